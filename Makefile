@@ -1,0 +1,37 @@
+# Two commands on a fresh machine with Python >= 3.11 and make:
+#   make demo   flies, reconstructs, estimates and scores a synthetic flight; pictures in demo-flight/
+#   make test   checks the code and runs every test
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test fast lint notebooks clean
+
+demo: $(VENV)/installed
+	$(BIN)/postflight demo demo-flight
+
+test: lint
+	$(BIN)/python -m pytest -n 2 --dist loadscope -q
+
+fast: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m "not slow"
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/installed: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable .
+	touch $@
+
+$(VENV)/installed-dev: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@ $(VENV)/installed
+
+clean:
+	rm -rf $(VENV) demo-flight build dist

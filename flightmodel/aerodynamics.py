@@ -1,0 +1,126 @@
+"""What the air does to the aeroshell: coefficients over Mach number and total angle of attack.
+
+Coefficients refer to ``q S`` and ``q S l`` and act at the nose (datum) of the shell, in the plane of the total angle
+of attack: ``C_A`` along -x, ``C_N`` against the lateral velocity, ``C_m`` nose-up positive (so a stable shape has
+C_m < 0), ``C_mq`` per ``omega l / (2 V)`` on the transverse rates. Between the table's knots they are linear, which is
+the seed paper's blend from Mach 5.7 to 3.5 where the table has no knot in between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.interpolate import RegularGridInterpolator
+
+from flightmodel.checks import FloatArray, GateError, TableRangeError
+
+COLUMNS = ("mach", "alpha_deg", "ca", "cn", "cm", "cmq")
+# above the cone's half-angle part of it lies in shadow; no entry vehicle of the class flies there, so look-ups stop
+INVERSE_LIMIT_RAD = np.deg2rad(60.0)
+
+
+@dataclass(frozen=True)
+class AeroTable:
+    """Coefficients on a grid of Mach number and total angle of attack.
+
+    Parameters
+    ----------
+    mach : (m,) float
+        Strictly increasing knots. Below the first and above the last the end values hold (Mach-number independence
+        above; subsonic coefficients are flat below Mach 0.6).
+    alpha_rad : (a,) float
+        Uniform from 0 to pi.
+    coefficients : (m, a, 4) float
+        C_A, C_N, C_m at the nose, C_mq.
+    """
+
+    mach: FloatArray
+    alpha_rad: FloatArray
+    coefficients: FloatArray
+
+    def at(self, mach: FloatArray | float, alpha_rad: FloatArray | float) -> FloatArray:
+        """C_A, C_N, C_m, C_mq ``(..., 4)`` at Mach numbers and total angles of attack.
+
+        Raises
+        ------
+        TableRangeError
+            For angles outside 0 to pi, or where an argument is not a number.
+        """
+        m, a = np.broadcast_arrays(np.asarray(mach, dtype=float), np.asarray(alpha_rad, dtype=float))
+        inside = (a >= 0.0) & (a <= self.alpha_rad[-1]) & (m >= 0.0)
+        if not inside.all():
+            bad = int(np.argmin(inside))
+            raise TableRangeError(
+                f"aerodynamic table: Mach {m.flat[bad]:.3f}, angle {np.rad2deg(a.flat[bad]):.2f} deg "
+                f"lies outside Mach >= 0, 0 to {np.rad2deg(self.alpha_rad[-1]):.0f} deg"
+            )
+        grid = RegularGridInterpolator((self.mach, self.alpha_rad), self.coefficients)
+        points = np.stack([np.clip(m, self.mach[0], self.mach[-1]), a], axis=-1)
+        return grid(points).reshape(*m.shape, 4)
+
+    def ratio(self, mach: FloatArray | float, alpha_rad: FloatArray | float) -> FloatArray:
+        """C_N/C_A (seed paper eq. [2])."""
+        c = self.at(mach, alpha_rad)
+        return c[..., 1] / c[..., 0]
+
+    def alpha_from_ratio(self, mach: FloatArray, ratio: FloatArray) -> FloatArray:
+        """Total angle of attack, rad, whose C_N/C_A is ``ratio`` (seed paper eq. [3]); NaN outside 0 to 60 deg."""
+        mach, ratio = np.broadcast_arrays(np.asarray(mach, dtype=float), np.asarray(ratio, dtype=float))
+        knots = self.alpha_rad[self.alpha_rad <= INVERSE_LIMIT_RAD + 1e-9]
+        table = self.ratio(mach.ravel()[:, None], knots[None, :])
+        flat = ratio.ravel()
+        k = np.clip(np.sum(table <= flat[:, None], axis=1) - 1, 0, len(knots) - 2)
+        row = np.arange(len(flat))
+        fraction = (flat - table[row, k]) / (table[row, k + 1] - table[row, k])
+        alpha = knots[k] + fraction * (knots[1] - knots[0])
+        outside = (flat < 0.0) | (flat > table[:, -1])
+        return np.where(outside, np.nan, alpha).reshape(ratio.shape)
+
+    def scaled(self, ca: float = 1.0, cn: float = 1.0, cm: float = 1.0, cmq_shift: float = 0.0) -> AeroTable:
+        """Dispersed copy: factors on C_A, C_N, C_m, and a shift of C_mq."""
+        return AeroTable(
+            self.mach, self.alpha_rad, self.coefficients * np.array([ca, cn, cm, 1.0]) + np.array([0, 0, 0, cmq_shift])
+        )
+
+    def with_constant_cmq(self, cmq: float) -> AeroTable:
+        """Copy with one pitch damping coefficient everywhere."""
+        changed = self.coefficients.copy()
+        changed[..., 3] = cmq
+        return AeroTable(self.mach, self.alpha_rad, changed)
+
+
+def read_aero_table(path: Path) -> AeroTable:
+    """Read a coefficient table: columns mach, alpha_deg, ca, cn, cm, cmq, one row a grid point, ``#`` comments.
+
+    Raises
+    ------
+    GateError
+        With every fault: missing columns, numbers that are not finite, a grid with holes or uneven angles.
+    """
+    try:
+        frame = pd.read_csv(path, comment="#")
+    except FileNotFoundError:
+        raise GateError(f"{path}: no such aerodynamic table") from None
+    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as fault:
+        raise GateError(f"{path}: cannot be read as a table: {fault}") from None
+    missing = [c for c in COLUMNS if c not in frame.columns]
+    if missing:
+        raise GateError(f"{path}: columns {', '.join(missing)} are missing; wanted {', '.join(COLUMNS)}")
+    values = frame[list(COLUMNS)].apply(pd.to_numeric, errors="coerce").to_numpy(dtype=float)
+    faults = []
+    if not np.isfinite(values).all():
+        faults.append(f"{path}: data row {int(np.argmin(np.isfinite(values).all(axis=1))) + 1} holds no finite number")
+        raise GateError(faults)
+    values = values[np.lexsort((values[:, 1], values[:, 0]))]
+    mach, alpha_deg = np.unique(values[:, 0]), np.unique(values[:, 1])
+    if len(values) != len(mach) * len(alpha_deg):
+        faults.append(f"{path}: {len(values)} rows where {len(mach)} Mach x {len(alpha_deg)} angles are wanted")
+    if len(alpha_deg) < 2 or len(mach) < 2 or np.ptp(np.diff(alpha_deg)) > 1e-9 or alpha_deg[0] != 0.0:
+        faults.append(f"{path}: angles must be evenly spaced from 0, and at least two, as Mach numbers")
+    if faults:
+        raise GateError(faults)
+    grid = values[:, 2:].reshape(len(mach), len(alpha_deg), 4)
+    return AeroTable(mach, np.deg2rad(alpha_deg), np.ascontiguousarray(grid))

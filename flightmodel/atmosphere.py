@@ -1,0 +1,223 @@
+"""What air the vehicle met: the US Standard Atmosphere 1976, the day's soundings blended into it, and winds.
+
+To 86 km the standard's exact equations; above, its printed tables to 1000 km, interpolated by cubic splines of
+log density and log pressure, and its temperature equations. Speed of sound uses gamma = 1.4 and the sea-level gas
+constant throughout, so above 86 km Mach number is a convention, as in the trajectory codes of the field.
+
+References
+----------
+NOAA/NASA/USAF, "U.S. Standard Atmosphere, 1976", NOAA-S/T 76-1562: tables I, VIII and section 1.2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing
+from flightmodel.telemetry import Sounding
+
+GAMMA = 1.4
+R_AIR_JPKGK = 8314.32 / 28.9644
+EARTH_RADIUS_US76_M = 6356766.0
+G0_MPS2 = 9.80665
+# geopotential base m, base temperature K, lapse K/m
+_LAYERS = np.array(
+    [
+        [0.0, 288.15, -0.0065],
+        [11000.0, 216.65, 0.0],
+        [20000.0, 216.65, 0.001],
+        [32000.0, 228.65, 0.0028],
+        [47000.0, 270.65, 0.0],
+        [51000.0, 270.65, -0.0028],
+        [71000.0, 214.65, -0.002],
+    ]
+)
+# geometric height km, density kg/m^3, pressure Pa, as printed
+_UPPER = np.array(
+    [
+        [86, 6.958e-6, 3.7338e-1],
+        [90, 3.416e-6, 1.8359e-1],
+        [95, 1.393e-6, 7.5966e-2],
+        [100, 5.604e-7, 3.2011e-2],
+        [105, 2.325e-7, 1.4477e-2],
+        [110, 9.708e-8, 7.1042e-3],
+        [115, 4.289e-8, 4.0096e-3],
+        [120, 2.222e-8, 2.5382e-3],
+        [125, 1.291e-8, 1.7354e-3],
+        [130, 8.152e-9, 1.2505e-3],
+        [140, 3.831e-9, 7.2028e-4],
+        [150, 2.076e-9, 4.5422e-4],
+        [160, 1.233e-9, 3.0395e-4],
+        [180, 5.194e-10, 1.5271e-4],
+        [200, 2.541e-10, 8.4736e-5],
+        [250, 6.073e-11, 2.4767e-5],
+        [300, 1.916e-11, 8.7704e-6],
+        [400, 2.803e-12, 1.4518e-6],
+        [500, 5.215e-13, 3.0236e-7],
+        [600, 1.137e-13, 8.2130e-8],
+        [700, 3.070e-14, 3.1908e-8],
+        [800, 1.136e-14, 1.7036e-8],
+        [900, 5.759e-15, 1.0873e-8],
+        [1000, 3.561e-15, 7.5138e-9],
+    ]
+)
+TOP_M = 1.0e6
+BOTTOM_M = -5000.0
+
+
+@dataclass(frozen=True)
+class AirState:
+    """Air at given altitudes; all ``(...)`` arrays. ``density_sd`` is a fraction; winds are where the air goes."""
+
+    density_kgpm3: FloatArray
+    temperature_k: FloatArray
+    pressure_pa: FloatArray
+    sound_speed_mps: FloatArray
+    wind_ned_mps: FloatArray
+    density_sd: FloatArray
+    wind_sd_mps: FloatArray
+
+
+def us76(altitude_m: FloatArray | float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Density kg/m^3, temperature K, pressure Pa at geometric altitudes from -5 to 1000 km.
+
+    Raises
+    ------
+    GateError
+        Outside that range.
+    """
+    z = np.asarray(altitude_m, dtype=float)
+    if not ((z >= BOTTOM_M) & (z <= TOP_M)).all():
+        raise GateError(
+            f"US76: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_M:.0f} to {TOP_M:.0f} m"
+        )
+    low = np.minimum(z, 86000.0)
+    t_low, p_low = _below_86_km(EARTH_RADIUS_US76_M * low / (EARTH_RADIUS_US76_M + low))
+    high = np.maximum(z, 86000.0)
+    above = z > 86000.0
+    temperature = np.where(above, _temperature_above_86_km(high), t_low)
+    pressure = np.where(above, np.exp(_LOG_PRESSURE(high)), p_low)
+    density = np.where(above, np.exp(_LOG_DENSITY(high)), p_low / (R_AIR_JPKGK * t_low))
+    return density, temperature, pressure
+
+
+def _below_86_km(h: FloatArray) -> tuple[FloatArray, FloatArray]:
+    base_p = [101325.0]
+    for (h0, t0, lapse), (h1, _, _) in pairwise(_LAYERS):
+        base_p.append(base_p[-1] * float(_pressure_ratio(np.array(h1 - h0), t0, lapse)))
+    k = np.clip(np.searchsorted(_LAYERS[:, 0], h, side="right") - 1, 0, len(_LAYERS) - 1)
+    h0, t0, lapse = _LAYERS[k].T if np.ndim(h) == 0 else np.moveaxis(_LAYERS[k], -1, 0)
+    return t0 + lapse * (h - h0), np.asarray(base_p)[k] * _pressure_ratio(h - h0, t0, lapse)
+
+
+def _pressure_ratio(dh: FloatArray, t0: FloatArray, lapse: FloatArray) -> FloatArray:
+    isothermal = np.abs(lapse) < 1e-12
+    safe = np.where(isothermal, 1.0, lapse)
+    power = np.where(isothermal, 0.0, G0_MPS2 / (R_AIR_JPKGK * safe))
+    return np.where(isothermal, np.exp(-G0_MPS2 * dh / (R_AIR_JPKGK * t0)), (t0 / (t0 + lapse * dh)) ** power)
+
+
+def _temperature_above_86_km(z: FloatArray) -> FloatArray:
+    km = z / 1000.0
+    ellipse = 263.1905 - 76.3232 * np.sqrt(np.maximum(1.0 - ((np.clip(km, 91.0, 110.0) - 91.0) / 19.9429) ** 2, 0.0))
+    xi = (np.maximum(km, 120.0) - 120.0) * (6356.766 + 120.0) / (6356.766 + km)
+    upper = 1000.0 - 640.0 * np.exp(-0.01875 * xi)
+    return np.select([km <= 91.0, km <= 110.0, km <= 120.0], [186.8673, ellipse, 240.0 + 12.0 * (km - 110.0)], upper)
+
+
+def _spline(column: int) -> CubicSpline:
+    """Return a cubic spline of the log over height, joined to the equations below 86 km with their slope."""
+    h = EARTH_RADIUS_US76_M * np.array([85990.0, 86000.0]) / (EARTH_RADIUS_US76_M + np.array([85990.0, 86000.0]))
+    t, p = _below_86_km(h)
+    value = np.log(p if column == 2 else p / (R_AIR_JPKGK * t))
+    table = np.log(_UPPER[:, column])
+    table[0] = value[1]
+    slope = float(value[1] - value[0]) / 10.0
+    return CubicSpline(_UPPER[:, 0] * 1000.0, table, bc_type=((1, slope), (2, 0.0)))
+
+
+_LOG_DENSITY = _spline(1)
+_LOG_PRESSURE = _spline(2)
+
+
+def default_sounding_sd(altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Usual error of rocketsonde and balloon profiles: density (fraction) and wind per component (m/s), 1 sd.
+
+    2, 3, 5, 10 % and 2, 4, 8, 15 m/s below 35, 60, 80 km and above (assumed sizes, after the accuracy of falling
+    spheres and datasondes), joined linearly over 5 km.
+    """
+    knots = [32500.0, 37500.0, 57500.0, 62500.0, 77500.0, 82500.0]
+    density = np.interp(altitude_m, knots, [0.02, 0.03, 0.03, 0.05, 0.05, 0.10])
+    return density, np.interp(altitude_m, knots, [2.0, 4.0, 4.0, 8.0, 8.0, 15.0])
+
+
+@dataclass(frozen=True)
+class AtmosphereProfile:
+    """Air over altitude: log density relative to US76, temperature, winds, each linear between knots.
+
+    Between the knots the US76 carries the exponential; outside them the ratio to US76 and the winds fade with
+    ``fade_m``, and the standard deviations grow to 15 % and 20 m/s.
+    """
+
+    altitude_m: FloatArray
+    log_density_ratio: FloatArray
+    temperature_offset_k: FloatArray
+    wind_ned_mps: FloatArray
+    density_sd: FloatArray
+    wind_sd_mps: FloatArray
+    fade_m: float = 10000.0
+
+    def __post_init__(self) -> None:
+        """Check once."""
+        check_increasing("atmosphere altitude", self.altitude_m)
+        check_finite("atmosphere wind", self.wind_ned_mps)
+        check_finite("atmosphere density", self.log_density_ratio)
+
+    def at(self, altitude_m: FloatArray | float) -> AirState:
+        """Air at geometric altitudes, m."""
+        z = np.asarray(altitude_m, dtype=float)
+        density, temperature, pressure = us76(z)
+        beyond = np.maximum(z - self.altitude_m[-1], 0.0) + np.maximum(self.altitude_m[0] - z, 0.0)
+        fade = np.exp(-beyond / self.fade_m)
+
+        def column(values: FloatArray) -> FloatArray:
+            return np.interp(z, self.altitude_m, values)
+
+        ratio = np.exp(fade * column(self.log_density_ratio))
+        warmer = temperature + fade * column(self.temperature_offset_k)
+        wind = np.stack([fade * column(w) for w in self.wind_ned_mps.T], axis=-1)
+        return AirState(
+            density_kgpm3=density * ratio,
+            temperature_k=warmer,
+            pressure_pa=pressure * ratio * warmer / temperature,
+            sound_speed_mps=np.sqrt(GAMMA * R_AIR_JPKGK * warmer),
+            wind_ned_mps=wind,
+            density_sd=column(self.density_sd) * fade + 0.15 * (1.0 - fade),
+            wind_sd_mps=column(self.wind_sd_mps) * fade + 20.0 * (1.0 - fade),
+        )
+
+
+def profile_from_sounding(sounding: Sounding) -> AtmosphereProfile:
+    """Blend the day's sounding into US76."""
+    density, temperature, _ = us76(sounding.altitude_m)
+    return AtmosphereProfile(
+        altitude_m=sounding.altitude_m,
+        log_density_ratio=np.log(sounding.density_kgpm3 / density),
+        temperature_offset_k=sounding.temperature_k - temperature,
+        wind_ned_mps=np.column_stack(
+            [sounding.wind_north_mps, sounding.wind_east_mps, np.zeros_like(sounding.altitude_m)]
+        ),
+        density_sd=sounding.density_sd,
+        wind_sd_mps=sounding.wind_sd_mps,
+    )
+
+
+def standard_atmosphere() -> AtmosphereProfile:
+    """US76 without winds."""
+    z = np.arange(0.0, 100001.0, 2500.0)
+    density_sd, wind_sd = default_sounding_sd(z)
+    return AtmosphereProfile(z, np.zeros(len(z)), np.zeros(len(z)), np.zeros((len(z), 3)), density_sd, wind_sd)

@@ -1,0 +1,223 @@
+"""Where does a point of the vehicle appear in the picture, and what does a pixel look at?
+
+The lens is Kannala and Brandt's fisheye in OpenCV's form. A point ``(X, Y, Z)`` in camera axes lies at the angle
+``a = atan2(hypot(X, Y), Z)`` from the optical axis and at the distance
+
+    a_d = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8)
+
+from the principal point, in units of the focal length: ``u = fx a_d X/hypot(X, Y) + cx`` and likewise ``v``. Camera
+axes are x right, y down, z forward; pixel centres lie at integers. Only points in front of the camera and inside the
+field where ``a_d`` grows with ``a`` have a pixel: OpenCV itself returns a mirrored pixel for a point behind the camera.
+
+References
+----------
+J. Kannala, S. Brandt, "A generic camera model and calibration method for conventional, wide-angle, and fish-eye
+lenses", IEEE PAMI 28(8), 2006. OpenCV, module ``cv2.fisheye``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flightmodel import rotations
+from flightmodel.checks import FloatArray, GateError, check_finite, check_shape
+from flightmodel.deflection import lv_direction
+
+if TYPE_CHECKING:
+    from flightmodel.vehicle import CameraMount
+
+BoolArray = NDArray[np.bool_]
+
+WIDEST_HALF_ANGLE_RAD = float(np.deg2rad(89.0))
+"""OpenCV projects through X/Z, so a point must lie in front of the camera."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A fisheye camera fixed to the centerbody.
+
+    Parameters
+    ----------
+    width_px, height_px : int
+        Size of the picture.
+    focal_px, centre_px : (2,) float
+        Focal lengths and principal point along u (right) and v (down), px.
+    distortion : (4,) float
+        Kannala-Brandt k1 to k4.
+    position_body_m : (3,) float
+        Entrance pupil from the datum, body axes, m.
+    dcm_cam_body : (3, 3) float
+        ``v_cam = dcm_cam_body @ v_body``.
+    """
+
+    width_px: int
+    height_px: int
+    focal_px: FloatArray
+    centre_px: FloatArray
+    distortion: FloatArray
+    position_body_m: FloatArray
+    dcm_cam_body: FloatArray
+    half_field_rad: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check shapes and orthonormality once; find the field in which the lens is one-to-one."""
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "focal_px": (2,),
+            "centre_px": (2,),
+            "distortion": (4,),
+            "position_body_m": (3,),
+            "dcm_cam_body": (3, 3),
+        }
+        for name, shape in shapes.items():
+            value = check_shape(f"camera.{name}", np.asarray(getattr(self, name), dtype=float), shape)
+            check_finite(f"camera.{name}", value)
+            object.__setattr__(self, name, value)
+        dcm = self.dcm_cam_body
+        if not np.allclose(dcm @ dcm.T, np.eye(3), atol=1e-9) or np.linalg.det(dcm) < 0.0:
+            raise GateError("camera.dcm_cam_body: not a rotation matrix")
+        object.__setattr__(self, "half_field_rad", one_to_one_half_angle_rad(self.distortion))
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height, px."""
+        return self.width_px, self.height_px
+
+    def is_inside(self, pixels: FloatArray, margin_px: float = 0.0) -> BoolArray:
+        """Whether pixels ``(..., 2)`` lie in the picture, at least ``margin_px`` from its border; False for NaN."""
+        u, v = pixels[..., 0], pixels[..., 1]
+        low, right, bottom = margin_px - 0.5, self.width_px - 0.5 - margin_px, self.height_px - 0.5 - margin_px
+        inside: BoolArray = (u >= low) & (u <= right) & (v >= low) & (v <= bottom)
+        return inside
+
+    def cam_from_body(self, points_body_m: FloatArray) -> FloatArray:
+        """Points ``(n, 3)`` from the datum in body axes, as seen from the camera in its own axes, m."""
+        out: FloatArray = (np.asarray(points_body_m, dtype=float) - self.position_body_m) @ self.dcm_cam_body.T
+        return out
+
+    def is_in_field(self, points_body_m: FloatArray) -> BoolArray:
+        """Whether points ``(n, 3)`` lie in front of the camera, inside the one-to-one field of the lens."""
+        x, y, z = self.cam_from_body(points_body_m).T
+        seen: BoolArray = np.arctan2(np.hypot(x, y), z) < self.half_field_rad
+        return seen
+
+    def project(self, points_body_m: FloatArray) -> FloatArray:
+        """Pixels ``(n, 2)`` of points ``(n, 3)`` in body axes; NaN outside the field of the lens."""
+        return self.project_with_jacobian(points_body_m)[0]
+
+    def project_with_jacobian(self, points_body_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Pixels and their derivatives.
+
+        Parameters
+        ----------
+        points_body_m : (n, 3) float
+            From the datum, body axes, m.
+
+        Returns
+        -------
+        pixels : (n, 2) float
+            NaN outside the field.
+        per_cam_m : (n, 2, 3) float
+            Derivative by the point's coordinates in camera axes, px/m (``@ dcm_cam_body`` for body axes).
+        per_lens : (n, 2, 8) float
+            Derivative by focal lengths (2), principal point (2) and k1 to k4, the last in px.
+        """
+        points_body_m = check_shape("points_body_m", points_body_m, (None, 3))
+        seen = self.is_in_field(points_body_m)
+        n = len(points_body_m)
+        pixels, per_cam_m, per_lens = np.full((n, 2), np.nan), np.full((n, 2, 3), np.nan), np.full((n, 2, 8), np.nan)
+        if seen.any():
+            cam = self.cam_from_body(points_body_m[seen])
+            (fx, fy), (cx, cy) = self.focal_px, self.centre_px
+            matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+            out, jacobian = cv2.fisheye.projectPoints(
+                np.ascontiguousarray(cam[:, None, :]), np.zeros(3), np.zeros(3), matrix, self.distortion
+            )
+            pixels[seen] = out.reshape(-1, 2)
+            jacobian = jacobian.reshape(-1, 2, 15)
+            per_lens[seen], per_cam_m[seen] = jacobian[:, :, :8], jacobian[:, :, 11:14]
+        return pixels, per_cam_m, per_lens
+
+    def rays_body(self, pixels: FloatArray) -> FloatArray:
+        """Unit directions ``(n, 3)`` in body axes that pixels ``(n, 2)`` look along; NaN outside the field.
+
+        Inverts the lens polynomial by Newton steps, which converge everywhere inside the one-to-one field.
+        """
+        pixels = check_shape("pixels", pixels, (None, 2))
+        slope = (pixels - self.centre_px) / self.focal_px
+        distance = np.hypot(slope[:, 0], slope[:, 1])
+        angle = angle_from_lens_distance(distance, self.distortion, self.half_field_rad)
+        away = np.where(distance > 1e-12, np.sin(angle) / np.where(distance > 1e-12, distance, 1.0), 1.0)
+        cam = np.column_stack([slope * away[:, None], np.cos(angle)])
+        out: FloatArray = cam @ self.dcm_cam_body
+        return out
+
+    def turned(self, rotation_cam_rad: FloatArray, focal_scale: float = 1.0) -> Camera:
+        """Return this camera with the scene turned by a small rotation vector in camera axes and a scaled focal length.
+
+        ``v_cam_new = exp(rotation) v_cam``: a positive rotation about camera y (down) moves the scene to the right.
+        """
+        turn = rotations.dcm_from_q(rotations.exp(np.asarray(rotation_cam_rad, dtype=float)))
+        return replace(self, dcm_cam_body=turn @ self.dcm_cam_body, focal_px=self.focal_px * focal_scale)
+
+
+def camera_from_mount(mount: CameraMount) -> Camera:
+    """Build the nominal camera of a mount.
+
+    The optical axis leans ``axis_from_forward_deg`` from body +x outwards in the camera's clocking plane. The picture
+    stands upright like a view to a horizon: **up is outboard and aft**, so the sky is above the shell's rim, the aft
+    face of the shell below it and the centerbody at the lower border. Looking forward so, **left is increasing
+    clocking angle**, and a rim that moves aft, towards the camera, moves up in the picture (towards smaller rows).
+    """
+    lean = np.deg2rad(mount.axis_from_forward_deg)
+    outboard = lv_direction(np.deg2rad(mount.clock_lv_deg))
+    forward = np.array([1.0, 0.0, 0.0])
+    z_cam = np.cos(lean) * forward + np.sin(lean) * outboard
+    y_cam = np.sin(lean) * forward - np.cos(lean) * outboard
+    return Camera(
+        width_px=mount.width_px,
+        height_px=mount.height_px,
+        focal_px=np.array(mount.focal_px),
+        centre_px=np.array(mount.centre_px),
+        distortion=np.array(mount.distortion),
+        position_body_m=-mount.station_m * forward + mount.radius_m * outboard,
+        dcm_cam_body=np.stack([np.cross(y_cam, z_cam), y_cam, z_cam]),
+    )
+
+
+def lens_distance(angle_rad: FloatArray, distortion: FloatArray) -> FloatArray:
+    """Distance from the principal point, in focal lengths, of rays at an angle from the optical axis."""
+    a2 = np.square(angle_rad)
+    k1, k2, k3, k4 = distortion
+    out: FloatArray = angle_rad * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
+    return out
+
+
+def _lens_slope(angle_rad: FloatArray | float, distortion: FloatArray) -> FloatArray:
+    a2 = np.square(angle_rad)
+    k1, k2, k3, k4 = distortion
+    out: FloatArray = 1.0 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)))
+    return out
+
+
+def one_to_one_half_angle_rad(distortion: FloatArray) -> float:
+    """Largest angle from the optical axis up to which the lens polynomial grows, at most 89 deg, rad."""
+    angle = np.linspace(0.0, WIDEST_HALF_ANGLE_RAD, 2000)
+    falling = _lens_slope(angle, distortion) <= 1e-3
+    return float(angle[max(int(np.argmax(falling)) - 1, 0)]) if falling.any() else WIDEST_HALF_ANGLE_RAD
+
+
+def angle_from_lens_distance(distance: FloatArray, distortion: FloatArray, half_field_rad: float) -> FloatArray:
+    """Invert `lens_distance` by Newton's method, rad; NaN beyond ``half_field_rad``."""
+    reachable = distance < lens_distance(np.array(half_field_rad), distortion)
+    angle = np.clip(distance, 0.0, half_field_rad)
+    for _ in range(12):
+        step = (lens_distance(angle, distortion) - distance) / _lens_slope(angle, distortion)
+        angle = np.clip(angle - step, 0.0, half_field_rad)
+        if np.abs(step[reachable]).max(initial=0.0) < 1e-14:
+            break
+    return np.where(reachable, angle, np.nan)

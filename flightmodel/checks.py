@@ -1,0 +1,96 @@
+"""What may pass a gate: exceptions and checks of arrays where data enter the toolkit.
+
+Public entry points check once and then trust; compiled kernels check nothing.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+class GateError(ValueError):
+    """Data refused at a gate; carries every fault found, one line each.
+
+    Parameters
+    ----------
+    faults : str or sequence of str
+        Each says what is wrong, where (file and line, or source and time), and what to try.
+    """
+
+    exit_code = 3
+
+    def __init__(self, faults: str | Sequence[str]) -> None:
+        self.faults: tuple[str, ...] = (faults,) if isinstance(faults, str) else tuple(faults)
+        super().__init__("\n".join(self.faults))
+
+
+class ConfigError(GateError):
+    """A configuration file (flight, vehicle, scenario) or an option that cannot be used."""
+
+    exit_code = 2
+
+
+class TableRangeError(GateError):
+    """A look-up outside the range of its table; nothing is extrapolated in silence."""
+
+
+class DivergenceError(GateError):
+    """The simulated vehicle tumbled or its joint diverged where the caller needs a bounded flight."""
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str:
+    """Return ``" (did you mean 'x'?)"`` for a misspelt name, or an empty string."""
+    folded = {candidate.lower(): candidate for candidate in known}
+    close = difflib.get_close_matches(name.lower(), list(folded), n=1, cutoff=0.5)
+    return f" (did you mean '{folded[close[0]]}'?)" if close else ""
+
+
+def check_shape(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
+    """Return ``array`` as contiguous float64, or raise `GateError` where its shape differs.
+
+    ``None`` in ``shape`` accepts any length of that axis.
+    """
+    out = np.ascontiguousarray(array, dtype=np.float64)
+    fits = out.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, out.shape, strict=True))
+    if not fits:
+        raise GateError(f"{name}: shape {out.shape} where {shape} is wanted")
+    return out
+
+
+def check_finite(name: str, array: FloatArray) -> None:
+    """Raise `GateError` naming the first entry that is NaN or infinite."""
+    bad = ~np.isfinite(array)
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise GateError(f"{name}: {int(bad.sum())} values are not finite, the first at index {first}")
+
+
+def check_increasing(name: str, time_s: FloatArray) -> None:
+    """Raise `GateError` where times do not strictly increase."""
+    step = np.diff(time_s)
+    if (step <= 0).any():
+        k = int(np.argmax(step <= 0))
+        raise GateError(
+            f"{name}: time does not increase at index {k + 1}: {time_s[k]:.6f} s then {time_s[k + 1]:.6f} s"
+        )
+
+
+def check_unit_quaternion(name: str, q: FloatArray, tolerance: float = 1e-6) -> None:
+    """Raise `GateError` where a quaternion's norm differs from one by more than ``tolerance``."""
+    off = np.abs(np.linalg.norm(q, axis=-1) - 1.0)
+    if (off > tolerance).any():
+        raise GateError(f"{name}: not a unit quaternion (norm off by {float(off.max()):.2e})")
+
+
+def check_positive_definite(name: str, matrix: FloatArray) -> None:
+    """Raise `GateError` where a symmetric matrix has an eigenvalue that is not positive."""
+    lowest = float(np.linalg.eigvalsh(matrix).min())
+    if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0) or lowest <= 0.0:
+        raise GateError(f"{name}: not symmetric positive definite (lowest eigenvalue {lowest:.3g})")

@@ -1,0 +1,219 @@
+"""How columns of a table become SI arrays: canonical names with unit suffixes, declared names and units, time formats.
+
+A canonical column says its unit in its name (``range_m``, ``az_deg``). Anything else is accepted only where the
+flight file declares column and unit; nothing is guessed. This is the only place where degrees, g, yards and the
+like turn into SI and radians.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from flightmodel.checks import FloatArray, GateError, nearest_name
+
+# unit -> (kind of quantity, factor to SI, offset added after the factor)
+UNITS: dict[str, tuple[str, float, float]] = {
+    "s": ("time", 1.0, 0.0),
+    "ms": ("time", 1e-3, 0.0),
+    "us": ("time", 1e-6, 0.0),
+    "min": ("time", 60.0, 0.0),
+    "m": ("length", 1.0, 0.0),
+    "km": ("length", 1000.0, 0.0),
+    "yd": ("length", 0.9144, 0.0),
+    "ft": ("length", 0.3048, 0.0),
+    "kft": ("length", 304.8, 0.0),
+    "nmi": ("length", 1852.0, 0.0),
+    "rad": ("angle", 1.0, 0.0),
+    "mrad": ("angle", 1e-3, 0.0),
+    "deg": ("angle", np.pi / 180.0, 0.0),
+    "mil": ("angle", 2.0 * np.pi / 6400.0, 0.0),
+    "mps2": ("acceleration", 1.0, 0.0),
+    "g": ("acceleration", 9.80665, 0.0),
+    "mg": ("acceleration", 9.80665e-3, 0.0),
+    "ftps2": ("acceleration", 0.3048, 0.0),
+    "radps": ("rate", 1.0, 0.0),
+    "degps": ("rate", np.pi / 180.0, 0.0),
+    "rpm": ("rate", 2.0 * np.pi / 60.0, 0.0),
+    "mps": ("speed", 1.0, 0.0),
+    "kmh": ("speed", 1.0 / 3.6, 0.0),
+    "kt": ("speed", 1852.0 / 3600.0, 0.0),
+    "ftps": ("speed", 0.3048, 0.0),
+    "kgpm3": ("density", 1.0, 0.0),
+    "gpm3": ("density", 1e-3, 0.0),
+    "k": ("temperature", 1.0, 0.0),
+    "degc": ("temperature", 1.0, 273.15),
+    "pa": ("pressure", 1.0, 0.0),
+    "hpa": ("pressure", 100.0, 0.0),
+    "1": ("fraction", 1.0, 0.0),
+    "percent": ("fraction", 0.01, 0.0),
+}
+KINDS = {kind for kind, _, _ in UNITS.values()}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column that a table may hold: short name in the flight file, canonical column, kind, whether it is required."""
+
+    short: str
+    canonical: str
+    kind: str
+    required: bool = True
+
+
+ACCELEROMETER = tuple(Quantity(f"a{a}", f"a{a}_suba_mps2", "acceleration") for a in "xyz")
+RATES = tuple(Quantity(a, f"{a}_body_degps", "rate") for a in "pqr")
+RADAR = (Quantity("range", "range_m", "length"), Quantity("az", "az_deg", "angle"), Quantity("el", "el_deg", "angle"))
+ATMOSPHERE = (
+    Quantity("alt", "alt_m", "length"),
+    Quantity("rho", "rho_kgpm3", "density"),
+    Quantity("temperature", "t_k", "temperature"),
+    Quantity("pressure", "p_pa", "pressure", required=False),
+    Quantity("wind_north", "wind_n_mps", "speed", required=False),
+    Quantity("wind_east", "wind_e_mps", "speed", required=False),
+    Quantity("wind_speed", "wind_speed_mps", "speed", required=False),
+    Quantity("wind_from", "wind_from_deg", "angle", required=False),
+    Quantity("rho_sd", "rho_sd_percent", "fraction", required=False),
+    Quantity("wind_sd", "wind_sd_mps", "speed", required=False),
+)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A column and its unit as the flight file declares them."""
+
+    column: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class TimeColumn:
+    """Where a table's time stands and how it is written: ``seconds``, ``utc`` (ISO) or ``irig_doy``."""
+
+    column: str = "t_s"
+    format: str = "seconds"
+    unit: str = "s"
+
+
+def read_table(path: Path, label: str) -> pd.DataFrame:
+    """Read a CSV as text; raise `GateError` for a file that is missing, empty, binary or ragged."""
+    try:
+        frame = pd.read_csv(path, dtype=str, skipinitialspace=True, keep_default_na=False, encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise GateError(f"{label}: {path}: no such file") from None
+    except (UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError, OSError) as fault:
+        raise GateError(f"{label}: {path}: not a readable CSV table: {str(fault).strip()}") from None
+    frame.columns = [str(c).strip() for c in frame.columns]
+    if len(frame) < 2:
+        raise GateError(f"{label}: {path}: {len(frame)} data rows; at least two are needed")
+    return frame
+
+
+def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: list[str]) -> FloatArray:
+    """Column as float64; empty and NaN cells are missing, any other text is a fault with its file line."""
+    text = frame[column].str.strip()
+    values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, copy=True)
+    missing = text.str.lower().isin(["", "nan", "na", "null", "-"]).to_numpy()
+    bad = (~np.isfinite(values)) & ~missing
+    if bad.any():
+        first = int(np.argmax(bad))
+        faults.append(
+            f"{label}: {path}: line {first + 2}, column '{column}': '{text.iloc[first]}' is no finite number "
+            f"({int(bad.sum())} such cells); leave a missing value empty"
+        )
+    return values
+
+
+def column_si(
+    frame: pd.DataFrame,
+    quantity: Quantity,
+    declared: Declared | None,
+    path: Path,
+    label: str,
+    faults: list[str],
+) -> FloatArray | None:
+    """Return a quantity in SI, or None where it is absent (a fault when it is required)."""
+    column = declared.column if declared else quantity.canonical
+    unit = declared.unit if declared else quantity.canonical.rsplit("_", 1)[-1]
+    if column not in frame.columns:
+        if quantity.required or declared:
+            faults.append(_absent(frame, quantity, column, path, label))
+        return None
+    if unit not in UNITS or UNITS[unit][0] != quantity.kind:
+        fitting = ", ".join(u for u, (kind, _, _) in UNITS.items() if kind == quantity.kind)
+        faults.append(f"{label}: {path}: column '{column}': unit '{unit}' is not one of {quantity.kind}: {fitting}")
+        return None
+    _, factor, offset = UNITS[unit]
+    return numbers(frame, column, path, label, faults) * factor + offset
+
+
+def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, label: str) -> str:
+    stem = column.rsplit("_", 1)[0]
+    bare = [c for c in frame.columns if c.lower() in (stem.lower(), quantity.short.lower())]
+    if bare:
+        hint = (
+            f"; '{bare[0]}' names no unit: declare it in flight.toml, "
+            f'columns.{quantity.short} = {{ column = "{bare[0]}", unit = "..." }}'
+        )
+    else:
+        hint = nearest_name(column, frame.columns)
+    return f"{label}: {path}: line 1: no column '{column}'{hint}; found {', '.join(frame.columns)}"
+
+
+def times_s(
+    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
+) -> FloatArray | None:
+    """Seconds after t0, strictly increasing, or None with a fault for each thing that is wrong."""
+    if spec.column not in frame.columns:
+        found = ", ".join(frame.columns)
+        hint = nearest_name(spec.column, frame.columns)
+        faults.append(f"{label}: {path}: line 1: no time column '{spec.column}'{hint}; found {found}")
+        return None
+    if spec.format == "seconds":
+        values = numbers(frame, spec.column, path, label, faults) * UNITS[spec.unit][1]
+    else:
+        values = _clock_times(frame[spec.column].str.strip(), spec.format, t0)
+    bad = ~np.isfinite(values)
+    if bad.any():
+        first = int(np.argmax(bad))
+        faults.append(
+            f"{label}: {path}: line {first + 2}: time '{frame[spec.column].iloc[first]}' is not in format "
+            f"'{spec.format}' ({int(bad.sum())} such rows)"
+        )
+        return None
+    back = np.diff(values) <= 0.0
+    if back.any():
+        k = int(np.argmax(back))
+        faults.append(
+            f"{label}: {path}: line {k + 3}: time runs backwards or repeats: {values[k]:.6f} s then "
+            f"{values[k + 1]:.6f} s ({int(back.sum())} places); sort the rows or remove the duplicates"
+        )
+        return None
+    return values
+
+
+_IRIG = re.compile(r"^(\d{1,3}):(\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)$")
+
+
+def _clock_times(text: pd.Series, form: str, t0: datetime) -> FloatArray:
+    """Seconds after t0 of ISO UTC or IRIG day-of-year times (in t0's year); NaN where a cell does not parse."""
+    out = np.full(len(text), np.nan)
+    if form == "irig_doy":
+        year_start = (datetime(t0.year, 1, 1, tzinfo=UTC) - t0).total_seconds()
+        for k, cell in enumerate(text):
+            match = _IRIG.match(cell)
+            if match and 1 <= int(match[1]) <= 366 and int(match[2]) < 24 and int(match[3]) < 60:
+                seconds = int(match[2]) * 3600 + int(match[3]) * 60 + float(match[4])
+                out[k] = year_start + (int(match[1]) - 1) * 86400.0 + seconds
+    else:
+        stamps = pd.to_datetime(text, utc=True, errors="coerce", format="ISO8601")
+        good = stamps.notna().to_numpy()
+        base = pd.Timestamp(t0)
+        out[good] = [(stamp - base).total_seconds() for stamp in stamps[good]]
+    # clocks are written to a microsecond at best: remove the rounding of the large offset
+    return np.round(out, 7)

@@ -1,0 +1,118 @@
+"""How the aeroshell is bent against the centerbody: one type for the truth and for every estimate of it.
+
+The bending angle ``theta`` is the angle between the two bodies' x axes. Its plane is the clocking angle, in the
+launch-vehicle (LV) frame, towards which the shell's nose axis tilts in the centerbody's frame; the shell's rim on
+that side moves aft, towards a camera that sits there, and the centerbody's aft end swings to that side. Clocking
+direction ``phi`` is ``(0, -cos(phi), sin(phi))`` in body axes (POST2 y lies at 180 deg, z at 90 deg; seed paper,
+section II).
+
+As a lateral vector, ``theta_yz = theta * (-cos(plane), sin(plane))``. With ``d`` the clocking direction, the rotation
+vector of the shell against the body is ``theta * x_hat x d``; that of the body against the shell is its opposite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flightmodel.checks import FloatArray, check_finite, check_increasing, check_shape
+
+
+def lv_direction(clock_lv_rad: FloatArray | float) -> FloatArray:
+    """Unit vectors ``(..., 3)`` in body axes of clocking angles in the LV frame, rad."""
+    phi = np.asarray(clock_lv_rad, dtype=float)
+    return np.stack([np.zeros_like(phi), -np.cos(phi), np.sin(phi)], axis=-1)
+
+
+def lv_clock(lateral_yz: FloatArray) -> FloatArray:
+    """Clocking angle in the LV frame, rad in [0, 2 pi), of lateral vectors ``(..., 2)`` in body y, z."""
+    lateral_yz = np.asarray(lateral_yz, dtype=float)
+    return np.mod(np.arctan2(lateral_yz[..., 1], -lateral_yz[..., 0]), 2.0 * np.pi)
+
+
+def rotation_vector_body_shell(theta_rad: FloatArray, plane_lv_rad: FloatArray) -> FloatArray:
+    """Rotation vector, rad, of the shell against the body: ``q_body_shell = exp(it)``."""
+    d = lv_direction(plane_lv_rad)
+    x_hat = np.broadcast_to(np.array([1.0, 0.0, 0.0]), d.shape)
+    return np.asarray(theta_rad, dtype=float)[..., None] * np.cross(x_hat, d)
+
+
+@dataclass(frozen=True)
+class DeflectionHistory:
+    """Bending angle and plane over time.
+
+    Parameters
+    ----------
+    time_s : (n,) float
+        Seconds after t0, strictly increasing.
+    theta_rad : (n,) float
+        Bending angle, rad. NaN where the method has no answer (the reason stands in ``assumptions``).
+    plane_lv_rad : (n,) float
+        Clocking angle of the bending plane in the LV frame, rad.
+    covariance : (n, 2, 2) float or None
+        Of ``(theta, plane)``, rad^2. A plane that is assumed carries the variance of the assumption.
+    method : str
+        ``"camera"``, ``"misalignment"``, ``"trim"`` or ``"truth"``.
+    assumptions : str
+        In words.
+    """
+
+    time_s: FloatArray
+    theta_rad: FloatArray
+    plane_lv_rad: FloatArray
+    covariance: FloatArray | None
+    method: str
+    assumptions: str = field(default="")
+
+    def __post_init__(self) -> None:
+        """Check shapes and time order once."""
+        n = len(self.time_s)
+        check_finite(f"{self.method}.time_s", self.time_s)
+        check_increasing(f"{self.method}.time_s", self.time_s)
+        check_shape(f"{self.method}.theta_rad", self.theta_rad, (n,))
+        check_shape(f"{self.method}.plane_lv_rad", self.plane_lv_rad, (n,))
+        if self.covariance is not None:
+            check_shape(f"{self.method}.covariance", self.covariance, (n, 2, 2))
+
+    @property
+    def theta_sd_rad(self) -> FloatArray:
+        """Standard deviation of the angle, rad; NaN without covariance."""
+        if self.covariance is None:
+            return np.full(len(self.time_s), np.nan)
+        return np.sqrt(self.covariance[:, 0, 0])
+
+    @property
+    def theta_yz_rad(self) -> FloatArray:
+        """Lateral deflection vector ``(n, 2)`` in body y, z, rad."""
+        return self.theta_rad[:, None] * lv_direction(self.plane_lv_rad)[:, 1:]
+
+    def at(self, time_s: float) -> tuple[float, float]:
+        """Angle and its sd, rad, at one time by linear interpolation between answers; NaN outside them."""
+        known = np.isfinite(self.theta_rad)
+        if not known.any() or not self.time_s[known][0] <= time_s <= self.time_s[known][-1]:
+            return float("nan"), float("nan")
+        theta = np.interp(time_s, self.time_s[known], self.theta_rad[known])
+        return float(theta), float(np.interp(time_s, self.time_s[known], self.theta_sd_rad[known]))
+
+
+def history_from_lateral(
+    time_s: FloatArray, theta_yz_rad: FloatArray, covariance_yz: FloatArray, method: str, assumptions: str
+) -> DeflectionHistory:
+    """History from lateral deflection vectors ``(n, 2)`` in body y, z and their covariance ``(n, 2, 2)``, rad.
+
+    The plane's variance is that of the sideways component over the angle squared, at most that of an unknown
+    direction (``pi^2 / 3``). Rows that hold NaN stay NaN.
+    """
+    size = np.linalg.norm(theta_yz_rad, axis=1)
+    plane = np.where(np.isfinite(size), lv_clock(theta_yz_rad), 0.0)
+    d = lv_direction(plane)[:, 1:]
+    # the direction of growing clock angle: derivative of (-cos, sin)
+    sideways = np.column_stack([np.sin(plane), np.cos(plane)])
+    turn = np.stack([d, sideways], axis=1)
+    polar = turn @ covariance_yz @ turn.transpose(0, 2, 1)
+    safe = np.where(size > 0.0, size, np.inf)
+    polar[:, 0, 1] /= safe
+    polar[:, 1, 0] /= safe
+    polar[:, 1, 1] = np.minimum(polar[:, 1, 1] / safe**2, np.pi**2 / 3.0)
+    return DeflectionHistory(time_s, size, plane, polar, method, assumptions)

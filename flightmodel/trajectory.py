@@ -1,0 +1,138 @@
+"""Where a vehicle was and how it was turned: one type for truth and estimate, so that they can be subtracted.
+
+The followed point is the structural datum (the nose), fixed hardware: the c.g. is one of the things estimated.
+*Body* is the centerbody, where the sensors are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+from flightmodel import earth, rotations
+from flightmodel.checks import (
+    FloatArray,
+    GateError,
+    check_finite,
+    check_increasing,
+    check_shape,
+    check_unit_quaternion,
+)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Position, velocity and attitude over time.
+
+    Parameters
+    ----------
+    epoch_utc : str
+        ISO time of ``time_s = 0``.
+    time_s : (n,) float
+    point : str
+        Which point of the vehicle is followed, ``"datum"`` unless moved.
+    position_ecef_m : (n, 3) float
+    velocity_ecef_mps : (n, 3) float
+        Relative to the rotating Earth.
+    q_ecef_body : (n, 4) float
+    omega_body_eci_body_radps : (n, 3) float
+        Rate of the body relative to inertial space, body axes.
+    covariance : (n, 9, 9) float or None
+        Of position ECEF m, velocity ECEF m/s, rotation in body axes rad: the coordinates of `difference`.
+    """
+
+    epoch_utc: str
+    time_s: FloatArray
+    point: str
+    position_ecef_m: FloatArray
+    velocity_ecef_mps: FloatArray
+    q_ecef_body: FloatArray
+    omega_body_eci_body_radps: FloatArray
+    covariance: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        """Check shapes, finiteness, time order and unit attitudes once."""
+        n = len(self.time_s)
+        for name, width in (
+            ("position_ecef_m", 3),
+            ("velocity_ecef_mps", 3),
+            ("q_ecef_body", 4),
+            ("omega_body_eci_body_radps", 3),
+        ):
+            check_finite(name, check_shape(name, getattr(self, name), (n, width)))
+        check_increasing("trajectory.time_s", self.time_s)
+        check_unit_quaternion("q_ecef_body", self.q_ecef_body)
+        if self.covariance is not None:
+            check_shape("covariance", self.covariance, (n, 9, 9))
+
+    def sd(self) -> FloatArray:
+        """Standard deviations ``(n, 9)`` in the covariance's coordinates; NaN without covariance."""
+        if self.covariance is None:
+            return np.full((len(self.time_s), 9), np.nan)
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+
+def resample(trajectory: Trajectory, time_s: FloatArray) -> Trajectory:
+    """Trajectory at other times: cubic in position, linear in the rest, shortest arc in attitude.
+
+    Raises
+    ------
+    GateError
+        Where a time lies outside the trajectory; nothing is extrapolated.
+    """
+    t = trajectory.time_s
+    at = np.asarray(time_s, dtype=float)
+    if at.min() < t[0] - 1e-9 or at.max() > t[-1] + 1e-9:
+        raise GateError(f"resample: {at.min():.3f} to {at.max():.3f} s lies outside {t[0]:.3f} to {t[-1]:.3f} s")
+    at = np.clip(at, t[0], t[-1])
+    spline = CubicHermiteSpline(t, trajectory.position_ecef_m, trajectory.velocity_ecef_mps)
+    covariance = None
+    if trajectory.covariance is not None:
+        k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+        w = ((at - t[k]) / (t[k + 1] - t[k]))[:, None, None]
+        covariance = (1.0 - w) * trajectory.covariance[k] + w * trajectory.covariance[k + 1]
+    return Trajectory(
+        trajectory.epoch_utc,
+        at,
+        trajectory.point,
+        spline(at),
+        interpolate_rows(at, t, trajectory.velocity_ecef_mps),
+        rotations.slerp(t, trajectory.q_ecef_body, at),
+        interpolate_rows(at, t, trajectory.omega_body_eci_body_radps),
+        covariance,
+    )
+
+
+def interpolate_rows(at: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
+    """Linear interpolation of each column of ``values`` (n, m) given at ``t``."""
+    return np.column_stack([np.interp(at, t, column) for column in values.T])
+
+
+def move_point(trajectory: Trajectory, to: str, to_from_point_body_m: FloatArray) -> Trajectory:
+    """Trajectory of another point fixed in the body, ``to_from_point_body_m`` (3,) away; covariance is dropped."""
+    arm = rotations.rotate(trajectory.q_ecef_body, np.broadcast_to(to_from_point_body_m, (len(trajectory.time_s), 3)))
+    rate = rotations.rotate(trajectory.q_ecef_body, trajectory.omega_body_eci_body_radps) - earth.OMEGA_ECEF_RADPS
+    return Trajectory(
+        trajectory.epoch_utc,
+        trajectory.time_s,
+        to,
+        trajectory.position_ecef_m + arm,
+        trajectory.velocity_ecef_mps + np.cross(rate, arm),
+        trajectory.q_ecef_body,
+        trajectory.omega_body_eci_body_radps,
+    )
+
+
+def difference(estimate: Trajectory, truth: Trajectory) -> FloatArray:
+    """Error ``(n, 9)``, estimate minus truth, in the covariance's coordinates; times and points must be equal."""
+    if estimate.point != truth.point or not np.allclose(estimate.time_s, truth.time_s, atol=1e-9, rtol=0.0):
+        raise GateError("difference: the trajectories follow different points or times; resample or move one first")
+    return np.hstack(
+        [
+            estimate.position_ecef_m - truth.position_ecef_m,
+            estimate.velocity_ecef_mps - truth.velocity_ecef_mps,
+            rotations.boxminus(estimate.q_ecef_body, truth.q_ecef_body),
+        ]
+    )

@@ -1,0 +1,256 @@
+"""What flies: two rigid bodies, the joint between them, their coefficients, sensors and cameras, from a TOML file.
+
+Body axes lie in the centerbody: x out of the nose, y and z as POST2's (y clocked at 180 deg, z at 90 deg in the
+launch-vehicle frame). The datum is the nose. *Shell* axes equal body axes when the joint is not bent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from flightmodel.aerodynamics import AeroTable, read_aero_table
+from flightmodel.checks import ConfigError, FloatArray, check_positive_definite, nearest_name
+from flightmodel.config import Section, parse_section, read_toml
+from flightmodel.instruments import dcm_body_from_clocking
+
+DATA = Path(__file__).parent / "data"
+Positive = Annotated[float, Field(gt=0.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+Vector = tuple[float, float, float]
+
+
+class Reference(Section):
+    """Reference area and length of the coefficients."""
+
+    area_m2: Positive
+    length_m: Positive
+
+
+class MassProperties(Section):
+    """Mass, c.g. from the datum in body axes, inertia tensor about the body's own c.g. in body axes."""
+
+    mass_kg: Positive
+    cg_from_datum_body_m: Vector
+    inertia_kgm2: tuple[Vector, Vector, Vector]
+
+    @field_validator("inertia_kgm2")
+    @classmethod
+    def _physical(cls, value: tuple[Vector, Vector, Vector]) -> tuple[Vector, Vector, Vector]:
+        tensor = np.array(value)
+        check_positive_definite("inertia", tensor)
+        principal = np.linalg.eigvalsh(tensor)
+        if principal[2] > principal[0] + principal[1] + 1e-9:
+            raise ValueError(f"principal moments {np.round(principal, 4).tolist()} break the triangle inequality")
+        return value
+
+    @property
+    def cg_m(self) -> FloatArray:
+        """C.g. from the datum, body axes, (3,), m."""
+        return np.array(self.cg_from_datum_body_m)
+
+    @property
+    def inertia(self) -> FloatArray:
+        """Inertia tensor about the c.g., (3, 3), kg m^2."""
+        return np.array(self.inertia_kgm2)
+
+
+class CompliantJoint(Section):
+    """Spherical joint on the axis with bending and torsion springs, damping, freeplay and hardening.
+
+    The bending moment is ``K1 d + K3 d^3`` of the bending angle ``d`` beyond the freeplay, the damping moment
+    ``(C1 + C3 theta^2)`` times the relative angular rate.
+    """
+
+    station_m: float
+    bending_stiffness_nmprad: NonNegative
+    bending_damping_nmsprad: NonNegative = 0.0
+    torsion_stiffness_nmprad: NonNegative
+    torsion_damping_nmsprad: NonNegative = 0.0
+    freeplay_deg: NonNegative = 0.0
+    freeplay_corner: Annotated[float, Field(gt=0.0, le=0.5)] = 0.02
+    hardening_nmprad3: NonNegative = 0.0
+    damping_hardening_nmsprad3: NonNegative = 0.0
+
+
+class Uncertainty(Section):
+    """What is known of the vehicle before flight, one standard deviation; fractions where no unit is named."""
+
+    mass: NonNegative = 0.01
+    cg_station_m: NonNegative = 0.01
+    cg_lateral_m: NonNegative = 0.001
+    inertia: NonNegative = 0.03
+    ca: NonNegative = 0.03
+    cn: NonNegative = 0.07
+    cm: NonNegative = 0.10
+
+
+class ShellGeometry(Section):
+    """Stacked-torus aeroshell and cylindrical centerbody."""
+
+    nose_radius_m: Positive
+    half_angle_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
+    torus_count: Annotated[int, Field(ge=1, le=60)]
+    torus_minor_radius_m: Positive
+    torus_spacing_m: Positive
+    innermost_torus_radius_m: Positive
+    base_radius_m: Positive
+    gore_count: Annotated[int, Field(ge=3, le=120)]
+    centerbody_radius_m: Positive
+    centerbody_length_m: Positive
+
+
+class SensorMount(Section):
+    """Where a sensor package sits and how its axes are clocked."""
+
+    position_from_datum_body_m: Vector
+    x_axis_lv_deg: float
+    y_axis_lv_deg: float
+
+    @field_validator("y_axis_lv_deg")
+    @classmethod
+    def _right_angle(cls, value: float, info: object) -> float:
+        x_axis = getattr(info, "data", {}).get("x_axis_lv_deg", value + 90.0)
+        if abs(np.cos(np.deg2rad(value - x_axis))) > 1e-9:
+            raise ValueError("x and y axes of a package must be clocked 90 deg apart")
+        return value
+
+    @property
+    def dcm_body_sensor(self) -> FloatArray:
+        """Nominal mounting, ``v_body = dcm_body_sensor @ v_sensor``, (3, 3)."""
+        return dcm_body_from_clocking(np.deg2rad(self.x_axis_lv_deg), np.deg2rad(self.y_axis_lv_deg))
+
+
+class CameraMount(Section):
+    """A camera on the centerbody, its nominal pointing and its Kannala-Brandt lens."""
+
+    clock_lv_deg: float
+    station_m: float
+    radius_m: NonNegative
+    axis_from_forward_deg: float
+    width_px: Annotated[int, Field(ge=16, le=8192)]
+    height_px: Annotated[int, Field(ge=16, le=8192)]
+    focal_px: tuple[Positive, Positive]
+    centre_px: tuple[float, float]
+    distortion: tuple[float, float, float, float]
+
+
+class _Aerodynamics(Section):
+    table: str
+
+
+class _VehicleFile(Section):
+    name: str
+    description: str = ""
+    reference: Reference
+    joint: CompliantJoint
+    aeroshell: MassProperties
+    centerbody: MassProperties
+    uncertainty: Uncertainty = Uncertainty()
+    aerodynamics: _Aerodynamics
+    geometry: ShellGeometry
+    sensors: dict[str, SensorMount] = {}
+    cameras: dict[str, CameraMount] = {}
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A vehicle as flown or as assumed; every part frozen. See `vehicle_from_toml`."""
+
+    name: str
+    reference: Reference
+    joint: CompliantJoint
+    aeroshell: MassProperties
+    centerbody: MassProperties
+    uncertainty: Uncertainty
+    aero: AeroTable
+    geometry: ShellGeometry
+    sensors: dict[str, SensorMount]
+    cameras: dict[str, CameraMount]
+    source: Path
+
+    @property
+    def mass_kg(self) -> float:
+        """Total mass, kg."""
+        return self.aeroshell.mass_kg + self.centerbody.mass_kg
+
+    @cached_property
+    def cg_m(self) -> FloatArray:
+        """C.g. of the unbent vehicle from the datum, body axes, (3,), m."""
+        parts = (self.aeroshell, self.centerbody)
+        return sum((b.mass_kg * b.cg_m for b in parts), np.zeros(3)) / self.mass_kg
+
+    @cached_property
+    def inertia(self) -> FloatArray:
+        """Inertia tensor of the unbent vehicle about its c.g., body axes, (3, 3), kg m^2."""
+        total = np.zeros((3, 3))
+        for body in (self.aeroshell, self.centerbody):
+            d = body.cg_m - self.cg_m
+            total += body.inertia + body.mass_kg * (d @ d * np.eye(3) - np.outer(d, d))
+        return total
+
+    @property
+    def joint_m(self) -> FloatArray:
+        """Joint from the datum, body axes, (3,), m."""
+        return np.array([-self.joint.station_m, 0.0, 0.0])
+
+    def transverse_inertia_about_joint(self) -> tuple[float, float]:
+        """Aeroshell's and centerbody's mean transverse inertia about the joint, kg m^2 (seed paper eq. [7])."""
+        about = []
+        for body in (self.aeroshell, self.centerbody):
+            arm = body.cg_m[0] - self.joint_m[0]
+            about.append(0.5 * (body.inertia[1, 1] + body.inertia[2, 2]) + body.mass_kg * arm**2)
+        return about[0], about[1]
+
+    def free_free_frequency_hz(self) -> float:
+        """Free-free bending frequency (seed paper eq. [7]), Hz."""
+        ia, icb = self.transverse_inertia_about_joint()
+        return float(np.sqrt(self.joint.bending_stiffness_nmprad * (ia + icb) / (ia * icb)) / (2.0 * np.pi))
+
+    def critical_damping_nmsprad(self) -> float:
+        """Critical damping of the joint (seed paper eq. [8]), N m s/rad."""
+        ia, icb = self.transverse_inertia_about_joint()
+        return float(2.0 * np.sqrt(self.joint.bending_stiffness_nmprad * ia * icb / (ia + icb)))
+
+
+def vehicle_path(name: str, beside: Path | None = None) -> Path:
+    """Find a vehicle file: a path (relative to ``beside``), or the name of a vehicle that ships with the toolkit."""
+    if name.endswith(".toml"):
+        return (beside or Path()) / name
+    path = DATA / "vehicles" / f"{name}.toml"
+    if not path.exists():
+        shipped = [p.stem for p in (DATA / "vehicles").glob("*.toml")]
+        raise ConfigError(f"no vehicle '{name}'{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}")
+    return path
+
+
+def vehicle_from_toml(path: Path) -> Vehicle:
+    """Read a vehicle file.
+
+    Raises
+    ------
+    ConfigError
+        With every fault of the file, unknown keys with the nearest known one.
+    """
+    spec = parse_section(_VehicleFile, read_toml(path), str(path))
+    table = path.parent / spec.aerodynamics.table
+    if not table.exists():
+        table = DATA / "aerodynamics" / spec.aerodynamics.table
+    return Vehicle(
+        name=spec.name,
+        reference=spec.reference,
+        joint=spec.joint,
+        aeroshell=spec.aeroshell,
+        centerbody=spec.centerbody,
+        uncertainty=spec.uncertainty,
+        aero=read_aero_table(table),
+        geometry=spec.geometry,
+        sensors=dict(spec.sensors),
+        cameras=dict(spec.cameras),
+        source=path,
+    )

@@ -1,0 +1,104 @@
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from flightmodel.atmosphere import (
+    AtmosphereProfile,
+    default_sounding_sd,
+    profile_from_sounding,
+    standard_atmosphere,
+    us76,
+)
+from flightmodel.checks import GateError
+from flightmodel.telemetry import Sounding
+
+DATA = Path(__file__).parents[1] / "data"
+R0 = 6356766.0
+
+
+def test_layer_bases_as_printed():
+    table = pd.read_csv(DATA / "us76_table1_layer_bases.csv")
+    h = table["geopotential_m"].to_numpy(dtype=float)
+    density, temperature, pressure = us76(R0 * h / (R0 - h))
+    # printed kinetic temperature; ours is the molecular-scale one, 0.08 K more at the top
+    np.testing.assert_allclose(temperature[:-1], table["T_K"][:-1], atol=0.005)
+    assert temperature[-1] == pytest.approx(table["T_K"].iloc[-1], abs=0.1)
+    np.testing.assert_allclose(pressure, table["p_pa"], rtol=1e-4)  # four printed digits at 47 km
+    # the printed 71 km density is a misprint; 6.4211e-5 follows from the printed pressure and temperature
+    printed = table["rho_kgpm3"].where(table["geopotential_m"] != 71000, 6.4211e-5)
+    np.testing.assert_allclose(density, printed, rtol=1e-4)
+
+
+def test_density_and_pressure_above_86_km_equal_the_number_densities():
+    table = pd.read_csv(DATA / "us76_table8_number_density.csv").fillna(0.0)
+    table = table[table["z_m"] > 86000]  # atomic oxygen is not printed at 86 km
+    molar = np.array([28.0134, 15.9994, 31.9988, 39.948, 4.0026, 1.00797]) / 6.022169e26
+    number = table.iloc[:, 1:].to_numpy()
+    z = table["z_m"].to_numpy(dtype=float)
+    density, temperature, pressure = us76(z)
+    # four printed digits; at 300 km the printed helium disagrees in the third digit
+    np.testing.assert_allclose(density, number @ molar, rtol=1.5e-3)
+    np.testing.assert_allclose(pressure, number.sum(axis=1) * 1.380622e-23 * temperature, rtol=1.6e-3)
+
+
+def test_upper_temperature_as_printed():
+    table = pd.read_csv(DATA / "us76_upper_temperature.csv")
+    np.testing.assert_allclose(us76(table["z_m"].to_numpy(dtype=float))[1], table["T_K"], atol=0.02)
+
+
+@pytest.mark.parametrize("z", [3e3, 30e3, 60e3, 88e3, 103e3, 117e3, 145e3, 225e3])
+def test_air_is_in_hydrostatic_balance(z):
+    # dp/dz = -rho g with the standard's own gravity: an independent check between the tabulated heights
+    step = 10.0  # truncation (step / scale height)^2 / 6 = 5e-7
+    slope = (us76(z + step)[2] - us76(z - step)[2]) / (2 * step)
+    gravity = 9.80665 * (R0 / (R0 + z)) ** 2
+    # the thermosphere above 110 km is in diffusive, not mixed, balance, but total pressure still carries the weight
+    assert -slope / (us76(z)[0] * gravity) == pytest.approx(1.0, abs=0.012 if z > 86e3 else 1e-5)
+
+
+def test_density_and_its_slope_are_continuous_at_86_km():
+    below, above = us76(np.array([86000.0 - 1.0, 86000.0 + 1.0]))[0]
+    assert above / below == pytest.approx(1.0, abs=4e-4)
+
+
+def test_outside_the_standard_is_refused():
+    with pytest.raises(GateError, match="outside"):
+        us76(1.2e6)
+
+
+def sounding():
+    z = np.arange(0.0, 60001.0, 1000.0)
+    density, temperature, pressure = us76(z)
+    sd = default_sounding_sd(z)
+    return Sounding(z, density * (1.04 + z / 1e6), temperature + 3.0, pressure, -5.0 + z / 4000, z / 2000, *sd)
+
+
+def test_sounding_is_met_at_its_heights_and_fades_above():
+    s = sounding()
+    profile = profile_from_sounding(s)
+    air = profile.at(s.altitude_m)
+    np.testing.assert_allclose(air.density_kgpm3, s.density_kgpm3, rtol=1e-12)
+    np.testing.assert_allclose(air.wind_ned_mps[:, 0], s.wind_north_mps, atol=1e-12)
+    np.testing.assert_allclose(air.wind_ned_mps[:, 1], s.wind_east_mps, atol=1e-12)
+    far = profile.at(np.array([140e3]))
+    assert far.density_kgpm3[0] / us76(140e3)[0] == pytest.approx(1.0, abs=1e-4)
+    assert far.wind_sd_mps[0] > air.wind_sd_mps[-1]
+
+
+def test_warmer_air_at_equal_density_has_more_pressure_and_faster_sound():
+    profile = profile_from_sounding(sounding())
+    standard = standard_atmosphere().at(np.array([30e3]))
+    day = profile.at(np.array([30e3]))
+    t, t0 = day.temperature_k[0], standard.temperature_k[0]
+    assert t - t0 == pytest.approx(3.0)
+    ratio = day.density_kgpm3[0] / standard.density_kgpm3[0]
+    assert day.pressure_pa[0] / standard.pressure_pa[0] == pytest.approx(ratio * t / t0)
+    assert day.sound_speed_mps[0] / standard.sound_speed_mps[0] == pytest.approx(np.sqrt(t / t0))
+
+
+def test_profile_refuses_what_is_not_a_number():
+    z = np.array([0.0, 1e4])
+    with pytest.raises(GateError):
+        AtmosphereProfile(z, np.array([0.0, np.nan]), np.zeros(2), np.zeros((2, 3)), np.ones(2), np.ones(2))
