@@ -1,0 +1,1 @@
+"""A flight that everything is known about: two bodies on a compliant joint, and the instruments that watched them."""

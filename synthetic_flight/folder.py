@@ -1,0 +1,243 @@
+"""Writing a synthetic flight as a range would deliver a real one: telemetry in one place, the truth apart.
+
+The folder is made beside its destination and renamed when whole, so a killed run leaves nothing half-written.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from flightmodel import earth, rotations
+from flightmodel.checks import FloatArray, GateError
+from synthetic_flight import sensing, video
+from synthetic_flight.scenarios import Radar, Scenario, child_rng, fly_scenario
+from synthetic_flight.simulate import Truth
+
+Progress = Callable[[float, str], None]
+# Sun at the pad at 12:52 UTC on 17 August: azimuth from north, elevation
+SUN_AZ_EL_RAD = np.deg2rad([95.5, 28.9])
+TRUTH_RATE_HZ = 50.0
+
+
+def simulate_to_folder(
+    scenario: Scenario, seed: int, destination: Path, progress: Progress | None = None, replace: bool = False
+) -> Truth:
+    """Fly a scenario and write its flight folder.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    seed : int
+        Draws the day's air and every instrument's errors.
+    destination : Path
+    progress : callable, optional
+        Called with the fraction done and what is being done.
+    replace : bool
+        Replace an existing *synthetic* flight folder; anything else is never touched.
+
+    Raises
+    ------
+    GateError
+        Where the destination exists, or the flight diverged before the telemetry begins.
+    """
+    report = progress or (lambda _fraction, _what: None)
+    check_destination(destination, replace)
+    report(0.0, "flying")
+    truth = fly_scenario(scenario, seed)
+    if truth.time_s[-1] < scenario.spec.time.telemetry_from_s + 1.0:
+        raise GateError(f"scenario '{scenario.spec.name}': {truth.words or 'the flight ended'} before telemetry begins")
+    destination.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{destination.name}-partial-", dir=destination.parent))
+    try:
+        _write(scenario, seed, truth, partial, report)
+        if destination.exists():
+            shutil.rmtree(destination)
+        partial.chmod(0o755)
+        partial.rename(destination)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    report(1.0, "done")
+    return truth
+
+
+def check_destination(destination: Path, replace: bool) -> None:
+    """Refuse to overwrite what is not a synthetic flight folder."""
+    if not destination.exists():
+        return
+    ours = (destination / "truth" / "run.json").is_file() and (destination / "flight.toml").is_file()
+    if not replace:
+        raise GateError(f"{destination}: exists already; choose another folder, or give --force to replace it")
+    if not ours:
+        raise GateError(f"{destination}: is not a synthetic flight folder, so --force does not replace it")
+
+
+def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Progress) -> None:
+    spec, vehicle = scenario.spec, scenario.vehicle
+    start = spec.time.telemetry_from_s
+    telemetry = folder / "telemetry"
+    telemetry.mkdir()
+    report(0.15, "sensing")
+    at, force = sensing.sense_accelerometer(truth, vehicle, "suba", spec.accelerometer, start, child_rng(seed, "suba"))
+    _csv(telemetry / "accelerometer.csv", {"t_s": at, **_named("a{}_suba_mps2", "xyz", force)}, "%.6f")
+    at, rate = sensing.sense_rates(truth, spec.rates, start, child_rng(seed, "rates"))
+    _csv(telemetry / "rates.csv", {"t_s": at, **_named("{}_body_degps", "pqr", np.rad2deg(rate))}, "%.6f")
+    for name, radar in spec.radars.items():
+        at, rae = sensing.sense_radar(truth, radar, start, child_rng(seed, name))
+        columns = {"t_s": at, "range_m": rae[:, 0], "az_deg": np.rad2deg(rae[:, 1]), "el_deg": np.rad2deg(rae[:, 2])}
+        _csv(telemetry / f"radar_{name}.csv", columns, "%.6f")
+    z, air, wind = sensing.sense_atmosphere(truth.profile, spec.atmosphere, child_rng(seed, "sounding"))
+    columns = {"alt_m": z, "rho_kgpm3": air[:, 0], "t_k": air[:, 1], "wind_n_mps": wind[:, 0], "wind_e_mps": wind[:, 1]}
+    _csv(telemetry / "atmosphere.csv", columns, "%.8g")
+    q_prior = sensing.sense_attitude(truth, spec.attitude_prior, child_rng(seed, "attitude"))
+    _write_truth(scenario, seed, truth, folder / "truth")
+    if spec.video is not None:
+        _write_video(scenario, seed, truth, telemetry, report)
+    (folder / "flight.toml").write_text(_flight_toml(scenario, q_prior))
+
+
+def _named(pattern: str, letters: str, values: FloatArray) -> dict[str, FloatArray]:
+    return {pattern.format(letter): column for letter, column in zip(letters, values.T, strict=True)}
+
+
+def _csv(path: Path, columns: dict[str, FloatArray], form: str) -> None:
+    pd.DataFrame(columns).to_csv(path, index=False, float_format=form, lineterminator="\n")
+
+
+def _write_truth(scenario: Scenario, seed: int, truth: Truth, folder: Path) -> None:
+    folder.mkdir()
+    every = max(1, round(1.0 / (TRUTH_RATE_HZ * scenario.spec.time.record_s)))
+    rows = np.flatnonzero(truth.time_s >= scenario.spec.time.telemetry_from_s - 1e-9)[::every]
+    t, path = truth.time_s[rows], truth.trajectory
+    columns = {
+        "t_s": t,
+        **_named("r{}_ecef_m", "xyz", path.position_ecef_m[rows]),
+        **_named("v{}_ecef_mps", "xyz", path.velocity_ecef_mps[rows]),
+        **_named("q{}_ecef_body", "wxyz", path.q_ecef_body[rows]),
+        **_named("{}_body_degps", "pqr", np.rad2deg(path.omega_body_eci_body_radps[rows])),
+        "alt_m": truth.altitude_m[rows],
+        "mach": truth.mach[rows],
+        "dynamic_pressure_pa": truth.dynamic_pressure_pa[rows],
+        "alpha_shell_deg": np.rad2deg(truth.alpha_shell_rad[rows]),
+        "alpha_body_deg": np.rad2deg(truth.alpha_body_rad[rows]),
+    }
+    _csv(folder / "truth.csv", columns, "%.10g")
+    bent = truth.deflection
+    columns = {
+        "t_s": t,
+        "theta_deg": np.rad2deg(bent.theta_rad[rows]),
+        "plane_lv_deg": np.rad2deg(bent.plane_lv_rad[rows]),
+        "twist_deg": np.rad2deg(truth.twist_rad[rows]),
+    }
+    _csv(folder / "deflection.csv", columns, "%.8f")
+    shutil.copyfile(scenario.source, folder / "scenario.toml")
+    run = {"scenario": scenario.spec.name, "seed": seed, "words": truth.words, "synthetic": True}
+    (folder / "run.json").write_text(json.dumps(run, indent=2) + "\n")
+
+
+def _write_video(scenario: Scenario, seed: int, truth: Truth, telemetry: Path, report: Progress) -> None:
+    spec, vehicle = scenario.spec.video, scenario.vehicle
+    assert spec is not None
+    images = telemetry / spec.camera
+    images.mkdir()
+    at = sensing.sample_times(spec.start_s, min(spec.stop_s, float(truth.time_s[-1])), spec.rate_hz)
+    yz = np.column_stack([np.interp(at, truth.time_s, c) for c in truth.deflection.theta_yz_rad.T])
+    plane = np.arctan2(yz[:, 1], -yz[:, 0])
+    frames = video.render_video(
+        vehicle.geometry,
+        vehicle.cameras[spec.camera],
+        vehicle.joint.station_m,
+        np.hypot(yz[:, 0], yz[:, 1]),
+        plane,
+        sun_direction_body(truth, next(iter(scenario.spec.radars.values())), at),
+        child_rng(seed, spec.camera),
+    )
+    names = [f"frame_{k:05d}.png" for k in range(len(at))]
+    for k, frame in enumerate(frames):
+        report(0.25 + 0.7 * k / len(at), f"filming frame {k + 1} of {len(at)}")
+        if not cv2.imwrite(str(images / names[k]), frame, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+            raise GateError(f"{images / names[k]}: cannot be written")
+    table = pd.DataFrame({"t_s": at, "frame": names})
+    table.to_csv(telemetry / "frames.csv", index=False, float_format="%.6f", lineterminator="\n")
+
+
+def sun_direction_body(truth: Truth, site: Radar, at_s: FloatArray) -> FloatArray:
+    """Unit vectors ``(n, 3)`` towards the Sun in body axes."""
+    azimuth, elevation = SUN_AZ_EL_RAD
+    ned = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), -np.sin(elevation)])
+    to_sun_ecef = earth.dcm_ned_ecef(np.deg2rad(site.latitude_deg), np.deg2rad(site.longitude_deg)).T @ ned
+    q = rotations.slerp(truth.time_s, truth.trajectory.q_ecef_body, at_s)
+    return rotations.rotate(rotations.conjugate(q), np.broadcast_to(to_sun_ecef, (len(at_s), 3)))
+
+
+def _flight_toml(scenario: Scenario, q_prior: FloatArray) -> str:
+    """Return ``flight.toml`` with nominal errors: what an analyst would be told, nothing that was drawn."""
+    spec = scenario.spec
+    # a vehicle that ships is named; a vehicle of the user's own must be put beside flight.toml by its path
+    vehicle = (
+        spec.vehicle if not spec.vehicle.endswith(".toml") else str((scenario.source.parent / spec.vehicle).resolve())
+    )
+    acc, gyro = spec.accelerometer, spec.rates
+    lines = [
+        "# SYNTHETIC flight, written by postflight simulate. Nothing in truth/ may be used to estimate.",
+        f"name = {json.dumps(spec.name)}",
+        f"t0_utc = {json.dumps(spec.t0_utc)}",
+        f"vehicle = {json.dumps(vehicle)}",
+        "synthetic = true",
+        "",
+        "[attitude_prior]",
+        f"t_s = {spec.attitude_prior.t_s}",
+        f"q_ecef_body = [{', '.join(f'{x:.6f}' for x in q_prior)}]",
+        f"sd_deg = {spec.attitude_prior.sd_deg}",
+        "",
+        "[sensors.accelerometer]",
+        'file = "telemetry/accelerometer.csv"',
+        'mount = "suba"',
+        f"noise_sd_mps2 = {acc.noise_mps2}",
+        f"bias_sd_mps2 = {acc.bias_mps2}",
+        f"scale_sd = {acc.scale}",
+        f"mount_sd_deg = {acc.mount_deg}",
+        f"resolution_mps2 = {acc.resolution_mps2}",
+        "",
+        "[sensors.rates]",
+        'file = "telemetry/rates.csv"',
+        f"noise_sd_degps = {gyro.noise_degps}",
+        f"bias_sd_degps = {gyro.bias_degps}",
+        f"scale_sd = {gyro.scale}",
+        f"mount_sd_deg = {gyro.mount_deg}",
+        f"resolution_degps = {gyro.resolution_degps}",
+    ]
+    for name, radar in spec.radars.items():
+        lines += [
+            "",
+            f"[radars.{name}]",
+            f'file = "telemetry/radar_{name}.csv"',
+            f"latitude_deg = {radar.latitude_deg}",
+            f"longitude_deg = {radar.longitude_deg}",
+            f"height_m = {radar.height_m}",
+            f"range_sd_m = {radar.range_sd_m}",
+            f"angle_sd_deg = {radar.angle_sd_deg}",
+            f"range_bias_sd_m = {radar.range_bias_m}",
+            f"angle_bias_sd_deg = {radar.angle_bias_deg}",
+            f"time_bias_sd_s = {radar.time_bias_s}",
+        ]
+    lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
+    if spec.video is not None:
+        lines += [
+            "",
+            "[frames]",
+            'file = "telemetry/frames.csv"',
+            f'folder = "telemetry/{spec.video.camera}"',
+            f'camera = "{spec.video.camera}"',
+            f"benchmark_s = {spec.video.benchmark_s}",
+        ]
+    if spec.time.inflated_s is not None and spec.time.inflated_s >= spec.time.telemetry_from_s:
+        lines += ["", "[[events]]", 'name = "aeroshell inflated"', f"t_s = {spec.time.inflated_s}"]
+    return "\n".join(lines) + "\n"

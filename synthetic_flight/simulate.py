@@ -1,0 +1,232 @@
+"""Flying a scenario: from its start to its end, every record of what really happened.
+
+Fixed steps of fourth order (Runge-Kutta); the joint may be locked until the aeroshell is inflated. A flight that
+tumbles or whose joint passes 90 deg is not an exception: it ends there, and the truth says so and when.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flightmodel import airdata, earth, rotations
+from flightmodel.atmosphere import AtmosphereProfile
+from flightmodel.checks import ConfigError, FloatArray
+from flightmodel.deflection import DeflectionHistory, lv_clock
+from flightmodel.trajectory import Trajectory
+from flightmodel.vehicle import Vehicle
+from synthetic_flight import _kernels, dynamics
+
+BENDING_LIMIT_RAD = 0.5 * np.pi
+TUMBLE_RAD = 0.5 * np.pi
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the synthetic vehicle did; every array has one row a record. Estimators never see it.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        Of the structural datum on the centerbody's axis, body attitude.
+    state_eci : (n, 20) float
+        As integrated (`synthetic_flight._kernels`).
+    q_body_shell : (n, 4) float
+    deflection : DeflectionHistory
+        Method ``"truth"``.
+    twist_rad, altitude_m, density_kgpm3, mach, dynamic_pressure_pa : (n,) float
+        Air data at the shell's nose.
+    alpha_shell_rad, alpha_body_rad : (n,) float
+        Total angles of attack of the aeroshell and of the centerbody, wind-relative.
+    joint_force_body_n, joint_moment_body_nm : (n, 3) float
+        On the centerbody, body axes.
+    angular_acceleration_body_radps2 : (n, 3) float
+    tumbled_s : float or None
+        When the shell's total angle of attack first passed 90 deg with dynamic pressure above 1 Pa.
+    diverged_s : float or None
+        When the bending angle passed 90 deg; the flight ends there.
+    """
+
+    trajectory: Trajectory
+    state_eci: FloatArray
+    q_body_shell: FloatArray
+    deflection: DeflectionHistory
+    twist_rad: FloatArray
+    altitude_m: FloatArray
+    density_kgpm3: FloatArray
+    mach: FloatArray
+    dynamic_pressure_pa: FloatArray
+    alpha_shell_rad: FloatArray
+    alpha_body_rad: FloatArray
+    joint_force_body_n: FloatArray
+    joint_moment_body_nm: FloatArray
+    angular_acceleration_body_radps2: FloatArray
+    vehicle: Vehicle
+    profile: AtmosphereProfile
+    tumbled_s: float | None
+    diverged_s: float | None
+    words: str = field(default="")
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Times of the records, s."""
+        return self.trajectory.time_s
+
+    def specific_force_body(self, position_from_datum_body_m: FloatArray) -> FloatArray:
+        """Specific force ``(n, 3)``, body axes, m/s^2, that an ideal accelerometer feels at a point of the centerbody.
+
+        Joint force over mass, moved from the body's c.g. by lever-arm terms, plus the difference of gravitation
+        between the two points.
+        """
+        body = self.vehicle.centerbody
+        arm = position_from_datum_body_m - body.cg_m
+        w, e = self.state_eci[:, 14:17], self.angular_acceleration_body_radps2
+        q = self.state_eci[:, 6:10]
+        at_cg = dynamics.points(self.state_eci, self.vehicle)["body"][0]
+        at_point = at_cg + rotations.rotate(q, np.broadcast_to(arm, at_cg.shape))
+        tide = rotations.rotate(rotations.conjugate(q), earth.gravitation(at_cg) - earth.gravitation(at_point))
+        return self.joint_force_body_n / body.mass_kg + np.cross(e, arm) + np.cross(w, np.cross(w, arm)) + tide
+
+
+def state_from_ecef(
+    time_s: float,
+    position_ecef_m: FloatArray,
+    velocity_ecef_mps: FloatArray,
+    q_ecef_body: FloatArray,
+    omega_body_radps: FloatArray,
+    q_body_shell: FloatArray | None = None,
+) -> FloatArray:
+    """Initial state (20,) with the composite c.g. at a place and velocity (relative to the Earth), both rates equal."""
+    to_eci = rotations.conjugate(earth.q_ecef_eci(time_s))
+    r = rotations.rotate(to_eci, position_ecef_m)
+    v = rotations.rotate(to_eci, velocity_ecef_mps + np.cross(earth.OMEGA_ECEF_RADPS, position_ecef_m))
+    q_b = rotations.multiply(to_eci, q_ecef_body)
+    bent = np.array([1.0, 0.0, 0.0, 0.0]) if q_body_shell is None else q_body_shell
+    omega_shell = rotations.rotate(rotations.conjugate(bent), omega_body_radps)
+    return np.concatenate([r, v, q_b, rotations.multiply(q_b, bent), omega_body_radps, omega_shell])
+
+
+def integrate(
+    vehicle: Vehicle,
+    atmosphere: FloatArray,
+    state: FloatArray,
+    step_s: float,
+    per_record: int,
+    records: int,
+    lock_records: int = 0,
+) -> tuple[FloatArray, FloatArray]:
+    """States ``(n, 20)`` and auxiliaries ``(n, 18)`` of a flight; fewer than ``records`` where the joint diverged."""
+    out, aux = np.empty((records, _kernels.STATES)), np.empty((records, _kernels.AUX))
+    written = _kernels.integrate(
+        np.ascontiguousarray(state),
+        dynamics.parameter_vector(vehicle),
+        *dynamics.kernel_tables(vehicle, atmosphere),
+        step_s,
+        per_record,
+        records,
+        lock_records,
+        BENDING_LIMIT_RAD,
+        out,
+        aux,
+    )
+    return out[:written], aux[:written]
+
+
+def fly(
+    vehicle: Vehicle,
+    profile: AtmosphereProfile,
+    state: FloatArray,
+    start_s: float,
+    stop_s: float,
+    epoch_utc: str,
+    step_s: float = 0.002,
+    record_s: float = 0.004,
+    inflated_s: float | None = None,
+) -> Truth:
+    """Fly from a state at ``start_s`` to ``stop_s``.
+
+    Parameters
+    ----------
+    state : (20,) float
+        In ECI, which equals ECEF at time zero (`state_from_ecef`).
+    step_s, record_s : float
+        Integration step, and a whole multiple of it between records.
+    inflated_s : float or None
+        The joint is locked before this time.
+
+    Raises
+    ------
+    ConfigError
+        Where times do not fit each other.
+    """
+    per_record = round(record_s / step_s)
+    if per_record < 1 or abs(per_record * step_s - record_s) > 1e-9 or stop_s <= start_s:
+        raise ConfigError(f"fly: record {record_s} s must be a whole multiple of step {step_s} s, and stop after start")
+    records = round((stop_s - start_s) / record_s) + 1
+    lock = 0 if inflated_s is None else max(0, int(np.ceil((inflated_s - start_s) / record_s - 1e-9)))
+    states, aux = integrate(vehicle, dynamics.atmosphere_table(profile), state, step_s, per_record, records, lock)
+    finite = np.isfinite(states).all(axis=1)
+    states, aux = states[finite], aux[finite]
+    diverged = len(states) < records
+    return _truth(
+        vehicle,
+        profile,
+        epoch_utc,
+        start_s + record_s * np.arange(len(states), dtype=np.float64),
+        states,
+        aux,
+        diverged,
+    )
+
+
+def _truth(
+    vehicle: Vehicle,
+    profile: AtmosphereProfile,
+    epoch_utc: str,
+    time_s: FloatArray,
+    states: FloatArray,
+    aux: FloatArray,
+    diverged: bool,
+) -> Truth:
+    q_b, q_a = states[:, 6:10], states[:, 10:14]
+    to_ecef = earth.q_ecef_eci(time_s)
+    cg, cg_v = dynamics.points(states, vehicle)["body"]
+    arm = rotations.rotate(q_b, np.broadcast_to(-vehicle.centerbody.cg_m, cg.shape))
+    rate = rotations.rotate(q_b, states[:, 14:17])
+    r_ecef = rotations.rotate(to_ecef, cg + arm)
+    v_ecef = rotations.rotate(to_ecef, cg_v + np.cross(rate, arm)) - np.cross(earth.OMEGA_ECEF_RADPS, r_ecef)
+    q_ecef_body = rotations.continuous(rotations.multiply(to_ecef, q_b))
+    trajectory = Trajectory(epoch_utc, time_s, "datum", r_ecef, v_ecef, q_ecef_body, states[:, 14:17].copy())
+    theta, nose = dynamics.bending(q_b, q_a)
+    to_body = rotations.conjugate(q_b)
+    air = airdata.air_data(trajectory, profile, vehicle.cg_m)
+    tumbling = (aux[:, 4] > TUMBLE_RAD) & (aux[:, 3] > 1.0)
+    tumbled_s = float(time_s[np.argmax(tumbling)]) if tumbling.any() else None
+    diverged_s = float(time_s[-1]) if diverged else None
+    words = []
+    if tumbled_s is not None:
+        words.append(f"tumbled at {tumbled_s:.2f} s")
+    if diverged_s is not None:
+        words.append(f"joint diverged past 90 deg at {diverged_s:.2f} s; the flight ends there")
+    return Truth(
+        trajectory=trajectory,
+        state_eci=states,
+        q_body_shell=rotations.continuous(rotations.multiply(to_body, q_a)),
+        deflection=DeflectionHistory(time_s, theta, lv_clock(nose[:, 1:]), None, "truth"),
+        twist_rad=dynamics.twist(q_b, q_a),
+        altitude_m=aux[:, 0],
+        density_kgpm3=aux[:, 1],
+        mach=aux[:, 2],
+        dynamic_pressure_pa=aux[:, 3],
+        alpha_shell_rad=aux[:, 4],
+        alpha_body_rad=air.alpha_total_wind_rad,
+        joint_force_body_n=rotations.rotate(to_body, aux[:, 6:9]),
+        joint_moment_body_nm=rotations.rotate(to_body, aux[:, 9:12]),
+        angular_acceleration_body_radps2=aux[:, 15:18],
+        vehicle=vehicle,
+        profile=profile,
+        tumbled_s=tumbled_s,
+        diverged_s=diverged_s,
+        words="; ".join(words),
+    )

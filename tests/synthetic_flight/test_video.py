@@ -1,0 +1,139 @@
+"""The film: its edge against the projected curve, its randomness, its gates."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import flightmodel
+from estimators.horizon import find_horizon
+from estimators.virtual_camera import VirtualCamera
+from flightmodel.camera import camera_from_mount
+from flightmodel.checks import GateError
+from flightmodel.deflection import lv_direction
+from flightmodel.vehicle import CameraMount, ShellGeometry
+from synthetic_flight.video import Imaging, ShellRenderer, real_camera, record, render_video
+
+TABLES = tomllib.loads((Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml").read_text())
+GEOMETRY = ShellGeometry.model_validate(TABLES["geometry"])
+MOUNT = CameraMount.model_validate(TABLES["cameras"]["camera5"])
+JOINT_M = 0.2
+D = np.deg2rad
+
+
+def sun(clock_deg, from_aft_deg=61.0):
+    a = D(from_aft_deg)
+    return -np.cos(a) * np.array([1.0, 0.0, 0.0]) + np.sin(a) * lv_direction(D(clock_deg))
+
+
+@pytest.fixture(scope="module")
+def off_camera():
+    """A real camera with everything off nominal, and its renderer."""
+    camera = real_camera(MOUNT, np.random.default_rng(5))
+    return camera, ShellRenderer(GEOMETRY, camera, JOINT_M)
+
+
+@pytest.mark.parametrize(
+    ("theta_deg", "plane_deg", "sun_deg"),
+    [(0.0, 153.0, 330.0), (4.5, 153.0, 200.0), (4.5, 199.0, 40.0), (-3.0, 120.0, 100.0)],
+)
+def test_ray_cast_edge_equals_the_projected_limb(off_camera, theta_deg, plane_deg, sun_deg):
+    """Marched rays and a closed-form curve share no code: noise-free they agree to a fraction of a pixel."""
+    camera, renderer = off_camera
+    frame = record(renderer.radiance(D(theta_deg), D(plane_deg), sun(sun_deg)), renderer.vignetting,
+                   Imaging(noise_sd=0.0), np.random.default_rng(0))  # fmt: skip
+    view = VirtualCamera(GEOMETRY, camera, JOINT_M)
+    found = find_horizon(frame, view.scan_lines(), camera.size_px)
+    residual, _ = view.mismatch(found, view.edge_of(D(theta_deg), D(plane_deg)))
+    assert found.is_usable
+    assert np.isfinite(residual).mean() > 0.9
+    # shading that changes within the 1.1 px blur moves the half-level crossing by a share of it; unshaded it is 0.02
+    assert abs(np.nanmedian(residual)) < 0.3
+    assert np.nanstd(residual) < 0.25
+
+
+def test_without_shading_the_two_edges_agree_to_hundredths_of_a_pixel(off_camera, monkeypatch):
+    camera, renderer = off_camera
+    monkeypatch.setattr(renderer.stack, "shade", lambda rays, t, sun_shell: np.full_like(t, 0.7))
+    frame = record(renderer.radiance(D(3.7), D(191.0), sun(0.0)), np.ones_like(renderer.vignetting),
+                   Imaging(noise_sd=0.0), np.random.default_rng(0))  # fmt: skip
+    view = VirtualCamera(GEOMETRY, camera, JOINT_M)
+    residual, _ = view.mismatch(find_horizon(frame, view.scan_lines(), camera.size_px), view.edge_of(D(3.7), D(191.0)))
+    # one grey level of 178 is 0.015 px; a pixel's box coverage at a slant adds a few hundredths
+    assert abs(np.nanmean(residual)) < 0.03
+    assert np.nanstd(residual) < 0.06
+
+
+def test_edge_moves_up_when_the_rim_comes_towards_the_camera(off_camera):
+    camera, renderer = off_camera
+    view = VirtualCamera(GEOMETRY, camera, JOINT_M)
+    rows = []
+    for theta_deg in (-4.0, 0.0, 4.0):
+        frame = record(
+            renderer.radiance(D(theta_deg), D(153.0), sun(330.0)),
+            renderer.vignetting,
+            Imaging(),
+            np.random.default_rng(1),
+        )
+        rows.append(find_horizon(frame, view.scan_lines(), camera.size_px).lowest_row_px)
+    # rim moves by about 0.84 theta: 4 deg is 18 px at 5.4 px/deg
+    np.testing.assert_allclose(np.diff(rows), -18.0, atol=2.5)
+
+
+def test_sky_shell_and_centerbody_are_where_they_should_be(off_camera):
+    _, renderer = off_camera
+    picture = renderer.radiance(0.0, 0.0, sun(330.0))
+    assert picture[:40].max() < 0.08
+    assert picture[150:380, 300:420].mean() > 0.2
+    assert np.isfinite(renderer.body_depth_m[-1]).all()
+    assert not np.isfinite(renderer.body_depth_m[:300]).any()
+    assert np.isfinite(picture).all()
+
+
+def test_light_comes_from_the_sun_and_darkness_is_dark(off_camera):
+    _, renderer = off_camera
+    # left in the picture is increasing clock
+    left, right = (renderer.radiance(0.0, 0.0, sun(153.0 + s))[200:400] for s in (90.0, -90.0))
+    assert left[:, 500:700].mean() > 1.3 * left[:, 20:220].mean()  # the Sun lights the far inner slope
+    assert right[:, 20:220].mean() > 1.3 * right[:, 500:700].mean()
+    dark = renderer.radiance(0.0, 0.0, np.zeros(3))
+    assert dark.max() < 0.25
+
+
+def test_film_is_reproducible_and_the_real_camera_scatters_as_declared():
+    theta, plane, light = D(np.array([0.0, 3.0])), D(np.array([0.0, 190.0])), np.stack([sun(10.0), sun(60.0)])
+    films = [
+        list(render_video(GEOMETRY, MOUNT, JOINT_M, theta, plane, light, np.random.default_rng(s))) for s in (7, 7, 8)
+    ]
+    assert films[0][0].shape == (480, 720)
+    assert films[0][0].dtype == np.uint8
+    np.testing.assert_array_equal(films[0], films[1])
+    assert np.abs(films[0][1].astype(float) - films[2][1]).mean() > 1.0
+    nominal = camera_from_mount(MOUNT)
+    drawn = [real_camera(MOUNT, np.random.default_rng(s)) for s in range(200)]
+    focal = np.array([c.focal_px[0] / nominal.focal_px[0] - 1.0 for c in drawn])
+    swing = np.array([np.arccos(np.clip(c.dcm_cam_body[2] @ nominal.dcm_cam_body[2], -1, 1)) for c in drawn])
+    # chi-square bounds of 200 (scale) and 400 (two axes) draws at 4 sd
+    assert np.sum((focal / 0.01) ** 2) == pytest.approx(200.0, abs=4 * np.sqrt(400.0))
+    assert np.sum((swing / D(0.5)) ** 2) == pytest.approx(400.0, abs=4 * np.sqrt(800.0))
+
+
+def test_noise_has_the_declared_level(off_camera):
+    _, renderer = off_camera
+    radiance = renderer.radiance(0.0, 0.0, sun(330.0))
+    clean, noisy = (
+        record(radiance, renderer.vignetting, Imaging(noise_sd=s), np.random.default_rng(3)).astype(float)
+        for s in (0.0, 2.5)
+    )
+    block = (noisy - clean)[150:350, 250:450]
+    # 40 000 pixels; rounding to levels of both frames adds 2/12
+    assert block.var() == pytest.approx(2.5**2 + 2.0 / 12.0, rel=0.03)
+
+
+def test_film_refuses_lengths_that_differ_and_nan():
+    light, rng = np.zeros((3, 3)), np.random.default_rng(0)
+    with pytest.raises(GateError, match="plane_lv_rad"):
+        render_video(GEOMETRY, MOUNT, JOINT_M, np.zeros(3), np.zeros(2), light, rng)
+    with pytest.raises(GateError, match="theta"):
+        render_video(GEOMETRY, MOUNT, JOINT_M, np.full(3, np.nan), np.zeros(3), light, rng)
