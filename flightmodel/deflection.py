@@ -96,23 +96,33 @@ class DeflectionHistory:
         return float(theta), float(np.interp(time_s, self.time_s[known], self.theta_sd_rad[known]))
 
 
+def polar_from_lateral(
+    theta_yz_rad: FloatArray, covariance_yz: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Angle ``(n,)``, plane ``(n,)`` and their covariance ``(n, 2, 2)`` from lateral vectors ``(n, 2)``, rad.
+
+    Where the angle is small against its sd the plane is unknown: its variance ends at that of a uniform one, pi^2/3.
+    """
+    size = np.linalg.norm(theta_yz_rad, axis=-1)
+    plane = np.where(np.isfinite(size), lv_clock(theta_yz_rad), 0.0)
+    # towards growing angle, and towards growing clock: the derivative of (-cos, sin)
+    towards, sideways = lv_direction(plane)[..., 1:], np.stack([np.sin(plane), np.cos(plane)], axis=-1)
+    turn = np.stack([towards, sideways / np.maximum(size, 1e-9)[..., None]], axis=-2)
+    cov = turn @ covariance_yz @ np.swapaxes(turn, -1, -2)
+    with np.errstate(invalid="ignore"):
+        shrink = np.minimum(1.0, np.pi / np.sqrt(3.0 * cov[..., 1, 1]))
+    cov[..., 0, 1] *= shrink
+    cov[..., 1, 0] *= shrink
+    cov[..., 1, 1] *= shrink**2
+    return size, plane, cov
+
+
 def history_from_lateral(
     time_s: FloatArray, theta_yz_rad: FloatArray, covariance_yz: FloatArray, method: str, assumptions: str
 ) -> DeflectionHistory:
     """History from lateral deflection vectors ``(n, 2)`` in body y, z and their covariance ``(n, 2, 2)``, rad.
 
-    The plane's variance is that of the sideways component over the angle squared, at most that of an unknown
-    direction (``pi^2 / 3``). Rows that hold NaN stay NaN.
+    Rows that hold NaN stay NaN.
     """
-    size = np.linalg.norm(theta_yz_rad, axis=1)
-    plane = np.where(np.isfinite(size), lv_clock(theta_yz_rad), 0.0)
-    d = lv_direction(plane)[:, 1:]
-    # the direction of growing clock angle: derivative of (-cos, sin)
-    sideways = np.column_stack([np.sin(plane), np.cos(plane)])
-    turn = np.stack([d, sideways], axis=1)
-    polar = turn @ covariance_yz @ turn.transpose(0, 2, 1)
-    safe = np.where(size > 0.0, size, np.inf)
-    polar[:, 0, 1] /= safe
-    polar[:, 1, 0] /= safe
-    polar[:, 1, 1] = np.minimum(polar[:, 1, 1] / safe**2, np.pi**2 / 3.0)
-    return DeflectionHistory(time_s, size, plane, polar, method, assumptions)
+    theta, plane, cov = polar_from_lateral(theta_yz_rad, covariance_yz)
+    return DeflectionHistory(time_s, theta, plane, cov, method, assumptions)

@@ -49,7 +49,7 @@ class RadarSite:
     latitude_rad, longitude_rad, height_m : float
         WGS-84.
     range_sd_m, angle_sd_rad : float
-        White noise per sample.
+        White noise per sample; the angle's across the line of sight, so azimuth scatters ``1 / cos(elevation)`` more.
     range_bias_sd_m, angle_bias_sd_rad, time_bias_sd_s : float
         Systematic errors, constant over a flight, one standard deviation.
     """

@@ -62,7 +62,8 @@ def sense_rates(truth: Truth, spec: Rates, start_s: float, rng: np.random.Genera
 def sense_radar(truth: Truth, spec: Radar, start_s: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and slant range m, azimuth, elevation rad ``(n, 3)`` of the vehicle's true c.g.
 
-    A positive time bias stamps a point later than it was measured.
+    Angle noise is that of the beam: across the line of sight, so azimuth scatters by ``1 / cos(elevation)`` more. A
+    positive time bias stamps a point later than it was measured.
     """
     at = sample_times(start_s, truth.time_s[-1] - 0.05, spec.rate_hz, spec.offset_s)
     bias_sd = np.array([spec.range_bias_m, *np.deg2rad([spec.angle_bias_deg] * 2)])
@@ -74,7 +75,9 @@ def sense_radar(truth: Truth, spec: Radar, start_s: float, rng: np.random.Genera
     site = np.deg2rad([spec.latitude_deg, spec.longitude_deg])
     ideal = earth.radar_from_ecef(ecef, site[0], site[1], spec.height_m)
     noise_sd = np.array([spec.range_sd_m, *np.deg2rad([spec.angle_sd_deg] * 2)])
-    measured = ideal + bias + noise_sd * rng.standard_normal(ideal.shape)
+    noise = noise_sd * rng.standard_normal(ideal.shape)
+    noise[:, 1] /= np.cos(ideal[:, 2])
+    measured = ideal + bias + noise
     measured[:, 1] = np.mod(measured[:, 1], 2.0 * np.pi)
     return at, measured
 
