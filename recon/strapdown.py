@@ -1,0 +1,203 @@
+"""How accelerometers and gyros carry a state forward, in readable form: the twin of `recon._kernels`.
+
+Model, Earth-fixed axes, for the point where the accelerometer sits:
+
+    dr/dt = v,   dv/dt = C f + g(r) - W x (W x r) - 2 W x v,   dC/dt = C [w x] - [W x] C
+
+with C from body to ECEF, W the Earth's rate, f and w the corrected specific force and inertial rate in body axes.
+A sensor triad measures ``(1 + s) * (R(m)^T D^T x) + b``: D is the nominal mounting (sensor to body), m the mounting
+rotation in sensor axes, s the scale errors and b the biases, so ``x = D R(m) ((measured - b) / (1 + s))``.
+
+Steps are mid-point steps between samples: mean of the two samples, attitude at mid-step. White noise of density N
+(unit^2/Hz) drives velocity and rotation. The gravity gradient in the transition is the central one (J2 changes it by
+0.2 %, which moves a 100 m error by 0.2 mm in a second).
+
+References
+----------
+D. Titterton, J. Weston, "Strapdown Inertial Navigation Technology", 2nd ed., chapters 3, 11 and 12.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flightmodel import earth, rotations
+from flightmodel.checks import FloatArray
+from recon import _kernels
+from recon.state import IntArray, States
+
+
+@dataclass(frozen=True)
+class InertialGrid:
+    """Samples of both inertial triads on one time grid that contains every node.
+
+    Parameters
+    ----------
+    time_s : (k,) float
+    force_sensor_mps2, rate_sensor_radps : (k, 3) float
+        As measured, in sensor axes, gaps bridged.
+    force_density, rate_density : (k, 3) float
+        White-noise densities, (m/s^2)^2/Hz and (rad/s)^2/Hz along body axes, from a grid point to the next.
+    dcm_body_force, dcm_body_rate : (3, 3) float
+        Nominal mountings.
+    """
+
+    time_s: FloatArray
+    force_sensor_mps2: FloatArray
+    rate_sensor_radps: FloatArray
+    force_density: FloatArray
+    rate_density: FloatArray
+    dcm_body_force: FloatArray
+    dcm_body_rate: FloatArray
+
+
+@dataclass(frozen=True)
+class Step:
+    """A state carried to another node, with its transition (9, 27) and process noise (9, 9)."""
+
+    state: States
+    transition: FloatArray
+    noise: FloatArray
+
+
+def correct(measured_sensor: FloatArray, errors: FloatArray, dcm_body_sensor: FloatArray) -> FloatArray:
+    """True quantity in body axes ``(n, 3)`` from measured ``(n, 3)`` and bias, scale, mount ``(9,)`` or ``(n, 9)``."""
+    actual = (measured_sensor - errors[..., 0:3]) / (1.0 + errors[..., 3:6])
+    return rotations.rotate(rotations.exp(errors[..., 6:9]), actual) @ dcm_body_sensor.T
+
+
+def correction_partials(measured_sensor: FloatArray, errors: FloatArray, dcm_body_sensor: FloatArray) -> FloatArray:
+    """Partials ``(..., 3, 9)`` of `correct` with respect to bias, scale and mount."""
+    mount = errors[..., 6:9]
+    gain = 1.0 / (1.0 + errors[..., 3:6])
+    actual = (measured_sensor - errors[..., 0:3]) * gain
+    body_actual = dcm_body_sensor @ rotations.dcm_from_q(rotations.exp(mount))
+    d_bias = -body_actual * gain[..., None, :]
+    d_scale = d_bias * actual[..., None, :]
+    value = np.einsum("...ij,...j->...i", body_actual, actual)
+    d_mount = -rotations.skew(value) @ (dcm_body_sensor @ (np.eye(3) + 0.5 * rotations.skew(mount)))
+    return np.concatenate([d_bias, d_scale, d_mount], axis=-1)
+
+
+def propagate_plain(grid: InertialGrid, first: int, last: int, start: States) -> Step:
+    """Carry a state from grid point ``first`` to ``last`` in numpy; slow, for reading and for tests."""
+    position, velocity, q = start.position_ecef_m, start.velocity_ecef_mps, start.q_ecef_body
+    errors = start.sensor_errors
+    transition = np.hstack([np.eye(9), np.zeros((9, 18))])
+    noise = np.zeros((9, 9))
+    spin = rotations.skew(earth.OMEGA_ECEF_RADPS)
+    step = 1 if last >= first else -1
+    for k in range(first, last, step):
+        dt = grid.time_s[k + step] - grid.time_s[k]
+        f_measured = 0.5 * (grid.force_sensor_mps2[k] + grid.force_sensor_mps2[k + step])
+        w_measured = 0.5 * (grid.rate_sensor_radps[k] + grid.rate_sensor_radps[k + step])
+        f = correct(f_measured, errors[0:9], grid.dcm_body_force)
+        w = correct(w_measured, errors[9:18], grid.dcm_body_rate)
+
+        earth_half = rotations.exp(-0.5 * dt * earth.OMEGA_ECEF_RADPS)
+        q_mid = rotations.multiply(earth_half, rotations.boxplus(q, 0.5 * dt * w))
+        q = rotations.multiply(earth_half, rotations.boxplus(q_mid, 0.5 * dt * w))
+        mid = position + 0.5 * dt * velocity
+        c = rotations.dcm_from_q(q_mid)
+        a = c @ f + earth.gravitation(mid) - spin @ spin @ mid
+        a = a - 2.0 * spin @ (velocity + 0.5 * dt * (a - 2.0 * spin @ velocity))
+        position = position + dt * velocity + 0.5 * dt**2 * a
+        velocity = velocity + dt * a
+
+        full = _step_transition(dt, c, f, rotations.dcm_from_q(rotations.exp(0.5 * dt * w)), mid)
+        full[3:6, 9:18] = dt * c @ correction_partials(f_measured, errors[0:9], grid.dcm_body_force)
+        d_rate = correction_partials(w_measured, errors[9:18], grid.dcm_body_rate)
+        half = rotations.dcm_from_q(rotations.exp(0.5 * dt * w))
+        full[6:9, 18:27] = dt * half.T @ d_rate
+        full[3:6, 18:27] = -0.5 * dt**2 * c @ rotations.skew(f) @ d_rate
+        full[0:3, 9:] = 0.5 * dt * full[3:6, 9:]
+        transition = full @ np.vstack([transition, np.hstack([np.zeros((18, 9)), np.eye(18)])])
+
+        j = min(k, k + step)
+        noise = full[:, :9] @ noise @ full[:, :9].T + _step_noise(dt, c, grid.force_density[j], grid.rate_density[j])
+    return Step(States(position, velocity, q, errors), transition, noise)
+
+
+def _step_transition(dt: float, c: FloatArray, f: FloatArray, half: FloatArray, mid: FloatArray) -> FloatArray:
+    """Kinematic part of one step's transition, in a (9, 27) matrix whose sensor columns are zero."""
+    spin = rotations.skew(earth.OMEGA_ECEF_RADPS)
+    gradient = earth.gravitation_gradient(mid) - spin @ spin
+    coriolis = np.eye(3) - dt * spin
+    by_position = coriolis @ gradient
+    by_velocity = 0.5 * dt * by_position - 2.0 * spin
+    by_rotation = -coriolis @ c @ rotations.skew(f) @ half.T
+    full = np.zeros((9, 27))
+    for column, block in zip((0, 3, 6), (by_position, by_velocity, by_rotation), strict=True):
+        full[3:6, column : column + 3] = dt * block
+        full[0:3, column : column + 3] = 0.5 * dt**2 * block
+    full[0:3, 0:3] += np.eye(3)
+    full[0:3, 3:6] += dt * np.eye(3)
+    full[3:6, 3:6] += np.eye(3)
+    full[6:9, 6:9] = half.T @ half.T
+    return full
+
+
+def _step_noise(dt: float, c: FloatArray, force_density: FloatArray, rate_density: FloatArray) -> FloatArray:
+    """White noise of one step (9, 9)."""
+    force = abs(dt) * (c * force_density) @ c.T
+    noise = np.zeros((9, 9))
+    noise[0:3, 0:3] = force * dt**2 / 3.0
+    noise[0:3, 3:6] = noise[3:6, 0:3] = 0.5 * dt * force
+    noise[3:6, 3:6] = force
+    noise[6:9, 6:9] = abs(dt) * np.diag(rate_density)
+    return noise
+
+
+def propagate(grid: InertialGrid, first: int, last: int, start: States) -> Step:
+    """Carry a state from grid point ``first`` to ``last`` (either direction), compiled."""
+    position, velocity, q = start.position_ecef_m.copy(), start.velocity_ecef_mps.copy(), start.q_ecef_body.copy()
+    phi, noise = np.empty((9, 27)), np.empty((9, 9))
+    _kernels.propagate(
+        *_arrays(grid), first, last, grid.dcm_body_force, grid.dcm_body_rate,
+        start.sensor_errors, position, velocity, q, phi, noise,
+    )  # fmt: skip
+    return Step(States(position, velocity, q, start.sensor_errors), phi, noise)
+
+
+def propagate_all(grid: InertialGrid, node_index: IntArray, states: States) -> Step:
+    """Carry the state of every node but the last to the next one: all arrays get a leading axis of n - 1."""
+    n = len(node_index)
+    position, velocity = states.position_ecef_m[:-1].copy(), states.velocity_ecef_mps[:-1].copy()
+    q = states.q_ecef_body[:-1].copy()
+    phi, noise = np.empty((n - 1, 9, 27)), np.empty((n - 1, 9, 9))
+    errors = np.ascontiguousarray(states.sensor_errors)
+    _kernels.propagate_all(
+        *_arrays(grid), node_index, grid.dcm_body_force, grid.dcm_body_rate,
+        errors, position, velocity, q, phi, noise,
+    )  # fmt: skip
+    return Step(States(position, velocity, q, states.sensor_errors[:-1]), phi, noise)
+
+
+def fill_between(grid: InertialGrid, node_index: IntArray, known: IntArray, at_known: States) -> States:
+    """States at all nodes (n,) from those at the ``known`` ones (indices, the first is 0), noise-free between."""
+    n = len(node_index)
+    position, velocity, q = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4))
+    position[known], velocity[known], q[known] = (
+        at_known.position_ecef_m,
+        at_known.velocity_ecef_mps,
+        at_known.q_ecef_body,
+    )
+    flags = np.zeros(n, dtype=np.bool_)
+    flags[known] = True
+    errors = np.ascontiguousarray(at_known.sensor_errors[np.cumsum(flags) - 1])
+    _kernels.propagate_chain(
+        *_arrays(grid), node_index, flags, grid.dcm_body_force, grid.dcm_body_rate, errors, position, velocity, q
+    )
+    return States(position, velocity, rotations.continuous(q), errors)
+
+
+def _arrays(grid: InertialGrid) -> tuple[FloatArray, ...]:
+    return (
+        grid.time_s,
+        grid.force_sensor_mps2,
+        grid.rate_sensor_radps,
+        grid.force_density,
+        grid.rate_density,
+    )

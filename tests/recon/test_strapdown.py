@@ -1,0 +1,149 @@
+"""The kernel does what the readable twin does, and every column of its transition is the derivative it claims to be."""
+
+import numpy as np
+import pytest
+
+from flightmodel import earth, rotations
+from recon.state import States, boxminus, boxplus
+from recon.strapdown import InertialGrid, correct, fill_between, propagate, propagate_all, propagate_plain
+
+# column groups: position, velocity, rotation, then bias, scale, mount of accelerometer and gyros
+STEPS = np.repeat([10.0, 0.01, 1e-4, 1e-2, 1e-4, 1e-4, 1e-5, 1e-4, 1e-4], 3)
+
+
+@pytest.fixture
+def grid():
+    rng = np.random.default_rng(3)
+    n = 80
+    return InertialGrid(
+        np.cumsum(rng.uniform(0.002, 0.006, n)),
+        rng.normal(0.0, 20.0, (n, 3)),
+        rng.normal(0.0, 0.6, (n, 3)),
+        rng.uniform(1.0, 2.0, (n, 3)) * 1e-4,
+        rng.uniform(1.0, 2.0, (n, 3)) * 1e-6,
+        rotations.dcm_from_q(rotations.exp(rng.normal(0.0, 1.0, 3))),
+        rotations.dcm_from_q(rotations.exp(rng.normal(0.0, 1.0, 3))),
+    )
+
+
+@pytest.fixture
+def state():
+    rng = np.random.default_rng(4)
+    position = earth.ecef_from_geodetic(-0.6, 1.2, 9e4)
+    return States(
+        position, np.array([1500.0, -900.0, 700.0]), rotations.exp(rng.normal(0, 1, 3)), rng.normal(0, 0.01, 18)
+    )
+
+
+@pytest.mark.parametrize(("first", "last"), [(3, 70), (70, 3)])
+def test_kernel_equals_readable_twin(grid, state, first, last):
+    fast, plain = propagate(grid, first, last, state), propagate_plain(grid, first, last, state)
+    # positions are 6.4e6 m with 1e-16 relative rounding over 67 steps: 67 * 1e-9 m
+    assert np.abs(fast.state.position_ecef_m - plain.state.position_ecef_m).max() < 1e-7
+    assert np.abs(fast.state.velocity_ecef_mps - plain.state.velocity_ecef_mps).max() < 1e-10
+    assert np.abs(rotations.boxminus(fast.state.q_ecef_body, plain.state.q_ecef_body)).max() < 1e-12
+    # the kernel leaves out dt times Coriolis on gradient and noise transitions: below 1e-4 of the block's size
+    scale = np.abs(plain.transition).max(axis=1, keepdims=True)
+    assert np.abs((fast.transition - plain.transition) / scale).max() < 1e-6
+    assert np.abs(fast.noise - plain.noise).max() < 1e-4 * np.abs(plain.noise).max()
+    assert np.linalg.eigvalsh(fast.noise).min() > -1e-18
+
+
+@pytest.mark.parametrize(("first", "last"), [(3, 70), (70, 3)])
+def test_transition_is_the_derivative_in_every_block(grid, state, first, last):
+    transition = propagate(grid, first, last, state).transition
+    for j in range(27):
+        e = np.zeros(27)
+        e[j] = STEPS[j]
+        ahead, behind = (propagate(grid, first, last, boxplus(state, s * e)).state for s in (1.0, -1.0))
+        column = boxminus(ahead, behind)[:9] / (2.0 * STEPS[j])
+        for rows, rounding in ((slice(0, 3), 4e-9), (slice(3, 6), 1e-12), (slice(6, 9), 1e-14)):
+            size = max(np.abs(column[rows]).max(), 1e-300)
+            # the central gradient leaves out J2 (0.2 % of what a position error does to velocity); J_l of a mount
+            # to second order; both below 5e-3 of the block, the rest is rounding of the difference
+            assert np.abs(transition[rows, j] - column[rows]).max() < 5e-3 * size + 20.0 * rounding / STEPS[j], (
+                j,
+                rows,
+            )
+
+
+def test_every_term_is_alive(grid, state):
+    transition = propagate(grid, 0, 79, state).transition
+    blocks = np.abs(transition).reshape(3, 3, 9, 3).max(axis=(1, 3))
+    zero_by_nature = np.zeros((3, 9), dtype=bool)
+    zero_by_nature[2, [0, 1, 3, 4, 5]] = True  # attitude hears only attitude and gyros
+    assert ((blocks == 0.0) == zero_by_nature).all()
+
+
+def test_steps_compose(grid, state):
+    whole = propagate(grid, 0, 60, state)
+    half = propagate(grid, 0, 25, state)
+    rest = propagate(grid, 25, 60, half.state)
+    lower = np.hstack([np.zeros((18, 9)), np.eye(18)])
+    assert np.allclose(rest.transition @ np.vstack([half.transition, lower]), whole.transition, rtol=1e-9, atol=1e-9)
+    a = rest.transition[:, :9]
+    # gravity and Coriolis (1e-4 a step) are left out of the carried noise
+    assert np.allclose(a @ half.noise @ a.T + rest.noise, whole.noise, rtol=1e-3, atol=1e-4 * whole.noise.max())
+
+
+def test_forward_then_back_returns(grid, state):
+    there = propagate(grid, 0, 79, state)
+    back = boxminus(propagate(grid, 79, 0, there.state).state, state)
+    assert np.abs(back[:3]).max() < 2e-5  # mid-point steps are reversible to third order in a step
+    assert np.abs(back[6:9]).max() < 1e-12
+
+
+def test_noise_of_a_free_vehicle_is_the_textbook_double_integrator(grid, state):
+    n = 80
+    still = InertialGrid(
+        grid.time_s,
+        np.zeros((n, 3)),
+        np.zeros((n, 3)),
+        np.full((n, 3), 2e-4),
+        np.full((n, 3), 3e-6),
+        np.eye(3),
+        np.eye(3),
+    )
+    quiet = States(state.position_ecef_m, state.velocity_ecef_mps, state.q_ecef_body, np.zeros(18))
+    noise = propagate(still, 0, n - 1, quiet).noise
+    span = still.time_s[-1] - still.time_s[0]
+    assert np.allclose(np.diag(noise), np.repeat([2e-4 * span**3 / 3, 2e-4 * span, 3e-6 * span], 3), rtol=1e-9)
+
+
+def test_many_nodes_at_once_equal_one_by_one(grid, state):
+    nodes = np.array([0, 7, 30, 31, 79])
+    known = np.array([0, 2])
+    second = propagate(grid, 0, 30, state).state
+    at_known = States(*(np.stack([getattr(state, f), getattr(second, f)]) for f in States.__dataclass_fields__))
+    filled = fill_between(grid, nodes, known, at_known)
+    step = propagate_all(grid, nodes, filled)
+    for k in range(4):
+        one = propagate(grid, nodes[k], nodes[k + 1], filled[k])
+        assert np.array_equal(one.transition, step.transition[k])
+        assert np.array_equal(one.noise, step.noise[k])
+        assert np.allclose(one.state.position_ecef_m, filled[k + 1].position_ecef_m, atol=1e-7)
+
+
+def test_correction_undoes_a_measurement():
+    rng = np.random.default_rng(5)
+    dcm = rotations.dcm_from_q(rotations.exp(rng.normal(0, 1, 3)))
+    errors, true = rng.normal(0.0, 0.01, 9), rng.normal(0.0, 30.0, (50, 3))
+    actual = true @ dcm @ rotations.dcm_from_q(rotations.exp(errors[6:9]))
+    measured = (1.0 + errors[3:6]) * actual + errors[0:3]
+    assert np.abs(correct(measured, errors, dcm) - true).max() < 1e-12
+
+
+def test_integration_follows_an_independent_truth(mini_truth):
+    """Perfect samples of a spinning, coning 8 g flight, integrated for 60 s, against DOP853 in inertial axes."""
+    t = np.arange(25000, 40000) / 250.0
+    zero = np.zeros((len(t), 3))
+    omega = mini_truth.state(t)[3]
+    grid = InertialGrid(t, mini_truth.specific_force_imu(t), omega, zero, zero, np.eye(3), np.eye(3))
+    start = mini_truth.trajectory(grid.time_s[:1], (-0.95, 0.04, -0.03))
+    end = mini_truth.trajectory(grid.time_s[-1:], (-0.95, 0.04, -0.03))
+    begin = States(start.position_ecef_m[0], start.velocity_ecef_mps[0], start.q_ecef_body[0], np.zeros(18))
+    last = propagate(grid, 0, len(grid.time_s) - 1, begin).state
+    # mid-point rule: w'' dt^2 / 24 of 0.2 rad/s at 2 rad/s over 4 ms is 5e-7 rad/s, swinging; far below any gyro
+    assert np.abs(rotations.boxminus(last.q_ecef_body, end.q_ecef_body[0])).max() < 2e-5
+    assert np.abs(last.velocity_ecef_mps - end.velocity_ecef_mps[0]).max() < 0.01
+    assert np.abs(last.position_ecef_m - end.position_ecef_m[0]).max() < 0.3
