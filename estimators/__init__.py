@@ -1,0 +1,1 @@
+"""How far the aeroshell bent: one question an estimator, one `DeflectionHistory` as its answer; none sees the truth."""

@@ -1,0 +1,265 @@
+"""The virtual camera against differences, the estimator against films made by another renderer and another lens."""
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import flightmodel
+from estimators.camera_deflection import deflection_from_frames, orient_camera, polar, sensitivity_table
+from estimators.figures import figure_camera_overlay
+from estimators.horizon import HorizonLine, find_horizon
+from estimators.virtual_camera import DEFLECTION, NUISANCE, POINTING, VirtualCamera
+from flightmodel.camera import camera_from_mount
+from flightmodel.checks import GateError
+from flightmodel.deflection import lv_direction, rotation_vector_body_shell
+from flightmodel.vehicle import CameraMount, ShellGeometry
+from synthetic_flight.video import render_video
+
+TABLES = tomllib.loads((Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml").read_text())
+GEOMETRY = ShellGeometry.model_validate(TABLES["geometry"])
+MOUNT = CameraMount.model_validate(TABLES["cameras"]["camera5"])
+JOINT_M = 0.2
+D = np.deg2rad
+HERE = np.array([0.031, -0.048])
+
+
+def sun(clock_deg, from_aft_deg=61.0):
+    a = D(from_aft_deg)
+    return -np.cos(a) * np.array([1.0, 0.0, 0.0]) + np.sin(a) * lv_direction(D(clock_deg))
+
+
+def film(seed, theta_deg, plane_deg):
+    rng = np.random.default_rng(seed)
+    light = np.stack([sun(rng.uniform(0, 360), rng.uniform(50, 70)) for _ in theta_deg])
+    return list(render_video(GEOMETRY, MOUNT, JOINT_M, D(np.array(theta_deg)), D(np.array(plane_deg)), light, rng))
+
+
+@pytest.fixture(scope="module")
+def view():
+    return VirtualCamera(GEOMETRY, camera_from_mount(MOUNT).turned(np.array([0.01, -0.006, 0.008]), 0.99), JOINT_M)
+
+
+@pytest.fixture(scope="module")
+def ensemble():
+    """Truth (theta, plane) and answers, plane found and plane assumed, of 12 flights with their own lens and light.
+
+    The benchmark frame is bent by 0.1 deg a lateral axis, one sd, in a plane nobody is told.
+    """
+    rows = []
+    for seed in range(12):
+        rng = np.random.default_rng(1000 + seed)
+        rest = 0.1 * rng.standard_normal(2)
+        theta = [float(np.hypot(*rest)), rng.uniform(3.0, 4.8), rng.uniform(1.5, 4.0)]
+        plane = [float(np.rad2deg(np.arctan2(rest[1], -rest[0]))), rng.uniform(183.0, 200.0), rng.uniform(140.0, 190.0)]
+        frames = film(seed, theta, plane)
+        times = np.array([421.0, 440.0, 441.0])
+        free = deflection_from_frames(times, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None)
+        assumed = deflection_from_frames(times, frames, GEOMETRY, MOUNT, JOINT_M)
+        rows.append((D(np.array(theta)), D(np.array(plane)), free, assumed))
+    return rows
+
+
+def shifted(view, edge, moved):
+    """Distance of a moved edge from the edge, along its normals."""
+    horizon = HorizonLine(moved.pixels, moved.inward_px, np.ones(len(moved.pixels)))
+    return view.mismatch(horizon, edge)
+
+
+def test_every_derivative_of_the_edge_equals_differences(view):
+    edge = view.edge(HERE)
+    h = 2e-4
+    camera = view.camera
+    unit = np.eye(3)
+
+    def look(**change):
+        return replace(view, camera=replace(camera, **change)).edge(HERE)
+
+    def wider(s):
+        """Move the tori outwards and keep their stations: the cone then starts from another nose."""
+        half = D(GEOMETRY.half_angle_deg)
+        per_nose = 1.0 - np.sin(half) - np.cos(half) / np.tan(half)
+        change = {
+            "innermost_torus_radius_m": GEOMETRY.innermost_torus_radius_m + s,
+            "nose_radius_m": GEOMETRY.nose_radius_m - s / np.tan(half) / per_nose,
+        }
+        return replace(view, geometry=GEOMETRY.model_copy(update=change)).edge(HERE)
+
+    moves = {
+        DEFLECTION.start: lambda s: view.edge(HERE + s * unit[0, :2]),
+        DEFLECTION.start + 1: lambda s: view.edge(HERE + s * unit[1, :2]),
+        POINTING.start + 3: lambda s: replace(view, camera=camera.turned(np.zeros(3), 1.0 + s)).edge(HERE),
+        NUISANCE.start: lambda s: look(centre_px=camera.centre_px + s * unit[0, :2]),
+        NUISANCE.start + 1: lambda s: look(centre_px=camera.centre_px + s * unit[1, :2]),
+        NUISANCE.start + 2: lambda s: look(distortion=camera.distortion + s * np.eye(4)[0]),
+        NUISANCE.start + 6: wider,
+        NUISANCE.start + 7: lambda s: replace(view, joint_station_m=JOINT_M + s).edge(HERE),
+    }
+    for k in range(3):
+        moves[POINTING.start + k] = lambda s, k=k: replace(view, camera=camera.turned(s * unit[k])).edge(HERE)
+        moves[NUISANCE.start + 3 + k] = lambda s, k=k: look(position_body_m=camera.position_body_m + s * unit[k])
+    assert sorted(moves) == list(range(NUISANCE.stop))
+    for column, move in moves.items():
+        up, jacobian = shifted(view, edge, move(h))
+        down, _ = shifted(view, edge, move(-h))
+        # the edge is a polyline: chords of 5 px on radii of 400 px are 0.01 px off, the same on both sides
+        numeric = (up - down) / (2.0 * h)
+        ok = np.isfinite(numeric)
+        scale = max(np.abs(jacobian[:, column]).max(), 1.0)
+        np.testing.assert_allclose(
+            numeric[ok][3:-3], jacobian[ok][3:-3, column], atol=0.02 * scale, err_msg=str(column)
+        )
+
+
+def test_positive_bending_towards_the_camera_moves_the_edge_up(view):
+    apex = [view.edge_of(D(t), D(MOUNT.clock_lv_deg)).pixels[:, 1].min() for t in (-4.0, 0.0, 4.0)]
+    assert apex[2] < apex[1] - 15.0 < apex[0] - 30.0
+    # towards camera 1 (larger clock, left): the left end of the edge rises against the right one
+    rest, tilted = view.edge_of(0.0, 0.0), view.edge_of(D(4.0), D(225.0))
+    for column, sign in ((100.0, 1.0), (620.0, -1.0)):
+        row = [np.interp(column, *e.pixels[np.argsort(e.pixels[:, 0])].T) for e in (rest, tilted)]
+        assert sign * (row[0] - row[1]) > 5.0
+
+
+def test_polar_is_the_inverse_of_the_rotation_vector_with_its_covariance():
+    theta, plane = D(3.3), D(187.0)
+    w = rotation_vector_body_shell(np.array(theta), np.array(plane))[1:]
+    cov = np.array([[2.0, 0.5], [0.5, 1.0]]) * 1e-6
+    got = polar(w, cov)
+    assert got[0] == pytest.approx(theta)
+    assert got[1] == pytest.approx(plane)
+    h = 1e-6
+    ends = [(np.array(polar(w + d, cov)[:2]), np.array(polar(w - d, cov)[:2])) for d in h * np.eye(2)]
+    turn = np.column_stack([(up - down) / (2 * h) for up, down in ends])
+    np.testing.assert_allclose(got[2], turn @ cov @ turn.T, rtol=1e-5)
+    _, _, unknown = polar(np.array([1e-6, 0.0]), cov)
+    assert unknown[1, 1] == pytest.approx(np.pi**2 / 3.0)
+    assert np.linalg.eigvalsh(unknown).min() > 0.0
+
+
+def test_deflection_and_plane_are_recovered_with_honest_sd(ensemble):
+    normal = []
+    for theta, plane, free, _ in ensemble:
+        for k in (1, 2):
+            assert abs(free.theta_rad[k] - theta[k]) < D(0.7)
+            error = np.array([free.theta_rad[k] - theta[k], np.angle(np.exp(1j * (free.plane_lv_rad[k] - plane[k])))])
+            normal.append(error @ np.linalg.solve(free.covariance[k], error))
+    nees = np.array(normal).reshape(-1, 2)
+    # 24 answers of 2 components, but the two of a flight share their lens: 12 independent pairs at the least,
+    # chi-square with 24 degrees of freedom, 0.1 % on either side of the mean of both
+    assert 8.08 / 24.0 < nees.mean() / 2.0 < 51.2 / 24.0
+
+
+def test_assumed_plane_reads_the_component_in_it_and_says_how_far_off_that_may_be(ensemble):
+    for theta, plane, _, assumed in ensemble:
+        component = theta * np.cos(plane - D(153.0)) - theta[0] * np.cos(plane[0] - D(153.0))
+        # 0.4 deg: three sd of what is held fixed, 0.1 deg, and the leak of the component across
+        assert np.abs(assumed.theta_rad - component)[1:].max() < D(0.4)
+        np.testing.assert_array_equal(assumed.plane_lv_rad, D(153.0))
+        assert (np.abs(assumed.theta_rad - theta)[1:] < 3.0 * assumed.theta_sd_rad[1:]).all()
+        assert np.linalg.eigvalsh(assumed.covariance).min() > 0.0
+
+
+def test_camera_orientation_is_found_on_the_benchmark():
+    frame = film(3, [0.0], [0.0])[0]
+    oriented = orient_camera(frame, GEOMETRY, MOUNT, JOINT_M)
+    assert oriented.residual_rms_px < 0.4
+    # the nominal camera misses the edge by pixels
+    nominal = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
+    residual, _ = nominal.mismatch(oriented.benchmark, nominal.edge(np.zeros(2)))
+    assert np.sqrt(np.nanmean(residual**2)) > 5.0 * oriented.residual_rms_px
+    moved = rotation_vector_body_shell(np.array(D(4.0)), np.array(D(170.0)))[1:]
+    same = oriented.fit(frame, None, start_yz_rad=moved).rotation_yz_rad
+    np.testing.assert_allclose(same, 0.0, atol=D(0.02))
+
+
+def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
+    frames = film(4, [0.0, 3.0, 3.0], [0.0, 180.0, 180.0])
+    stripes = np.where(np.arange(480)[:, None] // 2 % 2, 30, 220).astype(np.uint8) * np.ones((1, 720), np.uint8)
+    cv2.imwrite(str(tmp_path / "good.png"), frames[2])
+    rng = np.random.default_rng(0)
+    pictures = [
+        frames[0],
+        np.zeros_like(frames[0]),
+        np.full_like(frames[0], 255),
+        frames[1][:240],
+        tmp_path / "missing.png",
+        rng.integers(95, 105, frames[0].shape, dtype=np.uint8),
+        stripes,
+        tmp_path / "good.png",
+    ]
+    times = 421.0 + np.arange(len(pictures))
+    history = deflection_from_frames(times, pictures, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None)
+    np.testing.assert_array_equal(np.isnan(history.theta_rad), [False] + [True] * 6 + [False])
+    for word in ("too dark", "saturated", "size 720 x 240", "size 0 x 0", "no clear edge", "6 of 8 frames refused"):
+        assert word in history.assumptions, word
+    assert history.theta_rad[-1] == pytest.approx(D(3.0), abs=D(0.4))
+    # squeezed, the frame shows an edge that is no bending of this shell's
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    squeezed = cv2.resize(frames[1], (720, 300))
+    low = np.vstack([frames[1][:60], squeezed, squeezed[-120:]])
+    assert oriented.fit(low, None).refused
+
+
+def test_gates_name_what_is_wrong():
+    frames = film(4, [0.0], [0.0])
+    with pytest.raises(GateError, match="2 frame times for 1 frames"):
+        deflection_from_frames(np.array([421.0, 422.0]), frames, GEOMETRY, MOUNT, JOINT_M)
+    with pytest.raises(GateError, match="benchmark time"):
+        deflection_from_frames(np.array([440.0]), frames, GEOMETRY, MOUNT, JOINT_M)
+    with pytest.raises(GateError, match="too dark"):
+        deflection_from_frames(np.array([421.0]), [np.zeros_like(frames[0])], GEOMETRY, MOUNT, JOINT_M)
+
+
+def test_found_points_carry_the_sd_their_noise_gives_them():
+    """One scene, many noises: scatter of each point against its stated sd, pooled chi-square."""
+    from synthetic_flight.video import Imaging, ShellRenderer, record
+
+    camera = camera_from_mount(MOUNT)
+    view = VirtualCamera(GEOMETRY, camera, JOINT_M)
+    renderer = ShellRenderer(GEOMETRY, camera, JOINT_M)
+    radiance = 0.35 * renderer.radiance(0.0, 0.0, sun(330.0))
+    lines = view.scan_lines()
+    places, sds = [], []
+    for seed in range(20):
+        frame = record(radiance, renderer.vignetting, Imaging(noise_sd=4.0), np.random.default_rng(seed))
+        found = find_horizon(frame, lines, camera.size_px)
+        assert len(found.points_px) == len(lines.origin_px)
+        places.append(np.einsum("ni,ni->n", found.points_px - lines.origin_px, lines.inward_px))
+        sds.append(found.sd_px)
+    ratio = np.mean(np.var(places, axis=0, ddof=1)) / np.mean(np.square(sds))
+    # the floor and the noise of the shell's level are approximations: the variance is right within a factor of two
+    assert 0.5 < ratio < 2.0
+
+
+def test_sensitivity_table_hardly_knows_the_joint():
+    frames = film(6, [0.0, 4.2], [0.0, 153.0])
+    planes, joints = D(np.array([153.0, 183.0, 200.0])), np.array([0.0, 0.2])
+    table = sensitivity_table(frames[0], frames[1], GEOMETRY, MOUNT, planes, joints)
+    assert table.shape == (2, 3)
+    assert table[1, 0] == pytest.approx(D(4.2), abs=D(0.3))
+    # truth in the camera's plane: other planes need 1 / (cos d + s sin d) of it, a quarter at most for these 47 deg
+    assert (np.abs(table / table[:, :1] - 1.0) < 0.25).all()
+    # facts: 0.84 theta of rim motion about the torus, 0.79 about the nose
+    np.testing.assert_allclose(table[0] / table[1], 0.84 / 0.79, atol=0.03)
+
+
+def test_overlay_covers_the_right_half_and_the_figure_draws():
+    frames = film(3, [0.0, 4.0], [0.0, 188.0])
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    theta, plane, _ = polar(oriented.fit(frames[1], None).rotation_yz_rad, 1e-6 * np.eye(2))
+    picture = oriented.view.overlay(frames[1], theta, plane)
+    np.testing.assert_array_equal(picture[:, :350], np.repeat(frames[1][:, :350, None], 3, axis=2))
+    # painted triangles and found edge agree: coloured pixels begin at the frame's own edge
+    for column in (420, 500, 600):
+        painted = np.argmax(np.ptp(picture[:, column].astype(int), axis=1) > 25)
+        bright = np.argmax(frames[1][:, column] > 0.5 * frames[1][painted + 5, column])
+        assert abs(painted - bright) <= 3
+    figure = figure_camera_overlay(oriented, frames, [421.0, 440.0], [0.0, theta], [plane, plane])
+    assert len(figure.axes) == 2
+    assert len(figure.axes[1].lines) == 2
+    rows = [line.get_ydata()[0] for line in figure.axes[1].lines]
+    assert rows[0] == pytest.approx(rows[1], abs=1.0)
