@@ -1,0 +1,84 @@
+"""How long each link of the chain takes on one flight, warm: best of several rounds, one process, two cores or one.
+
+Run: ``python benchmarks/chain.py [ROUNDS]``. Absolute times move with the machine; the last column, against the
+flight's own 440 s, moves less. Nothing in the test suite depends on them.
+"""
+
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from estimators.misalignment import estimate_misalignment
+from estimators.trim import estimate_trim
+from flightmodel.flightfolder import read_flight
+from postflight.pipeline import estimate_camera, pulse_data, reconstruct_flight
+from recon.bet import reconstruct
+from synthetic_flight import _kernels, dynamics
+from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.scenarios import child_rng, day_atmosphere, fly_scenario, initial_state, read_scenario
+from synthetic_flight.simulate import integrate
+
+ROUNDS = int(sys.argv[1]) if len(sys.argv) > 1 else 3
+
+
+def best(work):
+    work()  # warm
+    times = []
+    for _ in range(ROUNDS):
+        begun = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begun)
+    return min(times)
+
+
+def peer_seconds(vehicle, table, state, span_s):
+    """DOP853 of scipy over the same compiled right-hand side: the usual way to fly such equations in Python."""
+    p, tables = dynamics.parameter_vector(vehicle), dynamics.kernel_tables(vehicle, table)
+    dy, aux = np.empty(_kernels.STATES), np.empty(_kernels.AUX)
+
+    def f(_t, y):
+        _kernels.rates(y, p, *tables, False, dy, aux)
+        return dy.copy()
+
+    return best(lambda: solve_ivp(f, (0.0, span_s), state, method="DOP853", rtol=1e-6, atol=1e-6))
+
+
+def main():
+    scenario = read_scenario("irve2_reference")
+    vehicle = scenario.vehicle
+    table = dynamics.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    state = initial_state(scenario)
+    rows = []
+    kernel = best(lambda: integrate(vehicle, table, state, 0.002, 2, 110001, 52501))
+    rows.append(("fly 440 s, RK4 at 500 Hz, integration alone", kernel))
+    rows.append(("fly 440 s with air data and truth", best(lambda: fly_scenario(scenario, 0))))
+    begin = integrate(vehicle, table, state, 0.002, 50, 3361, 2101)[0][-1]  # 336 s later: in the pulse
+    rows.append(("  30 s of the pulse, our RK4", best(lambda: integrate(vehicle, table, begin, 0.002, 2, 7501))))
+    rows.append(("  the same by scipy DOP853 on the same compiled rates", peer_seconds(vehicle, table, begin, 30.0)))
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "flight"
+        film = replace(scenario, spec=scenario.spec.model_copy(update={"video": scenario.spec.video}))
+        begun = time.perf_counter()
+        simulate_to_folder(film, 0, folder)
+        rows.append(("simulate a flight folder with video", time.perf_counter() - begun))
+        telemetry = read_flight(folder)
+        rows.append(("read telemetry through the gate", best(lambda: read_flight(folder))))
+        rows.append(("reconstruct 230 s at 250 Hz", best(lambda: reconstruct(telemetry))))
+        flight = reconstruct_flight(folder)
+        bet, air = flight.reconstruction, flight.air
+        rows.append(("deflection from video", best(lambda: estimate_camera(telemetry))))
+        pulse = pulse_data(telemetry, bet, air)
+        rows.append(("deflection from misalignment", best(lambda: estimate_misalignment(pulse))))
+        rows.append(("deflection from trim", best(lambda: estimate_trim(pulse))))
+    print(f"{'':55s}{'seconds':>10s}{'x real time':>14s}")
+    for name, seconds in rows:
+        print(f"{name:55s}{seconds:10.3f}{440.0 / seconds if 'fly 440' in name else float('nan'):14.0f}")
+
+
+if __name__ == "__main__":
+    main()

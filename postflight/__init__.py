@@ -1,0 +1,1 @@
+"""Where the parts meet: the command, the pipeline, results, scores and figures."""

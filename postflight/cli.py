@@ -1,0 +1,129 @@
+"""The ``postflight`` command. Exit codes: 0 fine, 2 usage or configuration, 3 data refused, 4 an estimator gave no
+answer, 5 a synthetic-truth check failed, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+# heavy imports stand inside the commands, so that --help answers at once
+FOLDER = click.Path(path_type=Path)
+EXIT_INTERRUPTED = 130
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="postflight")
+def cli() -> None:
+    """What an entry vehicle really did, and how far its flexible aeroshell bent.
+
+    A flight is a folder: flight.toml, telemetry/, and for synthetic flights truth/, which no estimator opens.
+    """
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER, default=Path("demo-flight"))
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the day and all errors.")
+def demo(folder: Path, seed: int) -> None:
+    """Fly the reference flight, forget the truth, reconstruct, estimate, then score against the truth.
+
+    Writes a flight folder (default ./demo-flight, replaced when it is one already) with results and figures.
+    """
+    from postflight import commands
+
+    commands.demo(folder, seed)
+
+
+@cli.command()
+@click.argument("scenario", default="irve2_reference")
+@click.argument("folder", type=FOLDER)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the day and all errors.")
+@click.option("--force", is_flag=True, help="Replace an existing synthetic flight folder.")
+def simulate(scenario: str, folder: Path, seed: int, force: bool) -> None:
+    """Fly SCENARIO (a name, or a .toml file) and write telemetry and truth to a new flight FOLDER."""
+    from postflight import commands
+
+    commands.simulate(scenario, folder, seed, force)
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--rate", type=click.FloatRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
+def reconstruct(folder: Path, rate: float) -> None:
+    """Reconstruct the best-estimated trajectory of the flight in FOLDER."""
+    from postflight import commands
+
+    commands.run(folder, (), rate)
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option(
+    "--method",
+    "methods",
+    type=click.Choice(["camera", "misalignment", "trim"]),
+    multiple=True,
+    help="Estimator to run; repeat for several. Default: all that the flight has data for.",
+)
+@click.option("--plane", type=float, help="Assume this plane for the camera (LV clocking, deg); default: find it.")
+@click.option("--joint", type=float, help="Assume the joint this far aft of the nose, m; default: the vehicle file's.")
+def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None) -> None:
+    """Estimate how far the aeroshell bent in the flight in FOLDER."""
+    from postflight import commands
+
+    commands.deflection(folder, methods, plane, joint)
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--rate", type=click.FloatRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
+def run(folder: Path, rate: float) -> None:
+    """Do it all for the flight in FOLDER: trajectory, three deflection estimates, tables and figures."""
+    from postflight import commands
+    from postflight.pipeline import METHODS
+
+    commands.run(folder, METHODS, rate)
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+def score(folder: Path, as_json: bool) -> None:
+    """Compare the newest run of a synthetic flight with its truth; exit 5 where recovery fails."""
+    from postflight import commands
+
+    commands.score(folder, as_json)
+
+
+def main() -> None:
+    """Run the command; known faults become messages and exit codes, never a traceback."""
+    from flightmodel.checks import GateError
+
+    try:
+        cli.main(standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        sys.exit(stop.exit_code)
+    except click.exceptions.Abort:
+        click.echo("interrupted; nothing half-written is left", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+    except KeyboardInterrupt:
+        click.echo("interrupted; nothing half-written is left", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+    except click.ClickException as fault:
+        fault.show()
+        sys.exit(fault.exit_code)
+    except GateError as fault:
+        for line in fault.faults:
+            click.echo(f"error: {line}", err=True)
+        if len(fault.faults) > 1:
+            click.echo(f"{len(fault.faults)} faults", err=True)
+        sys.exit(fault.exit_code)
+    except OSError as fault:
+        click.echo(f"error: {fault.filename or ''}: {fault.strerror or fault}", err=True)
+        sys.exit(3)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,243 @@
+"""What each command does, with progress while it works and a table at its end."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.flightfolder import read_flight
+from postflight import drawing, results, scoring
+from postflight.pipeline import METHODS, Answers, Flight, estimate, reconstruct_flight
+from recon.bet import Settings
+from synthetic_flight.folder import check_destination, simulate_to_folder
+from synthetic_flight.scenarios import read_scenario
+from synthetic_flight.simulate import Truth
+
+EXIT_NO_ANSWER, EXIT_CHECK_FAILED = 4, 5
+Report = Callable[[float, str], None]
+console = Console(soft_wrap=True)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Report]:
+    """Progress on standard error with remaining time; silent where that is no terminal."""
+    screen = Console(stderr=True)
+    columns = (TextColumn("{task.description:<34}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda fraction, what: bar.update(task, completed=fraction, description=what)
+
+
+def simulate(scenario: str, folder: Path, seed: int, force: bool) -> None:
+    """Fly and write a flight folder."""
+    chosen = read_scenario(scenario)
+    with progress_bar() as report:
+        truth = simulate_to_folder(chosen, seed, folder, report, replace=force)
+    print_truth(truth, folder)
+
+
+def print_truth(truth: Truth, folder: Path) -> None:
+    """Print what the flight was, without its deflection."""
+    k = int(np.argmax(truth.dynamic_pressure_pa))
+    table = Table(title=f"Synthetic flight in {escape(str(folder))}")
+    for name in ("apogee km", "peak q Pa", "at s", "altitude km", "Mach", "ended at s"):
+        table.add_column(name, justify="right")
+    table.add_row(
+        f"{truth.altitude_m.max() / 1e3:.1f}",
+        f"{truth.dynamic_pressure_pa[k]:.0f}",
+        f"{truth.time_s[k]:.2f}",
+        f"{truth.altitude_m[k] / 1e3:.1f}",
+        f"{truth.mach[k]:.2f}",
+        f"{truth.time_s[-1]:.1f}",
+    )
+    console.print(table)
+    if truth.words:
+        console.print(f"[yellow]{escape(truth.words)}[/]")
+
+
+def run(folder: Path, methods: tuple[str, ...], rate_hz: float) -> None:
+    """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers."""
+    flight, answers, written = run_flight(folder, methods, rate_hz)
+    print_flight(flight)
+    if methods:
+        print_answers(answers, flight.peak_s)
+    console.print(f"results in {escape(str(written))}")
+    if methods and not answers.histories:
+        sys.exit(EXIT_NO_ANSWER)
+
+
+def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[Flight, Answers, Path]:
+    """Run the chain on one flight folder and write its run folder."""
+    settings = {"methods": list(methods), "output_rate_hz": rate_hz}
+    log: list[str] = []
+    with progress_bar() as report:
+
+        def step(low: float, high: float) -> Report:
+            def tell(fraction: float, what: str) -> None:
+                if not log or log[-1] != what:
+                    log.append(what)
+                report(low + (high - low) * fraction, what)
+
+            return tell
+
+        flight = reconstruct_flight(folder, Settings(output_rate_hz=rate_hz), step(0.0, 0.5))
+        wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
+        answers = estimate(flight, flight.telemetry, wanted, step(0.5, 0.7))
+        if "camera" in methods and "camera" not in wanted:
+            answers.refused["camera"] = "the flight has no video"
+        with results.RunFolder(folder, flight.telemetry, settings) as out:
+            results.write_reconstruction(out, flight)
+            results.write_answers(out, answers)
+            out.write_json("summary.json", results.summary(flight, answers))
+            drawing.draw_run(flight, answers, out.path / "figures", step(0.7, 1.0))
+            lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
+            (out.path / "log.jsonl").write_text(lines)
+    return flight, answers, out.path
+
+
+def print_flight(flight: Flight) -> None:
+    """Events, verdicts and findings."""
+    table = Table(title=f"Best-estimated trajectory of {escape(flight.telemetry.name)}")
+    for name in ("event", "t s", "altitude km", "Mach", "q Pa", "alpha total deg"):
+        table.add_column(name, justify="left" if name == "event" else "right")
+    for row in results.event_table(flight.air, flight.telemetry, flight.peak_s).itertuples(index=False):
+        alpha = f"{row.alpha_total_wind_deg:.2f} ± {row.alpha_total_wind_sd_deg:.2f}"
+        pressure = f"{row.dynamic_pressure_pa:.1f}"
+        table.add_row(row.event, f"{row.t_s:.2f}", f"{row.alt_m / 1e3:.2f}", f"{row.mach:.2f}", pressure, alpha)
+    console.print(table)
+    for finding in (*flight.telemetry.findings, *flight.reconstruction.findings):
+        console.print(f"[yellow]found[/] {escape(str(finding))}")
+    failed = [v for v in flight.reconstruction.verdicts if not v.passed]
+    passed = len(flight.reconstruction.verdicts) - len(failed)
+    console.print(f"{passed} of {len(flight.reconstruction.verdicts)} consistency verdicts pass")
+    for verdict in failed:
+        numbers = f"{verdict.value:.3g} outside {verdict.low:.3g} to {verdict.high:.3g}"
+        console.print(f"[red]verdict[/] {verdict.name}: {verdict.words} ({numbers})")
+
+
+def print_answers(answers: Answers, peak_s: float) -> None:
+    """Deflection at peak pressure, method by method."""
+    when = f" at {peak_s:.2f} s" if np.isfinite(peak_s) else ""
+    table = Table(title=f"Deflection of the aeroshell against the centerbody{when}")
+    for name in ("method", "deflection deg", "1 sd", "plane LV deg", "largest deg", "at s"):
+        table.add_column(name, justify="left" if name == "method" else "right")
+    for method, row in results.method_summary(answers, peak_s).items():
+        if row["deflection_deg"] is None:
+            table.add_row(method, "no answer", "", "", "", "")
+            continue
+        history = answers.histories[method]
+        yz = [np.interp(peak_s, history.time_s, c) for c in np.nan_to_num(history.theta_yz_rad).T]
+        plane = np.rad2deg(np.mod(np.arctan2(yz[1], -yz[0]), 2 * np.pi))
+        angle, largest = f"{row['deflection_deg']:.2f}", f"{row['largest_deg']:.2f}"
+        table.add_row(method, angle, f"{row['sd_deg']:.2f}", f"{plane:.0f}", largest, f"{row['largest_at_s']:.2f}")
+    console.print(table)
+    for method, reason in answers.refused.items():
+        console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
+
+
+def deflection(folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None) -> None:
+    """Estimate the deflection alone; the camera needs no trajectory."""
+    telemetry = read_flight(folder)
+    if not methods:
+        methods = tuple(m for m in METHODS if m != "camera" or telemetry.frames is not None)
+    plane_rad = None if plane_deg is None else float(np.deg2rad(plane_deg))
+    settings = {"methods": list(methods), "plane_deg": plane_deg, "joint_m": joint_m}
+    with progress_bar() as report:
+        needs_bet = set(methods) != {"camera"}
+        flight = reconstruct_flight(folder, None, lambda f, what: report(0.6 * f, what)) if needs_bet else None
+        tell: Report = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
+        answers = estimate(flight, telemetry, methods, tell, plane_rad, joint_m)
+        with results.RunFolder(folder, telemetry, settings) as out:
+            results.write_answers(out, answers)
+            if "camera" in answers.histories:
+                drawing.draw_camera(telemetry, answers.histories["camera"], out.path / "figures", joint_m)
+    # without a trajectory the camera's own largest deflection is what can be named
+    peak_s = flight.peak_s if flight else largest_s(answers)
+    print_answers(answers, peak_s)
+    console.print(f"results in {escape(str(out.path))}")
+    if answers.refused:
+        sys.exit(EXIT_NO_ANSWER)
+
+
+def largest_s(answers: Answers) -> float:
+    """Time of the largest deflection of the first method that answered, s."""
+    for history in answers.histories.values():
+        return float(history.time_s[np.nanargmax(history.theta_rad)])
+    return float("nan")
+
+
+def score(folder: Path, as_json: bool) -> None:
+    """Score the newest run; exit 5 where recovery fails."""
+    result = scoring.score_run(folder)
+    if as_json:
+        sys.stdout.write(json.dumps(result.as_json()) + "\n")
+    else:
+        print_score(result)
+    if result.failures:
+        sys.exit(EXIT_CHECK_FAILED)
+
+
+def print_score(result: scoring.Score) -> None:
+    """Estimates against the truth, with the paper's own figures beside them."""
+    table = Table(title=f"Deflection at peak dynamic pressure ({result.peak_s:.2f} s), against the truth")
+    for name in ("method", "deflection deg", "1 sd", "truth", "error", "IRVE-II (paper)"):
+        table.add_column(name, justify="left" if name == "method" else "right")
+    for method, row in result.methods.items():
+        paper = f"{scoring.PAPER_DEG[method]:g}"
+        if row["deflection_deg"] is None:
+            table.add_row(method, "no answer", "", f"{row['truth_deg']:.2f}", "", paper)
+            continue
+        numbers = (f"{row[k]:.2f}" for k in ("deflection_deg", "sd_deg", "truth_deg"))
+        table.add_row(method, *numbers, f"{row['error_deg']:+.2f}", paper)
+    console.print(table)
+    bet = result.bet
+    console.print(
+        f"BET over the pulse ({bet['pulse_start_s']:.1f} to {bet['pulse_end_s']:.1f} s), rms error: "
+        f"position {bet['position_rms_m']:.1f} m, velocity {bet['velocity_rms_mps']:.2f} m/s, "
+        f"total angle of attack {bet['alpha_total_rms_deg']:.2f} deg"
+    )
+    for failure in result.failures:
+        console.print(f"[red]failed[/] {escape(failure)}")
+    if not result.failures:
+        console.print("[green]truth recovered[/] within every limit")
+
+
+def demo(folder: Path, seed: int) -> None:
+    """Fly, reconstruct, estimate, and only then look at the truth."""
+    check_destination(folder, replace=True)
+    begun = time.perf_counter()
+    console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
+    simulate("irve2_reference", folder, seed, force=True)
+    flight, answers, written = run_flight(folder, METHODS, 20.0)
+    print_flight(flight)
+    for method, reason in answers.refused.items():
+        console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
+    result = scoring.score_run(folder, written)
+    drawing.draw_summary(flight, answers, written / "figures", truth=truth_history(folder))
+    print_score(result)
+    console.print(f"results and figures in {escape(str(written))}")
+    console.print(f"the answer as a picture: {escape(str(written / 'figures' / 'summary.png'))}")
+    console.print(f"{time.perf_counter() - begun:.0f} s in all")
+    if result.failures:
+        sys.exit(EXIT_CHECK_FAILED)
+
+
+def truth_history(folder: Path) -> tuple[FloatArray, FloatArray]:
+    """Times and true deflection, deg, of a synthetic flight, for drawing after everything is estimated."""
+    try:
+        table = pd.read_csv(folder / "truth" / "deflection.csv")
+    except FileNotFoundError:
+        raise GateError(f"{folder}: no truth/deflection.csv") from None
+    return table["t_s"].to_numpy(), table["theta_deg"].to_numpy()

@@ -1,0 +1,78 @@
+"""Which figures a run gets, and what is drawn from which data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from estimators.camera_deflection import OrientedCamera, orient_camera, read_frame
+from estimators.figures import figure_camera_overlay
+from flightmodel.checks import FloatArray
+from flightmodel.deflection import DeflectionHistory
+from flightmodel.telemetry import Telemetry
+from postflight import figures
+from postflight.pipeline import Answers, Flight
+from postflight.preflight import rigid_bounds
+
+Report = Callable[[float, str], None]
+
+
+def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> None:
+    """Draw everything that the run's answers allow."""
+    report(0.0, "flying the rigid vehicle")
+    bounds = rigid_bounds(flight, progress=lambda f, what: report(0.6 * f, what))
+    report(0.6, "drawing")
+    figures.save(figures.figure_1_3(flight, bounds), folder / "figure_1_3.png")
+    figures.save(figures.figure_2_5(flight), folder / "figure_2_5.png")
+    figures.save(figures.figure_residuals(flight), folder / "residuals.png")
+    if "misalignment" in answers.histories:
+        figures.save(figures.figure_2_7(flight, answers.histories["misalignment"]), folder / "figure_2_7.png")
+    if "camera" in answers.histories:
+        draw_camera(flight.telemetry, answers.histories["camera"], folder)
+    if answers.histories:
+        draw_summary(flight, answers, folder)
+    report(1.0, "drawn")
+
+
+def oriented_camera(telemetry: Telemetry, joint_m: float | None = None) -> tuple[OrientedCamera, int]:
+    """Camera oriented on the benchmark frame, and that frame's index."""
+    frames, vehicle = telemetry.frames, telemetry.vehicle
+    assert frames is not None
+    benchmark = int(np.argmin(np.abs(frames.time_s - frames.benchmark_s)))
+    station = vehicle.joint.station_m if joint_m is None else joint_m
+    return orient_camera(read_frame(frames.paths[benchmark]), vehicle.geometry, frames.camera, station), benchmark
+
+
+def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, joint_m: float | None = None) -> None:
+    """Benchmark frame and frame of the largest deflection with the virtual camera over them (Figure 2.3)."""
+    frames = telemetry.frames
+    assert frames is not None
+    oriented, benchmark = oriented_camera(telemetry, joint_m)
+    largest = int(np.nanargmax(np.abs(history.theta_rad)))
+    pick = [benchmark, largest]
+    pictures = [read_frame(frames.paths[k]) for k in pick]
+    theta = [0.0, float(history.theta_rad[largest])]
+    figure = figure_camera_overlay(
+        oriented, pictures, list(frames.time_s[pick]), theta, list(history.plane_lv_rad[pick])
+    )
+    figures.save(figure, folder / "figure_2_3.png")
+
+
+def draw_summary(
+    flight: Flight, answers: Answers, folder: Path, truth: tuple[FloatArray, FloatArray] | None = None
+) -> None:
+    """Draw the one-page picture; with the truth where it is known and everything is estimated."""
+    frames = None
+    if "camera" in answers.histories:
+        history, video = answers.histories["camera"], flight.telemetry.frames
+        assert video is not None
+        oriented, benchmark = oriented_camera(flight.telemetry)
+        largest = int(np.nanargmax(history.theta_rad))
+        left = oriented.view.overlay(read_frame(video.paths[benchmark]), 0.0, float(history.plane_lv_rad[largest]))
+        right = oriented.view.overlay(
+            read_frame(video.paths[largest]), float(history.theta_rad[largest]), float(history.plane_lv_rad[largest])
+        )
+        frames = np.concatenate([left, np.full((len(left), 12, 3), 255, dtype=np.uint8), right], axis=1)
+    figures.save(figures.figure_summary(flight, answers, truth, frames), folder / "summary.png")

@@ -1,0 +1,240 @@
+"""Run folders: every result of one run as CSV and JSON, whole or not there at all.
+
+``runs/<utc>-<hash8>/``: the hash covers inputs, settings and version, so equal runs carry equal hashes, and the same
+inputs give the same bytes in every file but ``run.json``, which alone holds times and machine.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import shutil
+import tempfile
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from flightmodel import earth
+from flightmodel.airdata import AirData
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.deflection import DeflectionHistory
+from flightmodel.telemetry import Telemetry
+from postflight.pipeline import Answers, Flight
+
+DIGITS = "%.10g"
+
+
+class RunFolder:
+    """A run folder under construction: use as a context; it is renamed into place when the block ends well."""
+
+    def __init__(self, flight_folder: Path, telemetry: Telemetry, settings: dict[str, Any]) -> None:
+        facts = json.dumps([telemetry.hashes, settings, version("postflight")], sort_keys=True)
+        self.hash8 = hashlib.sha256(facts.encode()).hexdigest()[:8]
+        self.settings = settings
+        self.telemetry = telemetry
+        self.parent = flight_folder / "runs"
+        self.path = Path()
+
+    def __enter__(self) -> RunFolder:
+        """Make the partial folder beside the final one."""
+        try:
+            self.parent.mkdir(exist_ok=True)
+            self.path = Path(tempfile.mkdtemp(prefix=".partial-", dir=self.parent))
+        except OSError as fault:
+            raise GateError(f"{self.parent}: cannot be written: {fault.strerror}; copy the flight folder") from None
+        (self.path / "figures").mkdir()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Rename when whole; remove otherwise."""
+        if kind is not None:
+            shutil.rmtree(self.path, ignore_errors=True)
+            return
+        now = datetime.now(UTC)
+        facts = {
+            "finished_utc": now.isoformat(timespec="seconds"),
+            "version": version("postflight"),
+            "python": platform.python_version(),
+            "packages": {name: version(name) for name in ("numpy", "scipy", "numba", "filterpy", "trimesh")},
+            "settings": self.settings,
+            "inputs_sha256": self.telemetry.hashes,
+        }
+        self.write_json("run.json", facts)
+        final = self.parent / f"{now.strftime('%Y%m%dT%H%M%SZ')}-{self.hash8}"
+        if final.exists():
+            shutil.rmtree(final)
+        self.path.chmod(0o755)
+        self.path.rename(final)
+        self.path = final
+
+    def write_csv(self, name: str, table: pd.DataFrame) -> None:
+        """Write a table."""
+        table.to_csv(self.path / name, index=False, float_format=DIGITS, lineterminator="\n")
+
+    def write_json(self, name: str, value: Any) -> None:
+        """Write one JSON object; NaN becomes null."""
+        text = json.dumps(_no_nan(value), indent=2, allow_nan=False)
+        (self.path / name).write_text(text + "\n")
+
+
+def _no_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _no_nan(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_no_nan(v) for v in value]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    return value
+
+
+def newest_run(flight_folder: Path) -> Path:
+    """Return the newest run that has a summary; `GateError` where there is none."""
+    finished = (flight_folder / "runs").glob("*/summary.json")
+    runs = sorted(path.parent for path in finished if not path.parent.name.startswith("."))
+    if not runs:
+        raise GateError(f"{flight_folder}: no finished run; use `postflight run {flight_folder}` first")
+    return runs[-1]
+
+
+def bet_table(flight: Flight) -> pd.DataFrame:
+    """Best estimated trajectory with air data and standard deviations, one row an output time."""
+    bet, air = flight.reconstruction.smoothed, flight.air
+    sd = bet.sd()
+    v_ned = earth.ned_from_ecef(bet.velocity_ecef_mps, bet.position_ecef_m)
+    columns: dict[str, FloatArray] = {"t_s": bet.time_s}
+
+    def three(pattern: str, letters: str, values: FloatArray) -> None:
+        columns.update({pattern.format(a): c for a, c in zip(letters, values.T, strict=True)})
+
+    three("r{}_ecef_m", "xyz", bet.position_ecef_m)
+    three("v{}_ecef_mps", "xyz", bet.velocity_ecef_mps)
+    three("q{}_ecef_body", "wxyz", bet.q_ecef_body)
+    three("{}_body_degps", "pqr", np.rad2deg(bet.omega_body_eci_body_radps))
+    three("r{}_ecef_sd_m", "xyz", sd[:, 0:3])
+    three("v{}_ecef_sd_mps", "xyz", sd[:, 3:6])
+    three("rotation_{}_body_sd_deg", "xyz", np.rad2deg(sd[:, 6:9]))
+    columns |= {
+        "lat_deg": np.rad2deg(air.latitude_rad),
+        "lon_deg": np.rad2deg(air.longitude_rad),
+        "alt_m": air.altitude_m,
+        "speed_ground_mps": np.linalg.norm(bet.velocity_ecef_mps, axis=1),
+        "airspeed_mps": air.airspeed_mps,
+        "flight_path_deg": np.rad2deg(air.flight_path_angle_rad),
+        "heading_deg": np.rad2deg(np.mod(np.arctan2(v_ned[:, 1], v_ned[:, 0]), 2 * np.pi)),
+        "mach": air.mach,
+        "dynamic_pressure_pa": air.dynamic_pressure_pa,
+        "dynamic_pressure_sd_pa": air.dynamic_pressure_sd_pa,
+        "rho_kgpm3": air.air.density_kgpm3,
+        "t_k": air.air.temperature_k,
+        "wind_n_mps": air.air.wind_ned_mps[:, 0],
+        "wind_e_mps": air.air.wind_ned_mps[:, 1],
+        "wind_sd_mps": air.air.wind_sd_mps,
+        "alpha_deg": np.rad2deg(air.alpha_rad),
+        "beta_deg": np.rad2deg(air.beta_rad),
+        "clock_lv_deg": np.rad2deg(air.clock_lv_rad),
+    }
+    for kind in ("wind", "ground", "inertial"):
+        columns[f"alpha_total_{kind}_deg"] = np.rad2deg(getattr(air, f"alpha_total_{kind}_rad"))
+        columns[f"alpha_total_{kind}_sd_deg"] = np.rad2deg(getattr(air, f"alpha_total_{kind}_sd_rad"))
+    return pd.DataFrame(columns)
+
+
+def deflection_table(history: DeflectionHistory) -> pd.DataFrame:
+    """Angle and plane with standard deviations; rows without an answer are left out."""
+    keep = np.isfinite(history.theta_rad)
+    plane_sd = np.full(len(keep), np.nan)
+    if history.covariance is not None:
+        plane_sd = np.sqrt(history.covariance[:, 1, 1])
+    table = pd.DataFrame(
+        {
+            "t_s": history.time_s,
+            "theta_deg": np.rad2deg(history.theta_rad),
+            "theta_sd_deg": np.rad2deg(history.theta_sd_rad),
+            "plane_lv_deg": np.rad2deg(history.plane_lv_rad),
+            "plane_sd_deg": np.rad2deg(plane_sd),
+        }
+    )
+    return table[keep]
+
+
+def event_table(air: AirData, telemetry: Telemetry, peak_s: float) -> pd.DataFrame:
+    """Moments of the flight with altitude, Mach number, dynamic pressure and total angle of attack."""
+    moments = [(name, t) for name, t in telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
+    moments.append(("peak dynamic pressure", peak_s))
+    if (k := int(np.argmax(air.altitude_m))) not in (0, len(air.time_s) - 1):
+        moments.append(("apogee", float(air.time_s[k])))
+    for name, values, level in (
+        ("80 km", air.altitude_m, 80e3),
+        ("40 km", air.altitude_m, 40e3),
+        ("Mach 3.5", air.mach, 3.5),
+        ("Mach 1", air.mach, 1.0),
+    ):
+        falls = np.flatnonzero((values[:-1] > level) & (values[1:] <= level) & (air.altitude_m[1:] < 130e3))
+        if len(falls):
+            moments.append((name, float(air.time_s[falls[0] + 1])))
+    rows = []
+    for name, t in sorted(moments, key=lambda m: m[1]):
+        k = int(np.searchsorted(air.time_s, t).clip(0, len(air.time_s) - 1))
+        alpha, sd = np.rad2deg([air.alpha_total_wind_rad[k], air.alpha_total_wind_sd_rad[k]])
+        rows.append((name, t, air.altitude_m[k], air.mach[k], air.dynamic_pressure_pa[k], alpha, sd))
+    names = ["event", "t_s", "alt_m", "mach", "dynamic_pressure_pa", "alpha_total_wind_deg", "alpha_total_wind_sd_deg"]
+    return pd.DataFrame(rows, columns=names)
+
+
+def method_summary(answers: Answers, at_s: float) -> dict[str, dict[str, Any]]:
+    """Each method's deflection at one time, and the reason where it has none."""
+    out: dict[str, dict[str, Any]] = {}
+    for method, history in answers.histories.items():
+        theta, sd = np.rad2deg(history.at(at_s))
+        largest = int(np.nanargmax(history.theta_rad))
+        out[method] = {
+            "deflection_deg": float(theta),
+            "sd_deg": float(sd),
+            "largest_deg": float(np.rad2deg(history.theta_rad[largest])),
+            "largest_at_s": float(history.time_s[largest]),
+            "assumptions": history.assumptions,
+        }
+    for method, reason in answers.refused.items():
+        out[method] = {"deflection_deg": None, "sd_deg": None, "reason": reason}
+    return out
+
+
+def write_reconstruction(run: RunFolder, flight: Flight) -> None:
+    """Trajectory, residuals, verdicts, sensor errors, events, findings."""
+    bet = flight.reconstruction
+    run.write_csv("bet.csv", bet_table(flight))
+    run.write_csv("residuals.csv", bet.residuals)
+    run.write_csv("verdicts.csv", pd.DataFrame([vars(v) for v in bet.verdicts]))
+    run.write_csv("sensor_errors.csv", bet.sensor_errors)
+    run.write_csv("events.csv", event_table(flight.air, flight.telemetry, flight.peak_s))
+    findings = [vars(f) for f in (*flight.telemetry.findings, *bet.findings)]
+    run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s"]))
+
+
+def write_answers(run: RunFolder, answers: Answers) -> None:
+    """One CSV a method that answered."""
+    for method, history in answers.histories.items():
+        run.write_csv(f"deflection_{method}.csv", deflection_table(history))
+
+
+def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
+    """Return the short story of a run, for ``summary.json``."""
+    air, peak = flight.air, flight.peak_s
+    k = int(np.searchsorted(air.time_s, peak).clip(0, len(air.time_s) - 1))
+    verdicts = flight.reconstruction.verdicts
+    return {
+        "flight": flight.telemetry.name,
+        "synthetic": flight.telemetry.synthetic,
+        "peak_dynamic_pressure_pa": float(air.dynamic_pressure_pa[k]),
+        "peak_dynamic_pressure_s": float(peak),
+        "alpha_total_wind_deg": float(np.rad2deg(air.alpha_total_wind_rad[k])),
+        "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])),
+        "methods": method_summary(answers, peak),
+        "verdicts_passed": sum(v.passed for v in verdicts),
+        "verdicts_failed": [f"{v.name}: {v.words}" for v in verdicts if not v.passed],
+    }
