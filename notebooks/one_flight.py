@@ -44,8 +44,8 @@ if not (folder / "flight.toml").exists():
 # %% [markdown]
 # ## What came down
 #
-# Two radars, accelerometers in their own clocked package, rate gyros, the day's sounding, and video. The gate checks all
-# of it; what an analyst should know of the data is a finding, not a repair.
+# Two radars, accelerometers in their own clocked package, rate gyros, the day's sounding, and video. The gate checks
+# all of it; what an analyst should know of the data is a finding, not a repair.
 
 # %%
 flight = reconstruct_flight(folder)
