@@ -18,7 +18,7 @@ from rich.table import Table
 
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.flightfolder import read_flight
-from postflight import drawing, results, scoring
+from postflight import drawing, figures, results, scoring
 from postflight.pipeline import METHODS, Answers, Flight, estimate, reconstruct_flight
 from recon.bet import Settings
 from synthetic_flight.folder import check_destination, simulate_to_folder
@@ -225,10 +225,11 @@ def demo(folder: Path, seed: int) -> None:
     for method, reason in answers.refused.items():
         console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
     result = scoring.score_run(folder, written)
-    drawing.draw_summary(flight, answers, written / "figures", truth=truth_history(folder))
+    picture = folder / "demo.png"
+    figures.save(drawing.summary_figure(flight, answers, truth_history(folder)), picture)
     print_score(result)
     console.print(f"results and figures in {escape(str(written))}")
-    console.print(f"the answer as a picture: {escape(str(written / 'figures' / 'summary.png'))}")
+    console.print(f"the answer as a picture, with the truth: {escape(str(picture))}")
     console.print(f"{time.perf_counter() - begun:.0f} s in all")
     if result.failures:
         sys.exit(EXIT_CHECK_FAILED)

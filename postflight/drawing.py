@@ -32,7 +32,7 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
     if "camera" in answers.histories:
         draw_camera(flight.telemetry, answers.histories["camera"], folder)
     if answers.histories:
-        draw_summary(flight, answers, folder)
+        figures.save(summary_figure(flight, answers), folder / "summary.png")
     report(1.0, "drawn")
 
 
@@ -60,19 +60,20 @@ def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, 
     figures.save(figure, folder / "figure_2_3.png")
 
 
-def draw_summary(
-    flight: Flight, answers: Answers, folder: Path, truth: tuple[FloatArray, FloatArray] | None = None
-) -> None:
-    """Draw the one-page picture; with the truth where it is known and everything is estimated."""
-    frames = None
-    if "camera" in answers.histories:
-        history, video = answers.histories["camera"], flight.telemetry.frames
-        assert video is not None
-        oriented, benchmark = oriented_camera(flight.telemetry)
-        largest = int(np.nanargmax(history.theta_rad))
-        left = oriented.view.overlay(read_frame(video.paths[benchmark]), 0.0, float(history.plane_lv_rad[largest]))
-        right = oriented.view.overlay(
-            read_frame(video.paths[largest]), float(history.theta_rad[largest]), float(history.plane_lv_rad[largest])
-        )
-        frames = np.concatenate([left, np.full((len(left), 12, 3), 255, dtype=np.uint8), right], axis=1)
-    figures.save(figures.figure_summary(flight, answers, truth, frames), folder / "summary.png")
+def summary_figure(
+    flight: Flight, answers: Answers, truth: tuple[FloatArray, FloatArray] | None = None
+) -> figures.Figure:
+    """Return the one-page picture; with the truth where it is known and everything is estimated."""
+    if "camera" not in answers.histories:
+        return figures.figure_summary(flight, answers, truth)
+    history, video = answers.histories["camera"], flight.telemetry.frames
+    assert video is not None
+    oriented, benchmark = oriented_camera(flight.telemetry)
+    largest = int(np.nanargmax(history.theta_rad))
+    plane = float(history.plane_lv_rad[largest])
+    pictures = [
+        oriented.view.overlay(read_frame(video.paths[k]), theta, plane)
+        for k, theta in ((benchmark, 0.0), (largest, float(history.theta_rad[largest])))
+    ]
+    between = np.full((len(pictures[0]), 12, 3), 255, dtype=np.uint8)
+    return figures.figure_summary(flight, answers, truth, np.concatenate([pictures[0], between, pictures[1]], axis=1))
