@@ -17,6 +17,7 @@ from postflight.pipeline import Answers, Flight
 from postflight.preflight import rigid_bounds
 
 Report = Callable[[float, str], None]
+YELLOW, GREY = (255, 230, 0), (170, 170, 170)
 
 
 def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> None:
@@ -71,9 +72,27 @@ def summary_figure(
     oriented, benchmark = oriented_camera(flight.telemetry)
     largest = int(np.nanargmax(history.theta_rad))
     plane = float(history.plane_lv_rad[largest])
-    pictures = [
-        oriented.view.overlay(read_frame(video.paths[k]), theta, plane)
-        for k, theta in ((benchmark, 0.0), (largest, float(history.theta_rad[largest])))
-    ]
+    shown = ((benchmark, 0.0), (largest, float(history.theta_rad[largest])))
+    pictures = [oriented.view.overlay(read_frame(video.paths[k]), theta, plane) for k, theta in shown]
+    # the benchmark's horizon in both, so that the eye sees how far the edge moved; its own in the second
+    rows = [horizon_row(oriented, theta, plane) for _, theta in shown]
+    for picture, row, colour in (
+        (pictures[0], rows[0], YELLOW),
+        (pictures[1], rows[0], GREY),
+        (pictures[1], rows[1], YELLOW),
+    ):
+        picture[max(row - 1, 0) : row + 1] = colour
     between = np.full((len(pictures[0]), 12, 3), 255, dtype=np.uint8)
-    return figures.figure_summary(flight, answers, truth, np.concatenate([pictures[0], between, pictures[1]], axis=1))
+    strip = np.concatenate([pictures[0], between, pictures[1]], axis=1)
+    bent = np.rad2deg(shown[1][1])
+    words = (
+        f"left: {video.time_s[benchmark]:.2f} s, benchmark; right: {video.time_s[largest]:.2f} s, {bent:.1f} deg; "
+        "the virtual camera over the right half of each, its horizon in yellow, the benchmark's in grey"
+    )
+    return figures.figure_summary(flight, answers, truth, (strip, words))
+
+
+def horizon_row(oriented: OrientedCamera, theta_rad: float, plane_lv_rad: float) -> int:
+    """Return the smallest row of the virtual camera's shell edge, px (seed paper Figure 2.3)."""
+    edge = oriented.view.edge_of(theta_rad, plane_lv_rad).pixels
+    return round(float(edge[oriented.view.camera.is_inside(edge), 1].min()))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from estimators.misalignment import aerodynamic_angle, aeroshell_acceleration, psi_from_acceleration
 from flightmodel.airdata import pressure_pulse
@@ -146,20 +147,21 @@ def figure_summary(
     flight: Flight,
     answers: Answers,
     truth: tuple[FloatArray, FloatArray] | None = None,
-    frames: FloatArray | None = None,
+    frames: tuple[NDArray[np.uint8], str] | None = None,
 ) -> Figure:
     """The answer on one page: what the camera saw above, deflection, angles and pressure below.
 
     Parameters
     ----------
-    frames : (h, w, 3) float or uint8, optional
-        Picture to show on top (benchmark and peak frame with overlay).
+    frames : ((h, w, 3) uint8, str), optional
+        Picture to show on top (benchmark and peak frame with overlay), and its caption.
     """
     figure = Figure(figsize=(9.0, 9.0 if frames is not None else 6.4), layout="constrained")
     if frames is not None:
         top, bottom = list(np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 1.9))))
         picture = top.subplots()
-        picture.imshow(frames)
+        picture.imshow(frames[0])
+        picture.set_title(frames[1], fontsize=8)
         picture.axis("off")
         axes = bottom.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
     else:
