@@ -7,6 +7,8 @@ like turn into SI and radians.
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,9 +16,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from flightmodel.checks import FloatArray, GateError, nearest_name
 
+IntArray = NDArray[np.int64]
 # unit -> (kind of quantity, factor to SI, offset added after the factor)
 UNITS: dict[str, tuple[str, float, float]] = {
     "s": ("time", 1.0, 0.0),
@@ -101,17 +105,60 @@ class TimeColumn:
 
 
 def read_table(path: Path, label: str) -> pd.DataFrame:
-    """Read a CSV as text; raise `GateError` for a file that is missing, empty, binary or ragged."""
+    """Read a CSV as text; ``attrs["lines"]`` holds each row's line in the file.
+
+    Raises
+    ------
+    GateError
+        For a file that is missing, empty, binary, ragged, or names a column twice.
+    """
     try:
-        frame = pd.read_csv(path, dtype=str, skipinitialspace=True, keep_default_na=False, encoding="utf-8-sig")
+        text = path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
         raise GateError(f"{label}: {path}: no such file") from None
-    except (UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError, OSError) as fault:
-        raise GateError(f"{label}: {path}: not a readable CSV table: {str(fault).strip()}") from None
-    frame.columns = [str(c).strip() for c in frame.columns]
-    if len(frame) < 2:
-        raise GateError(f"{label}: {path}: {len(frame)} data rows; at least two are needed")
+    except (UnicodeDecodeError, OSError) as fault:
+        raise GateError(f"{label}: {path}: not a readable CSV table: {fault}") from None
+    if "\0" in text:
+        raise GateError(f"{label}: {path}: not a readable CSV table: it holds binary data")
+    numbered = [(k, line) for k, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    if len(numbered) < 3:
+        rows = max(0, len(numbered) - 1)
+        raise GateError(f"{label}: {path}: {rows} data rows; at least two are needed")
+    lines = np.array([k for k, _ in numbered[1:]])
+    names, counts = _cells(numbered)
+    faults = [f"{label}: {path}: line {numbered[0][0]}: column '{n}' stands twice" for n in _twice(names)]
+    ragged = np.flatnonzero(counts != len(names))
+    if len(ragged):
+        k = int(ragged[0])
+        faults.append(
+            f"{label}: {path}: line {lines[k]}: {counts[k]} cells where the header has {len(names)} "
+            f"({len(ragged)} such rows); mend or remove them"
+        )
+    if faults:
+        raise GateError(faults)
+    body = "\n".join(line for _, line in numbered)
+    frame = pd.read_csv(io.StringIO(body), dtype=str, skipinitialspace=True, keep_default_na=False, index_col=False)
+    frame.columns = pd.Index(names)
+    frame.attrs["lines"] = lines
     return frame
+
+
+def _cells(numbered: list[tuple[int, str]]) -> tuple[list[str], IntArray]:
+    """Names in the header, and the number of cells of each further row."""
+    if any('"' in line for _, line in numbered):
+        rows = list(csv.reader(line for _, line in numbered))
+        return [c.strip() for c in rows[0]], np.array([len(r) for r in rows[1:]])
+    names = [c.strip() for c in numbered[0][1].split(",")]
+    return names, np.array([line.count(",") + 1 for _, line in numbered[1:]])
+
+
+def _twice(names: list[str]) -> list[str]:
+    return sorted({n for n in names if names.count(n) > 1})
+
+
+def line_of(frame: pd.DataFrame, row: int) -> int:
+    """Line in the file of a row of a table read by `read_table`."""
+    return int(frame.attrs["lines"][row])
 
 
 def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: list[str]) -> FloatArray:
@@ -122,10 +169,9 @@ def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: li
     bad = (~np.isfinite(values)) & ~missing
     if bad.any():
         first = int(np.argmax(bad))
-        faults.append(
-            f"{label}: {path}: line {first + 2}, column '{column}': '{text.iloc[first]}' is no finite number "
-            f"({int(bad.sum())} such cells); leave a missing value empty"
-        )
+        where = f"{label}: {path}: line {line_of(frame, first)}, column '{column}'"
+        count = f"({int(bad.sum())} such cells)"
+        faults.append(f"{where}: '{text.iloc[first]}' is no finite number {count}; leave a missing value empty")
     return values
 
 
@@ -182,7 +228,7 @@ def times_s(
     if bad.any():
         first = int(np.argmax(bad))
         faults.append(
-            f"{label}: {path}: line {first + 2}: time '{frame[spec.column].iloc[first]}' is not in format "
+            f"{label}: {path}: line {line_of(frame, first)}: time '{frame[spec.column].iloc[first]}' is not in format "
             f"'{spec.format}' ({int(bad.sum())} such rows)"
         )
         return None
@@ -190,7 +236,7 @@ def times_s(
     if back.any():
         k = int(np.argmax(back))
         faults.append(
-            f"{label}: {path}: line {k + 3}: time runs backwards or repeats: {values[k]:.6f} s then "
+            f"{label}: {path}: line {line_of(frame, k + 1)}: time runs backwards or repeats: {values[k]:.6f} s then "
             f"{values[k + 1]:.6f} s ({int(back.sum())} places); sort the rows or remove the duplicates"
         )
         return None
@@ -198,18 +244,21 @@ def times_s(
 
 
 _IRIG = re.compile(r"^(\d{1,3}):(\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)$")
+HALF_YEAR_S = 183 * 86400.0
 
 
 def _clock_times(text: pd.Series, form: str, t0: datetime) -> FloatArray:
-    """Seconds after t0 of ISO UTC or IRIG day-of-year times (in t0's year); NaN where a cell does not parse."""
+    """Seconds after t0 of ISO UTC or IRIG day-of-year times; NaN where a cell does not parse.
+
+    Day-of-year times lie in t0's year, or in the next one where that is nearer (a flight across New Year).
+    """
     out = np.full(len(text), np.nan)
     if form == "irig_doy":
-        year_start = (datetime(t0.year, 1, 1, tzinfo=UTC) - t0).total_seconds()
         for k, cell in enumerate(text):
             match = _IRIG.match(cell)
-            if match and 1 <= int(match[1]) <= 366 and int(match[2]) < 24 and int(match[3]) < 60:
-                seconds = int(match[2]) * 3600 + int(match[3]) * 60 + float(match[4])
-                out[k] = year_start + (int(match[1]) - 1) * 86400.0 + seconds
+            if match:
+                near = [_irig_seconds(match, year, t0) for year in (t0.year, t0.year + 1)]
+                out[k] = near[1] if near[0] < -HALF_YEAR_S else near[0]
     else:
         stamps = pd.to_datetime(text, utc=True, errors="coerce", format="ISO8601")
         good = stamps.notna().to_numpy()
@@ -217,3 +266,12 @@ def _clock_times(text: pd.Series, form: str, t0: datetime) -> FloatArray:
         out[good] = [(stamp - base).total_seconds() for stamp in stamps[good]]
     # clocks are written to a microsecond at best: remove the rounding of the large offset
     return np.round(out, 7)
+
+
+def _irig_seconds(match: re.Match[str], year: int, t0: datetime) -> float:
+    """Seconds after t0, or NaN for a day, hour, minute or second that does not exist."""
+    day, hour, minute, second = int(match[1]), int(match[2]), int(match[3]), float(match[4])
+    start, after = datetime(year, 1, 1, tzinfo=UTC), datetime(year + 1, 1, 1, tzinfo=UTC)
+    if not 1 <= day <= (after - start).days or hour > 23 or minute > 59 or second >= 60.0:
+        return float("nan")
+    return (start - t0).total_seconds() + (day - 1) * 86400.0 + hour * 3600 + minute * 60 + second

@@ -23,8 +23,7 @@ SectionT = TypeVar("SectionT", bound=Section)
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file, or raise `ConfigError` with the file, line and column."""
     try:
-        with path.open("rb") as stream:
-            return tomllib.load(stream)
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:

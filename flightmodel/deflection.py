@@ -18,6 +18,8 @@ import numpy as np
 
 from flightmodel.checks import FloatArray, check_finite, check_increasing, check_shape
 
+HOLE_FACTOR = 3.0
+
 
 def lv_direction(clock_lv_rad: FloatArray | float) -> FloatArray:
     """Unit vectors ``(..., 3)`` in body axes of clocking angles in the LV frame, rad."""
@@ -88,12 +90,18 @@ class DeflectionHistory:
         return self.theta_rad[:, None] * lv_direction(self.plane_lv_rad)[:, 1:]
 
     def at(self, time_s: float) -> tuple[float, float]:
-        """Angle and its sd, rad, at one time by linear interpolation between answers; NaN outside them."""
+        """Angle and its sd, rad, at one time by linear interpolation between answers; NaN outside them and in holes.
+
+        A hole is a distance between answers of more than three times the usual one.
+        """
         known = np.isfinite(self.theta_rad)
-        if not known.any() or not self.time_s[known][0] <= time_s <= self.time_s[known][-1]:
+        t = self.time_s[known]
+        if len(t) < 2 or not t[0] <= time_s <= t[-1]:
             return float("nan"), float("nan")
-        theta = np.interp(time_s, self.time_s[known], self.theta_rad[known])
-        return float(theta), float(np.interp(time_s, self.time_s[known], self.theta_sd_rad[known]))
+        k = int(np.clip(np.searchsorted(t, time_s, side="right") - 1, 0, len(t) - 2))
+        if t[k + 1] - t[k] > HOLE_FACTOR * np.median(np.diff(t)) and time_s not in (t[k], t[k + 1]):
+            return float("nan"), float("nan")
+        return float(np.interp(time_s, t, self.theta_rad[known])), float(np.interp(time_s, t, self.theta_sd_rad[known]))
 
 
 def polar_from_lateral(

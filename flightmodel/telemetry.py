@@ -96,7 +96,10 @@ class Frames:
 
 @dataclass(frozen=True)
 class Finding:
-    """Something in the data that an analyst should know; never an error and never repaired in silence."""
+    """Something in the data that an analyst should know; never an error and never repaired in silence.
+
+    Times are NaN where it is not about a time.
+    """
 
     source: str
     what: str
@@ -105,6 +108,8 @@ class Finding:
 
     def __str__(self) -> str:
         """One line for tables and logs."""
+        if not np.isfinite(self.start_s):
+            return f"{self.source}: {self.what}"
         where = (
             f"at {self.start_s:.3f} s" if self.end_s == self.start_s else f"{self.start_s:.3f} to {self.end_s:.3f} s"
         )

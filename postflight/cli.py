@@ -6,12 +6,24 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
 # heavy imports stand inside the commands, so that --help answers at once
 FOLDER = click.Path(path_type=Path)
 EXIT_INTERRUPTED = 130
+
+
+class FiniteRange(click.FloatRange):
+    """A number within bounds; ``nan``, which no comparison catches, is refused too."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number or raise a usage error."""
+        number = float(super().convert(value, param, ctx))
+        if number != number:
+            self.fail(f"{value} is not a number", param, ctx)
+        return number
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -37,20 +49,24 @@ def demo(folder: Path, seed: int) -> None:
 
 
 @cli.command()
-@click.argument("scenario", default="irve2_reference")
-@click.argument("folder", type=FOLDER)
+@click.argument("arguments", nargs=-1, metavar="[SCENARIO] [FOLDER]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the day and all errors.")
 @click.option("--force", is_flag=True, help="Replace an existing synthetic flight folder.")
-def simulate(scenario: str, folder: Path, seed: int, force: bool) -> None:
-    """Fly SCENARIO (a name, or a .toml file) and write telemetry and truth to a new flight FOLDER."""
+def simulate(arguments: tuple[str, ...], seed: int, force: bool) -> None:
+    """Fly SCENARIO (a name, or a .toml file; default irve2_reference) and write telemetry and truth to a new FOLDER.
+
+    FOLDER defaults to SCENARIO-flight.
+    """
+    if len(arguments) > 2:
+        raise click.UsageError(f"at most a scenario and a folder; got {' '.join(arguments)}")
     from postflight import commands
 
-    commands.simulate(scenario, folder, seed, force)
+    commands.simulate(*commands.scenario_and_folder(arguments), seed, force)
 
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--rate", type=click.FloatRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
+@click.option("--rate", type=FiniteRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
 def reconstruct(folder: Path, rate: float) -> None:
     """Reconstruct the best-estimated trajectory of the flight in FOLDER."""
     from postflight import commands
@@ -67,8 +83,16 @@ def reconstruct(folder: Path, rate: float) -> None:
     multiple=True,
     help="Estimator to run; repeat for several. Default: all that the flight has data for.",
 )
-@click.option("--plane", type=float, help="Assume this plane for the camera (LV clocking, deg); default: find it.")
-@click.option("--joint", type=float, help="Assume the joint this far aft of the nose, m; default: the vehicle file's.")
+@click.option(
+    "--plane",
+    type=FiniteRange(-360.0, 360.0),
+    help="Assume this plane for the camera (LV clocking, deg); default: find it.",
+)
+@click.option(
+    "--joint",
+    type=FiniteRange(0.0, 1.0),
+    help="Assume the joint this far aft of the nose, m; default: the vehicle file's.",
+)
 def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None) -> None:
     """Estimate how far the aeroshell bent in the flight in FOLDER."""
     from postflight import commands
@@ -78,7 +102,7 @@ def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, join
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--rate", type=click.FloatRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
+@click.option("--rate", type=FiniteRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
 def run(folder: Path, rate: float) -> None:
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates, tables and figures."""
     from postflight import commands
@@ -99,8 +123,6 @@ def score(folder: Path, as_json: bool) -> None:
 
 def main() -> None:
     """Run the command; known faults become messages and exit codes, never a traceback."""
-    from flightmodel.checks import GateError
-
     try:
         cli.main(standalone_mode=False)
     except click.exceptions.Exit as stop:
@@ -114,15 +136,24 @@ def main() -> None:
     except click.ClickException as fault:
         fault.show()
         sys.exit(fault.exit_code)
-    except GateError as fault:
-        for line in fault.faults:
-            click.echo(f"error: {line}", err=True)
-        if len(fault.faults) > 1:
-            click.echo(f"{len(fault.faults)} faults", err=True)
-        sys.exit(fault.exit_code)
     except OSError as fault:
         click.echo(f"error: {fault.filename or ''}: {fault.strerror or fault}", err=True)
         sys.exit(3)
+    except ValueError as fault:
+        sys.exit(refusal(fault))
+
+
+def refusal(fault: ValueError) -> int:
+    """Print a known refusal and return its exit code; anything else is a defect and is raised again."""
+    from flightmodel.checks import GateError
+
+    if not isinstance(fault, GateError):
+        raise fault
+    for line in fault.faults:
+        click.echo(f"error: {line}", err=True)
+    if len(fault.faults) > 1:
+        click.echo(f"{len(fault.faults)} faults", err=True)
+    return fault.exit_code
 
 
 if __name__ == "__main__":

@@ -22,10 +22,11 @@ from postflight import drawing, figures, results, scoring
 from postflight.pipeline import METHODS, Answers, Flight, estimate, reconstruct_flight
 from recon.bet import Settings
 from synthetic_flight.folder import check_destination, simulate_to_folder
-from synthetic_flight.scenarios import read_scenario
+from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
 
 EXIT_NO_ANSWER, EXIT_CHECK_FAILED = 4, 5
+REFERENCE = "irve2_reference"
 Report = Callable[[float, str], None]
 console = Console(soft_wrap=True)
 
@@ -38,6 +39,15 @@ def progress_bar() -> Iterator[Report]:
     with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda fraction, what: bar.update(task, completed=fraction, description=what)
+
+
+def scenario_and_folder(arguments: tuple[str, ...]) -> tuple[str, Path]:
+    """Tell scenario and folder apart where only one is given: a .toml file or a shipped name is a scenario."""
+    if len(arguments) == 2:
+        return arguments[0], Path(arguments[1])
+    if arguments and (arguments[0].endswith(".toml") or arguments[0] in shipped_scenarios()):
+        return arguments[0], Path(f"{Path(arguments[0]).stem}-flight")
+    return REFERENCE, Path(arguments[0] if arguments else f"{REFERENCE}-flight")
 
 
 def simulate(scenario: str, folder: Path, seed: int, force: bool) -> None:
@@ -74,7 +84,7 @@ def run(folder: Path, methods: tuple[str, ...], rate_hz: float) -> None:
     if methods:
         print_answers(answers, flight.peak_s)
     console.print(f"results in {escape(str(written))}")
-    if methods and not answers.histories:
+    if any(reason != results.NO_VIDEO for reason in answers.refused.values()):
         sys.exit(EXIT_NO_ANSWER)
 
 
@@ -96,7 +106,7 @@ def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[
         wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
         answers = estimate(flight, flight.telemetry, wanted, step(0.5, 0.7))
         if "camera" in methods and "camera" not in wanted:
-            answers.refused["camera"] = "the flight has no video"
+            answers.refused["camera"] = results.NO_VIDEO
         with results.RunFolder(folder, flight.telemetry, settings) as out:
             results.write_reconstruction(out, flight)
             results.write_answers(out, answers)
@@ -117,6 +127,8 @@ def print_flight(flight: Flight) -> None:
         pressure = f"{row.dynamic_pressure_pa:.1f}"
         table.add_row(row.event, f"{row.t_s:.2f}", f"{row.alt_m / 1e3:.2f}", f"{row.mach:.2f}", pressure, alpha)
     console.print(table)
+    if not flight.peak_is_inside:
+        console.print("[yellow]found[/] the data end before or begin after the peak of dynamic pressure")
     for finding in (*flight.telemetry.findings, *flight.reconstruction.findings):
         console.print(f"[yellow]found[/] {escape(str(finding))}")
     failed = [v for v in flight.reconstruction.verdicts if not v.passed]
@@ -143,8 +155,9 @@ def print_answers(answers: Answers, peak_s: float) -> None:
         angle, largest = f"{row['deflection_deg']:.2f}", f"{row['largest_deg']:.2f}"
         table.add_row(method, angle, f"{row['sd_deg']:.2f}", f"{plane:.0f}", largest, f"{row['largest_at_s']:.2f}")
     console.print(table)
-    for method, reason in answers.refused.items():
-        console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
+    for method, row in results.method_summary(answers, peak_s).items():
+        if "reason" in row:
+            console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")
 
 
 def deflection(folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None) -> None:
@@ -219,7 +232,7 @@ def demo(folder: Path, seed: int) -> None:
     check_destination(folder, replace=True)
     begun = time.perf_counter()
     console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
-    simulate("irve2_reference", folder, seed, force=True)
+    simulate(REFERENCE, folder, seed, force=True)
     flight, answers, written = run_flight(folder, METHODS, 20.0)
     print_flight(flight)
     for method, reason in answers.refused.items():

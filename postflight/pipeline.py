@@ -16,11 +16,13 @@ from estimators.misalignment import estimate_misalignment
 from estimators.pulse import PulseData
 from estimators.trim import estimate_trim
 from flightmodel.airdata import AirData, air_data, lateral_angles, peak_pressure
-from flightmodel.atmosphere import profile_from_sounding
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.atmosphere import BOTTOM_M, TOP_M, profile_from_sounding
+from flightmodel.checks import DivergenceError, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.earth import geodetic_from_ecef
 from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Telemetry
+from flightmodel.trajectory import Trajectory
 from recon.bet import Reconstruction, Settings, reconstruct
 
 Progress = Callable[[float, str], None]
@@ -43,6 +45,11 @@ class Flight:
         """Time of peak dynamic pressure by the BET and the day's density, s."""
         return peak_pressure(self.air.time_s, self.air.dynamic_pressure_pa)[0]
 
+    @property
+    def peak_is_inside(self) -> bool:
+        """Whether the largest dynamic pressure is a peak, not the first or last second of the data."""
+        return self.air.time_s[0] + 1.0 < self.peak_s < self.air.time_s[-1] - 1.0
+
 
 @dataclass(frozen=True)
 class Answers:
@@ -60,9 +67,22 @@ def reconstruct_flight(folder: Path, settings: Settings | None = None, progress:
     report(0.1, "reconstructing")
     bet = reconstruct(telemetry, settings, lambda f, what: report(0.1 + 0.85 * f, what))
     profile = profile_from_sounding(telemetry.sounding)
+    _check_flown(bet.smoothed)
     air = air_data(bet.smoothed, profile, telemetry.vehicle.cg_m)
     report(1.0, "reconstructed")
     return Flight(telemetry, bet, air, pulse_data(telemetry, bet, air))
+
+
+def _check_flown(trajectory: Trajectory) -> None:
+    """Raise `DivergenceError` where the reconstruction left the ground or the atmosphere's tables."""
+    _, _, altitude_m = geodetic_from_ecef(trajectory.position_ecef_m)
+    wrong = (altitude_m < BOTTOM_M) | (altitude_m > TOP_M)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise DivergenceError(
+            f"reconstruction: diverged: at {trajectory.time_s[k]:.1f} s the altitude is {altitude_m[k] / 1000:.1f} km. "
+            "Check the accelerometer's and gyros' units, signs and mounting, and the attitude prior"
+        )
 
 
 def window_means(time_s: FloatArray, values: FloatArray, start_s: FloatArray, end_s: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 import shutil
 import tempfile
@@ -27,6 +28,7 @@ from flightmodel.telemetry import Telemetry
 from postflight.pipeline import Answers, Flight
 
 DIGITS = "%.10g"
+NO_VIDEO = "the flight has no video"
 
 
 class RunFolder:
@@ -44,7 +46,8 @@ class RunFolder:
         """Make the partial folder beside the final one."""
         try:
             self.parent.mkdir(exist_ok=True)
-            self.path = Path(tempfile.mkdtemp(prefix=".partial-", dir=self.parent))
+            remove_abandoned(self.parent)
+            self.path = Path(tempfile.mkdtemp(prefix=f".partial-{os.getpid()}-", dir=self.parent))
         except OSError as fault:
             raise GateError(f"{self.parent}: cannot be written: {fault.strerror}; copy the flight folder") from None
         (self.path / "figures").mkdir()
@@ -80,6 +83,17 @@ class RunFolder:
         """Write one JSON object; NaN becomes null."""
         text = json.dumps(_no_nan(value), indent=2, allow_nan=False)
         (self.path / name).write_text(text + "\n")
+
+
+def remove_abandoned(parent: Path) -> None:
+    """Remove partial run folders whose process is gone: it was killed where it could not tidy up."""
+    for path in parent.glob(".partial-*-*"):
+        try:
+            os.kill(int(path.name.split("-")[1]), 0)
+        except ProcessLookupError:
+            shutil.rmtree(path, ignore_errors=True)
+        except (PermissionError, ValueError):
+            continue
 
 
 def _no_nan(value: Any) -> Any:
@@ -165,7 +179,8 @@ def deflection_table(history: DeflectionHistory) -> pd.DataFrame:
 def event_table(air: AirData, telemetry: Telemetry, peak_s: float) -> pd.DataFrame:
     """Moments of the flight with altitude, Mach number, dynamic pressure and total angle of attack."""
     moments = [(name, t) for name, t in telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
-    moments.append(("peak dynamic pressure", peak_s))
+    inside = air.time_s[0] + 1.0 < peak_s < air.time_s[-1] - 1.0
+    moments.append(("peak dynamic pressure" if inside else "largest dynamic pressure (edge of data)", peak_s))
     if (k := int(np.argmax(air.altitude_m))) not in (0, len(air.time_s) - 1):
         moments.append(("apogee", float(air.time_s[k])))
     for name, values, level in (
@@ -191,6 +206,7 @@ def method_summary(answers: Answers, at_s: float) -> dict[str, dict[str, Any]]:
     out: dict[str, dict[str, Any]] = {}
     for method, history in answers.histories.items():
         theta, sd = np.rad2deg(history.at(at_s))
+        known = history.time_s[np.isfinite(history.theta_rad)]
         largest = int(np.nanargmax(history.theta_rad))
         out[method] = {
             "deflection_deg": float(theta),
@@ -199,8 +215,11 @@ def method_summary(answers: Answers, at_s: float) -> dict[str, dict[str, Any]]:
             "largest_at_s": float(history.time_s[largest]),
             "assumptions": history.assumptions,
         }
+        if not np.isfinite(theta):
+            out[method]["deflection_deg"] = out[method]["sd_deg"] = None
+            out[method]["reason"] = f"no data at {at_s:.2f} s; answers span {known[0]:.2f} to {known[-1]:.2f} s"
     for method, reason in answers.refused.items():
-        out[method] = {"deflection_deg": None, "sd_deg": None, "reason": reason}
+        out[method] = {"deflection_deg": None, "sd_deg": None, "reason": reason, "applicable": reason != NO_VIDEO}
     return out
 
 

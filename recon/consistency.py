@@ -96,7 +96,7 @@ def edit_verdict(source: str, accepted: BoolArray) -> Verdict:
         0.0,
         MOST_EDITED,
         f"{count} of {len(accepted)} points edited",
-        f"{count} of {len(accepted)} points edited: look at the track before trusting the rest of it",
+        f"{count} of {len(accepted)} points edited: it and the rest of the data disagree, and either may be wrong",
     )
 
 

@@ -140,11 +140,16 @@ class Scenario:
     source: Path
 
 
+def shipped_scenarios() -> list[str]:
+    """Names of the scenarios that ship with the toolkit."""
+    return sorted(p.stem for p in (DATA / "scenarios").glob("*.toml"))
+
+
 def read_scenario(name: str) -> Scenario:
     """Read a scenario: a path to a TOML file, or the name of one that ships with the toolkit."""
     path = Path(name) if name.endswith(".toml") else DATA / "scenarios" / f"{name}.toml"
     if not path.exists():
-        shipped = [p.stem for p in (DATA / "scenarios").glob("*.toml")]
+        shipped = shipped_scenarios()
         raise ConfigError(f"no scenario '{name}'{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}")
     spec = parse_section(ScenarioFile, read_toml(path), str(path))
     return Scenario(spec, vehicle_from_toml(vehicle_path(spec.vehicle, path.parent)), path)

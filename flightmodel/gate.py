@@ -1,0 +1,114 @@
+"""The gate of a flight folder: keeps faults and findings while files are read, and opens where there is no fault."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from flightmodel import columns
+from flightmodel.checks import ConfigError, FloatArray, GateError, nearest_name
+from flightmodel.flightfile import Source
+from flightmodel.telemetry import Finding
+
+# no entry vehicle's instruments read beyond these; a larger number is a wrong unit or a broken word
+SANE_LIMIT = {"acceleration": 1.0e4, "rate": 400.0, "length": 1.0e8, "angle": 4.0 * np.pi}
+
+
+@dataclass(frozen=True)
+class Table:
+    """One file's times (where it has any), SI columns by short name, and the file line of each row."""
+
+    path: Path
+    label: str
+    time_s: FloatArray | None
+    columns: dict[str, FloatArray]
+    lines: FloatArray
+
+    def at(self, row: int) -> str:
+        """Return where a row stands, for messages."""
+        return f"{self.label}: {self.path}: line {int(self.lines[row])}"
+
+
+@dataclass
+class Gate:
+    """What is wrong with a folder (``faults`` of the data, ``config`` of flight.toml), and what is notable."""
+
+    folder: Path
+    t0: datetime
+    faults: list[str] = field(default_factory=list)
+    config: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+
+    def refuse_config(self, words: str) -> None:
+        """Keep a fault of flight.toml."""
+        self.config.append(f"{self.folder / 'flight.toml'}: {words}")
+
+    def close(self) -> None:
+        """Raise `ConfigError` or `GateError` with everything that was refused."""
+        if self.config:
+            raise ConfigError([*self.config, *self.faults])
+        if self.faults:
+            raise GateError(self.faults)
+
+    def wrong_place(self, path: Path, named: str) -> str:
+        """Return why a named file may not be read: outside the folder, or below its truth; empty where it may."""
+        root, target = self.folder.resolve(), path.resolve()
+        if Path(named).is_absolute() or not target.is_relative_to(root):
+            return f"file '{named}' lies outside the flight folder; copy it inside and name it relative to flight.toml"
+        if target.is_relative_to(root / "truth"):
+            return f"file '{named}' lies below truth/, which no estimator may open"
+        return ""
+
+    def path(self, named: str) -> Path | None:
+        """Path of a file or folder that flight.toml names; None, with a fault, where it may not be read."""
+        path = self.folder / named
+        wrong = self.wrong_place(path, named)
+        if wrong:
+            self.refuse_config(wrong)
+        return None if wrong else path
+
+    def table(
+        self, label: str, source: Source, quantities: tuple[columns.Quantity, ...], timed: bool = True
+    ) -> Table | None:
+        """Read one file; None, with its faults kept, where anything in it is refused."""
+        before = len(self.faults) + len(self.config)
+        shorts = [q.short for q in quantities]
+        for key in (k for k in source.columns if k not in shorts):
+            hint = nearest_name(key, shorts)
+            self.refuse_config(f"{label}.columns.{key}: no such quantity{hint}")
+        path = self.path(source.file)
+        if path is None:
+            return None
+        try:
+            frame = columns.read_table(path, label)
+        except GateError as fault:
+            self.faults.extend(fault.faults)
+            return None
+        time_s = columns.times_s(frame, source.time_column, self.t0, path, label, self.faults) if timed else None
+        values = {}
+        for quantity in quantities:
+            column = columns.column_si(frame, quantity, source.declared(quantity.short), path, label, self.faults)
+            if column is not None:
+                values[quantity.short] = column
+        table = Table(path, label, time_s, values, frame.attrs["lines"])
+        for quantity in quantities:
+            limit = SANE_LIMIT.get(quantity.kind, np.inf)
+            self.refuse_rows(table, quantity.short, -limit, limit, f"beyond any {quantity.kind} of a flight")
+        return table if len(self.faults) + len(self.config) == before else None
+
+    def refuse_rows(self, table: Table, short: str, low: float, high: float, words: str) -> None:
+        """Refuse a column's values outside ``low`` to ``high`` (SI), naming the first's line; missing ones pass."""
+        values = table.columns.get(short)
+        if values is None:
+            return
+        with np.errstate(invalid="ignore"):
+            wild = (values < low) | (values > high)
+        if wild.any():
+            k = int(np.argmax(wild))
+            count = f"({int(wild.sum())} such cells)"
+            self.faults.append(
+                f"{table.at(k)}: {short} = {values[k]:.6g} (SI) is {words} {count}; check its unit or leave it empty"
+            )

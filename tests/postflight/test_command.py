@@ -1,0 +1,387 @@
+"""The command as a user or a script meets it: exit codes, messages, nothing half-written, nothing deleted."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+HEAVY = {"numpy", "scipy", "numba", "matplotlib", "cv2", "trimesh", "filterpy", "pandas"}
+COMMANDS = ("demo", "simulate", "reconstruct", "deflection", "run", "score")
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+# ---------------------------------------------------------------------------------------------------------------- help
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"]])
+def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
+    """Help in under half a second needs that; the import list does not depend on the machine's load."""
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "postflight.cli", *arguments], capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    imported = {line.rsplit("|", 1)[-1].strip().split(".")[0] for line in done.stderr.splitlines() if "|" in line}
+    assert "click" in imported, "the list of imports was not read"
+    assert not imported & HEAVY
+
+
+def test_help_answers_soon(postflight) -> None:
+    """Half a second is wanted (0.2 s alone on the machine); three times that allows for neighbours at work."""
+    took = []
+    for _ in range(5):
+        start = time.perf_counter()
+        assert postflight("--help").returncode == 0
+        took.append(time.perf_counter() - start)
+    assert min(took) < 1.5
+
+
+def test_help_names_every_command(postflight) -> None:
+    text = postflight("--help").stdout
+    assert all(f"  {command} " in text for command in COMMANDS)
+
+
+def test_version(postflight) -> None:
+    from importlib.metadata import version
+
+    assert version("postflight") in postflight("--version").stdout
+
+
+# --------------------------------------------------------------------------------------------------------------- usage
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["rnu", "x"],
+        ["--colour"],
+        ["run"],
+        ["run", "x", "--rte", "3"],
+        ["run", "x", "--rate", "0"],
+        ["run", "x", "--rate", "nan"],
+        ["deflection", "x", "--method", "horizon"],
+        ["deflection", "x", "--method", "camera", "--joint", "-5"],
+        ["deflection", "x", "--method", "camera", "--joint", "nan"],
+        ["deflection", "x", "--method", "camera", "--plane", "nan"],
+        ["simulate", "irve2_reference", "x", "--seed", "-1"],
+        ["simulate", "irve2_reference", "x", "--seed", "two"],
+    ],
+)
+def test_wrong_usage_exits_2(command, tmp_path: Path, arguments: list[str]) -> None:
+    done = command(*arguments, cwd=tmp_path)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert "Error" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_command_names_the_nearest_or_the_way_to_help(command) -> None:
+    text = command("rnu").stderr
+    assert "run" in text or "--help" in text
+
+
+@pytest.mark.parametrize("verb", ["reconstruct", "deflection", "run", "score"])
+def test_missing_folder(command, tmp_path: Path, verb: str) -> None:
+    done = command(verb, "no-such-flight", cwd=tmp_path)
+    assert done.returncode in (2, 3)
+    assert "no-such-flight" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_in_place_of_the_folder(command, tmp_path: Path) -> None:
+    (tmp_path / "flight.csv").write_text("t_s\n1\n")
+    done = command("run", "flight.csv", cwd=tmp_path)
+    assert done.returncode in (2, 3)
+    assert "flight.csv" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_unknown_scenario_names_the_nearest(command, tmp_path: Path) -> None:
+    done = command("simulate", "irve2_refrence", "out", cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert "irve2_reference" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["name = ", 'nmae = "x"\n', ""])
+def test_bad_scenario_file_exits_2_and_writes_nothing(command, tmp_path: Path, text: str) -> None:
+    (tmp_path / "mine.toml").write_text(text)
+    done = command("simulate", "mine.toml", "out", cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert "mine.toml" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.toml"]
+
+
+def test_simulate_without_a_scenario_flies_the_reference(command, tmp_path: Path) -> None:
+    """The usage line says ``[SCENARIO] FOLDER``: a folder alone is enough (here a file, so that nothing is flown)."""
+    (tmp_path / "out").write_text("a file, not a folder")
+    done = command("simulate", "out", cwd=tmp_path)
+    assert "Missing argument" not in done.stderr
+    assert "out" in done.stderr
+    assert (tmp_path / "out").read_text() == "a file, not a folder"
+
+
+# --------------------------------------------------------------------------------------------- places to write, or not
+
+
+def test_runs_that_cannot_be_written(command, flight) -> None:
+    (flight.root / "runs").write_text("a file where the results should go")
+    before = tree(flight.root)
+    done = command("reconstruct", flight.root)
+    assert done.returncode in (2, 3)
+    assert "runs" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert tree(flight.root) == before
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write to a read-only folder")
+def test_read_only_folder(command, flight) -> None:
+    flight.root.chmod(0o555)
+    try:
+        done = command("reconstruct", flight.root)
+    finally:
+        flight.root.chmod(0o755)
+    assert done.returncode in (2, 3)
+    assert "runs" in done.stderr
+    assert "written" in done.stderr or "denied" in done.stderr.lower()
+    assert "Traceback" not in done.stderr
+
+
+@pytest.fixture
+def precious(tmp_path: Path) -> Path:
+    """A folder that is no flight at all."""
+    folder = tmp_path / "thesis"
+    (folder / "chapters").mkdir(parents=True)
+    (folder / "chapters" / "one.txt").write_text("three years of work")
+    return folder
+
+
+@pytest.mark.parametrize("more", [[], ["--force"]])
+def test_simulate_leaves_a_foreign_folder_alone(command, precious: Path, more: list[str]) -> None:
+    before = tree(precious)
+    done = command("simulate", "irve2_reference", precious, *more)
+    assert done.returncode in (2, 3), done.stdout
+    assert "thesis" in done.stderr
+    assert tree(precious) == before
+    assert [p.name for p in precious.parent.iterdir()] == ["thesis"]
+
+
+def test_demo_leaves_a_foreign_folder_alone(command, precious: Path) -> None:
+    before = tree(precious)
+    done = command("demo", precious)
+    assert done.returncode in (2, 3), done.stdout
+    assert tree(precious) == before
+
+
+def test_simulate_does_not_overwrite_without_force(command, flight) -> None:
+    flight.replace("flight.toml", 'vehicle = "irve2_reference"', 'vehicle = "irve2_reference"\nsynthetic = true')
+    (flight.root / "truth").mkdir()
+    (flight.root / "truth" / "truth.csv").write_text("t_s\n420.0\n")
+    before = tree(flight.root)
+    done = command("simulate", "irve2_reference", flight.root)
+    assert done.returncode in (2, 3)
+    assert "--force" in done.stderr
+    assert tree(flight.root) == before
+
+
+@pytest.mark.parametrize(
+    "disguise", ["", '\ndescription = "no synthetic = true flight"', "\n# synthetic = true", "\nsynthetic = false"]
+)
+@pytest.mark.parametrize("verb", ["simulate", "demo"])
+def test_force_never_deletes_a_real_flight(command, flight, verb: str, disguise: str) -> None:
+    flight.replace("flight.toml", 'vehicle = "irve2_reference"', 'vehicle = "irve2_reference"' + disguise)
+    before = tree(flight.root)
+    arguments = ["irve2_reference", flight.root, "--force"] if verb == "simulate" else [flight.root]
+    done = command(verb, *arguments)
+    assert done.returncode in (2, 3), done.stdout
+    assert tree(flight.root) == before
+
+
+@pytest.mark.parametrize("verb", ["simulate", "demo"])
+def test_force_never_deletes_a_delivery_that_another_simulator_made(command, flight, verb: str) -> None:
+    """``synthetic = true`` and no truth: somebody else's files, which no seed can bring back."""
+    flight.replace("flight.toml", 'vehicle = "irve2_reference"', 'vehicle = "irve2_reference"\nsynthetic = true')
+    before = tree(flight.root)
+    arguments = ["irve2_reference", flight.root, "--force"] if verb == "simulate" else [flight.root]
+    done = command(verb, *arguments)
+    assert done.returncode in (2, 3), done.stdout
+    assert tree(flight.root) == before
+
+
+def test_parent_of_the_destination_is_missing(command, tmp_path: Path) -> None:
+    """Made on the way, or refused before the flight is flown; never a traceback."""
+    (tmp_path / "file").write_text("x")
+    done = command("simulate", "irve2_reference", tmp_path / "file" / "deeper" / "out")
+    assert done.returncode in (2, 3)
+    assert "Traceback" not in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+# ---------------------------------------------------------------------------------------------------------- interrupted
+
+
+def start(*arguments: str | Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "postflight.cli", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for_new(parent: Path, known: set[str], process: subprocess.Popen[str], limit_s: float = 60.0) -> bool:
+    """Wait until something is being written; False where the process ended first."""
+    end = time.monotonic() + limit_s
+    while time.monotonic() < end and process.poll() is None:
+        if parent.is_dir() and {p.name for p in parent.iterdir()} - known:
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def test_interrupt_during_run_leaves_nothing(flight) -> None:
+    before = flight.contents()
+    process = start("run", flight.root)
+    written = wait_for_new(flight.root / "runs", set(), process)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert written, errors
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert flight.contents() - {"runs"} == before
+
+
+@pytest.mark.slow
+def test_terminated_run_leaves_no_run_that_looks_whole(flight, postflight) -> None:
+    process = start("run", flight.root)
+    assert wait_for_new(flight.root / "runs", set(), process)
+    process.kill()
+    process.communicate(timeout=30)
+    assert [p for p in (flight.root / "runs").iterdir() if not p.name.startswith(".")] == []
+    (flight.root / "truth").mkdir()
+    (flight.root / "truth" / "truth.csv").write_text("t_s\n420.0\n")
+    done = postflight("score", flight.root)
+    assert done.returncode == 3
+    assert "no finished run" in done.stderr
+
+
+@pytest.mark.slow
+def test_interrupt_during_simulate_leaves_nothing(tmp_path: Path) -> None:
+    process = start("simulate", "irve2_reference", tmp_path / "out")
+    written = wait_for_new(tmp_path, set(), process)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert written
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupt_before_anything_is_written(tmp_path: Path) -> None:
+    process = start("simulate", "irve2_reference", tmp_path / "out")
+    time.sleep(1.5)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------------------------------------------------------- score
+
+
+def test_score_without_truth_exits_3(command, flight) -> None:
+    done = command("score", flight.root, "--json")
+    assert done.returncode == 3
+    assert "truth" in done.stderr
+    assert done.stdout == ""
+
+
+def test_score_with_broken_truth_exits_3_without_traceback(command, flight) -> None:
+    (flight.root / "truth").mkdir()
+    for name in ("truth.csv", "deflection.csv"):
+        (flight.root / "truth" / name).write_text("")
+    run = flight.root / "runs" / "20260101T000000Z-00000000"
+    run.mkdir(parents=True)
+    for name in ("run.json", "summary.json"):
+        (run / name).write_text(json.dumps({"methods": {}}))
+    (run / "bet.csv").write_text("t_s\n")
+    done = command("score", flight.root)
+    assert done.returncode == 3
+    assert "Traceback" not in done.stderr
+
+
+# ----------------------------------------------------------------------------------------------- a flight, run twice
+
+
+@pytest.fixture(scope="session")
+def two_runs(clean_flight, postflight, tmp_path_factory: pytest.TempPathFactory):
+    """The hand-made flight run twice, the second time by a link from another directory with spaces and accents."""
+    home = tmp_path_factory.mktemp("vols d’été")
+    shutil.copytree(clean_flight.root, home / "vol numéro 1")
+    (home / "link").symlink_to(home / "vol numéro 1", target_is_directory=True)
+    first = postflight("run", "vol numéro 1", cwd=home)
+    one = sorted((home / "vol numéro 1" / "runs").iterdir())
+    saved = tree(one[0]) if one else {}
+    time.sleep(1.1)  # run folders are named to a second
+    second = postflight("run", home / "link", cwd="/")
+    two = [p for p in sorted((home / "vol numéro 1" / "runs").iterdir()) if p not in one]
+    return first, second, saved, tree(two[0]) if two else {}
+
+
+@pytest.mark.slow
+def test_estimators_that_cannot_answer_exit_4_and_say_why(two_runs) -> None:
+    """No physics in the hand-made numbers: no method can answer, and the trajectory is written all the same."""
+    first, second, saved, _ = two_runs
+    assert first.returncode == 4, first.stdout + first.stderr
+    assert second.returncode == 4, second.stdout + second.stderr
+    assert first.stdout.count("no answer from") == 3
+    assert "Traceback" not in first.stderr + second.stderr
+    assert {"bet.csv", "residuals.csv", "verdicts.csv", "findings.csv", "summary.json", "run.json"} <= set(saved)
+
+
+@pytest.mark.slow
+def test_nonsense_is_not_reported_as_a_good_trajectory(two_runs) -> None:
+    first, _, saved, _ = two_runs
+    assert "verdict" in first.stdout
+    assert b"False" in saved["verdicts.csv"]
+
+
+@pytest.mark.slow
+def test_second_run_gives_the_same_bytes(two_runs) -> None:
+    _, _, one, two = two_runs
+    assert one
+    assert sorted(one) == sorted(two)
+    different = [name for name in one if one[name] != two[name]]
+    assert different == ["run.json"]
+
+
+@pytest.mark.slow
+def test_run_json_says_what_was_run_on_what(two_runs) -> None:
+    _, _, one, _ = two_runs
+    facts = json.loads(one["run.json"])
+    assert {"version", "settings", "inputs_sha256"} <= set(facts)
+    assert all(len(digest) == 64 for digest in facts["inputs_sha256"].values())
+    assert any("flight.toml" in name for name in facts["inputs_sha256"])
+
+
+@pytest.mark.slow
+def test_no_result_file_names_this_machine(two_runs, clean_flight) -> None:
+    _, _, one, _ = two_runs
+    text = b"".join(data for name, data in one.items() if not name.endswith(".png"))
+    assert b"vol num" not in text
+    assert str(Path.home()).encode() + b"/" not in text

@@ -1,0 +1,437 @@
+"""The whole chain on one flight: fly, forget the truth, reconstruct, find the deflection three ways, score.
+
+Limits are those that the demo flight must reach with nominal instrument errors. Bounds on the consistency of errors
+with their standard deviations are four sd of a single draw (exceeded once in 16 000 by chance), or for a whole history
+the mean square of error / sd, which is correlated in time and so is given one wide two-sided band.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+METHODS = ("camera", "misalignment", "trim")
+DEFLECTION_LIMIT_DEG = {"camera": 0.7, "misalignment": 0.7, "trim": 1.2}
+PULSE_FRACTION = 0.5  # the pressure pulse: dynamic pressure above half its peak
+
+pytestmark = pytest.mark.slow
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def copy_of(flight: Path, target: Path, *leave_out: str) -> Path:
+    shutil.copytree(flight, target, ignore=shutil.ignore_patterns(*leave_out))
+    return target
+
+
+def newest(flight: Path) -> Path:
+    return sorted(p for p in (flight / "runs").iterdir() if not p.name.startswith("."))[-1]
+
+
+@pytest.fixture(scope="module")
+def truth(flown: Path) -> pd.DataFrame:
+    return pd.read_csv(flown / "truth" / "truth.csv")
+
+
+@pytest.fixture(scope="module")
+def true_deflection(flown: Path) -> pd.DataFrame:
+    return pd.read_csv(flown / "truth" / "deflection.csv")
+
+
+@pytest.fixture(scope="module")
+def bet(run_folder: Path) -> pd.DataFrame:
+    return pd.read_csv(run_folder / "bet.csv")
+
+
+@pytest.fixture(scope="module")
+def peak_s(truth: pd.DataFrame) -> float:
+    return float(truth["t_s"][truth["dynamic_pressure_pa"].idxmax()])
+
+
+@pytest.fixture(scope="module")
+def pulse(bet: pd.DataFrame, truth: pd.DataFrame) -> np.ndarray:
+    pressure = np.interp(bet["t_s"], truth["t_s"], truth["dynamic_pressure_pa"])
+    return pressure > PULSE_FRACTION * truth["dynamic_pressure_pa"].max()
+
+
+@pytest.fixture(scope="module")
+def scored(command, flown: Path) -> dict:
+    """The one object that ``score --json`` prints."""
+    done = command("score", flown, "--json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    return json.loads(done.stdout)
+
+
+def errors(bet: pd.DataFrame, truth: pd.DataFrame, names: list[str]) -> np.ndarray:
+    """Estimate minus truth, the truth carried to the estimate's times by a cubic through its 50 Hz samples."""
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(truth["t_s"], truth[names])
+    return bet[names].to_numpy() - spline(bet["t_s"])
+
+
+# ----------------------------------------------------------------------------------------------------------- trajectory
+
+
+def test_position_and_velocity_over_the_pulse(bet, truth, pulse) -> None:
+    position = errors(bet, truth, ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m"])[pulse]
+    velocity = errors(bet, truth, ["vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"])[pulse]
+    assert np.sqrt((position**2).sum(axis=1).mean()) < 30.0
+    assert np.sqrt((velocity**2).sum(axis=1).mean()) < 0.5
+
+
+def test_total_angle_of_attack_over_the_pulse(bet, truth, pulse) -> None:
+    error = bet["alpha_total_wind_deg"] - np.interp(bet["t_s"], truth["t_s"], truth["alpha_body_deg"])
+    assert np.sqrt((error[pulse] ** 2).mean()) < 0.5
+
+
+def test_altitude_mach_and_pressure_follow_the_truth(bet, truth, pulse) -> None:
+    """The sounding errs by a few percent in density and a few kelvin, so the bounds are 4 sd of these."""
+    altitude = bet["alt_m"] - np.interp(bet["t_s"], truth["t_s"], truth["alt_m"])
+    assert np.abs(altitude[pulse]).max() < 60.0
+    ratio = bet["dynamic_pressure_pa"] / np.interp(bet["t_s"], truth["t_s"], truth["dynamic_pressure_pa"])
+    assert np.abs(ratio[pulse] - 1.0).max() < 0.16
+    mach = bet["mach"] / np.interp(bet["t_s"], truth["t_s"], truth["mach"])
+    assert np.abs(mach[pulse] - 1.0).max() < 0.08
+
+
+@pytest.mark.parametrize(
+    ("names", "sd"),
+    [
+        (["rx_ecef_m", "ry_ecef_m", "rz_ecef_m"], ["rx_ecef_sd_m", "ry_ecef_sd_m", "rz_ecef_sd_m"]),
+        (["vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"], ["vx_ecef_sd_mps", "vy_ecef_sd_mps", "vz_ecef_sd_mps"]),
+    ],
+)
+def test_trajectory_errors_are_within_four_sd(bet, truth, pulse, names: list[str], sd: list[str]) -> None:
+    ratio = np.abs(errors(bet, truth, names) / bet[sd].to_numpy())[pulse]
+    assert np.isfinite(ratio).all()
+    assert ratio.max() < 4.0
+    assert ratio.max() > 0.02, "an error of nothing means that the truth has been seen"
+
+
+def test_angle_of_attack_error_is_within_four_sd(bet, truth, pulse) -> None:
+    error = bet["alpha_total_wind_deg"] - np.interp(bet["t_s"], truth["t_s"], truth["alpha_body_deg"])
+    ratio = np.abs(error / bet["alpha_total_wind_sd_deg"])[pulse]
+    assert ratio.max() < 4.0
+
+
+def test_standard_deviations_are_positive_everywhere(bet) -> None:
+    columns = [name for name in bet if "_sd_" in name]
+    assert len(columns) >= 12
+    values = bet[columns].to_numpy()
+    assert np.isfinite(values).all()
+    assert (values > 0.0).all()
+
+
+def test_verdicts_of_a_nominal_flight_pass(run_folder: Path) -> None:
+    """Instruments err as flight.toml says, so that no verdict may be red."""
+    verdicts = pd.read_csv(run_folder / "verdicts.csv")
+    assert len(verdicts) >= 5
+    failed = verdicts.loc[~verdicts["passed"].astype(bool), ["name", "value", "low", "high"]]
+    assert failed.empty, failed.to_string()
+
+
+# ----------------------------------------------------------------------------------------------------------- deflection
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_deflection_at_peak_is_recovered(scored: dict, method: str) -> None:
+    row = scored["methods"][method]
+    assert {"deflection_deg", "sd_deg", "truth_deg", "error_deg"} <= set(row)
+    assert row["error_deg"] == pytest.approx(row["deflection_deg"] - row["truth_deg"], abs=1e-9)
+    assert abs(row["error_deg"]) < DEFLECTION_LIMIT_DEG[method]
+    assert abs(row["error_deg"]) < 4.0 * row["sd_deg"]
+    assert 0.01 < row["sd_deg"] < DEFLECTION_LIMIT_DEG[method]
+    assert row["truth_deg"] > 1.0, "nothing bent, nothing shown"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_score_is_what_the_files_say(scored: dict, run_folder: Path, true_deflection, truth, peak_s, method) -> None:
+    """Recomputed here from the CSV files; 0.05 deg covers the sample nearest the peak against the peak itself."""
+    table = pd.read_csv(run_folder / f"deflection_{method}.csv")
+    at_peak = np.interp(scored["peak_dynamic_pressure_s"], table["t_s"], table["theta_deg"])
+    assert scored["methods"][method]["deflection_deg"] == pytest.approx(at_peak, abs=1e-6)
+    true = np.interp(peak_s, true_deflection["t_s"], true_deflection["theta_deg"])
+    assert scored["methods"][method]["truth_deg"] == pytest.approx(true, abs=0.05)
+    assert scored["peak_dynamic_pressure_s"] == pytest.approx(peak_s, abs=0.05)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_deflection_history_follows_the_truth(run_folder: Path, true_deflection, truth, method: str) -> None:
+    """Not only at the peak: over the pulse each method's rms error is within its limit and fits its sd."""
+    table = pd.read_csv(run_folder / f"deflection_{method}.csv")
+    pressure = np.interp(table["t_s"], truth["t_s"], truth["dynamic_pressure_pa"])
+    table = table[pressure > PULSE_FRACTION * truth["dynamic_pressure_pa"].max()]
+    assert len(table) > 30
+    error = table["theta_deg"] - np.interp(table["t_s"], true_deflection["t_s"], true_deflection["theta_deg"])
+    assert np.sqrt((error**2).mean()) < DEFLECTION_LIMIT_DEG[method]
+    assert (np.abs(error) < 4.0 * table["theta_sd_deg"]).mean() > 0.99
+    assert 0.02 < ((error / table["theta_sd_deg"]) ** 2).mean() < 6.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_plane_of_deflection_follows_the_truth(run_folder: Path, true_deflection, peak_s: float, method: str) -> None:
+    table = pd.read_csv(run_folder / f"deflection_{method}.csv")
+    row = table.iloc[(table["t_s"] - peak_s).abs().argmin()]
+    k = (true_deflection["t_s"] - row["t_s"]).abs().argmin()
+    turn = (row["plane_lv_deg"] - true_deflection["plane_lv_deg"].iloc[k] + 180.0) % 360.0 - 180.0
+    assert abs(turn) < max(4.0 * row["plane_sd_deg"], 1.0)
+    assert abs(turn) < 25.0
+
+
+def test_methods_agree_with_each_other(scored: dict) -> None:
+    rows = [scored["methods"][m] for m in METHODS]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        apart = abs(rows[a]["deflection_deg"] - rows[b]["deflection_deg"])
+        assert apart < 4.0 * np.hypot(rows[a]["sd_deg"], rows[b]["sd_deg"])
+
+
+# ---------------------------------------------------------------------------------------------------------------- score
+
+
+def test_score_json_is_one_object(command, flown: Path) -> None:
+    done = command("score", flown, "--json")
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 1
+    result = json.loads(done.stdout, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    assert set(result["methods"]) == set(METHODS)
+    assert {"position_rms_m", "velocity_rms_mps"} <= set(result["bet"])
+    assert any("alpha" in key for key in result["bet"])
+
+
+def test_score_bet_errors_are_those_of_the_files(scored: dict, bet, truth, pulse) -> None:
+    """Ends of the pulse may fall a sample apart: 2 % of the rms."""
+    position = errors(bet, truth, ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m"])[pulse]
+    velocity = errors(bet, truth, ["vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"])[pulse]
+    assert scored["bet"]["position_rms_m"] == pytest.approx(np.sqrt((position**2).sum(axis=1).mean()), rel=0.02)
+    assert scored["bet"]["velocity_rms_mps"] == pytest.approx(np.sqrt((velocity**2).sum(axis=1).mean()), rel=0.05)
+
+
+def _spoiled(flown: Path, run_folder: Path, tmp_path: Path) -> tuple[Path, Path]:
+    folder = copy_of(flown, tmp_path / "flight", "camera5")
+    return folder, folder / "runs" / run_folder.name
+
+
+def _change(path: Path, column: str, change) -> None:
+    table = pd.read_csv(path)
+    table[column] = change(table[column])
+    table.to_csv(path, index=False)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_score_exits_5_where_a_deflection_is_wrong(command, flown, run_folder, tmp_path, method: str) -> None:
+    folder, run = _spoiled(flown, run_folder, tmp_path)
+    _change(run / f"deflection_{method}.csv", "theta_deg", lambda v: v + 1.5 * DEFLECTION_LIMIT_DEG[method])
+    done = command("score", folder, "--json")
+    assert done.returncode == 5
+    result = json.loads(done.stdout)
+    assert abs(result["methods"][method]["error_deg"]) > DEFLECTION_LIMIT_DEG[method]
+
+
+@pytest.mark.parametrize(
+    ("column", "shift"), [("rx_ecef_m", 40.0), ("vy_ecef_mps", 0.8), ("alpha_total_wind_deg", 0.9)]
+)
+def test_score_exits_5_where_the_trajectory_is_wrong(command, flown, run_folder, tmp_path, column, shift) -> None:
+    folder, run = _spoiled(flown, run_folder, tmp_path)
+    _change(run / "bet.csv", column, lambda v: v + shift)
+    assert command("score", folder).returncode == 5
+
+
+def test_score_exits_5_where_a_method_has_no_answer(command, flown, run_folder, tmp_path) -> None:
+    folder, run = _spoiled(flown, run_folder, tmp_path)
+    (run / "deflection_camera.csv").unlink()
+    done = command("score", folder, "--json")
+    assert done.returncode == 5
+    assert json.loads(done.stdout)["methods"]["camera"]["deflection_deg"] is None
+
+
+def test_score_exits_5_where_an_answer_is_no_number(command, flown, run_folder, tmp_path) -> None:
+    """NaN compares false with every limit: it must not pass for recovery, nor be printed as JSON."""
+    folder, run = _spoiled(flown, run_folder, tmp_path)
+    _change(run / "deflection_trim.csv", "theta_deg", lambda v: v * np.nan)
+    done = command("score", folder, "--json")
+    assert done.returncode == 5
+    json.loads(done.stdout, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+
+
+def test_score_exits_5_where_the_answers_stop_short_of_the_peak(
+    command, flown, run_folder, tmp_path, peak_s: float
+) -> None:
+    """Six seconds without an answer around the peak are not bridged by a straight line."""
+    folder, run = _spoiled(flown, run_folder, tmp_path)
+    path = run / "deflection_misalignment.csv"
+    table = pd.read_csv(path)
+    table[(table["t_s"] - peak_s).abs() > 3.0].to_csv(path, index=False)
+    done = command("score", folder, "--json")
+    assert done.returncode == 5
+    assert json.loads(done.stdout)["methods"]["misalignment"]["deflection_deg"] is None
+
+
+def test_score_finds_the_newest_whole_run(command, flown, run_folder, tmp_path) -> None:
+    """A later run of one estimator alone has no trajectory: it does not hide the whole run before it."""
+    folder, run = _spoiled(flown, run_folder, tmp_path)
+    later = run.parent / "29990101T000000Z-00000000"
+    later.mkdir()
+    shutil.copyfile(run / "run.json", later / "run.json")
+    shutil.copyfile(run / "deflection_camera.csv", later / "deflection_camera.csv")
+    assert command("score", folder).returncode == 0
+
+
+# ------------------------------------------------------------------------------------------- nobody has seen the truth
+
+
+@pytest.fixture(scope="module")
+def without_truth(command, flown: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = copy_of(flown, tmp_path_factory.mktemp("blind") / "other name", "truth", "runs")
+    done = command("run", folder)
+    assert done.returncode == 0, done.stderr
+    return newest(folder)
+
+
+def test_without_truth_every_result_has_the_same_bytes(run_folder: Path, without_truth: Path) -> None:
+    seen, blind = tree(run_folder), tree(without_truth)
+    assert sorted(seen) == sorted(blind)
+    assert {f"deflection_{m}.csv" for m in METHODS} <= set(seen)
+    assert [name for name in seen if seen[name] != blind[name]] == ["run.json"]
+
+
+def test_pictures_and_tables_are_there(run_folder: Path) -> None:
+    import cv2
+
+    files = tree(run_folder)
+    wanted = {"bet.csv", "residuals.csv", "verdicts.csv", "summary.json", "run.json", "log.jsonl"}
+    assert wanted <= set(files)
+    pictures = [name for name in files if name.endswith(".png")]
+    for number in ("1_3", "2_3", "2_5", "2_7"):
+        assert any(number in name for name in pictures), f"no figure in the manner of the paper's {number}"
+    for name in pictures:
+        image = cv2.imread(str(run_folder / name))
+        assert image is not None
+        assert image.std() > 5.0, f"{name} is blank"
+
+
+# ---------------------------------------------------------------------------------------------------------------- teeth
+
+
+def _drop_frames(folder: Path) -> None:
+    toml = folder / "flight.toml"
+    text = toml.read_text()
+    start = text.index("[frames]")
+    toml.write_text(text[:start] + text[text.index("[", start + 1) :])
+
+
+def test_no_answer_where_the_accelerometer_was_silent(command, flown: Path, truth, tmp_path: Path, peak_s) -> None:
+    """Seven seconds of missing samples around the peak: no deflection may be named there, the rest stays honest."""
+    folder = copy_of(flown, tmp_path / "flight", "runs", "camera5", "frames.csv", "truth")
+    _drop_frames(folder)
+    path = folder / "telemetry" / "accelerometer.csv"
+    table = pd.read_csv(path)
+    table.loc[(table["t_s"] - peak_s).abs() < 3.5, table.columns[1:]] = np.nan
+    table.to_csv(path, index=False)
+    done = command("run", folder)
+    assert done.returncode in (0, 4), done.stderr
+    assert "samples missing" in done.stdout
+    run = newest(folder)
+    for method in ("misalignment", "trim"):
+        rows = pd.read_csv(run / f"deflection_{method}.csv")
+        assert not ((rows["t_s"] - peak_s).abs() < 3.0).any()
+        assert json.loads((run / "summary.json").read_text())["methods"][method]["deflection_deg"] is None
+    bet = pd.read_csv(run / "bet.csv")
+    near = (bet["t_s"] - peak_s).abs() < 10.0
+    names = [f"v{a}_ecef_mps" for a in "xyz"]
+    ratio = np.abs(errors(bet, truth, names) / bet[[f"v{a}_ecef_sd_mps" for a in "xyz"]].to_numpy())[near]
+    assert ratio.max() < 4.0
+
+
+def test_swapped_accelerometer_axes_turn_something_red(command, flown: Path, tmp_path: Path) -> None:
+    """Two columns in each other's place, as a wiring list can have it: a verdict and the score go red, or no answer."""
+    folder = copy_of(flown, tmp_path / "flight", "runs", "camera5", "frames.csv")
+    _drop_frames(folder)
+    path = folder / "telemetry" / "accelerometer.csv"
+    table = pd.read_csv(path)
+    table[["ay_suba_mps2", "az_suba_mps2"]] = table[["az_suba_mps2", "ay_suba_mps2"]].to_numpy()
+    table.to_csv(path, index=False)
+    done = command("run", folder)
+    if done.returncode != 0:
+        assert done.returncode in (3, 4)
+        return
+    verdicts = pd.read_csv(newest(folder) / "verdicts.csv")
+    assert not verdicts["passed"].astype(bool).all()
+    assert "verdict" in done.stdout
+    assert command("score", folder).returncode == 5
+
+
+# ------------------------------------------------------------------------------------------- a flight from elsewhere
+
+
+def test_range_package_runs_end_to_end(delivered) -> None:
+    done, run = delivered
+    files = tree(run)
+    wanted = {"bet.csv", "residuals.csv", "verdicts.csv", "findings.csv", "events.csv", "summary.json", "run.json"}
+    assert wanted | {"deflection_misalignment.csv", "deflection_trim.csv"} <= set(files)
+    assert "deflection_camera.csv" not in files
+    pictures = [name for name in files if name.endswith(".png")]
+    assert all(any(number in name for name in pictures) for number in ("1_3", "2_5", "2_7"))
+    assert "no answer" in done.stdout
+    assert "video" in done.stdout
+    assert "Traceback" not in done.stderr
+
+
+def test_range_package_verdicts_and_findings(delivered) -> None:
+    """The delivery's own README speaks of a dropout and of track errors: both must be named with their times."""
+    done, run = delivered
+    verdicts = pd.read_csv(run / "verdicts.csv")
+    assert len(verdicts) >= 5
+    assert np.isfinite(verdicts["value"]).all()
+    findings = pd.read_csv(run / "findings.csv")
+    dropout = findings[findings["source"].str.contains("accelerometer") & findings["what"].str.startswith("gap")]
+    assert len(dropout) == 1
+    assert 300.0 < dropout["start_s"].iloc[0] < dropout["end_s"].iloc[0] < 530.0
+    assert findings["source"].str.contains("wallops").any()
+    assert f"{dropout['start_s'].iloc[0]:.2f}" in done.stdout
+
+
+def test_range_package_trajectory(delivered) -> None:
+    """From where the README says the data begin to where they end, coming down through 202 km to below 40 km."""
+    bet = pd.read_csv(delivered[1] / "bet.csv")
+    assert bet["t_s"].iloc[0] == pytest.approx(300.0, abs=1.0)
+    assert bet["t_s"].iloc[-1] > 520.0
+    assert bet["alt_m"].iloc[0] == pytest.approx(202e3, abs=1e3)
+    assert bet["alt_m"].min() < 35e3
+    values = bet[[c for c in bet if "_sd_" in c]].to_numpy()
+    assert np.isfinite(values).all()
+    pulse = bet["dynamic_pressure_pa"] > PULSE_FRACTION * bet["dynamic_pressure_pa"].max()
+    assert bet.loc[pulse, [f"r{a}_ecef_sd_m" for a in "xyz"]].to_numpy().max() < 15.0
+    assert bet.loc[pulse, "alpha_total_wind_sd_deg"].max() < 1.0
+
+
+@pytest.mark.parametrize("method", ["misalignment", "trim"])
+def test_range_package_deflection_histories(delivered, method: str) -> None:
+    table = pd.read_csv(delivered[1] / f"deflection_{method}.csv")
+    span = table[(table["t_s"] >= 430.0) & (table["t_s"] <= 445.0)]
+    assert np.diff(span["t_s"]).max() < 0.2, "no hole in the history"
+    assert len(span) >= 15 * 10
+    assert np.isfinite(span[["theta_deg", "theta_sd_deg", "plane_lv_deg"]].to_numpy()).all()
+    assert (span["theta_sd_deg"] > 0.0).all()
+    assert span["theta_deg"].between(0.0, 15.0).all()
+    assert (np.diff(table["t_s"]) > 0.0).all()
+
+
+def test_range_package_methods_agree_at_peak(delivered) -> None:
+    methods = json.loads((delivered[1] / "summary.json").read_text())["methods"]
+    a, b = methods["misalignment"], methods["trim"]
+    assert abs(a["deflection_deg"] - b["deflection_deg"]) < 3.0 * np.hypot(a["sd_deg"], b["sd_deg"])
+    assert a["deflection_deg"] > 3.0 * a["sd_deg"], "the deflection must stand out of its own uncertainty"
+
+
+def test_range_package_cannot_be_scored(command, delivered) -> None:
+    done = command("score", delivered[1].parents[1])
+    assert done.returncode == 3
+    assert "truth" in done.stderr
