@@ -19,7 +19,7 @@ from rich.table import Table
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.flightfolder import read_flight
 from postflight import drawing, figures, results, scoring
-from postflight.pipeline import METHODS, Answers, Flight, estimate, reconstruct_flight
+from postflight.pipeline import METHODS, Answers, Flight, camera_sensitivity, estimate, reconstruct_flight
 from recon.bet import Settings
 from synthetic_flight.folder import check_destination, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
@@ -110,6 +110,10 @@ def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[
         with results.RunFolder(folder, flight.telemetry, settings) as out:
             results.write_reconstruction(out, flight)
             results.write_answers(out, answers)
+            if "camera" in answers.histories:
+                out.write_csv(
+                    "camera_sensitivity.csv", camera_sensitivity(flight.telemetry, answers.histories["camera"])
+                )
             out.write_json("summary.json", results.summary(flight, answers))
             drawing.draw_run(flight, answers, out.path / "figures", step(0.7, 1.0))
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))

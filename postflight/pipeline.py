@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from estimators.camera_deflection import deflection_from_frames
+from estimators.camera_deflection import deflection_from_frames, read_frame, sensitivity_table
 from estimators.misalignment import estimate_misalignment
 from estimators.pulse import PulseData
 from estimators.trim import estimate_trim
@@ -27,6 +28,8 @@ from recon.bet import Reconstruction, Settings, reconstruct
 
 Progress = Callable[[float, str], None]
 METHODS = ("camera", "misalignment", "trim")
+# assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
+PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
 # half the window over which sensors are averaged: well below the joint's 2.5 Hz, well above the sampling interval
 HALF_WINDOW_S = 0.05
 
@@ -159,6 +162,27 @@ def estimate_camera(
         benchmark_time_s=frames.benchmark_s,
         plane_lv_rad=plane_lv_rad,
     )
+
+
+def camera_sensitivity(telemetry: Telemetry, history: DeflectionHistory) -> pd.DataFrame:
+    """Deflection read from the frame of the largest one under other assumptions: the seed paper's Table 2.1.
+
+    Columns ``joint_station_m, plane_lv_deg, deflection_deg, paper_deg``. It need not equal the paper's column: one
+    camera sees the component towards it, and the shell and lens are not IRVE-II's.
+    """
+    frames, vehicle = telemetry.frames, telemetry.vehicle
+    assert frames is not None
+    benchmark = int(np.argmin(np.abs(frames.time_s - frames.benchmark_s)))
+    straight, bent = (read_frame(frames.paths[k]) for k in (benchmark, int(np.nanargmax(history.theta_rad))))
+    stations = np.array([0.0, vehicle.joint.station_m])
+    planes = np.deg2rad(list(PAPER_TABLE_2_1_DEG))
+    angles = sensitivity_table(straight, bent, vehicle.geometry, frames.camera, planes, stations)
+    rows = [
+        (station, plane, np.rad2deg(angle), paper)
+        for station, line in zip(stations, angles, strict=True)
+        for (plane, paper), angle in zip(PAPER_TABLE_2_1_DEG.items(), line, strict=True)
+    ]
+    return pd.DataFrame(rows, columns=["joint_station_m", "plane_lv_deg", "deflection_deg", "paper_deg"])
 
 
 def estimate(

@@ -435,3 +435,14 @@ def test_range_package_cannot_be_scored(command, delivered) -> None:
     done = command("score", delivered[1].parents[1])
     assert done.returncode == 3
     assert "truth" in done.stderr
+
+
+def test_sensitivity_to_plane_and_joint_has_the_shape_of_the_paper_s_table(run_folder: Path) -> None:
+    """Seed paper Table 2.1: hardly any sensitivity to the joint, more deflection in planes away from the camera's."""
+    table = pd.read_csv(run_folder / "camera_sensitivity.csv").pivot_table(
+        index="joint_station_m", columns="plane_lv_deg", values="deflection_deg"
+    )
+    assert list(table.columns) == [153, 183, 200]
+    # the nose is 0.20 m further from the camera than the torus joint, of 1.4 m: 6 % of lever
+    np.testing.assert_allclose(table.iloc[0], table.iloc[1], rtol=0.08)
+    assert (np.diff(table.to_numpy(), axis=1) > 0).all()
