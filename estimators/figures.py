@@ -38,7 +38,7 @@ def figure_camera_overlay(
 
     from estimators.horizon import find_horizon
 
-    figure = Figure(figsize=(6.0 * len(frames), 4.6), layout="constrained")
+    figure = Figure(figsize=(6.0 * len(frames), 4.4), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(frames)))
     view = oriented.view
     for k, axis in enumerate(axes):

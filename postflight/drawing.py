@@ -58,6 +58,7 @@ def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, 
     figure = figure_camera_overlay(
         oriented, pictures, list(frames.time_s[pick]), theta, list(history.plane_lv_rad[pick])
     )
+    figures.stamp(figure, telemetry)
     figures.save(figure, folder / "figure_2_3.png")
 
 

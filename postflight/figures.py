@@ -14,6 +14,7 @@ from estimators.misalignment import aerodynamic_angle, aeroshell_acceleration, p
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.telemetry import Telemetry
 from postflight.pipeline import Answers, Flight
 from postflight.preflight import RigidBounds
 
@@ -31,9 +32,10 @@ def _axes(figure: Figure, rows: int = 1) -> list[Axes]:
     return list(axes)
 
 
-def _stamp(figure: Figure, flight: Flight) -> None:
-    tag = "SYNTHETIC flight" if flight.telemetry.synthetic else "flight"
-    figure.text(0.995, 0.005, f"{flight.telemetry.name}: {tag}", ha="right", va="bottom", fontsize=7, color="0.4")
+def stamp(figure: Figure, telemetry: Telemetry) -> None:
+    """Name the flight in a corner, and whether it is synthetic."""
+    tag = "SYNTHETIC flight" if telemetry.synthetic else "flight"
+    figure.text(0.995, 0.005, f"{telemetry.name}: {tag}", ha="right", va="bottom", fontsize=7, color="0.4")
 
 
 def _window(flight: Flight) -> tuple[float, float]:
@@ -70,7 +72,7 @@ def figure_1_3(flight: Flight, bounds: RigidBounds) -> Figure:
     for ax in (upper, lower):
         ax.legend(fontsize=7, loc="upper left", frameon=False)
     figure.suptitle("Flight against a rigid vehicle (as seed paper Figure 1.3)", fontsize=10)
-    _stamp(figure, flight)
+    stamp(figure, flight.telemetry)
     return figure
 
 
@@ -83,10 +85,10 @@ def figure_2_5(flight: Flight) -> Figure:
     inferred = aerodynamic_angle(flight.telemetry.vehicle.aero, pulse.mach, pulse.specific_force_body_mps2)
     ax.plot(pulse.time_s, _where(use, inferred), color="black", lw=1.2, label="C_N/C_A look-up, no adjustment")
     _no_answer(ax, use, inferred, pulse.time_s)
-    ax.set(xlim=_window(flight), ylim=(0, 45), ylabel="total angle of attack (deg)", xlabel="time after launch (s)")
+    ax.set(xlim=_window(flight), ylim=(0, 60), ylabel="total angle of attack (deg)", xlabel="time after launch (s)")
     ax.legend(fontsize=8, frameon=False, loc="upper left")
     figure.suptitle("Angle of attack: BET against uncorrected accelerometers (as Figure 2.5)", fontsize=10)
-    _stamp(figure, flight)
+    stamp(figure, flight.telemetry)
     return figure
 
 
@@ -105,10 +107,10 @@ def figure_2_7(flight: Flight, history: DeflectionHistory) -> Figure:
     ax.plot(
         pulse.time_s, np.rad2deg(biased), color="#0072B2", lw=1.4, ls="--", label="BET less the deflection: aeroshell"
     )
-    ax.set(xlim=_window(flight), ylim=(0, 45), ylabel="total angle of attack (deg)", xlabel="time after launch (s)")
+    ax.set(xlim=_window(flight), ylim=(0, 60), ylabel="total angle of attack (deg)", xlabel="time after launch (s)")
     ax.legend(fontsize=8, frameon=False, loc="upper left")
     figure.suptitle("Angle of attack of the aeroshell, both ways (as Figure 2.7)", fontsize=10)
-    _stamp(figure, flight)
+    stamp(figure, flight.telemetry)
     return figure
 
 
@@ -126,7 +128,7 @@ def _where(mask: BoolArray, angle_rad: FloatArray) -> FloatArray:
 def _no_answer(ax: Axes, use: BoolArray, inferred: FloatArray, time_s: FloatArray) -> None:
     beyond = use & ~np.isfinite(inferred)
     if beyond.any():
-        ax.plot(time_s[beyond], np.full(beyond.sum(), 44.0), "k^", ms=3, label="beyond the look-up (60 deg)")
+        ax.plot(time_s[beyond], np.full(beyond.sum(), 59.0), "k^", ms=3, label="beyond the look-up (60 deg)")
 
 
 def draw_histories(
@@ -186,7 +188,7 @@ def figure_summary(
     pressure.spines["top"].set_visible(False)
     axes[1].legend(fontsize=8, frameon=False, loc="upper left")
     figure.suptitle("How far the aeroshell bent, three ways", fontsize=12)
-    _stamp(figure, flight)
+    stamp(figure, flight.telemetry)
     return figure
 
 
@@ -215,7 +217,7 @@ def figure_residuals(flight: Flight) -> Figure:
         ax.set_ylim(-limit, limit)
     figure.get_axes()[-1].set_xlabel("time after launch (s)")
     figure.suptitle("Radar residuals before each update, 3 sd, edited points crossed", fontsize=10)
-    _stamp(figure, flight)
+    stamp(figure, flight.telemetry)
     return figure
 
 
