@@ -132,7 +132,7 @@ def read_table(path: Path, label: str) -> pd.DataFrame:
         k = int(ragged[0])
         faults.append(
             f"{label}: {path}: line {lines[k]}: {counts[k]} cells where the header has {len(names)} "
-            f"({len(ragged)} such rows); mend or remove them"
+            f"({len(ragged)} in all); mend or remove them"
         )
     if faults:
         raise GateError(faults)
@@ -170,7 +170,7 @@ def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: li
     if bad.any():
         first = int(np.argmax(bad))
         where = f"{label}: {path}: line {line_of(frame, first)}, column '{column}'"
-        count = f"({int(bad.sum())} such cells)"
+        count = f"({int(bad.sum())} in all)"
         faults.append(f"{where}: '{text.iloc[first]}' is no finite number {count}; leave a missing value empty")
     return values
 
@@ -229,7 +229,7 @@ def times_s(
         first = int(np.argmax(bad))
         faults.append(
             f"{label}: {path}: line {line_of(frame, first)}: time '{frame[spec.column].iloc[first]}' is not in format "
-            f"'{spec.format}' ({int(bad.sum())} such rows)"
+            f"'{spec.format}' ({int(bad.sum())} in all)"
         )
         return None
     back = np.diff(values) <= 0.0
@@ -237,7 +237,7 @@ def times_s(
         k = int(np.argmax(back))
         faults.append(
             f"{label}: {path}: line {line_of(frame, k + 1)}: time runs backwards or repeats: {values[k]:.6f} s then "
-            f"{values[k + 1]:.6f} s ({int(back.sum())} places); sort the rows or remove the duplicates"
+            f"{values[k + 1]:.6f} s ({int(back.sum())} in all); sort the rows or remove the duplicates"
         )
         return None
     return values

@@ -47,14 +47,14 @@ def read_flight(folder: Path) -> Telemetry:
     """
     spec = read_flight_file(folder)
     gate = Gate(folder, parse_utc(spec.t0_utc))
-    vehicle = vehicle_from_toml(vehicle_path(spec.vehicle, folder))
-    _check_against_vehicle(gate, spec, vehicle)
+    vehicle = _vehicle(gate, spec)
     accelerometer = _triad(gate, "accelerometer", spec.sensors.accelerometer, vehicle)
     rates = _triad(gate, "rates", spec.sensors.rates, vehicle)
     radars = {name: _radar(gate, name, entry) for name, entry in spec.radars.items()}
     sounding = read_sounding(gate, spec.atmosphere)
     frames = _frames(gate, spec.frames, vehicle) if spec.frames else None
     gate.close()
+    assert vehicle is not None
     assert accelerometer is not None
     assert rates is not None
     assert sounding is not None
@@ -83,7 +83,15 @@ def read_flight(folder: Path) -> Telemetry:
     return telemetry
 
 
-def _check_against_vehicle(gate: Gate, spec: FlightFile, vehicle: Vehicle) -> None:
+def _vehicle(gate: Gate, spec: FlightFile) -> Vehicle | None:
+    """Read the vehicle that flight.toml names; None, with faults kept, where it or what it must carry is missing."""
+    try:
+        vehicle = vehicle_from_toml(vehicle_path(spec.vehicle, gate.folder))
+    except GateError as fault:
+        for words in fault.faults:
+            gate.refuse_config(f"vehicle: {words}")
+        return None
+
     def missing(key: str, name: str, known: list[str]) -> None:
         if name not in known:
             hint = nearest_name(name, known)
@@ -95,10 +103,10 @@ def _check_against_vehicle(gate: Gate, spec: FlightFile, vehicle: Vehicle) -> No
     norm = float(np.linalg.norm(spec.attitude_prior.q_ecef_body))
     if abs(norm - 1.0) > 1e-3:
         gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1")
-    gate.close()
+    return None if gate.config else vehicle
 
 
-def _triad(gate: Gate, name: str, source: TriadEntry | RatesEntry, vehicle: Vehicle) -> TriadRecord | None:
+def _triad(gate: Gate, name: str, source: TriadEntry | RatesEntry, vehicle: Vehicle | None) -> TriadRecord | None:
     quantities = columns.ACCELEROMETER if isinstance(source, TriadEntry) else columns.RATES
     table = gate.table(f"sensors.{name}", source, quantities)
     if table is None or table.time_s is None:
@@ -108,6 +116,8 @@ def _triad(gate: Gate, name: str, source: TriadEntry | RatesEntry, vehicle: Vehi
         gate.faults.append(f"sensors.{name}: {table.path}: every sample is missing")
         return None
     gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in quantities), values))
+    if vehicle is None:
+        return None
     return TriadRecord(_triad_spec(name, source, vehicle), table.time_s, values)
 
 
@@ -145,7 +155,7 @@ def _radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
     if not np.isfinite(values).all(axis=1).any():
         gate.faults.append(f"{label}: {table.path}: no track point with range, azimuth and elevation; remove the radar")
         return None
-    gate.findings.extend(find_faults(label, table.time_s, ("range", "az", "el"), values))
+    gate.findings.extend(find_faults(name, table.time_s, ("range", "az", "el"), values))
     lat, lon = np.deg2rad([source.latitude_deg, source.longitude_deg])
     angle_sd, angle_bias_sd = np.deg2rad([source.angle_sd_deg, source.angle_bias_sd_deg])
     site = RadarSite(
@@ -155,12 +165,12 @@ def _radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
     return RadarRecord(site, table.time_s, values, source.tracks)
 
 
-def _frames(gate: Gate, source: FramesEntry, vehicle: Vehicle) -> Frames | None:
+def _frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Frames | None:
     label = "frames"
     if source.columns:
         gate.refuse_config("frames.columns: the frame list has only t_s and frame")
     path, images = gate.path(source.file), gate.path(source.folder)
-    if path is None or images is None:
+    if path is None or images is None or vehicle is None:
         return None
     try:
         table = columns.read_table(path, label)

@@ -108,7 +108,7 @@ class Gate:
             wild = (values < low) | (values > high)
         if wild.any():
             k = int(np.argmax(wild))
-            count = f"({int(wild.sum())} such cells)"
+            count = f"({int(wild.sum())} in all)"
             self.faults.append(
                 f"{table.at(k)}: {short} = {values[k]:.6g} (SI) is {words} {count}; check its unit or leave it empty"
             )

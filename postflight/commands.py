@@ -19,7 +19,7 @@ from rich.table import Table
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.flightfolder import read_flight
 from postflight import drawing, figures, results, scoring
-from postflight.pipeline import METHODS, Answers, Flight, camera_sensitivity, estimate, reconstruct_flight
+from postflight.pipeline import METHODS, NO_VIDEO, Answers, Flight, camera_sensitivity, estimate, reconstruct_flight
 from recon.bet import Settings
 from synthetic_flight.folder import check_destination, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
@@ -84,7 +84,7 @@ def run(folder: Path, methods: tuple[str, ...], rate_hz: float) -> None:
     if methods:
         print_answers(answers, flight.peak_s)
     console.print(f"results in {escape(str(written))}")
-    if any(reason != results.NO_VIDEO for reason in answers.refused.values()):
+    if any(reason != NO_VIDEO for reason in answers.refused.values()):
         sys.exit(EXIT_NO_ANSWER)
 
 
@@ -106,7 +106,7 @@ def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[
         wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
         answers = estimate(flight, flight.telemetry, wanted, step(0.5, 0.7))
         if "camera" in methods and "camera" not in wanted:
-            answers.refused["camera"] = results.NO_VIDEO
+            answers.refused["camera"] = NO_VIDEO
         with results.RunFolder(folder, flight.telemetry, settings) as out:
             results.write_reconstruction(out, flight)
             results.write_answers(out, answers)
@@ -143,10 +143,10 @@ def print_flight(flight: Flight) -> None:
         console.print(f"[red]verdict[/] {verdict.name}: {verdict.words} ({numbers})")
 
 
-def print_answers(answers: Answers, peak_s: float) -> None:
-    """Deflection at peak pressure, method by method."""
+def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> None:
+    """Deflection at one time, method by method; ``note`` says which time that is."""
     when = f" at {peak_s:.2f} s" if np.isfinite(peak_s) else ""
-    table = Table(title=f"Deflection of the aeroshell against the centerbody{when}")
+    table = Table(title=f"Deflection of the aeroshell against the centerbody{when}{note}")
     for name in ("method", "deflection deg", "1 sd", "plane LV deg", "largest deg", "at s"):
         table.add_column(name, justify="left" if name == "method" else "right")
     for method, row in results.method_summary(answers, peak_s).items():
@@ -182,7 +182,7 @@ def deflection(folder: Path, methods: tuple[str, ...], plane_deg: float | None, 
                 drawing.draw_camera(telemetry, answers.histories["camera"], out.path / "figures", joint_m)
     # without a trajectory the camera's own largest deflection is what can be named
     peak_s = flight.peak_s if flight else largest_s(answers)
-    print_answers(answers, peak_s)
+    print_answers(answers, peak_s, " (peak q)" if flight else " (its largest; no trajectory was made)")
     console.print(f"results in {escape(str(out.path))}")
     if answers.refused:
         sys.exit(EXIT_NO_ANSWER)
@@ -208,7 +208,7 @@ def score(folder: Path, as_json: bool) -> None:
 
 def print_score(result: scoring.Score) -> None:
     """Estimates against the truth, with the paper's own figures beside them."""
-    table = Table(title=f"Deflection at peak dynamic pressure ({result.peak_s:.2f} s), against the truth")
+    table = Table(title=f"Deflection at the true peak of dynamic pressure ({result.peak_s:.3f} s), against the truth")
     for name in ("method", "deflection deg", "1 sd", "truth", "error", "IRVE-II (paper)"):
         table.add_column(name, justify="left" if name == "method" else "right")
     for method, row in result.methods.items():

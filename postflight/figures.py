@@ -56,7 +56,11 @@ def figure_1_3(flight: Flight, bounds: RigidBounds) -> Figure:
         (lower, bounds.normal_g, bounds.nominal_normal_g),
     ):
         ax.fill_between(
-            bounds.time_s, band[0], band[2], color="0.85", label=f"rigid, 2.3 to 97.7 % of {bounds.flights}"
+            bounds.time_s,
+            band[0],
+            band[2],
+            color="0.85",
+            label=f"2.3 to 97.7 % of {bounds.flights} rigid flights",
         )
         ax.plot(bounds.time_s, band[1], color="0.55", lw=1, label="rigid, 50 %")
         ax.plot(bounds.time_s, nominal, color="0.3", lw=1, ls=":", label="rigid, nominal")
@@ -71,7 +75,7 @@ def figure_1_3(flight: Flight, bounds: RigidBounds) -> Figure:
     lower.set(ylabel="normal acceleration (g)", ylim=(0, None), xlabel="time after launch (s)")
     for ax in (upper, lower):
         ax.legend(fontsize=7, loc="upper left", frameon=False)
-    figure.suptitle("Flight against a rigid vehicle (as seed paper Figure 1.3)", fontsize=10)
+    figure.suptitle("Flight against a rigid vehicle (in the manner of AIAA 2011-2571, Figure 1.3)", fontsize=10)
     stamp(figure, flight.telemetry)
     return figure
 
@@ -87,7 +91,7 @@ def figure_2_5(flight: Flight) -> Figure:
     _no_answer(ax, use, inferred, pulse.time_s)
     ax.set(xlim=_window(flight), ylim=(0, 60), ylabel="total angle of attack (deg)", xlabel="time after launch (s)")
     ax.legend(fontsize=8, frameon=False, loc="upper left")
-    figure.suptitle("Angle of attack: BET against uncorrected accelerometers (as Figure 2.5)", fontsize=10)
+    figure.suptitle("Angle of attack: BET against uncorrected accelerometers (AIAA 2011-2571, Figure 2.5)", fontsize=10)
     stamp(figure, flight.telemetry)
     return figure
 
@@ -109,7 +113,7 @@ def figure_2_7(flight: Flight, history: DeflectionHistory) -> Figure:
     )
     ax.set(xlim=_window(flight), ylim=(0, 60), ylabel="total angle of attack (deg)", xlabel="time after launch (s)")
     ax.legend(fontsize=8, frameon=False, loc="upper left")
-    figure.suptitle("Angle of attack of the aeroshell, both ways (as Figure 2.7)", fontsize=10)
+    figure.suptitle("Angle of attack of the aeroshell, both ways (AIAA 2011-2571, Figure 2.7)", fontsize=10)
     stamp(figure, flight.telemetry)
     return figure
 
@@ -178,7 +182,7 @@ def figure_summary(
         xlim=_window(flight),
         ylim=(0, _top(answers.histories.values())),
     )
-    axes[0].legend(fontsize=8, frameon=False, loc="upper left")
+    axes[0].legend(fontsize=8, frameon=False, loc="upper left", title="bands: 1 sd; dotted: peak q", title_fontsize=8)
     _bet_line(axes[1], flight, "centerbody total angle of attack, BET")
     axes[1].set(ylabel="angle of attack (deg)", xlabel="time after launch (s)", ylim=(0, 16))
     pressure = axes[1].twinx()

@@ -28,6 +28,7 @@ from recon.bet import Reconstruction, Settings, reconstruct
 
 Progress = Callable[[float, str], None]
 METHODS = ("camera", "misalignment", "trim")
+NO_VIDEO = "the flight has no video"
 # assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
 PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
 # half the window over which sensors are averaged: well below the joint's 2.5 Hz, well above the sampling interval
@@ -151,7 +152,7 @@ def estimate_camera(
     """
     frames = telemetry.frames
     if frames is None:
-        raise GateError("camera: the flight has no video (no [frames] in flight.toml)")
+        raise GateError(NO_VIDEO)
     vehicle = telemetry.vehicle
     return deflection_from_frames(
         frames.time_s,

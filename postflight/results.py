@@ -25,10 +25,9 @@ from flightmodel.airdata import AirData
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
-from postflight.pipeline import Answers, Flight
+from postflight.pipeline import NO_VIDEO, Answers, Flight
 
 DIGITS = "%.10g"
-NO_VIDEO = "the flight has no video"
 
 
 class RunFolder:
@@ -54,10 +53,15 @@ class RunFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Rename when whole; remove otherwise."""
-        if kind is not None:
-            shutil.rmtree(self.path, ignore_errors=True)
-            return
+        """Rename when whole; remove otherwise, also where the end itself is interrupted."""
+        partial = self.path
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+    def _finish(self) -> None:
         now = datetime.now(UTC)
         facts = {
             "finished_utc": now.isoformat(timespec="seconds"),

@@ -60,7 +60,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     """
     truth_folder = flight_folder / "truth"
     if not (truth_folder / "truth.csv").is_file():
-        raise GateError(f"{flight_folder}: no truth/truth.csv; only synthetic flights can be scored")
+        raise GateError(f"{flight_folder}: no truth/truth.csv to score against")
     run = run or newest_run(flight_folder)
     truth = _read(truth_folder / "truth.csv", (*STATE_COLUMNS, "dynamic_pressure_pa", "alpha_body_deg"))
     bent = _read(truth_folder / "deflection.csv", ("t_s", "theta_deg"))

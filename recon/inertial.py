@@ -88,7 +88,7 @@ def bridge(record: TriadRecord) -> Bridged:
         words = f"no samples for {length:.3f} s, bridged; integral over the gap uncertain by " + ", ".join(
             f"{m:.3g}" for m in missed
         )
-        findings.append(Finding(spec.name, words + " (body x, y, z)", float(t[k]), float(t[k + 1])))
+        findings.append(Finding(spec.name, words + " (SI; body x, y, z)", float(t[k]), float(t[k + 1])))
     if extra_t:
         gap_flags = np.ones(sum(len(e) for e in extra_t), dtype=bool)
         all_t = np.concatenate([t, *extra_t])
