@@ -112,23 +112,3 @@ def boxplus(q, d0, d1, d2):
     q3 = w * ez + x * ey - y * ex + z * c
     n = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     q[0], q[1], q[2], q[3] = q0 * n, q1 * n, q2 * n, q3 * n
-
-
-@kernel
-def uniform_row(table, start, step, at, out):
-    """Interpolate all columns of ``table`` (n, m), given at ``start + i step``, linearly at ``at`` into ``out`` (m,).
-
-    Held at its end values outside; callers see to it that the table covers what they ask.
-    """
-    n = table.shape[0]
-    u = (at - start) / step
-    i = int(u)
-    if u < 0.0:
-        i = 0
-        u = 0.0
-    elif i > n - 2:
-        i = n - 2
-        u = min(u, n - 1.0)
-    f = u - i
-    for k in range(table.shape[1]):
-        out[k] = table[i, k] + f * (table[i + 1, k] - table[i, k])

@@ -141,8 +141,3 @@ class Telemetry:
         triads = (self.accelerometer, self.rates)
         start = max(first_radar, *(t.time_s[0] for t in triads))
         return float(start), float(min(last_radar, *(t.time_s[-1] for t in triads)))
-
-
-def wrap_angle(angle_rad: FloatArray) -> FloatArray:
-    """Wrap angles to [-pi, pi)."""
-    return np.mod(angle_rad + np.pi, 2.0 * np.pi) - np.pi
