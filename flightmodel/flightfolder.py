@@ -172,10 +172,8 @@ def _frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Frames 
     path, images = gate.path(source.file), gate.path(source.folder)
     if path is None or images is None or vehicle is None:
         return None
-    try:
-        table = columns.read_table(path, label)
-    except GateError as fault:
-        gate.faults.extend(fault.faults)
+    table = gate.csv(path, label)
+    if table is None:
         return None
     time_s = columns.times_s(table, source.time_column, gate.t0, path, label, gate.faults)
     if "frame" not in table.columns:

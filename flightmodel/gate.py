@@ -7,6 +7,7 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from flightmodel import columns
 from flightmodel.checks import ConfigError, FloatArray, GateError, nearest_name
@@ -70,6 +71,14 @@ class Gate:
             self.refuse_config(wrong)
         return None if wrong else path
 
+    def csv(self, path: Path, label: str) -> pd.DataFrame | None:
+        """Read a CSV as text; None, with its faults kept, where it is no table."""
+        try:
+            return columns.read_table(path, label)
+        except GateError as fault:
+            self.faults.extend(fault.faults)
+            return None
+
     def table(
         self, label: str, source: Source, quantities: tuple[columns.Quantity, ...], timed: bool = True
     ) -> Table | None:
@@ -82,10 +91,8 @@ class Gate:
         path = self.path(source.file)
         if path is None:
             return None
-        try:
-            frame = columns.read_table(path, label)
-        except GateError as fault:
-            self.faults.extend(fault.faults)
+        frame = self.csv(path, label)
+        if frame is None:
             return None
         time_s = columns.times_s(frame, source.time_column, self.t0, path, label, self.faults) if timed else None
         values = {}

@@ -93,6 +93,11 @@ class Frames:
     paths: tuple[Path, ...]
     benchmark_s: float
 
+    @property
+    def benchmark(self) -> int:
+        """Index of the frame nearest to the benchmark time."""
+        return int(np.argmin(np.abs(self.time_s - self.benchmark_s)))
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -63,7 +63,7 @@ pd.DataFrame(rows, columns=["sensor", "samples", "from s", "to s"])
 # the sensors' own errors on the way. If its assumptions hold, the residuals are as large as predicted and white.
 
 # %%
-event_table(flight.air, telemetry, flight.peak_s).round(2)
+event_table(flight).round(2)
 
 # %%
 pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.words) for v in flight.reconstruction.verdicts],

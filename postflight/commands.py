@@ -17,9 +17,19 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from flightmodel.checks import FloatArray, GateError
+from flightmodel.deflection import lv_clock
 from flightmodel.flightfolder import read_flight
 from postflight import drawing, figures, results, scoring
-from postflight.pipeline import METHODS, NO_VIDEO, Answers, Flight, camera_sensitivity, estimate, reconstruct_flight
+from postflight.pipeline import (
+    METHODS,
+    NO_VIDEO,
+    Answers,
+    Flight,
+    camera_sensitivity,
+    estimate,
+    reconstruct_flight,
+    reconstruct_telemetry,
+)
 from recon.bet import Settings
 from synthetic_flight.folder import check_destination, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
@@ -126,7 +136,7 @@ def print_flight(flight: Flight) -> None:
     table = Table(title=f"Best-estimated trajectory of {escape(flight.telemetry.name)}")
     for name in ("event", "t s", "altitude km", "Mach", "q Pa", "alpha total deg"):
         table.add_column(name, justify="left" if name == "event" else "right")
-    for row in results.event_table(flight.air, flight.telemetry, flight.peak_s).itertuples(index=False):
+    for row in results.event_table(flight).itertuples(index=False):
         alpha = f"{row.alpha_total_wind_deg:.2f} ± {row.alpha_total_wind_sd_deg:.2f}"
         pressure = f"{row.dynamic_pressure_pa:.1f}"
         table.add_row(row.event, f"{row.t_s:.2f}", f"{row.alt_m / 1e3:.2f}", f"{row.mach:.2f}", pressure, alpha)
@@ -149,17 +159,18 @@ def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> N
     table = Table(title=f"Deflection of the aeroshell against the centerbody{when}{note}")
     for name in ("method", "deflection deg", "1 sd", "plane LV deg", "largest deg", "at s"):
         table.add_column(name, justify="left" if name == "method" else "right")
-    for method, row in results.method_summary(answers, peak_s).items():
+    rows = results.method_summary(answers, peak_s)
+    for method, row in rows.items():
         if row["deflection_deg"] is None:
             table.add_row(method, "no answer", "", "", "", "")
             continue
         history = answers.histories[method]
         yz = [np.interp(peak_s, history.time_s, c) for c in np.nan_to_num(history.theta_yz_rad).T]
-        plane = np.rad2deg(np.mod(np.arctan2(yz[1], -yz[0]), 2 * np.pi))
+        plane = np.rad2deg(lv_clock(np.array(yz)))
         angle, largest = f"{row['deflection_deg']:.2f}", f"{row['largest_deg']:.2f}"
         table.add_row(method, angle, f"{row['sd_deg']:.2f}", f"{plane:.0f}", largest, f"{row['largest_at_s']:.2f}")
     console.print(table)
-    for method, row in results.method_summary(answers, peak_s).items():
+    for method, row in rows.items():
         if "reason" in row:
             console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")
 
@@ -173,7 +184,7 @@ def deflection(folder: Path, methods: tuple[str, ...], plane_deg: float | None, 
     settings = {"methods": list(methods), "plane_deg": plane_deg, "joint_m": joint_m}
     with progress_bar() as report:
         needs_bet = set(methods) != {"camera"}
-        flight = reconstruct_flight(folder, None, lambda f, what: report(0.6 * f, what)) if needs_bet else None
+        flight = reconstruct_telemetry(telemetry, None, lambda f, what: report(0.6 * f, what)) if needs_bet else None
         tell: Report = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
         answers = estimate(flight, telemetry, methods, tell, plane_rad, joint_m)
         with results.RunFolder(folder, telemetry, settings) as out:

@@ -41,7 +41,7 @@ def oriented_camera(telemetry: Telemetry, joint_m: float | None = None) -> tuple
     """Camera oriented on the benchmark frame, and that frame's index."""
     frames, vehicle = telemetry.frames, telemetry.vehicle
     assert frames is not None
-    benchmark = int(np.argmin(np.abs(frames.time_s - frames.benchmark_s)))
+    benchmark = frames.benchmark
     station = vehicle.joint.station_m if joint_m is None else joint_m
     return orient_camera(read_frame(frames.paths[benchmark]), vehicle.geometry, frames.camera, station), benchmark
 

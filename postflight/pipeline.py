@@ -68,8 +68,16 @@ def reconstruct_flight(folder: Path, settings: Settings | None = None, progress:
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "reading telemetry")
     telemetry = read_flight(folder)
-    report(0.1, "reconstructing")
-    bet = reconstruct(telemetry, settings, lambda f, what: report(0.1 + 0.85 * f, what))
+    return reconstruct_telemetry(telemetry, settings, lambda f, what: report(0.1 + 0.9 * f, what))
+
+
+def reconstruct_telemetry(
+    telemetry: Telemetry, settings: Settings | None = None, progress: Progress | None = None
+) -> Flight:
+    """Reconstruct a flight that was read already."""
+    report = progress or (lambda _fraction, _what: None)
+    report(0.0, "reconstructing")
+    bet = reconstruct(telemetry, settings, lambda f, what: report(0.95 * f, what))
     profile = profile_from_sounding(telemetry.sounding)
     _check_flown(bet.smoothed)
     air = air_data(bet.smoothed, profile, telemetry.vehicle.cg_m)
@@ -173,8 +181,7 @@ def camera_sensitivity(telemetry: Telemetry, history: DeflectionHistory) -> pd.D
     """
     frames, vehicle = telemetry.frames, telemetry.vehicle
     assert frames is not None
-    benchmark = int(np.argmin(np.abs(frames.time_s - frames.benchmark_s)))
-    straight, bent = (read_frame(frames.paths[k]) for k in (benchmark, int(np.nanargmax(history.theta_rad))))
+    straight, bent = (read_frame(frames.paths[k]) for k in (frames.benchmark, int(np.nanargmax(history.theta_rad))))
     stations = np.array([0.0, vehicle.joint.station_m])
     planes = np.deg2rad(list(PAPER_TABLE_2_1_DEG))
     angles = sensitivity_table(straight, bent, vehicle.geometry, frames.camera, planes, stations)

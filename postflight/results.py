@@ -21,7 +21,6 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import earth
-from flightmodel.airdata import AirData
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
@@ -180,11 +179,12 @@ def deflection_table(history: DeflectionHistory) -> pd.DataFrame:
     return table[keep]
 
 
-def event_table(air: AirData, telemetry: Telemetry, peak_s: float) -> pd.DataFrame:
+def event_table(flight: Flight) -> pd.DataFrame:
     """Moments of the flight with altitude, Mach number, dynamic pressure and total angle of attack."""
-    moments = [(name, t) for name, t in telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
-    inside = air.time_s[0] + 1.0 < peak_s < air.time_s[-1] - 1.0
-    moments.append(("peak dynamic pressure" if inside else "largest dynamic pressure (edge of data)", peak_s))
+    air = flight.air
+    moments = [(name, t) for name, t in flight.telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
+    peak = "peak dynamic pressure" if flight.peak_is_inside else "largest dynamic pressure (edge of data)"
+    moments.append((peak, flight.peak_s))
     if (k := int(np.argmax(air.altitude_m))) not in (0, len(air.time_s) - 1):
         moments.append(("apogee", float(air.time_s[k])))
     for name, values, level in (
@@ -234,7 +234,7 @@ def write_reconstruction(run: RunFolder, flight: Flight) -> None:
     run.write_csv("residuals.csv", bet.residuals)
     run.write_csv("verdicts.csv", pd.DataFrame([vars(v) for v in bet.verdicts]))
     run.write_csv("sensor_errors.csv", bet.sensor_errors)
-    run.write_csv("events.csv", event_table(flight.air, flight.telemetry, flight.peak_s))
+    run.write_csv("events.csv", event_table(flight))
     findings = [vars(f) for f in (*flight.telemetry.findings, *bet.findings)]
     run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s"]))
 

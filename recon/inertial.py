@@ -16,6 +16,7 @@ import numpy as np
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import Finding, TriadRecord
+from flightmodel.trajectory import interpolate_rows
 from recon.state import BoolArray, IntArray
 from recon.strapdown import InertialGrid
 
@@ -161,18 +162,14 @@ def inertial_grid(force: Bridged, rate: Bridged, node_time_s: FloatArray) -> tup
     t = np.sort(np.concatenate([inner[clear], node_time_s]))
     grid = InertialGrid(
         t,
-        _columns(t, force.time_s, force.measured_sensor),
-        _columns(t, rate.time_s, rate.measured_sensor),
+        interpolate_rows(t, force.time_s, force.measured_sensor),
+        interpolate_rows(t, rate.time_s, rate.measured_sensor),
         _held(t, force),
         _held(t, rate),
         np.ascontiguousarray(force.spec.dcm_body_sensor, dtype=float),
         np.ascontiguousarray(rate.spec.dcm_body_sensor, dtype=float),
     )
     return grid, np.searchsorted(t, node_time_s).astype(np.int64)
-
-
-def _columns(at: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
-    return np.ascontiguousarray(np.column_stack([np.interp(at, t, column) for column in values.T]))
 
 
 def _held(at: FloatArray, triad: Bridged) -> FloatArray:

@@ -12,6 +12,7 @@ from scipy.interpolate import CubicHermiteSpline
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile, default_sounding_sd
 from flightmodel.checks import FloatArray
+from flightmodel.trajectory import interpolate_rows
 from flightmodel.vehicle import Vehicle
 from synthetic_flight.scenarios import Accelerometer, Attitude, DayAtmosphere, Radar, Rates, correlated
 from synthetic_flight.simulate import Truth
@@ -21,10 +22,6 @@ def sample_times(start_s: float, stop_s: float, rate_hz: float, offset_s: float 
     """Times of samples at a rate, rounded to a microsecond so that files hold them exactly."""
     n = int(np.floor((stop_s - start_s - offset_s) * rate_hz + 1e-9)) + 1
     return np.round(start_s + offset_s + np.arange(n) / rate_hz, 6)
-
-
-def _interpolate(truth: Truth, values: FloatArray, at_s: FloatArray) -> FloatArray:
-    return np.column_stack([np.interp(at_s, truth.time_s, column) for column in values.T])
 
 
 def _triad_errors(
@@ -45,7 +42,7 @@ def sense_accelerometer(
     """Times (n,) and specific force ``(n, 3)`` in the package's own axes, m/s^2, at its own place."""
     package = vehicle.sensors[mount]
     at = sample_times(start_s, truth.time_s[-1], spec.rate_hz)
-    body = _interpolate(truth, truth.specific_force_body(np.array(package.position_from_datum_body_m)), at)
+    body = interpolate_rows(at, truth.time_s, truth.specific_force_body(np.array(package.position_from_datum_body_m)))
     ideal = body @ package.dcm_body_sensor
     mount_rad = float(np.deg2rad(spec.mount_deg))
     return at, _triad_errors(ideal, spec.noise_mps2, spec.bias_mps2, spec.scale, mount_rad, spec.resolution_mps2, rng)
@@ -54,7 +51,7 @@ def sense_accelerometer(
 def sense_rates(truth: Truth, spec: Rates, start_s: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and rates ``(n, 3)`` of the body against inertial space, body axes, rad/s."""
     at = sample_times(start_s, truth.time_s[-1], spec.rate_hz)
-    ideal = _interpolate(truth, truth.trajectory.omega_body_eci_body_radps, at)
+    ideal = interpolate_rows(at, truth.time_s, truth.trajectory.omega_body_eci_body_radps)
     noise, bias, mount, step = np.deg2rad([spec.noise_degps, spec.bias_degps, spec.mount_deg, spec.resolution_degps])
     return at, _triad_errors(ideal, noise, bias, spec.scale, mount, step, rng)
 
