@@ -17,7 +17,7 @@ from estimators.trim import estimate_trim
 from flightmodel.flightfolder import read_flight
 from postflight.pipeline import estimate_camera, pulse_data, reconstruct_flight
 from recon.bet import reconstruct
-from synthetic_flight import _kernels, dynamics
+from synthetic_flight import _kernels, packing
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import child_rng, day_atmosphere, fly_scenario, initial_state, read_scenario
 from synthetic_flight.simulate import integrate
@@ -37,7 +37,7 @@ def best(work):
 
 def peer_seconds(vehicle, table, state, span_s):
     """DOP853 of scipy over the same compiled right-hand side: the usual way to fly such equations in Python."""
-    p, tables = dynamics.parameter_vector(vehicle), dynamics.kernel_tables(vehicle, table)
+    p, tables = packing.parameter_vector(vehicle), packing.kernel_tables(vehicle, table)
     dy, aux = np.empty(_kernels.STATES), np.empty(_kernels.AUX)
 
     def f(_t, y):
@@ -50,7 +50,7 @@ def peer_seconds(vehicle, table, state, span_s):
 def main():
     scenario = read_scenario("irve2_reference")
     vehicle = scenario.vehicle
-    table = dynamics.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    table = packing.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
     state = initial_state(scenario)
     rows = []
     kernel = best(lambda: integrate(vehicle, table, state, 0.002, 2, 110001, 52501))

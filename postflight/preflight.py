@@ -18,7 +18,7 @@ from flightmodel.checks import FloatArray, GateError
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Vehicle
 from postflight.pipeline import Flight
-from synthetic_flight import dynamics
+from synthetic_flight import packing
 from synthetic_flight.scenarios import correlated
 from synthetic_flight.simulate import integrate, state_from_ecef
 
@@ -85,7 +85,7 @@ def _fly(
     omega = start.omega_body_eci_body_radps[0]
     state = state_from_ecef(start_s, start.position_ecef_m[0] + arm, start.velocity_ecef_mps[0], q, omega)
     per_record = round(RECORD_S / STEP_S)
-    states, aux = integrate(vehicle, dynamics.atmosphere_table(profile), state, STEP_S, per_record, records, records)
+    states, aux = integrate(vehicle, packing.atmosphere_table(profile), state, STEP_S, per_record, records, records)
     force_body = rotations.rotate(rotations.conjugate(states[:, 6:10]), aux[:, 12:15])
     out = np.full((2, records), np.nan)
     out[0, : len(aux)] = np.rad2deg(aux[:, 4])

@@ -10,6 +10,7 @@ B is the centerbody (*body*), A the aeroshell (*shell*). State as in `synthetic_
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -19,61 +20,6 @@ from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import _kernels
-
-ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, ATMOSPHERE_ROWS = -1000.0, 50.0, 8001
-
-
-def parameter_vector(vehicle: Vehicle) -> FloatArray:
-    """Pack a vehicle for the kernels."""
-    p = np.zeros(_kernels.PARAMETERS)
-    body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
-    p[_kernels.M_B], p[_kernels.M_A] = body.mass_kg, shell.mass_kg
-    for inertia_at, inverse_at, mobility_at, arm_at, part in (
-        (_kernels.I_B, _kernels.W_B, _kernels.N_B, _kernels.P_B, body),
-        (_kernels.I_A, _kernels.W_A, _kernels.N_A, _kernels.P_A, shell),
-    ):
-        arm = vehicle.joint_m - part.cg_m
-        inverse = np.linalg.inv(part.inertia)
-        p[inertia_at : inertia_at + 9] = part.inertia.ravel()
-        p[inverse_at : inverse_at + 9] = inverse.ravel()
-        p[mobility_at : mobility_at + 9] = (-rotations.skew(arm) @ inverse @ rotations.skew(arm)).ravel()
-        p[arm_at : arm_at + 3] = arm
-    p[_kernels.NOSE_A : _kernels.NOSE_A + 3] = -shell.cg_m
-    p[_kernels.JOINT : _kernels.JOINT + 8] = (
-        joint.bending_stiffness_nmprad,
-        joint.hardening_nmprad3,
-        joint.torsion_stiffness_nmprad,
-        joint.bending_damping_nmsprad,
-        joint.damping_hardening_nmsprad3,
-        joint.torsion_damping_nmsprad,
-        np.deg2rad(joint.freeplay_deg),
-        joint.freeplay_corner,
-    )
-    p[_kernels.REFERENCE : _kernels.REFERENCE + 2] = vehicle.reference.area_m2, vehicle.reference.length_m
-    return p
-
-
-def atmosphere_table(profile: AtmosphereProfile) -> FloatArray:
-    """Log density, speed of sound, north and east wind every 50 m from -1 to 399 km, for the kernels."""
-    z = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS, dtype=np.float64)
-    air = profile.at(z)
-    return np.column_stack([np.log(air.density_kgpm3), air.sound_speed_mps, air.wind_ned_mps[:, :2]])
-
-
-def vacuum_table() -> FloatArray:
-    """Table of an atmosphere too thin to matter (e^-700 kg/m^3), for flights under gravity and springs alone."""
-    return np.tile(np.array([-700.0, 300.0, 0.0, 0.0]), (ATMOSPHERE_ROWS, 1))
-
-
-def kernel_tables(vehicle: Vehicle, atmosphere: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the four table arguments of the kernels: atmosphere, grid, Mach knots, coefficients."""
-    grid = np.array([ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, vehicle.aero.alpha_rad[1]])
-    return (
-        np.ascontiguousarray(atmosphere),
-        grid,
-        np.ascontiguousarray(vehicle.aero.mach),
-        np.ascontiguousarray(vehicle.aero.coefficients),
-    )
 
 
 def split(state: FloatArray) -> tuple[FloatArray, ...]:
@@ -223,17 +169,42 @@ def aerodynamics(
     return rotations.rotate(q_a, force), rotations.rotate(q_a, moment)
 
 
-def rates(state: FloatArray, vehicle: Vehicle, force_nose: FloatArray, moment_nose: FloatArray) -> FloatArray:
-    """Derivative of one state (20,) under gravity, the joint, and a force and moment at the shell's nose (ECI)."""
-    _, v, q_b, q_a, w_b, w_a = split(state)
-    body, shell = vehicle.centerbody, vehicle.aeroshell
+@dataclass(frozen=True)
+class Loads:
+    """What acts on the two bodies besides the joint, ECI axes, (3,) each: forces at, moments about the own c.g."""
+
+    force_body_n: FloatArray
+    force_shell_n: FloatArray
+    moment_shell_nm: FloatArray
+    moment_body_nm: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+
+def flight_loads(state: FloatArray, vehicle: Vehicle, profile: AtmosphereProfile | None, time_s: float = 0.0) -> Loads:
+    """Gravity on both bodies and, where there is air, aerodynamics on the shell."""
     where = points(state, vehicle)
+    weight_b = vehicle.centerbody.mass_kg * earth.gravitation(where["body"][0])
+    weight_a = vehicle.aeroshell.mass_kg * earth.gravitation(where["shell"][0])
+    if profile is None:
+        return Loads(weight_b, weight_a, np.zeros(3))
+    force, moment = aerodynamics(state, vehicle, profile, time_s)
+    nose = rotations.rotate(state[10:14], -vehicle.aeroshell.cg_m)
+    return Loads(weight_b, weight_a + force, moment + np.cross(nose, force))
+
+
+def accelerations(state: FloatArray, vehicle: Vehicle, loads: Loads) -> tuple[FloatArray, ...]:
+    """c.g. and angular accelerations of body and shell, and the joint's force on the body; ECI axes, (3,) each.
+
+    Returns
+    -------
+    acceleration_body, angular_body, acceleration_shell, angular_shell, joint_force
+    """
+    _, _, q_b, q_a, w_b, w_a = split(state)
+    body, shell = vehicle.centerbody, vehicle.aeroshell
     r_b, r_a = rotations.dcm_from_q(q_b), rotations.dcm_from_q(q_a)
     rate_b, rate_a = r_b @ w_b, r_a @ w_a
     p_b, p_a = r_b @ (vehicle.joint_m - body.cg_m), r_a @ (vehicle.joint_m - shell.cg_m)
     tau = joint_moment(vehicle, q_b, q_a, rate_b - rate_a)
     inertia_b, inertia_a = r_b @ body.inertia @ r_b.T, r_a @ shell.inertia @ r_a.T
-    nose = -r_a @ shell.cg_m
     eye, zero = np.eye(3), np.zeros((3, 3))
     # unknowns: a_B, w_B', a_A, w_A', Fc (on the body)
     matrix = np.block(
@@ -247,15 +218,27 @@ def rates(state: FloatArray, vehicle: Vehicle, force_nose: FloatArray, moment_no
     )
     right = np.concatenate(
         [
-            body.mass_kg * earth.gravitation(where["body"][0]),
-            tau - np.cross(rate_b, inertia_b @ rate_b),
-            shell.mass_kg * earth.gravitation(where["shell"][0]) + force_nose,
-            moment_nose + np.cross(nose, force_nose) - tau - np.cross(rate_a, inertia_a @ rate_a),
+            loads.force_body_n,
+            loads.moment_body_nm + tau - np.cross(rate_b, inertia_b @ rate_b),
+            loads.force_shell_n,
+            loads.moment_shell_nm - tau - np.cross(rate_a, inertia_a @ rate_a),
             np.cross(rate_a, np.cross(rate_a, p_a)) - np.cross(rate_b, np.cross(rate_b, p_b)),
         ]
     )
-    a_b, turn_b, a_a, turn_a, _ = np.split(np.linalg.solve(matrix, right), 5)
+    a_b, turn_b, a_a, turn_a, force = np.split(np.linalg.solve(matrix, right), 5)
+    return a_b, turn_b, a_a, turn_a, force
+
+
+def rates(state: FloatArray, vehicle: Vehicle, loads: Loads) -> FloatArray:
+    """Derivative of one state (20,) under loads and the joint."""
+    _, v, q_b, q_a, w_b, w_a = split(state)
+    body, shell = vehicle.centerbody, vehicle.aeroshell
+    a_b, turn_b, a_a, turn_a, _ = accelerations(state, vehicle, loads)
     acceleration = (body.mass_kg * a_b + shell.mass_kg * a_a) / vehicle.mass_kg
     spin_b = 0.5 * rotations.multiply(q_b, np.concatenate([[0.0], w_b]))
     spin_a = 0.5 * rotations.multiply(q_a, np.concatenate([[0.0], w_a]))
-    return np.concatenate([v, acceleration, spin_b, spin_a, r_b.T @ turn_b, r_a.T @ turn_a])
+    turn_b, turn_a = (
+        rotations.rotate(rotations.conjugate(q_b), turn_b),
+        rotations.rotate(rotations.conjugate(q_a), turn_a),
+    )
+    return np.concatenate([v, acceleration, spin_b, spin_a, turn_b, turn_a])

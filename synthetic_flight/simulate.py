@@ -16,7 +16,7 @@ from flightmodel.checks import ConfigError, FloatArray
 from flightmodel.deflection import DeflectionHistory, lv_clock
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import Vehicle
-from synthetic_flight import _kernels, dynamics
+from synthetic_flight import _kernels, dynamics, packing
 
 BENDING_LIMIT_RAD = 0.5 * np.pi
 TUMBLE_RAD = 0.5 * np.pi
@@ -120,8 +120,8 @@ def integrate(
     out, aux = np.empty((records, _kernels.STATES)), np.empty((records, _kernels.AUX))
     written = _kernels.integrate(
         np.ascontiguousarray(state),
-        dynamics.parameter_vector(vehicle),
-        *dynamics.kernel_tables(vehicle, atmosphere),
+        packing.parameter_vector(vehicle),
+        *packing.kernel_tables(vehicle, atmosphere),
         step_s,
         per_record,
         records,
@@ -165,7 +165,7 @@ def fly(
         raise ConfigError(f"fly: record {record_s} s must be a whole multiple of step {step_s} s, and stop after start")
     records = round((stop_s - start_s) / record_s) + 1
     lock = 0 if inflated_s is None else max(0, int(np.ceil((inflated_s - start_s) / record_s - 1e-9)))
-    states, aux = integrate(vehicle, dynamics.atmosphere_table(profile), state, step_s, per_record, records, lock)
+    states, aux = integrate(vehicle, packing.atmosphere_table(profile), state, step_s, per_record, records, lock)
     finite = np.isfinite(states).all(axis=1)
     states, aux = states[finite], aux[finite]
     diverged = len(states) < records
