@@ -9,15 +9,12 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-from scipy.integrate import solve_ivp
-
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from flightmodel.flightfolder import read_flight
 from postflight.pipeline import estimate_camera, pulse_data, reconstruct_flight
 from recon.bet import reconstruct
-from synthetic_flight import _kernels, packing
+from synthetic_flight import packing
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import child_rng, day_atmosphere, fly_scenario, initial_state, read_scenario
 from synthetic_flight.simulate import integrate
@@ -35,18 +32,6 @@ def best(work):
     return min(times)
 
 
-def peer_seconds(vehicle, table, state, span_s):
-    """DOP853 of scipy over the same compiled right-hand side: the usual way to fly such equations in Python."""
-    p, tables = packing.parameter_vector(vehicle), packing.kernel_tables(vehicle, table)
-    dy, aux = np.empty(_kernels.STATES), np.empty(_kernels.AUX)
-
-    def f(_t, y):
-        _kernels.rates(y, p, *tables, False, dy, aux)
-        return dy.copy()
-
-    return best(lambda: solve_ivp(f, (0.0, span_s), state, method="DOP853", rtol=1e-6, atol=1e-6))
-
-
 def main():
     scenario = read_scenario("irve2_reference")
     vehicle = scenario.vehicle
@@ -56,9 +41,6 @@ def main():
     kernel = best(lambda: integrate(vehicle, table, state, 0.002, 2, 110001, 52501))
     rows.append(("fly 440 s, RK4 at 500 Hz, integration alone", kernel))
     rows.append(("fly 440 s with air data and truth", best(lambda: fly_scenario(scenario, 0))))
-    begin = integrate(vehicle, table, state, 0.002, 50, 3361, 2101)[0][-1]  # 336 s later: in the pulse
-    rows.append(("  30 s of the pulse, our RK4", best(lambda: integrate(vehicle, table, begin, 0.002, 2, 7501))))
-    rows.append(("  the same by scipy DOP853 on the same compiled rates", peer_seconds(vehicle, table, begin, 30.0)))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "flight"
         begun = time.perf_counter()

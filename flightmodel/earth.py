@@ -10,6 +10,8 @@ NIMA TR8350.2 (WGS-84), 3rd ed. Conversions: pymap3d.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pymap3d
 
@@ -22,6 +24,19 @@ J2 = 1.082629821313e-3
 OMEGA_RADPS = 7.292115e-5
 OMEGA_ECEF_RADPS = np.array([0.0, 0.0, OMEGA_RADPS])
 STANDARD_GRAVITY_MPS2 = 9.80665
+
+
+class Planet(NamedTuple):
+    """What pulls and turns below a simulated flight; everything that reads flights assumes `WGS84`."""
+
+    gm_m3ps2: float
+    j2: float
+    semi_major_m: float
+    flattening: float
+    rate_radps: float
+
+
+WGS84 = Planet(GM_M3PS2, J2, SEMI_MAJOR_M, FLATTENING, OMEGA_RADPS)
 
 
 def potential(position_m: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import GM_WGS84, OMEGA_WGS84, boxplus, dcm_from_quaternion, gravitation, kernel
+from flightmodel._kernels import GM_WGS84, OMEGA_WGS84, WGS84, boxplus, dcm_from_quaternion, gravitation, kernel
 
 
 @kernel
@@ -176,7 +176,7 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     x = position[0] + h * velocity[0]
     y = position[1] + h * velocity[1]
     z = position[2] + h * velocity[2]
-    gx, gy, gz = gravitation(x, y, z)
+    gx, gy, gz = gravitation(x, y, z, WGS84)
     w2 = OMEGA_WGS84 * OMEGA_WGS84
     ax = dcm_mid[0, 0] * force[0] + dcm_mid[0, 1] * force[1] + dcm_mid[0, 2] * force[2] + gx + w2 * x
     ay = dcm_mid[1, 0] * force[0] + dcm_mid[1, 1] * force[1] + dcm_mid[1, 2] * force[2] + gy + w2 * y

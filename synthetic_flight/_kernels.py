@@ -1,400 +1,258 @@
-"""Compiled two-body dynamics: right-hand side, Runge-Kutta steps, recording.
+"""Compiled two-body dynamics: right-hand side, Runge-Kutta steps, recording; one flight or many side by side.
 
 Readable twin: `synthetic_flight.dynamics`.
 
 State (20): position and velocity of the composite c.g. (ECI), quaternions ECI from body and ECI from shell, rates of
 body and shell (own axes). The joint's constraint is eliminated, so nothing drifts: its force comes from one 3x3
-symmetric positive-definite solve (the constraint force equation of a spherical joint).
+symmetric positive-definite solve (the constraint force equation of a spherical joint), in shell axes, where the
+shell's inertia, its arm to the joint and the aerodynamic wrench need no turning.
+
+One flight is a long chain of dependent arithmetic, so a processor mostly waits. Flights do not depend on each other,
+so they fly in lanes: row ``r`` of the workspace ``s`` holds one quantity of every flight, ``s[r * lanes + i]``, and
+loops over ``i`` become vector instructions. The number of lanes is the length of the tuple ``lanes``, which the
+compiler knows; one lane is the plain simulator. Table look-ups, which do not vectorise, have loops of their own. All
+rows lie in one array, so that the compiler sees that none overlap. Branches in vector loops must be arithmetic.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from flightmodel._kernels import OMEGA_WGS84, geodetic, gravitation, kernel
-
-STATES = 20
-# what is recorded beside the state: altitude, density, Mach, dynamic pressure, shell's total angle of attack,
-# bending angle, joint force on the body (ECI, 3), joint moment on the body (ECI, 3), aerodynamic force (ECI, 3),
-# angular acceleration of the body (body axes, 3)
-AUX = 18
-# layout of the parameter vector
-M_B, M_A, I_B, I_A, W_B, W_A, N_B, N_A, P_B, P_A, NOSE_A, JOINT, REFERENCE = (
-    0,
-    1,
-    2,
-    11,
-    20,
-    29,
-    38,
-    47,
-    56,
-    59,
-    62,
-    65,
-    75,
-)
-PARAMETERS = 77
+from flightmodel import _kernels as la
+from flightmodel._kernels import inlined, kernel
+from synthetic_flight import _air_kernels as air
+from synthetic_flight import _workspace_kernels as at
 
 
 @kernel
-def _rotation(q0, q1, q2, q3):
-    return (
-        1.0 - 2.0 * (q2 * q2 + q3 * q3), 2.0 * (q1 * q2 - q0 * q3), 2.0 * (q1 * q3 + q0 * q2),
-        2.0 * (q1 * q2 + q0 * q3), 1.0 - 2.0 * (q1 * q1 + q3 * q3), 2.0 * (q2 * q3 - q0 * q1),
-        2.0 * (q1 * q3 - q0 * q2), 2.0 * (q2 * q3 + q0 * q1), 1.0 - 2.0 * (q1 * q1 + q2 * q2),
-    )  # fmt: skip
+def beyond_freeplay(theta, freeplay, half, per_four_half):
+    """Bending angle beyond the dead band, with a corner that is smooth in slope over +/- ``half``."""
+    inside = min(max(theta - freeplay + half, 0.0), 2.0 * half)
+    return inside * inside * per_four_half + max(theta - freeplay - half, 0.0)
 
 
-@kernel
-def _apply(m, x, y, z):
-    return m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z, m[6] * x + m[7] * y + m[8] * z
-
-
-@kernel
-def _apply_transposed(m, x, y, z):
-    return m[0] * x + m[3] * y + m[6] * z, m[1] * x + m[4] * y + m[7] * z, m[2] * x + m[5] * y + m[8] * z
-
-
-@kernel
-def _cross(a0, a1, a2, b0, b1, b2):
-    return a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-
-
-@kernel
-def _nine(p, i):
-    return p[i], p[i + 1], p[i + 2], p[i + 3], p[i + 4], p[i + 5], p[i + 6], p[i + 7], p[i + 8]
-
-
-@kernel
-def _turned(r, m):
-    """R M R^T of a 3x3 matrix given as nine numbers."""
-    a = (
-        r[0] * m[0] + r[1] * m[3] + r[2] * m[6], r[0] * m[1] + r[1] * m[4] + r[2] * m[7],
-        r[0] * m[2] + r[1] * m[5] + r[2] * m[8], r[3] * m[0] + r[4] * m[3] + r[5] * m[6],
-        r[3] * m[1] + r[4] * m[4] + r[5] * m[7], r[3] * m[2] + r[4] * m[5] + r[5] * m[8],
-        r[6] * m[0] + r[7] * m[3] + r[8] * m[6], r[6] * m[1] + r[7] * m[4] + r[8] * m[7],
-        r[6] * m[2] + r[7] * m[5] + r[8] * m[8],
-    )  # fmt: skip
-    return (
-        a[0] * r[0] + a[1] * r[1] + a[2] * r[2], a[0] * r[3] + a[1] * r[4] + a[2] * r[5],
-        a[0] * r[6] + a[1] * r[7] + a[2] * r[8], a[3] * r[0] + a[4] * r[1] + a[5] * r[2],
-        a[3] * r[3] + a[4] * r[4] + a[5] * r[5], a[3] * r[6] + a[4] * r[7] + a[5] * r[8],
-        a[6] * r[0] + a[7] * r[1] + a[8] * r[2], a[6] * r[3] + a[7] * r[4] + a[8] * r[5],
-        a[6] * r[6] + a[7] * r[7] + a[8] * r[8],
-    )  # fmt: skip
-
-
-@kernel
-def _solve3(m, b0, b1, b2):
-    """Solution of a 3x3 system by cofactors."""
-    c0 = m[4] * m[8] - m[5] * m[7]
-    c1 = m[5] * m[6] - m[3] * m[8]
-    c2 = m[3] * m[7] - m[4] * m[6]
-    d = 1.0 / (m[0] * c0 + m[1] * c1 + m[2] * c2)
-    x = c0 * b0 + (m[2] * m[7] - m[1] * m[8]) * b1 + (m[1] * m[5] - m[2] * m[4]) * b2
-    y = c1 * b0 + (m[0] * m[8] - m[2] * m[6]) * b1 + (m[2] * m[3] - m[0] * m[5]) * b2
-    z = c2 * b0 + (m[1] * m[6] - m[0] * m[7]) * b1 + (m[0] * m[4] - m[1] * m[3]) * b2
-    return x * d, y * d, z * d
-
-
-@kernel
-def beyond_freeplay(theta, freeplay, corner):
-    """Bending angle beyond the dead band, with a corner that is smooth in slope over +/- ``corner * freeplay``."""
-    w = corner * freeplay
-    if theta >= freeplay + w:
-        return theta - freeplay
-    if theta <= freeplay - w:
-        return 0.0
-    return (theta - freeplay + w) ** 2 / (4.0 * w)
-
-
-@kernel
-def _joint_moment(p, rb, ra, qb, qa, db, da, dc):
-    """Moment of the joint on the body (ECI) and the bending angle; (db, da, dc) is body's rate against shell's (ECI).
+@inlined
+def _joint(s, w, i, c, wx, wy, wz):
+    """Moment of the joint on the body and the bending angle; ``w``: body's rate against the shell's. Shell axes.
 
     Bending potential of the angle between the two x axes, torsion potential of the twist left after swinging one x
     axis onto the other; both moments are exact gradients, so springs conserve energy at any angle.
     """
-    bx, by, bz = rb[0], rb[3], rb[6]
-    ax, ay, az = ra[0], ra[3], ra[6]
-    ex, ey, ez = _cross(bx, by, bz, ax, ay, az)
-    s = math.sqrt(ex * ex + ey * ey + ez * ez)
-    c = bx * ax + by * ay + bz * az
-    theta = math.atan2(s, c)
-    d = beyond_freeplay(theta, p[JOINT + 6], p[JOINT + 7])
-    bend = p[JOINT] * d + p[JOINT + 1] * d * d * d
-    k = bend / s if s > 1e-9 else p[JOINT] if p[JOINT + 6] == 0.0 else 0.0
-    # twist of body against shell: scalar and x parts of conj(q_eci_shell) q_eci_body
-    w = qa[0] * qb[0] + qa[1] * qb[1] + qa[2] * qb[2] + qa[3] * qb[3]
-    x = qa[0] * qb[1] - qa[1] * qb[0] - qa[2] * qb[3] + qa[3] * qb[2]
-    twist = 2.0 * math.atan2(x, w)
-    if twist > math.pi:
-        twist -= 2.0 * math.pi
-    elif twist < -math.pi:
-        twist += 2.0 * math.pi
-    t = -p[JOINT + 2] * twist / (1.0 + c)
-    tx, ty, tz = bx + ax, by + ay, bz + az
-    along = (db * tx + da * ty + dc * tz) / (2.0 + 2.0 * c)
-    damp = p[JOINT + 3] + p[JOINT + 4] * theta * theta
-    roll = (p[JOINT + 5] - damp) * along
-    return (
-        k * ex + t * tx - damp * db - roll * tx,
-        k * ey + t * ty - damp * da - roll * ty,
-        k * ez + t * tz - damp * dc - roll * tz,
-        theta,
-    )
+    # body's x axis is (c0, c3, c6), the shell's (1, 0, 0): their cross product is (0, c6, -c3)
+    sine = math.sqrt(c[6] * c[6] + c[3] * c[3])
+    theta = la.atan2(sine, c[0])
+    j = (at.P + at.JOINT) * w + i
+    d = beyond_freeplay(theta, s[j + 6 * w], s[j + 7 * w], s[j + 8 * w])
+    k = d * (s[j] + s[j + w] * d * d) / (sine + 1e-300)
+    twist = 2.0 * la.atan2(s[(at.TWIST + 1) * w + i], s[at.TWIST * w + i])
+    twist -= 2.0 * math.pi * ((1.0 if twist > math.pi else 0.0) - (1.0 if twist < -math.pi else 0.0))
+    tx, ty, tz = 1.0 + c[0], c[3], c[6]
+    damp = s[j + 3 * w] + s[j + 4 * w] * theta * theta
+    per_tx = 1.0 / tx
+    t = -per_tx * (s[j + 2 * w] * twist + 0.5 * (s[j + 5 * w] - damp) * (wx * tx + wy * ty + wz * tz))
+    return t * tx - damp * wx, k * c[6] + t * ty - damp * wy, t * tz - k * c[3] - damp * wz, theta
+
+
+@inlined
+def _common(s, w, i, planet):
+    """What both joints need: rotations, rates, arms, and gravity and aerodynamics, their sum already in the rates."""
+    r, c = at.nine(s, at.R_A, w, i), at.nine(s, at.C_AB, w, i)
+    mb, ma, per_mass = s[(at.P + at.M_B) * w + i], s[(at.P + at.M_A) * w + i], s[(at.P + at.PER_MASS) * w + i]
+    bx, by, bz = at.three(s, at.P + at.P_B, w, i)
+    bx, by, bz = la.times(c, bx, by, bz)
+    ax, ay, az = at.three(s, at.P + at.P_A, w, i)
+    sx, sy, sz = ax - bx, ay - by, az - bz  # body's c.g. from the shell's
+    ex, ey, ez = la.times(r, sx, sy, sz)
+    fb, fa = s[(at.P + at.SHARE_B) * w + i], s[(at.P + at.SHARE_A) * w + i]
+    x, y, z = at.three(s, at.TRIAL, w, i)
+    g0, g1, g2 = la.gravitation(x + fb * ex, y + fb * ey, z + fb * ez, planet)
+    h0, h1, h2 = la.gravitation(x + fa * ex, y + fa * ey, z + fa * ez, planet)
+    _, wa1, wa2 = at.three(s, at.TRIAL + 17, w, i)
+    fx, fy, fz, mx, my = air.wrench(s, w, i, wa1, wa2)
+    nx, ny, nz = at.three(s, at.P + at.NOSE_A, w, i)
+    tx, ty, tz = la.cross(nx, ny, nz, fx, fy, fz)
+    gx, gy, gz = la.times(r, fx, fy, fz)
+    vx, vy, vz = at.three(s, at.TRIAL + 3, w, i)
+    at.put(s, at.RATE, w, i, vx, vy, vz)
+    a0, a1, a2 = mb * g0 + ma * h0 + gx, mb * g1 + ma * h1 + gy, mb * g2 + ma * h2 + gz
+    at.put(s, at.RATE + 3, w, i, a0 * per_mass, a1 * per_mass, a2 * per_mass)
+    at.put(s, at.AERO, w, i, fx, fy, fz)
+    tide = la.back(r, h0 - g0, h1 - g1, h2 - g2)
+    for k, q in ((6, 14), (10, 17)):
+        t = (at.TRIAL + k) * w + i
+        q0, q1, q2, q3 = s[t], s[t + w], s[t + 2 * w], s[t + 3 * w]
+        w0, w1, w2 = at.three(s, at.TRIAL + q, w, i)
+        t = (at.RATE + k) * w + i
+        s[t], s[t + w] = 0.5 * (-q1 * w0 - q2 * w1 - q3 * w2), 0.5 * (q0 * w0 + q2 * w2 - q3 * w1)
+        s[t + 2 * w], s[t + 3 * w] = 0.5 * (q0 * w1 + q3 * w0 - q1 * w2), 0.5 * (q0 * w2 + q1 * w1 - q2 * w0)
+    return c, (bx, by, bz), (ax, ay, az), (sx, sy, sz), tide, (tx, ty + mx, tz + my), (fx, fy, fz)
 
 
 @kernel
-def _air(atmosphere, start, step, altitude):
-    """Log density, speed of sound, north and east wind at an altitude; end values outside."""
-    u = (altitude - start) / step
-    u = min(max(u, 0.0), atmosphere.shape[0] - 1.000001)
-    i = int(u)
-    f = u - i
-    g = 1.0 - f
-    return (
-        g * atmosphere[i, 0] + f * atmosphere[i + 1, 0],
-        g * atmosphere[i, 1] + f * atmosphere[i + 1, 1],
-        g * atmosphere[i, 2] + f * atmosphere[i + 1, 2],
-        g * atmosphere[i, 3] + f * atmosphere[i + 1, 3],
-    )
-
-
-@kernel
-def _coefficients(mach_knots, alpha_step, table, mach, alpha):
-    """C_A, C_N, C_m, C_mq, bilinear; held at the first and last Mach number."""
-    i = 0
-    while i < mach_knots.shape[0] - 2 and mach > mach_knots[i + 1]:
-        i += 1
-    f = min(max((mach - mach_knots[i]) / (mach_knots[i + 1] - mach_knots[i]), 0.0), 1.0)
-    u = alpha / alpha_step
-    j = min(int(u), table.shape[1] - 2)
-    h = u - j
-    a, b, c, d = (1.0 - f) * (1.0 - h), (1.0 - f) * h, f * (1.0 - h), f * h
-    return (
-        a * table[i, j, 0] + b * table[i, j + 1, 0] + c * table[i + 1, j, 0] + d * table[i + 1, j + 1, 0],
-        a * table[i, j, 1] + b * table[i, j + 1, 1] + c * table[i + 1, j, 1] + d * table[i + 1, j + 1, 1],
-        a * table[i, j, 2] + b * table[i, j + 1, 2] + c * table[i + 1, j, 2] + d * table[i + 1, j + 1, 2],
-        a * table[i, j, 3] + b * table[i, j + 1, 3] + c * table[i + 1, j, 3] + d * table[i + 1, j + 1, 3],
-    )
-
-
-@kernel
-def _aerodynamics(p, ra, x, v, w, atmosphere, grid, mach_knots, table, aux):
-    """Force at the nose and moment about it on the shell (ECI); ``x``, ``v`` of the nose (ECI), ``w`` shell rate."""
-    sin_lat, cos_lat, altitude = geodetic(x[0], x[1], x[2])
-    log_rho, sound, north, east = _air(atmosphere, grid[0], grid[1], altitude)
-    rho = math.exp(log_rho)
-    equatorial = math.sqrt(x[0] * x[0] + x[1] * x[1])
-    cl, sl = x[0] / equatorial, x[1] / equatorial
-    ux = v[0] + OMEGA_WGS84 * x[1] + north * sin_lat * cl + east * sl
-    uy = v[1] - OMEGA_WGS84 * x[0] + north * sin_lat * sl - east * cl
-    uz = v[2] - north * cos_lat
-    u, lv, lw = _apply_transposed(ra, ux, uy, uz)
-    lateral = math.sqrt(lv * lv + lw * lw)
-    speed = math.sqrt(u * u + lateral * lateral)
-    alpha = math.atan2(lateral, u)
-    pressure = 0.5 * rho * speed * speed
-    mach = speed / sound
-    ca, cn, cm, cmq = _coefficients(mach_knots, grid[2], table, mach, alpha)
-    area, length = p[REFERENCE], p[REFERENCE + 1]
-    ny, nz = (lv / lateral, lw / lateral) if lateral > 1e-12 else (0.0, 0.0)
-    qs = pressure * area
-    fx, fy, fz = _apply(ra, -qs * ca, -qs * cn * ny, -qs * cn * nz)
-    damping = qs * length * length * cmq / (2.0 * max(speed, 1e-3))
-    # nose-up about n x x_hat = (0, n_z, -n_y)
-    mx, my, mz = _apply(ra, 0.0, qs * length * cm * nz + damping * w[1], -qs * length * cm * ny + damping * w[2])
-    aux[0], aux[1], aux[2], aux[3], aux[4] = altitude, rho, mach, pressure, alpha
-    return fx, fy, fz, mx, my, mz
-
-
-@kernel
-def rates(y, p, atmosphere, grid, mach_knots, table, locked, dy, aux):
-    """Time derivative of the state into ``dy`` and what is recorded into ``aux``."""
-    qb, qa = y[6:10], y[10:14]
-    wb, wa = y[14:17], y[17:20]
-    rb = _rotation(qb[0], qb[1], qb[2], qb[3])
-    ra = _rotation(qa[0], qa[1], qa[2], qa[3])
-    mb, ma = p[M_B], p[M_A]
-    mass = mb + ma
-    # joint from each c.g. (ECI), then c.g.s from the composite c.g.
-    pb = _apply(rb, p[P_B], p[P_B + 1], p[P_B + 2])
-    pa = _apply(ra, p[P_A], p[P_A + 1], p[P_A + 2])
-    sx, sy, sz = pa[0] - pb[0], pa[1] - pb[1], pa[2] - pb[2]  # body's c.g. from the shell's
-    fb, fa = ma / mass, -mb / mass
-    gb = gravitation(y[0] + fb * sx, y[1] + fb * sy, y[2] + fb * sz)
-    ga = gravitation(y[0] + fa * sx, y[1] + fa * sy, y[2] + fa * sz)
-    wbi = _apply(rb, wb[0], wb[1], wb[2])
-    wai = _apply(ra, wa[0], wa[1], wa[2])
-    vb = _cross(wbi[0], wbi[1], wbi[2], pb[0], pb[1], pb[2])  # joint's velocity from each c.g.'s
-    va = _cross(wai[0], wai[1], wai[2], pa[0], pa[1], pa[2])
-    nose = _apply(ra, p[NOSE_A], p[NOSE_A + 1], p[NOSE_A + 2])
-    vn = _cross(wai[0], wai[1], wai[2], nose[0], nose[1], nose[2])
-    x = (y[0] + fa * sx + nose[0], y[1] + fa * sy + nose[1], y[2] + fa * sz + nose[2])
-    v = (
-        y[3] + fa * (va[0] - vb[0]) + vn[0],
-        y[4] + fa * (va[1] - vb[1]) + vn[1],
-        y[5] + fa * (va[2] - vb[2]) + vn[2],
-    )
-    aero = _aerodynamics(p, ra, x, v, wa, atmosphere, grid, mach_knots, table, aux)
-    arm = _cross(nose[0], nose[1], nose[2], aero[0], aero[1], aero[2])
-    ta = (aero[3] + arm[0], aero[4] + arm[1], aero[5] + arm[2])  # moment on the shell about its c.g. (ECI)
-    for k in range(3):
-        dy[k] = y[3 + k]
-        dy[3 + k] = (mb * gb[k] + ma * ga[k] + aero[k]) / mass
-    if locked:
-        tau, theta, force = _locked(p, y, rb, ra, pb, sx, sy, sz, gb, ga, aero, ta, fb, fa, dy)
-    else:
-        tau, theta, force = _hinged(p, qb, qa, wb, wa, rb, ra, pb, pa, wbi, wai, vb, va, gb, ga, aero, ta, dy)
-    _quaternion_rate(qb, wb, dy, 6)
-    _quaternion_rate(qa, wa, dy, 10)
-    aux[5] = theta
-    for k in range(3):
-        aux[6 + k] = force[k]
-        aux[9 + k] = tau[k]
-        aux[12 + k] = aero[k]
-        aux[15 + k] = dy[14 + k]
-
-
-@kernel
-def _quaternion_rate(q, w, dy, i):
-    dy[i] = 0.5 * (-q[1] * w[0] - q[2] * w[1] - q[3] * w[2])
-    dy[i + 1] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1])
-    dy[i + 2] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2])
-    dy[i + 3] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0])
-
-
-@kernel
-def _euler(inertia, inverse, w, tx, ty, tz):
-    """Angular acceleration, own axes, under a moment in own axes."""
-    h = _apply(inertia, w[0], w[1], w[2])
-    g = _cross(w[0], w[1], w[2], h[0], h[1], h[2])
-    return _apply(inverse, tx - g[0], ty - g[1], tz - g[2])
-
-
-@kernel
-def _hinged(p, qb, qa, wb, wa, rb, ra, pb, pa, wbi, wai, vb, va, gb, ga, aero, ta, dy):
+def _hinged(s, lanes, planet):
     """Rates of both bodies with the joint's force from the constraint force equation."""
-    mb, ma = p[M_B], p[M_A]
-    jx, jy, jz, theta = _joint_moment(p, rb, ra, qb, qa, wbi[0] - wai[0], wbi[1] - wai[1], wbi[2] - wai[2])
-    tb = _apply_transposed(rb, jx, jy, jz)
-    tas = _apply_transposed(ra, ta[0] - jx, ta[1] - jy, ta[2] - jz)
-    ib, ia, ivb, iva = _nine(p, I_B), _nine(p, I_A), _nine(p, W_B), _nine(p, W_A)
-    eb = _euler(ib, ivb, wb, tb[0], tb[1], tb[2])
-    ea = _euler(ia, iva, wa, tas[0], tas[1], tas[2])
-    ebi, eai = _apply(rb, eb[0], eb[1], eb[2]), _apply(ra, ea[0], ea[1], ea[2])
-    ub = _cross(ebi[0], ebi[1], ebi[2], pb[0], pb[1], pb[2])
-    ua = _cross(eai[0], eai[1], eai[2], pa[0], pa[1], pa[2])
-    cb = _cross(wbi[0], wbi[1], wbi[2], vb[0], vb[1], vb[2])
-    ca = _cross(wai[0], wai[1], wai[2], va[0], va[1], va[2])
-    mob_b, mob_a = _turned(rb, _nine(p, N_B)), _turned(ra, _nine(p, N_A))
-    k = 1.0 / mb + 1.0 / ma
-    m = (
-        mob_b[0] + mob_a[0] + k, mob_b[1] + mob_a[1], mob_b[2] + mob_a[2],
-        mob_b[3] + mob_a[3], mob_b[4] + mob_a[4] + k, mob_b[5] + mob_a[5],
-        mob_b[6] + mob_a[6], mob_b[7] + mob_a[7], mob_b[8] + mob_a[8] + k,
-    )  # fmt: skip
-    force = _solve3(
-        m,
-        ga[0] + aero[0] / ma + ua[0] + ca[0] - gb[0] - ub[0] - cb[0],
-        ga[1] + aero[1] / ma + ua[1] + ca[1] - gb[1] - ub[1] - cb[1],
-        ga[2] + aero[2] / ma + ua[2] + ca[2] - gb[2] - ub[2] - cb[2],
-    )
-    fb, fa = (
-        _cross(pb[0], pb[1], pb[2], force[0], force[1], force[2]),
-        _cross(pa[0], pa[1], pa[2], force[0], force[1], force[2]),
-    )
-    lb, la = _apply_transposed(rb, fb[0], fb[1], fb[2]), _apply_transposed(ra, fa[0], fa[1], fa[2])
-    cb2, ca2 = _apply(ivb, lb[0], lb[1], lb[2]), _apply(iva, la[0], la[1], la[2])
-    for i in range(3):
-        dy[14 + i] = eb[i] + cb2[i]
-        dy[17 + i] = ea[i] - ca2[i]
-    return (jx, jy, jz), theta, force
+    w = len(lanes)
+    for i in range(w):
+        c, _, pa, _, tide, ta, aero = _common(s, w, i, planet)
+        wb0, wb1, wb2 = at.three(s, at.TRIAL + 14, w, i)
+        wa0, wa1, wa2 = at.three(s, at.TRIAL + 17, w, i)
+        vx, vy, vz = la.times(c, wb0, wb1, wb2)
+        jx, jy, jz, theta = _joint(s, w, i, c, vx - wa0, vy - wa1, vz - wa2)
+        inverse_b, inverse_a = at.six(s, at.P + at.W_B, w, i), at.six(s, at.P + at.W_A, w, i)
+        g0, g1, g2 = la.gyroscopic(at.six(s, at.P + at.I_B, w, i), wb0, wb1, wb2)
+        h0, h1, h2 = la.gyroscopic(at.six(s, at.P + at.I_A, w, i), wa0, wa1, wa2)
+        tx, ty, tz = la.back(c, jx, jy, jz)
+        eb0, eb1, eb2 = la.symmetric(inverse_b, tx - g0, ty - g1, tz - g2)
+        ea0, ea1, ea2 = la.symmetric(inverse_a, ta[0] - jx - h0, ta[1] - jy - h1, ta[2] - jz - h2)
+        # what the joint's point would do without the joint's force
+        p0, p1, p2 = at.three(s, at.P + at.P_B, w, i)
+        x, y, z = la.cross(eb0, eb1, eb2, p0, p1, p2)
+        u, v, t = la.centripetal(wb0, wb1, wb2, p0, p1, p2)
+        x, y, z = la.times(c, x + u, y + v, z + t)
+        u, v, t = la.cross(ea0, ea1, ea2, pa[0], pa[1], pa[2])
+        m0, m1, m2 = la.centripetal(wa0, wa1, wa2, pa[0], pa[1], pa[2])
+        x, y, z = tide[0] + u + m0 - x, tide[1] + v + m1 - y, tide[2] + t + m2 - z
+        per_a = s[(at.P + at.PER_A) * w + i]
+        k, n, m = (
+            per_a + s[(at.P + at.PER_B) * w + i],
+            la.turned(c, at.six(s, at.P + at.N_B, w, i)),
+            at.six(s, at.P + at.N_A, w, i),
+        )
+        n = (n[0] + m[0] + k, n[1] + m[1], n[2] + m[2], n[3] + m[3] + k, n[4] + m[4], n[5] + m[5] + k)
+        fx, fy, fz = la.solved(n, x + aero[0] * per_a, y + aero[1] * per_a, z + aero[2] * per_a)
+        u, v, t = la.back(c, fx, fy, fz)
+        u, v, t = la.cross(p0, p1, p2, u, v, t)
+        u, v, t = la.symmetric(inverse_b, u, v, t)
+        x, y, z = la.cross(pa[0], pa[1], pa[2], fx, fy, fz)
+        x, y, z = la.symmetric(inverse_a, x, y, z)
+        at.put(s, at.RATE + 14, w, i, eb0 + u, eb1 + v, eb2 + t)
+        at.put(s, at.RATE + 17, w, i, ea0 - x, ea1 - y, ea2 - z)
+        s[at.THETA * w + i] = theta
+        at.put(s, at.FORCE, w, i, fx, fy, fz)
+        at.put(s, at.MOMENT, w, i, jx, jy, jz)
+        at.put(s, at.TURN, w, i, eb0 + u, eb1 + v, eb2 + t)
 
 
 @kernel
-def _locked(p, y, rb, ra, pb, sx, sy, sz, gb, ga, aero, ta, fb, fa, dy):
-    """Rates of one rigid body: joint locked, both rates equal; returns the moment and force that the lock carries."""
-    mb, ma = p[M_B], p[M_A]
-    ib, ia = _turned(rb, _nine(p, I_B)), _turned(ra, _nine(p, I_A))
-    reduced = mb * ma / (mb + ma)
-    s2 = sx * sx + sy * sy + sz * sz
-    m = (
-        ib[0] + ia[0] + reduced * (s2 - sx * sx), ib[1] + ia[1] - reduced * sx * sy, ib[2] + ia[2] - reduced * sx * sz,
-        ib[3] + ia[3] - reduced * sy * sx, ib[4] + ia[4] + reduced * (s2 - sy * sy), ib[5] + ia[5] - reduced * sy * sz,
-        ib[6] + ia[6] - reduced * sz * sx, ib[7] + ia[7] - reduced * sz * sy, ib[8] + ia[8] + reduced * (s2 - sz * sz),
-    )  # fmt: skip
-    w = _apply(rb, y[14], y[15], y[16])
-    h = _apply(m, w[0], w[1], w[2])
-    g = _cross(w[0], w[1], w[2], h[0], h[1], h[2])
-    # moments about the composite c.g.: aerodynamics (ta is about the shell's c.g.) and gravity's gradient
-    t1 = _cross(fa * sx, fa * sy, fa * sz, aero[0], aero[1], aero[2])
-    t2 = _cross(sx, sy, sz, reduced * (gb[0] - ga[0]), reduced * (gb[1] - ga[1]), reduced * (gb[2] - ga[2]))
-    e = _solve3(m, ta[0] + t1[0] + t2[0] - g[0], ta[1] + t1[1] + t2[1] - g[1], ta[2] + t1[2] + t2[2] - g[2])
-    eb, ea = _apply_transposed(rb, e[0], e[1], e[2]), _apply_transposed(ra, e[0], e[1], e[2])
-    for k in range(3):
-        dy[14 + k] = eb[k]
-        dy[17 + k] = ea[k]
-    # force on the body: its c.g.'s acceleration less gravity
-    r1 = _cross(w[0], w[1], w[2], fb * sx, fb * sy, fb * sz)
-    r2 = _cross(w[0], w[1], w[2], r1[0], r1[1], r1[2])
-    r3 = _cross(e[0], e[1], e[2], fb * sx, fb * sy, fb * sz)
-    force = (
-        mb * (dy[3] + r2[0] + r3[0] - gb[0]),
-        mb * (dy[4] + r2[1] + r3[1] - gb[1]),
-        mb * (dy[5] + r2[2] + r3[2] - gb[2]),
-    )
-    # moment on the body about its c.g. that is not the force's at the joint
-    hb = _apply(ib, w[0], w[1], w[2])
-    g1 = _cross(w[0], w[1], w[2], hb[0], hb[1], hb[2])
-    ie = _apply(ib, e[0], e[1], e[2])
-    arm = _cross(pb[0], pb[1], pb[2], force[0], force[1], force[2])
-    tau = (ie[0] + g1[0] - arm[0], ie[1] + g1[1] - arm[1], ie[2] + g1[2] - arm[2])
-    c = rb[0] * ra[0] + rb[3] * ra[3] + rb[6] * ra[6]
-    ex, ey, ez = _cross(rb[0], rb[3], rb[6], ra[0], ra[3], ra[6])
-    return tau, math.atan2(math.sqrt(ex * ex + ey * ey + ez * ez), c), force
+def _locked(s, lanes, planet):
+    """Rates of one rigid body: joint locked, both rates equal; the moment and force that the lock carries."""
+    w = len(lanes)
+    for i in range(w):
+        c, pb, _, d, tide, ta, aero = _common(s, w, i, planet)
+        w0, w1, w2 = at.three(s, at.TRIAL + 17, w, i)
+        mb, f, share = s[(at.P + at.M_B) * w + i], s[(at.P + at.SHARE_A) * w + i], s[(at.P + at.SHARE_B) * w + i]
+        per_mass = s[(at.P + at.PER_MASS) * w + i]
+        m, square = mb * share, d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+        b, a = la.turned(c, at.six(s, at.P + at.I_B, w, i)), at.six(s, at.P + at.I_A, w, i)
+        n = (
+            a[0] + b[0] + m * (square - d[0] * d[0]), a[1] + b[1] - m * d[0] * d[1], a[2] + b[2] - m * d[0] * d[2],
+            a[3] + b[3] + m * (square - d[1] * d[1]), a[4] + b[4] - m * d[1] * d[2],
+            a[5] + b[5] + m * (square - d[2] * d[2]),
+        )  # fmt: skip
+        g0, g1, g2 = la.gyroscopic(n, w0, w1, w2)
+        # moments about the composite c.g.: aerodynamics (ta is about the shell's c.g.) and gravity's gradient
+        x, y, z = f * aero[0] - m * tide[0], f * aero[1] - m * tide[1], f * aero[2] - m * tide[2]
+        x, y, z = la.cross(d[0], d[1], d[2], x, y, z)
+        e0, e1, e2 = la.solved(n, ta[0] + x - g0, ta[1] + y - g1, ta[2] + z - g2)
+        # the body's c.g. moves with the composite c.g. and turns about it
+        x, y, z = la.centripetal(w0, w1, w2, d[0], d[1], d[2])
+        u, v, t = la.cross(e0, e1, e2, d[0], d[1], d[2])
+        fx = mb * (share * (tide[0] + x + u) + aero[0] * per_mass)
+        fy = mb * (share * (tide[1] + y + v) + aero[1] * per_mass)
+        fz = mb * (share * (tide[2] + z + t) + aero[2] * per_mass)
+        # moment on the body about its c.g. that is not the force's at the joint
+        g0, g1, g2 = la.gyroscopic(b, w0, w1, w2)
+        x, y, z = la.symmetric(b, e0, e1, e2)
+        u, v, t = la.cross(pb[0], pb[1], pb[2], fx, fy, fz)
+        at.put(s, at.FORCE, w, i, fx, fy, fz)
+        at.put(s, at.MOMENT, w, i, x + g0 - u, y + g1 - v, z + g2 - t)
+        x, y, z = la.back(c, e0, e1, e2)
+        at.put(s, at.RATE + 14, w, i, x, y, z)
+        at.put(s, at.RATE + 17, w, i, e0, e1, e2)
+        at.put(s, at.TURN, w, i, x, y, z)
+        s[at.THETA * w + i] = la.atan2(math.sqrt(c[6] * c[6] + c[3] * c[3]), c[0])
 
 
 @kernel
-def integrate(y0, p, atmosphere, grid, mach_knots, table, step, per_record, records, lock_records, limit, out, out_aux):
+def rates(s, lanes, atmosphere, grid, mach_knots, table, free, planet, locked):
+    """Time derivative of the trial state of every lane, and what is recorded."""
+    air.place(s, lanes, planet)
+    air.air(s, lanes, atmosphere, grid)
+    air.flow(s, lanes)
+    air.look_up(s, lanes, grid, mach_knots, table, free)
+    if locked:
+        _locked(s, lanes, planet)
+    else:
+        _hinged(s, lanes, planet)
+
+
+@kernel
+def _record(s, w, record, limit, out, out_aux, written):
+    """Write state and record of every lane that still flies; true while one does."""
+    flying = False
+    for i in range(w):
+        if written[i] < record:
+            continue
+        written[i] = record + 1
+        for k in range(at.STATES):
+            out[i, record, k] = s[(at.Y + k) * w + i]
+        for k in range(at.AUX):
+            out_aux[i, record, k] = s[(at.REC + k) * w + i]
+        if s[at.THETA * w + i] < limit:
+            flying = True
+        else:
+            written[i] = -record - 1  # ended here
+    return flying
+
+
+@kernel
+def _advance(s, w, stage, step):
+    """After a stage of RK4: add to the next state, and set the next trial state."""
+    ahead = step * (1.0 if stage == 2 else 0.5)
+    if stage == 0:
+        for k in range(at.STATES * w):
+            s[at.NEXT * w + k] = s[at.Y * w + k] + step / 6.0 * s[at.RATE * w + k]
+    else:
+        for k in range(at.STATES * w):
+            s[at.NEXT * w + k] += step / 3.0 * s[at.RATE * w + k]
+    for k in range(at.STATES * w):
+        s[at.TRIAL * w + k] = s[at.Y * w + k] + ahead * s[at.RATE * w + k]
+
+
+@kernel
+def _finish(s, w, step):
+    """After the last stage: the new state, quaternions of length one, and the trial state equal to it."""
+    for k in range(at.STATES * w):
+        s[at.Y * w + k] = s[at.NEXT * w + k] + step / 6.0 * s[at.RATE * w + k]
+    for row in (at.Y + 6, at.Y + 10):
+        for i in range(w):
+            j = row * w + i
+            a, b, c, d = s[j], s[j + w], s[j + 2 * w], s[j + 3 * w]
+            n = 1.0 / math.sqrt(a * a + b * b + c * c + d * d)
+            s[j], s[j + w], s[j + 2 * w], s[j + 3 * w] = a * n, b * n, c * n, d * n
+    for k in range(at.STATES * w):
+        s[at.TRIAL * w + k] = s[at.Y * w + k]
+
+
+@kernel
+def integrate(lanes, s, tables, planet, step, per_record, records, lock_records, limit, out, out_aux, written):
     """Fly ``records - 1`` intervals of ``per_record`` RK4 steps; joint locked for the first ``lock_records`` intervals.
 
-    Returns the number of records written: less than ``records`` where the bending angle passed ``limit`` or a number
-    stopped being finite.
+    ``written`` becomes the number of records of every lane, negative where the flight ended because the bending angle
+    passed ``limit`` or was not a number any more.
     """
-    y, trial = y0.copy(), np.empty(STATES)
-    k1, k2, k3, k4 = np.empty(STATES), np.empty(STATES), np.empty(STATES), np.empty(STATES)
-    aux = np.empty(AUX)
+    w = len(lanes)
+    for k in range(at.STATES * w):
+        s[at.TRIAL * w + k] = s[at.Y * w + k]
     for record in range(records):
         locked = record < lock_records
-        rates(y, p, atmosphere, grid, mach_knots, table, locked, k1, aux)
-        for i in range(STATES):
-            out[record, i] = y[i]
-        for i in range(AUX):
-            out_aux[record, i] = aux[i]
-        if not aux[5] < limit:
-            return record + 1
-        if record == records - 1:
-            break
-        for _ in range(per_record):
-            rates(y, p, atmosphere, grid, mach_knots, table, locked, k1, aux)
-            for i in range(STATES):
-                trial[i] = y[i] + 0.5 * step * k1[i]
-            rates(trial, p, atmosphere, grid, mach_knots, table, locked, k2, aux)
-            for i in range(STATES):
-                trial[i] = y[i] + 0.5 * step * k2[i]
-            rates(trial, p, atmosphere, grid, mach_knots, table, locked, k3, aux)
-            for i in range(STATES):
-                trial[i] = y[i] + step * k3[i]
-            rates(trial, p, atmosphere, grid, mach_knots, table, locked, k4, aux)
-            for i in range(STATES):
-                y[i] += step / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-            for j in (6, 10):
-                n = 1.0 / math.sqrt(y[j] * y[j] + y[j + 1] * y[j + 1] + y[j + 2] * y[j + 2] + y[j + 3] * y[j + 3])
-                for i in range(4):
-                    y[j + i] *= n
-    return records
+        for sub in range(per_record):
+            for stage in range(4):
+                rates(s, lanes, tables[0], tables[1], tables[2], tables[3], tables[4], planet, locked)
+                if stage + sub == 0:
+                    flying = _record(s, w, record, limit, out, out_aux, written)
+                    if record == records - 1 or not flying:
+                        return
+                if stage < 3:
+                    _advance(s, w, stage, step)
+            _finish(s, w, step)

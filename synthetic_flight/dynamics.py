@@ -19,7 +19,6 @@ from flightmodel import earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
-from synthetic_flight import _kernels
 
 
 def split(state: FloatArray) -> tuple[FloatArray, ...]:
@@ -76,6 +75,14 @@ def twist(q_eci_body: FloatArray, q_eci_shell: FloatArray) -> FloatArray:
     return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
 
 
+def beyond_freeplay(theta_rad: FloatArray, freeplay_rad: float, corner: float) -> FloatArray:
+    """Bending angle beyond the dead band; within ``corner * freeplay`` of its edge a parabola joins the two slopes."""
+    half = corner * freeplay_rad
+    parabola = (theta_rad - freeplay_rad + half) ** 2 / (4.0 * half) if half > 0.0 else np.zeros_like(theta_rad)
+    outside = np.where(theta_rad >= freeplay_rad + half, theta_rad - freeplay_rad, parabola)
+    return np.where(theta_rad <= freeplay_rad - half, 0.0, outside)
+
+
 def spring_energy(vehicle: Vehicle, q_eci_body: FloatArray, q_eci_shell: FloatArray) -> FloatArray:
     """Energy in the joint's springs, J: the integral of its moment over the angle, freeplay and hardening included."""
     joint = vehicle.joint
@@ -88,7 +95,7 @@ def spring_energy(vehicle: Vehicle, q_eci_body: FloatArray, q_eci_shell: FloatAr
     for low, high in pairwise(edges):
         a, b = np.minimum(low, theta), np.minimum(high, theta)
         x = a[..., None] + 0.5 * (b - a)[..., None] * (node + 1.0)
-        d = np.vectorize(_kernels.beyond_freeplay, otypes=[float])(x, freeplay, joint.freeplay_corner)
+        d = beyond_freeplay(x, freeplay, joint.freeplay_corner)
         moment = joint.bending_stiffness_nmprad * d + joint.hardening_nmprad3 * d**3
         energy = energy + 0.5 * (b - a) * np.sum(weight * moment, axis=-1)
     return energy + 0.5 * joint.torsion_stiffness_nmprad * twist(q_eci_body, q_eci_shell) ** 2
@@ -135,7 +142,7 @@ def joint_moment(vehicle: Vehicle, q_b: FloatArray, q_a: FloatArray, rate_eci: F
     normal = np.cross(x_b, x_a)
     sine, cosine = np.linalg.norm(normal), x_b @ x_a
     theta = np.arctan2(sine, cosine)
-    d = _kernels.beyond_freeplay(theta, np.deg2rad(joint.freeplay_deg), joint.freeplay_corner)
+    d = beyond_freeplay(theta, np.deg2rad(joint.freeplay_deg), joint.freeplay_corner)
     bend = joint.bending_stiffness_nmprad * d + joint.hardening_nmprad3 * d**3
     moment = bend * normal / sine if sine > 0 else np.zeros(3)
     middle = x_b + x_a

@@ -8,59 +8,92 @@ from flightmodel import rotations
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
-from synthetic_flight import _kernels
+from synthetic_flight import _workspace_kernels as at
 
 ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, ATMOSPHERE_ROWS = -1000.0, 50.0, 8001
 
 
+def freeplay_corner(freeplay_rad: float, corner: float) -> tuple[float, float, float]:
+    """Arguments of `_kernels.beyond_freeplay` after the angle: freeplay, half width of its corner, 1 / (4 half)."""
+    half = corner * freeplay_rad
+    return freeplay_rad, half, 0.25 / half if half > 0.0 else 0.0
+
+
 def parameter_vector(vehicle: Vehicle) -> FloatArray:
     """Pack a vehicle for the kernels."""
-    p = np.zeros(_kernels.PARAMETERS)
+    p = np.zeros(at.PARAMETERS)
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
-    p[_kernels.M_B], p[_kernels.M_A] = body.mass_kg, shell.mass_kg
+    upper = np.triu_indices(3)
+    mb, ma = body.mass_kg, shell.mass_kg
+    p[: at.I_B] = mb, ma, 1.0 / mb, 1.0 / ma, ma / (mb + ma), -mb / (mb + ma), 1.0 / (mb + ma)
     for inertia_at, inverse_at, mobility_at, arm_at, part in (
-        (_kernels.I_B, _kernels.W_B, _kernels.N_B, _kernels.P_B, body),
-        (_kernels.I_A, _kernels.W_A, _kernels.N_A, _kernels.P_A, shell),
+        (at.I_B, at.W_B, at.N_B, at.P_B, body),
+        (at.I_A, at.W_A, at.N_A, at.P_A, shell),
     ):
         arm = vehicle.joint_m - part.cg_m
         inverse = np.linalg.inv(part.inertia)
-        p[inertia_at : inertia_at + 9] = part.inertia.ravel()
-        p[inverse_at : inverse_at + 9] = inverse.ravel()
-        p[mobility_at : mobility_at + 9] = (-rotations.skew(arm) @ inverse @ rotations.skew(arm)).ravel()
+        p[inertia_at : inertia_at + 6] = part.inertia[upper]
+        p[inverse_at : inverse_at + 6] = inverse[upper]
+        p[mobility_at : mobility_at + 6] = (-rotations.skew(arm) @ inverse @ rotations.skew(arm))[upper]
         p[arm_at : arm_at + 3] = arm
-    p[_kernels.NOSE_A : _kernels.NOSE_A + 3] = -shell.cg_m
-    p[_kernels.JOINT : _kernels.JOINT + 8] = (
+    p[at.NOSE_A : at.NOSE_A + 3] = -shell.cg_m
+    freeplay = np.deg2rad(joint.freeplay_deg)
+    p[at.JOINT : at.JOINT + 9] = (
         joint.bending_stiffness_nmprad,
         joint.hardening_nmprad3,
         joint.torsion_stiffness_nmprad,
         joint.bending_damping_nmsprad,
         joint.damping_hardening_nmsprad3,
         joint.torsion_damping_nmsprad,
-        np.deg2rad(joint.freeplay_deg),
-        joint.freeplay_corner,
+        *freeplay_corner(freeplay, joint.freeplay_corner),
     )
-    p[_kernels.REFERENCE : _kernels.REFERENCE + 2] = vehicle.reference.area_m2, vehicle.reference.length_m
+    p[at.REFERENCE : at.REFERENCE + 2] = vehicle.reference.area_m2, vehicle.reference.length_m
+    p[at.FACTOR : at.FACTOR + 4] = 1.0, 1.0, 1.0, 0.0
     return p
 
 
 def atmosphere_table(profile: AtmosphereProfile) -> FloatArray:
-    """Log density, speed of sound, north and east wind every 50 m from -1 to 399 km, for the kernels."""
+    """Air every 50 m from -1 to 399 km, ``(rows, 6)``, for the kernels.
+
+    Density, the change of its logarithm up to the next row, speed of sound, north and east wind, and the fraction of
+    free-molecular flow.
+    """
     z = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS, dtype=np.float64)
     air = profile.at(z)
-    return np.column_stack([np.log(air.density_kgpm3), air.sound_speed_mps, air.wind_ned_mps[:, :2]])
+    change = np.diff(np.log(air.density_kgpm3), append=np.log(air.density_kgpm3[-1]))
+    columns = [air.density_kgpm3, change, air.sound_speed_mps, air.wind_ned_mps[:, :2], np.zeros(len(z))]
+    return np.column_stack(columns)
 
 
 def vacuum_table() -> FloatArray:
-    """Table of an atmosphere too thin to matter (e^-700 kg/m^3), for flights under gravity and springs alone."""
-    return np.tile(np.array([-700.0, 300.0, 0.0, 0.0]), (ATMOSPHERE_ROWS, 1))
+    """Table of no atmosphere, for flights under gravity and springs alone."""
+    return np.tile(np.array([0.0, 0.0, 300.0, 0.0, 0.0, 0.0]), (ATMOSPHERE_ROWS, 1))
 
 
-def kernel_tables(vehicle: Vehicle, atmosphere: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the four table arguments of the kernels: atmosphere, grid, Mach knots, coefficients."""
-    grid = np.array([ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, vehicle.aero.alpha_rad[1]])
+def kernel_tables(vehicle: Vehicle, atmosphere: FloatArray) -> tuple[FloatArray, ...]:
+    """Return the tables of the kernels: atmosphere of every lane, grid, Mach knots, coefficients, free-molecular."""
+    grid = np.array([ATMOSPHERE_START_M, 1.0 / ATMOSPHERE_STEP_M, 1.0 / vehicle.aero.alpha_rad[1]])
+    coefficients = np.ascontiguousarray(vehicle.aero.coefficients)
     return (
-        np.ascontiguousarray(atmosphere),
+        np.ascontiguousarray(atmosphere if atmosphere.ndim == 3 else atmosphere[None]),
         grid,
         np.ascontiguousarray(vehicle.aero.mach),
-        np.ascontiguousarray(vehicle.aero.coefficients),
+        coefficients,
+        np.zeros(coefficients.shape[1:]),
     )
+
+
+def workspace(states: FloatArray, parameters: FloatArray) -> FloatArray:
+    """Lanes' rows before a flight: states ``(lanes, 20)`` and parameter vectors ``(lanes, 61)`` of every lane."""
+    s = np.zeros((at.ROWS, len(states)))
+    s[at.Y : at.Y + at.STATES] = states.T
+    s[at.P :] = parameters.T
+    return s.ravel()
+
+
+def record_in_eci(states: FloatArray, aux: FloatArray) -> FloatArray:
+    """Records with the joint's force and moment and the aerodynamic force turned from shell axes into ECI."""
+    turned = aux.copy()
+    for k in (6, 9, 12):
+        turned[..., k : k + 3] = rotations.rotate(states[..., 10:14], aux[..., k : k + 3])
+    return turned

@@ -17,6 +17,7 @@ from flightmodel.deflection import DeflectionHistory, lv_clock
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import _kernels, dynamics, packing
+from synthetic_flight._workspace_kernels import AUX, STATES
 
 BENDING_LIMIT_RAD = 0.5 * np.pi
 TUMBLE_RAD = 0.5 * np.pi
@@ -115,13 +116,18 @@ def integrate(
     per_record: int,
     records: int,
     lock_records: int = 0,
+    planet: earth.Planet = earth.WGS84,
 ) -> tuple[FloatArray, FloatArray]:
     """States ``(n, 20)`` and auxiliaries ``(n, 18)`` of a flight; fewer than ``records`` where the joint diverged."""
-    out, aux = np.empty((records, _kernels.STATES)), np.empty((records, _kernels.AUX))
-    written = _kernels.integrate(
-        np.ascontiguousarray(state),
-        packing.parameter_vector(vehicle),
-        *packing.kernel_tables(vehicle, atmosphere),
+    lanes = (0,)
+    workspace = packing.workspace(state[None], packing.parameter_vector(vehicle)[None])
+    out, aux = np.empty((1, records, STATES)), np.empty((1, records, AUX))
+    written = np.zeros(1, dtype=np.int64)
+    _kernels.integrate(
+        lanes,
+        workspace,
+        packing.kernel_tables(vehicle, atmosphere),
+        planet,
         step_s,
         per_record,
         records,
@@ -129,8 +135,10 @@ def integrate(
         BENDING_LIMIT_RAD,
         out,
         aux,
+        written,
     )
-    return out[:written], aux[:written]
+    n = abs(int(written[0]))
+    return out[0, :n], packing.record_in_eci(out[0, :n], aux[0, :n])
 
 
 def fly(

@@ -6,6 +6,7 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile
 from synthetic_flight import _kernels, dynamics, packing
+from synthetic_flight import _workspace_kernels as at
 from synthetic_flight.simulate import integrate, state_from_ecef
 
 from .conftest import entry_state, free_state, undamped
@@ -33,10 +34,11 @@ def windy():
 
 
 def kernel_rates(state, vehicle, table, locked=False):
-    dy, aux = np.empty(_kernels.STATES), np.empty(_kernels.AUX)
-    tables = packing.kernel_tables(vehicle, table)
-    _kernels.rates(state, packing.parameter_vector(vehicle), *tables, locked, dy, aux)
-    return dy, aux
+    s = packing.workspace(state[None], packing.parameter_vector(vehicle)[None])
+    s[at.TRIAL : at.TRIAL + at.STATES] = state
+    _kernels.rates(s, (0,), *packing.kernel_tables(vehicle, table), earth.WGS84, locked)
+    dy, aux = s[at.RATE : at.RATE + at.STATES], s[at.REC : at.REC + at.AUX]
+    return dy, packing.record_in_eci(state, aux)
 
 
 def test_kernel_equals_the_readable_form_with_every_term_alive(generic_vehicle):
@@ -258,7 +260,8 @@ def test_mirrored_flight_is_the_mirrored_path(vehicle):
 def test_freeplay_corner_is_smooth_and_exact_outside():
     freeplay, corner = 0.01, 0.1
     theta = np.linspace(0.0, 0.03, 30001)
-    d = np.array([_kernels.beyond_freeplay(x, freeplay, corner) for x in theta])
+    d = np.array([_kernels.beyond_freeplay(x, *packing.freeplay_corner(freeplay, corner)) for x in theta])
+    np.testing.assert_allclose(d, dynamics.beyond_freeplay(theta, freeplay, corner), atol=1e-17)
     assert (d[theta <= 0.009] == 0.0).all()
     np.testing.assert_allclose(d[theta >= 0.011], theta[theta >= 0.011] - freeplay, atol=1e-15)
     slope = np.diff(d) / np.diff(theta)
