@@ -14,33 +14,18 @@ from synthetic_flight import _workspace_kernels as at
 
 @kernel
 def place(s, lanes, planet):
-    """Rotations, and where the nose is above the Earth."""
+    """Where the nose is above the Earth, and how fast the air there turns with it."""
     w = len(lanes)
     for i in range(w):
-        t = (at.TRIAL + 6) * w + i
-        b0, b1, b2, b3 = s[t], s[t + w], s[t + 2 * w], s[t + 3 * w]
-        a0, a1, a2, a3 = s[t + 4 * w], s[t + 5 * w], s[t + 6 * w], s[t + 7 * w]
-        q0, q1 = a0 * b0 + a1 * b1 + a2 * b2 + a3 * b3, a0 * b1 - a1 * b0 - a2 * b3 + a3 * b2
-        q2, q3 = a0 * b2 + a1 * b3 - a2 * b0 - a3 * b1, a0 * b3 - a1 * b2 + a2 * b1 - a3 * b0
-        r, c = la.rotation(a0, a1, a2, a3), la.rotation(q0, q1, q2, q3)
-        at.put(s, at.R_A, w, i, r[0], r[1], r[2])
-        at.put(s, at.R_A + 3, w, i, r[3], r[4], r[5])
-        at.put(s, at.R_A + 6, w, i, r[6], r[7], r[8])
-        at.put(s, at.C_AB, w, i, c[0], c[1], c[2])
-        at.put(s, at.C_AB + 3, w, i, c[3], c[4], c[5])
-        at.put(s, at.C_AB + 6, w, i, c[6], c[7], c[8])
-        s[at.TWIST * w + i], s[(at.TWIST + 1) * w + i] = q0, q1
-        share = s[(at.P + at.SHARE_A) * w + i]
-        bx, by, bz = at.three(s, at.P + at.P_B, w, i)
-        bx, by, bz = la.times(c, bx, by, bz)
-        ax, ay, az = at.three(s, at.P + at.P_A, w, i)
+        r, share = at.nine(s, at.R_A, w, i), s[(at.P + at.SHARE_A) * w + i]
+        dx, dy, dz = at.three(s, at.BETWEEN, w, i)
         nx, ny, nz = at.three(s, at.P + at.NOSE_A, w, i)
-        x, y, z = la.times(r, nx + share * (ax - bx), ny + share * (ay - by), nz + share * (az - bz))
-        x, y, z = x + s[at.TRIAL * w + i], y + s[(at.TRIAL + 1) * w + i], z + s[(at.TRIAL + 2) * w + i]
+        dx, dy, dz = la.times(r, nx + share * dx, ny + share * dy, nz + share * dz)
+        x, y, z = at.three(s, at.TRIAL, w, i)
+        x, y, z = x + dx, y + dy, z + dz
         sin_lat, cos_lat, altitude, per_radius = la.geodetic(x, y, z, planet)
         s[at.SIN * w + i], s[at.COS * w + i], s[at.ALTITUDE * w + i] = sin_lat, cos_lat, altitude
         s[at.SIN_LON * w + i], s[at.COS_LON * w + i] = y * per_radius, x * per_radius
-        # the air's own velocity where it turns with the Earth
         at.put(s, at.FLOW, w, i, -planet[4] * y, planet[4] * x, 0.0)
 
 
@@ -76,7 +61,7 @@ def flow(s, lanes):
     """Flow at the nose in shell axes, Mach number, dynamic pressure, total angle of attack."""
     w = len(lanes)
     for i in range(w):
-        r, c = at.nine(s, at.R_A, w, i), at.nine(s, at.C_AB, w, i)
+        r, share = at.nine(s, at.R_A, w, i), s[(at.P + at.SHARE_A) * w + i]
         sin_lat, cos_lat, sl, cl = s[at.SIN * w + i], s[at.COS * w + i], s[at.SIN_LON * w + i], s[at.COS_LON * w + i]
         north, east = s[at.NORTH * w + i], s[at.EAST * w + i]
         vx, vy, vz = at.three(s, at.TRIAL + 3, w, i)
@@ -84,12 +69,9 @@ def flow(s, lanes):
         vx += north * sin_lat * cl + east * sl - ex
         vy += north * sin_lat * sl - east * cl - ey
         u, v, z = la.back(r, vx, vy, vz - north * cos_lat - ez)
-        share = s[(at.P + at.SHARE_A) * w + i]
-        wb0, wb1, wb2 = at.three(s, at.TRIAL + 14, w, i)
-        wb0, wb1, wb2 = la.times(c, wb0, wb1, wb2)
+        wb0, wb1, wb2 = at.three(s, at.RATE_B, w, i)
         wa0, wa1, wa2 = at.three(s, at.TRIAL + 17, w, i)
-        bx, by, bz = at.three(s, at.P + at.P_B, w, i)
-        bx, by, bz = la.times(c, bx, by, bz)
+        bx, by, bz = at.three(s, at.ARM_B, w, i)
         ax, ay, az = at.three(s, at.P + at.P_A, w, i)
         nx, ny, nz = at.three(s, at.P + at.NOSE_A, w, i)
         sx, sy, sz = la.cross(wb0, wb1, wb2, bx, by, bz)
@@ -130,8 +112,8 @@ def look_up(s, lanes, grid, mach_knots, table, free):
 
 
 @inlined
-def wrench(s, w, i, wa1, wa2):
-    """Force at the nose and moment about it on the shell, shell axes."""
+def wrench(s, w, i):
+    """Force at the nose on the shell, and y and z of the moment about it; shell axes."""
     _, v, z = at.three(s, at.FLOW, w, i)
     speed, area, length = s[at.SPEED * w + i], s[(at.P + at.REFERENCE) * w + i], s[(at.P + at.REFERENCE + 1) * w + i]
     f = (at.P + at.FACTOR) * w + i
@@ -143,4 +125,5 @@ def wrench(s, w, i, wa1, wa2):
     damping = 0.25 * s[at.RHO * w + i] * speed * area * length * length * cmq  # q S l^2 / (2 V)
     # nose-up about n x x_hat = (0, n_z, -n_y)
     turn = qs * length * cm
+    wa1, wa2 = s[(at.TRIAL + 18) * w + i], s[(at.TRIAL + 19) * w + i]
     return -qs * ca, -qs * cn * ny, -qs * cn * nz, turn * nz + damping * wa1, damping * wa2 - turn * ny

@@ -26,11 +26,14 @@ REC = ALTITUDE = 80
 DENSITY, MACH, PRESSURE, ALPHA, THETA, FORCE, MOMENT, AERO, TURN = 81, 82, 83, 84, 85, 86, 89, 92, 95
 # ECI from shell, shell from body (matrices), and scalar and x part of the latter's quaternion
 R_A, C_AB, TWIST = 98, 107, 116
+# in shell axes: body's rate, its arm to the joint, its c.g. from the shell's, gravitation at the shell's c.g. less that
+# at the body's, moment on the shell about its c.g. without the joint's
+RATE_B, ARM_B, BETWEEN, TIDE, SHELL = 118, 121, 124, 127, 130
 # sine and cosine of latitude, of longitude; density, sound, north and east wind, free-molecular fraction
-SIN, COS, SIN_LON, COS_LON, RHO, SOUND, NORTH, EAST, FREE = 118, 119, 120, 121, 122, 123, 124, 125, 126
+SIN, COS, SIN_LON, COS_LON, RHO, SOUND, NORTH, EAST, FREE = 133, 134, 135, 136, 137, 138, 139, 140, 141
 # C_A C_N C_m C_mq; flow at the nose, shell axes; its size, its lateral part; Mach bracket of the last look-up
-COEF, FLOW, SPEED, LATERAL, BRACKET = 127, 131, 134, 135, 136
-P = 137
+COEF, FLOW, SPEED, LATERAL, BRACKET = 142, 146, 149, 150, 151
+P = 152
 ROWS = P + PARAMETERS
 
 
@@ -59,3 +62,10 @@ def nine(s, row, w, i):
 @inlined
 def put(s, row, w, i, x, y, z):
     s[row * w + i], s[(row + 1) * w + i], s[(row + 2) * w + i] = x, y, z
+
+
+@inlined
+def put_nine(s, row, w, i, m):
+    put(s, row, w, i, m[0], m[1], m[2])
+    put(s, row + 3, w, i, m[3], m[4], m[5])
+    put(s, row + 6, w, i, m[6], m[7], m[8])

@@ -19,8 +19,10 @@ def freeplay_corner(freeplay_rad: float, corner: float) -> tuple[float, float, f
     return freeplay_rad, half, 0.25 / half if half > 0.0 else 0.0
 
 
-def parameter_vector(vehicle: Vehicle) -> FloatArray:
-    """Pack a vehicle for the kernels."""
+def parameter_vector(
+    vehicle: Vehicle, ca: float = 1.0, cn: float = 1.0, cm: float = 1.0, cmq_shift: float = 0.0
+) -> FloatArray:
+    """Pack a vehicle for the kernels, (67,), with factors on its C_A, C_N and C_m and a shift of its C_mq."""
     p = np.zeros(at.PARAMETERS)
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
     upper = np.triu_indices(3)
@@ -48,7 +50,7 @@ def parameter_vector(vehicle: Vehicle) -> FloatArray:
         *freeplay_corner(freeplay, joint.freeplay_corner),
     )
     p[at.REFERENCE : at.REFERENCE + 2] = vehicle.reference.area_m2, vehicle.reference.length_m
-    p[at.FACTOR : at.FACTOR + 4] = 1.0, 1.0, 1.0, 0.0
+    p[at.FACTOR : at.FACTOR + 4] = ca, cn, cm, cmq_shift
     return p
 
 
@@ -89,6 +91,13 @@ def workspace(states: FloatArray, parameters: FloatArray) -> FloatArray:
     s[at.Y : at.Y + at.STATES] = states.T
     s[at.P :] = parameters.T
     return s.ravel()
+
+
+def flown_records(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Records up to the first that is not finite, with forces and moments turned from shell axes into ECI."""
+    finite = np.isfinite(states).all(axis=-1)
+    n = len(states) if finite.all() else int(np.argmin(finite))
+    return states[:n], record_in_eci(states[:n], aux[:n])
 
 
 def record_in_eci(states: FloatArray, aux: FloatArray) -> FloatArray:

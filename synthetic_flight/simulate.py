@@ -12,7 +12,7 @@ import numpy as np
 
 from flightmodel import airdata, earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile
-from flightmodel.checks import ConfigError, FloatArray
+from flightmodel.checks import ConfigError, FloatArray, check_finite
 from flightmodel.deflection import DeflectionHistory, lv_clock
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import Vehicle
@@ -138,7 +138,7 @@ def integrate(
         written,
     )
     n = abs(int(written[0]))
-    return out[0, :n], packing.record_in_eci(out[0, :n], aux[0, :n])
+    return packing.flown_records(out[0, :n], aux[0, :n])
 
 
 def fly(
@@ -171,11 +171,10 @@ def fly(
     per_record = round(record_s / step_s)
     if per_record < 1 or abs(per_record * step_s - record_s) > 1e-9 or stop_s <= start_s:
         raise ConfigError(f"fly: record {record_s} s must be a whole multiple of step {step_s} s, and stop after start")
+    check_finite("fly: state at the start", state)
     records = round((stop_s - start_s) / record_s) + 1
     lock = 0 if inflated_s is None else max(0, int(np.ceil((inflated_s - start_s) / record_s - 1e-9)))
     states, aux = integrate(vehicle, packing.atmosphere_table(profile), state, step_s, per_record, records, lock)
-    finite = np.isfinite(states).all(axis=1)
-    states, aux = states[finite], aux[finite]
     diverged = len(states) < records
     return _truth(
         vehicle,

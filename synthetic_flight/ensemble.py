@@ -1,0 +1,143 @@
+"""Thousands of flights: many side by side in vector registers, on every core, memory flat in their number.
+
+Sixteen flights fly in the lanes of one kernel call (`synthetic_flight._kernels`), and kernel calls run in threads,
+since compiled code holds no interpreter lock. Flight ``run`` is the same to the last bit wherever and beside whichever
+other flights it flies: every lane goes through the same instructions.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+
+from flightmodel import earth
+from flightmodel.checks import ConfigError, FloatArray
+from flightmodel.vehicle import Vehicle
+from synthetic_flight import _kernels, packing
+from synthetic_flight._workspace_kernels import AUX, STATES
+from synthetic_flight.simulate import BENDING_LIMIT_RAD
+
+# two to four vectors of a register each; more lanes outgrow the first-level cache
+LANES = 16
+
+
+@dataclass(frozen=True)
+class Start:
+    """How one flight of an ensemble differs from the others.
+
+    Parameters
+    ----------
+    state : (20,) float
+        At the start (`synthetic_flight.simulate.state_from_ecef`).
+    parameters : (67,) float
+        `packing.parameter_vector` of the dispersed vehicle. All flights share one coefficient table; the last four
+        parameters scale C_A, C_N, C_m and shift C_mq.
+    atmosphere : (rows, 6) float
+        `packing.atmosphere_table` of the flight's own day.
+    """
+
+    state: FloatArray
+    parameters: FloatArray
+    atmosphere: FloatArray
+
+
+@dataclass(frozen=True)
+class Flown:
+    """One flight of an ensemble: its records; fewer than asked for where the joint diverged, which ``diverged`` says.
+
+    ``states`` ``(n, 20)`` and ``aux`` ``(n, 18)`` as `synthetic_flight.simulate.integrate` gives them.
+    """
+
+    run: int
+    states: FloatArray
+    aux: FloatArray
+    diverged: bool
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Steps and records that all flights of an ensemble share: ``records`` of them, ``per_record`` steps apart."""
+
+    step_s: float
+    per_record: int
+    records: int
+    lock_records: int = 0
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def fly_ensemble(
+    vehicle: Vehicle,
+    start_of: Callable[[int], Start],
+    runs: Iterable[int],
+    schedule: Schedule,
+    workers: int | None = None,
+) -> Iterator[Flown]:
+    """Fly one flight a run number, in order.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+        Gives the coefficient table.
+    start_of : callable
+        From run number to how that flight starts; called in this thread, in order.
+    runs : iterable of int
+    schedule : Schedule
+    workers : int, optional
+        Threads; every core by default. No more than two blocks a worker are in memory at a time.
+
+    Yields
+    ------
+    Flown
+    """
+    workers = available_cores() if workers is None else workers
+    if workers < 1 or schedule.records < 1 or schedule.per_record < 1 or not schedule.step_s > 0.0:
+        raise ConfigError(f"fly_ensemble: workers, steps and records must be positive; got {workers}, {schedule}")
+    remaining = iter(runs)
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: deque[tuple[list[int], Future[list[Flown]]]] = deque()
+        while True:
+            while len(waiting) < workers + 1 and (block := list(islice(remaining, LANES))):
+                starts = [start_of(run) for run in block]
+                waiting.append((block, pool.submit(_fly_block, vehicle, block, starts, schedule)))
+            if not waiting:
+                return
+            yield from waiting.popleft()[1].result()
+
+
+def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule: Schedule) -> list[Flown]:
+    padded = starts + [starts[-1]] * (LANES - len(starts))
+    workspace = packing.workspace(np.stack([s.state for s in padded]), np.stack([s.parameters for s in padded]))
+    shared = all(s.atmosphere is starts[0].atmosphere for s in starts)
+    air = starts[0].atmosphere[None] if shared else np.stack([s.atmosphere for s in padded])
+    out = np.empty((LANES, schedule.records, STATES))
+    aux = np.empty((LANES, schedule.records, AUX))
+    written = np.zeros(LANES, dtype=np.int64)
+    _kernels.integrate(
+        (0,) * LANES,
+        workspace,
+        packing.kernel_tables(vehicle, air),
+        earth.WGS84,
+        schedule.step_s,
+        schedule.per_record,
+        schedule.records,
+        schedule.lock_records,
+        BENDING_LIMIT_RAD,
+        out,
+        aux,
+        written,
+    )
+    flown = []
+    for k, run in enumerate(runs):
+        n = abs(int(written[k]))
+        flown.append(Flown(run, *packing.flown_records(out[k, :n], aux[k, :n]), diverged=bool(written[k] < 0)))
+    return flown
