@@ -15,8 +15,9 @@ from flightmodel.flightfolder import read_flight
 from postflight.pipeline import estimate_camera, pulse_data, reconstruct_flight
 from recon.bet import reconstruct
 from synthetic_flight import packing
+from synthetic_flight.day_air import day_atmosphere
 from synthetic_flight.folder import simulate_to_folder
-from synthetic_flight.scenarios import child_rng, day_atmosphere, fly_scenario, initial_state, read_scenario
+from synthetic_flight.scenarios import child_rng, fly_scenario, initial_state, read_scenario
 from synthetic_flight.simulate import integrate
 
 ROUNDS = int(sys.argv[1]) if len(sys.argv) > 1 else 3

@@ -1,18 +1,22 @@
 """What air the vehicle met: the US Standard Atmosphere 1976, the day's soundings blended into it, and winds.
 
 To 86 km the standard's exact equations; above, its printed tables to 1000 km, interpolated by cubic splines of
-log density and log pressure, and its temperature equations. Speed of sound uses gamma = 1.4 and the sea-level gas
+log density and log pressure, and its temperature equations. A modelled profile of the day (NRLMSIS) is held as its
+ratio to the standard, as a sounding is. Speed of sound uses gamma = 1.4 and the sea-level gas
 constant throughout, so above 86 km Mach number is a convention, as in the trajectory codes of the field.
 
 References
 ----------
 NOAA/NASA/USAF, "U.S. Standard Atmosphere, 1976", NOAA-S/T 76-1562: tables I, VIII and section 1.2.
+Emmert et al., "NRLMSIS 2.1", J. Geophys. Res. Space Phys. 127, 2022 (the table in ``data/atmosphere``).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -65,6 +69,7 @@ _UPPER = np.array(
         [1000, 3.561e-15, 7.5138e-9],
     ]
 )
+TABLES = Path(__file__).parent / "data" / "atmosphere"
 TOP_M = 1.0e6
 BOTTOM_M = -5000.0
 
@@ -221,3 +226,23 @@ def standard_atmosphere() -> AtmosphereProfile:
     z = np.arange(0.0, 100001.0, 2500.0)
     density_sd, wind_sd = default_sounding_sd(z)
     return AtmosphereProfile(z, np.zeros(len(z)), np.zeros(len(z)), np.zeros((len(z), 3)), density_sd, wind_sd)
+
+
+@cache
+def nrlmsis_profile(name: str = "nrlmsis_2009_08_17") -> AtmosphereProfile:
+    """Modelled profile of a day that ships with the toolkit, 0 to 400 km, without winds.
+
+    Parameters
+    ----------
+    name : str
+        Stem of a table in ``data/atmosphere``, whose head names its source.
+
+    Notes
+    -----
+    Temperature is the kinetic one; as everywhere here, the speed of sound takes it with sea-level composition.
+    """
+    z, density, temperature, _ = np.loadtxt(TABLES / f"{name}.csv", delimiter=",", comments="#", skiprows=3).T
+    standard, standard_t, _ = us76(z)
+    sd = default_sounding_sd(z)
+    still = np.zeros((len(z), 3))
+    return AtmosphereProfile(z, np.log(density / standard), temperature - standard_t, still, *sd)

@@ -19,7 +19,7 @@ from flightmodel.trajectory import resample
 from flightmodel.vehicle import Vehicle
 from postflight.pipeline import Flight
 from synthetic_flight import packing
-from synthetic_flight.scenarios import correlated
+from synthetic_flight.day_air import correlated
 from synthetic_flight.simulate import integrate, state_from_ecef
 
 START_ALTITUDE_M = 100e3

@@ -17,7 +17,7 @@ import pandas as pd
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray, GateError
-from synthetic_flight import sensing, video
+from synthetic_flight import day_air, sensing, video
 from synthetic_flight.scenarios import Radar, Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
@@ -93,7 +93,7 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
         at, rae = sensing.sense_radar(truth, radar, start, child_rng(seed, name))
         columns = {"t_s": at, "range_m": rae[:, 0], "az_deg": np.rad2deg(rae[:, 1]), "el_deg": np.rad2deg(rae[:, 2])}
         _csv(telemetry / f"radar_{name}.csv", columns, "%.6f")
-    z, air, wind = sensing.sense_atmosphere(truth.profile, spec.atmosphere, child_rng(seed, "sounding"))
+    z, air, wind = day_air.sense_atmosphere(truth.profile, spec.atmosphere, child_rng(seed, "sounding"))
     columns = {"alt_m": z, "rho_kgpm3": air[:, 0], "t_k": air[:, 1], "wind_n_mps": wind[:, 0], "wind_e_mps": wind[:, 1]}
     _csv(telemetry / "atmosphere.csv", columns, "%.8g")
     q_prior = sensing.sense_attitude(truth, spec.attitude_prior, child_rng(seed, "attitude"))

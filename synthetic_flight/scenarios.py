@@ -1,4 +1,4 @@
-"""What is to be flown: a scenario file, and the truth's own atmosphere drawn from it."""
+"""What is to be flown: a scenario file, its vehicle, and the flight of it on a day that a seed draws."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flightmodel import earth, rotations
-from flightmodel.atmosphere import AtmosphereProfile, default_sounding_sd
 from flightmodel.checks import ConfigError, FloatArray, nearest_name
 from flightmodel.config import Section, parse_section, read_toml
 from flightmodel.vehicle import DATA, Vehicle, vehicle_from_toml, vehicle_path
+from synthetic_flight.day_air import DayAtmosphere, day_atmosphere
 from synthetic_flight.simulate import Truth, fly, state_from_ecef
 
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -50,15 +50,6 @@ class Initial(Section):
     nose_elevation_deg: float
     roll_deg: float = 0.0
     spin_rpm: float = 0.0
-
-
-class DayAtmosphere(Section):
-    """The day's departure from US76 and the size of the sounding's errors."""
-
-    winds: bool = True
-    density_sd: NonNegative = 0.015
-    wind_sd_mps: NonNegative = 2.0
-    sounding_scale: NonNegative = 1.0
 
 
 class Accelerometer(Section):
@@ -185,42 +176,6 @@ def initial_state(scenario: Scenario) -> FloatArray:
     q = rotations.multiply(rotations.multiply(q_ecef_ned, q_ned_body), rotations.exp(np.array([roll, 0.0, 0.0])))
     omega = np.array([spec.spin_rpm * 2.0 * np.pi / 60.0, 0.0, 0.0])
     return state_from_ecef(start, position, velocity, q, omega)
-
-
-# altitude km, north and east wind m/s: a smooth mid-latitude August day, assumed
-_AUGUST_WIND = np.array(
-    [
-        [0, 2, 1], [5, 3, 8], [11, 4, 16], [18, 1, 0], [25, 0, -10], [35, 2, -18], [45, 3, -28], [55, -4, -38],
-        [65, -6, -45], [75, 10, -36], [82, 4, -12], [90, -12, 14], [100, -8, 22], [115, 0, 0],
-    ],
-    dtype=float,
-)  # fmt: skip
-
-
-def correlated(altitude_m: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:
-    """Gauss-Markov noise of unit variance along altitude with a correlation length, m."""
-    step = np.exp(-np.diff(altitude_m) / length_m)
-    white = rng.standard_normal(len(altitude_m))
-    out = np.empty(len(altitude_m))
-    out[0] = white[0]
-    for k in range(1, len(out)):
-        out[k] = step[k - 1] * out[k - 1] + np.sqrt(1.0 - step[k - 1] ** 2) * white[k]
-    return out
-
-
-def day_atmosphere(spec: DayAtmosphere, rng: np.random.Generator) -> AtmosphereProfile:
-    """Draw the air that the vehicle really meets, 0 to 130 km."""
-    z = np.arange(0.0, 130001.0, 250.0)
-    smooth = 0.03 * np.sin(2.0 * np.pi * (z / 45000.0 + rng.random())) * (spec.density_sd > 0.0)
-    ratio = smooth + spec.density_sd * correlated(z, 5000.0, rng)
-    wind = np.zeros((len(z), 3))
-    if spec.winds:
-        for axis in (0, 1):
-            mean = np.interp(z / 1000.0, _AUGUST_WIND[:, 0], _AUGUST_WIND[:, axis + 1])
-            wind[:, axis] = mean + spec.wind_sd_mps * correlated(z, 3000.0, rng)
-        wind *= np.interp(z, [110000.0, 130000.0], [1.0, 0.0])[:, None]
-    density_sd, wind_sd = default_sounding_sd(z)
-    return AtmosphereProfile(z, ratio, np.zeros(len(z)), wind, density_sd, wind_sd)
 
 
 def fly_scenario(scenario: Scenario, seed: int) -> Truth:

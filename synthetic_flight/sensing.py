@@ -1,7 +1,7 @@
 """What instruments on and around the vehicle would have measured: truth plus the errors of real instruments.
 
-Each instrument draws from its own generator. Systematic errors are drawn once a flight. The sounding errs in another
-way than the filter assumes: a constant part, a gravity wave, and small structure, smoothed over two kilometres.
+Each instrument draws from its own generator. Systematic errors are drawn once a flight. The sounding of the day is in
+`synthetic_flight.day_air`.
 """
 
 from __future__ import annotations
@@ -10,11 +10,10 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from flightmodel import earth, rotations
-from flightmodel.atmosphere import AtmosphereProfile, default_sounding_sd
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import interpolate_rows
 from flightmodel.vehicle import Vehicle
-from synthetic_flight.scenarios import Accelerometer, Attitude, DayAtmosphere, Radar, Rates, correlated
+from synthetic_flight.scenarios import Accelerometer, Attitude, Radar, Rates
 from synthetic_flight.simulate import Truth
 
 
@@ -77,33 +76,6 @@ def sense_radar(truth: Truth, spec: Radar, start_s: float, rng: np.random.Genera
     measured = ideal + bias + noise
     measured[:, 1] = np.mod(measured[:, 1], 2.0 * np.pi)
     return at, measured
-
-
-def sense_atmosphere(
-    profile: AtmosphereProfile, spec: DayAtmosphere, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Altitudes (n,) m, density (n,) kg/m^3 and temperature, wind ``(n, 2)`` m/s north and east: a sounding of the day.
-
-    Returns
-    -------
-    altitude_m, density_temperature (n, 2), wind_ned_mps (n, 2)
-    """
-    z = np.arange(0.0, 95001.0, 1000.0)
-    fine = z[:, None] + np.linspace(-1000.0, 1000.0, 9)
-    air = profile.at(np.maximum(fine, 0.0))
-    density = np.exp(np.log(air.density_kgpm3).mean(axis=1))
-    # smoothing an exponential over 2 km does not move its log-mean, so only structure is lost
-    wind = air.wind_ned_mps.mean(axis=1)[:, :2]
-    density_sd, wind_sd = default_sounding_sd(z)
-
-    def error() -> FloatArray:
-        wave = np.sqrt(2.0) * np.sin(2.0 * np.pi * (z / 7000.0 + rng.random()))
-        return 0.6 * rng.standard_normal() + 0.6 * wave + 0.5 * correlated(z, 2500.0, rng)
-
-    density = density * np.exp(spec.sounding_scale * density_sd * error())
-    wind = wind + spec.sounding_scale * wind_sd[:, None] * np.column_stack([error(), error()])
-    temperature = profile.at(z).temperature_k + spec.sounding_scale * 1.5 * error()
-    return z, np.column_stack([density, temperature]), wind
 
 
 def sense_attitude(truth: Truth, spec: Attitude, rng: np.random.Generator) -> FloatArray:

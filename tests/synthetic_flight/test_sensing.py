@@ -7,8 +7,9 @@ from flightmodel import earth, rotations
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.trajectory import move_point
 from synthetic_flight import sensing
+from synthetic_flight.day_air import day_atmosphere, sense_atmosphere
 from synthetic_flight.folder import simulate_to_folder
-from synthetic_flight.scenarios import child_rng, day_atmosphere, fly_scenario, read_scenario
+from synthetic_flight.scenarios import child_rng, fly_scenario, read_scenario
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +114,7 @@ def test_sounding_errs_as_large_as_assumed_but_in_another_way(scenario, truth):
 
     errors = []
     for seed in range(60):
-        z, air, wind = sensing.sense_atmosphere(truth.profile, scenario.spec.atmosphere, np.random.default_rng(seed))
+        z, air, wind = sense_atmosphere(truth.profile, scenario.spec.atmosphere, np.random.default_rng(seed))
         day = truth.profile.at(z)
         density_sd, wind_sd = default_sounding_sd(z)
         errors.append(

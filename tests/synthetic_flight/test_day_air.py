@@ -1,0 +1,187 @@
+"""The day's air and its sounding: structures where they are asked for, nothing else moved, errors of declared size."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from flightmodel.atmosphere import nrlmsis_profile, us76
+from flightmodel.checks import ConfigError
+from flightmodel.config import parse_section
+from synthetic_flight import dynamics
+from synthetic_flight.day_air import (
+    DayAtmosphere,
+    RangeSounding,
+    day_atmosphere,
+    dryden_transverse,
+    range_accuracy,
+    sense_atmosphere,
+)
+
+STILL = {"winds": False, "density_sd": 0.0, "wind_sd_mps": 0.0}
+Z = np.arange(500.0, 129e3, 37.0)
+
+
+def day(seed=3, **keys):
+    return day_atmosphere(parse_section(DayAtmosphere, keys, "test"), np.random.default_rng(seed))
+
+
+def test_every_structure_leaves_the_random_day_as_it_is():
+    plain = day().at(Z)
+    pocket = {"altitude_m": 45e3, "depth": 0.1, "thickness_m": 2000.0}
+    shear = {"altitude_m": 50e3, "north_mps": 10.0, "east_mps": -5.0, "thickness_m": 1000.0}
+    gust = {"altitude_m": 40e3, "north_mps": 4.0, "east_mps": 3.0, "thickness_m": 500.0}
+    band = {"sd_mps": 3.0, "length_m": 400.0, "from_m": 60e3, "to_m": 70e3}
+    rich = day(pockets=[pocket], shears=[shear], discrete_gusts=[gust], gusts=[band]).at(Z)
+    # a raised cosine on knots a tenth of its half-width apart, read linearly between: (pi/10)^2/8/2 = 0.6 %
+    shape = np.where(np.abs(Z - 45e3) < 2e3, 0.5 * (1 + np.cos(np.pi * (Z - 45e3) / 2e3)), 0.0)
+    np.testing.assert_allclose(rich.density_kgpm3 / plain.density_kgpm3, 1.0 - 0.1 * shape, atol=0.1 * 0.0065)
+    np.testing.assert_allclose(rich.pressure_pa, plain.pressure_pa, rtol=1e-4)  # a pocket at unchanged pressure
+    change = rich.wind_ned_mps - plain.wind_ned_mps
+    here = (Z > 52e3) & (Z < 59e3)
+    np.testing.assert_allclose(change[here, :2], np.tile([10.0, -5.0], (here.sum(), 1)), atol=1e-9)
+    assert np.abs(change[(Z < 39e3) | ((Z > 41e3) & (Z < 49e3))]).max() < 1e-12
+    near = (Z > 39e3) & (Z < 41e3)
+    assert np.abs(change[near, 0]).max() == pytest.approx(4.0, rel=0.01)
+    assert np.abs(change[near, 1]).max() == pytest.approx(3.0, rel=0.01)
+    assert 1.0 < np.std(change[(Z > 61e3) & (Z < 69e3), 0]) < 5.0
+    # the truth as it is flown: rows of the dynamics' own table resolve the smallest structure allowed
+    thin = day(**STILL, pockets=[{"altitude_m": 45020.0, "depth": 0.1, "thickness_m": 200.0}])
+    rows = np.exp(dynamics.atmosphere_table(thin)[:, 0])
+    z = dynamics.ATMOSPHERE_START_M + dynamics.ATMOSPHERE_STEP_M * np.arange(len(rows))
+    low = z < 120e3
+    assert (rows[low] / us76(z[low])[0]).min() == pytest.approx(0.9, abs=0.01)
+
+
+def test_adding_a_band_of_turbulence_does_not_change_another():
+    bands = [
+        {"sd_mps": 2.0, "length_m": 500.0, "from_m": 30e3, "to_m": 40e3},
+        {"sd_mps": 2.0, "length_m": 500.0, "from_m": 60e3, "to_m": 70e3},
+    ]
+    one, two = day(gusts=bands[:1]).at(Z), day(gusts=bands).at(Z)
+    low = Z < 50e3
+    np.testing.assert_allclose(one.wind_ned_mps[low], two.wind_ned_mps[low], atol=1e-9)
+
+
+def test_turbulence_has_drydens_spectrum():
+    length, step, count = 400.0, 40.0, 4000
+    rng = np.random.default_rng(1)
+    drawn = np.array([dryden_transverse(count, step, length, rng) for _ in range(60)])
+    # 60 x 4000 points, about 4 to an independent one: variance to sqrt(2/60000) = 0.6 %, 4 sd
+    assert drawn.var() == pytest.approx(1.0, abs=0.025)
+    for lag in (1, 5, 10, 20, 30):
+        d = lag * step / length
+        assert np.mean(drawn[:, lag:] * drawn[:, :-lag]) == pytest.approx((1 - 0.5 * d) * np.exp(-d), abs=0.025)
+    # the spectrum itself, in bands well inside the sampling: (1 + 3 x^2)/(1 + x^2)^2 L/pi per rad/m, one-sided
+    power = np.mean(np.abs(np.fft.rfft(drawn * np.hanning(count))) ** 2, axis=0) * step / (np.pi * 0.375 * count)
+    x = 2.0 * np.pi * np.fft.rfftfreq(count, step) * length
+    for low, high in ((0.3, 0.6), (0.8, 1.2), (2.0, 3.0)):
+        inside = (x > low) & (x < high)
+        theory = length / np.pi * (1 + 3 * x[inside] ** 2) / (1 + x[inside] ** 2) ** 2
+        # at least 8 bins x 60 draws: sqrt(1/480) = 5 %, 3 sd; folding adds below 2 % at x = 3
+        assert power[inside].mean() == pytest.approx(theory.mean(), rel=0.15)
+
+
+def test_modelled_base_is_flown_and_carries_the_days_structure():
+    bare = day(base="nrlmsis_2009_08_17", **STILL).at(Z)
+    model = nrlmsis_profile().at(Z)
+    np.testing.assert_allclose(bare.density_kgpm3, model.density_kgpm3, rtol=1e-12)
+    np.testing.assert_allclose(bare.temperature_k, model.temperature_k, rtol=1e-12)
+    high = np.array([200e3, 300e3])
+    np.testing.assert_allclose(
+        day(base="nrlmsis_2009_08_17").at(high).density_kgpm3, nrlmsis_profile().at(high).density_kgpm3, rtol=1e-3
+    )
+    ratio = day(base="nrlmsis_2009_08_17").at(Z).density_kgpm3 / model.density_kgpm3
+    np.testing.assert_allclose(ratio, day().at(Z).density_kgpm3 / us76(Z)[0], rtol=1e-9)
+
+
+def errors_of_range(age_h, seeds=200):
+    spec = DayAtmosphere(**STILL, sounding=RangeSounding(age_h=age_h))
+    truth = day(**STILL)
+    found = []
+    for seed in range(seeds):
+        z, air, wind = sense_atmosphere(truth, spec, np.random.default_rng(seed))
+        real = truth.at(z)
+        found.append(
+            np.column_stack(
+                [
+                    np.log(air[:, 0] / real.density_kgpm3),
+                    air[:, 1] - real.temperature_k,
+                    wind - real.wind_ned_mps[:, :2],
+                ]
+            )
+        )
+    return z, real, np.array(found)
+
+
+def test_range_sounding_errs_as_its_instruments_do():
+    z, real, fresh = errors_of_range(0.0)
+    want = range_accuracy(z, real.pressure_pa, real.temperature_k)[:, [0, 1, 2, 2]]
+    low, high = chi2.ppf([1e-5, 1 - 1e-5], fresh.shape[0]) / fresh.shape[0]
+    # smoothing rounds the corners of US76's own temperature by up to 0.35 K at its layer bases
+    bias = np.array([0.0, 0.35, 0.0, 0.0])
+    square = np.mean(fresh**2, axis=0)
+    checked = [int(np.searchsorted(z, at)) for at in (1e3, 10e3, 20e3, 29e3, 40e3, 55e3, 65e3, 75e3, 85e3)]
+    for k in checked:
+        assert (square[k] > low * want[k] ** 2).all(), z[k]
+        assert (square[k] < high * (want[k] ** 2 + bias**2)).all(), z[k]
+    # what facts say of the instruments, at their own altitudes
+    at = [int(np.searchsorted(z, a)) for a in (10e3, 40e3, 60e3, 80e3)]
+    np.testing.assert_allclose(want[at, 2], [1.0, 1.0, 3.0, 7.0])
+    np.testing.assert_allclose(want[at[1:], 0], 0.03)
+    np.testing.assert_allclose(want[at, 1], [0.5, 1.5, 2.5, 5.0])
+
+
+def test_an_old_sounding_errs_by_what_the_air_changed():
+    z, real, old = errors_of_range(6.0)
+    want = range_accuracy(z, real.pressure_pa, real.temperature_k)[:, [0, 2]]
+    low, high = chi2.ppf([1e-5, 1 - 1e-5], old.shape[0]) / old.shape[0]
+    for altitude in (10e3, 40e3, 60e3):
+        k = int(np.searchsorted(z, altitude))
+        square = np.mean(old[:, k][:, [0, 2]] ** 2, axis=0) / (want[k] ** 2 + np.array([0.03, 6.0]) ** 2)
+        assert ((square > low) & (square < high)).all(), (altitude, square)
+
+
+@pytest.mark.parametrize(("wavelength_m", "gain"), [(2000.0, 0.5), (1000.0, 0.0625), (8000.0, 0.9576)])
+def test_range_sounding_resolves_two_kilometres(wavelength_m, gain):
+    # a Gaussian's gain is 2^-((2 km / wavelength)^2)
+    from dataclasses import replace
+
+    truth = day(**STILL)
+    z = np.arange(0.0, 130001.0, 25.0)
+    wavy = replace(
+        truth,
+        altitude_m=z,
+        log_density_ratio=0.02 * np.sin(2 * np.pi * z / wavelength_m),
+        temperature_offset_k=np.zeros(len(z)),
+        wind_ned_mps=np.zeros((len(z), 3)),
+        density_sd=np.ones(len(z)),
+        wind_sd_mps=np.ones(len(z)),
+    )
+    spec = DayAtmosphere(sounding=RangeSounding(), sounding_scale=0.0)
+    got, air, _ = sense_atmosphere(wavy, spec, np.random.default_rng(0))
+    inside = (got > 40e3) & (got < 80e3)
+    wave = np.log(air[:, 0] / us76(got)[0])[inside]
+    phase = 2 * np.pi * got[inside] / wavelength_m
+    basis = np.column_stack([np.sin(phase), np.cos(phase)])
+    if wavelength_m == 1000.0:  # its samples 500 m apart fall on the nodes: only the size can be bounded
+        assert np.abs(wave).max() < 0.02 * 0.0625 + 1e-6
+        return
+    size = np.hypot(*np.linalg.lstsq(basis, wave, rcond=None)[0]) / 0.02
+    assert size == pytest.approx(gain, abs=0.01)
+
+
+def test_top_and_faults_of_the_tables():
+    spec = DayAtmosphere(sounding=RangeSounding(top_m=72e3))
+    z, _, _ = sense_atmosphere(day(), spec, np.random.default_rng(0))
+    assert z[-1] == 72e3
+    with pytest.raises(ConfigError) as caught:
+        day(
+            pockets=[{"altitude_m": 45e3, "depht": 0.1, "thickness_m": 100.0}],
+            gusts=[{"sd_mps": 1.0, "length_m": 500.0, "from_m": 50e3, "to_m": 50.5e3}],
+            base="nrlmsis",
+        )
+    text = str(caught.value)
+    assert "did you mean 'depth'" in text
+    assert "thickness_m" in text
+    assert "two length_m" in text
+    assert "nrlmsis_2009_08_17" in text
