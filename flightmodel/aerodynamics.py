@@ -3,12 +3,13 @@
 Coefficients refer to ``q S`` and ``q S l`` and act at the nose (datum) of the shell, in the plane of the total angle
 of attack: ``C_A`` along -x, ``C_N`` against the lateral velocity, ``C_m`` nose-up positive (so a stable shape has
 C_m < 0), ``C_mq`` per ``omega l / (2 V)`` on the transverse rates. Between the table's knots they are linear, which is
-the seed paper's blend from Mach 5.7 to 3.5 where the table has no knot in between.
+the seed paper's blend from Mach 5.7 to 3.5 where the table has no knot in between. Where molecules seldom meet, they
+pass to the free-molecular coefficients, if the table has them (`flightmodel.rarefied`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import pandas as pd
 from scipy.interpolate import RegularGridInterpolator
 
 from flightmodel.checks import FloatArray, GateError, TableRangeError
+from flightmodel.rarefied import bridge
 
 COLUMNS = ("mach", "alpha_deg", "ca", "cn", "cm", "cmq")
 # above the cone's half-angle part of it lies in shadow; no entry vehicle of the class flies there, so look-ups stop
@@ -35,14 +37,21 @@ class AeroTable:
         Uniform from 0 to pi.
     coefficients : (m, a, 4) float
         C_A, C_N, C_m at the nose, C_mq.
+    free_molecular : (a, 4) float or None
+        The same on the same angles in free-molecular flow; None keeps the continuum's at any Knudsen number.
     """
 
     mach: FloatArray
     alpha_rad: FloatArray
     coefficients: FloatArray
+    free_molecular: FloatArray | None = None
 
-    def at(self, mach: FloatArray | float, alpha_rad: FloatArray | float) -> FloatArray:
+    def at(
+        self, mach: FloatArray | float, alpha_rad: FloatArray | float, knudsen: FloatArray | float | None = None
+    ) -> FloatArray:
         """C_A, C_N, C_m, C_mq ``(..., 4)`` at Mach numbers and total angles of attack.
+
+        Given Knudsen numbers too, they are bridged to the table's free-molecular coefficients (`rarefied.bridge`).
 
         Raises
         ------
@@ -59,7 +68,11 @@ class AeroTable:
             )
         grid = RegularGridInterpolator((self.mach, self.alpha_rad), self.coefficients)
         points = np.stack([np.clip(m, self.mach[0], self.mach[-1]), a], axis=-1)
-        return grid(points).reshape(*m.shape, 4)
+        continuum = grid(points).reshape(*m.shape, 4)
+        if knudsen is None or self.free_molecular is None:
+            return continuum
+        free = RegularGridInterpolator((self.alpha_rad,), self.free_molecular)(a[..., None])
+        return continuum + bridge(knudsen)[..., None] * (free.reshape(continuum.shape) - continuum)
 
     def ratio(self, mach: FloatArray | float, alpha_rad: FloatArray | float) -> FloatArray:
         """C_N/C_A (seed paper eq. [2])."""
@@ -81,19 +94,21 @@ class AeroTable:
 
     def scaled(self, ca: float = 1.0, cn: float = 1.0, cm: float = 1.0, cmq_shift: float = 0.0) -> AeroTable:
         """Dispersed copy: factors on C_A, C_N, C_m, and a shift of C_mq."""
-        return AeroTable(
-            self.mach, self.alpha_rad, self.coefficients * np.array([ca, cn, cm, 1.0]) + np.array([0, 0, 0, cmq_shift])
-        )
+        factor, shift = np.array([ca, cn, cm, 1.0]), np.array([0.0, 0.0, 0.0, cmq_shift])
+        free = None if self.free_molecular is None else self.free_molecular * factor + shift
+        return replace(self, coefficients=self.coefficients * factor + shift, free_molecular=free)
 
     def with_constant_cmq(self, cmq: float) -> AeroTable:
         """Copy with one pitch damping coefficient everywhere."""
         changed = self.coefficients.copy()
         changed[..., 3] = cmq
-        return AeroTable(self.mach, self.alpha_rad, changed)
+        return replace(self, coefficients=changed)
 
 
-def read_aero_table(path: Path) -> AeroTable:
+def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     """Read a coefficient table: columns mach, alpha_deg, ca, cn, cm, cmq, one row a grid point, ``#`` comments.
+
+    What the columns refer to is in the sidecar, see `flightmodel.aeroinput`; ``names`` are the columns' in that order.
 
     Raises
     ------
@@ -106,10 +121,10 @@ def read_aero_table(path: Path) -> AeroTable:
         raise GateError(f"{path}: no such aerodynamic table") from None
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as fault:
         raise GateError(f"{path}: cannot be read as a table: {fault}") from None
-    missing = [c for c in COLUMNS if c not in frame.columns]
+    missing = [c for c in names if c not in frame.columns]
     if missing:
-        raise GateError(f"{path}: columns {', '.join(missing)} are missing; wanted {', '.join(COLUMNS)}")
-    values = frame[list(COLUMNS)].apply(pd.to_numeric, errors="coerce").to_numpy(dtype=float)
+        raise GateError(f"{path}: columns {', '.join(missing)} are missing; wanted {', '.join(names)}")
+    values = frame[list(names)].apply(pd.to_numeric, errors="coerce").to_numpy(dtype=float)
     faults = []
     if not np.isfinite(values).all():
         faults.append(f"{path}: data row {int(np.argmin(np.isfinite(values).all(axis=1))) + 1} holds no finite number")
@@ -120,6 +135,8 @@ def read_aero_table(path: Path) -> AeroTable:
         faults.append(f"{path}: {len(values)} rows where {len(mach)} Mach x {len(alpha_deg)} angles are wanted")
     if len(alpha_deg) < 2 or len(mach) < 2 or np.ptp(np.diff(alpha_deg)) > 1e-9 or alpha_deg[0] != 0.0:
         faults.append(f"{path}: angles must be evenly spaced from 0, and at least two, as Mach numbers")
+    elif abs(alpha_deg[-1] - 180.0) > 1e-9:
+        faults.append(f"{path}: angles end at {alpha_deg[-1]:g} deg; give rows to 180: above the air all are met")
     if faults:
         raise GateError(faults)
     grid = values[:, 2:].reshape(len(mach), len(alpha_deg), 4)

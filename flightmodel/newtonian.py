@@ -11,6 +11,8 @@ Truitt, "Hypersonic Aerodynamics", 1959; Clark and Trimmer, AEDC-TDR-64-25, 1964
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from flightmodel.checks import FloatArray
@@ -49,6 +51,48 @@ def sphere_cone_closed_form(
     return axial, normal_cone + normal_cap, -(normal_cone * x_m + normal_cap * rn) / length_m
 
 
+@dataclass(frozen=True)
+class Panels:
+    """Rings of a body of revolution times azimuths, every field ``(rings, azimuths)``; body axes x forward, z down.
+
+    Half the body stands for the whole: ``area_m2`` counts each panel and its mirror image in the plane of symmetry.
+    """
+
+    normal_x: FloatArray
+    normal_z: FloatArray
+    aft_m: FloatArray
+    lateral_z_m: FloatArray
+    area_m2: FloatArray
+
+    def coefficients(self, force_x: FloatArray, force_z: FloatArray, area: float, length: float) -> FloatArray:
+        """C_A, C_N and C_m about the nose, (3,), of forces on the panels over dynamic pressure, m^2."""
+        moment = (self.lateral_z_m * force_x + self.aft_m * force_z).sum()
+        return np.array([-force_x.sum() / area, -force_z.sum() / area, moment / (area * length)])
+
+
+def sphere_cone_panels(half_angle_rad: float, nose_radius_m: float, base_radius_m: float, points: int) -> Panels:
+    """Gauss-Legendre panels of a spherical cap, a cone and a flat base, ``points`` rings on each and azimuths."""
+    s, c = np.sin(half_angle_rad), np.cos(half_angle_rad)
+    rn, rb = nose_radius_m, base_radius_m
+    node, weight = np.polynomial.legendre.leggauss(points)
+    azimuth = np.pi * 0.5 * (node + 1)  # half the body; the other half mirrors it
+    w_az = np.pi * 0.5 * weight
+    polar = 0.5 * (node + 1) * (0.5 * np.pi - half_angle_rad)  # cap, from the axis to the cone
+    cap_area = rn**2 * np.sin(polar) * 0.5 * (0.5 * np.pi - half_angle_rad) * weight
+    cap = (np.cos(polar), np.sin(polar), rn * (1 - np.cos(polar)), rn * np.sin(polar), cap_area)
+    r = rn * c + 0.5 * (node + 1) * (rb - rn * c)
+    cone_area = r / s * 0.5 * (rb - rn * c) * weight
+    cone = (np.full(points, s), np.full(points, c), rn * (1 - s) + (r - rn * c) / np.tan(half_angle_rad), r, cone_area)
+    base_r = 0.5 * (node + 1) * rb
+    x_base = rn * (1 - s) + (rb - rn * c) / np.tan(half_angle_rad)
+    base = (np.full(points, -1.0), np.zeros(points), np.full(points, x_base), base_r, base_r * 0.5 * rb * weight)
+    n_x, n_r, aft, radius, area = (np.concatenate(parts)[:, None] for parts in zip(cap, cone, base, strict=True))
+    around = np.ones_like(azimuth)
+    return Panels(
+        n_x * around, n_r * np.cos(azimuth), aft * around, radius * np.cos(azimuth), 2.0 * area * w_az[None, :]
+    )
+
+
 def sphere_cone_quadrature(
     alpha_rad: float,
     half_angle_rad: float,
@@ -58,29 +102,10 @@ def sphere_cone_quadrature(
     points: int = 400,
 ) -> tuple[float, float, float]:
     """C_A, C_N and C_m about the nose for ``Cp_max = 1`` at any angle, with shadow and a flat base."""
-    s, c = np.sin(half_angle_rad), np.cos(half_angle_rad)
-    rn, rb = nose_radius_m, base_radius_m
-    node, weight = np.polynomial.legendre.leggauss(points)
-    azimuth = np.pi * 0.5 * (node + 1)  # half the body; the other half mirrors it
-    w_az = np.pi * 0.5 * weight
-    polar = 0.5 * (node + 1) * (0.5 * np.pi - half_angle_rad)  # cap, from the axis to the cone
-    cap_n = np.cos(polar), np.sin(polar)
-    cap_area = rn**2 * np.sin(polar) * 0.5 * (0.5 * np.pi - half_angle_rad) * weight
-    cap = (cap_n[0], cap_n[1], rn * (1 - np.cos(polar)), rn * np.sin(polar), cap_area)
-    r = rn * c + 0.5 * (node + 1) * (rb - rn * c)
-    cone_area = r / s * 0.5 * (rb - rn * c) * weight
-    cone = (np.full(points, s), np.full(points, c), rn * (1 - s) + (r - rn * c) / np.tan(half_angle_rad), r, cone_area)
-    base_r = 0.5 * (node + 1) * rb
-    x_base = rn * (1 - s) + (rb - rn * c) / np.tan(half_angle_rad)
-    base = (np.full(points, -1.0), np.zeros(points), np.full(points, x_base), base_r, base_r * 0.5 * rb * weight)
-    total = np.zeros(3)
-    # body axes here: x forward, z down; the flow comes from (cos a, 0, sin a)
-    for n_x, n_r, aft, radius, area in (cap, cone, base):
-        n_z = n_r[:, None] * np.cos(azimuth)
-        cos_incidence = np.maximum(n_x[:, None] * np.cos(alpha_rad) + n_z * np.sin(alpha_rad), 0.0)
-        push = cos_incidence**2 * area[:, None] * w_az * 2.0
-        force_x, force_z = -push * n_x[:, None], -push * n_z
-        arm_x, arm_z = -aft[:, None], radius[:, None] * np.cos(azimuth)
-        total += -force_x.sum(), -force_z.sum(), (arm_z * force_x - arm_x * force_z).sum()
-    area_ref = np.pi * rb**2
-    return float(total[0] / area_ref), float(total[1] / area_ref), float(total[2] / (area_ref * length_m))
+    panels = sphere_cone_panels(half_angle_rad, nose_radius_m, base_radius_m, points)
+    # the flow comes from (cos a, 0, sin a)
+    incidence = panels.normal_x * np.cos(alpha_rad) + panels.normal_z * np.sin(alpha_rad)
+    push = np.maximum(incidence, 0.0) ** 2 * panels.area_m2
+    force = -push * panels.normal_x, -push * panels.normal_z
+    ca, cn, cm = panels.coefficients(*force, np.pi * base_radius_m**2, length_m)
+    return float(ca), float(cn), float(cm)

@@ -14,7 +14,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, field_validator
 
-from flightmodel.aerodynamics import AeroTable, read_aero_table
+from flightmodel.aerodynamics import AeroTable
+from flightmodel.aeroinput import Aerodynamics, Shape, aerodynamics_from
 from flightmodel.checks import ConfigError, FloatArray, check_positive_definite, nearest_name
 from flightmodel.config import Section, parse_section, read_toml
 from flightmodel.instruments import dcm_body_from_clocking
@@ -140,10 +141,6 @@ class CameraMount(Section):
     distortion: tuple[float, float, float, float]
 
 
-class _Aerodynamics(Section):
-    table: str
-
-
 class _VehicleFile(Section):
     name: str
     description: str = ""
@@ -152,7 +149,7 @@ class _VehicleFile(Section):
     aeroshell: MassProperties
     centerbody: MassProperties
     uncertainty: Uncertainty = Uncertainty()
-    aerodynamics: _Aerodynamics
+    aerodynamics: Aerodynamics
     geometry: ShellGeometry
     sensors: dict[str, SensorMount] = {}
     cameras: dict[str, CameraMount] = {}
@@ -238,17 +235,25 @@ def vehicle_from_toml(path: Path) -> Vehicle:
         With every fault of the file, unknown keys with the nearest known one.
     """
     spec = parse_section(_VehicleFile, read_toml(path), str(path))
-    table = path.parent / spec.aerodynamics.table
-    if not table.exists():
-        table = DATA / "aerodynamics" / spec.aerodynamics.table
+    shell, reference = spec.geometry, spec.reference
+    shape = Shape(
+        float(np.deg2rad(shell.half_angle_deg)),
+        shell.nose_radius_m,
+        shell.base_radius_m,
+        reference.area_m2,
+        reference.length_m,
+    )
+    aero, table_sd = aerodynamics_from(spec.aerodynamics, shape, (path.parent, DATA / "aerodynamics"))
+    # the vehicle file's own word first, then the table's
+    stated = {k: v for k, v in table_sd if v is not None and k not in spec.uncertainty.model_fields_set}
     return Vehicle(
         name=spec.name,
         reference=spec.reference,
         joint=spec.joint,
         aeroshell=spec.aeroshell,
         centerbody=spec.centerbody,
-        uncertainty=spec.uncertainty,
-        aero=read_aero_table(table),
+        uncertainty=spec.uncertainty.model_copy(update=stated),
+        aero=aero,
         geometry=spec.geometry,
         sensors=dict(spec.sensors),
         cameras=dict(spec.cameras),

@@ -208,7 +208,8 @@ def _on_base(day: AtmosphereProfile, base: AtmosphereProfile) -> AtmosphereProfi
 def _with_structures(day: AtmosphereProfile, spec: DayAtmosphere, rng: np.random.Generator) -> AtmosphereProfile:
     """Add pockets, shears and gusts, on knots fine enough for the thinnest of them."""
     knots = [day.altitude_m]
-    for part in (*spec.pockets, *spec.shears, *spec.discrete_gusts):
+    parts: list[Pocket | Shear | DiscreteGust] = [*spec.pockets, *spec.shears, *spec.discrete_gusts]
+    for part in parts:
         reach = part.thickness_m
         knots.append(np.linspace(part.altitude_m - reach, part.altitude_m + reach, 2 * POINTS_A_STRUCTURE + 1))
     bands = [

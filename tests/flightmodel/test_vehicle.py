@@ -102,6 +102,7 @@ def test_table_beside_the_vehicle_file_is_used_first(tmp_path):
     path = edited(tmp_path)
     shipped = vehicle_path("irve2_reference").parent.parent / "aerodynamics" / "irve2_reference.csv"
     shutil.copy(shipped, tmp_path / "irve2_reference.csv")
+    shutil.copy(shipped.with_suffix(".toml"), tmp_path / "irve2_reference.toml")
     text = (tmp_path / "irve2_reference.csv").read_text().replace("\n3,0,", "\n3,0,9", 1)
     (tmp_path / "irve2_reference.csv").write_text(text)
     assert vehicle_from_toml(path).aero.at(3.0, 0.0)[0] > 9.0
