@@ -15,6 +15,7 @@ from flightmodel import earth, rotations
 from flightmodel.atmosphere import AirState, AtmosphereProfile
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
+from flightmodel.moments import peak
 from flightmodel.trajectory import Trajectory
 
 
@@ -65,11 +66,7 @@ def lateral_angles(velocity_body_mps: FloatArray) -> FloatArray:
 
 def peak_pressure(time_s: FloatArray, dynamic_pressure_pa: FloatArray) -> tuple[float, float]:
     """Time and value of the largest dynamic pressure, by a parabola through the three samples around it."""
-    k = int(np.clip(np.argmax(dynamic_pressure_pa), 1, len(time_s) - 2))
-    fit = np.polynomial.Polynomial.fit(time_s[k - 1 : k + 2], dynamic_pressure_pa[k - 1 : k + 2], 2)
-    at = float(fit.deriv().roots()[0].real) if abs(fit.coef[2]) > 0 else float(time_s[k])
-    at = float(np.clip(at, time_s[k - 1], time_s[k + 1]))
-    return at, float(fit(at))
+    return peak(time_s, dynamic_pressure_pa)
 
 
 def pressure_pulse(dynamic_pressure_pa: FloatArray) -> BoolArray:

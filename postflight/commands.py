@@ -31,6 +31,7 @@ from postflight.pipeline import (
     reconstruct_telemetry,
 )
 from recon.bet import Settings
+from synthetic_flight.events import Event, flight_events
 from synthetic_flight.folder import check_destination, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
@@ -66,6 +67,9 @@ def simulate(scenario: str, folder: Path, seed: int, force: bool) -> None:
     with progress_bar() as report:
         truth = simulate_to_folder(chosen, seed, folder, report, replace=force)
     print_truth(truth, folder)
+    print_events(flight_events(truth, chosen.spec.time.inflated_s))
+    if truth.words:
+        console.print(f"[yellow]{escape(truth.words)}[/]")
 
 
 def print_truth(truth: Truth, folder: Path) -> None:
@@ -83,8 +87,25 @@ def print_truth(truth: Truth, folder: Path) -> None:
         f"{truth.time_s[-1]:.1f}",
     )
     console.print(table)
-    if truth.words:
-        console.print(f"[yellow]{escape(truth.words)}[/]")
+
+
+def print_events(flown: list[Event]) -> None:
+    """Print the moments of a synthetic flight, without the angles that estimators look for (truth/events.csv)."""
+    table = Table(title="Events")
+    for name in ("event", "t s", "alt km", "m/s", "Mach", "q Pa", "W/cm2", "g"):
+        table.add_column(name, justify="left" if name == "event" else "right")
+    for e in flown:
+        table.add_row(
+            e.name.replace("dynamic pressure", "q"),
+            f"{e.time_s:.2f}",
+            f"{e.altitude_m / 1e3:.2f}",
+            f"{e.speed_mps:.1f}",
+            f"{e.mach:.2f}",
+            f"{e.dynamic_pressure_pa:.1f}",
+            f"{e.heat_flux_wpm2 / 1e4:.2f}",
+            f"{e.sensed_g:.2f}",
+        )
+    console.print(table)
 
 
 def run(folder: Path, methods: tuple[str, ...], rate_hz: float) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from flightmodel import earth
+from flightmodel import earth, moments
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
@@ -182,22 +182,12 @@ def deflection_table(history: DeflectionHistory) -> pd.DataFrame:
 def event_table(flight: Flight) -> pd.DataFrame:
     """Moments of the flight with altitude, Mach number, dynamic pressure and total angle of attack."""
     air = flight.air
-    moments = [(name, t) for name, t in flight.telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
+    named = [(name, t) for name, t in flight.telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
     peak = "peak dynamic pressure" if flight.peak_is_inside else "largest dynamic pressure (edge of data)"
-    moments.append((peak, flight.peak_s))
-    if (k := int(np.argmax(air.altitude_m))) not in (0, len(air.time_s) - 1):
-        moments.append(("apogee", float(air.time_s[k])))
-    for name, values, level in (
-        ("80 km", air.altitude_m, 80e3),
-        ("40 km", air.altitude_m, 40e3),
-        ("Mach 3.5", air.mach, 3.5),
-        ("Mach 1", air.mach, 1.0),
-    ):
-        falls = np.flatnonzero((values[:-1] > level) & (values[1:] <= level) & (air.altitude_m[1:] < 130e3))
-        if len(falls):
-            moments.append((name, float(air.time_s[falls[0] + 1])))
+    named.append((peak, flight.peak_s))
+    named += moments.descent_moments(air.time_s, air.altitude_m, air.mach)
     rows = []
-    for name, t in sorted(moments, key=lambda m: m[1]):
+    for name, t in sorted(named, key=lambda m: m[1]):
         k = int(np.searchsorted(air.time_s, t).clip(0, len(air.time_s) - 1))
         alpha, sd = np.rad2deg([air.alpha_total_wind_rad[k], air.alpha_total_wind_sd_rad[k]])
         rows.append((name, t, air.altitude_m[k], air.mach[k], air.dynamic_pressure_pa[k], alpha, sd))

@@ -17,7 +17,7 @@ import pandas as pd
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray, GateError
-from synthetic_flight import day_air, sensing, video
+from synthetic_flight import day_air, events, sensing, video
 from synthetic_flight.scenarios import Radar, Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
@@ -137,6 +137,8 @@ def _write_truth(scenario: Scenario, seed: int, truth: Truth, folder: Path) -> N
         "twist_deg": np.rad2deg(truth.twist_rad[rows]),
     }
     _csv(folder / "deflection.csv", columns, "%.8f")
+    moments = events.event_table(events.flight_events(truth, scenario.spec.time.inflated_s))
+    moments.to_csv(folder / "events.csv", index=False, float_format="%.8g", lineterminator="\n")
     shutil.copyfile(scenario.source, folder / "scenario.toml")
     run = {"scenario": scenario.spec.name, "seed": seed, "words": truth.words, "synthetic": True}
     (folder / "run.json").write_text(json.dumps(run, indent=2) + "\n")

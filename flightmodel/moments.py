@@ -1,0 +1,87 @@
+"""When something happened between two records: peaks and crossings to a small fraction of the step between them.
+
+A peak is that of the parabola through the three samples around the largest; a crossing is the root, inside its own
+step, of the cubic through the four samples around it. Truth and estimate name the moments of a descent alike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import brentq
+
+from flightmodel.checks import BoolArray, FloatArray
+
+# above this height a Mach number is a convention, and one that rises and falls with the thermosphere
+HIGHEST_M = 130e3
+
+
+def peak(time_s: FloatArray, values: FloatArray) -> tuple[float, float]:
+    """Time and size of the largest value, by a parabola through the three samples around it."""
+    k = int(np.clip(np.argmax(values), 1, len(time_s) - 2))
+    fit = np.polynomial.Polynomial.fit(time_s[k - 1 : k + 2], values[k - 1 : k + 2], 2)
+    at = float(fit.deriv().roots()[0].real) if abs(fit.coef[2]) > 0 else float(time_s[k])
+    at = float(np.clip(at, time_s[k - 1], time_s[k + 1]))
+    return at, float(fit(at))
+
+
+def has_peak(values: FloatArray) -> bool:
+    """Whether the largest value lies inside, not at an end where the data begin or stop."""
+    return 0 < int(np.argmax(values)) < len(values) - 1
+
+
+def _around(time_s: FloatArray, k: int) -> slice:
+    """Four samples around the step from k to k + 1, fewer at the ends."""
+    low = int(np.clip(k - 1, 0, max(len(time_s) - 4, 0)))
+    return slice(low, low + 4)
+
+
+def first_fall(time_s: FloatArray, values: FloatArray, level: float, allowed: BoolArray | None = None) -> float | None:
+    """Time at which values first fall to a level; None where they never do.
+
+    Parameters
+    ----------
+    time_s, values : (n,) float
+    level : float
+    allowed : (n,) bool, optional
+        Steps whose second sample is not allowed do not count.
+    """
+    falls = (values[:-1] > level) & (values[1:] <= level)
+    if allowed is not None:
+        falls &= allowed[1:]
+    if not falls.any():
+        return None
+    k = int(np.argmax(falls))
+    rows = _around(time_s, k)
+    size = len(time_s[rows]) - 1
+    fit = np.polynomial.Polynomial.fit(time_s[rows], values[rows] - level, size)
+    low, high = float(time_s[k]), float(time_s[k + 1])
+    # a sample on the level, within rounding, is the crossing itself
+    if fit(low) <= 0.0:
+        return low
+    if fit(high) >= 0.0:
+        return high
+    return float(brentq(fit, low, high, xtol=1e-12))
+
+
+def values_at(time_s: FloatArray, columns: FloatArray, at_s: float) -> FloatArray:
+    """Columns ``(n, m)`` at one time inside the records, ``(m,)``, by the cubic through four samples around it."""
+    k = int(np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2))
+    t, v = time_s[_around(time_s, k)], columns[_around(time_s, k)]
+    weights = [np.prod([(at_s - t[j]) / (t[i] - t[j]) for j in range(len(t)) if j != i]) for i in range(len(t))]
+    return np.array(weights) @ v
+
+
+def descent_moments(time_s: FloatArray, altitude_m: FloatArray, mach: FloatArray) -> list[tuple[str, float]]:
+    """Name and time of apogee, of 80 and 40 km and of Mach 3.5 and 1 on the way down, of those that lie inside."""
+    moments: list[tuple[str, float | None]] = []
+    if has_peak(altitude_m):
+        moments.append(("apogee", peak(time_s, altitude_m)[0]))
+    down = (np.arange(len(time_s)) > np.argmax(altitude_m)) & (altitude_m < HIGHEST_M)
+    for name, values, level in (
+        ("80 km", altitude_m, 80e3),
+        ("40 km", altitude_m, 40e3),
+        ("Mach 3.5", mach, 3.5),
+        ("Mach 1", mach, 1.0),
+    ):
+        moments.append((name, first_fall(time_s, values, level, down)))
+    return [(name, at) for name, at in moments if at is not None]
