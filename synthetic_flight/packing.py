@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flightmodel import rotations
+from flightmodel import rarefied, rotations
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
@@ -57,8 +57,8 @@ def parameter_vector(
 def atmosphere_table(profile: AtmosphereProfile) -> FloatArray:
     """Air every 50 m from -1 to 399 km, ``(rows, 6)``, for the kernels.
 
-    Density, the change of its logarithm up to the next row, speed of sound, north and east wind, and the fraction of
-    free-molecular flow.
+    Density, the change of its logarithm up to the next row, speed of sound, north and east wind, and room for the
+    fraction of free-molecular flow, which depends on the vehicle (`kernel_tables`).
     """
     z = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS, dtype=np.float64)
     air = profile.at(z)
@@ -76,13 +76,13 @@ def kernel_tables(vehicle: Vehicle, atmosphere: FloatArray) -> tuple[FloatArray,
     """Return the tables of the kernels: atmosphere of every lane, grid, Mach knots, coefficients, free-molecular."""
     grid = np.array([ATMOSPHERE_START_M, 1.0 / ATMOSPHERE_STEP_M, 1.0 / vehicle.aero.alpha_rad[1]])
     coefficients = np.ascontiguousarray(vehicle.aero.coefficients)
-    return (
-        np.ascontiguousarray(atmosphere if atmosphere.ndim == 3 else atmosphere[None]),
-        grid,
-        np.ascontiguousarray(vehicle.aero.mach),
-        coefficients,
-        np.zeros(coefficients.shape[1:]),
-    )
+    air = atmosphere if atmosphere.ndim == 3 else atmosphere[None]
+    free = np.zeros(coefficients.shape[1:])
+    if vehicle.aero.free_molecular is not None:
+        free, air = np.ascontiguousarray(vehicle.aero.free_molecular), air.copy()
+        with np.errstate(divide="ignore"):  # no air: infinitely far between molecules
+            air[..., 5] = rarefied.bridge(rarefied.knudsen(air[..., 0], vehicle.reference.length_m))
+    return np.ascontiguousarray(air), grid, np.ascontiguousarray(vehicle.aero.mach), coefficients, free
 
 
 def workspace(states: FloatArray, parameters: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import _kernels, dynamics, packing
 from synthetic_flight._workspace_kernels import AUX, STATES
+from synthetic_flight.events import splashdown_index
 
 BENDING_LIMIT_RAD = 0.5 * np.pi
 TUMBLE_RAD = 0.5 * np.pi
@@ -176,6 +177,8 @@ def fly(
     lock = 0 if inflated_s is None else max(0, int(np.ceil((inflated_s - start_s) / record_s - 1e-9)))
     states, aux = integrate(vehicle, packing.atmosphere_table(profile), state, step_s, per_record, records, lock)
     diverged = len(states) < records
+    at_sea = splashdown_index(aux[:, 0])
+    states, aux = states[:at_sea], aux[:at_sea]
     return _truth(
         vehicle,
         profile,

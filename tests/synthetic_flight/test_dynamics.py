@@ -55,6 +55,20 @@ def test_kernel_equals_the_readable_form_with_every_term_alive(generic_vehicle):
     np.testing.assert_allclose(drag_free, want, rtol=1e-11, atol=1e-11)
 
 
+def test_kernel_bridges_to_free_molecular_flow_as_the_readable_form(generic_vehicle):
+    alpha = generic_vehicle.aero.alpha_rad
+    free = np.column_stack([2.4 * np.cos(alpha), 0.3 * np.sin(alpha), -0.2 * np.sin(2 * alpha), 0.1 + 0.0 * alpha])
+    vehicle = replace(generic_vehicle, aero=replace(generic_vehicle.aero, free_molecular=free))
+    state, profile = entry_45_km(), windy()
+    state[:3] *= 1.0 + 58e3 / np.linalg.norm(state[:3])  # 103 km: nearly half way
+    _, aux = kernel_rates(state, vehicle, packing.atmosphere_table(profile))
+    force, _ = dynamics.aerodynamics(state, vehicle, profile)
+    continuum, _ = dynamics.aerodynamics(state, generic_vehicle, profile)
+    assert np.linalg.norm(force) > 1.1 * np.linalg.norm(continuum)
+    # the bridge is linear between rows 50 m apart: 50 m is 1 % of a decade's 12 km
+    np.testing.assert_allclose(aux[12:15], force, rtol=2e-5, atol=1e-9)
+
+
 def test_joint_point_of_both_bodies_has_one_acceleration(generic_vehicle):
     # differentiate the joint's position as seen from each body along a short flight: no drift, one point
     states, _ = integrate(generic_vehicle, packing.atmosphere_table(windy()), entry_45_km(), 1e-4, 1, 2001)

@@ -11,8 +11,8 @@ from flightmodel import earth
 from flightmodel._kernels import FASTMATH
 from flightmodel.checks import ConfigError
 from synthetic_flight import _air_kernels, _kernels, packing
-from synthetic_flight.ensemble import LANES, Schedule, Start, fly_ensemble
 from synthetic_flight.day_air import DayAtmosphere, day_atmosphere
+from synthetic_flight.ensemble import LANES, Schedule, Start, fly_ensemble
 from synthetic_flight.scenarios import child_rng
 from synthetic_flight.simulate import integrate
 
