@@ -1,8 +1,8 @@
 """Compiled primitives of the Earth and of attitudes, shared by the simulator's and the filter's kernels.
 
 Readable twins: `flightmodel.earth`, `flightmodel.rotations`. Importing this module also points numba's cache at a
-folder whose name carries a hash of every kernel source: numba does not notice a change in a callee of another file,
-so a stale cache must not be reachable.
+folder whose name carries a hash of every kernel source and the processor: numba does not notice a change in a callee
+of another file, so a stale cache must not be reachable.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ import math
 import os
 from pathlib import Path
 
+import llvmlite.binding
 import numba
 
 # Contraction and reordering are allowed; assuming away NaN is not: telemetry marks gaps with it.
 FASTMATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 
-def _point_cache_at_these_sources() -> None:
-    digest = hashlib.sha256(numba.__version__.encode())
+def _point_cache_at_these_sources() -> Path | None:
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()}".encode())
     for package in ("flightmodel", "recon", "estimators", "synthetic_flight"):
         spec = importlib.util.find_spec(package)
         for folder in (spec.submodule_search_locations or ()) if spec else ():
@@ -31,11 +32,12 @@ def _point_cache_at_these_sources() -> None:
     try:
         cache.mkdir(parents=True, exist_ok=True)
     except OSError:  # a read-only home: numba compiles anew, which is slow but right
-        return
+        return None
     numba.config.CACHE_DIR = str(cache)
+    return cache
 
 
-_point_cache_at_these_sources()
+CACHE = _point_cache_at_these_sources()
 
 
 def kernel(function):

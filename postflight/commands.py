@@ -19,7 +19,7 @@ from rich.table import Table
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import lv_clock
 from flightmodel.flightfolder import read_flight
-from postflight import drawing, figures, results, scoring
+from postflight import drawing, figures, results, scoring, warmup
 from postflight.pipeline import (
     METHODS,
     NO_VIDEO,
@@ -27,7 +27,6 @@ from postflight.pipeline import (
     Flight,
     camera_sensitivity,
     estimate,
-    reconstruct_flight,
     reconstruct_telemetry,
 )
 from recon.bet import Settings
@@ -40,6 +39,7 @@ EXIT_NO_ANSWER, EXIT_CHECK_FAILED = 4, 5
 REFERENCE = "irve2_reference"
 Report = Callable[[float, str], None]
 console = Console(soft_wrap=True)
+console_err = Console(stderr=True, soft_wrap=True)
 
 
 @contextmanager
@@ -50,6 +50,11 @@ def progress_bar() -> Iterator[Report]:
     with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda fraction, what: bar.update(task, completed=fraction, description=what)
+
+
+def compile_kernels(*groups: str) -> None:
+    """Compile before first use, and say so."""
+    warmup.prepare(groups, lambda words: console_err.print(escape(words)))
 
 
 def scenario_and_folder(arguments: tuple[str, ...]) -> tuple[str, Path]:
@@ -64,6 +69,7 @@ def scenario_and_folder(arguments: tuple[str, ...]) -> tuple[str, Path]:
 def simulate(scenario: str, folder: Path, seed: int, force: bool) -> None:
     """Fly and write a flight folder."""
     chosen = read_scenario(scenario)
+    compile_kernels("simulator")
     with progress_bar() as report:
         truth = simulate_to_folder(chosen, seed, folder, report, replace=force)
     print_truth(truth, folder)
@@ -133,7 +139,10 @@ def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[
 
             return tell
 
-        flight = reconstruct_flight(folder, Settings(output_rate_hz=rate_hz), step(0.0, 0.5))
+        step(0.0, 0.05)(0.0, "reading telemetry")
+        telemetry = read_flight(folder)
+        compile_kernels("reconstruction", "simulator")
+        flight = reconstruct_telemetry(telemetry, Settings(output_rate_hz=rate_hz), step(0.05, 0.5))
         wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
         answers = estimate(flight, flight.telemetry, wanted, step(0.5, 0.7))
         if "camera" in methods and "camera" not in wanted:
@@ -203,8 +212,10 @@ def deflection(folder: Path, methods: tuple[str, ...], plane_deg: float | None, 
         methods = tuple(m for m in METHODS if m != "camera" or telemetry.frames is not None)
     plane_rad = None if plane_deg is None else float(np.deg2rad(plane_deg))
     settings = {"methods": list(methods), "plane_deg": plane_deg, "joint_m": joint_m}
+    needs_bet = set(methods) != {"camera"}
+    if needs_bet:
+        compile_kernels("reconstruction")
     with progress_bar() as report:
-        needs_bet = set(methods) != {"camera"}
         flight = reconstruct_telemetry(telemetry, None, lambda f, what: report(0.6 * f, what)) if needs_bet else None
         tell: Report = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
         answers = estimate(flight, telemetry, methods, tell, plane_rad, joint_m)
@@ -268,6 +279,7 @@ def demo(folder: Path, seed: int) -> None:
     check_destination(folder, replace=True)
     begun = time.perf_counter()
     console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
+    compile_kernels("simulator", "reconstruction")
     simulate(REFERENCE, folder, seed, force=True)
     flight, answers, written = run_flight(folder, METHODS, 20.0)
     print_flight(flight)

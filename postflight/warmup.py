@@ -1,0 +1,108 @@
+"""Compiling the kernels before their first use: in processes side by side, with a word about the wait.
+
+Kernels are compiled for the very processor they run on and kept in a cache whose name carries a hash of their sources
+(`flightmodel._kernels`). Without this a first command would compile them one after another, in silence.
+
+Run as ``python -m postflight.warmup GROUP`` it compiles one group in its own process.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+from flightmodel import earth
+from flightmodel._kernels import CACHE
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+
+
+def _simulator() -> None:
+    from synthetic_flight.packing import vacuum_table
+    from synthetic_flight.simulate import integrate, state_from_ecef
+
+    vehicle = vehicle_from_toml(vehicle_path("irve2_reference"))
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    state = state_from_ecef(0.0, np.array([7e6, 0.0, 0.0]), np.zeros(3), level, np.zeros(3))
+    integrate(vehicle, vacuum_table(), state, 0.001, 1, 2)
+
+
+def _ensembles() -> None:
+    from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
+    from synthetic_flight.packing import parameter_vector, vacuum_table
+    from synthetic_flight.simulate import state_from_ecef
+
+    vehicle = vehicle_from_toml(vehicle_path("irve2_reference"))
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    state = state_from_ecef(0.0, np.array([7e6, 0.0, 0.0]), np.zeros(3), level, np.zeros(3))
+    start = Start(state, parameter_vector(vehicle), vacuum_table())
+    list(fly_ensemble(vehicle, lambda _run: start, [0], Schedule(0.001, 1, 2)))
+
+
+def _reconstruction() -> None:
+    from recon import strapdown
+    from recon._kernels import normalised_square, radar_prediction
+    from recon.state import States
+
+    grid = strapdown.InertialGrid(
+        np.array([0.0, 0.01, 0.02]), np.zeros((3, 3)), np.zeros((3, 3)), np.ones((3, 3)), np.ones((3, 3)),
+        np.eye(3), np.eye(3),
+    )  # fmt: skip
+    nodes = np.array([0, 1, 2])
+    place = np.tile(earth.ecef_from_geodetic(0.6, -1.3, 5e4), (3, 1))
+    states = States(place, np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)), np.zeros((3, 22)))
+    strapdown.propagate(grid, 0, 1, states[0])
+    strapdown.propagate_all(grid, nodes, states)
+    strapdown.fill_between(grid, nodes, nodes[:1], states[:1])
+    three = np.ones(3)
+    radar_prediction(
+        np.eye(3), three, three, place[0], three, np.ones(4), np.zeros(4), three, np.empty(3), np.empty((3, 13))
+    )
+    normalised_square(three, np.eye(3))
+
+
+GROUPS: dict[str, Callable[[], None]] = {
+    "simulator": _simulator,
+    "ensembles": _ensembles,
+    "reconstruction": _reconstruction,
+}
+
+
+def _stamp(group: str) -> Path | None:
+    return CACHE / f"{group}.compiled" if CACHE is not None else None
+
+
+def missing(groups: Iterable[str]) -> list[str]:
+    """Groups of kernels that were not compiled on this machine from these sources yet."""
+    stamps = ((group, _stamp(group)) for group in groups)
+    return [group for group, stamp in stamps if stamp is not None and not stamp.exists()]
+
+
+def prepare(groups: Iterable[str], say: Callable[[str], None]) -> None:
+    """Compile what is missing, every group in a process of its own; what fails there compiles at its first use."""
+    wanted = missing(groups)
+    if not wanted:
+        return
+    say(f"compiling kernels for this machine, once (about 15 s): {', '.join(wanted)}")
+    quiet = subprocess.DEVNULL
+    running = [
+        subprocess.Popen([sys.executable, "-m", "postflight.warmup", group], stdin=quiet, stdout=quiet, stderr=quiet)
+        for group in wanted
+    ]
+    try:
+        for process in running:
+            process.wait()
+    except BaseException:
+        for process in running:
+            process.terminate()
+        raise
+
+
+if __name__ == "__main__":
+    GROUPS[sys.argv[1]]()
+    stamp = _stamp(sys.argv[1])
+    if stamp is not None:
+        stamp.touch()
