@@ -41,13 +41,18 @@ CACHE = _point_cache_at_these_sources()
 
 
 def kernel(function):
-    """Compile with the project's settings."""
+    """Compile with the project's settings: for what is called from Python only."""
     return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)(function)
 
 
 def inlined(function):
-    """Compile as `kernel` does, as part of every caller: for the small algebra inside vector loops."""
-    return numba.njit(nogil=True, error_model="numpy", fastmath=FASTMATH, forceinline=True)(function)
+    """Compile as `kernel` does, and as a part of every kernel that calls it.
+
+    A callee that stays a function of its own exists once in its own library and once in every caller's, differently
+    optimised; which one runs would depend on what was compiled in the process and what came from the cache.
+    """
+    options = {"nogil": True, "error_model": "numpy", "fastmath": FASTMATH, "forceinline": True}
+    return numba.njit(cache=True, **options)(function)
 
 
 A_WGS84 = 6378137.0
@@ -182,7 +187,7 @@ def gyroscopic(inertia, w0, w1, w2):
     return cross(w0, w1, w2, h0, h1, h2)
 
 
-@kernel
+@inlined
 def dcm_from_quaternion(w, x, y, z, out):
     """Direction cosine matrix of a unit quaternion, into ``out`` (3, 3)."""
     out[0, 0] = 1.0 - 2.0 * (y * y + z * z)
@@ -196,7 +201,7 @@ def dcm_from_quaternion(w, x, y, z, out):
     out[2, 2] = 1.0 - 2.0 * (x * x + y * y)
 
 
-@kernel
+@inlined
 def boxplus(q, d0, d1, d2):
     """Turn the quaternion ``q`` (4,) in place by the rotation vector (d0, d1, d2), rad, and renormalise it."""
     half2 = 0.25 * (d0 * d0 + d1 * d1 + d2 * d2)

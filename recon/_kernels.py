@@ -11,10 +11,19 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import GM_WGS84, OMEGA_WGS84, WGS84, boxplus, dcm_from_quaternion, gravitation, kernel
+from flightmodel._kernels import (
+    GM_WGS84,
+    OMEGA_WGS84,
+    WGS84,
+    boxplus,
+    dcm_from_quaternion,
+    gravitation,
+    inlined,
+    kernel,
+)
 
 
-@kernel
+@inlined
 def turn_ecef(q, angle):
     """Turn the ECEF side of ``q`` (4,) in place by ``-angle`` rad about the Earth's axis."""
     c = math.cos(0.5 * angle)
@@ -26,7 +35,7 @@ def turn_ecef(q, angle):
     q[3] = c * z + s * w
 
 
-@kernel
+@inlined
 def cross_into(a, b, out):
     """Cross product of (3,) vectors into ``out``."""
     x = a[1] * b[2] - a[2] * b[1]
@@ -36,7 +45,7 @@ def cross_into(a, b, out):
     out[1] = y
 
 
-@kernel
+@inlined
 def matmul_into(a, b, out):
     """Product of 3x3 matrices into ``out`` (another array than ``a`` and ``b``)."""
     for i in range(3):
@@ -44,7 +53,7 @@ def matmul_into(a, b, out):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@kernel
+@inlined
 def mount_matrices(dcm_body_sensor, mount, body_actual, body_mount):
     """Matrix from actual sensor axes to body, and from a change of the mount vector to body (left Jacobian)."""
     turn = np.empty((3, 3))
@@ -62,7 +71,7 @@ def mount_matrices(dcm_body_sensor, mount, body_actual, body_mount):
     matmul_into(dcm_body_sensor, half, body_mount)
 
 
-@kernel
+@inlined
 def correct_sample(before, after, errors, offset, body_actual, body_mount, value, columns):
     """Mean of two samples in body axes into ``value`` (3,), and its partials into ``columns`` (3, 9).
 
@@ -82,7 +91,7 @@ def correct_sample(before, after, errors, offset, body_actual, body_mount, value
         cross_into(body_mount[:, j], value, columns[:, 6 + j])
 
 
-@kernel
+@inlined
 def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradient):
     """Carry the 27 columns of ``phi`` (9, 27) over one step."""
     u = np.empty(3)
@@ -116,7 +125,7 @@ def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradien
             phi[6 + i, j] = half_turn[0, i] * u[0] + half_turn[1, i] * u[1] + half_turn[2, i] * u[2]
 
 
-@kernel
+@inlined
 def noise_rows(matrix, dt, half_turn, lever):
     """Apply the step's kinematic transition to the rows of ``matrix`` (9, 9), in place."""
     for j in range(9):
@@ -132,7 +141,7 @@ def noise_rows(matrix, dt, half_turn, lever):
             matrix[6 + i, j] = half_turn[0, i] * x + half_turn[1, i] * y + half_turn[2, i] * z
 
 
-@kernel
+@inlined
 def advance_noise(noise, dt, half_turn, dcm_mid, force, force_density, rate_density):
     """Carry the process noise (9, 9) over one step and add the step's own white noise."""
     lever = np.empty((3, 3))
@@ -156,7 +165,7 @@ def advance_noise(noise, dt, half_turn, dcm_mid, force, force_density, rate_dens
             noise[i, j] += value * span * dt * dt / 3.0
 
 
-@kernel
+@inlined
 def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient):
     """Carry the state over one step in place; leaves mid-step attitude, half turn and gravity gradient behind."""
     one = np.array([1.0, 0.0, 0.0, 0.0])
@@ -204,7 +213,7 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     gradient[1, 1] += w2
 
 
-@kernel
+@inlined
 def propagate(
     time, force_sensor, rate_sensor, force_density, rate_density, first, last, dcm_force, dcm_rate, errors,
     position, velocity, q, phi, noise,

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 
 from flightmodel import _kernels as la
-from flightmodel._kernels import inlined, kernel
+from flightmodel._kernels import inlined
 from synthetic_flight import _workspace_kernels as at
 
 
-@kernel
+@inlined
 def place(s, lanes, planet):
     """Where the nose is above the Earth, and how fast the air there turns with it."""
     w = len(lanes)
@@ -39,7 +39,7 @@ def _between(a, b, f):
     return a[0] + f * (b[0] - a[0]), a[1] + f * (b[1] - a[1]), a[2] + f * (b[2] - a[2]), a[3] + f * (b[3] - a[3])
 
 
-@kernel
+@inlined
 def air(s, lanes, atmosphere, grid):
     """Air of the row of the table below the nose, and what changes up to the next; end values outside."""
     w, last = len(lanes), atmosphere.shape[1] - 2
@@ -56,7 +56,7 @@ def air(s, lanes, atmosphere, grid):
         s[at.SOUND * w + i], s[at.NORTH * w + i], s[at.EAST * w + i], s[at.FREE * w + i] = c
 
 
-@kernel
+@inlined
 def flow(s, lanes):
     """Flow at the nose in shell axes, Mach number, dynamic pressure, total angle of attack."""
     w = len(lanes)
@@ -85,7 +85,7 @@ def flow(s, lanes):
         s[at.PRESSURE * w + i] = 0.5 * s[at.RHO * w + i] * speed * speed
 
 
-@kernel
+@inlined
 def look_up(s, lanes, grid, mach_knots, table, free):
     """C_A, C_N, C_m, C_mq, bilinear, held at the first and last Mach number, bridged to free-molecular ones."""
     w = len(lanes)

@@ -25,14 +25,14 @@ from synthetic_flight import _air_kernels as air
 from synthetic_flight import _workspace_kernels as at
 
 
-@kernel
+@inlined
 def beyond_freeplay(theta, freeplay, half, per_four_half):
     """Bending angle beyond the dead band, with a corner that is smooth in slope over +/- ``half``."""
     inside = min(max(theta - freeplay + half, 0.0), 2.0 * half)
     return inside * inside * per_four_half + max(theta - freeplay - half, 0.0)
 
 
-@kernel
+@inlined
 def _attitudes(s, lanes):
     """Rotations, and what of the body is wanted in shell axes."""
     w = len(lanes)
@@ -68,7 +68,7 @@ def _spin(s, w, i, row, q0, q1, q2, q3, w0, w1, w2):
     s[t + 2 * w], s[t + 3 * w] = 0.5 * (q0 * w1 + q3 * w0 - q1 * w2), 0.5 * (q0 * w2 + q1 * w1 - q2 * w0)
 
 
-@kernel
+@inlined
 def _joint(s, lanes):
     """Moment of the joint on the body, and the bending angle.
 
@@ -95,7 +95,7 @@ def _joint(s, lanes):
         at.put(s, at.MOMENT, w, i, t * (1.0 + x) - damp * w0, k * z + t * y - damp * w1, t * z - k * y - damp * w2)
 
 
-@kernel
+@inlined
 def _pull(s, lanes, planet):
     """Acceleration of the composite c.g. under gravity and aerodynamics, and the loads on the two bodies."""
     w = len(lanes)
@@ -120,7 +120,7 @@ def _pull(s, lanes, planet):
         at.put(s, at.RATE + 3, w, i, x * per_mass, y * per_mass, z * per_mass)
 
 
-@kernel
+@inlined
 def _hinged(s, lanes):
     """Angular accelerations of both bodies with the joint's force from the constraint force equation."""
     w = len(lanes)
@@ -162,7 +162,7 @@ def _hinged(s, lanes):
         at.put(s, at.RATE + 17, w, i, ea0 - x, ea1 - y, ea2 - z)
 
 
-@kernel
+@inlined
 def _locked(s, lanes):
     """Angular acceleration of one rigid body, and the moment and force that the lock of the joint carries."""
     w = len(lanes)
@@ -205,7 +205,7 @@ def _locked(s, lanes):
         s[at.THETA * w + i] = la.atan2(math.sqrt(c[6] * c[6] + c[3] * c[3]), c[0])
 
 
-@kernel
+@inlined
 def rates(s, lanes, atmosphere, grid, mach_knots, table, free, planet, locked):
     """Time derivative of the trial state of every lane, and what is recorded."""
     _attitudes(s, lanes)
@@ -221,7 +221,7 @@ def rates(s, lanes, atmosphere, grid, mach_knots, table, free, planet, locked):
         _hinged(s, lanes)
 
 
-@kernel
+@inlined
 def _record(s, w, record, limit, out, out_aux, written):
     """Write state and record of every lane that still flies; true while one does."""
     flying = False
@@ -240,7 +240,7 @@ def _record(s, w, record, limit, out, out_aux, written):
     return flying
 
 
-@kernel
+@inlined
 def _advance(s, w, stage, step):
     """After a stage of RK4: add to the next state, and set the next trial state."""
     ahead = step * (1.0 if stage == 2 else 0.5)
@@ -254,7 +254,7 @@ def _advance(s, w, stage, step):
         s[at.TRIAL * w + k] = s[at.Y * w + k] + ahead * s[at.RATE * w + k]
 
 
-@kernel
+@inlined
 def _finish(s, w, step):
     """After the last stage: the new state, quaternions of length one, and the trial state equal to it."""
     for k in range(at.STATES * w):
