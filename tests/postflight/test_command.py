@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = {"numpy", "scipy", "numba", "matplotlib", "cv2", "trimesh", "filterpy", "pandas"}
+HEAVY = {"numpy", "scipy", "numba", "matplotlib", "cv2", "trimesh", "filterpy", "pandas", "ppigrf", "erfa"}
 COMMANDS = ("demo", "simulate", "reconstruct", "deflection", "run", "score")
 
 
