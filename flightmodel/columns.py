@@ -44,6 +44,10 @@ UNITS: dict[str, tuple[str, float, float]] = {
     "radps": ("rate", 1.0, 0.0),
     "degps": ("rate", np.pi / 180.0, 0.0),
     "rpm": ("rate", 2.0 * np.pi / 60.0, 0.0),
+    "t": ("magnetic field", 1.0, 0.0),
+    "ut": ("magnetic field", 1e-6, 0.0),
+    "nt": ("magnetic field", 1e-9, 0.0),
+    "gauss": ("magnetic field", 1e-4, 0.0),
     "mps": ("speed", 1.0, 0.0),
     "kmh": ("speed", 1.0 / 3.6, 0.0),
     "kt": ("speed", 1852.0 / 3600.0, 0.0),
@@ -72,6 +76,7 @@ class Quantity:
 
 ACCELEROMETER = tuple(Quantity(f"a{a}", f"a{a}_suba_mps2", "acceleration") for a in "xyz")
 RATES = tuple(Quantity(a, f"{a}_body_degps", "rate") for a in "pqr")
+MAGNETOMETER = tuple(Quantity(f"b{a}", f"b{a}_magnetometer_ut", "magnetic field") for a in "xyz")
 RADAR = (Quantity("range", "range_m", "length"), Quantity("az", "az_deg", "angle"), Quantity("el", "el_deg", "angle"))
 ATMOSPHERE = (
     Quantity("alt", "alt_m", "length"),
@@ -85,6 +90,12 @@ ATMOSPHERE = (
     Quantity("rho_sd", "rho_sd_percent", "fraction", required=False),
     Quantity("wind_sd", "wind_sd_mps", "speed", required=False),
 )
+
+
+def sun_quantities(heads: int) -> tuple[Quantity, ...]:
+    """Columns of a table of Sun sensors with so many heads, counted from 1."""
+    pairs = [(axis, head) for head in range(1, heads + 1) for axis in ("az", "el")]
+    return tuple(Quantity(f"{axis}{head}", f"{axis}_sun{head}_deg", "angle") for axis, head in pairs)
 
 
 @dataclass(frozen=True)

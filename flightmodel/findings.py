@@ -12,7 +12,9 @@ FROZEN_S, FROZEN_SAMPLES = 0.5, 10  # a column unchanged for this long, in at le
 SATURATED_SAMPLES = 5  # this many samples in a row at a column's largest or smallest value are a stop
 
 
-def find_faults(source: str, time_s: FloatArray, names: tuple[str, ...], values: FloatArray) -> list[Finding]:
+def find_faults(
+    source: str, time_s: FloatArray, names: tuple[str, ...], values: FloatArray, missing: BoolArray | None = None
+) -> list[Finding]:
     """Findings of one sensor.
 
     Parameters
@@ -23,12 +25,16 @@ def find_faults(source: str, time_s: FloatArray, names: tuple[str, ...], values:
         Of the columns.
     values : (n, m) float
         NaN is missing.
+    missing : (n,) bool, optional
+        Rows that count as missing; where not given, those in which any value is.
     """
     found = []
+    if missing is None:
+        missing = np.asarray(~np.isfinite(values).all(axis=1))
     step = np.diff(time_s)
     for k in np.flatnonzero(step > GAP_FACTOR * float(np.median(step))):
         found.append(Finding(source, f"gap of {step[k]:.3f} s", float(time_s[k]), float(time_s[k + 1])))
-    for first, last in runs(np.asarray(~np.isfinite(values).all(axis=1))):
+    for first, last in runs(missing):
         found.append(Finding(source, f"{last - first + 1} samples missing", float(time_s[first]), float(time_s[last])))
     for name, column in zip(names, values.T, strict=True):
         # a long run at an extreme may be either: a stop reached, or a sensor that stuck there

@@ -77,6 +77,28 @@ class RatesEntry(Source):
     resolution_degps: NonNegative = 0.0
 
 
+class MagnetometerEntry(Source):
+    """Magnetometer: file, mounting on the vehicle, errors; the bias holds the vehicle's hard iron too."""
+
+    mount: str = "magnetometer"
+    noise_sd_ut: Positive = 0.2
+    bias_sd_ut: NonNegative = 0.5
+    scale_sd: NonNegative = 0.003
+    soft_iron_sd: NonNegative = 0.0
+    mount_sd_deg: NonNegative = 0.2
+    resolution_ut: NonNegative = 0.0
+
+
+class SunEntry(Source):
+    """Two-axis Sun sensors, one head looking outward at each clocking angle; an empty cell where a head sees no Sun."""
+
+    heads_lv_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=8)] = (45.0, 135.0, 225.0, 315.0)
+    field_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 180.0
+    noise_sd_deg: Positive = 1.0
+    bias_sd_deg: NonNegative = 0.5
+    mount_sd_deg: NonNegative = 0.2
+
+
 class RadarEntry(Source):
     """A tracking radar and its site (WGS-84)."""
 
@@ -89,6 +111,12 @@ class RadarEntry(Source):
     range_bias_sd_m: NonNegative = 3.0
     angle_bias_sd_deg: NonNegative = 0.003
     time_bias_sd_s: NonNegative = 0.001
+    mislevel_sd_deg: NonNegative = 0.0
+    droop_sd_deg: NonNegative = 0.0
+    skew_sd_deg: NonNegative = 0.0
+    nonorthogonality_sd_deg: NonNegative = 0.0
+    wander_sd_deg: NonNegative = 0.0
+    wander_time_constant_s: Positive = 20.0
 
 
 class AtmosphereEntry(Source):
@@ -123,6 +151,8 @@ class SensorsEntry(Section):
 
     accelerometer: TriadEntry
     rates: RatesEntry
+    magnetometer: MagnetometerEntry | None = None
+    sun: SunEntry | None = None
 
 
 class FlightFile(Section):

@@ -17,16 +17,18 @@ from flightmodel.findings import find_faults
 from flightmodel.flightfile import (
     FlightFile,
     FramesEntry,
+    MagnetometerEntry,
     RadarEntry,
     RatesEntry,
+    SunEntry,
     TriadEntry,
     parse_utc,
     read_flight_file,
 )
 from flightmodel.gate import Gate
-from flightmodel.instruments import RadarSite, TriadSpec
+from flightmodel.instruments import RadarSite, SunHeads, TriadSpec
 from flightmodel.sounding import read_sounding
-from flightmodel.telemetry import AttitudePrior, Frames, RadarRecord, Telemetry, TriadRecord
+from flightmodel.telemetry import AttitudePrior, Frames, RadarRecord, SunRecord, Telemetry, TriadRecord
 from flightmodel.vehicle import CameraMount, Vehicle, vehicle_from_toml, vehicle_path
 
 
@@ -50,6 +52,10 @@ def read_flight(folder: Path) -> Telemetry:
     vehicle = _vehicle(gate, spec)
     accelerometer = _triad(gate, "accelerometer", spec.sensors.accelerometer, vehicle)
     rates = _triad(gate, "rates", spec.sensors.rates, vehicle)
+    magnetometer = (
+        _triad(gate, "magnetometer", spec.sensors.magnetometer, vehicle) if spec.sensors.magnetometer else None
+    )
+    sun = _sun(gate, spec.sensors.sun) if spec.sensors.sun else None
     radars = {name: _radar(gate, name, entry) for name, entry in spec.radars.items()}
     sounding = read_sounding(gate, spec.atmosphere)
     frames = _frames(gate, spec.frames, vehicle) if spec.frames else None
@@ -71,6 +77,8 @@ def read_flight(folder: Path) -> Telemetry:
         sounding=sounding,
         attitude_prior=prior,
         frames=frames,
+        magnetometer=magnetometer,
+        sun=sun,
         events=tuple((e.name, e.t_s) for e in spec.events),
         findings=tuple(gate.findings),
         hashes=_hashes(folder, spec, vehicle, frames),
@@ -98,6 +106,8 @@ def _vehicle(gate: Gate, spec: FlightFile) -> Vehicle | None:
             gate.refuse_config(f"{key} = '{name}'{hint}: not on vehicle '{vehicle.name}'")
 
     missing("sensors.accelerometer.mount", spec.sensors.accelerometer.mount, list(vehicle.sensors))
+    if spec.sensors.magnetometer:
+        missing("sensors.magnetometer.mount", spec.sensors.magnetometer.mount, list(vehicle.sensors))
     if spec.frames:
         missing("frames.camera", spec.frames.camera, list(vehicle.cameras))
     norm = float(np.linalg.norm(spec.attitude_prior.q_ecef_body))
@@ -106,8 +116,16 @@ def _vehicle(gate: Gate, spec: FlightFile) -> Vehicle | None:
     return None if gate.config else vehicle
 
 
-def _triad(gate: Gate, name: str, source: TriadEntry | RatesEntry, vehicle: Vehicle | None) -> TriadRecord | None:
-    quantities = columns.ACCELEROMETER if isinstance(source, TriadEntry) else columns.RATES
+Triad = TriadEntry | RatesEntry | MagnetometerEntry
+TRIAD_COLUMNS = {
+    TriadEntry: columns.ACCELEROMETER,
+    RatesEntry: columns.RATES,
+    MagnetometerEntry: columns.MAGNETOMETER,
+}
+
+
+def _triad(gate: Gate, name: str, source: Triad, vehicle: Vehicle | None) -> TriadRecord | None:
+    quantities = TRIAD_COLUMNS[type(source)]
     table = gate.table(f"sensors.{name}", source, quantities)
     if table is None or table.time_s is None:
         return None
@@ -121,23 +139,38 @@ def _triad(gate: Gate, name: str, source: TriadEntry | RatesEntry, vehicle: Vehi
     return TriadRecord(_triad_spec(name, source, vehicle), table.time_s, values)
 
 
-def _triad_spec(name: str, source: TriadEntry | RatesEntry, vehicle: Vehicle) -> TriadSpec:
-    if isinstance(source, TriadEntry):
-        mount = vehicle.sensors[source.mount]
-        return TriadSpec(
-            name,
-            np.array(mount.position_from_datum_body_m),
-            mount.dcm_body_sensor,
-            source.noise_sd_mps2,
-            source.bias_sd_mps2,
-            source.scale_sd,
-            np.deg2rad(source.mount_sd_deg),
-            source.resolution_mps2,
-        )
-    noise, bias, mount_sd, step = np.deg2rad(
-        [source.noise_sd_degps, source.bias_sd_degps, source.mount_sd_deg, source.resolution_degps]
+def _triad_spec(name: str, source: Triad, vehicle: Vehicle) -> TriadSpec:
+    mount_sd = float(np.deg2rad(source.mount_sd_deg))
+    if isinstance(source, RatesEntry):
+        noise, bias, step = np.deg2rad([source.noise_sd_degps, source.bias_sd_degps, source.resolution_degps])
+        return TriadSpec(name, np.zeros(3), np.eye(3), noise, bias, source.scale_sd, mount_sd, step)
+    mount = vehicle.sensors[source.mount]
+    place, dcm = np.array(mount.position_from_datum_body_m), mount.dcm_body_sensor
+    if isinstance(source, MagnetometerEntry):
+        noise, bias, step = 1e-6 * np.array([source.noise_sd_ut, source.bias_sd_ut, source.resolution_ut])
+        return TriadSpec(name, place, dcm, noise, bias, source.scale_sd, mount_sd, step, source.soft_iron_sd)
+    noise, bias, step = source.noise_sd_mps2, source.bias_sd_mps2, source.resolution_mps2
+    return TriadSpec(name, place, dcm, noise, bias, source.scale_sd, mount_sd, step)
+
+
+def _sun(gate: Gate, source: SunEntry) -> SunRecord | None:
+    heads = len(source.heads_lv_deg)
+    quantities = columns.sun_quantities(heads)
+    table = gate.table("sensors.sun", source, quantities)
+    if table is None or table.time_s is None:
+        return None
+    values = np.column_stack([table.columns[q.short] for q in quantities])
+    seen = np.isfinite(values.reshape(-1, heads, 2)).all(axis=2)
+    dark = np.asarray(seen.sum(axis=1) == 0)
+    if dark.all():
+        gate.faults.append(f"sensors.sun: {table.path}: no head ever sees the Sun; remove [sensors.sun]")
+        return None
+    gate.findings.extend(find_faults("sun", table.time_s, tuple(q.short for q in quantities), values, dark))
+    noise, bias, mount, field = np.deg2rad(
+        [source.noise_sd_deg, source.bias_sd_deg, source.mount_sd_deg, source.field_deg]
     )
-    return TriadSpec(name, np.zeros(3), np.eye(3), noise, bias, source.scale_sd, mount_sd, step)
+    spec = SunHeads("sun", np.deg2rad(source.heads_lv_deg), field, noise, bias, mount)
+    return SunRecord(spec, table.time_s, values.reshape(-1, heads, 2))
 
 
 def _radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
@@ -156,13 +189,26 @@ def _radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
         gate.faults.append(f"{label}: {table.path}: no track point with range, azimuth and elevation; remove the radar")
         return None
     gate.findings.extend(find_faults(name, table.time_s, ("range", "az", "el"), values))
-    lat, lon = np.deg2rad([source.latitude_deg, source.longitude_deg])
-    angle_sd, angle_bias_sd = np.deg2rad([source.angle_sd_deg, source.angle_bias_sd_deg])
-    site = RadarSite(
+    return RadarRecord(_site(name, source), table.time_s, values, source.tracks)
+
+
+def _site(name: str, source: RadarEntry) -> RadarSite:
+    lat, lon, angle_sd, angle_bias_sd = np.deg2rad(
+        [source.latitude_deg, source.longitude_deg, source.angle_sd_deg, source.angle_bias_sd_deg]
+    )
+    mislevel, droop, skew, square, wander = np.deg2rad(
+        [
+            source.mislevel_sd_deg,
+            source.droop_sd_deg,
+            source.skew_sd_deg,
+            source.nonorthogonality_sd_deg,
+            source.wander_sd_deg,
+        ]
+    )
+    return RadarSite(
         name, lat, lon, source.height_m, source.range_sd_m, angle_sd, source.range_bias_sd_m, angle_bias_sd,
-        source.time_bias_sd_s,
+        source.time_bias_sd_s, mislevel, droop, skew, square, wander, source.wander_time_constant_s,
     )  # fmt: skip
-    return RadarRecord(site, table.time_s, values, source.tracks)
 
 
 def _frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Frames | None:
@@ -210,6 +256,7 @@ def _image_fault(path: Path, camera: CameraMount) -> str:
 def _hashes(folder: Path, spec: FlightFile, vehicle: Vehicle, frames: Frames | None) -> dict[str, str]:
     """SHA-256 of every file that the results depend on; all frames' pictures share one."""
     names = ["flight.toml", spec.sensors.accelerometer.file, spec.sensors.rates.file, spec.atmosphere.file]
+    names += [s.file for s in (spec.sensors.magnetometer, spec.sensors.sun) if s is not None]
     names += [r.file for r in spec.radars.values()] + ([spec.frames.file] if spec.frames else [])
     digests = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in sorted(set(names))}
     digests[f"vehicle {vehicle.name}"] = hashlib.sha256(vehicle.source.read_bytes()).hexdigest()

@@ -15,7 +15,13 @@ from flightmodel.flightfile import Source
 from flightmodel.telemetry import Finding
 
 # no entry vehicle's instruments read beyond these; a larger number is a wrong unit or a broken word
-SANE_LIMIT = {"acceleration": 1.0e4, "rate": 400.0, "length": 1.0e8, "angle": 4.0 * np.pi}
+SANE_LIMIT = {
+    "acceleration": 1.0e4,
+    "rate": 400.0,
+    "length": 1.0e8,
+    "angle": 4.0 * np.pi,
+    "magnetic field": 1.0e-3,
+}
 
 
 @dataclass(frozen=True)

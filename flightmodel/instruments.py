@@ -11,7 +11,7 @@ from flightmodel.checks import FloatArray
 
 @dataclass(frozen=True)
 class TriadSpec:
-    """Three orthogonal sensors (accelerometers or rate gyros) on the centerbody.
+    """Three orthogonal sensors (accelerometers, rate gyros or magnetometers) on the centerbody.
 
     Parameters
     ----------
@@ -22,10 +22,12 @@ class TriadSpec:
     dcm_body_sensor : (3, 3) float
         Nominal mounting: ``v_body = dcm_body_sensor @ v_sensor``.
     noise_sd, bias_sd, scale_sd, mount_sd_rad : float
-        White noise per sample (m/s^2 or rad/s), bias, scale factor, mounting rotation per axis; one standard
-        deviation each, as the data sheet gives them.
+        White noise per sample (m/s^2, rad/s or T), bias (hard iron with it), scale factor, mounting rotation per axis;
+        one standard deviation each, as the data sheet gives them.
     resolution : float
-        Quantisation step, m/s^2 or rad/s; 0 for none.
+        Quantisation step, m/s^2, rad/s or T; 0 for none.
+    soft_iron_sd : float
+        Of a magnetometer: elements of the symmetric matrix by which the vehicle's iron bends the field.
     """
 
     name: str
@@ -36,6 +38,7 @@ class TriadSpec:
     scale_sd: float
     mount_sd_rad: float
     resolution: float = 0.0
+    soft_iron_sd: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,11 @@ class RadarSite:
         White noise per sample; the angle's across the line of sight, so azimuth scatters ``1 / cos(elevation)`` more.
     range_bias_sd_m, angle_bias_sd_rad, time_bias_sd_s : float
         Systematic errors, constant over a flight, one standard deviation.
+    mislevel_sd_rad, droop_sd_rad, skew_sd_rad, nonorthogonality_sd_rad : float
+        Systematic errors of the pedestal (RCC 753-95): its tilt about north and about east, and the factors of cos E in
+        elevation, sec E and tan E in azimuth. 0 where nothing is stated.
+    wander_sd_rad, wander_time_constant_s : float
+        Slow (Gauss-Markov) error of both angles across the line of sight.
     """
 
     name: str
@@ -63,6 +71,41 @@ class RadarSite:
     range_bias_sd_m: float
     angle_bias_sd_rad: float
     time_bias_sd_s: float
+    mislevel_sd_rad: float = 0.0
+    droop_sd_rad: float = 0.0
+    skew_sd_rad: float = 0.0
+    nonorthogonality_sd_rad: float = 0.0
+    wander_sd_rad: float = 0.0
+    wander_time_constant_s: float = 20.0
+
+
+@dataclass(frozen=True)
+class SunHeads:
+    """Two-axis Sun sensors on the centerbody, each looking outward at its clocking angle.
+
+    Parameters
+    ----------
+    name : str
+        As in the flight file.
+    clock_lv_rad : (k,) float
+        Clocking angle of each head.
+    field_rad : float
+        Full cone about a head's axis in which it sees the Sun.
+    noise_sd_rad, bias_sd_rad, mount_sd_rad : float
+        White noise per sample and constant error across the line of sight, mounting rotation per axis of each head.
+    """
+
+    name: str
+    clock_lv_rad: FloatArray
+    field_rad: float
+    noise_sd_rad: float
+    bias_sd_rad: float
+    mount_sd_rad: float
+
+    @property
+    def dcm_body_head(self) -> FloatArray:
+        """Nominal mounting of each head, ``v_body = dcm_body_head[k] @ v_head``, (k, 3, 3)."""
+        return np.array([dcm_body_from_sun_head(float(clock)) for clock in self.clock_lv_rad])
 
 
 def dcm_body_from_clocking(x_axis_lv_rad: float, y_axis_lv_rad: float) -> FloatArray:
@@ -77,3 +120,33 @@ def dcm_body_from_clocking(x_axis_lv_rad: float, y_axis_lv_rad: float) -> FloatA
 
     x_axis, y_axis = lv_direction(x_axis_lv_rad), lv_direction(y_axis_lv_rad)
     return np.column_stack([x_axis, y_axis, np.cross(x_axis, y_axis)])
+
+
+def dcm_body_from_sun_head(clock_lv_rad: float) -> FloatArray:
+    """Mounting of a Sun head: z along its axis, outward at the clocking angle; x forward, along body x.
+
+    Returns
+    -------
+    (3, 3) float
+        ``dcm_body_head``.
+    """
+    from flightmodel.deflection import lv_direction
+
+    forward, outward = np.array([1.0, 0.0, 0.0]), lv_direction(clock_lv_rad)
+    return np.column_stack([forward, np.cross(outward, forward), outward])
+
+
+def sun_angles_from_direction(direction_head: FloatArray) -> FloatArray:
+    """Azimuth about the head's x from z towards y, and elevation from there towards x, rad ``(..., 2)``.
+
+    ``direction_head`` (..., 3) are unit vectors in head axes. A point ``d`` away across the line of sight differs by
+    ``d / cos(elevation)`` in azimuth.
+    """
+    x, y, z = np.moveaxis(np.asarray(direction_head, dtype=float), -1, 0)
+    return np.stack([np.arctan2(y, z), np.arctan2(x, np.hypot(y, z))], axis=-1)
+
+
+def direction_from_sun_angles(az_el_rad: FloatArray) -> FloatArray:
+    """Unit vectors ``(..., 3)`` in head axes: inverse of `sun_angles_from_direction`."""
+    az, el = np.moveaxis(np.asarray(az_el_rad, dtype=float), -1, 0)
+    return np.stack([np.sin(el), np.cos(el) * np.sin(az), np.cos(el) * np.cos(az)], axis=-1)

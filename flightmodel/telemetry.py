@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel.checks import FloatArray, check_increasing, check_shape
-from flightmodel.instruments import RadarSite, TriadSpec
+from flightmodel.instruments import RadarSite, SunHeads, TriadSpec
 from flightmodel.vehicle import CameraMount, Vehicle
 
 
@@ -25,7 +25,8 @@ class TriadRecord:
     time_s : (n,) float
         Strictly increasing, seconds after t0.
     measured_sensor : (n, 3) float
-        Specific force m/s^2, or rate of the body against inertial space rad/s, in sensor axes; NaN is missing.
+        Specific force m/s^2, rate of the body against inertial space rad/s, or magnetic field T, in sensor axes; NaN
+        is missing.
     """
 
     spec: TriadSpec
@@ -36,6 +37,30 @@ class TriadRecord:
         """Check once."""
         check_increasing(self.spec.name, self.time_s)
         check_shape(self.spec.name, self.measured_sensor, (len(self.time_s), 3))
+
+
+@dataclass(frozen=True)
+class SunRecord:
+    """What Sun heads saw.
+
+    Parameters
+    ----------
+    spec : SunHeads
+    time_s : (n,) float
+        Strictly increasing, seconds after t0.
+    az_el_head_rad : (n, k, 2) float
+        Azimuth and elevation of the Sun in each head's axes (`flightmodel.instruments.sun_angles_from_direction`); NaN
+        where a head sees no Sun.
+    """
+
+    spec: SunHeads
+    time_s: FloatArray
+    az_el_head_rad: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check once."""
+        check_increasing(self.spec.name, self.time_s)
+        check_shape(self.spec.name, self.az_el_head_rad, (len(self.time_s), len(self.spec.clock_lv_rad), 2))
 
 
 @dataclass(frozen=True)
@@ -135,6 +160,8 @@ class Telemetry:
     sounding: Sounding
     attitude_prior: AttitudePrior
     frames: Frames | None = None
+    magnetometer: TriadRecord | None = None
+    sun: SunRecord | None = None
     events: tuple[tuple[str, float], ...] = ()
     findings: tuple[Finding, ...] = ()
     hashes: dict[str, str] = field(default_factory=dict)

@@ -17,8 +17,9 @@ import pandas as pd
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray, GateError
-from synthetic_flight import day_air, events, sensing, video
-from synthetic_flight.scenarios import Radar, Scenario, child_rng, fly_scenario
+from synthetic_flight import day_air, events, radar_sensing, sensing, sun_sensing, video
+from synthetic_flight.instrument_sections import Magnetometer, Radar, SunSensors
+from synthetic_flight.scenarios import Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
 Progress = Callable[[float, str], None]
@@ -89,8 +90,9 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     _csv(telemetry / "accelerometer.csv", {"t_s": at, **_named("a{}_suba_mps2", "xyz", force)}, "%.6f")
     at, rate = sensing.sense_rates(truth, spec.rates, start, child_rng(seed, "rates"))
     _csv(telemetry / "rates.csv", {"t_s": at, **_named("{}_body_degps", "pqr", np.rad2deg(rate))}, "%.6f")
+    _write_attitude_sensors(scenario, seed, truth, telemetry)
     for name, radar in spec.radars.items():
-        at, rae = sensing.sense_radar(truth, radar, start, child_rng(seed, name))
+        at, rae = radar_sensing.sense_radar(truth, radar, start, child_rng(seed, name))
         columns = {"t_s": at, "range_m": rae[:, 0], "az_deg": np.rad2deg(rae[:, 1]), "el_deg": np.rad2deg(rae[:, 2])}
         _csv(telemetry / f"radar_{name}.csv", columns, "%.6f")
     z, air, wind = day_air.sense_atmosphere(truth.profile, spec.atmosphere, child_rng(seed, "sounding"))
@@ -101,6 +103,21 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     if spec.video is not None:
         _write_video(scenario, seed, truth, telemetry, report)
     (folder / "flight.toml").write_text(_flight_toml(scenario, q_prior))
+
+
+def _write_attitude_sensors(scenario: Scenario, seed: int, truth: Truth, telemetry: Path) -> None:
+    spec, start = scenario.spec, scenario.spec.time.telemetry_from_s
+    if spec.magnetometer is not None:
+        rng = child_rng(seed, "magnetometer")
+        at, field = sensing.sense_magnetometer(truth, scenario.vehicle, spec.magnetometer, start, rng)
+        columns = {"t_s": at, **_named("b{}_magnetometer_ut", "xyz", field * 1e6)}
+        _csv(telemetry / "magnetometer.csv", columns, "%.6f")
+    if spec.sun is not None:
+        at, angles = sun_sensing.sense_sun(truth, spec.sun, start, child_rng(seed, "sun"))
+        columns = {"t_s": at}
+        for k, head in enumerate(np.moveaxis(np.rad2deg(angles), 1, 0), 1):
+            columns |= {f"az_sun{k}_deg": head[:, 0], f"el_sun{k}_deg": head[:, 1]}
+        _csv(telemetry / "sun.csv", columns, "%.6f")
 
 
 def _named(pattern: str, letters: str, values: FloatArray) -> dict[str, FloatArray]:
@@ -216,6 +233,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray) -> str:
         f"mount_sd_deg = {gyro.mount_deg}",
         f"resolution_degps = {gyro.resolution_degps}",
     ]
+    lines += _magnetometer_lines(spec.magnetometer) + _sun_lines(spec.sun)
     for name, radar in spec.radars.items():
         lines += [
             "",
@@ -229,6 +247,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray) -> str:
             f"range_bias_sd_m = {radar.range_bias_m}",
             f"angle_bias_sd_deg = {radar.angle_bias_deg}",
             f"time_bias_sd_s = {radar.time_bias_s}",
+            *_pedestal_lines(radar),
         ]
     lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
     if spec.video is not None:
@@ -243,3 +262,46 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray) -> str:
     if spec.time.inflated_s is not None and spec.time.inflated_s >= spec.time.telemetry_from_s:
         lines += ["", "[[events]]", 'name = "aeroshell inflated"', f"t_s = {spec.time.inflated_s}"]
     return "\n".join(lines) + "\n"
+
+
+def _magnetometer_lines(spec: Magnetometer | None) -> list[str]:
+    if spec is None:
+        return []
+    return [
+        "",
+        "[sensors.magnetometer]",
+        'file = "telemetry/magnetometer.csv"',
+        f'mount = "{spec.mount}"',
+        f"noise_sd_ut = {spec.noise_ut}",
+        # the analyst is told one number for electronics and hard iron together
+        f"bias_sd_ut = {np.hypot(spec.bias_ut, spec.hard_iron_ut):.4g}",
+        f"scale_sd = {spec.scale}",
+        f"soft_iron_sd = {spec.soft_iron}",
+        f"mount_sd_deg = {spec.mount_deg}",
+        f"resolution_ut = {spec.resolution_ut}",
+    ]
+
+
+def _sun_lines(spec: SunSensors | None) -> list[str]:
+    if spec is None:
+        return []
+    return [
+        "",
+        "[sensors.sun]",
+        'file = "telemetry/sun.csv"',
+        f"heads_lv_deg = [{', '.join(str(clock) for clock in spec.heads_lv_deg)}]",
+        f"field_deg = {spec.field_deg}",
+        f"noise_sd_deg = {spec.noise_deg}",
+        f"bias_sd_deg = {spec.bias_deg}",
+        f"mount_sd_deg = {spec.mount_deg}",
+    ]
+
+
+def _pedestal_lines(radar: Radar) -> list[str]:
+    """Systematic errors that are there; a radar without any is described as it always was."""
+    terms = ("mislevel", "droop", "skew", "nonorthogonality", "wander")
+    sizes = {name: getattr(radar, f"{name}_deg") for name in terms}
+    lines = [f"{name}_sd_deg = {size}" for name, size in sizes.items() if size > 0.0]
+    if radar.wander_deg > 0.0:
+        lines.append(f"wander_time_constant_s = {radar.wander_time_constant_s}")
+    return ([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []) + lines

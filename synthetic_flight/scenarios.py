@@ -14,6 +14,15 @@ from flightmodel.checks import ConfigError, FloatArray, nearest_name
 from flightmodel.config import Section, parse_section, read_toml
 from flightmodel.vehicle import DATA, Vehicle, vehicle_from_toml, vehicle_path
 from synthetic_flight.day_air import DayAtmosphere, day_atmosphere
+from synthetic_flight.instrument_sections import (
+    Accelerometer,
+    Attitude,
+    Magnetometer,
+    Radar,
+    Rates,
+    SunSensors,
+    Video,
+)
 from synthetic_flight.simulate import Truth, fly, state_from_ecef
 
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -52,60 +61,6 @@ class Initial(Section):
     spin_rpm: float = 0.0
 
 
-class Accelerometer(Section):
-    """Errors of the accelerometer triad, one standard deviation."""
-
-    rate_hz: Positive
-    noise_mps2: NonNegative
-    bias_mps2: NonNegative
-    scale: NonNegative
-    mount_deg: NonNegative
-    resolution_mps2: NonNegative = 0.0
-
-
-class Rates(Section):
-    """Errors of the rate gyros, one standard deviation."""
-
-    rate_hz: Positive
-    noise_degps: NonNegative
-    bias_degps: NonNegative
-    scale: NonNegative
-    mount_deg: NonNegative
-    resolution_degps: NonNegative = 0.0
-
-
-class Radar(Section):
-    """A radar's site and errors, one standard deviation."""
-
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    rate_hz: Positive
-    offset_s: NonNegative = 0.0
-    range_sd_m: NonNegative
-    angle_sd_deg: NonNegative
-    range_bias_m: NonNegative
-    angle_bias_deg: NonNegative
-    time_bias_s: NonNegative
-
-
-class Video(Section):
-    """When the onboard camera records."""
-
-    camera: str
-    start_s: float
-    stop_s: float
-    rate_hz: Positive
-    benchmark_s: float
-
-
-class Attitude(Section):
-    """The attitude that the range states to start from."""
-
-    t_s: float
-    sd_deg: Positive
-
-
 class ScenarioFile(Section):
     """The whole of a scenario file."""
 
@@ -118,6 +73,8 @@ class ScenarioFile(Section):
     accelerometer: Accelerometer
     rates: Rates
     radars: dict[str, Radar]
+    magnetometer: Magnetometer | None = None
+    sun: SunSensors | None = None
     video: Video | None = None
     attitude_prior: Attitude
 

@@ -1,20 +1,21 @@
 """What instruments on and around the vehicle would have measured: truth plus the errors of real instruments.
 
-Each instrument draws from its own generator. Systematic errors are drawn once a flight. The sounding of the day is in
+Each instrument draws from its own generator. Systematic errors are drawn once a flight. Radars are in
+`synthetic_flight.radar_sensing`, Sun sensors in `synthetic_flight.sun_sensing`, the sounding of the day in
 `synthetic_flight.day_air`.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
-from flightmodel import earth, rotations
+from flightmodel import rotations
 from flightmodel.checks import FloatArray
-from flightmodel.trajectory import interpolate_rows
+from flightmodel.geomagnetism_and_sun import magnetic_field_ecef_t
 from flightmodel.vehicle import Vehicle
-from synthetic_flight.scenarios import Accelerometer, Attitude, Radar, Rates
+from synthetic_flight.instrument_sections import Accelerometer, Attitude, Magnetometer, Rates
 from synthetic_flight.simulate import Truth
+from synthetic_flight.triad_errors import child, measured, sampled
 
 
 def sample_times(start_s: float, stop_s: float, rate_hz: float, offset_s: float = 0.0) -> FloatArray:
@@ -23,59 +24,57 @@ def sample_times(start_s: float, stop_s: float, rate_hz: float, offset_s: float 
     return np.round(start_s + offset_s + np.arange(n) / rate_hz, 6)
 
 
-def _triad_errors(
-    ideal_sensor: FloatArray, noise: float, bias: float, scale: float, mount_rad: float, resolution: float,
-    rng: np.random.Generator,
-) -> FloatArray:  # fmt: skip
-    """Measured values ``(n, 3)`` of a triad whose axes are turned by a small mounting error."""
-    turn = rotations.dcm_from_q(rotations.exp(mount_rad * rng.standard_normal(3)))
-    factor = 1.0 + scale * rng.standard_normal(3)
-    offset = bias * rng.standard_normal(3)
-    measured = (ideal_sensor @ turn) * factor + offset + noise * rng.standard_normal(ideal_sensor.shape)
-    return np.round(measured / resolution) * resolution if resolution > 0.0 else measured
-
-
 def sense_accelerometer(
     truth: Truth, vehicle: Vehicle, mount: str, spec: Accelerometer, start_s: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Times (n,) and specific force ``(n, 3)`` in the package's own axes, m/s^2, at its own place."""
-    package = vehicle.sensors[mount]
+    """Times (n,) and specific force ``(n, 3)`` in the package's own axes, m/s^2, at its own place.
+
+    Where the three elements have places of their own, each feels what is felt there.
+    """
+    package, errors = vehicle.sensors[mount], spec.errors
     at = sample_times(start_s, truth.time_s[-1], spec.rate_hz)
-    body = interpolate_rows(at, truth.time_s, truth.specific_force_body(np.array(package.position_from_datum_body_m)))
-    ideal = body @ package.dcm_body_sensor
-    mount_rad = float(np.deg2rad(spec.mount_deg))
-    return at, _triad_errors(ideal, spec.noise_mps2, spec.bias_mps2, spec.scale, mount_rad, spec.resolution_mps2, rng)
+    place, dcm = np.array(package.position_from_datum_body_m), package.dcm_body_sensor
+
+    def felt(position_from_datum_body_m: FloatArray) -> FloatArray:
+        return sampled(at, truth.time_s, truth.specific_force_body(position_from_datum_body_m), errors) @ dcm
+
+    if spec.elements_sensor_m:
+        places = [place + dcm @ np.array(element) for element in spec.elements_sensor_m]
+        ideal = np.column_stack([felt(each)[:, axis] for axis, each in enumerate(places)])
+    else:
+        ideal = felt(place)
+    return measured(at, ideal, errors, rng)
 
 
 def sense_rates(truth: Truth, spec: Rates, start_s: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and rates ``(n, 3)`` of the body against inertial space, body axes, rad/s."""
     at = sample_times(start_s, truth.time_s[-1], spec.rate_hz)
-    ideal = interpolate_rows(at, truth.time_s, truth.trajectory.omega_body_eci_body_radps)
-    noise, bias, mount, step = np.deg2rad([spec.noise_degps, spec.bias_degps, spec.mount_deg, spec.resolution_degps])
-    return at, _triad_errors(ideal, noise, bias, spec.scale, mount, step, rng)
+    ideal = sampled(at, truth.time_s, truth.trajectory.omega_body_eci_body_radps, spec.errors)
+    return measured(at, ideal, spec.errors, rng)
 
 
-def sense_radar(truth: Truth, spec: Radar, start_s: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Times (n,) and slant range m, azimuth, elevation rad ``(n, 3)`` of the vehicle's true c.g.
+def sense_magnetometer(
+    truth: Truth, vehicle: Vehicle, spec: Magnetometer, start_s: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) and magnetic field ``(n, 3)`` in the package's own axes, tesla.
 
-    Angle noise is that of the beam: across the line of sight, so azimuth scatters by ``1 / cos(elevation)`` more. A
-    positive time bias stamps a point later than it was measured.
+    The Earth's field at the package's own place, bent by the vehicle's iron (symmetric matrix) and added to the
+    field of its magnets; both are fixed to the vehicle.
     """
-    at = sample_times(start_s, truth.time_s[-1] - 0.05, spec.rate_hz, spec.offset_s)
-    bias_sd = np.array([spec.range_bias_m, *np.deg2rad([spec.angle_bias_deg] * 2)])
-    bias = bias_sd * rng.standard_normal(3)
-    late = spec.time_bias_s * rng.standard_normal()
-    true_at = np.clip(at - late, truth.time_s[0], truth.time_s[-1])
-    cg = CubicHermiteSpline(truth.time_s, truth.state_eci[:, 0:3], truth.state_eci[:, 3:6])(true_at)
-    ecef = rotations.rotate(earth.q_ecef_eci(true_at), cg)
-    site = np.deg2rad([spec.latitude_deg, spec.longitude_deg])
-    ideal = earth.radar_from_ecef(ecef, site[0], site[1], spec.height_m)
-    noise_sd = np.array([spec.range_sd_m, *np.deg2rad([spec.angle_sd_deg] * 2)])
-    noise = noise_sd * rng.standard_normal(ideal.shape)
-    noise[:, 1] /= np.cos(ideal[:, 2])
-    measured = ideal + bias + noise
-    measured[:, 1] = np.mod(measured[:, 1], 2.0 * np.pi)
-    return at, measured
+    package = vehicle.sensors[spec.mount]
+    at = sample_times(start_s, truth.time_s[-1], spec.rate_hz)
+    # what the low-pass still remembers of before the first sample
+    rows = truth.time_s >= start_s - abs(spec.delay_s) - (10.0 / spec.bandwidth_hz if spec.bandwidth_hz > 0.0 else 0.1)
+    t, q = truth.time_s[rows], truth.trajectory.q_ecef_body[rows]
+    arm = np.broadcast_to(package.position_from_datum_body_m, (len(t), 3))
+    place = truth.trajectory.position_ecef_m[rows] + rotations.rotate(q, arm)
+    field = rotations.rotate(rotations.conjugate(q), magnetic_field_ecef_t(place, truth.trajectory.epoch_utc))
+    if spec.soft_iron > 0.0:
+        upper = np.triu(spec.soft_iron * child(rng, "soft iron").standard_normal((3, 3)))
+        field = field @ (np.eye(3) + upper + np.triu(upper, 1).T)
+    if spec.hard_iron_ut > 0.0:
+        field = field + 1e-6 * spec.hard_iron_ut * child(rng, "hard iron").standard_normal(3)
+    return measured(at, sampled(at, t, field, spec.errors) @ package.dcm_body_sensor, spec.errors, rng)
 
 
 def sense_attitude(truth: Truth, spec: Attitude, rng: np.random.Generator) -> FloatArray:
