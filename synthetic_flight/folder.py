@@ -15,16 +15,15 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from flightmodel import earth, rotations
+from flightmodel import rotations
 from flightmodel.checks import FloatArray, GateError
+from flightmodel.geomagnetism_and_sun import sun_direction_ecef
 from synthetic_flight import day_air, events, radar_sensing, sensing, sun_sensing, video
 from synthetic_flight.instrument_sections import Magnetometer, Radar, SunSensors
 from synthetic_flight.scenarios import Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
 Progress = Callable[[float, str], None]
-# Sun at the pad at 12:52 UTC on 17 August: azimuth from north, elevation
-SUN_AZ_EL_RAD = np.deg2rad([95.5, 28.9])
 TRUTH_RATE_HZ = 50.0
 
 
@@ -175,7 +174,7 @@ def _write_video(scenario: Scenario, seed: int, truth: Truth, telemetry: Path, r
         vehicle.joint.station_m,
         np.hypot(yz[:, 0], yz[:, 1]),
         plane,
-        sun_direction_body(truth, next(iter(scenario.spec.radars.values())), at),
+        sun_direction_body(truth, at),
         child_rng(seed, spec.camera),
     )
     names = [f"frame_{k:05d}.png" for k in range(len(at))]
@@ -187,13 +186,10 @@ def _write_video(scenario: Scenario, seed: int, truth: Truth, telemetry: Path, r
     table.to_csv(telemetry / "frames.csv", index=False, float_format="%.6f", lineterminator="\n")
 
 
-def sun_direction_body(truth: Truth, site: Radar, at_s: FloatArray) -> FloatArray:
+def sun_direction_body(truth: Truth, at_s: FloatArray) -> FloatArray:
     """Unit vectors ``(n, 3)`` towards the Sun in body axes."""
-    azimuth, elevation = SUN_AZ_EL_RAD
-    ned = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), -np.sin(elevation)])
-    to_sun_ecef = earth.dcm_ned_ecef(np.deg2rad(site.latitude_deg), np.deg2rad(site.longitude_deg)).T @ ned
     q = rotations.slerp(truth.time_s, truth.trajectory.q_ecef_body, at_s)
-    return rotations.rotate(rotations.conjugate(q), np.broadcast_to(to_sun_ecef, (len(at_s), 3)))
+    return rotations.rotate(rotations.conjugate(q), sun_direction_ecef(truth.trajectory.epoch_utc, at_s))
 
 
 def _flight_toml(scenario: Scenario, q_prior: FloatArray) -> str:
