@@ -159,6 +159,13 @@ def _sun(gate: Gate, source: SunEntry) -> SunRecord | None:
     table = gate.table("sensors.sun", source, quantities)
     if table is None or table.time_s is None:
         return None
+    before = len(gate.faults)
+    for q in quantities:
+        # an elevation may pass 90 deg by its noise
+        limit = np.pi if q.short.startswith("az") else 0.6 * np.pi
+        gate.refuse_rows(table, q.short, -limit, limit, "no angle of a head")
+    if len(gate.faults) > before:
+        return None
     values = np.column_stack([table.columns[q.short] for q in quantities])
     seen = np.isfinite(values.reshape(-1, heads, 2)).all(axis=2)
     dark = np.asarray(seen.sum(axis=1) == 0)

@@ -5,8 +5,9 @@ Refractivity ``N = (n - 1) 1e6`` falls with height in spherical layers about the
 
 ``phi = int a dr / (r sqrt(n^2 r^2 - a^2))``,  ``L = int n^2 r dr / sqrt(n^2 r^2 - a^2)``,  ``a = n_0 r_0 cos(E_0)``.
 
-The apparent elevation ``E_0`` is the one whose ray goes through the target. The ionosphere is left out: at C band
-(5.6 GHz) it delays by decimetres. So are ducts and anything that differs along the horizon.
+Above 130 km the ray is straight. The apparent elevation ``E_0`` is the one whose ray goes through the target. The
+ionosphere is left out: at C band (5.6 GHz) it delays by decimetres. So are ducts and anything that differs along the
+horizon.
 
 References
 ----------
@@ -88,7 +89,8 @@ def refracted(
     r0 = site_radius_m(latitude_rad, height_m)
     across, up = range_m * np.cos(elevation_rad), r0 + range_m * np.sin(elevation_rad)
     target = np.hypot(across, up)
-    edges = np.minimum(np.append(_EDGES_M, np.inf), (target - r0)[:, None])
+    edges = np.minimum(_EDGES_M, (target - r0)[:, None])
+    top = r0 + edges[:, -1]
     half = 0.5 * np.diff(edges, axis=1)[..., None]
     h = (edges[:, :-1, None] + half * (1.0 + _NODES)).reshape(len(range_m), -1)
     weight = (half * _WEIGHTS).reshape(len(range_m), -1)
@@ -100,8 +102,16 @@ def refracted(
     apparent = elevation_rad.copy()
     for _ in range(ITERATIONS):
         root = np.sqrt(rise * (2.0 * n0 * r0 + rise) + (n0 * r0 * np.sin(apparent))[:, None] ** 2)
-        centre = np.sum(weight * (n0 * r0 * np.cos(apparent))[:, None] / (r * root), axis=1)
+        a = n0 * r0 * np.cos(apparent)
+        straight = _straight(a, target) - _straight(a, top)
+        centre = np.sum(weight * a[:, None] / (r * root), axis=1) + straight[0]
         reached = np.arctan2(target * np.cos(centre) - r0, target * np.sin(centre))
         apparent += elevation_rad - reached
-    length = np.sum(weight * n**2 * r / root, axis=1)
+    length = np.sum(weight * n**2 * r / root, axis=1) + straight[1]
     return length - range_m, apparent - elevation_rad
+
+
+def _straight(nearest_m: FloatArray, radius_m: FloatArray) -> FloatArray:
+    """Angle at the centre and length ``(2, n)`` of a straight ray from its nearest point out to a radius."""
+    ratio = np.minimum(nearest_m / radius_m, 1.0)
+    return np.stack([np.arccos(ratio), radius_m * np.sqrt(1.0 - ratio**2)])

@@ -47,9 +47,10 @@ class Dropouts(Section):
 class Triad(Section):
     """What accelerometers, gyros and magnetometers have in common.
 
-    ``bandwidth_hz`` is the corner of a low-pass of ``filter_order`` (0 for none); a sample shows what was there
-    ``delay_s`` earlier; ``nonorthogonality_deg`` tilts the axes against each other; negative values have another scale
-    by ``scale_asymmetry``.
+    ``bandwidth_hz`` is the corner of a low-pass of ``filter_order`` (0 for none); beyond the low-pass's own lag a
+    sample shows what was there ``delay_s`` earlier (negative where stamps were corrected for that lag);
+    ``nonorthogonality_deg`` tilts the axes against each other; negative values have another scale by
+    ``scale_asymmetry``.
     """
 
     rate_hz: Positive

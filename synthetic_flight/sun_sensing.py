@@ -69,6 +69,7 @@ def _head(
     error = bias * rng.standard_normal(2) + noise * rng.standard_normal(angles.shape)
     error[:, 0] /= np.maximum(np.cos(angles[:, 1]), 1e-3)
     angles = angles + error
+    angles[:, 0] = np.mod(angles[:, 0] + np.pi, 2.0 * np.pi) - np.pi
     if step > 0.0:
         angles = np.round(angles / step) * step
     angles[~lit | (sun[:, 2] < edge)] = np.nan

@@ -1,0 +1,187 @@
+"""The gate with magnetometer and Sun sensors: the same words for their faults as for those of the other sensors."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from flightmodel.checks import ConfigError, GateError
+from flightmodel.flightfolder import read_flight
+
+SECTIONS = """\
+[sensors.magnetometer]
+file = "telemetry/magnetometer.csv"
+noise_sd_ut = 0.2
+bias_sd_ut = 0.7
+soft_iron_sd = 0.004
+
+[sensors.sun]
+file = "telemetry/sun.csv"
+heads_lv_deg = [45.0, 135.0, 225.0, 315.0]
+noise_sd_deg = 0.8
+"""
+SUN_HEADER = "t_s," + ",".join(f"az_sun{k}_deg,el_sun{k}_deg" for k in (1, 2, 3, 4))
+
+
+@pytest.fixture
+def told(flight):
+    """The hand-made folder with both sensors: two heads see the Sun, then the next two, as the vehicle turns."""
+    t = np.arange(420.0, 430.0, 0.05)
+    turn = 0.6 * (t - 420.0)
+    field = np.column_stack([t, 20.0 * np.cos(turn), 20.0 * np.sin(turn), -43.0 + 0.01 * np.sin(7.0 * t)])
+    rows = [",".join(f"{v:.6f}" for v in row) for row in field]
+    flight.write_lines("magnetometer.csv", ["t_s,bx_magnetometer_ut,by_magnetometer_ut,bz_magnetometer_ut", *rows])
+    lines = [SUN_HEADER]
+    for at, angle in zip(t, np.rad2deg(turn), strict=True):
+        cells = []
+        for k in range(4):
+            az = (angle - 90.0 * k + 180.0) % 360.0 - 180.0
+            cells += [f"{az:.4f}", f"{12.0 + 0.3 * np.sin(9.0 * at + k):.4f}"] if abs(az) < 90.0 else ["", ""]
+        lines.append(",".join([f"{at:.6f}", *cells]))
+    flight.write_lines("sun.csv", lines)
+    flight.append(SECTIONS)
+    return flight
+
+
+def refused(flight, *words, kind=GateError):
+    with pytest.raises(kind) as caught:
+        read_flight(flight.root)
+    missing = [word for word in words if word.lower() not in str(caught.value).lower()]
+    assert not missing, f"no {missing} in the message:\n{caught.value}"
+    return str(caught.value)
+
+
+def findings(flight, source):
+    return [str(f) for f in read_flight(flight.root).findings if f.source == source]
+
+
+def test_both_are_read_in_si_with_their_data_sheets(told):
+    telemetry = read_flight(told.root)
+    assert telemetry.findings == ()
+    magnetometer, sun = telemetry.magnetometer, telemetry.sun
+    first = [float(v) for v in told.lines("magnetometer.csv")[1].split(",")]
+    np.testing.assert_allclose(magnetometer.measured_sensor[0], np.array(first[1:]) * 1e-6, rtol=1e-12)
+    assert magnetometer.spec.bias_sd == pytest.approx(0.7e-6)
+    assert magnetometer.spec.soft_iron_sd == 0.004
+    mount = telemetry.vehicle.sensors["magnetometer"]
+    np.testing.assert_array_equal(magnetometer.spec.dcm_body_sensor, mount.dcm_body_sensor)
+    assert sun.az_el_head_rad.shape == (200, 4, 2)
+    assert (np.isfinite(sun.az_el_head_rad[:, :, 0]).sum(axis=1) >= 1).all()
+    np.testing.assert_allclose(sun.az_el_head_rad[0, 0, 1], np.deg2rad(float(told.column("sun.csv", 2)[0])))
+    np.testing.assert_allclose(sun.spec.clock_lv_rad, np.deg2rad([45.0, 135.0, 225.0, 315.0]))
+    assert sun.spec.noise_sd_rad == pytest.approx(np.deg2rad(0.8))
+    assert {"telemetry/magnetometer.csv", "telemetry/sun.csv"} <= set(telemetry.hashes)
+
+
+def test_neither_is_asked_for(clean_flight):
+    telemetry = read_flight(clean_flight.root)
+    assert telemetry.magnetometer is None
+    assert telemetry.sun is None
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "wrong"),
+    [
+        ("magnetometer.csv", "by_magnetometer_ut", "by_magnetometr_ut"),
+        ("sun.csv", "az_sun3_deg", "az_sun_3_deg"),
+    ],
+)
+def test_wrong_column_names_the_nearest(told, name, known, wrong):
+    told.header(name, known, wrong)
+    refused(told, name, "line 1", f"no column '{known}'", f"did you mean '{wrong}'")
+
+
+def test_column_without_unit_tells_how_to_declare_it(told):
+    told.header("magnetometer.csv", "bx_magnetometer_ut", "bx")
+    refused(told, "sensors.magnetometer", "names no unit", "columns.bx = { column", kind=GateError)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("nt", 1e3), ("gauss", 1e-2), ("t", 1e-6)])
+def test_declared_units_equal_the_canonical_result(told, unit, factor):
+    before = read_flight(told.root).magnetometer.measured_sensor
+    told.header("magnetometer.csv", "bz_magnetometer_ut", "B-Z")
+    told.map_column("magnetometer.csv", 3, lambda cell: f"{float(cell) * factor:.12g}")
+    told.append(f'[sensors.magnetometer.columns]\nbz = {{ column = "B-Z", unit = "{unit}" }}')
+    np.testing.assert_allclose(read_flight(told.root).magnetometer.measured_sensor, before, rtol=1e-9)
+
+
+def test_wrong_unit_is_refused_with_those_that_fit(told):
+    told.append('[sensors.magnetometer.columns]\nbz = { column = "bz_magnetometer_ut", unit = "mps2" }')
+    refused(told, "not one of magnetic field", "ut, nt, gauss")
+
+
+def test_nanotesla_written_as_microtesla_are_refused(told):
+    told.map_column("magnetometer.csv", 1, lambda cell: f"{float(cell) * 1e3:.3f}")
+    refused(told, "magnetometer.csv: line 2", "beyond any magnetic field", "check its unit")
+
+
+def test_impossible_sun_angle_is_refused_with_its_line(told):
+    told.cell("sun.csv", 7, 1, "260.0")
+    text = refused(told, "sensors.sun", "no angle of a head", "az1")
+    assert re.search(r"line 7\b", text)
+
+
+@pytest.mark.parametrize("name", ["magnetometer.csv", "sun.csv"])
+def test_time_running_backwards_names_line_and_values(told, name):
+    told.cell(name, 9, 0, "420.1")
+    refused(told, name, "line 9", "time runs backwards")
+
+
+def test_mount_that_the_vehicle_lacks(told):
+    told.declare('mount = "magnetometre"', 'file = "telemetry/magnetometer.csv"')
+    refused(told, "sensors.magnetometer.mount", "did you mean 'magnetometer'", kind=ConfigError)
+
+
+def test_misspelt_key_names_the_nearest(told):
+    told.replace("flight.toml", "soft_iron_sd", "soft_irn_sd")
+    refused(told, "soft_irn_sd", "did you mean 'soft_iron_sd'", kind=ConfigError)
+
+
+def test_all_faults_come_at_once(told):
+    told.header("magnetometer.csv", "by_magnetometer_ut", "by_wrong_ut")
+    told.cell("sun.csv", 4, 2, "bright")
+    told.cell("rates.csv", 5, 1, "fast")
+    refused(told, "by_magnetometer_ut", "'bright' is no finite number", "'fast' is no finite number")
+
+
+def test_gap_frozen_and_saturated_runs_are_findings(told):
+    lines = told.lines("magnetometer.csv")
+    told.write_lines("magnetometer.csv", lines[:61] + lines[75:])
+    for line in range(100, 121):
+        told.cell("magnetometer.csv", line, 2, "11.111")
+    for line in range(20, 27):
+        told.cell("magnetometer.csv", line, 1, "60.0")
+    words = findings(told, "magnetometer")
+    assert any("gap of 0.750 s" in w for w in words)
+    assert any("by frozen" in w and "21 samples" in w for w in words)
+    assert any("bx saturated at 6e-05" in w and "7 samples" in w for w in words)
+
+
+def test_sun_is_missing_only_where_no_head_sees_it(told):
+    for line in range(50, 60):
+        for column in range(1, 9):
+            told.cell("sun.csv", line, column, "")
+    for line in range(100, 120):
+        seen = next(c for c in range(1, 9, 2) if told.lines("sun.csv")[line - 1].split(",")[c])
+        told.cell("sun.csv", line, seen + 1, "11.5")
+    words = findings(told, "sun")
+    assert any("10 samples missing (422.400 to 422.850 s)" in w for w in words)
+    assert any("frozen" in w and "el" in w for w in words)
+    assert sum("missing" in w for w in words) == 1
+
+
+def test_empty_sensors_are_refused(told):
+    for column in (1, 2, 3):
+        told.map_column("magnetometer.csv", column, lambda _: "")
+    for column in range(1, 9):
+        told.map_column("sun.csv", column, lambda _: "")
+    refused(told, "every sample is missing", "no head ever sees the Sun")
+
+
+def test_number_of_heads_is_that_of_flight_toml(told):
+    told.replace("flight.toml", "[45.0, 135.0, 225.0, 315.0]", "[45.0, 135.0, 225.0, 270.0, 315.0]")
+    refused(told, "no column 'az_sun5_deg'")
+    told.replace("flight.toml", "[45.0, 135.0, 225.0, 270.0, 315.0]", "[45.0, 135.0]")
+    assert read_flight(told.root).sun.az_el_head_rad.shape == (200, 2, 2)
