@@ -14,6 +14,7 @@ from synthetic_flight.instrument_sections import Accelerometer, Dropouts, Magnet
 from synthetic_flight.scenarios import fly_scenario, read_scenario
 from synthetic_flight.sensing import sense_accelerometer, sense_magnetometer
 from synthetic_flight.sun_sensing import sense_sun
+from synthetic_flight.triad_errors import child
 
 
 @pytest.fixture(scope="module")
@@ -189,6 +190,13 @@ def test_accuracy_is_across_the_line_of_sight(truth):
     across = np.stack([error[..., 0] * np.cos(clean[..., 1]), error[..., 1]], axis=-1)
     # 1200 values: 2 % of a standard deviation
     assert np.nanstd(across) == pytest.approx(1.0, rel=0.08)
+    draws = child(np.random.default_rng(1), "head 3")
+    draws.standard_normal(5)  # mount and bias
+    raw = draws.standard_normal((len(clean), 2))
+    seen = np.isfinite(clean[:, 3, 0])
+    # the sine of the elevation is not small, so that a missing 1 / cos would show
+    assert np.abs(clean[seen, 3, 1]).max() > 0.2
+    np.testing.assert_allclose(across[seen, 3], raw[seen], atol=1e-9)
     biases, turns = [], []
     for seed in range(40):
         error = np.rad2deg(sun_of(truth, seed, bias_deg=0.5)[1] - clean)

@@ -2,9 +2,19 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from synthetic_flight import triad_errors
-from synthetic_flight.triad_errors import DropoutErrors, TriadErrors, child, gauss_markov, kept, low_pass, measured
+from synthetic_flight.triad_errors import (
+    DropoutErrors,
+    TriadErrors,
+    child,
+    gauss_markov,
+    kept,
+    low_pass,
+    measured,
+    tilted_axes,
+)
 
 QUIET = {"mount_rad": 0.0, "scale": 0.0, "bias": 0.0, "noise": 0.0}
 STEP = 0.004
@@ -90,6 +100,10 @@ def test_misalignment_comes_before_scale_and_scale_before_bias():
     np.testing.assert_allclose(bias, 0.7 * drawn.standard_normal(3), atol=1e-12)
     # rows of N are unit vectors and R is a rotation, so each row's length is its axis's scale
     np.testing.assert_allclose(np.linalg.norm(matrix, axis=1), scale, rtol=1e-12)
+    # written out with the draws in their order, which the seeds of flights already flown rest upon
+    tilt = 0.03 * child(np.random.default_rng(8), "nonorthogonality").standard_normal(3)
+    turned = Rotation.from_rotvec(0.05 * turn).as_matrix()
+    np.testing.assert_allclose(matrix, np.diag(scale) @ tilted_axes(tilt) @ turned.T, atol=1e-12)
     first = matrix[0] / scale[0]  # the first axis is R^T's own: its angle to x is the turn's across x
     assert np.arccos(first[0]) == pytest.approx(0.05 * np.hypot(turn[1], turn[2]), rel=0.02)
 
