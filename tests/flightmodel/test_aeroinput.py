@@ -190,11 +190,10 @@ def test_tables_uncertainty_stands_where_the_vehicle_file_is_silent(tmp_path):
     assert (known.cn, known.ca) == (0.22, 0.03)
 
 
-def test_shipped_table_is_read_bit_by_bit(tmp_path):
+def test_shipped_table_is_read_bit_by_bit():
     path = vehicle_path("irve2_reference").parents[1] / "aerodynamics" / "irve2_reference.csv"
     vehicle = vehicle_from_toml(vehicle_path("irve2_reference"))
     np.testing.assert_array_equal(vehicle.aero.coefficients, read_aero_table(path).coefficients)
-    assert vehicle.aero.free_molecular is None
 
 
 # ------------------------------------------------------------------------------------------------------------ DAVE-ML

@@ -105,10 +105,10 @@ def test_finer_records_give_the_same_events():
         other = coarse[name]
         if name.startswith("peak"):
             # the top is flat and, where it meets a knot of the air's structure, sharp: one record in time, and in size
-            # 1e-4 (its slope beside the knot, 100 Pa/s at most, over a fraction of a record)
+            # 2e-4 (beside the knot at most 100 Pa/s, so 1 Pa in half a record, of which a parabola leaves a quarter)
             assert other.time_s == pytest.approx(e.time_s, abs=0.03), name
             size = "heat_flux_wpm2" if name == "peak heating" else "dynamic_pressure_pa"
-            assert getattr(other, size) == pytest.approx(getattr(e, size), rel=1e-4), name
+            assert getattr(other, size) == pytest.approx(getattr(e, size), rel=2e-4), name
             continue
         assert other.time_s == pytest.approx(e.time_s, abs=2e-4 if name != "apogee" else 2e-2), name
         assert other.altitude_m == pytest.approx(e.altitude_m, abs=0.2), name

@@ -49,8 +49,9 @@ def test_ideal_accelerometer_is_the_second_derivative_of_its_place(truth):
     q_body_eci = rotations.conjugate(rotations.multiply(to_eci, path.q_ecef_body))[1:-1]
     felt = truth.specific_force_body(place)[1:-1]
     pulse = t[1:-1] > 425.0
-    # central differences over 8 ms: (2 pi 2.8 Hz)^2 h^2 / 6 of the 2.8 Hz part, and rounding of 1e6 m positions
-    np.testing.assert_allclose(felt[pulse], rotations.rotate(q_body_eci, acceleration)[pulse], atol=6e-3)
+    # central differences over 8 ms: (2 pi 2.8 Hz)^2 h^2 / 6 of the 2.8 Hz part, rounding of 1e6 m positions (6e-3 in
+    # all), and h / 4 of the jump in slope at a knot of the air: 2 % of 80 m/s^2 in 0.2 s, so 8e-3
+    np.testing.assert_allclose(felt[pulse], rotations.rotate(q_body_eci, acceleration)[pulse], atol=1.4e-2)
     assert np.abs(felt[pulse]).max() > 60.0
 
 
