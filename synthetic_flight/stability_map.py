@@ -1,0 +1,191 @@
+"""Where do stiffness and damping of the joint make a vehicle diverge, oscillate ever wider, or settle?
+
+Axdahl's map, drawn twice: from eigenvalues (`synthetic_flight.linear`) and from flights of the nonlinear simulator. The
+flights need speed and pressure that stay put although the vehicle decelerates. They get them by falling at terminal
+speed through air of one density: gravity then is to each body what deceleration is, ``g = q S C_A / m``, so the linear
+equations hold unchanged. On Earth that fixes ``q_E = m g / (S C_A)``; a flight at pressure ``q`` and speed ``V`` is
+similar to a fall at ``q_E`` and ``V sqrt(q_E / q)`` with stiffness scaled by ``q_E / q``, and its rates are ``sqrt(q /
+q_E)`` times those of the fall. Falls start above the pole, where the Earth's rotation does not blow from the side.
+
+References
+----------
+Axdahl, AIAA 2009-2963; summary in Bose et al., AIAA 2011-2571.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flightmodel import earth, rotations
+from flightmodel.aerodynamics import AeroTable
+from flightmodel.atmosphere import AtmosphereProfile, us76
+from flightmodel.checks import FloatArray
+from flightmodel.vehicle import MassProperties, Vehicle
+from synthetic_flight import packing
+from synthetic_flight.linear import DIVERGENT, STABLE, UNSTABLE, Slopes, critical_stiffness_nmprad, linear_matrix, modes
+from synthetic_flight.simulate import integrate
+
+FALL_S, FALL_STEP_S, RECORD_S = 120.0, 0.01, 0.1
+LARGE_RAD = 0.2
+START_M = 60.0e3
+
+
+@dataclass(frozen=True)
+class StabilityMap:
+    """Growth over a grid of joints at one pressure and speed.
+
+    Parameters
+    ----------
+    stiffness_nmprad : (k,) float
+    damping_ratio : (c,) float
+        Of critical (seed paper eq. [8]) at each stiffness.
+    growth_rate_radps : (k, c) float
+        Largest growth rate, 1/s.
+    zone : (k, c) int
+        `linear.STABLE`, `linear.UNSTABLE`, `linear.DIVERGENT`.
+    critical_stiffness_nmprad : float
+        Static limit of divergence.
+    """
+
+    stiffness_nmprad: FloatArray
+    damping_ratio: FloatArray
+    growth_rate_radps: FloatArray
+    zone: NDArray[np.int64]
+    critical_stiffness_nmprad: float
+    pressure_pa: float
+    speed_mps: float
+    slopes: Slopes
+
+
+def on_axis(vehicle: Vehicle, slopes: Slopes) -> Vehicle:
+    """Copy as the linear model takes it: c.g.s on the axis, round inertias, coefficients linear in the angle."""
+
+    def plain(body: MassProperties) -> MassProperties:
+        lateral = 0.5 * float(body.inertia[1, 1] + body.inertia[2, 2])
+        tensor = ((float(body.inertia[0, 0]), 0.0, 0.0), (0.0, lateral, 0.0), (0.0, 0.0, lateral))
+        return MassProperties(
+            mass_kg=body.mass_kg, cg_from_datum_body_m=(float(body.cg_m[0]), 0.0, 0.0), inertia_kgm2=tensor
+        )
+
+    alpha = np.linspace(0.0, np.pi, 3)
+    one = np.ones(3)
+    row = np.column_stack([slopes.ca * one, slopes.cn_alpha * alpha, slopes.cm_alpha * alpha, slopes.cmq * one])
+    return replace(
+        vehicle,
+        aeroshell=plain(vehicle.aeroshell),
+        centerbody=plain(vehicle.centerbody),
+        aero=AeroTable(np.array([0.0, 100.0]), alpha, np.stack([row, row])),
+    )
+
+
+def with_spring(vehicle: Vehicle, stiffness_nmprad: float, damping_ratio: float, twist_factor: float = 1.0) -> Vehicle:
+    """Copy with a linear bending spring, its damper a share of critical; torsion stiffness times ``twist_factor``."""
+    update = {
+        "bending_stiffness_nmprad": stiffness_nmprad,
+        "torsion_stiffness_nmprad": vehicle.joint.torsion_stiffness_nmprad * twist_factor,
+        "freeplay_deg": 0.0,
+        "hardening_nmprad3": 0.0,
+        "damping_hardening_nmsprad3": 0.0,
+    }
+    made = replace(vehicle, joint=vehicle.joint.model_copy(update=update))
+    damping = damping_ratio * made.critical_damping_nmsprad()
+    return replace(made, joint=made.joint.model_copy(update={"bending_damping_nmsprad": damping}))
+
+
+def linear_map(
+    vehicle: Vehicle,
+    slopes: Slopes,
+    pressure_pa: float,
+    speed_mps: float,
+    stiffness_nmprad: FloatArray,
+    damping_ratio: FloatArray,
+) -> StabilityMap:
+    """Map from the eigenvalues of the linear model."""
+    plain = on_axis(vehicle, slopes)
+
+    def at(stiffness: float, damping: float) -> tuple[float, int]:
+        found = modes(linear_matrix(with_spring(plain, stiffness, damping), slopes, pressure_pa, speed_mps))
+        return found.growth_rate_radps, found.zone
+
+    return _map(plain, slopes, pressure_pa, speed_mps, stiffness_nmprad, damping_ratio, at)
+
+
+def flown_map(
+    vehicle: Vehicle,
+    slopes: Slopes,
+    pressure_pa: float,
+    speed_mps: float,
+    stiffness_nmprad: FloatArray,
+    damping_ratio: FloatArray,
+) -> StabilityMap:
+    """Map from flights of the nonlinear simulator, released half a milliradian off their path."""
+    plain = on_axis(vehicle, slopes)
+    start = _release()
+    gravity = float(np.linalg.norm(earth.gravitation(start[:3] - np.array([0.0, 0.0, 0.5 * START_M]))))
+    fall_pa = plain.mass_kg * gravity / (plain.reference.area_m2 * slopes.ca)
+    factor = fall_pa / pressure_pa
+    fall_mps = speed_mps * float(np.sqrt(factor))
+    start[5] -= fall_mps
+    air = packing.atmosphere_table(_even_air(2.0 * fall_pa / fall_mps**2))
+
+    def at(stiffness: float, damping: float) -> tuple[float, int]:
+        fallen = with_spring(plain, stiffness * factor, damping, factor)
+        n = round(FALL_S / RECORD_S) + 1
+        states, _ = integrate(fallen, air, start, FALL_STEP_S, round(RECORD_S / FALL_STEP_S), n)
+        growth, zone = _growth(states)
+        return growth / float(np.sqrt(factor)), zone
+
+    return _map(plain, slopes, pressure_pa, speed_mps, stiffness_nmprad, damping_ratio, at)
+
+
+def _map(
+    vehicle: Vehicle,
+    slopes: Slopes,
+    pressure_pa: float,
+    speed_mps: float,
+    stiffness_nmprad: FloatArray,
+    damping_ratio: FloatArray,
+    at: Callable[[float, float], tuple[float, int]],
+) -> StabilityMap:
+    pairs = [[at(float(k), float(c)) for c in damping_ratio] for k in stiffness_nmprad]
+    growth = np.array([[pair[0] for pair in row] for row in pairs])
+    zone = np.array([[pair[1] for pair in row] for row in pairs], dtype=np.int64)
+    limit = critical_stiffness_nmprad(vehicle, slopes, pressure_pa)
+    return StabilityMap(stiffness_nmprad, damping_ratio, growth, zone, limit, pressure_pa, speed_mps, slopes)
+
+
+def _even_air(density_kgpm3: float) -> AtmosphereProfile:
+    """Still air of one density over the whole fall: what the standard atmosphere lacks of it, at the tables' knots."""
+    z = np.arange(-1000.0, START_M + 20.0e3, packing.ATMOSPHERE_STEP_M)
+    ratio = np.log(density_kgpm3 / us76(z)[0])
+    nothing, one = np.zeros(len(z)), np.ones(len(z))
+    return AtmosphereProfile(z, ratio, nothing, np.zeros((len(z), 3)), one, one)
+
+
+def _release() -> FloatArray:
+    """State above the pole, nose down and at rest, the shell tilted by half a milliradian against the body."""
+    down = rotations.q_from_dcm(np.array([[[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]]))[0]
+    tilted = rotations.boxplus(down, np.array([0.0, 5.0e-4, 0.0]))
+    # 1 m off the axis, where longitude is defined
+    where = earth.ecef_from_geodetic(0.5 * np.pi, 0.0, START_M) * np.array([0.0, 0.0, 1.0]) + np.array([1.0, 0.0, 0.0])
+    return np.concatenate([where, np.zeros(3), down, tilted, np.zeros(6)])
+
+
+def _growth(states: FloatArray) -> tuple[float, int]:
+    """Growth rate, 1/s, and zone of a fall: from the size of all angles in the last two quarters of its small ones."""
+    axes = [rotations.rotate(states[:, i : i + 4], np.tile([1.0, 0.0, 0.0], (len(states), 1))) for i in (6, 10)]
+    tilts = np.column_stack([axes[0][:, :2], axes[1][:, :2]])
+    size = np.sqrt(np.sum(tilts**2, axis=1))
+    large = np.flatnonzero(size > LARGE_RAD)
+    end = int(large[0]) if len(large) else len(size)
+    quarter = max(end // 4, 2)
+    late, before = size[end - quarter : end], size[end - 2 * quarter : end - quarter]
+    growth = 0.5 * float(np.log(np.mean(late**2) / np.mean(before**2))) / (quarter * RECORD_S)
+    if growth <= 0.0:
+        return growth, STABLE
+    bending = (axes[1] - axes[0])[end - quarter : end, 0]
+    return growth, UNSTABLE if bending.min() < 0.0 < bending.max() else DIVERGENT
