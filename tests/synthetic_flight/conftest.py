@@ -75,3 +75,36 @@ def free_state(vehicle, distance_m=1.0e10):
     # momentum and energy are about the motion inside: no common velocity
     state[3:6] = 0.0
     return state
+
+
+def bent_entry_state(bent_rad, rate_of_shell_radps, altitude_m=70e3, speed_mps=1526.0):
+    """Path angle -76 deg; off the velocity by 6 deg, rolling, bent (and twisted)."""
+    r = earth.ecef_from_geodetic(np.deg2rad(37.0), np.deg2rad(-74.3), altitude_m)
+    path, azimuth = np.deg2rad([-76.5, 130.0])
+    v = earth.ecef_from_ned(
+        speed_mps * np.array([np.cos(path) * np.cos(azimuth), np.cos(path) * np.sin(azimuth), -np.sin(path)]), r
+    )
+    x = v / np.linalg.norm(v)
+    y = np.cross(x, [0.0, 0.0, 1.0])
+    y /= np.linalg.norm(y)
+    q = rotations.q_from_dcm(np.column_stack([x, y, np.cross(x, y)])[None])[0]
+    q = rotations.boxplus(q, np.array([0.3, 0.09, -0.05]))
+    state = state_from_ecef(0.0, r, v, q, np.array([0.6, 0.05, -0.1]), rotations.exp(np.array(bent_rad)))
+    state[17:20] += np.array(rate_of_shell_radps)
+    return state
+
+
+def with_joint(vehicle, **update):
+    return replace(vehicle, joint=vehicle.joint.model_copy(update=update))
+
+
+@pytest.fixture
+def measured(record_property):
+    """Assert a margin and keep it: ``measured(what, value, limit, unit)`` (see docs/proofs.md; pytest --junitxml)."""
+
+    def within(what, value, limit, unit=""):
+        value = float(value)
+        record_property(what, f"{value:.3g} against {limit:g} {unit}".strip())
+        assert value <= limit, f"{what}: {value:.6g} {unit} against {limit:g} {unit}"
+
+    return within
