@@ -6,7 +6,7 @@ nose in the plane of the total angle of attack), not from the package.
 """
 
 from dataclasses import dataclass
-from math import atan2, cos, exp, hypot, sin, sqrt
+from math import atan2, cos, exp, hypot, log10, pi, sin, sqrt
 
 import numpy as np
 
@@ -81,19 +81,31 @@ class Aerodynamics:
         self.air, self.table = air, vehicle.aero.coefficients.tolist()
         self.mach, self.step = vehicle.aero.mach.tolist(), float(vehicle.aero.alpha_rad[1])
         self.area, self.length = vehicle.reference.area_m2, vehicle.reference.length_m
+        self.free = None if vehicle.aero.free_molecular is None else vehicle.aero.free_molecular.tolist()
 
-    def coefficients(self, mach, alpha):
-        """Bilinear; end values outside the Mach numbers."""
+    def thinness(self, rho):
+        """sin^2 bridge in log10 Kn from 1e-3 to 10; free path of spheres of 3.65 Angstrom (US76)."""
+        free_path = 28.9644e-3 / 6.022169e23 / (sqrt(2.0) * pi * 3.65e-10**2 * rho)
+        decade = log10(min(max(free_path / self.length, 1e-3), 10.0))
+        return sin(pi * (decade + 3.0) / 8.0) ** 2
+
+    def coefficients(self, mach, alpha, rho):
+        """Bilinear; end values outside the Mach numbers; towards free-molecular ones in thin air."""
         mach = min(max(mach, self.mach[0]), self.mach[-1])
         i = max(k for k in range(len(self.mach) - 1) if k == 0 or self.mach[k] <= mach)
         f = (mach - self.mach[i]) / (self.mach[i + 1] - self.mach[i])
         j = min(int(alpha / self.step), len(self.table[0]) - 2)
         h = alpha / self.step - j
         low, high = self.table[i], self.table[i + 1]
-        return [
+        dense = [
             (1 - f) * ((1 - h) * a + h * b) + f * ((1 - h) * c + h * d)
             for a, b, c, d in zip(low[j], low[j + 1], high[j], high[j + 1], strict=True)
         ]
+        if self.free is None:
+            return dense
+        thin = self.thinness(rho)
+        free = [(1 - h) * a + h * b for a, b in zip(self.free[j], self.free[j + 1], strict=True)]
+        return [(1 - thin) * a + thin * b for a, b in zip(dense, free, strict=True)]
 
     def wrench(self, r, v, m, w):
         """Force and moment about the nose, ECI; ``r``, ``v`` of the nose, ``m`` ECI from shell, ``w`` shell axes."""
@@ -111,7 +123,7 @@ class Aerodynamics:
         u, lv, lw = turned_back(m, *flow)
         lateral = hypot(lv, lw)
         speed = hypot(u, lateral)
-        ca, cn, cm, cmq = self.coefficients(speed / sound, atan2(lateral, u))
+        ca, cn, cm, cmq = self.coefficients(speed / sound, atan2(lateral, u), rho)
         qs = 0.5 * rho * speed * speed * self.area
         ny, nz = lv / lateral, lw / lateral
         pitching, damping = qs * self.length * cm, qs * self.length**2 * cmq / (2.0 * speed)
