@@ -1,4 +1,4 @@
-"""The page of scenario and vehicle files names every key that these files may hold."""
+"""The pages of scenario and vehicle files name every key that these files may hold."""
 
 from pathlib import Path
 
@@ -6,9 +6,20 @@ import pytest
 from pydantic import BaseModel
 
 from flightmodel import aeroinput, vehicle
-from synthetic_flight import day_air, scenarios
+from synthetic_flight import day_air, instrument_sections, scenarios
 
-PAGE = (Path(__file__).parents[1] / "docs" / "scenario-and-vehicle-files.md").read_text()
+DOCS = Path(__file__).parents[1] / "docs"
+INSTRUMENTS = [
+    instrument_sections.Accelerometer,
+    instrument_sections.Rates,
+    instrument_sections.Magnetometer,
+    instrument_sections.SunSensors,
+    instrument_sections.Radar,
+    instrument_sections.AirRefraction,
+    instrument_sections.Dropouts,
+    instrument_sections.Video,
+    instrument_sections.Attitude,
+]
 MODELS = [
     scenarios.TimeSpan,
     scenarios.Initial,
@@ -33,8 +44,16 @@ MODELS = [
 ]
 
 
+def missing_keys(page: str, model: type[BaseModel]) -> list[str]:
+    quoted = (DOCS / page).read_text().replace(".", "`").replace("[", "`").replace("]", "`")
+    return [key for key in model.model_fields if f"`{key}`" not in quoted]
+
+
 @pytest.mark.parametrize("model", MODELS, ids=lambda m: m.__name__)
 def test_every_key_is_on_the_page(model: type[BaseModel]):
-    quoted = PAGE.replace(".", "`").replace("[", "`").replace("]", "`")
-    missing = [key for key in model.model_fields if f"`{key}`" not in quoted]
-    assert not missing
+    assert not missing_keys("scenario-and-vehicle-files.md", model)
+
+
+@pytest.mark.parametrize("model", INSTRUMENTS, ids=lambda m: m.__name__)
+def test_every_key_of_an_instrument_is_on_its_page(model: type[BaseModel]):
+    assert not missing_keys("instruments.md", model)
