@@ -22,6 +22,7 @@ from flightmodel.vehicle import Vehicle
 from synthetic_flight import _kernels, packing
 from synthetic_flight._workspace_kernels import AUX, STATES
 from synthetic_flight.simulate import BENDING_LIMIT_RAD
+from synthetic_flight.step_size import check_step
 
 # two to four vectors of a register each; more lanes outgrow the first-level cache
 LANES = 16
@@ -102,6 +103,7 @@ def fly_ensemble(
     workers = available_cores() if workers is None else workers
     if workers < 1 or schedule.records < 1 or schedule.per_record < 1 or not schedule.step_s > 0.0:
         raise ConfigError(f"fly_ensemble: workers, steps and records must be positive; got {workers}, {schedule}")
+    check_step(vehicle, schedule.step_s)
     remaining = iter(runs)
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[tuple[list[int], Future[list[Flown]]]] = deque()

@@ -19,6 +19,7 @@ from flightmodel.vehicle import Vehicle
 from synthetic_flight import _kernels, dynamics, packing
 from synthetic_flight._workspace_kernels import AUX, STATES
 from synthetic_flight.events import splashdown_index
+from synthetic_flight.step_size import check_step
 
 BENDING_LIMIT_RAD = 0.5 * np.pi
 TUMBLE_RAD = 0.5 * np.pi
@@ -173,6 +174,8 @@ def fly(
     if per_record < 1 or abs(per_record * step_s - record_s) > 1e-9 or stop_s <= start_s:
         raise ConfigError(f"fly: record {record_s} s must be a whole multiple of step {step_s} s, and stop after start")
     check_finite("fly: state at the start", state)
+    if inflated_s is None or inflated_s < stop_s:
+        check_step(vehicle, step_s)
     records = round((stop_s - start_s) / record_s) + 1
     lock = 0 if inflated_s is None else max(0, int(np.ceil((inflated_s - start_s) / record_s - 1e-9)))
     states, aux = integrate(vehicle, packing.atmosphere_table(profile), state, step_s, per_record, records, lock)
