@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
-from scipy.interpolate import RegularGridInterpolator
 
 from flightmodel.checks import FloatArray, GateError, TableRangeError
 from flightmodel.rarefied import bridge
 
+MOST_FAULTS = 10
 COLUMNS = ("mach", "alpha_deg", "ca", "cn", "cm", "cmq")
 # above the cone's half-angle part of it lies in shadow; no entry vehicle of the class flies there, so look-ups stop
 INVERSE_LIMIT_RAD = np.deg2rad(60.0)
@@ -66,6 +65,8 @@ class AeroTable:
                 f"aerodynamic table: Mach {m.flat[bad]:.3f}, angle {np.rad2deg(a.flat[bad]):.2f} deg "
                 f"lies outside Mach >= 0, 0 to {np.rad2deg(self.alpha_rad[-1]):.0f} deg"
             )
+        from scipy.interpolate import RegularGridInterpolator  # half a second to import
+
         grid = RegularGridInterpolator((self.mach, self.alpha_rad), self.coefficients)
         points = np.stack([np.clip(m, self.mach[0], self.mach[-1]), a], axis=-1)
         continuum = grid(points).reshape(*m.shape, 4)
@@ -105,6 +106,13 @@ class AeroTable:
         return replace(self, coefficients=changed)
 
 
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
 def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     """Read a coefficient table: columns mach, alpha_deg, ca, cn, cm, cmq, one row a grid point, ``#`` comments.
 
@@ -116,23 +124,32 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
         With every fault: missing columns, numbers that are not finite, a grid with holes or uneven angles.
     """
     try:
-        frame = pd.read_csv(path, comment="#")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise GateError(f"{path}: no such aerodynamic table") from None
-    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as fault:
+    except (OSError, UnicodeDecodeError) as fault:
         raise GateError(f"{path}: cannot be read as a table: {fault}") from None
-    missing = [c for c in names if c not in frame.columns]
+    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
+    header = [cell.strip() for cell in lines[0][1].split("#")[0].split(",")] if lines else []
+    missing = [c for c in names if c not in header]
     if missing:
         raise GateError(f"{path}: columns {', '.join(missing)} are missing; wanted {', '.join(names)}")
-    values = frame[list(names)].apply(pd.to_numeric, errors="coerce").to_numpy(dtype=float)
-    faults = []
-    if not np.isfinite(values).all():
-        faults.append(f"{path}: data row {int(np.argmin(np.isfinite(values).all(axis=1))) + 1} holds no finite number")
-        raise GateError(faults)
+    rows, faults = [], []
+    for k, line in lines[1:]:
+        cells = line.split("#")[0].split(",")
+        row = [_number(cells[header.index(c)]) if len(cells) == len(header) else np.nan for c in names]
+        rows.append(row)
+        if not np.isfinite(row).all():
+            faults.append(f"{path}, line {k}: {len(header)} finite numbers are wanted; got '{line.strip()}'")
+    if faults:
+        raise GateError(faults[:MOST_FAULTS] + [f"{path}: {len(faults)} such lines"] * (len(faults) > MOST_FAULTS))
+    values = np.array(rows, dtype=float).reshape(-1, len(names))
     values = values[np.lexsort((values[:, 1], values[:, 0]))]
     mach, alpha_deg = np.unique(values[:, 0]), np.unique(values[:, 1])
-    if len(values) != len(mach) * len(alpha_deg):
-        faults.append(f"{path}: {len(values)} rows where {len(mach)} Mach x {len(alpha_deg)} angles are wanted")
+    if len(values) != len(mach) * len(alpha_deg) or len(np.unique(values[:, :2], axis=0)) != len(values):
+        faults.append(
+            f"{path}: {len(values)} rows where {len(mach)} Mach x {len(alpha_deg)} angles, each once, are wanted"
+        )
     if len(alpha_deg) < 2 or len(mach) < 2 or np.ptp(np.diff(alpha_deg)) > 1e-9 or alpha_deg[0] != 0.0:
         faults.append(f"{path}: angles must be evenly spaced from 0, and at least two, as Mach numbers")
     elif abs(alpha_deg[-1] - 180.0) > 1e-9:

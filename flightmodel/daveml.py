@@ -20,7 +20,6 @@ from typing import Any
 from xml.parsers import expat
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import FloatArray, GateError
@@ -188,6 +187,8 @@ def _on_one_grid(path: Path, found: list[tuple[list[str], list[FloatArray], Floa
     mach = mach if len(mach) > 1 else np.array([mach[0], mach[0] + 1.0])
     at = {"mach": mach[:, None], "alpha": even[None, :]}
     c = np.zeros((len(mach), len(even), 4))
+    from scipy.interpolate import RegularGridInterpolator  # half a second to import
+
     for k, part in enumerate(found):
         if part is not None:
             axes, grids, values = part

@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from flightmodel import earth, moments
 from flightmodel.atmosphere import G0_MPS2
 from flightmodel.checks import FloatArray
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from synthetic_flight.simulate import Truth
 
 SUTTON_GRAVES = 1.7415e-4
@@ -143,4 +144,6 @@ def event_table(events: list[Event]) -> pd.DataFrame:
         }
         for e in events
     ]
+    import pandas as pd
+
     return pd.DataFrame(rows)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import signal
 
 from flightmodel import rotations
 from flightmodel.checks import BoolArray, FloatArray
@@ -91,6 +90,8 @@ def low_pass(values: FloatArray, step_s: float, bandwidth_hz: float, order: int)
 
 def filtered(values: FloatArray, step_s: float, numerator: list[float], denominator: list[float]) -> FloatArray:
     """Rows ``(n, m)`` behind a transfer function of unit gain in s, at rest at the first row; first-order hold."""
+    from scipy import signal  # half a second to import
+
     top, bottom, _ = signal.cont2discrete((numerator, denominator), step_s, method="foh")
     top = np.asarray(top).ravel()
     start = signal.lfilter_zi(top, bottom)

@@ -95,7 +95,7 @@ def test_outside_the_table_is_refused(table):
     ("text", "words"),
     [
         ("mach,alpha_deg,ca,cn,cm\n1,0,1,0,0\n", "cmq"),
-        ("mach,alpha_deg,ca,cn,cm,cmq\n1,0,1,0,0,0\n1,5,1,x,0,0\n2,0,1,0,0,0\n2,5,1,0,0,0\n", "row 2"),
+        ("mach,alpha_deg,ca,cn,cm,cmq\n1,0,1,0,0,0\n1,5,1,x,0,0\n2,0,1,0,0,0\n2,5,1,0,0,0\n", "line 3"),
         ("mach,alpha_deg,ca,cn,cm,cmq\n1,0,1,0,0,0\n1,5,1,0,0,0\n2,0,1,0,0,0\n", "3 rows"),
         ("mach,alpha_deg,ca,cn,cm,cmq\n" + "".join(f"{m},{a},1,0,0,0\n" for m in (1, 2) for a in (0, 5, 7)), "evenly"),
     ],
