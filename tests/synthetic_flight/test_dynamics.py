@@ -87,20 +87,20 @@ def test_joint_point_of_both_bodies_has_one_acceleration(generic_vehicle):
     np.testing.assert_allclose(where["body"][1][-1] - where["body"][1][0], impulse, atol=2e-6)
 
 
-@pytest.mark.parametrize(("freeplay_deg", "tolerance"), [(0.0, 1e-9), (0.4, 5e-8)])
+@pytest.mark.parametrize(("freeplay_deg", "tolerance"), [(0.0, 1e-10), (0.4, 1e-9)])
 def test_energy_and_momentum_of_the_free_undamped_system(generic_vehicle, freeplay_deg, tolerance):
     # the freeplay's corner is smooth in slope, not in curvature, which costs the fourth-order steps their order there
     # 1e10 m away gravity's gradient is 1e-15 /s^2: motion about the c.g. is free
     vehicle = undamped(generic_vehicle)
     vehicle = replace(vehicle, joint=vehicle.joint.model_copy(update={"freeplay_deg": freeplay_deg}))
-    states, aux = integrate(vehicle, packing.vacuum_table(), free_state(vehicle), 1e-4, 5000, 201)
+    states, aux = integrate(vehicle, packing.vacuum_table(), free_state(vehicle), 5e-5, 10000, 201)
     energy = dynamics.internal_energy(states, vehicle)
     inside = energy[0]
     assert 5.0 < inside < 1000.0  # joules of rotation and springs, not of orbit
     assert aux[:, 5].max() > 1.05 * aux[:, 5].min()  # the joint works
     np.testing.assert_allclose(energy, inside, rtol=tolerance)
     spin = dynamics.angular_momentum(states, vehicle)
-    np.testing.assert_allclose(spin, np.broadcast_to(spin[0], spin.shape), atol=1e-11 * np.linalg.norm(spin[0]))
+    np.testing.assert_allclose(spin, np.broadcast_to(spin[0], spin.shape), atol=1e-12 * np.linalg.norm(spin[0]))
 
 
 def test_energy_near_the_earth_with_gravity_alive(generic_vehicle):
