@@ -36,6 +36,12 @@ def turn_ecef(q, angle):
 
 
 @inlined
+def level(q):
+    """Set the quaternion ``q`` (4,) to no rotation (element by element: array expressions take seconds to compile)."""
+    q[0], q[1], q[2], q[3] = 1.0, 0.0, 0.0, 0.0
+
+
+@inlined
 def cross_into(a, b, out):
     """Cross product of (3,) vectors into ``out``."""
     x = a[1] * b[2] - a[2] * b[1]
@@ -57,17 +63,15 @@ def matmul_into(a, b, out):
 def mount_matrices(dcm_body_sensor, mount, body_actual, body_mount):
     """Matrix from actual sensor axes to body, and from a change of the mount vector to body (left Jacobian)."""
     turn = np.empty((3, 3))
-    q = np.array([1.0, 0.0, 0.0, 0.0])
+    q = np.empty(4)
+    level(q)
     boxplus(q, mount[0], mount[1], mount[2])
     dcm_from_quaternion(q[0], q[1], q[2], q[3], turn)
     matmul_into(dcm_body_sensor, turn, body_actual)
-    half = np.array(
-        [
-            [1.0, -0.5 * mount[2], 0.5 * mount[1]],
-            [0.5 * mount[2], 1.0, -0.5 * mount[0]],
-            [-0.5 * mount[1], 0.5 * mount[0], 1.0],
-        ]
-    )
+    half = np.empty((3, 3))
+    half[0, 0], half[0, 1], half[0, 2] = 1.0, -0.5 * mount[2], 0.5 * mount[1]
+    half[1, 0], half[1, 1], half[1, 2] = 0.5 * mount[2], 1.0, -0.5 * mount[0]
+    half[2, 0], half[2, 1], half[2, 2] = -0.5 * mount[1], 0.5 * mount[0], 1.0
     matmul_into(dcm_body_sensor, half, body_mount)
 
 
@@ -168,7 +172,8 @@ def advance_noise(noise, dt, half_turn, dcm_mid, force, force_density, rate_dens
 @inlined
 def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient):
     """Carry the state over one step in place; leaves mid-step attitude, half turn and gravity gradient behind."""
-    one = np.array([1.0, 0.0, 0.0, 0.0])
+    one = np.empty(4)
+    level(one)
     h = 0.5 * dt
     boxplus(one, h * rate[0], h * rate[1], h * rate[2])
     dcm_from_quaternion(one[0], one[1], one[2], one[3], half_turn)
@@ -222,10 +227,11 @@ def propagate(
 
     ``phi`` (9, 27) and ``noise`` (9, 9) are overwritten. Densities hold from a grid point to the next later one.
     """
-    phi[:] = 0.0
-    noise[:] = 0.0
     for i in range(9):
-        phi[i, i] = 1.0
+        for j in range(27):
+            phi[i, j] = 1.0 if i == j else 0.0
+        for j in range(9):
+            noise[i, j] = 0.0
     force_actual, force_mount = np.empty((3, 3)), np.empty((3, 3))
     rate_actual, rate_mount = np.empty((3, 3)), np.empty((3, 3))
     mount_matrices(dcm_force, errors[6:9], force_actual, force_mount)
@@ -267,9 +273,10 @@ def propagate_chain(
     for k in range(len(node_index) - 1):
         if known[k + 1]:
             continue
-        position[k + 1] = position[k]
-        velocity[k + 1] = velocity[k]
-        q[k + 1] = q[k]
+        for i in range(3):
+            position[k + 1, i], velocity[k + 1, i] = position[k, i], velocity[k, i]
+        for i in range(4):
+            q[k + 1, i] = q[k, i]
         propagate(
             time, force_sensor, rate_sensor, force_density, rate_density, node_index[k], node_index[k + 1],
             dcm_force, dcm_rate, errors[k], position[k + 1], velocity[k + 1], q[k + 1], phi, noise,
@@ -308,7 +315,9 @@ def radar_prediction(dcm_ned_ecef, site, arm, position, velocity, q, bias, rate,
     m[0, 0], m[0, 1], m[0, 2] = n / slant, e / slant, d / slant
     m[1, 0], m[1, 1], m[1, 2] = -e / level2, n / level2, 0.0
     m[2, 0], m[2, 1], m[2, 2] = d * n / (slant2 * level), d * e / (slant2 * level), -level / slant2
-    jacobian[:] = 0.0
+    for i in range(3):
+        for j in range(13):
+            jacobian[i, j] = 0.0
     row, lever = np.empty(3), np.empty(3)
     for i in range(3):
         jacobian[i, 9 + i] = 1.0
