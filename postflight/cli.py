@@ -121,6 +121,14 @@ def score(folder: Path, as_json: bool) -> None:
     commands.score(folder, as_json)
 
 
+@cli.command()
+def warmup() -> None:
+    """Compile the kernels for this machine now, so that no later command waits for it."""
+    from postflight import commands
+
+    commands.warm_up()
+
+
 def main() -> None:
     """Run the command; known faults become messages and exit codes, never a traceback."""
     try:

@@ -57,6 +57,14 @@ def compile_kernels(*groups: str) -> None:
     warmup.prepare(groups, lambda words: console_err.print(escape(words)))
 
 
+def warm_up() -> None:
+    """Compile every group of kernels that is missing, and say where they lie."""
+    compile_kernels(*warmup.GROUPS)
+    if warmup.CACHE is None:
+        raise GateError("no folder to keep compiled kernels in can be written: set XDG_CACHE_HOME or NUMBA_CACHE_DIR")
+    console.print(f"kernels are compiled: {escape(str(warmup.CACHE))}")
+
+
 def scenario_and_folder(arguments: tuple[str, ...]) -> tuple[str, Path]:
     """Tell scenario and folder apart where only one is given: a .toml file or a shipped name is a scenario."""
     if len(arguments) == 2:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 HEAVY = {"numpy", "scipy", "numba", "matplotlib", "cv2", "trimesh", "filterpy", "pandas", "ppigrf", "erfa"}
-COMMANDS = ("demo", "simulate", "reconstruct", "deflection", "run", "score")
+COMMANDS = ("demo", "simulate", "reconstruct", "deflection", "run", "score", "warmup")
 
 
 def tree(root: Path) -> dict[str, bytes]:

@@ -1,0 +1,59 @@
+"""What is compiled before first use is what the commands then use: nothing is compiled a second time."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+COUNT = """
+import sys
+import numba.core.event as event
+from pathlib import Path
+
+compiled = []
+
+class Listener(event.Listener):
+    def on_start(self, happened):
+        compiled.append(happened.data["dispatcher"].py_func.__name__)
+
+    def on_end(self, happened):
+        pass
+
+event.register("numba:compile", Listener())
+from dataclasses import replace
+from postflight.pipeline import reconstruct_flight
+from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.scenarios import read_scenario
+
+scenario = read_scenario("irve2_reference")
+scenario = replace(scenario, spec=scenario.spec.model_copy(update={"video": None}))
+simulate_to_folder(scenario, 0, Path(sys.argv[1]))
+reconstruct_flight(Path(sys.argv[1]))
+print(compiled)
+"""
+
+
+@pytest.mark.slow
+def test_after_warmup_a_flight_and_its_reconstruction_compile_nothing(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    run = [sys.executable, "-m", "postflight.cli", "warmup"]
+    first = subprocess.run(run, env=environment, capture_output=True, text=True)
+    assert first.returncode == 0, first.stderr
+    assert "compiling kernels for this machine, once" in first.stderr
+    again = subprocess.run(run, env=environment, capture_output=True, text=True)
+    assert "compiling" not in again.stderr
+    flown = subprocess.run(
+        [sys.executable, "-c", COUNT, str(tmp_path / "flight")], env=environment, capture_output=True, text=True
+    )
+    assert flown.stdout.strip() == "[]", flown.stderr
+
+
+def test_without_a_folder_to_keep_kernels_in_warmup_says_so(tmp_path):
+    (tmp_path / "file").touch()
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "file"), "MPLCONFIGDIR": str(tmp_path)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    run = [sys.executable, "-m", "postflight.cli", "warmup"]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True)
+    assert done.returncode == 3
+    assert "set XDG_CACHE_HOME or NUMBA_CACHE_DIR" in done.stderr
