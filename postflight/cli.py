@@ -1,9 +1,10 @@
 """The ``postflight`` command. Exit codes: 0 fine, 2 usage or configuration, 3 data refused, 4 an estimator gave no
-answer, 5 a synthetic-truth check failed, 130 interrupted.
+answer, 5 a synthetic-truth check failed, 130 interrupted, 143 terminated.
 """
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import click
 
 # heavy imports stand inside the commands, so that --help answers at once
 FOLDER = click.Path(path_type=Path)
-EXIT_INTERRUPTED = 130
+EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
 
 
 class FiniteRange(click.FloatRange):
@@ -129,8 +130,14 @@ def warmup() -> None:
     commands.warm_up()
 
 
+def terminate(_number: int, _frame: object) -> None:
+    """Leave as after Ctrl-C, so that what is half-written is removed; exit code as the shell gives it."""
+    sys.exit(EXIT_TERMINATED)
+
+
 def main() -> None:
     """Run the command; known faults become messages and exit codes, never a traceback."""
+    signal.signal(signal.SIGTERM, terminate)
     try:
         cli.main(standalone_mode=False)
     except click.exceptions.Exit as stop:

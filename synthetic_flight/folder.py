@@ -6,8 +6,8 @@ The folder is made beside its destination and renamed when whole, so a killed ru
 from __future__ import annotations
 
 import json
+import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from synthetic_flight.simulate import Truth
 
 Progress = Callable[[float, str], None]
 TRUTH_RATE_HZ = 50.0
+SHORTEST_TELEMETRY_S = 1.0
 
 
 def simulate_to_folder(
@@ -49,23 +50,62 @@ def simulate_to_folder(
         Where the destination exists, or the flight diverged before the telemetry begins.
     """
     report = progress or (lambda _fraction, _what: None)
+    if destination.is_symlink():
+        destination = destination.resolve()
+    _remove_leftovers(destination)
     check_destination(destination, replace)
     report(0.0, "flying")
     truth = fly_scenario(scenario, seed)
-    if truth.time_s[-1] < scenario.spec.time.telemetry_from_s + 1.0:
-        raise GateError(f"scenario '{scenario.spec.name}': {truth.words or 'the flight ended'} before telemetry begins")
+    _check_telemetry(scenario, truth)
     destination.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{destination.name}-partial-", dir=destination.parent))
+    partial = _beside(destination, "partial")
+    partial.mkdir(mode=0o755)
     try:
         _write(scenario, seed, truth, partial, report)
-        if destination.exists():
-            shutil.rmtree(destination)
-        partial.chmod(0o755)
-        partial.rename(destination)
+        _put_in_place(partial, destination)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     report(1.0, "done")
     return truth
+
+
+def _check_telemetry(scenario: Scenario, truth: Truth) -> None:
+    ended, begins = truth.time_s[-1], scenario.spec.time.telemetry_from_s
+    if ended < begins + SHORTEST_TELEMETRY_S:
+        why = truth.words or ("it came down" if truth.altitude_m[-1] <= 0.0 else "stop_s is too early")
+        raise GateError(
+            f"scenario '{scenario.spec.name}': the flight ends at {ended:.2f} s ({why}); time.telemetry_from_s = "
+            f"{begins:g} leaves less than {SHORTEST_TELEMETRY_S:g} s to deliver"
+        )
+
+
+def _beside(destination: Path, what: str) -> Path:
+    return destination.with_name(f".{destination.name}-{what}-{os.getpid()}")
+
+
+def _put_in_place(partial: Path, destination: Path) -> None:
+    """Rename; what was there before is moved aside first and removed last, so that one of the two always exists."""
+    if not destination.exists():
+        partial.rename(destination)
+        return
+    old = _beside(destination, "old")
+    destination.rename(old)
+    partial.rename(destination)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _remove_leftovers(destination: Path) -> None:
+    """Remove what killed processes left beside the destination; an old flight without a successor is put back."""
+    if not Path("/proc/self").exists():  # no telling which process still lives
+        return
+    for left in destination.parent.glob(f".{destination.name}-*-*"):
+        what, _, number = left.name.removeprefix(f".{destination.name}-").partition("-")
+        if what not in ("partial", "old") or not number.isdigit() or Path(f"/proc/{number}").exists():
+            continue
+        if what == "old" and not destination.exists():
+            left.rename(destination)
+        else:
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def check_destination(destination: Path, replace: bool) -> None:

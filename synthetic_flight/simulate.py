@@ -121,6 +121,11 @@ def integrate(
     planet: earth.Planet = earth.WGS84,
 ) -> tuple[FloatArray, FloatArray]:
     """States ``(n, 20)`` and auxiliaries ``(n, 18)`` of a flight; fewer than ``records`` where the joint diverged."""
+    if state.shape != (STATES,) or records < 1 or per_record < 1 or not step_s > 0.0:
+        raise ConfigError(
+            f"integrate: a state (20,), step_s > 0, per_record and records >= 1 are wanted; got state {state.shape}, "
+            f"step_s {step_s:g}, per_record {per_record}, records {records}"
+        )
     lanes = (0,)
     workspace = packing.workspace(state[None], packing.parameter_vector(vehicle)[None])
     out, aux = np.empty((1, records, STATES)), np.empty((1, records, AUX))
@@ -161,7 +166,8 @@ def fly(
     state : (20,) float
         In ECI, which equals ECEF at time zero (`state_from_ecef`).
     step_s, record_s : float
-        Integration step, and a whole multiple of it between records.
+        Integration step, and a whole multiple of it between records; the last record is the last at or before
+        ``stop_s``.
     inflated_s : float or None
         The joint is locked before this time.
 
@@ -170,13 +176,19 @@ def fly(
     ConfigError
         Where times do not fit each other.
     """
+    check_finite("fly: times", np.array([start_s, stop_s, step_s, record_s]))
+    if not (0.0 < step_s <= record_s <= stop_s - start_s):
+        raise ConfigError(
+            f"fly: 0 < step <= record <= stop - start is wanted; got step {step_s:g} s, record {record_s:g} s, "
+            f"start {start_s:g} s, stop {stop_s:g} s"
+        )
     per_record = round(record_s / step_s)
-    if per_record < 1 or abs(per_record * step_s - record_s) > 1e-9 or stop_s <= start_s:
-        raise ConfigError(f"fly: record {record_s} s must be a whole multiple of step {step_s} s, and stop after start")
+    if abs(per_record * step_s - record_s) > 1e-9:
+        raise ConfigError(f"fly: record {record_s:g} s must be a whole multiple of step {step_s:g} s")
     check_finite("fly: state at the start", state)
     if inflated_s is None or inflated_s < stop_s:
         check_step(vehicle, step_s)
-    records = round((stop_s - start_s) / record_s) + 1
+    records = int(np.floor((stop_s - start_s) / record_s + 1e-6)) + 1
     lock = 0 if inflated_s is None else max(0, int(np.ceil((inflated_s - start_s) / record_s - 1e-9)))
     states, aux = integrate(vehicle, packing.atmosphere_table(profile), state, step_s, per_record, records, lock)
     diverged = len(states) < records

@@ -279,14 +279,15 @@ def test_terminated_run_leaves_no_run_that_looks_whole(flight, postflight) -> No
 
 
 @pytest.mark.slow
-def test_interrupt_during_simulate_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupt_during_simulate_leaves_nothing(tmp_path: Path, sent: signal.Signals, code: int) -> None:
     process = start("simulate", "irve2_reference", tmp_path / "out")
     written = wait_for_new(tmp_path, set(), process)
     time.sleep(0.5)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(sent)
     _, errors = process.communicate(timeout=60)
     assert written
-    assert process.returncode == 130, errors
+    assert process.returncode == code, errors
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
 

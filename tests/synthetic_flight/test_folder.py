@@ -1,0 +1,62 @@
+"""The folder of a synthetic flight takes its place whole; what killed processes left goes with the next flight."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from flightmodel.checks import GateError
+from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.scenarios import read_scenario
+
+
+@pytest.fixture(scope="module")
+def short():
+    """Nine seconds around 100 km, no video."""
+    scenario = read_scenario("irve2_reference")
+    time = scenario.spec.time.model_copy(update={"stop_s": 99.0, "telemetry_from_s": 91.0})
+    prior = scenario.spec.attitude_prior.model_copy(update={"t_s": 92.0})
+    update = {"video": None, "time": time, "attitude_prior": prior}
+    return replace(scenario, spec=scenario.spec.model_copy(update=update))
+
+
+def dead_process_number():
+    done = subprocess.Popen([sys.executable, "-c", ""])
+    done.wait()
+    return done.pid
+
+
+def test_leftovers_of_dead_processes_are_removed_and_of_living_ones_left(tmp_path, short):
+    dead = dead_process_number()
+    for name in (f".a-partial-{dead}", ".a-partial-1", ".ab-partial-1", ".a-partial-notes"):
+        (tmp_path / name).mkdir()
+    simulate_to_folder(short, 0, tmp_path / "a")
+    assert {p.name for p in tmp_path.iterdir()} == {"a", ".a-partial-1", ".ab-partial-1", ".a-partial-notes"}
+
+
+def test_an_old_flight_whose_successor_was_never_put_in_place_comes_back(tmp_path, short):
+    simulate_to_folder(short, 0, tmp_path / "a")
+    (tmp_path / "a").rename(tmp_path / f".a-old-{dead_process_number()}")
+    with pytest.raises(GateError, match="exists already"):
+        simulate_to_folder(short, 1, tmp_path / "a")
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_link_is_followed_and_stays_a_link(tmp_path, short):
+    simulate_to_folder(short, 0, tmp_path / "real")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    with pytest.raises(GateError, match="exists already"):
+        simulate_to_folder(short, 1, tmp_path / "link")
+    before = (tmp_path / "real" / "flight.toml").stat().st_ino
+    simulate_to_folder(short, 1, tmp_path / "link", replace=True)
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "flight.toml").stat().st_ino != before
+
+
+def test_a_flight_too_short_for_its_telemetry_says_so(tmp_path, short):
+    time = short.spec.time.model_copy(update={"telemetry_from_s": 98.5})
+    late = replace(short, spec=short.spec.model_copy(update={"time": time}))
+    with pytest.raises(GateError, match=r"ends at 99\.00 s .*; time\.telemetry_from_s = 98\.5 leaves"):
+        simulate_to_folder(late, 0, tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []
