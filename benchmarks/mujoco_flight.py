@@ -39,7 +39,7 @@ def isotropic(vehicle):
 
 
 class MujocoFlight:
-    """A flight from a state of ours; ``wrench``: none, or ``"compiled"`` or ``"numpy"``, held or ``", four stages"``."""
+    """A flight from a state of ours; ``wrench``: None, or ``"compiled"`` or ``"numpy"``, and ``", four stages"``."""
 
     def __init__(self, problem, rate_hz, wrench, integrator="RK4"):
         import mujoco
