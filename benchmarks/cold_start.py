@@ -56,9 +56,7 @@ def everything(folder):
     short = Schedule(step_s=0.005, per_record=1, records=2)
     stages = {
         "one flight": lambda: fly_scenario(scenario, 0),
-        "sixteen lanes": lambda: list(
-            fly_ensemble(scenario.vehicle, lambda _: start, range(16), Schedule(0.005, 1, 2))
-        ),
+        "sixteen lanes": lambda: list(fly_ensemble(scenario.vehicle, lambda _: start, range(16), short)),
         "reconstruction": lambda: reconstruct(read_flight(Path(folder))),
     }
     took, compiled = {}, []
