@@ -18,8 +18,9 @@ from problem import reference_problem
 
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import packing
+from synthetic_flight.day_air import day_atmosphere
 from synthetic_flight.ensemble import LANES, Schedule, Start, available_cores, fly_ensemble
-from synthetic_flight.scenarios import child_rng, day_atmosphere, read_scenario
+from synthetic_flight.scenarios import child_rng, read_scenario
 from synthetic_flight.simulate import integrate
 
 SECONDS, RECORD_HZ = 300.0, 10.0

@@ -8,7 +8,8 @@ import numpy as np
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import packing
-from synthetic_flight.scenarios import child_rng, day_atmosphere, initial_state, read_scenario
+from synthetic_flight.day_air import day_atmosphere
+from synthetic_flight.scenarios import child_rng, initial_state, read_scenario
 from synthetic_flight.simulate import integrate
 
 START_S, PULSE_S = 400.0, 60.0  # 100 km, and through the largest dynamic pressure (about 435 s)

@@ -26,18 +26,19 @@ class Constants:
     grid: FloatArray
     mach: FloatArray
     coefficients: FloatArray
+    free: FloatArray
 
 
 def constants(vehicle: Vehicle, atmosphere: FloatArray) -> Constants:
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint_m
     head = [shell.mass_kg, body.mass_kg, vehicle.reference.area_m2, vehicle.reference.length_m]
-    air, grid, mach, coefficients, _ = packing.kernel_tables(vehicle, atmosphere)
+    air, grid, mach, coefficients, free = packing.kernel_tables(vehicle, atmosphere)
     numbers = np.concatenate([head, shell.cg_m, joint, body.cg_m - joint])
-    return Constants(numbers, air[0], grid, mach, coefficients)
+    return Constants(numbers, air[0], grid, mach, coefficients, free)
 
 
 @numba.njit(error_model="numpy", fastmath=la.FASTMATH)
-def _compiled(qpos, qvel, out, planet, n, air, grid, mach, table):
+def _compiled(qpos, qvel, out, planet, n, air, grid, mach, table, free):
     r = la.rotation(qpos[3], qpos[4], qpos[5], qpos[6])
     sin_lat, cos_lat, altitude, per_axis = la.geodetic(qpos[0], qpos[1], qpos[2], planet)
     u = max((altitude - grid[0]) * grid[1], 0.0)
@@ -45,6 +46,7 @@ def _compiled(qpos, qvel, out, planet, n, air, grid, mach, table):
     f = min(u - k, 1.0)
     density = air[k, 0] * math.exp(f * air[k, 1])
     sound = air[k, 2] + f * (air[k + 1, 2] - air[k, 2])
+    thin = air[k, 5] + f * (air[k + 1, 5] - air[k, 5])
     north, east = air[k, 3] + f * (air[k + 1, 3] - air[k, 3]), air[k, 4] + f * (air[k + 1, 4] - air[k, 4])
     sl, cl = qpos[1] * per_axis, qpos[0] * per_axis
     u, v, w = la.back(
@@ -66,6 +68,11 @@ def _compiled(qpos, qvel, out, planet, n, air, grid, mach, table):
     cn = b00 * table[m, j, 1] + b01 * table[m, j + 1, 1] + b10 * table[m + 1, j, 1] + b11 * table[m + 1, j + 1, 1]
     cm = b00 * table[m, j, 2] + b01 * table[m, j + 1, 2] + b10 * table[m + 1, j, 2] + b11 * table[m + 1, j + 1, 2]
     cq = b00 * table[m, j, 3] + b01 * table[m, j + 1, 3] + b10 * table[m + 1, j, 3] + b11 * table[m + 1, j + 1, 3]
+    if thin > 0.0:
+        ca += thin * ((1.0 - h) * free[j, 0] + h * free[j + 1, 0] - ca)
+        cn += thin * ((1.0 - h) * free[j, 1] + h * free[j + 1, 1] - cn)
+        cm += thin * ((1.0 - h) * free[j, 2] + h * free[j + 1, 2] - cm)
+        cq += thin * ((1.0 - h) * free[j, 3] + h * free[j + 1, 3] - cq)
     ny, nz = v / (lateral + 1e-12), w / (lateral + 1e-12)
     qs = 0.5 * density * speed * speed * n[2]
     damping = 0.25 * density * speed * n[2] * n[3] * n[3] * cq
@@ -88,11 +95,11 @@ def _compiled(qpos, qvel, out, planet, n, air, grid, mach, table):
 def compiled_wrench(c: Constants):
     """Return ``wrench(qpos, qvel, xfrc_applied)``."""
 
-    numbers, air, grid, mach, table = c.numbers, c.air, c.grid, c.mach, c.coefficients
+    numbers, air, grid, mach, table, free = c.numbers, c.air, c.grid, c.mach, c.coefficients, c.free
     planet = tuple(earth.WGS84)  # numba takes a plain tuple several times faster than a named one
 
     def wrench(qpos, qvel, out):
-        _compiled(qpos, qvel, out, planet, numbers, air, grid, mach, table)
+        _compiled(qpos, qvel, out, planet, numbers, air, grid, mach, table, free)
 
     return wrench
 
@@ -104,7 +111,7 @@ def numpy_wrench(c: Constants):
     mass_a, mass_b, area, length = (float(x) for x in c.numbers[:4])
     cg_a, joint, cg_b = c.numbers[4:7], c.numbers[7:10], c.numbers[10:13]
     start, per_step, per_alpha = (float(x) for x in c.grid)
-    knots, table, air = c.mach, c.coefficients, c.air
+    knots, table, air, free = c.mach, c.coefficients, c.air, c.free
 
     def matrix(q):
         w, x, y, z = q.tolist()
@@ -136,7 +143,7 @@ def numpy_wrench(c: Constants):
         u = max((altitude - start) * per_step, 0.0)
         k = min(int(u), len(air) - 2)
         f = min(u - k, 1.0)
-        _, _, sound, north, east, _ = (air[k] + f * (air[k + 1] - air[k])).tolist()
+        _, _, sound, north, east, thin = (air[k] + f * (air[k + 1] - air[k])).tolist()
         density = float(air[k, 0]) * math.exp(f * float(air[k, 1]))
         sl, cl = y / axis, x / axis
         stream = np.array(
@@ -152,7 +159,10 @@ def numpy_wrench(c: Constants):
         h = angle - j
         low = table[m, j] + h * (table[m, j + 1] - table[m, j])
         high = table[m + 1, j] + h * (table[m + 1, j + 1] - table[m + 1, j])
-        ca, cn, cm, cmq = (low + f * (high - low)).tolist()
+        c = low + f * (high - low)
+        if thin > 0.0:
+            c += thin * (free[j] + h * (free[j + 1] - free[j]) - c)
+        ca, cn, cm, cmq = c.tolist()
         ny, nz = v / (lateral + 1e-12), w / (lateral + 1e-12)
         qs, damping = 0.5 * density * speed * speed * area, 0.25 * density * speed * area * length * length * cmq
         fx, fy, fz = -qs * ca, -qs * cn * ny, -qs * cn * nz
