@@ -25,7 +25,7 @@ from synthetic_flight.simulate import integrate
 
 SECONDS, RECORD_HZ = 300.0, 10.0
 RATES_HZ = (200.0, 150.0)
-FLIGHTS = 2 * LANES  # a block a worker
+FLIGHTS = 4 * LANES  # two blocks a worker
 
 
 def schedule(rate_hz):

@@ -182,10 +182,12 @@ class AtmosphereProfile:
         check_finite("atmosphere wind", self.wind_ned_mps)
         check_finite("atmosphere density", self.log_density_ratio)
 
-    def at(self, altitude_m: FloatArray | float) -> AirState:
-        """Air at geometric altitudes, m."""
+    def at(
+        self, altitude_m: FloatArray | float, standard: tuple[FloatArray, FloatArray, FloatArray] | None = None
+    ) -> AirState:
+        """Air at geometric altitudes, m; ``standard`` is `us76` there, where it is known already."""
         z = np.asarray(altitude_m, dtype=float)
-        density, temperature, pressure = us76(z)
+        density, temperature, pressure = us76(z) if standard is None else standard
         beyond = np.maximum(z - self.altitude_m[-1], 0.0) + np.maximum(self.altitude_m[0] - z, 0.0)
         fade = np.exp(-beyond / self.fade_m)
 

@@ -21,6 +21,7 @@ from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 
 
 def _simulator() -> None:
+    from synthetic_flight._air_kernels import gauss_markov
     from synthetic_flight.packing import vacuum_table
     from synthetic_flight.simulate import integrate, state_from_ecef
 
@@ -28,6 +29,7 @@ def _simulator() -> None:
     level = np.array([1.0, 0.0, 0.0, 0.0])
     state = state_from_ecef(0.0, np.array([7e6, 0.0, 0.0]), np.zeros(3), level, np.zeros(3))
     integrate(vehicle, vacuum_table(), state, 0.001, 1, 2)
+    gauss_markov(np.zeros(1), np.zeros(2), np.zeros(2))
 
 
 def _ensembles() -> None:

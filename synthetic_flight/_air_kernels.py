@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from flightmodel import _kernels as la
-from flightmodel._kernels import inlined
+from flightmodel._kernels import inlined, kernel
 from synthetic_flight import _workspace_kernels as at
 
 
@@ -103,8 +103,10 @@ def look_up(s, lanes, grid, mach_knots, table, free):
         j = min(int(u), table.shape[1] - 2)
         h = u - j
         thin = s[at.FREE * w + i]
-        low = _between(_four(table[m, j]), _four(table[m, j + 1]), h)
-        c = _between(low, _between(_four(table[m + 1, j]), _four(table[m + 1, j + 1]), h), f)
+        c = (0.0, 0.0, 0.0, 0.0)
+        if thin < 1.0:
+            low = _between(_four(table[m, j]), _four(table[m, j + 1]), h)
+            c = _between(low, _between(_four(table[m + 1, j]), _four(table[m + 1, j + 1]), h), f)
         if thin > 0.0:
             c = _between(c, _between(_four(free[j]), _four(free[j + 1]), h), thin)
         n = at.COEF * w + i
@@ -127,3 +129,11 @@ def wrench(s, w, i):
     turn = qs * length * cm
     wa1, wa2 = s[(at.TRIAL + 18) * w + i], s[(at.TRIAL + 19) * w + i]
     return -qs * ca, -qs * cn * ny, -qs * cn * nz, turn * nz + damping * wa1, damping * wa2 - turn * ny
+
+
+@kernel
+def gauss_markov(keep, white, out):
+    """Noise of unit variance into ``out`` (n,): ``keep`` (n - 1,) of the last value is left in the next."""
+    out[0] = white[0]
+    for k in range(1, len(out)):
+        out[k] = keep[k - 1] * out[k - 1] + math.sqrt(1.0 - keep[k - 1] * keep[k - 1]) * white[k]

@@ -156,7 +156,6 @@ def _hinged(s, lanes):
         x, y, z = la.cross(p0, p1, p2, x, y, z)
         x, y, z = la.symmetric(inverse_b, x, y, z)
         at.put(s, at.RATE + 14, w, i, eb0 + x, eb1 + y, eb2 + z)
-        at.put(s, at.TURN, w, i, eb0 + x, eb1 + y, eb2 + z)
         x, y, z = la.cross(a0, a1, a2, fx, fy, fz)
         x, y, z = la.symmetric(inverse_a, x, y, z)
         at.put(s, at.RATE + 17, w, i, ea0 - x, ea1 - y, ea2 - z)
@@ -200,7 +199,6 @@ def _locked(s, lanes):
         at.put(s, at.MOMENT, w, i, x + g0 - u, y + g1 - v, z + g2 - t)
         x, y, z = la.back(c, e0, e1, e2)
         at.put(s, at.RATE + 14, w, i, x, y, z)
-        at.put(s, at.TURN, w, i, x, y, z)
         at.put(s, at.RATE + 17, w, i, e0, e1, e2)
         s[at.THETA * w + i] = la.atan2(math.sqrt(c[6] * c[6] + c[3] * c[3]), c[0])
 
@@ -223,7 +221,7 @@ def rates(s, lanes, atmosphere, grid, mach_knots, table, free, planet, locked):
 
 @inlined
 def _record(s, w, record, limit, out, out_aux, written):
-    """Write state and record of every lane that still flies; true while one does."""
+    """Write state and record of every lane that still flies, forces and moments in ECI; true while one flies."""
     flying = False
     for i in range(w):
         if written[i] < record:
@@ -231,8 +229,14 @@ def _record(s, w, record, limit, out, out_aux, written):
         written[i] = record + 1
         for k in range(at.STATES):
             out[i, record, k] = s[(at.Y + k) * w + i]
-        for k in range(at.AUX):
-            out_aux[i, record, k] = s[(at.REC + k) * w + i]
+        for k in range(6):
+            out_aux[i, record, k] = s[(at.ALTITUDE + k) * w + i]
+        r = at.nine(s, at.R_A, w, i)
+        for k in range(3):
+            x, y, z = at.three(s, at.FORCE + 3 * k, w, i)
+            n = 6 + 3 * k
+            out_aux[i, record, n], out_aux[i, record, n + 1], out_aux[i, record, n + 2] = la.times(r, x, y, z)
+            out_aux[i, record, 15 + k] = s[(at.RATE + 14 + k) * w + i]
         if s[at.THETA * w + i] < limit:
             flying = True
         else:

@@ -20,20 +20,19 @@ PARAMETERS = 67
 
 # rows: state, trial state of a Runge-Kutta stage, its derivative, the next state
 Y, TRIAL, RATE, NEXT = 0, 20, 40, 60
-# the record: altitude, density, Mach, dynamic pressure, shell's total angle of attack, bending angle; in shell axes
-# force and moment of the joint on the body and aerodynamic force; angular acceleration of the body, body axes
-REC = ALTITUDE = 80
-DENSITY, MACH, PRESSURE, ALPHA, THETA, FORCE, MOMENT, AERO, TURN = 81, 82, 83, 84, 85, 86, 89, 92, 95
+# what is recorded: altitude, density, Mach, dynamic pressure, shell's total angle of attack, bending angle; in shell
+# axes force and moment of the joint on the body and aerodynamic force
+ALTITUDE, DENSITY, MACH, PRESSURE, ALPHA, THETA, FORCE, MOMENT, AERO = 80, 81, 82, 83, 84, 85, 86, 89, 92
 # ECI from shell, shell from body (matrices), and scalar and x part of the latter's quaternion
-R_A, C_AB, TWIST = 98, 107, 116
+R_A, C_AB, TWIST = 95, 104, 113
 # in shell axes: body's rate, its arm to the joint, its c.g. from the shell's, gravitation at the shell's c.g. less that
 # at the body's, moment on the shell about its c.g. without the joint's
-RATE_B, ARM_B, BETWEEN, TIDE, SHELL = 118, 121, 124, 127, 130
+RATE_B, ARM_B, BETWEEN, TIDE, SHELL = 115, 118, 121, 124, 127
 # sine and cosine of latitude, of longitude; density, sound, north and east wind, free-molecular fraction
-SIN, COS, SIN_LON, COS_LON, RHO, SOUND, NORTH, EAST, FREE = 133, 134, 135, 136, 137, 138, 139, 140, 141
+SIN, COS, SIN_LON, COS_LON, RHO, SOUND, NORTH, EAST, FREE = 130, 131, 132, 133, 134, 135, 136, 137, 138
 # C_A C_N C_m C_mq; flow at the nose, shell axes; its size, its lateral part; Mach bracket of the last look-up
-COEF, FLOW, SPEED, LATERAL, BRACKET = 142, 146, 149, 150, 151
-P = 152
+COEF, FLOW, SPEED, LATERAL, BRACKET = 139, 143, 146, 147, 148
+P = 149
 ROWS = P + PARAMETERS
 
 

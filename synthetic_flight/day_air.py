@@ -28,6 +28,7 @@ from flightmodel.atmosphere import (
 )
 from flightmodel.checks import FloatArray
 from flightmodel.config import Section
+from synthetic_flight import _air_kernels
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 # the dynamics' own table of the air has a row every 50 m: nothing thinner than four rows can be flown through
@@ -118,9 +119,7 @@ def correlated(altitude_m: FloatArray, length_m: float, rng: np.random.Generator
     step = np.exp(-np.diff(altitude_m) / length_m)
     white = rng.standard_normal(len(altitude_m))
     out = np.empty(len(altitude_m))
-    out[0] = white[0]
-    for k in range(1, len(out)):
-        out[k] = step[k - 1] * out[k - 1] + np.sqrt(1.0 - step[k - 1] ** 2) * white[k]
+    _air_kernels.gauss_markov(step, white, out)
     return out
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from flightmodel import rarefied, rotations
-from flightmodel.atmosphere import AtmosphereProfile
+from flightmodel.atmosphere import AtmosphereProfile, us76
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import _workspace_kernels as at
@@ -54,14 +56,23 @@ def parameter_vector(
     return p
 
 
+def _altitudes() -> FloatArray:
+    return ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS, dtype=np.float64)
+
+
+@cache
+def _standard() -> tuple[FloatArray, FloatArray, FloatArray]:
+    return us76(_altitudes())
+
+
 def atmosphere_table(profile: AtmosphereProfile) -> FloatArray:
     """Air every 50 m from -1 to 399 km, ``(rows, 6)``, for the kernels.
 
     Density, the change of its logarithm up to the next row, speed of sound, north and east wind, and room for the
     fraction of free-molecular flow, which depends on the vehicle (`kernel_tables`).
     """
-    z = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS, dtype=np.float64)
-    air = profile.at(z)
+    z = _altitudes()
+    air = profile.at(z, _standard())
     change = np.diff(np.log(air.density_kgpm3), append=np.log(air.density_kgpm3[-1]))
     columns = [air.density_kgpm3, change, air.sound_speed_mps, air.wind_ned_mps[:, :2], np.zeros(len(z))]
     return np.column_stack(columns)
@@ -94,15 +105,7 @@ def workspace(states: FloatArray, parameters: FloatArray) -> FloatArray:
 
 
 def flown_records(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Records up to the first that is not finite, with forces and moments turned from shell axes into ECI."""
+    """Records up to the first that is not finite."""
     finite = np.isfinite(states).all(axis=-1)
     n = len(states) if finite.all() else int(np.argmin(finite))
-    return states[:n], record_in_eci(states[:n], aux[:n])
-
-
-def record_in_eci(states: FloatArray, aux: FloatArray) -> FloatArray:
-    """Records with the joint's force and moment and the aerodynamic force turned from shell axes into ECI."""
-    turned = aux.copy()
-    for k in (6, 9, 12):
-        turned[..., k : k + 3] = rotations.rotate(states[..., 10:14], aux[..., k : k + 3])
-    return turned
+    return states[:n], aux[:n]

@@ -26,7 +26,7 @@ class SmoothAir:
     north_mps: tuple = (-8.0, 5e-4)
     east_mps: tuple = (20.0, -7e-4)
 
-    def at(self, altitude_m):
+    def at(self, altitude_m, standard=None):
         z = np.asarray(altitude_m, dtype=float)
         density = self.density_at_zero_kgpm3 * np.exp(-z / self.scale_height_m)
         wind = np.stack([self.north_mps[0] + self.north_mps[1] * z, self.east_mps[0] + self.east_mps[1] * z, 0 * z], -1)

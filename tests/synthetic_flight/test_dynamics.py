@@ -37,8 +37,10 @@ def kernel_rates(state, vehicle, table, locked=False):
     s = packing.workspace(state[None], packing.parameter_vector(vehicle)[None])
     s[at.TRIAL : at.TRIAL + at.STATES] = state
     _kernels.rates(s, (0,), *packing.kernel_tables(vehicle, table), earth.WGS84, locked)
-    dy, aux = s[at.RATE : at.RATE + at.STATES], s[at.REC : at.REC + at.AUX]
-    return dy, packing.record_in_eci(state, aux)
+    # as recorded: forces and moments in ECI
+    vectors = s[at.FORCE : at.FORCE + 9].reshape(3, 3) @ s[at.R_A : at.R_A + 9].reshape(3, 3).T
+    aux = np.concatenate([s[at.ALTITUDE : at.ALTITUDE + 6], vectors.ravel(), s[at.RATE + 14 : at.RATE + 17]])
+    return s[at.RATE : at.RATE + at.STATES], aux
 
 
 def test_kernel_equals_the_readable_form_with_every_term_alive(generic_vehicle):
