@@ -13,13 +13,13 @@ Emmert et al., "NRLMSIS 2.1", J. Geophys. Res. Space Phys. 127, 2022 (the table 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing
 from flightmodel.telemetry import Sounding
@@ -134,15 +134,36 @@ def _temperature_above_86_km(z: FloatArray) -> FloatArray:
     return np.select([km <= 91.0, km <= 110.0, km <= 120.0], [186.8673, ellipse, 240.0 + 12.0 * (km - 110.0)], upper)
 
 
-def _spline(column: int) -> CubicSpline:
-    """Return a cubic spline of the log over height, joined to the equations below 86 km with their slope."""
+def _spline(column: int) -> Callable[[FloatArray], FloatArray]:
+    """Return the cubic spline of the log over height, joined to the equations below 86 km with their slope.
+
+    Natural at its top. Written out, since importing a library's takes longer than flying a flight; a test holds it to
+    `scipy.interpolate.CubicSpline`.
+    """
     h = EARTH_RADIUS_US76_M * np.array([85990.0, 86000.0]) / (EARTH_RADIUS_US76_M + np.array([85990.0, 86000.0]))
     t, p = _below_86_km(h)
     value = np.log(p if column == 2 else p / (R_AIR_JPKGK * t))
-    table = np.log(_UPPER[:, column])
-    table[0] = value[1]
-    slope = float(value[1] - value[0]) / 10.0
-    return CubicSpline(_UPPER[:, 0] * 1000.0, table, bc_type=((1, slope), (2, 0.0)))
+    x, y = _UPPER[:, 0] * 1000.0, np.log(_UPPER[:, column])
+    y[0] = value[1]
+    step, slope = np.diff(x), np.diff(y) / np.diff(x)
+    # slopes at the knots: given below, continuous curvature between, none at the top
+    n = len(x)
+    matrix, right = np.zeros((n, n)), np.zeros(n)
+    matrix[0, 0], right[0] = 1.0, (value[1] - value[0]) / 10.0
+    for k in range(1, n - 1):
+        matrix[k, k - 1 : k + 2] = step[k], 2.0 * (step[k - 1] + step[k]), step[k - 1]
+        right[k] = 3.0 * (step[k] * slope[k - 1] + step[k - 1] * slope[k])
+    matrix[-1, -2:], right[-1] = (1.0, 2.0), 3.0 * slope[-1]
+    d = np.linalg.solve(matrix, right)
+    square = (3.0 * slope - 2.0 * d[:-1] - d[1:]) / step
+    cube = (d[:-1] + d[1:] - 2.0 * slope) / step**2
+
+    def at(z: FloatArray) -> FloatArray:
+        k = np.clip(np.searchsorted(x, z, side="right") - 1, 0, n - 2)
+        u = z - x[k]
+        return y[k] + u * (d[k] + u * (square[k] + u * cube[k]))
+
+    return at
 
 
 _LOG_DENSITY = _spline(1)

@@ -7,7 +7,6 @@ step, of the cubic through the four samples around it. Truth and estimate name t
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
 
 from flightmodel.checks import BoolArray, FloatArray
 
@@ -60,6 +59,8 @@ def first_fall(time_s: FloatArray, values: FloatArray, level: float, allowed: Bo
         return low
     if fit(high) >= 0.0:
         return high
+    from scipy.optimize import brentq  # a quarter of a second to import
+
     return float(brentq(fit, low, high, xtol=1e-12))
 
 

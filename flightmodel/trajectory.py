@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from flightmodel import earth, rotations
 from flightmodel.checks import (
@@ -87,6 +86,8 @@ def resample(trajectory: Trajectory, time_s: FloatArray) -> Trajectory:
     if at.min() < t[0] - 1e-9 or at.max() > t[-1] + 1e-9:
         raise GateError(f"resample: {at.min():.3f} to {at.max():.3f} s lies outside {t[0]:.3f} to {t[-1]:.3f} s")
     at = np.clip(at, t[0], t[-1])
+    from scipy.interpolate import CubicHermiteSpline  # half a second to import
+
     spline = CubicHermiteSpline(t, trajectory.position_ecef_m, trajectory.velocity_ecef_mps)
     covariance = None
     if trajectory.covariance is not None:

@@ -3,7 +3,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.interpolate import CubicSpline
 
+from flightmodel import atmosphere
 from flightmodel.atmosphere import (
     AtmosphereProfile,
     default_sounding_sd,
@@ -102,3 +104,15 @@ def test_profile_refuses_what_is_not_a_number():
     z = np.array([0.0, 1e4])
     with pytest.raises(GateError):
         AtmosphereProfile(z, np.array([0.0, np.nan]), np.zeros(2), np.zeros((2, 3)), np.ones(2), np.ones(2))
+
+
+@pytest.mark.parametrize(("column", "own"), [(1, atmosphere._LOG_DENSITY), (2, atmosphere._LOG_PRESSURE)])
+def test_the_spline_of_the_upper_tables_is_the_library_s(column, own):
+    x, y = atmosphere._UPPER[:, 0] * 1000.0, own(atmosphere._UPPER[:, 0] * 1000.0)
+    slope = (own(np.array([86000.0 + 1e-3]))[0] - y[0]) / 1e-3
+    np.testing.assert_allclose(y[1:], np.log(atmosphere._UPPER[1:, column]), atol=1e-13)
+    z = np.linspace(86e3, 1e6, 5001)
+    np.testing.assert_allclose(own(z), CubicSpline(x, y, bc_type=((1, slope), (2, 0.0)))(z), atol=1e-7)
+    # the given slope at the bottom is that of the equations below
+    below = np.log(np.array(us76(np.array([85990.0, 86000.0]))[0 if column == 1 else 2]))
+    assert slope == pytest.approx(np.diff(below)[0] / 10.0, rel=1e-6)
