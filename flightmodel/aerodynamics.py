@@ -14,10 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, GateError, TableRangeError
+from flightmodel.checks import ConfigError, FloatArray, GateError, TableRangeError
 from flightmodel.rarefied import bridge
 
 MOST_FAULTS = 10
+AXIAL_TOLERANCE = 1e-6
+AXIAL_RULE = "0 is wanted there, as the shell is a body of revolution; put an asymmetry into the c.g."
 COLUMNS = ("mach", "alpha_deg", "ca", "cn", "cm", "cmq")
 # above the cone's half-angle part of it lies in shadow; no entry vehicle of the class flies there, so look-ups stop
 INVERSE_LIMIT_RAD = np.deg2rad(60.0)
@@ -106,6 +108,30 @@ class AeroTable:
         return replace(self, coefficients=changed)
 
 
+def check_axial_flow(path: Path, table: AeroTable) -> None:
+    """Raise `GateError` where the air flows along the axis and yet pushes sideways or turns the shell."""
+    faults = [
+        f"{path}: Mach {mach:g}, angle 0: {name} = {value:g}; {AXIAL_RULE}"
+        for mach, row in zip(table.mach, table.coefficients[:, 0], strict=True)
+        for name, value in (("normal force (lift)", row[1]), ("pitching moment", row[2]))
+        if abs(value) > AXIAL_TOLERANCE
+    ]
+    if faults:
+        raise GateError(faults[:MOST_FAULTS])
+
+
+def _row_faults(row: list[float], names: tuple[str, ...]) -> list[str]:
+    """Say what no row of a coefficient table may hold; ``row`` is finite, in the order of ``names``."""
+    mach, alpha = row[:2]
+    faults = [] if mach >= 0.0 else [f"column '{names[0]}': {mach:g}; a Mach number is not negative"]
+    if not 0.0 <= alpha <= 180.0:
+        faults.append(f"column '{names[1]}': {alpha:g}; an angle from 0 to 180 deg is wanted")
+    if alpha == 0.0:
+        off = [k for k in (3, 4) if abs(row[k]) > AXIAL_TOLERANCE]
+        faults += [f"column '{names[k]}': {row[k]:g} at angle 0; {AXIAL_RULE}" for k in off]
+    return faults
+
+
 def _number(text: str) -> float:
     try:
         return float(text)
@@ -126,7 +152,7 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise GateError(f"{path}: no such aerodynamic table") from None
+        raise ConfigError(f"{path}: no such aerodynamic table") from None
     except (OSError, UnicodeDecodeError) as fault:
         raise GateError(f"{path}: cannot be read as a table: {fault}") from None
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
@@ -136,13 +162,17 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
         raise GateError(f"{path}: columns {', '.join(missing)} are missing; wanted {', '.join(names)}")
     rows, faults = [], []
     for k, line in lines[1:]:
-        cells = line.split("#")[0].split(",")
-        row = [_number(cells[header.index(c)]) if len(cells) == len(header) else np.nan for c in names]
+        cells = [cell.strip() for cell in line.split("#")[0].split(",")]
+        if len(cells) != len(header):
+            faults.append(f"{path}, line {k}: {len(cells)} cells where {len(header)} are wanted; got '{line.strip()}'")
+            continue
+        row = [_number(cells[header.index(c)]) for c in names]
         rows.append(row)
-        if not np.isfinite(row).all():
-            faults.append(f"{path}, line {k}: {len(header)} finite numbers are wanted; got '{line.strip()}'")
+        bad = [c for c, value in zip(names, row, strict=True) if not np.isfinite(value)]
+        faults += [f"{path}, line {k}: column '{c}': '{cells[header.index(c)]}' is no finite number" for c in bad]
+        faults += [] if bad else [f"{path}, line {k}: {words}" for words in _row_faults(row, names)]
     if faults:
-        raise GateError(faults[:MOST_FAULTS] + [f"{path}: {len(faults)} such lines"] * (len(faults) > MOST_FAULTS))
+        raise GateError(faults[:MOST_FAULTS] + [f"{path}: {len(faults)} faults in all"] * (len(faults) > MOST_FAULTS))
     values = np.array(rows, dtype=float).reshape(-1, len(names))
     values = values[np.lexsort((values[:, 1], values[:, 0]))]
     mach, alpha_deg = np.unique(values[:, 0]), np.unique(values[:, 1])

@@ -15,21 +15,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from flightmodel.aerodynamics import COLUMNS, AeroTable, read_aero_table
+from flightmodel.aerodynamics import COLUMNS, AeroTable, check_axial_flow, read_aero_table
 from flightmodel.checks import ConfigError, FloatArray, GateError
-from flightmodel.config import Section, parse_section, read_toml
+from flightmodel.config import Fraction, KeyFaults, Length, Place, Section, parse_section, read_toml
 from flightmodel.daveml import read_daveml
 from flightmodel.newtonian import sphere_cone_closed_form, sphere_cone_quadrature, stagnation_cp
 from flightmodel.rarefied import sphere_cone_free_molecular, wall_speed_ratio
 
-Positive = Annotated[float, Field(gt=0.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
+MachNumber = Annotated[float, Field(ge=0.0, le=1000.0)]
+Degrees = Annotated[float, Field(ge=0.0, le=180.0)]
+Factor = Annotated[float, Field(ge=0.0, le=100.0)]
+Coefficient = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 MACH = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.7, 6.5, 8.0, 10.0, 15.0, 20.0)
 ALPHA_RAD = np.deg2rad(np.arange(0.0, 181.0))
 
@@ -37,9 +39,9 @@ ALPHA_RAD = np.deg2rad(np.arange(0.0, 181.0))
 class TableUncertainty(Section):
     """One standard deviation of the coefficients, as fractions; used where the vehicle file gives none."""
 
-    ca: NonNegative | None = None
-    cn: NonNegative | None = None
-    cm: NonNegative | None = None
+    ca: Fraction | None = None
+    cn: Fraction | None = None
+    cm: Fraction | None = None
 
 
 class Sidecar(Section):
@@ -47,19 +49,19 @@ class Sidecar(Section):
 
     source: Annotated[str, Field(min_length=1)]
     licence: Annotated[str, Field(min_length=1)]
-    area_m2: Positive
-    length_m: Positive
-    moment_reference_station_m: float
+    area_m2: Annotated[float, Field(gt=0.0, le=1e4)]
+    length_m: Length
+    moment_reference_station_m: Place
     axes: Literal["body", "wind"] = "body"
     damping_per: Literal["ql/2V", "ql/V"] = "ql/2V"
     uncertainty: TableUncertainty = TableUncertainty()
 
 
 class Knots(Section):
-    """A number over Mach, linear between knots, constant beyond them."""
+    """A factor over Mach, linear between knots, constant beyond them."""
 
-    mach: tuple[NonNegative, ...]
-    value: tuple[float, ...]
+    mach: tuple[MachNumber, ...]
+    value: tuple[Factor, ...]
 
     @model_validator(mode="after")
     def _matched(self) -> Knots:
@@ -71,9 +73,9 @@ class Knots(Section):
 class DampingTable(Section):
     """C_mq over Mach (rows) and total angle of attack (columns), linear between, constant beyond."""
 
-    mach: tuple[NonNegative, ...]
-    alpha_deg: tuple[NonNegative, ...]
-    value: tuple[tuple[float, ...], ...]
+    mach: Annotated[tuple[MachNumber, ...], Field(min_length=1)]
+    alpha_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
+    value: tuple[tuple[Coefficient, ...], ...]
 
     @model_validator(mode="after")
     def _matched(self) -> DampingTable:
@@ -89,33 +91,35 @@ class SphereCone(Section):
     """A spherically blunted cone with a flat base, in modified Newtonian flow."""
 
     half_angle_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
-    nose_radius_m: Positive
-    base_radius_m: Positive
-    mach: Annotated[tuple[NonNegative, ...], Field(min_length=2)] = MACH
+    nose_radius_m: Length
+    base_radius_m: Length
+    mach: Annotated[tuple[MachNumber, ...], Field(min_length=2)] = MACH
     k_a: Knots | None = None
     k_n: Knots | None = None
-    cmq: float | None = None
+    cmq: Coefficient | None = None
     cmq_table: DampingTable | None = None
 
     @model_validator(mode="after")
     def _possible(self) -> SphereCone:
-        faults = []
-        if self.nose_radius_m * np.cos(np.deg2rad(self.half_angle_deg)) >= self.base_radius_m:
-            faults.append("the nose cap is wider than the base")
+        faults: list[tuple[str, object, str]] = []
+        widest = self.base_radius_m / float(np.cos(np.deg2rad(self.half_angle_deg)))
+        if self.nose_radius_m >= widest:
+            words = f"the nose cap is wider than the base; below {widest:.4g} m for this base and angle"
+            faults.append(("nose_radius_m", self.nose_radius_m, words))
         if (self.cmq is None) == (self.cmq_table is None):
-            faults.append("either cmq or cmq_table is wanted")
+            faults.append(("cmq", self.cmq, "either cmq or cmq_table is wanted, and not both"))
         if not _increase(self.mach):
-            faults.append("Mach numbers must increase")
+            faults.append(("mach", self.mach, "Mach numbers must increase"))
         if faults:
-            raise ValueError("; ".join(faults))
+            raise KeyFaults(faults)
         return self
 
 
 class FreeMolecular(Section):
     """Free-molecular coefficients from the vehicle's own shape, with a wall that re-emits at its temperature."""
 
-    wall_temperature_k: Positive = 300.0
-    speed_mps: Positive = 1500.0
+    wall_temperature_k: Annotated[float, Field(ge=1.0, le=1e4)] = 300.0
+    speed_mps: Annotated[float, Field(ge=1.0, le=2e4)] = 1500.0
 
 
 class Aerodynamics(Section):
@@ -128,8 +132,18 @@ class Aerodynamics(Section):
     @model_validator(mode="after")
     def _one(self) -> Aerodynamics:
         if (self.table is None) == (self.sphere_cone is None):
-            raise ValueError("either table or sphere_cone is wanted")
+            raise ValueError("either table or sphere_cone is wanted, and not both")
         return self
+
+    @field_validator("table")
+    @classmethod
+    def _beside(cls, value: str | None) -> str | None:
+        # so that a copy of the vehicle file with its table holds without what lies elsewhere
+        if value is not None and (
+            not value or "\0" in value or _leads_away(PurePosixPath(value)) or _leads_away(PureWindowsPath(value))
+        ):
+            raise ValueError("a file beside the vehicle file, or in a folder below it, is wanted; copy the table there")
+        return value
 
 
 @dataclass(frozen=True)
@@ -141,6 +155,10 @@ class Shape:
     base_radius_m: float
     area_m2: float
     length_m: float
+
+
+def _leads_away(path: PurePosixPath | PureWindowsPath) -> bool:
+    return bool(path.anchor) or ".." in path.parts
 
 
 def _increase(values: tuple[float, ...]) -> bool:
@@ -184,9 +202,9 @@ def read_with_sidecar(path: Path) -> tuple[AeroTable, Sidecar]:
     Raises
     ------
     ConfigError
-        Where only the sidecar has faults.
+        Where only the sidecar has faults, or the table does not exist.
     GateError
-        Where the table has, with all faults of both.
+        Where the table has faults, with all of both.
     """
     faults: list[str] = []
     beside, sidecar, table = path.with_suffix(".toml"), None, None
@@ -199,9 +217,13 @@ def read_with_sidecar(path: Path) -> tuple[AeroTable, Sidecar]:
     names = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:]) if wind else COLUMNS
     try:
         daveml = path.suffix.lower() in (".dml", ".xml")
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such aerodynamic table; key 'aerodynamics.table' names it")
         table = read_daveml(path, ("CD", "CL") if wind else ("CA", "CN")) if daveml else read_aero_table(path, names)
+        if daveml:
+            check_axial_flow(path, table)
     except GateError as fault:
-        raise GateError([*fault.faults, *faults]) from None
+        raise type(fault)([*fault.faults, *faults]) from None
     if sidecar is None:
         raise ConfigError(faults)
     return table, sidecar

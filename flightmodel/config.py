@@ -3,18 +3,88 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from flightmodel.checks import ConfigError, nearest_name
 
+# what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
+Positive = Annotated[float, Field(gt=0.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
+Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
+Latitude = Elevation
+Longitude = Angle
+ErrorAngle = Annotated[float, Field(ge=0.0, le=45.0)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Time = Annotated[float, Field(ge=-1e6, le=1e6)]
+Duration = Annotated[float, Field(gt=0.0, le=1e6)]
+SampleRate = Annotated[float, Field(ge=1e-3, le=20e3)]
+Length = Annotated[float, Field(gt=0.0, le=100.0)]
+Place = Annotated[float, Field(ge=-100.0, le=100.0)]
+# also the name of a table in TOML, of a file and of a column
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
+NAME_RULE = "a name has 1 to 64 letters (a to z), digits, _ and -"
+
+
+class KeyFaults(ValueError):
+    """What keys of a table do not fit each other; `parse_section` makes a sentence of each.
+
+    Parameters
+    ----------
+    faults : list of (str, object, str)
+        Key below the table that is checked, its value, what is wrong and what to try.
+    """
+
+    def __init__(self, faults: list[tuple[str, object, str]]) -> None:
+        self.faults = tuple(faults)
+        super().__init__("; ".join(f"{key} = {_shown(value)}: {words}" for key, value, words in faults))
+
 
 class Section(BaseModel):
-    """Base of all configuration tables: immutable, unknown keys refused, numbers finite."""
+    """Base of all configuration tables: immutable, unknown keys refused, numbers finite and nothing else than numbers.
+
+    Whole numbers pass where a number is wanted; true, false and text do not.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_coercion(cls, value: Any, info: ValidationInfo) -> Any:
+        wanted = set(_leaf_types(cls.model_fields[str(info.field_name)].annotation))
+        for leaf in _leaves(value):
+            if isinstance(leaf, bool) and bool not in wanted and wanted & {int, float}:
+                raise ValueError("a number is wanted, not true or false")
+            if isinstance(leaf, str) and str not in wanted and wanted & {int, float, bool}:
+                raise ValueError("a number is wanted, not text" if bool not in wanted else "true or false is wanted")
+            if isinstance(leaf, (int, float)) and wanted == {bool} and not isinstance(leaf, bool):
+                raise ValueError("true or false is wanted")
+        return value
+
+
+def _leaf_types(annotation: Any) -> Iterator[type]:
+    if get_origin(annotation) is Literal:
+        yield from {type(value) for value in get_args(annotation)}
+    elif get_origin(annotation) is Annotated:
+        yield from _leaf_types(get_args(annotation)[0])
+    elif get_args(annotation):
+        for part in get_args(annotation):
+            yield from _leaf_types(part)
+    elif annotation is not type(None) and isinstance(annotation, type):
+        yield annotation
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    """Return the numbers and texts of a value; tables check themselves."""
+    if isinstance(value, (list, tuple)):
+        for part in value:
+            yield from _leaves(part)
+    elif not isinstance(value, (dict, BaseModel)):
+        yield value
 
 
 SectionT = TypeVar("SectionT", bound=Section)
@@ -26,8 +96,13 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
-        raise ConfigError(f"{path}: not valid TOML: {fault}") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: not valid TOML: arrays or tables lie too deep in each other") from None
+    except ValueError as fault:
+        # also integers of thousands of digits, and a NUL in the path
+        raise ConfigError(
+            f"{str(path)!r}: not valid TOML: {fault}" if "\0" in str(path) else f"{path}: not valid TOML: {fault}"
+        ) from None
     except OSError as fault:
         raise ConfigError(f"{path}: cannot be read: {fault.strerror or fault}") from None
 
@@ -37,18 +112,37 @@ def parse_section(model: type[SectionT], tables: dict[str, Any], where: str) -> 
     try:
         return model.model_validate(tables)
     except ValidationError as fault:
-        raise ConfigError([_sentence(where, model, item) for item in fault.errors()]) from None
+        raise ConfigError([text for item in fault.errors() for text in _sentences(where, model, item)]) from None
+    except RecursionError:
+        raise ConfigError(f"{where}: arrays or tables lie too deep in each other") from None
 
 
-def _sentence(where: str, model: type[BaseModel], item: Any) -> str:
+def _shown(value: object) -> str:
+    """Return a value as a message shows it: short."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        return "(too long to show)"
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _sentences(where: str, model: type[BaseModel], item: Any) -> list[str]:
     path = [str(part) for part in item["loc"]]
+    if path and path[-1] == "[key]":
+        return [f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}"]
     key = ".".join(path)
     if item["type"] == "extra_forbidden":
         known = _keys_beside(model, path[:-1])
-        return f"{where}: unknown key '{key}'{nearest_name(path[-1], known)}; known here: {', '.join(sorted(known))}"
+        return [f"{where}: unknown key '{key}'{nearest_name(path[-1], known)}; known here: {', '.join(sorted(known))}"]
     if item["type"] == "missing":
-        return f"{where}: key '{key}' is missing"
-    return f"{where}: key '{key}' = {item['input']!r}: {item['msg'].removeprefix('Value error, ')}"
+        return [f"{where}: key '{key}' is missing"]
+    words = item["msg"].removeprefix("Value error, ")
+    cause = item.get("ctx", {}).get("error")
+    if isinstance(cause, KeyFaults):
+        return [f"{where}: key '{'.'.join([*path, name])}' = {_shown(v)}: {text}" for name, v, text in cause.faults]
+    if isinstance(item["input"], (dict, BaseModel)):
+        return [f"{where}: key '{key}': {words}"]
+    return [f"{where}: key '{key}' = {_shown(item['input'])}: {words}"]
 
 
 def _keys_beside(model: Any, path: list[str]) -> list[str]:

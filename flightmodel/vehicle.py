@@ -12,37 +12,54 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.aeroinput import Aerodynamics, Shape, aerodynamics_from
 from flightmodel.checks import ConfigError, FloatArray, check_positive_definite, nearest_name
-from flightmodel.config import Section, parse_section, read_toml
+from flightmodel.config import (
+    Angle,
+    ErrorAngle,
+    Fraction,
+    KeyFaults,
+    Length,
+    Name,
+    Place,
+    Section,
+    parse_section,
+    read_toml,
+)
 from flightmodel.instruments import dcm_body_from_clocking
 
 DATA = Path(__file__).parent / "data"
-Positive = Annotated[float, Field(gt=0.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
-Vector = tuple[float, float, float]
+Stiffness = Annotated[float, Field(ge=0.0, le=1e15)]
+Damping = Annotated[float, Field(ge=0.0, le=1e12)]
+Metres = Annotated[float, Field(ge=0.0, le=10.0)]
+Inertia = Annotated[float, Field(ge=-1e9, le=1e9)]
+Pixels = Annotated[float, Field(ge=-1e5, le=1e5)]
+Focal = Annotated[float, Field(gt=0.0, le=1e5)]
+Distortion = Annotated[float, Field(ge=-100.0, le=100.0)]
+Vector = tuple[Place, Place, Place]
+InertiaRow = tuple[Inertia, Inertia, Inertia]
 
 
 class Reference(Section):
     """Reference area and length of the coefficients."""
 
-    area_m2: Positive
-    length_m: Positive
+    area_m2: Annotated[float, Field(gt=0.0, le=1e4)]
+    length_m: Length
 
 
 class MassProperties(Section):
     """Mass, c.g. from the datum in body axes, inertia tensor about the body's own c.g. in body axes."""
 
-    mass_kg: Positive
+    mass_kg: Annotated[float, Field(gt=0.0, le=1e6)]
     cg_from_datum_body_m: Vector
-    inertia_kgm2: tuple[Vector, Vector, Vector]
+    inertia_kgm2: tuple[InertiaRow, InertiaRow, InertiaRow]
 
     @field_validator("inertia_kgm2")
     @classmethod
-    def _physical(cls, value: tuple[Vector, Vector, Vector]) -> tuple[Vector, Vector, Vector]:
+    def _physical(cls, value: tuple[InertiaRow, ...]) -> tuple[InertiaRow, ...]:
         tensor = np.array(value)
         check_positive_definite("inertia", tensor)
         principal = np.linalg.eigvalsh(tensor)
@@ -68,50 +85,72 @@ class CompliantJoint(Section):
     ``(C1 + C3 theta^2)`` times the relative angular rate.
     """
 
-    station_m: float
-    bending_stiffness_nmprad: NonNegative
-    bending_damping_nmsprad: NonNegative = 0.0
-    torsion_stiffness_nmprad: NonNegative
-    torsion_damping_nmsprad: NonNegative = 0.0
-    freeplay_deg: NonNegative = 0.0
+    station_m: Place
+    bending_stiffness_nmprad: Stiffness
+    bending_damping_nmsprad: Damping = 0.0
+    torsion_stiffness_nmprad: Stiffness
+    torsion_damping_nmsprad: Damping = 0.0
+    freeplay_deg: ErrorAngle = 0.0
     freeplay_corner: Annotated[float, Field(gt=0.0, le=0.5)] = 0.02
-    hardening_nmprad3: NonNegative = 0.0
-    damping_hardening_nmsprad3: NonNegative = 0.0
+    hardening_nmprad3: Stiffness = 0.0
+    damping_hardening_nmsprad3: Damping = 0.0
 
 
 class Uncertainty(Section):
     """What is known of the vehicle before flight, one standard deviation; fractions where no unit is named."""
 
-    mass: NonNegative = 0.01
-    cg_station_m: NonNegative = 0.01
-    cg_lateral_m: NonNegative = 0.001
-    inertia: NonNegative = 0.03
-    ca: NonNegative = 0.03
-    cn: NonNegative = 0.07
-    cm: NonNegative = 0.10
+    mass: Fraction = 0.01
+    cg_station_m: Metres = 0.01
+    cg_lateral_m: Metres = 0.001
+    inertia: Fraction = 0.03
+    ca: Fraction = 0.03
+    cn: Fraction = 0.07
+    cm: Fraction = 0.10
 
 
 class ShellGeometry(Section):
     """Stacked-torus aeroshell and cylindrical centerbody."""
 
-    nose_radius_m: Positive
+    nose_radius_m: Length
     half_angle_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
     torus_count: Annotated[int, Field(ge=1, le=60)]
-    torus_minor_radius_m: Positive
-    torus_spacing_m: Positive
-    innermost_torus_radius_m: Positive
-    base_radius_m: Positive
+    torus_minor_radius_m: Length
+    torus_spacing_m: Length
+    innermost_torus_radius_m: Length
+    base_radius_m: Length
     gore_count: Annotated[int, Field(ge=3, le=120)]
-    centerbody_radius_m: Positive
-    centerbody_length_m: Positive
+    centerbody_radius_m: Length
+    centerbody_length_m: Length
+
+    @model_validator(mode="after")
+    def _possible(self) -> ShellGeometry:
+        angle, base = np.deg2rad(self.half_angle_deg), self.base_radius_m
+        outermost = self.innermost_torus_radius_m + (self.torus_count - 1) * self.torus_spacing_m * np.sin(angle)
+        faults: list[tuple[str, object, str]] = []
+        if self.nose_radius_m * np.cos(angle) >= base:
+            words = f"the nose cap is wider than the base; below {base / np.cos(angle):.4g} m for this base and angle"
+            faults.append(("nose_radius_m", self.nose_radius_m, words))
+        if self.torus_minor_radius_m >= self.innermost_torus_radius_m:
+            words = (
+                f"wanted below innermost_torus_radius_m = {self.innermost_torus_radius_m:g}, or the torus has no hole"
+            )
+            faults.append(("torus_minor_radius_m", self.torus_minor_radius_m, words))
+        if outermost - self.torus_minor_radius_m >= base:
+            words = f"the outermost of {self.torus_count} tori, of radius {outermost:.4g} m, lies outside the base"
+            faults.append(("base_radius_m", base, f"{words}; check torus_count and torus_spacing_m"))
+        if self.centerbody_radius_m >= base:
+            faults.append(("centerbody_radius_m", self.centerbody_radius_m, f"wanted below base_radius_m = {base:g}"))
+        if faults:
+            raise KeyFaults(faults)
+        return self
 
 
 class SensorMount(Section):
     """Where a sensor package sits and how its axes are clocked."""
 
     position_from_datum_body_m: Vector
-    x_axis_lv_deg: float
-    y_axis_lv_deg: float
+    x_axis_lv_deg: Angle
+    y_axis_lv_deg: Angle
 
     @field_validator("y_axis_lv_deg")
     @classmethod
@@ -130,15 +169,15 @@ class SensorMount(Section):
 class CameraMount(Section):
     """A camera on the centerbody, its nominal pointing and its Kannala-Brandt lens."""
 
-    clock_lv_deg: float
-    station_m: float
-    radius_m: NonNegative
-    axis_from_forward_deg: float
+    clock_lv_deg: Angle
+    station_m: Place
+    radius_m: Metres
+    axis_from_forward_deg: Angle
     width_px: Annotated[int, Field(ge=16, le=8192)]
     height_px: Annotated[int, Field(ge=16, le=8192)]
-    focal_px: tuple[Positive, Positive]
-    centre_px: tuple[float, float]
-    distortion: tuple[float, float, float, float]
+    focal_px: tuple[Focal, Focal]
+    centre_px: tuple[Pixels, Pixels]
+    distortion: tuple[Distortion, Distortion, Distortion, Distortion]
 
 
 class _VehicleFile(Section):
@@ -151,8 +190,8 @@ class _VehicleFile(Section):
     uncertainty: Uncertainty = Uncertainty()
     aerodynamics: Aerodynamics
     geometry: ShellGeometry
-    sensors: dict[str, SensorMount] = {}
-    cameras: dict[str, CameraMount] = {}
+    sensors: dict[Name, SensorMount] = {}
+    cameras: dict[Name, CameraMount] = {}
 
 
 @dataclass(frozen=True)
@@ -170,6 +209,7 @@ class Vehicle:
     sensors: dict[str, SensorMount]
     cameras: dict[str, CameraMount]
     source: Path
+    tables: tuple[str, ...] = ()  # coefficient table and sidecar beside the vehicle file, relative to it
 
     @property
     def mass_kg(self) -> float:
@@ -217,13 +257,15 @@ class Vehicle:
 
 def vehicle_path(name: str, beside: Path | None = None) -> Path:
     """Find a vehicle file: a path (relative to ``beside``), or the name of a vehicle that ships with the toolkit."""
+    if "\0" in name:
+        raise ConfigError(f"vehicle {name!r}: a path holds no NUL character")
     if name.endswith(".toml"):
         return (beside or Path()) / name
-    path = DATA / "vehicles" / f"{name}.toml"
-    if not path.exists():
-        shipped = [p.stem for p in (DATA / "vehicles").glob("*.toml")]
-        raise ConfigError(f"no vehicle '{name}'{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}")
-    return path
+    shipped = [p.stem for p in (DATA / "vehicles").glob("*.toml")]
+    if name not in shipped:
+        hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
+        raise ConfigError(f"no vehicle '{name}'{hint}")
+    return DATA / "vehicles" / f"{name}.toml"
 
 
 def vehicle_from_toml(path: Path) -> Vehicle:
@@ -243,6 +285,8 @@ def vehicle_from_toml(path: Path) -> Vehicle:
         reference.area_m2,
         reference.length_m,
     )
+    table = spec.aerodynamics.table
+    own = table is not None and (path.parent / table).exists()
     aero, table_sd = aerodynamics_from(spec.aerodynamics, shape, (path.parent, DATA / "aerodynamics"))
     # the vehicle file's own word first, then the table's
     stated = {k: v for k, v in table_sd if v is not None and k not in spec.uncertainty.model_fields_set}
@@ -258,4 +302,5 @@ def vehicle_from_toml(path: Path) -> Vehicle:
         sensors=dict(spec.sensors),
         cameras=dict(spec.cameras),
         source=path,
+        tables=(table, str(Path(table).with_suffix(".toml"))) if own and table is not None else (),
     )
