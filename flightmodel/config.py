@@ -100,9 +100,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: not valid TOML: arrays or tables lie too deep in each other") from None
     except ValueError as fault:
         # also integers of thousands of digits, and a NUL in the path
-        raise ConfigError(
-            f"{str(path)!r}: not valid TOML: {fault}" if "\0" in str(path) else f"{path}: not valid TOML: {fault}"
-        ) from None
+        name = repr(str(path)) if "\0" in str(path) else str(path)
+        raise ConfigError(f"{name}: not valid TOML: {fault}") from None
     except OSError as fault:
         raise ConfigError(f"{path}: cannot be read: {fault.strerror or fault}") from None
 

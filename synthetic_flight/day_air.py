@@ -27,12 +27,13 @@ from flightmodel.atmosphere import (
     standard_atmosphere,
 )
 from flightmodel.checks import FloatArray
-from flightmodel.config import Section
+from flightmodel.config import Fraction, Section
 from synthetic_flight import _air_kernels
 
-NonNegative = Annotated[float, Field(ge=0.0)]
+Wind = Annotated[float, Field(ge=-500.0, le=500.0)]
+WindSize = Annotated[float, Field(ge=0.0, le=500.0)]
 # the dynamics' own table of the air has a row every 50 m: nothing thinner than four rows can be flown through
-Thickness = Annotated[float, Field(ge=200.0)]
+Thickness = Annotated[float, Field(ge=200.0, le=110e3)]
 Altitude = Annotated[float, Field(gt=0.0, lt=110e3)]
 STEP_M, TOP_M = 250.0, 130000.0
 POINTS_A_STRUCTURE = 10
@@ -52,15 +53,15 @@ class Shear(Section):
     """A change of wind across a layer; the wind above is changed by the whole of it."""
 
     altitude_m: Altitude
-    north_mps: float
-    east_mps: float
+    north_mps: Wind
+    east_mps: Wind
     thickness_m: Thickness
 
 
 class Turbulence(Section):
     """Random horizontal gusts in a band of altitudes, with Dryden's transverse spectrum."""
 
-    sd_mps: NonNegative
+    sd_mps: WindSize
     length_m: Thickness
     from_m: Altitude
     to_m: Altitude
@@ -76,15 +77,15 @@ class DiscreteGust(Section):
     """A single gust, ``(1 + cos)/2`` of its peak over twice ``thickness_m``."""
 
     altitude_m: Altitude
-    north_mps: float
-    east_mps: float
+    north_mps: Wind
+    east_mps: Wind
     thickness_m: Thickness
 
 
 class RangeSounding(Section):
     """The range's own sounding: how old it is at the flight, how high it reached, what it resolves."""
 
-    age_h: NonNegative = 3.0
+    age_h: Annotated[float, Field(ge=0.0, le=240.0)] = 3.0
     top_m: Annotated[float, Field(ge=35e3, le=100e3)] = 90e3
     resolution_m: Annotated[float, Field(ge=500.0, le=20e3)] = 2000.0
 
@@ -94,13 +95,13 @@ class DayAtmosphere(Section):
 
     base: Literal["us76", "nrlmsis_2009_08_17"] = "us76"
     winds: bool = True
-    density_sd: NonNegative = 0.015
-    wind_sd_mps: NonNegative = 2.0
+    density_sd: Fraction = 0.015
+    wind_sd_mps: WindSize = 2.0
     pockets: tuple[Pocket, ...] = ()
     shears: tuple[Shear, ...] = ()
     gusts: tuple[Turbulence, ...] = ()
     discrete_gusts: tuple[DiscreteGust, ...] = ()
-    sounding_scale: NonNegative = 1.0
+    sounding_scale: Annotated[float, Field(ge=0.0, le=10.0)] = 1.0
     sounding: RangeSounding | None = None
 
 

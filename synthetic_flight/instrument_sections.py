@@ -12,30 +12,55 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from flightmodel.config import Section
+from flightmodel.config import (
+    Angle,
+    Elevation,
+    ErrorAngle,
+    Fraction,
+    KeyFaults,
+    Latitude,
+    Longitude,
+    SampleRate,
+    Section,
+    Time,
+)
 from flightmodel.refraction import Refractivity
 from synthetic_flight.triad_errors import DropoutErrors, TriadErrors
 
-NonNegative = Annotated[float, Field(ge=0.0)]
-Positive = Annotated[float, Field(gt=0.0)]
-Vector = tuple[float, float, float]
-Limits = tuple[Positive, Positive, Positive]
+# sizes of errors: of triads in their own everyday unit, of ranges in metres
+Size = Annotated[float, Field(ge=0.0, le=1e4)]
+RangeError = Annotated[float, Field(ge=0.0, le=1e4)]
+Bandwidth = Annotated[float, Field(ge=0.0, le=1e5)]
+Delay = Annotated[float, Field(ge=-10.0, le=10.0)]
+TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
+Limit = Annotated[float, Field(gt=0.0, le=1e6)]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0)]
+Height = Annotated[float, Field(ge=-500.0, le=1e4)]
+ProfileHeight = Annotated[float, Field(ge=-1e3, le=1e6)]
+Refractive = Annotated[float, Field(gt=0.0, le=1000.0)]
+Vector = tuple[Offset, Offset, Offset]
+Limits = tuple[Limit, Limit, Limit]
 
 
 class Dropouts(Section):
     """Lost samples: bursts at a mean rate and of a mean length, and stated intervals ``[from, to]``."""
 
-    rate_hz: NonNegative = 0.0
-    mean_s: NonNegative = 0.0
-    outages_s: tuple[tuple[float, float], ...] = ()
+    rate_hz: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    mean_s: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
+    outages_s: tuple[tuple[Time, Time], ...] = ()
 
     @model_validator(mode="after")
     def _ordered(self) -> Dropouts:
-        for start, stop in self.outages_s:
-            if stop <= start:
-                raise ValueError(f"outage from {start} to {stop} s does not end after it starts")
+        faults: list[tuple[str, object, str]] = [
+            (f"outages_s.{k}", [start, stop], "the outage does not end after it starts")
+            for k, (start, stop) in enumerate(self.outages_s)
+            if stop <= start
+        ]
         if (self.rate_hz > 0.0) != (self.mean_s > 0.0):
-            raise ValueError("rate_hz and mean_s are given together")
+            words = f"with mean_s = {self.mean_s:g}; give both positive for bursts, or both zero for none"
+            faults.append(("rate_hz", self.rate_hz, words))
+        if faults:
+            raise KeyFaults(faults)
         return self
 
     @property
@@ -53,15 +78,15 @@ class Triad(Section):
     ``scale_asymmetry``.
     """
 
-    rate_hz: Positive
-    scale: NonNegative
-    mount_deg: NonNegative
-    nonorthogonality_deg: NonNegative = 0.0
-    scale_asymmetry: NonNegative = 0.0
-    drift_time_constant_s: Positive = 100.0
-    bandwidth_hz: NonNegative = 0.0
+    rate_hz: SampleRate
+    scale: Fraction
+    mount_deg: ErrorAngle
+    nonorthogonality_deg: ErrorAngle = 0.0
+    scale_asymmetry: Fraction = 0.0
+    drift_time_constant_s: TimeConstant = 100.0
+    bandwidth_hz: Bandwidth = 0.0
     filter_order: Literal[1, 2] = 2
-    delay_s: float = 0.0
+    delay_s: Delay = 0.0
     dropouts: Dropouts | None = None
 
     def _errors(
@@ -91,11 +116,11 @@ class Accelerometer(Triad):
     ``range_mps2`` is of each axis of the package (z is aft in Sub-A).
     """
 
-    noise_mps2: NonNegative
-    bias_mps2: NonNegative
-    drift_mps2: NonNegative = 0.0
+    noise_mps2: Size
+    bias_mps2: Size
+    drift_mps2: Size = 0.0
     range_mps2: Limits | None = None
-    resolution_mps2: NonNegative = 0.0
+    resolution_mps2: Size = 0.0
     elements_sensor_m: tuple[Vector, Vector, Vector] | None = None
 
     @property
@@ -109,11 +134,11 @@ class Accelerometer(Triad):
 class Rates(Triad):
     """Errors of the rate gyros."""
 
-    noise_degps: NonNegative
-    bias_degps: NonNegative
-    drift_degps: NonNegative = 0.0
+    noise_degps: Size
+    bias_degps: Size
+    drift_degps: Size = 0.0
     range_degps: Limits | None = None
-    resolution_degps: NonNegative = 0.0
+    resolution_degps: Size = 0.0
 
     @property
     def errors(self) -> TriadErrors:
@@ -132,13 +157,13 @@ class Magnetometer(Triad):
     """
 
     mount: str = "magnetometer"
-    noise_ut: NonNegative
-    bias_ut: NonNegative
-    hard_iron_ut: NonNegative = 0.0
-    soft_iron: NonNegative = 0.0
-    drift_ut: NonNegative = 0.0
+    noise_ut: Size
+    bias_ut: Size
+    hard_iron_ut: Size = 0.0
+    soft_iron: Fraction = 0.0
+    drift_ut: Size = 0.0
     range_ut: Limits | None = None
-    resolution_ut: NonNegative = 0.0
+    resolution_ut: Size = 0.0
 
     @property
     def errors(self) -> TriadErrors:
@@ -153,15 +178,15 @@ class SunSensors(Section):
     weight of the sunlit Earth against the Sun in a head that has the nadir in its field (0 for none).
     """
 
-    rate_hz: Positive
-    heads_lv_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=8)] = (45.0, 135.0, 225.0, 315.0)
+    rate_hz: SampleRate
+    heads_lv_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=8)] = (45.0, 135.0, 225.0, 315.0)
     field_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 180.0
-    noise_deg: NonNegative
-    bias_deg: NonNegative
-    mount_deg: NonNegative
-    resolution_deg: NonNegative = 0.0
-    delay_s: float = 0.0
-    albedo: NonNegative = 0.0
+    noise_deg: ErrorAngle
+    bias_deg: ErrorAngle
+    mount_deg: ErrorAngle
+    resolution_deg: ErrorAngle = 0.0
+    delay_s: Delay = 0.0
+    albedo: Fraction = 0.0
     dropouts: Dropouts | None = None
 
 
@@ -171,10 +196,10 @@ class AirRefraction(Section):
     ``residual`` is the fraction that the range's own correction leaves in the data: 1 is uncorrected.
     """
 
-    surface: NonNegative = 315.0
-    scale_height_m: Positive = 7350.0
-    profile: Annotated[tuple[tuple[float, Positive], ...], Field(min_length=2)] | None = None
-    residual: float = 1.0
+    surface: Annotated[float, Field(ge=0.0, le=1000.0)] = 315.0
+    scale_height_m: Annotated[float, Field(ge=500.0, le=1e5)] = 7350.0
+    profile: Annotated[tuple[tuple[ProfileHeight, Refractive], ...], Field(min_length=2)] | None = None
+    residual: Annotated[float, Field(ge=-10.0, le=10.0)] = 1.0
 
     @model_validator(mode="after")
     def _increasing(self) -> AirRefraction:
@@ -199,36 +224,36 @@ class Radar(Section):
     axis) errs in azimuth by sec E, ``nonorthogonality_deg`` by tan E, ``droop_deg`` in elevation by cos E;
     ``encoder_once_deg`` and ``encoder_twice_deg`` go once and twice a turn of each encoder. ``angle_servo_hz`` is the
     bandwidth of a tracking servo without velocity lag. ``transit_time`` leaves in that an echo shows where the vehicle
-    was when it was hit. Points beyond ``max_range_m`` or below ``min_elevation_deg`` are not tracked.
+    was when it was hit. Points beyond ``max_range_m`` or below ``min_elevation_deg`` (the horizon) are not tracked.
     """
 
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    rate_hz: Positive
-    offset_s: NonNegative = 0.0
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    height_m: Height
+    rate_hz: SampleRate
+    offset_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 0.0
     tracks: Literal["cg", "datum"] = "cg"
-    range_sd_m: NonNegative
-    angle_sd_deg: NonNegative
-    range_bias_m: NonNegative
-    angle_bias_deg: NonNegative
-    time_bias_s: NonNegative
-    range_scale: NonNegative = 0.0
-    mislevel_deg: NonNegative = 0.0
-    skew_deg: NonNegative = 0.0
-    nonorthogonality_deg: NonNegative = 0.0
-    droop_deg: NonNegative = 0.0
-    encoder_once_deg: NonNegative = 0.0
-    encoder_twice_deg: NonNegative = 0.0
-    wander_deg: NonNegative = 0.0
-    wander_time_constant_s: Positive = 20.0
-    angle_servo_hz: NonNegative = 0.0
+    range_sd_m: RangeError
+    angle_sd_deg: ErrorAngle
+    range_bias_m: RangeError
+    angle_bias_deg: ErrorAngle
+    time_bias_s: Annotated[float, Field(ge=0.0, le=10.0)]
+    range_scale: Fraction = 0.0
+    mislevel_deg: ErrorAngle = 0.0
+    skew_deg: ErrorAngle = 0.0
+    nonorthogonality_deg: ErrorAngle = 0.0
+    droop_deg: ErrorAngle = 0.0
+    encoder_once_deg: ErrorAngle = 0.0
+    encoder_twice_deg: ErrorAngle = 0.0
+    wander_deg: ErrorAngle = 0.0
+    wander_time_constant_s: TimeConstant = 20.0
+    angle_servo_hz: Bandwidth = 0.0
     transit_time: bool = False
     refraction: AirRefraction | None = None
-    range_resolution_m: NonNegative = 0.0
-    angle_resolution_deg: NonNegative = 0.0
-    max_range_m: Positive | None = None
-    min_elevation_deg: float | None = None
+    range_resolution_m: RangeError = 0.0
+    angle_resolution_deg: ErrorAngle = 0.0
+    max_range_m: Annotated[float, Field(gt=0.0, le=1e9)] | None = None
+    min_elevation_deg: Elevation = 0.0
     dropouts: Dropouts | None = None
 
 
@@ -236,14 +261,23 @@ class Video(Section):
     """When the onboard camera records."""
 
     camera: str
-    start_s: float
-    stop_s: float
-    rate_hz: Positive
-    benchmark_s: float
+    start_s: Time
+    stop_s: Time
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1000.0)]
+    benchmark_s: Time
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Video:
+        if self.stop_s < self.start_s:
+            raise KeyFaults([("stop_s", self.stop_s, f"after start_s = {self.start_s:g} is wanted")])
+        if not self.start_s <= self.benchmark_s <= self.stop_s:
+            words = f"a time of the video, {self.start_s:g} to {self.stop_s:g} s, is wanted"
+            raise KeyFaults([("benchmark_s", self.benchmark_s, words)])
+        return self
 
 
 class Attitude(Section):
     """The attitude that the range states to start from."""
 
-    t_s: float
-    sd_deg: Positive
+    t_s: Time
+    sd_deg: Annotated[float, Field(gt=0.0, le=180.0)]

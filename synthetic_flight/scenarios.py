@@ -7,11 +7,24 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from flightmodel import earth, rotations
-from flightmodel.checks import ConfigError, FloatArray, nearest_name
-from flightmodel.config import Section, parse_section, read_toml
+from flightmodel.checks import ConfigError, FloatArray, GateError, nearest_name
+from flightmodel.config import (
+    Angle,
+    Duration,
+    Elevation,
+    KeyFaults,
+    Latitude,
+    Longitude,
+    Name,
+    Section,
+    Time,
+    parse_section,
+    read_toml,
+)
+from flightmodel.flightfile import parse_utc
 from flightmodel.vehicle import DATA, Vehicle, vehicle_from_toml, vehicle_path
 from synthetic_flight.day_air import DayAtmosphere, day_atmosphere
 from synthetic_flight.instrument_sections import (
@@ -21,44 +34,70 @@ from synthetic_flight.instrument_sections import (
     Radar,
     Rates,
     SunSensors,
+    Triad,
     Video,
 )
 from synthetic_flight.simulate import Truth, fly, state_from_ecef
 
-NonNegative = Annotated[float, Field(ge=0.0)]
-Positive = Annotated[float, Field(gt=0.0)]
+Altitude = Annotated[float, Field(ge=0.0, le=1e6)]
+MOST_RECORDS, MOST_STEPS, MOST_SAMPLES, MOST_FRAMES = 5_000_000, 2_000_000_000, 5_000_000, 20_000
+ACCELEROMETER_MOUNT = "suba"
+Faults = list[tuple[str, object, str]]
 
 
 class TimeSpan(Section):
     """When the flight starts and stops, and how finely it is integrated and recorded, s."""
 
-    start_s: float
-    stop_s: float
-    inflated_s: float | None = None
-    telemetry_from_s: float
-    step_s: Positive = 0.002
-    record_s: Positive = 0.004
+    start_s: Time
+    stop_s: Time
+    inflated_s: Time | None = None
+    telemetry_from_s: Time
+    step_s: Duration = 0.002
+    record_s: Duration = 0.004
 
     @model_validator(mode="after")
     def _ordered(self) -> TimeSpan:
+        faults: Faults = []
+        span, record, step = self.stop_s - self.start_s, self.record_s, self.step_s
         if not self.start_s <= self.telemetry_from_s < self.stop_s:
-            raise ValueError("start_s <= telemetry_from_s < stop_s is wanted")
+            words = f"start_s = {self.start_s:g} <= telemetry_from_s < stop_s = {self.stop_s:g} is wanted"
+            faults.append(("telemetry_from_s", self.telemetry_from_s, words))
+        if span <= 0.0:
+            raise KeyFaults([*faults, ("stop_s", self.stop_s, f"after start_s = {self.start_s:g} is wanted")])
+        if not _is_whole(record / step):
+            words = f"a whole multiple of step_s = {step:g} is wanted; try {max(1, round(record / step)) * step:.12g}"
+            faults.append(("record_s", record, words))
+        if not _is_whole(span / record):
+            words = f"a whole part of the flight of {span:g} s is wanted; try {span / max(1, round(span / record)):.9g}"
+            faults.append(("record_s", record, f"{words}, or another stop_s"))
+        if span / record > MOST_RECORDS:
+            words = f"{span / record:.2g} records, {span / record * 304e-9:.1f} GB, where {MOST_RECORDS} are the most"
+            faults.append(("record_s", record, f"{words}; at least {span / MOST_RECORDS:.2g} s is wanted"))
+        if span / step > MOST_STEPS:
+            words = f"{span / step:.2g} steps, hours of computing, where {MOST_STEPS:.0e} are the most"
+            faults.append(("step_s", step, f"{words}; at least {span / MOST_STEPS:.2g} s is wanted"))
+        if faults:
+            raise KeyFaults(faults)
         return self
+
+
+def _is_whole(ratio: float) -> bool:
+    return ratio > 0.5 and abs(ratio - round(ratio)) < 1e-6 * max(1.0, ratio * 1e-3)
 
 
 class Initial(Section):
     """Composite c.g. at the start: place, velocity relative to the Earth, nose direction in north-east-down, spin."""
 
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-    speed_mps: Positive
-    flight_path_deg: float
-    azimuth_deg: float
-    nose_azimuth_deg: float
-    nose_elevation_deg: float
-    roll_deg: float = 0.0
-    spin_rpm: float = 0.0
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    altitude_m: Altitude
+    speed_mps: Annotated[float, Field(ge=1.0, le=2e4)]
+    flight_path_deg: Elevation
+    azimuth_deg: Angle
+    nose_azimuth_deg: Angle
+    nose_elevation_deg: Elevation
+    roll_deg: Angle = 0.0
+    spin_rpm: Annotated[float, Field(ge=-1000.0, le=1000.0)] = 0.0
 
 
 class ScenarioFile(Section):
@@ -72,11 +111,66 @@ class ScenarioFile(Section):
     atmosphere: DayAtmosphere
     accelerometer: Accelerometer
     rates: Rates
-    radars: dict[str, Radar]
+    radars: dict[Name, Radar]
     magnetometer: Magnetometer | None = None
     sun: SunSensors | None = None
     video: Video | None = None
     attitude_prior: Attitude
+
+    @field_validator("t0_utc")
+    @classmethod
+    def _parses(cls, value: str) -> str:
+        try:
+            parse_utc(value)
+        except (ValueError, OverflowError):
+            raise ValueError("an ISO 8601 time such as 2009-08-17T12:52:00Z is wanted") from None
+        return value
+
+    @field_validator("radars")
+    @classmethod
+    def _at_least_one(cls, value: dict[str, Radar]) -> dict[str, Radar]:
+        if not value:
+            raise ValueError("at least one radar is wanted: give a table [radars.<name>]")
+        return value
+
+    @model_validator(mode="after")
+    def _in_time(self) -> ScenarioFile:
+        start, stop = self.time.telemetry_from_s, self.time.stop_s
+        words, faults = f"a time of the telemetry, {start:g} to {stop:g} s, is wanted", Faults()
+        if not start <= self.attitude_prior.t_s <= stop:
+            faults.append(("attitude_prior.t_s", self.attitude_prior.t_s, words))
+        instruments: dict[str, Triad | SunSensors | Radar | None] = {
+            "accelerometer": self.accelerometer,
+            "rates": self.rates,
+            "magnetometer": self.magnetometer,
+            "sun": self.sun,
+            **{f"radars.{name}": radar for name, radar in self.radars.items()},
+        }
+        for name, part in instruments.items():
+            if part is not None:
+                offset = part.offset_s if isinstance(part, Radar) else 0.0
+                faults += _rate_faults(name, part.rate_hz, stop - start - offset)
+        if self.video is not None:
+            times = ("start_s", "stop_s")
+            outside = [(f"video.{k}", getattr(self.video, k)) for k in times]
+            faults += [(key, value, words) for key, value in outside if not start <= value <= stop]
+            count = (self.video.stop_s - self.video.start_s) * self.video.rate_hz
+            if count > MOST_FRAMES:
+                faults.append(("video.rate_hz", self.video.rate_hz, f"{count:.2g} frames, at most {MOST_FRAMES}"))
+        if faults:
+            raise KeyFaults(faults)
+        return self
+
+
+def _rate_faults(name: str, rate_hz: float, span_s: float) -> Faults:
+    count = rate_hz * span_s
+    if count > MOST_SAMPLES:
+        return [(f"{name}.rate_hz", rate_hz, f"{count:.2g} samples, at most {MOST_SAMPLES}; lower the rate")]
+    if count < 2.0:
+        return [
+            (f"{name}.rate_hz", rate_hz, f"fewer than three samples in the telemetry's {span_s:g} s; raise the rate")
+        ]
+    return []
 
 
 @dataclass(frozen=True)
@@ -95,12 +189,48 @@ def shipped_scenarios() -> list[str]:
 
 def read_scenario(name: str) -> Scenario:
     """Read a scenario: a path to a TOML file, or the name of one that ships with the toolkit."""
+    shipped = shipped_scenarios()
+    if not name.endswith(".toml") and name not in shipped:
+        hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
+        raise ConfigError(f"no scenario '{name}'{hint}")
     path = Path(name) if name.endswith(".toml") else DATA / "scenarios" / f"{name}.toml"
-    if not path.exists():
-        shipped = shipped_scenarios()
-        raise ConfigError(f"no scenario '{name}'{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}")
-    spec = parse_section(ScenarioFile, read_toml(path), str(path))
-    return Scenario(spec, vehicle_from_toml(vehicle_path(spec.vehicle, path.parent)), path)
+    tables = read_toml(path)
+    spec, vehicle, faults = None, None, []
+    try:
+        spec = parse_section(ScenarioFile, tables, str(path))
+    except ConfigError as fault:
+        faults += fault.faults
+    try:
+        if isinstance(tables.get("vehicle"), str):
+            vehicle = vehicle_from_toml(vehicle_path(tables["vehicle"], path.parent))
+    except GateError as fault:
+        if spec is not None:
+            raise
+        faults += fault.faults
+    if spec is not None and vehicle is not None:
+        faults += check_against_vehicle(spec, vehicle, path)
+        if not faults:
+            return Scenario(spec, vehicle, path)
+    raise ConfigError(faults)
+
+
+def check_against_vehicle(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[str]:
+    """Say which sensor packages and cameras the scenario ``path`` needs and the vehicle lacks."""
+    packages, cameras = list(vehicle.sensors), list(vehicle.cameras)
+    faults = []
+    if ACCELEROMETER_MOUNT not in packages:
+        wanted = f"key 'sensors.{ACCELEROMETER_MOUNT}' is missing: the accelerometer's package"
+        faults.append(f"{vehicle.source}: {wanted}; known there: {', '.join(packages) or 'none'}")
+    needed = []
+    if spec.magnetometer is not None:
+        needed.append(("magnetometer.mount", spec.magnetometer.mount, packages, "sensors"))
+    if spec.video is not None:
+        needed.append(("video.camera", spec.video.camera, cameras, "cameras"))
+    for key, name, known, table in needed:
+        if name not in known:
+            hint = f"{nearest_name(name, known)}; known there: {', '.join(known) or 'none'}"
+            faults.append(f"{path}: key '{key}' = {name!r}: {vehicle.source} has no [{table}.{name}]{hint}")
+    return faults
 
 
 def child_rng(seed: int, name: str) -> np.random.Generator:
