@@ -32,6 +32,7 @@ from flightmodel.config import (
 from flightmodel.instruments import dcm_body_from_clocking
 
 DATA = Path(__file__).parent / "data"
+SAME_SHAPE = 0.1  # the cone of the coefficients may be an effective one, but not another vehicle's
 Stiffness = Annotated[float, Field(ge=0.0, le=1e15)]
 Damping = Annotated[float, Field(ge=0.0, le=1e12)]
 Metres = Annotated[float, Field(ge=0.0, le=10.0)]
@@ -192,6 +193,21 @@ class _VehicleFile(Section):
     geometry: ShellGeometry
     sensors: dict[Name, SensorMount] = {}
     cameras: dict[Name, CameraMount] = {}
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> _VehicleFile:
+        cone, shell = self.aerodynamics.sphere_cone, self.geometry
+        if cone is None:
+            return self
+        faults: list[tuple[str, object, str]] = []
+        for key in ("half_angle_deg", "nose_radius_m", "base_radius_m"):
+            flown, drawn = getattr(cone, key), getattr(shell, key)
+            if abs(flown - drawn) > SAME_SHAPE * drawn:
+                words = f"geometry.{key} = {drawn:g} of the same shell; within {100 * SAME_SHAPE:.0f} % is wanted"
+                faults.append((f"aerodynamics.sphere_cone.{key}", flown, words))
+        if faults:
+            raise KeyFaults(faults)
+        return self
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from flightmodel import rotations
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.geomagnetism_and_sun import sun_direction_ecef
 from synthetic_flight import day_air, events, radar_sensing, sensing, sun_sensing, video
-from synthetic_flight.instrument_sections import Magnetometer, Radar, SunSensors
+from synthetic_flight.flight_toml import write_flight_toml
 from synthetic_flight.scenarios import Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
@@ -131,7 +131,7 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     _csv(telemetry / "rates.csv", {"t_s": at, **_named("{}_body_degps", "pqr", np.rad2deg(rate))}, "%.6f")
     _write_attitude_sensors(scenario, seed, truth, telemetry)
     for name, radar in spec.radars.items():
-        at, rae = radar_sensing.sense_radar(truth, radar, start, child_rng(seed, name))
+        at, rae = radar_sensing.sense_radar(truth, radar, start, child_rng(seed, name), name)
         columns = {"t_s": at, "range_m": rae[:, 0], "az_deg": np.rad2deg(rae[:, 1]), "el_deg": np.rad2deg(rae[:, 2])}
         _csv(telemetry / f"radar_{name}.csv", columns, "%.6f")
     z, air, wind = day_air.sense_atmosphere(truth.profile, spec.atmosphere, child_rng(seed, "sounding"))
@@ -141,7 +141,7 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     _write_truth(scenario, seed, truth, folder / "truth")
     if spec.video is not None:
         _write_video(scenario, seed, truth, telemetry, report)
-    (folder / "flight.toml").write_text(_flight_toml(scenario, q_prior))
+    write_flight_toml(scenario, q_prior, folder)
 
 
 def _write_attitude_sensors(scenario: Scenario, seed: int, truth: Truth, telemetry: Path) -> None:
@@ -230,114 +230,3 @@ def sun_direction_body(truth: Truth, at_s: FloatArray) -> FloatArray:
     """Unit vectors ``(n, 3)`` towards the Sun in body axes."""
     q = rotations.slerp(truth.time_s, truth.trajectory.q_ecef_body, at_s)
     return rotations.rotate(rotations.conjugate(q), sun_direction_ecef(truth.trajectory.epoch_utc, at_s))
-
-
-def _flight_toml(scenario: Scenario, q_prior: FloatArray) -> str:
-    """Return ``flight.toml`` with nominal errors: what an analyst would be told, nothing that was drawn."""
-    spec = scenario.spec
-    # a vehicle that ships is named; a vehicle of the user's own must be put beside flight.toml by its path
-    vehicle = (
-        spec.vehicle if not spec.vehicle.endswith(".toml") else str((scenario.source.parent / spec.vehicle).resolve())
-    )
-    acc, gyro = spec.accelerometer, spec.rates
-    lines = [
-        "# SYNTHETIC flight, written by postflight simulate. Nothing in truth/ may be used to estimate.",
-        f"name = {json.dumps(spec.name)}",
-        f"t0_utc = {json.dumps(spec.t0_utc)}",
-        f"vehicle = {json.dumps(vehicle)}",
-        "synthetic = true",
-        "",
-        "[attitude_prior]",
-        f"t_s = {spec.attitude_prior.t_s}",
-        f"q_ecef_body = [{', '.join(f'{x:.6f}' for x in q_prior)}]",
-        f"sd_deg = {spec.attitude_prior.sd_deg}",
-        "",
-        "[sensors.accelerometer]",
-        'file = "telemetry/accelerometer.csv"',
-        'mount = "suba"',
-        f"noise_sd_mps2 = {acc.noise_mps2}",
-        f"bias_sd_mps2 = {acc.bias_mps2}",
-        f"scale_sd = {acc.scale}",
-        f"mount_sd_deg = {acc.mount_deg}",
-        f"resolution_mps2 = {acc.resolution_mps2}",
-        "",
-        "[sensors.rates]",
-        'file = "telemetry/rates.csv"',
-        f"noise_sd_degps = {gyro.noise_degps}",
-        f"bias_sd_degps = {gyro.bias_degps}",
-        f"scale_sd = {gyro.scale}",
-        f"mount_sd_deg = {gyro.mount_deg}",
-        f"resolution_degps = {gyro.resolution_degps}",
-    ]
-    lines += _magnetometer_lines(spec.magnetometer) + _sun_lines(spec.sun)
-    for name, radar in spec.radars.items():
-        lines += [
-            "",
-            f"[radars.{name}]",
-            f'file = "telemetry/radar_{name}.csv"',
-            f"latitude_deg = {radar.latitude_deg}",
-            f"longitude_deg = {radar.longitude_deg}",
-            f"height_m = {radar.height_m}",
-            f"range_sd_m = {radar.range_sd_m}",
-            f"angle_sd_deg = {radar.angle_sd_deg}",
-            f"range_bias_sd_m = {radar.range_bias_m}",
-            f"angle_bias_sd_deg = {radar.angle_bias_deg}",
-            f"time_bias_sd_s = {radar.time_bias_s}",
-            *_pedestal_lines(radar),
-        ]
-    lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
-    if spec.video is not None:
-        lines += [
-            "",
-            "[frames]",
-            'file = "telemetry/frames.csv"',
-            f'folder = "telemetry/{spec.video.camera}"',
-            f'camera = "{spec.video.camera}"',
-            f"benchmark_s = {spec.video.benchmark_s}",
-        ]
-    if spec.time.inflated_s is not None and spec.time.inflated_s >= spec.time.telemetry_from_s:
-        lines += ["", "[[events]]", 'name = "aeroshell inflated"', f"t_s = {spec.time.inflated_s}"]
-    return "\n".join(lines) + "\n"
-
-
-def _magnetometer_lines(spec: Magnetometer | None) -> list[str]:
-    if spec is None:
-        return []
-    return [
-        "",
-        "[sensors.magnetometer]",
-        'file = "telemetry/magnetometer.csv"',
-        f'mount = "{spec.mount}"',
-        f"noise_sd_ut = {spec.noise_ut}",
-        # the analyst is told one number for electronics and hard iron together
-        f"bias_sd_ut = {np.hypot(spec.bias_ut, spec.hard_iron_ut):.4g}",
-        f"scale_sd = {spec.scale}",
-        f"soft_iron_sd = {spec.soft_iron}",
-        f"mount_sd_deg = {spec.mount_deg}",
-        f"resolution_ut = {spec.resolution_ut}",
-    ]
-
-
-def _sun_lines(spec: SunSensors | None) -> list[str]:
-    if spec is None:
-        return []
-    return [
-        "",
-        "[sensors.sun]",
-        'file = "telemetry/sun.csv"',
-        f"heads_lv_deg = [{', '.join(str(clock) for clock in spec.heads_lv_deg)}]",
-        f"field_deg = {spec.field_deg}",
-        f"noise_sd_deg = {spec.noise_deg}",
-        f"bias_sd_deg = {spec.bias_deg}",
-        f"mount_sd_deg = {spec.mount_deg}",
-    ]
-
-
-def _pedestal_lines(radar: Radar) -> list[str]:
-    """Systematic errors that are there; a radar without any is described as it always was."""
-    terms = ("mislevel", "droop", "skew", "nonorthogonality", "wander")
-    sizes = {name: getattr(radar, f"{name}_deg") for name in terms}
-    lines = [f"{name}_sd_deg = {size}" for name, size in sizes.items() if size > 0.0]
-    if radar.wander_deg > 0.0:
-        lines.append(f"wander_time_constant_s = {radar.wander_time_constant_s}")
-    return ([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []) + lines

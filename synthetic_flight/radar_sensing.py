@@ -22,7 +22,7 @@ from scipy.constants import speed_of_light
 from scipy.interpolate import CubicHermiteSpline
 
 from flightmodel import earth, rotations
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, GateError
 from flightmodel.refraction import refracted
 from synthetic_flight.instrument_sections import Radar
 from synthetic_flight.sensing import sample_times
@@ -32,13 +32,25 @@ from synthetic_flight.triad_errors import BUTTERWORTH, child, filtered, gauss_ma
 LOWEST_RAD = np.deg2rad(0.5)
 
 
-def sense_radar(truth: Truth, spec: Radar, start_s: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def sense_radar(
+    truth: Truth, spec: Radar, start_s: float, rng: np.random.Generator, name: str = "radar"
+) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and slant range m, azimuth, elevation rad ``(n, 3)`` of the vehicle's true c.g. (or its datum).
 
     Angle noise is that of the beam: across the line of sight, so azimuth scatters by ``1 / cos(elevation)`` more. A
     positive time bias stamps a point later than it was measured.
+
+    Raises
+    ------
+    GateError
+        Where fewer than two points are left, with ``name`` and what took them.
     """
     at = sample_times(start_s, truth.time_s[-1] - 0.05, spec.rate_hz, spec.offset_s)
+    if len(at) < 2:
+        raise GateError(
+            f"radars.{name}: {len(at)} points from {start_s + spec.offset_s:g} s to the flight's end at "
+            f"{truth.time_s[-1]:.2f} s; two are the least: raise rate_hz or lower offset_s"
+        )
     bias_sd = np.array([spec.range_bias_m, *np.deg2rad([spec.angle_bias_deg] * 2)])
     bias = bias_sd * rng.standard_normal(3)
     late = spec.time_bias_s * rng.standard_normal()
@@ -57,10 +69,17 @@ def sense_radar(truth: Truth, spec: Radar, start_s: float, rng: np.random.Genera
     keep = np.ones(len(at), dtype=bool)
     if spec.dropouts:
         keep &= kept(at, spec.dropouts.errors, child(rng, "dropouts"))
-    if spec.max_range_m is not None:
-        keep &= arrived[:, 0] <= spec.max_range_m
-    if spec.min_elevation_deg is not None:
-        keep &= arrived[:, 2] >= np.deg2rad(spec.min_elevation_deg)
+    near = np.full(len(at), True) if spec.max_range_m is None else arrived[:, 0] <= spec.max_range_m
+    above = arrived[:, 2] >= np.deg2rad(spec.min_elevation_deg)
+    if (keep & near & above).sum() < 2:
+        highest, nearest = np.rad2deg(arrived[:, 2].max()), arrived[:, 0].min()
+        raise GateError(
+            f"radars.{name}: fewer than two of {len(at)} points are tracked; elevation is {highest:.2f} deg at most "
+            f"(min_elevation_deg = {spec.min_elevation_deg:g}), range {nearest:.0f} m at least (max_range_m = "
+            f"{'none' if spec.max_range_m is None else format(spec.max_range_m, 'g')}), dropouts take "
+            f"{(~keep).sum()}; put the radar elsewhere or leave it out"
+        )
+    keep &= near & above
     return at[keep], measured[keep]
 
 

@@ -195,7 +195,8 @@ def read_scenario(name: str) -> Scenario:
         raise ConfigError(f"no scenario '{name}'{hint}")
     path = Path(name) if name.endswith(".toml") else DATA / "scenarios" / f"{name}.toml"
     tables = read_toml(path)
-    spec, vehicle, faults = None, None, []
+    spec, vehicle = None, None
+    faults: list[str] = []
     try:
         spec = parse_section(ScenarioFile, tables, str(path))
     except ConfigError as fault:
