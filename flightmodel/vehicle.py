@@ -36,7 +36,7 @@ SAME_SHAPE = 0.1  # the cone of the coefficients may be an effective one, but no
 Stiffness = Annotated[float, Field(ge=0.0, le=1e15)]
 Damping = Annotated[float, Field(ge=0.0, le=1e12)]
 Metres = Annotated[float, Field(ge=0.0, le=10.0)]
-Inertia = Annotated[float, Field(ge=-1e9, le=1e9)]
+Inertia = Annotated[float, Field(ge=-1e15, le=1e15)]
 Pixels = Annotated[float, Field(ge=-1e5, le=1e5)]
 Focal = Annotated[float, Field(gt=0.0, le=1e5)]
 Distortion = Annotated[float, Field(ge=-100.0, le=100.0)]
@@ -54,7 +54,7 @@ class Reference(Section):
 class MassProperties(Section):
     """Mass, c.g. from the datum in body axes, inertia tensor about the body's own c.g. in body axes."""
 
-    mass_kg: Annotated[float, Field(gt=0.0, le=1e6)]
+    mass_kg: Annotated[float, Field(gt=0.0, le=1e12)]
     cg_from_datum_body_m: Vector
     inertia_kgm2: tuple[InertiaRow, InertiaRow, InertiaRow]
 
