@@ -92,16 +92,16 @@ SectionT = TypeVar("SectionT", bound=Section)
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file, or raise `ConfigError` with the file, line and column."""
+    if "\0" in str(path):
+        raise ConfigError(f"{str(path)!r}: a path holds no NUL character")
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except RecursionError:
         raise ConfigError(f"{path}: not valid TOML: arrays or tables lie too deep in each other") from None
-    except ValueError as fault:
-        # also integers of thousands of digits, and a NUL in the path
-        name = repr(str(path)) if "\0" in str(path) else str(path)
-        raise ConfigError(f"{name}: not valid TOML: {fault}") from None
+    except ValueError as fault:  # also integers of thousands of digits
+        raise ConfigError(f"{path}: not valid TOML: {fault}") from None
     except OSError as fault:
         raise ConfigError(f"{path}: cannot be read: {fault.strerror or fault}") from None
 

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from flightmodel.config import (
     Angle,
@@ -27,10 +27,17 @@ from flightmodel.config import (
 from flightmodel.refraction import Refractivity
 from synthetic_flight.triad_errors import DropoutErrors, TriadErrors
 
+
+def _none_or_some(hertz: float) -> float:
+    if 0.0 < hertz < 1e-3:
+        raise ValueError("0 for none, or at least 0.001 Hz is wanted")
+    return hertz
+
+
 # sizes of errors: of triads in their own everyday unit, of ranges in metres
 Size = Annotated[float, Field(ge=0.0, le=1e4)]
 RangeError = Annotated[float, Field(ge=0.0, le=1e4)]
-Bandwidth = Annotated[float, Field(ge=0.0, le=1e5)]
+Bandwidth = Annotated[float, Field(ge=0.0, le=1e5), AfterValidator(_none_or_some)]
 Delay = Annotated[float, Field(ge=-10.0, le=10.0)]
 TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
 Limit = Annotated[float, Field(gt=0.0, le=1e6)]
