@@ -357,6 +357,8 @@ def test_events_lie_on_the_truth(simulate):
     assert events.loc["40 km", "alt_m"] == pytest.approx(40e3, abs=1e-3)
     assert events.loc["Mach 1", "mach"] == pytest.approx(1.0, abs=1e-6)
     low = {"altitude_m = 60000.0": "altitude_m = 250.0", "speed_mps = 1400.0": "speed_mps = 20.0"}
+    # the radar is 100 km off: the last of the fall is below its horizon
+    low |= {"height_m = 12.0": "height_m = 12.0\nmin_elevation_deg = -2.0"}
     sea = table(simulate(low | {"stop_s = 8.0": "stop_s = 60.0"}, name="sea"), "truth/events").set_index("event")
     assert sea.loc["splashdown", "alt_m"] == pytest.approx(0.0, abs=1e-3)
 
