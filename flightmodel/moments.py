@@ -64,6 +64,15 @@ def first_fall(time_s: FloatArray, values: FloatArray, level: float, allowed: Bo
     return float(brentq(fit, low, high, xtol=1e-12))
 
 
+def splashdown_index(altitude_m: FloatArray) -> int | None:
+    """Count of the records up to and with the first at or below zero height after one above; None where none is.
+
+    A flight that keeps ``records[:splashdown_index]`` ends at the sea, and its last step holds the moment itself.
+    """
+    fell = (altitude_m[:-1] > 0.0) & (altitude_m[1:] <= 0.0)
+    return int(np.argmax(fell)) + 2 if fell.any() else None
+
+
 def values_at(time_s: FloatArray, columns: FloatArray, at_s: float) -> FloatArray:
     """Columns ``(n, m)`` at one time inside the records, ``(m,)``, by the cubic through four samples around it."""
     k = int(np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2))

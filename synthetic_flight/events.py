@@ -54,15 +54,6 @@ class Event:
     sensed_g: float
 
 
-def splashdown_index(altitude_m: FloatArray) -> int | None:
-    """Count of the records up to and with the first at or below zero height after one above; None where none is.
-
-    A flight that keeps ``records[:splashdown_index]`` ends at the sea, and its last step holds the moment itself.
-    """
-    fell = (altitude_m[:-1] > 0.0) & (altitude_m[1:] <= 0.0)
-    return int(np.argmax(fell)) + 2 if fell.any() else None
-
-
 def heat_flux(density_kgpm3: FloatArray, airspeed_mps: FloatArray, nose_radius_m: float) -> FloatArray:
     """Stagnation-point convective heat flux of a cold wall, W/m^2 (Sutton and Graves)."""
     return SUTTON_GRAVES * np.sqrt(density_kgpm3 / nose_radius_m) * airspeed_mps**3
@@ -77,7 +68,7 @@ def flight_events(truth: Truth, inflated_s: float | None = None) -> list[Event]:
     inflated_s : float or None
         When the joint was unlocked; no inflation is named without it.
     """
-    whole = splashdown_index(truth.altitude_m)
+    whole = moments.splashdown_index(truth.altitude_m)
     rows = slice(0, whole)
     t, altitude = truth.time_s[rows], truth.altitude_m[rows]
     density, pressure = truth.density_kgpm3[rows], truth.dynamic_pressure_pa[rows]

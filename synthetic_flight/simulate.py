@@ -14,11 +14,11 @@ from flightmodel import airdata, earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import ConfigError, FloatArray, check_finite
 from flightmodel.deflection import DeflectionHistory, lv_clock
+from flightmodel.moments import splashdown_index
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import _kernels, dynamics, packing
 from synthetic_flight._workspace_kernels import AUX, STATES
-from synthetic_flight.events import splashdown_index
 from synthetic_flight.step_size import check_step
 
 BENDING_LIMIT_RAD = 0.5 * np.pi
