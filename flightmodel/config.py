@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -155,3 +156,9 @@ def _keys_beside(model: Any, path: list[str]) -> list[str]:
                 break
             model = inner[-1]
     return list(model.model_fields) if hasattr(model, "model_fields") else []
+
+
+def parse_utc(text: str) -> datetime:
+    """Return an aware UTC time from ISO text; ValueError where it is none."""
+    stamp = datetime.fromisoformat(text.replace("Z", "+00:00"))
+    return stamp.astimezone(UTC) if stamp.tzinfo else stamp.replace(tzinfo=UTC)

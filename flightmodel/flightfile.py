@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,7 +9,7 @@ from pydantic import Field, field_validator
 
 from flightmodel.checks import ConfigError
 from flightmodel.columns import UNITS, Declared, TimeColumn
-from flightmodel.config import Section, parse_section, read_toml
+from flightmodel.config import Section, parse_section, parse_utc, read_toml
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -182,12 +181,6 @@ class FlightFile(Section):
         if not value:
             raise ValueError("at least one radar is needed")
         return value
-
-
-def parse_utc(text: str) -> datetime:
-    """Return an aware UTC time from ISO text; ValueError where it is none."""
-    stamp = datetime.fromisoformat(text.replace("Z", "+00:00"))
-    return stamp.astimezone(UTC) if stamp.tzinfo else stamp.replace(tzinfo=UTC)
 
 
 def read_flight_file(folder: Path) -> FlightFile:

@@ -13,6 +13,7 @@ import numpy as np
 
 from flightmodel import columns
 from flightmodel.checks import GateError, nearest_name
+from flightmodel.config import parse_utc
 from flightmodel.findings import find_faults
 from flightmodel.flightfile import (
     FlightFile,
@@ -22,7 +23,6 @@ from flightmodel.flightfile import (
     RatesEntry,
     SunEntry,
     TriadEntry,
-    parse_utc,
     read_flight_file,
 )
 from flightmodel.gate import Gate

@@ -23,7 +23,7 @@ import numpy as np
 
 from flightmodel import earth
 from flightmodel.checks import BoolArray, FloatArray, GateError
-from flightmodel.flightfile import parse_utc
+from flightmodel.config import parse_utc
 
 IGRF_FROM, IGRF_TO = datetime(1900, 1, 1, tzinfo=UTC), datetime(2030, 1, 1, tzinfo=UTC)
 # along a path the field is evaluated at least this often and interpolated: a bent path (14 km radius at apogee) leaves

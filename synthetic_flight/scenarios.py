@@ -22,9 +22,9 @@ from flightmodel.config import (
     Section,
     Time,
     parse_section,
+    parse_utc,
     read_toml,
 )
-from flightmodel.flightfile import parse_utc
 from flightmodel.vehicle import DATA, Vehicle, vehicle_from_toml, vehicle_path
 from synthetic_flight.day_air import DayAtmosphere, day_atmosphere
 from synthetic_flight.instrument_sections import (

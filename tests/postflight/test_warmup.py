@@ -57,3 +57,14 @@ def test_without_a_folder_to_keep_kernels_in_warmup_says_so(tmp_path):
     done = subprocess.run(run, env=environment, capture_output=True, text=True)
     assert done.returncode == 3
     assert "set XDG_CACHE_HOME or NUMBA_CACHE_DIR" in done.stderr
+
+
+def test_a_scenario_is_read_without_the_libraries_that_only_tables_and_filters_need():
+    # each takes a quarter of a second or more to import, which a first flight would wait for
+    heavy = ("pandas", "scipy.interpolate", "scipy.signal", "scipy.stats", "cv2", "matplotlib", "ppigrf")
+    code = (
+        "import sys; from synthetic_flight.scenarios import fly_scenario, read_scenario; "
+        f"read_scenario('irve2_reference'); print([m for m in {heavy} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
