@@ -257,11 +257,11 @@ def initial_state(scenario: Scenario) -> FloatArray:
     position = earth.ecef_from_geodetic(lat, lon, spec.altitude_m)
     heading = np.array([np.cos(path) * np.cos(azimuth), np.cos(path) * np.sin(azimuth), -np.sin(path)])
     velocity = earth.ecef_from_ned(spec.speed_mps * heading, position)
-    nose = np.array([np.cos(nose_el) * np.cos(nose_az), np.cos(nose_el) * np.sin(nose_az), -np.sin(nose_el)])
-    right = np.array([-np.sin(nose_az), np.cos(nose_az), 0.0])
-    q_ned_body = rotations.q_from_dcm(np.column_stack([nose, right, np.cross(nose, right)])[None])[0]
-    q_ecef_ned = rotations.q_from_dcm(earth.dcm_ned_ecef(lat, lon).T[None])[0]
-    q = rotations.multiply(rotations.multiply(q_ecef_ned, q_ned_body), rotations.exp(np.array([roll, 0.0, 0.0])))
+    # ECEF from north-east-down, then azimuth, elevation, roll of the nose
+    turns = [(2, lon), (1, -0.5 * np.pi - lat), (2, nose_az), (1, nose_el), (0, roll)]
+    q = np.array([1.0, 0.0, 0.0, 0.0])
+    for axis, angle in turns:
+        q = rotations.multiply(q, rotations.exp(angle * np.eye(3)[axis]))
     omega = np.array([spec.spin_rpm * 2.0 * np.pi / 60.0, 0.0, 0.0])
     return state_from_ecef(start, position, velocity, q, omega)
 
