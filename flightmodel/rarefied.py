@@ -41,8 +41,11 @@ def knudsen(density_kgpm3: FloatArray | float, length_m: float) -> FloatArray:
 
 def bridge(knudsen_number: FloatArray | float) -> FloatArray:
     """Share of the free-molecular coefficients, 0 to 1 ``(...)``: sin^2 in log10 Kn between 1e-3 and 10."""
-    decade = np.log10(np.clip(np.asarray(knudsen_number, dtype=float), KN_CONTINUUM, KN_FREE))
-    return np.sin(0.5 * np.pi * (decade + 3.0) / 4.0) ** 2
+    kn = np.asarray(knudsen_number, dtype=float)
+    share = np.where(kn >= KN_FREE, 1.0, 0.0)
+    between = (kn > KN_CONTINUUM) & (kn < KN_FREE)
+    share[between] = np.sin(0.5 * np.pi * (np.log10(kn[between]) + 3.0) / 4.0) ** 2
+    return share[()]
 
 
 def wall_speed_ratio(wall_temperature_k: float, speed_mps: float) -> float:
