@@ -125,6 +125,7 @@ def atan2(y, x):
 
 @inlined
 def rotation(q0, q1, q2, q3):
+    """Direction cosine matrix of a unit quaternion, nine numbers by rows."""
     return (
         1.0 - 2.0 * (q2 * q2 + q3 * q3), 2.0 * (q1 * q2 - q0 * q3), 2.0 * (q1 * q3 + q0 * q2),
         2.0 * (q1 * q2 + q0 * q3), 1.0 - 2.0 * (q1 * q1 + q3 * q3), 2.0 * (q2 * q3 - q0 * q1),
@@ -190,15 +191,10 @@ def gyroscopic(inertia, w0, w1, w2):
 @inlined
 def dcm_from_quaternion(w, x, y, z, out):
     """Direction cosine matrix of a unit quaternion, into ``out`` (3, 3)."""
-    out[0, 0] = 1.0 - 2.0 * (y * y + z * z)
-    out[0, 1] = 2.0 * (x * y - w * z)
-    out[0, 2] = 2.0 * (x * z + w * y)
-    out[1, 0] = 2.0 * (x * y + w * z)
-    out[1, 1] = 1.0 - 2.0 * (x * x + z * z)
-    out[1, 2] = 2.0 * (y * z - w * x)
-    out[2, 0] = 2.0 * (x * z - w * y)
-    out[2, 1] = 2.0 * (y * z + w * x)
-    out[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    m = rotation(w, x, y, z)
+    out[0, 0], out[0, 1], out[0, 2] = m[0], m[1], m[2]
+    out[1, 0], out[1, 1], out[1, 2] = m[3], m[4], m[5]
+    out[2, 0], out[2, 1], out[2, 2] = m[6], m[7], m[8]
 
 
 @inlined

@@ -17,29 +17,33 @@ import numpy as np
 
 from flightmodel import earth
 from flightmodel._kernels import CACHE
-from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from flightmodel.checks import FloatArray
+from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
+
+
+def _vehicle_at_rest() -> tuple[Vehicle, FloatArray]:
+    from synthetic_flight.simulate import state_from_ecef
+
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    state = state_from_ecef(0.0, np.array([7e6, 0.0, 0.0]), np.zeros(3), level, np.zeros(3))
+    return vehicle_from_toml(vehicle_path("irve2_reference")), state
 
 
 def _simulator() -> None:
     from synthetic_flight._air_kernels import gauss_markov
     from synthetic_flight.packing import vacuum_table
-    from synthetic_flight.simulate import integrate, state_from_ecef
+    from synthetic_flight.simulate import integrate
 
-    vehicle = vehicle_from_toml(vehicle_path("irve2_reference"))
-    level = np.array([1.0, 0.0, 0.0, 0.0])
-    state = state_from_ecef(0.0, np.array([7e6, 0.0, 0.0]), np.zeros(3), level, np.zeros(3))
+    vehicle, state = _vehicle_at_rest()
     integrate(vehicle, vacuum_table(), state, 0.001, 1, 2)
-    gauss_markov(np.zeros(1), np.zeros(2), np.zeros(2))
+    gauss_markov(np.zeros(1), np.zeros((2, 1)), np.zeros((2, 1)))
 
 
 def _ensembles() -> None:
     from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
     from synthetic_flight.packing import parameter_vector, vacuum_table
-    from synthetic_flight.simulate import state_from_ecef
 
-    vehicle = vehicle_from_toml(vehicle_path("irve2_reference"))
-    level = np.array([1.0, 0.0, 0.0, 0.0])
-    state = state_from_ecef(0.0, np.array([7e6, 0.0, 0.0]), np.zeros(3), level, np.zeros(3))
+    vehicle, state = _vehicle_at_rest()
     start = Start(state, parameter_vector(vehicle), vacuum_table())
     list(fly_ensemble(vehicle, lambda _run: start, [0], Schedule(0.001, 1, 2)))
 

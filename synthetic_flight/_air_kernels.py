@@ -51,7 +51,7 @@ def air(s, lanes, atmosphere, grid):
         f = min(u - k, 1.0)
         # e^x of a small x: a 50 m step of the table changes density by about 1 %
         x = f * a[k, 1]
-        s[at.RHO * w + i] = a[k, 0] * (1.0 + x * (1.0 + x / 2.0 * (1.0 + x / 3.0 * (1.0 + x / 4.0))))
+        s[at.DENSITY * w + i] = a[k, 0] * (1.0 + x * (1.0 + x / 2.0 * (1.0 + x / 3.0 * (1.0 + x / 4.0))))
         c = _between(_four(a[k, 2:]), _four(a[k + 1, 2:]), f)
         s[at.SOUND * w + i], s[at.NORTH * w + i], s[at.EAST * w + i], s[at.FREE * w + i] = c
 
@@ -81,8 +81,8 @@ def flow(s, lanes):
         speed = math.sqrt(u * u + v * v + z * z)
         at.put(s, at.FLOW, w, i, u, v, z)
         s[at.SPEED * w + i], s[at.LATERAL * w + i], s[at.ALPHA * w + i] = speed, lateral, la.atan2(lateral, u)
-        s[at.MACH * w + i], s[at.DENSITY * w + i] = speed / s[at.SOUND * w + i], s[at.RHO * w + i]
-        s[at.PRESSURE * w + i] = 0.5 * s[at.RHO * w + i] * speed * speed
+        s[at.MACH * w + i] = speed / s[at.SOUND * w + i]
+        s[at.PRESSURE * w + i] = 0.5 * s[at.DENSITY * w + i] * speed * speed
 
 
 @inlined
@@ -124,7 +124,7 @@ def wrench(s, w, i):
     per_lateral = 1.0 / (s[at.LATERAL * w + i] + 1e-12)
     ny, nz = v * per_lateral, z * per_lateral
     qs = s[at.PRESSURE * w + i] * area
-    damping = 0.25 * s[at.RHO * w + i] * speed * area * length * length * cmq  # q S l^2 / (2 V)
+    damping = 0.25 * s[at.DENSITY * w + i] * speed * area * length * length * cmq  # q S l^2 / (2 V)
     # nose-up about n x x_hat = (0, n_z, -n_y)
     turn = qs * length * cm
     wa1, wa2 = s[(at.TRIAL + 18) * w + i], s[(at.TRIAL + 19) * w + i]
@@ -133,7 +133,8 @@ def wrench(s, w, i):
 
 @kernel
 def gauss_markov(keep, white, out):
-    """Noise of unit variance into ``out`` (n,): ``keep`` (n - 1,) of the last value is left in the next."""
-    out[0] = white[0]
-    for k in range(1, len(out)):
-        out[k] = keep[k - 1] * out[k - 1] + math.sqrt(1.0 - keep[k - 1] * keep[k - 1]) * white[k]
+    """Noise of unit variance into ``out`` (n, m): ``keep`` (n - 1,) of the last row is left in the next."""
+    for i in range(out.shape[1]):
+        out[0, i] = white[0, i]
+        for k in range(1, out.shape[0]):
+            out[k, i] = keep[k - 1] * out[k - 1, i] + math.sqrt(1.0 - keep[k - 1] * keep[k - 1]) * white[k, i]

@@ -28,11 +28,11 @@ R_A, C_AB, TWIST = 95, 104, 113
 # in shell axes: body's rate, its arm to the joint, its c.g. from the shell's, gravitation at the shell's c.g. less that
 # at the body's, moment on the shell about its c.g. without the joint's
 RATE_B, ARM_B, BETWEEN, TIDE, SHELL = 115, 118, 121, 124, 127
-# sine and cosine of latitude, of longitude; density, sound, north and east wind, free-molecular fraction
-SIN, COS, SIN_LON, COS_LON, RHO, SOUND, NORTH, EAST, FREE = 130, 131, 132, 133, 134, 135, 136, 137, 138
+# sine and cosine of latitude, of longitude; sound, north and east wind, free-molecular fraction
+SIN, COS, SIN_LON, COS_LON, SOUND, NORTH, EAST, FREE = 130, 131, 132, 133, 134, 135, 136, 137
 # C_A C_N C_m C_mq; flow at the nose, shell axes; its size, its lateral part; Mach bracket of the last look-up
-COEF, FLOW, SPEED, LATERAL, BRACKET = 139, 143, 146, 147, 148
-P = 149
+COEF, FLOW, SPEED, LATERAL, BRACKET = 138, 142, 145, 146, 147
+P = 148
 ROWS = P + PARAMETERS
 
 

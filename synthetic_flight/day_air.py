@@ -28,7 +28,7 @@ from flightmodel.atmosphere import (
 )
 from flightmodel.checks import FloatArray
 from flightmodel.config import Fraction, Section
-from synthetic_flight import _air_kernels
+from synthetic_flight.triad_errors import gauss_markov
 
 Wind = Annotated[float, Field(ge=-500.0, le=500.0)]
 WindSize = Annotated[float, Field(ge=0.0, le=500.0)]
@@ -117,11 +117,7 @@ _AUGUST_WIND = np.array(
 
 def correlated(altitude_m: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:
     """Gauss-Markov noise of unit variance along altitude with a correlation length, m."""
-    step = np.exp(-np.diff(altitude_m) / length_m)
-    white = rng.standard_normal(len(altitude_m))
-    out = np.empty(len(altitude_m))
-    _air_kernels.gauss_markov(step, white, out)
-    return out
+    return gauss_markov(altitude_m, 1.0, length_m, 1, rng)[:, 0]
 
 
 def dryden_transverse(count: int, step_m: float, length_m: float, rng: np.random.Generator) -> FloatArray:

@@ -16,12 +16,9 @@ from itertools import islice
 
 import numpy as np
 
-from flightmodel import earth
 from flightmodel.checks import ConfigError, FloatArray
 from flightmodel.vehicle import Vehicle
-from synthetic_flight import _kernels, packing
-from synthetic_flight._workspace_kernels import AUX, STATES
-from synthetic_flight.simulate import BENDING_LIMIT_RAD
+from synthetic_flight.simulate import integrate_lanes
 from synthetic_flight.step_size import check_step
 
 # two to four vectors of a register each; more lanes outgrow the first-level cache
@@ -118,28 +115,15 @@ def fly_ensemble(
 
 def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule: Schedule) -> list[Flown]:
     padded = starts + [starts[-1]] * (LANES - len(starts))
-    workspace = packing.workspace(np.stack([s.state for s in padded]), np.stack([s.parameters for s in padded]))
     shared = all(s.atmosphere is starts[0].atmosphere for s in starts)
-    air = starts[0].atmosphere[None] if shared else np.stack([s.atmosphere for s in padded])
-    out = np.empty((LANES, schedule.records, STATES))
-    aux = np.empty((LANES, schedule.records, AUX))
-    written = np.zeros(LANES, dtype=np.int64)
-    _kernels.integrate(
-        (0,) * LANES,
-        workspace,
-        packing.kernel_tables(vehicle, air),
-        earth.WGS84,
+    lanes = integrate_lanes(
+        vehicle,
+        starts[0].atmosphere if shared else np.stack([s.atmosphere for s in padded]),
+        np.stack([s.state for s in padded]),
+        np.stack([s.parameters for s in padded]),
         schedule.step_s,
         schedule.per_record,
         schedule.records,
         schedule.lock_records,
-        BENDING_LIMIT_RAD,
-        out,
-        aux,
-        written,
     )
-    flown = []
-    for k, run in enumerate(runs):
-        n = abs(int(written[k]))
-        flown.append(Flown(run, *packing.flown_records(out[k, :n], aux[k, :n]), diverged=bool(written[k] < 0)))
-    return flown
+    return [Flown(run, *lane) for run, lane in zip(runs, lanes, strict=False)]

@@ -14,7 +14,7 @@ import numpy as np
 
 from flightmodel.checks import FloatArray
 from synthetic_flight.instrument_sections import Magnetometer, Radar, SunSensors
-from synthetic_flight.scenarios import Scenario
+from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, Scenario
 
 # the last digit of the telemetry's files: noise below it is not in them, and an estimator wants none of zero
 LAST_DIGIT = 1e-6
@@ -62,7 +62,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
         "",
         "[sensors.accelerometer]",
         'file = "telemetry/accelerometer.csv"',
-        'mount = "suba"',
+        f'mount = "{ACCELEROMETER_MOUNT}"',
         f"noise_sd_mps2 = {_at_least(acc.noise_mps2)}",
         f"bias_sd_mps2 = {acc.bias_mps2}",
         f"scale_sd = {acc.scale}",

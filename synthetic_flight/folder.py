@@ -20,7 +20,7 @@ from flightmodel.checks import FloatArray, GateError
 from flightmodel.geomagnetism_and_sun import sun_direction_ecef
 from synthetic_flight import day_air, events, radar_sensing, sensing, sun_sensing, video
 from synthetic_flight.flight_toml import write_flight_toml
-from synthetic_flight.scenarios import Scenario, child_rng, fly_scenario
+from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
 Progress = Callable[[float, str], None]
@@ -125,7 +125,8 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     telemetry = folder / "telemetry"
     telemetry.mkdir()
     report(0.15, "sensing")
-    at, force = sensing.sense_accelerometer(truth, vehicle, "suba", spec.accelerometer, start, child_rng(seed, "suba"))
+    rng = child_rng(seed, ACCELEROMETER_MOUNT)
+    at, force = sensing.sense_accelerometer(truth, vehicle, ACCELEROMETER_MOUNT, spec.accelerometer, start, rng)
     _csv(telemetry / "accelerometer.csv", {"t_s": at, **_named("a{}_suba_mps2", "xyz", force)}, "%.6f")
     at, rate = sensing.sense_rates(truth, spec.rates, start, child_rng(seed, "rates"))
     _csv(telemetry / "rates.csv", {"t_s": at, **_named("{}_body_degps", "pqr", np.rad2deg(rate))}, "%.6f")

@@ -97,7 +97,7 @@ def kernel_tables(vehicle: Vehicle, atmosphere: FloatArray) -> tuple[FloatArray,
 
 
 def workspace(states: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Lanes' rows before a flight: states ``(lanes, 20)`` and parameter vectors ``(lanes, 61)`` of every lane."""
+    """Lanes' rows before a flight: states ``(lanes, 20)`` and parameter vectors ``(lanes, 67)`` of every lane."""
     s = np.zeros((at.ROWS, len(states)))
     s[at.Y : at.Y + at.STATES] = states.T
     s[at.P :] = parameters.T

@@ -38,6 +38,7 @@ from synthetic_flight.instrument_sections import (
     Video,
 )
 from synthetic_flight.simulate import Truth, fly, state_from_ecef
+from synthetic_flight.triad_errors import name_key
 
 Altitude = Annotated[float, Field(ge=0.0, le=1e6)]
 MOST_RECORDS, MOST_STEPS, MOST_SAMPLES, MOST_FRAMES = 5_000_000, 2_000_000_000, 5_000_000, 20_000
@@ -236,8 +237,7 @@ def check_against_vehicle(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> l
 
 def child_rng(seed: int, name: str) -> np.random.Generator:
     """Return the generator of one instrument: adding another instrument does not change its noise."""
-    key = [int.from_bytes(name.encode()[i : i + 4], "big") for i in range(0, len(name.encode()), 4)]
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=name_key(name)))
 
 
 def initial_state(scenario: Scenario) -> FloatArray:

@@ -126,13 +126,34 @@ def integrate(
             f"integrate: a state (20,), step_s > 0, per_record and records >= 1 are wanted; got state {state.shape}, "
             f"step_s {step_s:g}, per_record {per_record}, records {records}"
         )
-    lanes = (0,)
-    workspace = packing.workspace(state[None], packing.parameter_vector(vehicle)[None])
-    out, aux = np.empty((1, records, STATES)), np.empty((1, records, AUX))
-    written = np.zeros(1, dtype=np.int64)
+    parameters = packing.parameter_vector(vehicle)[None]
+    lanes = integrate_lanes(
+        vehicle, atmosphere, state[None], parameters, step_s, per_record, records, lock_records, planet
+    )
+    return lanes[0][:2]
+
+
+def integrate_lanes(
+    vehicle: Vehicle,
+    atmosphere: FloatArray,
+    states: FloatArray,
+    parameters: FloatArray,
+    step_s: float,
+    per_record: int,
+    records: int,
+    lock_records: int,
+    planet: earth.Planet = earth.WGS84,
+) -> list[tuple[FloatArray, FloatArray, bool]]:
+    """States, auxiliaries and whether the joint diverged of flights side by side.
+
+    ``states`` ``(lanes, 20)``, ``parameters`` ``(lanes, 67)``; ``atmosphere`` is one table, or ``(lanes, rows, 6)``.
+    """
+    lanes = len(states)
+    out, aux = np.empty((lanes, records, STATES)), np.empty((lanes, records, AUX))
+    written = np.zeros(lanes, dtype=np.int64)
     _kernels.integrate(
-        lanes,
-        workspace,
+        (0,) * lanes,
+        packing.workspace(states, parameters),
         packing.kernel_tables(vehicle, atmosphere),
         planet,
         step_s,
@@ -144,8 +165,10 @@ def integrate(
         aux,
         written,
     )
-    n = abs(int(written[0]))
-    return packing.flown_records(out[0, :n], aux[0, :n])
+    counts = np.abs(written)
+    return [
+        (*packing.flown_records(out[k, :n], aux[k, :n]), bool(written[k] < 0)) for k, n in enumerate(counts.tolist())
+    ]
 
 
 def fly(

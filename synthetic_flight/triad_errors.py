@@ -15,6 +15,7 @@ import numpy as np
 from flightmodel import rotations
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.trajectory import interpolate_rows
+from synthetic_flight import _air_kernels
 
 BUTTERWORTH = np.sqrt(0.5)
 CHILD = 0  # stands between an instrument's key and its child's: no name holds a NUL
@@ -68,13 +69,18 @@ class TriadErrors:
     dropouts: DropoutErrors = field(default_factory=DropoutErrors)
 
 
+def name_key(name: str) -> list[int]:
+    """Return a name as the words of a seed's key, four bytes each."""
+    raw = name.encode()
+    return [int.from_bytes(raw[i : i + 4], "big") for i in range(0, len(raw), 4)]
+
+
 def child(rng: np.random.Generator, name: str) -> np.random.Generator:
     """Return the generator of one error of an instrument, without drawing from the instrument's own."""
     seed = rng.bit_generator.seed_seq
     assert isinstance(seed, np.random.SeedSequence)
-    raw = name.encode()
-    key = [int.from_bytes(raw[i : i + 4], "big") for i in range(0, len(raw), 4)]
-    return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, CHILD, *key)))
+    key = (*seed.spawn_key, CHILD, *name_key(name))
+    return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=key))
 
 
 def low_pass(values: FloatArray, step_s: float, bandwidth_hz: float, order: int) -> FloatArray:
@@ -106,9 +112,7 @@ def gauss_markov(
     keep = np.exp(-np.diff(time_s) / time_constant_s)
     white = rng.standard_normal((len(time_s), columns))
     out = np.empty_like(white)
-    out[0] = white[0]
-    for k, (phi, fresh) in enumerate(zip(keep, np.sqrt(1.0 - keep**2), strict=True)):
-        out[k + 1] = phi * out[k] + fresh * white[k + 1]
+    _air_kernels.gauss_markov(keep, white, out)
     return sd * out
 
 
