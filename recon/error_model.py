@@ -1,40 +1,52 @@
-"""Which systematic errors the filter estimates, how large they may be, and how they wander.
+"""Which systematic errors the filter knows of, how large they may be, how they wander, and which are only considered.
 
 Every block is a first-order Gauss-Markov process about zero, ``de/dt = -e / tau + noise``, started at its prior
-standard deviation and kept there by its noise; an infinite ``tau`` is a constant. Order: nine inertial blocks in the
-order of `recon._kernels` (18 components), then four components for each radar.
+standard deviation and kept there by its noise; an infinite ``tau`` is a constant. What belongs to the air forgets with
+altitude instead: ``exp(-|climb| / length)``. A *considered* error (Schmidt) is never estimated, but what it may have
+done stays in the covariance of everything else. The drivers of the motion come first (`recon.motion`).
+
+References
+----------
+S. Schmidt, "Application of state-space methods to navigation problems", Advances in Control Systems 3 (1966) 293.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flightmodel.checks import FloatArray
-from flightmodel.instruments import RadarSite, TriadSpec
-from recon.state import KINEMATIC
+from flightmodel.checks import FloatArray, GateError, nearest_name
+from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SunHeads, TriadSpec
+from flightmodel.telemetry import Motion as MotionSpec
+from recon.packed import Wander
 
 AXES = ("x", "y", "z")
-RADAR_ERRORS = 4
+DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0  # over which the air's errors forget: facts of soundings, 5 and 3 km
 
 
 @dataclass(frozen=True)
 class Block:
-    """One kind of error of one instrument: components with one unit, one prior and one time constant."""
+    """One kind of error of one instrument: components with one unit, one prior and one way of forgetting."""
 
     instrument: str
     components: tuple[str, ...]
     unit: str
     prior_sd: float
     time_constant_s: float = np.inf
+    altitude_m: float = np.inf
+    considered: bool = False
 
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """All estimated sensor errors, in the order of ``States.sensor_errors``."""
+    """All errors beside the nine kinematic ones, in the order of ``States.sensor_errors``; drivers first."""
 
     blocks: tuple[Block, ...]
+
+    def _each(self, name: str) -> list[object]:
+        return [getattr(b, name) for b in self.blocks for _ in b.components]
 
     @property
     def names(self) -> list[str]:
@@ -44,70 +56,149 @@ class ErrorModel:
     @property
     def instruments(self) -> list[str]:
         """Instrument of every error."""
-        return [b.instrument for b in self.blocks for _ in b.components]
+        return [str(name) for name in self._each("instrument")]
 
     @property
     def units(self) -> list[str]:
         """Unit of every error."""
-        return [b.unit for b in self.blocks for _ in b.components]
+        return [str(unit) for unit in self._each("unit")]
 
     @property
     def prior_sd(self) -> FloatArray:
         """Prior standard deviation of every error, (m,)."""
-        return np.array([b.prior_sd for b in self.blocks for _ in b.components])
-
-    @property
-    def time_constant_s(self) -> FloatArray:
-        """Time constant of every error, (m,), infinite for constants."""
-        return np.array([b.time_constant_s for b in self.blocks for _ in b.components])
+        return np.array(self._each("prior_sd"), dtype=float)
 
     @property
     def size(self) -> int:
-        """Number of sensor errors."""
+        """Number of errors."""
         return len(self.names)
 
-    def radar_slice(self, index: int) -> slice:
-        """Where the errors of the ``index``-th radar stand in the full error vector."""
-        start = KINEMATIC + 18 + RADAR_ERRORS * index
-        return slice(start, start + RADAR_ERRORS)
+    @property
+    def wander(self) -> Wander:
+        """How every error wanders; a considered one stays what it is."""
+        considered = np.array(self._each("considered"), dtype=bool)
+        tau, length = (np.array(self._each(name), dtype=float) for name in ("time_constant_s", "altitude_m"))
+        return Wander(np.where(considered, np.inf, tau), np.where(considered, np.inf, length), self.prior_sd, considered)
 
-    def decay(self, dt_s: FloatArray) -> FloatArray:
-        """Factor by which each error's mean decays over each step, ``(k, m)``."""
-        return np.asarray(np.exp(-np.asarray(dt_s)[..., None] / self.time_constant_s))
+    @property
+    def wandering(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        """Which errors (w,) are not constant."""
+        w = self.wander
+        return np.flatnonzero(np.isfinite(w.time_constant_s) | np.isfinite(w.altitude_m)).astype(np.int64)
 
-    def noise_var(self, decay: FloatArray) -> FloatArray:
-        """Variance that keeps each error at its prior standard deviation, ``(k, m)``; zero for constants."""
-        return np.asarray(self.prior_sd**2 * (1.0 - decay**2))
+    def column(self, instrument: str, component: str) -> int:
+        """Where an error stands among all errors; -1 where it is not modelled."""
+        name = f"{instrument} {component}"
+        names = self.names
+        return names.index(name) if name in names else -1
+
+    def considering(self, names: Iterable[str]) -> ErrorModel:
+        """Model in which the named errors are considered: ``"accelerometer mount"``, ``"radar1 time bias"``, ...
+
+        Raises
+        ------
+        GateError
+            Where a name fits no error; with the nearest known one.
+        """
+        wanted = list(names)
+        blocks = tuple(replace(b, considered=True) if _fits(b, wanted) else b for b in self.blocks)
+        known = sorted({f"{b.instrument} {_kind(c)}" for b in self.blocks for c in b.components})
+        faults = [
+            f"considered error '{name}'{nearest_name(name, known)}: no such error; known: {', '.join(known)}"
+            for name in wanted
+            if not any(_fits(b, [name]) for b in self.blocks)
+        ]
+        if faults:
+            raise GateError(faults)
+        return ErrorModel(blocks)
 
 
-def triad_blocks(spec: TriadSpec, unit: str, bias_time_constant_s: float) -> list[Block]:
-    """Bias, scale and mount of one inertial triad; a prior of zero becomes a millionth of a typical one."""
+def _kind(component: str) -> str:
+    """Component without its axis."""
+    stem, _, last = component.rpartition(" ")
+    return stem if last in (*AXES, "north", "east", "down") and stem else component
 
-    def block(kind: str, unit: str, sd: float, least: float, tau: float = np.inf) -> Block:
-        return Block(spec.name, tuple(f"{kind} {axis}" for axis in AXES), unit, max(sd, least), tau)
+
+def _fits(block: Block, names: list[str]) -> bool:
+    return any(f"{block.instrument} {_kind(c)}" in names or f"{block.instrument} {c}" in names for c in block.components)
+
+
+def triad_blocks(spec: TriadSpec, unit: str) -> list[Block]:
+    """Bias, scale and mount of one triad; a prior of zero becomes a millionth of a typical one."""
+
+    def block(kind: str, unit: str, sd: float, tau: float = np.inf) -> Block:
+        return Block(spec.name, tuple(f"{kind} {axis}" for axis in AXES), unit, max(sd, 1e-9), tau)
 
     return [
-        block("bias", unit, spec.bias_sd, 1e-9, bias_time_constant_s),
-        block("scale", "1", spec.scale_sd, 1e-9),
-        block("mount", "rad", spec.mount_sd_rad, 1e-9),
+        block("bias", unit, float(np.hypot(spec.bias_sd, spec.bias_wander_sd)), spec.bias_time_constant_s),
+        block("scale", "1", spec.scale_sd),
+        block("mount", "rad", spec.mount_sd_rad),
+    ]
+
+
+def ballistic_blocks(motion: MotionSpec) -> list[Block]:
+    """Drivers of ballistic flight; density and winds in units of the sounding's standard deviations."""
+    tau = motion.drag_time_constant_s
+    return [
+        Block("vehicle", ("drag",), "1", motion.drag_sd, tau),
+        Block("vehicle", ("side force level", "side force upright"), "1", motion.side_sd, tau),
+        Block("air", ("density",), "sd", 1.0, altitude_m=DENSITY_LENGTH_M),
+        Block("air", ("wind north", "wind east"), "sd", 1.0, altitude_m=WIND_LENGTH_M),
     ]
 
 
 def radar_blocks(site: RadarSite) -> list[Block]:
-    """Range, angle and time-tag bias of one radar; time tag minus true time."""
-    return [
-        Block(site.name, ("range bias",), "m", max(site.range_bias_sd_m, 1e-6)),
-        Block(site.name, ("azimuth bias", "elevation bias"), "rad", max(site.angle_bias_sd_rad, 1e-12)),
-        Block(site.name, ("time bias",), "s", max(site.time_bias_sd_s, 1e-12)),
+    """Errors of one radar (RCC 753-95); those that the flight file states none of are left out."""
+    name, tau = site.name, site.wander_time_constant_s
+    always = [
+        Block(name, ("range bias",), "m", max(site.range_bias_sd_m, 1e-6)),
+        Block(name, ("azimuth bias", "elevation bias"), "rad", max(site.angle_bias_sd_rad, 1e-12)),
+        Block(name, ("time bias",), "s", max(site.time_bias_sd_s, 1e-12)),
     ]
+    stated = [
+        Block(name, ("tilt north", "tilt east"), "rad", site.mislevel_sd_rad),
+        Block(name, ("droop",), "rad", site.droop_sd_rad),
+        Block(name, ("skew",), "rad", site.skew_sd_rad),
+        Block(name, ("non-orthogonality",), "rad", site.nonorthogonality_sd_rad),
+        Block(name, ("traverse wander", "elevation wander"), "rad", site.wander_sd_rad, tau),
+        Block(name, ("refraction",), "1", site.refraction_sd),
+        Block(name, ("range scale",), "1", site.range_scale_sd),
+    ]
+    return always + [b for b in stated if b.prior_sd > 0.0]
 
 
-def build_error_model(
-    accelerometer: TriadSpec, rates: TriadSpec, sites: list[RadarSite], bias_time_constant_s: float
-) -> ErrorModel:
-    """Error model of two inertial triads and any number of radars."""
-    blocks = triad_blocks(accelerometer, "m/s2", bias_time_constant_s)
-    blocks += triad_blocks(rates, "rad/s", bias_time_constant_s)
-    for site in sites:
-        blocks += radar_blocks(site)
-    return ErrorModel(tuple(blocks))
+def gnss_blocks(spec: GnssSpec) -> list[Block]:
+    """Slowly wandering position error along north, east and down, and the latency of one receiver."""
+    axes = tuple(f"wander {axis}" for axis in ("north", "east", "down"))
+    blocks = [
+        Block(spec.name, axes, "m", spec.wander_sd_m, spec.wander_time_constant_s),
+        Block(spec.name, ("time bias",), "s", spec.time_bias_sd_s),
+    ]
+    return [b for b in blocks if b.prior_sd > 0.0]
+
+
+def barometer_blocks(spec: BarometerSpec) -> list[Block]:
+    """Errors of a height from air pressure."""
+    blocks = [
+        Block(spec.name, ("bias",), "m", spec.bias_sd_m),
+        Block(spec.name, ("scale",), "1", spec.scale_sd),
+        Block(spec.name, ("wander",), "m", spec.wander_sd_m, spec.wander_time_constant_s),
+        Block(spec.name, ("time bias",), "s", spec.time_bias_sd_s),
+    ]
+    return [b for b in blocks if b.prior_sd > 0.0]
+
+
+def magnetometer_blocks(spec: TriadSpec) -> list[Block]:
+    """Bias, scale and mount of a magnetometer, and the iron of the vehicle about it."""
+    iron = Block(spec.name, ("soft iron xy", "soft iron xz", "soft iron yz"), "1", spec.soft_iron_sd)
+    return triad_blocks(spec, "T") + ([iron] if spec.soft_iron_sd > 0.0 else [])
+
+
+def sun_blocks(spec: SunHeads) -> list[Block]:
+    """Bias and mounting of every head, counted from 1."""
+    blocks: list[Block] = []
+    for number in range(1, len(spec.clock_lv_rad) + 1):
+        head = f"{spec.name}{number}"
+        blocks.append(Block(head, ("bias across", "bias along"), "rad", spec.bias_sd_rad))
+        blocks.append(Block(head, tuple(f"mount {axis}" for axis in AXES), "rad", spec.mount_sd_rad))
+    return [b for b in blocks if b.prior_sd > 0.0]

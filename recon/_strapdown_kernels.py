@@ -19,7 +19,6 @@ from flightmodel._kernels import (
     dcm_from_quaternion,
     gravitation,
     inlined,
-    kernel,
 )
 
 
@@ -76,10 +75,10 @@ def mount_matrices(dcm_body_sensor, mount, body_actual, body_mount):
 
 
 @inlined
-def correct_sample(before, after, errors, offset, body_actual, body_mount, value, columns):
-    """Mean of two samples in body axes into ``value`` (3,), and its partials into ``columns`` (3, 9).
+def correct_sample(before, after, errors, offset, body_actual, body_mount, value, change, columns):
+    """Mean of two samples in body axes into ``value`` (3,), with partials in ``columns`` (3, 9); ``change`` (3,) too.
 
-    ``errors[offset:offset + 6]`` are bias and scale of the triad.
+    ``errors[offset:offset + 6]`` are bias and scale of the triad; ``change`` is the second sample less the first.
     """
     for j in range(3):
         gain = 1.0 / (1.0 + errors[offset + 3 + j])
@@ -89,10 +88,31 @@ def correct_sample(before, after, errors, offset, body_actual, body_mount, value
             columns[i, 3 + j] = columns[i, j] * actual
     for i in range(3):
         value[i] = 0.0
+        change[i] = 0.0
         for j in range(3):
             value[i] -= columns[i, j] * (0.5 * (before[j] + after[j]) - errors[offset + j])
+            change[i] -= columns[i, j] * (after[j] - before[j])
     for j in range(3):
         cross_into(body_mount[:, j], value, columns[:, 6 + j])
+
+
+@inlined
+def coning_and_sculling(force, d_force, rate, d_rate, dt):
+    """Add to mean force and rate (3,), in place, what both do to each other inside a step (signals straight in time).
+
+    ``d_force``, ``d_rate`` are their changes over the step: ``w + dt/12 w x dw``, ``f + dt/12 (w x df - dw x f)``.
+    """
+    k = dt / 12.0
+    w0, w1, w2 = rate[0], rate[1], rate[2]
+    f0, f1, f2 = force[0], force[1], force[2]
+    a0, a1, a2 = d_rate[0], d_rate[1], d_rate[2]
+    b0, b1, b2 = d_force[0], d_force[1], d_force[2]
+    rate[0] += k * (w1 * a2 - w2 * a1)
+    rate[1] += k * (w2 * a0 - w0 * a2)
+    rate[2] += k * (w0 * a1 - w1 * a0)
+    force[0] += k * (w1 * b2 - w2 * b1 - a1 * f2 + a2 * f1)
+    force[1] += k * (w2 * b0 - w0 * b2 - a2 * f0 + a0 * f2)
+    force[2] += k * (w0 * b1 - w1 * b0 - a0 * f1 + a1 * f0)
 
 
 @inlined
@@ -219,129 +239,29 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
 
 
 @inlined
-def propagate(
-    time, force_sensor, rate_sensor, force_density, rate_density, first, last, dcm_force, dcm_rate, errors,
-    position, velocity, q, phi, noise,
-):  # fmt: skip
+def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise):
     """Carry a state in place from grid point ``first`` to ``last`` (either direction) with ``phi`` and ``noise``.
 
-    ``phi`` (9, 27) and ``noise`` (9, 9) are overwritten. Densities hold from a grid point to the next later one.
+    ``phi`` (9, 27) and ``noise`` (9, 9) come as the identity and zero. Densities hold from a grid point to the next
+    later one.
     """
-    for i in range(9):
-        for j in range(27):
-            phi[i, j] = 1.0 if i == j else 0.0
-        for j in range(9):
-            noise[i, j] = 0.0
     force_actual, force_mount = np.empty((3, 3)), np.empty((3, 3))
     rate_actual, rate_mount = np.empty((3, 3)), np.empty((3, 3))
-    mount_matrices(dcm_force, errors[6:9], force_actual, force_mount)
-    mount_matrices(dcm_rate, errors[15:18], rate_actual, rate_mount)
+    mount_matrices(motion.dcm_body_force, errors[6:9], force_actual, force_mount)
+    mount_matrices(motion.dcm_body_rate, errors[15:18], rate_actual, rate_mount)
     force, rate, q_mid = np.empty(3), np.empty(3), np.empty(4)
+    force_change, rate_change = np.empty(3), np.empty(3)
     d_force, d_rate = np.empty((3, 9)), np.empty((3, 9))
     half_turn, dcm_mid, gradient = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    f, w = motion.force_sensor_mps2, motion.rate_sensor_radps
     step = 1 if last >= first else -1
     for k in range(first, last, step):
-        dt = time[k + step] - time[k]
-        j = min(k, k + step)
-        correct_sample(force_sensor[k], force_sensor[k + step], errors, 0, force_actual, force_mount, force, d_force)
-        correct_sample(rate_sensor[k], rate_sensor[k + step], errors, 9, rate_actual, rate_mount, rate, d_rate)
+        n = k + step
+        dt = motion.time_s[n] - motion.time_s[k]
+        j = min(k, n)
+        correct_sample(f[k], f[n], errors, 0, force_actual, force_mount, force, force_change, d_force)
+        correct_sample(w[k], w[n], errors, 9, rate_actual, rate_mount, rate, rate_change, d_rate)
+        coning_and_sculling(force, force_change, rate, rate_change, dt)
         advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient)
         advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradient)
-        advance_noise(noise, dt, half_turn, dcm_mid, force, force_density[j], rate_density[j])
-
-
-@kernel
-def propagate_all(
-    time, force_sensor, rate_sensor, force_density, rate_density, node_index, dcm_force, dcm_rate, errors,
-    position, velocity, q, phi, noise,
-):  # fmt: skip
-    """Carry every node's state in place to the next node: rows of ``position``, ``velocity``, ``q``, ``errors``."""
-    for k in range(len(node_index) - 1):
-        propagate(
-            time, force_sensor, rate_sensor, force_density, rate_density, node_index[k], node_index[k + 1],
-            dcm_force, dcm_rate, errors[k], position[k], velocity[k], q[k], phi[k], noise[k],
-        )  # fmt: skip
-
-
-@kernel
-def propagate_chain(
-    time, force_sensor, rate_sensor, force_density, rate_density, node_index, known, dcm_force, dcm_rate, errors,
-    position, velocity, q,
-):  # fmt: skip
-    """Fill the rows of nodes that are not ``known`` by carrying the row before, in place."""
-    phi, noise = np.empty((9, 27)), np.empty((9, 9))
-    for k in range(len(node_index) - 1):
-        if known[k + 1]:
-            continue
-        for i in range(3):
-            position[k + 1, i], velocity[k + 1, i] = position[k, i], velocity[k, i]
-        for i in range(4):
-            q[k + 1, i] = q[k, i]
-        propagate(
-            time, force_sensor, rate_sensor, force_density, rate_density, node_index[k], node_index[k + 1],
-            dcm_force, dcm_rate, errors[k], position[k + 1], velocity[k + 1], q[k + 1], phi, noise,
-        )  # fmt: skip
-
-
-@kernel
-def radar_prediction(dcm_ned_ecef, site, arm, position, velocity, q, bias, rate, h, jacobian):
-    """Range, azimuth, elevation into ``h`` (3,) and partials into ``jacobian`` (3, 13); twin: `recon.measurements`.
-
-    Columns: position, velocity, rotation, the radar's four errors. ``rate`` is against inertial space.
-    """
-    c, m = np.empty((3, 3)), np.empty((3, 3))
-    dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
-    turn, swing, effective, moving, ned = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for i in range(3):
-        turn[i] = rate[i] - OMEGA_WGS84 * c[2, i]
-    cross_into(turn, arm, swing)
-    tau = bias[3]
-    for i in range(3):
-        effective[i] = arm[i] - tau * swing[i]
-        moving[i] = velocity[i] + c[i, 0] * swing[0] + c[i, 1] * swing[1] + c[i, 2] * swing[2]
-    for i in range(3):
-        ned[i] = 0.0
-        for j in range(3):
-            at = position[j] - site[j] + c[j, 0] * arm[0] + c[j, 1] * arm[1] + c[j, 2] * arm[2] - tau * moving[j]
-            ned[i] += dcm_ned_ecef[i, j] * at
-    n, e, d = ned[0], ned[1], ned[2]
-    level2 = n * n + e * e
-    level = math.sqrt(level2)
-    slant2 = level2 + d * d
-    slant = math.sqrt(slant2)
-    h[0] = slant + bias[0]
-    h[1] = math.atan2(e, n) + bias[1]
-    h[2] = math.atan2(-d, level) + bias[2]
-    m[0, 0], m[0, 1], m[0, 2] = n / slant, e / slant, d / slant
-    m[1, 0], m[1, 1], m[1, 2] = -e / level2, n / level2, 0.0
-    m[2, 0], m[2, 1], m[2, 2] = d * n / (slant2 * level), d * e / (slant2 * level), -level / slant2
-    for i in range(3):
-        for j in range(13):
-            jacobian[i, j] = 0.0
-    row, lever = np.empty(3), np.empty(3)
-    for i in range(3):
-        jacobian[i, 9 + i] = 1.0
-        for j in range(3):
-            jacobian[i, j] = m[i, 0] * dcm_ned_ecef[0, j] + m[i, 1] * dcm_ned_ecef[1, j] + m[i, 2] * dcm_ned_ecef[2, j]
-            jacobian[i, 3 + j] = -tau * jacobian[i, j]
-            jacobian[i, 12] -= jacobian[i, j] * moving[j]
-        for j in range(3):
-            row[j] = jacobian[i, 0] * c[0, j] + jacobian[i, 1] * c[1, j] + jacobian[i, 2] * c[2, j]
-        cross_into(effective, row, lever)  # row . (rotation x effective) = rotation . (effective x row)
-        for j in range(3):
-            jacobian[i, 6 + j] = lever[j]
-
-
-@kernel
-def normalised_square(y, cov):
-    """``y^T cov^-1 y`` of three components by Cholesky factors."""
-    a = math.sqrt(cov[0, 0])
-    b = cov[1, 0] / a
-    c = cov[2, 0] / a
-    d = math.sqrt(cov[1, 1] - b * b)
-    e = (cov[2, 1] - b * c) / d
-    f = math.sqrt(cov[2, 2] - c * c - e * e)
-    u = y[0] / a
-    v = (y[1] - b * u) / d
-    w = (y[2] - c * u - e * v) / f
-    return u * u + v * v + w * w
+        advance_noise(noise, dt, half_turn, dcm_mid, force, motion.force_density[j], motion.rate_density[j])

@@ -1,0 +1,278 @@
+"""Compiled measurements: what each instrument should have read, and the partials. Readable twin: `recon.measurements`.
+
+A kind fills ``h`` (3,), ``by_state`` (3, 9) by position, velocity, rotation, and ``by_error`` (3, `SLOTS`) by the
+source's own errors in the order of `recon.measurements.SLOT_NAMES`; ``e`` (SLOTS,) holds their values, zero where off.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flightmodel._kernels import OMEGA_WGS84, WGS84, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined, kernel
+from recon._ballistic_kernels import ballistic_acceleration
+from recon._strapdown_kernels import cross_into, level, matmul_into
+
+RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN = range(6)
+SLOTS = 13
+
+
+@inlined
+def node_motion(motion, index, position, velocity, q, errors, c, rate, acceleration):
+    """Attitude matrix, inertial rate in body axes and acceleration against the Earth at a grid point, in place."""
+    dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
+    if motion.ballistic:
+        a = ballistic_acceleration(
+            motion, position[0], position[1], position[2], velocity[0], velocity[1], velocity[2],
+            errors[0], errors[1], errors[2], errors[3], errors[4], errors[5],
+        )  # fmt: skip
+        for i in range(3):
+            rate[i] = OMEGA_WGS84 * c[2, i]
+            acceleration[i] = a[i]
+        return
+    force = np.empty(3)
+    corrected(motion.force_sensor_mps2[index], errors, 0, motion.dcm_body_force, force)
+    corrected(motion.rate_sensor_radps[index], errors, 9, motion.dcm_body_rate, rate)
+    x, y, z = position[0], position[1], position[2]
+    gx, gy, gz = gravitation(x, y, z, WGS84)
+    w2, two = OMEGA_WGS84 * OMEGA_WGS84, 2.0 * OMEGA_WGS84
+    for i in range(3):
+        acceleration[i] = c[i, 0] * force[0] + c[i, 1] * force[1] + c[i, 2] * force[2]
+    acceleration[0] += gx + w2 * x + two * velocity[1]
+    acceleration[1] += gy + w2 * y - two * velocity[0]
+    acceleration[2] += gz
+
+
+@inlined
+def corrected(measured, errors, offset, dcm_body_sensor, out):
+    """True quantity (3,) in body axes of one sample, ``out = D R(mount) (measured - bias) / (1 + scale)``."""
+    q, turn, actual = np.empty(4), np.empty((3, 3)), np.empty(3)
+    level(q)
+    boxplus(q, errors[offset + 6], errors[offset + 7], errors[offset + 8])
+    dcm_from_quaternion(q[0], q[1], q[2], q[3], turn)
+    for i in range(3):
+        actual[i] = 0.0
+        for j in range(3):
+            actual[i] += turn[i, j] * (measured[j] - errors[offset + j]) / (1.0 + errors[offset + 3 + j])
+    for i in range(3):
+        out[i] = dcm_body_sensor[i, 0] * actual[0] + dcm_body_sensor[i, 1] * actual[1] + dcm_body_sensor[i, 2] * actual[2]
+
+
+@inlined
+def seen_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective):
+    """Where the instrument saw its point (3,), how fast it moved (3,), and the lever (3,) of rotation, in place.
+
+    ``p = r + C d - tau (v + C (w x d)) + tau^2 a / 2`` with ``w`` against the Earth.
+    """
+    turn, swing = np.empty(3), np.empty(3)
+    for i in range(3):
+        turn[i] = rate[i] - OMEGA_WGS84 * c[2, i]
+    cross_into(turn, arm, swing)
+    for i in range(3):
+        effective[i] = arm[i] - tau * swing[i]
+        moving = velocity[i] + c[i, 0] * swing[0] + c[i, 1] * swing[1] + c[i, 2] * swing[2]
+        point[i] = position[i] + c[i, 0] * arm[0] + c[i, 1] * arm[1] + c[i, 2] * arm[2]
+        point[i] += tau * (0.5 * tau * acceleration[i] - moving)
+        speed[i] = moving - tau * acceleration[i]
+
+
+@inlined
+def state_rows(m, count, tau, c, effective, speed, by_state, by_error):
+    """Partials of readings with partials ``m`` (3, 3) by the seen point: by state, and by the time tag (slot 3)."""
+    row, lever = np.empty(3), np.empty(3)
+    for i in range(count):
+        by_error[i, 3] = -(m[i, 0] * speed[0] + m[i, 1] * speed[1] + m[i, 2] * speed[2])
+        for j in range(3):
+            by_state[i, j] = m[i, j]
+            by_state[i, 3 + j] = -tau * m[i, j]
+            row[j] = m[i, 0] * c[0, j] + m[i, 1] * c[1, j] + m[i, 2] * c[2, j]
+        cross_into(effective, row, lever)  # row . (rotation x effective) = rotation . (effective x row)
+        for j in range(3):
+            by_state[i, 6 + j] = lever[j]
+
+
+@inlined
+def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
+    """Range, azimuth, elevation, with partials (3, 3) by the seen point; ``known[0]`` is the refractivity at the site."""
+    ned = np.empty(3)
+    for i in range(3):
+        ned[i] = 0.0
+        for j in range(3):
+            ned[i] += dcm_ned_ecef[i, j] * (point[j] - site[j])
+    north, east, down = ned[0], ned[1], ned[2]
+    level2 = north * north + east * east
+    across = math.sqrt(level2)
+    slant2 = level2 + down * down
+    slant = math.sqrt(slant2)
+    p = (
+        (north / slant, east / slant, down / slant),
+        (-east / level2, north / level2, 0.0),
+        (down * north / (slant2 * across), down * east / (slant2 * across), -across / slant2),
+    )
+    for i in range(3):
+        for j in range(3):
+            m[i, j] = p[i][0] * dcm_ned_ecef[0, j] + p[i][1] * dcm_ned_ecef[1, j] + p[i][2] * dcm_ned_ecef[2, j]
+    sin_az, cos_az = east / across, north / across
+    sin_el, cos_el = -down / slant, across / slant
+    sec = 1.0 / max(cos_el, 1e-3)
+    tan = sin_el * sec
+    by_error[0, 0], by_error[1, 1], by_error[2, 2] = 1.0, 1.0, 1.0
+    # a pedestal turned by (tn, te) about north and east: RCC 753-95, to first order
+    by_error[1, 4], by_error[1, 5] = -cos_az * tan, -sin_az * tan
+    by_error[2, 4], by_error[2, 5] = sin_az, -cos_az
+    by_error[2, 6], by_error[1, 7], by_error[1, 8] = cos_el, sec, tan
+    by_error[1, 9], by_error[2, 10] = sec, 1.0
+    # bending of a ray through the whole air; near the horizon it stays what it is at 2 deg
+    by_error[2, 11] = known[0] * cos_el / max(sin_el, 0.035)
+    by_error[0, 12] = slant
+    h[0], h[1], h[2] = slant, math.atan2(east, north), math.atan2(-down, across)
+    for i in range(3):
+        for j in range(SLOTS):
+            if j != 3:
+                h[i] += by_error[i, j] * e[j]
+
+
+@inlined
+def predict_place(kind, site, dcm_ned_ecef, e, point, speed, acceleration, h, m, by_error):
+    """Position north, east, down of a reference, or velocity along these axes, or height; partials by the seen point."""
+    if kind == HEIGHT:
+        sin_lat, cos_lat, height, per_p = geodetic(point[0], point[1], point[2], WGS84)
+        m[0, 0], m[0, 1], m[0, 2] = cos_lat * point[0] * per_p, cos_lat * point[1] * per_p, sin_lat
+        by_error[0, 0], by_error[0, 1], by_error[0, 2] = 1.0, height - site[0], 1.0
+        h[0] = height + e[0] + (height - site[0]) * e[1] + e[2]
+        return
+    for i in range(3):
+        h[i] = e[i] if kind == POSITION else 0.0
+        by_error[i, i] = 1.0 if kind == POSITION else 0.0
+        for j in range(3):
+            m[i, j] = dcm_ned_ecef[i, j]
+            h[i] += m[i, j] * (point[j] - site[j] if kind == POSITION else speed[j])
+
+
+@inlined
+def predict_field(dcm_body_sensor, known, e, c, h, by_state, by_error):
+    """Field in a magnetometer's axes: ``S (R(mount)^T D^T C^T B) + bias``, S with scales and soft iron."""
+    q, turn, mount, actual, lever = np.empty(4), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    level(q)
+    boxplus(q, e[6], e[7], e[8])
+    dcm_from_quaternion(q[0], q[1], q[2], q[3], turn)
+    matmul_into(dcm_body_sensor, turn, mount)
+    body = np.empty(3)
+    for i in range(3):
+        body[i] = c[0, i] * known[0] + c[1, i] * known[1] + c[2, i] * known[2]
+    for i in range(3):
+        actual[i] = mount[0, i] * body[0] + mount[1, i] * body[1] + mount[2, i] * body[2]
+    iron = ((1.0 + e[3], e[9], e[10]), (e[9], 1.0 + e[4], e[11]), (e[10], e[11], 1.0 + e[5]))
+    row = np.empty(3)
+    for i in range(3):
+        h[i] = e[i] + iron[i][0] * actual[0] + iron[i][1] * actual[1] + iron[i][2] * actual[2]
+        by_error[i, i], by_error[i, 3 + i] = 1.0, actual[i]
+        # the body turned by d sees b + b x d, a mount turned by m about sensor axes likewise
+        for j in range(3):
+            row[j] = iron[i][0] * mount[j, 0] + iron[i][1] * mount[j, 1] + iron[i][2] * mount[j, 2]
+        cross_into(row, body, lever)
+        for j in range(3):
+            by_state[i, 6 + j] = lever[j]
+        row[0], row[1], row[2] = iron[i][0], iron[i][1], iron[i][2]
+        cross_into(row, actual, lever)
+        for j in range(3):
+            by_error[i, 6 + j] = lever[j]
+    by_error[0, 9], by_error[1, 9] = actual[1], actual[0]
+    by_error[0, 10], by_error[2, 10] = actual[2], actual[0]
+    by_error[1, 11], by_error[2, 11] = actual[2], actual[1]
+
+
+@inlined
+def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
+    """Azimuth and elevation of the Sun in a head's axes; errors: bias across in azimuth, bias in elevation, mount."""
+    q, turn, mount, s, lever = np.empty(4), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    level(q)
+    boxplus(q, e[4], e[5], e[6])
+    dcm_from_quaternion(q[0], q[1], q[2], q[3], turn)
+    matmul_into(dcm_body_head, turn, mount)
+    body, row = np.empty(3), np.empty(3)
+    for i in range(3):
+        body[i] = c[0, i] * known[0] + c[1, i] * known[1] + c[2, i] * known[2]
+    for i in range(3):
+        s[i] = mount[0, i] * body[0] + mount[1, i] * body[1] + mount[2, i] * body[2]
+    across2 = s[1] * s[1] + s[2] * s[2] + 1e-30
+    across = math.sqrt(across2)
+    whole2 = across2 + s[0] * s[0]
+    p = (
+        (0.0, s[2] / across2, -s[1] / across2),
+        (across / whole2, -s[0] * s[1] / (whole2 * across), -s[0] * s[2] / (whole2 * across)),
+    )
+    h[0] = math.atan2(s[1], s[2]) + e[0] / across
+    h[1] = math.atan2(s[0], across) + e[1]
+    by_error[0, 0], by_error[1, 1] = 1.0 / across, 1.0
+    for i in range(2):
+        for j in range(3):
+            row[j] = p[i][0] * mount[j, 0] + p[i][1] * mount[j, 1] + p[i][2] * mount[j, 2]
+        cross_into(row, body, lever)
+        for j in range(3):
+            by_state[i, 6 + j] = lever[j]
+        row[0], row[1], row[2] = p[i][0], p[i][1], p[i][2]
+        cross_into(row, s, lever)
+        for j in range(3):
+            by_error[i, 4 + j] = lever[j]
+
+
+@inlined
+def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error):
+    """Prediction and partials of one measurement, in place."""
+    for i in range(3):
+        h[i] = 0.0
+        for j in range(9):
+            by_state[i, j] = 0.0
+        for j in range(SLOTS):
+            by_error[i, j] = 0.0
+    if kind == FIELD:
+        predict_field(dcm, known, e, c, h, by_state, by_error)
+        return
+    if kind == SUN:
+        predict_sun(dcm, known, e, c, h, by_state, by_error)
+        return
+    point, speed, effective, m = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
+    tau = e[3]
+    seen_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective)
+    if kind == RADAR:
+        predict_radar(site, dcm, known, e, point, h, m, by_error)
+        state_rows(m, 3, tau, c, effective, speed, by_state, by_error)
+        return
+    predict_place(kind, site, dcm, e, point, speed, acceleration, h, m, by_error)
+    if kind == VELOCITY:
+        velocity_rows(m, arm, rate, c, acceleration, by_state, by_error)
+        return
+    state_rows(m, 1 if kind == HEIGHT else 3, tau, c, effective, speed, by_state, by_error)
+
+
+@inlined
+def velocity_rows(m, arm, rate, c, acceleration, by_state, by_error):
+    """Partials of a velocity along axes ``m`` (3, 3): ``m (v + C (w x d) - tau a)``."""
+    turn, swing, row, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        turn[i] = rate[i] - OMEGA_WGS84 * c[2, i]
+    cross_into(turn, arm, swing)
+    for i in range(3):
+        by_error[i, 3] = -(m[i, 0] * acceleration[0] + m[i, 1] * acceleration[1] + m[i, 2] * acceleration[2])
+        for j in range(3):
+            by_state[i, 3 + j] = m[i, j]
+            row[j] = m[i, 0] * c[0, j] + m[i, 1] * c[1, j] + m[i, 2] * c[2, j]
+        cross_into(swing, row, lever)
+        for j in range(3):
+            by_state[i, 6 + j] = lever[j]
+
+
+@kernel
+def predict_one(kind, arm, site, dcm, known, e, position, velocity, q, rate, acceleration, h, by_state, by_error):
+    """`predict` from an attitude quaternion, for the readable filter and for tests."""
+    c = np.empty((3, 3))
+    dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
+    predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error)
+
+
+@kernel
+def motion_at(motion, index, position, velocity, q, errors, rate, acceleration):
+    """`node_motion` without the attitude matrix, for the readable filter and for tests."""
+    node_motion(motion, index, position, velocity, q, errors, np.empty((3, 3)), rate, acceleration)

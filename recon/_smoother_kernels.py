@@ -1,0 +1,383 @@
+"""Compiled smoothers: Rauch-Tung-Striebel and Bryson-Frazier. Readable twin, and the equations: `recon.smoother`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flightmodel._kernels import inlined, kernel
+from recon._measurement_kernels import SLOTS
+
+LEAST_PIVOT = 1e-14  # of a correlation matrix; below it a direction is known exactly
+
+
+@inlined
+def load_triangle(triangle, p):
+    """Symmetric ``p`` (N, N) from its packed lower triangle."""
+    at = 0
+    for i in range(p.shape[0]):
+        for j in range(i + 1):
+            p[i, j] = triangle[at]
+            p[j, i] = triangle[at]
+            at += 1
+
+
+@inlined
+def store_moments(p, size, triangle, variance):
+    """Lower triangle of the leading rows of ``p``, and its whole diagonal."""
+    at = 0
+    for i in range(size):
+        for j in range(i + 1):
+            triangle[at] = 0.5 * (p[i, j] + p[j, i])
+            at += 1
+    for i in range(p.shape[0]):
+        variance[i] = p[i, i]
+
+
+@inlined
+def solve_scaled(p, columns, scale):
+    """``columns = P^-1 columns`` by rows (d, N); ``p`` becomes the factor of the correlation matrix."""
+    size = p.shape[0]
+    for i in range(size):
+        scale[i] = math.sqrt(p[i, i])
+    for i in range(size):
+        for j in range(i + 1):
+            p[i, j] /= scale[i] * scale[j]
+    for j in range(size):
+        for i in range(j, size):
+            value = p[i, j]
+            for l in range(j):
+                value -= p[i, l] * p[j, l]
+            p[i, j] = value
+        p[j, j] = math.sqrt(max(p[j, j], LEAST_PIVOT))
+        for i in range(j + 1, size):
+            p[i, j] /= p[j, j]
+    for r in range(columns.shape[0]):
+        y = columns[r]
+        for i in range(size):
+            value = y[i] / scale[i]
+            for l in range(i):
+                value -= p[i, l] * y[l]
+            y[i] = value / p[i, i]
+        for t in range(size):
+            i = size - 1 - t
+            value = y[i]
+            for l in range(i + 1, size):
+                value -= p[l, i] * y[l]
+            y[i] = value / p[i, i]
+        for i in range(size):
+            y[i] /= scale[i]
+
+
+@inlined
+def solve_square(a, b):
+    """``b = a^-1 b`` in place for ``a`` (9, 9), which is destroyed; rows are exchanged for the largest pivot."""
+    size, width = a.shape[0], b.shape[1]
+    for j in range(size):
+        best = j
+        for i in range(j + 1, size):
+            if abs(a[i, j]) > abs(a[best, j]):
+                best = i
+        if best != j:
+            for l in range(size):
+                a[j, l], a[best, l] = a[best, l], a[j, l]
+            for l in range(width):
+                b[j, l], b[best, l] = b[best, l], b[j, l]
+        for i in range(j + 1, size):
+            f = a[i, j] / a[j, j]
+            for l in range(j, size):
+                a[i, l] -= f * a[j, l]
+            for l in range(width):
+                b[i, l] -= f * b[j, l]
+    for t in range(size):
+        i = size - 1 - t
+        for m in range(i + 1, size):
+            for l in range(width):
+                b[i, l] -= a[i, m] * b[m, l]
+        for l in range(width):
+            b[i, l] /= a[i, i]
+
+
+@inlined
+def backward_gain(phi, noise, decay, noise_var, moving, still, p, columns, scale, square, gain, added):
+    """Gain rows (d, N) and added covariance (d, d) of one step; ``p`` (N, N) is the prior of the later node."""
+    size, d, dense = p.shape[0], len(moving), phi.shape[1]
+    for r in range(d):
+        for j in range(size):
+            columns[r, j] = 0.0
+        if r < 9:
+            for j in range(9):
+                columns[r, j] = noise[r, j]
+        else:
+            columns[r, moving[r]] = noise_var[moving[r] - 9]
+    solve_scaled(p, columns, scale)  # row r: P^-1 times column r of Q
+    for r in range(d):
+        for t in range(d):
+            value = 0.0
+            if r < 9:
+                for l in range(9):
+                    value += noise[r, l] * columns[t, l]
+            else:
+                value = noise_var[moving[r] - 9] * columns[t, moving[r]]
+            q = noise[r, t] if r < 9 and t < 9 else (noise_var[moving[r] - 9] if r == t else 0.0)
+            added[r, t] = q - value
+        for j in range(size):
+            gain[r, j] = -columns[r, j]
+        gain[r, moving[r]] += 1.0
+    for r in range(9, d):  # errors that wander: 1 / decay
+        f = 1.0 / decay[moving[r] - 9]
+        for j in range(size):
+            gain[r, j] *= f
+        for t in range(d):
+            added[r, t] *= f
+        for t in range(d):
+            added[t, r] *= f
+    for i in range(9):
+        for j in range(9, dense):  # what drivers carry into the nine kinematic errors
+            if still[j]:
+                gain[i, j] -= phi[i, j]
+    for r in range(9, d):
+        if moving[r] < dense:
+            for i in range(9):
+                f = phi[i, moving[r]]
+                for j in range(size):
+                    gain[i, j] -= f * gain[r, j]
+                for t in range(d):
+                    added[i, t] -= f * added[r, t]
+    for r in range(9, d):
+        if moving[r] < dense:
+            for i in range(9):
+                for t in range(d):
+                    added[t, i] -= phi[i, moving[r]] * added[t, r]
+    left_inverse(phi, square, gain[:9])
+    left_inverse(phi, square, added[:9])
+    left_inverse(phi, square, added.T[:9])
+
+
+@inlined
+def left_inverse(phi, square, b):
+    """``b = A^-1 b`` with ``A`` the kinematic square of ``phi``."""
+    for i in range(9):
+        for j in range(9):
+            square[i, j] = phi[i, j]
+    solve_square(square, b)
+
+
+@kernel
+def rauch_tung_striebel(steps, run, moving, x, covariance, variance):
+    """Smooth backwards: errors ``x`` (n, N) in place of the filtered ones, moments at kept nodes where wanted.
+
+    ``moving`` (d,) are the nine kinematic errors and those that wander. ``covariance`` (k, D (D + 1) / 2) is empty
+    where only the mean is wanted.
+    """
+    n, size = x.shape
+    d, dense = len(moving), steps.transition.shape[2]
+    p, prior = run.p_last.copy(), np.empty((size, size))
+    columns, gain, rows = np.empty((d, size)), np.empty((d, size)), np.empty((d, size))
+    added, square, scale, step = np.empty((d, d)), np.empty((9, 9)), np.empty(size), np.empty(size)
+    still = np.full(size, True)
+    for r in range(d):
+        still[moving[r]] = False
+    wanted = len(covariance) > 0
+    if wanted and run.kept[n - 1] >= 0:
+        store_moments(p, dense, covariance[run.kept[n - 1]], variance[run.kept[n - 1]])
+    for b in range(n - 1):
+        k = n - 2 - b
+        load_triangle(run.p_minus[k + 1], prior)
+        backward_gain(
+            steps.transition[k], steps.noise[k], steps.decay[k], steps.noise_var[k], moving, still,
+            prior, columns, scale, square, gain, added,
+        )  # fmt: skip
+        for j in range(size):
+            step[j] = x[k + 1, j] - run.x_minus[k + 1, j]
+            x[k, j] += step[j]
+        for r in range(d):
+            value = 0.0
+            for j in range(size):
+                value += gain[r, j] * step[j]
+            x[k, moving[r]] += value - step[moving[r]]
+        if not wanted:
+            continue
+        for r in range(d):
+            for j in range(size):
+                rows[r, j] = 0.0
+            for l in range(size):
+                f = gain[r, l]
+                for j in range(size):
+                    rows[r, j] += f * p[l, j]
+        for r in range(d):
+            for t in range(r + 1):
+                value = 0.5 * (added[r, t] + added[t, r])
+                for j in range(size):
+                    value += rows[r, j] * gain[t, j]
+                added[r, t] = value
+                added[t, r] = value
+        for r in range(d):
+            for j in range(size):
+                p[moving[r], j] = rows[r, j]
+                p[j, moving[r]] = rows[r, j]
+        for r in range(d):
+            for t in range(d):
+                p[moving[r], moving[t]] = added[r, t]
+        if run.kept[k] >= 0:
+            store_moments(p, dense, covariance[run.kept[k]], variance[run.kept[k]])
+
+
+@kernel
+def bryson_frazier(steps, run, observed, slots, innovations, x, covariance, variance):
+    """As `rauch_tung_striebel`, by the adjoint of the filter; nothing larger than (3, 3) is inverted."""
+    n, size = x.shape
+    dense = steps.transition.shape[2]
+    mean, information = np.zeros(size), np.zeros((size, size))
+    p, product, out, old = np.empty((size, size)), np.empty((size, size)), np.empty((size, size)), np.empty(size)
+    wanted = len(covariance) > 0
+    for b in range(n):
+        k = n - 1 - b
+        for a in range(observed.first[k + 1] - observed.first[k]):
+            row = observed.first[k + 1] - 1 - a
+            if innovations.accepted[row]:
+                adjoint_update(
+                    innovations.by_state[row], innovations.by_error[row], slots[observed.source[row]],
+                    innovations.gain[row], innovations.covariance[row], innovations.residual[row],
+                    observed.variance[row], mean, information, wanted,
+                )  # fmt: skip
+        load_triangle(run.p_minus[k], p)
+        for i in range(size):
+            value = 0.0
+            for j in range(size):
+                value += p[i, j] * mean[j]
+            x[k, i] = run.x_minus[k, i] - value
+        if wanted and run.kept[k] >= 0:
+            smoothed_covariance(p, information, product, out)
+            store_moments(out, dense, covariance[run.kept[k]], variance[run.kept[k]])
+        if k > 0:
+            adjoint_step(steps.transition[k - 1], steps.decay[k - 1], mean, information, old, product, wanted)
+
+
+@inlined
+def smoothed_covariance(p, information, product, out):
+    """``out = P - P L P``; ``product`` (N, N) is scratch."""
+    size = p.shape[0]
+    for i in range(size):
+        for j in range(size):
+            product[i, j] = 0.0
+            out[i, j] = p[i, j]
+        for l in range(size):
+            f = p[i, l]
+            for j in range(size):
+                product[i, j] += f * information[l, j]
+        for l in range(size):
+            f = product[i, l]
+            for j in range(size):
+                out[i, j] -= f * p[l, j]
+
+
+@inlined
+def adjoint_step(phi, decay, mean, information, old, product, wanted):
+    """``l = F^T l`` and ``L = F^T L F`` in place."""
+    size, dense = len(mean), phi.shape[1]
+    for j in range(size):
+        old[j] = mean[j]
+    for j in range(size):
+        value = decay[j - 9] * old[j] if j >= 9 else 0.0
+        if j < dense:
+            for l in range(9):
+                value += phi[l, j] * old[l]
+        mean[j] = value
+    if not wanted:
+        return
+    for i in range(size):
+        for j in range(size):
+            product[i, j] = decay[j - 9] * information[i, j] if j >= 9 else 0.0
+        for l in range(9):
+            f = information[i, l]
+            for j in range(dense):
+                product[i, j] += f * phi[l, j]
+    for i in range(size):
+        f = decay[i - 9] if i >= 9 else 0.0
+        for j in range(size):
+            information[i, j] = f * product[i, j]
+        if i < dense:
+            for l in range(9):
+                g = phi[l, i]
+                for j in range(size):
+                    information[i, j] += g * product[l, j]
+
+
+@inlined
+def adjoint_update(by_state, by_error, slot, gain, covariance, residual, variance, mean, information, wanted):
+    """Carry mean and information back over one measurement, in place."""
+    size = len(mean)
+    inverse, u, v = np.zeros((3, 3)), np.zeros((3, size)), np.zeros((3, 3))
+    invert_used(covariance, variance, inverse)
+    push = np.empty(3)
+    for r in range(3):
+        push[r] = 0.0
+        for j in range(size):
+            push[r] += gain[j, r] * mean[j]
+        for t in range(3):
+            push[r] += inverse[r, t] * residual[t]
+    for r in range(3):
+        for l in range(9):
+            mean[l] -= by_state[r, l] * push[r]
+        for l in range(SLOTS):
+            if slot[l] >= 0:
+                mean[9 + slot[l]] -= by_error[r, l] * push[r]
+    if not wanted:
+        return
+    for r in range(3):
+        for l in range(size):
+            f = gain[l, r]
+            for j in range(size):
+                u[r, j] += f * information[l, j]
+    for r in range(3):
+        for t in range(3):
+            v[r, t] = inverse[r, t]
+            for j in range(size):
+                v[r, t] += u[r, j] * gain[j, t]
+    # L - H^T U - U^T H + H^T V H = L - H^T (U - V H) - U^T H
+    for r in range(3):
+        for l in range(9):
+            f = by_state[r, l]
+            for j in range(size):
+                information[j, l] -= u[r, j] * f
+        for l in range(SLOTS):
+            if slot[l] >= 0:
+                for j in range(size):
+                    information[j, 9 + slot[l]] -= u[r, j] * by_error[r, l]
+    for r in range(3):
+        for t in range(3):
+            for l in range(9):
+                u[r, l] -= v[r, t] * by_state[t, l]
+            for l in range(SLOTS):
+                if slot[l] >= 0:
+                    u[r, 9 + slot[l]] -= v[r, t] * by_error[t, l]
+    for r in range(3):
+        for l in range(9):
+            f = by_state[r, l]
+            for j in range(size):
+                information[l, j] -= f * u[r, j]
+        for l in range(SLOTS):
+            if slot[l] >= 0:
+                for j in range(size):
+                    information[9 + slot[l], j] -= by_error[r, l] * u[r, j]
+
+
+@inlined
+def invert_used(covariance, variance, inverse):
+    """Inverse (3, 3) of an innovation's covariance on the measured components; zero elsewhere."""
+    c = covariance
+    a00 = c[1, 1] * c[2, 2] - c[1, 2] * c[2, 1]
+    a01 = c[0, 2] * c[2, 1] - c[0, 1] * c[2, 2]
+    a02 = c[0, 1] * c[1, 2] - c[0, 2] * c[1, 1]
+    det = c[0, 0] * a00 + c[1, 0] * a01 + c[2, 0] * a02
+    inverse[0, 0], inverse[0, 1], inverse[0, 2] = a00 / det, a01 / det, a02 / det
+    inverse[1, 0], inverse[1, 1] = a01 / det, (c[0, 0] * c[2, 2] - c[0, 2] * c[2, 0]) / det
+    inverse[1, 2], inverse[2, 0] = (c[0, 2] * c[1, 0] - c[0, 0] * c[1, 2]) / det, a02 / det
+    inverse[2, 1] = inverse[1, 2]
+    inverse[2, 2] = (c[0, 0] * c[1, 1] - c[0, 1] * c[1, 0]) / det
+    for i in range(3):
+        if math.isinf(variance[i]):
+            for j in range(3):
+                inverse[i, j], inverse[j, i] = 0.0, 0.0

@@ -1,0 +1,73 @@
+"""What carries a state from one moment to another: inertial sensors, or a ballistic model of drag in the day's air.
+
+Both drive the nine kinematic errors (position, velocity, rotation) through a few *drivers*, errors that the motion
+depends on: with inertial sensors their bias, scale and mount, 18 in all; in ballistic flight drag, side forces, density
+and winds, 6 in all, and rotation stands still. So one filter serves both. Models and readable twins:
+`recon.strapdown`, `recon.ballistic`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flightmodel.checks import FloatArray
+
+STRAPDOWN_DRIVERS, BALLISTIC_DRIVERS = 18, 6
+
+
+class Motion(NamedTuple):
+    """Time grid that contains every node, and what acts on it; a plain tuple, so that kernels can take it.
+
+    Parameters
+    ----------
+    ballistic : bool
+        Whether there are no inertial sensors.
+    time_s : (k,) float
+    force_sensor_mps2, rate_sensor_radps : (k, 3) float
+        As measured, in sensor axes, gaps bridged; zeros in ballistic flight.
+    force_density, rate_density : (k, 3) float
+        White-noise densities, (m/s^2)^2/Hz and (rad/s)^2/Hz, from a grid point to the next: along body axes, in
+        ballistic flight along Earth-fixed axes.
+    dcm_body_force, dcm_body_rate : (3, 3) float
+        Nominal mountings.
+    air : (a, 5) float
+        Logarithm of density, wind north and east, sd of density's logarithm, sd of wind, at equally spaced altitudes.
+    air_from_m, air_step_m : float
+        Their first altitude and spacing.
+    drag_m2pkg : float
+        Drag area per mass before anything is learnt.
+    """
+
+    ballistic: bool
+    time_s: FloatArray
+    force_sensor_mps2: FloatArray
+    rate_sensor_radps: FloatArray
+    force_density: FloatArray
+    rate_density: FloatArray
+    dcm_body_force: FloatArray
+    dcm_body_rate: FloatArray
+    air: FloatArray
+    air_from_m: float
+    air_step_m: float
+    drag_m2pkg: float
+
+    @property
+    def drivers(self) -> int:
+        """Number of errors that the motion depends on."""
+        return BALLISTIC_DRIVERS if self.ballistic else STRAPDOWN_DRIVERS
+
+
+def strapdown_motion(
+    time_s: FloatArray,
+    force_sensor_mps2: FloatArray,
+    rate_sensor_radps: FloatArray,
+    force_density: FloatArray,
+    rate_density: FloatArray,
+    dcm_body_force: FloatArray,
+    dcm_body_rate: FloatArray,
+) -> Motion:
+    """Motion carried by inertial sensors."""
+    arrays = (time_s, force_sensor_mps2, rate_sensor_radps, force_density, rate_density, dcm_body_force, dcm_body_rate)
+    return Motion(False, *(np.ascontiguousarray(a, dtype=float) for a in arrays), np.zeros((2, 5)), 0.0, 1.0, 0.0)
