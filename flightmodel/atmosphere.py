@@ -251,6 +251,18 @@ def standard_atmosphere() -> AtmosphereProfile:
     return AtmosphereProfile(z, np.zeros(len(z)), np.zeros(len(z)), np.zeros((len(z), 3)), density_sd, wind_sd)
 
 
+def standard_sounding() -> Sounding:
+    """US76 without winds in the form of a sounding, 0 to 120 km, for a flight of which no sounding was made.
+
+    Density is uncertain by 10 % and each component of the wind by 15 m/s: the day's departure from the standard in
+    middle latitudes and the usual winds of the stratosphere, not an instrument's error.
+    """
+    z = np.arange(0.0, 120001.0, 1000.0)
+    density, temperature, pressure = us76(z)
+    still = np.zeros(len(z))
+    return Sounding(z, density, temperature, pressure, still, still, np.full(len(z), 0.10), np.full(len(z), 15.0))
+
+
 @cache
 def nrlmsis_profile(name: str = "nrlmsis_2009_08_17") -> AtmosphereProfile:
     """Modelled profile of a day that ships with the toolkit, 0 to 400 km, without winds.

@@ -65,7 +65,9 @@ def read_flight(folder: Path) -> Telemetry:
     assert rates is not None
     assert sounding is not None
     q = np.array(spec.attitude_prior.q_ecef_body)
-    prior = AttitudePrior(spec.attitude_prior.t_s, q / np.linalg.norm(q), np.deg2rad(spec.attitude_prior.sd_deg))
+    prior = AttitudePrior(
+        spec.attitude_prior.t_s, q / np.linalg.norm(q), np.full(3, np.deg2rad(spec.attitude_prior.sd_deg))
+    )
     telemetry = Telemetry(
         name=spec.name,
         t0_utc=spec.t0_utc,

@@ -28,6 +28,9 @@ class TriadSpec:
         Quantisation step, m/s^2, rad/s or T; 0 for none.
     soft_iron_sd : float
         Of a magnetometer: elements of the symmetric matrix by which the vehicle's iron bends the field.
+    bias_wander_sd, bias_time_constant_s : float
+        A second part of the bias that varies slowly (Gauss-Markov): its standard deviation, in the triad's unit, and
+        time constant; 0 for none.
     """
 
     name: str
@@ -39,6 +42,8 @@ class TriadSpec:
     mount_sd_rad: float
     resolution: float = 0.0
     soft_iron_sd: float = 0.0
+    bias_wander_sd: float = 0.0
+    bias_time_constant_s: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,68 @@ class RadarSite:
     nonorthogonality_sd_rad: float = 0.0
     wander_sd_rad: float = 0.0
     wander_time_constant_s: float = 20.0
+
+
+@dataclass(frozen=True)
+class GnssSpec:
+    """A satellite navigation receiver and its antenna.
+
+    Parameters
+    ----------
+    name : str
+        As in the flight file.
+    antenna_from_datum_body_m : (3,) float
+        Where the antenna sits, body axes, m.
+    horizontal_sd_m, vertical_sd_m : float
+        White noise of a fix: of each horizontal axis, and of height.
+    speed_sd_mps, vertical_speed_sd_mps : float
+        White noise of a velocity: of each horizontal axis, and of the vertical one.
+    wander_sd_m, wander_time_constant_s : float
+        Slowly wandering (Gauss-Markov) part of the position's error, of each axis; 0 for none. Satellites' clocks and
+        orbits, the ionosphere and reflections change in minutes, so that one fix repeats the error of the last.
+    time_bias_sd_s : float
+        Time tag minus true time, constant over a flight: a receiver's latency, or the second that its clock rounds to.
+    """
+
+    name: str
+    antenna_from_datum_body_m: FloatArray
+    horizontal_sd_m: float
+    vertical_sd_m: float
+    speed_sd_mps: float
+    vertical_speed_sd_mps: float
+    wander_sd_m: float = 0.0
+    wander_time_constant_s: float = 100.0
+    time_bias_sd_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class BarometerSpec:
+    """A static pressure sensor read as a height.
+
+    Parameters
+    ----------
+    name : str
+        As in the flight file.
+    sd_m : float
+        White noise of a height.
+    bias_sd_m : float
+        Constant error: the day's pressure at sea level, the sensor's offset, the undulation of the geoid.
+    scale_sd : float
+        Error proportional to the height above the first reading: a day warmer or colder than the profile, of which
+        1 % in temperature is 1 % in height.
+    wander_sd_m, wander_time_constant_s : float
+        Slowly wandering (Gauss-Markov) error: the vehicle's own flow, winds; 0 for none.
+    time_bias_sd_s : float
+        Time tag minus true time, with the lag of a vented bay.
+    """
+
+    name: str
+    sd_m: float
+    bias_sd_m: float
+    scale_sd: float
+    wander_sd_m: float = 0.0
+    wander_time_constant_s: float = 100.0
+    time_bias_sd_s: float = 0.0
 
 
 @dataclass(frozen=True)

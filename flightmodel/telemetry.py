@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, check_increasing, check_shape
-from flightmodel.instruments import RadarSite, SunHeads, TriadSpec
+from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
+from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SunHeads, TriadSpec
 from flightmodel.vehicle import CameraMount, Vehicle
 
 
@@ -82,6 +83,56 @@ class RadarRecord:
 
 
 @dataclass(frozen=True)
+class GnssRecord:
+    """Fixes of one satellite navigation receiver, of its antenna.
+
+    Parameters
+    ----------
+    spec : GnssSpec
+    time_s : (n,) float
+        Strictly increasing, seconds after t0.
+    position_ecef_m : (n, 3) float
+        NaN is missing.
+    velocity_ecef_mps : (n, 3) float
+        Relative to the rotating Earth; NaN where the receiver gives none.
+    """
+
+    spec: GnssSpec
+    time_s: FloatArray
+    position_ecef_m: FloatArray
+    velocity_ecef_mps: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check once."""
+        check_increasing(self.spec.name, self.time_s)
+        check_shape(self.spec.name, self.position_ecef_m, (len(self.time_s), 3))
+        check_shape(self.spec.name, self.velocity_ecef_mps, (len(self.time_s), 3))
+
+
+@dataclass(frozen=True)
+class BarometerRecord:
+    """Heights by static pressure.
+
+    Parameters
+    ----------
+    spec : BarometerSpec
+    time_s : (n,) float
+        Strictly increasing, seconds after t0.
+    height_m : (n,) float
+        Above the WGS-84 ellipsoid; NaN is missing.
+    """
+
+    spec: BarometerSpec
+    time_s: FloatArray
+    height_m: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check once."""
+        check_increasing(self.spec.name, self.time_s)
+        check_shape(self.spec.name, self.height_m, (len(self.time_s),))
+
+
+@dataclass(frozen=True)
 class Sounding:
     """Atmosphere of the day by altitude, as measured before the flight; wind is where the air goes.
 
@@ -105,7 +156,39 @@ class AttitudePrior:
 
     time_s: float
     q_ecef_body: FloatArray
-    sd_rad: float
+    sd_rad: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check once."""
+        check_shape("attitude prior", self.q_ecef_body, (4,))
+        check_shape("attitude prior's standard deviation", self.sd_rad, (3,))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the vehicle moves, as far as it is stated rather than measured.
+
+    Parameters
+    ----------
+    model : str
+        ``"strapdown"``: accelerometers and gyros carry the state. ``"ballistic"``: gravitation and drag do, and, in
+        stated spans, an acceleration of which only the size is known.
+    drag_area_per_mass_m2pkg : float
+        ``C_D S / m`` before anything is learnt.
+    drag_sd, drag_time_constant_s : float
+        Standard deviation of its natural logarithm, and how long it stays what it is (Gauss-Markov).
+    powered_s : tuple of (float, float)
+        Spans in which thrust or an opening parachute acts.
+    powered_sd_mps2 : float
+        Acceleration that may act there, of each axis.
+    """
+
+    model: Literal["strapdown", "ballistic"] = "strapdown"
+    drag_area_per_mass_m2pkg: float = 0.0
+    drag_sd: float = 1.0
+    drag_time_constant_s: float = 10.0
+    powered_s: tuple[tuple[float, float], ...] = ()
+    powered_sd_mps2: float = 50.0
 
 
 @dataclass(frozen=True)
@@ -148,28 +231,51 @@ class Finding:
 
 @dataclass(frozen=True)
 class Telemetry:
-    """Everything measured on one flight, plus what the analyst states about vehicle and start."""
+    """Everything measured on one flight, plus what the analyst states about vehicle, start and motion.
+
+    Accelerometer and rates are there both or neither. At least one radar or receiver is there.
+    """
 
     name: str
     t0_utc: str
     synthetic: bool
-    vehicle: Vehicle
-    accelerometer: TriadRecord
-    rates: TriadRecord
+    vehicle: Vehicle | None
+    accelerometer: TriadRecord | None
+    rates: TriadRecord | None
     radars: dict[str, RadarRecord]
     sounding: Sounding
-    attitude_prior: AttitudePrior
+    attitude_prior: AttitudePrior | None
     frames: Frames | None = None
     magnetometer: TriadRecord | None = None
     sun: SunRecord | None = None
     events: tuple[tuple[str, float], ...] = ()
     findings: tuple[Finding, ...] = ()
     hashes: dict[str, str] = field(default_factory=dict)
+    gnss: dict[str, GnssRecord] = field(default_factory=dict)
+    barometers: dict[str, BarometerRecord] = field(default_factory=dict)
+    motion: Motion = Motion()
 
     def span_s(self) -> tuple[float, float]:
-        """First and last time that accelerometer, rates and at least one radar cover together."""
-        first_radar = min(r.time_s[0] for r in self.radars.values())
-        last_radar = max(r.time_s[-1] for r in self.radars.values())
-        triads = (self.accelerometer, self.rates)
-        start = max(first_radar, *(t.time_s[0] for t in triads))
-        return float(start), float(min(last_radar, *(t.time_s[-1] for t in triads)))
+        """First and last time that all triads and at least one radar or receiver cover together."""
+        trackers = [r.time_s for r in self.radars.values()] + [r.time_s for r in self.gnss.values()]
+        triads = [t.time_s for t in (self.accelerometer, self.rates) if t is not None]
+        start = max([min(t[0] for t in trackers), *(t[0] for t in triads)])
+        return float(start), float(min([max(t[-1] for t in trackers), *(t[-1] for t in triads)]))
+
+    def required_vehicle(self) -> Vehicle:
+        """Return the vehicle, or raise `GateError` where flight.toml names none."""
+        if self.vehicle is None:
+            raise GateError(
+                f"flight '{self.name}' names no vehicle, whose mass properties and coefficients are needed here; add "
+                'vehicle = "..." to flight.toml (a vehicle that ships with the toolkit, or the path of a vehicle file)'
+            )
+        return self.vehicle
+
+    def required_triads(self) -> tuple[TriadRecord, TriadRecord]:
+        """Return accelerometer and rates, or raise `GateError` where flight.toml names none."""
+        if self.accelerometer is None or self.rates is None:
+            raise GateError(
+                f"flight '{self.name}' has no inertial sensors, which are needed here; add [sensors.accelerometer] and "
+                "[sensors.rates] to flight.toml"
+            )
+        return self.accelerometer, self.rates

@@ -39,7 +39,7 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
 
 def oriented_camera(telemetry: Telemetry, joint_m: float | None = None) -> tuple[OrientedCamera, int]:
     """Camera oriented on the benchmark frame, and that frame's index."""
-    frames, vehicle = telemetry.frames, telemetry.vehicle
+    frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
     benchmark = frames.benchmark
     station = vehicle.joint.station_m if joint_m is None else joint_m

@@ -86,7 +86,7 @@ def figure_2_5(flight: Flight) -> Figure:
     (ax,) = _axes(figure)
     _bet_line(ax, flight, "BET, centerbody")
     pulse, use = flight.pulse, flight.pulse.informative
-    inferred = aerodynamic_angle(flight.telemetry.vehicle.aero, pulse.mach, pulse.specific_force_body_mps2)
+    inferred = aerodynamic_angle(flight.telemetry.required_vehicle().aero, pulse.mach, pulse.specific_force_body_mps2)
     ax.plot(pulse.time_s, _where(use, inferred), color="black", lw=1.2, label="C_N/C_A look-up, no adjustment")
     _no_answer(ax, use, inferred, pulse.time_s)
     ax.set(xlim=_window(flight), ylim=(0, 60), ylabel="total angle of attack (deg)", xlabel="time after launch (s)")
@@ -100,7 +100,7 @@ def figure_2_7(flight: Flight, history: DeflectionHistory) -> Figure:
     """The same with the accelerometers turned by the estimated deflection, and the BET biased by it (Figure 2.7)."""
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
     (ax,) = _axes(figure)
-    pulse, aero = flight.pulse, flight.telemetry.vehicle.aero
+    pulse, aero = flight.pulse, flight.telemetry.required_vehicle().aero
     use, force = pulse.informative, pulse.specific_force_body_mps2
     raw = aerodynamic_angle(aero, pulse.mach, force)
     turned = aeroshell_acceleration(force, np.nan_to_num(history.theta_rad), psi_from_acceleration(force))

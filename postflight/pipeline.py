@@ -80,7 +80,7 @@ def reconstruct_telemetry(
     bet = reconstruct(telemetry, settings, lambda f, what: report(0.95 * f, what))
     profile = profile_from_sounding(telemetry.sounding)
     _check_flown(bet.smoothed)
-    air = air_data(bet.smoothed, profile, telemetry.vehicle.cg_m)
+    air = air_data(bet.smoothed, profile, telemetry.required_vehicle().cg_m)
     report(1.0, "reconstructed")
     return Flight(telemetry, bet, air, pulse_data(telemetry, bet, air))
 
@@ -128,23 +128,24 @@ def pulse_data(telemetry: Telemetry, bet: Reconstruction, air: AirData) -> Pulse
     before = window_means(t_imu, bet.rate_body_radps, t - 2 * h, t)
     turn = (after - before) / (2 * h)
     samples = max(1.0, 2 * h / float(np.median(np.diff(t_imu))))
-    arm = telemetry.vehicle.cg_m - telemetry.accelerometer.spec.position_from_datum_body_m
+    vehicle, (accelerometer, rates) = telemetry.required_vehicle(), telemetry.required_triads()
+    arm = vehicle.cg_m - accelerometer.spec.position_from_datum_body_m
     at_cg = force + np.cross(turn, arm) + np.cross(rate, np.cross(rate, arm))
-    white = telemetry.accelerometer.spec.noise_sd**2 / samples * np.eye(3)
+    white = accelerometer.spec.noise_sd**2 / samples * np.eye(3)
     return PulseData(
         time_s=t,
         specific_force_body_mps2=at_cg,
         specific_force_cov=bet.specific_force_cov[inside] + white,
         rate_body_radps=rate,
         angular_acceleration_body_radps2=turn,
-        angular_acceleration_sd_radps2=float(np.sqrt(2.0 / samples) * telemetry.rates.spec.noise_sd / (2 * h)),
+        angular_acceleration_sd_radps2=float(np.sqrt(2.0 / samples) * rates.spec.noise_sd / (2 * h)),
         flow_yz_rad=lateral_angles(air.velocity_air_body_mps[inside]),
         flow_cov=air.lateral_flow_cov[inside],
         mach=air.mach[inside],
         dynamic_pressure_pa=air.dynamic_pressure_pa[inside],
         dynamic_pressure_sd_pa=air.dynamic_pressure_sd_pa[inside],
         airspeed_mps=air.airspeed_mps[inside],
-        vehicle=telemetry.vehicle,
+        vehicle=vehicle,
     )
 
 
@@ -161,7 +162,7 @@ def estimate_camera(
     frames = telemetry.frames
     if frames is None:
         raise GateError(NO_VIDEO)
-    vehicle = telemetry.vehicle
+    vehicle = telemetry.required_vehicle()
     return deflection_from_frames(
         frames.time_s,
         frames.paths,
@@ -179,7 +180,7 @@ def camera_sensitivity(telemetry: Telemetry, history: DeflectionHistory) -> pd.D
     Columns ``joint_station_m, plane_lv_deg, deflection_deg, paper_deg``. It need not equal the paper's column: one
     camera sees the component towards it, and the shell and lens are not IRVE-II's.
     """
-    frames, vehicle = telemetry.frames, telemetry.vehicle
+    frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
     straight, bent = (read_frame(frames.paths[k]) for k in (frames.benchmark, int(np.nanargmax(history.theta_rad))))
     stations = np.array([0.0, vehicle.joint.station_m])

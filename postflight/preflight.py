@@ -51,7 +51,7 @@ def rigid_bounds(
     if not len(below):
         raise GateError("pre-flight bounds: the reconstruction never comes below 100 km")
     start_s = float(air.time_s[below[0]])
-    vehicle, profile = flight.telemetry.vehicle, profile_from_sounding(flight.telemetry.sounding)
+    vehicle, profile = flight.telemetry.required_vehicle(), profile_from_sounding(flight.telemetry.sounding)
     records = round(min(SPAN_S, air.time_s[-1] - start_s) / RECORD_S)
     alpha, normal = np.full((flights, records), np.nan), np.full((flights, records), np.nan)
     nominal = _fly(flight, vehicle, profile, start_s, records, np.zeros(3))

@@ -136,13 +136,14 @@ def reconstruct(
     settings = settings or Settings()
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "bridging gaps")
-    force, rate = inertial.bridge(telemetry.accelerometer), inertial.bridge(telemetry.rates)
+    accelerometer, rates = telemetry.required_triads()
+    force, rate = inertial.bridge(accelerometer), inertial.bridge(rates)
     problem, output = build_problem(telemetry, settings, force, rate)
     run, smoothed, reference = _iterate(problem, settings.passes, report)
 
     report(0.95, "testing consistency")
-    arm = telemetry.accelerometer.spec.position_from_datum_body_m
-    mount = product.Mounting(telemetry.t0_utc, arm, telemetry.rates.spec.noise_sd)
+    arm = accelerometer.spec.position_from_datum_body_m
+    mount = product.Mounting(telemetry.t0_utc, arm, rates.spec.noise_sd)
     final = product.datum_trajectory(problem, mount, reference, smoothed.covariance, output)
     filtered = product.datum_trajectory(problem, mount, run.filtered(), run.p_plus, output)
     names = [radar.name for radar in problem.radars]
@@ -246,15 +247,17 @@ def build_problem(
         for node, measured in zip(nearest, record.range_az_el[use], strict=True):
             points[node].append((number, measured))
 
-    accelerometer = telemetry.accelerometer.spec
+    accelerometer, rates = (record.spec for record in telemetry.required_triads())
     sites = [r.site for r in records]
-    model = build_error_model(accelerometer, telemetry.rates.spec, sites, settings.bias_time_constant_s)
+    model = build_error_model(accelerometer, rates, sites, settings.bias_time_constant_s)
     arm = accelerometer.position_from_datum_body_m
     traverse = settings.angle_noise == "traverse"
     radars = [
-        radar_model(name, record, model.radar_slice(i), telemetry.vehicle.cg_m, arm, traverse)
+        radar_model(name, record, model.radar_slice(i), telemetry.required_vehicle().cg_m, arm, traverse)
         for i, (name, record) in enumerate(zip(names, records, strict=True))
     ]
+    if telemetry.attitude_prior is None:
+        raise GateError(f"flight '{telemetry.name}' has no [attitude_prior] in flight.toml; a reconstruction needs one")
     start, covariance = startup.start_state(records, radars, telemetry.attitude_prior, start_s, force, rate, model)
     grid, node_index = inertial.inertial_grid(force, rate, time_s)
     from scipy.stats import chi2

@@ -35,7 +35,7 @@ def start_attitude(
     GateError
         Where gyro data do not reach from the prior to the start.
     """
-    q, var = prior.q_ecef_body, prior.sd_rad**2 * np.eye(3)
+    q, var = prior.q_ecef_body, np.diag(prior.sd_rad**2)
     if abs(prior.time_s - start_s) < 1e-9:
         return q, var, np.zeros((3, 9))
     lo, hi = sorted((prior.time_s, start_s))

@@ -149,7 +149,7 @@ def sense(truth, seed, sites=SITES, prior_time_s=START - 2.0, noise_factor=1.0, 
         radars[site.name] = RadarRecord(site, tags, z)
         errors.append(e)
     q = truth.state(np.array([prior_time_s]))[2][0]
-    prior = AttitudePrior(prior_time_s, rotations.boxplus(q, PRIOR_SD * rng.standard_normal(3)), PRIOR_SD)
+    prior = AttitudePrior(prior_time_s, rotations.boxplus(q, PRIOR_SD * rng.standard_normal(3)), np.full(3, PRIOR_SD))
     telemetry = Telemetry(
         "mini",
         "2009-08-17T12:52:00Z",
