@@ -65,6 +65,10 @@ class RadarSite:
         elevation, sec E and tan E in azimuth. 0 where nothing is stated.
     wander_sd_rad, wander_time_constant_s : float
         Slow (Gauss-Markov) error of both angles across the line of sight.
+    refraction_sd : float
+        Of the part of the air's bending that is left in the elevations: 1 where nothing is known of a correction.
+    range_scale_sd : float
+        Of range error over range: velocity of light, oscillator.
     """
 
     name: str
@@ -82,6 +86,8 @@ class RadarSite:
     nonorthogonality_sd_rad: float = 0.0
     wander_sd_rad: float = 0.0
     wander_time_constant_s: float = 20.0
+    refraction_sd: float = 0.0
+    range_scale_sd: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -177,6 +177,10 @@ class Motion:
         ``C_D S / m`` before anything is learnt.
     drag_sd, drag_time_constant_s : float
         Standard deviation of its natural logarithm, and how long it stays what it is (Gauss-Markov).
+    side_sd : float
+        Of forces across the flow, as a fraction of the drag; they change as the drag does.
+    acceleration_density : float
+        Root power spectral density, (m/s^2)/sqrt(Hz) per axis, of what ballistic flight leaves out everywhere.
     powered_s : tuple of (float, float)
         Spans in which thrust or an opening parachute acts.
     powered_sd_mps2 : float
@@ -187,6 +191,8 @@ class Motion:
     drag_area_per_mass_m2pkg: float = 0.0
     drag_sd: float = 1.0
     drag_time_constant_s: float = 10.0
+    side_sd: float = 0.1
+    acceleration_density: float = 0.002
     powered_s: tuple[tuple[float, float], ...] = ()
     powered_sd_mps2: float = 50.0
 

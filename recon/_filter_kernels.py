@@ -68,6 +68,12 @@ def height_of(p):
     return height
 
 
+@kernel
+def height(p):
+    """`height_of` for callers in Python."""
+    return height_of(p)
+
+
 @inlined
 def forget(wander, dt, climb, decay, noise_var):
     """Decay of each error over a step and the variance that keeps it at its prior; whether any error moves at all."""
@@ -75,7 +81,8 @@ def forget(wander, dt, climb, decay, noise_var):
     for j in range(len(decay)):
         tau, length = wander.time_constant_s[j], wander.altitude_m[j]
         if math.isinf(tau) and math.isinf(length):
-            decay[j], noise_var[j] = 1.0, 0.0
+            decay[j], noise_var[j] = 1.0, wander.walk_var_per_s[j] * dt
+            moving = moving or noise_var[j] > 0.0
         else:
             decay[j] = math.exp(-dt / tau - climb / length)
             noise_var[j] = wander.sd[j] * wander.sd[j] * (1.0 - decay[j] * decay[j])

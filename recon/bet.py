@@ -1,8 +1,10 @@
-"""Where the vehicle was and how it was turned: the best estimated trajectory from radar, accelerometers and gyros.
+"""Where the vehicle was and how it was turned: the best estimated trajectory from trackers and inertial sensors.
 
-Inertial sensors carry the state, radars correct it, a smoother brings what was learnt later back to every earlier time,
-and the whole is repeated about the smoothed trajectory until linearisation no longer matters (`Settings.passes`).
-Aerodynamics and atmosphere take no part: the answer is inertial, and what the air did can be inferred from it.
+Inertial sensors carry the state, trackers (radars, receivers, barometers) correct it, a smoother brings what was learnt
+later back to every earlier time, and the whole is repeated about the smoothed trajectory until that no longer moves the
+result (`Settings.passes`). Aerodynamics and atmosphere take no part: the answer is inertial, and what the air did can be
+inferred from it. A flight without inertial sensors is carried by gravity and the drag of the day's air instead
+(`recon.ballistic`).
 """
 
 from __future__ import annotations
@@ -13,70 +15,25 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import FloatArray, GateError
-from flightmodel.telemetry import Finding, RadarRecord, Telemetry
+from flightmodel.checks import FloatArray
+from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
 from recon import consistency, ekf, inertial, product, smoother, startup, strapdown
 from recon.consistency import Verdict
-from recon.error_model import build_error_model
-from recon.measurements import radar_model
-from recon.state import ROTATION, BoolArray, IntArray, States, boxminus
+from recon.packed import unpacked
+from recon.problem import Problem
+from recon.settings import Settings
+from recon.setup import Bridges, build_problem
+from recon.smoother import Smoothed
+from recon.state import ROTATION, States, boxminus
+
+__all__ = ["Reconstruction", "Settings", "reconstruct"]
 
 Progress = Callable[[float, str], None]
 THINNED_STEP_S = 0.5
 MOST_THINNED_PASSES = 6
 SETTLED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of what it does
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What an analyst may choose.
-
-    Parameters
-    ----------
-    output_rate_hz : float
-        Of the trajectories.
-    start_s, end_s : float or None
-        Span; the data's own common span where None.
-    passes : int
-        Forward passes. With one, an extended Kalman filter about its own estimate. With more, the first is that
-        filter on thinned radar data, iterated until attitudes settle, and the others, on all data, are linearised
-        about the smoothed trajectory of the one before.
-    gate_probability : float
-        A radar point is edited where its normalised innovation squared is beyond this chi-square quantile.
-    bias_time_constant_s : float
-        Of the inertial sensors' biases; infinite for constants.
-    verdict_confidence : float
-        Two-sided confidence of each verdict.
-    angle_noise : str
-        ``"traverse"`` or ``"axis"``, see `recon.measurements`.
-    """
-
-    output_rate_hz: float = 20.0
-    start_s: float | None = None
-    end_s: float | None = None
-    passes: int = 2
-    gate_probability: float = 0.9999
-    bias_time_constant_s: float = np.inf
-    verdict_confidence: float = 0.999
-    angle_noise: str = "traverse"
-
-    def __post_init__(self) -> None:
-        """Check once."""
-        faults = []
-        if not 0.1 <= self.output_rate_hz <= 1000.0:
-            faults.append(f"output_rate_hz {self.output_rate_hz} must lie in 0.1 to 1000")
-        if not 1 <= self.passes <= 10:
-            faults.append(f"passes {self.passes} must lie in 1 to 10")
-        for name in ("gate_probability", "verdict_confidence"):
-            if not 0.5 <= getattr(self, name) < 1.0:
-                faults.append(f"{name} {getattr(self, name)} must lie in 0.5 to 1 (1 excluded)")
-        if not self.bias_time_constant_s > 0.0:
-            faults.append(f"bias_time_constant_s {self.bias_time_constant_s} must be positive (infinite for constants)")
-        if self.angle_noise not in ("traverse", "axis"):
-            faults.append(f"angle_noise '{self.angle_noise}' must be 'traverse' or 'axis'")
-        if faults:
-            raise GateError(faults)
+SETTLED_SD = 0.01  # a pass that moves nothing by more than this part of its sd needs no other
 
 
 @dataclass(frozen=True)
@@ -136,178 +93,124 @@ def reconstruct(
     settings = settings or Settings()
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "bridging gaps")
-    accelerometer, rates = telemetry.required_triads()
-    force, rate = inertial.bridge(accelerometer), inertial.bridge(rates)
-    problem, output = build_problem(telemetry, settings, force, rate)
-    run, smoothed, reference = _iterate(problem, settings.passes, report)
+    bridges = bridge_triads(telemetry)
+    problem = build_problem(telemetry, settings, bridges)
+    run, smoothed, reference, passes = _iterate(problem, settings, report)
 
     report(0.95, "testing consistency")
-    arm = accelerometer.spec.position_from_datum_body_m
-    mount = product.Mounting(telemetry.t0_utc, arm, rates.spec.noise_sd)
-    final = product.datum_trajectory(problem, mount, reference, smoothed.covariance, output)
-    filtered = product.datum_trajectory(problem, mount, run.filtered(), run.p_plus, output)
-    names = [radar.name for radar in problem.radars]
-    settled = problem.time_s > problem.time_s[0] + startup.FIT_SPAN_S
-    verdicts = consistency.radar_verdicts(problem.time_s, run.innovations, names, settings.verdict_confidence)
-    verdicts += consistency.mcreynolds_verdicts(
-        boxminus(run.filtered(), reference)[settled, :9],
-        run.p_plus[settled, :9, :9],
-        smoothed.covariance[settled, :9, :9],
-    )
-    table = product.sensor_error_table(problem, reference, smoothed.covariance, run.p_last)
+    mount = _mounting(telemetry, bridges)
+    table = product.sensor_error_table(problem, reference, smoothed)
+    verdicts = consistency.source_verdicts(problem, run.innovations, settings.verdict_confidence)
+    verdicts += _mcreynolds(problem, run, smoothed, reference)
     verdicts += _sheet_verdicts(problem, table, settings.verdict_confidence)
-    imu_time_s, specific_force, body_rate = product.corrected_series(problem, force, rate, reference)
-    edits = product.edit_findings(problem.time_s, run.innovations, names)
+    series = _series(problem, bridges, reference, smoothed)
+    found = [] if bridges is None else [*bridges.force.findings, *bridges.rate.findings]
     report(1.0, "done")
     return Reconstruction(
-        smoothed=final,
-        filtered=filtered,
+        smoothed=product.datum_trajectory(problem, mount, reference, smoothed.triangles),
+        filtered=product.datum_trajectory(problem, mount, run.states(), run.filtered.p_plus),
         sensor_errors=table,
-        residuals=product.residual_table(problem.time_s, run.innovations, names),
+        residuals=product.residual_table(problem, run.innovations),
         verdicts=tuple(verdicts),
-        imu_time_s=imu_time_s,
-        specific_force_body_mps2=specific_force,
-        rate_body_radps=body_rate,
-        specific_force_cov=product.specific_force_cov(problem, reference, smoothed.covariance, output),
-        findings=(*force.findings, *rate.findings, *edits),
+        imu_time_s=series[0],
+        specific_force_body_mps2=series[1],
+        rate_body_radps=series[2],
+        specific_force_cov=series[3],
+        findings=(*found, *product.edit_findings(problem, run.innovations.accepted)),
         provenance={
             "flight": telemetry.name,
             "settings": asdict(settings),
             "start_s": float(problem.time_s[0]),
             "end_s": float(problem.time_s[-1]),
             "nodes": len(problem.time_s),
-            "states": problem.model.size + 9,
+            "states": problem.size,
+            "passes": passes,
+            "motion": "ballistic" if problem.motion.ballistic else "strapdown",
             "hashes": dict(telemetry.hashes),
         },
     )
 
 
-def _sheet_verdicts(problem: ekf.Problem, table: pd.DataFrame, confidence: float) -> list[Verdict]:
+def bridge_triads(telemetry: Telemetry) -> Bridges | None:
+    """Inertial triads with their gaps bridged; None where the flight has none."""
+    if telemetry.accelerometer is None or telemetry.rates is None or telemetry.motion.model == "ballistic":
+        return None
+    return Bridges(inertial.bridge(telemetry.accelerometer), inertial.bridge(telemetry.rates))
+
+
+def _mounting(telemetry: Telemetry, bridges: Bridges | None) -> product.Mounting:
+    if bridges is None:
+        return product.Mounting(telemetry.t0_utc, np.zeros(3), 0.0)
+    arm = bridges.force.spec.position_from_datum_body_m
+    return product.Mounting(telemetry.t0_utc, arm, bridges.rate.spec.noise_sd)
+
+
+def _series(
+    problem: Problem, bridges: Bridges | None, states: States, smoothed: Smoothed
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Corrected specific force and rates with their times, and the covariance of the force at kept nodes."""
+    if bridges is None:
+        return np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
+    series = product.corrected_series(problem, bridges.force, bridges.rate, states)
+    return (*series, product.specific_force_cov(problem, states, smoothed.triangles))
+
+
+def _mcreynolds(problem: Problem, run: ekf.ForwardPass, smoothed: Smoothed, reference: States) -> list[Verdict]:
+    """Filter against smoother at the kept nodes after the first seconds."""
+    kept = np.flatnonzero(problem.kept)
+    settled = problem.time_s[kept] > problem.time_s[0] + startup.FIT_SPAN_S
+    difference = boxminus(run.states()[kept], reference[kept])[settled, :9]
+    both = (unpacked(triangles[settled], 9) for triangles in (run.filtered.p_plus, smoothed.triangles))
+    groups = [name for name in consistency.GROUPS if name != "attitude" or not problem.motion.ballistic]
+    return consistency.mcreynolds_verdicts(difference, *both, groups)
+
+
+def _sheet_verdicts(problem: Problem, table: pd.DataFrame, confidence: float) -> list[Verdict]:
     """One verdict for each instrument whose errors the flight taught something about."""
     out = []
     owners = np.array(problem.model.instruments, dtype=object)
-    for name in dict.fromkeys(owners):
-        rows = table[owners == name]
+    estimated = ~problem.model.wander.considered
+    for name in dict.fromkeys(owners[estimated]):
+        rows = table[(owners == name) & estimated]
         estimate, prior_sd, sd = rows[["estimate", "prior_sd", "sd"]].to_numpy(dtype=float).T
         out.append(consistency.sheet_verdict(name, rows["name"].tolist(), estimate, prior_sd, sd, confidence))
     return [v for v in out if v is not None]
 
 
-def _iterate(problem: ekf.Problem, passes: int, report: Progress) -> tuple[ekf.ForwardPass, smoother.Smoothed, States]:
-    """Filter and smooth ``passes`` times; the last forward pass, its smoothed errors and the smoothed states."""
+def _iterate(
+    problem: Problem, settings: Settings, report: Progress
+) -> tuple[ekf.ForwardPass, Smoothed, States, int]:
+    """Filter and smooth; the last forward pass, its smoothed errors, the smoothed states, and how often it ran."""
     reference = None
-    if passes > 1:
-        report(0.02, "first pass on thinned data")
-        reference = _first_reference(problem)
-    whole_passes = max(1, passes - 1)
-    share = 0.85 / whole_passes
-    for i in range(whole_passes):
-        done = 0.1 + share * i
-
-        def tell(fraction: float, done: float = done) -> None:
-            report(done + 0.6 * share * fraction, "filter")
-
-        run = ekf.forward(problem, reference, tell)
-        report(done + 0.6 * share, "smoother")
-        smoothed = smoother.smooth(run, with_covariance=i == whole_passes - 1)
+    if settings.passes > 0:
+        report(0.02, "first passes on thinned data")
+        reference = first_reference(problem, settings)
+    most = max(1, settings.passes)
+    for i in range(most):
+        share = 0.85 / most
+        report(0.1 + share * i, f"filter, pass {i + 1}")
+        run = ekf.forward(problem, reference, settings.engine)
+        report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
+        smoothed = smoother.smooth(problem, run, True, settings.smoother, settings.engine)
+        kept = np.flatnonzero(problem.kept)
+        moved = np.abs(smoothed.x[kept]) / np.sqrt(np.maximum(smoothed.variance, 1e-300))
         reference = smoothed.states(run.charts)
+        if moved.max() < SETTLED_SD:
+            break
     assert reference is not None
-    return run, smoothed, reference
+    return run, smoothed, reference, i + 1
 
 
-def _first_reference(problem: ekf.Problem) -> States:
-    """Smoothed states at all nodes from a point of each radar every `THINNED_STEP_S`, iterated until they stay."""
+def first_reference(problem: Problem, settings: Settings) -> States:
+    """Smoothed states at all nodes from a point of each source every `THINNED_STEP_S`, iterated until they stay."""
     thinned, kept = problem.thinned(THINNED_STEP_S)
     reference = None
     for _ in range(MOST_THINNED_PASSES):
-        run = ekf.forward(thinned, reference)
-        smoothed = smoother.smooth(run, with_covariance=False)
+        run = ekf.forward(thinned, reference, settings.engine)
+        smoothed = smoother.smooth(thinned, run, False, "rauch-tung-striebel", settings.engine)
         moved = np.abs(smoothed.x[:, ROTATION]).max() if reference is not None else np.inf
         reference = smoothed.states(run.charts)
         if moved < SETTLED_RAD:
             break
     assert reference is not None
-    return strapdown.fill_between(problem.grid, problem.node_index, kept, reference)
-
-
-def build_problem(
-    telemetry: Telemetry, settings: Settings, force: inertial.Bridged, rate: inertial.Bridged
-) -> tuple[ekf.Problem, IntArray]:
-    """Nodes, grid, models and start of the filter, and which nodes are output times."""
-    start_s, end_s = _span(telemetry, settings, force, rate)
-    records = list(telemetry.radars.values())
-    names = list(telemetry.radars)
-    output_s = _output_times(start_s, end_s, settings.output_rate_hz)
-    within = [_usable(r, start_s, end_s) for r in records]
-    time_s = _union([output_s, *(r.time_s[w] for r, w in zip(records, within, strict=True))])
-
-    points: list[list[tuple[int, FloatArray]]] = [[] for _ in time_s]
-    for number, (record, use) in enumerate(zip(records, within, strict=True)):
-        nearest = _nearest(time_s, record.time_s[use])
-        for node, measured in zip(nearest, record.range_az_el[use], strict=True):
-            points[node].append((number, measured))
-
-    accelerometer, rates = (record.spec for record in telemetry.required_triads())
-    sites = [r.site for r in records]
-    model = build_error_model(accelerometer, rates, sites, settings.bias_time_constant_s)
-    arm = accelerometer.position_from_datum_body_m
-    traverse = settings.angle_noise == "traverse"
-    radars = [
-        radar_model(name, record, model.radar_slice(i), telemetry.required_vehicle().cg_m, arm, traverse)
-        for i, (name, record) in enumerate(zip(names, records, strict=True))
-    ]
-    if telemetry.attitude_prior is None:
-        raise GateError(f"flight '{telemetry.name}' has no [attitude_prior] in flight.toml; a reconstruction needs one")
-    start, covariance = startup.start_state(records, radars, telemetry.attitude_prior, start_s, force, rate, model)
-    grid, node_index = inertial.inertial_grid(force, rate, time_s)
-    from scipy.stats import chi2
-
-    gate = float(chi2.ppf(settings.gate_probability, 3))
-    problem = ekf.Problem(time_s, node_index, grid, model, radars, points, start, covariance, gate)
-    return problem, _nearest(time_s, output_s)
-
-
-def _span(
-    telemetry: Telemetry, settings: Settings, force: inertial.Bridged, rate: inertial.Bridged
-) -> tuple[float, float]:
-    """First and last time that both triads and at least one radar cover, within the settings' span."""
-    radar_times = [r.time_s[np.isfinite(r.range_az_el).all(axis=1)] for r in telemetry.radars.values()]
-    radar_times = [t for t in radar_times if len(t)]
-    if not radar_times:
-        raise GateError("no radar has a usable track point; a trajectory needs at least one radar")
-    start_s = max(min(t[0] for t in radar_times), force.time_s[0], rate.time_s[0])
-    end_s = min(max(t[-1] for t in radar_times), force.time_s[-1], rate.time_s[-1])
-    if settings.start_s is not None:
-        start_s = max(start_s, settings.start_s)
-    if settings.end_s is not None:
-        end_s = min(end_s, settings.end_s)
-    if end_s - start_s < 2.0 * startup.FIT_SPAN_S:
-        raise GateError(
-            f"accelerometer, gyros and radars share only {start_s:.3f} to {end_s:.3f} s; "
-            f"at least {2.0 * startup.FIT_SPAN_S:.0f} s are needed: check time bases and the chosen span"
-        )
-    return float(start_s), float(end_s)
-
-
-def _usable(record: RadarRecord, start_s: float, end_s: float) -> BoolArray:
-    """Which points (n,) lie in the span and are complete."""
-    t = record.time_s
-    return np.isfinite(record.range_az_el).all(axis=1) & (t >= start_s - 1e-9) & (t <= end_s + 1e-9)
-
-
-def _output_times(start_s: float, end_s: float, rate_hz: float) -> FloatArray:
-    """Multiples of the output step inside the span, and the start itself."""
-    first, last = np.ceil(start_s * rate_hz - 1e-6), np.floor(end_s * rate_hz + 1e-6)
-    times = np.clip(np.arange(first, last + 1.0) / rate_hz, start_s, end_s)
-    return _union([np.array([start_s]), times])
-
-
-def _union(times: list[FloatArray]) -> FloatArray:
-    """All times in order, instants closer than `inertial.SAME_INSTANT_S` taken once."""
-    t = np.sort(np.concatenate(times))
-    return t[np.diff(t, prepend=-np.inf) > inertial.SAME_INSTANT_S]
-
-
-def _nearest(grid_s: FloatArray, at_s: FloatArray) -> IntArray:
-    k = np.clip(np.searchsorted(grid_s, at_s), 1, len(grid_s) - 1)
-    return k - (at_s - grid_s[k - 1] < grid_s[k] - at_s)
+    return strapdown.fill_between(problem.motion, problem.node_index, kept, reference)

@@ -1,8 +1,7 @@
 """Is the reconstruction as good as it says? Verdicts in words, from the residuals and the two passes.
 
 Innovations of a filter whose model matches the data are white with the predicted covariance, so the sum of normalised
-innovations squared (NIS) over ``N`` points of three components is chi-square with ``3 N`` degrees of freedom and the
-lag-one autocorrelation of a component is normal with sd ``1 / sqrt(N)``. Filter minus smoother has covariance
+innovations squared (NIS) is chi-square with as many degrees of freedom as components were measured, and the lag-one autocorrelation of a component is normal with sd ``1 / sqrt(N)``. Filter minus smoother has covariance
 ``P_filter - P_smoother`` (McReynolds); differences last, so one that is beyond three sd by chance may stay there for
 long: a tenth of them may. Points of the first seconds are left out: they chose the start. What the flight taught about
 a sensor error, ``estimate / sqrt(prior_sd^2 - sd^2)``, is standard normal where the data sheet is right; radars can
@@ -24,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel.checks import FloatArray
-from recon.ekf import Innovations
-from recon.measurements import COMPONENTS
+from recon.packed import Innovations
+from recon.problem import Problem
 from recon.startup import FIT_SPAN_S
 from recon.state import BoolArray
 
@@ -53,12 +52,12 @@ def verdict(name: str, value: float, low: float, high: float, good: str, bad: st
     return Verdict(name, float(value), float(low), float(high), passed, good if passed else bad)
 
 
-def nis_verdict(source: str, nis: FloatArray, confidence: float) -> Verdict:
-    """Mean normalised innovation squared of accepted three-component points against its chi-square band."""
+def nis_verdict(source: str, nis: FloatArray, components: int, confidence: float) -> Verdict:
+    """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all."""
     from scipy.stats import chi2
 
     n, tail = len(nis), 0.5 * (1.0 - confidence)
-    low, high = (float(chi2.ppf(p, 3 * n)) / n for p in (tail, 1.0 - tail))
+    low, high = (float(chi2.ppf(p, components)) / n for p in (tail, 1.0 - tail))
     mean = float(np.mean(nis))
     bad = (
         "residuals are smaller than predicted: the assumed noise is too large"
@@ -122,13 +121,16 @@ def sheet_verdict(
     )
 
 
-def mcreynolds_verdicts(difference: FloatArray, p_filter: FloatArray, p_smoother: FloatArray) -> list[Verdict]:
-    """Share of filter-minus-smoother differences ``(n, 9)`` within three sd of their own covariance."""
+def mcreynolds_verdicts(
+    difference: FloatArray, p_filter: FloatArray, p_smoother: FloatArray, groups: list[str]
+) -> list[Verdict]:
+    """Share of filter-minus-smoother differences ``(n, 9)`` within three sd of their own covariance, by group."""
     var = np.diagonal(p_filter - p_smoother, axis1=1, axis2=2)
     alive = var > 1e-9 * np.diagonal(p_filter, axis1=1, axis2=2)  # at the end both are one
     inside = np.abs(difference) <= 3.0 * np.sqrt(np.where(alive, var, 0.0))
     out = []
-    for name, part in GROUPS.items():
+    for name in groups:
+        part = GROUPS[name]
         use = alive[:, part]
         share = float(inside[:, part][use].mean()) if use.any() else 1.0
         out.append(
@@ -144,20 +146,24 @@ def mcreynolds_verdicts(difference: FloatArray, p_filter: FloatArray, p_smoother
     return out
 
 
-def radar_verdicts(time_s: FloatArray, innovations: Innovations, names: list[str], confidence: float) -> list[Verdict]:
-    """NIS, whiteness and edits of each radar; ``time_s`` (n,) of the nodes."""
+def source_verdicts(problem: Problem, innovations: Innovations, confidence: float) -> list[Verdict]:
+    """NIS, whiteness and edits of each source; one that was left out on purpose has none."""
     out = []
-    settled = time_s[innovations.node] > time_s[0] + FIT_SPAN_S
-    sd = np.sqrt(np.diagonal(innovations.covariance, axis1=1, axis2=2))
-    normalised = innovations.residual / sd
-    for number, name in enumerate(names):
-        mine = innovations.radar == number
+    time_s = problem.time_s[problem.node]
+    settled = time_s > problem.time_s[0] + FIT_SPAN_S
+    measured = np.isfinite(problem.observed.variance)
+    normalised = innovations.residual / np.sqrt(np.diagonal(innovations.covariance, axis1=1, axis2=2))
+    for number, instrument in enumerate(problem.instruments):
+        mine = (problem.observed.source == number) & problem.observed.usable
         if not mine.any():
             continue
         use = mine & settled & innovations.accepted
         if use.sum() >= 10:
-            out.append(nis_verdict(name, innovations.nis[use], confidence))
-            for i, component in enumerate(COMPONENTS):
-                out.append(whiteness_verdict(f"{name} {component}", normalised[use, i], confidence))
-        out.append(edit_verdict(name, innovations.accepted[mine]))
+            count = int(measured[use].sum())
+            out.append(nis_verdict(instrument.name, innovations.nis[use], count, confidence))
+            for i, component in enumerate(instrument.components):
+                rows = use & measured[:, i]
+                if rows.sum() >= 10:
+                    out.append(whiteness_verdict(f"{instrument.name} {component}", normalised[rows, i], confidence))
+        out.append(edit_verdict(instrument.name, innovations.accepted[mine]))
     return out

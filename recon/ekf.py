@@ -1,287 +1,249 @@
-"""What the data up to a time say: an extended Kalman filter on the error state, forward through all nodes.
+"""The error-state extended Kalman filter, compiled and readable: two engines with the same numbers.
 
-Built on `filterpy.kalman.ExtendedKalmanFilter`, which predicts and updates; retraction, gate and bookkeeping are here.
-At every node ``k`` errors ``x_k`` are coordinates about a nominal state (the *chart*). Between nodes
+The filter's state is the error about a nominal state at each node, its *chart*. In the first pass the chart is the
+prediction itself; in later passes it is the smoothed trajectory of the pass before, about which everything is
+linearised (iterated Kalman smoothing). In both cases a step is affine,
 
-    x_{k+1} = F_k x_k + u_k + w_k,   F_k = transition of the strapdown, cov(w_k) = its process noise
+    x_{k+1} = F_k x_k + u_k,   P_{k+1} = F_k P_k F_k^T + Q_k
 
-First pass: the next chart is the propagated estimate, so ``u_k = -F_k x_k`` returns the error state to zero, and
-``F_k`` contains the turn of the tangent plane. Later passes: the charts are the previous pass's smoothed states and
-``u_k`` is the step from a chart's propagation to the next chart; iterating is Gauss-Newton on the whole flight
-(the iterated extended Kalman smoother), which matters where attitude is off by ten degrees as the pulse sets in.
+and a measurement is ``y = z - h(chart) = H x + noise``; it is used where ``y - H x`` passes a chi-square gate, with the
+gain ``K = P H^T S^-1`` in which the rows of considered errors are zero (Schmidt), so that
+
+    P+ = (1 - K H) P (1 - K H)^T + K R K^T
+
+(Joseph), by which a considered error keeps its own variance. The compiled engine is `recon._filter_kernels`; the readable
+one below runs on filterpy's filter and is where another filter can be put in its place.
 
 References
 ----------
 B. Bell, "The iterated Kalman smoother as a Gauss-Newton method", SIAM J. Optim. 4 (1994) 626.
+S. Schmidt, "Application of state-space methods to navigation problems", Advances in Control Systems 3 (1966) 293.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from flightmodel import rotations
 from flightmodel.checks import FloatArray
-from recon import _kernels
-from recon.error_model import ErrorModel
-from recon.measurements import RadarModel, predict_radar, residual
-from recon.state import (
-    INERTIAL,
-    KINEMATIC,
-    ROTATION,
-    BoolArray,
-    IntArray,
-    States,
-    boxminus,
-    boxplus,
-    right_jacobian,
-    stack,
-)
-from recon.strapdown import InertialGrid, correct, propagate, propagate_all
+from recon import _filter_kernels, _measurement_kernels
+from recon._measurement_kernels import SLOTS
+from recon.measurements import NodeMotion, predict, wrapped
+from recon.packed import Charts, Filtered, Innovations, Steps, packed
+from recon.problem import Problem
+from recon.state import KINEMATIC, ROTATION, IntArray, States, boxminus, boxplus, right_jacobian
+from recon.strapdown import propagate
 
-
-@dataclass(frozen=True)
-class Problem:
-    """Everything the filter needs.
-
-    Parameters
-    ----------
-    time_s : (n,) float
-        Nodes, the first is the start.
-    node_index : (n,) int
-        Where each node stands in the grid.
-    points : list of n lists of (int, (3,) float)
-        Radar number and its range, azimuth, elevation at each node.
-    start, start_covariance : States, (9 + m, 9 + m) float
-    gate : float
-        Largest normalised innovation squared that is used.
-    """
-
-    time_s: FloatArray
-    node_index: IntArray
-    grid: InertialGrid
-    model: ErrorModel
-    radars: list[RadarModel]
-    points: list[list[tuple[int, FloatArray]]]
-    start: States
-    start_covariance: FloatArray
-    gate: float
-
-    def thinned(self, step_s: float) -> tuple[Problem, IntArray]:
-        """Problem with at most one point of each radar every ``step_s``, and which nodes (k,) it keeps."""
-        seen: dict[int, float] = {}
-        points, keep = [], [0]
-        for node, (t, here) in enumerate(zip(self.time_s, self.points, strict=True)):
-            chosen = [(number, z) for number, z in here if np.floor(t / step_s) > seen.get(number, -np.inf)]
-            for number, _ in chosen:
-                seen[number] = float(np.floor(t / step_s))
-            if chosen and node > 0:
-                keep.append(node)
-            if chosen or node == 0:
-                points.append(chosen)
-        index = np.array(keep)
-        return replace(self, time_s=self.time_s[index], node_index=self.node_index[index], points=points), index
-
-
-@dataclass(frozen=True)
-class Innovations:
-    """One row for each radar point: node, radar number, residual (3,), its covariance (3, 3), NIS, accepted."""
-
-    node: IntArray
-    radar: IntArray
-    residual: FloatArray
-    covariance: FloatArray
-    nis: FloatArray
-    accepted: BoolArray
+ENGINES = ("compiled", "readable")
 
 
 @dataclass(frozen=True)
 class ForwardPass:
-    """What the smoother needs of a linear (or linearised) filter, node by node.
-
-    Parameters
-    ----------
-    charts : States
-        Nominal states.
-    x_minus, x_plus : (n, N) float
-        Errors about the charts before and after the node's measurements.
-    p_minus : (n, N, N) float
-    p_plus : (n, 27, 27) float
-        Without the radars' errors.
-    p_last : (N, N) float
-        After the last node's measurements.
-    transition : (n - 1, 9, 27) float
-        Kinematic rows; sensor errors only decay.
-    noise : (n - 1, 9, 9) float
-        Kinematic process noise.
-    decay, noise_var : (n - 1, m) float
-        Of the sensor errors.
-    innovations : Innovations
-    """
+    """What the smoother needs of a linear (or linearised) filter, node by node; see `recon.packed`."""
 
     charts: States
-    x_minus: FloatArray
-    x_plus: FloatArray
-    p_minus: FloatArray
-    p_plus: FloatArray
-    p_last: FloatArray
-    transition: FloatArray
-    noise: FloatArray
-    decay: FloatArray
-    noise_var: FloatArray
+    steps: Steps
+    filtered: Filtered
     innovations: Innovations
 
-    def filtered(self) -> States:
+    def states(self) -> States:
         """Filtered states at every node."""
-        return boxplus(self.charts, self.x_plus)
+        return boxplus(self.charts, self.filtered.x_plus)
 
 
-def forward(
-    problem: Problem, reference: States | None = None, progress: Callable[[float], None] | None = None
-) -> ForwardPass:
+def forward(problem: Problem, reference: States | None = None, engine: str = "compiled") -> ForwardPass:
     """Run the filter through all nodes, about its own estimate or about a reference trajectory."""
-    run = _Run(problem, reference)
+    steps, run, innovations = _empty(problem)
     n = len(problem.time_s)
-    for k in range(n):
-        if k > 0:
-            run.predict(k)
-        run.update(k)
-        if progress is not None and k % 500 == 0:
-            progress(k / n)
-    return run.result()
+    if reference is None:
+        charts = Charts(np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)), np.empty((n, problem.model.size)))
+        for part, value in zip(charts, as_charts(problem.start), strict=True):
+            part[0] = value
+        start = np.zeros(problem.size)
+    else:
+        charts = Charts(*(np.array(part, order="C") for part in as_charts(reference)))
+        start = boxminus(problem.start, reference[0])
+    run.p_last[:] = problem.start_covariance
+    if engine == "compiled":
+        _filter_kernels.forward(
+            problem.motion, problem.node_index, problem.sources(), problem.observed, problem.model.wander,
+            problem.gate, reference is not None, start, steps, charts, run, innovations,
+        )  # fmt: skip
+    else:
+        Readable(problem, reference is not None, start, steps, charts, run, innovations).run_all()
+    states = States(charts.position, charts.velocity, rotations.continuous(charts.q), charts.errors)
+    return ForwardPass(states, steps, run, innovations)
 
 
-class _Run:
-    """One forward pass in the making."""
+def as_charts(states: States) -> Charts:
+    """Arrays of states."""
+    return Charts(states.position_ecef_m, states.velocity_ecef_mps, states.q_ecef_body, states.sensor_errors)
 
-    def __init__(self, problem: Problem, reference: States | None) -> None:
-        from filterpy.kalman import ExtendedKalmanFilter
 
-        n, size = len(problem.time_s), KINEMATIC + problem.model.size
-        self.problem = problem
-        self.reference = reference
-        dt = np.diff(problem.time_s)
-        self.decay = problem.model.decay(dt)
-        self.noise_var = problem.model.noise_var(self.decay)
-        self.transition = np.empty((n - 1, KINEMATIC, INERTIAL))
-        self.noise = np.empty((n - 1, KINEMATIC, KINEMATIC))
-        self.x_minus, self.x_plus = np.zeros((2, n, size))
-        self.p_minus, self.p_plus = np.empty((n, size, size)), np.empty((n, INERTIAL, INERTIAL))
-        self.charts: list[States] = []
-        self.rows: list[tuple[int, int, FloatArray, FloatArray, float, bool]] = []
+def _empty(problem: Problem) -> tuple[Steps, Filtered, Innovations]:
+    """Arrays for one pass."""
+    n, size, dense, m = len(problem.time_s), problem.size, problem.dense, problem.model.size
+    count = len(problem.row)
+    kept: IntArray = np.full(n, -1, dtype=np.int64)
+    kept[problem.kept] = np.arange(int(problem.kept.sum()))
+    steps = Steps(np.empty((n - 1, 9, dense)), np.empty((n - 1, 9, 9)), np.empty((n - 1, m)), np.empty((n - 1, m)))
+    run = Filtered(
+        np.empty((n, size)),
+        np.empty((n, size)),
+        np.empty((n, size * (size + 1) // 2)),
+        kept,
+        np.empty((int(problem.kept.sum()), dense * (dense + 1) // 2)),
+        np.empty((size, size)),
+    )
+    innovations = Innovations(
+        np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros(count), np.zeros(count, dtype=bool),
+        np.zeros((count, size, 3)), np.zeros((count, 3, 9)), np.zeros((count, 3, SLOTS)),
+    )  # fmt: skip
+    return steps, run, innovations
 
-        self.ekf = ExtendedKalmanFilter(size, 3)
-        self.ekf.x = np.zeros(size)
-        self.ekf.P = problem.start_covariance.copy()
-        self.ekf.F = np.eye(size)
-        self.ekf.Q = np.zeros((size, size))
-        self.ekf.B = np.eye(size)
-        self.sensor_diagonal = np.arange(KINEMATIC, size)
-        self.wandering = bool((self.decay < 1.0).any())
-        if reference is None:
-            self.charts.append(problem.start)
-        else:
-            self.ekf.x = boxminus(problem.start, reference[0])
-            self._follow(reference)
 
-    def _follow(self, reference: States) -> None:
-        """Linearise every step about the reference at once."""
-        step = propagate_all(self.problem.grid, self.problem.node_index, reference)
-        self.transition[:] = step.transition
-        self.noise[:] = step.noise
-        reached = States(
-            step.state.position_ecef_m,
-            step.state.velocity_ecef_mps,
-            step.state.q_ecef_body,
-            reference.sensor_errors[:-1] * self.decay,
-        )
-        self.offset = boxminus(reached, reference[1:])
-        self.rates = correct(
-            self.problem.grid.rate_sensor_radps[self.problem.node_index],
-            reference.sensor_errors[:, 9:18],
-            self.problem.grid.dcm_body_rate,
-        )
-        self.charts = [reference[k] for k in range(len(self.problem.time_s))]
+class Readable:
+    """One forward pass on filterpy's `ExtendedKalmanFilter`, written to be read."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        follow: bool,
+        start: FloatArray,
+        steps: Steps,
+        charts: Charts,
+        run: Filtered,
+        innovations: Innovations,
+    ) -> None:
+        self.problem, self.follow = problem, follow
+        self.steps, self.charts, self.run, self.innovations = steps, charts, run, innovations
+        self.ekf = make_filter(problem.size, start, run.p_last.copy())
+        self.wander = problem.model.wander
+        self.considered = KINEMATIC + np.flatnonzero(self.wander.considered)
+        self.slots = [i.slots(problem.model) for i in problem.instruments]
+
+    def run_all(self) -> None:
+        """All nodes in turn."""
+        for k in range(len(self.problem.time_s)):
+            if k > 0:
+                self.predict(k)
+            self.run.x_minus[k], self.run.p_minus[k] = self.ekf.x, packed(self.ekf.P)
+            for row in range(self.problem.observed.first[k], self.problem.observed.first[k + 1]):
+                self.update(k, row)
+            self.run.x_plus[k] = self.ekf.x
+            if self.run.kept[k] >= 0:
+                dense = self.problem.dense
+                self.run.p_plus[self.run.kept[k]] = packed(self.ekf.P[:dense, :dense])
+        self.run.p_last[:] = self.ekf.P
+
+    def chart(self, k: int) -> States:
+        """Nominal state of a node."""
+        return States(*(part[k] for part in self.charts))
 
     def predict(self, k: int) -> None:
         """From node ``k - 1`` to node ``k``."""
-        ekf, j = self.ekf, k - 1
-        if self.reference is None:
-            estimate = boxplus(self.charts[j], ekf.x)
-            step = propagate(self.problem.grid, self.problem.node_index[j], self.problem.node_index[k], estimate)
-            tangent = right_jacobian(ekf.x[ROTATION])
-            self.transition[j] = step.transition
-            self.transition[j][:, ROTATION] = step.transition[:, ROTATION] @ tangent
-            self.noise[j] = step.noise
-            state = step.state
-            self.charts.append(
-                States(
-                    state.position_ecef_m,
-                    state.velocity_ecef_mps,
-                    state.q_ecef_body,
-                    state.sensor_errors * self.decay[j],
-                )
-            )
-        ekf.F[:KINEMATIC, :INERTIAL] = self.transition[j]
-        ekf.Q[:KINEMATIC, :KINEMATIC] = self.noise[j]
-        if self.wandering:
-            ekf.F[self.sensor_diagonal, self.sensor_diagonal] = self.decay[j]
-            ekf.Q[self.sensor_diagonal, self.sensor_diagonal] = self.noise_var[j]
-        offset = -(ekf.F @ ekf.x) if self.reference is None else self.offset[j]
-        ekf.predict(u=offset)
+        problem, ekf, j = self.problem, self.ekf, k - 1
+        estimate = self.chart(j) if self.follow else boxplus(self.chart(j), ekf.x)
+        step = propagate(problem.motion, problem.node_index[j], problem.node_index[k], estimate)
+        phi = step.transition
+        if not self.follow:
+            phi[:, ROTATION] = phi[:, ROTATION] @ right_jacobian(ekf.x[ROTATION])
+        climb = abs(height(step.state) - height(estimate))
+        decay, noise_var = self._forget(problem.time_s[k] - problem.time_s[j], climb)
+        reached = States(*as_charts(step.state)[:3], step.state.sensor_errors * decay)
+        self.steps.transition[j], self.steps.noise[j] = phi, step.noise
+        self.steps.decay[j], self.steps.noise_var[j] = decay, noise_var
 
-    def update(self, k: int) -> None:
-        """Use the radar points of node ``k`` that pass the gate."""
-        ekf, problem, chart = self.ekf, self.problem, self.charts[k]
+        ekf.F = np.diag(np.concatenate([np.ones(KINEMATIC), decay]))
+        ekf.F[:KINEMATIC, : problem.dense] = phi
+        ekf.Q = np.diag(np.concatenate([np.zeros(KINEMATIC), noise_var]))
+        ekf.Q[:KINEMATIC, :KINEMATIC] = step.noise
+        if self.follow:
+            ekf.predict(u=boxminus(reached, self.chart(k)))
+            return
+        for part, value in zip(self.charts, as_charts(reached), strict=True):
+            part[k] = value
+        ekf.predict(u=-(ekf.F @ ekf.x))
+
+    def _forget(self, dt_s: float, climb_m: float) -> tuple[FloatArray, FloatArray]:
+        """Decay of each error over a step, and the variance that comes new."""
+        w = self.wander
+        decay = np.exp(-dt_s / w.time_constant_s - climb_m / w.altitude_m)
+        stays = np.isinf(w.time_constant_s) & np.isinf(w.altitude_m)
+        return decay, np.where(stays, w.walk_var_per_s * dt_s, w.sd**2 * (1.0 - decay**2))
+
+    def node_motion(self, k: int) -> NodeMotion:
+        """What measurements need to know of a node's motion."""
+        chart = self.chart(k)
+        rate, acceleration = np.empty(3), np.empty(3)
+        _measurement_kernels.motion_at(
+            self.problem.motion, self.problem.node_index[k], *as_charts(chart), rate, acceleration
+        )
+        c = rotations.dcm_from_q(chart.q_ecef_body)
+        return NodeMotion(chart.position_ecef_m, chart.velocity_ecef_mps, c, rate, acceleration)
+
+    def update(self, k: int, row: int) -> None:
+        """Use one measurement if it passes the gate."""
+        ekf, observed = self.ekf, self.problem.observed
+        source = observed.source[row]
+        instrument, slot = self.problem.instruments[source], self.slots[source]
+        there = slot >= 0
+        e = np.where(there, self.charts.errors[k][slot], 0.0)
+        h, by_state, by_error = predict(instrument, observed.known[row], e, self.node_motion(k))
+        jacobian = np.zeros((3, self.problem.size))
+        jacobian[:, :KINEMATIC] = by_state
+        jacobian[:, KINEMATIC + slot[there]] += by_error[:, there]
+        used = np.flatnonzero(np.isfinite(observed.variance[row]))
+        jacobian, noise = jacobian[used], np.diag(observed.variance[row, used])
+        y = wrapped(instrument.kind, observed.value[row] - h)[used] - jacobian @ ekf.x
+        s = jacobian @ ekf.P @ jacobian.T + noise
+        nis = float(y @ np.linalg.solve(s, y))
+        accepted = bool(nis <= self.problem.gate[len(used)] and observed.usable[row])
+
+        out, both = self.innovations, np.ix_(used, used)
+        out.residual[row], out.covariance[row] = 0.0, np.eye(3)
+        out.residual[row, used], out.covariance[row][both] = y, s
+        out.nis[row], out.accepted[row] = nis, accepted
+        out.by_state[row], out.by_error[row] = by_state, by_error
+        if accepted:
+            gain = schmidt_update(ekf, y, jacobian, noise, self.considered)
+            out.gain[row][:, used] = gain
+
+
+def make_filter(size: int, x: FloatArray, p: FloatArray) -> Any:
+    """Filterpy's extended Kalman filter at its start; another filter with the same methods may stand here."""
+    from filterpy.kalman import ExtendedKalmanFilter
+
+    ekf = ExtendedKalmanFilter(size, 3)
+    ekf.x, ekf.P, ekf.B = x.copy(), p.copy(), np.eye(size)
+    return ekf
+
+
+def schmidt_update(
+    ekf: Any, innovation: FloatArray, jacobian: FloatArray, noise: FloatArray, considered: IntArray
+) -> FloatArray:
+    """Update filterpy's filter by a known innovation; errors that are only considered get no gain. Returns the gain.
+
+    Without considered errors this is filterpy's own update; its gain cannot be masked, so with them Joseph's form stands
+    here.
+    """
+    if len(considered) == 0:
+        ekf.update(innovation, lambda _x: jacobian, lambda _x: np.zeros(len(innovation)), R=noise)
         ekf.P = 0.5 * (ekf.P + ekf.P.T)
-        self.x_minus[k], self.p_minus[k] = ekf.x, ekf.P
-        points = problem.points[k]
-        rate = self._rate(k) if points else np.zeros(3)
-        for number, measured in points:
-            radar = problem.radars[number]
-            h, jacobian = predict_radar(radar, chart, rate)
-            y = residual(measured, h) - jacobian @ ekf.x
-            noise_var = radar.noise_var(h[2])
-            cov = jacobian @ ekf.P @ jacobian.T + noise_var
-            nis = _kernels.normalised_square(y, cov)
-            accepted = nis <= problem.gate
-            self.rows.append((k, number, y, cov, nis, accepted))
-            if accepted:
-                _update(ekf, y, jacobian, noise_var)
-        self.x_plus[k], self.p_plus[k] = ekf.x, ekf.P[:INERTIAL, :INERTIAL]
-
-    def _rate(self, k: int) -> FloatArray:
-        """Rate of the body against inertial space (3,) at a node."""
-        if self.reference is not None:
-            return self.rates[k]
-        grid = self.problem.grid
-        measured = grid.rate_sensor_radps[self.problem.node_index[k]]
-        return correct(measured[None], self.charts[k].sensor_errors[9:18], grid.dcm_body_rate)[0]
-
-    def result(self) -> ForwardPass:
-        """Everything as arrays."""
-        node, radar, y, cov, nis, accepted = (list(c) for c in zip(*self.rows, strict=True))
-        innovations = Innovations(
-            np.array(node), np.array(radar), np.array(y), np.array(cov), np.array(nis), np.array(accepted)
-        )
-        return ForwardPass(
-            stack(self.charts),
-            self.x_minus,
-            self.x_plus,
-            self.p_minus,
-            self.p_plus,
-            self.ekf.P.copy(),
-            self.transition,
-            self.noise,
-            self.decay,
-            self.noise_var,
-            innovations,
-        )
+        return np.asarray(ekf.K)
+    s = jacobian @ ekf.P @ jacobian.T + noise
+    gain = np.linalg.solve(s, jacobian @ ekf.P).T
+    gain[considered] = 0.0
+    ekf.x = ekf.x + gain @ innovation
+    rest = np.eye(len(ekf.x)) - gain @ jacobian
+    p = rest @ ekf.P @ rest.T + gain @ noise @ gain.T
+    ekf.P = 0.5 * (p + p.T)
+    return np.asarray(gain)
 
 
-def _update(ekf: object, innovation: FloatArray, jacobian: FloatArray, noise_var: FloatArray) -> None:
-    """One update of filterpy's filter with an innovation that is known already."""
-    ekf.update(  # type: ignore[attr-defined]
-        innovation, lambda _x: jacobian, lambda _x: np.zeros(len(innovation)), R=noise_var
-    )
+def height(state: States) -> float:
+    """Geodetic height of one state, m."""
+    return float(_filter_kernels.height(state.position_ecef_m))

@@ -36,6 +36,7 @@ class Block:
     prior_sd: float
     time_constant_s: float = np.inf
     altitude_m: float = np.inf
+    walk_var_per_s: float = 0.0
     considered: bool = False
 
 
@@ -77,14 +78,18 @@ class ErrorModel:
     def wander(self) -> Wander:
         """How every error wanders; a considered one stays what it is."""
         considered = np.array(self._each("considered"), dtype=bool)
-        tau, length = (np.array(self._each(name), dtype=float) for name in ("time_constant_s", "altitude_m"))
-        return Wander(np.where(considered, np.inf, tau), np.where(considered, np.inf, length), self.prior_sd, considered)
+        tau, length, walk = (
+            np.array(self._each(name), dtype=float) for name in ("time_constant_s", "altitude_m", "walk_var_per_s")
+        )
+        forever = np.where(considered, np.inf, tau), np.where(considered, np.inf, length)
+        return Wander(*forever, self.prior_sd, np.where(considered, 0.0, walk), considered)
 
     @property
     def wandering(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         """Which errors (w,) are not constant."""
         w = self.wander
-        return np.flatnonzero(np.isfinite(w.time_constant_s) | np.isfinite(w.altitude_m)).astype(np.int64)
+        moves = np.isfinite(w.time_constant_s) | np.isfinite(w.altitude_m) | (w.walk_var_per_s > 0.0)
+        return np.flatnonzero(moves).astype(np.int64)
 
     def column(self, instrument: str, component: str) -> int:
         """Where an error stands among all errors; -1 where it is not modelled."""
@@ -126,11 +131,13 @@ def _fits(block: Block, names: list[str]) -> bool:
 def triad_blocks(spec: TriadSpec, unit: str) -> list[Block]:
     """Bias, scale and mount of one triad; a prior of zero becomes a millionth of a typical one."""
 
-    def block(kind: str, unit: str, sd: float, tau: float = np.inf) -> Block:
-        return Block(spec.name, tuple(f"{kind} {axis}" for axis in AXES), unit, max(sd, 1e-9), tau)
+    def block(kind: str, unit: str, sd: float, walk: float = 0.0) -> Block:
+        return Block(spec.name, tuple(f"{kind} {axis}" for axis in AXES), unit, max(sd, 1e-9), walk_var_per_s=walk)
 
+    # a wandering part beside a constant one: over times below its time constant it walks, and one error holds both
+    walk = 2.0 * spec.bias_wander_sd**2 / spec.bias_time_constant_s
     return [
-        block("bias", unit, float(np.hypot(spec.bias_sd, spec.bias_wander_sd)), spec.bias_time_constant_s),
+        block("bias", unit, float(np.hypot(spec.bias_sd, spec.bias_wander_sd)), walk),
         block("scale", "1", spec.scale_sd),
         block("mount", "rad", spec.mount_sd_rad),
     ]

@@ -17,8 +17,8 @@ from flightmodel.checks import FloatArray, GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import Finding, TriadRecord
 from flightmodel.trajectory import interpolate_rows
+from recon.motion import Motion, strapdown_motion
 from recon.state import BoolArray, IntArray
-from recon.strapdown import InertialGrid
 
 SAME_INSTANT_S = 2e-6
 SLOPE_SPAN_S = 0.06
@@ -150,7 +150,7 @@ def _missed_sd(t: FloatArray, x: FloatArray, k: int, length: float, dcm: FloatAr
     return worse
 
 
-def inertial_grid(force: Bridged, rate: Bridged, node_time_s: FloatArray) -> tuple[InertialGrid, IntArray]:
+def inertial_motion(force: Bridged, rate: Bridged, node_time_s: FloatArray) -> tuple[Motion, IntArray]:
     """Both triads from first to last node, on the faster one's times and the nodes', and each node's index."""
     first, last = node_time_s[0], node_time_s[-1]
     finer = rate if np.median(np.diff(rate.time_s)) < 0.9 * np.median(np.diff(force.time_s)) else force
@@ -160,16 +160,16 @@ def inertial_grid(force: Bridged, rate: Bridged, node_time_s: FloatArray) -> tup
         node_time_s[np.clip(near, None, len(node_time_s) - 1)] - inner > SAME_INSTANT_S
     )
     t = np.sort(np.concatenate([inner[clear], node_time_s]))
-    grid = InertialGrid(
+    motion = strapdown_motion(
         t,
         interpolate_rows(t, force.time_s, force.measured_sensor),
         interpolate_rows(t, rate.time_s, rate.measured_sensor),
         _held(t, force),
         _held(t, rate),
-        np.ascontiguousarray(force.spec.dcm_body_sensor, dtype=float),
-        np.ascontiguousarray(rate.spec.dcm_body_sensor, dtype=float),
+        force.spec.dcm_body_sensor,
+        rate.spec.dcm_body_sensor,
     )
-    return grid, np.searchsorted(t, node_time_s).astype(np.int64)
+    return motion, np.searchsorted(t, node_time_s).astype(np.int64)
 
 
 def _held(at: FloatArray, triad: Bridged) -> FloatArray:

@@ -1,12 +1,18 @@
-"""What a radar should have measured, how that changes with the state, and how noisy it is.
+"""What each instrument should have read, how that changes with the state, and how noisy it is.
 
-The tracked point sits at ``d`` from the accelerometer in body axes. A point tagged ``t`` was taken at ``t - tau``
-(``tau``: time tag minus true time), so the radar sees
+A tracked point at ``d`` from the accelerometer in body axes, tagged ``t``, was seen at ``t - tau`` (``tau``: time tag
+minus true time), so
 
-    p = r + C d - tau (v + C (w x d)),    z = (range, azimuth, elevation of p from the site) + bias + noise
+    p = r + C d - tau (v + C (w x d)) + tau^2 a / 2
 
-with ``w`` the body's rate relative to the Earth. The acceleration term ``tau^2 a / 2`` is below a millimetre for
-milliseconds and 10 g and is left out; so is the uncertainty of ``w`` times arm and time bias (a micrometre).
+with ``w`` the body's rate against the Earth and ``a`` the acceleration. Then, each plus its errors and noise:
+
+* radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95) and what is left of
+  the air's bending, ``N cot(E)`` for a ray through the whole air;
+* receiver: ``p`` north, east and down of a reference, and its velocity along the same axes;
+* barometer: geodetic height of ``p``;
+* magnetometer: ``S R(m)^T D^T C^T B + b``, S with scales and soft iron, m the mounting rotation, D its nominal axes;
+* Sun head: azimuth and elevation of ``R(m)^T D^T C^T s``.
 
 A tracker's angle noise is noise of its line of sight: ``angle_sd`` in elevation and in traverse, hence
 ``angle_sd / cos(elevation)`` in azimuth. `Settings.angle_noise` says ``"axis"`` for a radar whose azimuth readings
@@ -21,138 +27,295 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
-from flightmodel.telemetry import RadarRecord
-from recon import _kernels
-from recon.state import POSITION, ROTATION, VELOCITY, States
+from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
+from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, SLOTS, SUN, VELOCITY
+from recon.error_model import AXES, ErrorModel
+from recon.state import IntArray
 
-COMPONENTS = ("range", "azimuth", "elevation")
+SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
+COMPONENTS = {
+    RADAR: ("range", "azimuth", "elevation"),
+    POSITION: ("north", "east", "down"),
+    VELOCITY: ("velocity north", "velocity east", "velocity down"),
+    HEIGHT: ("height",),
+    FIELD: ("field x", "field y", "field z"),
+    SUN: ("azimuth", "elevation"),
+}
+_WANDER = ("wander north", "wander east", "wander down", "time bias")
+SLOT_NAMES: dict[int, tuple[str, ...]] = {
+    RADAR: (
+        "range bias", "azimuth bias", "elevation bias", "time bias", "tilt north", "tilt east", "droop", "skew",
+        "non-orthogonality", "traverse wander", "elevation wander", "refraction", "range scale",
+    ),
+    POSITION: _WANDER,
+    VELOCITY: ("", "", "", "time bias"),
+    HEIGHT: ("bias", "scale", "wander", "time bias"),
+    FIELD: (
+        *(f"{kind} {axis}" for kind in ("bias", "scale", "mount") for axis in AXES),
+        "soft iron xy", "soft iron xz", "soft iron yz",
+    ),
+    SUN: ("bias across", "bias along", "", "", *(f"mount {axis}" for axis in AXES)),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
-class RadarModel:
-    """One radar as the filter sees it.
+class Instrument:
+    """One source of measurements and all that it measured.
 
     Parameters
     ----------
-    name : str
-    errors : slice
-        Its four errors in the full error vector.
+    name, kind : str, int
+        Name of the source in tables and verdicts; kind of `recon._measurement_kernels`.
+    owner : str
+        Instrument whose errors it carries; a receiver's position and velocity share one.
     arm_body_m : (3,) float
-        Tracked point from the accelerometer, body axes.
-    sd : (3,) float
-        Noise of one point in range, traverse (or azimuth) and elevation, m and rad.
-    traverse : bool
-        Whether the second is noise in traverse.
-    site_ecef_m, dcm_ned_ecef : (3,), (3, 3) float
-        Where the radar stands and its local axes.
+        Seen point from the accelerometer, body axes.
+    site_ecef_m : (3,) float
+        Radar, or reference of a receiver; of a barometer, the height above which its scale acts, first.
+    dcm : (3, 3) float
+        ``dcm_ned_ecef`` at the site, or ``dcm_body_sensor``.
+    time_s : (k,) float
+    value, variance, known : (k, 3) float
+        As in `recon.packed.Observed`.
     """
 
     name: str
-    errors: slice
+    kind: int
+    owner: str
     arm_body_m: FloatArray
-    sd: FloatArray
-    traverse: bool
     site_ecef_m: FloatArray
-    dcm_ned_ecef: FloatArray
+    dcm: FloatArray
+    time_s: FloatArray
+    value: FloatArray
+    variance: FloatArray
+    known: FloatArray
 
-    def noise_var(self, elevation_rad: float) -> FloatArray:
-        """Covariance (3, 3) of one point at an elevation."""
-        sd = self.sd.copy()
-        if self.traverse:
-            sd[1] /= max(float(np.cos(elevation_rad)), 1e-3)
-        return np.diag(sd**2)
+    @property
+    def components(self) -> tuple[str, ...]:
+        """What its components are called."""
+        return COMPONENTS[self.kind]
+
+    @property
+    def count(self) -> IntArray:
+        """Components measured at each time, (k,)."""
+        return np.isfinite(self.variance).sum(axis=1)
+
+    def slots(self, model: ErrorModel) -> IntArray:
+        """Which error (`SLOTS`,) of the model stands in each slot; -1 for none."""
+        names = SLOT_NAMES[self.kind]
+        found = [model.column(self.owner, name) if name else -1 for name in names]
+        return np.array([*found, *[-1] * (SLOTS - len(found))], dtype=np.int64)
 
 
-def radar_model(
-    name: str,
-    record: RadarRecord,
-    errors: slice,
-    cg_m: FloatArray,
-    accelerometer_m: FloatArray,
-    traverse: bool = True,
-) -> RadarModel:
-    """Model of one radar; c.g. and accelerometer from the datum, body axes, (3,), m."""
+def _instrument(
+    name: str, kind: int, owner: str, arm: FloatArray, site: FloatArray, dcm: FloatArray,
+    time_s: FloatArray, value: FloatArray, sd: FloatArray, known: FloatArray | None = None,
+) -> Instrument:  # fmt: skip
+    """Instrument with NaN readings taken as not measured, rows without any left out."""
+    variance = np.where(np.isfinite(value), np.broadcast_to(sd, value.shape) ** 2, np.inf)
+    keep = np.isfinite(variance).any(axis=1)
+    known = np.zeros((len(value), 3)) if known is None else known
+    value = np.where(np.isfinite(value), value, 0.0)
+    return Instrument(
+        name, kind, owner, np.asarray(arm, dtype=float), np.asarray(site, dtype=float), np.ascontiguousarray(dcm),
+        time_s[keep], value[keep], variance[keep], known[keep],
+    )  # fmt: skip
+
+
+def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, traverse: bool = True) -> Instrument:
+    """One radar; a missing component leaves the others."""
     site = record.site
-    point = cg_m if record.point == "cg" else np.zeros(3)
-    return RadarModel(
-        name,
-        errors,
-        point - accelerometer_m,
-        np.array([site.range_sd_m, site.angle_sd_rad, site.angle_sd_rad]),
-        traverse,
-        earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m),
-        np.ascontiguousarray(earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)),
+    sd = np.tile([site.range_sd_m, site.angle_sd_rad, site.angle_sd_rad], (len(record.time_s), 1))
+    if traverse:
+        elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
+        sd[:, 1] /= np.maximum(np.cos(elevation), 1e-3)
+    known = np.tile([SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
+    place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
+    dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
+    return _instrument(
+        name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known
     )
 
 
-def predict_radar(model: RadarModel, state: States, rate_body_eci_radps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Predicted range, azimuth, elevation (3,) of one state, and the partials (3, 9 + m), compiled.
+def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray) -> list[Instrument]:
+    """Position of one receiver and, where it gives one, velocity; axes are those at its first fix."""
+    spec = record.spec
+    good = np.isfinite(record.position_ecef_m).all(axis=1)
+    reference = record.position_ecef_m[good][0]
+    latitude, longitude, _ = earth.geodetic_from_ecef(reference)
+    dcm = earth.dcm_ned_ecef(float(latitude), float(longitude))
+    arm = spec.antenna_from_datum_body_m - accelerometer_m
+    place_sd = np.array([spec.horizontal_sd_m, spec.horizontal_sd_m, spec.vertical_sd_m])
+    speed_sd = np.array([spec.speed_sd_mps, spec.speed_sd_mps, spec.vertical_speed_sd_mps])
+    place = (record.position_ecef_m - reference) @ dcm.T
+    both = [
+        _instrument(name, POSITION, spec.name, arm, reference, dcm, record.time_s, place, place_sd),
+        _instrument(
+            f"{name} velocity", VELOCITY, spec.name, arm, reference, dcm,
+            record.time_s, record.velocity_ecef_mps @ dcm.T, speed_sd,
+        ),
+    ]  # fmt: skip
+    return [i for i in both if len(i.time_s)]
 
-    ``rate_body_eci_radps`` (3,) is the body's rate against inertial space.
+
+def barometer_instrument(name: str, record: BarometerRecord, accelerometer_m: FloatArray) -> Instrument:
+    """Height by pressure of the datum's point."""
+    first = record.height_m[np.isfinite(record.height_m)][0]
+    value = np.column_stack([record.height_m, np.full((len(record.height_m), 2), np.nan)])
+    return _instrument(
+        name, HEIGHT, record.spec.name, -accelerometer_m, np.array([first, 0.0, 0.0]), np.eye(3),
+        record.time_s, value, np.full(3, record.spec.sd_m),
+    )  # fmt: skip
+
+
+def magnetometer_instrument(name: str, record: TriadRecord, field_ecef_t: FloatArray, rows: IntArray) -> Instrument:
+    """Chosen samples of a magnetometer, with the field (n, 3) at them in Earth-fixed axes."""
+    spec = record.spec
+    sd = np.full(3, np.hypot(spec.noise_sd, spec.resolution / np.sqrt(12.0)))
+    return _instrument(
+        name, FIELD, spec.name, np.zeros(3), np.zeros(3), spec.dcm_body_sensor,
+        record.time_s[rows], record.measured_sensor[rows], sd, field_ecef_t,
+    )  # fmt: skip
+
+
+def sun_instruments(name: str, record: SunRecord, sun_ecef: FloatArray, rows: IntArray) -> list[Instrument]:
+    """Every head of a set of Sun sensors at chosen samples, with the Sun's direction (n, 3) at them."""
+    out = []
+    for number, dcm in enumerate(record.spec.dcm_body_head, start=1):
+        angles = record.az_el_head_rad[rows, number - 1]
+        sd = np.full((len(rows), 3), record.spec.noise_sd_rad)
+        sd[:, 0] /= np.maximum(np.cos(np.where(np.isfinite(angles[:, 1]), angles[:, 1], 0.0)), 1e-3)
+        value = np.column_stack([angles, np.full(len(rows), np.nan)])
+        head = f"{name}{number}"
+        out.append(
+            _instrument(head, SUN, head, np.zeros(3), np.zeros(3), dcm, record.time_s[rows], value, sd, sun_ecef)
+        )
+    return [i for i in out if len(i.time_s)]
+
+
+@dataclass(frozen=True)
+class NodeMotion:
+    """Attitude matrix, inertial rate in body axes and acceleration against the Earth at one node."""
+
+    position_ecef_m: FloatArray
+    velocity_ecef_mps: FloatArray
+    dcm_ecef_body: FloatArray
+    rate_body_radps: FloatArray
+    acceleration_ecef_mps2: FloatArray
+
+
+def predict(
+    instrument: Instrument, known: FloatArray, e: FloatArray, at: NodeMotion
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Prediction (3,) and partials by state (3, 9) and by the instrument's own errors (3, `SLOTS`), in numpy.
+
+    ``e`` (`SLOTS`,) are the errors. Readable twin of `recon._measurement_kernels.predict`.
     """
-    h, compact = np.empty(3), np.empty((3, 13))
-    first, last = model.errors.start, model.errors.stop
-    _kernels.radar_prediction(
-        model.dcm_ned_ecef,
-        model.site_ecef_m,
-        model.arm_body_m,
-        state.position_ecef_m,
-        state.velocity_ecef_mps,
-        state.q_ecef_body,
-        state.sensor_errors[first - 9 : last - 9],
-        rate_body_eci_radps,
-        h,
-        compact,
-    )
-    jacobian = np.zeros((3, 9 + len(state.sensor_errors)))
-    jacobian[:, :9] = compact[:, :9]
-    jacobian[:, model.errors] = compact[:, 9:]
-    return h, jacobian
+    by_state, by_error = np.zeros((3, 9)), np.zeros((3, SLOTS))
+    if instrument.kind == FIELD:
+        return _field(instrument.dcm, known, e, at.dcm_ecef_body, by_state, by_error)
+    if instrument.kind == SUN:
+        return _sun(instrument.dcm, known, e, at.dcm_ecef_body, by_state, by_error)
+    c, arm, tau = at.dcm_ecef_body, instrument.arm_body_m, e[3]
+    swing = np.cross(at.rate_body_radps - earth.OMEGA_RADPS * c[2], arm)
+    moving = at.velocity_ecef_mps + c @ swing
+    point = at.position_ecef_m + c @ arm - tau * moving + 0.5 * tau**2 * at.acceleration_ecef_mps2
+    speed = moving - tau * at.acceleration_ecef_mps2
+    if instrument.kind == VELOCITY:
+        by_state[:, 3:6] = instrument.dcm
+        by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(swing)
+        by_error[:, 3] = -instrument.dcm @ at.acceleration_ecef_mps2
+        return instrument.dcm @ speed, by_state, by_error
+    if instrument.kind == RADAR:
+        h, m = _radar(instrument, known, e, point, by_error)
+    elif instrument.kind == POSITION:
+        m, by_error[:, 0:3] = instrument.dcm, np.eye(3)
+        h = m @ (point - instrument.site_ecef_m) + e[0:3]
+    else:
+        h, m = _height(instrument, e, point, by_error)
+    by_state[:, 0:3] = m
+    by_state[:, 3:6] = -tau * m
+    by_state[:, 6:9] = -m @ c @ rotations.skew(arm - tau * swing)
+    by_error[:, 3] = -m @ speed
+    return h, by_state, by_error
 
 
-def predict_radar_plain(
-    model: RadarModel, state: States, rate_body_eci_radps: FloatArray
+def _radar(
+    instrument: Instrument, known: FloatArray, e: FloatArray, point: FloatArray, by_error: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Same as `predict_radar` in numpy; for reading and for tests."""
-    c = rotations.dcm_from_q(state.q_ecef_body)
-    bias = state.sensor_errors[model.errors.start - 9 : model.errors.stop - 9]
-    rate = rate_body_eci_radps - earth.OMEGA_RADPS * c[2]
-    swing = np.cross(rate, model.arm_body_m)
-    velocity = state.velocity_ecef_mps + c @ swing
-    tau = bias[3]
-    point = state.position_ecef_m + c @ model.arm_body_m - tau * velocity
-    h, partials = _range_az_el(model.dcm_ned_ecef @ (point - model.site_ecef_m))
-    partials = partials @ model.dcm_ned_ecef
-
-    jacobian = np.zeros((3, 9 + len(state.sensor_errors)))
-    jacobian[:, POSITION] = partials
-    jacobian[:, VELOCITY] = -tau * partials
-    jacobian[:, ROTATION] = -partials @ c @ rotations.skew(model.arm_body_m - tau * swing)
-    jacobian[:, model.errors.start : model.errors.start + 3] = np.eye(3)
-    jacobian[:, model.errors.start + 3] = -partials @ velocity
-    return h + bias[:3], jacobian
-
-
-def _range_az_el(ned: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Range, azimuth, elevation of a point at ``ned`` (3,), m, from the radar, and their partials (3, 3)."""
-    n, e, d = ned
-    level2 = n * n + e * e
-    level = np.sqrt(level2)
-    slant2 = level2 + d * d
-    slant = np.sqrt(slant2)
-    h = np.array([slant, np.arctan2(e, n), np.arctan2(-d, level)])
+    n, east, d = instrument.dcm @ (point - instrument.site_ecef_m)
+    level = np.hypot(n, east)
+    slant = np.hypot(level, d)
+    az, el = np.arctan2(east, n), np.arctan2(-d, level)
     partials = np.array(
         [
-            [n / slant, e / slant, d / slant],
-            [-e / level2, n / level2, 0.0],
-            [d * n / (slant2 * level), d * e / (slant2 * level), -level / slant2],
+            [n / slant, east / slant, d / slant],
+            [-east / level**2, n / level**2, 0.0],
+            [d * n / (slant**2 * level), d * east / (slant**2 * level), -level / slant**2],
         ]
     )
-    return h, partials
+    sec, tan = 1.0 / np.cos(el), np.tan(el)
+    by_error[:, 0:3] = np.eye(3)
+    by_error[1, 4:6] = -tan * np.cos(az), -tan * np.sin(az)
+    by_error[2, 4:6] = np.sin(az), -np.cos(az)
+    by_error[2, 6], by_error[1, 7], by_error[1, 8] = np.cos(el), sec, tan
+    by_error[1, 9], by_error[2, 10] = sec, 1.0
+    by_error[2, 11] = known[0] * np.cos(el) / max(np.sin(el), 0.035)
+    by_error[0, 12] = slant
+    others = np.delete(np.arange(SLOTS), 3)
+    return np.array([slant, az, el]) + by_error[:, others] @ e[others], partials @ instrument.dcm
 
 
-def residual(measured: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Measured minus predicted (..., 3), with the azimuth's difference wrapped to [-pi, pi)."""
-    y = np.asarray(measured - predicted)
-    y[..., 1] = np.mod(y[..., 1] + np.pi, 2.0 * np.pi) - np.pi
-    return y
+def _height(
+    instrument: Instrument, e: FloatArray, point: FloatArray, by_error: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    latitude, longitude, height = earth.geodetic_from_ecef(point)
+    m = np.zeros((3, 3))
+    m[0] = -earth.dcm_ned_ecef(float(latitude), float(longitude))[2]
+    above = float(height) - instrument.site_ecef_m[0]
+    by_error[0, 0:3] = 1.0, above, 1.0
+    return np.array([float(height) + e[0] + above * e[1] + e[2], 0.0, 0.0]), m
+
+
+def _field(
+    dcm_body_sensor: FloatArray, known: FloatArray, e: FloatArray, c: FloatArray, by_state: FloatArray,
+    by_error: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    mount = dcm_body_sensor @ rotations.dcm_from_q(rotations.exp(e[6:9]))
+    body = c.T @ known
+    x = mount.T @ body
+    iron = np.diag(1.0 + e[3:6])
+    for slot, (i, j) in zip((9, 10, 11), ((0, 1), (0, 2), (1, 2)), strict=True):
+        iron[i, j] = iron[j, i] = e[slot]
+        by_error[i, slot], by_error[j, slot] = x[j], x[i]
+    by_state[:, 6:9] = iron @ mount.T @ rotations.skew(body)
+    by_error[:, 0:3], by_error[:, 3:6] = np.eye(3), np.diag(x)
+    by_error[:, 6:9] = iron @ rotations.skew(x)
+    return iron @ x + e[0:3], by_state, by_error
+
+
+def _sun(
+    dcm_body_head: FloatArray, known: FloatArray, e: FloatArray, c: FloatArray, by_state: FloatArray,
+    by_error: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    mount = dcm_body_head @ rotations.dcm_from_q(rotations.exp(e[4:7]))
+    body = c.T @ known
+    x, y, z = s = mount.T @ body
+    across = np.hypot(y, z)
+    whole2 = across**2 + x**2
+    p = np.zeros((3, 3))
+    p[0] = 0.0, z / across**2, -y / across**2
+    p[1] = across / whole2, -x * y / (whole2 * across), -x * z / (whole2 * across)
+    by_state[:, 6:9] = p @ mount.T @ rotations.skew(body)
+    by_error[:, 4:7] = p @ rotations.skew(s)
+    by_error[0, 0], by_error[1, 1] = 1.0 / across, 1.0
+    h = np.array([np.arctan2(y, z) + e[0] / across, np.arctan2(x, across) + e[1], 0.0])
+    return h, by_state, by_error
+
+
+def wrapped(instrument_kind: int, residual: FloatArray) -> FloatArray:
+    """Residual (3,) with angles that come round taken the short way."""
+    component = 1 if instrument_kind == RADAR else 0 if instrument_kind == SUN else None
+    if component is not None:
+        residual[component] = np.mod(residual[component] + np.pi, 2.0 * np.pi) - np.pi
+    return residual

@@ -48,11 +48,16 @@ class Observed(NamedTuple):
 
 
 class Wander(NamedTuple):
-    """How each error (m,) wanders: time constant and altitude over which it forgets, its sd, whether only considered."""
+    """How each error (m,) wanders.
+
+    Time constant and altitude over which it forgets and returns to its sd; variance by which it walks away in a second;
+    whether it is only considered.
+    """
 
     time_constant_s: FloatArray
     altitude_m: FloatArray
     sd: FloatArray
+    walk_var_per_s: FloatArray
     considered: BoolArray
 
 

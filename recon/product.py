@@ -5,7 +5,8 @@ Moving from the accelerometer (at ``r`` from the datum, body axes) to the datum:
     p = p_imu - C r,   v = v_imu - C (w x r),   w = gyro rate - C^T W
 
 and the errors move with them: ``dp = dp_imu + C [r x] d``, ``dv = dv_imu + C [(w x r) x] d + C [r x] dw`` with rotation
-error ``d`` and rate error ``dw`` from the gyros' estimated errors and white noise.
+error ``d`` and rate error ``dw`` from the gyros' estimated errors and white noise. In ballistic flight the tracked point
+is the datum, the attitude is not known, and its covariance says so.
 """
 
 from __future__ import annotations
@@ -19,13 +20,15 @@ from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, interpolate_rows
-from recon.ekf import Innovations, Problem
 from recon.inertial import Bridged
-from recon.measurements import COMPONENTS
-from recon.state import INERTIAL, IntArray, States
+from recon.packed import Innovations, unpacked
+from recon.problem import Problem
+from recon.smoother import Smoothed
+from recon.state import BoolArray, States
 from recon.strapdown import correct, correction_partials
 
 SAME_STRETCH_S = 1.0
+UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
 
 
 @dataclass(frozen=True)
@@ -37,34 +40,44 @@ class Mounting:
     rate_noise_sd: float
 
 
-def datum_trajectory(
-    problem: Problem, mounting: Mounting, states: States, covariance: FloatArray, output: IntArray
-) -> Trajectory:
-    """Trajectory of the datum at the nodes ``output`` from states and covariances at all nodes."""
-    grid = problem.grid
-    measured = grid.rate_sensor_radps[problem.node_index[output]]
-    errors = states.sensor_errors[output, 9:18]
-    c = rotations.dcm_from_q(states.q_ecef_body[output])
-    omega = correct(measured, errors, grid.dcm_body_rate)
+def datum_trajectory(problem: Problem, mounting: Mounting, states: States, triangles: FloatArray) -> Trajectory:
+    """Trajectory of the datum at the kept nodes from states at all nodes and packed covariances at the kept ones."""
+    kept = np.flatnonzero(problem.kept)
+    covariance = unpacked(triangles)
+    states = states[kept]
+    n = len(kept)
+    if problem.motion.ballistic:
+        covariance = covariance[:, :9, :9].copy()
+        covariance[:, 6:9] = 0.0
+        covariance[:, :, 6:9] = 0.0
+        covariance[:, range(6, 9), range(6, 9)] = UNKNOWN_ROTATION_VAR
+        return Trajectory(
+            mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m, states.velocity_ecef_mps,
+            states.q_ecef_body, np.tile(earth.OMEGA_ECEF_RADPS, (n, 1)), covariance,
+        )  # fmt: skip
+    motion = problem.motion
+    measured = motion.rate_sensor_radps[problem.node_index[kept]]
+    errors = states.sensor_errors[:, 9:18]
+    c = rotations.dcm_from_q(states.q_ecef_body)
+    omega = correct(measured, errors, motion.dcm_body_rate)
     r = mounting.arm_body_m
     swing = np.cross(omega - earth.OMEGA_RADPS * c[:, 2], r)
 
-    n = len(output)
     move = np.zeros((n, 9, 27))
     move[:, range(9), range(9)] = 1.0
     lever = c @ rotations.skew(r)
     move[:, 0:3, 6:9] = lever
     move[:, 3:6, 6:9] = c @ rotations.skew(swing)
-    move[:, 3:6, 18:27] = lever @ correction_partials(measured, errors, grid.dcm_body_rate)
-    moved = move @ covariance[output] @ np.swapaxes(move, 1, 2)
+    move[:, 3:6, 18:27] = lever @ correction_partials(measured, errors, motion.dcm_body_rate)
+    moved = move @ covariance @ np.swapaxes(move, 1, 2)
     moved[:, 3:6, 3:6] += mounting.rate_noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
     return Trajectory(
         mounting.epoch_utc,
-        problem.time_s[output],
+        problem.time_s[kept],
         "datum",
-        states.position_ecef_m[output] - c @ r,
-        states.velocity_ecef_mps[output] - np.einsum("nij,nj->ni", c, swing),
-        states.q_ecef_body[output],
+        states.position_ecef_m - c @ r,
+        states.velocity_ecef_mps - np.einsum("nij,nj->ni", c, swing),
+        states.q_ecef_body,
         omega,
         0.5 * (moved + np.swapaxes(moved, 1, 2)),
     )
@@ -83,56 +96,66 @@ def corrected_series(
     keep = ~bridged & ~hidden & (t >= problem.time_s[0]) & (t <= problem.time_s[-1])
     t = t[keep]
     errors = interpolate_rows(t, problem.time_s, states.sensor_errors[:, :18])
-    specific_force = correct(force.measured_sensor[keep], errors[:, 0:9], problem.grid.dcm_body_force)
+    specific_force = correct(force.measured_sensor[keep], errors[:, 0:9], problem.motion.dcm_body_force)
     measured_rate = interpolate_rows(t, rate.time_s, rate.measured_sensor)
-    return t, specific_force, correct(measured_rate, errors[:, 9:18], problem.grid.dcm_body_rate)
+    return t, specific_force, correct(measured_rate, errors[:, 9:18], problem.motion.dcm_body_rate)
 
 
-def specific_force_cov(problem: Problem, states: States, covariance: FloatArray, output: IntArray) -> FloatArray:
-    """Systematic error covariance (n, 3, 3) of the corrected specific force, body axes, (m/s^2)^2."""
-    measured = problem.grid.force_sensor_mps2[problem.node_index[output]]
-    partials = correction_partials(measured, states.sensor_errors[output, 0:9], problem.grid.dcm_body_force)
-    return np.asarray(partials @ covariance[output, 9:18, 9:18] @ np.swapaxes(partials, 1, 2))
+def specific_force_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
+    """Systematic error covariance (k, 3, 3) of the corrected specific force at kept nodes, body axes, (m/s^2)^2."""
+    kept = np.flatnonzero(problem.kept)
+    measured = problem.motion.force_sensor_mps2[problem.node_index[kept]]
+    partials = correction_partials(measured, states.sensor_errors[kept, 0:9], problem.motion.dcm_body_force)
+    covariance = unpacked(triangles, 18)[:, 9:18, 9:18]
+    return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
 
 
-def sensor_error_table(problem: Problem, states: States, covariance: FloatArray, last: FloatArray) -> pd.DataFrame:
-    """Prior and posterior of every sensor error at mid-span; of constants, from the last covariance ``last`` (N, N)."""
-    middle = len(problem.time_s) // 2
+def sensor_error_table(problem: Problem, states: States, smoothed: Smoothed) -> pd.DataFrame:
+    """Prior and posterior of every error; of those that wander, the value at mid-span."""
+    kept = np.flatnonzero(problem.kept)
+    row = len(kept) // 2
     model = problem.model
     return pd.DataFrame(
         {
             "name": model.names,
             "unit": model.units,
+            "treated": np.where(model.wander.considered, "considered", "estimated"),
             "prior_sd": model.prior_sd,
-            "estimate": states.sensor_errors[middle],
-            "sd": np.sqrt(np.concatenate([np.diag(covariance[middle])[9:], np.diag(last)[INERTIAL:]])),
+            "estimate": states.sensor_errors[kept[row]],
+            "sd": np.sqrt(smoothed.variance[row, 9:]),
         }
     )
 
 
-def residual_table(time_s: FloatArray, innovations: Innovations, names: list[str]) -> pd.DataFrame:
-    """One row for each component of each radar point."""
-    n = len(innovations.node)
+def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
+    """One row for each component that was measured."""
+    row, component = np.nonzero(np.isfinite(problem.observed.variance))
+    source = problem.observed.source[row]
+    names = np.array([i.name for i in problem.instruments], dtype=object)
+    components = np.array([(*i.components, "", "")[:3] for i in problem.instruments], dtype=object)
     return pd.DataFrame(
         {
-            "time_s": np.repeat(time_s[innovations.node], 3),
-            "source": np.repeat(np.array(names, dtype=object)[innovations.radar], 3),
-            "component": list(COMPONENTS) * n,
-            "residual": innovations.residual.ravel(),
-            "predicted_sd": np.sqrt(np.diagonal(innovations.covariance, axis1=1, axis2=2)).ravel(),
-            "accepted": np.repeat(innovations.accepted, 3),
+            "time_s": problem.time_s[problem.node[row]],
+            "source": names[source],
+            "component": components[source, component],
+            "residual": innovations.residual[row, component],
+            "predicted_sd": np.sqrt(innovations.covariance[row, component, component]),
+            "accepted": innovations.accepted[row],
         }
     )
 
 
-def edit_findings(time_s: FloatArray, innovations: Innovations, names: list[str]) -> list[Finding]:
-    """Stretches of track in which points were edited."""
+def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
+    """Stretches in which measurements were edited; sources that were left out on purpose say nothing."""
     out = []
-    for number, name in enumerate(names):
-        times = time_s[innovations.node[(innovations.radar == number) & ~innovations.accepted]]
+    time_s = problem.time_s[problem.node]
+    for number, instrument in enumerate(problem.instruments):
+        mine = (problem.observed.source == number) & problem.observed.usable
+        times = time_s[mine & ~accepted]
         if len(times) == 0:
             continue
+        what = "track point" if instrument.name == instrument.owner else "reading"
         for stretch in np.split(times, np.flatnonzero(np.diff(times) > SAME_STRETCH_S) + 1):
-            words = f"{len(stretch)} track point{'s' if len(stretch) > 1 else ''} edited"
-            out.append(Finding(name, words, float(stretch[0]), float(stretch[-1])))
+            words = f"{len(stretch)} {what}{'s' if len(stretch) > 1 else ''} edited"
+            out.append(Finding(instrument.name, words, float(stretch[0]), float(stretch[-1])))
     return out

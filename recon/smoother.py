@@ -1,7 +1,7 @@
-"""What all data say about every time: Rauch-Tung-Striebel smoothing of the forward pass's stored priors.
+"""What all data say about every time: two smoothers of the forward pass, compiled and readable.
 
-With ``x_{k+1} = F x_k + u + w``, ``cov(w) = Q`` and the filter's prior ``P = P_{k+1|k}``, the textbook gain
-``C = P_{k|k} F^T P^-1`` equals ``C = F^-1 (1 - Q P^-1)``, and
+**Rauch-Tung-Striebel** on the stored priors. With ``x_{k+1} = F x_k + u + w``, ``cov(w) = Q`` and the filter's prior
+``P = P_{k+1|k}``, the textbook gain ``C = P_{k|k} F^T P^-1`` equals ``C = F^-1 (1 - Q P^-1)``, and
 
     x_{k|N} = x_{k|k} + C (x_{k+1|N} - x_{k+1|k})
     P_{k|N} = C P_{k+1|N} C^T + F^-1 (Q - Q P^-1 Q) F^-T
@@ -10,9 +10,21 @@ a sum of two positive terms: no difference of nearly equal covariances is formed
 in ``C`` and stay exactly constant, so only the rows of *moving* errors are formed. ``P`` is scaled to a correlation
 matrix before it is solved with.
 
+**Bryson-Frazier**, the adjoint of the filter, which inverts nothing larger than an innovation's covariance. Backwards
+over a measurement and over a step,
+
+    l- = (1 - K H)^T l+ - H^T S^-1 (y - H x),   L- = (1 - K H)^T L+ (1 - K H) + H^T S^-1 H
+    l+ = F^T l-,                               L+ = F^T L- F
+    x_{k|N} = x_{k|k-1} - P_{k|k-1} l-,        P_{k|N} = P_{k|k-1} - P_{k|k-1} L- P_{k|k-1}
+
+It is faster, and loses digits where smoothing takes most of a prior's variance away. It presumes optimal gains, so
+where errors are only considered the first is used: a considered error then stays at zero with its own variance.
+
 References
 ----------
 H. Rauch, F. Tung, C. Striebel, AIAA J. 3 (1965) 1445, eqs. (3.23)-(3.30).
+G. Bierman, "Fixed interval smoothing with discrete measurements", Int. J. Control 18 (1973) 65 (modified
+Bryson-Frazier).
 """
 
 from __future__ import annotations
@@ -22,94 +34,154 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel.checks import FloatArray
+from recon import _smoother_kernels
 from recon.ekf import ForwardPass
-from recon.state import INERTIAL, KINEMATIC, IntArray, States, boxplus
+from recon.packed import Filtered, Innovations, Observed, Steps, packed, unpacked
+from recon.problem import Problem
+from recon.state import KINEMATIC, IntArray, States, boxplus
 
-CHUNK = 256
+SMOOTHERS = ("rauch-tung-striebel", "bryson-frazier")
 
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Smoothed errors (n, N) about the charts of the pass, and their covariances (n, 27, 27).
+    """Smoothed errors about the charts of a pass.
 
-    Radar errors are constants: their smoothed covariance is the filter's last one.
+    Parameters
+    ----------
+    x : (n, N) float
+    triangles : (k, D (D + 1) / 2) float
+        Covariance of kinematic errors and drivers at the kept nodes, packed.
+    variance : (k, N) float
+        Of all errors there.
     """
 
     x: FloatArray
-    covariance: FloatArray
+    triangles: FloatArray
+    variance: FloatArray
 
     def states(self, charts: States) -> States:
         """Smoothed states at every node."""
         return boxplus(charts, self.x)
 
 
-def step_gains(
+def smooth(
+    problem: Problem,
+    run: ForwardPass,
+    with_covariance: bool = True,
+    method: str = "rauch-tung-striebel",
+    engine: str = "compiled",
+) -> Smoothed:
+    """Smooth a forward pass; without covariance where only a reference trajectory is wanted."""
+    kept = int(problem.kept.sum()) if with_covariance else 0
+    triangles, variance = np.empty((kept, problem.dense * (problem.dense + 1) // 2)), np.empty((kept, problem.size))
+    if method == "bryson-frazier" and not problem.model.wander.considered.any():
+        x = np.empty_like(run.filtered.x_plus)
+        adjoint = _smoother_kernels.bryson_frazier if engine == "compiled" else bryson_frazier
+        adjoint(
+            run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, x, triangles, variance
+        )
+    else:
+        x = run.filtered.x_plus.copy()
+        backward = _smoother_kernels.rauch_tung_striebel if engine == "compiled" else rauch_tung_striebel
+        backward(run.steps, run.filtered, problem.moving, x, triangles, variance)
+    return Smoothed(x, triangles, variance)
+
+
+def step_gain(
     transition: FloatArray, noise: FloatArray, p_next: FloatArray, moving: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Rows of the smoother gain ``(k, d, N)`` and added covariance ``(k, d, d)`` of the moving errors.
+    """Rows of the smoother's gain ``(d, N)`` and added covariance ``(d, d)`` of the moving errors in one step.
 
     Parameters
     ----------
-    transition : (k, d, N) float
+    transition : (d, N) float
         Rows of the moving errors; all other rows are unit rows.
-    noise : (k, d, d) float
+    noise : (d, d) float
         Noise of the moving errors.
-    p_next : (k, N, N) float
+    p_next : (N, N) float
         Filter covariance predicted for the later node.
     moving : (d,) int
         Errors that change or are driven by noise.
     """
-    size = p_next.shape[-1]
-    scale = np.sqrt(np.diagonal(p_next, axis1=1, axis2=2))
-    columns = np.zeros((len(p_next), size, len(moving)))
-    columns[:, moving] = noise
-    correlation = p_next / (scale[:, :, None] * scale[:, None, :])
-    solved = np.linalg.solve(correlation, columns / scale[:, :, None]) / scale[:, :, None]  # P^-1 Q
-    rest = noise - noise @ solved[:, moving]
-    inverse = np.linalg.inv(transition[:, :, moving])
-    gain = -np.swapaxes(solved, 1, 2)  # rows of 1 - Q P^-1, less what constants carry into moving errors
-    gain[:, np.arange(len(moving)), moving] += 1.0
+    size = len(p_next)
+    scale = np.sqrt(np.diag(p_next))
+    columns = np.zeros((size, len(moving)))
+    columns[moving] = noise
+    solved = np.linalg.solve(p_next / np.outer(scale, scale), columns / scale[:, None]) / scale[:, None]  # P^-1 Q
+    rest = noise - noise @ solved[moving]
+    inverse = np.linalg.inv(transition[:, moving])
+    gain = -solved.T  # rows of 1 - Q P^-1, less what constants carry into moving errors
+    gain[np.arange(len(moving)), moving] += 1.0
     constant = np.setdiff1d(np.arange(size), moving)
-    gain[:, :, constant] -= transition[:, :, constant]
-    return inverse @ gain, inverse @ rest @ np.swapaxes(inverse, 1, 2)
+    gain[:, constant] -= transition[:, constant]
+    return inverse @ gain, inverse @ rest @ inverse.T
 
 
-def smooth(run: ForwardPass, with_covariance: bool = True) -> Smoothed:
-    """Smooth a forward pass; without covariance where only a reference trajectory is wanted."""
-    n = len(run.x_plus)
-    wandering = (run.decay < 1.0).any(axis=0) | (run.noise_var > 0.0).any(axis=0)
-    moving = np.concatenate([np.arange(KINEMATIC), KINEMATIC + np.flatnonzero(wandering)])
-    x = run.x_plus.copy()
-    covariance = np.empty_like(run.p_plus) if with_covariance else np.empty((0, INERTIAL, INERTIAL))
+def _keep(run: Filtered, k: int, p: FloatArray, triangles: FloatArray, variance: FloatArray) -> None:
+    """Store the moments of node ``k`` where they are wanted."""
+    row = run.kept[k]
+    if row >= 0 and len(triangles):
+        dense = int(np.sqrt(2 * triangles.shape[1]))
+        triangles[row], variance[row] = packed(p[:dense, :dense]), np.diag(p)
+
+
+def full_step(steps: Steps, k: int) -> tuple[FloatArray, FloatArray]:
+    """Whole transition and noise (N, N) of a step from its blocks."""
+    decay, noise_var = steps.decay[k], steps.noise_var[k]
+    f = np.diag(np.concatenate([np.ones(KINEMATIC), decay]))
+    q = np.diag(np.concatenate([np.zeros(KINEMATIC), noise_var]))
+    phi = steps.transition[k]
+    f[:KINEMATIC, : phi.shape[1]] = phi
+    q[:KINEMATIC, :KINEMATIC] = steps.noise[k]
+    return f, q
+
+
+def rauch_tung_striebel(
+    steps: Steps, run: Filtered, moving: IntArray, x: FloatArray, triangles: FloatArray, variance: FloatArray
+) -> None:
+    """Readable twin of `recon._smoother_kernels.rauch_tung_striebel`."""
     p = run.p_last.copy()
-    if with_covariance:
-        covariance[-1] = p[:INERTIAL, :INERTIAL]
-    for start in reversed(range(0, n - 1, CHUNK)):
-        stop = min(start + CHUNK, n - 1)
-        gain, added = step_gains(*_rows(run, start, stop, moving), run.p_minus[start + 1 : stop + 1], moving)
-        for k in reversed(range(start, stop)):
-            c = gain[k - start]
-            step = x[k + 1] - run.x_minus[k + 1]
-            x[k] += step
-            x[k, moving] += c @ step - step[moving]
-            if with_covariance:
-                rows = c @ p
-                block = rows @ c.T + added[k - start]
-                p[moving] = rows
-                p[:, moving] = rows.T
-                p[moving[:, None], moving] = 0.5 * (block + block.T)
-                covariance[k] = p[:INERTIAL, :INERTIAL]
-    return Smoothed(x, covariance)
+    _keep(run, len(x) - 1, p, triangles, variance)
+    for k in reversed(range(len(x) - 1)):
+        f, q = full_step(steps, k)
+        prior = unpacked(run.p_minus[k + 1])
+        c, added = step_gain(f[moving], q[np.ix_(moving, moving)], prior, moving)
+        step = x[k + 1] - run.x_minus[k + 1]
+        x[k] += step
+        x[k, moving] += c @ step - step[moving]
+        rows = c @ p
+        p[moving], p[:, moving] = rows, rows.T
+        block = rows @ c.T + added
+        p[np.ix_(moving, moving)] = 0.5 * (block + block.T)
+        _keep(run, k, p, triangles, variance)
 
 
-def _rows(run: ForwardPass, start: int, stop: int, moving: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Transition rows and noise of the moving errors for steps ``start`` to ``stop - 1``."""
-    count, size = stop - start, run.x_plus.shape[1]
-    transition = np.zeros((count, len(moving), size))
-    noise = np.zeros((count, len(moving), len(moving)))
-    transition[:, :KINEMATIC, :INERTIAL] = run.transition[start:stop]
-    noise[:, :KINEMATIC, :KINEMATIC] = run.noise[start:stop]
-    for row, error in enumerate(moving[KINEMATIC:], start=KINEMATIC):
-        transition[:, row, error] = run.decay[start:stop, error - KINEMATIC]
-        noise[:, row, row] = run.noise_var[start:stop, error - KINEMATIC]
-    return transition, noise
+def bryson_frazier(
+    steps: Steps, run: Filtered, observed: Observed, slots: IntArray, innovations: Innovations, x: FloatArray,
+    triangles: FloatArray, variance: FloatArray,
+) -> None:  # fmt: skip
+    """Readable twin of `recon._smoother_kernels.bryson_frazier`."""
+    n, size = x.shape
+    mean, information = np.zeros(size), np.zeros((size, size))
+    first, v = observed.first, innovations
+    for k in reversed(range(n)):
+        for row in reversed(range(first[k], first[k + 1])):
+            if not v.accepted[row]:
+                continue
+            used = np.flatnonzero(np.isfinite(observed.variance[row]))
+            slot = slots[observed.source[row]]
+            h = np.zeros((3, size))
+            h[:, :KINEMATIC] = v.by_state[row]
+            h[:, KINEMATIC + slot[slot >= 0]] += v.by_error[row][:, slot >= 0]
+            h = h[used]
+            weight = h.T @ np.linalg.inv(v.covariance[row][np.ix_(used, used)])
+            rest = np.eye(size) - v.gain[row][:, used] @ h
+            mean = rest.T @ mean - weight @ v.residual[row, used]
+            information = rest.T @ information @ rest + weight @ h
+        p = unpacked(run.p_minus[k])
+        x[k] = run.x_minus[k] - p @ mean
+        _keep(run, k, p - p @ information @ p, triangles, variance)
+        if k > 0:
+            f, _ = full_step(steps, k - 1)
+            mean, information = f.T @ mean, f.T @ information @ f

@@ -2,7 +2,8 @@
 
 Position and velocity get a prior so wide that it carries no information (`DIFFUSE_POSITION_M`,
 `DIFFUSE_VELOCITY_MPS`): the fit to the first seconds of tracking only chooses the point about which to linearise, so
-no radar point counts twice. The attitude's errors are correlated with those of the gyros that carried it.
+no point counts twice. The attitude's errors are correlated with those of the gyros that carried it. Ballistic flight
+has no attitude; its rotation stands still and is known.
 """
 
 from __future__ import annotations
@@ -11,17 +12,19 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.telemetry import AttitudePrior, RadarRecord
+from flightmodel.telemetry import AttitudePrior, Telemetry
+from recon._measurement_kernels import POSITION, RADAR
 from recon.error_model import ErrorModel
-from recon.inertial import Bridged, inertial_grid
-from recon.measurements import RadarModel
+from recon.inertial import Bridged, inertial_motion
+from recon.measurements import Instrument
 from recon.state import KINEMATIC, States
 from recon.strapdown import correct, propagate
 
 DIFFUSE_POSITION_M = 1000.0
 DIFFUSE_VELOCITY_MPS = 100.0
 FIT_SPAN_S = 3.0
-FIT_POINTS = 12
+LEAST_POINTS = 4
+STILL_RAD = 1e-6
 GYRO = slice(18, 27)
 
 
@@ -44,10 +47,10 @@ def start_attitude(
             f"attitude prior at {prior.time_s:.3f} s: gyro samples cover {rate.time_s[0]:.3f} to "
             f"{rate.time_s[-1]:.3f} s and cannot carry it to the start at {start_s:.3f} s"
         )
-    grid, ends = inertial_grid(force, rate, np.array([lo, hi]))
+    motion, ends = inertial_motion(force, rate, np.array([lo, hi]))
     first, last = (int(ends[0]), int(ends[1])) if prior.time_s < start_s else (int(ends[1]), int(ends[0]))
     somewhere = States(np.array([earth.SEMI_MAJOR_M, 0.0, 0.0]), np.zeros(3), q, np.zeros(model.size))
-    step = propagate(grid, first, last, somewhere)
+    step = propagate(motion, first, last, somewhere)
     by_attitude, by_gyro = step.transition[6:9, 6:9], step.transition[6:9, GYRO]
     gyro_var = np.diag(model.prior_sd[9:18] ** 2)
     cross = by_gyro @ gyro_var
@@ -55,7 +58,37 @@ def start_attitude(
     return step.state.q_ecef_body, total, cross
 
 
-def fit_first_points(records: list[RadarRecord], start_s: float) -> tuple[FloatArray, FloatArray]:
+def attitude_prior(telemetry: Telemetry, instruments: tuple[Instrument, ...]) -> AttitudePrior:
+    """Attitude as it is stated."""
+    if telemetry.attitude_prior is None:
+        raise GateError("no attitude to start from: add [attitude_prior] to flight.toml")
+    return telemetry.attitude_prior
+
+
+def places(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:
+    """Times (k,) and points (k, 3), ECEF m, of everything that tells a place by itself, in order."""
+    times, points = [], []
+    for i in instruments:
+        whole = np.isfinite(i.variance).all(axis=1)
+        if i.kind == RADAR:
+            ned = _ned_from_radar(i.value[whole])
+        elif i.kind == POSITION:
+            ned = i.value[whole]
+        else:
+            continue
+        times.append(i.time_s[whole])
+        points.append(i.site_ecef_m + ned @ i.dcm)
+    t = np.concatenate([np.empty(0), *times])
+    order = np.argsort(t, kind="stable")
+    return t[order], np.concatenate([np.empty((0, 3)), *points])[order]
+
+
+def _ned_from_radar(range_az_el: FloatArray) -> FloatArray:
+    slant, az, el = range_az_el.T
+    return np.column_stack([slant * np.cos(el) * np.cos(az), slant * np.cos(el) * np.sin(az), -slant * np.sin(el)])
+
+
+def fit_first_points(instruments: tuple[Instrument, ...], start_s: float) -> tuple[FloatArray, FloatArray]:
     """Position and velocity (3,) of the tracked point at the start: a parabola through the first seconds.
 
     Points far from the parabola, in units of the median distance, lose their weight as the fit is repeated.
@@ -63,20 +96,14 @@ def fit_first_points(records: list[RadarRecord], start_s: float) -> tuple[FloatA
     Raises
     ------
     GateError
-        With fewer than three radar points.
+        With fewer than three points.
     """
-    tau, points = [], []
-    for record in records:
-        good = np.isfinite(record.range_az_el).all(axis=1) & (record.time_s >= start_s)
-        s = record.site
-        tau.append(record.time_s[good] - start_s)
-        points.append(earth.ecef_from_radar(record.range_az_el[good], s.latitude_rad, s.longitude_rad, s.height_m))
-    t, p = np.concatenate(tau), np.concatenate(points)
+    t, p = places(instruments)
+    t, p = t[t >= start_s] - start_s, p[t >= start_s]
     if len(t) < 3:
-        raise GateError(f"radar: {len(t)} track points after {start_s:.3f} s; at least 3 are needed to start")
-    order = np.argsort(t, kind="stable")
-    count = max(FIT_POINTS, int(np.searchsorted(t[order], FIT_SPAN_S)))
-    t, p = t[order][:count], p[order][:count]
+        raise GateError(f"tracking: {len(t)} points after {start_s:.3f} s; at least 3 are needed to start")
+    count = max(LEAST_POINTS, int(np.searchsorted(t, FIT_SPAN_S)))
+    t, p = t[:count], p[:count]
     weight: FloatArray = np.ones(len(t))
     coefficients: FloatArray = np.zeros((3, 3))
     for _ in range(10):
@@ -87,9 +114,14 @@ def fit_first_points(records: list[RadarRecord], start_s: float) -> tuple[FloatA
     return coefficients[0], coefficients[1]
 
 
-def start_state(
-    records: list[RadarRecord],
-    radars: list[RadarModel],
+def _covariance(model: ErrorModel) -> FloatArray:
+    """Prior of everything but rotation."""
+    sd = np.concatenate([np.full(3, DIFFUSE_POSITION_M), np.full(3, DIFFUSE_VELOCITY_MPS), np.zeros(3), model.prior_sd])
+    return np.diag(sd**2)
+
+
+def start_by_inertial_sensors(
+    instruments: tuple[Instrument, ...],
     prior: AttitudePrior,
     start_s: float,
     force: Bridged,
@@ -98,18 +130,26 @@ def start_state(
 ) -> tuple[States, FloatArray]:
     """State at the start and its covariance (9 + m, 9 + m)."""
     q, var, cross = start_attitude(prior, start_s, force, rate, model)
-    position, velocity = fit_first_points(records, start_s)
+    position, velocity = fit_first_points(instruments, start_s)
     sample = np.array([[np.interp(start_s, rate.time_s, column) for column in rate.measured_sensor.T]])
     w = correct(sample, np.zeros(9), rate.spec.dcm_body_sensor)[0]
-    arm = radars[0].arm_body_m
+    arm = next(i.arm_body_m for i in instruments if i.kind in (RADAR, POSITION))
     c = rotations.dcm_from_q(q)
     swing = c @ np.cross(w - c.T @ earth.OMEGA_ECEF_RADPS, arm)
     state = States(position - c @ arm, velocity - swing, q, np.zeros(model.size))
-
-    sd = np.concatenate([np.full(3, DIFFUSE_POSITION_M), np.full(3, DIFFUSE_VELOCITY_MPS), np.zeros(3), model.prior_sd])
-    covariance = np.diag(sd**2)
+    covariance = _covariance(model)
     covariance[6:9, 6:9] = var
     gyro = slice(KINEMATIC + 9, KINEMATIC + 18)
     covariance[6:9, gyro] = cross
     covariance[gyro, 6:9] = cross.T
     return state, covariance
+
+
+def start_ballistic(
+    instruments: tuple[Instrument, ...], start_s: float, model: ErrorModel
+) -> tuple[States, FloatArray]:
+    """State at the start and its covariance (9 + m, 9 + m), without attitude."""
+    position, velocity = fit_first_points(instruments, start_s)
+    covariance = _covariance(model)
+    covariance[range(6, 9), range(6, 9)] = STILL_RAD**2
+    return States(position, velocity, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(model.size)), covariance

@@ -1,0 +1,71 @@
+"""What an analyst may choose about a reconstruction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flightmodel.checks import GateError, nearest_name
+from recon.ekf import ENGINES
+from recon.smoother import SMOOTHERS
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an analyst may choose.
+
+    Parameters
+    ----------
+    output_rate_hz : float
+        Of the trajectories.
+    start_s, end_s : float or None
+        Span; the data's own common span where None.
+    passes : int
+        Most forward passes over all data. The first filter runs on thinned data about its own estimate, iterated until
+        attitudes settle; each pass over all data is linearised about the smoothed trajectory before it, and another
+        follows only where one moved the result by more than a hundredth of its standard deviation. With 0, a single
+        extended Kalman filter over all data about its own estimate.
+    gate_probability : float
+        A measurement is edited where its normalised innovation squared is beyond this chi-square quantile.
+    verdict_confidence : float
+        Two-sided confidence of each verdict.
+    angle_noise : str
+        ``"traverse"`` or ``"axis"``, see `recon.measurements`.
+    consider : tuple of str
+        Errors that are not estimated but whose effect stays in the covariance: ``"accelerometer mount"``, ...
+    without : tuple of str
+        Sources (radars, receivers, barometers) that are predicted but never used.
+    attitude_sensors : bool
+        Whether magnetometer and Sun sensors are measurements too; otherwise they only start and check the attitude.
+    engine, smoother : str
+        ``"compiled"`` or ``"readable"``; ``"rauch-tung-striebel"`` or ``"bryson-frazier"``.
+    """
+
+    output_rate_hz: float = 20.0
+    start_s: float | None = None
+    end_s: float | None = None
+    passes: int = 3
+    gate_probability: float = 0.9999
+    verdict_confidence: float = 0.999
+    angle_noise: str = "traverse"
+    consider: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    attitude_sensors: bool = False
+    engine: str = "compiled"
+    smoother: str = "rauch-tung-striebel"
+
+    def __post_init__(self) -> None:
+        """Check once."""
+        faults = []
+        if not 0.1 <= self.output_rate_hz <= 1000.0:
+            faults.append(f"output_rate_hz {self.output_rate_hz} must lie in 0.1 to 1000")
+        if not 0 <= self.passes <= 10:
+            faults.append(f"passes {self.passes} must lie in 0 to 10")
+        for name in ("gate_probability", "verdict_confidence"):
+            if not 0.5 <= getattr(self, name) < 1.0:
+                faults.append(f"{name} {getattr(self, name)} must lie in 0.5 to 1 (1 excluded)")
+        for name, known in (("angle_noise", ("traverse", "axis")), ("engine", ENGINES), ("smoother", SMOOTHERS)):
+            value = getattr(self, name)
+            if value not in known:
+                faults.append(f"{name} '{value}'{nearest_name(value, known)} must be one of {', '.join(known)}")
+        if faults:
+            raise GateError(faults)

@@ -1,0 +1,179 @@
+"""From telemetry to the filter's problem: span, nodes, instruments, errors, motion and start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flightmodel import geomagnetism_and_sun
+from flightmodel.checks import FloatArray, GateError, nearest_name
+from flightmodel.telemetry import Telemetry
+from recon import error_model, inertial, measurements, startup
+from recon.ballistic import ballistic_motion
+from recon.error_model import ErrorModel
+from recon.inertial import SAME_INSTANT_S, Bridged
+from recon.measurements import Instrument
+from recon.problem import Problem, nearest_index, observe
+from recon.settings import Settings
+from recon.state import BoolArray
+
+ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
+
+
+@dataclass(frozen=True)
+class Bridges:
+    """Both inertial triads without gaps; None in ballistic flight."""
+
+    force: Bridged
+    rate: Bridged
+
+
+def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | None) -> Problem:
+    """Everything that the filter needs.
+
+    Raises
+    ------
+    GateError
+        Where the data cannot start or carry a filter (no common span, too few points, prior out of reach).
+    """
+    arm = _accelerometer_arm(telemetry, bridges)
+    instruments = tracking_instruments(telemetry, settings, arm)
+    start_s, end_s = _span(instruments, settings, bridges)
+    output_s = _output_times(start_s, end_s, settings.output_rate_hz)
+    if settings.attitude_sensors:
+        instruments += attitude_instruments(telemetry, instruments, start_s, end_s)
+    inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
+    time_s = _union([output_s, *inside])
+    observed, row = observe(time_s, instruments, SAME_INSTANT_S)
+    model = build_error_model(telemetry, bridges, settings.attitude_sensors).considering(settings.consider)
+
+    if bridges is None:
+        motion, node_index = ballistic_motion(telemetry.motion, telemetry.sounding, time_s, SAME_INSTANT_S)
+        start, covariance = startup.start_ballistic(instruments, start_s, model)
+    else:
+        force, rate = bridges.force, bridges.rate
+        motion, node_index = inertial.inertial_motion(force, rate, time_s)
+        prior = startup.attitude_prior(telemetry, instruments)
+        start, covariance = startup.start_by_inertial_sensors(instruments, prior, start_s, force, rate, model)
+    from scipy.stats import chi2
+
+    gate = np.array([0.0, *(float(chi2.ppf(settings.gate_probability, k)) for k in (1, 2, 3))])
+    kept: BoolArray = np.zeros(len(time_s), dtype=bool)
+    kept[nearest_index(time_s, output_s)] = True
+    problem = Problem(
+        time_s, node_index, motion, model, instruments, row, observed, start, covariance, gate, kept
+    )
+    left_out = np.array([i.name in settings.without or i.owner in settings.without for i in instruments])
+    return problem.without(left_out[observed.source])
+
+
+def _accelerometer_arm(telemetry: Telemetry, bridges: Bridges | None) -> FloatArray:
+    """Accelerometer from the datum; in ballistic flight the followed point is the tracked one."""
+    if bridges is None:
+        return np.zeros(3)
+    return bridges.force.spec.position_from_datum_body_m
+
+
+def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: FloatArray) -> tuple[Instrument, ...]:
+    """Radars, receivers and barometers."""
+    traverse = settings.angle_noise == "traverse"
+    ballistic = telemetry.accelerometer is None
+    out: list[Instrument] = []
+    for name, record in telemetry.radars.items():
+        cg = telemetry.vehicle.cg_m if telemetry.vehicle is not None and record.point == "cg" else np.zeros(3)
+        arm = np.zeros(3) if ballistic else cg - arm_body_m
+        out.append(measurements.radar_instrument(name, record, arm, traverse))
+    for name, fixes in telemetry.gnss.items():
+        antenna = fixes.spec.antenna_from_datum_body_m
+        out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m)
+    for name, heights in telemetry.barometers.items():
+        out.append(measurements.barometer_instrument(name, heights, arm_body_m))
+    known = [name for i in out for name in (i.name, i.owner)]
+    faults = [f"source '{n}'{nearest_name(n, known)}: no such source" for n in settings.without if n not in known]
+    if faults:
+        raise GateError(faults)
+    return tuple(out)
+
+
+def attitude_instruments(
+    telemetry: Telemetry, tracking: tuple[Instrument, ...], start_s: float, end_s: float
+) -> tuple[Instrument, ...]:
+    """Magnetometer and Sun heads as measurements, thinned; places for the field come from the tracking data."""
+    t, points = startup.places(tracking)
+    out: list[Instrument] = []
+    if telemetry.magnetometer is not None:
+        record = telemetry.magnetometer
+        good = np.isfinite(record.measured_sensor).all(axis=1)
+        rows = _thinned(record.time_s, good, start_s, end_s)
+        at = record.time_s[rows]
+        place = np.column_stack([np.interp(at, t, column) for column in points.T])
+        field = geomagnetism_and_sun.magnetic_field_ecef_t(place, telemetry.t0_utc)
+        out.append(measurements.magnetometer_instrument("magnetometer", record, field, rows))
+    if telemetry.sun is not None:
+        lit = np.isfinite(telemetry.sun.az_el_head_rad).any(axis=(1, 2))
+        rows = _thinned(telemetry.sun.time_s, lit, start_s, end_s)
+        to_sun = geomagnetism_and_sun.sun_direction_ecef(telemetry.t0_utc, telemetry.sun.time_s[rows])
+        out += measurements.sun_instruments("sun", telemetry.sun, to_sun, rows)
+    return tuple(out)
+
+
+def _thinned(time_s: FloatArray, good: BoolArray, start_s: float, end_s: float) -> np.ndarray:
+    """Rows of the first good sample of each cell of time within a span."""
+    rows = np.flatnonzero(good & (time_s >= start_s) & (time_s <= end_s))
+    _, first = np.unique(np.floor(time_s[rows] * ATTITUDE_RATE_HZ), return_index=True)
+    return rows[first]
+
+
+def build_error_model(telemetry: Telemetry, bridges: Bridges | None, attitude_sensors: bool) -> ErrorModel:
+    """All errors that the flight file states, drivers of the motion first."""
+    if bridges is None:
+        blocks = error_model.ballistic_blocks(telemetry.motion)
+    else:
+        blocks = error_model.triad_blocks(bridges.force.spec, "m/s2")
+        blocks += error_model.triad_blocks(bridges.rate.spec, "rad/s")
+    for radar in telemetry.radars.values():
+        blocks += error_model.radar_blocks(radar.site)
+    for fixes in telemetry.gnss.values():
+        blocks += error_model.gnss_blocks(fixes.spec)
+    for heights in telemetry.barometers.values():
+        blocks += error_model.barometer_blocks(heights.spec)
+    if attitude_sensors and telemetry.magnetometer is not None:
+        blocks += error_model.magnetometer_blocks(telemetry.magnetometer.spec)
+    if attitude_sensors and telemetry.sun is not None:
+        blocks += error_model.sun_blocks(telemetry.sun.spec)
+    return ErrorModel(tuple(blocks))
+
+
+def _span(instruments: tuple[Instrument, ...], settings: Settings, bridges: Bridges | None) -> tuple[float, float]:
+    """First and last time that inertial sensors and at least one tracker cover, within the settings' span."""
+    t, _ = startup.places(instruments)
+    if len(t) == 0:
+        raise GateError("no radar or receiver has a usable point; a trajectory needs at least one")
+    start_s, end_s = float(t[0]), float(t[-1])
+    if bridges is not None:
+        start_s = max(start_s, bridges.force.time_s[0], bridges.rate.time_s[0])
+        end_s = min(end_s, bridges.force.time_s[-1], bridges.rate.time_s[-1])
+    if settings.start_s is not None:
+        start_s = max(start_s, settings.start_s)
+    if settings.end_s is not None:
+        end_s = min(end_s, settings.end_s)
+    if end_s - start_s < 2.0 * startup.FIT_SPAN_S:
+        raise GateError(
+            f"inertial sensors and trackers share only {start_s:.3f} to {end_s:.3f} s; "
+            f"at least {2.0 * startup.FIT_SPAN_S:.0f} s are needed: check time bases and the chosen span"
+        )
+    return float(start_s), float(end_s)
+
+
+def _output_times(start_s: float, end_s: float, rate_hz: float) -> FloatArray:
+    """Multiples of the output step inside the span, and the start itself."""
+    first, last = np.ceil(start_s * rate_hz - 1e-6), np.floor(end_s * rate_hz + 1e-6)
+    times = np.clip(np.arange(first, last + 1.0) / rate_hz, start_s, end_s)
+    return _union([np.array([start_s]), times])
+
+
+def _union(times: list[FloatArray]) -> FloatArray:
+    """All times in order, instants closer than `inertial.SAME_INSTANT_S` taken once."""
+    t = np.sort(np.concatenate(times))
+    return np.asarray(t[np.diff(t, prepend=-np.inf) > SAME_INSTANT_S])
