@@ -149,7 +149,7 @@ def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[
 
         step(0.0, 0.05)(0.0, "reading telemetry")
         telemetry = read_flight(folder)
-        compile_kernels("reconstruction", "simulator")
+        compile_kernels(*warmup.RECONSTRUCTION, "simulator")
         flight = reconstruct_telemetry(telemetry, Settings(output_rate_hz=rate_hz), step(0.05, 0.5))
         wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
         answers = estimate(flight, flight.telemetry, wanted, step(0.5, 0.7))
@@ -222,7 +222,7 @@ def deflection(folder: Path, methods: tuple[str, ...], plane_deg: float | None, 
     settings = {"methods": list(methods), "plane_deg": plane_deg, "joint_m": joint_m}
     needs_bet = set(methods) != {"camera"}
     if needs_bet:
-        compile_kernels("reconstruction")
+        compile_kernels(*warmup.RECONSTRUCTION)
     with progress_bar() as report:
         flight = reconstruct_telemetry(telemetry, None, lambda f, what: report(0.6 * f, what)) if needs_bet else None
         tell: Report = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
@@ -287,7 +287,7 @@ def demo(folder: Path, seed: int) -> None:
     check_destination(folder, replace=True)
     begun = time.perf_counter()
     console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
-    compile_kernels("simulator", "reconstruction")
+    compile_kernels("simulator", *warmup.RECONSTRUCTION)
     simulate(REFERENCE, folder, seed, force=True)
     flight, answers, written = run_flight(folder, METHODS, 20.0)
     print_flight(flight)

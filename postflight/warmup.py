@@ -19,6 +19,13 @@ from flightmodel import earth
 from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
+from recon import ekf, smoother, strapdown
+from recon.error_model import Block, ErrorModel
+from recon.measurements import Instrument
+from recon.motion import strapdown_motion
+from recon.packed import packed
+from recon.problem import Problem, observe
+from recon.state import States
 
 
 def _vehicle_at_rest() -> tuple[Vehicle, FloatArray]:
@@ -48,33 +55,53 @@ def _ensembles() -> None:
     list(fly_ensemble(vehicle, lambda _run: start, [0], Schedule(0.001, 1, 2)))
 
 
-def _reconstruction() -> None:
-    from recon import strapdown
-    from recon._kernels import normalised_square, radar_prediction
-    from recon.state import States
-
-    grid = strapdown.InertialGrid(
+def _tiny_problem() -> Problem:
+    """Three nodes without a measurement: enough to compile the filter."""
+    motion = strapdown_motion(
         np.array([0.0, 0.01, 0.02]), np.zeros((3, 3)), np.zeros((3, 3)), np.ones((3, 3)), np.ones((3, 3)),
         np.eye(3), np.eye(3),
     )  # fmt: skip
-    nodes = np.array([0, 1, 2])
-    place = np.tile(earth.ecef_from_geodetic(0.6, -1.3, 5e4), (3, 1))
-    states = States(place, np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)), np.zeros((3, 22)))
-    strapdown.propagate(grid, 0, 1, states[0])
-    strapdown.propagate_all(grid, nodes, states)
-    strapdown.fill_between(grid, nodes, nodes[:1], states[:1])
-    three = np.ones(3)
-    radar_prediction(
-        np.eye(3), three, three, place[0], three, np.ones(4), np.zeros(4), three, np.empty(3), np.empty((3, 13))
+    model = ErrorModel((Block("all", tuple("abcdefghijklmnopqr"), "1", 1.0),))
+    start = States(earth.ecef_from_geodetic(0.6, -1.3, 5e4), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(18))
+    nothing = Instrument(
+        "none", 0, "none", np.zeros(3), np.zeros(3), np.eye(3), np.empty(0), *(np.empty((0, 3)) for _ in range(3))
     )
-    normalised_square(three, np.eye(3))
+    nodes = np.arange(3)
+    observed, row = observe(motion.time_s, (nothing,), 0.0)
+    return Problem(
+        motion.time_s, nodes, motion, model, (nothing,), row, observed, start, np.eye(27), np.ones(4), nodes >= 0
+    )
+
+
+def _filter() -> None:
+    problem = _tiny_problem()
+    ekf.forward(problem)
+
+
+def _smoothers() -> None:
+    problem = _tiny_problem()
+    steps, run, innovations = ekf.empty_pass(problem)
+    for part in (*steps, run.x_minus, run.x_plus):
+        part[:] = 0.0
+    run.p_minus[:] = packed(np.eye(27))
+    run.p_last[:] = np.eye(27)
+    steps.transition[:, range(9), range(9)] = 1.0
+    states = States(*(np.array([part] * 3) for part in ekf.as_charts(problem.start)))
+    for method in smoother.SMOOTHERS:
+        smoother.smooth(problem, ekf.ForwardPass(states, steps, run, innovations), method=method)
+    strapdown.fill_between(problem.motion, problem.node_index, problem.node_index[:1], states[:1])
+    strapdown.propagate(problem.motion, 0, 1, problem.start)
 
 
 GROUPS: dict[str, Callable[[], None]] = {
     "simulator": _simulator,
     "ensembles": _ensembles,
-    "reconstruction": _reconstruction,
+    "filter": _filter,
+    "smoothers": _smoothers,
 }
+
+
+RECONSTRUCTION = ("filter", "smoothers")
 
 
 def _stamp(group: str) -> Path | None:

@@ -1,4 +1,4 @@
-"""Compiled ballistic motion: gravity, drag and side force in the day's air. Readable twin, and the model: `recon.ballistic`.
+"""Compiled ballistic motion: gravity, drag and side force in the day's air. Readable twin: `recon.ballistic`.
 
 The state is position and velocity; the six drivers are the logarithm of the drag area, two side forces as fractions of
 the drag, and density, wind north and wind east in units of their standard deviations.
@@ -64,9 +64,9 @@ def ballistic_partials(motion, point, partials):
 
 @inlined
 def ballistic_step(motion, dt, point, stage, slope, mid):
-    """Carry position and velocity ``point[:6]`` over a step by Runge and Kutta's fourth-order rule; ``mid`` (12,) half way.
+    """Carry position and velocity ``point[:6]`` over a step by Runge and Kutta's fourth-order rule.
 
-    ``stage`` (12,) and ``slope`` (6,) are scratch.
+    ``mid`` (12,) is the point half way; ``stage`` (12,) and ``slope`` (6,) are scratch.
     """
     for j in range(12):
         stage[j] = point[j]

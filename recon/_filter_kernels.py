@@ -97,16 +97,16 @@ def predict_covariance(p, phi, noise, decay, noise_var, moving, rows):
     for i in range(9):
         for j in range(size):
             rows[i, j] = 0.0
-        for l in range(dense):
-            f = phi[i, l]
+        for col in range(dense):
+            f = phi[i, col]
             if f != 0.0:
                 for j in range(size):
-                    rows[i, j] += f * p[l, j]
+                    rows[i, j] += f * p[col, j]
     for i in range(9):
         for j in range(i + 1):
             value = noise[i, j]
-            for l in range(dense):
-                value += rows[i, l] * phi[j, l]
+            for col in range(dense):
+                value += rows[i, col] * phi[j, col]
             p[i, j] = value
             p[j, i] = value
     for i in range(9):
@@ -169,8 +169,8 @@ def small_cholesky(s, count, factor):
     for i in range(count):
         for j in range(i + 1):
             value = s[i, j]
-            for l in range(j):
-                value -= factor[i, l] * factor[j, l]
+            for col in range(j):
+                value -= factor[i, col] * factor[j, col]
             factor[i, j] = math.sqrt(value) if i == j else value / factor[j, j]
 
 
@@ -178,13 +178,13 @@ def small_cholesky(s, count, factor):
 def small_solve(factor, count, y):
     """Solve ``L L^T out = y`` in place for ``y`` (3,)."""
     for i in range(count):
-        for l in range(i):
-            y[i] -= factor[i, l] * y[l]
+        for col in range(i):
+            y[i] -= factor[i, col] * y[col]
         y[i] /= factor[i, i]
     for r in range(count):
         i = count - 1 - r
-        for l in range(i + 1, count):
-            y[i] -= factor[l, i] * y[l]
+        for col in range(i + 1, count):
+            y[i] -= factor[col, i] * y[col]
         y[i] /= factor[i, i]
 
 
@@ -196,17 +196,17 @@ def cross_covariance(p, by_state, by_error, slot, count, rows, used, w):
         i = used[r]
         for j in range(size):
             w[r, j] = 0.0
-        for l in range(9):
-            f = by_state[i, l]
+        for col in range(9):
+            f = by_state[i, col]
             if f != 0.0:
                 for j in range(size):
-                    w[r, j] += f * p[l, j]
-        for l in range(SLOTS):
-            if slot[l] >= 0:
-                f = by_error[i, l]
+                    w[r, j] += f * p[col, j]
+        for col in range(SLOTS):
+            if slot[col] >= 0:
+                f = by_error[i, col]
                 if f != 0.0:
                     for j in range(size):
-                        w[r, j] += f * p[9 + slot[l], j]
+                        w[r, j] += f * p[9 + slot[col], j]
     for r in range(count):
         for t in range(count):
             rows[r, t] = times(by_state[used[t]], by_error[used[t]], slot, w[r])
@@ -216,11 +216,11 @@ def cross_covariance(p, by_state, by_error, slot, count, rows, used, w):
 def times(by_state, by_error, slot, x):
     """One row of H times a vector (N,)."""
     value = 0.0
-    for l in range(9):
-        value += by_state[l] * x[l]
-    for l in range(SLOTS):
-        if slot[l] >= 0:
-            value += by_error[l] * x[9 + slot[l]]
+    for col in range(9):
+        value += by_state[col] * x[col]
+    for col in range(SLOTS):
+        if slot[col] >= 0:
+            value += by_error[col] * x[9 + slot[col]]
     return value
 
 
@@ -353,8 +353,8 @@ def update_node(motion, index, sources, observed, wander, gate, charts, innovati
         source = observed.source[row]
         slot, kind = sources.slot[source], sources.kind[source]
         by_state, by_error = innovations.by_state[row], innovations.by_error[row]
-        for l in range(SLOTS):
-            e[l] = charts.errors[k, slot[l]] if slot[l] >= 0 else 0.0
+        for col in range(SLOTS):
+            e[col] = charts.errors[k, slot[col]] if slot[col] >= 0 else 0.0
         predict(
             kind, sources.arm_body_m[source], sources.site_ecef_m[source], sources.dcm[source], observed.known[row], e,
             position, velocity, c, rate, acceleration, h, by_state, by_error,
@@ -375,8 +375,8 @@ def update_node(motion, index, sources, observed, wander, gate, charts, innovati
         nis = 0.0
         for i in range(count):
             h[i] = y[i]
-            for l in range(i):
-                h[i] -= factor[i, l] * h[l]
+            for col in range(i):
+                h[i] -= factor[i, col] * h[col]
             h[i] /= factor[i, i]
             nis += h[i] * h[i]
         innovations.nis[row] = nis

@@ -10,7 +10,16 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import OMEGA_WGS84, WGS84, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined, kernel
+from flightmodel._kernels import (
+    OMEGA_WGS84,
+    WGS84,
+    boxplus,
+    dcm_from_quaternion,
+    geodetic,
+    gravitation,
+    inlined,
+    kernel,
+)
 from recon._ballistic_kernels import ballistic_acceleration
 from recon._strapdown_kernels import cross_into, level, matmul_into
 
@@ -56,7 +65,9 @@ def corrected(measured, errors, offset, dcm_body_sensor, out):
         for j in range(3):
             actual[i] += turn[i, j] * (measured[j] - errors[offset + j]) / (1.0 + errors[offset + 3 + j])
     for i in range(3):
-        out[i] = dcm_body_sensor[i, 0] * actual[0] + dcm_body_sensor[i, 1] * actual[1] + dcm_body_sensor[i, 2] * actual[2]
+        out[i] = 0.0
+        for j in range(3):
+            out[i] += dcm_body_sensor[i, j] * actual[j]
 
 
 @inlined
@@ -94,7 +105,7 @@ def state_rows(m, count, tau, c, effective, speed, by_state, by_error):
 
 @inlined
 def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
-    """Range, azimuth, elevation, with partials (3, 3) by the seen point; ``known[0]`` is the refractivity at the site."""
+    """Range, azimuth, elevation and partials (3, 3) by the seen point; ``known[0]`` is the refractivity at the site."""
     ned = np.empty(3)
     for i in range(3):
         ned[i] = 0.0
@@ -134,8 +145,8 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
 
 
 @inlined
-def predict_place(kind, site, dcm_ned_ecef, e, point, speed, acceleration, h, m, by_error):
-    """Position north, east, down of a reference, or velocity along these axes, or height; partials by the seen point."""
+def predict_place(kind, site, dcm_ned_ecef, e, point, speed, h, m, by_error):
+    """Position or velocity along a reference's axes, or height; partials by the seen point."""
     if kind == HEIGHT:
         sin_lat, cos_lat, height, per_p = geodetic(point[0], point[1], point[2], WGS84)
         m[0, 0], m[0, 1], m[0, 2] = cos_lat * point[0] * per_p, cos_lat * point[1] * per_p, sin_lat
@@ -240,7 +251,7 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
         predict_radar(site, dcm, known, e, point, h, m, by_error)
         state_rows(m, 3, tau, c, effective, speed, by_state, by_error)
         return
-    predict_place(kind, site, dcm, e, point, speed, acceleration, h, m, by_error)
+    predict_place(kind, site, dcm, e, point, speed, h, m, by_error)
     if kind == VELOCITY:
         velocity_rows(m, arm, rate, c, acceleration, by_state, by_error)
         return

@@ -47,8 +47,8 @@ def solve_scaled(p, columns, scale):
     for j in range(size):
         for i in range(j, size):
             value = p[i, j]
-            for l in range(j):
-                value -= p[i, l] * p[j, l]
+            for col in range(j):
+                value -= p[i, col] * p[j, col]
             p[i, j] = value
         p[j, j] = math.sqrt(max(p[j, j], LEAST_PIVOT))
         for i in range(j + 1, size):
@@ -57,14 +57,14 @@ def solve_scaled(p, columns, scale):
         y = columns[r]
         for i in range(size):
             value = y[i] / scale[i]
-            for l in range(i):
-                value -= p[i, l] * y[l]
+            for col in range(i):
+                value -= p[i, col] * y[col]
             y[i] = value / p[i, i]
         for t in range(size):
             i = size - 1 - t
             value = y[i]
-            for l in range(i + 1, size):
-                value -= p[l, i] * y[l]
+            for col in range(i + 1, size):
+                value -= p[col, i] * y[col]
             y[i] = value / p[i, i]
         for i in range(size):
             y[i] /= scale[i]
@@ -80,23 +80,23 @@ def solve_square(a, b):
             if abs(a[i, j]) > abs(a[best, j]):
                 best = i
         if best != j:
-            for l in range(size):
-                a[j, l], a[best, l] = a[best, l], a[j, l]
-            for l in range(width):
-                b[j, l], b[best, l] = b[best, l], b[j, l]
+            for col in range(size):
+                a[j, col], a[best, col] = a[best, col], a[j, col]
+            for col in range(width):
+                b[j, col], b[best, col] = b[best, col], b[j, col]
         for i in range(j + 1, size):
             f = a[i, j] / a[j, j]
-            for l in range(j, size):
-                a[i, l] -= f * a[j, l]
-            for l in range(width):
-                b[i, l] -= f * b[j, l]
+            for col in range(j, size):
+                a[i, col] -= f * a[j, col]
+            for col in range(width):
+                b[i, col] -= f * b[j, col]
     for t in range(size):
         i = size - 1 - t
         for m in range(i + 1, size):
-            for l in range(width):
-                b[i, l] -= a[i, m] * b[m, l]
-        for l in range(width):
-            b[i, l] /= a[i, i]
+            for col in range(width):
+                b[i, col] -= a[i, m] * b[m, col]
+        for col in range(width):
+            b[i, col] /= a[i, i]
 
 
 @inlined
@@ -116,8 +116,8 @@ def backward_gain(phi, noise, decay, noise_var, moving, still, p, columns, scale
         for t in range(d):
             value = 0.0
             if r < 9:
-                for l in range(9):
-                    value += noise[r, l] * columns[t, l]
+                for col in range(9):
+                    value += noise[r, col] * columns[t, col]
             else:
                 value = noise_var[moving[r] - 9] * columns[t, moving[r]]
             q = noise[r, t] if r < 9 and t < 9 else (noise_var[moving[r] - 9] if r == t else 0.0)
@@ -202,10 +202,10 @@ def rauch_tung_striebel(steps, run, moving, x, covariance, variance):
         for r in range(d):
             for j in range(size):
                 rows[r, j] = 0.0
-            for l in range(size):
-                f = gain[r, l]
+            for col in range(size):
+                f = gain[r, col]
                 for j in range(size):
-                    rows[r, j] += f * p[l, j]
+                    rows[r, j] += f * p[col, j]
         for r in range(d):
             for t in range(r + 1):
                 value = 0.5 * (added[r, t] + added[t, r])
@@ -263,14 +263,14 @@ def smoothed_covariance(p, information, product, out):
         for j in range(size):
             product[i, j] = 0.0
             out[i, j] = p[i, j]
-        for l in range(size):
-            f = p[i, l]
+        for col in range(size):
+            f = p[i, col]
             for j in range(size):
-                product[i, j] += f * information[l, j]
-        for l in range(size):
-            f = product[i, l]
+                product[i, j] += f * information[col, j]
+        for col in range(size):
+            f = product[i, col]
             for j in range(size):
-                out[i, j] -= f * p[l, j]
+                out[i, j] -= f * p[col, j]
 
 
 @inlined
@@ -282,27 +282,27 @@ def adjoint_step(phi, decay, mean, information, old, product, wanted):
     for j in range(size):
         value = decay[j - 9] * old[j] if j >= 9 else 0.0
         if j < dense:
-            for l in range(9):
-                value += phi[l, j] * old[l]
+            for col in range(9):
+                value += phi[col, j] * old[col]
         mean[j] = value
     if not wanted:
         return
     for i in range(size):
         for j in range(size):
             product[i, j] = decay[j - 9] * information[i, j] if j >= 9 else 0.0
-        for l in range(9):
-            f = information[i, l]
+        for col in range(9):
+            f = information[i, col]
             for j in range(dense):
-                product[i, j] += f * phi[l, j]
+                product[i, j] += f * phi[col, j]
     for i in range(size):
         f = decay[i - 9] if i >= 9 else 0.0
         for j in range(size):
             information[i, j] = f * product[i, j]
         if i < dense:
-            for l in range(9):
-                g = phi[l, i]
+            for col in range(9):
+                g = phi[col, i]
                 for j in range(size):
-                    information[i, j] += g * product[l, j]
+                    information[i, j] += g * product[col, j]
 
 
 @inlined
@@ -319,18 +319,18 @@ def adjoint_update(by_state, by_error, slot, gain, covariance, residual, varianc
         for t in range(3):
             push[r] += inverse[r, t] * residual[t]
     for r in range(3):
-        for l in range(9):
-            mean[l] -= by_state[r, l] * push[r]
-        for l in range(SLOTS):
-            if slot[l] >= 0:
-                mean[9 + slot[l]] -= by_error[r, l] * push[r]
+        for col in range(9):
+            mean[col] -= by_state[r, col] * push[r]
+        for col in range(SLOTS):
+            if slot[col] >= 0:
+                mean[9 + slot[col]] -= by_error[r, col] * push[r]
     if not wanted:
         return
     for r in range(3):
-        for l in range(size):
-            f = gain[l, r]
+        for col in range(size):
+            f = gain[col, r]
             for j in range(size):
-                u[r, j] += f * information[l, j]
+                u[r, j] += f * information[col, j]
     for r in range(3):
         for t in range(3):
             v[r, t] = inverse[r, t]
@@ -338,30 +338,34 @@ def adjoint_update(by_state, by_error, slot, gain, covariance, residual, varianc
                 v[r, t] += u[r, j] * gain[j, t]
     # L - H^T U - U^T H + H^T V H = L - H^T (U - V H) - U^T H
     for r in range(3):
-        for l in range(9):
-            f = by_state[r, l]
+        for col in range(9):
+            f = by_state[r, col]
             for j in range(size):
-                information[j, l] -= u[r, j] * f
-        for l in range(SLOTS):
-            if slot[l] >= 0:
+                information[j, col] -= u[r, j] * f
+        for col in range(SLOTS):
+            if slot[col] >= 0:
                 for j in range(size):
-                    information[j, 9 + slot[l]] -= u[r, j] * by_error[r, l]
+                    information[j, 9 + slot[col]] -= u[r, j] * by_error[r, col]
     for r in range(3):
         for t in range(3):
-            for l in range(9):
-                u[r, l] -= v[r, t] * by_state[t, l]
-            for l in range(SLOTS):
-                if slot[l] >= 0:
-                    u[r, 9 + slot[l]] -= v[r, t] * by_error[t, l]
+            for col in range(9):
+                u[r, col] -= v[r, t] * by_state[t, col]
+            for col in range(SLOTS):
+                if slot[col] >= 0:
+                    u[r, 9 + slot[col]] -= v[r, t] * by_error[t, col]
     for r in range(3):
-        for l in range(9):
-            f = by_state[r, l]
+        for col in range(9):
+            f = by_state[r, col]
             for j in range(size):
-                information[l, j] -= f * u[r, j]
-        for l in range(SLOTS):
-            if slot[l] >= 0:
+                information[col, j] -= f * u[r, j]
+        for col in range(SLOTS):
+            if slot[col] >= 0:
                 for j in range(size):
-                    information[9 + slot[l], j] -= by_error[r, l] * u[r, j]
+                    information[9 + slot[col], j] -= by_error[r, col] * u[r, j]
+    for i in range(size):  # else rounding grows into an asymmetry that the products above do not expect
+        for j in range(i):
+            value = 0.5 * (information[i, j] + information[j, i])
+            information[i, j], information[j, i] = value, value
 
 
 @inlined

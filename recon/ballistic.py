@@ -4,8 +4,8 @@ With ``u`` the velocity against the air and ``B`` the drag area per mass,
 
     dv/dt = g(r) - W x (W x r) - 2 W x v + rho |u| B e^d / 2 (-u + |u| (s1 n1 + s2 n2)),   rho = rho0(h) e^(c0 sd(h))
 
-with ``n1`` level and ``n2`` upright across the flow. The six drivers ``d, s1, s2, c0, cN, cE`` are errors of the filter:
-drag and side forces wander along time, density and the winds' ``c sd(h)`` along altitude. What a thrust or an
+with ``n1`` level and ``n2`` upright across the flow. The six drivers ``d, s1, s2, c0, cN, cE`` are errors of the
+filter: drag and side forces wander along time, density and the winds' ``c sd(h)`` along altitude. What a thrust or an
 opening parachute does in stated spans is white noise of acceleration. Steps are fourth-order Runge-Kutta steps, the
 transition is ``1 + M dt + M^2 dt^2 / 2`` of the partials half way. Attitude takes no part.
 """

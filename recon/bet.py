@@ -1,10 +1,10 @@
 """Where the vehicle was and how it was turned: the best estimated trajectory from trackers and inertial sensors.
 
-Inertial sensors carry the state, trackers (radars, receivers, barometers) correct it, a smoother brings what was learnt
-later back to every earlier time, and the whole is repeated about the smoothed trajectory until that no longer moves the
-result (`Settings.passes`). Aerodynamics and atmosphere take no part: the answer is inertial, and what the air did can be
-inferred from it. A flight without inertial sensors is carried by gravity and the drag of the day's air instead
-(`recon.ballistic`).
+Inertial sensors carry the state, trackers (radars, receivers, barometers) correct it, a smoother brings what was
+learnt later back to every earlier time, and the whole is repeated about the smoothed trajectory until that no longer
+moves the result (`Settings.passes`). Aerodynamics and atmosphere take no part: the answer is inertial, and what the
+air did can be inferred from it. A flight without inertial sensors is carried by gravity and the drag of the day's air
+instead (`recon.ballistic`).
 """
 
 from __future__ import annotations
@@ -160,9 +160,9 @@ def _mcreynolds(problem: Problem, run: ekf.ForwardPass, smoothed: Smoothed, refe
     kept = np.flatnonzero(problem.kept)
     settled = problem.time_s[kept] > problem.time_s[0] + startup.FIT_SPAN_S
     difference = boxminus(run.states()[kept], reference[kept])[settled, :9]
-    both = (unpacked(triangles[settled], 9) for triangles in (run.filtered.p_plus, smoothed.triangles))
+    p_filter, p_smoother = (unpacked(t[settled], 9) for t in (run.filtered.p_plus, smoothed.triangles))
     groups = [name for name in consistency.GROUPS if name != "attitude" or not problem.motion.ballistic]
-    return consistency.mcreynolds_verdicts(difference, *both, groups)
+    return consistency.mcreynolds_verdicts(difference, p_filter, p_smoother, groups)
 
 
 def _sheet_verdicts(problem: Problem, table: pd.DataFrame, confidence: float) -> list[Verdict]:
@@ -177,9 +177,7 @@ def _sheet_verdicts(problem: Problem, table: pd.DataFrame, confidence: float) ->
     return [v for v in out if v is not None]
 
 
-def _iterate(
-    problem: Problem, settings: Settings, report: Progress
-) -> tuple[ekf.ForwardPass, Smoothed, States, int]:
+def _iterate(problem: Problem, settings: Settings, report: Progress) -> tuple[ekf.ForwardPass, Smoothed, States, int]:
     """Filter and smooth; the last forward pass, its smoothed errors, the smoothed states, and how often it ran."""
     reference = None
     if settings.passes > 0:

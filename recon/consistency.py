@@ -1,11 +1,12 @@
 """Is the reconstruction as good as it says? Verdicts in words, from the residuals and the two passes.
 
 Innovations of a filter whose model matches the data are white with the predicted covariance, so the sum of normalised
-innovations squared (NIS) is chi-square with as many degrees of freedom as components were measured, and the lag-one autocorrelation of a component is normal with sd ``1 / sqrt(N)``. Filter minus smoother has covariance
-``P_filter - P_smoother`` (McReynolds); differences last, so one that is beyond three sd by chance may stay there for
-long: a tenth of them may. Points of the first seconds are left out: they chose the start. What the flight taught about
-a sensor error, ``estimate / sqrt(prior_sd^2 - sd^2)``, is standard normal where the data sheet is right; radars can
-absorb a wrong mounting so well that only this shows it.
+innovations squared (NIS) is chi-square with as many degrees of freedom as components were measured, and the lag-one
+autocorrelation of a component is normal with sd ``1 / sqrt(N)``. Filter minus smoother has covariance ``P_filter -
+P_smoother`` (McReynolds); differences last, so one that is beyond three sd by chance may stay there for long: a tenth
+of them may. Points of the first seconds are left out: they chose the start. What the flight taught about a sensor
+error, ``estimate / sqrt(prior_sd^2 - sd^2)``, is standard normal where the data sheet is right; radars can absorb a
+wrong mounting so well that only this shows it.
 
 A failed verdict is a finding about the data or the model, not an error of the program. Each is two-sided at the
 settings' confidence, so that seventeen verdicts on a good flight are all green 98 times in a hundred (at 0.999).

@@ -6,13 +6,13 @@ linearised (iterated Kalman smoothing). In both cases a step is affine,
 
     x_{k+1} = F_k x_k + u_k,   P_{k+1} = F_k P_k F_k^T + Q_k
 
-and a measurement is ``y = z - h(chart) = H x + noise``; it is used where ``y - H x`` passes a chi-square gate, with the
-gain ``K = P H^T S^-1`` in which the rows of considered errors are zero (Schmidt), so that
+and a measurement is ``y = z - h(chart) = H x + noise``; it is used where ``y - H x`` passes a chi-square gate, with
+the gain ``K = P H^T S^-1`` in which the rows of considered errors are zero (Schmidt), so that
 
     P+ = (1 - K H) P (1 - K H)^T + K R K^T
 
-(Joseph), by which a considered error keeps its own variance. The compiled engine is `recon._filter_kernels`; the readable
-one below runs on filterpy's filter and is where another filter can be put in its place.
+(Joseph), by which a considered error keeps its own variance. The compiled engine is `recon._filter_kernels`; the
+readable one below runs on filterpy's filter and is where another filter can be put in its place.
 
 References
 ----------
@@ -56,7 +56,7 @@ class ForwardPass:
 
 def forward(problem: Problem, reference: States | None = None, engine: str = "compiled") -> ForwardPass:
     """Run the filter through all nodes, about its own estimate or about a reference trajectory."""
-    steps, run, innovations = _empty(problem)
+    steps, run, innovations = empty_pass(problem)
     n = len(problem.time_s)
     if reference is None:
         charts = Charts(np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)), np.empty((n, problem.model.size)))
@@ -83,7 +83,7 @@ def as_charts(states: States) -> Charts:
     return Charts(states.position_ecef_m, states.velocity_ecef_mps, states.q_ecef_body, states.sensor_errors)
 
 
-def _empty(problem: Problem) -> tuple[Steps, Filtered, Innovations]:
+def empty_pass(problem: Problem) -> tuple[Steps, Filtered, Innovations]:
     """Arrays for one pass."""
     n, size, dense, m = len(problem.time_s), problem.size, problem.dense, problem.model.size
     count = len(problem.row)
@@ -227,8 +227,8 @@ def schmidt_update(
 ) -> FloatArray:
     """Update filterpy's filter by a known innovation; errors that are only considered get no gain. Returns the gain.
 
-    Without considered errors this is filterpy's own update; its gain cannot be masked, so with them Joseph's form stands
-    here.
+    Without considered errors this is filterpy's own update; its gain cannot be masked, so with them Joseph's form
+    stands here.
     """
     if len(considered) == 0:
         ekf.update(innovation, lambda _x: jacobian, lambda _x: np.zeros(len(innovation)), R=noise)

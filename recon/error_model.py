@@ -125,7 +125,8 @@ def _kind(component: str) -> str:
 
 
 def _fits(block: Block, names: list[str]) -> bool:
-    return any(f"{block.instrument} {_kind(c)}" in names or f"{block.instrument} {c}" in names for c in block.components)
+    spelt = [f"{block.instrument} {part}" for c in block.components for part in (c, _kind(c))]
+    return any(name in names for name in spelt)
 
 
 def triad_blocks(spec: TriadSpec, unit: str) -> list[Block]:

@@ -132,9 +132,7 @@ def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, tra
     known = np.tile([SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
     place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
-    return _instrument(
-        name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known
-    )
+    return _instrument(name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known)
 
 
 def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray) -> list[Instrument]:

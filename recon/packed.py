@@ -1,7 +1,7 @@
 """The filter's problem and its answer as plain tuples of arrays, which compiled and readable engines both take.
 
 ``n`` nodes, ``M`` measurements, ``m`` errors beside the nine kinematic ones (``N = 9 + m``), the first ``s`` of them
-drivers of the motion (`recon.motion`), ``D = 9 + s``. Symmetric matrices are stored as packed lower triangles, row by row.
+drivers of the motion (`recon.motion`), ``D = 9 + s``. Symmetric matrices are stored as packed lower triangles.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Charts(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """From each node to the next: transition (n - 1, 9, D), noise (n - 1, 9, 9), decay and noise of errors (n - 1, m)."""
+    """Each node to the next: transition (n - 1, 9, D), noise (n - 1, 9, 9), decay and noise of errors (n - 1, m)."""
 
     transition: FloatArray
     noise: FloatArray

@@ -92,7 +92,11 @@ class Problem:
         observed = self.observed
         thin = Observed(
             np.concatenate([[0], np.searchsorted(node[chosen], index, side="right")]).astype(np.int64),
-            *(np.ascontiguousarray(part[chosen]) for part in observed[1:]),
+            observed.source[chosen],
+            observed.value[chosen],
+            observed.variance[chosen],
+            observed.known[chosen],
+            observed.usable[chosen],
         )
         return (
             replace(

@@ -4,9 +4,9 @@ Moving from the accelerometer (at ``r`` from the datum, body axes) to the datum:
 
     p = p_imu - C r,   v = v_imu - C (w x r),   w = gyro rate - C^T W
 
-and the errors move with them: ``dp = dp_imu + C [r x] d``, ``dv = dv_imu + C [(w x r) x] d + C [r x] dw`` with rotation
-error ``d`` and rate error ``dw`` from the gyros' estimated errors and white noise. In ballistic flight the tracked point
-is the datum, the attitude is not known, and its covariance says so.
+and the errors move with them: ``dp = dp_imu + C [r x] d``, ``dv = dv_imu + C [(w x r) x] d + C [r x] dw`` with
+rotation error ``d`` and rate error ``dw`` from the gyros' estimated errors and white noise. In ballistic flight the
+tracked point is the datum, the attitude is not known, and its covariance says so.
 """
 
 from __future__ import annotations

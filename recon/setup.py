@@ -16,14 +16,14 @@ from recon.inertial import SAME_INSTANT_S, Bridged
 from recon.measurements import Instrument
 from recon.problem import Problem, nearest_index, observe
 from recon.settings import Settings
-from recon.state import BoolArray
+from recon.state import BoolArray, IntArray
 
 ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
 
 
 @dataclass(frozen=True)
 class Bridges:
-    """Both inertial triads without gaps; None in ballistic flight."""
+    """Both inertial triads without gaps."""
 
     force: Bridged
     rate: Bridged
@@ -37,7 +37,7 @@ def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | N
     GateError
         Where the data cannot start or carry a filter (no common span, too few points, prior out of reach).
     """
-    arm = _accelerometer_arm(telemetry, bridges)
+    arm = _accelerometer_arm(bridges)
     instruments = tracking_instruments(telemetry, settings, arm)
     start_s, end_s = _span(instruments, settings, bridges)
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
@@ -54,21 +54,19 @@ def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | N
     else:
         force, rate = bridges.force, bridges.rate
         motion, node_index = inertial.inertial_motion(force, rate, time_s)
-        prior = startup.attitude_prior(telemetry, instruments)
+        prior = startup.attitude_prior(telemetry)
         start, covariance = startup.start_by_inertial_sensors(instruments, prior, start_s, force, rate, model)
     from scipy.stats import chi2
 
     gate = np.array([0.0, *(float(chi2.ppf(settings.gate_probability, k)) for k in (1, 2, 3))])
     kept: BoolArray = np.zeros(len(time_s), dtype=bool)
     kept[nearest_index(time_s, output_s)] = True
-    problem = Problem(
-        time_s, node_index, motion, model, instruments, row, observed, start, covariance, gate, kept
-    )
+    problem = Problem(time_s, node_index, motion, model, instruments, row, observed, start, covariance, gate, kept)
     left_out = np.array([i.name in settings.without or i.owner in settings.without for i in instruments])
     return problem.without(left_out[observed.source])
 
 
-def _accelerometer_arm(telemetry: Telemetry, bridges: Bridges | None) -> FloatArray:
+def _accelerometer_arm(bridges: Bridges | None) -> FloatArray:
     """Accelerometer from the datum; in ballistic flight the followed point is the tracked one."""
     if bridges is None:
         return np.zeros(3)
@@ -104,21 +102,21 @@ def attitude_instruments(
     out: list[Instrument] = []
     if telemetry.magnetometer is not None:
         record = telemetry.magnetometer
-        good = np.isfinite(record.measured_sensor).all(axis=1)
+        good = np.asarray(np.isfinite(record.measured_sensor).all(axis=1))
         rows = _thinned(record.time_s, good, start_s, end_s)
         at = record.time_s[rows]
         place = np.column_stack([np.interp(at, t, column) for column in points.T])
         field = geomagnetism_and_sun.magnetic_field_ecef_t(place, telemetry.t0_utc)
         out.append(measurements.magnetometer_instrument("magnetometer", record, field, rows))
     if telemetry.sun is not None:
-        lit = np.isfinite(telemetry.sun.az_el_head_rad).any(axis=(1, 2))
+        lit = np.asarray(np.isfinite(telemetry.sun.az_el_head_rad).any(axis=(1, 2)))
         rows = _thinned(telemetry.sun.time_s, lit, start_s, end_s)
         to_sun = geomagnetism_and_sun.sun_direction_ecef(telemetry.t0_utc, telemetry.sun.time_s[rows])
         out += measurements.sun_instruments("sun", telemetry.sun, to_sun, rows)
     return tuple(out)
 
 
-def _thinned(time_s: FloatArray, good: BoolArray, start_s: float, end_s: float) -> np.ndarray:
+def _thinned(time_s: FloatArray, good: BoolArray, start_s: float, end_s: float) -> IntArray:
     """Rows of the first good sample of each cell of time within a span."""
     rows = np.flatnonzero(good & (time_s >= start_s) & (time_s <= end_s))
     _, first = np.unique(np.floor(time_s[rows] * ATTITUDE_RATE_HZ), return_index=True)

@@ -58,7 +58,7 @@ def start_attitude(
     return step.state.q_ecef_body, total, cross
 
 
-def attitude_prior(telemetry: Telemetry, instruments: tuple[Instrument, ...]) -> AttitudePrior:
+def attitude_prior(telemetry: Telemetry) -> AttitudePrior:
     """Attitude as it is stated."""
     if telemetry.attitude_prior is None:
         raise GateError("no attitude to start from: add [attitude_prior] to flight.toml")

@@ -40,8 +40,8 @@ class States:
     q_ecef_body: FloatArray
     sensor_errors: FloatArray
 
-    def __getitem__(self, index: int | slice) -> States:
-        """State of one node, or of a range."""
+    def __getitem__(self, index: int | slice | IntArray) -> States:
+        """State of one node, of a range, or of chosen nodes."""
         return States(
             self.position_ecef_m[index],
             self.velocity_ecef_mps[index],

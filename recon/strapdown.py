@@ -4,14 +4,14 @@ Model, Earth-fixed axes, for the point where the accelerometer sits:
 
     dr/dt = v,   dv/dt = C f + g(r) - W x (W x r) - 2 W x v,   dC/dt = C [w x] - [W x] C
 
-with C from body to ECEF, W the Earth's rate, f and w the corrected specific force and inertial rate in body axes.
-A sensor triad measures ``(1 + s) * (R(m)^T D^T x) + b``: D is the nominal mounting (sensor to body), m the mounting
+with C from body to ECEF, W the Earth's rate, f and w the corrected specific force and inertial rate in body axes. A
+sensor triad measures ``(1 + s) * (R(m)^T D^T x) + b``: D is the nominal mounting (sensor to body), m the mounting
 rotation in sensor axes, s the scale errors and b the biases, so ``x = D R(m) ((measured - b) / (1 + s))``.
 
 Steps are mid-point steps between samples: mean of the two samples, attitude at mid-step, and what turning and pushing
-do to each other within a step when both are straight in time (coning ``dt/12 w x dw``, sculling ``dt/12 (w x df - dw x
-f)``). White noise of density N (unit^2/Hz) drives velocity and rotation. The gravity gradient in the transition is the central one (J2 changes it by
-0.2 %, which moves a 100 m error by 0.2 mm in a second).
+do to each other within a step when both are straight in time (coning ``dt/12 w x dw``, sculling ``dt/12 (w x df - dw
+x f)``). White noise of density N (unit^2/Hz) drives velocity and rotation. The gravity gradient in the transition is
+the central one (J2 changes it by 0.2 %, which moves a 100 m error by 0.2 mm in a second).
 
 References
 ----------
