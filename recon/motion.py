@@ -69,5 +69,18 @@ def strapdown_motion(
     dcm_body_rate: FloatArray,
 ) -> Motion:
     """Motion carried by inertial sensors."""
-    arrays = (time_s, force_sensor_mps2, rate_sensor_radps, force_density, rate_density, dcm_body_force, dcm_body_rate)
-    return Motion(False, *(np.ascontiguousarray(a, dtype=float) for a in arrays), np.zeros((2, 5)), 0.0, 1.0, 0.0)
+    # numba compiles anew for every other memory layout
+    return Motion(
+        ballistic=False,
+        time_s=np.ascontiguousarray(time_s, dtype=float),
+        force_sensor_mps2=np.ascontiguousarray(force_sensor_mps2, dtype=float),
+        rate_sensor_radps=np.ascontiguousarray(rate_sensor_radps, dtype=float),
+        force_density=np.ascontiguousarray(force_density, dtype=float),
+        rate_density=np.ascontiguousarray(rate_density, dtype=float),
+        dcm_body_force=np.ascontiguousarray(dcm_body_force, dtype=float),
+        dcm_body_rate=np.ascontiguousarray(dcm_body_rate, dtype=float),
+        air=np.zeros((2, 5)),
+        air_from_m=0.0,
+        air_step_m=1.0,
+        drag_m2pkg=0.0,
+    )
