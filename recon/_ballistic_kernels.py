@@ -30,7 +30,8 @@ def ballistic_acceleration(motion, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     uy = vy + sin_lat * se * north - ce * east
     uz = vz - cos_lat * north
     speed = math.sqrt(ux * ux + uy * uy + uz * uz) + 1e-9
-    k = 0.5 * density * motion.drag_m2pkg * math.exp(e0) * speed
+    # a filter that gropes may ask for any drag; e^8 is a parachute on a needle
+    k = 0.5 * density * motion.drag_m2pkg * math.exp(min(max(e0, -8.0), 8.0)) * speed
     # across the flow: level, and in the vertical plane
     ax, ay, az = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
     n = 1.0 / (math.sqrt(ax * ax + ay * ay + az * az) + 1e-9)

@@ -68,7 +68,7 @@ def acceleration(motion: Motion, position: FloatArray, velocity: FloatArray, dri
     level = np.cross(position, u)
     level /= np.linalg.norm(level)
     upright = np.cross(u / speed, level)
-    push = 0.5 * density * motion.drag_m2pkg * np.exp(drivers[0]) * speed
+    push = 0.5 * density * motion.drag_m2pkg * np.exp(np.clip(drivers[0], -8.0, 8.0)) * speed
     spin = rotations.skew(earth.OMEGA_ECEF_RADPS)
     force = push * (speed * (drivers[1] * level + drivers[2] * upright) - u)
     return np.asarray(force + earth.gravitation(position) - spin @ spin @ position - 2.0 * spin @ velocity)

@@ -20,6 +20,7 @@ from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
 from recon import consistency, ekf, inertial, product, smoother, startup, strapdown
 from recon.consistency import Verdict
+from recon.disturbance import Disturbance, disturbed, widened
 from recon.packed import unpacked
 from recon.problem import Problem
 from recon.settings import Settings
@@ -95,7 +96,7 @@ def reconstruct(
     report(0.0, "bridging gaps")
     bridges = bridge_triads(telemetry)
     problem = build_problem(telemetry, settings, bridges)
-    run, smoothed, reference, passes = _iterate(problem, settings, report)
+    run, smoothed, reference, passes, disturbances = _iterate(problem, settings, report)
 
     report(0.95, "testing consistency")
     mount = _mounting(telemetry, bridges)
@@ -116,7 +117,11 @@ def reconstruct(
         specific_force_body_mps2=series[1],
         rate_body_radps=series[2],
         specific_force_cov=series[3],
-        findings=(*found, *product.edit_findings(problem, run.innovations.accepted)),
+        findings=(
+            *found,
+            *(d.finding() for d in disturbances),
+            *product.edit_findings(problem, run.innovations.accepted),
+        ),
         provenance={
             "flight": telemetry.name,
             "settings": asdict(settings),
@@ -177,17 +182,20 @@ def _sheet_verdicts(problem: Problem, table: pd.DataFrame, confidence: float) ->
     return [v for v in out if v is not None]
 
 
-def _iterate(problem: Problem, settings: Settings, report: Progress) -> tuple[ekf.ForwardPass, Smoothed, States, int]:
-    """Filter and smooth; the last forward pass, its smoothed errors, the smoothed states, and how often it ran."""
+def _iterate(
+    problem: Problem, settings: Settings, report: Progress
+) -> tuple[ekf.ForwardPass, Smoothed, States, int, tuple[Disturbance, ...]]:
+    """Filter and smooth: last forward pass, smoothed errors and states, how often it ran, disturbances."""
     reference = None
+    found: tuple[Disturbance, ...] = ()
     if settings.passes > 0:
         report(0.02, "first passes on thinned data")
-        reference = first_reference(problem, settings)
+        reference, found = first_reference(problem, settings)
     most = max(1, settings.passes)
     for i in range(most):
         share = 0.85 / most
         report(0.1 + share * i, f"filter, pass {i + 1}")
-        run = ekf.forward(problem, reference, settings.engine)
+        run, found = follow_track(problem, reference, settings, found)
         report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
         smoothed = smoother.smooth(problem, run, True, settings.smoother, settings.engine)
         kept = np.flatnonzero(problem.kept)
@@ -196,19 +204,32 @@ def _iterate(problem: Problem, settings: Settings, report: Progress) -> tuple[ek
         if moved.max() < SETTLED_SD:
             break
     assert reference is not None
-    return run, smoothed, reference, i + 1
+    return run, smoothed, reference, i + 1, found
 
 
-def first_reference(problem: Problem, settings: Settings) -> States:
+def follow_track(
+    problem: Problem, reference: States | None, settings: Settings, found: tuple[Disturbance, ...]
+) -> tuple[ekf.ForwardPass, tuple[Disturbance, ...]]:
+    """Forward pass with as many disturbances as it takes to follow the track, and these."""
+    while True:
+        run = ekf.forward(disturbed(problem, found), reference, settings.engine)
+        more = widened(found, problem, run)
+        if more is None:
+            return run, found
+        found = more
+
+
+def first_reference(problem: Problem, settings: Settings) -> tuple[States, tuple[Disturbance, ...]]:
     """Smoothed states at all nodes from a point of each source every `THINNED_STEP_S`, iterated until they stay."""
     thinned, kept = problem.thinned(THINNED_STEP_S)
     reference = None
+    found: tuple[Disturbance, ...] = ()
     for _ in range(MOST_THINNED_PASSES):
-        run = ekf.forward(thinned, reference, settings.engine)
+        run, found = follow_track(thinned, reference, settings, found)
         smoothed = smoother.smooth(thinned, run, False, "rauch-tung-striebel", settings.engine)
         moved = np.abs(smoothed.x[:, ROTATION]).max() if reference is not None else np.inf
         reference = smoothed.states(run.charts)
         if moved < SETTLED_RAD:
             break
     assert reference is not None
-    return strapdown.fill_between(problem.motion, problem.node_index, kept, reference)
+    return strapdown.fill_between(problem.motion, problem.node_index, kept, reference), found
