@@ -14,13 +14,13 @@ from flightmodel._kernels import OMEGA_WGS84, WGS84, geodetic, gravitation, inli
 
 
 @inlined
-def ballistic_acceleration(motion, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
+def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     """Acceleration against the rotating Earth, m/s^2, and height, m."""
     sin_lat, cos_lat, height, per_p = geodetic(x, y, z, WGS84)
-    at = (height - motion.air_from_m) / motion.air_step_m
-    row = int(min(max(at, 0.0), len(motion.air) - 2.0))
+    at = (height - air.from_m) / air.step_m
+    row = int(min(max(at, 0.0), len(air.table) - 2.0))
     w = min(max(at - row, 0.0), 1.0)
-    low, high = motion.air[row], motion.air[row + 1]
+    low, high = air.table[row], air.table[row + 1]
     density = math.exp(low[0] + w * (high[0] - low[0]) + e3 * (low[3] + w * (high[3] - low[3])))
     wind_sd = low[4] + w * (high[4] - low[4])
     north = low[1] + w * (high[1] - low[1]) + e4 * wind_sd
@@ -31,7 +31,7 @@ def ballistic_acceleration(motion, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     uz = vz - cos_lat * north
     speed = math.sqrt(ux * ux + uy * uy + uz * uz) + 1e-9
     # a filter that gropes may ask for any drag; e^8 is a parachute on a needle
-    k = 0.5 * density * motion.drag_m2pkg * math.exp(min(max(e0, -8.0), 8.0)) * speed
+    k = 0.5 * density * air.drag_m2pkg * math.exp(min(max(e0, -8.0), 8.0)) * speed
     # across the flow: level, and in the vertical plane
     ax, ay, az = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
     n = 1.0 / (math.sqrt(ax * ax + ay * ay + az * az) + 1e-9)
@@ -46,7 +46,7 @@ def ballistic_acceleration(motion, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
 
 
 @inlined
-def ballistic_partials(motion, point, partials):
+def ballistic_partials(air, point, partials):
     """Partials (3, 12) of the acceleration by position, velocity and drivers ``point`` (12,), central differences."""
     p = np.empty(12)
     for j in range(12):
@@ -54,9 +54,9 @@ def ballistic_partials(motion, point, partials):
     for j in range(12):
         h = 1.0 if j < 3 else (0.01 if j < 6 else 1e-4)
         p[j] = point[j] + h
-        a = ballistic_acceleration(motion, p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
+        a = ballistic_acceleration(air, p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
         p[j] = point[j] - h
-        b = ballistic_acceleration(motion, p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
+        b = ballistic_acceleration(air, p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
         p[j] = point[j]
         partials[0, j] = (a[0] - b[0]) / (2.0 * h)
         partials[1, j] = (a[1] - b[1]) / (2.0 * h)
@@ -64,7 +64,7 @@ def ballistic_partials(motion, point, partials):
 
 
 @inlined
-def ballistic_step(motion, dt, point, stage, slope, mid):
+def ballistic_step(air, dt, point, stage, slope, mid):
     """Carry position and velocity ``point[:6]`` over a step by Runge and Kutta's fourth-order rule.
 
     ``mid`` (12,) is the point half way; ``stage`` (12,) and ``slope`` (6,) are scratch.
@@ -76,7 +76,7 @@ def ballistic_step(motion, dt, point, stage, slope, mid):
     for i in range(4):
         s = stage
         a0, a1, a2, _ = ballistic_acceleration(
-            motion, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11]
+            air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11]
         )
         weight = 1.0 / 6.0 if i == 0 or i == 3 else 1.0 / 3.0
         ahead = dt if i == 2 else 0.5 * dt
@@ -115,7 +115,7 @@ def ballistic_transition(partials, dt, full):
 
 
 @inlined
-def propagate_ballistic(motion, first, last, errors, position, velocity, phi, noise):
+def propagate_ballistic(motion, air, first, last, errors, position, velocity, phi, noise):
     """Carry a state in place between grid points, with ``phi`` (9, 15) and ``noise`` (9, 9) from identity and zero."""
     point, stage, slope, mid = np.empty(12), np.empty(12), np.empty(6), np.empty(12)
     partials, full, old = np.empty((3, 12)), np.empty((6, 12)), np.empty((6, 15))
@@ -126,8 +126,8 @@ def propagate_ballistic(motion, first, last, errors, position, velocity, phi, no
     step = 1 if last >= first else -1
     for k in range(first, last, step):
         dt = motion.time_s[k + step] - motion.time_s[k]
-        ballistic_step(motion, dt, point, stage, slope, mid)
-        ballistic_partials(motion, mid, partials)
+        ballistic_step(air, dt, point, stage, slope, mid)
+        ballistic_partials(air, mid, partials)
         ballistic_transition(partials, dt, full)
         for i in range(6):
             for j in range(15):

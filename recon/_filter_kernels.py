@@ -19,46 +19,23 @@ TWO_PI = 2.0 * math.pi
 
 
 @inlined
-def propagate(motion, first, last, errors, position, velocity, q, phi, noise):
-    """Carry a state in place between grid points with its transition ``phi`` (9, D) and ``noise`` (9, 9)."""
+def level_transition(phi, noise):
+    """Set the transition to the identity and its noise to zero."""
     for i in range(9):
         for j in range(phi.shape[1]):
             phi[i, j] = 1.0 if i == j else 0.0
         for j in range(9):
             noise[i, j] = 0.0
-    if motion.ballistic:
-        propagate_ballistic(motion, first, last, errors, position, velocity, phi, noise)
-    else:
+
+
+@kernel
+def propagate_one(motion, air, first, last, errors, position, velocity, q, phi, noise):
+    """Carry a state in place between grid points with its transition ``phi`` (9, D) and ``noise`` (9, 9)."""
+    level_transition(phi, noise)
+    if air is None:
         propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise)
-
-
-@kernel
-def propagate_one(motion, first, last, errors, position, velocity, q, phi, noise):
-    """`propagate` for callers in Python."""
-    propagate(motion, first, last, errors, position, velocity, q, phi, noise)
-
-
-@kernel
-def propagate_chain(motion, node_index, known, charts):
-    """Fill the charts of nodes that are not ``known`` by carrying the node before, in place."""
-    phi, noise = np.empty((9, 9 + (6 if motion.ballistic else 18))), np.empty((9, 9))
-    for k in range(len(node_index) - 1):
-        if known[k + 1]:
-            continue
-        carry(charts, k)
-        propagate(
-            motion, node_index[k], node_index[k + 1], charts.errors[k],
-            charts.position[k + 1], charts.velocity[k + 1], charts.q[k + 1], phi, noise,
-        )  # fmt: skip
-
-
-@inlined
-def carry(charts, k):
-    """Copy node ``k``'s place, velocity and attitude to the next node."""
-    for i in range(3):
-        charts.position[k + 1, i], charts.velocity[k + 1, i] = charts.position[k, i], charts.velocity[k, i]
-    for i in range(4):
-        charts.q[k + 1, i] = charts.q[k, i]
+    else:
+        propagate_ballistic(motion, air, first, last, errors, position, velocity, phi, noise)
 
 
 @inlined
@@ -260,7 +237,7 @@ def gain_and_update(x, p, w, y, factor, count, used, considered, wander_sd, gain
 
 
 @kernel
-def forward(motion, node_index, sources, observed, wander, gate, follow, start, steps, charts, run, innovations):
+def forward(motion, air, node_index, sources, observed, wander, gate, follow, start, steps, charts, run, innovations):
     """Run the filter through all nodes, in place.
 
     ``charts`` hold the start in row 0, or with ``follow`` a reference in all rows; ``start`` (N,) is the start's error
@@ -271,7 +248,7 @@ def forward(motion, node_index, sources, observed, wander, gate, follow, start, 
     rows = np.empty((9, size))
     for k in range(n):
         if k > 0:
-            moving = advance(motion, node_index, wander, follow, steps, charts, x, x_next, k)
+            moving = advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k)
             predict_covariance(
                 p, steps.transition[k - 1], steps.noise[k - 1], steps.decay[k - 1], steps.noise_var[k - 1], moving, rows
             )
@@ -279,7 +256,7 @@ def forward(motion, node_index, sources, observed, wander, gate, follow, start, 
         for j in range(size):
             run.x_minus[k, j] = x[j]
         if observed.first[k + 1] > observed.first[k]:
-            update_node(motion, node_index[k], sources, observed, wander, gate, charts, innovations, x, p, k)
+            update_node(motion, air, node_index[k], sources, observed, wander, gate, charts, innovations, x, p, k)
         for j in range(size):
             run.x_plus[k, j] = x[j]
         if run.kept[k] >= 0:
@@ -297,7 +274,7 @@ def store_triangle(p, size, out):
 
 
 @inlined
-def advance(motion, node_index, wander, follow, steps, charts, x, x_next, k):
+def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k):
     """Carry chart and error from node ``k - 1`` to ``k``; about its own estimate, or along the reference."""
     a = k - 1
     position, velocity, q = charts.position[a].copy(), charts.velocity[a].copy(), charts.q[a].copy()
@@ -311,7 +288,13 @@ def advance(motion, node_index, wander, follow, steps, charts, x, x_next, k):
             errors[j] += x[9 + j]
     before = height_of(position)
     phi = steps.transition[a]
-    propagate(motion, node_index[a], node_index[k], errors, position, velocity, q, phi, steps.noise[a])
+    noise = steps.noise[a]
+    level_transition(phi, noise)
+    first, last = node_index[a], node_index[k]
+    if air is None:
+        propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise)
+    else:
+        propagate_ballistic(motion, air, first, last, errors, position, velocity, phi, noise)
     climb = abs(height_of(position) - before)
     dt = motion.time_s[node_index[k]] - motion.time_s[node_index[a]]
     decay = steps.decay[a]
@@ -340,7 +323,7 @@ def advance(motion, node_index, wander, follow, steps, charts, x, x_next, k):
 
 
 @inlined
-def update_node(motion, index, sources, observed, wander, gate, charts, innovations, x, p, k):
+def update_node(motion, air, index, sources, observed, wander, gate, charts, innovations, x, p, k):
     """Use the measurements of node ``k`` that pass the gate."""
     size = len(x)
     c, rate, acceleration = np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -348,7 +331,7 @@ def update_node(motion, index, sources, observed, wander, gate, charts, innovati
     used, s, factor = np.empty(3, dtype=np.int64), np.empty((3, 3)), np.empty((3, 3))
     w = np.empty((3, size))
     position, velocity = charts.position[k], charts.velocity[k]
-    node_motion(motion, index, position, velocity, charts.q[k], charts.errors[k], c, rate, acceleration)
+    node_motion(motion, air, index, position, velocity, charts.q[k], charts.errors[k], c, rate, acceleration)
     for row in range(observed.first[k], observed.first[k + 1]):
         source = observed.source[row]
         slot, kind = sources.slot[source], sources.kind[source]

@@ -28,12 +28,12 @@ SLOTS = 13
 
 
 @inlined
-def node_motion(motion, index, position, velocity, q, errors, c, rate, acceleration):
+def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acceleration):
     """Attitude matrix, inertial rate in body axes and acceleration against the Earth at a grid point, in place."""
     dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
-    if motion.ballistic:
+    if air is not None:
         a = ballistic_acceleration(
-            motion, position[0], position[1], position[2], velocity[0], velocity[1], velocity[2],
+            air, position[0], position[1], position[2], velocity[0], velocity[1], velocity[2],
             errors[0], errors[1], errors[2], errors[3], errors[4], errors[5],
         )  # fmt: skip
         for i in range(3):
@@ -284,6 +284,6 @@ def predict_one(kind, arm, site, dcm, known, e, position, velocity, q, rate, acc
 
 
 @kernel
-def motion_at(motion, index, position, velocity, q, errors, rate, acceleration):
+def motion_at(motion, air, index, position, velocity, q, errors, rate, acceleration):
     """`node_motion` without the attitude matrix, for the readable filter and for tests."""
-    node_motion(motion, index, position, velocity, q, errors, np.empty((3, 3)), rate, acceleration)
+    node_motion(motion, air, index, position, velocity, q, errors, np.empty((3, 3)), rate, acceleration)

@@ -69,7 +69,7 @@ def forward(problem: Problem, reference: States | None = None, engine: str = "co
     run.p_last[:] = problem.start_covariance
     if engine == "compiled":
         _filter_kernels.forward(
-            problem.motion, problem.node_index, problem.sources(), problem.observed, problem.model.wander,
+            *problem.motion.split(), problem.node_index, problem.sources(), problem.observed, problem.model.wander,
             problem.gate, reference is not None, start, steps, charts, run, innovations,
         )  # fmt: skip
     else:
@@ -180,7 +180,7 @@ class Readable:
         chart = self.chart(k)
         rate, acceleration = np.empty(3), np.empty(3)
         _measurement_kernels.motion_at(
-            self.problem.motion, self.problem.node_index[k], *as_charts(chart), rate, acceleration
+            *self.problem.motion.split(), self.problem.node_index[k], *as_charts(chart), rate, acceleration
         )
         c = rotations.dcm_from_q(chart.q_ecef_body)
         return NodeMotion(chart.position_ecef_m, chart.velocity_ecef_mps, c, rate, acceleration)

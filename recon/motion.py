@@ -17,8 +17,29 @@ from flightmodel.checks import FloatArray
 STRAPDOWN_DRIVERS, BALLISTIC_DRIVERS = 18, 6
 
 
+class Inertial(NamedTuple):
+    """Inertial part of a `Motion`, for kernels."""
+
+    time_s: FloatArray
+    force_sensor_mps2: FloatArray
+    rate_sensor_radps: FloatArray
+    force_density: FloatArray
+    rate_density: FloatArray
+    dcm_body_force: FloatArray
+    dcm_body_rate: FloatArray
+
+
+class Air(NamedTuple):
+    """Ballistic part of a `Motion`, for kernels."""
+
+    table: FloatArray
+    from_m: float
+    step_m: float
+    drag_m2pkg: float
+
+
 class Motion(NamedTuple):
-    """Time grid that contains every node, and what acts on it; a plain tuple, so that kernels can take it.
+    """Time grid that contains every node, and what acts on it.
 
     Parameters
     ----------
@@ -52,6 +73,11 @@ class Motion(NamedTuple):
     air_from_m: float
     air_step_m: float
     drag_m2pkg: float
+
+    def split(self) -> tuple[Inertial, Air | None]:
+        """Return what kernels take: a None for the air lets them be compiled without ballistic flight."""
+        air = Air(self.air, self.air_from_m, self.air_step_m, self.drag_m2pkg) if self.ballistic else None
+        return Inertial(*self[1:8]), air
 
     @property
     def drivers(self) -> int:

@@ -28,7 +28,6 @@ from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from recon import _filter_kernels
 from recon.motion import Motion
-from recon.packed import Charts
 from recon.state import IntArray, States
 
 
@@ -141,18 +140,21 @@ def propagate(motion: Motion, first: int, last: int, start: States) -> Step:
     position, velocity, q = start.position_ecef_m.copy(), start.velocity_ecef_mps.copy(), start.q_ecef_body.copy()
     phi, noise = np.empty((9, 9 + motion.drivers)), np.empty((9, 9))
     errors = np.ascontiguousarray(start.sensor_errors)
-    _filter_kernels.propagate_one(motion, first, last, errors, position, velocity, q, phi, noise)
+    _filter_kernels.propagate_one(*motion.split(), first, last, errors, position, velocity, q, phi, noise)
     return Step(States(position, velocity, q, start.sensor_errors), phi, noise)
 
 
 def fill_between(motion: Motion, node_index: IntArray, known: IntArray, at_known: States) -> States:
     """States at all nodes (n,) from those at the ``known`` ones (indices, the first is 0), noise-free between."""
     n = len(node_index)
-    charts = Charts(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)), np.empty((n, 0)))
-    charts.position[known], charts.velocity[known] = at_known.position_ecef_m, at_known.velocity_ecef_mps
-    charts.q[known] = at_known.q_ecef_body
-    flags = np.zeros(n, dtype=np.bool_)
-    flags[known] = True
-    charts = charts._replace(errors=np.ascontiguousarray(at_known.sensor_errors[np.cumsum(flags) - 1]))
-    _filter_kernels.propagate_chain(motion, node_index, flags, charts)
-    return States(charts.position, charts.velocity, rotations.continuous(charts.q), charts.errors)
+    position, velocity, q = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4))
+    position[known], velocity[known] = at_known.position_ecef_m, at_known.velocity_ecef_mps
+    q[known] = at_known.q_ecef_body
+    is_known = np.zeros(n, dtype=bool)
+    is_known[known] = True
+    errors = np.ascontiguousarray(at_known.sensor_errors[np.cumsum(is_known) - 1])
+    for k in np.flatnonzero(~is_known):
+        before = States(position[k - 1], velocity[k - 1], q[k - 1], errors[k - 1])
+        state = propagate(motion, node_index[k - 1], node_index[k], before).state
+        position[k], velocity[k], q[k] = state.position_ecef_m, state.velocity_ecef_mps, state.q_ecef_body
+    return States(position, velocity, rotations.continuous(q), errors)
