@@ -28,6 +28,8 @@ UNITS: dict[str, tuple[str, float, float]] = {
     "us": ("time", 1e-6, 0.0),
     "min": ("time", 60.0, 0.0),
     "m": ("length", 1.0, 0.0),
+    "cm": ("length", 0.01, 0.0),
+    "mm": ("length", 1e-3, 0.0),
     "km": ("length", 1000.0, 0.0),
     "yd": ("length", 0.9144, 0.0),
     "ft": ("length", 0.3048, 0.0),
@@ -37,6 +39,7 @@ UNITS: dict[str, tuple[str, float, float]] = {
     "mrad": ("angle", 1e-3, 0.0),
     "deg": ("angle", np.pi / 180.0, 0.0),
     "mil": ("angle", 2.0 * np.pi / 6400.0, 0.0),
+    "deg1e7": ("angle", 1e-7 * np.pi / 180.0, 0.0),  # whole numbers, as many receivers write a latitude
     "mps2": ("acceleration", 1.0, 0.0),
     "g": ("acceleration", 9.80665, 0.0),
     "mg": ("acceleration", 9.80665e-3, 0.0),
@@ -49,6 +52,8 @@ UNITS: dict[str, tuple[str, float, float]] = {
     "nt": ("magnetic field", 1e-9, 0.0),
     "gauss": ("magnetic field", 1e-4, 0.0),
     "mps": ("speed", 1.0, 0.0),
+    "cmps": ("speed", 0.01, 0.0),
+    "mmps": ("speed", 1e-3, 0.0),
     "kmh": ("speed", 1.0 / 3.6, 0.0),
     "kt": ("speed", 1852.0 / 3600.0, 0.0),
     "ftps": ("speed", 0.3048, 0.0),
@@ -58,6 +63,8 @@ UNITS: dict[str, tuple[str, float, float]] = {
     "degc": ("temperature", 1.0, 273.15),
     "pa": ("pressure", 1.0, 0.0),
     "hpa": ("pressure", 100.0, 0.0),
+    "kpa": ("pressure", 1000.0, 0.0),
+    "psi": ("pressure", 6894.757293168361, 0.0),
     "1": ("fraction", 1.0, 0.0),
     "percent": ("fraction", 0.01, 0.0),
 }
@@ -78,6 +85,20 @@ ACCELEROMETER = tuple(Quantity(f"a{a}", f"a{a}_suba_mps2", "acceleration") for a
 RATES = tuple(Quantity(a, f"{a}_body_degps", "rate") for a in "pqr")
 MAGNETOMETER = tuple(Quantity(f"b{a}", f"b{a}_magnetometer_ut", "magnetic field") for a in "xyz")
 RADAR = (Quantity("range", "range_m", "length"), Quantity("az", "az_deg", "angle"), Quantity("el", "el_deg", "angle"))
+GNSS = (
+    Quantity("lat", "lat_deg", "angle", required=False),
+    Quantity("lon", "lon_deg", "angle", required=False),
+    Quantity("alt", "alt_m", "length", required=False),
+    *(Quantity(a, f"{a}_ecef_m", "length", required=False) for a in "xyz"),
+    *(Quantity(f"v{a}", f"v{a}_ecef_mps", "speed", required=False) for a in "xyz"),
+    *(Quantity(f"v{a}", f"v{a}_mps", "speed", required=False) for a in "ned"),
+)
+# counts of a receiver, read where flight.toml asks for a least one
+GNSS_COUNTS = {"nsat": Quantity("nsat", "nsat", "fraction"), "fix_mode": Quantity("fix_mode", "fix_mode", "fraction")}
+BAROMETER = (
+    Quantity("height", "height_m", "length", required=False),
+    Quantity("pressure", "pressure_pa", "pressure", required=False),
+)
 ATMOSPHERE = (
     Quantity("alt", "alt_m", "length"),
     Quantity("rho", "rho_kgpm3", "density"),
@@ -108,11 +129,18 @@ class Declared:
 
 @dataclass(frozen=True)
 class TimeColumn:
-    """Where a table's time stands and how it is written: ``seconds``, ``utc`` (ISO) or ``irig_doy``."""
+    """Where a table's time stands and how it is written: ``seconds``, ``utc`` (ISO), ``irig_doy`` or ``utc_hms``.
+
+    ``parts`` are all columns that hold it, ``offset_s`` is added, ``repeats`` is ``first`` where equal times may follow
+    each other (`flightmodel.selection` then keeps the first row).
+    """
 
     column: str = "t_s"
     format: str = "seconds"
     unit: str = "s"
+    parts: tuple[str, ...] = ("t_s",)
+    offset_s: float = 0.0
+    repeats: str = "refuse"
 
 
 def read_table(path: Path, label: str) -> pd.DataFrame:
@@ -226,24 +254,30 @@ def times_s(
     frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
 ) -> FloatArray | None:
     """Seconds after t0, strictly increasing, or None with a fault for each thing that is wrong."""
-    if spec.column not in frame.columns:
+    absent = [column for column in spec.parts if column not in frame.columns]
+    if absent:
         found = ", ".join(frame.columns)
-        hint = nearest_name(spec.column, frame.columns)
-        faults.append(f"{label}: {path}: line 1: no time column '{spec.column}'{hint}; found {found}")
+        hint = nearest_name(absent[0], frame.columns)
+        faults.append(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}")
         return None
     if spec.format == "seconds":
         values = numbers(frame, spec.column, path, label, faults) * UNITS[spec.unit][1]
+    elif spec.format == "utc_hms":
+        values = _times_of_day([numbers(frame, column, path, label, faults) for column in spec.parts], t0)
     else:
         values = _clock_times(frame[spec.column].str.strip(), spec.format, t0)
     bad = ~np.isfinite(values)
     if bad.any():
         first = int(np.argmax(bad))
         faults.append(
-            f"{label}: {path}: line {line_of(frame, first)}: time '{frame[spec.column].iloc[first]}' is not in format "
+            f"{label}: {path}: line {line_of(frame, first)}: time "
+            f"'{':'.join(frame[column].iloc[first] for column in spec.parts)}' is not in format "
             f"'{spec.format}' ({int(bad.sum())} in all)"
         )
         return None
-    back = np.diff(values) <= 0.0
+    values = values + spec.offset_s
+    step = np.diff(values)
+    back = step < 0.0 if spec.repeats == "first" else step <= 0.0
     if back.any():
         k = int(np.argmax(back))
         faults.append(
@@ -252,6 +286,16 @@ def times_s(
         )
         return None
     return values
+
+
+def _times_of_day(parts: list[FloatArray], t0: datetime) -> FloatArray:
+    """Seconds after t0 of hours, minutes and seconds of a day (UTC): of the day on which they lie nearest to t0."""
+    hour, minute, second = parts
+    with np.errstate(invalid="ignore"):
+        real = (hour >= 0) & (hour < 24) & (minute >= 0) & (minute < 60) & (second >= 0) & (second < 61)
+    of_day = (t0 - t0.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()
+    after = np.where(real, 3600.0 * hour + 60.0 * minute + second - of_day, np.nan)
+    return np.round(after - 86400.0 * np.round(after / 86400.0), 7)
 
 
 _IRIG = re.compile(r"^(\d{1,3}):(\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)$")

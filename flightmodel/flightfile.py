@@ -1,141 +1,98 @@
-"""What ``flight.toml`` says: the flight, its sensors and radars, their files, and how their columns are written."""
+"""What ``flight.toml`` says: the flight, its instruments and their tables, how it starts and how it moves."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from flightmodel.checks import ConfigError
-from flightmodel.columns import UNITS, Declared, TimeColumn
-from flightmodel.config import Section, parse_section, parse_utc, read_toml
+from flightmodel.config import (
+    Angle,
+    Duration,
+    Elevation,
+    KeyFaults,
+    Latitude,
+    Longitude,
+    Name,
+    Section,
+    Time,
+    parse_section,
+    parse_utc,
+    read_toml,
+)
+from flightmodel.instrument_entries import (
+    AtmosphereEntry,
+    BarometerEntry,
+    FramesEntry,
+    GnssEntry,
+    MagnetometerEntry,
+    RadarEntry,
+    RatesEntry,
+    SunEntry,
+    TriadEntry,
+)
+from flightmodel.sources import Source, Spans
 
-NonNegative = Annotated[float, Field(ge=0.0)]
-Positive = Annotated[float, Field(gt=0.0)]
-
-
-class ColumnEntry(Section):
-    """A column of a table under another name or unit than the canonical one."""
-
-    column: str
-    unit: str
-
-    @field_validator("unit")
-    @classmethod
-    def _known(cls, value: str) -> str:
-        if value not in UNITS:
-            raise ValueError(f"unknown unit; known: {', '.join(UNITS)}")
-        return value
-
-
-class TimeEntry(Section):
-    """The time column of a table."""
-
-    column: str = "t_s"
-    format: Literal["seconds", "utc", "irig_doy"] = "seconds"
-    unit: Literal["s", "ms", "us", "min"] = "s"
-
-
-class Source(Section):
-    """A table in the flight folder: its file, its time column, columns that are not canonical."""
-
-    file: str
-    time: TimeEntry = TimeEntry()
-    columns: dict[str, ColumnEntry] = {}
-
-    def declared(self, short: str) -> Declared | None:
-        """Return the declared column of a quantity, or None for the canonical one."""
-        entry = self.columns.get(short)
-        return Declared(entry.column, entry.unit) if entry else None
-
-    @property
-    def time_column(self) -> TimeColumn:
-        """The time column in the form the reader takes."""
-        return TimeColumn(self.time.column, self.time.format, self.time.unit)
-
-
-class TriadEntry(Source):
-    """Accelerometer triad: file, mounting on the vehicle, errors from the data sheet (one standard deviation)."""
-
-    mount: str = "suba"
-    noise_sd_mps2: Positive = 0.049
-    bias_sd_mps2: NonNegative = 0.098
-    scale_sd: NonNegative = 0.003
-    mount_sd_deg: NonNegative = 0.2
-    resolution_mps2: NonNegative = 0.0
-
-
-class RatesEntry(Source):
-    """Rate gyros along body axes."""
-
-    noise_sd_degps: Positive = 0.05
-    bias_sd_degps: NonNegative = 0.05
-    scale_sd: NonNegative = 0.003
-    mount_sd_deg: NonNegative = 0.15
-    resolution_degps: NonNegative = 0.0
-
-
-class MagnetometerEntry(Source):
-    """Magnetometer: file, mounting on the vehicle, errors; the bias holds the vehicle's hard iron too."""
-
-    mount: str = "magnetometer"
-    noise_sd_ut: Positive = 0.2
-    bias_sd_ut: NonNegative = 0.5
-    scale_sd: NonNegative = 0.003
-    soft_iron_sd: NonNegative = 0.0
-    mount_sd_deg: NonNegative = 0.2
-    resolution_ut: NonNegative = 0.0
-
-
-class SunEntry(Source):
-    """Two-axis Sun sensors, one head looking outward at each clocking angle; an empty cell where a head sees no Sun."""
-
-    heads_lv_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=8)] = (45.0, 135.0, 225.0, 315.0)
-    field_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 180.0
-    noise_sd_deg: Positive = 1.0
-    bias_sd_deg: NonNegative = 0.5
-    mount_sd_deg: NonNegative = 0.2
-
-
-class RadarEntry(Source):
-    """A tracking radar and its site (WGS-84)."""
-
-    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
-    longitude_deg: Annotated[float, Field(ge=-360.0, le=360.0)]
-    height_m: float
-    tracks: Literal["cg", "datum"] = "cg"
-    range_sd_m: Positive = 5.0
-    angle_sd_deg: Positive = 0.0086
-    range_bias_sd_m: NonNegative = 3.0
-    angle_bias_sd_deg: NonNegative = 0.003
-    time_bias_sd_s: NonNegative = 0.001
-    mislevel_sd_deg: NonNegative = 0.0
-    droop_sd_deg: NonNegative = 0.0
-    skew_sd_deg: NonNegative = 0.0
-    nonorthogonality_sd_deg: NonNegative = 0.0
-    wander_sd_deg: NonNegative = 0.0
-    wander_time_constant_s: Positive = 20.0
-
-
-class AtmosphereEntry(Source):
-    """The day's sounding; standard deviations default to those of rocketsondes and balloons."""
-
-
-class FramesEntry(Source):
-    """Onboard video as a list of frames: column ``frame`` holds file names below ``folder``."""
-
-    folder: str
-    camera: str = "camera5"
-    benchmark_s: float = 421.0
+AttitudeSd = Annotated[float, Field(gt=0.0, le=180.0)]
 
 
 class AttitudeEntry(Section):
-    """Attitude from another source (magnetometer and Sun, say) to start from; quaternion scalar first."""
+    """Attitude to start from: a quaternion (scalar first), or where the body's x axis points and how it is rolled.
 
-    t_s: float
-    q_ecef_body: tuple[float, float, float, float]
-    sd_deg: Positive = 3.0
+    At roll 0 the body's y axis is horizontal and points to the right of one who looks along x, east where x is
+    level and north. ``sd_deg`` is one number, or one for each body axis.
+    """
+
+    t_s: Time
+    q_ecef_body: tuple[float, float, float, float] | None = None
+    azimuth_deg: Angle | None = None
+    elevation_deg: Elevation | None = None
+    roll_deg: Angle | None = None
+    latitude_deg: Latitude | None = None
+    longitude_deg: Longitude | None = None
+    sd_deg: tuple[AttitudeSd, AttitudeSd, AttitudeSd] = (3.0, 3.0, 3.0)
+
+    @field_validator("sd_deg", mode="before")
+    @classmethod
+    def _each_axis(cls, value: Any) -> Any:
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            if not 0.0 < value <= 180.0:
+                raise ValueError("above 0 and at most 180 deg is wanted")
+            return (float(value),) * 3
+        return value
+
+    @model_validator(mode="after")
+    def _one_form(self) -> AttitudeEntry:
+        pointing = (self.azimuth_deg, self.elevation_deg, self.roll_deg)
+        place = (self.latitude_deg, self.longitude_deg)
+        if self.q_ecef_body is not None and any(v is not None for v in (*pointing, *place)):
+            raise ValueError("q_ecef_body says it all; remove azimuth_deg, elevation_deg, roll_deg and the place")
+        if self.q_ecef_body is None and any(v is None for v in pointing):
+            raise ValueError("write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis")
+        if (place[0] is None) != (place[1] is None):
+            raise ValueError("latitude_deg and longitude_deg belong together")
+        return self
+
+
+class MotionEntry(Section):
+    """How the vehicle moves between measurements; `flightmodel.telemetry.Motion`."""
+
+    model: Literal["strapdown", "ballistic"] = "strapdown"
+    drag_area_per_mass_m2pkg: Annotated[float, Field(gt=0.0, le=1e3)] | None = None
+    drag_sd: Annotated[float, Field(gt=0.0, le=20.0)] = 1.0
+    drag_time_constant_s: Duration = 10.0
+    powered_s: Spans | None = None
+    powered_sd_mps2: Annotated[float, Field(gt=0.0, le=1e4)] = 50.0
+
+    @model_validator(mode="after")
+    def _drag_known(self) -> MotionEntry:
+        if self.model == "ballistic" and self.drag_area_per_mass_m2pkg is None:
+            raise KeyFaults(
+                [("model", self.model, "needs drag_area_per_mass_m2pkg, C_D S / m to a factor of exp(drag_sd)")]
+            )
+        return self
 
 
 class EventEntry(Section):
@@ -148,8 +105,8 @@ class EventEntry(Section):
 class SensorsEntry(Section):
     """The onboard sensors."""
 
-    accelerometer: TriadEntry
-    rates: RatesEntry
+    accelerometer: TriadEntry | None = None
+    rates: RatesEntry | None = None
     magnetometer: MagnetometerEntry | None = None
     sun: SunEntry | None = None
 
@@ -159,13 +116,16 @@ class FlightFile(Section):
 
     name: str
     t0_utc: str
-    vehicle: str
+    vehicle: str | None = None
     synthetic: bool = False
     description: str = ""
-    attitude_prior: AttitudeEntry
-    sensors: SensorsEntry
-    radars: dict[str, RadarEntry]
-    atmosphere: AtmosphereEntry
+    attitude_prior: AttitudeEntry | None = None
+    motion: MotionEntry = MotionEntry()
+    sensors: SensorsEntry = SensorsEntry()
+    radars: dict[Name, RadarEntry] = {}
+    gnss: dict[Name, GnssEntry] = {}
+    barometers: dict[Name, BarometerEntry] = {}
+    atmosphere: AtmosphereEntry | None = None
     frames: FramesEntry | None = None
     events: list[EventEntry] = []
 
@@ -175,12 +135,42 @@ class FlightFile(Section):
         parse_utc(value)
         return value
 
-    @field_validator("radars")
-    @classmethod
-    def _at_least_one(cls, value: dict[str, RadarEntry]) -> dict[str, RadarEntry]:
-        if not value:
-            raise ValueError("at least one radar is needed")
-        return value
+    @property
+    def sources(self) -> list[Source]:
+        """Every table that is named."""
+        onboard = (self.sensors.accelerometer, self.sensors.rates, self.sensors.magnetometer, self.sensors.sun)
+        single = [s for s in (*onboard, self.atmosphere, self.frames) if s is not None]
+        return [*single, *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
+
+    def misfits(self) -> list[str]:
+        """Return what does not go together, each with what to write instead."""
+        out = []
+        triads = [name for name in ("accelerometer", "rates") if getattr(self.sensors, name) is not None]
+        if not self.radars and not self.gnss:
+            also = "; a barometer alone knows no place" if self.barometers else ""
+            out.append(f"no [radars.NAME] and no [gnss.NAME]: a trajectory needs at least one of them{also}")
+        if len(triads) == 1:
+            other = "rates" if triads == ["accelerometer"] else "accelerometer"
+            out.append(
+                f"[sensors.{triads[0]}] without [sensors.{other}]: only both together carry a state; add the other"
+            )
+        if self.motion.model == "strapdown" and not triads:
+            words = (
+                'needs [sensors.accelerometer] and [sensors.rates]; without them write model = "ballistic" in [motion]'
+            )
+            out.append(f'motion.model = "strapdown" {words}')
+        attitude = self.attitude_prior or (self.sensors.magnetometer and self.sensors.sun)
+        if self.motion.model == "strapdown" and not attitude:
+            words = "write [attitude_prior] (a quaternion, or azimuth_deg, elevation_deg and roll_deg)"
+            out.append(
+                f"nothing says how the vehicle was turned: {words}, or both [sensors.magnetometer] and [sensors.sun]"
+            )
+        if self.frames and self.vehicle is None:
+            out.append('frames: their camera stands in a vehicle file; add vehicle = "..."')
+        names = [*self.radars, *self.gnss, *self.barometers]
+        for name in sorted({n for n in names if names.count(n) > 1}):
+            out.append(f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name")
+        return out
 
 
 def read_flight_file(folder: Path) -> FlightFile:

@@ -8,28 +8,22 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from flightmodel import columns
-from flightmodel.checks import GateError, nearest_name
+from flightmodel.atmosphere import standard_sounding
+from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import parse_utc
-from flightmodel.findings import find_faults
-from flightmodel.flightfile import (
-    FlightFile,
-    FramesEntry,
-    MagnetometerEntry,
-    RadarEntry,
-    RatesEntry,
-    SunEntry,
-    TriadEntry,
-    read_flight_file,
-)
+from flightmodel.earth import ecef_from_radar, geodetic_from_ecef
+from flightmodel.flightfile import AttitudeEntry, FlightFile, MotionEntry, read_flight_file
 from flightmodel.gate import Gate
-from flightmodel.instruments import RadarSite, SunHeads, TriadSpec
+from flightmodel.onboard_tables import read_frames, read_sun, read_triad
+from flightmodel.pointing import q_ecef_body_from_pointing
 from flightmodel.sounding import read_sounding
-from flightmodel.telemetry import AttitudePrior, Frames, RadarRecord, SunRecord, Telemetry, TriadRecord
-from flightmodel.vehicle import CameraMount, Vehicle, vehicle_from_toml, vehicle_path
+from flightmodel.telemetry import AttitudePrior, Finding, Frames, GnssRecord, Motion, RadarRecord, Sounding, Telemetry
+from flightmodel.tracking_tables import read_barometer, read_gnss, read_radar
+from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
+
+LEAST_SPAN_S = 1.0
 
 
 def read_flight(folder: Path) -> Telemetry:
@@ -49,226 +43,130 @@ def read_flight(folder: Path) -> Telemetry:
     """
     spec = read_flight_file(folder)
     gate = Gate(folder, parse_utc(spec.t0_utc))
-    vehicle = _vehicle(gate, spec)
-    accelerometer = _triad(gate, "accelerometer", spec.sensors.accelerometer, vehicle)
-    rates = _triad(gate, "rates", spec.sensors.rates, vehicle)
-    magnetometer = (
-        _triad(gate, "magnetometer", spec.sensors.magnetometer, vehicle) if spec.sensors.magnetometer else None
-    )
-    sun = _sun(gate, spec.sensors.sun) if spec.sensors.sun else None
-    radars = {name: _radar(gate, name, entry) for name, entry in spec.radars.items()}
-    sounding = read_sounding(gate, spec.atmosphere)
-    frames = _frames(gate, spec.frames, vehicle) if spec.frames else None
+    for words in spec.misfits():
+        gate.refuse_config(words)
+    vehicle = _vehicle(gate, spec.vehicle) if spec.vehicle is not None else None
+    triads = {name: read_triad(gate, name, spec, vehicle) for name in ("accelerometer", "rates", "magnetometer")}
+    sun = read_sun(gate, spec.sensors.sun) if spec.sensors.sun else None
+    radars = {name: read_radar(gate, name, entry) for name, entry in spec.radars.items()}
+    gnss = {name: read_gnss(gate, name, entry) for name, entry in spec.gnss.items()}
+    sounding = _sounding(gate, spec)
+    measured = spec.atmosphere is not None
+    barometers = {
+        name: read_barometer(gate, name, entry, sounding, measured) for name, entry in spec.barometers.items()
+    }
+    frames = read_frames(gate, spec.frames, vehicle) if spec.frames else None
+    tracks = {name: record for name, record in radars.items() if record is not None}
+    fixes = {name: record for name, record in gnss.items() if record is not None}
+    prior = _attitude_prior(gate, spec.attitude_prior, tracks, fixes) if spec.attitude_prior else None
     gate.close()
-    assert vehicle is not None
-    assert accelerometer is not None
-    assert rates is not None
     assert sounding is not None
-    q = np.array(spec.attitude_prior.q_ecef_body)
-    prior = AttitudePrior(
-        spec.attitude_prior.t_s, q / np.linalg.norm(q), np.full(3, np.deg2rad(spec.attitude_prior.sd_deg))
-    )
     telemetry = Telemetry(
         name=spec.name,
         t0_utc=spec.t0_utc,
         synthetic=spec.synthetic,
         vehicle=vehicle,
-        accelerometer=accelerometer,
-        rates=rates,
-        radars={name: record for name, record in radars.items() if record is not None},
+        accelerometer=triads["accelerometer"],
+        rates=triads["rates"],
+        radars=tracks,
         sounding=sounding,
         attitude_prior=prior,
         frames=frames,
-        magnetometer=magnetometer,
+        magnetometer=triads["magnetometer"],
         sun=sun,
         events=tuple((e.name, e.t_s) for e in spec.events),
         findings=tuple(gate.findings),
         hashes=_hashes(folder, spec, vehicle, frames),
+        gnss=fixes,
+        barometers={name: record for name, record in barometers.items() if record is not None},
+        motion=_motion(spec.motion),
     )
     start, stop = telemetry.span_s()
-    if stop - start < 1.0:
-        raise GateError(
-            f"{folder}: accelerometer, rates and radars have no second in common ({start:.2f} to {stop:.2f} s)"
-        )
+    if stop - start < LEAST_SPAN_S:
+        who = "accelerometer, rates and" if telemetry.accelerometer is not None else "the flight's"
+        trackers = " and ".join(kind for kind, some in (("radars", tracks), ("receivers", fixes)) if some)
+        raise GateError(f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)")
     return telemetry
 
 
-def _vehicle(gate: Gate, spec: FlightFile) -> Vehicle | None:
-    """Read the vehicle that flight.toml names; None, with faults kept, where it or what it must carry is missing."""
+def _vehicle(gate: Gate, name: str) -> Vehicle | None:
+    """Read the vehicle that flight.toml names; None, with its faults kept, where it is refused."""
     try:
-        vehicle = vehicle_from_toml(vehicle_path(spec.vehicle, gate.folder))
+        return vehicle_from_toml(vehicle_path(name, gate.folder))
     except GateError as fault:
         for words in fault.faults:
             gate.refuse_config(f"vehicle: {words}")
         return None
 
-    def missing(key: str, name: str, known: list[str]) -> None:
-        if name not in known:
-            hint = nearest_name(name, known)
-            gate.refuse_config(f"{key} = '{name}'{hint}: not on vehicle '{vehicle.name}'")
 
-    missing("sensors.accelerometer.mount", spec.sensors.accelerometer.mount, list(vehicle.sensors))
-    if spec.sensors.magnetometer:
-        missing("sensors.magnetometer.mount", spec.sensors.magnetometer.mount, list(vehicle.sensors))
-    if spec.frames:
-        missing("frames.camera", spec.frames.camera, list(vehicle.cameras))
-    norm = float(np.linalg.norm(spec.attitude_prior.q_ecef_body))
-    if abs(norm - 1.0) > 1e-3:
-        gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1")
-    return None if gate.config else vehicle
-
-
-Triad = TriadEntry | RatesEntry | MagnetometerEntry
-TRIAD_COLUMNS = {
-    TriadEntry: columns.ACCELEROMETER,
-    RatesEntry: columns.RATES,
-    MagnetometerEntry: columns.MAGNETOMETER,
-}
-
-
-def _triad(gate: Gate, name: str, source: Triad, vehicle: Vehicle | None) -> TriadRecord | None:
-    quantities = TRIAD_COLUMNS[type(source)]
-    table = gate.table(f"sensors.{name}", source, quantities)
-    if table is None or table.time_s is None:
-        return None
-    values = np.column_stack([table.columns[q.short] for q in quantities])
-    if not np.isfinite(values).all(axis=1).any():
-        gate.faults.append(f"sensors.{name}: {table.path}: every sample is missing")
-        return None
-    gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in quantities), values))
-    if vehicle is None:
-        return None
-    return TriadRecord(_triad_spec(name, source, vehicle), table.time_s, values)
-
-
-def _triad_spec(name: str, source: Triad, vehicle: Vehicle) -> TriadSpec:
-    mount_sd = float(np.deg2rad(source.mount_sd_deg))
-    if isinstance(source, RatesEntry):
-        noise, bias, step = np.deg2rad([source.noise_sd_degps, source.bias_sd_degps, source.resolution_degps])
-        return TriadSpec(name, np.zeros(3), np.eye(3), noise, bias, source.scale_sd, mount_sd, step)
-    mount = vehicle.sensors[source.mount]
-    place, dcm = np.array(mount.position_from_datum_body_m), mount.dcm_body_sensor
-    if isinstance(source, MagnetometerEntry):
-        noise, bias, step = 1e-6 * np.array([source.noise_sd_ut, source.bias_sd_ut, source.resolution_ut])
-        return TriadSpec(name, place, dcm, noise, bias, source.scale_sd, mount_sd, step, source.soft_iron_sd)
-    noise, bias, step = source.noise_sd_mps2, source.bias_sd_mps2, source.resolution_mps2
-    return TriadSpec(name, place, dcm, noise, bias, source.scale_sd, mount_sd, step)
-
-
-def _sun(gate: Gate, source: SunEntry) -> SunRecord | None:
-    heads = len(source.heads_lv_deg)
-    quantities = columns.sun_quantities(heads)
-    table = gate.table("sensors.sun", source, quantities)
-    if table is None or table.time_s is None:
-        return None
-    before = len(gate.faults)
-    for q in quantities:
-        # an elevation may pass 90 deg by its noise
-        limit = np.pi if q.short.startswith("az") else 0.6 * np.pi
-        gate.refuse_rows(table, q.short, -limit, limit, "no angle of a head")
-    if len(gate.faults) > before:
-        return None
-    values = np.column_stack([table.columns[q.short] for q in quantities])
-    seen = np.isfinite(values.reshape(-1, heads, 2)).all(axis=2)
-    dark = np.asarray(seen.sum(axis=1) == 0)
-    if dark.all():
-        gate.faults.append(f"sensors.sun: {table.path}: no head ever sees the Sun; remove [sensors.sun]")
-        return None
-    gate.findings.extend(find_faults("sun", table.time_s, tuple(q.short for q in quantities), values, dark))
-    noise, bias, mount, field = np.deg2rad(
-        [source.noise_sd_deg, source.bias_sd_deg, source.mount_sd_deg, source.field_deg]
+def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
+    """Read the day's air; the standard's, with a finding, where flight.toml names no table."""
+    if spec.atmosphere is not None:
+        return read_sounding(gate, spec.atmosphere)
+    words = (
+        "no [atmosphere]: the US Standard Atmosphere 1976 without wind stands for it, density to 10 %, wind to 15 m/s"
     )
-    spec = SunHeads("sun", np.deg2rad(source.heads_lv_deg), field, noise, bias, mount)
-    return SunRecord(spec, table.time_s, values.reshape(-1, heads, 2))
+    gate.findings.append(Finding("atmosphere", words, np.nan, np.nan))
+    return standard_sounding()
 
 
-def _radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
-    label = f"radars.{name}"
-    table = gate.table(label, source, columns.RADAR)
-    if table is None or table.time_s is None:
+def _attitude_prior(
+    gate: Gate, entry: AttitudeEntry, radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]
+) -> AttitudePrior | None:
+    """Attitude to start from; None, with a fault kept, where it cannot be told."""
+    sd = np.deg2rad(entry.sd_deg)
+    if entry.q_ecef_body is not None:
+        q = np.array(entry.q_ecef_body)
+        norm = float(np.linalg.norm(q))
+        if abs(norm - 1.0) > 1e-3:
+            gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1")
+            return None
+        return AttitudePrior(entry.t_s, q / norm, sd)
+    if entry.latitude_deg is not None and entry.longitude_deg is not None:
+        latitude, longitude = np.deg2rad([entry.latitude_deg, entry.longitude_deg])
+    else:
+        place = _first_place(radars, gnss)
+        if place is None:  # its table was refused
+            return None
+        latitude, longitude = place
+    assert entry.azimuth_deg is not None
+    assert entry.elevation_deg is not None
+    assert entry.roll_deg is not None
+    azimuth, elevation, roll = np.deg2rad([entry.azimuth_deg, entry.elevation_deg, entry.roll_deg])
+    q = q_ecef_body_from_pointing(azimuth, elevation, roll, float(latitude), float(longitude))
+    return AttitudePrior(entry.t_s, q, sd)
+
+
+def _first_place(radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]) -> tuple[float, float] | None:
+    """Latitude and longitude, rad, of the first receiver's first fix, or of the first radar's first point."""
+    points: list[FloatArray] = [r.position_ecef_m for r in gnss.values()]
+    for radar in radars.values():
+        s = radar.site
+        points.append(ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m))
+    if not points:
         return None
-    before = len(gate.faults)
-    gate.refuse_rows(table, "range", 1.0, np.inf, "no slant range")
-    gate.refuse_rows(table, "el", -0.5 * np.pi, 0.5 * np.pi, "no elevation")
-    if len(gate.faults) > before:
-        return None
-    azimuth = np.mod(table.columns["az"], 2.0 * np.pi)
-    values = np.column_stack([table.columns["range"], azimuth, table.columns["el"]])
-    if not np.isfinite(values).all(axis=1).any():
-        gate.faults.append(f"{label}: {table.path}: no track point with range, azimuth and elevation; remove the radar")
-        return None
-    gate.findings.extend(find_faults(name, table.time_s, ("range", "az", "el"), values))
-    return RadarRecord(_site(name, source), table.time_s, values, source.tracks)
+    whole = points[0][np.isfinite(points[0]).all(axis=1)]
+    latitude, longitude, _ = geodetic_from_ecef(whole[0])
+    return float(latitude), float(longitude)
 
 
-def _site(name: str, source: RadarEntry) -> RadarSite:
-    lat, lon, angle_sd, angle_bias_sd = np.deg2rad(
-        [source.latitude_deg, source.longitude_deg, source.angle_sd_deg, source.angle_bias_sd_deg]
+def _motion(entry: MotionEntry) -> Motion:
+    return Motion(
+        entry.model,
+        entry.drag_area_per_mass_m2pkg or 0.0,
+        entry.drag_sd,
+        entry.drag_time_constant_s,
+        entry.powered_s or (),
+        entry.powered_sd_mps2,
     )
-    mislevel, droop, skew, square, wander = np.deg2rad(
-        [
-            source.mislevel_sd_deg,
-            source.droop_sd_deg,
-            source.skew_sd_deg,
-            source.nonorthogonality_sd_deg,
-            source.wander_sd_deg,
-        ]
-    )
-    return RadarSite(
-        name, lat, lon, source.height_m, source.range_sd_m, angle_sd, source.range_bias_sd_m, angle_bias_sd,
-        source.time_bias_sd_s, mislevel, droop, skew, square, wander, source.wander_time_constant_s,
-    )  # fmt: skip
 
 
-def _frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Frames | None:
-    label = "frames"
-    if source.columns:
-        gate.refuse_config("frames.columns: the frame list has only t_s and frame")
-    path, images = gate.path(source.file), gate.path(source.folder)
-    if path is None or images is None or vehicle is None:
-        return None
-    table = gate.csv(path, label)
-    if table is None:
-        return None
-    time_s = columns.times_s(table, source.time_column, gate.t0, path, label, gate.faults)
-    if "frame" not in table.columns:
-        gate.faults.append(f"{label}: {path}: line 1: no column 'frame'{nearest_name('frame', table.columns)}")
-        return None
-    camera, paths = vehicle.cameras[source.camera], []
-    for row, name in enumerate(table["frame"].str.strip()):
-        image = images / name
-        wrong = gate.wrong_place(image, name) or _image_fault(image, camera)
-        if wrong:
-            where = f"{label}: {path}: line {columns.line_of(table, row)}: {image}"
-            gate.faults.append(f"{where}: {wrong}; replace the file or remove the line")
-        paths.append(image)
-    if time_s is None:
-        return None
-    if not time_s[0] - 2.0 <= source.benchmark_s <= time_s[-1] + 2.0:
-        span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
-        gate.refuse_config(f"frames.benchmark_s = {source.benchmark_s}: frames span {span}")
-        return None
-    return Frames(camera, source.camera, time_s, tuple(paths), source.benchmark_s)
-
-
-def _image_fault(path: Path, camera: CameraMount) -> str:
-    if not path.is_file():
-        return "no such file"
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        return "cannot be decoded as an image"
-    if image.shape != (camera.height_px, camera.width_px):
-        return f"is {image.shape[1]} x {image.shape[0]} pixels, the camera {camera.width_px} x {camera.height_px}"
-    return ""
-
-
-def _hashes(folder: Path, spec: FlightFile, vehicle: Vehicle, frames: Frames | None) -> dict[str, str]:
+def _hashes(folder: Path, spec: FlightFile, vehicle: Vehicle | None, frames: Frames | None) -> dict[str, str]:
     """SHA-256 of every file that the results depend on; all frames' pictures share one."""
-    names = ["flight.toml", spec.sensors.accelerometer.file, spec.sensors.rates.file, spec.atmosphere.file]
-    names += [s.file for s in (spec.sensors.magnetometer, spec.sensors.sun) if s is not None]
-    names += [r.file for r in spec.radars.values()] + ([spec.frames.file] if spec.frames else [])
-    digests = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in sorted(set(names))}
-    digests[f"vehicle {vehicle.name}"] = hashlib.sha256(vehicle.source.read_bytes()).hexdigest()
+    names = {"flight.toml", *(source.file for source in spec.sources)}
+    digests = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in sorted(names)}
+    if vehicle is not None:
+        digests[f"vehicle {vehicle.name}"] = hashlib.sha256(vehicle.source.read_bytes()).hexdigest()
     if frames is not None:
         pictures = hashlib.sha256()
         for path in frames.paths:

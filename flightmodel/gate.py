@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import columns
-from flightmodel.checks import ConfigError, FloatArray, GateError, nearest_name
-from flightmodel.flightfile import Source
+from flightmodel.checks import BoolArray, ConfigError, FloatArray, GateError, nearest_name
+from flightmodel.selection import rows_to_use
+from flightmodel.sources import Source
 from flightmodel.telemetry import Finding
 
 # no entry vehicle's instruments read beyond these; a larger number is a wrong unit or a broken word
@@ -37,6 +38,12 @@ class Table:
     def at(self, row: int) -> str:
         """Return where a row stands, for messages."""
         return f"{self.label}: {self.path}: line {int(self.lines[row])}"
+
+    def of_rows(self, rows: BoolArray) -> Table:
+        """Return the table of these rows alone."""
+        time_s = None if self.time_s is None else self.time_s[rows]
+        kept = {short: values[rows] for short, values in self.columns.items()}
+        return Table(self.path, self.label, time_s, kept, self.lines[rows])
 
 
 @dataclass
@@ -106,11 +113,22 @@ class Gate:
             column = columns.column_si(frame, quantity, source.declared(quantity.short), path, label, self.faults)
             if column is not None:
                 values[quantity.short] = column
-        table = Table(path, label, time_s, values, frame.attrs["lines"])
+        table = self.chosen(Table(path, label, time_s, values, frame.attrs["lines"]), source)
         for quantity in quantities:
             limit = SANE_LIMIT.get(quantity.kind, np.inf)
             self.refuse_rows(table, quantity.short, -limit, limit, f"beyond any {quantity.kind} of a flight")
         return table if len(self.faults) + len(self.config) == before else None
+
+    def chosen(self, table: Table, source: Source) -> Table:
+        """Return the rows that flight.toml lets be used, with a finding for those that it does not."""
+        if table.time_s is None:
+            return table
+        rows, findings = rows_to_use(table.label, source, table.time_s)
+        self.findings.extend(findings)
+        if rows.sum() < 2:
+            span = f"{table.time_s[0]:.2f} to {table.time_s[-1]:.2f} s"
+            self.faults.append(f"{table.label}: {table.path}: use_s leaves {rows.sum()} rows of {span}; two are needed")
+        return table.of_rows(rows)
 
     def refuse_rows(self, table: Table, short: str, low: float, high: float, words: str) -> None:
         """Refuse a column's values outside ``low`` to ``high`` (SI), naming the first's line; missing ones pass."""

@@ -7,8 +7,8 @@ import numpy as np
 from flightmodel import columns
 from flightmodel.atmosphere import R_AIR_JPKGK, default_sounding_sd
 from flightmodel.checks import FloatArray
-from flightmodel.flightfile import AtmosphereEntry
 from flightmodel.gate import Gate, Table
+from flightmodel.instrument_entries import AtmosphereEntry
 from flightmodel.telemetry import Finding, Sounding
 
 SOURCE = "atmosphere"

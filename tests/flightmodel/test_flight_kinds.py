@@ -1,0 +1,430 @@
+"""Flights other than an entry vehicle's: receivers, barometers, mounts without a vehicle, motion, what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flightmodel import earth, rotations
+from flightmodel.atmosphere import height_from_pressure, profile_from_sounding, standard_sounding, us76
+from flightmodel.checks import ConfigError, GateError
+from flightmodel.flightfolder import read_flight
+from flightmodel.pointing import q_ecef_body_from_pointing
+
+DEG = np.pi / 180.0
+HEAD = 'name = "small"\nt0_utc = "2022-06-24T15:17:17.5Z"\n'
+GNSS = '[gnss.gps]\nfile = "gps.csv"\nheight_is = "ellipsoid"\n'
+BALLISTIC = '[motion]\nmodel = "ballistic"\ndrag_area_per_mass_m2pkg = 0.01\n'
+PRIOR = "[attitude_prior]\nt_s = 0.0\nazimuth_deg = 30.0\nelevation_deg = 80.0\nroll_deg = 10.0\n"
+TRIADS = """\
+[sensors.accelerometer]
+file = "imu.csv"
+mount = "body"
+columns = { ax = { column = "fx", unit = "mps2" }, ay = { column = "fy", unit = "mps2" }, az = { column = "fz", unit = "mps2" } }
+[sensors.rates]
+file = "imu.csv"
+columns = { p = { column = "wx", unit = "degps" }, q = { column = "wy", unit = "degps" }, r = { column = "wz", unit = "degps" } }
+"""  # noqa: E501
+BARO = '[barometers.baro]\nfile = "baro.csv"\nheight_is = "ellipsoid"\n'
+LAT, LON = 32.9, -106.9
+T = np.arange(0.0, 20.0, 0.5)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Write a table by name, header and rows; and flight.toml; ``read`` reads it."""
+
+    class Folder:
+        root = tmp_path
+
+        def table(self, name, header, *columns):
+            rows = [",".join(f"{v:.9g}" if np.isfinite(v) else "" for v in row) for row in zip(*columns, strict=True)]
+            (tmp_path / name).write_text("\n".join([header, *rows]) + "\n")
+
+        def read(self, *sections):
+            (tmp_path / "flight.toml").write_text("\n".join([HEAD, *sections]))
+            return read_flight(tmp_path)
+
+        def refused(self, sections, *words, kind=ConfigError):
+            with pytest.raises(kind) as caught:
+                self.read(*sections)
+            missing = [word for word in words if word not in str(caught.value)]
+            assert not missing, f"no {missing} in:\n{caught.value}"
+
+    made = Folder()
+    up = 10.0 * T
+    made.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m", T, LAT + 0 * T, LON + 1e-5 * T, 1400 + up)
+    phase = np.sin(7.0 * T)
+    made.table("imu.csv", "t_s,fx,fy,fz,wx,wy,wz", T, 10 + phase, phase, 2 * phase, 30 + phase, 3 * phase, phase)
+    made.table("baro.csv", "t_s,height_m", T, 1400 + up + phase)
+    return made
+
+
+def findings(telemetry, source):
+    return [str(f) for f in telemetry.findings if f.source == source]
+
+
+# what is read
+
+
+def test_receiver_alone_is_enough_with_ballistic_motion(folder):
+    telemetry = folder.read(GNSS, BALLISTIC)
+    assert telemetry.vehicle is None
+    assert telemetry.accelerometer is None
+    assert telemetry.radars == {}
+    assert telemetry.motion.model == "ballistic"
+    record = telemetry.gnss["gps"]
+    lat, lon, height = earth.geodetic_from_ecef(record.position_ecef_m)
+    np.testing.assert_allclose(lat, LAT * DEG, atol=1e-9)
+    np.testing.assert_allclose(lon, (LON + 1e-5 * T) * DEG, atol=1e-9)
+    np.testing.assert_allclose(height, 1400 + 10 * T, atol=1e-3)
+    assert np.isnan(record.velocity_ecef_mps).all()
+    assert telemetry.span_s() == (0.0, 19.5)
+    assert "gps.csv" in telemetry.hashes
+
+
+def test_standard_air_stands_in_and_is_told(folder):
+    telemetry = folder.read(GNSS, BALLISTIC)
+    assert any("US Standard Atmosphere" in words for words in findings(telemetry, "atmosphere"))
+    air = telemetry.sounding
+    assert (air.altitude_m[0], air.altitude_m[-1]) == (0.0, 120e3)
+    np.testing.assert_array_equal(air.density_kgpm3, us76(air.altitude_m)[0])
+    assert set(air.density_sd) == {0.10}
+    assert set(air.wind_sd_mps) == {15.0}
+    assert not air.wind_north_mps.any()
+
+
+def test_height_above_sea_level_gets_the_undulation(folder):
+    before = folder.read(GNSS, BALLISTIC).gnss["gps"].position_ecef_m
+    above_sea = GNSS.replace('"ellipsoid"', '"msl"\ngeoid_undulation_m = -24.0')
+    after = folder.read(above_sea, BALLISTIC).gnss["gps"].position_ecef_m
+    up = earth.ned_from_ecef(after - before, before)
+    np.testing.assert_allclose(up, np.tile([0.0, 0.0, 24.0], (len(T), 1)), atol=1e-5)
+
+
+def test_ecef_columns_are_read_before_geodetic_ones_and_velocities_either_way(folder):
+    at = earth.ecef_from_geodetic(LAT * DEG, LON * DEG, 1400 + 10 * T)
+    ned = np.column_stack([3.0 + 0 * T, -2.0 + 0 * T, -10.0 + 0 * T])
+    v = earth.ecef_from_ned(ned, at)
+    geodetic = (LAT + 0 * T, LON + 0 * T, 9999 + 0 * T)
+    header = "t_s,lat_deg,lon_deg,alt_m,x_ecef_m,y_ecef_m,z_ecef_m"
+    folder.table("gps.csv", f"{header},vx_ecef_mps,vy_ecef_mps,vz_ecef_mps", T, *geodetic, *at.T, *v.T)
+    one = folder.read('[gnss.gps]\nfile = "gps.csv"\n', BALLISTIC).gnss["gps"]
+    np.testing.assert_allclose(one.position_ecef_m, at, atol=0.01)
+    np.testing.assert_allclose(one.velocity_ecef_mps, v, atol=1e-6)
+    folder.table("gps.csv", f"{header},vn_mps,ve_mps,vd_mps", T, *geodetic, *at.T, *ned.T)
+    two = folder.read('[gnss.gps]\nfile = "gps.csv"\n', BALLISTIC).gnss["gps"]
+    np.testing.assert_allclose(two.velocity_ecef_mps, v, atol=1e-6)
+    silent = folder.read('[gnss.gps]\nfile = "gps.csv"\nvelocity = false\n', BALLISTIC).gnss["gps"]
+    assert np.isnan(silent.velocity_ecef_mps).all()
+    # geodetic columns that are declared are meant
+    meant = GNSS + 'columns = { alt = { column = "alt_m", unit = "m" } }\n'
+    height = earth.geodetic_from_ecef(folder.read(meant, BALLISTIC).gnss["gps"].position_ecef_m)[2]
+    np.testing.assert_allclose(height, 9999.0, atol=1e-3)
+
+
+def test_weak_fixes_are_left_out_and_counted(folder):
+    nsat = np.where(T < 5.0, 5, 9)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,sats", T, LAT + 0 * T, LON + 0 * T, 1400 + T, nsat)
+    telemetry = folder.read(GNSS, 'min_satellites = 7\nsatellites_column = "sats"', BALLISTIC)
+    assert telemetry.gnss["gps"].time_s[0] == 5.0
+    assert any("10 of 40 fixes have satellites below 7" in words for words in findings(telemetry, "gps"))
+
+
+def test_empty_cells_are_missing_fixes(folder):
+    alt = np.where(T == 3.0, np.nan, 1400 + T)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m", T, LAT + 0 * T, LON + 0 * T, alt)
+    record = folder.read(GNSS, BALLISTIC).gnss["gps"]
+    assert np.flatnonzero(np.isnan(record.position_ecef_m).any(axis=1)).tolist() == [6]
+
+
+def test_barometer_by_height_and_by_pressure(folder):
+    heights = folder.read(GNSS, BARO, BALLISTIC).barometers["baro"]
+    np.testing.assert_allclose(heights.height_m, 1400 + 10 * T + np.sin(7.0 * T), atol=1e-3)
+    true = np.linspace(-200.0, 30e3, len(T))
+    folder.table("baro.csv", "t_s,pressure_pa", T, us76(true)[2])
+    telemetry = folder.read(GNSS, BARO, BALLISTIC)
+    np.testing.assert_allclose(telemetry.barometers["baro"].height_m, true, atol=0.01)
+    assert any("speed of sound" in words for words in findings(telemetry, "baro"))
+
+
+def test_pressure_height_follows_the_days_air():
+    sounding = standard_sounding()
+    warm = profile_from_sounding(sounding)
+    z = np.linspace(0.0, 60e3, 301) + 7.0
+    np.testing.assert_allclose(height_from_pressure(warm, warm.at(z).pressure_pa), z, atol=0.01)
+    assert np.isnan(height_from_pressure(warm, np.array([np.nan])))[0]
+
+
+def test_body_axes_and_own_axes_turn_the_same_samples_alike(folder):
+    plain = folder.read(GNSS, TRIADS, PRIOR).accelerometer
+    np.testing.assert_array_equal(plain.spec.dcm_body_sensor, np.eye(3))
+    np.testing.assert_array_equal(plain.spec.position_from_datum_body_m, np.zeros(3))
+    axes = 'axes = ["-z", "+y", "+x"]\nposition_from_datum_body_m = [-1.0, 0.1, 0.2]'
+    turned = folder.read(GNSS, TRIADS.replace('mount = "body"', axes), PRIOR).accelerometer
+    body = turned.measured_sensor @ turned.spec.dcm_body_sensor.T
+    sensor = plain.measured_sensor
+    np.testing.assert_array_equal(body, np.column_stack([sensor[:, 2], sensor[:, 1], -sensor[:, 0]]))
+    np.testing.assert_array_equal(turned.spec.position_from_datum_body_m, [-1.0, 0.1, 0.2])
+
+
+def test_rates_have_axes_too_and_a_slow_bias(folder):
+    slow = 'axes = ["+y", "-x", "+z"]\nbias_wander_sd_degps = 0.2\nbias_time_constant_s = 60.0\ncolumns = { p'
+    rates = folder.read(GNSS, TRIADS.replace("columns = { p", slow), PRIOR).rates
+    np.testing.assert_array_equal(rates.spec.dcm_body_sensor @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(rates.spec.dcm_body_sensor @ [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0])
+    assert rates.spec.bias_wander_sd == pytest.approx(0.2 * DEG)
+    assert rates.spec.bias_time_constant_s == 60.0
+    assert folder.read(GNSS, TRIADS, PRIOR).rates.spec.bias_time_constant_s == np.inf
+
+
+def test_reversed_magnetometer(folder):
+    folder.table("mag.csv", "t_s,x,y,z", T, 20 + np.sin(T), np.cos(T), 40 + np.sin(2 * T))
+    columns = ", ".join(f'b{a} = {{ column = "{a}", unit = "ut" }}' for a in "xyz")
+    section = f'[sensors.magnetometer]\nfile = "mag.csv"\nmount = "body"\ncolumns = {{ {columns} }}\n'
+    plain = folder.read(GNSS, TRIADS, PRIOR, section).magnetometer
+    turned = folder.read(GNSS, TRIADS, PRIOR, section, "reversed = true").magnetometer
+    np.testing.assert_array_equal(turned.measured_sensor, -plain.measured_sensor)
+
+
+def test_pointing_conventions():
+    lat, lon = 40.0 * DEG, -100.0 * DEG
+    to_ned = earth.dcm_ned_ecef(lat, lon)
+
+    def axes(azimuth, elevation, roll):
+        q = q_ecef_body_from_pointing(azimuth * DEG, elevation * DEG, roll * DEG, lat, lon)
+        return to_ned @ rotations.dcm_from_q(q)
+
+    level = axes(0.0, 0.0, 0.0)  # columns: body x, y, z in north, east, down
+    np.testing.assert_allclose(level, np.eye(3), atol=1e-12)
+    upright = axes(0.0, 90.0, 0.0)
+    np.testing.assert_allclose(upright, np.column_stack([[0, 0, -1], [0, 1, 0], [1, 0, 0]]), atol=1e-12)
+    tilted = axes(120.0, 35.0, 0.0)
+    c, s = np.cos(35 * DEG), np.sin(35 * DEG)
+    np.testing.assert_allclose(tilted[:, 0], [c * np.cos(120 * DEG), c * np.sin(120 * DEG), -s], atol=1e-12)
+    assert abs(tilted[2, 1]) < 1e-12, "y is horizontal at roll 0"
+    assert np.cross(tilted[:, 0], tilted[:, 1])[2] > 0.0, "y is to the right"
+    rolled = axes(0.0, 0.0, 90.0)
+    np.testing.assert_allclose(rolled[:, 1], [0.0, 0.0, 1.0], atol=1e-12)
+
+
+def test_prior_by_pointing_takes_the_place_of_the_first_fix(folder):
+    telemetry = folder.read(GNSS, TRIADS, PRIOR + "sd_deg = [20.0, 2.0, 3.0]")
+    q = q_ecef_body_from_pointing(30 * DEG, 80 * DEG, 10 * DEG, LAT * DEG, LON * DEG)
+    np.testing.assert_allclose(telemetry.attitude_prior.q_ecef_body, q, atol=1e-9)
+    np.testing.assert_allclose(telemetry.attitude_prior.sd_rad, np.array([20.0, 2.0, 3.0]) * DEG)
+    elsewhere = PRIOR + "latitude_deg = 10.0\nlongitude_deg = 20.0\nsd_deg = 4"
+    prior = folder.read(GNSS, TRIADS, elsewhere).attitude_prior
+    q = q_ecef_body_from_pointing(30 * DEG, 80 * DEG, 10 * DEG, 10 * DEG, 20 * DEG)
+    np.testing.assert_allclose(prior.q_ecef_body, q, atol=1e-12)
+    np.testing.assert_allclose(prior.sd_rad, np.full(3, 4.0 * DEG))
+
+
+def test_prior_by_pointing_takes_the_place_of_the_first_radar_point(folder):
+    folder.table("track.csv", "t_s,range_m,az_deg,el_deg", T, 5000 + T, 90 + 0 * T, 0.1 + T)
+    radar = '[radars.one]\nfile = "track.csv"\nlatitude_deg = 32.0\nlongitude_deg = -106.0\nheight_m = 1200.0\n'
+    q = folder.read(radar, TRIADS, PRIOR).attitude_prior.q_ecef_body
+    near = q_ecef_body_from_pointing(30 * DEG, 80 * DEG, 10 * DEG, 32 * DEG, (-106.0 + 5000 / 111e3 / 0.848) * DEG)
+    assert np.linalg.norm(rotations.boxminus(q, near)) < 1e-4
+
+
+def test_use_s_and_offset_and_repeats(folder):
+    twice = np.sort(np.concatenate([T, T[4:8]]))
+    folder.table("baro.csv", "t_s,height_m", twice, 1400 + 10 * twice)
+    section = BARO + 'time = { offset_s = 2.0, repeats = "first" }\nuse_s = [[2.0, 6.0], [10.0, 12.0]]'
+    telemetry = folder.read(GNSS, BALLISTIC, section)
+    record = telemetry.barometers["baro"]
+    inside = T[((T >= 0.0) & (T <= 4.0)) | ((T >= 8.0) & (T <= 10.0))]
+    np.testing.assert_allclose(record.time_s, inside + 2.0)
+    np.testing.assert_allclose(record.height_m, 1400 + 10 * inside)
+    words = " ".join(findings(telemetry, "baro"))
+    assert "4 rows repeat the time" in words
+    assert "26 of 40 rows lie outside use_s (2 to 6 s, 10 to 12 s)" in words
+
+
+def test_samples_outside_use_s_may_be_wild(folder):
+    wild = np.where(T > 15.0, 1e9, 1400 + T)
+    folder.table("baro.csv", "t_s,height_m", T, wild)
+    assert folder.read(GNSS, BALLISTIC, BARO + "use_s = [[0.0, 15.0]]").barometers["baro"].height_m.max() < 1500
+    folder.refused([GNSS, BALLISTIC, BARO], "baro.csv: line", kind=GateError)
+
+
+def test_hours_minutes_and_seconds_of_a_day(folder):
+    hours = np.array([23.0, 23.0, 0.0, 0.0])
+    minutes, seconds = np.array([59.0, 59.0, 0.0, 0.0]), np.array([57.5, 59.5, 1.5, 3.5])
+    header, place = "h,m,s,lat_deg,lon_deg,alt_m", (np.full(4, LAT), np.full(4, LON), 1400 + np.arange(4.0))
+    folder.table("gps.csv", header, hours, minutes, seconds, *place)
+    head = 'name = "small"\nt0_utc = "2022-06-24T23:59:58.5Z"\n'
+    section = GNSS + 'time = { format = "utc_hms", columns = ["h", "m", "s"] }'
+    (folder.root / "flight.toml").write_text("\n".join([head, section, BALLISTIC]))
+    np.testing.assert_allclose(read_flight(folder.root).gnss["gps"].time_s, [-1.0, 1.0, 3.0, 5.0], atol=1e-6)
+    folder.table("gps.csv", header, np.array([23.0, 24.0, 0.0, 0.0]), minutes, seconds, *place)
+    folder.refused([section, BALLISTIC], "24:59:59.5", "utc_hms", kind=GateError)
+
+
+def test_motion_is_carried(folder):
+    section = BALLISTIC + "drag_sd = 2.0\npowered_s = [[0.0, 5.0], [9.0, 11.0]]\npowered_sd_mps2 = 60.0\n"
+    motion = folder.read(GNSS, section).motion
+    assert (motion.drag_area_per_mass_m2pkg, motion.drag_sd, motion.powered_sd_mps2) == (0.01, 2.0, 60.0)
+    assert motion.powered_s == ((0.0, 5.0), (9.0, 11.0))
+
+
+def test_what_needs_a_vehicle_says_which_key_to_add(folder):
+    telemetry = folder.read(GNSS, BALLISTIC)
+    with pytest.raises(GateError, match=r'add vehicle = "\.\.\." to flight\.toml'):
+        telemetry.required_vehicle()
+    with pytest.raises(GateError, match=r"add \[sensors.accelerometer\] and \[sensors.rates\]"):
+        telemetry.required_triads()
+
+
+# what is refused
+
+
+def test_nothing_that_tracks_is_refused(folder):
+    folder.refused([BALLISTIC], "no [radars.NAME] and no [gnss.NAME]")
+    folder.refused([BALLISTIC, BARO], "a barometer alone knows no place")
+
+
+def test_one_triad_alone_is_refused(folder):
+    only_force, only_rates = (TRIADS[: TRIADS.index("[sensors.rates]")], TRIADS[TRIADS.index("[sensors.rates]") :])
+    folder.refused([GNSS, PRIOR, only_force], "[sensors.accelerometer] without [sensors.rates]", "add the other")
+    folder.refused([GNSS, PRIOR, only_rates], "[sensors.rates] without [sensors.accelerometer]")
+
+
+def test_strapdown_without_sensors_or_attitude_is_refused(folder):
+    folder.refused([GNSS], 'motion.model = "strapdown"', "ballistic")
+    folder.refused([GNSS, TRIADS], "nothing says how the vehicle was turned", "[attitude_prior]", "[sensors.sun]")
+
+
+def test_ballistic_without_drag_is_refused(folder):
+    folder.refused([GNSS, '[motion]\nmodel = "ballistic"\n'], "motion.model", "drag_area_per_mass_m2pkg")
+
+
+@pytest.mark.parametrize(
+    ("axes", "words"),
+    [
+        ('["+x", "+y", "-z"]', "left-handed"),
+        ('["+x", "+x", "+z"]', "same body axis"),
+        ('["+x", "-x", "+z"]', "same body axis"),
+        ('["x", "+y", "+z"]', "axes.0"),
+    ],
+)
+def test_axes_that_are_none_are_refused(folder, axes, words):
+    folder.refused(
+        [GNSS, PRIOR, TRIADS.replace('mount = "body"', f"axes = {axes}")], "sensors.accelerometer.axes", words
+    )
+
+
+def test_mounts_that_contradict_or_lack_a_vehicle_are_refused(folder):
+    folder.refused(
+        [GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "body"\naxes = ["+x", "+y", "+z"]')], "keep one"
+    )
+    folder.refused(
+        [GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "suba"')], "names no vehicle", 'mount = "body"'
+    )
+    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"\n', "")], "nothing is said of its mount")
+    place = 'mount = "suba"\nposition_from_datum_body_m = [0.0, 0.0, 0.0]'
+    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"', place)], "position_from_datum_body_m")
+    named = ['vehicle = "irve2_reference"', GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "sub"')]
+    folder.refused(named, "sensors.accelerometer.mount = 'sub'", "suba")
+
+
+def test_heights_above_what_must_be_said(folder):
+    folder.refused([GNSS.replace('height_is = "ellipsoid"\n', ""), BALLISTIC], "gnss.gps", "alt is above what?")
+    folder.refused([GNSS.replace("ellipsoid", "msl"), BALLISTIC], "gnss.gps.height_is", "geoid_undulation_m")
+    folder.refused([GNSS + "geoid_undulation_m = 20.0\n", BALLISTIC], "used only with height_is")
+    folder.refused([GNSS, BARO.replace('height_is = "ellipsoid"\n', ""), BALLISTIC], "barometers.baro", "above what?")
+    folder.refused([GNSS.replace("ellipsoid", "geoid"), BALLISTIC], "gnss.gps.height_is", "'geoid'")
+
+
+def test_bad_fixes_are_refused_by_line(folder):
+    lat = np.where(T == 2.0, 0.0, LAT)
+    lon = np.where(T == 2.0, 0.0, LON)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m", T, lat, lon, 1400 + T)
+    folder.refused([GNSS, BALLISTIC], "gps.csv: line 6", "latitude and longitude 0", "min_satellites", kind=GateError)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m", T, LAT + 60 + 0 * T, LON + 0 * T, 1400 + T)
+    folder.refused([GNSS, BALLISTIC], "gps.csv: line 2", "no latitude", kind=GateError)
+    folder.table("gps.csv", "t_s,x_ecef_m,y_ecef_m,z_ecef_m", T, 0 * T, 0 * T, 0 * T)
+    folder.refused([GNSS, BALLISTIC], "inside the Earth", "40 in all", kind=GateError)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg", T, LAT + 0 * T, LON + 0 * T)
+    folder.refused([GNSS, BALLISTIC], "no column alt_m", kind=GateError)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,vn_mps", T, LAT + 0 * T, LON + 0 * T, 1400 + T, T)
+    folder.refused([GNSS, BALLISTIC], "a velocity lacks vd, ve", "velocity = false", kind=GateError)
+
+
+def test_no_fix_good_enough_is_refused(folder):
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,nsat", T, LAT + 0 * T, LON + 0 * T, 1400 + T, 5 + 0 * T)
+    folder.refused([GNSS + "min_satellites = 6\n", BALLISTIC], "0 fixes are good enough", kind=GateError)
+    folder.refused([GNSS + "min_fix_mode = 3\n", BALLISTIC], "no column 'fix_mode'", kind=GateError)
+
+
+def test_declaring_both_kinds_of_position_is_refused(folder):
+    both = 'columns = { x = { column = "x_ecef_m", unit = "m" }, lat = { column = "lat_deg", unit = "deg" } }\n'
+    header = "t_s,lat_deg,lon_deg,alt_m,x_ecef_m,y_ecef_m,z_ecef_m"
+    at = earth.ecef_from_geodetic(LAT * DEG, LON * DEG, 1400 + T)
+    folder.table("gps.csv", header, T, LAT + 0 * T, LON + 0 * T, 1400 + T, *at.T)
+    folder.refused([GNSS + both, BALLISTIC], "keep one of the two")
+
+
+def test_barometer_tables_that_are_not_clear_are_refused(folder):
+    folder.table("baro.csv", "t_s,height_m,pressure_pa", T, 1400 + T, 86e3 - T)
+    folder.refused([GNSS, BARO, BALLISTIC], "heights and pressures are both there")
+    declared = BARO + 'columns = { pressure = { column = "pressure_pa", unit = "pa" } }\n'
+    np.testing.assert_allclose(
+        folder.read(GNSS, declared, BALLISTIC).barometers["baro"].height_m,
+        height_from_pressure(profile_from_sounding(standard_sounding()), 86e3 - T),
+        atol=1e-3,
+    )
+    folder.table("baro.csv", "t_s,alt", T, 1400 + T)
+    folder.refused([GNSS, BARO, BALLISTIC], "no column height_m and none pressure_pa", kind=GateError)
+    folder.table("baro.csv", "t_s,pressure_pa", T, 860 * 1e3 - T)
+    folder.refused([GNSS, BARO, BALLISTIC], "baro.csv: line 2", "no static pressure", kind=GateError)
+
+
+def test_prior_must_have_one_form(folder):
+    words = "azimuth_deg, elevation_deg and roll_deg"
+    folder.refused([GNSS, TRIADS, PRIOR.replace("roll_deg = 10.0\n", "")], "attitude_prior", words)
+    folder.refused([GNSS, TRIADS, PRIOR + "q_ecef_body = [1.0, 0.0, 0.0, 0.0]\n"], "q_ecef_body says it all")
+    folder.refused([GNSS, TRIADS, PRIOR + "latitude_deg = 10.0\n"], "belong together")
+    folder.refused([GNSS, TRIADS, PRIOR + "sd_deg = [1.0, 2.0]\n"], "attitude_prior.sd_deg")
+    folder.refused([GNSS, TRIADS, PRIOR + "sd_deg = 0\n"], "attitude_prior.sd_deg", "above 0")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("use_s = [[5.0, 5.0]]", "ends after it begins"),
+        ("use_s = []", "use_s"),
+        ("use_s = [[100.0, 200.0]]", "use_s leaves 0 rows"),
+        ("min_satelites = 6", "did you mean 'min_satellites'"),
+        ("horizontal_sd_m = 0.0", "gnss.gps.horizontal_sd_m"),
+        ("time_bias_sd_s = 100.0", "gnss.gps.time_bias_sd_s"),
+        ("antenna_from_datum_body_m = [0.0, 0.0, 1000.0]", "antenna_from_datum_body_m"),
+        ('time = { format = "utc_hms" }', "belong together"),
+        ('time = { repeats = "last" }', "repeats"),
+        ("geoid_undulation_m = 500.0", "geoid_undulation_m"),
+        ("velocity = 1", "true or false"),
+        ('columns = { latt = { column = "lat_deg", unit = "deg" } }', "did you mean 'lat'"),
+    ],
+)
+def test_slips_of_the_pen_are_refused(folder, line, words):
+    folder.refused([GNSS + line, BALLISTIC], words, kind=GateError)
+
+
+def test_a_name_stands_once_and_a_sounding_has_no_spans(folder):
+    folder.refused(
+        [GNSS, BARO.replace("barometers.baro", "barometers.gps"), BALLISTIC], "the name 'gps' stands in more"
+    )
+    folder.table("air.csv", "alt_m,rho_kgpm3,t_k", T, 1.2 - 0.001 * T, 280 + T)
+    folder.refused(
+        [GNSS, BALLISTIC, '[atmosphere]\nfile = "air.csv"\nuse_s = [[0.0, 5.0]]'], "atmosphere.use_s", "by altitude"
+    )
+
+
+def test_video_needs_a_vehicle(folder):
+    folder.refused([GNSS, BALLISTIC, '[frames]\nfile = "gps.csv"\nfolder = "."'], "frames", 'add vehicle = "..."')
+
+
+def test_no_second_in_common_is_refused(folder):
+    late = GNSS.replace('"gps.csv"', '"gps.csv"\ntime = { offset_s = 19.0 }')
+    folder.refused([late, TRIADS, PRIOR], "accelerometer, rates and receivers have no second in common", kind=GateError)
