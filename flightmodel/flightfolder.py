@@ -152,12 +152,12 @@ def _first_place(radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]) ->
 
 def _motion(entry: MotionEntry) -> Motion:
     return Motion(
-        entry.model,
-        entry.drag_area_per_mass_m2pkg or 0.0,
-        entry.drag_sd,
-        entry.drag_time_constant_s,
-        entry.powered_s or (),
-        entry.powered_sd_mps2,
+        model=entry.model,
+        drag_area_per_mass_m2pkg=entry.drag_area_per_mass_m2pkg or 0.0,
+        drag_sd=entry.drag_sd,
+        drag_time_constant_s=entry.drag_time_constant_s,
+        powered_s=entry.powered_s or (),
+        powered_sd_mps2=entry.powered_sd_mps2,
     )
 
 

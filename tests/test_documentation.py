@@ -1,11 +1,13 @@
-"""The pages of scenario and vehicle files name every key that these files may hold."""
+"""The pages of scenario, vehicle and flight files name every key that these files may hold, with their defaults."""
 
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
 
-from flightmodel import aeroinput, vehicle
+from flightmodel import aeroinput, flightfile, instrument_entries, sources, vehicle
 from synthetic_flight import day_air, instrument_sections, scenarios
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -44,6 +46,19 @@ MODELS = [
 ]
 
 
+FLIGHT_SECTIONS = [
+    flightfile.FlightFile,
+    flightfile.AttitudeEntry,
+    flightfile.MotionEntry,
+    instrument_entries.Mounted,
+    instrument_entries.MagnetometerEntry,
+    instrument_entries.GnssEntry,
+    instrument_entries.BarometerEntry,
+    sources.TimeEntry,
+    sources.Source,
+]
+
+
 def missing_keys(page: str, model: type[BaseModel]) -> list[str]:
     quoted = (DOCS / page).read_text().replace(".", "`").replace("[", "`").replace("]", "`")
     return [key for key in model.model_fields if f"`{key}`" not in quoted]
@@ -57,3 +72,30 @@ def test_every_key_is_on_the_page(model: type[BaseModel]):
 @pytest.mark.parametrize("model", INSTRUMENTS, ids=lambda m: m.__name__)
 def test_every_key_of_an_instrument_is_on_its_page(model: type[BaseModel]):
     assert not missing_keys("instruments.md", model)
+
+
+@pytest.mark.parametrize("model", FLIGHT_SECTIONS, ids=lambda m: m.__name__)
+def test_every_key_of_flight_toml_is_on_its_page(model: type[BaseModel]):
+    page = (DOCS / "flight-folder.md").read_text()
+    assert not [key for key in model.model_fields if not re.search(rf"\b{key}\b", page)]
+
+
+@pytest.mark.parametrize(
+    ("table", "model", "examples"),
+    [
+        (
+            "gnss",
+            instrument_entries.GnssEntry,
+            {"file", "height_is", "geoid_undulation_m", "min_satellites", "min_fix_mode"},
+        ),
+        ("barometers", instrument_entries.BarometerEntry, {"file", "height_is", "geoid_undulation_m", "use_s"}),
+        ("motion", flightfile.MotionEntry, {"model", "drag_area_per_mass_m2pkg", "powered_s"}),
+    ],
+)
+def test_values_on_the_page_are_the_defaults(table: str, model: type[BaseModel], examples: set[str]):
+    blocks = re.findall(r"```toml\n(.*?)```", (DOCS / "flight-folder.md").read_text(), re.DOTALL)
+    block = next(b for b in blocks if b.startswith(f"[{table}"))
+    written = tomllib.loads(block)[table]
+    section = model.model_validate(written if table == "motion" else next(iter(written.values())))
+    for key in section.model_fields_set - examples:
+        assert getattr(section, key) == model.model_fields[key].default, key
