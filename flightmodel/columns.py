@@ -131,15 +131,14 @@ class Declared:
 class TimeColumn:
     """Where a table's time stands and how it is written: ``seconds``, ``utc`` (ISO), ``irig_doy`` or ``utc_hms``.
 
-    ``parts`` are all columns that hold it, ``offset_s`` is added, ``repeats`` is ``first`` where equal times may follow
-    each other (`flightmodel.selection` then keeps the first row).
+    ``parts`` are all columns that hold it; ``repeats`` is ``first`` where equal times may follow each other
+    (`flightmodel.selection` then keeps the first row).
     """
 
     column: str = "t_s"
     format: str = "seconds"
     unit: str = "s"
     parts: tuple[str, ...] = ("t_s",)
-    offset_s: float = 0.0
     repeats: str = "refuse"
 
 
@@ -275,7 +274,6 @@ def times_s(
             f"'{spec.format}' ({int(bad.sum())} in all)"
         )
         return None
-    values = values + spec.offset_s
     step = np.diff(values)
     back = step < 0.0 if spec.repeats == "first" else step <= 0.0
     if back.any():

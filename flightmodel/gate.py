@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -114,19 +114,23 @@ class Gate:
             if column is not None:
                 values[quantity.short] = column
         table = self.chosen(Table(path, label, time_s, values, frame.attrs["lines"]), source)
+        if not len(table.lines):
+            return None
         for quantity in quantities:
             limit = SANE_LIMIT.get(quantity.kind, np.inf)
             self.refuse_rows(table, quantity.short, -limit, limit, f"beyond any {quantity.kind} of a flight")
         return table if len(self.faults) + len(self.config) == before else None
 
     def chosen(self, table: Table, source: Source) -> Table:
-        """Return the rows that flight.toml lets be used, with a finding for those that it does not."""
+        """Return the rows that flight.toml lets be used, at its times, with a finding for those that it does not."""
         if table.time_s is None:
             return table
-        rows, findings = rows_to_use(table.label, source, table.time_s)
+        time_s = table.time_s + source.time.offset_s
+        table = replace(table, time_s=time_s)
+        rows, findings = rows_to_use(table.label, source, time_s)
         self.findings.extend(findings)
         if rows.sum() < 2:
-            span = f"{table.time_s[0]:.2f} to {table.time_s[-1]:.2f} s"
+            span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
             self.faults.append(f"{table.label}: {table.path}: use_s leaves {rows.sum()} rows of {span}; two are needed")
         return table.of_rows(rows)
 

@@ -153,6 +153,7 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
     camera, paths = vehicle.cameras[source.camera], []
     used = np.ones(len(table), dtype=bool)
     if time_s is not None:
+        time_s = time_s + source.time.offset_s
         used, findings = rows_to_use(label, source, time_s)
         gate.findings.extend(findings)
         time_s = time_s[used]

@@ -1,4 +1,7 @@
-"""Which rows of a table are used: those inside the spans that flight.toml states, and of repeated times the first."""
+"""Which rows of a table are used: those inside the spans that flight.toml states, and of repeated times the first.
+
+Times are those after ``time.offset_s`` was added.
+"""
 
 from __future__ import annotations
 

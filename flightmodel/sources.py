@@ -73,4 +73,4 @@ class Source(Section):
         """The time column in the form the reader takes."""
         t = self.time
         parts = t.columns or (t.column,)
-        return TimeColumn(parts[0], t.format, t.unit, parts, t.offset_s, t.repeats)
+        return TimeColumn(parts[0], t.format, t.unit, parts, t.repeats)

@@ -69,6 +69,8 @@ def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:
         return None
     before = len(gate.faults) + len(gate.config)
     good = _good_fixes(gate, name, table, asked)
+    if not good.any():
+        return None
     time_s, table = table.time_s[good], table.of_rows(good)
     position = _positions(gate, table, source)
     if position is None or len(gate.faults) + len(gate.config) > before:
