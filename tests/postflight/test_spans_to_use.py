@@ -14,12 +14,12 @@ from flightmodel.flightfolder import read_flight
 )
 def test_rows_outside_are_left_out(flight, clean_flight, section):
     name = section.split(".")[-1]
-    flight.declare("use_s = [[420.0, 422.4], [424.0, 429.0]]", after=f"[{section}]")
+    flight.declare("use_s = [[420.0, 422.4], [424.0, 428.0]]", after=f"[{section}]")
     telemetry = read_flight(flight.root)
     record = telemetry.radars[name] if section.startswith("radars") else getattr(telemetry, name)
     whole = read_flight(clean_flight.root)
     before = whole.radars[name] if section.startswith("radars") else getattr(whole, name)
-    inside = np.array([420.0 <= t <= 422.4 or 424.0 <= t <= 429.0 for t in before.time_s])
+    inside = np.array([420.0 <= t <= 422.4 or 424.0 <= t <= 428.0 for t in before.time_s])
     assert 0 < inside.sum() < len(inside)
     np.testing.assert_array_equal(record.time_s, before.time_s[inside])
     if section == "frames":
