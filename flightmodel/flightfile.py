@@ -83,6 +83,8 @@ class MotionEntry(Section):
     drag_area_per_mass_m2pkg: Annotated[float, Field(gt=0.0, le=1e3)] | None = None
     drag_sd: Annotated[float, Field(gt=0.0, le=20.0)] = 1.0
     drag_time_constant_s: Duration = 10.0
+    side_sd: Annotated[float, Field(ge=0.0, le=10.0)] = 0.1
+    acceleration_density: Annotated[float, Field(ge=0.0, le=100.0)] = 0.002
     powered_s: Spans | None = None
     powered_sd_mps2: Annotated[float, Field(gt=0.0, le=1e4)] = 50.0
 

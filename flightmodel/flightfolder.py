@@ -156,6 +156,8 @@ def _motion(entry: MotionEntry) -> Motion:
         drag_area_per_mass_m2pkg=entry.drag_area_per_mass_m2pkg or 0.0,
         drag_sd=entry.drag_sd,
         drag_time_constant_s=entry.drag_time_constant_s,
+        side_sd=entry.side_sd,
+        acceleration_density=entry.acceleration_density,
         powered_s=entry.powered_s or (),
         powered_sd_mps2=entry.powered_sd_mps2,
     )

@@ -132,6 +132,8 @@ class RadarEntry(Source):
     nonorthogonality_sd_deg: NonNegative = 0.0
     wander_sd_deg: NonNegative = 0.0
     wander_time_constant_s: Positive = 20.0
+    refraction_sd: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
+    range_scale_sd: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
 
 
 class Heights(Source):

@@ -56,6 +56,7 @@ def _site(name: str, source: RadarEntry) -> RadarSite:
     return RadarSite(
         name, lat, lon, source.height_m, source.range_sd_m, angle_sd, source.range_bias_sd_m, angle_bias_sd,
         source.time_bias_sd_s, mislevel, droop, skew, square, wander, source.wander_time_constant_s,
+        source.refraction_sd, source.range_scale_sd,
     )  # fmt: skip
 
 

@@ -263,9 +263,11 @@ def test_hours_minutes_and_seconds_of_a_day(folder):
 
 
 def test_motion_is_carried(folder):
-    section = BALLISTIC + "drag_sd = 2.0\npowered_s = [[0.0, 5.0], [9.0, 11.0]]\npowered_sd_mps2 = 60.0\n"
+    drag = "drag_sd = 2.0\nside_sd = 0.3\nacceleration_density = 0.01\n"
+    section = BALLISTIC + drag + "powered_s = [[0.0, 5.0], [9.0, 11.0]]\npowered_sd_mps2 = 60.0\n"
     motion = folder.read(GNSS, section).motion
     assert (motion.drag_area_per_mass_m2pkg, motion.drag_sd, motion.powered_sd_mps2) == (0.01, 2.0, 60.0)
+    assert (motion.side_sd, motion.acceleration_density) == (0.3, 0.01)
     assert motion.powered_s == ((0.0, 5.0), (9.0, 11.0))
 
 
