@@ -197,10 +197,11 @@ def with_filterpy(motion, node, start, z):
 def peak_mib(what, seconds):
     """Peak memory of a process of its own that runs one of them, MiB."""
     code = (
-        "import resource, sys; sys.argv = ['x']; import filter_and_smoother as b\n"
+        "import filter_and_smoother as b\n"
         f"args = b.flight({seconds})\n"
         + ("b.ours(b.problem_of(*args))\n" if what == "ours" else "b.with_filterpy(*args)\n")
-        + "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+        # of this process alone: ru_maxrss would begin at the parent's
+        + "print([float(l.split()[1]) / 1024 for l in open('/proc/self/status') if l.startswith('VmHWM')][0])"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=Path(__file__).parent, check=True, capture_output=True, text=True

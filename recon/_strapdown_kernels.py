@@ -116,37 +116,47 @@ def coning_and_sculling(force, d_force, rate, d_rate, dt):
 
 
 @inlined
-def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradient):
-    """Carry the 27 columns of ``phi`` (9, 27) over one step."""
-    u = np.empty(3)
-    mid = np.empty(3)
-    arm = np.empty(3)
-    acceleration = np.empty(3)
-    two_omega = 2.0 * OMEGA_WGS84
+def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradient, turned, pushed, moved):
+    """Carry the 27 columns of ``phi`` (9, 27) over one step; ``turned``, ``pushed``, ``moved`` (3, 27) are scratch.
+
+    Along rows, which lie side by side in memory: the compiler puts several columns into one instruction.
+    """
+    h, two_omega = 0.5 * dt, 2.0 * OMEGA_WGS84
+    for i in range(3):
+        a, b, c = half_turn[0, i], half_turn[1, i], half_turn[2, i]
+        for j in range(27):
+            turned[i, j] = a * phi[6, j] + b * phi[7, j] + c * phi[8, j]
+            moved[i, j] = turned[i, j]
+        for j in range(9):
+            moved[i, 18 + j] += h * d_rate[i, j]
+            turned[i, 18 + j] += dt * d_rate[i, j]
+    f0, f1, f2 = force[0], force[1], force[2]
     for j in range(27):
-        for i in range(3):
-            u[i] = half_turn[0, i] * phi[6, j] + half_turn[1, i] * phi[7, j] + half_turn[2, i] * phi[8, j]
-            mid[i] = u[i]
-        if j >= 18:
-            for i in range(3):
-                mid[i] += 0.5 * dt * d_rate[i, j - 18]
-                u[i] += dt * d_rate[i, j - 18]
-        cross_into(mid, force, arm)
-        if 9 <= j < 18:
-            for i in range(3):
-                arm[i] += d_force[i, j - 9]
-        for i in range(3):
-            acceleration[i] = dcm_mid[i, 0] * arm[0] + dcm_mid[i, 1] * arm[1] + dcm_mid[i, 2] * arm[2]
-            for k in range(3):
-                acceleration[i] += gradient[i, k] * (phi[k, j] + 0.5 * dt * phi[3 + k, j])
-        vx = phi[3, j] + 0.5 * dt * acceleration[0]
-        vy = phi[4, j] + 0.5 * dt * acceleration[1]
-        acceleration[0] += two_omega * vy
-        acceleration[1] -= two_omega * vx
-        for i in range(3):
-            phi[i, j] += dt * (phi[3 + i, j] + 0.5 * dt * acceleration[i])
-            phi[3 + i, j] += dt * acceleration[i]
-            phi[6 + i, j] = half_turn[0, i] * u[0] + half_turn[1, i] * u[1] + half_turn[2, i] * u[2]
+        m0, m1, m2 = moved[0, j], moved[1, j], moved[2, j]
+        pushed[0, j] = m1 * f2 - m2 * f1
+        pushed[1, j] = m2 * f0 - m0 * f2
+        pushed[2, j] = m0 * f1 - m1 * f0
+    for i in range(3):
+        for j in range(9):
+            pushed[i, 9 + j] += d_force[i, j]
+    for i in range(3):
+        a, b, c = dcm_mid[i, 0], dcm_mid[i, 1], dcm_mid[i, 2]
+        x, y, z = gradient[i, 0], gradient[i, 1], gradient[i, 2]
+        for j in range(27):
+            moved[i, j] = (
+                a * pushed[0, j] + b * pushed[1, j] + c * pushed[2, j]
+                + x * (phi[0, j] + h * phi[3, j]) + y * (phi[1, j] + h * phi[4, j]) + z * (phi[2, j] + h * phi[5, j])
+            )  # fmt: skip
+    for j in range(27):
+        vx, vy = phi[3, j] + h * moved[0, j], phi[4, j] + h * moved[1, j]
+        moved[0, j] += two_omega * vy
+        moved[1, j] -= two_omega * vx
+    for i in range(3):
+        a, b, c = half_turn[0, i], half_turn[1, i], half_turn[2, i]
+        for j in range(27):
+            phi[i, j] += dt * (phi[3 + i, j] + h * moved[i, j])
+            phi[3 + i, j] += dt * moved[i, j]
+            phi[6 + i, j] = a * turned[0, j] + b * turned[1, j] + c * turned[2, j]
 
 
 @inlined
@@ -253,6 +263,7 @@ def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi,
     force_change, rate_change = np.empty(3), np.empty(3)
     d_force, d_rate = np.empty((3, 9)), np.empty((3, 9))
     half_turn, dcm_mid, gradient = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    turned, pushed, moved = np.empty((3, 27)), np.empty((3, 27)), np.empty((3, 27))
     f, w = motion.force_sensor_mps2, motion.rate_sensor_radps
     step = 1 if last >= first else -1
     for k in range(first, last, step):
@@ -263,5 +274,5 @@ def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi,
         correct_sample(w[k], w[n], errors, 9, rate_actual, rate_mount, rate, rate_change, d_rate)
         coning_and_sculling(force, force_change, rate, rate_change, dt)
         advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient)
-        advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradient)
+        advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradient, turned, pushed, moved)
         advance_noise(noise, dt, half_turn, dcm_mid, force, motion.force_density[j], motion.rate_density[j])
