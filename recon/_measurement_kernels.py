@@ -121,9 +121,6 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
         (-east / level2, north / level2, 0.0),
         (down * north / (slant2 * across), down * east / (slant2 * across), -across / slant2),
     )
-    for i in range(3):
-        for j in range(3):
-            m[i, j] = p[i][0] * dcm_ned_ecef[0, j] + p[i][1] * dcm_ned_ecef[1, j] + p[i][2] * dcm_ned_ecef[2, j]
     sin_az, cos_az = east / across, north / across
     sin_el, cos_el = -down / slant, across / slant
     sec = 1.0 / max(cos_el, 1e-3)
@@ -137,6 +134,21 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
     # bending of a ray through the whole air; near the horizon it stays what it is at 2 deg
     by_error[2, 11] = known[0] * cos_el / max(sin_el, 0.035)
     by_error[0, 12] = slant
+    # the errors themselves change with azimuth and elevation: near the horizon that of the refraction by a tenth
+    by_tilt = cos_az * e[4] + sin_az * e[5]
+    bend = 1.0 / (sin_el * sin_el) if sin_el > 0.035 else sin_el / 0.035
+    g = (
+        (1.0 + e[12], 0.0, 0.0),
+        (0.0, 1.0 - tan * (cos_az * e[5] - sin_az * e[4]),
+         sec * sec * (e[8] - by_tilt) + sec * tan * (e[7] + e[9])),
+        (0.0, by_tilt, 1.0 - sin_el * e[6] - known[0] * bend * e[11]),
+    )  # fmt: skip
+    for i in range(3):
+        for j in range(3):
+            m[i, j] = 0.0
+            for k in range(3):
+                f = g[i][0] * p[0][k] + g[i][1] * p[1][k] + g[i][2] * p[2][k]
+                m[i, j] += f * dcm_ned_ecef[k, j]
     h[0], h[1], h[2] = slant, math.atan2(east, north), math.atan2(-down, across)
     for i in range(3):
         for j in range(SLOTS):
@@ -149,7 +161,8 @@ def predict_place(kind, site, dcm_ned_ecef, e, point, speed, h, m, by_error):
     """Position or velocity along a reference's axes, or height; partials by the seen point."""
     if kind == HEIGHT:
         sin_lat, cos_lat, height, per_p = geodetic(point[0], point[1], point[2], WGS84)
-        m[0, 0], m[0, 1], m[0, 2] = cos_lat * point[0] * per_p, cos_lat * point[1] * per_p, sin_lat
+        level_part = (1.0 + e[1]) * cos_lat * per_p
+        m[0, 0], m[0, 1], m[0, 2] = level_part * point[0], level_part * point[1], (1.0 + e[1]) * sin_lat
         by_error[0, 0], by_error[0, 1], by_error[0, 2] = 1.0, height - site[0], 1.0
         h[0] = height + e[0] + (height - site[0]) * e[1] + e[2]
         return
@@ -159,6 +172,21 @@ def predict_place(kind, site, dcm_ned_ecef, e, point, speed, h, m, by_error):
         for j in range(3):
             m[i, j] = dcm_ned_ecef[i, j]
             h[i] += m[i, j] * (point[j] - site[j] if kind == POSITION else speed[j])
+
+
+@inlined
+def mount_row(row, value, e, offset, out):
+    """Partials of ``row . R(mount)^T b`` by the mount (3,): ``row [value x] J``, with ``value`` = R^T b.
+
+    The right Jacobian ``J = 1 - [m x] / 2 + [m x]^2 / 6`` leaves out 2e-4 of a mount of 10 deg.
+    """
+    m, half, sixth = np.empty(3), np.empty(3), np.empty(3)
+    m[0], m[1], m[2] = e[offset], e[offset + 1], e[offset + 2]
+    cross_into(row, value, out)
+    cross_into(out, m, half)
+    cross_into(half, m, sixth)
+    for j in range(3):
+        out[j] += sixth[j] / 6.0 - 0.5 * half[j]
 
 
 @inlined
@@ -186,7 +214,7 @@ def predict_field(dcm_body_sensor, known, e, c, h, by_state, by_error):
         for j in range(3):
             by_state[i, 6 + j] = lever[j]
         row[0], row[1], row[2] = iron[i][0], iron[i][1], iron[i][2]
-        cross_into(row, actual, lever)
+        mount_row(row, actual, e, 6, lever)
         for j in range(3):
             by_error[i, 6 + j] = lever[j]
     by_error[0, 9], by_error[1, 9] = actual[1], actual[0]
@@ -210,8 +238,9 @@ def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
     across2 = s[1] * s[1] + s[2] * s[2] + 1e-30
     across = math.sqrt(across2)
     whole2 = across2 + s[0] * s[0]
+    less = e[0] / (across2 * across)  # of the bias across, as the Sun nears the head's x axis
     p = (
-        (0.0, s[2] / across2, -s[1] / across2),
+        (0.0, s[2] / across2 - less * s[1], -s[1] / across2 - less * s[2]),
         (across / whole2, -s[0] * s[1] / (whole2 * across), -s[0] * s[2] / (whole2 * across)),
     )
     h[0] = math.atan2(s[1], s[2]) + e[0] / across
@@ -224,7 +253,7 @@ def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
         for j in range(3):
             by_state[i, 6 + j] = lever[j]
         row[0], row[1], row[2] = p[i][0], p[i][1], p[i][2]
-        cross_into(row, s, lever)
+        mount_row(row, s, e, 4, lever)
         for j in range(3):
             by_error[i, 4 + j] = lever[j]
 

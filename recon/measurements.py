@@ -30,7 +30,7 @@ from flightmodel.checks import FloatArray
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
 from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, SLOTS, SUN, VELOCITY
 from recon.error_model import AXES, ErrorModel
-from recon.state import IntArray
+from recon.state import IntArray, right_jacobian
 
 SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {
@@ -252,7 +252,8 @@ def _radar(
             [d * n / (slant**2 * level), d * east / (slant**2 * level), -level / slant**2],
         ]
     )
-    sec, tan = 1.0 / np.cos(el), np.tan(el)
+    sec = 1.0 / max(np.cos(el), 1e-3)
+    tan = np.sin(el) * sec
     by_error[:, 0:3] = np.eye(3)
     by_error[1, 4:6] = -tan * np.cos(az), -tan * np.sin(az)
     by_error[2, 4:6] = np.sin(az), -np.cos(az)
@@ -260,8 +261,15 @@ def _radar(
     by_error[1, 9], by_error[2, 10] = sec, 1.0
     by_error[2, 11] = known[0] * np.cos(el) / max(np.sin(el), 0.035)
     by_error[0, 12] = slant
+    # the errors themselves change with azimuth and elevation
+    g = np.eye(3) + np.diag([e[12], 0.0, 0.0])
+    g[1, 1] += tan * (np.sin(az) * e[4] - np.cos(az) * e[5])
+    g[1, 2] = sec**2 * (e[8] - np.cos(az) * e[4] - np.sin(az) * e[5]) + sec * tan * (e[7] + e[9])
+    g[2, 1] = np.cos(az) * e[4] + np.sin(az) * e[5]
+    bend = 1.0 / np.sin(el) ** 2 if np.sin(el) > 0.035 else np.sin(el) / 0.035
+    g[2, 2] -= np.sin(el) * e[6] + known[0] * bend * e[11]
     others = np.delete(np.arange(SLOTS), 3)
-    return np.array([slant, az, el]) + by_error[:, others] @ e[others], partials @ instrument.dcm
+    return np.array([slant, az, el]) + by_error[:, others] @ e[others], g @ partials @ instrument.dcm
 
 
 def _height(
@@ -269,7 +277,7 @@ def _height(
 ) -> tuple[FloatArray, FloatArray]:
     latitude, longitude, height = earth.geodetic_from_ecef(point)
     m = np.zeros((3, 3))
-    m[0] = -earth.dcm_ned_ecef(float(latitude), float(longitude))[2]
+    m[0] = -(1.0 + e[1]) * earth.dcm_ned_ecef(float(latitude), float(longitude))[2]
     above = float(height) - instrument.site_ecef_m[0]
     by_error[0, 0:3] = 1.0, above, 1.0
     return np.array([float(height) + e[0] + above * e[1] + e[2], 0.0, 0.0]), m
@@ -288,7 +296,7 @@ def _field(
         by_error[i, slot], by_error[j, slot] = x[j], x[i]
     by_state[:, 6:9] = iron @ mount.T @ rotations.skew(body)
     by_error[:, 0:3], by_error[:, 3:6] = np.eye(3), np.diag(x)
-    by_error[:, 6:9] = iron @ rotations.skew(x)
+    by_error[:, 6:9] = iron @ rotations.skew(x) @ right_jacobian(e[6:9])
     return iron @ x + e[0:3], by_state, by_error
 
 
@@ -302,10 +310,10 @@ def _sun(
     across = np.hypot(y, z)
     whole2 = across**2 + x**2
     p = np.zeros((3, 3))
-    p[0] = 0.0, z / across**2, -y / across**2
+    p[0] = 0.0, z / across**2 - e[0] * y / across**3, -y / across**2 - e[0] * z / across**3
     p[1] = across / whole2, -x * y / (whole2 * across), -x * z / (whole2 * across)
     by_state[:, 6:9] = p @ mount.T @ rotations.skew(body)
-    by_error[:, 4:7] = p @ rotations.skew(s)
+    by_error[:, 4:7] = p @ rotations.skew(s) @ right_jacobian(e[4:7])
     by_error[0, 0], by_error[1, 1] = 1.0 / across, 1.0
     h = np.array([np.arctan2(y, z) + e[0] / across, np.arctan2(x, across) + e[1], 0.0])
     return h, by_state, by_error
