@@ -231,6 +231,7 @@ def bryson_frazier(steps, run, observed, slots, innovations, x, covariance, vari
     dense = steps.transition.shape[2]
     mean, information = np.zeros(size), np.zeros((size, size))
     p, product, out, old = np.empty((size, size)), np.empty((size, size)), np.empty((size, size)), np.empty(size)
+    rest, turned = np.empty((size, 9 + SLOTS)), np.empty((size, 9 + SLOTS))
     wanted = len(covariance) > 0
     for b in range(n):
         k = n - 1 - b
@@ -240,7 +241,7 @@ def bryson_frazier(steps, run, observed, slots, innovations, x, covariance, vari
                 adjoint_update(
                     innovations.by_state[row], innovations.by_error[row], slots[observed.source[row]],
                     innovations.gain[row], innovations.covariance[row], innovations.residual[row],
-                    observed.variance[row], mean, information, wanted,
+                    observed.variance[row], mean, information, wanted, rest, turned,
                 )  # fmt: skip
         load_triangle(run.p_minus[k], p)
         for i in range(size):
@@ -306,66 +307,71 @@ def adjoint_step(phi, decay, mean, information, old, product, wanted):
 
 
 @inlined
-def adjoint_update(by_state, by_error, slot, gain, covariance, residual, variance, mean, information, wanted):
-    """Carry mean and information back over one measurement, in place."""
+def adjoint_update(
+    by_state, by_error, slot, gain, covariance, residual, variance, mean, information, wanted, rest, out
+):
+    """Carry mean and information back over one measurement, in place.
+
+    ``1 - K H`` is written out in the columns that the measurement reads (N, at most 9 + SLOTS, scratch): after a wide
+    prior it is tiny, and ``L - L K H`` would leave nothing of it but rounding.
+    """
     size = len(mean)
-    inverse, u, v = np.zeros((3, 3)), np.zeros((3, size)), np.zeros((3, 3))
+    inverse, h, weight = np.zeros((3, 3)), np.empty((3, 9 + SLOTS)), np.empty((3, 9 + SLOTS))
+    column, push = np.empty(9 + SLOTS, dtype=np.int64), np.empty(9 + SLOTS)
     invert_used(covariance, variance, inverse)
-    push = np.empty(3)
-    for r in range(3):
-        push[r] = 0.0
-        for j in range(size):
-            push[r] += gain[j, r] * mean[j]
-        for t in range(3):
-            push[r] += inverse[r, t] * residual[t]
-    for r in range(3):
-        for col in range(9):
-            mean[col] -= by_state[r, col] * push[r]
-        for col in range(SLOTS):
-            if slot[col] >= 0:
-                mean[9 + slot[col]] -= by_error[r, col] * push[r]
+    count = read_columns(by_state, by_error, slot, column, h)
+    for a in range(count):
+        for r in range(3):
+            weight[r, a] = inverse[r, 0] * h[0, a] + inverse[r, 1] * h[1, a] + inverse[r, 2] * h[2, a]
+        push[a] = 0.0
+        for i in range(size):
+            value = 1.0 if i == column[a] else 0.0
+            for r in range(3):
+                value -= gain[i, r] * h[r, a]
+            rest[i, a] = value
+            push[a] += value * mean[i]
+        for r in range(3):
+            push[a] -= weight[r, a] * residual[r]
+    for a in range(count):
+        mean[column[a]] = push[a]
     if not wanted:
         return
-    for r in range(3):
-        for col in range(size):
-            f = gain[col, r]
-            for j in range(size):
-                u[r, j] += f * information[col, j]
-    for r in range(3):
-        for t in range(3):
-            v[r, t] = inverse[r, t]
-            for j in range(size):
-                v[r, t] += u[r, j] * gain[j, t]
-    # L - H^T U - U^T H + H^T V H = L - H^T (U - V H) - U^T H
-    for r in range(3):
-        for col in range(9):
-            f = by_state[r, col]
-            for j in range(size):
-                information[j, col] -= u[r, j] * f
-        for col in range(SLOTS):
-            if slot[col] >= 0:
-                for j in range(size):
-                    information[j, 9 + slot[col]] -= u[r, j] * by_error[r, col]
-    for r in range(3):
-        for t in range(3):
-            for col in range(9):
-                u[r, col] -= v[r, t] * by_state[t, col]
-            for col in range(SLOTS):
-                if slot[col] >= 0:
-                    u[r, 9 + slot[col]] -= v[r, t] * by_error[t, col]
-    for r in range(3):
-        for col in range(9):
-            f = by_state[r, col]
-            for j in range(size):
-                information[col, j] -= f * u[r, j]
-        for col in range(SLOTS):
-            if slot[col] >= 0:
-                for j in range(size):
-                    information[9 + slot[col], j] -= by_error[r, col] * u[r, j]
-    for i in range(size):  # else rounding grows into an asymmetry that the products above do not expect
-        for j in range(i):
-            value = 0.5 * (information[i, j] + information[j, i])
-            information[i, j], information[j, i] = value, value
+    for i in range(size):
+        for a in range(count):
+            out[i, a] = 0.0
+        for j in range(size):
+            f = information[i, j]
+            for a in range(count):
+                out[i, a] += f * rest[j, a]
+    for i in range(size):
+        for a in range(count):
+            information[i, column[a]] = out[i, a]
+            information[column[a], i] = out[i, a]
+    for a in range(count):
+        for b in range(a + 1):
+            value = 0.0
+            for i in range(size):
+                value += rest[i, a] * out[i, b]
+            for r in range(3):
+                value += h[r, a] * weight[r, b]
+            information[column[a], column[b]], information[column[b], column[a]] = value, value
+
+
+@inlined
+def read_columns(by_state, by_error, slot, column, h):
+    """Which errors a measurement reads, into ``column``, and its partials by them (3, count); their number."""
+    for a in range(9):
+        column[a] = a
+        for r in range(3):
+            h[r, a] = by_state[r, a]
+    count = 9
+    for col in range(SLOTS):
+        if slot[col] >= 0:
+            column[count] = 9 + slot[col]
+            for r in range(3):
+                h[r, count] = by_error[r, col]
+            count += 1
+    return count
 
 
 @inlined
