@@ -16,6 +16,7 @@ from recon._measurement_kernels import RADAR, SLOTS, SUN, node_motion, predict
 from recon._strapdown_kernels import propagate_strapdown
 
 TWO_PI = 2.0 * math.pi
+LEAST_DECAY = 1e-3  # the smoother divides by it: what is forgotten to a thousandth is forgotten
 
 
 @inlined
@@ -61,7 +62,7 @@ def forget(wander, dt, climb, decay, noise_var):
             decay[j], noise_var[j] = 1.0, wander.walk_var_per_s[j] * dt
             moving = moving or noise_var[j] > 0.0
         else:
-            decay[j] = math.exp(-dt / tau - climb / length)
+            decay[j] = max(LEAST_DECAY, math.exp(-dt / tau - climb / length))
             noise_var[j] = wander.sd[j] * wander.sd[j] * (1.0 - decay[j] * decay[j])
             moving = True
     return moving
@@ -112,8 +113,7 @@ def linear_step(x, phi, decay, out):
 
 @inlined
 def right_jacobian_columns(phi, d0, d1, d2):
-    """Turn the rotation columns of ``phi`` (9, D): rotations about an estimate that is ``d`` from its chart."""
-    # 1 - [d x] / 2 + [d x]^2 / 6
+    """Turn the rotation columns of ``phi`` (9, D) by ``1 - [d x] / 2 + [d x]^2 / 6``: about ``d`` off the chart."""
     s = d0 * d0 + d1 * d1 + d2 * d2
     j00, j01, j02 = 1.0 + (d0 * d0 - s) / 6.0, 0.5 * d2 + d0 * d1 / 6.0, -0.5 * d1 + d0 * d2 / 6.0
     j10, j11, j12 = -0.5 * d2 + d1 * d0 / 6.0, 1.0 + (d1 * d1 - s) / 6.0, 0.5 * d0 + d1 * d2 / 6.0

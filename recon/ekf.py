@@ -171,7 +171,7 @@ class Readable:
     def _forget(self, dt_s: float, climb_m: float) -> tuple[FloatArray, FloatArray]:
         """Decay of each error over a step, and the variance that comes new."""
         w = self.wander
-        decay = np.exp(-dt_s / w.time_constant_s - climb_m / w.altitude_m)
+        decay = np.maximum(_filter_kernels.LEAST_DECAY, np.exp(-dt_s / w.time_constant_s - climb_m / w.altitude_m))
         stays = np.isinf(w.time_constant_s) & np.isinf(w.altitude_m)
         return decay, np.where(stays, w.walk_var_per_s * dt_s, w.sd**2 * (1.0 - decay**2))
 
