@@ -87,8 +87,7 @@ def _smoothers() -> None:
     run.p_last[:] = np.eye(27)
     steps.transition[:, range(9), range(9)] = 1.0
     states = States(*(np.array([part] * 3) for part in ekf.as_charts(problem.start)))
-    for method in smoother.SMOOTHERS:
-        smoother.smooth(problem, ekf.ForwardPass(states, steps, run, innovations), method=method)
+    smoother.smooth(problem, ekf.ForwardPass(states, steps, run, innovations))
     strapdown.fill_between(problem.motion, problem.node_index, problem.node_index[:1], states[:1])
     strapdown.propagate(problem.motion, 0, 1, problem.start)
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import WGS84, boxplus, geodetic, inlined, kernel
+from flightmodel._kernels import WGS84, boxplus, geodetic, inlined, kernel, merged
 from recon._ballistic_kernels import propagate_ballistic
 from recon._measurement_kernels import RADAR, SLOTS, SUN, node_motion, predict
 from recon._strapdown_kernels import propagate_strapdown
@@ -68,7 +68,7 @@ def forget(wander, dt, climb, decay, noise_var):
     return moving
 
 
-@inlined
+@merged
 def predict_covariance(p, phi, noise, decay, noise_var, moving, rows):
     """``P = F P F^T + Q`` in place; ``rows`` (9, N) is scratch."""
     size, dense = p.shape[0], phi.shape[1]
@@ -165,7 +165,7 @@ def small_solve(factor, count, y):
         y[i] /= factor[i, i]
 
 
-@inlined
+@merged
 def cross_covariance(p, by_state, by_error, slot, count, rows, used, w):
     """``w`` (3, N) = H P and ``H P H^T`` of the used components in the leading rows of the returned scratch."""
     size = p.shape[0]
@@ -201,7 +201,7 @@ def times(by_state, by_error, slot, x):
     return value
 
 
-@inlined
+@merged
 def gain_and_update(x, p, w, y, factor, count, used, considered, wander_sd, gain):
     """Schmidt's update in place: ``K = P H^T S^-1``, no gain for considered errors, whose own covariance stays."""
     size = len(x)
@@ -273,7 +273,7 @@ def store_triangle(p, size, out):
             at += 1
 
 
-@inlined
+@merged
 def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k):
     """Carry chart and error from node ``k - 1`` to ``k``; about its own estimate, or along the reference."""
     a = k - 1
@@ -322,7 +322,7 @@ def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k
     return moving
 
 
-@inlined
+@merged
 def update_node(motion, air, index, sources, observed, wander, gate, charts, innovations, x, p, k):
     """Use the measurements of node ``k`` that pass the gate."""
     size = len(x)

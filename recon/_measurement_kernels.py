@@ -19,6 +19,7 @@ from flightmodel._kernels import (
     gravitation,
     inlined,
     kernel,
+    merged,
 )
 from recon._ballistic_kernels import ballistic_acceleration
 from recon._strapdown_kernels import cross_into, level, matmul_into
@@ -27,7 +28,7 @@ RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN = range(6)
 SLOTS = 13
 
 
-@inlined
+@merged
 def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acceleration):
     """Attitude matrix, inertial rate in body axes and acceleration against the Earth at a grid point, in place."""
     dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
@@ -258,7 +259,7 @@ def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
             by_error[i, 4 + j] = lever[j]
 
 
-@inlined
+@merged
 def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error):
     """Prediction and partials of one measurement, in place."""
     for i in range(3):

@@ -19,6 +19,7 @@ from flightmodel._kernels import (
     dcm_from_quaternion,
     gravitation,
     inlined,
+    merged,
 )
 
 
@@ -248,7 +249,7 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     gradient[1, 1] += w2
 
 
-@inlined
+@merged
 def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise):
     """Carry a state in place from grid point ``first`` to ``last`` (either direction) with ``phi`` and ``noise``.
 

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel.checks import FloatArray
-from recon import _smoother_kernels
+from recon import _bryson_frazier_kernels, _smoother_kernels
 from recon.ekf import ForwardPass
 from recon.packed import Filtered, Innovations, Observed, Steps, packed, unpacked
 from recon.problem import Problem
@@ -77,7 +77,7 @@ def smooth(
     triangles, variance = np.empty((kept, problem.dense * (problem.dense + 1) // 2)), np.empty((kept, problem.size))
     if method == "bryson-frazier" and not problem.model.wander.considered.any():
         x = np.empty_like(run.filtered.x_plus)
-        adjoint = _smoother_kernels.bryson_frazier if engine == "compiled" else bryson_frazier
+        adjoint = _bryson_frazier_kernels.bryson_frazier if engine == "compiled" else bryson_frazier
         adjoint(
             run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, x, triangles, variance
         )
@@ -161,7 +161,7 @@ def bryson_frazier(
     steps: Steps, run: Filtered, observed: Observed, slots: IntArray, innovations: Innovations, x: FloatArray,
     triangles: FloatArray, variance: FloatArray,
 ) -> None:  # fmt: skip
-    """Readable twin of `recon._smoother_kernels.bryson_frazier`."""
+    """Readable twin of `recon._bryson_frazier_kernels`."""
     n, size = x.shape
     mean, information = np.zeros(size), np.zeros((size, size))
     first, v = observed.first, innovations
