@@ -37,7 +37,8 @@ class Settings:
     attitude_sensors : bool
         Whether magnetometer and Sun sensors are measurements too; otherwise they only start and check the attitude.
     engine, smoother : str
-        ``"compiled"`` or ``"readable"``; ``"rauch-tung-striebel"`` or ``"bryson-frazier"``.
+        ``"compiled"`` or ``"readable"``; ``"rauch-tung-striebel"`` or ``"bryson-frazier"``. Where errors are considered
+        there is one smoother alone, see `recon.smoother`.
     """
 
     output_rate_hz: float = 20.0

@@ -1,4 +1,4 @@
-"""What all data say about every time: two smoothers of the forward pass, compiled and readable.
+"""What all data say about every time: smoothers of the forward pass.
 
 **Rauch-Tung-Striebel** on the stored priors. With ``x_{k+1} = F x_k + u + w``, ``cov(w) = Q`` and the filter's prior
 ``P = P_{k+1|k}``, the textbook gain ``C = P_{k|k} F^T P^-1`` equals ``C = F^-1 (1 - Q P^-1)``, and
@@ -17,14 +17,30 @@ over a measurement and over a step,
     l+ = F^T l-,                               L+ = F^T L- F
     x_{k|N} = x_{k|k-1} - P_{k|k-1} l-,        P_{k|N} = P_{k|k-1} - P_{k|k-1} L- P_{k|k-1}
 
-It is faster, and loses digits where smoothing takes most of a prior's variance away. It presumes optimal gains, so
-where errors are only considered the first is used: a considered error then stays at zero with its own variance.
+It is faster, and loses digits where smoothing takes most of a prior's variance away.
+
+Both presume optimal gains, which a filter that only *considers* some errors has not. The second is then wrong. The
+first still knows its own covariance, but takes a later change of everything else as if considered errors could have
+changed with it: with a considered scale of an accelerometer it is ten times worse than the filter that it smooths. Then
+the **two-filter** smoother is used: an information filter from the end,
+
+    l- = l+ + L+ K y + H^T R^-1 y,     L- = L+ + H^T R^-1 H        (y: the forward filter's residual)
+    l+ = F^T (1 + L- Q)^-1 l-,         L+ = F^T (1 + L- Q)^-1 L- F
+
+tells what all later data say about the errors of the forward estimate, and Schmidt's rule uses that as one measurement,
+
+    x_{k|N} = x_{k|k-1} + P_{k|k-1} (1 + L- P_{k|k-1})^-1 l-,     P_{k|N} = P_{k|k-1} (1 + L- P_{k|k-1})^-1
+
+in the rows of the estimated errors; considered ones stay at zero with their own variance. It is never worse than the
+filter, its covariance is exact, and without considered errors it equals the other two.
 
 References
 ----------
 H. Rauch, F. Tung, C. Striebel, AIAA J. 3 (1965) 1445, eqs. (3.23)-(3.30).
 G. Bierman, "Fixed interval smoothing with discrete measurements", Int. J. Control 18 (1973) 65 (modified
 Bryson-Frazier).
+D. Fraser, J. Potter, "The optimum linear smoother as a combination of two optimum linear filters", IEEE Trans.
+Automatic Control 14 (1969) 387.
 """
 
 from __future__ import annotations
@@ -72,10 +88,20 @@ def smooth(
     method: str = "rauch-tung-striebel",
     engine: str = "compiled",
 ) -> Smoothed:
-    """Smooth a forward pass; without covariance where only a reference trajectory is wanted."""
+    """Smooth a forward pass; without covariance where only a reference trajectory is wanted.
+
+    Where errors are only considered this is `two_filter`, whatever the method; it exists in numpy alone.
+    """
     kept = int(problem.kept.sum()) if with_covariance else 0
     triangles, variance = np.empty((kept, problem.dense * (problem.dense + 1) // 2)), np.empty((kept, problem.size))
-    if method == "bryson-frazier" and not problem.model.wander.considered.any():
+    considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
+    if len(considered):
+        x = run.filtered.x_minus.copy()
+        two_filter(
+            run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, considered, x,
+            triangles, variance,
+        )  # fmt: skip
+    elif method == "bryson-frazier":
         x = np.empty_like(run.filtered.x_plus)
         adjoint = _bryson_frazier_kernels.bryson_frazier if engine == "compiled" else bryson_frazier
         adjoint(
@@ -169,12 +195,7 @@ def bryson_frazier(
         for row in reversed(range(first[k], first[k + 1])):
             if not v.accepted[row]:
                 continue
-            used = np.flatnonzero(np.isfinite(observed.variance[row]))
-            slot = slots[observed.source[row]]
-            h = np.zeros((3, size))
-            h[:, :KINEMATIC] = v.by_state[row]
-            h[:, KINEMATIC + slot[slot >= 0]] += v.by_error[row][:, slot >= 0]
-            h = h[used]
+            used, h = _read(observed, slots, v, row, size)
             weight = h.T @ np.linalg.inv(v.covariance[row][np.ix_(used, used)])
             rest = np.eye(size) - v.gain[row][:, used] @ h
             mean = rest.T @ mean - weight @ v.residual[row, used]
@@ -185,3 +206,60 @@ def bryson_frazier(
         if k > 0:
             f, _ = full_step(steps, k - 1)
             mean, information = f.T @ mean, f.T @ information @ f
+
+
+def _read(
+    observed: Observed, slots: IntArray, innovations: Innovations, row: int, size: int
+) -> tuple[IntArray, FloatArray]:
+    """Which components a measurement has, and their partials by all errors (k, N)."""
+    used = np.flatnonzero(np.isfinite(observed.variance[row]))
+    slot = slots[observed.source[row]]
+    h = np.zeros((3, size))
+    h[:, :KINEMATIC] = innovations.by_state[row]
+    h[:, KINEMATIC + slot[slot >= 0]] += innovations.by_error[row][:, slot >= 0]
+    return used, h[used]
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Square root ``B`` with ``B B^T`` a covariance that may be singular; taken of its correlations."""
+    sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sd, sd))
+    return np.asarray(sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def two_filter(
+    steps: Steps, run: Filtered, observed: Observed, slots: IntArray, innovations: Innovations, considered: IntArray,
+    x: FloatArray, triangles: FloatArray, variance: FloatArray,
+) -> None:  # fmt: skip
+    """Smooth ``x`` (n, N), which comes as the predicted errors, in place; moments at kept nodes where wanted."""
+    n, size = x.shape
+    mean, information = np.zeros(size), np.zeros((size, size))
+    first, v = observed.first, innovations
+    estimated = np.setdiff1d(np.arange(size), considered)
+    for k in reversed(range(n)):
+        for row in reversed(range(first[k], first[k + 1])):
+            if not v.accepted[row]:
+                continue
+            used, h = _read(observed, slots, v, row, size)
+            weight, y = h.T / observed.variance[row, used], v.residual[row, used]
+            mean = mean + information @ (v.gain[row][:, used] @ y) + weight @ y
+            information = information + weight @ h
+        prior = unpacked(run.p_minus[k])
+        b = _root(prior)
+        whole = np.eye(size) + b.T @ information @ b
+        half = np.linalg.solve(np.linalg.cholesky(0.5 * (whole + whole.T)), b.T)  # half^T half = P (1 + L P)^-1
+        x[k, estimated] += (half.T @ (half @ mean))[estimated]
+        if run.kept[k] >= 0 and len(triangles):
+            p = half.T @ half
+            p[np.ix_(considered, considered)] = prior[np.ix_(considered, considered)]
+            _keep(run, k, p, triangles, variance)
+        if k > 0:
+            f, q = full_step(steps, k - 1)
+            moving = np.flatnonzero(np.diag(q) > 0.0)
+            b = np.zeros((size, len(moving)))
+            b[moving] = _root(q[np.ix_(moving, moving)])
+            j = np.linalg.solve(np.eye(len(moving)) + b.T @ information @ b, b.T @ information)
+            rest = (np.eye(size) - b @ j) @ f  # (1 + L Q)^-T F; a sum of two positive terms, as in Joseph's form
+            mean = rest.T @ mean
+            information = rest.T @ information @ rest + f.T @ j.T @ j @ f
+            information = 0.5 * (information + information.T)
