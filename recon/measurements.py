@@ -139,6 +139,8 @@ def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray)
     """Position of one receiver and, where it gives one, velocity; axes are those at its first fix."""
     spec = record.spec
     good = np.isfinite(record.position_ecef_m).all(axis=1)
+    if not good.any():
+        return []
     reference = record.position_ecef_m[good][0]
     latitude, longitude, _ = earth.geodetic_from_ecef(reference)
     dcm = earth.dcm_ned_ecef(float(latitude), float(longitude))
@@ -158,7 +160,7 @@ def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray)
 
 def barometer_instrument(name: str, record: BarometerRecord, accelerometer_m: FloatArray) -> Instrument:
     """Height by pressure of the datum's point."""
-    first = record.height_m[np.isfinite(record.height_m)][0]
+    first = next(iter(record.height_m[np.isfinite(record.height_m)]), 0.0)
     value = np.column_stack([record.height_m, np.full((len(record.height_m), 2), np.nan)])
     return _instrument(
         name, HEIGHT, record.spec.name, -accelerometer_m, np.array([first, 0.0, 0.0]), np.eye(3),

@@ -33,7 +33,8 @@ class Settings:
     consider : tuple of str
         Errors that are not estimated but whose effect stays in the covariance: ``"accelerometer mount"``, ...
     without : tuple of str
-        Sources (radars, receivers, barometers) that are predicted but never used.
+        Sources (radars, receivers, barometers; ``"magnetometer"``, ``"sun1"``, ... where attitude sensors are on) that
+        are predicted but never used, not even for the start.
     attitude_sensors : bool
         Whether magnetometer and Sun sensors are measurements too; otherwise they only start and check the attitude.
     engine, smoother : str

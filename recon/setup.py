@@ -19,6 +19,7 @@ from recon.settings import Settings
 from recon.state import BoolArray, IntArray
 
 ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
+BALLISTIC_STEP_S = 0.5  # drivers stand still within a step, and forget in seconds and kilometres
 
 
 @dataclass(frozen=True)
@@ -39,31 +40,60 @@ def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | N
     """
     arm = _accelerometer_arm(bridges)
     instruments = tracking_instruments(telemetry, settings, arm)
-    start_s, end_s = _span(instruments, settings, bridges)
+    model = _named_model(telemetry, settings, bridges, instruments)
+    used = tuple(i for i in instruments if not _left_out(i, settings))
+    start_s, end_s = _span(used, settings, bridges)
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
     if settings.attitude_sensors:
-        instruments += attitude_instruments(telemetry, instruments, start_s, end_s)
+        instruments += attitude_instruments(telemetry, used, start_s, end_s)
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
-    time_s = _union([output_s, *inside])
+    between = np.arange(start_s, end_s, BALLISTIC_STEP_S) if bridges is None else np.empty(0)
+    time_s = _union([output_s, between, *inside])
     observed, row = observe(time_s, instruments, SAME_INSTANT_S)
-    model = build_error_model(telemetry, bridges, settings.attitude_sensors).considering(settings.consider)
-
     if bridges is None:
         motion, node_index = ballistic_motion(telemetry.motion, telemetry.sounding, time_s, SAME_INSTANT_S)
-        start, covariance = startup.start_ballistic(instruments, start_s, model)
+        start, covariance = startup.start_ballistic(used, start_s, model)
     else:
         force, rate = bridges.force, bridges.rate
         motion, node_index = inertial.inertial_motion(force, rate, time_s)
         prior = startup.attitude_prior(telemetry)
-        start, covariance = startup.start_by_inertial_sensors(instruments, prior, start_s, force, rate, model)
+        start, covariance = startup.start_by_inertial_sensors(used, prior, start_s, force, rate, model)
     from scipy.stats import chi2
 
     gate = np.array([0.0, *(float(chi2.ppf(settings.gate_probability, k)) for k in (1, 2, 3))])
     kept: BoolArray = np.zeros(len(time_s), dtype=bool)
     kept[nearest_index(time_s, output_s)] = True
     problem = Problem(time_s, node_index, motion, model, instruments, row, observed, start, covariance, gate, kept)
-    left_out = np.array([i.name in settings.without or i.owner in settings.without for i in instruments])
-    return problem.without(left_out[observed.source])
+    return problem.without(np.array([_left_out(i, settings) for i in instruments])[observed.source])
+
+
+def _left_out(instrument: Instrument, settings: Settings) -> bool:
+    return instrument.name in settings.without or instrument.owner in settings.without
+
+
+def _named_model(
+    telemetry: Telemetry, settings: Settings, bridges: Bridges | None, trackers: tuple[Instrument, ...]
+) -> ErrorModel:
+    """Error model as the settings want it, or every fault of the names in them at once."""
+    known = sorted({name for i in trackers for name in (i.name, i.owner)})
+    if settings.attitude_sensors:
+        known += ["magnetometer"] if telemetry.magnetometer is not None else []
+        known += [f"sun{k + 1}" for k in range(len(telemetry.sun.spec.clock_lv_rad))] if telemetry.sun else []
+    faults = [
+        f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}"
+        for name in settings.without
+        if name not in known
+    ]
+    if settings.attitude_sensors and bridges is None:
+        faults.append("attitude_sensors: ballistic flight has no attitude that they could measure; leave them off")
+    model = build_error_model(telemetry, bridges, settings.attitude_sensors)
+    try:
+        model = model.considering(settings.consider)
+    except GateError as unknown:
+        faults += unknown.faults
+    if faults:
+        raise GateError(faults)
+    return model
 
 
 def _accelerometer_arm(bridges: Bridges | None) -> FloatArray:
@@ -87,10 +117,6 @@ def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: F
         out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m)
     for name, heights in telemetry.barometers.items():
         out.append(measurements.barometer_instrument(name, heights, arm_body_m))
-    known = [name for i in out for name in (i.name, i.owner)]
-    faults = [f"source '{n}'{nearest_name(n, known)}: no such source" for n in settings.without if n not in known]
-    if faults:
-        raise GateError(faults)
     return tuple(out)
 
 
@@ -147,7 +173,7 @@ def _span(instruments: tuple[Instrument, ...], settings: Settings, bridges: Brid
     """First and last time that inertial sensors and at least one tracker cover, within the settings' span."""
     t, _ = startup.places(instruments)
     if len(t) == 0:
-        raise GateError("no radar or receiver has a usable point; a trajectory needs at least one")
+        raise GateError("no radar or receiver has a usable point that is not left out; a trajectory needs at least one")
     start_s, end_s = float(t[0]), float(t[-1])
     if bridges is not None:
         start_s = max(start_s, bridges.force.time_s[0], bridges.rate.time_s[0])
@@ -174,4 +200,7 @@ def _output_times(start_s: float, end_s: float, rate_hz: float) -> FloatArray:
 def _union(times: list[FloatArray]) -> FloatArray:
     """All times in order, instants closer than `inertial.SAME_INSTANT_S` taken once."""
     t = np.sort(np.concatenate(times))
-    return np.asarray(t[np.diff(t, prepend=-np.inf) > SAME_INSTANT_S])
+    kept = t[np.diff(t, prepend=-np.inf) > SAME_INSTANT_S]
+    # in a chain of near instants the last may be far from the first
+    far = t[np.abs(kept[nearest_index(kept, t)] - t) > SAME_INSTANT_S]
+    return np.asarray(kept if len(far) == 0 else _union([kept, far]))

@@ -1,4 +1,4 @@
-"""How accelerometers and gyros carry a state forward, in readable form: the twin of `recon._kernels`.
+"""How accelerometers and gyros carry a state forward, in readable form: the twin of `recon._strapdown_kernels`.
 
 Model, Earth-fixed axes, for the point where the accelerometer sits:
 
