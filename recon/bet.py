@@ -145,9 +145,9 @@ def bridge_triads(telemetry: Telemetry) -> Bridges | None:
 
 def _mounting(telemetry: Telemetry, bridges: Bridges | None) -> product.Mounting:
     if bridges is None:
-        return product.Mounting(telemetry.t0_utc, np.zeros(3), 0.0)
+        return product.Mounting(telemetry.t0_utc, np.zeros(3), None)
     arm = bridges.force.spec.position_from_datum_body_m
-    return product.Mounting(telemetry.t0_utc, arm, bridges.rate.spec.noise_sd)
+    return product.Mounting(telemetry.t0_utc, arm, bridges.rate)
 
 
 def _series(

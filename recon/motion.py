@@ -47,7 +47,7 @@ class Motion(NamedTuple):
         Whether there are no inertial sensors.
     time_s : (k,) float
     force_sensor_mps2, rate_sensor_radps : (k, 3) float
-        As measured, in sensor axes, gaps bridged; zeros in ballistic flight.
+        As measured, in sensor axes, gaps bridged, `recon.inertial.unbent`; zeros in ballistic flight.
     force_density, rate_density : (k, 3) float
         White-noise densities, (m/s^2)^2/Hz and (rad/s)^2/Hz, from a grid point to the next: along body axes, in
         ballistic flight along Earth-fixed axes.

@@ -33,11 +33,11 @@ UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
 
 @dataclass(frozen=True)
 class Mounting:
-    """What moving a node to the datum needs: epoch, accelerometer from datum (3,), m, and gyro noise, rad/s."""
+    """What moving a node to the datum needs: epoch, accelerometer from datum (3,), m, and the gyros, if there are."""
 
     epoch_utc: str
     arm_body_m: FloatArray
-    rate_noise_sd: float
+    rate: Bridged | None
 
 
 def datum_trajectory(problem: Problem, mounting: Mounting, states: States, triangles: FloatArray) -> Trajectory:
@@ -46,7 +46,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
     covariance = unpacked(triangles)
     states = states[kept]
     n = len(kept)
-    if problem.motion.ballistic:
+    if mounting.rate is None:
         covariance = covariance[:, :9, :9].copy()
         covariance[:, 6:9] = 0.0
         covariance[:, :, 6:9] = 0.0
@@ -56,7 +56,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
             states.q_ecef_body, np.tile(earth.OMEGA_ECEF_RADPS, (n, 1)), covariance,
         )  # fmt: skip
     motion = problem.motion
-    measured = motion.rate_sensor_radps[problem.node_index[kept]]
+    measured = interpolate_rows(problem.time_s[kept], mounting.rate.time_s, mounting.rate.measured_sensor)
     errors = states.sensor_errors[:, 9:18]
     c = rotations.dcm_from_q(states.q_ecef_body)
     omega = correct(measured, errors, motion.dcm_body_rate)
@@ -70,7 +70,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
     move[:, 3:6, 6:9] = c @ rotations.skew(swing)
     move[:, 3:6, 18:27] = lever @ correction_partials(measured, errors, motion.dcm_body_rate)
     moved = move @ covariance @ np.swapaxes(move, 1, 2)
-    moved[:, 3:6, 3:6] += mounting.rate_noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
+    moved[:, 3:6, 3:6] += mounting.rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
     return Trajectory(
         mounting.epoch_utc,
         problem.time_s[kept],
