@@ -12,7 +12,8 @@ from pathlib import Path
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from flightmodel.flightfolder import read_flight
-from postflight.pipeline import estimate_camera, pulse_data, reconstruct_flight
+from postflight.pipeline import estimate_camera, reconstruct_flight
+from postflight.sensed import pulse_data
 from recon.bet import reconstruct
 from synthetic_flight import packing
 from synthetic_flight.day_air import day_atmosphere

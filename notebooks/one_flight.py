@@ -66,7 +66,7 @@ pd.DataFrame(rows, columns=["sensor", "samples", "from s", "to s"])
 event_table(flight).round(2)
 
 # %%
-pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.words) for v in flight.reconstruction.verdicts],
+pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.words) for v in flight.verdicts],
              columns=["verdict", "passed", "value", "in words"])  # fmt: skip
 
 # %%

@@ -183,9 +183,11 @@ def print_flight(flight: Flight) -> None:
         console.print("[yellow]found[/] the data end before or begin after the peak of dynamic pressure")
     for finding in (*flight.telemetry.findings, *flight.reconstruction.findings):
         console.print(f"[yellow]found[/] {escape(str(finding))}")
-    failed = [v for v in flight.reconstruction.verdicts if not v.passed]
-    passed = len(flight.reconstruction.verdicts) - len(failed)
-    console.print(f"{passed} of {len(flight.reconstruction.verdicts)} consistency verdicts pass")
+    for reason in flight.missing:
+        console.print(f"[yellow]left out[/] air of the day: {escape(reason)}")
+    failed = [v for v in flight.verdicts if not v.passed]
+    passed = len(flight.verdicts) - len(failed)
+    console.print(f"{passed} of {len(flight.verdicts)} consistency verdicts pass")
     for verdict in failed:
         numbers = f"{verdict.value:.3g} outside {verdict.low:.3g} to {verdict.high:.3g}"
         console.print(f"[red]verdict[/] {verdict.name}: {verdict.words} ({numbers})")

@@ -15,6 +15,7 @@ from flightmodel.telemetry import Telemetry
 from postflight import figures
 from postflight.pipeline import Answers, Flight
 from postflight.preflight import rigid_bounds
+from postflight.product import figures as product_figures
 
 Report = Callable[[float, str], None]
 YELLOW, GREY = (255, 230, 0), (170, 170, 170)
@@ -22,11 +23,15 @@ YELLOW, GREY = (255, 230, 0), (170, 170, 170)
 
 def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> None:
     """Draw everything that the run's answers allow."""
-    report(0.0, "flying the rigid vehicle")
-    bounds = rigid_bounds(flight, progress=lambda f, what: report(0.6 * f, what))
+    if flight.pulse is not None:
+        report(0.0, "flying the rigid vehicle")
+        bounds = rigid_bounds(flight, progress=lambda f, what: report(0.6 * f, what))
+        report(0.6, "drawing")
+        figures.save(figures.figure_1_3(flight, bounds), folder / "figure_1_3.png")
+        figures.save(figures.figure_2_5(flight), folder / "figure_2_5.png")
     report(0.6, "drawing")
-    figures.save(figures.figure_1_3(flight, bounds), folder / "figure_1_3.png")
-    figures.save(figures.figure_2_5(flight), folder / "figure_2_5.png")
+    if flight.day is not None:
+        figures.save(product_figures.figure_air(flight, flight.day), folder / "air.png")
     figures.save(figures.figure_residuals(flight), folder / "residuals.png")
     if "misalignment" in answers.histories:
         figures.save(figures.figure_2_7(flight, answers.histories["misalignment"]), folder / "figure_2_7.png")

@@ -50,7 +50,7 @@ def figure_1_3(flight: Flight, bounds: RigidBounds) -> Figure:
     """Total angle of attack and normal acceleration against a rigid vehicle's Monte Carlo bounds (Figure 1.3)."""
     figure = Figure(figsize=(7.2, 7.0), layout="constrained")
     upper, lower = _axes(figure, 2)
-    air, pulse = flight.air, flight.pulse
+    air, pulse = flight.air, flight.required_pulse()
     for ax, band, nominal in (
         (upper, bounds.alpha_total_deg, bounds.nominal_alpha_deg),
         (lower, bounds.normal_g, bounds.nominal_normal_g),
@@ -85,7 +85,8 @@ def figure_2_5(flight: Flight) -> Figure:
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
     (ax,) = _axes(figure)
     _bet_line(ax, flight, "BET, centerbody")
-    pulse, use = flight.pulse, flight.pulse.informative
+    pulse = flight.required_pulse()
+    use = pulse.informative
     inferred = aerodynamic_angle(flight.telemetry.required_vehicle().aero, pulse.mach, pulse.specific_force_body_mps2)
     ax.plot(pulse.time_s, _where(use, inferred), color="black", lw=1.2, label="C_N/C_A look-up, no adjustment")
     _no_answer(ax, use, inferred, pulse.time_s)
@@ -100,7 +101,7 @@ def figure_2_7(flight: Flight, history: DeflectionHistory) -> Figure:
     """The same with the accelerometers turned by the estimated deflection, and the BET biased by it (Figure 2.7)."""
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
     (ax,) = _axes(figure)
-    pulse, aero = flight.pulse, flight.telemetry.required_vehicle().aero
+    pulse, aero = flight.required_pulse(), flight.telemetry.required_vehicle().aero
     use, force = pulse.informative, pulse.specific_force_body_mps2
     raw = aerodynamic_angle(aero, pulse.mach, force)
     turned = aeroshell_acceleration(force, np.nan_to_num(history.theta_rad), psi_from_acceleration(force))

@@ -1,5 +1,7 @@
 """From a flight folder to answers: read, reconstruct, see the air, estimate the deflection three ways.
 
+A flight whose vehicle or inertial sensors are not known still has a trajectory; what it cannot have says why.
+
 Nothing here opens ``truth/``; only `postflight.scoring` does.
 """
 
@@ -16,33 +18,56 @@ from estimators.camera_deflection import deflection_from_frames, read_frame, sen
 from estimators.misalignment import estimate_misalignment
 from estimators.pulse import PulseData
 from estimators.trim import estimate_trim
-from flightmodel.airdata import AirData, air_data, lateral_angles, peak_pressure
+from flightmodel.airdata import AirData, air_data, peak_pressure
 from flightmodel.atmosphere import BOTTOM_M, TOP_M, profile_from_sounding
-from flightmodel.checks import DivergenceError, FloatArray, GateError
+from flightmodel.checks import DivergenceError, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import geodetic_from_ecef
 from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory
+from postflight.day_air import day_air
+from postflight.sensed import pulse_data
+from recon.air import ReconstructedAir
 from recon.bet import Reconstruction, Settings, reconstruct
+from recon.consistency import Verdict
 
 Progress = Callable[[float, str], None]
 METHODS = ("camera", "misalignment", "trim")
 NO_VIDEO = "the flight has no video"
 # assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
 PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
-# half the window over which sensors are averaged: well below the joint's 2.5 Hz, well above the sampling interval
-HALF_WINDOW_S = 0.05
 
 
 @dataclass(frozen=True)
 class Flight:
-    """A flight with its reconstruction and the air it met."""
+    """A flight with its reconstruction and the air it met; ``missing`` says why there is no pulse or no air of the day.
+
+    ``air`` is the sounding's along the trajectory; ``day`` is what the deceleration adds to it.
+    """
 
     telemetry: Telemetry
     reconstruction: Reconstruction
     air: AirData
-    pulse: PulseData
+    pulse: PulseData | None
+    day: ReconstructedAir | None = None
+    missing: tuple[str, ...] = ()
+
+    @property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """Verdicts on the trajectory, then on the air."""
+        return self.reconstruction.verdicts + (self.day.verdicts if self.day is not None else ())
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether inertial sensors carried the attitude; in ballistic flight it is not known."""
+        return self.reconstruction.provenance["motion"] != "ballistic"
+
+    def required_pulse(self) -> PulseData:
+        """Sensors and flow at the c.g.; `GateError` with the reason where there are none."""
+        if self.pulse is None:
+            raise GateError("; ".join(self.missing))
+        return self.pulse
 
     @property
     def peak_s(self) -> float:
@@ -78,11 +103,21 @@ def reconstruct_telemetry(
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "reconstructing")
     bet = reconstruct(telemetry, settings, lambda f, what: report(0.95 * f, what))
+    report(0.96, "finding the air of the day")
     profile = profile_from_sounding(telemetry.sounding)
     _check_flown(bet.smoothed)
-    air = air_data(bet.smoothed, profile, telemetry.required_vehicle().cg_m)
+    vehicle = telemetry.vehicle
+    air = air_data(bet.smoothed, profile, np.zeros(3) if vehicle is None else vehicle.cg_m)
+    pulse, day, missing = None, None, []
+    try:
+        telemetry.required_vehicle()
+        telemetry.required_triads()
+        pulse = pulse_data(telemetry, bet, air)
+        day = day_air(telemetry, bet, profile, (settings or Settings()).verdict_confidence)
+    except GateError as fault:
+        missing.append(str(fault))
     report(1.0, "reconstructed")
-    return Flight(telemetry, bet, air, pulse_data(telemetry, bet, air))
+    return Flight(telemetry, bet, air, pulse, day, tuple(missing))
 
 
 def _check_flown(trajectory: Trajectory) -> None:
@@ -95,58 +130,6 @@ def _check_flown(trajectory: Trajectory) -> None:
             f"reconstruction: diverged: at {trajectory.time_s[k]:.1f} s the altitude is {altitude_m[k] / 1000:.1f} km. "
             "Check the accelerometer's and gyros' units, signs and mounting, and the attitude prior"
         )
-
-
-def window_means(time_s: FloatArray, values: FloatArray, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
-    """Means ``(k, m)`` of piecewise linear ``values`` (n, m) over windows; uneven samples are weighted by time."""
-    area = np.concatenate(
-        [np.zeros((1, values.shape[1])), np.cumsum(0.5 * np.diff(time_s)[:, None] * (values[1:] + values[:-1]), axis=0)]
-    )
-
-    def integral(at: FloatArray) -> FloatArray:
-        at = np.clip(at, time_s[0], time_s[-1])
-        k = np.clip(np.searchsorted(time_s, at, side="right") - 1, 0, len(time_s) - 2)
-        h = (at - time_s[k])[:, None]
-        slope = (values[k + 1] - values[k]) / (time_s[k + 1] - time_s[k])[:, None]
-        return area[k] + values[k] * h + 0.5 * slope * h**2
-
-    width = np.clip(end_s, time_s[0], time_s[-1]) - np.clip(start_s, time_s[0], time_s[-1])
-    return (integral(end_s) - integral(start_s)) / np.maximum(width, 1e-9)[:, None]
-
-
-def pulse_data(telemetry: Telemetry, bet: Reconstruction, air: AirData) -> PulseData:
-    """Corrected sensors at the c.g. and the flow, on the BET's time grid, where no telemetry gap is near."""
-    t_imu, grid = bet.imu_time_s, bet.smoothed.time_s
-    h = HALF_WINDOW_S
-    inside = (grid - 2 * h >= t_imu[0]) & (grid + 2 * h <= t_imu[-1])
-    nearest = np.searchsorted(t_imu, grid).clip(1, len(t_imu) - 1)
-    inside &= t_imu[nearest] - t_imu[nearest - 1] <= 2.0 * h
-    t = grid[inside]
-    force = window_means(t_imu, bet.specific_force_body_mps2, t - h, t + h)
-    rate = window_means(t_imu, bet.rate_body_radps, t - h, t + h)
-    after = window_means(t_imu, bet.rate_body_radps, t, t + 2 * h)
-    before = window_means(t_imu, bet.rate_body_radps, t - 2 * h, t)
-    turn = (after - before) / (2 * h)
-    samples = max(1.0, 2 * h / float(np.median(np.diff(t_imu))))
-    vehicle, (accelerometer, rates) = telemetry.required_vehicle(), telemetry.required_triads()
-    arm = vehicle.cg_m - accelerometer.spec.position_from_datum_body_m
-    at_cg = force + np.cross(turn, arm) + np.cross(rate, np.cross(rate, arm))
-    white = accelerometer.spec.noise_sd**2 / samples * np.eye(3)
-    return PulseData(
-        time_s=t,
-        specific_force_body_mps2=at_cg,
-        specific_force_cov=bet.specific_force_cov[inside] + white,
-        rate_body_radps=rate,
-        angular_acceleration_body_radps2=turn,
-        angular_acceleration_sd_radps2=float(np.sqrt(2.0 / samples) * rates.spec.noise_sd / (2 * h)),
-        flow_yz_rad=lateral_angles(air.velocity_air_body_mps[inside]),
-        flow_cov=air.lateral_flow_cov[inside],
-        mach=air.mach[inside],
-        dynamic_pressure_pa=air.dynamic_pressure_pa[inside],
-        dynamic_pressure_sd_pa=air.dynamic_pressure_sd_pa[inside],
-        airspeed_mps=air.airspeed_mps[inside],
-        vehicle=vehicle,
-    )
 
 
 def estimate_camera(
@@ -215,7 +198,7 @@ def estimate(
                 history = estimate_camera(telemetry, plane_lv_rad, joint_station_m)
             else:
                 assert flight is not None
-                pulse = flight.pulse
+                pulse = flight.required_pulse()
                 history = (
                     estimate_misalignment(pulse) if method == "misalignment" else estimate_trim(pulse, joint_station_m)
                 )

@@ -222,9 +222,13 @@ def write_reconstruction(run: RunFolder, flight: Flight) -> None:
     bet = flight.reconstruction
     run.write_csv("bet.csv", bet_table(flight))
     run.write_csv("residuals.csv", bet.residuals)
-    run.write_csv("verdicts.csv", pd.DataFrame([vars(v) for v in bet.verdicts]))
+    run.write_csv("verdicts.csv", pd.DataFrame([vars(v) for v in flight.verdicts]))
     run.write_csv("sensor_errors.csv", bet.sensor_errors)
     run.write_csv("events.csv", event_table(flight))
+    if flight.day is not None:
+        run.write_csv("air_profile.csv", flight.day.profile)
+        run.write_csv("drag_ratio.csv", flight.day.drag)
+        run.write_csv("air_parameters.csv", flight.day.parameters)
     findings = [vars(f) for f in (*flight.telemetry.findings, *bet.findings)]
     run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s"]))
 
@@ -239,7 +243,7 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
     """Return the short story of a run, for ``summary.json``."""
     air, peak = flight.air, flight.peak_s
     k = int(np.searchsorted(air.time_s, peak).clip(0, len(air.time_s) - 1))
-    verdicts = flight.reconstruction.verdicts
+    verdicts = flight.verdicts
     return {
         "flight": flight.telemetry.name,
         "synthetic": flight.telemetry.synthetic,
@@ -248,6 +252,7 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
         "alpha_total_wind_deg": float(np.rad2deg(air.alpha_total_wind_rad[k])),
         "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])),
         "methods": method_summary(answers, peak),
+        "missing": list(flight.missing),
         "verdicts_passed": sum(v.passed for v in verdicts),
         "verdicts_failed": [f"{v.name}: {v.words}" for v in verdicts if not v.passed],
     }

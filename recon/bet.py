@@ -34,6 +34,11 @@ Progress = Callable[[float, str], None]
 THINNED_STEP_S = 0.5
 MOST_THINNED_PASSES = 6
 SETTLED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of what it does
+# what states the errors of a ballistic flight's air and vehicle, and what to say where they are larger
+SHEETS = {
+    "air": ("sounding", "is further from the sounding than its accuracy allows: check its units, its time and place"),
+    "vehicle": ("pre-flight drag", "is larger than stated before flight: check mass, area and coefficients"),
+}
 SETTLED_SD = 0.01  # a pass that moves nothing by more than this part of its sd needs no other
 
 
@@ -178,7 +183,9 @@ def _sheet_verdicts(problem: Problem, table: pd.DataFrame, confidence: float) ->
     for name in dict.fromkeys(owners[estimated]):
         rows = table[(owners == name) & estimated]
         estimate, prior_sd, sd = rows[["estimate", "prior_sd", "sd"]].to_numpy(dtype=float).T
-        out.append(consistency.sheet_verdict(name, rows["name"].tolist(), estimate, prior_sd, sd, confidence))
+        label, *bad = SHEETS.get(str(name), (f"data sheet {name}",))
+        names = rows["name"].tolist()
+        out.append(consistency.sheet_verdict(label, names, estimate, prior_sd, sd, confidence, *bad))
     return [v for v in out if v is not None]
 
 

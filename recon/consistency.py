@@ -101,9 +101,19 @@ def edit_verdict(source: str, accepted: BoolArray) -> Verdict:
 
 
 def sheet_verdict(
-    instrument: str, names: list[str], estimate: FloatArray, prior_sd: FloatArray, sd: FloatArray, confidence: float
+    label: str,
+    names: list[str],
+    estimate: FloatArray,
+    prior_sd: FloatArray,
+    sd: FloatArray,
+    confidence: float,
+    bad: str = "is larger than the data sheet allows: check mounting, units and calibration",
+    good: str = "estimated errors are as large as stated; the largest is",
 ) -> Verdict | None:
-    """Largest normalised shift (k,) of an instrument's errors from zero; None where nothing was learnt."""
+    """Largest normalised shift (k,) of stated errors from zero; None where nothing was learnt.
+
+    The words name the error that moved most: ``bad`` follows its name, ``good`` goes before it.
+    """
     from scipy.stats import norm
 
     learnt = sd < MOST_KEPT_SD * prior_sd
@@ -112,14 +122,8 @@ def sheet_verdict(
     shift = np.abs(estimate[learnt]) / np.sqrt(prior_sd[learnt] ** 2 - sd[learnt] ** 2)
     tail = 0.5 * (1.0 - confidence) / int(learnt.sum())
     worst = np.array(names, dtype=object)[learnt][int(np.argmax(shift))]
-    return verdict(
-        f"data sheet {instrument}",
-        float(shift.max()),
-        0.0,
-        float(norm.isf(tail)),
-        f"estimated errors are as large as the data sheet says; the largest is {worst}",
-        f"{worst} is larger than the data sheet allows: check mounting, units and calibration",
-    )
+    limit = float(norm.isf(tail))
+    return verdict(label, float(shift.max()), 0.0, limit, f"{good} {worst}", f"{worst} {bad}")
 
 
 def mcreynolds_verdicts(

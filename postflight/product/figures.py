@@ -1,0 +1,68 @@
+"""Figures of the trajectory as a product: the air of the day, residuals, filter against smoother, angles with bands."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from flightmodel.atmosphere import profile_from_sounding
+from flightmodel.checks import FloatArray
+from postflight.figures import stamp
+from postflight.pipeline import Flight
+from recon.air import ReconstructedAir
+
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "0.55"
+
+
+def _clean(*axes: Axes) -> None:
+    for ax in axes:
+        ax.grid(alpha=0.3)
+        ax.spines[["top", "right"]].set_visible(False)
+
+
+def _bands(
+    ax: Axes, height_km: FloatArray, middle: FloatArray, sd: FloatArray, prior: FloatArray, prior_sd: FloatArray
+) -> None:
+    """Prior and posterior along altitude, one sd and (pale) three of the posterior."""
+    ax.fill_betweenx(height_km, prior - prior_sd, prior + prior_sd, color="0.87", lw=0, label="sounding, 1 sd")
+    ax.plot(prior, height_km, color=GREY, lw=1, ls=":")
+    ax.fill_betweenx(height_km, middle - sd, middle + sd, color=BLUE, alpha=0.25, lw=0, label="reconstructed, 1 sd")
+    ax.plot(middle, height_km, color=BLUE, lw=1.4)
+
+
+def figure_air(flight: Flight, day: ReconstructedAir) -> Figure:
+    """Density ratio and winds along altitude with prior and posterior bands; measured over predicted drag."""
+    figure = Figure(figsize=(9.6, 6.6), layout="constrained")
+    upper, lower = list(np.asarray(figure.subfigures(2, 1, height_ratios=(1.7, 1.0))))
+    axes = upper.subplots(1, 3, sharey=True)
+    ratio_ax = lower.subplots()
+    _clean(*axes, ratio_ax)
+    p = day.profile
+    z = p["altitude_m"].to_numpy() / 1000.0
+    wind = profile_from_sounding(flight.telemetry.sounding).at(1000.0 * z).wind_ned_mps
+    column = {name: p[name].to_numpy() for name in p}
+    one = np.ones(len(z))
+    prior_wind = column["wind_prior_sd_mps"]
+    _bands(axes[0], z, column["density_ratio"], column["density_ratio_sd"], one, column["density_ratio_prior_sd"])
+    for ax, k, way in ((axes[1], 0, "north"), (axes[2], 1, "east")):
+        _bands(
+            ax, z, wind[:, k] + column[f"wind_{way}_change_mps"], column[f"wind_{way}_sd_mps"], wind[:, k], prior_wind
+        )
+        ax.set_xlabel(f"wind towards {way} (m/s)")
+    axes[0].set(xlabel="density / sounding's density", ylabel="altitude (km)")
+    axes[1].legend(fontsize=8, frameon=False, loc="lower left")
+    d = day.drag
+    mach, ratio, prior_sd = (d[name].to_numpy() for name in ("mach", "ratio", "ratio_prior_sd"))
+    order = np.argsort(mach)
+    ratio_ax.fill_between(mach[order], 1.0 - prior_sd[order], 1.0 + prior_sd[order], color="0.87", lw=0,
+                          label="density and C_A before the flight, 1 sd")  # fmt: skip
+    ratio_ax.axhline(1.0, color=GREY, lw=1, ls=":")
+    ratio_ax.plot(mach, ratio, ".", ms=3, color=BLUE, label="axial force, measured / predicted (0.4 s means)")
+    low, high = np.percentile(ratio, [1, 99])
+    room = max(1.3 * np.abs(np.array([low, high]) - 1.0).max(), 1.5 * float(np.median(prior_sd)))
+    ratio_ax.set(xlabel="Mach number", ylabel="drag ratio", ylim=(1.0 - room, 1.0 + room))
+    ratio_ax.legend(fontsize=8, frameon=False, loc="lower right", ncols=2)
+    figure.suptitle("Air of the day: from the deceleration along the reconstructed trajectory", fontsize=11)
+    stamp(figure, flight.telemetry)
+    return figure

@@ -1,0 +1,168 @@
+"""Air of the day from data made by the model itself: what was put in comes out, as well as is claimed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from flightmodel import rotations
+from flightmodel.atmosphere import standard_atmosphere
+from flightmodel.checks import GateError
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from recon import air
+
+KNOWN = replace(standard_atmosphere(), wind_sd_mps=np.full(41, 4.0), density_sd=np.full(41, 0.03))
+VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
+DRAG = air.Drag(VEHICLE.aero, VEHICLE.reference.area_m2 / VEHICLE.mass_kg, 0.03, 0.07, VEHICLE.reference.length_m)
+
+
+def descent(spin_rpm=6.0, attitude_sd=1e-5):
+    """A fall from 70 to 22 km at a lateral angle of a few degrees, nose down, spinning about the nose's axis."""
+    t = np.arange(0.0, 130.0, 0.4)
+    speed = np.interp(t, [0, 15, 25, 40, 130], [1600.0, 1450.0, 950.0, 250.0, 100.0])
+    altitude = 70e3 - 0.98 * 0.4 * np.cumsum(speed)
+    velocity = np.column_stack([0.1 * speed, 0.15 * speed, 0.98 * speed])
+    down = rotations.exp(np.array([0.0, -0.5 * np.pi, 0.0]))
+    tip = rotations.exp(np.column_stack([0.04 * np.sin(3 * t), 0.1 + 0.05 * np.cos(3 * t), 0.0 * t]))
+    turn = rotations.exp(np.column_stack([spin_rpm * 2 * np.pi / 60.0 * t, 0 * t, 0 * t]))
+    dcm = rotations.dcm_from_q(rotations.multiply(down, rotations.multiply(tip, turn)))
+    root = np.tile(np.diag([0.02] * 3 + [attitude_sd] * 3), (len(t), 1, 1))
+    return air.AirSamples(t, altitude, velocity, dcm, np.full((len(t), 3), -10.0), root)
+
+
+def pushed(samples, seen, rng=None):
+    """Samples with the forces that the model makes of what each of them sees (n, SEEN), with its noise."""
+    force = air._Model(samples, KNOWN, DRAG).forces(seen)[0]
+    if rng is not None:
+        part = np.array([air.MODEL_PART, air.LATERAL_PART, air.LATERAL_PART])
+        force = force + np.hypot(air.MODEL_FLOOR_MPS2, part * np.abs(force[:, :1])) * rng.standard_normal(force.shape)
+    return replace(samples, specific_force_body_mps2=force)
+
+
+def drawn(samples, rng):
+    """What the samples see when every unknown is drawn from its prior, and density and winds at the knots."""
+    height = air._knots(samples.altitude_m, air.KNOT_M)
+    at = air._interpolation(samples.altitude_m, height)
+    seen = np.zeros((len(samples.time_s), air.SEEN))
+    knots = []
+    for k, length in enumerate((5000.0, 3000.0, 3000.0)):
+        root = np.linalg.cholesky(np.linalg.inv(air._process_information(height, length, air.CONSTANT_PART)))
+        knots.append(root @ rng.standard_normal(len(height)))
+        seen[:, k] = at @ knots[-1]
+    sd = np.array([0.03, 0.07, 0.3, 0.1, *[np.deg2rad(1.0)] * 4])
+    own = sd * rng.standard_normal(8)
+    seen[:, 3:11] = own
+    return seen, height, np.array(knots), own
+
+
+def test_sounding_without_errors_is_left_as_it_is():
+    samples = descent()
+    found = air.reconstruct_air(pushed(samples, np.zeros((len(samples.time_s), air.SEEN))), KNOWN, DRAG)
+    assert np.abs(found.profile.density_ratio - 1.0).max() < 1e-6
+    assert np.abs(found.profile[["wind_north_change_mps", "wind_east_change_mps"]]).to_numpy().max() < 1e-4
+    assert np.abs(found.drag.ratio - 1.0).max() < 1e-12
+    assert all(v.passed for v in found.verdicts)
+
+
+@pytest.fixture(scope="module")
+def many():
+    """Sixteen days drawn from the prior: normalised errors of density, winds and C_A, and sds over prior."""
+    rows = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        samples = descent()
+        seen, height, knots, own = drawn(samples, rng)
+        found = air.reconstruct_air(pushed(samples, seen, rng), KNOWN, DRAG)
+        p, at = found.profile, np.isin(height, found.profile.altitude_m)
+        truth = [np.exp(0.03 * knots[0, at]), 4.0 * knots[1, at], 4.0 * knots[2, at]]
+        z = [
+            (p.density_ratio - truth[0]) / p.density_ratio_sd,
+            (p.wind_north_change_mps - truth[1]) / p.wind_north_sd_mps,
+            (p.wind_east_change_mps - truth[2]) / p.wind_east_sd_mps,
+        ]
+        ca = (found.parameters.estimate[0] - own[0]) / found.parameters.sd[0]
+        rows.append((np.array(z), ca, (p.density_ratio_sd / 0.03).mean(), (p.wind_north_sd_mps / 4.0).mean(), found))
+    return rows
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_errors_are_as_large_as_claimed_at_every_height(many, which):
+    values = np.array([row[0][which] for row in many]) ** 2
+    low, high = chi2.ppf([0.0001, 0.9999], len(many)) / len(many)
+    # winds carry the air's structure between knots on top, which the model's own data have none of
+    assert (values.mean(axis=0) > (low if which == 0 else 0.5 * low)).all()
+    assert (values.mean(axis=0) < high).all()
+
+
+def test_density_and_drag_share_a_factor_and_say_so(many):
+    low, high = chi2.ppf([0.0001, 0.9999], len(many)) / len(many)
+    assert low < np.mean([row[1] ** 2 for row in many]) < high
+    sd = many[0][4].parameters.sd[0]
+    assert 0.3 * 0.03 < sd < 0.8 * 0.03
+
+
+def test_flight_teaches_about_the_air(many):
+    assert np.mean([row[2] for row in many]) < 0.75
+    assert np.mean([row[3] for row in many]) < 0.9
+
+
+def test_days_like_the_prior_turn_no_verdict_red(many):
+    assert not [v.name for row in many for v in row[4].verdicts if not v.passed]
+
+
+def test_spin_tells_winds_from_an_offset_of_the_body():
+    """Two degrees that turn with the body and no wind, in the slow part of the fall, where both look most alike."""
+    sd, offset_sd, taken = {}, {}, {}
+    for spin in (0.0, 6.0):
+        samples = descent(spin)
+        samples = samples.rows(samples.altitude_m < 26e3)
+        seen = np.zeros((len(samples.time_s), air.SEEN))
+        seen[:, 9] = np.deg2rad(2.0)
+        found = air.reconstruct_air(pushed(samples, seen), KNOWN, DRAG)
+        sd[spin] = found.profile.wind_east_sd_mps.mean()
+        offset_sd[spin] = found.parameters.sd[6]
+        taken[spin] = np.abs(found.profile.wind_east_change_mps).max()
+    assert sd[6.0] < 0.87 * sd[0.0]
+    assert offset_sd[6.0] < 0.87 * offset_sd[0.0]
+    assert taken[6.0] < 0.3 * taken[0.0]
+
+
+def test_attitude_that_is_not_known_hides_the_winds():
+    sd = []
+    for attitude_sd in (1e-5, np.deg2rad(3.0)):
+        samples = descent(attitude_sd=attitude_sd)
+        found = air.reconstruct_air(pushed(samples, np.zeros((len(samples.time_s), air.SEEN))), KNOWN, DRAG)
+        sd.append(found.profile.wind_north_sd_mps.iloc[:10].mean())
+    assert sd[1] > 1.4 * sd[0]
+
+
+@pytest.mark.parametrize(
+    ("column", "verdict", "words"), [(0, "sounding density", "density"), (2, "sounding wind", "wind east")]
+)
+def test_layer_that_nobody_sounded_turns_its_verdict_red(column, verdict, words):
+    samples = descent()
+    seen = np.zeros((len(samples.time_s), air.SEEN))
+    low, high = (45e3, 55e3) if column == 0 else (0.0, 32e3)
+    inside = (samples.altitude_m > low) & (samples.altitude_m < high)
+    seen[inside, column] = np.log(1.15) / 0.03 if column == 0 else 5.0
+    red = [v for v in air.reconstruct_air(pushed(samples, seen), KNOWN, DRAG).verdicts if not v.passed]
+    assert verdict in [v.name for v in red]
+    words_of = next(v.words for v in red if v.name == verdict)
+    assert words_of.startswith(words)
+    assert low <= 1e3 * float(words_of.split(" at ")[1].split(" km")[0]) <= high
+
+
+def test_force_that_is_no_air_is_told():
+    samples = descent()
+    rng = np.random.default_rng(0)
+    pushed_samples = pushed(samples, np.zeros((len(samples.time_s), air.SEEN)))
+    force = pushed_samples.specific_force_body_mps2 * (1.0 + 0.1 * rng.standard_normal((len(samples.time_s), 1)))
+    found = air.reconstruct_air(replace(pushed_samples, specific_force_body_mps2=force), KNOWN, DRAG)
+    assert "air residuals axial" in [v.name for v in found.verdicts if not v.passed]
+
+
+def test_thin_air_is_refused_in_words():
+    samples = descent()
+    with pytest.raises(GateError, match="windows with a deceleration above"):
+        air.reconstruct_air(replace(samples, specific_force_body_mps2=np.zeros((len(samples.time_s), 3))), KNOWN, DRAG)
