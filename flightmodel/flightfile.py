@@ -76,6 +76,23 @@ class AttitudeEntry(Section):
         return self
 
 
+class DisturbedEntry(Section):
+    """A span in which more acts than sensors or model tell; `flightmodel.telemetry.Disturbed`."""
+
+    from_s: Time
+    to_s: Time
+    sd_mps2: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
+    sd_degps: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
+
+    @model_validator(mode="after")
+    def _something(self) -> DisturbedEntry:
+        if not self.from_s < self.to_s:
+            raise KeyFaults([("to_s", self.to_s, f"a span ends after it begins; it begins at {self.from_s:g} s")])
+        if self.sd_mps2 == 0.0 and self.sd_degps == 0.0:
+            raise KeyFaults([("sd_mps2", 0.0, "say what is disturbed: sd_mps2, sd_degps or both")])
+        return self
+
+
 class MotionEntry(Section):
     """How the vehicle moves between measurements; `flightmodel.telemetry.Motion`."""
 
@@ -87,6 +104,7 @@ class MotionEntry(Section):
     acceleration_density: Annotated[float, Field(ge=0.0, le=100.0)] = 0.002
     powered_s: Spans | None = None
     powered_sd_mps2: Annotated[float, Field(gt=0.0, le=1e4)] = 50.0
+    disturbed: list[DisturbedEntry] = []
 
     @model_validator(mode="after")
     def _drag_known(self) -> MotionEntry:

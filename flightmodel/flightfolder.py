@@ -19,7 +19,17 @@ from flightmodel.gate import Gate
 from flightmodel.onboard_tables import read_frames, read_sun, read_triad
 from flightmodel.pointing import q_ecef_body_from_pointing
 from flightmodel.sounding import read_sounding
-from flightmodel.telemetry import AttitudePrior, Finding, Frames, GnssRecord, Motion, RadarRecord, Sounding, Telemetry
+from flightmodel.telemetry import (
+    AttitudePrior,
+    Disturbed,
+    Finding,
+    Frames,
+    GnssRecord,
+    Motion,
+    RadarRecord,
+    Sounding,
+    Telemetry,
+)
 from flightmodel.tracking_tables import read_barometer, read_gnss, read_radar
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
@@ -160,6 +170,7 @@ def _motion(entry: MotionEntry) -> Motion:
         acceleration_density=entry.acceleration_density,
         powered_s=entry.powered_s or (),
         powered_sd_mps2=entry.powered_sd_mps2,
+        disturbed=tuple(Disturbed(d.from_s, d.to_s, d.sd_mps2, float(np.deg2rad(d.sd_degps))) for d in entry.disturbed),
     )
 
 

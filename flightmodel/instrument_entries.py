@@ -114,7 +114,16 @@ class SunEntry(Source):
     mount_sd_deg: NonNegative = 0.2
 
 
-class RadarEntry(Source):
+class TrackingSource(Source):
+    """A table of places; of rows closer than ``every_s`` some are predicted and not used (a smoothed, oversampled one).
+
+    Errors that last several rows are no white noise: taken for it, a hundred rows of one error count as a hundred.
+    """
+
+    every_s: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
+
+
+class RadarEntry(TrackingSource):
     """A tracking radar and its site (WGS-84)."""
 
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
@@ -123,6 +132,8 @@ class RadarEntry(Source):
     tracks: Literal["cg", "datum"] = "cg"
     range_sd_m: Positive = 5.0
     angle_sd_deg: Positive = 0.0086
+    azimuth_sd_deg: Positive | None = None
+    elevation_sd_deg: Positive | None = None
     range_bias_sd_m: NonNegative = 3.0
     angle_bias_sd_deg: NonNegative = 0.003
     time_bias_sd_s: NonNegative = 0.001
@@ -136,7 +147,7 @@ class RadarEntry(Source):
     range_scale_sd: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
 
 
-class Heights(Source):
+class Heights(TrackingSource):
     """A table with heights: above what, and by how much the two surfaces differ."""
 
     height_is: Literal["ellipsoid", "msl"] | None = None

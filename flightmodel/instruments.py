@@ -58,6 +58,8 @@ class RadarSite:
         WGS-84.
     range_sd_m, angle_sd_rad : float
         White noise per sample; the angle's across the line of sight, so azimuth scatters ``1 / cos(elevation)`` more.
+    azimuth_sd_rad, elevation_sd_rad : float or None
+        The same of one angle, where the two differ; azimuth's across the line of sight too.
     range_bias_sd_m, angle_bias_sd_rad, time_bias_sd_s : float
         Systematic errors, constant over a flight, one standard deviation.
     mislevel_sd_rad, droop_sd_rad, skew_sd_rad, nonorthogonality_sd_rad : float
@@ -88,6 +90,17 @@ class RadarSite:
     wander_time_constant_s: float = 20.0
     refraction_sd: float = 0.0
     range_scale_sd: float = 0.0
+    azimuth_sd_rad: float | None = None
+    elevation_sd_rad: float | None = None
+
+    @property
+    def angles_sd_rad(self) -> tuple[float, float]:
+        """White noise across the line of sight, in azimuth's direction and in elevation's."""
+        azimuth, elevation = self.azimuth_sd_rad, self.elevation_sd_rad
+        return (
+            self.angle_sd_rad if azimuth is None else azimuth,
+            self.angle_sd_rad if elevation is None else elevation,
+        )
 
 
 @dataclass(frozen=True)

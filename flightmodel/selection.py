@@ -1,6 +1,6 @@
 """Which rows of a table are used: those inside the spans that flight.toml states, and of repeated times the first.
 
-Times are those after ``time.offset_s`` was added.
+Times are those after ``time.offset_s`` was added. Of an oversampled tracker's rows some are read but only predicted.
 """
 
 from __future__ import annotations
@@ -30,3 +30,24 @@ def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArr
             findings.append(Finding(name, words, np.nan, np.nan))
         use &= inside
     return use, findings
+
+
+def spaced(time_s: FloatArray, every_s: float) -> BoolArray:
+    """Rows (n,) that keep at least ``every_s`` from the one kept before, the first among them; all of them for 0."""
+    if every_s <= 0.0:
+        return np.ones(len(time_s), dtype=bool)
+    keep = np.zeros(len(time_s), dtype=bool)
+    next_s = -np.inf
+    for k, t in enumerate(time_s.tolist()):
+        if t >= next_s - 1e-6:
+            keep[k], next_s = True, t + every_s
+    return keep
+
+
+def oversampled(name: str, time_s: FloatArray, every_s: float) -> list[Finding]:
+    """Say how many of a tracker's rows only check the trajectory."""
+    idle = int((~spaced(time_s, every_s)).sum())
+    if not idle:
+        return []
+    words = f"{idle} of {len(time_s)} rows lie closer than every_s = {every_s:g} s: they check the trajectory, no more"
+    return [Finding(name, words, np.nan, np.nan)]

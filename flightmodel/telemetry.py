@@ -68,13 +68,15 @@ class SunRecord:
 class RadarRecord:
     """Track points of one radar: slant range m, azimuth from true north rad, elevation rad; NaN is missing.
 
-    ``point`` is what is tracked: ``"cg"`` (skin track, centroid of the echo near the c.g.) or ``"datum"``.
+    ``point`` is what is tracked: ``"cg"`` (skin track, centroid of the echo near the c.g.) or ``"datum"``. Of points
+    closer than ``every_s`` some are predicted, not used.
     """
 
     site: RadarSite
     time_s: FloatArray
     range_az_el: FloatArray
     point: str = "cg"
+    every_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Check once."""
@@ -95,12 +97,15 @@ class GnssRecord:
         NaN is missing.
     velocity_ecef_mps : (n, 3) float
         Relative to the rotating Earth; NaN where the receiver gives none.
+    every_s : float
+        Of fixes closer than this some are predicted, not used.
     """
 
     spec: GnssSpec
     time_s: FloatArray
     position_ecef_m: FloatArray
     velocity_ecef_mps: FloatArray
+    every_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Check once."""
@@ -120,11 +125,14 @@ class BarometerRecord:
         Strictly increasing, seconds after t0.
     height_m : (n,) float
         Above the WGS-84 ellipsoid; NaN is missing.
+    every_s : float
+        Of heights closer than this some are predicted, not used.
     """
 
     spec: BarometerSpec
     time_s: FloatArray
     height_m: FloatArray
+    every_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Check once."""
@@ -165,6 +173,23 @@ class AttitudePrior:
 
 
 @dataclass(frozen=True)
+class Disturbed:
+    """Span in which more acts, or is shaken out of the sensors, than is modelled or than their noise tells.
+
+    Parameters
+    ----------
+    start_s, end_s : float
+    sd_mps2, sd_radps : float
+        Acceleration and rate that may be missed for about a second at a time, of each axis.
+    """
+
+    start_s: float
+    end_s: float
+    sd_mps2: float
+    sd_radps: float
+
+
+@dataclass(frozen=True)
 class Motion:
     """How the vehicle moves, as far as it is stated rather than measured.
 
@@ -185,6 +210,8 @@ class Motion:
         Spans in which thrust or an opening parachute acts.
     powered_sd_mps2 : float
         Acceleration that may act there, of each axis.
+    disturbed : tuple of Disturbed
+        Spans with a size of their own, with or without inertial sensors.
     """
 
     model: Literal["strapdown", "ballistic"] = "strapdown"
@@ -195,6 +222,7 @@ class Motion:
     acceleration_density: float = 0.002
     powered_s: tuple[tuple[float, float], ...] = ()
     powered_sd_mps2: float = 50.0
+    disturbed: tuple[Disturbed, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from flightmodel.findings import find_faults
 from flightmodel.gate import Gate, Table
 from flightmodel.instrument_entries import BarometerEntry, GnssEntry, RadarEntry
 from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite
+from flightmodel.selection import oversampled
 from flightmodel.telemetry import BarometerRecord, Finding, GnssRecord, RadarRecord, Sounding
 
 ECEF, GEODETIC = ("x", "y", "z"), ("lat", "lon", "alt")
@@ -37,7 +38,8 @@ def read_radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
         gate.faults.append(f"{label}: {table.path}: no track point with range, azimuth and elevation; remove the radar")
         return None
     gate.findings.extend(find_faults(name, table.time_s, ("range", "az", "el"), values))
-    return RadarRecord(_site(name, source), table.time_s, values, source.tracks)
+    gate.findings.extend(oversampled(name, table.time_s, source.every_s))
+    return RadarRecord(_site(name, source), table.time_s, values, source.tracks, source.every_s)
 
 
 def _site(name: str, source: RadarEntry) -> RadarSite:
@@ -53,10 +55,11 @@ def _site(name: str, source: RadarEntry) -> RadarSite:
             source.wander_sd_deg,
         ]
     )
+    own = [None if sd is None else float(np.deg2rad(sd)) for sd in (source.azimuth_sd_deg, source.elevation_sd_deg)]
     return RadarSite(
         name, lat, lon, source.height_m, source.range_sd_m, angle_sd, source.range_bias_sd_m, angle_bias_sd,
         source.time_bias_sd_s, mislevel, droop, skew, square, wander, source.wander_time_constant_s,
-        source.refraction_sd, source.range_scale_sd,
+        source.refraction_sd, source.range_scale_sd, *own,
     )  # fmt: skip
 
 
@@ -83,7 +86,8 @@ def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:
     if velocity is None:
         return None
     gate.findings.extend(find_faults(name, time_s, ("x", "y", "z"), position))
-    return GnssRecord(_gnss_spec(name, source), time_s, position, velocity)
+    gate.findings.extend(oversampled(name, time_s, source.every_s))
+    return GnssRecord(_gnss_spec(name, source), time_s, position, velocity, source.every_s)
 
 
 def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> BoolArray:
@@ -242,7 +246,8 @@ def read_barometer(
         source.wander_time_constant_s,
         source.time_bias_sd_s,
     )
-    return BarometerRecord(spec, table.time_s, height)
+    gate.findings.extend(oversampled(name, table.time_s, source.every_s))
+    return BarometerRecord(spec, table.time_s, height, source.every_s)
 
 
 def _barometer_form(gate: Gate, table: Table, source: BarometerEntry) -> str | None:

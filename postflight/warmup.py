@@ -64,7 +64,16 @@ def _tiny_problem() -> Problem:
     model = ErrorModel((Block("all", tuple("abcdefghijklmnopqr"), "1", 1.0),))
     start = States(earth.ecef_from_geodetic(0.6, -1.3, 5e4), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(18))
     nothing = Instrument(
-        "none", 0, "none", np.zeros(3), np.zeros(3), np.eye(3), np.empty(0), *(np.empty((0, 3)) for _ in range(3))
+        "none",
+        0,
+        "none",
+        np.zeros(3),
+        np.zeros(3),
+        np.eye(3),
+        np.empty(0),
+        np.empty((0, 3)),
+        np.empty((0, 3)),
+        np.empty((0, 3)),
     )
     nodes = np.arange(3)
     observed, row = observe(motion.time_s, (nothing,), 0.0)

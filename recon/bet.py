@@ -27,6 +27,7 @@ from recon.settings import Settings
 from recon.setup import Bridges, build_problem
 from recon.smoother import Smoothed
 from recon.state import ROTATION, States, boxminus
+from recon.withheld import withheld_table
 
 __all__ = ["Reconstruction", "Settings", "reconstruct"]
 
@@ -54,6 +55,9 @@ class Reconstruction:
         ``name, unit, prior_sd, estimate, sd``; of errors that wander, the value at mid-span.
     residuals : DataFrame
         ``time_s, source, component, residual, predicted_sd, accepted``: radar innovations of the last pass, m and rad.
+    withheld : DataFrame
+        ``time_s, source, component, residual, predicted_sd``: measurements that were not used, against the smoothed
+        trajectory (`recon.withheld`).
     verdicts : tuple of Verdict
     imu_time_s : (k,) float
         Times of the accelerometer's valid samples outside gyro gaps.
@@ -70,6 +74,7 @@ class Reconstruction:
     filtered: Trajectory
     sensor_errors: pd.DataFrame
     residuals: pd.DataFrame
+    withheld: pd.DataFrame
     verdicts: tuple[Verdict, ...]
     imu_time_s: FloatArray
     specific_force_body_mps2: FloatArray
@@ -117,6 +122,7 @@ def reconstruct(
         filtered=product.datum_trajectory(problem, mount, run.states(), run.filtered.p_plus),
         sensor_errors=table,
         residuals=product.residual_table(problem, run.innovations),
+        withheld=withheld_table(problem, run, settings.engine),
         verdicts=tuple(verdicts),
         imu_time_s=series[0],
         specific_force_body_mps2=series[1],

@@ -5,6 +5,9 @@ otherwise, and the gate rejects every point that follows. That is told from a tr
 while (a side lobe) by the others: where any source is still believed, the rejected one is suspect; where none is, and
 none comes back, the motion is. Then an unknown acceleration is allowed between the last point that was believed and the
 first that was not, white noise of density ``D`` along every axis, ten times larger each time it does not suffice.
+
+What an analyst states beforehand (``[[motion.disturbed]]``: shaking that turns into bias, a saturated gyro, thrust) is
+the same noise, of accelerations and of rates.
 """
 
 from __future__ import annotations
@@ -15,7 +18,9 @@ from itertools import pairwise
 import numpy as np
 
 from flightmodel.telemetry import Finding
+from flightmodel.telemetry import Motion as MotionSpec
 from recon.ekf import ForwardPass
+from recon.motion import Motion
 from recon.packed import Innovations
 from recon.problem import Problem
 
@@ -23,6 +28,20 @@ LOST_S = 5.0  # nothing believed for so long, or to the end of the track
 LOST_POINTS = 6
 BEFORE_S, AFTER_S = 1.5, 0.5  # a slow departure passes the gate for a while
 FIRST_DENSITY, GROWTH, LARGEST_DENSITY = 0.1, 10.0, 1.1e5  # (m/s^2)^2/Hz
+
+
+STATED_CORRELATION_S = 1.0  # what is disturbed keeps its value for about so long
+
+
+def with_stated(motion: Motion, spec: MotionSpec) -> Motion:
+    """Motion with the noise of the spans that flight.toml calls disturbed."""
+    force, rate = motion.force_density.copy(), motion.rate_density.copy()
+    for d in spec.disturbed:
+        inside = (motion.time_s >= d.start_s) & (motion.time_s < d.end_s)
+        force[inside] += d.sd_mps2**2 * STATED_CORRELATION_S
+        if not motion.ballistic:  # which has no rotation
+            rate[inside] += d.sd_radps**2 * STATED_CORRELATION_S
+    return motion._replace(force_density=force, rate_density=rate)
 
 
 @dataclass(frozen=True)

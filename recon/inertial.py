@@ -4,7 +4,8 @@ White noise of ``sd`` per sample at ``rate`` hertz drives the integrals with den
 ``resolution^2 / 12`` to the variance of a sample. A gap is bridged by a cubic that meets level and slope on both
 sides. What the bridge may miss is measured, not guessed: the same bridge is laid over pieces of the same length in
 the neighbouring good data, and the scatter E^2 of its integral there becomes the density ``E^2 / length`` inside the
-gap, per body axis, from the worse side.
+gap, per body axis, from the worse side. What counts as a gap is told by the samples nearby: a logger may change its
+rate in flight. Between slow samples the straight line misses about a twelfth of their second difference.
 
 Mechanisation joins samples by straight lines. `unbent` moves them so that the lines have the integral of the curve;
 else the error of the joins would be as large as the coning and sculling that are corrected for.
@@ -25,6 +26,8 @@ from recon.state import BoolArray, IntArray
 
 SAME_INSTANT_S = 2e-6
 SLOPE_SPAN_S = 0.06
+NEARBY_STEPS = 31  # of which the median is the usual step
+SLOWER = 1.5  # than the record's own usual step
 
 
 @dataclass(frozen=True)
@@ -68,18 +71,18 @@ def bridge(record: TriadRecord) -> Bridged:
     spec = record.spec
     t, x = valid_samples(record)
     step = np.diff(t)
-    nominal = float(np.median(step))
-    sample_var = spec.noise_sd**2 + spec.resolution**2 / 12.0
-    density = np.full((len(t), 3), max(sample_var, 1e-24) * nominal)
+    usual = usual_steps(step)
+    sample_var = max(spec.noise_sd**2 + spec.resolution**2 / 12.0, 1e-24)
+    density = sample_var * np.append(usual, usual[-1])[:, None] + _between_slow(t, x, usual, spec.dcm_body_sensor)
     in_gap = np.zeros(len(t), dtype=bool)
     findings: list[Finding] = []
     extra_t: list[FloatArray] = []
     extra_x: list[FloatArray] = []
     extra_density: list[FloatArray] = []
-    for k in np.flatnonzero(step > 1.5 * nominal).tolist():
-        length = step[k]
+    for k in np.flatnonzero(step > 1.5 * usual).tolist():
+        length, nominal = step[k], usual[k]
         in_gap[k] = True
-        density[k] = max(sample_var, 1e-24) * length
+        density[k] = sample_var * length
         if length <= 4.5 * nominal:  # a few samples: the straight line is as good as the signal is smooth
             continue
         missed = _missed_sd(t, x, k, length, spec.dcm_body_sensor)
@@ -102,6 +105,23 @@ def bridge(record: TriadRecord) -> Bridged:
         in_gap = np.concatenate([in_gap, gap_flags])[order]
         t = all_t[order]
     return Bridged(spec, t, x, density, in_gap, tuple(findings))
+
+
+def usual_steps(step: FloatArray) -> FloatArray:
+    """Step (n,) that is usual about each step, the median of `NEARBY_STEPS`."""
+    from scipy.ndimage import median_filter
+
+    return np.asarray(median_filter(step, size=min(NEARBY_STEPS, len(step)), mode="nearest"))
+
+
+def _between_slow(t: FloatArray, x: FloatArray, usual: FloatArray, dcm: FloatArray) -> FloatArray:
+    """Density (n, 3), body axes, of what a straight line misses where samples come slower than the record's usual."""
+    out = np.zeros((len(t), 3))
+    slow = np.flatnonzero(usual > SLOWER * float(np.median(usual)))
+    slow = slow[(slow > 0) & (slow < len(t) - 1)]
+    bend = (x[slow + 1] - 2.0 * x[slow] + x[slow - 1]) @ dcm.T
+    out[slow] = (bend / 12.0) ** 2 * usual[slow, None]
+    return out
 
 
 def _level_and_slope(t: FloatArray, x: FloatArray, at: int, side: int) -> tuple[FloatArray, FloatArray]:
@@ -141,7 +161,7 @@ def _missed_sd(t: FloatArray, x: FloatArray, k: int, length: float, dcm: FloatAr
         misses = []
         for start in starts:
             a, b = np.searchsorted(t, [start, start + length])
-            if a < 2 or b > len(t) - 2 or np.diff(t[a : b + 1]).max() > 0.2 * length:
+            if b - a < 2 or a < 2 or b > len(t) - 2 or np.diff(t[a : b + 1]).max() > 0.2 * length:
                 continue
             bridged = _cubic(t, x, int(a), int(b), t[a : b + 1])
             misses.append(np.trapezoid((bridged - x[a : b + 1]) @ dcm.T, t[a : b + 1], axis=0))

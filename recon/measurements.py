@@ -77,6 +77,8 @@ class Instrument:
     time_s : (k,) float
     value, variance, known : (k, 3) float
         As in `recon.packed.Observed`.
+    every_s : float
+        Of measurements closer than this some are predicted, not used.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Instrument:
     value: FloatArray
     variance: FloatArray
     known: FloatArray
+    every_s: float = 0.0
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -109,7 +112,7 @@ class Instrument:
 
 def _instrument(
     name: str, kind: int, owner: str, arm: FloatArray, site: FloatArray, dcm: FloatArray,
-    time_s: FloatArray, value: FloatArray, sd: FloatArray, known: FloatArray | None = None,
+    time_s: FloatArray, value: FloatArray, sd: FloatArray, known: FloatArray | None = None, every_s: float = 0.0,
 ) -> Instrument:  # fmt: skip
     """Instrument with NaN readings taken as not measured, rows without any left out."""
     variance = np.where(np.isfinite(value), np.broadcast_to(sd, value.shape) ** 2, np.inf)
@@ -118,21 +121,23 @@ def _instrument(
     value = np.where(np.isfinite(value), value, 0.0)
     return Instrument(
         name, kind, owner, np.asarray(arm, dtype=float), np.asarray(site, dtype=float), np.ascontiguousarray(dcm),
-        time_s[keep], value[keep], variance[keep], known[keep],
+        time_s[keep], value[keep], variance[keep], known[keep], every_s,
     )  # fmt: skip
 
 
 def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, traverse: bool = True) -> Instrument:
     """One radar; a missing component leaves the others."""
     site = record.site
-    sd = np.tile([site.range_sd_m, site.angle_sd_rad, site.angle_sd_rad], (len(record.time_s), 1))
+    sd = np.tile([site.range_sd_m, *site.angles_sd_rad], (len(record.time_s), 1))
     if traverse:
         elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
         sd[:, 1] /= np.maximum(np.cos(elevation), 1e-3)
     known = np.tile([SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
     place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
-    return _instrument(name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known)
+    return _instrument(
+        name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known, record.every_s
+    )
 
 
 def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray) -> list[Instrument]:
@@ -149,10 +154,12 @@ def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray)
     speed_sd = np.array([spec.speed_sd_mps, spec.speed_sd_mps, spec.vertical_speed_sd_mps])
     place = (record.position_ecef_m - reference) @ dcm.T
     both = [
-        _instrument(name, POSITION, spec.name, arm, reference, dcm, record.time_s, place, place_sd),
+        _instrument(
+            name, POSITION, spec.name, arm, reference, dcm, record.time_s, place, place_sd, every_s=record.every_s
+        ),
         _instrument(
             f"{name} velocity", VELOCITY, spec.name, arm, reference, dcm,
-            record.time_s, record.velocity_ecef_mps @ dcm.T, speed_sd,
+            record.time_s, record.velocity_ecef_mps @ dcm.T, speed_sd, every_s=record.every_s,
         ),
     ]  # fmt: skip
     return [i for i in both if len(i.time_s)]
@@ -164,7 +171,7 @@ def barometer_instrument(name: str, record: BarometerRecord, accelerometer_m: Fl
     value = np.column_stack([record.height_m, np.full((len(record.height_m), 2), np.nan)])
     return _instrument(
         name, HEIGHT, record.spec.name, -accelerometer_m, np.array([first, 0.0, 0.0]), np.eye(3),
-        record.time_s, value, np.full(3, record.spec.sd_m),
+        record.time_s, value, np.full(3, record.spec.sd_m), every_s=record.every_s,
     )  # fmt: skip
 
 

@@ -83,14 +83,14 @@ class Problem:
         return replace(self, observed=self.observed._replace(usable=self.observed.usable & ~unusable))
 
     def thinned(self, step_s: float) -> tuple[Problem, IntArray]:
-        """Problem with at most one measurement of each instrument every ``step_s``, and which nodes (k,) it keeps.
+        """Problem with at most one used measurement of an instrument every ``step_s``, and the nodes (k,) it keeps.
 
         A node of every step stays even where nothing is measured: what a long step forgets, no smoother can undo.
         """
-        node = self.node
-        cell = np.floor(self.time_s[node] / step_s).astype(np.int64)
-        _, chosen = np.unique(np.column_stack([self.observed.source, cell]), axis=0, return_index=True)
-        chosen = np.sort(chosen)
+        node, used = self.node, np.flatnonzero(self.observed.usable)
+        cell = np.floor(self.time_s[node[used]] / step_s).astype(np.int64)
+        _, first = np.unique(np.column_stack([self.observed.source[used], cell]), axis=0, return_index=True)
+        chosen = np.sort(used[first])
         _, first_of_step = np.unique(np.floor(self.time_s / step_s), return_index=True)
         index = np.unique(np.concatenate([first_of_step, node[chosen]])).astype(np.int64)
         observed = self.observed

@@ -35,6 +35,10 @@ class Settings:
     without : tuple of str
         Sources (radars, receivers, barometers; ``"magnetometer"``, ``"sun1"``, ... where attitude sensors are on) that
         are predicted but never used, not even for the start.
+    withhold_every : int
+        Every so many measurements of each tracker one is predicted but not used; 0 for none.
+    withhold_s : tuple of (float, float)
+        Spans in which no tracker is used, all are predicted.
     attitude_sensors : bool
         Whether magnetometer and Sun sensors are measurements too; otherwise they only start and check the attitude.
     engine, smoother : str
@@ -51,6 +55,8 @@ class Settings:
     angle_noise: str = "traverse"
     consider: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
+    withhold_every: int = 0
+    withhold_s: tuple[tuple[float, float], ...] = ()
     attitude_sensors: bool = False
     engine: str = "compiled"
     smoother: str = "rauch-tung-striebel"
@@ -62,6 +68,9 @@ class Settings:
             faults.append(f"output_rate_hz {self.output_rate_hz} must lie in 0.1 to 1000")
         if not 0 <= self.passes <= 10:
             faults.append(f"passes {self.passes} must lie in 0 to 10")
+        if self.withhold_every != 0 and not 2 <= self.withhold_every <= 1000:
+            faults.append(f"withhold_every {self.withhold_every} must be 0 (none) or lie in 2 to 1000")
+        faults += [f"withhold_s {a:g} to {b:g} s: a span ends after it begins" for a, b in self.withhold_s if not a < b]
         for name in ("gate_probability", "verdict_confidence"):
             if not 0.5 <= getattr(self, name) < 1.0:
                 faults.append(f"{name} {getattr(self, name)} must lie in 0.5 to 1 (1 excluded)")

@@ -8,9 +8,12 @@ import numpy as np
 
 from flightmodel import geomagnetism_and_sun
 from flightmodel.checks import FloatArray, GateError, nearest_name
+from flightmodel.selection import spaced
 from flightmodel.telemetry import Telemetry
 from recon import error_model, inertial, measurements, startup
+from recon._measurement_kernels import HEIGHT, POSITION, RADAR, VELOCITY
 from recon.ballistic import ballistic_motion
+from recon.disturbance import with_stated
 from recon.error_model import ErrorModel
 from recon.inertial import SAME_INSTANT_S, Bridged
 from recon.measurements import Instrument
@@ -18,6 +21,7 @@ from recon.problem import Problem, nearest_index, observe
 from recon.settings import Settings
 from recon.state import BoolArray, IntArray
 
+TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT)
 ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
 BALLISTIC_STEP_S = 0.5  # drivers stand still within a step, and forget in seconds and kilometres
 
@@ -58,13 +62,14 @@ def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | N
         motion, node_index = inertial.inertial_motion(force, rate, time_s)
         prior = startup.attitude_prior(telemetry)
         start, covariance = startup.start_by_inertial_sensors(used, prior, start_s, force, rate, model)
+    motion = with_stated(motion, telemetry.motion)
     from scipy.stats import chi2
 
     gate = np.array([0.0, *(float(chi2.ppf(settings.gate_probability, k)) for k in (1, 2, 3))])
     kept: BoolArray = np.zeros(len(time_s), dtype=bool)
     kept[nearest_index(time_s, output_s)] = True
     problem = Problem(time_s, node_index, motion, model, instruments, row, observed, start, covariance, gate, kept)
-    return problem.without(np.array([_left_out(i, settings) for i in instruments])[observed.source])
+    return problem.without(_only_predicted(problem, settings))
 
 
 def _left_out(instrument: Instrument, settings: Settings) -> bool:
@@ -94,6 +99,24 @@ def _named_model(
     if faults:
         raise GateError(faults)
     return model
+
+
+def _only_predicted(problem: Problem, settings: Settings) -> BoolArray:
+    """Measurements (M,) that check the trajectory: of whole sources, of oversampled ones, of spans, and every n-th."""
+    out: BoolArray = np.zeros(len(problem.row), dtype=bool)
+    at = problem.time_s[problem.node]
+    for number, i in enumerate(problem.instruments):
+        mine = np.flatnonzero(problem.observed.source == number)
+        out[mine] = _left_out(i, settings)
+        if i.kind not in TRACKING:
+            continue
+        out[mine] |= ~spaced(at[mine], i.every_s)
+        if settings.withhold_every:
+            left = mine[~out[mine]]
+            out[left[settings.withhold_every - 1 :: settings.withhold_every]] = True
+        for start, end in settings.withhold_s:
+            out[mine] |= (at[mine] >= start) & (at[mine] < end)
+    return out
 
 
 def _accelerometer_arm(bridges: Bridges | None) -> FloatArray:
