@@ -191,6 +191,8 @@ def print_flight(flight: Flight) -> None:
     for verdict in failed:
         numbers = f"{verdict.value:.3g} outside {verdict.low:.3g} to {verdict.high:.3g}"
         console.print(f"[red]verdict[/] {verdict.name}: {verdict.words} ({numbers})")
+    for k, words in enumerate(flight.suspects):
+        console.print(f"[red]{'suspect' if k == 0 else 'also'}[/] {escape(words)}")
 
 
 def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> None:

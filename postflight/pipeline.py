@@ -31,6 +31,7 @@ from postflight.sensed import pulse_data
 from recon.air import ReconstructedAir
 from recon.bet import Reconstruction, Settings, reconstruct
 from recon.consistency import Verdict
+from recon.suspects import suspects
 
 Progress = Callable[[float, str], None]
 METHODS = ("camera", "misalignment", "trim")
@@ -57,6 +58,11 @@ class Flight:
     def verdicts(self) -> tuple[Verdict, ...]:
         """Verdicts on the trajectory, then on the air."""
         return self.reconstruction.verdicts + (self.day.verdicts if self.day is not None else ())
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """What is most likely wrong, the first first; none where every verdict passes."""
+        return suspects(self.verdicts, self.reconstruction.left_out)
 
     @property
     def has_attitude(self) -> bool:

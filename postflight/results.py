@@ -254,5 +254,7 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
         "methods": method_summary(answers, peak),
         "missing": list(flight.missing),
         "verdicts_passed": sum(v.passed for v in verdicts),
+        "suspect": flight.suspects[0] if flight.suspects else None,
+        "suspects": list(flight.suspects),
         "verdicts_failed": [f"{v.name}: {v.words}" for v in verdicts if not v.passed],
     }

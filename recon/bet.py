@@ -10,7 +10,7 @@ instead (`recon.ballistic`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -18,8 +18,9 @@ import pandas as pd
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
-from recon import consistency, ekf, inertial, product, smoother, startup, strapdown
+from recon import consistency, disagreement, ekf, inertial, product, smoother, startup, strapdown
 from recon.consistency import Verdict
+from recon.disagreement import LeftOut
 from recon.disturbance import Disturbance, disturbed, widened
 from recon.packed import unpacked
 from recon.problem import Problem
@@ -32,6 +33,7 @@ from recon.withheld import withheld_table
 __all__ = ["Reconstruction", "Settings", "reconstruct"]
 
 Progress = Callable[[float, str], None]
+EXAMINED_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
 THINNED_STEP_S = 0.5
 MOST_THINNED_PASSES = 6
 SETTLED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of what it does
@@ -68,6 +70,8 @@ class Reconstruction:
     findings : tuple of Finding
         Gaps that were bridged, stretches of radar track that were edited.
     provenance : dict
+    left_out : tuple of LeftOut
+        What happens without each tracker, where a verdict on one was red.
     """
 
     smoothed: Trajectory
@@ -82,12 +86,13 @@ class Reconstruction:
     specific_force_cov: FloatArray
     findings: tuple[Finding, ...]
     provenance: dict[str, object]
+    left_out: tuple[LeftOut, ...] = ()
 
 
 def reconstruct(
     telemetry: Telemetry, settings: Settings | None = None, progress: Progress | None = None
 ) -> Reconstruction:
-    """Reconstruct a flight.
+    """Reconstruct a flight; where a verdict on a tracker is red, find out what each tracker does to it.
 
     Parameters
     ----------
@@ -102,6 +107,45 @@ def reconstruct(
         Where the data cannot start or carry a filter (no common span, too few points, prior out of reach).
     """
     settings = settings or Settings()
+    report = progress or (lambda _fraction, _what: None)
+    found = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what))
+    sources = trackers(telemetry, settings)
+    if len(sources) > 1 and disagreement.suspicious(found.verdicts, sources):
+        found = _examined(telemetry, settings, found, sources, report)
+    report(1.0, "done")
+    return found
+
+
+def trackers(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
+    """Radars, receivers and barometers that are used."""
+    names = (*telemetry.radars, *telemetry.gnss, *telemetry.barometers)
+    return tuple(name for name in names if name not in settings.without)
+
+
+def _examined(
+    telemetry: Telemetry, settings: Settings, found: Reconstruction, sources: tuple[str, ...], report: Progress
+) -> Reconstruction:
+    """Reconstruction whose covariance and findings know how far the trackers contradict each other."""
+    coarse = min(settings.output_rate_hz, EXAMINED_RATE_HZ)
+
+    def rerun(source: str) -> tuple[Trajectory, tuple[Verdict, ...]]:
+        report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
+        without = replace(settings, without=(*settings.without, source), output_rate_hz=coarse)
+        other = reconstruct_once(telemetry, without)
+        return other.smoothed, other.verdicts
+
+    left_out, more = disagreement.leave_each_out(found.smoothed, sources, rerun)
+    return replace(
+        found,
+        smoothed=disagreement.widened_trajectory(found.smoothed, more),
+        filtered=disagreement.widened_trajectory(found.filtered, more),
+        findings=(*found.findings, *disagreement.disagreement_findings(left_out)),
+        left_out=left_out,
+    )
+
+
+def reconstruct_once(telemetry: Telemetry, settings: Settings, progress: Progress | None = None) -> Reconstruction:
+    """Reconstruct a flight with the covariance as the filter has it, whatever its verdicts say."""
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "bridging gaps")
     bridges = bridge_triads(telemetry)

@@ -28,6 +28,7 @@ from recon.state import BoolArray, States
 from recon.strapdown import correct, correction_partials
 
 SAME_STRETCH_S = 1.0
+MOST_STRETCHES = 12  # that are listed one by one
 UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
 
 
@@ -155,7 +156,13 @@ def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
         if len(times) == 0:
             continue
         what = "track point" if instrument.name == instrument.owner else "reading"
-        for stretch in np.split(times, np.flatnonzero(np.diff(times) > SAME_STRETCH_S) + 1):
+        stretches = np.split(times, np.flatnonzero(np.diff(times) > SAME_STRETCH_S) + 1)
+        if len(stretches) > MOST_STRETCHES:
+            share = 100.0 * len(times) / int(mine.sum())
+            words = f"{len(times)} {what}s edited in {len(stretches)} stretches ({share:.0f} % of them)"
+            out.append(Finding(instrument.name, words, float(times[0]), float(times[-1])))
+            continue
+        for stretch in stretches:
             words = f"{len(stretch)} {what}{'s' if len(stretch) > 1 else ''} edited"
             out.append(Finding(instrument.name, words, float(stretch[0]), float(stretch[-1])))
     return out
