@@ -45,6 +45,16 @@ def kernel(function):
     return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)(function)
 
 
+def exact_kernel(function):
+    """Compile as `kernel` does, but every operation as it is written: for what must round correctly."""
+    return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+
+
+def exact_inlined(function):
+    """Compile as `exact_kernel` does, as a part of every kernel that calls it."""
+    return numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function)
+
+
 def inlined(function):
     """Compile as `kernel` does, and as a part of every kernel that calls it.
 

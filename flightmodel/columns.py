@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from flightmodel.checks import FloatArray, GateError, nearest_name
+from flightmodel.clocktimes import clock_times
 
 IntArray = NDArray[np.int64]
 # unit -> (kind of quantity, factor to SI, offset added after the factor)
@@ -163,6 +163,9 @@ def read_table(path: Path, label: str) -> pd.DataFrame:
         rows = max(0, len(numbered) - 1)
         raise GateError(f"{label}: {path}: {rows} data rows; at least two are needed")
     lines = np.array([k for k, _ in numbered[1:]])
+    opened = _open_quote(numbered)
+    if opened:
+        raise GateError(f"{label}: {path}: line {opened}: a quote opens and is not closed on the line; mend it")
     names, counts = _cells(numbered)
     faults = [f"{label}: {path}: line {numbered[0][0]}: column '{n}' stands twice" for n in _twice(names)]
     ragged = np.flatnonzero(counts != len(names))
@@ -181,13 +184,26 @@ def read_table(path: Path, label: str) -> pd.DataFrame:
     return frame
 
 
+def _open_quote(numbered: list[tuple[int, str]]) -> int:
+    """Line of the first quote that is not closed on its own line; 0 for none."""
+    if any('"' in line for _, line in numbered):
+        for (number, _), row in zip(numbered, csv.reader(line + "\n" for _, line in numbered), strict=False):
+            if any("\n" in cell for cell in row):  # the cell took in the end of its line
+                return number
+    return 0
+
+
 def _cells(numbered: list[tuple[int, str]]) -> tuple[list[str], IntArray]:
     """Names in the header, and the number of cells of each further row."""
     if any('"' in line for _, line in numbered):
         rows = list(csv.reader(line for _, line in numbered))
         return [c.strip() for c in rows[0]], np.array([len(r) for r in rows[1:]])
-    names = [c.strip() for c in numbered[0][1].split(",")]
-    return names, np.array([line.count(",") + 1 for _, line in numbered[1:]])
+    return column_names(numbered[0][1]), np.array([line.count(",") + 1 for _, line in numbered[1:]])
+
+
+def column_names(header: str) -> list[str]:
+    """Names in a header line, without the spaces around them."""
+    return [name.strip() for name in next(csv.reader([header]))]
 
 
 def _twice(names: list[str]) -> list[str]:
@@ -210,6 +226,28 @@ def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: li
         where = f"{label}: {path}: line {line_of(frame, first)}, column '{column}'"
         count = f"({int(bad.sum())} in all)"
         faults.append(f"{where}: '{text.iloc[first]}' is no finite number {count}; leave a missing value empty")
+    return values + 0.0  # no negative zero: whole-number columns know none
+
+
+def place(quantity: Quantity, declared: Declared | None) -> tuple[str, str]:
+    """Column and unit in which a table holds a quantity."""
+    if declared is not None:
+        return declared.column, declared.unit
+    return quantity.canonical, quantity.canonical.rsplit("_", 1)[-1]
+
+
+def fits(quantity: Quantity, unit: str) -> bool:
+    """Whether a quantity can have a unit."""
+    return unit in UNITS and UNITS[unit][0] == quantity.kind
+
+
+def to_si(values: FloatArray, unit: str) -> FloatArray:
+    """Turn numbers of a unit into SI, in place."""
+    _, factor, offset = UNITS[unit]
+    if factor != 1.0:
+        values *= factor
+    if offset != 0.0:
+        values += offset
     return values
 
 
@@ -222,18 +260,16 @@ def column_si(
     faults: list[str],
 ) -> FloatArray | None:
     """Return a quantity in SI, or None where it is absent (a fault when it is required)."""
-    column = declared.column if declared else quantity.canonical
-    unit = declared.unit if declared else quantity.canonical.rsplit("_", 1)[-1]
+    column, unit = place(quantity, declared)
     if column not in frame.columns:
         if quantity.required or declared:
             faults.append(_absent(frame, quantity, column, path, label))
         return None
-    if unit not in UNITS or UNITS[unit][0] != quantity.kind:
+    if not fits(quantity, unit):
         fitting = ", ".join(u for u, (kind, _, _) in UNITS.items() if kind == quantity.kind)
         faults.append(f"{label}: {path}: column '{column}': unit '{unit}' is not one of {quantity.kind}: {fitting}")
         return None
-    _, factor, offset = UNITS[unit]
-    return numbers(frame, column, path, label, faults) * factor + offset
+    return to_si(numbers(frame, column, path, label, faults), unit)
 
 
 def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, label: str) -> str:
@@ -249,10 +285,10 @@ def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, la
     return f"{label}: {path}: line 1: no column '{column}'{hint}; found {', '.join(frame.columns)}"
 
 
-def times_s(
+def unordered_times_s(
     frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
 ) -> FloatArray | None:
-    """Seconds after t0, strictly increasing, or None with a fault for each thing that is wrong."""
+    """Seconds after t0 in the file's order, or None with a fault for each thing that is wrong."""
     absent = [column for column in spec.parts if column not in frame.columns]
     if absent:
         found = ", ".join(frame.columns)
@@ -260,11 +296,11 @@ def times_s(
         faults.append(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}")
         return None
     if spec.format == "seconds":
-        values = numbers(frame, spec.column, path, label, faults) * UNITS[spec.unit][1]
+        values = to_si(numbers(frame, spec.column, path, label, faults), spec.unit)
     elif spec.format == "utc_hms":
         values = _times_of_day([numbers(frame, column, path, label, faults) for column in spec.parts], t0)
     else:
-        values = _clock_times(frame[spec.column].str.strip(), spec.format, t0)
+        values = clock_times(frame[spec.column].str.strip().tolist(), spec.format, t0)
     bad = ~np.isfinite(values)
     if bad.any():
         first = int(np.argmax(bad))
@@ -273,6 +309,16 @@ def times_s(
             f"'{':'.join(frame[column].iloc[first] for column in spec.parts)}' is not in format "
             f"'{spec.format}' ({int(bad.sum())} in all)"
         )
+        return None
+    return values
+
+
+def times_s(
+    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
+) -> FloatArray | None:
+    """Seconds after t0, strictly increasing, or None with a fault for each thing that is wrong."""
+    values = unordered_times_s(frame, spec, t0, path, label, faults)
+    if values is None:
         return None
     step = np.diff(values)
     back = step < 0.0 if spec.repeats == "first" else step <= 0.0
@@ -294,37 +340,3 @@ def _times_of_day(parts: list[FloatArray], t0: datetime) -> FloatArray:
     of_day = (t0 - t0.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()
     after = np.where(real, 3600.0 * hour + 60.0 * minute + second - of_day, np.nan)
     return np.round(after - 86400.0 * np.round(after / 86400.0), 7)
-
-
-_IRIG = re.compile(r"^(\d{1,3}):(\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)$")
-HALF_YEAR_S = 183 * 86400.0
-
-
-def _clock_times(text: pd.Series, form: str, t0: datetime) -> FloatArray:
-    """Seconds after t0 of ISO UTC or IRIG day-of-year times; NaN where a cell does not parse.
-
-    Day-of-year times lie in t0's year, or in the next one where that is nearer (a flight across New Year).
-    """
-    out = np.full(len(text), np.nan)
-    if form == "irig_doy":
-        for k, cell in enumerate(text):
-            match = _IRIG.match(cell)
-            if match:
-                near = [_irig_seconds(match, year, t0) for year in (t0.year, t0.year + 1)]
-                out[k] = near[1] if near[0] < -HALF_YEAR_S else near[0]
-    else:
-        stamps = pd.to_datetime(text, utc=True, errors="coerce", format="ISO8601")
-        good = stamps.notna().to_numpy()
-        base = pd.Timestamp(t0)
-        out[good] = [(stamp - base).total_seconds() for stamp in stamps[good]]
-    # clocks are written to a microsecond at best: remove the rounding of the large offset
-    return np.round(out, 7)
-
-
-def _irig_seconds(match: re.Match[str], year: int, t0: datetime) -> float:
-    """Seconds after t0, or NaN for a day, hour, minute or second that does not exist."""
-    day, hour, minute, second = int(match[1]), int(match[2]), int(match[3]), float(match[4])
-    start, after = datetime(year, 1, 1, tzinfo=UTC), datetime(year + 1, 1, 1, tzinfo=UTC)
-    if not 1 <= day <= (after - start).days or hour > 23 or minute > 59 or second >= 60.0:
-        return float("nan")
-    return (start - t0).total_seconds() + (day - 1) * 86400.0 + hour * 3600 + minute * 60 + second

@@ -1,8 +1,14 @@
-"""What an analyst should know of a sensor's samples: gaps, missing, frozen and saturated runs, each with its times."""
+"""What an analyst should know of a sensor's samples: gaps, missing, frozen and saturated runs, each with its times.
+
+Of very many of one kind the longest are told one by one and the others together: a list that nobody reads hides them.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from numpy.typing import NDArray
 
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.telemetry import Finding
@@ -10,6 +16,8 @@ from flightmodel.telemetry import Finding
 GAP_FACTOR = 5.0  # an interval this many times the usual one is a gap
 FROZEN_S, FROZEN_SAMPLES = 0.5, 10  # a column unchanged for this long, in at least so many samples, is frozen
 SATURATED_SAMPLES = 5  # this many samples in a row at a column's largest or smallest value are a stop
+MANY = 20  # runs of one kind that are told one by one
+Indices = NDArray[np.int64]
 
 
 def find_faults(
@@ -28,43 +36,63 @@ def find_faults(
     missing : (n,) bool, optional
         Rows that count as missing; where not given, those in which any value is.
     """
-    found = []
     if missing is None:
-        missing = np.asarray(~np.isfinite(values).all(axis=1))
+        missing = np.logical_or.reduce([np.isnan(column) for column in values.T])
     step = np.diff(time_s)
-    for k in np.flatnonzero(step > GAP_FACTOR * float(np.median(step))):
-        found.append(Finding(source, f"gap of {step[k]:.3f} s", float(time_s[k]), float(time_s[k + 1])))
-    for first, last in runs(missing):
-        found.append(Finding(source, f"{last - first + 1} samples missing", float(time_s[first]), float(time_s[last])))
+    wide = np.flatnonzero(step > GAP_FACTOR * float(np.median(step)))
+    found = told(source, time_s, wide, wide + 1, lambda k: f"gap of {step[wide[k]]:.3f} s", "gaps")
+    first, last = runs(missing)
+    found += told(source, time_s, first, last, lambda k: f"{last[k] - first[k] + 1} samples missing", "missing runs")
     for name, column in zip(names, values.T, strict=True):
-        # a long run at an extreme may be either: a stop reached, or a sensor that stuck there
-        frozen, saturated = _frozen(time_s, column), _saturated(column)
-        for first, last in sorted({*frozen, *saturated}):
-            is_frozen, is_saturated = (first, last) in frozen, (first, last) in saturated
-            what = "saturated or frozen" if is_frozen and is_saturated else "frozen" if is_frozen else "saturated"
-            words = f"{name} {what} at {column[first]:.6g} (SI) for {last - first + 1} samples"
-            found.append(Finding(source, words, float(time_s[first]), float(time_s[last])))
+        found += _stuck(source, time_s, name, column)
     return found
 
 
-def runs(mask: BoolArray) -> list[tuple[int, int]]:
+def told(
+    source: str, time_s: FloatArray, first: Indices, last: Indices, words: Callable[[int], str], kind: str
+) -> list[Finding]:
+    """Findings of runs of samples ``first`` to ``last``; ``words`` of each, and of what ``kind`` they are."""
+    size = last - first + 1
+    alone = np.ones(len(size), dtype=bool)
+    if len(size) > MANY:
+        least = np.partition(size, -MANY)[-MANY]
+        alone = size > least
+        alone[np.flatnonzero(size == least)[: MANY - int(alone.sum())]] = True
+    chosen = np.flatnonzero(alone).tolist()
+    found = [Finding(source, words(k), float(time_s[first[k]]), float(time_s[last[k]])) for k in chosen]
+    if not alone.all():
+        size, first, last = size[~alone], first[~alone], last[~alone]
+        together = f"{len(size)} further {kind}, {size.sum()} samples, at most {size.max()} in a row"
+        found.append(Finding(source, together, float(time_s[first[0]]), float(time_s[last[-1]])))
+    return found
+
+
+def runs(mask: BoolArray) -> tuple[Indices, Indices]:
     """First and last index of each unbroken run of true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    inside = np.flatnonzero(mask)
+    breaks = np.flatnonzero(np.diff(inside) > 1)
+    if not len(inside):
+        return inside, inside
+    return inside[np.append(0, breaks + 1)], inside[np.append(breaks, len(inside) - 1)]
 
 
-def _frozen(time_s: FloatArray, column: FloatArray) -> list[tuple[int, int]]:
-    with np.errstate(invalid="ignore"):
-        same = np.append(False, np.diff(column) == 0.0)
-    # a run of "equal to the sample before" begins one sample earlier
-    both = [(first - 1, last) for first, last in runs(same)]
-    return [(a, b) for a, b in both if time_s[b] - time_s[a] >= FROZEN_S and b - a + 1 >= FROZEN_SAMPLES]
-
-
-def _saturated(column: FloatArray) -> list[tuple[int, int]]:
-    """Runs at the extremes, in a column that holds other values too."""
-    known = column[np.isfinite(column)]
-    if len(known) == 0 or np.ptp(known) == 0.0:
+def _stuck(source: str, time_s: FloatArray, name: str, column: FloatArray) -> list[Finding]:
+    """Runs of one value: long ones anywhere, shorter ones at the column's largest and smallest value."""
+    # NaN is equal to nothing; a run of "equal to the sample before" begins one sample earlier
+    first, last = runs(column[1:] == column[:-1])
+    last = last + 1
+    if not len(first):
         return []
-    ends = [runs(column == extreme) for extreme in (known.max(), known.min())]
-    return sorted((a, b) for side in ends for a, b in side if b - a + 1 >= SATURATED_SAMPLES)
+    low, high = np.fmin.reduce(column), np.fmax.reduce(column)
+    at_end = (column[first] == low) | (column[first] == high)
+    saturated = at_end & (last - first + 1 >= SATURATED_SAMPLES) & (low < high)
+    frozen = (time_s[last] - time_s[first] >= FROZEN_S) & (last - first + 1 >= FROZEN_SAMPLES)
+    some = saturated | frozen
+    first, last, saturated, frozen = first[some], last[some], saturated[some], frozen[some]
+
+    def words(k: int) -> str:
+        # a long run at an extreme may be either: a stop reached, or a sensor that stuck there
+        what = "saturated or frozen" if saturated[k] and frozen[k] else "frozen" if frozen[k] else "saturated"
+        return f"{name} {what} at {column[first[k]]:.6g} (SI) for {last[k] - first[k] + 1} samples"
+
+    return told(source, time_s, first, last, words, f"runs of one value of {name}")

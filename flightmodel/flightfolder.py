@@ -86,7 +86,7 @@ def read_flight(folder: Path) -> Telemetry:
         sun=sun,
         events=tuple((e.name, e.t_s) for e in spec.events),
         findings=tuple(gate.findings),
-        hashes=_hashes(folder, spec, vehicle, frames),
+        hashes=_hashes(gate, spec, vehicle, frames),
         gnss=fixes,
         barometers={name: record for name, record in barometers.items() if record is not None},
         motion=_motion(spec.motion),
@@ -174,10 +174,10 @@ def _motion(entry: MotionEntry) -> Motion:
     )
 
 
-def _hashes(folder: Path, spec: FlightFile, vehicle: Vehicle | None, frames: Frames | None) -> dict[str, str]:
+def _hashes(gate: Gate, spec: FlightFile, vehicle: Vehicle | None, frames: Frames | None) -> dict[str, str]:
     """SHA-256 of every file that the results depend on; all frames' pictures share one."""
     names = {"flight.toml", *(source.file for source in spec.sources)}
-    digests = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in sorted(names)}
+    digests = {name: gate.sha256(gate.folder / name) for name in sorted(names)}
     if vehicle is not None:
         digests[f"vehicle {vehicle.name}"] = hashlib.sha256(vehicle.source.read_bytes()).hexdigest()
     if frames is not None:

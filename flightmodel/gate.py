@@ -11,6 +11,8 @@ import pandas as pd
 
 from flightmodel import columns
 from flightmodel.checks import BoolArray, ConfigError, FloatArray, GateError, nearest_name
+from flightmodel.columns import IntArray
+from flightmodel.quickread import file_sha256, read_numbers
 from flightmodel.selection import rows_to_use
 from flightmodel.sources import Source
 from flightmodel.telemetry import Finding
@@ -25,6 +27,10 @@ SANE_LIMIT = {
 }
 
 
+# times, columns by short name, and the file line of each row
+Read = tuple[FloatArray | None, dict[str, FloatArray], IntArray]
+
+
 @dataclass(frozen=True)
 class Table:
     """One file's times (where it has any), SI columns by short name, and the file line of each row."""
@@ -33,7 +39,7 @@ class Table:
     label: str
     time_s: FloatArray | None
     columns: dict[str, FloatArray]
-    lines: FloatArray
+    lines: IntArray
 
     def at(self, row: int) -> str:
         """Return where a row stands, for messages."""
@@ -55,6 +61,11 @@ class Gate:
     faults: list[str] = field(default_factory=list)
     config: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
+    digests: dict[Path, str] = field(default_factory=dict)
+
+    def sha256(self, path: Path) -> str:
+        """SHA-256 of a file, from its reading where that made one."""
+        return self.digests.get(path) or file_sha256(path)
 
     def refuse_config(self, words: str) -> None:
         """Keep a fault of flight.toml."""
@@ -104,6 +115,49 @@ class Gate:
         path = self.path(source.file)
         if path is None:
             return None
+        read = self._read_quickly(path, source, quantities, timed)
+        if read is None:
+            read = self._read_carefully(path, label, source, quantities, timed)
+        if read is None:
+            return None
+        table = self.chosen(Table(path, label, *read), source)
+        if not len(table.lines):
+            return None
+        for quantity in quantities:
+            limit = SANE_LIMIT.get(quantity.kind, np.inf)
+            self.refuse_rows(table, quantity.short, -limit, limit, f"beyond any {quantity.kind} of a flight")
+        return table if len(self.faults) + len(self.config) == before else None
+
+    def _read_quickly(
+        self, path: Path, source: Source, quantities: tuple[columns.Quantity, ...], timed: bool
+    ) -> Read | None:
+        """Times, columns and lines of a large file without faults; None where the careful reader must look."""
+        if timed and (source.time_column.format == "utc_hms" or source.time_column.repeats == "first"):
+            return None
+        places = {q.short: columns.place(q, source.declared(q.short)) for q in quantities}
+        if not all(columns.fits(q, places[q.short][1]) for q in quantities):
+            return None
+        wanted = {places[q.short][0]: q.required or q.short in source.columns for q in quantities}
+        time = source.time_column if timed else None
+        found = read_numbers(path, wanted, time, self.t0)
+        if found is None or len(wanted) < len(places):
+            return None
+        time_s = found.time
+        if time is not None and time_s is not None:
+            if time.format == "seconds":
+                time_s = columns.to_si(time_s.copy() if time.column in wanted else time_s, time.unit)
+            if not np.isfinite(time_s).all() or (np.diff(time_s) <= 0.0).any():
+                return None
+        self.digests[path] = found.sha256
+        held = {short: place for short, place in places.items() if place[0] in found.columns}
+        values = {short: columns.to_si(found.columns[column], unit) for short, (column, unit) in held.items()}
+        rows = len(next(iter(values.values())))
+        return time_s, values, found.first_line + np.arange(rows)
+
+    def _read_carefully(
+        self, path: Path, label: str, source: Source, quantities: tuple[columns.Quantity, ...], timed: bool
+    ) -> Read | None:
+        """Times, columns and lines of a file read as text; what is wrong with it becomes faults."""
         frame = self.csv(path, label)
         if frame is None:
             return None
@@ -113,13 +167,7 @@ class Gate:
             column = columns.column_si(frame, quantity, source.declared(quantity.short), path, label, self.faults)
             if column is not None:
                 values[quantity.short] = column
-        table = self.chosen(Table(path, label, time_s, values, frame.attrs["lines"]), source)
-        if not len(table.lines):
-            return None
-        for quantity in quantities:
-            limit = SANE_LIMIT.get(quantity.kind, np.inf)
-            self.refuse_rows(table, quantity.short, -limit, limit, f"beyond any {quantity.kind} of a flight")
-        return table if len(self.faults) + len(self.config) == before else None
+        return time_s, values, frame.attrs["lines"]
 
     def chosen(self, table: Table, source: Source) -> Table:
         """Return the rows that flight.toml lets be used, at its times, with a finding for those that it does not."""
@@ -138,6 +186,8 @@ class Gate:
         """Refuse a column's values outside ``low`` to ``high`` (SI), naming the first's line; missing ones pass."""
         values = table.columns.get(short)
         if values is None:
+            return
+        if np.fmin.reduce(values) >= low and np.fmax.reduce(values) <= high:
             return
         with np.errstate(invalid="ignore"):
             wild = (values < low) | (values > high)

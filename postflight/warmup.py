@@ -101,11 +101,21 @@ def _smoothers() -> None:
     strapdown.propagate(problem.motion, 0, 1, problem.start)
 
 
+def _tables() -> None:
+    from flightmodel import _csv_kernels as kernels
+
+    data, slots = np.frombuffer(b"1.5\n\0\0\0", dtype=np.uint8).copy(), np.zeros(1, dtype=np.int64)
+    powers = kernels.powers_of_five()
+    spans = np.empty((2, 0), dtype=np.int64)
+    kernels.read_rows(data, 0, 4, slots, kernels.EXACT_TENS, *powers, np.empty((1, 1)), spans, 0)
+
+
 GROUPS: dict[str, Callable[[], None]] = {
     "simulator": _simulator,
     "ensembles": _ensembles,
     "filter": _filter,
     "smoothers": _smoothers,
+    "tables": _tables,
 }
 
 
