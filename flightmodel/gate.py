@@ -13,6 +13,7 @@ from flightmodel import columns
 from flightmodel.checks import BoolArray, ConfigError, FloatArray, GateError, nearest_name
 from flightmodel.columns import IntArray
 from flightmodel.quickread import file_sha256, read_numbers
+from flightmodel.roworder import in_order
 from flightmodel.selection import rows_to_use
 from flightmodel.sources import Source
 from flightmodel.telemetry import Finding
@@ -123,6 +124,7 @@ class Gate:
         table = self.chosen(Table(path, label, *read), source)
         if not len(table.lines):
             return None
+        table = self._ordered(table)
         for quantity in quantities:
             limit = SANE_LIMIT.get(quantity.kind, np.inf)
             self.refuse_rows(table, quantity.short, -limit, limit, f"beyond any {quantity.kind} of a flight")
@@ -146,7 +148,7 @@ class Gate:
         if time is not None and time_s is not None:
             if time.format == "seconds":
                 time_s = columns.to_si(time_s.copy() if time.column in wanted else time_s, time.unit)
-            if not np.isfinite(time_s).all() or (np.diff(time_s) <= 0.0).any():
+            if not np.isfinite(time_s).all():
                 return None
         self.digests[path] = found.sha256
         held = {short: place for short, place in places.items() if place[0] in found.columns}
@@ -161,8 +163,9 @@ class Gate:
         frame = self.csv(path, label)
         if frame is None:
             return None
-        time_s = columns.times_s(frame, source.time_column, self.t0, path, label, self.faults) if timed else None
-        values = {}
+        time_s, values = None, {}
+        if timed:
+            time_s = columns.unordered_times_s(frame, source.time_column, self.t0, path, label, self.faults)
         for quantity in quantities:
             column = columns.column_si(frame, quantity, source.declared(quantity.short), path, label, self.faults)
             if column is not None:
@@ -181,6 +184,21 @@ class Gate:
             span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
             self.faults.append(f"{table.label}: {table.path}: use_s leaves {rows.sum()} rows of {span}; two are needed")
         return table.of_rows(rows)
+
+    def _ordered(self, table: Table) -> Table:
+        """Rows in the order of time, each once; what was done to them becomes findings, or a fault."""
+        if table.time_s is None:
+            return table
+        delivery = in_order(table.time_s, list(table.columns.values()), table.lines)
+        if delivery.refusal:
+            self.faults.append(f"{table.label}: {table.path}: {delivery.refusal}")
+        if delivery.refusal or not delivery.repairs:
+            return table
+        source = table.label.partition(".")[2] or table.label
+        self.findings.extend(Finding(source, *repair) for repair in delivery.repairs)
+        rows = delivery.rows
+        held = {short: column[rows] for short, column in table.columns.items()}
+        return Table(table.path, table.label, table.time_s[rows], held, table.lines[rows])
 
     def refuse_rows(self, table: Table, short: str, low: float, high: float, words: str) -> None:
         """Refuse a column's values outside ``low`` to ``high`` (SI), naming the first's line; missing ones pass."""

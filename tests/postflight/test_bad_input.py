@@ -399,12 +399,56 @@ def test_same_time_twice_names_line_and_value(flight) -> None:
     assert names_line(str(error), 51)
 
 
-def test_file_in_reverse_order(flight) -> None:
+def test_file_in_reverse_order_is_turned_and_said_so(flight, clean_flight) -> None:
     lines = flight.lines("rates.csv")
     flight.write_lines("rates.csv", [lines[0], *lines[:0:-1]])
-    error = refused(flight, "rates.csv")
-    assert names_line(str(error), 3)
-    assert len(str(error)) < 4000
+    _same(read_flight(flight.root), read_flight(clean_flight.root))
+    (told,) = findings_of(flight, "rates", "out of order")
+    assert "199 rows in 1 block" in told.what
+    assert (told.start_s, told.end_s) == (420.0, pytest.approx(429.9))
+
+
+@pytest.mark.parametrize(
+    ("name", "source"), [("accelerometer.csv", "accelerometer"), ("rates.csv", "rates"), ("radar_south.csv", "south")]
+)
+def test_blocks_delivered_twice_and_in_the_wrong_order(flight, clean_flight, name: str, source: str) -> None:
+    """Lines 12 to 21 come again at the end; lines 32 to 41 and 42 to 51 have changed places."""
+    rows = flight.lines(name)
+    flight.write_lines(name, [*rows[:31], *rows[41:51], *rows[31:41], *rows[51:], *rows[11:21]])
+    telemetry = read_flight(flight.root)
+    _same(telemetry, read_flight(clean_flight.root))
+    assert {f.source for f in telemetry.findings} == {source}
+    times = [float(row.split(",")[0]) for row in rows[1:]]
+    (again,), (late,) = findings_of(flight, source, "repeat"), findings_of(flight, source, "out of order")
+    assert "10 rows in 1 block" in again.what
+    assert (again.start_s, again.end_s) == (times[10], times[19])
+    assert "10 rows in 1 block" in late.what
+    assert (late.start_s, late.end_s) == (times[30], times[39])
+
+
+def test_a_clock_that_was_reset_is_refused(flight) -> None:
+    """From line 101 on the accelerometer's clock is 2.02 s behind: two stretches of the flight overlap."""
+    rows = flight.lines("accelerometer.csv")
+    for k in range(100, 201):
+        cells = rows[k].split(",")
+        rows[k] = ",".join([f"{float(cells[0]) - 2.02:.3f}", *cells[1:]])
+    flight.write_lines("accelerometer.csv", rows)
+    error = refused(flight, "accelerometer.csv", "time runs backwards", "clock was reset")
+    assert names_line(str(error), 101)
+
+
+def test_one_time_with_two_values_in_a_long_table_is_left_out(flight) -> None:
+    rows = flight.lines("accelerometer.csv")
+    dense = [f"{420.0 + 0.01 * k:.2f},{0.4 + 0.001 * (k % 7):.4f},0.5,{-12.0 - 0.01 * k:.3f}" for k in range(1000)]
+    dense[500] = dense[500].replace("425.00", "424.99")
+    flight.write_lines("accelerometer.csv", [rows[0], *dense])
+    telemetry = read_flight(flight.root)
+    assert telemetry.accelerometer.time_s.size == 998
+    assert not np.isclose(telemetry.accelerometer.time_s, 424.99).any()
+    (told,) = findings_of(flight, "accelerometer", "different values")
+    assert "2 rows in 1 block" in told.what
+    assert "424.990000 s" in told.what
+    assert "none of them is used" in told.what
 
 
 def test_missing_time_is_refused_with_its_line(flight) -> None:

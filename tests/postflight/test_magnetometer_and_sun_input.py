@@ -129,6 +129,20 @@ def test_time_running_backwards_names_line_and_values(told, name):
     refused(told, name, "line 9", "time runs backwards")
 
 
+@pytest.mark.parametrize("name", ["magnetometer", "sun"])
+def test_rows_that_come_twice_or_late_are_findings(told, name):
+    before = read_flight(told.root)
+    rows = told.lines(f"{name}.csv")
+    told.write_lines(f"{name}.csv", [*rows[:41], rows[42], rows[41], *rows[43:], *rows[1:4]])
+    after = read_flight(told.root)
+    np.testing.assert_array_equal(after.magnetometer.measured_sensor, before.magnetometer.measured_sensor)
+    np.testing.assert_array_equal(after.sun.az_el_head_rad, before.sun.az_el_head_rad)
+    assert sorted(findings(told, name)) == [
+        f"{name}: 1 row in 1 block came late or out of order: put in order (at 422.000 s)",
+        f"{name}: 3 rows in 1 block repeat earlier rows: left out (420.000 to 420.100 s)",
+    ]
+
+
 def test_mount_that_the_vehicle_lacks(told):
     told.declare('mount = "magnetometre"', 'file = "telemetry/magnetometer.csv"')
     refused(told, "sensors.magnetometer.mount", "did you mean 'magnetometer'", kind=ConfigError)

@@ -1,0 +1,172 @@
+"""Rows as ranges deliver them: whatever order packets come in, the flight is the same; what contradicts is not used."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flightmodel.roworder import FEW, in_order
+
+STEP_S = 0.01
+
+
+def flight(rows, seed=0):
+    """Times and two channels, one with holes."""
+    rng = np.random.default_rng(seed)
+    time_s = np.round(100.0 + STEP_S * np.arange(rows), 6)
+    values = rng.normal(size=(2, rows))
+    values[1, rng.random(rows) < 0.1] = np.nan
+    return time_s, values
+
+
+def delivered(time_s, values, rows):
+    rows = np.asarray(rows)
+    return in_order(time_s[rows], [column[rows] for column in values], 2 + np.arange(len(rows)))
+
+
+def counted(words):
+    return tuple(int(n) for n in re.match(r"(\d+) rows? in (\d+) block", words).groups())
+
+
+def check_whole(delivery, rows, count):
+    """Every row of the flight once, in order."""
+    assert not delivery.refusal
+    np.testing.assert_array_equal(np.asarray(rows)[delivery.rows], np.arange(count))
+
+
+def test_what_is_in_order_is_left_alone():
+    time_s, values = flight(500)
+    delivery = delivered(time_s, values, np.arange(500))
+    check_whole(delivery, np.arange(500), 500)
+    assert delivery.repairs == ()
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.data())
+def test_packets_in_any_order_and_number_are_the_same_flight(data):
+    count = data.draw(st.integers(40, 300))
+    time_s, values = flight(count, seed=count)
+    cuts = sorted(data.draw(st.sets(st.integers(1, count - 1), max_size=6)))
+    packets = np.split(np.arange(count), cuts)
+    packets = [packets[k] for k in data.draw(st.permutations(range(len(packets))))]
+    again = data.draw(st.lists(st.sampled_from(packets), max_size=3))
+    rows = np.concatenate([*packets, *again])
+    delivery = delivered(time_s, values, rows)
+    check_whole(delivery, rows, count)
+    told = {words.split("block")[1].split(" ", 1)[1][:6]: (words, low, high) for words, low, high in delivery.repairs}
+    assert ("repeat" in told) == bool(again)
+    if again:
+        words, low, high = told["repeat"]
+        assert counted(words)[0] == sum(map(len, again))
+        assert (low, high) == (time_s[np.concatenate(again)].min(), time_s[np.concatenate(again)].max())
+    sent = np.concatenate(packets)
+    late = sent[sent < np.maximum.accumulate(sent)]
+    assert ("came l" in told) == bool(len(late))
+    if len(late):
+        words, low, high = told["came l"]
+        assert counted(words)[0] == len(late)
+        assert (low, high) == (time_s[late.min()], time_s[late.max()])
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        np.arange(400)[::-1],
+        np.arange(400).reshape(-1, 2)[:, ::-1].ravel(),
+        np.random.default_rng(3).permutation(400),
+        np.concatenate([np.delete(np.arange(400), np.arange(5, 400, 9)), np.arange(5, 400, 9)]),
+        np.concatenate([np.arange(400), np.arange(400)]),
+        np.repeat(np.arange(400), 3),
+    ],
+    ids=["reversed", "swapped in pairs", "shuffled", "single rows late", "all twice", "each three times"],
+)
+def test_orders_of_all_kinds(rows):
+    time_s, values = flight(400)
+    check_whole(delivered(time_s, values, rows), rows, 400)
+
+
+def test_late_rows_of_a_jittering_clock_find_their_place():
+    rng = np.random.default_rng(5)
+    time_s, values = flight(2000)
+    time_s = time_s + STEP_S * rng.uniform(-0.2, 0.2, size=2000)
+    late = np.arange(7, 2000, 50)
+    rows = np.concatenate([np.delete(np.arange(2000), late), late])
+    check_whole(delivered(time_s, values, rows), rows, 2000)
+
+
+def test_a_late_block_of_which_a_part_was_there_already():
+    time_s, values = flight(300)
+    first = np.delete(np.arange(300), [*range(100, 104), *range(105, 120)])  # 104 came through, the rest was sent again
+    rows = np.concatenate([first, np.arange(100, 120)])
+    delivery = delivered(time_s, values, rows)
+    check_whole(delivery, rows, 300)
+    assert [counted(words) for words, _, _ in delivery.repairs] == [(1, 1), (19, 2)]
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.1, 0.37, 0.5, 0.8])
+@pytest.mark.parametrize("back", [30, 150, 399])
+def test_a_clock_that_was_reset_is_refused(phase, back):
+    time_s, values = flight(800)
+    time_s = np.round(np.where(np.arange(800) < 400, time_s, time_s - (back + phase) * STEP_S), 6)
+    delivery = in_order(time_s, list(values), 2 + np.arange(800))
+    assert delivery.refusal.startswith("line 402: time runs backwards")
+    assert "where the clock was reset, give each stretch its own times" in delivery.refusal
+    if phase == 0.0:
+        assert f"with other values than in line {402 - back} ({2 * back} such rows in all)" in delivery.refusal
+    else:
+        assert f"where earlier rows leave no room ({back} such rows in all)" in delivery.refusal
+
+
+def test_a_clock_that_was_reset_a_little_loses_the_rows_that_nobody_can_place():
+    time_s, values = flight(4000)
+    time_s = np.where(np.arange(4000) < 2000, time_s, time_s - 12.4 * STEP_S)
+    delivery = in_order(time_s, list(values), 2 + np.arange(4000))
+    assert not delivery.refusal
+    ((words, low, high),) = delivery.repairs
+    assert counted(words) == (12, 1)
+    assert "reset clock: not used" in words
+    assert (low, high) == (time_s[2000], time_s[2011])
+    assert set(range(4000)) - set(delivery.rows.tolist()) == set(range(2000, 2012))
+    assert (np.diff(time_s[delivery.rows]) > 0.0).all()
+
+
+@pytest.mark.parametrize("torn", [1, 3, 4, 40])
+def test_few_rows_that_contradict_are_left_out_and_many_are_refused(torn):
+    count = 800
+    time_s, values = flight(count)
+    places = np.linspace(10, 700, torn).astype(int)
+    rows = np.concatenate([np.arange(count), places])
+    values = values[:, rows]
+    values[0, count:] += 1.0
+    delivery = in_order(time_s[rows], list(values), 2 + np.arange(len(rows)))
+    if 2 * torn >= FEW * len(rows):
+        assert torn >= 4 + (torn == 4)
+        assert f"({2 * torn} such rows in all)" in delivery.refusal
+        assert delivery.refusal.startswith(f"line {count + 2}: ")
+        assert f"than in line {places[0] + 2} " in delivery.refusal
+        return
+    assert torn <= 4
+    ((words, low, high),) = delivery.repairs
+    assert counted(words) == (2 * torn, torn + 1)
+    assert all(f"{t:.6f}" in words for t in time_s[places])
+    assert (low, high) == (time_s[places[0]], time_s[places[-1]])
+    np.testing.assert_array_equal(delivery.rows, np.delete(np.arange(count), places))
+
+
+def test_a_value_that_is_missing_in_one_copy_alone_is_another_value():
+    time_s = np.array([0.0, 1.0, 1.0, 2.0, 3.0])
+    alike = in_order(time_s, [np.array([5.0, np.nan, np.nan, 6.0, 7.0])], np.arange(2, 7))
+    np.testing.assert_array_equal(alike.rows, [0, 1, 3, 4])
+    other = in_order(time_s, [np.array([5.0, np.nan, 2.0, 6.0, 7.0])], np.arange(2, 7))
+    assert "line 4: " in other.refusal
+    assert "line 3 " in other.refusal
+
+
+def test_one_row_all_over_again_is_refused():
+    delivery = in_order(np.full(5, 2.0), [np.ones(5)], np.arange(2, 7))
+    assert "line 3: " in delivery.refusal
+    assert "fewer than two different rows" in delivery.refusal
