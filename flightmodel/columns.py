@@ -138,8 +138,13 @@ class TimeColumn:
     column: str = "t_s"
     format: str = "seconds"
     unit: str = "s"
-    parts: tuple[str, ...] = ("t_s",)
+    parts: tuple[str, ...] = ()
     repeats: str = "refuse"
+
+    def __post_init__(self) -> None:
+        """One column holds it unless more are named."""
+        if not self.parts:
+            object.__setattr__(self, "parts", (self.column,))
 
 
 def read_table(path: Path, label: str) -> pd.DataFrame:
