@@ -1,8 +1,11 @@
-"""A short flight with known truth, integrated by other means than the filter's, and sensors that err as on paper."""
+"""A short flight with known truth, integrated by other means than the filter's, and sensors that err as on paper.
+
+`sense` gives it inertial sensors and radars with plain errors, `sense_everything` every instrument and every error.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,10 +13,27 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from flightmodel import earth, rotations
-from flightmodel.instruments import RadarSite, TriadSpec, dcm_body_from_clocking
-from flightmodel.telemetry import AttitudePrior, RadarRecord, Telemetry, TriadRecord
+from flightmodel import earth, geomagnetism_and_sun, rotations
+from flightmodel.instruments import (
+    BarometerSpec,
+    GnssSpec,
+    RadarSite,
+    SunHeads,
+    TriadSpec,
+    dcm_body_from_clocking,
+    sun_angles_from_direction,
+)
+from flightmodel.telemetry import (
+    AttitudePrior,
+    BarometerRecord,
+    GnssRecord,
+    RadarRecord,
+    SunRecord,
+    Telemetry,
+    TriadRecord,
+)
 from flightmodel.trajectory import Trajectory
+from synthetic_flight.radar_sensing import mislevel
 
 DEG = np.pi / 180.0
 START, END = 100.0, 160.0
@@ -30,6 +50,26 @@ SITES = [
     RadarSite("west", -33.4 * DEG, 17.6 * DEG, 120.0, 2.0, 0.004 * DEG, 2.0, 0.003 * DEG, 0.001),
 ]
 PRIOR_SD = 3.0 * DEG
+EPOCH = "2009-08-17T12:52:00Z"
+# every error alive: pedestals a few times worse than good ones, so that second order would show
+FULL_SITES = [
+    RadarSite(
+        "north", -33.0 * DEG, 18.0 * DEG, 40.0, 5.0, 0.006 * DEG, 5.0, 0.005 * DEG, 0.002, mislevel_sd_rad=2e-4,
+        droop_sd_rad=1e-4, skew_sd_rad=1e-4, nonorthogonality_sd_rad=1e-4, wander_sd_rad=5e-5,
+        wander_time_constant_s=15.0, refraction_sd=0.1, range_scale_sd=2e-5,
+    ),
+    RadarSite(
+        "west", -33.4 * DEG, 17.6 * DEG, 120.0, 2.0, 0.004 * DEG, 2.0, 0.003 * DEG, 0.001, mislevel_sd_rad=1e-4,
+        droop_sd_rad=2e-4, skew_sd_rad=2e-4, nonorthogonality_sd_rad=2e-4, wander_sd_rad=1e-4,
+        wander_time_constant_s=30.0, refraction_sd=0.2, range_scale_sd=1e-5,
+    ),
+]  # fmt: skip
+RECEIVER = GnssSpec("receiver", np.array([-0.7, 0.2, 0.9]), 3.0, 5.0, 0.2, 0.3, 4.0, 60.0, 0.02)
+BAROMETER = BarometerSpec("barometer", 20.0, 80.0, 0.01, 30.0, 25.0, 0.05)
+MAGNETOMETER = TriadSpec(
+    "magnetometer", np.zeros(3), dcm_body_from_clocking(40 * DEG, 130 * DEG), 1e-7, 5e-7, 0.01, 1.0 * DEG, 2e-8, 0.01
+)
+SUN = SunHeads("sun", np.array([20.0, 110.0, 200.0, 290.0]) * DEG, 120.0 * DEG, 0.2 * DEG, 0.3 * DEG, 0.5 * DEG)
 
 
 def body_rate(t):
@@ -67,7 +107,7 @@ class MiniTruth:
         arm = np.broadcast_to(np.array(point) - CG, (len(t), 3))
         rate = omega - rotations.rotate(rotations.conjugate(q), np.broadcast_to(earth.OMEGA_ECEF_RADPS, (len(t), 3)))
         return Trajectory(
-            "2009-08-17T12:52:00Z",
+            EPOCH,
             t,
             "datum",
             position + rotations.rotate(q, arm),
@@ -132,7 +172,97 @@ def measure_radar(truth, site, t, rng, point=CG, noise_factor=1.0):
     z = earth.radar_from_ecef(track.position_ecef_m, site.latitude_rad, site.longitude_rad, site.height_m)
     noise = noise_factor * rng.standard_normal(z.shape) * [site.range_sd_m, site.angle_sd_rad, site.angle_sd_rad]
     noise[:, 1] /= np.cos(z[:, 2])
-    return z + errors[:3] + noise, errors
+    return z + errors[:3] + noise + pedestal(site, t, z, rng), errors
+
+
+def pedestal(site, t, z, rng):
+    """What a pedestal that errs adds to range, azimuth and elevation (n, 3); the tilt is an exact turn."""
+    out = np.zeros_like(z)
+    if site.mislevel_sd_rad == 0.0:
+        return out
+    draw = rng.standard_normal
+    az, el = z[:, 1], z[:, 2]
+    out[:, 1:] = mislevel(az, el, site.mislevel_sd_rad * draw(2))
+    out[:, 1] += site.skew_sd_rad * draw() / np.cos(el) + site.nonorthogonality_sd_rad * draw() * np.tan(el)
+    out[:, 2] += site.droop_sd_rad * draw() * np.cos(el) + 3.2e-4 * site.refraction_sd * draw() / np.tan(el)
+    out[:, 0] += site.range_scale_sd * draw() * z[:, 0]
+    slow = gauss_markov(t, 2, site.wander_sd_rad, site.wander_time_constant_s, rng)
+    out[:, 1] += slow[:, 0] / np.cos(el)
+    out[:, 2] += slow[:, 1]
+    return out
+
+
+def gauss_markov(t, count, sd, time_constant_s, rng):
+    """Stationary first-order Gauss-Markov sequences (n, count)."""
+    out = sd * rng.standard_normal((len(t), count))
+    for k in range(1, len(t)):
+        keeps = np.exp(-(t[k] - t[k - 1]) / time_constant_s)
+        out[k] = keeps * out[k - 1] + np.sqrt(1.0 - keeps**2) * out[k]
+    return out
+
+
+def measure_gnss(truth, spec, t, rng):
+    """Fixes of a receiver; its slow error is along north, east and down of the first fix."""
+    track = truth.trajectory(t - spec.time_bias_sd_s * rng.standard_normal(), spec.antenna_from_datum_body_m)
+    latitude, longitude, _ = earth.geodetic_from_ecef(track.position_ecef_m[0])
+    ned = earth.dcm_ned_ecef(float(latitude), float(longitude))
+    sd = np.array([spec.horizontal_sd_m, spec.horizontal_sd_m, spec.vertical_sd_m])
+    speed_sd = np.array([spec.speed_sd_mps, spec.speed_sd_mps, spec.vertical_speed_sd_mps])
+    place = sd * rng.standard_normal((len(t), 3))
+    place += gauss_markov(t, 3, spec.wander_sd_m, spec.wander_time_constant_s, rng)
+    speed = speed_sd * rng.standard_normal((len(t), 3))
+    return GnssRecord(spec, t, track.position_ecef_m + place @ ned, track.velocity_ecef_mps + speed @ ned)
+
+
+def measure_barometer(truth, spec, t, rng):
+    """Heights of the datum's point."""
+    late = spec.time_bias_sd_s * rng.standard_normal()
+    height = earth.geodetic_from_ecef(truth.trajectory(t - late).position_ecef_m)[2]
+    slow = gauss_markov(t, 1, spec.wander_sd_m, spec.wander_time_constant_s, rng)[:, 0]
+    bias, scale = spec.bias_sd_m * rng.standard_normal(), spec.scale_sd * rng.standard_normal()
+    error = bias + scale * (height - height[0]) + slow + spec.sd_m * rng.standard_normal(len(t))
+    return BarometerRecord(spec, t, height + error)
+
+
+def measure_magnetometer(truth, spec, t, rng):
+    """Field in the magnetometer's axes, bent by the vehicle's iron."""
+    position, _, q, _ = truth.state(t)
+    field = geomagnetism_and_sun.magnetic_field_ecef_t(position, EPOCH)
+    body = rotations.rotate(rotations.conjugate(q), field)
+    actual = Rotation.from_rotvec(spec.mount_sd_rad * rng.standard_normal(3)).inv().apply(body @ spec.dcm_body_sensor)
+    iron = np.diag(1.0 + spec.scale_sd * rng.standard_normal(3))
+    iron[[0, 0, 1], [1, 2, 2]] = iron[[1, 2, 2], [0, 0, 1]] = spec.soft_iron_sd * rng.standard_normal(3)
+    measured = actual @ iron + spec.bias_sd * rng.standard_normal(3) + spec.noise_sd * rng.standard_normal(actual.shape)
+    return TriadRecord(spec, t, spec.resolution * np.round(measured / spec.resolution))
+
+
+def measure_sun(truth, spec, t, rng):
+    """Angles of the Sun in each head that sees it."""
+    q = truth.state(t)[2]
+    body = rotations.rotate(rotations.conjugate(q), geomagnetism_and_sun.sun_direction_ecef(EPOCH, t))
+    angles = np.empty((len(t), len(spec.clock_lv_rad), 2))
+    for k, dcm in enumerate(spec.dcm_body_head):
+        head = Rotation.from_rotvec(spec.mount_sd_rad * rng.standard_normal(3)).inv().apply(body @ dcm)
+        exact = sun_angles_from_direction(head)
+        error = spec.bias_sd_rad * rng.standard_normal(2) + spec.noise_sd_rad * rng.standard_normal((len(t), 2))
+        error[:, 0] /= np.cos(exact[:, 1])
+        unseen = head[:, 2] < np.cos(0.5 * spec.field_rad)
+        angles[:, k] = np.where(unseen[:, None], np.nan, exact + error)
+    return SunRecord(spec, t, angles)
+
+
+def sense_everything(truth, seed, sites=FULL_SITES):
+    """Telemetry in which every kind of instrument, and every error that a flight file can state, is alive."""
+    telemetry, _ = sense(truth, seed, sites)
+    rng = np.random.default_rng(10_000 + seed)
+    t = np.arange(START - 1.0, END - 0.3, 0.1)
+    return replace(
+        telemetry,
+        gnss={"receiver": measure_gnss(truth, RECEIVER, np.arange(START, END - 1.0, 0.5) + 0.0137, rng)},
+        barometers={"barometer": measure_barometer(truth, BAROMETER, np.arange(START, END - 1.0, 0.7) + 0.31, rng)},
+        magnetometer=measure_magnetometer(truth, MAGNETOMETER, t + 0.0021, rng),
+        sun=measure_sun(truth, SUN, t + 0.0007, rng),
+    )
 
 
 def sense(truth, seed, sites=SITES, prior_time_s=START - 2.0, noise_factor=1.0, accelerometer_errors=None, hz=100.0):
@@ -152,7 +282,7 @@ def sense(truth, seed, sites=SITES, prior_time_s=START - 2.0, noise_factor=1.0, 
     prior = AttitudePrior(prior_time_s, rotations.boxplus(q, PRIOR_SD * rng.standard_normal(3)), np.full(3, PRIOR_SD))
     telemetry = Telemetry(
         "mini",
-        "2009-08-17T12:52:00Z",
+        EPOCH,
         True,
         SimpleNamespace(cg_m=CG),
         TriadRecord(ACCELEROMETER, t, force),
@@ -175,5 +305,15 @@ def mini_sense(mini_truth):
 
     def make(seed, **options):
         return sense(mini_truth, seed, **options)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def mini_everything(mini_truth):
+    """``mini_everything(seed)`` gives telemetry with every kind of instrument and error."""
+
+    def make(seed, **options):
+        return sense_everything(mini_truth, seed, **options)
 
     return make
