@@ -36,6 +36,7 @@ Progress = Callable[[float, str], None]
 EXAMINED_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
 THINNED_STEP_S = 0.5
 MOST_THINNED_PASSES = 6
+FARTHEST_SD = 3.0
 SETTLED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of what it does
 # what states the errors of a ballistic flight's air and vehicle, and what to say where they are larger
 SHEETS = {
@@ -257,11 +258,11 @@ def _iterate(
         smoothed = smoother.smooth(problem, run, True, settings.smoother, settings.engine)
         kept = np.flatnonzero(problem.kept)
         moved = np.abs(smoothed.x[kept]) / np.sqrt(np.maximum(smoothed.variance, 1e-300))
-        reference = smoothed.states(run.charts)
+        smoothed_states = smoothed.states(run.charts)
         if moved.max() < SETTLED_SD:
             break
-    assert reference is not None
-    return run, smoothed, reference, i + 1, found
+        reference = likely(problem, smoothed_states)
+    return run, smoothed, smoothed_states, i + 1, found
 
 
 def follow_track(
@@ -276,6 +277,20 @@ def follow_track(
         found = more
 
 
+def likely(problem: Problem, states: States) -> States:
+    """States to linearise about: drivers of ballistic flight no farther than `FARTHEST_SD` from what was stated.
+
+    Drag enters as its logarithm. Seen from a thin, fast flight a parachute asks for a thousandfold drag, and about that
+    the next pass would be stiff and far from any truth; any point serves that later passes bring nearer.
+    """
+    if not problem.motion.ballistic:
+        return states
+    errors, count = states.sensor_errors.copy(), problem.motion.drivers
+    limit = FARTHEST_SD * problem.model.prior_sd[:count]
+    errors[:, :count] = np.clip(errors[:, :count], -limit, limit)
+    return replace(states, sensor_errors=errors)
+
+
 def first_reference(problem: Problem, settings: Settings) -> tuple[States, tuple[Disturbance, ...]]:
     """Smoothed states at all nodes from a point of each source every `THINNED_STEP_S`, iterated until they stay."""
     thinned, kept = problem.thinned(THINNED_STEP_S)
@@ -285,7 +300,7 @@ def first_reference(problem: Problem, settings: Settings) -> tuple[States, tuple
         run, found = follow_track(thinned, reference, settings, found)
         smoothed = smoother.smooth(thinned, run, False, "rauch-tung-striebel", settings.engine)
         moved = np.abs(smoothed.x[:, ROTATION]).max() if reference is not None else np.inf
-        reference = smoothed.states(run.charts)
+        reference = likely(problem, smoothed.states(run.charts))
         if moved < SETTLED_RAD:
             break
     assert reference is not None

@@ -89,9 +89,11 @@ def _ned_from_radar(range_az_el: FloatArray) -> FloatArray:
 
 
 def fit_first_points(instruments: tuple[Instrument, ...], start_s: float) -> tuple[FloatArray, FloatArray]:
-    """Position and velocity (3,) of the tracked point at the start: a parabola through the first seconds.
+    """Position and velocity (3,) of the tracked point at the start: a parabola through the seconds about it.
 
-    Points far from the parabola, in units of the median distance, lose their weight as the fit is repeated.
+    Where they hold fewer than `LEAST_POINTS` a line through two will do (a rocket on its pad whose receiver is silent
+    under thrust), and only without two are later points asked. Points far from the curve, in units of the median
+    distance, lose their weight as the fit is repeated.
 
     Raises
     ------
@@ -99,15 +101,17 @@ def fit_first_points(instruments: tuple[Instrument, ...], start_s: float) -> tup
         With fewer than three points.
     """
     t, p = places(instruments)
-    t, p = t[t >= start_s] - start_s, p[t >= start_s]
+    t, p = t[t >= start_s - FIT_SPAN_S] - start_s, p[t >= start_s - FIT_SPAN_S]
     if len(t) < 3:
         raise GateError(f"tracking: {len(t)} points after {start_s:.3f} s; at least 3 are needed to start")
-    count = max(LEAST_POINTS, int(np.searchsorted(t, FIT_SPAN_S)))
+    near = int(np.searchsorted(t, FIT_SPAN_S))
+    count = near if near >= 2 else LEAST_POINTS
     t, p = t[:count], p[:count]
+    degree = 2 if len(t) >= LEAST_POINTS else 1
     weight: FloatArray = np.ones(len(t))
     coefficients: FloatArray = np.zeros((3, 3))
     for _ in range(10):
-        coefficients = np.asarray(np.polynomial.polynomial.polyfit(t, p, min(2, len(t) - 1), w=weight), dtype=float)
+        coefficients = np.asarray(np.polynomial.polynomial.polyfit(t, p, degree, w=weight), dtype=float)
         distance = np.linalg.norm(p - np.polynomial.polynomial.polyval(t, coefficients).T, axis=1)
         scale = float(np.median(distance))
         weight = 1.0 / (1.0 + (distance / (2.0 * scale + 1e-3)) ** 2) ** 2
