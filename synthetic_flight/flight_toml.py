@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel.checks import FloatArray
-from synthetic_flight.instrument_sections import Magnetometer, Radar, SunSensors
+from synthetic_flight.instrument_sections import Magnetometer, Radar, SunSensors, Triad
 from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, Scenario
 
 # the last digit of the telemetry's files: noise below it is not in them, and an estimator wants none of zero
@@ -65,17 +65,17 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
         f'mount = "{ACCELEROMETER_MOUNT}"',
         f"noise_sd_mps2 = {_at_least(acc.noise_mps2)}",
         f"bias_sd_mps2 = {acc.bias_mps2}",
-        f"scale_sd = {acc.scale}",
-        f"mount_sd_deg = {acc.mount_deg}",
+        *_triad_lines(acc),
         f"resolution_mps2 = {acc.resolution_mps2}",
+        *_drift_lines("mps2", acc.drift_mps2, acc.drift_time_constant_s),
         "",
         "[sensors.rates]",
         'file = "telemetry/rates.csv"',
         f"noise_sd_degps = {_at_least(gyro.noise_degps)}",
         f"bias_sd_degps = {gyro.bias_degps}",
-        f"scale_sd = {gyro.scale}",
-        f"mount_sd_deg = {gyro.mount_deg}",
+        *_triad_lines(gyro),
         f"resolution_degps = {gyro.resolution_degps}",
+        *_drift_lines("degps", gyro.drift_degps, gyro.drift_time_constant_s),
     ]
     lines += _magnetometer_lines(spec.magnetometer) + _sun_lines(spec.sun)
     for name, radar in spec.radars.items():
@@ -89,7 +89,8 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
             f"range_sd_m = {_at_least(radar.range_sd_m, radar.range_resolution_m)}",
             f"angle_sd_deg = {_at_least(radar.angle_sd_deg, radar.angle_resolution_deg)}",
             f"range_bias_sd_m = {radar.range_bias_m}",
-            f"angle_bias_sd_deg = {radar.angle_bias_deg}",
+            # over the arc of one flight an encoder's waves are hardly told from a bias
+            f"angle_bias_sd_deg = {_together(radar.angle_bias_deg, radar.encoder_once_deg, radar.encoder_twice_deg)}",
             f"time_bias_sd_s = {radar.time_bias_s}",
             *_pedestal_lines(radar),
         ]
@@ -108,6 +109,24 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _together(*sds: float) -> float:
+    """Return the one number that is told of independent errors; of a single one, that number as it was written."""
+    present = [sd for sd in sds if sd > 0.0]
+    return present[0] if len(present) == 1 else float(f"{np.linalg.norm(present):.4g}")
+
+
+def _triad_lines(spec: Triad) -> list[str]:
+    """Axes that are not square are told with the mounting, what negative values gain with the scale."""
+    return [
+        f"scale_sd = {_together(spec.scale, spec.scale_asymmetry)}",
+        f"mount_sd_deg = {_together(spec.mount_deg, spec.nonorthogonality_deg)}",
+    ]
+
+
+def _drift_lines(unit: str, drift: float, time_constant_s: float) -> list[str]:
+    return [f"bias_wander_sd_{unit} = {drift}", f"bias_time_constant_s = {time_constant_s}"] if drift > 0.0 else []
+
+
 def _magnetometer_lines(spec: Magnetometer | None) -> list[str]:
     if spec is None:
         return []
@@ -119,10 +138,10 @@ def _magnetometer_lines(spec: Magnetometer | None) -> list[str]:
         f"noise_sd_ut = {_at_least(spec.noise_ut)}",
         # the analyst is told one number for electronics and hard iron together
         f"bias_sd_ut = {np.hypot(spec.bias_ut, spec.hard_iron_ut):.4g}",
-        f"scale_sd = {spec.scale}",
         f"soft_iron_sd = {spec.soft_iron}",
-        f"mount_sd_deg = {spec.mount_deg}",
+        *_triad_lines(spec),
         f"resolution_ut = {spec.resolution_ut}",
+        *_drift_lines("ut", spec.drift_ut, spec.drift_time_constant_s),
     ]
 
 
@@ -148,4 +167,8 @@ def _pedestal_lines(radar: Radar) -> list[str]:
     lines = [f"{name}_sd_deg = {size}" for name, size in sizes.items() if size > 0.0]
     if radar.wander_deg > 0.0:
         lines.append(f"wander_time_constant_s = {radar.wander_time_constant_s}")
+    if radar.refraction is not None and radar.refraction.residual != 0.0:
+        lines.append(f"refraction_sd = {abs(radar.refraction.residual)}")
+    if radar.range_scale > 0.0:
+        lines.append(f"range_scale_sd = {radar.range_scale}")
     return ([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []) + lines
