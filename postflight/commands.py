@@ -175,13 +175,13 @@ def print_flight(flight: Flight) -> None:
     for name in ("event", "t s", "altitude km", "Mach", "q Pa", "alpha total deg"):
         table.add_column(name, justify="left" if name == "event" else "right")
     for row in results.event_table(flight).itertuples(index=False):
-        alpha = f"{row.alpha_total_wind_deg:.2f} ± {row.alpha_total_wind_sd_deg:.2f}"
+        alpha = f"{row.alpha_total_wind_deg:.2f} ± {row.alpha_total_wind_sd_deg:.2f}" if flight.has_attitude else ""
         pressure = f"{row.dynamic_pressure_pa:.1f}"
         table.add_row(row.event, f"{row.t_s:.2f}", f"{row.alt_m / 1e3:.2f}", f"{row.mach:.2f}", pressure, alpha)
     console.print(table)
     if not flight.peak_is_inside:
         console.print("[yellow]found[/] the data end before or begin after the peak of dynamic pressure")
-    for finding in (*flight.telemetry.findings, *flight.reconstruction.findings):
+    for finding in (*flight.telemetry.findings, *flight.reconstruction.findings, *results.without_attitude(flight)):
         console.print(f"[yellow]found[/] {escape(str(finding))}")
     for reason in flight.missing:
         console.print(f"[yellow]left out[/] air of the day: {escape(reason)}")

@@ -26,9 +26,10 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
     if flight.pulse is not None:
         report(0.0, "flying the rigid vehicle")
         bounds = rigid_bounds(flight, progress=lambda f, what: report(0.6 * f, what))
-        report(0.6, "drawing")
         figures.save(figures.figure_1_3(flight, bounds), folder / "figure_1_3.png")
         figures.save(figures.figure_2_5(flight), folder / "figure_2_5.png")
+    else:
+        figures.save(figures.figure_flown(flight), folder / "flown.png")
     report(0.6, "drawing")
     if flight.day is not None:
         figures.save(product_figures.figure_air(flight, flight.day), folder / "air.png")

@@ -202,14 +202,47 @@ def _top(histories: Iterable[DeflectionHistory]) -> float:
     return 1.25 * float(max(largest, default=5.0))
 
 
+def figure_flown(flight: Flight) -> Figure:
+    """Altitude, speed and their standard deviations: the picture of a flight without a vehicle to speak of."""
+    figure = Figure(figsize=(7.2, 7.0), layout="constrained")
+    high, fast, sure = _axes(figure, 3)
+    bet, air = flight.reconstruction.smoothed, flight.air
+    high.plot(air.time_s, air.altitude_m / 1e3, color="#0072B2", lw=1.4)
+    high.set_ylabel("altitude (km)")
+    fast.plot(air.time_s, np.linalg.norm(bet.velocity_ecef_mps, axis=1), color="#0072B2", lw=1.4)
+    fast.set(ylabel="speed against\nthe ground (m/s)", ylim=(0, None))
+    sd = bet.sd()
+    for part, colour, label in ((slice(0, 3), "#0072B2", "position (m)"), (slice(3, 6), "#D55E00", "velocity (m/s)")):
+        sure.semilogy(air.time_s, np.linalg.norm(sd[:, part], axis=1), color=colour, lw=1.2, label=label)
+    sure.set(ylabel="standard deviation", xlabel="time after launch (s)")
+    sure.legend(fontsize=8, frameon=False)
+    found = [f for f in flight.reconstruction.findings if f.source == "motion"]
+    for ax in (high, fast, sure):
+        for f in found:
+            ax.axvspan(f.start_s, f.end_s, color="#E69F00", alpha=0.3, lw=0)
+    extra = "; shaded: accelerations that nothing on board told" if found else ""
+    figure.suptitle("The flight as reconstructed" + extra, fontsize=10)
+    stamp(figure, flight.telemetry)
+    return figure
+
+
+def _unit(component: str) -> tuple[float, str]:
+    """Scale and unit in which a component's residuals are drawn."""
+    if component.startswith("velocity"):
+        return 1.0, "m/s"
+    if component.startswith("field"):
+        return 1e6, "uT"
+    return (1e3, "mrad") if component in ("azimuth", "elevation") else (1.0, "m")
+
+
 def figure_residuals(flight: Flight) -> Figure:
-    """Radar innovations of each source and component with the predicted 3-sd lines; edited points marked."""
+    """Innovations of each source and component that were tried, with the predicted 3-sd lines; edited points marked."""
     table = flight.reconstruction.residuals
-    pairs = list(table.groupby(["source", "component"], sort=False))
+    pairs = list(table[table["used"]].groupby(["source", "component"], sort=False))
     figure = Figure(figsize=(7.2, 1.5 * len(pairs) + 0.8), layout="constrained")
     for ax, (name, rows) in zip(_axes(figure, len(pairs)), pairs, strict=True):
         source, component = name
-        scale, unit = (1.0, "m") if component == "range" else (1000.0, "mrad")
+        scale, unit = _unit(component)
         good = rows["accepted"].to_numpy(dtype=bool)
         t, r = rows["time_s"].to_numpy(), scale * rows["residual"].to_numpy()
         sd = scale * rows["predicted_sd"].to_numpy()
@@ -221,7 +254,7 @@ def figure_residuals(flight: Flight) -> Figure:
         ax.set_ylabel(f"{source}\n{component} ({unit})", fontsize=7)
         ax.set_ylim(-limit, limit)
     figure.get_axes()[-1].set_xlabel("time after launch (s)")
-    figure.suptitle("Radar residuals before each update, 3 sd, edited points crossed", fontsize=10)
+    figure.suptitle("Tracking residuals before each update, 3 sd, edited points crossed", fontsize=10)
     stamp(figure, flight.telemetry)
     return figure
 

@@ -23,10 +23,11 @@ import pandas as pd
 from flightmodel import earth, moments
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
-from flightmodel.telemetry import Telemetry
+from flightmodel.telemetry import Finding, Telemetry
 from postflight.pipeline import NO_VIDEO, Answers, Flight
 
 DIGITS = "%.10g"
+ATTITUDE_COLUMNS = ("q", "alpha", "beta", "clock")  # and those of the body axes
 
 
 class RunFolder:
@@ -119,7 +120,10 @@ def newest_run(flight_folder: Path) -> Path:
 
 
 def bet_table(flight: Flight) -> pd.DataFrame:
-    """Best estimated trajectory with air data and standard deviations, one row an output time."""
+    """Best estimated trajectory with air data and standard deviations, one row an output time.
+
+    Where the attitude is not known, columns that need it are left out.
+    """
     bet, air = flight.reconstruction.smoothed, flight.air
     sd = bet.sd()
     v_ned = earth.ned_from_ecef(bet.velocity_ecef_mps, bet.position_ecef_m)
@@ -158,7 +162,11 @@ def bet_table(flight: Flight) -> pd.DataFrame:
     for kind in ("wind", "ground", "inertial"):
         columns[f"alpha_total_{kind}_deg"] = np.rad2deg(getattr(air, f"alpha_total_{kind}_rad"))
         columns[f"alpha_total_{kind}_sd_deg"] = np.rad2deg(getattr(air, f"alpha_total_{kind}_sd_rad"))
-    return pd.DataFrame(columns)
+    table = pd.DataFrame(columns)
+    if not flight.has_attitude:
+        turned = [name for name in table if name.startswith(ATTITUDE_COLUMNS) or "_body_" in name]
+        table = table.drop(columns=turned)
+    return table
 
 
 def deflection_table(history: DeflectionHistory) -> pd.DataFrame:
@@ -190,6 +198,8 @@ def event_table(flight: Flight) -> pd.DataFrame:
     for name, t in sorted(named, key=lambda m: m[1]):
         k = int(np.searchsorted(air.time_s, t).clip(0, len(air.time_s) - 1))
         alpha, sd = np.rad2deg([air.alpha_total_wind_rad[k], air.alpha_total_wind_sd_rad[k]])
+        if not flight.has_attitude:
+            alpha = sd = np.nan
         rows.append((name, t, air.altitude_m[k], air.mach[k], air.dynamic_pressure_pa[k], alpha, sd))
     names = ["event", "t_s", "alt_m", "mach", "dynamic_pressure_pa", "alpha_total_wind_deg", "alpha_total_wind_sd_deg"]
     return pd.DataFrame(rows, columns=names)
@@ -222,6 +232,8 @@ def write_reconstruction(run: RunFolder, flight: Flight) -> None:
     bet = flight.reconstruction
     run.write_csv("bet.csv", bet_table(flight))
     run.write_csv("residuals.csv", bet.residuals)
+    if len(bet.withheld):
+        run.write_csv("withheld.csv", bet.withheld)
     run.write_csv("verdicts.csv", pd.DataFrame([vars(v) for v in flight.verdicts]))
     run.write_csv("sensor_errors.csv", bet.sensor_errors)
     run.write_csv("events.csv", event_table(flight))
@@ -229,8 +241,16 @@ def write_reconstruction(run: RunFolder, flight: Flight) -> None:
         run.write_csv("air_profile.csv", flight.day.profile)
         run.write_csv("drag_ratio.csv", flight.day.drag)
         run.write_csv("air_parameters.csv", flight.day.parameters)
-    findings = [vars(f) for f in (*flight.telemetry.findings, *bet.findings)]
+    findings = [vars(f) for f in (*flight.telemetry.findings, *bet.findings, *without_attitude(flight))]
     run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s"]))
+
+
+def without_attitude(flight: Flight) -> tuple[Finding, ...]:
+    """Finding that says what is not in the tables of a flight without inertial sensors; none with them."""
+    if flight.has_attitude:
+        return ()
+    words = "no inertial sensors carried the attitude: attitude, rates and flow angles are not in bet.csv"
+    return (Finding("attitude", words, np.nan, np.nan),)
 
 
 def write_answers(run: RunFolder, answers: Answers) -> None:
@@ -249,8 +269,8 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
         "synthetic": flight.telemetry.synthetic,
         "peak_dynamic_pressure_pa": float(air.dynamic_pressure_pa[k]),
         "peak_dynamic_pressure_s": float(peak),
-        "alpha_total_wind_deg": float(np.rad2deg(air.alpha_total_wind_rad[k])),
-        "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])),
+        "alpha_total_wind_deg": float(np.rad2deg(air.alpha_total_wind_rad[k])) if flight.has_attitude else None,
+        "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])) if flight.has_attitude else None,
         "methods": method_summary(answers, peak),
         "missing": list(flight.missing),
         "verdicts_passed": sum(v.passed for v in verdicts),

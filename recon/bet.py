@@ -57,7 +57,8 @@ class Reconstruction:
     sensor_errors : DataFrame
         ``name, unit, prior_sd, estimate, sd``; of errors that wander, the value at mid-span.
     residuals : DataFrame
-        ``time_s, source, component, residual, predicted_sd, accepted``: radar innovations of the last pass, m and rad.
+        ``time_s, source, component, residual, predicted_sd, accepted, used``: innovations of the last pass, SI; what is
+        not used was withheld and only checks.
     withheld : DataFrame
         ``time_s, source, component, residual, predicted_sd``: measurements that were not used, against the smoothed
         trajectory (`recon.withheld`).

@@ -129,7 +129,7 @@ def sensor_error_table(problem: Problem, states: States, smoothed: Smoothed) -> 
 
 
 def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
-    """One row for each component that was measured."""
+    """One row for each component that was measured; what is not ``used`` only checks."""
     row, component = np.nonzero(np.isfinite(problem.observed.variance))
     source = problem.observed.source[row]
     names = np.array([i.name for i in problem.instruments], dtype=object)
@@ -142,6 +142,7 @@ def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
             "residual": innovations.residual[row, component],
             "predicted_sd": np.sqrt(innovations.covariance[row, component, component]),
             "accepted": innovations.accepted[row],
+            "used": problem.observed.usable[row],
         }
     )
 
