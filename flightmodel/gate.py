@@ -121,10 +121,12 @@ class Gate:
             read = self._read_carefully(path, label, source, quantities, timed)
         if read is None:
             return None
-        table = self.chosen(Table(path, label, *read), source)
+        table = Table(path, label, *read)
+        if source.time.repeats == "refuse":  # else the first row of each time is chosen below
+            table = self._ordered(table)
+        table = self.chosen(table, source)
         if not len(table.lines):
             return None
-        table = self._ordered(table)
         for quantity in quantities:
             limit = SANE_LIMIT.get(quantity.kind, np.inf)
             self.refuse_rows(table, quantity.short, -limit, limit, f"beyond any {quantity.kind} of a flight")

@@ -21,7 +21,7 @@ from flightmodel.trajectory import Trajectory
 from recon import consistency, disagreement, ekf, inertial, product, smoother, startup, strapdown
 from recon.consistency import Verdict
 from recon.disagreement import LeftOut
-from recon.disturbance import Disturbance, disturbed, widened
+from recon.disturbance import Disturbance, disturbed, is_lost, widened
 from recon.packed import unpacked
 from recon.problem import Problem
 from recon.settings import Settings
@@ -297,8 +297,12 @@ def first_reference(problem: Problem, settings: Settings) -> tuple[States, tuple
     thinned, kept = problem.thinned(THINNED_STEP_S)
     reference = None
     found: tuple[Disturbance, ...] = ()
-    for _ in range(MOST_THINNED_PASSES):
+    for k in range(MOST_THINNED_PASSES):
         run, found = follow_track(thinned, reference, settings, found)
+        if k == 0 and problem.motion.ballistic and is_lost(thinned, run):
+            # a gap so long that the filter came out of it somewhere else: tracking alone tells where it is
+            reference = startup.along_track(problem.instruments, thinned.time_s, problem.model.size)
+            run, found = follow_track(thinned, reference, settings, ())
         smoothed = smoother.smooth(thinned, run, False, "rauch-tung-striebel", settings.engine)
         moved = np.abs(smoothed.x[:, ROTATION]).max() if reference is not None else np.inf
         reference = likely(problem, smoothed.states(run.charts))

@@ -26,8 +26,9 @@ from recon.problem import Problem
 
 LOST_S = 5.0  # nothing believed for so long, or to the end of the track
 LOST_POINTS = 6
+LEAST_BELIEVED = 0.5
 BEFORE_S, AFTER_S = 1.5, 0.5  # a slow departure passes the gate for a while
-FIRST_DENSITY, GROWTH, LARGEST_DENSITY = 0.1, 10.0, 1.1e5  # (m/s^2)^2/Hz
+FIRST_DENSITY, GROWTH, LARGEST_DENSITY = 0.1, 10.0, 1.1e6  # (m/s^2)^2/Hz
 
 
 STATED_CORRELATION_S = 1.0  # what is disturbed keeps its value for about so long
@@ -86,6 +87,12 @@ def lost_at(problem: Problem, innovations: Innovations) -> tuple[float, float] |
         if ends or time_s[last] - time_s[first] >= LOST_S:
             return (float(time_s[a]) if a >= 0 else float(problem.time_s[0])), float(time_s[first])
     return None
+
+
+def is_lost(problem: Problem, run: ForwardPass) -> bool:
+    """Whether a pass, with all the disturbances it was given, believed less than half of what it was offered."""
+    usable = problem.observed.usable
+    return bool(run.innovations.accepted[usable].mean() < LEAST_BELIEVED)
 
 
 def widened(known: tuple[Disturbance, ...], problem: Problem, run: ForwardPass) -> tuple[Disturbance, ...] | None:

@@ -24,6 +24,7 @@ DIFFUSE_POSITION_M = 1000.0
 DIFFUSE_VELOCITY_MPS = 100.0
 FIT_SPAN_S = 3.0
 LEAST_POINTS = 4
+TRACK_SPAN_S = 2.5
 STILL_RAD = 1e-6
 GYRO = slice(18, 27)
 
@@ -116,6 +117,35 @@ def fit_first_points(instruments: tuple[Instrument, ...], start_s: float) -> tup
         scale = float(np.median(distance))
         weight = 1.0 / (1.0 + (distance / (2.0 * scale + 1e-3)) ** 2) ** 2
     return coefficients[0], coefficients[1]
+
+
+def along_track(instruments: tuple[Instrument, ...], time_s: FloatArray, errors: int) -> States | None:
+    """States at nodes (n,) that tracking alone tells, without attitude: where to linearise when a filter is lost.
+
+    Parabolas through the points within `TRACK_SPAN_S` of a node give position and velocity; cubics that meet both
+    cross the gaps between. None where fewer than two nodes have points about them.
+    """
+    t, p = places(instruments)
+    first, last = np.searchsorted(t, time_s - TRACK_SPAN_S), np.searchsorted(t, time_s + TRACK_SPAN_S)
+    told = np.flatnonzero(last - first >= LEAST_POINTS)
+    # far from its own points a parabola says nothing
+    told = np.array([k for k in told if t[first[k]] <= time_s[k] <= t[last[k] - 1]], dtype=np.int64)
+    if len(told) < 2:
+        return None
+    fits = np.array(
+        [
+            np.polynomial.polynomial.polyfit(t[a:b] - at, p[a:b], 2)[:2]
+            for a, b, at in zip(first[told], last[told], time_s[told], strict=True)
+        ]
+    )
+    from scipy.interpolate import CubicHermiteSpline
+
+    path = CubicHermiteSpline(time_s[told], fits[:, 0], fits[:, 1])
+    inside = np.clip(time_s, time_s[told[0]], time_s[told[-1]])
+    velocity = path.derivative()(inside)
+    position = path(inside) + (time_s - inside)[:, None] * velocity
+    still = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_s), 1))
+    return States(position, velocity, still, np.zeros((len(time_s), errors)))
 
 
 def _covariance(model: ErrorModel) -> FloatArray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import _filter_kernels as kernels
-from recon import _smoother_kernels, smoother
+from recon import _bryson_frazier_kernels, _smoother_kernels, smoother
 from recon._measurement_kernels import SLOTS
 from recon.ekf import make_filter, schmidt_update
 from recon.packed import Filtered, Innovations, Observed, Steps, Wander, packed
@@ -160,7 +160,7 @@ def smooth(problem, out, innovations, method, engine="compiled"):
         )
     elif method == "bryson-frazier":
         x = np.empty_like(out.x_plus)
-        adjoint = _smoother_kernels.bryson_frazier if engine == "compiled" else smoother.bryson_frazier
+        adjoint = _bryson_frazier_kernels.bryson_frazier if engine == "compiled" else smoother.bryson_frazier
         adjoint(problem.steps, out, problem.observed, problem.slots, innovations, x, triangles, variance)
     else:
         x = out.x_plus.copy()
