@@ -32,7 +32,9 @@ from flightmodel.airdata import pressure_pulse
 from postflight import drawing, figures
 from postflight.pipeline import METHODS, estimate, reconstruct_flight
 from postflight.preflight import rigid_bounds
-from postflight.results import event_table, method_summary
+from postflight.product.tables import event_table
+from postflight.product.trajectory_table import bet_table
+from postflight.results import method_summary
 
 folder = Path(os.environ.get("POSTFLIGHT_FLIGHT", "../demo-flight"))
 if not (folder / "flight.toml").exists():
@@ -63,7 +65,7 @@ pd.DataFrame(rows, columns=["sensor", "samples", "from s", "to s"])
 # the sensors' own errors on the way. If its assumptions hold, the residuals are as large as predicted and white.
 
 # %%
-event_table(flight).round(2)
+event_table(flight, bet_table(flight)).round(2)
 
 # %%
 pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.words) for v in flight.verdicts],

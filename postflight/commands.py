@@ -23,6 +23,7 @@ from postflight import drawing, figures, results, scoring, warmup
 from postflight.pipeline import (
     METHODS,
     NO_VIDEO,
+    PULSE_RATE_HZ,
     Answers,
     Flight,
     camera_sensitivity,
@@ -125,7 +126,7 @@ def print_events(flown: list[Event]) -> None:
 def run(folder: Path, methods: tuple[str, ...], rate_hz: float) -> None:
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers."""
     flight, answers, written = run_flight(folder, methods, rate_hz)
-    print_flight(flight)
+    print_flight(flight, pd.read_csv(written / "events.csv"))
     if methods:
         print_answers(answers, flight.peak_s)
     console.print(f"results in {escape(str(written))}")
@@ -150,7 +151,9 @@ def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[
         step(0.0, 0.05)(0.0, "reading telemetry")
         telemetry = read_flight(folder)
         compile_kernels(*warmup.RECONSTRUCTION, "simulator")
-        flight = reconstruct_telemetry(telemetry, Settings(output_rate_hz=rate_hz), step(0.05, 0.5))
+        flight = reconstruct_telemetry(
+            telemetry, Settings(output_rate_hz=rate_hz, pulse_rate_hz=PULSE_RATE_HZ), step(0.05, 0.5)
+        )
         wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
         answers = estimate(flight, flight.telemetry, wanted, step(0.5, 0.7))
         if "camera" in methods and "camera" not in wanted:
@@ -169,13 +172,14 @@ def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[
     return flight, answers, out.path
 
 
-def print_flight(flight: Flight) -> None:
+def print_flight(flight: Flight, events: pd.DataFrame) -> None:
     """Events, verdicts and findings."""
     table = Table(title=f"Best-estimated trajectory of {escape(flight.telemetry.name)}")
     for name in ("event", "t s", "altitude km", "Mach", "q Pa", "alpha total deg"):
         table.add_column(name, justify="left" if name == "event" else "right")
-    for row in results.event_table(flight).itertuples(index=False):
-        alpha = f"{row.alpha_total_wind_deg:.2f} ± {row.alpha_total_wind_sd_deg:.2f}" if flight.has_attitude else ""
+    for row in events.itertuples(index=False):
+        sd = row.alpha_total_wind_3sd_deg / 3.0
+        alpha = f"{row.alpha_total_wind_deg:.2f} ± {sd:.2f}" if flight.has_attitude else ""
         pressure = f"{row.dynamic_pressure_pa:.1f}"
         table.add_row(row.event, f"{row.t_s:.2f}", f"{row.alt_m / 1e3:.2f}", f"{row.mach:.2f}", pressure, alpha)
     console.print(table)
@@ -294,7 +298,7 @@ def demo(folder: Path, seed: int) -> None:
     compile_kernels("simulator", *warmup.RECONSTRUCTION)
     simulate(REFERENCE, folder, seed, force=True)
     flight, answers, written = run_flight(folder, METHODS, 20.0)
-    print_flight(flight)
+    print_flight(flight, pd.read_csv(written / "events.csv"))
     for method, reason in answers.refused.items():
         console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
     result = scoring.score_run(folder, written)

@@ -35,6 +35,7 @@ from recon.suspects import suspects
 
 Progress = Callable[[float, str], None]
 METHODS = ("camera", "misalignment", "trim")
+PULSE_RATE_HZ = 50.0
 NO_VIDEO = "the flight has no video"
 # assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
 PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
@@ -108,6 +109,7 @@ def reconstruct_telemetry(
     """Reconstruct a flight that was read already."""
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "reconstructing")
+    settings = settings or Settings(pulse_rate_hz=PULSE_RATE_HZ)
     bet = reconstruct(telemetry, settings, lambda f, what: report(0.95 * f, what))
     report(0.96, "finding the air of the day")
     profile = profile_from_sounding(telemetry.sounding)
@@ -119,7 +121,7 @@ def reconstruct_telemetry(
         telemetry.required_vehicle()
         telemetry.required_triads()
         pulse = pulse_data(telemetry, bet, air)
-        day = day_air(telemetry, bet, profile, (settings or Settings()).verdict_confidence)
+        day = day_air(telemetry, bet, profile, settings.verdict_confidence)
     except GateError as fault:
         missing.append(str(fault))
     report(1.0, "reconstructed")

@@ -20,14 +20,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from flightmodel import earth, moments
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.pipeline import NO_VIDEO, Answers, Flight
+from postflight.product.header import header
+from postflight.product.tables import event_table, peak_table, residual_statistics, slow_covariance
+from postflight.product.trajectory_table import bet_table
 
 DIGITS = "%.10g"
-ATTITUDE_COLUMNS = ("q", "alpha", "beta", "clock")  # and those of the body axes
 
 
 class RunFolder:
@@ -119,56 +120,6 @@ def newest_run(flight_folder: Path) -> Path:
     return runs[-1]
 
 
-def bet_table(flight: Flight) -> pd.DataFrame:
-    """Best estimated trajectory with air data and standard deviations, one row an output time.
-
-    Where the attitude is not known, columns that need it are left out.
-    """
-    bet, air = flight.reconstruction.smoothed, flight.air
-    sd = bet.sd()
-    v_ned = earth.ned_from_ecef(bet.velocity_ecef_mps, bet.position_ecef_m)
-    columns: dict[str, FloatArray] = {"t_s": bet.time_s}
-
-    def three(pattern: str, letters: str, values: FloatArray) -> None:
-        columns.update({pattern.format(a): c for a, c in zip(letters, values.T, strict=True)})
-
-    three("r{}_ecef_m", "xyz", bet.position_ecef_m)
-    three("v{}_ecef_mps", "xyz", bet.velocity_ecef_mps)
-    three("q{}_ecef_body", "wxyz", bet.q_ecef_body)
-    three("{}_body_degps", "pqr", np.rad2deg(bet.omega_body_eci_body_radps))
-    three("r{}_ecef_sd_m", "xyz", sd[:, 0:3])
-    three("v{}_ecef_sd_mps", "xyz", sd[:, 3:6])
-    three("rotation_{}_body_sd_deg", "xyz", np.rad2deg(sd[:, 6:9]))
-    columns |= {
-        "lat_deg": np.rad2deg(air.latitude_rad),
-        "lon_deg": np.rad2deg(air.longitude_rad),
-        "alt_m": air.altitude_m,
-        "speed_ground_mps": np.linalg.norm(bet.velocity_ecef_mps, axis=1),
-        "airspeed_mps": air.airspeed_mps,
-        "flight_path_deg": np.rad2deg(air.flight_path_angle_rad),
-        "heading_deg": np.rad2deg(np.mod(np.arctan2(v_ned[:, 1], v_ned[:, 0]), 2 * np.pi)),
-        "mach": air.mach,
-        "dynamic_pressure_pa": air.dynamic_pressure_pa,
-        "dynamic_pressure_sd_pa": air.dynamic_pressure_sd_pa,
-        "rho_kgpm3": air.air.density_kgpm3,
-        "t_k": air.air.temperature_k,
-        "wind_n_mps": air.air.wind_ned_mps[:, 0],
-        "wind_e_mps": air.air.wind_ned_mps[:, 1],
-        "wind_sd_mps": air.air.wind_sd_mps,
-        "alpha_deg": np.rad2deg(air.alpha_rad),
-        "beta_deg": np.rad2deg(air.beta_rad),
-        "clock_lv_deg": np.rad2deg(air.clock_lv_rad),
-    }
-    for kind in ("wind", "ground", "inertial"):
-        columns[f"alpha_total_{kind}_deg"] = np.rad2deg(getattr(air, f"alpha_total_{kind}_rad"))
-        columns[f"alpha_total_{kind}_sd_deg"] = np.rad2deg(getattr(air, f"alpha_total_{kind}_sd_rad"))
-    table = pd.DataFrame(columns)
-    if not flight.has_attitude:
-        turned = [name for name in table if name.startswith(ATTITUDE_COLUMNS) or "_body_" in name]
-        table = table.drop(columns=turned)
-    return table
-
-
 def deflection_table(history: DeflectionHistory) -> pd.DataFrame:
     """Angle and plane with standard deviations; rows without an answer are left out."""
     keep = np.isfinite(history.theta_rad)
@@ -185,24 +136,6 @@ def deflection_table(history: DeflectionHistory) -> pd.DataFrame:
         }
     )
     return table[keep]
-
-
-def event_table(flight: Flight) -> pd.DataFrame:
-    """Moments of the flight with altitude, Mach number, dynamic pressure and total angle of attack."""
-    air = flight.air
-    named = [(name, t) for name, t in flight.telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
-    peak = "peak dynamic pressure" if flight.peak_is_inside else "largest dynamic pressure (edge of data)"
-    named.append((peak, flight.peak_s))
-    named += moments.descent_moments(air.time_s, air.altitude_m, air.mach)
-    rows = []
-    for name, t in sorted(named, key=lambda m: m[1]):
-        k = int(np.searchsorted(air.time_s, t).clip(0, len(air.time_s) - 1))
-        alpha, sd = np.rad2deg([air.alpha_total_wind_rad[k], air.alpha_total_wind_sd_rad[k]])
-        if not flight.has_attitude:
-            alpha = sd = np.nan
-        rows.append((name, t, air.altitude_m[k], air.mach[k], air.dynamic_pressure_pa[k], alpha, sd))
-    names = ["event", "t_s", "alt_m", "mach", "dynamic_pressure_pa", "alpha_total_wind_deg", "alpha_total_wind_sd_deg"]
-    return pd.DataFrame(rows, columns=names)
 
 
 def method_summary(answers: Answers, at_s: float) -> dict[str, dict[str, Any]]:
@@ -228,15 +161,21 @@ def method_summary(answers: Answers, at_s: float) -> dict[str, dict[str, Any]]:
 
 
 def write_reconstruction(run: RunFolder, flight: Flight) -> None:
-    """Trajectory, residuals, verdicts, sensor errors, events, findings."""
+    """Trajectory, its header and covariance, residuals, verdicts, sensor errors, events, air, findings."""
     bet = flight.reconstruction
-    run.write_csv("bet.csv", bet_table(flight))
+    table = bet_table(flight)
+    run.write_csv("bet.csv", table)
+    run.write_json("bet_header.json", header(flight))
+    slow = slow_covariance(flight)
+    np.savez_compressed(run.path / "covariance.npz", t_s=slow["t_s"], covariance=slow["covariance"])
+    run.write_csv("peaks.csv", peak_table(flight, table))
+    run.write_csv("residual_statistics.csv", residual_statistics(flight))
     run.write_csv("residuals.csv", bet.residuals)
     if len(bet.withheld):
         run.write_csv("withheld.csv", bet.withheld)
     run.write_csv("verdicts.csv", pd.DataFrame([vars(v) for v in flight.verdicts]))
     run.write_csv("sensor_errors.csv", bet.sensor_errors)
-    run.write_csv("events.csv", event_table(flight))
+    run.write_csv("events.csv", event_table(flight, table))
     if flight.day is not None:
         run.write_csv("air_profile.csv", flight.day.profile)
         run.write_csv("drag_ratio.csv", flight.day.drag)
@@ -249,7 +188,7 @@ def without_attitude(flight: Flight) -> tuple[Finding, ...]:
     """Finding that says what is not in the tables of a flight without inertial sensors; none with them."""
     if flight.has_attitude:
         return ()
-    words = "no inertial sensors carried the attitude: attitude, rates and flow angles are not in bet.csv"
+    words = "no inertial sensors carried the attitude: attitude, rates and flow angles are empty in bet.csv"
     return (Finding("attitude", words, np.nan, np.nan),)
 
 

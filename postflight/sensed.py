@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from estimators.pulse import PulseData
 from flightmodel.airdata import AirData, lateral_angles
-from flightmodel.checks import FloatArray
+from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.telemetry import Telemetry
 from recon.bet import Reconstruction
 
@@ -31,31 +33,55 @@ def window_means(time_s: FloatArray, values: FloatArray, start_s: FloatArray, en
     return (integral(end_s) - integral(start_s)) / np.maximum(width, 1e-9)[:, None]
 
 
-def pulse_data(telemetry: Telemetry, bet: Reconstruction, air: AirData) -> PulseData:
-    """Corrected sensors at the c.g. and the flow, on the BET's time grid, where no telemetry gap is near."""
-    t_imu, grid = bet.imu_time_s, bet.smoothed.time_s
-    h = HALF_WINDOW_S
+@dataclass(frozen=True)
+class Sensed:
+    """Means over `HALF_WINDOW_S` to both sides of times (k,), body axes: force at sensor and c.g., rate, its change."""
+
+    specific_force_sensor_mps2: FloatArray
+    specific_force_cg_mps2: FloatArray
+    rate_radps: FloatArray
+    angular_acceleration_radps2: FloatArray
+    samples: float
+
+
+def whole_windows(bet: Reconstruction, grid: FloatArray) -> BoolArray:
+    """Mask (n,) of times with sensor data to both sides and no telemetry gap near."""
+    t_imu, h = bet.imu_time_s, HALF_WINDOW_S
+    if len(t_imu) < 2:
+        return np.zeros(len(grid), dtype=bool)
     inside = (grid - 2 * h >= t_imu[0]) & (grid + 2 * h <= t_imu[-1])
     nearest = np.searchsorted(t_imu, grid).clip(1, len(t_imu) - 1)
-    inside &= t_imu[nearest] - t_imu[nearest - 1] <= 2.0 * h
-    t = grid[inside]
+    return np.asarray(inside & (t_imu[nearest] - t_imu[nearest - 1] <= 2.0 * h))
+
+
+def sensed(bet: Reconstruction, t: FloatArray, cg_from_sensor_m: FloatArray) -> Sensed:
+    """What the corrected sensors say at times whose windows are whole."""
+    t_imu, h = bet.imu_time_s, HALF_WINDOW_S
     force = window_means(t_imu, bet.specific_force_body_mps2, t - h, t + h)
     rate = window_means(t_imu, bet.rate_body_radps, t - h, t + h)
     after = window_means(t_imu, bet.rate_body_radps, t, t + 2 * h)
     before = window_means(t_imu, bet.rate_body_radps, t - 2 * h, t)
     turn = (after - before) / (2 * h)
-    samples = max(1.0, 2 * h / float(np.median(np.diff(t_imu))))
+    at_cg = force + np.cross(turn, cg_from_sensor_m) + np.cross(rate, np.cross(rate, cg_from_sensor_m))
+    return Sensed(force, at_cg, rate, turn, max(1.0, 2 * h / float(np.median(np.diff(t_imu)))))
+
+
+def pulse_data(telemetry: Telemetry, bet: Reconstruction, air: AirData) -> PulseData:
+    """Corrected sensors at the c.g. and the flow, at the BET's even output rate, where no telemetry gap is near."""
+    grid = bet.smoothed.time_s
+    ticks = grid * bet.output_rate_hz
+    inside = whole_windows(bet, grid) & (np.abs(ticks - np.round(ticks)) < 1e-5)
     vehicle, (accelerometer, rates) = telemetry.required_vehicle(), telemetry.required_triads()
-    arm = vehicle.cg_m - accelerometer.spec.position_from_datum_body_m
-    at_cg = force + np.cross(turn, arm) + np.cross(rate, np.cross(rate, arm))
-    white = accelerometer.spec.noise_sd**2 / samples * np.eye(3)
+    t = grid[inside]
+    at = sensed(bet, t, vehicle.cg_m - accelerometer.spec.position_from_datum_body_m)
+    white = accelerometer.spec.noise_sd**2 / at.samples * np.eye(3)
     return PulseData(
         time_s=t,
-        specific_force_body_mps2=at_cg,
+        specific_force_body_mps2=at.specific_force_cg_mps2,
         specific_force_cov=bet.specific_force_cov[inside] + white,
-        rate_body_radps=rate,
-        angular_acceleration_body_radps2=turn,
-        angular_acceleration_sd_radps2=float(np.sqrt(2.0 / samples) * rates.spec.noise_sd / (2 * h)),
+        rate_body_radps=at.rate_radps,
+        angular_acceleration_body_radps2=at.angular_acceleration_radps2,
+        angular_acceleration_sd_radps2=float(np.sqrt(2.0 / at.samples) * rates.spec.noise_sd / (2 * HALF_WINDOW_S)),
         flow_yz_rad=lateral_angles(air.velocity_air_body_mps[inside]),
         flow_cov=air.lateral_flow_cov[inside],
         mach=air.mach[inside],

@@ -67,8 +67,9 @@ class Reconstruction:
         Times of the accelerometer's valid samples outside gyro gaps.
     specific_force_body_mps2, rate_body_radps : (k, 3) float
         At the accelerometer, corrected for estimated bias, scale and mount; not smoothed.
-    specific_force_cov : (n, 3, 3) float
-        Systematic error covariance of the corrected specific force on the trajectory's times, (m/s^2)^2.
+    specific_force_cov, rate_cov : (n, 3, 3) float
+        Systematic error covariance of the corrected specific force, (m/s^2)^2, and rates, (rad/s)^2, on the
+        trajectory's times; empty without inertial sensors.
     findings : tuple of Finding
         Gaps that were bridged, stretches of radar track that were edited.
     provenance : dict
@@ -86,9 +87,17 @@ class Reconstruction:
     specific_force_body_mps2: FloatArray
     rate_body_radps: FloatArray
     specific_force_cov: FloatArray
+    rate_cov: FloatArray
     findings: tuple[Finding, ...]
     provenance: dict[str, object]
     left_out: tuple[LeftOut, ...] = ()
+
+    @property
+    def output_rate_hz(self) -> float:
+        """Rate of the trajectories outside the pulse."""
+        settings = self.provenance["settings"]
+        assert isinstance(settings, dict)
+        return float(settings["output_rate_hz"])
 
 
 def reconstruct(
@@ -132,7 +141,7 @@ def _examined(
 
     def rerun(source: str) -> tuple[Trajectory, tuple[Verdict, ...]]:
         report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
-        without = replace(settings, without=(*settings.without, source), output_rate_hz=coarse)
+        without = replace(settings, without=(*settings.without, source), output_rate_hz=coarse, pulse_rate_hz=0.0)
         other = reconstruct_once(telemetry, without)
         return other.smoothed, other.verdicts
 
@@ -174,6 +183,7 @@ def reconstruct_once(telemetry: Telemetry, settings: Settings, progress: Progres
         specific_force_body_mps2=series[1],
         rate_body_radps=series[2],
         specific_force_cov=series[3],
+        rate_cov=series[4],
         findings=(
             *found,
             *(d.finding() for d in disturbances),
@@ -207,14 +217,13 @@ def _mounting(telemetry: Telemetry, bridges: Bridges | None) -> product.Mounting
     return product.Mounting(telemetry.t0_utc, arm, bridges.rate)
 
 
-def _series(
-    problem: Problem, bridges: Bridges | None, states: States, smoothed: Smoothed
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Corrected specific force and rates with their times, and the covariance of the force at kept nodes."""
+def _series(problem: Problem, bridges: Bridges | None, states: States, smoothed: Smoothed) -> tuple[FloatArray, ...]:
+    """Corrected specific force and rates with their times, and the covariances of both at kept nodes."""
     if bridges is None:
-        return np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
+        return np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
     series = product.corrected_series(problem, bridges.force, bridges.rate, states)
-    return (*series, product.specific_force_cov(problem, states, smoothed.triangles))
+    covs = (make(problem, states, smoothed.triangles) for make in (product.specific_force_cov, product.rate_cov))
+    return (*series, *covs)
 
 
 def _mcreynolds(problem: Problem, run: ekf.ForwardPass, smoothed: Smoothed, reference: States) -> list[Verdict]:

@@ -111,6 +111,15 @@ def specific_force_cov(problem: Problem, states: States, triangles: FloatArray) 
     return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
 
 
+def rate_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
+    """Systematic error covariance (k, 3, 3) of the corrected rates at kept nodes, body axes, (rad/s)^2."""
+    kept = np.flatnonzero(problem.kept)
+    measured = problem.motion.rate_sensor_radps[problem.node_index[kept]]
+    partials = correction_partials(measured, states.sensor_errors[kept, 9:18], problem.motion.dcm_body_rate)
+    covariance = unpacked(triangles, 27)[:, 18:27, 18:27]
+    return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
+
+
 def sensor_error_table(problem: Problem, states: States, smoothed: Smoothed) -> pd.DataFrame:
     """Prior and posterior of every error; of those that wander, the value at mid-span."""
     kept = np.flatnonzero(problem.kept)

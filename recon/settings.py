@@ -17,6 +17,9 @@ class Settings:
     ----------
     output_rate_hz : float
         Of the trajectories.
+    pulse_rate_hz : float
+        Of the trajectories where the accelerometers feel more than half of the descent's largest force; 0 for no other
+        rate there, so that equal spans have equal times.
     start_s, end_s : float or None
         Span; the data's own common span where None.
     passes : int
@@ -47,6 +50,7 @@ class Settings:
     """
 
     output_rate_hz: float = 20.0
+    pulse_rate_hz: float = 0.0
     start_s: float | None = None
     end_s: float | None = None
     passes: int = 3
@@ -66,6 +70,8 @@ class Settings:
         faults = []
         if not 0.1 <= self.output_rate_hz <= 1000.0:
             faults.append(f"output_rate_hz {self.output_rate_hz} must lie in 0.1 to 1000")
+        if self.pulse_rate_hz != 0.0 and not 0.1 <= self.pulse_rate_hz <= 1000.0:
+            faults.append(f"pulse_rate_hz {self.pulse_rate_hz} must be 0 or lie in 0.1 to 1000")
         if not 0 <= self.passes <= 10:
             faults.append(f"passes {self.passes} must lie in 0 to 10")
         if self.withhold_every != 0 and not 2 <= self.withhold_every <= 1000:

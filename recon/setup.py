@@ -22,6 +22,7 @@ from recon.settings import Settings
 from recon.state import BoolArray, IntArray
 
 TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT)
+PULSE_CELL_S, LEAST_PULSE_MPS2 = 0.5, 5.0
 ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
 BALLISTIC_STEP_S = 0.5  # drivers stand still within a step, and forget in seconds and kilometres
 
@@ -48,6 +49,8 @@ def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | N
     used = tuple(i for i in instruments if not _left_out(i, settings))
     start_s, end_s = _span(used, settings, bridges)
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
+    if bridges is not None and settings.pulse_rate_hz > settings.output_rate_hz:
+        output_s = _union([output_s, *_pulse_times(instruments, bridges.force, start_s, end_s, settings.pulse_rate_hz)])
     if settings.attitude_sensors:
         instruments += attitude_instruments(telemetry, used, start_s, end_s)
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
@@ -218,6 +221,28 @@ def _output_times(start_s: float, end_s: float, rate_hz: float) -> FloatArray:
     first, last = np.ceil(start_s * rate_hz - 1e-6), np.floor(end_s * rate_hz + 1e-6)
     times = np.clip(np.arange(first, last + 1.0) / rate_hz, start_s, end_s)
     return _union([np.array([start_s]), times])
+
+
+def _pulse_times(
+    instruments: tuple[Instrument, ...], force: Bridged, start_s: float, end_s: float, rate_hz: float
+) -> list[FloatArray]:
+    """Multiples of the pulse's step where the descent's specific force exceeds half its largest; empty without one."""
+    at, points = startup.places(instruments)
+    apex_s = float(at[int(np.argmax(np.linalg.norm(points, axis=1)))])
+    inside = (force.time_s >= max(start_s, apex_s)) & (force.time_s <= end_s)
+    if inside.sum() < 2:
+        return []
+    cell = np.floor((force.time_s[inside] - force.time_s[inside][0]) / PULSE_CELL_S).astype(np.int64)
+    count = np.bincount(cell)
+    size = np.bincount(cell, np.linalg.norm(force.measured_sensor[inside], axis=1)) / np.maximum(count, 1)
+    size = np.interp(np.arange(len(size)), np.flatnonzero(count), size[count > 0])
+    if size.max() < LEAST_PULSE_MPS2:
+        return []
+    peak, weak = int(np.argmax(size)), size < 0.5 * size.max()
+    first = int(np.flatnonzero(weak[:peak])[-1]) + 1 if weak[:peak].any() else 0
+    last = peak + int(np.argmax(weak[peak:])) if weak[peak:].any() else len(size)
+    begin = float(force.time_s[inside][0]) + PULSE_CELL_S * first
+    return [_output_times(begin, min(begin + PULSE_CELL_S * (last - first), end_s), rate_hz)[1:]]
 
 
 def _union(times: list[FloatArray]) -> FloatArray:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon import _filter_kernels as kernels
 from recon import _bryson_frazier_kernels, _smoother_kernels, smoother
+from recon import _filter_kernels as kernels
 from recon._measurement_kernels import SLOTS
 from recon.ekf import make_filter, schmidt_update
 from recon.packed import Filtered, Innovations, Observed, Steps, Wander, packed
