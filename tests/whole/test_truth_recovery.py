@@ -135,7 +135,7 @@ def test_standard_deviations_are_positive_everywhere(bet) -> None:
 
 
 def test_force_coefficients_over_the_pulse_are_within_four_sd(bet, pulse) -> None:
-    """C_A is the table's; the body's C_N is several times the table's, for the shell pushes askew on it (Figure 2.5)."""
+    """C_A is the table's; the body's C_N is several times that, for the shell pushes askew on it (Figure 2.5)."""
     from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 
     aero = vehicle_from_toml(vehicle_path("irve2_reference")).aero
