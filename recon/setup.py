@@ -9,9 +9,10 @@ import numpy as np
 from flightmodel import geomagnetism_and_sun
 from flightmodel.checks import FloatArray, GateError, nearest_name
 from flightmodel.selection import spaced
-from flightmodel.telemetry import Telemetry
+from flightmodel.telemetry import AttitudePrior, Telemetry
 from recon import error_model, inertial, measurements, startup
 from recon._measurement_kernels import HEIGHT, POSITION, RADAR, VELOCITY
+from recon.attitude_check import start_attitude_from_vectors
 from recon.ballistic import ballistic_motion
 from recon.disturbance import with_stated
 from recon.error_model import ErrorModel
@@ -63,7 +64,7 @@ def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | N
     else:
         force, rate = bridges.force, bridges.rate
         motion, node_index = inertial.inertial_motion(force, rate, time_s)
-        prior = startup.attitude_prior(telemetry)
+        prior = _attitude_prior(telemetry, start_s)
         start, covariance = startup.start_by_inertial_sensors(used, prior, start_s, force, rate, model)
     motion = with_stated(motion, telemetry.motion)
     from scipy.stats import chi2
@@ -120,6 +121,19 @@ def _only_predicted(problem: Problem, settings: Settings) -> BoolArray:
         for start, end in settings.withhold_s:
             out[mine] |= (at[mine] >= start) & (at[mine] < end)
     return out
+
+
+def _attitude_prior(telemetry: Telemetry, start_s: float) -> AttitudePrior:
+    """Attitude as it is stated; where it is not, from magnetometer and Sun sensors about the start.
+
+    Raises
+    ------
+    GateError
+        Where there is neither.
+    """
+    if telemetry.attitude_prior is not None:
+        return telemetry.attitude_prior
+    return start_attitude_from_vectors(telemetry, start_s).prior()
 
 
 def _accelerometer_arm(bridges: Bridges | None) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.telemetry import AttitudePrior, Telemetry
+from flightmodel.telemetry import AttitudePrior
 from recon._measurement_kernels import POSITION, RADAR
 from recon.error_model import ErrorModel
 from recon.inertial import Bridged, inertial_motion
@@ -57,13 +57,6 @@ def start_attitude(
     cross = by_gyro @ gyro_var
     total = by_attitude @ var @ by_attitude.T + cross @ by_gyro.T + step.noise[6:9, 6:9]
     return step.state.q_ecef_body, total, cross
-
-
-def attitude_prior(telemetry: Telemetry) -> AttitudePrior:
-    """Attitude as it is stated."""
-    if telemetry.attitude_prior is None:
-        raise GateError("no attitude to start from: add [attitude_prior] to flight.toml")
-    return telemetry.attitude_prior
 
 
 def places(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:

@@ -187,7 +187,7 @@ def track(telemetry: Telemetry) -> tuple[FloatArray, FloatArray]:
     if not whole.any():
         raise GateError(f"flight '{telemetry.name}': no radar point and no fix places the vehicle in the Earth's field")
     block = np.floor(t[whole] / TRACK_BLOCK_S)
-    table = pd.DataFrame(np.column_stack([t, p])[whole]).groupby(block).median().to_numpy()
+    table = pd.DataFrame(np.column_stack([t, p])[whole]).groupby(block).median().to_numpy(copy=True)
     # a block's ends are nearer to its median than a field of a kilometre
     table[0, 0], table[-1, 0] = t[whole].min(), max(t[whole].max(), table[0, 0] + 1e-3)
     return table[:, 0], table[:, 1:]
