@@ -1,4 +1,4 @@
-"""Every notebook runs from top to bottom on a synthetic flight, and is stored without outputs."""
+"""Every notebook runs from top to bottom, on a synthetic flight or the tree's own, and is stored without outputs."""
 
 import os
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.py"))
+LEAST_PICTURES = {"one_flight": 5, "real_rockets": 3}
 
 
 @pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda p: p.stem)
@@ -27,10 +28,12 @@ def test_notebook_runs(script, tmp_path, monkeypatch):
     from synthetic_flight.scenarios import read_scenario
 
     folder = tmp_path / "flight"
-    simulate_to_folder(read_scenario("irve2_reference"), 21, folder)
+    if script.stem == "one_flight":
+        simulate_to_folder(read_scenario("irve2_reference"), 21, folder)
+    monkeypatch.delenv("POSTFLIGHT_REALDATA", raising=False)
     monkeypatch.setenv("POSTFLIGHT_FLIGHT", str(folder))
     notebook = jupytext.read(script)
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(script.parent)}}).execute()
     pictures = [o for c in notebook.cells for o in c.get("outputs", []) if "image/png" in o.get("data", {})]
-    assert len(pictures) >= 5
+    assert len(pictures) >= LEAST_PICTURES[script.stem]
     assert os.environ["POSTFLIGHT_FLIGHT"] == str(folder)
