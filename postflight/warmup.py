@@ -137,7 +137,7 @@ def prepare(groups: Iterable[str], say: Callable[[str], None]) -> None:
     wanted = missing(groups)
     if not wanted:
         return
-    say(f"compiling kernels for this machine, once (about 15 s): {', '.join(wanted)}")
+    say(f"compiling kernels for this machine, once (up to a minute): {', '.join(wanted)}")
     quiet = subprocess.DEVNULL
     running = [
         subprocess.Popen([sys.executable, "-m", "postflight.warmup", group], stdin=quiet, stdout=quiet, stderr=quiet)
