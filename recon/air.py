@@ -231,7 +231,7 @@ def _least_squares(
     model: _Model, blocks: list[FloatArray], information: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Normalised unknowns (u,), their covariance, and residuals (n, 3) in standard deviations."""
-    from scipy.linalg import block_diag, cho_factor, cho_solve
+    from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 
     prior = block_diag(*information)
     x = np.zeros(len(prior))
@@ -245,7 +245,13 @@ def _least_squares(
         jacobian = np.concatenate(
             [(partials[:, :, k] / sd)[:, :, None] * b[:, None, :] for k, b in enumerate(blocks)], axis=2
         ).reshape(-1, len(x))
-        factor = cho_factor(jacobian.T @ jacobian + prior)
+        try:
+            factor = cho_factor(jacobian.T @ jacobian + prior)
+        except (LinAlgError, ValueError):  # steps led to forces that are no numbers
+            raise GateError(
+                "air: no density and winds near the sounding's explain the deceleration along this trajectory; see the "
+                "verdicts, and check the accelerometer's axes, units and mount"
+            ) from None
         step = cho_solve(factor, jacobian.T @ residual.ravel() - prior @ x)
         x = x + step
         covariance = cho_solve(factor, np.eye(len(x)))

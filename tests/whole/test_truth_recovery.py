@@ -420,7 +420,9 @@ def test_range_package_trajectory(delivered) -> None:
     assert bet["t_s"].iloc[-1] > 520.0
     assert bet["alt_m"].iloc[0] == pytest.approx(202e3, abs=1e3)
     assert bet["alt_m"].min() < 35e3
-    values = bet[[c for c in bet if "_sd_" in c]].to_numpy()
+    # forces and what follows from them are empty in telemetry gaps and where nothing pushes (docs/bet-product.md)
+    forces = ("ax_", "ay_", "az_", "c_", "cn_", "density_ratio")
+    values = bet[[c for c in bet if "_sd_" in c and not c.startswith(forces)]].to_numpy()
     assert np.isfinite(values).all()
     pulse = bet["dynamic_pressure_pa"] > PULSE_FRACTION * bet["dynamic_pressure_pa"].max()
     assert bet.loc[pulse, [f"r{a}_ecef_sd_m" for a in "xyz"]].to_numpy().max() < 15.0
