@@ -133,6 +133,13 @@ def _attitude_prior(telemetry: Telemetry, start_s: float) -> AttitudePrior:
     """
     if telemetry.attitude_prior is not None:
         return telemetry.attitude_prior
+    if telemetry.magnetometer is None or telemetry.sun is None:
+        raise GateError(
+            [
+                f"flight '{telemetry.name}' has no attitude to start from; add [attitude_prior], or both "
+                "[sensors.magnetometer] and [sensors.sun] with their tables, to flight.toml"
+            ]
+        )
     return start_attitude_from_vectors(telemetry, start_s).prior()
 
 
