@@ -13,8 +13,6 @@ from recon.motion import Motion
 from recon.packed import Observed, Sources
 from recon.state import KINEMATIC, BoolArray, IntArray, States
 
-LONGEST_STEP_S = 2.0  # between the nodes of a thinned problem
-
 
 @dataclass(frozen=True)
 class Problem:

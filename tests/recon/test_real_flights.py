@@ -19,6 +19,7 @@ from scipy.stats import chi2
 
 from flightmodel import earth, rotations
 from flightmodel.flightfolder import read_flight
+from flightmodel.trajectory import resample
 from recon.bet import Settings, reconstruct
 from recon.withheld import summary
 
@@ -29,7 +30,10 @@ needs_data = [
     pytest.mark.slow,
     pytest.mark.skipif(REAL is None, reason="POSTFLIGHT_REALDATA names no folder of recorded flights"),
 ]
-USE_S = (r"(?m)^use_s = .*\n", "")
+# what an analyst wrote down of a flight's traps, taken out again
+ALL_TIMES = (r"(?m)^use_s = .*\n", "")
+THRUST_UNTOLD = (r"(?m)^powered_s.*\n", "")
+DISTURBED_UNTOLD = (r"(?m)^\[\[motion\.disturbed\]\]\n(.+\n){3}", "")
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +83,18 @@ def disturbances(flight):
     return [(f.start_s, f.end_s) for f in flight.findings if f.source == "motion"]
 
 
+def largest_difference(flight, other):
+    """Largest component of the position difference over the first flight's span, in combined standard deviations."""
+    a = flight.smoothed
+    b = resample(other.smoothed, a.time_s)
+    sd = np.sqrt(a.sd()[:, POSITION] ** 2 + b.sd()[:, POSITION] ** 2)
+    return float((np.abs(b.position_ecef_m - a.position_ecef_m) / sd).max())
+
+
+def some_overlap(spans, start, end):
+    return any(a < end and start < b for a, b in spans)
+
+
 POSITION, ATTITUDE = slice(0, 3), slice(6, 9)
 
 
@@ -123,6 +139,16 @@ class TestPrometheus:
         r = fly("rocketpy_prometheus", without=("baro",))
         assert 0.2 < foretold(r, "baro")["baro height"] < 2.2
 
+    def test_nothing_told_of_thrust_drogue_and_landing(self, fly):
+        """What powered_s and use_s told is found from the track, and the flight between comes out the same."""
+        raw = fly("rocketpy_prometheus", ALL_TIMES, THRUST_UNTOLD)
+        found = disturbances(raw)
+        assert some_overlap(found, 0.0, 6.0)
+        assert some_overlap(found, 28.4, 36.0)
+        assert some_overlap(found, 224.0, 229.0)
+        assert not some_overlap(found, 45.0, 150.0)
+        assert largest_difference(fly("rocketpy_prometheus"), raw) < 3.0
+
 
 # one radar
 
@@ -150,6 +176,15 @@ class TestBlackBrant:
 
     def test_no_acceleration_is_left_over(self, fly):
         assert not disturbances(fly("radar_36353"))
+
+    def test_nothing_told_of_echoes_gaps_and_loss(self, fly):
+        """Thrust behind a minute's gap, points that settle, echoes before landing, loss: found, the coast unharmed."""
+        told, raw = fly("radar_36353"), fly("radar_36353", ALL_TIMES, DISTURBED_UNTOLD)
+        found = disturbances(raw)
+        assert some_overlap(found, 1.65, 60.7)
+        assert not some_overlap(found, 100.0, 650.0)
+        assert largest_difference(told, raw) < 3.0
+        assert sd_at(raw, 30.0, POSITION) > 5e3
 
     def test_drag_has_the_history_of_a_body_that_enters_and_opens_a_parachute(self, fly):
         r = fly("radar_36353")
