@@ -18,7 +18,7 @@ import pandas as pd
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
-from recon import consistency, disagreement, ekf, inertial, product, smoother, startup, strapdown
+from recon import consistency, disagreement, ekf, gaps, product, smoother, startup, strapdown
 from recon.consistency import Verdict
 from recon.disagreement import LeftOut
 from recon.disturbance import Disturbance, disturbed, is_lost, widened
@@ -207,7 +207,7 @@ def bridge_triads(telemetry: Telemetry) -> Bridges | None:
     """Inertial triads with their gaps bridged; None where the flight has none."""
     if telemetry.accelerometer is None or telemetry.rates is None or telemetry.motion.model == "ballistic":
         return None
-    return Bridges(inertial.bridge(telemetry.accelerometer), inertial.bridge(telemetry.rates))
+    return Bridges(gaps.bridge(telemetry.accelerometer), gaps.bridge(telemetry.rates))
 
 
 def _mounting(telemetry: Telemetry, bridges: Bridges | None) -> product.Mounting:

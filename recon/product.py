@@ -20,7 +20,7 @@ from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, interpolate_rows
-from recon.inertial import Bridged
+from recon.gaps import Bridged
 from recon.packed import Innovations, unpacked
 from recon.problem import Problem
 from recon.smoother import Smoothed

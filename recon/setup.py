@@ -16,7 +16,8 @@ from recon.attitude_check import start_attitude_from_vectors
 from recon.ballistic import ballistic_motion
 from recon.disturbance import with_stated
 from recon.error_model import ErrorModel
-from recon.inertial import SAME_INSTANT_S, Bridged
+from recon.gaps import Bridged
+from recon.inertial import SAME_INSTANT_S
 from recon.measurements import Instrument
 from recon.problem import Problem, nearest_index, observe
 from recon.settings import Settings

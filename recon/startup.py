@@ -15,7 +15,8 @@ from flightmodel.checks import FloatArray, GateError
 from flightmodel.telemetry import AttitudePrior
 from recon._measurement_kernels import POSITION, RADAR
 from recon.error_model import ErrorModel
-from recon.inertial import Bridged, inertial_motion
+from recon.gaps import Bridged
+from recon.inertial import inertial_motion
 from recon.measurements import Instrument
 from recon.state import KINEMATIC, States
 from recon.strapdown import correct, propagate

@@ -5,7 +5,7 @@ import pytest
 
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
-from recon.inertial import bridge
+from recon.gaps import bridge
 
 SPEC = TriadSpec("rates", np.zeros(3), np.eye(3), 0.01, 0.01, 0.003, 0.002)
 

@@ -1,0 +1,215 @@
+"""One inertial triad without its missing samples, and what bridging them costs.
+
+White noise of ``sd`` per sample at ``rate`` hertz drives the integrals with density ``sd^2 / rate``; quantisation adds
+``resolution^2 / 12`` to the variance of a sample. Missing are samples without a value and, axis by axis, those that are
+`recon.stuck`. What counts as a gap is told by the samples nearby: a logger may change its rate in flight. Between slow
+samples the straight line misses about a twelfth of their second difference.
+
+A gap is bridged by a cubic that meets level and slope on both sides, or, where the signal swings, by a line from the
+mean before to the mean after. What either may miss is measured, not guessed: the same bridge is laid over pieces of the
+same length in the neighbouring good data, and the scatter E of its integral there, from the worse side, becomes the
+density ``E^2 / length`` inside the gap. The bridge that misses less is taken, axis by axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.instruments import TriadSpec
+from flightmodel.telemetry import Finding, TriadRecord
+from recon.stuck import stuck_samples
+
+SLOPE_SPAN_S = 0.06
+NEARBY_STEPS = 31  # of which the median is the usual step
+SLOWER = 1.5  # than the record's own usual step
+GAP, LONG_GAP = 1.5, 4.5  # usual steps: a straight line serves up to the second, as good as the signal is smooth
+LEAST_SAMPLES = 10
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Bridged:
+    """One triad without its missing samples.
+
+    Parameters
+    ----------
+    time_s, measured_sensor : (n,), (n, 3) float
+        Valid samples and the samples of the bridges.
+    density : (n, 3) float
+        White-noise density from each time to the next, body axes.
+    in_gap : (n,) bool
+        Whether the interval from each time to the next lies in a gap of any axis.
+    """
+
+    spec: TriadSpec
+    time_s: FloatArray
+    measured_sensor: FloatArray
+    density: FloatArray
+    in_gap: BoolArray
+    findings: tuple[Finding, ...]
+
+
+def bridge(record: TriadRecord) -> Bridged:
+    """Bridge the gaps of one triad and say where noise grows with them.
+
+    Raises
+    ------
+    GateError
+        Where an axis has fewer than ten good samples: there is nothing to integrate.
+    """
+    spec = record.spec
+    t, x, good, findings = _usable(record)
+    grid = _with_bridges(t)
+    column, density = np.empty((len(grid), 3)), np.empty((len(grid), 3))
+    in_gap = np.zeros(len(grid), dtype=bool)
+    told: dict[tuple[float, float], dict[str, float]] = {}
+    masks: list[BoolArray] = list(np.unique(good, axis=1).T)  # axes that miss the same samples are bridged together
+    for mask in masks:
+        axes = np.flatnonzero((good == mask[:, None]).all(axis=0))
+        column[:, axes], density[:, axes], gaps, missed = _bridge_axes(spec, t[mask], x[np.ix_(mask, axes)], grid)
+        in_gap |= gaps
+        for span, sizes in missed.items():
+            told.setdefault(span, {}).update(zip((AXES[a] for a in axes), sizes, strict=True))
+    for (start, end), lost in sorted(told.items()):
+        names = ", ".join(sorted(lost))
+        which = "samples" if len(lost) == 3 else f"usable samples of {names}"
+        words = f"no {which} for {end - start:.3f} s, bridged; integral over the gap uncertain by "
+        words += ", ".join(f"{lost[a]:.3g}" for a in sorted(lost)) + f" (SI; sensor {names})"
+        findings.append(Finding(spec.name, words, start, end))
+    return Bridged(spec, grid, column, density @ (spec.dcm_body_sensor**2).T, in_gap, tuple(findings))
+
+
+def _usable(record: TriadRecord) -> tuple[FloatArray, FloatArray, BoolArray, list[Finding]]:
+    """Times, samples and which of them are good (n, 3), from the first to the last time that every axis tells."""
+    t, x, spec = record.time_s, record.measured_sensor, record.spec
+    good = np.isfinite(x)
+    for axis in range(3):
+        there = np.flatnonzero(good[:, axis])
+        good[there, axis] = ~stuck_samples(x[there, axis], spec.noise_sd)
+        count = int(good[:, axis].sum())
+        if count < LEAST_SAMPLES:
+            one = len(there) >= LEAST_SAMPLES
+            why = f"all {len(there)} samples hold one value" if one else f"only {count} usable samples"
+            raise GateError(f"{spec.name}: sensor axis {AXES[axis]}: {why}; check its columns and units")
+    inside = [np.flatnonzero(g) for g in good.T]
+    first, last = max(int(k[0]) for k in inside), min(int(k[-1]) for k in inside)
+    rows = np.arange(len(t))
+    rows = rows[(rows >= first) & (rows <= last) & good.any(axis=1)]
+    findings = []
+    ended = [AXES[a] for a in range(3) if np.isfinite(x[last + 1 :, a]).any() and inside[a][-1] == last]
+    if ended and last < len(t) - LEAST_SAMPLES:
+        words = f"{', '.join(ended)} holds one value to the end of the record: the trajectory ends before it"
+        findings.append(Finding(spec.name, words, float(t[last]), float(t[-1])))
+    return t[rows], x[rows], good[rows], findings
+
+
+def _with_bridges(t: FloatArray) -> FloatArray:
+    """Times and, in gaps where there are none, those at which samples would have come."""
+    step = np.diff(t)
+    usual = usual_steps(step)
+    extra = [t]
+    for k in np.flatnonzero(step > LONG_GAP * usual).tolist():
+        times = t[k] + np.arange(1, int(np.ceil(step[k] / usual[k] - 0.5))) * usual[k]
+        extra.append(times[times < t[k + 1] - 0.5 * usual[k]])
+    return np.sort(np.concatenate(extra), kind="stable")
+
+
+def _bridge_axes(
+    spec: TriadSpec, t: FloatArray, x: FloatArray, grid: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray, dict[tuple[float, float], FloatArray]]:
+    """Samples (n, k) on the grid, densities (n, k) in sensor axes, gaps (n,), and what each long bridge may miss."""
+    step = np.diff(t)
+    usual = usual_steps(step)
+    sample_var = max(spec.noise_sd**2 + spec.resolution**2 / 12.0, 1e-24)
+    density = sample_var * np.append(usual, usual[-1])[:, None] + _between_slow(x, usual)
+    wide = np.zeros(len(t), dtype=bool)
+    wide[:-1] = step > GAP * usual
+    density[:-1][wide[:-1]] = sample_var * step[wide[:-1], None]
+    column = np.column_stack([np.interp(grid, t, axis) for axis in x.T])
+    missed = {}
+    for k in np.flatnonzero(step > LONG_GAP * usual).tolist():
+        sizes, swings = _missed_sd(t, x, k, step[k])
+        density[k] += sizes**2 / step[k]
+        missed[float(t[k]), float(t[k + 1])] = sizes
+        a, b = np.searchsorted(grid, [t[k], t[k + 1]])
+        cubic, line = _bridges(t, x, k, k + 1, grid[a + 1 : b])
+        column[a + 1 : b] = np.where(swings, line, cubic)
+    held = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
+    return column, density[held], wide[held], missed
+
+
+def usual_steps(step: FloatArray) -> FloatArray:
+    """Step (n,) that is usual about each step, the median of `NEARBY_STEPS`."""
+    from scipy.ndimage import median_filter
+
+    return np.asarray(median_filter(step, size=min(NEARBY_STEPS, len(step)), mode="nearest"))
+
+
+def _between_slow(x: FloatArray, usual: FloatArray) -> FloatArray:
+    """Density (n, k) of what a straight line misses where samples come slower than the record's usual."""
+    out = np.zeros(x.shape)
+    slow = np.flatnonzero(usual > SLOWER * float(np.median(usual)))
+    slow = slow[(slow > 0) & (slow < len(x) - 1)]
+    bend = x[slow + 1] - 2.0 * x[slow] + x[slow - 1]
+    out[slow] = (bend / 12.0) ** 2 * usual[slow, None]
+    return out
+
+
+def _level_and_slope(t: FloatArray, x: FloatArray, at: int, side: int) -> tuple[FloatArray, FloatArray]:
+    """Level and slope at sample ``at`` of a parabola through the samples on one side (-1 before, +1 after)."""
+    far = at + side * max(6, int(SLOPE_SPAN_S / max(abs(t[min(at + 1, len(t) - 1)] - t[at - 1]) / 2.0, 1e-4)))
+    lo, hi = max(0, min(at, far)), min(len(t), max(at, far) + 1)
+    tau = t[lo:hi] - t[at]
+    keep = np.abs(tau) <= 3.0 * SLOPE_SPAN_S  # not across another gap
+    if keep.sum() < 4:
+        return x[at], np.zeros(x.shape[1])
+    coefficients = np.polynomial.polynomial.polyfit(tau[keep], x[lo:hi][keep], 2)
+    return coefficients[0], coefficients[1]
+
+
+def _mean(t: FloatArray, x: FloatArray, at: int, span_s: float) -> tuple[float, FloatArray]:
+    """Mean time and sample of the samples up to ``span_s`` before (negative) or after sample ``at``."""
+    a, b = np.searchsorted(t, sorted((t[at], t[at] + span_s)))
+    rows = slice(a, max(b, a) + 1)
+    return float(t[rows].mean()), x[rows].mean(axis=0)
+
+
+def _bridges(t: FloatArray, x: FloatArray, before: int, after: int, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Cubic and line from sample ``before`` to sample ``after`` at ``times``, both (m, k)."""
+    x0, s0 = _level_and_slope(t, x, before, -1)
+    x1, s1 = _level_and_slope(t, x, after, 1)
+    length = t[after] - t[before]
+    u = ((times - t[before]) / length)[:, None]
+    cubic = (
+        (1.0 + 2.0 * u) * (1.0 - u) ** 2 * x0
+        + u * (1.0 - u) ** 2 * length * s0
+        + u**2 * (3.0 - 2.0 * u) * x1
+        - u**2 * (1.0 - u) * length * s1
+    )
+    (t0, m0), (t1, m1) = _mean(t, x, before, -length), _mean(t, x, after, length)
+    return cubic, m0 + ((times - t0) / (t1 - t0))[:, None] * (m1 - m0)
+
+
+def _missed_sd(t: FloatArray, x: FloatArray, k: int, length: float) -> tuple[FloatArray, BoolArray]:
+    """What the better bridge of the gap after sample ``k`` may miss of the integral (k,), and where it is the line."""
+    worse = np.zeros((2, x.shape[1]))
+    found = False
+    reach = max(2.0, 4.0 * length)
+    for side in (-1, 1):
+        edge = t[k] - reach if side < 0 else t[k + 1]
+        misses = []
+        for start in edge + np.linspace(0.0, reach - length, 24):
+            a, b = np.searchsorted(t, [start, start + length])
+            if b - a < 2 or a < 2 or b > len(t) - 2 or np.diff(t[a : b + 1]).max() > 0.2 * length:
+                continue
+            both = np.array(_bridges(t, x, int(a), int(b), t[a : b + 1]))
+            misses.append(np.trapezoid(both - x[a : b + 1], t[a : b + 1], axis=1))
+        if len(misses) >= 3:
+            found = True
+            worse = np.maximum(worse, np.sqrt(np.mean(np.square(misses), axis=0)))
+    if not found:  # nothing to learn from nearby: as if the signal could do anything it did in the whole record
+        return np.std(x, axis=0) * length, np.zeros(x.shape[1], dtype=bool)
+    return worse.min(axis=0), np.asarray(worse[1] < worse[0])
