@@ -18,7 +18,8 @@ import pandas as pd
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
-from recon import consistency, disagreement, ekf, gaps, product, smoother, startup, strapdown
+from recon import consistency, disagreement, disturbance, ekf, gaps, product, smoother, startup, strapdown
+from recon.beyond_sheet import beyond_sheet, sheet_findings, with_wider_priors
 from recon.consistency import Verdict
 from recon.disagreement import LeftOut
 from recon.disturbance import Disturbance, disturbed, is_lost, widened
@@ -120,11 +121,24 @@ def reconstruct(
     settings = settings or Settings()
     report = progress or (lambda _fraction, _what: None)
     found = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what))
+    wider = beyond_sheet(found.verdicts, found.sensor_errors)
+    if wider:
+        found = _with_wider(telemetry, settings, found, wider)
     sources = trackers(telemetry, settings)
     if len(sources) > 1 and disagreement.suspicious(found.verdicts, sources):
         found = _examined(telemetry, settings, found, sources, report)
     report(1.0, "done")
     return found
+
+
+def _with_wider(
+    telemetry: Telemetry, settings: Settings, found: Reconstruction, wider: dict[str, float]
+) -> Reconstruction:
+    """Reconstruction that does not hold on to the data sheets its verdicts, which stay, found wrong."""
+    again = reconstruct_once(telemetry, settings, wider=wider)
+    told = sheet_findings(again.sensor_errors, wider, *again.smoothed.time_s[[0, -1]].tolist())
+    findings = (*again.findings, *told)
+    return replace(again, verdicts=found.verdicts, residuals=found.residuals, findings=findings)
 
 
 def trackers(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
@@ -139,11 +153,14 @@ def _examined(
     """Reconstruction whose covariance and findings know how far the trackers contradict each other."""
     coarse = min(settings.output_rate_hz, EXAMINED_RATE_HZ)
 
-    def rerun(source: str) -> tuple[Trajectory, tuple[Verdict, ...]]:
+    def unknown(made: Reconstruction) -> int:
+        return sum(f.source == disturbance.SOURCE for f in made.findings)
+
+    def rerun(source: str) -> tuple[Trajectory, tuple[Verdict, ...], bool]:
         report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
         without = replace(settings, without=(*settings.without, source), output_rate_hz=coarse, pulse_rate_hz=0.0)
         other = reconstruct_once(telemetry, without)
-        return other.smoothed, other.verdicts
+        return other.smoothed, other.verdicts, unknown(other) > unknown(found)
 
     left_out, more = disagreement.leave_each_out(found.smoothed, sources, rerun)
     return replace(
@@ -155,12 +172,20 @@ def _examined(
     )
 
 
-def reconstruct_once(telemetry: Telemetry, settings: Settings, progress: Progress | None = None) -> Reconstruction:
-    """Reconstruct a flight with the covariance as the filter has it, whatever its verdicts say."""
+def reconstruct_once(
+    telemetry: Telemetry,
+    settings: Settings,
+    progress: Progress | None = None,
+    wider: dict[str, float] | None = None,
+) -> Reconstruction:
+    """Reconstruct a flight with the covariance as the filter has it, whatever its verdicts say.
+
+    ``wider`` names errors whose stated standard deviations are too small, and what to take instead.
+    """
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "bridging gaps")
     bridges = bridge_triads(telemetry)
-    problem = build_problem(telemetry, settings, bridges)
+    problem = with_wider_priors(build_problem(telemetry, settings, bridges), wider or {})
     run, smoothed, reference, passes, disturbances = _iterate(problem, settings, report)
 
     report(0.95, "testing consistency")

@@ -38,6 +38,9 @@ class LeftOut:
     source : str
     red : tuple of Verdict or None
         None where no trajectory can be made without it.
+    disturbed : bool
+        Whether the rest can be followed only with accelerations that nothing tells, which all sources together do not
+        ask for.
     apart_m : float
         Largest distance from the solution with all sources.
     apart : bool
@@ -52,11 +55,12 @@ class LeftOut:
     apart: bool = False
     start_s: float = float("nan")
     end_s: float = float("nan")
+    disturbed: bool = False
 
     @property
     def cures(self) -> bool:
         """Whether everything else agrees without it."""
-        return self.red is not None and not self.red
+        return self.red is not None and not self.red and not self.disturbed
 
 
 def is_about(verdict: Verdict, source: str) -> bool:
@@ -76,7 +80,7 @@ def suspicious(verdicts: tuple[Verdict, ...], sources: tuple[str, ...]) -> bool:
 def leave_each_out(
     smoothed: Trajectory,
     sources: tuple[str, ...],
-    rerun: Callable[[str], tuple[Trajectory, tuple[Verdict, ...]]],
+    rerun: Callable[[str], tuple[Trajectory, tuple[Verdict, ...], bool]],
 ) -> tuple[tuple[LeftOut, ...], FloatArray]:
     """What happens without each source, and what to add to the covariance, (n, 9, 9).
 
@@ -86,13 +90,14 @@ def leave_each_out(
         With all sources.
     sources : tuple of str
     rerun : callable
-        Trajectory and verdicts without a source; `GateError` where there is none.
+        Trajectory and verdicts without a source, and whether it asks for accelerations of its own; `GateError` where
+        there is none.
     """
     out: list[LeftOut] = []
     moved: list[FloatArray] = []
     for source in sources:
         try:
-            other, verdicts = rerun(source)
+            other, verdicts, disturbed = rerun(source)
         except GateError:
             out.append(LeftOut(source, None))
             moved.append(np.zeros((len(smoothed.time_s), 9)))
@@ -103,11 +108,8 @@ def leave_each_out(
         moved[-1][inside] = error
         distance = float(np.linalg.norm(error[:, :3], axis=1).max())
         t = smoothed.time_s[inside][far]
-        out.append(
-            LeftOut(source, red, distance, True, *map(float, t[[0, -1]]))
-            if far.any()
-            else LeftOut(source, red, distance)
-        )
+        start, end = (float(t[0]), float(t[-1])) if far.any() else (np.nan, np.nan)
+        out.append(LeftOut(source, red, distance, bool(far.any()), start, end, disturbed))
     cured = any(s.cures for s in out)
     supported = [e for s, e in zip(out, moved, strict=True) if s.apart and (s.cures or not cured)]
     return tuple(out), sum((e[:, :, None] * e[:, None, :] for e in supported), np.zeros((len(smoothed.time_s), 9, 9)))

@@ -3,8 +3,10 @@
 A stage separates, a parachute opens, a gyro saturates: from then on the filter's prediction is wrong while it believes
 otherwise, and the gate rejects every point that follows. That is told from a tracker that looks at something else for a
 while (a side lobe) by the others: where any source is still believed, the rejected one is suspect; where none is, and
-none comes back, the motion is. Then an unknown acceleration is allowed between the last point that was believed and the
-first that was not, white noise of density ``D`` along every axis, ten times larger each time it does not suffice.
+none comes back, the motion is. Inertial sensors carry a prediction through a false lock to where the track is believed
+again; without them it is soon so uncertain that anything would be, so five seconds decide. Then an unknown acceleration
+is allowed between the last point that was believed and the first that was not, white noise of density ``D`` along every
+axis, ten times larger each time it does not suffice.
 
 What an analyst states beforehand (``[[motion.disturbed]]``: shaking that turns into bias, a saturated gyro, thrust) is
 the same noise, of accelerations and of rates.
@@ -24,7 +26,8 @@ from recon.motion import Motion
 from recon.packed import Innovations
 from recon.problem import Problem
 
-LOST_S = 5.0  # nothing believed for so long, or to the end of the track
+SOURCE = "motion"  # of the finding
+LOST_S = 5.0  # nothing believed for so long in ballistic flight, or, in any, to the end of the track
 LOST_POINTS = 6
 LEAST_BELIEVED = 0.5
 BEFORE_S, AFTER_S = 1.5, 0.5  # a slow departure passes the gate for a while
@@ -60,7 +63,7 @@ class Disturbance:
             f"the track cannot be followed without an acceleration that no sensor and no model tells: up to about "
             f"{gained:.2g} m/s of velocity gained along each axis"
         )
-        return Finding("motion", words, self.start_s, self.end_s)
+        return Finding(SOURCE, words, self.start_s, self.end_s)
 
 
 def disturbed(problem: Problem, disturbances: tuple[Disturbance, ...]) -> Problem:
@@ -84,7 +87,7 @@ def lost_at(problem: Problem, innovations: Innovations) -> tuple[float, float] |
         if last - first + 1 < LOST_POINTS:
             continue
         ends = b == len(believed)
-        if ends or time_s[last] - time_s[first] >= LOST_S:
+        if ends or (problem.motion.ballistic and time_s[last] - time_s[first] >= LOST_S):
             return (float(time_s[a]) if a >= 0 else float(problem.time_s[0])), float(time_s[first])
     return None
 

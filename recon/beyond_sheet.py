@@ -1,0 +1,67 @@
+"""What if the flight finds an error far beyond its data sheet? Then the sheet is wrong, and is not held on to.
+
+A prior that is too narrow pulls the estimate towards nothing, and with it the trajectory, while both stay as sure as
+the sheet claims. So where the verdict on a sheet is red, the flight is reconstructed once more with wide priors of the
+errors that made it so. The verdicts, which judge what was stated, stay those of the first time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from flightmodel.telemetry import Finding
+from recon.consistency import MOST_KEPT_SD, Verdict
+from recon.problem import Problem
+from recon.state import KINEMATIC
+
+SHEET = "data sheet "
+TIMES = 3.0  # what was found: wide enough not to pull, for what was found was already pulled
+
+
+def beyond_sheet(verdicts: tuple[Verdict, ...], table: pd.DataFrame) -> dict[str, float]:
+    """Standard deviations to take instead, by name of the error; empty where every sheet holds.
+
+    Parameters
+    ----------
+    verdicts : tuple of Verdict
+    table : DataFrame
+        ``name, prior_sd, estimate, sd``.
+    """
+    out: dict[str, float] = {}
+    for verdict in verdicts:
+        if verdict.passed or not verdict.name.startswith(SHEET):
+            continue
+        owner = verdict.name.removeprefix(SHEET)
+        learnt_of = (table.treated == "estimated") & (table.sd < MOST_KEPT_SD * table.prior_sd)
+        mine = table[table.name.str.startswith(f"{owner} ") & learnt_of]
+        learnt = np.sqrt(mine.prior_sd**2 - mine.sd**2)
+        far = mine[mine.estimate.abs() > verdict.high * learnt]
+        out |= {str(name): TIMES * abs(float(found)) for name, found in zip(far.name, far.estimate, strict=True)}
+    return out
+
+
+def with_wider_priors(problem: Problem, wider: dict[str, float]) -> Problem:
+    """Problem whose start knows less of the errors named."""
+    covariance = problem.start_covariance.copy()
+    for name, sd in wider.items():
+        k = problem.model.names.index(name)
+        covariance[KINEMATIC + k, KINEMATIC + k] += max(0.0, sd**2 - float(problem.model.prior_sd[k]) ** 2)
+    return replace(problem, start_covariance=covariance)
+
+
+def sheet_findings(table: pd.DataFrame, wider: dict[str, float], start_s: float, end_s: float) -> list[Finding]:
+    """One finding for each error whose sheet was not held on to."""
+    rows = table.set_index("name")
+    return [
+        Finding(
+            name.split()[0],
+            f"{name} of {rows.estimate[name]:.3g} ± {rows.sd[name]:.2g} {rows.unit[name]} is beyond the stated "
+            f"{rows.prior_sd[name]:.2g} {rows.unit[name]}, which was not held on to",
+            start_s,
+            end_s,
+        )
+        for name in wider
+    ]
