@@ -1,11 +1,13 @@
-"""Gaps of inertial data that lie close to each other."""
+"""Gaps of inertial data, and samples that tell nothing new."""
 
 import numpy as np
 import pytest
 
+from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
 from recon.gaps import bridge
+from recon.stuck import stuck_samples
 
 SPEC = TriadSpec("rates", np.zeros(3), np.eye(3), 0.01, 0.01, 0.003, 0.002)
 
@@ -23,3 +25,75 @@ def test_short_gap_beside_a_long_one_is_bridged(apart_s):
     assert np.diff(bridged.time_s).max() < 0.01
     missed = np.array([bridged.density[np.searchsorted(bridged.time_s, s)] for s in (10.03, second + 0.35)])
     assert (missed[0] < missed[1]).all()
+
+
+def readings(resolution, noise_sd, seed=0, n=5000):
+    """A signal that stands still from 40 to 60 % of the record and swings elsewhere, as a sensor tells it."""
+    t = np.arange(n) * 0.004
+    swing = np.sin(2.0 * np.pi * t) * ((t < 8.0) | (t > 12.0))
+    return np.round((swing + np.random.default_rng(seed).normal(0.0, noise_sd, n)) / resolution) * resolution
+
+
+@pytest.mark.parametrize("length", [30, 100, 1000])
+def test_a_reading_that_stops_is_missing(length):
+    x = readings(0.02, 0.02)
+    x[500 : 500 + length] = x[500]
+    stuck = np.flatnonzero(stuck_samples(x, 0.02))
+    assert stuck[0] in (499, 500)
+    assert len(stuck) == pytest.approx(length, abs=3)
+
+
+def test_nothing_stops_in_a_thousand_noisy_records():
+    assert not any(stuck_samples(readings(0.02, 0.02, seed), 0.02).any() for seed in range(1000))
+
+
+@pytest.mark.parametrize("noise_sd", [0.0, 0.01])
+def test_a_sensor_coarser_than_its_noise_may_rest(noise_sd):
+    """Coast: a thousand samples within one step are no fault."""
+    x = readings(0.2, noise_sd)
+    assert (np.diff(x) == 0.0).mean() > 0.9
+    assert not stuck_samples(x, noise_sd).any()
+
+
+def test_rest_before_the_flight_is_no_fault_but_a_whole_record_is():
+    x = readings(0.02, 0.02)
+    x[:800] = x[0]
+    assert not stuck_samples(x, 0.02).any()
+    assert stuck_samples(np.full(100, 0.3), 0.02).all()
+
+
+def test_clipped_peaks_are_missing():
+    t = np.arange(5000) * 0.004
+    x = np.clip(np.round(np.sin(t) / 0.01 + np.random.default_rng(0).normal(size=5000)) * 0.01, -0.9, 0.9)
+    at_stop = stuck_samples(x, 0.01)
+    assert at_stop[np.abs(np.sin(t)) > 0.95].all()
+    assert not at_stop[np.abs(np.sin(t)) < 0.85].any()
+
+
+def test_an_axis_frozen_alone_leaves_the_others():
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 20.0, 0.004)
+    x = np.column_stack([np.sin(t), np.cos(2.0 * t), 0.1 * t]) + rng.normal(0.0, 0.01, (len(t), 3))
+    x = np.round(x / 0.002) * 0.002
+    good = x.copy()
+    x[2500:3000, 1] = x[2500, 1]
+    bridged = bridge(TriadRecord(SPEC, t, x))
+    np.testing.assert_array_equal(bridged.measured_sensor[:, [0, 2]], good[:, [0, 2]])
+    missed = np.sqrt(bridged.density[2700] * 2.0)
+    assert np.abs(bridged.measured_sensor[:, 1] - good[:, 1])[2500:3000].sum() * 0.004 < 4.0 * missed[1]
+    assert missed[1] > 10.0 * missed[0]
+    assert [f.source for f in bridged.findings] == ["rates"]
+    assert "usable samples of y" in str(bridged.findings[0])
+
+
+def test_an_axis_that_never_moves_is_refused_and_one_that_stops_ends_the_record():
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 20.0, 0.004)
+    x = rng.normal(0.0, 0.01, (len(t), 3))
+    x[4000:, 2] = x[4000, 2]
+    ended = bridge(TriadRecord(SPEC, t, x))
+    assert ended.time_s[-1] == pytest.approx(t[3999])
+    assert "to the end of the record" in str(ended.findings[-1])
+    x[:, 2] = 0.02
+    with pytest.raises(GateError, match="axis z: all 5000 samples hold one value"):
+        bridge(TriadRecord(SPEC, t, x))
