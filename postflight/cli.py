@@ -68,11 +68,12 @@ def simulate(arguments: tuple[str, ...], seed: int, force: bool) -> None:
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--rate", type=FiniteRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
-def reconstruct(folder: Path, rate: float) -> None:
+@click.option("--sensitivity", is_flag=True, help="Also rerun without each source, wind, and with other air and mass.")
+def reconstruct(folder: Path, rate: float, sensitivity: bool) -> None:
     """Reconstruct the best-estimated trajectory of the flight in FOLDER."""
     from postflight import commands
 
-    commands.run(folder, (), rate)
+    commands.run(folder, (), rate, sensitivity)
 
 
 @cli.command()

@@ -30,6 +30,7 @@ from postflight.pipeline import (
     estimate,
     reconstruct_telemetry,
 )
+from postflight.sensitivity import largest_of_groups, sensitivity
 from recon.bet import Settings
 from synthetic_flight.events import Event, flight_events
 from synthetic_flight.folder import check_destination, simulate_to_folder
@@ -37,6 +38,11 @@ from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
 
 EXIT_NO_ANSWER, EXIT_CHECK_FAILED = 4, 5
+SHORT = {
+    "position": "pos.", "velocity": "vel.", "attitude": "att.", "total angle of attack": "alpha",
+    "dynamic pressure": "q", "density of the day": "rho", "C_A": "C_A",
+}  # fmt: skip
+LARGEST_NORMAL = 3.5  # standard deviations that one of some dozens of changes may be off
 REFERENCE = "irve2_reference"
 Report = Callable[[float, str], None]
 console = Console(soft_wrap=True)
@@ -123,10 +129,12 @@ def print_events(flown: list[Event]) -> None:
     console.print(table)
 
 
-def run(folder: Path, methods: tuple[str, ...], rate_hz: float) -> None:
+def run(folder: Path, methods: tuple[str, ...], rate_hz: float, reruns: bool = False) -> None:
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers."""
-    flight, answers, written = run_flight(folder, methods, rate_hz)
+    flight, answers, written = run_flight(folder, methods, rate_hz, reruns)
     print_flight(flight, pd.read_csv(written / "events.csv"))
+    if reruns:
+        print_sensitivity(pd.read_csv(written / "sensitivity.csv"))
     if methods:
         print_answers(answers, flight.peak_s)
     console.print(f"results in {escape(str(written))}")
@@ -134,9 +142,11 @@ def run(folder: Path, methods: tuple[str, ...], rate_hz: float) -> None:
         sys.exit(EXIT_NO_ANSWER)
 
 
-def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[Flight, Answers, Path]:
-    """Run the chain on one flight folder and write its run folder."""
-    settings = {"methods": list(methods), "output_rate_hz": rate_hz}
+def run_flight(
+    folder: Path, methods: tuple[str, ...], rate_hz: float, reruns: bool = False
+) -> tuple[Flight, Answers, Path]:
+    """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too."""
+    settings = {"methods": list(methods), "output_rate_hz": rate_hz, "sensitivity": reruns}
     log: list[str] = []
     with progress_bar() as report:
 
@@ -148,14 +158,15 @@ def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[
 
             return tell
 
-        step(0.0, 0.05)(0.0, "reading telemetry")
+        share = 0.2 if reruns else 1.0  # of the time, for all but the reruns
+        step(0.0, 0.05 * share)(0.0, "reading telemetry")
         telemetry = read_flight(folder)
         compile_kernels(*warmup.RECONSTRUCTION, "simulator")
         flight = reconstruct_telemetry(
-            telemetry, Settings(output_rate_hz=rate_hz, pulse_rate_hz=PULSE_RATE_HZ), step(0.05, 0.5)
+            telemetry, Settings(output_rate_hz=rate_hz, pulse_rate_hz=PULSE_RATE_HZ), step(0.05 * share, 0.5 * share)
         )
         wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
-        answers = estimate(flight, flight.telemetry, wanted, step(0.5, 0.7))
+        answers = estimate(flight, flight.telemetry, wanted, step(0.5 * share, 0.7 * share))
         if "camera" in methods and "camera" not in wanted:
             answers.refused["camera"] = NO_VIDEO
         with results.RunFolder(folder, flight.telemetry, settings) as out:
@@ -166,7 +177,11 @@ def run_flight(folder: Path, methods: tuple[str, ...], rate_hz: float) -> tuple[
                     "camera_sensitivity.csv", camera_sensitivity(flight.telemetry, answers.histories["camera"])
                 )
             out.write_json("summary.json", results.summary(flight, answers))
-            drawing.draw_run(flight, answers, out.path / "figures", step(0.7, 1.0))
+            drawing.draw_run(flight, answers, out.path / "figures", step(0.7 * share, share))
+            if reruns:
+                table = sensitivity(flight, step(share, 1.0))
+                out.write_csv("sensitivity.csv", table)
+                drawing.draw_sensitivity(flight, table, out.path / "figures")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
             (out.path / "log.jsonl").write_text(lines)
     return flight, answers, out.path
@@ -197,6 +212,29 @@ def print_flight(flight: Flight, events: pd.DataFrame) -> None:
         console.print(f"[red]verdict[/] {verdict.name}: {verdict.words} ({numbers})")
     for k, words in enumerate(flight.suspects):
         console.print(f"[red]{'suspect' if k == 0 else 'also'}[/] {escape(words)}")
+
+
+def print_sensitivity(found: pd.DataFrame) -> None:
+    """Changes of a few quantities at peak dynamic pressure, rerun by rerun, in standard deviations."""
+    shown = largest_of_groups(found).pivot(index="rerun", columns="group", values="change_over_sd")
+    groups = [g for g in SHORT if g in shown]
+    table = Table(title="Sensitivity: change at peak dynamic pressure over the reported standard deviation")
+    table.add_column("rerun")
+    for group in groups:
+        table.add_column(SHORT[group], justify="right", no_wrap=True)
+    for rerun in dict.fromkeys(found["rerun"]):
+        if rerun in shown.index:
+            values = shown.loc[rerun, groups]
+            table.add_row(escape(rerun), *("" if np.isnan(x) else "-" if x == 0.0 else f"{x:+.2f}" for x in values))
+    console.print(table)
+    for row in found[found["quantity"].isna()].itertuples(index=False):
+        console.print(f"[yellow]no rerun[/] {escape(row.rerun)}: {escape(str(row.reason))}")
+    odd = found[found["change_over_expected_sd"].abs() > LARGEST_NORMAL]
+    for row in odd.itertuples(index=False):
+        console.print(
+            f"[yellow]found[/] {escape(row.rerun)}: {row.quantity} moves by {row.change:.3g} {row.unit}, "
+            f"{abs(row.change_over_expected_sd):.1f} times what the data left out should move it"
+        )
 
 
 def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from estimators.camera_deflection import OrientedCamera, orient_camera, read_frame
 from estimators.figures import figure_camera_overlay
@@ -41,6 +42,12 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
     if answers.histories:
         figures.save(summary_figure(flight, answers), folder / "summary.png")
     report(1.0, "drawn")
+
+
+def draw_sensitivity(flight: Flight, table: pd.DataFrame, folder: Path) -> None:
+    """Draw what moved in the reruns, where any succeeded."""
+    if table["quantity"].notna().any():
+        figures.save(product_figures.figure_sensitivity(flight, table), folder / "sensitivity.png")
 
 
 def oriented_camera(telemetry: Telemetry, joint_m: float | None = None) -> tuple[OrientedCamera, int]:

@@ -112,6 +112,13 @@ def reconstruct_telemetry(
     settings = settings or Settings(pulse_rate_hz=PULSE_RATE_HZ)
     bet = reconstruct(telemetry, settings, lambda f, what: report(0.95 * f, what))
     report(0.96, "finding the air of the day")
+    flight = flight_from(telemetry, bet)
+    report(1.0, "reconstructed")
+    return flight
+
+
+def flight_from(telemetry: Telemetry, bet: Reconstruction) -> Flight:
+    """Air data, pulse and air of the day along a trajectory; `DivergenceError` where it leaves the air's tables."""
     profile = profile_from_sounding(telemetry.sounding)
     _check_flown(bet.smoothed)
     vehicle = telemetry.vehicle
@@ -121,10 +128,9 @@ def reconstruct_telemetry(
         telemetry.required_vehicle()
         telemetry.required_triads()
         pulse = pulse_data(telemetry, bet, air)
-        day = day_air(telemetry, bet, profile, settings.verdict_confidence)
+        day = day_air(telemetry, bet, profile, bet.settings.verdict_confidence)
     except GateError as fault:
         missing.append(str(fault))
-    report(1.0, "reconstructed")
     return Flight(telemetry, bet, air, pulse, day, tuple(missing))
 
 

@@ -94,11 +94,16 @@ class Reconstruction:
     left_out: tuple[LeftOut, ...] = ()
 
     @property
+    def settings(self) -> Settings:
+        """Settings that it was made with."""
+        chosen = self.provenance["settings"]
+        assert isinstance(chosen, dict)
+        return Settings(**chosen)
+
+    @property
     def output_rate_hz(self) -> float:
         """Rate of the trajectories outside the pulse."""
-        settings = self.provenance["settings"]
-        assert isinstance(settings, dict)
-        return float(settings["output_rate_hz"])
+        return self.settings.output_rate_hz
 
 
 def reconstruct(

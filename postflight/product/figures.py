@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -10,6 +11,7 @@ from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from postflight.figures import stamp
 from postflight.pipeline import Flight
+from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.air import ReconstructedAir
 
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "0.55"
@@ -64,5 +66,46 @@ def figure_air(flight: Flight, day: ReconstructedAir) -> Figure:
     ratio_ax.set(xlabel="Mach number", ylabel="drag ratio", ylim=(1.0 - room, 1.0 + room))
     ratio_ax.legend(fontsize=8, frameon=False, loc="lower right", ncols=2)
     figure.suptitle("Air of the day: from the deceleration along the reconstructed trajectory", fontsize=11)
+    stamp(figure, flight.telemetry)
+    return figure
+
+
+def figure_sensitivity(flight: Flight, table: pd.DataFrame) -> Figure:
+    """Change of each group of quantities at peak pressure in standard deviations, a bar a rerun.
+
+    Diamonds: the same over what the change itself should be, where that is known.
+    """
+    names = list(dict.fromkeys(table["rerun"]))
+    failed = set(table["rerun"][table["quantity"].isna()])
+    shown = largest_of_groups(table)
+    groups = [g for g in GROUPS if g in set(shown["group"])]
+    columns = 4
+    figure = Figure(figsize=(10.5, 0.6 + (0.9 + 0.22 * len(names)) * -(-len(groups) // columns)), layout="constrained")
+    grid = figure.subplots(-(-len(groups) // columns), columns, sharey=True, squeeze=False).ravel()
+    for ax, group in zip(grid, groups, strict=False):
+        part = shown[shown["group"] == group].set_index("rerun").reindex(names)
+        y = np.arange(len(names))
+        over_sd, over_expected = (part[c].to_numpy(dtype=float) for c in ("change_over_sd", "change_over_expected_sd"))
+        ax.barh(y, np.nan_to_num(over_sd), height=0.7, color=BLUE, alpha=0.75)
+        ax.plot(over_expected, y, "D", ms=4, color=ORANGE)
+        far = float(np.nanmax(np.abs(np.concatenate([over_sd, over_expected, [3.0]]))))
+        for edge in (-3.0, 3.0):
+            ax.axvline(edge, color="0.3", lw=0.7, ls=":")
+        ax.axvline(0.0, color="0.3", lw=0.7)
+        ax.set(xlim=(-1.15 * far, 1.15 * far), title=group)
+        ax.title.set_fontsize(9)
+        ax.set_yticks(y, [f"{n} (failed)" if n in failed else n for n in names], fontsize=8)
+        ax.tick_params(axis="x", labelsize=7)
+        ax.set_axisbelow(True)
+        _clean(ax)
+    grid[0].invert_yaxis()
+    figure.get_layout_engine().set(rect=(0.0, 0.02, 1.0, 0.98))  # type: ignore[union-attr]  # room for the stamp
+    for ax in grid[len(groups) :]:
+        ax.set_visible(False)
+    figure.suptitle(
+        "What moves when a source is left out or an assumption changed, at peak dynamic pressure\n"
+        "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3",
+        fontsize=10,
+    )
     stamp(figure, flight.telemetry)
     return figure

@@ -1,0 +1,308 @@
+"""How much hangs on each source and on each assumption? The flight again without it, and what moved by how much.
+
+Each tracker is left out in turn, attitude sensors that were not used are used (or left out), the attitude's start is
+taken from them, winds are switched off, the sounding's density and the mass are moved by what they may err. Next to
+the reported standard deviation stands what the change itself should be: where a rerun knows less than the base and the
+rest is the same, the difference of two optimal estimates has covariance ``P_without - P_with`` (Hausman). A change of
+three of these, not of three reported standard deviations, says that a source contradicts the others.
+
+With inertial sensors the air and the mass take no part in the trajectory: only what is derived from it is made anew.
+In ballistic flight they do, and the filter runs again.
+
+References
+----------
+J. Hausman, "Specification tests in econometrics", Econometrica 46 (1978) 1251.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from flightmodel import earth
+from flightmodel.airdata import air_data, pressure_pulse
+from flightmodel.atmosphere import profile_from_sounding
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.telemetry import Sounding, Telemetry
+from flightmodel.trajectory import Trajectory, difference, interpolate_rows, resample
+from postflight.pipeline import Flight, flight_from
+from postflight.product.trajectory_table import bet_table
+from recon.bet import Settings, reconstruct_once, trackers
+
+Progress = Callable[[float, str], None]
+MASS_PART = 0.01
+PULSE_STEP_S = 0.1
+LEAST_LOST = 0.02  # part of a variance that leaving out must cost; a smaller one is no measure of a change
+COLUMNS = (
+    "rerun", "quantity", "unit", "t_s", "base", "base_sd", "change", "change_over_sd", "expected_sd",
+    "change_over_expected_sd", "largest_change", "largest_at_s", "reason",
+)  # fmt: skip
+# quantity: its unit, and its columns in bet.csv; day_kgpm3 is the sounding's density times the ratio found
+DERIVED = {
+    "altitude": ("m", "alt_m", "alt_sd_m"),
+    "total angle of attack": ("deg", "alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
+    "Mach number": ("1", "mach", "mach_sd"),
+    "dynamic pressure": ("Pa", "dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
+    "density of the day": ("kg/m^3", "day_kgpm3", "day_sd_kgpm3"),
+    "density ratio": ("1", "density_ratio", "density_ratio_sd"),
+    "C_A": ("1", "c_a", "c_a_sd"),
+    "C_N": ("1", "c_n", "c_n_sd"),
+    "C_N/C_A": ("1", "cn_over_ca", "cn_over_ca_sd"),
+}
+# quantity: its unit, its place in the trajectory's errors turned to NED and body axes, and its scale
+DIRECT = {
+    "position north": ("m", 0, 1.0),
+    "position east": ("m", 1, 1.0),
+    "velocity north": ("m/s", 3, 1.0),
+    "velocity east": ("m/s", 4, 1.0),
+    "velocity down": ("m/s", 5, 1.0),
+    "rotation about body x": ("deg", 6, 180.0 / np.pi),
+    "rotation about body y": ("deg", 7, 180.0 / np.pi),
+    "rotation about body z": ("deg", 8, 180.0 / np.pi),
+}
+UNITS = {name: about[0] for name, about in {**DIRECT, **DERIVED}.items()}
+# what is shown: the first of a group's quantities, or of a vector's parts the one that moved most
+GROUPS = {
+    "position": ("position north", "position east", "altitude"),
+    "velocity": ("velocity north", "velocity east", "velocity down"),
+    "attitude": ("rotation about body x", "rotation about body y", "rotation about body z"),
+    **{
+        name: (name,)
+        for name in ("total angle of attack", "Mach number", "dynamic pressure", "density of the day", "C_A")
+    },
+}
+
+
+@dataclass(frozen=True)
+class Rerun:
+    """One changed input.
+
+    Parameters
+    ----------
+    name : str
+    telemetry : Telemetry
+    settings : Settings
+    filtered : bool
+        Whether the trajectory itself hangs on what was changed.
+    data : int
+        -1 where data were left out, 1 where some were added, 0 where it is something else.
+    """
+
+    name: str
+    telemetry: Telemetry
+    settings: Settings
+    filtered: bool = True
+    data: int = 0
+
+
+def reruns(telemetry: Telemetry, settings: Settings) -> tuple[Rerun, ...]:
+    """Return what can be left out or changed in a flight."""
+    ballistic = telemetry.accelerometer is None or telemetry.motion.model == "ballistic"
+    leave: dict[str, tuple[str, ...]] = {f"without {name}": (name,) for name in trackers(telemetry, settings)}
+    heads = () if telemetry.sun is None else tuple(f"sun{k + 1}" for k in range(len(telemetry.sun.spec.clock_lv_rad)))
+    directions = telemetry.magnetometer is not None and telemetry.sun is not None
+    if settings.attitude_sensors:
+        leave |= {"without magnetometer": ("magnetometer",)} if telemetry.magnetometer is not None else {}
+        leave |= {"without Sun sensors": heads} if heads else {}
+    out = [
+        Rerun(name, telemetry, replace(settings, without=(*settings.without, *gone)), data=-1)
+        for name, gone in leave.items()
+    ]
+    if not ballistic and not settings.attitude_sensors and (telemetry.magnetometer is not None or heads):
+        out.append(Rerun("with attitude sensors", telemetry, replace(settings, attitude_sensors=True), data=1))
+    if not ballistic and directions and telemetry.attitude_prior is not None:
+        out.append(Rerun("without attitude prior", replace(telemetry, attitude_prior=None), settings))
+    air = {"winds off": _calm(telemetry.sounding)}
+    air |= {f"density {sign:+d} sd": _denser(telemetry.sounding, sign) for sign in (1, -1)}
+    out += [Rerun(name, replace(telemetry, sounding=s), settings, ballistic) for name, s in air.items()]
+    if telemetry.vehicle is not None or ballistic:
+        for part in (MASS_PART, -MASS_PART):
+            out.append(Rerun(f"mass {100 * part:+.0f} %", _heavier(telemetry, 1.0 + part), settings, ballistic))
+    return tuple(out)
+
+
+def _calm(sounding: Sounding) -> Sounding:
+    still = np.zeros_like(sounding.wind_north_mps)
+    return replace(sounding, wind_north_mps=still, wind_east_mps=still)
+
+
+def _denser(sounding: Sounding, sign: int) -> Sounding:
+    """Sounding with density moved by its own sd, temperature kept."""
+    factor = np.exp(sign * sounding.density_sd)
+    density, pressure = factor * sounding.density_kgpm3, factor * sounding.pressure_pa
+    return replace(sounding, density_kgpm3=density, pressure_pa=pressure)
+
+
+def _heavier(telemetry: Telemetry, factor: float) -> Telemetry:
+    """Telemetry of a vehicle whose parts are all heavier, and which drag slows less."""
+    motion = replace(telemetry.motion, drag_area_per_mass_m2pkg=telemetry.motion.drag_area_per_mass_m2pkg / factor)
+    vehicle = telemetry.vehicle
+    if vehicle is not None:
+        shell, body = (
+            part.model_copy(update={"mass_kg": factor * part.mass_kg})
+            for part in (vehicle.aeroshell, vehicle.centerbody)
+        )
+        vehicle = replace(vehicle, aeroshell=shell, centerbody=body)
+    return replace(telemetry, motion=motion, vehicle=vehicle)
+
+
+def sensitivity(flight: Flight, progress: Progress | None = None) -> pd.DataFrame:
+    """Rerun a reconstructed flight with each source left out and each assumption changed.
+
+    Parameters
+    ----------
+    flight : Flight
+    progress : callable, optional
+        Called with the fraction done and the rerun.
+
+    Returns
+    -------
+    DataFrame
+        One row a rerun and quantity, at the base's largest dynamic pressure ``t_s``: base value (empty for position and
+        rotation, which are told as changes alone) and its standard deviation, the rerun's change, that over the
+        standard deviation, over ``expected_sd`` (empty where the rerun is no subset of the base's data, or loses next
+        to nothing), and the largest change over the pulse. A rerun that fails is one row with its ``reason``.
+    """
+    report = progress or (lambda _fraction, _what: None)
+    telemetry, settings = flight.telemetry, flight.reconstruction.settings
+    planned = reruns(telemetry, settings)
+    report(0.0, "base")
+    # where trackers contradict each other the base's covariance was enlarged, and is no optimal filter's
+    own = flight
+    if flight.reconstruction.left_out:
+        own = flight_from(telemetry, reconstruct_once(telemetry, settings))
+    rows: list[dict[str, object]] = []
+    for k, rerun in enumerate(planned):
+        report(k / len(planned), rerun.name)
+        try:
+            bet = reconstruct_once(rerun.telemetry, rerun.settings) if rerun.filtered else flight.reconstruction
+            rows += _rows(rerun, flight, own, flight_from(rerun.telemetry, bet))
+        except GateError as fault:
+            rows.append({"rerun": rerun.name, "reason": str(fault)})
+    report(1.0, "done")
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def _rows(rerun: Rerun, base: Flight, own: Flight, other: Flight) -> list[dict[str, object]]:
+    """Every quantity of one rerun; `GateError` where it does not cover the peak."""
+    at, peak = _times(base, other.reconstruction.smoothed)
+    views = [View.of(flight, at) for flight in (base, own, other)]
+    change = views[2].minus(views[0])
+    out: list[dict[str, object]] = []
+    for name, unit in UNITS.items():
+        moved, sd = change[name], views[0].sd[name]
+        if not np.isfinite(sd[peak]):
+            continue
+        gained = rerun.data * (views[1].sd[name][peak] ** 2 - views[2].sd[name][peak] ** 2)
+        sharp = gained > LEAST_LOST * views[0].sd[name][peak] ** 2
+        expected = float(np.sqrt(gained)) if sharp else np.nan
+        largest = int(np.nanargmax(np.abs(moved))) if np.isfinite(moved).any() else peak
+        out.append(
+            {
+                "rerun": rerun.name,
+                "quantity": name,
+                "unit": unit,
+                "t_s": at[peak],
+                "base": views[0].value[name][peak] if name in views[0].value else np.nan,
+                "base_sd": sd[peak],
+                "change": moved[peak],
+                "change_over_sd": moved[peak] / sd[peak],
+                "expected_sd": expected,
+                "change_over_expected_sd": moved[peak] / expected,
+                "largest_change": moved[largest],
+                "largest_at_s": at[largest],
+                "reason": "",
+            }
+        )
+    return out
+
+
+def _times(base: Flight, other: Trajectory) -> tuple[FloatArray, int]:
+    """Times (k,) of the pulse that both cover, about `PULSE_STEP_S` apart, and which of them is the peak."""
+    t = base.air.time_s
+    peak_s = float(t[np.argmin(np.abs(t - base.peak_s))])
+    if not other.time_s[0] <= peak_s <= other.time_s[-1]:
+        raise GateError(
+            f"reaches from {other.time_s[0]:.3f} to {other.time_s[-1]:.3f} s only; the largest dynamic pressure is at "
+            f"{peak_s:.3f} s"
+        )
+    pulse = t[pressure_pulse(base.air.dynamic_pressure_pa)]
+    pulse = pulse[(pulse >= other.time_s[0]) & (pulse <= other.time_s[-1])]
+    _, first = np.unique(np.floor(pulse / PULSE_STEP_S + 1e-6), return_index=True)
+    at = np.union1d(pulse[first], [peak_s])
+    return at, int(np.searchsorted(at, peak_s))
+
+
+@dataclass(frozen=True)
+class View:
+    """A flight at chosen times (k,): trajectory, values and standard deviations of the quantities."""
+
+    trajectory: Trajectory
+    value: dict[str, FloatArray]
+    sd: dict[str, FloatArray]
+
+    @classmethod
+    def of(cls, flight: Flight, at: FloatArray) -> View:
+        """Flight at times ``at`` (k,)."""
+        cut = at_times(flight, at)
+        path, table = cut.reconstruction.smoothed, bet_table(cut)
+        for column, ratio in (("day_kgpm3", "density_ratio"), ("day_sd_kgpm3", "density_ratio_sd")):
+            table[column] = table[ratio] * table["rho_kgpm3"]
+        turn = _turn(path)
+        assert path.covariance is not None
+        spread = np.sqrt(np.diagonal(turn @ path.covariance @ np.swapaxes(turn, 1, 2), axis1=1, axis2=2))
+        value = {name: table[column].to_numpy(dtype=float) for name, (_, column, _) in DERIVED.items()}
+        sd = {name: table[column].to_numpy(dtype=float) for name, (_, _, column) in DERIVED.items()}
+        velocity = np.einsum("nij,nj->ni", turn[:, 3:6, 3:6], path.velocity_ecef_mps)
+        for name, (_, k, scale) in DIRECT.items():
+            known = flight.has_attitude or k < 6
+            sd[name] = scale * spread[:, k] if known else np.full(len(at), np.nan)
+            if 3 <= k < 6:
+                value[name] = velocity[:, k - 3]
+        return cls(path, value, sd)
+
+    def minus(self, base: View) -> dict[str, FloatArray]:
+        """Changes (k,) of every quantity against the base."""
+        moved = np.einsum("nij,nj->ni", _turn(base.trajectory), difference(self.trajectory, base.trajectory))
+        out = {name: scale * moved[:, k] for name, (_, k, scale) in DIRECT.items()}
+        return out | {name: self.value[name] - base.value[name] for name in DERIVED}
+
+
+def at_times(flight: Flight, at: FloatArray) -> Flight:
+    """Flight whose trajectory and air are given at times ``at`` (k,) alone."""
+    bet, telemetry = flight.reconstruction, flight.telemetry
+    t, path = bet.smoothed.time_s, resample(bet.smoothed, at)
+    force, rate = (
+        interpolate_rows(at, t, c.reshape(-1, 9)).reshape(-1, 3, 3) if len(c) else c
+        for c in (bet.specific_force_cov, bet.rate_cov)
+    )
+    arm = np.zeros(3) if telemetry.vehicle is None else telemetry.vehicle.cg_m
+    air = air_data(path, profile_from_sounding(telemetry.sounding), arm)
+    return replace(
+        flight, reconstruction=replace(bet, smoothed=path, specific_force_cov=force, rate_cov=rate), air=air, pulse=None
+    )
+
+
+def _turn(path: Trajectory) -> FloatArray:
+    """Matrices (k, 9, 9) that turn errors from ECEF to north, east, down; rotations stay about body axes."""
+    latitude, longitude, _ = earth.geodetic_from_ecef(path.position_ecef_m)
+    out = np.tile(np.eye(9), (len(path.time_s), 1, 1))
+    out[:, 0:3, 0:3] = out[:, 3:6, 3:6] = earth.dcm_ned_ecef(latitude, longitude)
+    return out
+
+
+def largest_of_groups(table: pd.DataFrame) -> pd.DataFrame:
+    """Rows of `sensitivity` that moved most in standard deviations, one a rerun and group, in a column ``group``.
+
+    Failed reruns have no rows.
+    """
+    rows = []
+    for _, part in table[table["quantity"].notna()].groupby("rerun", sort=False):
+        for group, names in GROUPS.items():
+            some = part[part["quantity"].isin(names) & part["change_over_sd"].notna()]
+            if len(some):
+                rows.append({"group": group, **some.loc[some["change_over_sd"].abs().idxmax()]})
+    return pd.DataFrame(rows, columns=["group", *table.columns])

@@ -1,0 +1,152 @@
+"""Reruns with one input left out or changed: what must not move, what must, and how far data may move it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from flightmodel.atmosphere import default_sounding_sd, us76
+from flightmodel.checks import GateError
+from flightmodel.telemetry import Sounding
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from postflight import sensitivity as module
+from postflight.pipeline import flight_from, reconstruct_flight, reconstruct_telemetry
+from postflight.sensitivity import COLUMNS, UNITS, largest_of_groups, reruns, sensitivity
+from recon.bet import Settings, reconstruct_once
+from tests.recon import conftest as mini
+
+
+@pytest.fixture(scope="module")
+def short(clean_flight):
+    return reconstruct_flight(clean_flight.root)
+
+
+@pytest.fixture(scope="module")
+def table(short):
+    return sensitivity(short)
+
+
+def sounding():
+    """Air in a layer only, so that the largest dynamic pressure lies inside the flight; no physics is asked of it."""
+    z = np.arange(0.0, 130e3, 2000.0)
+    density, temperature, pressure = us76(z)
+    density = density * np.exp(-0.5 * ((z - 80e3) / 4e3) ** 2)
+    return Sounding(z, density, temperature, pressure, 0.0 * z + 5.0, 0.0 * z, *default_sounding_sd(z))
+
+
+@pytest.fixture(scope="module")
+def mini_flight():
+    truth, air, vehicle = mini._truth(), sounding(), vehicle_from_toml(vehicle_path("irve2_reference"))
+
+    def make(seed):
+        return replace(mini.sense_everything(truth, seed, mini.SITES), sounding=air, vehicle=vehicle)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def pulse(mini_flight):
+    """Two radars and inertial sensors through a pulse of 8 g."""
+    telemetry = replace(mini_flight(3), gnss={}, barometers={}, magnetometer=None, sun=None)
+    return flight_from(telemetry, reconstruct_once(telemetry, Settings(output_rate_hz=5.0)))
+
+
+def rows(table, rerun):
+    return table[table.rerun == rerun].set_index("quantity")
+
+
+def test_every_source_and_assumption_has_its_rows(short, table):
+    names = ["without north", "without south", "winds off", "density +1 sd", "density -1 sd", "mass +1 %", "mass -1 %"]
+    assert list(dict.fromkeys(table.rerun)) == names
+    assert tuple(table.columns) == COLUMNS
+    assert set(rows(table, "winds off").index) <= set(UNITS)
+    assert (table.reason == "").all()
+
+
+def test_air_and_mass_move_what_is_derived_and_not_the_trajectory(pulse):
+    """With inertial sensors; the sizes follow from q = rho V^2 / 2 and C_A = m a / (q S)."""
+    table = sensitivity(pulse)
+    inertial = [name for name in UNITS if name.startswith(("position", "velocity", "rotation", "altitude"))]
+    for rerun in ("winds off", "density +1 sd", "mass -1 %"):
+        assert np.abs(rows(table, rerun).loc[inertial, "largest_change"]).max() < 1e-9
+    heavy = rows(table, "mass +1 %")
+    assert heavy.loc["C_A", "change"] == pytest.approx(0.01 * heavy.loc["C_A", "base"], rel=1e-9)
+    assert heavy.loc["dynamic pressure", "change"] == 0.0
+    dense = rows(table, "density +1 sd")
+    k = int(np.argmin(np.abs(pulse.air.time_s - dense.t_s.iloc[0])))
+    grown = np.expm1(pulse.air.air.density_sd[k])
+    # the sd is itself interpolated along altitude
+    assert dense.loc["dynamic pressure", "change"] == pytest.approx(
+        grown * dense.loc["dynamic pressure", "base"], rel=2e-2
+    )
+    assert rows(table, "winds off").loc["Mach number", "change"] != 0.0
+
+
+def test_the_only_tracker_is_refused_in_words_and_the_rest_goes_on(short):
+    telemetry = replace(short.telemetry, radars={"north": short.telemetry.radars["north"]})
+    found = sensitivity(reconstruct_telemetry(telemetry, Settings()))
+    lone = found[found.rerun == "without north"]
+    assert len(lone) == 1
+    assert lone["quantity"].isna().all()
+    assert "at least one" in lone.reason.iloc[0]
+    assert "without north" not in set(largest_of_groups(found).rerun)
+    assert len(rows(found, "winds off")) > 5
+
+
+def test_a_rerun_that_diverges_is_a_row_with_its_reason(pulse, monkeypatch):
+    def fails(telemetry, settings):
+        raise GateError("left the atmosphere")
+
+    monkeypatch.setattr(module, "reconstruct_once", fails)
+    found = sensitivity(pulse)
+    assert list(found[found.quantity.isna()].rerun) == ["without north", "without west"]
+    assert set(found[found.quantity.isna()].reason) == {"left the atmosphere"}
+
+
+def test_attitude_sensors_are_used_where_they_were_not_and_left_out_where_they_were(mini_flight):
+    telemetry = mini_flight(1)
+    names = {r.name: r for r in reruns(telemetry, Settings())}
+    assert names["with attitude sensors"].settings.attitude_sensors
+    assert names["without attitude prior"].telemetry.attitude_prior is None
+    assert {"without receiver", "without barometer", "without north"} <= set(names)
+    used = {r.name: r for r in reruns(telemetry, Settings(attitude_sensors=True, without=("north",)))}
+    assert used["without Sun sensors"].settings.without == ("north", "sun1", "sun2", "sun3", "sun4")
+    assert used["without magnetometer"].data == -1
+    assert "with attitude sensors" not in used
+    assert "without north" not in used
+
+
+@pytest.mark.slow
+def test_leaving_data_out_moves_the_answer_as_far_as_the_covariances_allow(mini_flight):
+    """Change over ``sqrt(P_without - P_with)`` is standard normal: its mean square over flights is chi-square."""
+    settings, count = Settings(output_rate_hz=5.0), 8
+    squares: dict[tuple[str, str], list[float]] = {}
+    for seed in range(count):
+        telemetry = replace(mini_flight(seed), gnss={})
+        flight = flight_from(telemetry, reconstruct_once(telemetry, settings))
+        found = sensitivity(flight)
+        for row in found[found.change_over_expected_sd.notna()].itertuples():
+            squares.setdefault((row.rerun, row.quantity), []).append(row.change_over_expected_sd**2)
+    direct = {k: v for k, v in squares.items() if k[1] not in module.DERIVED or k[1] == "altitude"}
+    kept = {k: v for k, v in direct.items() if len(v) == count}
+    assert {r for r, _ in kept} == {"without north", "without west", "with attitude sensors"}
+    # 25 quantities, many of them alike: 1e-4 each way
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], count) / count
+    mean = {k: np.mean(v) for k, v in kept.items()}
+    assert all(low < m < high for m in mean.values()), mean
+    pooled = np.mean(list(mean.values()))
+    # flights are independent, quantities of one are not: the mean scatters at most as that of one quantity
+    assert low < pooled < high
+
+
+@pytest.mark.slow
+def test_command_writes_table_and_figure(command, flight):
+    done = command("reconstruct", flight.root, "--sensitivity")
+    assert done.returncode == 0, done.stderr
+    (run,) = (flight.root / "runs").iterdir()
+    assert (run / "sensitivity.csv").read_text().startswith("rerun,quantity,unit,t_s,base")
+    assert (run / "figures" / "sensitivity.png").stat().st_size > 10_000
+    assert "winds off" in done.stdout
