@@ -187,9 +187,9 @@ def _normal(fit: Fit, knots: Knots, sightings: list[Sightings], linear: list[Lin
         diagonal[seen.knot] += weighted @ line.by_knot
         knot_side[seen.knot] += (weighted @ line.residual[:, :, None])[:, :, 0]
         border[seen.knot[:, None], :, seen.terms] += np.swapaxes(weighted @ line.by_errors, 1, 2)
-        flat = (line.by_errors * weight).reshape(-1, len(seen.terms)).T
-        errors[np.ix_(seen.terms, seen.terms)] += flat @ line.by_errors.reshape(-1, len(seen.terms))
-        error_side[seen.terms] += flat @ line.residual.ravel()
+        late = line.by_errors * weight
+        errors[np.ix_(seen.terms, seen.terms)] += _summed(late, line.by_errors)
+        error_side[seen.terms] += np.einsum("rij,ri->j", late, line.residual)
 
     residual, early, late = _links(fit, knots)
     var = fit.density**2 * np.where(knots.linked, knots.step_s, np.inf)[:, None]
@@ -231,11 +231,18 @@ def _solve(normal: Normal) -> Solved:
     sides = np.concatenate([normal.border, normal.knot_side[:, :, None]], axis=2).reshape(-1, m + 1)
     answer = cho_solve_banded((factor, True), sides, check_finite=False).reshape(n, BLOCK, m + 1)
     carried, alone = answer[:, :, :m], answer[:, :, m]
-    flat = normal.border.reshape(-1, m)
-    schur = cho_factor(normal.errors - flat.T @ carried.reshape(-1, m))
-    errors = cho_solve(schur, normal.error_side - flat.T @ alone.ravel())
+    schur = cho_factor(normal.errors - _summed(normal.border, carried))
+    errors = cho_solve(schur, normal.error_side - np.einsum("nij,ni->j", normal.border, alone))
     own, next_by_own = _blocks_of_inverse(factor, n)
     return Solved(alone - carried @ errors, errors, own, next_by_own, carried, cho_solve(schur, np.eye(m)))
+
+
+def _summed(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Sum over n of ``left[n].T @ right[n]``: small products, which BLAS does not share out among its threads.
+
+    One product of all rows would be; beside other work on the machine its threads then wait for each other for seconds.
+    """
+    return np.asarray((np.swapaxes(left, 1, 2) @ right).sum(axis=0))
 
 
 def _blocks_of_inverse(factor: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
@@ -80,7 +81,8 @@ def figure_sensitivity(flight: Flight, table: pd.DataFrame) -> Figure:
     shown = largest_of_groups(table)
     groups = [g for g in GROUPS if g in set(shown["group"])]
     columns = 4
-    figure = Figure(figsize=(10.5, 0.6 + (0.9 + 0.22 * len(names)) * -(-len(groups) // columns)), layout="constrained")
+    room = ConstrainedLayoutEngine(rect=(0.0, 0.02, 1.0, 0.98))  # below, for the stamp
+    figure = Figure(figsize=(10.5, 0.6 + (0.9 + 0.22 * len(names)) * -(-len(groups) // columns)), layout=room)
     grid = figure.subplots(-(-len(groups) // columns), columns, sharey=True, squeeze=False).ravel()
     for ax, group in zip(grid, groups, strict=False):
         part = shown[shown["group"] == group].set_index("rerun").reindex(names)
@@ -99,7 +101,6 @@ def figure_sensitivity(flight: Flight, table: pd.DataFrame) -> Figure:
         ax.set_axisbelow(True)
         _clean(ax)
     grid[0].invert_yaxis()
-    figure.get_layout_engine().set(rect=(0.0, 0.02, 1.0, 0.98))  # type: ignore[union-attr]  # room for the stamp
     for ax in grid[len(groups) :]:
         ax.set_visible(False)
     figure.suptitle(
