@@ -200,10 +200,12 @@ def print_flight(flight: Flight, events: pd.DataFrame) -> None:
     console.print(table)
     if not flight.peak_is_inside:
         console.print("[yellow]found[/] the data end before or begin after the peak of dynamic pressure")
-    for finding in (*flight.telemetry.findings, *flight.reconstruction.findings, *results.without_attitude(flight)):
+    for finding in (*flight.findings, *results.without_attitude(flight)):
         console.print(f"[yellow]found[/] {escape(str(finding))}")
     for reason in flight.missing:
         console.print(f"[yellow]left out[/] air of the day: {escape(reason)}")
+    if flight.attitude is not None and flight.attitude.comparison is not None:
+        console.print(escape(flight.attitude.words))
     failed = [v for v in flight.verdicts if not v.passed]
     passed = len(flight.verdicts) - len(failed)
     console.print(f"{passed} of {len(flight.verdicts)} consistency verdicts pass")

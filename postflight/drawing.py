@@ -34,6 +34,8 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
     report(0.6, "drawing")
     if flight.day is not None:
         figures.save(product_figures.figure_air(flight, flight.day), folder / "air.png")
+    if flight.attitude is not None and flight.attitude.comparison is not None:
+        figures.save(product_figures.figure_attitude(flight, flight.attitude), folder / "attitude_check.png")
     figures.save(figures.figure_residuals(flight), folder / "residuals.png")
     if "misalignment" in answers.histories:
         figures.save(figures.figure_2_7(flight, answers.histories["misalignment"]), folder / "figure_2_7.png")

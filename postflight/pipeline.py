@@ -8,7 +8,7 @@ Nothing here opens ``truth/``; only `postflight.scoring` does.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +24,9 @@ from flightmodel.checks import DivergenceError, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import geodetic_from_ecef
 from flightmodel.flightfolder import read_flight
-from flightmodel.telemetry import Telemetry
+from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
+from postflight.attitude import AttitudeCheck, check_attitude
 from postflight.day_air import day_air
 from postflight.sensed import pulse_data
 from recon.air import ReconstructedAir
@@ -45,7 +46,8 @@ PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
 class Flight:
     """A flight with its reconstruction and the air it met; ``missing`` says why there is no pulse or no air of the day.
 
-    ``air`` is the sounding's along the trajectory; ``day`` is what the deceleration adds to it.
+    ``air`` is the sounding's along the trajectory; ``day`` is what the deceleration adds to it; ``attitude`` is what
+    magnetometer and Sun sensors say alone.
     """
 
     telemetry: Telemetry
@@ -54,11 +56,19 @@ class Flight:
     pulse: PulseData | None
     day: ReconstructedAir | None = None
     missing: tuple[str, ...] = ()
+    attitude: AttitudeCheck | None = None
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
-        """Verdicts on the trajectory, then on the air."""
-        return self.reconstruction.verdicts + (self.day.verdicts if self.day is not None else ())
+        """Verdicts on the trajectory, then on its attitude, then on the air."""
+        attitude, day = (part.verdicts if part is not None else () for part in (self.attitude, self.day))
+        return self.reconstruction.verdicts + attitude + day
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What was found in the data, on the way, and by the check of the attitude."""
+        attitude = () if self.attitude is None else self.attitude.findings
+        return (*self.telemetry.findings, *self.reconstruction.findings, *attitude)
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -111,8 +121,10 @@ def reconstruct_telemetry(
     report(0.0, "reconstructing")
     settings = settings or Settings(pulse_rate_hz=PULSE_RATE_HZ)
     bet = reconstruct(telemetry, settings, lambda f, what: report(0.95 * f, what))
-    report(0.96, "finding the air of the day")
-    flight = flight_from(telemetry, bet)
+    report(0.95, "checking the attitude")
+    attitude = check_attitude(telemetry, bet)
+    report(0.97, "finding the air of the day")
+    flight = replace(flight_from(telemetry, bet), attitude=attitude)
     report(1.0, "reconstructed")
     return flight
 

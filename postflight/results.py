@@ -23,6 +23,7 @@ import pandas as pd
 from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Finding, Telemetry
+from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.pipeline import NO_VIDEO, Answers, Flight
 from postflight.product.header import header
 from postflight.product.tables import event_table, peak_table, residual_statistics, slow_covariance
@@ -180,7 +181,9 @@ def write_reconstruction(run: RunFolder, flight: Flight) -> None:
         run.write_csv("air_profile.csv", flight.day.profile)
         run.write_csv("drag_ratio.csv", flight.day.drag)
         run.write_csv("air_parameters.csv", flight.day.parameters)
-    findings = [vars(f) for f in (*flight.telemetry.findings, *bet.findings, *without_attitude(flight))]
+    if flight.attitude is not None and flight.attitude.comparison is not None:
+        run.write_csv("attitude_check.csv", attitude_table(flight.attitude, bet))
+    findings = [vars(f) for f in (*flight.findings, *without_attitude(flight))]
     run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s"]))
 
 
@@ -198,6 +201,23 @@ def write_answers(run: RunFolder, answers: Answers) -> None:
         run.write_csv(f"deflection_{method}.csv", deflection_table(history))
 
 
+def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
+    """Comparison with the attitude of magnetometer and Sun alone; None for a flight without them."""
+    if check is None:
+        return None
+    comparison = check.comparison
+    if comparison is None:
+        return {"passed": None, "independent": not check.dependence, "words": check.findings[-1].what}
+    return {
+        "passed": all(v.passed for v in check.verdicts),
+        "independent": not check.dependence,
+        "words": check.words,
+        "rms_body_deg": [float(x) for x in np.rad2deg(np.sqrt(np.mean(comparison.difference_body_rad**2, axis=0)))],
+        "mean_body_deg": [float(x) for x in np.rad2deg(comparison.mean_body_rad)],
+        "share_inside_3sd": comparison.share_inside,
+    }
+
+
 def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
     """Return the short story of a run, for ``summary.json``."""
     air, peak = flight.air, flight.peak_s
@@ -212,6 +232,7 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
         "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])) if flight.has_attitude else None,
         "methods": method_summary(answers, peak),
         "missing": list(flight.missing),
+        "attitude_check": attitude_summary(flight.attitude),
         "verdicts_passed": sum(v.passed for v in verdicts),
         "suspect": flight.suspects[0] if flight.suspects else None,
         "suspects": list(flight.suspects),

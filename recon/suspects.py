@@ -3,8 +3,9 @@
 Evidence comes in this order. Where leaving one tracker out makes everything else agree, it is the tracker; where
 leaving out any of several does, they contradict each other and nothing tells which is wrong; where no tracker can be
 left out to that effect, it is what all of them meet: the inertial sensors or the motion. An error that the flight
-found larger than its data sheet comes next, then the noise of the motion, and last the air, which takes no part in the
-trajectory and can only be as wrong as the trajectory is right.
+found larger than its data sheet comes next, then the noise of the motion, then what magnetometer and Sun sensors say of
+the attitude, and last the air, which takes no part in the trajectory and can only be as wrong as the trajectory is
+right.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from recon.consistency import Verdict
 from recon.disagreement import LeftOut, is_about
 
 INERTIAL = ("accelerometer", "rates")
+ATTITUDE = "attitude check"
 AIR = ("sounding", "pre-flight", "air residuals")
 
 
@@ -31,7 +33,8 @@ def suspects(verdicts: tuple[Verdict, ...], left_out: tuple[LeftOut, ...]) -> tu
         out.append(_inertial(inertial))
     if any(v.name.startswith("filter-smoother") for v in red) and not out:
         out.append("the motion: filter and smoother differ more than the sensors' noise and errors explain")
-    return (*out, *(f"the air: {v.words}" for v in red if v.name.startswith(AIR)))
+    attitude = dict.fromkeys(f"the attitude: {v.words}" for v in red if v.name.startswith(ATTITUDE))
+    return (*out, *attitude, *(f"the air: {v.words}" for v in red if v.name.startswith(AIR)))
 
 
 def _trackers(red: list[Verdict], left_out: tuple[LeftOut, ...], inertial: list[Verdict]) -> list[str]:

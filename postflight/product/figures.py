@@ -10,6 +10,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
+from flightmodel.trajectory import resample
+from postflight.attitude import AttitudeCheck
 from postflight.figures import stamp
 from postflight.pipeline import Flight
 from postflight.sensitivity import GROUPS, largest_of_groups
@@ -107,6 +109,42 @@ def figure_sensitivity(flight: Flight, table: pd.DataFrame) -> Figure:
         "What moves when a source is left out or an assumption changed, at peak dynamic pressure\n"
         "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3",
         fontsize=10,
+    )
+    stamp(figure, flight.telemetry)
+    return figure
+
+
+def figure_attitude(flight: Flight, check: AttitudeCheck) -> Figure:
+    """Attitude from magnetometer and Sun minus the trajectory's about three body axes, with what it may be."""
+    comparison = check.comparison
+    assert comparison is not None
+    figure = Figure(figsize=(7.2, 7.0), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True)
+    _clean(*axes)
+    t, off, sd = comparison.time_s, np.rad2deg(comparison.difference_body_rad), np.rad2deg(comparison.sd_body_rad)
+    own = np.rad2deg(resample(flight.reconstruction.smoothed, t).sd()[:, 6:9])
+    # stretches without Sun or field have no rows; a line across them would show what nobody knows
+    whole = np.append(np.diff(t) < 1.5 * float(np.median(np.diff(t))), True)
+    for k, ax in enumerate(axes):
+        ax.fill_between(
+            t, -3.0 * sd[:, k], 3.0 * sd[:, k], where=whole, color="0.87", lw=0, label="3 sd of the difference"
+        )
+        for sign in (-3.0, 3.0):
+            label = "3 sd of the trajectory" if sign > 0 else None
+            ax.plot(t, np.where(whole, sign * own[:, k], np.nan), color=GREY, lw=0.8, ls=":", label=label)
+        ax.plot(
+            t, np.where(whole, off[:, k], np.nan), color=BLUE, lw=0.9, label="magnetometer and Sun minus trajectory"
+        )
+        ax.axhline(0.0, color="0.3", lw=0.6)
+        rms = float(np.sqrt(np.mean(off[:, k] ** 2)))
+        ax.set_ylabel(f"about body {'xyz'[k]} (deg)\nrms {rms:.2f}", fontsize=9)
+        far = 1.4 * max(float(np.percentile(np.abs(off[:, k]), 99.5)), 3.0 * float(np.median(sd[:, k])))
+        ax.set_ylim(-far, far)
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=3, loc="outside lower left")
+    axes[-1].set_xlabel("time after launch (s)")
+    title = "Attitude from magnetometer and Sun sensors alone against the trajectory's"
+    figure.suptitle(
+        title + ("\n(not independent: the trajectory rests on them too)" if check.dependence else ""), fontsize=10
     )
     stamp(figure, flight.telemetry)
     return figure

@@ -8,12 +8,18 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+
+from flightmodel.atmosphere import default_sounding_sd, us76
+from flightmodel.telemetry import Sounding
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from tests.recon import conftest as mini
 
 START_S, END_S = 420.0, 430.0
 T0_UTC = "2009-08-17T12:52:00Z"
@@ -210,3 +216,22 @@ def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
         return SimpleNamespace(returncode=code, stdout=seen.out, stderr=seen.err + trace)
 
     return run
+
+
+def layer_of_air():
+    """Air in a layer only, so that the largest dynamic pressure lies inside the flight; no physics is asked of it."""
+    z = np.arange(0.0, 130e3, 2000.0)
+    density, temperature, pressure = us76(z)
+    density = density * np.exp(-0.5 * ((z - 80e3) / 4e3) ** 2)
+    return Sounding(z, density, temperature, pressure, 0.0 * z + 5.0, 0.0 * z, *default_sounding_sd(z))
+
+
+@pytest.fixture(scope="session")
+def mini_flight():
+    """``mini_flight(seed)``: telemetry of a minute with every kind of instrument, a vehicle and some air."""
+    truth, air, vehicle = mini._truth(), layer_of_air(), vehicle_from_toml(vehicle_path("irve2_reference"))
+
+    def make(seed):
+        return replace(mini.sense_everything(truth, seed, mini.SITES), sounding=air, vehicle=vehicle)
+
+    return make

@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from flightmodel.atmosphere import default_sounding_sd, us76
 from flightmodel.checks import GateError
-from flightmodel.telemetry import Sounding
-from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight import sensitivity as module
 from postflight.pipeline import flight_from, reconstruct_flight, reconstruct_telemetry
 from postflight.sensitivity import COLUMNS, UNITS, largest_of_groups, reruns, sensitivity
 from recon.bet import Settings, reconstruct_once
-from tests.recon import conftest as mini
 
 
 @pytest.fixture(scope="module")
@@ -27,24 +23,6 @@ def short(clean_flight):
 @pytest.fixture(scope="module")
 def table(short):
     return sensitivity(short)
-
-
-def sounding():
-    """Air in a layer only, so that the largest dynamic pressure lies inside the flight; no physics is asked of it."""
-    z = np.arange(0.0, 130e3, 2000.0)
-    density, temperature, pressure = us76(z)
-    density = density * np.exp(-0.5 * ((z - 80e3) / 4e3) ** 2)
-    return Sounding(z, density, temperature, pressure, 0.0 * z + 5.0, 0.0 * z, *default_sounding_sd(z))
-
-
-@pytest.fixture(scope="module")
-def mini_flight():
-    truth, air, vehicle = mini._truth(), sounding(), vehicle_from_toml(vehicle_path("irve2_reference"))
-
-    def make(seed):
-        return replace(mini.sense_everything(truth, seed, mini.SITES), sounding=air, vehicle=vehicle)
-
-    return make
 
 
 @pytest.fixture(scope="module")

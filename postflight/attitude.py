@@ -1,0 +1,115 @@
+"""Does an attitude from magnetometer and Sun sensors alone agree with the trajectory's? The range's check, every run.
+
+See docs/attitude.md, and `recon.attitude_check` for the comparison itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.stats import chi2
+
+from flightmodel import earth, rotations
+from flightmodel.checks import GateError
+from flightmodel.telemetry import Finding, Telemetry
+from flightmodel.trajectory import interpolate_rows, resample
+from postflight.product.kinematics import euler_321
+from recon.attitude_check import LEAST_INSIDE, AttitudeComparison, AttitudeHistory, Settings, compare
+from recon.bet import Reconstruction
+from recon.consistency import Verdict
+from recon.vector_attitude import reconstruct_attitude, track
+
+RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
+DEPENDS = "this check is not independent: the trajectory's "
+
+
+@dataclass(frozen=True)
+class AttitudeCheck:
+    """What the directions say of the attitude.
+
+    Parameters
+    ----------
+    history : AttitudeHistory or None
+        None where the sensors fix no attitude; a finding says why.
+    comparison : AttitudeComparison or None
+    dependence : str
+        Words where the trajectory itself rests on these sensors; empty where the check is independent.
+    findings : tuple of Finding
+    confidence : float
+    """
+
+    history: AttitudeHistory | None
+    comparison: AttitudeComparison | None
+    dependence: str
+    findings: tuple[Finding, ...]
+    confidence: float
+
+    @property
+    def words(self) -> str:
+        """Verdict in words, with what takes from it."""
+        said = "" if self.comparison is None else self.comparison.words
+        return "; ".join(part for part in (said, self.dependence) if part)
+
+    @property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """Size of the differences, their share inside three standard deviations, and the sensors' own residuals."""
+        if self.comparison is None or self.history is None:
+            return ()
+        nees, inside = self.comparison.mean_nees, self.comparison.share_inside
+        high = float(chi2.ppf(self.confidence, 3))
+        return (
+            Verdict("attitude check size", nees, 0.0, high, nees <= high, self.words),
+            Verdict("attitude check share inside", inside, LEAST_INSIDE, 1.0, inside >= LEAST_INSIDE, self.words),
+            *(Verdict(**{**vars(v), "name": f"attitude check {v.name}"}) for v in self.history.verdicts),
+        )
+
+
+def check_attitude(telemetry: Telemetry, bet: Reconstruction) -> AttitudeCheck | None:
+    """Attitude from directions over the trajectory's span, compared; None without sensors or without an attitude."""
+    if telemetry.magnetometer is None or telemetry.sun is None or bet.provenance["motion"] == "ballistic":
+        return None
+    settings = bet.settings
+    dependence = ""
+    if settings.attitude_sensors:
+        dependence = DEPENDS + "filter read these sensors too"
+    elif telemetry.attitude_prior is None:
+        dependence = DEPENDS + "attitude was started from these sensors"
+    history, comparison = None, None
+    found: list[Finding] = []
+    try:
+        t, points = track(telemetry)
+        ends = np.clip(bet.smoothed.time_s[[0, -1]], t[0], t[-1])
+        at = np.union1d(t[(t > ends[0]) & (t < ends[1])], ends)
+        chosen = Settings(rate_hz=RATE_HZ, confidence=settings.verdict_confidence)
+        history = reconstruct_attitude(telemetry, (at, interpolate_rows(at, t, points)), chosen)
+        comparison = compare(history, bet.smoothed, settings.verdict_confidence)
+        found += history.findings
+    except GateError as fault:
+        found.append(Finding("attitude check", str(fault), np.nan, np.nan))
+    return AttitudeCheck(history, comparison, dependence, tuple(found), settings.verdict_confidence)
+
+
+def attitude_table(check: AttitudeCheck, bet: Reconstruction) -> pd.DataFrame:
+    """Return ``attitude_check.csv``: the independent attitude, its difference from the trajectory's, and all sds."""
+    history, comparison = check.history, check.comparison
+    assert history is not None
+    assert comparison is not None
+    rows = np.searchsorted(history.time_s, comparison.time_s)
+    path = resample(bet.smoothed, comparison.time_s)
+    assert path.covariance is not None
+    latitude, longitude, _ = earth.geodetic_from_ecef(path.position_ecef_m)
+    dcm = earth.dcm_ned_ecef(latitude, longitude) @ rotations.dcm_from_q(history.q_ecef_body[rows])
+    columns = {"t_s": comparison.time_s}
+    angles = zip(("roll", "pitch", "yaw"), euler_321(dcm), strict=True)
+    columns |= {f"{name}_ned_deg": np.rad2deg(angle) for name, angle in angles}
+    parts = {
+        "difference_{}_body_deg": comparison.difference_body_rad,
+        "difference_{}_body_sd_deg": comparison.sd_body_rad,
+        "independent_{}_body_sd_deg": np.sqrt(np.diagonal(history.covariance[rows], axis1=1, axis2=2)),
+        "bet_{}_body_sd_deg": path.sd()[:, 6:9],
+    }
+    for pattern, values in parts.items():
+        columns |= {pattern.format(a): np.rad2deg(column) for a, column in zip("xyz", values.T, strict=True)}
+    return pd.DataFrame(columns)
