@@ -36,6 +36,7 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
         figures.save(product_figures.figure_air(flight, flight.day), folder / "air.png")
     if flight.attitude is not None and flight.attitude.comparison is not None:
         figures.save(product_figures.figure_attitude(flight, flight.attitude), folder / "attitude_check.png")
+    figures.save(product_figures.figure_filter_and_smoother(flight), folder / "filter_and_smoother.png")
     figures.save(figures.figure_residuals(flight), folder / "residuals.png")
     if "misalignment" in answers.histories:
         figures.save(figures.figure_2_7(flight, answers.histories["misalignment"]), folder / "figure_2_7.png")

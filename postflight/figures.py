@@ -246,15 +246,26 @@ def figure_residuals(flight: Flight) -> Figure:
         good = rows["accepted"].to_numpy(dtype=bool)
         t, r = rows["time_s"].to_numpy(), scale * rows["residual"].to_numpy()
         sd = scale * rows["predicted_sd"].to_numpy()
-        ax.plot(t[good], r[good], ".", ms=1.5, color="#0072B2")
+        ax.plot(t[good], r[good], ".", ms=1.5 if len(t) > 500 else 3, color="#0072B2")
         limit = 6.0 * float(np.median(sd))
-        ax.plot(t[~good], np.clip(r[~good], -limit, limit), "x", ms=4, color="#D55E00")
+        far = np.clip(r[~good], -0.95 * limit, 0.95 * limit)
+        beyond = np.abs(r[~good]) > 0.95 * limit
+        ax.plot(t[~good][~beyond], far[~beyond], "x", ms=4, color="#D55E00")
+        for sign, arrow in ((1.0, "^"), (-1.0, "v")):
+            off = beyond & (far * sign > 0.0)
+            ax.plot(t[~good][off], far[off], arrow, ms=4, color="#D55E00")
+        if not good.all():
+            ax.set_title(
+                f"{np.count_nonzero(~good)} of {len(good)} edited", fontsize=7, color="#D55E00", loc="right", pad=2
+            )
         for sign in (-3, 3):
             ax.plot(t, sign * sd, color="0.3", lw=0.7)
         ax.set_ylabel(f"{source}\n{component} ({unit})", fontsize=7)
         ax.set_ylim(-limit, limit)
     figure.get_axes()[-1].set_xlabel("time after launch (s)")
-    figure.suptitle("Tracking residuals before each update, 3 sd, edited points crossed", fontsize=10)
+    figure.suptitle(
+        "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside", fontsize=10
+    )
     stamp(figure, flight.telemetry)
     return figure
 

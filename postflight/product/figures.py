@@ -10,14 +10,20 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
-from flightmodel.trajectory import resample
+from flightmodel.trajectory import difference, resample
 from postflight.attitude import AttitudeCheck
 from postflight.figures import stamp
 from postflight.pipeline import Flight
 from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.air import ReconstructedAir
 
+LEAST_LOST = 1e-3  # of the filter's variance that the smoother takes away, for a difference to be drawn
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "0.55"
+
+
+def _room() -> ConstrainedLayoutEngine:
+    """Layout that leaves room for the stamp."""
+    return ConstrainedLayoutEngine(rect=(0.0, 0.025, 1.0, 0.975))
 
 
 def _clean(*axes: Axes) -> None:
@@ -83,8 +89,7 @@ def figure_sensitivity(flight: Flight, table: pd.DataFrame) -> Figure:
     shown = largest_of_groups(table)
     groups = [g for g in GROUPS if g in set(shown["group"])]
     columns = 4
-    room = ConstrainedLayoutEngine(rect=(0.0, 0.02, 1.0, 0.98))  # below, for the stamp
-    figure = Figure(figsize=(10.5, 0.6 + (0.9 + 0.22 * len(names)) * -(-len(groups) // columns)), layout=room)
+    figure = Figure(figsize=(10.5, 0.6 + (0.9 + 0.22 * len(names)) * -(-len(groups) // columns)), layout=_room())
     grid = figure.subplots(-(-len(groups) // columns), columns, sharey=True, squeeze=False).ravel()
     for ax, group in zip(grid, groups, strict=False):
         part = shown[shown["group"] == group].set_index("rerun").reindex(names)
@@ -140,11 +145,52 @@ def figure_attitude(flight: Flight, check: AttitudeCheck) -> Figure:
         ax.set_ylabel(f"about body {'xyz'[k]} (deg)\nrms {rms:.2f}", fontsize=9)
         far = 1.4 * max(float(np.percentile(np.abs(off[:, k]), 99.5)), 3.0 * float(np.median(sd[:, k])))
         ax.set_ylim(-far, far)
-    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=3, loc="outside lower left")
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=3, loc="outside upper left")
     axes[-1].set_xlabel("time after launch (s)")
     title = "Attitude from magnetometer and Sun sensors alone against the trajectory's"
     figure.suptitle(
         title + ("\n(not independent: the trajectory rests on them too)" if check.dependence else ""), fontsize=10
     )
+    stamp(figure, flight.telemetry)
+    return figure
+
+
+def figure_filter_and_smoother(flight: Flight) -> Figure:
+    """What the filter knew at each time and what the smoother knows, and their difference over its sd (McReynolds)."""
+    bet = flight.reconstruction
+    filtered, smoothed = bet.filtered, bet.smoothed
+    assert filtered.covariance is not None
+    assert smoothed.covariance is not None
+    groups = [("position", "m", 1.0), ("velocity", "m/s", 1.0), ("attitude", "deg", 180.0 / np.pi)]
+    groups = groups if flight.has_attitude else groups[:2]
+    figure = Figure(figsize=(10.0, 0.8 + 2.2 * len(groups)), layout=_room())
+    grid = figure.subplots(len(groups), 2, sharex=True)
+    _clean(*grid.ravel())
+    t, off = smoothed.time_s, difference(filtered, smoothed)
+    var_filter, var_smoother = (np.diagonal(p, axis1=1, axis2=2) for p in (filtered.covariance, smoothed.covariance))
+    lost = var_filter - var_smoother
+    # towards the end both are the same, and the ratio of nothing to nothing
+    sure = lost > LEAST_LOST * var_filter
+    ratio = np.where(sure, off / np.sqrt(np.where(sure, lost, 1.0)), np.nan)
+    for k, ((name, unit, scale), (known, apart)) in enumerate(zip(groups, grid, strict=True)):
+        part = slice(3 * k, 3 * k + 3)
+        for var, colour, label in ((var_filter, ORANGE, "filter"), (var_smoother, BLUE, "smoother")):
+            known.semilogy(t, scale * np.sqrt(var[:, part].sum(axis=1)), color=colour, lw=1.2, label=label)
+        known.set_ylabel(f"{name}, sd ({unit})", fontsize=9)
+        for column, colour, axis in zip(ratio[:, part].T, (BLUE, ORANGE, GREEN), "xyz", strict=True):
+            apart.plot(t, column, color=colour, lw=0.8, label=axis)
+        for edge in (-3.0, 3.0):
+            apart.axhline(edge, color="0.3", lw=0.8, ls=":")
+        far = 4.5
+        if np.isfinite(ratio[:, part]).any():
+            far = min(max(far, 1.1 * float(np.nanpercentile(np.abs(ratio[:, part]), 99.5))), 30.0)
+        frame = "body" if name == "attitude" else "ECEF"
+        apart.set_ylim(-far, far)
+        apart.set_ylabel(f"difference over\nits sd ({frame})", fontsize=9)
+        apart.legend(fontsize=7, frameon=False, ncols=3, loc="upper right")
+    grid[0, 0].legend(fontsize=8, frameon=False, ncols=2, loc="upper right")
+    for ax in grid[-1]:
+        ax.set_xlabel("time after launch (s)")
+    figure.suptitle("Filter against smoother: how well each knows, and their difference (dotted: 3 sd)", fontsize=10)
     stamp(figure, flight.telemetry)
     return figure

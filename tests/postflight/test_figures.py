@@ -1,0 +1,93 @@
+"""Figures of the trajectory show what they should, with an attitude and without one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flightmodel.telemetry import Motion
+from flightmodel.trajectory import difference
+from postflight.attitude import check_attitude
+from postflight.figures import figure_residuals, save
+from postflight.pipeline import flight_from
+from postflight.product.figures import figure_attitude, figure_filter_and_smoother, figure_sensitivity
+from postflight.sensitivity import sensitivity
+from recon.bet import Settings, reconstruct_once
+
+
+@pytest.fixture(scope="module")
+def flight(mini_flight):
+    """A flight of which one radar point in a hundred is a kilometre off."""
+    telemetry = replace(mini_flight(3), gnss={}, barometers={})
+    north = telemetry.radars["north"]
+    track = north.range_az_el.copy()
+    track[50::100, 0] += 1000.0
+    telemetry = replace(telemetry, radars=telemetry.radars | {"north": replace(north, range_az_el=track)})
+    bet = reconstruct_once(telemetry, Settings(output_rate_hz=5.0))
+    return replace(flight_from(telemetry, bet), attitude=check_attitude(telemetry, bet))
+
+
+@pytest.fixture(scope="module")
+def ballistic(mini_flight):
+    """The same fall without inertial sensors; the drag is a guess."""
+    telemetry = mini_flight(3)
+    bare = dict.fromkeys(("accelerometer", "rates", "magnetometer", "sun", "vehicle", "attitude_prior"))
+    motion = Motion("ballistic", 0.05)
+    telemetry = replace(telemetry, **bare, gnss={}, barometers={}, motion=motion)
+    return flight_from(telemetry, reconstruct_once(telemetry, Settings(output_rate_hz=5.0, passes=1)))
+
+
+def drawn(figure, path):
+    save(figure, path)
+    assert path.stat().st_size > 10_000
+
+
+def test_edited_points_are_counted_and_lie_in_view(flight, tmp_path):
+    figure = figure_residuals(flight)
+    drawn(figure, tmp_path / "residuals.png")
+    table = flight.reconstruction.residuals
+    count = int((~table.accepted & (table.source == "north") & (table.component == "range")).sum())
+    assert count >= 5
+    axes = figure.get_axes()
+    assert axes[0].get_title(loc="right").startswith(f"{count} of ")
+    assert sum(len(line.get_xdata()) for line in axes[0].lines if line.get_marker() in "x^v") == count
+    low, high = axes[0].get_ylim()
+    marks = np.concatenate([line.get_ydata() for line in axes[0].lines if line.get_marker() in "x^v"])
+    assert ((marks > low) & (marks < high)).all()
+    assert axes[4].get_title(loc="right") == ""
+
+
+def test_difference_of_filter_and_smoother_is_over_its_own_sd(flight, tmp_path):
+    figure = figure_filter_and_smoother(flight)
+    drawn(figure, tmp_path / "filter.png")
+    axes = figure.get_axes()
+    assert len(axes) == 6
+    bet = flight.reconstruction
+    off = difference(bet.filtered, bet.smoothed)
+    var = (np.diagonal(p.covariance, axis1=1, axis2=2) for p in (bet.filtered, bet.smoothed))
+    ratio = off / np.sqrt(np.abs(np.subtract(*var)) + 1e-30)
+    for row, part in enumerate((slice(0, 3), slice(3, 6), slice(6, 9))):
+        shown = np.array([line.get_ydata() for line in axes[2 * row + 1].lines[:3]]).T
+        known = np.isfinite(shown)
+        assert known.mean() > 0.5
+        assert np.allclose(shown[known], ratio[:, part][known])
+
+
+def test_without_attitude_nothing_is_drawn_of_it(ballistic, tmp_path):
+    assert not ballistic.has_attitude
+    figure = figure_filter_and_smoother(ballistic)
+    drawn(figure, tmp_path / "filter.png")
+    assert len(figure.get_axes()) == 4
+    drawn(figure_residuals(ballistic), tmp_path / "residuals.png")
+    found = sensitivity(ballistic)
+    assert not found.quantity.astype(str).str.contains("rotation|attack").any()
+    assert (found[(found.rerun == "mass +1 %") & (found.quantity == "altitude")].change != 0.0).all()
+    drawn(figure_sensitivity(ballistic, found), tmp_path / "sensitivity.png")
+
+
+def test_attitude_check_says_when_it_is_not_independent(flight, tmp_path):
+    drawn(figure_attitude(flight, flight.attitude), tmp_path / "attitude.png")
+    resting = replace(flight.attitude, dependence="the filter read these sensors too")
+    assert "not independent" in figure_attitude(flight, resting).get_suptitle()
