@@ -145,7 +145,7 @@ def figure_attitude(flight: Flight, check: AttitudeCheck) -> Figure:
         ax.set_ylabel(f"about body {'xyz'[k]} (deg)\nrms {rms:.2f}", fontsize=9)
         far = 1.4 * max(float(np.percentile(np.abs(off[:, k]), 99.5)), 3.0 * float(np.median(sd[:, k])))
         ax.set_ylim(-far, far)
-    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=3, loc="outside upper left")
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=7, frameon=False, ncols=3, loc="outside lower left")
     axes[-1].set_xlabel("time after launch (s)")
     title = "Attitude from magnetometer and Sun sensors alone against the trajectory's"
     figure.suptitle(
