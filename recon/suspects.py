@@ -63,9 +63,9 @@ def _trackers(red: list[Verdict], left_out: tuple[LeftOut, ...], inertial: list[
 
 def _lone_trackers(red: list[Verdict]) -> list[str]:
     """What can be said where no tracker could be left out."""
-    about = ("NIS ", "whiteness ", "edited ")
-    ours = ("data sheet accelerometer", "data sheet rates", "data sheet air", "data sheet vehicle")
-    kinds = [v for v in red if v.name.startswith(about) or (v.name.startswith("data sheet ") and v.name not in ours)]
+    inertial = tuple(f"data sheet {name}" for name in INERTIAL)
+    about = ("NIS ", "whiteness ", "edited ", "data sheet ")
+    kinds = [v for v in red if v.name.startswith(about) and v.name not in inertial]
     if not kinds:
         return []
     words = "; ".join(dict.fromkeys(_short(v) for v in kinds))
