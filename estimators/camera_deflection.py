@@ -1,251 +1,38 @@
 """How far did the shell bend, seen by the onboard camera?
 
-The camera is oriented on a benchmark frame in which the joint is taken as not bent (three angles, a focal scale); in
-every other frame the deflection is the rotation ``w`` of the shell whose projected edge fits the found one,
+The camera is oriented on a benchmark frame in which the joint is taken as not bent (`estimators.benchmark`); in every
+other frame the deflection is the rotation of the shell whose projected edge and marks fit the found ones
+(`estimators.camera_fit`): two parameters when the plane is found, one in an assumed plane (the seed paper's way, plane
+along the camera's line of sight).
 
-    min over w of  sum_j rho((r_j - J_j dw) / sd_j),
+With an assumed plane that is off by ``d`` the answer is ``theta (cos d + s sin d)``, ``s`` the answer to a unit bending
+across the plane; its mean square error ``theta^2 (s^2 sd^2 + 3 (1/2 + s^2)^2 sd^4)`` is in the variance.
 
-by Gauss-Newton with Huber's rho: one parameter in an assumed plane (the seed paper's way, plane along the camera's line
-of sight), two when the plane is found as well, from the tilt of the edge across the picture.
-
-The covariance is the formal one, scaled by the residuals where they exceed their sd, plus what is held fixed though not
-known: with the derivatives ``N`` of the edge by those quantities (principal point, k1, camera position, rim radius,
-joint station, residual deflection of the benchmark, shift and tilt of the found edge by changing light)
-
-    dw = G_f (N_f - C_f G_b N_b) dn,    G = (J' W J)^-1 J' W,
-
-where ``b`` is the benchmark frame, ``f`` the frame, ``C`` the derivative by the orientation. What spoils both frames
-alike is absorbed by the orientation and drops out. With an assumed plane that is off by ``d`` the answer is
-``theta (cos d + s sin d)``, ``s`` the answer to a unit bending across the plane; its mean square error
-``theta^2 (s^2 sd^2 + 3 (1/2 + s^2)^2 sd^4)`` is in the variance.
-
-Sources: seed paper, CAD-based estimate, Table 2.1. S. F. Schmidt's "consider" covariance, e.g. Tapley, Schutz, Born,
-"Statistical Orbit Determination", 2004, chapter 6.
+Sources: seed paper, CAD-based estimate, Table 2.1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from estimators.horizon import HorizonLine, ScanLines, find_horizon
-from estimators.virtual_camera import DEFLECTION, NUISANCE, POINTING, HeldFixed, VirtualCamera, huber_gain
-from flightmodel.camera import camera_from_mount
+from estimators.benchmark import orient_camera
+from estimators.camera_fit import FrameFit, HeldFixed, Image, OrientedCamera
 from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing
 from flightmodel.deflection import DeflectionHistory, polar_from_lateral, rotation_vector_body_shell
 from flightmodel.vehicle import CameraMount, ShellGeometry
 
-Image = NDArray[np.uint8]
-
-ITERATIONS = 8
-WORST_RMS_PX = 2.5
-LEAST_POINTS = 60
-POINTING_PRIOR_SD = np.array([*np.deg2rad([3.0, 3.0, 3.0]), 0.05])
+Progress = Callable[[float, str], None]
 
 
-@dataclass(frozen=True)
-class FrameFit:
-    """The deflection seen in one frame.
-
-    Parameters
-    ----------
-    rotation_yz_rad : (2,) float
-        Rotation vector of the shell against the body about body y and z, rad; NaN when refused.
-    covariance : (k, k) float
-        Of the fitted parameters: ``rotation_yz_rad`` (k = 2), or the angle in the assumed plane (k = 1), rad^2.
-    plane_leak : float
-        Answer to a unit bending across the assumed plane (k = 1); zero otherwise.
-    residual_rms_px : float
-    horizon : HorizonLine
-    refused : str
-        Why there is no answer; empty when there is one.
-    """
-
-    rotation_yz_rad: FloatArray
-    covariance: FloatArray
-    plane_leak: float
-    residual_rms_px: float
-    horizon: HorizonLine
-    refused: str = ""
-
-
-@dataclass(frozen=True)
-class _Solution:
-    """Normal equations of one frame at the answer: gain ``(k, m)``, formal covariance, Jacobian, used rows."""
-
-    value: FloatArray
-    gain: FloatArray
-    formal: FloatArray
-    jacobian: FloatArray
-    columns_px: FloatArray
-    rms_px: float
-
-
-@dataclass(frozen=True)
-class OrientedCamera:
-    """A virtual camera whose orientation was fitted on a benchmark frame; see `orient_camera`.
-
-    Parameters
-    ----------
-    view : VirtualCamera
-    lines : ScanLines
-        Where the edge is searched.
-    held : HeldFixed
-    benchmark : HorizonLine
-    pointing : (4,) float
-        Corrections found: three angles in camera axes, rad, and the focal scale less one.
-    pointing_covariance : (4, 4) float
-    pointing_per_held : (4, 8 + 2) float
-        Shift of the corrections per one sd of each held quantity and of the benchmark's deflection.
-    residual_rms_px : float
-        Of the benchmark frame.
-    """
-
-    view: VirtualCamera
-    lines: ScanLines
-    held: HeldFixed
-    benchmark: HorizonLine
-    pointing: FloatArray
-    pointing_covariance: FloatArray = field(repr=False)
-    pointing_per_held: FloatArray = field(repr=False)
-    residual_rms_px: float = 0.0
-
-    def fit(self, image: Image, plane_lv_rad: float | None, start_yz_rad: FloatArray | None = None) -> FrameFit:
-        """Find the deflection in a frame.
-
-        Parameters
-        ----------
-        image : (h, w) uint8
-        plane_lv_rad : float or None
-            Assumed plane, or None to find it.
-        start_yz_rad : (2,) float, optional
-            Where to start, e.g. the answer of the frame before.
-        """
-        horizon = find_horizon(image, self.lines, self.view.camera.size_px)
-        if not horizon.is_usable:
-            return _no_answer(horizon, horizon.refused)
-        return self.fit_horizon(horizon, plane_lv_rad, start_yz_rad)
-
-    def fit_horizon(
-        self, horizon: HorizonLine, plane_lv_rad: float | None, start_yz_rad: FloatArray | None = None
-    ) -> FrameFit:
-        """Find the deflection from an edge already found."""
-        basis = np.eye(2) if plane_lv_rad is None else _axis(plane_lv_rad)[:, None]
-        start = np.zeros(2) if start_yz_rad is None else start_yz_rad
-        try:
-            found = _solve(self.view, horizon, np.eye(2), start)
-            if plane_lv_rad is not None:
-                # whether this is the shell is judged with both parameters: an assumed plane alone may fit badly
-                found = _solve(self.view, horizon, basis, basis.T @ found.value, worst_rms_px=np.inf)
-        except _NoFit as fault:
-            return _no_answer(horizon, str(fault))
-        gain = found.gain
-        leak = 0.0
-        if plane_lv_rad is not None:
-            across = np.array([-basis[1, 0], basis[0, 0]])
-            # the axis turns from w(plane) by +90 deg of plane
-            across = across if across @ _axis(plane_lv_rad + 0.5 * np.pi) > 0.0 else -across
-            leak = float(gain[0] @ found.jacobian[:, DEFLECTION] @ across)
-        pointing = gain @ found.jacobian[:, POINTING]
-        held = np.zeros((len(gain), 10))
-        held[:, :8] = gain @ found.jacobian[:, NUISANCE] * self.held.nuisance_sd
-        held -= pointing @ self.pointing_per_held
-        # light: shift, tilt and bow of the edge in this frame alone
-        width = 0.5 * self.view.camera.width_px
-        side = (found.columns_px - width) / width
-        light = gain @ np.column_stack([np.ones_like(side), side, 1.5 * side**2 - 0.5]) * self.held.edge_px
-        covariance = found.formal + pointing @ self.pointing_covariance @ pointing.T + held @ held.T + light @ light.T
-        return FrameFit(basis @ found.value, covariance, leak, found.rms_px, horizon)
-
-
-class _NoFit(Exception):
-    """The edge found does not fit the model."""
-
-
-def _axis(plane_lv_rad: float) -> FloatArray:
+def axis_of(plane_lv_rad: float) -> FloatArray:
     """Rotation vector (y, z) of a unit bending in a plane."""
     out: FloatArray = rotation_vector_body_shell(np.array(1.0), np.array(plane_lv_rad))[1:]
     return out
-
-
-def _no_answer(horizon: HorizonLine, reason: str) -> FrameFit:
-    nan = np.full((2, 2), np.nan)
-    return FrameFit(nan[0], nan, 0.0, float("nan"), horizon, reason)
-
-
-def _solve(
-    view: VirtualCamera, horizon: HorizonLine, basis: FloatArray, start: FloatArray, worst_rms_px: float = WORST_RMS_PX
-) -> _Solution:
-    value = np.array(start, dtype=float)
-    for _ in range(ITERATIONS):
-        residual, jacobian = view.mismatch(horizon, view.edge(basis @ value))
-        used = np.isfinite(residual)
-        if used.sum() < LEAST_POINTS:
-            raise _NoFit(f"{int(used.sum())} edge points where {LEAST_POINTS} are wanted")
-        residual, jacobian = residual[used], jacobian[used]
-        gain, formal, rms = huber_gain(residual, jacobian[:, DEFLECTION] @ basis, horizon.sd_px[used], None)
-        step = gain @ residual
-        value += step
-        if np.linalg.norm(value) > 0.5:
-            raise _NoFit("the fit ran away beyond 28 deg")
-        if np.abs(step).max() < 5e-6:
-            break
-    if rms > worst_rms_px:
-        raise _NoFit(f"the edge is not the shell's: rms {rms:.1f} px where {worst_rms_px} px are allowed")
-    return _Solution(value, gain, formal, jacobian, horizon.points_px[used, 0], rms)
-
-
-def orient_camera(
-    benchmark: Image,
-    geometry: ShellGeometry,
-    camera_mount: CameraMount,
-    joint_station_m: float,
-    held: HeldFixed | None = None,
-) -> OrientedCamera:
-    """Fit the camera's orientation and focal scale on a frame taken as not bent.
-
-    Parameters
-    ----------
-    benchmark : (h, w) uint8
-    geometry : ShellGeometry
-    camera_mount : CameraMount
-        Nominal position, pointing and lens.
-    joint_station_m : float
-        Joint aft of the nose, m.
-    held : HeldFixed, optional
-
-    Raises
-    ------
-    GateError
-        When the frame cannot be used, with the reason.
-    """
-    held = held or HeldFixed()
-    nominal = camera_from_mount(camera_mount)
-    view = VirtualCamera(geometry, nominal, joint_station_m)
-    total = np.zeros(4)
-    for _ in range(ITERATIONS):
-        lines = view.scan_lines()
-        horizon = find_horizon(benchmark, lines, nominal.size_px)
-        if not horizon.is_usable:
-            raise GateError(f"benchmark frame: {horizon.refused}; choose another benchmark time")
-        residual, jacobian = view.mismatch(horizon, view.edge(np.zeros(2)))
-        used = np.isfinite(residual)
-        gain, formal, rms = huber_gain(residual[used], jacobian[used, POINTING], horizon.sd_px[used], POINTING_PRIOR_SD)
-        step = gain @ residual[used] - formal @ (total / POINTING_PRIOR_SD**2)
-        total = total + step
-        view = replace(view, camera=nominal.turned(total[:3], 1.0 + total[3]))
-        if np.abs(step).max() < 1e-5:
-            break
-    if rms > WORST_RMS_PX:
-        raise GateError(f"benchmark frame: the edge is not the shell's (rms {rms:.1f} px); choose another time")
-    per_held = [jacobian[used, NUISANCE] * held.nuisance_sd, jacobian[used, DEFLECTION] * held.benchmark_rad]
-    shift = gain @ np.column_stack(per_held)
-    return OrientedCamera(view, view.scan_lines(), held, horizon, total, formal, shift, rms)
 
 
 def deflection_from_frames(
@@ -258,8 +45,12 @@ def deflection_from_frames(
     plane_lv_rad: float | None = float(np.deg2rad(153.0)),
     plane_sd_rad: float = float(np.deg2rad(25.0)),
     held: HeldFixed | None = None,
+    benchmark: Image | None = None,
+    progress: Progress | None = None,
 ) -> DeflectionHistory:
     """Estimate the bending history from onboard video.
+
+    Frames are taken one at a time: memory does not grow with their number.
 
     Parameters
     ----------
@@ -276,6 +67,10 @@ def deflection_from_frames(
     plane_sd_rad : float
         Standard deviation of the assumed plane.
     held : HeldFixed, optional
+    benchmark : (h, w) uint8, optional
+        The benchmark frame, where ``frames`` can be gone through only once.
+    progress : callable, optional
+        Told the fraction done and what is being done.
 
     Returns
     -------
@@ -289,21 +84,37 @@ def deflection_from_frames(
         When times and frames do not match, or the benchmark frame is missing or unusable.
     """
     times = np.asarray(frame_times_s, dtype=float)
-    pictures: Sequence[Image | str | Path] = list(frames)
-    if len(times) != len(pictures) or len(times) == 0:
-        raise GateError(f"{len(times)} frame times for {len(pictures)} frames")
     check_finite("frame_times_s", times)
     check_increasing("frame_times_s", times)
-    nearest = int(np.argmin(np.abs(times - benchmark_time_s)))
-    if abs(times[nearest] - benchmark_time_s) > 2.0:
-        raise GateError(f"no frame within 2 s of the benchmark time {benchmark_time_s} s; frames span "
-                        f"{times[0]:.2f} to {times[-1]:.2f} s")  # fmt: skip
-    oriented = orient_camera(read_frame(pictures[nearest]), geometry, camera_mount, joint_station_m, held)
-    start, fits = np.zeros(2), []
-    for picture in pictures:
-        fits.append(oriented.fit(read_frame(picture), plane_lv_rad, start))
+    nearest = benchmark_index(times, benchmark_time_s)
+    if benchmark is None:
+        frames = list(frames)
+        if len(frames) != len(times):
+            raise GateError(f"{len(times)} frame times for {len(frames)} frames")
+        benchmark = read_frame(frames[nearest])
+    oriented = orient_camera(benchmark, geometry, camera_mount, joint_station_m, held)
+    axis = None if plane_lv_rad is None else axis_of(plane_lv_rad)
+    fits: list[FrameFit] = []
+    start = np.zeros(2)
+    for picture in frames:
+        if progress is not None and len(fits) % 10 == 0:
+            progress(min(len(fits) / len(times), 1.0), f"frame {len(fits) + 1} of {len(times)}")
+        fits.append(oriented.fit(read_frame(picture), axis, start))
         start = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad
+    if len(fits) != len(times):
+        raise GateError(f"{len(times)} frame times for {len(fits)} frames")
     return _history(times, fits, oriented, times[nearest], plane_lv_rad, plane_sd_rad)
+
+
+def benchmark_index(times_s: FloatArray, benchmark_time_s: float) -> int:
+    """Index of the frame nearest to the benchmark time; refused where there is none within 2 s."""
+    if len(times_s) == 0:
+        raise GateError("no frames")
+    nearest = int(np.argmin(np.abs(times_s - benchmark_time_s)))
+    if abs(times_s[nearest] - benchmark_time_s) > 2.0:
+        raise GateError(f"no frame within 2 s of the benchmark time {benchmark_time_s} s; frames span "
+                        f"{times_s[0]:.2f} to {times_s[-1]:.2f} s")  # fmt: skip
+    return nearest
 
 
 def read_frame(picture: Image | str | Path) -> Image:
@@ -326,15 +137,26 @@ def _history(
         if plane_lv_rad is None:
             theta[k], plane[k], covariance[k] = polar(fit.rotation_yz_rad, fit.covariance)
         else:
-            theta[k], plane[k] = fit.rotation_yz_rad @ _axis(plane_lv_rad), plane_lv_rad
+            theta[k] = fit.rotation_yz_rad @ axis_of(plane_lv_rad)
             s, sd2 = fit.plane_leak, plane_sd_rad**2
             off = theta[k] ** 2 * (s**2 * sd2 + 3.0 * (0.5 + s**2) ** 2 * sd2**2)
             cross = -theta[k] * s * sd2
             covariance[k] = [[fit.covariance[0, 0] + off, cross], [cross, sd2]]
     if plane_lv_rad is not None:
         plane[:] = plane_lv_rad
+    words = _words(times, fits, oriented, benchmark_s, plane_lv_rad, plane_sd_rad)
+    return DeflectionHistory(times, theta, plane, covariance, "camera", words)
+
+
+def _words(
+    times: FloatArray, fits: list[FrameFit], oriented: OrientedCamera, benchmark_s: float,
+    plane_lv_rad: float | None, plane_sd_rad: float,
+) -> str:  # fmt: skip
+    seen = [fit for fit in fits if not fit.refused]
+    edge = np.median([len(fit.horizon.points_px) for fit in seen]) / len(oriented.lines.origin_px) if seen else 0.0
+    marks = float(np.median([fit.marks for fit in seen])) if seen else 0.0
     how = (
-        "plane found from the edge's tilt"
+        "plane found in every frame"
         if plane_lv_rad is None
         else f"plane assumed at {np.rad2deg(plane_lv_rad):.0f} +/- {np.rad2deg(plane_sd_rad):.0f} deg LV"
     )
@@ -342,13 +164,15 @@ def _history(
         f"{how}; joint {oriented.view.joint_station_m:.3f} m aft of the nose",
         f"camera oriented on the frame at {benchmark_s:.3f} s, taken as not bent within "
         f"{np.rad2deg(oriented.held.benchmark_rad):.2f} deg (rms {oriented.residual_rms_px:.2f} px)",
-        "the shell is rigid but for its joint",
-    ]
+        f"from {100.0 * edge:.0f} % of the edge"
+        + (f" and {marks:.0f} rows of seams and dots" if marks >= 1.0 else "; no seam and no dot could be used, which "
+           "leaves flattening and ovality of the shell in the error bar"),
+    ]  # fmt: skip
     refused = [(t, fit.refused) for t, fit in zip(times, fits, strict=True) if fit.refused]
     if refused:
         listed = ", ".join(f"{t:.3f} s: {reason}" for t, reason in refused[:5])
         words.append(f"{len(refused)} of {len(times)} frames refused ({listed}{', ...' if len(refused) > 5 else ''})")
-    return DeflectionHistory(times, theta, plane, covariance, "camera", "; ".join(words))
+    return "; ".join(words)
 
 
 def polar(rotation_yz_rad: FloatArray, covariance: FloatArray) -> tuple[float, float, FloatArray]:
@@ -378,10 +202,11 @@ def sensitivity_table(
         Rad; NaN where the frame was refused. For the paper's table: planes 153, 183, 200 deg; joint at the nose (0 m)
         and at the midpoint of the innermost torus (0.20 m).
     """
-    oriented = orient_camera(benchmark, geometry, camera_mount, float(joint_stations_m[0]))
+    # the joint is assumed here, not uncertain
+    held = HeldFixed(joint_station_m=1e-4)
+    oriented = orient_camera(benchmark, geometry, camera_mount, float(joint_stations_m[0]), held)
     rows = []
     for station in joint_stations_m:
         here = replace(oriented, view=replace(oriented.view, joint_station_m=float(station)))
-        fits = [(here.fit(deflected, float(p)), float(p)) for p in planes_lv_rad]
-        rows.append([float(fit.rotation_yz_rad @ _axis(p)) for fit, p in fits])
+        rows.append([float(here.fit(deflected, axis_of(p)).rotation_yz_rad @ axis_of(p)) for p in planes_lv_rad])
     return np.array(rows)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from estimators.camera_deflection import OrientedCamera
+    from estimators.camera_fit import OrientedCamera
 
 
 def figure_camera_overlay(
@@ -37,16 +37,15 @@ def figure_camera_overlay(
     from matplotlib.figure import Figure
 
     from estimators.horizon import find_horizon
+    from estimators.overlay import Overlay, horizon_row
 
     figure = Figure(figsize=(6.0 * len(frames), 4.4), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(frames)))
-    view = oriented.view
+    view, overlay = oriented.view, Overlay(oriented.view)
     for k, axis in enumerate(axes):
         theta, plane = float(theta_rad[k]), float(plane_lv_rad[k])
-        axis.imshow(view.overlay(np.asarray(frames[k]), theta, plane), interpolation="nearest")
-        edge = view.edge_of(theta, plane).pixels
-        row = float(edge[view.camera.is_inside(edge), 1].min())
-        axis.axhline(row, color="yellow", linestyle="--", linewidth=1.0)
+        axis.imshow(overlay.blended(np.asarray(frames[k]), theta, plane), interpolation="nearest")
+        axis.axhline(horizon_row(view, theta, plane), color="yellow", linestyle="--", linewidth=1.0)
         found = find_horizon(np.asarray(frames[k]), oriented.lines, view.camera.size_px)
         if found.is_usable:
             axis.axhline(found.lowest_row_px, color="yellow", linewidth=1.4)

@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from flightmodel.checks import FloatArray
+from estimators import _edge_kernels
+from flightmodel.checks import BoolArray, FloatArray
 
 Image = NDArray[np.uint8]
 
@@ -35,6 +36,7 @@ EDGE_HALF = 7
 LEAST_CONTRAST = 8.0
 LEAST_SHARE = 0.4
 SD_FLOOR_PX = 0.05
+GREY_UNIT = 1.0 / 16.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,8 @@ class HorizonLine:
         Unit vectors from sky to shell, along which the points were located.
     sd_px : (n,) float
         Standard deviation of each point along ``inward_px``.
+    line : (n,) int
+        Index of the scan line that each point was found on.
     refused : str
         Why the frame cannot be used; empty when it can.
     """
@@ -76,6 +80,7 @@ class HorizonLine:
     points_px: FloatArray
     inward_px: FloatArray
     sd_px: FloatArray
+    line: NDArray[np.intp]
     refused: str = ""
 
     @property
@@ -96,7 +101,7 @@ class HorizonLine:
 
 
 def _refuse(reason: str) -> HorizonLine:
-    return HorizonLine(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), reason)
+    return HorizonLine(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.intp), reason)
 
 
 def fault_of_frame(image: Image, size_px: tuple[int, int]) -> str:
@@ -133,88 +138,56 @@ def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> Ho
     fault = fault_of_frame(image, size_px)
     if fault:
         return _refuse(fault)
-    along = np.arange(-lines.outer_px, lines.inner_px, STEP_PX)
-    at = lines.origin_px[:, None, :] + along[:, None] * lines.inward_px[:, None, :]
-    inside = (at >= 0.0).all(axis=-1) & (at[..., 0] <= size_px[0] - 1) & (at[..., 1] <= size_px[1] - 1)
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX)
-    grey = cv2.remap(smooth, at.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    place, sd, good = _first_rise(grey.astype(float), inside, along)
+    place, sd, good = lasting_rises(image, lines)
     if good.mean() < LEAST_SHARE:
         share = f"{100.0 * good.mean():.0f} % of the scan lines cross one ({100 * LEAST_SHARE:.0f} % wanted)"
         return _refuse(f"no clear edge: {share}")
     points = lines.origin_px + place[:, None] * lines.inward_px
-    return HorizonLine(points[good], lines.inward_px[good], sd[good])
+    return HorizonLine(points[good], lines.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), np.flatnonzero(good))
 
 
-def _first_rise(
-    grey: FloatArray, inside: NDArray[np.bool_], along: FloatArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Place, sd and validity of the first lasting rise on each line ``(n, m)``, sky first."""
-    n, m = grey.shape
-    rows = np.arange(n)
-    first = np.argmax(inside, axis=1)
-    # the sky: the first 6 px of each line that lie in the picture
+def lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Place along each line, px inwards from its origin, its sd without floor, and whether a clear edge is there."""
+    h, w = image.shape
+    count = round((lines.outer_px + lines.inner_px) / STEP_PX)
+    ends = np.concatenate([lines.origin_px - lines.outer_px * lines.inward_px,
+                           lines.origin_px + lines.inner_px * lines.inward_px])  # fmt: skip
+    # only the band that the lines cross is smoothed, in sixteenths of a grey level
+    low = np.clip(np.floor(ends.min(axis=0)).astype(int) - 4, 0, [w - 4, h - 4])
+    high = np.clip(np.ceil(ends.max(axis=0)).astype(int) + 5, low + 4, [w, h])
+    band = np.multiply(image[low[1] : high[1], low[0] : high[0]], np.uint16(1 / GREY_UNIT), dtype=np.uint16)
+    smooth = cv2.GaussianBlur(band, (0, 0), SMOOTHING_PX)
+    n = len(lines.origin_px)
+    grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
+    size = np.array([w, h], dtype=float)
+    corner = low.astype(float)
+    _edge_kernels.sample_lines(
+        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, size, GREY_UNIT, grey, inside
+    )
+    level, scatter, first = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
     span = int(6.0 / STEP_PX)
-    sky_at = np.minimum(first[:, None] + np.arange(span), m - 1)
-    sky = grey[rows[:, None], sky_at]
-    level = np.median(sky, axis=1)
-    noise = max(float(np.median(np.abs(np.diff(sky[:, ::6], axis=1)))) / (0.6745 * np.sqrt(2.0)), 0.3)
-    above = (grey > (level + max(6.0 * noise, 0.75 * LEAST_CONTRAST))[:, None]) & inside
-    # it must last 3 px, so that a hot pixel or a star is no edge
-    lasting = above.copy()
-    for k in range(1, int(3.0 / STEP_PX)):
-        lasting[:, :-k] &= above[:, k:]
-    rise = np.argmax(lasting, axis=1)
-    good = lasting.any(axis=1) & (rise > first + span) & (rise < m - int(8.0 / STEP_PX))
-    good &= level < np.median(level) + LEAST_CONTRAST
-    # the shell's level is read just inside the edge: first of the rise, then of the crossing so found
-    inner = rise + int(1.5 / STEP_PX)
-    for _ in range(2):
-        shell_at = np.minimum(inner[:, None] + np.arange(int(2.0 / STEP_PX), int(3.5 / STEP_PX)), m - 1)
-        shell = np.median(grey[rows[:, None], shell_at], axis=1)
-        half = 0.5 * (level + shell)
-        window = np.clip(rise[:, None] + np.arange(-int(3.0 / STEP_PX), int(5.0 / STEP_PX)), 0, m - 1)
-        values = grey[rows[:, None], window]
-        crossing = np.argmax(values > half[:, None], axis=1)
-        inner = window[rows, crossing]
-    good &= (crossing > 0) & (shell - level > LEAST_CONTRAST)
-    k = np.maximum(crossing, 1)
-    lower, upper = values[rows, k - 1], values[rows, k]
-    slope = np.maximum(upper - lower, 1e-3)
-    place = along[window[rows, k - 1]] + STEP_PX * np.clip((half - lower) / slope, 0.0, 1.0)
-    # fitting a ramp beside the step doubles the noise of a crossing: 2.4, found by repeating one scene
-    sd = np.hypot(2.4 * noise * STEP_PX / slope, SD_FLOOR_PX)
-    near = np.clip(window[rows, k][:, None] + np.arange(-EDGE_HALF, EDGE_HALF + 1), 0, m - 1)
-    place = along[window[rows, k]] + _refined(grey[rows[:, None], near] - level[:, None])
-    return place, sd, good
+    _edge_kernels.sky_levels(grey, inside, span, level, scatter, first)
+    noise = max(float(np.median(scatter)) / (0.6745 * np.sqrt(2.0)), 0.3)
+    place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
+    limits = (span, int(3.0 / STEP_PX), LEAST_CONTRAST)
+    _edge_kernels.first_rises(
+        grey, inside, level, first, noise, float(np.median(level)), limits, STEP_PX, EDGE_PLACES, EDGE_BASES,
+        place, sd, good,
+    )  # fmt: skip
+    return STEP_PX * place - lines.outer_px, sd, good
 
 
-def _refined(grey: FloatArray) -> FloatArray:
-    """Offset, px, of a blurred edge from the middle of each row of samples ``(n, 2 EDGE_HALF + 1)``, sky level off.
-
-    Every place on a grid is tried with the best step and ramp behind it; a parabola through the lowest misfits refines.
-    """
-    explained = np.stack([np.einsum("nk->n", (grey @ basis) ** 2) for basis in _EDGE_BASES], axis=1)
-    best = np.clip(np.argmax(explained, axis=1), 1, len(_EDGE_PLACES) - 2)
-    rows = np.arange(len(grey))
-    left, middle, right = (explained[rows, best + k] for k in (-1, 0, 1))
-    curve = np.maximum(2.0 * middle - left - right, 1e-9)
-    step = _EDGE_PLACES[1] - _EDGE_PLACES[0]
-    out: FloatArray = _EDGE_PLACES[best] + step * np.clip(0.5 * (right - left) / curve, -1.0, 1.0)
-    return out
-
-
-def _edge_bases() -> list[FloatArray]:
-    """Orthonormal bases ``(2 EDGE_HALF + 1, 2)`` of a blurred step and a blurred ramp for each place of the grid."""
+def _edge_bases() -> FloatArray:
+    """Orthonormal bases ``(places, 2 EDGE_HALF + 1, 2)`` of a blurred step and a blurred ramp for each place."""
     x = STEP_PX * np.arange(-EDGE_HALF, EDGE_HALF + 1)
     bases = []
-    for place in _EDGE_PLACES:
+    for place in EDGE_PLACES:
         z = (x - place) / WHOLE_BLUR_PX
         step = ndtr(z)
         ramp = z * step + np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
         bases.append(np.linalg.qr(np.column_stack([step, ramp]))[0])
-    return bases
+    return np.ascontiguousarray(bases)
 
 
-_EDGE_PLACES = np.arange(-1.5, 1.51, 0.1)
-_EDGE_BASES = _edge_bases()
+EDGE_PLACES = np.arange(-1.5, 1.51, 0.1)
+EDGE_BASES = _edge_bases()

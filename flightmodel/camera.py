@@ -9,6 +9,9 @@ from the principal point, in units of the focal length: ``u = fx a_d X/hypot(X, 
 axes are x right, y down, z forward; pixel centres lie at integers. Only points in front of the camera and inside the
 field where ``a_d`` grows with ``a`` have a pixel: OpenCV itself returns a mirrored pixel for a point behind the camera.
 
+A ``pinhole`` lens is OpenCV's other form, ``x = X/Z``, ``y = Y/Z`` with radial k1, k2, k3 and tangential p1, p2
+(coefficients in the order k1, k2, p1, p2, k3).
+
 References
 ----------
 J. Kannala, S. Brandt, "A generic camera model and calibration method for conventional, wide-angle, and fish-eye
@@ -18,7 +21,7 @@ lenses", IEEE PAMI 28(8), 2006. OpenCV, module ``cv2.fisheye``.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
@@ -32,6 +35,8 @@ if TYPE_CHECKING:
     from flightmodel.vehicle import CameraMount
 
 BoolArray = NDArray[np.bool_]
+Lens = Literal["fisheye", "pinhole"]
+LENSES: tuple[Lens, ...] = ("fisheye", "pinhole")
 
 WIDEST_HALF_ANGLE_RAD = float(np.deg2rad(89.0))
 """OpenCV projects through X/Z, so a point must lie in front of the camera."""
@@ -39,7 +44,7 @@ WIDEST_HALF_ANGLE_RAD = float(np.deg2rad(89.0))
 
 @dataclass(frozen=True)
 class Camera:
-    """A fisheye camera fixed to the centerbody.
+    """A camera fixed to the centerbody.
 
     Parameters
     ----------
@@ -47,12 +52,14 @@ class Camera:
         Size of the picture.
     focal_px, centre_px : (2,) float
         Focal lengths and principal point along u (right) and v (down), px.
-    distortion : (4,) float
-        Kannala-Brandt k1 to k4.
+    distortion : (4,) or (5,) float
+        Kannala-Brandt k1 to k4 of a fisheye; k1, k2, p1, p2 and, if there is one, k3 of a pinhole.
     position_body_m : (3,) float
         Entrance pupil from the datum, body axes, m.
     dcm_cam_body : (3, 3) float
         ``v_cam = dcm_cam_body @ v_body``.
+    lens : str
+        ``"fisheye"`` or ``"pinhole"``.
     """
 
     width_px: int
@@ -62,6 +69,7 @@ class Camera:
     distortion: FloatArray
     position_body_m: FloatArray
     dcm_cam_body: FloatArray
+    lens: Lens = "fisheye"
     half_field_rad: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -69,7 +77,7 @@ class Camera:
         shapes: dict[str, tuple[int | None, ...]] = {
             "focal_px": (2,),
             "centre_px": (2,),
-            "distortion": (4,),
+            "distortion": (4 if self.lens == "fisheye" or len(self.distortion) == 4 else 5,),
             "position_body_m": (3,),
             "dcm_cam_body": (3, 3),
         }
@@ -80,7 +88,16 @@ class Camera:
         dcm = self.dcm_cam_body
         if not np.allclose(dcm @ dcm.T, np.eye(3), atol=1e-9) or np.linalg.det(dcm) < 0.0:
             raise GateError("camera.dcm_cam_body: not a rotation matrix")
-        object.__setattr__(self, "half_field_rad", one_to_one_half_angle_rad(self.distortion))
+        object.__setattr__(self, "half_field_rad", one_to_one_half_angle_rad(self.distortion, self.lens))
+
+    @property
+    def lens_terms(self) -> tuple[int, float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """What a compiled projection wants: see `estimators._sight_kernels.project_shell`."""
+        coefficients = np.zeros(5)
+        coefficients[: len(self.distortion)] = self.distortion
+        axes = np.ascontiguousarray(self.dcm_cam_body)
+        model = LENSES.index(self.lens)
+        return model, self.half_field_rad, self.focal_px, self.centre_px, coefficients, self.position_body_m, axes
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -123,23 +140,29 @@ class Camera:
             NaN outside the field.
         per_cam_m : (n, 2, 3) float
             Derivative by the point's coordinates in camera axes, px/m (``@ dcm_cam_body`` for body axes).
-        per_lens : (n, 2, 8) float
-            Derivative by focal lengths (2), principal point (2) and k1 to k4, the last in px.
+        per_lens : (n, 2, 4 + k) float
+            Derivative by focal lengths (2), principal point (2) and the coefficients, the last in px.
         """
         points_body_m = check_shape("points_body_m", points_body_m, (None, 3))
         seen = self.is_in_field(points_body_m)
         n = len(points_body_m)
-        pixels, per_cam_m, per_lens = np.full((n, 2), np.nan), np.full((n, 2, 3), np.nan), np.full((n, 2, 8), np.nan)
+        count = len(self.distortion)
+        pixels, per_cam_m = np.full((n, 2), np.nan), np.full((n, 2, 3), np.nan)
+        per_lens = np.full((n, 2, 4 + count), np.nan)
         if seen.any():
             cam = self.cam_from_body(points_body_m[seen])
             (fx, fy), (cx, cy) = self.focal_px, self.centre_px
             matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-            out, jacobian = cv2.fisheye.projectPoints(
-                np.ascontiguousarray(cam[:, None, :]), np.zeros(3), np.zeros(3), matrix, self.distortion
-            )
+            scene, still = np.ascontiguousarray(cam[:, None, :]), np.zeros(3)
+            if self.lens == "fisheye":
+                out, jacobian = cv2.fisheye.projectPoints(scene, still, still, matrix, self.distortion)
+                jacobian = jacobian.reshape(-1, 2, 15)
+                per_lens[seen], per_cam_m[seen] = jacobian[:, :, :8], jacobian[:, :, 11:14]
+            else:
+                out, jacobian = cv2.projectPoints(scene, still, still, matrix, self.distortion)
+                jacobian = jacobian.reshape(-1, 2, 10 + count)
+                per_lens[seen], per_cam_m[seen] = jacobian[:, :, 6:], jacobian[:, :, 3:6]
             pixels[seen] = out.reshape(-1, 2)
-            jacobian = jacobian.reshape(-1, 2, 15)
-            per_lens[seen], per_cam_m[seen] = jacobian[:, :, :8], jacobian[:, :, 11:14]
         return pixels, per_cam_m, per_lens
 
     def rays_body(self, pixels: FloatArray) -> FloatArray:
@@ -148,12 +171,24 @@ class Camera:
         Inverts the lens polynomial by Newton steps, which converge everywhere inside the one-to-one field.
         """
         pixels = check_shape("pixels", pixels, (None, 2))
+        if self.lens == "pinhole":
+            return self._pinhole_rays(pixels)
         slope = (pixels - self.centre_px) / self.focal_px
         distance = np.hypot(slope[:, 0], slope[:, 1])
         angle = angle_from_lens_distance(distance, self.distortion, self.half_field_rad)
         away = np.where(distance > 1e-12, np.sin(angle) / np.where(distance > 1e-12, distance, 1.0), 1.0)
         cam = np.column_stack([slope * away[:, None], np.cos(angle)])
         out: FloatArray = cam @ self.dcm_cam_body
+        return out
+
+    def _pinhole_rays(self, pixels: FloatArray) -> FloatArray:
+        matrix = np.diag([*self.focal_px, 1.0])
+        matrix[:2, 2] = self.centre_px
+        stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
+        flat = cv2.undistortPoints(pixels[:, None, :], matrix, self.distortion, criteria=stop).reshape(-1, 2)
+        cam = np.column_stack([flat, np.ones(len(flat))])
+        cam[np.hypot(flat[:, 0], flat[:, 1]) >= np.tan(self.half_field_rad)] = np.nan
+        out: FloatArray = cam / np.linalg.norm(cam, axis=1, keepdims=True) @ self.dcm_cam_body
         return out
 
     def turned(self, rotation_cam_rad: FloatArray, focal_scale: float = 1.0) -> Camera:
@@ -186,6 +221,7 @@ def camera_from_mount(mount: CameraMount) -> Camera:
         distortion=np.array(mount.distortion),
         position_body_m=-mount.station_m * forward + mount.radius_m * outboard,
         dcm_cam_body=np.stack([np.cross(y_cam, z_cam), y_cam, z_cam]),
+        lens=mount.lens,
     )
 
 
@@ -204,10 +240,17 @@ def _lens_slope(angle_rad: FloatArray | float, distortion: FloatArray) -> FloatA
     return out
 
 
-def one_to_one_half_angle_rad(distortion: FloatArray) -> float:
-    """Largest angle from the optical axis up to which the lens polynomial grows, at most 89 deg, rad."""
+def one_to_one_half_angle_rad(distortion: FloatArray, lens: Lens = "fisheye") -> float:
+    """Largest angle from the optical axis up to which the lens spreads what it sees, at most 89 deg, rad."""
     angle = np.linspace(0.0, WIDEST_HALF_ANGLE_RAD, 2000)
-    falling = _lens_slope(angle, distortion) <= 1e-3
+    if lens == "fisheye":
+        slope = _lens_slope(angle, distortion)
+    else:
+        k1, k2 = distortion[:2]
+        k3 = distortion[4] if len(distortion) > 4 else 0.0
+        r2 = np.tan(angle) ** 2
+        slope = 1.0 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3))
+    falling = slope <= 1e-3
     return float(angle[max(int(np.argmax(falling)) - 1, 0)]) if falling.any() else WIDEST_HALF_ANGLE_RAD
 
 

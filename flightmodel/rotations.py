@@ -111,3 +111,15 @@ def skew(v: FloatArray) -> FloatArray:
     return np.stack(
         [np.stack([o, -z, y], axis=-1), np.stack([z, o, -x], axis=-1), np.stack([-y, x, o], axis=-1)], axis=-2
     )
+
+
+def left_jacobian(rotation_rad: FloatArray) -> FloatArray:
+    """Matrix ``(3, 3)`` with ``exp(w + dw) = exp(J dw) exp(w)`` to first order, for a rotation vector ``(3,)``."""
+    angle = float(np.linalg.norm(rotation_rad))
+    cross = skew(rotation_rad)
+    if angle < 1e-5:
+        return np.eye(3) + 0.5 * cross + cross @ cross / 6.0
+    out: FloatArray = (
+        np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * cross + (angle - np.sin(angle)) / angle**3 * cross @ cross
+    )
+    return out

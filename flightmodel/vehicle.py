@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -167,8 +167,24 @@ class SensorMount(Section):
         return dcm_body_from_clocking(np.deg2rad(self.x_axis_lv_deg), np.deg2rad(self.y_axis_lv_deg))
 
 
+class CameraUncertainty(Section):
+    """How well a camera is known before the flight: one standard deviation of each.
+
+    The defaults are those of a lens from a catalogue in a mount from a drawing. A calibrated lens has smaller ones; for
+    a lens that nobody calibrated ``focal = 0.2``, ``centre_px = 15``, ``k1 = 0.05``, ``k2 = 0.03`` let the benchmark
+    frame tell.
+    """
+
+    pointing_deg: ErrorAngle = 3.0
+    focal: Fraction = 0.05
+    centre_px: Annotated[float, Field(ge=0.0, le=1e4)] = 1.5
+    k1: Annotated[float, Field(ge=0.0, le=1.0)] = 0.004
+    k2: Annotated[float, Field(ge=0.0, le=1.0)] = 0.001
+    position_m: Metres = 0.003
+
+
 class CameraMount(Section):
-    """A camera on the centerbody, its nominal pointing and its Kannala-Brandt lens."""
+    """A camera on the centerbody, its nominal pointing and its lens, OpenCV's fisheye (Kannala-Brandt) or pinhole."""
 
     clock_lv_deg: Angle
     station_m: Place
@@ -178,7 +194,18 @@ class CameraMount(Section):
     height_px: Annotated[int, Field(ge=16, le=8192)]
     focal_px: tuple[Focal, Focal]
     centre_px: tuple[Pixels, Pixels]
-    distortion: tuple[Distortion, Distortion, Distortion, Distortion]
+    lens: Literal["fisheye", "pinhole"] = "fisheye"
+    distortion: tuple[Distortion, ...]
+    uncertainty: CameraUncertainty = CameraUncertainty()
+
+    @model_validator(mode="after")
+    def _all_coefficients(self) -> CameraMount:
+        count, lens = len(self.distortion), self.lens
+        wanted = "k1, k2, k3, k4" if lens == "fisheye" else "k1, k2, p1, p2 or k1, k2, p1, p2, k3"
+        if count != 4 and not (lens == "pinhole" and count == 5):
+            words = f"the coefficients of a {lens} lens, {wanted}, are wanted; write 0 for those that it has not"
+            raise KeyFaults([("distortion", list(self.distortion), words)])
+        return self
 
 
 class _VehicleFile(Section):

@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from estimators.camera_deflection import OrientedCamera, orient_camera, read_frame
+from estimators.benchmark import orient_camera
+from estimators.camera_deflection import read_frame
+from estimators.camera_fit import OrientedCamera
 from estimators.figures import figure_camera_overlay
+from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
@@ -19,7 +22,6 @@ from postflight.preflight import rigid_bounds
 from postflight.product import figures as product_figures
 
 Report = Callable[[float, str], None]
-YELLOW, GREY = (255, 230, 0), (170, 170, 170)
 
 
 def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> None:
@@ -90,15 +92,16 @@ def summary_figure(
     largest = int(np.nanargmax(history.theta_rad))
     plane = float(history.plane_lv_rad[largest])
     shown = ((benchmark, 0.0), (largest, float(history.theta_rad[largest])))
-    pictures = [oriented.view.overlay(read_frame(video.paths[k]), theta, plane) for k, theta in shown]
+    overlay = Overlay(oriented.view)
+    pictures = [overlay.blended(read_frame(video.paths[k]), theta, plane) for k, theta in shown]
     # the benchmark's horizon in both, so that the eye sees how far the edge moved; its own in the second
-    rows = [horizon_row(oriented, theta, plane) for _, theta in shown]
+    rows = [horizon_row(oriented.view, theta, plane) for _, theta in shown]
     for picture, row, colour in (
         (pictures[0], rows[0], YELLOW),
         (pictures[1], rows[0], GREY),
         (pictures[1], rows[1], YELLOW),
     ):
-        picture[max(row - 1, 0) : row + 1] = colour
+        draw_row(picture, row, colour)
     between = np.full((len(pictures[0]), 12, 3), 255, dtype=np.uint8)
     strip = np.concatenate([pictures[0], between, pictures[1]], axis=1)
     bent = np.rad2deg(shown[1][1])
@@ -107,9 +110,3 @@ def summary_figure(
         "the virtual camera over the right half of each, its horizon in yellow, the benchmark's in grey"
     )
     return figures.figure_summary(flight, answers, truth, (strip, words))
-
-
-def horizon_row(oriented: OrientedCamera, theta_rad: float, plane_lv_rad: float) -> int:
-    """Return the smallest row of the virtual camera's shell edge, px (seed paper Figure 2.3)."""
-    edge = oriented.view.edge_of(theta_rad, plane_lv_rad).pixels
-    return round(float(edge[oriented.view.camera.is_inside(edge), 1].min()))

@@ -1,0 +1,164 @@
+"""Compiled search for the shell's edge and for dark marks on it. Readable twin: `tests.estimators.plain_horizon`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flightmodel._kernels import inlined, kernel
+
+
+@inlined
+def grey_at(image, u, v):
+    """Grey level between pixels, bilinear; the border's beyond the picture."""
+    h, w = image.shape
+    u, v = min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001)
+    j, i = int(u), int(v)
+    a, b = u - j, v - i
+    upper = (1.0 - a) * image[i, j] + a * image[i, j + 1]
+    return (1.0 - b) * upper + b * ((1.0 - a) * image[i + 1, j] + a * image[i + 1, j + 1])
+
+
+@kernel
+def sample_lines(image, origin, inward, first, step, corner, size, per_unit, grey, inside):
+    """Grey levels ``(n, m)`` along lines, of a piece of the picture whose upper left pixel is ``corner``."""
+    n, m = grey.shape
+    for i in range(n):
+        for k in range(m):
+            along = first + k * step
+            u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
+            inside[i, k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
+            grey[i, k] = per_unit * grey_at(image, u - corner[0], v - corner[1])
+
+
+@inlined
+def median_of(values, count):
+    """Median of the first values, which are sorted in place (insertion: they are few)."""
+    for i in range(1, count):
+        key = values[i]
+        j = i - 1
+        while j >= 0 and values[j] > key:
+            values[j + 1] = values[j]
+            j -= 1
+        values[j + 1] = key
+    half = count // 2
+    return values[half] if count % 2 else 0.5 * (values[half - 1] + values[half])
+
+
+@kernel
+def sky_levels(grey, inside, span, level, scatter, first):
+    """Level and one difference over ``span / 2`` samples of each line's outer end, and where that end begins."""
+    n, m = grey.shape
+    few = np.empty(span)
+    for i in range(n):
+        k = 0
+        while k < m and not inside[i, k]:
+            k += 1
+        first[i] = 0 if k == m else k
+        for j in range(span):
+            few[j] = grey[i, min(first[i] + j, m - 1)]
+        scatter[i] = abs(few[span // 2] - few[0])
+        level[i] = median_of(few, span)
+
+
+@kernel
+def first_rises(grey, inside, level, first, noise, common, limits, step, places, bases, place, sd, good):
+    """Place along each line, its sd, and whether there is a lasting rise; see `estimators.horizon`.
+
+    ``limits``: span of the sky, samples a rise must last, least contrast.
+    """
+    n, m = grey.shape
+    span, lasting, contrast = limits
+    half_bases = bases.shape[1] // 2
+    few = np.empty(8)
+    explained = np.empty(len(places))
+    for i in range(n):
+        good[i] = False
+        threshold = level[i] + max(6.0 * noise, 0.75 * contrast)
+        rise, run = -1, 0
+        for k in range(m):
+            if inside[i, k] and grey[i, k] > threshold:
+                run += 1
+                if run == lasting:
+                    rise = k - lasting + 1
+                    break
+            else:
+                run = 0
+        if rise <= first[i] + span or rise >= m - int(8.0 / step) or level[i] >= common + contrast:
+            continue
+        # the shell's level is read just inside the edge: first of the rise, then of the crossing so found
+        inner, crossing, shell, half = rise + int(1.5 / step), -1, 0.0, 0.0
+        for _ in range(2):
+            count = int(3.5 / step) - int(2.0 / step)
+            for j in range(count):
+                few[j] = grey[i, min(inner + int(2.0 / step) + j, m - 1)]
+            shell = median_of(few, count)
+            half = 0.5 * (level[i] + shell)
+            crossing = -1
+            for k in range(max(rise - int(3.0 / step), 0), min(rise + int(5.0 / step), m)):
+                if grey[i, k] > half:
+                    crossing = k
+                    break
+            inner = max(crossing, 0)
+        if crossing <= max(rise - int(3.0 / step), 0) or shell - level[i] <= contrast:
+            continue
+        slope = max(grey[i, crossing] - grey[i, crossing - 1], 1e-3)
+        for b in range(len(places)):
+            step_share, ramp_share = 0.0, 0.0
+            for k in range(bases.shape[1]):
+                value = grey[i, min(max(crossing + k - half_bases, 0), m - 1)] - level[i]
+                step_share += value * bases[b, k, 0]
+                ramp_share += value * bases[b, k, 1]
+            explained[b] = step_share * step_share + ramp_share * ramp_share
+        best = min(max(int(np.argmax(explained)), 1), len(places) - 2)
+        curve = max(2.0 * explained[best] - explained[best - 1] - explained[best + 1], 1e-9)
+        shift = min(max(0.5 * (explained[best + 1] - explained[best - 1]) / curve, -1.0), 1.0)
+        place[i] = crossing + (places[best] + (places[1] - places[0]) * shift) / step
+        # fitting a ramp beside the step doubles the noise of a crossing: 2.4, found by repeating one scene
+        sd[i] = 2.4 * noise * step / slope
+        good[i] = True
+
+
+@kernel
+def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
+    """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
+
+    A profile is the mean of three lines a pixel apart; the dip under the line between its ends has its centroid where
+    the mark is. ``sd`` is infinite where no dip stands out of the noise, or where it is cut off by the window.
+    """
+    m = 2 * reach + 1
+    dip = np.empty(m)
+    h, w = image.shape
+    for i in range(len(origin)):
+        sd[i] = np.inf
+        du, dv = across[i]
+        centre = 0.0
+        for _ in range(2):
+            u0, v0 = origin[i, 0] + centre * du, origin[i, 1] + centre * dv
+            if u0 < reach + 2 or v0 < reach + 2 or u0 > w - reach - 3 or v0 > h - reach - 3:
+                sd[i] = np.inf
+                break
+            for k in range(m):
+                u, v = u0 + (k - reach) * du, v0 + (k - reach) * dv
+                dip[k] = (grey_at(image, u, v) + grey_at(image, u - dv, v + du) + grey_at(image, u + dv, v - du)) / 3.0
+            left, right = 0.5 * (dip[0] + dip[1]), 0.5 * (dip[m - 1] + dip[m - 2])
+            deepest = 0
+            for k in range(m):
+                dip[k] = left + (right - left) * k / (m - 1.0) - dip[k]
+                if dip[k] > dip[deepest]:
+                    deepest = k
+            depth = dip[deepest]
+            if depth < max(5.0 * noise, 6.0) or deepest < 2 or deepest > m - 3:
+                sd[i] = np.inf
+                break
+            total, moment = 0.0, 0.0
+            reach_in = half_widths[i]
+            for k in range(m):
+                if abs(k - deepest) <= reach_in:
+                    weight = max(dip[k] - 0.15 * depth, 0.0)
+                    total += weight
+                    moment += weight * (k - reach)
+            centre += moment / total
+            sd[i] = noise * reach_in / total * math.sqrt(2.0 * reach_in)
+        offset[i] = centre

@@ -1,0 +1,128 @@
+"""Compiled rasteriser: triangles through a lens into a picture of distances. Oracle in the tests: ray casting."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from estimators._sight_kernels import FISHEYE
+from flightmodel._kernels import inlined, kernel
+
+
+@inlined
+def pixel_of(x, y, z, lens):
+    """Pixel of a point in camera axes; see `flightmodel.camera` for the lenses."""
+    model, _, focal, centre, k, _, _ = lens
+    if model == FISHEYE:
+        r = math.sqrt(x * x + y * y)
+        a = math.atan2(r, z)
+        a2 = a * a
+        scale = a * (1.0 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3])))) / r if r > 1e-12 else 1.0 / z
+        u, v = scale * x, scale * y
+    else:
+        p, q = x / z, y / z
+        r2 = p * p + q * q
+        radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+        u = p * radial + 2.0 * k[2] * p * q + k[3] * (r2 + 2.0 * p * p)
+        v = q * radial + k[2] * (r2 + 2.0 * q * q) + 2.0 * k[3] * p * q
+    return focal[0] * u + centre[0], focal[1] * v + centre[1]
+
+
+@inlined
+def fill(ax, ay, bx, by, cx, cy, da, db, dc, face, depth, nearest):
+    """Enter one triangle at the pixel centres it covers, where it is the closest so far."""
+    h, w = depth.shape
+    area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    left, right = min(ax, bx, cx), max(ax, bx, cx)
+    top, bottom = min(ay, by, cy), max(ay, by, cy)
+    if abs(area) > 1e-9 and right >= 0.0 and bottom >= 0.0 and left <= w - 1.0 and top <= h - 1.0:
+        per = 1.0 / area
+        # barycentric coordinates are linear: start of a row, and step along it
+        step_b, step_c = (cy - ay) * per, (ay - by) * per
+        j0, j1 = math.ceil(max(left, 0.0)), math.floor(min(right, w - 1.0))
+        for i in range(math.ceil(max(top, 0.0)), math.floor(min(bottom, h - 1.0)) + 1):
+            share_b = ((j0 - ax) * (cy - ay) - (i - ay) * (cx - ax)) * per
+            share_c = ((bx - ax) * (i - ay) - (by - ay) * (j0 - ax)) * per
+            for j in range(j0, j1 + 1):
+                if share_b >= -1e-9 and share_c >= -1e-9 and share_b + share_c <= 1.0 + 1e-9:
+                    here = da + share_b * (db - da) + share_c * (dc - da)
+                    if here < depth[i, j]:
+                        depth[i, j] = here
+                        nearest[i, j] = face
+                share_b += step_b
+                share_c += step_c
+
+
+@kernel
+def raster(vertices, faces, lens, widest_cos, deepest, depth, nearest):
+    """Write into ``depth (h, w)`` and ``nearest (h, w)`` the distance and index of the closest face at pixel centres.
+
+    ``vertices (n, 3)`` in body axes; ``lens`` as in `estimators._sight_kernels.project_shell`. A face that spans more
+    than ``acos(widest_cos)`` is halved across its widest side, again and again, ``deepest`` times at the most.
+    """
+    position, axes = lens[5], lens[6]
+    field_cos = math.cos(lens[1])
+    n = len(vertices)
+    seen, pixels = np.empty((n, 4)), np.empty((n, 2))
+    for i in range(n):
+        dx, dy, dz = vertices[i, 0] - position[0], vertices[i, 1] - position[1], vertices[i, 2] - position[2]
+        for m in range(3):
+            seen[i, m] = axes[m, 0] * dx + axes[m, 1] * dy + axes[m, 2] * dz
+        seen[i, 3] = math.sqrt(dx * dx + dy * dy + dz * dz)
+        if seen[i, 2] > field_cos * seen[i, 3]:
+            pixels[i, 0], pixels[i, 1] = pixel_of(seen[i, 0], seen[i, 1], seen[i, 2], lens)
+    stack, level = np.empty((deepest + 2, 3, 3)), np.empty(deepest + 2, dtype=np.int64)
+    length, t = np.empty(3), np.empty((3, 3))
+    for f in range(len(faces)):
+        a, b, c = faces[f]
+        narrow, inside = True, 0
+        for p, q in ((a, b), (b, c), (c, a)):
+            dot = seen[p, 0] * seen[q, 0] + seen[p, 1] * seen[q, 1] + seen[p, 2] * seen[q, 2]
+            narrow = narrow and dot > widest_cos * seen[p, 3] * seen[q, 3]
+            inside += 1 if seen[p, 2] > field_cos * seen[p, 3] else 0
+        if narrow:
+            if inside == 3:
+                fill(
+                    pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1],
+                    seen[a, 3], seen[b, 3], seen[c, 3], f, depth, nearest,
+                )  # fmt: skip
+            continue
+        for m in range(3):
+            stack[0, 0, m], stack[0, 1, m], stack[0, 2, m] = seen[a, m], seen[b, m], seen[c, m]
+        level[0] = 0
+        top = 1
+        while top > 0:
+            top -= 1
+            t[:], here = stack[top], level[top]
+            # direction of the middle, and how far the corners lie from it: nothing of it may be in the field
+            mx, my, mz = t[0, 0] + t[1, 0] + t[2, 0], t[0, 1] + t[1, 1] + t[2, 1], t[0, 2] + t[1, 2] + t[2, 2]
+            mid = math.sqrt(mx * mx + my * my + mz * mz) + 1e-300
+            spread, inside = 1.0, 0
+            for m in range(3):
+                length[m] = math.sqrt(t[m, 0] ** 2 + t[m, 1] ** 2 + t[m, 2] ** 2) + 1e-300
+                spread = min(spread, (mx * t[m, 0] + my * t[m, 1] + mz * t[m, 2]) / (mid * length[m]))
+                inside += 1 if t[m, 2] > field_cos * length[m] else 0
+            if spread > 0.5 and math.acos(max(min(mz / mid, 1.0), -1.0)) - math.acos(spread) > lens[1]:
+                continue
+            widest, side = 2.0, 0
+            for m in range(3):
+                q = (m + 1) % 3
+                dot = (t[m, 0] * t[q, 0] + t[m, 1] * t[q, 1] + t[m, 2] * t[q, 2]) / (length[m] * length[q])
+                if dot < widest:
+                    widest, side = dot, m
+            if widest > widest_cos or here >= deepest:
+                if inside == 3:
+                    ax, ay = pixel_of(t[0, 0], t[0, 1], t[0, 2], lens)
+                    bx, by = pixel_of(t[1, 0], t[1, 1], t[1, 2], lens)
+                    cx, cy = pixel_of(t[2, 0], t[2, 1], t[2, 2], lens)
+                    fill(ax, ay, bx, by, cx, cy, length[0], length[1], length[2], f, depth, nearest)
+                continue
+            end = (side + 1) % 3
+            for child in range(2):
+                for m in range(3):
+                    moved = m == (end if child == 0 else side)
+                    for k in range(3):
+                        stack[top, m, k] = 0.5 * (t[side, k] + t[end, k]) if moved else t[m, k]
+                level[top] = here + 1
+                top += 1

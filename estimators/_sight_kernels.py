@@ -1,0 +1,200 @@
+"""Compiled projection of points of the bent shell with all derivatives. Readable twin: `tests.estimators.plain_sight`.
+
+Columns of a derivative are those of `estimators.virtual_camera`: bending (2), flattening, camera turn (3), focal scale,
+principal point (2), k1, k2, camera position (3), shell radius, joint station.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flightmodel._kernels import inlined, kernel
+
+FISHEYE, PINHOLE = 0, 1
+COLUMNS = 16
+
+
+@inlined
+def fisheye_sight(x, y, z, k):
+    """Normalised image point of Kannala and Brandt's lens, derivatives by x, y, z, and by k1 and k2."""
+    r2 = x * x + y * y
+    r = math.sqrt(r2)
+    a = math.atan2(r, z)
+    a2 = a * a
+    distance = a * (1.0 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))))
+    slope = 1.0 + a2 * (3.0 * k[0] + a2 * (5.0 * k[1] + a2 * (7.0 * k[2] + a2 * 9.0 * k[3])))
+    per_square = 1.0 / (r2 + z * z)
+    if r < 1e-9:
+        # on the axis the lens is a pinhole
+        return x / z, y / z, 1.0 / z, 0.0, -x / (z * z), 0.0, 1.0 / z, -y / (z * z), 0.0, 0.0, 0.0, 0.0
+    ex, ey = x / r, y / r
+    along, across = slope * z * per_square, distance / r
+    down = -slope * r * per_square
+    cross = (along - across) * ex * ey
+    a3 = a2 * a
+    return (
+        distance * ex, distance * ey,
+        along * ex * ex + across * ey * ey, cross, down * ex,
+        cross, along * ey * ey + across * ex * ex, down * ey,
+        a3 * ex, a3 * ey, a3 * a2 * ex, a3 * a2 * ey,
+    )  # fmt: skip
+
+
+@inlined
+def pinhole_sight(x, y, z, k):
+    """As `fisheye_sight`, for OpenCV's pinhole with radial k1, k2, k3 (``k[0], k[1], k[4]``) and tangential p1, p2."""
+    u, v = x / z, y / z
+    r2 = u * u + v * v
+    radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    slope = k[0] + r2 * (2.0 * k[1] + r2 * 3.0 * k[4])
+    p1, p2 = k[2], k[3]
+    du_du = radial + 2.0 * u * u * slope + 2.0 * p1 * v + 6.0 * p2 * u
+    du_dv = 2.0 * u * v * slope + 2.0 * p1 * u + 2.0 * p2 * v
+    dv_dv = radial + 2.0 * v * v * slope + 6.0 * p1 * v + 2.0 * p2 * u
+    return (
+        u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u),
+        v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v,
+        du_du / z, du_dv / z, -(du_du * u + du_dv * v) / z,
+        du_dv / z, dv_dv / z, -(du_dv * u + dv_dv * v) / z,
+        u * r2, v * r2, u * r2 * r2, v * r2 * r2,
+    )  # fmt: skip
+
+
+@inlined
+def project_points(points, bend, lens, pixels, jacobian):
+    """Pixels ``(n, 2)`` of shell points ``(n, 3)`` and their derivatives ``(n, 2, 16)``; NaN outside the lens's field.
+
+    ``bend``: rotation (3, 3), its left Jacobian's y and z columns (3, 2), joint station, flattening, and station and
+    radius of the ring about which it turns. ``lens``: model, half field, focal lengths (2), principal point (2),
+    coefficients (5), camera position (3) and camera axes (3, 3).
+    """
+    rotation, left, joint, flattening, ring_station, ring_radius = bend
+    model, half_field, focal, centre, k, position, axes = lens
+    by_body = np.empty((2, 3))
+    for i in range(len(points)):
+        px, py, pz = points[i]
+        radius = math.sqrt(py * py + pz * pz)
+        ey, ez = (py / radius, pz / radius) if radius > 0.0 else (0.0, 0.0)
+        fx, fr = -(radius - ring_radius), px + ring_station
+        ax = px + flattening * fx + joint
+        ay, az = py + flattening * fr * ey, pz + flattening * fr * ez
+        # arm from the joint, outboard and flattening directions, body axes
+        bx = rotation[0, 0] * ax + rotation[0, 1] * ay + rotation[0, 2] * az
+        by = rotation[1, 0] * ax + rotation[1, 1] * ay + rotation[1, 2] * az
+        bz = rotation[2, 0] * ax + rotation[2, 1] * ay + rotation[2, 2] * az
+        dx, dy, dz = bx - joint - position[0], by - position[1], bz - position[2]
+        x = axes[0, 0] * dx + axes[0, 1] * dy + axes[0, 2] * dz
+        y = axes[1, 0] * dx + axes[1, 1] * dy + axes[1, 2] * dz
+        z = axes[2, 0] * dx + axes[2, 1] * dy + axes[2, 2] * dz
+        if math.atan2(math.sqrt(x * x + y * y), z) >= half_field:
+            pixels[i, 0] = pixels[i, 1] = np.nan
+            jacobian[i] = 0.0
+            continue
+        if model == FISHEYE:
+            u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = fisheye_sight(x, y, z, k)
+        else:
+            u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = pinhole_sight(x, y, z, k)
+        pixels[i, 0], pixels[i, 1] = focal[0] * u + centre[0], focal[1] * v + centre[1]
+        for c in range(2):
+            f = focal[c]
+            cx, cy, cz = (ux, uy, uz) if c == 0 else (vx, vy, vz)
+            cx, cy, cz = f * cx, f * cy, f * cz
+            for m in range(3):
+                by_body[c, m] = cx * axes[0, m] + cy * axes[1, m] + cz * axes[2, m]
+            gx, gy, gz = by_body[c]
+            # g . (w x arm) = w . (arm x g)
+            tx, ty, tz = by * gz - bz * gy, bz * gx - bx * gz, bx * gy - by * gx
+            row = jacobian[i, c]
+            row[0] = tx * left[0, 0] + ty * left[1, 0] + tz * left[2, 0]
+            row[1] = tx * left[0, 1] + ty * left[1, 1] + tz * left[2, 1]
+            s0 = gx * rotation[0, 0] + gy * rotation[1, 0] + gz * rotation[2, 0]
+            s1 = gx * rotation[0, 1] + gy * rotation[1, 1] + gz * rotation[2, 1]
+            s2 = gx * rotation[0, 2] + gy * rotation[1, 2] + gz * rotation[2, 2]
+            outboard = s1 * ey + s2 * ez
+            row[2] = s0 * fx + fr * outboard
+            row[3], row[4], row[5] = y * cz - z * cy, z * cx - x * cz, x * cy - y * cx
+            row[6] = f * u if c == 0 else f * v
+            row[7], row[8] = (1.0, 0.0) if c == 0 else (0.0, 1.0)
+            row[9] = f * (uk1 if c == 0 else vk1)
+            row[10] = f * (uk2 if c == 0 else vk2)
+            row[11], row[12], row[13] = -gx, -gy, -gz
+            row[14] = outboard
+            row[15] = s0 - gx
+
+
+@inlined
+def limb_points(circle, eye, clocks, points):
+    """Outboard edge ``(n, 3)`` of a torus (station, radius, minor radius) seen from ``eye``; False inside the torus.
+
+    See `flightmodel.geometry.torus_limb`.
+    """
+    station, radius, minor = circle
+    for i in range(len(clocks)):
+        oy, oz = -math.cos(clocks[i]), math.sin(clocks[i])
+        a = radius - (oy * eye[1] + oz * eye[2])
+        b = station + eye[0]
+        reach = math.sqrt(a * a + b * b)
+        if reach <= minor:
+            return False
+        v = math.atan2(b, a) + math.acos(-minor / reach)
+        r = radius + minor * math.cos(v)
+        points[i, 0], points[i, 1], points[i, 2] = -(station + minor * math.sin(v)), r * oy, r * oz
+    return True
+
+
+@inlined
+def feet(found, vertex, jacobian, residual, rows, at):
+    """Distance of found points ``(m, 2)`` from the polyline ``vertex``, positive on its shell's side, with derivatives.
+
+    ``jacobian`` (n, 2, 16) is the vertices'; ``rows`` (m, 16) is the prediction's along the segment's normal, ``at``
+    (m,) the foot in vertices. NaN where the polyline does not reach.
+    """
+    n = len(vertex)
+    for i in range(len(found)):
+        u, v = found[i]
+        nearest, least = 0, 1e300
+        for j in range(n):
+            square = (vertex[j, 0] - u) ** 2 + (vertex[j, 1] - v) ** 2
+            if square < least:
+                nearest, least = j, square
+        # the foot lies on the segment before or after the closest vertex
+        j = min(max(nearest - 1, 0), n - 2)
+        for _ in range(2):
+            sx, sy = vertex[j + 1, 0] - vertex[j, 0], vertex[j + 1, 1] - vertex[j, 1]
+            length = sx * sx + sy * sy
+            share = ((u - vertex[j, 0]) * sx + (v - vertex[j, 1]) * sy) / length
+            if share > 1.0 and nearest < n - 1 and j != nearest:
+                j = nearest
+            else:
+                break
+        per = 1.0 / math.sqrt(length)
+        nx, ny = sy * per, -sx * per
+        residual[i] = (u - vertex[j, 0]) * nx + (v - vertex[j, 1]) * ny
+        if (share < -0.01 and j == 0) or (share > 1.01 and j == n - 2):
+            residual[i] = np.nan
+        share = min(max(share, 0.0), 1.0)
+        at[i] = j + share
+        for c in range(COLUMNS):
+            here = nx * jacobian[j, 0, c] + ny * jacobian[j, 1, c]
+            there = nx * jacobian[j + 1, 0, c] + ny * jacobian[j + 1, 1, c]
+            rows[i, c] = (1.0 - share) * here + share * there
+
+
+@kernel
+def project_shell(points, bend, lens, pixels, jacobian):
+    """`project_points` for callers in Python."""
+    project_points(points, bend, lens, pixels, jacobian)
+
+
+@kernel
+def limb(circle, eye, clocks, points):
+    """`limb_points` for callers in Python."""
+    return limb_points(circle, eye, clocks, points)
+
+
+@kernel
+def feet_on_edge(found, vertex, jacobian, residual, rows, at):
+    """`feet` for callers in Python."""
+    feet(found, vertex, jacobian, residual, rows, at)

@@ -1,0 +1,145 @@
+"""How was the camera really built in, and what does its lens really do? Told by a frame in which the shell is not bent.
+
+The camera's turn, focal scale, principal point, k1, k2 and position and the shell's radius are fitted to the edge and
+the marks of that frame, each held by what was known of it before the flight (``[cameras.*.uncertainty]``), beside the
+shell's own shape (its flattening and ovality as built) and the light at its edge. For a lens that nobody calibrated the
+prior is wide, and the frame calibrates it, as the seed paper oriented its camera on the frame at 421 s.
+
+First the edge alone is fitted, which may be far from where the nominal camera expects it; then marks are looked for
+from farther, then from nearer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimators.camera_fit import (
+    POSED,
+    HeldFixed,
+    Image,
+    OrientedCamera,
+    Seen,
+    edge_seen,
+    found_marks,
+    huber_gain,
+    joined,
+    marks_seen,
+)  # fmt: skip
+from estimators.horizon import HorizonLine, ScanLines, find_horizon
+from estimators.marks import Marks, visible_marks
+from estimators.virtual_camera import BENDING, FLATTENING, VirtualCamera
+from flightmodel.camera import camera_from_mount
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.vehicle import CameraMount, CameraUncertainty, ShellGeometry
+
+STEPS = 10
+REACHES_PX = (0, 12, 8)
+SETTLED_SD = 1e-2
+WORST_RMS_PX = 2.5
+PAINTED_M = 0.003
+BUILT_RAD = np.deg2rad(0.3)
+POSES = POSED.stop - POSED.start
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What was found in the benchmark frame from one pose of the camera."""
+
+    view: VirtualCamera
+    lines: ScanLines
+    horizon: HorizonLine
+    seen: Seen
+
+
+def orient_camera(
+    benchmark: Image,
+    geometry: ShellGeometry,
+    camera_mount: CameraMount,
+    joint_station_m: float,
+    held: HeldFixed | None = None,
+) -> OrientedCamera:
+    """Fit the camera's orientation and lens on a frame taken as not bent.
+
+    Parameters
+    ----------
+    benchmark : (h, w) uint8
+    geometry : ShellGeometry
+    camera_mount : CameraMount
+        Nominal position, pointing and lens, and how well they are known.
+    joint_station_m : float
+        Joint aft of the nose, m.
+    held : HeldFixed, optional
+
+    Raises
+    ------
+    GateError
+        When the frame cannot be used, with the reason.
+    """
+    held = held or HeldFixed()
+    nominal = VirtualCamera(geometry, camera_from_mount(camera_mount), joint_station_m)
+    prior = _prior_sd(camera_mount.uncertainty, held)
+    pose = np.zeros(POSES)
+    for reach in REACHES_PX:
+        marks = visible_marks(_posed(nominal, pose))
+        for _ in range(STEPS):
+            look = _look(_posed(nominal, pose), marks, benchmark, reach)
+            seen = look.seen
+            design = np.column_stack([seen.rows[:, POSED], seen.rows[:, FLATTENING], seen.shape])
+            gain, formal, rms = huber_gain(seen, design, np.diag(prior**-2.0), len(look.lines.origin_px))
+            before = np.concatenate([pose, np.zeros(len(prior) - POSES)])
+            step = gain @ seen.residual_px - formal @ (before / prior**2)
+            pose = pose + step[:POSES]
+            if np.abs(step[:POSES] / prior[:POSES]).max() < SETTLED_SD:
+                break
+    if rms > WORST_RMS_PX:
+        raise GateError(f"benchmark frame: the edge is not the shell's (rms {rms:.1f} px); choose another time")
+    look = _look(_posed(nominal, pose), marks, benchmark, REACHES_PX[-1])
+    per_bending = gain[:POSES] @ seen.rows[:, BENDING]
+    return OrientedCamera(
+        look.view, look.lines, marks, held, look.horizon, look.seen, pose[:8], formal[:POSES, :POSES],
+        per_bending, rms,
+    )  # fmt: skip
+
+
+def _prior_sd(known: CameraUncertainty, held: HeldFixed) -> FloatArray:
+    """Of the pose (12), the shell's flattening and ovality as built (3) and the light (3)."""
+    sd = [
+        *[np.deg2rad(known.pointing_deg)] * 3, known.focal, *[known.centre_px] * 2, known.k1, known.k2,
+        *[known.position_m] * 3, held.rim_radius_m, *[BUILT_RAD] * 3, *[held.edge_px] * 3,
+    ]  # fmt: skip
+    # what is known exactly is known to a thousandth of a pixel or so
+    return np.maximum(np.array(sd), 1e-6)
+
+
+def _posed(nominal: VirtualCamera, pose: FloatArray) -> VirtualCamera:
+    camera = nominal.camera
+    lens = camera.distortion.copy()
+    lens[:2] += pose[6:8]
+    moved = replace(
+        camera,
+        centre_px=camera.centre_px + pose[4:6],
+        distortion=lens,
+        position_body_m=camera.position_body_m + pose[8:11],
+    )
+    return replace(nominal, camera=moved.turned(pose[:3], 1.0 + pose[3]))
+
+
+def _look(view: VirtualCamera, marks: Marks, image: Image, reach_px: int) -> _Look:
+    """Find the edge and, with a reach, the marks around where they are expected."""
+    at_rest = np.zeros(3)
+    lines = view.scan_lines()
+    horizon = find_horizon(image, lines, view.camera.size_px)
+    if not horizon.is_usable:
+        raise GateError(f"benchmark frame: {horizon.refused}; choose another benchmark time")
+    seen = edge_seen(view, horizon, at_rest)
+    if reach_px:
+        found = found_marks(view, marks, image, at_rest, reach_px)
+        painted = marks_seen(view, marks, found, at_rest, len(lines.origin_px))
+        # where a mark was painted is known to millimetres
+        at = marks.points_shell_m[painted.index - len(lines.origin_px)]
+        away = np.linalg.norm(at - view.camera.position_body_m, axis=1)
+        painted = replace(painted, sd_px=np.hypot(painted.sd_px, PAINTED_M * view.camera.focal_px.mean() / away))
+        seen = joined(seen, painted)
+    return _Look(view, lines, horizon, seen.some(np.isfinite(seen.residual_px)))

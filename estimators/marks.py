@@ -1,0 +1,142 @@
+"""Where do the marks painted on the shell, gore seams and photogrammetry dots, appear in a frame?
+
+Each mark is measured along one direction in the picture: a piece of a seam across it, a dot along rows and along
+columns. The marks that a camera can see are chosen once, on the unbent shell: those that face it and that no torus and
+no part of the centerbody hides. In a frame they are looked for a few pixels around where a first fit of the edge
+expects them; a mark is taken where the grey level dips clearly below the line between the ends of its profile, and its
+place is the dip's centroid (`estimators._edge_kernels.dark_centres`).
+
+Assumed: marks darker than the cloth. Marks that are not there, or drowned in noise, give no measurement and no harm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators import _edge_kernels
+from estimators.virtual_camera import Sight, VirtualCamera
+from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.geometry import (
+    aft_profile,
+    dot_positions,
+    revolved,
+    seam_clocks_rad,
+    torus_circles,
+)  # fmt: skip
+
+Image = NDArray[np.uint8]
+
+LEAST_FACING = 0.3
+HALF_SEAM_M, HALF_DOT_M = 0.006, 0.011
+SEAM_STEP_PX = 10.0
+SD_FLOOR_PX = 0.05
+BORDER_PX = 12.0
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Marks that a camera can see, one row a direction in which one is measured.
+
+    Parameters
+    ----------
+    points_shell_m : (n, 3) float
+        On the unbent shell, from the datum.
+    across_px : (n, 2) float
+        Unit vectors in the picture.
+    half_width_px : (n,) int
+        How far from its middle a mark is dark, blur included.
+    is_dot : (n,) bool
+    """
+
+    points_shell_m: FloatArray
+    across_px: FloatArray
+    half_width_px: NDArray[np.int64]
+    is_dot: BoolArray
+
+    def find(self, image: Image, expected_px: FloatArray, reach_px: int, noise: float) -> tuple[FloatArray, FloatArray]:
+        """Distance ``(n,)`` of each mark from where it is expected ``(n, 2)``, along its direction, and its sd, px.
+
+        The sd is infinite where there is none within ``reach_px``.
+        """
+        offset, sd = np.zeros(len(expected_px)), np.full(len(expected_px), np.inf)
+        _edge_kernels.dark_centres(image, expected_px, self.across_px, reach_px, self.half_width_px, noise, offset, sd)
+        return offset, np.hypot(sd, SD_FLOOR_PX)
+
+
+def visible_marks(view: VirtualCamera) -> Marks:
+    """Choose the marks on the unbent shell that a camera sees well inside its picture."""
+    rows: list[tuple[FloatArray, FloatArray, FloatArray, bool]] = []
+    geometry, focal = view.geometry, float(view.camera.focal_px.mean())
+    profile = aft_profile(geometry)
+    for clock in seam_clocks_rad(geometry):
+        curve = revolved(profile, clock)
+        seen = _seen(view, curve, _aft_normals(profile, clock))
+        pixels = view.sight(curve, np.zeros(3)).pixels
+        pieces = _spaced(pixels, seen, SEAM_STEP_PX)
+        tangent = np.gradient(pixels, axis=0)[pieces]
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        rows.append(
+            (curve[pieces], np.column_stack([-tangent[:, 1], tangent[:, 0]]), _away(view, curve[pieces]), False)
+        )
+    dots = dot_positions(geometry)
+    # at its crest a torus faces along the cone's aft normal
+    half = np.deg2rad(geometry.half_angle_deg)
+    outboard = dots * np.array([0.0, 1.0, 1.0])
+    outboard /= np.linalg.norm(outboard, axis=1, keepdims=True)
+    normals = -np.cos(half) * outboard - np.sin(half) * np.array([1.0, 0.0, 0.0])
+    dots = dots[_seen(view, dots, normals)]
+    for axis in np.eye(2):
+        rows.append((dots, np.tile(axis, (len(dots), 1)), _away(view, dots), True))
+    points = np.concatenate([r[0] for r in rows])
+    across = np.concatenate([r[1] for r in rows])
+    is_dot = np.concatenate([np.full(len(r[0]), r[3]) for r in rows])
+    size_m = np.where(is_dot, HALF_DOT_M, HALF_SEAM_M)
+    half_width = np.ceil(focal * size_m / np.concatenate([r[2] for r in rows]) + 2.0).astype(np.int64)
+    return Marks(points, across, half_width, is_dot)
+
+
+def _away(view: VirtualCamera, points: FloatArray) -> FloatArray:
+    out: FloatArray = np.linalg.norm(points - view.camera.position_body_m, axis=1)
+    return out
+
+
+def _aft_normals(profile: FloatArray, clock_lv_rad: float) -> FloatArray:
+    """Outward normals ``(m, 3)`` of the aft side along a meridian ``(m, 2)`` of station and radius."""
+    along = np.gradient(profile, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    # outwards along the meridian, the free side lies to the left: aft of it
+    turned = np.column_stack([along[:, 1], -along[:, 0]])
+    return revolved(turned, clock_lv_rad)
+
+
+def _spaced(pixels: FloatArray, seen: BoolArray, step_px: float) -> NDArray[np.intp]:
+    """Indices of seen points at least ``step_px`` apart along a curve."""
+    chosen: list[int] = []
+    for k in np.flatnonzero(seen):
+        if not chosen or np.hypot(*(pixels[k] - pixels[chosen[-1]])) >= step_px:
+            chosen.append(int(k))
+    return np.array(chosen, dtype=np.intp)
+
+
+def _seen(view: VirtualCamera, points: FloatArray, normals: FloatArray) -> BoolArray:
+    """Whether points ``(n, 3)`` of the unbent shell with outward normals face the camera, unhidden, in the picture."""
+    eye = view.camera.position_body_m
+    sight: Sight = view.sight(points, np.zeros(3))
+    inside = np.isfinite(sight.pixels[:, 0]) & view.camera.is_inside(np.nan_to_num(sight.pixels, nan=-1e6), BORDER_PX)
+    towards = eye - points
+    distance = np.linalg.norm(towards, axis=1)
+    facing = np.einsum("ni,ni->n", normals, towards) / distance > LEAST_FACING
+    share = np.linspace(0.04, 0.97, 80)[:, None, None]
+    way = points + share * towards
+    station, radius = torus_circles(view.geometry)
+    s, r = -way[..., 0], np.hypot(way[..., 1], way[..., 2])
+    clear = np.ones(len(points), dtype=np.bool_)
+    for s_i, r_i in zip(station, radius, strict=True):
+        clear &= (np.hypot(s - s_i, r - r_i) > view.geometry.torus_minor_radius_m).all(axis=0)
+    # the lens may sit on the skin itself
+    skin = min(view.geometry.centerbody_radius_m, float(np.hypot(eye[1], eye[2])) - 1e-3)
+    clear &= (r > skin).all(axis=0)
+    return np.asarray(inside & facing & clear)
