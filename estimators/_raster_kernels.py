@@ -9,6 +9,8 @@ import numpy as np
 from estimators._sight_kernels import FISHEYE
 from flightmodel._kernels import inlined, kernel
 
+BORDER_COS = math.cos(math.radians(0.5))
+
 
 @inlined
 def pixel_of(x, y, z, lens):
@@ -81,7 +83,7 @@ def raster(vertices, faces, lens, widest_cos, deepest, depth, nearest):
             dot = seen[p, 0] * seen[q, 0] + seen[p, 1] * seen[q, 1] + seen[p, 2] * seen[q, 2]
             narrow = narrow and dot > widest_cos * seen[p, 3] * seen[q, 3]
             inside += 1 if seen[p, 2] > field_cos * seen[p, 3] else 0
-        if narrow:
+        if narrow and (inside == 0 or inside == 3):
             if inside == 3:
                 fill(
                     pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1],
@@ -111,7 +113,9 @@ def raster(vertices, faces, lens, widest_cos, deepest, depth, nearest):
                 dot = (t[m, 0] * t[q, 0] + t[m, 1] * t[q, 1] + t[m, 2] * t[q, 2]) / (length[m] * length[q])
                 if dot < widest:
                     widest, side = dot, m
-            if widest > widest_cos or here >= deepest:
+            # across the border of the field it is halved on to a pixel or so, so that the border is kept to
+            limit = widest_cos if inside == 0 or inside == 3 else BORDER_COS
+            if here >= deepest or widest > limit:
                 if inside == 3:
                     ax, ay = pixel_of(t[0, 0], t[0, 1], t[0, 2], lens)
                     bx, by = pixel_of(t[1, 0], t[1, 1], t[1, 2], lens)

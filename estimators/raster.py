@@ -20,8 +20,8 @@ from estimators import _raster_kernels
 from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray
 
-WIDEST_RAD = float(np.deg2rad(9.0))
-DEEPEST_SPLIT = 14
+WIDEST_RAD = float(np.deg2rad(5.0))
+DEEPEST_SPLIT = 20
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def test_the_picture_is_that_of_ray_casting(lens):
     assert (theirs & ours).sum() / (theirs | ours).sum() > 0.999
     both = theirs & ours
     off = np.abs(depth[both] - picture.depth_m[both]) / depth[both]
-    # straight edges and linear distances over up to nine degrees; a thousandth of the pixels lies at a step of depth
+    # straight edges and linear distances over up to five degrees; a thousandth of the pixels lies at a step of depth
     assert np.quantile(off, 0.5) < 2e-3
     assert np.quantile(off, 0.99) < 0.02
 
