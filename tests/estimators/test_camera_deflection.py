@@ -279,7 +279,8 @@ def test_gates_name_what_is_wrong():
 
 def test_found_points_carry_the_sd_their_noise_gives_them():
     """One scene, many noises: scatter of each point against its stated sd, pooled chi-square."""
-    from synthetic_flight.video import Imaging, ShellRenderer, record
+    from synthetic_flight.shell_renderer import ShellRenderer
+    from synthetic_flight.video import Imaging, record
 
     camera = camera_from_mount(MOUNT)
     view = VirtualCamera(GEOMETRY, camera, JOINT_M)

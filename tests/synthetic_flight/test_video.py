@@ -15,7 +15,8 @@ from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
 from flightmodel.geometry import bend, vehicle_meshes
 from flightmodel.vehicle import CameraMount, ShellGeometry
-from synthetic_flight.video import Imaging, ShellRenderer, real_camera, record, render_video
+from synthetic_flight.shell_renderer import ShellRenderer
+from synthetic_flight.video import Imaging, real_camera, record, render_video
 
 TABLES = tomllib.loads((Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml").read_text())
 GEOMETRY = ShellGeometry.model_validate(TABLES["geometry"])
@@ -47,7 +48,7 @@ def test_ray_cast_edge_equals_the_projected_limb(off_camera, theta_deg, plane_de
                    Imaging(noise_sd=0.0), np.random.default_rng(0))  # fmt: skip
     view = VirtualCamera(GEOMETRY, camera, JOINT_M)
     found = find_horizon(frame, view.scan_lines(), camera.size_px)
-    residual, _ = view.mismatch(found, view.edge_of(D(theta_deg), D(plane_deg)))
+    residual, _, _ = view.mismatch(found, view.edge_of(D(theta_deg), D(plane_deg)))
     assert found.is_usable
     assert np.isfinite(residual).mean() > 0.9
     # shading that changes within the 1.1 px blur moves the half-level crossing by a share of it; unshaded it is 0.02
@@ -61,7 +62,9 @@ def test_without_shading_the_two_edges_agree_to_hundredths_of_a_pixel(off_camera
     frame = record(renderer.radiance(D(3.7), D(191.0), sun(0.0)), np.ones_like(renderer.vignetting),
                    Imaging(noise_sd=0.0), np.random.default_rng(0))  # fmt: skip
     view = VirtualCamera(GEOMETRY, camera, JOINT_M)
-    residual, _ = view.mismatch(find_horizon(frame, view.scan_lines(), camera.size_px), view.edge_of(D(3.7), D(191.0)))
+    residual, _, _ = view.mismatch(
+        find_horizon(frame, view.scan_lines(), camera.size_px), view.edge_of(D(3.7), D(191.0))
+    )
     # one grey level of 178 is 0.015 px; a pixel's box coverage at a slant adds a few hundredths
     assert abs(np.nanmean(residual)) < 0.03
     assert np.nanstd(residual) < 0.06
