@@ -121,6 +121,52 @@ def first_rises(grey, inside, level, first, noise, common, limits, step, places,
 
 
 @kernel
+def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
+    """Place of the step, up or down, on short lines across an expected edge; see `estimators.horizon`."""
+    n, m = grey.shape
+    level_of = 6
+    few, explained = np.empty(level_of), np.empty(len(places))
+    for i in range(n):
+        good[i] = False
+        whole = True
+        for k in range(m):
+            whole = whole and inside[i, k]
+        if not whole:
+            continue
+        for k in range(level_of):
+            few[k] = grey[i, k]
+        level = median_of(few, level_of)
+        total = 0.0
+        for k in range(m):
+            total += (grey[i, k] - level) ** 2
+        for b in range(len(places)):
+            step_share, ramp_share = 0.0, 0.0
+            for k in range(m):
+                value = grey[i, k] - level
+                step_share += value * bases[b, k, 0]
+                ramp_share += value * bases[b, k, 1]
+            explained[b] = step_share * step_share + ramp_share * ramp_share
+        best = int(np.argmax(explained))
+        if best == 0 or best == len(places) - 1:
+            continue
+        curve = max(2.0 * explained[best] - explained[best - 1] - explained[best + 1], 1e-9)
+        shift = min(max(0.5 * (explained[best + 1] - explained[best - 1]) / curve, -1.0), 1.0)
+        # the first column of a basis is the step's: its share over the shell's length is the step
+        behind, count = 0.0, 0
+        for k in range(m):
+            if bases[best, k, 0] > 0.5 * bases[best, m - 1, 0]:
+                behind += grey[i, k] - level
+                count += 1
+        height = abs(behind / max(count, 1))
+        left_over = math.sqrt(max(total - explained[best], 0.0) / m)
+        if height > contrast and left_over < 2.0 * noise + 0.15 * height:
+            place[i] = places[best] + (places[1] - places[0]) * shift
+            # as for a crossing found by itself: 2.4 noises over the slope of a blurred step
+            sd[i] = 7.6 * noise / height
+            good[i] = True
+
+
+@kernel
 def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
     """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
 

@@ -27,7 +27,7 @@ from estimators.camera_fit import (
     joined,
     marks_seen,
 )  # fmt: skip
-from estimators.horizon import HorizonLine, ScanLines, find_horizon
+from estimators.horizon import HorizonLine, ScanLines, find_horizon, steps_near
 from estimators.marks import Marks, visible_marks
 from estimators.virtual_camera import BENDING, FLATTENING, VirtualCamera
 from flightmodel.camera import camera_from_mount
@@ -51,6 +51,7 @@ class _Look:
     lines: ScanLines
     horizon: HorizonLine
     seen: Seen
+    clocks_rad: FloatArray
 
 
 def orient_camera(
@@ -87,7 +88,7 @@ def orient_camera(
             look = _look(_posed(nominal, pose), marks, benchmark, reach)
             seen = look.seen
             design = np.column_stack([seen.rows[:, POSED], seen.rows[:, FLATTENING], seen.shape])
-            gain, formal, rms = huber_gain(seen, design, np.diag(prior**-2.0), len(look.lines.origin_px))
+            gain, formal, rms = huber_gain(seen, design, np.diag(prior**-2.0), len(look.clocks_rad))
             before = np.concatenate([pose, np.zeros(len(prior) - POSES)])
             step = gain @ seen.residual_px - formal @ (before / prior**2)
             pose = pose + step[:POSES]
@@ -98,7 +99,7 @@ def orient_camera(
     look = _look(_posed(nominal, pose), marks, benchmark, REACHES_PX[-1])
     per_bending = gain[:POSES] @ seen.rows[:, BENDING]
     return OrientedCamera(
-        look.view, look.lines, marks, held, look.horizon, look.seen, pose[:8], formal[:POSES, :POSES],
+        look.view, look.clocks_rad, look.lines, marks, held, look.horizon, look.seen, pose[:8], formal[:POSES, :POSES],
         per_bending, rms,
     )  # fmt: skip
 
@@ -129,17 +130,20 @@ def _posed(nominal: VirtualCamera, pose: FloatArray) -> VirtualCamera:
 def _look(view: VirtualCamera, marks: Marks, image: Image, reach_px: int) -> _Look:
     """Find the edge and, with a reach, the marks around where they are expected."""
     at_rest = np.zeros(3)
-    lines = view.scan_lines()
+    clocks = view.edge_clocks()
+    lines = view.lines_at(clocks, at_rest)
     horizon = find_horizon(image, lines, view.camera.size_px)
     if not horizon.is_usable:
         raise GateError(f"benchmark frame: {horizon.refused}; choose another benchmark time")
+    if reach_px:
+        horizon = steps_near(image, lines, horizon.noise_grey)
     seen = edge_seen(view, horizon, at_rest)
     if reach_px:
         found = found_marks(view, marks, image, at_rest, reach_px)
-        painted = marks_seen(view, marks, found, at_rest, len(lines.origin_px))
+        painted = marks_seen(view, marks, found, at_rest, len(clocks))
         # where a mark was painted is known to millimetres
-        at = marks.points_shell_m[painted.index - len(lines.origin_px)]
+        at = marks.points_shell_m[painted.index - len(clocks)]
         away = np.linalg.norm(at - view.camera.position_body_m, axis=1)
         painted = replace(painted, sd_px=np.hypot(painted.sd_px, PAINTED_M * view.camera.focal_px.mean() / away))
         seen = joined(seen, painted)
-    return _Look(view, lines, horizon, seen.some(np.isfinite(seen.residual_px)))
+    return _Look(view, lines, horizon, seen.some(np.isfinite(seen.residual_px)), clocks)

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators import _fit_kernels
-from estimators.horizon import HorizonLine, ScanLines, find_horizon
+from estimators.horizon import HorizonLine, ScanLines, fault_of_frame, find_horizon, no_horizon, steps_near
 from estimators.marks import Marks
 from estimators.virtual_camera import BENDING, CAMERA, FLATTENING, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, FloatArray
@@ -40,7 +40,7 @@ Image = NDArray[np.uint8]
 
 STEPS = 12
 WORST_RMS_PX = 2.5
-LEAST_POINTS = 60
+LEAST_POINTS, LEAST_MARKS = 60, 40
 HUBER = 2.5
 GROSS_PX = 5.0
 REACH_PX = 8
@@ -91,7 +91,7 @@ class Seen:
         Derivatives by the two ovalities, px/rad, and by the edge's shift, tilt and bow.
     sd_px : (n,) float
     index : (n,) int
-        Scan line, or number of scan lines plus row of `Marks`.
+        Place of the edge, or number of places plus row of `Marks`.
     """
 
     residual_px: FloatArray
@@ -136,6 +136,9 @@ class FrameFit:
     marks: int
     horizon: HorizonLine
     refused: str = ""
+
+
+_NOTHING = no_horizon("")
 
 
 class NoFitError(Exception):
@@ -247,8 +250,10 @@ class OrientedCamera:
     Parameters
     ----------
     view : VirtualCamera
+    clocks_rad : (n,) float
+        Places of the shell's edge that are looked for.
     lines : ScanLines
-        Where the edge is searched.
+        Where they are searched when nothing is known of the bending.
     marks : Marks
         Which marks are looked for.
     held : HeldFixed
@@ -266,6 +271,7 @@ class OrientedCamera:
     """
 
     view: VirtualCamera
+    clocks_rad: FloatArray
     lines: ScanLines
     marks: Marks
     held: HeldFixed
@@ -287,14 +293,15 @@ class OrientedCamera:
         start : (2,) float, optional
             Where to start, e.g. the answer of the frame before.
         """
-        horizon = find_horizon(image, self.lines, self.view.camera.size_px)
-        if not horizon.is_usable:
-            return _no_answer(horizon, horizon.refused)
-        bending, basis = np.zeros(3), np.eye(2)
+        fault = fault_of_frame(image, self.view.camera.size_px)
+        coarse = find_horizon(image, self.lines, self.view.camera.size_px)
+        if fault:
+            return _no_answer(coarse, fault)
+        bending, basis, horizon = np.zeros(3), np.eye(2), coarse
         bending[:2] = 0.0 if start is None else start
         try:
-            self._solve(horizon, None, bending, basis, np.inf)
-            place = found_marks(self.view, self.marks, image, bending, REACH_PX)
+            place = self._approach(image, coarse, bending)
+            horizon = steps_near(image, self.view.lines_at(self.clocks_rad, bending), coarse.noise_grey)
             last = self._solve(horizon, place, bending, basis, WORST_RMS_PX)
             if plane_axis is not None:
                 # whether this is the shell was judged with both parameters: an assumed plane alone may fit badly;
@@ -302,9 +309,35 @@ class OrientedCamera:
                 basis = plane_axis[:, None]
                 bending[:] = *(basis[:, 0] * (basis[:, 0] @ bending[:2])), 0.0
                 last = self._solve(horizon, None, bending, basis, np.inf)
-        except NoFitError as fault:
-            return _no_answer(horizon, str(fault))
+        except NoFitError as fault_of_fit:
+            return _no_answer(horizon, str(fault_of_fit))
         return self._answer(horizon, bending, last, basis)
+
+    def _approach(self, image: Image, coarse: HorizonLine, bending: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Carry ``bending`` in place to within a pixel or two, and find the marks there; None where there are few.
+
+        From where the edge was found, or, where more marks turn up there, from where the search starts: behind the rim
+        may be the Earth, whose limb and clouds are edges too.
+        """
+        guesses, trouble = [bending.copy()], coarse.refused
+        if coarse.is_usable:
+            edge_alone = bending.copy()
+            try:
+                self._solve(coarse, None, edge_alone, np.eye(2), np.inf)
+                guesses.append(edge_alone)
+            except NoFitError as fault:
+                trouble = str(fault)
+        found = [found_marks(self.view, self.marks, image, guess, REACH_PX) for guess in guesses]
+        rows = [int(np.isfinite(sd).sum()) for _, sd in found]
+        best = len(rows) - 1 if rows[-1] >= rows[0] else 0
+        if rows[best] >= LEAST_MARKS:
+            bending[:] = guesses[best]
+            self._solve(_NOTHING, found[best], bending, np.eye(2), np.inf)
+            return found_marks(self.view, self.marks, image, bending, REACH_PX)
+        if len(guesses) < 2:
+            raise NoFitError(trouble)
+        bending[:] = guesses[1]
+        return None
 
     def _left_over(self, index: NDArray[np.intp]) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
         """Of what was found at the benchmark too: residual (NaN where nothing was), sd, and its row."""
@@ -324,7 +357,7 @@ class OrientedCamera:
         basis: FloatArray, worst_rms_px: float,
     ) -> _Solution:  # fmt: skip
         """Fit ``bending`` (3,) in place to the edge and, where given, the marks found."""
-        view, k, lines = self.view, basis.shape[1], len(self.lines.origin_px)
+        view, k, lines = self.view, basis.shape[1], len(self.clocks_rad)
         has = np.flatnonzero(np.isfinite(place[1])) if place is not None else np.zeros(0, dtype=np.intp)
         left, before_sd, edge_at = self._left_over(horizon.line)
         mark_left, mark_before_sd, mark_at = self._left_over(lines + has)
@@ -336,7 +369,7 @@ class OrientedCamera:
         prior = self._shape_sd * (1.0 if k == 2 else 1e-3)
         count = len(left) + len(has)
         residual, rows, shape, weight = np.empty(count), np.zeros((count, 16)), np.zeros((count, 5)), np.empty(count)
-        limits = (HUBER, GROSS_PX, LAST_STEP_RAD, STEPS, LEAST_POINTS)
+        limits = (HUBER, GROSS_PX, LAST_STEP_RAD, STEPS, 0 if len(has) >= LEAST_MARKS else LEAST_POINTS)
         state, number = _fit_kernels.fit_frame(
             bending, np.ascontiguousarray(basis), view.shell_terms, view.camera.lens_terms, edge, marks, prior, limits,
             residual, rows, shape, weight,

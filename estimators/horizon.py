@@ -33,6 +33,7 @@ STEP_PX = 0.5
 SMOOTHING_PX = 0.8
 WHOLE_BLUR_PX = 1.27
 EDGE_HALF = 7
+NEAR_PX = 8.0
 LEAST_CONTRAST = 8.0
 LEAST_SHARE = 0.4
 SD_FLOOR_PX = 0.05
@@ -51,12 +52,15 @@ class ScanLines:
         Unit vectors from the sky to the shell.
     outer_px, inner_px : float
         How far each line reaches to the sky and into the shell, px.
+    index : (n,) int
+        Which place of the shell's edge each line crosses; the same number is the same place in every frame.
     """
 
     origin_px: FloatArray
     inward_px: FloatArray
     outer_px: float
     inner_px: float
+    index: NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,9 @@ class HorizonLine:
     sd_px : (n,) float
         Standard deviation of each point along ``inward_px``.
     line : (n,) int
-        Index of the scan line that each point was found on.
+        Index of the scan line that each point was found on (`ScanLines.index`).
+    noise_grey : float
+        Noise of the smoothed picture, grey levels.
     refused : str
         Why the frame cannot be used; empty when it can.
     """
@@ -81,6 +87,7 @@ class HorizonLine:
     inward_px: FloatArray
     sd_px: FloatArray
     line: NDArray[np.intp]
+    noise_grey: float
     refused: str = ""
 
     @property
@@ -100,8 +107,9 @@ class HorizonLine:
         return float(c0 - c1**2 / (4.0 * c2)) if c2 > 1e-6 else float(v.min())
 
 
-def _refuse(reason: str) -> HorizonLine:
-    return HorizonLine(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.intp), reason)
+def no_horizon(reason: str) -> HorizonLine:
+    """No edge points, and why."""
+    return HorizonLine(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.intp), 0.3, reason)
 
 
 def fault_of_frame(image: Image, size_px: tuple[int, int]) -> str:
@@ -137,33 +145,22 @@ def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> Ho
     """
     fault = fault_of_frame(image, size_px)
     if fault:
-        return _refuse(fault)
-    place, sd, good = lasting_rises(image, lines)
+        return no_horizon(fault)
+    place, sd, good, noise = lasting_rises(image, lines)
+    refused = ""
     if good.mean() < LEAST_SHARE:
         share = f"{100.0 * good.mean():.0f} % of the scan lines cross one ({100 * LEAST_SHARE:.0f} % wanted)"
-        return _refuse(f"no clear edge: {share}")
+        refused = f"no clear edge: {share}"
     points = lines.origin_px + place[:, None] * lines.inward_px
-    return HorizonLine(points[good], lines.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), np.flatnonzero(good))
-
-
-def lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Place along each line, px inwards from its origin, its sd without floor, and whether a clear edge is there."""
-    h, w = image.shape
-    count = round((lines.outer_px + lines.inner_px) / STEP_PX)
-    ends = np.concatenate([lines.origin_px - lines.outer_px * lines.inward_px,
-                           lines.origin_px + lines.inner_px * lines.inward_px])  # fmt: skip
-    # only the band that the lines cross is smoothed, in sixteenths of a grey level
-    low = np.clip(np.floor(ends.min(axis=0)).astype(int) - 4, 0, [w - 4, h - 4])
-    high = np.clip(np.ceil(ends.max(axis=0)).astype(int) + 5, low + 4, [w, h])
-    band = np.multiply(image[low[1] : high[1], low[0] : high[0]], np.uint16(1 / GREY_UNIT), dtype=np.uint16)
-    smooth = cv2.GaussianBlur(band, (0, 0), SMOOTHING_PX)
-    n = len(lines.origin_px)
-    grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
-    size = np.array([w, h], dtype=float)
-    corner = low.astype(float)
-    _edge_kernels.sample_lines(
-        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, size, GREY_UNIT, grey, inside
+    return HorizonLine(
+        points[good], lines.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), lines.index[good], noise, refused
     )
+
+
+def lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray, float]:
+    """Place along each line, px inwards from its origin, its sd without floor, whether there is one, and the noise."""
+    n = len(lines.origin_px)
+    grey, inside = _sampled(image, lines, round((lines.outer_px + lines.inner_px) / STEP_PX))
     level, scatter, first = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
     span = int(6.0 / STEP_PX)
     _edge_kernels.sky_levels(grey, inside, span, level, scatter, first)
@@ -174,20 +171,64 @@ def lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArra
         grey, inside, level, first, noise, float(np.median(level)), limits, STEP_PX, EDGE_PLACES, EDGE_BASES,
         place, sd, good,
     )  # fmt: skip
-    return STEP_PX * place - lines.outer_px, sd, good
+    return STEP_PX * place - lines.outer_px, sd, good, noise
 
 
-def _edge_bases() -> FloatArray:
-    """Orthonormal bases ``(places, 2 EDGE_HALF + 1, 2)`` of a blurred step and a blurred ramp for each place."""
-    x = STEP_PX * np.arange(-EDGE_HALF, EDGE_HALF + 1)
+def steps_near(image: Image, lines: ScanLines, noise_grey: float) -> HorizonLine:
+    """Find the edge where it is expected within a few pixels, darker or brighter than what lies behind it.
+
+    Parameters
+    ----------
+    image : (h, w) uint8
+    lines : ScanLines
+        With origins where the edge is expected; their lengths are not used.
+    noise_grey : float
+        Of the smoothed picture, grey levels; see `HorizonLine`.
+    """
+    near = ScanLines(lines.origin_px, lines.inward_px, NEAR_PX, NEAR_PX, lines.index)
+    grey, inside = _sampled(image, near, len(NEAR_ALONG))
+    n = len(near.origin_px)
+    place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
+    _edge_kernels.steps_near(grey, inside, noise_grey, LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, sd, good)
+    points = near.origin_px + place[:, None] * near.inward_px
+    return HorizonLine(
+        points[good], near.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), near.index[good], noise_grey
+    )
+
+
+def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
+    """Smoothed grey levels ``(n, count)`` along lines, and whether they lie in the picture."""
+    h, w = image.shape
+    ends = np.concatenate([lines.origin_px - lines.outer_px * lines.inward_px,
+                           lines.origin_px + lines.inner_px * lines.inward_px])  # fmt: skip
+    # only the band that the lines cross is smoothed, in sixteenths of a grey level
+    low = np.clip(np.floor(ends.min(axis=0)).astype(int) - 4, 0, [w - 4, h - 4])
+    high = np.clip(np.ceil(ends.max(axis=0)).astype(int) + 5, low + 4, [w, h])
+    band = np.multiply(image[low[1] : high[1], low[0] : high[0]], np.uint16(1 / GREY_UNIT), dtype=np.uint16)
+    smooth = cv2.GaussianBlur(band, (0, 0), SMOOTHING_PX)
+    n = len(lines.origin_px)
+    grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
+    size, corner = np.array([w, h], dtype=float), low.astype(float)
+    _edge_kernels.sample_lines(
+        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, size, GREY_UNIT, grey, inside
+    )
+    return grey, inside
+
+
+def _edge_bases(places: FloatArray, along: FloatArray) -> FloatArray:
+    """Orthonormal bases ``(places, samples, 2)`` of a blurred step and a blurred ramp for each place."""
     bases = []
-    for place in EDGE_PLACES:
-        z = (x - place) / WHOLE_BLUR_PX
+    for place in places:
+        z = (along - place) / WHOLE_BLUR_PX
         step = ndtr(z)
         ramp = z * step + np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
-        bases.append(np.linalg.qr(np.column_stack([step, ramp]))[0])
+        basis = np.linalg.qr(np.column_stack([step, ramp]))[0]
+        bases.append(basis * np.sign(basis[-1, 0]))
     return np.ascontiguousarray(bases)
 
 
 EDGE_PLACES = np.arange(-1.5, 1.51, 0.1)
-EDGE_BASES = _edge_bases()
+EDGE_BASES = _edge_bases(EDGE_PLACES, STEP_PX * np.arange(-EDGE_HALF, EDGE_HALF + 1))
+NEAR_ALONG = STEP_PX * np.arange(round(2.0 * NEAR_PX / STEP_PX) + 1) - NEAR_PX
+NEAR_PLACES = np.arange(-4.75, 4.76, 0.25)
+NEAR_BASES = _edge_bases(NEAR_PLACES, NEAR_ALONG)

@@ -160,17 +160,29 @@ class VirtualCamera:
         """Project the shell's edge for a bending angle and plane."""
         return self.edge(bending_of(theta_rad, plane_lv_rad))
 
-    def scan_lines(self, count: int = 240) -> ScanLines:
-        """Lay searches across the unbent edge, inside the picture and clear of its border."""
+    def edge_clocks(self, count: int = 240) -> FloatArray:
+        """Clocking angles of places evenly spread along the unbent edge, inside the picture and clear of its border."""
         edge = self.edge(np.zeros(3))
         inside = np.flatnonzero(self.camera.is_inside(edge.pixels, 6.0))
         if len(inside) < 2:
             raise GateError("the camera does not see the shell's edge; check its mount and lens in the vehicle file")
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(edge.pixels[inside], axis=0), axis=1))])
-        at = np.linspace(0.0, length[-1], count)
+        return np.interp(np.linspace(0.0, length[-1], count), length, edge.clocks_rad[inside])
+
+    def lines_at(self, clocks_rad: FloatArray, bending: FloatArray) -> ScanLines:
+        """Lay searches across the edge of a bending (3,) at clocking angles; those out of the field are left out."""
+        edge = self.edge(bending)
+        index = np.flatnonzero((clocks_rad >= edge.clocks_rad[0]) & (clocks_rad <= edge.clocks_rad[-1]))
         both = (edge.pixels, edge.inward_px)
-        origin, inward = (np.column_stack([np.interp(at, length, a[inside, k]) for k in (0, 1)]) for a in both)
-        return ScanLines(origin, inward / np.linalg.norm(inward, axis=1, keepdims=True), OUTER_PX, INNER_PX)
+        origin, inward = (
+            np.column_stack([np.interp(clocks_rad[index], edge.clocks_rad, a[:, k]) for k in (0, 1)]) for a in both
+        )
+        inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+        return ScanLines(origin, inward, OUTER_PX, INNER_PX, index)
+
+    def scan_lines(self) -> ScanLines:
+        """Lay searches across the unbent edge."""
+        return self.lines_at(self.edge_clocks(), np.zeros(3))
 
     def mismatch(self, horizon: HorizonLine, edge: ProjectedEdge) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Compare found edge points with a projected edge.
