@@ -6,7 +6,8 @@ shell's own shape (its flattening and ovality as built) and the light at its edg
 prior is wide, and the frame calibrates it, as the seed paper oriented its camera on the frame at 421 s.
 
 First the edge alone is fitted, which may be far from where the nominal camera expects it; then marks are looked for
-from farther, then from nearer.
+from farther, then from nearer. Where few turn up, the edge was not the shell's, and the pattern of all marks is looked
+for instead (`estimators.pattern`).
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ from estimators.camera_fit import (
     joined,
     marks_seen,
 )  # fmt: skip
-from estimators.horizon import HorizonLine, ScanLines, find_horizon, steps_near
+from estimators.horizon import HorizonLine, ScanLines, fault_of_frame, find_horizon, steps_near
 from estimators.marks import Marks, visible_marks
+from estimators.pattern import fitted_pattern
 from estimators.virtual_camera import BENDING, FLATTENING, VirtualCamera
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import FloatArray, GateError
@@ -37,8 +39,10 @@ from flightmodel.vehicle import CameraMount, CameraUncertainty, ShellGeometry
 STEPS = 10
 REACHES_PX = (0, 12, 8)
 SETTLED_SD = 1e-2
+USUAL_SHARE, USUAL_RMS_PX = 0.75, 1.0
 WORST_RMS_PX = 2.5
 PAINTED_M = 0.003
+FOCAL, FOCAL_PIECE = 3, 0.08
 BUILT_RAD = np.deg2rad(0.3)
 POSES = POSED.stop - POSED.start
 
@@ -79,10 +83,42 @@ def orient_camera(
         When the frame cannot be used, with the reason.
     """
     held = held or HeldFixed()
+    fault = fault_of_frame(benchmark, (camera_mount.width_px, camera_mount.height_px))
+    if fault:
+        raise GateError(f"benchmark frame: {fault}; choose another benchmark time")
     nominal = VirtualCamera(geometry, camera_from_mount(camera_mount), joint_station_m)
     prior = _prior_sd(camera_mount.uncertainty, held)
-    pose = np.zeros(POSES)
-    for reach in REACHES_PX:
+    try:
+        oriented = _fitted(nominal, benchmark, prior, held, np.zeros(POSES), REACHES_PX)
+        if oriented.marks_share > USUAL_SHARE and oriented.residual_rms_px < USUAL_RMS_PX:
+            return oriented
+        trouble = None
+    except GateError as no_edge:
+        oriented, trouble = None, no_edge
+    # the edge may have been the Earth's: the pattern of marks is the shell's alone
+    pose = _pose_of_pattern(nominal, benchmark, prior)
+    if pose is not None:
+        try:
+            other = _fitted(nominal, benchmark, prior, held, pose, REACHES_PX[1:])
+        except GateError as fault_of_pattern:
+            trouble = trouble or fault_of_pattern
+        else:
+            if oriented is None or other.marks_share / other.residual_rms_px > (
+                oriented.marks_share / oriented.residual_rms_px
+            ):
+                return other
+    if oriented is None:
+        assert trouble is not None
+        raise trouble
+    return oriented
+
+
+def _fitted(
+    nominal: VirtualCamera, benchmark: Image, prior: FloatArray, held: HeldFixed, pose: FloatArray,
+    reaches_px: tuple[int, ...],
+) -> OrientedCamera:  # fmt: skip
+    """Fit the pose from a start, marks looked for within each reach in turn; refused where the edge is no shell's."""
+    for reach in reaches_px:
         marks = visible_marks(_posed(nominal, pose))
         for _ in range(STEPS):
             look = _look(_posed(nominal, pose), marks, benchmark, reach)
@@ -95,13 +131,32 @@ def orient_camera(
             if np.abs(step[:POSES] / prior[:POSES]).max() < SETTLED_SD:
                 break
     if rms > WORST_RMS_PX:
-        raise GateError(f"benchmark frame: the edge is not the shell's (rms {rms:.1f} px); choose another time")
-    look = _look(_posed(nominal, pose), marks, benchmark, REACHES_PX[-1])
+        raise GateError(
+            f"benchmark frame: the edge is not the shell's (rms {rms:.1f} px); choose another benchmark time"
+        )
+    look = _look(_posed(nominal, pose), marks, benchmark, reaches_px[-1])
     per_bending = gain[:POSES] @ seen.rows[:, BENDING]
     return OrientedCamera(
         look.view, look.clocks_rad, look.lines, marks, held, look.horizon, look.seen, pose[:8], formal[:POSES, :POSES],
         per_bending, rms,
     )  # fmt: skip
+
+
+def _pose_of_pattern(nominal: VirtualCamera, image: Image, prior: FloatArray) -> FloatArray | None:
+    """Pose (12,) at which the pattern of marks fits; None where it stands out nowhere."""
+    points = visible_marks(nominal).points_shell_m
+    at_rest = np.zeros(3)
+
+    def pixels(lens: FloatArray) -> FloatArray:
+        return _posed(nominal, np.concatenate([lens, np.zeros(POSES - len(lens))])).sight(points, at_rest).pixels
+
+    # the focal length is what may be far off: it is searched in pieces
+    sd = prior[:8].copy()
+    pieces = max(1, round(sd[FOCAL] / FOCAL_PIECE))
+    sd[FOCAL] = min(sd[FOCAL], FOCAL_PIECE)
+    starts = [np.eye(8)[FOCAL] * scale for scale in FOCAL_PIECE * (np.arange(2 * pieces - 1) - (pieces - 1))]
+    found = fitted_pattern(image, pixels, starts, sd)
+    return None if found is None else np.concatenate([found, np.zeros(POSES - 8)])
 
 
 def _prior_sd(known: CameraUncertainty, held: HeldFixed) -> FloatArray:
@@ -133,10 +188,10 @@ def _look(view: VirtualCamera, marks: Marks, image: Image, reach_px: int) -> _Lo
     clocks = view.edge_clocks()
     lines = view.lines_at(clocks, at_rest)
     horizon = find_horizon(image, lines, view.camera.size_px)
-    if not horizon.is_usable:
-        raise GateError(f"benchmark frame: {horizon.refused}; choose another benchmark time")
     if reach_px:
         horizon = steps_near(image, lines, horizon.noise_grey)
+    elif not horizon.is_usable:
+        raise GateError(f"benchmark frame: {horizon.refused}; choose another benchmark time")
     seen = edge_seen(view, horizon, at_rest)
     if reach_px:
         found = found_marks(view, marks, image, at_rest, reach_px)

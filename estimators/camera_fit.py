@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from estimators import _fit_kernels
 from estimators.horizon import HorizonLine, ScanLines, fault_of_frame, find_horizon, no_horizon, steps_near
 from estimators.marks import Marks
+from estimators.pattern import fitted_pattern
 from estimators.virtual_camera import BENDING, CAMERA, FLATTENING, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
@@ -41,6 +42,8 @@ Image = NDArray[np.uint8]
 STEPS = 12
 WORST_RMS_PX = 2.5
 LEAST_POINTS, LEAST_MARKS = 60, 40
+FEW_MARKS = 0.6
+FAR_RAD = np.deg2rad([4.0, 4.0])
 HUBER = 2.5
 GROSS_PX = 5.0
 REACH_PX = 8
@@ -282,6 +285,12 @@ class OrientedCamera:
     posed_per_bending: FloatArray = field(repr=False)
     residual_rms_px: float
 
+    @property
+    def marks_share(self) -> float:
+        """Share of the marks in view that the benchmark frame shows."""
+        found = int((self.left_over.index >= len(self.clocks_rad)).sum())
+        return found / max(len(self.marks.is_dot), 1)
+
     def fit(self, image: Image, plane_axis: FloatArray | None = None, start: FloatArray | None = None) -> FrameFit:
         """Find the deflection in a frame.
 
@@ -316,8 +325,8 @@ class OrientedCamera:
     def _approach(self, image: Image, coarse: HorizonLine, bending: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Carry ``bending`` in place to within a pixel or two, and find the marks there; None where there are few.
 
-        From where the edge was found, or, where more marks turn up there, from where the search starts: behind the rim
-        may be the Earth, whose limb and clouds are edges too.
+        From where the edge was found, or where the search starts, or where the pattern of marks fits, whichever shows
+        most marks: behind the rim may be the Earth, whose limb and clouds are edges too.
         """
         guesses, trouble = [bending.copy()], coarse.refused
         if coarse.is_usable:
@@ -329,12 +338,22 @@ class OrientedCamera:
                 trouble = str(fault)
         found = [found_marks(self.view, self.marks, image, guess, REACH_PX) for guess in guesses]
         rows = [int(np.isfinite(sd).sum()) for _, sd in found]
-        best = len(rows) - 1 if rows[-1] >= rows[0] else 0
+        usual = int((self.left_over.index >= len(self.clocks_rad)).sum())
+        if max(rows) < FEW_MARKS * usual:
+            points = self.marks.points_shell_m
+            pattern = fitted_pattern(
+                image, lambda p: self.view.sight(points, np.array([*p, 0.0])).pixels, [bending[:2].copy()], FAR_RAD
+            )
+            if pattern is not None:
+                guesses.append(np.array([*pattern, 0.0]))
+                found.append(found_marks(self.view, self.marks, image, guesses[-1], REACH_PX))
+                rows.append(int(np.isfinite(found[-1][1]).sum()))
+        best = int(np.argmax(rows))
         if rows[best] >= LEAST_MARKS:
             bending[:] = guesses[best]
             self._solve(_NOTHING, found[best], bending, np.eye(2), np.inf)
             return found_marks(self.view, self.marks, image, bending, REACH_PX)
-        if len(guesses) < 2:
+        if trouble:
             raise NoFitError(trouble)
         bending[:] = guesses[1]
         return None

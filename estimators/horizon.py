@@ -227,8 +227,8 @@ def _edge_bases(places: FloatArray, along: FloatArray) -> FloatArray:
     return np.ascontiguousarray(bases)
 
 
-EDGE_PLACES = np.arange(-1.5, 1.51, 0.1)
-EDGE_BASES = _edge_bases(EDGE_PLACES, STEP_PX * np.arange(-EDGE_HALF, EDGE_HALF + 1))
-NEAR_ALONG = STEP_PX * np.arange(round(2.0 * NEAR_PX / STEP_PX) + 1) - NEAR_PX
-NEAR_PLACES = np.arange(-4.75, 4.76, 0.25)
+EDGE_PLACES: FloatArray = np.linspace(-1.5, 1.5, 31)
+EDGE_BASES = _edge_bases(EDGE_PLACES, np.linspace(-STEP_PX * EDGE_HALF, STEP_PX * EDGE_HALF, 2 * EDGE_HALF + 1))
+NEAR_ALONG: FloatArray = np.linspace(-NEAR_PX, NEAR_PX, round(2.0 * NEAR_PX / STEP_PX) + 1)
+NEAR_PLACES: FloatArray = np.linspace(-4.75, 4.75, 39)
 NEAR_BASES = _edge_bases(NEAR_PLACES, NEAR_ALONG)

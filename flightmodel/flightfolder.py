@@ -14,6 +14,7 @@ from flightmodel.atmosphere import standard_sounding
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import parse_utc
 from flightmodel.earth import ecef_from_radar, geodetic_from_ecef
+from flightmodel.film import Frames
 from flightmodel.flightfile import AttitudeEntry, FlightFile, MotionEntry, read_flight_file
 from flightmodel.gate import Gate
 from flightmodel.onboard_tables import read_frames, read_sun, read_triad
@@ -23,7 +24,6 @@ from flightmodel.telemetry import (
     AttitudePrior,
     Disturbed,
     Finding,
-    Frames,
     GnssRecord,
     Motion,
     RadarRecord,

@@ -217,8 +217,9 @@ class AtmosphereEntry(Source):
 
 
 class FramesEntry(Source):
-    """Onboard video as a list of frames: column ``frame`` holds file names below ``folder``."""
+    """Onboard video as a list of frames: column ``frame`` holds file names below ``folder``, or numbers in ``film``."""
 
-    folder: str
+    folder: str | None = None
+    film: str | None = None
     camera: str = "camera5"
     benchmark_s: float = 421.0

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
 
 from flightmodel import columns
-from flightmodel.checks import FloatArray, nearest_name
+from flightmodel.checks import BoolArray, FloatArray, nearest_name
+from flightmodel.film import Frames, fault_of_film, fault_of_image
 from flightmodel.findings import find_faults
 from flightmodel.flightfile import FlightFile
 from flightmodel.gate import Gate
 from flightmodel.instrument_entries import FramesEntry, MagnetometerEntry, RatesEntry, SunEntry, TriadEntry
 from flightmodel.instruments import SunHeads, TriadSpec
 from flightmodel.selection import rows_to_use
-from flightmodel.telemetry import Frames, SunRecord, TriadRecord
+from flightmodel.telemetry import SunRecord, TriadRecord
 from flightmodel.vehicle import CameraMount, Vehicle
 
 Triad = TriadEntry | RatesEntry | MagnetometerEntry
@@ -136,7 +138,10 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
     label = "frames"
     if source.columns:
         gate.refuse_config("frames.columns: the frame list has only t_s and frame")
-    path, images = gate.path(source.file), gate.path(source.folder)
+    if (source.folder is None) == (source.film is None):
+        gate.refuse_config("frames: one of folder (of images) and film (a .webm, .mp4 or .avi file) is wanted")
+        return None
+    path, images = gate.path(source.file), gate.path(source.film or source.folder or "")
     if vehicle is not None and source.camera not in vehicle.cameras:
         hint = nearest_name(source.camera, list(vehicle.cameras))
         gate.refuse_config(f"frames.camera = '{source.camera}'{hint}: not on vehicle '{vehicle.name}'")
@@ -150,22 +155,17 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
     if "frame" not in table.columns:
         gate.faults.append(f"{label}: {path}: line 1: no column 'frame'{nearest_name('frame', table.columns)}")
         return None
-    camera, paths = vehicle.cameras[source.camera], []
+    camera = vehicle.cameras[source.camera]
     used = np.ones(len(table), dtype=bool)
     if time_s is not None:
         time_s = time_s + source.time.offset_s
         used, findings = rows_to_use(label, source, time_s)
         gate.findings.extend(findings)
         time_s = time_s[used]
-    names = table["frame"].str.strip()
-    for row in np.flatnonzero(used).tolist():
-        name = names.iloc[row]
-        image = images / name
-        wrong = gate.wrong_place(image, name) or _image_fault(image, camera)
-        if wrong:
-            where = f"{label}: {path}: line {columns.line_of(table, row)}: {image}"
-            gate.faults.append(f"{where}: {wrong}; replace the file or remove the line")
-        paths.append(image)
+    if source.film is None:
+        paths, numbers = _image_paths(gate, images, table, used, path, camera), None
+    else:
+        paths, numbers = (images,), _film_numbers(gate, images, table, used, path, camera)
     if time_s is None:
         return None
     if not len(time_s):
@@ -175,15 +175,39 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
         span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
         gate.refuse_config(f"frames.benchmark_s = {source.benchmark_s}: frames span {span}")
         return None
-    return Frames(camera, source.camera, time_s, tuple(paths), source.benchmark_s)
+    return Frames(camera, source.camera, time_s, paths, source.benchmark_s, numbers)
 
 
-def _image_fault(path: Path, camera: CameraMount) -> str:
-    if not path.is_file():
-        return "no such file"
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        return "cannot be decoded as an image"
-    if image.shape != (camera.height_px, camera.width_px):
-        return f"is {image.shape[1]} x {image.shape[0]} pixels, the camera {camera.width_px} x {camera.height_px}"
-    return ""
+def _image_paths(
+    gate: Gate, images: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount
+) -> tuple[Path, ...]:
+    """Path of every frame's image; what is wrong with one becomes a fault."""
+    names, paths = table["frame"].astype(str).str.strip(), []
+    for row in np.flatnonzero(used).tolist():
+        image = images / names.iloc[row]
+        wrong = gate.wrong_place(image, names.iloc[row]) or fault_of_image(image, camera)
+        if wrong:
+            where = f"frames: {path}: line {columns.line_of(table, row)}: {image}"
+            gate.faults.append(f"{where}: {wrong}; replace the file or remove the line")
+        paths.append(image)
+    return tuple(paths)
+
+
+def _film_numbers(
+    gate: Gate, film: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount
+) -> NDArray[np.int64]:
+    """Number of every frame in the film; what is wrong becomes a fault."""
+    text = table["frame"].astype(str).str.strip()
+    whole = text.str.fullmatch(r"\d{1,9}").to_numpy(dtype=bool)
+    for row in np.flatnonzero(used & ~whole)[:5].tolist():
+        where = f"frames: {path}: line {columns.line_of(table, row)}: frame '{text.iloc[row]}'"
+        gate.faults.append(f"{where}: with film = \"{film.name}\" a frame's number is wanted, the first being 0")
+    numbers = np.array([int(t) for t in text.to_numpy()[used & whole]], dtype=np.int64)
+    if len(numbers) and (np.diff(numbers) < 0).any():
+        row = int(np.flatnonzero(used & whole)[int(np.argmax(np.diff(numbers) < 0)) + 1])
+        where = f"frames: {path}: line {columns.line_of(table, row)}"
+        gate.faults.append(f"{where}: frame numbers fall where times rise; sort the list by time")
+    wrong = fault_of_film(film, camera, int(numbers.max(initial=0)))
+    if wrong:
+        gate.faults.append(f"frames: {film}: {wrong}")
+    return numbers

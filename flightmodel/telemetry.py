@@ -6,14 +6,14 @@ Reading and writing of flight folders: `flightmodel.flightfolder`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
+from flightmodel.film import Frames
 from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SunHeads, TriadSpec
-from flightmodel.vehicle import CameraMount, Vehicle
+from flightmodel.vehicle import Vehicle
 
 
 @dataclass(frozen=True)
@@ -223,22 +223,6 @@ class Motion:
     powered_s: tuple[tuple[float, float], ...] = ()
     powered_sd_mps2: float = 50.0
     disturbed: tuple[Disturbed, ...] = ()
-
-
-@dataclass(frozen=True)
-class Frames:
-    """Onboard video: when each frame was taken, and where it lies; decoded only when asked for."""
-
-    camera: CameraMount
-    camera_name: str
-    time_s: FloatArray
-    paths: tuple[Path, ...]
-    benchmark_s: float
-
-    @property
-    def benchmark(self) -> int:
-        """Index of the frame nearest to the benchmark time."""
-        return int(np.argmin(np.abs(self.time_s - self.benchmark_s)))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from estimators.benchmark import orient_camera
-from estimators.camera_deflection import read_frame
 from estimators.camera_fit import OrientedCamera
 from estimators.figures import figure_camera_overlay
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row
@@ -61,7 +60,7 @@ def oriented_camera(telemetry: Telemetry, joint_m: float | None = None) -> tuple
     assert frames is not None
     benchmark = frames.benchmark
     station = vehicle.joint.station_m if joint_m is None else joint_m
-    return orient_camera(read_frame(frames.paths[benchmark]), vehicle.geometry, frames.camera, station), benchmark
+    return orient_camera(frames.picture(benchmark), vehicle.geometry, frames.camera, station), benchmark
 
 
 def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, joint_m: float | None = None) -> None:
@@ -71,7 +70,7 @@ def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, 
     oriented, benchmark = oriented_camera(telemetry, joint_m)
     largest = int(np.nanargmax(np.abs(history.theta_rad)))
     pick = [benchmark, largest]
-    pictures = [read_frame(frames.paths[k]) for k in pick]
+    pictures = [frames.picture(k) for k in pick]
     theta = [0.0, float(history.theta_rad[largest])]
     figure = figure_camera_overlay(
         oriented, pictures, list(frames.time_s[pick]), theta, list(history.plane_lv_rad[pick])
@@ -93,7 +92,7 @@ def summary_figure(
     plane = float(history.plane_lv_rad[largest])
     shown = ((benchmark, 0.0), (largest, float(history.theta_rad[largest])))
     overlay = Overlay(oriented.view)
-    pictures = [overlay.blended(read_frame(video.paths[k]), theta, plane) for k, theta in shown]
+    pictures = [overlay.blended(video.picture(k), theta, plane) for k, theta in shown]
     # the benchmark's horizon in both, so that the eye sees how far the edge moved; its own in the second
     rows = [horizon_row(oriented.view, theta, plane) for _, theta in shown]
     for picture, row, colour in (

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from estimators.camera_deflection import deflection_from_frames, read_frame, sensitivity_table
+from estimators.camera_deflection import deflection_from_frames, sensitivity_table
 from estimators.misalignment import estimate_misalignment
 from estimators.pulse import PulseData
 from estimators.trim import estimate_trim
@@ -159,7 +159,10 @@ def _check_flown(trajectory: Trajectory) -> None:
 
 
 def estimate_camera(
-    telemetry: Telemetry, plane_lv_rad: float | None = None, joint_station_m: float | None = None
+    telemetry: Telemetry,
+    plane_lv_rad: float | None = None,
+    joint_station_m: float | None = None,
+    progress: Progress | None = None,
 ) -> DeflectionHistory:
     """Deflection from the onboard video, in an assumed plane or with the plane found in every frame.
 
@@ -174,12 +177,14 @@ def estimate_camera(
     vehicle = telemetry.required_vehicle()
     return deflection_from_frames(
         frames.time_s,
-        frames.paths,
+        frames.pictures(),
         vehicle.geometry,
         frames.camera,
         vehicle.joint.station_m if joint_station_m is None else joint_station_m,
         benchmark_time_s=frames.benchmark_s,
         plane_lv_rad=plane_lv_rad,
+        benchmark=frames.picture(frames.benchmark),
+        progress=progress,
     )
 
 
@@ -191,7 +196,7 @@ def camera_sensitivity(telemetry: Telemetry, history: DeflectionHistory) -> pd.D
     """
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
-    straight, bent = (read_frame(frames.paths[k]) for k in (frames.benchmark, int(np.nanargmax(history.theta_rad))))
+    straight, bent = (frames.picture(k) for k in (frames.benchmark, int(np.nanargmax(history.theta_rad))))
     stations = np.array([0.0, vehicle.joint.station_m])
     planes = np.deg2rad(list(PAPER_TABLE_2_1_DEG))
     angles = sensitivity_table(straight, bent, vehicle.geometry, frames.camera, planes, stations)
@@ -201,6 +206,11 @@ def camera_sensitivity(telemetry: Telemetry, history: DeflectionHistory) -> pd.D
         for (plane, paper), angle in zip(PAPER_TABLE_2_1_DEG.items(), line, strict=True)
     ]
     return pd.DataFrame(rows, columns=["joint_station_m", "plane_lv_deg", "deflection_deg", "paper_deg"])
+
+
+def _part(report: Progress, number: int, parts: int) -> Progress:
+    """Report the progress of one of several parts as progress of the whole."""
+    return lambda fraction, what: report((number + fraction) / parts, what)
 
 
 def estimate(
@@ -221,7 +231,7 @@ def estimate(
         report(k / len(methods), f"deflection from {method}")
         try:
             if method == "camera":
-                history = estimate_camera(telemetry, plane_lv_rad, joint_station_m)
+                history = estimate_camera(telemetry, plane_lv_rad, joint_station_m, _part(report, k, len(methods)))
             else:
                 assert flight is not None
                 pulse = flight.required_pulse()

@@ -110,12 +110,27 @@ def _tables() -> None:
     kernels.read_rows(data, 0, 4, slots, kernels.EXACT_TENS, *powers, np.empty((1, 1)), spans, 0)
 
 
+def _camera() -> None:
+    """Orient a camera on its own virtual picture, and fit it."""
+    from estimators.benchmark import orient_camera
+    from estimators.overlay import Overlay
+    from estimators.virtual_camera import VirtualCamera
+    from flightmodel.camera import camera_from_mount
+
+    vehicle, _ = _vehicle_at_rest()
+    mount = next(iter(vehicle.cameras.values()))
+    view = VirtualCamera(vehicle.geometry, camera_from_mount(mount), vehicle.joint.station_m)
+    picture = np.ascontiguousarray(Overlay(view).view_of(0.0, 0.0)[0][:, :, 2])
+    orient_camera(picture, vehicle.geometry, mount, vehicle.joint.station_m).fit(picture)
+
+
 GROUPS: dict[str, Callable[[], None]] = {
     "simulator": _simulator,
     "ensembles": _ensembles,
     "filter": _filter,
     "smoothers": _smoothers,
     "tables": _tables,
+    "camera": _camera,
 }
 
 

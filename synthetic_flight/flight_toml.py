@@ -100,7 +100,9 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
             "",
             "[frames]",
             'file = "telemetry/frames.csv"',
-            f'folder = "telemetry/{spec.video.camera}"',
+            f'folder = "telemetry/{spec.video.camera}"'
+            if spec.video.format == "png"
+            else f'film = "telemetry/{spec.video.camera}.{spec.video.format}"',
             f'camera = "{spec.video.camera}"',
             f"benchmark_s = {spec.video.benchmark_s}",
         ]

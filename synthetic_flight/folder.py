@@ -11,14 +11,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 
-from flightmodel import rotations
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.geomagnetism_and_sun import sun_direction_ecef
-from synthetic_flight import day_air, events, radar_sensing, sensing, sun_sensing, video
+from synthetic_flight import day_air, events, radar_sensing, sensing, sun_sensing
+from synthetic_flight.filming import write_video
 from synthetic_flight.flight_toml import write_flight_toml
 from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
@@ -141,7 +139,7 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     q_prior = sensing.sense_attitude(truth, spec.attitude_prior, child_rng(seed, "attitude"))
     _write_truth(scenario, seed, truth, folder / "truth")
     if spec.video is not None:
-        _write_video(scenario, seed, truth, telemetry, report)
+        write_video(scenario, seed, truth, telemetry, report)
     write_flight_toml(scenario, q_prior, folder)
 
 
@@ -199,35 +197,3 @@ def _write_truth(scenario: Scenario, seed: int, truth: Truth, folder: Path) -> N
     shutil.copyfile(scenario.source, folder / "scenario.toml")
     run = {"scenario": scenario.spec.name, "seed": seed, "words": truth.words, "synthetic": True}
     (folder / "run.json").write_text(json.dumps(run, indent=2) + "\n")
-
-
-def _write_video(scenario: Scenario, seed: int, truth: Truth, telemetry: Path, report: Progress) -> None:
-    spec, vehicle = scenario.spec.video, scenario.vehicle
-    assert spec is not None
-    images = telemetry / spec.camera
-    images.mkdir()
-    at = sensing.sample_times(spec.start_s, min(spec.stop_s, float(truth.time_s[-1])), spec.rate_hz)
-    yz = np.column_stack([np.interp(at, truth.time_s, c) for c in truth.deflection.theta_yz_rad.T])
-    plane = np.arctan2(yz[:, 1], -yz[:, 0])
-    frames = video.render_video(
-        vehicle.geometry,
-        vehicle.cameras[spec.camera],
-        vehicle.joint.station_m,
-        np.hypot(yz[:, 0], yz[:, 1]),
-        plane,
-        sun_direction_body(truth, at),
-        child_rng(seed, spec.camera),
-    )
-    names = [f"frame_{k:05d}.png" for k in range(len(at))]
-    for k, frame in enumerate(frames):
-        report(0.25 + 0.7 * k / len(at), f"filming frame {k + 1} of {len(at)}")
-        if not cv2.imwrite(str(images / names[k]), frame, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise GateError(f"{images / names[k]}: cannot be written")
-    table = pd.DataFrame({"t_s": at, "frame": names})
-    table.to_csv(telemetry / "frames.csv", index=False, float_format="%.6f", lineterminator="\n")
-
-
-def sun_direction_body(truth: Truth, at_s: FloatArray) -> FloatArray:
-    """Unit vectors ``(n, 3)`` towards the Sun in body axes."""
-    q = rotations.slerp(truth.time_s, truth.trajectory.q_ecef_body, at_s)
-    return rotations.rotate(rotations.conjugate(q), sun_direction_ecef(truth.trajectory.epoch_utc, at_s))

@@ -26,6 +26,7 @@ from flightmodel.config import (
 )
 from flightmodel.refraction import Refractivity
 from synthetic_flight.triad_errors import DropoutErrors, TriadErrors
+from synthetic_flight.video import Imaging
 
 
 def _none_or_some(hertz: float) -> float:
@@ -264,14 +265,54 @@ class Radar(Section):
     dropouts: Dropouts | None = None
 
 
+class FilmQuality(Section):
+    """How the real camera differs from its drawing, and how it records; see `synthetic_flight.video.Imaging`."""
+
+    pointing_deg: ErrorAngle = 0.5
+    focal: Fraction = 0.01
+    centre_px: Annotated[float, Field(ge=0.0, le=1e4)] = 1.0
+    k1: Fraction = 0.003
+    k2: Fraction = 0.0
+    position_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.002
+    noise_grey: Annotated[float, Field(ge=0.0, le=255.0)] = 2.5
+    blur_px: Annotated[float, Field(gt=0.0, le=100.0)] = 0.8
+    vignetting: Fraction = 0.38
+    interlace_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    quality: Annotated[int, Field(ge=0, le=100)] = 0
+    built_deg: ErrorAngle = 0.0
+    loaded_deg: ErrorAngle = 0.0
+
+    def as_imaging(self) -> Imaging:
+        """In memory's units."""
+        return Imaging(
+            pointing_sd_rad=float(np.deg2rad(self.pointing_deg)),
+            focal_sd=self.focal,
+            centre_sd_px=self.centre_px,
+            k1_sd=self.k1,
+            k2_sd=self.k2,
+            position_sd_m=self.position_m,
+            noise_sd=self.noise_grey,
+            blur_px=self.blur_px,
+            vignetting=self.vignetting,
+            interlace_s=self.interlace_s,
+            quality=self.quality,
+            built_sd_rad=float(np.deg2rad(self.built_deg)),
+            loaded_sd_rad=float(np.deg2rad(self.loaded_deg)),
+        )
+
+
 class Video(Section):
-    """When the onboard camera records."""
+    """When the onboard camera records, and how well."""
 
     camera: str
     start_s: Time
     stop_s: Time
     rate_hz: Annotated[float, Field(ge=1e-3, le=1000.0)]
     benchmark_s: Time
+    format: Literal["png", "avi", "webm"] = "png"
+    time_offset_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
+    earth: bool = False
+    imaging: FilmQuality = FilmQuality()
 
     @model_validator(mode="after")
     def _ordered(self) -> Video:

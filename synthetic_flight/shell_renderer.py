@@ -328,7 +328,7 @@ class _Stack:
         n_s = (a * self.cos + b * self.sin) / self.minor
         n_r = (a * self.sin - b * self.cos) / self.minor
         lit = np.maximum(n_r * (y * sy + z * sz) / r - n_s * sx, 0.0)
-        crest = np.clip(b / self.minor, 0.0, 1.0)
+        crest = np.asarray(np.clip(b / self.minor, 0.0, 1.0), dtype=np.float32)
         value = (0.10 + 0.10 * crest + 0.62 * lit) * (0.55 + 0.45 * np.sqrt(crest))
         value *= self._paint(y, z, r, a, crest)
         return np.asarray(value, dtype=np.float32)

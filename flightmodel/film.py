@@ -1,0 +1,139 @@
+"""Onboard video: when each frame was taken, and its picture, from a folder of images or from a film.
+
+A list ``frames.csv`` gives the time of every frame, and either an image's file name or the frame's number in the film,
+counted from zero: the clock of a film is not trusted. Frames are decoded one at a time, a film from its beginning on,
+so that memory does not grow with their number; what cannot be decoded is an empty picture, for whoever looks at it to
+refuse by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flightmodel.checks import FloatArray
+from flightmodel.vehicle import CameraMount
+
+Image = NDArray[np.uint8]
+
+PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+NO_PICTURE: Image = np.zeros((0, 0), dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Onboard video; decoded only when asked for.
+
+    Parameters
+    ----------
+    camera : CameraMount
+    camera_name : str
+    time_s : (n,) float
+        Seconds after t0, increasing.
+    paths : tuple of Path
+        Of each frame's image, or the film alone.
+    benchmark_s : float
+        When the shell is taken as not bent.
+    numbers : (n,) int or None
+        Of each frame in the film; None for images.
+    """
+
+    camera: CameraMount
+    camera_name: str
+    time_s: FloatArray
+    paths: tuple[Path, ...]
+    benchmark_s: float
+    numbers: NDArray[np.int64] | None = None
+
+    @property
+    def benchmark(self) -> int:
+        """Index of the frame nearest to the benchmark time."""
+        return int(np.argmin(np.abs(self.time_s - self.benchmark_s)))
+
+    def picture(self, index: int) -> Image:
+        """Grey picture ``(h, w)`` of a frame; empty where it cannot be decoded."""
+        return next(self.pictures([index]))
+
+    def pictures(self, indices: list[int] | None = None) -> Iterator[Image]:
+        """Grey pictures of frames, in the order of ``indices``, which must increase; of all frames without."""
+        wanted = list(range(len(self.time_s))) if indices is None else indices
+        if self.numbers is None:
+            for k in wanted:
+                yield read_image(self.paths[k])
+            return
+        yield from film_frames(self.paths[0], [int(self.numbers[k]) for k in wanted])
+
+
+def read_image(path: Path) -> Image:
+    """Grey picture ``(h, w)`` of an image file; empty where it cannot be decoded."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    return NO_PICTURE if image is None else np.asarray(image, dtype=np.uint8)
+
+
+def film_frames(path: Path, numbers: list[int]) -> Iterator[Image]:
+    """Grey pictures of a film's frames by number, which must not decrease; empty ones behind its end."""
+    film = cv2.VideoCapture(str(path))
+    try:
+        at, last = -1, NO_PICTURE
+        for number in numbers:
+            while at < number:
+                at += 1
+                if not film.grab():
+                    at, last = number, NO_PICTURE
+                    break
+                if at == number:
+                    good, picture = film.retrieve()
+                    last = _grey(picture) if good else NO_PICTURE
+            yield last
+    finally:
+        film.release()
+
+
+def _grey(picture: NDArray[np.uint8]) -> Image:
+    if picture.ndim == 3:
+        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    return picture
+
+
+def fault_of_film(path: Path, camera: CameraMount, last_number: int) -> str:
+    """Say why a film cannot be used; empty when it can."""
+    if not path.is_file():
+        return "no such file"
+    if path.stat().st_size == 0:
+        return "is empty"
+    film = cv2.VideoCapture(str(path))
+    try:
+        if not film.isOpened():
+            return "cannot be opened as a film (known are .webm, .mp4 and .avi)"
+        width, height = (round(film.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if (width, height) != (camera.width_px, camera.height_px):
+            return f"is {width} x {height} pixels, the camera {camera.width_px} x {camera.height_px}"
+        count = round(film.get(cv2.CAP_PROP_FRAME_COUNT))
+        if 0 < count <= last_number:
+            return f"has {count} frames; the list asks for frame {last_number} (the first is 0)"
+        if not film.grab():
+            return "holds no frame that can be decoded"
+    finally:
+        film.release()
+    return ""
+
+
+def fault_of_image(path: Path, camera: CameraMount) -> str:
+    """Say why an image file cannot be used; empty when it can. A whole PNG is not decoded for it."""
+    if not path.is_file():
+        return "no such file"
+    data = path.read_bytes()
+    if data[:8] == PNG_START and data.rstrip(b"\0")[-8:] == PNG_END:
+        width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    else:
+        height, width = read_image(path).shape
+        if height == 0:
+            return "cannot be decoded as an image"
+    if (width, height) != (camera.width_px, camera.height_px):
+        return f"is {width} x {height} pixels, the camera {camera.width_px} x {camera.height_px}"
+    return ""
