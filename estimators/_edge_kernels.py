@@ -182,7 +182,7 @@ def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
         centre = 0.0
         for _ in range(2):
             u0, v0 = origin[i, 0] + centre * du, origin[i, 1] + centre * dv
-            if u0 < reach + 2 or v0 < reach + 2 or u0 > w - reach - 3 or v0 > h - reach - 3:
+            if not (reach + 2 <= u0 <= w - reach - 3 and reach + 2 <= v0 <= h - reach - 3):
                 sd[i] = np.inf
                 break
             for k in range(m):

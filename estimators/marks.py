@@ -75,8 +75,9 @@ def visible_marks(view: VirtualCamera) -> Marks:
         curve = revolved(profile, clock)
         seen = _seen(view, curve, _aft_normals(profile, clock))
         pixels = view.sight(curve, np.zeros(3)).pixels
-        pieces = _spaced(pixels, seen, SEAM_STEP_PX)
-        tangent = np.gradient(pixels, axis=0)[pieces]
+        along = np.gradient(pixels, axis=0)
+        pieces = _spaced(pixels, seen & np.isfinite(along).all(axis=1), SEAM_STEP_PX)
+        tangent = along[pieces]
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
         rows.append(
             (curve[pieces], np.column_stack([-tangent[:, 1], tangent[:, 0]]), _away(view, curve[pieces]), False)
