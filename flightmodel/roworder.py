@@ -5,7 +5,10 @@ earlier one (time and every value) are left out; rows out of order are put in or
 others: those of one time with different values, and late ones for which there is no room, because rows that came before
 stand there at their usual interval (a clock that was reset lays one stretch of the flight over another so). A few of
 them are left out: of one time all, for nobody can say which is right. With `FEW` of the rows or more the table is
-refused. Nothing of it happens in silence: each repair has its words, its number of rows and blocks, and its times.
+refused. It is refused with fewer, too, where a late block contradicts and the rows run on from it into new times at
+their usual interval: what was sent late ends with a jump forward, a clock that was set back does not, and then all
+that follows has wrong times. Nothing of it happens in silence: each repair has its words, its number of rows and
+blocks, and its times.
 """
 
 from __future__ import annotations
@@ -19,7 +22,9 @@ from flightmodel.columns import IntArray
 from flightmodel.findings import runs
 
 FEW = 0.01  # part of the rows that may contradict others
+MOSTLY = 0.5  # part of the rows of a stretch of old times that contradict, where the clock was set back
 ROOM = 1.5  # a late row needs a hole of so many usual intervals among the rows that came before it
+REMEDY = "keep one row of each time, or, where the clock was reset, give each stretch its own times"
 NAMED = 5  # times that a finding names one by one
 
 
@@ -64,12 +69,16 @@ def in_order(time_s: FloatArray, values: list[FloatArray], lines: IntArray) -> D
     used = np.setdiff1d(kept, squeezed)
     if len(torn) + len(squeezed) >= FEW * len(time_s) or len(used) < 2:
         return Delivery(everything, refusal=_refusal(time_s, lines, again, torn, squeezed))
+    contradicting = np.union1d(torn, squeezed)
+    row = _set_back(time_s, _usual_step(time_s[kept]), contradicting)
+    if row is not None:
+        return Delivery(everything, refusal=_refusal_of_clock(time_s, lines, row, contradicting))
     late = np.setdiff1d(late, squeezed)
     repairs = (
         (again, f"{_blocks(again)} repeat earlier rows: left out"),
         (late, f"{_blocks(late)} came late or out of order: put in order"),
         (torn, f"{_blocks(torn)} give different values for one time ({_times(time_s, torn)}): none of them is used"),
-        (squeezed, f"{_blocks(squeezed)} came late where earlier rows leave no room, as after a reset clock: not used"),
+        (squeezed, f"{_blocks(squeezed)} came late where earlier rows leave no room: not used"),
     )
     told = tuple((words, float(time_s[k].min()), float(time_s[k].max())) for k, words in repairs if len(k))
     return Delivery(used[np.argsort(time_s[used], kind="stable")], told)
@@ -94,14 +103,32 @@ def _without_room(time_s: FloatArray, kept: IntArray, late: IntArray) -> IntArra
     if not len(late):
         return late
     times = time_s[kept]
-    steps = np.diff(times)
-    # in what was shuffled row by row the steps as delivered say nothing
-    steps = np.diff(np.sort(times)) if (steps < 0.0).sum() > 0.25 * len(steps) else steps[steps > 0.0]
-    usual = float(np.median(steps))
+    usual = _usual_step(times)
     before, after = _neighbours_that_came_before(times)
     inside = (before >= 0) & (after >= 0)
     hole = np.where(inside, times[after] - times[before], np.inf)
     return np.intersect1d(kept[hole < ROOM * usual], late)
+
+
+def _usual_step(times: FloatArray) -> float:
+    """Median step between rows that follow each other; infinite where there are none."""
+    steps = np.diff(times)
+    # in what was shuffled row by row the steps as delivered say nothing
+    steps = np.diff(np.sort(times)) if (steps < 0.0).sum() > 0.25 * len(steps) else steps[steps > 0.0]
+    return float(np.median(steps)) if len(steps) else np.inf
+
+
+def _set_back(time_s: FloatArray, usual: float, contradicting: IntArray) -> int | None:
+    """Row at which time steps back onto rows that it contradicts, and from which it runs on beyond them; or None."""
+    top = np.maximum.accumulate(time_s)
+    old = np.append(False, time_s[1:] <= top[:-1])
+    doubtful = np.isin(np.arange(len(time_s)), contradicting)
+    for first, last in zip(*runs(old), strict=True):
+        goes_on = last + 1 < len(time_s) and time_s[last + 1] - time_s[last] < ROOM * usual
+        back = time_s[first] < time_s[first - 1]
+        if goes_on and back and doubtful[first : last + 1].mean() >= MOSTLY:
+            return int(first)
+    return None
 
 
 def _neighbours_that_came_before(times: FloatArray) -> tuple[IntArray, IntArray]:
@@ -119,24 +146,32 @@ def _neighbours_that_came_before(times: FloatArray) -> tuple[IntArray, IntArray]
     return before, after
 
 
+def _refusal_of_clock(time_s: FloatArray, lines: IntArray, row: int, contradicting: IntArray) -> str:
+    """Why a table is refused whose clock was set back in ``row``."""
+    later = contradicting[contradicting >= row]
+    return (
+        f"{_backwards(time_s, lines, row)}, and the rows run on from there as after a reset clock ({len(later)} of "
+        f"them contradict earlier ones, all later ones may have wrong times); {REMEDY}"
+    )
+
+
+def _backwards(time_s: FloatArray, lines: IntArray, row: int) -> str:
+    step = f"{time_s[row - 1]:.6f} s then {time_s[row]:.6f} s"
+    return f"line {int(lines[row])}: time runs backwards or repeats: {step}"
+
+
 def _refusal(time_s: FloatArray, lines: IntArray, again: IntArray, torn: IntArray, squeezed: IntArray) -> str:
     """Why the table is refused, with the first line at fault."""
-
-    def backwards(row: int) -> str:
-        step = f"{time_s[row - 1]:.6f} s then {time_s[row]:.6f} s"
-        return f"line {int(lines[row])}: time runs backwards or repeats: {step}"
-
-    remedy = "keep one row of each time, or, where the clock was reset, give each stretch its own times"
     if len(torn) and len(torn) >= len(squeezed):
         instants, first = np.unique(time_s[torn], return_index=True)
         row = int(np.setdiff1d(torn, torn[first])[0])
         other = int(torn[first[np.searchsorted(instants, time_s[row])]])
         words = f"with other values than in line {int(lines[other])} ({len(torn)} such rows in all)"
-        return f"{backwards(row)}, {words}; {remedy}"
+        return f"{_backwards(time_s, lines, row)}, {words}; {REMEDY}"
     if len(squeezed):
         words = f"where earlier rows leave no room ({len(squeezed)} such rows in all)"
-        return f"{backwards(int(squeezed[0]))}, {words}; {remedy}"
-    return f"{backwards(int(again[0]))}, with the same values throughout: fewer than two different rows"
+        return f"{_backwards(time_s, lines, int(squeezed[0]))}, {words}; {REMEDY}"
+    return f"{_backwards(time_s, lines, int(again[0]))}, with the same values throughout: fewer than two different rows"
 
 
 def _blocks(rows: IntArray) -> str:

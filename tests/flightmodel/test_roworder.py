@@ -121,17 +121,42 @@ def test_a_clock_that_was_reset_is_refused(phase, back):
         assert f"where earlier rows leave no room ({back} such rows in all)" in delivery.refusal
 
 
-def test_a_clock_that_was_reset_a_little_loses_the_rows_that_nobody_can_place():
+@pytest.mark.parametrize("back", [2.4, 12.0, 12.4])
+def test_a_clock_that_was_reset_a_little_is_refused_for_what_follows(back):
     time_s, values = flight(4000)
-    time_s = np.where(np.arange(4000) < 2000, time_s, time_s - 12.4 * STEP_S)
+    time_s = np.round(np.where(np.arange(4000) < 2000, time_s, time_s - back * STEP_S), 6)
     delivery = in_order(time_s, list(values), 2 + np.arange(4000))
+    assert delivery.refusal.startswith(f"line 2002: time runs backwards or repeats: {time_s[1999]:.6f} s then ")
+    assert f"the rows run on from there as after a reset clock ({int(back)} of them contradict" in delivery.refusal
+    assert "give each stretch its own times" in delivery.refusal
+
+
+@pytest.mark.parametrize("late", [1, 12])
+def test_a_late_block_that_contradicts_and_ends_with_a_jump_is_left_out(late):
+    time_s, values = flight(4000)
+    sent = np.concatenate([time_s[:2000], time_s[2000 - late : 2000] - 0.4 * STEP_S, time_s[2000:]])
+    rows = np.concatenate([np.arange(2000), np.arange(3000, 3000 + late), np.arange(2000, 4000)])
+    whole = in_order(sent[: 2000 + late], list(values[:, rows[: 2000 + late]]), np.arange(2000 + late))
+    sent = np.concatenate([sent[: 2000 + late], sent[2000 + late + 2 :]])  # after what is late comes something new
+    rows = np.concatenate([rows[: 2000 + late], rows[2000 + late + 2 :]])
+    delivery = in_order(sent, list(values[:, rows]), 2 + np.arange(len(sent)))
+    for found in (whole, delivery):
+        assert not found.refusal
+        ((words, low, high),) = found.repairs
+        assert counted(words) == (late, 1)
+        assert "leave no room: not used" in words
+        assert (low, high) == (sent[2000], sent[1999 + late])
+    assert (np.diff(sent[delivery.rows]) > 0.0).all()
+
+
+def test_a_block_sent_again_with_a_few_other_values_is_no_reset_clock():
+    time_s, values = flight(4000)
+    rows = np.concatenate([np.arange(2000), np.arange(1988, 4000)])  # runs on from what was sent again
+    values = values[:, rows]
+    values[0, [2003, 2004]] += 1.0
+    delivery = in_order(time_s[rows], list(values), 2 + np.arange(len(rows)))
     assert not delivery.refusal
-    ((words, low, high),) = delivery.repairs
-    assert counted(words) == (12, 1)
-    assert "reset clock: not used" in words
-    assert (low, high) == (time_s[2000], time_s[2011])
-    assert set(range(4000)) - set(delivery.rows.tolist()) == set(range(2000, 2012))
-    assert (np.diff(time_s[delivery.rows]) > 0.0).all()
+    assert [counted(words)[0] for words, _, _ in delivery.repairs] == [10, 4]
 
 
 @pytest.mark.parametrize("torn", [1, 3, 4, 40])

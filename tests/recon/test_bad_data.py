@@ -238,7 +238,6 @@ NO_CLOCK = "triads have no error of their time tags"
 LONE = "one radar tells little of its own clock, so a sheet that is twenty times too good is believed"
 ONE_SIDED = "a bridge over a clipped peak misses to one side, eight peaks in a row"
 NO_AFTER = "behind the gap too little of the flight is left to bring the attitude back"
-RESET = "the rows after a clock that was set back are used with their wrong times"
 OFF = "q off by 1 deg/s for 2 s; z off by 1 m/s2 for 2 s"
 TAGGED = "swapped, tagged on delivery; stale, tagged on delivery"
 NOT_YET = {
@@ -251,7 +250,6 @@ NOT_YET = {
         ONE_SIDED: "x clipped at 60 %",
         LONE: "lone radar 20 ms late",
         NO_CLOCK: "accelerometer 20 ms late; gyros 20 ms early; force clock jumps 20 ms ahead",
-        RESET: "force clock jumps back 0.1 s",
         NO_SHOCK: f"{OFF}; {TAGGED}",
     },
     "cost": {
