@@ -19,14 +19,16 @@ from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
 from recon import consistency, disagreement, disturbance, ekf, gaps, product, smoother, startup, strapdown
-from recon.beyond_sheet import beyond_sheet, sheet_findings, with_wider_priors
+from recon.beyond_sheet import NOTHING, Learnt, beyond_sheet, sheet_findings, with_wider_priors
 from recon.consistency import Verdict
 from recon.disagreement import LeftOut
+from recon.displaced import Displaced
 from recon.disturbance import Disturbance, disturbed, is_lost, widened
 from recon.packed import unpacked
 from recon.problem import Problem
 from recon.settings import Settings
 from recon.setup import Bridges, build_problem
+from recon.shock import doubtful
 from recon.smoother import Smoothed
 from recon.state import ROTATION, States, boxminus
 from recon.withheld import withheld_table
@@ -76,6 +78,8 @@ class Reconstruction:
     provenance : dict
     left_out : tuple of LeftOut
         What happens without each tracker, where a verdict on one was red.
+    learnt : Learnt
+        What was found of priors and readings, for others that are to be compared with this one.
     """
 
     smoothed: Trajectory
@@ -92,6 +96,7 @@ class Reconstruction:
     findings: tuple[Finding, ...]
     provenance: dict[str, object]
     left_out: tuple[LeftOut, ...] = ()
+    learnt: Learnt = NOTHING
 
     @property
     def settings(self) -> Settings:
@@ -140,7 +145,7 @@ def _with_wider(
     telemetry: Telemetry, settings: Settings, found: Reconstruction, wider: dict[str, float]
 ) -> Reconstruction:
     """Reconstruction that does not hold on to the data sheets its verdicts, which stay, found wrong."""
-    again = reconstruct_once(telemetry, settings, wider=wider)
+    again = reconstruct_once(telemetry, settings, learnt=replace(found.learnt, wider=wider))
     told = sheet_findings(again.sensor_errors, wider, *again.smoothed.time_s[[0, -1]].tolist())
     findings = (*again.findings, *told)
     return replace(again, verdicts=found.verdicts, residuals=found.residuals, findings=findings)
@@ -164,7 +169,7 @@ def _examined(
     def rerun(source: str) -> tuple[Trajectory, tuple[Verdict, ...], bool]:
         report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
         without = replace(settings, without=(*settings.without, source), output_rate_hz=coarse, pulse_rate_hz=0.0)
-        other = reconstruct_once(telemetry, without)
+        other = reconstruct_once(telemetry, without, learnt=found.learnt)
         return other.smoothed, other.verdicts, unknown(other) > unknown(found)
 
     left_out, more = disagreement.leave_each_out(found.smoothed, sources, rerun)
@@ -181,17 +186,23 @@ def reconstruct_once(
     telemetry: Telemetry,
     settings: Settings,
     progress: Progress | None = None,
-    wider: dict[str, float] | None = None,
+    learnt: Learnt = NOTHING,
 ) -> Reconstruction:
     """Reconstruct a flight with the covariance as the filter has it, whatever its verdicts say.
 
-    ``wider`` names errors whose stated standard deviations are too small, and what to take instead.
+    ``learnt`` is what an earlier reconstruction found of the same data; displaced readings are judged where it does
+    not say which to doubt.
     """
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "bridging gaps")
-    bridges = bridge_triads(telemetry)
-    problem = with_wider_priors(build_problem(telemetry, settings, bridges), wider or {})
+    bridges = bridge_triads(telemetry, learnt.doubted or ())
+    problem = with_wider_priors(build_problem(telemetry, settings, bridges), learnt.wider)
     run, smoothed, reference, passes, disturbances = _iterate(problem, settings, report)
+    if learnt.doubted is None:
+        displaced = () if bridges is None else (*bridges.force.displaced, *bridges.rate.displaced)
+        learnt = replace(learnt, doubted=doubtful(problem, run, displaced))
+        if learnt.doubted:
+            return reconstruct_once(telemetry, settings, progress, learnt)
 
     report(0.95, "testing consistency")
     mount = _mounting(telemetry, bridges)
@@ -230,14 +241,16 @@ def reconstruct_once(
             "motion": "ballistic" if problem.motion.ballistic else "strapdown",
             "hashes": dict(telemetry.hashes),
         },
+        learnt=learnt,
     )
 
 
-def bridge_triads(telemetry: Telemetry) -> Bridges | None:
-    """Inertial triads with their gaps bridged; None where the flight has none."""
+def bridge_triads(telemetry: Telemetry, doubted: tuple[Displaced, ...] = ()) -> Bridges | None:
+    """Inertial triads with their gaps bridged, doubted readings with them; None where the flight has none."""
     if telemetry.accelerometer is None or telemetry.rates is None or telemetry.motion.model == "ballistic":
         return None
-    return Bridges(gaps.bridge(telemetry.accelerometer), gaps.bridge(telemetry.rates))
+    force, rate = ([d for d in doubted if d.triad == triad] for triad in (0, 1))
+    return Bridges(gaps.bridge(telemetry.accelerometer, 0, tuple(force)), gaps.bridge(telemetry.rates, 1, tuple(rate)))
 
 
 def _mounting(telemetry: Telemetry, bridges: Bridges | None) -> product.Mounting:

@@ -7,18 +7,38 @@ errors that made it so. The verdicts, which judge what was stated, stay those of
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
 
 from flightmodel.telemetry import Finding
 from recon.consistency import MOST_KEPT_SD, Verdict
+from recon.displaced import Displaced
 from recon.problem import Problem
 from recon.state import KINEMATIC
 
 SHEET = "data sheet "
 TIMES = 3.0  # what was found: wide enough not to pull, for what was found was already pulled
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What a reconstruction learnt of the data that others of the same flight, to be compared with it, start from.
+
+    Parameters
+    ----------
+    wider : dict
+        Errors whose stated standard deviations are too small, and what to take instead.
+    doubted : tuple of Displaced or None
+        Readings that jump away and back and are not believed; None where that is still to be found out.
+    """
+
+    wider: dict[str, float] = field(default_factory=dict)
+    doubted: tuple[Displaced, ...] | None = None
+
+
+NOTHING = Learnt()
 
 
 def beyond_sheet(verdicts: tuple[Verdict, ...], table: pd.DataFrame) -> dict[str, float]:
@@ -47,6 +67,8 @@ def with_wider_priors(problem: Problem, wider: dict[str, float]) -> Problem:
     """Problem whose start knows less of the errors named."""
     covariance = problem.start_covariance.copy()
     for name, sd in wider.items():
+        if name not in problem.model.names:
+            continue  # of an instrument that takes no part this time
         k = problem.model.names.index(name)
         covariance[KINEMATIC + k, KINEMATIC + k] += max(0.0, sd**2 - float(problem.model.prior_sd[k]) ** 2)
     return replace(problem, start_covariance=covariance)
@@ -64,4 +86,5 @@ def sheet_findings(table: pd.DataFrame, wider: dict[str, float], start_s: float,
             end_s,
         )
         for name in wider
+        if name in rows.index
     ]

@@ -1,14 +1,16 @@
 """One inertial triad without its missing samples, and what bridging them costs.
 
 White noise of ``sd`` per sample at ``rate`` hertz drives the integrals with density ``sd^2 / rate``; quantisation adds
-``resolution^2 / 12`` to the variance of a sample. Missing are samples without a value and, axis by axis, those that are
-`recon.stuck`. What counts as a gap is told by the samples nearby: a logger may change its rate in flight. Between slow
-samples the straight line misses about a twelfth of their second difference.
+``resolution^2 / 12`` to the variance of a sample. Missing are samples without a value, blocks that repeat others and,
+axis by axis, samples that are stuck (`recon.stuck`) or displaced (`recon.displaced`). What counts as a gap is told by
+the samples nearby: a logger may change its rate in flight. Between slow samples the straight line misses about a
+twelfth of their second difference.
 
 A gap is bridged by a cubic that meets level and slope on both sides, or, where the signal swings, by a line from the
 mean before to the mean after. What either may miss is measured, not guessed: the same bridge is laid over pieces of the
 same length in the neighbouring good data, and the scatter E of its integral there, from the worse side, becomes the
-density ``E^2 / length`` inside the gap. The bridge that misses less is taken, axis by axis.
+density ``E^2 / length`` inside the gap. The bridge that misses less is taken, axis by axis. Displaced samples may be
+right for all that: there, the square of what the bridge differs from them adds to ``E^2``.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import numpy as np
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import Finding, TriadRecord
+from recon.displaced import Displaced, displaced_runs, repeated_samples
 from recon.stuck import stuck_samples
 
 SLOPE_SPAN_S = 0.06
@@ -42,6 +45,9 @@ class Bridged:
         White-noise density from each time to the next, body axes.
     in_gap : (n,) bool
         Whether the interval from each time to the next lies in a gap of any axis.
+    findings : tuple of Finding
+    displaced : tuple of Displaced
+        Samples, believed or not, that jump away and back.
     """
 
     spec: TriadSpec
@@ -50,10 +56,19 @@ class Bridged:
     density: FloatArray
     in_gap: BoolArray
     findings: tuple[Finding, ...]
+    displaced: tuple[Displaced, ...] = ()
 
 
-def bridge(record: TriadRecord) -> Bridged:
+def bridge(record: TriadRecord, triad: int = 0, doubted: tuple[Displaced, ...] = ()) -> Bridged:
     """Bridge the gaps of one triad and say where noise grows with them.
+
+    Parameters
+    ----------
+    record : TriadRecord
+    triad : int
+        0 for the accelerometer, 1 for the gyros.
+    doubted : tuple of Displaced
+        Displaced samples that are not believed; all others are.
 
     Raises
     ------
@@ -62,6 +77,8 @@ def bridge(record: TriadRecord) -> Bridged:
     """
     spec = record.spec
     t, x, good, findings = _usable(record)
+    displaced = _displaced(spec, t, x, good, triad)
+    suspect = _doubt(t, x, good, [d for d in doubted if d in displaced], findings, spec.name)
     grid = _with_bridges(t)
     column, density = np.empty((len(grid), 3)), np.empty((len(grid), 3))
     in_gap = np.zeros(len(grid), dtype=bool)
@@ -69,7 +86,9 @@ def bridge(record: TriadRecord) -> Bridged:
     masks: list[BoolArray] = list(np.unique(good, axis=1).T)  # axes that miss the same samples are bridged together
     for mask in masks:
         axes = np.flatnonzero((good == mask[:, None]).all(axis=0))
-        column[:, axes], density[:, axes], gaps, missed = _bridge_axes(spec, t[mask], x[np.ix_(mask, axes)], grid)
+        column[:, axes], density[:, axes], gaps, missed = _bridge_axes(
+            spec, t[mask], x[np.ix_(mask, axes)], grid, (t, suspect[:, axes])
+        )
         in_gap |= gaps
         for span, sizes in missed.items():
             told.setdefault(span, {}).update(zip((AXES[a] for a in axes), sizes, strict=True))
@@ -79,13 +98,14 @@ def bridge(record: TriadRecord) -> Bridged:
         words = f"no {which} for {end - start:.3f} s, bridged; integral over the gap uncertain by "
         words += ", ".join(f"{lost[a]:.3g}" for a in sorted(lost)) + f" (SI; sensor {names})"
         findings.append(Finding(spec.name, words, start, end))
-    return Bridged(spec, grid, column, density @ (spec.dcm_body_sensor**2).T, in_gap, tuple(findings))
+    return Bridged(spec, grid, column, density @ (spec.dcm_body_sensor**2).T, in_gap, tuple(findings), displaced)
 
 
 def _usable(record: TriadRecord) -> tuple[FloatArray, FloatArray, BoolArray, list[Finding]]:
     """Times, samples and which of them are good (n, 3), from the first to the last time that every axis tells."""
     t, x, spec = record.time_s, record.measured_sensor, record.spec
     good = np.isfinite(x)
+    findings = _left_out_as_repeated(spec, t, x, good)
     for axis in range(3):
         there = np.flatnonzero(good[:, axis])
         good[there, axis] = ~stuck_samples(x[there, axis], spec.noise_sd)
@@ -98,12 +118,50 @@ def _usable(record: TriadRecord) -> tuple[FloatArray, FloatArray, BoolArray, lis
     first, last = max(int(k[0]) for k in inside), min(int(k[-1]) for k in inside)
     rows = np.arange(len(t))
     rows = rows[(rows >= first) & (rows <= last) & good.any(axis=1)]
-    findings = []
     ended = [AXES[a] for a in range(3) if np.isfinite(x[last + 1 :, a]).any() and inside[a][-1] == last]
     if ended and last < len(t) - LEAST_SAMPLES:
         words = f"{', '.join(ended)} holds one value to the end of the record: the trajectory ends before it"
         findings.append(Finding(spec.name, words, float(t[last]), float(t[-1])))
     return t[rows], x[rows], good[rows], findings
+
+
+def _displaced(spec: TriadSpec, t: FloatArray, x: FloatArray, good: BoolArray, triad: int) -> tuple[Displaced, ...]:
+    """All runs of good samples (n, 3) that jump away and back."""
+    out = []
+    for axis in range(3):
+        rows = np.flatnonzero(good[:, axis])
+        for a, b, offset in displaced_runs(t[rows], x[rows, axis], spec.noise_sd):
+            out.append(Displaced(triad, axis, float(t[rows[a]]), float(t[rows[b]]), offset))
+    return tuple(out)
+
+
+def _doubt(
+    t: FloatArray, x: FloatArray, good: BoolArray, doubted: list[Displaced], findings: list[Finding], name: str
+) -> FloatArray:
+    """Take doubted samples out of ``good`` (n, 3), in place, and return them; NaN where there is none (n, 3)."""
+    out = np.full(x.shape, np.nan)
+    for d in doubted:
+        rows = np.flatnonzero((t >= d.start_s) & (t <= d.end_s) & good[:, d.axis])
+        out[rows, d.axis], good[rows, d.axis] = x[rows, d.axis], False
+        words = f"{AXES[d.axis]} jumps by about {d.offset:.3g} (SI) and back: not used, but reckoned with"
+        findings.append(Finding(name, words, d.start_s, d.end_s))
+    return out
+
+
+def _left_out_as_repeated(spec: TriadSpec, t: FloatArray, x: FloatArray, good: BoolArray) -> list[Finding]:
+    """Take blocks of samples that repeat others out of ``good`` (n, 3), in place; one finding for each."""
+    whole = np.flatnonzero(good.all(axis=1))
+    repeated, blocks = repeated_samples(x[whole], spec.noise_sd)
+    good[whole[repeated]] = False
+    return [
+        Finding(
+            spec.name,
+            f"{b - a + 1} samples repeat those from {t[whole[a0]]:.3f} s on under other times: not used",
+            float(t[whole[a]]),
+            float(t[whole[b]]),
+        )
+        for a, b, a0 in blocks
+    ]
 
 
 def _with_bridges(t: FloatArray) -> FloatArray:
@@ -118,7 +176,7 @@ def _with_bridges(t: FloatArray) -> FloatArray:
 
 
 def _bridge_axes(
-    spec: TriadSpec, t: FloatArray, x: FloatArray, grid: FloatArray
+    spec: TriadSpec, t: FloatArray, x: FloatArray, grid: FloatArray, doubted: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray, BoolArray, dict[tuple[float, float], FloatArray]]:
     """Samples (n, k) on the grid, densities (n, k) in sensor axes, gaps (n,), and what each long bridge may miss."""
     step = np.diff(t)
@@ -132,13 +190,25 @@ def _bridge_axes(
     missed = {}
     for k in np.flatnonzero(step > LONG_GAP * usual).tolist():
         sizes, swings = _missed_sd(t, x, k, step[k])
-        density[k] += sizes**2 / step[k]
-        missed[float(t[k]), float(t[k + 1])] = sizes
         a, b = np.searchsorted(grid, [t[k], t[k + 1]])
         cubic, line = _bridges(t, x, k, k + 1, grid[a + 1 : b])
         column[a + 1 : b] = np.where(swings, line, cubic)
+        sizes = np.hypot(sizes, _differs(*doubted, grid[a : b + 1], column[a : b + 1]))
+        density[k] += sizes**2 / step[k]
+        missed[float(t[k]), float(t[k + 1])] = sizes
     held = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
     return column, density[held], wide[held], missed
+
+
+def _differs(time_s: FloatArray, doubted: FloatArray, grid: FloatArray, bridge: FloatArray) -> FloatArray:
+    """Integral (k,) over a gap of what doubted samples (m, k), where there are any, differ from its bridge (g, k)."""
+    a, b = np.searchsorted(time_s, [grid[0], grid[-1]], side="right")
+    t, values = time_s[a : b - 1], doubted[a : b - 1]
+    if len(t) == 0:
+        return np.zeros(bridge.shape[1])
+    apart = values - np.column_stack([np.interp(t, grid, axis) for axis in bridge.T])
+    step = (grid[-1] - grid[0]) / (len(t) + 1)
+    return np.asarray(np.abs(np.nansum(apart, axis=0)) * step)
 
 
 def usual_steps(step: FloatArray) -> FloatArray:

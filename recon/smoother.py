@@ -195,7 +195,7 @@ def bryson_frazier(
         for row in reversed(range(first[k], first[k + 1])):
             if not v.accepted[row]:
                 continue
-            used, h = _read(observed, slots, v, row, size)
+            used, h = read(observed, slots, v, row, size)
             weight = h.T @ np.linalg.inv(v.covariance[row][np.ix_(used, used)])
             rest = np.eye(size) - v.gain[row][:, used] @ h
             mean = rest.T @ mean - weight @ v.residual[row, used]
@@ -208,7 +208,7 @@ def bryson_frazier(
             mean, information = f.T @ mean, f.T @ information @ f
 
 
-def _read(
+def read(
     observed: Observed, slots: IntArray, innovations: Innovations, row: int, size: int
 ) -> tuple[IntArray, FloatArray]:
     """Which components a measurement has, and their partials by all errors (k, N)."""
@@ -240,7 +240,7 @@ def two_filter(
         for row in reversed(range(first[k], first[k + 1])):
             if not v.accepted[row]:
                 continue
-            used, h = _read(observed, slots, v, row, size)
+            used, h = read(observed, slots, v, row, size)
             weight, y = h.T / observed.variance[row, used], v.residual[row, used]
             mean = mean + information @ (v.gain[row][:, used] @ y) + weight @ y
             information = information + weight @ h

@@ -42,7 +42,7 @@ def stuck_samples(column: FloatArray, noise_sd: float) -> BoolArray:
     if not len(first):
         out[:] = bool(len(column) >= LEAST_SAMPLES and same.all() and noise_sd > 0.0)
         return out
-    chance = np.maximum(_repeat_by_noise(column, noise_sd), _repeat_nearby(same, first, last))
+    chance = np.maximum(repeat_by_noise(column, noise_sd), _repeat_nearby(same, first, last))
     with np.errstate(divide="ignore"):
         surprise = (last - first) * np.log(chance)
     at_stop = (column[first] == np.nanmin(column)) | (column[first] == np.nanmax(column))
@@ -53,7 +53,7 @@ def stuck_samples(column: FloatArray, noise_sd: float) -> BoolArray:
     return out
 
 
-def _repeat_by_noise(column: FloatArray, noise_sd: float) -> float:
+def repeat_by_noise(column: FloatArray, noise_sd: float) -> float:
     """Largest probability that noise leaves a reading where it is."""
     if noise_sd <= 0.0:
         return 1.0

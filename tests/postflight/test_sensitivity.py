@@ -13,6 +13,7 @@ from postflight import sensitivity as module
 from postflight.pipeline import flight_from, reconstruct_flight, reconstruct_telemetry
 from postflight.sensitivity import COLUMNS, UNITS, largest_of_groups, reruns, sensitivity
 from recon.bet import Settings, reconstruct_once
+from recon.beyond_sheet import Learnt
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,7 @@ def test_the_only_tracker_is_refused_in_words_and_the_rest_goes_on(short):
 
 
 def test_a_rerun_that_diverges_is_a_row_with_its_reason(pulse, monkeypatch):
-    def fails(telemetry, settings):
+    def fails(telemetry, settings, learnt):
         raise GateError("left the atmosphere")
 
     monkeypatch.setattr(module, "reconstruct_once", fails)
@@ -128,3 +129,21 @@ def test_command_writes_table_and_figure(command, flight):
     assert (run / "sensitivity.csv").read_text().startswith("rerun,quantity,unit,t_s,base")
     assert (run / "figures" / "sensitivity.png").stat().st_size > 10_000
     assert "winds off" in done.stdout
+
+
+def test_reruns_start_from_what_the_base_learnt(pulse, monkeypatch):
+    """A base with a wide prior less a rerun with a narrow one would be a difference of priors."""
+    learnt = Learnt({"accelerometer scale x": 0.05}, ())
+    base = replace(pulse, reconstruction=replace(pulse.reconstruction, learnt=learnt))
+    seen = []
+
+    def spy(telemetry, settings, learnt):
+        seen.append(learnt)
+        return reconstruct_once(telemetry, settings, learnt=learnt)
+
+    monkeypatch.setattr(module, "reconstruct_once", spy)
+    found = sensitivity(base)
+    assert seen == [learnt, learnt]
+    wide = rows(found, "without north")
+    narrow = rows(sensitivity(pulse), "without north")
+    assert wide.loc["velocity down", "change"] != narrow.loc["velocity down", "change"]
