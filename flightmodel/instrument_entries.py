@@ -74,6 +74,7 @@ class TriadEntry(Mounted):
     bias_wander_sd_mps2: SdOrNone = 0.0
     scale_sd: NonNegative = 0.003
     mount_sd_deg: NonNegative = 0.2
+    time_bias_sd_s: NonNegative = 0.001
     resolution_mps2: NonNegative = 0.0
 
 
@@ -85,6 +86,7 @@ class RatesEntry(Mounted):
     bias_wander_sd_degps: SdOrNone = 0.0
     scale_sd: NonNegative = 0.003
     mount_sd_deg: NonNegative = 0.15
+    time_bias_sd_s: NonNegative = 0.001
     resolution_degps: NonNegative = 0.0
 
 

@@ -31,6 +31,8 @@ class TriadSpec:
     bias_wander_sd, bias_time_constant_s : float
         A second part of the bias that varies slowly (Gauss-Markov): its standard deviation, in the triad's unit, and
         time constant; 0 for none.
+    time_bias_sd_s : float
+        Of its clock: time tag minus true time, constant over a flight.
     """
 
     name: str
@@ -44,6 +46,7 @@ class TriadSpec:
     soft_iron_sd: float = 0.0
     bias_wander_sd: float = 0.0
     bias_time_constant_s: float = np.inf
+    time_bias_sd_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,7 @@ def _triad_spec(name: str, source: Triad, place_m: FloatArray, dcm: FloatArray) 
         soft_iron,
         float(wander),
         source.bias_time_constant_s if wander > 0.0 else np.inf,
+        0.0 if isinstance(source, MagnetometerEntry) else source.time_bias_sd_s,
     )
 
 

@@ -2,7 +2,7 @@
 
 Readable twin: `recon.strapdown`, which also states the model. Kernels take what the twin takes, as plain arrays, and
 check nothing. Error columns, 27 in all: position, velocity, rotation, then bias, scale and mount of the
-accelerometer, then of the gyros.
+accelerometer, then of the gyros; and two more, their clocks, where these may err.
 """
 
 from __future__ import annotations
@@ -76,14 +76,15 @@ def mount_matrices(dcm_body_sensor, mount, body_actual, body_mount):
 
 
 @inlined
-def correct_sample(before, after, errors, offset, body_actual, body_mount, value, change, columns):
+def correct_sample(before, after, errors, offset, late, body_actual, body_mount, value, change, columns):
     """Mean of two samples in body axes into ``value`` (3,), with partials in ``columns`` (3, 9); ``change`` (3,) too.
 
-    ``errors[offset:offset + 6]`` are bias and scale of the triad; ``change`` is the second sample less the first.
+    ``errors[offset:offset + 6]`` are bias and scale of the triad; ``late`` says by what part of the step its tags are;
+    ``change`` is the second sample less the first.
     """
     for j in range(3):
         gain = 1.0 / (1.0 + errors[offset + 3 + j])
-        actual = (0.5 * (before[j] + after[j]) - errors[offset + j]) * gain
+        actual = (0.5 * (before[j] + after[j]) + late * (after[j] - before[j]) - errors[offset + j]) * gain
         for i in range(3):
             columns[i, j] = -body_actual[i, j] * gain
             columns[i, 3 + j] = columns[i, j] * actual
@@ -91,8 +92,9 @@ def correct_sample(before, after, errors, offset, body_actual, body_mount, value
         value[i] = 0.0
         change[i] = 0.0
         for j in range(3):
-            value[i] -= columns[i, j] * (0.5 * (before[j] + after[j]) - errors[offset + j])
-            change[i] -= columns[i, j] * (after[j] - before[j])
+            difference = after[j] - before[j]
+            value[i] -= columns[i, j] * (0.5 * (before[j] + after[j]) + late * difference - errors[offset + j])
+            change[i] -= columns[i, j] * difference
     for j in range(3):
         cross_into(body_mount[:, j], value, columns[:, 6 + j])
 
@@ -117,22 +119,27 @@ def coning_and_sculling(force, d_force, rate, d_rate, dt):
 
 
 @inlined
-def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradient, turned, pushed, moved):
-    """Carry the 27 columns of ``phi`` (9, 27) over one step; ``turned``, ``pushed``, ``moved`` (3, 27) are scratch.
+def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, turned, pushed, moved):
+    """Carry the columns of ``phi`` (9, 27 or 29) over one step; ``turned``, ``pushed``, ``moved`` (3, ...) are scratch.
 
-    Along rows, which lie side by side in memory: the compiler puts several columns into one instruction.
+    ``by_clock`` (2, 3) is what force and rate change in a second. Along rows, which lie side by side in memory: the
+    compiler puts several columns into one instruction.
     """
+    width = phi.shape[1]
     h, two_omega = 0.5 * dt, 2.0 * OMEGA_WGS84
     for i in range(3):
         a, b, c = half_turn[0, i], half_turn[1, i], half_turn[2, i]
-        for j in range(27):
+        for j in range(width):
             turned[i, j] = a * phi[6, j] + b * phi[7, j] + c * phi[8, j]
             moved[i, j] = turned[i, j]
         for j in range(9):
             moved[i, 18 + j] += h * d_rate[i, j]
             turned[i, 18 + j] += dt * d_rate[i, j]
+        if width > 27:
+            moved[i, 28] += h * by_clock[1, i]
+            turned[i, 28] += dt * by_clock[1, i]
     f0, f1, f2 = force[0], force[1], force[2]
-    for j in range(27):
+    for j in range(width):
         m0, m1, m2 = moved[0, j], moved[1, j], moved[2, j]
         pushed[0, j] = m1 * f2 - m2 * f1
         pushed[1, j] = m2 * f0 - m0 * f2
@@ -140,21 +147,23 @@ def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradien
     for i in range(3):
         for j in range(9):
             pushed[i, 9 + j] += d_force[i, j]
+        if width > 27:
+            pushed[i, 27] += by_clock[0, i]
     for i in range(3):
         a, b, c = dcm_mid[i, 0], dcm_mid[i, 1], dcm_mid[i, 2]
         x, y, z = gradient[i, 0], gradient[i, 1], gradient[i, 2]
-        for j in range(27):
+        for j in range(width):
             moved[i, j] = (
                 a * pushed[0, j] + b * pushed[1, j] + c * pushed[2, j]
                 + x * (phi[0, j] + h * phi[3, j]) + y * (phi[1, j] + h * phi[4, j]) + z * (phi[2, j] + h * phi[5, j])
             )  # fmt: skip
-    for j in range(27):
+    for j in range(width):
         vx, vy = phi[3, j] + h * moved[0, j], phi[4, j] + h * moved[1, j]
         moved[0, j] += two_omega * vy
         moved[1, j] -= two_omega * vx
     for i in range(3):
         a, b, c = half_turn[0, i], half_turn[1, i], half_turn[2, i]
-        for j in range(27):
+        for j in range(width):
             phi[i, j] += dt * (phi[3 + i, j] + h * moved[i, j])
             phi[3 + i, j] += dt * moved[i, j]
             phi[6 + i, j] = a * turned[0, j] + b * turned[1, j] + c * turned[2, j]
@@ -253,8 +262,8 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
 def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise):
     """Carry a state in place from grid point ``first`` to ``last`` (either direction) with ``phi`` and ``noise``.
 
-    ``phi`` (9, 27) and ``noise`` (9, 9) come as the identity and zero. Densities hold from a grid point to the next
-    later one.
+    ``phi`` (9, 27), or (9, 29) with clocks, and ``noise`` (9, 9) come as the identity and zero. Densities hold from a
+    grid point to the next later one.
     """
     force_actual, force_mount = np.empty((3, 3)), np.empty((3, 3))
     rate_actual, rate_mount = np.empty((3, 3)), np.empty((3, 3))
@@ -264,16 +273,23 @@ def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi,
     force_change, rate_change = np.empty(3), np.empty(3)
     d_force, d_rate = np.empty((3, 9)), np.empty((3, 9))
     half_turn, dcm_mid, gradient = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    turned, pushed, moved = np.empty((3, 27)), np.empty((3, 27)), np.empty((3, 27))
+    width = phi.shape[1]
+    turned, pushed, moved = np.empty((3, width)), np.empty((3, width)), np.empty((3, width))
+    late_force, late_rate, by_clock = 0.0, 0.0, np.zeros((2, 3))
+    if width > 27:
+        late_force, late_rate = errors[18], errors[19]
     f, w = motion.force_sensor_mps2, motion.rate_sensor_radps
     step = 1 if last >= first else -1
     for k in range(first, last, step):
         n = k + step
         dt = motion.time_s[n] - motion.time_s[k]
         j = min(k, n)
-        correct_sample(f[k], f[n], errors, 0, force_actual, force_mount, force, force_change, d_force)
-        correct_sample(w[k], w[n], errors, 9, rate_actual, rate_mount, rate, rate_change, d_rate)
+        a, b = late_force / dt, late_rate / dt
+        correct_sample(f[k], f[n], errors, 0, a, force_actual, force_mount, force, force_change, d_force)
+        correct_sample(w[k], w[n], errors, 9, b, rate_actual, rate_mount, rate, rate_change, d_rate)
+        for i in range(3):
+            by_clock[0, i], by_clock[1, i] = force_change[i] / dt, rate_change[i] / dt
         coning_and_sculling(force, force_change, rate, rate_change, dt)
         advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient)
-        advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, gradient, turned, pushed, moved)
+        advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, turned, pushed, moved)
         advance_noise(noise, dt, half_turn, dcm_mid, force, motion.force_density[j], motion.rate_density[j])

@@ -52,8 +52,8 @@ def ballistic_motion(
         density[(t >= start) & (t < end)] += spec.powered_sd_mps2**2 * POWERED_CORRELATION_S
     still = np.zeros((len(t), 3))
     motion = Motion(
-        True, t, still, still, density, still, np.eye(3), np.eye(3), air_table(sounding), AIR_FROM_M, AIR_STEP_M,
-        spec.drag_area_per_mass_m2pkg,
+        True, t, still, still, density, still, np.eye(3), np.eye(3), False, air_table(sounding), AIR_FROM_M,
+        AIR_STEP_M, spec.drag_area_per_mass_m2pkg,
     )  # fmt: skip
     return motion, np.searchsorted(t, node_time_s).astype(np.int64)
 

@@ -144,6 +144,13 @@ def triad_blocks(spec: TriadSpec, unit: str) -> list[Block]:
     ]
 
 
+def clock_blocks(force: TriadSpec, rate: TriadSpec) -> list[Block]:
+    """Time biases of both triads; none where neither may err."""
+    if max(force.time_bias_sd_s, rate.time_bias_sd_s) <= 0.0:
+        return []
+    return [Block(spec.name, ("time bias",), "s", max(spec.time_bias_sd_s, 1e-9)) for spec in (force, rate)]
+
+
 def ballistic_blocks(motion: MotionSpec) -> list[Block]:
     """Drivers of ballistic flight; density and winds in units of the sounding's standard deviations."""
     tau = motion.drag_time_constant_s

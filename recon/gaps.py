@@ -10,12 +10,15 @@ A gap is bridged by a cubic that meets level and slope on both sides, or, where 
 mean before to the mean after. What either may miss is measured, not guessed: the same bridge is laid over pieces of the
 same length in the neighbouring good data, and the scatter E of its integral there, from the worse side, becomes the
 density ``E^2 / length`` inside the gap. The bridge that misses less is taken, axis by axis. Displaced samples may be
-right for all that: there, the square of what the bridge differs from them adds to ``E^2``.
+right for all that: there, the square of what the bridge differs from them adds to ``E^2``. At a stop every bridge
+misses to one side, all of ``n`` alike, so that their sum errs by ``n E`` and not by the root of ``n`` times ``E``: each
+counts ``n`` times.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +26,7 @@ from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import Finding, TriadRecord
 from recon.displaced import Displaced, displaced_runs, repeated_samples
+from recon.state import IntArray
 from recon.stuck import stuck_samples
 
 SLOPE_SPAN_S = 0.06
@@ -59,6 +63,14 @@ class Bridged:
     displaced: tuple[Displaced, ...] = ()
 
 
+class Unused(NamedTuple):
+    """What is bridged: all times (n,), doubted values, else NaN, and at which stop samples are, 0 none (both n, k)."""
+
+    time_s: FloatArray
+    doubted: FloatArray
+    stop: IntArray
+
+
 def bridge(record: TriadRecord, triad: int = 0, doubted: tuple[Displaced, ...] = ()) -> Bridged:
     """Bridge the gaps of one triad and say where noise grows with them.
 
@@ -79,6 +91,7 @@ def bridge(record: TriadRecord, triad: int = 0, doubted: tuple[Displaced, ...] =
     t, x, good, findings = _usable(record)
     displaced = _displaced(spec, t, x, good, triad)
     suspect = _doubt(t, x, good, [d for d in doubted if d in displaced], findings, spec.name)
+    stop = _at_a_stop(x, good)
     grid = _with_bridges(t)
     column, density = np.empty((len(grid), 3)), np.empty((len(grid), 3))
     in_gap = np.zeros(len(grid), dtype=bool)
@@ -87,7 +100,7 @@ def bridge(record: TriadRecord, triad: int = 0, doubted: tuple[Displaced, ...] =
     for mask in masks:
         axes = np.flatnonzero((good == mask[:, None]).all(axis=0))
         column[:, axes], density[:, axes], gaps, missed = _bridge_axes(
-            spec, t[mask], x[np.ix_(mask, axes)], grid, (t, suspect[:, axes])
+            spec, t[mask], x[np.ix_(mask, axes)], grid, Unused(t, suspect[:, axes], stop[:, axes])
         )
         in_gap |= gaps
         for span, sizes in missed.items():
@@ -98,7 +111,8 @@ def bridge(record: TriadRecord, triad: int = 0, doubted: tuple[Displaced, ...] =
         words = f"no {which} for {end - start:.3f} s, bridged; integral over the gap uncertain by "
         words += ", ".join(f"{lost[a]:.3g}" for a in sorted(lost)) + f" (SI; sensor {names})"
         findings.append(Finding(spec.name, words, start, end))
-    return Bridged(spec, grid, column, density @ (spec.dcm_body_sensor**2).T, in_gap, tuple(findings), displaced)
+    density = density @ (spec.dcm_body_sensor**2).T
+    return Bridged(spec, grid, column, density, in_gap, tuple(findings), displaced)
 
 
 def _usable(record: TriadRecord) -> tuple[FloatArray, FloatArray, BoolArray, list[Finding]]:
@@ -176,7 +190,7 @@ def _with_bridges(t: FloatArray) -> FloatArray:
 
 
 def _bridge_axes(
-    spec: TriadSpec, t: FloatArray, x: FloatArray, grid: FloatArray, doubted: tuple[FloatArray, FloatArray]
+    spec: TriadSpec, t: FloatArray, x: FloatArray, grid: FloatArray, unused: Unused
 ) -> tuple[FloatArray, FloatArray, BoolArray, dict[tuple[float, float], FloatArray]]:
     """Samples (n, k) on the grid, densities (n, k) in sensor axes, gaps (n,), and what each long bridge may miss."""
     step = np.diff(t)
@@ -188,22 +202,38 @@ def _bridge_axes(
     density[:-1][wide[:-1]] = sample_var * step[wide[:-1], None]
     column = np.column_stack([np.interp(grid, t, axis) for axis in x.T])
     missed = {}
-    for k in np.flatnonzero(step > LONG_GAP * usual).tolist():
+    gaps = np.flatnonzero(step > LONG_GAP * usual)
+    alike = _missed_alike(unused, t[gaps], t[gaps + 1])
+    for k, times in zip(gaps.tolist(), alike, strict=True):
         sizes, swings = _missed_sd(t, x, k, step[k])
         a, b = np.searchsorted(grid, [t[k], t[k + 1]])
         cubic, line = _bridges(t, x, k, k + 1, grid[a + 1 : b])
         column[a + 1 : b] = np.where(swings, line, cubic)
-        sizes = np.hypot(sizes, _differs(*doubted, grid[a : b + 1], column[a : b + 1]))
+        sizes = np.hypot(sizes, _differs(unused, grid[a : b + 1], column[a : b + 1])) * np.sqrt(times)
         density[k] += sizes**2 / step[k]
         missed[float(t[k]), float(t[k + 1])] = sizes
     held = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
     return column, density[held], wide[held], missed
 
 
-def _differs(time_s: FloatArray, doubted: FloatArray, grid: FloatArray, bridge: FloatArray) -> FloatArray:
-    """Integral (k,) over a gap of what doubted samples (m, k), where there are any, differ from its bridge (g, k)."""
-    a, b = np.searchsorted(time_s, [grid[0], grid[-1]], side="right")
-    t, values = time_s[a : b - 1], doubted[a : b - 1]
+def _at_a_stop(x: FloatArray, good: BoolArray) -> IntArray:
+    """1 and -1 where samples (n, 3) that are not good stand at the largest and smallest value of their column."""
+    stands = np.isfinite(x) & ~good
+    high, low = stands & (x == np.nanmax(x, axis=0)), stands & (x == np.nanmin(x, axis=0))
+    return high.astype(np.int64) - low.astype(np.int64)
+
+
+def _missed_alike(unused: Unused, start_s: FloatArray, end_s: FloatArray) -> IntArray:
+    """How many gaps (g, k) from ``start_s`` to ``end_s`` are missed to the same side as each: those at one stop."""
+    middle = np.searchsorted(unused.time_s, 0.5 * (start_s + end_s)) - 1
+    side = unused.stop[middle]
+    return np.where(side > 0, (side > 0).sum(axis=0), np.where(side < 0, (side < 0).sum(axis=0), 1))
+
+
+def _differs(unused: Unused, grid: FloatArray, bridge: FloatArray) -> FloatArray:
+    """Integral (k,) over a gap of what doubted samples, where there are any, differ from its bridge (g, k)."""
+    a, b = np.searchsorted(unused.time_s, [grid[0], grid[-1]], side="right")
+    t, values = unused.time_s[a : b - 1], unused.doubted[a : b - 1]
     if len(t) == 0:
         return np.zeros(bridge.shape[1])
     apart = values - np.column_stack([np.interp(t, grid, axis) for axis in bridge.T])

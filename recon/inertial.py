@@ -30,7 +30,9 @@ def unbent(time_s: FloatArray, samples: FloatArray) -> FloatArray:
     return out
 
 
-def inertial_motion(force: Bridged, rate: Bridged, node_time_s: FloatArray) -> tuple[Motion, IntArray]:
+def inertial_motion(
+    force: Bridged, rate: Bridged, node_time_s: FloatArray, clocks: bool = False
+) -> tuple[Motion, IntArray]:
     """Both triads from first to last node, on the faster one's times and the nodes', and each node's index."""
     first, last = node_time_s[0], node_time_s[-1]
     finer = rate if np.median(np.diff(rate.time_s)) < 0.9 * np.median(np.diff(force.time_s)) else force
@@ -48,6 +50,7 @@ def inertial_motion(force: Bridged, rate: Bridged, node_time_s: FloatArray) -> t
         _held(t, rate),
         force.spec.dcm_body_sensor,
         rate.spec.dcm_body_sensor,
+        clocks,
     )
     return motion, np.searchsorted(t, node_time_s).astype(np.int64)
 

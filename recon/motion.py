@@ -1,7 +1,8 @@
 """What carries a state from one moment to another: inertial sensors, or a ballistic model of drag in the day's air.
 
 Both drive the nine kinematic errors (position, velocity, rotation) through a few *drivers*, errors that the motion
-depends on: with inertial sensors their bias, scale and mount, 18 in all; in ballistic flight drag, side forces, density
+depends on: with inertial sensors their bias, scale and mount, 18 in all, and the errors of their clocks, 2, where such
+are stated; in ballistic flight drag, side forces, density
 and winds, 6 in all, and rotation stands still. So one filter serves both. Models and readable twins:
 `recon.strapdown`, `recon.ballistic`.
 """
@@ -14,7 +15,7 @@ import numpy as np
 
 from flightmodel.checks import FloatArray
 
-STRAPDOWN_DRIVERS, BALLISTIC_DRIVERS = 18, 6
+STRAPDOWN_DRIVERS, CLOCKS, BALLISTIC_DRIVERS = 18, 2, 6
 
 
 class Inertial(NamedTuple):
@@ -53,6 +54,8 @@ class Motion(NamedTuple):
         ballistic flight along Earth-fixed axes.
     dcm_body_force, dcm_body_rate : (3, 3) float
         Nominal mountings.
+    clocks : bool
+        Whether the clocks of accelerometer and gyros may err.
     air : (a, 5) float
         Logarithm of density, wind north and east, sd of density's logarithm, sd of wind, at equally spaced altitudes.
     air_from_m, air_step_m : float
@@ -69,6 +72,7 @@ class Motion(NamedTuple):
     rate_density: FloatArray
     dcm_body_force: FloatArray
     dcm_body_rate: FloatArray
+    clocks: bool
     air: FloatArray
     air_from_m: float
     air_step_m: float
@@ -82,7 +86,7 @@ class Motion(NamedTuple):
     @property
     def drivers(self) -> int:
         """Number of errors that the motion depends on."""
-        return BALLISTIC_DRIVERS if self.ballistic else STRAPDOWN_DRIVERS
+        return BALLISTIC_DRIVERS if self.ballistic else STRAPDOWN_DRIVERS + CLOCKS * self.clocks
 
 
 def strapdown_motion(
@@ -93,6 +97,7 @@ def strapdown_motion(
     rate_density: FloatArray,
     dcm_body_force: FloatArray,
     dcm_body_rate: FloatArray,
+    clocks: bool = False,
 ) -> Motion:
     """Motion carried by inertial sensors."""
     # numba compiles anew for every other memory layout
@@ -105,6 +110,7 @@ def strapdown_motion(
         rate_density=np.ascontiguousarray(rate_density, dtype=float),
         dcm_body_force=np.ascontiguousarray(dcm_body_force, dtype=float),
         dcm_body_rate=np.ascontiguousarray(dcm_body_rate, dtype=float),
+        clocks=clocks,
         air=np.zeros((2, 5)),
         air_from_m=0.0,
         air_step_m=1.0,

@@ -24,7 +24,7 @@ from recon.gaps import Bridged
 from recon.packed import Innovations, unpacked
 from recon.problem import Problem
 from recon.smoother import Smoothed
-from recon.state import BoolArray, States
+from recon.state import INERTIAL, KINEMATIC, BoolArray, States
 from recon.strapdown import correct, correction_partials
 
 SAME_STRETCH_S = 1.0
@@ -44,11 +44,10 @@ class Mounting:
 def datum_trajectory(problem: Problem, mounting: Mounting, states: States, triangles: FloatArray) -> Trajectory:
     """Trajectory of the datum at the kept nodes from states at all nodes and packed covariances at the kept ones."""
     kept = np.flatnonzero(problem.kept)
-    covariance = unpacked(triangles)
+    covariance = unpacked(triangles, KINEMATIC if mounting.rate is None else INERTIAL)
     states = states[kept]
     n = len(kept)
     if mounting.rate is None:
-        covariance = covariance[:, :9, :9].copy()
         covariance[:, 6:9] = 0.0
         covariance[:, :, 6:9] = 0.0
         covariance[:, range(6, 9), range(6, 9)] = UNKNOWN_ROTATION_VAR

@@ -64,7 +64,8 @@ def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | N
         start, covariance = startup.start_ballistic(used, start_s, model)
     else:
         force, rate = bridges.force, bridges.rate
-        motion, node_index = inertial.inertial_motion(force, rate, time_s)
+        clocks = model.column(rate.spec.name, "time bias") >= 0
+        motion, node_index = inertial.inertial_motion(force, rate, time_s, clocks)
         prior = _attitude_prior(telemetry, start_s)
         start, covariance = startup.start_by_inertial_sensors(used, prior, start_s, force, rate, model)
     motion = with_stated(motion, telemetry.motion)
@@ -204,6 +205,7 @@ def build_error_model(telemetry: Telemetry, bridges: Bridges | None, attitude_se
     else:
         blocks = error_model.triad_blocks(bridges.force.spec, "m/s2")
         blocks += error_model.triad_blocks(bridges.rate.spec, "rad/s")
+        blocks += error_model.clock_blocks(bridges.force.spec, bridges.rate.spec)
     for radar in telemetry.radars.values():
         blocks += error_model.radar_blocks(radar.site)
     for fixes in telemetry.gnss.values():

@@ -6,7 +6,9 @@ Model, Earth-fixed axes, for the point where the accelerometer sits:
 
 with C from body to ECEF, W the Earth's rate, f and w the corrected specific force and inertial rate in body axes. A
 sensor triad measures ``(1 + s) * (R(m)^T D^T x) + b``: D is the nominal mounting (sensor to body), m the mounting
-rotation in sensor axes, s the scale errors and b the biases, so ``x = D R(m) ((measured - b) / (1 + s))``.
+rotation in sensor axes, s the scale errors and b the biases, so ``x = D R(m) ((measured - b) / (1 + s))``. Where
+its clock may err, by tau (a late tag is positive), ``measured`` is what it reads at the tag tau later, by its rate of
+change: good for some ten milliseconds where a vehicle swings twice a second.
 
 Steps are mid-point steps between samples: mean of the two samples, attitude at mid-step, and what turning and pushing
 do to each other within a step when both are straight in time (coning ``dt/12 w x dw``, sculling ``dt/12 (w x df - dw
@@ -33,7 +35,7 @@ from recon.state import IntArray, States
 
 @dataclass(frozen=True)
 class Step:
-    """A state carried to another node, with its transition (9, 27) and process noise (9, 9)."""
+    """A state carried to another node, with its transition (9, 27 or 29) and process noise (9, 9)."""
 
     state: States
     transition: FloatArray
@@ -63,22 +65,22 @@ def propagate_plain(grid: Motion, first: int, last: int, start: States) -> Step:
     """Carry a state from grid point ``first`` to ``last`` in numpy; slow, for reading and for tests."""
     position, velocity, q = start.position_ecef_m, start.velocity_ecef_mps, start.q_ecef_body
     errors = start.sensor_errors
-    transition = np.hstack([np.eye(9), np.zeros((9, 18))])
+    drivers = grid.drivers
+    clock = errors[18:20] if grid.clocks else np.zeros(2)
+    transition = np.hstack([np.eye(9), np.zeros((9, drivers))])
     noise = np.zeros((9, 9))
     spin = rotations.skew(earth.OMEGA_ECEF_RADPS)
     step = 1 if last >= first else -1
     for k in range(first, last, step):
         dt = grid.time_s[k + step] - grid.time_s[k]
-        f_measured = 0.5 * (grid.force_sensor_mps2[k] + grid.force_sensor_mps2[k + step])
-        w_measured = 0.5 * (grid.rate_sensor_radps[k] + grid.rate_sensor_radps[k + step])
+        f_change = grid.force_sensor_mps2[k + step] - grid.force_sensor_mps2[k]
+        w_change = grid.rate_sensor_radps[k + step] - grid.rate_sensor_radps[k]
+        f_measured = grid.force_sensor_mps2[k] + (0.5 + clock[0] / dt) * f_change
+        w_measured = grid.rate_sensor_radps[k] + (0.5 + clock[1] / dt) * w_change
         f = correct(f_measured, errors[0:9], grid.dcm_body_force)
         w = correct(w_measured, errors[9:18], grid.dcm_body_rate)
-        df = -correction_partials(f_measured, errors[0:9], grid.dcm_body_force)[:, 0:3] @ (
-            grid.force_sensor_mps2[k + step] - grid.force_sensor_mps2[k]
-        )
-        dw = -correction_partials(w_measured, errors[9:18], grid.dcm_body_rate)[:, 0:3] @ (
-            grid.rate_sensor_radps[k + step] - grid.rate_sensor_radps[k]
-        )
+        df = -correction_partials(f_measured, errors[0:9], grid.dcm_body_force)[:, 0:3] @ f_change
+        dw = -correction_partials(w_measured, errors[9:18], grid.dcm_body_rate)[:, 0:3] @ w_change
         f, w = f + dt / 12.0 * (np.cross(w, df) - np.cross(dw, f)), w + dt / 12.0 * np.cross(w, dw)
 
         earth_half = rotations.exp(-0.5 * dt * earth.OMEGA_ECEF_RADPS)
@@ -91,29 +93,36 @@ def propagate_plain(grid: Motion, first: int, last: int, start: States) -> Step:
         position = position + dt * velocity + 0.5 * dt**2 * a
         velocity = velocity + dt * a
 
-        full = _step_transition(dt, c, f, rotations.dcm_from_q(rotations.exp(0.5 * dt * w)), mid)
+        full = _step_transition(dt, c, f, rotations.dcm_from_q(rotations.exp(0.5 * dt * w)), mid, drivers)
         full[3:6, 9:18] = dt * c @ correction_partials(f_measured, errors[0:9], grid.dcm_body_force)
         d_rate = correction_partials(w_measured, errors[9:18], grid.dcm_body_rate)
         half = rotations.dcm_from_q(rotations.exp(0.5 * dt * w))
         full[6:9, 18:27] = dt * half.T @ d_rate
         full[3:6, 18:27] = -0.5 * dt**2 * c @ rotations.skew(f) @ d_rate
+        if grid.clocks:
+            turned = c - dt * spin @ c  # signals that jump about make these columns large: with Coriolis
+            full[3:6, 27] = turned @ df
+            full[6:9, 28] = half.T @ dw
+            full[3:6, 28] = -0.5 * dt * turned @ np.cross(f, dw)
         full[0:3, 9:] = 0.5 * dt * full[3:6, 9:]
-        transition = full @ np.vstack([transition, np.hstack([np.zeros((18, 9)), np.eye(18)])])
+        transition = full @ np.vstack([transition, np.hstack([np.zeros((drivers, 9)), np.eye(drivers)])])
 
         j = min(k, k + step)
         noise = full[:, :9] @ noise @ full[:, :9].T + _step_noise(dt, c, grid.force_density[j], grid.rate_density[j])
     return Step(States(position, velocity, q, errors), transition, noise)
 
 
-def _step_transition(dt: float, c: FloatArray, f: FloatArray, half: FloatArray, mid: FloatArray) -> FloatArray:
-    """Kinematic part of one step's transition, in a (9, 27) matrix whose sensor columns are zero."""
+def _step_transition(
+    dt: float, c: FloatArray, f: FloatArray, half: FloatArray, mid: FloatArray, drivers: int
+) -> FloatArray:
+    """Kinematic part of one step's transition, in a (9, 9 + drivers) matrix whose sensor columns are zero."""
     spin = rotations.skew(earth.OMEGA_ECEF_RADPS)
     gradient = earth.gravitation_gradient(mid) - spin @ spin
     coriolis = np.eye(3) - dt * spin
     by_position = coriolis @ gradient
     by_velocity = 0.5 * dt * by_position - 2.0 * spin
     by_rotation = -coriolis @ c @ rotations.skew(f) @ half.T
-    full = np.zeros((9, 27))
+    full = np.zeros((9, 9 + drivers))
     for column, block in zip((0, 3, 6), (by_position, by_velocity, by_rotation), strict=True):
         full[3:6, column : column + 3] = dt * block
         full[0:3, column : column + 3] = 0.5 * dt**2 * block

@@ -66,6 +66,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
         f"noise_sd_mps2 = {_at_least(acc.noise_mps2)}",
         f"bias_sd_mps2 = {acc.bias_mps2}",
         *_triad_lines(acc),
+        f"time_bias_sd_s = {acc.time_bias_s}",
         f"resolution_mps2 = {acc.resolution_mps2}",
         *_drift_lines("mps2", acc.drift_mps2, acc.drift_time_constant_s),
         "",
@@ -74,6 +75,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
         f"noise_sd_degps = {_at_least(gyro.noise_degps)}",
         f"bias_sd_degps = {gyro.bias_degps}",
         *_triad_lines(gyro),
+        f"time_bias_sd_s = {gyro.time_bias_s}",
         f"resolution_degps = {gyro.resolution_degps}",
         *_drift_lines("degps", gyro.drift_degps, gyro.drift_time_constant_s),
     ]

@@ -81,7 +81,8 @@ class Triad(Section):
     """What accelerometers, gyros and magnetometers have in common.
 
     ``bandwidth_hz`` is the corner of a low-pass of ``filter_order`` (0 for none); beyond the low-pass's own lag a
-    sample shows what was there ``delay_s`` earlier (negative where stamps were corrected for that lag);
+    sample shows what was there ``delay_s`` earlier (negative where stamps were corrected for that lag), and by a
+    constant of the flight of standard deviation ``time_bias_s`` more (accelerometers and gyros alone);
     ``nonorthogonality_deg`` tilts the axes against each other; negative values have another scale by
     ``scale_asymmetry``.
     """
@@ -95,6 +96,7 @@ class Triad(Section):
     bandwidth_hz: Bandwidth = 0.0
     filter_order: Literal[1, 2] = 2
     delay_s: Delay = 0.0
+    time_bias_s: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
     dropouts: Dropouts | None = None
 
     def _errors(
@@ -113,6 +115,7 @@ class Triad(Section):
             bandwidth_hz=self.bandwidth_hz,
             order=self.filter_order,
             delay_s=self.delay_s,
+            time_bias_s=self.time_bias_s,
             limit=(limit[0] * unit, limit[1] * unit, limit[2] * unit) if limit else None,
             dropouts=self.dropouts.errors if self.dropouts else DropoutErrors(),
         )

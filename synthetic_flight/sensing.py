@@ -15,7 +15,7 @@ from flightmodel.geomagnetism_and_sun import magnetic_field_ecef_t
 from flightmodel.vehicle import Vehicle
 from synthetic_flight.instrument_sections import Accelerometer, Attitude, Magnetometer, Rates
 from synthetic_flight.simulate import Truth
-from synthetic_flight.triad_errors import child, measured, sampled
+from synthetic_flight.triad_errors import child, clock_late_s, measured, sampled
 
 
 def sample_times(start_s: float, stop_s: float, rate_hz: float, offset_s: float = 0.0) -> FloatArray:
@@ -35,8 +35,10 @@ def sense_accelerometer(
     at = sample_times(start_s, truth.time_s[-1], spec.rate_hz)
     place, dcm = np.array(package.position_from_datum_body_m), package.dcm_body_sensor
 
+    late_s = clock_late_s(errors, rng)
+
     def felt(position_from_datum_body_m: FloatArray) -> FloatArray:
-        return sampled(at, truth.time_s, truth.specific_force_body(position_from_datum_body_m), errors) @ dcm
+        return sampled(at, truth.time_s, truth.specific_force_body(position_from_datum_body_m), errors, late_s) @ dcm
 
     if spec.elements_sensor_m:
         places = [place + dcm @ np.array(element) for element in spec.elements_sensor_m]
@@ -49,7 +51,8 @@ def sense_accelerometer(
 def sense_rates(truth: Truth, spec: Rates, start_s: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and rates ``(n, 3)`` of the body against inertial space, body axes, rad/s."""
     at = sample_times(start_s, truth.time_s[-1], spec.rate_hz)
-    ideal = sampled(at, truth.time_s, truth.trajectory.omega_body_eci_body_radps, spec.errors)
+    late_s = clock_late_s(spec.errors, rng)
+    ideal = sampled(at, truth.time_s, truth.trajectory.omega_body_eci_body_radps, spec.errors, late_s)
     return measured(at, ideal, spec.errors, rng)
 
 

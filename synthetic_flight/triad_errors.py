@@ -46,6 +46,8 @@ class TriadErrors:
         Corner (-3 dB) of a low-pass of first order, or second (Butterworth); 0 for none.
     delay_s : float
         A sample stamped t shows what was there at ``t - delay_s``.
+    time_bias_s : float
+        Standard deviation of a constant that adds to the delay.
     limit : (3,) float or None
         Largest magnitude of each axis; beyond it the sensor reads the limit.
     resolution : float
@@ -65,6 +67,7 @@ class TriadErrors:
     bandwidth_hz: float = 0.0
     order: int = 2
     delay_s: float = 0.0
+    time_bias_s: float = 0.0
     limit: tuple[float, float, float] | None = None
     dropouts: DropoutErrors = field(default_factory=DropoutErrors)
 
@@ -129,14 +132,21 @@ def kept(time_s: FloatArray, spec: DropoutErrors, rng: np.random.Generator) -> B
     return keep
 
 
-def sampled(at_s: FloatArray, time_s: FloatArray, ideal: FloatArray, errors: TriadErrors) -> FloatArray:
-    """Values ``(n, 3)`` of an ideal signal at sampling times, behind the triad's bandwidth and delay.
+def clock_late_s(errors: TriadErrors, rng: np.random.Generator) -> float:
+    """By how much a triad's clock is late in one flight, beyond its delay."""
+    return errors.time_bias_s * float(child(rng, "time bias").standard_normal()) if errors.time_bias_s > 0.0 else 0.0
+
+
+def sampled(
+    at_s: FloatArray, time_s: FloatArray, ideal: FloatArray, errors: TriadErrors, late_s: float = 0.0
+) -> FloatArray:
+    """Values ``(n, 3)`` of an ideal signal at sampling times, behind bandwidth, delay and a clock that is ``late_s``.
 
     ``ideal`` (m, 3) stands on an even grid ``time_s`` (m,) that begins before the samples.
     """
     if errors.bandwidth_hz > 0.0:
         ideal = low_pass(ideal, float(time_s[1] - time_s[0]), errors.bandwidth_hz, int(errors.order))
-    return interpolate_rows(at_s - errors.delay_s, time_s, ideal)
+    return interpolate_rows(at_s - errors.delay_s - late_s, time_s, ideal)
 
 
 def measured(

@@ -40,6 +40,7 @@ START, END = 100.0, 160.0
 CG = np.array([-0.54, 0.004, -0.0004])
 IMU = np.array([-0.95, 0.04, -0.03])
 SPIN = 36.0 * DEG
+CLOCK_SD_S = 1e-3  # of both triads' clocks where these err
 ACCELEROMETER = TriadSpec(
     "accelerometer", IMU, dcm_body_from_clocking(135 * DEG, 225 * DEG), 0.04, 0.05, 0.003, 0.15 * DEG, 0.01
 )
@@ -253,7 +254,7 @@ def measure_sun(truth, spec, t, rng):
 
 def sense_everything(truth, seed, sites=FULL_SITES):
     """Telemetry in which every kind of instrument, and every error that a flight file can state, is alive."""
-    telemetry, _ = sense(truth, seed, sites)
+    telemetry, _ = sense(truth, seed, sites, clock_sd_s=CLOCK_SD_S)
     rng = np.random.default_rng(10_000 + seed)
     t = np.arange(START - 1.0, END - 0.3, 0.1)
     return replace(
@@ -265,13 +266,17 @@ def sense_everything(truth, seed, sites=FULL_SITES):
     )
 
 
-def sense(truth, seed, sites=SITES, prior_time_s=START - 2.0, noise_factor=1.0, accelerometer_errors=None, hz=100.0):
-    """Telemetry of the short flight and the true sensor errors in the filter's order."""
+def sense(
+    truth, seed, sites=SITES, prior_time_s=START - 2.0, noise_factor=1.0, accelerometer_errors=None, hz=100.0,
+    clock_sd_s=0.0,
+):  # fmt: skip
+    """Telemetry of the short flight and the true sensor errors in the filter's order (without the triads' clocks)."""
     rng = np.random.default_rng(seed)
+    late_s = clock_sd_s * np.random.default_rng([seed, 1]).standard_normal(2)
     t = np.arange(START - 4.0, END - 0.01, 1.0 / hz) + 0.0013
-    force, e_force = measure_triad(ACCELEROMETER, truth.specific_force_imu(t), rng, accelerometer_errors)
+    force, e_force = measure_triad(ACCELEROMETER, truth.specific_force_imu(t - late_s[0]), rng, accelerometer_errors)
     t_rate = np.arange(START - 4.0, END - 0.01, 1.0 / hz) + 0.0046
-    rate, e_rate = measure_triad(RATES, body_rate(t_rate), rng)
+    rate, e_rate = measure_triad(RATES, body_rate(t_rate - late_s[1]), rng)
     radars, errors = {}, [e_force, e_rate]
     for site in sites:
         tags = np.arange(START, END - 0.5, 0.1)
@@ -285,8 +290,8 @@ def sense(truth, seed, sites=SITES, prior_time_s=START - 2.0, noise_factor=1.0, 
         EPOCH,
         True,
         SimpleNamespace(cg_m=CG),
-        TriadRecord(ACCELEROMETER, t, force),
-        TriadRecord(RATES, t_rate, rate),
+        TriadRecord(replace(ACCELEROMETER, time_bias_sd_s=clock_sd_s), t, force),
+        TriadRecord(replace(RATES, time_bias_sd_s=clock_sd_s), t_rate, rate),
         radars,
         None,
         prior,

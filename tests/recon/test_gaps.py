@@ -1,5 +1,7 @@
 """Gaps of inertial data, and samples that tell nothing new."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -97,3 +99,20 @@ def test_an_axis_that_never_moves_is_refused_and_one_that_stops_ends_the_record(
     x[:, 2] = 0.02
     with pytest.raises(GateError, match="axis z: all 5000 samples hold one value"):
         bridge(TriadRecord(SPEC, t, x))
+
+
+def test_peaks_clipped_at_one_stop_are_missed_alike():
+    """Five bridges that miss to one side miss five times as much together: each has five times its variance."""
+    t = np.arange(0.0, 12.0, 0.01)
+    rng = np.random.default_rng(2)
+    x = np.column_stack([5.0 * np.sin(np.pi * t + k) for k in range(3)]) + 0.01 * rng.standard_normal((len(t), 3))
+    x[:, 1] = np.minimum(x[:, 1], 4.0)
+    spec = replace(SPEC, noise_sd=0.01, resolution=0.0, dcm_body_sensor=np.eye(3))
+    bridged = bridge(TriadRecord(spec, t, x))
+    lone = np.where((t > 3.0)[:, None] & (x == 4.0), np.nan, x)  # the first peak clipped, the others not measured
+    alone = bridge(TriadRecord(spec, t, lone))
+    spans = [(f.start_s, f.end_s) for f in bridged.findings]
+    assert len(spans) == 5
+    missed = [float(b.findings[0].what.split("uncertain by ")[1].split()[0]) for b in (bridged, alone)]
+    assert alone.findings[0].start_s == bridged.findings[0].start_s
+    assert missed[0] == pytest.approx(np.sqrt(5.0) * missed[1], rel=0.02)

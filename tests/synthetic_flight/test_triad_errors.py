@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from synthetic_flight import triad_errors
 from synthetic_flight.triad_errors import (
@@ -73,6 +74,24 @@ def test_delay_is_found_by_matching(delay_s, bandwidth_hz):
         # slow signals pass a Butterworth late by sqrt(2) / w; at 5.7 of 25 Hz that is 2.5 % more of 9 ms
         lag = np.sqrt(2.0) / (2.0 * np.pi * bandwidth_hz) if bandwidth_hz else 0.0
         assert found == pytest.approx(delay_s + lag, abs=1e-4 + 0.03 * lag)
+
+
+def test_clocks_scatter_as_declared_and_move_nothing_else():
+    errors = TriadErrors(**QUIET, time_bias_s=0.002)
+    late = [triad_errors.clock_late_s(errors, np.random.default_rng(seed)) for seed in range(400)]
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 400) / 400
+    assert low < np.mean(np.square(late)) / 0.002**2 < high
+    rng = np.random.default_rng(1)
+    assert triad_errors.clock_late_s(TriadErrors(**QUIET), rng) == 0.0
+    triad_errors.clock_late_s(errors, rng)
+    assert rng.standard_normal() == np.random.default_rng(1).standard_normal()
+    t = STEP * np.arange(2000)
+    at = t[500:-500]
+    both = [
+        triad_errors.sampled(at, t, wave(t), TriadErrors(**QUIET, delay_s=d), late)
+        for d, late in ((0.003, 0.002), (0.005, 0.0))
+    ]
+    np.testing.assert_allclose(*both, atol=1e-12)
 
 
 def test_axes_out_of_square_have_their_declared_angles():
