@@ -30,6 +30,7 @@ NOTHING = 4.0  # sd of the sum of jumps that cancel
 LONGEST_S = 10.0
 UNEVEN = 0.25  # of the usual step: by no more do the steps about a jump differ
 LEAST_REPEATED = 10
+HASH = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)  # odd, of mixed bits
 SEED = 10  # samples in a row by which a block is found
 
 
@@ -139,10 +140,10 @@ def repeated_samples(measured: FloatArray, noise_sd: float) -> tuple[BoolArray, 
 
 def _lag_to_the_same(measured: FloatArray) -> IntArray:
     """How many samples before each (n,) the nearest one stands that is equal in all axes; 0 for none."""
-    _, same = np.unique(measured, axis=0, return_inverse=True)
-    same = same.ravel()
-    order = np.argsort(same, kind="stable")
+    bits = np.ascontiguousarray(measured + 0.0).view(np.uint64)  # -0 becomes 0
+    mark = bits[:, 0] * HASH[0] + bits[:, 1] * HASH[1] + bits[:, 2] * HASH[2]
+    order = np.argsort(mark, kind="stable")
     lag = np.zeros(len(measured), dtype=np.int64)
-    follows = same[order][1:] == same[order][:-1]
+    follows = (measured[order[1:]] == measured[order[:-1]]).all(axis=1)
     lag[order[1:][follows]] = (order[1:] - order[:-1])[follows]
     return lag
