@@ -16,17 +16,22 @@ the bending joint is bounded in the error bar).
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
+from estimators.evidence import (
+    ACCELEROMETER,
+    Evidence,
+    flow_inputs,
+    history_of_evidence,
+    moved_vehicle,
+)
 from estimators.pulse import MIN_AXIAL_MPS2, PulseData, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import BoolArray, FloatArray
-from flightmodel.deflection import DeflectionHistory, history_from_lateral
+from flightmodel.deflection import DeflectionHistory
 
 # each step contracts by d atan(C_N/C_A)/d alpha, at most 0.15: twelve leave 1e-10
-ITERATIONS = 12
-# about one period of the slow aerodynamic mode, over which the joint's motion is averaged for its bound
-JOINT_WINDOW_S = 2.0
+AVERAGED_S = 0.1  # short against the joint's 2.5 Hz
+ITERATIONS, STEP_RAD = 12, 1e-4
 ASSUMPTIONS = (
     "plane free; all aerodynamic force on the aeroshell; C_N/C_A of the pre-flight model; no twist; no answer where "
     f"the axial deceleration is below {MIN_AXIAL_MPS2 / 9.80665:.1f} g"
@@ -78,48 +83,54 @@ def solve_deflection(aero: AeroTable, mach: FloatArray, tilt_yz: FloatArray, flo
     return theta
 
 
+def predicted_tilt(aero: AeroTable, mach: FloatArray, theta_yz: FloatArray, flow_yz: FloatArray) -> FloatArray:
+    """Tilt of the force (n, 2), rad, on a shell bent by ``theta_yz`` (n, 2) in a flow."""
+    direction, alpha = lateral_and_size(flow_yz - theta_yz)
+    return theta_yz + direction * np.arctan(aero.ratio(mach, np.minimum(alpha, np.pi)))[:, None]
+
+
+def misalignment_evidence(
+    pulse: PulseData, use: BoolArray | None = None, about_yz_rad: FloatArray | None = None
+) -> Evidence:
+    """Bending at every sample where the deceleration carries information, with its responses to what is uncertain.
+
+    A joint that swings throws the shell's c.g. about, so the tilt of the measured force is that of the push less
+    ``m_A r_A theta'' / (m a_x)``. Responses are taken, and the reading is linear, about a given deflection, else about
+    the reading itself.
+    """
+    use = pulse.informative if use is None else use
+    force, flow, mach = pulse.specific_force_body_mps2[use], pulse.flow_yz_rad[use], pulse.mach[use]
+    vehicle = pulse.vehicle
+    tilt = force_tilt(force)
+    about = solve_deflection(vehicle.aero, mach, tilt, flow) if about_yz_rad is None else about_yz_rad
+
+    def predict(d_theta: FloatArray, d_flow: FloatArray, aero: AeroTable = vehicle.aero) -> FloatArray:
+        return predicted_tilt(aero, mach, about + d_theta, flow + d_flow)
+
+    base, step, still = predict(np.zeros(2), np.zeros(2)), STEP_RAD * np.eye(2), np.zeros(2)
+    by_tilt = np.linalg.inv(_columns(base, [predict(e, still) for e in step]) / STEP_RAD)
+    by_flow = -by_tilt @ _columns(base, [predict(still, e) for e in step]) / STEP_RAD
+    by_force = by_tilt @ (_columns(tilt, [force_tilt(force + STEP_RAD * e) for e in np.eye(3)]) / STEP_RAD)
+    inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
+    inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + by_force @ pulse.force_root_mps2[use]
+    for name in ("C_A", "C_N"):
+        up, down = (predict(still, still, moved_vehicle(vehicle, {name: k}).aero) for k in (1.0, -1.0))
+        inputs[name] = -by_tilt @ (0.5 * (up - down))[:, :, None]
+    arm = (vehicle.joint_m[0] - vehicle.aeroshell.cg_m[0]) * vehicle.aeroshell.mass_kg / vehicle.mass_kg
+    swing = -arm / -force[:, 0, None, None] * by_tilt
+    noise = pulse.force_noise_sd_mps2**2 * by_force @ by_force.transpose(0, 2, 1)
+    read = about + (by_tilt @ (tilt - base)[:, :, None])[:, :, 0]
+    return Evidence("misalignment", pulse.time_s[use], read, swing, inputs, noise, AVERAGED_S)
+
+
 def estimate_misalignment(pulse: PulseData) -> DeflectionHistory:
     """Bending and plane at every sample where the deceleration carries information; NaN elsewhere.
 
-    The covariance propagates, by differences, the force's systematic error, the BET's flow angle with the wind's
-    error, and the coefficients' (C_N and C_A apart), and bounds the motion of the c.g. with the bending joint by the
-    scatter of the answer's own curvature.
+    The covariance propagates the accelerometer's errors, the BET's flow angle with the wind's and C_N and C_A, and
+    bounds the joint's swinging by the scatter of the answer's own curvature.
     """
-    use = pulse.informative
-    n = int(use.sum())
-    theta_yz, cov = np.full((len(use), 2), np.nan), np.full((len(use), 2, 2), np.nan)
-    if n:
-        force, flow, mach = pulse.specific_force_body_mps2[use], pulse.flow_yz_rad[use], pulse.mach[use]
-        aero, known = pulse.vehicle.aero, pulse.vehicle.uncertainty
-        tilt = force_tilt(force)
-        theta = solve_deflection(aero, mach, tilt, flow)
-        step = 1e-4
-        by_tilt = _columns(theta, [solve_deflection(aero, mach, tilt + step * e, flow) for e in np.eye(2)]) / step
-        by_flow = _columns(theta, [solve_deflection(aero, mach, tilt, flow + step * e) for e in np.eye(2)]) / step
-        by_force = _columns(tilt, [force_tilt(force + step * e) for e in np.eye(3)]) / step
-        to_theta = by_tilt @ by_force
-        ratio_sd = np.hypot(known.cn, known.ca)
-        by_ratio = solve_deflection(aero.scaled(cn=1.0 + ratio_sd), mach, tilt, flow) - theta
-        total = to_theta @ pulse.specific_force_cov[use] @ to_theta.transpose(0, 2, 1)
-        total += by_flow @ pulse.flow_cov[use] @ by_flow.transpose(0, 2, 1)
-        total += by_ratio[:, :, None] * by_ratio[:, None, :]
-        total += (_joint_motion(pulse, theta, use) ** 2)[:, None, None] * np.eye(2)
-        theta_yz[use], cov[use] = theta, total
-    return history_from_lateral(pulse.time_s, theta_yz, cov, "misalignment", ASSUMPTIONS)
+    return history_of_evidence(misalignment_evidence(pulse), pulse, ASSUMPTIONS)
 
 
 def _columns(base: FloatArray, moved: list[FloatArray]) -> FloatArray:
     return np.stack([m - base for m in moved], axis=-1)
-
-
-def _joint_motion(pulse: PulseData, theta_yz: FloatArray, use: BoolArray) -> FloatArray:
-    """Angle error, rad, from the shell's c.g. accelerating as the joint bends: ``m_A r_A theta'' / (m a_x)``."""
-    vehicle = pulse.vehicle
-    arm = abs(vehicle.aeroshell.cg_m[0] - vehicle.joint_m[0]) * vehicle.aeroshell.mass_kg / vehicle.mass_kg
-    if len(theta_yz) < 5:
-        return np.zeros(len(theta_yz))
-    t = pulse.time_s[use]
-    second = np.gradient(np.gradient(theta_yz, t, axis=0), t, axis=0)
-    window = max(1, round(JOINT_WINDOW_S / float(np.median(np.diff(t)))))
-    rms = np.sqrt(uniform_filter1d(np.sum(second**2, axis=1), window, mode="nearest"))
-    return arm * rms / -pulse.specific_force_body_mps2[use, 0]

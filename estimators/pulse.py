@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import BoolArray, FloatArray, check_shape
 from flightmodel.vehicle import Vehicle
 
@@ -25,13 +26,20 @@ class PulseData:
     time_s : (n,) float
     specific_force_body_mps2 : (n, 3) float
         At the vehicle's unbent c.g., body axes.
-    specific_force_cov : (n, 3, 3) float
-        Its covariance, (m/s^2)^2.
+    force_noise_sd_mps2 : float
+        Its white noise, each axis.
+    force_root_mps2 : (n, 3, 9) float
+        Its error per unit normal of nine that stand for the accelerometer's constant errors.
+    flow_root_rad : (n, 2, 9) float
+        What of the flow's error goes with the same nine: attitude and accelerometer were found together.
     rate_body_radps, angular_acceleration_body_radps2 : (n, 3) float
     angular_acceleration_sd_radps2 : float
     flow_yz_rad : (n, 2) float
         Total angle of attack of the centerbody, wind-relative, as a lateral vector (length is the angle).
     flow_cov : (n, 2, 2) float
+    wind_flow_sd_rad : (n,) float
+        What of the flow's error is the wind's, each component.
+    altitude_m : (n,) float
     mach, dynamic_pressure_pa, dynamic_pressure_sd_pa, airspeed_mps : (n,) float
     vehicle : Vehicle
         Pre-flight model.
@@ -39,12 +47,16 @@ class PulseData:
 
     time_s: FloatArray
     specific_force_body_mps2: FloatArray
-    specific_force_cov: FloatArray
+    force_noise_sd_mps2: float
+    force_root_mps2: FloatArray
+    flow_root_rad: FloatArray
     rate_body_radps: FloatArray
     angular_acceleration_body_radps2: FloatArray
     angular_acceleration_sd_radps2: float
     flow_yz_rad: FloatArray
     flow_cov: FloatArray
+    wind_flow_sd_rad: FloatArray
+    altitude_m: FloatArray
     mach: FloatArray
     dynamic_pressure_pa: FloatArray
     dynamic_pressure_sd_pa: FloatArray
@@ -56,7 +68,8 @@ class PulseData:
         n = len(self.time_s)
         for name, shape in (
             ("specific_force_body_mps2", (n, 3)),
-            ("specific_force_cov", (n, 3, 3)),
+            ("force_root_mps2", (n, 3, 9)),
+            ("flow_root_rad", (n, 2, 9)),
             ("rate_body_radps", (n, 3)),
             ("angular_acceleration_body_radps2", (n, 3)),
             ("flow_yz_rad", (n, 2)),
@@ -68,6 +81,15 @@ class PulseData:
     def informative(self) -> BoolArray:
         """Mask ``(n,)`` of samples where the deceleration is large enough."""
         return -self.specific_force_body_mps2[:, 0] >= MIN_AXIAL_MPS2
+
+    @property
+    def through_pulse(self) -> BoolArray:
+        """Mask ``(n,)`` of the informative samples up to the end of the pressure pulse.
+
+        After it the vehicle swings to angles at which lateral vectors no longer add.
+        """
+        after = np.flatnonzero(pressure_pulse(self.dynamic_pressure_pa))
+        return np.asarray(self.informative & (np.arange(len(self.time_s)) <= after[-1]))
 
 
 def lateral_and_size(vectors_yz: FloatArray) -> tuple[FloatArray, FloatArray]:

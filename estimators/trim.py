@@ -20,13 +20,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimators.evidence import (
+    PRESSURE,
+    VEHICLE_INPUTS,
+    Evidence,
+    flow_inputs,
+    history_of_evidence,
+    moved_vehicle,
+    pressure_input,
+)
 from estimators.pulse import MIN_AXIAL_MPS2, PulseData, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import BoolArray, FloatArray
-from flightmodel.deflection import DeflectionHistory, history_from_lateral
+from flightmodel.deflection import DeflectionHistory
 from flightmodel.vehicle import Vehicle
 
 LIMIT_RAD = np.deg2rad(30.0)
+# near 2.3 Hz the shell's inertia balances the air's stiffness, and the balance says nothing of the bending
+AVERAGED_S = 1.0
+ITERATIONS, STEP_RAD = 5, 1e-4
+NODE = np.sqrt(3.0)  # outer nodes of the three-point Gauss-Hermite rule, sd
 KNOTS_RAD = np.linspace(0.0, LIMIT_RAD, 121)
 ASSUMPTIONS = (
     "moment balance about the c.g. with measured angular acceleration; pre-flight coefficients and c.g. offset; joint "
@@ -66,6 +79,12 @@ class TrimModel:
         c = self.aero.at(mach, alpha_rad)
         return -(c[..., 2] * self.length_m + c[..., 1] * self.x_cg_m) / c[..., 0]
 
+    def imbalance(self, mach: FloatArray, theta_yz_rad: FloatArray, flow_yz_rad: FloatArray) -> FloatArray:
+        """Offset that the vehicle has less the one it would trim at, lateral (n, 2), m: ``u / C_A`` in balance."""
+        direction, alpha = lateral_and_size(flow_yz_rad - theta_yz_rad)
+        need = self.offset_for_angle(mach, np.minimum(alpha, np.pi))
+        return self.offset_yz_m + self.xbar_m * theta_yz_rad - direction * need[:, None]
+
 
 def trim_model(vehicle: Vehicle, joint_station_m: float | None = None) -> TrimModel:
     """Model of a vehicle; another joint station (the nose is 0) moves the point of rotation."""
@@ -101,12 +120,17 @@ def solve_trim(model: TrimModel, mach: FloatArray, flow_yz_rad: FloatArray, mome
     ``moment_yz_m`` (n, 2) is ``u / C_A`` of the module's equation.
     """
     direction, size = lateral_and_size(model.offset_yz_m + model.xbar_m * flow_yz_rad - moment_yz_m)
-    need = model.offset_for_angle(mach[:, None], KNOTS_RAD[None, :]) + model.xbar_m * KNOTS_RAD
-    k = np.clip(np.sum(need <= size[:, None], axis=1) - 1, 0, len(KNOTS_RAD) - 2)
-    row = np.arange(len(size))
-    fraction = (size - need[row, k]) / (need[row, k + 1] - need[row, k])
-    alpha = KNOTS_RAD[k] + fraction * (KNOTS_RAD[1] - KNOTS_RAD[0])
-    alpha = np.where(size > need[:, -1], np.nan, alpha)
+
+    def excess(alpha_rad: FloatArray) -> FloatArray:
+        return np.asarray(model.offset_for_angle(mach, alpha_rad) + model.xbar_m * alpha_rad - size)
+
+    # nearly straight and rising: Newton's steps settle at once
+    alpha = np.zeros(len(size))
+    for _ in range(ITERATIONS):
+        here = excess(alpha)
+        slope = (excess(alpha + STEP_RAD) - here) / STEP_RAD
+        alpha = np.clip(alpha - here / slope, 0.0, LIMIT_RAD)
+    alpha = np.where(excess(np.full(len(size), LIMIT_RAD)) < 0.0, np.nan, alpha)
     return flow_yz_rad - direction * alpha[:, None]
 
 
@@ -126,50 +150,78 @@ def moment_term(model: TrimModel, pulse: PulseData, use: BoolArray, dynamic: boo
     return np.column_stack([-transverse[:, 1], transverse[:, 0]]) / (q_area * c[:, 0])[:, None]
 
 
+def trim_evidence(
+    pulse: PulseData,
+    joint_station_m: float | None = None,
+    dynamic: bool = True,
+    use: BoolArray | None = None,
+    about_yz_rad: FloatArray | None = None,
+) -> Evidence:
+    """Bending from the moment balance at every sample with enough deceleration, with its responses.
+
+    The shell does not turn with the centerbody while the joint swings: the balance reads ``theta`` plus its share of
+    ``(I_A + mu r_A (r_A - r_B)) theta''``, with ``mu`` the bodies' reduced mass. Responses are taken, and the reading
+    is linear, about a given deflection, else about the reading itself.
+    """
+    use = pulse.informative if use is None else use
+    vehicle = pulse.vehicle
+    model = trim_model(vehicle, joint_station_m)
+    mach, flow = pulse.mach[use], pulse.flow_yz_rad[use]
+    moment = moment_term(model, pulse, use, dynamic)
+    about = solve_trim(model, mach, flow, moment) if about_yz_rad is None else about_yz_rad
+    known: BoolArray = np.asarray(np.isfinite(about).all(axis=1))
+    about = np.where(known[:, None], about, flow)
+
+    def excess(d_theta: FloatArray, d_flow: FloatArray, moved: Vehicle | None = None) -> FloatArray:
+        of, u = model, moment
+        if moved is not None:
+            of = trim_model(moved, joint_station_m)
+            u = moment_term(of, pulse, use, dynamic)
+        return of.imbalance(mach, about + d_theta, flow + d_flow) - u
+
+    base, step, still = excess(np.zeros(2), np.zeros(2)), STEP_RAD * np.eye(2), np.zeros(2)
+    by_moment = np.linalg.inv(np.stack([excess(e, still) - base for e in step], -1) / STEP_RAD)
+    by_flow = -by_moment @ np.stack([excess(still, e) - base for e in step], -1) / STEP_RAD
+    inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
+    for name in VEHICLE_INPUTS:
+        up, down = (excess(still, still, moved_vehicle(vehicle, {name: size})) for size in (1.0, -1.0))
+        inputs[name] = -by_moment @ (0.5 * (up - down))[:, :, None]
+    noise, swing = np.zeros((len(mach), 2, 2)), np.zeros((len(mach), 2, 2))
+    if dynamic:
+        inputs[PRESSURE] = -by_moment @ (moment[:, :, None] * pressure_input(pulse, use)[:, None, :])
+        axial_n = pulse.dynamic_pressure_pa[use] * model.area_m2 * model.aero.at(mach, 0.0)[:, 0]
+        turn = pulse.angular_acceleration_sd_radps2 * model.inertia_kgm2[1, 1] / axial_n
+        noise = (turn**2)[:, None, None] * by_moment @ by_moment.transpose(0, 2, 1)
+        swing = by_moment * (shell_inertia(vehicle) / axial_n)[:, None, None]
+    read = about - (by_moment @ base[:, :, None])[:, :, 0]
+    return Evidence("trim", pulse.time_s[use], np.where(known[:, None], read, np.nan), swing, inputs, noise, AVERAGED_S)
+
+
+def trim_bend(pulse: PulseData, joint_station_m: float | None = None, dynamic: bool = True) -> FloatArray:
+    """Half the second derivative of the reading by C_m (n, 2), rad: the one input known so badly that it counts."""
+    use, read = pulse.informative, []
+    for size in (NODE, 0.0, -NODE):
+        model = trim_model(moved_vehicle(pulse.vehicle, {"C_m": size}), joint_station_m)
+        moment = moment_term(model, pulse, use, dynamic)
+        read.append(solve_trim(model, pulse.mach[use], pulse.flow_yz_rad[use], moment))
+    return (read[0] + read[2] - 2.0 * read[1]) / (2.0 * NODE**2)
+
+
+def shell_inertia(vehicle: Vehicle) -> float:
+    """Moment about the vehicle's c.g. per angular acceleration of the shell against the body, kg m^2."""
+    shell, body = vehicle.aeroshell, vehicle.centerbody
+    arm_shell, arm_body = (vehicle.joint_m[0] - part.cg_m[0] for part in (shell, body))
+    reduced = shell.mass_kg * body.mass_kg / vehicle.mass_kg
+    own = 0.5 * (shell.inertia[1, 1] + shell.inertia[2, 2])
+    return float(own + reduced * arm_shell * (arm_shell - arm_body))
+
+
 def estimate_trim(pulse: PulseData, joint_station_m: float | None = None, dynamic: bool = True) -> DeflectionHistory:
     """Bending and plane from the moment balance at every sample with enough deceleration; NaN elsewhere.
 
-    The covariance propagates, by differences, the BET's flow angle, the initial offset, mass, c.g. station, inertia,
-    C_m, C_N and C_A, dynamic pressure and the angular acceleration.
+    The covariance propagates the BET's flow angle with the wind's, the initial offset, masses, c.g. stations, inertias,
+    C_m, C_N and C_A, dynamic pressure and the angular acceleration, and bounds the joint's swinging.
     """
-    use = pulse.informative
-    theta_yz, cov = np.full((len(use), 2), np.nan), np.full((len(use), 2, 2), np.nan)
-    if use.any():
-        model = trim_model(pulse.vehicle, joint_station_m)
-        mach, flow = pulse.mach[use], pulse.flow_yz_rad[use]
-        moment = moment_term(model, pulse, use, dynamic)
-        theta = solve_trim(model, mach, flow, moment)
-        step = 1e-4
-        by_flow = np.stack([solve_trim(model, mach, flow + step * e, moment) - theta for e in np.eye(2)], -1) / step
-        total = by_flow @ pulse.flow_cov[use] @ by_flow.transpose(0, 2, 1)
-        for changed, shift in _perturbations(model, pulse, use, moment, dynamic):
-            d = solve_trim(changed, mach, flow, shift) - theta
-            total += d[:, :, None] * d[:, None, :]
-        theta_yz[use], cov[use] = theta, total
-    return history_from_lateral(pulse.time_s, theta_yz, cov, "trim", ASSUMPTIONS)
-
-
-def _perturbations(
-    model: TrimModel, pulse: PulseData, use: BoolArray, moment: FloatArray, dynamic: bool
-) -> list[tuple[TrimModel, FloatArray]]:
-    """Model and moment term with one uncertain input each moved by its standard deviation."""
-    known, vehicle = pulse.vehicle.uncertainty, pulse.vehicle
-    moved = [(replace(model, offset_yz_m=model.offset_yz_m + known.cg_lateral_m * e), moment) for e in np.eye(2)]
-    moved += [
-        (replace(model, aero=model.aero.scaled(cm=1.0 + known.cm)), moment),
-        (replace(model, aero=model.aero.scaled(cn=1.0 + known.cn)), moment),
-        (replace(model, aero=model.aero.scaled(ca=1.0 + known.ca)), moment / (1.0 + known.ca)),
-        (replace(model, x_cg_m=model.x_cg_m + known.cg_station_m), moment),
-        # the centerbody's share of mass and its arm: what carries the offset
-        (
-            replace(model, xbar_m=model.xbar_m * (1.0 + np.hypot(known.mass, known.cg_station_m / abs(model.xbar_m)))),
-            moment,
-        ),
-    ]
-    if dynamic:
-        relative = (pulse.dynamic_pressure_sd_pa / pulse.dynamic_pressure_pa)[use][:, None]
-        moved += [(model, moment * (1.0 + relative)), (model, moment * (1.0 + known.inertia))]
-        c_a = -pulse.specific_force_body_mps2[use, 0] * vehicle.mass_kg
-        noise = pulse.angular_acceleration_sd_radps2 * vehicle.inertia[1, 1] / c_a
-        moved += [(model, moment + noise[:, None] * e) for e in np.eye(2)]
-    return moved
+    evidence = trim_evidence(pulse, joint_station_m, dynamic)
+    bend = trim_bend(pulse, joint_station_m, dynamic)
+    return history_of_evidence(replace(evidence, bend=bend), pulse, ASSUMPTIONS)

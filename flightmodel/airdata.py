@@ -64,6 +64,15 @@ def lateral_angles(velocity_body_mps: FloatArray) -> FloatArray:
     return direction * total_angle(velocity_body_mps)[..., None]
 
 
+def angle_partials(velocity_body_mps: FloatArray) -> FloatArray:
+    """Derivatives ``(n, 2, 3)`` of the lateral angles by the velocity (n, 3), to first order in the angle."""
+    u = velocity_body_mps[:, 0]
+    out = np.zeros((len(u), 2, 3))
+    out[:, 0, 1] = out[:, 1, 2] = 1.0 / u
+    out[:, :, 0] = -velocity_body_mps[:, 1:] / u[:, None] ** 2
+    return out
+
+
 def peak_pressure(time_s: FloatArray, dynamic_pressure_pa: FloatArray) -> tuple[float, float]:
     """Time and value of the largest dynamic pressure, by a parabola through the three samples around it."""
     return peak(time_s, dynamic_pressure_pa)
@@ -144,13 +153,10 @@ def _lateral_cov(
     To first order in the angle, ``angle = (v, w) / u``: a velocity error moves it by ``(dv, dw)/u``, a rotation
     error ``d`` of the body by ``v_body x d`` over ``u``.
     """
-    n = len(v_body)
     if trajectory.covariance is None:
-        return np.full((n, 2, 2), np.nan)
+        return np.full((len(v_body), 2, 2), np.nan)
     u = v_body[:, 0]
-    to_angle = np.zeros((n, 2, 3))
-    to_angle[:, 0, 1] = to_angle[:, 1, 2] = 1.0 / u
-    to_angle[:, :, 0] = -v_body[:, 1:] / u[:, None] ** 2
+    to_angle = angle_partials(v_body)
     jacobian = np.concatenate([to_angle @ dcm_ecef_body.transpose(0, 2, 1), to_angle @ rotations.skew(v_body)], axis=2)
     cov = jacobian @ trajectory.covariance[:, 3:, 3:] @ jacobian.transpose(0, 2, 1)
     return cov + (wind_var / u**2)[:, None, None] * np.eye(2)

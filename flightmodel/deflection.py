@@ -19,6 +19,7 @@ import numpy as np
 from flightmodel.checks import FloatArray, check_finite, check_increasing, check_shape
 
 HOLE_FACTOR = 3.0
+UNIFORM_VAR = np.pi**2 / 3.0  # of a clocking angle that may be anything
 
 
 def lv_direction(clock_lv_rad: FloatArray | float) -> FloatArray:
@@ -55,7 +56,7 @@ class DeflectionHistory:
     covariance : (n, 2, 2) float or None
         Of ``(theta, plane)``, rad^2. A plane that is assumed carries the variance of the assumption.
     method : str
-        ``"camera"``, ``"misalignment"``, ``"trim"`` or ``"truth"``.
+        ``"camera"``, ``"misalignment"``, ``"trim"``, ``"fused"`` or ``"truth"``.
     assumptions : str
         In words.
     """
@@ -89,6 +90,21 @@ class DeflectionHistory:
         """Lateral deflection vector ``(n, 2)`` in body y, z, rad."""
         return self.theta_rad[:, None] * lv_direction(self.plane_lv_rad)[:, 1:]
 
+    @property
+    def lateral_cov(self) -> FloatArray:
+        """Covariance ``(n, 2, 2)`` of the lateral vectors, rad^2; NaN without one, and where the plane is not known.
+
+        Not known is a plane whose sd has ended at a uniform one's: what it was across is then lost.
+        """
+        n = len(self.time_s)
+        if self.covariance is None:
+            return np.full((n, 2, 2), np.nan)
+        towards, sideways = lateral_axes(self.plane_lv_rad)
+        turn = np.stack([towards, sideways * self.theta_rad[:, None]], axis=-1)
+        cov = turn @ self.covariance @ turn.transpose(0, 2, 1)
+        lost = self.covariance[:, 1, 1] > UNIFORM_VAR * (1.0 - 1e-6)
+        return np.where(lost[:, None, None], np.nan, cov)
+
     def at(self, time_s: float) -> tuple[float, float]:
         """Angle and its sd, rad, at one time by linear interpolation between answers; NaN outside them and in holes.
 
@@ -104,6 +120,11 @@ class DeflectionHistory:
         return float(np.interp(time_s, t, self.theta_rad[known])), float(np.interp(time_s, t, self.theta_sd_rad[known]))
 
 
+def lateral_axes(plane_lv_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit lateral vectors ``(n, 2)`` along clocking angles, and across them: the derivative of ``(-cos, sin)``."""
+    return lv_direction(plane_lv_rad)[..., 1:], np.stack([np.sin(plane_lv_rad), np.cos(plane_lv_rad)], axis=-1)
+
+
 def polar_from_lateral(
     theta_yz_rad: FloatArray, covariance_yz: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -113,12 +134,11 @@ def polar_from_lateral(
     """
     size = np.linalg.norm(theta_yz_rad, axis=-1)
     plane = np.where(np.isfinite(size), lv_clock(theta_yz_rad), 0.0)
-    # towards growing angle, and towards growing clock: the derivative of (-cos, sin)
-    towards, sideways = lv_direction(plane)[..., 1:], np.stack([np.sin(plane), np.cos(plane)], axis=-1)
+    towards, sideways = lateral_axes(plane)
     turn = np.stack([towards, sideways / np.maximum(size, 1e-9)[..., None]], axis=-2)
     cov = turn @ covariance_yz @ np.swapaxes(turn, -1, -2)
     with np.errstate(invalid="ignore"):
-        shrink = np.minimum(1.0, np.pi / np.sqrt(3.0 * cov[..., 1, 1]))
+        shrink = np.minimum(1.0, np.sqrt(UNIFORM_VAR / cov[..., 1, 1]))
     cov[..., 0, 1] *= shrink
     cov[..., 1, 0] *= shrink
     cov[..., 1, 1] *= shrink**2

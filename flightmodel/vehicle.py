@@ -98,7 +98,10 @@ class CompliantJoint(Section):
 
 
 class Uncertainty(Section):
-    """What is known of the vehicle before flight, one standard deviation; fractions where no unit is named."""
+    """What is known of the vehicle before flight, one standard deviation; fractions where no unit is named.
+
+    Mass, c.g. and inertia are each body's own; C_mq's is absolute.
+    """
 
     mass: Fraction = 0.01
     cg_station_m: Metres = 0.01
@@ -107,6 +110,7 @@ class Uncertainty(Section):
     ca: Fraction = 0.03
     cn: Fraction = 0.07
     cm: Fraction = 0.10
+    cmq: Annotated[float, Field(ge=0.0, le=10.0)] = 0.15
 
 
 class ShellGeometry(Section):

@@ -81,7 +81,7 @@ def reconstruct(folder: Path, rate: float, sensitivity: bool) -> None:
 @click.option(
     "--method",
     "methods",
-    type=click.Choice(["camera", "misalignment", "trim"]),
+    type=click.Choice(["camera", "misalignment", "trim", "fused"]),
     multiple=True,
     help="Estimator to run; repeat for several. Default: all that the flight has data for.",
 )
@@ -106,7 +106,7 @@ def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, join
 @click.argument("folder", type=FOLDER)
 @click.option("--rate", type=FiniteRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
 def run(folder: Path, rate: float) -> None:
-    """Do it all for the flight in FOLDER: trajectory, three deflection estimates, tables and figures."""
+    """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
     from postflight import commands
     from postflight.pipeline import METHODS
 

@@ -256,6 +256,9 @@ def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> N
         angle, largest = f"{row['deflection_deg']:.2f}", f"{row['largest_deg']:.2f}"
         table.add_row(method, angle, f"{row['sd_deg']:.2f}", f"{plane:.0f}", largest, f"{row['largest_at_s']:.2f}")
     console.print(table)
+    if answers.fused is not None:
+        found = answers.fused.agreement
+        console.print(f"{'' if not found.suspects else '[red]verdict[/] '}{escape(found.words)}")
     for method, row in rows.items():
         if "reason" in row:
             console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")
@@ -311,7 +314,7 @@ def print_score(result: scoring.Score) -> None:
     for name in ("method", "deflection deg", "1 sd", "truth", "error", "IRVE-II (paper)"):
         table.add_column(name, justify="left" if name == "method" else "right")
     for method, row in result.methods.items():
-        paper = f"{scoring.PAPER_DEG[method]:g}"
+        paper = f"{scoring.PAPER_DEG[method]:g}" if method in scoring.PAPER_DEG else ""
         if row["deflection_deg"] is None:
             table.add_row(method, "no answer", "", f"{row['truth_deg']:.2f}", "", paper)
             continue

@@ -19,9 +19,20 @@ from postflight.pipeline import Answers, Flight
 from postflight.preflight import RigidBounds
 
 # distinct in hue and in grey (Okabe and Ito)
-COLOUR = {"camera": "#0072B2", "misalignment": "#D55E00", "trim": "#009E73", "truth": "#000000"}
-LABEL = {"camera": "video (virtual camera)", "misalignment": "accelerometers (misalignment)", "trim": "trim angle"}
-LINE = {"camera": "-", "misalignment": "--", "trim": "-."}
+COLOUR = {
+    "camera": "#0072B2",
+    "misalignment": "#D55E00",
+    "trim": "#009E73",
+    "fused": "#CC79A7",
+    "truth": "#000000",
+}
+LABEL = {
+    "camera": "video (virtual camera)",
+    "misalignment": "accelerometers (misalignment)",
+    "trim": "trim angle",
+    "fused": "all fused",
+}
+LINE = {"camera": "-", "misalignment": "--", "trim": "-.", "fused": "-"}
 
 
 def _axes(figure: Figure, rows: int = 1) -> list[Axes]:

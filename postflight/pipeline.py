@@ -28,6 +28,7 @@ from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
 from postflight.attitude import AttitudeCheck, check_attitude
 from postflight.day_air import day_air
+from postflight.fused import FusedAnswer, fuse_flight
 from postflight.sensed import pulse_data
 from recon.air import ReconstructedAir
 from recon.bet import Reconstruction, Settings, reconstruct
@@ -35,7 +36,7 @@ from recon.consistency import Verdict
 from recon.suspects import suspects
 
 Progress = Callable[[float, str], None]
-METHODS = ("camera", "misalignment", "trim")
+METHODS = ("camera", "misalignment", "trim", "fused")
 PULSE_RATE_HZ = 50.0
 NO_VIDEO = "the flight has no video"
 # assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
@@ -99,10 +100,11 @@ class Flight:
 
 @dataclass(frozen=True)
 class Answers:
-    """Deflection histories by method, and why a method gave none."""
+    """Deflection histories by method, why a method gave none, and what stands behind the fused one."""
 
     histories: dict[str, DeflectionHistory] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
+    fused: FusedAnswer | None = None
 
 
 def reconstruct_flight(folder: Path, settings: Settings | None = None, progress: Progress | None = None) -> Flight:
@@ -226,7 +228,9 @@ def estimate(
     ``flight`` may be None where only the camera is asked for. Plane and joint are assumptions of camera and trim.
     """
     report = progress or (lambda _fraction, _what: None)
-    histories, refused = {}, {}
+    histories: dict[str, DeflectionHistory] = {}
+    refused: dict[str, str] = {}
+    fused = None
     for k, method in enumerate(methods):
         report(k / len(methods), f"deflection from {method}")
         try:
@@ -235,9 +239,13 @@ def estimate(
             else:
                 assert flight is not None
                 pulse = flight.required_pulse()
-                history = (
-                    estimate_misalignment(pulse) if method == "misalignment" else estimate_trim(pulse, joint_station_m)
-                )
+                if method == "misalignment":
+                    history = estimate_misalignment(pulse)
+                elif method == "trim":
+                    history = estimate_trim(pulse, joint_station_m)
+                else:
+                    fused = fuse_flight(pulse, _seen(telemetry, histories, refused, plane_lv_rad), joint_station_m)
+                    history = fused.fused.history
         except GateError as fault:
             refused[method] = str(fault)
             continue
@@ -246,4 +254,16 @@ def estimate(
         else:
             refused[method] = f"no sample could be answered ({history.assumptions})"
     report(1.0, "estimated")
-    return Answers(histories, refused)
+    return Answers(histories, refused, fused)
+
+
+def _seen(
+    telemetry: Telemetry, histories: dict[str, DeflectionHistory], refused: dict[str, str], plane_lv_rad: float | None
+) -> DeflectionHistory | None:
+    """Camera's history for the fusion: the one at hand, else found now; None without usable video."""
+    if "camera" in histories or "camera" in refused or telemetry.frames is None:
+        return histories.get("camera")
+    try:
+        return estimate_camera(telemetry, plane_lv_rad)
+    except GateError:
+        return None

@@ -24,6 +24,7 @@ from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
+from postflight.fused import agreement_table, input_table
 from postflight.pipeline import NO_VIDEO, Answers, Flight
 from postflight.product.header import header
 from postflight.product.tables import event_table, peak_table, residual_statistics, slow_covariance
@@ -199,6 +200,9 @@ def write_answers(run: RunFolder, answers: Answers) -> None:
     """One CSV a method that answered."""
     for method, history in answers.histories.items():
         run.write_csv(f"deflection_{method}.csv", deflection_table(history))
+    if answers.fused is not None:
+        run.write_csv("fusion_inputs.csv", input_table(answers.fused))
+        run.write_csv("fusion_agreement.csv", agreement_table(answers.fused))
 
 
 def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
@@ -231,6 +235,7 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
         "alpha_total_wind_deg": float(np.rad2deg(air.alpha_total_wind_rad[k])) if flight.has_attitude else None,
         "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])) if flight.has_attitude else None,
         "methods": method_summary(answers, peak),
+        "agreement": None if answers.fused is None else answers.fused.agreement.words,
         "missing": list(flight.missing),
         "attitude_check": attitude_summary(flight.attitude),
         "verdicts_passed": sum(v.passed for v in verdicts),

@@ -18,7 +18,7 @@ from flightmodel.trajectory import Trajectory, difference, resample
 from postflight.results import newest_run
 
 # what the demo flight with nominal instrument errors must reach
-DEFLECTION_LIMIT_DEG = {"camera": 0.7, "misalignment": 0.7, "trim": 1.2}
+DEFLECTION_LIMIT_DEG = {"camera": 0.7, "misalignment": 0.7, "trim": 1.2, "fused": 0.5}
 BET_LIMITS = {"position_rms_m": 30.0, "velocity_rms_mps": 0.5, "alpha_total_rms_deg": 0.5}
 STATE_COLUMNS = (
     "t_s",

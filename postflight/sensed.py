@@ -7,13 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimators.pulse import PulseData
-from flightmodel.airdata import AirData, lateral_angles
+from flightmodel import rotations
+from flightmodel.airdata import AirData, angle_partials, lateral_angles
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.telemetry import Telemetry
 from recon.bet import Reconstruction
 
 # half the window over which sensors are averaged: well below the joint's 2.5 Hz, well above the sampling interval
 HALF_WINDOW_S = 0.05
+# the same for the estimators of the deflection, which look at the joint's own swinging: at 1 Hz it leaves 0.5 % of the
+# angular acceleration out, at 2.5 Hz 3 %; at least some samples must lie in it
+SWING_HALF_WINDOW_S, LEAST_SAMPLES = 0.02, 2.5
 
 
 def window_means(time_s: FloatArray, values: FloatArray, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
@@ -35,7 +39,7 @@ def window_means(time_s: FloatArray, values: FloatArray, start_s: FloatArray, en
 
 @dataclass(frozen=True)
 class Sensed:
-    """Means over `HALF_WINDOW_S` to both sides of times (k,), body axes: force at sensor and c.g., rate, its change."""
+    """Means over a half window to both sides of times (k,), body axes: force at sensor and c.g., rate, its change."""
 
     specific_force_sensor_mps2: FloatArray
     specific_force_cg_mps2: FloatArray
@@ -54,9 +58,9 @@ def whole_windows(bet: Reconstruction, grid: FloatArray) -> BoolArray:
     return np.asarray(inside & (t_imu[nearest] - t_imu[nearest - 1] <= 2.0 * h))
 
 
-def sensed(bet: Reconstruction, t: FloatArray, cg_from_sensor_m: FloatArray) -> Sensed:
-    """What the corrected sensors say at times whose windows are whole."""
-    t_imu, h = bet.imu_time_s, HALF_WINDOW_S
+def sensed(bet: Reconstruction, t: FloatArray, cg_from_sensor_m: FloatArray, h: float = HALF_WINDOW_S) -> Sensed:
+    """What the corrected sensors say at times whose windows, ``h`` s to both sides, are whole."""
+    t_imu = bet.imu_time_s
     force = window_means(t_imu, bet.specific_force_body_mps2, t - h, t + h)
     rate = window_means(t_imu, bet.rate_body_radps, t - h, t + h)
     after = window_means(t_imu, bet.rate_body_radps, t, t + 2 * h)
@@ -73,17 +77,24 @@ def pulse_data(telemetry: Telemetry, bet: Reconstruction, air: AirData) -> Pulse
     inside = whole_windows(bet, grid) & (np.abs(ticks - np.round(ticks)) < 1e-5)
     vehicle, (accelerometer, rates) = telemetry.required_vehicle(), telemetry.required_triads()
     t = grid[inside]
-    at = sensed(bet, t, vehicle.cg_m - accelerometer.spec.position_from_datum_body_m)
-    white = accelerometer.spec.noise_sd**2 / at.samples * np.eye(3)
+    step = np.median(np.diff(bet.imu_time_s)) if len(bet.imu_time_s) > 1 else 0.0
+    h = min(HALF_WINDOW_S, max(SWING_HALF_WINDOW_S, LEAST_SAMPLES * float(step)))
+    at = sensed(bet, t, vehicle.cg_m - accelerometer.spec.position_from_datum_body_m, h)
+    velocity = air.velocity_air_body_mps[inside]
+    root = bet.accelerometer_root[inside]
     return PulseData(
         time_s=t,
         specific_force_body_mps2=at.specific_force_cg_mps2,
-        specific_force_cov=bet.specific_force_cov[inside] + white,
+        force_noise_sd_mps2=float(accelerometer.spec.noise_sd / np.sqrt(at.samples)),
+        force_root_mps2=root[:, 3:],
+        flow_root_rad=angle_partials(velocity) @ rotations.skew(velocity) @ root[:, :3],
         rate_body_radps=at.rate_radps,
         angular_acceleration_body_radps2=at.angular_acceleration_radps2,
-        angular_acceleration_sd_radps2=float(np.sqrt(2.0 / at.samples) * rates.spec.noise_sd / (2 * HALF_WINDOW_S)),
-        flow_yz_rad=lateral_angles(air.velocity_air_body_mps[inside]),
+        angular_acceleration_sd_radps2=float(np.sqrt(2.0 / at.samples) * rates.spec.noise_sd / (2 * h)),
+        flow_yz_rad=lateral_angles(velocity),
         flow_cov=air.lateral_flow_cov[inside],
+        wind_flow_sd_rad=air.air.wind_sd_mps[inside] / velocity[:, 0],
+        altitude_m=air.altitude_m[inside],
         mach=air.mach[inside],
         dynamic_pressure_pa=air.dynamic_pressure_pa[inside],
         dynamic_pressure_sd_pa=air.dynamic_pressure_sd_pa[inside],

@@ -73,6 +73,8 @@ class Reconstruction:
     specific_force_cov, rate_cov : (n, 3, 3) float
         Systematic error covariance of the corrected specific force, (m/s^2)^2, and rates, (rad/s)^2, on the
         trajectory's times; empty without inertial sensors.
+    accelerometer_root : (n, 6, 9) float
+        Rotation and specific force error per unit normal of the accelerometer's errors, `product.accelerometer_root`.
     findings : tuple of Finding
         Gaps that were bridged, stretches of radar track that were edited.
     provenance : dict
@@ -93,6 +95,7 @@ class Reconstruction:
     rate_body_radps: FloatArray
     specific_force_cov: FloatArray
     rate_cov: FloatArray
+    accelerometer_root: FloatArray
     findings: tuple[Finding, ...]
     provenance: dict[str, object]
     left_out: tuple[LeftOut, ...] = ()
@@ -225,6 +228,7 @@ def reconstruct_once(
         rate_body_radps=series[2],
         specific_force_cov=series[3],
         rate_cov=series[4],
+        accelerometer_root=series[5],
         findings=(
             *found,
             *(d.finding() for d in disturbances),
@@ -261,12 +265,12 @@ def _mounting(telemetry: Telemetry, bridges: Bridges | None) -> product.Mounting
 
 
 def _series(problem: Problem, bridges: Bridges | None, states: States, smoothed: Smoothed) -> tuple[FloatArray, ...]:
-    """Corrected specific force and rates with their times, and the covariances of both at kept nodes."""
+    """Corrected specific force and rates with their times, and at kept nodes how well both are known."""
     if bridges is None:
-        return np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
+        return tuple(np.empty(s) for s in ((0,), (0, 3), (0, 3), (0, 3, 3), (0, 3, 3), (0, 6, 9)))
     series = product.corrected_series(problem, bridges.force, bridges.rate, states)
-    covs = (make(problem, states, smoothed.triangles) for make in (product.specific_force_cov, product.rate_cov))
-    return (*series, *covs)
+    known = (product.specific_force_cov, product.rate_cov, product.accelerometer_root)
+    return (*series, *(make(problem, states, smoothed.triangles) for make in known))
 
 
 def _mcreynolds(problem: Problem, run: ekf.ForwardPass, smoothed: Smoothed, reference: States) -> list[Verdict]:

@@ -110,6 +110,24 @@ def specific_force_cov(problem: Problem, states: States, triangles: FloatArray) 
     return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
 
 
+def accelerometer_root(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
+    """Response (k, 6, 9) of rotation error and specific force error, body axes, at kept nodes to nine unit normals.
+
+    The nine stand for the accelerometer's constant errors: ``root @ root.T`` of the lower rows is the covariance of
+    the corrected specific force, the upper rows are what of the attitude's error goes with them. Errors that wander
+    are taken as they are at mid-span.
+    """
+    kept = np.flatnonzero(problem.kept)
+    measured = problem.motion.force_sensor_mps2[problem.node_index[kept]]
+    partials = correction_partials(measured, states.sensor_errors[kept, 0:9], problem.motion.dcm_body_force)
+    covariance = unpacked(triangles, 18)
+    variance, axes = np.linalg.eigh(covariance[len(kept) // 2, 9:18, 9:18])
+    sd = np.sqrt(np.maximum(variance, 0.0))
+    inverse = np.divide(1.0, sd, out=np.zeros(9), where=sd > 1e-12)
+    attitude = covariance[:, 6:9, 9:18] @ (axes * inverse)
+    return np.concatenate([attitude, partials @ (axes * sd)], axis=1)
+
+
 def rate_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
     """Systematic error covariance (k, 3, 3) of the corrected rates at kept nodes, body axes, (rad/s)^2."""
     kept = np.flatnonzero(problem.kept)

@@ -71,15 +71,15 @@ def test_sd_equals_a_monte_carlo():
     one, _ = pulse_of(rng, n=1)
     nominal = estimate_misalignment(one)
     draws = 600
-    force_root = np.linalg.cholesky(one.specific_force_cov[0])
     flow_root = np.linalg.cholesky(one.flow_cov[0])
     known = one.vehicle.uncertainty
     got = []
     for _ in range(draws):
-        ratio = 1.0 + np.hypot(known.cn, known.ca) * rng.normal()
-        tilt = force_tilt(one.specific_force_body_mps2 + force_root @ rng.normal(size=3))
+        cn, ca = 1.0 + known.cn * rng.normal(), 1.0 + known.ca * rng.normal()
+        force = one.specific_force_body_mps2 + one.force_root_mps2[0] @ rng.normal(size=9)
+        tilt = force_tilt(force + one.force_noise_sd_mps2 * rng.normal(size=3))
         flow = one.flow_yz_rad + flow_root @ rng.normal(size=2)
-        got.append(solve_deflection(AERO.scaled(cn=ratio), one.mach, tilt, flow)[0])
+        got.append(solve_deflection(AERO.scaled(cn=cn, ca=ca), one.mach, tilt, flow)[0])
     sampled = np.cov(np.array(got).T)
     d = nominal.theta_yz_rad[0] / nominal.theta_rad[0]
     # 600 draws: 3 % of a standard deviation, 3 sd

@@ -3,12 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from estimators.evidence import VEHICLE_INPUTS, moved_vehicle
 from estimators.trim import (
     deflection_for_trim_angle,
     estimate_trim,
     moment_term,
     solve_trim,
     trim_angle_for_deflection,
+    trim_evidence,
     trim_model,
 )
 
@@ -57,8 +59,8 @@ def test_moment_about_the_cg_vanishes_as_a_cross_product():
 @pytest.mark.parametrize("seed", range(4))
 def test_recovers_any_plane_from_ideal_data(seed):
     pulse, truth = pulse_of(np.random.default_rng(seed), n=40)
-    np.testing.assert_allclose(estimate_trim(pulse, dynamic=False).theta_yz_rad, truth, atol=2e-4)
-    np.testing.assert_allclose(estimate_trim(pulse).theta_yz_rad, truth, atol=2e-4)
+    for dynamic in (False, True):
+        np.testing.assert_allclose(trim_evidence(pulse, dynamic=dynamic).theta_yz_rad, truth, atol=2e-4)
 
 
 def test_measured_moment_moves_the_balance_by_its_offset():
@@ -72,8 +74,8 @@ def test_measured_moment_moves_the_balance_by_its_offset():
     # a lateral force offset u times the axial force is the moment: u x x_hat
     want = np.cross(np.column_stack([np.zeros(20), u]), [1.0, 0.0, 0.0]) * pressure[:, None]
     np.testing.assert_allclose(want[:, 1:], np.broadcast_to(moment[1:], (20, 2)), rtol=1e-12)
-    ignored = estimate_trim(turning, dynamic=False).theta_yz_rad
-    seen = estimate_trim(turning).theta_yz_rad
+    ignored = trim_evidence(turning, dynamic=False).theta_yz_rad
+    seen = trim_evidence(turning).theta_yz_rad
     np.testing.assert_allclose(ignored, truth, atol=2e-4)
     assert np.abs(seen - truth).max() > 1e-3
 
@@ -82,23 +84,18 @@ def test_sd_equals_a_monte_carlo_over_the_vehicle():
     rng = np.random.default_rng(6)
     one, _ = pulse_of(rng, n=1)
     nominal = estimate_trim(one, dynamic=False)
-    known, got = VEHICLE.uncertainty, []
+    got = []
     root = np.linalg.cholesky(one.flow_cov[0])
     for _ in range(600):
-        g = rng.normal(size=8)
-        xbar = np.hypot(known.mass, known.cg_station_m / MODEL.xbar_m)
-        model = replace(
-            MODEL,
-            aero=MODEL.aero.scaled(1 + known.ca * g[0], 1 + known.cn * g[1], 1 + known.cm * g[2]),
-            offset_yz_m=MODEL.offset_yz_m + known.cg_lateral_m * g[3:5],
-            x_cg_m=MODEL.x_cg_m + known.cg_station_m * g[5],
-            xbar_m=MODEL.xbar_m * (1 + xbar * g[6]),
-        )
+        moved = {name: rng.normal() for name in VEHICLE_INPUTS}
         flow = one.flow_yz_rad + root @ rng.normal(size=2)
-        got.append(solve_trim(model, one.mach, flow, np.zeros((1, 2)))[0])
+        got.append(solve_trim(trim_model(moved_vehicle(VEHICLE, moved)), one.mach, flow, np.zeros((1, 2)))[0])
     sampled = np.cov(np.array(got).T)
     d = nominal.theta_yz_rad[0] / nominal.theta_rad[0]
     assert nominal.theta_sd_rad[0] == pytest.approx(np.sqrt(d @ sampled @ d), rel=0.10)
+    # the curvature by C_m shifts the mean: 600 draws know it to sd/24
+    shift = (np.mean(got, axis=0) - nominal.theta_yz_rad[0]) @ d
+    assert abs(shift) < 3.0 * nominal.theta_sd_rad[0] / np.sqrt(600)
 
 
 def test_no_answer_beyond_30_deg():

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-METHODS = ("camera", "misalignment", "trim")
+METHODS = ("camera", "misalignment", "trim", "fused")
 DEFLECTION_LIMIT_DEG = {"camera": 0.7, "misalignment": 0.7, "trim": 1.2}
 PULSE_FRACTION = 0.5  # the pressure pulse: dynamic pressure above half its peak
 

@@ -1,0 +1,297 @@
+"""What was the deflection, given all that was read of it at once? One posterior for angle and plane over the pulse.
+
+Unknown are the deflection's history, a cubic spline of its lateral vector whose second derivative is white (the joint
+as a second-order process of which only the size is taken as known), and every input that the methods lean on
+(`estimators.evidence`). Readings and priors are Gaussian and linear in both::
+
+    read(t) = theta(t) + A(t) theta''(t) - J(t) x + e,     theta'' ~ N(0, ACCELERATION_SD^2) a knot,     x ~ N(0, 1)
+
+so that the posterior is one least-squares problem, solved again with the readings taken at the inputs just found until
+these settle (Gauss and Newton's): a smoother with the deflection as its state, in which what methods
+share is correlated and what one method learns of an input helps the others. Its covariance is the Cramer-Rao bound of
+the same data and priors. One method alone gives that method's own smooth history.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_factor, cho_solve
+
+from estimators.evidence import Evidence, corrected_pulse
+from estimators.pulse import PulseData
+from flightmodel.checks import BoolArray, DivergenceError, FloatArray
+from flightmodel.deflection import DeflectionHistory, history_from_lateral
+
+KNOT_S = 0.2  # half a period of the joint at 2.5 Hz
+# of the joint, at each knot: 0.7 deg of swinging at 2.5 Hz, 10 deg at the slow aerodynamic mode's 0.65 Hz, so that it
+# is no reason to believe in other inputs
+ACCELERATION_SD_RADPS2 = 1.0
+SIZE_SD_RAD = 1.0  # of the deflection itself: says nothing
+# what the methods' equations leave out, second order in the angles and gusts shorter than the wind's knots: up to this,
+# for about so long
+LEFT_OUT_RAD, LEFT_OUT_TIME_S = np.deg2rad(0.03), 1.0
+LEAST_SAMPLES = 8
+MOST_INPUT_SD, SETTLED_SD, MOST_STEPS, WHOLE_STEPS = 8.0, 0.05, 12, 3
+NEAR_S = 0.5  # an answer is given no further from a reading
+
+Inputs = dict[str, FloatArray]
+Deflection = Callable[[FloatArray], FloatArray]
+Read = Callable[[Inputs, Deflection | None], list[Evidence]]
+
+
+@dataclass(frozen=True)
+class Fused:
+    """Posterior of the deflection and of what the methods lean on.
+
+    Parameters
+    ----------
+    history : DeflectionHistory
+        At the times of the method with most samples.
+    inputs : dict of str to (mean (k,), covariance (k, k))
+        Of each input's unit normals, given all readings.
+    correlation : (g, g) float
+        Of the inputs' leading unit normals and of the deflection's two components at ``at_s``, in order of ``names``.
+    names : tuple of str
+    at_s : float
+        Where the readings bear most: the time of the smallest deflection error.
+    deflection : callable
+        From times to lateral vectors (n, 2), rad.
+    """
+
+    history: DeflectionHistory
+    inputs: dict[str, tuple[FloatArray, FloatArray]]
+    correlation: FloatArray
+    names: tuple[str, ...]
+    at_s: float
+    deflection: Deflection
+
+
+def fuse(read: Read, method: str = "fused") -> Fused:
+    """Fuse what the methods read; one method alone is smoothed.
+
+    Parameters
+    ----------
+    read : callable
+        From inputs, moved by so many standard deviations, and a deflection to be linear about (from times to lateral
+        vectors; None: each method's own) to what the methods then read.
+    method : str
+        Name of the answer.
+
+    Raises
+    ------
+    DivergenceError
+        Where there is too little to read, or the readings ask for inputs far beyond what is known of them, or the
+        inputs do not settle.
+    """
+    told = [e for e in read({}, None) if np.isfinite(e.theta_yz_rad).all(axis=1).sum() >= LEAST_SAMPLES]
+    if not told:
+        raise DivergenceError(f"{method}: no method has {LEAST_SAMPLES} readings of the deflection")
+    methods = [e.method for e in told]
+    # first every sample by itself, without what they share: a deflection to be linear about
+    apart = [replace(e, by_input={}, independent_cov=e.covariance) for e in told]
+    problem = _Problem.of(apart, {})
+    found, covariance = problem.solved(method)
+    inputs: Inputs = {}
+    for step in range(MOST_STEPS):
+        told = [e for e in read(inputs, problem.deflection(found)) if e.method in methods]
+        problem, before = _Problem.of(told, inputs), found
+        found, covariance = problem.solved(method)
+        size = 2 * problem.spline.count
+        new = {name: found[size:][place] for name, place in problem.place.items()}
+        _check(new, method)
+        moved = float((np.abs(found[:size] - before[:size]) / np.sqrt(np.diag(covariance)[:size])).max())
+        if moved < SETTLED_SD and step > 0:
+            return _posterior(found, covariance, problem, told, method)
+        # Newton's whole steps first, then half steps, which cannot swing to and fro
+        part = 1.0 if step < WHOLE_STEPS else 0.5
+        inputs = {name: part * x + (1.0 - part) * inputs.get(name, 0.0 * x) for name, x in new.items()}
+    raise DivergenceError(
+        f"{method}: the deflection does not settle: after {MOST_STEPS} steps it still moves by {moved:.2g} "
+        "standard deviations; see each method's own answer"
+    )
+
+
+@dataclass(frozen=True)
+class _Spline:
+    """Cubic B-spline with even knots."""
+
+    knots_s: FloatArray
+    count: int
+    _full: FloatArray
+
+    @classmethod
+    def over(cls, low: float, high: float) -> _Spline:
+        inner = low + KNOT_S * np.arange(int(np.ceil((high - low) / KNOT_S)) + 1)
+        full = np.concatenate([inner[0] - KNOT_S * np.arange(3, 0, -1), inner, inner[-1] + KNOT_S * np.arange(1, 4)])
+        return cls(np.asarray(inner), len(full) - 4, np.asarray(full))
+
+    def rows(self, time_s: FloatArray, derivative: int = 0) -> FloatArray:
+        """Values (n, count) of every basis function, or of its derivative."""
+        basis = BSpline(self._full, np.eye(self.count), 3)
+        at = np.clip(time_s, self.knots_s[0], self.knots_s[-1])
+        return np.asarray(basis(at, nu=derivative))
+
+
+def pulse_reader(
+    pulse: PulseData, methods: dict[str, Callable[[PulseData, BoolArray, FloatArray | None], Evidence]],
+    others: list[Evidence],
+) -> Read:  # fmt: skip
+    """Return what `fuse` reads: methods that look at the pulse, and others whose readings are what they are.
+
+    Inputs scale what was measured, and would scale its noise too, which no input can have made smaller: they act on
+    the measurements' part that the spline can follow alone.
+    """
+    use = pulse.through_pulse
+    smooth = _smoothed(pulse, use)
+
+    def read(inputs: Inputs, about: Deflection | None) -> list[Evidence]:
+        if about is None:
+            return [*(method(pulse, use, None) for method in methods.values()), *others]
+        at, moved, out = about(pulse.time_s[use]), corrected_pulse(smooth, use, inputs), []
+        for method in methods.values():
+            found = method(moved, use, at)
+            noise = method(pulse, use, at).theta_yz_rad - method(smooth, use, at).theta_yz_rad
+            out.append(replace(found, theta_yz_rad=found.theta_yz_rad + noise))
+        return [*out, *others]
+
+    return read
+
+
+def _smoothed(pulse: PulseData, use: BoolArray) -> PulseData:
+    """Pulse whose force, rate and angular acceleration are what a spline with `KNOT_S` can follow."""
+    t = pulse.time_s[use]
+    value = _Spline.over(float(t[0]), float(t[-1])).rows(t)
+    fit = value @ np.linalg.pinv(value)
+    names = ("specific_force_body_mps2", "rate_body_radps", "angular_acceleration_body_radps2")
+    moved = {}
+    for name in names:
+        moved[name] = getattr(pulse, name).copy()
+        moved[name][use] = fit @ moved[name][use]
+    return replace(pulse, **moved)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Normal equations of the deflection's spline (y, then z) and of the inputs; where each input's normals stand."""
+
+    spline: _Spline
+    place: dict[str, slice]
+    normal: FloatArray
+    right: FloatArray
+
+    @classmethod
+    def of(cls, told: list[Evidence], inputs: Inputs) -> _Problem:
+        spline = _Spline.over(float(min(e.time_s[0] for e in told)), float(max(e.time_s[-1] for e in told)))
+        place: dict[str, slice] = {}
+        total = 0
+        for name, response in (item for e in told for item in e.by_input.items()):
+            if name not in place:
+                place[name] = slice(total, total + response.shape[2])
+                total = place[name].stop
+        size = 2 * spline.count
+        normal, right = np.zeros((size + total,) * 2), np.zeros(size + total)
+        for one in told:
+            rows, want = _whitened(one, spline, place, inputs)
+            normal += rows.T @ rows
+            right += rows.T @ want
+        curvature = spline.rows(spline.knots_s, 2) / ACCELERATION_SD_RADPS2
+        bending = curvature.T @ curvature + np.eye(spline.count) / SIZE_SD_RAD**2
+        for axis in range(2):
+            part = slice(axis * spline.count, (axis + 1) * spline.count)
+            normal[part, part] += bending
+        normal[range(size, len(right)), range(size, len(right))] += 1.0
+        return cls(spline, place, normal, right)
+
+    def deflection(self, found: FloatArray) -> Deflection:
+        """Lateral vectors (n, 2) of a solution, from times."""
+        coefficients = found[: 2 * self.spline.count].reshape(2, -1)
+        return lambda time_s: self.spline.rows(time_s) @ coefficients.T
+
+    def solved(self, method: str) -> tuple[FloatArray, FloatArray]:
+        """Posterior mean and covariance of all unknowns."""
+        try:
+            covariance = cho_solve(cho_factor(self.normal), np.eye(len(self.right)))
+        except np.linalg.LinAlgError:
+            raise DivergenceError(f"{method}: the readings do not determine the deflection") from None
+        return covariance @ self.right, covariance
+
+
+def _whitened(one: Evidence, spline: _Spline, place: dict[str, slice], inputs: Inputs) -> tuple[FloatArray, FloatArray]:
+    """Rows ``(2 n, unknowns)`` of the least-squares problem and what they should give, errors of unit variance."""
+    keep = np.isfinite(one.theta_yz_rad).all(axis=1)
+    n, m = int(keep.sum()), spline.count
+    value, second = spline.rows(one.time_s[keep]), spline.rows(one.time_s[keep], 2)
+    swing = one.by_acceleration_s2[keep]
+    rows = np.zeros((n, 2, 2 * m + max((p.stop for p in place.values()), default=0)))
+    for axis in range(2):
+        for other in range(2):
+            rows[:, axis, other * m : (other + 1) * m] = swing[:, axis, other, None] * second
+        rows[:, axis, axis * m : (axis + 1) * m] += value
+    want = one.theta_yz_rad[keep].copy()
+    for name, every in one.by_input.items():
+        response = every[keep]
+        rows[:, :, 2 * m + place[name].start : 2 * m + place[name].stop] = -response
+        if name in inputs:
+            want -= response @ inputs[name]
+    share = _bins(one.time_s[keep], one.averaged_s)
+    rows = (share @ rows.reshape(n, -1)).reshape(len(share), 2, -1)
+    cov = np.einsum("bn,nij->bij", share**2, one.independent_cov[keep])
+    cov += LEFT_OUT_RAD**2 * LEFT_OUT_TIME_S / one.averaged_s * np.eye(2)
+    whiten = np.linalg.inv(np.linalg.cholesky(cov))
+    return (whiten @ rows).reshape(2 * len(share), -1), (whiten @ (share @ want)[:, :, None]).ravel()
+
+
+def _bins(time_s: FloatArray, width_s: float) -> FloatArray:
+    """Weights (bins, n) of the means over spans of time; spans without a sample are left out."""
+    which = np.floor((time_s - time_s[0]) / width_s + 1e-6).astype(int)
+    _, which, count = np.unique(which, return_inverse=True, return_counts=True)
+    out = np.zeros((len(count), len(time_s)))
+    out[which, np.arange(len(time_s))] = 1.0 / count[which]
+    return out
+
+
+def _check(inputs: Inputs, method: str) -> None:
+    for name, moved in inputs.items():
+        worst = float(np.abs(moved).max())
+        if not worst <= MOST_INPUT_SD:
+            raise DivergenceError(
+                f"{method}: the readings agree only if {name} is {worst:.0f} standard deviations off what is stated; "
+                "check what the flight and vehicle files say of it, and each method's own answer"
+            )
+
+
+def _posterior(
+    found: FloatArray, covariance: FloatArray, problem: _Problem, told: list[Evidence], method: str
+) -> Fused:
+    spline = problem.spline
+    m, size = spline.count, 2 * spline.count
+    t = max(told, key=lambda e: len(e.time_s)).time_s
+    read = np.concatenate([e.time_s for e in told])
+    read.sort()
+    after = np.searchsorted(read, t).clip(1, len(read) - 1)
+    t = t[np.minimum(np.abs(read[after] - t), np.abs(t - read[after - 1])) <= NEAR_S]
+    value = spline.rows(t)
+    theta_yz = np.stack([value @ found[axis * m : (axis + 1) * m] for axis in range(2)], axis=-1)
+    cov = np.zeros((len(t), 2, 2))
+    for i in range(2):
+        for j in range(2):
+            block = covariance[i * m : (i + 1) * m, j * m : (j + 1) * m]
+            cov[:, i, j] = np.sum((value @ block) * value, axis=1)
+    words = f"from {', '.join(e.method for e in told)} with what they share; joint as a second-order process"
+    history = history_from_lateral(t, theta_yz, cov, method, words)
+    inputs = {
+        name: (found[size:][place], covariance[size:, size:][place, place]) for name, place in problem.place.items()
+    }
+    best = int(np.argmin(np.trace(cov, axis1=1, axis2=2)))
+    pick = np.zeros((2 + len(inputs), len(found)))
+    pick[0, :m], pick[1, m:size] = value[best], value[best]
+    for k, place in enumerate(problem.place.values()):
+        pick[2 + k, size + place.start] = 1.0
+    joint = pick @ covariance @ pick.T
+    sd = np.sqrt(np.diag(joint))
+    names = ("deflection y", "deflection z", *inputs)
+    return Fused(history, inputs, joint / np.outer(sd, sd), names, float(t[best]), problem.deflection(found))

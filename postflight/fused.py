@@ -1,0 +1,68 @@
+"""One answer from all methods of a flight, and whether they agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from estimators.agreement import Agreement, agreement
+from estimators.evidence import Evidence, evidence_of_history
+from estimators.fusion import Fused, fuse, pulse_reader
+from estimators.misalignment import misalignment_evidence
+from estimators.pulse import PulseData
+from estimators.trim import trim_evidence
+from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.deflection import DeflectionHistory
+
+
+@dataclass(frozen=True)
+class FusedAnswer:
+    """Posterior of deflection and inputs, and the tests of the methods against each other."""
+
+    fused: Fused
+    agreement: Agreement
+
+
+def fuse_flight(
+    pulse: PulseData, camera: DeflectionHistory | None, joint_station_m: float | None = None
+) -> FusedAnswer:
+    """Fuse accelerometers, moment balance and, where there is one, the camera's history.
+
+    Raises
+    ------
+    GateError
+        Where the deceleration carries no information.
+    DivergenceError
+        Where there is no common answer; it says why.
+    """
+    if not pulse.through_pulse.any():
+        raise GateError("fused: the deceleration carries no information at any time")
+
+    def trim(at: PulseData, use: BoolArray, about: FloatArray | None) -> Evidence:
+        return trim_evidence(at, joint_station_m, use=use, about_yz_rad=about)
+
+    seen = [] if camera is None else [evidence_of_history(camera)]
+    seen = [e for e in seen if len(e.time_s)]
+    read = pulse_reader(pulse, {"misalignment": misalignment_evidence, "trim": trim}, seen)
+    fused = fuse(read)
+    return FusedAnswer(fused, agreement(read({}, fused.deflection)))
+
+
+def input_table(answer: FusedAnswer) -> pd.DataFrame:
+    """What the methods together say of each input's leading unit normal, and its correlation with the deflection.
+
+    Columns ``input, moved_sd, sd_left, correlation_with_deflection_y, correlation_with_deflection_z``.
+    """
+    fused, rows = answer.fused, []
+    for k, (name, (mean, cov)) in enumerate(fused.inputs.items()):
+        rows.append((name, mean[0], np.sqrt(cov[0, 0]), *fused.correlation[2 + k, :2]))
+    names = ["input", "moved_sd", "sd_left", "correlation_with_deflection_y", "correlation_with_deflection_z"]
+    return pd.DataFrame(rows, columns=names)
+
+
+def agreement_table(answer: FusedAnswer) -> pd.DataFrame:
+    """Return one row a pair of methods: ``methods, chi_square, degrees, chance, passed``."""
+    rows = [(" and ".join(p.methods), p.chi_square, p.degrees, p.chance, p.passed) for p in answer.agreement.pairs]
+    return pd.DataFrame(rows, columns=["methods", "chi_square", "degrees", "chance", "passed"])

@@ -1,0 +1,203 @@
+"""One posterior from all methods: against the joint Gaussian written out, against ideal data, and what disagrees."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from estimators import fusion
+from estimators.agreement import agreement
+from estimators.evidence import (
+    WIND,
+    Evidence,
+    corrected_pulse,
+    evidence_of_history,
+    flow_inputs,
+    forgetful,
+    moved_vehicle,
+)
+from estimators.fusion import fuse, pulse_reader
+from estimators.misalignment import misalignment_evidence
+from estimators.trim import trim_evidence
+from flightmodel.checks import DivergenceError
+from flightmodel.deflection import history_from_lateral
+
+from .conftest import VEHICLE, pulse_of
+
+N = 160
+TIME_S = 430.0 + 0.05 * np.arange(N)
+
+
+def bent():
+    """A deflection that grows and swings slowly, in a plane that is none of the axes'."""
+    x = (TIME_S - 434.0) / 4.0
+    size = np.deg2rad(3.5) * np.exp(-(x**2)) + np.deg2rad(0.4) * np.sin(2 * np.pi * 0.6 * (TIME_S - 430.0))
+    return size[:, None] * np.array([0.8, -0.6])
+
+
+def trim(pulse, use, about):
+    return trim_evidence(pulse, use=use, about_yz_rad=about)
+
+
+METHODS = {"misalignment": misalignment_evidence, "trim": trim}
+
+
+def linear_evidence(rng, name, inputs, noise_sd=1e-3):
+    """Evidence of a method that leans on inputs with smooth responses."""
+    t = TIME_S - TIME_S[0]
+    response = {k: 2e-3 * rng.normal(size=(1, 2, 1)) * (1.0 + 0.3 * np.sin(t + j))[:, None, None]
+                for j, k in enumerate(inputs)}  # fmt: skip
+    cov = np.tile(noise_sd**2 * np.eye(2), (N, 1, 1))
+    return Evidence(name, TIME_S, np.zeros((N, 2)), np.tile(-1e-3 * np.eye(2), (N, 1, 1)), response, cov, 0.1)
+
+
+def linear_reader(told):
+    """Readings that move with the inputs exactly as their responses say."""
+
+    def read(inputs, _about):
+        return [
+            replace(e, theta_yz_rad=e.theta_yz_rad + sum(j @ inputs.get(k, np.zeros(1)) for k, j in e.by_input.items()))
+            for e in told
+        ]
+
+    return read
+
+
+def test_posterior_is_that_of_the_joint_gaussian():
+    """The same problem by the covariance form: condition prior on readings, no normal equations."""
+    rng = np.random.default_rng(0)
+    told = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"))]
+    told = [replace(e, theta_yz_rad=bent() + 1e-3 * rng.normal(size=(N, 2))) for e in told]
+    got = fuse(linear_reader(told))
+    spline = fusion._Spline.over(TIME_S[0], TIME_S[-1])
+    curvature = spline.rows(spline.knots_s, 2) / fusion.ACCELERATION_SD_RADPS2
+    prior = np.linalg.inv(curvature.T @ curvature + np.eye(spline.count) / fusion.SIZE_SD_RAD**2)
+    size = 2 * spline.count
+    before = np.eye(size + 3)
+    before[:size, :size] = np.kron(np.eye(2), prior)
+    rows, want = zip(
+        *(fusion._whitened(e, spline, {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}, {}) for e in told),
+        strict=True,
+    )
+    rows, want = np.concatenate(rows), np.concatenate(want)
+    gain = before @ rows.T @ np.linalg.inv(rows @ before @ rows.T + np.eye(len(want)))
+    mean, after = gain @ want, before - gain @ rows @ before
+    value = spline.rows(got.history.time_s)
+    lateral = np.stack([value @ mean[: spline.count], value @ mean[spline.count : size]], axis=-1)
+    np.testing.assert_allclose(got.history.theta_yz_rad, lateral, atol=1e-8)
+    np.testing.assert_allclose([got.inputs[k][0][0] for k in "pqr"], mean[size:], atol=1e-6)
+    np.testing.assert_allclose([got.inputs[k][1][0, 0] for k in "pqr"], np.diag(after)[size:], rtol=1e-5)
+    cov = np.einsum("ni,ij,nj->n", value, after[: spline.count, : spline.count], value)
+    np.testing.assert_allclose(got.history.lateral_cov[:, 0, 0], cov, rtol=1e-4)
+
+
+def test_linear_readings_err_as_the_posterior_says(monkeypatch):
+    """Normalised squares of the deflection's errors over draws are chi-squares; nothing is left out of the equations."""
+    monkeypatch.setattr(fusion, "LEFT_OUT_RAD", 1e-5)
+    rng = np.random.default_rng(1)
+    template = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"), 2e-3)]
+    truth, squares = bent(), []
+    for _ in range(40):
+        x = {k: rng.normal(size=1) for k in "pqr"}
+        second = np.gradient(np.gradient(truth, TIME_S, axis=0), TIME_S, axis=0)
+        told = []
+        for e in template:
+            read = truth + np.einsum("nij,nj->ni", e.by_acceleration_s2, second)
+            read -= sum(j @ x[k] for k, j in e.by_input.items())
+            told.append(replace(e, theta_yz_rad=read + np.sqrt(e.independent_cov[0, 0, 0]) * rng.normal(size=(N, 2))))
+        got = fuse(linear_reader(told))
+        k = N // 2
+        d = got.history.theta_yz_rad[k] - truth[k]
+        squares.append(d @ np.linalg.solve(got.history.lateral_cov[k], d))
+    low, high = chi2.ppf([0.005, 0.995], 80) / 40
+    assert low < np.mean(squares) < high
+
+
+def test_ideal_data_give_the_deflection_back():
+    pulse, truth = pulse_of(np.random.default_rng(2), N, bent())
+    got = fuse(pulse_reader(pulse, METHODS, []))
+    at = np.searchsorted(pulse.time_s, got.history.time_s)
+    inner = (got.history.time_s > TIME_S[8]) & (got.history.time_s < TIME_S[-9])
+    np.testing.assert_allclose(got.history.theta_yz_rad[inner], truth[at][inner], atol=np.deg2rad(0.1))
+    assert agreement(pulse_reader(pulse, METHODS, [])({}, got.deflection)).suspects == ()
+
+
+def test_fused_is_better_than_each_and_learns_the_coefficient():
+    """A C_m that is two sd off is found from the difference of the methods, and its own sd shrinks."""
+    flown = moved_vehicle(VEHICLE, {"C_m": 2.0})
+    pulse, _ = pulse_of(np.random.default_rng(3), N, bent(), flown)
+    got = fuse(pulse_reader(pulse, METHODS, []))
+    mean, cov = got.inputs["C_m"]
+    assert np.sqrt(cov[0, 0]) < 0.8
+    assert abs(mean[0] - 2.0) < 2.0 * np.sqrt(cov[0, 0])
+    k = N // 2
+    own = misalignment_evidence(pulse).covariance[k], trim_evidence(pulse).covariance[k]
+    fused = np.trace(got.history.lateral_cov[np.searchsorted(got.history.time_s, TIME_S[k])])
+    assert fused < min(np.trace(c) for c in own)
+
+
+def test_moving_the_inputs_moves_the_reading_by_the_response():
+    """J of every input against a finite change, both methods; the deflection to be linear about is the reading."""
+    pulse, _ = pulse_of(np.random.default_rng(4), 30)
+    use, rng = pulse.informative, np.random.default_rng(5)
+    for method in METHODS.values():
+        base = method(pulse, use, None)
+        for name, response in base.by_input.items():
+            x = 1e-3 * rng.normal(size=response.shape[2])
+            moved = method(corrected_pulse(pulse, use, {name: x}), use, None)
+            change = moved.theta_yz_rad - base.theta_yz_rad
+            scale = np.abs(response).max() * 1e-3 + 1e-9
+            np.testing.assert_allclose(change, response @ x, atol=0.05 * scale + 2e-8, err_msg=name)
+
+
+def test_flow_parts_add_up_to_its_covariance():
+    pulse, _ = pulse_of(np.random.default_rng(6), 40)
+    use = pulse.informative
+    parts = flow_inputs(pulse, use)
+    total = sum(j @ j.transpose(0, 2, 1) for j in parts.values())
+    np.testing.assert_allclose(np.trace(total, axis1=1, axis2=2), np.trace(pulse.flow_cov[use], axis1=1, axis2=2))
+    wind = parts[WIND] @ parts[WIND].transpose(0, 2, 1)
+    np.testing.assert_allclose(wind[:, 0, 0], pulse.wind_flow_sd_rad[use] ** 2)
+
+
+def test_a_forgetful_history_forgets():
+    at = np.linspace(0.0, 30.0, 400)
+    root = forgetful(at, 3.0)
+    correlation = root @ root.T
+    np.testing.assert_allclose(np.diag(correlation), 1.0)
+    # straight lines between knots a third of the length apart: neighbours are too much alike
+    np.testing.assert_allclose(correlation, np.exp(-np.abs(at[:, None] - at) / 3.0), atol=0.15)
+
+
+def test_no_common_answer_is_words():
+    pulse, _ = pulse_of(np.random.default_rng(7), N, bent())
+    far = trim_evidence(pulse).theta_yz_rad + np.deg2rad(25.0)
+
+    def apart(inputs, about):
+        own = pulse_reader(pulse, {"misalignment": misalignment_evidence}, [])(inputs, about)
+        other = trim_evidence(corrected_pulse(pulse, pulse.through_pulse, inputs), use=pulse.through_pulse)
+        return [*own, replace(other, theta_yz_rad=far)]
+
+    with pytest.raises(DivergenceError, match="standard deviations"):
+        fuse(apart)
+    with pytest.raises(DivergenceError, match="no method has 8 readings"):
+        fuse(lambda _i, _a: [])
+
+
+@pytest.mark.parametrize(
+    ("moved", "culprit"),
+    [
+        ({"C_m": 6.0}, "aerodynamic coefficients"),
+        ({"initial offset y": 12.0}, "initial c.g. offset"),
+    ],
+)
+def test_a_gross_planted_error_is_named(moved, culprit):
+    """The scores' ranking, far from the noise; how often it is right near it is measured over flights."""
+    pulse, truth = pulse_of(np.random.default_rng(8), N, bent(), moved_vehicle(VEHICLE, moved))
+    cov = np.tile(np.deg2rad(0.1) ** 2 * np.eye(2), (N, 1, 1))
+    camera = evidence_of_history(history_from_lateral(TIME_S, truth, cov, "camera", ""))
+    at = lambda t: np.stack([np.interp(t, TIME_S, c) for c in truth.T], axis=-1)  # noqa: E731
+    found = agreement(pulse_reader(pulse, METHODS, [camera])({}, at))
+    assert found.suspects[0] == culprit
+    assert culprit in found.words
