@@ -54,14 +54,7 @@ def linear_evidence(rng, name, inputs, noise_sd=1e-3):
 
 def linear_reader(told):
     """Readings that move with the inputs exactly as their responses say."""
-
-    def read(inputs, _about):
-        return [
-            replace(e, theta_yz_rad=e.theta_yz_rad + sum(j @ inputs.get(k, np.zeros(1)) for k, j in e.by_input.items()))
-            for e in told
-        ]
-
-    return read
+    return lambda inputs, _about: [fusion._moved(e, inputs) for e in told]
 
 
 def test_posterior_is_that_of_the_joint_gaussian():
@@ -93,7 +86,7 @@ def test_posterior_is_that_of_the_joint_gaussian():
 
 
 def test_linear_readings_err_as_the_posterior_says(monkeypatch):
-    """Normalised squares of the deflection's errors over draws are chi-squares; nothing is left out of the equations."""
+    """Normalised squares of the deflection's errors over draws are chi-squares; the equations leave nothing out."""
     monkeypatch.setattr(fusion, "LEFT_OUT_RAD", 1e-5)
     rng = np.random.default_rng(1)
     template = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"), 2e-3)]
@@ -121,6 +114,19 @@ def test_ideal_data_give_the_deflection_back():
     inner = (got.history.time_s > TIME_S[8]) & (got.history.time_s < TIME_S[-9])
     np.testing.assert_allclose(got.history.theta_yz_rad[inner], truth[at][inner], atol=np.deg2rad(0.1))
     assert agreement(pulse_reader(pulse, METHODS, [])({}, got.deflection)).suspects == ()
+
+
+def test_a_camera_off_by_a_sd_is_found_out():
+    """Its error is an input as any other, and its readings move with it."""
+    pulse, truth = pulse_of(np.random.default_rng(9), N, bent())
+    off = np.deg2rad(0.8)
+    cov = np.tile(off**2 * np.eye(2), (N, 1, 1))
+    camera = evidence_of_history(history_from_lateral(TIME_S, truth + np.array([off, 0.0]), cov, "camera", ""))
+    got = fuse(pulse_reader(pulse, METHODS, [camera]))
+    k = N // 2
+    np.testing.assert_allclose(got.deflection(TIME_S[k : k + 1])[0], truth[k], atol=np.deg2rad(0.12))
+    told = camera.by_input["camera"] @ got.inputs["camera"][0]
+    np.testing.assert_allclose(told[k], [-off, 0.0], atol=np.deg2rad(0.15))
 
 
 def test_fused_is_better_than_each_and_learns_the_coefficient():
