@@ -1,8 +1,8 @@
 """Do the deflection estimates err as they say? Dispersed flights with every error alive, scored at peak pressure.
 
 Run: ``python benchmarks/estimator_coverage.py [FLIGHTS] [FOLDER] [--rigid | --planted]`` (100 flights). Drawn anew for
-each seed: side and size of the offset that the analyst is told, and what the analyst is not told: masses, c.g.s, inertias,
-joint, coefficients (C_A 5 %, C_N 10 %, C_m 15 %, C_mq 0.15 between Mach 1.2 and 5), start, spin,
+each seed: side and size of the offset that the analyst is told, and what the analyst is not told: masses, c.g.s,
+inertias, joint, coefficients (C_A 5 %, C_N 10 %, C_m 15 %, C_mq 0.15 between Mach 1.2 and 5), start, spin,
 air, the sounding's and every instrument's errors. No video. Some 5 s a flight on each of two cores; what the
 estimators see and the truth are kept in FOLDER, so that the estimators can be scored again without flying. The camera's
 history is drawn, not rendered. ``--rigid`` flies a stiff joint; ``--planted`` spoils one assumption at a time, with

@@ -83,6 +83,25 @@ def solve_deflection(aero: AeroTable, mach: FloatArray, tilt_yz: FloatArray, flo
     return theta
 
 
+def deflection_along_acceleration(
+    aero: AeroTable, mach: FloatArray, acceleration_body_mps2: FloatArray, alpha_rad: FloatArray
+) -> FloatArray:
+    """Bending (n,), rad, by the paper's form: all in the plane of the normal acceleration.
+
+    The 1-2-1 rotation of eq. [4] with ``psi`` along the normal acceleration takes ``theta`` off the force's tilt, so
+    that the aerodynamic angle of eq. [3] and the BET's total angle ``alpha_rad`` (n,) less ``theta`` agree where
+    ``theta = atan(a_N / -a_x) - atan(C_N/C_A (alpha - theta))``. The plane is opposite the normal acceleration.
+    NaN where the vehicle is not decelerated.
+    """
+    ax, normal = acceleration_body_mps2[:, 0], np.hypot(acceleration_body_mps2[:, 1], acceleration_body_mps2[:, 2])
+    tilt = np.arctan2(normal, -ax)
+    theta = tilt
+    for _ in range(ITERATIONS):
+        shell = alpha_rad - theta
+        theta = tilt - np.sign(shell) * np.arctan(aero.ratio(mach, np.minimum(np.abs(shell), np.pi)))
+    return np.where(ax < 0.0, theta, np.nan)
+
+
 def predicted_tilt(aero: AeroTable, mach: FloatArray, theta_yz: FloatArray, flow_yz: FloatArray) -> FloatArray:
     """Tilt of the force (n, 2), rad, on a shell bent by ``theta_yz`` (n, 2) in a flow."""
     direction, alpha = lateral_and_size(flow_yz - theta_yz)

@@ -10,9 +10,11 @@ import pandas as pd
 
 from estimators.benchmark import orient_camera
 from estimators.camera_fit import OrientedCamera
-from estimators.figures import figure_camera_overlay
+from estimators.figures import figure_camera_overlay, figure_fusion, figure_static_trim
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row
-from flightmodel.checks import FloatArray
+from estimators.pulse import PulseData
+from estimators.static_trim import static_trim
+from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
 from postflight import figures
@@ -43,9 +45,32 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
         figures.save(figures.figure_2_7(flight, answers.histories["misalignment"]), folder / "figure_2_7.png")
     if "camera" in answers.histories:
         draw_camera(flight.telemetry, answers.histories["camera"], folder)
+    if answers.fused is not None:
+        fused = answers.fused
+        figure = figure_fusion(fused.fused, fused.limbs, f"{fused.agreement.words}; {fused.limbs_words}")
+        figures.stamp(figure, flight.telemetry)
+        figures.save(figure, folder / "fusion.png")
+    if flight.pulse is not None:
+        draw_static_trim(flight.pulse, flight.telemetry, folder)
     if answers.histories:
         figures.save(summary_figure(flight, answers), folder / "summary.png")
     report(1.0, "drawn")
+
+
+def draw_static_trim(pulse: PulseData, telemetry: Telemetry, folder: Path) -> None:
+    """Draw Figure 2.9 for the vehicle at the flight's peak of dynamic pressure, with its own offset and the paper's."""
+    vehicle, k = pulse.vehicle, int(np.argmax(pulse.dynamic_pressure_pa))
+    mach, pressure = float(pulse.mach[k]), float(pulse.dynamic_pressure_pa[k])
+    try:
+        static = static_trim(vehicle, mach, pressure)
+    except GateError:
+        return
+    own = float(np.linalg.norm(vehicle.cg_m[1:]))
+    offsets = sorted({round(own, 5), 0.01, 0.0254})
+    title = f"static trim at {pressure:.0f} Pa, Mach {mach:.1f} (seed paper Figure 2.9)"
+    figure = figure_static_trim(static, offsets, vehicle.joint.bending_stiffness_nmprad, title)
+    figures.stamp(figure, telemetry)
+    figures.save(figure, folder / "figure_2_9.png")
 
 
 def draw_sensitivity(flight: Flight, table: pd.DataFrame, folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,17 +13,33 @@ from estimators.evidence import Evidence, evidence_of_history
 from estimators.fusion import Fused, fuse, pulse_reader
 from estimators.misalignment import misalignment_evidence
 from estimators.pulse import PulseData
+from estimators.southwell import Limbs, southwell_limbs
 from estimators.trim import trim_evidence
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, DivergenceError, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 
 
 @dataclass(frozen=True)
 class FusedAnswer:
-    """Posterior of deflection and inputs, and the tests of the methods against each other."""
+    """Posterior of deflection and inputs, tests of the methods against each other, and the Southwell lines."""
 
     fused: Fused
     agreement: Agreement
+    limbs: Limbs | None
+    limbs_words: str
+
+    def southwell_summary(self) -> dict[str, Any]:
+        """Critical dynamic pressure and offset with their intervals, for ``summary.json``."""
+        if self.limbs is None:
+            return {"critical_pressure_pa": None, "words": self.limbs_words}
+        line = self.limbs.both
+        return {
+            "critical_pressure_pa": line.critical_pressure_pa,
+            "critical_pressure_90_percent_pa": list(line.critical_interval_pa),
+            "offset_over_xbar_deg": float(np.rad2deg(line.offset_angle_rad)),
+            "offset_over_xbar_90_percent_deg": [float(x) for x in np.rad2deg(line.offset_interval_rad)],
+            "words": self.limbs_words,
+        }
 
 
 def fuse_flight(
@@ -47,7 +64,12 @@ def fuse_flight(
     seen = [e for e in seen if len(e.time_s)]
     read = pulse_reader(pulse, {"misalignment": misalignment_evidence, "trim": trim}, seen)
     fused = fuse(read)
-    return FusedAnswer(fused, agreement(read({}, fused.deflection)))
+    try:
+        limbs = southwell_limbs(fused.history, pulse.time_s, pulse.dynamic_pressure_pa)
+        words = limbs.words
+    except DivergenceError as fault:
+        limbs, words = None, str(fault)
+    return FusedAnswer(fused, agreement(read({}, fused.deflection)), limbs, words)
 
 
 def input_table(answer: FusedAnswer) -> pd.DataFrame:

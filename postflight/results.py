@@ -236,6 +236,7 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
         "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])) if flight.has_attitude else None,
         "methods": method_summary(answers, peak),
         "agreement": None if answers.fused is None else answers.fused.agreement.words,
+        "southwell": None if answers.fused is None else answers.fused.southwell_summary(),
         "missing": list(flight.missing),
         "attitude_check": attitude_summary(flight.attitude),
         "verdicts_passed": sum(v.passed for v in verdicts),

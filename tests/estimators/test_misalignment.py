@@ -6,6 +6,7 @@ import pytest
 from estimators.misalignment import (
     aerodynamic_angle,
     aeroshell_acceleration,
+    deflection_along_acceleration,
     estimate_misalignment,
     force_tilt,
     psi_from_acceleration,
@@ -47,6 +48,24 @@ def test_closed_form_in_one_plane():
     tilt = d * (theta + np.arctan(AERO.ratio(mach, alpha)))[:, None]
     got = solve_deflection(AERO, mach, tilt, d * (alpha + theta))
     np.testing.assert_allclose(got, theta * d, atol=1e-12)
+
+
+def test_paper_s_form_brings_both_angles_together():
+    # after eq. [4]'s rotation by the answer, eq. [3]'s angle is the BET's less the answer: Figure 2.7's two curves
+    rng = np.random.default_rng(7)
+    mach = rng.uniform(2.6, 4.5, 12)
+    alpha_shell, theta, side = (np.deg2rad(rng.uniform(*span, 12)) for span in ((1.0, 6.0), (0.5, 5.0), (0.0, 360.0)))
+    tilt = theta + np.arctan(AERO.ratio(mach, alpha_shell))
+    force = np.stack([-80.0 * np.cos(tilt), 80.0 * np.sin(tilt) * np.cos(side), 80.0 * np.sin(tilt) * np.sin(side)], -1)
+    got = deflection_along_acceleration(AERO, mach, force, alpha_shell + theta)
+    np.testing.assert_allclose(got, theta, atol=1e-9)
+    turned = aeroshell_acceleration(force, got, psi_from_acceleration(force))
+    np.testing.assert_allclose(aerodynamic_angle(AERO, mach, turned), alpha_shell, atol=1e-4)
+    # in one plane the general form says the same
+    lateral = -force[:, 1:] / np.linalg.norm(force[:, 1:], axis=1, keepdims=True)
+    general = solve_deflection(AERO, mach, force_tilt(force), lateral * (alpha_shell + theta)[:, None])
+    np.testing.assert_allclose(np.linalg.norm(general, axis=1), got, atol=1e-9)
+    assert np.isnan(deflection_along_acceleration(AERO, mach[:1], -force[:1], alpha_shell[:1])).all()
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -1,0 +1,172 @@
+"""How stiff is the joint and how large was the offset? Both from how the bending grew with the load.
+
+A joint that yields by ``theta = (z_0 / xbar) u / (1 - u)``, ``u = q kappa / K`` (`estimators.static_trim`), gives a
+straight line of ``1 / theta`` against ``1 / q``, as R. V. Southwell plotted columns near buckling::
+
+    1 / theta = (xbar / z_0) (q_crit / q - 1),     q_crit = K / kappa
+
+Where it crosses zero is the dynamic pressure at which the joint diverges; its height at infinite load is the offset.
+``1 / theta`` of a small deflection is all error, so the curve itself is fitted: bending along its mean direction
+against ``u / (1 - u)``, whitened by the history's covariance, of which `evidence.CONSTANT_PART` lasts. Rise and fall of
+the pulse are fitted apart too: what differs is hysteresis (freeplay, a joint that sags, gas that warms).
+
+Assumed: quasi-static means over `SPAN_S`, a linear joint, kappa and the offset's plane constant over the pulse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import norm
+
+from estimators.evidence import CONSTANT_PART
+from flightmodel.checks import DivergenceError, FloatArray
+from flightmodel.deflection import DeflectionHistory
+
+SPAN_S = 1.6  # a period of the slow aerodynamic mode
+LEAST_SPANS = 4
+CONFIDENCE = 0.90
+LEFT_OUT = 0.05  # of the bending: swinging and spin that a quasi-static line leaves out
+MOST_LOADS = 50.0  # a joint this many times stiffer than its load does not show its stiffness
+
+
+@dataclass(frozen=True)
+class Southwell:
+    """Line through one limb or the whole pulse.
+
+    Parameters
+    ----------
+    critical_pressure_pa, offset_angle_rad : float
+        ``q_crit`` and ``z_0 / xbar``.
+    critical_interval_pa, offset_interval_rad : (low, high)
+        With the confidence of `CONFIDENCE`.
+    covariance : (2, 2) float
+        Of their logarithms.
+    pressure_pa, theta_rad, theta_sd_rad : (n,) float
+        Means over spans that were fitted.
+    """
+
+    critical_pressure_pa: float
+    offset_angle_rad: float
+    critical_interval_pa: tuple[float, float]
+    offset_interval_rad: tuple[float, float]
+    covariance: FloatArray
+    pressure_pa: FloatArray
+    theta_rad: FloatArray
+    theta_sd_rad: FloatArray
+
+    def deflection(self, pressure_pa: FloatArray) -> FloatArray:
+        """Bending, rad, at dynamic pressures below the critical one; NaN at and above it."""
+        u = np.asarray(pressure_pa) / self.critical_pressure_pa
+        return np.where(u < 1.0, self.offset_angle_rad * u / np.where(u < 1.0, 1.0 - u, 1.0), np.nan)
+
+
+@dataclass(frozen=True)
+class Limbs:
+    """Southwell lines of rise, fall and both; ``hysteresis_sd`` by how many standard deviations the two differ."""
+
+    both: Southwell
+    rise: Southwell | None
+    fall: Southwell | None
+    hysteresis_sd: float
+    words: str
+
+
+def southwell_limbs(history: DeflectionHistory, time_s: FloatArray, pressure_pa: FloatArray) -> Limbs:
+    """Fit a history against the dynamic pressure (n,) at ``time_s``: whole pulse, rise, and fall.
+
+    Raises
+    ------
+    DivergenceError
+        Where the whole pulse gives no line; a limb that gives none is left out, in words.
+    """
+    t, q, theta, sd = span_means(history, time_s, pressure_pa)
+    both = southwell(q, theta, sd)
+    top = t[np.argmax(q)]
+    limbs: dict[str, Southwell | None] = {}
+    words = []
+    for name, part in (("rise", t <= top), ("fall", t >= top)):
+        try:
+            limbs[name] = southwell(q[part], theta[part], sd[part])
+        except DivergenceError as fault:
+            limbs[name] = None
+            words.append(f"no line of the {name} alone ({fault})")
+    rise, fall = limbs["rise"], limbs["fall"]
+    apart = float("nan")
+    if rise is not None and fall is not None:
+        middle = np.array([0.8 * float(q.max())])
+        change = float(np.log(fall.deflection(middle)[0] / rise.deflection(middle)[0]))
+        apart = change / float(np.hypot(_log_sd(rise, middle[0]), _log_sd(fall, middle[0])))
+        verdict = (
+            "hysteresis" if abs(apart) > norm.ppf(0.5 + 0.5 * CONFIDENCE) else "no hysteresis beyond the error bars"
+        )
+        words.insert(0, f"{verdict}: fall over rise {np.exp(change):.2f} at 80 % of peak load")
+    return Limbs(both, rise, fall, apart, "; ".join(words))
+
+
+def span_means(
+    history: DeflectionHistory, time_s: FloatArray, pressure_pa: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Means over spans: time, pressure, bending along its mean direction, and the sd of what does not last."""
+    cov = history.lateral_cov
+    known = np.isfinite(history.theta_rad) & np.isfinite(cov[:, 0, 0])
+    t, yz, cov = history.time_s[known], history.theta_yz_rad[known], cov[known]
+    q = np.interp(t, time_s, pressure_pa)
+    if len(t) == 0:
+        raise DivergenceError("Southwell plot: the history has no answers with an error bar")
+    weight = q / np.trace(cov, axis1=1, axis2=2)
+    way = weight @ yz
+    way = way / np.linalg.norm(way)
+    along, sd = yz @ way, np.sqrt(np.einsum("i,nij,j->n", way, cov, way))
+    _, which, count = np.unique(np.floor((t - t[0]) / SPAN_S), return_inverse=True, return_counts=True)
+    mean = [np.bincount(which, v) / count for v in (t, q, along, sd)]
+    return mean[0], mean[1], mean[2], mean[3]
+
+
+def southwell(pressure_pa: FloatArray, theta_rad: FloatArray, theta_sd_rad: FloatArray) -> Southwell:
+    """Fit bending against dynamic pressure.
+
+    Raises
+    ------
+    DivergenceError
+        Where there are too few spans, or bending does not grow faster than the load, or not towards one side.
+    """
+    if len(theta_rad) < LEAST_SPANS:
+        raise DivergenceError(f"Southwell plot: {len(theta_rad)} spans of {SPAN_S} s where {LEAST_SPANS} are wanted")
+    lasting = np.sqrt(CONSTANT_PART) * theta_sd_rad
+    cov = np.outer(lasting, lasting) + np.diag((1.0 - CONSTANT_PART) * theta_sd_rad**2 + (LEFT_OUT * theta_rad) ** 2)
+    whiten = np.linalg.inv(np.linalg.cholesky(cov))
+    top = float(pressure_pa.max())
+
+    def model(x: FloatArray) -> FloatArray:
+        u = pressure_pa / (top * (1.0 + np.exp(x[0])))
+        return np.asarray(np.exp(x[1]) * u / (1.0 - u))
+
+    start = np.array([0.0, np.log(max(float(np.median(theta_rad)), 1e-4))])
+    fit = least_squares(lambda x: whiten @ (model(x) - theta_rad), start, max_nfev=200)
+    beyond = float(np.exp(fit.x[0]))
+    normal = fit.jac.T @ fit.jac
+    if not fit.success or np.linalg.cond(normal) > 1e12 or beyond > MOST_LOADS:
+        raise DivergenceError("Southwell plot: bending does not grow faster than the load: stiffness does not show")
+    # of the logarithm of q_crit = top (1 + e^x)
+    turn = np.diag([beyond / (1.0 + beyond), 1.0])
+    covariance = turn @ np.linalg.inv(normal) @ turn
+    k = norm.ppf(0.5 + 0.5 * CONFIDENCE)
+    crit, offset = top * (1.0 + beyond), float(np.exp(fit.x[1]))
+    sd_x = np.sqrt(np.linalg.inv(normal)[0, 0])
+    # the margin over the largest load is what is normal: never below it
+    low, high = (top * (1.0 + np.exp(fit.x[0] + side * k * sd_x)) for side in (-1.0, 1.0))
+    spread = np.exp(k * np.sqrt(covariance[1, 1]))
+    return Southwell(
+        crit, offset, (float(low), float(high)), (float(offset / spread), float(offset * spread)), covariance,
+        pressure_pa, theta_rad, theta_sd_rad,
+    )  # fmt: skip
+
+
+def _log_sd(line: Southwell, pressure_pa: float) -> float:
+    """Sd of the logarithm of the bending at a pressure."""
+    u = pressure_pa / line.critical_pressure_pa
+    partial = np.array([-1.0 / (1.0 - u), 1.0])
+    return float(np.sqrt(partial @ line.covariance @ partial))
