@@ -68,6 +68,7 @@ def figure_static_trim(static: StaticTrim, offsets_m: Sequence[float], joint_nmp
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     axis = figure.subplots()
     stiffness = np.geomspace(2e3, 1e5, 600)
+    axis.set_xlim(2e3, 1e5)
     for offset in offsets_m:
         axis.semilogx(stiffness, np.rad2deg(static.trim_angle(stiffness, offset)), label=f"{100 * offset:.2f} cm")
     axis.axvline(static.critical_stiffness_nmprad, color="black", linestyle="--", linewidth=1.0, label="divergence")
