@@ -18,6 +18,7 @@ the singular value ``s`` keeps ``1 / (1 + s^2)`` of its variance.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -32,6 +33,8 @@ SPAN_S = 2.0
 LEFT_OUT_RAD = np.deg2rad(0.03)  # of the methods' own equations, in each mean
 CONFIDENCE = 0.99
 WIDER = 4.0
+CAMERA, PLANE_SD_RAD = "camera", np.deg2rad(15.0)
+LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is held against another
 LARGEST_GAIN = np.log(100.0)  # odds at which one input is taken as wrong though every pair passes
 BLAME = {
     "aerodynamic coefficients": ("C_A", "C_N", "C_m", "C_mq"),
@@ -41,7 +44,7 @@ BLAME = {
     "attitude of the trajectory": (ATTITUDE,),
     "sounded wind": (WIND,),
     "sounded density": (PRESSURE,),
-    "camera's orientation, benchmark or plane": ("camera",),
+    "camera's orientation, benchmark or plane": (CAMERA,),
 }
 
 
@@ -92,7 +95,8 @@ class Agreement:
 def agreement(evidence: list[Evidence]) -> Agreement:
     """Test all pairs of methods over the spans in which both answer, and score what they lean on."""
     told = [_means(e) for e in evidence]
-    pairs, rows = [], []
+    pairs: list[Pair] = []
+    rows: list[_Difference] = []
     for a, b in combinations(told, 2):
         difference = _difference(a, b)
         if len(difference.time_s):
@@ -110,9 +114,12 @@ def agreement(evidence: list[Evidence]) -> Agreement:
     factor = cho_factor(columns @ columns.T + noise)
     gains = {}
     for culprit, inputs in BLAME.items():
-        mine = [jacobian[n] for n in inputs if n in jacobian]
+        more = WIDER**2 - 1.0
+        mine = [_lasting(jacobian[n]) if n == CAMERA else jacobian[n] for n in inputs if n in jacobian]
+        if CAMERA in inputs and mine:
+            mine.append(_plane_turned(base, len(d)) / np.sqrt(more))
         if mine:
-            j, more = np.concatenate(mine, axis=1), WIDER**2 - 1.0
+            j = np.concatenate(mine, axis=1)
             v, s = j.T @ cho_solve(factor, j), j.T @ cho_solve(factor, d)
             eye = np.eye(len(s))
             gains[culprit] = float(
@@ -122,9 +129,28 @@ def agreement(evidence: list[Evidence]) -> Agreement:
     return Agreement(tuple(pairs), gains, np.linalg.svd(white, compute_uv=False))
 
 
+def _lasting(camera: FloatArray) -> FloatArray:
+    """Columns of the camera's error that last: the first of each axis (`evidence.evidence_of_history`)."""
+    return camera[:, [0, camera.shape[1] // 2]]
+
+
+def _plane_turned(rows: list[_Difference], length: int) -> FloatArray:
+    """Change ``(length, 1)`` of the differences by a camera whose plane is turned by `PLANE_SD_RAD`."""
+    out, at = np.zeros((length, 1)), 0
+    for row in rows:
+        bent = row.reading_yz_rad
+        assert bent is not None
+        across = np.stack([-bent[:, 1], bent[:, 0]], axis=-1)
+        if CAMERA in row.by_input:
+            out[at : at + across.size, 0] = PLANE_SD_RAD * across.ravel()
+        at += across.size
+    return out
+
+
 def _means(one: Evidence) -> Evidence:
     """Evidence averaged over spans of `SPAN_S`, counted from time zero so that methods' spans are the same."""
-    keep = np.isfinite(one.theta_yz_rad).all(axis=1)
+    known = np.trace(one.covariance, axis1=1, axis2=2) < LARGEST_SD_RAD**2
+    keep = np.isfinite(one.theta_yz_rad).all(axis=1) & known
     span, which, count = np.unique(np.floor(one.time_s[keep] / SPAN_S), return_inverse=True, return_counts=True)
     share = np.zeros((len(span), int(keep.sum())))
     share[which, np.arange(share.shape[1])] = 1.0 / count[which]
@@ -143,20 +169,28 @@ def _means(one: Evidence) -> Evidence:
     )
 
 
-def _difference(a: Evidence, b: Evidence) -> Evidence:
+@dataclass(frozen=True)
+class _Difference(Evidence):
+    """Difference of two methods' readings, and the second's reading itself."""
+
+    reading_yz_rad: FloatArray | None = None
+
+
+def _difference(a: Evidence, b: Evidence) -> _Difference:
     """Readings of one less the other's in spans that both have."""
     time_s, i, j = np.intersect1d(a.time_s, b.time_s, return_indices=True)
     inputs = {name: response[i] for name, response in a.by_input.items()}
     for name, response in b.by_input.items():
         inputs[name] = inputs[name] - response[j] if name in inputs else -response[j]
-    return replace(
-        a,
+    return _Difference(
         method=f"{a.method} less {b.method}",
         time_s=time_s,
         theta_yz_rad=a.theta_yz_rad[i] - b.theta_yz_rad[j],
         by_acceleration_s2=a.by_acceleration_s2[i] - b.by_acceleration_s2[j],
         by_input=inputs,
+        reading_yz_rad=b.theta_yz_rad[j],
         independent_cov=a.independent_cov[i] + b.independent_cov[j],
+        averaged_s=SPAN_S,
     )
 
 
@@ -166,7 +200,7 @@ def _flat(one: Evidence) -> tuple[FloatArray, FloatArray]:
     return d, sum((j @ j.T for j in jacobian.values()), noise)
 
 
-def _stacked(rows: list[Evidence], names: list[str]) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
+def _stacked(rows: Sequence[Evidence], names: list[str]) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
     """Jacobians by input, differences and the covariance of what is independent, all spans of all rows in one.
 
     Rows that share a method share its independent part too; it is small beside the rest and taken as each row's own.

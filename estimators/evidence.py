@@ -209,6 +209,12 @@ def evidence_of_history(history: DeflectionHistory) -> Evidence:
     )
 
 
+def moved_evidence(one: Evidence, inputs: dict[str, FloatArray]) -> Evidence:
+    """Evidence of a method whose readings are linear in their inputs, with these moved."""
+    change = sum((j @ inputs[name] for name, j in one.by_input.items() if name in inputs), np.zeros(2))
+    return replace(one, theta_yz_rad=one.theta_yz_rad + change)
+
+
 def history_of_evidence(evidence: Evidence, pulse: PulseData, assumptions: str) -> DeflectionHistory:
     """History of a method by itself, sample by sample: NaN where it has no answer.
 

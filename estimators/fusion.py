@@ -21,7 +21,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from estimators.evidence import Evidence, corrected_pulse
+from estimators.evidence import Evidence, corrected_pulse, moved_evidence
 from estimators.pulse import PulseData
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
@@ -156,15 +156,9 @@ def pulse_reader(
             found = method(moved, use, at)
             noise = method(pulse, use, at).theta_yz_rad - method(smooth, use, at).theta_yz_rad
             out.append(replace(found, theta_yz_rad=found.theta_yz_rad + noise))
-        return [*out, *(_moved(other, inputs) for other in others)]
+        return [*out, *(moved_evidence(other, inputs) for other in others)]
 
     return read
-
-
-def _moved(one: Evidence, inputs: Inputs) -> Evidence:
-    """Evidence of a method whose readings are linear in their inputs, with these moved."""
-    change = sum((j @ inputs[name] for name, j in one.by_input.items() if name in inputs), np.zeros(2))
-    return replace(one, theta_yz_rad=one.theta_yz_rad + change)
 
 
 def _smoothed(pulse: PulseData, use: BoolArray) -> PulseData:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from estimators.agreement import Agreement, agreement
-from estimators.evidence import Evidence, evidence_of_history
+from estimators.evidence import Evidence, evidence_of_history, moved_evidence
 from estimators.fusion import Fused, fuse, pulse_reader
 from estimators.misalignment import misalignment_evidence
 from estimators.pulse import PulseData
@@ -69,7 +69,11 @@ def fuse_flight(
         words = limbs.words
     except DivergenceError as fault:
         limbs, words = None, str(fault)
-    return FusedAnswer(fused, agreement(read({}, fused.deflection)), limbs, words)
+    # as told, but by what the answer says the readings' slopes are: far inputs are curved
+    inputs = {name: mean for name, (mean, _) in fused.inputs.items()}
+    back = {name: -mean for name, mean in inputs.items()}
+    told = [moved_evidence(one, back) for one in read(inputs, fused.deflection)]
+    return FusedAnswer(fused, agreement(told), limbs, words)
 
 
 def input_table(answer: FusedAnswer) -> pd.DataFrame:

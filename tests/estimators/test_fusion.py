@@ -15,6 +15,7 @@ from estimators.evidence import (
     evidence_of_history,
     flow_inputs,
     forgetful,
+    moved_evidence,
     moved_vehicle,
 )
 from estimators.fusion import fuse, pulse_reader
@@ -54,7 +55,7 @@ def linear_evidence(rng, name, inputs, noise_sd=1e-3):
 
 def linear_reader(told):
     """Readings that move with the inputs exactly as their responses say."""
-    return lambda inputs, _about: [fusion._moved(e, inputs) for e in told]
+    return lambda inputs, _about: [moved_evidence(e, inputs) for e in told]
 
 
 def test_posterior_is_that_of_the_joint_gaussian():
