@@ -267,6 +267,7 @@ def report_planted(results, what):
     rows = [r for r in results if not r["words"]]
     red = [r for r in rows if r.get("suspects") or r["suspects"] is None]
     named = sum(1 for r in rows if r["suspects"] and r["suspects"][0] == what)
+    named += sum(1 for r in rows if what and r["suspects"] is None and f"the {what} would" in r["refused"][0])
     refused = sum(1 for r in rows if r["suspects"] is None)
     first = Counter(r["suspects"][0] for r in rows if r["suspects"])
     words = f"red {len(red)} of {len(rows)} ({refused} no common answer), named {named}"

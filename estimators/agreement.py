@@ -35,7 +35,7 @@ CONFIDENCE = 0.99
 WIDER = 4.0
 CAMERA, PLANE_SD_RAD = "camera", np.deg2rad(15.0)
 LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is held against another
-LARGEST_GAIN = np.log(100.0)  # odds at which one input is taken as wrong though every pair passes
+LARGEST_GAIN = np.log(20.0)  # odds at which one input is taken as wrong though every pair passes
 BLAME = {
     "aerodynamic coefficients": ("C_A", "C_N", "C_m", "C_mq"),
     "accelerometer's mounting or bias": (ACCELEROMETER,),

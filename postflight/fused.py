@@ -63,7 +63,10 @@ def fuse_flight(
     seen = [] if camera is None else [evidence_of_history(camera)]
     seen = [e for e in seen if len(e.time_s)]
     read = pulse_reader(pulse, {"misalignment": misalignment_evidence, "trim": trim}, seen)
-    fused = fuse(read)
+    try:
+        fused = fuse(read)
+    except DivergenceError as fault:
+        raise DivergenceError(f"{fault}; {agreement(read({}, None)).words}") from None
     try:
         limbs = southwell_limbs(fused.history, pulse.time_s, pulse.dynamic_pressure_pa)
         words = limbs.words
