@@ -30,12 +30,12 @@ from estimators.evidence import ACCELEROMETER, ATTITUDE, PRESSURE, VEHICLE_INPUT
 from flightmodel.checks import FloatArray
 
 SPAN_S = 2.0
-LEFT_OUT_RAD = np.deg2rad(0.03)  # of the methods' own equations, in each mean
+LEFT_OUT_RAD = np.deg2rad(0.05)  # of the methods' own equations, in each mean: up to 0.05 deg where the pulse ends
 CONFIDENCE = 0.99
 WIDER = 4.0
 CAMERA, PLANE_SD_RAD = "camera", np.deg2rad(15.0)
 LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is held against another
-LARGEST_GAIN = np.log(20.0)  # odds at which one input is taken as wrong though every pair passes
+LARGEST_GAIN = np.log(100.0)  # odds at which one input is taken as wrong though every pair passes
 BLAME = {
     "aerodynamic coefficients": ("C_A", "C_N", "C_m", "C_mq"),
     "accelerometer's mounting or bias": (ACCELEROMETER,),

@@ -27,6 +27,7 @@ from flightmodel.deflection import DeflectionHistory
 
 SPAN_S = 1.6  # a period of the slow aerodynamic mode
 LEAST_SPANS = 4
+MOST_LOG_SD = 3.0  # of offset or margin: known to a factor of twenty is not known
 CONFIDENCE = 0.90
 LEFT_OUT = 0.05  # of the bending: swinging and spin that a quasi-static line leaves out
 MOST_LOADS = 50.0  # a joint this many times stiffer than its load does not show its stiffness
@@ -153,6 +154,10 @@ def southwell(pressure_pa: FloatArray, theta_rad: FloatArray, theta_sd_rad: Floa
     # of the logarithm of q_crit = top (1 + e^x)
     turn = np.diag([beyond / (1.0 + beyond), 1.0])
     covariance = turn @ np.linalg.inv(normal) @ turn
+    if np.diag(np.linalg.inv(normal)).max() > MOST_LOG_SD**2:
+        raise DivergenceError(
+            "Southwell plot: the bending is lost in its error bars: neither stiffness nor offset shows"
+        )
     k = norm.ppf(0.5 + 0.5 * CONFIDENCE)
     crit, offset = top * (1.0 + beyond), float(np.exp(fit.x[1]))
     sd_x = np.sqrt(np.linalg.inv(normal)[0, 0])

@@ -196,7 +196,7 @@ def test_no_common_answer_is_words():
     ("moved", "culprit"),
     [
         ({"C_m": 6.0}, "aerodynamic coefficients"),
-        ({"initial offset y": 12.0}, "initial c.g. offset"),
+        ({"initial offset y": 20.0}, "initial c.g. offset"),
     ],
 )
 def test_a_gross_planted_error_is_named(moved, culprit):
