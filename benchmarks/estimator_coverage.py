@@ -236,7 +236,9 @@ def row_of(history, pulse, truth):
     size, d, cov = float(np.hypot(*true)), history.theta_yz_rad[k] - true, history.lateral_cov[k]
     turn = history.plane_lv_rad[k] - np.arctan2(true[1], -true[0])
     turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
-    square = float(d @ np.linalg.solve(cov, d)) if np.isfinite(cov).all() else np.nan
+    if not np.isfinite(cov).all():  # the plane is lost: as well known across as along
+        cov = history.covariance[k, 0, 0] * np.eye(2)
+    square = float(d @ np.linalg.solve(cov, d))
     return (
         history.theta_rad[k] - size, history.theta_sd_rad[k], turn, np.sqrt(history.covariance[k, 1, 1]), size, square,
     )  # fmt: skip
