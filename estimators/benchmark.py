@@ -16,21 +16,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.camera_fit import (
-    POSED,
-    HeldFixed,
-    Image,
-    OrientedCamera,
-    Seen,
-    edge_seen,
-    found_marks,
-    huber_gain,
-    joined,
-    marks_seen,
-)  # fmt: skip
+from estimators.camera_fit import POSED, HeldFixed, OrientedCamera  # fmt: skip
 from estimators.horizon import HorizonLine, ScanLines, fault_of_frame, find_horizon, steps_near
 from estimators.marks import Marks, visible_marks
 from estimators.pattern import fitted_pattern
+from estimators.seen import Image, Seen, edge_seen, found_marks, huber_gain, joined, marks_seen
 from estimators.virtual_camera import BENDING, FLATTENING, VirtualCamera
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import FloatArray, GateError

@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 
 from estimators.benchmark import orient_camera
-from estimators.camera_fit import FrameFit, HeldFixed, Image, OrientedCamera
+from estimators.camera_fit import FrameFit, HeldFixed, OrientedCamera
+from estimators.seen import Image
 from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing
 from flightmodel.deflection import DeflectionHistory, polar_from_lateral, rotation_vector_body_shell
 from flightmodel.vehicle import CameraMount, ShellGeometry

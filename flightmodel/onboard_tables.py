@@ -202,7 +202,7 @@ def _film_numbers(
     whole = text.str.fullmatch(r"\d{1,9}").to_numpy(dtype=bool)
     for row in np.flatnonzero(used & ~whole)[:5].tolist():
         where = f"frames: {path}: line {columns.line_of(table, row)}: frame '{text.iloc[row]}'"
-        gate.faults.append(f"{where}: with film = \"{film.name}\" a frame's number is wanted, the first being 0")
+        gate.faults.append(f'{where}: with film = "{film.name}" a frame\'s number is wanted, the first being 0')
     numbers = np.array([int(t) for t in text.to_numpy()[used & whole]], dtype=np.int64)
     if len(numbers) and (np.diff(numbers) < 0).any():
         row = int(np.flatnonzero(used & whole)[int(np.argmax(np.diff(numbers) < 0)) + 1])

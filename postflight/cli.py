@@ -7,7 +7,7 @@ from __future__ import annotations
 import signal
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
@@ -95,11 +95,23 @@ def reconstruct(folder: Path, rate: float, sensitivity: bool) -> None:
     type=FiniteRange(0.0, 1.0),
     help="Assume the joint this far aft of the nose, m; default: the vehicle file's.",
 )
-def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None) -> None:
+@click.option("--film", is_flag=True, help="Also write the film with the virtual camera over it (VP9 WebM).")
+def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None, film: bool) -> None:
     """Estimate how far the aeroshell bent in the flight in FOLDER."""
     from postflight import commands
 
-    commands.deflection(folder, methods, plane, joint)
+    commands.deflection(folder, methods, plane, joint, film)
+
+
+@cli.command()
+@click.argument("corners", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--size", required=True, metavar="WxH", help="Size of the pictures, e.g. 640x480.")
+@click.option("--lens", type=click.Choice(["fisheye", "pinhole"]), default="fisheye", show_default=True)
+def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> None:
+    """Calibrate a lens on checkerboard CORNERS (CSV: image, X_m, Y_m, u_px, v_px); print lines for a vehicle file."""
+    from postflight import commands
+
+    commands.calibrate(corners, size, lens)
 
 
 @cli.command()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -16,10 +17,13 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from flightmodel.checks import FloatArray, GateError
+from estimators.calibration import calibrate_lens
+from flightmodel.camera import Lens
+from flightmodel.checks import ConfigError, FloatArray, GateError
 from flightmodel.deflection import lv_clock
 from flightmodel.flightfolder import read_flight
 from postflight import drawing, figures, results, scoring, warmup
+from postflight.overlay_film import write_overlay_film
 from postflight.pipeline import (
     METHODS,
     NO_VIDEO,
@@ -161,7 +165,7 @@ def run_flight(
         share = 0.2 if reruns else 1.0  # of the time, for all but the reruns
         step(0.0, 0.05 * share)(0.0, "reading telemetry")
         telemetry = read_flight(folder)
-        compile_kernels(*warmup.RECONSTRUCTION, "simulator")
+        compile_kernels(*warmup.RECONSTRUCTION, "simulator", *(["camera"] if "camera" in methods else []))
         flight = reconstruct_telemetry(
             telemetry, Settings(output_rate_hz=rate_hz, pulse_rate_hz=PULSE_RATE_HZ), step(0.05 * share, 0.5 * share)
         )
@@ -264,7 +268,9 @@ def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> N
             console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")
 
 
-def deflection(folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None) -> None:
+def deflection(
+    folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None, film: bool = False
+) -> None:
     """Estimate the deflection alone; the camera needs no trajectory."""
     telemetry = read_flight(folder)
     if not methods:
@@ -274,6 +280,8 @@ def deflection(folder: Path, methods: tuple[str, ...], plane_deg: float | None, 
     needs_bet = set(methods) != {"camera"}
     if needs_bet:
         compile_kernels(*warmup.RECONSTRUCTION)
+    if "camera" in methods:
+        compile_kernels("camera")
     with progress_bar() as report:
         flight = reconstruct_telemetry(telemetry, None, lambda f, what: report(0.6 * f, what)) if needs_bet else None
         tell: Report = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
@@ -281,13 +289,31 @@ def deflection(folder: Path, methods: tuple[str, ...], plane_deg: float | None, 
         with results.RunFolder(folder, telemetry, settings) as out:
             results.write_answers(out, answers)
             if "camera" in answers.histories:
-                drawing.draw_camera(telemetry, answers.histories["camera"], out.path / "figures", joint_m)
+                history = answers.histories["camera"]
+                drawing.draw_camera(telemetry, history, out.path / "figures", joint_m)
+                if film:
+                    write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", joint_m, report)
     # without a trajectory the camera's own largest deflection is what can be named
     peak_s = flight.peak_s if flight else largest_s(answers)
     print_answers(answers, peak_s, " (peak q)" if flight else " (its largest; no trajectory was made)")
     console.print(f"results in {escape(str(out.path))}")
     if answers.refused:
         sys.exit(EXIT_NO_ANSWER)
+
+
+def calibrate(corners: Path, size: str, lens: Lens) -> None:
+    """Calibrate a lens and print the lines of a vehicle file."""
+    match = re.fullmatch(r"(\d{1,5})[x,](\d{1,5})", size.strip())
+    if not match:
+        raise ConfigError(f"--size {size}: width and height like 640x480 are wanted")
+    try:
+        table = pd.read_csv(corners)
+    except (ValueError, UnicodeDecodeError) as fault:
+        raise GateError(f"{corners}: not a CSV table ({fault})") from fault
+    found = calibrate_lens(table, (int(match[1]), int(match[2])), lens)
+    words = f"{found.corners} corners in {found.pictures} pictures, rms {found.rms_px:.3f} px"
+    console.print(f"# {words}", highlight=False)
+    console.print(escape(found.toml()), highlight=False)
 
 
 def largest_s(answers: Answers) -> float:
@@ -338,7 +364,7 @@ def demo(folder: Path, seed: int) -> None:
     check_destination(folder, replace=True)
     begun = time.perf_counter()
     console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
-    compile_kernels("simulator", *warmup.RECONSTRUCTION)
+    compile_kernels("simulator", *warmup.RECONSTRUCTION, "camera")
     simulate(REFERENCE, folder, seed, force=True)
     flight, answers, written = run_flight(folder, METHODS, 20.0)
     print_flight(flight, pd.read_csv(written / "events.csv"))

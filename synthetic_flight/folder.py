@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from flightmodel.checks import FloatArray, GateError
 from synthetic_flight import day_air, events, radar_sensing, sensing, sun_sensing

@@ -11,10 +11,11 @@ import pytest
 import flightmodel
 from estimators.benchmark import orient_camera
 from estimators.camera_deflection import deflection_from_frames, polar, sensitivity_table
-from estimators.camera_fit import REACH_PX, found_marks
+from estimators.camera_fit import REACH_PX
 from estimators.figures import figure_camera_overlay
 from estimators.horizon import HorizonLine, find_horizon
 from estimators.overlay import Overlay
+from estimators.seen import found_marks
 from estimators.virtual_camera import VirtualCamera
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import GateError
