@@ -108,7 +108,8 @@ class DeflectionHistory:
     def at(self, time_s: float) -> tuple[float, float]:
         """Angle and its sd, rad, at one time by linear interpolation between answers; NaN outside them and in holes.
 
-        A hole is a distance between answers of more than three times the usual one.
+        A hole is a distance between answers of more than three times the usual one. The sd holds what a straight line
+        between answers misses of a curved history.
         """
         known = np.isfinite(self.theta_rad)
         t = self.time_s[known]
@@ -117,7 +118,12 @@ class DeflectionHistory:
         k = int(np.clip(np.searchsorted(t, time_s, side="right") - 1, 0, len(t) - 2))
         if t[k + 1] - t[k] > HOLE_FACTOR * np.median(np.diff(t)) and time_s not in (t[k], t[k + 1]):
             return float("nan"), float("nan")
-        return float(np.interp(time_s, t, self.theta_rad[known])), float(np.interp(time_s, t, self.theta_sd_rad[known]))
+        theta, sd = self.theta_rad[known], self.theta_sd_rad[known]
+        # what a straight line between answers misses: s (1 - s) / 2 of their second difference, as large as about here
+        share = (time_s - t[k]) / (t[k + 1] - t[k])
+        around = np.diff(theta[max(k - 1, 0) : k + 3], n=2)
+        missed = 0.5 * share * (1.0 - share) * float(np.abs(around).max(initial=0.0))
+        return float(np.interp(time_s, t, theta)), float(np.hypot(np.interp(time_s, t, sd), missed))
 
 
 def lateral_axes(plane_lv_rad: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -282,6 +282,7 @@ class FilmQuality(Section):
     vignetting: Fraction = 0.38
     interlace_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     quality: Annotated[int, Field(ge=0, le=100)] = 0
+    painted: bool = True
     built_deg: ErrorAngle = 0.0
     loaded_deg: ErrorAngle = 0.0
 
@@ -299,6 +300,7 @@ class FilmQuality(Section):
             vignetting=self.vignetting,
             interlace_s=self.interlace_s,
             quality=self.quality,
+            painted=self.painted,
             built_sd_rad=float(np.deg2rad(self.built_deg)),
             loaded_sd_rad=float(np.deg2rad(self.loaded_deg)),
         )

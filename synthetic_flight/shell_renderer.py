@@ -244,6 +244,7 @@ class _Stack:
         self.last = np.float32(geometry.torus_count - 1)
         self.gore_rad = np.float32(2.0 * np.pi / geometry.gore_count)
         self.warp: Warp | None = None
+        self.painted = True
 
     def gap(self, rays: _Rays, t: Float32) -> Float32:
         """Distance, m, from the nearest torus of points at depth ``t`` along rays; negative inside."""
@@ -330,7 +331,8 @@ class _Stack:
         lit = np.maximum(n_r * (y * sy + z * sz) / r - n_s * sx, 0.0)
         crest = np.asarray(np.clip(b / self.minor, 0.0, 1.0), dtype=np.float32)
         value = (0.10 + 0.10 * crest + 0.62 * lit) * (0.55 + 0.45 * np.sqrt(crest))
-        value *= self._paint(y, z, r, a, crest)
+        if self.painted:
+            value *= self._paint(y, z, r, a, crest)
         return np.asarray(value, dtype=np.float32)
 
     def _paint(self, y: Float32, z: Float32, r: Float32, a: Float32, crest: Float32) -> Float32:

@@ -50,6 +50,8 @@ class Imaging:
         at once.
     quality : int
         Of JPEG compression, 1 to 100; zero: none.
+    painted : bool
+        Whether the shell carries seams and dots that can be seen.
     built_sd_rad, loaded_sd_rad : float
         Flattening of the shell as built, and under the largest load; saddle and lobes half of that each.
     """
@@ -65,6 +67,7 @@ class Imaging:
     vignetting: float = 0.38
     interlace_s: float = 0.0
     quality: int = 0
+    painted: bool = True
     built_sd_rad: float = 0.0
     loaded_sd_rad: float = 0.0
 
@@ -159,6 +162,7 @@ def film(
     imaging = imaging or Imaging()
     camera = real_camera(camera_mount, rng, imaging)
     renderer = ShellRenderer(vehicle_geometry, camera, joint_station_m, imaging.vignetting)
+    renderer.stack.painted = imaging.painted
     built, loaded = _shapes(imaging, rng)
 
     def radiance(k: int, after_s: float) -> Float32:

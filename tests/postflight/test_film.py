@@ -1,0 +1,107 @@
+"""A film instead of images: the same frames by number, and every way in which list and film can disagree."""
+
+import cv2
+import numpy as np
+import pytest
+
+from flightmodel.film import film_frames
+from flightmodel.flightfolder import read_flight
+from tests.postflight.test_bad_input import names_line, refused
+
+SHADES = [30, 60, 90, 120, 150, 180]
+
+
+def write_film(path, size=(720, 480), code="MJPG", shades=SHADES):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 10.0, size)
+    assert writer.isOpened()
+    for shade in shades:
+        writer.write(np.full((size[1], size[0], 3), shade, dtype=np.uint8))
+    writer.release()
+
+
+@pytest.fixture
+def filmed(flight):
+    """The clean folder with a film of six frames, of which the list names three."""
+    write_film(flight.root / "telemetry/camera5.avi")
+    flight.replace("flight.toml", 'folder = "telemetry/camera5"', 'film = "telemetry/camera5.avi"')
+    for line, number in ((2, "0"), (3, "2"), (4, "5")):
+        flight.cell("frames.csv", line, 1, number)
+    return flight
+
+
+def test_the_list_says_which_frame_was_when(filmed):
+    frames = read_flight(filmed.root).frames
+    np.testing.assert_allclose(frames.time_s, [421.0, 424.0, 428.5])
+    means = [float(picture.mean()) for picture in frames.pictures()]
+    # JPEG is off by a grey level or two
+    np.testing.assert_allclose(means, [SHADES[k] for k in (0, 2, 5)], atol=2.0)
+    assert frames.picture(2).shape == (480, 720)
+    assert float(frames.picture(1).mean()) == pytest.approx(SHADES[2], abs=2.0)
+
+
+@pytest.mark.parametrize(("name", "code"), [("camera5.webm", "VP80"), ("camera5.mp4", "mp4v")])
+def test_other_containers(filmed, name, code):
+    write_film(filmed.root / "telemetry" / name, code=code)
+    filmed.replace("flight.toml", "camera5.avi", name)
+    means = [float(picture.mean()) for picture in read_flight(filmed.root).frames.pictures()]
+    np.testing.assert_allclose(means, [SHADES[k] for k in (0, 2, 5)], atol=6.0)
+
+
+def test_frames_behind_the_end_of_a_film_are_empty_pictures(filmed):
+    film = filmed.root / "telemetry/camera5.avi"
+    shapes = [picture.shape for picture in film_frames(film, [4, 4, 5, 6, 9])]
+    assert shapes == [(480, 720)] * 3 + [(0, 0)] * 2
+
+
+def test_the_film_is_an_input_of_a_run(filmed):
+    before = read_flight(filmed.root).hashes
+    write_film(filmed.root / "telemetry/camera5.avi", shades=SHADES[::-1])
+    assert read_flight(filmed.root).hashes != before
+
+
+def test_a_list_that_disagrees_with_the_film(filmed):
+    filmed.cell("frames.csv", 4, 1, "6")
+    refused(filmed, "camera5.avi", "has 6 frames", "frame 6")
+
+
+def test_file_names_where_numbers_are_wanted(filmed):
+    filmed.cell("frames.csv", 3, 1, "frame_1.png")
+    assert names_line(str(refused(filmed, "frame_1.png", "number is wanted")), 3)
+
+
+def test_numbers_that_fall(filmed):
+    filmed.cell("frames.csv", 4, 1, "1")
+    assert names_line(str(refused(filmed, "sort the list")), 4)
+
+
+def test_a_film_of_another_size(filmed):
+    write_film(filmed.root / "telemetry/camera5.avi", size=(640, 480))
+    refused(filmed, "640 x 480", "720 x 480")
+
+
+@pytest.mark.parametrize("content", [b"", b"RIFF but no film", b"\0" * 4096])
+def test_a_film_that_is_none(filmed, content):
+    (filmed.root / "telemetry/camera5.avi").write_bytes(content)
+    refused(filmed, "camera5.avi")
+
+
+def test_a_truncated_film_loses_its_end_alone(filmed):
+    film = filmed.root / "telemetry/camera5.avi"
+    film.write_bytes(film.read_bytes()[: film.stat().st_size * 2 // 3])
+    frames = read_flight(filmed.root).frames
+    shapes = [picture.shape for picture in frames.pictures()]
+    assert shapes == [(480, 720), (480, 720), (0, 0)]
+
+
+def test_a_film_that_is_missing_and_one_outside(filmed):
+    (filmed.root / "telemetry/camera5.avi").unlink()
+    refused(filmed, "camera5.avi", "no such file")
+    filmed.replace("flight.toml", "telemetry/camera5.avi", "../elsewhere.avi")
+    refused(filmed, "elsewhere.avi")
+
+
+def test_folder_and_film_together_or_neither(filmed):
+    filmed.declare('folder = "telemetry/camera5"', 'film = "telemetry/camera5.avi"')
+    refused(filmed, "one of folder", "film")
+    filmed.replace("flight.toml", 'film = "telemetry/camera5.avi"\nfolder = "telemetry/camera5"\n', "")
+    refused(filmed, "one of folder", "film")
