@@ -179,7 +179,7 @@ def _look(view: VirtualCamera, marks: Marks, image: Image, reach_px: int) -> _Lo
     lines = view.lines_at(clocks, at_rest)
     horizon = find_horizon(image, lines, view.camera.size_px)
     if reach_px:
-        horizon = steps_near(image, lines, horizon.noise_grey)
+        horizon = steps_near(image, lines)
     elif not horizon.is_usable:
         raise GateError(f"benchmark frame: {horizon.refused}; choose another benchmark time")
     seen = edge_seen(view, horizon, at_rest)

@@ -130,6 +130,11 @@ class _Solution:
     rms_px: float
 
 
+def _has(found: tuple[FloatArray, FloatArray]) -> NDArray[np.intp]:
+    """Rows of marks that were found."""
+    return np.flatnonzero(np.isfinite(found[1]))
+
+
 def _no_answer(horizon: HorizonLine, reason: str) -> FrameFit:
     nan = np.full((2, 2), np.nan)
     return FrameFit(nan[0], nan, 0.0, float("nan"), float("nan"), 0, horizon, reason)
@@ -192,14 +197,13 @@ class OrientedCamera:
             Where to start, e.g. the answer of the frame before.
         """
         fault = fault_of_frame(image, self.view.camera.size_px)
-        coarse = find_horizon(image, self.lines, self.view.camera.size_px)
         if fault:
-            return _no_answer(coarse, fault)
-        bending, basis, horizon = np.zeros(3), np.eye(2), coarse
+            return _no_answer(no_horizon(fault), fault)
+        bending, basis, horizon = np.zeros(3), np.eye(2), _NOTHING
         bending[:2] = 0.0 if start is None else start
         try:
-            place = self._approach(image, coarse, bending)
-            horizon = steps_near(image, self.view.lines_at(self.clocks_rad, bending), coarse.noise_grey)
+            place = self._approach(image, bending)
+            horizon = steps_near(image, self.view.lines_at(self.clocks_rad, bending))
             last = self._solve(horizon, place, bending, basis, WORST_RMS_PX)
             if plane_axis is not None:
                 # whether this is the shell was judged with both parameters: an assumed plane alone may fit badly;
@@ -211,24 +215,28 @@ class OrientedCamera:
             return _no_answer(horizon, str(fault_of_fit))
         return self._answer(horizon, bending, last, basis)
 
-    def _approach(self, image: Image, coarse: HorizonLine, bending: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    def _approach(self, image: Image, bending: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Carry ``bending`` in place to within a pixel or two, and find the marks there; None where there are few.
 
-        From where the edge was found, or where the search starts, or where the pattern of marks fits, whichever shows
-        most marks: behind the rim may be the Earth, whose limb and clouds are edges too.
+        From where the search starts, if most marks turn up there; else from where the edge is found or where the
+        pattern of marks fits, whichever shows most: behind the rim may be the Earth, whose limb is an edge too.
         """
-        guesses, trouble = [bending.copy()], coarse.refused
-        if coarse.is_usable:
+        wanted = FEW_MARKS * int((self.left_over.index >= len(self.clocks_rad)).sum())
+        guesses = [bending.copy()]
+        found = [found_marks(self.view, self.marks, image, bending, REACH_PX)]
+        trouble = ""
+        if len(_has(found[0])) < max(wanted, LEAST_MARKS):
+            coarse = find_horizon(image, self.lines, self.view.camera.size_px)
+            trouble = coarse.refused
             edge_alone = bending.copy()
             try:
-                self._solve(coarse, None, edge_alone, np.eye(2), np.inf)
-                guesses.append(edge_alone)
+                if coarse.is_usable:
+                    self._solve(coarse, None, edge_alone, np.eye(2), np.inf)
+                    guesses.append(edge_alone)
+                    found.append(found_marks(self.view, self.marks, image, edge_alone, REACH_PX))
             except NoFitError as fault:
                 trouble = str(fault)
-        found = [found_marks(self.view, self.marks, image, guess, REACH_PX) for guess in guesses]
-        rows = [int(np.isfinite(sd).sum()) for _, sd in found]
-        usual = int((self.left_over.index >= len(self.clocks_rad)).sum())
-        if max(rows) < FEW_MARKS * usual:
+        if max(len(_has(f)) for f in found) < wanted:
             points = self.marks.points_shell_m
             pattern = fitted_pattern(
                 image, lambda p: self.view.sight(points, np.array([*p, 0.0])).pixels, [bending[:2].copy()], FAR_RAD
@@ -236,9 +244,8 @@ class OrientedCamera:
             if pattern is not None:
                 guesses.append(np.array([*pattern, 0.0]))
                 found.append(found_marks(self.view, self.marks, image, guesses[-1], REACH_PX))
-                rows.append(int(np.isfinite(found[-1][1]).sum()))
-        best = int(np.argmax(rows))
-        if rows[best] >= LEAST_MARKS:
+        best = int(np.argmax([len(_has(f)) for f in found]))
+        if len(_has(found[best])) >= LEAST_MARKS:
             bending[:] = guesses[best]
             self._solve(_NOTHING, found[best], bending, np.eye(2), np.inf)
             return found_marks(self.view, self.marks, image, bending, REACH_PX)
@@ -266,7 +273,7 @@ class OrientedCamera:
     ) -> _Solution:  # fmt: skip
         """Fit ``bending`` (3,) in place to the edge and, where given, the marks found."""
         view, k, lines = self.view, basis.shape[1], len(self.clocks_rad)
-        has = np.flatnonzero(np.isfinite(place[1])) if place is not None else np.zeros(0, dtype=np.intp)
+        has = _has(place) if place is not None else np.zeros(0, dtype=np.intp)
         left, before_sd, edge_at = self._left_over(horizon.line)
         mark_left, mark_before_sd, mark_at = self._left_over(lines + has)
         edge = (horizon.points_px, light_columns(view, horizon), np.hypot(horizon.sd_px, before_sd), left)

@@ -77,8 +77,6 @@ class HorizonLine:
         Standard deviation of each point along ``inward_px``.
     line : (n,) int
         Index of the scan line that each point was found on (`ScanLines.index`).
-    noise_grey : float
-        Noise of the smoothed picture, grey levels.
     refused : str
         Why the frame cannot be used; empty when it can.
     """
@@ -87,7 +85,6 @@ class HorizonLine:
     inward_px: FloatArray
     sd_px: FloatArray
     line: NDArray[np.intp]
-    noise_grey: float
     refused: str = ""
 
     @property
@@ -109,7 +106,7 @@ class HorizonLine:
 
 def no_horizon(reason: str) -> HorizonLine:
     """No edge points, and why."""
-    return HorizonLine(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.intp), 0.3, reason)
+    return HorizonLine(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.intp), reason)
 
 
 def fault_of_frame(image: Image, size_px: tuple[int, int]) -> str:
@@ -118,7 +115,8 @@ def fault_of_frame(image: Image, size_px: tuple[int, int]) -> str:
         return f"not an 8-bit grey image (shape {image.shape}, {image.dtype})"
     if image.shape != (size_px[1], size_px[0]):
         return f"size {image.shape[1]} x {image.shape[0]} where the camera has {size_px[0]} x {size_px[1]}"
-    low, high = np.percentile(image[::4, ::4], [5.0, 95.0])
+    few = np.sort(image[::8, ::4], axis=None)
+    low, high = float(few[len(few) // 20]), float(few[-len(few) // 20])
     if high < 2.0 * LEAST_CONTRAST:
         return f"too dark: 95 % of the pixels are below grey level {high:.0f}"
     if low > 250.0 or np.mean(image[::4, ::4] >= 254) > 0.5:
@@ -146,19 +144,17 @@ def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> Ho
     fault = fault_of_frame(image, size_px)
     if fault:
         return no_horizon(fault)
-    place, sd, good, noise = lasting_rises(image, lines)
+    place, sd, good = lasting_rises(image, lines)
     refused = ""
     if good.mean() < LEAST_SHARE:
         share = f"{100.0 * good.mean():.0f} % of the scan lines cross one ({100 * LEAST_SHARE:.0f} % wanted)"
         refused = f"no clear edge: {share}"
     points = lines.origin_px + place[:, None] * lines.inward_px
-    return HorizonLine(
-        points[good], lines.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), lines.index[good], noise, refused
-    )
+    return HorizonLine(points[good], lines.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), lines.index[good], refused)
 
 
-def lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray, float]:
-    """Place along each line, px inwards from its origin, its sd without floor, whether there is one, and the noise."""
+def lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Place along each line, px inwards from its origin, its sd without floor, whether there is one."""
     n = len(lines.origin_px)
     grey, inside = _sampled(image, lines, round((lines.outer_px + lines.inner_px) / STEP_PX))
     level, scatter, first = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
@@ -171,10 +167,10 @@ def lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArra
         grey, inside, level, first, noise, float(np.median(level)), limits, STEP_PX, EDGE_PLACES, EDGE_BASES,
         place, sd, good,
     )  # fmt: skip
-    return STEP_PX * place - lines.outer_px, sd, good, noise
+    return STEP_PX * place - lines.outer_px, sd, good
 
 
-def steps_near(image: Image, lines: ScanLines, noise_grey: float) -> HorizonLine:
+def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
     """Find the edge where it is expected within a few pixels, darker or brighter than what lies behind it.
 
     Parameters
@@ -182,18 +178,18 @@ def steps_near(image: Image, lines: ScanLines, noise_grey: float) -> HorizonLine
     image : (h, w) uint8
     lines : ScanLines
         With origins where the edge is expected; their lengths are not used.
-    noise_grey : float
-        Of the smoothed picture, grey levels; see `HorizonLine`.
     """
     near = ScanLines(lines.origin_px, lines.inward_px, NEAR_PX, NEAR_PX, lines.index)
     grey, inside = _sampled(image, near, len(NEAR_ALONG))
     n = len(near.origin_px)
     place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
-    _edge_kernels.steps_near(grey, inside, noise_grey, LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, sd, good)
+    if not n:
+        return no_horizon("")
+    # the noise, from samples so far apart that smoothing did not tie them together
+    noise = max(float(np.median(np.abs(grey[:, 6] - grey[:, 0]))) / (0.6745 * np.sqrt(2.0)), 0.3)
+    _edge_kernels.steps_near(grey, inside, noise, LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, sd, good)
     points = near.origin_px + place[:, None] * near.inward_px
-    return HorizonLine(
-        points[good], near.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), near.index[good], noise_grey
-    )
+    return HorizonLine(points[good], near.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), near.index[good])
 
 
 def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:

@@ -12,14 +12,10 @@ import numpy as np
 
 from flightmodel._kernels import OMEGA_WGS84, WGS84, geodetic, gravitation, inlined
 
-# of what drag's linear part would take of the speed's error: explicit steps are unstable beyond 2.8 times it
-MOST_TAKEN = 1.0
-MOST_PARTS = 1000  # each about halves the speed until it falls no faster than gravity makes it
-
 
 @inlined
 def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
-    """Acceleration against the rotating Earth, m/s^2, height, m, and drag over speed, 1/s."""
+    """Acceleration against the rotating Earth, m/s^2, and height, m."""
     sin_lat, cos_lat, height, per_p = geodetic(x, y, z, WGS84)
     at = (height - air.from_m) / air.step_m
     row = int(min(max(at, 0.0), len(air.table) - 2.0))
@@ -46,7 +42,7 @@ def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     w2, two = OMEGA_WGS84 * OMEGA_WGS84, 2.0 * OMEGA_WGS84
     fx = k * (speed * (e1 * ax + e2 * bx) - ux) + gx + w2 * x + two * vy
     fy = k * (speed * (e1 * ay + e2 * by) - uy) + gy + w2 * y - two * vx
-    return fx, fy, k * (speed * (e1 * az + e2 * bz) - uz) + gz, height, k
+    return fx, fy, k * (speed * (e1 * az + e2 * bz) - uz) + gz, height
 
 
 @inlined
@@ -79,7 +75,7 @@ def ballistic_step(air, dt, point, stage, slope, mid):
         slope[j] = 0.0
     for i in range(4):
         s = stage
-        a0, a1, a2, _, _ = ballistic_acceleration(
+        a0, a1, a2, _ = ballistic_acceleration(
             air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11]
         )
         weight = 1.0 / 6.0 if i == 0 or i == 3 else 1.0 / 3.0
@@ -119,46 +115,6 @@ def ballistic_transition(partials, dt, full):
 
 
 @inlined
-def stable_part(air, left, point):
-    """Part of a step ``left`` over which drag takes no more than `MOST_TAKEN`; backwards in time all of it."""
-    p = point
-    _, _, _, _, k = ballistic_acceleration(
-        air, p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11]
-    )
-    return left if 2.0 * k * left <= MOST_TAKEN else MOST_TAKEN / (2.0 * k)
-
-
-@inlined
-def advance_ballistic(full, density, dt, phi, noise, old):
-    """Carry ``phi`` (9, 15) and ``noise`` (9, 9) over a step with its transition (6, 12); ``old`` is scratch."""
-    for i in range(6):
-        for j in range(15):
-            old[i, j] = phi[i, j]
-    for i in range(6):
-        for j in range(15):
-            value = full[i, j - 3] if j >= 9 else 0.0
-            for m in range(6):
-                value += full[i, m] * old[m, j]
-            phi[i, j] = value
-    for i in range(6):
-        for j in range(6):
-            old[i, j] = 0.0
-            for m in range(6):
-                old[i, j] += full[i, m] * noise[m, j]
-    for i in range(6):
-        for j in range(6):
-            noise[i, j] = 0.0
-            for m in range(6):
-                noise[i, j] += old[i, m] * full[j, m]
-    for i in range(3):
-        q = density[i] * abs(dt)
-        noise[i, i] += q * dt * dt / 3.0
-        noise[i, 3 + i] += 0.5 * q * dt
-        noise[3 + i, i] += 0.5 * q * dt
-        noise[3 + i, 3 + i] += q
-
-
-@inlined
 def propagate_ballistic(motion, air, first, last, errors, position, velocity, phi, noise):
     """Carry a state in place between grid points, with ``phi`` (9, 15) and ``noise`` (9, 9) from identity and zero."""
     point, stage, slope, mid = np.empty(12), np.empty(12), np.empty(6), np.empty(12)
@@ -169,16 +125,35 @@ def propagate_ballistic(motion, air, first, last, errors, position, velocity, ph
         point[6 + j] = errors[j]
     step = 1 if last >= first else -1
     for k in range(first, last, step):
-        left = motion.time_s[k + step] - motion.time_s[k]
+        dt = motion.time_s[k + step] - motion.time_s[k]
+        ballistic_step(air, dt, point, stage, slope, mid)
+        ballistic_partials(air, mid, partials)
+        ballistic_transition(partials, dt, full)
+        for i in range(6):
+            for j in range(15):
+                old[i, j] = phi[i, j]
+        for i in range(6):
+            for j in range(15):
+                value = full[i, j - 3] if j >= 9 else 0.0
+                for m in range(6):
+                    value += full[i, m] * old[m, j]
+                phi[i, j] = value
+        for i in range(6):
+            for j in range(6):
+                old[i, j] = 0.0
+                for m in range(6):
+                    old[i, j] += full[i, m] * noise[m, j]
         density = motion.force_density[min(k, k + step)]
-        for _ in range(MOST_PARTS):
-            dt = stable_part(air, left, point)
-            ballistic_step(air, dt, point, stage, slope, mid)
-            ballistic_partials(air, mid, partials)
-            ballistic_transition(partials, dt, full)
-            advance_ballistic(full, density, dt, phi, noise, old)
-            left -= dt
-            if left == 0.0:
-                break
+        for i in range(6):
+            for j in range(6):
+                noise[i, j] = 0.0
+                for m in range(6):
+                    noise[i, j] += old[i, m] * full[j, m]
+        for i in range(3):
+            q = density[i] * abs(dt)
+            noise[i, i] += q * dt * dt / 3.0
+            noise[i, 3 + i] += 0.5 * q * dt
+            noise[3 + i, i] += 0.5 * q * dt
+            noise[3 + i, 3 + i] += q
     for j in range(3):
         position[j], velocity[j] = point[j], point[3 + j]

@@ -7,8 +7,7 @@ With ``u`` the velocity against the air and ``B`` the drag area per mass,
 with ``n1`` level and ``n2`` upright across the flow. The six drivers ``d, s1, s2, c0, cN, cE`` are errors of the
 filter: drag and side forces wander along time, density and the winds' ``c sd(h)`` along altitude. What a thrust or an
 opening parachute does in stated spans is white noise of acceleration. Steps are fourth-order Runge-Kutta steps, the
-transition is ``1 + M dt + M^2 dt^2 / 2`` of the partials half way. Where drag would take all of the speed within a step
-(of a filter that gropes: no parachute opens so fast) the step is taken in parts. Attitude takes no part.
+transition is ``1 + M dt + M^2 dt^2 / 2`` of the partials half way. Attitude takes no part.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Motion as MotionSpec
 from flightmodel.telemetry import Sounding
-from recon._ballistic_kernels import MOST_TAKEN
 from recon.motion import Motion
 from recon.state import IntArray, States
 from recon.strapdown import Step
@@ -60,13 +58,6 @@ def ballistic_motion(
 
 def acceleration(motion: Motion, position: FloatArray, velocity: FloatArray, drivers: FloatArray) -> FloatArray:
     """Acceleration (3,) against the rotating Earth, m/s^2."""
-    return _acceleration(motion, position, velocity, drivers)[0]
-
-
-def _acceleration(
-    motion: Motion, position: FloatArray, velocity: FloatArray, drivers: FloatArray
-) -> tuple[FloatArray, float]:
-    """Acceleration (3,), and drag over speed, 1/s."""
     latitude, longitude, height = (float(x) for x in earth.geodetic_from_ecef(position))
     altitude = motion.air_from_m + motion.air_step_m * np.arange(len(motion.air))
     log_density, north, east, density_sd, wind_sd = (np.interp(height, altitude, column) for column in motion.air.T)
@@ -80,7 +71,7 @@ def _acceleration(
     push = 0.5 * density * motion.drag_m2pkg * np.exp(np.clip(drivers[0], -8.0, 8.0)) * speed
     spin = rotations.skew(earth.OMEGA_ECEF_RADPS)
     force = push * (speed * (drivers[1] * level + drivers[2] * upright) - u)
-    return force + earth.gravitation(position) - spin @ spin @ position - 2.0 * spin @ velocity, float(push)
+    return np.asarray(force + earth.gravitation(position) - spin @ spin @ position - 2.0 * spin @ velocity)
 
 
 def propagate_plain(motion: Motion, first: int, last: int, start: States) -> Step:
@@ -94,26 +85,22 @@ def propagate_plain(motion: Motion, first: int, last: int, start: States) -> Ste
         return np.concatenate([at[3:6], acceleration(motion, at[:3], at[3:6], drivers)])
 
     for k in range(first, last, step):
-        left = motion.time_s[k + step] - motion.time_s[k]
-        while left != 0.0:
-            taken = 2.0 * left * _acceleration(motion, y[:3], y[3:6], drivers)[1]
-            dt = left if taken <= MOST_TAKEN else left * MOST_TAKEN / taken
-            left -= dt
-            k1 = slope(y)
-            k2 = slope(y + 0.5 * dt * k1)
-            mid = y + 0.5 * dt * k2
-            k3 = slope(mid)
-            k4 = slope(y + dt * k3)
-            m = np.zeros((6, 12))
-            m[:3, 3:6] = np.eye(3)
-            m[3:] = _partials(motion, np.concatenate([mid, drivers]))
-            y = y + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-            full = np.hstack([np.eye(6), np.zeros((6, 6))]) + dt * m + 0.5 * dt**2 * m[:, :6] @ m
-            transition[:6] = full[:, :6] @ transition[:6]
-            transition[:6, 9:] += full[:, 6:]
-            density = np.diag(motion.force_density[min(k, k + step)]) * abs(dt)
-            new = np.block([[density * dt**2 / 3.0, density * dt / 2.0], [density * dt / 2.0, density]])
-            noise[:6, :6] = full[:, :6] @ noise[:6, :6] @ full[:, :6].T + new
+        dt = motion.time_s[k + step] - motion.time_s[k]
+        k1 = slope(y)
+        k2 = slope(y + 0.5 * dt * k1)
+        mid = y + 0.5 * dt * k2
+        k3 = slope(mid)
+        k4 = slope(y + dt * k3)
+        m = np.zeros((6, 12))
+        m[:3, 3:6] = np.eye(3)
+        m[3:] = _partials(motion, np.concatenate([mid, drivers]))
+        y = y + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        full = np.hstack([np.eye(6), np.zeros((6, 6))]) + dt * m + 0.5 * dt**2 * m[:, :6] @ m
+        transition[:6] = full[:, :6] @ transition[:6]
+        transition[:6, 9:] += full[:, 6:]
+        density = np.diag(motion.force_density[min(k, k + step)]) * abs(dt)
+        new = np.block([[density * dt**2 / 3.0, density * dt / 2.0], [density * dt / 2.0, density]])
+        noise[:6, :6] = full[:, :6] @ noise[:6, :6] @ full[:, :6].T + new
     return Step(States(y[:3], y[3:], start.q_ecef_body, start.sensor_errors), transition, noise)
 
 

@@ -13,10 +13,10 @@ from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.geomagnetism_and_sun import sun_direction_ecef
 from synthetic_flight import sensing
-from synthetic_flight.instrument_sections import Video
+from synthetic_flight.instrument_sections import FilmQuality, Video
 from synthetic_flight.scenarios import Scenario, child_rng
 from synthetic_flight.simulate import Truth
-from synthetic_flight.video import Image, Scene, film
+from synthetic_flight.video import Image, Imaging, Scene, film
 
 Progress = Callable[[float, str], None]
 CODECS = {"avi": "MJPG", "webm": "VP90"}
@@ -28,7 +28,7 @@ def write_video(scenario: Scenario, seed: int, truth: Truth, telemetry: Path, re
     assert spec is not None
     rng = child_rng(seed, spec.camera)
     at = sensing.sample_times(spec.start_s, min(spec.stop_s, float(truth.time_s[-1])), spec.rate_hz)
-    mount, imaging = vehicle.cameras[spec.camera], spec.imaging.as_imaging()
+    mount, imaging = vehicle.cameras[spec.camera], imaging_of(spec.imaging)
     frames = film(vehicle.geometry, mount, vehicle.joint.station_m, scene(truth, at, spec.earth), rng, imaging)
     told = _reported(frames, len(at), report)
     if spec.format == "png":
@@ -39,6 +39,26 @@ def write_video(scenario: Scenario, seed: int, truth: Truth, telemetry: Path, re
     late = spec.time_offset_s * float(rng.standard_normal())
     table = pd.DataFrame({"t_s": at + late, "frame": names})
     table.to_csv(telemetry / "frames.csv", index=False, float_format="%.6f", lineterminator="\n")
+
+
+def imaging_of(told: FilmQuality) -> Imaging:
+    """How a scenario says that the film is, in memory's units."""
+    return Imaging(
+        pointing_sd_rad=float(np.deg2rad(told.pointing_deg)),
+        focal_sd=told.focal,
+        centre_sd_px=told.centre_px,
+        k1_sd=told.k1,
+        k2_sd=told.k2,
+        position_sd_m=told.position_m,
+        noise_sd=told.noise_grey,
+        blur_px=told.blur_px,
+        vignetting=told.vignetting,
+        interlace_s=told.interlace_s,
+        quality=told.quality,
+        painted=told.painted,
+        built_sd_rad=float(np.deg2rad(told.built_deg)),
+        loaded_sd_rad=float(np.deg2rad(told.loaded_deg)),
+    )
 
 
 def scene(truth: Truth, at_s: FloatArray, with_earth: bool) -> Scene:

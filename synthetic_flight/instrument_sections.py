@@ -26,7 +26,6 @@ from flightmodel.config import (
 )
 from flightmodel.refraction import Refractivity
 from synthetic_flight.triad_errors import DropoutErrors, TriadErrors
-from synthetic_flight.video import Imaging
 
 
 def _none_or_some(hertz: float) -> float:
@@ -285,25 +284,6 @@ class FilmQuality(Section):
     painted: bool = True
     built_deg: ErrorAngle = 0.0
     loaded_deg: ErrorAngle = 0.0
-
-    def as_imaging(self) -> Imaging:
-        """In memory's units."""
-        return Imaging(
-            pointing_sd_rad=float(np.deg2rad(self.pointing_deg)),
-            focal_sd=self.focal,
-            centre_sd_px=self.centre_px,
-            k1_sd=self.k1,
-            k2_sd=self.k2,
-            position_sd_m=self.position_m,
-            noise_sd=self.noise_grey,
-            blur_px=self.blur_px,
-            vignetting=self.vignetting,
-            interlace_s=self.interlace_s,
-            quality=self.quality,
-            painted=self.painted,
-            built_sd_rad=float(np.deg2rad(self.built_deg)),
-            loaded_sd_rad=float(np.deg2rad(self.loaded_deg)),
-        )
 
 
 class Video(Section):

@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 
 METHODS = ("camera", "misalignment", "trim", "fused")
-DEFLECTION_LIMIT_DEG = {"camera": 0.7, "misalignment": 0.7, "trim": 1.2}
+DEFLECTION_LIMIT_DEG = {"camera": 0.7, "misalignment": 0.7, "trim": 1.2, "fused": 0.5}
 PULSE_FRACTION = 0.5  # the pressure pulse: dynamic pressure above half its peak
 
 pytestmark = pytest.mark.slow
