@@ -156,7 +156,7 @@ def _means(one: Evidence) -> Evidence:
     share[which, np.arange(share.shape[1])] = 1.0 / count[which]
 
     def mean(values: FloatArray) -> FloatArray:
-        return np.asarray((share @ values[keep].reshape(share.shape[1], -1)).reshape(len(span), *values.shape[1:]))
+        return np.asarray(np.tensordot(share, values[keep], axes=1))
 
     return replace(
         one,

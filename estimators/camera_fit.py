@@ -38,7 +38,7 @@ from estimators.virtual_camera import BENDING, CAMERA, FLATTENING, HELD, Virtual
 from flightmodel.checks import FloatArray
 
 STEPS = 12
-WORST_RMS_PX = 2.5
+WORST_RMS_PX, MARKS_RMS_PX = 2.5, 1.0
 LEAST_POINTS, LEAST_MARKS = 60, 40
 FEW_MARKS = 0.6
 FAR_RAD = np.deg2rad([4.0, 4.0])
@@ -205,6 +205,8 @@ class OrientedCamera:
             place = self._approach(image, bending)
             horizon = steps_near(image, self.view.lines_at(self.clocks_rad, bending))
             last = self._solve(horizon, place, bending, basis, WORST_RMS_PX)
+            if last.edge_count < LEAST_POINTS and last.rms_px > MARKS_RMS_PX:
+                raise NoFitError(f"no edge near the marks, which lie {last.rms_px:.1f} px rms off: not the shell's")
             if plane_axis is not None:
                 # whether this is the shell was judged with both parameters: an assumed plane alone may fit badly;
                 # the seed paper's way knows the edge alone

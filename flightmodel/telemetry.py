@@ -6,14 +6,16 @@ Reading and writing of flight folders: `flightmodel.flightfolder`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
-from flightmodel.film import Frames
 from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SunHeads, TriadSpec
 from flightmodel.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from flightmodel.film import Frames
 
 
 @dataclass(frozen=True)

@@ -290,6 +290,8 @@ def test_every_error_of_the_rich_scenario_is_alive(rich):
     ]
     skipped = {"offset_s", "max_range_m", "min_elevation_deg", "profile", "outages_s", "scale_asymmetry"}
     for section in sections:
+        # a magnetometer's clock is drawn by none: its field turns as slowly as the vehicle
+        known = skipped | ({"time_bias_s"} if section is rich.spec.magnetometer else set())
         for name in type(section).model_fields:
-            if name not in skipped:
+            if name not in known:
                 assert getattr(section, name), f"{type(section).__name__}.{name}"

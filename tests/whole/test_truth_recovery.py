@@ -460,6 +460,7 @@ def test_sensitivity_to_plane_and_joint_has_the_shape_of_the_paper_s_table(run_f
         index="joint_station_m", columns="plane_lv_deg", values="deflection_deg"
     )
     assert list(table.columns) == [153, 183, 200]
-    # the nose is 0.20 m further from the camera than the torus joint, of 1.4 m: 6 % of lever
-    np.testing.assert_allclose(table.iloc[0], table.iloc[1], rtol=0.08)
+    # the nose is 0.20 m further from the camera than the torus joint, of 1.4 m: 6 % of lever for a bending in the
+    # plane; of the edge's tilt, which a fit in another plane also weighs, the lever is the rim's radius and no other
+    np.testing.assert_allclose(table.iloc[0], table.iloc[1], rtol=0.10)
     assert (np.diff(table.to_numpy(), axis=1) > 0).all()
