@@ -116,7 +116,8 @@ def raster(vertices, faces, lens, widest_cos, deepest, depth, nearest):
             # across the border of the field it is halved on to a pixel or so, so that the border is kept to
             limit = widest_cos if inside == 0 or inside == 3 else BORDER_COS
             if here >= deepest or widest > limit:
-                if inside == 3:
+                # what is still wide after that is closer than a picture can show
+                if inside == 3 and widest > widest_cos:
                     ax, ay = pixel_of(t[0, 0], t[0, 1], t[0, 2], lens)
                     bx, by = pixel_of(t[1, 0], t[1, 1], t[1, 2], lens)
                     cx, cy = pixel_of(t[2, 0], t[2, 1], t[2, 2], lens)

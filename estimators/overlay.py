@@ -38,28 +38,25 @@ class Overlay:
 
     view: VirtualCamera
     shell_m: FloatArray = field(init=False, repr=False)
-    body_m: FloatArray = field(init=False, repr=False)
     faces: NDArray[np.int64] = field(init=False, repr=False)
-    first_body_face: int = field(init=False)
+    clear: BoolArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Build the mesh, tori first, the centerbody last."""
+        """Build the shell's mesh; find the pixels that the centerbody leaves free."""
         meshes = vehicle_meshes(self.view.geometry, clock_sections=72, torus_sections=TORUS_SECTIONS)
-        body = meshes.pop("centerbody")
+        meshes.pop("centerbody")
         vertices, faces, count = [], [], 0
         for mesh in meshes.values():
             vertices.append(np.asarray(mesh.vertices))
             faces.append(np.asarray(mesh.faces) + count)
             count += len(mesh.vertices)
-        self.shell_m, self.body_m = np.concatenate(vertices), np.asarray(body.vertices)
-        self.first_body_face = sum(len(f) for f in faces)
-        self.faces = np.concatenate([*faces, np.asarray(body.faces) + count])
+        self.shell_m, self.faces = np.concatenate(vertices), np.concatenate(faces)
+        self.clear = ~centerbody_pixels(self.view)
 
     def rendered(self, theta_rad: float, plane_lv_rad: float) -> tuple[Rendered, FloatArray]:
-        """Render the vehicle bent, and return its vertices, body axes, m."""
+        """Render the shell bent, and return its vertices, body axes, m."""
         bent = bend(self.shell_m, theta_rad, plane_lv_rad, self.view.joint_station_m)
-        vertices = np.concatenate([bent, self.body_m])
-        return render(self.view.camera, vertices, self.faces), vertices
+        return render(self.view.camera, bent, self.faces), bent
 
     def view_of(self, theta_rad: float, plane_lv_rad: float) -> tuple[Picture, BoolArray]:
         """Virtual picture ``(h, w, 3)`` RGB of the shell, black elsewhere, and where the shell is in it ``(h, w)``."""
@@ -69,7 +66,7 @@ class Overlay:
         away = corners.mean(axis=1) - self.view.camera.position_body_m
         length = np.linalg.norm(normal, axis=1) * np.linalg.norm(away, axis=1)
         facing = np.abs(np.einsum("ni,ni->n", normal, away)) / np.maximum(length, 1e-12)
-        shell = seen.is_hit & (seen.face < self.first_body_face)
+        shell = seen.is_hit & self.clear
         tone = (60.0 + 150.0 * facing)[:, None] * COLOUR
         picture = np.zeros((*shell.shape, 3), dtype=np.uint8)
         picture[shell] = tone[seen.face[shell]].astype(np.uint8)
@@ -98,6 +95,20 @@ class Overlay:
         out = np.concatenate([frame, picture, self.blended(image, theta_rad, plane_lv_rad, 0)], axis=1)
         draw_row(out, horizon_row(self.view, theta_rad, plane_lv_rad), YELLOW)
         return out
+
+
+def centerbody_pixels(view: VirtualCamera) -> BoolArray:
+    """Pixels ``(h, w)`` whose rays meet the centerbody, a cylinder on whose skin the camera sits."""
+    camera = view.camera
+    v, u = np.indices((camera.height_px, camera.width_px), dtype=float)
+    rays = np.nan_to_num(camera.rays_body(np.column_stack([u.ravel(), v.ravel()])))
+    x, y, z = camera.position_body_m
+    across, inward = np.maximum(rays[:, 1] ** 2 + rays[:, 2] ** 2, 1e-12), -(y * rays[:, 1] + z * rays[:, 2])
+    excess = y**2 + z**2 - min(view.geometry.centerbody_radius_m, float(np.hypot(y, z)) - 1e-3) ** 2
+    square = inward**2 - across * excess
+    station = -x - rays[:, 0] * (inward - np.sqrt(np.maximum(square, 0.0))) / across
+    met = (square > 0.0) & (inward > 0.0) & (station > 0.0) & (station < view.geometry.centerbody_length_m)
+    return np.asarray(met.reshape(v.shape))
 
 
 def horizon_row(view: VirtualCamera, theta_rad: float, plane_lv_rad: float) -> int:

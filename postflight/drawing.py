@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 
@@ -102,6 +103,8 @@ def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, 
     )
     figures.stamp(figure, telemetry)
     figures.save(figure, folder / "figure_2_3.png")
+    picture = Overlay(oriented.view).side_by_side(pictures[1], theta[1], float(history.plane_lv_rad[largest]))
+    cv2.imwrite(str(folder / "overlay.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
 
 
 def summary_figure(
