@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.camera_fit import POSED, HeldFixed, OrientedCamera  # fmt: skip
+from estimators.camera_fit import POSED, HeldFixed, OrientedCamera
 from estimators.horizon import HorizonLine, ScanLines, fault_of_frame, find_horizon, steps_near
 from estimators.marks import Marks, visible_marks
 from estimators.pattern import fitted_pattern

@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from estimators.benchmark import orient_camera
@@ -25,6 +24,7 @@ from estimators.camera_fit import FrameFit, HeldFixed, OrientedCamera
 from estimators.seen import Image
 from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing
 from flightmodel.deflection import DeflectionHistory, polar_from_lateral, rotation_vector_body_shell
+from flightmodel.film import read_image
 from flightmodel.vehicle import CameraMount, ShellGeometry
 
 Progress = Callable[[float, str], None]
@@ -120,10 +120,7 @@ def benchmark_index(times_s: FloatArray, benchmark_time_s: float) -> int:
 
 def read_frame(picture: Image | str | Path) -> Image:
     """Return a grey picture ``(h, w)`` uint8 from an array or a file; an unreadable file gives an empty picture."""
-    if isinstance(picture, str | Path):
-        image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
-        return np.zeros((0, 0), dtype=np.uint8) if image is None else np.asarray(image, dtype=np.uint8)
-    return picture
+    return read_image(Path(picture)) if isinstance(picture, str | Path) else picture
 
 
 def _history(
