@@ -17,7 +17,7 @@ import numpy as np
 
 from flightmodel import earth
 from flightmodel._kernels import CACHE
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, GateError
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from recon import ekf, smoother, strapdown
 from recon.error_model import Block, ErrorModel
@@ -111,17 +111,17 @@ def _tables() -> None:
 
 
 def _camera() -> None:
-    """Orient a camera on its own virtual picture, and fit it."""
+    """Orient a camera on one synthetic frame, and fit it."""
     from estimators.benchmark import orient_camera
-    from estimators.overlay import Overlay
-    from estimators.virtual_camera import VirtualCamera
-    from flightmodel.camera import camera_from_mount
+    from synthetic_flight.video import render_video
 
     vehicle, _ = _vehicle_at_rest()
-    mount = next(iter(vehicle.cameras.values()))
-    view = VirtualCamera(vehicle.geometry, camera_from_mount(mount), vehicle.joint.station_m)
-    picture = np.ascontiguousarray(Overlay(view).view_of(0.0, 0.0)[0][:, :, 2])
-    orient_camera(picture, vehicle.geometry, mount, vehicle.joint.station_m).fit(picture)
+    mount, joint_m = next(iter(vehicle.cameras.values())), vehicle.joint.station_m
+    sun = np.array([[0.5, 0.6, 0.6]])
+    (frame,) = render_video(vehicle.geometry, mount, joint_m, np.zeros(1), np.zeros(1), sun, np.random.default_rng(0))
+    fit = orient_camera(frame, vehicle.geometry, mount, joint_m).fit(frame)
+    if fit.refused:  # then a part of the kernels was not called
+        raise GateError(fit.refused)
 
 
 GROUPS: dict[str, Callable[[], None]] = {
@@ -148,21 +148,27 @@ def missing(groups: Iterable[str]) -> list[str]:
 
 
 def prepare(groups: Iterable[str], say: Callable[[str], None]) -> None:
-    """Compile what is missing, every group in a process of its own; what fails there compiles at its first use."""
+    """Compile what is missing, every group in a process of its own.
+
+    What fails there is said, and compiles at its first use.
+    """
     wanted = missing(groups)
     if not wanted:
         return
     say(f"compiling kernels for this machine, once (up to a minute): {', '.join(wanted)}")
-    quiet = subprocess.DEVNULL
-    running = [
-        subprocess.Popen([sys.executable, "-m", "postflight.warmup", group], stdin=quiet, stdout=quiet, stderr=quiet)
+    quiet, command = subprocess.DEVNULL, [sys.executable, "-m", "postflight.warmup"]
+    running = {
+        group: subprocess.Popen([*command, group], stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True)
         for group in wanted
-    ]
+    }
     try:
-        for process in running:
-            process.wait()
+        for group, process in running.items():
+            why = process.communicate()[1]
+            if process.returncode:
+                reason = why.strip().splitlines()[-1] if why.strip() else f"exit code {process.returncode}"
+                say(f"kernels of {group} were not compiled beforehand, but will be at their first use: {reason}")
     except BaseException:
-        for process in running:
+        for process in running.values():
             process.terminate()
         raise
 

@@ -41,6 +41,7 @@ def test_after_warmup_a_flight_and_its_reconstruction_compile_nothing(tmp_path):
     first = subprocess.run(run, env=environment, capture_output=True, text=True)
     assert first.returncode == 0, first.stderr
     assert "compiling kernels for this machine, once" in first.stderr
+    assert "not compiled" not in first.stderr
     again = subprocess.run(run, env=environment, capture_output=True, text=True)
     assert "compiling" not in again.stderr
     flown = subprocess.run(
