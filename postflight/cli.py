@@ -136,6 +136,16 @@ def score(folder: Path, as_json: bool) -> None:
 
 
 @cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Default: report.html in the run.")
+def report(folder: Path, output: Path | None) -> None:
+    """Write the report of the newest run of the flight in FOLDER: one HTML file that needs nothing else."""
+    from postflight.report.write import write_report
+
+    click.echo(f"report in {write_report(folder, target=output)}")
+
+
+@cli.command()
 def warmup() -> None:
     """Compile the kernels for this machine now, so that no later command waits for it."""
     from postflight import commands

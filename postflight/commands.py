@@ -34,6 +34,7 @@ from postflight.pipeline import (
     estimate,
     reconstruct_telemetry,
 )
+from postflight.report.write import write_report
 from postflight.sensitivity import largest_of_groups, sensitivity
 from recon.bet import Settings
 from synthetic_flight.events import Event, flight_events
@@ -181,13 +182,16 @@ def run_flight(
                     "camera_sensitivity.csv", camera_sensitivity(flight.telemetry, answers.histories["camera"])
                 )
             out.write_json("summary.json", results.summary(flight, answers))
-            drawing.draw_run(flight, answers, out.path / "figures", step(0.7 * share, share))
+            bounds = drawing.draw_run(flight, answers, out.path / "figures", step(0.7 * share, share))
+            if bounds is not None:
+                out.write_csv("rigid_bounds.csv", bounds.table())
             if reruns:
                 table = sensitivity(flight, step(share, 1.0))
                 out.write_csv("sensitivity.csv", table)
                 drawing.draw_sensitivity(flight, table, out.path / "figures")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
             (out.path / "log.jsonl").write_text(lines)
+        write_report(folder, out.path, telemetry)
     return flight, answers, out.path
 
 

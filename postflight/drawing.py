@@ -20,14 +20,15 @@ from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
 from postflight import figures
 from postflight.pipeline import Answers, Flight
-from postflight.preflight import rigid_bounds
+from postflight.preflight import RigidBounds, rigid_bounds
 from postflight.product import figures as product_figures
 
 Report = Callable[[float, str], None]
 
 
-def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> None:
-    """Draw everything that the run's answers allow."""
+def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> RigidBounds | None:
+    """Draw everything that the run's answers allow; return the rigid vehicle's bands where it was flown."""
+    bounds = None
     if flight.pulse is not None:
         report(0.0, "flying the rigid vehicle")
         bounds = rigid_bounds(flight, progress=lambda f, what: report(0.6 * f, what))
@@ -56,6 +57,7 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
     if answers.histories:
         figures.save(summary_figure(flight, answers), folder / "summary.png")
     report(1.0, "drawn")
+    return bounds
 
 
 def draw_static_trim(pulse: PulseData, telemetry: Telemetry, folder: Path) -> None:

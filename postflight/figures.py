@@ -237,7 +237,7 @@ def figure_flown(flight: Flight) -> Figure:
     return figure
 
 
-def _unit(component: str) -> tuple[float, str]:
+def residual_unit(component: str) -> tuple[float, str]:
     """Scale and unit in which a component's residuals are drawn."""
     if component.startswith("velocity"):
         return 1.0, "m/s"
@@ -253,7 +253,7 @@ def figure_residuals(flight: Flight) -> Figure:
     figure = Figure(figsize=(7.2, 1.5 * len(pairs) + 0.8), layout="constrained")
     for ax, (name, rows) in zip(_axes(figure, len(pairs)), pairs, strict=True):
         source, component = name
-        scale, unit = _unit(component)
+        scale, unit = residual_unit(component)
         good = rows["accepted"].to_numpy(dtype=bool)
         t, r = rows["time_s"].to_numpy(), scale * rows["residual"].to_numpy()
         sd = scale * rows["predicted_sd"].to_numpy()

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 
 from flightmodel import rotations
 from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
@@ -39,6 +40,17 @@ class RigidBounds:
     nominal_alpha_deg: FloatArray
     nominal_normal_g: FloatArray
     flights: int
+
+    def table(self) -> pd.DataFrame:
+        """Return the bands as columns, for ``rigid_bounds.csv``."""
+        columns: dict[str, FloatArray] = {"t_s": self.time_s}
+        for name, unit, bands, nominal in (
+            ("alpha_total", "deg", self.alpha_total_deg, self.nominal_alpha_deg),
+            ("normal", "g", self.normal_g, self.nominal_normal_g),
+        ):
+            columns |= {f"{name}_{part}_{unit}": c for part, c in zip(("low", "median", "high"), bands, strict=True)}
+            columns[f"{name}_nominal_{unit}"] = nominal
+        return pd.DataFrame(columns).assign(flights=self.flights)
 
 
 def rigid_bounds(

@@ -1,0 +1,23 @@
+// Everything begins here; for paper, what is folded opens and charts take the width of a sheet.
+
+startControls();
+const fitCharts = startCharts();
+startFilm();
+startVehicle();
+clock.set(clock.now);
+clock.show(clock.from, clock.to);
+
+const SHEET = 690, opened = [];
+window.addEventListener("beforeprint", () => {
+  for (const part of document.querySelectorAll("details:not([open])")) {
+    part.open = true;
+    opened.push(part);
+  }
+  for (const { u, host } of charts) u.setSize({ width: host.closest(".pair") ? SHEET / 2 - 16 : SHEET, height: u.height });
+  requestAnimationFrame(() => charts.forEach((chart) => chart.place()));
+});
+window.addEventListener("afterprint", () => {
+  for (const part of opened.splice(0)) part.open = false;
+  fitCharts();
+});
+document.documentElement.dataset.ready = "yes";

@@ -1,0 +1,68 @@
+"""The film strip: frames of the onboard video with the virtual camera laid over, as JPEG."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import cv2
+import numpy as np
+
+from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row
+from flightmodel.film import Image
+from postflight.drawing import oriented_camera
+from postflight.report.source import Run
+
+FRAMES, WIDTH_PX, QUALITY = 10, 480, 80
+
+
+def film_strip(run: Run) -> list[dict[str, Any]]:
+    """Benchmark frame, frame of the largest deflection and others spread between, each with its answer.
+
+    Empty where the camera gave none.
+    """
+    table, frames = run.tables.get("deflection_camera"), run.telemetry.frames
+    if table is None or frames is None:
+        return []
+    answered = np.searchsorted(frames.time_s, table["t_s"] - 1e-6)
+    largest = int(answered[int(table["theta_deg"].argmax())])
+    picks = np.linspace(answered[0], answered[-1], FRAMES).round().astype(int).tolist()
+    oriented, benchmark = oriented_camera(run.telemetry)
+    overlay, at_rest = Overlay(oriented.view), horizon_row(oriented.view, 0.0, 0.0)
+    chosen = sorted({*_without_near(picks, (benchmark, largest)), benchmark, largest})
+    rows = dict(zip(answered.tolist(), table.itertuples(index=False), strict=True))
+    out = []
+    for k, image in zip(chosen, frames.pictures(chosen), strict=True):
+        if image.size == 0:
+            continue
+        said: dict[str, Any] = {"t": round(float(frames.time_s[k]), 4), "benchmark": k == benchmark}
+        said |= {"largest": k == largest, "theta": None, "sd": None}
+        if k in rows:
+            theta, plane = np.deg2rad([rows[k].theta_deg, rows[k].plane_lv_deg])
+            picture = overlay.blended(image, float(theta), float(plane))
+            draw_row(picture, at_rest, GREY)
+            draw_row(picture, horizon_row(oriented.view, float(theta), float(plane)), YELLOW)
+            said |= {"theta": round(rows[k].theta_deg, 3), "sd": round(rows[k].theta_sd_deg, 3)}
+        else:
+            picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
+        out.append(said | {"jpeg": jpeg(picture)})
+    return out
+
+
+def _without_near(picks: list[int], wanted: tuple[int, ...]) -> list[int]:
+    """Picks without the one nearest to each frame that is shown anyway."""
+    left = list(picks)
+    for k in wanted:
+        left.remove(min(left, key=lambda pick: abs(pick - k)))
+    return left
+
+
+def jpeg(picture: Image) -> str:
+    """Data URI of an RGB picture ``(h, w, 3)``, made ``WIDTH_PX`` wide where it is wider."""
+    height, width = picture.shape[:2]
+    if width > WIDTH_PX:
+        picture = np.asarray(
+            cv2.resize(picture, (WIDTH_PX, round(height * WIDTH_PX / width)), interpolation=cv2.INTER_AREA), np.uint8
+        )
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

@@ -1,0 +1,78 @@
+"""What is at hand for a report: a finished run's files, and the telemetry that they were made from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from flightmodel.checks import GateError
+from flightmodel.flightfolder import read_flight
+from flightmodel.telemetry import Telemetry
+from postflight.results import newest_run
+
+NEEDED = ("bet", "events", "peaks", "residuals", "verdicts", "findings")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Parameters
+    ----------
+    telemetry : Telemetry
+        As the run read it.
+    path : Path
+        The run's folder.
+    summary, facts, header : dict
+        ``summary.json``, ``run.json``, ``bet_header.json``.
+    tables : dict of DataFrame
+        Every CSV table of the folder by its stem.
+    """
+
+    telemetry: Telemetry
+    path: Path
+    summary: dict[str, Any]
+    facts: dict[str, Any]
+    header: dict[str, Any]
+    tables: dict[str, pd.DataFrame]
+
+    @property
+    def hash8(self) -> str:
+        """What stands for inputs, settings and version in the folder's name."""
+        return self.path.name.rpartition("-")[2]
+
+    def peak(self, name: str) -> pd.Series | None:
+        """Row of ``peaks.csv``; None where the flight has none of that name."""
+        rows = self.tables["peaks"][self.tables["peaks"]["peak"] == name]
+        return rows.iloc[0] if len(rows) else None
+
+
+def read_run(flight_folder: Path, path: Path | None = None, telemetry: Telemetry | None = None) -> Run:
+    """Read a run, the newest unless told, and its telemetry unless it is at hand.
+
+    Raises
+    ------
+    GateError
+        Where there is no finished run, a file of it is missing, or the telemetry is not what the run was made from.
+    """
+    path = newest_run(flight_folder) if path is None else path
+    again = f"use `postflight run {flight_folder}` again"
+    try:
+        told = [json.loads((path / f"{name}.json").read_text()) for name in ("summary", "run", "bet_header")]
+        tables = {p.stem: pd.read_csv(p) for p in sorted(path.glob("*.csv"))}
+    except (FileNotFoundError, ValueError) as fault:
+        raise GateError(f"{path}: not a whole run ({fault}); {again}") from None
+    missing = [f"{name}.csv" for name in NEEDED if name not in tables]
+    if missing:
+        raise GateError(f"{path}: not a whole run, without {', '.join(missing)}; {again}")
+    telemetry = read_flight(flight_folder) if telemetry is None else telemetry
+    summary, facts, header = told
+    then, now = facts["inputs_sha256"], telemetry.hashes
+    changed = sorted(name for name in then.keys() | now.keys() if then.get(name) != now.get(name))
+    if changed:
+        raise GateError(f"{flight_folder}: changed since the run {path.name}: {', '.join(changed)}; {again}")
+    return Run(telemetry, path, summary, facts, header, tables)

@@ -1,0 +1,189 @@
+"""The answer in words: title, verdict cards, the flight's moments, what was given to it and what it leaned on."""
+
+from __future__ import annotations
+
+import math
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from estimators.agreement import CONFIDENCE
+from flightmodel.config import parse_utc
+from flightmodel.deflection import lv_clock, lv_direction
+from postflight.figures import LABEL
+from postflight.pipeline import METHODS
+from postflight.report.series import COLOUR
+from postflight.report.shape import best_method, hole_s
+from postflight.report.source import Run
+
+SIDES_95 = 1.96
+HOW = {
+    "camera": "Edge, seams and dots of the shell as the onboard camera saw them.",
+    "misalignment": "The bending that reconciles the accelerometers with the trajectory's angle of attack.",
+    "trim": "The shift of the shell's force that balances the moments at the angle that was flown.",
+    "fused": "All of them, weighed by what they share.",
+}
+BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "trim": "the trim angle alone"}
+NOT_ASKED = "not asked for in this run"
+SHOWN_ROWS = 200
+
+
+def utc(run: Run, time_s: float) -> str:
+    """Clock time of a mission time, ``12:59:20.62``."""
+    stamp = parse_utc(run.telemetry.t0_utc) + timedelta(seconds=round(float(time_s), 2))
+    return stamp.strftime("%H:%M:%S.") + f"{stamp.microsecond // 10000:02d}"
+
+
+def pair(value: float, sd: float) -> str:
+    """``4.9 ± 0.1`` with the digits that the sd deserves."""
+    digits = max(0, min(4, -math.floor(math.log10(sd * 2.0)))) if sd > 0.0 else 2
+    return f"{value:.{digits}f} ± {sd:.{digits}f}"
+
+
+def title(run: Run) -> str:
+    """Return the answer in one sentence."""
+    best = best_method(run)
+    if best is not None:
+        told = run.summary["methods"][best]
+        size = pair(told["deflection_deg"], told["sd_deg"])
+        by = "" if best == "fused" else f", by {BY[best]}"
+        return f"The aeroshell bent {size}° at {peak_words(run)}{by}"
+    asked = run.facts["settings"]["methods"]
+    end = "no method could say how far anything bent" if asked else "how far it bent was not asked"
+    highest = run.peak("altitude")
+    if highest is not None and bool(highest["inside"]):
+        return f"{run.telemetry.name} rose to {pair(highest['value'] / 1e3, highest['sd'] / 1e3)} km; {end}"
+    return f"{run.telemetry.name}: the trajectory is known; {end}"
+
+
+def peak_words(run: Run) -> str:
+    """Peak dynamic pressure, or the largest there is where the data end before the peak."""
+    row = run.peak("dynamic pressure")
+    return "peak dynamic pressure" if row is None or bool(row["inside"]) else "the largest dynamic pressure in the data"
+
+
+def lead(run: Run) -> list[str]:
+    """Sentences below the title."""
+    s = run.summary
+    at = s["peak_dynamic_pressure_s"]
+    row = run.peak("dynamic pressure")
+    sd = f" ± {row['sd']:.0f}" if row is not None and np.isfinite(row["sd"]) else ""
+    place = run.tables["bet"]
+    k = int(np.abs(place["t_s"].to_numpy() - at).argmin())
+    out = [s["agreement"][0].upper() + s["agreement"][1:] + "."] if s["agreement"] else []
+    out.append(
+        f"{peak_words(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
+        f"({utc(run, at)} UTC), Mach {place['mach'].iloc[k]:.2f}, {place['alt_m'].iloc[k] / 1e3:.1f} km."
+    )
+    total = len(run.tables["verdicts"])
+    out.append(f"{s['verdicts_passed']} of {total} consistency verdicts pass.")
+    return out
+
+
+def cards(run: Run) -> list[dict[str, Any]]:
+    """One card a method, estimators first and the fusion last."""
+    return [_card(run, method) for method in METHODS]
+
+
+def _card(run: Run, method: str) -> dict[str, Any]:
+    told = run.summary["methods"].get(method)
+    card: dict[str, Any] = {"method": method, "label": LABEL[method], "how": HOW[method], "colour": COLOUR[method]}
+    if told is None or told["deflection_deg"] is None:
+        reason = NOT_ASKED if told is None else told["reason"]
+        return card | {"state": "none", "mark": "–", "words": "no answer", "reason": reason}
+    value, sd = told["deflection_deg"], told["sd_deg"]
+    card |= {
+        "value": f"{value:.2f}", "sd": f"{sd:.2f}", "number": value, "number_sd": sd,
+        "low": f"{value - SIDES_95 * sd:.2f}", "high": f"{value + SIDES_95 * sd:.2f}",
+        "plane": plane_at(run, method), "largest": f"{told['largest_deg']:.2f}", "largest_s": told["largest_at_s"],
+        "assumptions": told["assumptions"],
+    }  # fmt: skip
+    return card | agreement(run, method)
+
+
+def agreement(run: Run, method: str) -> dict[str, str]:
+    """Whether a method agrees with the others, by the tests of every pair; of the fusion, whether all do."""
+    table = run.tables.get("fusion_agreement")
+    if table is None or not len(table):
+        return {"state": "alone", "mark": "○", "words": "held against no other method"}
+    mine = table if method == "fused" else table[[method in m.split(" and ") for m in table["methods"]]]
+    if not len(mine):
+        return {"state": "alone", "mark": "○", "words": "held against no other method"}
+    failed = mine[~mine["passed"].astype(bool)]
+    least = f"least chance of a pair {mine['chance'].min():.2g}, wanted above {1 - CONFIDENCE:.2g}"
+    if not len(failed):
+        who = "all pairs agree" if method == "fused" else "agrees with the others"
+        return {"state": "agrees", "mark": "✓", "words": who, "detail": least}
+    if method == "fused":
+        return {"state": "differs", "mark": "✕", "words": "pairs disagree", "detail": "; ".join(failed["methods"])}
+    others = [o for m in failed["methods"] for o in m.split(" and ") if o != method]
+    return {"state": "differs", "mark": "✕", "words": f"disagrees with {', '.join(others)}", "detail": least}
+
+
+def plane_at(run: Run, method: str) -> str:
+    """Plane of the bending at peak dynamic pressure, deg LV clocking, with its sd; empty where it is not known."""
+    table, at = run.tables[f"deflection_{method}"], run.summary["peak_dynamic_pressure_s"]
+    t = table["t_s"].to_numpy()
+    k = int(np.abs(t - at).argmin())
+    sd = table["plane_sd_deg"].iloc[k]
+    if abs(t[k] - at) > max(hole_s(t), 1e-3) or not sd < 90.0:
+        return ""
+    yz = np.array(table["theta_deg"])[:, None] * lv_direction(np.deg2rad(np.array(table["plane_lv_deg"])))[:, 1:]
+    clock = np.rad2deg(lv_clock(np.array([np.interp(at, t, c) for c in yz.T])))
+    return f"{float(clock):.0f} ± {sd:.0f}"
+
+
+def scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
+    """Common scale of the cards' whiskers, deg: all 95 % intervals with a margin."""
+    ends = [c["number"] + s * SIDES_95 * c["number_sd"] for c in shown if "number" in c for s in (-1.0, 1.0)]
+    if not ends:
+        return 0.0, 1.0
+    margin = 0.06 * (max(ends) - min(ends)) + 0.01
+    return min(ends) - margin, max(ends) + margin
+
+
+def with_whiskers(shown: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Cards with the places of their whiskers on a scale of 0 to 200; the fusion's 95 % as a band behind each."""
+    low, high = scale(shown)
+    place = lambda x: round(200.0 * (x - low) / (high - low), 1)  # noqa: E731
+    fused = next((c for c in shown if c["method"] == "fused" and "number" in c), None)
+    for c in shown:
+        if "number" not in c:
+            continue
+        x, sd = c["number"], c["number_sd"]
+        c["whisker"] = [place(x + k * sd) for k in (-SIDES_95, -1.0, 0.0, 1.0, SIDES_95)]
+        if fused is not None:
+            c["behind"] = [place(fused["number"] + k * fused["number_sd"]) for k in (-SIDES_95, SIDES_95)]
+    return shown
+
+
+def moments(run: Run) -> list[dict[str, Any]]:
+    """Rows of the table of events; the numbers are those of the vertical lines."""
+    rows = []
+    for k, e in enumerate(run.tables["events"].itertuples(index=False), 1):
+        told = {
+            "altitude": (e.alt_m / 1e3, e.alt_3sd_m / 1e3, 3), "speed": (e.speed_ground_mps, e.speed_ground_3sd_mps, 1),
+            "mach": (e.mach, e.mach_3sd, 2), "pressure": (e.dynamic_pressure_pa, e.dynamic_pressure_3sd_pa, 1),
+            "alpha": (e.alpha_total_wind_deg, e.alpha_total_wind_3sd_deg, 2),
+        }  # fmt: skip
+        cells = {n: f"{x:.{d}f} ± {s:.{d}f}" if np.isfinite(x) else "not known" for n, (x, s, d) in told.items()}
+        rows.append({"number": k, "name": e.event, "t": f"{e.t_s:.2f}", "utc": utc(run, e.t_s)} | cells)
+    return rows
+
+
+def table_rows(table: pd.DataFrame) -> dict[str, Any]:
+    """Column names and cells of a small table, and how many rows are left out."""
+    shown = table.head(SHOWN_ROWS)
+    cells = [[cell(x) for x in row] for row in shown.itertuples(index=False)]
+    return {"names": [str(n).replace("_", " ") for n in table.columns], "rows": cells, "more": len(table) - len(shown)}
+
+
+def cell(value: Any) -> str:
+    """One cell: numbers short, nothing where there is none."""
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, float | np.floating):
+        return f"{value:.5g}" if np.isfinite(value) else ""
+    return str(value)

@@ -1,0 +1,165 @@
+"""`postflight report`: one HTML file that needs nothing else, with the same bytes for the same run."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import tempfile
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from jinja2 import DictLoader, Environment, StrictUndefined
+from markupsafe import Markup
+
+from flightmodel.airdata import pressure_pulse
+from flightmodel.checks import GateError
+from flightmodel.config import parse_utc
+from flightmodel.telemetry import Telemetry
+from postflight.report import pictures, series, shape, words
+from postflight.report.source import Run, read_run
+
+NAME = "report.html"
+SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
+STYLES = ("uPlot.min.css", "page.css")
+# what a script element must not hold literally: its own end, a comment's start, and line ends of JavaScript alone
+ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
+
+
+def write_report(
+    flight_folder: Path, path: Path | None = None, telemetry: Telemetry | None = None, target: Path | None = None
+) -> Path:
+    """Write the report of a run (`read_run`) to ``target`` or into the run's folder; return where it lies.
+
+    Raises
+    ------
+    GateError
+        Where the run cannot be read, or the file not be written.
+    """
+    run = read_run(flight_folder, path, telemetry)
+    target = run.path / NAME if target is None else target
+    text = page(run)
+    try:
+        handle, partial = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as out:
+                out.write(text)
+            Path(partial).chmod(0o644)
+            Path(partial).replace(target)
+        finally:
+            Path(partial).unlink(missing_ok=True)
+    except OSError as fault:
+        raise GateError(f"{target}: cannot be written: {fault.strerror}; name another place with --output") from None
+    return target
+
+
+def page(run: Run) -> str:
+    """Return the whole page."""
+    here = files("postflight.report").joinpath("page")
+    read = lambda name: here.joinpath(name).read_text(encoding="utf-8")  # noqa: E731
+    script = "\n".join(read(name) for name in SCRIPTS)
+    style = "\n".join(read(name) for name in STYLES)
+    frames = pictures.film_strip(run)
+    data, absent = numbers(run, frames)
+    environment = Environment(
+        loader=DictLoader({"page": read("page.html")}),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("page").render(
+        run=run,
+        script=Markup(script),
+        style=Markup(style),
+        script_hash=content_hash(script),
+        style_hash=content_hash(style),
+        licence=read("uPlot.LICENSE"),
+        data=Markup(safe_json(data)),
+        frames=frames,
+        absent=absent,
+        drawn=data,
+        **told(run),
+    )
+
+
+def told(run: Run) -> dict[str, Any]:
+    """Everything on the page that is words or tables."""
+    more = {
+        "sensitivity": "Sensitivity: change at peak dynamic pressure without a source or with another assumption",
+        "camera_sensitivity": "Deflection by video under assumed joints and planes, beside the seed paper's Table 2.1",
+        "fusion_inputs": "What the methods together say of each input they lean on",
+        "fusion_agreement": "Test of every pair of methods",
+        "air_parameters": "Coefficient scales and flexure found with the air of the day",
+        "residual_statistics": "Residuals by source and component",
+        "sensor_errors": "Estimated errors of the sensors",
+        "peaks": "Largest values",
+    }
+    verdicts = run.tables["verdicts"]
+    return {
+        "title": words.title(run),
+        "lead": words.lead(run),
+        "cards": words.with_whiskers(words.cards(run)),
+        "moments": words.moments(run),
+        "findings": words.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
+        "verdicts": words.table_rows(verdicts.assign(passed=verdicts["passed"].map({True: "✓ pass", False: "✕ fail"}))),
+        "extra": [(words_, words.table_rows(run.tables[name])) for name, words_ in more.items() if name in run.tables],
+        "settings": [(k, words.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
+        "date": parse_utc(run.telemetry.t0_utc).strftime("%-d %B %Y"),
+    }
+
+
+def numbers(run: Run, frames: list[dict[str, Any]]) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """Everything that the page's scripts draw, and the panels that the flight has no data for, with the reason."""
+    bet = run.tables["bet"]
+    rows = series.trajectory_rows(run)
+    panels, absent = series.trajectory_panels(run, rows)
+    deflection = series.deflection_panel(run)
+    if deflection is not None:
+        panels.insert(0, deflection)
+    else:
+        absent.insert(0, ("Deflection", series.NO_DEFLECTION))
+    vehicle = run.telemetry.vehicle
+    data = {
+        "t0_ms": round(1e3 * parse_utc(run.telemetry.t0_utc).timestamp()),
+        "span": [float(bet["t_s"].iloc[0]), float(bet["t_s"].iloc[-1])],
+        "pulse": pulse_window(bet),
+        "peak": round(float(run.summary["peak_dynamic_pressure_s"]), 3),
+        "bet": series.rounded(bet["t_s"].to_numpy()[rows], 4),
+        "rows": [len(rows), len(bet)],
+        "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in run.tables["events"].itertuples()],
+        "panels": panels,
+        "rigid": series.rigid_panels(run),
+        "residuals": series.residual_panels(run),
+        "solid": None if vehicle is None else shape.solid(vehicle),
+        "poses": shape.poses(run, rows),
+        "frames": [{k: v for k, v in frame.items() if k != "jpeg"} for frame in frames],
+    }
+    return data, absent
+
+
+def pulse_window(bet: pd.DataFrame) -> list[float]:
+    """From well before the pressure pulse to well after it, s."""
+    t = bet["t_s"].to_numpy()
+    inside = t[pressure_pulse(bet["dynamic_pressure_pa"].to_numpy())]
+    width = inside[-1] - inside[0]
+    return [
+        round(float(max(inside[0] - 0.75 * width, t[0])), 3),
+        round(float(min(inside[-1] + 0.5 * width, t[-1])), 3),
+    ]
+
+
+def safe_json(value: Any) -> str:
+    """JSON that may stand in a script element."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+    for sign, code in ESCAPED.items():
+        text = text.replace(sign, code)
+    return text
+
+
+def content_hash(text: str) -> str:
+    """Source expression of a content security policy that allows this inline text and nothing else."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
