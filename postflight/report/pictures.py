@@ -13,7 +13,7 @@ from flightmodel.film import Image
 from postflight.drawing import oriented_camera
 from postflight.report.source import Run
 
-FRAMES, WIDTH_PX, QUALITY = 10, 480, 80
+FRAMES, WIDTH_PX, QUALITY = 12, 480, 78
 
 
 def film_strip(run: Run) -> list[dict[str, Any]]:

@@ -1,0 +1,99 @@
+"""One short synthetic flight with a hostile vehicle, run once, and a browser to read its report with."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from postflight import commands
+from postflight.pipeline import METHODS
+from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.scenarios import read_scenario
+
+HOSTILE = "<script>alert(1)</script>"
+HOSTILE_EVENT = '</script><img src=x onerror="alert(2)">'
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+QUIET = ("disable-gpu", "disable-quic", "no-first-run", "disable-background-networking", "disable-component-update",
+         "disable-sync")  # fmt: skip
+# less of everything than the reference flight: it is looked at, not measured
+SHORTER = (
+    (r"(?m)^stop_s = 530\.0", "stop_s = 458.0"),
+    (r"telemetry_from_s = 300\.0", "telemetry_from_s = 412.0"),
+    (r"(?m)^t_s = 300\.0", "t_s = 412.0"),
+    (r"rate_hz = 250\.0", "rate_hz = 100.0"),
+    (r"rate_hz = 4\.0", "rate_hz = 1.0"),
+)
+
+
+@pytest.fixture(scope="session")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Flight folder with one run and its report; not to be written to."""
+    root = tmp_path_factory.mktemp("report")
+    text = Path(read_scenario("irve2_reference").source).read_text()
+    for pattern, new in SHORTER:
+        text, count = re.subn(pattern, new, text)
+        assert count, pattern
+    (root / "short.toml").write_text(text)
+    folder = root / "flight"
+    simulate_to_folder(read_scenario(str(root / "short.toml")), 0, folder)
+    shipped = vehicle_path("irve2_reference")
+    for table in vehicle_from_toml(shipped).tables:
+        shutil.copy(shipped.parent / table, folder / table)
+    named = re.sub(r'(?m)^name = ".*"', f'name = "{HOSTILE}"', shipped.read_text(), count=1)
+    (folder / "vehicle.toml").write_text(named)
+    flight = (folder / "flight.toml").read_text()
+    flight = flight.replace('vehicle = "irve2_reference"', 'vehicle = "vehicle.toml"')
+    flight = flight.replace('name = "irve2_reference"', f'name = "{HOSTILE}"', 1)
+    (folder / "flight.toml").write_text(flight + f"\n[[events]]\nname = '{HOSTILE_EVENT}'\nt_s = 430.0\n")
+    commands.run_flight(folder, METHODS, 20.0)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def report(reported: Path) -> Path:
+    """The report that the run wrote."""
+    return next((reported / "runs").glob("*/report.html"))
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[object]:
+    """A headless Chromium of this machine; skips where there is none."""
+    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if path is None:
+        pytest.skip("no Chromium on this machine")
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(
+            executable_path=path, headless=True, chromium_sandbox=False, args=[f"--{flag}" for flag in QUIET]
+        )
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def opened(browser, report: Path):
+    """``opened(width)``: the report in a new window; what it said and asked for is kept beside the page."""
+    contexts = []
+
+    def open_at(width: int = 1440, height: int = 900, path: Path = report) -> SimpleNamespace:
+        context = browser.new_context(viewport={"width": width, "height": height})
+        contexts.append(context)
+        page = context.new_page()
+        seen = SimpleNamespace(page=page, said=[], requests=[], dialogs=[])
+        page.on("console", lambda message: seen.said.append(message.text))
+        page.on("pageerror", lambda fault: seen.said.append(str(fault)))
+        page.on("request", lambda request: seen.requests.append(request.url))
+        page.on("dialog", lambda dialog: (seen.dialogs.append(dialog.message), dialog.dismiss()))
+        page.goto(path.as_uri())
+        page.wait_for_function("document.documentElement.dataset.ready === 'yes'")
+        return seen
+
+    yield open_at
+    for context in contexts:
+        context.close()
