@@ -56,6 +56,17 @@ def aft_profile(geometry: ShellGeometry, points_per_torus: int = 25) -> FloatArr
     return np.concatenate(arcs)
 
 
+def forward_profile(geometry: ShellGeometry) -> FloatArray:
+    """Meridian of the forward skin, ``(m, 2)`` as (station, radius), m: nose cap, then straight to the last torus."""
+    half, nose = np.deg2rad(geometry.half_angle_deg), geometry.nose_radius_m
+    delta = np.linspace(0.5 * np.pi, half, 12)
+    cap = np.column_stack([nose * (1.0 - np.sin(delta)), nose * np.cos(delta)])
+    station, radius = torus_circles(geometry)
+    touch = np.array([[station[-1] - geometry.torus_minor_radius_m * np.sin(half),
+                       radius[-1] + geometry.torus_minor_radius_m * np.cos(half)]])  # fmt: skip
+    return np.concatenate([cap, touch])
+
+
 def revolved(profile_station_radius_m: FloatArray, clock_lv_rad: FloatArray | float) -> FloatArray:
     """Points ``(..., m, 3)`` in shell axes, m, of a meridian ``(m, 2)`` at clocking angles ``(...)``."""
     outboard = lv_direction(np.asarray(clock_lv_rad, dtype=float))[..., None, :]
@@ -162,14 +173,8 @@ def vehicle_meshes(
             radius, geometry.torus_minor_radius_m, major_sections=clock_sections, minor_sections=torus_sections,
             transform=axes @ trimesh.transformations.translation_matrix([0.0, 0.0, station]),
         )  # fmt: skip
-    half, nose = np.deg2rad(geometry.half_angle_deg), geometry.nose_radius_m
-    delta = np.linspace(0.5 * np.pi, half, 12)
-    cap = np.column_stack([nose * np.cos(delta), nose * (1.0 - np.sin(delta))])
-    station, radius = torus_circles(geometry)
-    touch = np.array([[radius[-1] + geometry.torus_minor_radius_m * np.cos(half),
-                       station[-1] - geometry.torus_minor_radius_m * np.sin(half)]])  # fmt: skip
     meshes["forward_skin"] = trimesh.creation.revolve(
-        np.concatenate([cap, touch]), sections=clock_sections, transform=axes
+        forward_profile(geometry)[:, ::-1], sections=clock_sections, transform=axes
     )
     length = geometry.centerbody_length_m
     meshes["centerbody"] = trimesh.creation.cylinder(

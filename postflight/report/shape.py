@@ -8,45 +8,49 @@ import numpy as np
 
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import HOLE_FACTOR, lv_direction
-from flightmodel.geometry import aft_profile, revolved, rim_curve, seam_clocks_rad, vehicle_meshes
-from flightmodel.vehicle import ShellGeometry, Vehicle
+from flightmodel.geometry import aft_profile, forward_profile, revolved, rim_curve
+from flightmodel.vehicle import Vehicle
 from postflight.report.source import Run
 from postflight.report.thinning import Rows, rounded
 
-LEAST_SECTIONS, POINTS_PER_TORUS, RATE_HZ = 36, 6, 10.0
+LEAST_SECTIONS, POINTS_PER_TORUS, CONE_PIECES = 48, 7, 8
 
 
 def solid(vehicle: Vehicle) -> dict[str, Any]:
-    """Vertices, mm in body axes of the unbent vehicle, and polygons of aft side, forward skin and centerbody."""
+    """Vertices, mm in body axes of the unbent vehicle, and quadrangles of aft side, forward skin and centerbody.
+
+    Seen from outside, a quadrangle's vertices go round against the clock.
+    """
     geometry = vehicle.geometry
-    aft, faces, gores = aft_side(geometry)
-    meshes = vehicle_meshes(geometry, clock_sections=len(aft), torus_sections=3)
-    skin, body = meshes["forward_skin"], meshes["centerbody"]
-    clocks = np.linspace(0.0, 2.0 * np.pi, 73)
+    per_gore = max(1, -(-LEAST_SECTIONS // geometry.gore_count))
+    sections = per_gore * geometry.gore_count
+    aft = aft_profile(geometry, POINTS_PER_TORUS)
+    forward = forward_profile(geometry)
+    forward = np.concatenate([forward[:-1], np.linspace(forward[-2], forward[-1], CONE_PIECES + 1)[1:]])
+    # the centerbody shows where it comes out of the shell; it ends in a lid
+    stations = np.linspace(aft[0, 0], geometry.centerbody_length_m, CONE_PIECES)
+    body = np.column_stack([stations, np.full(CONE_PIECES, geometry.centerbody_radius_m)])
+    body = np.concatenate([body, [[geometry.centerbody_length_m, 0.0]]])
     return {
-        "aft": {"vertices": _mm(aft.reshape(-1, 3)), "faces": faces, "gores": gores},
-        "forward": {"vertices": _mm(skin.vertices), "faces": skin.faces.tolist()},
-        "centerbody": {"vertices": _mm(body.vertices), "faces": body.faces.tolist()},
-        "rim": _mm(rim_curve(geometry, clocks)),
+        "aft": surface(aft[::-1], sections)
+        | {"gores": np.repeat(np.arange(sections) // per_gore, len(aft) - 1).tolist()},
+        "forward": surface(forward, sections),
+        "centerbody": surface(body, sections),
+        "rim": _mm(rim_curve(geometry, np.linspace(0.0, 2.0 * np.pi, 73))),
         "joint": round(1e3 * vehicle.joint.station_m),
         "length": round(1e3 * geometry.centerbody_length_m),
         "radius": round(1e3 * geometry.base_radius_m),
     }
 
 
-def aft_side(geometry: ShellGeometry) -> tuple[FloatArray, list[list[int]], list[int]]:
-    """Vertices ``(clocks, m, 3)`` of the aft side, its quadrangles, and which gore each lies in."""
-    per_gore = max(1, -(-LEAST_SECTIONS // geometry.gore_count))
-    profile = aft_profile(geometry, POINTS_PER_TORUS)
-    sections, m = per_gore * geometry.gore_count, len(profile)
-    clocks = seam_clocks_rad(geometry)[0] + 2.0 * np.pi * np.arange(sections) / sections
-    faces, gores = [], []
+def surface(profile_station_radius_m: FloatArray, sections: int) -> dict[str, Any]:
+    """Surface of revolution of a meridian that has the vehicle on its right, going out from the nose or aft."""
+    clocks = 2.0 * np.pi * np.arange(sections) / sections
+    m, faces = len(profile_station_radius_m), []
     for k in range(sections):
         here, there = k * m, (k + 1) % sections * m
-        for i in range(m - 1):
-            faces.append([here + i, here + i + 1, there + i + 1, there + i])
-            gores.append(k // per_gore)
-    return revolved(profile, clocks), faces, gores
+        faces += [[here + i, there + i, there + i + 1, here + i + 1] for i in range(m - 1)]
+    return {"vertices": _mm(revolved(profile_station_radius_m, clocks).reshape(-1, 3)), "faces": faces}
 
 
 def _mm(points_m: FloatArray) -> list[list[int]]:

@@ -32,14 +32,14 @@ SHOWN_ROWS = 200
 
 def utc(run: Run, time_s: float) -> str:
     """Clock time of a mission time, ``12:59:20.62``."""
-    stamp = parse_utc(run.telemetry.t0_utc) + timedelta(seconds=round(float(time_s), 2))
+    stamp = parse_utc(run.telemetry.t0_utc) + timedelta(seconds=float(time_s), milliseconds=5)
     return stamp.strftime("%H:%M:%S.") + f"{stamp.microsecond // 10000:02d}"
 
 
 def pair(value: float, sd: float) -> str:
-    """``4.9 ± 0.1`` with the digits that the sd deserves."""
+    """``4.9 ± 0.1`` with the digits that the sd deserves, in one piece."""
     digits = max(0, min(4, -math.floor(math.log10(sd * 2.0)))) if sd > 0.0 else 2
-    return f"{value:.{digits}f} ± {sd:.{digits}f}"
+    return f"{value:.{digits}f}\u00a0±\u00a0{sd:.{digits}f}"
 
 
 def title(run: Run) -> str:
@@ -54,7 +54,7 @@ def title(run: Run) -> str:
     end = "no method could say how far anything bent" if asked else "how far it bent was not asked"
     highest = run.peak("altitude")
     if highest is not None and bool(highest["inside"]):
-        return f"{run.telemetry.name} rose to {pair(highest['value'] / 1e3, highest['sd'] / 1e3)} km; {end}"
+        return f"{run.telemetry.name} rose to {pair(highest['value'] / 1e3, highest['sd'] / 1e3)}\u00a0km; {end}"
     return f"{run.telemetry.name}: the trajectory is known; {end}"
 
 
@@ -186,4 +186,9 @@ def cell(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float | np.floating):
         return f"{value:.5g}" if np.isfinite(value) else ""
-    return str(value)
+    if isinstance(value, list):
+        inner = [f"({cell(x)})" if isinstance(x, list) else cell(x) for x in value]
+        return ", ".join(inner) or "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{name.replace('_', ' ')} {cell(x)}" for name, x in value.items())
+    return "not stated" if value is None else str(value)

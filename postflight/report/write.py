@@ -107,6 +107,7 @@ def told(run: Run) -> dict[str, Any]:
         "findings": words.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
         "verdicts": words.table_rows(verdicts.assign(passed=verdicts["passed"].map({True: "✓ pass", False: "✕ fail"}))),
         "extra": [(words_, words.table_rows(run.tables[name])) for name, words_ in more.items() if name in run.tables],
+        "vehicle": [(k, words.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
         "settings": [(k, words.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
         "date": parse_utc(run.telemetry.t0_utc).strftime("%-d %B %Y"),
     }
@@ -123,10 +124,12 @@ def numbers(run: Run, frames: list[dict[str, Any]]) -> tuple[dict[str, Any], lis
     else:
         absent.insert(0, ("Deflection", series.NO_DEFLECTION))
     vehicle = run.telemetry.vehicle
+    span = [float(bet["t_s"].iloc[0]), float(bet["t_s"].iloc[-1])]
     data = {
         "t0_ms": round(1e3 * parse_utc(run.telemetry.t0_utc).timestamp()),
-        "span": [float(bet["t_s"].iloc[0]), float(bet["t_s"].iloc[-1])],
+        "span": span,
         "pulse": pulse_window(bet),
+        "first": span if deflection is None else pulse_window(bet),
         "peak": round(float(run.summary["peak_dynamic_pressure_s"]), 3),
         "bet": series.rounded(bet["t_s"].to_numpy()[rows], 4),
         "rows": [len(rows), len(bet)],

@@ -64,7 +64,7 @@ function drawPoints(u, points, size) {
   clipped(u, (ctx, bbox, ratio) => {
     const low = u.scales.y.min, high = u.scales.y.max, bad = new Set(points.bad || []);
     const first = Math.max(rowBefore(points.t, u.scales.x.min) - 1, 0);
-    const s = size * ratio;
+    const s = size * ratio * (points.t.length < 400 ? 2 : 1);
     ctx.lineWidth = 1.5 * ratio;
     for (let k = first; k < points.t.length && points.t[k] <= u.scales.x.max; k++) {
       const y = points.y[k], x = u.valToPos(points.t[k], "x", true);
@@ -88,14 +88,14 @@ function drawPoints(u, points, size) {
   });
 }
 
-function axes(withUtc) {
+function axes(withUtc, small) {
   const grid = { stroke: "#eceff2", width: 1 }, ticks = { stroke: "#c4ccd3", width: 1, size: 5 };
   const look = { stroke: "#57616b", font: FONT, grid, ticks };
-  const digits = (splits) => (splits.length > 1 && splits[1] - splits[0] < 0.1 ? 2 : splits[1] - splits[0] < 1 ? 1 : 0);
+  const digits = (splits) => [0, 1, 2, 3].find((d) => splits.every((t) => Math.abs(t - t.toFixed(d)) < 1e-6)) ?? 3;
   return [
     { ...look, size: withUtc ? 46 : 30, space: withUtc ? 90 : 60, gap: 4,
       values: (u, splits) => splits.map((t) => `${t.toFixed(digits(splits))} s` + (withUtc ? `\n${utcWords(t)}` : "")) },
-    { ...look, size: GUTTER, gap: 6, space: 28 },
+    { ...look, size: GUTTER, gap: 6, space: small ? 18 : 28 },
   ];
 }
 
@@ -123,11 +123,11 @@ function makeChart(panel, told, series, bands, options) {
   const u = new uPlot({
     width: host.clientWidth,
     height: options.height + (options.utc ? 16 : 0),
-    padding: [8, 10, 0, 0],
+    padding: [8, 26, 0, 0],
     legend: { show: false },
     cursor: { x: false, y: false, points: { show: false }, drag: { x: true, y: false, setScale: false } },
     scales: { x: { time: false, range: () => [clock.from, clock.to] }, y: { range: scaleOf(panel) } },
-    axes: axes(options.utc),
+    axes: axes(options.utc, options.height === SMALL),
     series: [{}, ...series],
     bands,
     hooks: {

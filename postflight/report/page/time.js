@@ -7,8 +7,8 @@ window.devicePixelRatio = Math.max(2, window.devicePixelRatio || 1);
 
 const clock = {
   now: data.peak,
-  from: data.pulse[0],
-  to: data.pulse[1],
+  from: data.first[0],
+  to: data.first[1],
   onCursor: [],
   onWindow: [],
 
@@ -60,7 +60,8 @@ const clock = {
 };
 
 function utcWords(t, digits) {
-  return new Date(data.t0_ms + Math.round(t * 1000)).toISOString().slice(11, digits ? 20 + digits : 19);
+  const unit = 1000 / 10 ** (digits || 0);
+  return new Date(Math.round((data.t0_ms + t * 1000) / unit) * unit).toISOString().slice(11, digits ? 20 + digits : 19);
 }
 
 // row at or before t of ascending times

@@ -1,6 +1,18 @@
 // The vehicle at the cursor's time: centerbody, bent shell and the air that meets it, as shaded polygons on a canvas.
 // Body axes: x out of the nose, which points down here; the wind comes from below. Polygons far away are drawn first.
 
+// turn points, mm, about the joint by the rotation vector x cross b (Rodrigues), b in deg
+function bender(b, times, joint) {
+  const size = b ? Math.hypot(b[0], b[1]) : 0;
+  if (!size) return (p) => p;
+  const angle = size * times * Math.PI / 180, c = Math.cos(angle), s = Math.sin(angle);
+  const ky = -b[1] / size, kz = b[0] / size;
+  return ([x0, y, z]) => {
+    const x = x0 + joint, along = (ky * y + kz * z) * (1 - c);
+    return [x * c + (ky * z - kz * y) * s - joint, y * c + kz * x * s + ky * along, z * c - ky * x * s + kz * along];
+  };
+}
+
 function startVehicle() {
   const canvas = document.getElementById("vehicle");
   if (!canvas || !data.solid) return;
@@ -9,7 +21,7 @@ function startVehicle() {
   const RAD = Math.PI / 180, view = { azimuth: 0, elevation: 24 * RAD };
   const parts = [
     { ...solid.forward, bends: true, tone: () => [196, 186, 166] },
-    { ...solid.aft, bends: true, tone: (k) => (solid.aft.gores[k] % 2 ? [233, 221, 195] : [218, 203, 171]) },
+    { ...solid.aft, bends: true, tone: (k) => (solid.aft.gores[k] % 2 ? [236, 226, 204] : [224, 211, 184]) },
     { ...solid.centerbody, bends: false, tone: () => [150, 160, 170] },
   ];
   let wanted = false;
@@ -21,17 +33,6 @@ function startVehicle() {
     if (hole && step > hole && t !== told.t[k]) return null;
     const s = step > 0 ? (t - told.t[k]) / step : 0;
     return [told.y[k] + s * (told.y[n] - told.y[k]), told.z[k] + s * (told.z[n] - told.z[k])];
-  }
-
-  // turn about the joint by the rotation vector x cross b (Rodrigues), b in deg
-  function bender(b, times) {
-    const size = b ? Math.hypot(b[0], b[1]) : 0;
-    if (!size) return (p) => p;
-    const angle = size * RAD * times, ky = -b[1] / size, kz = b[0] / size, c = Math.cos(angle), s = Math.sin(angle);
-    return ([x0, y, z]) => {
-      const x = x0 + solid.joint, along = (ky * y + kz * z) * (1 - c);
-      return [x * c + (ky * z - kz * y) * s - solid.joint, y * c + kz * x * s + ky * along, z * c - ky * x * s + kz * along];
-    };
   }
 
   function axesOfView() {
@@ -47,9 +48,9 @@ function startVehicle() {
   function draw() {
     wanted = false;
     const bend = lateral(data.poses.bend, clock.now, data.poses.bend && data.poses.bend.hole);
-    const flow = lateral(data.poses.flow, clock.now, 1), times = +slider.value, turn = bender(bend, times);
+    const flow = lateral(data.poses.flow, clock.now, 1), times = +slider.value, turn = bender(bend, times, solid.joint);
     const { to, up, right } = axesOfView(), w = canvas.width, h = canvas.height;
-    const size = 0.36 * Math.min(w, h) / solid.radius, middle = [-0.3 * solid.length, 0, 0];
+    const size = 0.41 * Math.min(w, h) / solid.radius, middle = [-0.22 * solid.length, 0, 0];
     const flat = (p) => {
       const d = [p[0] - middle[0], p[1], p[2]];
       return [w / 2 + size * dot(d, right), 0.5 * h - size * dot(d, up), dot(d, to)];
@@ -63,10 +64,10 @@ function startVehicle() {
     for (const part of parts) {
       const points = part.vertices.map((p) => (part.bends ? turn(p) : p)).map(flat);
       part.faces.forEach((face, k) => {
-        const n = normal(face, points, size);
-        const shade = 0.55 + 0.45 * Math.abs(dot(n, light));
+        const n = normal(face, points, size), shade = 0.55 + 0.45 * Math.abs(dot(n, light));
         const depth = face.reduce((sum, i) => sum + points[i][2], 0) / face.length;
-        polygons.push({ face, points, depth, colour: part.tone(k).map((x) => Math.round(Math.min(255, x * shade * 1.04))) });
+        // what is seen from its inner side lies behind everything else
+        polygons.push({ face, points, depth: n[2] > 0 ? depth : depth - 1e6, colour: part.tone(k).map((x) => Math.round(Math.min(255, x * shade * 1.04))) });
       });
     }
     polygons.sort((p, q) => p.depth - q.depth);
@@ -82,7 +83,7 @@ function startVehicle() {
     for (const arrow of arrows.filter((a) => flat(a[0])[2] > 0)) drawArrow(arrow, flat);
     path(solid.rim.map(flat), "#57616b", 1.6, [7, 6]);
     path(solid.rim.map(turn).map(flat), "#1c2126", 2.4, []);
-    const far = -1.5 * solid.length, nose = 0.35 * solid.length;
+    const far = -1.35 * solid.length, nose = 0.3 * solid.length;
     path([[nose, 0, 0], [far, 0, 0]].map(flat), "#57616b", 1.6, [7, 6]);
     path([[nose, 0, 0], [far, 0, 0]].map(turn).map(flat), "#1c2126", 2.4, []);
     tell(bend, flow, times);
@@ -90,8 +91,9 @@ function startVehicle() {
 
   // of a polygon in the picture's axes, of length one
   function normal(face, points, size) {
-    const [a, b, c] = [face[0], face[1], face[face.length - 1]].map((i) => points[i]);
-    const u = [b[0] - a[0], a[1] - b[1], (b[2] - a[2]) * size], v = [c[0] - a[0], a[1] - c[1], (c[2] - a[2]) * size];
+    // by the diagonals: one side may have no length where a meridian begins on the axis
+    const [a, b, c, d] = face.map((i) => points[i]);
+    const u = [c[0] - a[0], a[1] - c[1], (c[2] - a[2]) * size], v = [d[0] - b[0], b[1] - d[1], (d[2] - b[2]) * size];
     const n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
     const length = Math.hypot(...n) || 1;
     return n.map((x) => x / length);
@@ -115,7 +117,7 @@ function startVehicle() {
     for (let k = 0; k < 6; k++) {
       const side = [0, 0.75 * r * Math.cos(k * Math.PI / 3), 0.75 * r * Math.sin(k * Math.PI / 3)];
       const at = (far) => side.map((s, i) => s + far * r * ahead[i]);
-      out.push([at(1.25), at(0.55)]);
+      out.push([at(0.9), at(0.2)]);
     }
     return out;
   }
