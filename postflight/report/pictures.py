@@ -13,7 +13,7 @@ from flightmodel.film import Image
 from postflight.drawing import oriented_camera
 from postflight.report.source import Run
 
-FRAMES, WIDTH_PX, QUALITY = 12, 480, 78
+FRAMES, WIDTH_PX, QUALITY, DASH_PX = 12, 480, 78, 12
 
 
 def film_strip(run: Run) -> list[dict[str, Any]]:
@@ -40,13 +40,21 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
         if k in rows:
             theta, plane = np.deg2rad([rows[k].theta_deg, rows[k].plane_lv_deg])
             picture = overlay.blended(image, float(theta), float(plane))
-            draw_row(picture, at_rest, GREY)
+            picture = dashed_row(picture, at_rest)
             draw_row(picture, horizon_row(oriented.view, float(theta), float(plane)), YELLOW)
             said |= {"theta": round(rows[k].theta_deg, 3), "sd": round(rows[k].theta_sd_deg, 3)}
         else:
             picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
         out.append(said | {"jpeg": jpeg(picture)})
     return out
+
+
+def dashed_row(picture: Image, row: int) -> Image:
+    """Picture with the grey line in dashes, so that it stands apart from the yellow one without colours."""
+    drawn = picture.copy()
+    draw_row(drawn, row, GREY)
+    dash = (np.arange(picture.shape[1]) // DASH_PX % 2 == 0)[None, :, None]
+    return np.where(dash, drawn, picture)
 
 
 def _without_near(picks: list[int], wanted: tuple[int, ...]) -> list[int]:

@@ -142,7 +142,7 @@ def with_holes(time_s: FloatArray, columns: Iterable[FloatArray]) -> tuple[Float
 def deflection_panel(run: Run) -> Panel | None:
     """Deflection by every method that answered, each at its own times; None where none did."""
     lines = []
-    for method in METHODS:
+    for method in METHODS[::-1]:  # the fusion first and so below the others, which are thinner
         table = run.tables.get(f"deflection_{method}")
         if table is None or not len(table):
             continue
@@ -151,7 +151,9 @@ def deflection_panel(run: Run) -> Panel | None:
         )
         rows = kept_rows([theta], TRAJECTORY_ROWS // 2)
         one = line(LABEL[method], theta[rows], sd[rows], COLOUR[method], DASH[method], 4)
-        lines.append(one | {"t": rounded(t[rows], 4), "width": 2.6 if method == "fused" else 1.6})
+        # pictures are few: each is a dot, which also tells the line apart without colours
+        one["dots"] = method == "camera"
+        lines.append(one | {"t": rounded(t[rows], 4), "width": 3.4 if method == "fused" else 1.4})
     if not lines:
         return None
     out = panel("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, [])

@@ -106,9 +106,9 @@ function scaleOf(panel) {
     if (low === null || high === null) return [0, 1];
     const width = high - low || 1, from = low, to = high;
     for (const points of panel.raw) {
-      const first = rowBefore(points.t, u.scales.x.min);
-      for (let k = first; k < points.t.length && points.t[k] <= u.scales.x.max; k++) {
+      for (let k = rowBefore(points.t, clock.from); k < points.t.length && points.t[k] <= clock.to; k++) {
         const y = points.y[k];
+        if (points.t[k] < clock.from) continue;
         if (y >= from - width && y <= to + width) { low = Math.min(low, y); high = Math.max(high, y); }
       }
     }
@@ -201,7 +201,7 @@ function addLegend(chart, told) {
 function timePanel(panel, options) {
   const told = panel.lines.map((line) => edges(line, panel)), series = [], bands = [];
   panel.lines.forEach((line, k) => {
-    series.push({ stroke: line.colour, width: line.width, dash: line.dash, points: { show: false } });
+    series.push({ stroke: line.colour, width: line.width, dash: line.dash, points: line.dots ? { show: true, size: 4, width: 0, fill: line.colour } : { show: false } });
     if (!told[k].low) return;
     const edge = { stroke: "rgba(0,0,0,0)", width: 0, points: { show: false } };
     bands.push({ series: [series.length + 2, series.length + 1], fill: translucent(line.colour, line.low ? 0.28 : 0.15) });

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from tests.report.conftest import HOSTILE, HOSTILE_EVENT
+from flightmodel.deflection import lv_direction
+from flightmodel.geometry import bend
+from tests.postflight.report.conftest import HOSTILE, HOSTILE_EVENT
 
 pytestmark = pytest.mark.browser
 
@@ -178,3 +183,22 @@ def test_prints_with_everything_open(opened) -> None:
     assert pdf.count(b"/Type /Page\n") >= 6
     assert page.evaluate("window.openThen") == page.locator("details").count() > 5
     assert page.locator("details[open]").count() == 0
+
+
+def test_shell_is_bent_as_the_library_bends_it(opened) -> None:
+    page = opened().page
+    theta, plane, station = np.deg2rad(7.0), np.deg2rad(215.0), 0.2
+    points = np.array([[-0.4, 1.1, 0.3], [0.0, 0.0, -1.4], [-0.2, 0.0, 0.0]])
+    lateral = (7.0 * lv_direction(plane)[1:]).tolist()
+    drawn = page.evaluate(
+        "([points, b, joint]) => points.map(bender(b, 1, joint))", [(1e3 * points).tolist(), lateral, 1e3 * station]
+    )
+    assert np.array(drawn) / 1e3 == pytest.approx(bend(points, theta, plane, station), abs=1e-9)
+
+
+def test_flight_without_vehicle_reads_as_well(opened, rocket: Path) -> None:
+    seen = opened(path=next((rocket / "runs").glob("*/report.html")))
+    assert seen.said == []
+    assert seen.page.locator("#vehicle").count() == 0
+    seen.page.locator("#time").fill("30")
+    assert len(set(seen.page.evaluate("charts.map((c) => c.cursor.dataset.time)"))) == 1

@@ -16,6 +16,7 @@ from postflight.pipeline import METHODS
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 
+ROOT = Path(__file__).parents[3]
 HOSTILE = "<script>alert(1)</script>"
 HOSTILE_EVENT = '</script><img src=x onerror="alert(2)">'
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -97,3 +98,12 @@ def opened(browser, report: Path):
     yield open_at
     for context in contexts:
         context.close()
+
+
+@pytest.fixture(scope="session")
+def rocket(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Flight folder of a rocket that flew, without vehicle file, inertial sensors and video, with one run."""
+    folder = tmp_path_factory.mktemp("rocket") / "flight"
+    shutil.copytree(ROOT / "tests" / "data" / "real_flights" / "rocketpy_prometheus", folder)
+    commands.run_flight(folder, METHODS, 20.0)
+    return folder

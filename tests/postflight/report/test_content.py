@@ -1,0 +1,249 @@
+"""What the report holds: the run's own numbers, whole and hostile-proof, and words where a flight has no answer."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from flightmodel.checks import GateError
+from postflight.report import words
+from postflight.report.series import with_holes
+from postflight.report.source import read_run
+from postflight.report.thinning import extreme_rows, kept_rows, rounded
+from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
+from tests.postflight.report.conftest import HOSTILE
+
+LARGEST_BYTES = 3_000_000
+
+
+def payload(text: str) -> dict:
+    """Numbers that the page's scripts draw."""
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
+
+
+@pytest.fixture(scope="module")
+def text(report: Path) -> str:
+    return report.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def run(reported: Path):
+    return read_run(reported)
+
+
+# ------------------------------------------------------------------------------------------------------- one whole file
+
+
+def test_one_small_file_that_refers_to_nothing(report: Path, text: str) -> None:
+    assert report.stat().st_size < LARGEST_BYTES
+    body = text[: text.index('<script type="application/json"')]
+    links = re.findall(r'\b(?:src|href|action|poster|data|srcset)\s*=\s*"([^"]*)"', body)
+    assert len(links) >= 13, "the pictures were not found"
+    assert all(link.startswith(("data:image/jpeg;base64,", "#")) for link in links)
+    assert not re.search(r"url\(|@import|@font-face", body)
+    assert "default-src 'none'" in text
+
+
+def test_same_run_gives_the_same_bytes(reported: Path, report: Path, tmp_path: Path) -> None:
+    again = write_report(reported, target=tmp_path / "again.html")
+    assert again.read_bytes() == report.read_bytes()
+    assert [p.name for p in tmp_path.iterdir()] == ["again.html"]
+
+
+def test_nothing_of_the_clock_or_the_machine(run, text: str) -> None:
+    assert run.facts["finished_utc"] not in text
+    assert run.path.name[:16] not in text
+    assert str(run.path.parent.parent) not in text
+
+
+def test_hostile_names_are_escaped(text: str) -> None:
+    assert text.count("<script") == 2
+    assert HOSTILE not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    assert "<img src=x" not in text
+
+
+@pytest.mark.parametrize("value", ["</script>", "<!--", "a\u2028b\u2029c", "&amp;", 'quote " and \\'])
+def test_json_in_a_script_is_safe_and_the_same(value: str) -> None:
+    told = safe_json({"name": value})
+    assert not re.search("[<>&\u2028\u2029]", told)
+    assert json.loads(told) == {"name": value}
+
+
+def test_page_files_are_in_the_package() -> None:
+    from importlib.resources import files
+
+    here = {p.name for p in files("postflight.report").joinpath("page").iterdir()}
+    assert {*SCRIPTS, *STYLES, "page.html", "uPlot.LICENSE"} <= here
+
+
+# ---------------------------------------------------------------------------------------------------------- its numbers
+
+
+def test_title_is_the_answer(run, text: str) -> None:
+    told = run.summary["methods"]["fused"]
+    assert (
+        words.title(run)
+        == f"The aeroshell bent {told['deflection_deg']:.1f}\u00a0±\u00a0{told['sd_deg']:.1f}° at peak dynamic pressure"
+    )
+    assert f"<h1>{words.title(run)}</h1>" in text
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "wanted"), [(4.88, 0.096, "4.9 ± 0.1"), (3.3, 0.49, "3.3 ± 0.5"), (12.0, 2.2, "12 ± 2"),
+                                (0.5, 0.02, "0.50 ± 0.02"), (1.0, 0.0, "1.00 ± 0.00")],
+)  # fmt: skip
+def test_pair_has_the_digits_that_its_sd_deserves(value: float, sd: float, wanted: str) -> None:
+    assert words.pair(value, sd).replace("\u00a0", " ") == wanted
+
+
+def test_cards_say_what_the_tests_of_pairs_say(run) -> None:
+    pairs = run.tables["fusion_agreement"]
+    for card in words.cards(run):
+        method = card["method"]
+        mine = pairs if method == "fused" else pairs[[method in m.split(" and ") for m in pairs["methods"]]]
+        assert card["state"] == ("agrees" if mine["passed"].all() else "differs")
+        assert card["value"] == f"{run.summary['methods'][method]['deflection_deg']:.2f}"
+
+
+def test_a_pair_that_disagrees_is_named(run) -> None:
+    table = run.tables["fusion_agreement"].assign(passed=[True, False, True], chance=[0.5, 1e-4, 0.5])
+    one = type(run)(**{**vars(run), "tables": run.tables | {"fusion_agreement": table}})
+    first, second = table["methods"][1].split(" and ")
+    cards = {card["method"]: card for card in words.cards(one)}
+    assert cards[first]["state"] == cards[second]["state"] == cards["fused"]["state"] == "differs"
+    assert cards[first]["words"] == f"disagrees with {second}"
+    assert [c["state"] for m, c in cards.items() if m not in (first, second, "fused")] == ["agrees"]
+
+
+def test_drawn_numbers_are_the_runs(run, text: str) -> None:
+    data, bet = payload(text), run.tables["bet"]
+    panels = {p["id"]: p for p in data["panels"]}
+    assert list(panels) == ["deflection", "altitude", "speed", "mach", "pressure", "alpha", "axial", "lateral"]
+    rows = np.searchsorted(bet["t_s"].to_numpy(), np.array(data["bet"]) - 1e-4)
+    assert np.abs(bet["t_s"].to_numpy()[rows] - data["bet"]).max() < 1e-4
+    drawn = panels["pressure"]["lines"][0]
+    assert drawn["y"] == pytest.approx(bet["dynamic_pressure_pa"].to_numpy()[rows], abs=6e-4)
+    assert drawn["sd3"] == pytest.approx(3.0 * bet["dynamic_pressure_sd_pa"].to_numpy()[rows], abs=6e-4)
+    assert max(drawn["y"]) == pytest.approx(bet["dynamic_pressure_pa"].max(), abs=6e-4)
+    fused = next(one for one in panels["deflection"]["lines"] if one["label"] == "all fused")
+    table = run.tables["deflection_fused"]
+    kept = [y for y in fused["y"] if y is not None]
+    assert kept == pytest.approx(table["theta_deg"].to_numpy(), abs=6e-5)
+    assert len(data["residuals"]) == 6
+    high = run.tables["rigid_bounds"]["alpha_total_high_deg"].to_numpy()
+    assert data["rigid"][0]["lines"][0]["high"] == pytest.approx(high, abs=6e-5)
+
+
+def test_raw_accelerations_keep_their_extremes(run, text: str) -> None:
+    data, record = payload(text), run.telemetry.accelerometer
+    body = record.measured_sensor @ record.spec.dcm_body_sensor.T
+    raw = next(p for p in data["panels"] if p["id"] == "axial")["raw"][0]
+    assert raw["of"] == len(body)
+    assert (min(raw["y"]), max(raw["y"])) == pytest.approx((body[:, 0].min(), body[:, 0].max()), abs=6e-4)
+
+
+# -------------------------------------------------------------------------------------------------- without some answer
+
+
+def test_rocket_without_vehicle_says_why(rocket: Path) -> None:
+    run = read_run(rocket)
+    text = (run.path / "report.html").read_text()
+    data = payload(text)
+    assert words.title(run).replace("\u00a0", " ").startswith("Prometheus rose to 5.50 ± 0.01 km; no method could say")
+    assert [p["id"] for p in data["panels"]] == ["altitude", "speed", "mach", "pressure"]
+    assert data["solid"] is None
+    for why in (
+        "names no vehicle", "the flight has no video", "The flight has no video.", "its shape is not known",
+        "The flight has no accelerometer", "Nothing on board carried the attitude", "no rigid vehicle to fly beside it",
+    ):  # fmt: skip
+        assert why in text
+    assert data["first"] == data["span"]
+
+
+def test_run_of_the_trajectory_alone(run) -> None:
+    bare = {**run.summary, "methods": {}, "agreement": None, "southwell": None}
+    tables = {k: v for k, v in run.tables.items() if not k.startswith(("deflection", "fusion", "rigid", "camera"))}
+    facts = {**run.facts, "settings": {**run.facts["settings"], "methods": []}}
+    one = type(run)(**{**vars(run), "summary": bare, "tables": tables, "facts": facts})
+    text = page(one)
+    assert "how far it bent was not asked" in text
+    assert text.count("not asked for in this run") >= 4
+    assert "This run holds no flights of the rigid vehicle" in text
+
+
+def test_failed_verdicts_and_findings_are_told(run) -> None:
+    bad = {**run.summary, "verdicts_failed": ["NIS north: too large <b>"], "suspects": ["north: its clock"]}
+    found = pd.DataFrame([("north", "gap of 3 s", 430.0, 433.0)] * 300, columns=["source", "what", "start_s", "end_s"])
+    one = type(run)(**{**vars(run), "summary": bad, "tables": run.tables | {"findings": found}})
+    text = page(one)
+    assert "✕ NIS north: too large &lt;b&gt;" in text
+    assert "Suspect: north: its clock" in text
+    assert "100 more rows stand in the run's folder" in text
+
+
+# ---------------------------------------------------------------------------------------------------------- refusals
+
+
+def test_changed_telemetry_is_refused(rocket: Path, tmp_path: Path) -> None:
+    shutil.copytree(rocket, tmp_path / "flight")
+    path = tmp_path / "flight" / "flight.toml"
+    path.write_text(path.read_text() + "\n# another thought\n")
+    with pytest.raises(GateError, match=r"changed since the run .*: flight\.toml; use `postflight run"):
+        read_run(tmp_path / "flight")
+
+
+@pytest.mark.parametrize("name", ["bet.csv", "summary.json", "residuals.csv"])
+def test_run_that_is_not_whole_is_refused(rocket: Path, tmp_path: Path, name: str) -> None:
+    shutil.copytree(rocket, tmp_path / "flight")
+    path = next((tmp_path / "flight" / "runs").iterdir())
+    (path / name).unlink()
+    with pytest.raises(GateError, match=r"not a whole run|no finished run"):
+        read_run(tmp_path / "flight", path)
+
+
+def test_command_writes_where_told_and_says_so(command, rocket: Path, tmp_path: Path) -> None:
+    done = command("report", rocket, "--output", tmp_path / "a.html")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert str(tmp_path / "a.html") in done.stdout
+    done = command("report", rocket, "--output", tmp_path / "nowhere" / "a.html")
+    assert done.returncode == 3
+    assert "cannot be written" in done.stderr
+    assert command("report", tmp_path).returncode == 3
+
+
+# ---------------------------------------------------------------------------------------------------------- thinning
+
+
+def test_thinning_keeps_every_buckets_extremes() -> None:
+    rng = np.random.default_rng(3)
+    columns = [np.cumsum(rng.standard_normal(20_000)), np.sin(np.arange(20_000) / 700.0)]
+    columns[1][5000:5100] = np.nan
+    rows = kept_rows(columns, 1000)
+    assert len(rows) <= 1000
+    assert {0, 19_999, 4999, 5000, 5099, 5100} <= set(rows.tolist())
+    for c in columns:
+        assert {int(np.nanargmin(c)), int(np.nanargmax(c))} <= set(rows.tolist())
+    spike = np.zeros(50_000)
+    spike[12_345] = 1.0
+    assert 12_345 in kept_rows([spike], 400)
+    assert len(kept_rows([spike], 60_000)) == 50_000
+
+
+def test_extremes_of_each_run_of_rows() -> None:
+    values = np.array([1.0, 5.0, 2.0, np.nan, np.nan, np.nan, 3.0, -1.0, 0.0])
+    assert extreme_rows(values, 3).tolist() == [0, 1, 6, 7]
+
+
+def test_holes_break_the_line_and_two_rates_do_not() -> None:
+    t = np.concatenate([np.arange(0.0, 2.0, 0.05), np.arange(2.0, 4.0, 0.02), np.arange(6.0, 8.0, 0.02)])
+    times, (values,) = with_holes(t, [np.ones(len(t))])
+    assert np.count_nonzero(np.isnan(values)) == 1
+    assert 3.98 < times[np.isnan(values)][0] < 6.0
+    assert rounded(values, 1).count(None) == 1
