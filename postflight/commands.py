@@ -142,7 +142,7 @@ def run(folder: Path, methods: tuple[str, ...], rate_hz: float, reruns: bool = F
         print_sensitivity(pd.read_csv(written / "sensitivity.csv"))
     if methods:
         print_answers(answers, flight.peak_s)
-    console.print(f"results in {escape(str(written))}")
+    console.print(f"results in {escape(str(written))}, to read in report.html")
     if any(reason != NO_VIDEO for reason in answers.refused.values()):
         sys.exit(EXIT_NO_ANSWER)
 
@@ -378,7 +378,7 @@ def demo(folder: Path, seed: int) -> None:
     picture = folder / "demo.png"
     figures.save(drawing.summary_figure(flight, answers, truth_history(folder)), picture)
     print_score(result)
-    console.print(f"results and figures in {escape(str(written))}")
+    console.print(f"results, figures and report.html in {escape(str(written))}")
     console.print(f"the answer as a picture, with the truth: {escape(str(picture))}")
     console.print(f"{time.perf_counter() - begun:.0f} s in all")
     if result.failures:

@@ -90,7 +90,7 @@ def told(run: Run) -> dict[str, Any]:
     """Everything on the page that is words or tables."""
     more = {
         "sensitivity": "Sensitivity: change at peak dynamic pressure without a source or with another assumption",
-        "camera_sensitivity": "Deflection by video under assumed joints and planes, beside the seed paper's Table 2.1",
+        "camera_sensitivity": "Deflection by video under assumed joints and planes, beside Table 2.1 of AIAA 2011-2571",
         "fusion_inputs": "What the methods together say of each input they lean on",
         "fusion_agreement": "Test of every pair of methods",
         "air_parameters": "Coefficient scales and flexure found with the air of the day",

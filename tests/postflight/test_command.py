@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 HEAVY = {"numpy", "scipy", "numba", "matplotlib", "cv2", "trimesh", "filterpy", "pandas", "ppigrf", "erfa"}
-COMMANDS = ("demo", "simulate", "reconstruct", "deflection", "run", "score", "warmup")
+COMMANDS = ("demo", "simulate", "reconstruct", "deflection", "run", "score", "report", "warmup")
 
 
 def tree(root: Path) -> dict[str, bytes]:
@@ -24,7 +24,7 @@ def tree(root: Path) -> dict[str, bytes]:
 # ---------------------------------------------------------------------------------------------------------------- help
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["report", "--help"]])
 def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     """Help in under half a second needs that; the import list does not depend on the machine's load."""
     done = subprocess.run(
