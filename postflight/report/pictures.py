@@ -13,7 +13,8 @@ from flightmodel.film import Image
 from postflight.drawing import oriented_camera
 from postflight.report.source import Run
 
-FRAMES, WIDTH_PX, QUALITY, DASH_PX = 12, 480, 78, 12
+FRAMES, WIDTH_PX, DASH_PX = 12, 480, 12
+QUALITIES, LARGEST_CHARACTERS = (78, 60, 40, 20), 600_000  # the whole strip stays below, or has the last quality
 
 
 def film_strip(run: Run) -> list[dict[str, Any]]:
@@ -31,7 +32,8 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
     overlay, at_rest = Overlay(oriented.view), horizon_row(oriented.view, 0.0, 0.0)
     chosen = sorted({*_without_near(picks, (benchmark, largest)), benchmark, largest})
     rows = dict(zip(answered.tolist(), table.itertuples(index=False), strict=True))
-    out = []
+    out: list[dict[str, Any]] = []
+    drawn: list[Image] = []
     for k, image in zip(chosen, frames.pictures(chosen), strict=True):
         if image.size == 0:
             continue
@@ -45,8 +47,9 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
             said |= {"theta": round(rows[k].theta_deg, 3), "sd": round(rows[k].theta_sd_deg, 3)}
         else:
             picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
-        out.append(said | {"jpeg": jpeg(picture)})
-    return out
+        out.append(said)
+        drawn.append(picture)
+    return [said | {"jpeg": text} for said, text in zip(out, jpegs(drawn), strict=True)]
 
 
 def dashed_row(picture: Image, row: int) -> Image:
@@ -65,12 +68,27 @@ def _without_near(picks: list[int], wanted: tuple[int, ...]) -> list[int]:
     return left
 
 
-def jpeg(picture: Image) -> str:
-    """Data URI of an RGB picture ``(h, w, 3)``, made ``WIDTH_PX`` wide where it is wider."""
+def jpegs(pictures: list[Image]) -> list[str]:
+    """Data URIs of RGB pictures ``(h, w, 3)``, as fine as lets all of them together stay small."""
+    small = [narrowed(picture) for picture in pictures]
+    told: list[str] = []
+    for quality in QUALITIES:
+        told = [jpeg(picture, quality) for picture in small]
+        if sum(map(len, told)) <= LARGEST_CHARACTERS:
+            break
+    return told
+
+
+def narrowed(picture: Image) -> Image:
+    """Picture made ``WIDTH_PX`` wide where it is wider."""
     height, width = picture.shape[:2]
-    if width > WIDTH_PX:
-        picture = np.asarray(
-            cv2.resize(picture, (WIDTH_PX, round(height * WIDTH_PX / width)), interpolation=cv2.INTER_AREA), np.uint8
-        )
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if width <= WIDTH_PX:
+        return picture
+    size = (WIDTH_PX, round(height * WIDTH_PX / width))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def jpeg(picture: Image, quality: int) -> str:
+    """Data URI of one RGB picture."""
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

@@ -168,6 +168,8 @@ def rigid_panels(run: Run) -> list[Panel]:
     bet = run.tables["bet"]
     from_s, to_s = bands["t_s"].iloc[0] - 5.0, bands["t_s"].iloc[-1] + 5.0
     bet = bet[(bet["t_s"] >= from_s) & (bet["t_s"] <= to_s)]
+    angles = [bet[c].to_numpy(float) for c in ("alpha_total_wind_deg", "ay_cg_mps2", "az_cg_mps2")]
+    bet = bet.iloc[kept_rows(angles, TRAJECTORY_ROWS)]
     t = rounded(bands["t_s"].to_numpy(), 3)
     normal = np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / 9.80665
     out = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import HOLE_FACTOR, lv_direction
@@ -13,7 +14,7 @@ from flightmodel.vehicle import Vehicle
 from postflight.report.source import Run
 from postflight.report.thinning import Rows, rounded
 
-LEAST_SECTIONS, POINTS_PER_TORUS, CONE_PIECES = 48, 7, 8
+LEAST_SECTIONS, POINTS_PER_TORUS, CONE_PIECES, POSES = 48, 7, 8, 3000
 
 
 def solid(vehicle: Vehicle) -> dict[str, Any]:
@@ -64,17 +65,22 @@ def poses(run: Run, rows: Rows) -> dict[str, Any]:
     """
     bet = run.tables["bet"].iloc[rows]
     known = bet["alpha_total_wind_deg"].notna()
-    thin = bet[known].iloc[:: max(1, len(bet[known]) // 3000)]
+    thin = thinned(bet[known])
     out: dict[str, Any] = {
         "flow": {"t": rounded(thin["t_s"].to_numpy(), 3)} | _lateral(thin["alpha_total_wind_deg"], thin["clock_lv_deg"])
     }
     method = best_method(run)
     if method is not None:
-        table = run.tables[f"deflection_{method}"]
+        table = thinned(run.tables[f"deflection_{method}"])
         t = table["t_s"].to_numpy()
         out["bend"] = {"t": rounded(t, 3), "method": method, "hole": hole_s(t)}
         out["bend"] |= _lateral(table["theta_deg"], table["plane_lv_deg"])
     return out
+
+
+def thinned(table: pd.DataFrame) -> pd.DataFrame:
+    """Rows at equal steps, at most ``POSES``."""
+    return table.iloc[:: -(-len(table) // POSES) or 1]
 
 
 def hole_s(time_s: FloatArray) -> float:

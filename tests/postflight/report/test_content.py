@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from flightmodel.checks import GateError
-from postflight.report import words
+from postflight.report import pictures, words
 from postflight.report.series import with_holes
 from postflight.report.source import read_run
 from postflight.report.thinning import extreme_rows, kept_rows, rounded
@@ -247,3 +247,14 @@ def test_holes_break_the_line_and_two_rates_do_not() -> None:
     assert np.count_nonzero(np.isnan(values)) == 1
     assert 3.98 < times[np.isnan(values)][0] < 6.0
     assert rounded(values, 1).count(None) == 1
+
+
+@pytest.mark.parametrize(("noise", "coarse"), [(0.0, False), (60.0, True)])
+def test_noisy_film_does_not_swell_the_report(noise: float, coarse: bool) -> None:
+    rng = np.random.default_rng(1)
+    ramp = np.broadcast_to(np.linspace(60.0, 190.0, 1280)[None, :, None], (720, 1280, 3))
+    film = [np.clip(ramp + noise * rng.standard_normal(ramp.shape), 0, 255).astype(np.uint8) for _ in range(14)]
+    told = pictures.jpegs(film)
+    assert sum(map(len, told)) <= pictures.LARGEST_CHARACTERS
+    finest = [pictures.jpeg(pictures.narrowed(picture), pictures.QUALITIES[0]) for picture in film]
+    assert (told != finest) == coarse
