@@ -152,7 +152,8 @@ function makeChart(panel, told, series, bands, options) {
     const inside = clock.now >= clock.from && clock.now <= clock.to;
     cursor.hidden = !inside;
     cursor.dataset.time = clock.now.toFixed(3);
-    if (inside) cursor.style.transform = `translateX(${u.valToPos(clock.now, "x").toFixed(1)}px)`;
+    // a share, not pixels: right at any width, also on paper
+    if (inside) cursor.style.left = `${(100 * (clock.now - clock.from) / (clock.to - clock.from)).toFixed(3)}%`;
   }
   charts.push(chart);
   return chart;
@@ -232,7 +233,6 @@ function startCharts() {
   const fit = () => charts.forEach((chart) => {
     const width = chart.host.clientWidth, height = chart.u.height;
     if (width && width !== chart.u.width) chart.u.setSize({ width, height });
-    requestAnimationFrame(chart.place);
   });
   window.addEventListener("resize", fit);
   return fit;

@@ -14,7 +14,6 @@ window.addEventListener("beforeprint", () => {
     opened.push(part);
   }
   for (const { u, host } of charts) u.setSize({ width: host.closest(".pair") ? SHEET / 2 - 16 : SHEET, height: u.height });
-  requestAnimationFrame(() => charts.forEach((chart) => chart.place()));
 });
 window.addEventListener("afterprint", () => {
   for (const part of opened.splice(0)) part.open = false;

@@ -185,6 +185,17 @@ def test_prints_with_everything_open(opened) -> None:
     assert page.locator("details[open]").count() == 0
 
 
+def test_cursor_stays_at_its_time_on_paper(opened) -> None:
+    page = opened(800).page
+    page.evaluate("clock.set(436.5); window.dispatchEvent(new Event('beforeprint'))")
+    page.wait_for_timeout(100)
+    widths = page.evaluate("charts.map((c) => c.u.width)")
+    assert page.evaluate(CURSORS) == pytest.approx([436.5] * len(widths), abs=0.15)
+    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    page.wait_for_timeout(100)
+    assert page.evaluate("charts.map((c) => c.u.width)") != widths
+
+
 def test_shell_is_bent_as_the_library_bends_it(opened) -> None:
     page = opened().page
     theta, plane, station = np.deg2rad(7.0), np.deg2rad(215.0), 0.2
