@@ -189,9 +189,11 @@ def run_flight(
                 table = sensitivity(flight, step(share, 1.0))
                 out.write_csv("sensitivity.csv", table)
                 drawing.draw_sensitivity(flight, table, out.path / "figures")
+            step(1.0, 1.0)(0.0, "writing the report")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
             (out.path / "log.jsonl").write_text(lines)
-        write_report(folder, out.path, telemetry)
+            out.write_facts()
+            write_report(folder, out.path, telemetry)
     return flight, answers, out.path
 
 

@@ -37,8 +37,8 @@ class RunFolder:
     """A run folder under construction: use as a context; it is renamed into place when the block ends well."""
 
     def __init__(self, flight_folder: Path, telemetry: Telemetry, settings: dict[str, Any]) -> None:
-        facts = json.dumps([telemetry.hashes, settings, version("postflight")], sort_keys=True)
-        self.hash8 = hashlib.sha256(facts.encode()).hexdigest()[:8]
+        self.hash8 = run_hash(telemetry.hashes, settings, version("postflight"))
+        self.finished: datetime | None = None
         self.settings = settings
         self.telemetry = telemetry
         self.parent = flight_folder / "runs"
@@ -64,7 +64,8 @@ class RunFolder:
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 
-    def _finish(self) -> None:
+    def write_facts(self) -> datetime:
+        """Write ``run.json`` and return the run's time: when everything is there, or earlier for who reads it."""
         now = datetime.now(UTC)
         facts = {
             "finished_utc": now.isoformat(timespec="seconds"),
@@ -75,6 +76,11 @@ class RunFolder:
             "inputs_sha256": self.telemetry.hashes,
         }
         self.write_json("run.json", facts)
+        self.finished = now
+        return now
+
+    def _finish(self) -> None:
+        now = self.finished or self.write_facts()
         final = self.parent / f"{now.strftime('%Y%m%dT%H%M%SZ')}-{self.hash8}"
         if final.exists():
             shutil.rmtree(final)
@@ -90,6 +96,12 @@ class RunFolder:
         """Write one JSON object; NaN becomes null."""
         text = json.dumps(_no_nan(value), indent=2, allow_nan=False)
         (self.path / name).write_text(text + "\n")
+
+
+def run_hash(inputs_sha256: dict[str, str], settings: dict[str, Any], made_by: str) -> str:
+    """Eight digits that equal runs share: of inputs, settings and version."""
+    facts = json.dumps([inputs_sha256, settings, made_by], sort_keys=True)
+    return hashlib.sha256(facts.encode()).hexdigest()[:8]
 
 
 def remove_abandoned(parent: Path) -> None:

@@ -12,7 +12,7 @@ import pandas as pd
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Telemetry
-from postflight.results import newest_run
+from postflight.results import newest_run, run_hash
 
 NEEDED = ("bet", "events", "peaks", "residuals", "verdicts", "findings")
 
@@ -43,7 +43,7 @@ class Run:
     @property
     def hash8(self) -> str:
         """What stands for inputs, settings and version in the folder's name."""
-        return self.path.name.rpartition("-")[2]
+        return run_hash(self.facts["inputs_sha256"], self.facts["settings"], self.facts["version"])
 
     def peak(self, name: str) -> pd.Series | None:
         """Row of ``peaks.csv``; None where the flight has none of that name."""

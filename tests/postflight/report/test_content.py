@@ -56,6 +56,11 @@ def test_same_run_gives_the_same_bytes(reported: Path, report: Path, tmp_path: P
     assert [p.name for p in tmp_path.iterdir()] == ["again.html"]
 
 
+def test_page_names_the_run_by_the_digits_of_its_folder(run, text: str) -> None:
+    assert run.path.name.endswith(f"-{run.hash8}")
+    assert f"Run {run.hash8} of postflight" in text
+
+
 def test_nothing_of_the_clock_or_the_machine(run, text: str) -> None:
     assert run.facts["finished_utc"] not in text
     assert run.path.name[:16] not in text
