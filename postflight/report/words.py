@@ -17,6 +17,7 @@ from postflight.pipeline import METHODS
 from postflight.report.series import COLOUR
 from postflight.report.shape import best_method, hole_s
 from postflight.report.source import Run
+from postflight.sensitivity import largest_of_groups
 
 SIDES_95 = 1.96
 HOW = {
@@ -178,6 +179,22 @@ def table_rows(table: pd.DataFrame) -> dict[str, Any]:
     shown = table.head(SHOWN_ROWS)
     cells = [[cell(x) for x in row] for row in shown.itertuples(index=False)]
     return {"names": [str(n).replace("_", " ") for n in table.columns], "rows": cells, "more": len(table) - len(shown)}
+
+
+def sensitivity_rows(table: pd.DataFrame) -> dict[str, Any]:
+    """Largest change of each group of quantities, rerun by rerun, in reported standard deviations; reasons below."""
+    largest = largest_of_groups(table)
+    shown = largest.pivot(index="rerun", columns="group", values="change_over_sd")
+    groups = list(dict.fromkeys(largest["group"]))
+    rows = []
+    for rerun in dict.fromkeys(table["rerun"]):
+        if rerun in shown.index:
+            values = shown.loc[rerun, groups]
+            rows.append([rerun, *("" if np.isnan(x) else "–" if x == 0.0 else f"{x:+.2f}" for x in values)])
+        else:
+            reasons = table.loc[table["rerun"] == rerun, "reason"].dropna()
+            rows.append([rerun, f"no rerun: {'; '.join(map(str, reasons))}", *[""] * (len(groups) - 1)])
+    return {"names": ["rerun", *(groups or ["reason"])], "rows": rows, "more": 0}
 
 
 def cell(value: Any) -> str:

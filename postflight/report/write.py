@@ -89,7 +89,6 @@ def page(run: Run) -> str:
 def told(run: Run) -> dict[str, Any]:
     """Everything on the page that is words or tables."""
     more = {
-        "sensitivity": "Sensitivity: change at peak dynamic pressure without a source or with another assumption",
         "camera_sensitivity": "Deflection by video under assumed joints and planes, beside Table 2.1 of AIAA 2011-2571",
         "fusion_inputs": "What the methods together say of each input they lean on",
         "fusion_agreement": "Test of every pair of methods",
@@ -98,7 +97,7 @@ def told(run: Run) -> dict[str, Any]:
         "sensor_errors": "Estimated errors of the sensors",
         "peaks": "Largest values",
     }
-    verdicts = run.tables["verdicts"]
+    verdicts, again = run.tables["verdicts"], run.tables.get("sensitivity")
     return {
         "title": words.title(run),
         "lead": words.lead(run),
@@ -107,6 +106,7 @@ def told(run: Run) -> dict[str, Any]:
         "findings": words.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
         "verdicts": words.table_rows(verdicts.assign(passed=verdicts["passed"].map({True: "✓ pass", False: "✕ fail"}))),
         "extra": [(words_, words.table_rows(run.tables[name])) for name, words_ in more.items() if name in run.tables],
+        "sensitivity": words.sensitivity_rows(again) if again is not None else None,
         "vehicle": [(k, words.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
         "settings": [(k, words.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
         "date": parse_utc(run.telemetry.t0_utc).strftime("%-d %B %Y"),

@@ -193,6 +193,25 @@ def test_failed_verdicts_and_findings_are_told(run) -> None:
     assert "100 more rows stand in the run's folder" in text
 
 
+def test_sensitivity_is_told_by_groups() -> None:
+    columns = ["rerun", "quantity", "change_over_sd", "change_over_expected_sd", "reason"]
+    table = pd.DataFrame(
+        [
+            ("without north", "position north", -0.5, -1.0, ""),
+            ("without north", "position east", 1.25, 1.0, ""),
+            ("without north", "Mach number", 0.0, 0.0, ""),
+            ("winds off", None, np.nan, np.nan, "it diverged"),
+        ],
+        columns=columns,
+    )
+    told = words.sensitivity_rows(table)
+    assert told["names"] == ["rerun", "position", "Mach number"]
+    assert told["rows"] == [["without north", "+1.25", "–"], ["winds off", "no rerun: it diverged", ""]]
+    assert words.sensitivity_rows(table[3:]) == {
+        "names": ["rerun", "reason"], "rows": [["winds off", "no rerun: it diverged"]], "more": 0,
+    }  # fmt: skip
+
+
 # ---------------------------------------------------------------------------------------------------------- refusals
 
 
