@@ -127,6 +127,16 @@ def run(folder: Path, rate: float) -> None:
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
+@click.option("--hardening", is_flag=True, help="Let the spring harden (or soften) with the angle.")
+def reconcile(folder: Path, hardening: bool) -> None:
+    """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
+    from postflight.reconciliation import command
+
+    command.run(folder, ("hardening",) if hardening else ())
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def score(folder: Path, as_json: bool) -> None:
     """Compare the newest run of a synthetic flight with its truth; exit 5 where recovery fails."""

@@ -1,0 +1,1 @@
+"""Which joint makes the simulator fly like the flight?"""

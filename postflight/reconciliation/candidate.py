@@ -1,0 +1,157 @@
+"""A vehicle and its air as they might have been.
+
+Physical unknowns are the joint's (stiffness, damping, where asked for freeplay and hardening), the side and size of the
+c.g.'s offset and the static stability. All else that the motion depends on and that is known only so well is carried
+along, so that the answer's uncertainty holds it: masses, stations, inertias, the other coefficients, the instruments'
+constant errors, and the air. Unknowns of vehicle and instruments are counted in standard deviations of what was known
+before; those of the air are the density's log ratio and the winds' difference, m/s, to the sounding, at knots along
+altitude.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from flightmodel.atmosphere import profile_from_sounding
+from flightmodel.checks import FloatArray
+from flightmodel.telemetry import Sounding
+from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
+from recon.air import CONSTANT_PART
+from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
+from synthetic_flight import packing
+
+# at 1200 m/s a quarter of a second: what is faster than that moves a joint of 3 Hz little; coarser where air is thin
+KNOT_M, MIDDLE_KNOT_M, UPPER_KNOT_M = 300.0, 600.0, 1200.0
+MIDDLE_M, UPPER_M, TOP_M, BELOW_M = 60e3, 75e3, 105e3, 1e3
+# priors before the flight speaks, one standard deviation: factors as logarithms
+STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 0.5, 1.0, 0.005
+FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
+# hardening is counted as the share by which the tangent stiffness has grown at this angle
+HARDENING_AT_RAD = np.deg2rad(4.0)
+JOINT = ("stiffness", "damping", "offset y", "offset z", "static stability")
+CARRIED = (
+    "C_A", "C_N", "C_mq", "mass of the shell", "mass of the centerbody", "station of the shell's c.g.",
+    "station of the centerbody's c.g.", "shell's c.g. y", "shell's c.g. z", "inertia of the shell",
+    "inertia of the centerbody",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class VehicleUnknowns:
+    """From unknowns, in standard deviations, to vehicles; ``extra`` names what the joint may have beside a spring."""
+
+    told: Vehicle
+    extra: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns, the joint's first."""
+        return (*JOINT, *self.extra, *CARRIED)
+
+    @property
+    def physical(self) -> int:
+        """How many of them are sought rather than carried along."""
+        return len(JOINT) + len(self.extra)
+
+    def vehicle(self, x: FloatArray) -> Vehicle:
+        """Vehicle of one candidate, with its coefficients as they are told (`factors` scales them)."""
+        told, known, v = self.told, self.told.uncertainty, dict(zip(self.names, x.tolist(), strict=True))
+        joint, shell, body = told.joint, told.aeroshell, told.centerbody
+        stiffer = STIFFNESS_LOG_SD * v["stiffness"]
+        stiffness = joint.bending_stiffness_nmprad * np.exp(stiffer)
+        # the damping ratio is what is unknown: at a given ratio the constant grows with the root of the stiffness
+        damping = joint.bending_damping_nmsprad * np.exp(DAMPING_LOG_SD * v["damping"] + 0.5 * stiffer)
+        changed = {"bending_stiffness_nmprad": stiffness, "bending_damping_nmsprad": damping}
+        if "freeplay" in v:
+            changed["freeplay_deg"] = float(np.rad2deg(FREEPLAY_SD_RAD) * abs(v["freeplay"]))
+        if "hardening" in v:
+            changed["hardening_nmprad3"] = stiffness * HARDENING_SD * abs(v["hardening"]) / (3.0 * HARDENING_AT_RAD**2)
+        # the whole vehicle's offset; the centerbody carries it
+        lateral = known.cg_lateral_m * np.array([v["shell's c.g. y"], v["shell's c.g. z"]])
+        offset = OFFSET_SD_M * np.array([v["offset y"], v["offset z"]]) * told.mass_kg - lateral * shell.mass_kg
+        return replace(
+            told,
+            joint=joint.model_copy(update=changed),
+            aeroshell=_moved(shell, known, v["mass of the shell"], v["station of the shell's c.g."], lateral,
+                             v["inertia of the shell"]),
+            centerbody=_moved(body, known, v["mass of the centerbody"], v["station of the centerbody's c.g."],
+                              offset / body.mass_kg, v["inertia of the centerbody"]),
+        )  # fmt: skip
+
+    def factors(self, x: FloatArray) -> tuple[float, float, float, float]:
+        """Factors on C_A, C_N, C_m and shift of C_mq."""
+        known, v = self.told.uncertainty, dict(zip(self.names, x.tolist(), strict=True))
+        return (
+            1.0 + known.ca * v["C_A"], 1.0 + known.cn * v["C_N"], 1.0 + known.cm * v["static stability"],
+            known.cmq * v["C_mq"],
+        )  # fmt: skip
+
+
+def _moved(
+    part: MassProperties, known: Uncertainty, mass: float, station: float, lateral_m: FloatArray, inertia: float
+) -> MassProperties:
+    """Return a body with mass, c.g. and inertia off by so many standard deviations, and a lateral shift, m."""
+    x, y, z = part.cg_from_datum_body_m
+    moved = {
+        "mass_kg": part.mass_kg * (1.0 + known.mass * mass),
+        "cg_from_datum_body_m": (x + known.cg_station_m * station, y + float(lateral_m[0]), z + float(lateral_m[1])),
+        "inertia_kgm2": tuple(map(tuple, (part.inertia * (1.0 + known.inertia * inertia)).tolist())),
+    }
+    return part.model_copy(update=moved)
+
+
+@dataclass(frozen=True)
+class AirUnknowns:
+    """From differences to the sounding at knots, ``(3, k)``: log density, north and east wind, to kernel tables."""
+
+    sounding: Sounding
+    lowest_m: float
+
+    @cached_property
+    def knots_m(self) -> FloatArray:
+        """Altitudes (k,) at which the air may differ from the sounding."""
+        lower = np.arange(MIDDLE_M, min(self.lowest_m, MIDDLE_M) - BELOW_M, -KNOT_M)[:0:-1]
+        middle, upper = np.arange(MIDDLE_M, UPPER_M, MIDDLE_KNOT_M), np.arange(UPPER_M, TOP_M, UPPER_KNOT_M)
+        return np.concatenate([lower, middle, upper])
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """Inverse covariance (3, k, k) of the sounding's errors: half constant, half forgetting along altitude."""
+        at = profile_from_sounding(self.sounding).at(self.knots_m)
+        apart = np.abs(self.knots_m[:, None] - self.knots_m)
+        out = []
+        for sd, length in ((at.density_sd, DENSITY_LENGTH_M), *[(at.wind_sd_mps, WIND_LENGTH_M)] * 2):
+            correlation = CONSTANT_PART + (1.0 - CONSTANT_PART) * np.exp(-apart / length)
+            out.append(np.linalg.inv(sd[:, None] * correlation * sd))
+        return np.array(out)
+
+    def between_knots(self, altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Log density and wind, m/s, one sd, of structure that a straight line between knots leaves out."""
+        apart = np.diff(self.knots_m, append=2 * self.knots_m[-1] - self.knots_m[-2])
+        at = profile_from_sounding(self.sounding).at(self.knots_m)
+
+        def left(sd: FloatArray, length_m: float) -> FloatArray:
+            bridged = sd * np.sqrt((1.0 - CONSTANT_PART) * apart / (3.0 * length_m))
+            return np.asarray(np.interp(altitude_m, self.knots_m, bridged))
+
+        return left(at.density_sd, DENSITY_LENGTH_M), left(at.wind_sd_mps, WIND_LENGTH_M)
+
+    @cached_property
+    def _sounded(self) -> tuple[FloatArray, FloatArray]:
+        table = packing.atmosphere_table(profile_from_sounding(self.sounding))
+        rows = packing.ATMOSPHERE_START_M + packing.ATMOSPHERE_STEP_M * np.arange(len(table), dtype=np.float64)
+        return table, np.asarray(rows)
+
+    def table(self, difference: FloatArray) -> FloatArray:
+        """Kernel table of the air."""
+        table, rows = self._sounded
+        table = table.copy()
+        ratio, north, east = (np.interp(rows, self.knots_m, part) for part in difference)
+        table[:, 0] *= np.exp(ratio)
+        table[:-1, 1] += np.diff(ratio)
+        table[:, 3] += north
+        table[:, 4] += east
+        return table

@@ -1,0 +1,70 @@
+"""What ``postflight reconcile`` does: fit the joint to a flight, write tables and a figure, print the story."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.markup import escape
+from rich.table import Table
+
+from flightmodel.flightfolder import read_flight
+from postflight import results
+from postflight.commands import compile_kernels, console, progress_bar
+from postflight.figures import save
+from postflight.pipeline import PULSE_RATE_HZ, estimate, reconstruct_telemetry
+from postflight.reconciliation.answer import correlations, deflection_of, joint_table, vehicle_lines
+from postflight.reconciliation.figures import figure_reconciled
+from postflight.reconciliation.fit import Reconciled, reconcile
+from postflight.warmup import RECONSTRUCTION
+from recon.bet import Settings
+
+
+def run(folder: Path, extra: tuple[str, ...]) -> None:
+    """Reconstruct, reconcile, write a run folder and print what was found."""
+    settings = {"reconcile": list(extra), "output_rate_hz": 20.0}
+    with progress_bar() as report:
+        report(0.0, "reading telemetry")
+        telemetry = read_flight(folder)
+        compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
+        flight = reconstruct_telemetry(
+            telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.2 * f, what)
+        )
+        answers = estimate(flight, telemetry, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
+        found = reconcile(flight, extra, lambda f, what: report(0.3 + 0.65 * f, what))
+        with results.RunFolder(folder, telemetry, settings) as out:
+            table = joint_table(found)
+            out.write_csv("joint.csv", table)
+            out.write_csv("joint_correlations.csv", correlations(found))
+            out.write_csv("deflection_reconciled.csv", results.deflection_table(deflection_of(found)))
+            out.write_json("reconciliation.json", summary(found, table))
+            (out.path / "joint.toml").write_text(vehicle_lines(found))
+            fused = answers.histories.get("fused")
+            save(figure_reconciled(found, telemetry, fused), out.path / "figures" / "reconciled.png")
+    print_joint(found, table)
+    console.print(f"results in {escape(str(out.path))}")
+
+
+def summary(found: Reconciled, table: pd.DataFrame) -> dict[str, object]:
+    """Return the short story, for ``reconciliation.json``."""
+    return {
+        "converged": found.converged,
+        "steps": found.steps,
+        "sensor_residual_rms_sd": float(np.sqrt(np.mean(found.residuals.sensors**2))),
+        "join_rms_sd": float(np.sqrt(np.mean(found.residuals.joins**2))),
+        "joint": table.to_dict(orient="records"),
+    }
+
+
+def print_joint(found: Reconciled, table: pd.DataFrame) -> None:
+    """Table of the joint, and a word where the fit did not settle or does not fit."""
+    printed = Table(title="The joint that explains the flight")
+    for name in ("quantity", "told", "found", "1 sd", "90 % interval"):
+        printed.add_column(name, justify="left" if name == "quantity" else "right")
+    for r in table.itertuples(index=False):
+        name = f"{r.quantity} ({r.unit})" if r.unit else str(r.quantity)
+        printed.add_row(name, f"{r.told:.4g}", f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}")
+    console.print(printed)
+    if not found.converged:
+        console.print("[yellow]the fit had not settled after its last step: take the intervals as too narrow[/]")

@@ -1,0 +1,90 @@
+"""Figures of a reconciliation: the flight, and what the simulator with the joint found makes of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from flightmodel.checks import FloatArray
+from flightmodel.deflection import DeflectionHistory
+from flightmodel.telemetry import Telemetry
+from postflight.figures import COLOUR, stamp
+from postflight.reconciliation.answer import deflection_of, stiffness_and_offset
+from postflight.reconciliation.fit import Reconciled
+
+FOUND, MEASURED = "#0072B2", "#000000"
+
+
+def figure_reconciled(found: Reconciled, telemetry: Telemetry, fused: DeflectionHistory | None) -> Figure:
+    """Rate and lateral force, measured and flown by the joint found; deflection; stiffness against offset."""
+    figure = Figure(figsize=(10.0, 9.0), layout="constrained")
+    axes = figure.subplots(3, 2)
+    seen, read = found.problem.observed, found.problem.predicted(found.unknowns)
+    flown = read.windows + found.problem.instrument_rows(read.slope) @ found.unknowns.instruments
+    t = seen.time_s.ravel()
+    rate, force = np.rad2deg(flown[..., 1].ravel()), flown[..., 4].ravel() / 9.80665
+    _pair(axes[0, 0], t, np.rad2deg(seen.rate_radps[..., 1].ravel()), rate, "body rate y (deg/s)")
+    _pair(axes[0, 1], t, seen.specific_force_mps2[..., 1].ravel() / 9.80665, force, "specific force y (g)")
+    left = found.residuals.sensors
+    _residuals(axes[1, 0], t, left[..., :3], "rates: residual / sd")
+    _residuals(axes[1, 1], t, left[..., 3:], "specific force: residual / sd")
+    _deflection(axes[2, 0], deflection_of(found), fused)
+    _ridge(axes[2, 1], found)
+    for ax in axes.ravel():
+        ax.grid(alpha=0.3)
+        ax.spines[["top", "right"]].set_visible(False)
+    for ax in axes.ravel()[:5]:
+        ax.set_xlabel("time after launch (s)")
+    figure.suptitle("Joint reconciled with the flight", fontsize=12)
+    stamp(figure, telemetry)
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.set(rect=(0.0, 0.02, 1.0, 0.98))  # type: ignore[call-arg]
+    return figure
+
+
+def _pair(ax: Axes, t: FloatArray, measured: FloatArray, flown: FloatArray, label: str) -> None:
+    ax.plot(t, measured, color=MEASURED, lw=1.2, label="measured")
+    ax.plot(t, flown, color=FOUND, lw=1.0, ls="--", label="flown with the joint found")
+    ax.set_ylabel(label)
+    ax.legend(frameon=False, fontsize=8, loc="upper left")
+
+
+def _residuals(ax: Axes, t: FloatArray, residual: FloatArray, label: str) -> None:
+    for axis, (name, colour) in enumerate(zip("xyz", ("#0072B2", "#D55E00", "#009E73"), strict=True)):
+        ax.plot(t, residual[..., axis].ravel(), color=colour, lw=0, marker=".", ms=1.5, label=name)
+    for gate in (-3.0, 3.0):
+        ax.axhline(gate, color="0.5", lw=0.8, ls=":")
+    ax.set_ylim(-5.0, 5.0)
+    ax.set_ylabel(label)
+    ax.legend(frameon=False, fontsize=8, loc="upper left", ncols=3, markerscale=4)
+
+
+def _deflection(ax: Axes, history: DeflectionHistory, fused: DeflectionHistory | None) -> None:
+    if fused is not None:
+        ax.plot(
+            fused.time_s, np.rad2deg(fused.theta_rad), color=COLOUR["fused"], lw=2.5, alpha=0.6, label="fused methods"
+        )
+    theta, sd = np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)
+    ax.plot(history.time_s, theta, color=FOUND, lw=1.2, label="with the joint found")
+    ax.fill_between(history.time_s, theta - sd, theta + sd, color=FOUND, alpha=0.25, lw=0, label="1 sd")
+    ax.set_ylabel("deflection (deg)")
+    ax.set_ylim(bottom=0.0)
+    ax.legend(frameon=False, fontsize=8, loc="upper left")
+
+
+def _ridge(ax: Axes, found: Reconciled) -> None:
+    """Ellipses of 1 and 2 sd of stiffness and size of the offset."""
+    mean, covariance = stiffness_and_offset(found)
+    root = np.linalg.cholesky(covariance)
+    turn = np.linspace(0.0, 2.0 * np.pi, 200)
+    for size, style in ((1.0, "-"), (2.0, "--")):
+        x, y = mean[:, None] + size * root @ np.stack([np.cos(turn), np.sin(turn)])
+        ax.plot(x, y, color=FOUND, ls=style, lw=1.2, label=f"{size:g} sd")
+    ax.plot(*mean, color=FOUND, marker="+", ms=10, lw=0)
+    ax.set_xlabel("bending stiffness (N m/rad)")
+    ax.set_ylabel("c.g. offset (cm)")
+    share = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
+    ax.set_title(f"correlation {share:+.2f}", fontsize=9)
+    ax.legend(frameon=False, fontsize=8)

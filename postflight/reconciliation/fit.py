@@ -1,0 +1,140 @@
+"""Which joint, offset and stability explain the flight best, and how well does the flight tell them?
+
+Gauss-Newton's steps on `Problem`, first with all standard deviations many times wider, so that far starts find the
+valley. The valley is long and bent (stiffness, inertias and stability nearly scale together), so every step gets the
+second-order correction of geodesic acceleration. The covariance is that of the linear problem at the answer.
+
+References
+----------
+M. K. Transtrum, J. P. Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
+minimization", 2012 (geodesic acceleration).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flightmodel.checks import DivergenceError, FloatArray
+from flightmodel.vehicle import Vehicle
+from postflight.pipeline import Flight
+from postflight.reconciliation.candidate import AirUnknowns, VehicleUnknowns
+from postflight.reconciliation.observed import observe
+from postflight.reconciliation.problem import Problem, Residuals, Unknowns
+
+WIDER = (30.0, 10.0, 3.0)
+MOST_STEPS, SETTLED_SD, SETTLED_COST = 10, 0.1, 0.3
+PARTS = (1.0, 0.5, 0.25)  # of a step
+LOOK_AHEAD = 0.1  # of a step, over which its curvature is taken
+FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e3
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Reconciled:
+    """The joint that explains the flight.
+
+    Parameters
+    ----------
+    problem : Problem
+    unknowns : Unknowns
+        Most probable of all.
+    covariance : (n, n) float
+        Of all unknowns, in their order.
+    residuals : Residuals
+    steps : int
+    converged : bool
+    """
+
+    problem: Problem
+    unknowns: Unknowns
+    covariance: FloatArray
+    residuals: Residuals
+    steps: int
+    converged: bool
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """Vehicle with the joint, the offset and the coefficients found."""
+        found = self.problem.unknown.vehicle(self.unknowns.vehicle)
+        ca, cn, cm, cmq = self.problem.unknown.factors(self.unknowns.vehicle)
+        return replace(found, aero=found.aero.scaled(ca, cn, cm, cmq))
+
+
+def reconcile(flight: Flight, extra: tuple[str, ...] = (), progress: Progress | None = None) -> Reconciled:
+    """Fit joint, offset and static stability to a reconstructed flight.
+
+    Parameters
+    ----------
+    flight : Flight
+    extra : tuple of str
+        What the joint may have beside a linear spring: ``"hardening"``, ``"freeplay"``.
+    progress : callable, optional
+
+    Raises
+    ------
+    GateError
+        Where sensors or vehicle are missing, or there is no pressure pulse.
+    DivergenceError
+        Where no candidate flies through.
+    """
+    observed = observe(flight)
+    air = AirUnknowns(flight.telemetry.sounding, float(observed.altitude_m.min()))
+    problem = Problem(observed, VehicleUnknowns(flight.telemetry.required_vehicle(), extra), air)
+    return solve(problem, problem.start(), WIDER, progress)
+
+
+def solve(
+    problem: Problem, start: Unknowns, wider: tuple[float, ...] = (), progress: Progress | None = None
+) -> Reconciled:
+    """Most probable unknowns from a start; standard deviations ``wider`` in the first steps."""
+    report = progress or (lambda _fraction, _what: None)
+    u, before, converged, step = start, np.inf, False, 0
+    while True:
+        report(step / MOST_STEPS, f"reconciling, step {step + 1}")
+        at = replace(problem, wider=wider[step]) if step < len(wider) else problem
+        u, moved_sd, residuals, covariance = _step(at, u)
+        if step >= len(wider):
+            converged = moved_sd < SETTLED_SD or before - residuals.cost < SETTLED_COST
+            before = residuals.cost
+        if converged or step + 1 >= MOST_STEPS:
+            break
+        step += 1
+    report(1.0, "reconciled")
+    return Reconciled(problem, u, covariance, residuals, step + 1, converged)
+
+
+def _step(problem: Problem, u: Unknowns) -> tuple[Unknowns, float, Residuals, FloatArray]:
+    """One damped, corrected step: where to, how far in sd of what is sought, residuals there, covariance."""
+    linear = problem.linear(u)
+    if not np.isfinite(linear.found.cost):
+        raise DivergenceError(
+            "reconciliation: a span of the flight cannot be flown with the vehicle as told: its joint diverges; give "
+            "a stiffer joint in the vehicle file to start from"
+        )
+    matrix, right = problem.normal(u, linear)
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    scaled = matrix * scale[:, None] * scale
+    covariance = np.linalg.inv(scaled) * scale[:, None] * scale
+    sought = np.sqrt(np.diag(covariance)[: problem.unknown.physical])
+    damping = 0.0
+    while damping < MOST_DAMPING:
+        damped = np.linalg.inv(scaled + damping * np.eye(len(right))) * scale[:, None] * scale
+        step = damped @ right
+        ahead, behind = (problem.residuals(u.moved(side * LOOK_AHEAD * step)) for side in (1.0, -1.0))
+        bent = damped @ linear.back(
+            (ahead.sensors - 2.0 * linear.found.sensors + behind.sensors) / LOOK_AHEAD**2,
+            (ahead.joins - 2.0 * linear.found.joins + behind.joins) / LOOK_AHEAD**2,
+        )
+        # a bent path, of which the straight part alone may go too far
+        paths = [part * step + 0.5 * part**2 * bent for part in PARTS if np.isfinite(bent).all()] or [step]
+        found, moved = min(
+            ((problem.residuals(end), end) for end in map(u.moved, paths)), key=lambda pair: pair[0].cost
+        )
+        if found.cost < linear.found.cost:
+            far = np.abs(moved.vehicle - u.vehicle)[: problem.unknown.physical] / sought
+            return moved, float(far.max()), found, covariance
+        damping = max(10.0 * damping, FIRST_DAMPING)
+    return u, 0.0, linear.found, covariance

@@ -1,0 +1,279 @@
+"""Residuals of a candidate flight in spans, how they fall with every unknown, and a step towards the best one.
+
+The flight is cut into spans of about a joint's period, each flown by the simulator from a motion of its own
+(multiple shooting: one flight of fifty seconds depends on its start so strongly that a fit of it stops in any of many
+false minima). Sought is the most probable of all unknowns together::
+
+    | (sensors - simulated) / sd |^2 + | (end of a span - start of the next) / sd |^2 + | unknowns' priors |^2
+
+Ends and starts differ by what the air's structure between its knots does to the motion.
+
+References
+----------
+H. G. Bock, "Recent advances in parameter identification techniques for O.D.E.", 1983 (multiple shooting).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from flightmodel.checks import FloatArray
+from postflight.reconciliation.candidate import AirUnknowns, VehicleUnknowns
+from postflight.reconciliation.observed import Observed
+from postflight.reconciliation.spans import (
+    ATTITUDE,
+    MOTION,
+    RATE,
+    Candidate,
+    Flights,
+    Index,
+    Read,
+    fly_spans,
+)
+from synthetic_flight import packing
+
+INSTRUMENTS = 20
+# per angle of flow, rad, that the air's structure between its knots makes, at the largest dynamic pressure within a
+# span: rotation rad, rate rad/s, bending rad, its rate rad/s; and what to divide by where there is no air
+GUST = np.array([0.3, 0.3, 0.3, 3.0, 3.0, 3.0, 0.0, 0.3, 0.3, 0.0, 9.0, 9.0])
+STILL_SD = np.deg2rad([0.001, 0.001, 0.001, 0.003, 0.003, 0.003, 1e-4, 0.001, 0.001, 0.03, 0.01, 0.01])
+LARGE_ANGLE_RAD = np.deg2rad(5.0)  # at which structure of the density turns the vehicle
+GUST_RATE, GUST_FORCE_MPS2 = 0.3, 30.0  # of the windows' rates and lateral force, likewise
+FIRST_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0])  # bending and its rate above the air
+MOTION_STEP = np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3))
+VEHICLE_STEP, AIR_STEP = 1e-5, np.array([1e-6, 2e-4, 2e-4])
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """One candidate: vehicle (v,), instruments (20,), air (3, k), motion at the start of each span (s, 12)."""
+
+    vehicle: FloatArray
+    instruments: FloatArray
+    air: FloatArray
+    motion: FloatArray
+
+    def moved(self, step: FloatArray) -> Unknowns:
+        """Candidate moved by a step of all unknowns in this order."""
+        parts = (self.vehicle, self.instruments, self.air, self.motion)
+        ends = np.cumsum([part.size for part in parts])[:-1]
+        return Unknowns(*(p + d.reshape(p.shape) for p, d in zip(parts, np.split(step, ends), strict=True)))
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """In standard deviations: sensors (s, WINDOWS, 6), joins (s - 1, 12); sum of squares with the priors'."""
+
+    sensors: FloatArray
+    joins: FloatArray
+    cost: float
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Residuals at a candidate, and how they fall with the unknowns: columns and responses, span by span."""
+
+    found: Residuals
+    sensors: list[tuple[Index, FloatArray]]
+    joins: list[tuple[Index, FloatArray]]
+    count: int
+
+    def back(self, sensors: FloatArray, joins: FloatArray) -> FloatArray:
+        """Transpose of the derivatives times numbers laid out as the residuals."""
+        out = np.zeros(self.count)
+        for parts, values in ((self.sensors, sensors), (self.joins, joins)):
+            for (column, response), value in zip(parts, values, strict=True):
+                out[column] += response.T @ value.ravel()
+        return out
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Flight, unknowns, and by how much all standard deviations are widened."""
+
+    observed: Observed
+    unknown: VehicleUnknowns
+    air: AirUnknowns
+    wider: float = 1.0
+
+    @property
+    def first_instrument(self) -> int:
+        """Where the instruments' unknowns begin; after them the air's."""
+        return len(self.unknown.names)
+
+    @property
+    def first_motion(self) -> int:
+        """Where the spans' unknowns begin."""
+        return self.first_instrument + INSTRUMENTS + 3 * len(self.air.knots_m)
+
+    @property
+    def count(self) -> int:
+        """Unknowns altogether."""
+        return self.first_motion + MOTION * self.observed.spans
+
+    @cached_property
+    def unsteady(self) -> FloatArray:
+        """Flow's angle (s,) that the air's structure between its knots makes, rad, times the share of the load."""
+        seen = self.observed
+        density, wind = self.air.between_knots(seen.altitude_m)
+        speed = np.linalg.norm(seen.start.velocity_ecef_mps[:-1], axis=1)
+        load = seen.dynamic_pressure_pa / seen.dynamic_pressure_pa.max()
+        return np.asarray(load * np.hypot(wind / speed, density * LARGE_ANGLE_RAD))
+
+    @cached_property
+    def data(self) -> FloatArray:
+        """Windows (s, WINDOWS, 6) as measured; zero where sensors are missing."""
+        return np.nan_to_num(np.concatenate([self.observed.rate_radps, self.observed.specific_force_mps2], axis=2))
+
+    @cached_property
+    def weight(self) -> FloatArray:
+        """Inverse standard deviations of the windows (s, WINDOWS, 6), zero where sensors are missing."""
+        seen = self.observed
+        size = np.abs(seen.specific_force_mps2)
+        density, _ = self.air.between_knots(seen.altitude_m)
+        gust = self.unsteady[:, None, None]
+        rate_sd = np.hypot(seen.rate_sd_radps, GUST_RATE * gust) * np.ones_like(size)
+        left_out = np.hypot(density[:, None, None] * size, GUST_FORCE_MPS2 * gust)
+        force_sd = np.hypot(seen.force_sd_mps2, left_out)
+        weight = 1.0 / (self.wider * np.concatenate([rate_sd, force_sd], axis=2))
+        return np.where(np.isfinite(seen.specific_force_mps2[..., :1]), np.nan_to_num(weight), 0.0)
+
+    @cached_property
+    def join_weight(self) -> FloatArray:
+        """Inverse standard deviations (s - 1, 12) of ends against starts."""
+        return np.asarray(1.0 / (self.wider * np.hypot(GUST * self.unsteady[:-1, None], STILL_SD)))
+
+    @cached_property
+    def near(self) -> list[Index]:
+        """Knots of the air that each span passes."""
+        z, knots = self.observed.altitude_m, self.air.knots_m
+        reach = 0.55 * np.abs(np.gradient(z)) + 50.0
+        apart = np.diff(knots, append=2 * knots[-1] - knots[-2])
+        return [np.flatnonzero(np.abs(knots - at) < r + apart) for at, r in zip(z, reach, strict=True)]
+
+    @cached_property
+    def attitude_precision(self) -> FloatArray:
+        """Inverse covariance (3, 3) of the reconstructed attitude at the first start."""
+        covariance = self.observed.start.covariance
+        assert covariance is not None
+        return np.asarray(np.linalg.inv(covariance[0, 6:9, 6:9]))
+
+    def start(self) -> Unknowns:
+        """Everything as told, motion as reconstructed."""
+        motion = np.zeros((self.observed.spans, MOTION))
+        motion[:, RATE] = self.observed.start.omega_body_eci_body_radps[:-1]
+        air = np.zeros((3, len(self.air.knots_m)))
+        return Unknowns(np.zeros(len(self.unknown.names)), np.zeros(INSTRUMENTS), air, motion)
+
+    def candidate(self, x: FloatArray) -> Candidate:
+        """Vehicle of unknowns in standard deviations."""
+        vehicle = self.unknown.vehicle(x)
+        return Candidate(vehicle, packing.parameter_vector(vehicle, *self.unknown.factors(x)))
+
+    def predicted(self, u: Unknowns) -> Read:
+        """Every span once; windows without the instruments' errors."""
+        spans = np.arange(self.observed.spans)
+        zero = np.zeros_like(spans)
+        flights = Flights(spans, zero, u.motion, zero, [self.candidate(u.vehicle)], [self.air.table(u.air)])
+        return fly_spans(self.observed, self.unknown.told, flights)
+
+    def instrument_rows(self, slope: FloatArray) -> FloatArray:
+        """Response of the windows to the instruments' unknowns, (s, WINDOWS, 6, 20)."""
+        seen = self.observed
+        rows = np.zeros((*slope.shape, INSTRUMENTS))
+        rows[..., :3, 0:9], rows[..., 3:, 9:18] = seen.rate_root_radps, seen.force_root_mps2
+        # a late clock shows what was earlier
+        rows[..., :3, 18] = -seen.clock_sd_s[0] * slope[..., :3]
+        rows[..., 3:, 19] = -seen.clock_sd_s[1] * slope[..., 3:]
+        return np.nan_to_num(rows)
+
+    def residuals(self, u: Unknowns, read: Read | None = None) -> Residuals:
+        """Where a span diverges the cost is infinite."""
+        read = read or self.predicted(u)
+        told = self.instrument_rows(read.slope) @ u.instruments
+        sensors = (self.data - read.windows - told) * self.weight
+        joins = (read.end[:-1] - u.motion[1:]) * self.join_weight
+        total = float((sensors**2).sum() + (joins**2).sum()) + self.prior_cost(u)
+        return Residuals(sensors, joins, total if np.isfinite(total) else np.inf)
+
+    def prior_cost(self, u: Unknowns) -> float:
+        """Sum of squares of what was known before."""
+        air = sum(float(a @ p @ a) for a, p in zip(u.air, self.air.precision, strict=True))
+        first, attitude = u.motion[0, 6:] / FIRST_SD, u.motion[0, ATTITUDE]
+        turned = float(attitude @ self.attitude_precision @ attitude)
+        return air + turned + float(u.vehicle @ u.vehicle + u.instruments @ u.instruments + first @ first)
+
+    def linear(self, u: Unknowns) -> Linear:
+        """Residuals' derivatives about ``u``."""
+        flights, columns, steps = self._moves(u)
+        moved, read = fly_spans(self.observed, self.unknown.told, flights), self.predicted(u)
+        found, rows = self.residuals(u, read), self.instrument_rows(read.slope)
+        late, at, sensors, joins = np.repeat(self.observed.clock_sd_s * u.instruments[18:20], 3), 0, [], []
+        for span, (column, step) in enumerate(zip(columns, steps, strict=True)):
+            part = slice(at, at := at + len(column))
+            change = moved.windows[part] - read.windows[span] - late * (moved.slope[part] - read.slope[span])
+            sensed = change / step[:, None, None] * self.weight[span]
+            told = (rows[span] * self.weight[span][..., None]).reshape(-1, INSTRUMENTS)
+            both = np.concatenate([column, self.first_instrument + np.arange(INSTRUMENTS)])
+            sensors.append((both, np.column_stack([sensed.reshape(len(step), -1).T, told])))
+            if span + 1 < self.observed.spans:
+                ended = (moved.end[part] - read.end[span]) / step[:, None]
+                following = self.first_motion + MOTION * (span + 1) + np.arange(MOTION)
+                response = np.column_stack([ended.T, -np.eye(MOTION)]) * self.join_weight[span][:, None]
+                joins.append((np.concatenate([column, following]), -response))
+        return Linear(found, sensors, joins, self.count)
+
+    def normal(self, u: Unknowns, linear: Linear) -> tuple[FloatArray, FloatArray]:
+        """Normal matrix and right-hand side of a step from ``u``."""
+        matrix = np.zeros((self.count, self.count))
+        for column, response in (*linear.sensors, *linear.joins):
+            matrix[np.ix_(column, column)] += response.T @ response
+        right = linear.back(linear.found.sensors, linear.found.joins)
+        self._add_priors(u, matrix, right)
+        return matrix, right
+
+    def _moves(self, u: Unknowns) -> tuple[Flights, list[Index], list[FloatArray]]:
+        """Spans with one unknown moved, which unknown (columns) and by how much, span by span."""
+        v, knots = self.first_instrument, len(self.air.knots_m)
+        candidates = [self.candidate(u.vehicle + VEHICLE_STEP * unit) for unit in np.eye(v)] + [
+            self.candidate(u.vehicle)
+        ]
+        tables, number = [self.air.table(u.air)], {}
+        for kind in range(3):
+            for knot in range(knots):
+                air = u.air.copy()
+                air[kind, knot] += AIR_STEP[kind]
+                number[kind, knot] = len(tables)
+                tables.append(self.air.table(air))
+        rows: list[tuple[int, int, FloatArray, int]] = []
+        columns, steps = [], []
+        for span in range(self.observed.spans):
+            motion = u.motion[span]
+            rows += [(span, j, motion, 0) for j in range(v)]
+            rows += [(span, v, motion + d, 0) for d in np.diag(MOTION_STEP)]
+            places = [(kind, knot) for kind in range(3) for knot in self.near[span].tolist()]
+            rows += [(span, v, motion, number[place]) for place in places]
+            in_air = [v + INSTRUMENTS + kind * knots + knot for kind, knot in places]
+            columns.append(np.array([*range(v), *(self.first_motion + MOTION * span + np.arange(MOTION)), *in_air]))
+            steps.append(np.array([VEHICLE_STEP] * v + MOTION_STEP.tolist() + [AIR_STEP[kind] for kind, _ in places]))
+        which = np.array([(row[0], row[1], row[3]) for row in rows]).T
+        motions = np.array([row[2] for row in rows])
+        return Flights(which[0], which[1], motions, which[2], candidates, tables), columns, steps
+
+    def _add_priors(self, u: Unknowns, matrix: FloatArray, right: FloatArray) -> None:
+        free, knots, first = self.first_instrument + INSTRUMENTS, len(self.air.knots_m), self.first_motion
+        parts = [
+            (slice(0, free), np.eye(free), np.concatenate([u.vehicle, u.instruments])),
+            *[
+                (slice(free + kind * knots, free + (kind + 1) * knots), self.air.precision[kind], u.air[kind])
+                for kind in range(3)
+            ],
+            (slice(first, first + 3), self.attitude_precision, u.motion[0, ATTITUDE]),
+            (slice(first + 6, first + MOTION), np.diag(FIRST_SD**-2.0), u.motion[0, 6:]),
+        ]
+        for part, precision, value in parts:
+            matrix[part, part] += precision
+            right[part] -= precision @ value
