@@ -128,11 +128,12 @@ def run(folder: Path, rate: float) -> None:
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--hardening", is_flag=True, help="Let the spring harden (or soften) with the angle.")
-def reconcile(folder: Path, hardening: bool) -> None:
+@click.option("--freeplay", is_flag=True, help="Let the joint have freeplay.")
+def reconcile(folder: Path, hardening: bool, freeplay: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
     from postflight.reconciliation import command
 
-    command.run(folder, ("hardening",) if hardening else ())
+    command.run(folder, tuple(n for n, asked in (("hardening", hardening), ("freeplay", freeplay)) if asked))
 
 
 @cli.command()

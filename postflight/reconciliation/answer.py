@@ -71,8 +71,21 @@ def joint_table(found: Reconciled) -> pd.DataFrame:
             continue
         k = unknown.names.index(name.split(" at")[0])
         at, sd = start + scale * float(x[k]), scale * float(np.sqrt(covariance[k, k]))
+        at = abs(at) if name == "freeplay" else at
         rows.append((name, "deg" if name == "freeplay" else "", start, at, sd, at - reach * sd, at + reach * sd))
     return pd.DataFrame(rows, columns=["quantity", "unit", "told", "found", "sd", "low", "high"])
+
+
+def log_odds(found: Reconciled, name: str) -> float:
+    """Logarithm of the odds (Bayes factor) of a joint with freeplay or hardening against one without.
+
+    Savage and Dickey's ratio of the prior's density at zero to the posterior's, both taken as Gaussian; the unknown is
+    in standard deviations of its prior. Freeplay has one sign only: both densities are folded at zero.
+    """
+    k = found.problem.unknown.names.index(name)
+    mean, sd = float(found.unknowns.vehicle[k]), float(np.sqrt(found.covariance[k, k]))
+    # folding doubles both densities at zero
+    return float(norm.logpdf(0.0) - norm.logpdf(0.0, mean, sd))
 
 
 def correlations(found: Reconciled) -> pd.DataFrame:

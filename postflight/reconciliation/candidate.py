@@ -29,7 +29,7 @@ MIDDLE_M, UPPER_M, TOP_M, BELOW_M = 60e3, 75e3, 105e3, 1e3
 # priors before the flight speaks, one standard deviation: factors as logarithms
 STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 0.5, 1.0, 0.005
 FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
-# hardening is counted as the share by which the tangent stiffness has grown at this angle
+# hardening is counted as the share by which the tangent stiffness has grown at this angle; negative: it softens
 HARDENING_AT_RAD = np.deg2rad(4.0)
 JOINT = ("stiffness", "damping", "offset y", "offset z", "static stability")
 CARRIED = (
@@ -68,7 +68,7 @@ class VehicleUnknowns:
         if "freeplay" in v:
             changed["freeplay_deg"] = float(np.rad2deg(FREEPLAY_SD_RAD) * abs(v["freeplay"]))
         if "hardening" in v:
-            changed["hardening_nmprad3"] = stiffness * HARDENING_SD * abs(v["hardening"]) / (3.0 * HARDENING_AT_RAD**2)
+            changed["hardening_nmprad3"] = stiffness * HARDENING_SD * v["hardening"] / (3.0 * HARDENING_AT_RAD**2)
         # the whole vehicle's offset; the centerbody carries it
         lateral = known.cg_lateral_m * np.array([v["shell's c.g. y"], v["shell's c.g. z"]])
         offset = OFFSET_SD_M * np.array([v["offset y"], v["offset z"]]) * told.mass_kg - lateral * shell.mass_kg

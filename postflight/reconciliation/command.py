@@ -14,11 +14,13 @@ from postflight import results
 from postflight.commands import compile_kernels, console, progress_bar
 from postflight.figures import save
 from postflight.pipeline import PULSE_RATE_HZ, estimate, reconstruct_telemetry
-from postflight.reconciliation.answer import correlations, deflection_of, joint_table, vehicle_lines
+from postflight.reconciliation.answer import correlations, deflection_of, joint_table, log_odds, vehicle_lines
 from postflight.reconciliation.figures import figure_reconciled
 from postflight.reconciliation.fit import Reconciled, reconcile
 from postflight.warmup import RECONSTRUCTION
 from recon.bet import Settings
+
+STRONG = 3.0  # logarithm of odds of twenty to one
 
 
 def run(folder: Path, extra: tuple[str, ...]) -> None:
@@ -54,6 +56,7 @@ def summary(found: Reconciled, table: pd.DataFrame) -> dict[str, object]:
         "sensor_residual_rms_sd": float(np.sqrt(np.mean(found.residuals.sensors**2))),
         "join_rms_sd": float(np.sqrt(np.mean(found.residuals.joins**2))),
         "joint": table.to_dict(orient="records"),
+        "log_odds": {name: log_odds(found, name) for name in found.problem.unknown.extra},
     }
 
 
@@ -66,5 +69,10 @@ def print_joint(found: Reconciled, table: pd.DataFrame) -> None:
         name = f"{r.quantity} ({r.unit})" if r.unit else str(r.quantity)
         printed.add_row(name, f"{r.told:.4g}", f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}")
     console.print(printed)
+    for name in found.problem.unknown.extra:
+        odds = log_odds(found, name)
+        side = "for" if odds > 0.0 else "against"
+        strong = "strong" if abs(odds) > STRONG else "no clear"
+        console.print(f"{name}: {strong} evidence {side} it (odds e^{odds:+.1f})")
     if not found.converged:
         console.print("[yellow]the fit had not settled after its last step: take the intervals as too narrow[/]")

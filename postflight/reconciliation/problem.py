@@ -44,6 +44,7 @@ LARGE_ANGLE_RAD = np.deg2rad(5.0)  # at which structure of the density turns the
 GUST_RATE, GUST_FORCE_MPS2 = 0.3, 30.0  # of the windows' rates and lateral force, likewise
 FIRST_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0])  # bending and its rate above the air
 MOTION_STEP = np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3))
+FIRST_FREEPLAY = 1.0
 VEHICLE_STEP, AIR_STEP = 1e-5, np.array([1e-6, 2e-4, 2e-4])
 
 
@@ -166,7 +167,10 @@ class Problem:
         motion = np.zeros((self.observed.spans, MOTION))
         motion[:, RATE] = self.observed.start.omega_body_eci_body_radps[:-1]
         air = np.zeros((3, len(self.air.knots_m)))
-        return Unknowns(np.zeros(len(self.unknown.names)), np.zeros(INSTRUMENTS), air, motion)
+        vehicle = np.zeros(len(self.unknown.names))
+        if "freeplay" in self.unknown.names:  # without any there is no slope to follow
+            vehicle[self.unknown.names.index("freeplay")] = FIRST_FREEPLAY
+        return Unknowns(vehicle, np.zeros(INSTRUMENTS), air, motion)
 
     def candidate(self, x: FloatArray) -> Candidate:
         """Vehicle of unknowns in standard deviations."""
