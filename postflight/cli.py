@@ -136,6 +136,16 @@ def score(folder: Path, as_json: bool) -> None:
 
 
 @cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+def check(folder: Path, as_json: bool) -> None:
+    """Look at the data of the flight in FOLDER: rates, gaps, stuck and doubtful sensors, units, axes, clocks."""
+    from postflight.intake import check_command
+
+    check_command.check(folder, as_json)
+
+
+@cli.command()
 def warmup() -> None:
     """Compile the kernels for this machine now, so that no later command waits for it."""
     from postflight import commands
