@@ -146,6 +146,27 @@ def check(folder: Path, as_json: bool) -> None:
 
 
 @cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option(
+    "--vehicle", metavar="NAME", help="A vehicle that ships, or a .toml file to copy; default: a form to fill in."
+)
+def init(folder: Path, vehicle: str | None) -> None:
+    """Write a commented flight.toml and vehicle file into FOLDER; what exists is never overwritten."""
+    from postflight.intake import init_command
+
+    init_command.init(folder, vehicle)
+
+
+@cli.command()
+@click.argument("kind", type=click.Choice(["flight", "vehicle", "scenario", "coefficients"]))
+def schema(kind: str) -> None:
+    """Print the JSON Schema of a flight.toml, vehicle or scenario file, or of a coefficient table's sidecar."""
+    from postflight.intake.schema import schema_text
+
+    click.echo(schema_text(kind), nl=False)
+
+
+@cli.command()
 def warmup() -> None:
     """Compile the kernels for this machine now, so that no later command waits for it."""
     from postflight import commands
