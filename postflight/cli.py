@@ -157,6 +157,16 @@ def init(folder: Path, vehicle: str | None) -> None:
     init_command.init(folder, vehicle)
 
 
+@cli.command("import")
+@click.argument("files", nargs=-1, required=True, type=FOLDER, metavar="FILES...")
+@click.option("--into", "folder", required=True, type=FOLDER, help="A flight folder that `postflight init` made.")
+def import_tables(files: tuple[Path, ...], folder: Path) -> None:
+    """Copy CSV and MATLAB tables into a flight folder and propose in flight.toml which column is which."""
+    from postflight.intake import import_command
+
+    import_command.import_files(files, folder)
+
+
 @cli.command()
 @click.argument("kind", type=click.Choice(["flight", "vehicle", "scenario", "coefficients"]))
 def schema(kind: str) -> None:

@@ -62,7 +62,7 @@ def schema_text(kind: str) -> str:
 
 
 def _properties(made: dict[str, Any], table: str) -> dict[str, Any]:
-    """Return the properties of the table that a dotted name reaches, through references, options, lists and free names."""
+    """Return the properties of the table that a dotted name reaches, through references, options and lists."""
     at = made
     for part in filter(None, table.split(".")):
         inner = at.get("properties", {}).get(part)
