@@ -168,6 +168,17 @@ def import_tables(files: tuple[Path, ...], folder: Path) -> None:
 
 
 @cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--to", "form", required=True, type=click.Choice(["csv", "parquet", "mat", "nc", "kml", "oem"]))
+@click.option("--out", type=FOLDER, help="File to write; default: exports/RUN.FORMAT in FOLDER.")
+def export(folder: Path, form: str, out: Path | None) -> None:
+    """Write the newest run's trajectory and deflections for another program."""
+    from postflight.exports import export_command
+
+    export_command.export(folder, form, out)
+
+
+@cli.command()
 @click.argument("kind", type=click.Choice(["flight", "vehicle", "scenario", "coefficients"]))
 def schema(kind: str) -> None:
     """Print the JSON Schema of a flight.toml, vehicle or scenario file, or of a coefficient table's sidecar."""
