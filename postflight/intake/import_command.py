@@ -19,6 +19,7 @@ from postflight.intake.loose import LooseTable, read_loose
 from postflight.intake.matlab import read_matlab
 from postflight.intake.proposal import SourceProposal
 from postflight.intake.propose import propose
+from postflight.intake.sounding_tables import radiosonde_table
 from postflight.intake.write_mapping import section_text, start_text
 
 console = Console(soft_wrap=True)
@@ -50,6 +51,7 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
             faults += fault.faults
     if faults:
         raise GateError(faults)
+    read = [radiosonde_table(table) or table for table in read]
     places = [_place(folder, table) for table in read]
     there = [str(p) for k, p in enumerate(places) if p.exists() or p in places[:k]]
     if there:

@@ -10,6 +10,7 @@ import csv
 import io
 import re
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,10 @@ def read_loose(path: Path) -> LooseTable:
         raise GateError(f"{path}: no such file") from None
     text, notes = _decoded(path, raw)
     lines = [line for line in text.splitlines() if line.strip()]
+    ruled = _ruled(path, lines)
+    if ruled is not None:
+        ruled.notes[:0] = notes
+        return ruled
     found = _layout(lines[:HEAD_LINES])
     if found is None:
         raise GateError(
@@ -98,6 +103,36 @@ def read_loose(path: Path) -> LooseTable:
             notes.append(f"column {k + 1} was named '{name}' like another: now '{names[k]}'")
     plain = not notes and all(len(r) == len(names) for r in rows)
     return LooseTable(path.stem, names, units, rows, notes, raw if plain else None)
+
+
+def _ruled(path: Path, lines: list[str]) -> LooseTable | None:
+    """Read a table of right-aligned columns between dashed rules (as the University of Wyoming lists soundings).
+
+    Empty cells are blanks there: a cell ends below the end of its name.
+    """
+    rules = [k for k, line in enumerate(lines[:HEAD_LINES]) if re.fullmatch(r"\s*-{10,}\s*", line)]
+    for top, bottom in pairwise(rules):
+        if bottom - top not in (2, 3):
+            continue
+        ends = [m.end() for m in re.finditer(r"\S+", lines[top + 1])]
+        names = lines[top + 1].split()
+        units = _columns_below(lines[top + 2], ends) if bottom - top == 3 else [""] * len(names)
+        rows = []
+        for line in lines[bottom + 1 :]:
+            cells = _columns_below(line, ends)
+            if not NUMBER.match(cells[0]):
+                break
+            rows.append(cells)
+        if len(rows) >= 3:
+            note = f"columns between rules became CSV; {len(lines) - len(rows)} lines of names, units and text left out"
+            return LooseTable(path.stem, names, units, rows, [note])
+    return None
+
+
+def _columns_below(line: str, ends: list[int]) -> list[str]:
+    """Cells of a line, each ending where a name ends; the last takes the rest."""
+    starts = [0, *ends[:-1]]
+    return [line[a:b].strip() for a, b in zip(starts, [*ends[:-1], len(line) + 1], strict=True)]
 
 
 def _decoded(path: Path, raw: bytes) -> tuple[str, list[str]]:

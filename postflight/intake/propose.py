@@ -24,6 +24,8 @@ TRIADS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
 }
 EARTH_RADII_M = (6.2e6, 7.5e6)
 MOUNT = 'a package of the vehicle file, or "body"; or axes = ["+x", "+y", "+z"]: which body axis is each of its axes?'
+AIR = ("alt", "rho", "temperature", "pressure", "wind_speed", "wind_from")
+AIR_BY_PARTS = ("wind_north", "wind_east")
 Family = tuple[tuple[str, ...], str]
 
 
@@ -47,11 +49,13 @@ class Reader:
 
     def everything(self) -> tuple[list[SourceProposal], list[str]]:
         """Triads first, whose columns come in threes; then radar, receiver, barometer, sounding."""
-        found = self.triads()
-        if self.time is None:
+        if self.is_sounding():
+            self.time = None
             found = self.sounding()
+        elif self.time is None:
+            found = []
         else:
-            found += self.radar() + self.receiver() + self.barometer()
+            found = self.triads() + self.radar() + self.receiver() + self.barometer()
         for source in found:
             source.time = self.time
         return found, [self.table.names[k] for k in sorted(self.free | self.spare)]
@@ -247,14 +251,26 @@ class Reader:
         what = '"ellipsoid", or "msl" with geoid_undulation_m = ... (m, geoid above ellipsoid); pressures too'
         return [SourceProposal(f"barometers.{self.name}", [found], [("height_is", '"FILL IN"', what)])]
 
+    def air_columns(self) -> dict[Quantity, Mapped]:
+        """Columns of a sounding; winds by speed and direction go before those by components."""
+        found = {q: m for q in columns.ATMOSPHERE if q.short in AIR and (m := self.single(q))}
+        if not {"wind_speed", "wind_from"} <= {q.short for q in found}:
+            found |= {q: m for q in columns.ATMOSPHERE if q.short in AIR_BY_PARTS and (m := self.single(q))}
+        return found
+
+    def is_sounding(self) -> bool:
+        """Whether height, temperature and wind's direction or density are there, and nothing of a tracker."""
+        tracker = all(self.columns_of(s) for s in ("lat", "lon")) or all(
+            self.columns_of(q.short) for q in columns.RADAR
+        )
+        air = all(self.columns_of(s) for s in ("alt", "temperature"))
+        return air and not tracker and bool(self.columns_of("wind_from") or self.columns_of("rho"))
+
     def sounding(self) -> list[SourceProposal]:
-        """A table by altitude; derived columns are `postflight.intake.sounding_tables`' matter."""
-        found = []
-        for q in columns.ATMOSPHERE:
-            if q.short in QUANTITY_WORDS and (mapped := self.single(q)):
-                found.append(mapped)
+        """A table by altitude, as it stands; `postflight.intake.sounding_tables` derives densities before."""
+        found = list(self.air_columns().values())
         shorts = {m.short for m in found}
-        return [SourceProposal("atmosphere", found)] if {"alt", "temperature"} <= shorts else []
+        return [SourceProposal("atmosphere", found)] if {"alt", "temperature", "rho"} <= shorts else []
 
 
 def _axes_of(tokens: tuple[str, ...]) -> list[tuple[tuple[str, ...], str, int]]:

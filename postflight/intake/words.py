@@ -137,6 +137,8 @@ QUANTITY_WORDS: dict[str, set[str]] = {
     "rho": {"rho", "density", "dichte", "dens", "luftdichte"},
     "wind_speed": {"windspeed", "wspd", "ff", "sknt", "windgeschwindigkeit", "smps", "wind"},
     "wind_from": {"winddir", "wdir", "dd", "drct", "windrichtung", "from", "wd"},
+    "wind_north": {"windn", "v", "vgrd", "meridional"},
+    "wind_east": {"winde", "u", "ugrd", "zonal"},
     "nsat": {"nsat", "sats", "satellites", "satelliten", "numsv", "nsats", "sat"},
 }
 TRIAD_WORDS: dict[str, set[str]] = {
