@@ -2,10 +2,10 @@
 
 ``rho = p / (R T_v)`` with the virtual temperature ``T_v = T / (1 - 0.378 e / p)`` and the vapour pressure ``e`` of the
 dew point (Bolton, "The computation of equivalent potential temperature", 1980, eq. 10). Radiosondes give geopotential
-heights ``h``; ``z = R h / (R - h)`` with R = 6356.766 km (US Standard Atmosphere 1976, eq. 19). Levels that hold only wind
-or only temperature take the other from their neighbours: temperature along the logarithm of pressure, wind by components
-along height; nothing beyond the first and last level that has it. Winds stay as they are told, by where they come from:
-`flightmodel.sounding` turns them, and says so.
+heights ``h``; ``z = R h / (R - h)`` with R = 6356.766 km (US Standard Atmosphere 1976, eq. 19). Levels that hold only
+wind or only temperature take the other from their neighbours: temperature along the logarithm of pressure, wind by
+components along height; nothing beyond the first and last level that has it. Winds stay as they are told, by where they
+come from: `flightmodel.sounding` turns them, and says so.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def radiosonde_table(table: LooseTable) -> LooseTable | None:
     if len(rows) < 3:
         return None
     notes += [
-        f"temperature of {int((filled_t & keep).sum())} levels and wind of {int((sides[0][1] & keep).sum())} taken from "
-        "their neighbours",
+        f"temperature of {(filled_t & keep).sum()} levels and wind of {(sides[0][1] & keep).sum()} taken from their "
+        "neighbours",
         f"{len(height) - len(rows)} levels left out: no height, below the first or above the last that has both",
         "density by gas law" + (" with the dew point's vapour" if dew is not None else ", as of dry air"),
         "geopotential heights became geometric ones",
