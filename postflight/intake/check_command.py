@@ -56,10 +56,10 @@ def _lines(mark: str, findings: list[Finding]) -> None:
 
 def _summary(report: Report) -> str:
     counts = (
-        (len(report.findings), "findings"),
-        (len(report.oddities), "oddities"),
-        (len(report.fill_in), "values still to fill in"),
-        (len(report.refused), "refused"),
+        (len(report.findings), "findings", "finding"),
+        (len(report.oddities), "oddities", "oddity"),
+        (len(report.fill_in), "values still to fill in", "value still to fill in"),
+        (len(report.refused), "refused", "refused"),
     )
-    said = ", ".join(f"{count} {what}" for count, what in counts if count)
+    said = ", ".join(f"{count} {what if count > 1 else one}" for count, what, one in counts if count)
     return said or "nothing found that would be in the way"

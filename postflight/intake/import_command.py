@@ -55,7 +55,9 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
     places = [_place(folder, table) for table in read]
     there = [str(p) for k, p in enumerate(places) if p.exists() or p in places[:k]]
     if there:
-        raise ConfigError([f"{p}: exists already, and nothing is overwritten; rename the new file" for p in there])
+        raise ConfigError(
+            [f"{p}: exists already, and nothing is overwritten; rename the new one, or remove it there" for p in there]
+        )
     added, shown = _proposals(read, places, folder, tables)
     text = path.read_text(encoding="utf-8-sig").rstrip() + "\n" + added
     tomllib.loads(text)  # what is written can be read

@@ -19,6 +19,7 @@ from flightmodel.checks import FloatArray, GateError
 from postflight.intake.words import SEVERAL_MEANINGS, UNIT_WORDS, unit_key
 
 LARGEST_BYTES = 2 * 1024**3
+LARGEST = 1e100  # what is beyond is a broken word
 HEAD_LINES = 80  # names and first rows are within
 COMMENT = re.compile(r"^\s*(#+|%+|//+|\*+|;|!|\")\s*")
 NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
@@ -51,7 +52,7 @@ class LooseTable:
                     out[k] = float(row[column])
                 except ValueError:
                     continue
-        return out
+        return np.where(np.abs(out) < LARGEST, out, np.nan)
 
     def as_csv(self) -> bytes:
         """Return the plain CSV that is written."""

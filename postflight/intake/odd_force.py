@@ -28,9 +28,10 @@ def at_rest(found: Sources) -> list[Finding]:
     for start in (record.time_s[0], record.time_s[-1] - REST_S):
         rows = (record.time_s >= start) & (record.time_s <= start + REST_S)
         turning = rates.measured_sensor[(rates.time_s >= start) & (rates.time_s <= start + REST_S)]
+        turning = turning[np.isfinite(turning).all(axis=1)]
         size = np.linalg.norm(record.measured_sensor[rows], axis=1)
         size = size[np.isfinite(size)]
-        if len(size) < 20 or not len(turning) or np.nanmax(np.abs(np.nanmean(turning, axis=0))) > REST_RATE_RADPS:
+        if len(size) < 20 or not len(turning) or np.abs(turning.mean(axis=0)).max() > REST_RATE_RADPS:
             continue
         mean = float(size.mean())
         if size.std() > REST_SPREAD * mean:
@@ -82,7 +83,9 @@ def entry_axis(found: Sources, force: TrackForce) -> list[Finding]:
     strong &= (force.time_s > record.time_s[0]) & (force.time_s < record.time_s[-1])
     if strong.sum() < 4:
         return []
-    mean, start, end = _mean_sensor(record, force, strong)
+    mean, start, end = _sum_sensor(record, force, strong)
+    if not mean.any():
+        return []
     body = record.spec.dcm_body_sensor @ mean / np.linalg.norm(mean)
     if -body[0] > LEAST_DRAG:
         return []
@@ -109,7 +112,7 @@ def lever(found: Sources) -> list[Finding]:
     own = SURE * (record.spec.noise_sd + record.spec.bias_sd)
     # the arm to the c.g. is known to a centimetre or so: a factor of ten is beyond it
     impossible = inward > 10.0 * (felt + own)
-    if np.mean(impossible) < 0.5:
+    if np.mean(impossible) < 0.5 or not np.isfinite(inward).any():
         return []
     declared = unit_of(source, columns.RATES[0])
     worst = f"{float(np.nanmedian(inward)):.3g} m/s^2 where it reads {float(np.nanmedian(felt)):.2g}"
@@ -127,10 +130,11 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-9)[:, None])
 
 
-def _mean_sensor(record: TriadRecord, force: TrackForce, use: FloatArray) -> tuple[FloatArray, float, float]:
+def _sum_sensor(record: TriadRecord, force: TrackForce, use: FloatArray) -> tuple[FloatArray, float, float]:
     times = force.time_s[use]
     half = 0.5 * force.width_s
     rows = np.zeros(len(record.time_s), dtype=bool)
     for t in times:
         rows[slice(*np.searchsorted(record.time_s, [t - half, t + half]))] = True
-    return np.nanmean(record.measured_sensor[rows], axis=0), float(times[0]), float(times[-1])
+    seen = record.measured_sensor[rows]
+    return seen[np.isfinite(seen).all(axis=1)].sum(axis=0), float(times[0]), float(times[-1])

@@ -15,7 +15,16 @@ from postflight.intake.clock_columns import find_time
 from postflight.intake.evidence import single_unit, triad_unit
 from postflight.intake.loose import LooseTable
 from postflight.intake.proposal import ASKED, NUMBERS, STATED, Mapped, SourceProposal
-from postflight.intake.words import AXES, BODY_RATES, NED, QUANTITY_WORDS, SEVERAL_MEANINGS, TRIAD_WORDS, take_apart
+from postflight.intake.words import (
+    AXES,
+    BODY_RATES,
+    NED,
+    QUANTITY_WORDS,
+    SEVERAL_MEANINGS,
+    TRIAD_WORDS,
+    means,
+    take_apart,
+)
 
 TRIADS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
     "acceleration": ("sensors.accelerometer", columns.ACCELEROMETER),
@@ -92,7 +101,7 @@ class Reader:
 
     def _triad_kind(self, stem: tuple[str, ...], family: str, at: list[int]) -> tuple[str, str]:
         stated = set.intersection(*(self.named[k].kinds for k in at))
-        worded = [kind for kind, words in TRIAD_WORDS.items() if set(stem) & words]
+        worded = [kind for kind, words in TRIAD_WORDS.items() if means(stem, words)]
         if family == "body" and (not stem or "rate" in worded or stated == {"rate"}):
             return ("rate", "names of body rates") if stated in (set(), {"rate"}) else ("", "")
         fitting = [kind for kind in worded if not stated or kind in stated]
@@ -124,8 +133,10 @@ class Reader:
         """Free columns whose name says a quantity, the plainest first."""
         words = QUANTITY_WORDS[short]
         found = [
-            k for k in sorted(self.free) if set(self.named[k].tokens) & words or "".join(self.named[k].tokens) in words
+            k for k in sorted(self.free) if means(self.named[k].tokens, words) or "".join(self.named[k].tokens) in words
         ]
+        if short == "wind_speed":  # "wind from" is no speed
+            found = [k for k in found if not set(self.named[k].tokens) & QUANTITY_WORDS["wind_from"]]
         return sorted(found, key=lambda k: (len(set(self.named[k].tokens) - words), k))
 
     def single(self, quantity: Quantity, word: str = "") -> Mapped | None:

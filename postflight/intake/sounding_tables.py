@@ -21,6 +21,7 @@ from postflight.intake.propose import Reader
 
 NEEDED = {"alt", "temperature", "pressure"}
 ZERO_C_K = 273.15
+LOWEST_M, HIGHEST_M = -1000.0, 2e5
 
 
 def radiosonde_table(table: LooseTable) -> LooseTable | None:
@@ -37,7 +38,9 @@ def radiosonde_table(table: LooseTable) -> LooseTable | None:
     notes = [*table.notes, f"radiosonde: {', '.join(f'{m.column} as {s} in {m.unit}' for s, m in found.items())}"]
     dew = _dew_point(reader)
     height, p = c["alt"], c["pressure"]
-    whole = np.isfinite(height) & np.isfinite(p)
+    with np.errstate(invalid="ignore"):
+        whole = (height > LOWEST_M) & (height < HIGHEST_M) & (p > 0.0)
+    height = np.where(whole, height, np.nan)
     temperature, filled_t = _between(-np.log(np.where(whole, p, 1.0)), c["temperature"], whole)
     flow = c["wind_speed"][:, None] * np.column_stack([np.cos(c["wind_from"]), np.sin(c["wind_from"])])
     sides = [_between(height, component, whole) for component in flow.T]
@@ -57,7 +60,7 @@ def radiosonde_table(table: LooseTable) -> LooseTable | None:
     notes += [
         f"temperature of {(filled_t & keep).sum()} levels and wind of {(sides[0][1] & keep).sum()} taken from their "
         "neighbours",
-        f"{len(height) - len(rows)} levels left out: no height, below the first or above the last that has both",
+        f"{len(height) - len(rows)} levels left out: no height or pressure, or beyond the first or last that has both",
         "density by gas law" + (" with the dew point's vapour" if dew is not None else ", as of dry air"),
         "geopotential heights became geometric ones",
     ]

@@ -76,6 +76,12 @@ UNIT_WORDS: dict[str, tuple[str, ...]] = {
     "grad/s": ("degps",),
     "degs-1": ("degps",),
     "rad/s": ("radps",),
+    "rad_s": ("radps",),
+    "deg_s": ("degps",),
+    "m_s2": ("mps2",),
+    "m_s": ("mps",),
+    "ft_s": ("ftps",),
+    "km_h": ("kmh",),
     "rads-1": ("radps",),
     "rad/sec": ("radps",),
     "1/min": ("rpm",),
@@ -126,8 +132,8 @@ QUANTITY_WORDS: dict[str, set[str]] = {
         "sekunde",
     },
     "range": {"range", "rng", "slant", "slantrange", "entfernung", "distanz", "schraegentfernung", "dist", "distance"},
-    "az": {"az", "azimuth", "azimut", "azi", "peilung", "bearing"},
-    "el": {"el", "elevation", "elev", "hoehenwinkel", "erhebung", "elevationswinkel"},
+    "az": {"az", "azimuth", "azimut", "azi", "azm", "peilung", "bearing"},
+    "el": {"el", "elevation", "elev", "elv", "hoehenwinkel", "erhebung", "elevationswinkel"},
     "lat": {"lat", "latitude", "breite", "breitengrad", "phi"},
     "lon": {"lon", "long", "lng", "longitude", "laenge", "laengengrad"},
     "alt": {"alt", "altitude", "height", "hoehe", "hgt", "hght", "h", "geopot", "z"},
@@ -206,6 +212,16 @@ BODY_RATES = {"roll", "pitch", "yaw", "p", "q", "r", "nick", "gier", "rollen", "
 NED = {"n", "e", "d", "north", "east", "down", "nord", "ost", "unten"}
 
 
+EVERY_WORD = {w for words in (*QUANTITY_WORDS.values(), *TRIAD_WORDS.values(), AXES) for w in words}
+
+
+def means(tokens: tuple[str, ...], words: set[str]) -> set[str]:
+    """Tokens of a name that say one of these words, whole or cut short (``azim``), where that is no word of its own."""
+    said = set(tokens) & words
+    cut = {t for t in tokens if len(t) >= 3 and t not in EVERY_WORD}
+    return said | {t for t in cut if any(w.startswith(t) and len(w) >= 6 for w in words)}
+
+
 @dataclass(frozen=True)
 class Named:
     """A column's name taken apart: tokens of what it is, and the unit's text where it names one."""
@@ -246,6 +262,6 @@ def take_apart(name: str, unit_row: str = "") -> Named:
             if head and (unit_key(tail) in UNIT_WORDS or unit_key(tail) in SEVERAL_MEANINGS):
                 base, unit = head, tail
                 break
-    stated = unit_row.strip() or unit
+    stated = unit_row.strip().strip("()[]{}<>") or unit
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", base)
     return Named(name, tuple(re.findall(r"[a-z]+|\d+", fold(spaced))), stated)

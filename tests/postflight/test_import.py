@@ -81,13 +81,13 @@ def written(path, table, names=None, units=None, sep=",", decimal=".", preface="
 STYLES = {
     "as delivered": {},
     "underscores": {
-        "a": ["time_s", "acc_x_g", "acc_y_g", "acc_z_g"], "r": ["time_s", "p_degps", "q_degps", "r_degps"],
+        "a": ["time_s", "acc_x_g", "acc_y_g", "acc_z_g"], "r": ["time_s", "w_x_deg_s", "w_y_deg_s", "w_z_deg_s"],
         "t": ["irig_time", "slant_range_yd", "azimuth_deg", "elevation_deg"],
     },
     "camel case and brackets": {
         "a": ["Time [s]", "AccX [g]", "AccY [g]", "AccZ [g]"],
         "r": ["Time [s]", "RollRate [°/s]", "PitchRate [°/s]", "YawRate [°/s]"],
-        "t": ["Time", "Range [yds]", "Azimuth [°]", "Elevation [°]"],
+        "t": ["GMT", "Slant Rng [yds]", "Azim [°]", "Elev [°]"],
     },
     "German, semicolons, decimal commas, Latin-1, a row of units": {
         "a": ["Zeit", "Beschl_x", "Beschl_y", "Beschl_z"], "au": ["s", "g", "g", "g"],
