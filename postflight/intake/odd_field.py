@@ -21,6 +21,7 @@ DECADE = 5.0  # iron and calibration change a field's size by less
 CELL_RAD = 0.3  # turned within a cell: as long as the field's direction allows, against the readings' noise
 EXPLAINED = 0.6  # of the turning's square; noise and iron that is not fixed are the rest
 MOST_SAMPLES = 4000
+LARGEST_LAG_S, COARSE_S = 0.5, 0.025
 
 
 def barometer_unit(
@@ -135,10 +136,13 @@ def _on(record: TriadRecord, grid: FloatArray) -> FloatArray:
 def _explained(w: FloatArray, b: FloatArray, change: FloatArray) -> tuple[float, float]:
     """Share of the turning's square that is explained, and the scale of ``w``."""
     # db/dt = k b x w + w x (k b0): linear in k and k b0
-    columns_ = [np.cross(b, w)] + [np.cross(w, axis) for axis in np.eye(3)]
-    design = np.column_stack([c.ravel() for c in columns_])
-    fit, *_ = np.linalg.lstsq(design, change.ravel(), rcond=None)
-    left = change.ravel() - design @ fit
+    design = np.stack([np.cross(b, w).ravel(), *(np.cross(w, axis).ravel() for axis in np.eye(3))])
+    design = design / (norm := np.sqrt(np.maximum(np.einsum("ik,ik->i", design, design), 1e-300)))[:, None]
+    wanted = change.ravel()
+    # normal equations: four columns of one size need no better
+    fit = np.linalg.pinv(np.einsum("ik,jk->ij", design, design)) @ np.einsum("ik,k->i", design, wanted)
+    left = wanted - np.einsum("i,ik->k", fit, design)
+    fit = fit / norm
     total = float(change.ravel() @ change.ravel())
     share = 1.0 - float(left @ left) / total if total > 0.0 and fit[0] > 0.0 else 0.0
     return share, float(fit[0])
@@ -152,7 +156,9 @@ def _clock(gyros: TriadRecord, field: TriadRecord) -> tuple[float, float] | None
     b = _on(field, grid)
     change = np.gradient(b, grid, axis=0)
     step = grid[1] - grid[0]
-    lags = np.arange(-0.5, 0.5 + step / 2, max(step / 2, 0.005))
+    coarse = np.arange(-LARGEST_LAG_S, LARGEST_LAG_S + 1e-9, COARSE_S)
+    near = coarse[int(np.argmax([_explained(_on(gyros, grid - lag), b, change)[0] for lag in coarse]))]
+    lags = near + np.arange(-COARSE_S, COARSE_S + 1e-9, max(step / 2, 0.005))
     shares = [_explained(_on(gyros, grid - lag), b, change)[0] for lag in lags]
     k = int(np.argmax(shares))
     if not 0 < k < len(lags) - 1:
