@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def _contents(folder: Path, vehicle: str | None) -> tuple[dict[Path, str], dict[
 
 
 def _line(vehicle: str) -> str:
-    return f'vehicle = "{vehicle}"'.ljust(VEHICLE_LINE.index("#", 1)) + "#"
+    return f"vehicle = {json.dumps(vehicle, ensure_ascii=False)}".ljust(VEHICLE_LINE.index("#", 1)) + "#"
 
 
 def write_text(path: Path, text: str) -> None:

@@ -292,3 +292,34 @@ def test_recorded_flights_are_recognised_as_their_flight_file_has_them(name, fol
                 asked = got.get("columns", {}).get(short, column)
                 assert asked["column"] == column["column"], (key, short)
                 assert asked["unit"] in (column["unit"], "FILL IN"), (key, short)
+
+
+def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
+    from flightmodel.checks import GateError
+    from postflight.intake.clock_columns import split_clocks
+    from postflight.intake.loose import read_loose
+    from postflight.intake.propose import propose
+    from postflight.intake.sounding_tables import radiosonde_table
+    from postflight.intake.write_mapping import section_text
+
+    rng = np.random.default_rng(7)
+    whole = [b"\n".join((PACKAGE / name).read_bytes().split(b"\n")[:30]) for name in ("rates.csv", "met_composite.csv")]
+    whole.append(b"p_hpa,h_m,T_C,Td_C,from_deg,wind_mps\n" + b"1000,116,11.2,11,30,10.8\n925,764,8,8,30,16.4\n" * 8)
+    bits = (b"", b",", b";", b'"', b"\n", b"nan", b"1e999", b"-", b"#", b"\xff", b"(g)", b"9" * 400, b"12:00:00", b"=")
+    read = 0
+    for _ in range(400):
+        content = bytearray(whole[rng.integers(len(whole))])
+        for _ in range(rng.integers(1, 6)):
+            at = int(rng.integers(len(content)))
+            content[at : at + int(rng.choice([0, 1, 3, 20]))] = bits[rng.integers(len(bits))]
+        (tmp_path / "x.csv").write_bytes(bytes(content))
+        try:
+            table = read_loose(tmp_path / "x.csv")
+        except GateError:
+            continue
+        table = radiosonde_table(table) or table
+        split_clocks(table)
+        for source in propose(table)[0]:
+            tomllib.loads(section_text(source, "telemetry/x.csv", table.notes, taken=False))
+        read += 1
+    assert read > 200

@@ -193,3 +193,10 @@ def test_keys_of_flight_and_vehicle_are_described():
     made = schema("flight")
     assert "site" in made["$defs"]["RadarEntry"]["properties"]["latitude_deg"]["description"]
     assert "aft of the nose" in schema("vehicle")["$defs"]["CompliantJoint"]["properties"]["station_m"]["description"]
+
+
+def test_quotes_in_a_file_name_stay_text(tmp_path):
+    own = tmp_path / "a\"b'.toml"
+    own.write_text((ROOT / "examples" / "own_vehicle" / "vehicle.toml").read_text())
+    assert run("init", tmp_path / "flight", "--vehicle", own).exit_code == 0
+    assert tomllib.loads((tmp_path / "flight" / "flight.toml").read_text())["vehicle"] == f"vehicle/{own.name}"
