@@ -28,6 +28,8 @@ Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Place = Annotated[float, Field(ge=-100.0, le=100.0)]
 # also the name of a table in TOML, of a file and of a column
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
+FILL_IN_VALUE = "FILL IN"  # where a new file leaves a value to its user
+FILL_IN = "still to fill in"  # and what is said of it
 NAME_RULE = "a name has 1 to 64 letters (a to z), digits, _ and -"
 
 
@@ -58,6 +60,8 @@ class Section(BaseModel):
     def _no_coercion(cls, value: Any, info: ValidationInfo) -> Any:
         wanted = set(_leaf_types(cls.model_fields[str(info.field_name)].annotation))
         for leaf in _leaves(value):
+            if isinstance(leaf, str) and leaf.startswith(FILL_IN_VALUE):
+                raise ValueError(FILL_IN)
             if isinstance(leaf, bool) and bool not in wanted and wanted & {int, float}:
                 raise ValueError("a number is wanted, not true or false")
             if isinstance(leaf, str) and str not in wanted and wanted & {int, float, bool}:

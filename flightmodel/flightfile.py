@@ -54,7 +54,9 @@ class AttitudeEntry(Section):
     longitude_deg: Longitude | None = None
     sd_deg: tuple[AttitudeSd, AttitudeSd, AttitudeSd] = (3.0, 3.0, 3.0)
 
-    @field_validator("sd_deg", mode="before")
+    @field_validator(
+        "sd_deg", mode="before", json_schema_input_type=AttitudeSd | tuple[AttitudeSd, AttitudeSd, AttitudeSd]
+    )
     @classmethod
     def _each_axis(cls, value: Any) -> Any:
         if isinstance(value, (int, float)) and not isinstance(value, bool):

@@ -6,7 +6,9 @@ Nothing below ``truth/`` is opened here.
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,18 +24,71 @@ from flightmodel.pointing import q_ecef_body_from_pointing
 from flightmodel.sounding import read_sounding
 from flightmodel.telemetry import (
     AttitudePrior,
+    BarometerRecord,
     Disturbed,
     Finding,
     GnssRecord,
     Motion,
     RadarRecord,
     Sounding,
+    SunRecord,
     Telemetry,
+    TriadRecord,
 )
 from flightmodel.tracking_tables import read_barometer, read_gnss, read_radar
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
 LEAST_SPAN_S = 1.0
+Record = TypeVar("Record")
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What could be read of a flight folder; what could not is among the faults of its ``gate``."""
+
+    gate: Gate
+    spec: FlightFile
+    vehicle: Vehicle | None
+    triads: dict[str, TriadRecord]
+    sun: SunRecord | None
+    radars: dict[str, RadarRecord]
+    gnss: dict[str, GnssRecord]
+    barometers: dict[str, BarometerRecord]
+    sounding: Sounding | None
+    frames: Frames | None
+    attitude_prior: AttitudePrior | None
+
+
+def read_sources(folder: Path) -> Sources:
+    """Read every table of a flight that can be read; faults and findings are kept in the gate.
+
+    Parameters
+    ----------
+    folder : Path
+        Flight folder with ``flight.toml``.
+
+    Raises
+    ------
+    ConfigError
+        For faults of ``flight.toml`` itself.
+    """
+    spec = read_flight_file(folder)
+    gate = Gate(folder, parse_utc(spec.t0_utc))
+    for words in spec.misfits():
+        gate.refuse_config(words)
+    vehicle = _vehicle(gate, spec.vehicle) if spec.vehicle is not None else None
+    triads = {name: read_triad(gate, name, spec, vehicle) for name in ("accelerometer", "rates", "magnetometer")}
+    sun = read_sun(gate, spec.sensors.sun) if spec.sensors.sun else None
+    radars = _there({name: read_radar(gate, name, entry) for name, entry in spec.radars.items()})
+    gnss = _there({name: read_gnss(gate, name, entry) for name, entry in spec.gnss.items()})
+    sounding = _sounding(gate, spec)
+    measured = spec.atmosphere is not None
+    barometers = {
+        name: read_barometer(gate, name, entry, sounding, measured) for name, entry in spec.barometers.items()
+    }
+    frames = read_frames(gate, spec.frames, vehicle) if spec.frames else None
+    prior = _attitude_prior(gate, spec.attitude_prior, radars, gnss) if spec.attitude_prior else None
+    return Sources(gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, frames, prior)
 
 
 def read_flight(folder: Path) -> Telemetry:
@@ -51,52 +106,41 @@ def read_flight(folder: Path) -> Telemetry:
     GateError
         For faults of the data files: all of them, each with file, line or time, and what to do.
     """
-    spec = read_flight_file(folder)
-    gate = Gate(folder, parse_utc(spec.t0_utc))
-    for words in spec.misfits():
-        gate.refuse_config(words)
-    vehicle = _vehicle(gate, spec.vehicle) if spec.vehicle is not None else None
-    triads = {name: read_triad(gate, name, spec, vehicle) for name in ("accelerometer", "rates", "magnetometer")}
-    sun = read_sun(gate, spec.sensors.sun) if spec.sensors.sun else None
-    radars = {name: read_radar(gate, name, entry) for name, entry in spec.radars.items()}
-    gnss = {name: read_gnss(gate, name, entry) for name, entry in spec.gnss.items()}
-    sounding = _sounding(gate, spec)
-    measured = spec.atmosphere is not None
-    barometers = {
-        name: read_barometer(gate, name, entry, sounding, measured) for name, entry in spec.barometers.items()
-    }
-    frames = read_frames(gate, spec.frames, vehicle) if spec.frames else None
-    tracks = {name: record for name, record in radars.items() if record is not None}
-    fixes = {name: record for name, record in gnss.items() if record is not None}
-    prior = _attitude_prior(gate, spec.attitude_prior, tracks, fixes) if spec.attitude_prior else None
+    found = read_sources(folder)
+    gate, spec = found.gate, found.spec
     gate.close()
-    assert sounding is not None
+    assert found.sounding is not None
     telemetry = Telemetry(
         name=spec.name,
         t0_utc=spec.t0_utc,
         synthetic=spec.synthetic,
-        vehicle=vehicle,
-        accelerometer=triads["accelerometer"],
-        rates=triads["rates"],
-        radars=tracks,
-        sounding=sounding,
-        attitude_prior=prior,
-        frames=frames,
-        magnetometer=triads["magnetometer"],
-        sun=sun,
+        vehicle=found.vehicle,
+        accelerometer=found.triads.get("accelerometer"),
+        rates=found.triads.get("rates"),
+        radars=found.radars,
+        sounding=found.sounding,
+        attitude_prior=found.attitude_prior,
+        frames=found.frames,
+        magnetometer=found.triads.get("magnetometer"),
+        sun=found.sun,
         events=tuple((e.name, e.t_s) for e in spec.events),
         findings=tuple(gate.findings),
-        hashes=_hashes(gate, spec, vehicle, frames),
-        gnss=fixes,
-        barometers={name: record for name, record in barometers.items() if record is not None},
+        hashes=_hashes(gate, spec, found.vehicle, found.frames),
+        gnss=found.gnss,
+        barometers=found.barometers,
         motion=_motion(spec.motion),
     )
     start, stop = telemetry.span_s()
     if stop - start < LEAST_SPAN_S:
         who = "accelerometer, rates and" if telemetry.accelerometer is not None else "the flight's"
-        trackers = " and ".join(kind for kind, some in (("radars", tracks), ("receivers", fixes)) if some)
+        trackers = " and ".join(kind for kind, some in (("radars", found.radars), ("receivers", found.gnss)) if some)
         raise GateError(f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)")
     return telemetry
+
+
+def _there(records: dict[str, Record | None]) -> dict[str, Record]:
+    """Those that could be read."""
+    return {name: record for name, record in records.items() if record is not None}
 
 
 def _vehicle(gate: Gate, name: str) -> Vehicle | None:

@@ -212,7 +212,9 @@ class CameraMount(Section):
         return self
 
 
-class _VehicleFile(Section):
+class VehicleFile(Section):
+    """The whole of a vehicle file."""
+
     name: str
     description: str = ""
     reference: Reference
@@ -226,7 +228,7 @@ class _VehicleFile(Section):
     cameras: dict[Name, CameraMount] = {}
 
     @model_validator(mode="after")
-    def _one_shape(self) -> _VehicleFile:
+    def _one_shape(self) -> VehicleFile:
         cone, shell = self.aerodynamics.sphere_cone, self.geometry
         if cone is None:
             return self
@@ -323,7 +325,7 @@ def vehicle_from_toml(path: Path) -> Vehicle:
     ConfigError
         With every fault of the file, unknown keys with the nearest known one.
     """
-    spec = parse_section(_VehicleFile, read_toml(path), str(path))
+    spec = parse_section(VehicleFile, read_toml(path), str(path))
     shell, reference = spec.geometry, spec.reference
     shape = Shape(
         float(np.deg2rad(shell.half_angle_deg)),

@@ -157,6 +157,58 @@ def report(folder: Path, output: Path | None) -> None:
 
 
 @cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+def check(folder: Path, as_json: bool) -> None:
+    """Look at the data of the flight in FOLDER: rates, gaps, stuck and doubtful sensors, units, axes, clocks."""
+    from postflight.intake import check_command
+
+    check_command.check(folder, as_json)
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option(
+    "--vehicle", metavar="NAME", help="A vehicle that ships, or a .toml file to copy; default: a form to fill in."
+)
+def init(folder: Path, vehicle: str | None) -> None:
+    """Write a commented flight.toml and vehicle file into FOLDER; what exists is never overwritten."""
+    from postflight.intake import init_command
+
+    init_command.init(folder, vehicle)
+
+
+@cli.command("import")
+@click.argument("files", nargs=-1, required=True, type=FOLDER, metavar="FILES...")
+@click.option("--into", "folder", required=True, type=FOLDER, help="A flight folder that `postflight init` made.")
+def import_tables(files: tuple[Path, ...], folder: Path) -> None:
+    """Copy CSV and MATLAB tables into a flight folder and propose in flight.toml which column is which."""
+    from postflight.intake import import_command
+
+    import_command.import_files(files, folder)
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--to", "form", required=True, type=click.Choice(["csv", "parquet", "mat", "nc", "kml", "oem"]))
+@click.option("--out", type=FOLDER, help="File to write; default: exports/RUN.FORMAT in FOLDER.")
+def export(folder: Path, form: str, out: Path | None) -> None:
+    """Write the newest run's trajectory and deflections for another program."""
+    from postflight.exports import export_command
+
+    export_command.export(folder, form, out)
+
+
+@cli.command()
+@click.argument("kind", type=click.Choice(["flight", "vehicle", "scenario", "coefficients"]))
+def schema(kind: str) -> None:
+    """Print the JSON Schema of a flight.toml, vehicle or scenario file, or of a coefficient table's sidecar."""
+    from postflight.intake.schema import schema_text
+
+    click.echo(schema_text(kind), nl=False)
+
+
+@cli.command()
 def warmup() -> None:
     """Compile the kernels for this machine now, so that no later command waits for it."""
     from postflight import commands

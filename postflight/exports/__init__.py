@@ -1,0 +1,1 @@
+"""A run's trajectory and deflections in the formats of other programs."""

@@ -1,0 +1,185 @@
+"""What should an analyst know of a flight folder before running it? Facts, findings, oddities and what is refused.
+
+Facts: rows, span, rate of every table. Findings: what the readers saw (gaps, frozen, saturated, told twice, out of
+order). Oddities: what sensors say against each other and against physics, each only where it can be proved from the
+data: units, axes, clocks. What cannot be told is not mentioned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flightmodel import earth
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.config import FILL_IN
+from flightmodel.flightfolder import Sources, read_sources
+from flightmodel.telemetry import Finding
+from postflight.intake import odd_field, odd_force, odd_tracks, odd_turning
+from postflight.intake.track import best_comparison, track_force
+
+CLOCK_SD, CLOCK_S = 5.0, 0.1  # a clock is doubted beyond so many standard deviations and seconds
+TOLD_S = 0.5  # a clock is told to better than this, or not at all
+FITS = 5.0  # reduced chi-square beyond which one lag and one scale do not describe it
+
+
+@dataclass(frozen=True)
+class Fact:
+    """One table: rows, first and last time, samples a second (the usual one), rows with a missing value."""
+
+    source: str
+    file: str
+    rows: int
+    start_s: float
+    end_s: float
+    rate_hz: float
+    missing: int
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How late ``source``'s times are against ``against``'s, with one standard deviation."""
+
+    source: str
+    against: str
+    late_s: float
+    sd_s: float
+
+
+@dataclass
+class Report:
+    """Everything that a check found; ``exit_code`` as the command leaves with."""
+
+    facts: list[Fact] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    oddities: list[Finding] = field(default_factory=list)
+    clocks: list[Clock] = field(default_factory=list)
+    fill_in: list[str] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    exit_code: int = 0
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything as JSON; times that are none become null."""
+        out: dict[str, Any] = asdict(self)
+        for rows in (out["facts"], out["findings"], out["oddities"]):
+            for row in rows:
+                row |= {k: None for k, v in row.items() if isinstance(v, float) and not np.isfinite(v)}
+        return out
+
+
+def check_folder(folder: Path) -> Report:
+    """Read a flight folder as far as it can be read and say what is odd; nothing is written."""
+    report = Report()
+    try:
+        found = read_sources(folder)
+    except GateError as fault:
+        _refuse(report, fault.faults, fault.exit_code)
+        return report
+    gate = found.gate
+    if gate.config or gate.faults:
+        _refuse(report, [*gate.config, *gate.faults], 3 if gate.faults else 2)
+    report.facts = _facts(found)
+    report.findings = sorted(gate.findings, key=lambda f: (f.source, np.nan_to_num(f.start_s, nan=-np.inf)))
+    with np.errstate(invalid="ignore"):
+        _compare(found, report)
+    return report
+
+
+def _refuse(report: Report, faults: tuple[str, ...] | list[str], code: int) -> None:
+    report.fill_in = [words for words in faults if FILL_IN in words]
+    report.refused = [words for words in faults if FILL_IN not in words]
+    report.exit_code = code
+
+
+def _facts(found: Sources) -> list[Fact]:
+    spec = found.spec
+    tables: list[tuple[str, str, FloatArray, FloatArray]] = []
+    for name, triad in found.triads.items():
+        tables.append((name, getattr(spec.sensors, name).file, triad.time_s, triad.measured_sensor))
+    if found.sun is not None and spec.sensors.sun is not None:
+        some = np.isfinite(found.sun.az_el_head_rad).any(axis=(1, 2))
+        tables.append(("sun", spec.sensors.sun.file, found.sun.time_s, np.where(some, 0.0, np.nan)[:, None]))
+    for name, radar in found.radars.items():
+        tables.append((name, spec.radars[name].file, radar.time_s, radar.range_az_el))
+    for name, fixes in found.gnss.items():
+        tables.append((name, spec.gnss[name].file, fixes.time_s, fixes.position_ecef_m))
+    for name, barometer in found.barometers.items():
+        tables.append((name, spec.barometers[name].file, barometer.time_s, barometer.height_m[:, None]))
+    if found.frames is not None and spec.frames is not None:
+        tables.append(("frames", spec.frames.file, found.frames.time_s, found.frames.time_s[:, None]))
+    out = []
+    for name, file, t, values in tables:
+        rate = float(1.0 / np.median(np.diff(t))) if len(t) > 1 else np.nan
+        missing = int((~np.isfinite(values).all(axis=1)).sum())
+        out.append(Fact(name, file, len(t), float(t[0]), float(t[-1]), rate, missing))
+    return out
+
+
+def _compare(found: Sources, report: Report) -> None:
+    """Sensors against each other and against physics."""
+    report.oddities += odd_force.at_rest(found) + odd_force.lever(found)
+    trackers = odd_tracks.tracks(found)
+    for name, radar in found.radars.items():
+        report.oddities += odd_tracks.free_fall(found, name, radar)
+    for name, fixes in found.gnss.items():
+        report.oddities += odd_tracks.receiver_velocity(found, name, fixes)
+    doubted = {f.source for f in report.oddities}
+    for name in trackers:
+        if name not in doubted:
+            _against_accelerometer(found, name, report)
+    names = [name for name in trackers if name not in doubted]
+    for k, first in enumerate(names):
+        for second in names[k + 1 :]:
+            odd, clock = odd_tracks.apart(found, first, second)
+            report.oddities += odd
+            if clock is not None and clock[1] < TOLD_S:
+                report.clocks.append(Clock(second, first, *clock))
+    if names:
+        _against_place(found, names, report)
+    odd, clock = odd_field.turning_field(found)
+    report.oddities += odd
+    if clock is not None and clock[1] < TOLD_S:
+        _say_clock(report, Clock("magnetometer", "rates", *clock), found.triads["magnetometer"].time_s)
+
+
+def _against_accelerometer(found: Sources, name: str, report: Report) -> None:
+    sensed = found.triads.get("accelerometer")
+    record = odd_tracks.tracks(found)[name]
+    if sensed is None:
+        return
+    position = odd_tracks.position_of(record)
+    seen = best_comparison(record.time_s, position, sensed.time_s, sensed.measured_sensor)
+    if seen is not None and seen.misfit < FITS:
+        already = any(f.source == "accelerometer" for f in report.oddities)
+        report.oddities += [] if already else odd_force.against_track(found, name, seen)
+        if seen.lag_sd_s < TOLD_S:
+            _say_clock(report, Clock(name, "accelerometer", seen.lag_s, seen.lag_sd_s), record.time_s)
+    force = track_force(record.time_s, position, 8.0)
+    if force is not None and not any(f.source == "accelerometer" and "drag" in f.what for f in report.oddities):
+        report.oddities += odd_force.entry_axis(found, force)
+    if force is not None and not report.oddities:
+        report.oddities += odd_turning.turned_force(found, force)
+
+
+def _say_clock(report: Report, clock: Clock, time_s: FloatArray) -> None:
+    report.clocks.append(clock)
+    if abs(clock.late_s) > max(CLOCK_SD * clock.sd_s, CLOCK_S):
+        which = "later than" if clock.late_s > 0 else "earlier than"
+        words = f"its times are {which} the {clock.against}'s by {abs(clock.late_s):.3f} +- {clock.sd_s:.3f} s"
+        hint = f"; if it is the one that is wrong: time.offset_s = {-clock.late_s:.3f}"
+        report.oddities.append(Finding(clock.source, words + hint, float(time_s[0]), float(time_s[-1])))
+
+
+def _against_place(found: Sources, names: list[str], report: Report) -> None:
+    """Barometers and the magnetometer's size against the first track that is not in doubt."""
+    record = odd_tracks.tracks(found)[next((n for n in names if n in found.gnss), names[0])]
+    position = odd_tracks.position_of(record)
+    whole = np.isfinite(position).all(axis=1)
+    t, position = record.time_s[whole], position[whole]
+    height = earth.geodetic_from_ecef(position)[2]
+    for name, barometer in found.barometers.items():
+        report.oddities += odd_field.barometer_unit(found, name, barometer, t, height)
+    report.oddities += odd_field.field_size(found, t, position)

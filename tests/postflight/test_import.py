@@ -1,0 +1,325 @@
+"""`postflight import`: tables as others write them come in with the same numbers, and what is unclear is asked."""
+
+import re
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+from flightmodel.flightfolder import read_flight, read_sources
+from postflight.cli import cli
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "examples" / "range_package_01" / "telemetry"
+ANSWERS = {
+    "name": '"renamed"',
+    "t0_utc": '"2009-08-17T12:52:00Z"',
+    "latitude_deg": "37.841",
+    "longitude_deg": "-75.485",
+    "height_m": "12.0",
+    "mount": '"suba"',
+    "t_s": "300.0",
+    "azimuth_deg": "0.0",
+    "elevation_deg": "0.0",
+    "roll_deg": "0.0",
+    "drag_area_per_mass_m2pkg": "0.006",
+}
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, [str(a) for a in arguments])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture
+def folder(tmp_path):
+    run("init", tmp_path / "flight", "--vehicle", "irve2_reference")
+    return tmp_path / "flight"
+
+
+def text_of(folder):
+    return (folder / "flight.toml").read_text()
+
+
+def answer(folder, **more):
+    """Fill in what is left by its key; what has no answer stays."""
+    answers = ANSWERS | more
+    text = re.sub(
+        r'(?m)^(\w+) = "FILL IN"', lambda m: f"{m[1]} = {answers[m[1]]}" if m[1] in answers else m[0], text_of(folder)
+    )
+    (folder / "flight.toml").write_text(text)
+
+
+@pytest.fixture(scope="module")
+def original():
+    return read_sources(ROOT / "examples" / "range_package_01")
+
+
+@pytest.fixture(scope="module")
+def tables():
+    """Seconds 436 to 446 of the package: radar, accelerometer and rates."""
+    accel, rates = (pd.read_csv(PACKAGE / f"{n}.csv") for n in ("suba_accel", "rates"))
+    radar = pd.read_csv(PACKAGE / "radar_wallops_island.csv")
+    return accel.iloc[27200:29200], rates.iloc[27200:29200], radar.iloc[1300:1400]
+
+
+def written(path, table, names=None, units=None, sep=",", decimal=".", preface="", encoding="utf-8", comment=""):
+    table = table.copy()
+    table.columns = names or list(table.columns)
+    body = table.to_csv(index=False, header=False, sep=sep, decimal=decimal, lineterminator="\n")
+    head = comment + sep.join(table.columns) + "\n" + (sep.join(units) + "\n" if units else "")
+    path.write_bytes((preface + head + body).encode(encoding))
+    return path
+
+
+STYLES = {
+    "as delivered": {},
+    "underscores": {
+        "a": ["time_s", "acc_x_g", "acc_y_g", "acc_z_g"], "r": ["time_s", "w_x_deg_s", "w_y_deg_s", "w_z_deg_s"],
+        "t": ["irig_time", "slant_range_yd", "azimuth_deg", "elevation_deg"],
+    },
+    "camel case and brackets": {
+        "a": ["Time [s]", "AccX [g]", "AccY [g]", "AccZ [g]"],
+        "r": ["Time [s]", "RollRate [°/s]", "PitchRate [°/s]", "YawRate [°/s]"],
+        "t": ["GMT", "Slant Rng [yds]", "Azim [°]", "Elev [°]"],
+    },
+    "German, semicolons, decimal commas, Latin-1, a row of units": {
+        "a": ["Zeit", "Beschl_x", "Beschl_y", "Beschl_z"], "au": ["s", "g", "g", "g"],
+        "r": ["Zeit", "Drehrate_x", "Drehrate_y", "Drehrate_z"], "ru": ["s", "°/s", "°/s", "°/s"],
+        "t": ["Zeit", "Entfernung", "Azimut", "Höhenwinkel"], "tu": ["", "yd", "°", "°"],
+        "sep": ";", "decimal": ",", "encoding": "latin-1",
+    },
+    "tabs below a preface of comments, with a byte order mark": {
+        "a": ["t", "ax", "ay", "az"], "au": ["(s)", "(g)", "(g)", "(g)"],
+        "r": ["t", "wx", "wy", "wz"], "ru": ["s", "dps", "dps", "dps"],
+        "t": ["irig", "rng", "az", "el"], "tu": ["-", "yd", "deg", "deg"],
+        "sep": "\t", "preface": "# recorder 7, range 4\n# version 1.2, 3 channels\n\n", "encoding": "utf-8-sig",
+    },
+    "spaces below names in a comment": {
+        "a": ["t/s", "ax/g", "ay/g", "az/g"], "r": ["t/s", "gyro_x/dps", "gyro_y/dps", "gyro_z/dps"],
+        "t": ["IRIG", "RANGE/yd", "AZ/deg", "EL/deg"], "sep": " ", "comment": "% ",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("style", list(STYLES))
+def test_renamed_package_gives_the_same_numbers(style, folder, tables, original, tmp_path):
+    s = STYLES[style]
+    shared = {k: s[k] for k in ("sep", "decimal", "preface", "encoding", "comment") if k in s}
+    files = [
+        written(tmp_path / f"{name}.csv", table, s.get(key), s.get(f"{key}u"), **shared)
+        for name, key, table in zip(("accel", "gyro", "radar_a"), "art", tables, strict=True)
+    ]
+    run("import", *files, "--into", folder)
+    assert not re.findall(r'.*unit = "FILL IN".*', text_of(folder))
+    answer(folder)
+    # gyros that are named x, y, z ask for their mount, which is the body's here
+    text = text_of(folder)
+    head, mark, tail = text.rpartition("\n[sensors.rates]\n")
+    (folder / "flight.toml").write_text(head + mark + tail.replace('mount = "suba"', 'mount = "body"', 1))
+    flight = read_flight(folder)
+    for name, record in (("accelerometer", flight.accelerometer), ("rates", flight.rates)):
+        whole = original.triads[name]
+        rows = np.searchsorted(whole.time_s, record.time_s)
+        np.testing.assert_allclose(record.measured_sensor, whole.measured_sensor[rows], rtol=1e-12)
+        np.testing.assert_array_equal(record.spec.dcm_body_sensor, whole.spec.dcm_body_sensor)
+    (radar,) = flight.radars.values()
+    rows = np.searchsorted(original.radars["wallops_island"].time_s, radar.time_s - 1e-6)
+    np.testing.assert_allclose(radar.range_az_el, original.radars["wallops_island"].range_az_el[rows], rtol=1e-12)
+
+
+def test_matlab_vectors_give_the_same_numbers(folder, tables, tmp_path):
+    from scipy.io import savemat
+
+    accel, _, radar = tables
+    content = {"t_s": accel.iloc[:, 0].to_numpy()[:, None], "note": "flown", "single": 3.0}
+    content |= {f"acc_{a}_g": accel.iloc[:, k].to_numpy() for k, a in enumerate("xyz", start=1)}
+    savemat(tmp_path / "suba.mat", content)
+    savemat(tmp_path / "radar.mat", {"track": {"time_s": np.arange(100) * 0.1, **dict(zip(
+        ("range_yd", "az_deg", "el_deg"), radar.to_numpy()[:, 1:].T.astype(float), strict=True))}})  # fmt: skip
+    out = run("import", tmp_path / "suba.mat", tmp_path / "radar.mat", "--into", folder)
+    assert "note, single" in out.output
+    got = pd.read_csv(folder / "telemetry" / "suba.csv")
+    np.testing.assert_array_equal(got.to_numpy(), accel.to_numpy())
+    found = tomllib.loads(text_of(folder))
+    assert found["sensors"]["accelerometer"]["columns"]["ax"] == {"column": "acc_x_g", "unit": "g"}
+    assert found["radars"]["radar_track"]["columns"]["range"]["unit"] == "yd"
+
+
+def test_matlab_73_is_read_or_refused_with_the_extra(folder, tables, tmp_path, monkeypatch):
+    h5py = pytest.importorskip("h5py")
+    accel = tables[0]
+    path = tmp_path / "new.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for k, name in enumerate(("t_s", "ax_g", "ay_g", "az_g")):
+            file[name] = accel.iloc[:, k].to_numpy()[None, :]
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + path.read_bytes()[512:])
+    run("import", path, "--into", folder)
+    got = pd.read_csv(folder / "telemetry" / "new.csv")
+    np.testing.assert_array_equal(got[["t_s", "ax_g", "ay_g", "az_g"]].to_numpy(), accel.to_numpy())
+    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
+    path.rename(tmp_path / "again.mat")
+    with pytest.raises(Exception, match=r"pip install 'postflight\[matlab\]'") as fault:
+        run("import", tmp_path / "again.mat", "--into", folder)
+    assert fault.value.exit_code == 2
+
+
+# what is unclear is asked
+
+
+def frame(n=400, dt=0.01, **columns):
+    t = np.arange(n) * dt
+    return pd.DataFrame({"t_s": t} | {k: v(t) if callable(v) else np.full(n, v) for k, v in columns.items()})
+
+
+def test_units_that_numbers_cannot_tell_are_questions(folder, tmp_path):
+    wave = lambda t: 0.3 * np.sin(t)  # noqa: E731
+    frame(wx=wave, wy=wave, wz=wave).to_csv(tmp_path / "gyro.csv", index=False)
+    frame(range=1e5, az=1.0, el=0.5).to_csv(tmp_path / "radar.csv", index=False)
+    run("import", tmp_path / "gyro.csv", tmp_path / "radar.csv", "--into", folder)
+    found = tomllib.loads(text_of(folder))
+    assert all(c["unit"] == "FILL IN" for c in found["sensors"]["rates"]["columns"].values())
+    assert all(c["unit"] == "FILL IN" for c in found["radars"]["radar"]["columns"].values())
+    assert "which unit? m, cm, mm, km, yd, ft" in text_of(folder)
+    answer(folder)
+    out = run("check", folder)
+    assert out.exit_code == 2
+    assert out.output.count("still to fill in") >= 6
+
+
+@pytest.mark.parametrize(("level", "unit"), [(9.81, "mps2"), (1.001, "g"), (32.2, "ftps2"), (3.0, "FILL IN")])
+def test_accelerometer_at_rest_tells_its_unit(folder, tmp_path, level, unit):
+    frame(ax=level, ay=0.01 * level, az=0.0).to_csv(tmp_path / "imu.csv", index=False)
+    run("import", tmp_path / "imu.csv", "--into", folder)
+    assert tomllib.loads(text_of(folder))["sensors"]["accelerometer"]["columns"]["ax"]["unit"] == unit
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("utc_h", "utc_m", "utc_s"), {"format": "utc_hms", "columns": ["utc_h", "utc_m", "utc_s"]}),
+        (("time_ms",), {"column": "time_ms", "unit": "ms"}),
+        (("clock",), {"format": "utc_hms", "columns": ["clock_h", "clock_m", "clock_s"]}),
+        (("timestamp",), {"format": "utc", "column": "timestamp_utc"}),
+        (("iso",), {"format": "utc", "column": "iso"}),
+        (("gps_tow_s",), {"column": "gps_tow_s", "offset_s": "FILL IN"}),
+        (("time",), {"column": "time", "unit": "FILL IN"}),
+    ],
+)
+def test_times_in_every_form(folder, tmp_path, names, expected):
+    n = 50
+    second = np.arange(n)
+    stamps = pd.date_range("2009-08-17T12:52:00", periods=n, freq="s")
+    columns = {
+        "utc_h": 12, "utc_m": 52, "utc_s": second, "time_ms": 1000 * second, "clock": stamps.strftime("%H:%M:%S"),
+        "timestamp": 1250513520 + second, "iso": stamps.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "gps_tow_s": 130000.5 + second, "time": second,
+    }  # fmt: skip
+    table = pd.DataFrame({k: columns[k] for k in names}, index=range(n))
+    table.assign(lat_deg=37.8, lon_deg=-75.4, alt_ell_m=100.0 + second).to_csv(tmp_path / "gps.csv", index=False)
+    run("import", tmp_path / "gps.csv", "--into", folder)
+    found = tomllib.loads(text_of(folder))
+    assert found["gnss"]["gps"]["time"] == expected
+    assert found["gnss"]["gps"]["height_is"] == "ellipsoid"
+    if "FILL IN" not in expected.values():
+        answer(folder)
+        record = read_sources(folder).gnss["gps"]
+        assert np.diff(record.time_s) == pytest.approx(1.0, abs=1e-6)
+        if names[0] not in ("time_ms",):
+            assert record.time_s[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_two_of_one_sensor_are_a_question(folder, tmp_path):
+    for name in ("one", "two"):
+        frame(ax_g=1.0, ay_g=0.0, az_g=0.0).to_csv(tmp_path / f"{name}.csv", index=False)
+    run("import", tmp_path / "one.csv", tmp_path / "two.csv", "--into", folder)
+    assert "# QUESTION: [sensors.accelerometer] is there already" in text_of(folder)
+    assert tomllib.loads(text_of(folder))["sensors"]["accelerometer"]["file"] == "telemetry/one.csv"
+
+
+def test_nothing_is_overwritten_and_no_half_import_is_left(folder, tmp_path):
+    frame(ax_g=1.0, ay_g=0.0, az_g=0.0).to_csv(tmp_path / "one.csv", index=False)
+    (tmp_path / "bad.csv").write_text("nothing\nhere\n")
+    before = text_of(folder)
+    with pytest.raises(Exception, match="no table found"):
+        run("import", tmp_path / "one.csv", tmp_path / "bad.csv", "--into", folder)
+    assert text_of(folder) == before
+    assert not list((folder / "telemetry").iterdir())
+    run("import", tmp_path / "one.csv", "--into", folder)
+    with pytest.raises(Exception, match="exists already"):
+        run("import", tmp_path / "one.csv", "--into", folder)
+
+
+def test_hostile_names_stay_text(folder, tmp_path):
+    evil = 'ax"] \\ #[x] (g)'
+    table = frame(**{evil: 1.0, "ay (g)": 0.0, "az (g)": 0.0})
+    table.to_csv(tmp_path / "a.csv", index=False)
+    run("import", tmp_path / "a.csv", "--into", folder)
+    tomllib.loads(text_of(folder))
+
+
+# recorded flights, whose own flight.toml is the answer
+
+REAL = __import__("os").environ.get("POSTFLIGHT_REALDATA")
+
+
+@pytest.mark.realdata
+@pytest.mark.skipif(REAL is None, reason="POSTFLIGHT_REALDATA names no folder of recorded flights")
+@pytest.mark.parametrize(
+    "name", ["psas_l12", "euroc21_piccard", "rocketpy_prometheus", "radar_36353", "navego_synthetic"]
+)
+def test_recorded_flights_are_recognised_as_their_flight_file_has_them(name, folder, tmp_path):
+    answers = tomllib.loads((ROOT / "tests" / "data" / "real_flights" / name / "flight.toml").read_text())
+    files = {
+        s["file"] for group in ("sensors", "radars", "gnss", "barometers") for s in answers.get(group, {}).values()
+    }
+    for file in files:
+        shutil.copy(Path(str(REAL)) / name / file, tmp_path)
+    run("import", *(tmp_path / f for f in sorted(files)), "--into", folder)
+    found = tomllib.loads(text_of(folder))
+    for group in ("sensors", "radars", "gnss", "barometers"):
+        kept = {Path(s["file"]).name: s for s in found.get(group, {}).values()}
+        for key, wanted in answers.get(group, {}).items():
+            got = found["sensors"].get(key) if group == "sensors" else kept.get(wanted["file"])
+            assert got, (group, key)
+            for short, column in wanted.get("columns", {}).items():
+                asked = got.get("columns", {}).get(short, column)
+                assert asked["column"] == column["column"], (key, short)
+                assert asked["unit"] in (column["unit"], "FILL IN"), (key, short)
+
+
+def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
+    from flightmodel.checks import GateError
+    from postflight.intake.clock_columns import split_clocks
+    from postflight.intake.loose import read_loose
+    from postflight.intake.propose import propose
+    from postflight.intake.sounding_tables import radiosonde_table
+    from postflight.intake.write_mapping import section_text
+
+    rng = np.random.default_rng(7)
+    whole = [b"\n".join((PACKAGE / name).read_bytes().split(b"\n")[:30]) for name in ("rates.csv", "met_composite.csv")]
+    whole.append(b"p_hpa,h_m,T_C,Td_C,from_deg,wind_mps\n" + b"1000,116,11.2,11,30,10.8\n925,764,8,8,30,16.4\n" * 8)
+    bits = (b"", b",", b";", b'"', b"\n", b"nan", b"1e999", b"-", b"#", b"\xff", b"(g)", b"9" * 400, b"12:00:00", b"=")
+    read = 0
+    for _ in range(400):
+        content = bytearray(whole[rng.integers(len(whole))])
+        for _ in range(rng.integers(1, 6)):
+            at = int(rng.integers(len(content)))
+            content[at : at + int(rng.choice([0, 1, 3, 20]))] = bits[rng.integers(len(bits))]
+        (tmp_path / "x.csv").write_bytes(bytes(content))
+        try:
+            table = read_loose(tmp_path / "x.csv")
+        except GateError:
+            continue
+        table = radiosonde_table(table) or table
+        split_clocks(table)
+        for source in propose(table)[0]:
+            tomllib.loads(section_text(source, "telemetry/x.csv", table.notes, taken=False))
+        read += 1
+    assert read > 200
