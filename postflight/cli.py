@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -133,6 +134,88 @@ def score(folder: Path, as_json: bool) -> None:
     from postflight import commands
 
     commands.score(folder, as_json)
+
+
+@cli.group()
+def montecarlo() -> None:
+    """Fly many dispersed flights, on this machine or a cluster; kill and resume at will.
+
+    DISPERSIONS is a .toml file, or the name of a shipped one (irve2_reference). FOLDER holds one study.
+    """
+
+
+def workers_and_scheduler(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that say who flies."""
+    command = click.option(
+        "--scheduler", metavar="ADDRESS", help="Fly on the Dask cluster of this scheduler, e.g. tcp://host:8786."
+    )(command)
+    return click.option("--workers", type=click.IntRange(min=1), help="Processes here; every core by default.")(command)
+
+
+@montecarlo.command(name="run")
+@click.argument("dispersions")
+@click.argument("folder", type=FOLDER)
+@click.option("--flights", type=click.IntRange(1, 10_000_000), help="Instead of the file's number; more extend a run.")
+@click.option(
+    "--until-width", metavar="OUTPUT=WIDTH", help="Stop once the 97.7th percentile's 95 % interval is this narrow."
+)
+@workers_and_scheduler
+def montecarlo_run(
+    dispersions: str,
+    folder: Path,
+    flights: int | None,
+    until_width: str | None,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    """Fly what is missing of DISPERSIONS in FOLDER, then write percentiles, intervals and bands."""
+    from postflight.montecarlo import commands
+
+    commands.run(dispersions, folder, flights, workers, scheduler, until_width)
+
+
+@montecarlo.command(name="status")
+@click.argument("folder", type=FOLDER)
+def montecarlo_status(folder: Path) -> None:
+    """Say how many flights FOLDER holds, and why some failed."""
+    from postflight.montecarlo import commands
+
+    commands.status(folder)
+
+
+@montecarlo.command(name="merge")
+@click.argument("folder", type=FOLDER)
+def montecarlo_merge(folder: Path) -> None:
+    """Write tables and figures of FOLDER anew from its flights."""
+    from postflight.montecarlo import commands
+
+    commands.remerge(folder)
+
+
+@montecarlo.command(name="retry-failed")
+@click.argument("folder", type=FOLDER)
+@workers_and_scheduler
+def montecarlo_retry_failed(folder: Path, workers: int | None, scheduler: str | None) -> None:
+    """Fly those flights of FOLDER again that failed."""
+    from postflight.montecarlo import commands
+
+    commands.retry_failed(folder, workers, scheduler)
+
+
+@montecarlo.command(name="sobol")
+@click.argument("dispersions")
+@click.argument("folder", type=FOLDER)
+@click.option("--output", default="peak_deflection_deg", show_default=True, help="Whose indices are printed and drawn.")
+@click.option("--base", type=int, default=256, show_default=True, help="Points of the design, a power of two.")
+@click.option("--by", type=click.Choice(["factor", "section"]), default="section", show_default=True)
+@workers_and_scheduler
+def montecarlo_sobol(
+    dispersions: str, folder: Path, output: str, base: int, by: str, workers: int | None, scheduler: str | None
+) -> None:
+    """Say which dispersion of DISPERSIONS makes an output uncertain: Sobol indices, BASE x (columns + 2) flights."""
+    from postflight.montecarlo import commands
+
+    commands.sobol_indices(dispersions, folder, output, base, by, workers, scheduler)
 
 
 @cli.command()
