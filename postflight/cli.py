@@ -218,6 +218,64 @@ def montecarlo_sobol(
     commands.sobol_indices(dispersions, folder, output, base, by, workers, scheduler)
 
 
+@cli.group()
+def study() -> None:
+    """The paper's own studies, as tables and figures beside its numbers."""
+
+
+@study.command(name="table-3.1")
+@click.argument("folder", type=FOLDER, default=Path("study-table-3.1"))
+@click.option("--vehicle", default="irve2_reference", show_default=True, help="A shipped one, or a .toml file.")
+def study_table_3_1(folder: Path, vehicle: str) -> None:
+    """Stiffness and damping against frequency and share of critical damping, into FOLDER."""
+    from postflight.studies import commands
+
+    commands.stiffness_and_damping(vehicle, folder)
+
+
+def scenario_and_seed(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that say what is flown."""
+    command = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the day.")(
+        command
+    )
+    return click.option("--scenario", default="irve2_reference", show_default=True, help="A name, or a .toml file.")(
+        command
+    )
+
+
+@study.command(name="damping")
+@click.argument("folder", type=FOLDER, default=Path("study-damping"))
+@scenario_and_seed
+def study_damping(folder: Path, scenario: str, seed: int) -> None:
+    """Angle of attack with 0.5 to 20 % damping at 2.5 Hz (Figure 3.1), into FOLDER."""
+    from postflight.studies import commands
+
+    commands.damping(scenario, folder, seed)
+
+
+@study.command(name="stiffness")
+@click.argument("folder", type=FOLDER, default=Path("study-stiffness"))
+@scenario_and_seed
+def study_stiffness(folder: Path, scenario: str, seed: int) -> None:
+    """Angle of attack and normal acceleration from 2 to 4 Hz at 0.5 % (Figures 3.2, 3.3), into FOLDER."""
+    from postflight.studies import commands
+
+    commands.stiffness(scenario, folder, seed)
+
+
+@study.command(name="preflight")
+@click.argument("flight", type=FOLDER)
+@click.argument("folder", type=FOLDER, default=Path("study-preflight"))
+@click.option("--dispersions", default="irve2_reference", show_default=True, help="Whose [joint] the joint has.")
+@click.option("--flights", type=click.IntRange(50, 100_000), default=1000, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def study_preflight(flight: Path, folder: Path, dispersions: str, flights: int, seed: int) -> None:
+    """Is FLIGHT inside the bounds of its own entry, with the joint locked and flexible (Figure 1.3)? Into FOLDER."""
+    from postflight.studies import commands
+
+    commands.preflight(flight, folder, dispersions, flights, seed)
+
+
 @cli.command()
 def warmup() -> None:
     """Compile the kernels for this machine now, so that no later command waits for it."""

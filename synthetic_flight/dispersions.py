@@ -242,15 +242,18 @@ def dispersed_case(scenario: Scenario, dispersions: Dispersions, u: dict[str, fl
     flown = replace(scenario, spec=spec, vehicle=dispersed_vehicle(scenario.vehicle, of))
     # one day for all is the day of the middle of its distribution's digits, the same whatever the seed
     profile = day_atmosphere(scenario.spec.atmosphere, rng_from_draw(u.get("atmosphere.day", 0.5)))
-    scales = (
-        1.0 + of("aerodynamics.ca"),
-        1.0 + of("aerodynamics.cn"),
-        1.0 + of("aerodynamics.cm"),
-        of("aerodynamics.cmq"),
-    )
-    if min(scales[:3]) <= 0.0:
-        raise GateError(f"aerodynamics: factors {', '.join(f'{s:.3g}' for s in scales[:3])} are not all positive")
+    scales = dispersed_scales(of)
     return Case(flown, _dispersed_air(profile, of), scales)
+
+
+def dispersed_scales(of: Callable[[str], float]) -> tuple[float, float, float, float]:
+    """Return factors on C_A, C_N, C_m and the shift of C_mq from the deviations that ``of`` gives by name."""
+    ca, cn, cm = (1.0 + of(f"aerodynamics.{name}") for name in ("ca", "cn", "cm"))
+    if min(ca, cn, cm) <= 0.0:
+        raise GateError(
+            f"drawn outside what can fly: aerodynamics: factors {ca:.3g}, {cn:.3g}, {cm:.3g} on C_A, C_N, C_m"
+        )
+    return ca, cn, cm, of("aerodynamics.cmq")
 
 
 def dispersed_vehicle(vehicle: Vehicle, of: Callable[[str], float]) -> Vehicle:
