@@ -364,7 +364,7 @@ def demo(folder: Path, seed: int) -> None:
     check_destination(folder, replace=True)
     begun = time.perf_counter()
     console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
-    compile_kernels("simulator", *warmup.RECONSTRUCTION, "camera")
+    compile_kernels("simulator", "ensembles", *warmup.RECONSTRUCTION, "camera")
     simulate(REFERENCE, folder, seed, force=True)
     flight, answers, written = run_flight(folder, METHODS, 20.0)
     print_flight(flight, pd.read_csv(written / "events.csv"))

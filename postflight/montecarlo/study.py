@@ -17,7 +17,7 @@ from flightmodel.checks import ConfigError, nearest_name
 from flightmodel.config import Section, parse_section, read_toml
 from flightmodel.vehicle import DATA, Vehicle
 from postflight.montecarlo import whole
-from postflight.montecarlo.sobol import Design, design_for
+from postflight.montecarlo.design import Design, design_for
 from synthetic_flight.dispersed_ensemble import Plan, legs
 from synthetic_flight.dispersions import Dispersions, Window, draws
 from synthetic_flight.outputs import QUANTITIES, SCALARS, check_names

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from rich.markup import escape
 from rich.table import Table
 
@@ -73,7 +72,7 @@ def stiffness(scenario: str, folder: Path, seed: int) -> None:
     write_study(study, folder, "stiffness", pictures)
 
 
-def write_study(study: joints.JointStudy, folder: Path, name: str, pictures: dict[str, Figure]) -> None:
+def write_study(study: joints.JointStudy, folder: Path, name: str, pictures: dict[str, figures.Figure]) -> None:
     """Write tables and figures of a study of the joint, and print it beside the paper's words."""
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / f"{name}.csv", study.table)
