@@ -126,7 +126,7 @@ def _on_dask(study: Study, jobs: list[Job], address: str) -> Iterator[Done]:
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as fault:
         raise ConfigError(f"--scheduler {address}: no scheduler answers there: {fault}") from None
-    with client:
+    with client, client.as_current():
         shared = client.scatter(study, broadcast=True, hash=False)
         ahead = iter(jobs)
 
