@@ -161,7 +161,7 @@ def finish_sobol(study: Study, folder: Path, output: str | None = None) -> None:
     save(figures.figure_sobol(shown, title, words_of(study)), folder / "sobol.png")
     printed = Table(title=title)
     for head in ("factor", "first order", "95 %", "total", "95 %"):
-        printed.add_column(head, justify="left" if head == "factor" else "right")
+        printed.add_column(head, justify="left" if head == "factor" else "right", no_wrap=head == "factor")
     for r in shown.sort_values("total", ascending=False, kind="stable").itertuples():
         printed.add_row(
             r.factor,

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 BLUE, ORANGE = "#0072B2", "#D55E00"  # distinct in hue and in grey (Okabe and Ito)
+MOST_BARS = 15
 LABEL = {
     "alpha_total_deg": "centerbody total\nangle of attack (deg)",
     "alpha_shell_deg": "aeroshell total\nangle of attack (deg)",
@@ -52,7 +53,8 @@ def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
 
 def figure_sobol(table: pd.DataFrame, title: str, synthetic: str) -> Figure:
     """First-order and total indices with their intervals, the largest total on top."""
-    table = table.sort_values("total", kind="stable")
+    left_out = max(0, len(table) - MOST_BARS)
+    table = table.sort_values("total", kind="stable").tail(MOST_BARS)
     place = np.arange(len(table))
     figure = Figure(figsize=(7.2, 0.36 * len(table) + 1.6), layout="constrained")
     ax = figure.subplots()
@@ -64,7 +66,8 @@ def figure_sobol(table: pd.DataFrame, title: str, synthetic: str) -> Figure:
         ax.errorbar(table[name], place + 0.2 * (2 * k - 1), xerr=[low, high], fmt="none", ecolor="0.25", lw=0.9)
     ax.set_yticks(place, table["factor"], fontsize=8)
     ax.axvline(0.0, color="0.3", lw=0.8)
-    ax.set_xlabel("share of the variance (bars) and 95 % interval (lines)")
+    more = f"; {left_out} factors with smaller totals are not shown" if left_out else ""
+    ax.set_xlabel(f"share of the variance (bars) and 95 % interval (lines){more}")
     ax.grid(alpha=0.3, axis="x")
     ax.spines[["top", "right"]].set_visible(False)
     ax.legend(fontsize=8, frameon=False, loc="lower right")
