@@ -50,21 +50,24 @@ def figure_table_3_1(table: pd.DataFrame, synthetic: str) -> Figure:
 
 
 def figure_joints(study: JointStudy, quantity: str, label: str, title: str, synthetic: str) -> Figure:
-    """One quantity of every flight of a study over time; a flight that leaves the axes says so in the legend."""
+    """One quantity of every flight of a study over time, up to a tumble; the legend names those beyond the axis."""
     figure = Figure(figsize=(7.2, 4.4), layout="constrained")
     ax = figure.subplots()
     largest = 0.0
+    highest, beyond = HIGHEST[quantity], []
     for k, flight in enumerate(study.flights):
-        values = getattr(flight, quantity)
-        name = f"{flight.label}, joint diverged at {flight.time_s[-1]:.1f} s" if flight.diverged else flight.label
-        ax.plot(flight.time_s, values, color=COLOURS[k], ls=STROKES[k], lw=1.6 if k == 0 else 1.2, label=name)
+        tumbling = flight.alpha_total_deg > 90.0
+        shown = int(np.argmax(tumbling)) if tumbling.any() else len(tumbling)
+        values = getattr(flight, quantity)[:shown]
+        name = f"{flight.label}, tumbles at {flight.time_s[shown]:.1f} s" if tumbling.any() else flight.label
+        ax.plot(flight.time_s[:shown], values, color=COLOURS[k], ls=STROKES[k], lw=1.6 if k == 0 else 1.2, label=name)
         largest = max(largest, float(np.max(values)))
-    highest = HIGHEST[quantity]
+        if np.max(values) > highest:
+            beyond.append(flight.label)
     ax.axvline(study.peak_s, color="0.5", lw=0.8, ls=":")
     ax.set(xlabel="time after launch (s); dotted: peak dynamic pressure", ylabel=label)
     ax.set_ylim(0.0, min(highest, 1.15 * largest))
     ax.set_xlim(study.flights[0].time_s[0], study.flights[0].time_s[-1])
-    beyond = [f.label for f in study.flights if np.max(getattr(f, quantity)) > highest]
     _tidy(ax)
     note = f"beyond the axis: {', '.join(beyond)}" if beyond else None
     ax.legend(fontsize=8, frameon=False, loc="upper left", title=note, title_fontsize=7)
