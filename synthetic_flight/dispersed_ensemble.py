@@ -91,14 +91,19 @@ def fly_runs(plan: Plan, runs: list[int], draws_of: Callable[[int], dict[str, fl
         try:
             case = dispersed_case(plan.scenario, plan.dispersions, draws_of(run))
             waiting.append((run, case, start_of(case, schedules[-1].step_s, locked)))
-        except GateError as fault:
-            out[run] = _failed(plan, run, str(fault))
+        except Exception as fault:  # one flight's defect must not cost the others: its row says what
+            out[run] = _failed(plan, run, reason_of(fault))
         if len(waiting) == LANES:
             _fly(plan, waiting, schedules, out)
             waiting = []
     if waiting:
         _fly(plan, waiting, schedules, out)
     return [out[run] for run in runs]
+
+
+def reason_of(fault: Exception) -> str:
+    """Return why a flight failed: a refusal's own words, any other fault's with its kind."""
+    return str(fault) if isinstance(fault, GateError) else f"{type(fault).__name__}: {fault}"
 
 
 def _failed(plan: Plan, run: int, reason: str) -> Row:

@@ -66,6 +66,8 @@ def finish(study: Study, folder: Path, flights: int) -> Merged:
     if len(merged.bands):
         save(figures.figure_bands(merged.bands, title, words_of(study)), folder / "bands.png")
     print_merged(merged, folder)
+    if merged.summary["failed"] == flights:
+        raise GateError(f"{folder}: every flight failed; the first: {merged.flights['reason'].iloc[0]}")
     return merged
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flightmodel.checks import GateError
-from synthetic_flight.dispersed_ensemble import Plan, Row
+from synthetic_flight.dispersed_ensemble import Plan, Row, reason_of
 from synthetic_flight.dispersions import Dispersions
 
 METHODS = ("misalignment", "trim", "fused")
@@ -42,8 +41,8 @@ def fly_whole(plan: Plan, seed: int, runs: list[int]) -> list[Row]:
     for run in runs:
         try:
             found, reason = trial(plan, seed, run), ""
-        except GateError as fault:
-            found, reason = dict.fromkeys(SCALARS, np.nan), str(fault)
+        except Exception as fault:  # one flight's defect must not cost the others: its row says what
+            found, reason = dict.fromkeys(SCALARS, np.nan), reason_of(fault)
         kept = {name: found[name] for name in plan.scalars}
         rows.append(Row(run, reason, np.nan, kept, np.empty((0, len(plan.window.history_time_s())))))
     return rows

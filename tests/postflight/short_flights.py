@@ -38,13 +38,16 @@ density = { normal = 0.02 }
 """
 
 
-def write_short(folder, text=DISPERSIONS):
+SHORT = {
+    "start_s": 400.0, "stop_s": 412.0, "inflated_s": 401.0, "telemetry_from_s": 402.0, "altitude_m": 80000.0,
+    "speed_mps": 1600.0, "flight_path_deg": -76.5, "nose_elevation_deg": -78.0, "t_s": 402.0,
+}  # fmt: skip
+ENTRY = {"stop_s": 465.0, "telemetry_from_s": 380.0, "t_s": 380.0}  # the reference flight's own, for whole trials
+
+
+def write_short(folder, text=DISPERSIONS, changes=SHORT):
     """Write scenario and dispersions file; return the latter's path."""
     spec = (DATA / "scenarios" / "irve2_reference.toml").read_text()
-    changes = {
-        "start_s": 400.0, "stop_s": 412.0, "inflated_s": 401.0, "telemetry_from_s": 402.0, "altitude_m": 80000.0,
-        "speed_mps": 1600.0, "flight_path_deg": -76.5, "nose_elevation_deg": -78.0, "t_s": 402.0,
-    }  # fmt: skip
     for key, value in changes.items():
         spec = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", spec, count=1)
     spec = re.sub(r"(?ms)^\[video\].*?(?=^\[)", "", spec)

@@ -14,14 +14,15 @@ import pytest
 from scipy.stats import binom
 
 from flightmodel.checks import ConfigError, GateError
-from postflight.montecarlo import execution, intervals, running, whole
+from flightmodel.vehicle import DATA
+from postflight.montecarlo import commands, execution, intervals, running, whole
 from postflight.montecarlo.chunks import PARTIAL, chunk_path, read_chunk
 from postflight.montecarlo.merge import coverage, merge, write_merged
 from postflight.montecarlo.running import Wanted, status, study_of
 from postflight.montecarlo.study import Stop, read_study
 from synthetic_flight import dispersed_ensemble
 
-from .short_flights import DISPERSIONS, write_short
+from .short_flights import DISPERSIONS, ENTRY, write_short
 
 FLIGHTS = 24
 PARTIAL_GLOB = f".*{PARTIAL}"
@@ -238,14 +239,16 @@ def test_a_failed_flight_is_a_row_and_can_be_flown_again(reference, path, tmp_pa
     seen = iter(range(FLIGHTS))
 
     def unlucky(*arguments):
-        if next(seen) in (5, 6, 20):
+        if (k := next(seen)) in (5, 6):
             raise GateError("out of luck")
+        if k == 20:
+            raise ZeroDivisionError("a defect")
         return case(*arguments)
 
     monkeypatch.setattr(dispersed_ensemble, "dispersed_case", unlucky)
     fly(path, folder)
     found = status(folder)
-    assert found.failed == {"out of luck": 3}
+    assert found.failed == {"out of luck": 2, "ZeroDivisionError: a defect": 1}
     table = pd.read_csv(folder / "flights.csv")
     assert table[table["reason"].notna()]["run"].tolist() == [5, 6, 20]
     assert table.loc[5, "peak_deflection_deg"] != table.loc[5, "peak_deflection_deg"]
@@ -256,6 +259,27 @@ def test_a_failed_flight_is_a_row_and_can_be_flown_again(reference, path, tmp_pa
     assert running.retry_failed(study, folder, Wanted(flights), quiet) == (3, 0)
     write_merged(folder, merge(study, folder, flights))
     assert content(folder) == reference
+
+
+def test_a_study_of_failures_alone_is_an_error(tmp_path):
+    path = write_short(tmp_path, DISPERSIONS.replace("normal = 0.07", "uniform = [-3.0, -2.0]"))
+    with pytest.raises(GateError, match="every flight failed; the first: drawn outside what can fly"):
+        commands.run(str(path), tmp_path / "study", 6, 1, None, None)
+    assert len(pd.read_csv(tmp_path / "study" / "flights.csv")) == 6
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("peak_deflection_deg", "OUTPUT=WIDTH is wanted"),
+        ("peak_deflection_deg=-1", "OUTPUT=WIDTH is wanted"),
+        ("peak_deflection=1", "did you mean 'peak_deflection_deg'"),
+    ],
+)
+def test_a_wrong_width_is_refused(path, tmp_path, text, words):
+    with pytest.raises(ConfigError) as refused:
+        commands.run(str(path), tmp_path / "study", 6, 1, None, text)
+    assert words in str(refused.value)
 
 
 def test_intervals_cover_as_order_statistics_say():
@@ -323,8 +347,10 @@ def test_coverage_counts_errors_by_their_own_bars():
 
 @pytest.mark.slow
 def test_a_whole_trial_recovers_its_truth(tmp_path):
-    """From the dispersed truth through telemetry to the estimators; same numbers twice."""
-    study = read_study("irve2_whole")
+    """From the dispersed truth through telemetry to the estimators."""
+    shipped = (DATA / "dispersions" / "irve2_whole.toml").read_text()
+    text = shipped.replace('scenario = "irve2_reference"', 'scenario = "short.toml"')
+    study = read_study(str(write_short(tmp_path, text, ENTRY)))
     rows = whole.fly_whole(replace(study.plan, scalars=whole.SCALARS), 3, [1])
     found = rows[0].scalars
     assert rows[0].reason == ""
