@@ -2,9 +2,9 @@
 
 Run: ``python benchmarks/monte_carlo_scale.py [FLIGHTS]`` (512) for throughput and overhead in one run, in turn;
 ``python benchmarks/monte_carlo_scale.py memory [FLIGHTS]`` (10000) for the peak memory of a study with bands, in one
-process and in two. Flights are those of the shipped ``irve2_reference`` dispersions. Wall time counts from the first
-chunk that comes back, once every worker has come up; processor time is the workers', as the system counts it. Where
-others use the machine, compare processor times: two workers on two free cores take half of theirs.
+process and in two. Flights are those of the shipped ``irve2_reference`` dispersions. Each case is flown with few
+flights and with FLIGHTS more; what is printed is the difference, so that starting processes and importing drop out.
+Where others use the machine, compare processor times: two workers on two free cores take half of one worker's time.
 """
 
 import json
@@ -16,94 +16,78 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
 from postflight.montecarlo import execution, running
 from postflight.montecarlo.merge import merge, write_merged
 from postflight.montecarlo.running import Wanted
 from postflight.montecarlo.study import read_study
 
 DISPERSIONS = "irve2_reference"
-ROUNDS = 2
 
 
 def jobs_of(study, flights):
     return [(k, study.runs_of(k, flights)) for k in range(study.chunks(flights))]
 
 
-def cpu_s():
-    """Processor seconds of this process and of its ended children, apart."""
-    own, ended = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
-    return own.ru_utime + own.ru_stime, ended.ru_utime + ended.ru_stime
+def cost(stream_of, study, flights):
+    """Wall seconds, processor seconds of ended children and of this process, for so many flights."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    wall, own = time.perf_counter(), time.process_time()
+    took, count = stream_of(study, jobs_of(study, flights))
+    assert count == flights
+    now = resource.getrusage(resource.RUSAGE_CHILDREN)
+    children = now.ru_utime + now.ru_stime - ended.ru_utime - ended.ru_stime
+    return np.array([took or time.perf_counter() - wall, children, time.process_time() - own])
 
 
-def child_cpu_s():
-    """Processor seconds of all live children and theirs, from /proc."""
-    parents, times = {}, {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                fields = (entry / "stat").read_text().rpartition(")")[2].split()
-            except OSError:
-                continue
-            parents[int(entry.name)] = int(fields[1])
-            times[int(entry.name)] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+def in_processes(workers):
+    def flown(study, jobs):
+        return None, sum(len(chunk.runs) for _, chunk in execution._in_processes(study, jobs, workers))
 
-    def below(pid):
-        return pid == os.getpid() or (pid in parents and below(parents[pid]))
-
-    return sum(t for pid, t in times.items() if pid != os.getpid() and below(pid))
+    return flown
 
 
-def paced(stream, skip):
-    """Flights, wall, workers' and own processor seconds from the ``skip``-th chunk on."""
-    count, begun = 0, None
-    for k, (_, chunk) in enumerate(stream):
-        now = time.perf_counter(), child_cpu_s(), time.process_time()
-        if begun is not None:
-            count += len(chunk.runs)
-            ended = now
-        elif k + 1 == skip:
-            begun = now
-    return (count, *(b - a for a, b in zip(begun, ended, strict=True)))
+def on_dask(workers):
+    from distributed import LocalCluster
 
+    def flown(study, jobs):
+        with LocalCluster(workers, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+            begun = time.perf_counter()
+            count = sum(len(c.runs) for _, c in execution._on_dask(study, jobs, cluster.scheduler_address))
+            took = time.perf_counter() - begun
+        return took, count
 
-def report(name, found):
-    flights, wall, workers, own = found
-    rate, each = flights / wall, 1e3 * workers / flights
-    print(
-        f"  {name:34s}{rate:7.1f} flights/s, {each:6.2f} ms of processor a flight, driver {1e3 * own / flights:.3f} ms"
-    )
-    return rate, each, 1e3 * own / flights
+    return flown
 
 
 def scaling(flights):
-    from distributed import LocalCluster
-
     study = read_study(DISPERSIONS)
-    jobs = jobs_of(study, flights)
     execution.fly_chunk(study, (0, [0]))  # compiled
     print(f"{flights} flights a case, chunks of {study.spec.chunk}; load before {os.getloadavg()[0]:.1f}")
-    kept = {}
-    for _ in range(ROUNDS):
-        found = {
-            "one process": paced(execution._in_processes(study, jobs, 1), 2),
-            "two processes": paced(execution._in_processes(study, jobs, 2), 4),
-        }
-        for workers in (1, 2):
-            with LocalCluster(workers, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
-                stream = execution._on_dask(study, jobs, cluster.scheduler_address)
-                found[f"Dask, {workers} worker{'s' * (workers > 1)}"] = paced(stream, 2 * workers)
-        for name, one in found.items():
-            if name not in kept or one[1] / one[0] < kept[name][1] / kept[name][0]:
-                kept[name] = one
-    rows = {name: report(name, one) for name, one in kept.items()}
-    (one, one_cpu, _), (two, two_cpu, driver) = rows["one process"], rows["two processes"]
-    print(f"two processes over one: {two / one:.2f} by the clock, {2 * one_cpu / two_cpu:.2f} by processor time")
-    print(f"own driver: {100 * driver / two_cpu:.1f} % of the flights' processor time")
-    for name in ("Dask, 1 worker", "Dask, 2 workers"):
-        base = one_cpu if "1" in name else two_cpu
-        _, each, driver = rows[name]
+    cases = {
+        "one process": (1, in_processes(1)),
+        "two processes": (2, in_processes(2)),
+        "Dask, one worker": (1, on_dask(1)),
+        "Dask, two workers": (2, on_dask(2)),
+    }
+    each = {}
+    for name, (workers, stream_of) in cases.items():
+        few = workers * study.spec.chunk
+        wall, children, own = (cost(stream_of, study, few + flights) - cost(stream_of, study, few)) / flights
+        each[name] = wall, children, own
         print(
-            f"{name}: workers {100 * (each / base - 1):+.1f} %, scheduler and driver {100 * driver / each:.1f} % (< 10)"
+            f"  {name:20s}{1 / wall:7.1f} flights/s; processor a flight: workers {1e3 * children:6.2f} ms, driver (and "
+            f"scheduler) {1e3 * own:.3f} ms",
+            flush=True,
+        )
+    one, two = each["one process"], each["two processes"]
+    print(f"two processes over one: {one[0] / two[0]:.2f} by the clock, {2 * one[1] / two[1]:.2f} by processor time")
+    for name, base in (("one", one), ("two", two)):
+        dask = each[f"Dask, {name} worker{'s' * (name == 'two')}"]
+        print(
+            f"{name} worker's driver: {100 * base[2] / base[1]:.1f} % of the flights' processor time; with Dask "
+            f"{100 * dask[2] / base[1]:.1f} %, and its workers take {100 * (dask[1] / base[1] - 1):+.1f} %"
         )
 
 

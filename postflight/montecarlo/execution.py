@@ -28,6 +28,7 @@ Job = tuple[int, list[int]]
 Done = tuple[int, Chunk]
 AHEAD = 2  # chunks a worker has or waits for: enough that none waits, few enough that results do not pile up
 CONNECT_S = 20
+END_S = 5.0  # within which an ended worker process is gone
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -52,13 +53,8 @@ def fly_jobs(study: Study, jobs: list[Job], workers: int, scheduler: str | None)
         yield from _in_processes(study, jobs, min(workers, len(jobs)))
 
 
-_study: Study | None = None
-
-
-def _begin(study: Study) -> None:
+def _begin() -> None:
     """Prepare a worker process: Ctrl-C is its parent's to handle, and it does not outlive its parent."""
-    global _study
-    _study = study
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -69,11 +65,6 @@ def _begin(study: Study) -> None:
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
-
-
-def _fly(job: Job) -> Done:
-    assert _study is not None
-    return fly_chunk(_study, job)
 
 
 @contextmanager
@@ -95,16 +86,17 @@ def _in_processes(study: Study, jobs: list[Job], workers: int) -> Iterator[Done]
     ahead = iter(jobs)
     # spawned, not forked: a fork copies locks that threads of this process may hold
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(study,))
+    # the study goes with every job: given at the start, it would fill the pipe and let workers start one by one
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
     begun = multiprocessing.active_children()
     try:
         with _one_thread_each():
-            waiting: set[Future[Done]] = {pool.submit(_fly, job) for job in islice(ahead, AHEAD * workers)}
+            waiting: set[Future[Done]] = {pool.submit(fly_chunk, study, job) for job in islice(ahead, AHEAD * workers)}
         while waiting:
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
-                waiting |= {pool.submit(_fly, job) for job in islice(ahead, 1)}
+                waiting |= {pool.submit(fly_chunk, study, job) for job in islice(ahead, 1)}
     except BrokenProcessPool:
         raise GateError(
             "a worker process was ended from outside (out of memory?); every finished chunk is kept: the same command "
@@ -112,9 +104,11 @@ def _in_processes(study: Study, jobs: list[Job], workers: int) -> Iterator[Done]
         ) from None
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            if process not in begun:
-                process.terminate()
+        ours = [process for process in multiprocessing.active_children() if process not in begun]
+        for process in ours:
+            process.terminate()
+        for process in ours:
+            process.join(END_S)
 
 
 def _on_dask(study: Study, jobs: list[Job], address: str) -> Iterator[Done]:
@@ -127,12 +121,12 @@ def _on_dask(study: Study, jobs: list[Job], address: str) -> Iterator[Done]:
     except (OSError, ValueError, TimeoutError) as fault:
         raise ConfigError(f"--scheduler {address}: no scheduler answers there: {fault}") from None
     with client, client.as_current():
-        shared = client.scatter(study, broadcast=True, hash=False)
         ahead = iter(jobs)
 
         def submit(count: int) -> list[Any]:
-            # a chunk whose worker is lost is flown again elsewhere by the scheduler
-            return [client.submit(fly_chunk, shared, job, pure=False) for job in islice(ahead, count)]
+            # a chunk whose worker is lost is flown again elsewhere by the scheduler; the study goes with every one, as
+            # data that were sent once would be lost with the last worker that holds them
+            return [client.submit(fly_chunk, study, job, pure=False) for job in islice(ahead, count)]
 
         threads = max(1, sum(client.nthreads().values()))
         going = as_completed(submit(AHEAD * threads))
