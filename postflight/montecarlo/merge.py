@@ -19,7 +19,7 @@ from postflight.montecarlo.chunks import Chunk, read_chunk
 from postflight.montecarlo.intervals import percentile_interval
 from postflight.montecarlo.study import CONFIDENCE, PERCENTILES, Study
 
-BAND_BYTES = 128 * 1024**2
+BAND_BYTES = 256 * 1024**2
 DIGITS = "%.10g"
 
 
