@@ -166,7 +166,7 @@ def run_flight(
         share = 0.2 if reruns else 1.0  # of the time, for all but the reruns
         step(0.0, 0.05 * share)(0.0, "reading telemetry")
         telemetry = read_flight(folder)
-        compile_kernels(*warmup.RECONSTRUCTION, "simulator", *(["camera"] if "camera" in methods else []))
+        compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *(["camera"] if "camera" in methods else []))
         flight = reconstruct_telemetry(
             telemetry, Settings(output_rate_hz=rate_hz, pulse_rate_hz=PULSE_RATE_HZ), step(0.05 * share, 0.5 * share)
         )
@@ -370,7 +370,7 @@ def demo(folder: Path, seed: int) -> None:
     check_destination(folder, replace=True)
     begun = time.perf_counter()
     console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
-    compile_kernels("simulator", *warmup.RECONSTRUCTION, "camera")
+    compile_kernels("simulator", "ensembles", *warmup.RECONSTRUCTION, "camera")
     simulate(REFERENCE, folder, seed, force=True)
     flight, answers, written = run_flight(folder, METHODS, 20.0)
     print_flight(flight, pd.read_csv(written / "events.csv"))

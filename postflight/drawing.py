@@ -20,13 +20,13 @@ from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
 from postflight import figures
 from postflight.pipeline import Answers, Flight
-from postflight.preflight import RigidBounds, rigid_bounds
+from postflight.preflight import Bounds, rigid_bounds
 from postflight.product import figures as product_figures
 
 Report = Callable[[float, str], None]
 
 
-def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> RigidBounds | None:
+def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> Bounds | None:
     """Draw everything that the run's answers allow; return the rigid vehicle's bands where it was flown."""
     bounds = None
     if flight.pulse is not None:

@@ -16,7 +16,7 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
 from postflight.pipeline import Answers, Flight
-from postflight.preflight import RigidBounds
+from postflight.preflight import Bounds
 
 # distinct in hue and in grey (Okabe and Ito)
 COLOUR = {
@@ -57,7 +57,7 @@ def _window(flight: Flight) -> tuple[float, float]:
     return float(max(first, flight.air.time_s[0])), float(min(last, flight.air.time_s[-1]))
 
 
-def figure_1_3(flight: Flight, bounds: RigidBounds) -> Figure:
+def figure_1_3(flight: Flight, bounds: Bounds) -> Figure:
     """Total angle of attack and normal acceleration against a rigid vehicle's Monte Carlo bounds (Figure 1.3)."""
     figure = Figure(figsize=(7.2, 7.0), layout="constrained")
     upper, lower = _axes(figure, 2)

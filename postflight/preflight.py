@@ -1,8 +1,9 @@
-"""What a rigid vehicle would have done: the pre-flight view that the flight is held against (seed paper Figure 1.3).
+"""What the vehicle would have done by all that was known before: the view that the flight is held against (Figure 1.3).
 
-The vehicle with its joint locked is flown many times from the reconstructed state above the atmosphere, with mass
-properties, coefficients, damping, density, winds and start attitude dispersed by their pre-flight uncertainty. Unlike
-a true pre-flight study it does not disperse the launch, so its bands are about this flight's own entry.
+The vehicle is flown many times from the reconstructed state above the atmosphere, with mass properties, coefficients,
+damping, density, winds and start attitude dispersed by their pre-flight uncertainty: with its joint locked, as before
+the paper's reconciliation, or with a flexible joint that is dispersed too, as after it. Unlike a true pre-flight study
+(`postflight montecarlo`) it does not disperse the launch, so its bands are about this flight's own entry.
 """
 
 from __future__ import annotations
@@ -15,24 +16,43 @@ import pandas as pd
 
 from flightmodel import rotations
 from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.trajectory import resample
-from flightmodel.vehicle import Vehicle
+from flightmodel.vehicle import Uncertainty, Vehicle
 from postflight.pipeline import Flight
 from synthetic_flight import packing
 from synthetic_flight.day_air import correlated
-from synthetic_flight.simulate import integrate, state_from_ecef
+from synthetic_flight.dispersions import (
+    AeroDispersions,
+    Dispersions,
+    Factor,
+    JointDispersions,
+    MassDispersions,
+    Shift,
+    dispersed_scales,
+    dispersed_vehicle,
+    draw_one,
+    draws,
+    rng_from_draw,
+)
+from synthetic_flight.ensemble import LANES, Flown, Schedule, Start, fly_legs
+from synthetic_flight.outputs import Records
+from synthetic_flight.simulate import state_from_ecef
+from synthetic_flight.step_size import check_step
 
 START_ALTITUDE_M = 100e3
 # the rigid vehicle's fastest motion is its pitch at 1 Hz; fourth-order steps of 10 ms hold it to 1e-6
-STEP_S, RECORD_S, SPAN_S = 0.01, 0.05, 70.0
+RIGID_STEP_S, FLEXIBLE_STEP_S, RECORD_S, SPAN_S = 0.01, 0.005, 0.05, 70.0
 PERCENTILES = (2.3, 50.0, 97.7)
-CMQ_SD = 0.15
+Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
-class RigidBounds:
-    """Percentile bands ``(3, n)`` of a rigid vehicle, and the nominal flight ``(n,)``."""
+class Bounds:
+    """Percentile bands ``(3, n)`` of dispersed entries, and the nominal one ``(n,)``; a flight that ended early holds.
+
+    ``ended`` of ``flights`` did not reach the end: their joint passed 90 deg.
+    """
 
     time_s: FloatArray
     alpha_total_deg: FloatArray
@@ -40,6 +60,7 @@ class RigidBounds:
     nominal_alpha_deg: FloatArray
     nominal_normal_g: FloatArray
     flights: int
+    ended: int = 0
 
     def table(self) -> pd.DataFrame:
         """Return the bands as columns, for ``rigid_bounds.csv``."""
@@ -53,80 +74,143 @@ class RigidBounds:
         return pd.DataFrame(columns).assign(flights=self.flights)
 
 
-def rigid_bounds(
-    flight: Flight, flights: int = 100, seed: int = 0, progress: Callable[[float, str], None] | None = None
-) -> RigidBounds:
+def dispersions_of(known: Uncertainty, joint: JointDispersions | None) -> Dispersions:
+    """Dispersions that a vehicle's file states; with a flexible joint where its own are given."""
+
+    def normal(sd: float) -> Factor:
+        return Factor(normal=sd)
+
+    def shift(sd: float) -> Shift:
+        return Shift(normal=sd)
+
+    return Dispersions(
+        joint_is="locked" if joint is None else "flexible",
+        mass=MassDispersions(
+            aeroshell_mass=normal(known.mass),
+            centerbody_mass=normal(known.mass),
+            aeroshell_inertia=normal(known.inertia),
+            centerbody_inertia=normal(known.inertia),
+            aeroshell_cg_station_m=shift(known.cg_station_m),
+            centerbody_cg_station_m=shift(known.cg_station_m),
+            offset_y_m=shift(known.cg_lateral_m),
+            offset_z_m=shift(known.cg_lateral_m),
+        ),
+        aerodynamics=AeroDispersions(
+            ca=normal(known.ca), cn=normal(known.cn), cm=normal(known.cm), cmq=shift(known.cmq)
+        ),
+        joint=joint or JointDispersions(),
+    )
+
+
+def rigid_bounds(flight: Flight, flights: int = 100, seed: int = 0, progress: Progress | None = None) -> Bounds:
     """Fly the rigid vehicle ``flights`` times; run ``k`` is the same flight whatever the number."""
+    return entry_bounds(flight, None, flights, seed, progress)
+
+
+def entry_bounds(
+    flight: Flight,
+    joint: JointDispersions | None,
+    flights: int = 100,
+    seed: int = 0,
+    progress: Progress | None = None,
+    vehicle: Vehicle | None = None,
+) -> Bounds:
+    """Fly the flight's own entry ``flights`` times.
+
+    Parameters
+    ----------
+    flight : Flight
+        With a vehicle; its reconstruction gives the start, its sounding the air.
+    joint : JointDispersions or None
+        What is uncertain of the joint; None locks it.
+    vehicle : Vehicle, optional
+        Flown instead of the one that the flight's analyst was told, such as a reconciled one.
+
+    Raises
+    ------
+    GateError
+        Where the reconstruction never comes below 100 km, or a draw cannot fly.
+    """
     report = progress or (lambda _fraction, _what: None)
-    air = flight.air
-    below = np.flatnonzero((air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0))
-    if not len(below):
-        raise GateError("pre-flight bounds: the reconstruction never comes below 100 km")
-    start_s = float(air.time_s[below[0]])
-    vehicle, profile = flight.telemetry.required_vehicle(), profile_from_sounding(flight.telemetry.sounding)
-    records = round(min(SPAN_S, air.time_s[-1] - start_s) / RECORD_S)
-    alpha, normal = np.full((flights, records), np.nan), np.full((flights, records), np.nan)
-    nominal = _fly(flight, vehicle, profile, start_s, records, np.zeros(3))
-    for k in range(flights):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(k,)))
-        turn = rng.standard_normal(3) * _attitude_sd(flight, start_s)
-        alpha[k], normal[k] = _fly(flight, _disperse(vehicle, rng), _disperse_air(profile, rng), start_s, records, turn)
-        report((k + 1) / flights, f"rigid flight {k + 1} of {flights}")
-    return RigidBounds(
-        time_s=start_s + RECORD_S * np.arange(records),
-        alpha_total_deg=np.nanpercentile(alpha, PERCENTILES, axis=0),
-        normal_g=np.nanpercentile(normal, PERCENTILES, axis=0),
+    entry = _Entry(flight, vehicle or flight.telemetry.required_vehicle(), joint)
+    nominal = entry.fly([entry.start(None)])[0]
+    alpha, normal = np.empty((2, flights, entry.records))
+    ended = 0
+    what = "rigid" if joint is None else "flexible"
+    for first in range(0, flights, LANES):
+        runs = range(first, min(first + LANES, flights))
+        for k, found in zip(runs, entry.fly([entry.start((seed, run)) for run in runs]), strict=True):
+            alpha[k], normal[k], diverged = found
+            ended += diverged
+        report(runs.stop / flights, f"{what} flight {runs.stop} of {flights}")
+    return Bounds(
+        time_s=entry.start_s + RECORD_S * np.arange(entry.records),
+        alpha_total_deg=np.percentile(alpha, PERCENTILES, axis=0),
+        normal_g=np.percentile(normal, PERCENTILES, axis=0),
         nominal_alpha_deg=nominal[0],
         nominal_normal_g=nominal[1],
         flights=flights,
+        ended=ended,
     )
 
 
-def _attitude_sd(flight: Flight, at_s: float) -> FloatArray:
-    sd = resample(flight.reconstruction.smoothed, np.array([at_s])).sd()[0, 6:9]
-    return np.asarray(sd)
+def inside(time_s: FloatArray, values: FloatArray, bounds: Bounds, band: FloatArray) -> BoolArray:
+    """Whether values at times lie between the outer percentiles of a band ``(3, n)`` of ``bounds``."""
+    low, high = (np.interp(time_s, bounds.time_s, band[k]) for k in (0, 2))
+    return np.asarray((values >= low) & (values <= high))
 
 
-def _fly(
-    flight: Flight, vehicle: Vehicle, profile: AtmosphereProfile, start_s: float, records: int, turn_rad: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Total angle of attack, deg, and normal acceleration, g, of one rigid flight."""
-    start = resample(flight.reconstruction.smoothed, np.array([start_s]))
-    q = rotations.boxplus(start.q_ecef_body[0], turn_rad)
-    arm = rotations.rotate(q, vehicle.cg_m)
-    omega = start.omega_body_eci_body_radps[0]
-    state = state_from_ecef(start_s, start.position_ecef_m[0] + arm, start.velocity_ecef_mps[0], q, omega)
-    per_record = round(RECORD_S / STEP_S)
-    states, aux = integrate(vehicle, packing.atmosphere_table(profile), state, STEP_S, per_record, records, records)
-    force_body = rotations.rotate(rotations.conjugate(states[:, 6:10]), aux[:, 12:15])
-    out = np.full((2, records), np.nan)
-    out[0, : len(aux)] = np.rad2deg(aux[:, 4])
-    out[1, : len(aux)] = np.hypot(force_body[:, 1], force_body[:, 2]) / vehicle.mass_kg / 9.80665
-    return out[0], out[1]
+class _Entry:
+    """The entry of one flight, ready to be flown from dispersed starts."""
+
+    def __init__(self, flight: Flight, vehicle: Vehicle, joint: JointDispersions | None) -> None:
+        air = flight.air
+        below = np.flatnonzero((air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0))
+        if not len(below):
+            raise GateError("pre-flight bounds: the reconstruction never comes below 100 km")
+        self.start_s = float(air.time_s[below[0]])
+        self.records = round(min(SPAN_S, air.time_s[-1] - self.start_s) / RECORD_S)
+        self.vehicle, self.locked = vehicle, joint is None
+        self.dispersions = dispersions_of(vehicle.uncertainty, joint)
+        self.profile = profile_from_sounding(flight.telemetry.sounding)
+        self.at_start = resample(flight.reconstruction.smoothed, np.array([self.start_s]))
+        step = RIGID_STEP_S if self.locked else FLEXIBLE_STEP_S
+        self.schedule = Schedule(step, round(RECORD_S / step), self.records, self.records if self.locked else 0)
+
+    def start(self, run: tuple[int, int] | None) -> tuple[Start, Vehicle]:
+        """Start and vehicle of one run, given as seed and number; None is the nominal one."""
+        vehicle, scales, profile, turn = self.vehicle, (1.0, 1.0, 1.0, 0.0), self.profile, np.zeros(3)
+        if run is not None:
+            u = draws(self.dispersions, *run)
+            deviation = {name: law.at(u[name]) for name, law in self.dispersions.factors().items() if law is not None}
+            vehicle = dispersed_vehicle(self.vehicle, lambda name: deviation.get(name, 0.0))
+            scales = dispersed_scales(lambda name: deviation.get(name, 0.0))
+            profile = _dispersed_air(self.profile, rng_from_draw(draw_one(*run, "sounding")))
+            attitude = rng_from_draw(draw_one(*run, "attitude")).standard_normal(3)
+            turn = attitude * self.at_start.sd()[0, 6:9]
+        if not self.locked:
+            check_step(vehicle, self.schedule.step_s)
+        q = rotations.boxplus(self.at_start.q_ecef_body[0], turn)
+        position = self.at_start.position_ecef_m[0] + rotations.rotate(q, vehicle.cg_m)
+        velocity, omega = self.at_start.velocity_ecef_mps[0], self.at_start.omega_body_eci_body_radps[0]
+        state = state_from_ecef(self.start_s, position, velocity, q, omega)
+        parameters = packing.parameter_vector(vehicle, *scales)
+        return Start(state, parameters, packing.atmosphere_table(profile)), vehicle
+
+    def fly(self, starts: list[tuple[Start, Vehicle]]) -> list[tuple[FloatArray, FloatArray, bool]]:
+        """Centerbody's total angle of attack, deg, normal acceleration, g, and whether the joint diverged."""
+        flown = fly_legs(self.vehicle, list(range(len(starts))), [s for s, _ in starts], [self.schedule])
+        return [self._kept(f, start, vehicle) for f, (start, vehicle) in zip(flown, starts, strict=True)]
+
+    def _kept(self, flown: Flown, start: Start, vehicle: Vehicle) -> tuple[FloatArray, FloatArray, bool]:
+        if not len(flown.aux):
+            raise GateError("pre-flight bounds: a flight has no record; the reconstruction's start is no flight")
+        records = Records(flown.states, flown.aux, vehicle, start.atmosphere)
+        rows = np.minimum(np.arange(self.records), len(flown.aux) - 1)
+        return records.alpha_total_deg[rows], records.normal_g[rows], flown.diverged
 
 
-def _disperse(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
-    known, body, shell = vehicle.uncertainty, vehicle.centerbody, vehicle.aeroshell
-    g = rng.standard_normal(9)
-    heavier, stiffer = 1.0 + known.mass * g[0], 1.0 + known.inertia * g[1]
-    shift = np.array([known.cg_station_m * g[2], known.cg_lateral_m * g[3], known.cg_lateral_m * g[4]])
-    # the whole vehicle's c.g. is known to that; the centerbody carries it
-    moved = body.cg_m + shift * vehicle.mass_kg / body.mass_kg
-    return replace(
-        vehicle,
-        aero=vehicle.aero.scaled(1 + known.ca * g[5], 1 + known.cn * g[6], 1 + known.cm * g[7], CMQ_SD * g[8]),
-        centerbody=body.model_copy(
-            update={
-                "mass_kg": body.mass_kg * heavier,
-                "cg_from_datum_body_m": tuple(moved),
-                "inertia_kgm2": tuple(map(tuple, body.inertia * stiffer)),
-            }
-        ),
-        aeroshell=shell.model_copy(update={"mass_kg": shell.mass_kg * heavier}),
-    )
-
-
-def _disperse_air(profile: AtmosphereProfile, rng: np.random.Generator) -> AtmosphereProfile:
+def _dispersed_air(profile: AtmosphereProfile, rng: np.random.Generator) -> AtmosphereProfile:
     z = profile.altitude_m
     wind = profile.wind_ned_mps.copy()
     for axis in (0, 1):

@@ -11,7 +11,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -107,13 +107,14 @@ def fly_ensemble(
         while True:
             while len(waiting) < workers + 1 and (block := list(islice(remaining, LANES))):
                 starts = [start_of(run) for run in block]
-                waiting.append((block, pool.submit(_fly_block, vehicle, block, starts, schedule)))
+                waiting.append((block, pool.submit(fly_block, vehicle, block, starts, schedule)))
             if not waiting:
                 return
             yield from waiting.popleft()[1].result()
 
 
-def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule: Schedule) -> list[Flown]:
+def fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule: Schedule) -> list[Flown]:
+    """Fly at most `LANES` flights side by side, in this thread; see `fly_ensemble`."""
     padded = starts + [starts[-1]] * (LANES - len(starts))
     shared = all(s.atmosphere is starts[0].atmosphere for s in starts)
     lanes = integrate_lanes(
@@ -127,3 +128,18 @@ def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule:
         schedule.lock_records,
     )
     return [Flown(run, *lane) for run, lane in zip(runs, lanes, strict=False)]
+
+
+def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[Schedule]) -> list[Flown]:
+    """Fly at most `LANES` flights through legs that follow each other; the records of the last are kept.
+
+    A flight that diverges in an earlier leg has no record.
+    """
+    flown: list[Flown] = []
+    for leg in legs:
+        if flown:
+            ends = [f.states[-1] if len(f.states) and not f.diverged else np.full(len(s.state), np.nan)
+                    for f, s in zip(flown, starts, strict=True)]  # fmt: skip
+            starts = [replace(s, state=end) for s, end in zip(starts, ends, strict=True)]
+        flown = fly_block(vehicle, runs, starts, leg)
+    return flown

@@ -8,7 +8,8 @@ import pytest
 from pydantic import BaseModel
 
 from flightmodel import aeroinput, flightfile, instrument_entries, sources, vehicle
-from synthetic_flight import day_air, instrument_sections, scenarios
+from postflight.montecarlo import study
+from synthetic_flight import day_air, dispersions, instrument_sections, outputs, scenarios
 
 DOCS = Path(__file__).parents[1] / "docs"
 INSTRUMENTS = [
@@ -46,6 +47,20 @@ MODELS = [
 ]
 
 
+DISPERSION_SECTIONS = [
+    study.DispersionsFile,
+    study.Outputs,
+    study.Stop,
+    dispersions.Window,
+    dispersions.Factor,
+    dispersions.InitialDispersions,
+    dispersions.MassDispersions,
+    dispersions.AeroDispersions,
+    dispersions.JointDispersions,
+    dispersions.AirDispersions,
+]
+
+
 FLIGHT_SECTIONS = [
     flightfile.FlightFile,
     flightfile.AttitudeEntry,
@@ -72,6 +87,22 @@ def test_every_key_is_on_the_page(model: type[BaseModel]):
 @pytest.mark.parametrize("model", INSTRUMENTS, ids=lambda m: m.__name__)
 def test_every_key_of_an_instrument_is_on_its_page(model: type[BaseModel]):
     assert not missing_keys("instruments.md", model)
+
+
+@pytest.mark.parametrize("model", DISPERSION_SECTIONS, ids=lambda m: m.__name__)
+def test_every_key_of_a_dispersions_file_is_on_its_page(model: type[BaseModel]):
+    page = (DOCS / "monte-carlo.md").read_text()
+    assert not [key for key in model.model_fields if not re.search(rf"\b{key}\b", page)]
+
+
+def test_every_output_is_on_the_page():
+    page = (DOCS / "monte-carlo.md").read_text()
+    assert not [name for name in outputs.QUANTITIES if f"`{name}`" not in page]
+
+
+@pytest.mark.parametrize("name", study.shipped_dispersions())
+def test_shipped_dispersions_are_read(name: str):
+    assert len(study.read_study(name).spec.factors()) > 20
 
 
 @pytest.mark.parametrize("model", FLIGHT_SECTIONS, ids=lambda m: m.__name__)

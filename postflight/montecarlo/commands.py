@@ -1,0 +1,176 @@
+"""What ``postflight montecarlo`` does: fly, look, merge, try again, with progress and a table at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.markup import escape
+from rich.table import Table
+
+from flightmodel.checks import ConfigError, GateError
+from postflight.commands import compile_kernels, console, progress_bar
+from postflight.figures import save
+from postflight.montecarlo import figures, running, sobol
+from postflight.montecarlo.merge import Merged, merge, write_csv, write_merged
+from postflight.montecarlo.running import Wanted
+from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
+from postflight.warmup import RECONSTRUCTION
+from synthetic_flight.ensemble import available_cores
+from synthetic_flight.outputs import check_names
+
+
+def run(
+    name: str, folder: Path, flights: int | None, workers: int | None, scheduler: str | None, until: str | None
+) -> None:
+    """Fly what is missing and merge."""
+    study = read_study(name)
+    stop = study.spec.stop if until is None else stop_from(until, study)
+    wanted = Wanted(flights or study.spec.flights, workers or available_cores(), scheduler, stop)
+    count = fly(study, folder, wanted)
+    finish(study, folder, count)
+    if stop is not None:
+        met = count < wanted.flights
+        words = "" if met else f" was not reached in {count} flights"
+        rule = f"an interval of {stop.output} narrower than {stop.width:g}"
+        console.print(f"{escape(rule)}{words or f' took {count} flights'}")
+
+
+def stop_from(text: str, study: Study) -> Stop:
+    """Read ``OUTPUT=WIDTH``."""
+    output, _, width = text.partition("=")
+    try:
+        number = float(width)
+    except ValueError:
+        number = np.nan
+    if not 0.0 < number < np.inf:
+        raise ConfigError(f"--until-width {text}: OUTPUT=WIDTH is wanted, e.g. peak_normal_g=0.05")
+    check_names((output,), study.plan.scalars)
+    base = study.spec.stop or Stop(output=output, width=number)
+    return base.model_copy(update={"output": output, "width": number})
+
+
+def fly(study: Study, folder: Path, wanted: Wanted) -> int:
+    """Fly with progress; return how many flights the study has."""
+    compile_kernels("simulator", "ensembles", *(RECONSTRUCTION if study.spec.mode == "whole" else ()))
+    with progress_bar() as report:
+        return running.run(study, folder, wanted, report)
+
+
+def finish(study: Study, folder: Path, flights: int) -> Merged:
+    """Merge, write, draw, print."""
+    merged = merge(study, folder, flights)
+    write_merged(folder, merged)
+    title = f"{flights} dispersed flights: 2.3, 50 and 97.7 % of them"
+    if len(merged.bands):
+        save(figures.figure_bands(merged.bands, title, words_of(study)), folder / "bands.png")
+    print_merged(merged, folder)
+    if merged.summary["failed"] == flights:
+        raise GateError(f"{folder}: every flight failed; the first: {merged.flights['reason'].iloc[0]}")
+    return merged
+
+
+def words_of(study: Study) -> str:
+    """Say in a figure's corner what was flown."""
+    return f"{study.source.name}: SYNTHETIC flights of {study.plan.scenario.spec.name}"
+
+
+def print_merged(merged: Merged, folder: Path) -> None:
+    """Percentiles with their intervals, and what failed."""
+    table = Table(title=f"{merged.summary['flights']} flights: percentiles")
+    for name in ("output", "2.3 %", "50 %", "97.7 %", "95 % interval of the last"):
+        table.add_column(name, justify="left" if name == "output" else "right", no_wrap=name == "output")
+    for output, rows in merged.percentiles.groupby("output", sort=False):
+        last = rows.iloc[-1]
+        ends = (f"{'open' if np.isnan(x) else f'{x:.4g}'}" for x in (last["low_95"], last["high_95"]))
+        table.add_row(escape(str(output)), *(f"{value:.4g}" for value in rows["value"]), " to ".join(ends))
+    console.print(table)
+    for name, row in merged.summary.get("coverage", {}).items():
+        console.print(f"{name}: " + ", ".join(f"{key} {value:.3g}" for key, value in row.items()), highlight=False)
+    if merged.summary["diverged"]:
+        console.print(f"[yellow]found[/] the joint of {merged.summary['diverged']} flights diverged past 90 deg")
+    if merged.summary["failed"]:
+        words = f"{merged.summary['failed']} flights failed; their reasons are in flights.csv"
+        console.print(f"[red]failed[/] {words}; `postflight montecarlo retry-failed {escape(str(folder))}`")
+    console.print(f"results in {escape(str(folder))}")
+
+
+def status(folder: Path) -> None:
+    """Say how far a folder is."""
+    found = running.status(folder)
+    console.print(
+        f"{found.flights} of {found.flights_wanted} flights in {found.chunks} of {found.chunks_wanted} chunks; "
+        f"{found.failed.total()} failed, {found.diverged} diverged",
+        highlight=False,
+    )
+    for reason, count in found.failed.most_common(5):
+        console.print(f"[red]failed[/] {count} times: {escape(reason)}")
+
+
+def remerge(folder: Path) -> None:
+    """Merge the chunks of a folder again."""
+    study, flights = running.study_of(folder)
+    finish_sobol(study, folder) if study.design is not None else finish(study, folder, flights)
+
+
+def retry_failed(folder: Path, workers: int | None, scheduler: str | None) -> None:
+    """Fly failed runs again and merge."""
+    study, flights = running.study_of(folder)
+    compile_kernels("simulator", "ensembles", *(RECONSTRUCTION if study.spec.mode == "whole" else ()))
+    wanted = Wanted(flights, workers or available_cores(), scheduler)
+    with progress_bar() as report:
+        tried, still = running.retry_failed(study, folder, wanted, report)
+    console.print(f"{tried} failed flights flown again, {still} fail again", highlight=False)
+    finish_sobol(study, folder) if study.design is not None else finish(study, folder, flights)
+
+
+def sobol_indices(
+    name: str, folder: Path, output: str, base: int, by: str, workers: int | None, scheduler: str | None
+) -> None:
+    """Fly Saltelli's design and print the indices of every output; draw those of ``output``."""
+    study = sobol_study(read_study(name), by, base)
+    check_names((output,), study.plan.scalars)
+    assert study.design is not None
+    fly(study, folder, Wanted(study.design.flights, workers or available_cores(), scheduler))
+    finish_sobol(study, folder, output)
+
+
+def finish_sobol(study: Study, folder: Path, output: str | None = None) -> None:
+    """Write indices of every output, draw and print those of one: that which is asked for, or the first."""
+    design = study.design
+    assert design is not None
+    merged = merge(study, folder, design.flights)
+    tables = []
+    for name in study.plan.scalars:
+        try:
+            table, left_out = sobol.indices(design, merged.flights[name].to_numpy(dtype=float))
+        except GateError as fault:
+            console.print(f"[yellow]left out[/] {escape(name)}: {escape(str(fault))}")
+            continue
+        table.insert(0, "output", name)
+        table["points"] = design.base - left_out
+        tables.append(table)
+    if not tables:
+        raise GateError(f"{folder}: no output has indices")
+    every = pd.concat(tables, ignore_index=True)
+    write_merged(folder, merged)
+    write_csv(folder / "sobol.csv", every)
+    shown = every[every["output"] == (output or every["output"].iloc[0])]
+    if shown.empty:
+        raise GateError(f"{folder}: {output} has no indices")
+    title = f"Sobol indices of {shown['output'].iloc[0]}: {design.flights} flights"
+    save(figures.figure_sobol(shown, title, words_of(study)), folder / "sobol.png")
+    printed = Table(title=title)
+    for head in ("factor", "first order", "95 %", "total", "95 %"):
+        printed.add_column(head, justify="left" if head == "factor" else "right", no_wrap=head == "factor")
+    for r in shown.sort_values("total", ascending=False, kind="stable").itertuples():
+        printed.add_row(
+            r.factor,
+            f"{r.first:.3f}",
+            f"{r.first_low_95:.3f} to {r.first_high_95:.3f}",
+            f"{r.total:.3f}",
+            f"{r.total_low_95:.3f} to {r.total_high_95:.3f}",
+        )
+    console.print(printed)
+    console.print(f"results in {escape(str(folder))}")

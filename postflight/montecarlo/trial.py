@@ -1,0 +1,60 @@
+"""Whole trials: fly, sense, reconstruct, estimate, and compare with the truth; do the error bars say what they mean?
+
+The analyst is told the nominal vehicle and what its data sheets say; flown is the dispersed one, on a day and with
+instruments of the run's own. The camera is left out: rendering and reading a film takes minutes a flight. Everything is
+taken at the flight's true peak of dynamic pressure.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from flightmodel.airdata import air_data, peak_pressure
+from flightmodel.flightfolder import read_flight
+from flightmodel.trajectory import difference, resample
+from postflight.montecarlo.whole import METHODS, SCALARS
+from postflight.pipeline import estimate, reconstruct_telemetry
+from synthetic_flight.dispersed_ensemble import Plan
+from synthetic_flight.dispersions import dispersed_case, draws, run_seed
+from synthetic_flight.folder import simulate_to_folder
+
+
+def trial(plan: Plan, seed: int, run: int) -> dict[str, float]:
+    """Fly and judge one run; every name of `SCALARS`, NaN for a method that gave no answer at the peak."""
+    told = plan.scenario.vehicle
+    case = dispersed_case(plan.scenario, plan.dispersions, draws(plan.dispersions, seed, run))
+    flown = replace(case.vehicle, aero=told.aero.scaled(*case.scales))
+    spec = case.scenario.spec.model_copy(update={"video": None})
+    scenario = replace(case.scenario, spec=spec, vehicle=flown)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "flight"
+        truth = simulate_to_folder(scenario, run_seed(seed, run), folder)
+        telemetry = replace(read_flight(folder), vehicle=told)
+    flight = reconstruct_telemetry(telemetry)
+    answers = estimate(flight, telemetry, METHODS)
+    peak_s, _ = peak_pressure(truth.time_s, truth.dynamic_pressure_pa)
+    out = dict.fromkeys(SCALARS, np.nan)
+    out["truth_deg"] = float(np.rad2deg(np.interp(peak_s, truth.time_s, truth.deflection.theta_rad)))
+    for method, history in answers.histories.items():
+        theta, sd = np.rad2deg(history.at(peak_s))
+        out |= {f"{method}_deg": float(theta), f"{method}_sd_deg": float(sd)}
+        out[f"{method}_error_deg"] = float(theta) - out["truth_deg"]
+    at = np.array([peak_s])
+    found, path = resample(flight.reconstruction.smoothed, at), resample(truth.trajectory, at)
+    error = difference(found, path)[0]
+    out["bet_position_m"], out["bet_velocity_mps"], turned = (
+        float(np.linalg.norm(error[k : k + 3])) for k in (0, 3, 6)
+    )
+    out["bet_attitude_deg"] = float(np.rad2deg(turned))
+    if found.covariance is not None:
+        out["bet_nees"] = float(error @ np.linalg.solve(found.covariance[0], error))
+    alpha = air_data(path, truth.profile, flown.cg_m).alpha_total_wind_rad[0]
+    air = flight.air
+    told_alpha = np.interp(peak_s, air.time_s, air.alpha_total_wind_rad)
+    out["alpha_total_error_deg"] = float(np.rad2deg(told_alpha - alpha))
+    out["alpha_total_sd_deg"] = float(np.rad2deg(np.interp(peak_s, air.time_s, air.alpha_total_wind_sd_rad)))
+    return out

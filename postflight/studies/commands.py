@@ -1,0 +1,196 @@
+"""What ``postflight study`` does: one of the paper's studies as tables and figures in a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.markup import escape
+from rich.table import Table
+
+from flightmodel.airdata import pressure_pulse
+from flightmodel.checks import GateError
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from postflight.commands import compile_kernels, console, progress_bar
+from postflight.figures import save
+from postflight.montecarlo.merge import write_csv
+from postflight.montecarlo.study import read_study
+from postflight.pipeline import Flight, reconstruct_flight
+from postflight.preflight import Bounds, entry_bounds, inside
+from postflight.studies import figures, joints
+from postflight.studies.table_3_1 import table_3_1
+from postflight.warmup import RECONSTRUCTION
+from synthetic_flight.scenarios import read_scenario
+
+
+def stiffness_and_damping(vehicle: str, folder: Path) -> None:
+    """Write and print Table 3.1."""
+    known = vehicle_from_toml(vehicle_path(vehicle))
+    table = table_3_1(known)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "table_3_1.csv", table)
+    save(figures.figure_table_3_1(table, f"vehicle: {known.name}"), folder / "table_3_1.png")
+    printed = Table(title="Table 3.1 (AIAA 2011-2571)")
+    for name in ("study", "Hz", "% of c*", "quantity", "paper", "ours", "vehicle's own"):
+        printed.add_column(name, justify="left" if name in ("study", "quantity") else "right")
+    for r in table.itertuples():
+        numbers = f"{r.frequency_hz:g}", f"{r.damping_percent:g}"
+        printed.add_row(r.study, *numbers, r.quantity, r.paper, r.ours, f"{r.vehicle:.5g}")
+    console.print(printed)
+    console.print(f"{int(table['agrees'].sum())} of {len(table)} numbers agree to the last digit printed")
+    console.print(f"results in {escape(str(folder))}")
+
+
+def damping(scenario: str, folder: Path, seed: int) -> None:
+    """Write and print the damping study."""
+    chosen = read_scenario(scenario)
+    compile_kernels("simulator", "ensembles")
+    study = joints.damping_study(chosen, seed)
+    title = "Damping of the joint at 2.5 Hz, % of critical (AIAA 2011-2571, Figure 3.1)"
+    label = "centerbody total angle of attack (deg)"
+    synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
+    picture = figures.figure_joints(study, "alpha_total_deg", label, title, synthetic)
+    write_study(study, folder, "damping", {"figure_3_1.png": picture})
+
+
+def stiffness(scenario: str, folder: Path, seed: int) -> None:
+    """Write and print the stiffness study."""
+    chosen = read_scenario(scenario)
+    compile_kernels("simulator", "ensembles")
+    study = joints.stiffness_study(chosen, seed)
+    synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
+    pictures = {
+        name: figures.figure_joints(
+            study, quantity, label, f"Stiffness of the joint at 0.5 % of critical (AIAA 2011-2571, {number})", synthetic
+        )
+        for name, quantity, label, number in (
+            ("figure_3_2.png", "alpha_total_deg", "centerbody total angle of attack (deg)", "Figure 3.2"),
+            ("figure_3_3.png", "normal_g", "centerbody normal acceleration (g)", "Figure 3.3"),
+        )
+    }
+    write_study(study, folder, "stiffness", pictures)
+
+
+def write_study(study: joints.JointStudy, folder: Path, name: str, pictures: dict[str, figures.Figure]) -> None:
+    """Write tables and figures of a study of the joint, and print it beside the paper's words."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / f"{name}.csv", study.table)
+    write_csv(folder / f"{name}_paper.csv", study.paper)
+    write_csv(folder / f"{name}_histories.csv", joints.histories(study))
+    for file, figure in pictures.items():
+        save(figure, folder / file)
+    words = f"around peak pressure ({study.peak_s:.1f} s) and {joints.LATER_S[0]:g} to {joints.LATER_S[1]:g} s later"
+    table = Table(title=f"Centerbody {words}")
+    for head in ("joint", "alpha deg", "later", "normal g", "peak g", "bent deg", "tumbled s"):
+        table.add_column(head, justify="left" if head == "joint" else "right")
+    for r in study.table.itertuples():
+        cells = (r.alpha_mean_deg, r.alpha_later_mean_deg, r.normal_mean_g, r.normal_peak_g, r.deflection_mean_deg)
+        ended = "" if np.isnan(r.tumbled_s) else f"{r.tumbled_s:.1f}"
+        table.add_row(r.joint, *("" if np.isnan(x) else f"{x:.2f}" for x in cells), ended)
+    console.print(table)
+    for r in study.paper.itertuples():
+        mark = "[green]agrees[/]" if r.agrees else "[yellow]differs[/]"
+        console.print(f"{mark} {escape(r.claim)}: paper {r.paper}, here {r.ours:.2f} ({escape(r.measured_as)})")
+    console.print(f"results in {escape(str(folder))}")
+
+
+def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int, seed: int) -> None:
+    """Fly the bounds of a flight's own entry with the joint locked and flexible; say where the flight lies."""
+    joint = read_study(dispersions).spec.joint
+    compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
+    with progress_bar() as report:
+        flight = reconstruct_flight(flight_folder, None, lambda f, what: report(0.4 * f, what))
+        pulse = flight.required_pulse()
+        rigid = entry_bounds(flight, None, flights, seed, lambda f, what: report(0.4 + 0.3 * f, what))
+        flexible = entry_bounds(flight, joint, flights, seed, lambda f, what: report(0.7 + 0.3 * f, what))
+    flown = pd.DataFrame(
+        {
+            "time_s": pulse.time_s,
+            "alpha_total_deg": np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad)),
+            "normal_g": np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / 9.80665,
+        }
+    )
+    table = shares(flight, flown, rigid, flexible)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "preflight.csv", table)
+    write_csv(folder / "preflight_bands.csv", bands(rigid, flexible))
+    write_csv(folder / "preflight_flight.csv", flown)
+    words = "inside, of the pulse: " + "; ".join(
+        f"{joint} {quantity.split('_')[0]} {100 * share:.0f} %"
+        for joint, quantity, share in zip(table["joint"], table["quantity"], table["share_inside"], strict=True)
+    )
+    tag = "SYNTHETIC flight" if flight.telemetry.synthetic else "flight"
+    span = _pulse_span(flight)
+    picture = figures.figure_preflight(
+        rigid, flexible, flown, (span[0] - 10.0, span[1] + 5.0), words, f"{flight.telemetry.name}: {tag}"
+    )
+    save(picture, folder / "figure_1_3.png")
+    printed = Table(title=f"The flight against 2.3 to 97.7 % of {flights} entries, over the pulse")
+    for head in ("joint", "quantity", "inside", "over the median", "peak / 97.7 %", "diverged"):
+        left = head in ("joint", "quantity")
+        printed.add_column(head, justify="left" if left else "right", no_wrap=left)
+    for r in table.itertuples():
+        numbers = f"{100 * r.share_inside:.1f} %", f"{r.over_median_at_peak:.3g}", f"{r.peak_over_upper:.2f}"
+        printed.add_row(r.joint, r.quantity, *numbers, f"{r.diverged}")
+    console.print(printed)
+    console.print("paper: angle of attack 4 to 5 deg above the median, peak normal acceleration over twice the bound")
+    console.print(f"results in {escape(str(folder))}")
+
+
+def _pulse_span(flight: Flight) -> tuple[float, float]:
+    times = flight.air.time_s[pressure_pulse(flight.air.dynamic_pressure_pa)]
+    return float(times[0]), float(times[-1])
+
+
+def shares(flight: Flight, flown: pd.DataFrame, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
+    """Share of the pulse's samples between the outer percentiles, by joint and quantity; how far outside the others.
+
+    Columns ``joint, quantity, share_inside, largest_excess`` (over the upper percentile, in the quantity's unit); where
+    the flight has its peak, ``over_median_at_peak`` and ``peak_over_upper`` (a ratio); ``diverged`` flights.
+    """
+    first, last = _pulse_span(flight)
+    rows = flown[(flown["time_s"] >= first) & (flown["time_s"] <= last)]
+    if rows.empty:
+        raise GateError("pre-flight bounds: the flight has no sample in its pulse")
+    time_s, out = rows["time_s"].to_numpy(), []
+    for joint, bounds in (("rigid", rigid), ("flexible", flexible)):
+        for quantity, band in (("alpha_total_deg", bounds.alpha_total_deg), ("normal_g", bounds.normal_g)):
+            values = rows[quantity].to_numpy()
+            at = int(np.argmax(values))
+            middle, upper = (np.interp(time_s, bounds.time_s, band[k]) for k in (1, 2))
+            out.append(
+                {
+                    "joint": joint,
+                    "quantity": quantity,
+                    "share_inside": float(np.mean(inside(time_s, values, bounds, band))),
+                    "largest_excess": float(np.max(values - upper)),
+                    "over_median_at_peak": float(values[at] - middle[at]),
+                    "peak_over_upper": float(values[at] / upper[at]),
+                    "diverged": bounds.ended,
+                }
+            )
+    return pd.DataFrame(out)
+
+
+def bands(rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
+    """Bands of both, for a file."""
+    parts = [
+        pd.DataFrame(
+            {
+                "joint": joint,
+                "quantity": quantity,
+                "time_s": np.round(b.time_s, 6),
+                "p2.3": band[0],
+                "p50": band[1],
+                "p97.7": band[2],
+                "nominal": nominal,
+            }
+        )
+        for joint, b in (("rigid", rigid), ("flexible", flexible))
+        for quantity, band, nominal in (
+            ("alpha_total_deg", b.alpha_total_deg, b.nominal_alpha_deg),
+            ("normal_g", b.normal_g, b.nominal_normal_g),
+        )
+    ]
+    return pd.concat(parts, ignore_index=True)

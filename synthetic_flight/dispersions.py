@@ -1,0 +1,309 @@
+"""What is uncertain of a flight, and by how much: a dispersions file, and the flight that one set of draws makes.
+
+Every dispersed quantity is a *factor* and takes one number between 0 and 1, from which its value follows by the inverse
+of its distribution; the day's air takes its whole random structure from the digits of that number. Run ``k`` draws the
+number of each factor from ``SeedSequence(seed, spawn_key=(k, name of the factor))``: it is the same on one worker or a
+thousand, and one factor more or less leaves the others' numbers as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+from scipy.special import ndtri
+
+from flightmodel.atmosphere import AtmosphereProfile
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.config import KeyFaults, NonNegative, Section, Time
+from flightmodel.vehicle import CompliantJoint, MassProperties, Vehicle
+from synthetic_flight.day_air import day_atmosphere
+from synthetic_flight.scenarios import Initial, Scenario
+from synthetic_flight.triad_errors import name_key
+
+SMALLEST = 2.0**-54  # a draw of exactly zero would be an infinite deviation
+WIND_FADE_M = (110e3, 130e3)
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+T = TypeVar("T", bound=Section)
+
+
+class Shift(Section):
+    """What is added to a value: normal with a standard deviation, or uniform between two bounds."""
+
+    normal: NonNegative | None = None
+    uniform: tuple[Number, Number] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Shift:
+        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
+        if len(given) != 1:
+            names = ", ".join(type(self).model_fields)
+            raise ValueError(f"exactly one of {names} is wanted; got {', '.join(given) or 'none'}")
+        if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
+            raise KeyFaults([("uniform", list(self.uniform), "a lower and a higher bound are wanted")])
+        return self
+
+    def at(self, u: float) -> float:
+        """Deviation of which the fraction ``u`` of all draws lies below."""
+        if self.uniform is not None:
+            return self.uniform[0] + (self.uniform[1] - self.uniform[0]) * u
+        return float((self.normal or 0.0) * ndtri(u))
+
+
+class Factor(Shift):
+    """What a value is multiplied by, less one: normal, uniform, or by a lognormal factor."""
+
+    lognormal: NonNegative | None = None
+
+    def at(self, u: float) -> float:
+        """Deviation of which the fraction ``u`` of all draws lies below."""
+        return float(np.expm1(self.lognormal * ndtri(u))) if self.lognormal is not None else super().at(u)
+
+
+class InitialDispersions(Section):
+    """Of the state at the start of the scenario; keys and units are the scenario's own."""
+
+    latitude_deg: Shift | None = None
+    longitude_deg: Shift | None = None
+    altitude_m: Shift | None = None
+    speed_mps: Shift | None = None
+    flight_path_deg: Shift | None = None
+    azimuth_deg: Shift | None = None
+    nose_azimuth_deg: Shift | None = None
+    nose_elevation_deg: Shift | None = None
+    roll_deg: Shift | None = None
+    spin_rpm: Shift | None = None
+
+
+class MassDispersions(Section):
+    """Of the two bodies; a station grows aft, the offset is the vehicle's c.g., carried by the centerbody."""
+
+    aeroshell_mass: Factor | None = None
+    centerbody_mass: Factor | None = None
+    aeroshell_inertia: Factor | None = None
+    centerbody_inertia: Factor | None = None
+    aeroshell_cg_station_m: Shift | None = None
+    centerbody_cg_station_m: Shift | None = None
+    offset_y_m: Shift | None = None
+    offset_z_m: Shift | None = None
+
+
+class AeroDispersions(Section):
+    """Of the coefficients: factors on C_A, C_N and C_m, a shift of C_mq."""
+
+    ca: Factor | None = None
+    cn: Factor | None = None
+    cm: Factor | None = None
+    cmq: Shift | None = None
+
+
+class JointDispersions(Section):
+    """Of the joint."""
+
+    stiffness: Factor | None = None
+    damping: Factor | None = None
+    torsion_stiffness: Factor | None = None
+    station_m: Shift | None = None
+    freeplay_deg: Shift | None = None
+    hardening_nmprad3: Shift | None = None
+    damping_hardening_nmsprad3: Shift | None = None
+
+
+class AirDispersions(Section):
+    """Of the air: a day of its own for every flight or one day for all, a factor on all density, a wind everywhere."""
+
+    day: bool = True
+    density: Factor | None = None
+    wind_north_mps: Shift | None = None
+    wind_east_mps: Shift | None = None
+
+
+class Window(Section):
+    """Which part of the flight is looked at, s, and how finely: for peaks, and for histories."""
+
+    from_s: Time
+    to_s: Time
+    record_s: Annotated[float, Field(ge=1e-3, le=1.0)] = 0.02
+    history_s: Annotated[float, Field(ge=1e-3, le=10.0)] = 0.1
+
+    @model_validator(mode="after")
+    def _fits(self) -> Window:
+        faults: list[tuple[str, object, str]] = []
+        if not self.from_s < self.to_s:
+            faults.append(("to_s", self.to_s, f"after from_s = {self.from_s:g} is wanted"))
+        ratio = self.history_s / self.record_s
+        if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+            faults.append(("history_s", self.history_s, f"a whole multiple of record_s = {self.record_s:g} is wanted"))
+        if (self.to_s - self.from_s) / self.record_s > 200_000:
+            faults.append(("record_s", self.record_s, "more than 200 000 records a flight; a longer one is wanted"))
+        if faults:
+            raise KeyFaults(faults)
+        return self
+
+    @property
+    def records(self) -> int:
+        """Records of a whole flight through the window, its first one at ``from_s``."""
+        return int(np.floor((self.to_s - self.from_s) / self.record_s + 1e-6)) + 1
+
+    @property
+    def per_history(self) -> int:
+        """Records from one point of a history to the next."""
+        return round(self.history_s / self.record_s)
+
+    def history_time_s(self) -> FloatArray:
+        """Times of the points of a history, s."""
+        return self.from_s + self.history_s * np.arange((self.records - 1) // self.per_history + 1, dtype=np.float64)
+
+
+class Dispersions(Section):
+    """What varies from flight to flight."""
+
+    joint_is: Literal["flexible", "locked"] = "flexible"
+    initial: InitialDispersions = InitialDispersions()
+    mass: MassDispersions = MassDispersions()
+    aerodynamics: AeroDispersions = AeroDispersions()
+    joint: JointDispersions = JointDispersions()
+    atmosphere: AirDispersions = AirDispersions()
+
+    def factors(self) -> dict[str, Shift | None]:
+        """Distribution of every factor by its name, ``section.key``; None for the day, which is a profile."""
+        out: dict[str, Shift | None] = {}
+        for section in ("initial", "mass", "aerodynamics", "joint", "atmosphere"):
+            part = getattr(self, section)
+            for key in type(part).model_fields:
+                value = getattr(part, key)
+                if isinstance(value, Shift):
+                    out[f"{section}.{key}"] = value
+                elif value is True:
+                    out[f"{section}.{key}"] = None
+        return out
+
+
+def draws(dispersions: Dispersions, seed: int, run: int) -> dict[str, float]:
+    """Return the number between 0 and 1 of every factor in one run."""
+    return {name: draw_one(seed, run, name) for name in dispersions.factors()}
+
+
+def draw_one(seed: int, run: int, name: str) -> float:
+    """Return the number between 0 and 1 of one factor in one run."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(run, *name_key(name)))
+    return max(float(np.random.default_rng(sequence).random()), SMALLEST)
+
+
+def run_seed(seed: int, run: int) -> int:
+    """Return the seed of all that one run draws beside its factors: its day and its instruments."""
+    return int(np.random.SeedSequence(seed, spawn_key=(run,)).generate_state(1, np.uint64)[0] >> 1)
+
+
+def rng_from_draw(u: float) -> np.random.Generator:
+    """Return the generator of a factor that is more than a number: a profile."""
+    return np.random.default_rng(np.random.SeedSequence(int(u * 2.0**53)))
+
+
+@dataclass(frozen=True)
+class Case:
+    """One dispersed flight before it is flown; ``scales`` are the factors on C_A, C_N, C_m and the shift of C_mq."""
+
+    scenario: Scenario
+    profile: AtmosphereProfile
+    scales: tuple[float, float, float, float]
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """As it flies, but for `scales`."""
+        return self.scenario.vehicle
+
+
+def dispersed_case(scenario: Scenario, dispersions: Dispersions, u: dict[str, float]) -> Case:
+    """Make the flight that one set of draws describes.
+
+    Parameters
+    ----------
+    u : dict
+        A number between 0 and 1 for every factor of ``dispersions``.
+
+    Raises
+    ------
+    GateError
+        Where the draws make what cannot fly: a negative mass, freeplay or stiffness, a latitude beyond the pole.
+    """
+    deviation = {name: law.at(u[name]) for name, law in dispersions.factors().items() if law is not None}
+
+    def of(name: str) -> float:
+        return deviation.get(name, 0.0)
+
+    start = scenario.spec.initial
+    moved = {key: getattr(start, key) + of(f"initial.{key}") for key in InitialDispersions.model_fields}
+    initial = _checked(Initial, moved, "initial")
+    spec = scenario.spec.model_copy(update={"initial": initial})
+    flown = replace(scenario, spec=spec, vehicle=dispersed_vehicle(scenario.vehicle, of))
+    # one day for all is the day of the middle of its distribution's digits, the same whatever the seed
+    profile = day_atmosphere(scenario.spec.atmosphere, rng_from_draw(u.get("atmosphere.day", 0.5)))
+    scales = dispersed_scales(of)
+    return Case(flown, _dispersed_air(profile, of), scales)
+
+
+def dispersed_scales(of: Callable[[str], float]) -> tuple[float, float, float, float]:
+    """Return factors on C_A, C_N, C_m and the shift of C_mq from the deviations that ``of`` gives by name."""
+    ca, cn, cm = (1.0 + of(f"aerodynamics.{name}") for name in ("ca", "cn", "cm"))
+    if min(ca, cn, cm) <= 0.0:
+        raise GateError(
+            f"drawn outside what can fly: aerodynamics: factors {ca:.3g}, {cn:.3g}, {cm:.3g} on C_A, C_N, C_m"
+        )
+    return ca, cn, cm, of("aerodynamics.cmq")
+
+
+def dispersed_vehicle(vehicle: Vehicle, of: Callable[[str], float]) -> Vehicle:
+    """Vehicle with the deviations that ``of`` gives by the factor's name; coefficients are left as they are."""
+    body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
+    # the offset is the whole vehicle's, the centerbody carries it
+    carried = (vehicle.mass_kg / body.mass_kg) * np.array([0.0, of("mass.offset_y_m"), of("mass.offset_z_m")])
+    springs = {
+        "station_m": joint.station_m + of("joint.station_m"),
+        "bending_stiffness_nmprad": joint.bending_stiffness_nmprad * (1.0 + of("joint.stiffness")),
+        "bending_damping_nmsprad": joint.bending_damping_nmsprad * (1.0 + of("joint.damping")),
+        "torsion_stiffness_nmprad": joint.torsion_stiffness_nmprad * (1.0 + of("joint.torsion_stiffness")),
+        "freeplay_deg": joint.freeplay_deg + of("joint.freeplay_deg"),
+        "hardening_nmprad3": joint.hardening_nmprad3 + of("joint.hardening_nmprad3"),
+        "damping_hardening_nmsprad3": joint.damping_hardening_nmsprad3 + of("joint.damping_hardening_nmsprad3"),
+    }
+    return replace(
+        vehicle,
+        joint=_checked(CompliantJoint, {**joint.model_dump(), **springs}, "joint"),
+        aeroshell=_dispersed_body(shell, "aeroshell", of, np.zeros(3)),
+        centerbody=_dispersed_body(body, "centerbody", of, carried),
+    )
+
+
+def _dispersed_body(
+    part: MassProperties, name: str, of: Callable[[str], float], lateral_m: FloatArray
+) -> MassProperties:
+    cg = part.cg_m + lateral_m - [of(f"mass.{name}_cg_station_m"), 0.0, 0.0]
+    values = {
+        "mass_kg": part.mass_kg * (1.0 + of(f"mass.{name}_mass")),
+        "cg_from_datum_body_m": tuple(cg.tolist()),
+        "inertia_kgm2": tuple(map(tuple, (part.inertia * (1.0 + of(f"mass.{name}_inertia"))).tolist())),
+    }
+    return _checked(MassProperties, values, name)
+
+
+def _checked(model: type[T], values: dict[str, Any], where: str) -> T:
+    try:
+        return model.model_validate(values)
+    except ValidationError as fault:
+        words = [f"{where}.{'.'.join(map(str, e['loc']))} = {e['input']!r:.40}: {e['msg']}" for e in fault.errors()]
+        raise GateError(f"drawn outside what can fly: {'; '.join(words)}") from None
+
+
+def _dispersed_air(profile: AtmosphereProfile, of: Callable[[str], float]) -> AtmosphereProfile:
+    density, wind = 1.0 + of("atmosphere.density"), [of("atmosphere.wind_north_mps"), of("atmosphere.wind_east_mps")]
+    if density <= 0.0:
+        raise GateError(f"drawn outside what can fly: atmosphere.density: a factor of {density:.3g}")
+    if density == 1.0 and not any(wind):
+        return profile
+    winds = profile.wind_ned_mps.copy()
+    winds[:, :2] += np.interp(profile.altitude_m, WIND_FADE_M, [1.0, 0.0])[:, None] * wind
+    return replace(profile, log_density_ratio=profile.log_density_ratio + np.log(density), wind_ned_mps=winds)

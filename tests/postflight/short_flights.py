@@ -1,0 +1,57 @@
+"""A short dispersed flight for tests: from 100 km for ten seconds, some milliseconds of computing each."""
+
+import re
+
+from flightmodel.vehicle import DATA
+
+DISPERSIONS = """
+scenario = "short.toml"
+flights = 24
+seed = 7
+chunk = 4
+
+[window]
+from_s = 402.0
+to_s = 406.0
+record_s = 0.02
+history_s = 0.1
+
+[outputs]
+scalars = ["peak_deflection_deg", "peak_normal_g", "deflection_deg_at_peak_pressure"]
+histories = ["alpha_total_deg", "deflection_deg"]
+
+[initial]
+altitude_m = { normal = 300.0 }
+nose_elevation_deg = { uniform = [-2.0, 2.0] }
+
+[mass]
+offset_y_m = { normal = 0.001 }
+
+[aerodynamics]
+cn = { normal = 0.07 }
+
+[joint]
+stiffness = { lognormal = 0.1 }
+
+[atmosphere]
+density = { normal = 0.02 }
+"""
+
+
+SHORT = {
+    "start_s": 400.0, "stop_s": 412.0, "inflated_s": 401.0, "telemetry_from_s": 402.0, "altitude_m": 80000.0,
+    "speed_mps": 1600.0, "flight_path_deg": -76.5, "nose_elevation_deg": -78.0, "t_s": 402.0,
+}  # fmt: skip
+ENTRY = {"stop_s": 465.0, "telemetry_from_s": 380.0, "t_s": 380.0}  # the reference flight's own, for whole trials
+
+
+def write_short(folder, text=DISPERSIONS, changes=SHORT):
+    """Write scenario and dispersions file; return the latter's path."""
+    spec = (DATA / "scenarios" / "irve2_reference.toml").read_text()
+    for key, value in changes.items():
+        spec = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", spec, count=1)
+    spec = re.sub(r"(?ms)^\[video\].*?(?=^\[)", "", spec)
+    (folder / "short.toml").write_text(spec)
+    path = folder / "dispersions.toml"
+    path.write_text(text)
+    return path
