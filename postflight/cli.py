@@ -129,12 +129,11 @@ def run(folder: Path, rate: float) -> None:
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--hardening", is_flag=True, help="Let the spring harden (or soften) with the angle.")
-@click.option("--freeplay", is_flag=True, help="Let the joint have freeplay.")
-def reconcile(folder: Path, hardening: bool, freeplay: bool) -> None:
+def reconcile(folder: Path, hardening: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
     from postflight.reconciliation import command
 
-    command.run(folder, tuple(n for n, asked in (("hardening", hardening), ("freeplay", freeplay)) if asked))
+    command.run(folder, hardening)
 
 
 @cli.command()

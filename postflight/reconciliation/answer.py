@@ -12,7 +12,6 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_clock
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.candidate import (
-    FREEPLAY_SD_RAD,
     HARDENING_SD,
     OFFSET_SD_M,
     STIFFNESS_LOG_SD,
@@ -62,30 +61,15 @@ def joint_table(found: Reconciled) -> pd.DataFrame:
         if by_factor:
             low, high, sd = float(np.exp(low)), float(np.exp(high)), float(np.exp(at)) * sd
         rows.append((name, unit, value(told), value(best), sd, low, high))
-    sd_known = unknown.told.uncertainty.cm
-    for name, scale, start in (
-        ("static stability", sd_known, 1.0), ("freeplay", float(np.rad2deg(FREEPLAY_SD_RAD)), 0.0),
-        ("hardening at 4 deg", HARDENING_SD, 0.0),
-    ):  # fmt: skip
-        if name.split(" at")[0] not in unknown.names:
-            continue
-        k = unknown.names.index(name.split(" at")[0])
-        at, sd = start + scale * float(x[k]), scale * float(np.sqrt(covariance[k, k]))
-        at = abs(at) if name == "freeplay" else at
-        rows.append((name, "deg" if name == "freeplay" else "", start, at, sd, at - reach * sd, at + reach * sd))
+    for name, label, scale, start in (
+        ("static stability", "static stability", unknown.told.uncertainty.cm, 1.0),
+        ("hardening", "hardening at 4 deg", HARDENING_SD, 0.0),
+    ):
+        if name in unknown.names:
+            k = unknown.names.index(name)
+            at, sd = start + scale * float(x[k]), scale * float(np.sqrt(covariance[k, k]))
+            rows.append((label, "", start, at, sd, at - reach * sd, at + reach * sd))
     return pd.DataFrame(rows, columns=["quantity", "unit", "told", "found", "sd", "low", "high"])
-
-
-def log_odds(found: Reconciled, name: str) -> float:
-    """Logarithm of the odds (Bayes factor) of a joint with freeplay or hardening against one without.
-
-    Savage and Dickey's ratio of the prior's density at zero to the posterior's, both taken as Gaussian; the unknown is
-    in standard deviations of its prior. Freeplay has one sign only: both densities are folded at zero.
-    """
-    k = found.problem.unknown.names.index(name)
-    mean, sd = float(found.unknowns.vehicle[k]), float(np.sqrt(found.covariance[k, k]))
-    # folding doubles both densities at zero
-    return float(norm.logpdf(0.0) - norm.logpdf(0.0, mean, sd))
 
 
 def correlations(found: Reconciled) -> pd.DataFrame:
@@ -136,8 +120,6 @@ def vehicle_lines(found: Reconciled) -> str:
         f"bending_stiffness_nmprad = {joint.bending_stiffness_nmprad:.6g}",
         f"bending_damping_nmsprad = {joint.bending_damping_nmsprad:.6g}",
     ]
-    if "freeplay" in found.problem.unknown.extra:
-        lines.append(f"freeplay_deg = {joint.freeplay_deg:.6g}")
-    if "hardening" in found.problem.unknown.extra:
+    if found.problem.unknown.hardening:
         lines.append(f"hardening_nmprad3 = {joint.hardening_nmprad3:.6g}")
     return "\n".join(lines) + "\n"

@@ -14,7 +14,7 @@ from postflight import results
 from postflight.commands import compile_kernels, console, progress_bar
 from postflight.figures import save
 from postflight.pipeline import PULSE_RATE_HZ, estimate, reconstruct_telemetry
-from postflight.reconciliation.answer import correlations, deflection_of, joint_table, log_odds, vehicle_lines
+from postflight.reconciliation.answer import correlations, deflection_of, joint_table, vehicle_lines
 from postflight.reconciliation.figures import figure_reconciled
 from postflight.reconciliation.fit import Reconciled, reconcile
 from postflight.warmup import RECONSTRUCTION
@@ -23,9 +23,9 @@ from recon.bet import Settings
 STRONG = 3.0  # logarithm of odds of twenty to one
 
 
-def run(folder: Path, extra: tuple[str, ...]) -> None:
+def run(folder: Path, hardening: bool) -> None:
     """Reconstruct, reconcile, write a run folder and print what was found."""
-    settings = {"reconcile": list(extra), "output_rate_hz": 20.0}
+    settings = {"reconcile": True, "hardening": hardening, "output_rate_hz": 20.0}
     with progress_bar() as report:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder)
@@ -34,21 +34,24 @@ def run(folder: Path, extra: tuple[str, ...]) -> None:
             telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.2 * f, what)
         )
         answers = estimate(flight, telemetry, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
-        found = reconcile(flight, extra, lambda f, what: report(0.3 + 0.65 * f, what))
+        found, odds = reconcile(flight, False, lambda f, what: report(0.3 + 0.3 * f, what)), None
+        if hardening:
+            plain, found = found, reconcile(flight, True, lambda f, what: report(0.6 + 0.35 * f, what))
+            odds = found.log_evidence - plain.log_evidence
         with results.RunFolder(folder, telemetry, settings) as out:
             table = joint_table(found)
             out.write_csv("joint.csv", table)
             out.write_csv("joint_correlations.csv", correlations(found))
             out.write_csv("deflection_reconciled.csv", results.deflection_table(deflection_of(found)))
-            out.write_json("reconciliation.json", summary(found, table))
+            out.write_json("reconciliation.json", summary(found, table, odds))
             (out.path / "joint.toml").write_text(vehicle_lines(found))
             fused = answers.histories.get("fused")
             save(figure_reconciled(found, telemetry, fused), out.path / "figures" / "reconciled.png")
-    print_joint(found, table)
+    print_joint(found, table, odds)
     console.print(f"results in {escape(str(out.path))}")
 
 
-def summary(found: Reconciled, table: pd.DataFrame) -> dict[str, object]:
+def summary(found: Reconciled, table: pd.DataFrame, odds: float | None) -> dict[str, object]:
     """Return the short story, for ``reconciliation.json``."""
     return {
         "converged": found.converged,
@@ -56,11 +59,11 @@ def summary(found: Reconciled, table: pd.DataFrame) -> dict[str, object]:
         "sensor_residual_rms_sd": float(np.sqrt(np.mean(found.residuals.sensors**2))),
         "join_rms_sd": float(np.sqrt(np.mean(found.residuals.joins**2))),
         "joint": table.to_dict(orient="records"),
-        "log_odds": {name: log_odds(found, name) for name in found.problem.unknown.extra},
+        "log_odds_of_hardening": odds,
     }
 
 
-def print_joint(found: Reconciled, table: pd.DataFrame) -> None:
+def print_joint(found: Reconciled, table: pd.DataFrame, odds: float | None) -> None:
     """Table of the joint, and a word where the fit did not settle or does not fit."""
     printed = Table(title="The joint that explains the flight")
     for name in ("quantity", "told", "found", "1 sd", "90 % interval"):
@@ -69,10 +72,8 @@ def print_joint(found: Reconciled, table: pd.DataFrame) -> None:
         name = f"{r.quantity} ({r.unit})" if r.unit else str(r.quantity)
         printed.add_row(name, f"{r.told:.4g}", f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}")
     console.print(printed)
-    for name in found.problem.unknown.extra:
-        odds = log_odds(found, name)
-        side = "for" if odds > 0.0 else "against"
-        strong = "strong" if abs(odds) > STRONG else "no clear"
-        console.print(f"{name}: {strong} evidence {side} it (odds e^{odds:+.1f})")
+    if odds is not None:
+        words = "no clear evidence" if abs(odds) < STRONG else f"strong evidence {'for' if odds > 0.0 else 'against'}"
+        console.print(f"hardening: {words} (odds e^{odds:+.1f})")
     if not found.converged:
         console.print("[yellow]the fit had not settled after its last step: take the intervals as too narrow[/]")

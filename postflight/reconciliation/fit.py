@@ -56,6 +56,13 @@ class Reconciled:
     converged: bool
 
     @property
+    def log_evidence(self) -> float:
+        """Logarithm of the probability of the data by Laplace's method, up to what all models of a flight share."""
+        sd = np.sqrt(np.diag(self.covariance))
+        _, shape = np.linalg.slogdet(self.covariance / np.outer(sd, sd))
+        return float(0.5 * shape + np.log(sd).sum() - 0.5 * self.residuals.cost)
+
+    @property
     def vehicle(self) -> Vehicle:
         """Vehicle with the joint, the offset and the coefficients found."""
         found = self.problem.unknown.vehicle(self.unknowns.vehicle)
@@ -63,14 +70,14 @@ class Reconciled:
         return replace(found, aero=found.aero.scaled(ca, cn, cm, cmq))
 
 
-def reconcile(flight: Flight, extra: tuple[str, ...] = (), progress: Progress | None = None) -> Reconciled:
+def reconcile(flight: Flight, hardening: bool = False, progress: Progress | None = None) -> Reconciled:
     """Fit joint, offset and static stability to a reconstructed flight.
 
     Parameters
     ----------
     flight : Flight
-    extra : tuple of str
-        What the joint may have beside a linear spring: ``"hardening"``, ``"freeplay"``.
+    hardening : bool
+        Whether the spring may harden or soften with the angle.
     progress : callable, optional
 
     Raises
@@ -82,7 +89,7 @@ def reconcile(flight: Flight, extra: tuple[str, ...] = (), progress: Progress | 
     """
     observed = observe(flight)
     air = AirUnknowns(flight.telemetry.sounding, float(observed.altitude_m.min()))
-    problem = Problem(observed, VehicleUnknowns(flight.telemetry.required_vehicle(), extra), air)
+    problem = Problem(observed, VehicleUnknowns(flight.telemetry.required_vehicle(), hardening), air)
     return solve(problem, problem.start(), WIDER, progress)
 
 

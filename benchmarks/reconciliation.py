@@ -1,0 +1,107 @@
+"""Is the joint found, and do its intervals hold? Dispersed flights of a joint that the fit is not told.
+
+Run: ``python benchmarks/reconciliation.py [FLIGHTS] [--hardening SHARE]`` (30 flights). Drawn anew for each seed and
+not told: stiffness up to half above the told one, damping ratio, size and side of the c.g.'s offset, masses, stations,
+inertias, coefficients, start, spin, air, the sounding's and every instrument's errors, all in the sizes that vehicle
+file and data sheets state. No video. Some 25 s of processor time a flight. With ``--hardening`` the spring's slope is
+by that share steeper at 4 deg, every flight is fitted with and without hardening, and the odds are printed; 0 flies
+plain joints.
+"""
+
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from flightmodel.flightfolder import read_flight
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from postflight.pipeline import reconstruct_telemetry
+from postflight.reconciliation.answer import joint_table
+from postflight.reconciliation.fit import reconcile
+from synthetic_flight.folder import simulate_to_folder
+from tests.recon import dispersed
+
+TOLD = vehicle_from_toml(vehicle_path("irve2_reference"))
+AT_RAD = np.deg2rad(4.0)
+
+
+def flown_vehicle(seed, hardening=0.0):
+    """Vehicle as it is."""
+    rng = np.random.default_rng([seed, 7, 2009])
+    vehicle = dispersed.dispersed_vehicle(TOLD, rng)
+    body, known = vehicle.centerbody, TOLD.uncertainty
+    clock, size = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.002, 0.005)
+    lateral = size * vehicle.mass_kg / body.mass_kg * np.array([-np.cos(clock), np.sin(clock)])
+    moved = body.model_copy(update={"cg_from_datum_body_m": (body.cg_from_datum_body_m[0], *map(float, lateral))})
+    factors = {k: 1.0 + getattr(known, k) * rng.standard_normal() for k in ("ca", "cn", "cm")}
+    aero = vehicle.aero.scaled(**factors, cmq_shift=known.cmq * rng.standard_normal())
+    stiffness = TOLD.joint.bending_stiffness_nmprad * rng.uniform(1.0, 1.5)
+    ratio = 0.005 * np.exp(0.5 * rng.standard_normal())
+    changed = {
+        "bending_stiffness_nmprad": float(stiffness),
+        "hardening_nmprad3": hardening * stiffness / 3.0 / AT_RAD**2,
+    }
+    vehicle = replace(vehicle, centerbody=moved, aero=aero, joint=vehicle.joint.model_copy(update=changed))
+    damping = {"bending_damping_nmsprad": float(ratio * vehicle.critical_damping_nmsprad())}
+    return replace(vehicle, joint=vehicle.joint.model_copy(update=damping)), factors
+
+
+def reconstructed(seed, vehicle):
+    """Flight as its analyst has it, and the truth."""
+    scenario = replace(dispersed.dispersed_scenario("irve2_reference", seed), vehicle=vehicle)
+    with tempfile.TemporaryDirectory() as temporary:
+        truth = simulate_to_folder(scenario, seed, Path(temporary) / "flight")
+        telemetry = read_flight(Path(temporary) / "flight")
+    return reconstruct_telemetry(telemetry), truth
+
+
+def errors(found, vehicle, factors):
+    """Error and sd of log stiffness, log damping ratio, offset y and z in cm, static stability."""
+    table = joint_table(found).set_index("quantity")
+    ratio = vehicle.joint.bending_damping_nmsprad / vehicle.critical_damping_nmsprad()
+    out = []
+    for name, true in (("bending stiffness", vehicle.joint.bending_stiffness_nmprad), ("damping ratio", ratio)):
+        out += [np.log(table.found[name] / true), table.sd[name] / table.found[name]]
+    for axis, name in enumerate(("c.g. offset y", "c.g. offset z")):
+        out += [table.found[name] - 100.0 * vehicle.cg_m[1 + axis], table.sd[name]]
+    return [*out, table.found["static stability"] - factors["cm"], table.sd["static stability"]]
+
+
+def main():
+    hardening = float(sys.argv[sys.argv.index("--hardening") + 1]) if "--hardening" in sys.argv else None
+    count = int(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[1].isdigit() else 30
+    rows, odds = [], []
+    for seed in range(count):
+        vehicle, factors = flown_vehicle(seed, hardening or 0.0)
+        flight, truth = reconstructed(seed, vehicle)
+        if truth.words:
+            print(f"{seed}: {truth.words}; left out", flush=True)
+            continue
+        begun = time.process_time()
+        found = reconcile(flight)
+        took = time.process_time() - begun
+        words = f"{seed}: {found.steps} steps{'' if found.converged else ' (not settled)'}, {took:.0f} s"
+        if hardening is not None:
+            odds.append(reconcile(flight, hardening=True).log_evidence - found.log_evidence)
+            words += f", log odds of hardening {odds[-1]:+.1f}"
+        rows.append(errors(found, vehicle, factors))
+        largest = np.rad2deg(np.nanmax(truth.deflection.theta_rad))
+        print(
+            f"{words}, bent {largest:.1f} deg, errors / sd {np.round(np.array(rows[-1]).reshape(-1, 2), 3).tolist()}",
+            flush=True,
+        )
+    a = np.array(rows)
+    for k, name in enumerate(("log stiffness", "log damping ratio", "offset y cm", "offset z cm", "static stability")):
+        e, z = a[:, 2 * k], a[:, 2 * k] / a[:, 2 * k + 1]
+        inside = ", ".join(f"{100 * np.mean(np.abs(z) < s):.0f} % inside {s} sd" for s in (1, 2))
+        print(f"{name:18} rms {np.sqrt(np.mean(e**2)):.4f} bias {e.mean():+.4f}, {inside}")
+    if odds:
+        print(f"log odds of hardening above 3 in {np.sum(np.array(odds) > 3.0)} of {len(odds)}")
+
+
+if __name__ == "__main__":
+    main()
