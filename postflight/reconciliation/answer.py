@@ -12,6 +12,7 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_clock
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.candidate import (
+    DAMPING_LOG_SD,
     HARDENING_SD,
     OFFSET_SD_M,
     STIFFNESS_LOG_SD,
@@ -70,6 +71,15 @@ def joint_table(found: Reconciled) -> pd.DataFrame:
             at, sd = start + scale * float(x[k]), scale * float(np.sqrt(covariance[k, k]))
             rows.append((label, "", start, at, sd, at - reach * sd, at + reach * sd))
     return pd.DataFrame(rows, columns=["quantity", "unit", "told", "found", "sd", "low", "high"])
+
+
+def found_sd(found: Reconciled) -> tuple[tuple[float, float], float, float]:
+    """One sd: of stiffness and damping (logarithms), of the offset's sides (their mean), m, of the stability."""
+    names = found.problem.unknown.names
+    sd = dict(zip(names, np.sqrt(np.diag(found.covariance)[: len(names)]).tolist(), strict=True))
+    offset = float(OFFSET_SD_M * np.hypot(sd["offset y"], sd["offset z"]) / np.sqrt(2.0))
+    joint = STIFFNESS_LOG_SD * sd["stiffness"], DAMPING_LOG_SD * sd["damping"]
+    return joint, offset, found.problem.unknown.told.uncertainty.cm * sd["static stability"]
 
 
 def correlations(found: Reconciled) -> pd.DataFrame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,19 @@ from rich.table import Table
 
 from flightmodel.flightfolder import read_flight
 from postflight import results
-from postflight.commands import compile_kernels, console, progress_bar
+from postflight.commands import Report, compile_kernels, console, progress_bar
 from postflight.figures import save
-from postflight.pipeline import PULSE_RATE_HZ, estimate, reconstruct_telemetry
-from postflight.reconciliation.answer import correlations, deflection_of, joint_table, vehicle_lines
+from postflight.pipeline import PULSE_RATE_HZ, Flight, estimate, reconstruct_telemetry
+from postflight.preflight import Bounds, entry_bounds, rigid_bounds
+from postflight.reconciliation.answer import correlations, deflection_of, found_sd, joint_table, vehicle_lines
 from postflight.reconciliation.figures import figure_reconciled
 from postflight.reconciliation.fit import Reconciled, reconcile
+from postflight.studies.commands import bands, held_against
 from postflight.warmup import RECONSTRUCTION
 from recon.bet import Settings
+from synthetic_flight.dispersions import Factor, JointDispersions
 
+ENTRIES = 300
 STRONG = 3.0  # logarithm of odds of twenty to one
 
 
@@ -34,21 +39,49 @@ def run(folder: Path, hardening: bool) -> None:
             telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.2 * f, what)
         )
         answers = estimate(flight, telemetry, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
-        found, odds = reconcile(flight, False, lambda f, what: report(0.3 + 0.3 * f, what)), None
-        if hardening:
-            plain, found = found, reconcile(flight, True, lambda f, what: report(0.6 + 0.35 * f, what))
-            odds = found.log_evidence - plain.log_evidence
+        found, odds = _joint(flight, hardening, lambda f, what: report(0.3 + 0.6 * f, what))
+        rigid = rigid_bounds(flight, ENTRIES, progress=lambda f, what: report(0.9 + 0.05 * f, what))
+        flexible = reconciled_bounds(found, flight, lambda f, what: report(0.95 + 0.05 * f, what))
+        shares, _, bands_picture = held_against(flight, rigid, flexible)
         with results.RunFolder(folder, telemetry, settings) as out:
             table = joint_table(found)
             out.write_csv("joint.csv", table)
             out.write_csv("joint_correlations.csv", correlations(found))
             out.write_csv("deflection_reconciled.csv", results.deflection_table(deflection_of(found)))
             out.write_json("reconciliation.json", summary(found, table, odds))
+            out.write_csv("bands.csv", bands(rigid, flexible))
+            out.write_csv("bands_shares.csv", shares)
+            save(bands_picture, out.path / "figures" / "bands.png")
             (out.path / "joint.toml").write_text(vehicle_lines(found))
             fused = answers.histories.get("fused")
             save(figure_reconciled(found, telemetry, fused), out.path / "figures" / "reconciled.png")
     print_joint(found, table, odds)
+    inside = ", ".join(
+        f"{r.joint} {100 * r.share_inside:.0f} % ({r.quantity.split('_')[0]})" for r in shares.itertuples(index=False)
+    )
+    console.print(f"the flight lies inside the bands of {ENTRIES} entries, of the pulse: {inside}")
     console.print(f"results in {escape(str(out.path))}")
+
+
+def _joint(flight: Flight, hardening: bool, report: Report) -> tuple[Reconciled, float | None]:
+    """Fit the joint; with hardening both ways, the evidence chooses: log odds of a spring that hardens."""
+    if not hardening:
+        return reconcile(flight, False, report), None
+    plain = reconcile(flight, False, lambda f, what: report(0.5 * f, what))
+    hard = reconcile(flight, True, lambda f, what: report(0.5 + 0.5 * f, what))
+    odds = hard.log_evidence - plain.log_evidence
+    # a spring that softens is no joint that the vehicle file knows: it is said, not flown
+    hardens = hard.vehicle.joint.hardening_nmprad3 > 0.0
+    return (hard if odds > 0.0 and hardens else plain), odds
+
+
+def reconciled_bounds(found: Reconciled, flight: Flight, report: Report) -> Bounds:
+    """Bands of entries with the joint, offset and stability found, dispersed as far as they are open still."""
+    joint, offset, stability = found_sd(found)
+    vehicle = found.vehicle
+    known = vehicle.uncertainty.model_copy(update={"cg_lateral_m": offset, "cm": stability})
+    laws = JointDispersions(stiffness=Factor(lognormal=joint[0]), damping=Factor(lognormal=joint[1]))
+    return entry_bounds(flight, laws, ENTRIES, progress=report, vehicle=replace(vehicle, uncertainty=known))
 
 
 def summary(found: Reconciled, table: pd.DataFrame, odds: float | None) -> dict[str, object]:
@@ -59,7 +92,7 @@ def summary(found: Reconciled, table: pd.DataFrame, odds: float | None) -> dict[
         "sensor_residual_rms_sd": float(np.sqrt(np.mean(found.residuals.sensors**2))),
         "join_rms_sd": float(np.sqrt(np.mean(found.residuals.joins**2))),
         "joint": table.to_dict(orient="records"),
-        "log_odds_of_hardening": odds,
+        "log_odds_of_changing_slope": odds,
     }
 
 
@@ -74,6 +107,10 @@ def print_joint(found: Reconciled, table: pd.DataFrame, odds: float | None) -> N
     console.print(printed)
     if odds is not None:
         words = "no clear evidence" if abs(odds) < STRONG else f"strong evidence {'for' if odds > 0.0 else 'against'}"
-        console.print(f"hardening: {words} (odds e^{odds:+.1f})")
+        console.print(f"a spring whose slope changes with the angle: {words} (odds e^{odds:+.1f})")
+        if odds > STRONG and not found.problem.unknown.hardening:
+            console.print(
+                "[yellow]the slope falls with the angle: freeplay in part of the pulse, or a joint that gives[/]"
+            )
     if not found.converged:
         console.print("[yellow]the fit had not settled after its last step: take the intervals as too narrow[/]")

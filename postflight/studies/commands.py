@@ -101,30 +101,14 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
     compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
     with progress_bar() as report:
         flight = reconstruct_flight(flight_folder, None, lambda f, what: report(0.4 * f, what))
-        pulse = flight.required_pulse()
+        flight.required_pulse()
         rigid = entry_bounds(flight, None, flights, seed, lambda f, what: report(0.4 + 0.3 * f, what))
         flexible = entry_bounds(flight, joint, flights, seed, lambda f, what: report(0.7 + 0.3 * f, what))
-    flown = pd.DataFrame(
-        {
-            "time_s": pulse.time_s,
-            "alpha_total_deg": np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad)),
-            "normal_g": np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / 9.80665,
-        }
-    )
-    table = shares(flight, flown, rigid, flexible)
+    table, flown, picture = held_against(flight, rigid, flexible)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "preflight.csv", table)
     write_csv(folder / "preflight_bands.csv", bands(rigid, flexible))
     write_csv(folder / "preflight_flight.csv", flown)
-    words = "inside, of the pulse: " + "; ".join(
-        f"{joint} {quantity.split('_')[0]} {100 * share:.0f} %"
-        for joint, quantity, share in zip(table["joint"], table["quantity"], table["share_inside"], strict=True)
-    )
-    tag = "SYNTHETIC flight" if flight.telemetry.synthetic else "flight"
-    span = _pulse_span(flight)
-    picture = figures.figure_preflight(
-        rigid, flexible, flown, (span[0] - 10.0, span[1] + 5.0), words, f"{flight.telemetry.name}: {tag}"
-    )
     save(picture, folder / "figure_1_3.png")
     printed = Table(title=f"The flight against 2.3 to 97.7 % of {flights} entries, over the pulse")
     for head in ("joint", "quantity", "inside", "over the median", "peak / 97.7 %", "diverged"):
@@ -136,6 +120,28 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
     console.print(printed)
     console.print("paper: angle of attack 4 to 5 deg above the median, peak normal acceleration over twice the bound")
     console.print(f"results in {escape(str(folder))}")
+
+
+def held_against(flight: Flight, rigid: Bounds, flexible: Bounds) -> tuple[pd.DataFrame, pd.DataFrame, figures.Figure]:
+    """Return `shares`, the flight's own columns ``time_s, alpha_total_deg, normal_g``, and both as a picture."""
+    pulse = flight.required_pulse()
+    flown = pd.DataFrame(
+        {
+            "time_s": pulse.time_s,
+            "alpha_total_deg": np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad)),
+            "normal_g": np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / 9.80665,
+        }
+    )
+    table = shares(flight, flown, rigid, flexible)
+    words = "inside, of the pulse: " + "; ".join(
+        f"{joint} {quantity.split('_')[0]} {100 * share:.0f} %"
+        for joint, quantity, share in zip(table["joint"], table["quantity"], table["share_inside"], strict=True)
+    )
+    tag = "SYNTHETIC flight" if flight.telemetry.synthetic else "flight"
+    span = _pulse_span(flight)
+    window = span[0] - 10.0, span[1] + 5.0
+    picture = figures.figure_preflight(rigid, flexible, flown, window, words, f"{flight.telemetry.name}: {tag}")
+    return table, flown, picture
 
 
 def _pulse_span(flight: Flight) -> tuple[float, float]:
