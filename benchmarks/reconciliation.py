@@ -1,6 +1,6 @@
 """Is the joint found, and do its intervals hold? Dispersed flights of a joint that the fit is not told.
 
-Run: ``python benchmarks/reconciliation.py [FLIGHTS] [--hardening SHARE]`` (30 flights). Drawn anew for each seed and
+Run: ``python benchmarks/reconciliation.py [FLIGHTS] [--first SEED] [--hardening SHARE]`` (30 flights). Drawn anew for each seed and
 not told: stiffness up to half above the told one, damping ratio, size and side of the c.g.'s offset, masses, stations,
 inertias, coefficients, start, spin, air, the sounding's and every instrument's errors, all in the sizes that vehicle
 file and data sheets state. No video. Some 25 s of processor time a flight. With ``--hardening`` the spring's slope is
@@ -74,8 +74,9 @@ def errors(found, vehicle, factors):
 def main():
     hardening = float(sys.argv[sys.argv.index("--hardening") + 1]) if "--hardening" in sys.argv else None
     count = int(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[1].isdigit() else 30
+    first = int(sys.argv[sys.argv.index("--first") + 1]) if "--first" in sys.argv else 0
     rows, odds = [], []
-    for seed in range(count):
+    for seed in range(first, first + count):
         vehicle, factors = flown_vehicle(seed, hardening or 0.0)
         flight, truth = reconstructed(seed, vehicle)
         if truth.words:

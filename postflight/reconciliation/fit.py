@@ -2,7 +2,8 @@
 
 Gauss-Newton's steps on `Problem`, first with all standard deviations many times wider, so that far starts find the
 valley. The valley is long and bent (stiffness, inertias and stability nearly scale together), so every step gets the
-second-order correction of geodesic acceleration. The covariance is that of the linear problem at the answer.
+second-order correction of geodesic acceleration. The covariance is that of the linear problem at the answer, widened by a
+measured factor.
 
 References
 ----------
@@ -27,6 +28,9 @@ from postflight.reconciliation.problem import Problem, Residuals, Unknowns
 WIDER = (30.0, 10.0, 3.0)
 MOST_STEPS, SETTLED_SD, SETTLED_COST = 10, 0.1, 0.3
 PARTS = (1.0, 0.5, 0.25)  # of a step
+# over thirty dispersed flights (seeds 0 to 29) errors of stiffness were 1.5, of offset 1.2, of stability 1.1 times what
+# the linear problem says
+BENT_VALLEY = 1.4
 LOOK_AHEAD = 0.1  # of a step, over which its curvature is taken
 FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e3
 Progress = Callable[[float, str], None]
@@ -41,8 +45,8 @@ class Reconciled:
     problem : Problem
     unknowns : Unknowns
         Most probable of all.
-    covariance : (n, n) float
-        Of all unknowns, in their order.
+    linear_covariance : (n, n) float
+        Of all unknowns, in their order, of the linear problem at the answer.
     residuals : Residuals
     steps : int
     converged : bool
@@ -50,16 +54,21 @@ class Reconciled:
 
     problem: Problem
     unknowns: Unknowns
-    covariance: FloatArray
+    linear_covariance: FloatArray
     residuals: Residuals
     steps: int
     converged: bool
 
     @property
+    def covariance(self) -> FloatArray:
+        """Covariance of all unknowns, in their order: the linear one, widened for the bent valley."""
+        return self.linear_covariance * BENT_VALLEY**2
+
+    @property
     def log_evidence(self) -> float:
         """Logarithm of the probability of the data by Laplace's method, up to what all models of a flight share."""
-        sd = np.sqrt(np.diag(self.covariance))
-        _, shape = np.linalg.slogdet(self.covariance / np.outer(sd, sd))
+        sd = np.sqrt(np.diag(self.linear_covariance))
+        _, shape = np.linalg.slogdet(self.linear_covariance / np.outer(sd, sd))
         return float(0.5 * shape + np.log(sd).sum() - 0.5 * self.residuals.cost)
 
     @property
