@@ -1,7 +1,7 @@
 """Is the joint found, and do its intervals hold? Dispersed flights of a joint that the fit is not told.
 
-Run: ``python benchmarks/reconciliation.py [FLIGHTS] [--first SEED] [--hardening SHARE]`` (30 flights). Drawn anew for each seed and
-not told: stiffness up to half above the told one, damping ratio, size and side of the c.g.'s offset, masses, stations,
+Run: ``python benchmarks/reconciliation.py [FLIGHTS] [--first SEED] [--hardening SHARE]`` (30 flights). Drawn anew for
+each seed and not told: stiffness up to half above the told one, damping ratio, size and side of the c.g.'s offset, masses, stations,
 inertias, coefficients, start, spin, air, the sounding's and every instrument's errors, all in the sizes that vehicle
 file and data sheets state. No video. Some 25 s of processor time a flight. With ``--hardening`` the spring's slope is
 by that share steeper at 4 deg, every flight is fitted with and without hardening, and the odds are printed; 0 flies

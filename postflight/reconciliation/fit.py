@@ -2,8 +2,8 @@
 
 Gauss-Newton's steps on `Problem`, first with all standard deviations many times wider, so that far starts find the
 valley. The valley is long and bent (stiffness, inertias and stability nearly scale together), so every step gets the
-second-order correction of geodesic acceleration. The covariance is that of the linear problem at the answer, widened by a
-measured factor.
+second-order correction of geodesic acceleration. The covariance is that of the linear problem at the answer, widened by
+a measured factor.
 
 References
 ----------
