@@ -10,6 +10,7 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
+from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight import results
 from postflight.commands import Report, compile_kernels, console, progress_bar
@@ -17,8 +18,9 @@ from postflight.figures import save
 from postflight.pipeline import PULSE_RATE_HZ, Flight, estimate, reconstruct_telemetry
 from postflight.preflight import Bounds, entry_bounds, rigid_bounds
 from postflight.reconciliation.answer import correlations, deflection_of, found_sd, joint_table, vehicle_lines
-from postflight.reconciliation.figures import figure_reconciled
+from postflight.reconciliation.figures import figure_modes, figure_reconciled
 from postflight.reconciliation.fit import Reconciled, reconcile
+from postflight.reconciliation.modes import ModalStiffness, stiffness_by_modes
 from postflight.studies.commands import bands, held_against
 from postflight.warmup import RECONSTRUCTION
 from recon.bet import Settings
@@ -40,6 +42,7 @@ def run(folder: Path, hardening: bool) -> None:
         )
         answers = estimate(flight, telemetry, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
         found, odds = _joint(flight, hardening, lambda f, what: report(0.3 + 0.6 * f, what))
+        modal, no_modes = _modes(flight)
         rigid = rigid_bounds(flight, ENTRIES, progress=lambda f, what: report(0.9 + 0.05 * f, what))
         flexible = reconciled_bounds(found, flight, lambda f, what: report(0.95 + 0.05 * f, what))
         shares, _, bands_picture = held_against(flight, rigid, flexible)
@@ -48,19 +51,41 @@ def run(folder: Path, hardening: bool) -> None:
             out.write_csv("joint.csv", table)
             out.write_csv("joint_correlations.csv", correlations(found))
             out.write_csv("deflection_reconciled.csv", results.deflection_table(deflection_of(found)))
-            out.write_json("reconciliation.json", summary(found, table, odds))
+            out.write_json("reconciliation.json", summary(found, table, odds) | modal_summary(modal, no_modes))
             out.write_csv("bands.csv", bands(rigid, flexible))
             out.write_csv("bands_shares.csv", shares)
             save(bands_picture, out.path / "figures" / "bands.png")
+            if modal is not None:
+                save(figure_modes(modal, telemetry), out.path / "figures" / "modes.png")
             (out.path / "joint.toml").write_text(vehicle_lines(found))
             fused = answers.histories.get("fused")
             save(figure_reconciled(found, telemetry, fused), out.path / "figures" / "reconciled.png")
     print_joint(found, table, odds)
+    if modal is None:
+        console.print(f"stiffness by the joint's frequency: none ({escape(no_modes)})")
+    else:
+        by_modes = f"{modal.stiffness_nmprad:.0f} +/- {modal.sd_nmprad:.0f} N m/rad"
+        console.print(f"stiffness by the joint's frequency alone, independently: {by_modes}")
     inside = ", ".join(
         f"{r.joint} {100 * r.share_inside:.0f} % ({r.quantity.split('_')[0]})" for r in shares.itertuples(index=False)
     )
     console.print(f"the flight lies inside the bands of {ENTRIES} entries, of the pulse: {inside}")
     console.print(f"results in {escape(str(out.path))}")
+
+
+def _modes(flight: Flight) -> tuple[ModalStiffness | None, str]:
+    """Stiffness by the joint's frequency, or why there is none."""
+    try:
+        return stiffness_by_modes(flight), ""
+    except GateError as fault:
+        return None, str(fault)
+
+
+def modal_summary(modal: ModalStiffness | None, no_modes: str) -> dict[str, object]:
+    """Return the second way's answer, for ``reconciliation.json``."""
+    if modal is None:
+        return {"stiffness_by_modes_nmprad": None, "no_modes": no_modes}
+    return {"stiffness_by_modes_nmprad": modal.stiffness_nmprad, "stiffness_by_modes_sd_nmprad": modal.sd_nmprad}
 
 
 def _joint(flight: Flight, hardening: bool, report: Report) -> tuple[Reconciled, float | None]:

@@ -12,8 +12,10 @@ from flightmodel.telemetry import Telemetry
 from postflight.figures import COLOUR, stamp
 from postflight.reconciliation.answer import deflection_of, stiffness_and_offset
 from postflight.reconciliation.fit import Reconciled
+from postflight.reconciliation.modes import ModalStiffness
 
 FOUND, MEASURED = "#0072B2", "#000000"
+HIGHEST_HZ = 5.0
 
 
 def figure_reconciled(found: Reconciled, telemetry: Telemetry, fused: DeflectionHistory | None) -> Figure:
@@ -37,10 +39,7 @@ def figure_reconciled(found: Reconciled, telemetry: Telemetry, fused: Deflection
     for ax in axes.ravel()[:5]:
         ax.set_xlabel("time after launch (s)")
     figure.suptitle("Joint reconciled with the flight", fontsize=12)
-    stamp(figure, telemetry)
-    engine = figure.get_layout_engine()
-    assert engine is not None
-    engine.set(rect=(0.0, 0.02, 1.0, 0.98))  # type: ignore[call-arg]
+    _with_room_for_stamp(figure, telemetry)
     return figure
 
 
@@ -88,3 +87,40 @@ def _ridge(ax: Axes, found: Reconciled) -> None:
     share = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
     ax.set_title(f"correlation {share:+.2f}", fontsize=9)
     ax.legend(frameon=False, fontsize=8)
+
+
+def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
+    """Spectra through the pulse with the linear model's modes over them; what lies along every stiffness's track."""
+    figure = Figure(figsize=(9.0, 4.8), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[2.0, 1.0])
+    shown = np.abs(found.frequency_hz) < HIGHEST_HZ
+    picture = left.pcolormesh(
+        found.time_s, found.frequency_hz[shown], found.power.T[shown], shading="nearest", cmap="Greys", vmin=0.0
+    )
+    figure.colorbar(picture, ax=left, label="ln of power over noise")
+    for sense in (1.0, -1.0):
+        left.plot(found.time_s, sense * found.joint_hz, color=FOUND, lw=1.2, label="joint" if sense > 0.0 else None)
+        label = "aerodynamic" if sense > 0.0 else None
+        left.plot(found.time_s, sense * found.aerodynamic_hz, color="#D55E00", lw=1.2, ls="--", label=label)
+    left.set_xlabel("time after launch (s)")
+    left.set_ylabel("frequency in axes that do not spin (Hz)")
+    left.legend(frameon=False, fontsize=8, loc="upper left")
+    told = found.stiffness_nmprad / found.factor[int(np.argmax(found.gathered))]
+    right.plot(found.factor * told, found.gathered, color=FOUND, lw=1.2)
+    low, high = found.stiffness_nmprad - found.sd_nmprad, found.stiffness_nmprad + found.sd_nmprad
+    right.axvspan(low, high, color=FOUND, alpha=0.2, lw=0, label="1 sd")
+    right.set_xlabel("bending stiffness (N m/rad)")
+    right.set_ylabel("gathered along the joint's track")
+    right.grid(alpha=0.3)
+    right.spines[["top", "right"]].set_visible(False)
+    right.legend(frameon=False, fontsize=8)
+    figure.suptitle("Modes of the lateral motion and the linear model", fontsize=12)
+    _with_room_for_stamp(figure, telemetry)
+    return figure
+
+
+def _with_room_for_stamp(figure: Figure, telemetry: Telemetry) -> None:
+    stamp(figure, telemetry)
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.set(rect=(0.0, 0.03, 1.0, 0.97))  # type: ignore[call-arg]

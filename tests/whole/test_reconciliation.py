@@ -5,6 +5,7 @@ The flown vehicle has another joint, offset, stability, masses and coefficients 
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -112,6 +113,9 @@ def test_an_unknown_joint_is_found(flown):
         by_factor = table.low[name] > 0.0 and "offset" not in name and name != "static stability"
         error = np.log(table.found[name] / true) * table.found[name] if by_factor else table.found[name] - true
         assert abs(error) < 4.0 * table.sd[name], name
+    told = json.loads((run / "reconciliation.json").read_text())
+    by_modes, sd = told["stiffness_by_modes_nmprad"], told["stiffness_by_modes_sd_nmprad"]
+    assert abs(by_modes - vehicle.joint.bending_stiffness_nmprad) < 3.5 * sd < 0.15 * by_modes
     for axis in "yz":
         assert abs(table.found[f"c.g. offset {axis}"] - 100.0 * vehicle.cg_m["xyz".index(axis)]) < 0.08
     bent = pd.read_csv(run / "deflection_reconciled.csv")

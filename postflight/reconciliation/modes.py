@@ -1,0 +1,189 @@
+"""A second way to the stiffness: at which frequency does the joint swing, and how does that follow dynamic pressure?
+
+Lateral rates and specific force, turned into axes that do not spin, are cut into overlapping windows; of their spectra
+the part above the noise is summed along the frequency that the linear model (`synthetic_flight.linear`) predicts for
+the joint's mode at every window's dynamic pressure, Mach number and speed, for both senses of rotation. The stiffness
+for which most is gathered is the answer: no start, no damping, no offset and no wind take part, only the vehicle's
+masses, stations, inertias and coefficients, whose uncertainty is carried by differences.
+
+Assumed: small angles, pressure frozen over a window, and a spin slow against the mode (both senses are summed, so that
+what spin adds to one it takes from the other).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.vehicle import Vehicle
+from postflight.pipeline import Flight
+from postflight.reconciliation.candidate import STIFFNESS_LOG_SD, VehicleUnknowns
+from synthetic_flight.linear import linear_matrix, modes, slopes_at
+
+RATE_HZ = 50.0
+WINDOW, HOP, PADDED = 256, 32, 2048
+LEAST_PRESSURE_PA = 20.0
+FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 141))  # of the stiffness that was told
+BLOCKS = 6
+DIFFERENCE = 0.05  # of a standard deviation
+LEAST_GATHERED = 1.0  # mean logarithm of power over noise along the best track
+
+
+@dataclass(frozen=True)
+class ModalStiffness:
+    """Stiffness by the joint's frequency.
+
+    Parameters
+    ----------
+    stiffness_nmprad, sd_nmprad : float
+        The sd holds the scatter between parts of the pulse and the vehicle's uncertainty.
+    time_s : (n,) float
+        Middles of the windows.
+    frequency_hz : (k,) float
+        Both senses of rotation.
+    power : (n, k) float
+        Logarithm of the spectra over their noise, rates and force together.
+    joint_hz, aerodynamic_hz : (n,) float
+        Frequencies of the linear model with this stiffness.
+    factor, gathered : (m,) float
+        Of the told stiffness, and what lies along its track.
+    """
+
+    stiffness_nmprad: float
+    sd_nmprad: float
+    time_s: FloatArray
+    frequency_hz: FloatArray
+    power: FloatArray
+    joint_hz: FloatArray
+    aerodynamic_hz: FloatArray
+    factor: FloatArray
+    gathered: FloatArray
+
+
+def stiffness_by_modes(flight: Flight) -> ModalStiffness:
+    """Track the joint's mode through the pressure pulse.
+
+    Raises
+    ------
+    GateError
+        Where vehicle or sensors are missing, the pulse is shorter than a few windows, or no mode stands out.
+    """
+    pulse, told = flight.required_pulse(), flight.telemetry.required_vehicle()
+    t, log_power = _spectra(flight, pulse.time_s)
+    pressure = np.interp(t, pulse.time_s, pulse.dynamic_pressure_pa)
+    use = pressure > LEAST_PRESSURE_PA
+    if use.sum() < BLOCKS:
+        raise GateError(f"modes: {use.sum()} windows with more than {LEAST_PRESSURE_PA:g} Pa; {BLOCKS} are wanted")
+    t, log_power, pressure = t[use], log_power[use], pressure[use]
+    flow = pressure, np.interp(t, pulse.time_s, pulse.mach), np.interp(t, pulse.time_s, pulse.airspeed_mps)
+    frequency = np.asarray(np.fft.fftfreq(PADDED, 1.0 / RATE_HZ), dtype=np.float64)
+    along = np.array([_along(frequency, log_power, track) for track in _tracks(told, flow)])
+    gathered = along.mean(axis=1)
+    if gathered.max() < LEAST_GATHERED:
+        raise GateError("modes: the joint's swinging does not stand out of the noise anywhere in the pulse")
+    best = _peak(gathered)
+    parts = np.array_split(np.arange(len(t)), BLOCKS)
+    left_out = np.array([_peak(np.delete(along, part, axis=1).mean(axis=1)) for part in parts])
+    scatter = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((left_out - left_out.mean()) ** 2))
+    sd = float(np.hypot(scatter, _vehicle_sd(told, float(np.exp(best)), flow)))
+    stiffness = told.joint.bending_stiffness_nmprad * float(np.exp(best))
+    aerodynamic, joint = _frequencies(_stiffer(told, float(np.exp(best))), flow)
+    order = np.argsort(frequency)
+    return ModalStiffness(
+        stiffness, stiffness * sd, t, frequency[order], log_power[:, order], joint, aerodynamic, FACTORS, gathered
+    )
+
+
+def _spectra(flight: Flight, span_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) and logarithms (n, PADDED) of power over noise, means of rates and force."""
+    bet = flight.reconstruction
+    grid = np.arange(span_s[0], span_s[-1], 1.0 / RATE_HZ)
+    if len(grid) < WINDOW + HOP:
+        raise GateError(
+            f"modes: {len(grid) / RATE_HZ:.1f} s of pulse; at least {(WINDOW + HOP) / RATE_HZ:.1f} s are wanted"
+        )
+    rate = np.column_stack([np.interp(grid, bet.imu_time_s, c) for c in bet.rate_body_radps.T])
+    force = np.column_stack([np.interp(grid, bet.imu_time_s, c) for c in bet.specific_force_body_mps2.T])
+    despun = np.exp(1j * np.cumsum(rate[:, 0]) / RATE_HZ)
+    starts = np.arange(0, len(grid) - WINDOW, HOP)
+    total = np.zeros((len(starts), PADDED))
+    for lateral in (rate[:, 1] + 1j * rate[:, 2], force[:, 1] + 1j * force[:, 2]):
+        # differences take the slow motion's leakage down
+        moved = np.diff(lateral * despun, append=0.0)
+        pieces = moved[starts[:, None] + np.arange(WINDOW)] * np.hanning(WINDOW)
+        power = np.abs(np.fft.fft(pieces, PADDED, axis=1)) ** 2
+        total += 0.5 * np.log(power / np.median(power, axis=1, keepdims=True))
+    return grid[starts] + 0.5 * WINDOW / RATE_HZ, total
+
+
+def _tracks(told: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
+    """Frequencies of the joint's mode (factors, n), Hz: between every tenth of `FACTORS` by straight lines."""
+    coarse = FACTORS[::10]
+    known = np.array([_frequencies(_stiffer(told, factor), flow)[1] for factor in coarse])
+    return np.column_stack([np.interp(np.log(FACTORS), np.log(coarse), column) for column in known.T])
+
+
+def _stiffer(told: Vehicle, factor: float) -> Vehicle:
+    x = np.zeros(len(VehicleUnknowns(told).names))
+    x[0] = np.log(factor) / STIFFNESS_LOG_SD
+    return VehicleUnknowns(told).vehicle(x)
+
+
+def _frequencies(vehicle: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Frequencies of the aerodynamic and the joint's mode, Hz, each (n,); NaN where one does not oscillate."""
+    out = np.full((2, len(flow[0])), np.nan)
+    for k, (pressure, mach, speed) in enumerate(zip(*flow, strict=True)):
+        found = modes(
+            linear_matrix(vehicle, slopes_at(vehicle, float(mach)), float(pressure), float(speed))
+        ).frequencies_hz
+        out[1, k] = found[-1] if len(found) else np.nan
+        out[0, k] = found[-2] if len(found) > 1 else np.nan
+    return out[0], out[1]
+
+
+def _along(frequency_hz: FloatArray, log_power: FloatArray, track_hz: FloatArray) -> FloatArray:
+    """Mean of both senses at a track's frequencies, (n,); zero where the track ends."""
+    step = frequency_hz[1]
+    known = np.isfinite(track_hz)
+    near = np.where(known, np.nan_to_num(track_hz) / step, 0.0)
+    rows, low = np.arange(len(track_hz)), np.floor(near).astype(int)
+    share = near - low
+    out = np.zeros(len(track_hz))
+    for sense in (1, -1):
+        here, there = (log_power[rows, (sense * k) % len(frequency_hz)] for k in (low, low + 1))
+        out += 0.5 * ((1.0 - share) * here + share * there)
+    return np.where(known, out, 0.0)
+
+
+def _peak(gathered: FloatArray) -> float:
+    """Logarithm of the factor with most gathered, by a parabola."""
+    k = int(np.clip(np.argmax(gathered), 1, len(gathered) - 2))
+    left, middle, right = gathered[k - 1 : k + 2]
+    bow = left - 2.0 * middle + right
+    shift = 0.0 if bow >= 0.0 else float(np.clip(0.5 * (left - right) / bow, -1.0, 1.0))
+    return float(np.log(FACTORS[k]) + shift * np.log(FACTORS[1] / FACTORS[0]))
+
+
+def _vehicle_sd(told: Vehicle, factor: float, flow: tuple[FloatArray, FloatArray, FloatArray]) -> float:
+    """One sd of the stiffness's logarithm for what is open of the vehicle, the joint's frequency held."""
+    unknown = VehicleUnknowns(told)
+
+    def mean_log_hz(x: FloatArray) -> float:
+        vehicle = unknown.vehicle(x)
+        ca, cn, cm, cmq = unknown.factors(x)
+        scaled = replace(vehicle, aero=vehicle.aero.scaled(ca, cn, cm, cmq))
+        return float(np.nanmean(np.log(_frequencies(scaled, flow)[1])))
+
+    x = np.zeros(len(unknown.names))
+    x[0] = np.log(factor) / STIFFNESS_LOG_SD
+    base = mean_log_hz(x)
+    slopes = {}
+    for k, name in enumerate(unknown.names):
+        if name not in ("damping", "offset y", "offset z"):
+            moved = x.copy()
+            moved[k] += DIFFERENCE
+            slopes[name] = (mean_log_hz(moved) - base) / DIFFERENCE
+    by_stiffness = slopes.pop("stiffness") / STIFFNESS_LOG_SD
+    return float(np.sqrt(sum(s**2 for s in slopes.values())) / abs(by_stiffness))
