@@ -21,6 +21,7 @@ from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
 from postflight.report import pictures, series, shape, words
 from postflight.report.source import Run, read_run
+from postflight.results import remove_abandoned
 
 NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
@@ -43,7 +44,8 @@ def write_report(
     target = run.path / NAME if target is None else target
     text = page(run)
     try:
-        handle, partial = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)
+        remove_abandoned(target.parent, f".{target.name}-")
+        handle, partial = tempfile.mkstemp(prefix=f".{target.name}-{os.getpid()}-", dir=target.parent)
         try:
             with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as out:
                 out.write(text)
