@@ -175,7 +175,8 @@ def main() -> None:
         fault.show()
         sys.exit(fault.exit_code)
     except OSError as fault:
-        click.echo(f"error: {fault.filename or ''}: {fault.strerror or fault}", err=True)
+        where = fault.filename or "reading or writing a file failed"
+        click.echo(f"error: {where}: {fault.strerror or fault}", err=True)
         sys.exit(3)
     except ValueError as fault:
         sys.exit(refusal(fault))

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import GateError
+from flightmodel.checks import GateError, writing
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
@@ -31,6 +31,7 @@ from postflight.product.tables import event_table, peak_table, residual_statisti
 from postflight.product.trajectory_table import bet_table
 
 DIGITS = "%.10g"
+COPY = "copy the flight folder to where you may write"
 PARTIAL = ".partial-"  # before the number of the process that writes it
 
 
@@ -47,21 +48,22 @@ class RunFolder:
 
     def __enter__(self) -> RunFolder:
         """Make the partial folder beside the final one."""
-        try:
+        with writing(self.parent, COPY):
             self.parent.mkdir(exist_ok=True)
             remove_abandoned(self.parent)
             self.path = Path(tempfile.mkdtemp(prefix=f"{PARTIAL}{os.getpid()}-", dir=self.parent))
-        except OSError as fault:
-            raise GateError(f"{self.parent}: cannot be written: {fault.strerror}; copy the flight folder") from None
-        (self.path / "figures").mkdir()
+            (self.path / "figures").mkdir()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, _: object) -> None:
         """Rename when whole; remove otherwise, also where the end itself is interrupted."""
         partial = self.path
         try:
-            if kind is None:
-                self._finish()
+            with writing(self.parent, COPY):
+                if isinstance(fault, OSError):
+                    raise fault
+                if kind is None:
+                    self._finish()
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 

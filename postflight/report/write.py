@@ -16,7 +16,7 @@ from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import GateError
+from flightmodel.checks import writing
 from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
 from postflight.report import pictures, series, shape, words
@@ -43,7 +43,7 @@ def write_report(
     run = read_run(flight_folder, path, telemetry)
     target = run.path / NAME if target is None else target
     text = page(run)
-    try:
+    with writing(target, "name another place with --output"):
         remove_abandoned(target.parent, f".{target.name}-")
         handle, partial = tempfile.mkstemp(prefix=f".{target.name}-{os.getpid()}-", dir=target.parent)
         try:
@@ -53,8 +53,6 @@ def write_report(
             Path(partial).replace(target)
         finally:
             Path(partial).unlink(missing_ok=True)
-    except OSError as fault:
-        raise GateError(f"{target}: cannot be written: {fault.strerror}; name another place with --output") from None
     return target
 
 

@@ -24,12 +24,12 @@ def start_run(flight: Path) -> subprocess.Popen[bytes]:
 
 
 def contents(folder: Path) -> Files:
-    """Every file below a folder that has a visible name, by path; names of run folders without their time."""
+    """Every file of run folders that has a visible name, by its path in its run."""
     out = {}
     for path in sorted(folder.rglob("*")):
         parts = path.relative_to(folder).parts
         if path.is_file() and not any(part.startswith(".") for part in parts):
-            out["/".join((parts[0].split("-")[-1], *parts[1:]))] = path.read_bytes()
+            out["/".join(parts[1:])] = path.read_bytes()
     return out
 
 
@@ -49,12 +49,18 @@ def run_whole(flight: Path) -> Files:
     return contents(runs)
 
 
-def kill_run(flight: Path, at_s: float, whole: Files) -> str:
-    """Kill a run after ``at_s`` and compare what has a visible name with ``whole``; say when it was killed."""
+def kill_run(flight: Path, at_s: float | None, whole: Files) -> str:
+    """Kill a run after ``at_s`` and compare what has a visible name with ``whole``; say when it was killed.
+
+    None kills it half a second after it began to write.
+    """
     runs = flight / "runs"
     before = set(runs.glob(".*"))
     process = start_run(flight)
-    time.sleep(at_s)
+    if at_s is None:
+        while process.poll() is None and not set(runs.glob(".*")) - before:
+            time.sleep(0.02)
+    time.sleep(0.5 if at_s is None else at_s)
     process.kill()
     process.communicate(timeout=30)
     left, writing = contents(runs) if runs.is_dir() else {}, bool(set(runs.glob(".*")) - before)
@@ -77,4 +83,4 @@ def run_again(flight: Path, whole: Files) -> None:
 def assert_same(files: Files, whole: Files) -> None:
     """Check names and bytes, but for ``run.json``, which holds the time."""
     assert sorted(files) == sorted(whole)
-    assert [n for n in files if files[n] != whole[n] and not n.endswith("/run.json")] == []
+    assert [n for n in files if files[n] != whole[n] and n != "run.json"] == []
