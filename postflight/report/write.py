@@ -42,7 +42,12 @@ def write_report(
     """
     run = read_run(flight_folder, path, telemetry)
     target = run.path / NAME if target is None else target
-    text = page(run)
+    write_whole(target, page(run))
+    return target
+
+
+def write_whole(target: Path, text: str) -> None:
+    """Write a file that appears at once, or a `GateError` with its name."""
     with writing(target, "name another place with --output"):
         remove_abandoned(target.parent, f".{target.name}-")
         handle, partial = tempfile.mkstemp(prefix=f".{target.name}-{os.getpid()}-", dir=target.parent)
@@ -53,7 +58,6 @@ def write_report(
             Path(partial).replace(target)
         finally:
             Path(partial).unlink(missing_ok=True)
-    return target
 
 
 def page(run: Run) -> str:
