@@ -12,16 +12,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
 
+from flightmodel import columns
 from flightmodel.camera import Lens
 from flightmodel.checks import FloatArray, GateError, nearest_name
 
 COLUMNS = ("image", "X_m", "Y_m", "u_px", "v_px")
 LEAST_PICTURES, LEAST_CORNERS = 3, 6
+LARGEST_BOARD_M = 100.0
 STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 300, 1e-10)
 
 
@@ -62,6 +65,32 @@ class LensCalibration:
         known = {"focal": self.sd[:2].max() / fx, "centre_px": self.sd[2:4].max(), "k1": self.sd[4], "k2": self.sd[5]}
         lines += [f"uncertainty.{key} = {value:.3g}" for key, value in known.items()]
         return "\n".join(lines)
+
+
+def read_corners(path: Path) -> pd.DataFrame:
+    """Read a table of checkerboard corners.
+
+    Raises
+    ------
+    GateError
+        For a file that is no table, lacks a column, or holds anything but numbers, with the line.
+    """
+    label = "calibration"
+    table = columns.read_table(path, label)
+    missing = [c for c in COLUMNS if c not in table.columns]
+    if missing:
+        found = ", ".join(table.columns)
+        hints = [f"no column '{c}'{nearest_name(c, list(table.columns))}; found {found}" for c in missing]
+        raise GateError([f"{label}: {path}: line 1: {words}" for words in hints])
+    faults: list[str] = []
+    values = {c: columns.numbers(table, c, path, label, faults) for c in COLUMNS[1:]}
+    for c, column in values.items():
+        if not faults and np.isnan(column).any():
+            line = columns.line_of(table, int(np.argmax(np.isnan(column))))
+            faults.append(f"{label}: {path}: line {line}, column '{c}': no number; remove the line")
+    if faults:
+        raise GateError(faults)
+    return pd.DataFrame({"image": table["image"].str.strip().to_numpy(), **values})
 
 
 def calibrate_lens(corners: pd.DataFrame, size_px: tuple[int, int], lens: Lens = "fisheye") -> LensCalibration:
@@ -135,6 +164,11 @@ def _faults(corners: pd.DataFrame, size_px: tuple[int, int]) -> list[str]:
             f"calibration: line {row + 2}: corner at {where} lies outside a picture of {size_px[0]} x {size_px[1]}; "
             "check the size"
         )
+    far = numbers[["X_m", "Y_m"]].abs() > LARGEST_BOARD_M
+    if far.any(axis=None):
+        row = int(np.argmax(far.any(axis=1).to_numpy()))
+        where = f"({numbers['X_m'].iloc[row]:g}, {numbers['Y_m'].iloc[row]:g}) m"
+        out.append(f"calibration: line {row + 2}: corner at {where} of the board; metres, below {LARGEST_BOARD_M:g}")
     counts = corners.groupby("image").size()
     if len(counts) < LEAST_PICTURES:
         out.append(f"calibration: {len(counts)} pictures; at least {LEAST_PICTURES}, better 20, are wanted")

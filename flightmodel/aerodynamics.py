@@ -134,7 +134,8 @@ def _row_faults(row: list[float], names: tuple[str, ...]) -> list[str]:
 
 def _number(text: str) -> float:
     try:
-        return float(text)
+        # Python's own float takes 1_0 and digits of any script
+        return float(text) if text.isascii() and "_" not in text else float("nan")
     except ValueError:
         return float("nan")
 
@@ -160,6 +161,9 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     missing = [c for c in names if c not in header]
     if missing:
         raise GateError(f"{path}: columns {', '.join(missing)} are missing; wanted {', '.join(names)}")
+    twice = [c for c in names if header.count(c) > 1]
+    if twice:
+        raise GateError(f"{path}, line {lines[0][0]}: columns {', '.join(twice)} stand twice; keep one of each")
     rows, faults = [], []
     for k, line in lines[1:]:
         cells = [cell.strip() for cell in line.split("#")[0].split(",")]

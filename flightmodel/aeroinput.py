@@ -49,7 +49,7 @@ class Sidecar(Section):
 
     source: Annotated[str, Field(min_length=1)]
     licence: Annotated[str, Field(min_length=1)]
-    area_m2: Annotated[float, Field(gt=0.0, le=1e4)]
+    area_m2: Annotated[float, Field(ge=1e-6, le=1e4)]
     length_m: Length
     moment_reference_station_m: Place
     axes: Literal["body", "wind"] = "body"

@@ -6,7 +6,10 @@ Public entry points check once and then trust; compiled kernels check nothing.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+import errno
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +46,23 @@ class TableRangeError(GateError):
 
 class DivergenceError(GateError):
     """The simulated vehicle tumbled or its joint diverged where the caller needs a bounded flight."""
+
+
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+@contextmanager
+def writing(where: Path, remedy: str) -> Iterator[None]:
+    """Turn what a disk refuses inside the block into a `GateError` that names the place and a way out."""
+    try:
+        yield
+    except OSError as fault:
+        full = fault.errno in NO_ROOM
+        if not full and fault.filename is not None and not str(fault.filename).startswith(str(where)):
+            raise  # a file elsewhere, named by the fault itself
+        remedy = "make room, or write to another disk" if full else remedy
+        words = f"cannot be written: {fault.strerror or fault}; nothing half-written is left; {remedy}"
+        raise GateError(f"{where}: {words}") from None
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

@@ -250,7 +250,8 @@ def to_si(values: FloatArray, unit: str) -> FloatArray:
     """Turn numbers of a unit into SI, in place."""
     _, factor, offset = UNITS[unit]
     if factor != 1.0:
-        values *= factor
+        with np.errstate(over="ignore"):  # beyond any flight, and refused as such
+            values *= factor
     if offset != 0.0:
         values += offset
     return values

@@ -22,10 +22,12 @@ Longitude = Angle
 ErrorAngle = Annotated[float, Field(ge=0.0, le=45.0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Time = Annotated[float, Field(ge=-1e6, le=1e6)]
-Duration = Annotated[float, Field(gt=0.0, le=1e6)]
+Duration = Annotated[float, Field(ge=1e-9, le=1e6)]
 SampleRate = Annotated[float, Field(ge=1e-3, le=20e3)]
-Length = Annotated[float, Field(gt=0.0, le=100.0)]
+Length = Annotated[float, Field(ge=1e-4, le=100.0)]
 Place = Annotated[float, Field(ge=-100.0, le=100.0)]
+YEARS = (1940, 2200)
+LARGEST_TOML_BYTES = 10_000_000
 # also the name of a table in TOML, of a file and of a column
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
 FILL_IN_VALUE = "FILL IN"  # where a new file leaves a value to its user
@@ -100,11 +102,15 @@ def read_toml(path: Path) -> dict[str, Any]:
     if "\0" in str(path):
         raise ConfigError(f"{str(path)!r}: a path holds no NUL character")
     try:
+        if path.is_file() and path.stat().st_size > LARGEST_TOML_BYTES:
+            raise ConfigError(f"{path}: more than {LARGEST_TOML_BYTES // 10**6} MB; no configuration is that long")
         return tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except RecursionError:
         raise ConfigError(f"{path}: not valid TOML: arrays or tables lie too deep in each other") from None
+    except ConfigError:
+        raise
     except ValueError as fault:  # also integers of thousands of digits
         raise ConfigError(f"{path}: not valid TOML: {fault}") from None
     except OSError as fault:
@@ -163,6 +169,8 @@ def _keys_beside(model: Any, path: list[str]) -> list[str]:
 
 
 def parse_utc(text: str) -> datetime:
-    """Return an aware UTC time from ISO text; ValueError where it is none."""
+    """Return an aware UTC time from ISO text; ValueError where it is none, or in no year of spaceflight."""
     stamp = datetime.fromisoformat(text.replace("Z", "+00:00"))
+    if not YEARS[0] <= stamp.year <= YEARS[1]:
+        raise ValueError(f"a year from {YEARS[0]} to {YEARS[1]} is wanted")
     return stamp.astimezone(UTC) if stamp.tzinfo else stamp.replace(tzinfo=UTC)

@@ -8,12 +8,14 @@ refuse by name.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 
 from flightmodel.checks import FloatArray
@@ -22,6 +24,9 @@ from flightmodel.vehicle import CameraMount
 Image = NDArray[np.uint8]
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+WEBM_START = b"\x1aE\xdf\xa3"
+PICTURE_KINDS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
+UNKNOWN_FILM = "cannot be opened as a film (known are .webm, .mp4 and .avi)"
 NO_PICTURE: Image = np.zeros((0, 0), dtype=np.uint8)
 
 
@@ -71,7 +76,10 @@ class Frames:
 
 def read_image(path: Path) -> Image:
     """Grey picture ``(h, w)`` of an image file; empty where it cannot be decoded."""
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # more pixels than OpenCV takes
+        image = None
     return NO_PICTURE if image is None else np.asarray(image, dtype=np.uint8)
 
 
@@ -100,16 +108,49 @@ def _grey(picture: NDArray[np.uint8]) -> Image:
     return picture
 
 
+def doubt_of_film(path: Path) -> str:
+    """Say why frame numbers of a film may be off; empty where every frame that it tells of can be decoded.
+
+    A frame that cannot be decoded is stepped over without a word, and every later one then has a number less. What
+    gives it away is the file's own count of frames (WebM has none), or a jump in its times. The whole film is decoded.
+    """
+    film = cv2.VideoCapture(str(path))
+    try:
+        counts = round(film.get(cv2.CAP_PROP_FRAME_COUNT)) if path.read_bytes()[:4] != WEBM_START else 0
+        times = []
+        while film.grab():
+            times.append(film.get(cv2.CAP_PROP_POS_MSEC))
+    finally:
+        film.release()
+    remedy = "numbers in the list may name later pictures; extract the frames as images, or check the list"
+    if 0 < counts != len(times):
+        return f"{len(times)} frames can be decoded where the film tells of {counts}: {remedy}"
+    if len(times) < 3:
+        return ""
+    step = np.diff(times)
+    step = np.append(times[0] + np.median(step), step)  # the first frame's time is 0
+    uneven = np.flatnonzero(np.abs(step - np.median(step)) > 0.5 * np.median(step))
+    if len(uneven):
+        where = f"{1e-3 * times[uneven[0]]:.3f} s into the film, before its frame {uneven[0]}"
+        return f"time jumps {where} ({len(uneven)} such jumps): a lost frame or an uneven rate; {remedy}"
+    return ""
+
+
 def fault_of_film(path: Path, camera: CameraMount, last_number: int) -> str:
     """Say why a film cannot be used; empty when it can."""
     if not path.is_file():
         return "no such file"
     if path.stat().st_size == 0:
         return "is empty"
+    with path.open("rb") as file:
+        start = file.read(12)
+    # by content: a list of other places to play from would be opened too
+    if not (start[:4] == WEBM_START or start[4:8] == b"ftyp" or (start[:4] == b"RIFF" and start[8:12] == b"AVI ")):
+        return UNKNOWN_FILM
     film = cv2.VideoCapture(str(path))
     try:
         if not film.isOpened():
-            return "cannot be opened as a film (known are .webm, .mp4 and .avi)"
+            return UNKNOWN_FILM
         width, height = (round(film.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if (width, height) != (camera.width_px, camera.height_px):
             return f"is {width} x {height} pixels, the camera {camera.width_px} x {camera.height_px}"
@@ -124,16 +165,32 @@ def fault_of_film(path: Path, camera: CameraMount, last_number: int) -> str:
 
 
 def fault_of_image(path: Path, camera: CameraMount) -> str:
-    """Say why an image file cannot be used; empty when it can. A whole PNG is not decoded for it."""
+    """Say why an image file cannot be used; empty when it can. A whole PNG is not decoded for it.
+
+    Its size is read from its head first: an image of another size than the camera's is never unpacked.
+    """
     if not path.is_file():
         return "no such file"
-    data = path.read_bytes()
-    if data[:8] == PNG_START and data.rstrip(b"\0")[-8:] == PNG_END:
-        width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    else:
+    wanted = (camera.width_px, camera.height_px)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
+            with PIL.Image.open(path, formats=PICTURE_KINDS) as head:
+                size = head.size
+    except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
+        return f"has far more pixels than the camera's {wanted[0]} x {wanted[1]}"
+    except (OSError, ValueError, SyntaxError):
+        return f"cannot be decoded as an image (known are {', '.join(PICTURE_KINDS)})"
+    if sorted(size) == sorted(wanted) and not _is_whole_png(path):  # a turned JPEG says so in its metadata
         height, width = read_image(path).shape
         if height == 0:
             return "cannot be decoded as an image"
-    if (width, height) != (camera.width_px, camera.height_px):
-        return f"is {width} x {height} pixels, the camera {camera.width_px} x {camera.height_px}"
+        size = (width, height)
+    if size != wanted:
+        return f"is {size[0]} x {size[1]} pixels, the camera {wanted[0]} x {wanted[1]}"
     return ""
+
+
+def _is_whole_png(path: Path) -> bool:
+    data = path.read_bytes()
+    return data[:8] == PNG_START and data.rstrip(b"\0")[-8:] == PNG_END

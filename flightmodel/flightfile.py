@@ -35,7 +35,7 @@ from flightmodel.instrument_entries import (
 )
 from flightmodel.sources import Source, Spans
 
-AttitudeSd = Annotated[float, Field(gt=0.0, le=180.0)]
+AttitudeSd = Annotated[float, Field(ge=1e-9, le=180.0)]
 
 
 class AttitudeEntry(Section):
@@ -99,13 +99,13 @@ class MotionEntry(Section):
     """How the vehicle moves between measurements; `flightmodel.telemetry.Motion`."""
 
     model: Literal["strapdown", "ballistic"] = "strapdown"
-    drag_area_per_mass_m2pkg: Annotated[float, Field(gt=0.0, le=1e3)] | None = None
-    drag_sd: Annotated[float, Field(gt=0.0, le=20.0)] = 1.0
+    drag_area_per_mass_m2pkg: Annotated[float, Field(ge=1e-9, le=1e3)] | None = None
+    drag_sd: Annotated[float, Field(ge=1e-9, le=20.0)] = 1.0
     drag_time_constant_s: Duration = 10.0
     side_sd: Annotated[float, Field(ge=0.0, le=10.0)] = 0.1
     acceleration_density: Annotated[float, Field(ge=0.0, le=100.0)] = 0.002
     powered_s: Spans | None = None
-    powered_sd_mps2: Annotated[float, Field(gt=0.0, le=1e4)] = 50.0
+    powered_sd_mps2: Annotated[float, Field(ge=1e-9, le=1e4)] = 50.0
     disturbed: list[DisturbedEntry] = []
 
     @model_validator(mode="after")
@@ -121,7 +121,7 @@ class EventEntry(Section):
     """A named moment."""
 
     name: str
-    t_s: float
+    t_s: Time
 
 
 class SensorsEntry(Section):

@@ -81,6 +81,8 @@ class Gate:
 
     def wrong_place(self, path: Path, named: str) -> str:
         """Return why a named file may not be read: outside the folder, or below its truth; empty where it may."""
+        if "\0" in named:
+            return f"file {named!r}: a path holds no NUL character"
         root, target = self.folder.resolve(), path.resolve()
         if Path(named).is_absolute() or not target.is_relative_to(root):
             return f"file '{named}' lies outside the flight folder; copy it inside and name it relative to flight.toml"

@@ -13,12 +13,10 @@ from pydantic import Field, model_validator
 
 from flightmodel.checks import FloatArray
 from flightmodel.columns import Declared
-from flightmodel.config import Duration, Fraction, KeyFaults, Place
+from flightmodel.config import Angle, Duration, Fraction, KeyFaults, Place
 from flightmodel.sources import Source
 
-NonNegative = Annotated[float, Field(ge=0.0)]
-Positive = Annotated[float, Field(gt=0.0)]
-Sd = Annotated[float, Field(gt=0.0, le=1e6)]
+Sd = Annotated[float, Field(ge=1e-12, le=1e6)]  # its square is a number that can be divided by
 SdOrNone = Annotated[float, Field(ge=0.0, le=1e6)]
 Undulation = Annotated[float, Field(ge=-120.0, le=120.0)]  # of the geoid, whose extremes are -106 and +85 m
 BodyAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
@@ -69,25 +67,25 @@ class Mounted(Source):
 class TriadEntry(Mounted):
     """Accelerometer triad: file, mounting, errors from the data sheet (one standard deviation)."""
 
-    noise_sd_mps2: Positive = 0.049
-    bias_sd_mps2: NonNegative = 0.098
+    noise_sd_mps2: Sd = 0.049
+    bias_sd_mps2: SdOrNone = 0.098
     bias_wander_sd_mps2: SdOrNone = 0.0
-    scale_sd: NonNegative = 0.003
-    mount_sd_deg: NonNegative = 0.2
-    time_bias_sd_s: NonNegative = 0.001
-    resolution_mps2: NonNegative = 0.0
+    scale_sd: SdOrNone = 0.003
+    mount_sd_deg: SdOrNone = 0.2
+    time_bias_sd_s: SdOrNone = 0.001
+    resolution_mps2: SdOrNone = 0.0
 
 
 class RatesEntry(Mounted):
     """Rate gyros, along body axes unless ``axes`` say otherwise."""
 
-    noise_sd_degps: Positive = 0.05
-    bias_sd_degps: NonNegative = 0.05
+    noise_sd_degps: Sd = 0.05
+    bias_sd_degps: SdOrNone = 0.05
     bias_wander_sd_degps: SdOrNone = 0.0
-    scale_sd: NonNegative = 0.003
-    mount_sd_deg: NonNegative = 0.15
-    time_bias_sd_s: NonNegative = 0.001
-    resolution_degps: NonNegative = 0.0
+    scale_sd: SdOrNone = 0.003
+    mount_sd_deg: SdOrNone = 0.15
+    time_bias_sd_s: SdOrNone = 0.001
+    resolution_degps: SdOrNone = 0.0
 
 
 class MagnetometerEntry(Mounted):
@@ -96,24 +94,24 @@ class MagnetometerEntry(Mounted):
     ``reversed`` is for one that reads the field with the opposite sign along all its axes.
     """
 
-    noise_sd_ut: Positive = 0.2
-    bias_sd_ut: NonNegative = 0.5
+    noise_sd_ut: Sd = 0.2
+    bias_sd_ut: SdOrNone = 0.5
     bias_wander_sd_ut: SdOrNone = 0.0
-    scale_sd: NonNegative = 0.003
-    soft_iron_sd: NonNegative = 0.0
-    mount_sd_deg: NonNegative = 0.2
-    resolution_ut: NonNegative = 0.0
+    scale_sd: SdOrNone = 0.003
+    soft_iron_sd: SdOrNone = 0.0
+    mount_sd_deg: SdOrNone = 0.2
+    resolution_ut: SdOrNone = 0.0
     reversed: bool = False
 
 
 class SunEntry(Source):
     """Two-axis Sun sensors, one head looking outward at each clocking angle; an empty cell where a head sees no Sun."""
 
-    heads_lv_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=8)] = (45.0, 135.0, 225.0, 315.0)
+    heads_lv_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=8)] = (45.0, 135.0, 225.0, 315.0)
     field_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 180.0
-    noise_sd_deg: Positive = 1.0
-    bias_sd_deg: NonNegative = 0.5
-    mount_sd_deg: NonNegative = 0.2
+    noise_sd_deg: Sd = 1.0
+    bias_sd_deg: SdOrNone = 0.5
+    mount_sd_deg: SdOrNone = 0.2
 
 
 class TrackingSource(Source):
@@ -130,21 +128,21 @@ class RadarEntry(TrackingSource):
 
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     longitude_deg: Annotated[float, Field(ge=-360.0, le=360.0)]
-    height_m: float
+    height_m: Annotated[float, Field(ge=-1e3, le=1e5)]
     tracks: Literal["cg", "datum"] = "cg"
-    range_sd_m: Positive = 5.0
-    angle_sd_deg: Positive = 0.0086
-    azimuth_sd_deg: Positive | None = None
-    elevation_sd_deg: Positive | None = None
-    range_bias_sd_m: NonNegative = 3.0
-    angle_bias_sd_deg: NonNegative = 0.003
-    time_bias_sd_s: NonNegative = 0.001
-    mislevel_sd_deg: NonNegative = 0.0
-    droop_sd_deg: NonNegative = 0.0
-    skew_sd_deg: NonNegative = 0.0
-    nonorthogonality_sd_deg: NonNegative = 0.0
-    wander_sd_deg: NonNegative = 0.0
-    wander_time_constant_s: Positive = 20.0
+    range_sd_m: Sd = 5.0
+    angle_sd_deg: Sd = 0.0086
+    azimuth_sd_deg: Sd | None = None
+    elevation_sd_deg: Sd | None = None
+    range_bias_sd_m: SdOrNone = 3.0
+    angle_bias_sd_deg: SdOrNone = 0.003
+    time_bias_sd_s: SdOrNone = 0.001
+    mislevel_sd_deg: SdOrNone = 0.0
+    droop_sd_deg: SdOrNone = 0.0
+    skew_sd_deg: SdOrNone = 0.0
+    nonorthogonality_sd_deg: SdOrNone = 0.0
+    wander_sd_deg: SdOrNone = 0.0
+    wander_time_constant_s: Duration = 20.0
     refraction_sd: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
     range_scale_sd: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
 

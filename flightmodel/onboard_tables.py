@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from flightmodel import columns
 from flightmodel.checks import BoolArray, FloatArray, nearest_name
-from flightmodel.film import Frames, fault_of_film, fault_of_image
+from flightmodel.film import Frames, doubt_of_film, fault_of_film, fault_of_image
 from flightmodel.findings import find_faults
 from flightmodel.flightfile import FlightFile
 from flightmodel.gate import Gate
 from flightmodel.instrument_entries import FramesEntry, MagnetometerEntry, RatesEntry, SunEntry, TriadEntry
 from flightmodel.instruments import SunHeads, TriadSpec
 from flightmodel.selection import rows_to_use
-from flightmodel.telemetry import SunRecord, TriadRecord
+from flightmodel.telemetry import Finding, SunRecord, TriadRecord
 from flightmodel.vehicle import CameraMount, Vehicle
 
 Triad = TriadEntry | RatesEntry | MagnetometerEntry
@@ -211,4 +211,8 @@ def _film_numbers(
     wrong = fault_of_film(film, camera, int(numbers.max(initial=0)))
     if wrong:
         gate.faults.append(f"frames: {film}: {wrong}")
+        return numbers
+    doubt = doubt_of_film(film)
+    if doubt:
+        gate.findings.append(Finding("frames", f"{film.name}: {doubt}", np.nan, np.nan))
     return numbers

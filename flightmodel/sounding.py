@@ -13,6 +13,7 @@ from flightmodel.telemetry import Finding, Sounding
 
 SOURCE = "atmosphere"
 TINY = 1e-30
+SMALLEST_SD = 1e-6  # a fraction, and m/s
 # pressure may depart from the gas law by this much before it is worth a word (separate instruments, humidity)
 GAS_LAW_TOLERANCE = 0.05
 LOWEST_TOP_M = 60e3
@@ -29,6 +30,8 @@ def read_sounding(gate: Gate, source: AtmosphereEntry) -> Sounding | None:
     gate.refuse_rows(table, "temperature", 80.0, 400.0, "outside 80 to 400 K")
     for short in ("wind_north", "wind_east", "wind_speed"):
         gate.refuse_rows(table, short, -300.0, 300.0, "above 300 m/s")
+    gate.refuse_rows(table, "rho_sd", SMALLEST_SD, 10.0, "no standard deviation of a density, as a fraction")
+    gate.refuse_rows(table, "wind_sd", SMALLEST_SD, 300.0, "no standard deviation of a wind")
     winds = _winds(gate, table)
     if winds is None or len(gate.faults) > before:
         return None

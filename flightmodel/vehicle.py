@@ -38,7 +38,7 @@ Damping = Annotated[float, Field(ge=0.0, le=1e12)]
 Metres = Annotated[float, Field(ge=0.0, le=10.0)]
 Inertia = Annotated[float, Field(ge=-1e15, le=1e15)]
 Pixels = Annotated[float, Field(ge=-1e5, le=1e5)]
-Focal = Annotated[float, Field(gt=0.0, le=1e5)]
+Focal = Annotated[float, Field(ge=1e-3, le=1e5)]
 Distortion = Annotated[float, Field(ge=-100.0, le=100.0)]
 Vector = tuple[Place, Place, Place]
 InertiaRow = tuple[Inertia, Inertia, Inertia]
@@ -47,14 +47,14 @@ InertiaRow = tuple[Inertia, Inertia, Inertia]
 class Reference(Section):
     """Reference area and length of the coefficients."""
 
-    area_m2: Annotated[float, Field(gt=0.0, le=1e4)]
+    area_m2: Annotated[float, Field(ge=1e-6, le=1e4)]
     length_m: Length
 
 
 class MassProperties(Section):
     """Mass, c.g. from the datum in body axes, inertia tensor about the body's own c.g. in body axes."""
 
-    mass_kg: Annotated[float, Field(gt=0.0, le=1e12)]
+    mass_kg: Annotated[float, Field(ge=1e-6, le=1e12)]
     cg_from_datum_body_m: Vector
     inertia_kgm2: tuple[InertiaRow, InertiaRow, InertiaRow]
 

@@ -148,12 +148,15 @@ def score(folder: Path, as_json: bool) -> None:
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Default: report.html in the run.")
-def report(folder: Path, output: Path | None) -> None:
+@click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Default: in the run's folder.")
+@click.option("--notebook", is_flag=True, help="Write a Jupyter notebook filled in for this flight instead.")
+def report(folder: Path, output: Path | None, notebook: bool) -> None:
     """Write the report of the newest run of the flight in FOLDER: one HTML file that needs nothing else."""
+    from postflight.report.notebook import write_notebook
     from postflight.report.write import write_report
 
-    click.echo(f"report in {write_report(folder, target=output)}")
+    write = write_notebook if notebook else write_report
+    click.echo(f"report in {write(folder, target=output)}")
 
 
 @cli.command()
@@ -242,7 +245,8 @@ def main() -> None:
         fault.show()
         sys.exit(fault.exit_code)
     except OSError as fault:
-        click.echo(f"error: {fault.filename or ''}: {fault.strerror or fault}", err=True)
+        where = fault.filename or "reading or writing a file failed"
+        click.echo(f"error: {where}: {fault.strerror or fault}", err=True)
         sys.exit(3)
     except ValueError as fault:
         sys.exit(refusal(fault))

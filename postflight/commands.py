@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from estimators.calibration import calibrate_lens
+from estimators.calibration import calibrate_lens, read_corners
 from flightmodel.camera import Lens
 from flightmodel.checks import ConfigError, FloatArray, GateError
 from flightmodel.deflection import lv_clock
@@ -312,11 +312,7 @@ def calibrate(corners: Path, size: str, lens: Lens) -> None:
     match = re.fullmatch(r"(\d{1,5})[x,](\d{1,5})", size.strip())
     if not match:
         raise ConfigError(f"--size {size}: width and height like 640x480 are wanted")
-    try:
-        table = pd.read_csv(corners)
-    except (ValueError, UnicodeDecodeError) as fault:
-        raise GateError(f"{corners}: not a CSV table ({fault})") from fault
-    found = calibrate_lens(table, (int(match[1]), int(match[2])), lens)
+    found = calibrate_lens(read_corners(corners), (int(match[1]), int(match[2])), lens)
     words = f"{found.corners} corners in {found.pictures} pictures, rms {found.rms_px:.3f} px"
     console.print(f"# {words}", highlight=False)
     console.print(escape(found.toml()), highlight=False)

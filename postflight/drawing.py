@@ -106,7 +106,7 @@ def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, 
     figures.stamp(figure, telemetry)
     figures.save(figure, folder / "figure_2_3.png")
     picture = Overlay(oriented.view).side_by_side(pictures[1], theta[1], float(history.plane_lv_rad[largest]))
-    cv2.imwrite(str(folder / "overlay.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    (folder / "overlay.png").write_bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 def summary_figure(

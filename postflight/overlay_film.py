@@ -11,6 +11,7 @@ from estimators.benchmark import orient_camera
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row, write_words
 from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.film import film_frames
 from flightmodel.telemetry import Telemetry
 from postflight.pipeline import Progress
 
@@ -59,6 +60,8 @@ def write_overlay_film(
                 write_words(picture, [said + bent])
             writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         writer.release()
+        if next(film_frames(partial, [len(frames.time_s) - 1])).size == 0:  # OpenCV tells of no full disk
+            raise GateError(f"{path.name}: the film could not be written whole; make room, or leave out --film")
         partial.replace(path)
     finally:
         writer.release()

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import GateError
+from flightmodel.checks import GateError, writing
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
@@ -31,6 +31,8 @@ from postflight.product.tables import event_table, peak_table, residual_statisti
 from postflight.product.trajectory_table import bet_table
 
 DIGITS = "%.10g"
+COPY = "copy the flight folder to where you may write"
+PARTIAL = ".partial-"  # before the number of the process that writes it
 
 
 class RunFolder:
@@ -46,21 +48,22 @@ class RunFolder:
 
     def __enter__(self) -> RunFolder:
         """Make the partial folder beside the final one."""
-        try:
+        with writing(self.parent, COPY):
             self.parent.mkdir(exist_ok=True)
             remove_abandoned(self.parent)
-            self.path = Path(tempfile.mkdtemp(prefix=f".partial-{os.getpid()}-", dir=self.parent))
-        except OSError as fault:
-            raise GateError(f"{self.parent}: cannot be written: {fault.strerror}; copy the flight folder") from None
-        (self.path / "figures").mkdir()
+            self.path = Path(tempfile.mkdtemp(prefix=f"{PARTIAL}{os.getpid()}-", dir=self.parent))
+            (self.path / "figures").mkdir()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, _: object) -> None:
         """Rename when whole; remove otherwise, also where the end itself is interrupted."""
         partial = self.path
         try:
-            if kind is None:
-                self._finish()
+            with writing(self.parent, COPY):
+                if isinstance(fault, OSError):
+                    raise fault
+                if kind is None:
+                    self._finish()
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 
@@ -104,14 +107,23 @@ def run_hash(inputs_sha256: dict[str, str], settings: dict[str, Any], made_by: s
     return hashlib.sha256(facts.encode()).hexdigest()[:8]
 
 
-def remove_abandoned(parent: Path) -> None:
-    """Remove partial run folders whose process is gone: it was killed where it could not tidy up."""
-    for path in parent.glob(".partial-*-*"):
+def remove_abandoned(parent: Path, prefix: str = PARTIAL) -> None:
+    """Remove what processes that are gone left half-written: they were killed where they could not tidy up.
+
+    Such folders and files are named ``prefix``, process number, ``-`` and anything.
+    """
+    for path in parent.iterdir():
+        number, dash, _ = path.name.removeprefix(prefix).partition("-")
+        if not path.name.startswith(prefix) or not dash or not number.isdigit():
+            continue
         try:
-            os.kill(int(path.name.split("-")[1]), 0)
+            os.kill(int(number), 0)
         except ProcessLookupError:
-            shutil.rmtree(path, ignore_errors=True)
-        except (PermissionError, ValueError):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+        except (PermissionError, OverflowError):
             continue
 
 

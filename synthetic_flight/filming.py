@@ -11,6 +11,7 @@ import pandas as pd
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray, GateError
+from flightmodel.film import film_frames
 from flightmodel.geomagnetism_and_sun import sun_direction_ecef
 from synthetic_flight import sensing
 from synthetic_flight.instrument_sections import FilmQuality, Video
@@ -101,8 +102,8 @@ def _write_images(frames: Iterable[Image], folder: Path) -> Iterable[str]:
     folder.mkdir()
     for k, frame in enumerate(frames):
         name = f"frame_{k:05d}.png"
-        if not cv2.imwrite(str(folder / name), frame, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise GateError(f"{folder / name}: cannot be written")
+        # through Python's own file, which tells of a full disk
+        (folder / name).write_bytes(cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
         yield name
 
 
@@ -111,8 +112,12 @@ def _write_film(frames: Iterable[Image], path: Path, spec: Video, size_px: tuple
     writer = cv2.VideoWriter(str(path), code, float(spec.rate_hz), size_px)
     if not writer.isOpened():
         raise GateError(f'{path}: this build of OpenCV cannot write such a film; write images: video.format = "png"')
+    count = 0
     try:
         for frame in frames:
             writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
+            count += 1
     finally:
         writer.release()
+    if count and next(film_frames(path, [count - 1])).size == 0:  # OpenCV tells of no full disk
+        raise GateError(f"{path.name}: the film could not be written whole; make room, or write to another disk")

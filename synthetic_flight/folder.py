@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import FloatArray, GateError, writing
 from synthetic_flight import day_air, events, radar_sensing, sensing, sun_sensing
 from synthetic_flight.filming import write_video
 from synthetic_flight.flight_toml import write_flight_toml
@@ -54,14 +54,15 @@ def simulate_to_folder(
     report(0.0, "flying")
     truth = fly_scenario(scenario, seed)
     _check_telemetry(scenario, truth)
-    destination.parent.mkdir(parents=True, exist_ok=True)
     partial = _beside(destination, "partial")
-    partial.mkdir(mode=0o755)
-    try:
-        _write(scenario, seed, truth, partial, report)
-        _put_in_place(partial, destination)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with writing(destination, "choose another folder"):
+        destination.parent.mkdir(parents=True, exist_ok=True)
+        partial.mkdir(mode=0o755)
+        try:
+            _write(scenario, seed, truth, partial, report)
+            _put_in_place(partial, destination)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
     report(1.0, "done")
     return truth
 

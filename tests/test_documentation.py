@@ -1,15 +1,21 @@
 """The pages of scenario, vehicle and flight files name every key that these files may hold, with their defaults."""
 
+import importlib.util
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
+import click
 import pytest
 from pydantic import BaseModel
 
 from flightmodel import aeroinput, flightfile, instrument_entries, sources, vehicle
+from postflight.cli import cli
 from postflight.montecarlo import study
 from synthetic_flight import day_air, dispersions, instrument_sections, outputs, scenarios
+from tests.documents import PAGES, ROOT, blocks, commands
 
 DOCS = Path(__file__).parents[1] / "docs"
 INSTRUMENTS = [
@@ -130,3 +136,43 @@ def test_values_on_the_page_are_the_defaults(table: str, model: type[BaseModel],
     section = model.model_validate(written if table == "motion" else next(iter(written.values())))
     for key in section.model_fields_set - examples:
         assert getattr(section, key) == model.model_fields[key].default, key
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_commands_on_the_page_are_understood(page: Path, monkeypatch: pytest.MonkeyPatch):
+    """Parsed, not run: tests/whole/test_examples.py runs those that are quick."""
+    monkeypatch.chdir(ROOT)
+    for words in commands(page):
+        given = [w for w in words if w != "corners.csv"]
+        given += ["tests/data/fisheye/corners_even.csv"] * (len(words) - len(given))
+        command = cli.get_command(click.Context(cli), given[0])
+        assert command is not None, f"{page.name}: postflight {' '.join(words)}"
+        command.make_context(given[0], given[1:])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_python_on_the_page_compiles(page: Path):
+    for text in blocks(page, "python"):
+        compile(text, page.name, "exec")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("material", "mkdocstrings", "latex2mathml")),
+    reason="the extra 'docs' is not installed",
+)
+def test_site_builds_without_a_warning_and_asks_for_nothing(tmp_path: Path):
+    site = tmp_path / "site"
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(site)],
+        cwd=ROOT, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    pages = {page.relative_to(site).as_posix(): page.read_text() for page in site.rglob("*.html")}
+    for name, text in pages.items():
+        asked = re.findall(r"<(?:script|img|iframe|source)[^>]* src=\"?(?:https?:)?//", text)
+        asked += re.findall(r"<link[^>]* href=\"?(?:https?:)?//[^>]*(?:stylesheet|preconnect|icon)", text)
+        assert not asked, f"{name} loads something from elsewhere"
+        assert not re.search(r'class="arithmatex"', text), f"{name} has a formula that is not drawn"
+    assert "<math" in pages["derivations.html"]
+    assert "estimate_misalignment" in pages["reference/estimators.html"]

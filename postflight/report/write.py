@@ -16,11 +16,12 @@ from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import GateError
+from flightmodel.checks import writing
 from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
 from postflight.report import pictures, series, shape, words
 from postflight.report.source import Run, read_run
+from postflight.results import remove_abandoned
 
 NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
@@ -41,9 +42,15 @@ def write_report(
     """
     run = read_run(flight_folder, path, telemetry)
     target = run.path / NAME if target is None else target
-    text = page(run)
-    try:
-        handle, partial = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)
+    write_whole(target, page(run))
+    return target
+
+
+def write_whole(target: Path, text: str) -> None:
+    """Write a file that appears at once, or a `GateError` with its name."""
+    with writing(target, "name another place with --output"):
+        remove_abandoned(target.parent, f".{target.name}-")
+        handle, partial = tempfile.mkstemp(prefix=f".{target.name}-{os.getpid()}-", dir=target.parent)
         try:
             with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as out:
                 out.write(text)
@@ -51,9 +58,6 @@ def write_report(
             Path(partial).replace(target)
         finally:
             Path(partial).unlink(missing_ok=True)
-    except OSError as fault:
-        raise GateError(f"{target}: cannot be written: {fault.strerror}; name another place with --output") from None
-    return target
 
 
 def page(run: Run) -> str:

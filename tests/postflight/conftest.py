@@ -128,7 +128,7 @@ def _table(path: Path, header: str, table: np.ndarray, fmt: str = "%.9g") -> Non
     np.savetxt(path, table, fmt=fmt, delimiter=",", header=header, comments="")
 
 
-def _write(root: Path) -> None:
+def write_flight(root: Path) -> None:
     """Write numbers of the right size for a descent through 70 km; no physics is asked of them here."""
     telemetry = root / "telemetry"
     (telemetry / "camera5").mkdir(parents=True)
@@ -166,7 +166,7 @@ def _write(root: Path) -> None:
 def clean_flight(tmp_path_factory: pytest.TempPathFactory) -> FlightFolder:
     """The unspoilt folder; not to be written to."""
     root = tmp_path_factory.mktemp("clean") / "flight"
-    _write(root)
+    write_flight(root)
     return FlightFolder(root)
 
 

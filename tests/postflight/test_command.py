@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -12,6 +14,10 @@ import time
 from pathlib import Path
 
 import pytest
+
+from flightmodel.checks import GateError, writing
+from postflight.results import remove_abandoned
+from tests.postflight.killing import kill_run, run_again
 
 HEAVY = {"numpy", "scipy", "numba", "matplotlib", "cv2", "trimesh", "filterpy", "pandas", "ppigrf", "erfa"}
 COMMANDS = ("demo", "simulate", "reconstruct", "deflection", "run", "score", "report", "warmup")
@@ -386,3 +392,76 @@ def test_no_result_file_names_this_machine(two_runs, clean_flight) -> None:
     text = b"".join(data for name, data in one.items() if not name.endswith(".png"))
     assert b"vol num" not in text
     assert str(Path.home()).encode() + b"/" not in text
+
+
+# ------------------------------------------------------------------------------------------ killed, and no room on disk
+
+
+@pytest.mark.slow
+def test_killed_runs_leave_nothing_half_written(two_runs, clean_flight, tmp_path: Path) -> None:
+    """Three moments of what benchmarks/kill.py draws at random; the run after them gives the bytes of any other."""
+    _, _, saved, _ = two_runs
+    shutil.copytree(clean_flight.root, tmp_path / "flight")
+    moments = [kill_run(tmp_path / "flight", at_s, saved) for at_s in (1.0, 4.0)]
+    assert kill_run(tmp_path / "flight", None, saved) == "while writing"
+    assert set(moments) <= {"before anything", "while writing"}
+    run_again(tmp_path / "flight", saved)
+
+
+def test_what_a_killed_report_left_is_removed(tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    left, ours, other = (
+        tmp_path / f".report.html-{number}-abc" for number in (gone.pid, os.getpid(), "x")
+    )  # fmt: skip
+    for path in (left, ours, other):
+        path.write_text("half")
+    remove_abandoned(tmp_path, ".report.html-")
+    assert sorted(tmp_path.iterdir()) == sorted([ours, other])
+
+
+def limited(*arguments: str | Path, largest_bytes: int) -> subprocess.CompletedProcess[str]:
+    """Run the command where no file may grow beyond a size: what a full disk does, without one."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_bytes, largest_bytes))
+
+    return subprocess.run(
+        [sys.executable, "-m", "postflight.cli", *map(str, arguments)],
+        capture_output=True, text=True, timeout=120, preexec_fn=limit,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_no_room_for_a_run(flight) -> None:
+    before = flight.contents()
+    done = limited("reconstruct", flight.root, largest_bytes=30_000)
+    assert done.returncode == 3, done.stderr
+    assert "runs: cannot be written: File too large" in done.stderr
+    assert "make room" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert flight.contents() - {"runs"} == before
+
+
+@pytest.mark.slow
+def test_no_room_for_a_flight(tmp_path: Path) -> None:
+    done = limited("simulate", "irve2_reference", tmp_path / "out", largest_bytes=30_000)
+    assert done.returncode == 3, done.stderr
+    assert "out: cannot be written: File too large" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_is_full_or_read_only_is_told_with_its_place(tmp_path: Path) -> None:
+    for number, words in ((errno.ENOSPC, "make room"), (errno.EROFS, "elsewhere")):
+        with pytest.raises(GateError, match=words) as told, writing(tmp_path, "write elsewhere"):
+            raise OSError(number, os.strerror(number))
+        assert str(told.value).startswith(f"{tmp_path}: cannot be written: {os.strerror(number)}")
+    with pytest.raises(FileNotFoundError), writing(tmp_path, "write elsewhere"):
+        raise FileNotFoundError(errno.ENOENT, "no such file", "/elsewhere/input.csv")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_results_on_a_device_that_is_full(tmp_path: Path) -> None:
+    with pytest.raises(GateError, match="No space left"), writing(tmp_path, ""):
+        Path("/dev/full").write_text("x")

@@ -6,7 +6,15 @@ from pathlib import Path
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.py"))
-LEAST_PICTURES = {"one_flight": 5, "real_rockets": 3}
+LEAST_PICTURES = {
+    "one_flight": 5,
+    "real_rockets": 3,
+    "flight_and_invariants": 2,
+    "bet_and_how_we_know": 2,
+    "seeing_the_shell_bend": 3,
+    "three_methods_one_answer": 1,
+}
+FLOWN = {"seeing_the_shell_bend", "three_methods_one_answer"}  # read this suite's own flight
 
 
 @pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda p: p.stem)
@@ -18,9 +26,16 @@ def test_pair_is_in_step_and_without_outputs(script):
     assert not any(c.get("outputs") for c in stored.cells)
 
 
+@pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda p: p.stem)
+def test_essay_ends_in_what_it_proved(script):
+    if script.stem != "one_flight":  # whose last section is the truth; its claim stands before
+        last = script.read_text().rpartition("# %% [markdown]")[2]
+        assert "assert " in last
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda p: p.stem)
-def test_notebook_runs(script, tmp_path, monkeypatch):
+def test_notebook_runs(script, tmp_path, monkeypatch, request):
     import jupytext
     from nbclient import NotebookClient
 
@@ -28,7 +43,9 @@ def test_notebook_runs(script, tmp_path, monkeypatch):
     from synthetic_flight.scenarios import read_scenario
 
     folder = tmp_path / "flight"
-    if script.stem == "one_flight":
+    if script.stem in FLOWN:
+        folder = request.getfixturevalue("flown")
+    elif script.stem == "one_flight":
         simulate_to_folder(read_scenario("irve2_reference"), 21, folder)
     monkeypatch.delenv("POSTFLIGHT_REALDATA", raising=False)
     monkeypatch.setenv("POSTFLIGHT_FLIGHT", str(folder))

@@ -1,0 +1,71 @@
+"""Makes a site of the pages in ``docs/``: pages from files beside it, the reference, formulas as MathML.
+
+The pages are written to be read in the repository too, where links lead to files that are no pages of the site: such a
+link becomes its words.
+"""
+
+import html
+import re
+from pathlib import Path
+
+from latex2mathml.converter import convert
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[1]
+BESIDE = {
+    "conventions.md": "CONVENTIONS.md",
+    "benchmarks.md": "benchmarks/README.md",
+    "changes.md": "CHANGELOG.md",
+}
+# what a user of the library calls; the rest is read in the code
+REFERENCE = {
+    "flightmodel": ["flightfolder", "telemetry", "vehicle", "trajectory", "deflection", "film", "camera", "earth",
+                    "atmosphere", "airdata", "aerodynamics", "rotations", "checks"],
+    "recon": ["bet", "error_model", "strapdown", "consistency", "attitude_check", "product"],
+    "estimators": ["camera_deflection", "misalignment", "trim", "fusion", "agreement", "static_trim", "southwell",
+                   "calibration"],
+    "synthetic_flight": ["scenarios", "simulate", "folder", "ensemble", "linear", "stability_map"],
+    "postflight": ["pipeline", "results", "sensitivity", "preflight", "scoring", "figures"],
+}  # fmt: skip
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+
+
+def on_files(files, config):
+    """Add pages that are made: of files beside ``docs/``, of docstrings, a list of decisions."""
+    for page, source in BESIDE.items():
+        files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+    for package, modules in REFERENCE.items():
+        text = f"# {package}\n\n" + "\n\n".join(f"::: {package}.{module}" for module in modules) + "\n"
+        files.append(File.generated(config, f"reference/{package}.md", content=text))
+    decisions = sorted((ROOT / "docs/decisions").glob("0*.md"))
+    listed = "\n".join(f"- [{path.read_text().splitlines()[0].lstrip('# ')}]({path.name})" for path in decisions)
+    files.append(File.generated(config, "decisions/index.md", content=f"# Decisions\n\n{listed}\n"))
+    return files
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Links that leave the pages become what they lead to within the site, or their words alone."""
+    home = Path(BESIDE.get(page.file.src_uri, f"docs/{page.file.src_uri}")).parent
+
+    def lead(match):
+        words, target = match[1], match[2]
+        if re.match(r"[a-z]+:|#", target):
+            return match[0]
+        path, _, anchor = target.partition("#")
+        there = (ROOT / home / path).resolve().relative_to(ROOT).as_posix()
+        made = {source: name for name, source in BESIDE.items()}.get(there, there.removeprefix("docs/"))
+        if files.get_file_from_path(made) is None:
+            return words
+        up = "../" * page.file.src_uri.count("/")
+        return f"[{words}]({up}{made}{'#' + anchor if anchor else ''})"
+
+    return re.sub(r"(?<!!)\[([^\[\]]*)\]\(([^)\s]+)\)", lead, markdown)
+
+
+def on_page_content(content, **_):
+    """Formulas in MathML: every browser draws it, and nothing has to be loaded."""
+
+    def mathml(match):
+        return convert(html.unescape(match[3]), display="block" if match[2] == "[" else "inline")
+
+    return FORMULA.sub(mathml, content)
