@@ -112,18 +112,21 @@ def doubt_of_film(path: Path) -> str:
     """Say why frame numbers of a film may be off; empty where every frame that it tells of can be decoded.
 
     A frame that cannot be decoded is stepped over without a word, and every later one then has a number less. What
-    gives it away is the file's own count of frames (WebM has none), or a jump in its times. The whole film is decoded.
+    gives it away is the file's own count of frames (WebM's is its length times its rate), or a jump in its times. The
+    whole film is decoded.
     """
     film = cv2.VideoCapture(str(path))
     try:
-        counts = round(film.get(cv2.CAP_PROP_FRAME_COUNT)) if path.read_bytes()[:4] != WEBM_START else 0
+        counts = round(film.get(cv2.CAP_PROP_FRAME_COUNT))
+        with path.open("rb") as file:
+            estimated = file.read(4) == WEBM_START
         times = []
         while film.grab():
             times.append(film.get(cv2.CAP_PROP_POS_MSEC))
     finally:
         film.release()
     remedy = "numbers in the list may name later pictures; extract the frames as images, or check the list"
-    if 0 < counts != len(times):
+    if counts > 0 and not (len(times) >= counts - 1 if estimated else len(times) == counts):
         return f"{len(times)} frames can be decoded where the film tells of {counts}: {remedy}"
     if len(times) < 3:
         return ""
