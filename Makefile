@@ -1,20 +1,24 @@
 # Two commands on a fresh machine with Python >= 3.11 and make:
 #   make demo   flies, reconstructs, estimates and scores a synthetic flight; pictures in demo-flight/
-#   make test   checks the code and runs every test
+#   make test   checks the code and runs the tests (the longest statistics: make long)
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test fast lint docs notebooks clean
+.PHONY: demo test fast long lint docs notebooks clean
 
 demo: $(VENV)/installed
 	$(BIN)/postflight demo demo-flight
 
 test: lint
-	$(BIN)/python -m pytest -n 2 --dist loadscope -q
+	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m "not long"
+
+# statistics over many flights, beyond what a check of every change can wait for (some six minutes)
+long: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m long
 
 fast: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m "not slow and not long"
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -58,7 +58,8 @@ def writing(where: Path, remedy: str) -> Iterator[None]:
         yield
     except OSError as fault:
         full = fault.errno in NO_ROOM
-        if not full and fault.filename is not None and not str(fault.filename).startswith(str(where)):
+        named = str(where if fault.filename is None else fault.filename)
+        if not full and not named.startswith(str(where)) and not str(where).startswith(named):
             raise  # a file elsewhere, named by the fault itself
         remedy = "make room, or write to another disk" if full else remedy
         words = f"cannot be written: {fault.strerror or fault}; nothing half-written is left; {remedy}"

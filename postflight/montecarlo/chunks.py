@@ -1,4 +1,4 @@
-"""Chunks of a study on disk: whole or not there at all, the same bytes from the same flights, nothing to unpickle.
+"""Chunks of a study on disk: whole or not there at all, the same bytes from the same flights.
 
 ``chunk-000012.npz`` holds runs, reasons of those that failed, when a joint diverged, the named numbers as float64 and
 the histories as float32. A file that was damaged counts as missing, and is flown again.

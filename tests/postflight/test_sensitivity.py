@@ -98,10 +98,10 @@ def test_attitude_sensors_are_used_where_they_were_not_and_left_out_where_they_w
     assert "without north" not in used
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_leaving_data_out_moves_the_answer_as_far_as_the_covariances_allow(mini_flight):
     """Change over ``sqrt(P_without - P_with)`` is standard normal: its mean square over flights is chi-square."""
-    settings, count = Settings(output_rate_hz=5.0), 5
+    settings, count = Settings(output_rate_hz=5.0), 8
     squares: dict[tuple[str, str], list[float]] = {}
     for seed in range(count):
         telemetry = replace(mini_flight(seed), gnss={})

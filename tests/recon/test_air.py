@@ -86,6 +86,7 @@ def many():
     return rows
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("which", [0, 1, 2])
 def test_errors_are_as_large_as_claimed_at_every_height(many, which):
     values = np.array([row[0][which] for row in many]) ** 2
@@ -95,6 +96,7 @@ def test_errors_are_as_large_as_claimed_at_every_height(many, which):
     assert (values.mean(axis=0) < high).all()
 
 
+@pytest.mark.long
 def test_density_and_drag_share_a_factor_and_say_so(many):
     low, high = chi2.ppf([0.0001, 0.9999], len(many)) / len(many)
     assert low < np.mean([row[1] ** 2 for row in many]) < high
@@ -102,11 +104,13 @@ def test_density_and_drag_share_a_factor_and_say_so(many):
     assert 0.3 * 0.03 < sd < 0.8 * 0.03
 
 
+@pytest.mark.long
 def test_flight_teaches_about_the_air(many):
     assert np.mean([row[2] for row in many]) < 0.75
     assert np.mean([row[3] for row in many]) < 0.9
 
 
+@pytest.mark.long
 def test_days_like_the_prior_turn_no_verdict_red(many):
     assert not [v.name for row in many for v in row[4].verdicts if not v.passed]
 

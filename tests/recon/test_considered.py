@@ -133,6 +133,7 @@ def test_considering_on_a_flight(mini_sense, consider):
     assert off_in_covariance(run.filtered.p_plus, run.filtered.p_plus) == 0.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("consider", CHOICES[1:3], ids=lambda names: names[0])
 def test_considered_flights_err_as_they_claim(mini_sense, mini_truth, consider):

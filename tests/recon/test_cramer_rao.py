@@ -93,6 +93,7 @@ def realisations(mini_sense, mini_truth, linear):
     return {which: tuple(map(np.array, pair)) for which, pair in out.items()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("which", ["smoothed", "filtered"])
 @pytest.mark.parametrize("group", GROUPS)
 def test_rms_errors_reach_the_bound(realisations, least, which, group, record_property):
@@ -112,6 +113,7 @@ def test_rms_errors_reach_the_bound(realisations, least, which, group, record_pr
     assert ratio >= 1.0 - 3.0 * uncertain
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("which", ["smoothed", "filtered"])
 def test_every_epoch_and_component_is_near_the_bound(realisations, least, which, record_property):
     """One by one a ratio is uncertain by 7 per cent (one over the root of twice 100): 1.25 is 3.5 of its sd."""
@@ -122,6 +124,7 @@ def test_every_epoch_and_component_is_near_the_bound(realisations, least, which,
     assert ratio.min() > 0.75
 
 
+@pytest.mark.long
 def test_stated_sds_of_noisy_flights_scatter_about_the_bound(realisations, least, record_property):
     """About a noisy estimate the linearisation differs a little from flight to flight, not on average."""
     for which, (_, sd) in realisations.items():

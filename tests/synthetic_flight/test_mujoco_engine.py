@@ -189,7 +189,7 @@ def test_entry_on_mujoco_s_own_ball_joint(generic_vehicle, measured):
     assert bend.max() > 0.25
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_entry_with_every_joint_law_alive(generic_vehicle, measured):
     # freeplay, hardening of spring and damper, torsion stiffness of its own: MuJoCo does the mechanics, the joint's law
     # comes in as a torque on both bodies. The freeplay's corner is made wide, as it costs both integrators their order
