@@ -52,6 +52,7 @@ def ensemble():
     return rows
 
 
+@pytest.mark.long
 def test_every_flight_is_answered_and_errors_lie_in_their_bars(ensemble):
     """100 flights by hand: 0.16 deg and 2.1 deg rms, 1 sd covers 62 and 64 % (benchmarks/video_coverage.py)."""
     errors, normal = [], []
@@ -68,6 +69,7 @@ def test_every_flight_is_answered_and_errors_lie_in_their_bars(ensemble):
     assert 1.48 / 10.0 < np.mean(normal) / 2.0 < 29.6 / 10.0
 
 
+@pytest.mark.long
 def test_the_lens_is_found_on_the_benchmark(ensemble):
     frames, _, _ = degraded(0)
     oriented = orient_camera(frames[0], GEOMETRY, UNCALIBRATED, JOINT_M)
