@@ -11,6 +11,7 @@ from rich.markup import escape
 from flightmodel.checks import ConfigError, GateError
 from postflight.exports import kml, matlab, netcdf, oem, tables
 from postflight.exports.source import Source, read_source
+from postflight.whole_file import write_file
 
 FORMS: dict[str, Callable[[Source], bytes]] = {
     "csv": tables.csv_bytes,
@@ -46,13 +47,8 @@ def export(folder: Path, form: str, out: Path | None) -> None:
             raise
         words = f"--to {form} needs {name}, which is not installed: pip install 'postflight[{EXTRAS[name]}]'"
         raise ConfigError(words) from None
-    partial = path.with_name(f".partial-{path.name}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(content)
-        partial.replace(path)
+        write_file(path, content)
     except OSError as fault:
         raise GateError(f"{path}: cannot be written: {fault.strerror or fault}") from None
-    finally:
-        partial.unlink(missing_ok=True)
     console.print(f"{escape(str(path))} ({len(content) / 1e6:.1f} MB) of run {escape(source.run)}", highlight=False)

@@ -14,13 +14,13 @@ from rich.table import Table
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.config import read_toml
 from postflight.intake.clock_columns import split_clocks
-from postflight.intake.init_command import write_text
 from postflight.intake.loose import LooseTable, read_loose
 from postflight.intake.matlab import read_matlab
 from postflight.intake.proposal import SourceProposal
 from postflight.intake.propose import propose
 from postflight.intake.sounding_tables import radiosonde_table
 from postflight.intake.write_mapping import section_text, start_text
+from postflight.whole_file import write_file
 
 console = Console(soft_wrap=True)
 MATLAB = (".mat",)
@@ -62,8 +62,8 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
     text = path.read_text(encoding="utf-8-sig").rstrip() + "\n" + added
     tomllib.loads(text)  # what is written can be read
     for table, place in zip(read, places, strict=True):
-        write_bytes(place, table.as_csv())
-    write_text(path, text)
+        write_file(place, table.as_csv())
+    write_file(path, text)
     print_proposals(shown)
     left = f"{added.count('FILL IN')} values are left to you in {path}. Next: postflight check {folder}"
     console.print(escape(left), highlight=False)
@@ -97,17 +97,6 @@ def _sections(tables: dict[str, Any]) -> set[str]:
     for group in ("sensors", "radars", "gnss", "barometers"):
         out |= {f"{group}.{name}" for name in tables.get(group, {})}
     return out
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def print_proposals(shown: list[tuple[LooseTable, list[SourceProposal], list[str]]]) -> None:

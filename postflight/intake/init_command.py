@@ -13,6 +13,7 @@ from flightmodel.checks import ConfigError
 from flightmodel.config import FILL_IN_VALUE
 from flightmodel.vehicle import DATA, vehicle_from_toml, vehicle_path
 from postflight.intake.schema import schema_text, template
+from postflight.whole_file import write_file
 
 console = Console(soft_wrap=True)
 VEHICLE_LINE = '# vehicle = "vehicle/vehicle.toml"    #'
@@ -41,7 +42,7 @@ def init(folder: Path, vehicle: str | None) -> None:
         )
     (folder / "telemetry").mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
-        write_text(path, text)
+        write_file(path, text)
     for path, source in copies.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, path)
@@ -75,14 +76,3 @@ def _contents(folder: Path, vehicle: str | None) -> tuple[dict[Path, str], dict[
 
 def _line(vehicle: str) -> str:
     return f"vehicle = {json.dumps(vehicle, ensure_ascii=False)}".ljust(VEHICLE_LINE.index("#", 1)) + "#"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
-    try:
-        partial.write_text(text, encoding="utf-8", newline="\n")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

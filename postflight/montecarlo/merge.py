@@ -18,6 +18,7 @@ from flightmodel.checks import FloatArray, GateError
 from postflight.montecarlo.chunks import Chunk, read_chunk
 from postflight.montecarlo.intervals import percentile_interval
 from postflight.montecarlo.study import CONFIDENCE, PERCENTILES, Study
+from postflight.whole_file import write_file
 
 BAND_BYTES = 256 * 1024**2
 DIGITS = "%.10g"
@@ -138,19 +139,9 @@ def write_merged(folder: Path, merged: Merged) -> None:
         ("bands.csv", merged.bands),
     ):
         write_csv(folder / name, table)
-    write_text(folder / "summary.json", json.dumps(merged.summary, indent=2) + "\n")
+    write_file(folder / "summary.json", json.dumps(merged.summary, indent=2) + "\n")
 
 
 def write_csv(path: Path, table: pd.DataFrame) -> None:
     """Write a table beside its place and rename it."""
-    write_text(path, table.to_csv(index=False, float_format=DIGITS, lineterminator="\n"))
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text beside its place and rename it."""
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        partial.write_text(text)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_file(path, table.to_csv(index=False, float_format=DIGITS, lineterminator="\n"))

@@ -20,8 +20,8 @@ from flightmodel.checks import ConfigError, GateError
 from postflight.montecarlo.chunks import Chunk, chunk_path, read_chunk, remove_partial, write_chunk
 from postflight.montecarlo.execution import fly_jobs
 from postflight.montecarlo.intervals import is_narrow
-from postflight.montecarlo.merge import write_text
 from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
+from postflight.whole_file import write_file
 
 Report = Callable[[float, str], None]
 MOST_DIFFERENCES = 12
@@ -63,7 +63,7 @@ def begin(study: Study, folder: Path, flights: int) -> None:
 
 def _note(folder: Path, settings: dict[str, Any], flights: int, source: str) -> None:
     facts = {"version": version("postflight"), "flights": flights, "source": source, "settings": settings}
-    write_text(folder / "study.json", json.dumps(facts, indent=1) + "\n")
+    write_file(folder / "study.json", json.dumps(facts, indent=1) + "\n")
 
 
 def read_settings(folder: Path) -> dict[str, Any]:

@@ -78,6 +78,11 @@ class VehicleUnknowns:
                               offset / body.mass_kg, v["inertia of the centerbody"]),
         )  # fmt: skip
 
+    def flown(self, x: FloatArray) -> Vehicle:
+        """Vehicle of one candidate with its own coefficients."""
+        vehicle = self.vehicle(x)
+        return replace(vehicle, aero=vehicle.aero.scaled(*self.factors(x)))
+
     def factors(self, x: FloatArray) -> tuple[float, float, float, float]:
         """Factors on C_A, C_N, C_m and shift of C_mq."""
         known, v = self.told.uncertainty, dict(zip(self.names, x.tolist(), strict=True))

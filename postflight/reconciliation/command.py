@@ -50,7 +50,8 @@ def run(folder: Path, hardening: bool) -> None:
             table = joint_table(found)
             out.write_csv("joint.csv", table)
             out.write_csv("joint_correlations.csv", correlations(found))
-            out.write_csv("deflection_reconciled.csv", results.deflection_table(deflection_of(found)))
+            bent = deflection_of(found)
+            out.write_csv("deflection_reconciled.csv", results.deflection_table(bent))
             out.write_json("reconciliation.json", summary(found, table, odds) | modal_summary(modal, no_modes))
             out.write_csv("bands.csv", bands(rigid, flexible))
             out.write_csv("bands_shares.csv", shares)
@@ -59,7 +60,7 @@ def run(folder: Path, hardening: bool) -> None:
                 save(figure_modes(modal, telemetry), out.path / "figures" / "modes.png")
             (out.path / "joint.toml").write_text(vehicle_lines(found))
             fused = answers.histories.get("fused")
-            save(figure_reconciled(found, telemetry, fused), out.path / "figures" / "reconciled.png")
+            save(figure_reconciled(found, telemetry, bent, fused), out.path / "figures" / "reconciled.png")
     print_joint(found, table, odds)
     if modal is None:
         console.print(f"stiffness by the joint's frequency: none ({escape(no_modes)})")

@@ -10,7 +10,7 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
 from postflight.figures import COLOUR, stamp
-from postflight.reconciliation.answer import deflection_of, stiffness_and_offset
+from postflight.reconciliation.answer import stiffness_and_offset
 from postflight.reconciliation.fit import Reconciled
 from postflight.reconciliation.modes import ModalStiffness
 
@@ -18,7 +18,9 @@ FOUND, MEASURED = "#0072B2", "#000000"
 HIGHEST_HZ = 5.0
 
 
-def figure_reconciled(found: Reconciled, telemetry: Telemetry, fused: DeflectionHistory | None) -> Figure:
+def figure_reconciled(
+    found: Reconciled, telemetry: Telemetry, bent: DeflectionHistory, fused: DeflectionHistory | None
+) -> Figure:
     """Rate and lateral force, measured and flown by the joint found; deflection; stiffness against offset."""
     figure = Figure(figsize=(10.0, 9.0), layout="constrained")
     axes = figure.subplots(3, 2)
@@ -31,7 +33,7 @@ def figure_reconciled(found: Reconciled, telemetry: Telemetry, fused: Deflection
     left = found.residuals.sensors
     _residuals(axes[1, 0], t, left[..., :3], "rates: residual / sd")
     _residuals(axes[1, 1], t, left[..., 3:], "specific force: residual / sd")
-    _deflection(axes[2, 0], deflection_of(found), fused)
+    _deflection(axes[2, 0], bent, fused)
     _ridge(axes[2, 1], found)
     for ax in axes.ravel():
         ax.grid(alpha=0.3)

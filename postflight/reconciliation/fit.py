@@ -74,9 +74,7 @@ class Reconciled:
     @property
     def vehicle(self) -> Vehicle:
         """Vehicle with the joint, the offset and the coefficients found."""
-        found = self.problem.unknown.vehicle(self.unknowns.vehicle)
-        ca, cn, cm, cmq = self.problem.unknown.factors(self.unknowns.vehicle)
-        return replace(found, aero=found.aero.scaled(ca, cn, cm, cmq))
+        return self.problem.unknown.flown(self.unknowns.vehicle)
 
 
 def reconcile(flight: Flight, hardening: bool = False, progress: Progress | None = None) -> Reconciled:

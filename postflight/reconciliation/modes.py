@@ -12,7 +12,7 @@ what spin adds to one it takes from the other).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -127,9 +127,13 @@ def _tracks(told: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArray]) -> F
 
 
 def _stiffer(told: Vehicle, factor: float) -> Vehicle:
+    return VehicleUnknowns(told).vehicle(_at_stiffness(told, factor))
+
+
+def _at_stiffness(told: Vehicle, factor: float) -> FloatArray:
     x = np.zeros(len(VehicleUnknowns(told).names))
     x[0] = np.log(factor) / STIFFNESS_LOG_SD
-    return VehicleUnknowns(told).vehicle(x)
+    return x
 
 
 def _frequencies(vehicle: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
@@ -172,13 +176,9 @@ def _vehicle_sd(told: Vehicle, factor: float, flow: tuple[FloatArray, FloatArray
     unknown = VehicleUnknowns(told)
 
     def mean_log_hz(x: FloatArray) -> float:
-        vehicle = unknown.vehicle(x)
-        ca, cn, cm, cmq = unknown.factors(x)
-        scaled = replace(vehicle, aero=vehicle.aero.scaled(ca, cn, cm, cmq))
-        return float(np.nanmean(np.log(_frequencies(scaled, flow)[1])))
+        return float(np.nanmean(np.log(_frequencies(unknown.flown(x), flow)[1])))
 
-    x = np.zeros(len(unknown.names))
-    x[0] = np.log(factor) / STIFFNESS_LOG_SD
+    x = _at_stiffness(told, factor)
     base = mean_log_hz(x)
     slopes = {}
     for k, name in enumerate(unknown.names):

@@ -1,4 +1,4 @@
-"""Residuals of a candidate flight in spans, how they fall with every unknown, and a step towards the best one.
+"""Residuals of a candidate flight in spans, and how they fall with every unknown.
 
 The flight is cut into spans of about a joint's period, each flown by the simulator from a motion of its own
 (multiple shooting: one flight of fifty seconds depends on its start so strongly that a fit of it stops in any of many
