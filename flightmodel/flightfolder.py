@@ -6,6 +6,7 @@ Nothing below ``truth/`` is opened here.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -59,13 +60,15 @@ class Sources:
     attitude_prior: AttitudePrior | None
 
 
-def read_sources(folder: Path) -> Sources:
+def read_sources(folder: Path, progress: Callable[[float], None] | None = None) -> Sources:
     """Read every table of a flight that can be read; faults and findings are kept in the gate.
 
     Parameters
     ----------
     folder : Path
         Flight folder with ``flight.toml``.
+    progress : callable, optional
+        Is told which part of large tables is read.
 
     Raises
     ------
@@ -74,6 +77,8 @@ def read_sources(folder: Path) -> Sources:
     """
     spec = read_flight_file(folder)
     gate = Gate(folder, parse_utc(spec.t0_utc))
+    if progress is not None:
+        gate.tell = _share_of(folder, spec, progress)
     for words in spec.misfits():
         gate.refuse_config(words)
     vehicle = _vehicle(gate, spec.vehicle) if spec.vehicle is not None else None
@@ -91,13 +96,15 @@ def read_sources(folder: Path) -> Sources:
     return Sources(gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, frames, prior)
 
 
-def read_flight(folder: Path) -> Telemetry:
+def read_flight(folder: Path, progress: Callable[[float], None] | None = None) -> Telemetry:
     """Read everything measured on one flight.
 
     Parameters
     ----------
     folder : Path
         Flight folder with ``flight.toml``.
+    progress : callable, optional
+        Is told which part of large tables is read.
 
     Raises
     ------
@@ -106,7 +113,7 @@ def read_flight(folder: Path) -> Telemetry:
     GateError
         For faults of the data files: all of them, each with file, line or time, and what to do.
     """
-    found = read_sources(folder)
+    found = read_sources(folder, progress)
     gate, spec = found.gate, found.spec
     gate.close()
     assert found.sounding is not None
@@ -136,6 +143,19 @@ def read_flight(folder: Path) -> Telemetry:
         trackers = " and ".join(kind for kind, some in (("radars", found.radars), ("receivers", found.gnss)) if some)
         raise GateError(f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)")
     return telemetry
+
+
+def _share_of(folder: Path, spec: FlightFile, progress: Callable[[float], None]) -> Callable[[int], None]:
+    """Turn bytes that were read more into the part of all tables' bytes."""
+    paths = [folder / source.file for source in spec.sources]
+    total, done = sum(path.stat().st_size for path in paths if path.is_file()), 0
+
+    def tell(more: int) -> None:
+        nonlocal done
+        done += more
+        progress(min(1.0, done / total))
+
+    return tell
 
 
 def _there(records: dict[str, Record | None]) -> dict[str, Record]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -48,6 +49,8 @@ class Table:
 
     def of_rows(self, rows: BoolArray) -> Table:
         """Return the table of these rows alone."""
+        if rows.all():
+            return self
         time_s = None if self.time_s is None else self.time_s[rows]
         kept = {short: values[rows] for short, values in self.columns.items()}
         return Table(self.path, self.label, time_s, kept, self.lines[rows])
@@ -63,6 +66,7 @@ class Gate:
     config: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     digests: dict[Path, str] = field(default_factory=dict)
+    tell: Callable[[int], None] = lambda _bytes: None  # of how many bytes more were read
 
     def sha256(self, path: Path) -> str:
         """SHA-256 of a file, from its reading where that made one."""
@@ -145,7 +149,7 @@ class Gate:
             return None
         wanted = {places[q.short][0]: q.required or q.short in source.columns for q in quantities}
         time = source.time_column if timed else None
-        found = read_numbers(path, wanted, time, self.t0)
+        found = read_numbers(path, wanted, time, self.t0, self.tell)
         if found is None or len(wanted) < len(places):
             return None
         time_s = found.time

@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from flightmodel import columns
+from flightmodel.averaging import averaged
 from flightmodel.checks import BoolArray, FloatArray, nearest_name
 from flightmodel.film import Frames, doubt_of_film, fault_of_film, fault_of_image
 from flightmodel.findings import find_faults
@@ -50,7 +51,9 @@ def read_triad(gate: Gate, name: str, spec: FlightFile, vehicle: Vehicle | None)
         return None
     if isinstance(source, MagnetometerEntry) and source.reversed:
         values = -values
-    return TriadRecord(_triad_spec(name, source, *mounting), table.time_s, values)
+    record, told = averaged(TriadRecord(_triad_spec(name, source, *mounting), table.time_s, values))
+    gate.findings.extend(told)
+    return record
 
 
 def _mounting(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
@@ -58,7 +58,11 @@ class _Layout:
 
 
 def read_numbers(
-    path: Path, wanted: Mapping[str, bool], time: TimeColumn | None = None, t0: datetime | None = None
+    path: Path,
+    wanted: Mapping[str, bool],
+    time: TimeColumn | None = None,
+    t0: datetime | None = None,
+    tell: Callable[[int], None] = lambda _bytes: None,
 ) -> Numbers | None:
     """Read columns of numbers; None where the careful reader must have a look.
 
@@ -70,6 +74,8 @@ def read_numbers(
     time : TimeColumn, optional
         Column of times; those of a clock become seconds after ``t0``.
     t0 : datetime, optional
+    tell : callable, optional
+        Is told, as the file is read, of how many bytes more.
     """
     clock = time is not None and time.format != "seconds"
     try:
@@ -87,8 +93,9 @@ def read_numbers(
         if shelf is not None and shelf.worth_a_look():
             digest = file_sha256(path)
             block = shelf.load(digest)
+            tell(0 if block is None else size)
         if block is None:
-            read = _parse(path, size, layout, time if clock else None, t0)
+            read = _parse(path, size, layout, time if clock else None, t0, tell)
             if read is None:
                 return None
             block, digest = read
@@ -144,7 +151,12 @@ def _tables() -> tuple[FloatArray, NDArray[np.uint64], NDArray[np.uint64]]:
 
 
 def _parse(
-    path: Path, size: int, layout: _Layout, clock: TimeColumn | None, t0: datetime | None
+    path: Path,
+    size: int,
+    layout: _Layout,
+    clock: TimeColumn | None,
+    t0: datetime | None,
+    tell: Callable[[int], None],
 ) -> tuple[FloatArray, str] | None:
     """Block of numbers (times of a clock first) and the content's SHA-256; None where anything is unusual."""
     from flightmodel import _csv_kernels as kernels
@@ -166,7 +178,10 @@ def _parse(
             rows = int(kernels.read_rows(data, 0, stop, layout.slots, *_tables(), block, spans, row))
             return rows, _cells(data, spans[:, row : row + rows]) if layout.text and rows > 0 else []
 
-        done = list(pool.map(read, range(len(edges) - 1)))
+        done = []
+        for k, got in enumerate(pool.map(read, range(len(edges) - 1))):
+            done.append(got)
+            tell(edges[k + 1][0] - edges[k][0])
         # blank lines leave rows out; they may stand after the last row alone
         full = [edge[1] + rows for edge, (rows, _) in zip(edges, done, strict=False) if rows > 0]
         total = sum(rows for rows, _ in done)

@@ -165,7 +165,7 @@ def run_flight(
 
         share = 0.2 if reruns else 1.0  # of the time, for all but the reruns
         step(0.0, 0.05 * share)(0.0, "reading telemetry")
-        telemetry = read_flight(folder)
+        telemetry = read_flight(folder, lambda f: report(0.05 * share * f, "reading telemetry"))
         compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *(["camera"] if "camera" in methods else []))
         flight = reconstruct_telemetry(
             telemetry, Settings(output_rate_hz=rate_hz, pulse_rate_hz=PULSE_RATE_HZ), step(0.05 * share, 0.5 * share)

@@ -111,7 +111,7 @@ def reconstruct_flight(folder: Path, settings: Settings | None = None, progress:
     """Read a flight folder and reconstruct it; `ConfigError` or `GateError` where the data cannot be used."""
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "reading telemetry")
-    telemetry = read_flight(folder)
+    telemetry = read_flight(folder, lambda f: report(0.1 * f, "reading telemetry"))
     return reconstruct_telemetry(telemetry, settings, lambda f, what: report(0.1 + 0.9 * f, what))
 
 

@@ -35,10 +35,10 @@ def run(folder: Path, hardening: bool) -> None:
     settings = {"reconcile": True, "hardening": hardening, "output_rate_hz": 20.0}
     with progress_bar() as report:
         report(0.0, "reading telemetry")
-        telemetry = read_flight(folder)
+        telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
         compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
         flight = reconstruct_telemetry(
-            telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.2 * f, what)
+            telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
         )
         answers = estimate(flight, telemetry, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
         found, odds = _joint(flight, hardening, lambda f, what: report(0.3 + 0.6 * f, what))
