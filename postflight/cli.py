@@ -150,13 +150,23 @@ def score(folder: Path, as_json: bool) -> None:
 @click.argument("folder", type=FOLDER)
 @click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Default: in the run's folder.")
 @click.option("--notebook", is_flag=True, help="Write a Jupyter notebook filled in for this flight instead.")
-def report(folder: Path, output: Path | None, notebook: bool) -> None:
+@click.option(
+    "--bands",
+    multiple=True,
+    type=click.Path(exists=True, path_type=Path),
+    help="Folder of a Monte Carlo study or a reconciliation to hold the flight against.",
+)
+def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path, ...]) -> None:
     """Write the report of the newest run of the flight in FOLDER: one HTML file that needs nothing else."""
     from postflight.report.notebook import write_notebook
     from postflight.report.write import write_report
 
-    write = write_notebook if notebook else write_report
-    click.echo(f"report in {write(folder, target=output)}")
+    if notebook and bands:
+        raise click.UsageError("--bands belongs to the report in HTML; leave out --notebook")
+    if notebook:
+        click.echo(f"report in {write_notebook(folder, target=output)}")
+    else:
+        click.echo(f"report in {write_report(folder, target=output, studies=bands)}")
 
 
 @cli.command()

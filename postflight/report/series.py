@@ -43,7 +43,7 @@ TRAJECTORY: list[tuple[str, str, str, float, int, list[tuple[str, str, str | Non
         ("z, corrected", "az_imu_mps2", "az_imu_sd_mps2", GREEN, [6, 3])]),
 ]  # fmt: skip
 WHY_ABSENT = {"alpha": NO_ATTITUDE, "axial": NO_ACCELEROMETER, "lateral": NO_ACCELEROMETER}
-FLOOR = {"speed", "mach", "pressure", "alpha", "deflection", "rigid_alpha", "rigid_normal"}
+FLOOR = {"speed", "mach", "pressure", "alpha", "deflection"}
 
 
 def line(
@@ -158,39 +158,6 @@ def deflection_panel(run: Run) -> Panel | None:
         return None
     out = panel("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, [])
     return out | {"ceiling": round(1.3 * max(max(x for x in one["y"] if x is not None) for one in lines), 2)}
-
-
-def rigid_panels(run: Run) -> list[Panel]:
-    """Flight against the bands of a rigid vehicle; none where the run flew no rigid vehicle."""
-    bands = run.tables.get("rigid_bounds")
-    if bands is None:
-        return []
-    bet = run.tables["bet"]
-    from_s, to_s = bands["t_s"].iloc[0] - 5.0, bands["t_s"].iloc[-1] + 5.0
-    bet = bet[(bet["t_s"] >= from_s) & (bet["t_s"] <= to_s)]
-    angles = [bet[c].to_numpy(float) for c in ("alpha_total_wind_deg", "ay_cg_mps2", "az_cg_mps2")]
-    bet = bet.iloc[kept_rows(angles, TRAJECTORY_ROWS)]
-    t = rounded(bands["t_s"].to_numpy(), 3)
-    normal = np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / 9.80665
-    out = []
-    for name, title, unit, flown in (
-        ("alpha_total", "Total angle of attack", "deg", bet["alpha_total_wind_deg"]),
-        ("normal", "Acceleration across the axis at the c.g.", "g", normal),
-    ):
-        low, middle, high, nominal = (
-            rounded(bands[f"{name}_{part}_{unit}"].to_numpy(), 4) for part in ("low", "median", "high", "nominal")
-        )
-        lines = [
-            {"label": "rigid, half above", "t": t, "y": middle, "low": low, "high": high, "colour": GREY, "dash": [],
-             "width": 1.2},
-            {"label": "rigid, nominal", "t": t, "y": nominal, "colour": DARK, "dash": [2, 3], "width": 1.2},
-            line("this flight", flown.to_numpy(float), None, BLUE, [], 4) | {"t": rounded(bet["t_s"].to_numpy(), 3)},
-        ]  # fmt: skip
-        # a rigid vehicle may tumble late, out of what is of interest here
-        highest = max(float(np.nanmax(flown)), float(np.nanmax(bands[f"{name}_median_{unit}"])))
-        one = panel(f"rigid_{name.removesuffix('_total')}", title, unit, None, lines, [])
-        out.append(one | {"ceiling": round(1.5 * highest, 2)})
-    return out
 
 
 def residual_panels(run: Run) -> list[Panel]:

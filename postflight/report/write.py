@@ -19,7 +19,7 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import writing
 from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
-from postflight.report import pictures, series, shape, words
+from postflight.report import bands, pictures, series, shape, words
 from postflight.report.source import Run, read_run
 from postflight.results import remove_abandoned
 
@@ -31,9 +31,15 @@ ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", 
 
 
 def write_report(
-    flight_folder: Path, path: Path | None = None, telemetry: Telemetry | None = None, target: Path | None = None
+    flight_folder: Path,
+    path: Path | None = None,
+    telemetry: Telemetry | None = None,
+    target: Path | None = None,
+    studies: tuple[Path, ...] = (),
 ) -> Path:
     """Write the report of a run (`read_run`) to ``target`` or into the run's folder; return where it lies.
+
+    ``studies`` are folders or files with bands that the flight is held against (`postflight.report.bands`).
 
     Raises
     ------
@@ -42,7 +48,7 @@ def write_report(
     """
     run = read_run(flight_folder, path, telemetry)
     target = run.path / NAME if target is None else target
-    write_whole(target, page(run))
+    write_whole(target, page(run, studies))
     return target
 
 
@@ -60,14 +66,14 @@ def write_whole(target: Path, text: str) -> None:
             Path(partial).unlink(missing_ok=True)
 
 
-def page(run: Run) -> str:
+def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
     """Return the whole page."""
     here = files("postflight.report").joinpath("page")
     read = lambda name: here.joinpath(name).read_text(encoding="utf-8")  # noqa: E731
     script = "\n".join(read(name) for name in SCRIPTS)
     style = "\n".join(read(name) for name in STYLES)
     frames = pictures.film_strip(run)
-    data, absent = numbers(run, frames)
+    data, absent = numbers(run, frames, studies)
     environment = Environment(
         loader=DictLoader({"page": read("page.html")}),
         autoescape=True,
@@ -86,6 +92,7 @@ def page(run: Run) -> str:
         frames=frames,
         absent=absent,
         drawn=data,
+        studies=[path.resolve().name for path in studies],
         **told(run),
     )
 
@@ -117,7 +124,9 @@ def told(run: Run) -> dict[str, Any]:
     }
 
 
-def numbers(run: Run, frames: list[dict[str, Any]]) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+def numbers(
+    run: Run, frames: list[dict[str, Any]], studies: tuple[Path, ...]
+) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """Everything that the page's scripts draw, and the panels that the flight has no data for, with the reason."""
     bet = run.tables["bet"]
     rows = series.trajectory_rows(run)
@@ -139,7 +148,8 @@ def numbers(run: Run, frames: list[dict[str, Any]]) -> tuple[dict[str, Any], lis
         "rows": [len(rows), len(bet)],
         "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in run.tables["events"].itertuples()],
         "panels": panels,
-        "rigid": series.rigid_panels(run),
+        "rigid": bands.rigid_panels(run),
+        "studies": bands.study_panels(run, studies),
         "residuals": series.residual_panels(run),
         "solid": None if vehicle is None else shape.solid(vehicle),
         "poses": shape.poses(run, rows),

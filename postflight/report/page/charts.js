@@ -223,7 +223,7 @@ function residualPanel(panel, options) {
 
 function startCharts() {
   data.panels.forEach((panel, k) => timePanel(panel, { numbered: true, utc: k === data.panels.length - 1 || k === 0 }));
-  data.rigid.forEach((panel) => timePanel(panel, { numbered: true, utc: true }));
+  [...data.rigid, ...data.studies].forEach((panel) => timePanel(panel, { numbered: true, utc: true }));
   data.residuals.forEach((panel) => residualPanel(panel, { numbered: false, utc: false }));
   clock.onCursor.push(() => charts.forEach((chart) => chart.place()));
   clock.onWindow.push((from, to) => charts.forEach((chart) => {
