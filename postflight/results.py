@@ -107,22 +107,19 @@ def run_hash(inputs_sha256: dict[str, str], settings: dict[str, Any], made_by: s
     return hashlib.sha256(facts.encode()).hexdigest()[:8]
 
 
-def remove_abandoned(parent: Path, prefix: str = PARTIAL) -> None:
-    """Remove what processes that are gone left half-written: they were killed where they could not tidy up.
+def remove_abandoned(parent: Path) -> None:
+    """Remove the folders that processes which are gone left half-written: killed where they could not tidy up.
 
-    Such folders and files are named ``prefix``, process number, ``-`` and anything.
+    Such a folder is named `PARTIAL`, process number, ``-`` and anything.
     """
     for path in parent.iterdir():
-        number, dash, _ = path.name.removeprefix(prefix).partition("-")
-        if not path.name.startswith(prefix) or not dash or not number.isdigit():
+        number, dash, _ = path.name.removeprefix(PARTIAL).partition("-")
+        if not path.name.startswith(PARTIAL) or not dash or not number.isdigit():
             continue
         try:
             os.kill(int(number), 0)
         except ProcessLookupError:
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
+            shutil.rmtree(path, ignore_errors=True)  # refuses what is no folder, or a link to one
         except (PermissionError, OverflowError):
             continue
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
-import tempfile
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
 from postflight.report import bands, pictures, series, shape, words
 from postflight.report.source import Run, read_run
-from postflight.results import remove_abandoned
+from postflight.whole_file import write_file
 
 NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
@@ -55,15 +53,7 @@ def write_report(
 def write_whole(target: Path, text: str) -> None:
     """Write a file that appears at once, or a `GateError` with its name."""
     with writing(target, "name another place with --output"):
-        remove_abandoned(target.parent, f".{target.name}-")
-        handle, partial = tempfile.mkstemp(prefix=f".{target.name}-{os.getpid()}-", dir=target.parent)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as out:
-                out.write(text)
-            Path(partial).chmod(0o644)
-            Path(partial).replace(target)
-        finally:
-            Path(partial).unlink(missing_ok=True)
+        write_file(target, text)
 
 
 def page(run: Run, studies: tuple[Path, ...] = ()) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from flightmodel.checks import GateError, writing
-from postflight.results import remove_abandoned
+from postflight.results import PARTIAL, remove_abandoned
 from tests.postflight.killing import kill_run, run_again
 
 HEAVY = {"numpy", "scipy", "numba", "matplotlib", "cv2", "trimesh", "filterpy", "pandas", "ppigrf", "erfa"}
@@ -408,15 +408,16 @@ def test_killed_runs_leave_nothing_half_written(two_runs, clean_flight, tmp_path
     run_again(tmp_path / "flight", saved)
 
 
-def test_what_a_killed_report_left_is_removed(tmp_path: Path) -> None:
+def test_what_a_killed_run_left_is_removed(tmp_path: Path) -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     left, ours, other = (
-        tmp_path / f".report.html-{number}-abc" for number in (gone.pid, os.getpid(), "x")
+        tmp_path / f"{PARTIAL}{number}-abc" for number in (gone.pid, os.getpid(), "x")
     )  # fmt: skip
     for path in (left, ours, other):
-        path.write_text("half")
-    remove_abandoned(tmp_path, ".report.html-")
+        path.mkdir()
+        (path / "bet.csv").write_text("half")
+    remove_abandoned(tmp_path)
     assert sorted(tmp_path.iterdir()) == sorted([ours, other])
 
 

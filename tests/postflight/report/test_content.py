@@ -236,7 +236,9 @@ def test_command_writes_where_told_and_says_so(command, rocket: Path, tmp_path: 
     done = command("report", rocket, "--output", tmp_path / "a.html")
     assert (done.returncode, done.stderr) == (0, "")
     assert str(tmp_path / "a.html") in done.stdout
-    done = command("report", rocket, "--output", tmp_path / "nowhere" / "a.html")
+    done = command("report", rocket, "--output", tmp_path / "new" / "a.html")
+    assert (done.returncode, (tmp_path / "new" / "a.html").read_bytes()) == (0, (tmp_path / "a.html").read_bytes())
+    done = command("report", rocket, "--output", tmp_path / "a.html" / "b.html")
     assert done.returncode == 3
     assert "cannot be written" in done.stderr
     assert command("report", tmp_path).returncode == 3
