@@ -26,7 +26,7 @@ def write_flight_toml(scenario: Scenario, q_prior: FloatArray, folder: Path) -> 
     vehicle = scenario.spec.vehicle
     if vehicle.endswith(".toml"):
         source = scenario.vehicle.source
-        for name in (source.name, *scenario.vehicle.tables):
+        for name in (source.name, *scenario.vehicle.files):
             copy = folder / VEHICLE_FOLDER / name
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source.parent / name, copy)
