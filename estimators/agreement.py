@@ -26,7 +26,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
-from estimators.evidence import ACCELEROMETER, ATTITUDE, PRESSURE, VEHICLE_INPUTS, WIND, Evidence
+from estimators.evidence import ACCELEROMETER, ATTITUDE, FILM_CLOCK, PRESSURE, VEHICLE_INPUTS, WIND, Evidence
 from flightmodel.checks import FloatArray
 
 SPAN_S = 2.0
@@ -45,6 +45,7 @@ BLAME = {
     "sounded wind": (WIND,),
     "sounded density": (PRESSURE,),
     "camera's orientation, benchmark or plane": (CAMERA,),
+    "film's clock": (FILM_CLOCK,),
 }
 
 

@@ -19,6 +19,7 @@ the dynamic pressure, over `DENSITY_LENGTH_M`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,8 @@ WIND_LENGTH_M, DENSITY_LENGTH_M, CONSTANT_PART, TRAJECTORY_TIME_S = 3000.0, 5000
 LIGHT_TIME_S = 2.5
 KNOTS_A_LENGTH = 3  # knots of a forgetful history, over what it forgets
 ACCELEROMETER, ATTITUDE, WIND, PRESSURE = "accelerometer", "BET attitude", "wind", "dynamic pressure"
+FILM_CLOCK, RATE_STEP_S = "film's clock", 0.005
+Deflection = Callable[[FloatArray], FloatArray]
 SWING_WINDOW_S = 2.0  # about a period of the slow aerodynamic mode, over which the joint's swinging is averaged
 BODIES = ("aeroshell", "centerbody")
 VEHICLE_INPUTS = (
@@ -66,6 +69,8 @@ class Evidence:
         Span over which readings may be averaged without loss of what they say.
     bend : (n, 2) float or None
         Half the second derivative of the reading by its most uncertain input, rad; None where that is nothing.
+    clock_sd_s : float
+        How well the clock that ``time_s`` was read from is known against the gyros'; zero: it is theirs.
     """
 
     method: str
@@ -76,6 +81,7 @@ class Evidence:
     independent_cov: FloatArray
     averaged_s: float
     bend: FloatArray | None = None
+    clock_sd_s: float = 0.0
 
     @property
     def mean_yz_rad(self) -> FloatArray:
@@ -183,8 +189,8 @@ def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
     return replace(vehicle, aero=aero, **bodies)
 
 
-def evidence_of_history(history: DeflectionHistory) -> Evidence:
-    """Evidence from a history alone, e.g. the camera's.
+def evidence_of_history(history: DeflectionHistory, clock_sd_s: float = 0.0) -> Evidence:
+    """Evidence from a history alone, e.g. the camera's, whose clock may be off by ``clock_sd_s``.
 
     Of what a history's errors share from sample to sample its covariance says nothing. `CONSTANT_PART` is taken as one
     error in all samples (orientation, benchmark), the rest as one that forgets over `LIGHT_TIME_S` (light, which turns
@@ -206,13 +212,26 @@ def evidence_of_history(history: DeflectionHistory) -> Evidence:
         {history.method: _turned(root, columns)},
         np.zeros_like(cov),
         averaged_s=float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0,
+        clock_sd_s=clock_sd_s,
     )
 
 
-def moved_evidence(one: Evidence, inputs: dict[str, FloatArray]) -> Evidence:
-    """Evidence of a method whose readings are linear in their inputs, with these moved."""
-    change = sum((j @ inputs[name] for name, j in one.by_input.items() if name in inputs), np.zeros(2))
-    return replace(one, theta_yz_rad=one.theta_yz_rad + change)
+def moved_evidence(one: Evidence, inputs: dict[str, FloatArray], about: Deflection | None = None) -> Evidence:
+    """Evidence of a method whose readings are linear in their inputs, with these moved.
+
+    A clock that is late by ``late`` read ``theta(t - late)`` at what it calls ``t``: its times are moved, and what is
+    left of its error enters by the rate of the deflection ``about`` (from times to lateral vectors) at those.
+    """
+    linear = {name: j for name, j in one.by_input.items() if name != FILM_CLOCK}
+    change = sum((j @ inputs[name] for name, j in linear.items() if name in inputs), np.zeros(2))
+    moved = replace(one, theta_yz_rad=one.theta_yz_rad + change)
+    if one.clock_sd_s == 0.0:
+        return moved
+    time_s = one.time_s - one.clock_sd_s * float(inputs.get(FILM_CLOCK, np.zeros(1))[0])
+    if about is None:
+        return replace(moved, time_s=time_s)
+    rate = (about(time_s + RATE_STEP_S) - about(time_s - RATE_STEP_S)) / (2.0 * RATE_STEP_S)
+    return replace(moved, time_s=time_s, by_input=linear | {FILM_CLOCK: one.clock_sd_s * rate[:, :, None]})
 
 
 def history_of_evidence(evidence: Evidence, pulse: PulseData, assumptions: str) -> DeflectionHistory:

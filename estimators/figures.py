@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from estimators.fusion import Fused
     from estimators.southwell import Limbs
     from estimators.static_trim import StaticTrim
+    from flightmodel.meshes import BodyMesh
 
 
 def figure_camera_overlay(
@@ -26,6 +27,7 @@ def figure_camera_overlay(
     times_s: Sequence[float],
     theta_rad: Sequence[float],
     plane_lv_rad: Sequence[float],
+    meshes: Mapping[str, BodyMesh] | None = None,
 ) -> Figure:
     """Frames side by side, the virtual camera over the right part of each (seed paper Figure 2.3).
 
@@ -39,6 +41,8 @@ def figure_camera_overlay(
         Benchmark first, then e.g. the frame of the largest deflection.
     times_s, theta_rad, plane_lv_rad : sequence of float
         Of each frame.
+    meshes : mapping, optional
+        A user's own, by body; see `estimators.overlay.Overlay`.
     """
     from matplotlib.figure import Figure
 
@@ -47,7 +51,7 @@ def figure_camera_overlay(
 
     figure = Figure(figsize=(6.0 * len(frames), 4.4), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(frames)))
-    view, overlay = oriented.view, Overlay(oriented.view)
+    view, overlay = oriented.view, Overlay(oriented.view, meshes or {})
     for k, axis in enumerate(axes):
         theta, plane = float(theta_rad[k]), float(plane_lv_rad[k])
         axis.imshow(overlay.blended(np.asarray(frames[k]), theta, plane), interpolation="nearest")

@@ -20,8 +20,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
+from scipy.ndimage import uniform_filter1d
 
-from estimators.evidence import Evidence, corrected_pulse, moved_evidence
+from estimators.evidence import (
+    FILM_CLOCK,
+    LIGHT_TIME_S,
+    Deflection,
+    Evidence,
+    corrected_pulse,
+    evidence_of_history,
+    moved_evidence,
+)
 from estimators.pulse import PulseData
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
@@ -35,11 +44,13 @@ SIZE_SD_RAD = 1.0  # of the deflection itself: says nothing
 # for about so long
 LEFT_OUT_RAD, LEFT_OUT_TIME_S = np.deg2rad(0.03), 1.0
 LEAST_SAMPLES = 8
-MOST_INPUT_SD, SETTLED_SD, MOST_STEPS, WHOLE_STEPS = 8.0, 0.05, 12, 4
+MOST_INPUT_SD, SETTLED_SD, MOST_STEPS, WHOLE_STEPS = 8.0, 0.05, 30, 4
 NEAR_S = 0.5  # an answer is given no further from a reading
+CLOCK_STEP_S, FARTHEST_CLOCK_SD = 0.01, 3.0
+MOVES = 1.75  # rms rate of the deflection against its sd; of noise alone it is 1
+SMOOTH_RATE_HZ = 50.0
 
 Inputs = dict[str, FloatArray]
-Deflection = Callable[[FloatArray], FloatArray]
 Read = Callable[[Inputs, Deflection | None], list[Evidence]]
 
 
@@ -70,7 +81,7 @@ class Fused:
     deflection: Deflection
 
 
-def fuse(read: Read, method: str = "fused") -> Fused:
+def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> Fused:
     """Fuse what the methods read; one method alone is smoothed.
 
     Parameters
@@ -80,6 +91,8 @@ def fuse(read: Read, method: str = "fused") -> Fused:
         vectors; None: each method's own) to what the methods then read.
     method : str
         Name of the answer.
+    at_s : (n,) float, optional
+        Times of the answer, s; else those of the method with most samples.
 
     Raises
     ------
@@ -92,20 +105,26 @@ def fuse(read: Read, method: str = "fused") -> Fused:
         raise DivergenceError(f"{method}: no method has {LEAST_SAMPLES} readings of the deflection")
     methods = [e.method for e in told]
     # first every sample by itself, without what they share: a deflection to be linear about
-    apart = [replace(e, by_input={}, independent_cov=e.covariance) for e in told]
-    problem = _Problem.of(apart, {})
+    inputs: Inputs = _started_clock(told, method)
+    span = _span(told)
+    apart = [_apart(moved_evidence(e, inputs)) for e in told]
+    problem = _Problem.of(apart, {}, span)
     found, covariance = problem.solved(method)
-    inputs: Inputs = {}
     for step in range(MOST_STEPS):
         told = [e for e in read(inputs, problem.deflection(found)) if e.method in methods]
-        problem, before = _Problem.of(told, inputs), found
+        problem, before = _Problem.of(told, inputs, span), found
         found, covariance = problem.solved(method)
         size = 2 * problem.spline.count
         new = {name: found[size:][place] for name, place in problem.place.items()}
-        moved = float((np.abs(found[:size] - before[:size]) / np.sqrt(np.diag(covariance)[:size])).max())
+        sd = np.sqrt(np.diag(covariance))
+        moved = float((np.abs(found[:size] - before[:size]) / sd[:size]).max())
+        if FILM_CLOCK in new:
+            clock = np.abs(new[FILM_CLOCK] - inputs.get(FILM_CLOCK, 0.0)) / sd[size:][problem.place[FILM_CLOCK]]
+            moved = max(moved, float(clock.max()))
         if moved < SETTLED_SD and step > 0:
             _check(new, method)
-            return _posterior(found, covariance, problem, told, method)
+            times = max(told, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
+            return _posterior(found, covariance, problem, told, method, times)
         # Newton's whole steps first, then half steps, which cannot swing to and fro
         part = 1.0 if step < WHOLE_STEPS else 0.5
         inputs = {name: part * x + (1.0 - part) * inputs.get(name, 0.0 * x) for name, x in new.items()}
@@ -113,6 +132,88 @@ def fuse(read: Read, method: str = "fused") -> Fused:
         f"{method}: the deflection does not settle: after {MOST_STEPS} steps it still moves by {moved:.2g} "
         "standard deviations; see each method's own answer"
     )
+
+
+def smoothed(history: DeflectionHistory, rate_hz: float = SMOOTH_RATE_HZ) -> DeflectionHistory:
+    """One method's history as a smooth one, every ``1 / rate_hz`` s: the joint as a second-order process.
+
+    Between readings and through short holes its error bar grows; further than `NEAR_S` from a reading it has no answer.
+
+    Raises
+    ------
+    DivergenceError
+        Where there are too few readings.
+    """
+    known = history.time_s[np.isfinite(history.theta_rad)]
+    if len(known) < LEAST_SAMPLES:
+        raise DivergenceError(f"{history.method}: no smooth history of {len(known)} readings")
+    first, last = np.ceil(known[0] * rate_hz), np.floor(known[-1] * rate_hz)
+    one = evidence_of_history(history)
+    return fuse(lambda _inputs, _about: [one], history.method, np.arange(first, last + 1.0) / rate_hz).history
+
+
+def _apart(one: Evidence) -> Evidence:
+    """Evidence whose every sample stands by itself."""
+    return replace(one, by_input={}, independent_cov=one.covariance)
+
+
+def _span(told: list[Evidence]) -> tuple[float, float]:
+    """First and last time that any clock may mean."""
+    wide = [FARTHEST_CLOCK_SD * e.clock_sd_s for e in told]
+    low = min(e.time_s[0] - w for e, w in zip(told, wide, strict=True))
+    return float(low), float(max(e.time_s[-1] + w for e, w in zip(told, wide, strict=True)))
+
+
+def clock_is_seen(read: Read) -> bool:
+    """Whether the deflection by the methods on the gyros' clock moves enough to tell another clock's offset.
+
+    A deflection that stands still fits any offset, and the rate of what is but noise would fit a wrong one closely.
+    """
+    told = [e for e in read({}, None) if np.isfinite(e.theta_yz_rad).all(axis=1).sum() >= LEAST_SAMPLES]
+    off, own = [e for e in told if e.clock_sd_s > 0.0], [e for e in told if e.clock_sd_s == 0.0]
+    if not off or not own:
+        return False
+    span = _span(own)
+    # what lasts in a reading does not move
+    problem = _Problem.of([replace(e, by_input={}) for e in own], {}, span)
+    try:
+        found, covariance = problem.solved("clock")
+    except DivergenceError:
+        return False
+    m = problem.spline.count
+    time_s = np.concatenate([e.time_s for e in off])
+    rows = problem.spline.rows(time_s[(time_s > span[0]) & (time_s < span[1])], 1)
+    square = sum(float(np.sum((rows @ found[part]) ** 2)) for part in (slice(0, m), slice(m, 2 * m)))
+    variance = sum(float(np.sum((rows @ covariance[p, p]) * rows)) for p in (slice(0, m), slice(m, 2 * m)))
+    return square > MOVES**2 * variance
+
+
+def _started_clock(told: list[Evidence], method: str) -> Inputs:
+    """Offset of a clock that is not the gyros', in its standard deviations, to start from; none where it is theirs.
+
+    The joint rings several times within what such a clock may be off: the sum of squares has a minimum at every swing,
+    and the lowest is looked for, with the clock's own term. What lasts longer than `LIGHT_TIME_S` says nothing of it.
+    """
+    off, own = [e for e in told if e.clock_sd_s > 0.0], [e for e in told if e.clock_sd_s == 0.0]
+    if not off or not own:
+        return {}
+    one, span = off[0], _span(own)
+    problem = _Problem.of([_apart(e) for e in own], {}, span)
+    bent = problem.deflection(problem.solved(method)[0])
+    reach = FARTHEST_CLOCK_SD * one.clock_sd_s
+    late_s = np.arange(-np.ceil(reach / CLOCK_STEP_S), np.ceil(reach / CLOCK_STEP_S) + 1.0) * CLOCK_STEP_S
+    inside = (one.time_s > span[0] + reach) & (one.time_s < span[1] - reach) & np.isfinite(one.theta_yz_rad[:, 0])
+    time_s, read = one.time_s[inside], one.theta_yz_rad[inside]
+    if len(time_s) < LEAST_SAMPLES:
+        return {}
+    window = max(3, round(LIGHT_TIME_S / float(np.median(np.diff(time_s)))))
+    square = np.empty(len(late_s))
+    for k, late in enumerate(late_s):
+        off_rad = read - bent(time_s - late)
+        square[k] = np.sum((off_rad - uniform_filter1d(off_rad, window, axis=0, mode="nearest")) ** 2)
+    variance = float(square.min()) / (2.0 * len(time_s)) + LEFT_OUT_RAD**2
+    best = int(np.argmin(square / variance + (late_s / one.clock_sd_s) ** 2))
+    return {FILM_CLOCK: np.array([late_s[best] / one.clock_sd_s])}
 
 
 @dataclass(frozen=True)
@@ -156,7 +257,7 @@ def pulse_reader(
             found = method(moved, use, at)
             noise = method(pulse, use, at).theta_yz_rad - method(smooth, use, at).theta_yz_rad
             out.append(replace(found, theta_yz_rad=found.theta_yz_rad + noise))
-        return [*out, *(moved_evidence(other, inputs) for other in others)]
+        return [*out, *(moved_evidence(other, inputs, about) for other in others)]
 
     return read
 
@@ -184,8 +285,8 @@ class _Problem:
     right: FloatArray
 
     @classmethod
-    def of(cls, told: list[Evidence], inputs: Inputs) -> _Problem:
-        spline = _Spline.over(float(min(e.time_s[0] for e in told)), float(max(e.time_s[-1] for e in told)))
+    def of(cls, told: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> _Problem:
+        spline = _Spline.over(*span_s)
         place: dict[str, slice] = {}
         total = 0
         for name, response in (item for e in told for item in e.by_input.items()):
@@ -265,11 +366,10 @@ def _check(inputs: Inputs, method: str) -> None:
 
 
 def _posterior(
-    found: FloatArray, covariance: FloatArray, problem: _Problem, told: list[Evidence], method: str
+    found: FloatArray, covariance: FloatArray, problem: _Problem, told: list[Evidence], method: str, t: FloatArray
 ) -> Fused:
     spline = problem.spline
     m, size = spline.count, 2 * spline.count
-    t = max(told, key=lambda e: len(e.time_s)).time_s
     read = np.concatenate([e.time_s for e in told])
     read.sort()
     after = np.searchsorted(read, t).clip(1, len(read) - 1)

@@ -1,82 +1,102 @@
 """Pictures for the eye: the virtual camera's view beside and over what the real one filmed (seed paper Figure 2.3).
 
 The shell is rendered bent as the estimate says, shaded by how it faces the camera, with the mesh's lines on it; where
-the centerbody covers it, it is not drawn. Yellow is the smallest row of the virtual edge, the
-seed paper's horizon line.
+the centerbody covers it, it is not drawn. A user's own meshes of either body take the place of the parametric ones.
+Yellow is the smallest row of the virtual edge, the seed paper's horizon line.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.raster import Rendered, render
+from estimators.raster import render
 from estimators.virtual_camera import VirtualCamera, bending_of
+from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.geometry import bend, vehicle_meshes
+from flightmodel.meshes import BodyMesh, outboard
 
 Picture = NDArray[np.uint8]
 
 YELLOW, GREY, BLACK, WHITE = (255, 230, 0), (170, 170, 170), (0, 0, 0), (255, 255, 255)
-COLOUR = np.array([0.45, 0.75, 1.0])
-LINE_COLOUR = np.array([25, 70, 130], dtype=np.uint8)
+COLOUR, BODY_COLOUR = np.array([0.45, 0.75, 1.0]), np.array([0.95, 0.85, 0.65])
+LINE_SHARE = 90.0
 SHARE = 0.65
 TORUS_SECTIONS = 20
+SMOOTH_RAD = float(np.deg2rad(15.0))  # faces of a user's mesh that meet at less are one piece
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """Triangles of one body, the piece of it that each belongs to, and its colour."""
+
+    vertices_m: FloatArray
+    faces: NDArray[np.int64]
+    piece: NDArray[np.int64]
+    colour: FloatArray
+
+    def seen_from(self, camera: Camera, vertices_m: FloatArray) -> tuple[FloatArray, Picture]:
+        """Depth ``(h, w)``, m, and picture ``(h, w, 3)``, RGB, with the vertices where they are now, body axes."""
+        seen = render(camera, vertices_m, self.faces)
+        corners = vertices_m[self.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        away = corners.mean(axis=1) - camera.position_body_m
+        length = np.linalg.norm(normal, axis=1) * np.linalg.norm(away, axis=1)
+        facing = np.abs(np.einsum("ni,ni->n", normal, away)) / np.maximum(length, 1e-12)
+        tone = ((60.0 + 150.0 * facing)[:, None] * self.colour).astype(np.uint8)
+        picture = np.zeros((*seen.face.shape, 3), dtype=np.uint8)
+        picture[seen.is_hit] = tone[seen.face[seen.is_hit]]
+        # a line where the piece changes to the right or below
+        piece = np.where(seen.is_hit, self.piece[seen.face], -1)
+        line = np.zeros_like(seen.is_hit)
+        line[:, 1:] |= piece[:, 1:] != piece[:, :-1]
+        line[1:] |= piece[1:] != piece[:-1]
+        picture[line & seen.is_hit] = LINE_SHARE * self.colour
+        return seen.depth_m, picture
 
 
 @dataclass
 class Overlay:
-    """Draws the shell of one virtual camera; holds its mesh.
+    """Draws the bodies of one virtual camera; holds their meshes.
 
     Parameters
     ----------
     view : VirtualCamera
+    meshes : mapping of str to BodyMesh
+        A user's own, of ``aeroshell`` or ``centerbody``, drawn in place of the stacked tori and of the centerbody,
+        which is not drawn otherwise. Where the shell's edge is (`horizon_row`) stays what the fit says.
     """
 
     view: VirtualCamera
-    shell_m: FloatArray = field(init=False, repr=False)
-    faces: NDArray[np.int64] = field(init=False, repr=False)
-    clear: BoolArray = field(init=False, repr=False)
+    meshes: Mapping[str, BodyMesh] = field(default_factory=dict)
+    shell: _Drawing = field(init=False, repr=False)
+    before_m: FloatArray = field(init=False, repr=False)
+    body: Picture = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Build the shell's mesh; find the pixels that the centerbody leaves free."""
-        meshes = vehicle_meshes(self.view.geometry, clock_sections=72, torus_sections=TORUS_SECTIONS)
-        meshes.pop("centerbody")
-        vertices, faces, count = [], [], 0
-        for mesh in meshes.values():
-            vertices.append(np.asarray(mesh.vertices))
-            faces.append(np.asarray(mesh.faces) + count)
-            count += len(mesh.vertices)
-        self.shell_m, self.faces = np.concatenate(vertices), np.concatenate(faces)
-        self.clear = ~centerbody_pixels(self.view)
-
-    def rendered(self, theta_rad: float, plane_lv_rad: float) -> tuple[Rendered, FloatArray]:
-        """Render the shell bent, and return its vertices, body axes, m."""
-        bent = bend(self.shell_m, theta_rad, plane_lv_rad, self.view.joint_station_m)
-        return render(self.view.camera, bent, self.faces), bent
+        """Build the shell's mesh; find how far each pixel's ray goes to the centerbody, and what it shows there."""
+        self.shell = _drawing(self.meshes["aeroshell"]) if "aeroshell" in self.meshes else _stacked(self.view)
+        camera = self.view.camera
+        self.body = np.zeros((camera.height_px, camera.width_px, 3), dtype=np.uint8)
+        if "centerbody" in self.meshes:
+            drawing = _drawing(self.meshes["centerbody"], BODY_COLOUR)
+            clear = replace(camera, position_body_m=outboard(camera.position_body_m))
+            self.before_m, self.body = drawing.seen_from(clear, drawing.vertices_m)
+        else:
+            self.before_m = np.where(centerbody_pixels(self.view), 0.0, np.inf)
 
     def view_of(self, theta_rad: float, plane_lv_rad: float) -> tuple[Picture, BoolArray]:
-        """Virtual picture ``(h, w, 3)`` RGB of the shell, black elsewhere, and where the shell is in it ``(h, w)``."""
-        seen, vertices = self.rendered(theta_rad, plane_lv_rad)
-        corners = vertices[self.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        away = corners.mean(axis=1) - self.view.camera.position_body_m
-        length = np.linalg.norm(normal, axis=1) * np.linalg.norm(away, axis=1)
-        facing = np.abs(np.einsum("ni,ni->n", normal, away)) / np.maximum(length, 1e-12)
-        shell = seen.is_hit & self.clear
-        tone = (60.0 + 150.0 * facing)[:, None] * COLOUR
-        picture = np.zeros((*shell.shape, 3), dtype=np.uint8)
-        picture[shell] = tone[seen.face[shell]].astype(np.uint8)
-        # two triangles make one piece of the mesh: a line where the piece changes to the right or below
-        piece = seen.face // 2
-        line = np.zeros_like(shell)
-        line[:, 1:] |= piece[:, 1:] != piece[:, :-1]
-        line[1:] |= piece[1:] != piece[:-1]
-        picture[line & shell] = LINE_COLOUR
-        return picture, np.asarray(shell)
+        """Virtual picture ``(h, w, 3)`` RGB of the bodies, black elsewhere, and where they are in it ``(h, w)``."""
+        bent = bend(self.shell.vertices_m, theta_rad, plane_lv_rad, self.view.joint_station_m)
+        depth, picture = self.shell.seen_from(self.view.camera, bent)
+        shell = depth < self.before_m
+        picture = np.where(shell[..., None], picture, self.body)
+        return picture, np.asarray(shell | self.body.any(axis=2))
 
     def blended(self, image: Picture, theta_rad: float, plane_lv_rad: float, from_column: int | None = None) -> Picture:
         """Virtual view over the right part of a grey frame ``(h, w)``; RGB ``(h, w, 3)``."""
@@ -95,6 +115,33 @@ class Overlay:
         out = np.concatenate([frame, picture, self.blended(image, theta_rad, plane_lv_rad, 0)], axis=1)
         draw_row(out, horizon_row(self.view, theta_rad, plane_lv_rad), YELLOW)
         return out
+
+
+def _stacked(view: VirtualCamera) -> _Drawing:
+    """Stacked tori and forward skin; two triangles make one piece."""
+    meshes = vehicle_meshes(view.geometry, clock_sections=72, torus_sections=TORUS_SECTIONS)
+    meshes.pop("centerbody")
+    vertices, faces, count = [], [], 0
+    for mesh in meshes.values():
+        vertices.append(np.asarray(mesh.vertices))
+        faces.append(np.asarray(mesh.faces) + count)
+        count += len(mesh.vertices)
+    triangles = np.concatenate(faces)
+    return _Drawing(np.concatenate(vertices), triangles, np.arange(len(triangles)) // 2, COLOUR)
+
+
+def _drawing(mesh: BodyMesh, colour: FloatArray = COLOUR) -> _Drawing:
+    """A user's mesh; faces that go over into each other smoothly are one piece."""
+    import trimesh
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
+    smooth = solid.face_adjacency[solid.face_adjacency_angles < SMOOTH_RAD]
+    n = len(mesh.faces)
+    graph = coo_array((np.ones(len(smooth)), (smooth[:, 0], smooth[:, 1])), shape=(n, n))
+    _, piece = connected_components(graph, directed=False)
+    return _Drawing(mesh.vertices_m, mesh.faces, piece.astype(np.int64), colour)
 
 
 def centerbody_pixels(view: VirtualCamera) -> BoolArray:

@@ -15,15 +15,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from flightmodel.aerodynamics import COLUMNS, AeroTable, check_axial_flow, read_aero_table
 from flightmodel.checks import ConfigError, FloatArray, GateError
-from flightmodel.config import Fraction, KeyFaults, Length, Place, Section, parse_section, read_toml
+from flightmodel.config import FileBeside, Fraction, KeyFaults, Length, Place, Section, parse_section, read_toml
 from flightmodel.daveml import read_daveml
 from flightmodel.newtonian import sphere_cone_closed_form, sphere_cone_quadrature, stagnation_cp
 from flightmodel.rarefied import sphere_cone_free_molecular, wall_speed_ratio
@@ -125,7 +125,7 @@ class FreeMolecular(Section):
 class Aerodynamics(Section):
     """The ``[aerodynamics]`` of a vehicle file: a table, or a sphere-cone; free-molecular flow if asked for."""
 
-    table: str | None = None
+    table: FileBeside | None = None
     sphere_cone: SphereCone | None = None
     free_molecular: FreeMolecular | None = None
 
@@ -134,16 +134,6 @@ class Aerodynamics(Section):
         if (self.table is None) == (self.sphere_cone is None):
             raise ValueError("either table or sphere_cone is wanted, and not both")
         return self
-
-    @field_validator("table")
-    @classmethod
-    def _beside(cls, value: str | None) -> str | None:
-        # so that a copy of the vehicle file with its table holds without what lies elsewhere
-        if value is not None and (
-            not value or "\0" in value or _leads_away(PurePosixPath(value)) or _leads_away(PureWindowsPath(value))
-        ):
-            raise ValueError("a file beside the vehicle file, or in a folder below it, is wanted; copy the table there")
-        return value
 
 
 @dataclass(frozen=True)
@@ -155,10 +145,6 @@ class Shape:
     base_radius_m: float
     area_m2: float
     length_m: float
-
-
-def _leads_away(path: PurePosixPath | PureWindowsPath) -> bool:
-    return bool(path.anchor) or ".." in path.parts
 
 
 def _increase(values: tuple[float, ...]) -> bool:

@@ -219,7 +219,7 @@ def camera_from_mount(mount: CameraMount) -> Camera:
         focal_px=np.array(mount.focal_px),
         centre_px=np.array(mount.centre_px),
         distortion=np.array(mount.distortion),
-        position_body_m=-mount.station_m * forward + mount.radius_m * outboard,
+        position_body_m=mount.position_m,
         dcm_cam_body=np.stack([np.cross(y_cam, z_cam), y_cam, z_cam]),
         lens=mount.lens,
     )

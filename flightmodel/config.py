@@ -5,10 +5,10 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from flightmodel.checks import ConfigError, nearest_name
 
@@ -33,6 +33,17 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
 FILL_IN_VALUE = "FILL IN"  # where a new file leaves a value to its user
 FILL_IN = "still to fill in"  # and what is said of it
 NAME_RULE = "a name has 1 to 64 letters (a to z), digits, _ and -"
+
+
+def _beside(value: str) -> str:
+    """Refuse a file name that leads out of the folder, so that a copy of the folder is whole."""
+    paths = PurePosixPath(value), PureWindowsPath(value)
+    if not value or "\0" in value or any(path.anchor or ".." in path.parts for path in paths):
+        raise ValueError("a file beside the vehicle file, or in a folder below it, is wanted; copy it there")
+    return value
+
+
+FileBeside = Annotated[str, AfterValidator(_beside)]
 
 
 class KeyFaults(ValueError):

@@ -46,6 +46,8 @@ class Frames:
         When the shell is taken as not bent.
     numbers : (n,) int or None
         Of each frame in the film; None for images.
+    time_bias_sd_s : float
+        How well the film's clock is known against the gyros', one standard deviation; zero: it is taken as right.
     """
 
     camera: CameraMount
@@ -54,6 +56,7 @@ class Frames:
     paths: tuple[Path, ...]
     benchmark_s: float
     numbers: NDArray[np.int64] | None = None
+    time_bias_sd_s: float = 0.0
 
     @property
     def benchmark(self) -> int:

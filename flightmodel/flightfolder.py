@@ -166,11 +166,15 @@ def _there(records: dict[str, Record | None]) -> dict[str, Record]:
 def _vehicle(gate: Gate, name: str) -> Vehicle | None:
     """Read the vehicle that flight.toml names; None, with its faults kept, where it is refused."""
     try:
-        return vehicle_from_toml(vehicle_path(name, gate.folder))
+        vehicle = vehicle_from_toml(vehicle_path(name, gate.folder))
     except GateError as fault:
         for words in fault.faults:
             gate.refuse_config(f"vehicle: {words}")
         return None
+    for body, mesh in vehicle.meshes.items():
+        words = f"{mesh.words}; it is drawn, while the camera's fit is of [geometry]"
+        gate.findings.append(Finding(f"mesh of the {body}", words, np.nan, np.nan))
+    return vehicle
 
 
 def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
@@ -244,6 +248,8 @@ def _hashes(gate: Gate, spec: FlightFile, vehicle: Vehicle | None, frames: Frame
     digests = {name: gate.sha256(gate.folder / name) for name in sorted(names)}
     if vehicle is not None:
         digests[f"vehicle {vehicle.name}"] = hashlib.sha256(vehicle.source.read_bytes()).hexdigest()
+        for name in vehicle.files:
+            digests[f"vehicle's {name}"] = hashlib.sha256((vehicle.source.parent / name).read_bytes()).hexdigest()
     if frames is not None:
         pictures = hashlib.sha256()
         for path in frames.paths:

@@ -223,3 +223,4 @@ class FramesEntry(Source):
     film: str | None = None
     camera: str = "camera5"
     benchmark_s: float = 421.0
+    time_bias_sd_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0

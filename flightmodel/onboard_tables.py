@@ -179,7 +179,7 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
         span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
         gate.refuse_config(f"frames.benchmark_s = {source.benchmark_s}: frames span {span}")
         return None
-    return Frames(camera, source.camera, time_s, paths, source.benchmark_s, numbers)
+    return Frames(camera, source.camera, time_s, paths, source.benchmark_s, numbers, source.time_bias_sd_s)
 
 
 def _image_paths(

@@ -6,7 +6,7 @@ launch-vehicle frame). The datum is the nose. *Shell* axes equal body axes when 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
@@ -29,7 +29,9 @@ from flightmodel.config import (
     parse_section,
     read_toml,
 )
+from flightmodel.deflection import lv_direction
 from flightmodel.instruments import dcm_body_from_clocking
+from flightmodel.meshes import BodyMesh, MeshFiles, body_meshes
 
 DATA = Path(__file__).parent / "data"
 SAME_SHAPE = 0.1  # the cone of the coefficients may be an effective one, but not another vehicle's
@@ -202,6 +204,12 @@ class CameraMount(Section):
     distortion: tuple[Distortion, ...]
     uncertainty: CameraUncertainty = CameraUncertainty()
 
+    @property
+    def position_m(self) -> FloatArray:
+        """Nominal place of the lens from the datum, body axes, (3,), m."""
+        radial = lv_direction(float(np.deg2rad(self.clock_lv_deg)))
+        return np.asarray(self.radius_m * radial - np.array([self.station_m, 0.0, 0.0]))
+
     @model_validator(mode="after")
     def _all_coefficients(self) -> CameraMount:
         count, lens = len(self.distortion), self.lens
@@ -224,6 +232,7 @@ class VehicleFile(Section):
     uncertainty: Uncertainty = Uncertainty()
     aerodynamics: Aerodynamics
     geometry: ShellGeometry
+    meshes: MeshFiles = MeshFiles()
     sensors: dict[Name, SensorMount] = {}
     cameras: dict[Name, CameraMount] = {}
 
@@ -258,7 +267,8 @@ class Vehicle:
     sensors: dict[str, SensorMount]
     cameras: dict[str, CameraMount]
     source: Path
-    tables: tuple[str, ...] = ()  # coefficient table and sidecar beside the vehicle file, relative to it
+    files: tuple[str, ...] = ()  # coefficient table, sidecar and meshes beside the vehicle file, relative to it
+    meshes: dict[str, BodyMesh] = field(default_factory=dict)  # of the user's own, by body
 
     @property
     def mass_kg(self) -> float:
@@ -337,6 +347,9 @@ def vehicle_from_toml(path: Path) -> Vehicle:
     table = spec.aerodynamics.table
     own = table is not None and (path.parent / table).exists()
     aero, table_sd = aerodynamics_from(spec.aerodynamics, shape, (path.parent, DATA / "aerodynamics"))
+    lenses = {name: camera.position_m for name, camera in spec.cameras.items()}
+    meshes = body_meshes(spec.meshes, path.parent, shell, lenses)
+    drawn = [mesh.file for mesh in (spec.meshes.aeroshell, spec.meshes.centerbody) if mesh is not None]
     # the vehicle file's own word first, then the table's
     stated = {k: v for k, v in table_sd if v is not None and k not in spec.uncertainty.model_fields_set}
     return Vehicle(
@@ -351,5 +364,6 @@ def vehicle_from_toml(path: Path) -> Vehicle:
         sensors=dict(spec.sensors),
         cameras=dict(spec.cameras),
         source=path,
-        tables=(table, str(Path(table).with_suffix(".toml"))) if own and table is not None else (),
+        files=(*((table, str(Path(table).with_suffix(".toml"))) if own and table is not None else ()), *drawn),
+        meshes=meshes,
     )

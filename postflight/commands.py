@@ -269,6 +269,9 @@ def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> N
     if answers.fused is not None:
         found = answers.fused.agreement
         console.print(f"{'' if not found.suspects else '[red]verdict[/] '}{escape(found.words)}")
+        clock = answers.fused.film_clock
+        if clock is not None:
+            console.print(f"{'[red]verdict[/] ' if clock.is_off else ''}{escape(clock.words)}")
     for method, row in rows.items():
         if "reason" in row:
             console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")

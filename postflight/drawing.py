@@ -96,16 +96,18 @@ def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, 
     frames = telemetry.frames
     assert frames is not None
     oriented, benchmark = oriented_camera(telemetry, joint_m)
+    meshes = telemetry.required_vehicle().meshes
     largest = int(np.nanargmax(np.abs(history.theta_rad)))
     pick = [benchmark, largest]
     pictures = [frames.picture(k) for k in pick]
     theta = [0.0, float(history.theta_rad[largest])]
     figure = figure_camera_overlay(
-        oriented, pictures, list(frames.time_s[pick]), theta, list(history.plane_lv_rad[pick])
+        oriented, pictures, list(frames.time_s[pick]), theta, list(history.plane_lv_rad[pick]), meshes
     )
     figures.stamp(figure, telemetry)
     figures.save(figure, folder / "figure_2_3.png")
-    picture = Overlay(oriented.view).side_by_side(pictures[1], theta[1], float(history.plane_lv_rad[largest]))
+    overlay = Overlay(oriented.view, meshes)
+    picture = overlay.side_by_side(pictures[1], theta[1], float(history.plane_lv_rad[largest]))
     (folder / "overlay.png").write_bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
@@ -121,7 +123,7 @@ def summary_figure(
     largest = int(np.nanargmax(history.theta_rad))
     plane = float(history.plane_lv_rad[largest])
     shown = ((benchmark, 0.0), (largest, float(history.theta_rad[largest])))
-    overlay = Overlay(oriented.view)
+    overlay = Overlay(oriented.view, flight.telemetry.required_vehicle().meshes)
     pictures = [overlay.blended(video.picture(k), theta, plane) for k, theta in shown]
     # the benchmark's horizon in both, so that the eye sees how far the edge moved; its own in the second
     rows = [horizon_row(oriented.view, theta, plane) for _, theta in shown]

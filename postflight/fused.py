@@ -9,14 +9,38 @@ import numpy as np
 import pandas as pd
 
 from estimators.agreement import Agreement, agreement
-from estimators.evidence import Evidence, evidence_of_history, moved_evidence
-from estimators.fusion import Fused, fuse, pulse_reader
+from estimators.evidence import FILM_CLOCK, Evidence, evidence_of_history, moved_evidence
+from estimators.fusion import Fused, Read, clock_is_seen, fuse, pulse_reader
 from estimators.misalignment import misalignment_evidence
 from estimators.pulse import PulseData
 from estimators.southwell import Limbs, southwell_limbs
 from estimators.trim import trim_evidence
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
+
+OFF_SD = 4.0
+LOOSE_CLOCK_SD_S = 0.3  # of a film's clock that is taken as right, when it is asked whether it is
+
+
+@dataclass(frozen=True)
+class FilmClock:
+    """How late the film's times are against the gyros', s, with one standard deviation, and whether that was used."""
+
+    offset_s: float
+    sd_s: float
+    applied: bool
+
+    @property
+    def words(self) -> str:
+        """One sentence."""
+        late = f"the film's clock is {'late' if self.offset_s > 0.0 else 'early'} by {abs(self.offset_s):.3f} s"
+        used = "allowed for in the fusion" if self.applied else "not applied: time_bias_sd_s in [frames] is 0"
+        return f"{late} (1 sd {self.sd_s:.3f} s) against the gyros', {used}"
+
+    @property
+    def is_off(self) -> bool:
+        """Whether times that were taken as right are proved not to be."""
+        return not self.applied and abs(self.offset_s) > OFF_SD * self.sd_s
 
 
 @dataclass(frozen=True)
@@ -27,6 +51,15 @@ class FusedAnswer:
     agreement: Agreement
     limbs: Limbs | None
     limbs_words: str
+    film_clock: FilmClock | None = None
+
+    def clock_summary(self) -> dict[str, Any] | None:
+        """Film's clock against the gyros', for ``summary.json``; None without a film that tells."""
+        clock = self.film_clock
+        if clock is None:
+            return None
+        facts = {"offset_s": clock.offset_s, "sd_s": clock.sd_s, "applied": clock.applied}
+        return facts | {"words": clock.words}
 
     def southwell_summary(self) -> dict[str, Any]:
         """Critical dynamic pressure and offset with their intervals, for ``summary.json``."""
@@ -43,9 +76,16 @@ class FusedAnswer:
 
 
 def fuse_flight(
-    pulse: PulseData, camera: DeflectionHistory | None, joint_station_m: float | None = None
+    pulse: PulseData,
+    camera: DeflectionHistory | None,
+    joint_station_m: float | None = None,
+    film_clock_sd_s: float = 0.0,
 ) -> FusedAnswer:
     """Fuse accelerometers, moment balance and, where there is one, the camera's history.
+
+    A film's clock that may be off by ``film_clock_sd_s`` is found with the rest. One that is taken as right (zero)
+    moves nothing, but is asked for in a fusion of its own, so that what is off does not stay unseen. A deflection that
+    hardly moves tells no time: then the clock is taken as right, and nothing is said of it.
 
     Raises
     ------
@@ -60,9 +100,15 @@ def fuse_flight(
     def trim(at: PulseData, use: BoolArray, about: FloatArray | None) -> Evidence:
         return trim_evidence(at, joint_station_m, use=use, about_yz_rad=about)
 
-    seen = [] if camera is None else [evidence_of_history(camera)]
-    seen = [e for e in seen if len(e.time_s)]
-    read = pulse_reader(pulse, {"misalignment": misalignment_evidence, "trim": trim}, seen)
+    def reader(clock_sd_s: float) -> Read:
+        seen = [] if camera is None else [evidence_of_history(camera, clock_sd_s)]
+        return pulse_reader(
+            pulse, {"misalignment": misalignment_evidence, "trim": trim}, [e for e in seen if len(e.time_s)]
+        )
+
+    seen = camera is not None and clock_is_seen(reader(LOOSE_CLOCK_SD_S))
+    told_sd_s = film_clock_sd_s if seen else 0.0
+    read = reader(told_sd_s)
     try:
         fused = fuse(read)
     except DivergenceError as fault:
@@ -75,8 +121,21 @@ def fuse_flight(
     # as told, but by what the answer says the readings' slopes are: far inputs are curved
     inputs = {name: mean for name, (mean, _) in fused.inputs.items()}
     back = {name: -mean for name, mean in inputs.items()}
-    told = [moved_evidence(one, back) for one in read(inputs, fused.deflection)]
-    return FusedAnswer(fused, agreement(told), limbs, words)
+    told = [moved_evidence(one, back, fused.deflection) for one in read(inputs, fused.deflection)]
+    clock = None
+    if told_sd_s > 0.0:
+        clock = _film_clock(fused, told_sd_s, True)
+    elif seen:
+        try:
+            clock = _film_clock(fuse(reader(LOOSE_CLOCK_SD_S)), LOOSE_CLOCK_SD_S, False)
+        except DivergenceError:
+            clock = None  # with a free clock there is no common answer: nothing is said of it
+    return FusedAnswer(fused, agreement(told), limbs, words, clock)
+
+
+def _film_clock(fused: Fused, told_sd_s: float, applied: bool) -> FilmClock:
+    mean, covariance = fused.inputs[FILM_CLOCK]
+    return FilmClock(told_sd_s * float(mean[0]), told_sd_s * float(np.sqrt(covariance[0, 0])), applied)
 
 
 def input_table(answer: FusedAnswer) -> pd.DataFrame:

@@ -32,7 +32,7 @@ def write_overlay_film(
     assert frames is not None
     station = vehicle.joint.station_m if joint_m is None else joint_m
     oriented = orient_camera(frames.picture(frames.benchmark), vehicle.geometry, frames.camera, station)
-    overlay = Overlay(oriented.view)
+    overlay = Overlay(oriented.view, vehicle.meshes)
     at_rest = horizon_row(oriented.view, 0.0, 0.0)
     partial = path.with_suffix(".part.webm")
     rate = 1.0 / float(np.median(np.diff(frames.time_s))) if len(frames.time_s) > 1 else 1.0

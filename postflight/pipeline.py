@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from estimators.camera_deflection import deflection_from_frames, sensitivity_table
+from estimators.fusion import smoothed
 from estimators.misalignment import estimate_misalignment
 from estimators.pulse import PulseData
 from estimators.trim import estimate_trim
@@ -100,11 +101,15 @@ class Flight:
 
 @dataclass(frozen=True)
 class Answers:
-    """Deflection histories by method, why a method gave none, and what stands behind the fused one."""
+    """Deflection histories by method, why a method gave none, and what stands behind the fused one.
+
+    ``smooth_camera`` is the camera's alone as a second-order process, where it found the plane.
+    """
 
     histories: dict[str, DeflectionHistory] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
     fused: FusedAnswer | None = None
+    smooth_camera: DeflectionHistory | None = None
 
 
 def reconstruct_flight(folder: Path, settings: Settings | None = None, progress: Progress | None = None) -> Flight:
@@ -244,7 +249,9 @@ def estimate(
                 elif method == "trim":
                     history = estimate_trim(pulse, joint_station_m)
                 else:
-                    fused = fuse_flight(pulse, _seen(telemetry, histories, refused, plane_lv_rad), joint_station_m)
+                    seen = _seen(telemetry, histories, refused, plane_lv_rad)
+                    film_clock_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
+                    fused = fuse_flight(pulse, seen, joint_station_m, film_clock_s)
                     history = fused.fused.history
         except GateError as fault:
             refused[method] = str(fault)
@@ -254,7 +261,13 @@ def estimate(
         else:
             refused[method] = f"no sample could be answered ({history.assumptions})"
     report(1.0, "estimated")
-    return Answers(histories, refused, fused)
+    smooth = None
+    if "camera" in histories and plane_lv_rad is None:
+        try:
+            smooth = smoothed(histories["camera"])
+        except DivergenceError:
+            smooth = None  # a few frames are no history
+    return Answers(histories, refused, fused, smooth)
 
 
 def _seen(

@@ -221,6 +221,8 @@ def write_answers(run: RunFolder, answers: Answers) -> None:
     """One CSV a method that answered."""
     for method, history in answers.histories.items():
         run.write_csv(f"deflection_{method}.csv", deflection_table(history))
+    if answers.smooth_camera is not None:
+        run.write_csv("camera_smooth.csv", deflection_table(answers.smooth_camera))
     if answers.fused is not None:
         run.write_csv("fusion_inputs.csv", input_table(answers.fused))
         run.write_csv("fusion_agreement.csv", agreement_table(answers.fused))
@@ -257,6 +259,7 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
         "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])) if flight.has_attitude else None,
         "methods": method_summary(answers, peak),
         "agreement": None if answers.fused is None else answers.fused.agreement.words,
+        "film_clock": None if answers.fused is None else answers.fused.clock_summary(),
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),
         "missing": list(flight.missing),
         "attitude_check": attitude_summary(flight.attitude),

@@ -26,7 +26,7 @@ def write_flight_toml(scenario: Scenario, q_prior: FloatArray, folder: Path) -> 
     vehicle = scenario.spec.vehicle
     if vehicle.endswith(".toml"):
         source = scenario.vehicle.source
-        for name in (source.name, *scenario.vehicle.tables):
+        for name in (source.name, *scenario.vehicle.files):
             copy = folder / VEHICLE_FOLDER / name
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source.parent / name, copy)
@@ -107,6 +107,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
             else f'film = "telemetry/{spec.video.camera}.{spec.video.format}"',
             f'camera = "{spec.video.camera}"',
             f"benchmark_s = {spec.video.benchmark_s}",
+            *([f"time_bias_sd_s = {spec.video.time_offset_s}"] if 0.0 < spec.video.time_offset_s <= 1.0 else []),
         ]
     if spec.time.inflated_s is not None and spec.time.inflated_s >= spec.time.telemetry_from_s:
         lines += ["", "[[events]]", 'name = "aeroshell inflated"', f"t_s = {spec.time.inflated_s}"]

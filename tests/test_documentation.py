@@ -11,7 +11,7 @@ import click
 import pytest
 from pydantic import BaseModel
 
-from flightmodel import aeroinput, flightfile, instrument_entries, sources, vehicle
+from flightmodel import aeroinput, flightfile, instrument_entries, meshes, sources, vehicle
 from postflight.cli import cli
 from postflight.montecarlo import study
 from synthetic_flight import day_air, dispersions, instrument_sections, outputs, scenarios
@@ -45,6 +45,8 @@ MODELS = [
     vehicle.Uncertainty,
     vehicle.SensorMount,
     vehicle.CameraMount,
+    meshes.MeshFiles,
+    meshes.MeshFile,
     aeroinput.Aerodynamics,
     aeroinput.SphereCone,
     aeroinput.FreeMolecular,

@@ -68,7 +68,7 @@ def _contents(folder: Path, vehicle: str | None) -> tuple[dict[Path, str], dict[
         if source.parent != DATA / "vehicles":
             read = vehicle_from_toml(source)
             named = f"vehicle/{source.name}"
-            copies = {folder / "vehicle" / name: source.parent / name for name in (source.name, *read.tables)}
+            copies = {folder / "vehicle" / name: source.parent / name for name in (source.name, *read.files)}
     assert VEHICLE_LINE in flight
     texts[folder / "flight.toml"] = flight.replace(VEHICLE_LINE, _line(named))
     return texts, copies

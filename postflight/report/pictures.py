@@ -29,7 +29,10 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
     largest = int(answered[int(table["theta_deg"].argmax())])
     picks = np.linspace(answered[0], answered[-1], FRAMES).round().astype(int).tolist()
     oriented, benchmark = oriented_camera(run.telemetry)
-    overlay, at_rest = Overlay(oriented.view), horizon_row(oriented.view, 0.0, 0.0)
+    overlay, at_rest = (
+        Overlay(oriented.view, run.telemetry.required_vehicle().meshes),
+        horizon_row(oriented.view, 0.0, 0.0),
+    )
     chosen = sorted({*_without_near(picks, (benchmark, largest)), benchmark, largest})
     rows = dict(zip(answered.tolist(), table.itertuples(index=False), strict=True))
     out: list[dict[str, Any]] = []

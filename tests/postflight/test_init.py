@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from pydantic import BaseModel
 
-from flightmodel import aeroinput, flightfile, instrument_entries, sources, vehicle
+from flightmodel import aeroinput, flightfile, instrument_entries, meshes, sources, vehicle
 from postflight.cli import cli
 from postflight.intake.schema import MODELS, schema, template, template_keys
 
@@ -43,6 +43,9 @@ TABLES = {
         "aerodynamics.sphere_cone": aeroinput.SphereCone,
         "aerodynamics.free_molecular": aeroinput.FreeMolecular,
         "geometry": vehicle.ShellGeometry,
+        "meshes": meshes.MeshFiles,
+        "meshes.aeroshell": meshes.MeshFile,
+        "meshes.centerbody": meshes.MeshFile,
         "sensors.suba": vehicle.SensorMount,
         "cameras.camera5": vehicle.CameraMount,
         "cameras.camera5.uncertainty": vehicle.CameraUncertainty,

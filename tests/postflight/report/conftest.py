@@ -44,7 +44,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = root / "flight"
     simulate_to_folder(read_scenario(str(root / "short.toml")), 0, folder)
     shipped = vehicle_path("irve2_reference")
-    for table in vehicle_from_toml(shipped).tables:
+    for table in vehicle_from_toml(shipped).files:
         shutil.copy(shipped.parent / table, folder / table)
     named = re.sub(r'(?m)^name = ".*"', f'name = "{HOSTILE}"', shipped.read_text(), count=1)
     (folder / "vehicle.toml").write_text(named)

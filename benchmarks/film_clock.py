@@ -1,0 +1,58 @@
+"""Is a film's clock found as well as is said? Offsets planted in the camera's times, over dispersed flights.
+
+Run: ``python benchmarks/film_clock.py [FLIGHTS] [FOLDER]`` (40 flights; those that ``estimator_coverage.py`` kept in
+FOLDER, or flown now). Offsets of 0, 0.05 and 0.2 s in turn, late and early; the film's clock is told to be good to
+0.3 s. The camera's history is drawn, not rendered: 4 frames a second, errors of 0.15 or 0.40 deg and twice that across.
+"""
+
+import sys
+
+import estimator_coverage as dispersed
+import numpy as np
+
+from flightmodel.checks import DivergenceError
+from postflight.fused import fuse_flight
+
+PLANTED_S = (0.0, 0.05, 0.2, -0.05, -0.2)
+TOLD_SD_S = 0.3
+
+
+def found_clock(seed, folder, late_s, camera_sd_rad):
+    """Offset found and its sd, s; None where the flight tumbled or has no common answer."""
+    pulse, truth = dispersed.kept_flight(folder, seed)
+    if str(truth["words"]):
+        return None
+    use = pulse.through_pulse
+    told_s = pulse.time_s[use]
+    seen = dispersed.columns(told_s - late_s, pulse.time_s, truth["theta_yz"])
+    camera = dispersed.camera_history(np.random.default_rng([seed, 7, 2009]), seen, told_s, camera_sd_rad)
+    try:
+        clock = fuse_flight(pulse, camera, film_clock_sd_s=TOLD_SD_S).film_clock
+    except DivergenceError as fault:
+        print(f"flight {seed}: {fault}")
+        return None
+    return clock.offset_s, clock.sd_s
+
+
+def main():
+    count = next((int(a) for a in sys.argv[1:] if a.isdigit()), 40)
+    folder = next((a for a in sys.argv[1:] if not a.isdigit()), dispersed.KEPT)
+    dispersed.fly_missing(folder, range(count))
+    for name, sd in dispersed.CAMERA_SD.items():
+        rows = []
+        for seed in range(count):
+            late = PLANTED_S[seed % len(PLANTED_S)]
+            answer = found_clock(seed, folder, late, sd)
+            if answer is not None:
+                rows.append((answer[0] - late, answer[1]))
+            if (seed + 1) % 10 == 0:
+                print(f"{seed + 1} of {count}", flush=True)
+        error, stated = np.array(rows).T
+        inside = [100.0 * np.mean(np.abs(error) < k * stated) for k in (1, 2)]
+        size = [1e3 * x for x in (np.sqrt(np.mean(error**2)), error.mean(), np.abs(error).max(), stated.mean())]
+        print(f"{name}: {len(rows)} flights; rms {size[0]:.1f} ms, mean {size[1]:+.1f}, largest {size[2]:.1f}, "
+              f"stated {size[3]:.1f}; 1 sd covers {inside[0]:.0f} %, 2 sd {inside[1]:.0f} %", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
