@@ -15,8 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.vehicle import Vehicle
@@ -109,7 +111,7 @@ def solve(
     while True:
         report(step / MOST_STEPS, f"reconciling, step {step + 1}")
         at = replace(problem, wider=wider[step]) if step < len(wider) else problem
-        u, moved_sd, residuals, covariance = _step(at, u)
+        u, moved_sd, residuals, normal = _step(at, u)
         if step >= len(wider):
             converged = moved_sd < SETTLED_SD or before - residuals.cost < SETTLED_COST
             before = residuals.cost
@@ -117,30 +119,58 @@ def solve(
             break
         step += 1
     report(1.0, "reconciled")
-    return Reconciled(problem, u, covariance, residuals, step + 1, converged)
+    return Reconciled(problem, u, normal.covariance, residuals, step + 1, converged)
 
 
-def _step(problem: Problem, u: Unknowns) -> tuple[Unknowns, float, Residuals, FloatArray]:
-    """One damped, corrected step: where to, how far in sd of what is sought, residuals there, covariance."""
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of a step, scaled to a diagonal of one."""
+
+    matrix: FloatArray
+    right: FloatArray
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """One over the root of the diagonal."""
+        return np.asarray(1.0 / np.sqrt(np.diag(self.matrix)))
+
+    def damped(self, damping: float) -> Callable[[FloatArray], FloatArray]:
+        """Solver of the equations with a share of the diagonal added."""
+        scaled = self.matrix * self.scale[:, None] * self.scale
+        scaled[np.diag_indices_from(scaled)] += damping
+        factor = cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)
+        return lambda right: np.asarray((cho_solve(factor, (right.T * self.scale).T).T * self.scale).T)
+
+    def sd(self, count: int) -> FloatArray:
+        """Standard deviations of the first unknowns."""
+        return np.asarray(np.sqrt(np.diag(self.damped(0.0)(np.eye(len(self.right), count)))))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of all unknowns."""
+        return self.damped(0.0)(np.eye(len(self.right)))
+
+
+def _step(problem: Problem, u: Unknowns) -> tuple[Unknowns, float, Residuals, Normal]:
+    """One damped, corrected step: where to, how far in sd of what is sought, residuals there, its equations."""
     linear = problem.linear(u)
     if not np.isfinite(linear.found.cost):
         raise DivergenceError(
             "reconciliation: a span of the flight cannot be flown with the vehicle as told: its joint diverges; give "
             "a stiffer joint in the vehicle file to start from"
         )
-    matrix, right = problem.normal(u, linear)
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    scaled = matrix * scale[:, None] * scale
-    covariance = np.linalg.inv(scaled) * scale[:, None] * scale
-    sought = np.sqrt(np.diag(covariance)[: problem.unknown.physical])
+    normal = Normal(*problem.normal(u, linear))
+    sought = normal.sd(problem.unknown.physical)
     damping = 0.0
     while damping < MOST_DAMPING:
-        damped = np.linalg.inv(scaled + damping * np.eye(len(right))) * scale[:, None] * scale
-        step = damped @ right
+        solved = normal.damped(damping)
+        step = solved(normal.right)
         ahead, behind = (problem.residuals(u.moved(side * LOOK_AHEAD * step)) for side in (1.0, -1.0))
-        bent = damped @ linear.back(
-            (ahead.sensors - 2.0 * linear.found.sensors + behind.sensors) / LOOK_AHEAD**2,
-            (ahead.joins - 2.0 * linear.found.joins + behind.joins) / LOOK_AHEAD**2,
+        bent = solved(
+            linear.back(
+                (ahead.sensors - 2.0 * linear.found.sensors + behind.sensors) / LOOK_AHEAD**2,
+                (ahead.joins - 2.0 * linear.found.joins + behind.joins) / LOOK_AHEAD**2,
+            )
         )
         # a bent path, of which the straight part alone may go too far
         paths = [part * step + 0.5 * part**2 * bent for part in PARTS if np.isfinite(bent).all()] or [step]
@@ -149,6 +179,6 @@ def _step(problem: Problem, u: Unknowns) -> tuple[Unknowns, float, Residuals, Fl
         )
         if found.cost < linear.found.cost:
             far = np.abs(moved.vehicle - u.vehicle)[: problem.unknown.physical] / sought
-            return moved, float(far.max()), found, covariance
+            return moved, float(far.max()), found, normal
         damping = max(10.0 * damping, FIRST_DAMPING)
-    return u, 0.0, linear.found, covariance
+    return u, 0.0, linear.found, normal
