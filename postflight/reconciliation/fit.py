@@ -13,7 +13,7 @@ minimization", 2012 (geodesic acceleration).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,11 +24,11 @@ from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.vehicle import Vehicle
 from postflight.pipeline import Flight
 from postflight.reconciliation.candidate import AirUnknowns, VehicleUnknowns
-from postflight.reconciliation.observed import observe
+from postflight.reconciliation.observed import Observed, observe
 from postflight.reconciliation.problem import Problem, Residuals, Unknowns
 
 WIDER = (30.0, 10.0, 3.0)
-MOST_STEPS, SETTLED_SD, SETTLED_COST = 10, 0.1, 0.3
+MOST_STEPS, SETTLED_SD = 9, 0.1  # steps after the widened ones
 PARTS = (1.0, 0.5, 0.25)  # of a step
 # over thirty dispersed flights (seeds 0 to 29) errors of stiffness were 1.5, of offset 1.2, of stability 1.1 times what
 # the linear problem says
@@ -71,7 +71,9 @@ class Reconciled:
         """Logarithm of the probability of the data by Laplace's method, up to what all models of a flight share."""
         sd = np.sqrt(np.diag(self.linear_covariance))
         _, shape = np.linalg.slogdet(self.linear_covariance / np.outer(sd, sd))
-        return float(0.5 * shape + np.log(sd).sum() - 0.5 * self.residuals.cost)
+        # freeplay has one sign: its prior is folded
+        folded = np.log(2.0) if "freeplay" in self.problem.unknown.laws else 0.0
+        return float(folded + 0.5 * shape + np.log(sd).sum() - 0.5 * self.residuals.cost)
 
     @property
     def vehicle(self) -> Vehicle:
@@ -79,14 +81,18 @@ class Reconciled:
         return self.problem.unknown.flown(self.unknowns.vehicle)
 
 
-def reconcile(flight: Flight, hardening: bool = False, progress: Progress | None = None) -> Reconciled:
+def reconcile(
+    flight: Flight, laws: tuple[str, ...] = (), loaded: bool = False, progress: Progress | None = None
+) -> Reconciled:
     """Fit joint, offset and static stability to a reconstructed flight.
 
     Parameters
     ----------
     flight : Flight
-    hardening : bool
-        Whether the spring may harden or soften with the angle.
+    laws : tuple of str
+        What the spring may have beside its slope, of `candidate.LAWS`; for freeplay see `freeplay.reconcile_loose`.
+    loaded : bool
+        Only where air loads the joint (`observe`).
     progress : callable, optional
 
     Raises
@@ -96,26 +102,43 @@ def reconcile(flight: Flight, hardening: bool = False, progress: Progress | None
     DivergenceError
         Where no candidate flies through.
     """
-    observed = observe(flight)
+    problem = problem_of(flight, observe(flight, loaded), laws)
+    return solve(problem, problem.start(), [replace(problem, wider=wider) for wider in WIDER], progress)
+
+
+def problem_of(flight: Flight, observed: Observed, laws: tuple[str, ...]) -> Problem:
+    """Problem of a flight."""
     air = AirUnknowns(flight.telemetry.sounding, float(observed.altitude_m.min()))
-    problem = Problem(observed, VehicleUnknowns(flight.telemetry.required_vehicle(), hardening), air)
-    return solve(problem, problem.start(), WIDER, progress)
+    return Problem(observed, VehicleUnknowns(flight.telemetry.required_vehicle(), laws), air)
 
 
 def solve(
-    problem: Problem, start: Unknowns, wider: tuple[float, ...] = (), progress: Progress | None = None
+    problem: Problem,
+    start: Unknowns,
+    early: Sequence[Problem] = (),
+    progress: Progress | None = None,
+    mend: Callable[[Problem, Unknowns], Unknowns] | None = None,
 ) -> Reconciled:
-    """Most probable unknowns from a start; standard deviations ``wider`` in the first steps."""
+    """Most probable unknowns from a start.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : Unknowns
+    early : sequence of Problem
+        Easier ones, one for each of the first steps.
+    progress : callable, optional
+    mend : callable, optional
+        Betters the unknowns of a problem before each step.
+    """
     report = progress or (lambda _fraction, _what: None)
-    u, before, converged, step = start, np.inf, False, 0
+    most, u, converged, step = len(early) + MOST_STEPS, start, False, 0
     while True:
-        report(step / MOST_STEPS, f"reconciling, step {step + 1}")
-        at = replace(problem, wider=wider[step]) if step < len(wider) else problem
-        u, moved_sd, residuals, normal = _step(at, u)
-        if step >= len(wider):
-            converged = moved_sd < SETTLED_SD or before - residuals.cost < SETTLED_COST
-            before = residuals.cost
-        if converged or step + 1 >= MOST_STEPS:
+        report(step / most, f"reconciling, step {step + 1}")
+        at = early[step] if step < len(early) else problem
+        u, moved_sd, residuals, normal = step_from(at, mend(at, u) if mend else u)
+        converged = step >= len(early) and moved_sd < SETTLED_SD
+        if converged or step + 1 >= most:
             break
         step += 1
     report(1.0, "reconciled")
@@ -151,7 +174,7 @@ class Normal:
         return self.damped(0.0)(np.eye(len(self.right)))
 
 
-def _step(problem: Problem, u: Unknowns) -> tuple[Unknowns, float, Residuals, Normal]:
+def step_from(problem: Problem, u: Unknowns) -> tuple[Unknowns, float, Residuals, Normal]:
     """One damped, corrected step: where to, how far in sd of what is sought, residuals there, its equations."""
     linear = problem.linear(u)
     if not np.isfinite(linear.found.cost):
