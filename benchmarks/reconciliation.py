@@ -1,11 +1,16 @@
 """Is the joint found, and do its intervals hold? Dispersed flights of a joint that the fit is not told.
 
-Run: ``python benchmarks/reconciliation.py [FLIGHTS] [--first SEED] [--hardening SHARE]`` (30 flights). Drawn anew for
-each seed and not told: stiffness up to half above the told one, damping ratio, size and side of the c.g.'s offset,
-masses, stations, inertias, coefficients, start, spin, air, the sounding's and every instrument's errors, all in the
-sizes that vehicle file and data sheets state. No video. Some 25 s of processor time a flight. With ``--hardening`` the
-spring's slope is by that share steeper at 4 deg, every flight is fitted with and without hardening, and the odds are
-printed; 0 flies plain joints. The stiffness by the joint's frequency alone is scored beside the fit's.
+Run: ``python benchmarks/reconciliation.py [FLIGHTS] [--first SEED] [--hardening SHARE | --freeplay DEG]`` (30 flights).
+Drawn anew for each seed and not told: stiffness up to half above the told one, damping ratio, size and side of the
+c.g.'s offset, masses, stations, inertias, coefficients, start, spin, air, the sounding's and every instrument's errors,
+all in the sizes that vehicle file and data sheets state. No video. Some 15 s of processor time a flight.
+
+With ``--hardening`` the spring's slope is by that share steeper at 4 deg, with ``--freeplay`` the joint has so much of
+it; 0 flies plain joints. Then each flight is asked for the law (`postflight.reconciliation.laws`), and printed are the
+odds and the law's effect: the flight is flown once more with a plain joint and all else equal, and the difference of
+the two histories of deflection, over the standard deviation of the plain fit's, is largest so much in the pulse.
+
+The stiffness by the joint's frequency alone is scored beside the fit's.
 """
 
 import sys
@@ -21,17 +26,19 @@ from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.pipeline import reconstruct_telemetry
-from postflight.reconciliation.answer import joint_table
+from postflight.reconciliation.answer import deflection_of, joint_table
 from postflight.reconciliation.fit import reconcile
+from postflight.reconciliation.laws import explain
 from postflight.reconciliation.modes import stiffness_by_modes
 from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed
 
 TOLD = vehicle_from_toml(vehicle_path("irve2_reference"))
 AT_RAD = np.deg2rad(4.0)
+SURE, FELT_SD = 3.0, 3.0  # odds of twenty to one; an effect that must be recognised
 
 
-def flown_vehicle(seed, hardening=0.0):
+def flown_vehicle(seed, hardening=0.0, freeplay_deg=0.0):
     """Vehicle as it is."""
     rng = np.random.default_rng([seed, 7, 2009])
     vehicle = dispersed.dispersed_vehicle(TOLD, rng)
@@ -46,6 +53,7 @@ def flown_vehicle(seed, hardening=0.0):
     changed = {
         "bending_stiffness_nmprad": float(stiffness),
         "hardening_nmprad3": hardening * stiffness / 3.0 / AT_RAD**2,
+        "freeplay_deg": freeplay_deg,
     }
     vehicle = replace(vehicle, centerbody=moved, aero=aero, joint=vehicle.joint.model_copy(update=changed))
     damping = {"bending_damping_nmsprad": float(ratio * vehicle.critical_damping_nmsprad())}
@@ -84,13 +92,26 @@ def modal_errors(flight, vehicle):
     return [np.log(found.stiffness_nmprad / true), found.sd_nmprad / found.stiffness_nmprad]
 
 
+def effect_sd(plain, truth, other):
+    """Largest difference in the pulse of deflections with and without the law, in sd of the plain fit's."""
+    bent = deflection_of(plain)
+    with_law, without = (np.interp(bent.time_s, t.time_s, t.deflection.theta_rad) for t in (truth, other))
+    return float(np.nanmax(np.abs(with_law - without) / bent.theta_sd_rad))
+
+
+def option(name):
+    return float(sys.argv[sys.argv.index(name) + 1]) if name in sys.argv else None
+
+
 def main():
-    hardening = float(sys.argv[sys.argv.index("--hardening") + 1]) if "--hardening" in sys.argv else None
+    size = {law: option(f"--{law}") for law in ("hardening", "freeplay")}
+    asked = tuple(law for law, value in size.items() if value is not None)
+    law = {"hardening": size["hardening"] or 0.0, "freeplay_deg": size["freeplay"] or 0.0}
     count = int(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[1].isdigit() else 30
-    first = int(sys.argv[sys.argv.index("--first") + 1]) if "--first" in sys.argv else 0
-    rows, odds = [], []
+    first = int(option("--first") or 0)
+    rows, odds, effects = [], [], []
     for seed in range(first, first + count):
-        vehicle, factors = flown_vehicle(seed, hardening or 0.0)
+        vehicle, factors = flown_vehicle(seed, **law)
         flight, truth = reconstructed(seed, vehicle)
         if truth.words:
             print(f"{seed}: {truth.words}; left out", flush=True)
@@ -99,9 +120,17 @@ def main():
         found = reconcile(flight)
         took = time.process_time() - begun
         words = f"{seed}: {found.steps} steps{'' if found.converged else ' (not settled)'}, {took:.0f} s"
-        if hardening is not None:
-            odds.append(reconcile(flight, hardening=True).log_evidence - found.log_evidence)
-            words += f", log odds of hardening {odds[-1]:+.1f}"
+        if asked:
+            explained = explain(flight, asked)
+            plain, found = found, explained.found
+            odds.append([explained.log_odds[name] for name in asked])
+            other = reconstructed(seed, flown_vehicle(seed)[0])[1] if any(law.values()) else truth
+            effects.append(effect_sd(plain, truth, other))
+            told = ", ".join(f"{name} {value:+.1f}" for name, value in explained.log_odds.items())
+            words += f", log odds of {told}, effect {effects[-1]:.1f} sd"
+            if "freeplay" in found.problem.unknown.laws:
+                got = joint_table(found).set_index("quantity").loc["freeplay"]
+                words += f", freeplay {got.found:.4f} +/- {got.sd:.4f} deg"
         rows.append([*errors(found, vehicle, factors), *modal_errors(flight, vehicle)])
         largest = np.rad2deg(np.nanmax(truth.deflection.theta_rad))
         print(
@@ -115,8 +144,13 @@ def main():
         e, z = a[known, 2 * k], a[known, 2 * k] / a[known, 2 * k + 1]
         inside = ", ".join(f"{100 * np.mean(np.abs(z) < s):.0f} % inside {s} sd" for s in (1, 2))
         print(f"{name:18} rms {np.sqrt(np.mean(e**2)):.4f} bias {e.mean():+.4f}, {inside}")
-    if odds:
-        print(f"log odds of hardening above 3 in {np.sum(np.array(odds) > 3.0)} of {len(odds)}")
+    for name, of_law in zip(asked, np.array(odds).T, strict=False):
+        felt = np.array(effects) > FELT_SD
+        sure = of_law > SURE
+        print(
+            f"{name}: log odds above {SURE:g} in {sure.sum()} of {len(sure)}; where its effect is above "
+            f"{FELT_SD:g} sd in {(sure & felt).sum()} of {felt.sum()}"
+        )
 
 
 if __name__ == "__main__":

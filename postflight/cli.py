@@ -128,12 +128,13 @@ def run(folder: Path, rate: float) -> None:
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--hardening", is_flag=True, help="Let the spring harden (or soften) with the angle.")
-def reconcile(folder: Path, hardening: bool) -> None:
+@click.option("--hardening", is_flag=True, help="Ask whether the spring hardens (or softens) with the angle.")
+@click.option("--freeplay", is_flag=True, help="Ask whether the joint has freeplay.")
+def reconcile(folder: Path, hardening: bool, freeplay: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
     from postflight.reconciliation import command
 
-    command.run(folder, hardening)
+    command.run(folder, ("freeplay",) * freeplay + ("hardening",) * hardening)
 
 
 @cli.command()

@@ -13,6 +13,7 @@ from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_c
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.candidate import (
     DAMPING_LOG_SD,
+    FREEPLAY_SD_RAD,
     HARDENING_SD,
     OFFSET_SD_M,
     STIFFNESS_LOG_SD,
@@ -62,14 +63,16 @@ def joint_table(found: Reconciled) -> pd.DataFrame:
         if by_factor:
             low, high, sd = float(np.exp(low)), float(np.exp(high)), float(np.exp(at)) * sd
         rows.append((name, unit, value(told), value(best), sd, low, high))
-    for name, label, scale, start in (
-        ("static stability", "static stability", unknown.told.uncertainty.cm, 1.0),
-        ("hardening", "hardening at 4 deg", HARDENING_SD, 0.0),
+    for name, label, unit, scale, start in (
+        ("static stability", "static stability", "", unknown.told.uncertainty.cm, 1.0),
+        ("freeplay", "freeplay", "deg", float(np.rad2deg(FREEPLAY_SD_RAD)), 0.0),
+        ("hardening", "hardening at 4 deg", "", HARDENING_SD, 0.0),
     ):
         if name in unknown.names:
             k = unknown.names.index(name)
             at, sd = start + scale * float(x[k]), scale * float(np.sqrt(covariance[k, k]))
-            rows.append((label, "", start, at, sd, at - reach * sd, at + reach * sd))
+            at = abs(at) if name == "freeplay" else at  # either sign of the unknown is the same band
+            rows.append((label, unit, start, at, sd, at - reach * sd, at + reach * sd))
     return pd.DataFrame(rows, columns=["quantity", "unit", "told", "found", "sd", "low", "high"])
 
 
@@ -130,6 +133,8 @@ def vehicle_lines(found: Reconciled) -> str:
         f"bending_stiffness_nmprad = {joint.bending_stiffness_nmprad:.6g}",
         f"bending_damping_nmsprad = {joint.bending_damping_nmsprad:.6g}",
     ]
-    if found.problem.unknown.hardening:
+    if "freeplay" in found.problem.unknown.laws:
+        lines.append(f"freeplay_deg = {joint.freeplay_deg:.6g}")
+    if "hardening" in found.problem.unknown.laws:
         lines.append(f"hardening_nmprad3 = {joint.hardening_nmprad3:.6g}")
     return "\n".join(lines) + "\n"

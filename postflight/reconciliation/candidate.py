@@ -1,10 +1,11 @@
 """A vehicle and its air as they might have been.
 
-Physical unknowns are the joint's (stiffness, damping, hardening where asked for), the side and size of the c.g.'s
-offset and the static stability. All else that the motion depends on and that is known only so well is carried along, so
-that the answer's uncertainty holds it: masses, stations, inertias, the other coefficients, the instruments' constant
-errors, and the air. Unknowns of vehicle and instruments are counted in standard deviations of what was known before;
-those of the air are the density's log ratio and the winds' difference, m/s, to the sounding, at knots along altitude.
+Physical unknowns are the joint's (stiffness, damping, freeplay and hardening where asked for), the side and size of the
+c.g.'s offset and the static stability. All else that the motion depends on and that is known only so well is carried
+along, so that the answer's uncertainty holds it: masses, stations, inertias, the other coefficients, the instruments'
+constant errors, and the air. Unknowns of vehicle and instruments are counted in standard deviations of what was known
+before; those of the air are the density's log ratio and the winds' difference, m/s, to the sounding, at knots along
+altitude.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ KNOT_M, MIDDLE_KNOT_M, UPPER_KNOT_M = 300.0, 600.0, 1200.0
 MIDDLE_M, UPPER_M, TOP_M, BELOW_M = 60e3, 75e3, 105e3, 1e3
 # priors before the flight speaks, one standard deviation: factors as logarithms
 STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 0.5, 1.0, 0.005
-HARDENING_SD = 1.0
+FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
 # hardening is counted as the share by which the tangent stiffness has grown at this angle; negative: it softens
 HARDENING_AT_RAD = np.deg2rad(4.0)
 JOINT = ("stiffness", "damping", "offset y", "offset z", "static stability")
+LAWS = ("freeplay", "hardening")
 CARRIED = (
     "C_A", "C_N", "C_mq", "mass of the shell", "mass of the centerbody", "station of the shell's c.g.",
     "station of the centerbody's c.g.", "shell's c.g. y", "shell's c.g. z", "inertia of the shell",
@@ -40,20 +42,30 @@ CARRIED = (
 
 @dataclass(frozen=True)
 class VehicleUnknowns:
-    """From unknowns, in standard deviations, to vehicles; with ``hardening`` the spring's slope may change."""
+    """From unknowns, in standard deviations, to vehicles.
+
+    Parameters
+    ----------
+    told : Vehicle
+    laws : tuple of str
+        What the spring may have beside its slope, of `LAWS`.
+    corner : float, optional
+        How far the dead band's corners are rounded, of the freeplay; as told by default.
+    """
 
     told: Vehicle
-    hardening: bool = False
+    laws: tuple[str, ...] = ()
+    corner: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the unknowns, the joint's first."""
-        return (*JOINT, *(("hardening",) if self.hardening else ()), *CARRIED)
+        return (*JOINT, *self.laws, *CARRIED)
 
     @property
     def physical(self) -> int:
         """How many of them are sought rather than carried along."""
-        return len(JOINT) + self.hardening
+        return len(JOINT) + len(self.laws)
 
     def vehicle(self, x: FloatArray) -> Vehicle:
         """Vehicle of one candidate, with its coefficients as they are told (`factors` scales them)."""
@@ -64,6 +76,10 @@ class VehicleUnknowns:
         # the damping ratio is what is unknown: at a given ratio the constant grows with the root of the stiffness
         damping = joint.bending_damping_nmsprad * np.exp(DAMPING_LOG_SD * v["damping"] + 0.5 * stiffer)
         changed = {"bending_stiffness_nmprad": stiffness, "bending_damping_nmsprad": damping}
+        if "freeplay" in v:
+            changed["freeplay_deg"] = float(np.rad2deg(FREEPLAY_SD_RAD) * abs(v["freeplay"]))
+            if self.corner is not None:
+                changed["freeplay_corner"] = self.corner
         if "hardening" in v:
             changed["hardening_nmprad3"] = stiffness * HARDENING_SD * v["hardening"] / (3.0 * HARDENING_AT_RAD**2)
         # the whole vehicle's offset; the centerbody carries it

@@ -19,7 +19,8 @@ from postflight.pipeline import PULSE_RATE_HZ, Flight, estimate, reconstruct_tel
 from postflight.preflight import Bounds, entry_bounds, rigid_bounds
 from postflight.reconciliation.answer import correlations, deflection_of, found_sd, joint_table, vehicle_lines
 from postflight.reconciliation.figures import figure_modes, figure_reconciled
-from postflight.reconciliation.fit import Reconciled, reconcile
+from postflight.reconciliation.fit import Reconciled
+from postflight.reconciliation.laws import explain
 from postflight.reconciliation.modes import ModalStiffness, stiffness_by_modes
 from postflight.studies.commands import bands, held_against
 from postflight.warmup import RECONSTRUCTION
@@ -28,11 +29,13 @@ from synthetic_flight.dispersions import Factor, JointDispersions
 
 ENTRIES = 300
 STRONG = 3.0  # logarithm of odds of twenty to one
+MISFIT = 1.5  # rms of the sensors' residuals over their sd; some 0.6 where the joint explains the flight
+LAW_WORDS = {"freeplay": "freeplay", "hardening": "a spring whose slope changes with the angle"}
 
 
-def run(folder: Path, hardening: bool) -> None:
+def run(folder: Path, laws: tuple[str, ...]) -> None:
     """Reconstruct, reconcile, write a run folder and print what was found."""
-    settings = {"reconcile": True, "hardening": hardening, "output_rate_hz": 20.0}
+    settings = {"reconcile": True, "laws": list(laws), "output_rate_hz": 20.0}
     with progress_bar() as report:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
@@ -41,7 +44,8 @@ def run(folder: Path, hardening: bool) -> None:
             telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
         )
         answers = estimate(flight, telemetry, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
-        found, odds = _joint(flight, hardening, lambda f, what: report(0.3 + 0.6 * f, what))
+        explained = explain(flight, laws, lambda f, what: report(0.3 + 0.6 * f, what))
+        found, odds = explained.found, explained.log_odds
         modal, no_modes = _modes(flight)
         rigid = rigid_bounds(flight, ENTRIES, progress=lambda f, what: report(0.9 + 0.05 * f, what))
         flexible = reconciled_bounds(found, flight, lambda f, what: report(0.95 + 0.05 * f, what))
@@ -89,18 +93,6 @@ def modal_summary(modal: ModalStiffness | None, no_modes: str) -> dict[str, obje
     return {"stiffness_by_modes_nmprad": modal.stiffness_nmprad, "stiffness_by_modes_sd_nmprad": modal.sd_nmprad}
 
 
-def _joint(flight: Flight, hardening: bool, report: Report) -> tuple[Reconciled, float | None]:
-    """Fit the joint; with hardening both ways, the evidence chooses: log odds of a spring that hardens."""
-    if not hardening:
-        return reconcile(flight, False, report), None
-    plain = reconcile(flight, False, lambda f, what: report(0.5 * f, what))
-    hard = reconcile(flight, True, lambda f, what: report(0.5 + 0.5 * f, what))
-    odds = hard.log_evidence - plain.log_evidence
-    # a spring that softens is no joint that the vehicle file knows: it is said, not flown
-    hardens = hard.vehicle.joint.hardening_nmprad3 > 0.0
-    return (hard if odds > 0.0 and hardens else plain), odds
-
-
 def reconciled_bounds(found: Reconciled, flight: Flight, report: Report) -> Bounds:
     """Bands of entries with the joint, offset and stability found, dispersed as far as they are open still."""
     joint, offset, stability = found_sd(found)
@@ -110,7 +102,7 @@ def reconciled_bounds(found: Reconciled, flight: Flight, report: Report) -> Boun
     return entry_bounds(flight, laws, ENTRIES, progress=report, vehicle=replace(vehicle, uncertainty=known))
 
 
-def summary(found: Reconciled, table: pd.DataFrame, odds: float | None) -> dict[str, object]:
+def summary(found: Reconciled, table: pd.DataFrame, odds: dict[str, float]) -> dict[str, object]:
     """Return the short story, for ``reconciliation.json``."""
     return {
         "converged": found.converged,
@@ -118,11 +110,11 @@ def summary(found: Reconciled, table: pd.DataFrame, odds: float | None) -> dict[
         "sensor_residual_rms_sd": float(np.sqrt(np.mean(found.residuals.sensors**2))),
         "join_rms_sd": float(np.sqrt(np.mean(found.residuals.joins**2))),
         "joint": table.to_dict(orient="records"),
-        "log_odds_of_changing_slope": odds,
+        "log_odds": odds,
     }
 
 
-def print_joint(found: Reconciled, table: pd.DataFrame, odds: float | None) -> None:
+def print_joint(found: Reconciled, table: pd.DataFrame, odds: dict[str, float]) -> None:
     """Table of the joint, and a word where the fit did not settle or does not fit."""
     printed = Table(title="The joint that explains the flight")
     for name in ("quantity", "told", "found", "1 sd", "90 % interval"):
@@ -131,12 +123,19 @@ def print_joint(found: Reconciled, table: pd.DataFrame, odds: float | None) -> N
         name = f"{r.quantity} ({r.unit})" if r.unit else str(r.quantity)
         printed.add_row(name, f"{r.told:.4g}", f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}")
     console.print(printed)
-    if odds is not None:
-        words = "no clear evidence" if abs(odds) < STRONG else f"strong evidence {'for' if odds > 0.0 else 'against'}"
-        console.print(f"a spring whose slope changes with the angle: {words} (odds e^{odds:+.1f})")
-        if odds > STRONG and not found.problem.unknown.hardening:
-            console.print(
-                "[yellow]the slope falls with the angle: freeplay in part of the pulse, or a joint that gives[/]"
-            )
+    for law, words in LAW_WORDS.items():
+        if law not in odds:
+            continue
+        side = "for" if odds[law] > 0.0 else "against"
+        evidence = "no clear evidence" if abs(odds[law]) < STRONG else f"strong evidence {side}"
+        console.print(f"{words}: {evidence} (odds e^{odds[law]:+.1f})")
+    if odds.get("hardening", 0.0) > STRONG and "hardening" not in found.problem.unknown.laws:
+        console.print("[yellow]the slope falls with the angle: freeplay in part of the pulse, or a joint that gives[/]")
+    misfit = float(np.sqrt(np.mean(found.residuals.sensors**2)))
+    if misfit > MISFIT:
+        console.print(
+            f"[yellow]the sensors lie {misfit:.1f} sd (rms) from the flight flown: no such joint explains it; a joint "
+            "with freeplay does that to a fit without --freeplay[/]"
+        )
     if not found.converged:
         console.print("[yellow]the fit had not settled after its last step: take the intervals as too narrow[/]")

@@ -23,6 +23,9 @@ WINDOW_S = 0.04  # of the joint's swinging at 2.5 Hz it passes 98 %, and the sim
 WINDOWS = 10  # a span
 SPAN_S = WINDOWS * WINDOW_S
 LEAST_SPANS = 20
+LOADED = 0.1  # of the largest dynamic pressure
+# bending and its rate (about x, y, z) at the first start, as known before: at rest above the air; swinging under load
+REST_SD, LOADED_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0]), np.deg2rad([1e-3, 3.0, 3.0, 0.1, 30.0, 30.0])
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class Observed:
         Of the gyros' and of the accelerometer's clock.
     accelerometer_m : (3,) float
         From the datum, body axes.
+    first_bending_sd : (6,) float
+        Of the shell's rotation vector against the body, rad, and its rate, rad/s, at the first start.
     """
 
     start: Trajectory
@@ -62,6 +67,7 @@ class Observed:
     force_root_mps2: FloatArray
     clock_sd_s: FloatArray
     accelerometer_m: FloatArray
+    first_bending_sd: FloatArray
 
     @property
     def spans(self) -> int:
@@ -69,8 +75,15 @@ class Observed:
         return len(self.time_s)
 
 
-def observe(flight: Flight) -> Observed:
+def observe(flight: Flight, loaded: bool = False) -> Observed:
     """Take what a joint can be reconciled with from a reconstructed flight, 100 km down to the end of the pulse.
+
+    Parameters
+    ----------
+    flight : Flight
+    loaded : bool
+        Begin only where a tenth of the largest dynamic pressure loads the joint: in thinner air a shell with freeplay
+        rattles between the edges of its dead band, and no start of a span tells where it will strike.
 
     Raises
     ------
@@ -80,6 +93,8 @@ def observe(flight: Flight) -> Observed:
     pulse, bet, air = flight.required_pulse(), flight.reconstruction, flight.air
     accelerometer, rates = flight.telemetry.required_triads()
     falling = (air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0)
+    if loaded:
+        falling &= air.dynamic_pressure_pa > LOADED * pulse.dynamic_pressure_pa.max()
     if not falling.any():
         raise GateError("reconciliation: the reconstruction never comes below 100 km")
     first_s = float(np.ceil(air.time_s[np.argmax(falling)] / WINDOW_S) * WINDOW_S)
@@ -115,6 +130,7 @@ def observe(flight: Flight) -> Observed:
         bet.accelerometer_root[near][:, 3:].reshape(*shape, 3, 9),
         np.array([rates.spec.time_bias_sd_s, accelerometer.spec.time_bias_sd_s]),
         accelerometer.spec.position_from_datum_body_m,
+        LOADED_SD if loaded else REST_SD,
     )
 
 

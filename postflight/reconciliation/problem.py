@@ -42,7 +42,6 @@ GUST = np.array([0.3, 0.3, 0.3, 3.0, 3.0, 3.0, 0.0, 0.3, 0.3, 0.0, 9.0, 9.0])
 STILL_SD = np.deg2rad([0.001, 0.001, 0.001, 0.003, 0.003, 0.003, 1e-4, 0.001, 0.001, 0.03, 0.01, 0.01])
 LARGE_ANGLE_RAD = np.deg2rad(5.0)  # at which structure of the density turns the vehicle
 GUST_RATE, GUST_FORCE_MPS2 = 2.0, 60.0  # of the windows' rates and lateral force, as if it forgot from one to the next
-FIRST_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0])  # bending and its rate above the air
 MOTION_STEP = np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3))
 VEHICLE_STEP, AIR_STEP = 1e-5, np.array([1e-6, 2e-4, 2e-4])
 
@@ -92,12 +91,24 @@ class Linear:
 
 @dataclass(frozen=True)
 class Problem:
-    """Flight, unknowns, and by how much all standard deviations are widened."""
+    """Flight, unknowns, those of the vehicle that are held, and by how much standard deviations are widened.
+
+    Parameters
+    ----------
+    observed : Observed
+    unknown : VehicleUnknowns
+    air : AirUnknowns
+    held : tuple of str
+        Unknowns of the vehicle that no step moves.
+    wider : float or (s,) float
+        All, or each span's.
+    """
 
     observed: Observed
     unknown: VehicleUnknowns
     air: AirUnknowns
-    wider: float = 1.0
+    held: tuple[str, ...] = ()
+    wider: float | FloatArray = 1.0
 
     @property
     def first_instrument(self) -> int:
@@ -138,13 +149,18 @@ class Problem:
         rate_sd = np.hypot(seen.rate_sd_radps, GUST_RATE * gust) * np.ones_like(size)
         left_out = np.hypot(density[:, None, None] * size, GUST_FORCE_MPS2 * gust)
         force_sd = np.hypot(seen.force_sd_mps2, left_out)
-        weight = 1.0 / (self.wider * np.concatenate([rate_sd, force_sd], axis=2))
+        weight = 1.0 / (self._widened[:, None, None] * np.concatenate([rate_sd, force_sd], axis=2))
         return np.where(np.isfinite(seen.specific_force_mps2[..., :1]), np.nan_to_num(weight), 0.0)
 
     @cached_property
     def join_weight(self) -> FloatArray:
         """Inverse standard deviations (s - 1, 12) of ends against starts."""
-        return np.asarray(1.0 / (self.wider * np.hypot(GUST * self.unsteady[:-1, None], STILL_SD)))
+        wider = np.maximum(self._widened[:-1], self._widened[1:])
+        return np.asarray(1.0 / (wider[:, None] * np.hypot(GUST * self.unsteady[:-1, None], STILL_SD)))
+
+    @property
+    def _widened(self) -> FloatArray:
+        return np.asarray(np.broadcast_to(self.wider, self.observed.spans))
 
     @cached_property
     def near(self) -> list[Index]:
@@ -203,7 +219,7 @@ class Problem:
     def prior_cost(self, u: Unknowns) -> float:
         """Sum of squares of what was known before."""
         air = sum(float(a @ p @ a) for a, p in zip(u.air, self.air.precision, strict=True))
-        first, attitude = u.motion[0, 6:] / FIRST_SD, u.motion[0, ATTITUDE]
+        first, attitude = u.motion[0, 6:] / self.observed.first_bending_sd, u.motion[0, ATTITUDE]
         turned = float(attitude @ self.attitude_precision @ attitude)
         return air + turned + float(u.vehicle @ u.vehicle + u.instruments @ u.instruments + first @ first)
 
@@ -215,6 +231,7 @@ class Problem:
         late, at, sensors, joins = np.repeat(self.observed.clock_sd_s * u.instruments[18:20], 3), 0, [], []
         for span, (column, step) in enumerate(zip(columns, steps, strict=True)):
             part = slice(at, at := at + len(column))
+            step[self.held_columns] = np.inf  # no step moves what is held
             change = moved.windows[part] - read.windows[span] - late * (moved.slope[part] - read.slope[span])
             sensed = change / step[:, None, None] * self.weight[span]
             told = (rows[span] * self.weight[span][..., None]).reshape(-1, INSTRUMENTS)
@@ -234,7 +251,13 @@ class Problem:
             matrix[np.ix_(column, column)] += response.T @ response
         right = linear.back(linear.found.sensors, linear.found.joins)
         self._add_priors(u, matrix, right)
+        right[self.held_columns] = 0.0
         return matrix, right
+
+    @property
+    def held_columns(self) -> list[int]:
+        """Places of the unknowns that are held."""
+        return [self.unknown.names.index(name) for name in self.held]
 
     def _moves(self, u: Unknowns) -> tuple[Flights, list[Index], list[FloatArray]]:
         """Spans with one unknown moved, which unknown (columns) and by how much, span by span."""
@@ -273,7 +296,7 @@ class Problem:
                 for kind in range(3)
             ],
             (slice(first, first + 3), self.attitude_precision, u.motion[0, ATTITUDE]),
-            (slice(first + 6, first + MOTION), np.diag(FIRST_SD**-2.0), u.motion[0, 6:]),
+            (slice(first + 6, first + MOTION), np.diag(self.observed.first_bending_sd**-2.0), u.motion[0, 6:]),
         ]
         for part, precision, value in parts:
             matrix[part, part] += precision
