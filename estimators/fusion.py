@@ -18,8 +18,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import uniform_filter1d
 
 from estimators.evidence import (
@@ -31,18 +29,11 @@ from estimators.evidence import (
     evidence_of_history,
     moved_evidence,
 )
+from estimators.normal_equations import LEFT_OUT_RAD, Inputs, NormalEquations, Spline
 from estimators.pulse import PulseData
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
 
-KNOT_S = 0.2  # half a period of the joint at 2.5 Hz
-# of the joint, at each knot: 0.7 deg of swinging at 2.5 Hz, 10 deg at the slow aerodynamic mode's 0.65 Hz, so that it
-# is no reason to believe in other inputs
-ACCELERATION_SD_RADPS2 = 1.0
-SIZE_SD_RAD = 1.0  # of the deflection itself: says nothing
-# what the methods' equations leave out, second order in the angles and gusts shorter than the wind's knots: up to this,
-# for about so long
-LEFT_OUT_RAD, LEFT_OUT_TIME_S = np.deg2rad(0.03), 1.0
 LEAST_SAMPLES = 8
 MOST_INPUT_SD, SETTLED_SD, MOST_STEPS, WHOLE_STEPS = 8.0, 0.05, 30, 4
 NEAR_S = 0.5  # an answer is given no further from a reading
@@ -50,7 +41,6 @@ CLOCK_STEP_S, FARTHEST_CLOCK_SD = 0.01, 3.0
 MOVES = 1.75  # rms rate of the deflection against its sd; of noise alone it is 1
 SMOOTH_RATE_HZ = 50.0
 
-Inputs = dict[str, FloatArray]
 Read = Callable[[Inputs, Deflection | None], list[Evidence]]
 
 
@@ -108,11 +98,11 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     inputs: Inputs = _started_clock(told, method)
     span = _span(told)
     apart = [_apart(moved_evidence(e, inputs)) for e in told]
-    problem = _Problem.of(apart, {}, span)
+    problem = NormalEquations.of(apart, {}, span)
     found, covariance = problem.solved(method)
     for step in range(MOST_STEPS):
         told = [e for e in read(inputs, problem.deflection(found)) if e.method in methods]
-        problem, before = _Problem.of(told, inputs, span), found
+        problem, before = NormalEquations.of(told, inputs, span), found
         found, covariance = problem.solved(method)
         size = 2 * problem.spline.count
         new = {name: found[size:][place] for name, place in problem.place.items()}
@@ -175,7 +165,7 @@ def clock_is_seen(read: Read) -> bool:
         return False
     span = _span(own)
     # what lasts in a reading does not move
-    problem = _Problem.of([replace(e, by_input={}) for e in own], {}, span)
+    problem = NormalEquations.of([replace(e, by_input={}) for e in own], {}, span)
     try:
         found, covariance = problem.solved("clock")
     except DivergenceError:
@@ -198,7 +188,7 @@ def _started_clock(told: list[Evidence], method: str) -> Inputs:
     if not off or not own:
         return {}
     one, span = off[0], _span(own)
-    problem = _Problem.of([_apart(e) for e in own], {}, span)
+    problem = NormalEquations.of([_apart(e) for e in own], {}, span)
     bent = problem.deflection(problem.solved(method)[0])
     reach = FARTHEST_CLOCK_SD * one.clock_sd_s
     late_s = np.arange(-np.ceil(reach / CLOCK_STEP_S), np.ceil(reach / CLOCK_STEP_S) + 1.0) * CLOCK_STEP_S
@@ -214,27 +204,6 @@ def _started_clock(told: list[Evidence], method: str) -> Inputs:
     variance = float(square.min()) / (2.0 * len(time_s)) + LEFT_OUT_RAD**2
     best = int(np.argmin(square / variance + (late_s / one.clock_sd_s) ** 2))
     return {FILM_CLOCK: np.array([late_s[best] / one.clock_sd_s])}
-
-
-@dataclass(frozen=True)
-class _Spline:
-    """Cubic B-spline with even knots."""
-
-    knots_s: FloatArray
-    count: int
-    _full: FloatArray
-
-    @classmethod
-    def over(cls, low: float, high: float) -> _Spline:
-        inner = low + KNOT_S * np.arange(int(np.ceil((high - low) / KNOT_S)) + 1)
-        full = np.concatenate([inner[0] - KNOT_S * np.arange(3, 0, -1), inner, inner[-1] + KNOT_S * np.arange(1, 4)])
-        return cls(np.asarray(inner), len(full) - 4, np.asarray(full))
-
-    def rows(self, time_s: FloatArray, derivative: int = 0) -> FloatArray:
-        """Values (n, count) of every basis function, or of its derivative."""
-        basis = BSpline(self._full, np.eye(self.count), 3)
-        at = np.clip(time_s, self.knots_s[0], self.knots_s[-1])
-        return np.asarray(basis(at, nu=derivative))
 
 
 def pulse_reader(
@@ -265,7 +234,7 @@ def pulse_reader(
 def _smoothed(pulse: PulseData, use: BoolArray) -> PulseData:
     """Pulse whose force, rate and angular acceleration are what a spline with `KNOT_S` can follow."""
     t = pulse.time_s[use]
-    value = _Spline.over(float(t[0]), float(t[-1])).rows(t)
+    value = Spline.over(float(t[0]), float(t[-1])).rows(t)
     fit = value @ np.linalg.pinv(value)
     names = ("specific_force_body_mps2", "rate_body_radps", "angular_acceleration_body_radps2")
     moved = {}
@@ -273,86 +242,6 @@ def _smoothed(pulse: PulseData, use: BoolArray) -> PulseData:
         moved[name] = getattr(pulse, name).copy()
         moved[name][use] = fit @ moved[name][use]
     return replace(pulse, **moved)
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """Normal equations of the deflection's spline (y, then z) and of the inputs; where each input's normals stand."""
-
-    spline: _Spline
-    place: dict[str, slice]
-    normal: FloatArray
-    right: FloatArray
-
-    @classmethod
-    def of(cls, told: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> _Problem:
-        spline = _Spline.over(*span_s)
-        place: dict[str, slice] = {}
-        total = 0
-        for name, response in (item for e in told for item in e.by_input.items()):
-            if name not in place:
-                place[name] = slice(total, total + response.shape[2])
-                total = place[name].stop
-        size = 2 * spline.count
-        normal, right = np.zeros((size + total,) * 2), np.zeros(size + total)
-        for one in told:
-            rows, want = _whitened(one, spline, place, inputs)
-            normal += rows.T @ rows
-            right += rows.T @ want
-        curvature = spline.rows(spline.knots_s, 2) / ACCELERATION_SD_RADPS2
-        bending = curvature.T @ curvature + np.eye(spline.count) / SIZE_SD_RAD**2
-        for axis in range(2):
-            part = slice(axis * spline.count, (axis + 1) * spline.count)
-            normal[part, part] += bending
-        normal[range(size, len(right)), range(size, len(right))] += 1.0
-        return cls(spline, place, normal, right)
-
-    def deflection(self, found: FloatArray) -> Deflection:
-        """Lateral vectors (n, 2) of a solution, from times."""
-        coefficients = found[: 2 * self.spline.count].reshape(2, -1)
-        return lambda time_s: self.spline.rows(time_s) @ coefficients.T
-
-    def solved(self, method: str) -> tuple[FloatArray, FloatArray]:
-        """Posterior mean and covariance of all unknowns."""
-        try:
-            covariance = cho_solve(cho_factor(self.normal), np.eye(len(self.right)))
-        except np.linalg.LinAlgError:
-            raise DivergenceError(f"{method}: the readings do not determine the deflection") from None
-        return covariance @ self.right, covariance
-
-
-def _whitened(one: Evidence, spline: _Spline, place: dict[str, slice], inputs: Inputs) -> tuple[FloatArray, FloatArray]:
-    """Rows ``(2 n, unknowns)`` of the least-squares problem and what they should give, errors of unit variance."""
-    keep = np.isfinite(one.theta_yz_rad).all(axis=1)
-    n, m = int(keep.sum()), spline.count
-    value, second = spline.rows(one.time_s[keep]), spline.rows(one.time_s[keep], 2)
-    swing = one.by_acceleration_s2[keep]
-    rows = np.zeros((n, 2, 2 * m + max((p.stop for p in place.values()), default=0)))
-    for axis in range(2):
-        for other in range(2):
-            rows[:, axis, other * m : (other + 1) * m] = swing[:, axis, other, None] * second
-        rows[:, axis, axis * m : (axis + 1) * m] += value
-    want = one.theta_yz_rad[keep].copy()
-    for name, every in one.by_input.items():
-        response = every[keep]
-        rows[:, :, 2 * m + place[name].start : 2 * m + place[name].stop] = -response
-        if name in inputs:
-            want -= response @ inputs[name]
-    share = _bins(one.time_s[keep], one.averaged_s)
-    rows = (share @ rows.reshape(n, -1)).reshape(len(share), 2, -1)
-    cov = np.einsum("bn,nij->bij", share**2, one.independent_cov[keep])
-    cov += LEFT_OUT_RAD**2 * LEFT_OUT_TIME_S / one.averaged_s * np.eye(2)
-    whiten = np.linalg.inv(np.linalg.cholesky(cov))
-    return (whiten @ rows).reshape(2 * len(share), -1), (whiten @ (share @ want)[:, :, None]).ravel()
-
-
-def _bins(time_s: FloatArray, width_s: float) -> FloatArray:
-    """Weights (bins, n) of the means over spans of time; spans without a sample are left out."""
-    which = np.floor((time_s - time_s[0]) / width_s + 1e-6).astype(int)
-    _, which, count = np.unique(which, return_inverse=True, return_counts=True)
-    out = np.zeros((len(count), len(time_s)))
-    out[which, np.arange(len(time_s))] = 1.0 / count[which]
-    return out
 
 
 def _check(inputs: Inputs, method: str) -> None:
@@ -366,7 +255,12 @@ def _check(inputs: Inputs, method: str) -> None:
 
 
 def _posterior(
-    found: FloatArray, covariance: FloatArray, problem: _Problem, told: list[Evidence], method: str, t: FloatArray
+    found: FloatArray,
+    covariance: FloatArray,
+    problem: NormalEquations,
+    told: list[Evidence],
+    method: str,
+    t: FloatArray,
 ) -> Fused:
     spline = problem.spline
     m, size = spline.count, 2 * spline.count

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from estimators import fusion
 from estimators.evidence import FILM_CLOCK, LIGHT_TIME_S, Evidence, evidence_of_history, forgetful, moved_evidence
 from estimators.fusion import clock_is_seen, fuse, smoothed
 from flightmodel.checks import DivergenceError
@@ -123,7 +122,7 @@ def test_a_clock_taken_as_right_moves_nothing_but_is_told():
 
 def test_the_smooth_history_errs_less_than_the_frames_and_says_how_much():
     normal, raw, smooth = [], [], []
-    noise = fusion.LEFT_OUT_RAD * np.sqrt(fusion.LEFT_OUT_TIME_S / 0.1)
+    noise = normal_equations.LEFT_OUT_RAD * np.sqrt(normal_equations.LEFT_OUT_TIME_S / 0.1)
     for seed in range(12):
         rng = np.random.default_rng(100 + seed)
         seen = camera(rng, 0.0, swing=0.0, sd=np.deg2rad(0.03))

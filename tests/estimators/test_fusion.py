@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from estimators import fusion
+from estimators import normal_equations
 from estimators.agreement import agreement
 from estimators.evidence import (
     WIND,
@@ -64,14 +64,17 @@ def test_posterior_is_that_of_the_joint_gaussian():
     told = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"))]
     told = [replace(e, theta_yz_rad=bent() + 1e-3 * rng.normal(size=(N, 2))) for e in told]
     got = fuse(linear_reader(told))
-    spline = fusion._Spline.over(TIME_S[0], TIME_S[-1])
-    curvature = spline.rows(spline.knots_s, 2) / fusion.ACCELERATION_SD_RADPS2
-    prior = np.linalg.inv(curvature.T @ curvature + np.eye(spline.count) / fusion.SIZE_SD_RAD**2)
+    spline = normal_equations.Spline.over(TIME_S[0], TIME_S[-1])
+    curvature = spline.rows(spline.knots_s, 2) / normal_equations.ACCELERATION_SD_RADPS2
+    prior = np.linalg.inv(curvature.T @ curvature + np.eye(spline.count) / normal_equations.SIZE_SD_RAD**2)
     size = 2 * spline.count
     before = np.eye(size + 3)
     before[:size, :size] = np.kron(np.eye(2), prior)
     rows, want = zip(
-        *(fusion._whitened(e, spline, {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}, {}) for e in told),
+        *(
+            normal_equations.whitened(e, spline, {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}, {})
+            for e in told
+        ),
         strict=True,
     )
     rows, want = np.concatenate(rows), np.concatenate(want)
@@ -88,7 +91,7 @@ def test_posterior_is_that_of_the_joint_gaussian():
 
 def test_linear_readings_err_as_the_posterior_says(monkeypatch):
     """Normalised squares of the deflection's errors over draws are chi-squares; the equations leave nothing out."""
-    monkeypatch.setattr(fusion, "LEFT_OUT_RAD", 1e-5)
+    monkeypatch.setattr(normal_equations, "LEFT_OUT_RAD", 1e-5)
     rng = np.random.default_rng(1)
     template = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"), 2e-3)]
     truth, squares = bent(), []
