@@ -23,6 +23,7 @@ import numpy as np
 from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from estimators.agreement import BLAME
 from estimators.evidence import LIGHT_TIME_S, forgetful
 from estimators.misalignment import estimate_misalignment
 from estimators.pulse import PulseData
@@ -208,8 +209,8 @@ def scored(seed, folder, rigid, what):
         answers[f"fused, {name}"] = safely(out, lambda c=camera: fuse_flight(pulse, c).fused.history)
     if what is not None:
         found = safely(out, lambda: fuse_flight(pulse, cameras["clean"]).agreement)
-        out["suspects"] = None if found is None else found.suspects
-        out["gains"] = {} if found is None else found.gains
+        out["named"] = None if found is None else found.named
+        out["red"] = found is None or bool(found.suspects)
     out["rows"] = {name: row_of(h, pulse, truth) for name, h in answers.items() if h is not None}
     return out
 
@@ -267,13 +268,18 @@ def report(results, rigid):
 
 def report_planted(results, what):
     rows = [r for r in results if not r["words"]]
-    red = [r for r in rows if r.get("suspects") or r["suspects"] is None]
-    named = sum(1 for r in rows if r["suspects"] and r["suspects"][0] == what)
-    named += sum(1 for r in rows if what and r["suspects"] is None and f"the {what} would" in r["refused"][0])
-    refused = sum(1 for r in rows if r["suspects"] is None)
-    first = Counter(r["suspects"][0] for r in rows if r["suspects"])
-    words = f"red {len(red)} of {len(rows)} ({refused} no common answer), named {named}"
-    print(f"{what or 'nothing wrong'}: {words}; {dict(first)}", flush=True)
+    red = sum(r["red"] for r in rows)
+    # a refusal names its suspects in its words
+    told = [r["named"] if r["named"] is not None else named_in(r["refused"][0]) for r in rows]
+    refused = sum(r["named"] is None for r in rows)
+    first, any_of = sum(n[:1] == (what,) for n in told), sum(what in n for n in told)
+    words = f"red {red} of {len(rows)} ({refused} no common answer), named {any_of}, first or alone {first}"
+    print(f"{what or 'nothing wrong'}: {words}; {dict(Counter(' or '.join(n) for n in told if n))}", flush=True)
+
+
+def named_in(words):
+    """Suspects that a refusal names, the first first."""
+    return tuple(sorted((s for s in BLAME if f"the {s} would" in words or f"the {s} or" in words), key=words.index))
 
 
 def main():

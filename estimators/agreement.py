@@ -1,41 +1,58 @@
 """Do the methods agree, and if not, what is most likely wrong?
 
-The difference of two methods' readings holds no deflection, only what they lean on::
+The difference of two methods' readings at one time holds no deflection, only what they lean on::
 
-    d(t) = read_a - read_b = -(J_a - J_b) x + e,      x ~ N(0, 1)
+    d(t) = read_a - read_b - (A_a - A_b) theta'' = -(J_a - J_b) x + e,      x ~ N(0, 1)
 
-averaged over spans long against the joint's swinging. Its chi-square against that covariance is the test of a pair.
-Which input is to blame is asked of each: how much likelier are all differences together if this one is `WIDER` times
-less well known than stated? With their covariance ``C``, ``V = J' C^-1 J`` and ``s = J' C^-1 d`` the log of that is
+taken at the sparser one's times and averaged over spans. Its chi-square against that covariance is the test of a
+pair. Which input is to blame is asked of each: how much likelier are all readings together if this one is `WIDER` times
+less well known than stated? With mean ``m`` and covariance ``P`` of its unit normals after the fusion, its log is
 
-    gain = s' (1/(WIDER^2 - 1) + V)^-1 s / 2 - log det(1 + (WIDER^2 - 1) V) / 2
+    gain = m' (1/(WIDER^2 - 1) + V)^-1 m / 2 - log det(1 + (WIDER^2 - 1) V) / 2,      V = 1 - P
 
-An input that hardly bears on the differences gains nothing however far it is moved.
+(``V`` is ``J' C^-1 J`` of the readings' whole covariance ``C``, and ``m`` is ``J' C^-1 d``). Directions of which less
+than `LEAST_TOLD` was learnt are left out: what the equations of the methods neglect would move them far at no cost.
 
-What the differences cannot tell apart is in the singular values of the whitened ``J``: a direction of the inputs with
-the singular value ``s`` keeps ``1 / (1 + s^2)`` of its variance.
+What the readings cannot tell apart is in the singular values of the whitened ``J``: a direction of the inputs with the
+singular value ``s`` keeps ``1 / (1 + s^2)`` of its variance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
-from estimators.evidence import ACCELEROMETER, ATTITUDE, FILM_CLOCK, PRESSURE, VEHICLE_INPUTS, WIND, Evidence
-from flightmodel.checks import FloatArray
+from estimators.evidence import (
+    ACCELEROMETER,
+    ATTITUDE,
+    CAMERA_PLANE,
+    FILM_CLOCK,
+    PRESSURE,
+    VEHICLE_INPUTS,
+    WIND,
+    Deflection,
+    Evidence,
+)
+from estimators.normal_equations import Learnt
+from flightmodel.checks import BoolArray, FloatArray
 
 SPAN_S = 2.0
 LEFT_OUT_RAD = np.deg2rad(0.05)  # of the methods' own equations, in each mean: up to 0.05 deg where the pulse ends
+HOLE = 2.5  # usual steps: through a wider one readings are not joined by lines
+SWING_STEP_S = 0.1
 CONFIDENCE = 0.99
 WIDER = 4.0
-CAMERA, PLANE_SD_RAD = "camera", np.deg2rad(15.0)
+LEAST_TOLD = 0.05  # part of a direction's variance that the readings must have taken away
+CAMERA = "camera"
 LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is held against another
-LARGEST_GAIN = np.log(100.0)  # odds at which one input is taken as wrong though every pair passes
+LARGEST_GAIN = np.log(50.0)  # odds at which one input is taken as wrong though every pair passes
+ALSO = np.log(10.0)  # odds below which the next suspect is named too
 BLAME = {
     "aerodynamic coefficients": ("C_A", "C_N", "C_m", "C_mq"),
     "accelerometer's mounting or bias": (ACCELEROMETER,),
@@ -44,7 +61,7 @@ BLAME = {
     "attitude of the trajectory": (ATTITUDE,),
     "sounded wind": (WIND,),
     "sounded density": (PRESSURE,),
-    "camera's orientation, benchmark or plane": (CAMERA,),
+    "camera's orientation, benchmark or plane": (CAMERA, CAMERA_PLANE),
     "film's clock": (FILM_CLOCK,),
 }
 
@@ -80,146 +97,146 @@ class Agreement:
         return tuple(sorted(self.gains, key=lambda name: -self.gains[name]))
 
     @property
+    def named(self) -> tuple[str, ...]:
+        """The likeliest suspect, and the next where it is hardly less likely."""
+        suspects = [s for s in self.suspects if self.gains[s] > 0.0]
+        return tuple(s for s in suspects[:2] if self.gains[s] > self.gains[suspects[0]] - ALSO)
+
+    @property
     def words(self) -> str:
         """One sentence."""
         if not self.pairs:
             return "only one method answers: nothing to hold it against"
-        if not self.suspects:
-            return "the methods agree within their error bars"
         failed = [f"{a} and {b}" for a, b in (p.methods for p in self.pairs if not p.passed)]
-        return (
-            f"{', '.join(failed) or 'the methods'} disagree beyond their error bars: "
-            f"the {self.suspects[0]} would explain it best"
-        )
+        if not failed and not self.suspects:
+            return "the methods agree within their error bars"
+        suspects = " or the ".join(self.named)
+        would = f": the {suspects} would explain it best" if suspects else ", and no single input would explain it"
+        return f"{', '.join(failed) or 'the methods'} disagree beyond their error bars{would}"
 
 
-def agreement(evidence: list[Evidence]) -> Agreement:
-    """Test all pairs of methods over the spans in which both answer, and score what they lean on."""
-    told = [_means(e) for e in evidence]
+def agreement(
+    evidence: list[Evidence], learnt: Learnt | None = None, deflection: Deflection | None = None
+) -> Agreement:
+    """Test all pairs of methods over the spans in which both answer, and score what they lean on.
+
+    Parameters
+    ----------
+    evidence : list of Evidence
+        As told: no input moved.
+    learnt : Learnt, optional
+        What the fusion says of the inputs; without it there are no suspects.
+    deflection : callable, optional
+        From times to lateral vectors (n, 2), rad: what of it swings is taken out of the readings.
+    """
     pairs: list[Pair] = []
-    rows: list[_Difference] = []
-    for a, b in combinations(told, 2):
-        difference = _difference(a, b)
+    for a, b in combinations(evidence, 2):
+        difference = _difference(a, b, deflection)
         if len(difference.time_s):
-            rows.append(difference)
             d, cov = _flat(difference)
             square = float(d @ cho_solve(cho_factor(cov), d))
             pairs.append(Pair((a.method, b.method), square, len(d), float(chi2.sf(square, len(d)))))
-    if not rows:
-        return Agreement((), {}, np.empty(0))
-    # the differences against the first method hold everything that all pairs do
-    base = rows[: len(told) - 1]
-    names = list(dict.fromkeys(n for r in base for n in r.by_input))
-    jacobian, d, noise = _stacked(base, names)
-    columns = np.concatenate(list(jacobian.values()), axis=1)
-    factor = cho_factor(columns @ columns.T + noise)
+    if learnt is None or not pairs:
+        return Agreement(tuple(pairs), {}, np.empty(0))
     gains = {}
     for culprit, inputs in BLAME.items():
-        more = WIDER**2 - 1.0
-        mine = [_lasting(jacobian[n]) if n == CAMERA else jacobian[n] for n in inputs if n in jacobian]
-        if CAMERA in inputs and mine:
-            mine.append(_plane_turned(base, len(d)) / np.sqrt(more))
-        if mine:
-            j = np.concatenate(mine, axis=1)
-            v, s = j.T @ cho_solve(factor, j), j.T @ cho_solve(factor, d)
-            eye = np.eye(len(s))
-            gains[culprit] = float(
-                0.5 * s @ np.linalg.solve(eye / more + v, s) - 0.5 * np.linalg.slogdet(eye + more * v)[1]
-            )
-    white = np.linalg.solve(np.linalg.cholesky(noise), columns)
-    return Agreement(tuple(pairs), gains, np.linalg.svd(white, compute_uv=False))
+        rows = [np.arange(learnt.place[n].start, learnt.place[n].stop) for n in inputs if n in learnt.place]
+        if CAMERA in inputs and CAMERA in learnt.place:  # of its own error what lasts: the first of each axis
+            rows[0] = rows[0][[0, len(rows[0]) // 2]]
+        score = _gain(learnt, np.concatenate(rows)) if rows else None
+        if score is not None:
+            gains[culprit] = score
+    told = np.clip(np.linalg.eigvalsh(np.eye(len(learnt.mean)) - learnt.covariance), 0.0, 1.0 - 1e-12)
+    return Agreement(tuple(pairs), gains, np.sqrt(told / (1.0 - told))[::-1])
 
 
-def _lasting(camera: FloatArray) -> FloatArray:
-    """Columns of the camera's error that last: the first of each axis (`evidence.evidence_of_history`)."""
-    return camera[:, [0, camera.shape[1] // 2]]
+def _gain(learnt: Learnt, rows: NDArray[np.int64]) -> float | None:
+    """Log of how much likelier all readings are with these inputs `WIDER` times less well known; None if untold."""
+    told, axes = np.linalg.eigh(np.eye(len(rows)) - learnt.covariance[np.ix_(rows, rows)])
+    known = told > LEAST_TOLD
+    if not known.any():
+        return None
+    more, along = WIDER**2 - 1.0, (axes.T @ learnt.mean[rows])[known]
+    told = told[known]
+    return float(0.5 * np.sum(along**2 / (1.0 / more + told)) - 0.5 * np.sum(np.log1p(more * told)))
 
 
-def _plane_turned(rows: list[_Difference], length: int) -> FloatArray:
-    """Change ``(length, 1)`` of the differences by a camera whose plane is turned by `PLANE_SD_RAD`."""
-    out, at = np.zeros((length, 1)), 0
-    for row in rows:
-        bent = row.reading_yz_rad
-        assert bent is not None
-        across = np.stack([-bent[:, 1], bent[:, 0]], axis=-1)
-        if CAMERA in row.by_input:
-            out[at : at + across.size, 0] = PLANE_SD_RAD * across.ravel()
-        at += across.size
-    return out
+def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> Evidence:
+    """Readings of one less the other's at the sparser one's times, averaged over spans of `SPAN_S`."""
+    a, b = _well_read(a), _well_read(b)
+    if len(a.time_s) < 2 or len(b.time_s) < 2:
+        return replace(a, time_s=np.empty(0))
+    sparse, dense = sorted((a, b), key=lambda e: -float(np.median(np.diff(e.time_s))))
+    after = np.searchsorted(dense.time_s, sparse.time_s).clip(1, len(dense.time_s) - 1)
+    step = dense.time_s[after] - dense.time_s[after - 1]
+    part = (sparse.time_s - dense.time_s[after - 1]) / step
+    both = (part >= 0.0) & (part <= 1.0) & (step < HOLE * np.median(np.diff(dense.time_s)))
+    sign = 1.0 if sparse is a else -1.0
+    time_s, after, part = sparse.time_s[both], after[both], part[both]
+    span, which, count = np.unique(np.floor(time_s / SPAN_S), return_inverse=True, return_counts=True)
+    share = np.zeros((len(span), len(time_s)))
+    share[which, np.arange(len(time_s))] = 1.0 / count[which]
 
-
-def _means(one: Evidence) -> Evidence:
-    """Evidence averaged over spans of `SPAN_S`, counted from time zero so that methods' spans are the same."""
-    known = np.trace(one.covariance, axis1=1, axis2=2) < LARGEST_SD_RAD**2
-    keep = np.isfinite(one.theta_yz_rad).all(axis=1) & known
-    span, which, count = np.unique(np.floor(one.time_s[keep] / SPAN_S), return_inverse=True, return_counts=True)
-    share = np.zeros((len(span), int(keep.sum())))
-    share[which, np.arange(share.shape[1])] = 1.0 / count[which]
+    def between(values: FloatArray) -> FloatArray:
+        w = part.reshape((-1,) + (1,) * (values.ndim - 1))
+        return np.asarray((1.0 - w) * values[after - 1] + w * values[after])
 
     def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.tensordot(share, values[keep], axes=1))
+        return np.asarray(np.tensordot(share, values, axes=1))
 
-    return replace(
-        one,
-        time_s=(span + 0.5) * SPAN_S,
-        theta_yz_rad=mean(one.theta_yz_rad),
-        by_acceleration_s2=mean(one.by_acceleration_s2),
-        by_input={name: mean(j) for name, j in one.by_input.items()},
-        independent_cov=np.einsum("bn,nij->bij", share**2, one.independent_cov[keep]) + LEFT_OUT_RAD**2 * np.eye(2),
-        bend=None,
-    )
-
-
-@dataclass(frozen=True)
-class _Difference(Evidence):
-    """Difference of two methods' readings, and the second's reading itself."""
-
-    reading_yz_rad: FloatArray | None = None
-
-
-def _difference(a: Evidence, b: Evidence) -> _Difference:
-    """Readings of one less the other's in spans that both have."""
-    time_s, i, j = np.intersect1d(a.time_s, b.time_s, return_indices=True)
-    inputs = {name: response[i] for name, response in a.by_input.items()}
-    for name, response in b.by_input.items():
-        inputs[name] = inputs[name] - response[j] if name in inputs else -response[j]
-    return _Difference(
-        method=f"{a.method} less {b.method}",
-        time_s=time_s,
-        theta_yz_rad=a.theta_yz_rad[i] - b.theta_yz_rad[j],
-        by_acceleration_s2=a.by_acceleration_s2[i] - b.by_acceleration_s2[j],
-        by_input=inputs,
-        reading_yz_rad=b.theta_yz_rad[j],
-        independent_cov=a.independent_cov[i] + b.independent_cov[j],
+    names = dict.fromkeys([*sparse.by_input, *dense.by_input])
+    inputs = {n: _less(sparse.by_input.get(n), dense.by_input.get(n), both, between) for n in names}
+    swing = sparse.by_acceleration_s2[both] - between(dense.by_acceleration_s2)
+    d = sparse.theta_yz_rad[both] - between(dense.theta_yz_rad)
+    if deflection is not None:
+        d -= np.einsum("nij,nj->ni", swing, _second_derivative(deflection, time_s))
+    noise = sparse.independent_cov[both] + between(dense.independent_cov)
+    return Evidence(
+        f"{a.method} less {b.method}",
+        (span + 0.5) * SPAN_S,
+        sign * mean(d),
+        sign * mean(swing),
+        {n: sign * mean(j) for n, j in inputs.items()},
+        np.einsum("bn,nij->bij", share**2, noise) + LEFT_OUT_RAD**2 * np.eye(2),
         averaged_s=SPAN_S,
     )
 
 
+def _well_read(one: Evidence) -> Evidence:
+    """Evidence where its sum of errors is below `LARGEST_SD_RAD`."""
+    keep = np.isfinite(one.theta_yz_rad).all(axis=1)
+    keep &= np.trace(one.covariance, axis1=1, axis2=2) < LARGEST_SD_RAD**2
+    return replace(
+        one,
+        time_s=one.time_s[keep],
+        theta_yz_rad=one.theta_yz_rad[keep],
+        by_acceleration_s2=one.by_acceleration_s2[keep],
+        by_input={name: j[keep] for name, j in one.by_input.items()},
+        independent_cov=one.independent_cov[keep],
+        bend=None,
+    )
+
+
+def _less(
+    sparse: FloatArray | None, dense: FloatArray | None, both: BoolArray, between: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Response of the difference to an input on which one of the two may not lean."""
+    if sparse is None:
+        assert dense is not None
+        return -between(dense)
+    return sparse[both] if dense is None else sparse[both] - between(dense)
+
+
+def _second_derivative(deflection: Deflection, time_s: FloatArray) -> FloatArray:
+    before, at, after = (deflection(time_s + shift) for shift in (-SWING_STEP_S, 0.0, SWING_STEP_S))
+    return np.asarray((before - 2.0 * at + after) / SWING_STEP_S**2)
+
+
 def _flat(one: Evidence) -> tuple[FloatArray, FloatArray]:
     """Differences (2 n,) and their covariance."""
-    jacobian, d, noise = _stacked([one], list(one.by_input))
-    return d, sum((j @ j.T for j in jacobian.values()), noise)
-
-
-def _stacked(rows: Sequence[Evidence], names: list[str]) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
-    """Jacobians by input, differences and the covariance of what is independent, all spans of all rows in one.
-
-    Rows that share a method share its independent part too; it is small beside the rest and taken as each row's own.
-    """
-    d = np.concatenate([r.theta_yz_rad.ravel() for r in rows])
-    width = {n: next(r.by_input[n].shape[2] for r in rows if n in r.by_input) for n in names}
-    jacobian = {
-        n: np.concatenate(
-            [
-                r.by_input[n].reshape(-1, width[n]) if n in r.by_input else np.zeros((2 * len(r.time_s), width[n]))
-                for r in rows
-            ]
-        )
-        for n in names
-    }
-    noise = np.zeros((len(d), len(d)))
-    at = 0
-    for cov in (c for r in rows for c in r.independent_cov):
-        noise[at : at + 2, at : at + 2] = cov
-        at += 2
-    return {n: -j for n, j in jacobian.items()}, d, noise
+    n = len(one.time_s)
+    columns = np.concatenate([j.reshape(2 * n, -1) for j in one.by_input.values()], axis=1)
+    cov = columns @ columns.T
+    for k in range(n):
+        cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += one.independent_cov[k]
+    return one.theta_yz_rad.ravel(), cov

@@ -35,6 +35,7 @@ LIGHT_TIME_S = 2.5
 KNOTS_A_LENGTH = 3  # knots of a forgetful history, over what it forgets
 ACCELEROMETER, ATTITUDE, WIND, PRESSURE = "accelerometer", "BET attitude", "wind", "dynamic pressure"
 FILM_CLOCK, RATE_STEP_S = "film's clock", 0.005
+CAMERA_PLANE = "camera's plane"
 Deflection = Callable[[FloatArray], FloatArray]
 SWING_WINDOW_S = 2.0  # about a period of the slow aerodynamic mode, over which the joint's swinging is averaged
 BODIES = ("aeroshell", "centerbody")
@@ -189,8 +190,10 @@ def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
     return replace(vehicle, aero=aero, **bodies)
 
 
-def evidence_of_history(history: DeflectionHistory, clock_sd_s: float = 0.0) -> Evidence:
+def evidence_of_history(history: DeflectionHistory, clock_sd_s: float = 0.0, plane_sd_rad: float = 0.0) -> Evidence:
     """Evidence from a history alone, e.g. the camera's, whose clock may be off by ``clock_sd_s``.
+
+    All its planes may be turned together by ``plane_sd_rad``: as by a camera that is clocked otherwise than it is told.
 
     Of what a history's errors share from sample to sample its covariance says nothing. `CONSTANT_PART` is taken as one
     error in all samples (orientation, benchmark), the rest as one that forgets over `LIGHT_TIME_S` (light, which turns
@@ -204,12 +207,16 @@ def evidence_of_history(history: DeflectionHistory, clock_sd_s: float = 0.0) -> 
     root = (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
     lasting = np.full(len(time_s), np.sqrt(CONSTANT_PART))
     columns = np.column_stack([lasting, np.sqrt(1.0 - CONSTANT_PART) * forgetful(time_s, LIGHT_TIME_S)])
+    inputs = {history.method: _turned(root, columns)}
+    if plane_sd_rad > 0.0:
+        across = np.stack([-theta_yz[:, 1], theta_yz[:, 0]], axis=-1)
+        inputs[CAMERA_PLANE] = plane_sd_rad * across[:, :, None]
     return Evidence(
         history.method,
         time_s,
         theta_yz,
         np.zeros((len(theta_yz), 2, 2)),
-        {history.method: _turned(root, columns)},
+        inputs,
         np.zeros_like(cov),
         averaged_s=float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0,
         clock_sd_s=clock_sd_s,

@@ -29,7 +29,7 @@ from estimators.evidence import (
     evidence_of_history,
     moved_evidence,
 )
-from estimators.normal_equations import LEFT_OUT_RAD, Inputs, NormalEquations, Spline
+from estimators.normal_equations import LEFT_OUT_RAD, Inputs, Learnt, NormalEquations, Spline
 from estimators.pulse import PulseData
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
@@ -52,8 +52,8 @@ class Fused:
     ----------
     history : DeflectionHistory
         At the times of the method with most samples.
-    inputs : dict of str to (mean (k,), covariance (k, k))
-        Of each input's unit normals, given all readings.
+    learnt : Learnt
+        Of the inputs, given all readings.
     correlation : (g, g) float
         Of the inputs' leading unit normals and of the deflection's two components at ``at_s``, in order of ``names``.
     names : tuple of str
@@ -64,11 +64,25 @@ class Fused:
     """
 
     history: DeflectionHistory
-    inputs: dict[str, tuple[FloatArray, FloatArray]]
+    learnt: Learnt
     correlation: FloatArray
     names: tuple[str, ...]
     at_s: float
     deflection: Deflection
+
+    @property
+    def inputs(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Mean (k,) and covariance (k, k) of each input's unit normals, given all readings."""
+        known = self.learnt
+        return {name: (known.mean[at], known.covariance[at, at]) for name, at in known.place.items()}
+
+
+class FarInputsError(DivergenceError):
+    """Readings agree only with inputs far beyond what is known of them: ``learnt`` says which."""
+
+    def __init__(self, words: str, learnt: Learnt) -> None:
+        super().__init__(words)
+        self.learnt = learnt
 
 
 def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> Fused:
@@ -87,8 +101,9 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     Raises
     ------
     DivergenceError
-        Where there is too little to read, or the readings ask for inputs far beyond what is known of them, or the
-        inputs do not settle.
+        Where there is too little to read, or the inputs do not settle.
+    FarInputsError
+        Where the readings ask for inputs far beyond what is known of them.
     """
     told = [e for e in read({}, None) if np.isfinite(e.theta_yz_rad).all(axis=1).sum() >= LEAST_SAMPLES]
     if not told:
@@ -112,9 +127,10 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
             clock = np.abs(new[FILM_CLOCK] - inputs.get(FILM_CLOCK, 0.0)) / sd[size:][problem.place[FILM_CLOCK]]
             moved = max(moved, float(clock.max()))
         if moved < SETTLED_SD and step > 0:
-            _check(new, method)
+            learnt = Learnt(found[size:], covariance[size:, size:], problem.place)
+            _check(new, learnt, method)
             times = max(told, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
-            return _posterior(found, covariance, problem, told, method, times)
+            return _posterior(found, covariance, problem, learnt, told, method, times)
         # Newton's whole steps first, then half steps, which cannot swing to and fro
         part = 1.0 if step < WHOLE_STEPS else 0.5
         inputs = {name: part * x + (1.0 - part) * inputs.get(name, 0.0 * x) for name, x in new.items()}
@@ -244,13 +260,14 @@ def _smoothed(pulse: PulseData, use: BoolArray) -> PulseData:
     return replace(pulse, **moved)
 
 
-def _check(inputs: Inputs, method: str) -> None:
+def _check(inputs: Inputs, learnt: Learnt, method: str) -> None:
     for name, moved in inputs.items():
         worst = float(np.abs(moved).max())
         if not worst <= MOST_INPUT_SD:
-            raise DivergenceError(
+            raise FarInputsError(
                 f"{method}: the readings agree only if {name} is {worst:.0f} standard deviations off what is stated; "
-                "check what the flight and vehicle files say of it, and each method's own answer"
+                "check what the flight and vehicle files say of it, and each method's own answer",
+                learnt,
             )
 
 
@@ -258,6 +275,7 @@ def _posterior(
     found: FloatArray,
     covariance: FloatArray,
     problem: NormalEquations,
+    learnt: Learnt,
     told: list[Evidence],
     method: str,
     t: FloatArray,
@@ -277,15 +295,12 @@ def _posterior(
             cov[:, i, j] = np.sum((value @ block) * value, axis=1)
     words = f"from {', '.join(e.method for e in told)} with what they share; joint as a second-order process"
     history = history_from_lateral(t, theta_yz, cov, method, words)
-    inputs = {
-        name: (found[size:][place], covariance[size:, size:][place, place]) for name, place in problem.place.items()
-    }
     best = int(np.argmin(np.trace(cov, axis1=1, axis2=2)))
-    pick = np.zeros((2 + len(inputs), len(found)))
+    pick = np.zeros((2 + len(problem.place), len(found)))
     pick[0, :m], pick[1, m:size] = value[best], value[best]
     for k, place in enumerate(problem.place.values()):
         pick[2 + k, size + place.start] = 1.0
     joint = pick @ covariance @ pick.T
     sd = np.sqrt(np.diag(joint))
-    names = ("deflection y", "deflection z", *inputs)
-    return Fused(history, inputs, joint / np.outer(sd, sd), names, float(t[best]), problem.deflection(found))
+    names = ("deflection y", "deflection z", *problem.place)
+    return Fused(history, learnt, joint / np.outer(sd, sd), names, float(t[best]), problem.deflection(found))

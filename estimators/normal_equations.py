@@ -26,6 +26,15 @@ Inputs = dict[str, FloatArray]
 
 
 @dataclass(frozen=True)
+class Learnt:
+    """What readings say of all inputs: ``mean`` (k,) and ``covariance`` (k, k) of their unit normals, by place."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    place: dict[str, slice]
+
+
+@dataclass(frozen=True)
 class Spline:
     """Cubic B-spline with even knots."""
 
@@ -35,6 +44,7 @@ class Spline:
 
     @classmethod
     def over(cls, low: float, high: float) -> Spline:
+        """Return the spline whose knots reach from ``low`` to ``high``, s."""
         inner = low + KNOT_S * np.arange(int(np.ceil((high - low) / KNOT_S)) + 1)
         full = np.concatenate([inner[0] - KNOT_S * np.arange(3, 0, -1), inner, inner[-1] + KNOT_S * np.arange(1, 4)])
         return cls(np.asarray(inner), len(full) - 4, np.asarray(full))
@@ -57,6 +67,7 @@ class NormalEquations:
 
     @classmethod
     def of(cls, told: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> NormalEquations:
+        """Return the equations of what methods read at ``inputs``; the spline reaches over ``span_s``."""
         spline = Spline.over(*span_s)
         place: dict[str, slice] = {}
         total = 0

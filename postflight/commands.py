@@ -218,7 +218,7 @@ def print_flight(flight: Flight, events: pd.DataFrame) -> None:
         console.print(escape(flight.attitude.words))
     failed = [v for v in flight.verdicts if not v.passed]
     passed = len(flight.verdicts) - len(failed)
-    console.print(f"{passed} of {len(flight.verdicts)} consistency verdicts pass")
+    console.print(f"{passed} of {len(flight.verdicts)} verdicts on the trajectory pass")
     for verdict in failed:
         numbers = f"{verdict.value:.3g} outside {verdict.low:.3g} to {verdict.high:.3g}"
         console.print(f"[red]verdict[/] {verdict.name}: {verdict.words} ({numbers})")

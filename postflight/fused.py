@@ -10,7 +10,7 @@ import pandas as pd
 
 from estimators.agreement import Agreement, agreement
 from estimators.evidence import FILM_CLOCK, Evidence, evidence_of_history, moved_evidence
-from estimators.fusion import Fused, Read, clock_is_seen, fuse, pulse_reader
+from estimators.fusion import FarInputsError, Fused, Read, clock_is_seen, fuse, pulse_reader
 from estimators.misalignment import misalignment_evidence
 from estimators.pulse import PulseData
 from estimators.southwell import Limbs, southwell_limbs
@@ -19,6 +19,7 @@ from flightmodel.checks import BoolArray, DivergenceError, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 
 OFF_SD = 4.0
+CAMERA_PLANE_SD_RAD = np.deg2rad(1.0)  # of where the camera sits around the axis
 LOOSE_CLOCK_SD_S = 0.3  # of a film's clock that is taken as right, when it is asked whether it is
 
 
@@ -101,7 +102,7 @@ def fuse_flight(
         return trim_evidence(at, joint_station_m, use=use, about_yz_rad=about)
 
     def reader(clock_sd_s: float) -> Read:
-        seen = [] if camera is None else [evidence_of_history(camera, clock_sd_s)]
+        seen = [] if camera is None else [evidence_of_history(camera, clock_sd_s, CAMERA_PLANE_SD_RAD)]
         return pulse_reader(
             pulse, {"misalignment": misalignment_evidence, "trim": trim}, [e for e in seen if len(e.time_s)]
         )
@@ -111,6 +112,8 @@ def fuse_flight(
     read = reader(told_sd_s)
     try:
         fused = fuse(read)
+    except FarInputsError as fault:
+        raise DivergenceError(f"{fault}; {agreement(read({}, None), fault.learnt).words}") from None
     except DivergenceError as fault:
         raise DivergenceError(f"{fault}; {agreement(read({}, None)).words}") from None
     try:
@@ -130,7 +133,7 @@ def fuse_flight(
             clock = _film_clock(fuse(reader(LOOSE_CLOCK_SD_S)), LOOSE_CLOCK_SD_S, False)
         except DivergenceError:
             clock = None  # with a free clock there is no common answer: nothing is said of it
-    return FusedAnswer(fused, agreement(told), limbs, words, clock)
+    return FusedAnswer(fused, agreement(told, fused.learnt, fused.deflection), limbs, words, clock)
 
 
 def _film_clock(fused: Fused, told_sd_s: float, applied: bool) -> FilmClock:

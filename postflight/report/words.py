@@ -29,6 +29,7 @@ HOW = {
 BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "trim": "the trim angle alone"}
 NOT_ASKED = "not asked for in this run"
 SHOWN_ROWS = 200
+SWING_S, SWINGS_SD = 1.0, 4.0
 
 
 def utc(run: Run, time_s: float) -> str:
@@ -78,9 +79,27 @@ def lead(run: Run) -> list[str]:
         f"{peak_words(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
         f"({utc(run, at)} UTC), Mach {place['mach'].iloc[k]:.2f}, {place['alt_m'].iloc[k] / 1e3:.1f} km."
     )
+    swing = swing_words(run)
+    if swing:
+        out.insert(0, swing)
     total = len(run.tables["verdicts"])
-    out.append(f"{s['verdicts_passed']} of {total} consistency verdicts pass.")
+    out.append(f"{s['verdicts_passed']} of {total} verdicts on the trajectory pass.")
     return out
+
+
+def swing_words(run: Run) -> str:
+    """Sentence on a deflection that swings around the peak; empty where one number says it."""
+    best = best_method(run)
+    if best is None:
+        return ""
+    told, table = run.summary["methods"][best], run.tables[f"deflection_{best}"]
+    near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < SWING_S]
+    if len(near) < 2 or near.max() - near.min() < SWINGS_SD * told["sd_deg"]:
+        return ""
+    return (
+        f"It swings: between {near.min():.1f} and {near.max():.1f}° within {SWING_S:.0f} s of that moment; "
+        f"largest {told['largest_deg']:.1f}° at {told['largest_at_s']:.2f} s."
+    )
 
 
 def cards(run: Run) -> list[dict[str, Any]]:

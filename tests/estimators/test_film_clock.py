@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from estimators import normal_equations
 from estimators.evidence import FILM_CLOCK, LIGHT_TIME_S, Evidence, evidence_of_history, forgetful, moved_evidence
 from estimators.fusion import clock_is_seen, fuse, smoothed
 from flightmodel.checks import DivergenceError
