@@ -221,7 +221,7 @@ FAULTS = [
     forces("both triads lost near the end", lost(BOTH, *END_5), END_5, record=(FROM_S, LATER_S)),
     # two clocks contradict each other and nothing tells which is wrong: the answer covers both
     island("radar 20 ms late", late(ISLAND, 0.02), slow=False, during=6.0),
-    # 78 s tell a lone radar's clock against the accelerometer's to 6 ms, the coast before them to 2
+    # 78 s tell a lone radar's clock against the accelerometer's to 6 ms, with the coast before them to 3
     island("lone radar 20 ms late", late(ISLAND, 0.02), without=MAINLAND, record=(COAST_S, TO_S), **ALONE),
     forces("accelerometer 20 ms late", late("accelerometer", 0.02)),
     gyros("gyros 20 ms early", late("rates", -0.02), slow=False),
