@@ -18,35 +18,29 @@ import pandas as pd
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
-from recon import consistency, disagreement, disturbance, ekf, gaps, product, smoother, startup, strapdown
-from recon.beyond_sheet import NOTHING, Learnt, beyond_sheet, sheet_findings, with_wider_priors
+from recon import clock_jumps, consistency, disagreement, disturbance, ekf, gaps, product, startup, triad_clocks
+from recon.beyond_sheet import NOTHING, TIMES, Learnt, beyond_sheet, sheet_findings, with_wider_priors
 from recon.consistency import Verdict
 from recon.disagreement import LeftOut
-from recon.displaced import Displaced
-from recon.disturbance import Disturbance, disturbed, is_lost, widened
 from recon.packed import unpacked
+from recon.passes import iterate
 from recon.problem import Problem
 from recon.settings import Settings
 from recon.setup import Bridges, build_problem
 from recon.shock import doubtful
 from recon.smoother import Smoothed
-from recon.state import ROTATION, States, boxminus
+from recon.state import States, boxminus
 from recon.withheld import withheld_table
 
 __all__ = ["Reconstruction", "Settings", "reconstruct"]
 
 Progress = Callable[[float, str], None]
 EXAMINED_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
-THINNED_STEP_S = 0.5
-MOST_THINNED_PASSES = 6
-FARTHEST_SD = 3.0
-SETTLED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of what it does
 # what states the errors of a ballistic flight's air and vehicle, and what to say where they are larger
 SHEETS = {
     "air": ("sounding", "is further from the sounding than its accuracy allows: check its units, its time and place"),
     "vehicle": ("pre-flight drag", "is larger than stated before flight: check mass, area and coefficients"),
 }
-SETTLED_SD = 0.01  # a pass that moves nothing by more than this part of its sd needs no other
 
 
 @dataclass(frozen=True)
@@ -134,7 +128,7 @@ def reconstruct(
     settings = settings or Settings()
     report = progress or (lambda _fraction, _what: None)
     found = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what))
-    wider = beyond_sheet(found.verdicts, found.sensor_errors)
+    wider = beyond_sheet(found.verdicts, found.sensor_errors) | _clocks_that_differ(telemetry, found)
     if wider:
         found = _with_wider(telemetry, settings, found, wider)
     sources = trackers(telemetry, settings)
@@ -154,6 +148,14 @@ def _with_wider(
     return replace(again, verdicts=found.verdicts, residuals=found.residuals, findings=findings)
 
 
+def _clocks_that_differ(telemetry: Telemetry, found: Reconstruction) -> dict[str, float]:
+    """Standard deviations to take instead of those of the inertial clocks, where they differ by more than stated."""
+    lag, triads = found.learnt.lag, (telemetry.accelerometer, telemetry.rates)
+    if lag is None:
+        return {}
+    return {f"{t.spec.name} time bias": TIMES * abs(lag.lag_s) for t in triads if t is not None}
+
+
 def trackers(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
     """Radars, receivers and barometers that are used."""
     names = (*telemetry.radars, *telemetry.gnss, *telemetry.barometers)
@@ -165,6 +167,7 @@ def _examined(
 ) -> Reconstruction:
     """Reconstruction whose covariance and findings know how far the trackers contradict each other."""
     coarse = min(settings.output_rate_hz, EXAMINED_RATE_HZ)
+    withheld: dict[str, pd.DataFrame] = {}
 
     def unknown(made: Reconstruction) -> int:
         return sum(f.source == disturbance.SOURCE for f in made.findings)
@@ -173,9 +176,20 @@ def _examined(
         report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
         without = replace(settings, without=(*settings.without, source), output_rate_hz=coarse, pulse_rate_hz=0.0)
         other = reconstruct_once(telemetry, without, learnt=found.learnt)
+        withheld[source] = other.withheld
         return other.smoothed, other.verdicts, unknown(other) > unknown(found)
 
     left_out, more = disagreement.leave_each_out(found.smoothed, sources, rerun)
+    denied = disagreement.denied_points(left_out, withheld, found.residuals, settings.gate_probability)
+    if denied:
+        again = reconstruct_once(telemetry, settings, learnt=replace(found.learnt, denied=denied))
+        if all(v.passed for v in again.verdicts) and unknown(again) <= unknown(found):
+            return replace(
+                again,
+                verdicts=disagreement.edited_with_denied(again.verdicts, again.residuals, denied),
+                findings=(*again.findings, *disagreement.denied_findings(denied)),
+                left_out=tuple(replace(s, apart=False) for s in left_out),
+            )
     return replace(
         found,
         smoothed=disagreement.widened_trajectory(found.smoothed, more),
@@ -198,14 +212,15 @@ def reconstruct_once(
     """
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "bridging gaps")
-    bridges = bridge_triads(telemetry, learnt.doubted or ())
-    problem = with_wider_priors(build_problem(telemetry, settings, bridges), learnt.wider)
-    run, smoothed, reference, passes, disturbances = _iterate(problem, settings, report)
-    if learnt.doubted is None:
-        displaced = () if bridges is None else (*bridges.force.displaced, *bridges.rate.displaced)
-        learnt = replace(learnt, doubted=doubtful(problem, run, displaced))
-        if learnt.doubted:
-            return reconstruct_once(telemetry, settings, progress, learnt)
+    bridges = bridge_triads(telemetry, learnt)
+    problem = with_wider_priors(build_problem(telemetry, settings, bridges, learnt.denied), learnt.wider)
+    if bridges is not None:
+        problem = triad_clocks.with_lag(problem, learnt.lag, bridges.force.spec.name, bridges.rate.spec.name)
+    run, smoothed, reference, passes, disturbances = iterate(problem, settings, report)
+    judged = _judged(telemetry, problem, run, bridges, learnt)
+    if judged.jumps != (learnt.jumps or ()) or judged.doubted != (learnt.doubted or ()):
+        return reconstruct_once(telemetry, settings, progress, judged)
+    learnt = judged
 
     report(0.95, "testing consistency")
     mount = _mounting(telemetry, bridges)
@@ -213,8 +228,15 @@ def reconstruct_once(
     verdicts = consistency.source_verdicts(problem, run.innovations, settings.verdict_confidence)
     verdicts += _mcreynolds(problem, run, smoothed, reference)
     verdicts += _sheet_verdicts(problem, table, settings.verdict_confidence)
+    if bridges is not None and learnt.lag is None:
+        lag = triad_clocks.lag_between(bridges.force, bridges.rate, reference, problem.time_s)
+        if lag is not None:
+            verdicts.append(triad_clocks.lag_verdict(lag, bridges.force, bridges.rate, settings.verdict_confidence))
+            learnt = replace(learnt, lag=None if verdicts[-1].passed else lag)
     series = _series(problem, bridges, reference, smoothed)
     found = [] if bridges is None else [*bridges.force.findings, *bridges.rate.findings]
+    if bridges is not None:
+        found += clock_jumps.jump_findings(learnt.jumps or (), (bridges.force.spec.name, bridges.rate.spec.name))
     report(1.0, "done")
     return Reconstruction(
         smoothed=product.datum_trajectory(problem, mount, reference, smoothed.triangles),
@@ -249,12 +271,33 @@ def reconstruct_once(
     )
 
 
-def bridge_triads(telemetry: Telemetry, doubted: tuple[Displaced, ...] = ()) -> Bridges | None:
+def _judged(
+    telemetry: Telemetry, problem: Problem, run: ekf.ForwardPass, bridges: Bridges | None, learnt: Learnt
+) -> Learnt:
+    """What was learnt with clocks that jumped and, once these are set right, readings that are not believed."""
+    if bridges is None or telemetry.accelerometer is None or telemetry.rates is None:
+        return replace(learnt, jumps=(), doubted=())
+    both = bridges.force, bridges.rate
+    if learnt.jumps is None:
+        jumps = clock_jumps.jumps_of_clocks(problem, run, (telemetry.accelerometer, telemetry.rates), both)
+        learnt = replace(learnt, jumps=jumps)
+        if jumps:
+            return learnt
+    if learnt.doubted is None:
+        learnt = replace(learnt, doubted=doubtful(problem, run, (*both[0].displaced, *both[1].displaced)))
+    return learnt
+
+
+def bridge_triads(telemetry: Telemetry, learnt: Learnt = NOTHING) -> Bridges | None:
     """Inertial triads with their gaps bridged, doubted readings with them; None where the flight has none."""
-    if telemetry.accelerometer is None or telemetry.rates is None or telemetry.motion.model == "ballistic":
+    records = telemetry.accelerometer, telemetry.rates
+    if records[0] is None or records[1] is None or telemetry.motion.model == "ballistic":
         return None
-    force, rate = ([d for d in doubted if d.triad == triad] for triad in (0, 1))
-    return Bridges(gaps.bridge(telemetry.accelerometer, 0, tuple(force)), gaps.bridge(telemetry.rates, 1, tuple(rate)))
+    out = []
+    for triad, record in enumerate(r for r in records if r is not None):
+        doubted = tuple(d for d in learnt.doubted or () if d.triad == triad)
+        out.append(gaps.bridge(clock_jumps.mended(record, triad, learnt.jumps or ()), triad, doubted))
+    return Bridges(*out)
 
 
 def _mounting(telemetry: Telemetry, bridges: Bridges | None) -> product.Mounting:
@@ -295,74 +338,3 @@ def _sheet_verdicts(problem: Problem, table: pd.DataFrame, confidence: float) ->
         names = rows["name"].tolist()
         out.append(consistency.sheet_verdict(label, names, estimate, prior_sd, sd, confidence, *bad))
     return [v for v in out if v is not None]
-
-
-def _iterate(
-    problem: Problem, settings: Settings, report: Progress
-) -> tuple[ekf.ForwardPass, Smoothed, States, int, tuple[Disturbance, ...]]:
-    """Filter and smooth: last forward pass, smoothed errors and states, how often it ran, disturbances."""
-    reference = None
-    found: tuple[Disturbance, ...] = ()
-    if settings.passes > 0:
-        report(0.02, "first passes on thinned data")
-        reference, found = first_reference(problem, settings)
-    most = max(1, settings.passes)
-    for i in range(most):
-        share = 0.85 / most
-        report(0.1 + share * i, f"filter, pass {i + 1}")
-        run, found = follow_track(problem, reference, settings, found)
-        report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
-        smoothed = smoother.smooth(problem, run, True, settings.smoother, settings.engine)
-        kept = np.flatnonzero(problem.kept)
-        moved = np.abs(smoothed.x[kept]) / np.sqrt(np.maximum(smoothed.variance, 1e-300))
-        smoothed_states = smoothed.states(run.charts)
-        if moved.max() < SETTLED_SD:
-            break
-        reference = likely(problem, smoothed_states)
-    return run, smoothed, smoothed_states, i + 1, found
-
-
-def follow_track(
-    problem: Problem, reference: States | None, settings: Settings, found: tuple[Disturbance, ...]
-) -> tuple[ekf.ForwardPass, tuple[Disturbance, ...]]:
-    """Forward pass with as many disturbances as it takes to follow the track, and these."""
-    while True:
-        run = ekf.forward(disturbed(problem, found), reference, settings.engine)
-        more = widened(found, problem, run)
-        if more is None:
-            return run, found
-        found = more
-
-
-def likely(problem: Problem, states: States) -> States:
-    """States to linearise about: drivers of ballistic flight no farther than `FARTHEST_SD` from what was stated.
-
-    Drag enters as its logarithm. Seen from a thin, fast flight a parachute asks for a thousandfold drag, and about that
-    the next pass would be stiff and far from any truth; any point serves that later passes bring nearer.
-    """
-    if not problem.motion.ballistic:
-        return states
-    errors, count = states.sensor_errors.copy(), problem.motion.drivers
-    limit = FARTHEST_SD * problem.model.prior_sd[:count]
-    errors[:, :count] = np.clip(errors[:, :count], -limit, limit)
-    return replace(states, sensor_errors=errors)
-
-
-def first_reference(problem: Problem, settings: Settings) -> tuple[States, tuple[Disturbance, ...]]:
-    """Smoothed states at all nodes from a point of each source every `THINNED_STEP_S`, iterated until they stay."""
-    thinned, kept = problem.thinned(THINNED_STEP_S)
-    reference = None
-    found: tuple[Disturbance, ...] = ()
-    for k in range(MOST_THINNED_PASSES):
-        run, found = follow_track(thinned, reference, settings, found)
-        if k == 0 and problem.motion.ballistic and is_lost(thinned, run):
-            # a gap so long that the filter came out of it somewhere else: tracking alone tells where it is
-            reference = startup.along_track(problem.instruments, thinned.time_s, problem.model.size)
-            run, found = follow_track(thinned, reference, settings, ())
-        smoothed = smoother.smooth(thinned, run, False, "rauch-tung-striebel", settings.engine)
-        moved = np.abs(smoothed.x[:, ROTATION]).max() if reference is not None else np.inf
-        reference = likely(problem, smoothed.states(run.charts))
-        if moved < SETTLED_RAD:
-            break
-    assert reference is not None
-    return strapdown.fill_between(problem.motion, problem.node_index, kept, reference), found

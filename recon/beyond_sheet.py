@@ -12,11 +12,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
+from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding
+from recon.clock_jumps import ClockJump
 from recon.consistency import MOST_KEPT_SD, Verdict
 from recon.displaced import Displaced
 from recon.problem import Problem
 from recon.state import KINEMATIC
+from recon.triad_clocks import Lag
 
 SHEET = "data sheet "
 TIMES = 3.0  # what was found: wide enough not to pull, for what was found was already pulled
@@ -32,10 +35,19 @@ class Learnt:
         Errors whose stated standard deviations are too small, and what to take instead.
     doubted : tuple of Displaced or None
         Readings that jump away and back and are not believed; None where that is still to be found out.
+    jumps : tuple of ClockJump or None
+        Of the inertial triads' clocks; None where that is still to be found out.
+    lag : Lag or None
+        Of the accelerometer behind the gyros, where it is more than their sheets allow.
+    denied : dict
+        By name of a tracker, times (k,) of its points that all the rest of the flight contradicts.
     """
 
     wider: dict[str, float] = field(default_factory=dict)
     doubted: tuple[Displaced, ...] | None = None
+    jumps: tuple[ClockJump, ...] | None = None
+    lag: Lag | None = None
+    denied: dict[str, FloatArray] = field(default_factory=dict)
 
 
 NOTHING = Learnt()
@@ -80,8 +92,8 @@ def sheet_findings(table: pd.DataFrame, wider: dict[str, float], start_s: float,
     return [
         Finding(
             name.split()[0],
-            f"{name} of {rows.estimate[name]:.3g} ± {rows.sd[name]:.2g} {rows.unit[name]} is beyond the stated "
-            f"{rows.prior_sd[name]:.2g} {rows.unit[name]}, which was not held on to",
+            f"{name} was found to be {rows.estimate[name]:.3g} ± {rows.sd[name]:.2g} {rows.unit[name]}; the stated "
+            f"{rows.prior_sd[name]:.2g} {rows.unit[name]} was not held on to",
             start_s,
             end_s,
         )

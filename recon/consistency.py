@@ -9,7 +9,7 @@ error, ``estimate / sqrt(prior_sd^2 - sd^2)``, is standard normal where the data
 wrong mounting so well that only this shows it.
 
 A failed verdict is a finding about the data or the model, not an error of the program. Each is two-sided at the
-settings' confidence, so that seventeen verdicts on a good flight are all green 98 times in a hundred (at 0.999).
+settings' confidence, so that eighteen verdicts on a good flight are all green 98 times in a hundred (at 0.999).
 
 References
 ----------

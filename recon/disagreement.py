@@ -7,6 +7,10 @@ lies further away, and in which all else agrees, is another answer that the data
 enlarged by ``e e^T``, and a finding says so. (Where nothing agrees whichever is left out, every one of them is added.)
 Whether the rest agrees without a tracker is evidence for `recon.suspects`.
 
+Where it is one tracker alone without which all else agrees, and the answer lies elsewhere, the others need not follow
+it: its points are judged by the trajectory without it, those beyond the gate are denied, and with the rest of them the
+flight is reconstructed once more. Where everything agrees then, that is the answer, and as sure as it says.
+
 References
 ----------
 J. Hausman, "Specification tests in econometrics", Econometrica 46 (1978) 1251 (the covariance of ``e``).
@@ -18,11 +22,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, difference, resample
-from recon.consistency import Verdict
+from recon.consistency import Verdict, edit_verdict
+from recon.problem import nearest_index
+from recon.product import SAME_STRETCH_S
 
 CONFIDENCE = 0.999
 LEAST_LOST = 0.05  # of its variance that a solution loses by leaving a source out, for the test
@@ -154,3 +161,58 @@ def disagreement_findings(left_out: tuple[LeftOut, ...]) -> list[Finding]:
         for s in left_out
         if s.apart and (s.cures or not cured)
     ]
+
+
+def denied_points(
+    left_out: tuple[LeftOut, ...], withheld: dict[str, pd.DataFrame], residuals: pd.DataFrame, gate: float
+) -> dict[str, FloatArray]:
+    """Times of points beyond the gate of the trajectory without them, by instrument; empty without a lone culprit.
+
+    Parameters
+    ----------
+    left_out : tuple of LeftOut
+    withheld : dict of DataFrame
+        By tracker, `recon.withheld` of the reconstruction without it.
+    residuals : DataFrame
+        With all trackers; where the other table was thinned, a point is judged with the nearest that is there.
+    gate : float
+        Probability of a single component.
+    """
+    from scipy.stats import norm
+
+    cured = [s for s in left_out if s.cures]
+    if len(cured) != 1 or not cured[0].apart:
+        return {}
+    table, source = withheld[cured[0].source], cured[0].source
+    table = table.assign(far=table.residual.abs() > norm.ppf(0.5 * (1.0 + gate)) * table.predicted_sd)
+    out = {}
+    for name, rows in table.groupby("source"):
+        if str(name) == source or str(name).startswith(f"{source} "):
+            judged = rows.groupby("time_s").far.any()
+            times = np.unique(residuals.time_s[residuals.source == name])
+            out[str(name)] = times[judged.to_numpy()[nearest_index(judged.index.to_numpy(), times)]]
+    return {name: times for name, times in out.items() if len(times)}
+
+
+def edited_with_denied(
+    verdicts: tuple[Verdict, ...], residuals: pd.DataFrame, denied: dict[str, FloatArray]
+) -> tuple[Verdict, ...]:
+    """Verdicts in which points that were denied count as edited."""
+    again = {}
+    for name, times in denied.items():
+        mine = residuals[residuals.source == name].drop_duplicates("time_s")
+        at = mine.time_s.to_numpy()
+        out = np.abs(times[nearest_index(times, at)] - at) < 1e-5
+        offered = mine.used.to_numpy() | out
+        again[f"edited {name}"] = edit_verdict(name, (mine.accepted.to_numpy() & ~out)[offered])
+    return tuple(again.get(v.name, v) for v in verdicts)
+
+
+def denied_findings(denied: dict[str, FloatArray]) -> list[Finding]:
+    """One finding for each stretch of denied points."""
+    out = []
+    for name, times in denied.items():
+        for part in np.split(times, np.flatnonzero(np.diff(times) > SAME_STRETCH_S) + 1):
+            words = f"{len(part)} track points contradict all else, with which the rest of its points agree: not used"
+            out.append(Finding(name, words, float(part[0]), float(part[-1])))
+    return out

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -26,6 +28,7 @@ from recon.state import BoolArray, IntArray
 TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT)
 PULSE_CELL_S, LEAST_PULSE_MPS2 = 0.5, 5.0
 ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
+NONE: Mapping[str, FloatArray] = MappingProxyType({})
 BALLISTIC_STEP_S = 0.5  # drivers stand still within a step, and forget in seconds and kilometres
 
 
@@ -37,8 +40,10 @@ class Bridges:
     rate: Bridged
 
 
-def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | None) -> Problem:
-    """Everything that the filter needs.
+def build_problem(
+    telemetry: Telemetry, settings: Settings, bridges: Bridges | None, denied: Mapping[str, FloatArray] = NONE
+) -> Problem:
+    """Everything that the filter needs; points of a source at its ``denied`` times are predicted, never used.
 
     Raises
     ------
@@ -48,7 +53,7 @@ def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | N
     arm = _accelerometer_arm(bridges)
     instruments = tracking_instruments(telemetry, settings, arm)
     model = _named_model(telemetry, settings, bridges, instruments)
-    used = tuple(i for i in instruments if not _left_out(i, settings))
+    used = tuple(_believed(i, denied) for i in instruments if not _left_out(i, settings))
     start_s, end_s = _span(used, settings, bridges)
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
     if bridges is not None and settings.pulse_rate_hz > settings.output_rate_hz:
@@ -75,7 +80,20 @@ def build_problem(telemetry: Telemetry, settings: Settings, bridges: Bridges | N
     kept: BoolArray = np.zeros(len(time_s), dtype=bool)
     kept[nearest_index(time_s, output_s)] = True
     problem = Problem(time_s, node_index, motion, model, instruments, row, observed, start, covariance, gate, kept)
-    return problem.without(_only_predicted(problem, settings))
+    return problem.without(_only_predicted(problem, settings, denied))
+
+
+def _believed(instrument: Instrument, denied: Mapping[str, FloatArray]) -> Instrument:
+    """Instrument without what it measured at denied times."""
+    keep = ~_at_any(instrument.time_s, denied.get(instrument.name))
+    parts = {name: getattr(instrument, name)[keep] for name in ("time_s", "value", "variance", "known")}
+    return replace(instrument, **parts)
+
+
+def _at_any(time_s: FloatArray, times: FloatArray | None) -> BoolArray:
+    if times is None or len(times) == 0:
+        return np.zeros(len(time_s), dtype=bool)
+    return np.asarray(np.abs(times[nearest_index(times, time_s)] - time_s) <= SAME_INSTANT_S)
 
 
 def _left_out(instrument: Instrument, settings: Settings) -> bool:
@@ -107,13 +125,13 @@ def _named_model(
     return model
 
 
-def _only_predicted(problem: Problem, settings: Settings) -> BoolArray:
-    """Measurements (M,) that check the trajectory: of whole sources, of oversampled ones, of spans, and every n-th."""
+def _only_predicted(problem: Problem, settings: Settings, denied: Mapping[str, FloatArray]) -> BoolArray:
+    """Measurements (M,) that check the trajectory: whole sources, oversampled and denied ones, spans, every n-th."""
     out: BoolArray = np.zeros(len(problem.row), dtype=bool)
     at = problem.time_s[problem.node]
     for number, i in enumerate(problem.instruments):
         mine = np.flatnonzero(problem.observed.source == number)
-        out[mine] = _left_out(i, settings)
+        out[mine] = _left_out(i, settings) | _at_any(at[mine], denied.get(i.name))
         if i.kind not in TRACKING:
             continue
         out[mine] |= ~spaced(at[mine], i.every_s)

@@ -66,9 +66,11 @@ def doubtful(problem: Problem, run: ForwardPass, displaced: tuple[Displaced, ...
     return tuple(out)
 
 
-def window_scores(problem: Problem, run: ForwardPass, begin: IntArray, end: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Scores (w, 6) of constant offsets of both triads in the steps ``begin`` to ``end``, and covariances (w, 6, 6)."""
-    score, variance = np.zeros((len(begin), len(BIASES))), np.zeros((len(begin), len(BIASES), len(BIASES)))
+def window_scores(
+    problem: Problem, run: ForwardPass, begin: IntArray, end: IntArray, columns: IntArray = BIASES
+) -> tuple[FloatArray, FloatArray]:
+    """Scores (w, c) of constant offsets of ``columns`` in the steps ``begin`` to ``end``, and covariances (w, c, c)."""
+    score, variance = np.zeros((len(begin), len(columns))), np.zeros((len(begin), len(columns), len(columns)))
     if not len(begin):
         return score, variance
     order = np.argsort(-end, kind="stable")
@@ -76,7 +78,7 @@ def window_scores(problem: Problem, run: ForwardPass, begin: IntArray, end: IntA
     most = int(((first[:, None] <= first) & (last[:, None] >= first)).sum(axis=0).max())
     some, more = score.copy(), variance.copy()
     _shock_kernels.window_scores(
-        run.steps, problem.observed, problem.sources().slot, run.innovations, BIASES, first, last, most, some, more
+        run.steps, problem.observed, problem.sources().slot, run.innovations, columns, first, last, most, some, more
     )
     score[order], variance[order] = some, more
     return score, variance

@@ -17,6 +17,7 @@ from recon.disagreement import LeftOut, is_about
 
 INERTIAL = ("accelerometer", "rates")
 ATTITUDE = "attitude check"
+CLOCKS = "clocks of "
 AIR = ("sounding", "pre-flight", "air residuals")
 
 
@@ -25,6 +26,7 @@ def suspects(verdicts: tuple[Verdict, ...], left_out: tuple[LeftOut, ...]) -> tu
     red = [v for v in verdicts if not v.passed]
     sheets = [v for v in red if v.name.startswith("data sheet ")]
     inertial = [v for v in sheets if v.name.removeprefix("data sheet ") in INERTIAL]
+    inertial += [v for v in red if v.name.startswith(CLOCKS)]
     out = _trackers(red, left_out, inertial) if any(is_about(v, s.source) for v in red for s in left_out) else []
     if not out and not left_out:
         out += _lone_trackers(red)
@@ -73,7 +75,7 @@ def _lone_trackers(red: list[Verdict]) -> list[str]:
 
 
 def _inertial(sheets: list[Verdict]) -> str:
-    worst = max(sheets, key=lambda v: v.value / max(v.high, np.finfo(float).tiny))
+    worst = max(sheets, key=lambda v: abs(v.value) / max(v.high, np.finfo(float).tiny))
     if " mount " in worst.words:
         names = " or ".join(v.words.split(" is larger")[0] for v in sheets if " mount " in v.words)
         return f"inertial sensors: {names}; the mounts of accelerometer and gyros are seen only against each other"

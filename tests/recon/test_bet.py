@@ -61,7 +61,7 @@ def test_flight_teaches_about_its_sensors(ensemble):
 
 def test_matched_flights_get_green_verdicts(ensemble):
     red = [v for r, _ in ensemble for v in r.verdicts if not v.passed]
-    assert not red  # 17 verdicts at 99.9 % in 8 flights: one red in eight such ensembles; the seeds are fixed
+    assert not red  # 17 or 18 verdicts at 99.9 % in 8 flights: one red in eight such ensembles; the seeds are fixed
 
 
 def test_corrected_specific_force_is_within_its_covariance(ensemble, mini_truth):

@@ -3,13 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from flightmodel.telemetry import RadarRecord
 from flightmodel.trajectory import difference
 from recon.bet import Settings, reconstruct, reconstruct_once
 from recon.consistency import verdict
-from recon.disagreement import LeftOut, is_about
+from recon.disagreement import LeftOut, denied_findings, denied_points, edited_with_denied, is_about
 from recon.suspects import suspects
 
 FAST = Settings(output_rate_hz=5.0)
@@ -141,3 +142,38 @@ def test_air_comes_last():
 
 def test_motion_is_named_where_nothing_else_is():
     assert suspects((red("filter-smoother attitude"),), ())[0].startswith("the motion")
+
+
+# ------------------------------------------------------------------------------------------------- points denied
+
+
+def table(source, time_s, residual):
+    rows = {"time_s": time_s, "source": source, "component": "range", "residual": residual, "predicted_sd": 1.0}
+    return pd.DataFrame(rows | {"accepted": np.abs(residual) < 5.0, "used": True})
+
+
+def test_points_of_a_lone_culprit_are_judged_by_the_rest():
+    t = np.arange(100.0)
+    off = np.where((t >= 20.0) & (t < 30.0) | (t == 50.0), 40.0, 0.5)
+    residuals = pd.concat([table("gps", t, 0.0 * t), table("gps2", t, off)])
+    judged = residuals.assign(residual=np.concatenate([off, off]))
+    thinned = judged[judged.time_s % 2 == 0]
+    lone = (LeftOut("gps", (), 300.0, True), LeftOut("gps2", (red("NIS gps"),)))
+    for seen in (judged, thinned):
+        denied = denied_points(lone, {"gps": seen}, residuals, 0.9999)
+        assert list(denied) == ["gps"]
+        assert set(range(21, 29)) | {50} <= set(denied["gps"]) <= set(range(19, 31)) | {49, 50, 51}
+    denied = denied_points(lone, {"gps": judged}, residuals, 0.9999)
+    assert [(f.source, f.start_s, f.end_s) for f in denied_findings(denied)] == [("gps", 20, 29), ("gps", 50, 50)]
+    verdicts = (verdict("edited gps", 0.0, 0.0, 0.05, "none", "many"), red("NIS gps2"))
+    edited, other = edited_with_denied(verdicts, residuals, denied)
+    assert (edited.value, edited.passed, other) == (pytest.approx(0.11), False, verdicts[1])
+
+
+def test_points_are_denied_to_none_where_two_cure_or_none_lies_apart():
+    t = np.arange(10.0)
+    far = {name: table(name, t, 40.0 + 0.0 * t) for name in ("north", "west")}
+    both = (LeftOut("north", (), 300.0, True), LeftOut("west", (), 300.0, True))
+    near = (LeftOut("north", (), 3.0), LeftOut("west", (red("NIS north"),)))
+    for left_out in (both, near):
+        assert denied_points(left_out, far, pd.concat(far.values()), 0.9999) == {}

@@ -33,6 +33,7 @@ needs_data = [
 # what an analyst wrote down of a flight's traps, taken out again
 ALL_TIMES = (r"(?m)^use_s = .*\n", "")
 THRUST_UNTOLD = (r"(?m)^powered_s.*\n", "")
+DRAG = "drag_area_per_mass_m2pkg = {:.9f}"
 DISTURBED_UNTOLD = (r"(?m)^\[\[motion\.disturbed\]\]\n(.+\n){3}", "")
 
 
@@ -105,6 +106,12 @@ POSITION, ATTITUDE = slice(0, 3), slice(6, 9)
 class TestPrometheus:
     def test_every_verdict_is_green(self, fly):
         assert not red(fly("rocketpy_prometheus"))
+
+    @pytest.mark.parametrize("mass", [0.99, 1.01])
+    def test_a_mass_that_differs_by_a_hundredth_hardly_moves_it(self, fly, mass):
+        other = fly("rocketpy_prometheus", (r"(?m)^drag_area_per_mass_m2pkg = 0\.012$", DRAG.format(0.012 / mass)))
+        assert not red(other)
+        assert largest_difference(fly("rocketpy_prometheus"), other) < 1.0
 
     def test_apogee_is_what_the_receiver_itself_says(self, fly):
         t, h = heights(fly("rocketpy_prometheus"))
