@@ -1,9 +1,10 @@
 """Errors of the virtual camera over many films, and how often its standard deviations cover them.
 
-    python benchmarks/video_coverage.py [clean | degraded] [flights]
+    python benchmarks/video_coverage.py [clean | unbent | degraded] [flights]
 
 Every flight has a camera, a light and bendings of its own; its benchmark frame is bent by 0.12 deg an axis that nobody
-is told. ``clean``: a lens known to a data sheet's tolerances. ``degraded``: a lens nobody calibrated, the Earth behind
+is told. ``clean``: a lens known to a data sheet's tolerances. ``unbent``: the same with a benchmark frame that is truly
+not bent, which shows what pictures alone leave. ``degraded``: a lens nobody calibrated, the Earth behind
 the rim, interlace, noise, compression, a shell out of shape (tests/estimators/test_degraded_video.py).
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -26,10 +28,10 @@ from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D,
 from tests.estimators.test_degraded_video import TIMES, UNCALIBRATED, degraded
 
 
-def clean(seed: int) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+def clean(seed: int, at_rest_deg: float = 0.12) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Three frames with their truth (theta, plane)."""
     rng = np.random.default_rng(seed)
-    rest = D(0.12) * rng.standard_normal(2)
+    rest = D(at_rest_deg) * rng.standard_normal(2)
     theta = np.array([np.hypot(*rest), D(rng.uniform(3.0, 4.8)), D(rng.uniform(3.0, 4.8))])
     plane = np.array([np.arctan2(rest[1], -rest[0]), D(rng.uniform(0.0, 360.0)), D(rng.uniform(153.0, 240.0))])
     light = np.stack([sun(rng.uniform(0.0, 360.0), rng.uniform(50.0, 70.0)) for _ in TIMES])
@@ -40,8 +42,9 @@ def one_flight(job: tuple[str, int]) -> tuple[int, list[tuple[float, ...]], str]
     """Error of angle and plane with their sd, deg, of both bent frames of a flight; a reason where it was refused."""
     kind, seed = job
     cv2.setNumThreads(1)
-    frames, theta, plane = clean(seed) if kind == "clean" else degraded(seed)
-    mount = MOUNT if kind == "clean" else UNCALIBRATED
+    makers = {"clean": clean, "unbent": partial(clean, at_rest_deg=0.0), "degraded": degraded}
+    frames, theta, plane = makers[kind](seed)
+    mount = UNCALIBRATED if kind == "degraded" else MOUNT
     try:
         history = deflection_from_frames(TIMES, frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None)
     except GateError as fault:

@@ -3,14 +3,19 @@
     python benchmarks/virtual_camera.py
 
 Peers: scipy's least squares over OpenCV's fisheye projection, given the edge points and marks that ours must find
-first, and the same eight unknowns; trimesh with embreex (one ray a pixel), and open3d where it is installed.
+first, with five unknowns (ours has nine); the same rasteriser in plain C++ (needs g++); trimesh with embreex (one ray a
+pixel), and open3d where it is installed. Jobs take turns; times are minima, of the wall and of the processor with all
+threads.
 """
 
 from __future__ import annotations
 
+import ctypes
+import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,19 +33,31 @@ from estimators.horizon import find_horizon
 from estimators.raster import render
 from estimators.seen import found_marks
 from flightmodel import rotations
+from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.film import film_frames
 from flightmodel.geometry import torus_limb
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
 
+SOURCE = Path(__file__).parent / "plain_cpp" / "raster.cpp"
+ROUNDS, FRAMES = 25, 500
 
-def best(job: Callable[[], object], repeats: int = 9) -> float:
-    """Shortest time of a job, ms."""
-    times = []
+
+def rounds(jobs: dict[str, Callable[[], object]], repeats: int) -> dict[str, tuple[float, float]]:
+    """Shortest wall and processor time of jobs that take turns, ms."""
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in jobs}
     for _ in range(repeats):
-        start = time.perf_counter()
-        job()
-        times.append(time.perf_counter() - start)
-    return 1e3 * min(times)
+        for name, job in jobs.items():
+            wall, worked = time.perf_counter(), time.process_time()
+            job()
+            times[name].append((time.perf_counter() - wall, time.process_time() - worked))
+    return {name: (1e3 * min(w for w, _ in t), 1e3 * min(c for _, c in t)) for name, t in times.items()}
+
+
+def told(measured: dict[str, tuple[float, float]], ours: str) -> None:
+    """Print times, and how many times ours they are."""
+    for name, (wall, worked) in measured.items():
+        ratios = f"{wall / measured[ours][0]:6.2f} {worked / measured[ours][1]:6.2f}"
+        print(f"  {name:42} wall {wall:7.2f} ms, processor {worked:7.2f} ms; of ours {ratios}", flush=True)
 
 
 def scipy_fit(oriented, image) -> Callable[[], object]:
@@ -76,57 +93,113 @@ def scipy_fit(oriented, image) -> Callable[[], object]:
     return lambda: least_squares(residuals, np.zeros(5), x_scale=[0.05, 0.05, 1, 1, 1], loss="huber")
 
 
-def main() -> None:
-    """Measure and print."""
-    cv2.setNumThreads(1)
+def fit_jobs() -> dict[str, Callable[[], object]]:
     frames = film(0, [0.0, 4.1], [0.0, 188.0])
     oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
     start = oriented.fit(frames[1]).rotation_yz_rad
-    ours = best(lambda: oriented.fit(frames[1], None, start), 30)
-    peer = best(scipy_fit(oriented, frames[1]), 15)
-    print(f"fit of a frame, search included: {ours:.2f} ms")
-    print(f"scipy over OpenCV, points given: {peer:.2f} ms; {peer / ours:.1f}x")
+    return {
+        "ours, edge and marks searched for": lambda: oriented.fit(frames[1], None, start),
+        "scipy over OpenCV, points given": scipy_fit(oriented, frames[1]),
+    }
 
+
+def time_a_film() -> None:
+    """Five hundred frames, decoding included, and decoding alone."""
+    frames = film(0, [0.0, 4.1], [0.0, 188.0])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.avi"
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (720, 480))
-        for k in range(500):
+        for k in range(FRAMES):
             writer.write(cv2.cvtColor(frames[min(k, 1)], cv2.COLOR_GRAY2BGR))
         writer.release()
-        times = 421.0 + 0.1 * np.arange(500)
-        begin = time.perf_counter()
-        for _ in film_frames(path, list(range(500))):
-            pass
-        decoded = time.perf_counter() - begin
-        begin = time.perf_counter()
-        pictures = film_frames(path, list(range(500)))
-        deflection_from_frames(times, pictures, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None, benchmark=frames[0])
-        print(f"500 frames of a film: {time.perf_counter() - begin:.2f} s, of it decoding {decoded:.2f} s")
+        times = 421.0 + 0.1 * np.arange(FRAMES)
 
-    shell = trimesh.creation.torus(1.2, 0.25, major_sections=160, minor_sections=62)
+        def pictures():
+            return film_frames(path, list(range(FRAMES)))
+
+        def estimate():
+            deflection_from_frames(times, pictures(), GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None, benchmark=frames[0])
+
+        told(
+            rounds({f"{FRAMES} frames": estimate, "of it decoding": lambda: deque(pictures(), 0)}, 3),
+            f"{FRAMES} frames",
+        )
+
+
+def fine_torus(across: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a torus around the camera's view, ``2 * 160 * across`` triangles or so."""
+    shell = trimesh.creation.torus(1.1, 0.6, major_sections=160, minor_sections=across)
     axes = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    mesh = trimesh.Trimesh(np.asarray(shell.vertices) @ axes.T + [-0.4, 0.0, 0.0], shell.faces, process=False)
-    camera = oriented.view.camera
-    v, u = np.indices((480, 720), dtype=float)
+    return np.ascontiguousarray(np.asarray(shell.vertices) @ axes.T + [-0.4, 0.0, 0.0]), np.asarray(shell.faces)
+
+
+def plain_cpp(camera: Camera, vertices: np.ndarray, faces: np.ndarray, folder: str) -> Callable[[], np.ndarray]:
+    """The C++ rasteriser, ready to run; it returns the picture of faces."""
+    target = Path(folder) / "raster.so"
+    flags = ["-std=c++17", "-O3", "-march=native", "-shared", "-fPIC"]
+    subprocess.run(["g++", *flags, str(SOURCE), "-o", str(target)], check=True)
+    run = ctypes.CDLL(str(target)).raster
+    doubles, longs = ctypes.POINTER(ctypes.c_double), ctypes.POINTER(ctypes.c_long)
+    lens = (camera.focal_px, camera.centre_px, camera.distortion, camera.position_body_m, camera.dcm_cam_body)
+    kept = [np.ascontiguousarray(part, dtype=float) for part in lens]
+    shape = (camera.height_px, camera.width_px)
+
+    def job() -> np.ndarray:
+        depth, nearest = np.full(shape, np.inf), np.full(shape, -1, dtype=np.int64)
+        run(
+            vertices.ctypes.data_as(doubles), ctypes.c_long(len(vertices)),
+            faces.ctypes.data_as(longs), ctypes.c_long(len(faces)),
+            *(part.ctypes.data_as(doubles) for part in kept), ctypes.c_double(camera.half_field_rad),
+            ctypes.c_long(shape[1]), ctypes.c_long(shape[0]),
+            depth.ctypes.data_as(doubles), nearest.ctypes.data_as(longs),
+        )  # fmt: skip
+        return nearest
+
+    return job
+
+
+def ray_casters(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> dict[str, Callable[[], object]]:
+    """One ray a pixel through embree, by trimesh and by open3d where that is installed."""
+    v, u = np.indices((camera.height_px, camera.width_px), dtype=float)
     rays = camera.rays_body(np.column_stack([u.ravel(), v.ravel()]))
     rays = rays[np.isfinite(rays[:, 0])]
     eyes = np.tile(camera.position_body_m, (len(rays), 1))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert trimesh.ray.has_embree
     mesh.ray.intersects_first(eyes[:10], rays[:10])
-    ours = best(lambda: render(camera, mesh.vertices, mesh.faces))
-    peer = best(lambda: mesh.ray.intersects_first(eyes, rays), 5)
-    print(f"render of {len(mesh.faces)} triangles, 720 x 480: {ours:.1f} ms")
-    print(f"trimesh with embreex: {peer:.0f} ms; {peer / ours:.1f}x")
+    jobs: dict[str, Callable[[], object]] = {"trimesh with embreex": lambda: mesh.ray.intersects_first(eyes, rays)}
     try:
         import open3d
     except ImportError:
         print("open3d is not installed")
-        return
+        return jobs
     scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.uint32))
+    scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
     both = open3d.core.Tensor(np.column_stack([eyes, rays]).astype(np.float32))
-    peer = best(lambda: scene.cast_rays(both), 5)
-    print(f"open3d {peer:.1f} ms; {peer / ours:.1f}x")
+    jobs["open3d, all cores"] = lambda: scene.cast_rays(both)
+    jobs["open3d, one thread"] = lambda: scene.cast_rays(both, 1)
+    return jobs
+
+
+def main() -> None:
+    """Measure and print."""
+    cv2.setNumThreads(1)
+    print("fit of a frame")
+    told(rounds(fit_jobs(), ROUNDS), "ours, edge and marks searched for")
+    print("a film")
+    time_a_film()
+    mount = MOUNT.model_copy(update={"width_px": 640, "height_px": 480, "centre_px": (320.0, 240.0)})
+    camera = camera_from_mount(mount)
+    for across in (63, 313):
+        vertices, faces = fine_torus(across)
+        with tempfile.TemporaryDirectory() as folder:
+            theirs = plain_cpp(camera, vertices, faces, folder)
+            picture = render(camera, vertices, faces)
+            same = np.mean(theirs() == picture.face)
+            print(f"{len(faces)} triangles, fisheye of 640 x 480, {100 * picture.is_hit.mean():.0f} % covered; "
+                  f"C++ sees the same face in {100 * same:.2f} % of the pixels")  # fmt: skip
+            jobs = {"ours": lambda v=vertices, f=faces: render(camera, v, f), "plain C++": theirs}
+            told(rounds(jobs | ray_casters(camera, vertices, faces), ROUNDS), "ours")
 
 
 if __name__ == "__main__":

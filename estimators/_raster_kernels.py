@@ -9,6 +9,7 @@ import numpy as np
 from estimators._sight_kernels import FISHEYE
 from flightmodel._kernels import inlined, kernel
 
+WIDE_PX = 8
 BORDER_COS = math.cos(math.radians(0.5))
 
 
@@ -32,6 +33,16 @@ def pixel_of(x, y, z, lens):
 
 
 @inlined
+def cut(value, per_step, first, last):
+    """Part of ``first`` to ``last`` in which ``value + k / per_step`` is not negative; all of it for no step."""
+    if per_step > 0.0:
+        first = max(first, -value * per_step)
+    elif per_step < 0.0:
+        last = min(last, -value * per_step)
+    return first, last
+
+
+@inlined
 def fill(ax, ay, bx, by, cx, cy, da, db, dc, face, depth, nearest):
     """Enter one triangle at the pixel centres it covers, where it is the closest so far."""
     h, w = depth.shape
@@ -43,10 +54,23 @@ def fill(ax, ay, bx, by, cx, cy, da, db, dc, face, depth, nearest):
         # barycentric coordinates are linear: start of a row, and step along it
         step_b, step_c = (cy - ay) * per, (ay - by) * per
         j0, j1 = math.ceil(max(left, 0.0)), math.floor(min(right, w - 1.0))
+        # of a wide triangle most of the box around it is empty: its part of each row is worked out
+        wide = j1 - j0 >= WIDE_PX
+        per_b = 1.0 / step_b if abs(step_b) > 1e-12 else 0.0
+        per_c = 1.0 / step_c if abs(step_c) > 1e-12 else 0.0
+        per_a = -1.0 / (step_b + step_c) if abs(step_b + step_c) > 1e-12 else 0.0
         for i in range(math.ceil(max(top, 0.0)), math.floor(min(bottom, h - 1.0)) + 1):
             share_b = ((j0 - ax) * (cy - ay) - (i - ay) * (cx - ax)) * per
             share_c = ((bx - ax) * (i - ay) - (by - ay) * (j0 - ax)) * per
-            for j in range(j0, j1 + 1):
+            first, last = 0.0, j1 - j0 + 0.0
+            if wide:
+                first, last = cut(share_b, per_b, first, last)
+                first, last = cut(share_c, per_c, first, last)
+                first, last = cut(1.0 - share_b - share_c, per_a, first, last)
+                first, last = math.floor(max(first, 0.0)), math.ceil(min(last, j1 - j0 + 0.0))
+                share_b += first * step_b
+                share_c += first * step_c
+            for j in range(j0 + int(first), j0 + int(last) + 1):
                 if share_b >= -1e-9 and share_c >= -1e-9 and share_b + share_c <= 1.0 + 1e-9:
                     here = da + share_b * (db - da) + share_c * (dc - da)
                     if here < depth[i, j]:
@@ -57,12 +81,16 @@ def fill(ax, ay, bx, by, cx, cy, da, db, dc, face, depth, nearest):
 
 
 @kernel
-def raster(vertices, faces, lens, widest_cos, deepest, depth, nearest):
+def raster(vertices, faces, lens, sight, widest, deepest, depth, nearest):
     """Write into ``depth (h, w)`` and ``nearest (h, w)`` the distance and index of the closest face at pixel centres.
 
     ``vertices (n, 3)`` in body axes; ``lens`` as in `estimators._sight_kernels.project_shell`. A face that spans more
-    than ``acos(widest_cos)`` is halved across its widest side, again and again, ``deepest`` times at the most.
+    than ``widest`` is halved across its widest side, again and again, ``deepest`` times at the most; what lies farther
+    than ``sight`` from the optical axis is not in the picture.
     """
+    widest_cos = math.cos(widest)
+    # where the picture ends well within the lens's field, that field's border needs no care
+    border_cos = BORDER_COS if lens[1] - widest < sight else widest_cos
     position, axes = lens[5], lens[6]
     field_cos = math.cos(lens[1])
     n = len(vertices)
@@ -105,19 +133,19 @@ def raster(vertices, faces, lens, widest_cos, deepest, depth, nearest):
                 length[m] = math.sqrt(t[m, 0] ** 2 + t[m, 1] ** 2 + t[m, 2] ** 2) + 1e-300
                 spread = min(spread, (mx * t[m, 0] + my * t[m, 1] + mz * t[m, 2]) / (mid * length[m]))
                 inside += 1 if t[m, 2] > field_cos * length[m] else 0
-            if spread > 0.5 and math.acos(max(min(mz / mid, 1.0), -1.0)) - math.acos(spread) > lens[1]:
+            if spread > 0.5 and math.acos(max(min(mz / mid, 1.0), -1.0)) - math.acos(spread) > sight:
                 continue
-            widest, side = 2.0, 0
+            side_cos, side = 2.0, 0
             for m in range(3):
                 q = (m + 1) % 3
                 dot = (t[m, 0] * t[q, 0] + t[m, 1] * t[q, 1] + t[m, 2] * t[q, 2]) / (length[m] * length[q])
-                if dot < widest:
-                    widest, side = dot, m
+                if dot < side_cos:
+                    side_cos, side = dot, m
             # across the border of the field it is halved on to a pixel or so, so that the border is kept to
-            limit = widest_cos if inside == 0 or inside == 3 else BORDER_COS
-            if here >= deepest or widest > limit:
+            limit = widest_cos if inside == 0 or inside == 3 else border_cos
+            if here >= deepest or side_cos > limit:
                 # what is still wide after that is closer than a picture can show
-                if inside == 3 and widest > widest_cos:
+                if inside == 3 and side_cos > widest_cos:
                     ax, ay = pixel_of(t[0, 0], t[0, 1], t[0, 2], lens)
                     bx, by = pixel_of(t[1, 0], t[1, 1], t[1, 2], lens)
                     cx, cy = pixel_of(t[2, 0], t[2, 1], t[2, 2], lens)

@@ -182,6 +182,33 @@ def feet(found, vertex, jacobian, residual, rows, at):
             rows[i, c] = (1.0 - share) * here + share * there
 
 
+@inlined
+def turn(wy, wz, rotation, left):
+    """Rotation matrix of a rotation vector ``(0, wy, wz)`` and the y and z columns of its left Jacobian."""
+    angle2 = wy * wy + wz * wz
+    angle = math.sqrt(angle2)
+    if angle < 1e-6:
+        s, c, t = 1.0, 0.5, 1.0 / 6.0
+    else:
+        s, c = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
+        t = (angle - math.sin(angle)) / (angle2 * angle)
+    # the cross product matrix K and its square
+    k = ((0.0, -wz, wy), (wz, 0.0, 0.0), (-wy, 0.0, 0.0))
+    k2 = ((-angle2, 0.0, 0.0), (0.0, -wz * wz, wy * wz), (0.0, wy * wz, -wy * wy))
+    for i in range(3):
+        for j in range(3):
+            one = 1.0 if i == j else 0.0
+            rotation[i, j] = one + s * k[i][j] + c * k2[i][j]
+            if j > 0:
+                left[i, j - 1] = one + c * k[i][j] + t * k2[i][j]
+
+
+@kernel
+def turned(wy, wz, rotation, left):
+    """`turn` for callers in Python."""
+    turn(wy, wz, rotation, left)
+
+
 @kernel
 def project_shell(points, bend, lens, pixels, jacobian):
     """`project_points` for callers in Python."""

@@ -13,7 +13,8 @@ Sources: seed paper, CAD-based estimate, Table 2.1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,14 +98,29 @@ def deflection_from_frames(
     axis = None if plane_lv_rad is None else axis_of(plane_lv_rad)
     fits: list[FrameFit] = []
     start = np.zeros(2)
-    for picture in frames:
+    for picture in _decoded_ahead(frames):
         if progress is not None and len(fits) % 10 == 0:
             progress(min(len(fits) / len(times), 1.0), f"frame {len(fits) + 1} of {len(times)}")
-        fits.append(oriented.fit(read_frame(picture), axis, start))
+        fits.append(oriented.fit(picture, axis, start))
         start = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad
     if len(fits) != len(times):
         raise GateError(f"{len(times)} frame times for {len(fits)} frames")
     return _history(times, fits, oriented, times[nearest], plane_lv_rad, plane_sd_rad)
+
+
+def _decoded_ahead(frames: Iterable[Image | str | Path]) -> Iterator[Image]:
+    """Pictures of frames, the next one decoded while this one is looked at."""
+    source = iter(frames)
+
+    def following() -> Image | None:
+        picture = next(source, None)
+        return None if picture is None else read_frame(picture)
+
+    with ThreadPoolExecutor(1) as decoder:
+        coming = decoder.submit(following)
+        while (picture := coming.result()) is not None:
+            coming = decoder.submit(following)
+            yield picture
 
 
 def benchmark_index(times_s: FloatArray, benchmark_time_s: float) -> int:

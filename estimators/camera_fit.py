@@ -130,6 +130,18 @@ class _Solution:
     rms_px: float
 
 
+@dataclass(frozen=True)
+class _Points:
+    """Edge points, which come first, and marks at the end of a fit; ``benchmark_at``: their rows there."""
+
+    residual_px: FloatArray
+    rows: FloatArray
+    shape: FloatArray
+    weight: FloatArray
+    benchmark_at: NDArray[np.intp]
+    edge_points: int
+
+
 def _has(found: tuple[FloatArray, FloatArray]) -> NDArray[np.intp]:
     """Rows of marks that were found."""
     return np.flatnonzero(np.isfinite(found[1]))
@@ -233,7 +245,7 @@ class OrientedCamera:
             edge_alone = bending.copy()
             try:
                 if coarse.is_usable:
-                    self._solve(coarse, None, edge_alone, np.eye(2), np.inf)
+                    self._fit_points(coarse, None, edge_alone, np.eye(2))
                     guesses.append(edge_alone)
                     found.append(found_marks(self.view, self.marks, image, edge_alone, REACH_PX))
             except NoFitError as fault:
@@ -249,7 +261,7 @@ class OrientedCamera:
         best = int(np.argmax([len(_has(f)) for f in found]))
         if len(_has(found[best])) >= LEAST_MARKS:
             bending[:] = guesses[best]
-            self._solve(_NOTHING, found[best], bending, np.eye(2), np.inf)
+            self._fit_points(_NOTHING, found[best], bending, np.eye(2))
             return found_marks(self.view, self.marks, image, bending, REACH_PX)
         if trouble:
             raise NoFitError(trouble)
@@ -269,10 +281,14 @@ class OrientedCamera:
         light = [np.sqrt(2.0) * held.edge_px] * 3
         return np.array([held.flattening_rad, held.joint_station_m, *[held.ovality_rad] * 2, *light])
 
-    def _solve(
+    def _shape_prior(self, k: int) -> FloatArray:
+        """Prior sd of the shape, which must not make up for what an assumed plane (k = 1) cannot explain."""
+        return self._shape_sd * (1.0 if k == 2 else 1e-3)
+
+    def _fit_points(
         self, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, bending: FloatArray,
-        basis: FloatArray, worst_rms_px: float,
-    ) -> _Solution:  # fmt: skip
+        basis: FloatArray,
+    ) -> _Points:  # fmt: skip
         """Fit ``bending`` (3,) in place to the edge and, where given, the marks found."""
         view, k, lines = self.view, basis.shape[1], len(self.clocks_rad)
         has = _has(place) if place is not None else np.zeros(0, dtype=np.intp)
@@ -282,8 +298,7 @@ class OrientedCamera:
         spot, sd = (place[0][has], place[1][has]) if place is not None else (np.zeros(0), np.zeros(0))
         painted = self.marks
         marks = (painted.points_shell_m[has], painted.across_px[has], spot, np.hypot(sd, mark_before_sd), mark_left)
-        # with an assumed plane the shape must not make up for what the plane cannot explain
-        prior = self._shape_sd * (1.0 if k == 2 else 1e-3)
+        prior = self._shape_prior(k)
         count = len(left) + len(has)
         residual, rows, shape, weight = np.empty(count), np.zeros((count, 16)), np.zeros((count, 5)), np.empty(count)
         limits = (HUBER, GROSS_PX, LAST_STEP_RAD, STEPS, 0 if len(has) >= LEAST_MARKS else LEAST_POINTS)
@@ -295,6 +310,16 @@ class OrientedCamera:
             raise NoFitError(f"{number} edge points also found at the benchmark where {LEAST_POINTS} are wanted")
         if state == _fit_kernels.RAN_AWAY:
             raise NoFitError("the fit ran away beyond 28 deg")
+        return _Points(residual, rows, shape, weight, np.concatenate([edge_at, mark_at]), len(left))
+
+    def _solve(
+        self, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, bending: FloatArray,
+        basis: FloatArray, worst_rms_px: float,
+    ) -> _Solution:  # fmt: skip
+        """Fit as `_fit_points`, and say how well it is known; `NoFitError` where the residuals are too large."""
+        found, k = self._fit_points(horizon, place, bending, basis), basis.shape[1]
+        prior = self._shape_prior(k)
+        residual, rows, shape, weight = found.residual_px, found.rows, found.shape, found.weight
         used = weight > 0.0
         residual, rows, shape, weight = residual[used], rows[used], shape[used], weight[used]
         rms = float(np.sqrt(np.average(residual**2, weights=weight)))
@@ -303,8 +328,8 @@ class OrientedCamera:
         design = np.concatenate([rows[:, BENDING] @ basis, rows[:, [FLATTENING, JOINT]], shape], axis=1)
         weighted = design.T * weight
         formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(k), prior**-2])))
-        before = self.left_over.rows[np.concatenate([edge_at, mark_at])[used]]
-        edge_count = int(used[: len(left)].sum())
+        before = self.left_over.rows[found.benchmark_at[used]]
+        edge_count = int(used[: found.edge_points].sum())
         return _Solution((formal @ weighted)[:k], formal[:k, :k], rows, shape, before, edge_count, rms)
 
     def _answer(self, horizon: HorizonLine, bending: FloatArray, last: _Solution, basis: FloatArray) -> FrameFit:

@@ -3,7 +3,7 @@
 Vertices are projected through the lens and triangles filled in the picture with a depth buffer. An edge that is
 straight in space is straight in the picture only where a triangle is small, so larger ones are split until they span
 less than ``WIDEST_RAD`` as seen from the camera; that also follows those that reach beyond the lens's field or behind
-the camera.
+the camera. Pieces that lie outside the picture are dropped on the way.
 
 Rendering is for overlays, masks and checks: a fit projects the edge instead (`estimators.virtual_camera`), which costs
 hundreds of times less. Held to ray casting in the tests.
@@ -20,7 +20,7 @@ from estimators import _raster_kernels
 from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray
 
-WIDEST_RAD = float(np.deg2rad(5.0))
+WIDEST_RAD, MARGIN_RAD = float(np.deg2rad(5.0)), float(np.deg2rad(0.5))
 DEEPEST_SPLIT = 20
 
 
@@ -65,6 +65,6 @@ def render(camera: Camera, vertices_body_m: FloatArray, faces: NDArray[np.int64]
     depth, nearest = np.full(shape, np.inf), np.full(shape, -1, dtype=np.int64)
     _raster_kernels.raster(
         np.ascontiguousarray(vertices_body_m, dtype=float), np.ascontiguousarray(faces, dtype=np.int64),
-        camera.lens_terms, float(np.cos(WIDEST_RAD)), DEEPEST_SPLIT, depth, nearest,
+        camera.lens_terms, camera.picture_half_angle_rad + MARGIN_RAD, WIDEST_RAD, DEEPEST_SPLIT, depth, nearest,
     )  # fmt: skip
     return Rendered(depth, nearest)

@@ -15,12 +15,12 @@ Sources: seed paper, CAD-based estimate and Figures 2.1 to 2.3.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from estimators import _sight_kernels
 from estimators.horizon import HorizonLine, ScanLines
-from flightmodel import rotations
 from flightmodel.camera import Camera
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import rotation_vector_body_shell
@@ -104,20 +104,28 @@ class VirtualCamera:
     @property
     def shell_terms(self) -> tuple[FloatArray, tuple[float, float, float], tuple[float, float], float]:
         """What the compiled fit wants of the shell: see `estimators._fit_kernels.fit_frame`."""
+        return self.clocks_rad, *self._circles, self.joint_station_m
+
+    @cached_property
+    def _circles(self) -> tuple[tuple[float, float, float], tuple[float, float]]:
+        """Station, radius and minor radius of the outermost torus; station and radius of the innermost, m."""
         station, radius = (part.tolist() for part in torus_circles(self.geometry))
-        circle = (station[-1], radius[-1], self.geometry.torus_minor_radius_m)
-        return self.clocks_rad, circle, (station[0], radius[0]), self.joint_station_m
+        return (station[-1], radius[-1], self.geometry.torus_minor_radius_m), (station[0], radius[0])
+
+    def _turn(self, bending: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotation matrix (3, 3) of a bending, and the y and z columns (3, 2) of its left Jacobian."""
+        rotation, left = np.empty((3, 3)), np.empty((3, 2))
+        _sight_kernels.turned(float(bending[0]), float(bending[1]), rotation, left)
+        return rotation, left
 
     def sight(self, points_shell_m: FloatArray, bending: FloatArray) -> Sight:
         """Project points ``(n, 3)`` of the unbent shell, m from the datum, for a bending.
 
         ``bending`` (3,) is the shell's rotation vector against the body about body y and z, and its flattening, rad.
         """
-        rotation_vector = np.array([0.0, bending[0], bending[1]])
-        rotation = rotations.dcm_from_q(rotations.exp(rotation_vector))
-        station, radius = torus_circles(self.geometry)
-        left = np.ascontiguousarray(rotations.left_jacobian(rotation_vector)[:, 1:])
-        bend = (rotation, left, self.joint_station_m, float(bending[2]), float(station[0]), float(radius[0]))
+        rotation, left = self._turn(bending)
+        _, ring = self._circles
+        bend = (rotation, left, self.joint_station_m, float(bending[2]), *ring)
         pixels, jacobian = np.empty((len(points_shell_m), 2)), np.empty((len(points_shell_m), 2, 16))
         _sight_kernels.project_shell(
             np.ascontiguousarray(points_shell_m), bend, self.camera.lens_terms, pixels, jacobian
@@ -126,13 +134,12 @@ class VirtualCamera:
 
     def edge(self, bending: FloatArray) -> ProjectedEdge:
         """Project the shell's edge for a bending (3,); see `sight`."""
-        turn = rotations.dcm_from_q(rotations.exp(np.array([0.0, bending[0], bending[1]])))
+        turn, _ = self._turn(bending)
         eye = turn.T @ (self.camera.position_body_m - self.joint_m) + self.joint_m
-        station, radius = torus_circles(self.geometry)
+        (station, radius, minor), ring = self._circles
         points = np.empty((len(self.clocks_rad), 3))
         flat = float(bending[2])
-        outwards, aft = float(radius[-1] - radius[0]), float(station[-1] - station[0])
-        circle = (station[-1] + flat * outwards, radius[-1] - flat * aft, self.geometry.torus_minor_radius_m)
+        circle = (station + flat * (radius - ring[1]), radius - flat * (station - ring[0]), minor)
         if not _sight_kernels.limb(circle, eye, self.clocks_rad, points):
             raise GateError(f"the camera at {np.round(eye, 3).tolist()} m lies inside the outermost torus")
         seen = self.sight(self._unflattened(points, flat), bending)
@@ -148,12 +155,12 @@ class VirtualCamera:
 
     def _unflattened(self, points: FloatArray, flattening: float) -> FloatArray:
         """Points ``(n, 3)`` of the shell before it flattened."""
-        station, radius = torus_circles(self.geometry)
+        _, (station, radius) = self._circles
         r = np.hypot(points[:, 1], points[:, 2])
-        aft, outwards = -points[:, 0] - station[0], r - radius[0]
+        aft, outwards = -points[:, 0] - station, r - radius
         per = 1.0 / (1.0 + flattening**2)
-        scale = (radius[0] + per * (outwards + flattening * aft)) / r
-        x = -(station[0] + per * (aft - flattening * outwards))
+        scale = (radius + per * (outwards + flattening * aft)) / r
+        x = -(station + per * (aft - flattening * outwards))
         return np.column_stack([x, scale * points[:, 1], scale * points[:, 2]])
 
     def edge_of(self, theta_rad: float, plane_lv_rad: float) -> ProjectedEdge:

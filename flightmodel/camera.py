@@ -21,6 +21,7 @@ lenses", IEEE PAMI 28(8), 2006. OpenCV, module ``cv2.fisheye``.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import cv2
@@ -98,6 +99,18 @@ class Camera:
         axes = np.ascontiguousarray(self.dcm_cam_body)
         model = LENSES.index(self.lens)
         return model, self.half_field_rad, self.focal_px, self.centre_px, coefficients, self.position_body_m, axes
+
+    @cached_property
+    def picture_half_angle_rad(self) -> float:
+        """Largest angle from the optical axis that the picture shows, rad; the lens's field where that ends in it."""
+        w, h = self.width_px, self.height_px
+        across, down = np.linspace(-0.5, w - 0.5, 33), np.linspace(-0.5, h - 0.5, 33)
+        border = [(u, v) for u in across for v in (down[0], down[-1])]
+        border += [(u, v) for u in (across[0], across[-1]) for v in down]
+        rays = self.rays_body(np.array(border))
+        if not np.isfinite(rays).all():
+            return self.half_field_rad
+        return min(self.half_field_rad, float(np.arccos(np.clip(rays @ self.dcm_cam_body[2], -1.0, 1.0)).max()))
 
     @property
     def size_px(self) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,10 +113,13 @@ def fuse_flight(
     read = reader(told_sd_s)
     try:
         fused = fuse(read)
-    except FarInputsError as fault:
-        raise DivergenceError(f"{fault}; {agreement(read({}, None), fault.learnt).words}") from None
     except DivergenceError as fault:
-        raise DivergenceError(f"{fault}; {agreement(read({}, None)).words}") from None
+        learnt = fault.learnt if isinstance(fault, FarInputsError) else None
+        words = f"{fault}; {agreement(read({}, None), learnt).words}"
+        clock = _asked_clock(reader) if seen and told_sd_s == 0.0 else None
+        if clock is not None and clock.is_off:
+            words += f"; there is an answer if {clock.words}"
+        raise DivergenceError(words) from None
     try:
         limbs = southwell_limbs(fused.history, pulse.time_s, pulse.dynamic_pressure_pa)
         words = limbs.words
@@ -129,11 +133,16 @@ def fuse_flight(
     if told_sd_s > 0.0:
         clock = _film_clock(fused, told_sd_s, True)
     elif seen:
-        try:
-            clock = _film_clock(fuse(reader(LOOSE_CLOCK_SD_S)), LOOSE_CLOCK_SD_S, False)
-        except DivergenceError:
-            clock = None  # with a free clock there is no common answer: nothing is said of it
+        clock = _asked_clock(reader)
     return FusedAnswer(fused, agreement(told, fused.learnt, fused.deflection), limbs, words, clock)
+
+
+def _asked_clock(reader: Callable[[float], Read]) -> FilmClock | None:
+    """What a clock that is taken as right would be found to be; None where there is no common answer with it free."""
+    try:
+        return _film_clock(fuse(reader(LOOSE_CLOCK_SD_S)), LOOSE_CLOCK_SD_S, False)
+    except DivergenceError:
+        return None
 
 
 def _film_clock(fused: Fused, told_sd_s: float, applied: bool) -> FilmClock:

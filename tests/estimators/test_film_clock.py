@@ -121,6 +121,13 @@ def test_a_clock_taken_as_right_moves_nothing_but_is_told():
     assert not FilmClock(0.01, 0.01, False).is_off
 
 
+def test_a_late_film_that_leaves_no_common_answer_is_told_as_such():
+    pulse, truth = pulse_of(np.random.default_rng(11), len(TIME_S), bent(TIME_S, 0.8))
+    cov = np.tile(np.deg2rad(0.01) ** 2 * np.eye(2), (len(TIME_S), 1, 1))
+    with pytest.raises(DivergenceError, match=r"answer if the film's clock is late by 0\.3.* time_bias_sd_s in"):
+        fuse_flight(pulse, history_from_lateral(TIME_S + 0.3, truth, cov, "camera", ""))
+
+
 def test_the_smooth_history_errs_less_than_the_frames_and_says_how_much():
     normal, raw, smooth = [], [], []
     noise = normal_equations.LEFT_OUT_RAD * np.sqrt(normal_equations.LEFT_OUT_TIME_S / 0.1)

@@ -148,3 +148,16 @@ def test_a_camera_that_is_no_camera_is_refused(camera):
         replace(camera, dcm_cam_body=np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(GateError, match="distortion"):
         replace(camera, distortion=np.zeros(5))
+
+
+@pytest.mark.parametrize(("focal", "ends_in_picture"), [(310.0, False), (120.0, True)])
+def test_the_picture_shows_no_more_than_its_half_angle(mount, focal, ends_in_picture):
+    camera = camera_from_mount(mount.model_copy(update={"focal_px": (focal, focal)}))
+    v, u = np.indices((camera.height_px, camera.width_px), dtype=float)[:, ::7, ::7]
+    rays = camera.rays_body(np.column_stack([u.ravel(), v.ravel()]))
+    angle = np.arccos(np.clip(rays @ camera.dcm_cam_body[2], -1.0, 1.0))
+    assert np.nanmax(angle) <= camera.picture_half_angle_rad
+    if ends_in_picture:
+        assert camera.picture_half_angle_rad == camera.half_field_rad
+    else:
+        assert camera.picture_half_angle_rad < min(camera.half_field_rad, np.nanmax(angle) + np.deg2rad(2.0))
