@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
@@ -115,6 +116,7 @@ def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
                 root = np.linalg.cholesky(covariance[np.ix_(pair, pair)] + 1e-12 * np.diag(np.diag(covariance)[pair]))
                 for size, style in ((1.0, "-"), (2.0, "--")):
                     ax.plot(*(best[pair][:, None] + size * root @ circle), color=FOUND, ls=style, lw=1.0)
+            ax.xaxis.set_major_locator(MaxNLocator(3))
             ax.tick_params(labelsize=7, labelleft=column == 0 and row > 0, labelbottom=row == n - 1)
             if row == n - 1:
                 ax.set_xlabel(table.columns[column], fontsize=8)

@@ -31,7 +31,8 @@ WIDER = (30.0, 10.0, 3.0)
 MOST_STEPS, SETTLED_SD = 9, 0.1  # steps after the widened ones
 PARTS = (1.0, 0.5, 0.25)  # of a step
 # over thirty dispersed flights (seeds 0 to 29) errors of stiffness were 1.5, of offset 1.2, of stability 1.1 times what
-# the linear problem says
+# the linear problem says; the posterior's shape is the linear problem's (docs/reconciliation.md), so this is what the
+# model of the noise leaves out
 UNMODELLED = 1.4
 LOOK_AHEAD = 0.1  # of a step, over which its curvature is taken
 FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e3
@@ -63,7 +64,7 @@ class Reconciled:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance of all unknowns, in their order: the linear one, widened for the bent valley."""
+        """Covariance of all unknowns, in their order: the linear one, widened for what the noise model leaves out."""
         return self.linear_covariance * UNMODELLED**2
 
     @property
