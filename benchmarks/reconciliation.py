@@ -27,7 +27,6 @@ from flightmodel.flightfolder import read_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.pipeline import reconstruct_telemetry
 from postflight.reconciliation.answer import deflection_of, joint_table
-from postflight.reconciliation.fit import reconcile
 from postflight.reconciliation.laws import explain
 from postflight.reconciliation.modes import stiffness_by_modes
 from synthetic_flight.folder import simulate_to_folder
@@ -117,15 +116,13 @@ def main():
             print(f"{seed}: {truth.words}; left out", flush=True)
             continue
         begun = time.process_time()
-        found = reconcile(flight)
-        took = time.process_time() - begun
+        explained = explain(flight, asked)
+        took, found = time.process_time() - begun, explained.found
         words = f"{seed}: {found.steps} steps{'' if found.converged else ' (not settled)'}, {took:.0f} s"
         if asked:
-            explained = explain(flight, asked)
-            plain, found = found, explained.found
             odds.append([explained.log_odds[name] for name in asked])
             other = reconstructed(seed, flown_vehicle(seed)[0])[1] if any(law.values()) else truth
-            effects.append(effect_sd(plain, truth, other))
+            effects.append(effect_sd(explained.compared[asked[0]][0], truth, other))
             told = ", ".join(f"{name} {value:+.1f}" for name, value in explained.log_odds.items())
             words += f", log odds of {told}, effect {effects[-1]:.1f} sd"
             if "freeplay" in found.problem.unknown.laws:

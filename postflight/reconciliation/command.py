@@ -18,10 +18,17 @@ from postflight.figures import save
 from postflight.pipeline import PULSE_RATE_HZ, Flight, estimate, reconstruct_telemetry
 from postflight.preflight import Bounds, entry_bounds, rigid_bounds
 from postflight.reconciliation.answer import correlations, deflection_of, found_sd, joint_table, vehicle_lines
-from postflight.reconciliation.figures import figure_modes, figure_reconciled
+from postflight.reconciliation.figures import figure_modes, figure_posterior, figure_reconciled
 from postflight.reconciliation.fit import Reconciled
 from postflight.reconciliation.laws import explain
 from postflight.reconciliation.modes import ModalStiffness, stiffness_by_modes
+from postflight.reconciliation.posterior import (
+    Posterior,
+    posterior_summary,
+    quantities,
+    require_samplers,
+    sample_all,
+)
 from postflight.studies.commands import bands, held_against
 from postflight.warmup import RECONSTRUCTION
 from recon.bet import Settings
@@ -33,9 +40,11 @@ MISFIT = 1.5  # rms of the sensors' residuals over their sd; some 0.6 where the 
 LAW_WORDS = {"freeplay": "freeplay", "hardening": "a spring whose slope changes with the angle"}
 
 
-def run(folder: Path, laws: tuple[str, ...]) -> None:
+def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     """Reconstruct, reconcile, write a run folder and print what was found."""
-    settings = {"reconcile": True, "laws": list(laws), "output_rate_hz": 20.0}
+    settings = {"reconcile": True, "laws": list(laws), "posterior": sampled, "output_rate_hz": 20.0}
+    if sampled:
+        require_samplers()
     with progress_bar() as report:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
@@ -44,8 +53,13 @@ def run(folder: Path, laws: tuple[str, ...]) -> None:
             telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
         )
         answers = estimate(flight, telemetry, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
-        explained = explain(flight, laws, lambda f, what: report(0.3 + 0.6 * f, what))
+        fitting = 0.3 if sampled else 0.6
+        explained = explain(flight, laws, lambda f, what: report(0.3 + fitting * f, what))
         found, odds = explained.found, explained.log_odds
+        posterior = None
+        if sampled:
+            posterior, nested = sample_all(explained, lambda f, what: report(0.6 + 0.3 * f, what))
+            odds |= nested
         modal, no_modes = _modes(flight)
         rigid = rigid_bounds(flight, ENTRIES, progress=lambda f, what: report(0.9 + 0.05 * f, what))
         flexible = reconciled_bounds(found, flight, lambda f, what: report(0.95 + 0.05 * f, what))
@@ -56,16 +70,23 @@ def run(folder: Path, laws: tuple[str, ...]) -> None:
             out.write_csv("joint_correlations.csv", correlations(found))
             bent = deflection_of(found)
             out.write_csv("deflection_reconciled.csv", results.deflection_table(bent))
-            out.write_json("reconciliation.json", summary(found, table, odds) | modal_summary(modal, no_modes))
+            story = summary(found, table, odds) | modal_summary(modal, no_modes) | posterior_words(posterior)
+            out.write_json("reconciliation.json", story)
             out.write_csv("bands.csv", bands(rigid, flexible))
             out.write_csv("bands_shares.csv", shares)
             save(bands_picture, out.path / "figures" / "bands.png")
             if modal is not None:
                 save(figure_modes(modal, telemetry), out.path / "figures" / "modes.png")
             (out.path / "joint.toml").write_text(vehicle_lines(found))
+            if posterior is not None:
+                out.write_csv("posterior.csv", quantities(found.problem.unknown, posterior.samples))
+                out.write_csv("posterior_summary.csv", posterior_summary(posterior))
+                save(figure_posterior(posterior, telemetry), out.path / "figures" / "posterior.png")
             fused = answers.histories.get("fused")
             save(figure_reconciled(found, telemetry, bent, fused), out.path / "figures" / "reconciled.png")
     print_joint(found, table, odds)
+    if posterior is not None:
+        print_posterior(posterior)
     if modal is None:
         console.print(f"stiffness by the joint's frequency: none ({escape(no_modes)})")
     else:
@@ -91,6 +112,29 @@ def modal_summary(modal: ModalStiffness | None, no_modes: str) -> dict[str, obje
     if modal is None:
         return {"stiffness_by_modes_nmprad": None, "no_modes": no_modes}
     return {"stiffness_by_modes_nmprad": modal.stiffness_nmprad, "stiffness_by_modes_sd_nmprad": modal.sd_nmprad}
+
+
+def posterior_words(posterior: Posterior | None) -> dict[str, object]:
+    """Return how far the samples may be trusted, for ``reconciliation.json``."""
+    if posterior is None:
+        return {}
+    return {
+        "posterior_refit_error_of_cost": posterior.refit_error.tolist(),
+        "posterior_steps_to_forget": posterior.steps_to_forget,
+        "posterior_log_evidence_over_laplace": posterior.log_evidence - posterior.found.log_evidence,
+        "posterior_log_evidence_sd": posterior.log_evidence_sd,
+    }
+
+
+def print_posterior(posterior: Posterior) -> None:
+    """Table of the samples beside the linear problem."""
+    printed = Table(title="Posterior (emcee)")
+    for name in ("quantity", "most probable", "linear sd", "median", "sd", "90 % interval"):
+        printed.add_column(name, justify="left" if name == "quantity" else "right")
+    for r in posterior_summary(posterior).itertuples(index=False):
+        interval = f"{r.low:.4g} to {r.high:.4g}"
+        printed.add_row(r.quantity, f"{r.best:.4g}", f"{r.linear_sd:.2g}", f"{r.median:.4g}", f"{r.sd:.2g}", interval)
+    console.print(printed)
 
 
 def reconciled_bounds(found: Reconciled, flight: Flight, report: Report) -> Bounds:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
@@ -13,6 +14,7 @@ from postflight.figures import COLOUR, stamp
 from postflight.reconciliation.answer import stiffness_and_offset
 from postflight.reconciliation.fit import Reconciled
 from postflight.reconciliation.modes import ModalStiffness
+from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities
 
 FOUND, MEASURED = "#0072B2", "#000000"
 HIGHEST_HZ = 5.0
@@ -89,6 +91,47 @@ def _ridge(ax: Axes, found: Reconciled) -> None:
     share = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
     ax.set_title(f"correlation {share:+.2f}", fontsize=9)
     ax.legend(frameon=False, fontsize=8)
+
+
+def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
+    """Every pair of quantities: samples, and the ellipses of 1 and 2 sd of the linear problem."""
+    table = quantities(posterior.found.problem.unknown, posterior.samples)
+    best, covariance = linear_quantities(posterior)
+    n = len(best)
+    figure = Figure(figsize=(2.0 * n, 2.0 * n), layout="constrained")
+    axes = figure.subplots(n, n, squeeze=False)
+    turn = np.linspace(0.0, 2.0 * np.pi, 200)
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    values = table.to_numpy()
+    for row in range(n):
+        for column in range(n):
+            ax = axes[row, column]
+            if column > row:
+                ax.axis("off")
+            elif column == row:
+                _histogram(ax, values[:, row], best[row], float(np.sqrt(covariance[row, row])))
+            else:
+                ax.plot(values[:, column], values[:, row], ".", color="0.55", ms=1.0, alpha=0.4, rasterized=True)
+                pair = [column, row]
+                root = np.linalg.cholesky(covariance[np.ix_(pair, pair)] + 1e-12 * np.diag(np.diag(covariance)[pair]))
+                for size, style in ((1.0, "-"), (2.0, "--")):
+                    ax.plot(*(best[pair][:, None] + size * root @ circle), color=FOUND, ls=style, lw=1.0)
+            ax.xaxis.set_major_locator(MaxNLocator(3))
+            ax.tick_params(labelsize=7, labelleft=column == 0 and row > 0, labelbottom=row == n - 1)
+            if row == n - 1:
+                ax.set_xlabel(table.columns[column], fontsize=8)
+            if column == 0 and row > 0:
+                ax.set_ylabel(table.columns[row], fontsize=8)
+    figure.suptitle("Posterior of the joint: samples, and ellipses of the linear problem (1 and 2 sd)", fontsize=12)
+    _with_room_for_stamp(figure, telemetry)
+    return figure
+
+
+def _histogram(ax: Axes, values: FloatArray, best: float, sd: float) -> None:
+    ax.hist(values, bins=40, density=True, color="0.7")
+    x = np.linspace(*ax.get_xlim(), 200)
+    ax.plot(x, np.exp(-0.5 * ((x - best) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi)), color=FOUND, lw=1.0)
+    ax.set_yticks([])
 
 
 def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:

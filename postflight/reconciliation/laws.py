@@ -21,12 +21,17 @@ class Explained:
     Parameters
     ----------
     found : Reconciled
-    log_odds : dict
-        Of every law that was asked for: logarithm of the odds of a joint with it against one without.
+    compared : dict
+        Of every law that was asked for: the fits without and with it.
     """
 
     found: Reconciled
-    log_odds: dict[str, float]
+    compared: dict[str, tuple[Reconciled, Reconciled]]
+
+    @property
+    def log_odds(self) -> dict[str, float]:
+        """Of every law that was asked for: logarithm of the odds of a joint with it against one without."""
+        return {law: having.log_evidence - lacking.log_evidence for law, (lacking, having) in self.compared.items()}
 
 
 def explain(flight: Flight, asked: tuple[str, ...] = (), progress: Progress | None = None) -> Explained:
@@ -51,20 +56,18 @@ def explain(flight: Flight, asked: tuple[str, ...] = (), progress: Progress | No
             return reconcile_loose(flight, observe(flight, loaded), laws, part)
         return reconcile(flight, laws, loaded, part)
 
-    odds: dict[str, float] = {}
-    kept: tuple[str, ...] = ()
-    chosen: Reconciled | None = None
+    compared: dict[str, tuple[Reconciled, Reconciled]] = {}
+    found: Reconciled | None = None
     if "freeplay" in asked:
-        tight, loose = fitted((), True), fitted(("freeplay",), True)
-        odds["freeplay"] = loose.log_evidence - tight.log_evidence
-        if odds["freeplay"] > 0.0:
-            kept, chosen = ("freeplay",), loose
-    found = chosen or fitted((), False)
+        tight, loose = compared["freeplay"] = fitted((), True), fitted(("freeplay",), True)
+        found = loose if loose.log_evidence > tight.log_evidence else None
+    kept = found.problem.unknown.laws if found else ()
+    found = found or fitted((), False)
     if "hardening" in asked:
         hard = fitted((*kept, "hardening"), bool(kept))
-        odds["hardening"] = hard.log_evidence - found.log_evidence
+        compared["hardening"] = found, hard
         # a spring that softens is no joint that the vehicle file knows: it is said, not flown
-        if odds["hardening"] > 0.0 and hard.vehicle.joint.hardening_nmprad3 > 0.0:
+        if hard.log_evidence > found.log_evidence and hard.vehicle.joint.hardening_nmprad3 > 0.0:
             found = hard
     report(1.0, "reconciled")
-    return Explained(found, odds)
+    return Explained(found, compared)

@@ -218,10 +218,7 @@ class Problem:
 
     def prior_cost(self, u: Unknowns) -> float:
         """Sum of squares of what was known before."""
-        air = sum(float(a @ p @ a) for a, p in zip(u.air, self.air.precision, strict=True))
-        first, attitude = u.motion[0, 6:] / self.observed.first_bending_sd, u.motion[0, ATTITUDE]
-        turned = float(attitude @ self.attitude_precision @ attitude)
-        return air + turned + float(u.vehicle @ u.vehicle + u.instruments @ u.instruments + first @ first)
+        return sum(float(value @ precision @ value) for _, precision, value in self._priors(u))
 
     def linear(self, u: Unknowns) -> Linear:
         """Residuals' derivatives about ``u``."""
@@ -249,10 +246,17 @@ class Problem:
         matrix = np.zeros((self.count, self.count))
         for column, response in (*linear.sensors, *linear.joins):
             matrix[np.ix_(column, column)] += response.T @ response
-        right = linear.back(linear.found.sensors, linear.found.joins)
-        self._add_priors(u, matrix, right)
+        for part, precision, _ in self._priors(u):
+            matrix[part, part] += precision
+        return matrix, self.right(u, linear, linear.found)
+
+    def right(self, u: Unknowns, linear: Linear, found: Residuals) -> FloatArray:
+        """Right-hand side of a step from ``u`` with residuals ``found``, by derivatives of there or nearby."""
+        right = linear.back(found.sensors, found.joins)
+        for part, precision, value in self._priors(u):
+            right[part] -= precision @ value
         right[self.held_columns] = 0.0
-        return matrix, right
+        return right
 
     @property
     def held_columns(self) -> list[int]:
@@ -287,9 +291,10 @@ class Problem:
         motions = np.array([row[2] for row in rows])
         return Flights(which[0], which[1], motions, which[2], candidates, tables), columns, steps
 
-    def _add_priors(self, u: Unknowns, matrix: FloatArray, right: FloatArray) -> None:
+    def _priors(self, u: Unknowns) -> list[tuple[slice, FloatArray, FloatArray]]:
+        """Which unknowns, their inverse covariance before the flight, their values."""
         free, knots, first = self.first_instrument + INSTRUMENTS, len(self.air.knots_m), self.first_motion
-        parts = [
+        return [
             (slice(0, free), np.eye(free), np.concatenate([u.vehicle, u.instruments])),
             *[
                 (slice(free + kind * knots, free + (kind + 1) * knots), self.air.precision[kind], u.air[kind])
@@ -298,6 +303,3 @@ class Problem:
             (slice(first, first + 3), self.attitude_precision, u.motion[0, ATTITUDE]),
             (slice(first + 6, first + MOTION), np.diag(self.observed.first_bending_sd**-2.0), u.motion[0, 6:]),
         ]
-        for part, precision, value in parts:
-            matrix[part, part] += precision
-            right[part] -= precision @ value

@@ -17,8 +17,13 @@ from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight.cli import cli
 from postflight.pipeline import reconstruct_telemetry
+from postflight.reconciliation.answer import joint_table, vehicle_lines
 from postflight.reconciliation.candidate import AirUnknowns, VehicleUnknowns
+from postflight.reconciliation.fit import reconcile
+from postflight.reconciliation.freeplay import false_spans, reconcile_loose
+from postflight.reconciliation.laws import explain
 from postflight.reconciliation.observed import observe
+from postflight.reconciliation.posterior import posterior_summary, sample
 from postflight.reconciliation.problem import Problem, Unknowns
 from postflight.reconciliation.spans import ATTITUDE, BENDING, BENDING_RATE, RATE
 from synthetic_flight.folder import simulate_to_folder
@@ -29,9 +34,23 @@ SEED = 5
 STIFFER, MORE_DAMPING, OFFSET_M = 1.2, 1.3, (0.0025, -0.0012)
 
 
+FREEPLAY_DEG = 0.1
+
+
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     """Folder, truth and vehicle of a dispersed flight."""
+    return fly(tmp_path_factory, 0.0)
+
+
+@pytest.fixture(scope="module")
+def loose(tmp_path_factory):
+    """The same with freeplay."""
+    folder, _, vehicle = fly(tmp_path_factory, FREEPLAY_DEG)
+    return reconstruct_telemetry(read_flight(folder)), vehicle
+
+
+def fly(tmp_path_factory, freeplay_deg):
     scenario = dispersed.dispersed_scenario("irve2_reference", SEED)
     vehicle = scenario.vehicle
     body, joint = vehicle.centerbody, vehicle.joint
@@ -43,6 +62,7 @@ def flown(tmp_path_factory):
             update={
                 "bending_stiffness_nmprad": joint.bending_stiffness_nmprad * STIFFER,
                 "bending_damping_nmsprad": joint.bending_damping_nmsprad * MORE_DAMPING,
+                "freeplay_deg": freeplay_deg,
             }
         ),
         aero=vehicle.aero.scaled(ca=0.97, cn=1.06, cm=0.93, cmq_shift=0.1),
@@ -122,6 +142,41 @@ def test_an_unknown_joint_is_found(flown):
     true = np.interp(bent.t_s, truth.time_s, np.rad2deg(truth.deflection.theta_rad))
     assert np.sqrt(np.mean((bent.theta_deg - true) ** 2)) < 0.15
     assert {p.name for p in run.iterdir()} >= {"joint.toml", "reconciliation.json", "joint_correlations.csv", "figures"}
+
+
+def test_freeplay_is_found(loose):
+    flight, vehicle = loose
+    found = reconcile_loose(flight, observe(flight, loaded=True))
+    assert found.converged
+    assert not false_spans(found).any()
+    row = joint_table(found).set_index("quantity").loc["freeplay"]
+    assert abs(row.found - FREEPLAY_DEG) < 4.0 * row.sd < 0.05
+    stiffness = found.vehicle.joint.bending_stiffness_nmprad
+    assert stiffness == pytest.approx(vehicle.joint.bending_stiffness_nmprad, rel=0.06)
+    assert f"freeplay_deg = {row.found:.4f}"[:-1] in vehicle_lines(found)
+
+
+@pytest.mark.long
+def test_freeplay_is_told_from_a_plain_joint(loose, flown):
+    """And what the evidence denies is not in the joint found."""
+    told = explain(loose[0], ("freeplay",))
+    assert told.log_odds["freeplay"] > 3.0
+    assert told.found.problem.unknown.laws == ("freeplay",)
+    plain = explain(reconstruct_telemetry(read_flight(flown[0])), ("freeplay", "hardening"))
+    assert plain.log_odds["freeplay"] < 0.0
+    assert "freeplay" not in plain.found.problem.unknown.laws
+
+
+@pytest.mark.long
+def test_the_posterior_is_that_of_new_fits(flown):
+    """Interpolated log probability against new fits, two sd away; widths against the linear problem."""
+    found = reconcile(reconstruct_telemetry(read_flight(flown[0])))
+    sampled = sample(found)
+    assert np.abs(sampled.refit_error).max() < 2.0  # of a cost of four there
+    table = posterior_summary(sampled).set_index("quantity")
+    for name in ("stiffness_nmprad", "cg_offset_y_cm", "cg_offset_z_cm", "static_stability"):
+        assert table.sd[name] == pytest.approx(table.linear_sd[name], rel=0.3), name
+    assert abs(sampled.log_evidence - found.log_evidence) < 1.0
 
 
 def test_a_flight_without_a_pulse_is_refused_in_words(flown):
