@@ -51,8 +51,8 @@ WIDER = 4.0
 LEAST_TOLD = 0.05  # part of a direction's variance that the readings must have taken away
 CAMERA = "camera"
 LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is held against another
-LARGEST_GAIN = np.log(50.0)  # odds at which one input is taken as wrong though every pair passes
-ALSO = np.log(10.0)  # odds below which the next suspect is named too
+LARGEST_GAIN = np.log(100.0)  # odds at which one input is taken as wrong though every pair passes
+ALSO = np.log(100.0)  # odds below which the next suspect is named too: odds were seen to be overconfident
 BLAME = {
     "aerodynamic coefficients": ("C_A", "C_N", "C_m", "C_mq"),
     "accelerometer's mounting or bias": (ACCELEROMETER,),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -116,7 +117,7 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
     inputs.set(xlabel="found, in stated standard deviations (grey: stated)")
     for axis in (angle, plane, line, inputs):
         axis.grid(alpha=0.3)
-    figure.suptitle(words, fontsize=10)
+    figure.suptitle(fill(words, 130), fontsize=10)
     return figure
 
 

@@ -46,7 +46,7 @@ def _axes(figure: Figure, rows: int = 1) -> list[Axes]:
 def stamp(figure: Figure, telemetry: Telemetry) -> None:
     """Name the flight in a corner, and whether it is synthetic."""
     tag = "SYNTHETIC flight" if telemetry.synthetic else "flight"
-    figure.text(0.995, 0.005, f"{telemetry.name}: {tag}", ha="right", va="bottom", fontsize=7, color="0.4")
+    figure.supxlabel(f"{telemetry.name}: {tag}", x=0.995, ha="right", fontsize=7, color="0.4")
 
 
 def _window(flight: Flight) -> tuple[float, float]:

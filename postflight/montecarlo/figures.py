@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 BLUE, ORANGE = "#0072B2", "#D55E00"  # distinct in hue and in grey (Okabe and Ito)
 MOST_BARS = 15
@@ -24,10 +23,7 @@ LABEL = {
 
 def stamp(figure: Figure, words: str) -> None:
     """Say in the corner what was flown, below everything else."""
-    engine = figure.get_layout_engine()
-    if isinstance(engine, ConstrainedLayoutEngine):
-        engine.set(rect=(0.0, 0.025, 1.0, 0.975))
-    figure.text(0.995, 0.006, words, ha="right", va="bottom", fontsize=7, color="0.4")
+    figure.supxlabel(words, x=0.995, ha="right", fontsize=7, color="0.4")
 
 
 def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:

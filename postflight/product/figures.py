@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
@@ -19,11 +18,6 @@ from recon.air import ReconstructedAir
 
 LEAST_LOST = 1e-3  # of the filter's variance that the smoother takes away, for a difference to be drawn
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "0.55"
-
-
-def _room() -> ConstrainedLayoutEngine:
-    """Layout that leaves room for the stamp."""
-    return ConstrainedLayoutEngine(rect=(0.0, 0.025, 1.0, 0.975))
 
 
 def _clean(*axes: Axes) -> None:
@@ -89,7 +83,7 @@ def figure_sensitivity(flight: Flight, table: pd.DataFrame) -> Figure:
     shown = largest_of_groups(table)
     groups = [g for g in GROUPS if g in set(shown["group"])]
     columns = 4
-    figure = Figure(figsize=(10.5, 0.6 + (0.9 + 0.22 * len(names)) * -(-len(groups) // columns)), layout=_room())
+    figure = Figure(figsize=(10.5, 0.6 + (0.9 + 0.22 * len(names)) * -(-len(groups) // columns)), layout="constrained")
     grid = figure.subplots(-(-len(groups) // columns), columns, sharey=True, squeeze=False).ravel()
     for ax, group in zip(grid, groups, strict=False):
         part = shown[shown["group"] == group].set_index("rerun").reindex(names)
@@ -163,7 +157,7 @@ def figure_filter_and_smoother(flight: Flight) -> Figure:
     assert smoothed.covariance is not None
     groups = [("position", "m", 1.0), ("velocity", "m/s", 1.0), ("attitude", "deg", 180.0 / np.pi)]
     groups = groups if flight.has_attitude else groups[:2]
-    figure = Figure(figsize=(10.0, 0.8 + 2.2 * len(groups)), layout=_room())
+    figure = Figure(figsize=(10.0, 0.8 + 2.2 * len(groups)), layout="constrained")
     grid = figure.subplots(len(groups), 2, sharex=True)
     _clean(*grid.ravel())
     t, off = smoothed.time_s, difference(filtered, smoothed)
