@@ -32,7 +32,8 @@ def print_report(report: Report) -> None:
     if report.facts:
         table = Table(title="Sensors")
         for name in ("source", "rows", "from s", "to s", "rate Hz", "missing", "file"):
-            table.add_column(name, justify="left" if name in ("source", "file") else "right")
+            left = name in ("source", "file")  # whole, however narrow the screen: two radars differ in their ends
+            table.add_column(name, justify="left" if left else "right", overflow="fold")
         for f in report.facts:
             span = (f"{f.start_s:.3f}", f"{f.end_s:.3f}", f"{f.rate_hz:.4g}")
             table.add_row(escape(f.source), str(f.rows), *span, str(f.missing), escape(f.file))
