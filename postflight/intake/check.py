@@ -19,7 +19,7 @@ from flightmodel.config import FILL_IN, read_toml
 from flightmodel.flightfolder import Sources, read_sources
 from flightmodel.telemetry import Finding
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.intake import odd_field, odd_force, odd_tracks, odd_turning
+from postflight.intake import odd_field, odd_force, odd_start, odd_tracks, odd_turning
 from postflight.intake.left import left_to_fill_in
 from postflight.intake.track import best_comparison, track_force
 
@@ -137,7 +137,7 @@ def _facts(found: Sources) -> list[Fact]:
 
 def _compare(found: Sources, report: Report) -> None:
     """Sensors against each other and against physics."""
-    report.oddities += odd_force.at_rest(found) + odd_force.lever(found)
+    report.oddities += odd_start.apart_in_time(found) + odd_force.at_rest(found) + odd_force.lever(found)
     trackers = odd_tracks.tracks(found)
     for name, radar in found.radars.items():
         report.oddities += odd_tracks.free_fall(found, name, radar)
@@ -179,6 +179,8 @@ def _against_accelerometer(found: Sources, name: str, report: Report) -> None:
         report.oddities += odd_force.entry_axis(found, force)
     if force is not None and not report.oddities:
         report.oddities += odd_turning.turned_force(found, force)
+    if force is not None and not report.oddities:
+        report.oddities += odd_start.attitude_and_force(found, force)
 
 
 def _say_clock(report: Report, clock: Clock, time_s: FloatArray) -> None:

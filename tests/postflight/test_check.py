@@ -252,6 +252,31 @@ def test_radar_at_another_site(folder):
     said(folder, "wallops_mainland", "km from where wallops_island has it")
 
 
+# the start
+
+
+def test_attitude_with_the_scalar_last_and_turned_the_other_way(folder):
+    q = "[0.41731, -0.53156, -0.11720, 0.72771]"
+    edit(folder, (q, "[-0.53156, -0.11720, 0.72771, 0.41731]"))
+    found = said(folder, "attitude_prior", "away from where the track has it", "with the scalar last")
+    assert len(found) == 1
+    edit(folder, ("[-0.53156, -0.11720, 0.72771, 0.41731]", "[0.41731, 0.53156, 0.11720, -0.72771]"))
+    said(folder, "attitude_prior", "as from ECEF to body")
+
+
+def test_time_zero_an_hour_off(folder):
+    edit(folder, ("12:52:00", "13:52:00"))
+    edit(folder, ("t_s = 300.0", "t_s = 3900.0"))
+    found = said(folder, "wallops_island", "lies beside the accelerometer's time", "Moved by 1 h (a time zone?)")
+    assert [line.split(":")[0] for line in found] == ["wallops_island", "wallops_mainland", "attitude_prior"]
+
+
+def test_inertial_sensors_beside_ballistic_motion(folder):
+    with (folder / "flight.toml").open("a") as text:
+        text.write('\n[motion]\nmodel = "ballistic"\ndrag_area_per_mass_m2pkg = 0.006\n')
+    assert any("are not used" in f.what for f in check_folder(folder).findings if f.source == "motion")
+
+
 # what the readers see
 
 
