@@ -9,9 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
+from rich.console import Console
 
 from postflight.cli import cli
-from postflight.intake.check import check_folder
+from postflight.intake import check_command
+from postflight.intake.check import Fact, Report, check_folder
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "examples" / "range_package_01"
@@ -297,6 +299,17 @@ def test_gap_duplicates_out_of_order_frozen_and_saturated(folder):
 
 
 # the command
+
+
+@pytest.mark.parametrize("radar", ["WALLOPS_MAINLAND_TWO", "a_name_of_nearly_as_many_letters_as_a_name_may_have_64"])
+def test_sensors_names_are_shown_whole(radar, monkeypatch, capsys):
+    fact = Fact(radar, f"telemetry/{radar}_and_more.csv", 2300, 300.0, 530.0, 10.0, 0)
+    for width in (80, check_command.WIDE):
+        screen = Console(soft_wrap=True, width=width, color_system=None)
+        monkeypatch.setattr(check_command, "console", screen)
+        check_command.print_report(Report(facts=[fact]))
+        rows = [line.split("│")[1].strip() for line in capsys.readouterr().out.splitlines() if "│" in line]
+        assert "".join(rows) == radar
 
 
 def test_json_is_whole_and_exit_code_0(folder):
