@@ -9,6 +9,7 @@ pass to the free-molecular coefficients, if the table has them (`flightmodel.rar
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +22,18 @@ MOST_FAULTS = 10
 AXIAL_TOLERANCE = 1e-6
 AXIAL_RULE = "0 is wanted there, as the shell is a body of revolution; put an asymmetry into the c.g."
 COLUMNS = ("mach", "alpha_deg", "ca", "cn", "cm", "cmq")
+# as others write them: all of a column's name, or its first word before words that only say about or in what
+SPELLINGS = {
+    "mach": {"mach", "ma", "machnumber", "machno", "machzahl"},
+    "alpha_deg": {"alpha", "alphadeg", "aoa", "aoadeg", "anstellwinkel"},
+    "ca": {"ca", "caxial"},
+    "cn": {"cn", "cnormal"},
+    "cd": {"cd", "cdrag"},
+    "cl": {"cl", "clift"},
+    "cm": {"cm", "cmy", "cpitch"},
+    "cmq": {"cmq", "cmqcmadot"},
+}
+SAID_BESIDE = {"deg", "total", "t", "nose", "nase", "cg", "ref", "mrc", "mrp", "body", "wind", "number", "no"}
 # above the cone's half-angle part of it lies in shadow; no entry vehicle of the class flies there, so look-ups stop
 INVERSE_LIMIT_RAD = np.deg2rad(60.0)
 
@@ -140,6 +153,20 @@ def _number(text: str) -> float:
         return float("nan")
 
 
+def named_columns(wanted: tuple[str, ...], header: list[str]) -> dict[str, str]:
+    """Return which column of a header each of the ``wanted`` is, where one alone says it, however it is written."""
+    words = {column: re.findall("[a-z]+", column.lower()) for column in header}
+    found: dict[str, str] = {}
+    for name in wanted:
+        same = [c for c in header if c.lower() == name] or [c for c in header if "".join(words[c]) in SPELLINGS[name]]
+        near = same or [
+            c for c in header if words[c] and words[c][0] in SPELLINGS[name] and set(words[c][1:]) <= SAID_BESIDE
+        ]
+        if len(near) == 1 and near[0] not in found.values():
+            found[name] = near[0]
+    return found
+
+
 def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     """Read a coefficient table: columns mach, alpha_deg, ca, cn, cm, cmq, one row a grid point, ``#`` comments.
 
@@ -158,9 +185,13 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
         raise GateError(f"{path}: cannot be read as a table: {fault}") from None
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
     header = [cell.strip() for cell in lines[0][1].split("#")[0].split(",")] if lines else []
+    header = [c.lower() if c.lower() in names else c for c in header]
     missing = [c for c in names if c not in header]
     if missing:
-        raise GateError(f"{path}: columns {', '.join(missing)} are missing; wanted {', '.join(names)}")
+        near = named_columns(names, header)
+        meant = [f"'{near[c]}' looks like {c}: name it so" for c in missing if c in near]
+        words = f"columns {', '.join(missing)} are missing; wanted {', '.join(names)}; found {', '.join(header)}"
+        raise GateError("; ".join([f"{path}: {words}", *meant]))
     twice = [c for c in names if header.count(c) > 1]
     if twice:
         raise GateError(f"{path}, line {lines[0][0]}: columns {', '.join(twice)} stand twice; keep one of each")

@@ -87,6 +87,12 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None) 
     radars = _there({name: read_radar(gate, name, entry) for name, entry in spec.radars.items()})
     gnss = _there({name: read_gnss(gate, name, entry) for name, entry in spec.gnss.items()})
     sounding = _sounding(gate, spec)
+    if spec.motion.model == "ballistic" and triads["accelerometer"] is not None and triads["rates"] is not None:
+        words = (
+            'accelerometer and rates are there, but with model = "ballistic" gravitation and drag carry the flight: '
+            "they are not used for its path and attitude; take [motion] out unless that is meant"
+        )
+        gate.findings.append(Finding("motion", words, np.nan, np.nan))
     measured = spec.atmosphere is not None
     barometers = {
         name: read_barometer(gate, name, entry, sounding, measured) for name, entry in spec.barometers.items()

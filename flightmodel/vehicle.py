@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -44,6 +44,7 @@ Focal = Annotated[float, Field(ge=1e-3, le=1e5)]
 Distortion = Annotated[float, Field(ge=-100.0, le=100.0)]
 Vector = tuple[Place, Place, Place]
 InertiaRow = tuple[Inertia, Inertia, Inertia]
+InertiaRows = tuple[InertiaRow, InertiaRow, InertiaRow]
 
 
 class Reference(Section):
@@ -58,7 +59,20 @@ class MassProperties(Section):
 
     mass_kg: Annotated[float, Field(ge=1e-6, le=1e12)]
     cg_from_datum_body_m: Vector
-    inertia_kgm2: tuple[InertiaRow, InertiaRow, InertiaRow]
+    inertia_kgm2: InertiaRows
+
+    @field_validator("inertia_kgm2", mode="before", json_schema_input_type=InertiaRow | InertiaRows)
+    @classmethod
+    def _rows(cls, value: Any) -> Any:
+        """Three numbers are the diagonal."""
+        if isinstance(value, str):
+            return value
+        of_three = isinstance(value, (list, tuple)) and len(value) == 3
+        if of_three and not any(isinstance(v, (list, tuple, str, bool)) for v in value):
+            return [[value[i] if i == k else 0.0 for i in range(3)] for k in range(3)]
+        if not of_three or not all(isinstance(row, (list, tuple)) and len(row) == 3 for row in value):
+            raise ValueError("three numbers (about body x, y, z) or three rows of three are wanted, kg m2")
+        return value
 
     @field_validator("inertia_kgm2")
     @classmethod

@@ -6,15 +6,12 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from estimators.calibration import calibrate_lens, read_corners
@@ -34,6 +31,7 @@ from postflight.pipeline import (
     estimate,
     reconstruct_telemetry,
 )
+from postflight.progress import Report, progress_bar
 from postflight.report.write import write_report
 from postflight.sensitivity import largest_of_groups, sensitivity
 from recon.bet import Settings
@@ -49,19 +47,8 @@ SHORT = {
 }  # fmt: skip
 LARGEST_NORMAL = 3.5  # standard deviations that one of some dozens of changes may be off
 REFERENCE = "irve2_reference"
-Report = Callable[[float, str], None]
 console = Console(soft_wrap=True)
 console_err = Console(stderr=True, soft_wrap=True)
-
-
-@contextmanager
-def progress_bar() -> Iterator[Report]:
-    """Progress on standard error with remaining time; silent where that is no terminal."""
-    screen = Console(stderr=True)
-    columns = (TextColumn("{task.description:<34}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
-        task = bar.add_task("starting", total=1.0)
-        yield lambda fraction, what: bar.update(task, completed=fraction, description=what)
 
 
 def compile_kernels(*groups: str) -> None:

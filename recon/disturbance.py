@@ -19,6 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from flightmodel.checks import DivergenceError
 from flightmodel.telemetry import Finding
 from flightmodel.telemetry import Motion as MotionSpec
 from recon.ekf import ForwardPass
@@ -32,6 +33,7 @@ LOST_POINTS = 6
 LEAST_BELIEVED = 0.5
 BEFORE_S, AFTER_S = 1.5, 0.5  # a slow departure passes the gate for a while
 FIRST_DENSITY, GROWTH, LARGEST_DENSITY = 0.1, 10.0, 1.1e6  # (m/s^2)^2/Hz
+MOST = 10  # spans in which inertial sensors may fail to carry the track, before nothing is believed of them
 
 
 STATED_CORRELATION_S = 1.0  # what is disturbed keeps its value for about so long
@@ -110,4 +112,19 @@ def widened(known: tuple[Disturbance, ...], problem: Problem, run: ForwardPass) 
         return None
     # one that is near but did not suffice is the same one: the track was lost a little later this time
     start, end = min([start, *(d.start_s for d in near)]), max([end, *(d.end_s for d in near)])
-    return (*(d for d in known if d not in near), Disturbance(start, end, density))
+    found = (*(d for d in known if d not in near), Disturbance(start, end, density))
+    if not problem.motion.ballistic and len(found) > MOST:
+        raise _not_carried(found)
+    return found
+
+
+def _not_carried(found: tuple[Disturbance, ...]) -> DivergenceError:
+    """Refusal of a flight whose inertial sensors carry it nowhere: each span more would cost some passes."""
+    start, end = min(d.start_s for d in found), max(d.end_s for d in found)
+    return DivergenceError(
+        f"reconstruction: accelerometer and gyros do not carry the track: in more than {MOST} spans between "
+        f"{start:.1f} and {end:.1f} s accelerations would be needed that nothing tells. Look at the flight with "
+        "`postflight check`; check attitude_prior (q_ecef_body has its scalar first and turns body vectors into ECEF), "
+        "units, axes and mounts of both sensors, and t0_utc. Where the vehicle was shaken so often, state it in "
+        "[[motion.disturbed]]"
+    )

@@ -15,10 +15,12 @@ import numpy as np
 
 from flightmodel import earth
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.config import FILL_IN
+from flightmodel.config import FILL_IN, read_toml
 from flightmodel.flightfolder import Sources, read_sources
 from flightmodel.telemetry import Finding
-from postflight.intake import odd_field, odd_force, odd_tracks, odd_turning
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from postflight.intake import odd_field, odd_force, odd_start, odd_tracks, odd_turning
+from postflight.intake.left import left_to_fill_in
 from postflight.intake.track import best_comparison, track_force
 
 CLOCK_SD, CLOCK_S = 5.0, 0.1  # a clock is doubted beyond so many standard deviations and seconds
@@ -76,11 +78,11 @@ def check_folder(folder: Path) -> Report:
     try:
         found = read_sources(folder)
     except GateError as fault:
-        _refuse(report, fault.faults, fault.exit_code)
+        _refuse(report, folder, [*fault.faults, *_vehicle_faults(folder)], fault.exit_code)
         return report
     gate = found.gate
     if gate.config or gate.faults:
-        _refuse(report, [*gate.config, *gate.faults], 3 if gate.faults else 2)
+        _refuse(report, folder, [*gate.config, *gate.faults], 3 if gate.faults else 2)
     report.facts = _facts(found)
     report.findings = sorted(gate.findings, key=lambda f: (f.source, np.nan_to_num(f.start_s, nan=-np.inf)))
     with np.errstate(invalid="ignore"):
@@ -88,8 +90,23 @@ def check_folder(folder: Path) -> Report:
     return report
 
 
-def _refuse(report: Report, faults: tuple[str, ...] | list[str], code: int) -> None:
-    report.fill_in = [words for words in faults if FILL_IN in words]
+def _vehicle_faults(folder: Path) -> list[str]:
+    """Faults of the vehicle file, which is not reached where flight.toml has some."""
+    try:
+        named = read_toml(folder / "flight.toml").get("vehicle")
+    except GateError:
+        return []
+    if not isinstance(named, str) or not named.endswith(".toml"):
+        return []
+    try:
+        vehicle_from_toml(vehicle_path(named, folder))
+    except GateError as fault:
+        return [f"vehicle: {words}" for words in fault.faults]
+    return []
+
+
+def _refuse(report: Report, folder: Path, faults: list[str], code: int) -> None:
+    report.fill_in = left_to_fill_in(folder)
     report.refused = [words for words in faults if FILL_IN not in words]
     report.exit_code = code
 
@@ -120,7 +137,7 @@ def _facts(found: Sources) -> list[Fact]:
 
 def _compare(found: Sources, report: Report) -> None:
     """Sensors against each other and against physics."""
-    report.oddities += odd_force.at_rest(found) + odd_force.lever(found)
+    report.oddities += odd_start.apart_in_time(found) + odd_force.at_rest(found) + odd_force.lever(found)
     trackers = odd_tracks.tracks(found)
     for name, radar in found.radars.items():
         report.oddities += odd_tracks.free_fall(found, name, radar)
@@ -162,6 +179,8 @@ def _against_accelerometer(found: Sources, name: str, report: Report) -> None:
         report.oddities += odd_force.entry_axis(found, force)
     if force is not None and not report.oddities:
         report.oddities += odd_turning.turned_force(found, force)
+    if force is not None and not report.oddities:
+        report.oddities += odd_start.attitude_and_force(found, force)
 
 
 def _say_clock(report: Report, clock: Clock, time_s: FloatArray) -> None:

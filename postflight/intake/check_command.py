@@ -13,7 +13,9 @@ from rich.table import Table
 from flightmodel.telemetry import Finding
 from postflight.intake.check import Report, check_folder
 
-console = Console(soft_wrap=True)
+WIDE = 160  # of a log file: a table need not be squeezed there
+console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else WIDE)
+LONGEST_NAME = 28  # that leaves room for the rest of a table on 80 columns
 
 
 def check(folder: Path, as_json: bool) -> None:
@@ -32,7 +34,10 @@ def print_report(report: Report) -> None:
     if report.facts:
         table = Table(title="Sensors")
         for name in ("source", "rows", "from s", "to s", "rate Hz", "missing", "file"):
-            table.add_column(name, justify="left" if name in ("source", "file") else "right")
+            left = name in ("source", "file")
+            # names stay whole on one line, as two radars may differ in their ends; files are folded
+            whole = name != "file" and max(len(f.source) for f in report.facts) <= LONGEST_NAME
+            table.add_column(name, justify="left" if left else "right", overflow="fold", no_wrap=whole)
         for f in report.facts:
             span = (f"{f.start_s:.3f}", f"{f.end_s:.3f}", f"{f.rate_hz:.4g}")
             table.add_row(escape(f.source), str(f.rows), *span, str(f.missing), escape(f.file))

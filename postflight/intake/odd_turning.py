@@ -46,7 +46,7 @@ def turned_force(found: Sources, force: TrackForce) -> list[Finding]:
         return []
     grid = np.arange(times[0] - force.width_s / 2, times[-1] + force.width_s / 2, CELL_S)
     w, a = (
-        _means(record.time_s, record.measured_sensor @ record.spec.dcm_body_sensor.T, grid)
+        cell_means(record.time_s, record.measured_sensor @ record.spec.dcm_body_sensor.T, grid)
         for record in (gyros, sensed)
     )
     if not (np.isfinite(w).all() and np.isfinite(a).all()):
@@ -70,7 +70,7 @@ def turned_force(found: Sources, force: TrackForce) -> list[Finding]:
     return [Finding("rates", words, float(times[0]), float(times[-1]))]
 
 
-def _means(time_s: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
+def cell_means(time_s: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
     """Means of columns (n, 3) over cells that begin at the grid's times; NaN in gaps of 0.5 s and beyond the ends."""
     whole = np.isfinite(values).all(axis=1)
     t, v = time_s[whole], values[whole]

@@ -24,6 +24,7 @@ from postflight.intake.words import (
     TRIAD_WORDS,
     means,
     take_apart,
+    unit_key,
 )
 
 TRIADS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
@@ -31,6 +32,8 @@ TRIADS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
     "rate": ("sensors.rates", columns.RATES),
     "magnetic field": ("sensors.magnetometer", columns.MAGNETOMETER),
 }
+G_OR_GAUSS = {"acceleration", "magnetic field"}
+FIELD_GAUSS = (0.15, 1.0)  # the Earth's, with some iron
 EARTH_RADII_M = (6.2e6, 7.5e6)
 MOUNT = 'a package of the vehicle file, or "body"; or axes = ["+x", "+y", "+z"]: which body axis is each of its axes?'
 AIR = ("alt", "rho", "temperature", "pressure", "wind_speed", "wind_from")
@@ -100,7 +103,7 @@ class Reader:
         return list(found.values())
 
     def _triad_kind(self, stem: tuple[str, ...], family: str, at: list[int]) -> tuple[str, str]:
-        stated = set.intersection(*(self.named[k].kinds for k in at))
+        stated = self._stated(at)
         worded = [kind for kind, words in TRIAD_WORDS.items() if means(stem, words)]
         if family == "body" and (not stem or "rate" in worded or stated == {"rate"}):
             return ("rate", "names of body rates") if stated in (set(), {"rate"}) else ("", "")
@@ -111,9 +114,34 @@ class Reader:
             if kind in ("rate", "magnetic field", "acceleration") or kind in worded:
                 return kind, "unit"
             return "", ""
+        if stated == G_OR_GAUSS and not worded and self._is_g(at):
+            return "acceleration", "three axes"
         if stated and len(fitting) != 1:
             return "", ""
         return (fitting[0], "name") if len(fitting) == 1 else ("", "")
+
+    def _is_g(self, at: list[int]) -> bool:
+        """Whether ``g`` is no gauss: a small letter, or of a size that the Earth's field has nowhere."""
+        if all(unit_key(self.named[k].unit_text) == self.named[k].unit_text for k in at):
+            return True
+        size = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1)
+        size = size[np.isfinite(size)]
+        return len(size) > 0 and not FIELD_GAUSS[0] < float(np.median(size)) < FIELD_GAUSS[1]
+
+    def may_be_inertial(self) -> bool:
+        """Whether columns that were recognised as nothing differ by x, y, z alone, as an inertial sensor's do."""
+        if self.time is None:
+            return False
+        left = {"_".join(self.named[k].tokens): self.named[k].kinds for k in self.free}
+        for name, kinds in left.items():
+            for at in (k for k, letter in enumerate(name) if letter == "x"):
+                mates = [name[:at] + axis + name[at + 1 :] for axis in "yz"]
+                if all(mate in left for mate in mates) and not kinds - {"acceleration", "rate", "magnetic field"}:
+                    return True
+        return False
+
+    def _stated(self, at: Iterable[int]) -> set[str]:
+        return set.intersection(*(self.named[k].kinds for k in at))
 
     def _triad_columns(self, kind: str, quantities: Iterable[Quantity], at: list[int], why: str) -> list[Mapped]:
         guess, seen = triad_unit(kind, np.column_stack([self.table.numbers(k) for k in at]))
@@ -210,7 +238,7 @@ class Reader:
         ned = shorts[0] == "vn"
         for (stem, family), by_axis in self.families().items():
             at = [by_axis[a] for a in range(3)]
-            stated = set.intersection(*(self.named[k].kinds for k in at))
+            stated = self._stated(at)
             if not set(at) <= self.free or (stated and kind not in stated) or (family == "ned") != ned:
                 continue
             if not stated and not set(stem) & TRIAD_WORDS[kind]:
@@ -298,6 +326,8 @@ def _axes_of(tokens: tuple[str, ...]) -> list[tuple[tuple[str, ...], str, int]]:
             out.append((rest, "numbered", int(token) - 1))
         elif len(token) > 1 and token[-1] in "xyz" and token[:-1] in stems:
             out.append(((token[:-1], *rest), "xyz", AXES[token[-1]]))
+        elif len(token) > 3 and token[0] in "xyz" and token[1:] in stems:
+            out.append(((token[1:], *rest), "xyz", AXES[token[0]]))
         elif len(token) > 1 and token[-1] in "ned" and token[:-1] == "v":
             out.append((("v", *rest), "ned", AXES[token[-1]]))
     return out

@@ -148,7 +148,21 @@ QUANTITY_WORDS: dict[str, set[str]] = {
     "nsat": {"nsat", "sats", "satellites", "satelliten", "numsv", "nsats", "sat"},
 }
 TRIAD_WORDS: dict[str, set[str]] = {
-    "acceleration": {"a", "acc", "accel", "acceleration", "accelerometer", "beschleunigung", "beschl", "f", "nf", "sf"},
+    "acceleration": {
+        "a",
+        "acc",
+        "accel",
+        "acceleration",
+        "accelerometer",
+        "beschleunigung",
+        "beschl",
+        "f",
+        "n",  # load factor
+        "nf",
+        "sf",
+        "load",
+        "loadfactor",
+    },
     "rate": {
         "w",
         "om",
@@ -162,7 +176,7 @@ TRIAD_WORDS: dict[str, set[str]] = {
         "angular",
         "winkelgeschwindigkeit",
     },
-    "magnetic field": {"m", "mag", "magnet", "magnetometer", "b", "field", "feld", "magnetfeld"},
+    "magnetic field": {"m", "h", "mag", "magnet", "magnetometer", "b", "field", "feld", "magnetfeld"},
     "speed": {"v", "vel", "velocity", "geschwindigkeit"},
     "length": {"pos", "position", "r", "ecef"},
 }

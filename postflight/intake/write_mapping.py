@@ -30,26 +30,54 @@ def section_text(source: SourceProposal, file: str, notes: list[str], taken: boo
     return "\n".join(lines) + "\n"
 
 
-def start_text(sections: set[str], tables: dict[str, Any]) -> str:
-    """Return what the tables ask for besides: how the vehicle was turned, or how it moves without inertial sensors."""
+def start_text(sections: set[str], tables: dict[str, Any], doubtful: list[str]) -> str:
+    """Return what the tables ask for besides: how the vehicle was turned, or how it moves without inertial sensors.
+
+    ``doubtful`` names files with columns that were recognised as nothing and may be an accelerometer's or gyros'.
+    """
     inertial = {"sensors.accelerometer", "sensors.rates"} <= sections
-    if inertial and "attitude_prior" not in tables:
-        return (
-            "[attitude_prior]                  # how the vehicle was turned at one time; or q_ecef_body, scalar first\n"
-            't_s = "FILL IN"                   # s after t0\n'
-            'azimuth_deg = "FILL IN"           # deg from true north: where the nose points\n'
-            'elevation_deg = "FILL IN"         # deg above the horizon\n'
-            'roll_deg = "FILL IN"              # deg; at 0 body y is level and points right of one who looks along x\n'
-            "sd_deg = 3.0                      # deg, one number or one for body x, y, z\n"
-        )
+    if inertial:
+        return _ballistic_doubt(tables) + _attitude_text(tables)
     tracked = any(s.startswith(("radars.", "gnss.")) for s in sections)
-    if tracked and not inertial and "motion" not in tables:
-        return (
-            "[motion]                          # without inertial sensors gravitation and drag carry the flight\n"
-            'model = "ballistic"\n'
-            'drag_area_per_mass_m2pkg = "FILL IN"  # m2/kg: C_D S / m, to a factor of 2.7\n'
-        )
-    return ""
+    if not tracked or "motion" in tables:
+        return ""
+    text = (
+        "[motion]                          # no accelerometer with gyros yet: gravitation and drag carry the flight\n"
+        'model = "ballistic"               # take [motion] out once both are there\n'
+        'drag_area_per_mass_m2pkg = "FILL IN"  # m2/kg: C_D S / m, to a factor of 2.7\n'
+    )
+    if not doubtful:
+        return text
+    first = (
+        f"# QUESTION: {one_line(', '.join(doubtful))} may hold an accelerometer or gyros: declare the columns above.\n"
+        "# Only a flight without both moves like this:\n"
+    )
+    return first + "".join(f"# {line}\n" for line in text.replace("FILL IN", "...").splitlines())
+
+
+def _ballistic_doubt(tables: dict[str, Any]) -> str:
+    """Return the question that an earlier ``[motion]`` is, once inertial sensors are there."""
+    motion = tables.get("motion")
+    if not isinstance(motion, dict) or motion.get("model") != "ballistic":
+        return ""
+    return (
+        '# QUESTION: [motion] above says model = "ballistic", so accelerometer and gyros would not carry the flight:\n'
+        "# take [motion] out, unless that is meant.\n"
+    )
+
+
+def _attitude_text(tables: dict[str, Any]) -> str:
+    if "attitude_prior" in tables:
+        return ""
+    return (
+        "[attitude_prior]                  # how the vehicle was turned at one time; or q_ecef_body, scalar first\n"
+        't_s = "FILL IN"                   # s after t0\n'
+        'azimuth_deg = "FILL IN"           # deg from true north: where the nose points\n'
+        'elevation_deg = "FILL IN"         # deg above the horizon\n'
+        'roll_deg = "FILL IN"              # deg; at 0 body y is level and points right of one who looks along x\n'
+        "# q_ecef_body = [1.0, 0.0, 0.0, 0.0]  # instead of these three: body to ECEF, scalar FIRST, e.g.\n"
+        "sd_deg = 3.0                      # deg, one number or one for body x, y, z\n"
+    )
 
 
 def _line(text: str, comment: str) -> str:

@@ -10,12 +10,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.checks import ConfigError, GateError
-from postflight.commands import compile_kernels, console, progress_bar
+from postflight.commands import compile_kernels, console
 from postflight.figures import save
 from postflight.montecarlo import figures, running, sobol
 from postflight.montecarlo.merge import Merged, merge, write_csv, write_merged
 from postflight.montecarlo.running import Wanted
 from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
+from postflight.progress import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from synthetic_flight.ensemble import available_cores
 from synthetic_flight.outputs import check_names

@@ -13,10 +13,11 @@ from rich.table import Table
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight import results
-from postflight.commands import Report, compile_kernels, console, progress_bar
+from postflight.commands import compile_kernels, console
 from postflight.figures import save
 from postflight.pipeline import PULSE_RATE_HZ, Flight, estimate, reconstruct_telemetry
 from postflight.preflight import Bounds, entry_bounds, rigid_bounds
+from postflight.progress import Report, progress_bar
 from postflight.reconciliation.answer import correlations, deflection_of, found_sd, joint_table, vehicle_lines
 from postflight.reconciliation.figures import figure_modes, figure_posterior, figure_reconciled
 from postflight.reconciliation.fit import Reconciled

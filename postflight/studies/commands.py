@@ -12,12 +12,13 @@ from rich.table import Table
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import GateError
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.commands import compile_kernels, console, progress_bar
+from postflight.commands import compile_kernels, console
 from postflight.figures import save
 from postflight.montecarlo.merge import write_csv
 from postflight.montecarlo.study import read_study
 from postflight.pipeline import Flight, reconstruct_flight
 from postflight.preflight import Bounds, entry_bounds, inside
+from postflight.progress import progress_bar
 from postflight.studies import figures, joints
 from postflight.studies.table_3_1 import table_3_1
 from postflight.warmup import RECONSTRUCTION

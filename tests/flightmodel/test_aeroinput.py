@@ -162,12 +162,32 @@ def test_sidecar_is_required_and_every_fault_of_both_is_named(tmp_path):
     with pytest.raises(ConfigError, match="needs one beside it: source"):
         read_with_sidecar(path)
     path = write_table(tmp_path, sidecar={"sorce": "us", "area_m2": -1.0, "length_m": 3.0, "axes": "stability"})
-    path.write_text(path.read_text().replace("mach,", "Mach,").replace("1.5,", "x,", 1))
+    path.write_text(path.read_text().replace("mach,", "M,").replace("1.5,", "x,", 1))
     with pytest.raises(GateError) as caught:
         read_with_sidecar(path)
     text = str(caught.value)
     for words in ("columns mach are missing", "did you mean 'source'", "area_m2", "axes", "licence", "t.toml", "t.csv"):
         assert words in text, words
+
+
+def test_header_in_capitals_is_read_and_other_names_are_told_with_the_nearest(tmp_path):
+    reference = {"area_m2": 7.0, "length_m": 3.0, "moment_reference_station_m": 0.0}
+    path = write_table(tmp_path, sidecar={"source": "x", "licence": "x"} | reference)
+    small = read_with_sidecar(path)[0]
+    path.write_text(path.read_text().replace("mach,alpha_deg,ca,cn,cm,cmq", "Mach,Alpha_deg,CA,CN,CM,Cmq"))
+    np.testing.assert_array_equal(read_with_sidecar(path)[0].coefficients, small.coefficients)
+    path.write_text(path.read_text().replace("Mach,Alpha_deg,CA,CN,CM,Cmq", "Mach No,AoA (deg),CA,CN,Cm_nose,CN_alpha"))
+    with pytest.raises(GateError) as caught:
+        read_with_sidecar(path)
+    for words in (
+        "columns mach, alpha_deg, cm, cmq are missing",
+        "found Mach No, AoA (deg), ca, cn, Cm_nose, CN_alpha",
+        "'Mach No' looks like mach",
+        "'AoA (deg)' looks like alpha_deg",
+        "'Cm_nose' looks like cm",
+    ):
+        assert words in str(caught.value), words
+    assert "looks like cmq" not in str(caught.value)
 
 
 def test_tables_uncertainty_stands_where_the_vehicle_file_is_silent(tmp_path):

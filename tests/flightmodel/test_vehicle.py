@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from flightmodel.checks import ConfigError, GateError
+from flightmodel.config import parse_section
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_clock, lv_direction
-from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from flightmodel.vehicle import MassProperties, vehicle_from_toml, vehicle_path
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +89,22 @@ def test_impossible_inertia_is_refused(tmp_path):
     )
     with pytest.raises(ConfigError, match="triangle"):
         vehicle_from_toml(path)
+
+
+def test_three_moments_of_inertia_are_the_diagonal_and_other_forms_are_told(tmp_path):
+    def body(inertia):
+        table = {"mass_kg": 1.0, "cg_from_datum_body_m": [0.0, 0.0, 0.0], "inertia_kgm2": inertia}
+        return parse_section(MassProperties, table, "x.toml")
+
+    np.testing.assert_array_equal(body([7.0, 4, 4.0]).inertia, np.diag([7.0, 4.0, 4.0]))
+    for wrong in (3.0, [1.0, 2.0], [[1.0, 2.0, 3.0]], [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], [1.0, [0, 1, 0], 2.0]):
+        with pytest.raises(ConfigError, match=r"three numbers .* or three rows of three") as caught:
+            body(wrong)
+        assert len(caught.value.faults) == 1
+    with pytest.raises(ConfigError, match="still to fill in"):
+        body("FILL IN")
+    with pytest.raises(ConfigError, match="three numbers"):
+        body([True, 1.0, 1.0])
 
 
 def test_unknown_vehicle_and_bad_toml(tmp_path):

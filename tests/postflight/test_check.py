@@ -9,9 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
+from rich.console import Console
 
 from postflight.cli import cli
-from postflight.intake.check import check_folder
+from postflight.intake import check_command
+from postflight.intake.check import Fact, Report, check_folder
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "examples" / "range_package_01"
@@ -252,6 +254,31 @@ def test_radar_at_another_site(folder):
     said(folder, "wallops_mainland", "km from where wallops_island has it")
 
 
+# the start
+
+
+def test_attitude_with_the_scalar_last_and_turned_the_other_way(folder):
+    q = "[0.41731, -0.53156, -0.11720, 0.72771]"
+    edit(folder, (q, "[-0.53156, -0.11720, 0.72771, 0.41731]"))
+    found = said(folder, "attitude_prior", "away from where the track has it", "with the scalar last")
+    assert len(found) == 1
+    edit(folder, ("[-0.53156, -0.11720, 0.72771, 0.41731]", "[0.41731, 0.53156, 0.11720, -0.72771]"))
+    said(folder, "attitude_prior", "as from ECEF to body")
+
+
+def test_time_zero_an_hour_off(folder):
+    edit(folder, ("12:52:00", "13:52:00"))
+    edit(folder, ("t_s = 300.0", "t_s = 3900.0"))
+    found = said(folder, "wallops_island", "lies beside the accelerometer's time", "Moved by 1 h (a time zone?)")
+    assert [line.split(":")[0] for line in found] == ["wallops_island", "wallops_mainland", "attitude_prior"]
+
+
+def test_inertial_sensors_beside_ballistic_motion(folder):
+    with (folder / "flight.toml").open("a") as text:
+        text.write('\n[motion]\nmodel = "ballistic"\ndrag_area_per_mass_m2pkg = 0.006\n')
+    assert any("are not used" in f.what for f in check_folder(folder).findings if f.source == "motion")
+
+
 # what the readers see
 
 
@@ -272,6 +299,17 @@ def test_gap_duplicates_out_of_order_frozen_and_saturated(folder):
 
 
 # the command
+
+
+@pytest.mark.parametrize("radar", ["WALLOPS_MAINLAND_TWO", "a_name_of_nearly_as_many_letters_as_a_name_may_have_64"])
+def test_sensors_names_are_shown_whole(radar, monkeypatch, capsys):
+    fact = Fact(radar, f"telemetry/{radar}_and_more.csv", 2300, 300.0, 530.0, 10.0, 0)
+    for width in (80, check_command.WIDE):
+        screen = Console(soft_wrap=True, width=width, color_system=None)
+        monkeypatch.setattr(check_command, "console", screen)
+        check_command.print_report(Report(facts=[fact]))
+        rows = [line.split("│")[1].strip() for line in capsys.readouterr().out.splitlines() if "│" in line]
+        assert "".join(rows) == radar
 
 
 def test_json_is_whole_and_exit_code_0(folder):

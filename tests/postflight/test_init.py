@@ -89,14 +89,16 @@ def test_new_folder_says_what_is_still_to_fill_in(tmp_path):
     assert made.exit_code == 0, made.output
     found = json.loads(run("check", tmp_path / "flight", "--json").stdout)
     assert found["exit_code"] == 2
-    assert [w.split("'")[1] for w in found["fill_in"]] == ["name", "t0_utc"]
+    left = template("vehicle").count('"FILL IN"')
+    assert [w.split("'")[1] for w in found["fill_in"] if "flight.toml" in w] == ["name", "t0_utc"]
+    assert len(found["fill_in"]) == 2 + left
+    assert not found["refused"]
     text = (tmp_path / "flight" / "flight.toml").read_text()
     text = text.replace('name = "FILL IN" ', 'name = "x" ').replace(
         't0_utc = "FILL IN" ', 't0_utc = "2020-01-01T00:00:00Z" '
     )
     (tmp_path / "flight" / "flight.toml").write_text(text)
     found = json.loads(run("check", tmp_path / "flight", "--json").stdout)
-    left = template("vehicle").count('"FILL IN"')
     assert len(found["fill_in"]) == left
     assert sum("no [radars.NAME]" in w for w in found["refused"]) == 1
 

@@ -1,0 +1,215 @@
+"""`postflight import` of a delivery: accelerometers however named, video, coefficients, and what is left to write."""
+
+import json
+import shutil
+import tomllib
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from postflight.cli import cli
+
+N = 60
+T = np.arange(N) * 0.1
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, [str(a) for a in arguments])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def read(folder):
+    return tomllib.loads((folder / "flight.toml").read_text())
+
+
+@pytest.fixture
+def folder(tmp_path):
+    run("init", tmp_path / "flight")
+    return tmp_path / "flight"
+
+
+def triad(path, names, size=1.0):
+    values = size * np.random.default_rng(3).normal(size=(N, 3))
+    pd.DataFrame(np.column_stack([T, values]), columns=["t_s", *names]).to_csv(path, index=False)
+    return path
+
+
+def radar(path):
+    pd.DataFrame({"t_s": T, "range_m": 1e5 - T, "az_deg": 90.0, "el_deg": 30.0}).to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("form", "unit"),
+    [
+        ("SUBA_{} (g)", "g"),
+        ("SUBA_{} [G]", "g"),
+        ("Accel {} [m/s^2]", "mps2"),
+        ("A{}_G", "g"),
+        ("N{} (g)", "g"),
+        ("ACC_{}", "FILL IN"),
+        ("IMU_ACC_{}_MPS2", "mps2"),
+        ("{}ACCEL_G", "g"),
+        ("accel-{}, g", "g"),
+        ("LinAcc.{} (m s^-2)", "mps2"),
+        ("Body {} Accel (G's)", "g"),
+        ("ACCEL1{} (mg)", "mg"),
+    ],
+)
+def test_accelerometers_however_they_are_named(form, unit, folder, tmp_path):
+    run("import", triad(tmp_path / "a.csv", [form.format(a) for a in "XYZ"]), "--into", folder)
+    found = read(folder)["sensors"]["accelerometer"]["columns"]
+    assert [found[f"a{a}"] for a in "xyz"] == [{"column": form.format(a.upper()), "unit": unit} for a in "xyz"]
+
+
+@pytest.mark.parametrize(("form", "size"), [("H{} [G]", 0.3), ("SUBA_{} [G]", 0.3), ("P{}", 1.0)])
+def test_fields_in_gauss_and_threes_of_nothing_are_no_accelerometer(form, size, folder, tmp_path):
+    run("import", triad(tmp_path / "a.csv", [form.format(a) for a in "XYZ"], size), "--into", folder)
+    assert "accelerometer" not in read(folder).get("sensors", {})
+
+
+def test_ballistic_is_proposed_only_where_no_column_may_be_an_accelerometer(folder, tmp_path):
+    run("import", radar(tmp_path / "radar.csv"), triad(tmp_path / "suba.csv", ["QX", "QY", "QZ"]), "--into", folder)
+    assert "motion" not in read(folder)
+    assert "QUESTION: suba may hold an accelerometer" in (folder / "flight.toml").read_text()
+    run("init", tmp_path / "other")
+    run("import", tmp_path / "radar.csv", "--into", tmp_path / "other")
+    assert read(tmp_path / "other")["motion"]["model"] == "ballistic"
+    later = [
+        triad(tmp_path / "acc.csv", ["ax_g", "ay_g", "az_g"]),
+        triad(tmp_path / "w.csv", ["p_dps", "q_dps", "r_dps"]),
+    ]
+    run("import", *later, "--into", tmp_path / "other")
+    text = (tmp_path / "other" / "flight.toml").read_text()
+    assert '[motion] above says model = "ballistic"' in text
+    assert "attitude_prior" in read(tmp_path / "other")
+
+
+# video
+
+
+def film_folder(path, count=5):
+    path.mkdir()
+    for k in range(count):
+        cv2.imwrite(str(path / f"frame_{k:03d}.png"), np.full((8, 8), k, np.uint8))
+    return path
+
+
+def frames_csv(path, names, column="frame"):
+    pd.DataFrame({"t_s": 421.0 + 0.5 * np.arange(len(names)), column: names}).to_csv(path, index=False)
+    return path
+
+
+def test_pictures_and_their_list_become_frames(folder, tmp_path):
+    pictures = film_folder(tmp_path / "CAM 5")
+    names = [f"CAM 5/{p.name}" for p in sorted(pictures.iterdir())]
+    out = run("import", pictures, frames_csv(tmp_path / "times.csv", names, "file"), "--into", folder)
+    assert out.exit_code == 0
+    found = read(folder)["frames"]
+    assert found == {
+        "file": "telemetry/times.csv", "folder": "telemetry/CAM_5", "camera": "FILL IN", "benchmark_s": "FILL IN",
+    }  # fmt: skip
+    for picture in pictures.iterdir():
+        assert (folder / "telemetry" / "CAM_5" / picture.name).read_bytes() == picture.read_bytes()
+    listed = pd.read_csv(folder / "telemetry" / "times.csv")
+    assert listed["frame"].tolist() == sorted(p.name for p in pictures.iterdir())
+    assert "goes from 421 to 423" in (folder / "flight.toml").read_text()
+    with pytest.raises(Exception, match="exists already"):
+        run("import", pictures, "--into", folder)
+
+
+def test_list_after_pictures_a_film_and_the_only_camera(tmp_path):
+    folder = tmp_path / "flight"
+    run("init", folder, "--vehicle", "irve2_reference")
+    run("import", film_folder(tmp_path / "cam"), "--into", folder)
+    assert "telemetry/cam holds 5 pictures; when was each frame taken?" in (folder / "flight.toml").read_text()
+    run("import", frames_csv(tmp_path / "t.csv", [f"frame_{k:03d}.png" for k in range(5)]), "--into", folder)
+    frames = read(folder)["frames"]
+    assert (frames["folder"], frames["camera"]) == ("telemetry/cam", "FILL IN")
+    assert "of the vehicle file: camera5_uncalibrated, camera5" in (folder / "flight.toml").read_text()
+    run("init", tmp_path / "b")
+    with (tmp_path / "b" / "vehicle" / "vehicle.toml").open("a") as form:
+        form.write("\n[cameras.aft]\n")
+    (tmp_path / "onboard.webm").write_bytes(b"\x1aE\xdf\xa3 no matter")
+    run("import", tmp_path / "onboard.webm", frames_csv(tmp_path / "n.csv", [0, 1, 2, 3]), "--into", tmp_path / "b")
+    frames = read(tmp_path / "b")["frames"]
+    assert (frames["film"], frames["camera"]) == ("telemetry/onboard.webm", "aft")
+    assert (tmp_path / "b" / "telemetry" / "onboard.webm").read_bytes() == b"\x1aE\xdf\xa3 no matter"
+
+
+def test_what_is_no_data_is_named_and_left_out(folder, tmp_path):
+    delivery = tmp_path / "delivery"
+    delivery.mkdir()
+    (delivery / "notes").mkdir()
+    (delivery / "notes" / "a.txt").write_text("nothing")
+    (delivery / "MEMO.txt").write_text("Launch at noon\n")
+    (film_folder(delivery / "cam") / "index.txt").write_text("x")
+    radar(delivery / "radar.csv")
+    out = run("import", *sorted(delivery.iterdir()), "--into", folder).output
+    for words in ("notes: a folder without pictures", "MEMO.txt: no table found", "beside its pictures index.txt"):
+        assert words in out, words
+    assert sorted(p.name for p in (folder / "telemetry").iterdir()) == ["cam", "radar.csv"]
+    assert sorted(p.suffix for p in (folder / "telemetry" / "cam").iterdir()) == [".png"] * 5
+    with pytest.raises(Exception, match="no table found"):
+        run("import", delivery / "MEMO.txt", "--into", folder)
+
+
+# coefficients
+
+
+def shipped_table(path, header):
+    source = vehicle_path("irve2_reference").parents[1] / "aerodynamics" / "irve2_reference.csv"
+    lines = [line for line in source.read_text().splitlines() if not line.startswith("#")]
+    path.write_text("\n".join([header, *lines[1:]]) + "\n")
+    return path
+
+
+def test_coefficients_go_beside_the_vehicle_with_a_form_of_their_sidecar(folder, tmp_path):
+    table = shipped_table(tmp_path / "AERO 1.csv", "Mach,Alpha_deg,CA,CN,Cm_nose,Cmq")
+    out = run("import", table, "--into", folder).output
+    assert "vehicle.toml names it now" in out
+    assert not list((folder / "telemetry").iterdir())
+    vehicle = tomllib.loads((folder / "vehicle" / "vehicle.toml").read_text())
+    assert vehicle["aerodynamics"] == {"table": "AERO_1.csv"}
+    sidecar = tomllib.loads((folder / "vehicle" / "AERO_1.toml").read_text())
+    assert sidecar["moment_reference_station_m"] == 0.0
+    left = json.loads(run("check", folder, "--json").output)["fill_in"]
+    assert [w.split("'")[1] for w in left if "AERO_1.toml" in w] == ["source", "licence", "area_m2", "length_m"]
+    # filled in, it is the shipped vehicle's
+    text = (folder / "vehicle" / "AERO_1.toml").read_text()
+    for key, value in (("source", '"x"'), ("licence", '"x"'), ("area_m2", "7.0686"), ("length_m", "3.0")):
+        text = text.replace(f'{key} = "FILL IN"', f"{key} = {value}")
+    (folder / "vehicle" / "AERO_1.toml").write_text(text)
+    shipped = vehicle_path("irve2_reference")
+    (folder / "vehicle" / "own.toml").write_text(shipped.read_text().replace("irve2_reference.csv", "AERO_1.csv"))
+    own = vehicle_from_toml(folder / "vehicle" / "own.toml")
+    np.testing.assert_allclose(own.aero.coefficients, vehicle_from_toml(shipped).aero.coefficients, rtol=1e-12)
+
+
+def test_a_vehicle_file_that_was_filled_in_is_left_as_it_is(folder, tmp_path):
+    path = folder / "vehicle" / "vehicle.toml"
+    path.write_text(path.read_text().replace('half_angle_deg = "FILL IN"', "half_angle_deg = 60.0", 1))
+    before = path.read_text()
+    out = run("import", shipped_table(tmp_path / "vehicle.csv", "mach,aoa,CD,CL,CM,CMQ"), "--into", folder).output
+    assert path.read_text() == before
+    assert 'write  [aerodynamics]  table = "vehicle_coefficients.csv"' in out
+    assert tomllib.loads((folder / "vehicle" / "vehicle_coefficients.toml").read_text())["axes"] == "wind"
+
+
+# what is left
+
+
+def test_import_and_check_count_the_same_values(folder, tmp_path):
+    shutil.copy(radar(tmp_path / "radar.csv"), tmp_path / "second.csv")
+    out = run("import", tmp_path / "radar.csv", tmp_path / "second.csv", "--into", folder).output
+    checked = json.loads(run("check", folder, "--json").output)
+    assert f"{len(checked['fill_in'])} values are left to you" in out
+    keys = [w.split("'")[1] for w in checked["fill_in"]]
+    assert {"name", "radars.second.height_m", "motion.drag_area_per_mass_m2pkg", "joint.station_m"} <= set(keys)
+    assert all(key in out for key in keys)
