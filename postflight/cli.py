@@ -197,7 +197,7 @@ def init(folder: Path, vehicle: str | None) -> None:
 @click.argument("files", nargs=-1, required=True, type=FOLDER, metavar="FILES...")
 @click.option("--into", "folder", required=True, type=FOLDER, help="A flight folder that `postflight init` made.")
 def import_tables(files: tuple[Path, ...], folder: Path) -> None:
-    """Copy CSV and MATLAB tables into a flight folder and propose in flight.toml which column is which."""
+    """Bring tables, video and coefficients into a flight folder; proposes in flight.toml which column is which."""
     from postflight.intake import import_command
 
     import_command.import_files(files, folder)

@@ -33,17 +33,12 @@ TRIADS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
     "magnetic field": ("sensors.magnetometer", columns.MAGNETOMETER),
 }
 G_OR_GAUSS = {"acceleration", "magnetic field"}
-FIELD_GAUSS = (0.15, 1.0)  # the Earth's, with some iron
+FIELD_GAUSS = (0.15, 0.9)  # the Earth's, with some iron, and less than 1 g
 EARTH_RADII_M = (6.2e6, 7.5e6)
 MOUNT = 'a package of the vehicle file, or "body"; or axes = ["+x", "+y", "+z"]: which body axis is each of its axes?'
 AIR = ("alt", "rho", "temperature", "pressure", "wind_speed", "wind_from")
 AIR_BY_PARTS = ("wind_north", "wind_east")
 Family = tuple[tuple[str, ...], str]
-
-
-def propose(table: LooseTable) -> tuple[list[SourceProposal], list[str]]:
-    """Return what a table holds, and the names of columns that were recognised as nothing."""
-    return Reader(table).everything()
 
 
 class Reader:
@@ -60,7 +55,10 @@ class Reader:
         self.name = re.sub(r"[^A-Za-z0-9_-]+", "_", table.label).strip("_")[:64] or "table"
 
     def everything(self) -> tuple[list[SourceProposal], list[str]]:
-        """Triads first, whose columns come in threes; then radar, receiver, barometer, sounding."""
+        """Return what the table holds, and the names of columns that were recognised as nothing.
+
+        Triads first, whose columns come in threes; then radar, receiver, barometer, sounding.
+        """
         if self.is_sounding():
             self.time = None
             found = self.sounding()

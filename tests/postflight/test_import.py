@@ -297,16 +297,21 @@ def test_recorded_flights_are_recognised_as_their_flight_file_has_them(name, fol
 def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
     from flightmodel.checks import GateError
     from postflight.intake.clock_columns import split_clocks
+    from postflight.intake.coefficients import as_coefficients, coefficient_columns, sidecar_text
     from postflight.intake.loose import read_loose
-    from postflight.intake.propose import propose
+    from postflight.intake.pictures import Video, frame_list
+    from postflight.intake.propose import Reader
     from postflight.intake.sounding_tables import radiosonde_table
     from postflight.intake.write_mapping import section_text
 
     rng = np.random.default_rng(7)
     whole = [b"\n".join((PACKAGE / name).read_bytes().split(b"\n")[:30]) for name in ("rates.csv", "met_composite.csv")]
     whole.append(b"p_hpa,h_m,T_C,Td_C,from_deg,wind_mps\n" + b"1000,116,11.2,11,30,10.8\n925,764,8,8,30,16.4\n" * 8)
+    whole.append(b"GMT,file,n\n" + b"".join(b"2009-08-17T12:52:%02dZ,cam/f_%03d.png,1\n" % (k, k) for k in range(20)))
+    whole.append(b"Mach,AoA (deg),CA,CN,Cm_nose,Cmq\n" + b"0.5,0,1,0,0,-0.1\n0.5,90,1,0.1,-0.1,-0.1\n" * 6)
+    video = Video(tmp_path, tmp_path / "cam", tuple(f"f_{k:03d}.png" for k in range(20)))
     bits = (b"", b",", b";", b'"', b"\n", b"nan", b"1e999", b"-", b"#", b"\xff", b"(g)", b"9" * 400, b"12:00:00", b"=")
-    read = 0
+    read = frames_read = coefficients_read = 0
     for _ in range(400):
         content = bytearray(whole[rng.integers(len(whole))])
         for _ in range(rng.integers(1, 6)):
@@ -319,7 +324,16 @@ def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
             continue
         table = radiosonde_table(table) or table
         split_clocks(table)
-        for source in propose(table)[0]:
+        columns = coefficient_columns(table)
+        if columns is not None:
+            as_coefficients(table, columns)
+            tomllib.loads(sidecar_text(columns))
+        frames = frame_list(table, [video], ["a"], tmp_path)
+        coefficients_read += columns is not None
+        frames_read += frames is not None
+        for source in [frames] if frames is not None else Reader(table).everything()[0]:
             tomllib.loads(section_text(source, "telemetry/x.csv", table.notes, taken=False))
         read += 1
     assert read > 200
+    assert frames_read > 5
+    assert coefficients_read > 20
