@@ -43,7 +43,7 @@ def figure_reconciled(
     for ax in axes.ravel()[:5]:
         ax.set_xlabel("time after launch (s)")
     figure.suptitle("Joint reconciled with the flight", fontsize=12)
-    _with_room_for_stamp(figure, telemetry)
+    stamp(figure, telemetry)
     return figure
 
 
@@ -123,7 +123,7 @@ def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
             if column == 0 and row > 0:
                 ax.set_ylabel(table.columns[row], fontsize=8)
     figure.suptitle("Posterior of the joint: samples, and ellipses of the linear problem (1 and 2 sd)", fontsize=12)
-    _with_room_for_stamp(figure, telemetry)
+    stamp(figure, telemetry)
     return figure
 
 
@@ -160,12 +160,5 @@ def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
     right.spines[["top", "right"]].set_visible(False)
     right.legend(frameon=False, fontsize=8)
     figure.suptitle("Modes of the lateral motion and the linear model", fontsize=12)
-    _with_room_for_stamp(figure, telemetry)
-    return figure
-
-
-def _with_room_for_stamp(figure: Figure, telemetry: Telemetry) -> None:
     stamp(figure, telemetry)
-    engine = figure.get_layout_engine()
-    assert engine is not None
-    engine.set(rect=(0.0, 0.03, 1.0, 0.97))  # type: ignore[call-arg]
+    return figure
