@@ -13,7 +13,7 @@ demo: $(VENV)/installed
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m "not long"
 
-# statistics over many flights, beyond what a check of every change can wait for (some six minutes)
+# statistics over many flights, beyond what a check of every change can wait for (some fifteen minutes)
 long: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m long
 

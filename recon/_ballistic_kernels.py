@@ -12,8 +12,6 @@ import numpy as np
 
 from flightmodel._kernels import OMEGA_WGS84, WGS84, geodetic, gravitation, inlined
 
-MOST_DRAG_PER_S = 20.0  # of the speed, taken away: beyond one in a step of 0.05 s Runge and Kutta's rule swings open
-
 
 @inlined
 def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
@@ -32,8 +30,8 @@ def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     uy = vy + sin_lat * se * north - ce * east
     uz = vz - cos_lat * north
     speed = math.sqrt(ux * ux + uy * uy + uz * uz) + 1e-9
-    # a filter that gropes may ask for any drag: e^8 is a parachute on a needle, and none stops within a step
-    k = min(0.5 * density * air.drag_m2pkg * math.exp(min(max(e0, -8.0), 8.0)) * speed, MOST_DRAG_PER_S)
+    # a filter that gropes may ask for any drag; e^8 is a parachute on a needle
+    k = 0.5 * density * air.drag_m2pkg * math.exp(min(max(e0, -8.0), 8.0)) * speed
     # across the flow: level, and in the vertical plane
     ax, ay, az = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
     n = 1.0 / (math.sqrt(ax * ax + ay * ay + az * az) + 1e-9)

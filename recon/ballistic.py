@@ -19,7 +19,6 @@ from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Motion as MotionSpec
 from flightmodel.telemetry import Sounding
-from recon._ballistic_kernels import MOST_DRAG_PER_S
 from recon.motion import Motion
 from recon.state import IntArray, States
 from recon.strapdown import Step
@@ -69,7 +68,7 @@ def acceleration(motion: Motion, position: FloatArray, velocity: FloatArray, dri
     level = np.cross(position, u)
     level /= np.linalg.norm(level)
     upright = np.cross(u / speed, level)
-    push = min(0.5 * density * motion.drag_m2pkg * np.exp(np.clip(drivers[0], -8.0, 8.0)) * speed, MOST_DRAG_PER_S)
+    push = 0.5 * density * motion.drag_m2pkg * np.exp(np.clip(drivers[0], -8.0, 8.0)) * speed
     spin = rotations.skew(earth.OMEGA_ECEF_RADPS)
     force = push * (speed * (drivers[1] * level + drivers[2] * upright) - u)
     return np.asarray(force + earth.gravitation(position) - spin @ spin @ position - 2.0 * spin @ velocity)

@@ -22,6 +22,7 @@ import numpy as np
 import pandas as pd
 
 from estimators.calibration import calibrate_lens, read_corners
+from flightmodel import aerodynamics
 from flightmodel.aeroinput import read_with_sidecar
 from flightmodel.checks import GateError
 from flightmodel.film import Frames
@@ -468,6 +469,7 @@ def vehicle_cases(root: Path) -> tuple[Case, Case, Case]:
             return ""
         lines = [line.split("#")[0] for line in data.decode("utf-8-sig").splitlines() if line.split("#")[0].strip()]
         header = [cell.strip() for cell in lines[0].split(",")]
+        header = [c.lower() if c.lower() in aerodynamics.COLUMNS else c for c in header]  # capitals are no other column
         if len(set(header)) < len(header):
             return "accepted with a column that stands twice"
         for line in lines[1:]:

@@ -49,6 +49,7 @@ def test_stagnation_pressure_coefficient():
     np.testing.assert_allclose(stagnation_cp(mach), want, atol=6e-5)
 
 
+@pytest.mark.long
 def test_shipped_table_is_what_its_script_makes(table):
     rows = runpy.run_path(str(FOLDER / "irve2_reference.py"))["rows"]()
     np.testing.assert_allclose(table.coefficients.reshape(-1, 4), rows[:, 2:], atol=6e-5)

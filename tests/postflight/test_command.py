@@ -303,7 +303,9 @@ def test_interrupt_before_anything_is_written(tmp_path: Path) -> None:
     time.sleep(1.5)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130, errors
+    # an interrupt that met compiled code on its way lets Python end itself by the signal: 130 to a shell as well
+    assert process.returncode in (130, -signal.SIGINT), errors
+    assert "interrupted; nothing half-written is left" in errors
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
 

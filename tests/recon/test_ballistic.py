@@ -36,7 +36,7 @@ def carried():
 
 
 @pytest.mark.parametrize(
-    ("first", "last"), [(0, 1), (0, 2), (2, 0), pytest.param(0, 5, marks=pytest.mark.slow), (4, 5), (5, 4)]
+    ("first", "last"), [(0, 1), (0, 2), (2, 0), pytest.param(0, 5, marks=pytest.mark.long), (4, 5), (5, 4)]
 )
 def test_kernel_equals_readable_twin(carried, first, last):
     """60 s of entry at up to 50 g amplify a position's rounding of 1e-9 m; 2e-6 m measured."""

@@ -68,6 +68,7 @@ def errors(flight: Flight, truth, height_m: float):
     return np.array(z), row.density_ratio_sd / row.density_ratio_prior_sd, row.wind_north_sd_mps / row.wind_prior_sd_mps
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("height_km", HEIGHTS_KM)
 def test_density_and_winds_are_as_uncertain_as_claimed(days, height_km: int) -> None:
     values = [errors(flight, truth, 1000.0 * height_km) for flight, truth, _ in days]
@@ -79,6 +80,7 @@ def test_density_and_winds_are_as_uncertain_as_claimed(days, height_km: int) -> 
     assert np.mean([w for _, _, w in values]) < (0.9 if height_km > 35 else 0.8)
 
 
+@pytest.mark.long
 def test_density_is_nearer_to_the_truth_than_the_sounding(days) -> None:
     before, after = [], []
     for flight, truth, _ in days:
@@ -90,12 +92,14 @@ def test_density_is_nearer_to_the_truth_than_the_sounding(days) -> None:
     assert np.sqrt(np.mean(after)) < 0.6 * np.sqrt(np.mean(before))
 
 
+@pytest.mark.long
 def test_axial_coefficient_is_as_uncertain_as_claimed(days) -> None:
     z = [(f.day.parameters.estimate[0] + wrong[0]) / f.day.parameters.sd[0] for f, _, wrong in days]
     low, high = chi2.ppf([0.0005, 0.9995], DAYS) / DAYS
     assert low < np.mean(np.square(z)) < high
 
 
+@pytest.mark.long
 def test_nominal_days_turn_no_verdict_on_the_air_red(days) -> None:
     """Five verdicts at 99.9 % in a dozen flights: one red in seventeen such ensembles; the seeds are fixed."""
     assert not [v.name for flight, _, _ in days for v in flight.day.verdicts if not v.passed]

@@ -144,6 +144,7 @@ def test_an_unknown_joint_is_found(flown):
     assert {p.name for p in run.iterdir()} >= {"joint.toml", "reconciliation.json", "joint_correlations.csv", "figures"}
 
 
+@pytest.mark.long
 def test_freeplay_is_found(loose):
     flight, vehicle = loose
     found = reconcile_loose(flight, observe(flight, loaded=True))
