@@ -58,11 +58,11 @@ flight = reconstruct_telemetry(telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ))
 # %% [markdown]
 # ## A rigid vehicle does not fly like that
 #
-# A hundred entries of the vehicle with its joint locked, from the reconstructed state above the atmosphere, mass,
+# Sixty entries of the vehicle with its joint locked, from the reconstructed state above the atmosphere, mass,
 # coefficients and air dispersed by what was known. If the flight were one of them, it would lie inside their band.
 
 # %%
-rigid = rigid_bounds(flight, 100)
+rigid = rigid_bounds(flight, 60)
 
 
 def against(bounds, axis, colour, label):

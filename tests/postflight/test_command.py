@@ -399,7 +399,7 @@ def test_no_result_file_names_this_machine(two_runs, clean_flight) -> None:
 # ------------------------------------------------------------------------------------------ killed, and no room on disk
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_runs_leave_nothing_half_written(two_runs, clean_flight, tmp_path: Path) -> None:
     """Three moments of what benchmarks/kill.py draws at random; the run after them gives the bytes of any other."""
     _, _, saved, _ = two_runs

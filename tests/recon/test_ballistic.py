@@ -228,7 +228,7 @@ def test_a_gap_costs_the_same_at_any_output_rate():
     assert np.allclose(sd[0], sd[1], rtol=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_reentry_of_the_known_benchmark_errs_as_it_claims():
     """The geometry of Julier and Uhlmann's re-entry, seen as a missile's: speed 7 km/s, drag known to a factor of two.
 

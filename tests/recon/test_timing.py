@@ -31,7 +31,9 @@ def apart(one, other, relative=1e-6):
     return max(by_state, (np.abs(a.estimate - b.estimate) / a.sd).max())
 
 
-@pytest.mark.parametrize(("attitude_sensors", "within"), [(False, 1e-6), (True, 0.05)])
+@pytest.mark.parametrize(
+    ("attitude_sensors", "within"), [(False, 1e-6), pytest.param(True, 0.05, marks=pytest.mark.long)]
+)
 def test_order_of_instruments_does_not_matter(mini_everything, attitude_sensors, within):
     """Updates at one instant commute but for rounding, as all are linear about one state; measured 2e-9 sd.
 

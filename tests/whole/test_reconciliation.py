@@ -113,9 +113,10 @@ def test_gradient_is_that_of_the_cost(problem):
         assert right @ step == pytest.approx(-0.25 * difference, rel=2e-3), name
 
 
-def test_an_unknown_joint_is_found(flown):
+def test_an_unknown_joint_is_found(flown, monkeypatch):
     """Within 4 sd and the goals: 4 % of stiffness, 0.08 cm of offset; coverage is `benchmarks/reconciliation.py`'s."""
     folder, truth, vehicle = flown
+    monkeypatch.setattr("postflight.reconciliation.command.ENTRIES", 100)
     done = CliRunner().invoke(cli, ["reconcile", str(folder)], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     assert "The joint that explains the flight" in done.output

@@ -240,7 +240,7 @@ def _change(path: Path, column: str, change) -> None:
     table.to_csv(path, index=False)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [METHODS[0], *(pytest.param(m, marks=pytest.mark.long) for m in METHODS[1:])])
 def test_score_exits_5_where_a_deflection_is_wrong(command, flown, run_folder, tmp_path, method: str) -> None:
     folder, run = _spoiled(flown, run_folder, tmp_path)
     _change(run / f"deflection_{method}.csv", "theta_deg", lambda v: v + 1.5 * DEFLECTION_LIMIT_DEG[method])
@@ -251,7 +251,12 @@ def test_score_exits_5_where_a_deflection_is_wrong(command, flown, run_folder, t
 
 
 @pytest.mark.parametrize(
-    ("column", "shift"), [("rx_ecef_m", 40.0), ("vy_ecef_mps", 0.8), ("alpha_total_wind_deg", 0.9)]
+    ("column", "shift"),
+    [
+        ("rx_ecef_m", 40.0),
+        pytest.param("vy_ecef_mps", 0.8, marks=pytest.mark.long),
+        pytest.param("alpha_total_wind_deg", 0.9, marks=pytest.mark.long),
+    ],
 )
 def test_score_exits_5_where_the_trajectory_is_wrong(command, flown, run_folder, tmp_path, column, shift) -> None:
     folder, run = _spoiled(flown, run_folder, tmp_path)
