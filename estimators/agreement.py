@@ -25,7 +25,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.stats import chi2
 
 from estimators.evidence import (
@@ -39,7 +39,7 @@ from estimators.evidence import (
     Deflection,
     Evidence,
 )
-from estimators.normal_equations import Learnt
+from estimators.normal_equations import Learnt, means_over_spans
 from flightmodel.checks import BoolArray, FloatArray
 
 SPAN_S = 2.0
@@ -131,9 +131,8 @@ def agreement(
     """
     pairs: list[Pair] = []
     for a, b in combinations(evidence, 2):
-        difference = _difference(a, b, deflection)
-        if len(difference.time_s):
-            d, cov = _flat(difference)
+        d, cov = _difference(a, b, deflection)
+        if len(d):
             square = float(d @ cho_solve(cho_factor(cov), d))
             pairs.append(Pair((a.method, b.method), square, len(d), float(chi2.sf(square, len(d)))))
     if learnt is None or not pairs:
@@ -161,45 +160,35 @@ def _gain(learnt: Learnt, rows: NDArray[np.int64]) -> float | None:
     return float(0.5 * np.sum(along**2 / (1.0 / more + told)) - 0.5 * np.sum(np.log1p(more * told)))
 
 
-def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> Evidence:
-    """Readings of one less the other's at the sparser one's times, averaged over spans of `SPAN_S`."""
+def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> tuple[FloatArray, FloatArray]:
+    """Differences (2 n,) and their covariance: at the sparser one's times, averaged over spans of `SPAN_S`."""
     a, b = _well_read(a), _well_read(b)
     if len(a.time_s) < 2 or len(b.time_s) < 2:
-        return replace(a, time_s=np.empty(0))
+        return np.empty(0), np.empty((0, 0))
     sparse, dense = sorted((a, b), key=lambda e: -float(np.median(np.diff(e.time_s))))
     after = np.searchsorted(dense.time_s, sparse.time_s).clip(1, len(dense.time_s) - 1)
     step = dense.time_s[after] - dense.time_s[after - 1]
     part = (sparse.time_s - dense.time_s[after - 1]) / step
     both = (part >= 0.0) & (part <= 1.0) & (step < HOLE * np.median(np.diff(dense.time_s)))
-    sign = 1.0 if sparse is a else -1.0
     time_s, after, part = sparse.time_s[both], after[both], part[both]
-    span, which, count = np.unique(np.floor(time_s / SPAN_S), return_inverse=True, return_counts=True)
-    share = np.zeros((len(span), len(time_s)))
-    share[which, np.arange(len(time_s))] = 1.0 / count[which]
+    if not len(time_s):
+        return np.empty(0), np.empty((0, 0))
 
     def between(values: FloatArray) -> FloatArray:
         w = part.reshape((-1,) + (1,) * (values.ndim - 1))
         return np.asarray((1.0 - w) * values[after - 1] + w * values[after])
 
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.tensordot(share, values, axes=1))
-
-    names = dict.fromkeys([*sparse.by_input, *dense.by_input])
-    inputs = {n: _less(sparse.by_input.get(n), dense.by_input.get(n), both, between) for n in names}
-    swing = sparse.by_acceleration_s2[both] - between(dense.by_acceleration_s2)
     d = sparse.theta_yz_rad[both] - between(dense.theta_yz_rad)
     if deflection is not None:
+        swing = sparse.by_acceleration_s2[both] - between(dense.by_acceleration_s2)
         d -= np.einsum("nij,nj->ni", swing, _second_derivative(deflection, time_s))
+    names = dict.fromkeys([*sparse.by_input, *dense.by_input])
+    responses = [_less(sparse.by_input.get(n), dense.by_input.get(n), both, between) for n in names]
     noise = sparse.independent_cov[both] + between(dense.independent_cov)
-    return Evidence(
-        f"{a.method} less {b.method}",
-        (span + 0.5) * SPAN_S,
-        sign * mean(d),
-        sign * mean(swing),
-        {n: sign * mean(j) for n, j in inputs.items()},
-        np.einsum("bn,nij->bij", share**2, noise) + LEFT_OUT_RAD**2 * np.eye(2),
-        averaged_s=SPAN_S,
-    )
+    share = means_over_spans(time_s, SPAN_S, from_s=0.0)
+    columns = np.tensordot(share, np.concatenate(responses, axis=2), axes=1).reshape(2 * len(share), -1)
+    blocks = np.einsum("bn,nij->bij", share**2, noise) + LEFT_OUT_RAD**2 * np.eye(2)
+    return (share @ d).ravel(), columns @ columns.T + block_diag(*blocks)
 
 
 def _well_read(one: Evidence) -> Evidence:
@@ -230,13 +219,3 @@ def _less(
 def _second_derivative(deflection: Deflection, time_s: FloatArray) -> FloatArray:
     before, at, after = (deflection(time_s + shift) for shift in (-SWING_STEP_S, 0.0, SWING_STEP_S))
     return np.asarray((before - 2.0 * at + after) / SWING_STEP_S**2)
-
-
-def _flat(one: Evidence) -> tuple[FloatArray, FloatArray]:
-    """Differences (2 n,) and their covariance."""
-    n = len(one.time_s)
-    columns = np.concatenate([j.reshape(2 * n, -1) for j in one.by_input.values()], axis=1)
-    cov = columns @ columns.T
-    for k in range(n):
-        cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += one.independent_cov[k]
-    return one.theta_yz_rad.ravel(), cov

@@ -120,7 +120,7 @@ def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inp
         rows[:, :, 2 * m + place[name].start : 2 * m + place[name].stop] = -response
         if name in inputs:
             want -= response @ inputs[name]
-    share = means_over_spans(one.time_s[keep], one.averaged_s)
+    share = means_over_spans(one.time_s[keep], one.averaged_s, one.time_s[keep][0])
     rows = (share @ rows.reshape(n, -1)).reshape(len(share), 2, -1)
     cov = np.einsum("bn,nij->bij", share**2, one.independent_cov[keep])
     cov += LEFT_OUT_RAD**2 * LEFT_OUT_TIME_S / one.averaged_s * np.eye(2)
@@ -128,9 +128,9 @@ def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inp
     return (whiten @ rows).reshape(2 * len(share), -1), (whiten @ (share @ want)[:, :, None]).ravel()
 
 
-def means_over_spans(time_s: FloatArray, width_s: float) -> FloatArray:
-    """Weights (bins, n) of the means over spans of time; spans without a sample are left out."""
-    which = np.floor((time_s - time_s[0]) / width_s + 1e-6).astype(int)
+def means_over_spans(time_s: FloatArray, width_s: float, from_s: float) -> FloatArray:
+    """Weights (bins, n) of the means over spans of time, one of which begins at ``from_s``; empty ones are left out."""
+    which = np.floor((time_s - from_s) / width_s + 1e-6).astype(int)
     _, which, count = np.unique(which, return_inverse=True, return_counts=True)
     out = np.zeros((len(count), len(time_s)))
     out[which, np.arange(len(time_s))] = 1.0 / count[which]
