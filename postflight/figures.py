@@ -15,6 +15,7 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
+from postflight.montecarlo.figures import words_in_corner
 from postflight.pipeline import Answers, Flight
 from postflight.preflight import Bounds
 
@@ -46,7 +47,7 @@ def _axes(figure: Figure, rows: int = 1) -> list[Axes]:
 def stamp(figure: Figure, telemetry: Telemetry) -> None:
     """Name the flight in a corner, and whether it is synthetic."""
     tag = "SYNTHETIC flight" if telemetry.synthetic else "flight"
-    figure.supxlabel(f"{telemetry.name}: {tag}", x=0.995, ha="right", fontsize=7, color="0.4")
+    words_in_corner(figure, f"{telemetry.name}: {tag}")
 
 
 def _window(flight: Flight) -> tuple[float, float]:

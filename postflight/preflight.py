@@ -154,10 +154,13 @@ def entry_bounds(
     )
 
 
-def inside(time_s: FloatArray, values: FloatArray, bounds: Bounds, band: FloatArray) -> BoolArray:
-    """Whether values at times lie between the outer percentiles of a band ``(3, n)`` of ``bounds``."""
-    low, high = (np.interp(time_s, bounds.time_s, band[k]) for k in (0, 2))
-    return np.asarray((values >= low) & (values <= high))
+def inside(
+    time_s: FloatArray, values: FloatArray, band_time_s: FloatArray, low: FloatArray, high: FloatArray
+) -> BoolArray:
+    """Whether values at times lie between two limits that are given at other times."""
+    return np.asarray(
+        (values >= np.interp(time_s, band_time_s, low)) & (values <= np.interp(time_s, band_time_s, high))
+    )
 
 
 class _Entry:

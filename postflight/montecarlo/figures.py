@@ -21,8 +21,8 @@ LABEL = {
 }
 
 
-def stamp(figure: Figure, words: str) -> None:
-    """Say in the corner what was flown, below everything else."""
+def words_in_corner(figure: Figure, words: str) -> None:
+    """Say what was flown, below everything else."""
     figure.supxlabel(words, x=0.995, ha="right", fontsize=7, color="0.4")
 
 
@@ -43,7 +43,7 @@ def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
     first.legend(fontsize=8, frameon=False, loc="upper left")
     last.set_xlabel("time after launch (s)")
     figure.suptitle(title, fontsize=10)
-    stamp(figure, synthetic)
+    words_in_corner(figure, synthetic)
     return figure
 
 
@@ -68,5 +68,5 @@ def figure_sobol(table: pd.DataFrame, title: str, synthetic: str) -> Figure:
     ax.spines[["top", "right"]].set_visible(False)
     ax.legend(fontsize=8, frameon=False, loc="lower right")
     figure.suptitle(title, fontsize=10)
-    stamp(figure, synthetic)
+    words_in_corner(figure, synthetic)
     return figure

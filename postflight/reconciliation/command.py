@@ -152,7 +152,7 @@ def summary(found: Reconciled, table: pd.DataFrame, odds: dict[str, float]) -> d
     return {
         "converged": found.converged,
         "steps": found.steps,
-        "sensor_residual_rms_sd": float(np.sqrt(np.mean(found.residuals.sensors**2))),
+        "sensor_residual_rms_sd": found.sensor_rms_sd,
         "join_rms_sd": float(np.sqrt(np.mean(found.residuals.joins**2))),
         "joint": table.to_dict(orient="records"),
         "log_odds": odds,
@@ -176,11 +176,10 @@ def print_joint(found: Reconciled, table: pd.DataFrame, odds: dict[str, float]) 
         console.print(f"{words}: {evidence} (odds e^{odds[law]:+.1f})")
     if odds.get("hardening", 0.0) > STRONG and "hardening" not in found.problem.unknown.laws:
         console.print("[yellow]the slope falls with the angle: freeplay in part of the pulse, or a joint that gives[/]")
-    misfit = float(np.sqrt(np.mean(found.residuals.sensors**2)))
-    if misfit > MISFIT:
+    if found.sensor_rms_sd > MISFIT:
         console.print(
-            f"[yellow]the sensors lie {misfit:.1f} sd (rms) from the flight flown: no such joint explains it; a joint "
-            "with freeplay does that to a fit without --freeplay[/]"
+            f"[yellow]the sensors lie {found.sensor_rms_sd:.1f} sd (rms) from the flight flown: no such joint explains "
+            "it; a joint with freeplay does that to a fit without --freeplay[/]"
         )
     if not found.converged:
         console.print("[yellow]the fit had not settled after its last step: take the intervals as too narrow[/]")

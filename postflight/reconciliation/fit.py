@@ -68,6 +68,11 @@ class Reconciled:
         return self.linear_covariance * UNMODELLED**2
 
     @property
+    def sensor_rms_sd(self) -> float:
+        """Rms of the sensors' residuals over their standard deviations."""
+        return float(np.sqrt(np.mean(self.residuals.sensors**2)))
+
+    @property
     def log_evidence(self) -> float:
         """Logarithm of the probability of the data by Laplace's method, up to what all models of a flight share."""
         sd = np.sqrt(np.diag(self.linear_covariance))

@@ -15,6 +15,7 @@ import pandas as pd
 
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
+from postflight.preflight import inside
 from postflight.report.series import BLUE, DARK, GREEN, GREY, ORANGE, TRAJECTORY_ROWS, Panel, line, panel
 from postflight.report.source import Run
 from postflight.report.thinning import kept_rows, rounded
@@ -130,8 +131,8 @@ def share_inside(time_s: FloatArray, flown: FloatArray, band: pd.DataFrame) -> f
     known = np.isfinite(flown) & (time_s >= t[0]) & (time_s <= t[-1])
     if not known.any():
         return float("nan")
-    low, high = (np.interp(time_s[known], t, band[c].to_numpy()) for c in (LOW, HIGH))
-    return float(np.mean((flown[known] >= low) & (flown[known] <= high)))
+    low, high = band[LOW].to_numpy(), band[HIGH].to_numpy()
+    return float(np.mean(inside(time_s[known], flown[known], t, low, high)))
 
 
 def band_lines(label: str, band: pd.DataFrame, share: float, colour: str) -> list[dict[str, Any]]:

@@ -170,7 +170,7 @@ def shares(flight: Flight, flown: pd.DataFrame, rigid: Bounds, flexible: Bounds)
                 {
                     "joint": joint,
                     "quantity": quantity,
-                    "share_inside": float(np.mean(inside(time_s, values, bounds, band))),
+                    "share_inside": float(np.mean(inside(time_s, values, bounds.time_s, band[0], band[2]))),
                     "largest_excess": float(np.max(values - upper)),
                     "over_median_at_peak": float(values[at] - middle[at]),
                     "peak_over_upper": float(values[at] / upper[at]),

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
 from flightmodel.checks import FloatArray
-from postflight.montecarlo.figures import stamp
+from postflight.montecarlo.figures import words_in_corner
 from postflight.preflight import Bounds
 from postflight.studies.joints import JointStudy
 
@@ -45,7 +45,7 @@ def figure_table_3_1(table: pd.DataFrame, synthetic: str) -> Figure:
         axis.set_minor_formatter("")
     left.legend(fontsize=7, frameon=False, loc="upper left")
     figure.suptitle("Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)", fontsize=10)
-    stamp(figure, synthetic)
+    words_in_corner(figure, synthetic)
     return figure
 
 
@@ -72,7 +72,7 @@ def figure_joints(study: JointStudy, quantity: str, label: str, title: str, synt
     note = f"beyond the axis: {', '.join(beyond)}" if beyond else None
     ax.legend(fontsize=8, frameon=False, loc="upper left", title=note, title_fontsize=7)
     figure.suptitle(title, fontsize=10)
-    stamp(figure, synthetic)
+    words_in_corner(figure, synthetic)
     return figure
 
 
@@ -114,7 +114,7 @@ def figure_preflight(
     axes[0, 0].set_xlim(*window)
     axes[0, 0].legend(fontsize=8, frameon=False, loc="upper left")
     figure.suptitle(f"Flight against bounds of its own entry (AIAA 2011-2571, Figure 1.3)\n{words}", fontsize=10)
-    stamp(figure, synthetic)
+    words_in_corner(figure, synthetic)
     return figure
 
 

@@ -120,8 +120,9 @@ def test_bounds_are_the_same_flights_whatever_their_number(flight):
     joint = read_study(VEHICLE).spec.joint
     soft = entry_bounds(reconstructed, joint, flights=20)
     assert soft.normal_g[1].max() > 3.0 * many.normal_g[1].max()
-    assert inside(many.time_s, many.alpha_total_deg[1], many, many.alpha_total_deg).all()
-    assert not inside(many.time_s, many.alpha_total_deg[2] + 1.0, many, many.alpha_total_deg).any()
+    low, high = many.alpha_total_deg[[0, 2]]
+    assert inside(many.time_s, many.alpha_total_deg[1], many.time_s, low, high).all()
+    assert not inside(many.time_s, high + 1.0, many.time_s, low, high).any()
 
 
 def test_bounds_disperse_what_the_vehicle_file_states():
