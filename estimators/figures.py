@@ -121,6 +121,36 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
     return figure
 
 
+def figure_told_apart(fused: Fused, singular_values: FloatArray) -> Figure:
+    """Show what the readings cannot tell apart: singular values, and what is left of correlation.
+
+    A direction of the inputs of singular value ``s`` keeps ``1 / (1 + s^2)`` of the variance it was told with.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 6.0), layout="constrained")
+    values, table = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
+    told = int(np.sum(singular_values > 1.0))
+    values.semilogy(np.arange(1, len(singular_values) + 1), singular_values, ".", color="#CC79A7")
+    values.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
+    values.set(xlabel="direction of the inputs", ylabel="singular value", ylim=(1e-3, None))
+    values.set_title(
+        f"of {told} of {len(singular_values)} directions the readings say\nmore than was told before (above the line)",
+        fontsize=10,
+    )
+    values.grid(alpha=0.3)
+    image = table.imshow(fused.correlation, cmap="PuOr", vmin=-1.0, vmax=1.0)
+    names = range(len(fused.names))
+    table.set_xticks(names, fused.names, rotation=90, fontsize=7)
+    table.set_yticks(names, fused.names, fontsize=7)
+    apart = np.abs(np.triu(fused.correlation, 1))
+    i, j = np.unravel_index(np.argmax(apart), apart.shape)
+    least = f"least told apart: {fused.names[i]} and {fused.names[j]} ({fused.correlation[i, j]:+.2f})"
+    table.set_title(f"correlation given all readings, at {fused.at_s:.1f} s\n{least}", fontsize=10)
+    figure.colorbar(image, ax=table, shrink=0.7)
+    return figure
+
+
 def _band(axis: Axes, time_s: FloatArray, value: FloatArray, sd: FloatArray) -> None:
     axis.plot(time_s, value, color="#CC79A7")
     axis.fill_between(time_s, value - 2.0 * sd, value + 2.0 * sd, color="#CC79A7", alpha=0.2, label="2 sd")

@@ -11,7 +11,7 @@ import pandas as pd
 
 from estimators.benchmark import orient_camera
 from estimators.camera_fit import OrientedCamera
-from estimators.figures import figure_camera_overlay, figure_fusion, figure_static_trim
+from estimators.figures import figure_camera_overlay, figure_fusion, figure_static_trim, figure_told_apart
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row
 from estimators.pulse import PulseData
 from estimators.static_trim import static_trim
@@ -49,9 +49,11 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
         draw_camera(flight.telemetry, answers.histories["camera"], folder)
     if answers.fused is not None:
         fused = answers.fused
-        figure = figure_fusion(fused.fused, fused.limbs, f"{fused.agreement.words}; {fused.limbs_words}")
-        figures.stamp(figure, flight.telemetry)
-        figures.save(figure, folder / "fusion.png")
+        answer = figure_fusion(fused.fused, fused.limbs, f"{fused.agreement.words}; {fused.limbs_words}")
+        apart = figure_told_apart(fused.fused, fused.agreement.singular_values)
+        for name, figure in (("fusion.png", answer), ("told_apart.png", apart)):
+            figures.stamp(figure, flight.telemetry)
+            figures.save(figure, folder / name)
     if flight.pulse is not None:
         draw_static_trim(flight.pulse, flight.telemetry, folder)
     if answers.histories:
