@@ -6,7 +6,8 @@ inertias, joint, coefficients (C_A 5 %, C_N 10 %, C_m 15 %, C_mq 0.15 between Ma
 air, the sounding's and every instrument's errors. No video. Some 5 s a flight on each of two cores; what the
 estimators see and the truth are kept in FOLDER, so that the estimators can be scored again without flying. The camera's
 history is drawn, not rendered. ``--rigid`` flies a stiff joint; ``--planted`` spoils one assumption at a time, with
-uncertainties as the reference vehicle's file states them.
+uncertainties as the reference vehicle's file states them; ``--told`` says how well the same errors could be told by one
+who knows the size and the direction of each that may be there.
 """
 
 import multiprocessing
@@ -20,11 +21,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from estimators.agreement import BLAME
-from estimators.evidence import LIGHT_TIME_S, forgetful
+from estimators.evidence import CAMERA_PLANE, LIGHT_TIME_S, forgetful
 from estimators.misalignment import estimate_misalignment
 from estimators.pulse import PulseData
 from estimators.trim import estimate_trim
@@ -36,7 +37,7 @@ from flightmodel.deflection import history_from_lateral
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.fused import fuse_flight
+from postflight.fused import CAMERA_PLANE_SD_RAD, fuse_flight
 from postflight.sensed import pulse_data
 from recon.bet import Settings, reconstruct
 from synthetic_flight.folder import simulate_to_folder
@@ -196,8 +197,8 @@ def scored(seed, folder, rigid, what):
     pulse, truth = kept_flight(folder, seed, rigid)
     use = pulse.through_pulse
     if what is not None:  # errors told as the vehicle file has them, not at the sizes of the ensemble
-        told = vehicle_from_toml(vehicle_path("irve2_reference")).uncertainty
-        pulse = replace(pulse, vehicle=replace(flown_aero(pulse.vehicle, truth, told), uncertainty=told))
+        known = vehicle_from_toml(vehicle_path("irve2_reference")).uncertainty
+        pulse = replace(pulse, vehicle=replace(flown_aero(pulse.vehicle, truth, known), uncertainty=known))
     out = {"seed": seed, "words": str(truth["words"])}
     cameras = {}
     for k, (name, sd) in enumerate(CAMERA_SD.items()):
@@ -245,6 +246,59 @@ def row_of(history, pulse, truth):
     )  # fmt: skip
 
 
+def planted_normals(pulse, learnt):
+    """Each planted error in standard deviations of the inputs, ``(k,)``, by name."""
+    known, place = pulse.vehicle.uncertainty, learnt.place
+    out = {what: np.zeros(len(learnt.mean)) for what in PLANTED}
+    out[PLANTED[0]][[place["C_m"].start, place["C_N"].start]] = 0.15 / known.cm, 0.15 / known.cn
+    use = pulse.through_pulse
+    force, axis = pulse.specific_force_body_mps2[use], np.deg2rad(0.5) * np.array([0.0, 0.6, 0.8])
+    root = pulse.force_root_mps2[use].reshape(-1, 9)
+    out[PLANTED[1]][place["accelerometer"]] = np.linalg.lstsq(root, np.cross(axis, force).ravel(), rcond=1e-6)[0]
+    masses = np.array([pulse.vehicle.aeroshell.mass_kg, pulse.vehicle.centerbody.mass_kg])
+    side = known.cg_lateral_m * np.hypot(*masses) / masses[1]
+    for name, planted_m in (("initial offset y", 0.004), ("initial offset z", -0.003)):
+        out[PLANTED[2]][place[name].start] = planted_m / side
+    out[PLANTED[3]][place[CAMERA_PLANE].start] = np.deg2rad(25.0) / CAMERA_PLANE_SD_RAD
+    return out
+
+
+def told(seed, folder):
+    """Size of each planted error against what the readings say of it, sd; and how often each would be named.
+
+    For small errors the readings' part ``m`` of what is known of the inputs is normal with the mean ``V d`` and the
+    covariance ``V`` (`estimators.agreement`). One who knows every ``d`` that may be there tells them apart best by the
+    likelihood, and finds each best by ``d' m``: no other test of the same false alarms is stronger.
+    """
+    pulse, truth = kept_flight(folder, seed)
+    if str(truth["words"]):
+        return None
+    known = vehicle_from_toml(vehicle_path("irve2_reference")).uncertainty
+    pulse = replace(pulse, vehicle=replace(flown_aero(pulse.vehicle, truth, known), uncertainty=known))
+    use, rng = pulse.through_pulse, np.random.default_rng([seed, 3, 2009])
+    camera = camera_history(rng, truth["theta_yz"][use], pulse.time_s[use], CAMERA_SD["clean"])
+    learnt = fuse_flight(pulse, camera).fused.learnt
+    errors = np.array([np.zeros(len(learnt.mean)), *planted_normals(pulse, learnt).values()])
+    told_apart = np.eye(len(learnt.mean)) - learnt.covariance
+    inner = errors @ told_apart @ errors.T
+    value, axes = np.linalg.eigh(inner)
+    spread = axes * np.sqrt(np.maximum(value, 0.0))  # of d' m
+    draws = rng.standard_normal((2000, len(errors))) @ spread.T
+    named = [np.mean(np.argmax(draws + inner[k] - 0.5 * np.diag(inner), axis=1) == k) for k in range(len(errors))]
+    return np.sqrt(np.diag(inner)[1:]), np.array(named)
+
+
+def report_told(results):
+    size, named = (np.array([r[k] for r in results if r is not None]) for k in (0, 1))
+    power = norm.sf(norm.isf(0.01) - size)
+    print(f"{len(size)} flights; one who knows size and direction of all four errors would")
+    print(f"  take a sound flight as sound in {100 * named[:, 0].mean():.0f} %")
+    for k, what in enumerate(PLANTED):
+        found, right = 100 * power[:, k].mean(), 100 * named[:, k + 1].mean()
+        words = f"find it in {found:.0f} % (1 % false alarms), name it in {right:.0f} %"
+        print(f"  {what}: {words}; {np.median(size[:, k]):.1f} sd at the median")
+
+
 def report(results, rigid):
     rows = [r for r in results if not r["words"]]
     print(f"\n{len(results)} flights, {len(results) - len(rows)} of them tumbled and left out; at peak pressure, deg")
@@ -287,6 +341,9 @@ def main():
     folder = next((a for a in sys.argv[1:] if not a.isdigit() and not a.startswith("-")), KEPT)
     rigid = "--rigid" in sys.argv
     fly_missing(folder, range(count), rigid)
+    if "--told" in sys.argv:
+        report_told([told(seed, folder) for seed in range(count)])
+        return
     whats = ("", *PLANTED) if "--planted" in sys.argv else (None,)
     begun = time.perf_counter()
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:
