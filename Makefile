@@ -10,7 +10,9 @@ BIN := $(VENV)/bin
 demo: $(VENV)/installed
 	$(BIN)/postflight demo demo-flight
 
+# kernels first: otherwise both processes compile them
 test: lint
+	$(BIN)/postflight warmup
 	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m "not long"
 
 # statistics over many flights, beyond what a check of every change can wait for (some fifteen minutes)

@@ -17,6 +17,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from postflight.warmup import GROUPS, prepare
 from tests.postflight.conftest import write_flight
 from tests.postflight.killing import kill_run, run_again, run_whole
 
@@ -26,6 +27,7 @@ def main() -> int:
     parser.add_argument("count", type=int, nargs="?", default=50)
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
+    prepare(GROUPS, print)
     rng = np.random.default_rng(chosen.seed)
     with tempfile.TemporaryDirectory() as root:
         flight = Path(root) / "flight"
