@@ -10,7 +10,9 @@ Where it crosses zero is the dynamic pressure at which the joint diverges; its h
 against ``u / (1 - u)``, whitened by the history's covariance, of which `evidence.CONSTANT_PART` lasts. Rise and fall of
 the pulse are fitted apart too: what differs is hysteresis (freeplay, a joint that sags, gas that warms).
 
-Assumed: quasi-static means over `SPAN_S`, a linear joint, kappa and the offset's plane constant over the pulse.
+Assumed: quasi-static means over `SPAN_S`, a linear joint, kappa and the offset's plane constant over the pulse. Means
+of true histories lie about such a line by `LEFT_OUT` at peak pressure, by more where swinging is slower. The dynamic
+pressure's own error scales ``q_crit`` and leaves ``q / q_crit`` as it is.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ SPAN_S = 1.6  # a period of the slow aerodynamic mode
 LEAST_SPANS = 4
 MOST_LOG_SD = 3.0  # of offset or margin: known to a factor of twenty is not known
 CONFIDENCE = 0.90
-LEFT_OUT = 0.05  # of the bending: swinging and spin that a quasi-static line leaves out
+LEFT_OUT = 0.10  # of the bending at peak, as means of swings leave out; elsewhere as their period, 1/sqrt(q)
 MOST_LOADS = 50.0  # a joint this many times stiffer than its load does not show its stiffness
 
 
@@ -75,8 +77,12 @@ class Limbs:
     words: str
 
 
-def southwell_limbs(history: DeflectionHistory, time_s: FloatArray, pressure_pa: FloatArray) -> Limbs:
+def southwell_limbs(
+    history: DeflectionHistory, time_s: FloatArray, pressure_pa: FloatArray, pressure_sd: float
+) -> Limbs:
     """Fit a history against the dynamic pressure (n,) at ``time_s``: whole pulse, rise, and fall.
+
+    ``pressure_sd`` is how well the pressure at its peak is known, a fraction.
 
     Raises
     ------
@@ -84,13 +90,13 @@ def southwell_limbs(history: DeflectionHistory, time_s: FloatArray, pressure_pa:
         Where the whole pulse gives no line; a limb that gives none is left out, in words.
     """
     t, q, theta, sd = span_means(history, time_s, pressure_pa)
-    both = southwell(q, theta, sd)
+    both = southwell(q, theta, sd, pressure_sd)
     top = t[np.argmax(q)]
     limbs: dict[str, Southwell | None] = {}
     words = []
     for name, part in (("rise", t <= top), ("fall", t >= top)):
         try:
-            limbs[name] = southwell(q[part], theta[part], sd[part])
+            limbs[name] = southwell(q[part], theta[part], sd[part], pressure_sd)
         except DivergenceError as fault:
             limbs[name] = None
             words.append(f"no line of the {name} alone ({fault})")
@@ -126,8 +132,10 @@ def span_means(
     return mean[0], mean[1], mean[2], mean[3]
 
 
-def southwell(pressure_pa: FloatArray, theta_rad: FloatArray, theta_sd_rad: FloatArray) -> Southwell:
-    """Fit bending against dynamic pressure.
+def southwell(
+    pressure_pa: FloatArray, theta_rad: FloatArray, theta_sd_rad: FloatArray, pressure_sd: float = 0.0
+) -> Southwell:
+    """Fit bending against dynamic pressure, of which all values may be off by a common fraction ``pressure_sd``.
 
     Raises
     ------
@@ -137,9 +145,10 @@ def southwell(pressure_pa: FloatArray, theta_rad: FloatArray, theta_sd_rad: Floa
     if len(theta_rad) < LEAST_SPANS:
         raise DivergenceError(f"Southwell plot: {len(theta_rad)} spans of {SPAN_S} s where {LEAST_SPANS} are wanted")
     lasting = np.sqrt(CONSTANT_PART) * theta_sd_rad
-    cov = np.outer(lasting, lasting) + np.diag((1.0 - CONSTANT_PART) * theta_sd_rad**2 + (LEFT_OUT * theta_rad) ** 2)
-    whiten = np.linalg.inv(np.linalg.cholesky(cov))
     top = float(pressure_pa.max())
+    swings = (LEFT_OUT * theta_rad) ** 2 * top / pressure_pa
+    cov = np.outer(lasting, lasting) + np.diag((1.0 - CONSTANT_PART) * theta_sd_rad**2 + swings)
+    whiten = np.linalg.inv(np.linalg.cholesky(cov))
 
     def model(x: FloatArray) -> FloatArray:
         u = pressure_pa / (top * (1.0 + np.exp(x[0])))
@@ -161,8 +170,9 @@ def southwell(pressure_pa: FloatArray, theta_rad: FloatArray, theta_sd_rad: Floa
     k = norm.ppf(0.5 + 0.5 * CONFIDENCE)
     crit, offset = top * (1.0 + beyond), float(np.exp(fit.x[1]))
     sd_x = np.sqrt(np.linalg.inv(normal)[0, 0])
-    # the margin over the largest load is what is normal: never below it
-    low, high = (top * (1.0 + np.exp(fit.x[0] + side * k * sd_x)) for side in (-1.0, 1.0))
+    # the logarithm of the margin over the largest load is normal, that of the pressure's scale too
+    ends = (np.log((1.0 + np.exp(fit.x[0] + side * k * sd_x)) / (1.0 + beyond)) for side in (-1.0, 1.0))
+    low, high = (crit * np.exp(np.sign(end) * np.hypot(end, k * pressure_sd)) for end in ends)
     spread = np.exp(k * np.sqrt(covariance[1, 1]))
     return Southwell(
         crit, offset, (float(low), float(high)), (float(offset / spread), float(offset * spread)), covariance,

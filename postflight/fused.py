@@ -121,7 +121,9 @@ def fuse_flight(
             words += f"; there is an answer if {clock.words}"
         raise DivergenceError(words) from None
     try:
-        limbs = southwell_limbs(fused.history, pulse.time_s, pulse.dynamic_pressure_pa)
+        peak = int(np.argmax(pulse.dynamic_pressure_pa))
+        pressure_sd = float(pulse.dynamic_pressure_sd_pa[peak] / pulse.dynamic_pressure_pa[peak])
+        limbs = southwell_limbs(fused.history, pulse.time_s, pulse.dynamic_pressure_pa, pressure_sd)
         words = limbs.words
     except DivergenceError as fault:
         limbs, words = None, str(fault)

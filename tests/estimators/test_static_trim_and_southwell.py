@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.southwell import southwell, southwell_limbs
+from estimators.southwell import LEFT_OUT, southwell, southwell_limbs
 from estimators.static_trim import static_trim
 from estimators.trim import trim_angle_for_deflection, trim_model
 from flightmodel.checks import DivergenceError, GateError
@@ -64,13 +64,16 @@ def test_line_gives_stiffness_and_offset_back():
     np.testing.assert_allclose(line.deflection(q), curve(q, 1500.0, 0.02), rtol=1e-3)
 
 
-def test_intervals_cover_as_they_say():
-    """90 % intervals over 300 draws of lasting and passing errors: binomial 99.9 %."""
+@pytest.mark.parametrize("pressure_sd", [0.0, 0.05])
+def test_intervals_cover_as_they_say(pressure_sd):
+    """90 % intervals over 300 draws of lasting and passing errors, swings and the pressure's: binomial 99.9 %."""
     rng, q, inside = np.random.default_rng(0), np.linspace(150.0, 1180.0, 12), []
     theta, sd = curve(q, 1500.0, 0.02), np.full(12, 1.5e-3)
     for _ in range(300):
-        passing = np.sqrt(0.5) * sd * rng.normal(size=12) + 0.05 * theta * rng.normal(size=12)
-        line = southwell(q, theta + np.sqrt(0.5) * sd * rng.normal() + passing, sd)
+        passing = np.sqrt(0.5) * sd * rng.normal(size=12)
+        swings = LEFT_OUT * np.sqrt(q.max() / q) * theta * rng.normal(size=12)
+        told = q * (1.0 + pressure_sd * rng.normal())
+        line = southwell(told, theta + np.sqrt(0.5) * sd * rng.normal() + passing + swings, sd, pressure_sd)
         low, high = np.array([line.critical_interval_pa, line.offset_interval_rad]).T
         inside.append((low < [1500.0, 0.02]) & (high > [1500.0, 0.02]))
     share = np.mean(inside, axis=0)
@@ -87,7 +90,7 @@ def limb_history(factor_on_fall):
 
 
 def test_hysteresis_is_told_from_none():
-    same, other = (southwell_limbs(*limb_history(f)) for f in (1.0, 1.6))
+    same, other = (southwell_limbs(*limb_history(f), 0.0) for f in (1.0, 1.6))
     assert abs(same.hysteresis_sd) < 1.0
     assert same.words.startswith("no hysteresis")
     assert other.hysteresis_sd > 1.645
