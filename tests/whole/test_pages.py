@@ -50,6 +50,7 @@ LONG = {
     "own-data.md: postflight export my-flight --to kml",
     "postflight demo demo-flight",
     "postflight reconcile my-flight",
+    "postflight reconstruct my-flight",
     "postflight reconstruct my-flight --sensitivity",
     "postflight reconstruct demo-flight --sensitivity",
     "postflight deflection my-flight --method camera --film",
