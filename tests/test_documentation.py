@@ -142,7 +142,7 @@ def test_values_on_the_page_are_the_defaults(table: str, model: type[BaseModel],
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_commands_on_the_page_are_understood(page: Path, monkeypatch: pytest.MonkeyPatch):
-    """Parsed, not run: tests/whole/test_examples.py runs those that are quick."""
+    """Parsed, in a moment; tests/whole/test_pages.py runs them."""
     monkeypatch.chdir(ROOT)
     for words in commands(page):
         given = [w for w in words if w != "corners.csv"]

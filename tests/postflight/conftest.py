@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import traceback
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ import pytest
 from flightmodel.atmosphere import default_sounding_sd, us76
 from flightmodel.telemetry import Sounding
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from tests.in_process import runner
 from tests.recon import conftest as mini
 
 START_S, END_S = 420.0, 430.0
@@ -196,26 +196,8 @@ def postflight() -> Callable[..., subprocess.CompletedProcess[str]]:
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
-    """Run the command's own ``main`` in this process: the same codes and words without two seconds of imports."""
-    from postflight.cli import main
-
-    def run(*arguments: str | Path, cwd: Path | None = None) -> SimpleNamespace:
-        monkeypatch.setattr(sys, "argv", ["postflight", *map(str, arguments)])
-        monkeypatch.setenv("COLUMNS", "200")
-        if cwd is not None:
-            monkeypatch.chdir(cwd)
-        capsys.readouterr()
-        code, trace = 0, ""
-        try:
-            main()
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-        except Exception:
-            code, trace = 1, traceback.format_exc()
-        seen = capsys.readouterr()
-        return SimpleNamespace(returncode=code, stdout=seen.out, stderr=seen.err + trace)
-
-    return run
+    """Run the command's own ``main`` in this process."""
+    return runner(capsys, monkeypatch)
 
 
 def layer_of_air():

@@ -1,4 +1,6 @@
-"""A short dispersed flight for tests: from 100 km for ten seconds, some milliseconds of computing each."""
+"""Short flights for tests: a dispersed one from 100 km for ten seconds, some milliseconds of computing each; and the
+reference flight's pulse alone, with everything that a range delivers.
+"""
 
 import re
 
@@ -53,5 +55,25 @@ def write_short(folder, text=DISPERSIONS, changes=SHORT):
     spec = re.sub(r"(?ms)^\[video\].*?(?=^\[)", "", spec)
     (folder / "short.toml").write_text(spec)
     path = folder / "dispersions.toml"
+    path.write_text(text)
+    return path
+
+
+# less of everything than the reference flight: it is looked at, not measured
+PULSE = (
+    (r"(?m)^stop_s = 530\.0", "stop_s = 458.0"),
+    (r"telemetry_from_s = 300\.0", "telemetry_from_s = 412.0"),
+    (r"(?m)^t_s = 300\.0", "t_s = 412.0"),
+    (r"rate_hz = 250\.0", "rate_hz = 100.0"),
+    (r"rate_hz = 4\.0", "rate_hz = 1.0"),
+)
+
+
+def write_pulse(path):
+    """Write the reference scenario from 412 to 458 s, 27 frames of film with it; return its path."""
+    text = (DATA / "scenarios" / "irve2_reference.toml").read_text()
+    for pattern, new in PULSE:
+        text, count = re.subn(pattern, new, text)
+        assert count, pattern
     path.write_text(text)
     return path

@@ -11,6 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from postflight import commands
+from postflight.pipeline import METHODS
+from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.scenarios import read_scenario
+from tests.postflight.short_flights import write_pulse
+
 SEED = 11
 EXAMPLE = Path(__file__).parents[2] / "examples" / "range_package_01"
 
@@ -51,6 +57,15 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def run_folder(flown: Path) -> Path:
     return newest(flown)
+
+
+@pytest.fixture(scope="session")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pulse of a synthetic flight with its film, simulated and run; to be copied."""
+    folder = tmp_path_factory.mktemp("short") / "flight"
+    simulate_to_folder(read_scenario(str(write_pulse(folder.parent / "pulse.toml"))), SEED, folder)
+    commands.run_flight(folder, METHODS, 20.0)
+    return folder
 
 
 @pytest.fixture(scope="session")

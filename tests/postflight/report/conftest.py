@@ -15,6 +15,7 @@ from postflight import commands, figures
 from postflight.pipeline import METHODS
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
+from tests.postflight.short_flights import write_pulse
 
 ROOT = Path(__file__).parents[3]
 HOSTILE = "<script>alert(1)</script>"
@@ -22,27 +23,14 @@ HOSTILE_EVENT = '</script><img src=x onerror="alert(2)">'
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 QUIET = ("disable-gpu", "disable-quic", "no-first-run", "disable-background-networking", "disable-component-update",
          "disable-sync")  # fmt: skip
-# less of everything than the reference flight: it is looked at, not measured
-SHORTER = (
-    (r"(?m)^stop_s = 530\.0", "stop_s = 458.0"),
-    (r"telemetry_from_s = 300\.0", "telemetry_from_s = 412.0"),
-    (r"(?m)^t_s = 300\.0", "t_s = 412.0"),
-    (r"rate_hz = 250\.0", "rate_hz = 100.0"),
-    (r"rate_hz = 4\.0", "rate_hz = 1.0"),
-)
 
 
 @pytest.fixture(scope="session")
 def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Flight folder with one run and its report; not to be written to."""
     root = tmp_path_factory.mktemp("report")
-    text = Path(read_scenario("irve2_reference").source).read_text()
-    for pattern, new in SHORTER:
-        text, count = re.subn(pattern, new, text)
-        assert count, pattern
-    (root / "short.toml").write_text(text)
     folder = root / "flight"
-    simulate_to_folder(read_scenario(str(root / "short.toml")), 0, folder)
+    simulate_to_folder(read_scenario(str(write_pulse(root / "short.toml"))), 0, folder)
     shipped = vehicle_path("irve2_reference")
     for table in vehicle_from_toml(shipped).files:
         shutil.copy(shipped.parent / table, folder / table)
