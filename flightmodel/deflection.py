@@ -119,9 +119,10 @@ class DeflectionHistory:
         if t[k + 1] - t[k] > HOLE_FACTOR * np.median(np.diff(t)) and time_s not in (t[k], t[k + 1]):
             return float("nan"), float("nan")
         theta, sd = self.theta_rad[known], self.theta_sd_rad[known]
-        # what a straight line between answers misses: s (1 - s) / 2 of their second difference, as large as about here
+        # what a straight line between answers misses: s (1 - s) / 2 of their second difference, as large as about here;
+        # among few of them all may be small where answers are no denser than the swings
         share = (time_s - t[k]) / (t[k + 1] - t[k])
-        around = np.diff(theta[max(k - 1, 0) : k + 3], n=2)
+        around = np.diff(theta[max(k - 3, 0) : k + 5], n=2)
         missed = 0.5 * share * (1.0 - share) * float(np.abs(around).max(initial=0.0))
         return float(np.interp(time_s, t, theta)), float(np.hypot(np.interp(time_s, t, sd), missed))
 
