@@ -15,26 +15,132 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from estimators.benchmark import orient_camera
+from estimators.benchmark_bending import BenchmarkBending, ReadFrames
 from estimators.camera_fit import FrameFit, HeldFixed, OrientedCamera
 from estimators.seen import Image
 from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing
-from flightmodel.deflection import DeflectionHistory, polar_from_lateral, rotation_vector_body_shell
+from flightmodel.deflection import (
+    DeflectionHistory,
+    history_from_lateral,
+    polar_from_lateral,
+    rotation_vector_body_shell,
+)
 from flightmodel.film import read_image
 from flightmodel.vehicle import CameraMount, ShellGeometry
 
 Progress = Callable[[float, str], None]
+_SWAP = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from a rotation about body y and z to the lateral vector
 
 
 def axis_of(plane_lv_rad: float) -> FloatArray:
     """Rotation vector (y, z) of a unit bending in a plane."""
     out: FloatArray = rotation_vector_body_shell(np.array(1.0), np.array(plane_lv_rad))[1:]
     return out
+
+
+@dataclass(frozen=True)
+class ReadFilm:
+    """What was read in every frame of a film, and how.
+
+    Parameters
+    ----------
+    time_s : (n,) float
+    fits : tuple of n FrameFit
+    oriented : OrientedCamera
+    benchmark_s : float
+        Time of the benchmark frame.
+    plane_lv_rad : float or None
+        Assumed plane; None: found in every frame.
+    plane_sd_rad : float
+        Of the assumed plane.
+    """
+
+    time_s: FloatArray
+    fits: tuple[FrameFit, ...]
+    oriented: OrientedCamera
+    benchmark_s: float
+    plane_lv_rad: float | None
+    plane_sd_rad: float
+
+    def against_benchmark(self, clock_sd_s: float = 0.0) -> ReadFrames:
+        """What the frames say of the bending beyond the benchmark frame's, where their planes were found.
+
+        Raises
+        ------
+        GateError
+            Where a plane was assumed: one component is no vector.
+        """
+        if self.plane_lv_rad is not None:
+            raise GateError("in an assumed plane one component of the bending is read")
+        rest = np.array([fit.per_benchmark for fit in self.fits])
+        held = self.oriented.held.benchmark_rad**2 * rest @ rest.transpose(0, 2, 1)
+        covariance = np.array([fit.covariance for fit in self.fits]) - held
+        theta_yz = np.array([fit.rotation_yz_rad for fit in self.fits]) @ _SWAP.T
+        return ReadFrames(
+            self.time_s, theta_yz, _SWAP @ covariance @ _SWAP.T, _SWAP @ rest @ _SWAP.T, self.benchmark_s, clock_sd_s
+        )
+
+    def history(self, benchmark: BenchmarkBending | None = None) -> DeflectionHistory:
+        """History of the bending, with the benchmark frame taken as not bent, or as bent as is told.
+
+        ``method = "camera"``. NaN where a frame was refused; the reasons stand in ``assumptions``. In an assumed plane
+        the angle has a sign.
+        """
+        if benchmark is not None:
+            read = self.against_benchmark()
+            back = read.per_benchmark
+            covariance = read.covariance + back @ benchmark.covariance @ back.transpose(0, 2, 1)
+            theta_yz = read.theta_yz_rad + back @ benchmark.theta_yz_rad
+            return history_from_lateral(self.time_s, theta_yz, covariance, "camera", self._words(benchmark))
+        n = len(self.time_s)
+        theta, plane, covariance = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2, 2), np.nan)
+        for k, fit in enumerate(self.fits):
+            if fit.refused:
+                continue
+            if self.plane_lv_rad is None:
+                theta[k], plane[k], covariance[k] = polar(fit.rotation_yz_rad, fit.covariance)
+            else:
+                theta[k] = fit.rotation_yz_rad @ axis_of(self.plane_lv_rad)
+                s, sd2 = fit.plane_leak, self.plane_sd_rad**2
+                off = theta[k] ** 2 * (s**2 * sd2 + 3.0 * (0.5 + s**2) ** 2 * sd2**2)
+                cross = -theta[k] * s * sd2
+                covariance[k] = [[fit.covariance[0, 0] + off, cross], [cross, sd2]]
+        if self.plane_lv_rad is not None:
+            plane[:] = self.plane_lv_rad
+        return DeflectionHistory(self.time_s, theta, plane, covariance, "camera", self._words(None))
+
+    def _words(self, benchmark: BenchmarkBending | None) -> str:
+        seen, oriented = [fit for fit in self.fits if not fit.refused], self.oriented
+        edge = np.median([len(fit.horizon.points_px) for fit in seen]) / len(oriented.lines.origin_px) if seen else 0.0
+        marks = float(np.median([fit.marks for fit in seen])) if seen else 0.0
+        how = (
+            "plane found in every frame"
+            if self.plane_lv_rad is None
+            else f"plane assumed at {np.rad2deg(self.plane_lv_rad):.0f} +/- {np.rad2deg(self.plane_sd_rad):.0f} deg LV"
+        )
+        bent = f"taken as not bent within {np.rad2deg(oriented.held.benchmark_rad):.2f} deg"
+        bent = bent if benchmark is None else benchmark.words
+        words = [
+            f"{how}; joint {oriented.view.joint_station_m:.3f} m aft of the nose",
+            f"camera oriented on the frame at {self.benchmark_s:.3f} s, {bent} "
+            f"(rms {oriented.residual_rms_px:.2f} px)",
+            f"from {100.0 * edge:.0f} % of the edge"
+            + (f" and {marks:.0f} rows of seams and dots" if marks >= 1.0 else "; no seam and no dot could be used, "
+               "which leaves flattening and ovality of the shell in the error bar"),
+        ]  # fmt: skip
+        refused = [(t, fit.refused) for t, fit in zip(self.time_s, self.fits, strict=True) if fit.refused]
+        if refused:
+            listed = ", ".join(f"{t:.3f} s: {reason}" for t, reason in refused[:5])
+            words.append(
+                f"{len(refused)} of {len(self.fits)} frames refused ({listed}{', ...' if len(refused) > 5 else ''})"
+            )
+        return "; ".join(words)
 
 
 def deflection_from_frames(
@@ -50,7 +156,34 @@ def deflection_from_frames(
     benchmark: Image | None = None,
     progress: Progress | None = None,
 ) -> DeflectionHistory:
-    """Estimate the bending history from onboard video.
+    """Estimate the bending history from onboard video: `read_film`, with nothing known of the benchmark frame.
+
+    Returns
+    -------
+    DeflectionHistory
+        See `ReadFilm.history`.
+    """
+    film = read_film(
+        frame_times_s, frames, geometry, camera_mount, joint_station_m, benchmark_time_s, plane_lv_rad, plane_sd_rad,
+        held, benchmark, progress,
+    )  # fmt: skip
+    return film.history()
+
+
+def read_film(
+    frame_times_s: FloatArray,
+    frames: Iterable[Image | str | Path],
+    geometry: ShellGeometry,
+    camera_mount: CameraMount,
+    joint_station_m: float,
+    benchmark_time_s: float = 421.0,
+    plane_lv_rad: float | None = float(np.deg2rad(153.0)),
+    plane_sd_rad: float = float(np.deg2rad(25.0)),
+    held: HeldFixed | None = None,
+    benchmark: Image | None = None,
+    progress: Progress | None = None,
+) -> ReadFilm:
+    """Orient the camera on the benchmark frame, and fit the bending in every frame.
 
     Frames are taken one at a time: memory does not grow with their number.
 
@@ -73,12 +206,6 @@ def deflection_from_frames(
         The benchmark frame, where ``frames`` can be gone through only once.
     progress : callable, optional
         Told the fraction done and what is being done.
-
-    Returns
-    -------
-    DeflectionHistory
-        ``method = "camera"``. NaN where a frame was refused; the reasons stand in ``assumptions``. In an assumed plane
-        the angle has a sign.
 
     Raises
     ------
@@ -105,7 +232,7 @@ def deflection_from_frames(
         start = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad
     if len(fits) != len(times):
         raise GateError(f"{len(times)} frame times for {len(fits)} frames")
-    return _history(times, fits, oriented, times[nearest], plane_lv_rad, plane_sd_rad)
+    return ReadFilm(times, tuple(fits), oriented, float(times[nearest]), plane_lv_rad, plane_sd_rad)
 
 
 def _decoded_ahead(frames: Iterable[Image | str | Path]) -> Iterator[Image]:
@@ -139,64 +266,13 @@ def read_frame(picture: Image | str | Path) -> Image:
     return read_image(Path(picture)) if isinstance(picture, str | Path) else picture
 
 
-def _history(
-    times: FloatArray, fits: list[FrameFit], oriented: OrientedCamera, benchmark_s: float,
-    plane_lv_rad: float | None, plane_sd_rad: float,
-) -> DeflectionHistory:  # fmt: skip
-    n = len(times)
-    theta, plane, covariance = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2, 2), np.nan)
-    for k, fit in enumerate(fits):
-        if fit.refused:
-            continue
-        if plane_lv_rad is None:
-            theta[k], plane[k], covariance[k] = polar(fit.rotation_yz_rad, fit.covariance)
-        else:
-            theta[k] = fit.rotation_yz_rad @ axis_of(plane_lv_rad)
-            s, sd2 = fit.plane_leak, plane_sd_rad**2
-            off = theta[k] ** 2 * (s**2 * sd2 + 3.0 * (0.5 + s**2) ** 2 * sd2**2)
-            cross = -theta[k] * s * sd2
-            covariance[k] = [[fit.covariance[0, 0] + off, cross], [cross, sd2]]
-    if plane_lv_rad is not None:
-        plane[:] = plane_lv_rad
-    words = _words(times, fits, oriented, benchmark_s, plane_lv_rad, plane_sd_rad)
-    return DeflectionHistory(times, theta, plane, covariance, "camera", words)
-
-
-def _words(
-    times: FloatArray, fits: list[FrameFit], oriented: OrientedCamera, benchmark_s: float,
-    plane_lv_rad: float | None, plane_sd_rad: float,
-) -> str:  # fmt: skip
-    seen = [fit for fit in fits if not fit.refused]
-    edge = np.median([len(fit.horizon.points_px) for fit in seen]) / len(oriented.lines.origin_px) if seen else 0.0
-    marks = float(np.median([fit.marks for fit in seen])) if seen else 0.0
-    how = (
-        "plane found in every frame"
-        if plane_lv_rad is None
-        else f"plane assumed at {np.rad2deg(plane_lv_rad):.0f} +/- {np.rad2deg(plane_sd_rad):.0f} deg LV"
-    )
-    words = [
-        f"{how}; joint {oriented.view.joint_station_m:.3f} m aft of the nose",
-        f"camera oriented on the frame at {benchmark_s:.3f} s, taken as not bent within "
-        f"{np.rad2deg(oriented.held.benchmark_rad):.2f} deg (rms {oriented.residual_rms_px:.2f} px)",
-        f"from {100.0 * edge:.0f} % of the edge"
-        + (f" and {marks:.0f} rows of seams and dots" if marks >= 1.0 else "; no seam and no dot could be used, which "
-           "leaves flattening and ovality of the shell in the error bar"),
-    ]  # fmt: skip
-    refused = [(t, fit.refused) for t, fit in zip(times, fits, strict=True) if fit.refused]
-    if refused:
-        listed = ", ".join(f"{t:.3f} s: {reason}" for t, reason in refused[:5])
-        words.append(f"{len(refused)} of {len(times)} frames refused ({listed}{', ...' if len(refused) > 5 else ''})")
-    return "; ".join(words)
-
-
 def polar(rotation_yz_rad: FloatArray, covariance: FloatArray) -> tuple[float, float, FloatArray]:
     """Angle, plane (rad) and their covariance ``(2, 2)`` from a rotation about body y and z.
 
     See `flightmodel.deflection.polar_from_lateral`; the shell's rotation ``theta x_hat x d`` has the lateral vector
     ``theta d = (w_z, -w_y)``.
     """
-    swap = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    theta, plane, out = polar_from_lateral(swap @ rotation_yz_rad, swap @ covariance @ swap.T)
+    theta, plane, out = polar_from_lateral(_SWAP @ rotation_yz_rad, _SWAP @ covariance @ _SWAP.T)
     return float(theta), float(plane), out
 
 

@@ -86,6 +86,8 @@ class FrameFit:
         Rotation vector of the shell against the body about body y and z, rad; NaN when refused.
     covariance : (k, k) float
         Of the fitted parameters: ``rotation_yz_rad`` (k = 2), or the angle in the assumed plane (k = 1), rad^2.
+    per_benchmark : (k, 2) float
+        What is missing of the answer per unit bending of the benchmark frame; its `HeldFixed` is in the covariance.
     plane_leak : float
         Answer to a unit bending across the assumed plane (k = 1); zero otherwise.
     flattening_rad : float
@@ -99,6 +101,7 @@ class FrameFit:
 
     rotation_yz_rad: FloatArray
     covariance: FloatArray
+    per_benchmark: FloatArray
     plane_leak: float
     flattening_rad: float
     residual_rms_px: float
@@ -149,7 +152,7 @@ def _has(found: tuple[FloatArray, FloatArray]) -> NDArray[np.intp]:
 
 def _no_answer(horizon: HorizonLine, reason: str) -> FrameFit:
     nan = np.full((2, 2), np.nan)
-    return FrameFit(nan[0], nan, 0.0, float("nan"), float("nan"), 0, horizon, reason)
+    return FrameFit(nan[0], nan, nan, 0.0, float("nan"), float("nan"), 0, horizon, reason)
 
 
 @dataclass(frozen=True)
@@ -335,7 +338,8 @@ class OrientedCamera:
     def _answer(self, horizon: HorizonLine, bending: FloatArray, last: _Solution, basis: FloatArray) -> FrameFit:
         gain, before, leak = last.gain, last.before, 0.0
         posed = gain @ (last.rows[:, POSED] - before[:, POSED])
-        rest = (gain @ before[:, BENDING] + posed @ self.posed_per_bending) * self.held.benchmark_rad
+        missing = gain @ before[:, BENDING] + posed @ self.posed_per_bending
+        rest = missing * self.held.benchmark_rad
         covariance = last.formal + posed @ self.posed_covariance @ posed.T + rest @ rest.T
         if basis.shape[1] == 1:
             shape = gain @ np.concatenate([last.rows[:, [FLATTENING, JOINT]], last.shape], axis=1) * self._shape_sd
@@ -344,4 +348,4 @@ class OrientedCamera:
             leak = float(gain[0] @ last.rows[:, BENDING] @ np.array([-basis[1, 0], basis[0, 0]]))
         marks = len(last.rows) - last.edge_count
         answer = basis @ (basis.T @ bending[:2])
-        return FrameFit(answer, covariance, leak, float(bending[2]), last.rms_px, marks, horizon)
+        return FrameFit(answer, covariance, missing, leak, float(bending[2]), last.rms_px, marks, horizon)

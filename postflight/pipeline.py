@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from estimators.camera_deflection import deflection_from_frames, sensitivity_table
+from estimators.benchmark_bending import benchmark_bending
+from estimators.camera_deflection import ReadFilm, read_film, sensitivity_table
 from estimators.fusion import smoothed
 from estimators.misalignment import estimate_misalignment
 from estimators.pulse import PulseData
@@ -173,16 +174,28 @@ def estimate_camera(
 ) -> DeflectionHistory:
     """Deflection from the onboard video, in an assumed plane or with the plane found in every frame.
 
+    The benchmark frame is taken as not bent; `told_by_the_joint` knows better where there are inertial sensors.
+
     Raises
     ------
     GateError
         Where there is no video or it cannot be used.
     """
+    return camera_film(telemetry, plane_lv_rad, joint_station_m, progress).history()
+
+
+def camera_film(
+    telemetry: Telemetry,
+    plane_lv_rad: float | None = None,
+    joint_station_m: float | None = None,
+    progress: Progress | None = None,
+) -> ReadFilm:
+    """What the onboard video shows, frame by frame; `GateError` where there is none or it cannot be used."""
     frames = telemetry.frames
     if frames is None:
         raise GateError(NO_VIDEO)
     vehicle = telemetry.required_vehicle()
-    return deflection_from_frames(
+    return read_film(
         frames.time_s,
         frames.pictures(),
         vehicle.geometry,
@@ -193,6 +206,23 @@ def estimate_camera(
         benchmark=frames.picture(frames.benchmark),
         progress=progress,
     )
+
+
+def told_by_the_joint(film: ReadFilm, flight: Flight | None, telemetry: Telemetry) -> DeflectionHistory:
+    """Camera's history with the benchmark frame as bent as the moment in the joint says; as not bent without one.
+
+    Why there is none stands in the history's words.
+    """
+    try:
+        if flight is None:
+            raise GateError("no trajectory was made")
+        clock_sd_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
+        frames = film.against_benchmark(clock_sd_s)
+        return film.history(benchmark_bending(frames, flight.required_pulse(), film.oriented.held.benchmark_rad))
+    except GateError as fault:
+        plain = film.history()
+        words = f"{plain.assumptions}; the benchmark's bending is not told by the joint ({fault})"
+        return replace(plain, assumptions=words)
 
 
 def camera_sensitivity(telemetry: Telemetry, history: DeflectionHistory) -> pd.DataFrame:
@@ -235,12 +265,14 @@ def estimate(
     report = progress or (lambda _fraction, _what: None)
     histories: dict[str, DeflectionHistory] = {}
     refused: dict[str, str] = {}
-    fused = None
+    fused, plain = None, None
     for k, method in enumerate(methods):
         report(k / len(methods), f"deflection from {method}")
         try:
             if method == "camera":
-                history = estimate_camera(telemetry, plane_lv_rad, joint_station_m, _part(report, k, len(methods)))
+                film = camera_film(telemetry, plane_lv_rad, joint_station_m, _part(report, k, len(methods)))
+                # the fusion finds the benchmark's bending itself, from the same sensors: it is given the plain history
+                plain, history = film.history(), told_by_the_joint(film, flight, telemetry)
             else:
                 assert flight is not None
                 pulse = flight.required_pulse()
@@ -249,7 +281,7 @@ def estimate(
                 elif method == "trim":
                     history = estimate_trim(pulse, joint_station_m)
                 else:
-                    seen = _seen(telemetry, histories, refused, plane_lv_rad)
+                    seen = plain if "camera" in histories else _seen(telemetry, refused, plane_lv_rad)
                     film_clock_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
                     fused = fuse_flight(pulse, seen, joint_station_m, film_clock_s)
                     history = fused.fused.history
@@ -270,12 +302,10 @@ def estimate(
     return Answers(histories, refused, fused, smooth)
 
 
-def _seen(
-    telemetry: Telemetry, histories: dict[str, DeflectionHistory], refused: dict[str, str], plane_lv_rad: float | None
-) -> DeflectionHistory | None:
-    """Camera's history for the fusion: the one at hand, else found now; None without usable video."""
-    if "camera" in histories or "camera" in refused or telemetry.frames is None:
-        return histories.get("camera")
+def _seen(telemetry: Telemetry, refused: dict[str, str], plane_lv_rad: float | None) -> DeflectionHistory | None:
+    """Camera's history for the fusion, found now; None without usable video."""
+    if "camera" in refused or telemetry.frames is None:
+        return None
     try:
         return estimate_camera(telemetry, plane_lv_rad)
     except GateError:
