@@ -152,7 +152,8 @@ def plane_at(run: Run, method: str) -> str:
         return ""
     yz = np.array(table["theta_deg"])[:, None] * lv_direction(np.deg2rad(np.array(table["plane_lv_deg"])))[:, 1:]
     clock = np.rad2deg(lv_clock(np.array([np.interp(at, t, c) for c in yz.T])))
-    return f"{float(clock):.0f} ± {sd:.0f}"
+    places = 0 if sd >= 1.0 else 1
+    return f"{float(clock):.{places}f} ± {sd:.{places}f}"
 
 
 def scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
