@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import estimator_coverage as dispersed
 
 from estimators.benchmark_bending import benchmark_bending
-from estimators.camera_deflection import deflection_from_frames, read_film
+from estimators.camera_deflection import read_film
 from flightmodel.checks import GateError
 from synthetic_flight.video import Imaging, Scene, film
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, sun
@@ -56,7 +56,7 @@ def one_flight(job: tuple[str, int]) -> tuple[int, list[tuple[float, ...]], str]
     frames, theta, plane = makers[kind](seed)
     mount = UNCALIBRATED if kind == "degraded" else MOUNT
     try:
-        history = deflection_from_frames(TIMES, frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None)
+        history = read_film(TIMES, frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None).history()
     except GateError as fault:
         return seed, [], str(fault)
     rows = []

@@ -27,7 +27,7 @@ from scipy.optimize import least_squares
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from estimators.benchmark import orient_camera
-from estimators.camera_deflection import deflection_from_frames
+from estimators.camera_deflection import read_film
 from estimators.camera_fit import REACH_PX
 from estimators.horizon import find_horizon
 from estimators.raster import render
@@ -118,7 +118,7 @@ def time_a_film() -> None:
             return film_frames(path, list(range(FRAMES)))
 
         def estimate():
-            deflection_from_frames(times, pictures(), GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None, benchmark=frames[0])
+            read_film(times, pictures(), GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None, benchmark=frames[0]).history()
 
         told(
             rounds({f"{FRAMES} frames": estimate, "of it decoding": lambda: deque(pictures(), 0)}, 3),

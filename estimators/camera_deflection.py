@@ -143,33 +143,6 @@ class ReadFilm:
         return "; ".join(words)
 
 
-def deflection_from_frames(
-    frame_times_s: FloatArray,
-    frames: Iterable[Image | str | Path],
-    geometry: ShellGeometry,
-    camera_mount: CameraMount,
-    joint_station_m: float,
-    benchmark_time_s: float = 421.0,
-    plane_lv_rad: float | None = float(np.deg2rad(153.0)),
-    plane_sd_rad: float = float(np.deg2rad(25.0)),
-    held: HeldFixed | None = None,
-    benchmark: Image | None = None,
-    progress: Progress | None = None,
-) -> DeflectionHistory:
-    """Estimate the bending history from onboard video: `read_film`, with nothing known of the benchmark frame.
-
-    Returns
-    -------
-    DeflectionHistory
-        See `ReadFilm.history`.
-    """
-    film = read_film(
-        frame_times_s, frames, geometry, camera_mount, joint_station_m, benchmark_time_s, plane_lv_rad, plane_sd_rad,
-        held, benchmark, progress,
-    )  # fmt: skip
-    return film.history()
-
-
 def read_film(
     frame_times_s: FloatArray,
     frames: Iterable[Image | str | Path],

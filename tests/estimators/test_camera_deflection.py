@@ -10,7 +10,7 @@ import pytest
 
 import flightmodel
 from estimators.benchmark import orient_camera
-from estimators.camera_deflection import deflection_from_frames, polar, sensitivity_table
+from estimators.camera_deflection import polar, read_film, sensitivity_table
 from estimators.camera_fit import REACH_PX
 from estimators.figures import figure_camera_overlay
 from estimators.horizon import HorizonLine, find_horizon
@@ -63,8 +63,8 @@ def ensemble():
         plane = [float(np.rad2deg(np.arctan2(rest[1], -rest[0]))), rng.uniform(183.0, 200.0), rng.uniform(140.0, 190.0)]
         frames = film(seed, theta, plane)
         times = np.array([421.0, 440.0, 441.0])
-        free = deflection_from_frames(times, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None)
-        assumed = deflection_from_frames(times, frames, GEOMETRY, MOUNT, JOINT_M)
+        free = read_film(times, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None).history()
+        assumed = read_film(times, frames, GEOMETRY, MOUNT, JOINT_M).history()
         rows.append((D(np.array(theta)), D(np.array(plane)), free, assumed))
     return rows
 
@@ -255,7 +255,7 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
         tmp_path / "good.png",
     ]
     times = 421.0 + np.arange(len(pictures))
-    history = deflection_from_frames(times, pictures, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None)
+    history = read_film(times, pictures, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None).history()
     np.testing.assert_array_equal(np.isnan(history.theta_rad), [False] + [True] * 6 + [False])
     for word in ("too dark", "saturated", "size 720 x 240", "size 0 x 0", "no clear edge", "6 of 8 frames refused"):
         assert word in history.assumptions, word
@@ -270,11 +270,11 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
 def test_gates_name_what_is_wrong():
     frames = film(4, [0.0], [0.0])
     with pytest.raises(GateError, match="2 frame times for 1 frames"):
-        deflection_from_frames(np.array([421.0, 422.0]), frames, GEOMETRY, MOUNT, JOINT_M)
+        read_film(np.array([421.0, 422.0]), frames, GEOMETRY, MOUNT, JOINT_M)
     with pytest.raises(GateError, match="benchmark time"):
-        deflection_from_frames(np.array([440.0]), frames, GEOMETRY, MOUNT, JOINT_M)
+        read_film(np.array([440.0]), frames, GEOMETRY, MOUNT, JOINT_M)
     with pytest.raises(GateError, match="too dark"):
-        deflection_from_frames(np.array([421.0]), [np.zeros_like(frames[0])], GEOMETRY, MOUNT, JOINT_M)
+        read_film(np.array([421.0]), [np.zeros_like(frames[0])], GEOMETRY, MOUNT, JOINT_M)
 
 
 def test_found_points_carry_the_sd_their_noise_gives_them():

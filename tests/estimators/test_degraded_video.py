@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.benchmark import orient_camera
-from estimators.camera_deflection import deflection_from_frames
+from estimators.camera_deflection import read_film
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
 from flightmodel.vehicle import CameraUncertainty
@@ -47,7 +47,7 @@ def ensemble():
     rows = []
     for seed in range(5):
         frames, theta, plane = degraded(seed)
-        history = deflection_from_frames(TIMES, frames, GEOMETRY, UNCALIBRATED, JOINT_M, plane_lv_rad=None)
+        history = read_film(TIMES, frames, GEOMETRY, UNCALIBRATED, JOINT_M, plane_lv_rad=None).history()
         rows.append((history, theta, plane))
     return rows
 
@@ -94,7 +94,7 @@ def film_without_earth(seed, painted):
     theta, plane = D(np.array([0.05, 3.9, 3.1])), D(np.array([20.0, 187.0, 230.0]))
     light = np.stack([sun(rng.uniform(0.0, 360.0)) for _ in TIMES])
     frames = list(film(GEOMETRY, MOUNT, JOINT_M, Scene(theta, plane, light), rng, Imaging(painted=painted)))
-    return deflection_from_frames(TIMES, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None), theta, plane
+    return read_film(TIMES, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None).history(), theta, plane
 
 
 def test_half_the_rim_out_of_view_widens_the_bar_and_is_told():
@@ -103,7 +103,7 @@ def test_half_the_rim_out_of_view_widens_the_bar_and_is_told():
     light = np.stack([sun(250.0)] * 3)
     frames = list(film(GEOMETRY, MOUNT, JOINT_M, Scene(theta, plane, light), rng, Imaging()))
     half = [frames[0]] + [np.where(np.arange(720) < 360, f, 0).astype(np.uint8) for f in frames[1:]]
-    whole, cut = (deflection_from_frames(TIMES, f, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None) for f in (frames, half))
+    whole, cut = (read_film(TIMES, f, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None).history() for f in (frames, half))
     used = [float(h.assumptions.split("from ")[1].split(" %")[0]) for h in (whole, cut)]
     assert used[0] > 90.0
     assert used[1] < 60.0
