@@ -23,9 +23,9 @@ from recon.air import CONSTANT_PART
 from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
 from synthetic_flight import packing
 
-# at 1200 m/s a quarter of a second: what is faster than that moves a joint of 3 Hz little; coarser where air is thin
-KNOT_M, MIDDLE_KNOT_M, UPPER_KNOT_M = 300.0, 600.0, 1200.0
-MIDDLE_M, UPPER_M, TOP_M, BELOW_M = 60e3, 75e3, 105e3, 1e3
+# at 1200 m/s a tenth of a second: gusts at the joint's own 2 to 4 Hz are the knots', not noise; coarser in thin air
+KNOT_M, UPPER_KNOT_M = 125.0, 500.0
+UPPER_M, TOP_M, BELOW_M = 75e3, 105e3, 1e3
 # priors before the flight speaks, one standard deviation: factors as logarithms
 STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 0.5, 1.0, 0.005
 FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
@@ -131,9 +131,13 @@ class AirUnknowns:
     @cached_property
     def knots_m(self) -> FloatArray:
         """Altitudes (k,) at which the air may differ from the sounding."""
-        lower = np.arange(MIDDLE_M, min(self.lowest_m, MIDDLE_M) - BELOW_M, -KNOT_M)[:0:-1]
-        middle, upper = np.arange(MIDDLE_M, UPPER_M, MIDDLE_KNOT_M), np.arange(UPPER_M, TOP_M, UPPER_KNOT_M)
-        return np.concatenate([lower, middle, upper])
+        lower = np.arange(UPPER_M, min(self.lowest_m, UPPER_M) - BELOW_M, -KNOT_M)[:0:-1]
+        return np.concatenate([lower, np.arange(UPPER_M, TOP_M, UPPER_KNOT_M)])
+
+    def apart_m(self, altitude_m: FloatArray) -> FloatArray:
+        """Distance of the knots about altitudes."""
+        apart = np.diff(self.knots_m, append=2 * self.knots_m[-1] - self.knots_m[-2])
+        return np.asarray(np.interp(altitude_m, self.knots_m, apart))
 
     @cached_property
     def precision(self) -> FloatArray:

@@ -36,10 +36,12 @@ from postflight.reconciliation.spans import (
 from synthetic_flight import packing
 
 INSTRUMENTS = 20
-# per angle of flow, rad, that the air's structure between its knots makes, at the largest dynamic pressure within a
-# span: rotation rad, rate rad/s, bending rad, its rate rad/s; and what to divide by where there is no air
+# per angle of flow, rad, that the air's structure between knots GUST_KNOT_M apart makes, at the largest dynamic
+# pressure within a span: rotation rad, rate rad/s, bending rad, its rate rad/s; and what to divide by
+# where there is no air
 GUST = np.array([0.3, 0.3, 0.3, 3.0, 3.0, 3.0, 0.0, 0.3, 0.3, 0.0, 9.0, 9.0])
 STILL_SD = np.deg2rad([0.001, 0.001, 0.001, 0.003, 0.003, 0.003, 1e-4, 0.001, 0.001, 0.03, 0.01, 0.01])
+GUST_KNOT_M = 300.0
 LARGE_ANGLE_RAD = np.deg2rad(5.0)  # at which structure of the density turns the vehicle
 GUST_RATE, GUST_FORCE_MPS2 = 2.0, 60.0  # of the windows' rates and lateral force, as if it forgot from one to the next
 MOTION_STEP = np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3))
@@ -127,12 +129,17 @@ class Problem:
 
     @cached_property
     def unsteady(self) -> FloatArray:
-        """Flow's angle (s,) that the air's structure between its knots makes, rad, times the share of the load."""
+        """Flow's angle (s,) that the air's structure between its knots makes, rad, times the share of the load.
+
+        Each stretch between two knots pushes for a time that grows with their distance, and they push at random: over
+        a span what they do grows, per angle, with the root of the distance (docs/reconciliation.md).
+        """
         seen = self.observed
+        forgets = np.sqrt(self.air.apart_m(seen.altitude_m) / GUST_KNOT_M)
         density, wind = self.air.between_knots(seen.altitude_m)
         speed = np.linalg.norm(seen.start.velocity_ecef_mps[:-1], axis=1)
         load = seen.dynamic_pressure_pa / seen.dynamic_pressure_pa.max()
-        return np.asarray(load * np.hypot(wind / speed, density * LARGE_ANGLE_RAD))
+        return np.asarray(load * forgets * np.hypot(wind / speed, density * LARGE_ANGLE_RAD))
 
     @cached_property
     def data(self) -> FloatArray:

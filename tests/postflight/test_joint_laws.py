@@ -10,7 +10,7 @@ import pytest
 from flightmodel.checks import ConfigError
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.reconciliation import posterior
-from postflight.reconciliation.candidate import FREEPLAY_SD_RAD, VehicleUnknowns
+from postflight.reconciliation.candidate import FREEPLAY_SD_RAD, KNOT_M, UPPER_M, AirUnknowns, VehicleUnknowns
 from postflight.reconciliation.freeplay import loosened
 from postflight.reconciliation.posterior import quantities
 from postflight.reconciliation.problem import Unknowns
@@ -79,3 +79,15 @@ def test_missing_samplers_are_told_in_words(monkeypatch):
     monkeypatch.setattr(posterior, "find_spec", lambda name: None if name == "emcee" else object())
     with pytest.raises(ConfigError, match=r"emcee not installed; pip install 'postflight\[posterior\]'"):
         posterior.require_samplers()
+
+
+def test_knots_carry_gusts_at_the_joints_own_period_and_leave_the_rest_to_the_noise():
+    """Half a period of the joint's quickest swinging, 4 Hz at 1200 m/s, holds a knot wherever air loads it."""
+    air = AirUnknowns(None, 38e3)
+    apart = np.diff(air.knots_m)
+    loaded = air.knots_m[:-1] < UPPER_M
+    assert np.all(apart > 0.0)
+    assert air.knots_m[0] <= 38e3
+    assert apart[loaded].max() <= 0.5 * 1200.0 / 4.0
+    assert air.apart_m(np.array([40e3, 60e3])) == pytest.approx(KNOT_M)
+    assert air.apart_m(np.array([90e3]))[0] == pytest.approx(apart[-1])
