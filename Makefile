@@ -4,6 +4,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# two processes; threads of linear algebra in each would only get in each other's way
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadscope -q
 
 .PHONY: demo test fast long lint docs notebooks clean
 
@@ -13,14 +15,14 @@ demo: $(VENV)/installed
 # kernels first: otherwise both processes compile them
 test: lint
 	$(BIN)/postflight warmup
-	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m "not long"
+	$(PYTEST) -m "not long"
 
-# statistics over many flights, beyond what a check of every change can wait for (some fifteen minutes)
+# statistics over many flights, beyond what a check of every change can wait for (some twenty minutes)
 long: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m long
+	$(PYTEST) -m long
 
 fast: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadscope -q -m "not slow and not long"
+	$(PYTEST) -m "not slow and not long"
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
