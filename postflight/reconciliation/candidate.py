@@ -24,7 +24,7 @@ from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
 from synthetic_flight import packing
 
 # at 1200 m/s a tenth of a second: gusts at the joint's own 2 to 4 Hz are the knots', not noise; coarser in thin air
-KNOT_M, UPPER_KNOT_M = 125.0, 500.0
+KNOT_M, UPPER_KNOT_M = 125.0, 250.0
 UPPER_M, TOP_M, BELOW_M = 75e3, 105e3, 1e3
 # priors before the flight speaks, one standard deviation: factors as logarithms
 STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 0.5, 1.0, 0.005
@@ -123,10 +123,20 @@ def _moved(
 
 @dataclass(frozen=True)
 class AirUnknowns:
-    """From differences to the sounding at knots, ``(3, k)``: log density, north and east wind, to kernel tables."""
+    """From differences to the sounding at knots, ``(3, k)``: log density, north and east wind, to kernel tables.
+
+    Parameters
+    ----------
+    sounding : Sounding
+    lowest_m : float
+        Of the flight.
+    fine : float
+        Share of the structure between knots, against what the sounding's statistics would have (`fine_air`).
+    """
 
     sounding: Sounding
     lowest_m: float
+    fine: float = 1.0
 
     @cached_property
     def knots_m(self) -> FloatArray:
@@ -156,7 +166,7 @@ class AirUnknowns:
         at = profile_from_sounding(self.sounding).at(self.knots_m)
 
         def left(sd: FloatArray, length_m: float) -> FloatArray:
-            bridged = sd * np.sqrt((1.0 - CONSTANT_PART) * apart / (3.0 * length_m))
+            bridged = self.fine * sd * np.sqrt((1.0 - CONSTANT_PART) * apart / (3.0 * length_m))
             return np.asarray(np.interp(altitude_m, self.knots_m, bridged))
 
         return left(at.density_sd, DENSITY_LENGTH_M), left(at.wind_sd_mps, WIND_LENGTH_M)

@@ -27,7 +27,7 @@ def figure_reconciled(
     figure = Figure(figsize=(10.0, 9.0), layout="constrained")
     axes = figure.subplots(3, 2)
     seen, read = found.problem.observed, found.problem.predicted(found.unknowns)
-    flown = read.windows + found.problem.instrument_rows(read.slope) @ found.unknowns.instruments
+    flown = read.windows + found.problem.instrument_rows(read) @ found.unknowns.instruments
     t = seen.time_s.ravel()
     rate, force = np.rad2deg(flown[..., 1].ravel()), flown[..., 4].ravel() / 9.80665
     _pair(axes[0, 0], t, np.rad2deg(seen.rate_radps[..., 1].ravel()), rate, "body rate y (deg/s)")

@@ -19,10 +19,11 @@ import numpy as np
 from flightmodel.checks import FloatArray
 from postflight.pipeline import Flight
 from postflight.reconciliation.candidate import FREEPLAY_SD_RAD
-from postflight.reconciliation.fit import Progress, Reconciled, problem_of, solve, step_from
+from postflight.reconciliation.fit import Progress, Reconciled, in_fine_air, problem_of, solve
 from postflight.reconciliation.observed import Observed
 from postflight.reconciliation.problem import Problem, Unknowns
 from postflight.reconciliation.spans import BENDING
+from postflight.reconciliation.steps import step_from
 
 # widening of the standard deviations, and corner's half width over the freeplay
 EARLY = ((30.0, 1.0), (10.0, 0.5), (3.0, 0.3), (3.0, 0.1), (1.0, 0.1), (1.0, 0.05))
@@ -47,7 +48,7 @@ def reconcile_loose(
     plain = problem_of(flight, observed, tuple(law for law in laws if law != "freeplay"))
     first = plain.start()
     for _ in range(PLAIN_STEPS):
-        first, *_ = step_from(replace(plain, wider=EARLY[0][0]), first)
+        first = step_from(replace(plain, wider=EARLY[0][0]), first).to
     early = [replace(problem, wider=wider, unknown=replace(problem.unknown, corner=corner)) for wider, corner in EARLY]
     found: list[Reconciled] = []
     share = 1.0 / len(STARTS_RAD)
@@ -60,8 +61,9 @@ def reconcile_loose(
         found.append(_again(at))
         if not false_spans(found[-1]).any():
             break
+    best = in_fine_air(min(found, key=lambda each: each.residuals.cost), rejoined)
     report(1.0, "reconciled")
-    return min(found, key=lambda each: each.residuals.cost)
+    return best
 
 
 def _again(found: Reconciled) -> Reconciled:

@@ -44,9 +44,10 @@ class Observed:
         NaN where sensors are missing; specific force at the accelerometer.
     rate_sd_radps, force_sd_mps2 : float
         White noise of a window, each axis.
-    rate_root_radps, force_root_mps2 : (s, WINDOWS, 3, 9) float
+    rate_response, force_response : (4, 3, 9) float
         Response to nine unit normals that stand for the triad's constant errors: of the gyros as their sheet states
-        bias, scale and mounting, of the accelerometer as the reconstruction left them.
+        bias, scale and mounting, of the accelerometer as the reconstruction left them. First the part that is always
+        there, then what is to be multiplied by the true x, y and z.
     clock_sd_s : (2,) float
         Of the gyros' and of the accelerometer's clock.
     accelerometer_m : (3,) float
@@ -63,8 +64,8 @@ class Observed:
     specific_force_mps2: FloatArray
     rate_sd_radps: float
     force_sd_mps2: float
-    rate_root_radps: FloatArray
-    force_root_mps2: FloatArray
+    rate_response: FloatArray
+    force_response: FloatArray
     clock_sd_s: FloatArray
     accelerometer_m: FloatArray
     first_bending_sd: FloatArray
@@ -126,17 +127,25 @@ def observe(flight: Flight, loaded: bool = False) -> Observed:
         windows(means.specific_force_sensor_mps2),
         float(rates.spec.noise_sd / np.sqrt(means.samples)),
         float(accelerometer.spec.noise_sd / np.sqrt(means.samples)),
-        rate_root(means.rate_radps, rates.spec).reshape(*shape, 3, 9),
-        bet.accelerometer_root[near][:, 3:].reshape(*shape, 3, 9),
+        _rate_response(rates.spec),
+        _affine(means.specific_force_sensor_mps2[whole], bet.accelerometer_root[near][whole, 3:]),
         np.array([rates.spec.time_bias_sd_s, accelerometer.spec.time_bias_sd_s]),
         accelerometer.spec.position_from_datum_body_m,
         LOADED_SD if loaded else REST_SD,
     )
 
 
-def rate_root(rate_radps: FloatArray, spec: TriadSpec) -> FloatArray:
-    """Response ``(n, 3, 9)`` of rates to unit normals of bias, scale and mounting."""
-    n = len(rate_radps)
-    bias = np.broadcast_to(spec.bias_sd * np.eye(3), (n, 3, 3))
-    scale = spec.scale_sd * rate_radps[:, :, None] * np.eye(3)
-    return np.concatenate([bias, scale, spec.mount_sd_rad * skew(rate_radps)], axis=2)
+def _rate_response(spec: TriadSpec) -> FloatArray:
+    """Response (4, 3, 9) to unit normals of bias, scale and mounting."""
+    out = np.zeros((4, 3, 9))
+    out[0, :, 0:3] = spec.bias_sd * np.eye(3)
+    out[1:, :, 3:6] = spec.scale_sd * np.einsum("kj,ij->kij", np.eye(3), np.eye(3))
+    out[1:, :, 6:9] = spec.mount_sd_rad * skew(np.eye(3))
+    return out
+
+
+def _affine(values: FloatArray, responses: FloatArray) -> FloatArray:
+    """Response (4, 3, 9) of which ``responses`` (n, 3, 9) to readings (n, 3) are made, without the readings' noise."""
+    ones = np.column_stack([np.ones(len(values)), values])
+    fitted, *_ = np.linalg.lstsq(ones, responses.reshape(len(values), -1), rcond=None)
+    return np.asarray(fitted.reshape(4, *responses.shape[1:]))

@@ -1,14 +1,13 @@
 """Posterior of the few unknowns that are sought, sampled by emcee, and its volume by dynesty.
 
-The other unknowns (some 1900: motion, air, instruments, masses) are put at their most probable for each candidate of
+The other unknowns (some 2700: motion, air, instruments, masses) are put at their most probable for each candidate of
 the few (a profile). To that end they follow the linear problem about the best fit and are then corrected by the
 gradient at the candidate with the derivatives of the best fit, which costs one flight of all spans a correction. The
 profile is taken at some two hundred candidates and interpolated between them by radial functions; the samplers see the
 interpolation. What that leaves out is told by `Posterior.refit_error`: candidates fitted anew with new derivatives.
 
-All standard deviations are widened for the samples as they are for the fit's covariance (`fit.UNMODELLED`); for the
-evidence they are not. A profile is no marginal: that the others' scatter differs from candidate to candidate is left
-out.
+The samples' stiffness is widened as it is in the fit's covariance (`fit.STIFFNESS_WIDER`); for the evidence it is not.
+A profile is no marginal: that the others' scatter differs from candidate to candidate is left out.
 
 References
 ----------
@@ -31,9 +30,10 @@ from scipy.interpolate import RBFInterpolator
 from flightmodel.checks import ConfigError, FloatArray
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.candidate import FREEPLAY_SD_RAD, HARDENING_SD, VehicleUnknowns
-from postflight.reconciliation.fit import UNMODELLED, Normal, Progress, Reconciled, step_from
+from postflight.reconciliation.fit import STIFFNESS_WIDER, Progress, Reconciled
 from postflight.reconciliation.laws import Explained
 from postflight.reconciliation.problem import Linear, Unknowns
+from postflight.reconciliation.steps import Normal, step_from
 
 SEED = 2009
 PER_UNKNOWN, REACH, CORRECTIONS = 32, 5.0, 3  # candidates; reach in sd of the linear problem
@@ -120,8 +120,10 @@ class Profile:
 
     def vehicles(self, z: FloatArray) -> FloatArray:
         """Vehicle's unknowns (n, v) of candidates (n, p), those carried along by the linear problem."""
-        steps = self._about[1][: len(self.found.problem.unknown.names)]
-        return np.asarray(self.found.unknowns.vehicle + z @ steps.T)
+        names = self.found.problem.unknown.names
+        away = z @ self._about[1][: len(names)].T
+        away[:, names.index("stiffness")] *= STIFFNESS_WIDER
+        return np.asarray(self.found.unknowns.vehicle + away)
 
     def at(self, z: FloatArray) -> tuple[float, Unknowns]:
         """Cost of a candidate and all its unknowns."""
@@ -145,8 +147,8 @@ class Profile:
         held = replace(problem, held=problem.unknown.names[: self.count])
         cost, u = self.at(z)
         for _ in range(REFIT_STEPS):
-            u, _, residuals, _ = step_from(held, u)
-            cost = min(cost, residuals.cost)
+            step = step_from(held, u)
+            u, cost = step.to, min(cost, step.residuals.cost)
         return cost
 
 
@@ -182,7 +184,7 @@ def sample(found: Reconciled, progress: Progress | None = None) -> Posterior:
     away *= REFIT_REACH / np.linalg.norm(away, axis=1)[:, None]
     refit_error = between(away) - [profile.refitted(z) - found.residuals.cost for z in away]
     report(0.9, "posterior: emcee")
-    chain, forgot = _walk(lambda z: log_probability(z) / UNMODELLED**2, p, rng)
+    chain, forgot = _walk(log_probability, p, rng)
     report(0.95, "posterior: dynesty")
     volume, volume_sd = _volume(log_probability, p)
     evidence = found.log_evidence + volume - 0.5 * p * np.log(2.0 * np.pi)

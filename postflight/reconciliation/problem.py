@@ -166,6 +166,11 @@ class Problem:
         return np.asarray(1.0 / (wider[:, None] * np.hypot(GUST * self.unsteady[:-1, None], STILL_SD)))
 
     @property
+    def log_weight(self) -> float:
+        """Sum of the logarithms of all weights."""
+        return float(np.log(self.weight[self.weight > 0.0]).sum() + np.log(self.join_weight).sum())
+
+    @property
     def _widened(self) -> FloatArray:
         return np.asarray(np.broadcast_to(self.wider, self.observed.spans))
 
@@ -203,20 +208,37 @@ class Problem:
         flights = Flights(spans, zero, u.motion, zero, [self.candidate(u.vehicle)], [self.air.table(u.air)])
         return fly_spans(self.observed, self.unknown.told, flights)
 
-    def instrument_rows(self, slope: FloatArray) -> FloatArray:
-        """Response of the windows to the instruments' unknowns, (s, WINDOWS, 6, 20)."""
+    def instrument_rows(self, read: Read) -> FloatArray:
+        """Response of the windows to the instruments' unknowns, (s, WINDOWS, 6, 20).
+
+        Scale and mounting work on what is flown, not on what was measured: on measured rates a gyro's scale would pay
+        for itself by scaling the noise.
+        """
         seen = self.observed
-        rows = np.zeros((*slope.shape, INSTRUMENTS))
-        rows[..., :3, 0:9], rows[..., 3:, 9:18] = seen.rate_root_radps, seen.force_root_mps2
+        rows = np.zeros((*read.windows.shape, INSTRUMENTS))
+        for axes, columns, response in (
+            (slice(0, 3), slice(0, 9), seen.rate_response),
+            (slice(3, 6), slice(9, 18), seen.force_response),
+        ):
+            rows[..., axes, columns] = response[0] + np.tensordot(read.windows[..., axes], response[1:], axes=1)
         # a late clock shows what was earlier
-        rows[..., :3, 18] = -seen.clock_sd_s[0] * slope[..., :3]
-        rows[..., 3:, 19] = -seen.clock_sd_s[1] * slope[..., 3:]
-        return np.nan_to_num(rows)
+        rows[..., :3, 18] = -seen.clock_sd_s[0] * read.slope[..., :3]
+        rows[..., 3:, 19] = -seen.clock_sd_s[1] * read.slope[..., 3:]
+        return rows
+
+    def shown(self, u: Unknowns, windows: FloatArray, slope: FloatArray) -> FloatArray:
+        """Changes (..., 6) of what the sensors show, by those of what is flown and of how fast that changes."""
+        seen = self.observed
+        gain = np.eye(6)
+        gain[:3, :3] += np.einsum("kij,j->ik", seen.rate_response[1:], u.instruments[0:9])
+        gain[3:, 3:] += np.einsum("kij,j->ik", seen.force_response[1:], u.instruments[9:18])
+        late = np.repeat(seen.clock_sd_s * u.instruments[18:20], 3)
+        return np.asarray(windows @ gain.T - late * slope)
 
     def residuals(self, u: Unknowns, read: Read | None = None) -> Residuals:
         """Where a span diverges the cost is infinite."""
         read = read or self.predicted(u)
-        told = self.instrument_rows(read.slope) @ u.instruments
+        told = self.instrument_rows(read) @ u.instruments
         sensors = (self.data - read.windows - told) * self.weight
         joins = (read.end[:-1] - u.motion[1:]) * self.join_weight
         with np.errstate(over="ignore", invalid="ignore"):  # a candidate that tumbles
@@ -231,12 +253,12 @@ class Problem:
         """Residuals' derivatives about ``u``."""
         flights, columns, steps = self._moves(u)
         moved, read = fly_spans(self.observed, self.unknown.told, flights), self.predicted(u)
-        found, rows = self.residuals(u, read), self.instrument_rows(read.slope)
-        late, at, sensors, joins = np.repeat(self.observed.clock_sd_s * u.instruments[18:20], 3), 0, [], []
+        found, rows = self.residuals(u, read), self.instrument_rows(read)
+        at, sensors, joins = 0, [], []
         for span, (column, step) in enumerate(zip(columns, steps, strict=True)):
             part = slice(at, at := at + len(column))
             step[self.held_columns] = np.inf  # no step moves what is held
-            change = moved.windows[part] - read.windows[span] - late * (moved.slope[part] - read.slope[span])
+            change = self.shown(u, moved.windows[part] - read.windows[span], moved.slope[part] - read.slope[span])
             sensed = change / step[:, None, None] * self.weight[span]
             told = (rows[span] * self.weight[span][..., None]).reshape(-1, INSTRUMENTS)
             both = np.concatenate([column, self.first_instrument + np.arange(INSTRUMENTS)])

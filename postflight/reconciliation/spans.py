@@ -78,8 +78,7 @@ class Read:
 
 def fly_spans(observed: Observed, told: Vehicle, flights: Flights) -> Read:
     """Fly spans and read the sensors."""
-    cg = np.array([c.vehicle.cg_m for c in flights.candidates])[flights.candidate]
-    starts = _start_states(observed, flights, cg)
+    starts = _start_states(observed, flights)
 
     def start_of(k: int) -> Start:
         return Start(starts[k], flights.candidates[flights.candidate[k]].parameters, flights.tables[flights.table[k]])
@@ -93,17 +92,23 @@ def fly_spans(observed: Observed, told: Vehicle, flights: Flights) -> Read:
     return Read(windows, slope, bent, _ends(observed, flights.span, states[:, -1]))
 
 
-def _start_states(observed: Observed, flights: Flights, cg: FloatArray) -> FloatArray:
-    """States (m, 20) as `synthetic_flight.simulate.state_from_ecef` lays them out."""
+def _start_states(observed: Observed, flights: Flights) -> FloatArray:
+    """States (m, 20) as `synthetic_flight.simulate.state_from_ecef` lays them out, of the bent vehicle's c.g."""
     at, span, motion = observed.start, flights.span, flights.motion
+    vehicles = [c.vehicle for c in flights.candidates]
+    cg = np.array([v.cg_m for v in vehicles])[flights.candidate]
+    # of the shell's c.g., from the joint; its share in the vehicle's
+    arm = np.array([v.aeroshell.cg_m - v.joint_m for v in vehicles])[flights.candidate]
+    share = np.array([v.aeroshell.mass_kg / v.mass_kg for v in vehicles])[flights.candidate, None]
     q = rotations.boxplus(at.q_ecef_body[span], motion[:, ATTITUDE])
-    omega = motion[:, RATE]
-    r = at.position_ecef_m[span] + rotations.rotate(q, cg)
-    v = at.velocity_ecef_mps[span] + rotations.rotate(q, np.cross(omega, cg))
-    to_eci = rotations.conjugate(earth.q_ecef_eci(at.time_s[span]))
-    bent = rotations.exp(motion[:, BENDING])
-    q_body = rotations.multiply(to_eci, q)
+    omega, bent = motion[:, RATE], rotations.exp(motion[:, BENDING])
     shell_rate = rotations.rotate(rotations.conjugate(bent), omega) + motion[:, BENDING_RATE]
+    place = cg + share * (rotations.rotate(bent, arm) - arm)
+    swing = np.cross(omega, cg) + share * (rotations.rotate(bent, np.cross(shell_rate, arm)) - np.cross(omega, arm))
+    r = at.position_ecef_m[span] + rotations.rotate(q, place)
+    v = at.velocity_ecef_mps[span] + rotations.rotate(q, swing)
+    to_eci = rotations.conjugate(earth.q_ecef_eci(at.time_s[span]))
+    q_body = rotations.multiply(to_eci, q)
     return np.column_stack(
         [
             rotations.rotate(to_eci, r),

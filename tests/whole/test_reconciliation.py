@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
+from flightmodel import rotations
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight.cli import cli
@@ -25,7 +26,8 @@ from postflight.reconciliation.laws import explain
 from postflight.reconciliation.observed import observe
 from postflight.reconciliation.posterior import posterior_summary, sample
 from postflight.reconciliation.problem import Problem, Unknowns
-from postflight.reconciliation.spans import ATTITUDE, BENDING, BENDING_RATE, RATE
+from postflight.reconciliation.spans import ATTITUDE, BENDING, BENDING_RATE, RATE, Candidate, Flights, fly_spans
+from synthetic_flight import packing
 from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed
 
@@ -111,6 +113,48 @@ def test_gradient_is_that_of_the_cost(problem):
         step[part] = sizes[name] * rng.standard_normal(part.stop - part.start)
         difference = problem.residuals(u.moved(step)).cost - problem.residuals(u.moved(-step)).cost
         assert right @ step == pytest.approx(-0.25 * difference, rel=2e-3), name
+
+
+def test_noise_says_nothing_of_a_scale(problem):
+    """A scale that worked on measured rates would pay for itself by scaling their noise."""
+    u, rng = problem.start(), np.random.default_rng(3)
+    read = problem.predicted(u)
+    noisy = replace(problem)
+    sd = np.divide(1.0, problem.weight, out=np.zeros_like(problem.weight), where=problem.weight > 0.0)
+    noisy.__dict__["data"] = read.windows + 30.0 * sd * rng.standard_normal(sd.shape)
+    matrix, right = noisy.normal(u, noisy.linear(u))
+    for number in (3, 4, 5, 12, 13, 14):  # scale of gyros; errors of the accelerometer that the trajectory left
+        k = problem.first_instrument + number
+        assert abs(right[k]) < 4.0 * 30.0 * np.sqrt(matrix[k, k])
+
+
+def test_spans_of_the_true_flight_join(problem, flown):
+    """Flown from the true motion with the true vehicle and air every span ends where the next begins, bent or not."""
+    _, truth, vehicle = flown
+    seen = problem.observed
+    at = [int(np.argmin(np.abs(truth.time_s - t))) for t in seen.start.time_s]
+    path, state = truth.trajectory, truth.state_eci[at]
+    place = replace(seen.start, position_ecef_m=path.position_ecef_m[at], velocity_ecef_mps=path.velocity_ecef_mps[at])
+    bent = rotations.multiply(rotations.conjugate(state[:, 6:10]), state[:, 10:14])
+    across = state[:, 17:20] - rotations.rotate(rotations.conjugate(bent), state[:, 14:17])
+    turned = rotations.boxminus(path.q_ecef_body[at], place.q_ecef_body)
+    motion = np.column_stack([turned, state[:, 14:17], rotations.log(bent), across])
+    spans = np.arange(seen.spans)
+    zero = np.zeros_like(spans)
+    true = Candidate(vehicle, packing.parameter_vector(vehicle))
+    flights = Flights(spans, zero, motion[:-1], zero, [true], [packing.atmosphere_table(truth.profile)])
+    read = fly_spans(replace(seen, start=place), vehicle, flights)
+    assert np.abs(motion[:, BENDING]).max() > 0.02
+    assert np.abs(read.end - motion[1:]).max() < np.deg2rad(2e-4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("step_m", "low", "high"), [(250.0, 0.0, 0.1), (50.0, 0.3, 1.0)])
+def test_the_flight_tells_how_fine_its_air_was(step_m, low, high, tmp_path_factory, monkeypatch):
+    """Synthetic air is straight between points; knots are 125 m apart."""
+    monkeypatch.setattr("synthetic_flight.day_air.STEP_M", step_m)
+    found = reconcile(reconstruct_telemetry(read_flight(fly(tmp_path_factory, 0.0)[0])))
+    assert low < found.problem.air.fine < high
 
 
 def test_an_unknown_joint_is_found(flown, monkeypatch):
