@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -42,6 +43,15 @@ MOVES = 1.75  # rms rate of the deflection against its sd; of noise alone it is 
 SMOOTH_RATE_HZ = 50.0
 
 Read = Callable[[Inputs, Deflection | None], list[Evidence]]
+
+
+class Method(Protocol):
+    """Reads the deflection from a pulse where a mask says, linear about a deflection; inputs' responses on demand."""
+
+    def __call__(
+        self, pulse: PulseData, use: BoolArray, about_yz_rad: FloatArray | None, *, with_inputs: bool = True
+    ) -> Evidence:
+        """Return what it reads."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +233,7 @@ def _started_clock(told: list[Evidence], method: str) -> Inputs:
 
 
 def pulse_reader(
-    pulse: PulseData, methods: dict[str, Callable[[PulseData, BoolArray, FloatArray | None], Evidence]],
+    pulse: PulseData, methods: dict[str, Method],
     others: list[Evidence],
 ) -> Read:  # fmt: skip
     """Return what `fuse` reads: methods that look at the pulse, and others whose readings are what they are.
@@ -240,8 +250,8 @@ def pulse_reader(
         at, moved, out = about(pulse.time_s[use]), corrected_pulse(smooth, use, inputs), []
         for method in methods.values():
             found = method(moved, use, at)
-            noise = method(pulse, use, at).theta_yz_rad - method(smooth, use, at).theta_yz_rad
-            out.append(replace(found, theta_yz_rad=found.theta_yz_rad + noise))
+            raw, even = (method(one, use, at, with_inputs=False).theta_yz_rad for one in (pulse, smooth))
+            out.append(replace(found, theta_yz_rad=found.theta_yz_rad + raw - even))
         return [*out, *(moved_evidence(other, inputs, about) for other in others)]
 
     return read

@@ -37,8 +37,8 @@ def bent():
     return size[:, None] * np.array([0.8, -0.6])
 
 
-def trim(pulse, use, about):
-    return trim_evidence(pulse, use=use, about_yz_rad=about)
+def trim(pulse, use, about_yz_rad, *, with_inputs=True):
+    return trim_evidence(pulse, use=use, about_yz_rad=about_yz_rad, with_inputs=with_inputs)
 
 
 METHODS = {"misalignment": misalignment_evidence, "trim": trim}
