@@ -85,12 +85,12 @@ class TrimModel:
         return -(c[..., 2] * self.length_m + c[..., 1] * self.x_cg_m) / c[..., 0]
 
 
-def imbalance(model: TrimModel, theta_yz_rad: FloatArray, direction: FloatArray, coefficients: FloatArray) -> FloatArray:
+def _imbalance(of: TrimModel, theta_yz_rad: FloatArray, direction: FloatArray, coefficients: FloatArray) -> FloatArray:
     """Offset that the vehicle has less the one it would trim at, lateral (n, 2), m: ``u / C_A`` in balance.
 
     ``direction`` (n, 2) is the unit vector of the shell's lateral flow, ``coefficients`` (n, 4) are those at its angle.
     """
-    return model.offset_yz_m + model.xbar_m * theta_yz_rad - direction * model.trimmed_offset(coefficients)[:, None]
+    return of.offset_yz_m + of.xbar_m * theta_yz_rad - direction * of.trimmed_offset(coefficients)[:, None]
 
 
 def trim_model(vehicle: Vehicle, joint_station_m: float | None = None) -> TrimModel:
@@ -196,17 +196,17 @@ def trim_evidence(
 
     step, still = STEP_RAD * np.eye(2), np.zeros(2)
     theta, direction, coefficients = on_shell(still, still)
-    base = imbalance(model, theta, direction, coefficients)
-    by_moment = np.linalg.inv(np.stack([imbalance(model, *on_shell(e, still)) - base for e in step], -1) / STEP_RAD)
+    base = _imbalance(model, theta, direction, coefficients)
+    by_moment = np.linalg.inv(np.stack([_imbalance(model, *on_shell(e, still)) - base for e in step], -1) / STEP_RAD)
     inputs: dict[str, FloatArray] = {}
     if with_inputs:
-        by_flow = -by_moment @ np.stack([imbalance(model, *on_shell(still, e)) - base for e in step], -1) / STEP_RAD
+        by_flow = -by_moment @ np.stack([_imbalance(model, *on_shell(still, e)) - base for e in step], -1) / STEP_RAD
         inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
 
     def excess(moved: dict[str, float]) -> FloatArray:
         of = trim_model(moved_vehicle(vehicle, moved), joint_station_m)
         shell, body = (moved_coefficients(vehicle, moved, c) for c in (coefficients, on_body))
-        return imbalance(of, theta, direction, shell) - (_moment_with(of, pulse, use, body) if dynamic else 0.0)
+        return _imbalance(of, theta, direction, shell) - (_moment_with(of, pulse, use, body) if dynamic else 0.0)
 
     for name in VEHICLE_INPUTS if with_inputs else ():
         up, down = (excess({name: size}) for size in (1.0, -1.0))
