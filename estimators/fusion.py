@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import lstsq
 from scipy.ndimage import uniform_filter1d
 
 from estimators.evidence import (
@@ -124,7 +125,7 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     span = _span(told)
     apart = [_apart(moved_evidence(e, inputs)) for e in told]
     problem = NormalEquations.of(apart, {}, span)
-    found, covariance = problem.solved(method)
+    found = problem.mean(method)
     for step in range(MOST_STEPS):
         told = [e for e in read(inputs, problem.deflection(found)) if e.method in methods]
         problem, before = NormalEquations.of(told, inputs, span), found
@@ -215,7 +216,7 @@ def _started_clock(told: list[Evidence], method: str) -> Inputs:
         return {}
     one, span = off[0], _span(own)
     problem = NormalEquations.of([_apart(e) for e in own], {}, span)
-    bent = problem.deflection(problem.solved(method)[0])
+    bent = problem.deflection(problem.mean(method))
     reach = FARTHEST_CLOCK_SD * one.clock_sd_s
     late_s = np.arange(-np.ceil(reach / CLOCK_STEP_S), np.ceil(reach / CLOCK_STEP_S) + 1.0) * CLOCK_STEP_S
     inside = (one.time_s > span[0] + reach) & (one.time_s < span[1] - reach) & np.isfinite(one.theta_yz_rad[:, 0])
@@ -261,12 +262,11 @@ def _smoothed(pulse: PulseData, use: BoolArray) -> PulseData:
     """Pulse whose force, rate and angular acceleration are what a spline with `KNOT_S` can follow."""
     t = pulse.time_s[use]
     value = Spline.over(float(t[0]), float(t[-1])).rows(t)
-    fit = value @ np.linalg.pinv(value)
     names = ("specific_force_body_mps2", "rate_body_radps", "angular_acceleration_body_radps2")
     moved = {}
     for name in names:
         moved[name] = getattr(pulse, name).copy()
-        moved[name][use] = fit @ moved[name][use]
+        moved[name][use] = value @ lstsq(value, moved[name][use], lapack_driver="gelsy")[0]
     return replace(pulse, **moved)
 
 
