@@ -46,7 +46,7 @@ SPAN_S = 2.0
 LEFT_OUT_RAD = np.deg2rad(0.05)  # of the methods' own equations, in each mean: up to 0.05 deg where the pulse ends
 HOLE = 2.5  # usual steps: through a wider one readings are not joined by lines
 SWING_STEP_S = 0.1
-# the sounding's errors hold waves that the fusion's air does not know: of sound flights 5 in 50 fail a pair at one per cent
+# a sounding's errors may hold waves that the fusion's air does not know: 5 of 50 sound flights fail a pair at 1 %
 CONFIDENCE = 0.999
 WIDER = 4.0
 LEAST_TOLD = 0.05  # part of a direction's variance that the readings must have taken away
