@@ -165,8 +165,6 @@ def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
     the initial offset, carried by the centerbody.
     """
     known = vehicle.uncertainty
-    factors = (("C_A", known.ca), ("C_N", known.cn), ("C_m", known.cm))
-    ca, cn, cm = (1.0 + moved.get(name, 0.0) * sd for name, sd in factors)
     masses = np.array([getattr(vehicle, name).mass_kg for name in BODIES])
     side = known.cg_lateral_m * np.hypot(*masses) / masses[1]
     bodies = {}
@@ -186,8 +184,20 @@ def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
                 "inertia_kgm2": tuple(map(tuple, inertia.tolist())),
             }
         )
-    aero = vehicle.aero.scaled(ca, cn, cm, cmq_shift=moved.get("C_mq", 0.0) * known.cmq)
-    return replace(vehicle, aero=aero, **bodies)
+    return replace(vehicle, aero=vehicle.aero.scaled(*_scaling(vehicle, moved)), **bodies)
+
+
+def moved_coefficients(vehicle: Vehicle, moved: dict[str, float], coefficients: FloatArray) -> FloatArray:
+    """Coefficients ``(..., 4)`` of the vehicle's table as `moved_vehicle` would have them."""
+    ca, cn, cm, cmq_shift = _scaling(vehicle, moved)
+    return coefficients * np.array([ca, cn, cm, 1.0]) + np.array([0.0, 0.0, 0.0, cmq_shift])
+
+
+def _scaling(vehicle: Vehicle, moved: dict[str, float]) -> tuple[float, float, float, float]:
+    """Factors on C_A, C_N, C_m and the shift of C_mq."""
+    known = vehicle.uncertainty
+    ca, cn, cm = (1.0 + moved.get(k, 0.0) * sd for k, sd in (("C_A", known.ca), ("C_N", known.cn), ("C_m", known.cm)))
+    return ca, cn, cm, moved.get("C_mq", 0.0) * known.cmq
 
 
 def evidence_of_history(history: DeflectionHistory, clock_sd_s: float = 0.0, plane_sd_rad: float = 0.0) -> Evidence:

@@ -16,8 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
+from scipy.linalg import lstsq
 from scipy.ndimage import uniform_filter1d
 
 from estimators.evidence import (
@@ -42,6 +44,15 @@ MOVES = 1.75  # rms rate of the deflection against its sd; of noise alone it is 
 SMOOTH_RATE_HZ = 50.0
 
 Read = Callable[[Inputs, Deflection | None], list[Evidence]]
+
+
+class Method(Protocol):
+    """Reads the deflection from a pulse where a mask says, linear about a deflection; inputs' responses on demand."""
+
+    def __call__(
+        self, pulse: PulseData, use: BoolArray, about_yz_rad: FloatArray | None, *, with_inputs: bool = True
+    ) -> Evidence:
+        """Return what it reads."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +125,7 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     span = _span(told)
     apart = [_apart(moved_evidence(e, inputs)) for e in told]
     problem = NormalEquations.of(apart, {}, span)
-    found, covariance = problem.solved(method)
+    found = problem.mean(method)
     for step in range(MOST_STEPS):
         told = [e for e in read(inputs, problem.deflection(found)) if e.method in methods]
         problem, before = NormalEquations.of(told, inputs, span), found
@@ -205,7 +216,7 @@ def _started_clock(told: list[Evidence], method: str) -> Inputs:
         return {}
     one, span = off[0], _span(own)
     problem = NormalEquations.of([_apart(e) for e in own], {}, span)
-    bent = problem.deflection(problem.solved(method)[0])
+    bent = problem.deflection(problem.mean(method))
     reach = FARTHEST_CLOCK_SD * one.clock_sd_s
     late_s = np.arange(-np.ceil(reach / CLOCK_STEP_S), np.ceil(reach / CLOCK_STEP_S) + 1.0) * CLOCK_STEP_S
     inside = (one.time_s > span[0] + reach) & (one.time_s < span[1] - reach) & np.isfinite(one.theta_yz_rad[:, 0])
@@ -223,7 +234,7 @@ def _started_clock(told: list[Evidence], method: str) -> Inputs:
 
 
 def pulse_reader(
-    pulse: PulseData, methods: dict[str, Callable[[PulseData, BoolArray, FloatArray | None], Evidence]],
+    pulse: PulseData, methods: dict[str, Method],
     others: list[Evidence],
 ) -> Read:  # fmt: skip
     """Return what `fuse` reads: methods that look at the pulse, and others whose readings are what they are.
@@ -240,8 +251,8 @@ def pulse_reader(
         at, moved, out = about(pulse.time_s[use]), corrected_pulse(smooth, use, inputs), []
         for method in methods.values():
             found = method(moved, use, at)
-            noise = method(pulse, use, at).theta_yz_rad - method(smooth, use, at).theta_yz_rad
-            out.append(replace(found, theta_yz_rad=found.theta_yz_rad + noise))
+            raw, even = (method(one, use, at, with_inputs=False).theta_yz_rad for one in (pulse, smooth))
+            out.append(replace(found, theta_yz_rad=found.theta_yz_rad + raw - even))
         return [*out, *(moved_evidence(other, inputs, about) for other in others)]
 
     return read
@@ -251,12 +262,11 @@ def _smoothed(pulse: PulseData, use: BoolArray) -> PulseData:
     """Pulse whose force, rate and angular acceleration are what a spline with `KNOT_S` can follow."""
     t = pulse.time_s[use]
     value = Spline.over(float(t[0]), float(t[-1])).rows(t)
-    fit = value @ np.linalg.pinv(value)
     names = ("specific_force_body_mps2", "rate_body_radps", "angular_acceleration_body_radps2")
     moved = {}
     for name in names:
         moved[name] = getattr(pulse, name).copy()
-        moved[name][use] = fit @ moved[name][use]
+        moved[name][use] = value @ lstsq(value, moved[name][use], lapack_driver="gelsy")[0]
     return replace(pulse, **moved)
 
 

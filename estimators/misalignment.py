@@ -22,7 +22,7 @@ from estimators.evidence import (
     Evidence,
     flow_inputs,
     history_of_evidence,
-    moved_vehicle,
+    moved_coefficients,
 )
 from estimators.pulse import MIN_AXIAL_MPS2, PulseData, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
@@ -102,20 +102,19 @@ def deflection_along_acceleration(
     return np.where(ax < 0.0, theta, np.nan)
 
 
-def predicted_tilt(aero: AeroTable, mach: FloatArray, theta_yz: FloatArray, flow_yz: FloatArray) -> FloatArray:
-    """Tilt of the force (n, 2), rad, on a shell bent by ``theta_yz`` (n, 2) in a flow."""
-    direction, alpha = lateral_and_size(flow_yz - theta_yz)
-    return theta_yz + direction * np.arctan(aero.ratio(mach, np.minimum(alpha, np.pi)))[:, None]
+def _pushed_tilt(theta_yz: FloatArray, direction: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Tilt of the force (n, 2), rad, on a shell bent by ``theta_yz`` (n, 2) that meets its flow from a direction."""
+    return theta_yz + direction * np.arctan(coefficients[:, 1] / coefficients[:, 0])[:, None]
 
 
 def misalignment_evidence(
-    pulse: PulseData, use: BoolArray | None = None, about_yz_rad: FloatArray | None = None
+    pulse: PulseData, use: BoolArray | None = None, about_yz_rad: FloatArray | None = None, with_inputs: bool = True
 ) -> Evidence:
     """Bending at every sample where the deceleration carries information, with its responses to what is uncertain.
 
     A joint that swings throws the shell's c.g. about, so the tilt of the measured force is that of the push less
     ``m_A r_A theta'' / (m a_x)``. Responses are taken, and the reading is linear, about a given deflection, else about
-    the reading itself.
+    the reading itself. Those to inputs can be left out.
     """
     use = pulse.informative if use is None else use
     force, flow, mach = pulse.specific_force_body_mps2[use], pulse.flow_yz_rad[use], pulse.mach[use]
@@ -123,18 +122,24 @@ def misalignment_evidence(
     tilt = force_tilt(force)
     about = solve_deflection(vehicle.aero, mach, tilt, flow) if about_yz_rad is None else about_yz_rad
 
-    def predict(d_theta: FloatArray, d_flow: FloatArray, aero: AeroTable = vehicle.aero) -> FloatArray:
-        return predicted_tilt(aero, mach, about + d_theta, flow + d_flow)
+    def on_shell(d_theta: FloatArray, d_flow: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        direction, alpha = lateral_and_size(flow + d_flow - about - d_theta)
+        return about + d_theta, direction, vehicle.aero.at(mach, np.minimum(alpha, np.pi))
 
-    base, step, still = predict(np.zeros(2), np.zeros(2)), STEP_RAD * np.eye(2), np.zeros(2)
-    by_tilt = np.linalg.inv(_columns(base, [predict(e, still) for e in step]) / STEP_RAD)
-    by_flow = -by_tilt @ _columns(base, [predict(still, e) for e in step]) / STEP_RAD
+    step, still = STEP_RAD * np.eye(2), np.zeros(2)
+    theta, direction, coefficients = on_shell(still, still)
+    base = _pushed_tilt(theta, direction, coefficients)
+    by_tilt = np.linalg.inv(_columns(base, [_pushed_tilt(*on_shell(e, still)) for e in step]) / STEP_RAD)
     by_force = by_tilt @ (_columns(tilt, [force_tilt(force + STEP_RAD * e) for e in np.eye(3)]) / STEP_RAD)
-    inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
-    inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + by_force @ pulse.force_root_mps2[use]
-    for name in ("C_A", "C_N"):
-        up, down = (predict(still, still, moved_vehicle(vehicle, {name: k}).aero) for k in (1.0, -1.0))
-        inputs[name] = -by_tilt @ (0.5 * (up - down))[:, :, None]
+    inputs: dict[str, FloatArray] = {}
+    if with_inputs:
+        by_flow = -by_tilt @ _columns(base, [_pushed_tilt(*on_shell(still, e)) for e in step]) / STEP_RAD
+        inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
+        inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + by_force @ pulse.force_root_mps2[use]
+        for name in ("C_A", "C_N"):
+            moved = (moved_coefficients(vehicle, {name: k}, coefficients) for k in (1.0, -1.0))
+            up, down = (_pushed_tilt(theta, direction, c) for c in moved)
+            inputs[name] = -by_tilt @ (0.5 * (up - down))[:, :, None]
     arm = (vehicle.joint_m[0] - vehicle.aeroshell.cg_m[0]) * vehicle.aeroshell.mass_kg / vehicle.mass_kg
     swing = -arm / -force[:, 0, None, None] * by_tilt
     noise = pulse.force_noise_sd_mps2**2 * by_force @ by_force.transpose(0, 2, 1)

@@ -10,18 +10,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
 
 from estimators.evidence import Deflection, Evidence
 from flightmodel.checks import DivergenceError, FloatArray
 
-KNOT_S = 0.2  # half a period of the joint at 2.5 Hz
-# of the joint, at each knot: 0.7 deg of swinging at 2.5 Hz, 10 deg at the slow aerodynamic mode's 0.65 Hz, so that it
-# is no reason to believe in other inputs
-ACCELERATION_SD_RADPS2 = 1.0
+KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its swinging
+# of the joint, at each knot; three of it are 1 deg of swinging at the joint's 2.85 Hz, 20 deg at the slow aerodynamic
+# mode's 0.65 Hz, so that swinging is no reason to believe in other inputs
+ACCELERATION_SD_RADPS2 = 2.0
 SIZE_SD_RAD = 1.0  # of the deflection itself: says nothing
-# what the methods' equations leave out, second order in the angles and gusts shorter than the wind's knots: up to this,
-# for about so long
-LEFT_OUT_RAD, LEFT_OUT_TIME_S = np.deg2rad(0.03), 1.0
+# what the methods' equations leave out, second order in the angles and gusts shorter than the wind's knots: with true
+# inputs 0.01 to 0.02 deg rms over the pulses of thirty flights, forgotten within half a second
+LEFT_OUT_RAD, LEFT_OUT_TIME_S = np.deg2rad(0.02), 0.4
 Inputs = dict[str, FloatArray]
 
 
@@ -96,11 +97,19 @@ class NormalEquations:
 
     def solved(self, method: str) -> tuple[FloatArray, FloatArray]:
         """Posterior mean and covariance of all unknowns."""
+        factor = self._factor(method)
+        upper = np.triu(dpotri(factor)[0])
+        return cho_solve((factor, False), self.right), upper + np.triu(upper, 1).T
+
+    def mean(self, method: str) -> FloatArray:
+        """Posterior mean of all unknowns."""
+        return np.asarray(cho_solve((self._factor(method), False), self.right))
+
+    def _factor(self, method: str) -> FloatArray:
         try:
-            covariance = cho_solve(cho_factor(self.normal), np.eye(len(self.right)))
+            return np.asarray(cho_factor(self.normal)[0])
         except np.linalg.LinAlgError:
             raise DivergenceError(f"{method}: the readings do not determine the deflection") from None
-        return covariance @ self.right, covariance
 
 
 def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inputs) -> tuple[FloatArray, FloatArray]:

@@ -26,6 +26,7 @@ from estimators.evidence import (
     Evidence,
     flow_inputs,
     history_of_evidence,
+    moved_coefficients,
     moved_vehicle,
     pressure_input,
 )
@@ -76,14 +77,20 @@ class TrimModel:
 
     def offset_for_angle(self, mach: FloatArray, alpha_rad: FloatArray) -> FloatArray:
         """Lateral c.g. offset, m, at which the shell trims at an angle (eq. [6] with no moment)."""
-        c = self.aero.at(mach, alpha_rad)
+        return self.trimmed_offset(self.aero.at(mach, alpha_rad))
+
+    def trimmed_offset(self, coefficients: FloatArray) -> FloatArray:
+        """Lateral c.g. offset, m, at which the shell trims with these coefficients ``(..., 4)``."""
+        c = coefficients
         return -(c[..., 2] * self.length_m + c[..., 1] * self.x_cg_m) / c[..., 0]
 
-    def imbalance(self, mach: FloatArray, theta_yz_rad: FloatArray, flow_yz_rad: FloatArray) -> FloatArray:
-        """Offset that the vehicle has less the one it would trim at, lateral (n, 2), m: ``u / C_A`` in balance."""
-        direction, alpha = lateral_and_size(flow_yz_rad - theta_yz_rad)
-        need = self.offset_for_angle(mach, np.minimum(alpha, np.pi))
-        return self.offset_yz_m + self.xbar_m * theta_yz_rad - direction * need[:, None]
+
+def _imbalance(of: TrimModel, theta_yz_rad: FloatArray, direction: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Offset that the vehicle has less the one it would trim at, lateral (n, 2), m: ``u / C_A`` in balance.
+
+    ``direction`` (n, 2) is the unit vector of the shell's lateral flow, ``coefficients`` (n, 4) are those at its angle.
+    """
+    return of.offset_yz_m + of.xbar_m * theta_yz_rad - direction * of.trimmed_offset(coefficients)[:, None]
 
 
 def trim_model(vehicle: Vehicle, joint_station_m: float | None = None) -> TrimModel:
@@ -136,18 +143,27 @@ def solve_trim(model: TrimModel, mach: FloatArray, flow_yz_rad: FloatArray, mome
 
 def moment_term(model: TrimModel, pulse: PulseData, use: BoolArray, dynamic: bool) -> FloatArray:
     """``u / C_A`` as lateral vectors ``(n, 2)``, m; zero in the static form."""
-    w, turn = pulse.rate_body_radps[use], pulse.angular_acceleration_body_radps2[use]
     if not dynamic:
-        return np.zeros((len(w), 2))
-    pressure, speed = pulse.dynamic_pressure_pa[use], pulse.airspeed_mps[use]
+        return np.zeros((int(use.sum()), 2))
+    return _moment_with(model, pulse, use, _at_centerbody(model, pulse, use))
+
+
+def _at_centerbody(model: TrimModel, pulse: PulseData, use: BoolArray) -> FloatArray:
+    """Coefficients ``(n, 4)`` at the centerbody's angle of attack."""
     alpha = np.minimum(np.linalg.norm(pulse.flow_yz_rad[use], axis=1), np.pi)
-    c = model.aero.at(pulse.mach[use], alpha)
+    return model.aero.at(pulse.mach[use], alpha)
+
+
+def _moment_with(model: TrimModel, pulse: PulseData, use: BoolArray, coefficients: FloatArray) -> FloatArray:
+    """``u / C_A`` as lateral vectors ``(n, 2)``, m, with these coefficients ``(n, 4)``."""
+    w, turn = pulse.rate_body_radps[use], pulse.angular_acceleration_body_radps2[use]
+    pressure, speed = pulse.dynamic_pressure_pa[use], pulse.airspeed_mps[use]
     moment = turn @ model.inertia_kgm2.T + np.cross(w, w @ model.inertia_kgm2.T)
     q_area = pressure * model.area_m2
-    damping = (q_area * model.length_m**2 * c[:, 3] / (2.0 * speed))[:, None] * w
+    damping = (q_area * model.length_m**2 * coefficients[:, 3] / (2.0 * speed))[:, None] * w
     transverse = (moment - damping)[:, 1:]
     # a lateral vector u has u x x_hat = (0, u_z, -u_y)
-    return np.column_stack([-transverse[:, 1], transverse[:, 0]]) / (q_area * c[:, 0])[:, None]
+    return np.column_stack([-transverse[:, 1], transverse[:, 0]]) / (q_area * coefficients[:, 0])[:, None]
 
 
 def trim_evidence(
@@ -156,44 +172,54 @@ def trim_evidence(
     dynamic: bool = True,
     use: BoolArray | None = None,
     about_yz_rad: FloatArray | None = None,
+    with_inputs: bool = True,
 ) -> Evidence:
     """Bending from the moment balance at every sample with enough deceleration, with its responses.
 
     The shell does not turn with the centerbody while the joint swings: the balance reads ``theta`` plus its share of
     ``(I_A + mu r_A (r_A - r_B)) theta''``, with ``mu`` the bodies' reduced mass. Responses are taken, and the reading
-    is linear, about a given deflection, else about the reading itself.
+    is linear, about a given deflection, else about the reading itself. Those to inputs can be left out.
     """
     use = pulse.informative if use is None else use
     vehicle = pulse.vehicle
     model = trim_model(vehicle, joint_station_m)
     mach, flow = pulse.mach[use], pulse.flow_yz_rad[use]
-    moment = moment_term(model, pulse, use, dynamic)
+    on_body = _at_centerbody(model, pulse, use)
+    moment = _moment_with(model, pulse, use, on_body) if dynamic else np.zeros((len(mach), 2))
     about = solve_trim(model, mach, flow, moment) if about_yz_rad is None else about_yz_rad
     known: BoolArray = np.asarray(np.isfinite(about).all(axis=1))
     about = np.where(known[:, None], about, flow)
 
-    def excess(d_theta: FloatArray, d_flow: FloatArray, moved: Vehicle | None = None) -> FloatArray:
-        of, u = model, moment
-        if moved is not None:
-            of = trim_model(moved, joint_station_m)
-            u = moment_term(of, pulse, use, dynamic)
-        return of.imbalance(mach, about + d_theta, flow + d_flow) - u
+    def on_shell(d_theta: FloatArray, d_flow: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        direction, alpha = lateral_and_size(flow + d_flow - about - d_theta)
+        return about + d_theta, direction, vehicle.aero.at(mach, np.minimum(alpha, np.pi))
 
-    base, step, still = excess(np.zeros(2), np.zeros(2)), STEP_RAD * np.eye(2), np.zeros(2)
-    by_moment = np.linalg.inv(np.stack([excess(e, still) - base for e in step], -1) / STEP_RAD)
-    by_flow = -by_moment @ np.stack([excess(still, e) - base for e in step], -1) / STEP_RAD
-    inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
-    for name in VEHICLE_INPUTS:
-        up, down = (excess(still, still, moved_vehicle(vehicle, {name: size})) for size in (1.0, -1.0))
+    step, still = STEP_RAD * np.eye(2), np.zeros(2)
+    theta, direction, coefficients = on_shell(still, still)
+    base = _imbalance(model, theta, direction, coefficients)
+    by_moment = np.linalg.inv(np.stack([_imbalance(model, *on_shell(e, still)) - base for e in step], -1) / STEP_RAD)
+    inputs: dict[str, FloatArray] = {}
+    if with_inputs:
+        by_flow = -by_moment @ np.stack([_imbalance(model, *on_shell(still, e)) - base for e in step], -1) / STEP_RAD
+        inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
+
+    def excess(moved: dict[str, float]) -> FloatArray:
+        of = trim_model(moved_vehicle(vehicle, moved), joint_station_m)
+        shell, body = (moved_coefficients(vehicle, moved, c) for c in (coefficients, on_body))
+        return _imbalance(of, theta, direction, shell) - (_moment_with(of, pulse, use, body) if dynamic else 0.0)
+
+    for name in VEHICLE_INPUTS if with_inputs else ():
+        up, down = (excess({name: size}) for size in (1.0, -1.0))
         inputs[name] = -by_moment @ (0.5 * (up - down))[:, :, None]
     noise, swing = np.zeros((len(mach), 2, 2)), np.zeros((len(mach), 2, 2))
     if dynamic:
-        inputs[PRESSURE] = -by_moment @ (moment[:, :, None] * pressure_input(pulse, use)[:, None, :])
+        if with_inputs:
+            inputs[PRESSURE] = -by_moment @ (moment[:, :, None] * pressure_input(pulse, use)[:, None, :])
         axial_n = pulse.dynamic_pressure_pa[use] * model.area_m2 * model.aero.at(mach, 0.0)[:, 0]
         turn = pulse.angular_acceleration_sd_radps2 * model.inertia_kgm2[1, 1] / axial_n
         noise = (turn**2)[:, None, None] * by_moment @ by_moment.transpose(0, 2, 1)
         swing = by_moment * (shell_inertia(vehicle) / axial_n)[:, None, None]
-    read = about - (by_moment @ base[:, :, None])[:, :, 0]
+    read = about - (by_moment @ (base - moment)[:, :, None])[:, :, 0]
     return Evidence("trim", pulse.time_s[use], np.where(known[:, None], read, np.nan), swing, inputs, noise, AVERAGED_S)
 
 

@@ -99,8 +99,10 @@ def fuse_flight(
     if not pulse.through_pulse.any():
         raise GateError("fused: the deceleration carries no information at any time")
 
-    def trim(at: PulseData, use: BoolArray, about: FloatArray | None) -> Evidence:
-        return trim_evidence(at, joint_station_m, use=use, about_yz_rad=about)
+    def trim(
+        pulse: PulseData, use: BoolArray, about_yz_rad: FloatArray | None, *, with_inputs: bool = True
+    ) -> Evidence:
+        return trim_evidence(pulse, joint_station_m, use=use, about_yz_rad=about_yz_rad, with_inputs=with_inputs)
 
     def reader(clock_sd_s: float) -> Read:
         seen = [] if camera is None else [evidence_of_history(camera, clock_sd_s, CAMERA_PLANE_SD_RAD)]

@@ -37,8 +37,8 @@ def bent():
     return size[:, None] * np.array([0.8, -0.6])
 
 
-def trim(pulse, use, about):
-    return trim_evidence(pulse, use=use, about_yz_rad=about)
+def trim(pulse, use, about_yz_rad, *, with_inputs=True):
+    return trim_evidence(pulse, use=use, about_yz_rad=about_yz_rad, with_inputs=with_inputs)
 
 
 METHODS = {"misalignment": misalignment_evidence, "trim": trim}
@@ -109,6 +109,22 @@ def test_linear_readings_err_as_the_posterior_says(monkeypatch):
         squares.append(d @ np.linalg.solve(got.history.lateral_cov[k], d))
     low, high = chi2.ppf([0.005, 0.995], 80) / 40
     assert low < np.mean(squares) < high
+
+
+def test_a_ringing_joint_is_no_scale_error():
+    """Swings at the stiffest joint's 2.85 Hz are followed, and not taken for a scale factor, known to 0.3 %."""
+    w = 2.0 * np.pi * 2.85
+    theta = bent() + (np.deg2rad(0.3) * np.sin(w * (TIME_S - 430.0)))[:, None] * np.array([0.8, -0.6])
+    second = -(w**2) * (theta - bent()) + np.gradient(np.gradient(bent(), TIME_S, axis=0), TIME_S, axis=0)
+    swing = np.tile(1e-3 * np.eye(2), (N, 1, 1))
+    read = theta + 1e-3 * second
+    scale = {"scale": 0.003 * read[:, :, None]}
+    one = Evidence("a", TIME_S, read, swing, scale, np.tile((2e-4) ** 2 * np.eye(2), (N, 1, 1)), 0.1)
+    got = fuse(linear_reader([one]))
+    assert abs(got.inputs["scale"][0][0]) < 0.5
+    inner = slice(10, -10)
+    at = np.searchsorted(TIME_S, got.history.time_s[inner])
+    np.testing.assert_allclose(got.history.theta_yz_rad[inner], theta[at], atol=np.deg2rad(0.06))
 
 
 def test_ideal_data_give_the_deflection_back():
