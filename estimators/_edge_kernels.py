@@ -184,8 +184,9 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
 def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
     """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
 
-    A profile is the mean of three lines a pixel apart; the dip under the line between its ends has its centroid where
-    the mark is. ``sd`` is infinite where no dip stands out of the noise, or where it is cut off by the window.
+    A profile is the mean of three lines a pixel apart; the dip under the line between its ends, as a share of that
+    line, has its centroid where the mark is. ``sd`` is infinite where no dip stands out of the noise, or where it is
+    cut off by the window.
     """
     m = 2 * reach + 1
     dip = np.empty(m)
@@ -213,13 +214,17 @@ def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
             if depth < max(5.0 * noise, 6.0) or deepest < 2 or deepest > m - 3:
                 sd[i] = np.inf
                 break
-            total, moment = 0.0, 0.0
-            reach_in = half_widths[i]
+            # paint takes away a share of the light, whatever the light's slope across the mark
+            slope = (right - left) / (m - 1.0)
+            total, moment, reach_in = 0.0, 0.0, half_widths[i]
             for k in range(m):
-                if abs(k - deepest) <= reach_in:
-                    weight = max(dip[k] - 0.15 * depth, 0.0)
-                    total += weight
-                    moment += weight * (k - reach)
+                above = dip[k] - 0.15 * depth
+                if above > 0.0 and abs(k - deepest) <= reach_in:
+                    share = above / (left + slope * k)
+                    total += share
+                    moment += share * (k - reach)
             centre += moment / total
-            sd[i] = noise * reach_in / total * math.sqrt(2.0 * reach_in)
+            # of the mean of three lines, over the squares of 1, 2, ... on either side
+            squares = reach_in * (reach_in + 1.0) * (2.0 * reach_in + 1.0) / 3.0
+            sd[i] = noise / (left + slope * deepest) * math.sqrt(squares / 3.0) / total
         offset[i] = centre
