@@ -1,16 +1,16 @@
 """Errors of the virtual camera over many films, and how often its standard deviations cover them.
 
-    python benchmarks/video_coverage.py [clean | unbent | degraded | flown] [flights]
+    python benchmarks/video_coverage.py [KIND] [flights] [first seed]
 
 Every flight has a camera, a light and bendings of its own; its benchmark frame is bent by 0.12 deg an axis that nobody
-is told. ``clean``: a lens known to a data sheet's tolerances. ``unbent``: the same with a benchmark frame that is truly
-not bent, which shows what pictures alone leave. ``degraded``: a lens nobody calibrated, the Earth behind
-the rim, interlace, noise, compression, a shell out of shape (tests/estimators/test_degraded_video.py).
+is told. Kinds: ``clean``: a lens known to a data sheet's tolerances. ``unbent``: the same with a benchmark that is
+truly not bent, which shows what pictures alone leave. ``degraded``: a lens nobody calibrated, the Earth behind the rim,
+interlace, noise, compression, a shell out of shape (tests/estimators/test_degraded_video.py).
 
 Nothing moved the shell in these. ``flown``: films, a frame a second from 421 to 448 s, of the dispersed flights of
-``estimator_coverage.py`` (kept in its folder, or flown now), as clean. Scored is the frame nearest to
-peak pressure, with the benchmark taken as not bent, and with its bending told by the
-joint's moment.
+``estimator_coverage.py`` (kept in its folder, or flown now), as clean. ``flown-degraded``: as degraded, out of shape in
+proportion to the pressure, moving between two fields as it flew. Scored is the frame nearest to peak pressure, with the
+benchmark taken as not bent, and with its bending told by the joint's moment.
 """
 
 from __future__ import annotations
@@ -30,11 +30,14 @@ import estimator_coverage as dispersed
 
 from estimators.benchmark_bending import benchmark_bending
 from estimators.camera_deflection import read_film
+from estimators.pulse import PulseData
 from flightmodel.checks import GateError
+from flightmodel.deflection import lv_direction
 from synthetic_flight.video import Imaging, Scene, film
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, sun
-from tests.estimators.test_degraded_video import TIMES, UNCALIBRATED, degraded
+from tests.estimators.test_degraded_video import BAD, TIMES, UNCALIBRATED, degraded
 
+FLOWN = {"flown": Imaging(), "flown-degraded": BAD}
 FLOWN_S = np.arange(421.0, 448.01, 1.0)
 
 
@@ -67,31 +70,44 @@ def one_flight(job: tuple[str, int]) -> tuple[int, list[tuple[float, ...]], str]
     return seed, rows, ""
 
 
-def flown_scene(seed: int, rng: np.random.Generator) -> Scene:
-    """What a kept flight's camera sees; the light at a random side, and it turns with the roll."""
-    pulse, truth = dispersed.kept_flight(dispersed.KEPT, seed)
-    t, yz = pulse.time_s, truth["theta_yz"]
-    seen = dispersed.columns(FLOWN_S, t, yz)
-    moving = dispersed.columns(FLOWN_S, t, np.gradient(yz, t, axis=0))
+def flown_scene(pulse: PulseData, bent: np.ndarray, rng: np.random.Generator, kind: str) -> Scene:
+    """What a kept flight's camera sees; light and Earth at random sides, and they turn with the roll."""
+    t = pulse.time_s
+    seen = dispersed.columns(FLOWN_S, t, bent)
+    moving = dispersed.columns(FLOWN_S, t, np.gradient(bent, t, axis=0))
     roll = np.interp(FLOWN_S, t, np.concatenate([[0.0], np.cumsum(np.diff(t) * pulse.rate_body_radps[1:, 0])]))
     first, from_aft = rng.uniform(0.0, 360.0), rng.uniform(50.0, 70.0)
     light = np.stack([sun(first + np.rad2deg(turn), from_aft) for turn in roll])
     theta, plane = np.hypot(*seen.T), np.arctan2(seen[:, 1], -seen[:, 0])
-    return Scene(theta, plane, light, bending_rate_yz_radps=moving)
+    load = np.interp(FLOWN_S, t, pulse.dynamic_pressure_pa / pulse.dynamic_pressure_pa.max())
+    nadir, altitude = None, None
+    if kind == "flown-degraded":
+        lean, side = D(20.0), rng.uniform(0.0, 2.0 * np.pi)
+        nadir = np.array([np.cos(lean), 0.0, 0.0]) + np.sin(lean) * np.stack([lv_direction(side + r) for r in roll])
+        altitude = np.interp(FLOWN_S, t, pulse.altitude_m)
+    return Scene(theta, plane, light, nadir, altitude, load, moving)
 
 
-def one_flown(seed: int) -> tuple[int, list[tuple[float, ...]], str]:
+def flown_film(seed: int, kind: str) -> tuple[list[np.ndarray], Scene]:
+    """Frames of a kept flight and what there was to see."""
+    pulse, truth = dispersed.kept_flight(dispersed.KEPT, seed)
+    rng = np.random.default_rng([seed, 11, 2009])
+    scene = flown_scene(pulse, truth["theta_yz"], rng, kind)
+    return list(film(GEOMETRY, MOUNT, JOINT_M, scene, rng, FLOWN[kind])), scene
+
+
+def one_flown(job: tuple[str, int]) -> tuple[int, list[tuple[float, ...]], str]:
     """Errors and sd at the frame nearest to peak pressure, benchmark not bent and told; then the benchmark's own."""
+    kind, seed = job
     cv2.setNumThreads(1)
     pulse, truth = dispersed.kept_flight(dispersed.KEPT, seed)
     if str(truth["words"]):
         return seed, [], str(truth["words"])
-    rng = np.random.default_rng([seed, 11, 2009])
-    scene = flown_scene(seed, rng)
-    frames = list(film(GEOMETRY, MOUNT, JOINT_M, scene, rng, Imaging()))
+    frames, scene = flown_film(seed, kind)
+    mount = UNCALIBRATED if kind == "flown-degraded" else MOUNT
     k = int(np.argmin(np.abs(FLOWN_S - truth["peak"])))
     try:
-        read = read_film(FLOWN_S, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None)
+        read = read_film(FLOWN_S, frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None)
         told = benchmark_bending(read.against_benchmark(), pulse, read.oriented.held.benchmark_rad)
     except GateError as fault:
         return seed, [], str(fault)
@@ -114,18 +130,19 @@ def report(name: str, table: np.ndarray) -> None:
           f"2 sd {cover[1]:.0f} %")  # fmt: skip
 
 
-def main_flown(flights: int) -> None:
+def main_flown(kind: str, flights: int, first: int) -> None:
     """Film kept flights, estimate, count."""
-    dispersed.fly_missing(dispersed.KEPT, range(flights))
+    seeds = range(first, first + flights)
+    dispersed.fly_missing(dispersed.KEPT, seeds)
     found = []
     with ProcessPoolExecutor(2) as pool:
-        jobs = pool.map(one_flown, range(flights))
-        for seed, rows, refused in track(jobs, total=flights, description="flown"):
+        jobs = pool.map(one_flown, [(kind, seed) for seed in seeds])
+        for seed, rows, refused in track(jobs, total=flights, description=kind):
             if refused or not np.isfinite(rows[0]).all():
                 print(f"flight {seed}: {refused or 'the frame was refused'}")
             else:
                 found.append(rows)
-    print(f"flown: {len(found)} films")
+    print(f"{kind}: {len(found)} films")
     own = np.array([rows[2] for rows in found])
     print(f"  benchmark: bent by {np.sqrt(np.mean(own[:, :2] ** 2)):.3f} deg rms an axis")
     report("benchmark, an axis", own[:, 2:].reshape(-1, 2, 2).transpose(0, 2, 1).reshape(-1, 2))
@@ -139,12 +156,13 @@ def main() -> None:
     """Fly, estimate, count."""
     kind = sys.argv[1] if len(sys.argv) > 1 else "clean"
     flights = int(sys.argv[2]) if len(sys.argv) > 2 else 100
-    if kind == "flown":
-        main_flown(flights)
+    first = int(sys.argv[3]) if len(sys.argv) > 3 else 0
+    if kind in FLOWN:
+        main_flown(kind, flights, first)
         return
     rows: list[tuple[float, ...]] = []
     with ProcessPoolExecutor(2) as pool:
-        jobs = pool.map(one_flight, [(kind, 5000 + k) for k in range(flights)])
+        jobs = pool.map(one_flight, [(kind, 5000 + first + k) for k in range(flights)])
         for seed, answers, refused in track(jobs, total=flights, description=kind):
             if refused or not np.isfinite(answers).all():
                 print(f"flight {seed}: {refused or 'a frame was refused'}")

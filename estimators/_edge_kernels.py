@@ -10,18 +10,32 @@ from flightmodel._kernels import inlined, kernel
 
 
 @inlined
-def grey_at(image, u, v):
-    """Grey level between pixels, bilinear; the border's beyond the picture."""
-    h, w = image.shape
-    u, v = min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001)
+def grey_inside(image, u, v):
+    """As `grey_at`, for places that are known to lie in the picture."""
     j, i = int(u), int(v)
     a, b = u - j, v - i
     upper = (1.0 - a) * image[i, j] + a * image[i, j + 1]
     return (1.0 - b) * upper + b * ((1.0 - a) * image[i + 1, j] + a * image[i + 1, j + 1])
 
 
+@inlined
+def grey_at(image, u, v):
+    """Grey level between pixels, bilinear; the border's beyond the picture."""
+    h, w = image.shape
+    return grey_inside(image, min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001))
+
+
 @kernel
-def sample_lines(image, origin, inward, first, step, corner, size, per_unit, grey, inside):
+def levels(image, rows, columns, count):
+    """Count grey levels (256,) of every so manieth row and column."""
+    count[:] = 0
+    for i in range(0, image.shape[0], rows):
+        for j in range(0, image.shape[1], columns):
+            count[image[i, j]] += 1
+
+
+@kernel
+def sample_lines(image, origin, inward, first, step, corner, size, grey, inside):
     """Grey levels ``(n, m)`` along lines, of a piece of the picture whose upper left pixel is ``corner``."""
     n, m = grey.shape
     for i in range(n):
@@ -29,7 +43,7 @@ def sample_lines(image, origin, inward, first, step, corner, size, per_unit, gre
             along = first + k * step
             u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
             inside[i, k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
-            grey[i, k] = per_unit * grey_at(image, u - corner[0], v - corner[1])
+            grey[i, k] = grey_at(image, u - corner[0], v - corner[1])
 
 
 @inlined
@@ -70,7 +84,7 @@ def first_rises(grey, inside, level, first, noise, common, limits, step, places,
     """
     n, m = grey.shape
     span, lasting, contrast = limits
-    half_bases = bases.shape[1] // 2
+    half_bases = bases.shape[2] // 2
     few = np.empty(8)
     explained = np.empty(len(places))
     for i in range(n):
@@ -106,10 +120,10 @@ def first_rises(grey, inside, level, first, noise, common, limits, step, places,
         slope = max(grey[i, crossing] - grey[i, crossing - 1], 1e-3)
         for b in range(len(places)):
             step_share, ramp_share = 0.0, 0.0
-            for k in range(bases.shape[1]):
+            for k in range(bases.shape[2]):
                 value = grey[i, min(max(crossing + k - half_bases, 0), m - 1)] - level[i]
-                step_share += value * bases[b, k, 0]
-                ramp_share += value * bases[b, k, 1]
+                step_share += value * bases[b, 0, k]
+                ramp_share += value * bases[b, 1, k]
             explained[b] = step_share * step_share + ramp_share * ramp_share
         best = min(max(int(np.argmax(explained)), 1), len(places) - 2)
         curve = max(2.0 * explained[best] - explained[best - 1] - explained[best + 1], 1e-9)
@@ -125,7 +139,7 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
     """Place of the step, up or down, on short lines across an expected edge; see `estimators.horizon`."""
     n, m = grey.shape
     level_of = 6
-    few, explained = np.empty(level_of), np.empty(len(places))
+    few, value, explained = np.empty(level_of), np.empty(m), np.empty(len(places))
     for i in range(n):
         good[i] = False
         whole = True
@@ -138,24 +152,24 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
         level = median_of(few, level_of)
         total = 0.0
         for k in range(m):
-            total += (grey[i, k] - level) ** 2
+            value[k] = grey[i, k] - level
+            total += value[k] ** 2
         for b in range(len(places)):
             step_share, ramp_share = 0.0, 0.0
             for k in range(m):
-                value = grey[i, k] - level
-                step_share += value * bases[b, k, 0]
-                ramp_share += value * bases[b, k, 1]
+                step_share += value[k] * bases[b, 0, k]
+                ramp_share += value[k] * bases[b, 1, k]
             explained[b] = step_share * step_share + ramp_share * ramp_share
         best = int(np.argmax(explained))
         if best == 0 or best == len(places) - 1:
             continue
         curve = max(2.0 * explained[best] - explained[best - 1] - explained[best + 1], 1e-9)
         shift = min(max(0.5 * (explained[best + 1] - explained[best - 1]) / curve, -1.0), 1.0)
-        # the first column of a basis is the step's: its share over the shell's length is the step
+        # the first row of a basis is the step's: its share over the shell's length is the step
         behind, count = 0.0, 0
         for k in range(m):
-            if bases[best, k, 0] > 0.5 * bases[best, m - 1, 0]:
-                behind += grey[i, k] - level
+            if bases[best, 0, k] > 0.5 * bases[best, 0, m - 1]:
+                behind += value[k]
                 count += 1
         height = abs(behind / max(count, 1))
         left_over = math.sqrt(max(total - explained[best], 0.0) / m)
@@ -170,8 +184,9 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
 def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
     """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
 
-    A profile is the mean of three lines a pixel apart; the dip under the line between its ends has its centroid where
-    the mark is. ``sd`` is infinite where no dip stands out of the noise, or where it is cut off by the window.
+    A profile is the mean of three lines a pixel apart; the dip under the line between its ends, as a share of that
+    line, has its centroid where the mark is. ``sd`` is infinite where no dip stands out of the noise, or where it is
+    cut off by the window.
     """
     m = 2 * reach + 1
     dip = np.empty(m)
@@ -187,7 +202,8 @@ def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
                 break
             for k in range(m):
                 u, v = u0 + (k - reach) * du, v0 + (k - reach) * dv
-                dip[k] = (grey_at(image, u, v) + grey_at(image, u - dv, v + du) + grey_at(image, u + dv, v - du)) / 3.0
+                beside = grey_inside(image, u - dv, v + du) + grey_inside(image, u + dv, v - du)
+                dip[k] = (grey_inside(image, u, v) + beside) / 3.0
             left, right = 0.5 * (dip[0] + dip[1]), 0.5 * (dip[m - 1] + dip[m - 2])
             deepest = 0
             for k in range(m):
@@ -198,13 +214,17 @@ def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
             if depth < max(5.0 * noise, 6.0) or deepest < 2 or deepest > m - 3:
                 sd[i] = np.inf
                 break
-            total, moment = 0.0, 0.0
-            reach_in = half_widths[i]
+            # paint takes away a share of the light, whatever the light's slope across the mark
+            slope = (right - left) / (m - 1.0)
+            total, moment, reach_in = 0.0, 0.0, half_widths[i]
             for k in range(m):
-                if abs(k - deepest) <= reach_in:
-                    weight = max(dip[k] - 0.15 * depth, 0.0)
-                    total += weight
-                    moment += weight * (k - reach)
+                above = dip[k] - 0.15 * depth
+                if above > 0.0 and abs(k - deepest) <= reach_in:
+                    share = above / (left + slope * k)
+                    total += share
+                    moment += share * (k - reach)
             centre += moment / total
-            sd[i] = noise * reach_in / total * math.sqrt(2.0 * reach_in)
+            # of the mean of three lines, over the squares of 1, 2, ... on either side
+            squares = reach_in * (reach_in + 1.0) * (2.0 * reach_in + 1.0) / 3.0
+            sd[i] = noise / (left + slope * deepest) * math.sqrt(squares / 3.0) / total
         offset[i] = centre

@@ -166,10 +166,11 @@ def fit_frame(bending, basis, shell, lens, edge, marks, prior, limits, residual,
     for taken in range(steps):
         turn(bending[0], bending[1], rotation, left)
         bend = (rotation, left, joint, bending[2], ring[0], ring[1])
-        count = project_edge(bending, clocks, circle, ring, joint, lens, bend, points, pixels, jacobian, kept)
-        if count < 2:
-            return TOO_FEW, taken
-        against_edge(found, light, edge_left, pixels, jacobian, kept, count, residual, rows, shape, at)
+        if m > 0:
+            count = project_edge(bending, clocks, circle, ring, joint, lens, bend, points, pixels, jacobian, kept)
+            if count < 2:
+                return TOO_FEW, taken
+            against_edge(found, light, edge_left, pixels, jacobian, kept, count, residual, rows, shape, at)
         against_marks(
             spots, across, place, mark_left, bend, lens, gross, m, spot_pixels, spot_jacobian, residual, rows, shape
         )

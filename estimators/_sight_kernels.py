@@ -14,6 +14,7 @@ from flightmodel._kernels import inlined, kernel
 
 FISHEYE, PINHOLE = 0, 1
 COLUMNS = 16
+SPARSE = 10
 
 
 @inlined
@@ -154,8 +155,13 @@ def feet(found, vertex, jacobian, residual, rows, at):
     n = len(vertex)
     for i in range(len(found)):
         u, v = found[i]
+        # an edge is smooth: the closest of every so manieth vertex has the closest of all next to it
         nearest, least = 0, 1e300
-        for j in range(n):
+        for j in range(0, n, SPARSE):
+            square = (vertex[j, 0] - u) ** 2 + (vertex[j, 1] - v) ** 2
+            if square < least:
+                nearest, least = j, square
+        for j in range(max(nearest - SPARSE, 0), min(nearest + SPARSE + 1, n)):
             square = (vertex[j, 0] - u) ** 2 + (vertex[j, 1] - v) ** 2
             if square < least:
                 nearest, least = j, square

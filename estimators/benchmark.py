@@ -24,6 +24,7 @@ from estimators.seen import Image, Seen, edge_seen, found_marks, huber_gain, joi
 from estimators.virtual_camera import BENDING, FLATTENING, VirtualCamera
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import FloatArray, GateError
+from flightmodel.deflection import rotation_vector_body_shell
 from flightmodel.vehicle import CameraMount, CameraUncertainty, ShellGeometry
 
 STEPS = 10
@@ -103,6 +104,15 @@ def orient_camera(
     return oriented
 
 
+def with_bent_benchmark(oriented: OrientedCamera, theta_rad: float, plane_lv_rad: float) -> OrientedCamera:
+    """Camera as it was built in if the shell was bent by so much in the benchmark frame, to first order.
+
+    The fit took the shell as not bent there, and turned the camera instead.
+    """
+    bending = rotation_vector_body_shell(np.array(theta_rad), np.array(plane_lv_rad))[1:]
+    return replace(oriented, view=_posed(oriented.view, -oriented.posed_per_bending @ bending))
+
+
 def _fitted(
     nominal: VirtualCamera, benchmark: Image, prior: FloatArray, held: HeldFixed, pose: FloatArray,
     reaches_px: tuple[int, ...],
@@ -124,7 +134,8 @@ def _fitted(
         raise GateError(
             f"benchmark frame: the edge is not the shell's (rms {rms:.1f} px); choose another benchmark time"
         )
-    look = _look(_posed(nominal, pose), marks, benchmark, reaches_px[-1])
+    # where a mark was painted is left over in every frame: other frames are weighed by how well it was found
+    look = _look(_posed(nominal, pose), marks, benchmark, reaches_px[-1], painted_m=0.0)
     per_bending = gain[:POSES] @ seen.rows[:, BENDING]
     return OrientedCamera(
         look.view, look.clocks_rad, look.lines, marks, held, look.horizon, look.seen, pose[:8], formal[:POSES, :POSES],
@@ -172,7 +183,9 @@ def _posed(nominal: VirtualCamera, pose: FloatArray) -> VirtualCamera:
     return replace(nominal, camera=moved.turned(pose[:3], 1.0 + pose[3]))
 
 
-def _look(view: VirtualCamera, marks: Marks, image: Image, reach_px: int) -> _Look:
+def _look(
+    view: VirtualCamera, marks: Marks, image: Image, reach_px: int, painted_m: float = PAINTED_M
+) -> _Look:  # fmt: skip
     """Find the edge and, with a reach, the marks around where they are expected."""
     at_rest = np.zeros(3)
     clocks = view.edge_clocks()
@@ -189,6 +202,6 @@ def _look(view: VirtualCamera, marks: Marks, image: Image, reach_px: int) -> _Lo
         # where a mark was painted is known to millimetres
         at = marks.points_shell_m[painted.index - len(clocks)]
         away = np.linalg.norm(at - view.camera.position_body_m, axis=1)
-        painted = replace(painted, sd_px=np.hypot(painted.sd_px, PAINTED_M * view.camera.focal_px.mean() / away))
+        painted = replace(painted, sd_px=np.hypot(painted.sd_px, painted_m * view.camera.focal_px.mean() / away))
         seen = joined(seen, painted)
     return _Look(view, lines, horizon, seen.some(np.isfinite(seen.residual_px)), clocks)

@@ -37,7 +37,7 @@ NEAR_PX = 8.0
 LEAST_CONTRAST = 8.0
 LEAST_SHARE = 0.4
 SD_FLOOR_PX = 0.05
-GREY_UNIT = 1.0 / 16.0
+SMOOTHING = cv2.getGaussianKernel(7, SMOOTHING_PX, cv2.CV_32F)
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,14 @@ def fault_of_frame(image: Image, size_px: tuple[int, int]) -> str:
         return f"not an 8-bit grey image (shape {image.shape}, {image.dtype})"
     if image.shape != (size_px[1], size_px[0]):
         return f"size {image.shape[1]} x {image.shape[0]} where the camera has {size_px[0]} x {size_px[1]}"
-    below = np.cumsum(np.bincount(image[::8, ::4].ravel(), minlength=256))
+    count = np.empty(256, dtype=np.int64)
+    _edge_kernels.levels(image, 8, 4, count)
+    below = np.cumsum(count)
     low, high = (float(np.searchsorted(below, share * below[-1], side="right")) for share in (0.05, 0.95))
     if high < 2.0 * LEAST_CONTRAST:
         return f"too dark: 95 % of the pixels are below grey level {high:.0f}"
-    if low > 250.0 or np.mean(image[::4, ::4] >= 254) > 0.5:
+    _edge_kernels.levels(image, 4, 4, count)
+    if low > 250.0 or count[254:].sum() > 0.5 * count.sum():
         return "saturated: more than half of the pixels are at full scale"
     return ""
 
@@ -197,29 +200,29 @@ def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, Bo
     h, w = image.shape
     ends = np.concatenate([lines.origin_px - lines.outer_px * lines.inward_px,
                            lines.origin_px + lines.inner_px * lines.inward_px])  # fmt: skip
-    # only the band that the lines cross is smoothed, in sixteenths of a grey level
+    # only the band that the lines cross is smoothed
     low = np.clip(np.floor(ends.min(axis=0)).astype(int) - 4, 0, [w - 4, h - 4])
     high = np.clip(np.ceil(ends.max(axis=0)).astype(int) + 5, low + 4, [w, h])
-    band = np.multiply(image[low[1] : high[1], low[0] : high[0]], np.uint16(1 / GREY_UNIT), dtype=np.uint16)
-    smooth = cv2.GaussianBlur(band, (0, 0), SMOOTHING_PX)
+    band = image[low[1] : high[1], low[0] : high[0]]
+    smooth = cv2.sepFilter2D(band, cv2.CV_32F, SMOOTHING, SMOOTHING)
     n = len(lines.origin_px)
     grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
     size, corner = np.array([w, h], dtype=float), low.astype(float)
     _edge_kernels.sample_lines(
-        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, size, GREY_UNIT, grey, inside
+        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, size, grey, inside
     )
     return grey, inside
 
 
 def _edge_bases(places: FloatArray, along: FloatArray) -> FloatArray:
-    """Orthonormal bases ``(places, samples, 2)`` of a blurred step and a blurred ramp for each place."""
+    """Orthonormal bases ``(places, 2, samples)`` of a blurred step and a blurred ramp for each place."""
     bases = []
     for place in places:
         z = (along - place) / WHOLE_BLUR_PX
         step = ndtr(z)
         ramp = z * step + np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
         basis = np.linalg.qr(np.column_stack([step, ramp]))[0]
-        bases.append(basis * np.sign(basis[-1, 0]))
+        bases.append((basis * np.sign(basis[-1, 0])).T)
     return np.ascontiguousarray(bases)
 
 

@@ -130,14 +130,16 @@ def _seen(view: VirtualCamera, points: FloatArray, normals: FloatArray) -> BoolA
     towards = eye - points
     distance = np.linalg.norm(towards, axis=1)
     facing = np.einsum("ni,ni->n", normals, towards) / distance > LEAST_FACING
+    seen = inside & facing
     share = np.linspace(0.04, 0.97, 80)[:, None, None]
-    way = points + share * towards
+    way = points[seen] + share * towards[seen]
     station, radius = torus_circles(view.geometry)
     s, r = -way[..., 0], np.hypot(way[..., 1], way[..., 2])
-    clear = np.ones(len(points), dtype=np.bool_)
+    clear = np.ones(int(seen.sum()), dtype=np.bool_)
     for s_i, r_i in zip(station, radius, strict=True):
         clear &= (np.hypot(s - s_i, r - r_i) > view.geometry.torus_minor_radius_m).all(axis=0)
     # the lens may sit on the skin itself
     skin = min(view.geometry.centerbody_radius_m, float(np.hypot(eye[1], eye[2])) - 1e-3)
     clear &= (r > skin).all(axis=0)
-    return np.asarray(inside & facing & clear)
+    seen[seen] = clear
+    return np.asarray(seen)

@@ -291,6 +291,11 @@ class Telemetry:
             )
         return self.vehicle
 
+    @property
+    def can_tell_moment(self) -> bool:
+        """Whether there are a vehicle and inertial sensors, which measure the moment in the joint."""
+        return self.vehicle is not None and self.accelerometer is not None and self.rates is not None
+
     def required_triads(self) -> tuple[TriadRecord, TriadRecord]:
         """Return accelerometer and rates, or raise `GateError` where flight.toml names none."""
         if self.accelerometer is None or self.rates is None:

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from estimators.calibration import calibrate_lens, read_corners
 from flightmodel.camera import Lens
-from flightmodel.checks import ConfigError, FloatArray, GateError
+from flightmodel.checks import ConfigError, DivergenceError, FloatArray, GateError
 from flightmodel.deflection import lv_clock
 from flightmodel.flightfolder import read_flight
 from postflight import drawing, figures, results, scoring, warmup
@@ -267,19 +267,27 @@ def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> N
 def deflection(
     folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None, film: bool = False
 ) -> None:
-    """Estimate the deflection alone; the camera needs no trajectory."""
+    """Estimate the deflection alone; the camera needs no trajectory, and is told more where one can be made."""
     telemetry = read_flight(folder)
     if not methods:
         methods = tuple(m for m in METHODS if m != "camera" or telemetry.frames is not None)
     plane_rad = None if plane_deg is None else float(np.deg2rad(plane_deg))
     settings = {"methods": list(methods), "plane_deg": plane_deg, "joint_m": joint_m}
-    needs_bet = set(methods) != {"camera"}
-    if needs_bet:
+    alone = set(methods) == {"camera"}
+    makes_bet = not alone or (plane_rad is None and telemetry.can_tell_moment)
+    if makes_bet:
         compile_kernels(*warmup.RECONSTRUCTION)
     if "camera" in methods:
         compile_kernels("camera")
     with progress_bar() as report:
-        flight = reconstruct_telemetry(telemetry, None, lambda f, what: report(0.6 * f, what)) if needs_bet else None
+        flight, trouble = None, ""
+        try:
+            if makes_bet:
+                flight = reconstruct_telemetry(telemetry, None, lambda f, what: report(0.6 * f, what))
+        except (GateError, DivergenceError) as fault:
+            if not alone:
+                raise
+            trouble = str(fault)
         tell: Report = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
         answers = estimate(flight, telemetry, methods, tell, plane_rad, joint_m)
         with results.RunFolder(folder, telemetry, settings) as out:
@@ -289,9 +297,13 @@ def deflection(
                 drawing.draw_camera(telemetry, history, out.path / "figures", joint_m)
                 if film:
                     write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", joint_m, report)
+    if trouble:
+        console.print(f"[yellow]no trajectory[/], the camera answers alone: {escape(trouble)}")
     # without a trajectory the camera's own largest deflection is what can be named
     peak_s = flight.peak_s if flight else largest_s(answers)
     print_answers(answers, peak_s, " (peak q)" if flight else " (its largest; no trajectory was made)")
+    if "camera" in answers.histories:
+        console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
     console.print(f"results in {escape(str(out.path))}")
     if answers.refused:
         sys.exit(EXIT_NO_ANSWER)

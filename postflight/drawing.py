@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from estimators.benchmark import orient_camera
+from estimators.benchmark import orient_camera, with_bent_benchmark
 from estimators.camera_fit import OrientedCamera
 from estimators.figures import figure_camera_overlay, figure_fusion, figure_static_trim, figure_told_apart
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row
@@ -22,6 +22,8 @@ from postflight import figures
 from postflight.pipeline import Answers, Flight
 from postflight.preflight import Bounds, rigid_bounds
 from postflight.product import figures as product_figures
+
+UNBENT_RAD = 1e-4  # less than a fit resolves: the benchmark frame where it was taken as not bent
 
 Report = Callable[[float, str], None]
 
@@ -84,32 +86,41 @@ def draw_sensitivity(flight: Flight, table: pd.DataFrame, folder: Path) -> None:
         figures.save(product_figures.figure_sensitivity(flight, table), folder / "sensitivity.png")
 
 
-def oriented_camera(telemetry: Telemetry, joint_m: float | None = None) -> tuple[OrientedCamera, int]:
-    """Camera oriented on the benchmark frame, and that frame's index."""
+def oriented_camera(
+    telemetry: Telemetry, history: DeflectionHistory, joint_m: float | None = None
+) -> tuple[OrientedCamera, int]:
+    """Camera oriented on the benchmark frame, the shell there as bent as the history says, and that frame's index."""
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
     benchmark = frames.benchmark
     station = vehicle.joint.station_m if joint_m is None else joint_m
-    return orient_camera(frames.picture(benchmark), vehicle.geometry, frames.camera, station), benchmark
+    oriented = orient_camera(frames.picture(benchmark), vehicle.geometry, frames.camera, station)
+    return with_bent_benchmark(oriented, *bending_at(history, float(frames.time_s[benchmark]))), benchmark
+
+
+def bending_at(history: DeflectionHistory, time_s: float) -> tuple[float, float]:
+    """Angle and plane, rad, in the frame of that time; not bent where it has no answer or less than a fit resolves."""
+    k = int(np.argmin(np.abs(history.time_s - time_s)))
+    theta, plane = float(history.theta_rad[k]), float(history.plane_lv_rad[k])
+    return (theta, plane) if abs(theta) > UNBENT_RAD and abs(history.time_s[k] - time_s) < 1e-3 else (0.0, 0.0)
 
 
 def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, joint_m: float | None = None) -> None:
     """Benchmark frame and frame of the largest deflection with the virtual camera over them (Figure 2.3)."""
     frames = telemetry.frames
     assert frames is not None
-    oriented, benchmark = oriented_camera(telemetry, joint_m)
+    oriented, benchmark = oriented_camera(telemetry, history, joint_m)
     meshes = telemetry.required_vehicle().meshes
     largest = int(np.nanargmax(np.abs(history.theta_rad)))
     pick = [benchmark, largest]
     pictures = [frames.picture(k) for k in pick]
-    theta = [0.0, float(history.theta_rad[largest])]
-    figure = figure_camera_overlay(
-        oriented, pictures, list(frames.time_s[pick]), theta, list(history.plane_lv_rad[pick]), meshes
-    )
+    times = [float(t) for t in frames.time_s[pick]]
+    theta, plane = zip(*(bending_at(history, t) for t in times), strict=True)
+    figure = figure_camera_overlay(oriented, pictures, times, theta, plane, meshes)
     figures.stamp(figure, telemetry)
     figures.save(figure, folder / "figure_2_3.png")
     overlay = Overlay(oriented.view, meshes)
-    picture = overlay.side_by_side(pictures[1], theta[1], float(history.plane_lv_rad[largest]))
+    picture = overlay.side_by_side(pictures[1], theta[1], plane[1])
     (folder / "overlay.png").write_bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
@@ -121,14 +132,13 @@ def summary_figure(
         return figures.figure_summary(flight, answers, truth)
     history, video = answers.histories["camera"], flight.telemetry.frames
     assert video is not None
-    oriented, benchmark = oriented_camera(flight.telemetry)
+    oriented, benchmark = oriented_camera(flight.telemetry, history)
     largest = int(np.nanargmax(history.theta_rad))
-    plane = float(history.plane_lv_rad[largest])
-    shown = ((benchmark, 0.0), (largest, float(history.theta_rad[largest])))
+    shown = [(k, *bending_at(history, float(video.time_s[k]))) for k in (benchmark, largest)]
     overlay = Overlay(oriented.view, flight.telemetry.required_vehicle().meshes)
-    pictures = [overlay.blended(video.picture(k), theta, plane) for k, theta in shown]
+    pictures = [overlay.blended(video.picture(k), theta, plane) for k, theta, plane in shown]
     # the benchmark's horizon in both, so that the eye sees how far the edge moved; its own in the second
-    rows = [horizon_row(oriented.view, theta, plane) for _, theta in shown]
+    rows = [horizon_row(oriented.view, theta, plane) for _, theta, plane in shown]
     for picture, row, colour in (
         (pictures[0], rows[0], YELLOW),
         (pictures[1], rows[0], GREY),

@@ -7,12 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from estimators.benchmark import orient_camera
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row, write_words
 from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import film_frames
 from flightmodel.telemetry import Telemetry
+from postflight.drawing import bending_at, oriented_camera
 from postflight.pipeline import Progress
 
 
@@ -30,10 +30,9 @@ def write_overlay_film(
     """
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
-    station = vehicle.joint.station_m if joint_m is None else joint_m
-    oriented = orient_camera(frames.picture(frames.benchmark), vehicle.geometry, frames.camera, station)
+    oriented, benchmark = oriented_camera(telemetry, history, joint_m)
     overlay = Overlay(oriented.view, vehicle.meshes)
-    at_rest = horizon_row(oriented.view, 0.0, 0.0)
+    before = horizon_row(oriented.view, *bending_at(history, float(frames.time_s[benchmark])))
     partial = path.with_suffix(".part.webm")
     rate = 1.0 / float(np.median(np.diff(frames.time_s))) if len(frames.time_s) > 1 else 1.0
     size = (frames.camera.width_px, frames.camera.height_px)
@@ -53,7 +52,7 @@ def write_overlay_film(
                 write_words(picture, [said + "not used"])
             else:
                 picture = overlay.blended(image, theta, plane)
-                draw_row(picture, at_rest, GREY)
+                draw_row(picture, before, GREY)
                 draw_row(picture, horizon_row(oriented.view, theta, plane), YELLOW)
                 sd = float(np.rad2deg(history.theta_sd_rad[k]))
                 bent = f"{np.rad2deg(theta):5.2f} +/- {sd:.2f} deg   plane {np.rad2deg(plane):4.0f} deg LV"

@@ -215,6 +215,7 @@ def told_by_the_joint(film: ReadFilm, flight: Flight | None, telemetry: Telemetr
     """
     try:
         if flight is None:
+            telemetry.required_triads()
             raise GateError("no trajectory was made")
         clock_sd_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
         frames = film.against_benchmark(clock_sd_s)

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row
+from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Image
-from postflight.drawing import oriented_camera
+from postflight.drawing import bending_at, oriented_camera
 from postflight.report.source import Run
 
 FRAMES, WIDTH_PX, DASH_PX = 12, 480, 12
@@ -28,11 +29,11 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
     answered = np.searchsorted(frames.time_s, table["t_s"] - 1e-6)
     largest = int(answered[int(table["theta_deg"].argmax())])
     picks = np.linspace(answered[0], answered[-1], FRAMES).round().astype(int).tolist()
-    oriented, benchmark = oriented_camera(run.telemetry)
-    overlay, at_rest = (
-        Overlay(oriented.view, run.telemetry.required_vehicle().meshes),
-        horizon_row(oriented.view, 0.0, 0.0),
-    )
+    time_s, theta_deg, plane_deg = (table[name].to_numpy() for name in ("t_s", "theta_deg", "plane_lv_deg"))
+    history = DeflectionHistory(time_s, np.deg2rad(theta_deg), np.deg2rad(plane_deg), None, "camera", "")
+    oriented, benchmark = oriented_camera(run.telemetry, history)
+    overlay = Overlay(oriented.view, run.telemetry.required_vehicle().meshes)
+    before = horizon_row(oriented.view, *bending_at(history, float(frames.time_s[benchmark])))
     chosen = sorted({*_without_near(picks, (benchmark, largest)), benchmark, largest})
     rows = dict(zip(answered.tolist(), table.itertuples(index=False), strict=True))
     out: list[dict[str, Any]] = []
@@ -45,7 +46,7 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
         if k in rows:
             theta, plane = np.deg2rad([rows[k].theta_deg, rows[k].plane_lv_deg])
             picture = overlay.blended(image, float(theta), float(plane))
-            picture = dashed_row(picture, at_rest)
+            picture = dashed_row(picture, before)
             draw_row(picture, horizon_row(oriented.view, float(theta), float(plane)), YELLOW)
             said |= {"theta": round(rows[k].theta_deg, 3), "sd": round(rows[k].theta_sd_deg, 3)}
         else:
