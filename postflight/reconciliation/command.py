@@ -154,6 +154,7 @@ def summary(found: Reconciled, table: pd.DataFrame, odds: dict[str, float]) -> d
         "steps": found.steps,
         "sensor_residual_rms_sd": found.sensor_rms_sd,
         "join_rms_sd": float(np.sqrt(np.mean(found.residuals.joins**2))),
+        "share_of_fine_air": found.problem.air.fine,
         "joint": table.to_dict(orient="records"),
         "log_odds": odds,
     }

@@ -6,7 +6,7 @@ gradient at the candidate with the derivatives of the best fit, which costs one 
 profile is taken at some two hundred candidates and interpolated between them by radial functions; the samplers see the
 interpolation. What that leaves out is told by `Posterior.refit_error`: candidates fitted anew with new derivatives.
 
-The samples' stiffness is widened as it is in the fit's covariance (`fit.STIFFNESS_WIDER`); for the evidence it is not.
+The samples are widened as the fit's covariance is (`fit.WIDER_SD`); for the evidence they are not.
 A profile is no marginal: that the others' scatter differs from candidate to candidate is left out.
 
 References
@@ -30,7 +30,7 @@ from scipy.interpolate import RBFInterpolator
 from flightmodel.checks import ConfigError, FloatArray
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.candidate import FREEPLAY_SD_RAD, HARDENING_SD, VehicleUnknowns
-from postflight.reconciliation.fit import STIFFNESS_WIDER, Progress, Reconciled
+from postflight.reconciliation.fit import Progress, Reconciled
 from postflight.reconciliation.laws import Explained
 from postflight.reconciliation.problem import Linear, Unknowns
 from postflight.reconciliation.steps import Normal, step_from
@@ -121,8 +121,7 @@ class Profile:
     def vehicles(self, z: FloatArray) -> FloatArray:
         """Vehicle's unknowns (n, v) of candidates (n, p), those carried along by the linear problem."""
         names = self.found.problem.unknown.names
-        away = z @ self._about[1][: len(names)].T
-        away[:, names.index("stiffness")] *= STIFFNESS_WIDER
+        away = z @ self._about[1][: len(names)].T * self.found.wider[: len(names)]
         return np.asarray(self.found.unknowns.vehicle + away)
 
     def at(self, z: FloatArray) -> tuple[float, Unknowns]:

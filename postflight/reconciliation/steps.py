@@ -42,10 +42,11 @@ class Normal:
 
     def damped(self, damping: float) -> Callable[[FloatArray], FloatArray]:
         """Solver of the equations with a share of the diagonal added."""
-        scaled = self.matrix * self.scale[:, None] * self.scale
+        scale = self.scale  # and not self, which would hold itself through its own solver
+        scaled = self.matrix * scale[:, None] * scale
         scaled[np.diag_indices_from(scaled)] += damping
         factor = cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)
-        return lambda right: np.asarray((cho_solve(factor, (right.T * self.scale).T).T * self.scale).T)
+        return lambda right: np.asarray((cho_solve(factor, (right.T * scale).T).T * scale).T)
 
     @cached_property
     def solve(self) -> Callable[[FloatArray], FloatArray]:

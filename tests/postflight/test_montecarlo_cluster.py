@@ -1,8 +1,13 @@
 """The same bytes from a Dask cluster of three worker processes, also when one of them is killed."""
 
 import os
+import re
 import signal
+import subprocess
+import sys
+from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from flightmodel.checks import ConfigError
@@ -11,6 +16,7 @@ from postflight.montecarlo.chunks import chunk_from_rows
 from postflight.montecarlo.merge import merge, write_merged
 from postflight.montecarlo.running import Wanted
 from postflight.montecarlo.study import read_study
+from tests.documents import ROOT
 
 from .short_flights import write_short
 from .test_montecarlo import content, fly, quiet
@@ -77,3 +83,60 @@ def test_a_chunk_can_travel(path):
     _, chunk = pickle.loads(pickle.dumps(execution.fly_chunk(study, (0, [0, 1]))))
     again = chunk_from_rows(execution.fly_runs(study.plan, [0, 1], study.draws_of), study.plan.scalars)
     assert chunk.scalars.tobytes() == again.scalars.tobytes()
+
+
+# a queue that has room: what is submitted is copied and runs at once, in a session of its own
+SUBMIT = """#!/bin/sh
+for script; do :; done
+cp "$script" {folder}/job.sh
+setsid bash {folder}/job.sh >/dev/null 2>&1 &
+echo "{answer}"
+echo $! > {folder}/job
+"""
+CANCEL = """#!/bin/sh
+kill -- -$(cat {folder}/job)
+"""
+QUEUES = {"PBS": ("qsub", "qdel", "17.queue"), "SLURM": ("sbatch", "scancel", "Submitted batch job 17")}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", QUEUES)
+def test_the_pages_script_for_a_queue_runs(kind: str, tmp_path: Path) -> None:
+    """The script of docs/monte-carlo.md with fewer workers and flights, under a queue's own commands."""
+    pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is not installed: postflight[cluster]")
+    page = (ROOT / "docs" / "monte-carlo.md").read_text()
+    script = re.search(r"```python\n(# montecarlo_pbs\.py.*?)```", page, re.DOTALL)[1]
+    if kind == "SLURM":
+        slurm = re.search(r"# Slurm: (SLURMCluster\(.*\))\n", script)[1]
+        script = re.sub(r"PBSCluster\(.*?\n    \)\n", f"{slurm}\n", script, flags=re.DOTALL)
+        script = script.replace("import PBSCluster", "import SLURMCluster")
+    for many, few in (
+        ("cores=32", "cores=2"),
+        ("processes=32", "processes=2"),
+        ("32GB", "4GB"),
+        ("jobs=8", "jobs=1"),
+        ("1000000", "192"),
+    ):
+        assert many in script
+        script = script.replace(many, few)
+    (tmp_path / "script.py").write_text(script)
+    submit, cancel, answer = QUEUES[kind]
+    for name, text in ((submit, SUBMIT), (cancel, CANCEL)):
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / name).write_text(text.format(answer=answer, folder=tmp_path))
+        (tmp_path / "bin" / name).chmod(0o755)
+    path = os.pathsep.join([str(tmp_path / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]])
+    done = subprocess.run(
+        [sys.executable, "script.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PATH": path},
+        timeout=300,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "job").exists()
+    flown = pd.read_csv(tmp_path / "study" / "flights.csv")
+    assert len(flown) == 192
+    assert flown.reason.isna().all()
