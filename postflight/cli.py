@@ -247,10 +247,11 @@ def main() -> None:
         cli.main(standalone_mode=False)
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
-    except click.exceptions.Abort:
-        click.echo("interrupted; nothing half-written is left", err=True)
-        sys.exit(EXIT_INTERRUPTED)
-    except KeyboardInterrupt:
+    except (click.exceptions.Abort, KeyboardInterrupt, RuntimeError) as fault:
+        # before Python 3.12 a Ctrl-C while a class is made (libraries being imported) comes wrapped
+        known = isinstance(fault, click.exceptions.Abort | KeyboardInterrupt)
+        if not known and not isinstance(fault.__cause__, KeyboardInterrupt):
+            raise
         click.echo("interrupted; nothing half-written is left", err=True)
         sys.exit(EXIT_INTERRUPTED)
     except click.ClickException as fault:

@@ -467,5 +467,7 @@ def test_sensitivity_to_plane_and_joint_has_the_shape_of_the_paper_s_table(run_f
     assert list(table.columns) == [153, 183, 200]
     # the nose is 0.20 m further from the camera than the torus joint, of 1.4 m: 6 % of lever for a bending in the
     # plane; of the edge's tilt, which a fit in another plane also weighs, the lever is the rim's radius and no other
-    np.testing.assert_allclose(table.iloc[0], table.iloc[1], rtol=0.10)
+    np.testing.assert_allclose(table.iloc[0, 1:], table.iloc[1, 1:], rtol=0.08)
+    # 153 deg is 36 deg off the plane flown: marks and edge want different angles there, and weigh by the lever
+    np.testing.assert_allclose(table.iloc[0, 0], table.iloc[1, 0], rtol=0.15)
     assert (np.diff(table.to_numpy(), axis=1) > 0).all()
