@@ -12,10 +12,15 @@ import numpy as np
 
 from flightmodel._kernels import OMEGA_WGS84, WGS84, geodetic, gravitation, inlined
 
+# a filter that gropes may ask for a drag that stops the vehicle within a step: such a step is taken in parts. What drag
+# does falls with the speed it takes, so their number grows as the logarithm of the drag
+MOST_CHANGE = 0.2  # of the velocity in a part: the transition's second order then errs by 1e-2 of itself
+MOST_PARTS = 64  # backwards in time drag grows without bound
+
 
 @inlined
 def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
-    """Acceleration against the rotating Earth, m/s^2, and height, m."""
+    """Acceleration against the rotating Earth, m/s^2, and the rate 1/s at which the air changes the velocity."""
     sin_lat, cos_lat, height, per_p = geodetic(x, y, z, WGS84)
     at = (height - air.from_m) / air.step_m
     row = int(min(max(at, 0.0), len(air.table) - 2.0))
@@ -32,17 +37,19 @@ def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     speed = math.sqrt(ux * ux + uy * uy + uz * uz) + 1e-9
     # a filter that gropes may ask for any drag; e^8 is a parachute on a needle
     k = 0.5 * density * air.drag_m2pkg * math.exp(min(max(e0, -8.0), 8.0)) * speed
-    # across the flow: level, and in the vertical plane
-    ax, ay, az = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
+    # across the flow: across the path's plane, and in it
+    m = 1.0 / speed
+    px, py, pz = air.across[0], air.across[1], air.across[2]
+    along = m * m * (px * ux + py * uy + pz * uz)
+    ax, ay, az = px - along * ux, py - along * uy, pz - along * uz
     n = 1.0 / (math.sqrt(ax * ax + ay * ay + az * az) + 1e-9)
     ax, ay, az = ax * n, ay * n, az * n
-    m = 1.0 / speed
     bx, by, bz = m * (uy * az - uz * ay), m * (uz * ax - ux * az), m * (ux * ay - uy * ax)
     gx, gy, gz = gravitation(x, y, z, WGS84)
     w2, two = OMEGA_WGS84 * OMEGA_WGS84, 2.0 * OMEGA_WGS84
     fx = k * (speed * (e1 * ax + e2 * bx) - ux) + gx + w2 * x + two * vy
     fy = k * (speed * (e1 * ay + e2 * by) - uy) + gy + w2 * y - two * vx
-    return fx, fy, k * (speed * (e1 * az + e2 * bz) - uz) + gz, height
+    return fx, fy, k * (speed * (e1 * az + e2 * bz) - uz) + gz, k * math.sqrt(1.0 + e1 * e1 + e2 * e2)
 
 
 @inlined
@@ -115,6 +122,47 @@ def ballistic_transition(partials, dt, full):
 
 
 @inlined
+def followed(air, point, rest):
+    """Part of a step ``rest`` in which the air changes the velocity by no more than `MOST_CHANGE`."""
+    s = point
+    a = ballistic_acceleration(
+        air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11]
+    )  # fmt: skip
+    change = a[3] * abs(rest)
+    return rest if change <= MOST_CHANGE else rest * MOST_CHANGE / change
+
+
+@inlined
+def accumulate(full, density, dt, phi, noise, old):
+    """Transition ``phi`` (9, 15) and ``noise`` (9, 9) of all steps so far; ``old`` (6, 15) is scratch."""
+    for i in range(6):
+        for j in range(15):
+            old[i, j] = phi[i, j]
+    for i in range(6):
+        for j in range(15):
+            value = full[i, j - 3] if j >= 9 else 0.0
+            for m in range(6):
+                value += full[i, m] * old[m, j]
+            phi[i, j] = value
+    for i in range(6):
+        for j in range(6):
+            old[i, j] = 0.0
+            for m in range(6):
+                old[i, j] += full[i, m] * noise[m, j]
+    for i in range(6):
+        for j in range(6):
+            noise[i, j] = 0.0
+            for m in range(6):
+                noise[i, j] += old[i, m] * full[j, m]
+    for i in range(3):
+        q = density[i] * abs(dt)
+        noise[i, i] += q * dt * dt / 3.0
+        noise[i, 3 + i] += 0.5 * q * dt
+        noise[3 + i, i] += 0.5 * q * dt
+        noise[3 + i, 3 + i] += q
+
+
+@inlined
 def propagate_ballistic(motion, air, first, last, errors, position, velocity, phi, noise):
     """Carry a state in place between grid points, with ``phi`` (9, 15) and ``noise`` (9, 9) from identity and zero."""
     point, stage, slope, mid = np.empty(12), np.empty(12), np.empty(6), np.empty(12)
@@ -125,35 +173,15 @@ def propagate_ballistic(motion, air, first, last, errors, position, velocity, ph
         point[6 + j] = errors[j]
     step = 1 if last >= first else -1
     for k in range(first, last, step):
-        dt = motion.time_s[k + step] - motion.time_s[k]
-        ballistic_step(air, dt, point, stage, slope, mid)
-        ballistic_partials(air, mid, partials)
-        ballistic_transition(partials, dt, full)
-        for i in range(6):
-            for j in range(15):
-                old[i, j] = phi[i, j]
-        for i in range(6):
-            for j in range(15):
-                value = full[i, j - 3] if j >= 9 else 0.0
-                for m in range(6):
-                    value += full[i, m] * old[m, j]
-                phi[i, j] = value
-        for i in range(6):
-            for j in range(6):
-                old[i, j] = 0.0
-                for m in range(6):
-                    old[i, j] += full[i, m] * noise[m, j]
         density = motion.force_density[min(k, k + step)]
-        for i in range(6):
-            for j in range(6):
-                noise[i, j] = 0.0
-                for m in range(6):
-                    noise[i, j] += old[i, m] * full[j, m]
-        for i in range(3):
-            q = density[i] * abs(dt)
-            noise[i, i] += q * dt * dt / 3.0
-            noise[i, 3 + i] += 0.5 * q * dt
-            noise[3 + i, i] += 0.5 * q * dt
-            noise[3 + i, 3 + i] += q
+        rest, parts = motion.time_s[k + step] - motion.time_s[k], 0
+        while rest != 0.0 and parts < MOST_PARTS:
+            parts += 1
+            dt = followed(air, point, rest) if parts < MOST_PARTS else rest
+            rest -= dt
+            ballistic_step(air, dt, point, stage, slope, mid)
+            ballistic_partials(air, mid, partials)
+            ballistic_transition(partials, dt, full)
+            accumulate(full, density, dt, phi, noise, old)
     for j in range(3):
         position[j], velocity[j] = point[j], point[3 + j]

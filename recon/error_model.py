@@ -156,7 +156,7 @@ def ballistic_blocks(motion: MotionSpec) -> list[Block]:
     tau = motion.drag_time_constant_s
     return [
         Block("vehicle", ("drag",), "1", motion.drag_sd, tau),
-        Block("vehicle", ("side force level", "side force upright"), "1", motion.side_sd, tau),
+        Block("vehicle", ("side force across", "side force within"), "1", motion.side_sd, tau),
         Block("air", ("density",), "sd", 1.0, altitude_m=DENSITY_LENGTH_M),
         Block("air", ("wind north", "wind east"), "sd", 1.0, altitude_m=WIND_LENGTH_M),
     ]

@@ -37,6 +37,7 @@ class Air(NamedTuple):
     from_m: float
     step_m: float
     drag_m2pkg: float
+    across: FloatArray
 
 
 class Motion(NamedTuple):
@@ -62,6 +63,8 @@ class Motion(NamedTuple):
         Their first altitude and spacing.
     drag_m2pkg : float
         Drag area per mass before anything is learnt.
+    across_ecef : (3,) float
+        Direction across the plane of the path, for the axes of side forces.
     """
 
     ballistic: bool
@@ -77,10 +80,15 @@ class Motion(NamedTuple):
     air_from_m: float
     air_step_m: float
     drag_m2pkg: float
+    across_ecef: FloatArray
 
     def split(self) -> tuple[Inertial, Air | None]:
         """Return what kernels take: a None for the air lets them be compiled without ballistic flight."""
-        air = Air(self.air, self.air_from_m, self.air_step_m, self.drag_m2pkg) if self.ballistic else None
+        air = (
+            Air(self.air, self.air_from_m, self.air_step_m, self.drag_m2pkg, self.across_ecef)
+            if self.ballistic
+            else None
+        )
         return Inertial(*self[1:8]), air
 
     @property
@@ -115,4 +123,5 @@ def strapdown_motion(
         air_from_m=0.0,
         air_step_m=1.0,
         drag_m2pkg=0.0,
+        across_ecef=np.zeros(3),
     )

@@ -65,7 +65,9 @@ def build_problem(
     time_s = _union([output_s, between, *inside])
     observed, row = observe(time_s, instruments, SAME_INSTANT_S)
     if bridges is None:
-        motion, node_index = ballistic_motion(telemetry.motion, telemetry.sounding, time_s, SAME_INSTANT_S)
+        motion, node_index = ballistic_motion(
+            telemetry.motion, telemetry.sounding, startup.across_path(used), time_s, SAME_INSTANT_S
+        )
         start, covariance = startup.start_ballistic(used, start_s, model)
     else:
         force, rate = bridges.force, bridges.rate

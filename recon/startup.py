@@ -113,6 +113,21 @@ def fit_first_points(instruments: tuple[Instrument, ...], start_s: float) -> tup
     return coefficients[0], coefficients[1]
 
 
+def across_path(instruments: tuple[Instrument, ...]) -> FloatArray:
+    """Level direction (3,), ECEF, in which the tracked places lie least far apart.
+
+    Each counts by its direction from the middle one alone, so that a wild point has no more weight than another.
+    """
+    _, points = places(instruments)
+    middle = np.median(points, axis=0)
+    up = middle / np.linalg.norm(middle)
+    level = points - middle
+    level -= np.outer(level @ up, up)
+    level /= np.linalg.norm(level, axis=1, keepdims=True) + 1e-9
+    # of three axes the least is upright
+    return np.asarray(np.linalg.eigh(level.T @ level)[1][:, 1])
+
+
 def along_track(instruments: tuple[Instrument, ...], time_s: FloatArray, errors: int) -> States | None:
     """States at nodes (n,) that tracking alone tells, without attitude: where to linearise when a filter is lost.
 

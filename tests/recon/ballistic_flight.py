@@ -44,13 +44,20 @@ def entry_state(height_m=90e3, velocity_ned_mps=(300.0, 900.0, 400.0), errors=8)
     return States(position, np.array(velocity_ned_mps) @ ned, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(errors))
 
 
+def across_plane(state):
+    """Level direction (3,), ECEF, across a state's vertical plane."""
+    across = np.cross(state.position_ecef_m, state.velocity_ecef_mps)
+    return across / np.linalg.norm(across)
+
+
 @cache
 def fly(seed, end_s=80.0, spec=SPEC, height_m=90e3, velocity_ned_mps=(300.0, 900.0, 400.0)):
     """Times and states of one flight drawn from the model: drivers that wander, white acceleration noise."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, end_s + 1e-9, 0.05)
-    motion, index = ballistic_motion(spec, windy_sounding(), t, 1e-6)
     state = entry_state(height_m, velocity_ned_mps, errors=6)
+    across = across_plane(state)
+    motion, index = ballistic_motion(spec, windy_sounding(), across, t, 1e-6)
     sd = np.array([spec.drag_sd, spec.side_sd, spec.side_sd, 1.0, 1.0, 1.0])
     length = np.array([np.inf] * 3 + [DENSITY_LENGTH_M] + [WIND_LENGTH_M] * 2)
     tau = np.array([spec.drag_time_constant_s] * 3 + [np.inf] * 3)

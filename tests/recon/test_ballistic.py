@@ -14,8 +14,9 @@ from recon.bet import Settings, reconstruct
 from recon.state import States, boxminus, boxplus
 from recon.strapdown import propagate
 
-from .ballistic_flight import SPEC, entry_state, fly, watch, windy_sounding
+from .ballistic_flight import LATITUDE, LONGITUDE, SPEC, across_plane, entry_state, fly, watch, windy_sounding
 
+ACROSS = across_plane(entry_state())
 DRIVERS = np.array([0.1, 0.05, -0.08, 0.7, -1.1, 0.6])
 NODES = np.array([0.0, 0.3137, 5.0, 20.0, 60.0, 61.003])
 # position, velocity, rotation, drag, side forces, density, winds
@@ -30,7 +31,7 @@ def airless(motion):
 @pytest.fixture(scope="module")
 def carried():
     spec = replace(SPEC, drag_area_per_mass_m2pkg=0.01, powered_s=((10.0, 12.0),))
-    motion, index = ballistic_motion(spec, windy_sounding(), NODES, 2e-6)
+    motion, index = ballistic_motion(spec, windy_sounding(), ACROSS, NODES, 2e-6)
     start = entry_state(60e3, (800.0, 1500.0, 900.0))
     return motion, index, replace(start, sensor_errors=np.concatenate([DRIVERS, [9.0, 9.0]]))
 
@@ -87,9 +88,10 @@ def test_entry_follows_an_independent_integrator(carried):
         speed = np.linalg.norm(u)
         pressure = 0.5 * np.exp(log_density + DRIVERS[3] * density_sd) * speed**2
         push = pressure * 0.01 * np.exp(DRIVERS[0])
-        across = np.cross(r, u) / np.linalg.norm(np.cross(r, u))
-        upright = np.cross(u, across) / speed
-        force = push * (-u / speed + DRIVERS[1] * across + DRIVERS[2] * upright)
+        flow = u / speed
+        across = np.cross(np.cross(flow, ACROSS), flow)
+        across /= np.linalg.norm(across)
+        force = push * (-flow + DRIVERS[1] * across + DRIVERS[2] * np.cross(flow, across))
         return np.r_[v, force + earth.gravitation(r) - np.cross(spin, np.cross(spin, r)) - 2.0 * np.cross(spin, v)]
 
     y = np.r_[start.position_ecef_m, start.velocity_ecef_mps]
@@ -98,6 +100,59 @@ def test_entry_follows_an_independent_integrator(carried):
     assert np.abs(state.position_ecef_m - end[:3]).max() < 5e-4
     assert np.abs(state.velocity_ecef_mps - end[3:]).max() < 2e-5
     assert np.linalg.norm(end[3:]) < 0.85 * np.linalg.norm(start.velocity_ecef_mps)
+
+
+def test_a_parachute_that_sinks_straight_down_has_side_forces_with_steady_axes():
+    """Level and upright axes turn by 90 deg for 0.1 m/s of drift here; the flow itself by 1 deg."""
+    calm = replace(SPEC, drag_area_per_mass_m2pkg=0.4)
+    motion, _ = ballistic_motion(calm, windy_sounding(), ACROSS, np.array([0.0, 5.0]), 2e-6)
+    start = entry_state(2e3, (0.0, 0.0, 7.0), errors=6)
+    wind = np.array(
+        [np.interp(2e3, ballistic.AIR_FROM_M + 100.0 * np.arange(len(motion.air)), c) for c in motion.air.T]
+    )
+    ned = earth.dcm_ned_ecef(LATITUDE, LONGITUDE)
+    down = np.array([wind[1], wind[2], 7.0])
+    drivers = np.array([0.0, 0.3, -0.2, 0.0, 0.0, 0.0])
+
+    def push(drift):
+        velocity = (down + drift) @ ned
+        sides, none = (
+            ballistic.acceleration(motion, start.position_ecef_m, velocity, d) for d in (drivers, 0.0 * drivers)
+        )
+        return sides - none
+
+    still = push(np.zeros(3))
+    assert np.linalg.norm(still) > 2.0
+    for drift in np.array([[0.1, 0.0, 0.0], [0.0, -0.1, 0.0], [-0.1, 0.1, 0.0]]):
+        turned = np.linalg.norm(push(drift) - still) / np.linalg.norm(still)
+        assert turned < 1.1 * np.linalg.norm(drift) / 7.0
+
+
+@pytest.mark.parametrize("drag", [4.0, 40.0, 400.0])
+def test_a_drag_that_stops_the_vehicle_within_a_step_is_followed(drag):
+    """Against Radau's method with differences of its ends; drag takes 3 to 300 times the airspeed in the step."""
+    spec = replace(SPEC, drag_area_per_mass_m2pkg=drag)
+    motion, index = ballistic_motion(spec, windy_sounding(), ACROSS, np.array([0.0, 0.05]), 2e-6)
+    start = entry_state(9e3, (300.0, 0.0, 0.0), errors=6)
+
+    def slope(_t, y):
+        return np.r_[y[3:], ballistic.acceleration(motion, y[:3], y[3:], np.zeros(6))]
+
+    def end(velocity):
+        y = np.r_[start.position_ecef_m, velocity]
+        return solve_ivp(slope, (0.0, 0.05), y, method="Radau", rtol=1e-9, atol=1e-9).y[:, -1]
+
+    step, truth = propagate(motion, index[0], index[1], start), end(start.velocity_ecef_mps)
+    assert np.linalg.norm(truth[3:]) < 0.5 * 300.0
+    assert np.abs(step.state.position_ecef_m - truth[:3]).max() < 1e-3
+    assert np.abs(step.state.velocity_ecef_mps - truth[3:]).max() < 1e-3 * 300.0
+    plain = ballistic.propagate_plain(motion, index[0], index[1], start)
+    assert np.abs(step.state.velocity_ecef_mps - plain.state.velocity_ecef_mps).max() < 1e-9 * 300.0
+    # differences of 1e-4 in a driver, of a force of 1e6 m/s^2 here
+    assert np.abs(step.transition - plain.transition).max() < 1e-6 * np.abs(plain.transition).max()
+    assert np.abs(step.noise - plain.noise).max() < 1e-6 * plain.noise.max()
+    by_velocity = [(end(start.velocity_ecef_mps + d) - end(start.velocity_ecef_mps - d)) / 2.0 for d in np.eye(3)]
+    assert np.abs(step.transition[3:6, 3:6] - np.transpose(by_velocity)[3:]).max() < 0.01
 
 
 def test_air_table_is_the_days_air():
@@ -110,7 +165,7 @@ def test_air_table_is_the_days_air():
 
 def test_without_air_energy_stays():
     """Jacobi's constant in the turning frame, with J2: 400 s over 600 km, Runge-Kutta steps of 0.05 s."""
-    motion, index = ballistic_motion(SPEC, windy_sounding(), np.array([0.0, 400.0]), 2e-6)
+    motion, index = ballistic_motion(SPEC, windy_sounding(), ACROSS, np.array([0.0, 400.0]), 2e-6)
     start = entry_state(200e3, (1500.0, 2500.0, -1500.0), errors=6)
 
     def jacobi(s):
@@ -132,7 +187,7 @@ def test_without_air_energy_stays():
 
 def test_air_takes_energy_only_and_wind_turns_with_the_earth():
     """A body at rest in still air that turns with the Earth feels no force of the air."""
-    motion, index = ballistic_motion(SPEC, windy_sounding(), np.array([0.0, 0.05]), 2e-6)
+    motion, index = ballistic_motion(SPEC, windy_sounding(), ACROSS, np.array([0.0, 0.05]), 2e-6)
     still = motion._replace(air=motion.air * [1.0, 0.0, 0.0, 1.0, 1.0])
     start = entry_state(20e3, (0.0, 0.0, 0.0), errors=6)
     with_air, without = (
@@ -147,7 +202,7 @@ def test_noise_is_the_integral_of_the_transition(carried):
     motion, index, start = carried
     nodes = np.linspace(0.0, 20.0, 81)
     spec = replace(SPEC, drag_area_per_mass_m2pkg=0.01, powered_s=((10.0, 12.0),), powered_sd_mps2=3.0)
-    motion, index = ballistic_motion(spec, windy_sounding(), nodes, 2e-6)
+    motion, index = ballistic_motion(spec, windy_sounding(), ACROSS, nodes, 2e-6)
     claimed = propagate(motion, index[0], index[-1], start).noise[:6, :6]
     states = [start]
     for k in range(80):
@@ -177,7 +232,7 @@ def test_noise_is_the_integral_of_the_transition(carried):
 
 def test_powered_spans_open_the_noise():
     spec = replace(SPEC, powered_s=((1.0, 2.0), (3.0, 3.5)), powered_sd_mps2=7.0)
-    motion, _ = ballistic_motion(spec, windy_sounding(), np.array([0.0, 0.5, 4.0]), 2e-6)
+    motion, _ = ballistic_motion(spec, windy_sounding(), ACROSS, np.array([0.0, 0.5, 4.0]), 2e-6)
     t = motion.time_s
     assert np.diff(t).max() < ballistic.GRID_STEP_S + 1e-9
     powered = ((t >= 1.0) & (t < 2.0)) | ((t >= 3.0) & (t < 3.5))
