@@ -25,6 +25,7 @@ from flightmodel.checks import FloatArray, GateError, nearest_name
 COLUMNS = ("image", "X_m", "Y_m", "u_px", "v_px")
 LEAST_PICTURES, LEAST_CORNERS = 3, 6
 LARGEST_BOARD_M = 100.0
+LARGEST_CONDITION = 1e8  # of the fit, its unknowns scaled alike
 STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 300, 1e-10)
 
 
@@ -136,13 +137,30 @@ def calibrate_lens(corners: pd.DataFrame, size_px: tuple[int, int], lens: Lens =
         ) from failed
     distortion = np.asarray(found, dtype=float).ravel()
     residual, jacobian = _reprojected(boards, seen, matrix, distortion, turns, shifts, lens)
-    free = jacobian.shape[1]
-    variance = float(residual @ residual) / max(len(residual) - free, 1)
-    count = 4 + len(distortion)
-    sd = np.sqrt(variance * np.diag(np.linalg.inv(jacobian.T @ jacobian))[:count])
+    variance = float(residual @ residual) / max(len(residual) - jacobian.shape[1], 1)
+    sd = np.sqrt(variance) * _unit_sd(jacobian)[: 4 + len(distortion)]
     rms = float(np.sqrt(2.0 * np.mean(residual**2)))
     focal, centre = matrix[[0, 1], [0, 1]], matrix[:2, 2]
     return LensCalibration(lens, focal, centre, distortion, sd, rms, len(boards), len(corners))
+
+
+def _unit_sd(jacobian: FloatArray) -> FloatArray:
+    """Standard deviations of a linear fit's unknowns for readings of one each.
+
+    Raises
+    ------
+    GateError
+        Where some unknowns can be changed together and no corner moves.
+    """
+    size = np.linalg.norm(jacobian, axis=0)
+    triangle = np.linalg.qr(jacobian / np.where(size > 0.0, size, 1.0), mode="r")
+    # not by the normal matrix, whose inverse can have a negative diagonal
+    if not size.all() or np.linalg.cond(triangle) > LARGEST_CONDITION:
+        raise GateError(
+            "calibration: these corners leave the lens open: wanted are pictures in which the board leans to several "
+            "sides and reaches the edges; check that each picture's corners lie where that picture has them"
+        )
+    return np.asarray(np.linalg.norm(np.linalg.inv(triangle), axis=1) / size)
 
 
 def _faults(corners: pd.DataFrame, size_px: tuple[int, int]) -> list[str]:

@@ -103,3 +103,18 @@ def test_tables_that_cannot_be_used_say_why():
     flat = CORNERS.assign(X_m=0.0)
     with pytest.raises(GateError):
         calibrate_lens(flat, (640, 480))
+
+
+def test_pictures_that_leave_the_lens_open_are_refused():
+    """A board that never leans tells no focal length: nearer and longer look alike."""
+    rng = np.random.default_rng(3)
+    x, y = np.meshgrid(0.03 * np.arange(5), 0.03 * np.arange(4))
+    rows = [
+        (image, a, b, 250.0 + 900.0 * a, 200.0 + 900.0 * b)
+        for image in range(5)
+        for a, b in zip(x.flat, y.flat, strict=True)
+    ]
+    corners = pd.DataFrame(rows, columns=["image", "X_m", "Y_m", "u_px", "v_px"])
+    corners[["u_px", "v_px"]] += 1e-4 * rng.standard_normal((len(corners), 2))
+    with pytest.raises(GateError, match="leave the lens open"):
+        calibrate_lens(corners, (640, 480), "pinhole")
