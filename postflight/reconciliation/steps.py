@@ -40,22 +40,25 @@ class Normal:
         """One over the root of the diagonal."""
         return np.asarray(1.0 / np.sqrt(np.diag(self.matrix)))
 
-    def damped(self, damping: float) -> Callable[[FloatArray], FloatArray]:
-        """Solver of the equations with a share of the diagonal added."""
-        scale = self.scale  # and not self, which would hold itself through its own solver
-        scaled = self.matrix * scale[:, None] * scale
+    def factor(self, damping: float) -> FloatArray:
+        """Lower Cholesky factor of the scaled matrix with a share of the diagonal added."""
+        scaled = self.matrix * self.scale[:, None] * self.scale
         scaled[np.diag_indices_from(scaled)] += damping
-        factor = cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)
-        return lambda right: np.asarray((cho_solve(factor, (right.T * scale).T).T * scale).T)
+        return np.asarray(cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)[0])
 
     @cached_property
-    def solve(self) -> Callable[[FloatArray], FloatArray]:
-        """Solver of the equations."""
-        return self.damped(0.0)
+    def undamped(self) -> FloatArray:
+        """Factor of the matrix as it is."""
+        return self.factor(0.0)
 
-    def sd(self, count: int) -> FloatArray:
-        """Standard deviations of the first unknowns."""
-        return np.asarray(np.sqrt(np.diag(self.solve(np.eye(len(self.right), count)))))
+    def solver(self, damping: float) -> Callable[[FloatArray], FloatArray]:
+        """Solver of the equations with a share of the diagonal added."""
+        factor, scale = self.factor(damping) if damping else self.undamped, self.scale
+        return lambda right: np.asarray((cho_solve((factor, True), (right.T * scale).T).T * scale).T)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solution of the equations."""
+        return self.solver(0.0)(right)
 
     @property
     def covariance(self) -> FloatArray:
@@ -65,8 +68,7 @@ class Normal:
     @property
     def log_det(self) -> float:
         """Logarithm of the determinant."""
-        factor, _ = cho_factor(self.matrix * self.scale[:, None] * self.scale, lower=True, check_finite=False)
-        return float(2.0 * (np.log(np.diag(factor)).sum() - np.log(self.scale).sum()))
+        return float(2.0 * (np.log(np.diag(self.undamped)).sum() - np.log(self.scale).sum()))
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def _better(
     best: tuple[Residuals, Unknowns],
 ) -> tuple[Residuals, Unknowns]:
     """Return the lowest of the best so far and parts of one corrected step."""
-    solved = normal.damped(damping) if damping else normal.solve
+    solved = normal.solver(damping)
     step = solved(normal.right)
     ahead, behind = (problem.residuals(u.moved(side * LOOK_AHEAD * step)) for side in (1.0, -1.0))
     bent = solved(
