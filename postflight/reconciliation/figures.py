@@ -51,7 +51,7 @@ def _pair(ax: Axes, t: FloatArray, measured: FloatArray, flown: FloatArray, labe
     ax.plot(t, measured, color=MEASURED, lw=1.2, label="measured")
     ax.plot(t, flown, color=FOUND, lw=1.0, ls="--", label="flown with the joint found")
     ax.set_ylabel(label)
-    ax.legend(frameon=False, fontsize=8, loc="upper left")
+    ax.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
 
 
 def _residuals(ax: Axes, t: FloatArray, residual: FloatArray, label: str) -> None:

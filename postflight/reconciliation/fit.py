@@ -111,19 +111,27 @@ def reconcile(
     problem = problem_of(flight, observe(flight, loaded), laws)
     report = progress or (lambda _fraction, _what: None)
 
-    def part(fraction: float, what: str) -> None:
-        report(0.7 * fraction, what)
+    def first(fraction: float, what: str) -> None:
+        report(0.6 * fraction, what)
+
+    def then(fraction: float, what: str) -> None:
+        report(0.6 + 0.4 * fraction, what)
 
     early = [replace(problem, wider=wider) for wider in WIDER]
-    found = in_fine_air(solve(problem, problem.start(), early, part, enough=NEARLY))
-    report(1.0, "reconciled")
-    return found
+    return in_fine_air(solve(problem, problem.start(), early, first, enough=NEARLY), then)
 
 
-def in_fine_air(found: Reconciled, mend: Callable[[Problem, Unknowns], Unknowns] | None = None) -> Reconciled:
+def in_fine_air(
+    found: Reconciled, report: Progress, mend: Callable[[Problem, Unknowns], Unknowns] | None = None
+) -> Reconciled:
     """Fit again with the air as fine as the flight says."""
+    report(0.0, "how fine is the air's structure?")
     air = replace(found.problem.air, fine=fine_air(found.problem, found.unknowns))
-    return solve(replace(found.problem, air=air), found.unknowns, mend=mend)
+
+    def part(fraction: float, what: str) -> None:
+        report(0.2 + 0.8 * fraction, f"{what} in that air")
+
+    return solve(replace(found.problem, air=air), found.unknowns, progress=part, mend=mend)
 
 
 def problem_of(flight: Flight, observed: Observed, laws: tuple[str, ...]) -> Problem:

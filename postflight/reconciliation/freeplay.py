@@ -51,7 +51,7 @@ def reconcile_loose(
         first = step_from(replace(plain, wider=EARLY[0][0]), first).to
     early = [replace(problem, wider=wider, unknown=replace(problem.unknown, corner=corner)) for wider, corner in EARLY]
     found: list[Reconciled] = []
-    share = 1.0 / len(STARTS_RAD)
+    share = 0.7 / len(STARTS_RAD)
     for k, freeplay_rad in enumerate(STARTS_RAD.tolist()):
 
         def part(f: float, what: str, k: int = k) -> None:
@@ -61,9 +61,11 @@ def reconcile_loose(
         found.append(_again(at))
         if not false_spans(found[-1]).any():
             break
-    best = in_fine_air(min(found, key=lambda each: each.residuals.cost), rejoined)
-    report(1.0, "reconciled")
-    return best
+
+    def then(fraction: float, what: str) -> None:
+        report(0.7 + 0.3 * fraction, what)
+
+    return in_fine_air(min(found, key=lambda each: each.residuals.cost), then, rejoined)
 
 
 def _again(found: Reconciled) -> Reconciled:
