@@ -194,12 +194,12 @@ if REAL:
 #
 # A trajectory from every fourth fix foretells the other three of Prometheus's fixes within what it says of itself:
 # normalised residuals of each axis between 0.7 and 1.4 rms. All its verdicts are green, apogee is the receiver's own to
-# 12 m, and without being told of thrust and parachutes the result under the drogue is the same to 25 m.
+# 12 m, and without being told of thrust and parachutes the result under the drogue is the same to 10 m.
 
 # %%
 gps = table[table.source == "gps"].set_index("component")
 assert gps.rms_normalised.between(0.7, 1.4).all()
 assert all(v.passed for v in bet.verdicts)
 assert abs(h.max() - 5500.0) < 12.0
-assert np.abs(apart[under_drogue]).max() < 25.0
+assert np.abs(apart[under_drogue]).max() < 10.0
 print("proved:", gps.rms_normalised.round(2).to_dict())
