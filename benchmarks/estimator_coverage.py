@@ -41,13 +41,15 @@ from postflight.fused import CAMERA_PLANE_SD_RAD, fuse_flight
 from postflight.sensed import pulse_data
 from recon.bet import Settings, reconstruct
 from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, read_scenario
 from tests.recon import dispersed
 
 KEPT = "/tmp/estimator_coverage"
 COEFFICIENT_SD = {"ca": 0.05, "cn": 0.10, "cm": 0.15}
 CMQ_SD = 0.15
 RATE_HZ = 20.0
-ARRAYS = [f.name for f in fields(PulseData) if f.name != "vehicle"]
+STATED = ("vehicle", "force_clock_sd_s", "rate_clock_sd_s", "cg_from_sensor_m")  # the same in every flight
+ARRAYS = [f.name for f in fields(PulseData) if f.name not in STATED]
 CAMERA_SD = {"clean": np.deg2rad(0.15), "degraded": np.deg2rad(0.40)}
 CAMERA_CLOCK = np.deg2rad(153.0)
 PLANTED = (
@@ -140,7 +142,10 @@ def kept_flight(folder, seed, rigid=False):
         arrays = {k: data[f"pulse_{k}"] for k in ARRAYS}
         arrays["angular_acceleration_sd_radps2"] = float(arrays["angular_acceleration_sd_radps2"])
         truth = {k.removeprefix("true_"): data[k] for k in data.files if k.startswith("true_")}
-    return PulseData(**arrays, vehicle=told_vehicle(seed)), truth
+    spec, vehicle = read_scenario("irve2_reference").spec, told_vehicle(seed)
+    arm = vehicle.cg_m - vehicle.sensors[ACCELEROMETER_MOUNT].position_from_datum_body_m
+    stated = (vehicle, spec.accelerometer.time_bias_s, spec.rates.time_bias_s, arm)
+    return PulseData(**arrays, **dict(zip(STATED, stated, strict=True))), truth
 
 
 def fly_missing(folder, seeds, rigid=False, workers=2):

@@ -9,6 +9,8 @@ from scipy.stats import chi2
 from estimators import normal_equations
 from estimators.agreement import agreement
 from estimators.evidence import (
+    FORCE_CLOCK,
+    RATE_CLOCK,
     WIND,
     Evidence,
     corrected_pulse,
@@ -166,7 +168,9 @@ def test_fused_is_better_than_each_and_learns_the_coefficient():
 def test_moving_the_inputs_moves_the_reading_by_the_response():
     """J of every input against a finite change, both methods; the deflection to be linear about is the reading."""
     pulse, _ = pulse_of(np.random.default_rng(4), 30)
+    pulse = replace(pulse, force_clock_sd_s=2e-3, rate_clock_sd_s=1e-3, cg_from_sensor_m=np.array([-0.4, 0.1, 0.2]))
     use, rng = pulse.informative, np.random.default_rng(5)
+    assert {FORCE_CLOCK, RATE_CLOCK} <= misalignment_evidence(pulse).by_input.keys()
     for method in METHODS.values():
         base = method(pulse, use, None)
         for name, response in base.by_input.items():
