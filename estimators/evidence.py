@@ -190,15 +190,19 @@ def forgetful(at: FloatArray, length: float) -> FloatArray:
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
+def offset_sd_m(vehicle: Vehicle) -> float:
+    """Initial offset's standard deviation, each axis, carried by the centerbody's c.g."""
+    masses = np.array([getattr(vehicle, name).mass_kg for name in BODIES])
+    return float(vehicle.uncertainty.cg_lateral_m * np.hypot(*masses) / masses[1])
+
+
 def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
     """Vehicle with its uncertain inputs moved by so many standard deviations, by the inputs' names.
 
     Stated uncertainties of mass, c.g. and inertia are each body's own; lateral c.g.s of the two bodies act together as
     the initial offset, carried by the centerbody.
     """
-    known = vehicle.uncertainty
-    masses = np.array([getattr(vehicle, name).mass_kg for name in BODIES])
-    side = known.cg_lateral_m * np.hypot(*masses) / masses[1]
+    known, side = vehicle.uncertainty, offset_sd_m(vehicle)
     bodies = {}
     for name in BODIES:
         body = getattr(vehicle, name)
