@@ -1,13 +1,13 @@
 """Do the deflection estimates err as they say? Dispersed flights with every error alive, scored at peak pressure.
 
-Run: ``python benchmarks/estimator_coverage.py [FLIGHTS] [FOLDER] [--rigid | --planted]`` (100 flights). Drawn anew for
-each seed: side and size of the offset that the analyst is told, and what the analyst is not told: masses, c.g.s,
-inertias, joint, coefficients (C_A 5 %, C_N 10 %, C_m 15 %, C_mq 0.15 between Mach 1.2 and 5), start, spin,
-air, the sounding's and every instrument's errors. No video. Some 5 s a flight on each of two cores; what the
-estimators see and the truth are kept in FOLDER, so that the estimators can be scored again without flying. The camera's
-history is drawn, not rendered. ``--rigid`` flies a stiff joint; ``--planted`` spoils one assumption at a time, with
-uncertainties as the reference vehicle's file states them; ``--told`` says how well the same errors could be told by one
-who knows the size and the direction of each that may be there.
+Run: ``python benchmarks/estimator_coverage.py [FLIGHTS [FIRST SEED]] [FOLDER] [--rigid | --planted]`` (100 flights from
+seed 0). Drawn anew for each seed: side and size of the offset that the analyst is told, and what the analyst is not
+told: masses, c.g.s, inertias, joint, coefficients (C_A 5 %, C_N 10 %, C_m 15 %, C_mq 0.15 between Mach 1.2 and 5),
+start, spin, air, the sounding's and every instrument's errors. No video. Some 5 s a flight on each of two cores; what
+the estimators see and the truth are kept in FOLDER, so that the estimators can be scored again without flying. The
+camera's history is drawn, not rendered. ``--rigid`` flies a stiff joint; ``--planted`` spoils one assumption at a time,
+with uncertainties as the reference vehicle's file states them; ``suspects_bound.py`` says how well the same errors
+could be told at all.
 """
 
 import multiprocessing
@@ -21,11 +21,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from estimators.agreement import BLAME
-from estimators.evidence import CAMERA_PLANE, LIGHT_TIME_S, forgetful
+from estimators.evidence import LIGHT_TIME_S, forgetful
+from estimators.gross_errors import CAMERA_TURNED, COEFFICIENTS, MOUNT, OFFSET
 from estimators.misalignment import estimate_misalignment
 from estimators.pulse import PulseData
 from estimators.trim import estimate_trim
@@ -37,25 +38,31 @@ from flightmodel.deflection import history_from_lateral
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.fused import CAMERA_PLANE_SD_RAD, fuse_flight
+from postflight.fused import fuse_flight
 from postflight.sensed import pulse_data
 from recon.bet import Settings, reconstruct
 from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, read_scenario
 from tests.recon import dispersed
 
 KEPT = "/tmp/estimator_coverage"
 COEFFICIENT_SD = {"ca": 0.05, "cn": 0.10, "cm": 0.15}
 CMQ_SD = 0.15
 RATE_HZ = 20.0
-ARRAYS = [f.name for f in fields(PulseData) if f.name != "vehicle"]
+STATED = ("vehicle", "force_clock_sd_s", "rate_clock_sd_s", "cg_from_sensor_m")  # the same in every flight
+ARRAYS = [f.name for f in fields(PulseData) if f.name not in STATED]
 CAMERA_SD = {"clean": np.deg2rad(0.15), "degraded": np.deg2rad(0.40)}
 CAMERA_CLOCK = np.deg2rad(153.0)
-PLANTED = (
-    "aerodynamic coefficients",
-    "accelerometer's mounting or bias",
-    "initial c.g. offset",
-    "camera's orientation, benchmark or plane",
-)
+FORCE_ALONE = "accelerometer's mounting, the attitude right"
+PLANTED = {  # and the right suspect
+    "nothing": "",
+    COEFFICIENTS: COEFFICIENTS,
+    MOUNT: MOUNT,
+    FORCE_ALONE: MOUNT,
+    OFFSET: OFFSET,
+    CAMERA_TURNED: CAMERA_TURNED,
+}
+TURN_YZ_RAD = np.deg2rad(0.5) * np.array([0.6, 0.8])
 
 
 def told_vehicle(seed):
@@ -140,7 +147,10 @@ def kept_flight(folder, seed, rigid=False):
         arrays = {k: data[f"pulse_{k}"] for k in ARRAYS}
         arrays["angular_acceleration_sd_radps2"] = float(arrays["angular_acceleration_sd_radps2"])
         truth = {k.removeprefix("true_"): data[k] for k in data.files if k.startswith("true_")}
-    return PulseData(**arrays, vehicle=told_vehicle(seed)), truth
+    spec, vehicle = read_scenario("irve2_reference").spec, told_vehicle(seed)
+    arm = vehicle.cg_m - vehicle.sensors[ACCELEROMETER_MOUNT].position_from_datum_body_m
+    stated = (vehicle, spec.accelerometer.time_bias_s, spec.rates.time_bias_s, arm)
+    return PulseData(**arrays, **dict(zip(STATED, stated, strict=True))), truth
 
 
 def fly_missing(folder, seeds, rigid=False, workers=2):
@@ -174,20 +184,23 @@ def camera_history(rng, truth_yz, time_s, sd_rad):
 
 def planted(pulse, camera, what):
     """Pulse and camera with one assumption wrong, as the analyst would have it."""
-    if what == "aerodynamic coefficients":
+    if what == COEFFICIENTS:
         told = replace(pulse.vehicle, aero=pulse.vehicle.aero.scaled(cm=1.15, cn=1.15))
         return replace(pulse, vehicle=told), camera
-    if what == "accelerometer's mounting or bias":
-        turned = rotations.exp(np.deg2rad(0.5) * np.array([0.0, 0.6, 0.8]))
-        return replace(pulse, specific_force_body_mps2=rotations.rotate(turned, pulse.specific_force_body_mps2)), camera
-    if what == "initial c.g. offset":
+    if what in (MOUNT, FORCE_ALONE):
+        # a reconstruction takes the force's direction for the attitude's: the flow turns by the same angle
+        turned = rotations.exp(np.array([0.0, *TURN_YZ_RAD]))
+        force = rotations.rotate(turned, pulse.specific_force_body_mps2)
+        along = np.array([TURN_YZ_RAD[1], -TURN_YZ_RAD[0]]) if what == MOUNT else 0.0
+        return replace(pulse, specific_force_body_mps2=force, flow_yz_rad=pulse.flow_yz_rad + along), camera
+    if what == OFFSET:
         body = pulse.vehicle.centerbody
         x, y, z = body.cg_from_datum_body_m
         told = replace(
             pulse.vehicle, centerbody=body.model_copy(update={"cg_from_datum_body_m": (x, y + 0.004, z - 0.003)})
         )
         return replace(pulse, vehicle=told), camera
-    if what.startswith("camera"):
+    if what == CAMERA_TURNED:
         return pulse, replace(camera, plane_lv_rad=camera.plane_lv_rad + np.deg2rad(25.0))
     return pulse, camera
 
@@ -204,7 +217,7 @@ def scored(seed, folder, rigid, what):
     for k, (name, sd) in enumerate(CAMERA_SD.items()):
         rng = np.random.default_rng([seed, 3 + k, 2009])
         cameras[name] = camera_history(rng, truth["theta_yz"][use], pulse.time_s[use], sd)
-    pulse, cameras["clean"] = planted(pulse, cameras["clean"], what or "")
+    pulse, cameras["clean"] = planted(pulse, cameras["clean"], what)
     answers = {} if what is not None else {"misalignment": estimate_misalignment(pulse), "trim": estimate_trim(pulse)}
     for name, camera in () if what is not None else (("no video", None), *cameras.items()):
         answers[f"fused, {name}"] = safely(out, lambda c=camera: fuse_flight(pulse, c).fused.history)
@@ -246,59 +259,6 @@ def row_of(history, pulse, truth):
     )  # fmt: skip
 
 
-def planted_normals(pulse, learnt):
-    """Each planted error in standard deviations of the inputs, ``(k,)``, by name."""
-    known, place = pulse.vehicle.uncertainty, learnt.place
-    out = {what: np.zeros(len(learnt.mean)) for what in PLANTED}
-    out[PLANTED[0]][[place["C_m"].start, place["C_N"].start]] = 0.15 / known.cm, 0.15 / known.cn
-    use = pulse.through_pulse
-    force, axis = pulse.specific_force_body_mps2[use], np.deg2rad(0.5) * np.array([0.0, 0.6, 0.8])
-    root = pulse.force_root_mps2[use].reshape(-1, 9)
-    out[PLANTED[1]][place["accelerometer"]] = np.linalg.lstsq(root, np.cross(axis, force).ravel(), rcond=1e-6)[0]
-    masses = np.array([pulse.vehicle.aeroshell.mass_kg, pulse.vehicle.centerbody.mass_kg])
-    side = known.cg_lateral_m * np.hypot(*masses) / masses[1]
-    for name, planted_m in (("initial offset y", 0.004), ("initial offset z", -0.003)):
-        out[PLANTED[2]][place[name].start] = planted_m / side
-    out[PLANTED[3]][place[CAMERA_PLANE].start] = np.deg2rad(25.0) / CAMERA_PLANE_SD_RAD
-    return out
-
-
-def told(seed, folder):
-    """Size of each planted error against what the readings say of it, sd; and how often each would be named.
-
-    For small errors the readings' part ``m`` of what is known of the inputs is normal with the mean ``V d`` and the
-    covariance ``V`` (`estimators.agreement`). One who knows every ``d`` that may be there tells them apart best by the
-    likelihood, and finds each best by ``d' m``: no other test of the same false alarms is stronger.
-    """
-    pulse, truth = kept_flight(folder, seed)
-    if str(truth["words"]):
-        return None
-    known = vehicle_from_toml(vehicle_path("irve2_reference")).uncertainty
-    pulse = replace(pulse, vehicle=replace(flown_aero(pulse.vehicle, truth, known), uncertainty=known))
-    use, rng = pulse.through_pulse, np.random.default_rng([seed, 3, 2009])
-    camera = camera_history(rng, truth["theta_yz"][use], pulse.time_s[use], CAMERA_SD["clean"])
-    learnt = fuse_flight(pulse, camera).fused.learnt
-    errors = np.array([np.zeros(len(learnt.mean)), *planted_normals(pulse, learnt).values()])
-    told_apart = np.eye(len(learnt.mean)) - learnt.covariance
-    inner = errors @ told_apart @ errors.T
-    value, axes = np.linalg.eigh(inner)
-    spread = axes * np.sqrt(np.maximum(value, 0.0))  # of d' m
-    draws = rng.standard_normal((2000, len(errors))) @ spread.T
-    named = [np.mean(np.argmax(draws + inner[k] - 0.5 * np.diag(inner), axis=1) == k) for k in range(len(errors))]
-    return np.sqrt(np.diag(inner)[1:]), np.array(named)
-
-
-def report_told(results):
-    size, named = (np.array([r[k] for r in results if r is not None]) for k in (0, 1))
-    power = norm.sf(norm.isf(0.01) - size)
-    print(f"{len(size)} flights; one who knows size and direction of all four errors would")
-    print(f"  take a sound flight as sound in {100 * named[:, 0].mean():.0f} %")
-    for k, what in enumerate(PLANTED):
-        found, right = 100 * power[:, k].mean(), 100 * named[:, k + 1].mean()
-        words = f"find it in {found:.0f} % (1 % false alarms), name it in {right:.0f} %"
-        print(f"  {what}: {words}; {np.median(size[:, k]):.1f} sd at the median")
-
-
 def report(results, rigid):
     rows = [r for r in results if not r["words"]]
     print(f"\n{len(results)} flights, {len(results) - len(rows)} of them tumbled and left out; at peak pressure, deg")
@@ -326,9 +286,10 @@ def report_planted(results, what):
     # a refusal names its suspects in its words
     told = [r["named"] if r["named"] is not None else named_in(r["refused"][0]) for r in rows]
     refused = sum(r["named"] is None for r in rows)
-    first, any_of = sum(n[:1] == (what,) for n in told), sum(what in n for n in told)
+    right = PLANTED[what]
+    first, any_of = sum(n[:1] == (right,) for n in told), sum(right in n for n in told)
     words = f"red {red} of {len(rows)} ({refused} no common answer), named {any_of}, first or alone {first}"
-    print(f"{what or 'nothing wrong'}: {words}; {dict(Counter(' or '.join(n) for n in told if n))}", flush=True)
+    print(f"{what} wrong: {words}; {dict(Counter(' or '.join(n) for n in told if n))}", flush=True)
 
 
 def named_in(words):
@@ -336,24 +297,27 @@ def named_in(words):
     return tuple(sorted((s for s in BLAME if f"the {s} would" in words or f"the {s} or" in words), key=words.index))
 
 
+def seeds_and_folder():
+    """Return seeds, from a count and the first one, and the folder of kept flights, as the command line has them."""
+    numbers = [int(a) for a in sys.argv[1:] if a.isdigit()]
+    count, first = numbers + [100, 0][len(numbers) :]
+    return range(first, first + count), next((a for a in sys.argv[1:] if not a.isdigit() and a[0] != "-"), KEPT)
+
+
 def main():
-    count = next((int(a) for a in sys.argv[1:] if a.isdigit()), 100)
-    folder = next((a for a in sys.argv[1:] if not a.isdigit() and not a.startswith("-")), KEPT)
+    seeds, folder = seeds_and_folder()
     rigid = "--rigid" in sys.argv
-    fly_missing(folder, range(count), rigid)
-    if "--told" in sys.argv:
-        report_told([told(seed, folder) for seed in range(count)])
-        return
-    whats = ("", *PLANTED) if "--planted" in sys.argv else (None,)
+    fly_missing(folder, seeds, rigid)
+    whats = PLANTED if "--planted" in sys.argv else (None,)
     begun = time.perf_counter()
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:
         for what in whats:
             work = partial(scored, folder=folder, rigid=rigid, what=what)
             results = []
-            for k, result in enumerate(pool.map(work, range(count)), 1):
+            for k, result in enumerate(pool.map(work, seeds), 1):
                 results.append(result)
                 if k % 20 == 0:
-                    print(f"scored {k} of {count}, {time.perf_counter() - begun:.0f} s", flush=True)
+                    print(f"scored {k} of {len(seeds)}, {time.perf_counter() - begun:.0f} s", flush=True)
             report(results, rigid) if what is None else report_planted(results, what)
 
 

@@ -1,11 +1,10 @@
 """Is a film's clock found as well as is said? Offsets planted in the camera's times, over dispersed flights.
 
-Run: ``python benchmarks/film_clock.py [FLIGHTS] [FOLDER]`` (40 flights; those that ``estimator_coverage.py`` kept in
-FOLDER, or flown now). Offsets of 0, 0.05 and 0.2 s in turn, late and early; the film's clock is told to be good to
-0.3 s. The camera's history is drawn, not rendered: 4 frames a second, errors of 0.15 or 0.40 deg and twice that across.
+Run: ``python benchmarks/film_clock.py [FLIGHTS [FIRST SEED]] [FOLDER]`` (100 flights; those that
+``estimator_coverage.py`` kept in FOLDER, or flown now). Offsets of 0, 0.05 and 0.2 s in turn, late and early; the
+film's clock is told to be good to 0.3 s. The camera's history is drawn, not rendered: 4 frames a second, errors of 0.15
+or 0.40 deg and twice that across.
 """
-
-import sys
 
 import estimator_coverage as dispersed
 import numpy as np
@@ -35,18 +34,17 @@ def found_clock(seed, folder, late_s, camera_sd_rad):
 
 
 def main():
-    count = next((int(a) for a in sys.argv[1:] if a.isdigit()), 40)
-    folder = next((a for a in sys.argv[1:] if not a.isdigit()), dispersed.KEPT)
-    dispersed.fly_missing(folder, range(count))
+    seeds, folder = dispersed.seeds_and_folder()
+    dispersed.fly_missing(folder, seeds)
     for name, sd in dispersed.CAMERA_SD.items():
         rows = []
-        for seed in range(count):
+        for k, seed in enumerate(seeds, 1):
             late = PLANTED_S[seed % len(PLANTED_S)]
             answer = found_clock(seed, folder, late, sd)
             if answer is not None:
                 rows.append((answer[0] - late, answer[1]))
-            if (seed + 1) % 10 == 0:
-                print(f"{seed + 1} of {count}", flush=True)
+            if k % 10 == 0:
+                print(f"{k} of {len(seeds)}", flush=True)
         error, stated = np.array(rows).T
         inside = [100.0 * np.mean(np.abs(error) < k * stated) for k in (1, 2)]
         size = [1e3 * x for x in (np.sqrt(np.mean(error**2)), error.mean(), np.abs(error).max(), stated.mean())]

@@ -13,6 +13,13 @@ less well known than stated? With mean ``m`` and covariance ``P`` of its unit no
 (``V`` is ``J' C^-1 J`` of the readings' whole covariance ``C``, and ``m`` is ``J' C^-1 d``). Directions of which less
 than `LEAST_TOLD` was learnt are left out: what the equations of the methods neglect would move them far at no cost.
 
+Errors that happen have few directions and a size. Of those in `estimators.gross_errors`, of columns ``D``, the same is
+
+    gain = m' D (1 + D' V D)^-1 D' m / 2 - log det(1 + D' V D) / 2
+
+and such a suspect has the mean of both likelihoods. No other decision among these errors finds more of them at as many
+false alarms, where their sizes are as stated and the sides they fall to are not known (Neyman, Pearson).
+
 What the readings cannot tell apart is in the singular values of the whitened ``J``: a direction of the inputs with the
 singular value ``s`` keeps ``1 / (1 + s^2)`` of its variance.
 """
@@ -39,6 +46,7 @@ from estimators.evidence import (
     Deflection,
     Evidence,
 )
+from estimators.gross_errors import CAMERA_TURNED, COEFFICIENTS, MOUNT, OFFSET
 from estimators.normal_equations import Learnt, means_over_spans
 from flightmodel.checks import BoolArray, FloatArray
 
@@ -53,18 +61,18 @@ LEAST_TOLD = 0.05  # part of a direction's variance that the readings must have 
 CAMERA = "camera"
 LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is held against another
 # odds at which an input is taken as wrong though every pair passes; more where the stated error is only assumed
-LARGEST_GAIN, LARGEST_ASSUMED_GAIN = np.log(10.0), np.log(100.0)
+LARGEST_GAIN, LARGEST_ASSUMED_GAIN = np.log(5.0), np.log(1e4)
 ASSUMED = ("mass properties", "attitude of the trajectory", "sounded wind", "sounded density")
 ALSO = np.log(100.0)  # odds below which the next suspect is named too: odds were seen to be overconfident
 BLAME = {
-    "aerodynamic coefficients": ("C_A", "C_N", "C_m", "C_mq"),
-    "accelerometer's mounting or bias": (ACCELEROMETER,),
-    "initial c.g. offset": ("initial offset y", "initial offset z"),
+    COEFFICIENTS: ("C_A", "C_N", "C_m", "C_mq"),
+    MOUNT: (ACCELEROMETER,),
+    OFFSET: ("initial offset y", "initial offset z"),
     "mass properties": tuple(n for n in VEHICLE_INPUTS if n.startswith(("aeroshell", "centerbody"))),
     "attitude of the trajectory": (ATTITUDE,),
     "sounded wind": (WIND,),
     "sounded density": (PRESSURE,),
-    "camera's orientation, benchmark or plane": (CAMERA, CAMERA_PLANE),
+    CAMERA_TURNED: (CAMERA, CAMERA_PLANE),
     "film's clock": (FILM_CLOCK,),
 }
 
@@ -120,7 +128,10 @@ class Agreement:
 
 
 def agreement(
-    evidence: list[Evidence], learnt: Learnt | None = None, deflection: Deflection | None = None
+    evidence: list[Evidence],
+    learnt: Learnt | None = None,
+    deflection: Deflection | None = None,
+    gross: dict[str, FloatArray] | None = None,
 ) -> Agreement:
     """Test all pairs of methods over the spans in which both answer, and score what they lean on.
 
@@ -132,6 +143,8 @@ def agreement(
         What the fusion says of the inputs; without it there are no suspects.
     deflection : callable, optional
         From times to lateral vectors (n, 2), rad: what of it swings is taken out of the readings.
+    gross : dict of str to (k, r) float, optional
+        Gross errors that suspects may have (`estimators.gross_errors`).
     """
     pairs: list[Pair] = []
     for a, b in combinations(evidence, 2):
@@ -146,9 +159,12 @@ def agreement(
         rows = [np.arange(learnt.place[n].start, learnt.place[n].stop) for n in inputs if n in learnt.place]
         if CAMERA in inputs and CAMERA in learnt.place:  # of its own error what lasts: the first of each axis
             rows[0] = rows[0][[0, len(rows[0]) // 2]]
-        score = _gain(learnt, np.concatenate(rows)) if rows else None
-        if score is not None:
-            gains[culprit] = score
+        wider = _gain(learnt, np.concatenate(rows)) if rows else None
+        scores = [] if wider is None else [wider]
+        if gross is not None and culprit in gross:
+            scores.append(gross_gain(learnt, gross[culprit]))
+        if scores:
+            gains[culprit] = float(np.logaddexp.reduce(scores) - np.log(len(scores)))
     told = np.clip(np.linalg.eigvalsh(np.eye(len(learnt.mean)) - learnt.covariance), 0.0, 1.0 - 1e-12)
     return Agreement(tuple(pairs), gains, np.sqrt(told / (1.0 - told))[::-1])
 
@@ -162,6 +178,13 @@ def _gain(learnt: Learnt, rows: NDArray[np.int64]) -> float | None:
     more, along = WIDER**2 - 1.0, (axes.T @ learnt.mean[rows])[known]
     told = told[known]
     return float(0.5 * np.sum(along**2 / (1.0 / more + told)) - 0.5 * np.sum(np.log1p(more * told)))
+
+
+def gross_gain(learnt: Learnt, columns: FloatArray) -> float:
+    """Log of how much likelier all readings are with an error that is ``columns`` (k, r) times unit normals."""
+    told = np.eye(columns.shape[1]) + columns.T @ (columns - learnt.covariance @ columns)
+    along = columns.T @ learnt.mean
+    return float(0.5 * along @ np.linalg.solve(told, along) - 0.5 * np.linalg.slogdet(told)[1])
 
 
 def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> tuple[FloatArray, FloatArray]:

@@ -15,6 +15,9 @@ is left of the trajectory's, and the wind's. The last two do not turn with the v
 not roll, where the trajectory's forgets over `TRAJECTORY_TIME_S` and the wind's has a constant half and a half that
 forgets over `WIND_LENGTH_M` of altitude, as the reconstruction of the air takes it. The same goes for the density in
 the dynamic pressure, over `DENSITY_LENGTH_M`.
+
+Accelerometer and gyros have clocks of their own, known to a millisecond or so: what swings is read that much late, and
+what the gyros carry from the accelerometer to the c.g. does not fit what it felt. The film's clock is told by both.
 """
 
 from __future__ import annotations
@@ -23,9 +26,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
-from estimators.pulse import PulseData
+from estimators.pulse import PulseData, carried
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
 from flightmodel.vehicle import Vehicle
@@ -35,6 +39,7 @@ LIGHT_TIME_S = 2.5
 KNOTS_A_LENGTH = 3  # knots of a forgetful history, over what it forgets
 ACCELEROMETER, ATTITUDE, WIND, PRESSURE = "accelerometer", "BET attitude", "wind", "dynamic pressure"
 FILM_CLOCK, RATE_STEP_S = "film's clock", 0.005
+FORCE_CLOCK, RATE_CLOCK = "accelerometer's clock", "gyros' clock"
 CAMERA_PLANE = "camera's plane"
 Deflection = Callable[[FloatArray], FloatArray]
 SWING_WINDOW_S = 2.0  # about a period of the slow aerodynamic mode, over which the joint's swinging is averaged
@@ -123,6 +128,33 @@ def pressure_input(pulse: PulseData, use: BoolArray) -> FloatArray:
     return np.asarray(relative[:, None] * _sounded(pulse.altitude_m[use], DENSITY_LENGTH_M))
 
 
+def read_later(pulse: PulseData, use: BoolArray, force_s: float, rate_s: float) -> PulseData:
+    """Pulse with what accelerometer and gyros say so much later: as it is where their clocks are so late.
+
+    With the gyros' clock go the attitude, and so the flow's angle, and what carries the force from the accelerometer to
+    the c.g.; pressure and Mach number are too slow to tell.
+    """
+    if force_s == rate_s == 0.0 or np.count_nonzero(use) < 2:
+        return pulse
+    t = pulse.time_s[use]
+
+    def later(values: FloatArray, late_s: float) -> FloatArray:
+        out = values.copy()
+        out[use] += late_s * CubicSpline(t, values[use])(t, 1)
+        return out
+
+    force, flow = pulse.specific_force_body_mps2, pulse.flow_yz_rad
+    rate, turn = pulse.rate_body_radps, pulse.angular_acceleration_body_radps2
+    arm = carried(rate, turn, pulse.cg_from_sensor_m)
+    return replace(
+        pulse,
+        specific_force_body_mps2=later(force - arm, force_s) + later(arm, rate_s),
+        flow_yz_rad=later(flow, rate_s),
+        rate_body_radps=later(rate, rate_s),
+        angular_acceleration_body_radps2=later(turn, rate_s),
+    )
+
+
 def _sounded(altitude_m: FloatArray, length_m: float) -> FloatArray:
     """Error of unit variance of a sounding ``(n, k)``, per unit normal: a constant part and one that forgets."""
     constant = np.full(len(altitude_m), np.sqrt(CONSTANT_PART))
@@ -158,15 +190,19 @@ def forgetful(at: FloatArray, length: float) -> FloatArray:
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
+def offset_sd_m(vehicle: Vehicle) -> float:
+    """Initial offset's standard deviation, each axis, carried by the centerbody's c.g."""
+    masses = np.array([getattr(vehicle, name).mass_kg for name in BODIES])
+    return float(vehicle.uncertainty.cg_lateral_m * np.hypot(*masses) / masses[1])
+
+
 def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
     """Vehicle with its uncertain inputs moved by so many standard deviations, by the inputs' names.
 
     Stated uncertainties of mass, c.g. and inertia are each body's own; lateral c.g.s of the two bodies act together as
     the initial offset, carried by the centerbody.
     """
-    known = vehicle.uncertainty
-    masses = np.array([getattr(vehicle, name).mass_kg for name in BODIES])
-    side = known.cg_lateral_m * np.hypot(*masses) / masses[1]
+    known, side = vehicle.uncertainty, offset_sd_m(vehicle)
     bodies = {}
     for name in BODIES:
         body = getattr(vehicle, name)
@@ -285,10 +321,10 @@ def corrected_pulse(pulse: PulseData, use: BoolArray, inputs: dict[str, FloatArr
     pressure = pulse.dynamic_pressure_pa.copy()
     if PRESSURE in inputs:
         pressure[use] *= 1.0 + pressure_input(pulse, use) @ inputs[PRESSURE]
+    late = [float(inputs[name][0]) if name in inputs else 0.0 for name in (FORCE_CLOCK, RATE_CLOCK)]
+    moved = replace(pulse, flow_yz_rad=flow, specific_force_body_mps2=force)
     return replace(
-        pulse,
-        flow_yz_rad=flow,
-        specific_force_body_mps2=force,
+        read_later(moved, use, late[0] * pulse.force_clock_sd_s, late[1] * pulse.rate_clock_sd_s),
         dynamic_pressure_pa=np.maximum(pressure, 1e-3),
         vehicle=moved_vehicle(pulse.vehicle, {k: float(v[0]) for k, v in inputs.items() if k in VEHICLE_INPUTS}),
     )

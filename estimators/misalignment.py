@@ -19,10 +19,13 @@ import numpy as np
 
 from estimators.evidence import (
     ACCELEROMETER,
+    FORCE_CLOCK,
+    RATE_CLOCK,
     Evidence,
     flow_inputs,
     history_of_evidence,
     moved_coefficients,
+    read_later,
 )
 from estimators.pulse import MIN_AXIAL_MPS2, PulseData, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
@@ -136,6 +139,11 @@ def misalignment_evidence(
         by_flow = -by_tilt @ _columns(base, [_pushed_tilt(*on_shell(still, e)) for e in step]) / STEP_RAD
         inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
         inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + by_force @ pulse.force_root_mps2[use]
+        for name, late_s in ((FORCE_CLOCK, (pulse.force_clock_sd_s, 0.0)), (RATE_CLOCK, (0.0, pulse.rate_clock_sd_s))):
+            if any(late_s):
+                later = read_later(pulse, use, *late_s)
+                by_clock = by_force @ (later.specific_force_body_mps2[use] - force)[:, :, None]
+                inputs[name] = by_clock + by_flow @ (later.flow_yz_rad[use] - flow)[:, :, None]
         for name in ("C_A", "C_N"):
             moved = (moved_coefficients(vehicle, {name: k}, coefficients) for k in (1.0, -1.0))
             up, down = (_pushed_tilt(theta, direction, c) for c in moved)

@@ -5,7 +5,7 @@ Made from a best-estimated trajectory and corrected sensors; it holds no truth. 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -43,6 +43,10 @@ class PulseData:
     mach, dynamic_pressure_pa, dynamic_pressure_sd_pa, airspeed_mps : (n,) float
     vehicle : Vehicle
         Pre-flight model.
+    force_clock_sd_s, rate_clock_sd_s : float
+        How well the clocks of accelerometer and gyros are known, s; zero: they are right.
+    cg_from_sensor_m : (3,) float
+        Arm over which the gyros carried the accelerometer's reading to the c.g., body axes.
     """
 
     time_s: FloatArray
@@ -62,6 +66,9 @@ class PulseData:
     dynamic_pressure_sd_pa: FloatArray
     airspeed_mps: FloatArray
     vehicle: Vehicle
+    force_clock_sd_s: float = 0.0
+    rate_clock_sd_s: float = 0.0
+    cg_from_sensor_m: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         """Check shapes once."""
@@ -90,6 +97,11 @@ class PulseData:
         """
         after = np.flatnonzero(pressure_pulse(self.dynamic_pressure_pa))
         return np.asarray(self.informative & (np.arange(len(self.time_s)) <= after[-1]))
+
+
+def carried(rate_body_radps: FloatArray, turn_body_radps2: FloatArray, arm_m: FloatArray) -> FloatArray:
+    """Specific force ``(n, 3)`` at the end of an arm less that at its beginning, m/s^2."""
+    return np.cross(turn_body_radps2, arm_m) + np.cross(rate_body_radps, np.cross(rate_body_radps, arm_m))
 
 
 def lateral_and_size(vectors_yz: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -22,6 +22,7 @@ import numpy as np
 
 from estimators.evidence import (
     PRESSURE,
+    RATE_CLOCK,
     VEHICLE_INPUTS,
     Evidence,
     flow_inputs,
@@ -29,6 +30,7 @@ from estimators.evidence import (
     moved_coefficients,
     moved_vehicle,
     pressure_input,
+    read_later,
 )
 from estimators.pulse import MIN_AXIAL_MPS2, PulseData, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
@@ -202,6 +204,10 @@ def trim_evidence(
     if with_inputs:
         by_flow = -by_moment @ np.stack([_imbalance(model, *on_shell(still, e)) - base for e in step], -1) / STEP_RAD
         inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
+        if pulse.rate_clock_sd_s > 0.0:
+            later = read_later(pulse, use, 0.0, pulse.rate_clock_sd_s)
+            late = _moment_with(model, later, use, on_body) - moment if dynamic else np.zeros_like(flow)
+            inputs[RATE_CLOCK] = (by_flow @ (later.flow_yz_rad[use] - flow)[:, :, None]) + by_moment @ late[:, :, None]
 
     def excess(moved: dict[str, float]) -> FloatArray:
         of = trim_model(moved_vehicle(vehicle, moved), joint_station_m)

@@ -12,6 +12,7 @@ import pandas as pd
 from estimators.agreement import Agreement, agreement
 from estimators.evidence import FILM_CLOCK, Evidence, evidence_of_history, moved_evidence
 from estimators.fusion import FarInputsError, Fused, Read, clock_is_seen, fuse, pulse_reader
+from estimators.gross_errors import gross_errors
 from estimators.misalignment import misalignment_evidence
 from estimators.pulse import PulseData
 from estimators.southwell import Limbs, southwell_limbs
@@ -117,7 +118,8 @@ def fuse_flight(
         fused = fuse(read)
     except DivergenceError as fault:
         learnt = fault.learnt if isinstance(fault, FarInputsError) else None
-        words = f"{fault}; {agreement(read({}, None), learnt).words}"
+        gross = None if learnt is None else gross_errors(pulse, learnt, CAMERA_PLANE_SD_RAD)
+        words = f"{fault}; {agreement(read({}, None), learnt, gross=gross).words}"
         clock = _asked_clock(reader) if seen and told_sd_s == 0.0 else None
         if clock is not None and clock.is_off:
             words += f"; there is an answer if {clock.words}"
@@ -138,7 +140,8 @@ def fuse_flight(
         clock = _film_clock(fused, told_sd_s, True)
     elif seen:
         clock = _asked_clock(reader)
-    return FusedAnswer(fused, agreement(told, fused.learnt, fused.deflection), limbs, words, clock)
+    gross = gross_errors(pulse, fused.learnt, CAMERA_PLANE_SD_RAD)
+    return FusedAnswer(fused, agreement(told, fused.learnt, fused.deflection, gross), limbs, words, clock)
 
 
 def _asked_clock(reader: Callable[[float], Read]) -> FilmClock | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.pulse import PulseData
+from estimators.pulse import PulseData, carried
 from flightmodel import rotations
 from flightmodel.airdata import AirData, angle_partials, lateral_angles
 from flightmodel.checks import BoolArray, FloatArray
@@ -66,7 +66,7 @@ def sensed(bet: Reconstruction, t: FloatArray, cg_from_sensor_m: FloatArray, h: 
     after = window_means(t_imu, bet.rate_body_radps, t, t + 2 * h)
     before = window_means(t_imu, bet.rate_body_radps, t - 2 * h, t)
     turn = (after - before) / (2 * h)
-    at_cg = force + np.cross(turn, cg_from_sensor_m) + np.cross(rate, np.cross(rate, cg_from_sensor_m))
+    at_cg = force + carried(rate, turn, cg_from_sensor_m)
     return Sensed(force, at_cg, rate, turn, max(1.0, 2 * h / float(np.median(np.diff(t_imu)))))
 
 
@@ -79,7 +79,8 @@ def pulse_data(telemetry: Telemetry, bet: Reconstruction, air: AirData) -> Pulse
     t = grid[inside]
     step = np.median(np.diff(bet.imu_time_s)) if len(bet.imu_time_s) > 1 else 0.0
     h = min(HALF_WINDOW_S, max(SWING_HALF_WINDOW_S, LEAST_SAMPLES * float(step)))
-    at = sensed(bet, t, vehicle.cg_m - accelerometer.spec.position_from_datum_body_m, h)
+    arm = vehicle.cg_m - accelerometer.spec.position_from_datum_body_m
+    at = sensed(bet, t, arm, h)
     velocity = air.velocity_air_body_mps[inside]
     root = bet.accelerometer_root[inside]
     return PulseData(
@@ -100,4 +101,7 @@ def pulse_data(telemetry: Telemetry, bet: Reconstruction, air: AirData) -> Pulse
         dynamic_pressure_sd_pa=air.dynamic_pressure_sd_pa[inside],
         airspeed_mps=air.airspeed_mps[inside],
         vehicle=vehicle,
+        force_clock_sd_s=accelerometer.spec.time_bias_sd_s,
+        rate_clock_sd_s=rates.spec.time_bias_sd_s,
+        cg_from_sensor_m=arm,
     )

@@ -7,8 +7,17 @@ import pytest
 from scipy.stats import chi2
 
 from estimators import normal_equations
-from estimators.evidence import FILM_CLOCK, LIGHT_TIME_S, Evidence, evidence_of_history, forgetful, moved_evidence
+from estimators.evidence import (
+    FILM_CLOCK,
+    LIGHT_TIME_S,
+    Evidence,
+    evidence_of_history,
+    forgetful,
+    moved_evidence,
+    read_later,
+)
 from estimators.fusion import clock_is_seen, fuse, smoothed
+from estimators.pulse import carried
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
 from postflight.fused import FilmClock, fuse_flight
@@ -120,6 +129,49 @@ def test_a_clock_taken_as_right_moves_nothing_but_is_told():
     assert fuse_flight(pulse, None).clock_summary() is None
     assert allowed.clock_summary()["applied"]
     assert not FilmClock(0.01, 0.01, False).is_off
+
+
+def test_late_triads_are_set_right():
+    """What accelerometer and gyros say, each with its own clock, and what the one carries for the other."""
+    arm, late_force, late_rate = np.array([-0.4, 0.1, 0.2]), 0.004, -0.003
+
+    def signals(time_s):
+        turn = 2.0 * np.pi * 0.65 * time_s[:, None] + np.array([0.0, 1.0, 2.5])
+        rate = 0.2 * np.sin(turn)
+        return 5.0 * np.cos(2.0 * turn), rate, 0.4 * np.pi * 0.65 * np.cos(turn)
+
+    def told(force_s, rate_s):
+        (force, _, _), (_, rate, turn) = signals(TIME_S - force_s), signals(TIME_S - rate_s)
+        flow = 0.3 * rate[:, 1:]
+        return replace(
+            pulse_of(np.random.default_rng(1), len(TIME_S), bent(TIME_S))[0],
+            specific_force_body_mps2=force + carried(rate, turn, arm),
+            flow_yz_rad=flow,
+            rate_body_radps=rate,
+            angular_acceleration_body_radps2=turn,
+            cg_from_sensor_m=arm,
+        )
+
+    got, want = (
+        read_later(told(late_force, late_rate), np.full(len(TIME_S), True), late_force, late_rate),
+        told(0.0, 0.0),
+    )
+    for name in ("specific_force_body_mps2", "flow_yz_rad", "rate_body_radps", "angular_acceleration_body_radps2"):
+        scale = np.abs(getattr(want, name)).max()
+        np.testing.assert_allclose(getattr(got, name), getattr(want, name), atol=1e-3 * scale, err_msg=name)
+
+
+def test_the_triads_clocks_are_in_the_films_sd():
+    pulse, truth = pulse_of(np.random.default_rng(11), len(TIME_S), bent(TIME_S, 0.7))
+    cov = np.tile(np.deg2rad(0.05) ** 2 * np.eye(2), (len(TIME_S), 1, 1))
+    told = history_from_lateral(TIME_S, truth, cov, "camera", "")
+    late = read_later(pulse, np.full(len(TIME_S), True), -0.01, -0.01)
+    trusting = fuse_flight(late, told, film_clock_sd_s=TOLD_SD_S).film_clock
+    stated = replace(late, force_clock_sd_s=0.01, rate_clock_sd_s=0.01)
+    allowing = fuse_flight(stated, told, film_clock_sd_s=TOLD_SD_S).film_clock
+    assert trusting.offset_s == pytest.approx(-0.01, abs=3.0 * trusting.sd_s)
+    assert allowing.sd_s**2 > trusting.sd_s**2 + 0.5 * 0.01**2
+    assert abs(allowing.offset_s) < 2.0 * allowing.sd_s
 
 
 def test_a_late_film_that_leaves_no_common_answer_is_told_as_such():

@@ -7,8 +7,11 @@ import pytest
 from scipy.stats import chi2
 
 from estimators import normal_equations
-from estimators.agreement import agreement
+from estimators.agreement import agreement, gross_gain
 from estimators.evidence import (
+    ACCELEROMETER,
+    FORCE_CLOCK,
+    RATE_CLOCK,
     WIND,
     Evidence,
     corrected_pulse,
@@ -17,9 +20,12 @@ from estimators.evidence import (
     forgetful,
     moved_evidence,
     moved_vehicle,
+    offset_sd_m,
 )
 from estimators.fusion import FarInputsError, fuse, pulse_reader
+from estimators.gross_errors import COEFFICIENTS, GROSS_MOUNT_RAD, MOUNT, OFFSET, gross_errors
 from estimators.misalignment import misalignment_evidence
+from estimators.normal_equations import Learnt
 from estimators.trim import trim_evidence
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
@@ -166,7 +172,9 @@ def test_fused_is_better_than_each_and_learns_the_coefficient():
 def test_moving_the_inputs_moves_the_reading_by_the_response():
     """J of every input against a finite change, both methods; the deflection to be linear about is the reading."""
     pulse, _ = pulse_of(np.random.default_rng(4), 30)
+    pulse = replace(pulse, force_clock_sd_s=2e-3, rate_clock_sd_s=1e-3, cg_from_sensor_m=np.array([-0.4, 0.1, 0.2]))
     use, rng = pulse.informative, np.random.default_rng(5)
+    assert {FORCE_CLOCK, RATE_CLOCK} <= misalignment_evidence(pulse).by_input.keys()
     for method in METHODS.values():
         base = method(pulse, use, None)
         for name, response in base.by_input.items():
@@ -231,3 +239,44 @@ def test_a_gross_planted_error_is_named(moved, culprit):
     found = agreement(read({}, None), learnt)
     assert found.suspects[0] == culprit
     assert culprit in found.words
+
+
+def linear_learnt(rng, place):
+    """What is learnt of inputs, from readings that hold nothing but them and noise: rows, readings, posterior."""
+    size = max(at.stop for at in place.values())
+    rows = rng.normal(size=(3 * size, size))
+    read = rows @ rng.standard_normal(size) + rng.standard_normal(3 * size)
+    covariance = np.linalg.inv(np.eye(size) + rows.T @ rows)
+    return rows, read, Learnt(covariance @ rows.T @ read, covariance, place)
+
+
+def test_the_gain_of_a_gross_error_is_its_likelihood_ratio():
+    """Against the two densities of the readings written out."""
+    rng = np.random.default_rng(12)
+    rows, read, learnt = linear_learnt(rng, {"a": slice(0, 3), "b": slice(3, 5)})
+    columns = rng.normal(size=(5, 2))
+    sound = np.eye(len(read)) + rows @ rows.T
+    wrong = sound + rows @ columns @ columns.T @ rows.T
+    ratio = [-0.5 * (read @ np.linalg.solve(c, read) + np.linalg.slogdet(c)[1]) for c in (wrong, sound)]
+    assert gross_gain(learnt, columns) == pytest.approx(ratio[0] - ratio[1])
+
+
+def test_gross_errors_move_the_readings_by_their_sizes():
+    """Each column's response is what the error itself does to the readings, to first order."""
+    pulse, _ = pulse_of(np.random.default_rng(13), N, bent())
+    use = pulse.through_pulse
+    got = fuse(pulse_reader(pulse, METHODS, []))
+    gross = gross_errors(pulse, got.learnt, np.deg2rad(1.0))
+    assert set(gross) == {COEFFICIENTS, MOUNT, OFFSET}  # no camera, no plane of its own
+    for suspect, column, moved in (
+        (COEFFICIENTS, 0, {"C_m": 0.15 / VEHICLE.uncertainty.cm}),
+        (OFFSET, 1, {"initial offset z": 0.005 / np.sqrt(2.0) / offset_sd_m(VEHICLE)}),
+    ):
+        inputs = {name: gross[suspect][at, column] for name, at in got.learnt.place.items()}
+        for name, value in moved.items():
+            assert inputs.pop(name)[0] == pytest.approx(value)
+        assert not any(x.any() for x in inputs.values())
+    # the conftest's accelerometer knows three biases: a turn of the drag is what they can make of it
+    turn = pulse.force_root_mps2[use] @ gross[MOUNT][got.learnt.place[ACCELEROMETER], 1]
+    want = np.cross(GROSS_MOUNT_RAD / np.sqrt(2.0) * np.array([0.0, 0.0, 1.0]), pulse.specific_force_body_mps2[use])
+    assert np.linalg.norm(turn - want) < 0.5 * np.linalg.norm(want)
