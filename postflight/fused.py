@@ -27,7 +27,7 @@ LOOSE_CLOCK_SD_S = 0.3  # of a film's clock that is taken as right, when it is a
 
 @dataclass(frozen=True)
 class FilmClock:
-    """How late the film's times are against the gyros', s, with one standard deviation, and whether that was used."""
+    """How late the film's times are against the trajectory's, s, with one standard deviation, and whether that was used."""
 
     offset_s: float
     sd_s: float
@@ -38,7 +38,7 @@ class FilmClock:
         """One sentence."""
         late = f"the film's clock is {'late' if self.offset_s > 0.0 else 'early'} by {abs(self.offset_s):.3f} s"
         used = "allowed for in the fusion" if self.applied else "not applied: time_bias_sd_s in [frames] is 0"
-        return f"{late} (1 sd {self.sd_s:.3f} s) against the gyros', {used}"
+        return f"{late} (1 sd {self.sd_s:.3f} s) against the trajectory's, {used}"
 
     @property
     def is_off(self) -> bool:
@@ -57,7 +57,7 @@ class FusedAnswer:
     film_clock: FilmClock | None = None
 
     def clock_summary(self) -> dict[str, Any] | None:
-        """Film's clock against the gyros', for ``summary.json``; None without a film that tells."""
+        """Film's clock against the trajectory's, for ``summary.json``; None without a film that tells."""
         clock = self.film_clock
         if clock is None:
             return None
