@@ -96,6 +96,9 @@ class ReadFilm:
             read = self.against_benchmark()
             back = read.per_benchmark
             covariance = read.covariance + back @ benchmark.covariance @ back.transpose(0, 2, 1)
+            if benchmark.with_readings is not None:
+                crossed = benchmark.with_readings @ back.transpose(0, 2, 1)
+                covariance = covariance + crossed + crossed.transpose(0, 2, 1)
             theta_yz = read.theta_yz_rad + back @ benchmark.theta_yz_rad
             return history_from_lateral(self.time_s, theta_yz, covariance, "camera", self._words(benchmark))
         n = len(self.time_s)
