@@ -137,13 +137,22 @@ class ReadFilm:
             + (f" and {marks:.0f} rows of seams and dots" if marks >= 1.0 else "; no seam and no dot could be used, "
                "which leaves flattening and ovality of the shell in the error bar"),
         ]  # fmt: skip
-        refused = [(t, fit.refused) for t, fit in zip(self.time_s, self.fits, strict=True) if fit.refused]
+        refused: dict[str, list[float]] = {}
+        for t, fit in zip(self.time_s, self.fits, strict=True):
+            if fit.refused:
+                refused.setdefault(fit.refused, []).append(float(t))
         if refused:
-            listed = ", ".join(f"{t:.3f} s: {reason}" for t, reason in refused[:5])
-            words.append(
-                f"{len(refused)} of {len(self.fits)} frames refused ({listed}{', ...' if len(refused) > 5 else ''})"
-            )
+            listed = ", ".join(f"{_spans(times)}: {reason}" for reason, times in list(refused.items())[:5])
+            more = ", ..." if len(refused) > 5 else ""
+            words.append(f"{len(self.fits) - len(seen)} of {len(self.fits)} frames refused ({listed}{more})")
         return "; ".join(words)
+
+
+def _spans(times_s: list[float]) -> str:
+    """Some times in words: one, or how many from the first to the last."""
+    if len(times_s) == 1:
+        return f"{times_s[0]:.3f} s"
+    return f"{len(times_s)} between {times_s[0]:.3f} and {times_s[-1]:.3f} s"
 
 
 def read_film(
