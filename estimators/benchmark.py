@@ -146,6 +146,8 @@ def _fitted(
 def _pose_of_pattern(nominal: VirtualCamera, image: Image, prior: FloatArray) -> FloatArray | None:
     """Pose (12,) at which the pattern of marks fits; None where it stands out nowhere."""
     points = visible_marks(nominal).points_shell_m
+    if len(points) == 0:
+        return None
     at_rest = np.zeros(3)
 
     def pixels(lens: FloatArray) -> FloatArray:

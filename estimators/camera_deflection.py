@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimators.benchmark import orient_camera
+from estimators.benchmark import USUAL_RMS_PX, USUAL_SHARE, orient_camera
 from estimators.benchmark_bending import BenchmarkBending, ReadFrames
 from estimators.camera_fit import FrameFit, HeldFixed, OrientedCamera
 from estimators.seen import Image
@@ -137,6 +137,12 @@ class ReadFilm:
             + (f" and {marks:.0f} rows of seams and dots" if marks >= 1.0 else "; no seam and no dot could be used, "
                "which leaves flattening and ovality of the shell in the error bar"),
         ]  # fmt: skip
+        if oriented.residual_rms_px > USUAL_RMS_PX and oriented.marks_share < USUAL_SHARE:
+            words.append(
+                f"the benchmark frame shows {100.0 * oriented.marks_share:.0f} % of the marks, and the vehicle file's "
+                "lens and shell leave more than a pixel of its edge unexplained: the error bar does not hold; check "
+                "mount, lens and [cameras.NAME.uncertainty]"
+            )
         refused: dict[str, list[float]] = {}
         for t, fit in zip(self.time_s, self.fits, strict=True):
             if fit.refused:

@@ -285,8 +285,21 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
     assert oriented.fit(low, None).refused
 
 
+def test_a_lens_that_cannot_be_is_told():
+    """An edge is found, and bendings, but the benchmark frame is not explained."""
+    times = np.array([421.0, 440.0])
+    wild = {"distortion": (-0.9, 0.9, -0.9, 0.9)}
+    for seed, change, told in ((4, {}, False), (4, wild, True), (5, {"lens": "pinhole"}, True)):
+        frames, mount = film(seed, [0.0, 3.0], [0.0, 180.0]), MOUNT.model_copy(update=change)
+        history = read_film(times, frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None).history()
+        assert ("error bar does not hold" in history.assumptions) == told, change
+
+
 def test_gates_name_what_is_wrong():
     frames = film(4, [0.0], [0.0])
+    ahead = MOUNT.model_copy(update={"axis_from_forward_deg": 178.0})
+    with pytest.raises(GateError, match="does not see the shell's edge"):
+        read_film(np.array([421.0]), frames, GEOMETRY, ahead, JOINT_M)
     with pytest.raises(GateError, match="2 frame times for 1 frames"):
         read_film(np.array([421.0, 422.0]), frames, GEOMETRY, MOUNT, JOINT_M)
     with pytest.raises(GateError, match="benchmark time"):
