@@ -286,13 +286,15 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
 
 
 def test_a_lens_that_cannot_be_is_told():
-    """An edge is found, and bendings, but the benchmark frame is not explained."""
+    """An edge is found, and bendings, but the benchmark frame is not explained, or by a camera too far off."""
     times = np.array([421.0, 440.0])
-    wild = {"distortion": (-0.9, 0.9, -0.9, 0.9)}
-    for seed, change, told in ((4, {}, False), (4, wild, True), (5, {"lens": "pinhole"}, True)):
-        frames, mount = film(seed, [0.0, 3.0], [0.0, 180.0]), MOUNT.model_copy(update=change)
+    for change, told in (({}, False), ({"lens": "pinhole"}, True)):
+        frames, mount = film(5, [0.0, 3.0], [0.0, 180.0]), MOUNT.model_copy(update=change)
         history = read_film(times, frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None).history()
         assert ("error bar does not hold" in history.assumptions) == told, change
+    wild = MOUNT.model_copy(update={"distortion": (-0.9, 0.9, -0.9, 0.9)})
+    with pytest.raises(GateError, match="off what the vehicle file states"):
+        orient_camera(film(4, [0.0], [0.0])[0], GEOMETRY, wild, JOINT_M)
 
 
 def test_gates_name_what_is_wrong():
