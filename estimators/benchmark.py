@@ -7,7 +7,8 @@ prior is wide, and the frame calibrates it, as the seed paper oriented its camer
 
 First the edge alone is fitted, which may be far from where the nominal camera expects it; then marks are looked for
 from farther, then from nearer. Where few turn up, the edge was not the shell's, and the pattern of all marks is looked
-for instead (`estimators.pattern`).
+for instead (`estimators.pattern`). An edge that is not the shell's, the Earth's limb say, may be fitted to a fraction
+of a pixel by a camera that is far from what was known: such a fit is none.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ REACHES_PX = (0, 12, 8)
 SETTLED_SD = 1e-2
 USUAL_SHARE, USUAL_RMS_PX = 0.75, 1.0
 WORST_RMS_PX = 2.5
+WORST_CORRECTIONS = 31.8  # chi-square of eight corrections that one sound frame in 10,000 exceeds
 PAINTED_M = 0.003
 FOCAL, FOCAL_PIECE = 3, 0.08
 BUILT_RAD = np.deg2rad(0.3)
@@ -134,6 +136,13 @@ def _fitted(
         raise GateError(
             f"benchmark frame: the edge is not the shell's (rms {rms:.1f} px); choose another benchmark time"
         )
+    off = float(np.sum((pose[:8] / prior[:8]) ** 2))
+    if off > WORST_CORRECTIONS:
+        raise GateError(
+            f"benchmark frame: the edge found fits best with a camera whose turn and lens are {np.sqrt(off / 8.0):.1f} "
+            "standard deviations (rms of eight) off what the vehicle file states, so it is not the shell's; choose "
+            "another benchmark time, or check the mount, the lens and [cameras.NAME.uncertainty]"
+        )
     # where a mark was painted is left over in every frame: other frames are weighed by how well it was found
     look = _look(_posed(nominal, pose), marks, benchmark, reaches_px[-1], painted_m=0.0)
     per_bending = gain[:POSES] @ seen.rows[:, BENDING]
@@ -146,6 +155,8 @@ def _fitted(
 def _pose_of_pattern(nominal: VirtualCamera, image: Image, prior: FloatArray) -> FloatArray | None:
     """Pose (12,) at which the pattern of marks fits; None where it stands out nowhere."""
     points = visible_marks(nominal).points_shell_m
+    if len(points) == 0:
+        return None
     at_rest = np.zeros(3)
 
     def pixels(lens: FloatArray) -> FloatArray:

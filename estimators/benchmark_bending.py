@@ -16,6 +16,10 @@ too, by the evidence of the readings over `SLACKS_RAD`: slack of a size that the
 bar. All is Gaussian, and the bending of the benchmark, held as before by what it was taken to be, is one conditional
 mean and covariance, a mixture over sizes of the slack.
 
+The same film tells it and is mended by it, and the two errors are not independent: what errs alike in all frames looks
+like a bending of the benchmark, and is taken out with it. With ``theta(t_b) = K read``, the error ``e`` of a frame and
+that of the benchmark's bending have the covariance ``cov(e, readings' errors) K'``.
+
 Source: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, chapters 2 and 5.
 """
 
@@ -48,10 +52,14 @@ VAGUE = 30.0  # prior sd of the compliance, in the values found
 
 @dataclass(frozen=True)
 class BenchmarkBending:
-    """Bending of the benchmark frame as a lateral vector (2,), rad, body y and z, and its covariance (2, 2)."""
+    """Bending of the benchmark frame as a lateral vector (2,), rad, body y and z, and its covariance (2, 2).
+
+    ``with_readings`` (n, 2, 2): covariance of every reading's error (rows) with this one's; None: they are independent.
+    """
 
     theta_yz_rad: FloatArray
     covariance: FloatArray
+    with_readings: FloatArray | None = None
 
     @property
     def words(self) -> str:
@@ -182,7 +190,7 @@ def _mixture(
     held = np.hstack([np.zeros((2, 2 * n)), np.eye(2)])
     look = np.vstack([look, held])  # the benchmark is held at zero as well: a reading more
     read = np.append(frames.theta_yz_rad[rows].ravel(), np.zeros(2))
-    camera = _camera_covariance(frames, rows)
+    camera = _camera_covariance(frames, rows, rows)
     apart = np.abs(times[:, None] - times[None, :])
     follows = np.asarray(np.kron(np.exp(-apart / SLACK_TIME_S), np.eye(2)), dtype=float)
     # freeplay is taken up towards the moment's side, as far as that is known
@@ -193,32 +201,40 @@ def _mixture(
     load = (look @ moment.value_nm.ravel())[: 2 * n]
     compliance = float(load @ read[: 2 * n] / (load @ load))
 
-    def posterior(slack_rad: float, freeplay_rad: float) -> tuple[FloatArray, FloatArray, float, float]:
+    def posterior(slack_rad: float, freeplay_rad: float) -> _Posterior:
         error = block_diag(camera, (held_rad**2 + slack_rad**2 + freeplay_rad**2) * np.eye(2))
         law = _law_covariance(moment, compliance, follows)
         return _posterior(law + slack_rad**2 * follows + freeplay_rad**2 * taken_up, look, read, error, moment)
 
     for _ in range(PASSES):
-        compliance = posterior(*USUAL_RAD)[2]
+        compliance = posterior(*USUAL_RAD).compliance
     found = [posterior(*sizes) for sizes in SIZES_RAD]
-    evidence = np.array([one[3] for one in found])
+    evidence = np.array([one.log_evidence for one in found])
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
-    mean = sum(w * one[0] for w, one in zip(weight, found, strict=True))
-    spread = sum(w * (one[1] + np.outer(one[0] - mean, one[0] - mean)) for w, one in zip(weight, found, strict=True))
+    gain = np.einsum("k,kij->ij", weight, [one.gain for one in found])
+    mean = gain @ read
+    off = np.array([one.gain @ read for one in found]) - mean
+    spread = np.einsum("k,kij->ij", weight, [one.covariance for one in found]) + (weight * off.T) @ off
     # shapes of slack and freeplay are guesses: what there is of them here stays in the error bar
     slack_var, freeplay_var = weight @ SIZES_RAD**2
     stays = float(slack_var + freeplay_var * loose[-1] ** 2)
-    return BenchmarkBending(np.asarray(mean), np.asarray(spread + stays * np.eye(2)))
+    seen = np.flatnonzero(np.isfinite(frames.theta_yz_rad).all(axis=1))
+    together = np.full((len(frames.time_s), 2, 2), np.nan)
+    together[seen] = (_camera_covariance(frames, seen, rows) @ gain[:, : 2 * n].T).reshape(-1, 2, 2)
+    return BenchmarkBending(np.asarray(mean), np.asarray(spread + stays * np.eye(2)), together)
 
 
-def _camera_covariance(frames: ReadFrames, rows: NDArray[np.intp]) -> FloatArray:
-    """Of all readings, (2 n, 2 n): a part lasts, the rest forgets with the light, as the fusion takes it."""
-    value, axes = np.linalg.eigh(frames.covariance[rows])
-    root = (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
-    apart = np.abs(frames.time_s[rows][:, None] - frames.time_s[rows][None, :])
+def _camera_covariance(frames: ReadFrames, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> FloatArray:
+    """Of readings, (2 n, 2 m): a part lasts, the rest forgets with the light, as the fusion takes it."""
+    ends = []
+    for k in (rows, columns):
+        value, axes = np.linalg.eigh(frames.covariance[k])
+        ends.append((axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1))
+    apart = np.abs(frames.time_s[rows][:, None] - frames.time_s[columns][None, :])
     shared = CONSTANT_PART + (1.0 - CONSTANT_PART) * np.exp(-apart / LIGHT_TIME_S)
-    return np.asarray(np.einsum("iab,ij,jcb->iajc", root, shared, root).reshape(2 * len(rows), 2 * len(rows)))
+    both = np.einsum("iab,ij,jcb->iajc", ends[0], shared, ends[1])
+    return np.asarray(both.reshape(2 * len(rows), 2 * len(columns)))
 
 
 def _law_covariance(moment: _Moment, compliance: float, follows: FloatArray) -> FloatArray:
@@ -230,16 +246,26 @@ def _law_covariance(moment: _Moment, compliance: float, follows: FloatArray) -> 
     return VAGUE**2 * np.outer(flat, flat) + inputs @ inputs.T + np.outer(size, size) * follows + noise
 
 
+@dataclass(frozen=True)
+class _Posterior:
+    """Of the benchmark's bending: gain (2, m) on the readings, covariance, compliance, logarithm of the evidence."""
+
+    gain: FloatArray
+    covariance: FloatArray
+    compliance: float
+    log_evidence: float
+
+
 def _posterior(
     bending: FloatArray, look: FloatArray, read: FloatArray, error: FloatArray, moment: _Moment
-) -> tuple[FloatArray, FloatArray, float, float]:
-    """Mean and covariance of the benchmark's bending, the compliance, and the logarithm of the evidence."""
+) -> _Posterior:
     cross = bending @ look.T
     factor = cho_factor(look @ cross + error, lower=True)
     solved = cho_solve(factor, read)
     theta = cross @ solved
     last = slice(-2, None)
-    covariance = bending[last, last] - cross[last] @ cho_solve(factor, cross[last].T)
+    gain = cho_solve(factor, cross[last].T).T
+    covariance = bending[last, last] - gain @ cross[last].T
     flat = moment.value_nm.ravel()
     log = -0.5 * float(read @ solved) - float(np.log(np.diag(factor[0])).sum())
-    return theta[last], covariance, float(flat @ theta / (flat @ flat)), log
+    return _Posterior(gain, covariance, float(flat @ theta / (flat @ flat)), log)

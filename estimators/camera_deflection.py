@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimators.benchmark import orient_camera
+from estimators.benchmark import USUAL_RMS_PX, USUAL_SHARE, orient_camera
 from estimators.benchmark_bending import BenchmarkBending, ReadFrames
 from estimators.camera_fit import FrameFit, HeldFixed, OrientedCamera
 from estimators.seen import Image
@@ -96,6 +96,9 @@ class ReadFilm:
             read = self.against_benchmark()
             back = read.per_benchmark
             covariance = read.covariance + back @ benchmark.covariance @ back.transpose(0, 2, 1)
+            if benchmark.with_readings is not None:
+                crossed = benchmark.with_readings @ back.transpose(0, 2, 1)
+                covariance = covariance + crossed + crossed.transpose(0, 2, 1)
             theta_yz = read.theta_yz_rad + back @ benchmark.theta_yz_rad
             return history_from_lateral(self.time_s, theta_yz, covariance, "camera", self._words(benchmark))
         n = len(self.time_s)
@@ -134,13 +137,28 @@ class ReadFilm:
             + (f" and {marks:.0f} rows of seams and dots" if marks >= 1.0 else "; no seam and no dot could be used, "
                "which leaves flattening and ovality of the shell in the error bar"),
         ]  # fmt: skip
-        refused = [(t, fit.refused) for t, fit in zip(self.time_s, self.fits, strict=True) if fit.refused]
-        if refused:
-            listed = ", ".join(f"{t:.3f} s: {reason}" for t, reason in refused[:5])
+        if oriented.residual_rms_px > USUAL_RMS_PX and oriented.marks_share < USUAL_SHARE:
             words.append(
-                f"{len(refused)} of {len(self.fits)} frames refused ({listed}{', ...' if len(refused) > 5 else ''})"
+                f"the benchmark frame shows {100.0 * oriented.marks_share:.0f} % of the marks, and the vehicle file's "
+                "lens and shell leave more than a pixel of its edge unexplained: the error bar does not hold; check "
+                "mount, lens and [cameras.NAME.uncertainty]"
             )
+        refused: dict[str, list[float]] = {}
+        for t, fit in zip(self.time_s, self.fits, strict=True):
+            if fit.refused:
+                refused.setdefault(fit.refused, []).append(float(t))
+        if refused:
+            listed = ", ".join(f"{_spans(times)}: {reason}" for reason, times in list(refused.items())[:5])
+            more = ", ..." if len(refused) > 5 else ""
+            words.append(f"{len(self.fits) - len(seen)} of {len(self.fits)} frames refused ({listed}{more})")
         return "; ".join(words)
+
+
+def _spans(times_s: list[float]) -> str:
+    """Some times in words: one, or how many from the first to the last."""
+    if len(times_s) == 1:
+        return f"{times_s[0]:.3f} s"
+    return f"{len(times_s)} between {times_s[0]:.3f} and {times_s[-1]:.3f} s"
 
 
 def read_film(

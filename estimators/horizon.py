@@ -111,6 +111,8 @@ def no_horizon(reason: str) -> HorizonLine:
 
 def fault_of_frame(image: Image, size_px: tuple[int, int]) -> str:
     """Say why a frame cannot be used before any edge is searched: size, darkness, saturation; empty when it can."""
+    if image.size == 0:
+        return "cannot be decoded"
     if image.ndim != 2 or image.dtype != np.uint8:
         return f"not an 8-bit grey image (shape {image.shape}, {image.dtype})"
     if image.shape != (size_px[1], size_px[0]):
@@ -120,7 +122,7 @@ def fault_of_frame(image: Image, size_px: tuple[int, int]) -> str:
     below = np.cumsum(count)
     low, high = (float(np.searchsorted(below, share * below[-1], side="right")) for share in (0.05, 0.95))
     if high < 2.0 * LEAST_CONTRAST:
-        return f"too dark: 95 % of the pixels are below grey level {high:.0f}"
+        return f"too dark: 95 % of the pixels are no brighter than grey level {high:.0f} of 255"
     _edge_kernels.levels(image, 4, 4, count)
     if low > 250.0 or count[254:].sum() > 0.5 * count.sum():
         return "saturated: more than half of the pixels are at full scale"

@@ -27,6 +27,7 @@ from flightmodel.deflection import rotation_vector_body_shell
 from flightmodel.geometry import torus_circles
 from flightmodel.vehicle import ShellGeometry
 
+OUT_OF_SIGHT = "the camera does not see the shell's edge; check its mount and lens in the vehicle file"
 EDGE_POINTS = 201
 OUTER_PX, INNER_PX = 75.0, 45.0
 
@@ -145,6 +146,8 @@ class VirtualCamera:
         seen = self.sight(self._unflattened(points, flat), bending)
         inside = np.isfinite(seen.pixels[:, 0])
         pixels = seen.pixels[inside]
+        if len(pixels) < 3:
+            raise GateError(OUT_OF_SIGHT)
         tangent = np.empty_like(pixels)
         tangent[1:-1] = pixels[2:] - pixels[:-2]
         tangent[0], tangent[-1] = pixels[1] - pixels[0], pixels[-1] - pixels[-2]
@@ -172,7 +175,7 @@ class VirtualCamera:
         edge = self.edge(np.zeros(3))
         inside = np.flatnonzero(self.camera.is_inside(edge.pixels, 6.0))
         if len(inside) < 2:
-            raise GateError("the camera does not see the shell's edge; check its mount and lens in the vehicle file")
+            raise GateError(OUT_OF_SIGHT)
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(edge.pixels[inside], axis=0), axis=1))])
         return np.interp(np.linspace(0.0, length[-1], count), length, edge.clocks_rad[inside])
 

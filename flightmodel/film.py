@@ -8,6 +8,7 @@ refuse by name.
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from flightmodel.vehicle import CameraMount
 
 Image = NDArray[np.uint8]
 
+# read at the first film: what cannot be decoded is said by frame, decoders' own lines on standard error say no more
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 WEBM_START = b"\x1aE\xdf\xa3"
 PICTURE_KINDS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
@@ -156,7 +159,7 @@ def fault_of_film(path: Path, camera: CameraMount, last_number: int) -> str:
     film = cv2.VideoCapture(str(path))
     try:
         if not film.isOpened():
-            return UNKNOWN_FILM
+            return f"{UNKNOWN_FILM}; if it is one, it is cut off (an .mp4 has its index at its end)"
         width, height = (round(film.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if (width, height) != (camera.width_px, camera.height_px):
             return f"is {width} x {height} pixels, the camera {camera.width_px} x {camera.height_px}"

@@ -164,8 +164,23 @@ class FlightFile(Section):
         single = [s for s in (*onboard, self.atmosphere, self.frames) if s is not None]
         return [*single, *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
-    def misfits(self) -> list[str]:
-        """Return what does not go together, each with what to write instead."""
+    def misfits(self, needs_path: bool = True) -> list[str]:
+        """Return what does not go together, each with what to write instead.
+
+        Without ``needs_path`` a folder with a film and neither radar nor receiver is whole.
+        """
+        out: list[str] = []
+        if needs_path or self.radars or self.gnss or self.frames is None:
+            out += self._misfits_of_path()
+        if self.frames and self.vehicle is None:
+            out.append('frames: their camera stands in a vehicle file; add vehicle = "..."')
+        names = [*self.radars, *self.gnss, *self.barometers]
+        for name in sorted({n for n in names if names.count(n) > 1}):
+            out.append(f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name")
+        return out
+
+    def _misfits_of_path(self) -> list[str]:
+        """Return what keeps a path from being found."""
         out = []
         triads = [name for name in ("accelerometer", "rates") if getattr(self.sensors, name) is not None]
         if not self.radars and not self.gnss:
@@ -187,11 +202,6 @@ class FlightFile(Section):
             out.append(
                 f"nothing says how the vehicle was turned: {words}, or both [sensors.magnetometer] and [sensors.sun]"
             )
-        if self.frames and self.vehicle is None:
-            out.append('frames: their camera stands in a vehicle file; add vehicle = "..."')
-        names = [*self.radars, *self.gnss, *self.barometers]
-        for name in sorted({n for n in names if names.count(n) > 1}):
-            out.append(f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name")
         return out
 
 

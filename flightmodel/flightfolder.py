@@ -60,7 +60,9 @@ class Sources:
     attitude_prior: AttitudePrior | None
 
 
-def read_sources(folder: Path, progress: Callable[[float], None] | None = None) -> Sources:
+def read_sources(
+    folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True
+) -> Sources:  # fmt: skip
     """Read every table of a flight that can be read; faults and findings are kept in the gate.
 
     Parameters
@@ -69,6 +71,8 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None) 
         Flight folder with ``flight.toml``.
     progress : callable, optional
         Is told which part of large tables is read.
+    needs_path : bool
+        Whether a folder without radar and receiver is refused even where it has a film.
 
     Raises
     ------
@@ -79,7 +83,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None) 
     gate = Gate(folder, parse_utc(spec.t0_utc))
     if progress is not None:
         gate.tell = _share_of(folder, spec, progress)
-    for words in spec.misfits():
+    for words in spec.misfits(needs_path):
         gate.refuse_config(words)
     vehicle = _vehicle(gate, spec.vehicle) if spec.vehicle is not None else None
     triads = {name: read_triad(gate, name, spec, vehicle) for name in ("accelerometer", "rates", "magnetometer")}
@@ -102,7 +106,9 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None) 
     return Sources(gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, frames, prior)
 
 
-def read_flight(folder: Path, progress: Callable[[float], None] | None = None) -> Telemetry:
+def read_flight(
+    folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True
+) -> Telemetry:  # fmt: skip
     """Read everything measured on one flight.
 
     Parameters
@@ -111,6 +117,8 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None) -
         Flight folder with ``flight.toml``.
     progress : callable, optional
         Is told which part of large tables is read.
+    needs_path : bool
+        Whether a folder without radar and receiver is refused even where it has a film.
 
     Raises
     ------
@@ -119,7 +127,7 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None) -
     GateError
         For faults of the data files: all of them, each with file, line or time, and what to do.
     """
-    found = read_sources(folder, progress)
+    found = read_sources(folder, progress, needs_path)
     gate, spec = found.gate, found.spec
     gate.close()
     assert found.sounding is not None
@@ -143,6 +151,8 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None) -
         barometers=found.barometers,
         motion=_motion(spec.motion),
     )
+    if not found.radars and not found.gnss:
+        return telemetry
     start, stop = telemetry.span_s()
     if stop - start < LEAST_SPAN_S:
         who = "accelerometer, rates and" if telemetry.accelerometer is not None else "the flight's"

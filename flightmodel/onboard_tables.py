@@ -215,6 +215,10 @@ def _film_numbers(
     if wrong:
         gate.faults.append(f"frames: {film}: {wrong}")
         return numbers
+    again = int((np.diff(numbers) == 0).sum())
+    if again:
+        words = f"{path.name}: {again} of {len(numbers)} lines name the same frame as the line before; check the list"
+        gate.findings.append(Finding("frames", words, np.nan, np.nan))
     doubt = doubt_of_film(film)
     if doubt:
         gate.findings.append(Finding("frames", f"{film.name}: {doubt}", np.nan, np.nan))

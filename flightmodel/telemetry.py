@@ -253,7 +253,8 @@ class Finding:
 class Telemetry:
     """Everything measured on one flight, plus what the analyst states about vehicle, start and motion.
 
-    Accelerometer and rates are there both or neither. At least one radar or receiver is there.
+    Accelerometer and rates are there both or neither. At least one radar or receiver is there, but
+    where the film alone is looked at.
     """
 
     name: str
@@ -293,8 +294,9 @@ class Telemetry:
 
     @property
     def can_tell_moment(self) -> bool:
-        """Whether there are a vehicle and inertial sensors, which measure the moment in the joint."""
-        return self.vehicle is not None and self.accelerometer is not None and self.rates is not None
+        """Whether there are a vehicle, inertial sensors, which measure the moment in the joint, and a path for them."""
+        triads = self.accelerometer is not None and self.rates is not None
+        return self.vehicle is not None and triads and bool(self.radars or self.gnss)
 
     def required_triads(self) -> tuple[TriadRecord, TriadRecord]:
         """Return accelerometer and rates, or raise `GateError` where flight.toml names none."""

@@ -268,7 +268,7 @@ def deflection(
     folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None, film: bool = False
 ) -> None:
     """Estimate the deflection alone; the camera needs no trajectory, and is told more where one can be made."""
-    telemetry = read_flight(folder)
+    telemetry = read_flight(folder, needs_path=set(methods) != {"camera"})
     if not methods:
         methods = tuple(m for m in METHODS if m != "camera" or telemetry.frames is not None)
     plane_rad = None if plane_deg is None else float(np.deg2rad(plane_deg))
@@ -297,6 +297,8 @@ def deflection(
                 drawing.draw_camera(telemetry, history, out.path / "figures", joint_m)
                 if film:
                     write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", joint_m, report)
+    for finding in telemetry.findings:
+        console.print(f"[yellow]found[/] {escape(str(finding))}")
     if trouble:
         console.print(f"[yellow]no trajectory[/], the camera answers alone: {escape(trouble)}")
     # without a trajectory the camera's own largest deflection is what can be named
@@ -304,6 +306,8 @@ def deflection(
     print_answers(answers, peak_s, " (peak q)" if flight else " (its largest; no trajectory was made)")
     if "camera" in answers.histories:
         console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
+    elif film:
+        console.print("[yellow]no film[/] was drawn: there is no answer of the camera to lay over it")
     console.print(f"results in {escape(str(out.path))}")
     if answers.refused:
         sys.exit(EXIT_NO_ANSWER)

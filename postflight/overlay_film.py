@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -36,7 +39,8 @@ def write_overlay_film(
     partial = path.with_suffix(".part.webm")
     rate = 1.0 / float(np.median(np.diff(frames.time_s))) if len(frames.time_s) > 1 else 1.0
     size = (frames.camera.width_px, frames.camera.height_px)
-    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"VP90"), round(rate, 3), size)
+    with _without_standard_error():  # OpenCV says there that it takes another tag for VP9, which is no fault
+        writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"VP90"), round(rate, 3), size)
     if not writer.isOpened():
         raise GateError(f"{path}: this build of OpenCV cannot write VP9 films; leave out --film")
     try:
@@ -65,3 +69,21 @@ def write_overlay_film(
     finally:
         writer.release()
         partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _without_standard_error() -> Iterator[None]:
+    """Let nothing through to standard error that libraries write there past Python."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # closed
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(nowhere)
+        os.close(kept)

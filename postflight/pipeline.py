@@ -289,7 +289,10 @@ def estimate(
         except GateError as fault:
             refused[method] = str(fault)
             continue
-        if np.isfinite(history.theta_rad).any():
+        answered = np.isfinite(history.theta_rad)
+        if method == "camera" and answered.any() and not answered[film.time_s != film.benchmark_s].any():
+            refused[method] = f"no frame but the benchmark frame can be used ({history.assumptions})"
+        elif answered.any():
             histories[method] = history
         else:
             refused[method] = f"no sample could be answered ({history.assumptions})"

@@ -41,7 +41,7 @@ PULSE = flown()
 
 
 def drawn(rng, freeplay_rad=0.0):
-    """A film's readings, and the benchmark's true bending: compliance, sensors' and camera's errors are drawn."""
+    """A film's readings, and the true bendings in its frames: compliance, sensors' and camera's errors are drawn."""
     said = joint_moment(PULSE)
     compliance = 1.0 / rng.uniform(3000.0, 9000.0)
     moment = said.value_nm + said.by_input_nm @ rng.standard_normal(said.by_input_nm.shape[2])
@@ -54,7 +54,7 @@ def drawn(rng, freeplay_rad=0.0):
     n = len(FRAMES_S)
     read = theta_yz - theta_yz[0] + READ_SD_RAD * camera
     covariance = np.tile(READ_SD_RAD**2 * np.eye(2), (n, 1, 1))
-    return ReadFrames(FRAMES_S, read, covariance, np.tile(np.eye(2), (n, 1, 1)), FRAMES_S[0]), theta_yz[0]
+    return ReadFrames(FRAMES_S, read, covariance, np.tile(np.eye(2), (n, 1, 1)), FRAMES_S[0]), theta_yz
 
 
 def told(count, freeplay_rad=0.0):
@@ -63,7 +63,7 @@ def told(count, freeplay_rad=0.0):
     for _ in range(count):
         frames, bent = drawn(rng, freeplay_rad)
         got = benchmark_bending(frames, PULSE, HELD_RAD)
-        rows.append((got.theta_yz_rad - bent, np.sqrt(np.diag(got.covariance)), bent))
+        rows.append((got.theta_yz_rad - bent[0], np.sqrt(np.diag(got.covariance)), bent[0]))
     error, sd, bent = np.moveaxis(np.array(rows), 1, 0)
     return error, sd, bent
 
@@ -94,6 +94,23 @@ def test_errors_lie_in_their_bars_whatever_the_compliance():
     assert np.sqrt(np.mean(sd**2)) < D(0.04)
     assert np.mean(np.abs(error) < sd) > 0.61
     assert np.mean(np.abs(error) < 2.0 * sd) > 0.93
+
+
+def test_its_error_goes_against_that_of_the_readings_as_it_says():
+    """100 draws of two axes, mean over all frames; mirror images of the camera's errors make the rest fall out."""
+    rng, k, products, said = np.random.default_rng(5), 20, [], []
+    for _ in range(100):
+        frames, bent = drawn(rng)
+        error = frames.theta_yz_rad - (bent - bent[0])
+        mirrored = replace(frames, theta_yz_rad=frames.theta_yz_rad - 2.0 * error)
+        got, other = (benchmark_bending(f, PULSE, HELD_RAD) for f in (frames, mirrored))
+        products.append(error.mean(axis=0) * 0.5 * (got.theta_yz_rad - other.theta_yz_rad))
+        said.append(0.5 * np.diag((got.with_readings + other.with_readings).mean(axis=0)))
+        whole = np.block([[frames.covariance[k], got.with_readings[k]], [got.with_readings[k].T, got.covariance]])
+        assert np.linalg.eigvalsh(whole).min() > 0.0
+    mean, sd_of_mean = np.mean(products), np.std(products) / np.sqrt(np.size(products))
+    assert mean < -4.0 * sd_of_mean
+    assert np.mean(said) == pytest.approx(mean, abs=3.0 * sd_of_mean)
 
 
 def test_with_freeplay_the_bar_grows():
@@ -141,6 +158,12 @@ def test_a_film_whose_benchmark_is_told_is_as_good_as_with_an_unbent_one():
     assert np.abs(put_back.theta_rad[1:] - D(np.array(theta_deg[1:]))).max() < D(0.12)
     assert (put_back.theta_sd_rad < 0.7 * plain.theta_sd_rad)[1:].all()
     assert "bent by 0.40 deg towards 40 deg LV" in put_back.assumptions
+    # what its error and the readings' share is in the bar; a frame that was refused has none
+    together = np.array([np.full((2, 2), np.nan), -2e-8 * np.eye(2), -2e-8 * np.eye(2)])
+    less = read.history(BenchmarkBending(bent, D(0.01) ** 2 * np.eye(2), together))
+    shared = together @ read.against_benchmark().per_benchmark.transpose(0, 2, 1)
+    shared = shared + shared.transpose(0, 2, 1)
+    np.testing.assert_allclose((less.lateral_cov - put_back.lateral_cov)[1:], shared[1:], atol=1e-14)
     # nothing is added to a history by telling what was taken before
     same = read.history(BenchmarkBending(np.zeros(2), HELD_RAD**2 * np.eye(2)))
     np.testing.assert_allclose(same.theta_rad, plain.theta_rad, atol=1e-12)

@@ -268,7 +268,14 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
     times = 421.0 + np.arange(len(pictures))
     history = read_film(times, pictures, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None).history()
     np.testing.assert_array_equal(np.isnan(history.theta_rad), [False] + [True] * 6 + [False])
-    for word in ("too dark", "saturated", "size 720 x 240", "size 0 x 0", "no clear edge", "6 of 8 frames refused"):
+    for word in (
+        "too dark",
+        "saturated",
+        "size 720 x 240",
+        "cannot be decoded",
+        "no clear edge",
+        "6 of 8 frames refused",
+    ):
         assert word in history.assumptions, word
     assert history.theta_rad[-1] == pytest.approx(D(3.0), abs=D(0.4))
     # squeezed, the frame shows an edge that is no bending of this shell's
@@ -278,8 +285,23 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
     assert oriented.fit(low, None).refused
 
 
+def test_a_lens_that_cannot_be_is_told():
+    """An edge is found, and bendings, but the benchmark frame is not explained, or by a camera too far off."""
+    times = np.array([421.0, 440.0])
+    for change, told in (({}, False), ({"lens": "pinhole"}, True)):
+        frames, mount = film(5, [0.0, 3.0], [0.0, 180.0]), MOUNT.model_copy(update=change)
+        history = read_film(times, frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None).history()
+        assert ("error bar does not hold" in history.assumptions) == told, change
+    wild = MOUNT.model_copy(update={"distortion": (-0.9, 0.9, -0.9, 0.9)})
+    with pytest.raises(GateError, match="off what the vehicle file states"):
+        orient_camera(film(4, [0.0], [0.0])[0], GEOMETRY, wild, JOINT_M)
+
+
 def test_gates_name_what_is_wrong():
     frames = film(4, [0.0], [0.0])
+    ahead = MOUNT.model_copy(update={"axis_from_forward_deg": 178.0})
+    with pytest.raises(GateError, match="does not see the shell's edge"):
+        read_film(np.array([421.0]), frames, GEOMETRY, ahead, JOINT_M)
     with pytest.raises(GateError, match="2 frame times for 1 frames"):
         read_film(np.array([421.0, 422.0]), frames, GEOMETRY, MOUNT, JOINT_M)
     with pytest.raises(GateError, match="benchmark time"):

@@ -1,11 +1,14 @@
 """A film instead of images: the same frames by number, and every way in which list and film can disagree."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
 
 from flightmodel.film import film_frames
 from flightmodel.flightfolder import read_flight
+from tests.estimators.test_camera_deflection import film as rendered
 from tests.postflight.test_bad_input import names_line, refused
 
 SHADES = [30, 60, 90, 120, 150, 180]
@@ -105,3 +108,63 @@ def test_folder_and_film_together_or_neither(filmed):
     refused(filmed, "one of folder", "film")
     filmed.replace("flight.toml", 'film = "telemetry/camera5.avi"\nfolder = "telemetry/camera5"\n', "")
     refused(filmed, "one of folder", "film")
+
+
+def test_a_cut_mp4_says_so(filmed):
+    write_film(filmed.root / "telemetry/camera5.mp4", code="mp4v")
+    filmed.replace("flight.toml", "camera5.avi", "camera5.mp4")
+    film = filmed.root / "telemetry/camera5.mp4"
+    film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    refused(filmed, "camera5.mp4", "cut off")
+
+
+def test_one_picture_for_many_times_is_found(filmed):
+    for line in (3, 4):
+        filmed.cell("frames.csv", line, 1, "0")
+    found = [f for f in read_flight(filmed.root).findings if f.source == "frames"]
+    assert any("2 of 3 lines name the same frame" in f.what for f in found)
+
+
+def test_the_command_tells_what_the_gate_found_about_a_film(filmed, command):
+    film = filmed.root / "telemetry/camera5.avi"
+    film.write_bytes(film.read_bytes()[: film.stat().st_size * 2 // 3])
+    done = command("deflection", filmed.root, "--method", "camera", "--plane", "153", "--film")
+    assert done.returncode == 4
+    assert "can be decoded where the film tells of 6" in done.stdout
+    assert "no film" in done.stdout
+
+
+def without_radars(flight):
+    text = flight.path("flight.toml").read_text()
+    flight.path("flight.toml").write_text(re.sub(r"\[radars\.[^\[]*", "", text))
+
+
+@pytest.mark.parametrize("sensors", [True, False])
+def test_the_camera_alone_needs_no_radar(flight, command, sensors):
+    without_radars(flight)
+    if not sensors:
+        text = re.sub(r"\[sensors\.[^\[]*", "", flight.path("flight.toml").read_text())
+        flight.path("flight.toml").write_text(text)
+    straight, bent, _ = pictures = rendered(4, [0.0, 3.0, 3.0], [0.0, 170.0, 180.0])
+    assert straight.shape == bent.shape
+    for k, picture in enumerate(pictures):
+        cv2.imwrite(str(flight.root / f"telemetry/camera5/frame_{k}.png"), picture)
+    done = command("deflection", flight.root, "--method", "camera")
+    assert done.returncode == 0, done.stderr
+    assert "no trajectory was made" in done.stdout
+    for others in ([], ["--method", "fused"], ["--method", "camera", "--method", "trim"]):
+        done = command("deflection", flight.root, *others)
+        assert done.returncode == 2
+        assert "a trajectory needs at least one" in done.stderr
+
+
+def test_a_benchmark_frame_alone_is_no_answer(flight, command):
+    """It is what the bending is measured from: 0.00 deg would be read as an answer."""
+    straight = rendered(4, [0.0], [0.0])[0]
+    for k in range(3):
+        cv2.imwrite(str(flight.root / f"telemetry/camera5/frame_{k}.png"), straight if k == 0 else 0 * straight)
+    done = command("deflection", flight.root, "--method", "camera", "--plane", "153", "--film")
+    assert done.returncode == 4
+    assert "no frame but the benchmark frame can be used" in done.stdout
+    assert "2 between 424.000 and 428.500 s: too dark" in done.stdout
+    assert not list(flight.root.rglob("*.webm"))
