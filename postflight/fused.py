@@ -27,7 +27,7 @@ LOOSE_CLOCK_SD_S = 0.3  # of a film's clock that is taken as right, when it is a
 
 @dataclass(frozen=True)
 class FilmClock:
-    """How late the film's times are against the trajectory's, s, with its standard deviation, and whether it was used."""
+    """How late the film's times are against the trajectory's, s, with its sd, and whether it was used."""
 
     offset_s: float
     sd_s: float
