@@ -119,12 +119,22 @@ class DeflectionHistory:
         if t[k + 1] - t[k] > HOLE_FACTOR * np.median(np.diff(t)) and time_s not in (t[k], t[k + 1]):
             return float("nan"), float("nan")
         theta, sd = self.theta_rad[known], self.theta_sd_rad[known]
-        # what a straight line between answers misses: s (1 - s) / 2 of their second difference, as large as about here;
-        # among few of them all may be small where answers are no denser than the swings
-        share = (time_s - t[k]) / (t[k + 1] - t[k])
-        around = np.diff(theta[max(k - 3, 0) : k + 5], n=2)
-        missed = 0.5 * share * (1.0 - share) * float(np.abs(around).max(initial=0.0))
+        missed = missed_between(t, theta, time_s)
         return float(np.interp(time_s, t, theta)), float(np.hypot(np.interp(time_s, t, sd), missed))
+
+
+def missed_between(known_s: FloatArray, values: FloatArray, time_s: float) -> float:
+    """What a straight line between values ``(n,)`` misses of a curve: of their second difference ``s (1 - s) / 2``.
+
+    It is taken as large as the largest about ``time_s``: among few of them all may be small where values are no denser
+    than the swings.
+    """
+    if not known_s[0] <= time_s <= known_s[-1] or len(known_s) < 3:
+        return 0.0
+    k = int(np.clip(np.searchsorted(known_s, time_s, side="right") - 1, 0, len(known_s) - 2))
+    share = (time_s - known_s[k]) / (known_s[k + 1] - known_s[k])
+    around = np.diff(values[max(k - 3, 0) : k + 5], n=2)
+    return float(0.5 * share * (1.0 - share) * np.abs(around).max(initial=0.0))
 
 
 def lateral_axes(plane_lv_rad: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -6,12 +6,14 @@ import json
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from flightmodel.checks import GateError
+from flightmodel.deflection import lv_clock
 from postflight.report import pictures, words
 from postflight.report.series import with_holes
 from postflight.report.source import read_run
@@ -35,6 +37,19 @@ def text(report: Path) -> str:
 @pytest.fixture(scope="module")
 def run(reported: Path):
     return read_run(reported)
+
+
+def test_a_plane_between_sparse_answers_errs_as_it_says():
+    """A shell that swings around the axis, four answers in 1.5 s: the straight line's error is in the plane's sd."""
+    t, at = np.arange(0.0, 6.0, 0.25), 3.12
+    y, z = 3.0 + np.cos(2.0 * np.pi * t / 1.5), np.sin(2.0 * np.pi * t / 1.5)
+    clock = np.rad2deg(lv_clock(np.column_stack([y, z])))
+    table = pd.DataFrame({"t_s": t, "theta_deg": np.hypot(y, z), "plane_lv_deg": clock, "plane_sd_deg": 0.01})
+    flown = SimpleNamespace(tables={"deflection_camera": table}, summary={"peak_dynamic_pressure_s": at})
+    plane, sd = map(float, words.plane_at(flown, "camera").split(" ± "))
+    turn = 2.0 * np.pi * at / 1.5
+    true = float(np.rad2deg(lv_clock(np.array([3.0 + np.cos(turn), np.sin(turn)]))))
+    assert 0.3 * sd < abs(plane - true) < 2.0 * sd
 
 
 # ------------------------------------------------------------------------------------------------------- one whole file
