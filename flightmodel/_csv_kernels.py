@@ -114,6 +114,16 @@ def exponent(data, k):
 
 
 @exact_kernel
+def leading_zeros(data, k):
+    """How many zeros stand before the digits that count, of a number from byte ``k`` on."""
+    zeros = 0
+    while data[k] == 48 or data[k] == _POINT or data[k] == _MINUS or data[k] == _PLUS:
+        zeros += data[k] == 48
+        k += 1
+    return zeros
+
+
+@exact_kernel
 def read_rows(data, k, stop, slots, tens, high, low, columns, spans, row):
     """Read whole lines of ``data`` from byte ``k`` to ``stop`` into ``columns``, from ``row`` on.
 
@@ -163,7 +173,7 @@ def read_rows(data, k, stop, slots, tens, high, low, columns, spans, row):
                     columns[slot, row] = math.nan
                     k = after_missing(data, start)
                 else:
-                    if digits > 19:  # more than 64 bits hold
+                    if digits > 19 and digits - leading_zeros(data, start) > 19:  # more than 64 bits hold
                         return UNUSUAL
                     if data[k] | 32 == _E:
                         k += 1

@@ -95,6 +95,14 @@ def test_plain_forms(text, value):
     assert not np.signbit(value_of("-0.0"))
 
 
+@pytest.mark.parametrize(
+    "text", ["0.0017631991002529457", "-0.00012345678901234567", "0" * 30, "0.000", "00012345678901234.5"]
+)
+def test_leading_zeros_are_no_digits(text):
+    """Python writes numbers above 1e-4 so: twenty digits, of which seventeen count."""
+    assert value_of(text) == float(text)
+
+
 @pytest.mark.parametrize("text", ["", " ", "nan", "NaN", "NAN", "na", "NA", "null", "Null", "-", " - ", "\t"])
 def test_missing_cells(text):
     assert np.isnan(value_of(text))
