@@ -60,9 +60,7 @@ class Sources:
     attitude_prior: AttitudePrior | None
 
 
-def read_sources(
-    folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True
-) -> Sources:  # fmt: skip
+def read_sources(folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True) -> Sources:
     """Read every table of a flight that can be read; faults and findings are kept in the gate.
 
     Parameters
@@ -106,9 +104,7 @@ def read_sources(
     return Sources(gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, frames, prior)
 
 
-def read_flight(
-    folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True
-) -> Telemetry:  # fmt: skip
+def read_flight(folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True) -> Telemetry:
     """Read everything measured on one flight.
 
     Parameters

@@ -11,7 +11,7 @@ import pandas as pd
 
 from estimators.agreement import CONFIDENCE
 from flightmodel.config import parse_utc
-from flightmodel.deflection import lv_clock, lv_direction, missed_between
+from flightmodel.deflection import lateral_axes, lv_clock, lv_direction, missed_between
 from postflight.figures import LABEL
 from postflight.pipeline import METHODS
 from postflight.report.series import COLOUR
@@ -154,9 +154,9 @@ def plane_at(run: Run, method: str) -> str:
     seen, t = table[known], t[known]
     yz = np.array(seen["theta_deg"])[:, None] * lv_direction(np.deg2rad(np.array(seen["plane_lv_deg"])))[:, 1:]
     here = np.array([np.interp(at, t, c) for c in yz.T])
-    across = np.array([-here[1], here[0]]) / np.linalg.norm(here)
-    missed = missed_between(t, yz @ across, at) / np.linalg.norm(here)
-    clock, sd = np.rad2deg(lv_clock(here)), float(np.hypot(sd, np.rad2deg(missed)))
+    clock = lv_clock(here)
+    missed = missed_between(t, yz @ lateral_axes(clock)[1], at) / np.linalg.norm(here)
+    clock, sd = np.rad2deg(clock), float(np.hypot(sd, np.rad2deg(missed)))
     places = 0 if sd >= 1.0 else 1
     return f"{float(clock):.{places}f} ± {sd:.{places}f}"
 
