@@ -12,14 +12,14 @@ from pathlib import Path
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from flightmodel.flightfolder import read_flight
-from postflight.pipeline import estimate_camera, reconstruct_flight
-from postflight.sensed import pulse_data
-from recon.bet import reconstruct
-from synthetic_flight import packing
-from synthetic_flight.day_air import day_atmosphere
+from postflight.flight import estimate_camera, reconstruct_flight
+from postflight.loads import pulse_data
+from recon.reconstruct import reconstruct
+from synthetic_flight import simulate
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import child_rng, fly_scenario, initial_state, read_scenario
 from synthetic_flight.simulate import integrate
+from synthetic_flight.weather import day_atmosphere
 
 ROUNDS = int(sys.argv[1]) if len(sys.argv) > 1 else 3
 
@@ -37,7 +37,7 @@ def best(work):
 def main():
     scenario = read_scenario("irve2_reference")
     vehicle = scenario.vehicle
-    table = packing.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    table = simulate.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
     state = initial_state(scenario)
     rows = []
     kernel = best(lambda: integrate(vehicle, table, state, 0.002, 2, 110001, 52501))

@@ -15,8 +15,8 @@ import numpy as np
 from problem import PULSE_S, minima, reference_problem
 
 from flightmodel import earth
-from synthetic_flight import _kernels, packing
-from synthetic_flight._workspace_kernels import AUX, STATES
+from synthetic_flight import _kernels, simulate
+from synthetic_flight._kernels import AUX, STATES
 from synthetic_flight.simulate import BENDING_LIMIT_RAD
 
 SOURCE = Path(__file__).parent / "plain_cpp" / "flight.cpp"
@@ -49,15 +49,15 @@ class Flights:
     def __init__(self, problem, lanes):
         self.lanes = lanes
         factors = 1.0 + 0.01 * np.arange(lanes)
-        self.parameters = np.stack([packing.parameter_vector(problem.vehicle, ca=f, cm=f) for f in factors])
+        self.parameters = np.stack([simulate.parameter_vector(problem.vehicle, ca=f, cm=f) for f in factors])
         self.states = np.tile(problem.entry, (lanes, 1))
-        self.tables = packing.kernel_tables(problem.vehicle, np.stack([problem.atmosphere] * lanes))
+        self.tables = simulate.kernel_tables(problem.vehicle, np.stack([problem.atmosphere] * lanes))
 
     def ours(self, seconds, step):
         """Final states (lanes, 20)."""
         steps = round(seconds / step)
         out, aux = np.empty((self.lanes, 2, STATES)), np.empty((self.lanes, 2, AUX))
-        workspace, written = packing.workspace(self.states, self.parameters), np.zeros(self.lanes, dtype=np.int64)
+        workspace, written = simulate.workspace(self.states, self.parameters), np.zeros(self.lanes, dtype=np.int64)
         _kernels.integrate(
             (0,) * self.lanes,
             workspace,

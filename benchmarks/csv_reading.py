@@ -73,10 +73,8 @@ def serve(path):
 
 def ours(folder):
     """Table and findings of the gate."""
-    from flightmodel.columns import Quantity
-    from flightmodel.findings import find_faults
-    from flightmodel.flightfile import Source
-    from flightmodel.gate import Gate
+    from flightmodel.gate import Gate, find_faults
+    from flightmodel.tables import Quantity, Source
 
     quantities = tuple(Quantity(f"a{k}", f"a{k}_mps2", "acceleration") for k in range(CHANNELS))
     gate = Gate(folder, datetime(2009, 8, 17, 12, 52, tzinfo=UTC))

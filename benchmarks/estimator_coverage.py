@@ -24,11 +24,10 @@ import numpy as np
 from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from estimators.agreement import BLAME
+from estimators.agreement import BLAME, CAMERA_TURNED, COEFFICIENTS, MOUNT, OFFSET
 from estimators.evidence import LIGHT_TIME_S, forgetful
-from estimators.gross_errors import CAMERA_TURNED, COEFFICIENTS, MOUNT, OFFSET
+from estimators.loads import PulseData
 from estimators.misalignment import estimate_misalignment
-from estimators.pulse import PulseData
 from estimators.trim import estimate_trim
 from flightmodel import rotations
 from flightmodel.airdata import air_data, lateral_angles, peak_pressure
@@ -38,9 +37,10 @@ from flightmodel.deflection import history_from_lateral
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.fused import fuse_flight
-from postflight.sensed import pulse_data
-from recon.bet import Settings, reconstruct
+from postflight.fusing import fuse_flight
+from postflight.loads import pulse_data
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, read_scenario
 from tests.recon import dispersed

@@ -10,7 +10,7 @@ import estimator_coverage as dispersed
 import numpy as np
 
 from flightmodel.checks import DivergenceError
-from postflight.fused import fuse_flight
+from postflight.fusing import fuse_flight
 
 PLANTED_S = (0.0, 0.05, 0.2, -0.05, -0.2)
 TOLD_SD_S = 0.3

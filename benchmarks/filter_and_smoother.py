@@ -29,9 +29,8 @@ from flightmodel.instruments import RadarSite, TriadSpec
 from flightmodel.telemetry import RadarRecord
 from recon import ekf, smoother
 from recon.error_model import ErrorModel, radar_blocks, triad_blocks
-from recon.inertial import SAME_INSTANT_S
 from recon.measurements import radar_instrument
-from recon.motion import strapdown_motion
+from recon.motion import SAME_INSTANT_S, strapdown_motion
 from recon.problem import Problem, observe
 from recon.state import States
 

@@ -17,11 +17,11 @@ import numpy as np
 from problem import reference_problem
 
 from flightmodel.vehicle import Vehicle
-from synthetic_flight import packing
-from synthetic_flight.day_air import day_atmosphere
+from synthetic_flight import simulate
 from synthetic_flight.ensemble import LANES, Schedule, Start, available_cores, fly_ensemble
 from synthetic_flight.scenarios import child_rng, read_scenario
 from synthetic_flight.simulate import integrate
+from synthetic_flight.weather import day_atmosphere
 
 SECONDS, RECORD_HZ = 300.0, 10.0
 RATES_HZ = (200.0, 150.0)
@@ -44,8 +44,8 @@ def dispersed_starts(problem):
         vehicle: Vehicle = replace(
             problem.vehicle, joint=joint.model_copy(update={"bending_stiffness_nmprad": stiffness})
         )
-        table = packing.atmosphere_table(day_atmosphere(spec, child_rng(run, "atmosphere")))
-        return Start(problem.inflated, packing.parameter_vector(vehicle, *factors[1:]), table)
+        table = simulate.atmosphere_table(day_atmosphere(spec, child_rng(run, "atmosphere")))
+        return Start(problem.inflated, simulate.parameter_vector(vehicle, *factors[1:]), table)
 
     return start_of
 

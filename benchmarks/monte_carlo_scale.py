@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from postflight.montecarlo import execution, running
-from postflight.montecarlo.merge import merge, write_merged
-from postflight.montecarlo.running import Wanted
+from postflight.montecarlo import execution
+from postflight.montecarlo.bands import merge, write_merged
+from postflight.montecarlo.execution import Wanted
 from postflight.montecarlo.study import read_study
 
 DISPERSIONS = "irve2_reference"
@@ -105,7 +105,7 @@ def memory_child(flights, workers):
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "study"
         begun = time.perf_counter()
-        count = running.run(study, folder, Wanted(flights, workers), lambda *_: None)
+        count = execution.run(study, folder, Wanted(flights, workers), lambda *_: None)
         flown = time.perf_counter() - begun
         write_merged(folder, merge(study, folder, count))
         merged = time.perf_counter() - begun - flown

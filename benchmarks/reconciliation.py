@@ -6,7 +6,7 @@ c.g.'s offset, masses, stations, inertias, coefficients, start, spin, air, the s
 all in the sizes that vehicle file and data sheets state. No video. Some 15 s of processor time a flight.
 
 With ``--hardening`` the spring's slope is by that share steeper at 4 deg, with ``--freeplay`` the joint has so much of
-it; 0 flies plain joints. Then each flight is asked for the law (`postflight.reconciliation.laws`), and printed are the
+it; 0 flies plain joints. Then each flight is asked for the law (`postflight.reconciliation.fit`), and printed are the
 odds and the law's effect: the flight is flown once more with a plain joint and all else equal, and the difference of
 the two histories of deflection, over the standard deviation of the plain fit's, is largest so much in the pulse. A
 slight hardening is mostly another stiffness, so what the plain *fit* of the same flight misses is counted as well.
@@ -26,9 +26,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.pipeline import reconstruct_telemetry
+from postflight.flight import reconstruct_telemetry
 from postflight.reconciliation.answer import deflection_of, joint_table
-from postflight.reconciliation.laws import explain
+from postflight.reconciliation.fit import explain
 from postflight.reconciliation.modes import stiffness_by_modes
 from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from postflight import results, scoring
-from postflight.pipeline import METHODS, estimate, reconstruct_flight
+from postflight import run_folder
+from postflight.flight import METHODS, estimate, reconstruct_flight
+from postflight.score import BET_LIMITS, score_run
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 
@@ -32,12 +33,12 @@ def main():
             flight = reconstruct_flight(folder)
             methods = METHODS if flight.telemetry.frames else METHODS[1:]
             answers = estimate(flight, flight.telemetry, methods)
-            with results.RunFolder(folder, flight.telemetry, {}) as run:
-                results.write_reconstruction(run, flight)
-                results.write_answers(run, answers)
-                run.write_json("summary.json", results.summary(flight, answers))
-            score = scoring.score_run(folder)
-        bets.append([score.bet[k] for k in scoring.BET_LIMITS])
+            with run_folder.RunFolder(folder, flight.telemetry, {}) as run:
+                run_folder.write_reconstruction(run, flight)
+                run_folder.write_answers(run, answers)
+                run.write_json("summary.json", run_folder.summary(flight, answers))
+            score = score_run(folder)
+        bets.append([score.bet[k] for k in BET_LIMITS])
         words = [f"{m} {score.methods[m]['error_deg']:+.2f} (sd {score.methods[m]['sd_deg']:.2f})" for m in methods]
         for m in methods:
             errors[m].append(score.methods[m]["error_deg"])
@@ -45,7 +46,7 @@ def main():
         print(f"seed {seed}: m, m/s, deg {np.round(bets[-1], 2)}; {', '.join(words)}; red verdicts {red}", flush=True)
     print(
         "BET rms errors over the pulse, largest:",
-        dict(zip(scoring.BET_LIMITS, np.max(bets, axis=0).round(2).tolist(), strict=True)),
+        dict(zip(BET_LIMITS, np.max(bets, axis=0).round(2).tolist(), strict=True)),
     )
     for method, values in errors.items():
         if values:

@@ -20,8 +20,8 @@ from problem import PULSE_S, fly, reference_problem
 from scipy.integrate import solve_ivp
 
 from flightmodel import earth
-from synthetic_flight import _kernels, dynamics, packing
-from synthetic_flight import _workspace_kernels as at
+from synthetic_flight import _kernels, dynamics, simulate
+from synthetic_flight import _kernels as at
 
 RATES_HZ = (500.0, 250.0, 200.0)
 STEP_HZ = 500.0
@@ -59,8 +59,8 @@ def ours(problem, rate_hz, seconds=PULSE_S):
 
 def dop853(problem, seconds, rtol):
     """The same from scipy's DOP853 with our compiled rates."""
-    s = packing.workspace(problem.entry[None], packing.parameter_vector(problem.vehicle)[None])
-    air, grid, mach, table, free = packing.kernel_tables(problem.vehicle, problem.atmosphere)
+    s = simulate.workspace(problem.entry[None], simulate.parameter_vector(problem.vehicle)[None])
+    air, grid, mach, table, free = simulate.kernel_tables(problem.vehicle, problem.atmosphere)
     planet = tuple(earth.WGS84)  # numba takes a plain tuple several times faster than a named one
     trial, rate = slice(at.TRIAL, at.TRIAL + at.STATES), slice(at.RATE, at.RATE + at.STATES)
 

@@ -14,9 +14,9 @@ import numpy as np
 from estimator_coverage import CAMERA_SD, camera_history, flown_aero, fly_missing, kept_flight, seeds_and_folder
 from scipy.stats import norm
 
-from estimators.gross_errors import CAMERA_TURNED, COEFFICIENTS, MOUNT, OFFSET, gross_errors
+from estimators.agreement import CAMERA_TURNED, COEFFICIENTS, MOUNT, OFFSET, gross_errors
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.fused import CAMERA_PLANE_SD_RAD, fuse_flight
+from postflight.fusing import CAMERA_PLANE_SD_RAD, fuse_flight
 
 DRAWS, FALSE_ALARMS = 200, (0.05, 0.10)
 SIDES = {  # of what `estimator_coverage.planted` plants, in columns of the gross errors

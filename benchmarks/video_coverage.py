@@ -28,12 +28,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import estimator_coverage as dispersed
 
-from estimators.benchmark_bending import benchmark_bending
-from estimators.camera_deflection import read_film
-from estimators.pulse import PulseData
+from estimators.benchmark import benchmark_bending
+from estimators.camera import read_film
+from estimators.loads import PulseData
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
-from synthetic_flight.video import Imaging, Scene, film
+from synthetic_flight.film import Imaging, Scene, film
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, sun
 from tests.estimators.test_degraded_video import BAD, TIMES, UNCALIBRATED, degraded
 

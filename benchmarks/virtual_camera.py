@@ -27,11 +27,10 @@ from scipy.optimize import least_squares
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from estimators.benchmark import orient_camera
-from estimators.camera_deflection import read_film
-from estimators.camera_fit import REACH_PX
-from estimators.horizon import find_horizon
-from estimators.raster import render
-from estimators.seen import found_marks
+from estimators.camera import read_film
+from estimators.camera_fit import REACH_PX, found_marks
+from estimators.edge import find_horizon
+from estimators.virtual_camera import render
 from flightmodel import rotations
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.film import film_frames

@@ -13,7 +13,7 @@ from flightmodel import _kernels as la
 from flightmodel import earth
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
-from synthetic_flight import packing
+from synthetic_flight import simulate
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Constants:
 def constants(vehicle: Vehicle, atmosphere: FloatArray) -> Constants:
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint_m
     head = [shell.mass_kg, body.mass_kg, vehicle.reference.area_m2, vehicle.reference.length_m]
-    air, grid, mach, coefficients, free = packing.kernel_tables(vehicle, atmosphere)
+    air, grid, mach, coefficients, free = simulate.kernel_tables(vehicle, atmosphere)
     numbers = np.concatenate([head, shell.cg_m, joint, body.cg_m - joint])
     return Constants(numbers, air[0], grid, mach, coefficients, free)
 

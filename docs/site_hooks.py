@@ -21,11 +21,10 @@ BESIDE = {
 REFERENCE = {
     "flightmodel": ["flightfolder", "telemetry", "vehicle", "trajectory", "deflection", "film", "camera", "earth",
                     "atmosphere", "airdata", "aerodynamics", "rotations", "checks"],
-    "recon": ["bet", "error_model", "strapdown", "consistency", "attitude_check", "product"],
-    "estimators": ["camera_deflection", "misalignment", "trim", "fusion", "agreement", "static_trim", "southwell",
-                   "calibration"],
+    "recon": ["reconstruct", "error_model", "strapdown", "consistency", "vector_attitude", "product"],
+    "estimators": ["camera", "misalignment", "trim", "fusion", "agreement", "southwell", "calibration"],
     "synthetic_flight": ["scenarios", "simulate", "folder", "ensemble", "linear", "stability_map"],
-    "postflight": ["pipeline", "results", "sensitivity", "preflight", "scoring", "figures"],
+    "postflight": ["flight", "run_folder", "sensitivity", "score"],
 }  # fmt: skip
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 

@@ -78,7 +78,7 @@ def sky_levels(grey, inside, span, level, scatter, first):
 
 @kernel
 def first_rises(grey, inside, level, first, noise, common, limits, step, places, bases, place, sd, good):
-    """Place along each line, its sd, and whether there is a lasting rise; see `estimators.horizon`.
+    """Place along each line, its sd, and whether there is a lasting rise; see `estimators.edge`.
 
     ``limits``: span of the sky, samples a rise must last, least contrast.
     """
@@ -136,7 +136,7 @@ def first_rises(grey, inside, level, first, noise, common, limits, step, places,
 
 @kernel
 def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
-    """Place of the step, up or down, on short lines across an expected edge; see `estimators.horizon`."""
+    """Place of the step, up or down, on short lines across an expected edge; see `estimators.edge`."""
     n, m = grey.shape
     level_of = 6
     few, value, explained = np.empty(level_of), np.empty(m), np.empty(len(places))

@@ -13,7 +13,7 @@ less well known than stated? With mean ``m`` and covariance ``P`` of its unit no
 (``V`` is ``J' C^-1 J`` of the readings' whole covariance ``C``, and ``m`` is ``J' C^-1 d``). Directions of which less
 than `LEAST_TOLD` was learnt are left out: what the equations of the methods neglect would move them far at no cost.
 
-Errors that happen have few directions and a size. Of those in `estimators.gross_errors`, of columns ``D``, the same is
+Errors that happen have few directions and a size. Of those in `estimators.agreement`, of columns ``D``, the same is
 
     gain = m' D (1 + D' V D)^-1 D' m / 2 - log det(1 + D' V D) / 2
 
@@ -22,6 +22,12 @@ false alarms, where their sizes are as stated and the sides they fall to are not
 
 What the readings cannot tell apart is in the singular values of the whitened ``J``: a direction of the inputs with the
 singular value ``s`` keeps ``1 / (1 + s^2)`` of its variance.
+
+What a gross error of each thing the methods lean on would look like: of known size, to an unknown side.
+
+Sizes are of errors that happen and that stated uncertainties do not mean: a coefficient table of another
+configuration, a package bolted on askew, a c.g. measured before the last change, a camera clocked by another drawing.
+Each is a matrix of columns in the inputs' unit normals; the error is these times a standard normal vector.
 """
 
 from __future__ import annotations
@@ -45,10 +51,55 @@ from estimators.evidence import (
     WIND,
     Deflection,
     Evidence,
+    offset_sd_m,
 )
-from estimators.gross_errors import CAMERA_TURNED, COEFFICIENTS, MOUNT, OFFSET
-from estimators.normal_equations import Learnt, means_over_spans
+from estimators.fusion import Learnt, means_over_spans
+from estimators.loads import PulseData
 from flightmodel.checks import BoolArray, FloatArray
+
+COEFFICIENTS, MOUNT = "aerodynamic coefficients", "accelerometer's mounting or bias"
+OFFSET, CAMERA_TURNED = "initial c.g. offset", "camera's orientation, benchmark or plane"
+GROSS_COEFFICIENT = 0.15  # of C_m and C_N, each by itself
+GROSS_MOUNT_RAD = np.deg2rad(0.5)  # across the long axis; about it the drag hardly turns
+GROSS_OFFSET_M = 0.005  # of the centerbody's c.g.
+GROSS_PLANE_RAD = np.deg2rad(25.0)
+
+
+def gross_errors(pulse: PulseData, learnt: Learnt, plane_sd_rad: float) -> dict[str, FloatArray]:
+    """Columns ``(inputs, directions)`` of each gross error, by the name of the suspect.
+
+    A mount that is turned turns the attitude with it: the reconstruction found both from one measurement.
+
+    Parameters
+    ----------
+    pulse : PulseData
+    learnt : Learnt
+        Says where each input's unit normals stand.
+    plane_sd_rad : float
+        What one unit normal of the camera's plane is.
+    """
+    known, size = pulse.vehicle.uncertainty, len(learnt.mean)
+    offset = GROSS_OFFSET_M / np.sqrt(2.0)
+    single = {
+        COEFFICIENTS: {"C_m": (GROSS_COEFFICIENT, known.cm), "C_N": (GROSS_COEFFICIENT, known.cn)},
+        OFFSET: {f"initial offset {axis}": (offset, offset_sd_m(pulse.vehicle)) for axis in "yz"},
+        CAMERA_TURNED: {CAMERA_PLANE: (GROSS_PLANE_RAD, plane_sd_rad)},
+    }
+    out = {}
+    for suspect, inputs in single.items():
+        there = {name: wrong / sd for name, (wrong, sd) in inputs.items() if name in learnt.place and sd > 0.0}
+        out[suspect] = np.zeros((size, len(there)))
+        for k, (name, normals) in enumerate(there.items()):
+            out[suspect][learnt.place[name].start, k] = normals
+    if ACCELEROMETER in learnt.place:
+        use = pulse.through_pulse
+        force, root = pulse.specific_force_body_mps2[use], pulse.force_root_mps2[use].reshape(-1, 9)
+        axes = GROSS_MOUNT_RAD / np.sqrt(2.0) * np.eye(3)[1:]
+        turned = np.column_stack([np.cross(axis, force).ravel() for axis in axes])
+        out[MOUNT] = np.zeros((size, 2))
+        out[MOUNT][learnt.place[ACCELEROMETER]] = np.linalg.lstsq(root, turned, rcond=1e-6)[0]
+    return {suspect: columns for suspect, columns in out.items() if columns.any()}
+
 
 SPAN_S = 2.0
 LEFT_OUT_RAD = np.deg2rad(0.05)  # of the methods' own equations, in each mean: up to 0.05 deg where the pulse ends
@@ -144,7 +195,7 @@ def agreement(
     deflection : callable, optional
         From times to lateral vectors (n, 2), rad: what of it swings is taken out of the readings.
     gross : dict of str to (k, r) float, optional
-        Gross errors that suspects may have (`estimators.gross_errors`).
+        Gross errors that suspects may have (`estimators.agreement`).
     """
     pairs: list[Pair] = []
     for a, b in combinations(evidence, 2):

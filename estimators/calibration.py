@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from flightmodel import columns
+from flightmodel import tables
 from flightmodel.camera import Lens
 from flightmodel.checks import FloatArray, GateError, nearest_name
 
@@ -77,17 +77,17 @@ def read_corners(path: Path) -> pd.DataFrame:
         For a file that is no table, lacks a column, or holds anything but numbers, with the line.
     """
     label = "calibration"
-    table = columns.read_table(path, label)
+    table = tables.read_table(path, label)
     missing = [c for c in COLUMNS if c not in table.columns]
     if missing:
         found = ", ".join(table.columns)
         hints = [f"no column '{c}'{nearest_name(c, list(table.columns))}; found {found}" for c in missing]
         raise GateError([f"{label}: {path}: line 1: {words}" for words in hints])
     faults: list[str] = []
-    values = {c: columns.numbers(table, c, path, label, faults) for c in COLUMNS[1:]}
+    values = {c: tables.numbers(table, c, path, label, faults) for c in COLUMNS[1:]}
     for c, column in values.items():
         if not faults and np.isnan(column).any():
-            line = columns.line_of(table, int(np.argmax(np.isnan(column))))
+            line = tables.line_of(table, int(np.argmax(np.isnan(column))))
             faults.append(f"{label}: {path}: line {line}, column '{c}': no number; remove the line")
     if faults:
         raise GateError(faults)

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
-from estimators.pulse import PulseData, carried
+from estimators.loads import PulseData, carried
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
 from flightmodel.vehicle import Vehicle

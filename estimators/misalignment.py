@@ -27,7 +27,7 @@ from estimators.evidence import (
     moved_coefficients,
     read_later,
 )
-from estimators.pulse import MIN_AXIAL_MPS2, PulseData, lateral_and_size
+from estimators.loads import MIN_AXIAL_MPS2, PulseData, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory

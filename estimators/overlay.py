@@ -14,12 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.raster import render
-from estimators.virtual_camera import VirtualCamera, bending_of
+from estimators.virtual_camera import VirtualCamera, bending_of, render
 from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray
-from flightmodel.geometry import bend, vehicle_meshes
-from flightmodel.meshes import BodyMesh, outboard
+from flightmodel.geometry import BodyMesh, bend, outboard, vehicle_meshes
 
 Picture = NDArray[np.uint8]
 

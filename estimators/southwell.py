@@ -1,6 +1,6 @@
 """How stiff is the joint and how large was the offset? Both from how the bending grew with the load.
 
-A joint that yields by ``theta = (z_0 / xbar) u / (1 - u)``, ``u = q kappa / K`` (`estimators.static_trim`), gives a
+A joint that yields by ``theta = (z_0 / xbar) u / (1 - u)``, ``u = q kappa / K`` (`estimators.trim`), gives a
 straight line of ``1 / theta`` against ``1 / q``, as R. V. Southwell plotted columns near buckling::
 
     1 / theta = (xbar / z_0) (q_crit / q - 1),     q_crit = K / kappa

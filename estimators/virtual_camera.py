@@ -10,6 +10,16 @@ torus, ``f`` being the motion per radian. Sliding along the surface moves a limb
 edge's motion across itself is that of the material point: derivatives are exact without differentiating the limb.
 
 Sources: seed paper, CAD-based estimate and Figures 2.1 to 2.3.
+
+What does a camera with a real lens see of a scene of triangles?
+
+Vertices are projected through the lens and triangles filled in the picture with a depth buffer. An edge that is
+straight in space is straight in the picture only where a triangle is small, so larger ones are split until they span
+less than ``WIDEST_RAD`` as seen from the camera; that also follows those that reach beyond the lens's field or behind
+the camera. Pieces that lie outside the picture are dropped on the way.
+
+Rendering is for overlays, masks and checks: a fit projects the edge instead (`estimators.virtual_camera`), which costs
+hundreds of times less. Held to ray casting in the tests.
 """
 
 from __future__ import annotations
@@ -18,14 +28,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from estimators import _sight_kernels
-from estimators.horizon import HorizonLine, ScanLines
+from estimators import _raster_kernels, _sight_kernels
+from estimators.edge import HorizonLine, ScanLines
 from flightmodel.camera import Camera
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.deflection import rotation_vector_body_shell
-from flightmodel.geometry import torus_circles
-from flightmodel.vehicle import ShellGeometry
+from flightmodel.geometry import ShellGeometry, torus_circles
 
 OUT_OF_SIGHT = "the camera does not see the shell's edge; check its mount and lens in the vehicle file"
 EDGE_POINTS = 201
@@ -216,3 +226,53 @@ def bending_of(theta_rad: float, plane_lv_rad: float) -> FloatArray:
     """Bending (3,) of `VirtualCamera.sight` for an angle and a plane, not flattened."""
     out: FloatArray = rotation_vector_body_shell(np.array(theta_rad), np.array(plane_lv_rad))
     return np.array([out[1], out[2], 0.0])
+
+
+WIDEST_RAD, MARGIN_RAD = float(np.deg2rad(5.0)), float(np.deg2rad(0.5))
+DEEPEST_SPLIT = 20
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A picture of distances.
+
+    Parameters
+    ----------
+    depth_m : (h, w) float
+        Distance from the camera along each pixel's ray; infinite where nothing is met.
+    face : (h, w) int
+        Index of the face seen; -1 where there is none.
+    """
+
+    depth_m: FloatArray
+    face: NDArray[np.int64]
+
+    @property
+    def is_hit(self) -> BoolArray:
+        """Mask ``(h, w)`` of pixels that show the scene."""
+        return np.asarray(self.face >= 0)
+
+
+def render(camera: Camera, vertices_body_m: FloatArray, faces: NDArray[np.int64]) -> Rendered:
+    """Render triangles.
+
+    Parameters
+    ----------
+    camera : Camera
+    vertices_body_m : (n, 3) float
+        From the datum, body axes.
+    faces : (m, 3) int
+        Indices of vertices.
+
+    Returns
+    -------
+    Rendered
+        ``face`` counts the given faces, whatever was split.
+    """
+    shape = (camera.height_px, camera.width_px)
+    depth, nearest = np.full(shape, np.inf), np.full(shape, -1, dtype=np.int64)
+    _raster_kernels.raster(
+        np.ascontiguousarray(vertices_body_m, dtype=float), np.ascontiguousarray(faces, dtype=np.int64),
+        camera.lens_terms, camera.picture_half_angle_rad + MARGIN_RAD, WIDEST_RAD, DEEPEST_SPLIT, depth, nearest,
+    )  # fmt: skip
+    return Rendered(depth, nearest)

@@ -4,3 +4,5 @@ Conventions (CONVENTIONS.md has them all): SI and radians in memory; frames ``ec
 ``ecef``, ``ned``, ``body`` (centerbody, x out of the nose), ``shell`` (aeroshell), ``lv`` (clocking angles), ``suba``
 (accelerometer package), ``cam`` (OpenCV). ``v_to = dcm_to_from @ v_from``; quaternions scalar first.
 """
+
+from __future__ import annotations

@@ -5,7 +5,7 @@ one multiplication or division rounds once (W. D. Clinger, How to Read Floating 
 Beyond that the leading 64 bits of ``w`` are multiplied with 128 bits of the power of five, which always suffice (D.
 Lemire, Number Parsing at a Gigabyte per Second, Software: Practice and Experience 51, 2021; N. Mushtak, D. Lemire,
 Fast Number Parsing Without Fallback, 2023). Whatever is no plain number, no missing cell or no full row ends the
-reading: the careful reader of `flightmodel.columns` then finds the words for it.
+reading: the careful reader of `flightmodel.tables` then finds the words for it.
 """
 
 from __future__ import annotations

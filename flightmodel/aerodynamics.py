@@ -4,19 +4,56 @@ Coefficients refer to ``q S`` and ``q S l`` and act at the nose (datum) of the s
 of attack: ``C_A`` along -x, ``C_N`` against the lateral velocity, ``C_m`` nose-up positive (so a stable shape has
 C_m < 0), ``C_mq`` per ``omega l / (2 V)`` on the transverse rates. Between the table's knots they are linear, which is
 the seed paper's blend from Mach 5.7 to 3.5 where the table has no knot in between. Where molecules seldom meet, they
-pass to the free-molecular coefficients, if the table has them (`flightmodel.rarefied`).
+pass to the free-molecular coefficients, if the table has them (`flightmodel.sphere_cone`).
+
+How gridded coefficient tables come out of DAVE-ML files (ANSI/AIAA S-119).
+
+Read are ``variableDef``, ``breakpointDef``, ``griddedTableDef`` (alone, or inside a ``functionDefn``) and ``function``
+of one dependent and one or two independent variables, Mach number and total angle of attack. The last breakpoint set
+of a table varies fastest, as the standard says. Anything else a coefficient depends on is refused by name: this is a
+reader of tables, not of models. Entities and document type subsets are refused before anything is expanded, and
+nothing outside the file is ever opened.
+
+References
+----------
+ANSI/AIAA S-119-2011 (R2016), "Flight Dynamics Model Exchange Standard"; DAVE-ML 2.0 reference.
+
+Where a vehicle's coefficients come from: a table with its sidecar, or the shape of a sphere-cone alone.
+
+A table (CSV, or DAVE-ML) has beside it a TOML file of the same stem that says what its numbers refer to; they are
+turned to what `AeroTable` holds: axial and normal force in body axes, moments about the nose, damping per
+``omega l / (2 V)``, all on the vehicle's own reference area and length:
+
+    C_m,nose = C_m,ref - C_N x_ref / l
+
+with ``x_ref`` the station, aft of the nose, that the table's moments are about. Damping is taken over as it is: moving
+it would need the force due to pitch rate, which such tables do not hold.
 """
 
 from __future__ import annotations
 
 import re
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
+from typing import Annotated, Any, Literal
+from xml.parsers import expat
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from flightmodel.checks import ConfigError, FloatArray, GateError, TableRangeError
-from flightmodel.rarefied import bridge
+from flightmodel.config import FileBeside, Fraction, KeyFaults, Length, Place, Section, parse_section, read_toml
+from flightmodel.sphere_cone import (
+    bridge,
+    sphere_cone_closed_form,
+    sphere_cone_free_molecular,
+    sphere_cone_quadrature,
+    stagnation_cp,
+    wall_speed_ratio,
+)
 
 MOST_FAULTS = 10
 AXIAL_TOLERANCE = 1e-6
@@ -170,7 +207,7 @@ def named_columns(wanted: tuple[str, ...], header: list[str]) -> dict[str, str]:
 def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     """Read a coefficient table: columns mach, alpha_deg, ca, cn, cm, cmq, one row a grid point, ``#`` comments.
 
-    What the columns refer to is in the sidecar, see `flightmodel.aeroinput`; ``names`` are the columns' in that order.
+    What the columns refer to is in the sidecar; ``names`` are the columns' in that order.
 
     Raises
     ------
@@ -223,3 +260,429 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
         raise GateError(faults)
     grid = values[:, 2:].reshape(len(mach), len(alpha_deg), 4)
     return AeroTable(mach, np.deg2rad(alpha_deg), np.ascontiguousarray(grid))
+
+
+LARGEST_BYTES = 50_000_000
+# exact names (varID or name); C_n is yawing moment in this field, so letter case counts
+MACH_NAMES = {"mach", "Mach", "MACH", "machNumber", "mach_number"}
+ALPHA_NAMES = {"alpha", "ALPHA", "alphaTotal", "alpha_total", "angleOfAttack", "totalAngleOfAttack", "alphat"}
+COEFFICIENT_NAMES = {
+    "CA": {"CA", "Ca", "axialForceCoefficient"},
+    "CN": {"CN", "normalForceCoefficient"},
+    "CD": {"CD", "dragCoefficient"},
+    "CL": {"CL", "liftCoefficient"},
+    "CM": {"CM", "Cm", "pitchMomentCoefficient", "pitchingMomentCoefficient"},
+    "CMQ": {"CMQ", "CMq", "Cmq", "pitchDampingCoefficient", "pitchMomentCoefficientDueToPitchRate"},
+}
+ANGLE_UNITS = {"deg": np.pi / 180.0, "d": np.pi / 180.0, "degrees": np.pi / 180.0, "rad": 1.0, "r": 1.0, "radians": 1.0}
+NO_UNITS = {"", "nd", "ND", "1", "nondimensional"}
+
+
+def read_daveml(path: Path, force_names: tuple[str, str] = ("CA", "CN")) -> AeroTable:
+    """Read C_A, C_N (or C_D, C_L), C_m and, if it is there, C_mq over Mach and total angle of attack.
+
+    Parameters
+    ----------
+    path : Path
+    force_names : tuple of str
+        ``("CA", "CN")``, or ``("CD", "CL")`` for wind axes, which then stand in their places.
+
+    Returns
+    -------
+    AeroTable
+        On the union of all breakpoints, angles evenly spaced; C_mq is zero where the file has none.
+
+    Raises
+    ------
+    GateError
+        With every fault: what is missing, not understood, or not safe to read.
+    """
+    root = _parse(path)
+    faults: list[str] = []
+    variables = {v.get("varID", ""): v for v in root.findall("variableDef")}
+    points = {b.get("bpID", ""): _numbers(path, b.find("bpVals"), b.get("bpID", ""), faults) for b in
+              root.findall("breakpointDef")}  # fmt: skip
+    tables = {t.get("gtID", ""): t for t in root.findall("griddedTableDef")}
+    functions = {}
+    for function in root.findall("function"):
+        reference = function.find("dependentVarRef")
+        functions[reference.get("varID", "") if reference is not None else ""] = function
+    found: dict[str, tuple[list[str], list[FloatArray], FloatArray]] = {}
+    for coefficient in (*force_names, "CM", "CMQ"):
+        names = COEFFICIENT_NAMES[coefficient]
+        match = [i for i, v in variables.items() if i in names or v.get("name", "") in names]
+        if not match:
+            if coefficient != "CMQ":
+                faults.append(f"{path}: no variable for {coefficient}: name it one of {', '.join(sorted(names))}")
+        elif match[0] not in functions:
+            faults.append(
+                f"{path}: variable '{match[0]}' has no gridded function; tabulate it (calculations are not read)"
+            )
+        else:
+            grid = _grid(path, functions[match[0]], match[0], variables, points, tables, faults)
+            if grid is not None:
+                found[coefficient] = grid
+    if faults:
+        raise GateError(faults)
+    return _on_one_grid(path, [found.get(c) for c in (*force_names, "CM", "CMQ")])
+
+
+def _parse(path: Path) -> ET.Element:
+    try:
+        data = path.read_bytes()
+    except OSError as fault:
+        raise GateError(f"{path}: cannot be read: {fault.strerror or fault}") from None
+    if len(data) > LARGEST_BYTES:
+        raise GateError(f"{path}: {len(data)} bytes; DAVE-ML files above {LARGEST_BYTES} are not read")
+    scout = expat.ParserCreate()
+
+    def refuse(*_: Any) -> None:
+        raise GateError(f"{path}: declares XML entities or its own document type; remove the DOCTYPE's [...] part")
+
+    def doctype(_name: str, _system: str | None, _public: str | None, has_subset: int) -> None:
+        if has_subset:
+            refuse()
+
+    scout.StartDoctypeDeclHandler = doctype
+    scout.EntityDeclHandler = refuse
+    try:
+        scout.Parse(data, True)
+        root = ET.fromstring(data)
+    except (expat.ExpatError, ET.ParseError) as fault:
+        raise GateError(f"{path}: not valid XML: {fault}") from None
+    for element in root.iter():
+        element.tag = str(element.tag).rsplit("}", 1)[-1]
+    if root.tag != "DAVEfunc":
+        raise GateError(f"{path}: its root is '{root.tag}', not DAVEfunc")
+    return root
+
+
+def _numbers(path: Path, element: ET.Element | None, where: str, faults: list[str]) -> FloatArray:
+    text = re.sub(r"[,\s]+", " ", (element.text or "") if element is not None else "").strip()
+    try:
+        values = np.array([float(part) for part in text.split()])
+    except ValueError:
+        values = np.array([])
+    if len(values) == 0 or not np.isfinite(values).all():
+        faults.append(f"{path}: '{where}' holds no list of finite numbers")
+    return values
+
+
+def _grid(
+    path: Path, function: ET.Element, output: str, variables: dict[str, ET.Element], points: dict[str, FloatArray],
+    tables: dict[str, ET.Element], faults: list[str],
+) -> tuple[list[str], list[FloatArray], FloatArray] | None:  # fmt: skip
+    """Axes ("mach", "alpha"), their breakpoints (alpha in rad) and values of one function; None with faults."""
+    before = len(faults)
+    inputs = [reference.get("varID", "") for reference in function.findall("independentVarRef")]
+    axes = []
+    for name in inputs:
+        alias = {name, variables[name].get("name", "")} if name in variables else {name}
+        axes.append("mach" if alias & MACH_NAMES else "alpha" if alias & ALPHA_NAMES else "")
+        if not axes[-1]:
+            faults.append(f"{path}: '{output}' depends on '{name}'; only Mach number and angle of attack are read")
+    definition = function.find("functionDefn")
+    table = definition.find("griddedTableDef") if definition is not None else None
+    if definition is not None and table is None:
+        link = definition.find("griddedTableRef")
+        table = tables.get(link.get("gtID", "")) if link is not None else None
+    if table is None:
+        faults.append(f"{path}: the function of '{output}' has no griddedTableDef; ungridded tables are not read")
+        return None
+    units = table.get("units") or (variables[output].get("units") or "")
+    if units not in NO_UNITS:
+        faults.append(f"{path}: '{output}' is in '{units}'; coefficients without unit are read")
+    grids = []
+    for reference, name, axis in zip(table.findall("breakpointRefs/bpRef"), inputs, axes, strict=False):
+        knots = points.get(reference.get("bpID", ""), np.array([]))
+        unit = (variables[name].get("units") or "") if name in variables else ""
+        if axis == "alpha" and unit not in ANGLE_UNITS:
+            faults.append(f"{path}: '{name}' is in '{unit}'; deg or rad is read")
+        if len(knots) < 2 or (np.diff(knots) <= 0).any():
+            faults.append(f"{path}: breakpoints '{reference.get('bpID')}' do not increase or are not defined")
+        grids.append(knots * ANGLE_UNITS.get(unit, 1.0) if axis == "alpha" else knots)
+    values = _numbers(path, table.find("dataTable"), output, faults)
+    if len(grids) != len(inputs) or not inputs or values.size != np.prod([len(g) for g in grids]):
+        faults.append(f"{path}: '{output}' has {values.size} values where its breakpoints want another number")
+    return None if len(faults) > before else (axes, grids, values.reshape([len(g) for g in grids]))
+
+
+def _on_one_grid(path: Path, found: list[tuple[list[str], list[FloatArray], FloatArray] | None]) -> AeroTable:
+    every = {"mach": np.array([0.0]), "alpha": np.array([0.0, np.pi])}
+    for axis in every:
+        knots = [g for part in found if part is not None for a, g in zip(part[0], part[1], strict=True) if a == axis]
+        if knots:
+            every[axis] = np.unique(np.round(np.concatenate(knots), 9))
+    mach, alpha = every["mach"], every["alpha"]
+    step = np.diff(alpha).min()
+    even = np.linspace(0.0, np.pi, round(np.pi / step) + 1)
+    if (
+        abs(alpha[0]) > 1e-8
+        or abs(alpha[-1] - np.pi) > 1e-8
+        or np.abs(alpha / step - np.round(alpha / step)).max() > 1e-5
+    ):
+        raise GateError(f"{path}: angles must run from 0 to 180 deg in multiples of their smallest step")
+    mach = mach if len(mach) > 1 else np.array([mach[0], mach[0] + 1.0])
+    at = {"mach": mach[:, None], "alpha": even[None, :]}
+    c = np.zeros((len(mach), len(even), 4))
+    from scipy.interpolate import RegularGridInterpolator  # half a second to import
+
+    for k, part in enumerate(found):
+        if part is not None:
+            axes, grids, values = part
+            held = [
+                np.clip(at[a], g[0], g[-1]) + 0.0 * at["mach"] * at["alpha"] for a, g in zip(axes, grids, strict=True)
+            ]
+            c[..., k] = RegularGridInterpolator(grids, values)(np.stack(held, axis=-1))
+    return AeroTable(mach, even, c)
+
+
+MachNumber = Annotated[float, Field(ge=0.0, le=1000.0)]
+Degrees = Annotated[float, Field(ge=0.0, le=180.0)]
+Factor = Annotated[float, Field(ge=0.0, le=100.0)]
+Coefficient = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+MACH = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.7, 6.5, 8.0, 10.0, 15.0, 20.0)
+ALPHA_RAD = np.deg2rad(np.arange(0.0, 181.0))
+
+
+class TableUncertainty(Section):
+    """One standard deviation of the coefficients, as fractions; used where the vehicle file gives none."""
+
+    ca: Fraction | None = None
+    cn: Fraction | None = None
+    cm: Fraction | None = None
+
+
+class Sidecar(Section):
+    """What a coefficient table's numbers refer to, and where they come from."""
+
+    source: Annotated[str, Field(min_length=1)]
+    licence: Annotated[str, Field(min_length=1)]
+    area_m2: Annotated[float, Field(ge=1e-6, le=1e4)]
+    length_m: Length
+    moment_reference_station_m: Place
+    axes: Literal["body", "wind"] = "body"
+    damping_per: Literal["ql/2V", "ql/V"] = "ql/2V"
+    uncertainty: TableUncertainty = TableUncertainty()
+
+
+class Knots(Section):
+    """A factor over Mach, linear between knots, constant beyond them."""
+
+    mach: tuple[MachNumber, ...]
+    value: tuple[Factor, ...]
+
+    @model_validator(mode="after")
+    def _matched(self) -> Knots:
+        if not self.mach or len(self.mach) != len(self.value) or not _increase(self.mach):
+            raise ValueError("as many values as Mach numbers, which increase, are wanted")
+        return self
+
+
+class DampingTable(Section):
+    """C_mq over Mach (rows) and total angle of attack (columns), linear between, constant beyond."""
+
+    mach: Annotated[tuple[MachNumber, ...], Field(min_length=1)]
+    alpha_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
+    value: tuple[tuple[Coefficient, ...], ...]
+
+    @model_validator(mode="after")
+    def _matched(self) -> DampingTable:
+        sizes = {len(row) for row in self.value}
+        if len(self.value) != len(self.mach) or sizes != {len(self.alpha_deg)}:
+            raise ValueError("one row a Mach number and one value an angle are wanted")
+        if not _increase(self.mach) or not _increase(self.alpha_deg):
+            raise ValueError("Mach numbers and angles must increase")
+        return self
+
+
+class SphereCone(Section):
+    """A spherically blunted cone with a flat base, in modified Newtonian flow."""
+
+    half_angle_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
+    nose_radius_m: Length
+    base_radius_m: Length
+    mach: Annotated[tuple[MachNumber, ...], Field(min_length=2)] = MACH
+    k_a: Knots | None = None
+    k_n: Knots | None = None
+    cmq: Coefficient | None = None
+    cmq_table: DampingTable | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> SphereCone:
+        faults: list[tuple[str, object, str]] = []
+        widest = self.base_radius_m / float(np.cos(np.deg2rad(self.half_angle_deg)))
+        if self.nose_radius_m >= widest:
+            words = f"the nose cap is wider than the base; below {widest:.4g} m for this base and angle"
+            faults.append(("nose_radius_m", self.nose_radius_m, words))
+        if (self.cmq is None) == (self.cmq_table is None):
+            faults.append(("cmq", self.cmq, "either cmq or cmq_table is wanted, and not both"))
+        if not _increase(self.mach):
+            faults.append(("mach", self.mach, "Mach numbers must increase"))
+        if faults:
+            raise KeyFaults(faults)
+        return self
+
+
+class FreeMolecular(Section):
+    """Free-molecular coefficients from the vehicle's own shape, with a wall that re-emits at its temperature."""
+
+    wall_temperature_k: Annotated[float, Field(ge=1.0, le=1e4)] = 300.0
+    speed_mps: Annotated[float, Field(ge=1.0, le=2e4)] = 1500.0
+
+
+class Aerodynamics(Section):
+    """The ``[aerodynamics]`` of a vehicle file: a table, or a sphere-cone; free-molecular flow if asked for."""
+
+    table: FileBeside | None = None
+    sphere_cone: SphereCone | None = None
+    free_molecular: FreeMolecular | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Aerodynamics:
+        if (self.table is None) == (self.sphere_cone is None):
+            raise ValueError("either table or sphere_cone is wanted, and not both")
+        return self
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A sphere-cone and the vehicle's reference area and length."""
+
+    half_angle_rad: float
+    nose_radius_m: float
+    base_radius_m: float
+    area_m2: float
+    length_m: float
+
+
+def _increase(values: tuple[float, ...]) -> bool:
+    return all(b > a for a, b in pairwise(values))
+
+
+def aerodynamics_from(
+    spec: Aerodynamics, shape: Shape, folders: tuple[Path, ...]
+) -> tuple[AeroTable, TableUncertainty]:
+    """Table of a vehicle and its stated uncertainty.
+
+    Parameters
+    ----------
+    spec : Aerodynamics
+    shape : Shape
+        The vehicle's geometry and reference; free-molecular coefficients are those of this shape.
+    folders : tuple of Path
+        Where a table is looked for, in order.
+
+    Raises
+    ------
+    GateError
+        With every fault of table and sidecar.
+    """
+    known = TableUncertainty()
+    if spec.sphere_cone is not None:
+        table = table_from_sphere_cone(spec.sphere_cone, shape.area_m2, shape.length_m)
+    else:
+        assert spec.table is not None
+        found = [folder / spec.table for folder in folders if (folder / spec.table).exists()]
+        table, sidecar = read_with_sidecar(found[0] if found else folders[0] / spec.table)
+        table, known = referred_to(table, sidecar, shape.area_m2, shape.length_m), sidecar.uncertainty
+    if spec.free_molecular is not None:
+        table = _with_free_molecular(table, spec.free_molecular, shape)
+    return table, known
+
+
+def read_with_sidecar(path: Path) -> tuple[AeroTable, Sidecar]:
+    """Read a table, ``.csv`` or DAVE-ML (``.dml``, ``.xml``), and the sidecar of its stem, as they stand in the files.
+
+    Raises
+    ------
+    ConfigError
+        Where only the sidecar has faults, or the table does not exist.
+    GateError
+        Where the table has faults, with all of both.
+    """
+    faults: list[str] = []
+    beside, sidecar, table = path.with_suffix(".toml"), None, None
+    try:
+        sidecar = parse_section(Sidecar, read_toml(beside), str(beside))
+    except ConfigError as fault:
+        wanted = "; a table needs one beside it: source, licence, area_m2, length_m, moment_reference_station_m"
+        faults += fault.faults if beside.exists() else [f"{beside}: no such file{wanted}"]
+    wind = sidecar is not None and sidecar.axes == "wind"
+    names = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:]) if wind else COLUMNS
+    try:
+        daveml = path.suffix.lower() in (".dml", ".xml")
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such aerodynamic table; key 'aerodynamics.table' names it")
+        table = read_daveml(path, ("CD", "CL") if wind else ("CA", "CN")) if daveml else read_aero_table(path, names)
+        if daveml:
+            check_axial_flow(path, table)
+    except GateError as fault:
+        raise type(fault)([*fault.faults, *faults]) from None
+    if sidecar is None:
+        raise ConfigError(faults)
+    return table, sidecar
+
+
+def referred_to(table: AeroTable, sidecar: Sidecar, area_m2: float, length_m: float) -> AeroTable:
+    """Table in body axes, about the nose, per ``omega l / (2 V)``, on another reference area and length."""
+    c = table.coefficients.copy()
+    if sidecar.axes == "wind":
+        drag, lift = c[..., 0].copy(), c[..., 1].copy()
+        cosine, sine = np.cos(table.alpha_rad), np.sin(table.alpha_rad)
+        c[..., 0] = drag * cosine - lift * sine
+        c[..., 1] = drag * sine + lift * cosine
+    if sidecar.moment_reference_station_m != 0.0:
+        c[..., 2] -= c[..., 1] * (sidecar.moment_reference_station_m / sidecar.length_m)
+    if sidecar.damping_per == "ql/V":
+        c[..., 3] *= 2.0
+    area, length = sidecar.area_m2 / area_m2, sidecar.length_m / length_m
+    return AeroTable(table.mach, table.alpha_rad, c * (area * np.array([1.0, 1.0, length, length**2])))
+
+
+@lru_cache(maxsize=8)
+def _newtonian_shape(half_angle_rad: float, nose_radius_m: float, base_radius_m: float) -> FloatArray:
+    """C_A, C_N, C_m (length 1 m) for ``Cp_max = 1`` on `ALPHA_RAD` ``(181, 3)``: closed form, then quadrature."""
+    arguments = (half_angle_rad, nose_radius_m, base_radius_m, 1.0)
+    closed = np.stack(sphere_cone_closed_form(ALPHA_RAD, *arguments), axis=-1)
+    # 48 points: below 1e-6 from 400
+    shadowed = [sphere_cone_quadrature(a, *arguments, 48) if a > half_angle_rad else (0.0,) * 3 for a in ALPHA_RAD]
+    return np.where((half_angle_rad >= ALPHA_RAD)[:, None], closed, np.array(shadowed))
+
+
+def table_from_sphere_cone(spec: SphereCone, area_m2: float, length_m: float) -> AeroTable:
+    """Modified Newtonian table of a sphere-cone, 0 to 180 deg: C_A times ``k_a``, C_N and C_m times ``k_n``.
+
+    Parameters
+    ----------
+    spec : SphereCone
+    area_m2, length_m : float
+        The vehicle's reference area and length.
+    """
+    mach = np.array(spec.mach)
+    shape = _newtonian_shape(float(np.deg2rad(spec.half_angle_deg)), spec.nose_radius_m, spec.base_radius_m)
+    area = np.pi * spec.base_radius_m**2 / area_m2
+    k_a, k_n = (np.ones(len(mach)) if k is None else np.interp(mach, k.mach, k.value) for k in (spec.k_a, spec.k_n))
+    scale = stagnation_cp(mach)[:, None] * area * np.column_stack([k_a, k_n, k_n / length_m])
+    c = np.empty((len(mach), len(ALPHA_RAD), 4))
+    c[..., :3] = scale[:, None, :] * shape
+    if spec.cmq_table is None:
+        c[..., 3] = spec.cmq
+    else:
+        d = spec.cmq_table
+        by_alpha = np.array([np.interp(np.rad2deg(ALPHA_RAD), d.alpha_deg, row) for row in d.value])
+        c[..., 3] = np.column_stack([np.interp(mach, d.mach, column) for column in by_alpha.T])
+    return AeroTable(mach, ALPHA_RAD.copy(), c)
+
+
+def _with_free_molecular(table: AeroTable, spec: FreeMolecular, shape: Shape) -> AeroTable:
+    free = sphere_cone_free_molecular(
+        table.alpha_rad,
+        shape.half_angle_rad,
+        shape.nose_radius_m,
+        shape.base_radius_m,
+        shape.length_m,
+        wall_speed_ratio(spec.wall_temperature_k, spec.speed_mps),
+    )
+    area = np.pi * shape.base_radius_m**2 / shape.area_m2
+    return AeroTable(table.mach, table.alpha_rad, table.coefficients, free * area)

@@ -15,7 +15,7 @@ from flightmodel import earth, rotations
 from flightmodel.atmosphere import AirState, AtmosphereProfile
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
-from flightmodel.moments import peak
+from flightmodel.events import peak
 from flightmodel.trajectory import Trajectory
 
 

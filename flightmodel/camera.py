@@ -35,6 +35,7 @@ from flightmodel.deflection import lv_direction
 if TYPE_CHECKING:
     from flightmodel.vehicle import CameraMount
 
+
 BoolArray = NDArray[np.bool_]
 Lens = Literal["fisheye", "pinhole"]
 LENSES: tuple[Lens, ...] = ("fisheye", "pinhole")

@@ -22,7 +22,7 @@ from flightmodel.config import (
     parse_utc,
     read_toml,
 )
-from flightmodel.instrument_entries import (
+from flightmodel.instruments import (
     AtmosphereEntry,
     BarometerEntry,
     FramesEntry,
@@ -33,7 +33,7 @@ from flightmodel.instrument_entries import (
     SunEntry,
     TriadEntry,
 )
-from flightmodel.sources import Source, Spans
+from flightmodel.tables import Source, Spans
 
 AttitudeSd = Annotated[float, Field(ge=1e-9, le=180.0)]
 

@@ -16,13 +16,19 @@ import numpy as np
 from flightmodel.atmosphere import standard_sounding
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import parse_utc
-from flightmodel.earth import ecef_from_radar, geodetic_from_ecef
+from flightmodel.earth import ecef_from_radar, geodetic_from_ecef, q_ecef_body_from_pointing
 from flightmodel.film import Frames
 from flightmodel.flightfile import AttitudeEntry, FlightFile, MotionEntry, read_flight_file
 from flightmodel.gate import Gate
-from flightmodel.onboard_tables import read_frames, read_sun, read_triad
-from flightmodel.pointing import q_ecef_body_from_pointing
-from flightmodel.sounding import read_sounding
+from flightmodel.sensor_tables import (
+    read_barometer,
+    read_frames,
+    read_gnss,
+    read_radar,
+    read_sounding,
+    read_sun,
+    read_triad,
+)
 from flightmodel.telemetry import (
     AttitudePrior,
     BarometerRecord,
@@ -36,7 +42,6 @@ from flightmodel.telemetry import (
     Telemetry,
     TriadRecord,
 )
-from flightmodel.tracking_tables import read_barometer, read_gnss, read_radar
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
 LEAST_SPAN_S = 1.0

@@ -1,4 +1,25 @@
-"""The gate of a flight folder: keeps faults and findings while files are read, and opens where there is no fault."""
+"""The gate of a flight folder: keeps faults and findings while files are read, and opens where there is no fault.
+
+What an analyst should know of a sensor's samples: gaps, missing, frozen and saturated runs, each with its times.
+
+Of very many of one kind the longest are told one by one and the others together: a list that nobody reads hides them.
+
+In which order do the rows of a table belong, and which are not to be believed? Data as ranges deliver them.
+
+Telemetry comes in packets: a row or a whole block may come twice, late, or in the wrong order. Rows that repeat an
+earlier one (time and every value) are left out; rows out of order are put in order. Two kinds of rows contradict
+others: those of one time with different values, and late ones for which there is no room, because rows that came before
+stand there at their usual interval (a clock that was reset lays one stretch of the flight over another so). A few of
+them are left out: of one time all, for nobody can say which is right. With `FEW` of the rows or more the table is
+refused. It is refused with fewer, too, where a late block contradicts and the rows run on from it into new times at
+their usual interval: what was sent late ends with a jump forward, a clock that was set back does not, and then all
+that follows has wrong times. Nothing of it happens in silence: each repair has its words, its number of rows and
+blocks, and its times.
+
+Which rows of a table are used: those inside the spans that flight.toml states, and of repeated times the first.
+
+Times are those after ``time.offset_s`` was added. Of an oversampled tracker's rows some are read but only predicted.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +30,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from flightmodel import columns
+from flightmodel import tables
 from flightmodel.checks import BoolArray, ConfigError, FloatArray, GateError, nearest_name
-from flightmodel.columns import IntArray
-from flightmodel.quickread import file_sha256, read_numbers
-from flightmodel.roworder import in_order
-from flightmodel.selection import rows_to_use
-from flightmodel.sources import Source
+from flightmodel.csv_reading import file_sha256, read_numbers
+from flightmodel.tables import IntArray, Source
 from flightmodel.telemetry import Finding
 
 # no entry vehicle's instruments read beyond these; a larger number is a wrong unit or a broken word
@@ -105,13 +124,13 @@ class Gate:
     def csv(self, path: Path, label: str) -> pd.DataFrame | None:
         """Read a CSV as text; None, with its faults kept, where it is no table."""
         try:
-            return columns.read_table(path, label)
+            return tables.read_table(path, label)
         except GateError as fault:
             self.faults.extend(fault.faults)
             return None
 
     def table(
-        self, label: str, source: Source, quantities: tuple[columns.Quantity, ...], timed: bool = True
+        self, label: str, source: Source, quantities: tuple[tables.Quantity, ...], timed: bool = True
     ) -> Table | None:
         """Read one file; None, with its faults kept, where anything in it is refused."""
         before = len(self.faults) + len(self.config)
@@ -139,13 +158,13 @@ class Gate:
         return table if len(self.faults) + len(self.config) == before else None
 
     def _read_quickly(
-        self, path: Path, source: Source, quantities: tuple[columns.Quantity, ...], timed: bool
+        self, path: Path, source: Source, quantities: tuple[tables.Quantity, ...], timed: bool
     ) -> Read | None:
         """Times, columns and lines of a large file without faults; None where the careful reader must look."""
         if timed and (source.time_column.format == "utc_hms" or source.time_column.repeats == "first"):
             return None
-        places = {q.short: columns.place(q, source.declared(q.short)) for q in quantities}
-        if not all(columns.fits(q, places[q.short][1]) for q in quantities):
+        places = {q.short: tables.place(q, source.declared(q.short)) for q in quantities}
+        if not all(tables.fits(q, places[q.short][1]) for q in quantities):
             return None
         wanted = {places[q.short][0]: q.required or q.short in source.columns for q in quantities}
         time = source.time_column if timed else None
@@ -155,17 +174,17 @@ class Gate:
         time_s = found.time
         if time is not None and time_s is not None:
             if time.format == "seconds":
-                time_s = columns.to_si(time_s.copy() if time.column in wanted else time_s, time.unit)
+                time_s = tables.to_si(time_s.copy() if time.column in wanted else time_s, time.unit)
             if not np.isfinite(time_s).all():
                 return None
         self.digests[path] = found.sha256
         held = {short: place for short, place in places.items() if place[0] in found.columns}
-        values = {short: columns.to_si(found.columns[column], unit) for short, (column, unit) in held.items()}
+        values = {short: tables.to_si(found.columns[column], unit) for short, (column, unit) in held.items()}
         rows = len(next(iter(values.values())))
         return time_s, values, found.first_line + np.arange(rows)
 
     def _read_carefully(
-        self, path: Path, label: str, source: Source, quantities: tuple[columns.Quantity, ...], timed: bool
+        self, path: Path, label: str, source: Source, quantities: tuple[tables.Quantity, ...], timed: bool
     ) -> Read | None:
         """Times, columns and lines of a file read as text; what is wrong with it becomes faults."""
         frame = self.csv(path, label)
@@ -173,9 +192,9 @@ class Gate:
             return None
         time_s, values = None, {}
         if timed:
-            time_s = columns.unordered_times_s(frame, source.time_column, self.t0, path, label, self.faults)
+            time_s = tables.unordered_times_s(frame, source.time_column, self.t0, path, label, self.faults)
         for quantity in quantities:
-            column = columns.column_si(frame, quantity, source.declared(quantity.short), path, label, self.faults)
+            column = tables.column_si(frame, quantity, source.declared(quantity.short), path, label, self.faults)
             if column is not None:
                 values[quantity.short] = column
         return time_s, values, frame.attrs["lines"]
@@ -223,3 +242,299 @@ class Gate:
             self.faults.append(
                 f"{table.at(k)}: {short} = {values[k]:.6g} (SI) is {words} {count}; check its unit or leave it empty"
             )
+
+
+GAP_FACTOR = 5.0  # an interval this many times the usual one is a gap
+FROZEN_S, FROZEN_SAMPLES = 0.5, 10  # a column unchanged for this long, in at least so many samples, is frozen
+SATURATED_SAMPLES = 5  # this many samples in a row at a column's largest or smallest value are a stop
+MANY = 20  # runs of one kind that are told one by one
+Indices = NDArray[np.int64]
+
+
+def find_faults(
+    source: str, time_s: FloatArray, names: tuple[str, ...], values: FloatArray, missing: BoolArray | None = None
+) -> list[Finding]:
+    """Findings of one sensor.
+
+    Parameters
+    ----------
+    source : str
+    time_s : (n,) float
+    names : tuple of str
+        Of the columns.
+    values : (n, m) float
+        NaN is missing.
+    missing : (n,) bool, optional
+        Rows that count as missing; where not given, those in which any value is.
+    """
+    if missing is None:
+        missing = np.logical_or.reduce([np.isnan(column) for column in values.T])
+    step = np.diff(time_s)
+    wide = np.flatnonzero(step > GAP_FACTOR * float(np.median(step)))
+    found = told(source, time_s, wide, wide + 1, lambda k: f"gap of {step[wide[k]]:.3f} s", "gaps")
+    first, last = runs(missing)
+    found += told(source, time_s, first, last, lambda k: f"{last[k] - first[k] + 1} samples missing", "missing runs")
+    for name, column in zip(names, values.T, strict=True):
+        found += _stuck(source, time_s, name, column)
+    return found
+
+
+def told(
+    source: str, time_s: FloatArray, first: Indices, last: Indices, words: Callable[[int], str], kind: str
+) -> list[Finding]:
+    """Findings of runs of samples ``first`` to ``last``; ``words`` of each, and of what ``kind`` they are."""
+    size = last - first + 1
+    alone = np.ones(len(size), dtype=bool)
+    if len(size) > MANY:
+        least = np.partition(size, -MANY)[-MANY]
+        alone = size > least
+        alone[np.flatnonzero(size == least)[: MANY - int(alone.sum())]] = True
+    chosen = np.flatnonzero(alone).tolist()
+    found = [Finding(source, words(k), float(time_s[first[k]]), float(time_s[last[k]])) for k in chosen]
+    if not alone.all():
+        size, first, last = size[~alone], first[~alone], last[~alone]
+        together = f"{len(size)} further {kind}, {size.sum()} samples, at most {size.max()} in a row"
+        found.append(Finding(source, together, float(time_s[first[0]]), float(time_s[last[-1]])))
+    return found
+
+
+def runs(mask: BoolArray) -> tuple[Indices, Indices]:
+    """First and last index of each unbroken run of true."""
+    inside = np.flatnonzero(mask)
+    breaks = np.flatnonzero(np.diff(inside) > 1)
+    if not len(inside):
+        return inside, inside
+    return inside[np.append(0, breaks + 1)], inside[np.append(breaks, len(inside) - 1)]
+
+
+def _stuck(source: str, time_s: FloatArray, name: str, column: FloatArray) -> list[Finding]:
+    """Runs of one value: long ones anywhere, shorter ones at the column's largest and smallest value."""
+    # NaN is equal to nothing; a run of "equal to the sample before" begins one sample earlier
+    first, last = runs(column[1:] == column[:-1])
+    last = last + 1
+    if not len(first):
+        return []
+    low, high = np.fmin.reduce(column), np.fmax.reduce(column)
+    at_end = (column[first] == low) | (column[first] == high)
+    saturated = at_end & (last - first + 1 >= SATURATED_SAMPLES) & (low < high)
+    frozen = (time_s[last] - time_s[first] >= FROZEN_S) & (last - first + 1 >= FROZEN_SAMPLES)
+    some = saturated | frozen
+    first, last, saturated, frozen = first[some], last[some], saturated[some], frozen[some]
+
+    def words(k: int) -> str:
+        # a long run at an extreme may be either: a stop reached, or a sensor that stuck there
+        what = "saturated or frozen" if saturated[k] and frozen[k] else "frozen" if frozen[k] else "saturated"
+        return f"{name} {what} at {column[first[k]]:.6g} (SI) for {last[k] - first[k] + 1} samples"
+
+    return told(source, time_s, first, last, words, f"runs of one value of {name}")
+
+
+FEW = 0.01  # part of the rows that may contradict others
+MOSTLY = 0.5  # part of the rows of a stretch of old times that contradict, where the clock was set back
+ROOM = 1.5  # a late row needs a hole of so many usual intervals among the rows that came before it
+REMEDY = "keep one row of each time, or, where the clock was reset, give each stretch its own times"
+NAMED = 5  # times that a finding names one by one
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """What becomes of a table's rows.
+
+    Parameters
+    ----------
+    rows : (k,) int
+        Rows to use, in order of time.
+    repairs : tuple of (str, float, float)
+        What was done, from which to which time, s.
+    refusal : str
+        Why the table cannot be used; empty where it can.
+    """
+
+    rows: IntArray
+    repairs: tuple[tuple[str, float, float], ...] = ()
+    refusal: str = ""
+
+
+def in_order(time_s: FloatArray, values: list[FloatArray], lines: IntArray) -> Delivery:
+    """Rows in the order of time, without those that repeat or contradict others.
+
+    Parameters
+    ----------
+    time_s : (n,) float
+        As delivered.
+    values : list of (n,) float
+        Everything else that was measured; NaN is missing and equal to NaN.
+    lines : (n,) int
+        Of the file, for the words of a refusal.
+    """
+    everything = np.arange(len(time_s))
+    if (time_s[1:] > time_s[:-1]).all():
+        return Delivery(everything)
+    again, torn = _of_one_time(time_s, values)
+    kept = np.setdiff1d(everything, np.concatenate([again, torn]))
+    late = kept[np.append(False, time_s[kept][1:] < np.maximum.accumulate(time_s[kept])[:-1])] if len(kept) else kept
+    squeezed = _without_room(time_s, kept, late)
+    used = np.setdiff1d(kept, squeezed)
+    if len(torn) + len(squeezed) >= FEW * len(time_s) or len(used) < 2:
+        return Delivery(everything, refusal=_refusal(time_s, lines, again, torn, squeezed))
+    contradicting = np.union1d(torn, squeezed)
+    row = _set_back(time_s, _usual_step(time_s[kept]), contradicting)
+    if row is not None:
+        return Delivery(everything, refusal=_refusal_of_clock(time_s, lines, row, contradicting))
+    late = np.setdiff1d(late, squeezed)
+    repairs = (
+        (again, f"{_blocks(again)} repeat earlier rows: left out"),
+        (late, f"{_blocks(late)} came late or out of order: put in order"),
+        (torn, f"{_blocks(torn)} give different values for one time ({_times(time_s, torn)}): none of them is used"),
+        (squeezed, f"{_blocks(squeezed)} came late where earlier rows leave no room: not used"),
+    )
+    told = tuple((words, float(time_s[k].min()), float(time_s[k].max())) for k, words in repairs if len(k))
+    return Delivery(used[np.argsort(time_s[used], kind="stable")], told)
+
+
+def _of_one_time(time_s: FloatArray, values: list[FloatArray]) -> tuple[IntArray, IntArray]:
+    """Rows that repeat an earlier one, and all rows of the times at which rows differ; both as delivered."""
+    order = np.argsort(time_s, kind="stable")
+    same = np.diff(time_s[order]) == 0.0
+    equal = same.copy()
+    for column in values:
+        one, other = column[order[:-1][equal]], column[order[1:][equal]]
+        equal[equal] = (one == other) | (np.isnan(one) & np.isnan(other))
+    instant = np.append(0, np.cumsum(~same))
+    torn = np.isin(instant, instant[1:][same & ~equal])
+    again = np.append(False, same) & ~torn
+    return np.sort(order[again]), np.sort(order[torn])
+
+
+def _without_room(time_s: FloatArray, kept: IntArray, late: IntArray) -> IntArray:
+    """Late rows between two rows that came before them and stand at their usual interval."""
+    if not len(late):
+        return late
+    times = time_s[kept]
+    usual = _usual_step(times)
+    before, after = _neighbours_that_came_before(times)
+    inside = (before >= 0) & (after >= 0)
+    hole = np.where(inside, times[after] - times[before], np.inf)
+    return np.intersect1d(kept[hole < ROOM * usual], late)
+
+
+def _usual_step(times: FloatArray) -> float:
+    """Median step between rows that follow each other; infinite where there are none."""
+    steps = np.diff(times)
+    # in what was shuffled row by row the steps as delivered say nothing
+    steps = np.diff(np.sort(times)) if (steps < 0.0).sum() > 0.25 * len(steps) else steps[steps > 0.0]
+    return float(np.median(steps)) if len(steps) else np.inf
+
+
+def _set_back(time_s: FloatArray, usual: float, contradicting: IntArray) -> int | None:
+    """Row at which time steps back onto rows that it contradicts, and from which it runs on beyond them; or None."""
+    top = np.maximum.accumulate(time_s)
+    old = np.append(False, time_s[1:] <= top[:-1])
+    doubtful = np.isin(np.arange(len(time_s)), contradicting)
+    for first, last in zip(*runs(old), strict=True):
+        goes_on = last + 1 < len(time_s) and time_s[last + 1] - time_s[last] < ROOM * usual
+        back = time_s[first] < time_s[first - 1]
+        if goes_on and back and doubtful[first : last + 1].mean() >= MOSTLY:
+            return int(first)
+    return None
+
+
+def _neighbours_that_came_before(times: FloatArray) -> tuple[IntArray, IntArray]:
+    """For each row the nearest in time on either side among the rows above it; -1 for none."""
+    order = np.argsort(times, kind="stable")
+    before, after = np.full(len(times), -1), np.full(len(times), -1)
+    for way, found in ((order, before), (order[::-1], after)):
+        above: list[int] = []  # rows in the order of time, of which none hides another
+        for row in way.tolist():
+            while above and above[-1] > row:
+                above.pop()
+            if above:
+                found[row] = above[-1]
+            above.append(row)
+    return before, after
+
+
+def _refusal_of_clock(time_s: FloatArray, lines: IntArray, row: int, contradicting: IntArray) -> str:
+    """Why a table is refused whose clock was set back in ``row``."""
+    later = contradicting[contradicting >= row]
+    return (
+        f"{_backwards(time_s, lines, row)}, and the rows run on from there as after a reset clock ({len(later)} of "
+        f"them contradict earlier ones, all later ones may have wrong times); {REMEDY}"
+    )
+
+
+def _backwards(time_s: FloatArray, lines: IntArray, row: int) -> str:
+    step = f"{time_s[row - 1]:.6f} s then {time_s[row]:.6f} s"
+    return f"line {int(lines[row])}: time runs backwards or repeats: {step}"
+
+
+def _refusal(time_s: FloatArray, lines: IntArray, again: IntArray, torn: IntArray, squeezed: IntArray) -> str:
+    """Why the table is refused, with the first line at fault."""
+    if len(torn) and len(torn) >= len(squeezed):
+        instants, first = np.unique(time_s[torn], return_index=True)
+        row = int(np.setdiff1d(torn, torn[first])[0])
+        other = int(torn[first[np.searchsorted(instants, time_s[row])]])
+        words = f"with other values than in line {int(lines[other])} ({len(torn)} such rows in all)"
+        return f"{_backwards(time_s, lines, row)}, {words}; {REMEDY}"
+    if len(squeezed):
+        words = f"where earlier rows leave no room ({len(squeezed)} such rows in all)"
+        return f"{_backwards(time_s, lines, int(squeezed[0]))}, {words}; {REMEDY}"
+    return f"{_backwards(time_s, lines, int(again[0]))}, with the same values throughout: fewer than two different rows"
+
+
+def _blocks(rows: IntArray) -> str:
+    """How many rows in how many unbroken blocks of the file."""
+    if not len(rows):
+        return ""
+    inside = np.zeros(int(rows[-1]) + 1, dtype=bool)
+    inside[rows] = True
+    blocks = len(runs(inside)[0])
+    return f"{len(rows)} row{'s' * (len(rows) > 1)} in {blocks} block{'s' * (blocks > 1)}"
+
+
+def _times(time_s: FloatArray, rows: IntArray) -> str:
+    times = np.unique(time_s[rows])
+    return (
+        ", ".join(f"{t:.6f}" for t in times[:NAMED]) + " s" + f" and {len(times) - NAMED} more" * (len(times) > NAMED)
+    )
+
+
+def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArray, list[Finding]]:
+    """Rows to use (n,), and a finding for each reason why others are not."""
+    name = label.rsplit(".", 1)[-1]
+    findings = []
+    use = np.diff(time_s, prepend=-np.inf) > 0.0
+    if not use.all():
+        again = time_s[~use]
+        words = f"{len(again)} rows repeat the time of the row before and are left out, as time.repeats says"
+        findings.append(Finding(name, words, float(again[0]), float(again[-1])))
+    if source.use_s is not None:
+        inside = np.any([(time_s >= start) & (time_s <= stop) for start, stop in source.use_s], axis=0)
+        left = int((use & ~inside).sum())
+        if left:
+            spans = ", ".join(f"{start:g} to {stop:g} s" for start, stop in source.use_s)
+            words = f"{left} of {int(use.sum())} rows lie outside use_s ({spans}) and are left out"
+            findings.append(Finding(name, words, np.nan, np.nan))
+        use &= inside
+    return use, findings
+
+
+def spaced(time_s: FloatArray, every_s: float) -> BoolArray:
+    """Rows (n,) that keep at least ``every_s`` from the one kept before, the first among them; all of them for 0."""
+    if every_s <= 0.0:
+        return np.ones(len(time_s), dtype=bool)
+    keep = np.zeros(len(time_s), dtype=bool)
+    next_s = -np.inf
+    for k, t in enumerate(time_s.tolist()):
+        if t >= next_s - 1e-6:
+            keep[k], next_s = True, t + every_s
+    return keep
+
+
+def oversampled(name: str, time_s: FloatArray, every_s: float) -> list[Finding]:
+    """Say how many of a tracker's rows only check the trajectory."""
+    idle = int((~spaced(time_s, every_s)).sum())
+    if not idle:
+        return []
+    words = f"{idle} of {len(time_s)} rows lie closer than every_s = {every_s:g} s: they check the trajectory, no more"
+    return [Finding(name, words, np.nan, np.nan)]

@@ -9,22 +9,75 @@ sphere of radius ``Rn``. In the half-plane (station aft of the nose ``s``, radiu
 with minor radius ``a`` and spacing ``p``. Body axes: datum at the nose, x forward, so ``x = -s``. *Shell* axes equal
 body axes when the joint is not bent; `bend` carries shell points to the body. Assumed: the skin follows the tori, the
 shell bends nowhere but at the joint, gore seams are meridians of the aft side evenly clocked from 0 deg LV.
+
+Meshes of a user's own for aeroshell and centerbody (STL, OBJ, GLB): read, laid into the vehicle, checked against it.
+
+A mesh says what a body looks like; `flightmodel.geometry` stays what the camera's fit projects. So that both are one
+vehicle, the mesh must have its size, and a shell's rim must be the circle that ``[geometry]`` has. A point ``p`` of the
+file lies in body axes at
+
+    unit_m R (p - nose),     rows of R: forward, -zero_clock, forward x -zero_clock.
+
+A mesh must be closed: every edge bounds an even number of faces. Then rays tell inside from outside by the parity of
+what they cross, whichever way faces are wound.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
 from flightmodel import rotations
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import ConfigError, FloatArray, GateError
+from flightmodel.config import FileBeside, KeyFaults, Length, Section
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 
 if TYPE_CHECKING:
     import trimesh
 
-    from flightmodel.vehicle import ShellGeometry
+
+class ShellGeometry(Section):
+    """Stacked-torus aeroshell and cylindrical centerbody."""
+
+    nose_radius_m: Length
+    half_angle_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
+    torus_count: Annotated[int, Field(ge=1, le=60)]
+    torus_minor_radius_m: Length
+    torus_spacing_m: Length
+    innermost_torus_radius_m: Length
+    base_radius_m: Length
+    gore_count: Annotated[int, Field(ge=3, le=120)]
+    centerbody_radius_m: Length
+    centerbody_length_m: Length
+
+    @model_validator(mode="after")
+    def _possible(self) -> ShellGeometry:
+        angle, base = np.deg2rad(self.half_angle_deg), self.base_radius_m
+        outermost = self.innermost_torus_radius_m + (self.torus_count - 1) * self.torus_spacing_m * np.sin(angle)
+        faults: list[tuple[str, object, str]] = []
+        if self.nose_radius_m * np.cos(angle) >= base:
+            words = f"the nose cap is wider than the base; below {base / np.cos(angle):.4g} m for this base and angle"
+            faults.append(("nose_radius_m", self.nose_radius_m, words))
+        if self.torus_minor_radius_m >= self.innermost_torus_radius_m:
+            words = (
+                f"wanted below innermost_torus_radius_m = {self.innermost_torus_radius_m:g}, or the torus has no hole"
+            )
+            faults.append(("torus_minor_radius_m", self.torus_minor_radius_m, words))
+        if outermost - self.torus_minor_radius_m >= base:
+            words = f"the outermost of {self.torus_count} tori, of radius {outermost:.4g} m, lies outside the base"
+            faults.append(("base_radius_m", base, f"{words}; check torus_count and torus_spacing_m"))
+        if self.centerbody_radius_m >= base:
+            faults.append(("centerbody_radius_m", self.centerbody_radius_m, f"wanted below base_radius_m = {base:g}"))
+        if faults:
+            raise KeyFaults(faults)
+        return self
 
 
 def torus_circles(geometry: ShellGeometry) -> tuple[FloatArray, FloatArray]:
@@ -182,3 +235,348 @@ def vehicle_meshes(
         transform=axes @ trimesh.transformations.translation_matrix([0.0, 0.0, 0.5 * length]),
     )  # fmt: skip
     return meshes
+
+
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
+Faces = NDArray[np.int64]
+
+KINDS = (".stl", ".obj", ".glb")
+LARGEST_BYTES, MOST_FACES, MOST_NODES = 50_000_000, 500_000, 10_000
+UNITS_M = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
+WRONG_UNIT, SUGGESTED = 1.6, 1.1  # units lie a factor of 2.5 apart; one that makes the size right to a tenth is named
+SAME_RIM, SAME_END = 0.1, 0.25  # of the rim's radius, of the centerbody's length
+NO_CIRCLE = 0.05  # of the rim's radius
+NEAR_M = 0.001  # a lens sits on the very skin: from so far outboard of it a mesh is looked at
+TO_CLOSE = "close it in the program that made it (export as a solid; mend holes and coinciding vertices)"
+
+
+class MeshFile(Section):
+    """A body's mesh: file, its unit, and how it lies in the vehicle; axes and ``nose`` are the file's own."""
+
+    file: FileBeside
+    unit_m: Annotated[float, Field(ge=1e-6, le=1e4)]
+    forward: Axis
+    zero_clock: Axis | None = None
+    nose: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _usable(self) -> MeshFile:
+        faults: list[tuple[str, object, str]] = []
+        if Path(self.file).suffix.lower() not in KINDS:
+            faults.append(("file", self.file, f"a mesh ends in {', '.join(KINDS)}"))
+        if self.zero_clock is not None and self.zero_clock[-1] == self.forward[-1]:
+            words = f"the axis towards clocking angle 0 lies across forward = '{self.forward}'"
+            faults.append(("zero_clock", self.zero_clock, words))
+        if faults:
+            raise KeyFaults(faults)
+        return self
+
+    @property
+    def rows(self) -> FloatArray:
+        """Body axes in the file's, (3, 3). Without ``zero_clock`` the file's axis after ``forward`` is body y."""
+        forward = _unit(self.forward)
+        y = np.roll(np.abs(forward), 1) if self.zero_clock is None else -_unit(self.zero_clock)
+        return np.stack([forward, y, np.cross(forward, y)])
+
+
+class MeshFiles(Section):
+    """The ``[meshes]`` of a vehicle file."""
+
+    aeroshell: MeshFile | None = None
+    centerbody: MeshFile | None = None
+
+
+@dataclass(frozen=True)
+class BodyMesh:
+    """A closed mesh in the axes of the unbent vehicle.
+
+    Parameters
+    ----------
+    vertices_m : (n, 3) float
+        From the datum, body axes (the aeroshell's: shell axes).
+    faces : (m, 3) int
+    words : str
+        What it is, and how its rim agrees with ``[geometry]``.
+    """
+
+    vertices_m: FloatArray
+    faces: Faces
+    words: str
+
+
+def body_meshes(
+    spec: MeshFiles, folder: Path, geometry: ShellGeometry, lenses_m: dict[str, FloatArray]
+) -> dict[str, BodyMesh]:
+    """Read and check the meshes of a vehicle, by body.
+
+    Parameters
+    ----------
+    spec : MeshFiles
+    folder : Path
+        Of the vehicle file.
+    geometry : ShellGeometry
+        What they must agree with.
+    lenses_m : dict of str to (3,) float
+        Where the vehicle's cameras are, body axes, m: none may lie inside a mesh.
+
+    Raises
+    ------
+    ConfigError
+        Where all faults are of the vehicle file's keys.
+    GateError
+        Where a mesh cannot be used; with every fault of both.
+    """
+    out: dict[str, BodyMesh] = {}
+    faults: list[GateError] = []
+    for body in ("aeroshell", "centerbody"):
+        entry: MeshFile | None = getattr(spec, body)
+        if entry is None:
+            continue
+        try:
+            vertices, faces = read_mesh(folder / entry.file)
+            out[body] = _laid(body, entry, vertices, faces, geometry)
+            _check_lenses(f"meshes.{body}: {entry.file}", out[body], lenses_m)
+        except GateError as fault:
+            faults.append(fault)
+    if faults:
+        kind = ConfigError if all(isinstance(fault, ConfigError) for fault in faults) else GateError
+        raise kind([words for fault in faults for words in fault.faults])
+    return out
+
+
+def read_mesh(path: Path) -> tuple[FloatArray, Faces]:
+    """Vertices ``(n, 3)`` in the file's unit and faces ``(m, 3)`` of a closed mesh, equal vertices made one.
+
+    Nothing but the file itself is read; it is refused before it is decoded where it would become too large.
+
+    Raises
+    ------
+    ConfigError
+        Where there is no such file.
+    GateError
+        Where it is too large, cut off, of another kind, empty, or not closed.
+    """
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such mesh; key 'meshes' names it")
+    size = path.stat().st_size
+    if size > LARGEST_BYTES:
+        raise GateError(f"{path}: {size / 1e6:.0f} MB where {LARGEST_BYTES // 10**6} at most are taken; thin it out")
+    data, kind = path.read_bytes(), path.suffix.lower()[1:]
+    fault = {"stl": _fault_of_stl, "obj": _fault_of_obj, "glb": _fault_of_glb}[kind](data) if data else "is empty"
+    if fault:
+        raise GateError(f"{path}: {fault}")
+    vertices, faces = _decoded(path, data, kind)
+    rest = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces = faces[rest]
+    if len(faces) == 0:
+        raise GateError(f"{path}: is empty: it has no face")
+    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, count = np.unique(ends[:, 0] * len(vertices) + ends[:, 1], return_counts=True)
+    odd = edges[count % 2 == 1]
+    if len(odd):
+        place = np.round(vertices[odd[0] // len(vertices)], 4).tolist()
+        words = f"{len(odd)} of its {len(edges)} edges bound one face or three, the first at {place} in the file's unit"
+        raise GateError(f"{path}: is not watertight: {words}; {TO_CLOSE}")
+    return vertices, faces
+
+
+def _decoded(path: Path, data: bytes, kind: str) -> tuple[FloatArray, Faces]:
+    """Triangles of a file's bodies together, equal vertices made one."""
+    import trimesh
+
+    try:
+        # from memory and without a resolver: materials and buffers in other files are not followed
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, skip_materials=True, process=False)
+        parts = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
+        solids = [part for part in parts if isinstance(part, trimesh.Trimesh)]
+        total = sum(len(part.faces) for part in solids)
+        if 0 < total <= MOST_FACES:
+            whole = scene.to_mesh()
+            is_finite = bool(np.isfinite(whole.vertices).all())
+            mesh = trimesh.Trimesh(whole.vertices, whole.faces, process=True)
+    except Exception as fault:  # a decoder of untrusted files raises whatever its parts raise
+        raise GateError(f"{path}: cannot be decoded as {kind.upper()} ({type(fault).__name__}: {fault})") from None
+    if total == 0:
+        raise GateError(f"{path}: is empty: it has no face")
+    if total > MOST_FACES:
+        raise GateError(f"{path}: {total} faces where {MOST_FACES} at most are taken; thin it out")
+    if not is_finite:
+        raise GateError(f"{path}: vertices are not finite numbers")
+    return np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
+
+
+def _too_many(count: int) -> str:
+    return f"{count} faces where {MOST_FACES} at most are taken; thin it out" if count > MOST_FACES else ""
+
+
+def _fault_of_stl(data: bytes) -> str:
+    """Say why an STL file is not to be decoded; the count in a binary one's head must fit its size."""
+    told = int.from_bytes(data[80:84], "little")
+    if len(data) >= 84 and len(data) == 84 + 50 * told:
+        return _too_many(told) if told else "is empty: it has no face"
+    if data.lstrip()[:5].lower() == b"solid" and (b"facet" in data or b"endsolid" in data):
+        if b"facet" not in data:
+            return "is empty: it has no face"
+        if b"endsolid" not in data[-1000:]:
+            return "is cut off: the last line, endsolid, is missing"
+        return _too_many(data.count(b"endfacet"))
+    if len(data) < 84:
+        return f"is cut off: {len(data)} bytes where the head of a binary STL takes 84"
+    words = f"its head tells of {told} faces, which take {84 + 50 * told} bytes, and it has {len(data)}"
+    return f"is cut off or no STL: {words}"
+
+
+def _fault_of_obj(data: bytes) -> str:
+    """Say why an OBJ file is not to be decoded."""
+    corners = [len(line.split()) - 1 for line in data.splitlines() if line.lstrip()[:2] == b"f "]
+    return _too_many(sum(max(n - 2, 0) for n in corners)) if corners else "is empty: it has no face"
+
+
+def _fault_of_glb(data: bytes) -> str:
+    """Say why a GLB file is not to be decoded: cut off, referring elsewhere, packed, or larger than it looks."""
+    if data[:4] != b"glTF" or len(data) < 20:
+        return "is no GLB file, or cut off: it does not begin with glTF and a head of 20 bytes"
+    told, size = (int.from_bytes(data[k : k + 4], "little") for k in (8, 12))
+    if told != len(data):
+        return f"is cut off: {len(data)} bytes where its head tells of {told}"
+    try:
+        tree = json.loads(data[20 : 20 + size])
+        accessors, nodes = tree.get("accessors", []), tree.get("nodes", [])
+        largest = max((int(a.get("count", 0)) for a in accessors), default=0)
+        elsewhere = [b["uri"] for b in tree.get("buffers", []) if "uri" in b]
+        wanted, is_tree = tree.get("extensionsRequired", []), _is_forest(nodes)
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return "has no head that can be read"
+    if elsewhere:
+        return "keeps its numbers in another place; export one GLB file that holds everything"
+    if wanted:
+        return f"needs {', '.join(map(str, wanted))}; export without packing"
+    if largest > 3 * MOST_FACES or len(nodes) > MOST_NODES or len(accessors) > MOST_NODES:
+        return f"has more than {MOST_FACES} faces or {MOST_NODES} parts; thin it out"
+    return "" if is_tree else "has a part that lies in itself or in two others"
+
+
+def _is_forest(nodes: list[dict[str, Any]]) -> bool:
+    """Whether every node of a GLB file has one parent at most and lies in no circle."""
+    children = [int(child) for node in nodes for child in node.get("children", [])]
+    if len(set(children)) < len(children) or not all(0 <= child < len(nodes) for child in children):
+        return False
+    at, reached = sorted(set(range(len(nodes))) - set(children)), 0
+    while at:
+        reached += len(at)
+        at = [int(child) for k in at for child in nodes[k].get("children", [])]
+    return reached == len(nodes)
+
+
+def _laid(body: str, spec: MeshFile, vertices: FloatArray, faces: Faces, geometry: ShellGeometry) -> BodyMesh:
+    """Lay a mesh into the vehicle; refused where its size, rim or end contradicts ``[geometry]``."""
+    key, named = f"key 'meshes.{body}", f"{spec.file}: "
+    station, radius = torus_circles(geometry)
+    rim_m, rim_station_m = float(radius[-1] + geometry.torus_minor_radius_m), float(station[-1])
+    across, length = geometry.centerbody_radius_m, geometry.centerbody_length_m
+    wanted_m = 2.0 * rim_m if body == "aeroshell" else max(length, 2.0 * across)
+    size = float(np.ptp(vertices, axis=0).max())
+    if not 1.0 / WRONG_UNIT < size * spec.unit_m / wanted_m < WRONG_UNIT:
+        fits = {n: u for n, u in UNITS_M.items() if 1.0 / SUGGESTED < size * u / wanted_m < SUGGESTED}
+        try_this = " or ".join(f"unit_m = {u:g} ({n})" for n, u in fits.items()) or f"unit_m = {wanted_m / size:.4g}"
+        words = f"{named}would be {size * spec.unit_m:.4g} m in size where [geometry] has {wanted_m:.4g} m"
+        raise ConfigError(f"{key}.unit_m' = {spec.unit_m:g}: {words}; try {try_this}, or correct [geometry]")
+    placed = spec.unit_m * (vertices - np.array(spec.nose)) @ spec.rows.T
+    head = f"{named}{len(faces)} faces, {size * spec.unit_m:.3f} m in size"
+    if body == "centerbody":
+        # rounded, so that no end lies at -0
+        ends = tuple(round(float(end), 4) + 0.0 for end in (-placed[:, 0].max(), -placed[:, 0].min()))
+        if max(abs(ends[1] - length), abs(ends[0])) > max(SAME_END * length, 2.0 * across):
+            words = f"reaches from station {ends[0]:.3f} to {ends[1]:.3f} m where [geometry] has 0 to {length:g} m"
+            raise ConfigError(f"{key}': {named}{words}; check forward and nose")
+        return BodyMesh(placed, faces, f"{head}, from station {ends[0]:.3f} to {ends[1]:.3f} m")
+    front_m, turn_it = float(-placed[:, 0].max()), "check forward, zero_clock and nose"
+    if front_m < -SAME_RIM * rim_m:
+        tip = np.array(spec.nose) - (front_m / spec.unit_m) * spec.rows[0]
+        words = f"reaches {-front_m:.3f} m ahead of the vehicle's nose; if forward is right, nose = {_shown(tip)}"
+        raise ConfigError(f"{key}.nose' = {list(spec.nose)}: {named}{words}")
+    rim = rim_circle(placed)
+    if rim.rms_m > NO_CIRCLE * rim.radius_m:
+        words = f"its outline from ahead is no circle (rms {rim.rms_m:.3f} m)"
+        raise ConfigError(f"{key}.forward' = '{spec.forward}': {named}{words}; {turn_it}")
+    off_m = float(np.hypot(*rim.centre_m))
+    words = (
+        f"rim of radius {rim.radius_m:.3f} m at station {rim.station_m:.3f} m, {off_m:.3f} m off the axis, where "
+        f"[geometry] has {rim_m:.3f} m at {rim_station_m:.3f} m"
+    )
+    if max(abs(rim.radius_m - rim_m), off_m) > SAME_RIM * rim_m:
+        allowed = f"{SAME_RIM * rim_m:.3f} m of difference is allowed"
+        raise ConfigError(f"{key}': {named}{words}; {allowed}; {turn_it}, or correct [geometry]")
+    apart = abs(rim.station_m - rim_station_m) > SAME_RIM * rim_m
+    return BodyMesh(placed, faces, f"{head}; {words}{', so it will not lie over the filmed shell' if apart else ''}")
+
+
+@dataclass(frozen=True)
+class Rim:
+    """Circle of a shell's largest radius.
+
+    Parameters
+    ----------
+    centre_m : (2,) float
+        Body y and z.
+    radius_m, station_m : float
+    rms_m : float
+        Of the outline against the circle.
+    """
+
+    centre_m: FloatArray
+    radius_m: float
+    station_m: float
+    rms_m: float
+
+
+def rim_circle(points_m: FloatArray) -> Rim:
+    """Circle through the outline from ahead, a convex hull, of points ``(n, 3)`` in body axes, m; Kasa's fit."""
+    from scipy.spatial import ConvexHull
+
+    hull = points_m[ConvexHull(points_m[:, 1:], qhull_options="QJ").vertices]
+    design = np.column_stack([2.0 * hull[:, 1:], np.ones(len(hull))])
+    (y, z, rest), *_ = np.linalg.lstsq(design, np.sum(hull[:, 1:] ** 2, axis=1), rcond=None)
+    radius = float(np.sqrt(rest + y * y + z * z))
+    rms = float(np.sqrt(np.mean((np.hypot(hull[:, 1] - y, hull[:, 2] - z) - radius) ** 2)))
+    return Rim(np.array([y, z]), radius, float(np.median(-hull[:, 0])), rms)
+
+
+def _check_lenses(named: str, mesh: BodyMesh, lenses_m: dict[str, FloatArray]) -> None:
+    """Raise `ConfigError` naming the cameras whose lenses lie inside a mesh."""
+    inside = [name for name, lens in lenses_m.items() if encloses(mesh, outboard(lens))]
+    if inside:
+        words = f"the lenses of {', '.join(inside)} lie inside it and would see nothing"
+        raise ConfigError(f"{named}: {words}; leave their housings out of the mesh, or check forward, nose and cameras")
+
+
+def outboard(lens_m: FloatArray) -> FloatArray:
+    """Point (3,) a little farther from the axis than a lens, which may lie on the very skin."""
+    away = lens_m * np.array([0.0, 1.0, 1.0])
+    return np.asarray(lens_m + NEAR_M * away / max(float(np.linalg.norm(away)), 1e-9))
+
+
+def encloses(mesh: BodyMesh, point_m: FloatArray) -> bool:
+    """Whether a point (3,), body axes, m, lies inside: a ray from it crosses an odd number of faces.
+
+    Möller and Trumbore's test; the ray's direction is one that no face or edge of a drawing lies along.
+    """
+    direction = np.array([-0.2718281, 0.5772157, 0.7724538])
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
+    p = np.cross(direction, c - a)
+    det = np.einsum("ni,ni->n", b - a, p)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = np.einsum("ni,ni->n", point_m - a, p) / det
+        q = np.cross(point_m - a, b - a)
+        v, t = (q @ direction) / det, np.einsum("ni,ni->n", c - a, q) / det
+        crossed = (u >= 0.0) & (v >= 0.0) & (u + v < 1.0) & (t > 0.0)
+    return bool(crossed.sum() % 2)
+
+
+def _shown(point: FloatArray) -> list[float]:
+    return [float(f"{x:.5g}") + 0.0 for x in point]
+
+
+def _unit(axis: Axis) -> FloatArray:
+    return (-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[-1])]

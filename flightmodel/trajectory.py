@@ -11,14 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel import earth, rotations
-from flightmodel.checks import (
-    FloatArray,
-    GateError,
-    check_finite,
-    check_increasing,
-    check_shape,
-    check_unit_quaternion,
-)
+from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing, check_shape, check_unit_quaternion
 
 
 @dataclass(frozen=True)

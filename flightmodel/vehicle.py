@@ -14,8 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from flightmodel.aerodynamics import AeroTable
-from flightmodel.aeroinput import Aerodynamics, Shape, aerodynamics_from
+from flightmodel.aerodynamics import Aerodynamics, AeroTable, Shape, aerodynamics_from
 from flightmodel.checks import ConfigError, FloatArray, check_positive_definite, nearest_name
 from flightmodel.config import (
     Angle,
@@ -30,8 +29,8 @@ from flightmodel.config import (
     read_toml,
 )
 from flightmodel.deflection import lv_direction
+from flightmodel.geometry import BodyMesh, MeshFiles, ShellGeometry, body_meshes
 from flightmodel.instruments import dcm_body_from_clocking
-from flightmodel.meshes import BodyMesh, MeshFiles, body_meshes
 
 DATA = Path(__file__).parent / "data"
 SAME_SHAPE = 0.1  # the cone of the coefficients may be an effective one, but not another vehicle's
@@ -127,43 +126,6 @@ class Uncertainty(Section):
     cn: Fraction = 0.07
     cm: Fraction = 0.10
     cmq: Annotated[float, Field(ge=0.0, le=10.0)] = 0.15
-
-
-class ShellGeometry(Section):
-    """Stacked-torus aeroshell and cylindrical centerbody."""
-
-    nose_radius_m: Length
-    half_angle_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
-    torus_count: Annotated[int, Field(ge=1, le=60)]
-    torus_minor_radius_m: Length
-    torus_spacing_m: Length
-    innermost_torus_radius_m: Length
-    base_radius_m: Length
-    gore_count: Annotated[int, Field(ge=3, le=120)]
-    centerbody_radius_m: Length
-    centerbody_length_m: Length
-
-    @model_validator(mode="after")
-    def _possible(self) -> ShellGeometry:
-        angle, base = np.deg2rad(self.half_angle_deg), self.base_radius_m
-        outermost = self.innermost_torus_radius_m + (self.torus_count - 1) * self.torus_spacing_m * np.sin(angle)
-        faults: list[tuple[str, object, str]] = []
-        if self.nose_radius_m * np.cos(angle) >= base:
-            words = f"the nose cap is wider than the base; below {base / np.cos(angle):.4g} m for this base and angle"
-            faults.append(("nose_radius_m", self.nose_radius_m, words))
-        if self.torus_minor_radius_m >= self.innermost_torus_radius_m:
-            words = (
-                f"wanted below innermost_torus_radius_m = {self.innermost_torus_radius_m:g}, or the torus has no hole"
-            )
-            faults.append(("torus_minor_radius_m", self.torus_minor_radius_m, words))
-        if outermost - self.torus_minor_radius_m >= base:
-            words = f"the outermost of {self.torus_count} tori, of radius {outermost:.4g} m, lies outside the base"
-            faults.append(("base_radius_m", base, f"{words}; check torus_count and torus_spacing_m"))
-        if self.centerbody_radius_m >= base:
-            faults.append(("centerbody_radius_m", self.centerbody_radius_m, f"wanted below base_radius_m = {base:g}"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
 
 
 class SensorMount(Section):

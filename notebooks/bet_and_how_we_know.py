@@ -33,7 +33,7 @@ from scipy.stats import chi2
 
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import Trajectory, difference, resample
-from recon.bet import reconstruct
+from recon.reconstruct import reconstruct
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 

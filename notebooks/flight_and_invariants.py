@@ -28,7 +28,7 @@ import numpy as np
 
 from flightmodel import rotations
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from synthetic_flight import dynamics, packing
+from synthetic_flight import dynamics, simulate
 from synthetic_flight.scenarios import fly_scenario, read_scenario
 from synthetic_flight.simulate import integrate
 
@@ -71,7 +71,7 @@ state[10:14] = rotations.multiply(state[6:10], rotations.exp(np.array([0.0, 0.07
 state[14:17], state[17:20] = [0.63, 0.05, -0.08], [0.63, 0.02, 0.12]
 steps = {}
 for step_s in (0.004, 0.002, 0.001):
-    states, _ = integrate(free, packing.vacuum_table(), state, step_s, round(0.02 / step_s), 2001)
+    states, _ = integrate(free, simulate.vacuum_table(), state, step_s, round(0.02 / step_s), 2001)
     held, turning = dynamics.internal_energy(states, free), dynamics.angular_momentum(states, free)
     steps[step_s] = (np.abs(held / held[0] - 1.0).max(),
                      np.linalg.norm(turning - turning[0], axis=1).max() / np.linalg.norm(turning[0]))  # fmt: skip

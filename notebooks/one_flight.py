@@ -29,12 +29,11 @@ import pandas as pd
 from IPython.display import Image, display
 
 from flightmodel.airdata import pressure_pulse
-from postflight import drawing, figures
-from postflight.pipeline import METHODS, estimate, reconstruct_flight
-from postflight.preflight import rigid_bounds
-from postflight.product.tables import event_table
-from postflight.product.trajectory_table import bet_table
-from postflight.results import method_summary
+from postflight.flight import METHODS, estimate, reconstruct_flight
+from postflight.plots import paper_figures, run_figures
+from postflight.product import bet_table, event_table
+from postflight.run_folder import method_summary
+from postflight.studies.preflight import rigid_bounds
 
 folder = Path(os.environ.get("POSTFLIGHT_FLIGHT", "../demo-flight"))
 if not (folder / "flight.toml").exists():
@@ -72,7 +71,7 @@ pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.words) for v in flight.ver
              columns=["verdict", "passed", "value", "in words"])  # fmt: skip
 
 # %%
-figures.figure_residuals(flight)
+paper_figures.figure_residuals(flight)
 
 # %% [markdown]
 # ## The anomaly
@@ -82,7 +81,7 @@ figures.figure_residuals(flight)
 
 # %%
 bounds = rigid_bounds(flight, flights=60)
-figures.figure_1_3(flight, bounds)
+paper_figures.figure_1_3(flight, bounds)
 
 # %% [markdown]
 # ## The sharp contrast
@@ -91,7 +90,7 @@ figures.figure_1_3(flight, bounds)
 # correction, the accelerometers ask for an angle that the trajectory denies.
 
 # %%
-figures.figure_2_5(flight)
+paper_figures.figure_2_5(flight)
 
 # %% [markdown]
 # ## Three ways to the deflection
@@ -107,12 +106,12 @@ answers = estimate(flight, telemetry, methods)
 pd.DataFrame(method_summary(answers, flight.peak_s)).T[["deflection_deg", "sd_deg", "largest_deg", "largest_at_s"]]
 
 # %%
-figures.figure_2_7(flight, answers.histories["misalignment"])
+paper_figures.figure_2_7(flight, answers.histories["misalignment"])
 
 # %%
 if "camera" in answers.histories:
     with TemporaryDirectory() as pictures:
-        drawing.draw_camera(telemetry, answers.histories["camera"], Path(pictures))
+        run_figures.draw_camera(telemetry, answers.histories["camera"], Path(pictures))
         display(Image((Path(pictures) / "figure_2_3.png").read_bytes()))
 
 # %% [markdown]
@@ -143,4 +142,4 @@ for k, one in enumerate(names):
 if (folder / "truth" / "deflection.csv").exists():
     truth = pd.read_csv(folder / "truth" / "deflection.csv")
     overlay = (truth["t_s"].to_numpy(), truth["theta_deg"].to_numpy())
-    display(figures.figure_summary(flight, answers, overlay))
+    display(paper_figures.figure_summary(flight, answers, overlay))

@@ -39,8 +39,9 @@ import pandas as pd
 
 from flightmodel import earth
 from flightmodel.flightfolder import read_flight
-from recon.bet import Settings, reconstruct
-from recon.withheld import summary
+from recon.consistency import summary
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 
 TREE = Path("../tests/data/real_flights")
 REAL = os.environ.get("POSTFLIGHT_REALDATA")

@@ -31,8 +31,8 @@ import pandas as pd
 from IPython.display import Image, display
 
 from flightmodel.flightfolder import read_flight
-from postflight import drawing
-from postflight.pipeline import estimate_camera
+from postflight.flight import estimate_camera
+from postflight.plots import run_figures
 
 folder = Path(os.environ.get("POSTFLIGHT_FLIGHT", "../demo-flight"))
 if not (folder / "flight.toml").exists():
@@ -64,7 +64,7 @@ for axis, k in zip(axes, (frames.benchmark, late), strict=True):
 # %%
 history = estimate_camera(telemetry)
 with TemporaryDirectory() as pictures:
-    drawing.draw_camera(telemetry, history, Path(pictures))
+    run_figures.draw_camera(telemetry, history, Path(pictures))
     display(Image((Path(pictures) / "figure_2_3.png").read_bytes()))
 
 # %% [markdown]

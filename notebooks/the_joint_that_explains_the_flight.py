@@ -32,14 +32,14 @@ import numpy as np
 import pandas as pd
 
 from flightmodel.flightfolder import read_flight
-from postflight.pipeline import PULSE_RATE_HZ, reconstruct_telemetry
-from postflight.preflight import rigid_bounds
+from postflight.flight import PULSE_RATE_HZ, reconstruct_telemetry
 from postflight.reconciliation.answer import deflection_of, joint_table
 from postflight.reconciliation.command import reconciled_bounds
 from postflight.reconciliation.fit import reconcile
 from postflight.reconciliation.modes import stiffness_by_modes
 from postflight.studies.commands import shares
-from recon.bet import Settings
+from postflight.studies.preflight import rigid_bounds
+from recon.settings import Settings
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 

@@ -32,8 +32,8 @@ import numpy as np
 import pandas as pd
 
 from flightmodel.checks import DivergenceError
-from postflight.fused import agreement_table, fuse_flight, input_table
-from postflight.pipeline import METHODS, estimate, reconstruct_flight
+from postflight.flight import METHODS, estimate, reconstruct_flight
+from postflight.fusing import agreement_table, fuse_flight, input_table
 
 folder = Path(os.environ.get("POSTFLIGHT_FLIGHT", "../demo-flight"))
 if not (folder / "flight.toml").exists():

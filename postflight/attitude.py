@@ -1,6 +1,6 @@
 """Does an attitude from magnetometer and Sun sensors alone agree with the trajectory's? The range's check, every run.
 
-See docs/attitude.md, and `recon.attitude_check` for the comparison itself.
+See docs/attitude.md, and `recon.vector_attitude` for the comparison itself.
 """
 
 from __future__ import annotations
@@ -15,11 +15,18 @@ from flightmodel import earth, rotations
 from flightmodel.checks import GateError
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import interpolate_rows, resample
-from postflight.product.kinematics import euler_321
-from recon.attitude_check import LEAST_INSIDE, AttitudeComparison, AttitudeHistory, Settings, compare
-from recon.bet import Reconstruction
+from postflight.kinematics import euler_321
 from recon.consistency import Verdict
-from recon.vector_attitude import reconstruct_attitude, track
+from recon.reconstruct import Reconstruction
+from recon.vector_attitude import (
+    LEAST_INSIDE,
+    AttitudeComparison,
+    AttitudeHistory,
+    Settings,
+    compare,
+    reconstruct_attitude,
+    track,
+)
 
 RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
 DEPENDS = "this check is not independent: the trajectory's "

@@ -1,17 +1,162 @@
 """The ``postflight`` command. Exit codes: 0 fine, 2 usage or configuration, 3 data refused, 4 an estimator gave no
 answer, 5 a synthetic-truth check failed, 130 interrupted, 143 terminated.
+
+The commands ``postflight montecarlo`` and ``postflight study``: many flights at once.
 """
 
 from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import click
 
-from postflight.cli_ensembles import FOLDER, montecarlo, study
+# heavy imports stand inside the commands, so that --help answers at once
+FOLDER = click.Path(path_type=Path)
+
+
+@click.group()
+def montecarlo() -> None:
+    """Fly many dispersed flights, on this machine or a cluster; kill and resume at will.
+
+    DISPERSIONS is a .toml file, or the name of a shipped one (irve2_reference). FOLDER holds one study.
+    """
+
+
+def workers_and_scheduler(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that say who flies."""
+    command = click.option(
+        "--scheduler", metavar="ADDRESS", help="Fly on the Dask cluster of this scheduler, e.g. tcp://host:8786."
+    )(command)
+    return click.option("--workers", type=click.IntRange(min=1), help="Processes here; every core by default.")(command)
+
+
+@montecarlo.command(name="run")
+@click.argument("dispersions")
+@click.argument("folder", type=FOLDER)
+@click.option("--flights", type=click.IntRange(1, 10_000_000), help="Instead of the file's number; more extend a run.")
+@click.option(
+    "--until-width", metavar="OUTPUT=WIDTH", help="Stop once the 97.7th percentile's 95 % interval is this narrow."
+)
+@workers_and_scheduler
+def montecarlo_run(
+    dispersions: str,
+    folder: Path,
+    flights: int | None,
+    until_width: str | None,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    """Fly what is missing of DISPERSIONS in FOLDER, then write percentiles, intervals and bands."""
+    from postflight.montecarlo import commands
+
+    commands.run(dispersions, folder, flights, workers, scheduler, until_width)
+
+
+@montecarlo.command(name="status")
+@click.argument("folder", type=FOLDER)
+def montecarlo_status(folder: Path) -> None:
+    """Say how many flights FOLDER holds, and why some failed."""
+    from postflight.montecarlo import commands
+
+    commands.status(folder)
+
+
+@montecarlo.command(name="merge")
+@click.argument("folder", type=FOLDER)
+def montecarlo_merge(folder: Path) -> None:
+    """Write tables and figures of FOLDER anew from its flights."""
+    from postflight.montecarlo import commands
+
+    commands.remerge(folder)
+
+
+@montecarlo.command(name="retry-failed")
+@click.argument("folder", type=FOLDER)
+@workers_and_scheduler
+def montecarlo_retry_failed(folder: Path, workers: int | None, scheduler: str | None) -> None:
+    """Fly those flights of FOLDER again that failed."""
+    from postflight.montecarlo import commands
+
+    commands.retry_failed(folder, workers, scheduler)
+
+
+@montecarlo.command(name="sobol")
+@click.argument("dispersions")
+@click.argument("folder", type=FOLDER)
+@click.option("--output", default="peak_deflection_deg", show_default=True, help="Whose indices are printed and drawn.")
+@click.option("--base", type=int, default=256, show_default=True, help="Points of the design, a power of two.")
+@click.option("--by", type=click.Choice(["factor", "section"]), default="section", show_default=True)
+@workers_and_scheduler
+def montecarlo_sobol(
+    dispersions: str, folder: Path, output: str, base: int, by: str, workers: int | None, scheduler: str | None
+) -> None:
+    """Say which dispersion of DISPERSIONS makes an output uncertain: Sobol indices, BASE x (columns + 2) flights."""
+    from postflight.montecarlo import commands
+
+    commands.sobol_indices(dispersions, folder, output, base, by, workers, scheduler)
+
+
+@click.group()
+def study() -> None:
+    """The paper's own studies, as tables and figures beside its numbers."""
+
+
+@study.command(name="table-3.1")
+@click.argument("folder", type=FOLDER, default=Path("study-table-3.1"))
+@click.option("--vehicle", default="irve2_reference", show_default=True, help="A shipped one, or a .toml file.")
+def study_table_3_1(folder: Path, vehicle: str) -> None:
+    """Stiffness and damping against frequency and share of critical damping, into FOLDER."""
+    from postflight.studies import commands
+
+    commands.stiffness_and_damping(vehicle, folder)
+
+
+def scenario_and_seed(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that say what is flown."""
+    command = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the day.")(
+        command
+    )
+    return click.option("--scenario", default="irve2_reference", show_default=True, help="A name, or a .toml file.")(
+        command
+    )
+
+
+@study.command(name="damping")
+@click.argument("folder", type=FOLDER, default=Path("study-damping"))
+@scenario_and_seed
+def study_damping(folder: Path, scenario: str, seed: int) -> None:
+    """Angle of attack with 0.5 to 20 % damping at 2.5 Hz (Figure 3.1), into FOLDER."""
+    from postflight.studies import commands
+
+    commands.damping(scenario, folder, seed)
+
+
+@study.command(name="stiffness")
+@click.argument("folder", type=FOLDER, default=Path("study-stiffness"))
+@scenario_and_seed
+def study_stiffness(folder: Path, scenario: str, seed: int) -> None:
+    """Angle of attack and normal acceleration from 2 to 4 Hz at 0.5 % (Figures 3.2, 3.3), into FOLDER."""
+    from postflight.studies import commands
+
+    commands.stiffness(scenario, folder, seed)
+
+
+@study.command(name="preflight")
+@click.argument("flight", type=FOLDER)
+@click.argument("folder", type=FOLDER, default=Path("study-preflight"))
+@click.option("--dispersions", default="irve2_reference", show_default=True, help="Whose [joint] the joint has.")
+@click.option("--flights", type=click.IntRange(50, 100_000), default=1000, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def study_preflight(flight: Path, folder: Path, dispersions: str, flights: int, seed: int) -> None:
+    """Is FLIGHT inside the bounds of its own entry, with the joint locked and flexible (Figure 1.3)? Into FOLDER."""
+    from postflight.studies import commands
+
+    commands.preflight(flight, folder, dispersions, flights, seed)
+
 
 # heavy imports stand inside the commands, so that --help answers at once
 EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
@@ -121,7 +266,7 @@ def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> 
 def run(folder: Path, rate: float) -> None:
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
     from postflight import commands
-    from postflight.pipeline import METHODS
+    from postflight.flight import METHODS
 
     commands.run(folder, METHODS, rate)
 
@@ -176,9 +321,9 @@ def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path,
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def check(folder: Path, as_json: bool) -> None:
     """Look at the data of the flight in FOLDER: rates, gaps, stuck and doubtful sensors, units, axes, clocks."""
-    from postflight.intake import check_command
+    from postflight.checks import folder_check
 
-    check_command.check(folder, as_json)
+    folder_check.check(folder, as_json)
 
 
 @cli.command()
@@ -188,9 +333,9 @@ def check(folder: Path, as_json: bool) -> None:
 )
 def init(folder: Path, vehicle: str | None) -> None:
     """Write a commented flight.toml and vehicle file into FOLDER; what exists is never overwritten."""
-    from postflight.intake import init_command
+    from postflight.intake import flight_form
 
-    init_command.init(folder, vehicle)
+    flight_form.init(folder, vehicle)
 
 
 @cli.command("import")
@@ -198,9 +343,9 @@ def init(folder: Path, vehicle: str | None) -> None:
 @click.option("--into", "folder", required=True, type=FOLDER, help="A flight folder that `postflight init` made.")
 def import_tables(files: tuple[Path, ...], folder: Path) -> None:
     """Bring tables, video and coefficients into a flight folder; proposes in flight.toml which column is which."""
-    from postflight.intake import import_command
+    from postflight.intake import deliveries
 
-    import_command.import_files(files, folder)
+    deliveries.import_files(files, folder)
 
 
 @cli.command()
@@ -209,16 +354,16 @@ def import_tables(files: tuple[Path, ...], folder: Path) -> None:
 @click.option("--out", type=FOLDER, help="File to write; default: exports/RUN.FORMAT in FOLDER.")
 def export(folder: Path, form: str, out: Path | None) -> None:
     """Write the newest run's trajectory and deflections for another program."""
-    from postflight.exports import export_command
+    from postflight import exports
 
-    export_command.export(folder, form, out)
+    exports.export(folder, form, out)
 
 
 @cli.command()
 @click.argument("kind", type=click.Choice(["flight", "vehicle", "scenario", "coefficients"]))
 def schema(kind: str) -> None:
     """Print the JSON Schema of a flight.toml, vehicle or scenario file, or of a coefficient table's sidecar."""
-    from postflight.intake.schema import schema_text
+    from postflight.intake.flight_form import schema_text
 
     click.echo(schema_text(kind), nl=False)
 

@@ -19,9 +19,8 @@ from flightmodel.camera import Lens
 from flightmodel.checks import ConfigError, DivergenceError, FloatArray, GateError
 from flightmodel.deflection import lv_clock
 from flightmodel.flightfolder import read_flight
-from postflight import drawing, figures, results, scoring, warmup
-from postflight.overlay_film import write_overlay_film
-from postflight.pipeline import (
+from postflight import run_folder, warmup
+from postflight.flight import (
     METHODS,
     NO_VIDEO,
     PULSE_RATE_HZ,
@@ -31,12 +30,14 @@ from postflight.pipeline import (
     estimate,
     reconstruct_telemetry,
 )
+from postflight.plots import paper_figures, run_figures
+from postflight.plots.overlay_film import write_overlay_film
 from postflight.progress import Report, progress_bar
 from postflight.report.write import write_report
+from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
-from recon.bet import Settings
-from synthetic_flight.events import Event, flight_events
-from synthetic_flight.folder import check_destination, simulate_to_folder
+from recon.settings import Settings
+from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
 
@@ -161,21 +162,21 @@ def run_flight(
         answers = estimate(flight, flight.telemetry, wanted, step(0.5 * share, 0.7 * share))
         if "camera" in methods and "camera" not in wanted:
             answers.refused["camera"] = NO_VIDEO
-        with results.RunFolder(folder, flight.telemetry, settings) as out:
-            results.write_reconstruction(out, flight)
-            results.write_answers(out, answers)
+        with run_folder.RunFolder(folder, flight.telemetry, settings) as out:
+            run_folder.write_reconstruction(out, flight)
+            run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 out.write_csv(
                     "camera_sensitivity.csv", camera_sensitivity(flight.telemetry, answers.histories["camera"])
                 )
-            out.write_json("summary.json", results.summary(flight, answers))
-            bounds = drawing.draw_run(flight, answers, out.path / "figures", step(0.7 * share, share))
+            out.write_json("summary.json", run_folder.summary(flight, answers))
+            bounds = run_figures.draw_run(flight, answers, out.path / "figures", step(0.7 * share, share))
             if bounds is not None:
                 out.write_csv("rigid_bounds.csv", bounds.table())
             if reruns:
                 table = sensitivity(flight, step(share, 1.0))
                 out.write_csv("sensitivity.csv", table)
-                drawing.draw_sensitivity(flight, table, out.path / "figures")
+                run_figures.draw_sensitivity(flight, table, out.path / "figures")
             step(1.0, 1.0)(0.0, "writing the report")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
             (out.path / "log.jsonl").write_text(lines)
@@ -197,7 +198,7 @@ def print_flight(flight: Flight, events: pd.DataFrame) -> None:
     console.print(table)
     if not flight.peak_is_inside:
         console.print("[yellow]found[/] the data end before or begin after the peak of dynamic pressure")
-    for finding in (*flight.findings, *results.without_attitude(flight)):
+    for finding in (*flight.findings, *run_folder.without_attitude(flight)):
         console.print(f"[yellow]found[/] {escape(str(finding))}")
     for reason in flight.missing:
         console.print(f"[yellow]left out[/] air of the day: {escape(reason)}")
@@ -242,7 +243,7 @@ def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> N
     table = Table(title=f"Deflection of the aeroshell against the centerbody{when}{note}")
     for name in ("method", "deflection deg", "1 sd", "plane LV deg", "largest deg", "at s"):
         table.add_column(name, justify="left" if name == "method" else "right")
-    rows = results.method_summary(answers, peak_s)
+    rows = run_folder.method_summary(answers, peak_s)
     for method, row in rows.items():
         if row["deflection_deg"] is None:
             table.add_row(method, "no answer", "", "", "", "")
@@ -290,11 +291,11 @@ def deflection(
             trouble = str(fault)
         tell: Report = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
         answers = estimate(flight, telemetry, methods, tell, plane_rad, joint_m)
-        with results.RunFolder(folder, telemetry, settings) as out:
-            results.write_answers(out, answers)
+        with run_folder.RunFolder(folder, telemetry, settings) as out:
+            run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 history = answers.histories["camera"]
-                drawing.draw_camera(telemetry, history, out.path / "figures", joint_m)
+                run_figures.draw_camera(telemetry, history, out.path / "figures", joint_m)
                 if film:
                     write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", joint_m, report)
     for finding in telemetry.findings:
@@ -333,7 +334,7 @@ def largest_s(answers: Answers) -> float:
 
 def score(folder: Path, as_json: bool) -> None:
     """Score the newest run; exit 5 where recovery fails."""
-    result = scoring.score_run(folder)
+    result = score_run(folder)
     if as_json:
         sys.stdout.write(json.dumps(result.as_json()) + "\n")
     else:
@@ -342,13 +343,13 @@ def score(folder: Path, as_json: bool) -> None:
         sys.exit(EXIT_CHECK_FAILED)
 
 
-def print_score(result: scoring.Score) -> None:
+def print_score(result: Score) -> None:
     """Estimates against the truth, with the paper's own figures beside them."""
     table = Table(title=f"Deflection at the true peak of dynamic pressure ({result.peak_s:.3f} s), against the truth")
     for name in ("method", "deflection deg", "1 sd", "truth", "error", "IRVE-II (paper)"):
         table.add_column(name, justify="left" if name == "method" else "right")
     for method, row in result.methods.items():
-        paper = f"{scoring.PAPER_DEG[method]:g}" if method in scoring.PAPER_DEG else ""
+        paper = f"{PAPER_DEG[method]:g}" if method in PAPER_DEG else ""
         if row["deflection_deg"] is None:
             table.add_row(method, "no answer", "", f"{row['truth_deg']:.2f}", "", paper)
             continue
@@ -378,9 +379,9 @@ def demo(folder: Path, seed: int) -> None:
     print_flight(flight, pd.read_csv(written / "events.csv"))
     for method, reason in answers.refused.items():
         console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
-    result = scoring.score_run(folder, written)
+    result = score_run(folder, written)
     picture = folder / "demo.png"
-    figures.save(drawing.summary_figure(flight, answers, truth_history(folder)), picture)
+    paper_figures.save(run_figures.summary_figure(flight, answers, truth_history(folder)), picture)
     print_score(result)
     console.print(f"results, figures and report.html in {escape(str(written))}")
     console.print(f"the answer as a picture, with the truth: {escape(str(picture))}")

@@ -16,7 +16,6 @@ J. Hausman, "Specification tests in econometrics", Econometrica 46 (1978) 1251.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,14 +24,14 @@ import pandas as pd
 from flightmodel import earth
 from flightmodel.airdata import air_data, pressure_pulse
 from flightmodel.atmosphere import profile_from_sounding
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.telemetry import Sounding, Telemetry
 from flightmodel.trajectory import Trajectory, difference, interpolate_rows, resample
-from postflight.pipeline import Flight, flight_from
-from postflight.product.trajectory_table import bet_table
-from recon.bet import Settings, reconstruct_once, trackers
+from postflight.flight import Flight, flight_from
+from postflight.product import bet_table
+from recon.reconstruct import reconstruct_once, trackers
+from recon.settings import Settings
 
-Progress = Callable[[float, str], None]
 MASS_PART = 0.01
 PULSE_STEP_S = 0.1
 LEAST_LOST = 0.02  # part of a variance that leaving out must cost; a smaller one is no measure of a change

@@ -23,9 +23,8 @@ from recon import ekf, smoother, strapdown
 from recon.error_model import Block, ErrorModel
 from recon.measurements import Instrument
 from recon.motion import strapdown_motion
-from recon.packed import packed
 from recon.problem import Problem, observe
-from recon.state import States
+from recon.state import States, packed
 
 
 def _vehicle_at_rest() -> tuple[Vehicle, FloatArray]:
@@ -37,9 +36,8 @@ def _vehicle_at_rest() -> tuple[Vehicle, FloatArray]:
 
 
 def _simulator() -> None:
-    from synthetic_flight._air_kernels import gauss_markov
-    from synthetic_flight.packing import vacuum_table
-    from synthetic_flight.simulate import integrate
+    from synthetic_flight._kernels import gauss_markov
+    from synthetic_flight.simulate import integrate, vacuum_table
 
     vehicle, state = _vehicle_at_rest()
     integrate(vehicle, vacuum_table(), state, 0.001, 1, 2)
@@ -48,7 +46,7 @@ def _simulator() -> None:
 
 def _ensembles() -> None:
     from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
-    from synthetic_flight.packing import parameter_vector, vacuum_table
+    from synthetic_flight.simulate import parameter_vector, vacuum_table
 
     vehicle, state = _vehicle_at_rest()
     start = Start(state, parameter_vector(vehicle), vacuum_table())
@@ -113,7 +111,7 @@ def _tables() -> None:
 def _camera() -> None:
     """Orient a camera on one synthetic frame, and fit it."""
     from estimators.benchmark import orient_camera
-    from synthetic_flight.video import render_video
+    from synthetic_flight.film import render_video
 
     vehicle, _ = _vehicle_at_rest()
     mount, joint_m = next(iter(vehicle.cameras.values())), vehicle.joint.station_m

@@ -1,1 +1,3 @@
-"""Finds the best estimated trajectory from radar, accelerometers and gyros; entry point: `recon.bet.reconstruct`."""
+"""The best-estimated trajectory from trackers, accelerometers and gyros; entry point: `recon.reconstruct`."""
+
+from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compiled scores of readings that are off for a while. Readable twin, and the equations: `recon.shock`."""
+"""Compiled scores of readings that are off for a while. Readable twin, and the equations: `recon.unmodelled`."""
 
 from __future__ import annotations
 

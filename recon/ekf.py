@@ -32,9 +32,21 @@ from flightmodel.checks import FloatArray
 from recon import _filter_kernels, _measurement_kernels
 from recon._measurement_kernels import SLOTS
 from recon.measurements import NodeMotion, predict, wrapped
-from recon.packed import Charts, Filtered, Innovations, Steps, packed
 from recon.problem import Problem
-from recon.state import KINEMATIC, ROTATION, IntArray, States, boxminus, boxplus, right_jacobian
+from recon.state import (
+    KINEMATIC,
+    ROTATION,
+    Charts,
+    Filtered,
+    Innovations,
+    IntArray,
+    States,
+    Steps,
+    boxminus,
+    boxplus,
+    packed,
+    right_jacobian,
+)
 from recon.strapdown import propagate
 
 ENGINES = ("compiled", "readable")
@@ -42,7 +54,7 @@ ENGINES = ("compiled", "readable")
 
 @dataclass(frozen=True)
 class ForwardPass:
-    """What the smoother needs of a linear (or linearised) filter, node by node; see `recon.packed`."""
+    """What the smoother needs of a linear (or linearised) filter, node by node; see `recon.state`."""
 
     charts: States
     steps: Steps

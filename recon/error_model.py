@@ -20,7 +20,7 @@ import numpy as np
 from flightmodel.checks import FloatArray, GateError, nearest_name
 from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SunHeads, TriadSpec
 from flightmodel.telemetry import Motion as MotionSpec
-from recon.packed import Wander
+from recon.state import Wander
 
 AXES = ("x", "y", "z")
 DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0  # over which the air's errors forget: facts of soundings, 5 and 3 km

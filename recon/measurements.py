@@ -76,7 +76,7 @@ class Instrument:
         ``dcm_ned_ecef`` at the site, or ``dcm_body_sensor``.
     time_s : (k,) float
     value, variance, known : (k, 3) float
-        As in `recon.packed.Observed`.
+        As in `recon.state.Observed`.
     every_s : float
         Of measurements closer than this some are predicted, not used.
     """

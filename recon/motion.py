@@ -5,6 +5,11 @@ depends on: with inertial sensors their bias, scale and mount, 18 in all, and th
 are stated; in ballistic flight drag, side forces, density
 and winds, 6 in all, and rotation stands still. So one filter serves both. Models and readable twins:
 `recon.strapdown`, `recon.ballistic`.
+
+Two bridged inertial triads on one grid, as the mechanisation wants them.
+
+Mechanisation joins samples by straight lines. `unbent` moves them so that the lines have the integral of the curve;
+else the error of the joins would be as large as the coning and sculling that are corrected for.
 """
 
 from __future__ import annotations
@@ -14,6 +19,9 @@ from typing import NamedTuple
 import numpy as np
 
 from flightmodel.checks import FloatArray
+from flightmodel.trajectory import interpolate_rows
+from recon.imu_screening import Bridged
+from recon.state import IntArray
 
 STRAPDOWN_DRIVERS, CLOCKS, BALLISTIC_DRIVERS = 18, 2, 6
 
@@ -49,7 +57,7 @@ class Motion(NamedTuple):
         Whether there are no inertial sensors.
     time_s : (k,) float
     force_sensor_mps2, rate_sensor_radps : (k, 3) float
-        As measured, in sensor axes, gaps bridged, `recon.inertial.unbent`; zeros in ballistic flight.
+        As measured, in sensor axes, gaps bridged, `recon.motion.unbent`; zeros in ballistic flight.
     force_density, rate_density : (k, 3) float
         White-noise densities, (m/s^2)^2/Hz and (rad/s)^2/Hz, from a grid point to the next: along body axes, in
         ballistic flight along Earth-fixed axes.
@@ -125,3 +133,50 @@ def strapdown_motion(
         drag_m2pkg=0.0,
         across_ecef=np.zeros(3),
     )
+
+
+SAME_INSTANT_S = 2e-6
+
+
+def unbent(time_s: FloatArray, samples: FloatArray) -> FloatArray:
+    """Samples (n, 3) whose straight joins have the integral of the curve: less a twelfth of the second difference.
+
+    Where steps are uneven by a twentieth, at gaps and ends, samples stay as they are. White noise keeps its integral.
+    """
+    out = samples.copy()
+    step = np.diff(time_s)
+    even = np.abs(np.diff(step)) < 0.05 * step[1:]
+    bend = samples[2:] - 2.0 * samples[1:-1] + samples[:-2]
+    out[1:-1][even] -= bend[even] / 12.0
+    return out
+
+
+def inertial_motion(
+    force: Bridged, rate: Bridged, node_time_s: FloatArray, clocks: bool = False
+) -> tuple[Motion, IntArray]:
+    """Both triads from first to last node, on the faster one's times and the nodes', and each node's index."""
+    first, last = node_time_s[0], node_time_s[-1]
+    finer = rate if np.median(np.diff(rate.time_s)) < 0.9 * np.median(np.diff(force.time_s)) else force
+    inner = finer.time_s[(finer.time_s > first) & (finer.time_s < last)]
+    near = np.searchsorted(node_time_s, inner)
+    clear = (inner - node_time_s[np.clip(near - 1, 0, None)] > SAME_INSTANT_S) & (
+        node_time_s[np.clip(near, None, len(node_time_s) - 1)] - inner > SAME_INSTANT_S
+    )
+    t = np.sort(np.concatenate([inner[clear], node_time_s]))
+    motion = strapdown_motion(
+        t,
+        interpolate_rows(t, force.time_s, unbent(force.time_s, force.measured_sensor)),
+        interpolate_rows(t, rate.time_s, unbent(rate.time_s, rate.measured_sensor)),
+        _held(t, force),
+        _held(t, rate),
+        force.spec.dcm_body_sensor,
+        rate.spec.dcm_body_sensor,
+        clocks,
+    )
+    return motion, np.searchsorted(t, node_time_s).astype(np.int64)
+
+
+def _held(at: FloatArray, triad: Bridged) -> FloatArray:
+    """Density of the interval that each grid point opens."""
+    k = np.clip(np.searchsorted(triad.time_s, at + SAME_INSTANT_S, side="right") - 1, 0, len(triad.time_s) - 1)
+    return np.ascontiguousarray(triad.density[k])

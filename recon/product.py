@@ -20,11 +20,10 @@ from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, interpolate_rows
-from recon.gaps import Bridged
-from recon.packed import Innovations, unpacked
+from recon.imu_screening import Bridged
 from recon.problem import Problem
 from recon.smoother import Smoothed
-from recon.state import INERTIAL, KINEMATIC, BoolArray, States
+from recon.state import INERTIAL, KINEMATIC, BoolArray, Innovations, States, unpacked
 from recon.strapdown import correct, correction_partials
 
 SAME_STRETCH_S = 1.0

@@ -52,9 +52,8 @@ import numpy as np
 from flightmodel.checks import FloatArray
 from recon import _bryson_frazier_kernels, _smoother_kernels
 from recon.ekf import ForwardPass
-from recon.packed import Filtered, Innovations, Observed, Steps, packed, unpacked
 from recon.problem import Problem
-from recon.state import KINEMATIC, IntArray, States, boxplus
+from recon.state import KINEMATIC, Filtered, Innovations, IntArray, Observed, States, Steps, boxplus, packed, unpacked
 
 SMOOTHERS = ("rauch-tung-striebel", "bryson-frazier")
 

@@ -13,6 +13,14 @@ loops over ``i`` become vector instructions. The number of lanes is the length o
 compiler knows; one lane is the plain simulator. Loops are short, so that the processor works at the chains of several
 lanes at once; table look-ups, which do not vectorise, have loops of their own. All rows lie in one array, so that the
 compiler sees that none overlap. Branches in vector loops must be arithmetic (`tests` watch the machine code).
+
+The workspace of the flight kernels: which row holds what, and how three, six or nine rows are read as one.
+
+Row ``r`` holds one quantity of every lane, ``s[r * lanes + i]``.
+
+Compiled air: where the nose is, what blows there, and the aerodynamic wrench; vector loops over lanes.
+
+Readable twin: `synthetic_flight.dynamics.aerodynamics`. The workspace: `synthetic_flight._kernels`.
 """
 
 from __future__ import annotations
@@ -21,8 +29,196 @@ import math
 
 from flightmodel import _kernels as la
 from flightmodel._kernels import inlined, kernel
-from synthetic_flight import _air_kernels as air
-from synthetic_flight import _workspace_kernels as at
+
+# of a flight: state, and what is recorded beside it
+STATES, AUX = 20, 18
+
+# parameters of a vehicle: masses of body and shell, 1/m_B, 1/m_A, m_A/m, -m_B/m, 1/m; of the body, then of the shell,
+# inertia, its inverse, and -[p] I^-1 [p] of the arm p from c.g. to joint (6 each: xx xy xz yy yz zz); those arms; nose
+# from the shell's c.g.; the joint's nine numbers; area, length; factors on C_A, C_N, C_m, shift of C_mq
+M_B, M_A, PER_B, PER_A, SHARE_B, SHARE_A, PER_MASS = 0, 1, 2, 3, 4, 5, 6
+I_B, W_B, N_B, I_A, W_A, N_A = 7, 13, 19, 25, 31, 37
+P_B, P_A, NOSE_A, JOINT, REFERENCE, FACTOR = 43, 46, 49, 52, 61, 63
+PARAMETERS = 67
+
+# rows: state, trial state of a Runge-Kutta stage, its derivative, the next state
+Y, TRIAL, RATE, NEXT = 0, 20, 40, 60
+# what is recorded: altitude, density, Mach, dynamic pressure, shell's total angle of attack, bending angle; in shell
+# axes force and moment of the joint on the body and aerodynamic force
+ALTITUDE, DENSITY, MACH, PRESSURE, ALPHA, THETA, FORCE, MOMENT, AERO = 80, 81, 82, 83, 84, 85, 86, 89, 92
+# ECI from shell, shell from body (matrices), and scalar and x part of the latter's quaternion
+R_A, C_AB, TWIST = 95, 104, 113
+# in shell axes: body's rate, its arm to the joint, its c.g. from the shell's, gravitation at the shell's c.g. less that
+# at the body's, moment on the shell about its c.g. without the joint's
+RATE_B, ARM_B, BETWEEN, TIDE, SHELL = 115, 118, 121, 124, 127
+# sine and cosine of latitude, of longitude; sound, north and east wind, free-molecular fraction
+SIN, COS, SIN_LON, COS_LON, SOUND, NORTH, EAST, FREE = 130, 131, 132, 133, 134, 135, 136, 137
+# C_A C_N C_m C_mq; flow at the nose, shell axes; its size, its lateral part; Mach bracket of the last look-up
+COEF, FLOW, SPEED, LATERAL, BRACKET = 138, 142, 145, 146, 147
+P = 148
+ROWS = P + PARAMETERS
+
+
+@inlined
+def three(s, row, w, i):
+    return s[row * w + i], s[(row + 1) * w + i], s[(row + 2) * w + i]
+
+
+@inlined
+def six(s, row, w, i):
+    return (
+        s[row * w + i], s[(row + 1) * w + i], s[(row + 2) * w + i],
+        s[(row + 3) * w + i], s[(row + 4) * w + i], s[(row + 5) * w + i],
+    )  # fmt: skip
+
+
+@inlined
+def nine(s, row, w, i):
+    return (
+        s[row * w + i], s[(row + 1) * w + i], s[(row + 2) * w + i],
+        s[(row + 3) * w + i], s[(row + 4) * w + i], s[(row + 5) * w + i],
+        s[(row + 6) * w + i], s[(row + 7) * w + i], s[(row + 8) * w + i],
+    )  # fmt: skip
+
+
+@inlined
+def put(s, row, w, i, x, y, z):
+    s[row * w + i], s[(row + 1) * w + i], s[(row + 2) * w + i] = x, y, z
+
+
+@inlined
+def put_nine(s, row, w, i, m):
+    put(s, row, w, i, m[0], m[1], m[2])
+    put(s, row + 3, w, i, m[3], m[4], m[5])
+    put(s, row + 6, w, i, m[6], m[7], m[8])
+
+
+@inlined
+def place(s, lanes, planet):
+    """Where the nose is above the Earth, and how fast the air there turns with it."""
+    w = len(lanes)
+    for i in range(w):
+        r, share = nine(s, R_A, w, i), s[(P + SHARE_A) * w + i]
+        dx, dy, dz = three(s, BETWEEN, w, i)
+        nx, ny, nz = three(s, P + NOSE_A, w, i)
+        dx, dy, dz = la.times(r, nx + share * dx, ny + share * dy, nz + share * dz)
+        x, y, z = three(s, TRIAL, w, i)
+        x, y, z = x + dx, y + dy, z + dz
+        sin_lat, cos_lat, altitude, per_radius = la.geodetic(x, y, z, planet)
+        s[SIN * w + i], s[COS * w + i], s[ALTITUDE * w + i] = sin_lat, cos_lat, altitude
+        s[SIN_LON * w + i], s[COS_LON * w + i] = y * per_radius, x * per_radius
+        put(s, FLOW, w, i, -planet[4] * y, planet[4] * x, 0.0)
+
+
+@inlined
+def _four(row):
+    return row[0], row[1], row[2], row[3]
+
+
+@inlined
+def _between(a, b, f):
+    return a[0] + f * (b[0] - a[0]), a[1] + f * (b[1] - a[1]), a[2] + f * (b[2] - a[2]), a[3] + f * (b[3] - a[3])
+
+
+@inlined
+def air(s, lanes, atmosphere, grid):
+    """Air of the row of the table below the nose, and what changes up to the next; end values outside."""
+    w, last = len(lanes), atmosphere.shape[1] - 2
+    for i in range(w):
+        a = atmosphere[min(i, atmosphere.shape[0] - 1)]
+        u = (s[ALTITUDE * w + i] - grid[0]) * grid[1]
+        u = u if u > 0.0 else 0.0  # and where it is not a number
+        k = int(u) if u < last else last
+        f = min(u - k, 1.0)
+        # e^x of a small x: a 50 m step of the table changes density by about 1 %
+        x = f * a[k, 1]
+        s[DENSITY * w + i] = a[k, 0] * (1.0 + x * (1.0 + x / 2.0 * (1.0 + x / 3.0 * (1.0 + x / 4.0))))
+        c = _between(_four(a[k, 2:]), _four(a[k + 1, 2:]), f)
+        s[SOUND * w + i], s[NORTH * w + i], s[EAST * w + i], s[FREE * w + i] = c
+
+
+@inlined
+def flow(s, lanes):
+    """Flow at the nose in shell axes, Mach number, dynamic pressure, total angle of attack."""
+    w = len(lanes)
+    for i in range(w):
+        r, share = nine(s, R_A, w, i), s[(P + SHARE_A) * w + i]
+        sin_lat, cos_lat, sl, cl = s[SIN * w + i], s[COS * w + i], s[SIN_LON * w + i], s[COS_LON * w + i]
+        north, east = s[NORTH * w + i], s[EAST * w + i]
+        vx, vy, vz = three(s, TRIAL + 3, w, i)
+        ex, ey, ez = three(s, FLOW, w, i)
+        vx += north * sin_lat * cl + east * sl - ex
+        vy += north * sin_lat * sl - east * cl - ey
+        u, v, z = la.back(r, vx, vy, vz - north * cos_lat - ez)
+        wb0, wb1, wb2 = three(s, RATE_B, w, i)
+        wa0, wa1, wa2 = three(s, TRIAL + 17, w, i)
+        bx, by, bz = three(s, ARM_B, w, i)
+        ax, ay, az = three(s, P + P_A, w, i)
+        nx, ny, nz = three(s, P + NOSE_A, w, i)
+        sx, sy, sz = la.cross(wb0, wb1, wb2, bx, by, bz)
+        tx, ty, tz = la.cross(wa0, wa1, wa2, nx + share * ax, ny + share * ay, nz + share * az)
+        u, v, z = u + tx - share * sx, v + ty - share * sy, z + tz - share * sz
+        lateral = math.sqrt(v * v + z * z)
+        speed = math.sqrt(u * u + v * v + z * z)
+        put(s, FLOW, w, i, u, v, z)
+        s[SPEED * w + i], s[LATERAL * w + i], s[ALPHA * w + i] = speed, lateral, la.atan2(lateral, u)
+        s[MACH * w + i] = speed / s[SOUND * w + i]
+        s[PRESSURE * w + i] = 0.5 * s[DENSITY * w + i] * speed * speed
+
+
+@inlined
+def look_up(s, lanes, grid, mach_knots, table, free):
+    """C_A, C_N, C_m, C_mq, bilinear, held at the first and last Mach number, bridged to free-molecular ones."""
+    w = len(lanes)
+    for i in range(w):
+        mach = s[MACH * w + i]
+        m = int(s[BRACKET * w + i])  # the last one found: seldom left
+        while m < mach_knots.shape[0] - 2 and mach > mach_knots[m + 1]:
+            m += 1
+        while m > 0 and mach < mach_knots[m]:
+            m -= 1
+        s[BRACKET * w + i] = m
+        f = min(max((mach - mach_knots[m]) / (mach_knots[m + 1] - mach_knots[m]), 0.0), 1.0)
+        u = s[ALPHA * w + i] * grid[2]
+        u = u if u > 0.0 else 0.0
+        j = min(int(u), table.shape[1] - 2)
+        h = u - j
+        thin = s[FREE * w + i]
+        c = (0.0, 0.0, 0.0, 0.0)
+        if thin < 1.0:
+            low = _between(_four(table[m, j]), _four(table[m, j + 1]), h)
+            c = _between(low, _between(_four(table[m + 1, j]), _four(table[m + 1, j + 1]), h), f)
+        if thin > 0.0:
+            c = _between(c, _between(_four(free[j]), _four(free[j + 1]), h), thin)
+        n = COEF * w + i
+        s[n], s[n + w], s[n + 2 * w], s[n + 3 * w] = c
+
+
+@inlined
+def wrench(s, w, i):
+    """Force at the nose on the shell, and y and z of the moment about it; shell axes."""
+    _, v, z = three(s, FLOW, w, i)
+    speed, area, length = s[SPEED * w + i], s[(P + REFERENCE) * w + i], s[(P + REFERENCE + 1) * w + i]
+    f = (P + FACTOR) * w + i
+    n = COEF * w + i
+    ca, cn, cm, cmq = s[n] * s[f], s[n + w] * s[f + w], s[n + 2 * w] * s[f + 2 * w], s[n + 3 * w] + s[f + 3 * w]
+    per_lateral = 1.0 / (s[LATERAL * w + i] + 1e-12)
+    ny, nz = v * per_lateral, z * per_lateral
+    qs = s[PRESSURE * w + i] * area
+    damping = 0.25 * s[DENSITY * w + i] * speed * area * length * length * cmq  # q S l^2 / (2 V)
+    # nose-up about n x x_hat = (0, n_z, -n_y)
+    turn = qs * length * cm
+    wa1, wa2 = s[(TRIAL + 18) * w + i], s[(TRIAL + 19) * w + i]
+    return -qs * ca, -qs * cn * ny, -qs * cn * nz, turn * nz + damping * wa1, damping * wa2 - turn * ny
+
+
+@kernel
+def gauss_markov(keep, white, out):
+    """Noise of unit variance into ``out`` (n, m): ``keep`` (n - 1,) of the last row is left in the next."""
+    for i in range(out.shape[1]):
+        out[0, i] = white[0, i]
+        for k in range(1, out.shape[0]):
+            out[k, i] = keep[k - 1] * out[k - 1, i] + math.sqrt(1.0 - keep[k - 1] * keep[k - 1]) * white[k, i]
 
 
 @inlined
@@ -37,28 +233,28 @@ def _attitudes(s, lanes):
     """Rotations, and what of the body is wanted in shell axes."""
     w = len(lanes)
     for i in range(w):
-        t = (at.TRIAL + 6) * w + i
+        t = (TRIAL + 6) * w + i
         b0, b1, b2, b3 = s[t], s[t + w], s[t + 2 * w], s[t + 3 * w]
         a0, a1, a2, a3 = s[t + 4 * w], s[t + 5 * w], s[t + 6 * w], s[t + 7 * w]
         q0, q1 = a0 * b0 + a1 * b1 + a2 * b2 + a3 * b3, a0 * b1 - a1 * b0 - a2 * b3 + a3 * b2
         q2, q3 = a0 * b2 + a1 * b3 - a2 * b0 - a3 * b1, a0 * b3 - a1 * b2 + a2 * b1 - a3 * b0
-        s[at.TWIST * w + i], s[(at.TWIST + 1) * w + i] = q0, q1
-        at.put_nine(s, at.R_A, w, i, la.rotation(a0, a1, a2, a3))
+        s[TWIST * w + i], s[(TWIST + 1) * w + i] = q0, q1
+        put_nine(s, R_A, w, i, la.rotation(a0, a1, a2, a3))
         c = la.rotation(q0, q1, q2, q3)
-        at.put_nine(s, at.C_AB, w, i, c)
-        wb0, wb1, wb2 = at.three(s, at.TRIAL + 14, w, i)
+        put_nine(s, C_AB, w, i, c)
+        wb0, wb1, wb2 = three(s, TRIAL + 14, w, i)
         x, y, z = la.times(c, wb0, wb1, wb2)
-        at.put(s, at.RATE_B, w, i, x, y, z)
-        ax, ay, az = at.three(s, at.P + at.P_A, w, i)
-        x, y, z = at.three(s, at.P + at.P_B, w, i)
+        put(s, RATE_B, w, i, x, y, z)
+        ax, ay, az = three(s, P + P_A, w, i)
+        x, y, z = three(s, P + P_B, w, i)
         x, y, z = la.times(c, x, y, z)
-        at.put(s, at.ARM_B, w, i, x, y, z)
-        at.put(s, at.BETWEEN, w, i, ax - x, ay - y, az - z)
-        wa0, wa1, wa2 = at.three(s, at.TRIAL + 17, w, i)
-        _spin(s, w, i, at.RATE + 6, b0, b1, b2, b3, wb0, wb1, wb2)
-        _spin(s, w, i, at.RATE + 10, a0, a1, a2, a3, wa0, wa1, wa2)
-        x, y, z = at.three(s, at.TRIAL + 3, w, i)
-        at.put(s, at.RATE, w, i, x, y, z)
+        put(s, ARM_B, w, i, x, y, z)
+        put(s, BETWEEN, w, i, ax - x, ay - y, az - z)
+        wa0, wa1, wa2 = three(s, TRIAL + 17, w, i)
+        _spin(s, w, i, RATE + 6, b0, b1, b2, b3, wb0, wb1, wb2)
+        _spin(s, w, i, RATE + 10, a0, a1, a2, a3, wa0, wa1, wa2)
+        x, y, z = three(s, TRIAL + 3, w, i)
+        put(s, RATE, w, i, x, y, z)
 
 
 @inlined
@@ -78,21 +274,21 @@ def _joint(s, lanes):
     w = len(lanes)
     for i in range(w):
         # the body's x axis; the shell's is (1, 0, 0), and their cross product (0, z, -y)
-        x, y, z = s[at.C_AB * w + i], s[(at.C_AB + 3) * w + i], s[(at.C_AB + 6) * w + i]
+        x, y, z = s[C_AB * w + i], s[(C_AB + 3) * w + i], s[(C_AB + 6) * w + i]
         sine = math.sqrt(y * y + z * z)
         theta = la.atan2(sine, x)
-        j = (at.P + at.JOINT) * w + i
+        j = (P + JOINT) * w + i
         d = beyond_freeplay(theta, s[j + 6 * w], s[j + 7 * w], s[j + 8 * w])
         k = d * (s[j] + s[j + w] * d * d) / (sine + 1e-300)
-        twist = 2.0 * la.atan2(s[(at.TWIST + 1) * w + i], s[at.TWIST * w + i])
+        twist = 2.0 * la.atan2(s[(TWIST + 1) * w + i], s[TWIST * w + i])
         twist -= 2.0 * math.pi * ((1.0 if twist > math.pi else 0.0) - (1.0 if twist < -math.pi else 0.0))
-        b0, b1, b2 = at.three(s, at.RATE_B, w, i)
-        a0, a1, a2 = at.three(s, at.TRIAL + 17, w, i)
+        b0, b1, b2 = three(s, RATE_B, w, i)
+        a0, a1, a2 = three(s, TRIAL + 17, w, i)
         w0, w1, w2, damp = b0 - a0, b1 - a1, b2 - a2, s[j + 3 * w] + s[j + 4 * w] * theta * theta
         along = 0.5 * (w0 * (1.0 + x) + w1 * y + w2 * z)
         t = -(s[j + 2 * w] * twist + (s[j + 5 * w] - damp) * along) / (1.0 + x)
-        s[at.THETA * w + i] = theta
-        at.put(s, at.MOMENT, w, i, t * (1.0 + x) - damp * w0, k * z + t * y - damp * w1, t * z - k * y - damp * w2)
+        s[THETA * w + i] = theta
+        put(s, MOMENT, w, i, t * (1.0 + x) - damp * w0, k * z + t * y - damp * w1, t * z - k * y - damp * w2)
 
 
 @inlined
@@ -100,24 +296,24 @@ def _pull(s, lanes, planet):
     """Acceleration of the composite c.g. under gravity and aerodynamics, and the loads on the two bodies."""
     w = len(lanes)
     for i in range(w):
-        r, per_mass = at.nine(s, at.R_A, w, i), s[(at.P + at.PER_MASS) * w + i]
-        mb, ma = s[(at.P + at.M_B) * w + i], s[(at.P + at.M_A) * w + i]
-        fb, fa = s[(at.P + at.SHARE_B) * w + i], s[(at.P + at.SHARE_A) * w + i]
-        dx, dy, dz = at.three(s, at.BETWEEN, w, i)
+        r, per_mass = nine(s, R_A, w, i), s[(P + PER_MASS) * w + i]
+        mb, ma = s[(P + M_B) * w + i], s[(P + M_A) * w + i]
+        fb, fa = s[(P + SHARE_B) * w + i], s[(P + SHARE_A) * w + i]
+        dx, dy, dz = three(s, BETWEEN, w, i)
         dx, dy, dz = la.times(r, dx, dy, dz)
-        x, y, z = at.three(s, at.TRIAL, w, i)
+        x, y, z = three(s, TRIAL, w, i)
         g0, g1, g2 = la.gravitation(x + fb * dx, y + fb * dy, z + fb * dz, planet)
         h0, h1, h2 = la.gravitation(x + fa * dx, y + fa * dy, z + fa * dz, planet)
         x, y, z = la.back(r, h0 - g0, h1 - g1, h2 - g2)
-        at.put(s, at.TIDE, w, i, x, y, z)
-        fx, fy, fz, my, mz = air.wrench(s, w, i)
-        at.put(s, at.AERO, w, i, fx, fy, fz)
-        nx, ny, nz = at.three(s, at.P + at.NOSE_A, w, i)
+        put(s, TIDE, w, i, x, y, z)
+        fx, fy, fz, my, mz = wrench(s, w, i)
+        put(s, AERO, w, i, fx, fy, fz)
+        nx, ny, nz = three(s, P + NOSE_A, w, i)
         x, y, z = la.cross(nx, ny, nz, fx, fy, fz)
-        at.put(s, at.SHELL, w, i, x, y + my, z + mz)
+        put(s, SHELL, w, i, x, y + my, z + mz)
         x, y, z = la.times(r, fx, fy, fz)
         x, y, z = mb * g0 + ma * h0 + x, mb * g1 + ma * h1 + y, mb * g2 + ma * h2 + z
-        at.put(s, at.RATE + 3, w, i, x * per_mass, y * per_mass, z * per_mass)
+        put(s, RATE + 3, w, i, x * per_mass, y * per_mass, z * per_mass)
 
 
 @inlined
@@ -125,40 +321,40 @@ def _hinged(s, lanes):
     """Angular accelerations of both bodies with the joint's force from the constraint force equation."""
     w = len(lanes)
     for i in range(w):
-        c, per_a = at.nine(s, at.C_AB, w, i), s[(at.P + at.PER_A) * w + i]
-        wb0, wb1, wb2 = at.three(s, at.TRIAL + 14, w, i)
-        wa0, wa1, wa2 = at.three(s, at.TRIAL + 17, w, i)
-        inverse_b, inverse_a = at.six(s, at.P + at.W_B, w, i), at.six(s, at.P + at.W_A, w, i)
-        g0, g1, g2 = la.gyroscopic(at.six(s, at.P + at.I_B, w, i), wb0, wb1, wb2)
-        h0, h1, h2 = la.gyroscopic(at.six(s, at.P + at.I_A, w, i), wa0, wa1, wa2)
-        jx, jy, jz = at.three(s, at.MOMENT, w, i)
+        c, per_a = nine(s, C_AB, w, i), s[(P + PER_A) * w + i]
+        wb0, wb1, wb2 = three(s, TRIAL + 14, w, i)
+        wa0, wa1, wa2 = three(s, TRIAL + 17, w, i)
+        inverse_b, inverse_a = six(s, P + W_B, w, i), six(s, P + W_A, w, i)
+        g0, g1, g2 = la.gyroscopic(six(s, P + I_B, w, i), wb0, wb1, wb2)
+        h0, h1, h2 = la.gyroscopic(six(s, P + I_A, w, i), wa0, wa1, wa2)
+        jx, jy, jz = three(s, MOMENT, w, i)
         x, y, z = la.back(c, jx, jy, jz)
         eb0, eb1, eb2 = la.symmetric(inverse_b, x - g0, y - g1, z - g2)
-        x, y, z = at.three(s, at.SHELL, w, i)
+        x, y, z = three(s, SHELL, w, i)
         ea0, ea1, ea2 = la.symmetric(inverse_a, x - jx - h0, y - jy - h1, z - jz - h2)
         # what would part the two joint points, without the joint's force
-        p0, p1, p2 = at.three(s, at.P + at.P_B, w, i)
+        p0, p1, p2 = three(s, P + P_B, w, i)
         x, y, z = la.cross(eb0, eb1, eb2, p0, p1, p2)
         u, v, t = la.centripetal(wb0, wb1, wb2, p0, p1, p2)
         x, y, z = la.times(c, x + u, y + v, z + t)
-        a0, a1, a2 = at.three(s, at.P + at.P_A, w, i)
+        a0, a1, a2 = three(s, P + P_A, w, i)
         u, v, t = la.cross(ea0, ea1, ea2, a0, a1, a2)
         g0, g1, g2 = la.centripetal(wa0, wa1, wa2, a0, a1, a2)
-        h0, h1, h2 = at.three(s, at.TIDE, w, i)
+        h0, h1, h2 = three(s, TIDE, w, i)
         x, y, z = h0 + u + g0 - x, h1 + v + g1 - y, h2 + t + g2 - z
-        fx, fy, fz = at.three(s, at.AERO, w, i)
-        n, m = la.turned(c, at.six(s, at.P + at.N_B, w, i)), at.six(s, at.P + at.N_A, w, i)
-        k = per_a + s[(at.P + at.PER_B) * w + i]
+        fx, fy, fz = three(s, AERO, w, i)
+        n, m = la.turned(c, six(s, P + N_B, w, i)), six(s, P + N_A, w, i)
+        k = per_a + s[(P + PER_B) * w + i]
         n = (n[0] + m[0] + k, n[1] + m[1], n[2] + m[2], n[3] + m[3] + k, n[4] + m[4], n[5] + m[5] + k)
         fx, fy, fz = la.solved(n, x + fx * per_a, y + fy * per_a, z + fz * per_a)
-        at.put(s, at.FORCE, w, i, fx, fy, fz)
+        put(s, FORCE, w, i, fx, fy, fz)
         x, y, z = la.back(c, fx, fy, fz)
         x, y, z = la.cross(p0, p1, p2, x, y, z)
         x, y, z = la.symmetric(inverse_b, x, y, z)
-        at.put(s, at.RATE + 14, w, i, eb0 + x, eb1 + y, eb2 + z)
+        put(s, RATE + 14, w, i, eb0 + x, eb1 + y, eb2 + z)
         x, y, z = la.cross(a0, a1, a2, fx, fy, fz)
         x, y, z = la.symmetric(inverse_a, x, y, z)
-        at.put(s, at.RATE + 17, w, i, ea0 - x, ea1 - y, ea2 - z)
+        put(s, RATE + 17, w, i, ea0 - x, ea1 - y, ea2 - z)
 
 
 @inlined
@@ -166,51 +362,51 @@ def _locked(s, lanes):
     """Angular acceleration of one rigid body, and the moment and force that the lock of the joint carries."""
     w = len(lanes)
     for i in range(w):
-        c, mb, share = at.nine(s, at.C_AB, w, i), s[(at.P + at.M_B) * w + i], s[(at.P + at.SHARE_B) * w + i]
-        w0, w1, w2 = at.three(s, at.TRIAL + 17, w, i)
-        d0, d1, d2 = at.three(s, at.BETWEEN, w, i)
+        c, mb, share = nine(s, C_AB, w, i), s[(P + M_B) * w + i], s[(P + SHARE_B) * w + i]
+        w0, w1, w2 = three(s, TRIAL + 17, w, i)
+        d0, d1, d2 = three(s, BETWEEN, w, i)
         m, square = mb * share, d0 * d0 + d1 * d1 + d2 * d2
-        b, a = la.turned(c, at.six(s, at.P + at.I_B, w, i)), at.six(s, at.P + at.I_A, w, i)
+        b, a = la.turned(c, six(s, P + I_B, w, i)), six(s, P + I_A, w, i)
         n = (
             a[0] + b[0] + m * (square - d0 * d0), a[1] + b[1] - m * d0 * d1, a[2] + b[2] - m * d0 * d2,
             a[3] + b[3] + m * (square - d1 * d1), a[4] + b[4] - m * d1 * d2, a[5] + b[5] + m * (square - d2 * d2),
         )  # fmt: skip
         g0, g1, g2 = la.gyroscopic(n, w0, w1, w2)
-        f0, f1, f2 = at.three(s, at.AERO, w, i)
-        t0, t1, t2 = at.three(s, at.TIDE, w, i)
+        f0, f1, f2 = three(s, AERO, w, i)
+        t0, t1, t2 = three(s, TIDE, w, i)
         # moments about the composite c.g.: aerodynamics (known about the shell's c.g.) and gravity's gradient
-        f = s[(at.P + at.SHARE_A) * w + i]
+        f = s[(P + SHARE_A) * w + i]
         x, y, z = la.cross(d0, d1, d2, f * f0 - m * t0, f * f1 - m * t1, f * f2 - m * t2)
-        u, v, t = at.three(s, at.SHELL, w, i)
+        u, v, t = three(s, SHELL, w, i)
         e0, e1, e2 = la.solved(n, u + x - g0, v + y - g1, t + z - g2)
         # the body's c.g. moves with the composite c.g. and turns about it
         x, y, z = la.centripetal(w0, w1, w2, d0, d1, d2)
         u, v, t = la.cross(e0, e1, e2, d0, d1, d2)
-        per_mass = s[(at.P + at.PER_MASS) * w + i]
+        per_mass = s[(P + PER_MASS) * w + i]
         fx = mb * (share * (t0 + x + u) + f0 * per_mass)
         fy = mb * (share * (t1 + y + v) + f1 * per_mass)
         fz = mb * (share * (t2 + z + t) + f2 * per_mass)
-        at.put(s, at.FORCE, w, i, fx, fy, fz)
+        put(s, FORCE, w, i, fx, fy, fz)
         # moment on the body about its c.g. that is not the force's at the joint
         g0, g1, g2 = la.gyroscopic(b, w0, w1, w2)
         x, y, z = la.symmetric(b, e0, e1, e2)
-        u, v, t = at.three(s, at.ARM_B, w, i)
+        u, v, t = three(s, ARM_B, w, i)
         u, v, t = la.cross(u, v, t, fx, fy, fz)
-        at.put(s, at.MOMENT, w, i, x + g0 - u, y + g1 - v, z + g2 - t)
+        put(s, MOMENT, w, i, x + g0 - u, y + g1 - v, z + g2 - t)
         x, y, z = la.back(c, e0, e1, e2)
-        at.put(s, at.RATE + 14, w, i, x, y, z)
-        at.put(s, at.RATE + 17, w, i, e0, e1, e2)
-        s[at.THETA * w + i] = la.atan2(math.sqrt(c[6] * c[6] + c[3] * c[3]), c[0])
+        put(s, RATE + 14, w, i, x, y, z)
+        put(s, RATE + 17, w, i, e0, e1, e2)
+        s[THETA * w + i] = la.atan2(math.sqrt(c[6] * c[6] + c[3] * c[3]), c[0])
 
 
 @inlined
 def rates(s, lanes, atmosphere, grid, mach_knots, table, free, planet, locked):
     """Time derivative of the trial state of every lane, and what is recorded."""
     _attitudes(s, lanes)
-    air.place(s, lanes, planet)
-    air.air(s, lanes, atmosphere, grid)
-    air.flow(s, lanes)
-    air.look_up(s, lanes, grid, mach_knots, table, free)
+    place(s, lanes, planet)
+    air(s, lanes, atmosphere, grid)
+    flow(s, lanes)
+    look_up(s, lanes, grid, mach_knots, table, free)
     _pull(s, lanes, planet)
     if locked:
         _locked(s, lanes)
@@ -227,17 +423,17 @@ def _record(s, w, record, limit, out, out_aux, written):
         if written[i] < record:
             continue
         written[i] = record + 1
-        for k in range(at.STATES):
-            out[i, record, k] = s[(at.Y + k) * w + i]
+        for k in range(STATES):
+            out[i, record, k] = s[(Y + k) * w + i]
         for k in range(6):
-            out_aux[i, record, k] = s[(at.ALTITUDE + k) * w + i]
-        r = at.nine(s, at.R_A, w, i)
+            out_aux[i, record, k] = s[(ALTITUDE + k) * w + i]
+        r = nine(s, R_A, w, i)
         for k in range(3):
-            x, y, z = at.three(s, at.FORCE + 3 * k, w, i)
+            x, y, z = three(s, FORCE + 3 * k, w, i)
             n = 6 + 3 * k
             out_aux[i, record, n], out_aux[i, record, n + 1], out_aux[i, record, n + 2] = la.times(r, x, y, z)
-            out_aux[i, record, 15 + k] = s[(at.RATE + 14 + k) * w + i]
-        if s[at.THETA * w + i] < limit:
+            out_aux[i, record, 15 + k] = s[(RATE + 14 + k) * w + i]
+        if s[THETA * w + i] < limit:
             flying = True
         else:
             written[i] = -record - 1  # ended here
@@ -249,28 +445,28 @@ def _advance(s, w, stage, step):
     """After a stage of RK4: add to the next state, and set the next trial state."""
     ahead = step * (1.0 if stage == 2 else 0.5)
     if stage == 0:
-        for k in range(at.STATES * w):
-            s[at.NEXT * w + k] = s[at.Y * w + k] + step / 6.0 * s[at.RATE * w + k]
+        for k in range(STATES * w):
+            s[NEXT * w + k] = s[Y * w + k] + step / 6.0 * s[RATE * w + k]
     else:
-        for k in range(at.STATES * w):
-            s[at.NEXT * w + k] += step / 3.0 * s[at.RATE * w + k]
-    for k in range(at.STATES * w):
-        s[at.TRIAL * w + k] = s[at.Y * w + k] + ahead * s[at.RATE * w + k]
+        for k in range(STATES * w):
+            s[NEXT * w + k] += step / 3.0 * s[RATE * w + k]
+    for k in range(STATES * w):
+        s[TRIAL * w + k] = s[Y * w + k] + ahead * s[RATE * w + k]
 
 
 @inlined
 def _finish(s, w, step):
     """After the last stage: the new state, quaternions of length one, and the trial state equal to it."""
-    for k in range(at.STATES * w):
-        s[at.Y * w + k] = s[at.NEXT * w + k] + step / 6.0 * s[at.RATE * w + k]
-    for row in (at.Y + 6, at.Y + 10):
+    for k in range(STATES * w):
+        s[Y * w + k] = s[NEXT * w + k] + step / 6.0 * s[RATE * w + k]
+    for row in (Y + 6, Y + 10):
         for i in range(w):
             j = row * w + i
             a, b, c, d = s[j], s[j + w], s[j + 2 * w], s[j + 3 * w]
             n = 1.0 / math.sqrt(a * a + b * b + c * c + d * d)
             s[j], s[j + w], s[j + 2 * w], s[j + 3 * w] = a * n, b * n, c * n, d * n
-    for k in range(at.STATES * w):
-        s[at.TRIAL * w + k] = s[at.Y * w + k]
+    for k in range(STATES * w):
+        s[TRIAL * w + k] = s[Y * w + k]
 
 
 @kernel
@@ -281,8 +477,8 @@ def integrate(lanes, s, tables, planet, step, per_record, records, lock_records,
     passed ``limit`` or was not a number any more.
     """
     w = len(lanes)
-    for k in range(at.STATES * w):
-        s[at.TRIAL * w + k] = s[at.Y * w + k]
+    for k in range(STATES * w):
+        s[TRIAL * w + k] = s[Y * w + k]
     for record in range(records):
         locked = record < lock_records
         for sub in range(per_record):

@@ -20,9 +20,9 @@ from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import KeyFaults, NonNegative, Section, Time
 from flightmodel.vehicle import CompliantJoint, MassProperties, Vehicle
-from synthetic_flight.day_air import day_atmosphere
+from synthetic_flight.instrument_errors import name_key
 from synthetic_flight.scenarios import Initial, Scenario
-from synthetic_flight.triad_errors import name_key
+from synthetic_flight.weather import day_atmosphere
 
 SMALLEST = 2.0**-54  # a draw of exactly zero would be an infinite deviation
 WIND_FADE_M = (110e3, 130e3)

@@ -3,6 +3,17 @@
 Sixteen flights fly in the lanes of one kernel call (`synthetic_flight._kernels`), and kernel calls run in threads,
 since compiled code holds no interpreter lock. Flight ``run`` is the same to the last bit wherever and beside whichever
 other flights it flies: every lane goes through the same instructions.
+
+What is kept of a flight of an ensemble: named histories over its window, and named numbers.
+
+``peak_X`` is the largest sample of the quantity X in the window, ``X_at_peak_pressure`` its sample where dynamic
+pressure is largest. Angles are degrees and accelerations g, since these numbers are for files and figures. A joint that
+diverges ends its flight: histories hold their last value from there on, so that bands do not forget that flight.
+
+Flights of a dispersions file, side by side: from draws to named numbers and histories.
+
+The joint is locked until the shell is inflated. There the vehicle is rigid and outside the air, and flown with longer
+steps; then with the scenario's own. Only the window is recorded.
 """
 
 from __future__ import annotations
@@ -12,14 +23,20 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 
 import numpy as np
 
-from flightmodel.checks import ConfigError, FloatArray
+from flightmodel import earth, rotations
+from flightmodel.airdata import total_angle
+from flightmodel.checks import ConfigError, FloatArray, GateError, nearest_name
 from flightmodel.vehicle import Vehicle
-from synthetic_flight.simulate import integrate_lanes
-from synthetic_flight.step_size import check_step
+from synthetic_flight import dynamics, simulate
+from synthetic_flight.dispersions import Case, Dispersions, Window, dispersed_case
+from synthetic_flight.dynamics import check_step
+from synthetic_flight.scenarios import Scenario, TimeSpan, initial_state
+from synthetic_flight.simulate import ATMOSPHERE_ROWS, ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, integrate_lanes
 
 # two to four vectors of a register each; more lanes outgrow the first-level cache
 LANES = 16
@@ -143,3 +160,217 @@ def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[
             starts = [replace(s, state=end) for s, end in zip(starts, ends, strict=True)]
         flown = fly_block(vehicle, runs, starts, leg)
     return flown
+
+
+G0_MPS2 = 9.80665
+_TABLE_M = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS)
+
+
+@dataclass(frozen=True)
+class Records:
+    """One flown flight: ``states`` (n, 20), ``aux`` (n, 18), its vehicle and its table of the air."""
+
+    states: FloatArray
+    aux: FloatArray
+    vehicle: Vehicle
+    atmosphere: FloatArray
+
+    @cached_property
+    def specific_force_body_mps2(self) -> FloatArray:
+        """Of the centerbody's point where the unbent vehicle's c.g. is, ``(n, 3)``, body axes.
+
+        The joint's force moved there by lever arms; the difference of gravitation over half a metre (1e-6 m/s^2) is
+        left out.
+        """
+        body = self.vehicle.centerbody
+        arm, rate, turn = self.vehicle.cg_m - body.cg_m, self.states[:, 14:17], self.aux[:, 15:18]
+        force = rotations.rotate(rotations.conjugate(self.states[:, 6:10]), self.aux[:, 6:9])
+        return force / body.mass_kg + np.cross(turn, arm) + np.cross(rate, np.cross(rate, arm))
+
+    @cached_property
+    def velocity_air_body_mps(self) -> FloatArray:
+        """Velocity of that point relative to the air, ``(n, 3)``, body axes."""
+        q, rate = self.states[:, 6:10], self.states[:, 14:17]
+        position, velocity = dynamics.points(self.states, self.vehicle)["body"]
+        arm = self.vehicle.cg_m - self.vehicle.centerbody.cg_m
+        at = position + rotations.rotate(q, np.broadcast_to(arm, position.shape))
+        velocity = velocity + rotations.rotate(q, np.cross(rate, arm)) - np.cross(earth.OMEGA_ECEF_RADPS, at)
+        # ECI turned about the Earth's axis alone: latitude is right, and north and east at this longitude of ECI
+        latitude, longitude, _ = earth.geodetic_from_ecef(at)
+        wind = np.zeros_like(velocity)
+        for axis in (0, 1):
+            wind[:, axis] = np.interp(self.aux[:, 0], _TABLE_M, self.atmosphere[:, 3 + axis])
+        wind_eci = np.einsum("nji,nj->ni", earth.dcm_ned_ecef(latitude, longitude), wind)
+        return rotations.rotate(rotations.conjugate(q), velocity - wind_eci)
+
+    @cached_property
+    def alpha_total_deg(self) -> FloatArray:
+        """Centerbody's total angle of attack, wind-relative, ``(n,)``."""
+        return np.rad2deg(total_angle(self.velocity_air_body_mps))
+
+    @cached_property
+    def normal_g(self) -> FloatArray:
+        """Size of the centerbody's lateral specific force, ``(n,)``."""
+        return np.hypot(*self.specific_force_body_mps2[:, 1:].T) / G0_MPS2
+
+
+QUANTITIES: dict[str, Callable[[Records], FloatArray]] = {
+    "alpha_total_deg": lambda r: r.alpha_total_deg,
+    "alpha_shell_deg": lambda r: np.rad2deg(r.aux[:, 4]),
+    "deflection_deg": lambda r: np.rad2deg(r.aux[:, 5]),
+    "normal_g": lambda r: r.normal_g,
+    "axial_g": lambda r: -r.specific_force_body_mps2[:, 0] / G0_MPS2,
+    "dynamic_pressure_pa": lambda r: r.aux[:, 3],
+    "mach": lambda r: r.aux[:, 2],
+    "altitude_m": lambda r: r.aux[:, 0],
+    "rate_degps": lambda r: np.rad2deg(np.linalg.norm(r.states[:, 15:17], axis=1)),
+}
+PEAK_TIME = "peak_pressure_s"
+SCALARS = (
+    PEAK_TIME,
+    *(f"peak_{name}" for name in QUANTITIES),
+    *(f"{name}_at_peak_pressure" for name in QUANTITIES),
+)
+
+
+def check_names(names: tuple[str, ...], known: tuple[str, ...]) -> None:
+    """Raise `ConfigError` with every name that is unknown or comes twice."""
+    faults = [f"unknown output '{n}'{nearest_name(n, known)}; known: {', '.join(known)}" for n in names
+              if n not in known]  # fmt: skip
+    faults += [f"output '{n}' comes twice" for n in dict.fromkeys(names) if names.count(n) > 1]
+    if faults:
+        raise ConfigError(faults)
+
+
+def scalars_of(records: Records, names: tuple[str, ...], window: Window) -> dict[str, float]:
+    """Return the named numbers of one flight."""
+    at_peak = int(np.argmax(records.aux[:, 3]))
+    found = {}
+    for name in names:
+        if name == PEAK_TIME:
+            found[name] = window.from_s + window.record_s * at_peak
+        elif name.startswith("peak_"):
+            found[name] = float(QUANTITIES[name.removeprefix("peak_")](records).max())
+        else:
+            found[name] = float(QUANTITIES[name.removesuffix("_at_peak_pressure")](records)[at_peak])
+    return found
+
+
+def histories_of(records: Records, names: tuple[str, ...], window: Window) -> FloatArray:
+    """Return the named histories of one flight, ``(names, points)``."""
+    points = len(window.history_time_s())
+    rows = np.minimum(window.per_history * np.arange(points), len(records.aux) - 1)
+    return np.stack([QUANTITIES[name](records)[rows] for name in names]) if names else np.empty((0, points))
+
+
+def records_of(flown: Flown, vehicle: Vehicle, atmosphere: FloatArray) -> Records:
+    """Return what a flight recorded; `GateError` where it did not reach its window."""
+    if not len(flown.aux):
+        raise GateError("the joint diverged, or the state was no number any more, before the window")
+    return Records(flown.states, flown.aux, vehicle, atmosphere)
+
+
+# a rigid vehicle outside the air turns at some tenths of a radian a second: errors of 1e-9 a step
+LOCKED_STEP_S = 0.02
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What every flight of a study shares: scenario, dispersions, window, and what is kept."""
+
+    scenario: Scenario
+    dispersions: Dispersions
+    window: Window
+    scalars: tuple[str, ...]
+    histories: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is kept of one flight; ``reason`` says why there is nothing, ``diverged_s`` when its joint passed 90 deg."""
+
+    run: int
+    reason: str
+    diverged_s: float
+    scalars: dict[str, float]
+    histories: FloatArray
+
+
+def legs(time: TimeSpan, window: Window, locked: bool) -> list[Schedule]:
+    """Schedules from the scenario's start to the end of the window."""
+    begins = time.start_s
+    inflated = begins if time.inflated_s is None else max(time.inflated_s, begins)
+    if not inflated <= window.from_s < window.to_s <= time.stop_s:
+        raise ConfigError(
+            f"window: {max(inflated, begins):g} (inflated) <= from_s = {window.from_s:g} < to_s = {window.to_s:g} <= "
+            f"{time.stop_s:g} (the scenario's stop_s) is wanted"
+        )
+    out = []
+    for start, end, step, lock in (
+        (begins, inflated, LOCKED_STEP_S, True),
+        (inflated, window.from_s, time.step_s, locked),
+    ):
+        if end > start:
+            steps = int(np.ceil((end - start) / step - 1e-9))
+            out.append(Schedule((end - start) / steps, steps, 2, 2 if lock else 0))
+    per_record = int(np.ceil(window.record_s / time.step_s - 1e-9))
+    step = window.record_s / per_record
+    return [*out, Schedule(step, per_record, window.records, window.records if locked else 0)]
+
+
+def start_of(case: Case, step_s: float, locked: bool) -> Start:
+    """Start of a case in the lanes; `GateError` where the step is too long for its joint."""
+    if not locked:
+        check_step(case.vehicle, step_s)
+    parameters = simulate.parameter_vector(case.vehicle, *case.scales)
+    return Start(initial_state(case.scenario), parameters, simulate.atmosphere_table(case.profile))
+
+
+def fly_runs(plan: Plan, runs: list[int], draws_of: Callable[[int], dict[str, float]]) -> list[Row]:
+    """Fly runs and keep what the plan asks for, in their order.
+
+    Parameters
+    ----------
+    draws_of : callable
+        From run number to a number between 0 and 1 for every factor.
+    """
+    locked = plan.dispersions.joint_is == "locked"
+    schedules = legs(plan.scenario.spec.time, plan.window, locked)
+    out: dict[int, Row] = {}
+    waiting: list[tuple[int, Case, Start]] = []
+    for run in runs:
+        try:
+            case = dispersed_case(plan.scenario, plan.dispersions, draws_of(run))
+            waiting.append((run, case, start_of(case, schedules[-1].step_s, locked)))
+        except Exception as fault:  # one flight's defect must not cost the others: its row says what
+            out[run] = _failed(plan, run, reason_of(fault))
+        if len(waiting) == LANES:
+            _fly(plan, waiting, schedules, out)
+            waiting = []
+    if waiting:
+        _fly(plan, waiting, schedules, out)
+    return [out[run] for run in runs]
+
+
+def reason_of(fault: Exception) -> str:
+    """Return why a flight failed: a refusal's own words, any other fault's with its kind."""
+    return str(fault) if isinstance(fault, GateError) else f"{type(fault).__name__}: {fault}"
+
+
+def _failed(plan: Plan, run: int, reason: str) -> Row:
+    points = len(plan.window.history_time_s())
+    nothing = np.full((len(plan.histories), points), np.nan)
+    return Row(run, reason, np.nan, dict.fromkeys(plan.scalars, np.nan), nothing)
+
+
+def _fly(plan: Plan, waiting: list[tuple[int, Case, Start]], schedules: list[Schedule], out: dict[int, Row]) -> None:
+    flights = fly_legs(plan.scenario.vehicle, [w[0] for w in waiting], [w[2] for w in waiting], schedules)
+    for (run, case, start), flown in zip(waiting, flights, strict=True):
+        try:
+            records = records_of(flown, case.vehicle, start.atmosphere)
+        except GateError as fault:
+            out[run] = _failed(plan, run, str(fault))
+            continue
+        ended = plan.window.from_s + plan.window.record_s * (len(flown.aux) - 1) if flown.diverged else np.nan
+        numbers = scalars_of(records, plan.scalars, plan.window)
+        out[run] = Row(run, "", ended, numbers, histories_of(records, plan.histories, plan.window))

@@ -1,6 +1,21 @@
 """Writing a synthetic flight as a range would deliver a real one: telemetry in one place, the truth apart.
 
 The folder is made beside its destination and renamed when whole, so a killed run leaves nothing half-written.
+
+What an analyst is told of a synthetic flight: ``flight.toml``, and beside it the vehicle file it needs.
+
+The folder holds by itself: a vehicle that ships with the toolkit is named, another one is copied in with its
+coefficient table, and nothing refers to a place outside.
+
+What happened when: the moments a flight is told by, each with the true state of the vehicle, from the records.
+
+Separation (the first record), inflation (the joint unlocks), apogee, 80 km, peak heating, Mach 3.5, peak dynamic
+pressure, 40 km, Mach 1, splashdown; those that the flown span does not hold are absent. Heating is the stagnation
+point's by Sutton and Graves, ``1.7415e-4 sqrt(rho / r_nose) V^3`` W/m^2 with the vehicle's own nose radius.
+
+References
+----------
+Sutton and Graves, "A general stagnation-point convective-heating equation for arbitrary gas mixtures", NASA TR R-376.
 """
 
 from __future__ import annotations
@@ -8,19 +23,26 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, GateError, writing
-from synthetic_flight import day_air, events, radar_sensing, sensing, sun_sensing
-from synthetic_flight.filming import write_video
-from synthetic_flight.flight_toml import write_flight_toml
+from flightmodel import earth
+from flightmodel.atmosphere import G0_MPS2
+from flightmodel.checks import FloatArray, GateError, Progress, writing
+from flightmodel.events import descent_moments, first_fall, has_peak, peak, splashdown_index, values_at
+from synthetic_flight import sensing, weather
+from synthetic_flight.film import write_video
+from synthetic_flight.instrument_errors import Magnetometer, Radar, SunSensors, Triad
 from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
-Progress = Callable[[float, str], None]
+if TYPE_CHECKING:
+    import pandas as pd
+
+
 TRUTH_RATE_HZ = 50.0
 SHORTEST_TELEMETRY_S = 1.0
 
@@ -130,10 +152,10 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     _csv(telemetry / "rates.csv", {"t_s": at, **_named("{}_body_degps", "pqr", np.rad2deg(rate))}, "%.6f")
     _write_attitude_sensors(scenario, seed, truth, telemetry)
     for name, radar in spec.radars.items():
-        at, rae = radar_sensing.sense_radar(truth, radar, start, child_rng(seed, name), name)
+        at, rae = sensing.sense_radar(truth, radar, start, child_rng(seed, name), name)
         columns = {"t_s": at, "range_m": rae[:, 0], "az_deg": np.rad2deg(rae[:, 1]), "el_deg": np.rad2deg(rae[:, 2])}
         _csv(telemetry / f"radar_{name}.csv", columns, "%.6f")
-    z, air, wind = day_air.sense_atmosphere(truth.profile, spec.atmosphere, child_rng(seed, "sounding"))
+    z, air, wind = weather.sense_atmosphere(truth.profile, spec.atmosphere, child_rng(seed, "sounding"))
     columns = {"alt_m": z, "rho_kgpm3": air[:, 0], "t_k": air[:, 1], "wind_n_mps": wind[:, 0], "wind_e_mps": wind[:, 1]}
     _csv(telemetry / "atmosphere.csv", columns, "%.8g")
     q_prior = sensing.sense_attitude(truth, spec.attitude_prior, child_rng(seed, "attitude"))
@@ -151,7 +173,7 @@ def _write_attitude_sensors(scenario: Scenario, seed: int, truth: Truth, telemet
         columns = {"t_s": at, **_named("b{}_magnetometer_ut", "xyz", field * 1e6)}
         _csv(telemetry / "magnetometer.csv", columns, "%.6f")
     if spec.sun is not None:
-        at, angles = sun_sensing.sense_sun(truth, spec.sun, start, child_rng(seed, "sun"))
+        at, angles = sensing.sense_sun(truth, spec.sun, start, child_rng(seed, "sun"))
         columns = {"t_s": at}
         for k, head in enumerate(np.moveaxis(np.rad2deg(angles), 1, 0), 1):
             columns |= {f"az_sun{k}_deg": head[:, 0], f"el_sun{k}_deg": head[:, 1]}
@@ -198,8 +220,286 @@ def _write_truth(scenario: Scenario, seed: int, truth: Truth, folder: Path) -> N
         "twist_deg": np.rad2deg(truth.twist_rad[rows]),
     }
     _csv(folder / "deflection.csv", columns, "%.8f")
-    moments = events.event_table(events.flight_events(truth, scenario.spec.time.inflated_s))
+    moments = event_table(flight_events(truth, scenario.spec.time.inflated_s))
     moments.to_csv(folder / "events.csv", index=False, float_format="%.8g", lineterminator="\n")
     shutil.copyfile(scenario.source, folder / "scenario.toml")
     run = {"scenario": scenario.spec.name, "seed": seed, "words": truth.words, "synthetic": True}
     (folder / "run.json").write_text(json.dumps(run, indent=2) + "\n")
+
+
+# the last digit of the telemetry's files: noise below it is not in them, and an estimator wants none of zero
+LAST_DIGIT = 1e-6
+VEHICLE_FOLDER = "vehicle"
+
+
+def write_flight_toml(scenario: Scenario, q_prior: FloatArray, folder: Path) -> None:
+    """Write ``flight.toml`` into a flight folder, and copy in a vehicle of the user's own with its table."""
+    vehicle = scenario.spec.vehicle
+    if vehicle.endswith(".toml"):
+        source = scenario.vehicle.source
+        for name in (source.name, *scenario.vehicle.files):
+            copy = folder / VEHICLE_FOLDER / name
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source.parent / name, copy)
+        vehicle = f"{VEHICLE_FOLDER}/{source.name}"
+    (folder / "flight.toml").write_text(_flight_toml(scenario, q_prior, vehicle), encoding="utf-8")
+
+
+def _text(value: str) -> str:
+    """Return a text as TOML writes it."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _at_least(sd: float, resolution: float = 0.0) -> float:
+    """Return the standard deviation that is told: an ideal instrument has that of its steps or of the last digit."""
+    return sd if sd >= LAST_DIGIT else max(LAST_DIGIT, round(resolution / np.sqrt(12.0), 9))
+
+
+def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
+    """Return ``flight.toml`` with nominal errors: what an analyst would be told, nothing that was drawn."""
+    spec = scenario.spec
+    acc, gyro = spec.accelerometer, spec.rates
+    lines = [
+        "# SYNTHETIC flight, written by postflight simulate. Nothing in truth/ may be used to estimate.",
+        f"name = {_text(spec.name)}",
+        f"t0_utc = {_text(spec.t0_utc)}",
+        f"vehicle = {_text(vehicle)}",
+        "synthetic = true",
+        "",
+        "[attitude_prior]",
+        f"t_s = {spec.attitude_prior.t_s}",
+        f"q_ecef_body = [{', '.join(f'{x:.6f}' for x in q_prior)}]",
+        f"sd_deg = {spec.attitude_prior.sd_deg}",
+        "",
+        "[sensors.accelerometer]",
+        'file = "telemetry/accelerometer.csv"',
+        f'mount = "{ACCELEROMETER_MOUNT}"',
+        f"noise_sd_mps2 = {_at_least(acc.noise_mps2)}",
+        f"bias_sd_mps2 = {acc.bias_mps2}",
+        *_triad_lines(acc),
+        f"time_bias_sd_s = {acc.time_bias_s}",
+        f"resolution_mps2 = {acc.resolution_mps2}",
+        *_drift_lines("mps2", acc.drift_mps2, acc.drift_time_constant_s),
+        "",
+        "[sensors.rates]",
+        'file = "telemetry/rates.csv"',
+        f"noise_sd_degps = {_at_least(gyro.noise_degps)}",
+        f"bias_sd_degps = {gyro.bias_degps}",
+        *_triad_lines(gyro),
+        f"time_bias_sd_s = {gyro.time_bias_s}",
+        f"resolution_degps = {gyro.resolution_degps}",
+        *_drift_lines("degps", gyro.drift_degps, gyro.drift_time_constant_s),
+    ]
+    lines += _magnetometer_lines(spec.magnetometer) + _sun_lines(spec.sun)
+    for name, radar in spec.radars.items():
+        lines += [
+            "",
+            f"[radars.{name}]",
+            f'file = "telemetry/radar_{name}.csv"',
+            f"latitude_deg = {radar.latitude_deg}",
+            f"longitude_deg = {radar.longitude_deg}",
+            f"height_m = {radar.height_m}",
+            f"range_sd_m = {_at_least(radar.range_sd_m, radar.range_resolution_m)}",
+            f"angle_sd_deg = {_at_least(radar.angle_sd_deg, radar.angle_resolution_deg)}",
+            f"range_bias_sd_m = {radar.range_bias_m}",
+            # over the arc of one flight an encoder's waves are hardly told from a bias
+            f"angle_bias_sd_deg = {_together(radar.angle_bias_deg, radar.encoder_once_deg, radar.encoder_twice_deg)}",
+            f"time_bias_sd_s = {radar.time_bias_s}",
+            *_pedestal_lines(radar),
+        ]
+    lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
+    if spec.video is not None:
+        lines += [
+            "",
+            "[frames]",
+            'file = "telemetry/frames.csv"',
+            f'folder = "telemetry/{spec.video.camera}"'
+            if spec.video.format == "png"
+            else f'film = "telemetry/{spec.video.camera}.{spec.video.format}"',
+            f'camera = "{spec.video.camera}"',
+            f"benchmark_s = {spec.video.benchmark_s}",
+            *([f"time_bias_sd_s = {spec.video.time_offset_s}"] if 0.0 < spec.video.time_offset_s <= 1.0 else []),
+        ]
+    if spec.time.inflated_s is not None and spec.time.inflated_s >= spec.time.telemetry_from_s:
+        lines += ["", "[[events]]", 'name = "aeroshell inflated"', f"t_s = {spec.time.inflated_s}"]
+    return "\n".join(lines) + "\n"
+
+
+def _together(*sds: float) -> float:
+    """Return the one number that is told of independent errors; of a single one, that number as it was written."""
+    present = [sd for sd in sds if sd > 0.0]
+    return present[0] if len(present) == 1 else float(f"{np.linalg.norm(present):.4g}")
+
+
+def _triad_lines(spec: Triad) -> list[str]:
+    """Axes that are not square are told with the mounting, what negative values gain with the scale."""
+    return [
+        f"scale_sd = {_together(spec.scale, spec.scale_asymmetry)}",
+        f"mount_sd_deg = {_together(spec.mount_deg, spec.nonorthogonality_deg)}",
+    ]
+
+
+def _drift_lines(unit: str, drift: float, time_constant_s: float) -> list[str]:
+    return [f"bias_wander_sd_{unit} = {drift}", f"bias_time_constant_s = {time_constant_s}"] if drift > 0.0 else []
+
+
+def _magnetometer_lines(spec: Magnetometer | None) -> list[str]:
+    if spec is None:
+        return []
+    return [
+        "",
+        "[sensors.magnetometer]",
+        'file = "telemetry/magnetometer.csv"',
+        f'mount = "{spec.mount}"',
+        f"noise_sd_ut = {_at_least(spec.noise_ut)}",
+        # the analyst is told one number for electronics and hard iron together
+        f"bias_sd_ut = {np.hypot(spec.bias_ut, spec.hard_iron_ut):.4g}",
+        f"soft_iron_sd = {spec.soft_iron}",
+        *_triad_lines(spec),
+        f"resolution_ut = {spec.resolution_ut}",
+        *_drift_lines("ut", spec.drift_ut, spec.drift_time_constant_s),
+    ]
+
+
+def _sun_lines(spec: SunSensors | None) -> list[str]:
+    if spec is None:
+        return []
+    return [
+        "",
+        "[sensors.sun]",
+        'file = "telemetry/sun.csv"',
+        f"heads_lv_deg = [{', '.join(str(clock) for clock in spec.heads_lv_deg)}]",
+        f"field_deg = {spec.field_deg}",
+        f"noise_sd_deg = {_at_least(spec.noise_deg, spec.resolution_deg)}",
+        f"bias_sd_deg = {spec.bias_deg}",
+        f"mount_sd_deg = {spec.mount_deg}",
+    ]
+
+
+def _pedestal_lines(radar: Radar) -> list[str]:
+    """Systematic errors that are there; a radar without any is described as it always was."""
+    terms = ("mislevel", "droop", "skew", "nonorthogonality", "wander")
+    sizes = {name: getattr(radar, f"{name}_deg") for name in terms}
+    lines = [f"{name}_sd_deg = {size}" for name, size in sizes.items() if size > 0.0]
+    if radar.wander_deg > 0.0:
+        lines.append(f"wander_time_constant_s = {radar.wander_time_constant_s}")
+    if radar.refraction is not None and radar.refraction.residual != 0.0:
+        lines.append(f"refraction_sd = {abs(radar.refraction.residual)}")
+    if radar.range_scale > 0.0:
+        lines.append(f"range_scale_sd = {radar.range_scale}")
+    return ([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []) + lines
+
+
+SUTTON_GRAVES = 1.7415e-4
+
+
+@dataclass(frozen=True)
+class Event:
+    """A moment of the flight and the true state at it.
+
+    Altitude, Mach number and dynamic pressure are those at the shell's nose, place and velocity (relative to the
+    rotating Earth) those of the datum; angles of attack are total and against the wind; ``sensed_g`` is the size of
+    the specific force at the vehicle's unbent c.g., in standard gravities.
+    """
+
+    name: str
+    time_s: float
+    altitude_m: float
+    latitude_rad: float
+    longitude_rad: float
+    speed_mps: float
+    flight_path_rad: float
+    airspeed_mps: float
+    mach: float
+    dynamic_pressure_pa: float
+    heat_flux_wpm2: float
+    alpha_shell_rad: float
+    alpha_body_rad: float
+    deflection_rad: float
+    sensed_g: float
+
+
+def heat_flux(density_kgpm3: FloatArray, airspeed_mps: FloatArray, nose_radius_m: float) -> FloatArray:
+    """Stagnation-point convective heat flux of a cold wall, W/m^2 (Sutton and Graves)."""
+    return SUTTON_GRAVES * np.sqrt(density_kgpm3 / nose_radius_m) * airspeed_mps**3
+
+
+def flight_events(truth: Truth, inflated_s: float | None = None) -> list[Event]:
+    """Events of a flight in order of time.
+
+    Parameters
+    ----------
+    truth : Truth
+    inflated_s : float or None
+        When the joint was unlocked; no inflation is named without it.
+    """
+    whole = splashdown_index(truth.altitude_m)
+    rows = slice(0, whole)
+    t, altitude = truth.time_s[rows], truth.altitude_m[rows]
+    density, pressure = truth.density_kgpm3[rows], truth.dynamic_pressure_pa[rows]
+    airspeed = np.sqrt(2.0 * pressure / density)
+    flux = heat_flux(density, airspeed, truth.vehicle.geometry.nose_radius_m)
+    named = [("separation", float(t[0])), *descent_moments(t, altitude, truth.mach[rows])]
+    if inflated_s is not None and t[0] < inflated_s < t[-1]:
+        named.append(("inflation", inflated_s))
+    for name, values in (("peak heating", flux), ("peak dynamic pressure", pressure)):
+        if has_peak(values):
+            named.append((name, peak(t, values)[0]))
+    if whole is not None:
+        splash = first_fall(t, altitude, 0.0)
+        named.append(("splashdown", float(t[-1]) if splash is None else splash))
+    force = truth.specific_force_body(truth.vehicle.cg_m)[rows]
+    columns = np.column_stack(
+        [
+            altitude,
+            truth.trajectory.position_ecef_m[rows],
+            truth.trajectory.velocity_ecef_mps[rows],
+            airspeed,
+            truth.mach[rows],
+            pressure,
+            flux,
+            truth.alpha_shell_rad[rows],
+            truth.alpha_body_rad[rows],
+            truth.deflection.theta_rad[rows],
+            np.linalg.norm(force, axis=1) / G0_MPS2,
+        ]
+    )
+    return [_event(name, at, values_at(t, columns, at)) for name, at in sorted(named, key=lambda one: one[1])]
+
+
+def _event(name: str, at_s: float, state: FloatArray) -> Event:
+    place, velocity = state[1:4], state[4:7]
+    latitude, longitude, _ = earth.geodetic_from_ecef(place)
+    north, east, down = earth.ned_from_ecef(velocity, place)
+    # angles and force have no sign: a cubic through a touch of zero may pass below it
+    sizes = [float(x) for x in (*state[7:11], *np.maximum(state[11:], 0.0))]
+    path = float(np.arctan2(-down, np.hypot(north, east)))
+    speed = float(np.linalg.norm(velocity))
+    return Event(name, at_s, float(state[0]), float(latitude), float(longitude), speed, path, *sizes)
+
+
+def event_table(events: list[Event]) -> pd.DataFrame:
+    """Events as a table with angles in degrees, as ``truth/events.csv`` holds it."""
+    rows = [
+        {
+            "event": e.name,
+            "t_s": e.time_s,
+            "alt_m": e.altitude_m,
+            "lat_deg": np.rad2deg(e.latitude_rad),
+            "lon_deg": np.rad2deg(e.longitude_rad),
+            "speed_ground_mps": e.speed_mps,
+            "flight_path_deg": np.rad2deg(e.flight_path_rad),
+            "airspeed_mps": e.airspeed_mps,
+            "mach": e.mach,
+            "dynamic_pressure_pa": e.dynamic_pressure_pa,
+            "heat_flux_wpm2": e.heat_flux_wpm2,
+            "alpha_shell_deg": np.rad2deg(e.alpha_shell_rad),
+            "alpha_body_deg": np.rad2deg(e.alpha_body_rad),
+            "deflection_deg": np.rad2deg(e.deflection_rad),
+            "sensed_g": e.sensed_g,
+        }
+        for e in events
+    ]
+    import pandas as pd
+
+    return pd.DataFrame(rows)

@@ -26,8 +26,7 @@ from flightmodel.config import (
     read_toml,
 )
 from flightmodel.vehicle import DATA, Vehicle, vehicle_from_toml, vehicle_path
-from synthetic_flight.day_air import DayAtmosphere, day_atmosphere
-from synthetic_flight.instrument_sections import (
+from synthetic_flight.instrument_errors import (
     Accelerometer,
     Attitude,
     Magnetometer,
@@ -36,9 +35,10 @@ from synthetic_flight.instrument_sections import (
     SunSensors,
     Triad,
     Video,
+    name_key,
 )
 from synthetic_flight.simulate import Truth, fly, state_from_ecef
-from synthetic_flight.triad_errors import name_key
+from synthetic_flight.weather import DayAtmosphere, day_atmosphere
 
 Altitude = Annotated[float, Field(ge=0.0, le=1e6)]
 MOST_RECORDS, MOST_STEPS, MOST_SAMPLES, MOST_FRAMES = 5_000_000, 2_000_000_000, 5_000_000, 20_000

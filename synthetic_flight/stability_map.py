@@ -25,7 +25,7 @@ from flightmodel.aerodynamics import AeroTable
 from flightmodel.atmosphere import AtmosphereProfile, us76
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import MassProperties, Vehicle
-from synthetic_flight import packing
+from synthetic_flight import simulate
 from synthetic_flight.linear import DIVERGENT, STABLE, UNSTABLE, Slopes, critical_stiffness_nmprad, linear_matrix, modes
 from synthetic_flight.simulate import integrate
 
@@ -130,7 +130,7 @@ def flown_map(
     factor = fall_pa / pressure_pa
     fall_mps = speed_mps * float(np.sqrt(factor))
     start[5] -= fall_mps
-    air = packing.atmosphere_table(_even_air(2.0 * fall_pa / fall_mps**2))
+    air = simulate.atmosphere_table(_even_air(2.0 * fall_pa / fall_mps**2))
 
     def at(stiffness: float, damping: float) -> tuple[float, int]:
         fallen = with_spring(plain, stiffness * factor, damping, factor)
@@ -160,7 +160,7 @@ def _map(
 
 def _even_air(density_kgpm3: float) -> AtmosphereProfile:
     """Still air of one density over the whole fall: what the standard atmosphere lacks of it, at the tables' knots."""
-    z = np.arange(-1000.0, START_M + 20.0e3, packing.ATMOSPHERE_STEP_M)
+    z = np.arange(-1000.0, START_M + 20.0e3, simulate.ATMOSPHERE_STEP_M)
     ratio = np.log(density_kgpm3 / us76(z)[0])
     nothing, one = np.zeros(len(z)), np.ones(len(z))
     return AtmosphereProfile(z, ratio, nothing, np.zeros((len(z), 3)), one, one)

@@ -23,7 +23,7 @@ import pandas as pd
 
 from estimators.calibration import calibrate_lens, read_corners
 from flightmodel import aerodynamics
-from flightmodel.aeroinput import read_with_sidecar
+from flightmodel.aerodynamics import read_with_sidecar
 from flightmodel.checks import GateError
 from flightmodel.film import Frames
 from flightmodel.flightfile import read_flight_file

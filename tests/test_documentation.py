@@ -11,47 +11,47 @@ import click
 import pytest
 from pydantic import BaseModel
 
-from flightmodel import aeroinput, flightfile, instrument_entries, meshes, sources, vehicle
+from flightmodel import aerodynamics, flightfile, geometry, instruments, tables, vehicle
 from postflight.cli import cli
 from postflight.montecarlo import study
-from synthetic_flight import day_air, dispersions, instrument_sections, outputs, scenarios
+from synthetic_flight import dispersions, ensemble, instrument_errors, scenarios, weather
 from tests.documents import PAGES, ROOT, blocks, commands
 
 DOCS = Path(__file__).parents[1] / "docs"
 INSTRUMENTS = [
-    instrument_sections.Accelerometer,
-    instrument_sections.Rates,
-    instrument_sections.Magnetometer,
-    instrument_sections.SunSensors,
-    instrument_sections.Radar,
-    instrument_sections.AirRefraction,
-    instrument_sections.Dropouts,
-    instrument_sections.Video,
-    instrument_sections.Attitude,
+    instrument_errors.Accelerometer,
+    instrument_errors.Rates,
+    instrument_errors.Magnetometer,
+    instrument_errors.SunSensors,
+    instrument_errors.Radar,
+    instrument_errors.AirRefraction,
+    instrument_errors.Dropouts,
+    instrument_errors.Video,
+    instrument_errors.Attitude,
 ]
 MODELS = [
     scenarios.TimeSpan,
     scenarios.Initial,
-    day_air.DayAtmosphere,
-    day_air.Pocket,
-    day_air.Shear,
-    day_air.Turbulence,
-    day_air.DiscreteGust,
-    day_air.RangeSounding,
+    weather.DayAtmosphere,
+    weather.Pocket,
+    weather.Shear,
+    weather.Turbulence,
+    weather.DiscreteGust,
+    weather.RangeSounding,
     vehicle.Reference,
     vehicle.CompliantJoint,
     vehicle.MassProperties,
-    vehicle.ShellGeometry,
+    geometry.ShellGeometry,
     vehicle.Uncertainty,
     vehicle.SensorMount,
     vehicle.CameraMount,
-    meshes.MeshFiles,
-    meshes.MeshFile,
-    aeroinput.Aerodynamics,
-    aeroinput.SphereCone,
-    aeroinput.FreeMolecular,
-    aeroinput.Sidecar,
-    aeroinput.TableUncertainty,
+    geometry.MeshFiles,
+    geometry.MeshFile,
+    aerodynamics.Aerodynamics,
+    aerodynamics.SphereCone,
+    aerodynamics.FreeMolecular,
+    aerodynamics.Sidecar,
+    aerodynamics.TableUncertainty,
 ]
 
 
@@ -73,12 +73,12 @@ FLIGHT_SECTIONS = [
     flightfile.FlightFile,
     flightfile.AttitudeEntry,
     flightfile.MotionEntry,
-    instrument_entries.Mounted,
-    instrument_entries.MagnetometerEntry,
-    instrument_entries.GnssEntry,
-    instrument_entries.BarometerEntry,
-    sources.TimeEntry,
-    sources.Source,
+    instruments.Mounted,
+    instruments.MagnetometerEntry,
+    instruments.GnssEntry,
+    instruments.BarometerEntry,
+    tables.TimeEntry,
+    tables.Source,
 ]
 
 
@@ -105,7 +105,7 @@ def test_every_key_of_a_dispersions_file_is_on_its_page(model: type[BaseModel]):
 
 def test_every_output_is_on_the_page():
     page = (DOCS / "monte-carlo.md").read_text()
-    assert not [name for name in outputs.QUANTITIES if f"`{name}`" not in page]
+    assert not [name for name in ensemble.QUANTITIES if f"`{name}`" not in page]
 
 
 @pytest.mark.parametrize("name", study.shipped_dispersions())
@@ -124,10 +124,10 @@ def test_every_key_of_flight_toml_is_on_its_page(model: type[BaseModel]):
     [
         (
             "gnss",
-            instrument_entries.GnssEntry,
+            instruments.GnssEntry,
             {"file", "height_is", "geoid_undulation_m", "min_satellites", "min_fix_mode"},
         ),
-        ("barometers", instrument_entries.BarometerEntry, {"file", "height_is", "geoid_undulation_m", "use_s"}),
+        ("barometers", instruments.BarometerEntry, {"file", "height_is", "geoid_undulation_m", "use_s"}),
         ("motion", flightfile.MotionEntry, {"model", "drag_area_per_mass_m2pkg", "powered_s"}),
     ],
 )

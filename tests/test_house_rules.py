@@ -17,7 +17,7 @@ DOORS = {
     "ppigrf": {"flightmodel/geomagnetism_and_sun.py"},
     "erfa": {"flightmodel/geomagnetism_and_sun.py"},
     "numba": "_kernels.py",
-    "matplotlib": "figures.py",
+    "matplotlib": "postflight/plots/",
 }
 UNITS = ("deg", "km", "ft", "degps")
 
@@ -37,13 +37,15 @@ def imports(tree):
 @pytest.mark.parametrize("path", CODE, ids=name)
 def test_file_is_short_and_keeps_to_the_doors(path):
     text = path.read_text()
-    assert len(text.splitlines()) <= 400, "files stay below 400 lines"
+    assert len(text.splitlines()) <= 800, "files stay below 800 lines"
     for module in imports(ast.parse(text)):
         door = DOORS.get(module.split(".")[0])
         if isinstance(door, set):
             assert name(path) in door, f"{module} has one door"
+        elif door and door.endswith("/"):
+            assert name(path).startswith(door), f"{module} is imported in {door} alone"
         elif door:
-            assert path.name == door, f"{module} is imported in files named {door} alone"
+            assert path.name.endswith(door), f"{module} is imported in files named {door} alone"
 
 
 @pytest.mark.parametrize("path", CODE, ids=name)
@@ -62,28 +64,46 @@ def test_modules_open_with_their_question(path):
     assert len(doc) > 40
 
 
+# where degrees and kilometres are read, written or shown
+DEGREES = (
+    "flightmodel/config.py", "flightmodel/tables.py", "flightmodel/flightf", "flightmodel/vehicle.py",
+    "flightmodel/instruments.py", "flightmodel/atmosphere.py", "synthetic_flight/scenarios.py",
+    "synthetic_flight/instrument_errors.py", "synthetic_flight/sensing.py", "synthetic_flight/folder.py",
+    "postflight/cli.py", "postflight/commands.py", "postflight/run_folder.py", "postflight/score.py",
+    "postflight/plots/", "postflight/studies/",
+)  # fmt: skip
+
+
 @pytest.mark.parametrize("path", CODE, ids=name)
 def test_degrees_stay_in_files_command_and_figures(path):
-    allowed = (
-        "config",
-        "columns",
-        "flightf",
-        "vehicle",
-        "scenarios",
-        "instrument_sections",
-        "sensing",
-        "folder",
-        "cli",
-        "commands",
-        "results",
-    )
-    if any(word in path.stem for word in (*allowed, "scoring", "figures", "preflight", "drawing", "atmosphere")):
+    if name(path).startswith(DEGREES) or path.stem == "commands":
         return
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.arg):
             assert node.arg.rsplit("_", 1)[-1] not in UNITS or node.arg in UNITS, (
                 f"{node.arg}: SI and radians in memory"
             )
+
+
+def modules_imported(path, known):
+    """Modules of this project that a file imports anywhere, also inside functions."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{a.name}" for a in node.names} | {node.module}
+        elif isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+    return found & known
+
+
+def test_no_module_imports_itself_by_a_detour():
+    module = {p: ".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for p in CODE}
+    graph = {module[p]: modules_imported(p, set(module.values())) - {module[p]} for p in CODE}
+    # the public door imports on demand, so a package above may name it
+    while leaves := [m for m, needs in graph.items() if not needs & graph.keys()]:
+        for m in leaves:
+            del graph[m]
+    assert not graph, f"circles among {sorted(graph)}"
 
 
 def test_no_utils():

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from synthetic_flight.figures import figure_axdahl_zones
+from postflight.plots.stability import figure_axdahl_zones
 from synthetic_flight.linear import Slopes
 from synthetic_flight.stability_map import flown_map, linear_map
 

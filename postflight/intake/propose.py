@@ -1,36 +1,253 @@
-"""Which columns of a table are which sensor's? Names, units and, where both leave it open, the numbers."""
+"""Which columns of a table are which sensor's? Names, units and, where both leave it open, the numbers.
+
+What is proposed of a table: which column is which, in which unit, how its time is written, and why.
+
+``how`` is ``stated`` where the header says it, ``numbers`` where only one reading of the numbers is possible, ``asked``
+where neither tells: that becomes a question, never a guess.
+
+Which unit do the numbers themselves allow? Only where one alone is possible; else the analyst is asked.
+
+Bounds are nature's: 9.8 m/s^2 where a vehicle stands, a field of 22 to 67 uT at the ground (15 to 100 with iron),
+800 to 1100 hPa near the ground, no angle beyond a full turn, no body that turns with more than 400 rad/s.
+
+Where does a table's time stand, and how is it written?
+
+Times of day (``HH:MM:SS``) become three columns and seconds since 1970 become ISO UTC, as flight.toml reads those.
+"""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from flightmodel import columns
+from flightmodel import tables
 from flightmodel.checks import FloatArray
-from flightmodel.columns import UNITS, Quantity
-from postflight.intake.clock_columns import find_time
-from postflight.intake.evidence import single_unit, triad_unit
-from postflight.intake.loose import LooseTable
-from postflight.intake.proposal import ASKED, NUMBERS, STATED, Mapped, SourceProposal
-from postflight.intake.words import (
+from flightmodel.tables import UNITS, Quantity
+from postflight.intake.headers import (
     AXES,
     BODY_RATES,
     NED,
     QUANTITY_WORDS,
     SEVERAL_MEANINGS,
     TRIAD_WORDS,
+    Named,
     means,
     take_apart,
     unit_key,
 )
+from postflight.intake.read_table import LooseTable
+
+STATED, NUMBERS, ASKED = "stated", "numbers", "asked"
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """One column: the quantity's short name in flight.toml, its unit (empty where it is asked), how and why."""
+
+    short: str
+    column: str
+    unit: str
+    how: str
+    why: str
+    canonical: bool = False
+
+
+@dataclass(frozen=True)
+class TimeMapped:
+    """Where the time stands: columns, format, unit (of seconds; empty where it is asked), other candidates."""
+
+    columns: tuple[str, ...]
+    format: str
+    unit: str
+    how: str
+    why: str
+    offset_asked: bool = False
+    others: tuple[str, ...] = ()
+
+
+@dataclass
+class SourceProposal:
+    """One table of flight.toml: its header (``sensors.rates``), columns, further keys as (key, TOML value, comment)."""
+
+    section: str
+    columns: list[Mapped]
+    keys: list[tuple[str, str, str]] = field(default_factory=list)
+    time: TimeMapped | None = None
+
+
+STEADY = 0.02  # of the mean: what stands still is no noisier
+STEADY_ROWS = 50
+BANDS: dict[str, list[tuple[float, float, str]]] = {
+    "acceleration": [(9.6, 10.0, "mps2"), (0.98, 1.02, "g"), (980.0, 1020.0, "mg"), (31.6, 32.8, "ftps2")],
+    "magnetic field": [(15.0, 100.0, "ut"), (0.15, 1.0, "gauss"), (15e-6, 100e-6, "t"), (15e3, 100e3, "nt")],
+    "pressure": [(6e4, 1.1e5, "pa"), (600.0, 1100.0, "hpa"), (60.0, 110.0, "kpa")],
+    "temperature": [(150.0, 400.0, "k"), (-120.0, 60.0, "degc")],
+    "density": [(0.5, 1.5, "kgpm3"), (500.0, 1500.0, "gpm3")],
+}
+
+
+def triad_unit(kind: str, values: FloatArray) -> tuple[str, str]:
+    """Unit of a triad (n, 3) of a kind, and why; an empty unit with what was seen where several are possible."""
+    size = np.linalg.norm(values, axis=1)
+    size = size[np.isfinite(size)]
+    if not len(size):
+        return "", "no numbers"
+    if kind == "acceleration":
+        for part, where in ((size[:STEADY_ROWS], "first"), (size[-STEADY_ROWS:], "last")):
+            mean = float(part.mean())
+            if len(part) == STEADY_ROWS and part.std() < STEADY * mean:
+                unit = _band(kind, mean)
+                if unit:
+                    return unit, f"steady at {mean:.4g} in the {where} rows, as where it stands still"
+        return "", f"size {float(np.median(size)):.3g} (median), nowhere steady at 1 g"
+    if kind == "magnetic field":
+        middle = float(np.median(size))
+        return _band(kind, middle), f"size {middle:.3g} (median)"
+    if kind == "rate" and size.max() > 400.0:
+        return "degps", f"up to {size.max():.4g}: no body turns so many rad/s"
+    return "", f"size up to {float(size.max()):.3g}"
+
+
+def single_unit(short: str, kind: str, values: FloatArray) -> tuple[str, str]:
+    """Unit of one column, and why; an empty unit with what was seen where several are possible."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return "", "no numbers"
+    low, high = float(known.min()), float(known.max())
+    seen = f"{low:.5g} to {high:.5g}"
+    most = max(abs(low), abs(high))
+    if kind == "angle":
+        limit = 0.5 * np.pi if short in ("lat", "el") else 2 * np.pi
+        if most > 1e6:
+            return "deg1e7", f"{seen}: whole numbers of 1e-7 deg"
+        if limit * 1.01 < most <= (90.0 if short in ("lat", "el") else 360.0):
+            return "deg", f"{seen}: too large for radians"
+        return "", seen
+    if kind in ("pressure", "density"):
+        return _band(kind, high), f"largest {high:.5g}"
+    if kind == "temperature":
+        return _band(kind, float(np.median(known))), seen
+    return "", seen
+
+
+def _band(kind: str, value: float) -> str:
+    fitting = [unit for low, high, unit in BANDS[kind] if low <= value <= high]
+    return fitting[0] if len(fitting) == 1 else ""
+
+
+IRIG = re.compile(r"^\d{1,3}:\d{1,2}:\d{2}:\d{2}([.,]\d+)?$")
+OF_DAY = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
+ISO = re.compile(r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}")
+PARTS = ({"h", "hour", "hours", "stunde", "hh"}, {"m", "min", "minute", "mm"}, {"s", "sec", "second", "sekunde", "ss"})
+ELSEWHERE = {"tow", "sod", "utc", "gmt", "gps", "week"}  # seconds of these do not start at t0
+UNIX = (1e9, 2.5e9)
+FASTEST_S, SLOWEST_S = 2e-5, 60.0
+
+
+def split_clocks(table: LooseTable) -> None:
+    """Add columns for times of day and for seconds since 1970; each is noted."""
+    for k, name in enumerate(list(table.names)):
+        first = [row[k] for row in table.rows[:20] if k < len(row) and row[k]]
+        if first and all(OF_DAY.match(c) for c in first):
+            parts = [OF_DAY.match(row[k]) if k < len(row) else None for row in table.rows]
+            for number, short in enumerate(("h", "m", "s"), start=1):
+                _add(table, f"{name}_{short}", [m[number].replace(",", ".") if m else "" for m in parts])
+            table.notes.append(f"times of day in '{name}' became columns {name}_h, {name}_m, {name}_s")
+        elif first and set(re.findall(r"[a-z]+", name.lower())) & {"time", "t", "unix", "epoch", "timestamp", "zeit"}:
+            values = table.numbers(k)
+            scale = next(
+                (s for s in (1.0, 1e-3, 1e-6) if UNIX[0] < np.nanmin(values, initial=np.inf) * s < UNIX[1]), None
+            )
+            if scale is not None:
+                stamps = (values * scale * 1e6).round()
+                iso = [f"{np.datetime64(int(s), 'us')}Z" if np.isfinite(s) else "" for s in stamps]
+                _add(table, f"{name}_utc", iso)
+                table.notes.append(f"seconds since 1970 in '{name}' became ISO UTC in {name}_utc")
+
+
+def _add(table: LooseTable, name: str, cells: list[str]) -> None:
+    table.raw = None
+    table.names.append(name)
+    table.units.append("")
+    for row, cell in zip(table.rows, cells, strict=True):
+        row.append(cell)
+
+
+def find_time(table: LooseTable, named: list[Named]) -> TimeMapped | None:
+    """Return how the table's time is written, or None where no column holds one."""
+    for pattern, form in ((IRIG, "irig_doy"), (ISO, "utc")):
+        for k, name in enumerate(table.names):
+            first = [row[k] for row in table.rows[:20] if k < len(row) and row[k]]
+            if first and all(pattern.match(c) for c in first):
+                return TimeMapped((name,), form, "", STATED, f"written as {first[0]}")
+    parts = _hour_minute_second(table, named)
+    seconds = [k for k in range(len(named)) if _is_time(named[k], table.numbers(k))]
+    # a time of day is known to the second of UTC; a counter's zero is not
+    if parts and not any(table.names[k] == "t_s" for k in seconds):
+        others = tuple(table.names[k] for k in seconds)
+        return TimeMapped(parts, "utc_hms", "", STATED, "hour, minute and second of the day", others=others)
+    if not seconds:
+        return None
+    best = min(seconds, key=lambda k: (table.names[k] != "t_s", not named[k].units("time"), k))
+    others = tuple(table.names[k] for k in seconds if k != best) + (parts or ())
+    unit, how, why = _time_unit(named[best], table.numbers(best))
+    asked = bool(set(named[best].tokens) & ELSEWHERE)
+    return TimeMapped((table.names[best],), "seconds", unit, how, why, asked, others)
+
+
+def _hour_minute_second(table: LooseTable, named: list[Named]) -> tuple[str, ...] | None:
+    found = []
+    for words, top in zip(PARTS, (24, 60, 61), strict=True):
+        last = [k for k, n in enumerate(named) if (re.findall("[a-z]+", n.name.lower()) or [""])[-1] in words]
+        last = [k for k in last if len(re.findall("[a-z]+", named[k].name.lower())) > 1 or len(named[k].name) > 1]
+        fitting = [
+            k for k in last if np.nanmax(table.numbers(k), initial=-1.0) < top and np.nanmin(table.numbers(k)) >= 0
+        ]
+        found.append(fitting)
+    for h in found[0]:
+        stem = re.findall("[a-z]+", table.names[h].lower())[:-1]
+        mates = [
+            next((k for k in some if re.findall("[a-z]+", table.names[k].lower())[:-1] == stem), None) for some in found
+        ]
+        if None not in mates and len(set(mates)) == 3:
+            return tuple(table.names[k] for k in mates if k is not None)
+    return None
+
+
+def _is_time(named: Named, values: FloatArray) -> bool:
+    if not (set(named.tokens) & QUANTITY_WORDS["time"] or named.units("time")) or named.kinds - {"time"} - {
+        "magnetic field"
+    }:
+        return False
+    known = values[np.isfinite(values)]
+    if len(known) < 3 or len(known) < 0.9 * len(values):
+        return False
+    step = np.diff(known)
+    return bool((step >= 0.0).mean() > 0.98 and (step > 0.0).any())
+
+
+def _time_unit(named: Named, values: FloatArray) -> tuple[str, str, str]:
+    units = named.units("time")
+    if units:
+        return units[0], STATED, f"'{named.unit_text}' in the header"
+    known = values[np.isfinite(values)]
+    step = np.diff(known)
+    usual = float(np.median(step[step > 0.0]))
+    whole = bool((known == np.round(known)).all())
+    seen = f"steps of {usual:.4g}"
+    if not whole and usual < SLOWEST_S and usual * 1e-3 < FASTEST_S * 10:
+        return "s", NUMBERS, f"{seen}: as ms they would be {1e3 / usual:.3g} Hz"
+    return "", ASKED, seen
+
 
 TRIADS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
-    "acceleration": ("sensors.accelerometer", columns.ACCELEROMETER),
-    "rate": ("sensors.rates", columns.RATES),
-    "magnetic field": ("sensors.magnetometer", columns.MAGNETOMETER),
+    "acceleration": ("sensors.accelerometer", tables.ACCELEROMETER),
+    "rate": ("sensors.rates", tables.RATES),
+    "magnetic field": ("sensors.magnetometer", tables.MAGNETOMETER),
 }
 G_OR_GAUSS = {"acceleration", "magnetic field"}
 FIELD_GAUSS = (0.15, 0.9)  # the Earth's, with some iron, and less than 1 g
@@ -193,9 +410,9 @@ class Reader:
 
     def radar(self) -> list[SourceProposal]:
         """Slant range, azimuth, elevation."""
-        if not all(self.columns_of(q.short) for q in columns.RADAR):
+        if not all(self.columns_of(q.short) for q in tables.RADAR):
             return []
-        found = [self.single(q) for q in columns.RADAR]
+        found = [self.single(q) for q in tables.RADAR]
         if any(m is None for m in found):
             return []
         keys = [(key, '"FILL IN"', words) for key, words in (
@@ -206,7 +423,7 @@ class Reader:
 
     def receiver(self) -> list[SourceProposal]:
         """Positions by latitude and longitude or ECEF, velocities."""
-        quantity = {q.short: q for q in columns.GNSS}
+        quantity = {q.short: q for q in tables.GNSS}
         ecef = self._vectors("length", ("x", "y", "z"))
         lat_lon = [] if ecef else [m for s in ("lat", "lon") if (m := self.single(quantity[s]))]
         if not ecef and len(lat_lon) < 2:
@@ -232,7 +449,7 @@ class Reader:
         return [SourceProposal(f"gnss.{self.name}", found, keys)]
 
     def _vectors(self, kind: str, shorts: tuple[str, ...]) -> list[Mapped]:
-        quantities = [next(q for q in columns.GNSS if q.short == s) for s in shorts]
+        quantities = [next(q for q in tables.GNSS if q.short == s) for s in shorts]
         ned = shorts[0] == "vn"
         for (stem, family), by_axis in self.families().items():
             at = [by_axis[a] for a in range(3)]
@@ -279,7 +496,7 @@ class Reader:
 
     def barometer(self) -> list[SourceProposal]:
         """Static pressure, or heights."""
-        height, pressure = columns.BAROMETER
+        height, pressure = tables.BAROMETER
         found = self.single(pressure)
         if found is None:
             found = self.single(height, "alt")
@@ -290,21 +507,19 @@ class Reader:
 
     def air_columns(self) -> dict[Quantity, Mapped]:
         """Columns of a sounding; winds by speed and direction go before those by components."""
-        found = {q: m for q in columns.ATMOSPHERE if q.short in AIR and (m := self.single(q))}
+        found = {q: m for q in tables.ATMOSPHERE if q.short in AIR and (m := self.single(q))}
         if not {"wind_speed", "wind_from"} <= {q.short for q in found}:
-            found |= {q: m for q in columns.ATMOSPHERE if q.short in AIR_BY_PARTS and (m := self.single(q))}
+            found |= {q: m for q in tables.ATMOSPHERE if q.short in AIR_BY_PARTS and (m := self.single(q))}
         return found
 
     def is_sounding(self) -> bool:
         """Whether height, temperature and wind's direction or density are there, and nothing of a tracker."""
-        tracker = all(self.columns_of(s) for s in ("lat", "lon")) or all(
-            self.columns_of(q.short) for q in columns.RADAR
-        )
+        tracker = all(self.columns_of(s) for s in ("lat", "lon")) or all(self.columns_of(q.short) for q in tables.RADAR)
         air = all(self.columns_of(s) for s in ("alt", "temperature"))
         return air and not tracker and bool(self.columns_of("wind_from") or self.columns_of("rho"))
 
     def sounding(self) -> list[SourceProposal]:
-        """A table by altitude, as it stands; `postflight.intake.sounding_tables` derives densities before."""
+        """A table by altitude, as it stands; `postflight.intake.deliveries` derives densities before."""
         found = list(self.air_columns().values())
         shorts = {m.short for m in found}
         return [SourceProposal("atmosphere", found)] if {"alt", "temperature", "rho"} <= shorts else []

@@ -11,15 +11,15 @@ from rich.table import Table
 
 from flightmodel.checks import ConfigError, GateError
 from postflight.commands import compile_kernels, console
-from postflight.figures import save
-from postflight.montecarlo import figures, running, sobol
-from postflight.montecarlo.merge import Merged, merge, write_csv, write_merged
-from postflight.montecarlo.running import Wanted
-from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
+from postflight.montecarlo import execution
+from postflight.montecarlo.bands import Merged, merge, write_csv, write_merged
+from postflight.montecarlo.execution import Wanted
+from postflight.montecarlo.study import Stop, Study, indices, read_study, sobol_study
+from postflight.plots import ensembles
+from postflight.plots.paper_figures import save
 from postflight.progress import progress_bar
 from postflight.warmup import RECONSTRUCTION
-from synthetic_flight.ensemble import available_cores
-from synthetic_flight.outputs import check_names
+from synthetic_flight.ensemble import available_cores, check_names
 
 
 def run(
@@ -56,7 +56,7 @@ def fly(study: Study, folder: Path, wanted: Wanted) -> int:
     """Fly with progress; return how many flights the study has."""
     compile_kernels("simulator", "ensembles", *(RECONSTRUCTION if study.spec.mode == "whole" else ()))
     with progress_bar() as report:
-        return running.run(study, folder, wanted, report)
+        return execution.run(study, folder, wanted, report)
 
 
 def finish(study: Study, folder: Path, flights: int) -> Merged:
@@ -65,7 +65,7 @@ def finish(study: Study, folder: Path, flights: int) -> Merged:
     write_merged(folder, merged)
     title = f"{flights} dispersed flights: 2.3, 50 and 97.7 % of them"
     if len(merged.bands):
-        save(figures.figure_bands(merged.bands, title, words_of(study)), folder / "bands.png")
+        save(ensembles.figure_bands(merged.bands, title, words_of(study)), folder / "bands.png")
     print_merged(merged, folder)
     if merged.summary["failed"] == flights:
         raise GateError(f"{folder}: every flight failed; the first: {merged.flights['reason'].iloc[0]}")
@@ -99,7 +99,7 @@ def print_merged(merged: Merged, folder: Path) -> None:
 
 def status(folder: Path) -> None:
     """Say how far a folder is."""
-    found = running.status(folder)
+    found = execution.status(folder)
     console.print(
         f"{found.flights} of {found.flights_wanted} flights in {found.chunks} of {found.chunks_wanted} chunks; "
         f"{found.failed.total()} failed, {found.diverged} diverged",
@@ -111,17 +111,17 @@ def status(folder: Path) -> None:
 
 def remerge(folder: Path) -> None:
     """Merge the chunks of a folder again."""
-    study, flights = running.study_of(folder)
+    study, flights = execution.study_of(folder)
     finish_sobol(study, folder) if study.design is not None else finish(study, folder, flights)
 
 
 def retry_failed(folder: Path, workers: int | None, scheduler: str | None) -> None:
     """Fly failed runs again and merge."""
-    study, flights = running.study_of(folder)
+    study, flights = execution.study_of(folder)
     compile_kernels("simulator", "ensembles", *(RECONSTRUCTION if study.spec.mode == "whole" else ()))
     wanted = Wanted(flights, workers or available_cores(), scheduler)
     with progress_bar() as report:
-        tried, still = running.retry_failed(study, folder, wanted, report)
+        tried, still = execution.retry_failed(study, folder, wanted, report)
     console.print(f"{tried} failed flights flown again, {still} fail again", highlight=False)
     finish_sobol(study, folder) if study.design is not None else finish(study, folder, flights)
 
@@ -145,7 +145,7 @@ def finish_sobol(study: Study, folder: Path, output: str | None = None) -> None:
     tables = []
     for name in study.plan.scalars:
         try:
-            table, left_out = sobol.indices(design, merged.flights[name].to_numpy(dtype=float))
+            table, left_out = indices(design, merged.flights[name].to_numpy(dtype=float))
         except GateError as fault:
             console.print(f"[yellow]left out[/] {escape(name)}: {escape(str(fault))}")
             continue
@@ -161,7 +161,7 @@ def finish_sobol(study: Study, folder: Path, output: str | None = None) -> None:
     if shown.empty:
         raise GateError(f"{folder}: {output} has no indices")
     title = f"Sobol indices of {shown['output'].iloc[0]}: {design.flights} flights"
-    save(figures.figure_sobol(shown, title, words_of(study)), folder / "sobol.png")
+    save(ensembles.figure_sobol(shown, title, words_of(study)), folder / "sobol.png")
     printed = Table(title=title)
     for head in ("factor", "first order", "95 %", "total", "95 %"):
         printed.add_column(head, justify="left" if head == "factor" else "right", no_wrap=head == "factor")

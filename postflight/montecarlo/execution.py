@@ -2,27 +2,48 @@
 
 All three call the same function with the same runs, and a flight is the same to the last bit in any company, so where
 it was flown cannot be told from its numbers. Chunks come back as they are done, in any order.
+
+A folder of flights: begun, killed, resumed, extended, stopped when enough; never two studies in one.
+
+``study.json`` says what decides the numbers and how many flights are wanted; ``chunks/`` holds them. Every step is
+whole or not there at all, so that a run may be killed at any time and the same command goes on.
 """
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
 from itertools import islice
 from multiprocessing.connection import wait as wait_for
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flightmodel.checks import ConfigError, GateError
-from postflight.montecarlo import whole
-from postflight.montecarlo.chunks import Chunk, chunk_from_rows
-from postflight.montecarlo.study import Study
-from synthetic_flight.dispersed_ensemble import fly_runs
+from postflight.montecarlo import trial
+from postflight.montecarlo.bands import (
+    Chunk,
+    chunk_from_rows,
+    chunk_path,
+    is_narrow,
+    read_chunk,
+    remove_partial,
+    write_chunk,
+)
+from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
+from postflight.run_folder import write_file
+from synthetic_flight.ensemble import fly_runs
 
 Job = tuple[int, list[int]]
 Done = tuple[int, Chunk]
@@ -36,7 +57,7 @@ def fly_chunk(study: Study, job: Job) -> Done:
     """Fly the runs of one job; a flight that fails is a row with its reason."""
     number, runs = job
     if study.spec.mode == "whole":
-        rows = whole.fly_whole(study.plan, study.spec.seed, runs)
+        rows = trial.fly_whole(study.plan, study.spec.seed, runs)
     else:
         rows = fly_runs(study.plan, runs, study.draws_of)
     return number, chunk_from_rows(rows, study.plan.scalars)
@@ -134,3 +155,213 @@ def _on_dask(study: Study, jobs: list[Job], address: str) -> Iterator[Done]:
             yield future.result()
             for one in submit(1):
                 going.add(one)
+
+
+Report = Callable[[float, str], None]
+MOST_DIFFERENCES = 12
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is asked of a study: so many flights, or fewer where the rule says enough; who flies them."""
+
+    flights: int
+    workers: int = 1
+    scheduler: str | None = None
+    stop: Stop | None = None
+
+
+def begin(study: Study, folder: Path, flights: int) -> None:
+    """Make the folder, or check that it holds this study; note how many flights are wanted.
+
+    Raises
+    ------
+    ConfigError
+        Where the folder holds a study with other settings (which, and both values), or more flights, or other things.
+    """
+    path = folder / "study.json"
+    settings = json.loads(json.dumps(study.settings()))
+    if path.exists():
+        held = read_settings(folder)
+        _check_same(folder, held["settings"], settings)
+        if held["version"] != version("postflight"):
+            raise ConfigError(f"{folder}: flown by version {held['version']}, this is {version('postflight')}")
+        if flights < held["flights"]:
+            raise ConfigError(f"{folder}: holds a study of {held['flights']} flights; at least as many are wanted")
+    elif folder.exists() and any(folder.iterdir()):
+        raise ConfigError(f"{folder}: is not empty and holds no study.json; name a new folder")
+    (folder / "chunks").mkdir(parents=True, exist_ok=True)
+    remove_partial(folder)
+    _note(folder, settings, flights, study.named)
+
+
+def _note(folder: Path, settings: dict[str, Any], flights: int, source: str) -> None:
+    facts = {"version": version("postflight"), "flights": flights, "source": source, "settings": settings}
+    write_file(folder / "study.json", json.dumps(facts, indent=1) + "\n")
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """Return ``study.json``; `GateError` where the folder holds no study."""
+    path = folder / "study.json"
+    try:
+        held = json.loads(path.read_text())
+        kinds = (("settings", dict), ("flights", int), ("source", str))
+        if not all(isinstance(held[key], kind) for key, kind in kinds):
+            raise ValueError("not a study")
+    except FileNotFoundError:
+        raise GateError(f"{folder}: no study.json; begin with `postflight montecarlo run`") from None
+    except (ValueError, KeyError, TypeError) as fault:
+        raise GateError(f"{path}: damaged: {fault}") from None
+    found: dict[str, Any] = held
+    return found
+
+
+def study_of(folder: Path) -> tuple[Study, int]:
+    """Return the study of a folder, read again from its dispersions file, and how many flights it wants.
+
+    Raises
+    ------
+    ConfigError
+        Where the file is gone, or says something else by now.
+    """
+    held = read_settings(folder)
+    study = read_study(held["source"])
+    if "sobol.base" in held["settings"]:
+        study = sobol_study(study, held["settings"]["sobol.by"], held["settings"]["sobol.base"])
+    _check_same(folder, held["settings"], json.loads(json.dumps(study.settings())))
+    return study, held["flights"]
+
+
+def _check_same(folder: Path, held: dict[str, Any], asked: dict[str, Any]) -> None:
+    differ = [k for k in dict.fromkeys((*held, *asked)) if held.get(k) != asked.get(k)]
+    if not differ:
+        return
+    lines = [
+        f"{folder}: holds flights of other settings: '{k}' is {held.get(k)!r} there, {asked.get(k)!r} now"
+        for k in differ[:MOST_DIFFERENCES]
+    ]
+    more = [f"{folder}: {len(differ)} settings differ in all"] * (len(differ) > MOST_DIFFERENCES)
+    raise ConfigError([*lines, *more, f"{folder}: name a new folder, or take the settings back"])
+
+
+class _Enough:
+    """Says after how many flights to stop, looking at whole chunks from the first on, in order of run number."""
+
+    def __init__(self, study: Study, stop: Stop | None, flights: int) -> None:
+        self.study, self.stop, self.flights = study, stop, flights
+        self.column = -1 if stop is None else study.plan.scalars.index(stop.output)
+        self.ahead: dict[int, Chunk] = {}
+        self.values: list[float] = []
+        self.next = 0
+        self.reached: int | None = None
+
+    def add(self, number: int, chunk: Chunk) -> bool:
+        """Take a chunk; true once there are enough flights."""
+        if self.stop is None or self.reached is not None:
+            return self.reached is not None
+        self.ahead[number] = chunk
+        while self.next in self.ahead and self.reached is None:
+            chunk = self.ahead.pop(self.next)
+            self.values += [v for v in chunk.scalars[:, self.column].tolist() if np.isfinite(v)]
+            self.next += 1
+            stop = self.stop
+            if is_narrow(np.array(self.values), stop.percentile, stop.confidence, stop.width):
+                self.reached = min(self.next * self.study.spec.chunk, self.flights)
+        return self.reached is not None
+
+
+def run(study: Study, folder: Path, wanted: Wanted, report: Report) -> int:
+    """Fly what is missing of a study; return how many flights it has: those wanted, or fewer where these are enough.
+
+    The stop rule looks at flights in the order of their numbers, so it stops at the same flight on any number of
+    workers; what was flown beyond it is removed.
+    """
+    flights = wanted.flights
+    begin(study, folder, flights)
+    total = study.chunks(flights)
+    enough = _Enough(study, wanted.stop, flights)
+    jobs, there = [], 0
+    for number in range(total):
+        runs = study.runs_of(number, flights)
+        chunk = read_chunk(folder, number, runs, histories=False)
+        if chunk is None:
+            jobs.append((number, runs))
+        else:
+            there += 1
+            if enough.add(number, chunk):
+                break
+    report(there / total, f"{there} of {total} chunks are there")
+    if enough.reached is None and jobs:
+        for number, chunk in fly_jobs(study, jobs, wanted.workers, wanted.scheduler):
+            write_chunk(folder, number, chunk)
+            there += 1
+            report(there / total, f"{min(there * study.spec.chunk, flights)} of {flights} flights")
+            if enough.add(number, chunk):
+                break
+    if enough.reached is not None and enough.reached < flights:
+        flights = enough.reached
+        for number in range(study.chunks(flights), total):
+            chunk_path(folder, number).unlink(missing_ok=True)
+        _note(folder, read_settings(folder)["settings"], flights, study.named)
+    return flights
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a folder holds: chunks of those wanted, flights, reasons of failures by number, flights that diverged."""
+
+    chunks: int
+    chunks_wanted: int
+    flights: int
+    flights_wanted: int
+    failed: Counter[str]
+    diverged: int
+
+
+def status(folder: Path) -> Status:
+    """Look at a folder without its dispersions file."""
+    held = read_settings(folder)
+    size, wanted = held["settings"]["chunk"], held["flights"]
+    count = flights = diverged = 0
+    failed: Counter[str] = Counter()
+    total = -(-wanted // size)
+    for number in range(total):
+        runs = list(range(number * size, min((number + 1) * size, wanted)))
+        chunk = read_chunk(folder, number, runs, histories=False)
+        if chunk is not None:
+            count, flights = count + 1, flights + len(runs)
+            failed.update(reason for reason in chunk.reasons if reason)
+            diverged += int(np.isfinite(chunk.diverged_s).sum())
+    return Status(count, total, flights, wanted, failed, diverged)
+
+
+def retry_failed(study: Study, folder: Path, wanted: Wanted, report: Report) -> tuple[int, int]:
+    """Fly failed runs again; return how many there were and how many still fail.
+
+    A flight's numbers depend on its run alone: one that failed on bad luck of the machine may fly now, one that was
+    drawn outside what can fly fails again.
+    """
+    begin(study, folder, wanted.flights)
+    jobs, before = [], {}
+    for number in range(study.chunks(wanted.flights)):
+        chunk = read_chunk(folder, number, study.runs_of(number, wanted.flights))
+        if chunk is not None and not chunk.flown.all():
+            jobs.append((number, chunk.runs[~chunk.flown].tolist()))
+            before[number] = chunk
+    tried, still = sum(len(runs) for _, runs in jobs), 0
+    for k, (number, again) in enumerate(fly_jobs(study, jobs, wanted.workers, wanted.scheduler)):
+        still += int((~again.flown).sum())
+        write_chunk(folder, number, _replaced(before[number], again))
+        report((k + 1) / len(jobs), "flying failed flights again")
+    return tried, still
+
+
+def _replaced(chunk: Chunk, again: Chunk) -> Chunk:
+    """Return a chunk with the rows of ``again`` in place of its own."""
+    at = np.searchsorted(chunk.runs, again.runs)
+    reasons, diverged = list(chunk.reasons), chunk.diverged_s.copy()
+    scalars, histories = chunk.scalars.copy(), chunk.histories.copy()
+    for k, row in enumerate(at.tolist()):
+        reasons[row] = again.reasons[k]
+    diverged[at], scalars[at], histories[at] = again.diverged_s, again.scalars, again.histories
+    return Chunk(chunk.runs, tuple(reasons), diverged, scalars, histories)

@@ -17,10 +17,10 @@ from postflight.reconciliation.candidate import (
     HARDENING_SD,
     OFFSET_SD_M,
     STIFFNESS_LOG_SD,
+    WINDOWS,
 )
 from postflight.reconciliation.fit import Reconciled
-from postflight.reconciliation.observed import WINDOWS
-from postflight.reconciliation.spans import BENDING, MOTION
+from postflight.reconciliation.problem import BENDING, MOTION
 
 INTERVAL = 0.90
 DIFFERENCE = 1e-4  # of a standard deviation of the prior

@@ -12,27 +12,20 @@ from rich.table import Table
 
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
-from postflight import results
+from postflight import run_folder
 from postflight.commands import compile_kernels, console
-from postflight.figures import save
-from postflight.pipeline import PULSE_RATE_HZ, Flight, estimate, reconstruct_telemetry
-from postflight.preflight import Bounds, entry_bounds, rigid_bounds
+from postflight.flight import PULSE_RATE_HZ, Flight, estimate, reconstruct_telemetry
+from postflight.plots.paper_figures import save
+from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.progress import Report, progress_bar
 from postflight.reconciliation.answer import correlations, deflection_of, found_sd, joint_table, vehicle_lines
-from postflight.reconciliation.figures import figure_modes, figure_posterior, figure_reconciled
-from postflight.reconciliation.fit import Reconciled
-from postflight.reconciliation.laws import explain
+from postflight.reconciliation.fit import Reconciled, explain
 from postflight.reconciliation.modes import ModalStiffness, stiffness_by_modes
-from postflight.reconciliation.posterior import (
-    Posterior,
-    posterior_summary,
-    quantities,
-    require_samplers,
-    sample_all,
-)
+from postflight.reconciliation.posterior import Posterior, posterior_summary, quantities, require_samplers, sample_all
 from postflight.studies.commands import bands, held_against
+from postflight.studies.preflight import Bounds, entry_bounds, rigid_bounds
 from postflight.warmup import RECONSTRUCTION
-from recon.bet import Settings
+from recon.settings import Settings
 from synthetic_flight.dispersions import Factor, JointDispersions
 
 ENTRIES = 300
@@ -65,12 +58,12 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         rigid = rigid_bounds(flight, ENTRIES, progress=lambda f, what: report(0.9 + 0.05 * f, what))
         flexible = reconciled_bounds(found, flight, lambda f, what: report(0.95 + 0.05 * f, what))
         shares, _, bands_picture = held_against(flight, rigid, flexible)
-        with results.RunFolder(folder, telemetry, settings) as out:
+        with run_folder.RunFolder(folder, telemetry, settings) as out:
             table = joint_table(found)
             out.write_csv("joint.csv", table)
             out.write_csv("joint_correlations.csv", correlations(found))
             bent = deflection_of(found)
-            out.write_csv("deflection_reconciled.csv", results.deflection_table(bent))
+            out.write_csv("deflection_reconciled.csv", run_folder.deflection_table(bent))
             story = summary(found, table, odds) | modal_summary(modal, no_modes) | posterior_words(posterior)
             out.write_json("reconciliation.json", story)
             out.write_csv("bands.csv", bands(rigid, flexible))

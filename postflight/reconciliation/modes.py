@@ -18,7 +18,7 @@ import numpy as np
 
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.vehicle import Vehicle
-from postflight.pipeline import Flight
+from postflight.flight import Flight
 from postflight.reconciliation.candidate import STIFFNESS_LOG_SD, VehicleUnknowns
 from synthetic_flight.linear import linear_matrix, modes, slopes_at
 

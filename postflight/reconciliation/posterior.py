@@ -30,10 +30,8 @@ from scipy.interpolate import RBFInterpolator
 from flightmodel.checks import ConfigError, FloatArray
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.candidate import FREEPLAY_SD_RAD, HARDENING_SD, VehicleUnknowns
-from postflight.reconciliation.fit import Progress, Reconciled
-from postflight.reconciliation.laws import Explained
-from postflight.reconciliation.problem import Linear, Unknowns
-from postflight.reconciliation.steps import Normal, step_from
+from postflight.reconciliation.fit import Explained, Progress, Reconciled
+from postflight.reconciliation.problem import Linear, Normal, Unknowns, step_from
 
 SEED = 2009
 PER_UNKNOWN, REACH, CORRECTIONS = 32, 5.0, 3  # candidates; reach in sd of the linear problem

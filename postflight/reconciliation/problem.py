@@ -11,29 +11,39 @@ Ends and starts differ by what the air's structure between its knots does to the
 References
 ----------
 H. G. Bock, "Recent advances in parameter identification techniques for O.D.E.", 1983 (multiple shooting).
+
+What would the sensors have read in short spans of a flight, and how would each have ended?
+
+Many spans at once: each starts from a motion of its own at the reconstruction's place and speed, and is flown by the
+simulator.
+
+One step towards the most probable unknowns of a `Problem`.
+
+Gauss-Newton's, with the second-order correction of geodesic acceleration, since the valley is long and bent
+(stiffness, inertias and stability nearly scale together); damped where the bend is sharper than that.
+
+References
+----------
+M. K. Transtrum, J. P. Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
+minimization", 2012 (geodesic acceleration).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
-from flightmodel.checks import FloatArray
-from postflight.reconciliation.candidate import AirUnknowns, VehicleUnknowns
-from postflight.reconciliation.observed import Observed
-from postflight.reconciliation.spans import (
-    ATTITUDE,
-    MOTION,
-    RATE,
-    Candidate,
-    Flights,
-    Index,
-    Read,
-    fly_spans,
-)
-from synthetic_flight import packing
+from flightmodel import earth, rotations
+from flightmodel.checks import DivergenceError, FloatArray
+from flightmodel.vehicle import Vehicle
+from postflight.reconciliation.candidate import SPAN_S, WINDOWS, AirUnknowns, Observed, VehicleUnknowns
+from synthetic_flight import simulate
+from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
 
 INSTRUMENTS = 20
 # per angle of flow, rad, that the air's structure between knots GUST_KNOT_M apart makes, at the largest dynamic
@@ -199,7 +209,7 @@ class Problem:
     def candidate(self, x: FloatArray) -> Candidate:
         """Vehicle of unknowns in standard deviations."""
         vehicle = self.unknown.vehicle(x)
-        return Candidate(vehicle, packing.parameter_vector(vehicle, *self.unknown.factors(x)))
+        return Candidate(vehicle, simulate.parameter_vector(vehicle, *self.unknown.factors(x)))
 
     def predicted(self, u: Unknowns) -> Read:
         """Every span once; windows without the instruments' errors."""
@@ -332,3 +342,242 @@ class Problem:
             (slice(first, first + 3), self.attitude_precision, u.motion[0, ATTITUDE]),
             (slice(first + 6, first + MOTION), np.diag(self.observed.first_bending_sd**-2.0), u.motion[0, 6:]),
         ]
+
+
+STEP_S = 0.004
+PER_RECORD = 5  # two records a window: its mean is Simpson's of its ends and middle
+RECORDS = 2 * WINDOWS + 1
+# of a span's start: rotation against the reconstructed attitude, body's rate, shell's rotation vector against the body
+# (x is its twist), shell's rate against the body, shell axes
+MOTION = 12
+ATTITUDE, RATE, BENDING, BENDING_RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A vehicle with its `packing.parameter_vector`."""
+
+    vehicle: Vehicle
+    parameters: FloatArray
+
+
+@dataclass(frozen=True)
+class Flights:
+    """Spans to fly: which, with which candidate, from which motion, in which air.
+
+    Parameters
+    ----------
+    span, candidate, table : (m,) int
+    motion : (m, 12) float
+    candidates : list of Candidate
+    tables : list of (rows, 6) float
+        Kernel tables of the air.
+    """
+
+    span: Index
+    candidate: Index
+    motion: FloatArray
+    table: Index
+    candidates: list[Candidate]
+    tables: list[FloatArray]
+
+
+@dataclass(frozen=True)
+class Read:
+    """What sensors read; NaN after a divergence.
+
+    Parameters
+    ----------
+    windows, slope : (m, WINDOWS, 6) float
+        Rates, rad/s, and specific force, m/s^2, means over windows, and how fast they change.
+    bending : (m, WINDOWS, 3) float
+        Shell's rotation vector against the body at the windows' middles, rad.
+    end : (m, 12) float
+        Motion at the end of the span, as the next one counts it.
+    """
+
+    windows: FloatArray
+    slope: FloatArray
+    bending: FloatArray
+    end: FloatArray
+
+
+def fly_spans(observed: Observed, told: Vehicle, flights: Flights) -> Read:
+    """Fly spans and read the sensors."""
+    starts = _start_states(observed, flights)
+
+    def start_of(k: int) -> Start:
+        return Start(starts[k], flights.candidates[flights.candidate[k]].parameters, flights.tables[flights.table[k]])
+
+    states, aux = np.full((len(starts), RECORDS, 20), np.nan), np.full((len(starts), RECORDS, 18), np.nan)
+    for flown in fly_ensemble(told, start_of, range(len(starts)), Schedule(STEP_S, PER_RECORD, RECORDS)):
+        states[flown.run, : len(flown.states)], aux[flown.run, : len(flown.aux)] = flown.states, flown.aux
+    windows, slope = _windows(observed, flights, states, aux)
+    middle = states[:, 1::2]
+    bent = rotations.log(rotations.multiply(rotations.conjugate(middle[..., 6:10]), middle[..., 10:14]))
+    return Read(windows, slope, bent, _ends(observed, flights.span, states[:, -1]))
+
+
+def _start_states(observed: Observed, flights: Flights) -> FloatArray:
+    """States (m, 20) as `synthetic_flight.simulate.state_from_ecef` lays them out, of the bent vehicle's c.g."""
+    at, span, motion = observed.start, flights.span, flights.motion
+    vehicles = [c.vehicle for c in flights.candidates]
+    cg = np.array([v.cg_m for v in vehicles])[flights.candidate]
+    # of the shell's c.g., from the joint; its share in the vehicle's
+    arm = np.array([v.aeroshell.cg_m - v.joint_m for v in vehicles])[flights.candidate]
+    share = np.array([v.aeroshell.mass_kg / v.mass_kg for v in vehicles])[flights.candidate, None]
+    q = rotations.boxplus(at.q_ecef_body[span], motion[:, ATTITUDE])
+    omega, bent = motion[:, RATE], rotations.exp(motion[:, BENDING])
+    shell_rate = rotations.rotate(rotations.conjugate(bent), omega) + motion[:, BENDING_RATE]
+    place = cg + share * (rotations.rotate(bent, arm) - arm)
+    swing = np.cross(omega, cg) + share * (rotations.rotate(bent, np.cross(shell_rate, arm)) - np.cross(omega, arm))
+    r = at.position_ecef_m[span] + rotations.rotate(q, place)
+    v = at.velocity_ecef_mps[span] + rotations.rotate(q, swing)
+    to_eci = rotations.conjugate(earth.q_ecef_eci(at.time_s[span]))
+    q_body = rotations.multiply(to_eci, q)
+    return np.column_stack(
+        [
+            rotations.rotate(to_eci, r),
+            rotations.rotate(to_eci, v + np.cross(earth.OMEGA_ECEF_RADPS, r)),
+            q_body,
+            rotations.multiply(q_body, bent),
+            omega,
+            shell_rate,
+        ]
+    )
+
+
+def _windows(
+    observed: Observed, flights: Flights, states: FloatArray, aux: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    bodies = [c.vehicle.centerbody for c in flights.candidates]
+    arm = np.array([observed.accelerometer_m - body.cg_m for body in bodies])[flights.candidate][:, None]
+    mass = np.array([body.mass_kg for body in bodies])[flights.candidate][:, None, None]
+    omega, turn = states[..., 14:17], aux[..., 15:18]
+    force = rotations.rotate(rotations.conjugate(states[..., 6:10]), aux[..., 6:9]) / mass
+    force = force + np.cross(turn, arm) + np.cross(omega, np.cross(omega, arm))
+    records = np.concatenate([omega, force], axis=2)
+    before, middle, after = records[:, 0:-1:2], records[:, 1::2], records[:, 2::2]
+    return (before + 4.0 * middle + after) / 6.0, (after - before) / (2.0 * PER_RECORD * STEP_S)
+
+
+def _ends(observed: Observed, span: Index, state: FloatArray) -> FloatArray:
+    """Motion as the next span counts it."""
+    q_body, q_shell = state[:, 6:10], state[:, 10:14]
+    q = rotations.multiply(earth.q_ecef_eci(observed.start.time_s[span] + SPAN_S), q_body)
+    turned = rotations.boxminus(q, observed.start.q_ecef_body[span + 1])
+    bent = rotations.multiply(rotations.conjugate(q_body), q_shell)
+    across = state[:, 17:20] - rotations.rotate(rotations.conjugate(bent), state[:, 14:17])
+    return np.column_stack([turned, state[:, 14:17], rotations.log(bent), across])
+
+
+PARTS = (1.0, 0.5, 0.25)  # of a step
+LOOK_AHEAD = 0.1  # of a step, over which its curvature is taken
+# shares of the diagonal that are added, until a step falls by a fair part of what an undamped one promises
+DAMPINGS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
+FIRST_DAMPING, MOST_DAMPING, FAIR = 1e-2, 1e3, 0.5
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of a step, scaled to a diagonal of one."""
+
+    matrix: FloatArray
+    right: FloatArray
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """One over the root of the diagonal."""
+        return np.asarray(1.0 / np.sqrt(np.diag(self.matrix)))
+
+    def factor(self, damping: float) -> FloatArray:
+        """Lower Cholesky factor of the scaled matrix with a share of the diagonal added."""
+        scaled = self.matrix * self.scale[:, None] * self.scale
+        scaled[np.diag_indices_from(scaled)] += damping
+        return np.asarray(cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)[0])
+
+    @cached_property
+    def undamped(self) -> FloatArray:
+        """Factor of the matrix as it is."""
+        return self.factor(0.0)
+
+    def solver(self, damping: float) -> Callable[[FloatArray], FloatArray]:
+        """Solver of the equations with a share of the diagonal added."""
+        factor, scale = self.factor(damping) if damping else self.undamped, self.scale
+        return lambda right: np.asarray((cho_solve((factor, True), (right.T * scale).T).T * scale).T)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solution of the equations."""
+        return self.solver(0.0)(right)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of all unknowns."""
+        return self.solve(np.eye(len(self.right)))
+
+    @property
+    def log_det(self) -> float:
+        """Logarithm of the determinant."""
+        return float(2.0 * (np.log(np.diag(self.undamped)).sum() - np.log(self.scale).sum()))
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where a step leads, by how much the cost may still fall by the linear problem, residuals there, its equations."""
+
+    to: Unknowns
+    promised: float
+    residuals: Residuals
+    normal: Normal
+
+
+def step_from(problem: Problem, u: Unknowns) -> Step:
+    """Take the best of some damped, corrected steps.
+
+    Raises
+    ------
+    DivergenceError
+        Where the candidate cannot be flown.
+    """
+    linear = problem.linear(u)
+    if not np.isfinite(linear.found.cost):
+        raise DivergenceError(
+            "reconciliation: a span of the flight cannot be flown with the vehicle as told: its joint diverges; give "
+            "a stiffer joint in the vehicle file to start from"
+        )
+    normal = Normal(*problem.normal(u, linear))
+    promised = float(normal.solve(normal.right) @ normal.right)
+    best = linear.found, u
+    for damping in DAMPINGS:
+        best = _better(problem, u, linear, normal, damping, best)
+        if linear.found.cost - best[0].cost > FAIR * promised:
+            break
+    damping = FIRST_DAMPING
+    while best[0].cost >= linear.found.cost and damping < MOST_DAMPING:
+        best = _better(problem, u, linear, normal, damping, best)
+        damping *= 10.0
+    return Step(best[1], promised, best[0], normal)
+
+
+def _better(
+    problem: Problem,
+    u: Unknowns,
+    linear: Linear,
+    normal: Normal,
+    damping: float,
+    best: tuple[Residuals, Unknowns],
+) -> tuple[Residuals, Unknowns]:
+    """Return the lowest of the best so far and parts of one corrected step."""
+    solved = normal.solver(damping)
+    step = solved(normal.right)
+    ahead, behind = (problem.residuals(u.moved(side * LOOK_AHEAD * step)) for side in (1.0, -1.0))
+    bent = solved(
+        linear.back(
+            (ahead.sensors - 2.0 * linear.found.sensors + behind.sensors) / LOOK_AHEAD**2,
+            (ahead.joins - 2.0 * linear.found.joins + behind.joins) / LOOK_AHEAD**2,
+        )
+    )
+    # a bent path, of which the straight part alone may go too far
+    paths = [part * step + 0.5 * part**2 * bent for part in PARTS if np.isfinite(bent).all()] or [step]
+    return min([best, *((problem.residuals(end), end) for end in map(u.moved, paths))], key=lambda pair: pair[0].cost)

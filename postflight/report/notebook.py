@@ -74,7 +74,7 @@ AGAIN = """\
 
 The same from the library, to be asked otherwise:
 
-    from postflight.pipeline import METHODS, estimate, reconstruct_flight
+    from postflight.flight import METHODS, estimate, reconstruct_flight
     flight = reconstruct_flight(folder)
     answers = estimate(flight, flight.telemetry, METHODS)"""
 

@@ -12,10 +12,9 @@ import pandas as pd
 from estimators.agreement import CONFIDENCE
 from flightmodel.config import parse_utc
 from flightmodel.deflection import lateral_axes, lv_clock, lv_direction, missed_between
-from postflight.figures import LABEL
-from postflight.pipeline import METHODS
-from postflight.report.series import COLOUR
-from postflight.report.shape import best_method, hole_s
+from postflight.flight import METHODS
+from postflight.plots.paper_figures import COLOUR, LABEL
+from postflight.report.pictures import best_method, hole_s
 from postflight.report.source import Run
 from postflight.sensitivity import largest_of_groups
 

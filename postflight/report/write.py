@@ -17,9 +17,18 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import writing
 from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
-from postflight.report import bands, pictures, series, shape, words
-from postflight.report.source import Run, read_run
-from postflight.whole_file import write_file
+from postflight.report import pictures, words
+from postflight.report.panels import (
+    NO_DEFLECTION,
+    deflection_panel,
+    residual_panels,
+    rigid_panels,
+    study_panels,
+    trajectory_panels,
+    trajectory_rows,
+)
+from postflight.report.source import Run, read_run, rounded
+from postflight.run_folder import write_file
 
 NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
@@ -37,7 +46,7 @@ def write_report(
 ) -> Path:
     """Write the report of a run (`read_run`) to ``target`` or into the run's folder; return where it lies.
 
-    ``studies`` are folders or files with bands that the flight is held against (`postflight.report.bands`).
+    ``studies`` are folders or files with bands that the flight is held against (`postflight.report.panels`).
 
     Raises
     ------
@@ -119,13 +128,13 @@ def numbers(
 ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """Everything that the page's scripts draw, and the panels that the flight has no data for, with the reason."""
     bet = run.tables["bet"]
-    rows = series.trajectory_rows(run)
-    panels, absent = series.trajectory_panels(run, rows)
-    deflection = series.deflection_panel(run)
+    rows = trajectory_rows(run)
+    panels, absent = trajectory_panels(run, rows)
+    deflection = deflection_panel(run)
     if deflection is not None:
         panels.insert(0, deflection)
     else:
-        absent.insert(0, ("Deflection", series.NO_DEFLECTION))
+        absent.insert(0, ("Deflection", NO_DEFLECTION))
     vehicle = run.telemetry.vehicle
     span = [float(bet["t_s"].iloc[0]), float(bet["t_s"].iloc[-1])]
     data = {
@@ -134,15 +143,15 @@ def numbers(
         "pulse": pulse_window(bet),
         "first": span if deflection is None else pulse_window(bet),
         "peak": round(float(run.summary["peak_dynamic_pressure_s"]), 3),
-        "bet": series.rounded(bet["t_s"].to_numpy()[rows], 4),
+        "bet": rounded(bet["t_s"].to_numpy()[rows], 4),
         "rows": [len(rows), len(bet)],
         "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in run.tables["events"].itertuples()],
         "panels": panels,
-        "rigid": bands.rigid_panels(run),
-        "studies": bands.study_panels(run, studies),
-        "residuals": series.residual_panels(run),
-        "solid": None if vehicle is None else shape.solid(vehicle),
-        "poses": shape.poses(run, rows),
+        "rigid": rigid_panels(run),
+        "studies": study_panels(run, studies),
+        "residuals": residual_panels(run),
+        "solid": None if vehicle is None else pictures.solid(vehicle),
+        "poses": pictures.poses(run, rows),
         "frames": [{k: v for k, v in frame.items() if k != "jpeg"} for frame in frames],
     }
     return data, absent

@@ -13,14 +13,15 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import GateError
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.commands import compile_kernels, console
-from postflight.figures import save
-from postflight.montecarlo.merge import write_csv
+from postflight.flight import Flight, reconstruct_flight
+from postflight.montecarlo.bands import write_csv
 from postflight.montecarlo.study import read_study
-from postflight.pipeline import Flight, reconstruct_flight
-from postflight.preflight import Bounds, entry_bounds, inside
+from postflight.plots import studies
+from postflight.plots.paper_figures import save
 from postflight.progress import progress_bar
-from postflight.studies import figures, joints
-from postflight.studies.table_3_1 import table_3_1
+from postflight.studies import joints
+from postflight.studies.joints import table_3_1
+from postflight.studies.preflight import Bounds, entry_bounds, inside
 from postflight.warmup import RECONSTRUCTION
 from synthetic_flight.scenarios import read_scenario
 
@@ -31,7 +32,7 @@ def stiffness_and_damping(vehicle: str, folder: Path) -> None:
     table = table_3_1(known)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "table_3_1.csv", table)
-    save(figures.figure_table_3_1(table, f"vehicle: {known.name}"), folder / "table_3_1.png")
+    save(studies.figure_table_3_1(table, f"vehicle: {known.name}"), folder / "table_3_1.png")
     printed = Table(title="Table 3.1 (AIAA 2011-2571)")
     for name in ("study", "Hz", "% of c*", "quantity", "paper", "ours", "vehicle's own"):
         printed.add_column(name, justify="left" if name in ("study", "quantity") else "right")
@@ -51,7 +52,7 @@ def damping(scenario: str, folder: Path, seed: int) -> None:
     title = "Damping of the joint at 2.5 Hz, % of critical (AIAA 2011-2571, Figure 3.1)"
     label = "centerbody total angle of attack (deg)"
     synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
-    picture = figures.figure_joints(study, "alpha_total_deg", label, title, synthetic)
+    picture = studies.figure_joints(study, "alpha_total_deg", label, title, synthetic)
     write_study(study, folder, "damping", {"figure_3_1.png": picture})
 
 
@@ -62,7 +63,7 @@ def stiffness(scenario: str, folder: Path, seed: int) -> None:
     study = joints.stiffness_study(chosen, seed)
     synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
     pictures = {
-        name: figures.figure_joints(
+        name: studies.figure_joints(
             study, quantity, label, f"Stiffness of the joint at 0.5 % of critical (AIAA 2011-2571, {number})", synthetic
         )
         for name, quantity, label, number in (
@@ -73,7 +74,7 @@ def stiffness(scenario: str, folder: Path, seed: int) -> None:
     write_study(study, folder, "stiffness", pictures)
 
 
-def write_study(study: joints.JointStudy, folder: Path, name: str, pictures: dict[str, figures.Figure]) -> None:
+def write_study(study: joints.JointStudy, folder: Path, name: str, pictures: dict[str, studies.Figure]) -> None:
     """Write tables and figures of a study of the joint, and print it beside the paper's words."""
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / f"{name}.csv", study.table)
@@ -123,7 +124,7 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
     console.print(f"results in {escape(str(folder))}")
 
 
-def held_against(flight: Flight, rigid: Bounds, flexible: Bounds) -> tuple[pd.DataFrame, pd.DataFrame, figures.Figure]:
+def held_against(flight: Flight, rigid: Bounds, flexible: Bounds) -> tuple[pd.DataFrame, pd.DataFrame, studies.Figure]:
     """Return `shares`, the flight's own columns ``time_s, alpha_total_deg, normal_g``, and both as a picture."""
     pulse = flight.required_pulse()
     flown = pd.DataFrame(
@@ -141,7 +142,7 @@ def held_against(flight: Flight, rigid: Bounds, flexible: Bounds) -> tuple[pd.Da
     tag = "SYNTHETIC flight" if flight.telemetry.synthetic else "flight"
     span = _pulse_span(flight)
     window = span[0] - 10.0, span[1] + 5.0
-    picture = figures.figure_preflight(rigid, flexible, flown, window, words, f"{flight.telemetry.name}: {tag}")
+    picture = studies.figure_preflight(rigid, flexible, flown, window, words, f"{flight.telemetry.name}: {tag}")
     return table, flown, picture
 
 

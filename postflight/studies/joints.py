@@ -2,11 +2,20 @@
 
 The scenario is flown on one day with the joints of the paper's Table 3.1, side by side, and once with the joint locked,
 the paper's "No CFE". The paper's curves are pictures; what it says of them in words is put beside what is found here.
+
+Table 3.1: which stiffness and damping are a free-free frequency and a share of critical damping?
+
+``K = I (2 pi f)^2`` and ``c = zeta 2 sqrt(K I)`` (seed paper eqs. [7], [8]) with the reduced inertia ``I = I_a I_cb /
+(I_a + I_cb)`` about the joint. The paper does not print its inertias, but its table holds one number of them: every row
+has ``K / f^2 = 693.6``. With it all numbers follow to the last digit printed, where halves are rounded up (3511.35 to
+3511.4) and the damping study's row is taken in multiples of its first entry as printed (40 x 2.7597 = 110.388, where
+eq. [8] gives 110.390). The vehicle's own inertia gives a second set.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from decimal import ROUND_HALF_UP, Decimal
 from typing import Any
 
 import numpy as np
@@ -15,15 +24,12 @@ import pandas as pd
 from flightmodel.airdata import peak_pressure, pressure_pulse
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
-from postflight.studies import table_3_1
-from synthetic_flight import packing
-from synthetic_flight.day_air import day_atmosphere
-from synthetic_flight.dispersed_ensemble import legs
+from synthetic_flight import simulate
 from synthetic_flight.dispersions import Window
-from synthetic_flight.ensemble import Start, fly_legs
-from synthetic_flight.outputs import Records, records_of
+from synthetic_flight.dynamics import check_step
+from synthetic_flight.ensemble import Records, Start, fly_legs, legs, records_of
 from synthetic_flight.scenarios import Scenario, child_rng, initial_state
-from synthetic_flight.step_size import check_step
+from synthetic_flight.weather import day_atmosphere
 
 BEFORE_S, AFTER_S, RECORD_S = 20.0, 20.0, 0.02
 MEAN_HALF_WINDOW_S = 1.5  # two periods of the aerodynamic mode to both sides of the peak
@@ -56,13 +62,13 @@ class JointStudy:
 
 def damping_study(scenario: Scenario, seed: int) -> JointStudy:
     """Fly the damping of Figure 3.1: 0.5 to 20 % of critical at 2.5 Hz, on the day that ``seed`` draws."""
-    stiffness = float({hz: k for hz, k, _ in table_3_1.PAPER_STIFFNESS}[table_3_1.STUDY_HZ])
-    joints = [(f"{100 * ratio:g} %", stiffness, float(c)) for ratio, c in table_3_1.PAPER_DAMPING]
+    stiffness = float({hz: k for hz, k, _ in PAPER_STIFFNESS}[STUDY_HZ])
+    joints = [(f"{100 * ratio:g} %", stiffness, float(c)) for ratio, c in PAPER_DAMPING]
     flights, peak_s = _fly(scenario, seed, joints)
     table = _table(flights, peak_s)
     later = dict(zip(table["joint"], table["alpha_later_mean_deg"], strict=True))
     rises = {name: later[name] - mean for name, mean in zip(table["joint"], table["alpha_mean_deg"], strict=True)}
-    above = [f"{100 * r:g} %" for r, _ in table_3_1.PAPER_DAMPING if r > 0.01]
+    above = [f"{100 * r:g} %" for r, _ in PAPER_DAMPING if r > 0.01]
     words = f"mean angle of attack {LATER_S[0]:g} to {LATER_S[1]:g} s after peak pressure less that at the peak, deg"
     claims = [
         ("locked joint: the angle rises after 440 s", "rises", rises[LOCKED], rises[LOCKED] > 0.0, words),
@@ -86,7 +92,7 @@ def damping_study(scenario: Scenario, seed: int) -> JointStudy:
 
 def stiffness_study(scenario: Scenario, seed: int) -> JointStudy:
     """Fly the stiffness of Figures 3.2 and 3.3: 2 to 4 Hz at 0.5 % of critical, on the day that ``seed`` draws."""
-    joints = [(f"{hz:g} Hz", float(k), float(c)) for hz, k, c in table_3_1.PAPER_STIFFNESS]
+    joints = [(f"{hz:g} Hz", float(k), float(c)) for hz, k, c in PAPER_STIFFNESS]
     flights, peak_s = _fly(scenario, seed, joints)
     table = _table(flights, peak_s)
     by = table.set_index("joint")
@@ -123,10 +129,10 @@ def _fly(
 ) -> tuple[tuple[JointFlight, ...], float]:
     """Fly a locked joint, then the given ones, through the pulse of the locked flight."""
     time = scenario.spec.time
-    table = packing.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere")))
+    table = simulate.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere")))
     state = initial_state(scenario)
     first = max(time.start_s, time.inflated_s or time.start_s)
-    peak_s = _pressure_peak(scenario, Start(state, packing.parameter_vector(scenario.vehicle), table), first)
+    peak_s = _pressure_peak(scenario, Start(state, simulate.parameter_vector(scenario.vehicle), table), first)
     window = Window(
         from_s=max(first, peak_s - BEFORE_S), to_s=min(time.stop_s, peak_s + AFTER_S + 5.0), record_s=RECORD_S
     )
@@ -136,7 +142,7 @@ def _fly(
         plan = legs(time, window, locked)
         for vehicle in () if locked else flown:
             check_step(vehicle, plan[-1].step_s)
-        starts = [Start(state, packing.parameter_vector(v), table) for v in flown]
+        starts = [Start(state, simulate.parameter_vector(v), table) for v in flown]
         for name, vehicle, one in zip(
             names, flown, fly_legs(scenario.vehicle, list(range(len(flown))), starts, plan), strict=True
         ):
@@ -205,3 +211,73 @@ def histories(study: JointStudy) -> pd.DataFrame:
         for f in study.flights
     ]
     return pd.concat(parts, ignore_index=True)
+
+
+PAPER_STIFFNESS_OVER_HZ2 = 693.6
+PAPER_REDUCED_INERTIA_KGM2 = PAPER_STIFFNESS_OVER_HZ2 / (2.0 * np.pi) ** 2
+STUDY_HZ, STUDY_RATIO = 2.5, 0.005
+# frequency Hz, K N m/rad, 0.5 % c* N m s/rad as printed
+PAPER_STIFFNESS = (
+    (2.0, "2774.4", "2.2078"),
+    (2.25, "3511.4", "2.4838"),
+    (2.5, "4335.0", "2.7597"),
+    (3.0, "6242.4", "3.3117"),
+    (4.0, "11098", "4.4156"),
+)
+# damping ratio, zeta c* at 2.5 Hz as printed (the paper's row is headed c*)
+PAPER_DAMPING = (
+    (0.005, "2.7597"),
+    (0.01, "5.5194"),
+    (0.025, "13.799"),
+    (0.05, "27.597"),
+    (0.10, "55.194"),
+    (0.20, "110.388"),
+)
+
+
+def stiffness_nmprad(frequency_hz: float, inertia_kgm2: float = PAPER_REDUCED_INERTIA_KGM2) -> float:
+    """Bending stiffness of a free-free frequency (seed paper eq. [7])."""
+    return float(inertia_kgm2 * (2.0 * np.pi * frequency_hz) ** 2)
+
+
+def damping_nmsprad(ratio: float, frequency_hz: float, inertia_kgm2: float = PAPER_REDUCED_INERTIA_KGM2) -> float:
+    """Damping that is a share of critical (seed paper eq. [8])."""
+    return float(ratio * 2.0 * np.sqrt(stiffness_nmprad(frequency_hz, inertia_kgm2) * inertia_kgm2))
+
+
+def reduced_inertia_kgm2(vehicle: Vehicle) -> float:
+    """Reduced transverse inertia of a vehicle about its joint."""
+    shell, body = vehicle.transverse_inertia_about_joint()
+    return shell * body / (shell + body)
+
+
+def _as_printed(value: Decimal, printed: str) -> str:
+    """Round to as many places as the paper prints, halves up."""
+    return str(value.quantize(Decimal(printed), ROUND_HALF_UP))
+
+
+def table_3_1(vehicle: Vehicle) -> pd.DataFrame:
+    """Table 3.1 as printed; as it follows from the paper's 693.6; by eqs. [7], [8], with its and the vehicle's inertia.
+
+    Columns ``study, frequency_hz, damping_percent, quantity, unit, paper, ours, agrees, equation, vehicle``; ``paper``
+    and ``ours`` are text, digit for digit.
+    """
+    own = reduced_inertia_kgm2(vehicle)
+    rows: list[tuple[str, float, float, str, str, str, str, float, float]] = []
+    for hz, stiffness, damping in PAPER_STIFFNESS:
+        k, c = Decimal(str(PAPER_STIFFNESS_OVER_HZ2)) * Decimal(str(hz)) ** 2, damping_nmsprad(STUDY_RATIO, hz)
+        for quantity, unit, printed, exact, value, theirs in (
+            ("K", "N m/rad", stiffness, k, stiffness_nmprad(hz), stiffness_nmprad(hz, own)),
+            ("0.5 % c*", "N m s/rad", damping, Decimal(repr(c)), c, damping_nmsprad(STUDY_RATIO, hz, own)),
+        ):
+            rounded = _as_printed(exact, printed)
+            rows.append(("stiffness", hz, 100 * STUDY_RATIO, quantity, unit, printed, rounded, value, theirs))
+    first = Decimal(_as_printed(Decimal(repr(damping_nmsprad(STUDY_RATIO, STUDY_HZ))), PAPER_DAMPING[0][1]))
+    for ratio, printed in PAPER_DAMPING:
+        rounded = _as_printed(first * Decimal(str(ratio)) / Decimal(str(STUDY_RATIO)), printed)
+        values = damping_nmsprad(ratio, STUDY_HZ), damping_nmsprad(ratio, STUDY_HZ, own)
+        rows.append(("damping", STUDY_HZ, 100 * ratio, "zeta c*", "N m s/rad", printed, rounded, *values))
+    columns = ["study", "frequency_hz", "damping_percent", "quantity", "unit", "paper", "ours", "equation", "vehicle"]
+    table = pd.DataFrame(rows, columns=columns)
+    table.insert(7, "agrees", table["ours"] == table["paper"])
+    return table

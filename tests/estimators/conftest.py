@@ -1,6 +1,6 @@
 import numpy as np
 
-from estimators.pulse import PulseData
+from estimators.loads import PulseData
 from estimators.trim import trim_model
 from flightmodel import rotations
 from flightmodel.deflection import lv_clock, rotation_vector_body_shell

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from estimators.camera_fit import GROSS_PX, JOINT, LAST_STEP_RAD, STEPS
-from estimators.seen import edge_seen, huber_gain, joined, marks_seen
+from estimators.camera_fit import GROSS_PX, JOINT, LAST_STEP_RAD, STEPS, edge_seen, huber_gain, joined, marks_seen
 from estimators.virtual_camera import BENDING, FLATTENING
 
 

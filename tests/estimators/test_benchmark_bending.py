@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.benchmark_bending import BenchmarkBending, ReadFrames, benchmark_bending, joint_moment
-from estimators.camera_deflection import read_film
+from estimators.benchmark import BenchmarkBending, ReadFrames, benchmark_bending, joint_moment
+from estimators.camera import read_film
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S, forgetful
 from flightmodel.checks import GateError
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film

@@ -10,19 +10,18 @@ import pytest
 
 import flightmodel
 from estimators.benchmark import orient_camera, with_bent_benchmark
-from estimators.camera_deflection import polar, read_film, sensitivity_table
-from estimators.camera_fit import REACH_PX
-from estimators.figures import figure_camera_overlay
-from estimators.horizon import HorizonLine, find_horizon
+from estimators.camera import polar, read_film, sensitivity_table
+from estimators.camera_fit import REACH_PX, found_marks
+from estimators.edge import HorizonLine, find_horizon
 from estimators.overlay import Overlay
-from estimators.seen import found_marks
 from estimators.virtual_camera import VirtualCamera
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
-from flightmodel.geometry import dot_positions
-from flightmodel.vehicle import CameraMount, ShellGeometry
-from synthetic_flight.video import render_video
+from flightmodel.geometry import ShellGeometry, dot_positions
+from flightmodel.vehicle import CameraMount
+from postflight.plots.deflection import figure_camera_overlay
+from synthetic_flight.film import render_video
 from tests.estimators.plain_fit import plain_fit
 
 TABLES = tomllib.loads((Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml").read_text())
@@ -312,8 +311,7 @@ def test_gates_name_what_is_wrong():
 
 def test_found_points_carry_the_sd_their_noise_gives_them():
     """One scene, many noises: scatter of each point against its stated sd, pooled chi-square."""
-    from synthetic_flight.shell_renderer import ShellRenderer
-    from synthetic_flight.video import Imaging, record
+    from synthetic_flight.film import Imaging, ShellRenderer, record
 
     camera = camera_from_mount(MOUNT)
     view = VirtualCamera(GEOMETRY, camera, JOINT_M)

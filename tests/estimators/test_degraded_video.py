@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from estimators.benchmark import orient_camera
-from estimators.camera_deflection import read_film
+from estimators.camera import read_film
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
 from flightmodel.vehicle import CameraUncertainty
-from synthetic_flight.video import Imaging, Scene, film
+from synthetic_flight.film import Imaging, Scene, film
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, sun
 
 UNCALIBRATED = MOUNT.model_copy(update={"uncertainty": CameraUncertainty(focal=0.2, centre_px=15.0, k1=0.05, k2=0.03)})

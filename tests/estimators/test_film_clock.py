@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from estimators import normal_equations
+from estimators import fusion
 from estimators.evidence import (
     FILM_CLOCK,
     LIGHT_TIME_S,
@@ -17,10 +17,10 @@ from estimators.evidence import (
     read_later,
 )
 from estimators.fusion import clock_is_seen, fuse, smoothed
-from estimators.pulse import carried
+from estimators.loads import carried
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
-from postflight.fused import FilmClock, fuse_flight
+from postflight.fusing import FilmClock, fuse_flight
 
 from .conftest import pulse_of
 
@@ -183,7 +183,7 @@ def test_a_late_film_that_leaves_no_common_answer_is_told_as_such():
 
 def test_the_smooth_history_errs_less_than_the_frames_and_says_how_much():
     normal, raw, smooth = [], [], []
-    noise = normal_equations.LEFT_OUT_RAD * np.sqrt(normal_equations.LEFT_OUT_TIME_S / 0.1)
+    noise = fusion.LEFT_OUT_RAD * np.sqrt(fusion.LEFT_OUT_TIME_S / 0.1)
     for seed in range(12):
         rng = np.random.default_rng(100 + seed)
         seen = camera(rng, 0.0, swing=0.0, sd=np.deg2rad(0.03))

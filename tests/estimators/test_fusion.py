@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from estimators import normal_equations
-from estimators.agreement import agreement, gross_gain
+from estimators import fusion
+from estimators.agreement import COEFFICIENTS, GROSS_MOUNT_RAD, MOUNT, OFFSET, agreement, gross_errors, gross_gain
 from estimators.evidence import (
     ACCELEROMETER,
     FORCE_CLOCK,
@@ -22,10 +22,8 @@ from estimators.evidence import (
     moved_vehicle,
     offset_sd_m,
 )
-from estimators.fusion import FarInputsError, fuse, pulse_reader
-from estimators.gross_errors import COEFFICIENTS, GROSS_MOUNT_RAD, MOUNT, OFFSET, gross_errors
+from estimators.fusion import FarInputsError, Learnt, fuse, pulse_reader
 from estimators.misalignment import misalignment_evidence
-from estimators.normal_equations import Learnt
 from estimators.trim import trim_evidence
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
@@ -70,17 +68,14 @@ def test_posterior_is_that_of_the_joint_gaussian():
     told = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"))]
     told = [replace(e, theta_yz_rad=bent() + 1e-3 * rng.normal(size=(N, 2))) for e in told]
     got = fuse(linear_reader(told))
-    spline = normal_equations.Spline.over(TIME_S[0], TIME_S[-1])
-    curvature = spline.rows(spline.knots_s, 2) / normal_equations.ACCELERATION_SD_RADPS2
-    prior = np.linalg.inv(curvature.T @ curvature + np.eye(spline.count) / normal_equations.SIZE_SD_RAD**2)
+    spline = fusion.Spline.over(TIME_S[0], TIME_S[-1])
+    curvature = spline.rows(spline.knots_s, 2) / fusion.ACCELERATION_SD_RADPS2
+    prior = np.linalg.inv(curvature.T @ curvature + np.eye(spline.count) / fusion.SIZE_SD_RAD**2)
     size = 2 * spline.count
     before = np.eye(size + 3)
     before[:size, :size] = np.kron(np.eye(2), prior)
     rows, want = zip(
-        *(
-            normal_equations.whitened(e, spline, {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}, {})
-            for e in told
-        ),
+        *(fusion.whitened(e, spline, {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}, {}) for e in told),
         strict=True,
     )
     rows, want = np.concatenate(rows), np.concatenate(want)
@@ -97,7 +92,7 @@ def test_posterior_is_that_of_the_joint_gaussian():
 
 def test_linear_readings_err_as_the_posterior_says(monkeypatch):
     """Normalised squares of the deflection's errors over draws are chi-squares; the equations leave nothing out."""
-    monkeypatch.setattr(normal_equations, "LEFT_OUT_RAD", 1e-5)
+    monkeypatch.setattr(fusion, "LEFT_OUT_RAD", 1e-5)
     rng = np.random.default_rng(1)
     template = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"), 2e-3)]
     truth, squares = bent(), []

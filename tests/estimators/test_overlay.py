@@ -10,7 +10,7 @@ import trimesh
 from estimators.overlay import Overlay, centerbody_pixels
 from estimators.virtual_camera import VirtualCamera
 from flightmodel.camera import camera_from_mount
-from flightmodel.meshes import BodyMesh, read_mesh
+from flightmodel.geometry import BodyMesh, read_mesh
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D
 from tests.flightmodel.meshes_of_vehicles import centerbody_mesh, shell_mesh
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from estimators.raster import render
+from estimators.virtual_camera import render
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.geometry import bend, vehicle_meshes
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.southwell import LEFT_OUT, southwell, southwell_limbs
-from estimators.static_trim import static_trim
-from estimators.trim import trim_angle_for_deflection, trim_model
+from estimators.trim import static_trim, trim_angle_for_deflection, trim_model
 from flightmodel.checks import DivergenceError, GateError
 from flightmodel.deflection import history_from_lateral
 

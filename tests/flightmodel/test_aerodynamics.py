@@ -7,7 +7,7 @@ import pytest
 import flightmodel
 from flightmodel.aerodynamics import read_aero_table
 from flightmodel.checks import GateError, TableRangeError
-from flightmodel.newtonian import sphere_cone_closed_form, sphere_cone_quadrature, stagnation_cp
+from flightmodel.sphere_cone import sphere_cone_closed_form, sphere_cone_quadrature, stagnation_cp
 
 FOLDER = Path(flightmodel.__file__).parent / "data" / "aerodynamics"
 SHAPE = (np.deg2rad(60.0), 0.38, 1.5, 3.0)

@@ -5,21 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flightmodel.aerodynamics import read_aero_table
-from flightmodel.aeroinput import (
+from flightmodel.aerodynamics import (
     Aerodynamics,
     Shape,
     Sidecar,
     SphereCone,
     aerodynamics_from,
+    read_aero_table,
+    read_daveml,
     read_with_sidecar,
     referred_to,
     table_from_sphere_cone,
 )
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.config import parse_section
-from flightmodel.daveml import read_daveml
-from flightmodel.newtonian import stagnation_cp
+from flightmodel.sphere_cone import stagnation_cp
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 
 from .test_aerodynamics import PRINTED

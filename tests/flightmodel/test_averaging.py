@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flightmodel.averaging import averaged
 from flightmodel.instruments import TriadSpec
+from flightmodel.sensor_tables import averaged
 from flightmodel.telemetry import TriadRecord
 
 SPEC = TriadSpec("rates", np.zeros(3), np.eye(3), 0.02, 0.0, 0.0, 0.0, resolution=0.004)

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from flightmodel import findings
-from flightmodel.findings import find_faults, runs, told
+from flightmodel import gate
+from flightmodel.gate import find_faults, runs, told
 
 
 @given(hnp.arrays(bool, st.integers(0, 40)))
@@ -51,7 +51,7 @@ def test_stuck_runs_are_those_that_one_would_count(column):
     assert [(f.what, f.start_s, f.end_s) for f in found] == wanted
 
 
-@pytest.mark.parametrize("count", [3, findings.MANY, findings.MANY + 1, 500])
+@pytest.mark.parametrize("count", [3, gate.MANY, gate.MANY + 1, 500])
 def test_of_very_many_the_longest_are_told_and_the_others_together(count):
     rng = np.random.default_rng(count)
     length = rng.integers(1, 40, size=count)
@@ -60,11 +60,11 @@ def test_of_very_many_the_longest_are_told_and_the_others_together(count):
     time_s = np.arange(last[-1] + 1) * 0.01
     found = told("s", time_s, first, last, lambda k: f"{length[k]} samples", "runs")
     alone = [f for f in found if "further" not in f.what]
-    assert len(alone) == min(count, findings.MANY)
+    assert len(alone) == min(count, gate.MANY)
     assert [f.start_s for f in alone] == sorted(f.start_s for f in alone)
     assert sorted(int(f.what.split()[0]) for f in alone) == sorted(length)[-len(alone) :]
-    if count > findings.MANY:
-        others = sorted(length)[: -findings.MANY]
+    if count > gate.MANY:
+        others = sorted(length)[: -gate.MANY]
         words = f"{len(others)} further runs, {sum(others)} samples, at most {others[-1]} in a row"
         assert found[-1].what == words
     else:
@@ -76,6 +76,6 @@ def test_a_table_full_of_holes_gives_a_list_that_one_can_read():
     values = rng.normal(size=(20000, 3))
     values[rng.random(values.shape) < 0.05] = np.nan
     found = find_faults("sensor", np.arange(20000) * 0.01, ("x", "y", "z"), values)
-    assert len(found) == findings.MANY + 1
+    assert len(found) == gate.MANY + 1
     samples = sum(int(f.what.split()[0]) for f in found[:-1]) + int(found[-1].what.split("runs, ")[1].split()[0])
     assert samples == np.isnan(values).any(axis=1).sum()

@@ -8,8 +8,8 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import height_from_pressure, profile_from_sounding, standard_sounding, us76
 from flightmodel.checks import ConfigError, GateError
+from flightmodel.earth import q_ecef_body_from_pointing
 from flightmodel.flightfolder import read_flight
-from flightmodel.pointing import q_ecef_body_from_pointing
 
 DEG = np.pi / 180.0
 HEAD = 'name = "small"\nt0_utc = "2022-06-24T15:17:17.5Z"\n'

@@ -10,7 +10,7 @@ import flightmodel
 from flightmodel import geometry as shell
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
-from flightmodel.vehicle import ShellGeometry
+from flightmodel.geometry import ShellGeometry
 
 TOML = Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml"
 D = np.deg2rad

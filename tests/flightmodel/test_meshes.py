@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from flightmodel.checks import ConfigError, GateError
-from flightmodel.meshes import LARGEST_BYTES, BodyMesh, encloses, read_mesh, rim_circle
+from flightmodel.geometry import LARGEST_BYTES, BodyMesh, encloses, read_mesh, rim_circle
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from tests.flightmodel.meshes_of_vehicles import as_drawn, centerbody_mesh, shell_mesh
 

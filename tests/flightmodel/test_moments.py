@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flightmodel.moments import descent_moments, first_fall, has_peak, peak, values_at
+from flightmodel.events import descent_moments, first_fall, has_peak, peak, values_at
 
 T = np.arange(0.0, 40.0, 0.5)
 

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flightmodel import _csv_kernels as kernels
-from flightmodel import columns, quickread
-from flightmodel.columns import TimeColumn
-from flightmodel.quickread import read_numbers
+from flightmodel import csv_reading
+from flightmodel.checks import GateError
+from flightmodel.csv_reading import read_numbers
+from flightmodel.tables import TimeColumn, numbers, read_table, times_s, unordered_times_s
 
 ROOT = Path(__file__).parents[2]
 T0 = datetime(2009, 8, 17, 12, 52, tzinfo=UTC)
@@ -25,16 +26,16 @@ TABLES = (kernels.EXACT_TENS, *kernels.powers_of_five())
 @pytest.fixture(autouse=True)
 def every_file_is_large(monkeypatch):
     """The limit spares small files the loading of compiled code; here all go the quick way, in pieces of their own."""
-    monkeypatch.setattr(quickread, "SMALLEST_BYTES", 0)
-    monkeypatch.setattr(quickread, "PIECE_BYTES", 997)
+    monkeypatch.setattr(csv_reading, "SMALLEST_BYTES", 0)
+    monkeypatch.setattr(csv_reading, "PIECE_BYTES", 997)
     monkeypatch.setenv("POSTFLIGHT_CACHE", "off")
 
 
 def carefully(path, names):
     """Columns as the careful reader has them, its lines, and its faults."""
     faults = []
-    frame = columns.read_table(path, "label")
-    return {n: columns.numbers(frame, n, path, "label", faults) for n in names}, frame.attrs["lines"], faults
+    frame = read_table(path, "label")
+    return {n: numbers(frame, n, path, "label", faults) for n in names}, frame.attrs["lines"], faults
 
 
 def same_bits(a, b):
@@ -122,10 +123,10 @@ def test_anything_else_is_left_to_the_careful_reader(text):
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda p: str(p.relative_to(ROOT)))
 def test_shipped_tables_are_equal_to_the_bit(path):
-    frame, names = columns.read_table(path, "label"), []
+    frame, names = read_table(path, "label"), []
     for name in frame.columns:
         faults = []
-        columns.numbers(frame, name, path, "label", faults)
+        numbers(frame, name, path, "label", faults)
         names += [] if faults else [name]
     quick = read_numbers(path, dict.fromkeys(names, True))
     assert quick is not None
@@ -163,7 +164,7 @@ def test_any_table_is_read_alike_or_left_alone(data, tmp_path_factory):
     quick = read_numbers(path, dict.fromkeys(asked, True))
     try:
         wanted, lines, faults = carefully(path, asked)
-    except columns.GateError:
+    except GateError:
         assert quick is None
         return
     if quick is None:
@@ -180,8 +181,8 @@ def test_an_open_quote_is_refused_with_its_line(tmp_path):
     path = tmp_path / "t.csv"
     for rows in (["1,2", '3,"4', "5,6"], ["1,2", '3,"4'], ["1,2", '3,"4', '5",6']):
         path.write_text("\n".join(["a,b", *rows]))
-        with pytest.raises(columns.GateError, match="line 3: a quote opens"):
-            columns.read_table(path, "label")
+        with pytest.raises(GateError, match="line 3: a quote opens"):
+            read_table(path, "label")
         assert read_numbers(path, {"a": True}) is None
 
 
@@ -262,9 +263,9 @@ def test_clock_times_are_those_of_the_careful_reader(tmp_path, form, written):
     time = TimeColumn("clock", form)
     read = read_numbers(path, {"a": True}, time, T0)
     faults = []
-    wanted = columns.times_s(columns.read_table(path, "x"), time, T0, path, "x", faults)
+    wanted = times_s(read_table(path, "x"), time, T0, path, "x", faults)
     if wanted is None:  # whole seconds only, so that times repeat
-        wanted = columns.unordered_times_s(columns.read_table(path, "x"), time, T0, path, "x", [])
+        wanted = unordered_times_s(read_table(path, "x"), time, T0, path, "x", [])
     same_bits(read.time, wanted)
     np.testing.assert_allclose(read.time, seconds, atol=1.0)
 
@@ -280,7 +281,7 @@ def test_a_time_that_does_not_exist_is_left_to_the_careful_reader(tmp_path, cell
 
 
 def test_day_366_and_new_year_in_either_reader():
-    from flightmodel.clocktimes import clock_times
+    from flightmodel.tables import clock_times
 
     eve = datetime(2008, 12, 31, 23, 52, 57, tzinfo=UTC)
     cells = ["366:23:59:59.500", "001:00:00:00.250", "1:00:00:01", "365:23:52:57.0", "366:24:00:00.0", "000:12:00:00.0"]
@@ -294,9 +295,8 @@ def test_day_366_and_new_year_in_either_reader():
 
 
 def test_at_the_gate_both_ways_give_the_same_table(tmp_path, monkeypatch):
-    from flightmodel.columns import ACCELEROMETER
-    from flightmodel.flightfile import Source
     from flightmodel.gate import Gate
+    from flightmodel.tables import ACCELEROMETER, Source
 
     rng = np.random.default_rng(3)
     rows = [f"{1e3 * k + 0.1:.1f},{x:.5f},,{z:.3f},-0.0" for k, (x, z) in enumerate(rng.normal(size=(400, 2)))]
@@ -306,7 +306,7 @@ def test_at_the_gate_both_ways_give_the_same_table(tmp_path, monkeypatch):
     )
     tables = []
     for smallest in (0, 10**9):
-        monkeypatch.setattr(quickread, "SMALLEST_BYTES", smallest)
+        monkeypatch.setattr(csv_reading, "SMALLEST_BYTES", smallest)
         gate = Gate(tmp_path, T0)
         tables.append(gate.table("sensors.accelerometer", source, ACCELEROMETER))
         assert (tmp_path / "t.csv" in gate.digests) == (smallest == 0)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from flightmodel.aeroinput import Aerodynamics, FreeMolecular, Shape, SphereCone, aerodynamics_from
+from flightmodel.aerodynamics import Aerodynamics, FreeMolecular, Shape, SphereCone, aerodynamics_from
 from flightmodel.atmosphere import us76
-from flightmodel.rarefied import bridge, knudsen, mean_free_path, sphere_cone_free_molecular, wall_speed_ratio
+from flightmodel.sphere_cone import bridge, knudsen, mean_free_path, sphere_cone_free_molecular, wall_speed_ratio
 
 ALPHA = np.deg2rad(np.array([0.0, 4.0, 17.0, 45.0, 70.0]))
 

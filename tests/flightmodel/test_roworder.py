@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flightmodel.roworder import FEW, in_order
+from flightmodel.gate import FEW, in_order
 
 STEP_S = 0.01
 

@@ -10,9 +10,9 @@ import time
 import numpy as np
 import pytest
 
-from flightmodel import quickread, tablecache
-from flightmodel.columns import TimeColumn
-from flightmodel.quickread import read_numbers
+from flightmodel import csv_reading
+from flightmodel.csv_reading import read_numbers
+from flightmodel.tables import TimeColumn
 
 WANTED = {"a": True, "b": False}
 
@@ -22,8 +22,8 @@ def cache(tmp_path, monkeypatch):
     """A cache of its own, which takes small files too."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("POSTFLIGHT_CACHE", raising=False)
-    monkeypatch.setattr(quickread, "SMALLEST_BYTES", 0)
-    monkeypatch.setattr(quickread, "CACHED_BYTES", 0)
+    monkeypatch.setattr(csv_reading, "SMALLEST_BYTES", 0)
+    monkeypatch.setattr(csv_reading, "CACHED_BYTES", 0)
     return tmp_path / "cache" / "postflight" / "tables"
 
 
@@ -38,8 +38,8 @@ def table(tmp_path):
 def parses(monkeypatch):
     """How often a file was read and not found in the cache."""
     count = []
-    parse = quickread._parse
-    monkeypatch.setattr(quickread, "_parse", lambda *arguments: count.append(1) or parse(*arguments))
+    parse = csv_reading._parse
+    monkeypatch.setattr(csv_reading, "_parse", lambda *arguments: count.append(1) or parse(*arguments))
     return count
 
 
@@ -132,7 +132,7 @@ def test_it_can_be_turned_off(cache, table, parses, monkeypatch, word):
 
 
 def test_small_files_are_not_kept(cache, table, monkeypatch):
-    monkeypatch.setattr(quickread, "CACHED_BYTES", table.stat().st_size + 1)
+    monkeypatch.setattr(csv_reading, "CACHED_BYTES", table.stat().st_size + 1)
     read(table)
     assert not cache.exists()
 
@@ -146,7 +146,7 @@ def test_it_stays_within_its_limit_and_the_longest_unused_goes(cache, table, mon
     read(table)
     (kept,) = cache.iterdir()
     size = kept.stat().st_size
-    monkeypatch.setattr(tablecache, "LIMIT_BYTES", int(3.5 * size))
+    monkeypatch.setattr(csv_reading, "LIMIT_BYTES", int(3.5 * size))
     names = []
     for k in range(3):
         path = table.with_name(f"{k}.csv")
@@ -179,7 +179,7 @@ def test_what_a_killed_process_left_is_swept_up(cache, table):
 
 
 def test_a_block_beyond_half_the_limit_is_not_kept(cache, table, monkeypatch):
-    monkeypatch.setattr(tablecache, "LIMIT_BYTES", 1000)
+    monkeypatch.setattr(csv_reading, "LIMIT_BYTES", 1000)
     read(table)
     assert not cache.exists()
 

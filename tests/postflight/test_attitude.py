@@ -9,10 +9,11 @@ import pytest
 
 from flightmodel import earth, rotations
 from postflight.attitude import attitude_table, check_attitude
-from postflight.pipeline import flight_from
-from postflight.results import attitude_summary
-from recon.bet import Settings, reconstruct_once
-from recon.suspects import suspects
+from postflight.flight import flight_from
+from postflight.run_folder import attitude_summary
+from recon.fault_isolation import suspects
+from recon.reconstruct import reconstruct_once
+from recon.settings import Settings
 
 SETTINGS = Settings(output_rate_hz=10.0)
 

@@ -11,9 +11,9 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
+from postflight.checks import folder_check
+from postflight.checks.folder_check import Fact, Report, check_folder
 from postflight.cli import cli
-from postflight.intake import check_command
-from postflight.intake.check import Fact, Report, check_folder
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "examples" / "range_package_01"
@@ -304,10 +304,10 @@ def test_gap_duplicates_out_of_order_frozen_and_saturated(folder):
 @pytest.mark.parametrize("radar", ["WALLOPS_MAINLAND_TWO", "a_name_of_nearly_as_many_letters_as_a_name_may_have_64"])
 def test_sensors_names_are_shown_whole(radar, monkeypatch, capsys):
     fact = Fact(radar, f"telemetry/{radar}_and_more.csv", 2300, 300.0, 530.0, 10.0, 0)
-    for width in (80, check_command.WIDE):
+    for width in (80, folder_check.WIDE):
         screen = Console(soft_wrap=True, width=width, color_system=None)
-        monkeypatch.setattr(check_command, "console", screen)
-        check_command.print_report(Report(facts=[fact]))
+        monkeypatch.setattr(folder_check, "console", screen)
+        folder_check.print_report(Report(facts=[fact]))
         rows = [line.split("│")[1].strip() for line in capsys.readouterr().out.splitlines() if "│" in line]
         assert "".join(rows) == radar
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from flightmodel.checks import GateError, writing
-from postflight.results import PARTIAL, remove_abandoned
+from postflight.run_folder import PARTIAL, remove_abandoned
 from tests.postflight.killing import kill_run, run_again
 
 HEAVY = {"numpy", "scipy", "numba", "matplotlib", "cv2", "trimesh", "filterpy", "pandas", "ppigrf", "erfa"}

@@ -10,11 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 from flightmodel.checks import ConfigError, GateError
-from postflight import results
+from postflight import exports, run_folder
 from postflight.cli import cli
-from postflight.exports import export_command
-from postflight.exports.source import read_source
-from postflight.pipeline import Answers, reconstruct_flight
+from postflight.exports import read_source
+from postflight.flight import Answers, reconstruct_flight
 
 FLIGHT = Path(__file__).parents[1] / "data" / "real_flights" / "rocketpy_prometheus"
 KML = "{http://www.opengis.net/kml/2.2}"
@@ -27,9 +26,9 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("exports") / "flight"
     shutil.copytree(FLIGHT, folder)
     flight = reconstruct_flight(folder)
-    with results.RunFolder(folder, flight.telemetry, {}) as out:
-        results.write_reconstruction(out, flight)
-        out.write_json("summary.json", results.summary(flight, Answers()))
+    with run_folder.RunFolder(folder, flight.telemetry, {}) as out:
+        run_folder.write_reconstruction(out, flight)
+        out.write_json("summary.json", run_folder.summary(flight, Answers()))
     (run,) = (folder / "runs").iterdir()
     t = np.arange(20.0, 26.0, 0.11)
     t = t[(t < 22.0) | (t > 24.0)]
@@ -139,7 +138,7 @@ def test_names_stay_text_in_kml(folder, tmp_path):
     etree = pytest.importorskip("lxml.etree")
     from dataclasses import replace
 
-    from postflight.exports.kml import kml_bytes
+    from postflight.exports import kml_bytes
 
     source = replace(read_source(folder), name="<script>alert(1)</script> & \x00")
     root = etree.fromstring(kml_bytes(source))
@@ -168,7 +167,7 @@ def test_oem_by_another_reader(written, run_table):
 @pytest.mark.parametrize("form", ["csv", "parquet", "mat", "nc", "kml", "oem"])
 def test_the_same_run_gives_the_same_bytes(form, folder):
     source = read_source(folder)
-    assert export_command.FORMS[form](source) == export_command.FORMS[form](read_source(folder))
+    assert exports.FORMS[form](source) == exports.FORMS[form](read_source(folder))
 
 
 def test_missing_extra_is_said_with_the_command(folder, monkeypatch):
@@ -181,16 +180,16 @@ def test_missing_extra_is_said_with_the_command(folder, monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ConfigError, match=r"pip install 'postflight\[parquet\]'") as fault:
-        export_command.export(folder, "parquet", None)
+        exports.export(folder, "parquet", None)
     assert fault.value.exit_code == 2
     assert not (folder / "exports").exists()
 
 
 def test_flight_without_a_run_is_refused(tmp_path):
     with pytest.raises(GateError, match="no finished run"):
-        export_command.export(tmp_path, "csv", None)
+        exports.export(tmp_path, "csv", None)
 
 
 def test_run_folders_stay_as_they_are(folder):
     with pytest.raises(ConfigError, match="stay as they were"):
-        export_command.export(folder, "csv", folder / "runs" / "x.csv")
+        exports.export(folder, "csv", folder / "runs" / "x.csv")

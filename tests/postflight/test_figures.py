@@ -10,11 +10,12 @@ import pytest
 from flightmodel.telemetry import Motion
 from flightmodel.trajectory import difference
 from postflight.attitude import check_attitude
-from postflight.figures import figure_residuals, save
-from postflight.pipeline import flight_from
-from postflight.product.figures import figure_attitude, figure_filter_and_smoother, figure_sensitivity
+from postflight.flight import flight_from
+from postflight.plots.paper_figures import figure_residuals, save
+from postflight.plots.trajectory import figure_attitude, figure_filter_and_smoother, figure_sensitivity
 from postflight.sensitivity import sensitivity
-from recon.bet import Settings, reconstruct_once
+from recon.reconstruct import reconstruct_once
+from recon.settings import Settings
 
 
 @pytest.fixture(scope="module")

@@ -296,13 +296,17 @@ def test_recorded_flights_are_recognised_as_their_flight_file_has_them(name, fol
 
 def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
     from flightmodel.checks import GateError
-    from postflight.intake.clock_columns import split_clocks
-    from postflight.intake.coefficients import as_coefficients, coefficient_columns, sidecar_text
-    from postflight.intake.loose import read_loose
-    from postflight.intake.pictures import Video, frame_list
-    from postflight.intake.propose import Reader
-    from postflight.intake.sounding_tables import radiosonde_table
-    from postflight.intake.write_mapping import section_text
+    from postflight.intake.deliveries import (
+        Video,
+        as_coefficients,
+        coefficient_columns,
+        frame_list,
+        radiosonde_table,
+        sidecar_text,
+    )
+    from postflight.intake.flight_form import section_text
+    from postflight.intake.propose import Reader, split_clocks
+    from postflight.intake.read_table import read_loose
 
     rng = np.random.default_rng(7)
     whole = [b"\n".join((PACKAGE / name).read_bytes().split(b"\n")[:30]) for name in ("rates.csv", "met_composite.csv")]

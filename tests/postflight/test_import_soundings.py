@@ -11,9 +11,9 @@ import pytest
 from click.testing import CliRunner
 
 from flightmodel.config import parse_utc
-from flightmodel.flightfile import AtmosphereEntry
 from flightmodel.gate import Gate
-from flightmodel.sounding import read_sounding
+from flightmodel.instruments import AtmosphereEntry
+from flightmodel.sensor_tables import read_sounding
 from postflight.cli import cli
 
 REAL = os.environ.get("POSTFLIGHT_REALDATA")

@@ -10,9 +10,10 @@ import pytest
 from click.testing import CliRunner
 from pydantic import BaseModel
 
-from flightmodel import aeroinput, flightfile, instrument_entries, meshes, sources, vehicle
+from flightmodel import aerodynamics, flightfile, geometry, instruments, vehicle
+from flightmodel.tables import Source
 from postflight.cli import cli
-from postflight.intake.schema import MODELS, schema, template, template_keys
+from postflight.intake.flight_form import MODELS, schema, template, template_keys
 
 ROOT = Path(__file__).parents[2]
 TABLES = {
@@ -21,15 +22,15 @@ TABLES = {
         "attitude_prior": flightfile.AttitudeEntry,
         "motion": flightfile.MotionEntry,
         "motion.disturbed": flightfile.DisturbedEntry,
-        "sensors.accelerometer": instrument_entries.TriadEntry,
-        "sensors.rates": instrument_entries.RatesEntry,
-        "sensors.magnetometer": instrument_entries.MagnetometerEntry,
-        "sensors.sun": instrument_entries.SunEntry,
-        "radars.NAME": instrument_entries.RadarEntry,
-        "gnss.NAME": instrument_entries.GnssEntry,
-        "barometers.NAME": instrument_entries.BarometerEntry,
-        "atmosphere": instrument_entries.AtmosphereEntry,
-        "frames": instrument_entries.FramesEntry,
+        "sensors.accelerometer": instruments.TriadEntry,
+        "sensors.rates": instruments.RatesEntry,
+        "sensors.magnetometer": instruments.MagnetometerEntry,
+        "sensors.sun": instruments.SunEntry,
+        "radars.NAME": instruments.RadarEntry,
+        "gnss.NAME": instruments.GnssEntry,
+        "barometers.NAME": instruments.BarometerEntry,
+        "atmosphere": instruments.AtmosphereEntry,
+        "frames": instruments.FramesEntry,
         "events": flightfile.EventEntry,
     },
     "vehicle": {
@@ -39,13 +40,13 @@ TABLES = {
         "aeroshell": vehicle.MassProperties,
         "centerbody": vehicle.MassProperties,
         "uncertainty": vehicle.Uncertainty,
-        "aerodynamics": aeroinput.Aerodynamics,
-        "aerodynamics.sphere_cone": aeroinput.SphereCone,
-        "aerodynamics.free_molecular": aeroinput.FreeMolecular,
+        "aerodynamics": aerodynamics.Aerodynamics,
+        "aerodynamics.sphere_cone": aerodynamics.SphereCone,
+        "aerodynamics.free_molecular": aerodynamics.FreeMolecular,
         "geometry": vehicle.ShellGeometry,
-        "meshes": meshes.MeshFiles,
-        "meshes.aeroshell": meshes.MeshFile,
-        "meshes.centerbody": meshes.MeshFile,
+        "meshes": geometry.MeshFiles,
+        "meshes.aeroshell": geometry.MeshFile,
+        "meshes.centerbody": geometry.MeshFile,
         "sensors.suba": vehicle.SensorMount,
         "cameras.camera5": vehicle.CameraMount,
         "cameras.camera5.uncertainty": vehicle.CameraUncertainty,
@@ -66,7 +67,7 @@ def test_template_names_every_key_with_its_default(kind, table):
     below = {
         t.split(".")[len(table.split(".")) if table else 0] for t in TABLES[kind] if t != table and t.startswith(table)
     }
-    shared = EVERY_TABLE | {"position_from_datum_body_m", "axes"} if issubclass(model, sources.Source) else set()
+    shared = EVERY_TABLE | {"position_from_datum_body_m", "axes"} if issubclass(model, Source) else set()
     missing = set(model.model_fields) - set(lines) - below - shared
     assert not missing
     assert set(lines) <= set(model.model_fields)

@@ -11,10 +11,9 @@ from flightmodel.checks import ConfigError
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.reconciliation import posterior
 from postflight.reconciliation.candidate import FREEPLAY_SD_RAD, KNOT_M, UPPER_M, AirUnknowns, VehicleUnknowns
-from postflight.reconciliation.freeplay import loosened
+from postflight.reconciliation.fit import loosened
 from postflight.reconciliation.posterior import quantities
-from postflight.reconciliation.problem import Unknowns
-from postflight.reconciliation.spans import BENDING, MOTION
+from postflight.reconciliation.problem import BENDING, MOTION, Unknowns
 from synthetic_flight.dynamics import beyond_freeplay
 
 TOLD = vehicle_from_toml(vehicle_path("irve2_reference"))

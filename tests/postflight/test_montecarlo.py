@@ -15,12 +15,20 @@ from scipy.stats import binom
 
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.vehicle import DATA
-from postflight.montecarlo import commands, execution, intervals, running, whole
-from postflight.montecarlo.chunks import PARTIAL, chunk_path, read_chunk
-from postflight.montecarlo.merge import coverage, merge, write_merged
-from postflight.montecarlo.running import Wanted, status, study_of
+from postflight.montecarlo import commands, execution, trial
+from postflight.montecarlo.bands import (
+    PARTIAL,
+    chunk_path,
+    coverage,
+    is_narrow,
+    merge,
+    percentile_interval,
+    read_chunk,
+    write_merged,
+)
+from postflight.montecarlo.execution import Wanted, status, study_of
 from postflight.montecarlo.study import Stop, read_study
-from synthetic_flight import dispersed_ensemble
+from synthetic_flight import ensemble
 
 from .short_flights import DISPERSIONS, ENTRY, write_short
 
@@ -34,7 +42,7 @@ def quiet(_fraction, _words):
 
 def fly(path, folder, flights=FLIGHTS, **wanted):
     study = read_study(str(path))
-    count = running.run(study, folder, Wanted(flights, **wanted), quiet)
+    count = execution.run(study, folder, Wanted(flights, **wanted), quiet)
     write_merged(folder, merge(study, folder, count))
     return study
 
@@ -80,7 +88,7 @@ def test_two_processes_make_the_same_bytes(reference, path, tmp_path):
 
 
 def test_bands_in_slabs_are_the_same(reference, path, tmp_path, monkeypatch):
-    monkeypatch.setattr("postflight.montecarlo.merge.BAND_BYTES", 7 * 4 * FLIGHTS * 2)
+    monkeypatch.setattr("postflight.montecarlo.bands.BAND_BYTES", 7 * 4 * FLIGHTS * 2)
     fly(path, tmp_path / "study")
     assert content(tmp_path / "study") == reference
 
@@ -235,7 +243,7 @@ def test_wrong_files_are_refused(tmp_path, old, new, words):
 
 
 def test_a_failed_flight_is_a_row_and_can_be_flown_again(reference, path, tmp_path, monkeypatch):
-    folder, case = tmp_path / "study", dispersed_ensemble.dispersed_case
+    folder, case = tmp_path / "study", ensemble.dispersed_case
     seen = iter(range(FLIGHTS))
 
     def unlucky(*arguments):
@@ -245,7 +253,7 @@ def test_a_failed_flight_is_a_row_and_can_be_flown_again(reference, path, tmp_pa
             raise ZeroDivisionError("a defect")
         return case(*arguments)
 
-    monkeypatch.setattr(dispersed_ensemble, "dispersed_case", unlucky)
+    monkeypatch.setattr(ensemble, "dispersed_case", unlucky)
     fly(path, folder)
     found = status(folder)
     assert found.failed == {"out of luck": 2, "ZeroDivisionError: a defect": 1}
@@ -254,9 +262,9 @@ def test_a_failed_flight_is_a_row_and_can_be_flown_again(reference, path, tmp_pa
     assert table.loc[5, "peak_deflection_deg"] != table.loc[5, "peak_deflection_deg"]
     assert json.loads((folder / "summary.json").read_text())["failed"] == 3
     assert (pd.read_csv(folder / "percentiles.csv")["flights"] == FLIGHTS - 3).all()
-    monkeypatch.setattr(dispersed_ensemble, "dispersed_case", case)
+    monkeypatch.setattr(ensemble, "dispersed_case", case)
     study, flights = study_of(folder)
-    assert running.retry_failed(study, folder, Wanted(flights), quiet) == (3, 0)
+    assert execution.retry_failed(study, folder, Wanted(flights), quiet) == (3, 0)
     write_merged(folder, merge(study, folder, flights))
     assert content(folder) == reference
 
@@ -285,7 +293,7 @@ def test_a_wrong_width_is_refused(path, tmp_path, text, words):
 def test_intervals_cover_as_order_statistics_say():
     """Against the exact binomial coverage of the ranks, and by drawing."""
     n, percentile, confidence = 300, 97.7, 0.95
-    low, high = intervals.percentile_interval(np.arange(1.0, n + 1.0), percentile, confidence)
+    low, high = percentile_interval(np.arange(1.0, n + 1.0), percentile, confidence)
     below = binom(n, percentile / 100.0)
     exact = below.cdf(high - 1) - below.cdf(low - 1)  # the low-th smallest <= q < the high-th
     assert confidence <= exact < 0.98
@@ -294,7 +302,7 @@ def test_intervals_cover_as_order_statistics_say():
     truth = -np.log(1.0 - percentile / 100.0)
     held = np.mean((draws[:, int(low) - 1] <= truth) & (truth <= draws[:, int(high) - 1]))
     assert abs(held - exact) < 4.0 * np.sqrt(exact * (1.0 - exact) / rounds)
-    assert np.isnan(intervals.percentile_interval(np.arange(20.0), percentile, confidence)[1])
+    assert np.isnan(percentile_interval(np.arange(20.0), percentile, confidence)[1])
 
 
 def test_the_stop_rule_stops_at_the_same_flight_on_any_workers(path, tmp_path):
@@ -307,10 +315,10 @@ def test_the_stop_rule_stops_at_the_same_flight_on_any_workers(path, tmp_path):
     assert 8 <= flights < 200
     assert flights % 4 == 0
     values = pd.read_csv(tmp_path / "one" / "flights.csv")["peak_deflection_deg"].to_numpy()
-    assert intervals.is_narrow(values, 50.0, 0.95, 0.05)
-    assert not intervals.is_narrow(values[:-4], 50.0, 0.95, 0.05)
+    assert is_narrow(values, 50.0, 0.95, 0.05)
+    assert not is_narrow(values[:-4], 50.0, 0.95, 0.05)
     # asked again: nothing to fly
-    assert running.run(one, tmp_path / "one", Wanted(200, stop=stop), quiet) == flights
+    assert execution.run(one, tmp_path / "one", Wanted(200, stop=stop), quiet) == flights
 
 
 def test_chunks_that_come_out_of_order_do_not_stop_it_earlier(path, tmp_path):
@@ -318,7 +326,7 @@ def test_chunks_that_come_out_of_order_do_not_stop_it_earlier(path, tmp_path):
     study = read_study(str(path))
     chunks = [read_chunk(tmp_path / "study", k) for k in range(6)]
     stop = Stop(output="peak_deflection_deg", width=1e9, percentile=50.0)
-    enough = running._Enough(study, stop, FLIGHTS)
+    enough = execution._Enough(study, stop, FLIGHTS)
     assert not enough.add(3, chunks[3])
     assert not enough.add(1, chunks[1])
     assert enough.add(0, chunks[0]) or enough.add(2, chunks[2])
@@ -351,12 +359,12 @@ def test_a_whole_trial_recovers_its_truth(tmp_path):
     shipped = (DATA / "dispersions" / "irve2_whole.toml").read_text()
     text = shipped.replace('scenario = "irve2_reference"', 'scenario = "short.toml"')
     study = read_study(str(write_short(tmp_path, text, ENTRY)))
-    rows = whole.fly_whole(replace(study.plan, scalars=whole.SCALARS), 3, [1])
+    rows = trial.fly_whole(replace(study.plan, scalars=trial.SCALARS), 3, [1])
     found = rows[0].scalars
     assert rows[0].reason == ""
-    assert np.isfinite([found[name] for name in whole.SCALARS]).all()
+    assert np.isfinite([found[name] for name in trial.SCALARS]).all()
     assert found["truth_deg"] > 1.0
-    for method in whole.METHODS:
+    for method in trial.METHODS:
         # one flight: within four of its own standard deviations
         assert abs(found[f"{method}_error_deg"]) < 4.0 * found[f"{method}_sd_deg"]
     assert found["bet_position_m"] < 100.0

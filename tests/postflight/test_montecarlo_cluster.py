@@ -11,10 +11,9 @@ import pandas as pd
 import pytest
 
 from flightmodel.checks import ConfigError
-from postflight.montecarlo import execution, running
-from postflight.montecarlo.chunks import chunk_from_rows
-from postflight.montecarlo.merge import merge, write_merged
-from postflight.montecarlo.running import Wanted
+from postflight.montecarlo import execution
+from postflight.montecarlo.bands import chunk_from_rows, merge, write_merged
+from postflight.montecarlo.execution import Wanted
 from postflight.montecarlo.study import read_study
 from tests.documents import ROOT
 
@@ -61,8 +60,8 @@ def test_a_killed_worker_costs_its_chunk_only(reference, path, cluster, tmp_path
                     os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
             yield number, chunk
 
-    monkeypatch.setattr(running, "fly_jobs", killing)
-    count = running.run(study, folder, Wanted(FLIGHTS, scheduler=cluster.scheduler_address), quiet)
+    monkeypatch.setattr(execution, "fly_jobs", killing)
+    count = execution.run(study, folder, Wanted(FLIGHTS, scheduler=cluster.scheduler_address), quiet)
     write_merged(folder, merge(study, folder, count))
     assert content(folder) == reference
     # every chunk came once: what the dead worker had was flown again by others, the rest was not

@@ -6,10 +6,8 @@ import pytest
 from scipy.stats import sobol_indices
 
 from flightmodel.checks import ConfigError, GateError
-from postflight.montecarlo import commands, running
-from postflight.montecarlo.design import design_for
-from postflight.montecarlo.sobol import indices
-from postflight.montecarlo.study import read_study, sobol_study
+from postflight.montecarlo import commands, execution
+from postflight.montecarlo.study import design_for, indices, read_study, sobol_study
 
 from .short_flights import write_short
 
@@ -99,9 +97,9 @@ def test_a_study_of_flights(tmp_path):
     assert set(table["output"]) == {"peak_deflection_deg", "peak_normal_g", "deflection_deg_at_peak_pressure"}
     assert (tmp_path / "study" / "sobol.png").stat().st_size > 5000
     # runs of the design that differ in one section alone
-    study, flights = running.study_of(tmp_path / "study")
+    study, flights = execution.study_of(tmp_path / "study")
     assert flights == 16 * 7
     a, mixed = study.draws_of(3), study.draws_of(2 * 16 + 3)
     assert {name.split(".")[0] for name in a if a[name] != mixed[name]} == {"initial"}
     with pytest.raises(ConfigError, match=r"'sobol\.base' is 16 there, 32 now"):
-        running.begin(sobol_study(read_study(str(path)), "section", 32), tmp_path / "study", 224)
+        execution.begin(sobol_study(read_study(str(path)), "section", 32), tmp_path / "study", 224)

@@ -13,8 +13,8 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.trajectory import Trajectory
-from postflight.pipeline import reconstruct_flight
-from postflight.product import header, kinematics, tables, trajectory_table
+from postflight import kinematics, product
+from postflight.flight import reconstruct_flight
 
 DOCS = Path(__file__).parents[2] / "docs" / "bet-product.md"
 
@@ -23,7 +23,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "bet-product.md"
 def short(clean_flight):
     """The hand-made flight: ten seconds, no physics asked."""
     flight = reconstruct_flight(clean_flight.root)
-    return flight, trajectory_table.bet_table(flight)
+    return flight, product.bet_table(flight)
 
 
 def documented() -> list[str]:
@@ -110,7 +110,7 @@ def test_standard_deviations_are_the_scatter_of_drawn_errors() -> None:
 
 
 def test_header_says_what_the_numbers_refer_to(short) -> None:
-    head = json.loads(json.dumps(header.header(short[0])))
+    head = json.loads(json.dumps(product.header(short[0])))
     assert head["epoch_utc"] == "2009-08-17T12:52:00Z"
     assert head["vehicle"]["reference_area_m2"] == pytest.approx(7.0686)
     assert head["vehicle"]["mass_kg"] == pytest.approx(155.0)
@@ -122,7 +122,7 @@ def test_header_says_what_the_numbers_refer_to(short) -> None:
 
 def test_events_carry_three_standard_deviations(short) -> None:
     flight, table = short
-    events = tables.event_table(flight, table)
+    events = product.event_table(flight, table)
     row = events.iloc[0]
     k = int((table.t_s - row.t_s).abs().argmin())
     assert row.alt_3sd_m == pytest.approx(3.0 * table.alt_sd_m[k], rel=0.05)
@@ -131,7 +131,7 @@ def test_events_carry_three_standard_deviations(short) -> None:
 
 def test_residual_statistics_count_every_point(short) -> None:
     flight, _ = short
-    stats = tables.residual_statistics(flight)
+    stats = product.residual_statistics(flight)
     assert stats["count"].sum() == len(flight.reconstruction.residuals)
     assert stats.edited.sum() == (~flight.reconstruction.residuals.accepted).sum()
 
@@ -146,7 +146,7 @@ def test_statistics_of_white_residuals_are_one_and_none() -> None:
         }
     )  # fmt: skip
     bet = type("Bet", (), {"residuals": part, "verdicts": ()})()
-    row = tables.residual_statistics(type("Flight", (), {"reconstruction": bet})()).iloc[0]
+    row = product.residual_statistics(type("Flight", (), {"reconstruction": bet})()).iloc[0]
     assert (row["count"], row.edited, row.unit) == (n, 20, "m")
     assert row.rms_normalised == pytest.approx(1.0, abs=0.06)
     assert abs(row.lag1) < 0.09
@@ -154,6 +154,6 @@ def test_statistics_of_white_residuals_are_one_and_none() -> None:
 
 
 def test_covariance_is_whole_once_a_second(short) -> None:
-    slow = tables.slow_covariance(short[0])
+    slow = product.slow_covariance(short[0])
     assert slow["covariance"].shape[1:] == (9, 9)
     assert 9 <= len(slow["t_s"]) <= 11

@@ -10,10 +10,11 @@ from scipy.stats import chi2
 
 from flightmodel.checks import GateError
 from postflight import sensitivity as module
-from postflight.pipeline import flight_from, reconstruct_flight, reconstruct_telemetry
+from postflight.flight import flight_from, reconstruct_flight, reconstruct_telemetry
 from postflight.sensitivity import COLUMNS, UNITS, largest_of_groups, reruns, sensitivity
-from recon.bet import Settings, reconstruct_once
-from recon.beyond_sheet import Learnt
+from recon.fault_isolation import Learnt
+from recon.reconstruct import reconstruct_once
+from recon.settings import Settings
 
 
 @pytest.fixture(scope="module")

@@ -8,23 +8,21 @@ from flightmodel import rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.checks import ConfigError
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from postflight.flight import reconstruct_flight
 from postflight.montecarlo.study import read_study
-from postflight.pipeline import reconstruct_flight
-from postflight.preflight import dispersions_of, entry_bounds, inside, rigid_bounds
-from postflight.studies import commands, joints, table_3_1
-from synthetic_flight import packing
-from synthetic_flight.dispersed_ensemble import legs
+from postflight.studies import commands, joints
+from postflight.studies.preflight import dispersions_of, entry_bounds, inside, rigid_bounds
+from synthetic_flight import simulate
 from synthetic_flight.dispersions import Window
-from synthetic_flight.ensemble import Start, fly_legs
+from synthetic_flight.ensemble import Records, Start, fly_legs, legs
 from synthetic_flight.folder import simulate_to_folder
-from synthetic_flight.outputs import Records
 from synthetic_flight.scenarios import initial_state, read_scenario
 
 VEHICLE = "irve2_reference"
 
 
 def test_table_3_1_agrees_to_the_last_digit():
-    table = table_3_1.table_3_1(vehicle_from_toml(vehicle_path(VEHICLE)))
+    table = joints.table_3_1(vehicle_from_toml(vehicle_path(VEHICLE)))
     assert len(table) == 16
     assert table["agrees"].all()
     assert table["ours"].tolist() == table["paper"].tolist()
@@ -41,17 +39,17 @@ def test_table_3_1_agrees_to_the_last_digit():
 def test_the_equations_are_the_vehicles_own():
     """Frequency and critical damping of the vehicle (seed paper eqs. [7], [8]) give the table's numbers back."""
     vehicle = vehicle_from_toml(vehicle_path(VEHICLE))
-    inertia = table_3_1.reduced_inertia_kgm2(vehicle)
+    inertia = joints.reduced_inertia_kgm2(vehicle)
     hz = vehicle.free_free_frequency_hz()
-    assert table_3_1.stiffness_nmprad(hz, inertia) == pytest.approx(vehicle.joint.bending_stiffness_nmprad, rel=1e-12)
-    assert table_3_1.damping_nmsprad(1.0, hz, inertia) == pytest.approx(vehicle.critical_damping_nmsprad(), rel=1e-12)
-    assert pytest.approx(17.569, abs=5e-4) == table_3_1.PAPER_REDUCED_INERTIA_KGM2
+    assert joints.stiffness_nmprad(hz, inertia) == pytest.approx(vehicle.joint.bending_stiffness_nmprad, rel=1e-12)
+    assert joints.damping_nmsprad(1.0, hz, inertia) == pytest.approx(vehicle.critical_damping_nmsprad(), rel=1e-12)
+    assert pytest.approx(17.569, abs=5e-4) == joints.PAPER_REDUCED_INERTIA_KGM2
 
 
 def test_a_planted_digit_is_seen(monkeypatch):
-    wrong = ((2.0, "2774.5", "2.2078"), *table_3_1.PAPER_STIFFNESS[1:])
-    monkeypatch.setattr(table_3_1, "PAPER_STIFFNESS", wrong)
-    table = table_3_1.table_3_1(vehicle_from_toml(vehicle_path(VEHICLE)))
+    wrong = ((2.0, "2774.5", "2.2078"), *joints.PAPER_STIFFNESS[1:])
+    monkeypatch.setattr(joints, "PAPER_STIFFNESS", wrong)
+    table = joints.table_3_1(vehicle_from_toml(vehicle_path(VEHICLE)))
     assert table["agrees"].sum() == 15
 
 
@@ -138,8 +136,8 @@ def test_bounds_disperse_what_the_vehicle_file_states():
 def test_a_locked_joint_carries_the_force_of_the_rigid_body():
     """Specific force at the c.g. by the joint's force and lever arms against aerodynamic force over mass."""
     scenario, window = read_scenario(VEHICLE), Window(from_s=430.0, to_s=445.0)
-    vehicle, table = scenario.vehicle, packing.atmosphere_table(standard_atmosphere())
-    start = Start(initial_state(scenario), packing.parameter_vector(vehicle), table)
+    vehicle, table = scenario.vehicle, simulate.atmosphere_table(standard_atmosphere())
+    start = Start(initial_state(scenario), simulate.parameter_vector(vehicle), table)
     (flown,) = fly_legs(vehicle, [0], [start], legs(scenario.spec.time, window, locked=True))
     records = Records(flown.states, flown.aux, vehicle, table)
     aero = rotations.rotate(rotations.conjugate(flown.states[:, 6:10]), flown.aux[:, 12:15]) / vehicle.mass_kg

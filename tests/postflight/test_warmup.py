@@ -22,7 +22,7 @@ class Listener(event.Listener):
 
 event.register("numba:compile", Listener())
 from dataclasses import replace
-from postflight.pipeline import reconstruct_flight
+from postflight.flight import reconstruct_flight
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 

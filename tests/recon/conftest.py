@@ -33,7 +33,7 @@ from flightmodel.telemetry import (
     TriadRecord,
 )
 from flightmodel.trajectory import Trajectory
-from synthetic_flight.radar_sensing import mislevel
+from synthetic_flight.sensing import mislevel
 
 DEG = np.pi / 180.0
 START, END = 100.0, 160.0

@@ -20,7 +20,8 @@ from scipy.stats import binom, chi2, norm
 from flightmodel import earth
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import difference, resample
-from recon.bet import Settings, reconstruct
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 

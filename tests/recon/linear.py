@@ -13,8 +13,8 @@ from recon import _bryson_frazier_kernels, _smoother_kernels, smoother
 from recon import _filter_kernels as kernels
 from recon._measurement_kernels import SLOTS
 from recon.ekf import make_filter, schmidt_update
-from recon.packed import Filtered, Innovations, Observed, Steps, Wander, packed
 from recon.smoother import full_step
+from recon.state import Filtered, Innovations, Observed, Steps, Wander, packed
 
 EMPTY = np.full(SLOTS, -1, dtype=np.int64)
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from recon.bet import bridge_triads
-from recon.packed import unpacked
+from recon.reconstruct import bridge_triads
 from recon.settings import Settings
 from recon.setup import build_problem
+from recon.state import unpacked
 
 
 def build(telemetry, **options):

@@ -10,11 +10,13 @@ from flightmodel import rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.checks import GateError
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from recon import air
+from recon import atmosphere
 
 KNOWN = replace(standard_atmosphere(), wind_sd_mps=np.full(41, 4.0), density_sd=np.full(41, 0.03))
 VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
-DRAG = air.Drag(VEHICLE.aero, VEHICLE.reference.area_m2 / VEHICLE.mass_kg, 0.03, 0.07, VEHICLE.reference.length_m)
+DRAG = atmosphere.Drag(
+    VEHICLE.aero, VEHICLE.reference.area_m2 / VEHICLE.mass_kg, 0.03, 0.07, VEHICLE.reference.length_m
+)
 
 
 def descent(spin_rpm=6.0, attitude_sd=1e-5):
@@ -28,26 +30,30 @@ def descent(spin_rpm=6.0, attitude_sd=1e-5):
     turn = rotations.exp(np.column_stack([spin_rpm * 2 * np.pi / 60.0 * t, 0 * t, 0 * t]))
     dcm = rotations.dcm_from_q(rotations.multiply(down, rotations.multiply(tip, turn)))
     root = np.tile(np.diag([0.02] * 3 + [attitude_sd] * 3), (len(t), 1, 1))
-    return air.AirSamples(t, altitude, velocity, dcm, np.full((len(t), 3), -10.0), root)
+    return atmosphere.AirSamples(t, altitude, velocity, dcm, np.full((len(t), 3), -10.0), root)
 
 
 def pushed(samples, seen, rng=None):
     """Samples with the forces that the model makes of what each of them sees (n, SEEN), with its noise."""
-    force = air._Model(samples, KNOWN, DRAG).forces(seen)[0]
+    force = atmosphere._Model(samples, KNOWN, DRAG).forces(seen)[0]
     if rng is not None:
-        part = np.array([air.MODEL_PART, air.LATERAL_PART, air.LATERAL_PART])
-        force = force + np.hypot(air.MODEL_FLOOR_MPS2, part * np.abs(force[:, :1])) * rng.standard_normal(force.shape)
+        part = np.array([atmosphere.MODEL_PART, atmosphere.LATERAL_PART, atmosphere.LATERAL_PART])
+        force = force + np.hypot(atmosphere.MODEL_FLOOR_MPS2, part * np.abs(force[:, :1])) * rng.standard_normal(
+            force.shape
+        )
     return replace(samples, specific_force_body_mps2=force)
 
 
 def drawn(samples, rng):
     """What the samples see when every unknown is drawn from its prior, and density and winds at the knots."""
-    height = air._knots(samples.altitude_m, air.KNOT_M)
-    at = air._interpolation(samples.altitude_m, height)
-    seen = np.zeros((len(samples.time_s), air.SEEN))
+    height = atmosphere._knots(samples.altitude_m, atmosphere.KNOT_M)
+    at = atmosphere._interpolation(samples.altitude_m, height)
+    seen = np.zeros((len(samples.time_s), atmosphere.SEEN))
     knots = []
     for k, length in enumerate((5000.0, 3000.0, 3000.0)):
-        root = np.linalg.cholesky(np.linalg.inv(air._process_information(height, length, air.CONSTANT_PART)))
+        root = np.linalg.cholesky(
+            np.linalg.inv(atmosphere._process_information(height, length, atmosphere.CONSTANT_PART))
+        )
         knots.append(root @ rng.standard_normal(len(height)))
         seen[:, k] = at @ knots[-1]
     sd = np.array([0.03, 0.07, 0.3, 0.1, *[np.deg2rad(1.0)] * 4])
@@ -58,7 +64,7 @@ def drawn(samples, rng):
 
 def test_sounding_without_errors_is_left_as_it_is():
     samples = descent()
-    found = air.reconstruct_air(pushed(samples, np.zeros((len(samples.time_s), air.SEEN))), KNOWN, DRAG)
+    found = atmosphere.reconstruct_air(pushed(samples, np.zeros((len(samples.time_s), atmosphere.SEEN))), KNOWN, DRAG)
     assert np.abs(found.profile.density_ratio - 1.0).max() < 1e-6
     assert np.abs(found.profile[["wind_north_change_mps", "wind_east_change_mps"]]).to_numpy().max() < 1e-4
     assert np.abs(found.drag.ratio - 1.0).max() < 1e-12
@@ -73,7 +79,7 @@ def many():
         rng = np.random.default_rng(seed)
         samples = descent()
         seen, height, knots, own = drawn(samples, rng)
-        found = air.reconstruct_air(pushed(samples, seen, rng), KNOWN, DRAG)
+        found = atmosphere.reconstruct_air(pushed(samples, seen, rng), KNOWN, DRAG)
         p, at = found.profile, np.isin(height, found.profile.altitude_m)
         truth = [np.exp(0.03 * knots[0, at]), 4.0 * knots[1, at], 4.0 * knots[2, at]]
         z = [
@@ -121,9 +127,9 @@ def test_spin_tells_winds_from_an_offset_of_the_body():
     for spin in (0.0, 6.0):
         samples = descent(spin)
         samples = samples.rows(samples.altitude_m < 26e3)
-        seen = np.zeros((len(samples.time_s), air.SEEN))
+        seen = np.zeros((len(samples.time_s), atmosphere.SEEN))
         seen[:, 9] = np.deg2rad(2.0)
-        found = air.reconstruct_air(pushed(samples, seen), KNOWN, DRAG)
+        found = atmosphere.reconstruct_air(pushed(samples, seen), KNOWN, DRAG)
         sd[spin] = found.profile.wind_east_sd_mps.mean()
         offset_sd[spin] = found.parameters.sd[6]
         taken[spin] = np.abs(found.profile.wind_east_change_mps).max()
@@ -136,7 +142,9 @@ def test_attitude_that_is_not_known_hides_the_winds():
     sd = []
     for attitude_sd in (1e-5, np.deg2rad(3.0)):
         samples = descent(attitude_sd=attitude_sd)
-        found = air.reconstruct_air(pushed(samples, np.zeros((len(samples.time_s), air.SEEN))), KNOWN, DRAG)
+        found = atmosphere.reconstruct_air(
+            pushed(samples, np.zeros((len(samples.time_s), atmosphere.SEEN))), KNOWN, DRAG
+        )
         sd.append(found.profile.wind_north_sd_mps.iloc[:10].mean())
     assert sd[1] > 1.4 * sd[0]
 
@@ -146,11 +154,11 @@ def test_attitude_that_is_not_known_hides_the_winds():
 )
 def test_layer_that_nobody_sounded_turns_its_verdict_red(column, verdict, words):
     samples = descent()
-    seen = np.zeros((len(samples.time_s), air.SEEN))
+    seen = np.zeros((len(samples.time_s), atmosphere.SEEN))
     low, high = (45e3, 55e3) if column == 0 else (0.0, 32e3)
     inside = (samples.altitude_m > low) & (samples.altitude_m < high)
     seen[inside, column] = np.log(1.15) / 0.03 if column == 0 else 5.0
-    red = [v for v in air.reconstruct_air(pushed(samples, seen), KNOWN, DRAG).verdicts if not v.passed]
+    red = [v for v in atmosphere.reconstruct_air(pushed(samples, seen), KNOWN, DRAG).verdicts if not v.passed]
     assert verdict in [v.name for v in red]
     words_of = next(v.words for v in red if v.name == verdict)
     assert words_of.startswith(words)
@@ -160,13 +168,15 @@ def test_layer_that_nobody_sounded_turns_its_verdict_red(column, verdict, words)
 def test_force_that_is_no_air_is_told():
     samples = descent()
     rng = np.random.default_rng(0)
-    pushed_samples = pushed(samples, np.zeros((len(samples.time_s), air.SEEN)))
+    pushed_samples = pushed(samples, np.zeros((len(samples.time_s), atmosphere.SEEN)))
     force = pushed_samples.specific_force_body_mps2 * (1.0 + 0.1 * rng.standard_normal((len(samples.time_s), 1)))
-    found = air.reconstruct_air(replace(pushed_samples, specific_force_body_mps2=force), KNOWN, DRAG)
+    found = atmosphere.reconstruct_air(replace(pushed_samples, specific_force_body_mps2=force), KNOWN, DRAG)
     assert "air residuals axial" in [v.name for v in found.verdicts if not v.passed]
 
 
 def test_thin_air_is_refused_in_words():
     samples = descent()
     with pytest.raises(GateError, match="windows with a deceleration above"):
-        air.reconstruct_air(replace(samples, specific_force_body_mps2=np.zeros((len(samples.time_s), 3))), KNOWN, DRAG)
+        atmosphere.reconstruct_air(
+            replace(samples, specific_force_body_mps2=np.zeros((len(samples.time_s), 3))), KNOWN, DRAG
+        )

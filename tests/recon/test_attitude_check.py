@@ -10,9 +10,9 @@ from flightmodel import rotations
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import difference, resample
-from recon.attitude_check import compare
-from recon.bet import Settings, reconstruct
-from recon.vector_attitude import reconstruct_attitude
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
+from recon.vector_attitude import compare, reconstruct_attitude
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 

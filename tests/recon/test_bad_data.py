@@ -30,8 +30,9 @@ from scipy.stats import chi2, norm
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Finding
-from recon.bet import Settings, reconstruct
-from recon.suspects import suspects
+from recon.fault_isolation import suspects
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 

@@ -10,7 +10,8 @@ from scipy.stats import chi2
 from flightmodel import earth, rotations
 from recon import ballistic
 from recon.ballistic import ballistic_motion
-from recon.bet import Settings, reconstruct
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 from recon.state import States, boxminus, boxplus
 from recon.strapdown import propagate
 

@@ -5,7 +5,8 @@ import pytest
 from scipy.stats import chi2
 
 from flightmodel.trajectory import difference
-from recon.bet import Settings, reconstruct_once
+from recon.reconstruct import reconstruct_once
+from recon.settings import Settings
 
 from .problems import build
 

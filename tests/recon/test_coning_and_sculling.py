@@ -2,7 +2,7 @@
 
 The correction is exact to fourth order where signals are straight in time. Samples of a sinusoid are not, and the
 error of joining them by straight lines is just as large as what is corrected for;
-`recon.inertial.unbent` takes it away.
+`recon.motion.unbent` takes it away.
 """
 
 from functools import cache
@@ -14,8 +14,7 @@ from scipy.integrate import solve_ivp
 
 from flightmodel import earth, rotations
 from recon import strapdown
-from recon.inertial import unbent
-from recon.motion import strapdown_motion
+from recon.motion import strapdown_motion, unbent
 from recon.state import States
 from recon.strapdown import propagate, propagate_plain
 

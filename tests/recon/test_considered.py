@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from recon.ekf import forward
-from recon.packed import unpacked
 from recon.smoother import SMOOTHERS, smooth
+from recon.state import unpacked
 
 from . import linear
 from .problems import build, off_in_covariance
@@ -141,7 +141,8 @@ def test_considered_flights_err_as_they_claim(mini_sense, mini_truth, consider):
     from scipy.stats import chi2
 
     from flightmodel.trajectory import difference
-    from recon.bet import Settings, reconstruct
+    from recon.reconstruct import reconstruct
+    from recon.settings import Settings
 
     values = []
     for seed in range(10):

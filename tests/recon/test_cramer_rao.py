@@ -13,7 +13,8 @@ import pytest
 from flightmodel import earth
 from flightmodel.telemetry import AttitudePrior, RadarRecord, TriadRecord
 from flightmodel.trajectory import difference
-from recon.bet import Settings, reconstruct
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 
 from . import bound
 from .conftest import CG, body_rate

@@ -8,10 +8,10 @@ import pytest
 
 from flightmodel.telemetry import RadarRecord
 from flightmodel.trajectory import difference
-from recon.bet import Settings, reconstruct, reconstruct_once
 from recon.consistency import verdict
-from recon.disagreement import LeftOut, denied_findings, denied_points, edited_with_denied, is_about
-from recon.suspects import suspects
+from recon.fault_isolation import LeftOut, denied_findings, denied_points, edited_with_denied, is_about, suspects
+from recon.reconstruct import reconstruct, reconstruct_once
+from recon.settings import Settings
 
 FAST = Settings(output_rate_hz=5.0)
 

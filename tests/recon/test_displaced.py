@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from flightmodel.telemetry import TriadRecord
-from recon import shock
-from recon.bet import Settings, bridge_triads, reconstruct_once
-from recon.displaced import REACH, Displaced, displaced_runs, repeated_samples
+from recon import unmodelled
 from recon.ekf import forward
-from recon.gaps import bridge
+from recon.imu_screening import REACH, Displaced, bridge, displaced_runs, repeated_samples
+from recon.reconstruct import bridge_triads, reconstruct_once
+from recon.settings import Settings
 from recon.setup import build_problem
 
 from . import linear
@@ -130,11 +130,11 @@ def believed(mini_sense):
 def test_readings_are_believed_where_the_trackers_tell_that_they_are_right(believed):
     right = tuple(Displaced(triad, axis, 125.0, 129.0, size) for triad, size in ((0, 5.0), (1, 0.3)) for axis in (1, 2))
     unclear = tuple(replace(d, offset=0.001 * d.offset) for d in right)
-    assert shock.doubtful(*believed, right) == ()
-    assert shock.doubtful(*believed, unclear) == unclear
+    assert unmodelled.doubtful(*believed, right) == ()
+    assert unmodelled.doubtful(*believed, unclear) == unclear
     considering = replace(believed[0], model=believed[0].model.considering(["accelerometer scale"]))
-    assert shock.doubtful(considering, believed[1], right) == right
-    assert shock.doubtful(*believed, ()) == ()
+    assert unmodelled.doubtful(considering, believed[1], right) == right
+    assert unmodelled.doubtful(*believed, ()) == ()
 
 
 def test_a_fault_is_doubted_and_the_next_reconstruction_knows(mini_sense):
@@ -176,10 +176,10 @@ def test_scores_are_the_likelihood_of_an_offset(seed):
     about = problem.steps, problem.observed, problem.slots, innovations, columns
     begin, end = np.array([9, 3, 3, 0]), np.array([13, 8, 5, 2])
     score, variance = np.zeros((4, 3)), np.zeros((4, 3, 3))
-    shock._shock_kernels.window_scores(*about, begin, end, 3, score, variance)
+    unmodelled._shock_kernels.window_scores(*about, begin, end, 3, score, variance)
     rng = np.random.default_rng(seed)
     for w in range(4):
-        s, v = shock.readable_scores(*about, begin[w], end[w])
+        s, v = unmodelled.readable_scores(*about, begin[w], end[w])
         np.testing.assert_allclose(score[w], s, rtol=1e-9, atol=1e-9 * np.abs(s).max())
         np.testing.assert_allclose(variance[w], v, rtol=1e-9, atol=1e-9 * np.abs(v).max())
         d = rng.standard_normal(3)

@@ -10,8 +10,8 @@ from flightmodel.telemetry import RadarRecord
 from recon import _measurement_kernels, ekf
 from recon.ekf import forward
 from recon.measurements import NodeMotion, predict, wrapped
-from recon.packed import packed, unpacked
 from recon.smoother import full_step, smooth
+from recon.state import packed, unpacked
 
 from .ballistic_flight import fly, watch
 from .problems import build, off_in_covariance, off_in_states

@@ -8,8 +8,7 @@ import pytest
 from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
-from recon.gaps import bridge
-from recon.stuck import stuck_samples
+from recon.imu_screening import bridge, stuck_samples
 
 SPEC = TriadSpec("rates", np.zeros(3), np.eye(3), 0.01, 0.01, 0.003, 0.002)
 

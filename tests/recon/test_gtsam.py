@@ -20,7 +20,8 @@ import pytest
 
 from flightmodel import earth, rotations
 from flightmodel.telemetry import RadarRecord, TriadRecord
-from recon.bet import Settings, reconstruct
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 
 from .conftest import ACCELEROMETER, CG, IMU, RATES, SITES, START, body_rate, measure_radar, measure_triad
 

@@ -23,9 +23,8 @@ from recon.measurements import (
 )
 from recon.settings import Settings
 from recon.setup import tracking_instruments
-from synthetic_flight import radar_sensing
-from synthetic_flight.instrument_sections import Radar
-from synthetic_flight.triad_errors import child
+from synthetic_flight import sensing
+from synthetic_flight.instrument_errors import Radar, child
 
 LATITUDE, LONGITUDE, HEIGHT_M = -0.58, 0.31, 40.0
 ARM = np.array([0.41, -0.36, 0.73])
@@ -278,7 +277,7 @@ def test_pedestal_terms_have_the_simulators_signs_and_sizes(name, place_rad):
         range_bias_m=0.0, angle_bias_deg=0.0, time_bias_s=0.0, **{field: size},
     )  # fmt: skip
     seen = np.array([[2e5, *place_rad], [2e5, 1.0, 0.5]])
-    out = radar_sensing.pedestal_errors(seen, spec, np.random.default_rng(4))
+    out = sensing.pedestal_errors(seen, spec, np.random.default_rng(4))
     slot = SLOT_NAMES[RADAR].index(name)
     drawn = child(np.random.default_rng(4), name.replace("non-", "non")).standard_normal(1)[0]
     drawn *= size if name == "range scale" else np.deg2rad(size)
@@ -292,7 +291,7 @@ def test_pedestal_terms_have_the_simulators_signs_and_sizes(name, place_rad):
 def test_tilt_is_the_turned_pedestal_to_first_order(place_rad):
     _, _, ours = partials_towards(np.array([2e5, *place_rad]))
     for tilt in (np.array([1e-4, 0.0]), np.array([0.0, 1e-4]), np.array([-2e-4, 3e-4])):
-        exact = radar_sensing.mislevel(np.array(place_rad[:1]), np.array(place_rad[1:]), tilt)[0]
+        exact = sensing.mislevel(np.array(place_rad[:1]), np.array(place_rad[1:]), tilt)[0]
         # second order: tilt^2 tan^2 E
         second = (tilt @ tilt) * (1.0 + np.tan(place_rad[1]) ** 2)
         assert np.abs(exact - ours[1:, 4:6] @ tilt).max() < second

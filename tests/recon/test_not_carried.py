@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flightmodel.checks import DivergenceError
-from recon.disturbance import LOST_POINTS, MOST, Disturbance, widened
+from recon.unmodelled import LOST_POINTS, MOST, Disturbance, widened
 
 TIME_S = np.arange(0.0, 300.0)
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from flightmodel.checks import GateError
-from recon.bet import Settings, reconstruct
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 
 
 def test_pulse_is_given_at_its_own_rate(mini_sense):

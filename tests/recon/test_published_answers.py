@@ -20,10 +20,9 @@ from recon.ekf import ENGINES, forward, height
 from recon.error_model import Block, ErrorModel
 from recon.measurements import Instrument
 from recon.motion import strapdown_motion
-from recon.packed import Observed, Steps, Wander, unpacked
 from recon.problem import Problem, observe
 from recon.smoother import SMOOTHERS, smooth
-from recon.state import States
+from recon.state import Observed, States, Steps, Wander, unpacked
 from recon.strapdown import propagate
 
 from . import linear

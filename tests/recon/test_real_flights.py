@@ -20,8 +20,9 @@ from scipy.stats import chi2
 from flightmodel import earth, rotations
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
-from recon.bet import Settings, reconstruct
-from recon.withheld import summary
+from recon.consistency import summary
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 
 FLIGHTS = Path(__file__).parents[1] / "data" / "real_flights"
 REAL = os.environ.get("POSTFLIGHT_REALDATA")

@@ -9,9 +9,10 @@ from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import GnssRecord, RadarRecord, TriadRecord
 from recon import error_model
-from recon.bet import Settings, bridge_triads, reconstruct
 from recon.error_model import ErrorModel, triad_blocks
-from recon.inertial import inertial_motion
+from recon.motion import inertial_motion
+from recon.reconstruct import bridge_triads, reconstruct
+from recon.settings import Settings
 
 from .ballistic_flight import fly, watch
 from .conftest import ACCELEROMETER, FULL_SITES

@@ -8,8 +8,8 @@ import pytest
 from flightmodel.instruments import GnssSpec
 from recon import smoother
 from recon.ekf import forward
-from recon.packed import unpacked
 from recon.smoother import SMOOTHERS, full_step, smooth, step_gain
+from recon.state import unpacked
 
 from . import linear
 from .ballistic_flight import fly, watch

@@ -9,9 +9,10 @@ from scipy.stats import chi2
 
 from flightmodel.telemetry import RadarRecord
 from flightmodel.trajectory import difference
-from recon.bet import Settings, reconstruct
-from recon.inertial import SAME_INSTANT_S
+from recon.motion import SAME_INSTANT_S
 from recon.problem import nearest_index, observe
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
 from recon.setup import _union
 
 from .conftest import END, EPOCH, START, measure_radar

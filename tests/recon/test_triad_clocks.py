@@ -7,11 +7,11 @@ import pytest
 
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
-from recon.bet import Settings, reconstruct, reconstruct_once
-from recon.clock_jumps import ClockJump, mended
-from recon.gaps import bridge
+from recon.imu_screening import bridge
+from recon.reconstruct import reconstruct_once
+from recon.settings import Settings
 from recon.state import States
-from recon.triad_clocks import lag_between
+from recon.time_bias import ClockJump, lag_between, mended
 
 FINE_S, STEP_S, END_S, SPIN = 0.002, 0.005, 60.0, 0.6
 FORCE = TriadSpec("accelerometer", np.zeros(3), np.eye(3), 0.05, 0.1, 0.003, 0.002, time_bias_sd_s=0.001)
@@ -115,13 +115,13 @@ def test_trackers_tell_a_jump_from_lost_samples(mini_sense, triads, early):
 
 def test_a_clock_beyond_its_sheet_is_told_by_the_swinging_and_followed(monkeypatch, mini_sense):
     """What the swinging says goes into the second reconstruction; the verdict stays that of the first."""
-    from recon import bet, triad_clocks
+    from recon import reconstruct, time_bias
 
     telemetry, _ = mini_sense(4, clock_sd_s=1e-3)
     rates = telemetry.rates
     early = replace(telemetry, rates=replace(rates, time_s=rates.time_s - 0.02))
-    told = triad_clocks.Lag(0.02, 0.002)
-    monkeypatch.setattr(bet.triad_clocks, "lag_between", lambda *_: told)
+    told = time_bias.Lag(0.02, 0.002)
+    monkeypatch.setattr(reconstruct.triad_clocks, "lag_between", lambda *_: told)
     found = reconstruct(early, Settings(output_rate_hz=5.0))
     (verdict,) = (v for v in found.verdicts if v.name.startswith("clocks of"))
     assert not verdict.passed

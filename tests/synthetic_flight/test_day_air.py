@@ -7,8 +7,8 @@ from scipy.stats import chi2
 from flightmodel.atmosphere import nrlmsis_profile, us76
 from flightmodel.checks import ConfigError
 from flightmodel.config import parse_section
-from synthetic_flight import packing
-from synthetic_flight.day_air import (
+from synthetic_flight import simulate
+from synthetic_flight.weather import (
     DayAtmosphere,
     RangeSounding,
     day_atmosphere,
@@ -46,8 +46,8 @@ def test_every_structure_leaves_the_random_day_as_it_is():
     assert 1.0 < np.std(change[(Z > 61e3) & (Z < 69e3), 0]) < 5.0
     # the truth as it is flown: rows of the dynamics' own table resolve the smallest structure allowed
     thin = day(**STILL, pockets=[{"altitude_m": 45020.0, "depth": 0.1, "thickness_m": 200.0}])
-    rows = packing.atmosphere_table(thin)[:, 0]
-    z = packing.ATMOSPHERE_START_M + packing.ATMOSPHERE_STEP_M * np.arange(len(rows))
+    rows = simulate.atmosphere_table(thin)[:, 0]
+    z = simulate.ATMOSPHERE_START_M + simulate.ATMOSPHERE_STEP_M * np.arange(len(rows))
     low = z < 120e3
     assert (rows[low] / us76(z[low])[0]).min() == pytest.approx(0.9, abs=0.01)
 

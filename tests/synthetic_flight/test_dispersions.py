@@ -8,9 +8,7 @@ from scipy.stats import kstest, lognorm, norm
 
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.config import parse_section
-from synthetic_flight import packing
-from synthetic_flight.day_air import day_atmosphere
-from synthetic_flight.dispersed_ensemble import Plan, fly_runs, legs
+from synthetic_flight import simulate
 from synthetic_flight.dispersions import (
     AirDispersions,
     Dispersions,
@@ -23,9 +21,9 @@ from synthetic_flight.dispersions import (
     dispersed_case,
     draws,
 )
-from synthetic_flight.ensemble import Start, fly_legs
-from synthetic_flight.outputs import QUANTITIES, records_of, scalars_of
+from synthetic_flight.ensemble import QUANTITIES, Plan, Start, fly_legs, fly_runs, legs, records_of, scalars_of
 from synthetic_flight.scenarios import child_rng, fly_scenario, initial_state, read_scenario
+from synthetic_flight.weather import day_atmosphere
 from tests.postflight.short_flights import write_short
 
 WINDOW = Window(from_s=402.0, to_s=410.0, record_s=0.02, history_s=0.1)
@@ -88,8 +86,8 @@ def test_wrong_dispersions_are_refused(tables, words):
 def test_an_undispersed_flight_is_the_simulators_own(short):
     """Legs, longer steps before inflation and outputs against `fly_scenario`, on the same day."""
     truth = fly_scenario(short, 5)
-    table = packing.atmosphere_table(day_atmosphere(short.spec.atmosphere, child_rng(5, "atmosphere")))
-    start = Start(initial_state(short), packing.parameter_vector(short.vehicle), table)
+    table = simulate.atmosphere_table(day_atmosphere(short.spec.atmosphere, child_rng(5, "atmosphere")))
+    start = Start(initial_state(short), simulate.parameter_vector(short.vehicle), table)
     plan = legs(short.spec.time, WINDOW, locked=False)
     records = records_of(fly_legs(short.vehicle, [0], [start], plan)[0], short.vehicle, table)
     at = np.round((WINDOW.from_s + 0.02 * np.arange(len(records.aux)) - 400.0) / 0.004).astype(int)
@@ -123,7 +121,7 @@ def test_every_factor_moves_the_flight(short):
             case = dispersed_case(short, one, {f"{section}.{key}": 0.7})
             same = (
                 np.array_equal(initial_state(case.scenario), initial_state(nominal.scenario))
-                and np.array_equal(packing.parameter_vector(case.vehicle), packing.parameter_vector(nominal.vehicle))
+                and np.array_equal(simulate.parameter_vector(case.vehicle), simulate.parameter_vector(nominal.vehicle))
                 and case.scales == nominal.scales
                 and np.array_equal(case.profile.log_density_ratio, nominal.profile.log_density_ratio)
                 and np.array_equal(case.profile.wind_ned_mps, nominal.profile.wind_ned_mps)

@@ -5,8 +5,8 @@ import pytest
 
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile
-from synthetic_flight import _kernels, dynamics, packing
-from synthetic_flight import _workspace_kernels as at
+from synthetic_flight import _kernels, dynamics, simulate
+from synthetic_flight import _kernels as at
 from synthetic_flight.simulate import integrate, state_from_ecef
 
 from .conftest import entry_state, free_state, undamped
@@ -34,9 +34,9 @@ def windy():
 
 
 def kernel_rates(state, vehicle, table, locked=False):
-    s = packing.workspace(state[None], packing.parameter_vector(vehicle)[None])
+    s = simulate.workspace(state[None], simulate.parameter_vector(vehicle)[None])
     s[at.TRIAL : at.TRIAL + at.STATES] = state
-    _kernels.rates(s, (0,), *packing.kernel_tables(vehicle, table), earth.WGS84, locked)
+    _kernels.rates(s, (0,), *simulate.kernel_tables(vehicle, table), earth.WGS84, locked)
     # as recorded: forces and moments in ECI
     vectors = s[at.FORCE : at.FORCE + 9].reshape(3, 3) @ s[at.R_A : at.R_A + 9].reshape(3, 3).T
     aux = np.concatenate([s[at.ALTITUDE : at.ALTITUDE + 6], vectors.ravel(), s[at.RATE + 14 : at.RATE + 17]])
@@ -45,14 +45,14 @@ def kernel_rates(state, vehicle, table, locked=False):
 
 def test_kernel_equals_the_readable_form_with_every_term_alive(generic_vehicle):
     state, profile = entry_45_km(), windy()
-    dy, aux = kernel_rates(state, generic_vehicle, packing.atmosphere_table(profile))
+    dy, aux = kernel_rates(state, generic_vehicle, simulate.atmosphere_table(profile))
     force, _ = dynamics.aerodynamics(state, generic_vehicle, profile)
     # the kernel reads density every 50 m, linear in its logarithm: (50 m / 7 km)^2 / 8 of curvature at most
     np.testing.assert_allclose(aux[12:15], force, rtol=2e-7)
     want = dynamics.rates(state, generic_vehicle, dynamics.flight_loads(state, generic_vehicle, profile))
     np.testing.assert_allclose(dy, want, rtol=1e-6, atol=1e-7)
     # with the kernel's own aerodynamic force, the mechanics agrees to rounding
-    drag_free, _ = kernel_rates(state, generic_vehicle, packing.vacuum_table())
+    drag_free, _ = kernel_rates(state, generic_vehicle, simulate.vacuum_table())
     want = dynamics.rates(state, generic_vehicle, dynamics.flight_loads(state, generic_vehicle, None))
     np.testing.assert_allclose(drag_free, want, rtol=1e-11, atol=1e-11)
 
@@ -63,7 +63,7 @@ def test_kernel_bridges_to_free_molecular_flow_as_the_readable_form(generic_vehi
     vehicle = replace(generic_vehicle, aero=replace(generic_vehicle.aero, free_molecular=free))
     state, profile = entry_45_km(), windy()
     state[:3] *= 1.0 + 58e3 / np.linalg.norm(state[:3])  # 103 km: nearly half way
-    _, aux = kernel_rates(state, vehicle, packing.atmosphere_table(profile))
+    _, aux = kernel_rates(state, vehicle, simulate.atmosphere_table(profile))
     force, _ = dynamics.aerodynamics(state, vehicle, profile)
     plain = replace(generic_vehicle, aero=replace(generic_vehicle.aero, free_molecular=None))
     continuum, _ = dynamics.aerodynamics(state, plain, profile)
@@ -74,7 +74,7 @@ def test_kernel_bridges_to_free_molecular_flow_as_the_readable_form(generic_vehi
 
 def test_joint_point_of_both_bodies_has_one_acceleration(generic_vehicle):
     # differentiate the joint's position as seen from each body along a short flight: no drift, one point
-    states, _ = integrate(generic_vehicle, packing.atmosphere_table(windy()), entry_45_km(), 1e-4, 1, 2001)
+    states, _ = integrate(generic_vehicle, simulate.atmosphere_table(windy()), entry_45_km(), 1e-4, 1, 2001)
     where = dynamics.points(states, generic_vehicle)
     arm_a = rotations.rotate(
         states[:, 10:14], np.broadcast_to(generic_vehicle.joint_m - generic_vehicle.aeroshell.cg_m, (2001, 3))
@@ -82,7 +82,7 @@ def test_joint_point_of_both_bodies_has_one_acceleration(generic_vehicle):
     np.testing.assert_allclose(where["shell"][0] + arm_a, where["joint"][0], atol=1e-8)
     # and each body's c.g. obeys Newton's law with the recorded joint force: velocity change equals the impulse
     dt = 1e-4
-    _, aux = integrate(generic_vehicle, packing.atmosphere_table(windy()), entry_45_km(), dt, 1, 2001)
+    _, aux = integrate(generic_vehicle, simulate.atmosphere_table(windy()), entry_45_km(), dt, 1, 2001)
     g = earth.gravitation(where["body"][0])
     acceleration = aux[:, 6:9] / generic_vehicle.centerbody.mass_kg + g
     impulse = np.sum(0.5 * dt * (acceleration[1:] + acceleration[:-1]), axis=0)
@@ -95,7 +95,7 @@ def test_energy_and_momentum_of_the_free_undamped_system(generic_vehicle, freepl
     # 1e10 m away gravity's gradient is 1e-15 /s^2: motion about the c.g. is free
     vehicle = undamped(generic_vehicle)
     vehicle = replace(vehicle, joint=vehicle.joint.model_copy(update={"freeplay_deg": freeplay_deg}))
-    states, aux = integrate(vehicle, packing.vacuum_table(), free_state(vehicle), 5e-5, 10000, 201)
+    states, aux = integrate(vehicle, simulate.vacuum_table(), free_state(vehicle), 5e-5, 10000, 201)
     energy = dynamics.internal_energy(states, vehicle)
     inside = energy[0]
     assert 5.0 < inside < 1000.0  # joules of rotation and springs, not of orbit
@@ -111,7 +111,7 @@ def test_energy_near_the_earth_with_gravity_alive(generic_vehicle):
     bent = rotations.exp(np.array([0.01, 0.05, 0.03]))
     state = state_from_ecef(0.0, r, np.array([500.0, -800, 300]), rotations.exp(np.array([0.3, -1.0, 0.5])),
                             np.array([0.6, 0.2, -0.3]), bent)  # fmt: skip
-    states, _ = integrate(vehicle, packing.vacuum_table(), state, 2.5e-4, 4000, 101)
+    states, _ = integrate(vehicle, simulate.vacuum_table(), state, 2.5e-4, 4000, 101)
     energy = dynamics.energy(states, vehicle)
     # 9e9 J in all: relative 1e-9 would be 9 J, more than the joint holds; rounding allows 1e-4 J
     np.testing.assert_allclose(energy, energy[0], atol=2e-4)
@@ -125,7 +125,7 @@ def test_energy_near_the_earth_with_gravity_alive(generic_vehicle):
 
 def test_damping_only_takes_energy(generic_vehicle):
     state = free_state(generic_vehicle)
-    states, _ = integrate(generic_vehicle, packing.vacuum_table(), state, 5e-4, 200, 101)
+    states, _ = integrate(generic_vehicle, simulate.vacuum_table(), state, 5e-4, 200, 101)
     energy = dynamics.energy(states, generic_vehicle)
     assert (np.diff(energy) < 0.0).all()
 
@@ -162,7 +162,7 @@ def test_free_free_frequency_is_eq_7_and_ring_down_eq_8(vehicle, frequency_hz):
         vehicle, joint=joint, aeroshell=balanced(vehicle.aeroshell, ia), centerbody=balanced(vehicle.centerbody, icb)
     )
     assert held.free_free_frequency_hz() == pytest.approx(frequency_hz, rel=1e-12)
-    states, _ = integrate(held, packing.vacuum_table(), planar_release(held, 0.05), 5e-4, 4, 4001)
+    states, _ = integrate(held, simulate.vacuum_table(), planar_release(held, 0.05), 5e-4, 4, 4001)
     _, nose = dynamics.bending(states[:, 6:10], states[:, 10:14])
     theta, t = np.arctan2(-nose[:, 2], nose[:, 0]), 2e-3 * np.arange(4001)
     up = np.flatnonzero((theta[:-1] < 0) & (theta[1:] >= 0))
@@ -186,7 +186,7 @@ def test_free_joint_recoils_by_the_two_body_formula(vehicle):
     )
     k = plain.joint.bending_stiffness_nmprad * np.array([[1, -1], [-1, 1]])
     want = np.sqrt(np.max(np.linalg.eigvals(np.linalg.solve(mass, k)).real)) / (2 * np.pi)
-    states, _ = integrate(plain, packing.vacuum_table(), planar_release(plain, 0.002), 5e-4, 4, 2001)
+    states, _ = integrate(plain, simulate.vacuum_table(), planar_release(plain, 0.002), 5e-4, 4, 2001)
     _, nose = dynamics.bending(states[:, 6:10], states[:, 10:14])
     theta = np.arctan2(-nose[:, 2], nose[:, 0])
     up = np.flatnonzero((theta[:-1] < 0) & (theta[1:] >= 0))
@@ -197,7 +197,7 @@ def test_free_joint_recoils_by_the_two_body_formula(vehicle):
 
 
 def test_stiff_joint_converges_to_the_locked_rigid_body(vehicle):
-    table, state = packing.atmosphere_table(windy()), entry_state(vehicle, alpha_deg=6.0, spin_rpm=6.0)
+    table, state = simulate.atmosphere_table(windy()), entry_state(vehicle, alpha_deg=6.0, spin_rpm=6.0)
 
     def stiffer(factor):
         k, c = 4335.0 * factor, 2.0 * 0.3 * np.sqrt(4335.0 * factor * 17.57)
@@ -223,7 +223,7 @@ def test_locked_body_is_euler_s_rigid_body(generic_vehicle):
     state = free_state(generic_vehicle)
     state[10:14] = state[6:10]
     state[17:20] = state[14:17]
-    states, aux = integrate(generic_vehicle, packing.vacuum_table(), state, 1e-3, 20, 501, lock_records=501)
+    states, aux = integrate(generic_vehicle, simulate.vacuum_table(), state, 1e-3, 20, 501, lock_records=501)
     w, inertia = states[:, 14:17], generic_vehicle.inertia
     kinetic = 0.5 * np.einsum("ni,ij,nj->n", w, inertia, w)
     np.testing.assert_allclose(kinetic, kinetic[0], rtol=1e-10)
@@ -241,7 +241,7 @@ def test_locked_body_is_euler_s_rigid_body(generic_vehicle):
 
 
 def test_integrator_is_of_fourth_order(generic_vehicle):
-    state, table = entry_45_km(), packing.atmosphere_table(windy())
+    state, table = entry_45_km(), simulate.atmosphere_table(windy())
     smooth = replace(generic_vehicle, joint=generic_vehicle.joint.model_copy(update={"freeplay_deg": 0.0}))
     ends = [integrate(smooth, table, state, 0.2 / n, n, 2)[0][-1] for n in (25, 50, 100, 800)]
     errors = [np.linalg.norm((e - ends[-1])[14:20]) for e in ends[:-1]]
@@ -261,7 +261,7 @@ def test_mirrored_flight_is_the_mirrored_path(vehicle):
     )
     r = np.array([0.0, 0.0, 6378137.0 + 60e3])  # above the pole, moving down the axis: the setting has no side
     still = AtmosphereProfile(np.array([0.0, 1e5]), np.zeros(2), np.zeros(2), np.zeros((2, 3)), np.ones(2), np.ones(2))
-    table = packing.atmosphere_table(still)
+    table = simulate.atmosphere_table(still)
     down = rotations.q_from_dcm(np.array([[[0.0, 0, 1.0], [0, 1.0, 0], [-1.0, 0, 0]]]))[0]
     ends = []
     for body in (plain, mirrored):
@@ -277,7 +277,7 @@ def test_mirrored_flight_is_the_mirrored_path(vehicle):
 def test_freeplay_corner_is_smooth_and_exact_outside():
     freeplay, corner = 0.01, 0.1
     theta = np.linspace(0.0, 0.03, 30001)
-    d = np.array([_kernels.beyond_freeplay(x, *packing.freeplay_corner(freeplay, corner)) for x in theta])
+    d = np.array([_kernels.beyond_freeplay(x, *simulate.freeplay_corner(freeplay, corner)) for x in theta])
     np.testing.assert_allclose(d, dynamics.beyond_freeplay(theta, freeplay, corner), atol=1e-17)
     assert (d[theta <= 0.009] == 0.0).all()
     np.testing.assert_allclose(d[theta >= 0.011], theta[theta >= 0.011] - freeplay, atol=1e-15)

@@ -10,11 +10,11 @@ import pytest
 from flightmodel import earth
 from flightmodel._kernels import FASTMATH
 from flightmodel.checks import ConfigError
-from synthetic_flight import _air_kernels, _kernels, packing
-from synthetic_flight.day_air import DayAtmosphere, day_atmosphere
+from synthetic_flight import _kernels, simulate
 from synthetic_flight.ensemble import LANES, Schedule, Start, fly_ensemble
 from synthetic_flight.scenarios import child_rng
 from synthetic_flight.simulate import integrate
+from synthetic_flight.weather import DayAtmosphere, day_atmosphere
 
 from .conftest import entry_state
 
@@ -33,8 +33,8 @@ def dispersed(vehicle):
         profile = day_atmosphere(DayAtmosphere(), child_rng(run, "atmosphere"))
         state = entry_state(vehicle, alpha_deg=3.0 + rng.random(), spin_rpm=10.0 * rng.random())
         state[:3] *= 1.0 - 30e3 / np.linalg.norm(state[:3])
-        p = packing.parameter_vector(replace(vehicle, joint=joint), *factors, cmq_shift=0.1 * rng.standard_normal())
-        return Start(state, p, packing.atmosphere_table(profile))
+        p = simulate.parameter_vector(replace(vehicle, joint=joint), *factors, cmq_shift=0.1 * rng.standard_normal())
+        return Start(state, p, simulate.atmosphere_table(profile))
 
     return start_of
 
@@ -91,8 +91,8 @@ def test_wrong_schedules_are_refused(vehicle, dispersed):
 def test_vector_loops_are_in_vector_registers(vehicle, name):
     """A branch or an alias that the compiler cannot see through would undo this in silence."""
     lanes, planet = (0,) * LANES, earth.WGS84
-    s = packing.workspace(np.zeros((LANES, 20)), np.tile(packing.parameter_vector(vehicle), (LANES, 1)))
-    loop = getattr(_kernels, name, None) or getattr(_air_kernels, name)
+    s = simulate.workspace(np.zeros((LANES, 20)), np.tile(simulate.parameter_vector(vehicle), (LANES, 1)))
+    loop = getattr(_kernels, name, None) or getattr(_kernels, name)
     anew = numba.njit(error_model="numpy", fastmath=FASTMATH)(loop.py_func)
     anew(s, lanes, planet) if loop.py_func.__code__.co_argcount == 3 else anew(s, lanes)
     (assembly,) = anew.inspect_asm().values()

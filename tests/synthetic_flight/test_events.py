@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flightmodel import earth
-from flightmodel.moments import splashdown_index
-from synthetic_flight.events import event_table, flight_events, heat_flux
+from flightmodel.events import splashdown_index
+from synthetic_flight.folder import event_table, flight_events, heat_flux
 from synthetic_flight.scenarios import fly_scenario, read_scenario
 
 NAMES = (

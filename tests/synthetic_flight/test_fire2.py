@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile, us76
-from synthetic_flight import packing
+from synthetic_flight import simulate
 from synthetic_flight.simulate import integrate, state_from_ecef
 
 from .rigid import rigid_vehicle
@@ -63,7 +63,7 @@ def flight(vehicle, table):
     q = rotations.q_from_dcm(np.column_stack([x, y, np.cross(x, y)])[None])[0]
     state = state_from_ecef(0.0, r, v, q, np.array([17.907, 0.0, 0.0]))
     n = round((STOP_S - START_S) / RECORD_S) + 1
-    states, aux = integrate(body, packing.atmosphere_table(sounded(table)), state, 0.005, 50, n, lock_records=n)
+    states, aux = integrate(body, simulate.atmosphere_table(sounded(table)), state, 0.005, 50, n, lock_records=n)
     to_ecef = earth.q_ecef_eci(RECORD_S * np.arange(n))
     r = rotations.rotate(to_ecef, states[:, :3])
     v = rotations.rotate(to_ecef, states[:, 3:6]) - np.cross(earth.OMEGA_ECEF_RADPS, r)

@@ -13,7 +13,7 @@ from scipy.special import ellipk
 
 from flightmodel import rotations
 from flightmodel.vehicle import MassProperties
-from synthetic_flight import dynamics, packing
+from synthetic_flight import dynamics, simulate
 from synthetic_flight.simulate import integrate
 
 from .conftest import bent_entry_state, free_state, undamped, with_joint
@@ -107,7 +107,7 @@ def test_free_double_pendulum(vehicle, measured, stiffness):
     state[6:10], state[10:14] = (rotations.exp(np.array([0.0, angle, 0.0])) for angle in first[:2])
     state[14:20] = [0.0, first[2], 0.0, 0.0, first[3], 0.0]
     if stiffness:
-        states, _ = integrate(one, packing.vacuum_table(), state, 1e-4, 500, len(time))
+        states, _ = integrate(one, simulate.vacuum_table(), state, 1e-4, 500, len(time))
         assert len(states) == len(time)
     else:
         # a kernel's flight ends where the joint passes 90 deg; the readable equations go on
@@ -206,7 +206,7 @@ def test_turned_axes_fly_the_same_path(generic_vehicle, measured, angle_deg):
     copy = state.copy()
     copy[6:10], copy[10:14] = rotations.multiply(state[6:10], back), rotations.multiply(state[10:14], back)
     copy[14:17], copy[17:20] = dcm @ state[14:17], dcm @ state[17:20]
-    table = packing.atmosphere_table(SmoothAir())
+    table = simulate.atmosphere_table(SmoothAir())
     states, aux = integrate(one, table, state, 1e-3, 100, 101)
     turned, _ = integrate(other, table, copy, 1e-3, 100, 101)
     assert aux[:, 3].max() > 500.0

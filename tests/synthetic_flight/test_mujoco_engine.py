@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flightmodel import rotations
-from synthetic_flight import dynamics, packing
+from synthetic_flight import dynamics, simulate
 from synthetic_flight.simulate import integrate
 
 from .conftest import bent_entry_state, with_joint
@@ -132,7 +132,7 @@ def compare(vehicle, state, steps_s, seconds, measured, outer_joint):
     step_s, kernel_step_s = steps_s
     q_b, q_a, r, pressure = Engine(vehicle, state, outer_joint).fly(step_s, round(every / step_s), records)
     states, aux = integrate(
-        vehicle, packing.atmosphere_table(AIR), state, kernel_step_s, round(every / kernel_step_s), records
+        vehicle, simulate.atmosphere_table(AIR), state, kernel_step_s, round(every / kernel_step_s), records
     )
     assert len(states) == records
     name = "all joint laws: " if outer_joint else "MuJoCo's own joint: "

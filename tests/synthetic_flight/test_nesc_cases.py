@@ -14,7 +14,7 @@ import pytest
 
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile
-from synthetic_flight import packing
+from synthetic_flight import simulate
 from synthetic_flight.simulate import integrate
 
 from .rigid import rigid_vehicle
@@ -83,7 +83,7 @@ def fly(case, vehicle, step_s=0.005, planet=earth.WGS84, drag=1.0):
     state = np.concatenate([r, v, q, q, w, w])
     states, _ = integrate(
         body,
-        packing.atmosphere_table(air),
+        simulate.atmosphere_table(air),
         state,
         step_s,
         round(1.0 / step_s),

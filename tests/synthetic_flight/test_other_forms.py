@@ -16,7 +16,7 @@ import pytest
 
 from flightmodel import rotations
 from flightmodel.vehicle import MassProperties
-from synthetic_flight import dynamics, packing
+from synthetic_flight import dynamics, simulate
 from synthetic_flight.simulate import integrate
 
 from .conftest import bent_entry_state, with_joint
@@ -226,7 +226,7 @@ def test_flight_in_maximal_coordinates(generic_vehicle, measured):
     # Baumgarte's a and b: 0.05 / step (rule of thumb 0.1 to 1 over the step; RK4 is stable to 2.8)
     a = 0.05 / step
     q_b, q_a, r, drift = fly_maximal(vehicle, state, step, round(seconds / step), a, a)
-    states, aux = integrate(vehicle, packing.atmosphere_table(AIR), state, 2.5e-4, round(seconds / 2.5e-4), 2)
+    states, aux = integrate(vehicle, simulate.atmosphere_table(AIR), state, 2.5e-4, round(seconds / 2.5e-4), 2)
     assert aux[-1, 3] > 500.0  # dynamic pressure
     # fourth order at 1 ms over 2 s of modes up to 14 Hz: (0.09)^4 / 120 a radian, 1e-5 of 0.01 rad
     for name, ours, theirs in (("body", states[-1, 6:10], q_b), ("shell", states[-1, 10:14], q_a)):

@@ -6,10 +6,10 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.trajectory import move_point
-from synthetic_flight import radar_sensing, sensing
-from synthetic_flight.day_air import day_atmosphere, sense_atmosphere
+from synthetic_flight import sensing
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import child_rng, fly_scenario, read_scenario
+from synthetic_flight.weather import day_atmosphere, sense_atmosphere
 
 
 @pytest.fixture(scope="module")
@@ -90,21 +90,21 @@ def test_radar_tracks_the_true_cg_with_beam_noise(scenario, truth):
     still = site.model_copy(
         update=dict.fromkeys(("range_sd_m", "angle_sd_deg", "range_bias_m", "angle_bias_deg", "time_bias_s"), 0.0)
     )
-    at, clean = radar_sensing.sense_radar(truth, still, 300.0, np.random.default_rng(0))
+    at, clean = sensing.sense_radar(truth, still, 300.0, np.random.default_rng(0))
     place = (np.deg2rad(site.latitude_deg), np.deg2rad(site.longitude_deg), site.height_m)
     rows = np.searchsorted(truth.time_s, at - 1e-6)
     cg = rotations.rotate(earth.q_ecef_eci(at), truth.state_eci[rows, :3])
     np.testing.assert_allclose(earth.ecef_from_radar(clean, *place), cg, atol=1e-3)
     scattered = site.model_copy(update=dict.fromkeys(("range_bias_m", "angle_bias_deg", "time_bias_s"), 0.0))
-    noisy = radar_sensing.sense_radar(truth, scattered, 300.0, np.random.default_rng(0))[1]
+    noisy = sensing.sense_radar(truth, scattered, 300.0, np.random.default_rng(0))[1]
     error = noisy - clean
     across = np.rad2deg(np.column_stack([error[:, 1] * np.cos(clean[:, 2]), error[:, 2]]))
     # 1500 points: 1.8 % of a standard deviation, 3 sd
     np.testing.assert_allclose(np.std(across, axis=0), site.angle_sd_deg, rtol=0.06)
     assert np.std(error[:, 0]) == pytest.approx(site.range_sd_m, rel=0.06)
-    late = radar_sensing.sense_radar(
-        truth, still.model_copy(update={"time_bias_s": 0.02}), 300.0, np.random.default_rng(3)
-    )[1]
+    late = sensing.sense_radar(truth, still.model_copy(update={"time_bias_s": 0.02}), 300.0, np.random.default_rng(3))[
+        1
+    ]
     speed = np.gradient(clean[:, 0], at)
     delay = -(late[:, 0] - clean[:, 0]) / speed
     assert np.std(delay[50:-50]) < 1e-3 * np.abs(delay[50:-50]).mean()  # one delay for the whole track

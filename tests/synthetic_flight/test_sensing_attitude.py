@@ -10,11 +10,9 @@ from flightmodel.flightfolder import read_flight
 from flightmodel.geomagnetism_and_sun import magnetic_field_ned_t, sun_direction_ecef
 from flightmodel.instruments import dcm_body_from_sun_head, direction_from_sun_angles, sun_angles_from_direction
 from synthetic_flight.folder import simulate_to_folder
-from synthetic_flight.instrument_sections import Accelerometer, Dropouts, Magnetometer, SunSensors
+from synthetic_flight.instrument_errors import Accelerometer, Dropouts, Magnetometer, SunSensors, child
 from synthetic_flight.scenarios import fly_scenario, read_scenario
-from synthetic_flight.sensing import sense_accelerometer, sense_magnetometer
-from synthetic_flight.sun_sensing import sense_sun
-from synthetic_flight.triad_errors import child
+from synthetic_flight.sensing import sense_accelerometer, sense_magnetometer, sense_sun
 
 
 @pytest.fixture(scope="module")

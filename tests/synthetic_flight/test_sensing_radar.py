@@ -9,11 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from flightmodel import earth, rotations
 from flightmodel.refraction import refracted
-from synthetic_flight import radar_sensing
-from synthetic_flight.instrument_sections import Dropouts, Radar
-from synthetic_flight.radar_sensing import pedestal_errors, sense_radar
+from synthetic_flight import sensing
+from synthetic_flight.instrument_errors import Dropouts, Radar, child
 from synthetic_flight.scenarios import fly_scenario, read_scenario
-from synthetic_flight.triad_errors import child
+from synthetic_flight.sensing import pedestal_errors, sense_radar
 
 MIL = np.rad2deg(1e-3)  # a milliradian in degrees: large, so that second order shows
 SITE = {"latitude_deg": 37.841, "longitude_deg": -75.485, "height_m": 12.0, "rate_hz": 10.0}
@@ -187,7 +186,7 @@ def test_servo_lags_by_the_acceleration(truth):
 def test_wander_is_slow_and_across_the_line_of_sight():
     t = 5.0 * np.arange(20000)
     observed = np.column_stack([np.full(len(t), 1e5), np.zeros(len(t)), np.full(len(t), 1.0)])
-    out = radar_sensing.wander(t, observed, radar(wander_deg=MIL), np.random.default_rng(2))
+    out = sensing.wander(t, observed, radar(wander_deg=MIL), np.random.default_rng(2))
     across = out[:, 1:] * [np.cos(1.0), 1.0]
     # 20000 values correlated over 4 of them are 2500 independent ones: 1.4 % of a standard deviation
     np.testing.assert_allclose(across.std(axis=0), 1e-3, rtol=0.06)

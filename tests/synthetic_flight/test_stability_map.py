@@ -8,7 +8,7 @@ moderate stiffness and damping; oscillating ever wider at high stiffness where C
 import numpy as np
 import pytest
 
-from synthetic_flight.figures import figure_axdahl_zones
+from postflight.plots.stability import figure_axdahl_zones
 from synthetic_flight.linear import DIVERGENT, STABLE, UNSTABLE
 from synthetic_flight.stability_map import flown_map, linear_map
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from flightmodel.checks import ConfigError
-from synthetic_flight import packing
+from synthetic_flight import simulate
+from synthetic_flight.dynamics import joint_modes, largest_step_s
 from synthetic_flight.ensemble import Schedule, fly_ensemble
 from synthetic_flight.simulate import fly, integrate
-from synthetic_flight.step_size import joint_modes, largest_step_s
 
 from .conftest import free_state
 
@@ -28,7 +28,7 @@ def test_steps_beside_the_limit_do_as_it_says(vehicle, stiffness, damping):
     state[14:20] = 0.0
     state[17:19] = 1e-4
     for factor, stays in ((0.97, True), (1.03, False)):
-        states, aux = integrate(body, packing.vacuum_table(), state, factor * longest, 50, 21)
+        states, aux = integrate(body, simulate.vacuum_table(), state, factor * longest, 50, 21)
         assert (len(states) == 21 and aux[-1, 5] < 0.2) == stays
 
 

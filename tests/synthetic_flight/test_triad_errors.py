@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from synthetic_flight import triad_errors
-from synthetic_flight.triad_errors import (
+from synthetic_flight import instrument_errors
+from synthetic_flight.instrument_errors import (
     DropoutErrors,
     TriadErrors,
     child,
@@ -63,7 +63,7 @@ def test_delay_is_found_by_matching(delay_s, bandwidth_hz):
     t = STEP * np.arange(10000)
     at = t[500:-500]
     errors = TriadErrors(**QUIET, delay_s=delay_s, bandwidth_hz=bandwidth_hz)
-    late = triad_errors.sampled(at, t, wave(t), errors)
+    late = instrument_errors.sampled(at, t, wave(t), errors)
     tries = np.arange(-0.04, 0.041, 0.002)
     for axis in range(3):
         # where the difference of late and shifted signals is smallest; near there it is a parabola
@@ -78,17 +78,17 @@ def test_delay_is_found_by_matching(delay_s, bandwidth_hz):
 
 def test_clocks_scatter_as_declared_and_move_nothing_else():
     errors = TriadErrors(**QUIET, time_bias_s=0.002)
-    late = [triad_errors.clock_late_s(errors, np.random.default_rng(seed)) for seed in range(400)]
+    late = [instrument_errors.clock_late_s(errors, np.random.default_rng(seed)) for seed in range(400)]
     low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 400) / 400
     assert low < np.mean(np.square(late)) / 0.002**2 < high
     rng = np.random.default_rng(1)
-    assert triad_errors.clock_late_s(TriadErrors(**QUIET), rng) == 0.0
-    triad_errors.clock_late_s(errors, rng)
+    assert instrument_errors.clock_late_s(TriadErrors(**QUIET), rng) == 0.0
+    instrument_errors.clock_late_s(errors, rng)
     assert rng.standard_normal() == np.random.default_rng(1).standard_normal()
     t = STEP * np.arange(2000)
     at = t[500:-500]
     both = [
-        triad_errors.sampled(at, t, wave(t), TriadErrors(**QUIET, delay_s=d), late)
+        instrument_errors.sampled(at, t, wave(t), TriadErrors(**QUIET, delay_s=d), late)
         for d, late in ((0.003, 0.002), (0.005, 0.0))
     ]
     np.testing.assert_allclose(*both, atol=1e-12)

@@ -8,15 +8,14 @@ import pytest
 import trimesh
 
 import flightmodel
-from estimators.horizon import find_horizon
+from estimators.edge import find_horizon
 from estimators.virtual_camera import VirtualCamera
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
-from flightmodel.geometry import bend, vehicle_meshes
-from flightmodel.vehicle import CameraMount, ShellGeometry
-from synthetic_flight.shell_renderer import ShellRenderer
-from synthetic_flight.video import Imaging, real_camera, record, render_video
+from flightmodel.geometry import ShellGeometry, bend, vehicle_meshes
+from flightmodel.vehicle import CameraMount
+from synthetic_flight.film import Imaging, ShellRenderer, real_camera, record, render_video
 
 TABLES = tomllib.loads((Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml").read_text())
 GEOMETRY = ShellGeometry.model_validate(TABLES["geometry"])

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Telemetry, TriadRecord
-from postflight.pipeline import Flight, reconstruct_telemetry
+from postflight.flight import Flight, reconstruct_telemetry
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 

@@ -17,17 +17,23 @@ from flightmodel import rotations
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight.cli import cli
-from postflight.pipeline import reconstruct_telemetry
+from postflight.flight import reconstruct_telemetry
 from postflight.reconciliation.answer import joint_table, vehicle_lines
-from postflight.reconciliation.candidate import AirUnknowns, VehicleUnknowns
-from postflight.reconciliation.fit import reconcile
-from postflight.reconciliation.freeplay import false_spans, reconcile_loose
-from postflight.reconciliation.laws import explain
-from postflight.reconciliation.observed import observe
+from postflight.reconciliation.candidate import AirUnknowns, VehicleUnknowns, observe
+from postflight.reconciliation.fit import explain, false_spans, reconcile, reconcile_loose
 from postflight.reconciliation.posterior import posterior_summary, sample
-from postflight.reconciliation.problem import Problem, Unknowns
-from postflight.reconciliation.spans import ATTITUDE, BENDING, BENDING_RATE, RATE, Candidate, Flights, fly_spans
-from synthetic_flight import packing
+from postflight.reconciliation.problem import (
+    ATTITUDE,
+    BENDING,
+    BENDING_RATE,
+    RATE,
+    Candidate,
+    Flights,
+    Problem,
+    Unknowns,
+    fly_spans,
+)
+from synthetic_flight import simulate
 from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed
 
@@ -141,8 +147,8 @@ def test_spans_of_the_true_flight_join(problem, flown):
     motion = np.column_stack([turned, state[:, 14:17], rotations.log(bent), across])
     spans = np.arange(seen.spans)
     zero = np.zeros_like(spans)
-    true = Candidate(vehicle, packing.parameter_vector(vehicle))
-    flights = Flights(spans, zero, motion[:-1], zero, [true], [packing.atmosphere_table(truth.profile)])
+    true = Candidate(vehicle, simulate.parameter_vector(vehicle))
+    flights = Flights(spans, zero, motion[:-1], zero, [true], [simulate.atmosphere_table(truth.profile)])
     read = fly_spans(replace(seen, start=place), vehicle, flights)
     assert np.abs(motion[:, BENDING]).max() > 0.02
     assert np.abs(read.end - motion[1:]).max() < np.deg2rad(2e-4)
@@ -152,7 +158,7 @@ def test_spans_of_the_true_flight_join(problem, flown):
 @pytest.mark.parametrize(("step_m", "low", "high"), [(250.0, 0.0, 0.1), (50.0, 0.3, 1.0)])
 def test_the_flight_tells_how_fine_its_air_was(step_m, low, high, tmp_path_factory, monkeypatch):
     """Synthetic air is straight between points; knots are 125 m apart."""
-    monkeypatch.setattr("synthetic_flight.day_air.STEP_M", step_m)
+    monkeypatch.setattr("synthetic_flight.weather.STEP_M", step_m)
     found = reconcile(reconstruct_telemetry(read_flight(fly(tmp_path_factory, 0.0)[0])))
     assert low < found.problem.air.fine < high
 

@@ -2,7 +2,7 @@
 
 C_A at zero angle: for Mach >= 2.5, 1.094 times modified Newtonian plus base drag of 64 % of the vacuum limit, within
 0.3 % of published 60 deg sphere-cone values; below, own rounding of blunt-cone data. Its shape with angle, C_N and
-C_m: modified Newtonian (`flightmodel.newtonian`), C_N and C_m times k_N, which falls from 1.00 at Mach 5.7 to 0.45 at
+C_m: modified Newtonian (`flightmodel.sphere_cone`), C_N and C_m times k_N, which falls from 1.00 at Mach 5.7 to 0.45 at
 3.5 and below: the value that reconciles the seed paper with itself. C_mq: a family-shaped table for 60 to 70 deg
 capsules, unstable at small angles below Mach 3. None of it is IRVE-II's own data. Run: ``python irve2_reference.py``.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flightmodel.newtonian import sphere_cone_closed_form, sphere_cone_quadrature, stagnation_cp
+from flightmodel.sphere_cone import sphere_cone_closed_form, sphere_cone_quadrature, stagnation_cp
 
 HALF_ANGLE = np.deg2rad(60.0)
 SHAPE = (HALF_ANGLE, 0.38, 1.5, 3.0)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from flightmodel.checks import GateError
-from postflight.report import bands
+from postflight.report import panels
 from postflight.report.source import read_run
 from postflight.report.write import page, write_report
 
@@ -37,7 +37,7 @@ def test_share_is_that_of_the_pulse_inside(run, tmp_path):
     # right about the flight in the pulse's first half, far off in its second and outside of it
     off = np.where((t < middle) & (t > pulse[0] - 1.0), 0.0, 50.0)
     path = study(tmp_path, "before <b>", "alpha_total_deg", t, alpha + off - 0.5, alpha + off + 0.5)
-    (panel,) = bands.study_panels(run, (path,))
+    (panel,) = panels.study_panels(run, (path,))
     words = panel["lines"][0]["label"]
     assert words.startswith("before <b>, half above; ")
     assert float(re.search(r"(\d+) % of the pulse inside", words)[1]) == pytest.approx(50.0, abs=6.0)
@@ -54,7 +54,7 @@ def test_several_studies_share_a_panel(run, tmp_path):
     wide, narrow = np.zeros(31), np.full(31, 3.0)
     first = study(tmp_path, "one", "mach", t, wide, wide + 9.0)
     second = study(tmp_path, "two", "mach", t, narrow, narrow + 0.1, nominal=narrow)
-    (panel,) = bands.study_panels(run, (first, second))
+    (panel,) = panels.study_panels(run, (first, second))
     labels = [line["label"] for line in panel["lines"]]
     assert [label.partition(",")[0] for label in labels] == ["one", "two", "two", "this flight"]
     assert "100 % of the pulse inside" in labels[0]
@@ -71,12 +71,12 @@ def test_what_holds_no_bands_is_refused(run, reported, tmp_path):
         write_report(reported, target=tmp_path / "r.html", studies=(tmp_path / "empty",))
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     with pytest.raises(GateError, match="no table of bands"):
-        bands.study_panels(run, (tmp_path / "other.csv",))
+        panels.study_panels(run, (tmp_path / "other.csv",))
     (tmp_path / "bare").mkdir()
     (tmp_path / "bare" / "bands.csv").write_text("history,time_s,flights,p2.3,p50,p97.7\n")
     with pytest.raises(GateError, match=r"name histories in the dispersions file's \[outputs\]"):
-        bands.study_panels(run, (tmp_path / "bare",))
+        panels.study_panels(run, (tmp_path / "bare",))
     late = study(tmp_path, "late", "mach", np.array([900.0, 901.0]), np.zeros(2), np.ones(2))
     with pytest.raises(GateError, match=r"none of a quantity .* and time of this flight's pulse"):
-        bands.study_panels(run, (late,))
+        panels.study_panels(run, (late,))
     assert not (tmp_path / "r.html").exists()

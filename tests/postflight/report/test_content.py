@@ -15,9 +15,8 @@ import pytest
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_clock
 from postflight.report import pictures, words
-from postflight.report.series import with_holes
-from postflight.report.source import read_run
-from postflight.report.thinning import extreme_rows, kept_rows, rounded
+from postflight.report.panels import with_holes
+from postflight.report.source import extreme_rows, kept_rows, read_run, rounded
 from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
 from tests.postflight.report.conftest import HOSTILE
 

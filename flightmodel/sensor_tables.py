@@ -1,0 +1,616 @@
+"""Tables of what tells where the vehicle is: radars, satellite navigation receivers, barometers.
+
+Tables of what flew on board: triads with their mounting, Sun heads, video frames.
+
+Triads sampled far faster than a vehicle moves: means of blocks of samples in their place.
+
+A block's mean keeps the integral that mechanisation forms from its samples, and the density of their noise; what is
+lost is motion within a block. Memory and time of everything after the reading go with the number of samples.
+
+The day's sounding through the gate: rows in order, winds turned to where the air goes, what is missing said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from flightmodel import earth, tables
+from flightmodel.atmosphere import R_AIR_JPKGK, default_sounding_sd, height_from_pressure, profile_from_sounding
+from flightmodel.checks import BoolArray, FloatArray, nearest_name
+from flightmodel.film import Frames, doubt_of_film, fault_of_film, fault_of_image
+from flightmodel.flightfile import FlightFile
+from flightmodel.gate import Gate, Table, find_faults, oversampled, rows_to_use
+from flightmodel.instruments import (
+    AtmosphereEntry,
+    BarometerEntry,
+    BarometerSpec,
+    FramesEntry,
+    GnssEntry,
+    GnssSpec,
+    MagnetometerEntry,
+    RadarEntry,
+    RadarSite,
+    RatesEntry,
+    SunEntry,
+    SunHeads,
+    TriadEntry,
+    TriadSpec,
+)
+from flightmodel.telemetry import BarometerRecord, Finding, GnssRecord, RadarRecord, Sounding, SunRecord, TriadRecord
+from flightmodel.vehicle import CameraMount, Vehicle
+
+ECEF, GEODETIC = ("x", "y", "z"), ("lat", "lon", "alt")
+ECEF_SPEEDS, NED_SPEEDS = ("vx", "vy", "vz"), ("vn", "ve", "vd")
+LEAST_RADIUS_M, LEAST_HEIGHT_M = 6.3e6, -12e3  # below every ocean's floor
+FASTEST_MPS = 2e4
+LOWEST_BAROMETER_M, HIGHEST_BAROMETER_M = -2000.0, 80e3
+
+
+def read_radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
+    """Read one radar's track; None, with the faults kept, where anything in it is refused."""
+    label = f"radars.{name}"
+    table = gate.table(label, source, tables.RADAR)
+    if table is None or table.time_s is None:
+        return None
+    before = len(gate.faults)
+    gate.refuse_rows(table, "range", 1.0, np.inf, "no slant range")
+    gate.refuse_rows(table, "el", -0.5 * np.pi, 0.5 * np.pi, "no elevation")
+    if len(gate.faults) > before:
+        return None
+    azimuth = np.mod(table.columns["az"], 2.0 * np.pi)
+    values = np.column_stack([table.columns["range"], azimuth, table.columns["el"]])
+    if not np.isfinite(values).all(axis=1).any():
+        gate.faults.append(f"{label}: {table.path}: no track point with range, azimuth and elevation; remove the radar")
+        return None
+    gate.findings.extend(find_faults(name, table.time_s, ("range", "az", "el"), values))
+    gate.findings.extend(oversampled(name, table.time_s, source.every_s))
+    return RadarRecord(_site(name, source), table.time_s, values, source.tracks, source.every_s)
+
+
+def _site(name: str, source: RadarEntry) -> RadarSite:
+    lat, lon, angle_sd, angle_bias_sd = np.deg2rad(
+        [source.latitude_deg, source.longitude_deg, source.angle_sd_deg, source.angle_bias_sd_deg]
+    )
+    mislevel, droop, skew, square, wander = np.deg2rad(
+        [
+            source.mislevel_sd_deg,
+            source.droop_sd_deg,
+            source.skew_sd_deg,
+            source.nonorthogonality_sd_deg,
+            source.wander_sd_deg,
+        ]
+    )
+    own = [None if sd is None else float(np.deg2rad(sd)) for sd in (source.azimuth_sd_deg, source.elevation_sd_deg)]
+    return RadarSite(
+        name, lat, lon, source.height_m, source.range_sd_m, angle_sd, source.range_bias_sd_m, angle_bias_sd,
+        source.time_bias_sd_s, mislevel, droop, skew, square, wander, source.wander_time_constant_s,
+        source.refraction_sd, source.range_scale_sd, *own,
+    )  # fmt: skip
+
+
+def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:
+    """Read one receiver's fixes; None, with the faults kept, where anything in them is refused."""
+    label = f"gnss.{name}"
+    least = {"nsat": source.min_satellites, "fix_mode": source.min_fix_mode}
+    asked = {short: count for short, count in least.items() if count is not None}
+    table = gate.table(label, source, tables.GNSS + tuple(tables.GNSS_COUNTS[short] for short in asked))
+    if table is None or table.time_s is None:
+        return None
+    before = len(gate.faults) + len(gate.config)
+    good = _good_fixes(gate, name, table, asked)
+    if not good.any():
+        return None
+    time_s, table = table.time_s[good], table.of_rows(good)
+    position = _positions(gate, table, source)
+    if position is None or len(gate.faults) + len(gate.config) > before:
+        return None
+    if not np.isfinite(position).all(axis=1).any():
+        gate.faults.append(f"{label}: {table.path}: no fix with a whole position; remove the receiver")
+        return None
+    velocity = _velocities(gate, table, source, position)
+    if velocity is None:
+        return None
+    gate.findings.extend(find_faults(name, time_s, ("x", "y", "z"), position))
+    gate.findings.extend(oversampled(name, time_s, source.every_s))
+    return GnssRecord(_gnss_spec(name, source), time_s, position, velocity, source.every_s)
+
+
+def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> BoolArray:
+    """Which fixes (n,) have satellites and mode enough; a missing count is too few."""
+    good = np.ones(len(table.lines), dtype=bool)
+    for short, count in asked.items():
+        with np.errstate(invalid="ignore"):
+            enough = table.columns[short] >= count
+        if not enough.all():
+            what = "satellites" if short == "nsat" else "mode"
+            words = f"{int((~enough).sum())} of {len(enough)} fixes have {what} below {count} and are left out"
+            gate.findings.append(Finding(name, words, np.nan, np.nan))
+        good &= enough
+    if good.sum() < 2:
+        gate.faults.append(
+            f"{table.label}: {table.path}: {good.sum()} fixes are good enough by flight.toml; lower what it asks"
+        )
+    return good
+
+
+def _positions(gate: Gate, table: Table, source: GnssEntry) -> FloatArray | None:
+    """ECEF positions (n, 3), m, from whichever columns are there; those that flight.toml declares go first."""
+    whole = {form: set(form) <= set(table.columns) for form in (ECEF, GEODETIC)}
+    stated = [form for form in (ECEF, GEODETIC) if set(form) & set(source.columns)]
+    if len(stated) == 2:
+        gate.refuse_config(
+            f"{table.label}.columns declares {' '.join(ECEF)} and {' '.join(GEODETIC)}; keep one of the two"
+        )
+        return None
+    form = stated[0] if stated else ECEF if whole[ECEF] else GEODETIC
+    if not whole[form]:
+        canonical = {q.short: q.canonical for q in tables.GNSS}
+        absent = ", ".join(canonical[short] for short in form if short not in table.columns)
+        gate.faults.append(
+            f"{table.label}: {table.path}: line 1: no column {absent}; a position is lat_deg, lon_deg, alt_m, or "
+            f"x_ecef_m, y_ecef_m, z_ecef_m; other columns are declared in {table.label}.columns"
+        )
+        return None
+    if form == ECEF:
+        position = np.column_stack([table.columns[short] for short in ECEF])
+        radius = np.linalg.norm(position, axis=1)
+        _refuse_fixes(gate, table, radius < LEAST_RADIUS_M, "lies inside the Earth")
+        return np.where(np.isfinite(radius)[:, None], position, np.nan)
+    if source.height_is is None:
+        words = 'alt is above what? write height_is = "ellipsoid", or height_is = "msl" with geoid_undulation_m'
+        gate.refuse_config(f"{table.label}: {words}; the two differ by up to 107 m")
+        return None
+    gate.refuse_rows(table, "lat", -0.5 * np.pi, 0.5 * np.pi, "no latitude")
+    gate.refuse_rows(table, "alt", LEAST_HEIGHT_M, np.inf, "below any ground")
+    lat, lon, alt = (table.columns[short] for short in GEODETIC)
+    gate.refuse_rows(table, "lon", -2.0 * np.pi, 2.0 * np.pi, "no longitude")
+    _refuse_fixes(gate, table, (lat == 0.0) & (lon == 0.0), "is at latitude and longitude 0")
+    position = earth.ecef_from_geodetic(lat, lon, alt + source.to_ellipsoid_m)
+    return np.where(np.isfinite(lat + lon + alt)[:, None], position, np.nan)
+
+
+def _refuse_fixes(gate: Gate, table: Table, bad: BoolArray, words: str) -> None:
+    if bad.any():
+        k, count = int(np.argmax(bad)), int(bad.sum())
+        hint = "as receivers write that have none: leave the cells empty, or ask for min_satellites or min_fix_mode"
+        gate.faults.append(f"{table.at(k)}: the fix {words} ({count} in all), {hint}")
+
+
+def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: FloatArray) -> FloatArray | None:
+    """ECEF velocities (n, 3), m/s, NaN where there are none; None, with a fault, where some components lack."""
+    nothing: FloatArray = np.full(position_ecef_m.shape, np.nan)
+    if not source.velocity:
+        return nothing
+    there = {form: set(form) & set(table.columns) for form in (ECEF_SPEEDS, NED_SPEEDS)}
+    for form, found in there.items():
+        if found and found != set(form):
+            absent = ", ".join(sorted(set(form) - found))
+            words = f"a velocity lacks {absent}; declare it in {table.label}.columns, or write velocity = false"
+            gate.faults.append(f"{table.label}: {table.path}: line 1: {words}")
+            return None
+    stated = [form for form in there if set(form) & set(source.columns)]
+    form = stated[0] if len(stated) == 1 else ECEF_SPEEDS if there[ECEF_SPEEDS] else NED_SPEEDS
+    if not there[form]:
+        return nothing
+    before = len(gate.faults)
+    for short in form:
+        gate.refuse_rows(table, short, -FASTEST_MPS, FASTEST_MPS, "no speed near the Earth")
+    if len(gate.faults) > before:
+        return None
+    velocity = np.column_stack([table.columns[short] for short in form])
+    whole = np.isfinite(velocity).all(axis=1)
+    if form == NED_SPEEDS:
+        # a velocity without a position cannot be turned
+        whole &= np.isfinite(position_ecef_m).all(axis=1)
+        nothing[whole] = earth.ecef_from_ned(velocity[whole], position_ecef_m[whole])
+    else:
+        nothing[whole] = velocity[whole]
+    return nothing
+
+
+def _gnss_spec(name: str, source: GnssEntry) -> GnssSpec:
+    return GnssSpec(
+        name,
+        np.array(source.antenna_from_datum_body_m),
+        source.horizontal_sd_m,
+        source.vertical_sd_m,
+        source.speed_sd_mps,
+        source.vertical_speed_sd_mps,
+        source.wander_sd_m,
+        source.wander_time_constant_s,
+        source.time_bias_sd_s,
+    )
+
+
+def read_barometer(
+    gate: Gate, name: str, source: BarometerEntry, sounding: Sounding | None, measured_air: bool
+) -> BarometerRecord | None:
+    """Read one barometer as heights above the ellipsoid; None, with the faults kept, where it is refused.
+
+    Pressures become heights by the flight's air; ``measured_air`` says whether that is a sounding or the standard's.
+    """
+    label = f"barometers.{name}"
+    table = gate.table(label, source, tables.BAROMETER)
+    if table is None or table.time_s is None:
+        return None
+    form = _barometer_form(gate, table, source)
+    if form is None or sounding is None:
+        return None
+    before = len(gate.faults)
+    if form == "pressure":
+        profile = profile_from_sounding(sounding)
+        limits = profile.at(np.array([HIGHEST_BAROMETER_M, LOWEST_BAROMETER_M])).pressure_pa
+        low, high = float(limits[0]), float(limits[1])
+        gate.refuse_rows(table, "pressure", low, high, "no static pressure between -2 and 80 km")
+    else:
+        gate.refuse_rows(table, "height", LEAST_HEIGHT_M, HIGHEST_BAROMETER_M, "no height that a barometer tells")
+    if len(gate.faults) > before:
+        return None
+    if form == "pressure":
+        height = height_from_pressure(profile, table.columns["pressure"])
+        air = "the day's sounding" if measured_air else "the US Standard Atmosphere 1976"
+        words = f"pressures became heights by {air}"
+        if source.use_s is None:
+            words += (
+                "; near and above the speed of sound a port does not tell static pressure: use_s can leave that out"
+            )
+        gate.findings.append(Finding(name, words, np.nan, np.nan))
+    else:
+        height = table.columns["height"]
+    height = height + source.to_ellipsoid_m
+    if not np.isfinite(height).any():
+        gate.faults.append(f"{label}: {table.path}: every reading is missing; remove the barometer")
+        return None
+    gate.findings.extend(find_faults(name, table.time_s, (form,), height[:, None]))
+    spec = BarometerSpec(
+        name,
+        source.sd_m,
+        source.bias_sd_m,
+        source.scale_sd,
+        source.wander_sd_m,
+        source.wander_time_constant_s,
+        source.time_bias_sd_s,
+    )
+    gate.findings.extend(oversampled(name, table.time_s, source.every_s))
+    return BarometerRecord(spec, table.time_s, height, source.every_s)
+
+
+def _barometer_form(gate: Gate, table: Table, source: BarometerEntry) -> str | None:
+    """Whether the table's heights or its pressures are read; None, with the faults kept, where that is not clear."""
+    there = [short for short in ("height", "pressure") if short in table.columns]
+    stated = [short for short in there if short in source.columns]
+    clear = next((shorts for shorts in (there, stated) if len(shorts) == 1), None)
+    form = clear[0] if clear else None
+    if not there:
+        words = "no column height_m and none pressure_pa; declare one of the two"
+        gate.faults.append(f"{table.label}: {table.path}: line 1: {words} in {table.label}.columns")
+    elif form is None:
+        words = "heights and pressures are both there; declare the one to read"
+        gate.refuse_config(f"{table.label}: {words} in {table.label}.columns, as height or as pressure")
+    if form is not None and source.height_is is None:
+        words = 'say height_is = "ellipsoid", or height_is = "msl" with geoid_undulation_m (pressures too)'
+        gate.refuse_config(f"{table.label}: heights above what? {words}")
+        return None
+    return form
+
+
+Triad = TriadEntry | RatesEntry | MagnetometerEntry
+TRIAD_COLUMNS = {
+    TriadEntry: tables.ACCELEROMETER,
+    RatesEntry: tables.RATES,
+    MagnetometerEntry: tables.MAGNETOMETER,
+}
+BODY = "body"  # the mount of a triad along body axes
+# package of the vehicle file where flight.toml names none
+DEFAULT_PACKAGE = {TriadEntry: "suba", RatesEntry: BODY, MagnetometerEntry: "magnetometer"}
+
+
+def read_triad(gate: Gate, name: str, spec: FlightFile, vehicle: Vehicle | None) -> TriadRecord | None:
+    """Read a triad that flight.toml names; None where it names none, or, with the faults kept, where it is refused."""
+    source: Triad | None = getattr(spec.sensors, name)
+    if source is None:
+        return None
+    quantities = TRIAD_COLUMNS[type(source)]
+    mounting = _mounting(gate, name, source, spec, vehicle)
+    table = gate.table(f"sensors.{name}", source, quantities)
+    if table is None or table.time_s is None:
+        return None
+    values = np.column_stack([table.columns[q.short] for q in quantities])
+    if not np.isfinite(values).all(axis=1).any():
+        gate.faults.append(f"sensors.{name}: {table.path}: every sample is missing")
+        return None
+    gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in quantities), values))
+    if mounting is None:
+        return None
+    if isinstance(source, MagnetometerEntry) and source.reversed:
+        values = -values
+    record, told = averaged(TriadRecord(_triad_spec(name, source, *mounting), table.time_s, values))
+    gate.findings.extend(told)
+    return record
+
+
+def _mounting(
+    gate: Gate, name: str, source: Triad, spec: FlightFile, vehicle: Vehicle | None
+) -> tuple[FloatArray, FloatArray] | None:
+    """Place (3,) and ``dcm_body_sensor`` (3, 3); None, with a fault kept, where no package of that name is known."""
+    package = source.mount or DEFAULT_PACKAGE[type(source)]
+    if source.axes is not None or package == BODY:
+        return source.place_m, source.dcm_body_sensor
+    if spec.vehicle is None:
+        said = "nothing is said of its mount" if source.mount is None else f"mount = '{package}' is a vehicle's package"
+        words = (
+            'write mount = "body" (along body axes) or axes = ["+x", "+y", "+z"] with the body axis of each of its axes'
+        )
+        gate.refuse_config(f"sensors.{name}: {said}, and flight.toml names no vehicle; {words}")
+        return None
+    if vehicle is None:  # refused already
+        return None
+    if package not in vehicle.sensors:
+        known = [*vehicle.sensors, BODY]
+        hint = nearest_name(package, known)
+        gate.refuse_config(f"sensors.{name}.mount = '{package}'{hint}: not on vehicle '{vehicle.name}'")
+        return None
+    mount = vehicle.sensors[package]
+    return np.array(mount.position_from_datum_body_m), mount.dcm_body_sensor
+
+
+def _triad_spec(name: str, source: Triad, place_m: FloatArray, dcm: FloatArray) -> TriadSpec:
+    soft_iron = 0.0
+    if isinstance(source, RatesEntry):
+        in_files = [source.noise_sd_degps, source.bias_sd_degps, source.resolution_degps, source.bias_wander_sd_degps]
+        noise, bias, step, wander = np.deg2rad(in_files)
+    elif isinstance(source, MagnetometerEntry):
+        in_files = [source.noise_sd_ut, source.bias_sd_ut, source.resolution_ut, source.bias_wander_sd_ut]
+        noise, bias, step, wander = 1e-6 * np.array(in_files)
+        soft_iron = source.soft_iron_sd
+    else:
+        noise, bias, step = source.noise_sd_mps2, source.bias_sd_mps2, source.resolution_mps2
+        wander = source.bias_wander_sd_mps2
+    return TriadSpec(
+        name,
+        place_m,
+        dcm,
+        float(noise),
+        float(bias),
+        source.scale_sd,
+        float(np.deg2rad(source.mount_sd_deg)),
+        float(step),
+        soft_iron,
+        float(wander),
+        source.bias_time_constant_s if wander > 0.0 else np.inf,
+        0.0 if isinstance(source, MagnetometerEntry) else source.time_bias_sd_s,
+    )
+
+
+def read_sun(gate: Gate, source: SunEntry) -> SunRecord | None:
+    """Read the Sun heads; None, with the faults kept, where anything in the table is refused."""
+    heads = len(source.heads_lv_deg)
+    quantities = tables.sun_quantities(heads)
+    table = gate.table("sensors.sun", source, quantities)
+    if table is None or table.time_s is None:
+        return None
+    before = len(gate.faults)
+    for q in quantities:
+        # an elevation may pass 90 deg by its noise
+        limit = np.pi if q.short.startswith("az") else 0.6 * np.pi
+        gate.refuse_rows(table, q.short, -limit, limit, "no angle of a head")
+    if len(gate.faults) > before:
+        return None
+    values = np.column_stack([table.columns[q.short] for q in quantities])
+    seen = np.isfinite(values.reshape(-1, heads, 2)).all(axis=2)
+    dark = np.asarray(seen.sum(axis=1) == 0)
+    if dark.all():
+        gate.faults.append(f"sensors.sun: {table.path}: no head ever sees the Sun; remove [sensors.sun]")
+        return None
+    gate.findings.extend(find_faults("sun", table.time_s, tuple(q.short for q in quantities), values, dark))
+    noise, bias, mount, field = np.deg2rad(
+        [source.noise_sd_deg, source.bias_sd_deg, source.mount_sd_deg, source.field_deg]
+    )
+    spec = SunHeads("sun", np.deg2rad(source.heads_lv_deg), field, noise, bias, mount)
+    return SunRecord(spec, table.time_s, values.reshape(-1, heads, 2))
+
+
+def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Frames | None:
+    """Read the list of frames and check every picture; None, with the faults kept, where anything is refused."""
+    label = "frames"
+    if source.columns:
+        gate.refuse_config("frames.columns: the frame list has only t_s and frame")
+    if (source.folder is None) == (source.film is None):
+        gate.refuse_config("frames: one of folder (of images) and film (a .webm, .mp4 or .avi file) is wanted")
+        return None
+    path, images = gate.path(source.file), gate.path(source.film or source.folder or "")
+    if vehicle is not None and source.camera not in vehicle.cameras:
+        hint = nearest_name(source.camera, list(vehicle.cameras))
+        gate.refuse_config(f"frames.camera = '{source.camera}'{hint}: not on vehicle '{vehicle.name}'")
+        return None
+    if path is None or images is None or vehicle is None:
+        return None
+    table = gate.csv(path, label)
+    if table is None:
+        return None
+    time_s = tables.times_s(table, source.time_column, gate.t0, path, label, gate.faults)
+    if "frame" not in table.columns:
+        gate.faults.append(f"{label}: {path}: line 1: no column 'frame'{nearest_name('frame', table.columns)}")
+        return None
+    camera = vehicle.cameras[source.camera]
+    used = np.ones(len(table), dtype=bool)
+    if time_s is not None:
+        time_s = time_s + source.time.offset_s
+        used, findings = rows_to_use(label, source, time_s)
+        gate.findings.extend(findings)
+        time_s = time_s[used]
+    if source.film is None:
+        paths, numbers = _image_paths(gate, images, table, used, path, camera), None
+    else:
+        paths, numbers = (images,), _film_numbers(gate, images, table, used, path, camera)
+    if time_s is None:
+        return None
+    if not len(time_s):
+        gate.faults.append(f"{label}: {path}: use_s leaves no frame")
+        return None
+    if not time_s[0] - 2.0 <= source.benchmark_s <= time_s[-1] + 2.0:
+        span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
+        gate.refuse_config(f"frames.benchmark_s = {source.benchmark_s}: frames span {span}")
+        return None
+    return Frames(camera, source.camera, time_s, paths, source.benchmark_s, numbers, source.time_bias_sd_s)
+
+
+def _image_paths(
+    gate: Gate, images: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount
+) -> tuple[Path, ...]:
+    """Path of every frame's image; what is wrong with one becomes a fault."""
+    names, paths = table["frame"].astype(str).str.strip(), []
+    for row in np.flatnonzero(used).tolist():
+        image = images / names.iloc[row]
+        wrong = gate.wrong_place(image, names.iloc[row]) or fault_of_image(image, camera)
+        if wrong:
+            where = f"frames: {path}: line {tables.line_of(table, row)}: {image}"
+            gate.faults.append(f"{where}: {wrong}; replace the file or remove the line")
+        paths.append(image)
+    return tuple(paths)
+
+
+def _film_numbers(
+    gate: Gate, film: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount
+) -> NDArray[np.int64]:
+    """Number of every frame in the film; what is wrong becomes a fault."""
+    text = table["frame"].astype(str).str.strip()
+    whole = text.str.fullmatch(r"\d{1,9}").to_numpy(dtype=bool)
+    for row in np.flatnonzero(used & ~whole)[:5].tolist():
+        where = f"frames: {path}: line {tables.line_of(table, row)}: frame '{text.iloc[row]}'"
+        gate.faults.append(f'{where}: with film = "{film.name}" a frame\'s number is wanted, the first being 0')
+    numbers = np.array([int(t) for t in text.to_numpy()[used & whole]], dtype=np.int64)
+    if len(numbers) and (np.diff(numbers) < 0).any():
+        row = int(np.flatnonzero(used & whole)[int(np.argmax(np.diff(numbers) < 0)) + 1])
+        where = f"frames: {path}: line {tables.line_of(table, row)}"
+        gate.faults.append(f"{where}: frame numbers fall where times rise; sort the list by time")
+    wrong = fault_of_film(film, camera, int(numbers.max(initial=0)))
+    if wrong:
+        gate.faults.append(f"frames: {film}: {wrong}")
+        return numbers
+    again = int((np.diff(numbers) == 0).sum())
+    if again:
+        words = f"{path.name}: {again} of {len(numbers)} lines name the same frame as the line before; check the list"
+        gate.findings.append(Finding("frames", words, np.nan, np.nan))
+    doubt = doubt_of_film(film)
+    if doubt:
+        gate.findings.append(Finding("frames", f"{film.name}: {doubt}", np.nan, np.nan))
+    return numbers
+
+
+LARGEST_RATE_HZ = 2000.0  # samples that come slower are used as they are
+WANTED_RATE_HZ = 1000.0  # a sine of 100 Hz, beyond structure and joint, loses 1.6 % in means of 1 ms
+STEADY = 0.99  # part of the steps that must be the usual one within a fifth
+WHOLE = 0.75  # part of a block's samples that its mean needs
+
+
+def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
+    """Means of blocks at about 1 kHz of a record of more than 2 kHz, and a finding; other records as they are.
+
+    Noise and resolution of the record's data sheet become those of a mean. A record whose rate changes is left as it
+    is: its means would not all have one noise.
+    """
+    step = np.diff(record.time_s)
+    usual = float(np.median(step))
+    count = int(1.0 / (usual * WANTED_RATE_HZ) + 0.5)
+    if usual * LARGEST_RATE_HZ >= 1.0 or np.mean(np.abs(step - usual) < 0.2 * usual) < STEADY:
+        return record, []
+    del step
+    block = ((record.time_s - record.time_s[0]) / (count * usual) + 0.5 / count).astype(np.int64)
+    first = np.flatnonzero(np.diff(block, prepend=-1))
+    whole = np.diff(first, append=len(block)) >= WHOLE * count
+    time_s = _means(record.time_s, first, 1.0)[whole]
+    means = np.column_stack([_means(column, first, WHOLE * count)[whole] for column in record.measured_sensor.T])
+    spec = replace(
+        record.spec, noise_sd=record.spec.noise_sd / np.sqrt(count), resolution=record.spec.resolution / np.sqrt(count)
+    )
+    words = f"{len(block)} samples at {1.0 / usual:.0f} Hz, of which means of {count} are used"
+    return TriadRecord(spec, time_s, means), [Finding(spec.name, words, np.nan, np.nan)]
+
+
+def _means(column: FloatArray, first: NDArray[np.int64], least: float) -> FloatArray:
+    """Mean of the values that are there from each of ``first`` to the next; NaN where fewer than ``least`` are."""
+    there = np.isfinite(column)
+    count = np.add.reduceat(there, first, dtype=np.int64)
+    sums = np.add.reduceat(np.where(there, column, 0.0), first)
+    return np.where(count >= least, sums / np.maximum(count, 1), np.nan)
+
+
+SOURCE = "atmosphere"
+TINY = 1e-30
+SMALLEST_SD = 1e-6  # a fraction, and m/s
+# pressure may depart from the gas law by this much before it is worth a word (separate instruments, humidity)
+GAS_LAW_TOLERANCE = 0.05
+LOWEST_TOP_M = 60e3
+
+
+def read_sounding(gate: Gate, source: AtmosphereEntry) -> Sounding | None:
+    """Read the sounding; None, with the faults kept in the gate, where it cannot be used."""
+    table = gate.table(SOURCE, source, tables.ATMOSPHERE, timed=False)
+    if table is None:
+        return None
+    before = len(gate.faults)
+    gate.refuse_rows(table, "alt", -1000.0, 2.0e5, "outside -1 to 200 km")
+    gate.refuse_rows(table, "rho", TINY, 2.0, "no density of the Earth's air")
+    gate.refuse_rows(table, "temperature", 80.0, 400.0, "outside 80 to 400 K")
+    for short in ("wind_north", "wind_east", "wind_speed"):
+        gate.refuse_rows(table, short, -300.0, 300.0, "above 300 m/s")
+    gate.refuse_rows(table, "rho_sd", SMALLEST_SD, 10.0, "no standard deviation of a density, as a fraction")
+    gate.refuse_rows(table, "wind_sd", SMALLEST_SD, 300.0, "no standard deviation of a wind")
+    winds = _winds(gate, table)
+    if winds is None or len(gate.faults) > before:
+        return None
+    return _ordered(gate, table, winds)
+
+
+def _winds(gate: Gate, table: Table) -> tuple[FloatArray, FloatArray] | None:
+    """North and east components of where the air goes."""
+    c = table.columns
+    if {"wind_north", "wind_east"} <= set(c):
+        return c["wind_north"], c["wind_east"]
+    if {"wind_speed", "wind_from"} <= set(c):
+        words = "wind is given by where it comes from: turned to where the air goes"
+        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan))
+        return -c["wind_speed"] * np.cos(c["wind_from"]), -c["wind_speed"] * np.sin(c["wind_from"])
+    needs = "wind_n_mps and wind_e_mps, or wind speed and direction from"
+    gate.faults.append(f"{SOURCE}: {table.path}: line 1: needs {needs}")
+    return None
+
+
+def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> Sounding | None:
+    c = table.columns
+    whole = np.isfinite(c["alt"] + c["rho"] + c["temperature"] + winds[0] + winds[1])
+    if not whole.all():
+        k, count = int(np.argmin(whole)), int((~whole).sum())
+        words = f"{count} rows with a missing value left out, the first at line {int(table.lines[k])}"
+        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan))
+    rows = np.flatnonzero(whole)[np.argsort(c["alt"][whole], kind="stable")]
+    alt, rho, temperature = c["alt"][rows], c["rho"][rows], c["temperature"][rows]
+    if len(rows) < 2:
+        gate.faults.append(f"{SOURCE}: {table.path}: fewer than two complete rows")
+        return None
+    if (np.diff(alt) <= 0).any():
+        k = int(rows[int(np.argmax(np.diff(alt) <= 0)) + 1])
+        gate.faults.append(f"{table.at(k)}: altitude {c['alt'][k]:.1f} m stands twice; keep one row")
+        return None
+    if alt[-1] < LOWEST_TOP_M:
+        words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, no wind is known"
+        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan))
+    pressure = rho * R_AIR_JPKGK * temperature
+    if "pressure" in c:
+        off = np.abs(c["pressure"][rows] / pressure - 1.0)
+        if np.nanmax(off, initial=0.0) > GAS_LAW_TOLERANCE:
+            k = int(rows[int(np.nanargmax(off))])
+            words = f"pressure departs from density and temperature by {100 * np.nanmax(off):.0f} % at line "
+            gate.findings.append(Finding(SOURCE, f"{words}{int(table.lines[k])}; density is used", np.nan, np.nan))
+    density_sd, wind_sd = default_sounding_sd(alt)
+    for key, default in (("rho_sd", density_sd), ("wind_sd", wind_sd)):
+        if key in c:
+            given = c[key][rows]
+            default[np.isfinite(given)] = given[np.isfinite(given)]
+    return Sounding(alt, rho, temperature, pressure, winds[0][rows], winds[1][rows], density_sd, wind_sd)

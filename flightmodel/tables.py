@@ -1,0 +1,493 @@
+"""How ``flight.toml`` names a table: its file, its time column, columns of other names, and which rows are used.
+
+How columns of a table become SI arrays: canonical names with unit suffixes, declared names and units, time formats.
+
+A canonical column says its unit in its name (``range_m``, ``az_deg``). Anything else is accepted only where the
+flight file declares column and unit; nothing is guessed. This is the only place where degrees, g, yards and the
+like turn into SI and radians.
+
+What second of the flight does a clock's text mean? ISO 8601 in UTC, or IRIG day of year, to seconds after t0.
+
+Day-of-year times ``DDD:HH:MM:SS.fff`` lie in t0's year, or in the next one where that is nearer (a flight across New
+Year). Cells of the usual width are read many at a time; others, one by one, to the same number.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from flightmodel.checks import FloatArray, GateError, nearest_name
+from flightmodel.config import Section, Time
+
+
+def _in_order(value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    for start, stop in value:
+        if not start < stop:
+            raise ValueError(f"a span ends after it begins; {start:g} to {stop:g} s does not")
+    return value
+
+
+# first and last second of each
+Spans = Annotated[tuple[tuple[Time, Time], ...], Field(min_length=1, max_length=100), AfterValidator(_in_order)]
+
+
+class ColumnEntry(Section):
+    """A column of a table under another name or unit than the canonical one."""
+
+    column: str
+    unit: str
+
+    @field_validator("unit")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in UNITS:
+            raise ValueError(f"unknown unit; known: {', '.join(UNITS)}")
+        return value
+
+
+class TimeEntry(Section):
+    """The time column of a table, or three columns with hour, minute and second of the day (UTC).
+
+    ``offset_s`` is added to every time. ``repeats`` says what becomes of rows that repeat the time of the row before.
+    """
+
+    column: str = "t_s"
+    columns: tuple[str, str, str] | None = None
+    format: Literal["seconds", "utc", "irig_doy", "utc_hms"] = "seconds"
+    unit: Literal["s", "ms", "us", "min"] = "s"
+    offset_s: Time = 0.0
+    repeats: Literal["refuse", "first"] = "refuse"
+
+    @model_validator(mode="after")
+    def _three_or_one(self) -> TimeEntry:
+        if (self.format == "utc_hms") != (self.columns is not None):
+            raise ValueError('format = "utc_hms" and columns = ["hour", "minute", "second"] belong together')
+        return self
+
+
+class Source(Section):
+    """A table in the flight folder: its file, its time column, columns that are not canonical, spans to use."""
+
+    file: str
+    time: TimeEntry = TimeEntry()
+    columns: dict[str, ColumnEntry] = {}
+    use_s: Spans | None = None
+
+    def declared(self, short: str) -> Declared | None:
+        """Return the declared column of a quantity, or None for the canonical one."""
+        entry = self.columns.get(short)
+        return Declared(entry.column, entry.unit) if entry else None
+
+    @property
+    def time_column(self) -> TimeColumn:
+        """The time column in the form the reader takes."""
+        t = self.time
+        parts = t.columns or (t.column,)
+        return TimeColumn(parts[0], t.format, t.unit, parts, t.repeats)
+
+
+IntArray = NDArray[np.int64]
+# unit -> (kind of quantity, factor to SI, offset added after the factor)
+UNITS: dict[str, tuple[str, float, float]] = {
+    "s": ("time", 1.0, 0.0),
+    "ms": ("time", 1e-3, 0.0),
+    "us": ("time", 1e-6, 0.0),
+    "min": ("time", 60.0, 0.0),
+    "m": ("length", 1.0, 0.0),
+    "cm": ("length", 0.01, 0.0),
+    "mm": ("length", 1e-3, 0.0),
+    "km": ("length", 1000.0, 0.0),
+    "yd": ("length", 0.9144, 0.0),
+    "ft": ("length", 0.3048, 0.0),
+    "kft": ("length", 304.8, 0.0),
+    "nmi": ("length", 1852.0, 0.0),
+    "rad": ("angle", 1.0, 0.0),
+    "mrad": ("angle", 1e-3, 0.0),
+    "deg": ("angle", np.pi / 180.0, 0.0),
+    "mil": ("angle", 2.0 * np.pi / 6400.0, 0.0),
+    "deg1e7": ("angle", 1e-7 * np.pi / 180.0, 0.0),  # whole numbers, as many receivers write a latitude
+    "mps2": ("acceleration", 1.0, 0.0),
+    "g": ("acceleration", 9.80665, 0.0),
+    "mg": ("acceleration", 9.80665e-3, 0.0),
+    "ftps2": ("acceleration", 0.3048, 0.0),
+    "radps": ("rate", 1.0, 0.0),
+    "degps": ("rate", np.pi / 180.0, 0.0),
+    "rpm": ("rate", 2.0 * np.pi / 60.0, 0.0),
+    "t": ("magnetic field", 1.0, 0.0),
+    "ut": ("magnetic field", 1e-6, 0.0),
+    "nt": ("magnetic field", 1e-9, 0.0),
+    "gauss": ("magnetic field", 1e-4, 0.0),
+    "mps": ("speed", 1.0, 0.0),
+    "cmps": ("speed", 0.01, 0.0),
+    "mmps": ("speed", 1e-3, 0.0),
+    "kmh": ("speed", 1.0 / 3.6, 0.0),
+    "kt": ("speed", 1852.0 / 3600.0, 0.0),
+    "ftps": ("speed", 0.3048, 0.0),
+    "kgpm3": ("density", 1.0, 0.0),
+    "gpm3": ("density", 1e-3, 0.0),
+    "k": ("temperature", 1.0, 0.0),
+    "degc": ("temperature", 1.0, 273.15),
+    "pa": ("pressure", 1.0, 0.0),
+    "hpa": ("pressure", 100.0, 0.0),
+    "kpa": ("pressure", 1000.0, 0.0),
+    "psi": ("pressure", 6894.757293168361, 0.0),
+    "1": ("fraction", 1.0, 0.0),
+    "percent": ("fraction", 0.01, 0.0),
+}
+KINDS = {kind for kind, _, _ in UNITS.values()}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column that a table may hold: short name in the flight file, canonical column, kind, whether it is required."""
+
+    short: str
+    canonical: str
+    kind: str
+    required: bool = True
+
+
+ACCELEROMETER = tuple(Quantity(f"a{a}", f"a{a}_suba_mps2", "acceleration") for a in "xyz")
+RATES = tuple(Quantity(a, f"{a}_body_degps", "rate") for a in "pqr")
+MAGNETOMETER = tuple(Quantity(f"b{a}", f"b{a}_magnetometer_ut", "magnetic field") for a in "xyz")
+RADAR = (Quantity("range", "range_m", "length"), Quantity("az", "az_deg", "angle"), Quantity("el", "el_deg", "angle"))
+GNSS = (
+    Quantity("lat", "lat_deg", "angle", required=False),
+    Quantity("lon", "lon_deg", "angle", required=False),
+    Quantity("alt", "alt_m", "length", required=False),
+    *(Quantity(a, f"{a}_ecef_m", "length", required=False) for a in "xyz"),
+    *(Quantity(f"v{a}", f"v{a}_ecef_mps", "speed", required=False) for a in "xyz"),
+    *(Quantity(f"v{a}", f"v{a}_mps", "speed", required=False) for a in "ned"),
+)
+# counts of a receiver, read where flight.toml asks for a least one
+GNSS_COUNTS = {"nsat": Quantity("nsat", "nsat", "fraction"), "fix_mode": Quantity("fix_mode", "fix_mode", "fraction")}
+BAROMETER = (
+    Quantity("height", "height_m", "length", required=False),
+    Quantity("pressure", "pressure_pa", "pressure", required=False),
+)
+ATMOSPHERE = (
+    Quantity("alt", "alt_m", "length"),
+    Quantity("rho", "rho_kgpm3", "density"),
+    Quantity("temperature", "t_k", "temperature"),
+    Quantity("pressure", "p_pa", "pressure", required=False),
+    Quantity("wind_north", "wind_n_mps", "speed", required=False),
+    Quantity("wind_east", "wind_e_mps", "speed", required=False),
+    Quantity("wind_speed", "wind_speed_mps", "speed", required=False),
+    Quantity("wind_from", "wind_from_deg", "angle", required=False),
+    Quantity("rho_sd", "rho_sd_percent", "fraction", required=False),
+    Quantity("wind_sd", "wind_sd_mps", "speed", required=False),
+)
+
+
+def sun_quantities(heads: int) -> tuple[Quantity, ...]:
+    """Columns of a table of Sun sensors with so many heads, counted from 1."""
+    pairs = [(axis, head) for head in range(1, heads + 1) for axis in ("az", "el")]
+    return tuple(Quantity(f"{axis}{head}", f"{axis}_sun{head}_deg", "angle") for axis, head in pairs)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A column and its unit as the flight file declares them."""
+
+    column: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class TimeColumn:
+    """Where a table's time stands and how it is written: ``seconds``, ``utc`` (ISO), ``irig_doy`` or ``utc_hms``.
+
+    ``parts`` are all columns that hold it; ``repeats`` is ``first`` where equal times may follow each other
+    (`flightmodel.gate` then keeps the first row).
+    """
+
+    column: str = "t_s"
+    format: str = "seconds"
+    unit: str = "s"
+    parts: tuple[str, ...] = ()
+    repeats: str = "refuse"
+
+    def __post_init__(self) -> None:
+        """One column holds it unless more are named."""
+        if not self.parts:
+            object.__setattr__(self, "parts", (self.column,))
+
+
+def read_table(path: Path, label: str) -> pd.DataFrame:
+    """Read a CSV as text; ``attrs["lines"]`` holds each row's line in the file.
+
+    Raises
+    ------
+    GateError
+        For a file that is missing, empty, binary, ragged, or names a column twice.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise GateError(f"{label}: {path}: no such file") from None
+    except (UnicodeDecodeError, OSError) as fault:
+        raise GateError(f"{label}: {path}: not a readable CSV table: {fault}") from None
+    if "\0" in text:
+        raise GateError(f"{label}: {path}: not a readable CSV table: it holds binary data")
+    numbered = [(k, line) for k, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    if len(numbered) < 3:
+        rows = max(0, len(numbered) - 1)
+        raise GateError(f"{label}: {path}: {rows} data rows; at least two are needed")
+    lines = np.array([k for k, _ in numbered[1:]])
+    opened = _open_quote(numbered)
+    if opened:
+        raise GateError(f"{label}: {path}: line {opened}: a quote opens and is not closed on the line; mend it")
+    names, counts = _cells(numbered)
+    faults = [f"{label}: {path}: line {numbered[0][0]}: column '{n}' stands twice" for n in _twice(names)]
+    ragged = np.flatnonzero(counts != len(names))
+    if len(ragged):
+        k = int(ragged[0])
+        faults.append(
+            f"{label}: {path}: line {lines[k]}: {counts[k]} cells where the header has {len(names)} "
+            f"({len(ragged)} in all); mend or remove them"
+        )
+    if faults:
+        raise GateError(faults)
+    body = "\n".join(line for _, line in numbered)
+    frame = pd.read_csv(io.StringIO(body), dtype=str, skipinitialspace=True, keep_default_na=False, index_col=False)
+    frame.columns = pd.Index(names)
+    frame.attrs["lines"] = lines
+    return frame
+
+
+def _open_quote(numbered: list[tuple[int, str]]) -> int:
+    """Line of the first quote that is not closed on its own line; 0 for none."""
+    if any('"' in line for _, line in numbered):
+        for (number, _), row in zip(numbered, csv.reader(line + "\n" for _, line in numbered), strict=False):
+            if any("\n" in cell for cell in row):  # the cell took in the end of its line
+                return number
+    return 0
+
+
+def _cells(numbered: list[tuple[int, str]]) -> tuple[list[str], IntArray]:
+    """Names in the header, and the number of cells of each further row."""
+    if any('"' in line for _, line in numbered):
+        rows = list(csv.reader(line for _, line in numbered))
+        return [c.strip() for c in rows[0]], np.array([len(r) for r in rows[1:]])
+    return column_names(numbered[0][1]), np.array([line.count(",") + 1 for _, line in numbered[1:]])
+
+
+def column_names(header: str) -> list[str]:
+    """Names in a header line, without the spaces around them."""
+    return [name.strip() for name in next(csv.reader([header]))]
+
+
+def _twice(names: list[str]) -> list[str]:
+    return sorted({n for n in names if names.count(n) > 1})
+
+
+def line_of(frame: pd.DataFrame, row: int) -> int:
+    """Line in the file of a row of a table read by `read_table`."""
+    return int(frame.attrs["lines"][row])
+
+
+def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: list[str]) -> FloatArray:
+    """Column as float64; empty and NaN cells are missing, any other text is a fault with its file line."""
+    text = frame[column].str.strip()
+    values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, copy=True)
+    missing = text.str.lower().isin(["", "nan", "na", "null", "-"]).to_numpy()
+    bad = (~np.isfinite(values)) & ~missing
+    if bad.any():
+        first = int(np.argmax(bad))
+        where = f"{label}: {path}: line {line_of(frame, first)}, column '{column}'"
+        count = f"({int(bad.sum())} in all)"
+        faults.append(f"{where}: '{text.iloc[first]}' is no finite number {count}; leave a missing value empty")
+    return values + 0.0  # no negative zero: whole-number columns know none
+
+
+def place(quantity: Quantity, declared: Declared | None) -> tuple[str, str]:
+    """Column and unit in which a table holds a quantity."""
+    if declared is not None:
+        return declared.column, declared.unit
+    return quantity.canonical, quantity.canonical.rsplit("_", 1)[-1]
+
+
+def fits(quantity: Quantity, unit: str) -> bool:
+    """Whether a quantity can have a unit."""
+    return unit in UNITS and UNITS[unit][0] == quantity.kind
+
+
+def to_si(values: FloatArray, unit: str) -> FloatArray:
+    """Turn numbers of a unit into SI, in place."""
+    _, factor, offset = UNITS[unit]
+    if factor != 1.0:
+        with np.errstate(over="ignore"):  # beyond any flight, and refused as such
+            values *= factor
+    if offset != 0.0:
+        values += offset
+    return values
+
+
+def column_si(
+    frame: pd.DataFrame,
+    quantity: Quantity,
+    declared: Declared | None,
+    path: Path,
+    label: str,
+    faults: list[str],
+) -> FloatArray | None:
+    """Return a quantity in SI, or None where it is absent (a fault when it is required)."""
+    column, unit = place(quantity, declared)
+    if column not in frame.columns:
+        if quantity.required or declared:
+            faults.append(_absent(frame, quantity, column, path, label))
+        return None
+    if not fits(quantity, unit):
+        fitting = ", ".join(u for u, (kind, _, _) in UNITS.items() if kind == quantity.kind)
+        faults.append(f"{label}: {path}: column '{column}': unit '{unit}' is not one of {quantity.kind}: {fitting}")
+        return None
+    return to_si(numbers(frame, column, path, label, faults), unit)
+
+
+def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, label: str) -> str:
+    stem = column.rsplit("_", 1)[0]
+    bare = [c for c in frame.columns if c.lower() in (stem.lower(), quantity.short.lower())]
+    if bare:
+        hint = (
+            f"; '{bare[0]}' names no unit: declare it in flight.toml, "
+            f'columns.{quantity.short} = {{ column = "{bare[0]}", unit = "..." }}'
+        )
+    else:
+        hint = nearest_name(column, frame.columns)
+    return f"{label}: {path}: line 1: no column '{column}'{hint}; found {', '.join(frame.columns)}"
+
+
+def unordered_times_s(
+    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
+) -> FloatArray | None:
+    """Seconds after t0 in the file's order, or None with a fault for each thing that is wrong."""
+    absent = [column for column in spec.parts if column not in frame.columns]
+    if absent:
+        found = ", ".join(frame.columns)
+        hint = nearest_name(absent[0], frame.columns)
+        faults.append(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}")
+        return None
+    if spec.format == "seconds":
+        values = to_si(numbers(frame, spec.column, path, label, faults), spec.unit)
+    elif spec.format == "utc_hms":
+        values = _times_of_day([numbers(frame, column, path, label, faults) for column in spec.parts], t0)
+    else:
+        values = clock_times(frame[spec.column].str.strip().tolist(), spec.format, t0)
+    bad = ~np.isfinite(values)
+    if bad.any():
+        first = int(np.argmax(bad))
+        faults.append(
+            f"{label}: {path}: line {line_of(frame, first)}: time "
+            f"'{':'.join(frame[column].iloc[first] for column in spec.parts)}' is not in format "
+            f"'{spec.format}' ({int(bad.sum())} in all)"
+        )
+        return None
+    return values
+
+
+def times_s(
+    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
+) -> FloatArray | None:
+    """Seconds after t0, strictly increasing, or None with a fault for each thing that is wrong."""
+    values = unordered_times_s(frame, spec, t0, path, label, faults)
+    if values is None:
+        return None
+    step = np.diff(values)
+    back = step < 0.0 if spec.repeats == "first" else step <= 0.0
+    if back.any():
+        k = int(np.argmax(back))
+        faults.append(
+            f"{label}: {path}: line {line_of(frame, k + 1)}: time runs backwards or repeats: {values[k]:.6f} s then "
+            f"{values[k + 1]:.6f} s ({int(back.sum())} in all); sort the rows or remove the duplicates"
+        )
+        return None
+    return values
+
+
+def _times_of_day(parts: list[FloatArray], t0: datetime) -> FloatArray:
+    """Seconds after t0 of hours, minutes and seconds of a day (UTC): of the day on which they lie nearest to t0."""
+    hour, minute, second = parts
+    with np.errstate(invalid="ignore"):
+        real = (hour >= 0) & (hour < 24) & (minute >= 0) & (minute < 60) & (second >= 0) & (second < 61)
+    of_day = (t0 - t0.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()
+    after = np.where(real, 3600.0 * hour + 60.0 * minute + second - of_day, np.nan)
+    return np.round(after - 86400.0 * np.round(after / 86400.0), 7)
+
+
+_IRIG = re.compile(r"^(\d{1,3}):(\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)$", re.ASCII)
+_COLONS, _POINT, _WIDEST = [3, 6, 9], 12, 22  # where the usual form has them; so many digits are exact in float64
+HALF_YEAR_S = 183 * 86400.0
+
+
+def clock_times(cells: Sequence[str], form: str, t0: datetime) -> FloatArray:
+    """Seconds after t0 of ``utc`` or ``irig_doy`` times; NaN where a cell does not parse."""
+    if form == "irig_doy":
+        out = _irig_times(cells, t0)
+    else:
+        stamps = pd.DatetimeIndex(pd.to_datetime(list(cells), utc=True, errors="coerce", format="ISO8601"))
+        out = (stamps - pd.Timestamp(t0)).total_seconds().to_numpy(dtype=float)
+    # clocks are written to a microsecond at best: remove the rounding of the large offset
+    return np.round(out, 7)
+
+
+def _irig_times(cells: Sequence[str], t0: datetime) -> FloatArray:
+    out = np.full(len(cells), np.nan)
+    widths = np.array([len(cell) for cell in cells])
+    for width in np.unique(widths).tolist():
+        rows = np.flatnonzero(widths == width)
+        usual = np.zeros(len(rows), dtype=bool)
+        if _POINT <= width <= _WIDEST:
+            try:
+                table = np.array([cells[k] for k in rows.tolist()], dtype=f"S{width}")
+            except UnicodeEncodeError:
+                table = np.full(len(rows), b"?" * width)
+            usual, seconds = _usual_irig(table.view(np.uint8).reshape(-1, width), t0)
+            out[rows[usual]] = seconds
+        for k in rows[~usual].tolist():
+            match = _IRIG.match(cells[k])
+            if match:
+                day, hour, minute = (np.array([float(match[part])]) for part in (1, 2, 3))
+                out[k] = _seconds(day, hour, minute, np.array([float(match[4])]), t0)[0]
+    return out
+
+
+def _usual_irig(table: np.ndarray, t0: datetime) -> tuple[np.ndarray, FloatArray]:
+    """Which rows of characters have the usual form, and their seconds after t0."""
+    width = table.shape[1]
+    marks = [*_COLONS, _POINT] if width > _POINT else _COLONS
+    digits = np.delete(table, marks, axis=1).astype(np.int64) - ord("0")
+    usual = np.all(table[:, _COLONS] == ord(":"), axis=1) & np.all((digits >= 0) & (digits <= 9), axis=1)
+    if width > _POINT:
+        usual &= table[:, _POINT] == ord(".")
+    digits = digits[usual]
+
+    def number(first: int, last: int) -> FloatArray:
+        return (digits[:, first:last] @ 10 ** np.arange(last - first - 1, -1, -1)).astype(float)
+
+    last = digits.shape[1]
+    second = number(7, last) / 10.0 ** (last - 9)
+    return usual, _seconds(number(0, 3), number(3, 5), number(5, 7), second, t0)
+
+
+def _seconds(day: FloatArray, hour: FloatArray, minute: FloatArray, second: FloatArray, t0: datetime) -> FloatArray:
+    """Seconds after t0; NaN for a day, hour, minute or second that does not exist."""
+    near = []
+    for year in (t0.year, t0.year + 1):
+        start, after = datetime(year, 1, 1, tzinfo=UTC), datetime(year + 1, 1, 1, tzinfo=UTC)
+        exists = (day >= 1) & (day <= (after - start).days) & (hour <= 23) & (minute <= 59) & (second < 60.0)
+        seconds = (start - t0).total_seconds() + (day - 1) * 86400.0 + hour * 3600 + minute * 60 + second
+        near.append(np.where(exists, seconds, np.nan))
+    with np.errstate(invalid="ignore"):
+        return np.where(near[0] < -HALF_YEAR_S, near[1], near[0])

@@ -1,0 +1,413 @@
+"""What is exported: the newest run's trajectory, deflections, events and covariances, as its files hold them.
+
+One table for spreadsheets and data frames: the trajectory's rows with UTC, and deflections at their times.
+
+Deflections stand at their own times in the run; here they are interpolated between neighbours, their two components
+apart (a clock angle has a jump), and left empty outside and in gaps.
+
+KML 2.2 for a globe: the track with its times (gx:Track), the same as a line, and the events as points.
+
+KML heights are above sea level, the trajectory's above the WGS-84 ellipsoid; they are written as they are, and the
+file's description says so.
+
+MATLAB (version 5): structures ``trajectory``, ``deflection.<method>`` and ``about``, a column vector a column.
+
+NetCDF after the CF conventions 1.8 (classic format, by scipy): a trajectory, and deflections at their own times.
+
+CCSDS Orbit Ephemeris Message 2.0 (KVN): places and velocities Earth-fixed, covariances once a second.
+
+References
+----------
+CCSDS 502.0-B-2, Orbit Data Messages, 2009. WGS-84 (G1150 and later) and ITRF2000 agree to centimetres.
+
+What ``postflight export`` does: one file, whole or not at all, the same bytes for the same run.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+import pandas as pd
+from rich import markup
+from rich.console import Console
+
+from flightmodel.checks import ConfigError, FloatArray, GateError
+from flightmodel.config import parse_utc
+from postflight.run_folder import DIGITS, newest_run, write_file
+
+UNITS = {
+    "m": "m", "mps": "m s-1", "mps2": "m s-2", "deg": "degree", "degps": "degree s-1", "pa": "Pa", "kgpm3": "kg m-3",
+    "k": "K", "s": "s",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Source:
+    """One run, read.
+
+    Parameters
+    ----------
+    name : str
+        Of the flight.
+    run : str
+        Of the run folder.
+    epoch : datetime
+        Time zero, UTC.
+    finished_utc : str
+        When the run ended: the only date that files may carry, so that one run gives one file.
+    synthetic : bool
+    header : dict
+        ``bet_header.json``.
+    trajectory, events : DataFrame
+        ``bet.csv`` and ``events.csv``.
+    deflections : dict of str to DataFrame
+        By method.
+    covariance_time_s : (k,) float
+    covariance : (k, 9, 9) float
+        Position and velocity ECEF (m, m/s), rotation body (rad).
+    """
+
+    name: str
+    run: str
+    epoch: datetime
+    finished_utc: str
+    synthetic: bool
+    header: dict[str, Any]
+    trajectory: pd.DataFrame
+    events: pd.DataFrame
+    deflections: dict[str, pd.DataFrame]
+    covariance_time_s: FloatArray
+    covariance: FloatArray
+
+    def utc(self, t_s: float) -> str:
+        """ISO 8601 UTC, microseconds, of a time of the flight."""
+        return (self.epoch + timedelta(seconds=float(t_s))).strftime("%Y-%m-%dT%H:%M:%S.%f")
+
+    @property
+    def title(self) -> str:
+        """What the file is, in a line."""
+        kind = "SYNTHETIC flight" if self.synthetic else "flight"
+        return f"Best-estimated trajectory and deflections of the {kind} {self.name}"
+
+
+def unit_of(column: str) -> str:
+    """UDUNITS name of a column's unit, by its suffix; ``1`` for none."""
+    tail = column.removesuffix("_sd").rsplit("_", 1)[-1]
+    if column == "lat_deg":
+        return "degrees_north"
+    if column == "lon_deg":
+        return "degrees_east"
+    return UNITS.get(tail, "1")
+
+
+def read_source(folder: Path) -> Source:
+    """Read the newest run of a flight folder; `GateError` where there is none or its files are not whole."""
+    run = newest_run(folder)
+    try:
+        header = json.loads((run / "bet_header.json").read_text())
+        facts = json.loads((run / "run.json").read_text())
+        trajectory = pd.read_csv(run / "bet.csv")
+        events = pd.read_csv(run / "events.csv")
+        with np.load(run / "covariance.npz", allow_pickle=False) as stored:
+            times, covariance = stored["t_s"], stored["covariance"]
+    except FileNotFoundError as fault:
+        words = f"has no {Path(str(fault.filename)).name}: it made no trajectory; `postflight run {folder}` does"
+        raise GateError(f"{run}: {words}") from None
+    except (ValueError, KeyError, OSError) as fault:
+        raise GateError(f"{run}: cannot be read back ({fault}); run it again") from None
+    deflections = {p.stem.removeprefix("deflection_"): pd.read_csv(p) for p in sorted(run.glob("deflection_*.csv"))}
+    return Source(
+        header["flight"], run.name, parse_utc(header["epoch_utc"]), facts["finished_utc"], bool(header["synthetic"]),
+        header, trajectory, events, deflections, times, covariance,
+    )  # fmt: skip
+
+
+GAP_FACTOR = 5.0
+
+
+def merged(source: Source) -> pd.DataFrame:
+    """Trajectory, UTC and deflections, one row a time."""
+    t = source.trajectory["t_s"].to_numpy()
+    parts = {"t_s": t, "utc": [source.utc(x) + "Z" for x in t]}
+    parts |= {name: source.trajectory[name].to_numpy() for name in source.trajectory.columns if name != "t_s"}
+    for method, table in source.deflections.items():
+        parts |= {f"{key}_{method}_{unit}": v for (key, unit), v in _at(table, t).items()}
+    return pd.DataFrame(parts)
+
+
+def _at(table: pd.DataFrame, t: FloatArray) -> dict[tuple[str, str], FloatArray]:
+    nothing = np.full(len(t), np.nan)
+    keys = [("theta", "deg"), ("theta_sd", "deg"), ("plane_lv", "deg"), ("plane_sd", "deg")]
+    if len(table) < 2:
+        return dict.fromkeys(keys, nothing)
+    at, plane = table["t_s"].to_numpy(), np.deg2rad(table["plane_lv_deg"].to_numpy())
+    theta = table["theta_deg"].to_numpy()
+    after = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
+    step = np.diff(at)
+    outside = (t < at[0]) | (t > at[-1]) | (step[after - 1] > GAP_FACTOR * np.median(step))
+    y, z = (np.interp(t, at, theta * f(plane)) for f in (np.cos, np.sin))
+    values = (
+        np.hypot(y, z),
+        np.interp(t, at, table["theta_sd_deg"]),
+        np.mod(np.rad2deg(np.arctan2(z, y)), 360.0),
+        np.interp(t, at, table["plane_sd_deg"]),
+    )
+    return {key: np.where(outside, np.nan, value) for key, value in zip(keys, values, strict=True)}
+
+
+def csv_bytes(source: Source) -> bytes:
+    """One CSV."""
+    out = io.StringIO()
+    merged(source).to_csv(out, index=False, float_format=DIGITS, lineterminator="\n")
+    return out.getvalue().encode()
+
+
+def parquet_bytes(source: Source) -> bytes:
+    """Parquet with the unit of each column in its field's metadata."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = merged(source)
+    utc = pd.to_datetime(table["utc"], format="ISO8601").astype("datetime64[us, UTC]")
+    table = table.assign(utc=utc)
+    arrow = pa.Table.from_pandas(table, preserve_index=False)
+    fields = [f.with_metadata({"unit": unit_of(f.name)}) for f in arrow.schema]
+    about = {"title": source.title, "run": source.run, "point": source.header["point"]}
+    arrow = arrow.cast(pa.schema(fields, metadata={**(arrow.schema.metadata or {}), **about}))
+    out = io.BytesIO()
+    pq.write_table(arrow, out)
+    return out.getvalue()
+
+
+STEP_S = 0.5  # between points
+
+
+def kml_bytes(source: Source) -> bytes:
+    """Return one .kml file."""
+    table = source.trajectory
+    t = table["t_s"].to_numpy()
+    keep = np.flatnonzero(np.diff(np.floor((t - t[0]) / STEP_S + 1e-9), prepend=-1.0) > 0.0)
+    keep = np.unique(np.append(keep, len(t) - 1))
+    place = table[["lon_deg", "lat_deg", "alt_m"]].to_numpy()
+    words = (
+        f"{source.title}; {source.header['point']}. Heights are above the WGS-84 ellipsoid, drawn as above sea level: "
+        "up to 107 m apart."
+    )
+    whens = "".join(f"<when>{source.utc(t[k])}Z</when>\n" for k in keep)
+    track = "".join(f"<gx:coord>{' '.join(f'{v:.9g}' for v in place[k])}</gx:coord>\n" for k in keep)
+    line = "\n".join(",".join(f"{v:.9g}" for v in place[k]) for k in keep)
+    points = ""
+    for event in source.events.itertuples(index=False):
+        at = ",".join(f"{np.interp(event.t_s, t, c):.9g}" for c in place.T)
+        points += (
+            f"<Placemark><name>{escape(_printable(str(event.event)))}</name><TimeStamp><when>{source.utc(event.t_s)}Z"
+            f"</when></TimeStamp><Point><altitudeMode>absolute</altitudeMode><coordinates>{at}</coordinates></Point>"
+            "</Placemark>\n"
+        )
+    text = f"""<?xml version="1.0" encoding="UTF-8"?>
+<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
+<Document>
+<name>{escape(_printable(source.name))}</name>
+<description>{escape(_printable(words))}</description>
+<Style id="flight"><LineStyle><color>ff0080ff</color><width>2</width></LineStyle></Style>
+<Placemark><name>track</name><styleUrl>#flight</styleUrl><gx:Track><altitudeMode>absolute</altitudeMode>
+{whens}{track}</gx:Track></Placemark>
+<Placemark><name>line</name><styleUrl>#flight</styleUrl><LineString><altitudeMode>absolute</altitudeMode><coordinates>
+{line}
+</coordinates></LineString></Placemark>
+<Folder><name>events</name>
+{points}</Folder>
+</Document>
+</kml>
+"""
+    return text.encode()
+
+
+def _printable(text: str) -> str:
+    """Text without characters that XML has no place for."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+HEADER = b"MATLAB 5.0 MAT-file, postflight export"  # scipy writes the time of writing there
+
+
+def mat_bytes(source: Source) -> bytes:
+    """Return one .mat file; names longer than MATLAB's 63 letters do not occur."""
+    from scipy.io import savemat
+
+    content = {
+        "trajectory": _struct(source.trajectory),
+        "deflection": {method: _struct(table) for method, table in source.deflections.items()},
+        "covariance": {"t_s": source.covariance_time_s[:, None], "position_velocity_rotation": source.covariance},
+        "about": {
+            "title": source.title,
+            "run": source.run,
+            "epoch_utc": source.utc(0.0) + "Z",
+            "point": source.header["point"],
+            "synthetic": source.synthetic,
+        },
+    }
+    if not source.deflections:
+        del content["deflection"]
+    out = io.BytesIO()
+    savemat(out, content, long_field_names=True, oned_as="column", do_compression=True)
+    return HEADER.ljust(116) + out.getvalue()[116:]
+
+
+def _struct(table: pd.DataFrame) -> dict[str, np.ndarray]:
+    return {name: table[name].to_numpy(dtype=float)[:, None] for name in table.columns}
+
+
+STANDARD = {
+    "lat_deg": "latitude",
+    "lon_deg": "longitude",
+    "alt_m": "height_above_reference_ellipsoid",
+    "p_pa": "air_pressure",
+    "t_k": "air_temperature",
+    "rho_kgpm3": "air_density",
+    "wind_n_mps": "northward_wind",
+    "wind_e_mps": "eastward_wind",
+    "speed_ground_mps": "platform_speed_wrt_ground",
+}
+COORDINATES = "time lat_deg lon_deg alt_m"
+
+
+def netcdf_bytes(source: Source) -> bytes:
+    """Return one .nc file."""
+    from scipy.io import netcdf_file
+
+    out = io.BytesIO()
+    file = netcdf_file(out, "w", version=2)
+    file.Conventions = "CF-1.8"
+    file.title = source.title
+    file.featureType = "trajectory"
+    file.source = "postflight: trajectory estimated from flight telemetry"
+    file.history = f"{source.finished_utc} run {source.run}"
+    file.comment = f"point: {source.header['point']}; columns: {source.header['frames']['flow']}"
+    label = source.name.encode()
+    file.createDimension("name_length", max(1, len(label)))
+    identity = file.createVariable("trajectory_id", "c", ("name_length",))
+    identity[:] = np.frombuffer(label, dtype="S1") if label else b" "
+    identity.cf_role = "trajectory_id"
+    _table(file, source, source.trajectory, "time", "", COORDINATES)
+    for method, table in source.deflections.items():
+        if len(table):
+            _table(file, source, table, f"time_{method}", f"_{method}", f"time_{method}")
+    file.flush()
+    content = out.getvalue()
+    file.close()
+    return content
+
+
+def _table(file: object, source: Source, table: pd.DataFrame, time: str, ending: str, coordinates: str) -> None:
+    create = file.createVariable  # type: ignore[attr-defined]
+    file.createDimension(time, len(table))  # type: ignore[attr-defined]
+    axis = create(time, "d", (time,))
+    axis[:] = table["t_s"].to_numpy(dtype=float)
+    axis.standard_name, axis.axis, axis.calendar = "time", "T", "standard"
+    axis.units = f"seconds since {source.epoch:%Y-%m-%d %H:%M:%S.%f}"
+    for column in table.columns:
+        if column == "t_s":
+            continue
+        variable = create(column + ending, "d", (time,))
+        variable[:] = table[column].to_numpy(dtype=float)
+        variable.units = unit_of(column)
+        variable.long_name = column.replace("_", " ")
+        variable._FillValue = np.nan
+        if column in STANDARD:
+            variable.standard_name = STANDARD[column]
+        if column not in coordinates.split():
+            variable.coordinates = coordinates
+
+
+FRAME = "ITRF2000"
+PLACE = ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m", "vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"]
+
+
+def oem_bytes(source: Source) -> bytes:
+    """Return one .oem file: km, km/s, km^2."""
+    table = source.trajectory
+    t = table["t_s"].to_numpy()
+    state = table[PLACE].to_numpy() / 1000.0
+    name = "".join(c if c.isalnum() and c.isascii() else "_" for c in source.name) or "flight"
+    lines = [
+        "CCSDS_OEM_VERS = 2.0",
+        "COMMENT " + _ascii(source.title),
+        f"COMMENT point: {_ascii(source.header['point'])}",
+        f"CREATION_DATE = {source.finished_utc[:19]}",
+        "ORIGINATOR = POSTFLIGHT",
+        "",
+        "META_START",
+        f"OBJECT_NAME = {name}",
+        f"OBJECT_ID = {source.epoch:%Y}-000A",
+        "CENTER_NAME = EARTH",
+        f"REF_FRAME = {FRAME}",
+        "TIME_SYSTEM = UTC",
+        f"START_TIME = {source.utc(t[0])}",
+        f"STOP_TIME = {source.utc(t[-1])}",
+        "INTERPOLATION = HERMITE",
+        "INTERPOLATION_DEGREE = 3",
+        "META_STOP",
+        "",
+    ]
+    lines += [f"{source.utc(at)} {' '.join(f'{v:.9f}' for v in row)}" for at, row in zip(t, state, strict=True)]
+    lines += ["", "COVARIANCE_START"]
+    for at, covariance in zip(source.covariance_time_s, source.covariance[:, :6, :6] / 1e6, strict=True):
+        lines += [f"EPOCH = {source.utc(at)}", f"COV_REF_FRAME = {FRAME}"]
+        lines += [" ".join(f"{v:.9e}" for v in covariance[k, : k + 1]) for k in range(6)]
+    return ("\n".join([*lines, "COVARIANCE_STOP"]) + "\n").encode()
+
+
+def _ascii(text: str) -> str:
+    return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
+
+
+FORMS: dict[str, Callable[[Source], bytes]] = {
+    "csv": csv_bytes,
+    "parquet": parquet_bytes,
+    "mat": mat_bytes,
+    "nc": netcdf_bytes,
+    "kml": kml_bytes,
+    "oem": oem_bytes,
+}
+EXTRAS = {"pyarrow": "parquet"}
+console = Console(soft_wrap=True)
+
+
+def export(folder: Path, form: str, out: Path | None) -> None:
+    """Write one file and say where.
+
+    Raises
+    ------
+    ConfigError
+        Where a library is missing, with the command that installs it; where the file would lie in a run folder.
+    GateError
+        Where the flight has no run with a trajectory.
+    """
+    source = read_source(folder)
+    path = out or folder / "exports" / f"{source.run}.{form}"
+    if (folder / "runs").resolve() in path.resolve().parents:
+        raise ConfigError(f"{path}: run folders stay as they were written; name another place")
+    try:
+        content = FORMS[form](source)
+    except ImportError as fault:
+        name = (fault.name or "").partition(".")[0]
+        if name not in EXTRAS:
+            raise
+        words = f"--to {form} needs {name}, which is not installed: pip install 'postflight[{EXTRAS[name]}]'"
+        raise ConfigError(words) from None
+    try:
+        write_file(path, content)
+    except OSError as fault:
+        raise GateError(f"{path}: cannot be written: {fault.strerror or fault}") from None
+    console.print(
+        f"{markup.escape(str(path))} ({len(content) / 1e6:.1f} MB) of run {markup.escape(source.run)}", highlight=False
+    )

@@ -1,1 +1,0 @@
-"""A run's trajectory and deflections in the formats of other programs."""

@@ -1,0 +1,329 @@
+"""Reading a table as somebody else wrote it: any delimiter, comments, a row of units, decimal commas, old encodings.
+
+Nothing is dropped or changed in silence: every conversion is among the table's notes. What comes out is a table of text
+cells that `flightmodel.tables.read_table` can read once it is written as plain CSV.
+
+Tables in MATLAB files: numbers alone, no objects, nothing that could run.
+
+Version 5 to 7 by scipy, version 7.3 (HDF5) by h5py where it is installed. Vectors of one length beside each
+other (at the top, or in one structure) are a table; a matrix with as many rows gives a column for each of its columns.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flightmodel.checks import ConfigError, FloatArray, GateError
+from postflight.intake.headers import SEVERAL_MEANINGS, UNIT_WORDS, unit_key
+
+LARGEST_BYTES = 2 * 1024**3
+LARGEST = 1e100  # what is beyond is a broken word
+HEAD_LINES = 80  # names and first rows are within
+COMMENT = re.compile(r"^\s*(#+|%+|//+|\*+|;|!|\")\s*")
+NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
+COMMA_NUMBER = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
+CLOCK = re.compile(r"^(\d{1,3}[:/])?\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?$|^\d{4}-\d{2}-\d{2}[T ]")
+DELIMITERS = ("\t", ";", ",", "|", None)  # None: runs of spaces
+MISSING = {"", "nan", "na", "n/a", "null", "-", "--", "---", "none"}
+
+
+@dataclass
+class LooseTable:
+    """A table of text cells with names, units as a row below the header gave them, and what was changed.
+
+    ``raw`` is the file's content where it is plain CSV already.
+    """
+
+    label: str
+    names: list[str]
+    units: list[str]
+    rows: list[list[str]]
+    notes: list[str] = field(default_factory=list)
+    raw: bytes | None = None
+
+    def numbers(self, column: int) -> FloatArray:
+        """Return a column as float64; what is no number is NaN."""
+        out = np.full(len(self.rows), np.nan)
+        for k, row in enumerate(self.rows):
+            if column < len(row):
+                try:
+                    out[k] = float(row[column])
+                except ValueError:
+                    continue
+        return np.where(np.abs(out) < LARGEST, out, np.nan)
+
+    def as_csv(self) -> bytes:
+        """Return the plain CSV that is written."""
+        if self.raw is not None:
+            return self.raw
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(self.names)
+        writer.writerows(self.rows)
+        return out.getvalue().encode()
+
+
+def read_loose(path: Path) -> LooseTable:
+    """Read one text table; `GateError` where no table of numbers with names is found."""
+    try:
+        if path.stat().st_size > LARGEST_BYTES:
+            raise GateError(f"{path}: larger than 2 GB; split it")
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        raise GateError(f"{path}: no such file") from None
+    text, notes = _decoded(path, raw)
+    lines = [line for line in text.splitlines() if line.strip()]
+    ruled = _ruled(path, lines)
+    if ruled is not None:
+        ruled.notes[:0] = notes
+        return ruled
+    found = _layout(lines[:HEAD_LINES])
+    if found is None:
+        raise GateError(
+            f"{path}: no table found: a line of names, three rows of numbers below it and one delimiter are wanted"
+        )
+    delimiter, first, header, unit_row = found
+    names = [n.strip() for n in header]
+    units = [u.strip() for u in unit_row] if unit_row else [""] * len(names)
+    rows = [_split(line, delimiter) for line in lines[first:] if not _is_comment(line, delimiter)]
+    if delimiter != ",":
+        notes.append(f"delimiter {'spaces' if delimiter is None else repr(delimiter)} became a comma")
+    if delimiter != "," and _decimal_comma(rows[:HEAD_LINES]):
+        rows = [[c.replace(",", ".") if COMMA_NUMBER.match(c) else c for c in row] for row in rows]
+        notes.append("decimal commas became points")
+    if unit_row:
+        notes.append("the row of units below the names was taken out")
+    skipped = len(lines) - len(rows) - 1 - bool(unit_row)
+    if skipped:
+        notes.append(f"{skipped} lines of comment or preface left out")
+    for k, name in enumerate(names):
+        if not name or names.index(name) != k:
+            names[k] = f"{name or 'column'}_{k + 1}"
+            notes.append(f"column {k + 1} was named '{name}' like another: now '{names[k]}'")
+    plain = not notes and all(len(r) == len(names) for r in rows)
+    return LooseTable(path.stem, names, units, rows, notes, raw if plain else None)
+
+
+def _ruled(path: Path, lines: list[str]) -> LooseTable | None:
+    """Read a table of right-aligned columns between dashed rules (as the University of Wyoming lists soundings).
+
+    Empty cells are blanks there: a cell ends below the end of its name.
+    """
+    rules = [k for k, line in enumerate(lines[:HEAD_LINES]) if re.fullmatch(r"\s*-{10,}\s*", line)]
+    for top, bottom in pairwise(rules):
+        if bottom - top not in (2, 3):
+            continue
+        ends = [m.end() for m in re.finditer(r"\S+", lines[top + 1])]
+        names = lines[top + 1].split()
+        units = _columns_below(lines[top + 2], ends) if bottom - top == 3 else [""] * len(names)
+        rows = []
+        for line in lines[bottom + 1 :]:
+            cells = _columns_below(line, ends)
+            if not NUMBER.match(cells[0]):
+                break
+            rows.append(cells)
+        if len(rows) >= 3:
+            note = f"columns between rules became CSV; {len(lines) - len(rows)} lines of names, units and text left out"
+            return LooseTable(path.stem, names, units, rows, [note])
+    return None
+
+
+def _columns_below(line: str, ends: list[int]) -> list[str]:
+    """Cells of a line, each ending where a name ends; the last takes the rest."""
+    starts = [0, *ends[:-1]]
+    return [line[a:b].strip() for a, b in zip(starts, [*ends[:-1], len(line) + 1], strict=True)]
+
+
+def _decoded(path: Path, raw: bytes) -> tuple[str, list[str]]:
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return raw.decode("utf-16", errors="replace"), ["UTF-16 became UTF-8"]
+    if b"\0" in raw[:65536]:
+        raise GateError(f"{path}: binary data where a text table is wanted")
+    try:
+        return raw.decode("utf-8-sig"), []
+    except UnicodeDecodeError:
+        return raw.decode("latin-1"), ["read as Latin-1 (it is no UTF-8)"]
+
+
+def _is_comment(line: str, delimiter: str | None) -> bool:
+    """Whether a line is a comment; where semicolons part the cells, an empty first cell makes none."""
+    return bool(COMMENT.match(line)) and not (delimiter == ";" and line.lstrip().startswith(";"))
+
+
+def _split(line: str, delimiter: str | None) -> list[str]:
+    if delimiter is None:
+        return line.split()
+    if '"' in line:
+        return [c.strip() for c in next(csv.reader([line], delimiter=delimiter))]
+    return [c.strip() for c in line.split(delimiter)]
+
+
+def _is_data(cells: list[str]) -> bool:
+    known = [c for c in cells if c.lower() not in MISSING]
+    good = sum(1 for c in known if NUMBER.match(c) or COMMA_NUMBER.match(c) or CLOCK.match(c))
+    return len(cells) >= 2 and bool(known) and good >= max(1, 0.5 * len(known))
+
+
+def _layout(lines: list[str]) -> tuple[str | None, int, list[str], list[str]] | None:
+    """Delimiter, first line of data, names and row of units (empty for none) of the widest table of numbers."""
+    best = None
+    for delimiter in DELIMITERS:
+        cut = [_split(line, delimiter) for line in lines]
+        for first in range(1, len(lines) - 2):
+            three = cut[first : first + 3]
+            same = len({len(c) for c in three}) == 1
+            if (
+                not same
+                or not all(_is_data(c) for c in three)
+                or any(_is_comment(x, delimiter) for x in lines[first : first + 3])
+            ):
+                continue
+            named = _names_above(lines, cut, first, delimiter)
+            if named and (best is None or len(three[0]) > len(best[2])):
+                best = (delimiter, first, *named)
+            break
+    return best
+
+
+def _names_above(
+    lines: list[str], cut: list[list[str]], first: int, delimiter: str | None
+) -> tuple[list[str], list[str]] | None:
+    """Names and units above a first row of numbers; None where there are no names."""
+    count = len(cut[first])
+    units: list[str] = []
+    for k in range(first - 1, max(-1, first - 6), -1):
+        cells = cut[k]
+        if len(cells) != count or _is_comment(lines[k], delimiter):
+            cells = _split(COMMENT.sub("", lines[k]), delimiter)
+        if len(cells) != count:
+            continue
+        if not units and _are_units(cells):
+            units = cells
+            continue
+        if any(re.search("[A-Za-z]", c) for c in cells) and not _is_data(cells):
+            return cells, units
+    return None
+
+
+def _are_units(cells: list[str]) -> bool:
+    known = [c for c in cells if c.strip("()[]{}<>- ")]
+    fitting = sum(1 for c in known if unit_key(c) in UNIT_WORDS or unit_key(c) in SEVERAL_MEANINGS or CLOCK.match(c))
+    formats = sum(1 for c in known if re.match(r"^(DDD|hh|HH)?:?[hH:mMsS.]+$", c))
+    return bool(known) and fitting + formats >= 0.6 * len(known) and not any(len(c) > 24 for c in known) and fitting > 0
+
+
+def _decimal_comma(rows: list[list[str]]) -> bool:
+    cells = [c for row in rows for c in row]
+    return any(COMMA_NUMBER.match(c) for c in cells) and not any(NUMBER.match(c) and "." in c for c in cells)
+
+
+MOST_NUMBERS = 200_000_000
+LEAST_ROWS = 3
+
+
+def read_matlab(path: Path) -> list[LooseTable]:
+    """Read every table of a MATLAB file; `GateError` where there is none."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(128)
+    except FileNotFoundError:
+        raise GateError(f"{path}: no such file") from None
+    variables, left_out = _version_73(path) if b"MATLAB 7.3" in head or head[:4] == b"\x89HDF" else _version_5(path)
+    groups: dict[tuple[str, int], dict[str, FloatArray]] = {}
+    for parent, name, values in variables:
+        rows = max(values.shape)
+        if rows < LEAST_ROWS or values.ndim != 2:
+            left_out.append(name)
+            continue
+        block = values if values.shape[0] == rows else values.T
+        columns = {name: block[:, 0]} if block.shape[1] == 1 else {f"{name}_{k + 1}": c for k, c in enumerate(block.T)}
+        groups.setdefault((parent, rows), {}).update(columns)
+    tables = []
+    for k, ((parent, _), columns) in enumerate(g for g in groups.items() if len(g[1]) >= 2):
+        label = "_".join(filter(None, [path.stem, parent])) + (f"_{k + 1}" if not parent and k else "")
+        cells = [
+            [repr(float(v)) if np.isfinite(v) else "" for v in row] for row in np.column_stack(list(columns.values()))
+        ]
+        notes = ["MATLAB numbers became CSV"]
+        if left_out:
+            notes.append(f"left out, as no columns of numbers: {', '.join(sorted(left_out)[:8])}")
+        tables.append(LooseTable(label, list(columns), [""] * len(columns), cells, notes))
+    if not tables:
+        raise GateError(
+            f"{path}: no two columns of numbers of one length; left out: {', '.join(left_out) or 'nothing'}"
+        )
+    return tables
+
+
+def _version_5(path: Path) -> tuple[list[tuple[str, str, FloatArray]], list[str]]:
+    from scipy.io import loadmat, whosmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        if sum(int(np.prod(shape)) for _, shape, _ in whosmat(path)) > MOST_NUMBERS:
+            raise GateError(f"{path}: more than {MOST_NUMBERS} numbers; split it")
+        content = loadmat(path, chars_as_strings=True)
+    except (ValueError, TypeError, OSError, MatReadError, NotImplementedError, KeyError) as fault:
+        if isinstance(fault, GateError):
+            raise
+        raise GateError(f"{path}: not a MATLAB file that can be read ({fault}); save it with -v7, or as CSV") from None
+    found, left_out = [], []
+    for parent, name, value in _walk(content):
+        if _is_numbers(value):
+            found.append((parent, name, np.atleast_2d(np.asarray(value, dtype=float))))
+        else:
+            left_out.append(name)
+    return found, left_out
+
+
+def _walk(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    """Variables, and fields of structures of one element."""
+    for name, value in content.items():
+        if name.startswith("__"):
+            continue
+        fields = getattr(getattr(value, "dtype", None), "names", None)
+        if fields and value.size == 1:
+            yield from ((name, part, value[part].flat[0]) for part in fields)
+        else:
+            yield "", name, value
+
+
+def _is_numbers(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 0
+
+
+def _version_73(path: Path) -> tuple[list[tuple[str, str, FloatArray]], list[str]]:
+    try:
+        import h5py
+    except ImportError:
+        words = (
+            "a MATLAB 7.3 file needs h5py: pip install 'postflight[matlab]', or save it in MATLAB with -v7, or as CSV"
+        )
+        raise ConfigError(f"{path}: {words}") from None
+    found: list[tuple[str, str, FloatArray]] = []
+    left_out: list[str] = []
+
+    def visit(name: str, item: Any) -> None:
+        if not isinstance(item, h5py.Dataset) or name.startswith("#"):
+            return
+        parent, _, own = name.rpartition("/")
+        if item.dtype.kind in "fiu" and item.ndim <= 2 and 0 < item.size <= MOST_NUMBERS:
+            found.append((parent.replace("/", "_"), own, np.atleast_2d(np.asarray(item[()], dtype=float))))
+        else:
+            left_out.append(own)
+
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems(visit)
+    except OSError as fault:
+        raise GateError(f"{path}: not a MATLAB file that can be read ({fault})") from None
+    return found, left_out

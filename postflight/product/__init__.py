@@ -1,1 +1,0 @@
-"""What an analyst is handed: tables, header, statistics and figures of a best estimated trajectory."""

@@ -1,0 +1,152 @@
+"""How well did it do? The only place that opens ``truth/``: a finished run of a synthetic flight against its truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from flightmodel import rotations
+from flightmodel.airdata import peak_pressure, pressure_pulse
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.deflection import DeflectionHistory
+from flightmodel.trajectory import Trajectory, difference, resample
+from postflight.run_folder import newest_run
+
+# what the demo flight with nominal instrument errors must reach
+DEFLECTION_LIMIT_DEG = {"camera": 0.7, "misalignment": 0.7, "trim": 1.2, "fused": 0.5}
+BET_LIMITS = {"position_rms_m": 30.0, "velocity_rms_mps": 0.5, "alpha_total_rms_deg": 0.5}
+STATE_COLUMNS = (
+    "t_s",
+    *(f"r{a}_ecef_m" for a in "xyz"),
+    *(f"v{a}_ecef_mps" for a in "xyz"),
+    *(f"q{a}_ecef_body" for a in "wxyz"),
+    *(f"{a}_body_degps" for a in "pqr"),
+)
+PAPER_DEG = {"camera": 4.2, "misalignment": 3.5, "trim": 3.75}
+
+
+@dataclass(frozen=True)
+class Score:
+    """A run against its truth: ``methods`` and ``bet`` as printed by ``score --json``, and what failed, in words."""
+
+    peak_s: float
+    methods: dict[str, dict[str, Any]]
+    bet: dict[str, float]
+    failures: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return one object for machines."""
+        return {
+            "peak_dynamic_pressure_s": self.peak_s,
+            "methods": self.methods,
+            "bet": self.bet,
+            "passed": not self.failures,
+            "failures": list(self.failures),
+        }
+
+
+def score_run(flight_folder: Path, run: Path | None = None) -> Score:
+    """Score the newest (or the given) run.
+
+    Raises
+    ------
+    GateError
+        Where there is no truth or no finished run.
+    """
+    truth_folder = flight_folder / "truth"
+    if not (truth_folder / "truth.csv").is_file():
+        raise GateError(f"{flight_folder}: no truth/truth.csv to score against")
+    run = run or newest_run(flight_folder)
+    truth = _read(truth_folder / "truth.csv", (*STATE_COLUMNS, "dynamic_pressure_pa", "alpha_body_deg"))
+    bent = _read(truth_folder / "deflection.csv", ("t_s", "theta_deg"))
+    peak_s, _ = peak_pressure(truth["t_s"].to_numpy(), truth["dynamic_pressure_pa"].to_numpy())
+    true_deg = float(np.interp(peak_s, bent["t_s"], bent["theta_deg"]))
+    refused = json.loads((run / "summary.json").read_text())["methods"]
+    methods, failures = {}, []
+    for method in DEFLECTION_LIMIT_DEG:
+        row = _method_row(run / f"deflection_{method}.csv", peak_s, true_deg)
+        methods[method] = row
+        if row["deflection_deg"] is None and refused.get(method, {}).get("applicable", True):
+            failures.append(f"{method}: no answer at peak ({refused.get(method, {}).get('reason', 'not run')})")
+        elif row["deflection_deg"] is not None and not abs(row["error_deg"]) <= DEFLECTION_LIMIT_DEG[method]:
+            failures.append(f"{method}: error {row['error_deg']:+.2f} deg beyond {DEFLECTION_LIMIT_DEG[method]} deg")
+    bet = _bet_errors(_read(run / "bet.csv", (*STATE_COLUMNS, "alpha_total_wind_deg")), truth)
+    failures += [f"BET {k}: {bet[k]:.3f} beyond {limit}" for k, limit in BET_LIMITS.items() if not bet[k] < limit]
+    return Score(peak_s, methods, bet, tuple(failures))
+
+
+def _read(path: Path, columns: tuple[str, ...]) -> pd.DataFrame:
+    """Read a result or truth table; `GateError` where it is no table of numbers with these columns."""
+    try:
+        table = pd.read_csv(path)
+        return table.astype(dict.fromkeys(columns, float))
+    except (OSError, ValueError, KeyError, pd.errors.ParserError, pd.errors.EmptyDataError) as fault:
+        raise GateError(f"{path}: cannot be read as a table with {', '.join(columns)}: {fault}") from None
+
+
+def _history(path: Path) -> DeflectionHistory:
+    """Read a ``deflection_<method>.csv`` back."""
+    names = ("theta_deg", "plane_lv_deg", "theta_sd_deg")
+    table = _read(path, ("t_s", *names))
+    theta, plane, sd = (np.deg2rad(table[c].to_numpy(dtype=float)) for c in names)
+    cov = np.zeros((len(table), 2, 2))
+    cov[:, 0, 0] = sd**2
+    return DeflectionHistory(table["t_s"].to_numpy(dtype=float), theta, plane, cov, path.stem)
+
+
+def _method_row(path: Path, at_s: float, true_deg: float) -> dict[str, Any]:
+    row: dict[str, Any] = {"deflection_deg": None, "sd_deg": None, "truth_deg": true_deg, "error_deg": None}
+    if not path.is_file():
+        return row
+    theta, sd = np.rad2deg(_history(path).at(at_s))
+    if np.isfinite(theta) and np.isfinite(sd):
+        row |= {"deflection_deg": float(theta), "sd_deg": float(sd), "error_deg": float(theta) - true_deg}
+    return row
+
+
+def trajectory_from_table(table: pd.DataFrame, epoch_utc: str = "2000-01-01T00:00:00Z") -> Trajectory:
+    """Trajectory from the columns that ``truth.csv`` and ``bet.csv`` share."""
+
+    def columns(pattern: str, letters: str) -> FloatArray:
+        return table[[pattern.format(a) for a in letters]].to_numpy(dtype=float)
+
+    q = columns("q{}_ecef_body", "wxyz")
+    return Trajectory(
+        epoch_utc,
+        table["t_s"].to_numpy(dtype=float),
+        "datum",
+        columns("r{}_ecef_m", "xyz"),
+        columns("v{}_ecef_mps", "xyz"),
+        rotations.continuous(q / np.linalg.norm(q, axis=1, keepdims=True)),
+        np.deg2rad(columns("{}_body_degps", "pqr")),
+    )
+
+
+def _bet_errors(bet: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:
+    """Root-mean-square errors over the pressure pulse (dynamic pressure above half its peak)."""
+    bet = bet[(bet["t_s"] >= truth["t_s"].iloc[0]) & (bet["t_s"] <= truth["t_s"].iloc[-1])]
+    estimate, true = trajectory_from_table(bet), trajectory_from_table(truth)
+    error = difference(estimate, resample(true, estimate.time_s))
+
+    def along(column: str) -> FloatArray:
+        return np.interp(estimate.time_s, truth["t_s"], truth[column])
+
+    pulse = pressure_pulse(along("dynamic_pressure_pa"))
+    alpha_error = bet["alpha_total_wind_deg"].to_numpy() - along("alpha_body_deg")
+
+    def rms(values: FloatArray) -> float:
+        return float(np.sqrt(np.mean(np.sum(np.atleast_2d(values.T) ** 2, axis=0)[pulse])))
+
+    return {
+        "pulse_start_s": float(estimate.time_s[pulse][0]),
+        "pulse_end_s": float(estimate.time_s[pulse][-1]),
+        "position_rms_m": rms(error[:, 0:3]),
+        "velocity_rms_mps": rms(error[:, 3:6]),
+        "attitude_rms_deg": float(np.rad2deg(rms(error[:, 6:9]))),
+        "alpha_total_rms_deg": rms(alpha_error),
+    }

@@ -1,0 +1,219 @@
+"""What the vehicle would have done by all that was known before: the view that the flight is held against (Figure 1.3).
+
+The vehicle is flown many times from the reconstructed state above the atmosphere, with mass properties, coefficients,
+damping, density, winds and start attitude dispersed by their pre-flight uncertainty: with its joint locked, as before
+the paper's reconciliation, or with a flexible joint that is dispersed too, as after it. Unlike a true pre-flight study
+(`postflight montecarlo`) it does not disperse the launch, so its bands are about this flight's own entry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from flightmodel import rotations
+from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
+from flightmodel.checks import BoolArray, FloatArray, GateError, Progress
+from flightmodel.trajectory import resample
+from flightmodel.vehicle import Uncertainty, Vehicle
+from postflight.flight import Flight
+from synthetic_flight import simulate
+from synthetic_flight.dispersions import (
+    AeroDispersions,
+    Dispersions,
+    Factor,
+    JointDispersions,
+    MassDispersions,
+    Shift,
+    dispersed_scales,
+    dispersed_vehicle,
+    draw_one,
+    draws,
+    rng_from_draw,
+)
+from synthetic_flight.dynamics import check_step
+from synthetic_flight.ensemble import LANES, Flown, Records, Schedule, Start, fly_legs
+from synthetic_flight.simulate import state_from_ecef
+from synthetic_flight.weather import correlated
+
+START_ALTITUDE_M = 100e3
+# the rigid vehicle's fastest motion is its pitch at 1 Hz; fourth-order steps of 10 ms hold it to 1e-6
+RIGID_STEP_S, FLEXIBLE_STEP_S, RECORD_S, SPAN_S = 0.01, 0.005, 0.05, 70.0
+PERCENTILES = (2.3, 50.0, 97.7)
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Percentile bands ``(3, n)`` of dispersed entries, and the nominal one ``(n,)``; a flight that ended early holds.
+
+    ``ended`` of ``flights`` did not reach the end: their joint passed 90 deg.
+    """
+
+    time_s: FloatArray
+    alpha_total_deg: FloatArray
+    normal_g: FloatArray
+    nominal_alpha_deg: FloatArray
+    nominal_normal_g: FloatArray
+    flights: int
+    ended: int = 0
+
+    def table(self) -> pd.DataFrame:
+        """Return the bands as columns, for ``rigid_bounds.csv``."""
+        columns: dict[str, FloatArray] = {"t_s": self.time_s}
+        for name, unit, bands, nominal in (
+            ("alpha_total", "deg", self.alpha_total_deg, self.nominal_alpha_deg),
+            ("normal", "g", self.normal_g, self.nominal_normal_g),
+        ):
+            columns |= {f"{name}_{part}_{unit}": c for part, c in zip(("low", "median", "high"), bands, strict=True)}
+            columns[f"{name}_nominal_{unit}"] = nominal
+        return pd.DataFrame(columns).assign(flights=self.flights)
+
+
+def dispersions_of(known: Uncertainty, joint: JointDispersions | None) -> Dispersions:
+    """Dispersions that a vehicle's file states; with a flexible joint where its own are given."""
+
+    def normal(sd: float) -> Factor:
+        return Factor(normal=sd)
+
+    def shift(sd: float) -> Shift:
+        return Shift(normal=sd)
+
+    return Dispersions(
+        joint_is="locked" if joint is None else "flexible",
+        mass=MassDispersions(
+            aeroshell_mass=normal(known.mass),
+            centerbody_mass=normal(known.mass),
+            aeroshell_inertia=normal(known.inertia),
+            centerbody_inertia=normal(known.inertia),
+            aeroshell_cg_station_m=shift(known.cg_station_m),
+            centerbody_cg_station_m=shift(known.cg_station_m),
+            offset_y_m=shift(known.cg_lateral_m),
+            offset_z_m=shift(known.cg_lateral_m),
+        ),
+        aerodynamics=AeroDispersions(
+            ca=normal(known.ca), cn=normal(known.cn), cm=normal(known.cm), cmq=shift(known.cmq)
+        ),
+        joint=joint or JointDispersions(),
+    )
+
+
+def rigid_bounds(flight: Flight, flights: int = 100, seed: int = 0, progress: Progress | None = None) -> Bounds:
+    """Fly the rigid vehicle ``flights`` times; run ``k`` is the same flight whatever the number."""
+    return entry_bounds(flight, None, flights, seed, progress)
+
+
+def entry_bounds(
+    flight: Flight,
+    joint: JointDispersions | None,
+    flights: int = 100,
+    seed: int = 0,
+    progress: Progress | None = None,
+    vehicle: Vehicle | None = None,
+) -> Bounds:
+    """Fly the flight's own entry ``flights`` times.
+
+    Parameters
+    ----------
+    flight : Flight
+        With a vehicle; its reconstruction gives the start, its sounding the air.
+    joint : JointDispersions or None
+        What is uncertain of the joint; None locks it.
+    vehicle : Vehicle, optional
+        Flown instead of the one that the flight's analyst was told, such as a reconciled one.
+
+    Raises
+    ------
+    GateError
+        Where the reconstruction never comes below 100 km, or a draw cannot fly.
+    """
+    report = progress or (lambda _fraction, _what: None)
+    entry = _Entry(flight, vehicle or flight.telemetry.required_vehicle(), joint)
+    nominal = entry.fly([entry.start(None)])[0]
+    alpha, normal = np.empty((2, flights, entry.records))
+    ended = 0
+    what = "rigid" if joint is None else "flexible"
+    for first in range(0, flights, LANES):
+        runs = range(first, min(first + LANES, flights))
+        for k, found in zip(runs, entry.fly([entry.start((seed, run)) for run in runs]), strict=True):
+            alpha[k], normal[k], diverged = found
+            ended += diverged
+        report(runs.stop / flights, f"{what} flight {runs.stop} of {flights}")
+    return Bounds(
+        time_s=entry.start_s + RECORD_S * np.arange(entry.records),
+        alpha_total_deg=np.percentile(alpha, PERCENTILES, axis=0),
+        normal_g=np.percentile(normal, PERCENTILES, axis=0),
+        nominal_alpha_deg=nominal[0],
+        nominal_normal_g=nominal[1],
+        flights=flights,
+        ended=ended,
+    )
+
+
+def inside(
+    time_s: FloatArray, values: FloatArray, band_time_s: FloatArray, low: FloatArray, high: FloatArray
+) -> BoolArray:
+    """Whether values at times lie between two limits that are given at other times."""
+    return np.asarray(
+        (values >= np.interp(time_s, band_time_s, low)) & (values <= np.interp(time_s, band_time_s, high))
+    )
+
+
+class _Entry:
+    """The entry of one flight, ready to be flown from dispersed starts."""
+
+    def __init__(self, flight: Flight, vehicle: Vehicle, joint: JointDispersions | None) -> None:
+        air = flight.air
+        below = np.flatnonzero((air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0))
+        if not len(below):
+            raise GateError("pre-flight bounds: the reconstruction never comes below 100 km")
+        self.start_s = float(air.time_s[below[0]])
+        self.records = round(min(SPAN_S, air.time_s[-1] - self.start_s) / RECORD_S)
+        self.vehicle, self.locked = vehicle, joint is None
+        self.dispersions = dispersions_of(vehicle.uncertainty, joint)
+        self.profile = profile_from_sounding(flight.telemetry.sounding)
+        self.at_start = resample(flight.reconstruction.smoothed, np.array([self.start_s]))
+        step = RIGID_STEP_S if self.locked else FLEXIBLE_STEP_S
+        self.schedule = Schedule(step, round(RECORD_S / step), self.records, self.records if self.locked else 0)
+
+    def start(self, run: tuple[int, int] | None) -> tuple[Start, Vehicle]:
+        """Start and vehicle of one run, given as seed and number; None is the nominal one."""
+        vehicle, scales, profile, turn = self.vehicle, (1.0, 1.0, 1.0, 0.0), self.profile, np.zeros(3)
+        if run is not None:
+            u = draws(self.dispersions, *run)
+            deviation = {name: law.at(u[name]) for name, law in self.dispersions.factors().items() if law is not None}
+            vehicle = dispersed_vehicle(self.vehicle, lambda name: deviation.get(name, 0.0))
+            scales = dispersed_scales(lambda name: deviation.get(name, 0.0))
+            profile = _dispersed_air(self.profile, rng_from_draw(draw_one(*run, "sounding")))
+            attitude = rng_from_draw(draw_one(*run, "attitude")).standard_normal(3)
+            turn = attitude * self.at_start.sd()[0, 6:9]
+        if not self.locked:
+            check_step(vehicle, self.schedule.step_s)
+        q = rotations.boxplus(self.at_start.q_ecef_body[0], turn)
+        position = self.at_start.position_ecef_m[0] + rotations.rotate(q, vehicle.cg_m)
+        velocity, omega = self.at_start.velocity_ecef_mps[0], self.at_start.omega_body_eci_body_radps[0]
+        state = state_from_ecef(self.start_s, position, velocity, q, omega)
+        parameters = simulate.parameter_vector(vehicle, *scales)
+        return Start(state, parameters, simulate.atmosphere_table(profile)), vehicle
+
+    def fly(self, starts: list[tuple[Start, Vehicle]]) -> list[tuple[FloatArray, FloatArray, bool]]:
+        """Centerbody's total angle of attack, deg, normal acceleration, g, and whether the joint diverged."""
+        flown = fly_legs(self.vehicle, list(range(len(starts))), [s for s, _ in starts], [self.schedule])
+        return [self._kept(f, start, vehicle) for f, (start, vehicle) in zip(flown, starts, strict=True)]
+
+    def _kept(self, flown: Flown, start: Start, vehicle: Vehicle) -> tuple[FloatArray, FloatArray, bool]:
+        if not len(flown.aux):
+            raise GateError("pre-flight bounds: a flight has no record; the reconstruction's start is no flight")
+        records = Records(flown.states, flown.aux, vehicle, start.atmosphere)
+        rows = np.minimum(np.arange(self.records), len(flown.aux) - 1)
+        return records.alpha_total_deg[rows], records.normal_g[rows], flown.diverged
+
+
+def _dispersed_air(profile: AtmosphereProfile, rng: np.random.Generator) -> AtmosphereProfile:
+    z = profile.altitude_m
+    wind = profile.wind_ned_mps.copy()
+    for axis in (0, 1):
+        wind[:, axis] += profile.wind_sd_mps * correlated(z, 3000.0, rng)
+    ratio = profile.log_density_ratio + profile.density_sd * correlated(z, 5000.0, rng)
+    return replace(profile, log_density_ratio=ratio, wind_ned_mps=wind)

@@ -1,0 +1,349 @@
+"""What the air of the day was, given the trajectory: density and winds along altitude, from the measured deceleration.
+
+The sounding is a prior. Half the variance of its errors is constant along altitude, half forgets (exponentially, over
+5 km for density, 3 km for winds); the accelerometers then say at every height how hard the air pushed,
+
+    f = q S / m (-C_A(M, |a|) e_x - C_N(M, |a|) a/|a| + C_A t),   q = rho |u|^2 / 2,   u = v - wind,   a = a_body + t
+
+with ``a_body`` the flow's lateral angle against the centerbody and ``t = (G a_body + B) s / (1 - g s) + b`` what a bent
+shell, a shifted c.g. and a mounting add to it (``s`` is the share of the largest dynamic pressure): a compliant joint
+yields in proportion to the load, the more the nearer it is to divergence. ``B`` and ``b`` turn with the body, while
+winds do not: spin tells them apart. Coefficient scales are unknown within their pre-flight
+standard deviations, attitude and velocity within the trajectory's own covariance. All are found at once by least
+squares. Density and C_A enter as a product: without pressure ports a constant factor between them stays open, and the
+standard deviations say so.
+
+References
+----------
+S. Dutta, R. Braun, "Statistical entry, descent, and landing performance reconstruction of the Mars Science
+Laboratory", J. Spacecraft Rockets 51 (2014) 1048 (density and drag are not separable without pressures).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from flightmodel.aerodynamics import AeroTable
+from flightmodel.airdata import lateral_angles
+from flightmodel.atmosphere import AtmosphereProfile
+from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.sphere_cone import knudsen
+from recon.consistency import Verdict, sheet_verdict, verdict
+from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
+
+KNOT_M, KNOT_S, TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
+LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration says nothing about the air
+LEAST_SAMPLES = 20
+# of the deceleration, along and across: what coefficients and a swinging joint leave open
+MODEL_PART, LATERAL_PART, MODEL_FLOOR_MPS2 = 0.01, 0.02, 0.03
+CONSTANT_PART = 0.5  # of a sounding's error variance: calibration, drag coefficient of the sphere
+GAIN_SD, GROWTH_SD, OFFSET_SD_RAD = 1.0, 0.3, np.deg2rad(3.0)
+BAD_AIR = "is further from the sounding than its accuracy allows: the air was other than sounded, or the drag"
+BAD_DRAG = "is further from the pre-flight value than stated: check mass, area and coefficients"
+LARGEST_RMS = 2.0
+LEAST_LEFT = 0.1  # of the joint's stiffness, when the air's push has taken its part
+SETTLED_SD, MOST_STEPS = 1e-2, 20
+
+
+@dataclass(frozen=True)
+class AirSamples:
+    """Means over windows long enough to average the joint's swinging.
+
+    Parameters
+    ----------
+    time_s, altitude_m : (n,) float
+    velocity_ned_mps : (n, 3) float
+        Of the c.g. against the rotating Earth.
+    dcm_ned_body : (n, 3, 3) float
+        Mean matrix of the window, which is not quite orthogonal: of body-axis components it makes means, too.
+    specific_force_body_mps2 : (n, 3) float
+        At the c.g.
+    error_root_ned : (n, 6, 6) float
+        Root of the trajectory's covariance: velocity m/s and rotation rad, estimate minus truth, NED axes.
+    """
+
+    time_s: FloatArray
+    altitude_m: FloatArray
+    velocity_ned_mps: FloatArray
+    dcm_ned_body: FloatArray
+    specific_force_body_mps2: FloatArray
+    error_root_ned: FloatArray
+
+    def rows(self, keep: BoolArray) -> AirSamples:
+        """Chosen samples."""
+        return AirSamples(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class Drag:
+    """What pushes: coefficients, reference area over mass, how well both are known (fractions), reference length."""
+
+    table: AeroTable
+    area_per_mass_m2pkg: float
+    ca_sd: float
+    cn_sd: float
+    length_m: float
+
+
+@dataclass(frozen=True)
+class ReconstructedAir:
+    """Air of the day with what was learnt from the flight.
+
+    Parameters
+    ----------
+    profile : DataFrame
+        ``altitude_m``; ``density_ratio`` (to the sounding) and winds north and east, each with ``_sd`` and
+        ``_prior_sd``.
+    drag : DataFrame
+        ``time_s, altitude_m, mach, dynamic_pressure_pa, ratio, ratio_prior_sd``: measured over predicted axial force
+        with the sounding's air and the pre-flight C_A.
+    parameters : DataFrame
+        ``name, unit, prior_sd, estimate, sd`` of coefficient scales, gain and offsets.
+    verdicts : tuple of Verdict
+    """
+
+    profile: pd.DataFrame
+    drag: pd.DataFrame
+    parameters: pd.DataFrame
+    verdicts: tuple[Verdict, ...]
+
+
+PARAMETERS = {
+    "C_A scale": "1",
+    "C_N scale": "1",
+    "flexure gain": "1",
+    "flexure growth": "1",
+    "load offset y": "rad",
+    "load offset z": "rad",
+    "offset y": "rad",
+    "offset z": "rad",
+}
+SEEN = 3 + len(PARAMETERS) + 6  # by each sample: density, two winds, parameters, errors of velocity and attitude
+
+
+class _Model:
+    """Forces as a function of the quantities that each sample sees, in the order of `SEEN`."""
+
+    def __init__(self, samples: AirSamples, profile: AtmosphereProfile, drag: Drag) -> None:
+        self.samples, self.drag = samples, drag
+        self.air = profile.at(samples.altitude_m)
+        self.knudsen = knudsen(self.air.density_kgpm3, drag.length_m)
+        still = np.zeros((len(samples.time_s), SEEN))
+        self.largest_pa = float(self.forces(still, 1.0)[1].max())
+
+    def forces(self, x: FloatArray, largest_pa: float | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Specific force (n, 3), dynamic pressure (n,), Mach number (n,)."""
+        s, air = self.samples, self.air
+        ca_scale, cn_scale, gain, growth = x[:, 3:7].T
+        error = np.einsum("nij,nj->ni", s.error_root_ned, x[:, 11:17])
+        wind = air.wind_ned_mps.copy()
+        wind[:, :2] += x[:, 1:3] * air.wind_sd_mps[:, None]
+        u_ned = s.velocity_ned_mps - error[:, 0:3] - wind
+        u_ned = u_ned + np.cross(error[:, 3:6], u_ned)
+        u = np.einsum("nji,nj->ni", s.dcm_ned_body, u_ned)
+        speed = np.linalg.norm(u_ned, axis=1)
+        q = 0.5 * air.density_kgpm3 * np.exp(x[:, 0] * air.density_sd) * speed**2
+        mach = speed / air.sound_speed_mps
+        body = lateral_angles(u)
+        share = q / (self.largest_pa if largest_pa is None else largest_pa)
+        share = share / np.maximum(1.0 - growth * share, LEAST_LEFT)
+        tilt = share[:, None] * (gain[:, None] * body + x[:, 7:9]) + x[:, 9:11]
+        flow = body + tilt
+        size = np.linalg.norm(flow, axis=1)
+        coefficients = self.drag.table.at(mach, np.clip(size, 0.0, np.pi), self.knudsen)
+        ca, cn = coefficients[:, 0] * np.exp(ca_scale), coefficients[:, 1] * np.exp(cn_scale)
+        direction = flow / np.maximum(size, 1e-12)[:, None]
+        push = (q * self.drag.area_per_mass_m2pkg)[:, None]
+        lateral = -cn[:, None] * direction + ca[:, None] * tilt
+        return push * np.column_stack([-ca, lateral]), q, mach
+
+    def linearised(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Forces (n, 3) and partials (n, 3, SEEN), central differences."""
+        step = 1e-4
+        partials = np.empty((len(x), 3, SEEN))
+        for j in range(SEEN):
+            up, down = x.copy(), x.copy()
+            up[:, j] += step
+            down[:, j] -= step
+            partials[:, :, j] = (self.forces(up)[0] - self.forces(down)[0]) / (2.0 * step)
+        return self.forces(x)[0], partials
+
+
+def _interpolation(at: FloatArray, knots: FloatArray) -> FloatArray:
+    """Weights (n, k) of linear interpolation."""
+    k = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    w = np.clip((at - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0)
+    out = np.zeros((len(at), len(knots)))
+    out[np.arange(len(at)), k], out[np.arange(len(at)), k + 1] = 1.0 - w, w
+    return out
+
+
+def _process_information(knots: FloatArray, length: float, constant: float = 0.0) -> FloatArray:
+    """Inverse covariance (k, k) of a process of unit variance on knots: a constant part and one that forgets."""
+    forgets = np.exp(-np.abs(knots[:, None] - knots[None, :]) / length)
+    return np.asarray(np.linalg.inv(constant + (1.0 - constant) * forgets))
+
+
+def _knots(at: FloatArray, spacing: float) -> FloatArray:
+    first, last = np.floor(at.min() / spacing), np.ceil(at.max() / spacing)
+    return spacing * np.arange(first, max(last, first + 1.0) + 1.0)
+
+
+def reconstruct_air(
+    samples: AirSamples, profile: AtmosphereProfile, drag: Drag, confidence: float = 0.999
+) -> ReconstructedAir:
+    """Density and winds along altitude from a trajectory and the deceleration along it.
+
+    Raises
+    ------
+    GateError
+        Where the air never pushes hard enough for `LEAST_SAMPLES` windows.
+    """
+    keep = -samples.specific_force_body_mps2[:, 0] >= LEAST_AXIAL_MPS2
+    if keep.sum() < LEAST_SAMPLES:
+        raise GateError(
+            f"air: {int(keep.sum())} windows with a deceleration above {LEAST_AXIAL_MPS2} m/s^2; "
+            f"{LEAST_SAMPLES} are the least from which density and winds can be learnt"
+        )
+    samples = samples.rows(keep)
+    model = _Model(samples, profile, drag)
+    height, moment = _knots(samples.altitude_m, KNOT_M), _knots(samples.time_s, KNOT_S)
+    by_height, by_time = _interpolation(samples.altitude_m, height), _interpolation(samples.time_s, moment)
+    prior_sd = np.array([drag.ca_sd, drag.cn_sd, GAIN_SD, GROWTH_SD, *[OFFSET_SD_RAD] * 4])
+    blocks = [by_height] * 3 + [np.tile(sd, (len(samples.time_s), 1)) for sd in prior_sd] + [by_time] * 6
+    lengths = (DENSITY_LENGTH_M, WIND_LENGTH_M, WIND_LENGTH_M)
+    information = [_process_information(height, length, CONSTANT_PART) for length in lengths]
+    information += [np.eye(1)] * len(prior_sd) + [_process_information(moment, TRAJECTORY_TIME_S)] * 6
+    estimate, covariance, residual = _least_squares(model, blocks, information)
+    sd = np.sqrt(np.diag(covariance))
+    return ReconstructedAir(
+        _profile(model, height, estimate, sd),
+        _drag_ratio(model),
+        _parameters(prior_sd, estimate[3 * len(height) :], sd[3 * len(height) :]),
+        (*_verdicts(height, estimate, sd, confidence), *_residual_verdicts(residual)),
+    )
+
+
+def _least_squares(
+    model: _Model, blocks: list[FloatArray], information: list[FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Normalised unknowns (u,), their covariance, and residuals (n, 3) in standard deviations."""
+    from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
+
+    prior = block_diag(*information)
+    x = np.zeros(len(prior))
+    edges = np.cumsum([0, *(b.shape[1] for b in blocks)])
+    measured = model.samples.specific_force_body_mps2
+    sd = np.hypot(MODEL_FLOOR_MPS2, np.array([MODEL_PART, LATERAL_PART, LATERAL_PART]) * np.abs(measured[:, :1]))
+    for _ in range(MOST_STEPS):
+        local = np.column_stack([b @ x[i:j] for b, i, j in zip(blocks, edges[:-1], edges[1:], strict=True)])
+        force, partials = model.linearised(local)
+        residual = (measured - force) / sd
+        jacobian = np.concatenate(
+            [(partials[:, :, k] / sd)[:, :, None] * b[:, None, :] for k, b in enumerate(blocks)], axis=2
+        ).reshape(-1, len(x))
+        try:
+            factor = cho_factor(jacobian.T @ jacobian + prior)
+        except (LinAlgError, ValueError):  # steps led to forces that are no numbers
+            raise GateError(
+                "air: no density and winds near the sounding's explain the deceleration along this trajectory; see the "
+                "verdicts, and check the accelerometer's axes, units and mount"
+            ) from None
+        step = cho_solve(factor, jacobian.T @ residual.ravel() - prior @ x)
+        x = x + step
+        covariance = cho_solve(factor, np.eye(len(x)))
+        if np.abs(step / np.sqrt(np.diag(covariance))).max() < SETTLED_SD:
+            break
+    return x, covariance, residual
+
+
+def _profile(model: _Model, height: FloatArray, estimate: FloatArray, sd: FloatArray) -> pd.DataFrame:
+    """Density ratio and winds at the knots (k,) that lie among the samples."""
+    k = len(height)
+    order = np.argsort(model.samples.altitude_m)
+    at = model.samples.altitude_m[order]
+    density_sd, wind_sd = (
+        np.interp(height, at, values[order]) for values in (model.air.density_sd, model.air.wind_sd_mps)
+    )
+    density, north, east = (slice(i * k, (i + 1) * k) for i in range(3))
+    ratio = np.exp(estimate[density] * density_sd)
+    # samples tell the mean wind about a knot; the air's own structure between knots lies on top of that
+    within = (1.0 - CONSTANT_PART) * KNOT_M / (3.0 * WIND_LENGTH_M)
+    north_sd, east_sd = (np.sqrt(np.minimum(sd[part] ** 2 + within, 1.0)) for part in (north, east))
+    table = pd.DataFrame(
+        {
+            "altitude_m": height,
+            "density_ratio": ratio,
+            "density_ratio_sd": ratio * sd[density] * density_sd,
+            "density_ratio_prior_sd": density_sd,
+            "wind_north_change_mps": estimate[north] * wind_sd,
+            "wind_north_sd_mps": north_sd * wind_sd,
+            "wind_east_change_mps": estimate[east] * wind_sd,
+            "wind_east_sd_mps": east_sd * wind_sd,
+            "wind_prior_sd_mps": wind_sd,
+        }
+    )
+    return table[(height >= at[0]) & (height <= at[-1])].reset_index(drop=True)
+
+
+def _parameters(prior_sd: FloatArray, estimate: FloatArray, sd: FloatArray) -> pd.DataFrame:
+    """Coefficient scales and flexure; the rest of the unknowns (u,) is the trajectory's."""
+    n = len(PARAMETERS)
+    return pd.DataFrame(
+        {
+            "name": list(PARAMETERS),
+            "unit": list(PARAMETERS.values()),
+            "prior_sd": prior_sd,
+            "estimate": estimate[:n] * prior_sd,
+            "sd": sd[:n] * prior_sd,
+        }
+    )
+
+
+def _drag_ratio(model: _Model) -> pd.DataFrame:
+    """Measured over predicted axial force, with the sounding's air and the pre-flight coefficients."""
+    s = model.samples
+    force, q, mach = model.forces(np.zeros((len(s.time_s), SEEN)))
+    return pd.DataFrame(
+        {
+            "time_s": s.time_s,
+            "altitude_m": s.altitude_m,
+            "mach": mach,
+            "dynamic_pressure_pa": q,
+            "ratio": s.specific_force_body_mps2[:, 0] / force[:, 0],
+            "ratio_prior_sd": np.hypot(model.air.density_sd, model.drag.ca_sd),
+        }
+    )
+
+
+def _residual_verdicts(residual: FloatArray) -> list[Verdict]:
+    """Do the forces follow the model (n, 3)?"""
+    out = []
+    for name, part in (("axial", residual[:, :1]), ("lateral", residual[:, 1:])):
+        good, bad = "forces follow the model", "forces do not follow the model: coefficients, or what pushes is not air"
+        rms = float(np.sqrt(np.mean(part**2)))
+        out.append(verdict(f"air residuals {name}", rms, 0.0, LARGEST_RMS, good, bad))
+    return out
+
+
+def _verdicts(height: FloatArray, estimate: FloatArray, sd: FloatArray, confidence: float) -> tuple[Verdict, ...]:
+    """Do density, winds and the axial coefficient lie where the sounding and the pre-flight model put them?"""
+    k = len(height)
+    heights = [f"{h / 1000:.0f} km" for h in height]
+
+    def judged(label: str, names: list[str], first: int, bad: str) -> Verdict | None:
+        rows = slice(first, first + len(names))
+        good = "as far from its statement as stated; the furthest is"
+        return sheet_verdict(label, names, estimate[rows], np.ones(len(names)), sd[rows], confidence, bad, good)
+
+    wind = [f"wind {way} at {h}" for way in ("north", "east") for h in heights]
+    found = (
+        judged("sounding density", [f"density at {h}" for h in heights], 0, BAD_AIR),
+        judged("sounding wind", wind, k, BAD_AIR),
+        # C_N is not judged: a shell that bends changes the normal force as a wrong C_N does
+        judged("pre-flight C_A", ["C_A"], 3 * k, BAD_DRAG),
+    )
+    return tuple(v for v in found if v is not None)

@@ -1,0 +1,499 @@
+"""How three real sensors distort what three ideal ones would say; the parts of that which other instruments share.
+
+In the order of the signal's way: bandwidth, delay, misalignment of the triad, axes that are not square to each other,
+scale (with another one for negative values), bias and its slow drift, noise, range, quantisation, dropped samples. What
+is constant over a flight is drawn once. Each quantity beyond the first four (mounting, scale, bias, noise) draws from a
+child of the instrument's generator with a name of its own, so that adding one leaves the others as they were.
+
+How a scenario file describes the instruments: their places, rates and errors, degrees and everyday units.
+
+Every error beyond the first few may be left out and is then absent. Sizes are one standard deviation of what is drawn
+once a flight, unless said otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
+
+from flightmodel import rotations
+from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.config import (
+    Angle,
+    Elevation,
+    ErrorAngle,
+    Fraction,
+    KeyFaults,
+    Latitude,
+    Longitude,
+    SampleRate,
+    Section,
+    Time,
+)
+from flightmodel.refraction import Refractivity
+from flightmodel.trajectory import interpolate_rows
+from synthetic_flight import _kernels
+
+BUTTERWORTH = np.sqrt(0.5)
+CHILD = 0  # stands between an instrument's key and its child's: no name holds a NUL
+
+
+@dataclass(frozen=True)
+class DropoutErrors:
+    """Bursts of lost samples: how many a second, how long on average, and stated intervals, s."""
+
+    rate_hz: float = 0.0
+    mean_s: float = 0.0
+    outages_s: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class TriadErrors:
+    """Errors of a triad, SI; the first four are standard deviations, drawn in this order: mount, scale, bias, noise.
+
+    Parameters
+    ----------
+    mount_rad, scale, bias, noise : float
+        Turn of the triad per axis, scale factor, constant bias, white noise per sample.
+    nonorthogonality_rad, scale_asymmetry, drift : float
+        Standard deviations of each axis's tilt towards the others, of what negative values gain over the scale, and of
+        a Gauss-Markov drift.
+    drift_time_constant_s : float
+    bandwidth_hz, order : float, int
+        Corner (-3 dB) of a low-pass of first order, or second (Butterworth); 0 for none.
+    delay_s : float
+        A sample stamped t shows what was there at ``t - delay_s``.
+    time_bias_s : float
+        Standard deviation of a constant that adds to the delay.
+    limit : (3,) float or None
+        Largest magnitude of each axis; beyond it the sensor reads the limit.
+    resolution : float
+        Quantisation step, 0 for none.
+    dropouts : DropoutErrors
+    """
+
+    mount_rad: float
+    scale: float
+    bias: float
+    noise: float
+    resolution: float = 0.0
+    nonorthogonality_rad: float = 0.0
+    scale_asymmetry: float = 0.0
+    drift: float = 0.0
+    drift_time_constant_s: float = 100.0
+    bandwidth_hz: float = 0.0
+    order: int = 2
+    delay_s: float = 0.0
+    time_bias_s: float = 0.0
+    limit: tuple[float, float, float] | None = None
+    dropouts: DropoutErrors = field(default_factory=DropoutErrors)
+
+
+def name_key(name: str) -> list[int]:
+    """Return a name as the words of a seed's key, four bytes each."""
+    raw = name.encode()
+    return [int.from_bytes(raw[i : i + 4], "big") for i in range(0, len(raw), 4)]
+
+
+def child(rng: np.random.Generator, name: str) -> np.random.Generator:
+    """Return the generator of one error of an instrument, without drawing from the instrument's own."""
+    seed = rng.bit_generator.seed_seq
+    assert isinstance(seed, np.random.SeedSequence)
+    key = (*seed.spawn_key, CHILD, *name_key(name))
+    return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=key))
+
+
+def low_pass(values: FloatArray, step_s: float, bandwidth_hz: float, order: int) -> FloatArray:
+    """Rows ``(n, m)`` at equal steps behind a low-pass that was at rest at the first row.
+
+    Exact for values that run straight between the rows (first-order hold).
+    """
+    w = 2.0 * np.pi * bandwidth_hz
+    if order == 1:
+        return filtered(values, step_s, [w], [1.0, w])
+    return filtered(values, step_s, [w * w], [1.0, 2.0 * BUTTERWORTH * w, w * w])
+
+
+def filtered(values: FloatArray, step_s: float, numerator: list[float], denominator: list[float]) -> FloatArray:
+    """Rows ``(n, m)`` behind a transfer function of unit gain in s, at rest at the first row; first-order hold."""
+    from scipy import signal  # half a second to import
+
+    top, bottom, _ = signal.cont2discrete((numerator, denominator), step_s, method="foh")
+    top = np.asarray(top).ravel()
+    start = signal.lfilter_zi(top, bottom)
+    out, _ = signal.lfilter(top, bottom, values, axis=0, zi=start[:, None] * values[:1])
+    return np.asarray(out)
+
+
+def gauss_markov(
+    time_s: FloatArray, sd: float, time_constant_s: float, columns: int, rng: np.random.Generator
+) -> FloatArray:
+    """Stationary Gauss-Markov sequences ``(n, columns)`` at increasing times, each of standard deviation ``sd``."""
+    keep = np.exp(-np.diff(time_s) / time_constant_s)
+    white = rng.standard_normal((len(time_s), columns))
+    out = np.empty_like(white)
+    _kernels.gauss_markov(keep, white, out)
+    return sd * out
+
+
+def kept(time_s: FloatArray, spec: DropoutErrors, rng: np.random.Generator) -> BoolArray:
+    """Which samples arrive: bursts begin at random (Poisson) and last exponentially distributed times."""
+    keep = np.ones(len(time_s), dtype=bool)
+    bursts = [*spec.outages_s]
+    if spec.rate_hz > 0.0 and spec.mean_s > 0.0:
+        span = float(time_s[-1] - time_s[0])
+        starts = time_s[0] + span * rng.random(rng.poisson(spec.rate_hz * span))
+        bursts += list(zip(starts, starts + rng.exponential(spec.mean_s, len(starts)), strict=True))
+    for start, stop in bursts:
+        keep[np.searchsorted(time_s, start) : np.searchsorted(time_s, stop)] = False
+    return keep
+
+
+def clock_late_s(errors: TriadErrors, rng: np.random.Generator) -> float:
+    """By how much a triad's clock is late in one flight, beyond its delay."""
+    return errors.time_bias_s * float(child(rng, "time bias").standard_normal()) if errors.time_bias_s > 0.0 else 0.0
+
+
+def sampled(
+    at_s: FloatArray, time_s: FloatArray, ideal: FloatArray, errors: TriadErrors, late_s: float = 0.0
+) -> FloatArray:
+    """Values ``(n, 3)`` of an ideal signal at sampling times, behind bandwidth, delay and a clock that is ``late_s``.
+
+    ``ideal`` (m, 3) stands on an even grid ``time_s`` (m,) that begins before the samples.
+    """
+    if errors.bandwidth_hz > 0.0:
+        ideal = low_pass(ideal, float(time_s[1] - time_s[0]), errors.bandwidth_hz, int(errors.order))
+    return interpolate_rows(at_s - errors.delay_s - late_s, time_s, ideal)
+
+
+def measured(
+    at_s: FloatArray, sensed: FloatArray, errors: TriadErrors, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Times and values ``(k, 3)`` that a triad delivers of the signal ``sensed`` (n, 3) in its nominal axes."""
+    turn = rotations.dcm_from_q(rotations.exp(errors.mount_rad * rng.standard_normal(3)))
+    factor = 1.0 + errors.scale * rng.standard_normal(3)
+    offset = errors.bias * rng.standard_normal(3)
+    turned = sensed @ turn
+    if errors.nonorthogonality_rad > 0.0:
+        tilt = errors.nonorthogonality_rad * child(rng, "nonorthogonality").standard_normal(3)
+        turned = turned @ tilted_axes(tilt).T
+    scaled = turned * factor
+    if errors.scale_asymmetry > 0.0:
+        extra = errors.scale_asymmetry * child(rng, "scale asymmetry").standard_normal(3)
+        scaled = scaled + np.minimum(turned, 0.0) * extra
+    out = scaled + offset + errors.noise * rng.standard_normal(sensed.shape)
+    if errors.drift > 0.0:
+        out = out + gauss_markov(at_s, errors.drift, errors.drift_time_constant_s, 3, child(rng, "drift"))
+    out = quantised(out, errors.limit, errors.resolution)
+    keep = kept(at_s, errors.dropouts, child(rng, "dropouts"))
+    return at_s[keep], out[keep]
+
+
+def tilted_axes(tilt_rad: FloatArray) -> FloatArray:
+    """Sensing directions, row by row, of axes that are not square: x stays, y leans to x, z to x and y, (3, 3)."""
+    yx, zx, zy = tilt_rad
+    rows = np.array([[1.0, 0.0, 0.0], [yx, 1.0, 0.0], [zx, zy, 1.0]])
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def quantised(values: FloatArray, limit: tuple[float, float, float] | None, resolution: float) -> FloatArray:
+    """Values ``(n, 3)`` as an analogue-digital converter gives them: whole steps, and no more of them than it has."""
+    if resolution <= 0.0:
+        return np.clip(values, -np.array(limit), np.array(limit)) if limit else values
+    counts = np.round(values / resolution)
+    if limit:
+        most = np.floor(np.array(limit) / resolution + 1e-9)
+        counts = np.clip(counts, -most, most)
+    return counts * resolution
+
+
+def _none_or_some(hertz: float) -> float:
+    if 0.0 < hertz < 1e-3:
+        raise ValueError("0 for none, or at least 0.001 Hz is wanted")
+    return hertz
+
+
+# sizes of errors: of triads in their own everyday unit, of ranges in metres
+Size = Annotated[float, Field(ge=0.0, le=1e4)]
+RangeError = Annotated[float, Field(ge=0.0, le=1e4)]
+Bandwidth = Annotated[float, Field(ge=0.0, le=1e5), AfterValidator(_none_or_some)]
+Delay = Annotated[float, Field(ge=-10.0, le=10.0)]
+TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
+Limit = Annotated[float, Field(gt=0.0, le=1e6)]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0)]
+Height = Annotated[float, Field(ge=-500.0, le=1e4)]
+ProfileHeight = Annotated[float, Field(ge=-1e3, le=1e6)]
+Refractive = Annotated[float, Field(gt=0.0, le=1000.0)]
+Vector = tuple[Offset, Offset, Offset]
+Limits = tuple[Limit, Limit, Limit]
+
+
+class Dropouts(Section):
+    """Lost samples: bursts at a mean rate and of a mean length, and stated intervals ``[from, to]``."""
+
+    rate_hz: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    mean_s: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
+    outages_s: tuple[tuple[Time, Time], ...] = ()
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Dropouts:
+        faults: list[tuple[str, object, str]] = [
+            (f"outages_s.{k}", [start, stop], "the outage does not end after it starts")
+            for k, (start, stop) in enumerate(self.outages_s)
+            if stop <= start
+        ]
+        if (self.rate_hz > 0.0) != (self.mean_s > 0.0):
+            words = f"with mean_s = {self.mean_s:g}; give both positive for bursts, or both zero for none"
+            faults.append(("rate_hz", self.rate_hz, words))
+        if faults:
+            raise KeyFaults(faults)
+        return self
+
+    @property
+    def errors(self) -> DropoutErrors:
+        """As the instruments take them."""
+        return DropoutErrors(self.rate_hz, self.mean_s, self.outages_s)
+
+
+class Triad(Section):
+    """What accelerometers, gyros and magnetometers have in common.
+
+    ``bandwidth_hz`` is the corner of a low-pass of ``filter_order`` (0 for none); beyond the low-pass's own lag a
+    sample shows what was there ``delay_s`` earlier (negative where stamps were corrected for that lag), and by a
+    constant of the flight of standard deviation ``time_bias_s`` more (accelerometers and gyros alone);
+    ``nonorthogonality_deg`` tilts the axes against each other; negative values have another scale by
+    ``scale_asymmetry``.
+    """
+
+    rate_hz: SampleRate
+    scale: Fraction
+    mount_deg: ErrorAngle
+    nonorthogonality_deg: ErrorAngle = 0.0
+    scale_asymmetry: Fraction = 0.0
+    drift_time_constant_s: TimeConstant = 100.0
+    bandwidth_hz: Bandwidth = 0.0
+    filter_order: Literal[1, 2] = 2
+    delay_s: Delay = 0.0
+    time_bias_s: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
+    dropouts: Dropouts | None = None
+
+    def _errors(
+        self, unit: float, noise: float, bias: float, drift: float, resolution: float, limit: Limits | None
+    ) -> TriadErrors:
+        return TriadErrors(
+            mount_rad=float(np.deg2rad(self.mount_deg)),
+            scale=self.scale,
+            bias=bias * unit,
+            noise=noise * unit,
+            resolution=resolution * unit,
+            nonorthogonality_rad=float(np.deg2rad(self.nonorthogonality_deg)),
+            scale_asymmetry=self.scale_asymmetry,
+            drift=drift * unit,
+            drift_time_constant_s=self.drift_time_constant_s,
+            bandwidth_hz=self.bandwidth_hz,
+            order=self.filter_order,
+            delay_s=self.delay_s,
+            time_bias_s=self.time_bias_s,
+            limit=(limit[0] * unit, limit[1] * unit, limit[2] * unit) if limit else None,
+            dropouts=self.dropouts.errors if self.dropouts else DropoutErrors(),
+        )
+
+
+class Accelerometer(Triad):
+    """Errors of the accelerometer triad; ``elements_sensor_m`` puts each of the three at its own place in the package.
+
+    ``range_mps2`` is of each axis of the package (z is aft in Sub-A).
+    """
+
+    noise_mps2: Size
+    bias_mps2: Size
+    drift_mps2: Size = 0.0
+    range_mps2: Limits | None = None
+    resolution_mps2: Size = 0.0
+    elements_sensor_m: tuple[Vector, Vector, Vector] | None = None
+
+    @property
+    def errors(self) -> TriadErrors:
+        """In SI."""
+        return self._errors(
+            1.0, self.noise_mps2, self.bias_mps2, self.drift_mps2, self.resolution_mps2, self.range_mps2
+        )
+
+
+class Rates(Triad):
+    """Errors of the rate gyros."""
+
+    noise_degps: Size
+    bias_degps: Size
+    drift_degps: Size = 0.0
+    range_degps: Limits | None = None
+    resolution_degps: Size = 0.0
+
+    @property
+    def errors(self) -> TriadErrors:
+        """In rad/s."""
+        unit = float(np.deg2rad(1.0))
+        return self._errors(
+            unit, self.noise_degps, self.bias_degps, self.drift_degps, self.resolution_degps, self.range_degps
+        )
+
+
+class Magnetometer(Triad):
+    """The magnetometer: ``mount`` names a package of the vehicle file.
+
+    ``hard_iron_ut`` is the field of the vehicle's own magnets, per body axis; ``soft_iron`` the size of the elements of
+    the symmetric matrix by which its iron bends the field.
+    """
+
+    mount: str = "magnetometer"
+    noise_ut: Size
+    bias_ut: Size
+    hard_iron_ut: Size = 0.0
+    soft_iron: Fraction = 0.0
+    drift_ut: Size = 0.0
+    range_ut: Limits | None = None
+    resolution_ut: Size = 0.0
+
+    @property
+    def errors(self) -> TriadErrors:
+        """In tesla."""
+        return self._errors(1e-6, self.noise_ut, self.bias_ut, self.drift_ut, self.resolution_ut, self.range_ut)
+
+
+class SunSensors(Section):
+    """Two-axis Sun sensors around the roll axis, one head at each clocking angle.
+
+    Noise and bias are across the line of sight. ``field_deg`` is the full cone about a head's axis. ``albedo`` is the
+    weight of the sunlit Earth against the Sun in a head that has the nadir in its field (0 for none).
+    """
+
+    rate_hz: SampleRate
+    heads_lv_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=8)] = (45.0, 135.0, 225.0, 315.0)
+    field_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 180.0
+    noise_deg: ErrorAngle
+    bias_deg: ErrorAngle
+    mount_deg: ErrorAngle
+    resolution_deg: ErrorAngle = 0.0
+    delay_s: Delay = 0.0
+    albedo: Fraction = 0.0
+    dropouts: Dropouts | None = None
+
+
+class AirRefraction(Section):
+    """Refraction of a radar's beam: an exponential profile, or a measured one as ``[height_m, N]`` pairs.
+
+    ``residual`` is the fraction that the range's own correction leaves in the data: 1 is uncorrected.
+    """
+
+    surface: Annotated[float, Field(ge=0.0, le=1000.0)] = 315.0
+    scale_height_m: Annotated[float, Field(ge=500.0, le=1e5)] = 7350.0
+    profile: Annotated[tuple[tuple[ProfileHeight, Refractive], ...], Field(min_length=2)] | None = None
+    residual: Annotated[float, Field(ge=-10.0, le=10.0)] = 1.0
+
+    @model_validator(mode="after")
+    def _increasing(self) -> AirRefraction:
+        heights = [height for height, _ in self.profile or ()]
+        if any(b <= a for a, b in pairwise(heights)):
+            raise ValueError("heights of the refractivity profile must increase")
+        return self
+
+    @property
+    def air(self) -> Refractivity:
+        """The profile."""
+        if self.profile is None:
+            return Refractivity(self.surface, self.scale_height_m)
+        table = np.array(self.profile)
+        return Refractivity(self.surface, self.scale_height_m, table[:, 0], table[:, 1])
+
+
+class Radar(Section):
+    """A radar's site and errors, one standard deviation of each; the systematic ones are those of RCC 753-95.
+
+    ``mislevel_deg`` is the tilt of the pedestal about north and about east; ``skew_deg`` (RF axis against the elevation
+    axis) errs in azimuth by sec E, ``nonorthogonality_deg`` by tan E, ``droop_deg`` in elevation by cos E;
+    ``encoder_once_deg`` and ``encoder_twice_deg`` go once and twice a turn of each encoder. ``angle_servo_hz`` is the
+    bandwidth of a tracking servo without velocity lag. ``transit_time`` leaves in that an echo shows where the vehicle
+    was when it was hit. Points beyond ``max_range_m`` or below ``min_elevation_deg`` (the horizon) are not tracked.
+    """
+
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    height_m: Height
+    rate_hz: SampleRate
+    offset_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 0.0
+    tracks: Literal["cg", "datum"] = "cg"
+    range_sd_m: RangeError
+    angle_sd_deg: ErrorAngle
+    range_bias_m: RangeError
+    angle_bias_deg: ErrorAngle
+    time_bias_s: Annotated[float, Field(ge=0.0, le=10.0)]
+    range_scale: Fraction = 0.0
+    mislevel_deg: ErrorAngle = 0.0
+    skew_deg: ErrorAngle = 0.0
+    nonorthogonality_deg: ErrorAngle = 0.0
+    droop_deg: ErrorAngle = 0.0
+    encoder_once_deg: ErrorAngle = 0.0
+    encoder_twice_deg: ErrorAngle = 0.0
+    wander_deg: ErrorAngle = 0.0
+    wander_time_constant_s: TimeConstant = 20.0
+    angle_servo_hz: Bandwidth = 0.0
+    transit_time: bool = False
+    refraction: AirRefraction | None = None
+    range_resolution_m: RangeError = 0.0
+    angle_resolution_deg: ErrorAngle = 0.0
+    max_range_m: Annotated[float, Field(gt=0.0, le=1e9)] | None = None
+    min_elevation_deg: Elevation = 0.0
+    dropouts: Dropouts | None = None
+
+
+class FilmQuality(Section):
+    """How the real camera differs from its drawing, and how it records; see `synthetic_flight.film.Imaging`."""
+
+    pointing_deg: ErrorAngle = 0.5
+    focal: Fraction = 0.01
+    centre_px: Annotated[float, Field(ge=0.0, le=1e4)] = 1.0
+    k1: Fraction = 0.003
+    k2: Fraction = 0.0
+    position_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.002
+    noise_grey: Annotated[float, Field(ge=0.0, le=255.0)] = 2.5
+    blur_px: Annotated[float, Field(gt=0.0, le=100.0)] = 0.8
+    vignetting: Fraction = 0.38
+    interlace_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    quality: Annotated[int, Field(ge=0, le=100)] = 0
+    painted: bool = True
+    built_deg: ErrorAngle = 0.0
+    loaded_deg: ErrorAngle = 0.0
+
+
+class Video(Section):
+    """When the onboard camera records, and how well."""
+
+    camera: str
+    start_s: Time
+    stop_s: Time
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1000.0)]
+    benchmark_s: Time
+    format: Literal["png", "avi", "webm"] = "png"
+    time_offset_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
+    earth: bool = False
+    imaging: FilmQuality = FilmQuality()
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Video:
+        if self.stop_s < self.start_s:
+            raise KeyFaults([("stop_s", self.stop_s, f"after start_s = {self.start_s:g} is wanted")])
+        if not self.start_s <= self.benchmark_s <= self.stop_s:
+            words = f"a time of the video, {self.start_s:g} to {self.stop_s:g} s, is wanted"
+            raise KeyFaults([("benchmark_s", self.benchmark_s, words)])
+        return self
+
+
+class Attitude(Section):
+    """The attitude that the range states to start from."""
+
+    t_s: Time
+    sd_deg: Annotated[float, Field(gt=0.0, le=180.0)]

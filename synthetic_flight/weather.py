@@ -1,0 +1,319 @@
+"""What air the day brings, and what a range that sounded it would report: truth and sounding differ as real ones do.
+
+The truth is a base (US76, or NRLMSIS of a day) times a smooth wave and random structure, with a smooth August wind;
+then whatever the scenario puts into it by name: density pockets, wind shears, turbulence, single gusts. Two soundings
+can be had of it. The simple one errs by a constant part, a gravity wave and small structure of the size that the
+filter assumes. The range's is a balloon below 30 km and a datasonde and an inflatable sphere above, each with its own
+accuracy, smoothed to the vertical wavelength that a falling sphere resolves, and some hours old.
+
+References
+----------
+Schmidlin et al., "The inflatable sphere: a technique for the accurate measurement of middle atmosphere temperatures",
+J. Geophys. Res. 96, 1991 (resolution); the accuracies are those ranges quote for these instruments.
+MIL-F-8785C, section 3.7 (Dryden spectra, 1-cosine gust).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from flightmodel.atmosphere import AtmosphereProfile, default_sounding_sd, nrlmsis_profile, standard_atmosphere
+from flightmodel.checks import FloatArray
+from flightmodel.config import Fraction, Section
+from synthetic_flight.instrument_errors import gauss_markov
+
+Wind = Annotated[float, Field(ge=-500.0, le=500.0)]
+WindSize = Annotated[float, Field(ge=0.0, le=500.0)]
+# the dynamics' own table of the air has a row every 50 m: nothing thinner than four rows can be flown through
+Thickness = Annotated[float, Field(ge=200.0, le=110e3)]
+Altitude = Annotated[float, Field(gt=0.0, lt=110e3)]
+STEP_M, TOP_M = 250.0, 130000.0
+POINTS_A_STRUCTURE = 10
+# gain 1/2 of a Gaussian of standard deviation s at wavelength l: s = l sqrt(ln 2 / 2) / pi
+HALF_GAIN = float(np.sqrt(0.5 * np.log(2.0)) / np.pi)
+
+
+class Pocket(Section):
+    """A layer thinner (or, with a negative depth, denser) than the air around it, at unchanged pressure."""
+
+    altitude_m: Altitude
+    depth: Annotated[float, Field(gt=-1.0, lt=1.0)]
+    thickness_m: Thickness
+
+
+class Shear(Section):
+    """A change of wind across a layer; the wind above is changed by the whole of it."""
+
+    altitude_m: Altitude
+    north_mps: Wind
+    east_mps: Wind
+    thickness_m: Thickness
+
+
+class Turbulence(Section):
+    """Random horizontal gusts in a band of altitudes, with Dryden's transverse spectrum."""
+
+    sd_mps: WindSize
+    length_m: Thickness
+    from_m: Altitude
+    to_m: Altitude
+
+    @model_validator(mode="after")
+    def _band(self) -> Turbulence:
+        if self.to_m - self.from_m < 2.0 * self.length_m:
+            raise ValueError("a band from_m to to_m of at least two length_m is wanted")
+        return self
+
+
+class DiscreteGust(Section):
+    """A single gust, ``(1 + cos)/2`` of its peak over twice ``thickness_m``."""
+
+    altitude_m: Altitude
+    north_mps: Wind
+    east_mps: Wind
+    thickness_m: Thickness
+
+
+class RangeSounding(Section):
+    """The range's own sounding: how old it is at the flight, how high it reached, what it resolves."""
+
+    age_h: Annotated[float, Field(ge=0.0, le=240.0)] = 3.0
+    top_m: Annotated[float, Field(ge=35e3, le=100e3)] = 90e3
+    resolution_m: Annotated[float, Field(ge=500.0, le=20e3)] = 2000.0
+
+
+class DayAtmosphere(Section):
+    """The day's departure from its base and the size of the sounding's errors."""
+
+    base: Literal["us76", "nrlmsis_2009_08_17"] = "us76"
+    winds: bool = True
+    density_sd: Fraction = 0.015
+    wind_sd_mps: WindSize = 2.0
+    pockets: tuple[Pocket, ...] = ()
+    shears: tuple[Shear, ...] = ()
+    gusts: tuple[Turbulence, ...] = ()
+    discrete_gusts: tuple[DiscreteGust, ...] = ()
+    sounding_scale: Annotated[float, Field(ge=0.0, le=10.0)] = 1.0
+    sounding: RangeSounding | None = None
+
+
+# altitude km, north and east wind m/s: a smooth mid-latitude August day, assumed
+_AUGUST_WIND = np.array(
+    [
+        [0, 2, 1], [5, 3, 8], [11, 4, 16], [18, 1, 0], [25, 0, -10], [35, 2, -18], [45, 3, -28], [55, -4, -38],
+        [65, -6, -45], [75, 10, -36], [82, 4, -12], [90, -12, 14], [100, -8, 22], [115, 0, 0],
+    ],
+    dtype=float,
+)  # fmt: skip
+
+
+def correlated(altitude_m: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:
+    """Gauss-Markov noise of unit variance along altitude with a correlation length, m."""
+    return gauss_markov(altitude_m, 1.0, length_m, 1, rng)[:, 0]
+
+
+def dryden_transverse(count: int, step_m: float, length_m: float, rng: np.random.Generator) -> FloatArray:
+    """``(count,)`` samples of unit variance, ``step_m`` apart, with Dryden's transverse spectrum.
+
+    Notes
+    -----
+    Spectrum ``L/pi (1 + 3 (L w)^2) / (1 + (L w)^2)^2``, correlation ``(1 - d/2L) exp(-d/L)``. Drawn by circulant
+    embedding: exact in its covariance up to wrap-round terms of ``exp(-count step / L)``.
+    """
+    n = 2 * count
+    lag = step_m * np.minimum(np.arange(n), n - np.arange(n))
+    power = np.fft.fft((1.0 - 0.5 * lag / length_m) * np.exp(-lag / length_m)).real
+    white = rng.standard_normal(n) + 1j * rng.standard_normal(n)
+    return np.fft.fft(np.sqrt(np.maximum(power, 0.0) / n) * white).real[:count]
+
+
+def raised_cosine(altitude_m: FloatArray, centre_m: float, thickness_m: float) -> FloatArray:
+    """One at the centre, a half ``thickness_m / 2`` beside it, zero from ``thickness_m`` on."""
+    x = np.clip((altitude_m - centre_m) / thickness_m, -1.0, 1.0)
+    return 0.5 * (1.0 + np.cos(np.pi * x))
+
+
+def smooth_step(altitude_m: FloatArray, centre_m: float, thickness_m: float) -> FloatArray:
+    """Rise from zero to one over ``thickness_m`` around the centre, by a half cosine."""
+    x = np.clip((altitude_m - centre_m) / thickness_m, -0.5, 0.5)
+    return 0.5 * (1.0 + np.sin(np.pi * x))
+
+
+def day_atmosphere(spec: DayAtmosphere, rng: np.random.Generator) -> AtmosphereProfile:
+    """Draw the air that the vehicle really meets: structure from 0 to 130 km, its base beyond.
+
+    Turbulence draws from children of ``rng``, one a band, so it leaves all other draws as they are.
+    """
+    z = np.arange(0.0, TOP_M + 1.0, STEP_M)
+    smooth = 0.03 * np.sin(2.0 * np.pi * (z / 45000.0 + rng.random())) * (spec.density_sd > 0.0)
+    ratio = smooth + spec.density_sd * correlated(z, 5000.0, rng)
+    wind = np.zeros((len(z), 3))
+    if spec.winds:
+        for axis in (0, 1):
+            mean = np.interp(z / 1000.0, _AUGUST_WIND[:, 0], _AUGUST_WIND[:, axis + 1])
+            wind[:, axis] = mean + spec.wind_sd_mps * correlated(z, 3000.0, rng)
+        wind *= np.interp(z, [110000.0, 130000.0], [1.0, 0.0])[:, None]
+    density_sd, wind_sd = default_sounding_sd(z)
+    day = AtmosphereProfile(z, ratio, np.zeros(len(z)), wind, density_sd, wind_sd)
+    if spec.base != "us76":
+        day = _on_base(day, nrlmsis_profile(spec.base))
+    structures = (*spec.pockets, *spec.shears, *spec.gusts, *spec.discrete_gusts)
+    return _with_structures(day, spec, rng) if structures else day
+
+
+def _resampled(profile: AtmosphereProfile, z: FloatArray) -> AtmosphereProfile:
+    """Return the same piecewise linear profile on more knots; ``z`` holds all of the old ones."""
+
+    def column(values: FloatArray) -> FloatArray:
+        return np.interp(z, profile.altitude_m, values)
+
+    return AtmosphereProfile(
+        z,
+        column(profile.log_density_ratio),
+        column(profile.temperature_offset_k),
+        np.column_stack([column(w) for w in profile.wind_ned_mps.T]),
+        column(profile.density_sd),
+        column(profile.wind_sd_mps),
+        profile.fade_m,
+    )
+
+
+def _on_base(day: AtmosphereProfile, base: AtmosphereProfile) -> AtmosphereProfile:
+    """Put the day's structure on a modelled base; above the structure, which fades over 10 km, the base alone."""
+    z = np.union1d(base.altitude_m, np.union1d(day.altitude_m, np.arange(TOP_M, TOP_M + 60e3, 1000.0)))
+    under = _resampled(base, z)
+    fade = np.exp(-np.maximum(z - TOP_M, 0.0) / day.fade_m)
+    return AtmosphereProfile(
+        z,
+        under.log_density_ratio + fade * np.interp(z, day.altitude_m, day.log_density_ratio),
+        under.temperature_offset_k,
+        np.column_stack([fade * np.interp(z, day.altitude_m, w) for w in day.wind_ned_mps.T]),
+        under.density_sd,
+        under.wind_sd_mps,
+    )
+
+
+def _with_structures(day: AtmosphereProfile, spec: DayAtmosphere, rng: np.random.Generator) -> AtmosphereProfile:
+    """Add pockets, shears and gusts, on knots fine enough for the thinnest of them."""
+    knots = [day.altitude_m]
+    parts: list[Pocket | Shear | DiscreteGust] = [*spec.pockets, *spec.shears, *spec.discrete_gusts]
+    for part in parts:
+        reach = part.thickness_m
+        knots.append(np.linspace(part.altitude_m - reach, part.altitude_m + reach, 2 * POINTS_A_STRUCTURE + 1))
+    bands = [
+        np.linspace(g.from_m, g.to_m, int(np.ceil((g.to_m - g.from_m) / g.length_m * POINTS_A_STRUCTURE)) + 1)
+        for g in spec.gusts
+    ]
+    z = np.unique(np.round(np.concatenate([*knots, *bands]), 3))
+    fine = _resampled(day, z[(z >= 0.0) & (z <= day.altitude_m[-1])])
+    z, ratio, wind = fine.altitude_m, fine.log_density_ratio.copy(), fine.wind_ned_mps.copy()
+    thinner = np.ones(len(z))
+    for pocket in spec.pockets:
+        thinner *= 1.0 - pocket.depth * raised_cosine(z, pocket.altitude_m, pocket.thickness_m)
+    for shear in spec.shears:
+        # the change fades out where the winds do
+        rise = smooth_step(z, shear.altitude_m, shear.thickness_m) * np.interp(z, [110e3, 130e3], [1.0, 0.0])
+        wind[:, :2] += rise[:, None] * (shear.north_mps, shear.east_mps)
+    for gust in spec.discrete_gusts:
+        shape = raised_cosine(z, gust.altitude_m, gust.thickness_m)
+        wind[:, :2] += shape[:, None] * (gust.north_mps, gust.east_mps)
+    for band, gusts, child in zip(bands, spec.gusts, rng.spawn(len(bands)), strict=True):
+        edge = np.clip(np.minimum(band - gusts.from_m, gusts.to_m - band) / gusts.length_m, 0.0, 1.0)
+        for axis in (0, 1):
+            drawn = dryden_transverse(len(band), band[1] - band[0], gusts.length_m, child)
+            wind[:, axis] += np.interp(z, band, gusts.sd_mps * edge * drawn, left=0.0, right=0.0)
+    # a pocket at unchanged pressure is warmer by what it is thinner
+    warmer = fine.at(z).temperature_k * (1.0 / thinner - 1.0)
+    return AtmosphereProfile(
+        z, ratio + np.log(thinner), fine.temperature_offset_k + warmer, wind, fine.density_sd, fine.wind_sd_mps
+    )
+
+
+def sense_atmosphere(
+    profile: AtmosphereProfile, spec: DayAtmosphere, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sound the day: by the simple model, or by the range's where the scenario has ``[atmosphere.sounding]``.
+
+    Returns
+    -------
+    altitude_m (n,), density_temperature (n, 2) in kg/m^3 and K, wind_ned_mps (n, 2) north and east
+    """
+    if spec.sounding is not None:
+        return range_sounding(profile, spec.sounding, spec.sounding_scale, rng)
+    z = np.arange(0.0, 95001.0, 1000.0)
+    fine = z[:, None] + np.linspace(-1000.0, 1000.0, 9)
+    air = profile.at(np.maximum(fine, 0.0))
+    density = np.exp(np.log(air.density_kgpm3).mean(axis=1))
+    # smoothing an exponential over 2 km does not move its log-mean, so only structure is lost
+    wind = air.wind_ned_mps.mean(axis=1)[:, :2]
+    density_sd, wind_sd = default_sounding_sd(z)
+
+    def error() -> FloatArray:
+        wave = np.sqrt(2.0) * np.sin(2.0 * np.pi * (z / 7000.0 + rng.random()))
+        return 0.6 * rng.standard_normal() + 0.6 * wave + 0.5 * correlated(z, 2500.0, rng)
+
+    density = density * np.exp(spec.sounding_scale * density_sd * error())
+    wind = wind + spec.sounding_scale * wind_sd[:, None] * np.column_stack([error(), error()])
+    temperature = profile.at(z).temperature_k + spec.sounding_scale * 1.5 * error()
+    return z, np.column_stack([density, temperature]), wind
+
+
+BALLOON_TOP_M = 30e3
+
+
+def range_accuracy(altitude_m: FloatArray, pressure_pa: FloatArray, temperature_k: FloatArray) -> FloatArray:
+    """One standard deviation of the range's instruments: density (fraction), temperature K, wind m/s, ``(n, 3)``.
+
+    Balloon below 30 km: 0.5 K, 1 m/s, and a pressure cell of 1 hPa up to where that is 1 %, which the hydrostatic
+    equation carries on above. Above: sphere density 3 % to 80 km, 10 % at 90 km; datasonde temperature 1 K at 30 to
+    3 K at 70 km, sphere 5 K from 80 km; winds 1, 3, 7 m/s at 40, 60, 80 km.
+    """
+    balloon = altitude_m < BALLOON_TOP_M
+    pressure = np.minimum(100.0 / pressure_pa, 0.01)
+    density = np.where(
+        balloon, np.hypot(pressure, 0.5 / temperature_k), np.interp(altitude_m, [80e3, 90e3], [0.03, 0.10])
+    )
+    temperature = np.where(balloon, 0.5, np.interp(altitude_m, [30e3, 70e3, 80e3], [1.0, 3.0, 5.0]))
+    wind = np.interp(altitude_m, [40e3, 60e3, 80e3, 100e3], [1.0, 3.0, 7.0, 11.0])
+    return np.column_stack([density, temperature, wind])
+
+
+def range_sounding(
+    profile: AtmosphereProfile, spec: RangeSounding, scale: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sound the day with a balloon, a datasonde and an inflatable sphere, ``spec.age_h`` hours before the flight.
+
+    Half of each instrument's variance is constant through its profile (calibration, drag coefficient, the pressure
+    cell), half varies over 5 km (density, temperature) or 3 km (winds). The air itself has changed since by 0.5 % and
+    1 m/s an hour. Above the balloon only structure longer than ``resolution_m`` is left (half gain there).
+
+    Returns
+    -------
+    altitude_m (n,), density_temperature (n, 2) in kg/m^3 and K, wind_ned_mps (n, 2)
+    """
+    step = 250.0
+    grid = np.arange(0.0, spec.top_m + 5001.0, step)
+    air, standard = profile.at(grid), standard_atmosphere().at(grid)
+    # density as its log ratio to the standard: smoothing then removes structure alone
+    columns = np.column_stack(
+        [np.log(air.density_kgpm3 / standard.density_kgpm3), air.temperature_k, air.wind_ned_mps[:, :2]]
+    )
+    reach = HALF_GAIN * spec.resolution_m / step
+    kernel = np.exp(-0.5 * (np.arange(-int(4 * reach) - 1, int(4 * reach) + 2) / reach) ** 2)
+    padded = np.pad(columns, ((len(kernel) // 2,) * 2, (0, 0)), mode="edge")
+    smoothed = np.column_stack([np.convolve(c, kernel / kernel.sum(), mode="valid") for c in padded.T])
+    measured = np.where(grid[:, None] < BALLOON_TOP_M, columns, smoothed)
+    z = np.arange(0.0, spec.top_m + 1.0, 500.0)
+    rows = np.searchsorted(grid, z)
+    sd = range_accuracy(z, air.pressure_pa[rows], air.temperature_k[rows])[:, [0, 1, 2, 2]]
+    stale = spec.age_h * np.array([0.005, 0.0, 1.0, 1.0])
+    for k, length in enumerate((5000.0, 5000.0, 3000.0, 3000.0)):
+        constant = np.where(z < BALLOON_TOP_M, *rng.standard_normal(2))
+        own = sd[:, k] * np.sqrt(0.5) * (constant + correlated(z, length, rng))
+        measured[rows, k] += scale * (own + stale[k] * correlated(z, length, rng))
+    ratio, temperature, north, east = measured[rows].T
+    density = standard.density_kgpm3[rows] * np.exp(ratio)
+    return z, np.column_stack([density, temperature]), np.column_stack([north, east])
