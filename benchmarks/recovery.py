@@ -42,7 +42,7 @@ def main():
         words = [f"{m} {score.methods[m]['error_deg']:+.2f} (sd {score.methods[m]['sd_deg']:.2f})" for m in methods]
         for m in methods:
             errors[m].append(score.methods[m]["error_deg"])
-        red = [v.name for v in flight.verdicts if not v.passed]
+        red = [v.name for v in flight.consistency_checks if not v.passed]
         print(f"seed {seed}: m, m/s, deg {np.round(bets[-1], 2)}; {', '.join(words)}; red verdicts {red}", flush=True)
     print(
         "BET rms errors over the pulse, largest:",

@@ -42,7 +42,7 @@ def main():
     for i, name in enumerate(dispersed.COMPONENTS):
         print(f"{name:16}{rms['smoothed'][k, i] * unit[i]:10.4f}{rms['filtered'][k, i] * unit[i]:10.4f}")
     red = Counter(name for f in flights for name in f.red)
-    print(f"\nred verdicts: {sum(red.values())} of {sum(f.verdicts for f in flights)}")
+    print(f"\nred verdicts: {sum(red.values())} of {sum(f.consistency_checks for f in flights)}")
     for name, times in red.most_common():
         print(f"  {name}: {times}")
 

@@ -106,10 +106,10 @@ def southwell_limbs(
         middle = np.array([0.8 * float(q.max())])
         change = float(np.log(fall.deflection(middle)[0] / rise.deflection(middle)[0]))
         apart = change / float(np.hypot(_log_sd(rise, middle[0]), _log_sd(fall, middle[0])))
-        verdict = (
+        consistency_check = (
             "hysteresis" if abs(apart) > norm.ppf(0.5 + 0.5 * CONFIDENCE) else "no hysteresis beyond the error bars"
         )
-        words.insert(0, f"{verdict}: fall over rise {np.exp(change):.2f} at 80 % of peak load")
+        words.insert(0, f"{consistency_check}: fall over rise {np.exp(change):.2f} at 80 % of peak load")
     return Limbs(both, rise, fall, apart, "; ".join(words))
 
 

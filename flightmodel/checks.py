@@ -19,20 +19,48 @@ BoolArray = NDArray[np.bool_]
 Progress = Callable[[float, str], None]  # fraction done, and what is being done
 
 
+class Fault(str):
+    """One sentence of refusal with a short stable code (``"frame-missing"``), which scripts and tests may use.
+
+    Parameters
+    ----------
+    words : str
+        What is wrong, where (file and line, or source and time), the value, and what to try.
+    code : str
+        Lower-case words joined by hyphens. The words may be edited freely; the code stays.
+    """
+
+    code: str
+
+    def __new__(cls, words: str, code: str = "") -> Fault:
+        """Keep the code that the words have where no other is given."""
+        fault = super().__new__(cls, words)
+        fault.code = code or getattr(words, "code", "")
+        return fault
+
+
 class GateError(ValueError):
     """Data refused at a gate; carries every fault found, one line each.
 
     Parameters
     ----------
     faults : str or sequence of str
-        Each says what is wrong, where (file and line, or source and time), and what to try.
+        Each says what is wrong, where (file and line, or source and time), and what to try; a `Fault` has its own code.
+    code : str
+        Code of those faults that have none of their own.
     """
 
     exit_code = 3
 
-    def __init__(self, faults: str | Sequence[str]) -> None:
-        self.faults: tuple[str, ...] = (faults,) if isinstance(faults, str) else tuple(faults)
+    def __init__(self, faults: str | Sequence[str], code: str = "") -> None:
+        listed = (faults,) if isinstance(faults, str) else tuple(faults)
+        self.faults: tuple[Fault, ...] = tuple(Fault(words, getattr(words, "code", "") or code) for words in listed)
         super().__init__("\n".join(self.faults))
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Codes of the faults, in their order."""
+        return tuple(fault.code for fault in self.faults)
 
 
 class ConfigError(GateError):

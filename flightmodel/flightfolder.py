@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from flightmodel.atmosphere import standard_sounding
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.config import parse_utc
 from flightmodel.earth import ecef_from_radar, geodetic_from_ecef, q_ecef_body_from_pointing
 from flightmodel.film import Frames
@@ -185,8 +185,8 @@ def _vehicle(gate: Gate, name: str) -> Vehicle | None:
     try:
         vehicle = vehicle_from_toml(vehicle_path(name, gate.folder))
     except GateError as fault:
-        for words in fault.faults:
-            gate.refuse_config(f"vehicle: {words}")
+        for said in fault.faults:
+            gate.refuse_config(Fault(f"vehicle: {said}", said.code))
         return None
     for body, mesh in vehicle.meshes.items():
         words = f"{mesh.words}; it is drawn, while the camera's fit is of [geometry]"

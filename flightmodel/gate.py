@@ -33,7 +33,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from flightmodel import tables
-from flightmodel.checks import BoolArray, ConfigError, FloatArray, GateError, nearest_name
+from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.csv_reading import file_sha256, read_numbers
 from flightmodel.tables import IntArray, Source
 from flightmodel.telemetry import Finding
@@ -91,9 +91,14 @@ class Gate:
         """SHA-256 of a file, from its reading where that made one."""
         return self.digests.get(path) or file_sha256(path)
 
-    def refuse_config(self, words: str) -> None:
+    def refuse(self, words: str, code: str) -> None:
+        """Keep a fault of the data."""
+        self.faults.append(Fault(words, code))
+
+    def refuse_config(self, words: str, code: str = "") -> None:
         """Keep a fault of flight.toml."""
-        self.config.append(f"{self.folder / 'flight.toml'}: {words}")
+        code = code or getattr(words, "code", "")
+        self.config.append(Fault(f"{self.folder / 'flight.toml'}: {words}", code))
 
     def close(self) -> None:
         """Raise `ConfigError` or `GateError` with everything that was refused."""

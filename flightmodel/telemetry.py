@@ -231,13 +231,14 @@ class Motion:
 class Finding:
     """Something in the data that an analyst should know; never an error and never repaired in silence.
 
-    Times are NaN where it is not about a time.
+    Times are NaN where it is not about a time. ``code`` is short and stable (``"data-gap"``); ``what`` may be reworded.
     """
 
     source: str
     what: str
     start_s: float
     end_s: float
+    code: str = ""
 
     def __str__(self) -> str:
         """One line for tables and logs."""

@@ -67,7 +67,7 @@ for source, rows in residuals.groupby("source"):
 axis.set_ylabel("residual / predicted sd")
 axis.set_xlabel("s after launch")
 axis.legend()
-table = pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.words) for v in bet.verdicts],
+table = pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.remark) for v in bet.consistency_checks],
                      columns=["verdict", "passed", "value", "in words"])  # fmt: skip
 table
 
@@ -83,7 +83,7 @@ radar = telemetry.radars[name]
 moved = radar.range_az_el.copy()
 moved[radar.time_s > 440.0, 0] += 60.0
 faulty = reconstruct(replace(telemetry, radars={**telemetry.radars, name: replace(radar, range_az_el=moved)}))
-red = [v.name for v in faulty.verdicts if not v.passed]
+red = [v.name for v in faulty.consistency_checks if not v.passed]
 print("red with the fault:", *red, sep="\n  ")
 
 # %% [markdown]
@@ -118,7 +118,7 @@ print(f"inside 3 sd: {share.min():.2f} of the time at least; mean squared error 
 # and the errors, which nothing above has seen, lie inside three of the stated standard deviations.
 
 # %%
-assert all(v.passed for v in bet.verdicts)
+assert all(v.passed for v in bet.consistency_checks)
 assert any(name in words for words in red)
 assert share.min() > 0.95
 low, high = chi2.ppf([0.005, 0.995], 9)  # errors last as long as the flight: they are one draw of nine

@@ -67,7 +67,7 @@ pd.DataFrame(rows, columns=["sensor", "samples", "from s", "to s"])
 event_table(flight, bet_table(flight)).round(2)
 
 # %%
-pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.words) for v in flight.verdicts],
+pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.remark) for v in flight.consistency_checks],
              columns=["verdict", "passed", "value", "in words"])  # fmt: skip
 
 # %%

@@ -76,7 +76,7 @@ def height(position):
 telemetry = flight("rocketpy_prometheus")
 print(*telemetry.findings, sep="\n")
 bet = reconstruct(telemetry)
-pd.DataFrame([vars(v) for v in bet.verdicts])[["name", "value", "low", "high", "passed"]]
+pd.DataFrame([vars(v) for v in bet.consistency_checks])[["name", "value", "low", "high", "passed"]]
 
 # %%
 t, h = bet.smoothed.time_s, height(bet.smoothed.position_ecef_m)
@@ -200,7 +200,7 @@ if REAL:
 # %%
 gps = table[table.source == "gps"].set_index("component")
 assert gps.rms_normalised.between(0.7, 1.4).all()
-assert all(v.passed for v in bet.verdicts)
+assert all(v.passed for v in bet.consistency_checks)
 assert abs(h.max() - 5500.0) < 12.0
 assert np.abs(apart[under_drogue]).max() < 10.0
 print("proved:", gps.rms_normalised.round(2).to_dict())

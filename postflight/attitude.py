@@ -16,7 +16,7 @@ from flightmodel.checks import GateError
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import interpolate_rows, resample
 from postflight.kinematics import euler_321
-from recon.consistency import Verdict
+from recon.consistency import ConsistencyCheck
 from recon.reconstruct import Reconstruction
 from recon.vector_attitude import (
     LEAST_INSIDE,
@@ -60,16 +60,27 @@ class AttitudeCheck:
         return "; ".join(part for part in (said, self.dependence) if part)
 
     @property
-    def verdicts(self) -> tuple[Verdict, ...]:
+    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
         """Size of the differences, their share inside three standard deviations, and the sensors' own residuals."""
         if self.comparison is None or self.history is None:
             return ()
         nees, inside = self.comparison.mean_nees, self.comparison.share_inside
         high = float(chi2.ppf(self.confidence, 3))
         return (
-            Verdict("attitude check size", nees, 0.0, high, nees <= high, self.words),
-            Verdict("attitude check share inside", inside, LEAST_INSIDE, 1.0, inside >= LEAST_INSIDE, self.words),
-            *(Verdict(**{**vars(v), "name": f"attitude check {v.name}"}) for v in self.history.verdicts),
+            ConsistencyCheck("attitude-nees", "attitude check size", nees, 0.0, high, nees <= high, self.words),
+            ConsistencyCheck(
+                "attitude-coverage",
+                "attitude check share inside",
+                inside,
+                LEAST_INSIDE,
+                1.0,
+                inside >= LEAST_INSIDE,
+                self.words,
+            ),
+            *(
+                ConsistencyCheck(**{**vars(v), "name": f"attitude check {v.name}"})
+                for v in self.history.consistency_checks
+            ),
         )
 
 
@@ -89,13 +100,13 @@ def check_attitude(telemetry: Telemetry, bet: Reconstruction) -> AttitudeCheck |
         t, points = track(telemetry)
         ends = np.clip(bet.smoothed.time_s[[0, -1]], t[0], t[-1])
         at = np.union1d(t[(t > ends[0]) & (t < ends[1])], ends)
-        chosen = Settings(rate_hz=RATE_HZ, confidence=settings.verdict_confidence)
+        chosen = Settings(rate_hz=RATE_HZ, confidence=settings.check_confidence)
         history = reconstruct_attitude(telemetry, (at, interpolate_rows(at, t, points)), chosen)
-        comparison = compare(history, bet.smoothed, settings.verdict_confidence)
+        comparison = compare(history, bet.smoothed, settings.check_confidence)
         found += history.findings
     except GateError as fault:
         found.append(Finding("attitude check", str(fault), np.nan, np.nan))
-    return AttitudeCheck(history, comparison, dependence, tuple(found), settings.verdict_confidence)
+    return AttitudeCheck(history, comparison, dependence, tuple(found), settings.check_confidence)
 
 
 def attitude_table(check: AttitudeCheck, bet: Reconstruction) -> pd.DataFrame:

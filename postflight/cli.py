@@ -417,7 +417,7 @@ def refusal(fault: ValueError) -> int:
     if not isinstance(fault, GateError):
         raise fault
     for line in fault.faults:
-        click.echo(f"error: {line}", err=True)
+        click.echo(f"error: {line}{f' [{line.code}]' if line.code else ''}", err=True)
     if len(fault.faults) > 1:
         click.echo(f"{len(fault.faults)} faults", err=True)
     return fault.exit_code

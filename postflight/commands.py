@@ -204,12 +204,12 @@ def print_flight(flight: Flight, events: pd.DataFrame) -> None:
         console.print(f"[yellow]left out[/] air of the day: {escape(reason)}")
     if flight.attitude is not None and flight.attitude.comparison is not None:
         console.print(escape(flight.attitude.words))
-    failed = [v for v in flight.verdicts if not v.passed]
-    passed = len(flight.verdicts) - len(failed)
-    console.print(f"{passed} of {len(flight.verdicts)} verdicts on the trajectory pass")
-    for verdict in failed:
-        numbers = f"{verdict.value:.3g} outside {verdict.low:.3g} to {verdict.high:.3g}"
-        console.print(f"[red]verdict[/] {verdict.name}: {verdict.words} ({numbers})")
+    failed = [v for v in flight.consistency_checks if not v.passed]
+    passed = len(flight.consistency_checks) - len(failed)
+    console.print(f"{passed} of {len(flight.consistency_checks)} verdicts on the trajectory pass")
+    for consistency_check in failed:
+        numbers = f"{consistency_check.value:.3g} outside {consistency_check.low:.3g} to {consistency_check.high:.3g}"
+        console.print(f"[red]verdict[/] {consistency_check.name}: {consistency_check.remark} ({numbers})")
     for k, words in enumerate(flight.suspects):
         console.print(f"[red]{'suspect' if k == 0 else 'also'}[/] {escape(words)}")
 
@@ -256,10 +256,10 @@ def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> N
     console.print(table)
     if answers.fused is not None:
         found = answers.fused.agreement
-        console.print(f"{'' if not found.suspects else '[red]verdict[/] '}{escape(found.words)}")
+        console.print(f"{'' if not found.suspects else '[red]consistency_check[/] '}{escape(found.words)}")
         clock = answers.fused.film_clock
         if clock is not None:
-            console.print(f"{'[red]verdict[/] ' if clock.is_off else ''}{escape(clock.words)}")
+            console.print(f"{'[red]consistency_check[/] ' if clock.is_off else ''}{escape(clock.words)}")
     for method, row in rows.items():
         if "reason" in row:
             console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")

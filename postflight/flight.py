@@ -31,7 +31,7 @@ from postflight.attitude import AttitudeCheck, check_attitude
 from postflight.fusing import FusedAnswer, fuse_flight
 from postflight.loads import day_air, pulse_data
 from recon.atmosphere import ReconstructedAir
-from recon.consistency import Verdict
+from recon.consistency import ConsistencyCheck
 from recon.fault_isolation import suspects
 from recon.reconstruct import Reconstruction, reconstruct
 from recon.settings import Settings
@@ -60,10 +60,10 @@ class Flight:
     attitude: AttitudeCheck | None = None
 
     @property
-    def verdicts(self) -> tuple[Verdict, ...]:
+    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
         """Verdicts on the trajectory, then on its attitude, then on the air."""
-        attitude, day = (part.verdicts if part is not None else () for part in (self.attitude, self.day))
-        return self.reconstruction.verdicts + attitude + day
+        attitude, day = (part.consistency_checks if part is not None else () for part in (self.attitude, self.day))
+        return self.reconstruction.consistency_checks + attitude + day
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -74,7 +74,7 @@ class Flight:
     @property
     def suspects(self) -> tuple[str, ...]:
         """What is most likely wrong, the first first; none where every verdict passes."""
-        return suspects(self.verdicts, self.reconstruction.left_out)
+        return suspects(self.consistency_checks, self.reconstruction.left_out)
 
     @property
     def has_attitude(self) -> bool:
@@ -146,7 +146,7 @@ def flight_from(telemetry: Telemetry, bet: Reconstruction) -> Flight:
         telemetry.required_vehicle()
         telemetry.required_triads()
         pulse = pulse_data(telemetry, bet, air)
-        day = day_air(telemetry, bet, profile, bet.settings.verdict_confidence)
+        day = day_air(telemetry, bet, profile, bet.settings.check_confidence)
     except GateError as fault:
         missing.append(str(fault))
     return Flight(telemetry, bet, air, pulse, day, tuple(missing))

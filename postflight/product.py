@@ -190,7 +190,11 @@ def residual_statistics(flight: Flight) -> pd.DataFrame:
     Mean and sd are in metres and radians (m/s for velocities); ``rms_normalised`` is over the predicted sd and should
     be one, ``lag1`` the autocorrelation of successive ones and should be none; ``nis`` repeats the source's verdict.
     """
-    nis = {v.name.removeprefix("NIS "): v.value for v in flight.reconstruction.verdicts if v.name.startswith("NIS ")}
+    nis = {
+        v.name.removeprefix("NIS "): v.value
+        for v in flight.reconstruction.consistency_checks
+        if v.name.startswith("NIS ")
+    }
     rows = []
     for (source, component), part in flight.reconstruction.residuals.groupby(["source", "component"], sort=False):
         good = part[part["accepted"]]

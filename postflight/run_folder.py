@@ -196,7 +196,10 @@ def write_reconstruction(run: RunFolder, flight: Flight) -> None:
     run.write_csv("residuals.csv", bet.residuals)
     if len(bet.withheld):
         run.write_csv("withheld.csv", bet.withheld)
-    run.write_csv("verdicts.csv", pd.DataFrame([vars(v) for v in flight.verdicts]))
+    checks = pd.DataFrame([vars(v) for v in flight.consistency_checks])
+    run.write_csv("consistency_checks.csv", checks)
+    # the table's name and columns of version 0.1, for scripts that read it; to go with version 0.3
+    run.write_csv("verdicts.csv", checks.drop(columns="code").rename(columns={"remark": "words"}))
     run.write_csv("sensor_errors.csv", bet.sensor_errors)
     run.write_csv("events.csv", event_table(flight, table))
     if flight.day is not None:
@@ -236,7 +239,7 @@ def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
     if comparison is None:
         return {"passed": None, "independent": not check.dependence, "words": check.findings[-1].what}
     return {
-        "passed": all(v.passed for v in check.verdicts),
+        "passed": all(v.passed for v in check.consistency_checks),
         "independent": not check.dependence,
         "words": check.words,
         "rms_body_deg": [float(x) for x in np.rad2deg(np.sqrt(np.mean(comparison.difference_body_rad**2, axis=0)))],
@@ -249,7 +252,7 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
     """Return the short story of a run, for ``summary.json``."""
     air, peak = flight.air, flight.peak_s
     k = int(np.searchsorted(air.time_s, peak).clip(0, len(air.time_s) - 1))
-    verdicts = flight.verdicts
+    consistency_checks = flight.consistency_checks
     return {
         "flight": flight.telemetry.name,
         "synthetic": flight.telemetry.synthetic,
@@ -263,10 +266,10 @@ def summary(flight: Flight, answers: Answers) -> dict[str, Any]:
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),
         "missing": list(flight.missing),
         "attitude_check": attitude_summary(flight.attitude),
-        "verdicts_passed": sum(v.passed for v in verdicts),
+        "verdicts_passed": sum(v.passed for v in consistency_checks),
         "suspect": flight.suspects[0] if flight.suspects else None,
         "suspects": list(flight.suspects),
-        "verdicts_failed": [f"{v.name}: {v.words}" for v in verdicts if not v.passed],
+        "verdicts_failed": [f"{v.name}: {v.remark}" for v in consistency_checks if not v.passed],
     }
 
 

@@ -31,7 +31,7 @@ from flightmodel.airdata import lateral_angles
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.sphere_cone import knudsen
-from recon.consistency import Verdict, sheet_verdict, verdict
+from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
 from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
 
 KNOT_M, KNOT_S, TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
@@ -108,7 +108,7 @@ class ReconstructedAir:
     profile: pd.DataFrame
     drag: pd.DataFrame
     parameters: pd.DataFrame
-    verdicts: tuple[Verdict, ...]
+    consistency_checks: tuple[ConsistencyCheck, ...]
 
 
 PARAMETERS = {
@@ -223,7 +223,7 @@ def reconstruct_air(
         _profile(model, height, estimate, sd),
         _drag_ratio(model),
         _parameters(prior_sd, estimate[3 * len(height) :], sd[3 * len(height) :]),
-        (*_verdicts(height, estimate, sd, confidence), *_residual_verdicts(residual)),
+        (*_consistency_checks(height, estimate, sd, confidence), *_residual_checks(residual)),
     )
 
 
@@ -319,25 +319,37 @@ def _drag_ratio(model: _Model) -> pd.DataFrame:
     )
 
 
-def _residual_verdicts(residual: FloatArray) -> list[Verdict]:
+def _residual_checks(residual: FloatArray) -> list[ConsistencyCheck]:
     """Do the forces follow the model (n, 3)?"""
     out = []
     for name, part in (("axial", residual[:, :1]), ("lateral", residual[:, 1:])):
         good, bad = "forces follow the model", "forces do not follow the model: coefficients, or what pushes is not air"
         rms = float(np.sqrt(np.mean(part**2)))
-        out.append(verdict(f"air residuals {name}", rms, 0.0, LARGEST_RMS, good, bad))
+        out.append(consistency_check("force-residuals", f"air residuals {name}", rms, 0.0, LARGEST_RMS, good, bad))
     return out
 
 
-def _verdicts(height: FloatArray, estimate: FloatArray, sd: FloatArray, confidence: float) -> tuple[Verdict, ...]:
+def _consistency_checks(
+    height: FloatArray, estimate: FloatArray, sd: FloatArray, confidence: float
+) -> tuple[ConsistencyCheck, ...]:
     """Do density, winds and the axial coefficient lie where the sounding and the pre-flight model put them?"""
     k = len(height)
     heights = [f"{h / 1000:.0f} km" for h in height]
 
-    def judged(label: str, names: list[str], first: int, bad: str) -> Verdict | None:
+    def judged(label: str, names: list[str], first: int, bad: str) -> ConsistencyCheck | None:
         rows = slice(first, first + len(names))
         good = "as far from its statement as stated; the furthest is"
-        return sheet_verdict(label, names, estimate[rows], np.ones(len(names)), sd[rows], confidence, bad, good)
+        return data_sheet_check(
+            label.lower().replace(" ", "-").replace("_", ""),
+            label,
+            names,
+            estimate[rows],
+            np.ones(len(names)),
+            sd[rows],
+            confidence,
+            bad,
+            good,
+        )
 
     wind = [f"wind {way} at {h}" for way in ("north", "east") for h in heights]
     found = (

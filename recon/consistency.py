@@ -47,24 +47,30 @@ GROUPS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6,
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """One test: its value, the band it should lie in, whether it does, and what that means."""
+class ConsistencyCheck:
+    """One statistic, the band it should lie in, whether it does, and what follows.
 
+    ``code`` is short and stable (``"nis"``, ``"whiteness"``); ``name`` adds what it is of, ``remark`` may be reworded.
+    """
+
+    code: str
     name: str
     value: float
     low: float
     high: float
     passed: bool
-    words: str
+    remark: str
 
 
-def verdict(name: str, value: float, low: float, high: float, good: str, bad: str) -> Verdict:
-    """Verdict with the words that fit."""
+def consistency_check(
+    code: str, name: str, value: float, low: float, high: float, good: str, bad: str
+) -> ConsistencyCheck:
+    """Consistency check with the remark that fits."""
     passed = bool(low <= value <= high)
-    return Verdict(name, float(value), float(low), float(high), passed, good if passed else bad)
+    return ConsistencyCheck(code, name, float(value), float(low), float(high), passed, good if passed else bad)
 
 
-def nis_verdict(source: str, nis: FloatArray, components: int, confidence: float) -> Verdict:
+def nis_check(source: str, nis: FloatArray, components: int, confidence: float) -> ConsistencyCheck:
     """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all."""
     from scipy.stats import chi2
 
@@ -76,10 +82,12 @@ def nis_verdict(source: str, nis: FloatArray, components: int, confidence: float
         if mean < low
         else "residuals are larger than predicted: noise is larger than assumed or an error is not modelled"
     )
-    return verdict(f"NIS {source}", mean, low, high, f"residuals as large as predicted ({n} points)", bad)
+    return consistency_check(
+        "nis", f"NIS {source}", mean, low, high, f"residuals as large as predicted ({n} points)", bad
+    )
 
 
-def whiteness_verdict(source: str, normalised: FloatArray, confidence: float) -> Verdict:
+def whiteness_check(source: str, normalised: FloatArray, confidence: float) -> ConsistencyCheck:
     """Lag-one autocorrelation of one component's normalised innovations (n,) against its band."""
     from scipy.stats import norm
 
@@ -87,7 +95,8 @@ def whiteness_verdict(source: str, normalised: FloatArray, confidence: float) ->
     centred = normalised - normalised.mean()
     rho = float(centred[1:] @ centred[:-1] / (centred @ centred))
     band = float(norm.ppf(0.5 * (1.0 + confidence))) / np.sqrt(n)
-    return verdict(
+    return consistency_check(
+        "whiteness",
         f"whiteness {source}",
         rho,
         -band,
@@ -97,11 +106,12 @@ def whiteness_verdict(source: str, normalised: FloatArray, confidence: float) ->
     )
 
 
-def edit_verdict(source: str, accepted: BoolArray) -> Verdict:
+def edit_check(source: str, accepted: BoolArray) -> ConsistencyCheck:
     """Fraction of points that failed the gate."""
     fraction = float(1.0 - np.mean(accepted))
     count = int(np.sum(~accepted))
-    return verdict(
+    return consistency_check(
+        "edited",
         f"edited {source}",
         fraction,
         0.0,
@@ -111,7 +121,8 @@ def edit_verdict(source: str, accepted: BoolArray) -> Verdict:
     )
 
 
-def sheet_verdict(
+def data_sheet_check(
+    code: str,
     label: str,
     names: list[str],
     estimate: FloatArray,
@@ -120,7 +131,7 @@ def sheet_verdict(
     confidence: float,
     bad: str = "is larger than the data sheet allows: check mounting, units and calibration",
     good: str = "estimated errors are as large as stated; the largest is",
-) -> Verdict | None:
+) -> ConsistencyCheck | None:
     """Largest normalised shift (k,) of stated errors from zero; None where nothing was learnt.
 
     The words name the error that moved most: ``bad`` follows its name, ``good`` goes before it.
@@ -134,12 +145,12 @@ def sheet_verdict(
     tail = 0.5 * (1.0 - confidence) / int(learnt.sum())
     worst = np.array(names, dtype=object)[learnt][int(np.argmax(shift))]
     limit = float(norm.isf(tail))
-    return verdict(label, float(shift.max()), 0.0, limit, f"{good} {worst}", f"{worst} {bad}")
+    return consistency_check(code, label, float(shift.max()), 0.0, limit, f"{good} {worst}", f"{worst} {bad}")
 
 
-def mcreynolds_verdicts(
+def mcreynolds_checks(
     difference: FloatArray, p_filter: FloatArray, p_smoother: FloatArray, groups: list[str]
-) -> list[Verdict]:
+) -> list[ConsistencyCheck]:
     """Share of filter-minus-smoother differences ``(n, 9)`` within three sd of their own covariance, by group."""
     var = np.diagonal(p_filter - p_smoother, axis1=1, axis2=2)
     alive = var > 1e-9 * np.diagonal(p_filter, axis1=1, axis2=2)  # at the end both are one
@@ -150,7 +161,8 @@ def mcreynolds_verdicts(
         use = alive[:, part]
         share = float(inside[:, part][use].mean()) if use.any() else 1.0
         out.append(
-            verdict(
+            consistency_check(
+                "filter-smoother",
                 f"filter-smoother {name}",
                 share,
                 LEAST_INSIDE,
@@ -162,7 +174,7 @@ def mcreynolds_verdicts(
     return out
 
 
-def source_verdicts(problem: Problem, innovations: Innovations, confidence: float) -> list[Verdict]:
+def source_checks(problem: Problem, innovations: Innovations, confidence: float) -> list[ConsistencyCheck]:
     """NIS, whiteness and edits of each source; one that was left out on purpose has none."""
     out = []
     time_s = problem.time_s[problem.node]
@@ -176,12 +188,12 @@ def source_verdicts(problem: Problem, innovations: Innovations, confidence: floa
         use = mine & settled & innovations.accepted
         if use.sum() >= 10:
             count = int(measured[use].sum())
-            out.append(nis_verdict(instrument.name, innovations.nis[use], count, confidence))
+            out.append(nis_check(instrument.name, innovations.nis[use], count, confidence))
             for i, component in enumerate(instrument.components):
                 rows = use & measured[:, i]
                 if rows.sum() >= 10:
-                    out.append(whiteness_verdict(f"{instrument.name} {component}", normalised[rows, i], confidence))
-        out.append(edit_verdict(instrument.name, innovations.accepted[mine]))
+                    out.append(whiteness_check(f"{instrument.name} {component}", normalised[rows, i], confidence))
+        out.append(edit_check(instrument.name, innovations.accepted[mine]))
     return out
 
 

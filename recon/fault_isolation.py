@@ -42,7 +42,7 @@ import pandas as pd
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, difference, resample
-from recon.consistency import MOST_KEPT_SD, Verdict, edit_verdict
+from recon.consistency import MOST_KEPT_SD, ConsistencyCheck, edit_check
 from recon.imu_screening import Displaced
 from recon.problem import Problem, nearest_index
 from recon.product import SAME_STRETCH_S
@@ -75,7 +75,7 @@ class LeftOut:
     """
 
     source: str
-    red: tuple[Verdict, ...] | None
+    red: tuple[ConsistencyCheck, ...] | None
     apart_m: float = 0.0
     apart: bool = False
     start_s: float = float("nan")
@@ -88,24 +88,24 @@ class LeftOut:
         return self.red is not None and not self.red and not self.disturbed
 
 
-def is_about(verdict: Verdict, source: str) -> bool:
+def is_about(consistency_check: ConsistencyCheck, source: str) -> bool:
     """Whether a verdict judges this tracker: its residuals, its edits or its stated errors."""
-    kind = next((k for k in ABOUT_TRACKERS if verdict.name.startswith(f"{k} ")), None)
+    kind = next((k for k in ABOUT_TRACKERS if consistency_check.name.startswith(f"{k} ")), None)
     if kind is None:
         return False
-    rest = verdict.name.removeprefix(f"{kind} ")
+    rest = consistency_check.name.removeprefix(f"{kind} ")
     return rest == source or rest.startswith(f"{source} ")
 
 
-def suspicious(verdicts: tuple[Verdict, ...], sources: tuple[str, ...]) -> bool:
+def suspicious(consistency_checks: tuple[ConsistencyCheck, ...], sources: tuple[str, ...]) -> bool:
     """Whether any red verdict is about a tracker."""
-    return any(not v.passed and is_about(v, s) for v in verdicts for s in sources)
+    return any(not v.passed and is_about(v, s) for v in consistency_checks for s in sources)
 
 
 def leave_each_out(
     smoothed: Trajectory,
     sources: tuple[str, ...],
-    rerun: Callable[[str], tuple[Trajectory, tuple[Verdict, ...], bool]],
+    rerun: Callable[[str], tuple[Trajectory, tuple[ConsistencyCheck, ...], bool]],
 ) -> tuple[tuple[LeftOut, ...], FloatArray]:
     """What happens without each source, and what to add to the covariance, (n, 9, 9).
 
@@ -122,12 +122,12 @@ def leave_each_out(
     moved: list[FloatArray] = []
     for source in sources:
         try:
-            other, verdicts, disturbed = rerun(source)
+            other, consistency_checks, disturbed = rerun(source)
         except GateError:
             out.append(LeftOut(source, None))
             moved.append(np.zeros((len(smoothed.time_s), 9)))
             continue
-        red = tuple(v for v in verdicts if not v.passed and not is_about(v, source))
+        red = tuple(v for v in consistency_checks if not v.passed and not is_about(v, source))
         inside, error, far = _apart(smoothed, other)
         moved.append(np.zeros((len(smoothed.time_s), 9)))
         moved[-1][inside] = error
@@ -213,8 +213,8 @@ def denied_points(
 
 
 def edited_with_denied(
-    verdicts: tuple[Verdict, ...], residuals: pd.DataFrame, denied: dict[str, FloatArray]
-) -> tuple[Verdict, ...]:
+    consistency_checks: tuple[ConsistencyCheck, ...], residuals: pd.DataFrame, denied: dict[str, FloatArray]
+) -> tuple[ConsistencyCheck, ...]:
     """Verdicts in which points that were denied count as edited."""
     again = {}
     for name, times in denied.items():
@@ -222,8 +222,8 @@ def edited_with_denied(
         at = mine.time_s.to_numpy()
         out = np.abs(times[nearest_index(times, at)] - at) < 1e-5
         offered = mine.used.to_numpy() | out
-        again[f"edited {name}"] = edit_verdict(name, (mine.accepted.to_numpy() & ~out)[offered])
-    return tuple(again.get(v.name, v) for v in verdicts)
+        again[f"edited {name}"] = edit_check(name, (mine.accepted.to_numpy() & ~out)[offered])
+    return tuple(again.get(v.name, v) for v in consistency_checks)
 
 
 def denied_findings(denied: dict[str, FloatArray]) -> list[Finding]:
@@ -268,7 +268,7 @@ class Learnt:
 NOTHING = Learnt()
 
 
-def beyond_sheet(verdicts: tuple[Verdict, ...], table: pd.DataFrame) -> dict[str, float]:
+def beyond_sheet(consistency_checks: tuple[ConsistencyCheck, ...], table: pd.DataFrame) -> dict[str, float]:
     """Standard deviations to take instead, by name of the error; empty where every sheet holds.
 
     Parameters
@@ -278,14 +278,14 @@ def beyond_sheet(verdicts: tuple[Verdict, ...], table: pd.DataFrame) -> dict[str
         ``name, prior_sd, estimate, sd``.
     """
     out: dict[str, float] = {}
-    for verdict in verdicts:
-        if verdict.passed or not verdict.name.startswith(SHEET):
+    for consistency_check in consistency_checks:
+        if consistency_check.passed or not consistency_check.name.startswith(SHEET):
             continue
-        owner = verdict.name.removeprefix(SHEET)
+        owner = consistency_check.name.removeprefix(SHEET)
         learnt_of = (table.treated == "estimated") & (table.sd < MOST_KEPT_SD * table.prior_sd)
         mine = table[table.name.str.startswith(f"{owner} ") & learnt_of]
         learnt = np.sqrt(mine.prior_sd**2 - mine.sd**2)
-        far = mine[mine.estimate.abs() > verdict.high * learnt]
+        far = mine[mine.estimate.abs() > consistency_check.high * learnt]
         out |= {str(name): TIMES * abs(float(found)) for name, found in zip(far.name, far.estimate, strict=True)}
     return out
 
@@ -323,9 +323,9 @@ CLOCKS = "clocks of "
 AIR = ("sounding", "pre-flight", "air residuals")
 
 
-def suspects(verdicts: tuple[Verdict, ...], left_out: tuple[LeftOut, ...]) -> tuple[str, ...]:
+def suspects(consistency_checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut, ...]) -> tuple[str, ...]:
     """Sentences, the most likely suspect first; none where every verdict passes."""
-    red = [v for v in verdicts if not v.passed]
+    red = [v for v in consistency_checks if not v.passed]
     sheets = [v for v in red if v.name.startswith("data sheet ")]
     inertial = [v for v in sheets if v.name.removeprefix("data sheet ") in INERTIAL]
     inertial += [v for v in red if v.name.startswith(CLOCKS)]
@@ -337,11 +337,13 @@ def suspects(verdicts: tuple[Verdict, ...], left_out: tuple[LeftOut, ...]) -> tu
         out.append(_inertial(inertial))
     if any(v.name.startswith("filter-smoother") for v in red) and not out:
         out.append("the motion: filter and smoother differ more than the sensors' noise and errors explain")
-    attitude = dict.fromkeys(f"the attitude: {v.words}" for v in red if v.name.startswith(ATTITUDE))
-    return (*out, *attitude, *(f"the air: {v.words}" for v in red if v.name.startswith(AIR)))
+    attitude = dict.fromkeys(f"the attitude: {v.remark}" for v in red if v.name.startswith(ATTITUDE))
+    return (*out, *attitude, *(f"the air: {v.remark}" for v in red if v.name.startswith(AIR)))
 
 
-def _trackers(red: list[Verdict], left_out: tuple[LeftOut, ...], inertial: list[Verdict]) -> list[str]:
+def _trackers(
+    red: list[ConsistencyCheck], left_out: tuple[LeftOut, ...], inertial: list[ConsistencyCheck]
+) -> list[str]:
     cured = [s for s in left_out if s.cures]
     if len(cured) == 1:
         s = cured[0]
@@ -365,7 +367,7 @@ def _trackers(red: list[Verdict], left_out: tuple[LeftOut, ...], inertial: list[
     return [f"inertial sensors or motion: no tracker can be left out so that the rest agrees; {most}"]
 
 
-def _lone_trackers(red: list[Verdict]) -> list[str]:
+def _lone_trackers(red: list[ConsistencyCheck]) -> list[str]:
     """What can be said where no tracker could be left out."""
     inertial = tuple(f"data sheet {name}" for name in INERTIAL)
     about = ("NIS ", "whiteness ", "edited ", "data sheet ")
@@ -376,14 +378,14 @@ def _lone_trackers(red: list[Verdict]) -> list[str]:
     return [f"the tracker or the motion ({words}): a second tracker would tell which"]
 
 
-def _inertial(sheets: list[Verdict]) -> str:
+def _inertial(sheets: list[ConsistencyCheck]) -> str:
     worst = max(sheets, key=lambda v: abs(v.value) / max(v.high, np.finfo(float).tiny))
-    if " mount " in worst.words:
-        names = " or ".join(v.words.split(" is larger")[0] for v in sheets if " mount " in v.words)
+    if " mount " in worst.remark:
+        names = " or ".join(v.remark.split(" is larger")[0] for v in sheets if " mount " in v.remark)
         return f"inertial sensors: {names}; the mounts of accelerometer and gyros are seen only against each other"
-    return f"inertial sensors: {worst.words}"
+    return f"inertial sensors: {worst.remark}"
 
 
-def _short(verdict: Verdict) -> str:
+def _short(consistency_check: ConsistencyCheck) -> str:
     """Words of a verdict up to the explanation."""
-    return verdict.words.split(":")[0]
+    return consistency_check.remark.split(":")[0]

@@ -31,7 +31,7 @@ from recon import (
     time_bias,
     unmodelled,
 )
-from recon.consistency import Verdict, withheld_table
+from recon.consistency import ConsistencyCheck, withheld_table
 from recon.fault_isolation import NOTHING, TIMES, Learnt, LeftOut, beyond_sheet, sheet_findings, with_wider_priors
 from recon.problem import FIT_SPAN_S, Problem
 from recon.settings import Settings
@@ -88,7 +88,7 @@ class Reconstruction:
     sensor_errors: pd.DataFrame
     residuals: pd.DataFrame
     withheld: pd.DataFrame
-    verdicts: tuple[Verdict, ...]
+    consistency_checks: tuple[ConsistencyCheck, ...]
     imu_time_s: FloatArray
     specific_force_body_mps2: FloatArray
     rate_body_radps: FloatArray
@@ -133,11 +133,11 @@ def reconstruct(
     settings = settings or Settings()
     report = progress or (lambda _fraction, _what: None)
     found = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what))
-    wider = beyond_sheet(found.verdicts, found.sensor_errors) | _clocks_that_differ(telemetry, found)
+    wider = beyond_sheet(found.consistency_checks, found.sensor_errors) | _clocks_that_differ(telemetry, found)
     if wider:
         found = _with_wider(telemetry, settings, found, wider)
     sources = trackers(telemetry, settings)
-    if len(sources) > 1 and fault_isolation.suspicious(found.verdicts, sources):
+    if len(sources) > 1 and fault_isolation.suspicious(found.consistency_checks, sources):
         found = _examined(telemetry, settings, found, sources, report)
     report(1.0, "done")
     return found
@@ -150,7 +150,7 @@ def _with_wider(
     again = reconstruct_once(telemetry, settings, learnt=replace(found.learnt, wider=wider))
     told = sheet_findings(again.sensor_errors, wider, *again.smoothed.time_s[[0, -1]].tolist())
     findings = (*again.findings, *told)
-    return replace(again, verdicts=found.verdicts, residuals=found.residuals, findings=findings)
+    return replace(again, consistency_checks=found.consistency_checks, residuals=found.residuals, findings=findings)
 
 
 def _clocks_that_differ(telemetry: Telemetry, found: Reconstruction) -> dict[str, float]:
@@ -177,21 +177,23 @@ def _examined(
     def unknown(made: Reconstruction) -> int:
         return sum(f.source == unmodelled.SOURCE for f in made.findings)
 
-    def rerun(source: str) -> tuple[Trajectory, tuple[Verdict, ...], bool]:
+    def rerun(source: str) -> tuple[Trajectory, tuple[ConsistencyCheck, ...], bool]:
         report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
         without = replace(settings, without=(*settings.without, source), output_rate_hz=coarse, pulse_rate_hz=0.0)
         other = reconstruct_once(telemetry, without, learnt=found.learnt)
         withheld[source] = other.withheld
-        return other.smoothed, other.verdicts, unknown(other) > unknown(found)
+        return other.smoothed, other.consistency_checks, unknown(other) > unknown(found)
 
     left_out, more = fault_isolation.leave_each_out(found.smoothed, sources, rerun)
     denied = fault_isolation.denied_points(left_out, withheld, found.residuals, settings.gate_probability)
     if denied:
         again = reconstruct_once(telemetry, settings, learnt=replace(found.learnt, denied=denied))
-        if all(v.passed for v in again.verdicts) and unknown(again) <= unknown(found):
+        if all(v.passed for v in again.consistency_checks) and unknown(again) <= unknown(found):
             return replace(
                 again,
-                verdicts=fault_isolation.edited_with_denied(again.verdicts, again.residuals, denied),
+                consistency_checks=fault_isolation.edited_with_denied(
+                    again.consistency_checks, again.residuals, denied
+                ),
                 findings=(*again.findings, *fault_isolation.denied_findings(denied)),
                 left_out=tuple(replace(s, apart=False) for s in left_out),
             )
@@ -230,14 +232,14 @@ def reconstruct_once(
     report(0.95, "testing consistency")
     mount = _mounting(telemetry, bridges)
     table = product.sensor_error_table(problem, reference, smoothed)
-    verdicts = consistency.source_verdicts(problem, run.innovations, settings.verdict_confidence)
-    verdicts += _mcreynolds(problem, run, smoothed, reference)
-    verdicts += _sheet_verdicts(problem, table, settings.verdict_confidence)
+    consistency_checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
+    consistency_checks += _mcreynolds(problem, run, smoothed, reference)
+    consistency_checks += _data_sheet_checks(problem, table, settings.check_confidence)
     if bridges is not None and learnt.lag is None:
         lag = time_bias.lag_between(bridges.force, bridges.rate, reference, problem.time_s)
         if lag is not None:
-            verdicts.append(time_bias.lag_verdict(lag, bridges.force, bridges.rate, settings.verdict_confidence))
-            learnt = replace(learnt, lag=None if verdicts[-1].passed else lag)
+            consistency_checks.append(time_bias.lag_check(lag, bridges.force, bridges.rate, settings.check_confidence))
+            learnt = replace(learnt, lag=None if consistency_checks[-1].passed else lag)
     series = _series(problem, bridges, reference, smoothed)
     found = [] if bridges is None else [*bridges.force.findings, *bridges.rate.findings]
     if bridges is not None:
@@ -249,7 +251,7 @@ def reconstruct_once(
         sensor_errors=table,
         residuals=product.residual_table(problem, run.innovations),
         withheld=withheld_table(problem, run, settings.engine),
-        verdicts=tuple(verdicts),
+        consistency_checks=tuple(consistency_checks),
         imu_time_s=series[0],
         specific_force_body_mps2=series[1],
         rate_body_radps=series[2],
@@ -321,17 +323,19 @@ def _series(problem: Problem, bridges: Bridges | None, states: States, smoothed:
     return (*series, *(make(problem, states, smoothed.triangles) for make in known))
 
 
-def _mcreynolds(problem: Problem, run: ekf.ForwardPass, smoothed: Smoothed, reference: States) -> list[Verdict]:
+def _mcreynolds(
+    problem: Problem, run: ekf.ForwardPass, smoothed: Smoothed, reference: States
+) -> list[ConsistencyCheck]:
     """Filter against smoother at the kept nodes after the first seconds."""
     kept = np.flatnonzero(problem.kept)
     settled = problem.time_s[kept] > problem.time_s[0] + FIT_SPAN_S
     difference = boxminus(run.states()[kept], reference[kept])[settled, :9]
     p_filter, p_smoother = (unpacked(t[settled], 9) for t in (run.filtered.p_plus, smoothed.triangles))
     groups = [name for name in consistency.GROUPS if name != "attitude" or not problem.motion.ballistic]
-    return consistency.mcreynolds_verdicts(difference, p_filter, p_smoother, groups)
+    return consistency.mcreynolds_checks(difference, p_filter, p_smoother, groups)
 
 
-def _sheet_verdicts(problem: Problem, table: pd.DataFrame, confidence: float) -> list[Verdict]:
+def _data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) -> list[ConsistencyCheck]:
     """One verdict for each instrument whose errors the flight taught something about."""
     out = []
     owners = np.array(problem.model.instruments, dtype=object)
@@ -341,7 +345,7 @@ def _sheet_verdicts(problem: Problem, table: pd.DataFrame, confidence: float) ->
         estimate, prior_sd, sd = rows[["estimate", "prior_sd", "sd"]].to_numpy(dtype=float).T
         label, *bad = SHEETS.get(str(name), (f"data sheet {name}",))
         names = rows["name"].tolist()
-        out.append(consistency.sheet_verdict(label, names, estimate, prior_sd, sd, confidence, *bad))
+        out.append(consistency.data_sheet_check("data-sheet", label, names, estimate, prior_sd, sd, confidence, *bad))
     return [v for v in out if v is not None]
 
 

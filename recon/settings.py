@@ -55,7 +55,7 @@ class Settings:
     end_s: float | None = None
     passes: int = 3
     gate_probability: float = 0.9999
-    verdict_confidence: float = 0.999
+    check_confidence: float = 0.999
     angle_noise: str = "traverse"
     consider: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
@@ -77,7 +77,7 @@ class Settings:
         if self.withhold_every != 0 and not 2 <= self.withhold_every <= 1000:
             faults.append(f"withhold_every {self.withhold_every} must be 0 (none) or lie in 2 to 1000")
         faults += [f"withhold_s {a:g} to {b:g} s: a span ends after it begins" for a, b in self.withhold_s if not a < b]
-        for name in ("gate_probability", "verdict_confidence"):
+        for name in ("gate_probability", "check_confidence"):
             if not 0.5 <= getattr(self, name) < 1.0:
                 faults.append(f"{name} {getattr(self, name)} must lie in 0.5 to 1 (1 excluded)")
         for name, known in (("angle_noise", ("traverse", "axis")), ("engine", ENGINES), ("smoother", SMOOTHERS)):

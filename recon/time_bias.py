@@ -30,7 +30,7 @@ import numpy as np
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.telemetry import Finding, TriadRecord
 from flightmodel.trajectory import interpolate_rows
-from recon.consistency import Verdict, verdict
+from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import ForwardPass
 from recon.imu_screening import Bridged, usual_steps
 from recon.problem import Problem
@@ -137,7 +137,7 @@ def _together(told: FloatArray) -> Lag:
     return Lag(middle, float(np.hypot(1.25 * scatter / np.sqrt(weight.sum()), common)))
 
 
-def lag_verdict(lag: Lag, force: Bridged, rate: Bridged, confidence: float) -> Verdict:
+def lag_check(lag: Lag, force: Bridged, rate: Bridged, confidence: float) -> ConsistencyCheck:
     """Whether both clocks may err by as much as the swinging says, by their sheets."""
     from scipy.stats import norm
 
@@ -148,7 +148,9 @@ def lag_verdict(lag: Lag, force: Bridged, rate: Bridged, confidence: float) -> V
     words = f"as the vehicle swings, the tags of {force.spec.name} are {1e3 * abs(lag.lag_s):.1f} ± "
     words += f"{1e3 * lag.sd_s:.1f} ms {side} than those of {rate.spec.name}"
     bad = f"{words}: the clocks of {names} differ by more than stated"
-    return verdict(f"clocks of {names}", lag.lag_s / np.hypot(lag.sd_s, allowed), -limit, limit, words, bad)
+    return consistency_check(
+        "clock-lag", f"clocks of {names}", lag.lag_s / np.hypot(lag.sd_s, allowed), -limit, limit, words, bad
+    )
 
 
 def with_lag(problem: Problem, lag: Lag | None, force: str, rate: str) -> Problem:

@@ -29,7 +29,7 @@ from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.telemetry import AttitudePrior, Finding, SunRecord, Telemetry, TriadRecord
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
-from recon.consistency import Verdict, sheet_verdict, verdict
+from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
 from recon.vector_models import (
     ErrorTerms,
     Fit,
@@ -104,7 +104,7 @@ class AttitudeHistory:
     rate_body_radps: FloatArray
     method: str
     findings: tuple[Finding, ...]
-    verdicts: tuple[Verdict, ...]
+    consistency_checks: tuple[ConsistencyCheck, ...]
     sensor_errors: pd.DataFrame
     sightings: tuple[Sightings, ...]
 
@@ -277,22 +277,23 @@ def _history(
         rate_body_radps=fit.rate_radps,
         method="magnetometer and Sun sensors, smoothed; no gyro, no accelerometer",
         findings=tuple(findings),
-        verdicts=tuple(_verdicts(fit, terms, settings.confidence)),
+        consistency_checks=tuple(_consistency_checks(fit, terms, settings.confidence)),
         sensor_errors=table,
         sightings=tuple(used),
     )
 
 
-def _verdicts(fit: Fit, terms: ErrorTerms, confidence: float) -> list[Verdict]:
+def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[ConsistencyCheck]:
     """Of each sensor its residuals, and its constant errors against its data sheet."""
     from scipy.stats import chi2
 
-    out: list[Verdict] = []
+    out: list[ConsistencyCheck] = []
     tail = 0.5 * (1.0 - confidence)
     for name, (squares, expected) in fit.misfit.items():
         low, high = chi2.ppf([tail, 1.0 - tail], expected) / expected
         out.append(
-            verdict(
+            consistency_check(
+                "attitude-residuals",
                 f"residuals {name}",
                 squares / expected,
                 float(low) - MISFIT_ALLOWANCE,
@@ -305,7 +306,7 @@ def _verdicts(fit: Fit, terms: ErrorTerms, confidence: float) -> list[Verdict]:
     for name in dict.fromkeys(terms.instruments):
         own = terms.of(name)
         names = [terms.names[i] for i in own]
-        said = sheet_verdict(name, names, fit.errors[own], terms.prior_sd[own], sd[own], confidence)
+        said = data_sheet_check("data-sheet", name, names, fit.errors[own], terms.prior_sd[own], sd[own], confidence)
         out += [said] if said is not None else []
     return out
 

@@ -48,7 +48,7 @@ for axis, column in zip(axes, shown):
     axis.set_ylabel(column)
 axes[-1].set_xlabel("t_s")
 pd.read_csv(run / "events.csv")"""
-VERDICTS = """\
+CONSISTENCY_CHECKS = """\
 verdicts = pd.read_csv(run / "verdicts.csv")
 print(f"{verdicts['passed'].sum()} of {len(verdicts)} pass")
 verdicts"""
@@ -105,7 +105,7 @@ def notebook(run: Run, folder: str) -> str:
         ("markdown", "## The best-estimated trajectory, with three standard deviations"),
         ("code", TRAJECTORY),
         ("markdown", "## Verdicts: do residuals and sensors behave as assumed?"),
-        ("code", VERDICTS),
+        ("code", CONSISTENCY_CHECKS),
         ("markdown", "## How far the shell bent, and why not where there is no answer"),
         ("code", ANSWERS),
         ("markdown", "## The claim: these results are of these inputs"),

@@ -107,14 +107,16 @@ def told(run: Run) -> dict[str, Any]:
         "sensor_errors": "Estimated errors of the sensors",
         "peaks": "Largest values",
     }
-    verdicts, again = run.tables["verdicts"], run.tables.get("sensitivity")
+    consistency_checks, again = run.tables["verdicts"], run.tables.get("sensitivity")
     return {
         "title": words.title(run),
         "lead": words.lead(run),
         "cards": words.with_whiskers(words.cards(run)),
         "moments": words.moments(run),
         "findings": words.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
-        "verdicts": words.table_rows(verdicts.assign(passed=verdicts["passed"].map({True: "✓ pass", False: "✕ fail"}))),
+        "verdicts": words.table_rows(
+            consistency_checks.assign(passed=consistency_checks["passed"].map({True: "✓ pass", False: "✕ fail"}))
+        ),
         "extra": [(words_, words.table_rows(run.tables[name])) for name, words_ in more.items() if name in run.tables],
         "sensitivity": words.sensitivity_rows(again) if again is not None else None,
         "vehicle": [(k, words.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],

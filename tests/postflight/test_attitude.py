@@ -42,14 +42,14 @@ def turned(telemetry, angle_deg):
 
 
 def test_a_good_flight_passes_and_the_check_is_independent(check, telemetry, bet):
-    assert all(v.passed for v in check.verdicts), check.verdicts
+    assert all(v.passed for v in check.consistency_checks), check.consistency_checks
     assert check.dependence == ""
     assert "agrees" in check.words
     said = attitude_summary(check)
     assert said["passed"]
     assert said["independent"]
     flight = replace(flight_from(telemetry, bet), attitude=check)
-    assert set(check.verdicts) <= set(flight.verdicts)
+    assert set(check.consistency_checks) <= set(flight.consistency_checks)
 
 
 def test_table_is_the_trajectory_turned_by_the_difference(check, bet):
@@ -71,7 +71,7 @@ def test_table_is_the_trajectory_turned_by_the_difference(check, bet):
 
 def test_a_magnetometer_that_was_turned_is_named(telemetry, bet):
     found = check_attitude(turned(telemetry, 15.0), bet)
-    red = [v for v in found.verdicts if not v.passed]
+    red = [v for v in found.consistency_checks if not v.passed]
     assert red
     assert attitude_summary(found)["passed"] is False
     words = suspects(tuple(red), ())[0]
@@ -88,7 +88,7 @@ def test_it_says_where_the_trajectory_rests_on_the_same_sensors(telemetry, bet, 
         found = check_attitude(telemetry, replace(bet, provenance=bet.provenance | {"settings": used}))
     assert f"{how}" in found.dependence
     assert "not independent" in found.words
-    assert "not independent" in found.verdicts[0].words
+    assert "not independent" in found.consistency_checks[0].remark
     assert attitude_summary(found)["independent"] is False
 
 
@@ -99,7 +99,7 @@ def test_without_sensors_there_is_no_check_and_without_light_a_finding(telemetry
     )
     found = check_attitude(dark, bet)
     assert found.comparison is None
-    assert not found.verdicts
+    assert not found.consistency_checks
     assert "no head sees the Sun" in found.findings[0].what
     assert attitude_summary(found)["passed"] is None
     assert attitude_summary(None) is None

@@ -100,7 +100,7 @@ class Scored:
     smoothed: tuple[np.ndarray, np.ndarray]
     filtered: tuple[np.ndarray, np.ndarray]
     red: tuple[str, ...]
-    verdicts: int
+    consistency_checks: int
 
 
 def scored(trajectory, truth, at_s):
@@ -132,8 +132,8 @@ def fly_and_score(seed, scenario="irve2_reference", settings=None):
         float(truth.dynamic_pressure_pa.max()),
         scored(bet.smoothed, truth.trajectory, at),
         scored(bet.filtered, truth.trajectory, at),
-        tuple(v.name for v in bet.verdicts if not v.passed),
-        len(bet.verdicts),
+        tuple(v.name for v in bet.consistency_checks if not v.passed),
+        len(bet.consistency_checks),
     )
 
 

@@ -68,7 +68,7 @@ def test_sounding_without_errors_is_left_as_it_is():
     assert np.abs(found.profile.density_ratio - 1.0).max() < 1e-6
     assert np.abs(found.profile[["wind_north_change_mps", "wind_east_change_mps"]]).to_numpy().max() < 1e-4
     assert np.abs(found.drag.ratio - 1.0).max() < 1e-12
-    assert all(v.passed for v in found.verdicts)
+    assert all(v.passed for v in found.consistency_checks)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_flight_teaches_about_the_air(many):
 
 @pytest.mark.long
 def test_days_like_the_prior_turn_no_verdict_red(many):
-    assert not [v.name for row in many for v in row[4].verdicts if not v.passed]
+    assert not [v.name for row in many for v in row[4].consistency_checks if not v.passed]
 
 
 def test_spin_tells_winds_from_an_offset_of_the_body():
@@ -150,17 +150,17 @@ def test_attitude_that_is_not_known_hides_the_winds():
 
 
 @pytest.mark.parametrize(
-    ("column", "verdict", "words"), [(0, "sounding density", "density"), (2, "sounding wind", "wind east")]
+    ("column", "consistency_check", "words"), [(0, "sounding density", "density"), (2, "sounding wind", "wind east")]
 )
-def test_layer_that_nobody_sounded_turns_its_verdict_red(column, verdict, words):
+def test_layer_that_nobody_sounded_turns_its_verdict_red(column, consistency_check, words):
     samples = descent()
     seen = np.zeros((len(samples.time_s), atmosphere.SEEN))
     low, high = (45e3, 55e3) if column == 0 else (0.0, 32e3)
     inside = (samples.altitude_m > low) & (samples.altitude_m < high)
     seen[inside, column] = np.log(1.15) / 0.03 if column == 0 else 5.0
-    red = [v for v in atmosphere.reconstruct_air(pushed(samples, seen), KNOWN, DRAG).verdicts if not v.passed]
-    assert verdict in [v.name for v in red]
-    words_of = next(v.words for v in red if v.name == verdict)
+    red = [v for v in atmosphere.reconstruct_air(pushed(samples, seen), KNOWN, DRAG).consistency_checks if not v.passed]
+    assert consistency_check in [v.name for v in red]
+    words_of = next(v.remark for v in red if v.name == consistency_check)
     assert words_of.startswith(words)
     assert low <= 1e3 * float(words_of.split(" at ")[1].split(" km")[0]) <= high
 
@@ -171,7 +171,7 @@ def test_force_that_is_no_air_is_told():
     pushed_samples = pushed(samples, np.zeros((len(samples.time_s), atmosphere.SEEN)))
     force = pushed_samples.specific_force_body_mps2 * (1.0 + 0.1 * rng.standard_normal((len(samples.time_s), 1)))
     found = atmosphere.reconstruct_air(replace(pushed_samples, specific_force_body_mps2=force), KNOWN, DRAG)
-    assert "air residuals axial" in [v.name for v in found.verdicts if not v.passed]
+    assert "air residuals axial" in [v.name for v in found.consistency_checks if not v.passed]
 
 
 def test_thin_air_is_refused_in_words():

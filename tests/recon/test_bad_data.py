@@ -298,7 +298,7 @@ class Flight:
         sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         parts = [(error[:, g], covariance[:, g, g]) for g in GROUPS]
         nees = [np.einsum("ni,ni->n", e, np.linalg.solve(p, e[..., None])[..., 0]) for e, p in parts]
-        words, findings = suspects(bet.verdicts, bet.left_out), (*telemetry.findings, *bet.findings)
+        words, findings = suspects(bet.consistency_checks, bet.left_out), (*telemetry.findings, *bet.findings)
         return Outcome(words, findings, epochs, error / sd, sd, np.column_stack(nees))
 
 

@@ -61,7 +61,7 @@ def test_flight_teaches_about_its_sensors(ensemble):
 
 
 def test_matched_flights_get_green_verdicts(ensemble):
-    red = [v for r, _ in ensemble for v in r.verdicts if not v.passed]
+    red = [v for r, _ in ensemble for v in r.consistency_checks if not v.passed]
     assert not red  # 17 or 18 verdicts at 99.9 % in 8 flights: one red in eight such ensembles; the seeds are fixed
 
 
@@ -101,7 +101,7 @@ def test_flights_with_every_error_alive_err_as_they_claim(mini_everything, mini_
         rows = np.linspace(20, len(r.smoothed.time_s) - 6, 6).astype(int)
         smoothed.append(nees(r.smoothed, mini_truth)[rows])
         filtered.append(nees(r.filtered, mini_truth)[rows])
-        red_ones += [v for v in r.verdicts if not v.passed]
+        red_ones += [v for v in r.consistency_checks if not v.passed]
     low, high = band(9, runs)
     for values in (smoothed, filtered):
         assert (np.mean(values, axis=0) > low).all()
@@ -126,7 +126,7 @@ def test_biases_that_wander_are_followed(mini_sense, mini_truth):
         middle = r.smoothed.time_s[len(r.smoothed.time_s) // 2]
         true = errors[:3] + slow[np.searchsorted(record.time_s, middle)]
         biases.append((r.sensor_errors.estimate[:3] - true) / r.sensor_errors.sd[:3])
-        assert not [v for v in r.verdicts if not v.passed]
+        assert not [v for v in r.consistency_checks if not v.passed]
     low, high = band(9, 8)
     assert (np.mean(values, axis=0) > low).all()
     assert (np.mean(values, axis=0) < high).all()
@@ -247,7 +247,7 @@ def test_attitude_may_be_known_after_the_start(mini_sense, mini_truth):
 
 
 def red(reconstruction):
-    return {v.name for v in reconstruction.verdicts if not v.passed}
+    return {v.name for v in reconstruction.consistency_checks if not v.passed}
 
 
 def test_doubled_radar_noise_turns_nis_red(mini_sense):
@@ -265,13 +265,13 @@ def test_noise_assumed_per_axis_turns_nis_red_at_high_elevation(mini_sense):
     assert "NIS west" in red(reconstruct(telemetry, replace(FAST, angle_noise="axis")))
 
 
-@pytest.mark.parametrize(("degrees", "verdict"), [(2.0, "data sheet accelerometer"), (5.0, "NIS west")])
-def test_wrong_mount_turns_a_verdict_red(mini_sense, degrees, verdict):
+@pytest.mark.parametrize(("degrees", "consistency_check"), [(2.0, "data sheet accelerometer"), (5.0, "NIS west")])
+def test_wrong_mount_turns_a_verdict_red(mini_sense, degrees, consistency_check):
     """Two degrees (13 sd) are absorbed by the estimated mount and show only there; five no longer fit the radars."""
     wrong = np.zeros(9)
     wrong[7] = np.deg2rad(degrees)
     telemetry, _ = mini_sense(802, accelerometer_errors=wrong)
-    assert verdict in red(reconstruct(telemetry, FAST))
+    assert consistency_check in red(reconstruct(telemetry, FAST))
 
 
 def test_no_common_span_is_refused_in_words(mini_sense):

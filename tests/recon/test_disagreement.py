@@ -8,7 +8,7 @@ import pytest
 
 from flightmodel.telemetry import RadarRecord
 from flightmodel.trajectory import difference
-from recon.consistency import verdict
+from recon.consistency import consistency_check
 from recon.fault_isolation import LeftOut, denied_findings, denied_points, edited_with_denied, is_about, suspects
 from recon.reconstruct import reconstruct, reconstruct_once
 from recon.settings import Settings
@@ -39,12 +39,12 @@ def test_azimuth_bias_far_beyond_its_sd_is_paid_for(mini_sense, mini_truth, name
     wrong = spoiled(telemetry, name, azimuth=np.deg2rad(0.1))
     before, after = reconstruct_once(wrong, FAST), reconstruct(wrong, FAST)
     assert np.array_equal(before.smoothed.position_ecef_m, after.smoothed.position_ecef_m)
-    assert any(not v.passed for v in after.verdicts)
+    assert any(not v.passed for v in after.consistency_checks)
     assert max(s.apart_m for s in after.left_out) > 50.0
     assert nees(after.smoothed, mini_truth).mean() < 12.0
     assert nees(before.smoothed, mini_truth).mean() > before_it
     assert [f.source for f in after.findings if "enlarged" in f.what] == ["north"]
-    words = suspects(after.verdicts, after.left_out)[0]
+    words = suspects(after.consistency_checks, after.left_out)[0]
     assert name in words
 
 
@@ -52,14 +52,14 @@ def test_good_flights_are_not_run_again(mini_sense):
     telemetry, _ = mini_sense(41)
     found = reconstruct(telemetry, FAST)
     assert not found.left_out
-    assert not suspects(found.verdicts, found.left_out)
+    assert not suspects(found.consistency_checks, found.left_out)
     assert np.array_equal(found.smoothed.covariance, reconstruct_once(telemetry, FAST).smoothed.covariance)
 
 
 def test_late_time_tags_of_one_radar_are_laid_on_it(mini_sense, mini_truth):
     telemetry, _ = mini_sense(42)
     found = reconstruct(spoiled(telemetry, "north", seconds=0.05), FAST)
-    words = suspects(found.verdicts, found.left_out)[0]
+    words = suspects(found.consistency_checks, found.left_out)[0]
     assert "north" in words
     assert nees(found.smoothed, mini_truth).mean() < 12.0
 
@@ -67,7 +67,7 @@ def test_late_time_tags_of_one_radar_are_laid_on_it(mini_sense, mini_truth):
 def test_noise_of_one_radar_is_laid_on_it_and_moves_nothing(mini_sense, mini_truth):
     telemetry, _ = mini_sense(43)
     found = reconstruct(spoiled(telemetry, "west", noise=1.5), FAST)
-    words = suspects(found.verdicts, found.left_out)[0]
+    words = suspects(found.consistency_checks, found.left_out)[0]
     assert words.startswith("west (")
     assert "without it all else agrees" in words
     assert nees(found.smoothed, mini_truth).mean() < 12.0
@@ -78,7 +78,7 @@ def test_a_lone_radar_is_not_left_out(mini_sense):
     lone = replace(telemetry, radars={"north": telemetry.radars["north"]})
     found = reconstruct(spoiled(lone, "north", noise=2.0), FAST)
     assert not found.left_out
-    assert "a second tracker would tell" in suspects(found.verdicts, found.left_out)[0]
+    assert "a second tracker would tell" in suspects(found.consistency_checks, found.left_out)[0]
 
 
 def test_wrong_mount_is_laid_on_the_inertial_sensors(mini_sense):
@@ -86,7 +86,7 @@ def test_wrong_mount_is_laid_on_the_inertial_sensors(mini_sense):
     wrong[7] = np.deg2rad(2.0)
     telemetry, _ = mini_sense(802, accelerometer_errors=wrong)
     found = reconstruct(telemetry, FAST)
-    words = " ".join(suspects(found.verdicts, found.left_out))
+    words = " ".join(suspects(found.consistency_checks, found.left_out))
     assert "accelerometer mount" in words
 
 
@@ -94,7 +94,7 @@ def test_wrong_mount_is_laid_on_the_inertial_sensors(mini_sense):
 
 
 def red(name, words="bad", value=9.0):
-    return verdict(name, value, 0.0, 3.0, "good", words)
+    return consistency_check("test", name, value, 0.0, 3.0, "good", words)
 
 
 def test_names_of_verdicts_are_told_apart():
@@ -106,22 +106,29 @@ def test_names_of_verdicts_are_told_apart():
 
 
 def test_one_cure_names_the_tracker_and_nothing_else():
-    verdicts = (red("NIS west", "large: noise"), red("data sheet accelerometer", "accelerometer bias x is larger"))
-    left_out = (LeftOut("north", (verdicts[0],)), LeftOut("west", ()))
-    assert suspects(verdicts, left_out) == ("west (large): without it all else agrees",)
+    consistency_checks = (
+        red("NIS west", "large: noise"),
+        red("data sheet accelerometer", "accelerometer bias x is larger"),
+    )
+    left_out = (LeftOut("north", (consistency_checks[0],)), LeftOut("west", ()))
+    assert suspects(consistency_checks, left_out) == ("west (large): without it all else agrees",)
 
 
 def test_two_cures_are_a_contradiction():
-    verdicts = (red("edited west", "100 of 200 points edited: it and the rest"),)
+    consistency_checks = (red("edited west", "100 of 200 points edited: it and the rest"),)
     left_out = (LeftOut("north", (), 300.0, True, 1.0, 2.0), LeftOut("west", ()))
-    words = suspects(verdicts, left_out)[0]
+    words = suspects(consistency_checks, left_out)[0]
     assert words.startswith("north and west contradict each other by up to 300 m")
 
 
 def test_no_cure_names_what_all_trackers_meet():
-    verdicts = (red("NIS west"), red("NIS north"), red("data sheet rates", "rates scale y is larger than stated"))
-    left_out = (LeftOut("north", verdicts), LeftOut("west", None))
-    words = suspects(verdicts, left_out)
+    consistency_checks = (
+        red("NIS west"),
+        red("NIS north"),
+        red("data sheet rates", "rates scale y is larger than stated"),
+    )
+    left_out = (LeftOut("north", consistency_checks), LeftOut("west", None))
+    words = suspects(consistency_checks, left_out)
     assert words[0].startswith("inertial sensors or motion")
     assert "rates scale y" in words[0]
     assert len(words) == 1
@@ -134,8 +141,11 @@ def test_mounts_are_seen_only_against_each_other():
 
 
 def test_air_comes_last():
-    verdicts = (red("sounding density", "density at 48 km is far"), red("data sheet rates", "rates bias x is larger"))
-    words = suspects(verdicts, ())
+    consistency_checks = (
+        red("sounding density", "density at 48 km is far"),
+        red("data sheet rates", "rates bias x is larger"),
+    )
+    words = suspects(consistency_checks, ())
     assert words[0].startswith("inertial sensors: rates bias x")
     assert words[1] == "the air: density at 48 km is far"
 
@@ -165,9 +175,9 @@ def test_points_of_a_lone_culprit_are_judged_by_the_rest():
         assert set(range(21, 29)) | {50} <= set(denied["gps"]) <= set(range(19, 31)) | {49, 50, 51}
     denied = denied_points(lone, {"gps": judged}, residuals, 0.9999)
     assert [(f.source, f.start_s, f.end_s) for f in denied_findings(denied)] == [("gps", 20, 29), ("gps", 50, 50)]
-    verdicts = (verdict("edited gps", 0.0, 0.0, 0.05, "none", "many"), red("NIS gps2"))
-    edited, other = edited_with_denied(verdicts, residuals, denied)
-    assert (edited.value, edited.passed, other) == (pytest.approx(0.11), False, verdicts[1])
+    consistency_checks = (consistency_check("edited", "edited gps", 0.0, 0.0, 0.05, "none", "many"), red("NIS gps2"))
+    edited, other = edited_with_denied(consistency_checks, residuals, denied)
+    assert (edited.value, edited.passed, other) == (pytest.approx(0.11), False, consistency_checks[1])
 
 
 def test_points_are_denied_to_none_where_two_cure_or_none_lies_apart():

@@ -76,6 +76,6 @@ def test_verdicts_of_matched_flights_stay_green(flights, record_property):
     """Each is red by chance once in a thousand (data sheets, McReynolds and edits less often)."""
     from scipy.stats import poisson
 
-    red, total = sum(len(f.red) for f in flights), sum(f.verdicts for f in flights)
+    red, total = sum(len(f.red) for f in flights), sum(f.consistency_checks for f in flights)
     record_property("red verdicts", f"{red} of {total}")
     assert red <= poisson.ppf(0.999, 1e-3 * total)

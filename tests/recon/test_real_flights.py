@@ -62,7 +62,7 @@ def fly(tmp_path_factory):
 
 
 def red(flight):
-    return {v.name for v in flight.verdicts if not v.passed}
+    return {v.name for v in flight.consistency_checks if not v.passed}
 
 
 def foretold(flight, *sources):

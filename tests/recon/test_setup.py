@@ -27,7 +27,7 @@ def faults(call, *arguments, **options):
 
 def test_settings_name_all_faults_at_once():
     said = faults(
-        Settings, output_rate_hz=0.0, passes=-1, gate_probability=1.0, verdict_confidence=0.1, angle_noise="axes",
+        Settings, output_rate_hz=0.0, passes=-1, gate_probability=1.0, check_confidence=0.1, angle_noise="axes",
         engine="complied", smoother="bryson",
     )  # fmt: skip
     assert len(said) == 7
@@ -129,7 +129,7 @@ def test_a_source_that_is_left_out_chooses_nothing(mini_sense, mini_truth):
     residuals = r.residuals[(r.residuals.source == "west") & (r.residuals.component == "range")]
     assert residuals.residual.mean() == pytest.approx(100e3, rel=0.1)
     assert not residuals.accepted.any()
-    assert not any("west" in v.name for v in r.verdicts if v.name.startswith("NIS"))
+    assert not any("west" in v.name for v in r.consistency_checks if v.name.startswith("NIS"))
 
 
 def test_only_stated_errors_become_states(mini_sense, mini_everything):

@@ -123,8 +123,8 @@ def test_a_clock_beyond_its_sheet_is_told_by_the_swinging_and_followed(monkeypat
     told = time_bias.Lag(0.02, 0.002)
     monkeypatch.setattr(reconstruct.triad_clocks, "lag_between", lambda *_: told)
     found = reconstruct(early, Settings(output_rate_hz=5.0))
-    (verdict,) = (v for v in found.verdicts if v.name.startswith("clocks of"))
-    assert not verdict.passed
+    (consistency_check,) = (v for v in found.consistency_checks if v.name.startswith("clocks of"))
+    assert not consistency_check.passed
     table = found.sensor_errors.set_index("name")
     between = table.estimate["accelerometer time bias"] - table.estimate["rates time bias"]
     assert between == pytest.approx(0.02, abs=0.004)

@@ -102,14 +102,14 @@ def test_axial_coefficient_is_as_uncertain_as_claimed(days) -> None:
 @pytest.mark.long
 def test_nominal_days_turn_no_verdict_on_the_air_red(days) -> None:
     """Five verdicts at 99.9 % in a dozen flights: one red in seventeen such ensembles; the seeds are fixed."""
-    assert not [v.name for flight, _, _ in days for v in flight.day.verdicts if not v.passed]
+    assert not [v.name for flight, _, _ in days for v in flight.day.consistency_checks if not v.passed]
 
 
 # --------------------------------------------------------------------------------------------------------------- teeth
 
 
 def red(flight: Flight) -> dict[str, str]:
-    return {v.name: v.words for v in flight.verdicts if not v.passed}
+    return {v.name: v.remark for v in flight.consistency_checks if not v.passed}
 
 
 @pytest.fixture(scope="module", params=[0, 7])

@@ -147,9 +147,9 @@ def test_force_coefficients_over_the_pulse_are_within_four_sd(bet, pulse) -> Non
 
 def test_verdicts_of_a_nominal_flight_pass(run_folder: Path) -> None:
     """Instruments err as flight.toml says, so that no verdict may be red."""
-    verdicts = pd.read_csv(run_folder / "verdicts.csv")
-    assert len(verdicts) >= 5
-    failed = verdicts.loc[~verdicts["passed"].astype(bool), ["name", "value", "low", "high"]]
+    consistency_checks = pd.read_csv(run_folder / "verdicts.csv")
+    assert len(consistency_checks) >= 5
+    failed = consistency_checks.loc[~consistency_checks["passed"].astype(bool), ["name", "value", "low", "high"]]
     assert failed.empty, failed.to_string()
 
 
@@ -382,8 +382,8 @@ def test_swapped_accelerometer_axes_turn_something_red(command, flown: Path, tmp
     if done.returncode != 0:
         assert done.returncode in (3, 4)
         return
-    verdicts = pd.read_csv(newest(folder) / "verdicts.csv")
-    assert not verdicts["passed"].astype(bool).all()
+    consistency_checks = pd.read_csv(newest(folder) / "verdicts.csv")
+    assert not consistency_checks["passed"].astype(bool).all()
     assert "verdict" in done.stdout
     assert command("score", folder).returncode == 5
 
@@ -407,9 +407,9 @@ def test_range_package_runs_end_to_end(delivered) -> None:
 def test_range_package_verdicts_and_findings(delivered) -> None:
     """The delivery's own README speaks of a dropout and of track errors: both must be named with their times."""
     done, run = delivered
-    verdicts = pd.read_csv(run / "verdicts.csv")
-    assert len(verdicts) >= 5
-    assert np.isfinite(verdicts["value"]).all()
+    consistency_checks = pd.read_csv(run / "verdicts.csv")
+    assert len(consistency_checks) >= 5
+    assert np.isfinite(consistency_checks["value"]).all()
     findings = pd.read_csv(run / "findings.csv")
     dropout = findings[findings["source"].str.contains("accelerometer") & findings["what"].str.startswith("gap")]
     assert len(dropout) == 1
