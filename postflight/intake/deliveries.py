@@ -40,7 +40,7 @@ from flightmodel.checks import ConfigError, FloatArray, GateError, writing
 from flightmodel.config import FILL_IN_VALUE, read_toml
 from flightmodel.tables import to_si
 from flightmodel.vehicle import DATA, vehicle_path
-from postflight.intake.flight_form import left_to_fill_in, section_text, start_text, template
+from postflight.intake.flight_form import placeholders, section_text, start_text, template
 from postflight.intake.headers import fold, take_apart
 from postflight.intake.propose import (
     ASKED,
@@ -420,7 +420,7 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
 
 def print_left(folder: Path) -> None:
     """Say which values are still to write, file by file."""
-    left = left_to_fill_in(folder)
+    left = placeholders(folder)
     by_file: dict[str, list[str]] = {}
     for words in left:
         file, key = words.split(": key '", 1)

@@ -100,7 +100,7 @@ def _resolved(made: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
             return node
 
 
-def left_to_fill_in(folder: Path) -> list[str]:
+def placeholders(folder: Path) -> list[str]:
     """Values that say FILL IN, each with file and key: of flight.toml, its vehicle file, and the table's sidecar.
 
     Files that cannot be read hold none: they are refused elsewhere.
