@@ -32,8 +32,8 @@ from postflight.checks.units_and_axes import (
     window_means,
 )
 
-Rows = NDArray[np.intp]
-Reading = tuple[float, Axes]
+_Rows = NDArray[np.intp]
+_Reading = tuple[float, Axes]
 _CELL_S = 0.05
 _GAP_S = 0.5
 _SPAN_S = 60.0  # in which a gyro's bias of 0.2 deg/s adds 12 deg
@@ -96,7 +96,7 @@ def gyro_axes(found: Sources, force: TrackForce) -> list[Finding]:
     return [Finding("rates", words, float(times[0]), float(times[-1]), code)]
 
 
-def _which(near: list[Reading], best: Reading, off_rad: float, declared: str) -> tuple[str, str]:
+def _which(near: list[_Reading], best: _Reading, off_rad: float, declared: str) -> tuple[str, str]:
     """Code and hint of what would mend the rates: all good readings differ by unit alone, by axes alone, or by both."""
     scale, axes = best
     if all(r[1] == AS_DECLARED for r in near):
@@ -171,7 +171,7 @@ def _cells(record: TriadRecord, grid: FloatArray) -> FloatArray:
 
 
 def _carried(
-    q: FloatArray, turn: FloatArray, grid: FloatArray, w: FloatArray, a: FloatArray, force: TrackForce, clear: Rows
+    q: FloatArray, turn: FloatArray, grid: FloatArray, w: FloatArray, a: FloatArray, force: TrackForce, clear: _Rows
 ) -> FloatArray:
     """Forces (c, k, 3) of k windows, carried from attitudes (c, 4) by rates that matrices (c, 3, 3) make of ``w``."""
     sums = np.zeros((len(q), len(clear), 3))
