@@ -2,8 +2,6 @@
 
 ``runs/<utc>-<hash8>/``: the hash covers inputs, settings and version, so equal runs carry equal hashes, and the same
 inputs give the same bytes in every file but ``run.json``, which alone holds times and machine.
-
-A file that is whole or not there at all.
 """
 
 from __future__ import annotations
@@ -253,14 +251,3 @@ def summary(flight: Reconstruction, answers: Deflections) -> dict[str, Any]:
         "suspects": list(flight.suspects),
         "verdicts_failed": [f"{v.name}: {v.remark}" for v in consistency_checks if not v.passed],
     }
-
-
-def write_file(path: Path, content: bytes | str) -> None:
-    """Write bytes, or text as UTF-8, beside its place and rename it; folders on the way are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
-    try:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

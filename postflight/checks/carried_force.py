@@ -44,7 +44,7 @@ _RATES_RIGHT_RAD, _ATTITUDE_RIGHT_RAD = np.deg2rad(12.0), np.deg2rad(15.0)
 _ATTITUDE_SD = 4.0
 _FARTHEST_S = 600.0  # that gyros are trusted to carry an attitude
 _DEGREE = np.pi / 180.0
-# slips in writing a quaternion: what is said of it, and the order that undoes it (None: the conjugate)
+# slips in writing a quaternion: the hint, and the order that undoes it (None: the conjugate)
 _SLIPS = {
     "with the scalar last, so put its last number first": [3, 0, 1, 2],
     "as from ECEF to body, so change the signs of its last three numbers": None,

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -24,6 +25,7 @@ from flightmodel import earth
 from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.config import FILL_IN, read_toml
 from flightmodel.flightfolder import Sources, read_sources
+from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.checks import carried_force, inertial, pressure_and_field, tracks
@@ -52,8 +54,8 @@ class Fact:
     missing: int
 
 
-@dataclass
-class Report:
+@dataclass(repr=False)
+class Report(Tabular):
     """Everything that a check found; ``exit_code`` as the command leaves with."""
 
     facts: list[Fact] = field(default_factory=list)
@@ -64,9 +66,28 @@ class Report:
     refused: list[Fault] = field(default_factory=list)
     exit_code: int = 0
 
+    def to_frame(self) -> pd.DataFrame:
+        """Return findings, suspicious cross-checks, placeholders and refusals: one row each, with its code."""
+        seen = [("found", f) for f in self.findings] + [("suspicious", f) for f in self.cross_checks]
+        rows = [(kind, f.code, f.source, f.what, f.start_s, f.end_s) for kind, f in seen]
+        rows += [("to fill in", "placeholder", "", words, np.nan, np.nan) for words in self.fill_in]
+        rows += [("refused", fault.code, "", str(fault), np.nan, np.nan) for fault in self.refused]
+        return pd.DataFrame(rows, columns=["kind", "code", "source", "message", "start_s", "end_s"])
+
+    def _about(self) -> str:
+        """How many of each kind."""
+        counts = (
+            (len(self.findings), "findings", "finding"),
+            (len(self.cross_checks), "suspicious cross-checks", "suspicious cross-check"),
+            (len(self.fill_in), "values still to fill in", "value still to fill in"),
+            (len(self.refused), "refused", "refused"),
+        )
+        stated = ", ".join(f"{count} {what if count > 1 else one}" for count, what, one in counts if count)
+        return stated or "no findings; all can be read"
+
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON; times that are none become null."""
-        out: dict[str, Any] = {
+        return {
             "facts": _rows(self.facts),
             "findings": _rows(self.findings),
             "cross_checks": _rows(self.cross_checks),
@@ -77,7 +98,6 @@ class Report:
             "refused_codes": [fault.code for fault in self.refused],
             "exit_code": self.exit_code,
         }
-        return out
 
 
 def _rows(items: Iterable[Any]) -> list[dict[str, Any]]:
@@ -273,19 +293,8 @@ def print_report(report: Report) -> None:
         _line("[cyan]to fill in[/]", words)
     for fault in report.refused:
         _line("[red]refused[/]", fault, fault.code)
-    console.print(_summary(report))
+    console.print(report._about())
 
 
 def _line(mark: str, words: str, code: str = "") -> None:
     console.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}", highlight=False)
-
-
-def _summary(report: Report) -> str:
-    counts = (
-        (len(report.findings), "findings", "finding"),
-        (len(report.cross_checks), "suspicious cross-checks", "suspicious cross-check"),
-        (len(report.fill_in), "values still to fill in", "value still to fill in"),
-        (len(report.refused), "refused", "refused"),
-    )
-    stated = ", ".join(f"{count} {what if count > 1 else one}" for count, what, one in counts if count)
-    return stated or "no findings; all can be read"

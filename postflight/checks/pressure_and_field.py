@@ -1,4 +1,4 @@
-"""Do barometer and magnetometer fit the track, and does the field rotate in the body as the gyros say?
+"""Do barometer and magnetometer fit the track, and does the field rotate in the body as the gyros indicate?
 
 Heights by pressure change as a track's do; the magnetometer's magnitude is within a factor of five of the Earth's field
 (IGRF) at the track. A field that is fixed in space rotates in the body as ``db/dt = (b - b0) x w``, with ``b0`` the

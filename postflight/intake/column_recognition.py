@@ -355,11 +355,11 @@ class Recogniser:
         """Whether columns that were recognised as nothing differ by x, y, z alone, as an inertial sensor's do."""
         if self.time is None:
             return False
-        left = {"_".join(self.named[k].tokens): self.named[k].kinds for k in self.free}
-        for name, kinds in left.items():
+        unused = {"_".join(self.named[k].tokens): self.named[k].kinds for k in self.free}
+        for name, kinds in unused.items():
             for at in (k for k, letter in enumerate(name) if letter == "x"):
                 mates = [name[:at] + axis + name[at + 1 :] for axis in "yz"]
-                if all(mate in left for mate in mates) and not kinds - {"acceleration", "rate", "magnetic field"}:
+                if all(mate in unused for mate in mates) and not kinds - {"acceleration", "rate", "magnetic field"}:
                     return True
         return False
 

@@ -508,6 +508,8 @@ def _coefficients(came: _Delivery, folder: Path, tables: dict[str, Any]) -> None
     for place, content, columns, notes in found:
         if place.with_suffix(".toml") == vehicle:  # the sidecar has the table's stem
             place = place.with_stem(f"{place.stem}_coefficients")
+        if place in came.files:
+            raise ConfigError(f"{place}: two delivered tables of this name; rename one", code="file-exists")
         came.files |= {place: content, place.with_suffix(".toml"): sidecar_text(columns)}
         text = came.vehicle.get(vehicle) or (vehicle.read_text(encoding="utf-8-sig") if vehicle.is_file() else "")
         named = _named_in_form(text, place.name)
@@ -539,7 +541,7 @@ def _proposals(
 ) -> tuple[str, list[tuple[FreeFormTable, list[SourceProposal], list[str]]]]:
     """Text to add to flight.toml, and what to print."""
     taken = _sections(tables)
-    added, shown, doubtful = [], [], []
+    added, shown, unrecognised = [], [], []
     videos = [*came.videos, *_earlier_videos(folder)]
     cameras = _cameras_of(folder, tables)
     for table, place in zip(came.tables, places, strict=True):
@@ -548,7 +550,7 @@ def _proposals(
         recogniser = Recogniser(table)
         found, unused = recogniser.proposals() if frames is None else ([frames], [])
         if frames is None and recogniser.may_be_inertial():
-            doubtful.append(table.label)
+            unrecognised.append(table.label)
         shown.append((table, found, unused))
         for source in found:
             file = place.relative_to(folder).as_posix()
@@ -556,7 +558,7 @@ def _proposals(
             taken.add(source.section)
     listed = "".join(added)
     added += [_without_list(v, folder) for v in came.videos if v.place.relative_to(folder).as_posix() not in listed]
-    start = start_text(taken, tables, doubtful)
+    start = start_text(taken, tables, unrecognised)
     return "".join(f"\n{text}" for text in (*added, start) if text), shown
 
 

@@ -197,7 +197,7 @@ def section_text(source: SourceProposal, file: str, notes: list[str], taken: boo
     return "\n".join(lines) + "\n"
 
 
-def start_text(sections: set[str], tables: dict[str, Any], doubtful: list[str]) -> str:
+def start_text(sections: set[str], tables: dict[str, Any], unrecognised: list[str]) -> str:
     """Return what the tables need besides: an attitude, or a model of motion where there are no inertial sensors.
 
     Parameters
@@ -206,7 +206,7 @@ def start_text(sections: set[str], tables: dict[str, Any], doubtful: list[str]) 
         Tables of flight.toml, proposed ones among them, as ``sensors.rates``.
     tables : dict
         Of flight.toml as it is.
-    doubtful : list of str
+    unrecognised : list of str
         Names of files with columns that were recognised as nothing and may be an accelerometer's or gyros'.
     """
     if {"sensors.accelerometer", "sensors.rates"} <= sections:
@@ -219,10 +219,10 @@ def start_text(sections: set[str], tables: dict[str, Any], doubtful: list[str]) 
         'model = "ballistic"               # take [motion] out once both are there\n'
         f"drag_area_per_mass_m2pkg = {FILL_IN_TOML}  # m2/kg: C_D S / m, to a factor of 2.7\n"
     )
-    if not doubtful:
+    if not unrecognised:
         return text
     first = (
-        f"# QUESTION: {_one_line(', '.join(doubtful))} may hold an accelerometer or gyros: declare the columns above.\n"
+        f"# QUESTION: {_one_line(', '.join(unrecognised))} may hold an accelerometer or gyros: declare the columns.\n"
         "# Only a flight without both moves like this:\n"
     )
     return first + "".join(f"# {line}\n" for line in text.replace(FILL_IN_VALUE, "...").splitlines())

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from flightmodel.checks import ConfigError, GateError
+from flightmodel.checks import ConfigError, GateError, write_file
 from postflight.montecarlo import trial
 from postflight.montecarlo.bands import (
     Chunk,
@@ -42,7 +42,6 @@ from postflight.montecarlo.bands import (
     write_chunk,
 )
 from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
-from postflight.run_folder import write_file
 from synthetic_flight.ensemble import fly_runs
 
 Job = tuple[int, list[int]]

@@ -362,7 +362,16 @@ def test_json_and_screen_give_the_code_of_each_remark(folder):
     assert all(f"[{row['code']}]" in screen for row in rows)
 
 
-def test_what_cannot_be_read_is_said_beside_what_can(folder):
+def test_report_as_a_table_has_a_row_for_each_finding_and_refusal(folder):
+    change(folder, ISLAND, lambda t: t.drop(columns="EL (deg)"))
+    report = check_folder(folder)
+    assert report.to_frame()["kind"].tolist() == ["found"] * len(report.findings) + ["refused"]
+    assert f"{len(report.findings)} findings, 1 refused" in repr(report)
+    edit(folder, ("37.8410", '"FILL IN"'))
+    assert check_folder(folder).to_frame()["code"].tolist() == ["placeholder"]
+
+
+def test_what_cannot_be_read_is_refused_beside_what_can(folder):
     change(folder, ISLAND, lambda t: t.drop(columns="EL (deg)"))
     result = CliRunner().invoke(cli, ["check", str(folder), "--json"])
     assert result.exit_code == 3

@@ -201,6 +201,18 @@ def test_coefficients_go_beside_the_vehicle_with_a_form_of_their_sidecar(folder,
     np.testing.assert_allclose(own.aero.coefficients, vehicle_from_toml(shipped).aero.coefficients, rtol=1e-12)
 
 
+def test_two_coefficient_tables_of_one_name_are_refused(folder, tmp_path):
+    tables = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        tables.append(shipped_table(tmp_path / name / "aero.csv", "Mach,Alpha_deg,CA,CN,Cm_nose,Cmq"))
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(ConfigError) as refusal:
+        run("import", *tables, "--into", folder)
+    assert refusal.value.codes == ("file-exists",)
+    assert sorted(folder.rglob("*")) == before
+
+
 def test_a_vehicle_file_that_was_filled_in_is_left_as_it_is(folder, tmp_path):
     path = folder / "vehicle" / "vehicle.toml"
     path.write_text(path.read_text().replace('half_angle_deg = "FILL IN"', "half_angle_deg = 60.0", 1))
