@@ -23,7 +23,7 @@ REFERENCE = {
                     "atmosphere", "airdata", "aerodynamics", "rotations", "checks"],
     "recon": ["reconstruct", "error_model", "strapdown", "consistency", "vector_attitude", "product"],
     "estimators": ["camera", "misalignment", "trim", "fusion", "agreement", "southwell", "calibration"],
-    "synthetic_flight": ["scenarios", "simulate", "folder", "ensemble", "linear", "stability_map"],
+    "synthetic_flight": ["scenarios", "simulate", "folder", "ensemble", "linear"],
     "postflight": ["flight", "run_folder", "sensitivity", "score"],
 }  # fmt: skip
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
