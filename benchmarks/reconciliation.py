@@ -115,8 +115,8 @@ def main():
     for seed in range(first, first + count):
         vehicle, factors = flown_vehicle(seed, **law)
         flight, truth = reconstructed(seed, vehicle)
-        if truth.words:
-            print(f"{seed}: {truth.words}; left out", flush=True)
+        if truth.remark:
+            print(f"{seed}: {truth.remark}; left out", flush=True)
             continue
         begun = time.process_time()
         explained = explain(flight, asked)

@@ -19,7 +19,7 @@ from postflight.plots import ensembles
 from postflight.plots.paper_figures import save
 from postflight.progress import progress_bar
 from postflight.warmup import RECONSTRUCTION
-from synthetic_flight.ensemble import available_cores, check_names
+from synthetic_flight.ensemble import available_cores, check_outputs
 
 
 def run(
@@ -47,7 +47,7 @@ def stop_from(text: str, study: Study) -> Stop:
         number = np.nan
     if not 0.0 < number < np.inf:
         raise ConfigError(f"--until-width {text}: OUTPUT=WIDTH is wanted, e.g. peak_normal_g=0.05")
-    check_names((output,), study.plan.scalars)
+    check_outputs((output,), study.plan.scalars)
     base = study.spec.stop or Stop(output=output, width=number)
     return base.model_copy(update={"output": output, "width": number})
 
@@ -131,7 +131,7 @@ def sobol_indices(
 ) -> None:
     """Fly Saltelli's design and print the indices of every output; draw those of ``output``."""
     study = sobol_study(read_study(name), by, base)
-    check_names((output,), study.plan.scalars)
+    check_outputs((output,), study.plan.scalars)
     assert study.design is not None
     fly(study, folder, Wanted(study.design.flights, workers or available_cores(), scheduler))
     finish_sobol(study, folder, output)

@@ -40,7 +40,7 @@ from flightmodel.config import Section, parse_section, read_toml
 from flightmodel.vehicle import DATA, Vehicle
 from postflight.montecarlo import trial
 from synthetic_flight.dispersions import SMALLEST, Dispersions, Window, draws
-from synthetic_flight.ensemble import QUANTITIES, SCALARS, Plan, check_names, legs
+from synthetic_flight.ensemble import QUANTITIES, SCALARS, Plan, check_outputs, legs
 from synthetic_flight.scenarios import read_scenario
 
 PERCENTILES = (2.3, 50.0, 97.7)
@@ -197,7 +197,7 @@ def read_study(name: str) -> Study:
         ("stop.output", () if spec.stop is None else (spec.stop.output,), spec.outputs.scalars),
     ):
         try:
-            check_names(names, allowed)
+            check_outputs(names, allowed)
         except ConfigError as fault:
             faults += [f"{path}: key '{key}': {words}" for words in fault.faults]
     if spec.mode == "whole":

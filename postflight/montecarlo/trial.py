@@ -20,7 +20,7 @@ from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import difference, resample
 from postflight.flight import estimate, reconstruct_telemetry
 from synthetic_flight.dispersions import Dispersions, dispersed_case, draws, run_seed
-from synthetic_flight.ensemble import Plan, Row, reason_of
+from synthetic_flight.ensemble import Plan, Row, failure_reason
 from synthetic_flight.folder import simulate_to_folder
 
 METHODS = ("misalignment", "trim", "fused")
@@ -57,7 +57,7 @@ def fly_whole(plan: Plan, seed: int, runs: list[int]) -> list[Row]:
         try:
             found, reason = trial(plan, seed, run), ""
         except Exception as fault:  # one flight's defect must not cost the others: its row says what
-            found, reason = dict.fromkeys(SCALARS, np.nan), reason_of(fault)
+            found, reason = dict.fromkeys(SCALARS, np.nan), failure_reason(fault)
         kept = {name: found[name] for name in plan.scalars}
         rows.append(Row(run, reason, np.nan, kept, np.empty((0, len(plan.window.history_time_s())))))
     return rows

@@ -29,7 +29,7 @@ from synthetic_flight.dispersions import Window
 from synthetic_flight.dynamics import check_step
 from synthetic_flight.ensemble import Records, Start, fly_legs, legs, records_of
 from synthetic_flight.scenarios import Scenario, child_rng, initial_state
-from synthetic_flight.weather import day_atmosphere
+from synthetic_flight.weather import day_of_flight_atmosphere
 
 BEFORE_S, AFTER_S, RECORD_S = 20.0, 20.0, 0.02
 MEAN_HALF_WINDOW_S = 1.5  # two periods of the aerodynamic mode to both sides of the peak
@@ -129,7 +129,7 @@ def _fly(
 ) -> tuple[tuple[JointFlight, ...], float]:
     """Fly a locked joint, then the given ones, through the pulse of the locked flight."""
     time = scenario.spec.time
-    table = simulate.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere")))
+    table = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere")))
     state = initial_state(scenario)
     first = max(time.start_s, time.inflated_s or time.start_s)
     peak_s = _pressure_peak(scenario, Start(state, simulate.parameter_vector(scenario.vehicle), table), first)

@@ -1,6 +1,6 @@
 """Axdahl's three zones come out of the nonlinear simulator where the linear model puts them.
 
-Authority: the linear model (itself held to printed eigenvalues in test_linear_model.py) against flights of the kernel
+Authority: the linear model (itself held to printed eigenvalues in test_linear.py) against flights of the kernel
 at terminal speed in air of one density. Zones: divergent below a stiffness that hardly depends on damping; stable at
 moderate stiffness and damping; oscillating ever wider at high stiffness where C_mq > 0.
 """
@@ -14,7 +14,7 @@ import pytest
 
 from synthetic_flight.linear import DIVERGENT, STABLE, UNSTABLE
 
-from .test_linear_model import PRESSURE_PA, SPEED_MPS, r1_slopes
+from .test_linear import PRESSURE_PA, SPEED_MPS, r1_slopes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "axdahl_zones.py"
 _spec = importlib.util.spec_from_file_location("axdahl_zones", EXAMPLE)
