@@ -14,7 +14,8 @@ from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight import run_folder
 from postflight.commands import compile_kernels, console
-from postflight.flight import PULSE_RATE_HZ, Flight, estimate, reconstruct_telemetry
+from postflight.deflections import estimate
+from postflight.flight import PULSE_RATE_HZ, Flight
 from postflight.plots.paper_figures import save
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.progress import Report, progress_bar
@@ -32,6 +33,7 @@ from postflight.reconciliation.posterior import (
     sample_selection,
     vehicle_file_lines,
 )
+from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies.commands import bands, compared_with_bounds
 from postflight.studies.preflight import Bounds, entry_bounds, rigid_bounds
 from postflight.warmup import RECONSTRUCTION
@@ -53,10 +55,10 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
         compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
-        flight = reconstruct_telemetry(
-            telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
+        flight = reconstruct(
+            Flight(telemetry), Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
         )
-        answers = estimate(flight, telemetry, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
+        answers = estimate(flight, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
         fitting = 0.3 if sampled else 0.6
         selection = select_laws(flight, laws, lambda f, what: report(0.3 + fitting * f, what))
         fit, odds = selection.fit, selection.log_odds
@@ -73,7 +75,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             out.write_csv("joint.csv", table)
             out.write_csv("joint_correlations.csv", correlations(fit))
             deflection = deflection_of(fit)
-            out.write_csv("deflection_reconciled.csv", run_folder.deflection_table(deflection))
+            out.write_csv("deflection_reconciled.csv", deflection.to_frame())
             facts = _summary(fit, table, odds) | _modal_summary(modal, no_modes) | _posterior_summary(posterior)
             out.write_json("reconciliation.json", facts)
             out.write_csv("bands.csv", bands(rigid, flexible))
@@ -103,7 +105,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     console.print(f"results in {escape(str(out.path))}")
 
 
-def _modes(flight: Flight) -> tuple[ModalStiffness | None, str]:
+def _modes(flight: Reconstruction) -> tuple[ModalStiffness | None, str]:
     """Stiffness by the joint's frequency, or why it cannot be estimated."""
     try:
         return stiffness_from_modes(flight), ""
@@ -141,7 +143,7 @@ def _print_posterior(posterior: Posterior) -> None:
     console.print(printed)
 
 
-def reconciled_bounds(fit: JointFit, flight: Flight, report: Report) -> Bounds:
+def reconciled_bounds(fit: JointFit, flight: Reconstruction, report: Report) -> Bounds:
     """Bands of entries with the fitted joint, offset and stability, dispersed by their standard deviations."""
     joint, offset, stability = posterior_sd(fit)
     vehicle = fit.vehicle

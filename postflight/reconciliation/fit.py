@@ -29,7 +29,6 @@ import numpy as np
 
 from flightmodel.checks import FloatArray, Progress
 from flightmodel.vehicle import Vehicle
-from postflight.flight import Flight
 from postflight.reconciliation.forward_model import (
     DEFLECTION,
     FREEPLAY_SD_RAD,
@@ -46,6 +45,7 @@ from postflight.reconciliation.gauss_newton import (
     Residuals,
     descend,
 )
+from postflight.reconstruction import Reconstruction
 
 Correction = Callable[[Problem, Parameters], Parameters]
 SD_FACTORS_EARLY = (30.0, 10.0, 3.0)
@@ -140,7 +140,7 @@ class LawSelection:
         return {law: having.log_evidence - lacking.log_evidence for law, (lacking, having) in self.compared.items()}
 
 
-def select_laws(flight: Flight, asked: tuple[str, ...] = (), progress: Progress | None = None) -> LawSelection:
+def select_laws(flight: Reconstruction, asked: tuple[str, ...] = (), progress: Progress | None = None) -> LawSelection:
     """Fit the joint; of the laws of `forward_model.LAWS` that are ``asked`` for keep those that the evidence favours.
 
     Raises
@@ -182,7 +182,7 @@ def part_of(report: Progress, first: float, last: float) -> Progress:
 
 
 def reconcile(
-    flight: Flight, laws: tuple[str, ...] = (), loaded: bool = False, progress: Progress | None = None
+    flight: Reconstruction, laws: tuple[str, ...] = (), loaded: bool = False, progress: Progress | None = None
 ) -> JointFit:
     """Fit joint, offset and static stability to a reconstructed flight.
 
@@ -209,7 +209,7 @@ def reconcile(
     return _refit_with_turbulence(first, part_of(report, 0.6, 1.0))
 
 
-def problem_of(flight: Flight, measured: Measurements, laws: tuple[str, ...]) -> Problem:
+def problem_of(flight: Reconstruction, measured: Measurements, laws: tuple[str, ...]) -> Problem:
     """Least-squares problem of a flight."""
     air = AtmosphereParameters(flight.telemetry.sounding, float(measured.altitude_m.min()))
     return Problem(measured, VehicleParameters(flight.telemetry.required_vehicle(), laws), air)
@@ -287,7 +287,10 @@ def _log_evidence(problem: Problem, other: Problem, u: Parameters, linear: Linea
 
 
 def reconcile_with_freeplay(
-    flight: Flight, measured: Measurements, laws: tuple[str, ...] = ("freeplay",), progress: Progress | None = None
+    flight: Reconstruction,
+    measured: Measurements,
+    laws: tuple[str, ...] = ("freeplay",),
+    progress: Progress | None = None,
 ) -> JointFit:
     """Fit a joint with freeplay, and the other ``laws`` of `forward_model.LAWS`, to the loaded part of a flight.
 

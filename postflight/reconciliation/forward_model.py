@@ -29,8 +29,8 @@ from flightmodel.rotations import skew
 from flightmodel.telemetry import Sounding
 from flightmodel.trajectory import Trajectory, resample
 from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
-from postflight.flight import Flight
 from postflight.loads import sensed, whole_windows
+from postflight.reconstruction import Reconstruction
 from recon.atmosphere import CONSTANT_PART
 from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
 from synthetic_flight import simulate
@@ -261,7 +261,7 @@ class Measurements:
         return len(self.time_s)
 
 
-def select_measurements(flight: Flight, loaded: bool = False) -> Measurements:
+def select_measurements(flight: Reconstruction, loaded: bool = False) -> Measurements:
     """Select the data of a reconstructed flight to which a joint is fitted, 100 km down to the end of the pulse.
 
     Parameters
@@ -276,7 +276,7 @@ def select_measurements(flight: Flight, loaded: bool = False) -> Measurements:
     GateError
         Where sensors or vehicle are missing, or no pressure pulse was reconstructed.
     """
-    pulse, bet, air = flight.required_pulse(), flight.reconstruction, flight.air
+    pulse, bet, air = flight.required_loads(), flight.solution, flight.air
     accelerometer, rates = flight.telemetry.required_triads()
     falling = (air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0)
     if loaded:

@@ -17,7 +17,7 @@ from flightmodel import rotations
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight.cli import cli
-from postflight.flight import reconstruct_telemetry
+from postflight.flight import Flight
 from postflight.reconciliation.fit import mismatched_spans, reconcile, reconcile_with_freeplay, select_laws
 from postflight.reconciliation.forward_model import (
     ATTITUDE,
@@ -33,6 +33,7 @@ from postflight.reconciliation.forward_model import (
 )
 from postflight.reconciliation.gauss_newton import Parameters, Problem
 from postflight.reconciliation.posterior import joint_table, posterior_summary, sample, vehicle_file_lines
+from postflight.reconstruction import reconstruct
 from synthetic_flight import simulate
 from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed
@@ -55,7 +56,7 @@ def flown(tmp_path_factory):
 def loose(tmp_path_factory):
     """The same with freeplay."""
     folder, _, vehicle = fly(tmp_path_factory, FREEPLAY_DEG)
-    return reconstruct_telemetry(read_flight(folder)), vehicle
+    return reconstruct(Flight(read_flight(folder))), vehicle
 
 
 def fly(tmp_path_factory, freeplay_deg):
@@ -82,7 +83,7 @@ def fly(tmp_path_factory, freeplay_deg):
 
 @pytest.fixture(scope="module")
 def problem(flown):
-    flight = reconstruct_telemetry(read_flight(flown[0]))
+    flight = reconstruct(Flight(read_flight(flown[0])))
     measured = select_measurements(flight)
     air = AtmosphereParameters(flight.telemetry.sounding, float(measured.altitude_m.min()))
     return Problem(measured, VehicleParameters(flight.telemetry.required_vehicle()), air)
@@ -161,7 +162,7 @@ def test_spans_of_the_true_flight_join(problem, flown):
 def test_the_turbulence_of_a_flight_is_estimated(step_m, low, high, tmp_path_factory, monkeypatch):
     """Synthetic air is straight between points; knots are 125 m apart."""
     monkeypatch.setattr("synthetic_flight.weather.STEP_M", step_m)
-    found = reconcile(reconstruct_telemetry(read_flight(fly(tmp_path_factory, 0.0)[0])))
+    found = reconcile(reconstruct(Flight(read_flight(fly(tmp_path_factory, 0.0)[0]))))
     assert low < found.problem.air.turbulence_share < high
 
 
@@ -215,7 +216,7 @@ def test_freeplay_is_separated_from_a_plain_joint(loose, flown):
     selection = select_laws(loose[0], ("freeplay",))
     assert selection.log_odds["freeplay"] > 3.0
     assert selection.fit.problem.vehicle_parameters.laws == ("freeplay",)
-    plain = select_laws(reconstruct_telemetry(read_flight(flown[0])), ("freeplay", "hardening"))
+    plain = select_laws(reconstruct(Flight(read_flight(flown[0]))), ("freeplay", "hardening"))
     assert plain.log_odds["freeplay"] < 0.0
     assert "freeplay" not in plain.fit.problem.vehicle_parameters.laws
 
@@ -223,7 +224,7 @@ def test_freeplay_is_separated_from_a_plain_joint(loose, flown):
 @pytest.mark.long
 def test_the_posterior_is_that_of_new_fits(flown):
     """Interpolated log probability against new fits, two sd away; widths against the linear problem."""
-    found = reconcile(reconstruct_telemetry(read_flight(flown[0])))
+    found = reconcile(reconstruct(Flight(read_flight(flown[0]))))
     sampled = sample(found)
     assert np.abs(sampled.refit_error).max() < 2.0  # of a cost of four there
     table = posterior_summary(sampled).set_index("quantity")
@@ -233,9 +234,9 @@ def test_the_posterior_is_that_of_new_fits(flown):
 
 
 def test_a_flight_without_a_pulse_is_refused(flown):
-    flight = reconstruct_telemetry(read_flight(flown[0]))
+    flight = reconstruct(Flight(read_flight(flown[0])))
     with pytest.raises(GateError, match="no vehicle is given"):
-        select_measurements(replace(flight, pulse=None, missing=("no vehicle is given",)))
+        select_measurements(replace(flight, loads=None, missing=("no vehicle is given",)))
     high = replace(flight, air=replace(flight.air, altitude_m=flight.air.altitude_m + 200e3))
     with pytest.raises(GateError) as refusal:
         select_measurements(high)
