@@ -30,7 +30,7 @@ from IPython.display import Image, display
 
 from flightmodel.airdata import pressure_pulse
 from postflight.flight import METHODS, estimate, reconstruct_flight
-from postflight.plots import paper_figures, run_figures
+from postflight.plots import deflection, paper_figures, run_figures, trajectory
 from postflight.product import bet_table, event_table
 from postflight.run_folder import method_summary
 from postflight.studies.preflight import rigid_bounds
@@ -71,7 +71,7 @@ pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.remark) for v in flight.co
              columns=["verdict", "passed", "value", "in words"])  # fmt: skip
 
 # %%
-paper_figures.figure_residuals(flight)
+trajectory.figure_residuals(flight)
 
 # %% [markdown]
 # ## The anomaly
@@ -142,4 +142,4 @@ for k, one in enumerate(names):
 if (folder / "truth" / "deflection.csv").exists():
     truth = pd.read_csv(folder / "truth" / "deflection.csv")
     overlay = (truth["t_s"].to_numpy(), truth["theta_deg"].to_numpy())
-    display(paper_figures.figure_summary(flight, answers, overlay))
+    display(deflection.figure_summary(flight, answers, overlay, pictures=False))

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from estimators.calibration import calibrate_lens, read_corners
 from flightmodel.camera import Lens
-from flightmodel.checks import ConfigError, DivergenceError, FloatArray, GateError
+from flightmodel.checks import ConfigError, DivergenceError, FloatArray, GateError, Progress
 from flightmodel.deflection import lv_clock
 from flightmodel.flightfolder import read_flight
 from postflight import run_folder, warmup
@@ -30,9 +30,11 @@ from postflight.flight import (
     estimate,
     reconstruct_telemetry,
 )
-from postflight.plots import paper_figures, run_figures
-from postflight.plots.overlay_film import write_overlay_film
-from postflight.progress import Report, progress_bar
+from postflight.plots import run_figures
+from postflight.plots.deflection import figure_summary
+from postflight.plots.overlay import write_overlay_film
+from postflight.plots.style import save
+from postflight.progress import progress_bar
 from postflight.report.write import write_report
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
@@ -143,7 +145,7 @@ def run_flight(
     log: list[str] = []
     with progress_bar() as report:
 
-        def step(low: float, high: float) -> Report:
+        def step(low: float, high: float) -> Progress:
             def tell(fraction: float, what: str) -> None:
                 if not log or log[-1] != what:
                     log.append(what)
@@ -203,7 +205,7 @@ def print_flight(flight: Flight, events: pd.DataFrame) -> None:
     for reason in flight.missing:
         console.print(f"[yellow]left out[/] air of the day: {escape(reason)}")
     if flight.attitude is not None and flight.attitude.comparison is not None:
-        console.print(escape(flight.attitude.words))
+        console.print(escape(flight.attitude.remark))
     failed = [v for v in flight.consistency_checks if not v.passed]
     passed = len(flight.consistency_checks) - len(failed)
     console.print(f"{passed} of {len(flight.consistency_checks)} verdicts on the trajectory pass")
@@ -289,7 +291,7 @@ def deflection(
             if not alone:
                 raise
             trouble = str(fault)
-        tell: Report = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
+        tell: Progress = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
         answers = estimate(flight, telemetry, methods, tell, plane_rad, joint_m)
         with run_folder.RunFolder(folder, telemetry, settings) as out:
             run_folder.write_answers(out, answers)
@@ -381,7 +383,7 @@ def demo(folder: Path, seed: int) -> None:
         console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
     result = score_run(folder, written)
     picture = folder / "demo.png"
-    paper_figures.save(run_figures.summary_figure(flight, answers, truth_history(folder)), picture)
+    save(figure_summary(flight, answers, truth_history(folder)), picture)
     print_score(result)
     console.print(f"results, figures and report.html in {escape(str(written))}")
     console.print(f"the answer as a picture, with the truth: {escape(str(picture))}")

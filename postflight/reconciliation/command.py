@@ -10,14 +10,14 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-from flightmodel.checks import GateError
+from flightmodel.checks import GateError, Progress
 from flightmodel.flightfolder import read_flight
 from postflight import run_folder
 from postflight.commands import compile_kernels, console
 from postflight.flight import PULSE_RATE_HZ, Flight, estimate, reconstruct_telemetry
-from postflight.plots.paper_figures import save
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
-from postflight.progress import Report, progress_bar
+from postflight.plots.style import save
+from postflight.progress import progress_bar
 from postflight.reconciliation.answer import correlations, deflection_of, found_sd, joint_table, vehicle_lines
 from postflight.reconciliation.fit import Reconciled, explain
 from postflight.reconciliation.modes import ModalStiffness, stiffness_by_modes
@@ -131,7 +131,7 @@ def print_posterior(posterior: Posterior) -> None:
     console.print(printed)
 
 
-def reconciled_bounds(found: Reconciled, flight: Flight, report: Report) -> Bounds:
+def reconciled_bounds(found: Reconciled, flight: Flight, report: Progress) -> Bounds:
     """Bands of entries with the joint, offset and stability found, dispersed as far as they are open still."""
     joint, offset, stability = found_sd(found)
     vehicle = found.vehicle

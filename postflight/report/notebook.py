@@ -44,14 +44,14 @@ for axis, column in zip(axes, shown):
     axis.plot(bet["t_s"], bet[column])
     if f"{column[:-4]}_sd_deg" in bet and column.endswith("_deg"):
         sd = bet[f"{column[:-4]}_sd_deg"]
-        axis.fill_between(bet["t_s"], bet[column] - 3 * sd, bet[column] + 3 * sd, alpha=0.3)
+        axis.fill_between(bet["t_s"], bet[column] - sd, bet[column] + sd, alpha=0.3)
     axis.set_ylabel(column)
 axes[-1].set_xlabel("t_s")
 pd.read_csv(run / "events.csv")"""
 CONSISTENCY_CHECKS = """\
-verdicts = pd.read_csv(run / "verdicts.csv")
-print(f"{verdicts['passed'].sum()} of {len(verdicts)} pass")
-verdicts"""
+checks = pd.read_csv(run / "consistency_checks.csv")
+print(f"{checks['passed'].sum()} of {len(checks)} pass")
+checks"""
 ANSWERS = """\
 answers = pd.DataFrame(summary["methods"]).T
 if answers.empty:
@@ -72,7 +72,7 @@ print(f"postflight {facts['version']}: results of exactly these {len(telemetry.h
 AGAIN = """\
 ## Going on
 
-The same from the library, to be asked otherwise:
+The same from the library, with other settings:
 
     from postflight.flight import METHODS, estimate, reconstruct_flight
     flight = reconstruct_flight(folder)
@@ -98,17 +98,17 @@ def notebook(run: Run, folder: str) -> str:
     """Text of the notebook; ``folder`` is the flight's path from where it lies."""
     title = html.escape(" ".join(run.telemetry.name.split())).replace("[", "\\[").replace("`", "'")
     cells = [
-        ("markdown", f"# {title}\n\nRun `{run.path.name}`. What went in, what came out, and what tests it."),
+        ("markdown", f"# {title}\n\nRun `{run.path.name}`. Inputs, results and consistency checks."),
         ("code", START.replace("{folder!r}", repr(folder)).replace("{run!r}", repr(run.path.name))),
-        ("markdown", "## What was measured"),
+        ("markdown", "## Measurements"),
         ("code", SENSORS),
-        ("markdown", "## The best-estimated trajectory, with three standard deviations"),
+        ("markdown", "## Best-estimated trajectory, with one standard deviation"),
         ("code", TRAJECTORY),
-        ("markdown", "## Verdicts: do residuals and sensors behave as assumed?"),
+        ("markdown", "## Consistency checks: do residuals and sensors behave as assumed?"),
         ("code", CONSISTENCY_CHECKS),
-        ("markdown", "## How far the shell bent, and why not where there is no answer"),
+        ("markdown", "## Deflection by method, and the reason where there is none"),
         ("code", ANSWERS),
-        ("markdown", "## The claim: these results are of these inputs"),
+        ("markdown", "## Provenance: these results are of these inputs"),
         ("code", PROOF),
         ("markdown", AGAIN),
     ]

@@ -1,9 +1,8 @@
-"""Numbers behind the page's time panels: what is drawn over time, with three standard deviations, gaps left as gaps.
+"""What does the report draw over time? Trajectory, deflection, residuals, and the flight against bands of others.
 
-The flight against bands of flights that were flown before it, or beside it: a rigid vehicle's, a study's, others.
-
-A table of bands has a row a time, quantity and label: median and outer percentiles, and a nominal flight where there is
-one. The run's own is the rigid vehicle's; `montecarlo` and `reconcile` write others (``bands.csv``).
+Lines carry their standard deviation ``sd``, which the page draws as a band of three and prints as one; gaps stay gaps.
+A table of bands (``bands.csv``, which `montecarlo` and `reconcile` write, and the run's own rigid vehicle) has a row
+for each time, quantity and label: median, 2.3 and 97.7 percentile, and a nominal flight where there is one.
 """
 
 from __future__ import annotations
@@ -20,35 +19,35 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR
 from postflight.flight import METHODS
-from postflight.plots.paper_figures import COLOUR, LABEL, residual_unit
+from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, residual_unit
 from postflight.report.source import Rows, Run, kept_rows, rounded
 from postflight.studies.preflight import inside
 
 TRAJECTORY_ROWS, RAW_POINTS, TRACK_POINTS, RESIDUAL_POINTS = 6000, 8000, 6000, 16000
-BLUE, ORANGE, GREEN, GREY, DARK = "#0072B2", "#D55E00", "#009E73", "#8a929a", "#3a4149"
+BLUE, GREY, DARK = COLOUR["estimate"], COLOUR["prior"], COLOUR["limit"]
 DASH: dict[str, list[int]] = {"camera": [], "misalignment": [8, 4], "trim": [10, 3, 2, 3], "fused": []}
 NO_ACCELEROMETER = "The flight has no accelerometer."
-NO_ATTITUDE = "Nothing on board carried the attitude, so the angle of attack is not known."
-NO_DEFLECTION = "No method gave a deflection; the reasons stand with the verdicts above."
+NO_ATTITUDE = "No inertial sensors carried the attitude, so the angle of attack is not known."
+NO_DEFLECTION = "No method gave a deflection; the reasons stand on the cards above."
 
 Panel = dict[str, Any]
 # id, title, unit, scale of the column, decimals, and its lines: label, column, its sd, colour, dash
 TRAJECTORY: list[tuple[str, str, str, float, int, list[tuple[str, str, str | None, str, list[int]]]]] = [
     ("altitude", "Altitude", "km", 1e-3, 4, [("reconstructed", "alt_m", "alt_sd_m", BLUE, [])]),
     ("speed", "Speed", "m/s", 1.0, 2, [
-        ("against the air", "airspeed_mps", "airspeed_sd_mps", BLUE, []),
-        ("against the ground", "speed_ground_mps", None, DARK, [6, 4])]),
-    ("mach", "Mach number", "", 1.0, 4, [("against the air", "mach", "mach_sd", BLUE, [])]),
+        ("airspeed", "airspeed_mps", "airspeed_sd_mps", BLUE, []),
+        ("ground speed", "speed_ground_mps", None, DARK, [6, 4])]),
+    ("mach", "Mach number", "", 1.0, 4, [("by airspeed and the sounding's temperature", "mach", "mach_sd", BLUE, [])]),
     ("pressure", "Dynamic pressure", "Pa", 1.0, 3,
      [("with the sounding's density", "dynamic_pressure_pa", "dynamic_pressure_sd_pa", BLUE, [])]),
     ("alpha", "Total angle of attack of the centerbody", "deg", 1.0, 3, [
-        ("against the air", "alpha_total_wind_deg", "alpha_total_wind_sd_deg", BLUE, []),
+        ("wind-relative", "alpha_total_wind_deg", "alpha_total_wind_sd_deg", BLUE, []),
         ("without wind", "alpha_total_ground_deg", None, DARK, [6, 4])]),
-    ("axial", "Acceleration along the axis (body x)", "m/s²", 1.0, 4,
+    ("axial", "Axial acceleration (body x)", "m/s²", 1.0, 4,
      [("x, corrected, mean of 0.1 s", "ax_imu_mps2", "ax_imu_sd_mps2", BLUE, [])]),
-    ("lateral", "Accelerations across the axis (body y, z)", "m/s²", 1.0, 4, [
-        ("y, corrected", "ay_imu_mps2", "ay_imu_sd_mps2", ORANGE, []),
-        ("z, corrected", "az_imu_mps2", "az_imu_sd_mps2", GREEN, [6, 3])]),
+    ("lateral", "Normal accelerations (body y, z)", "m/s²", 1.0, 4, [
+        ("y, corrected", "ay_imu_mps2", "ay_imu_sd_mps2", AXES["y"], []),
+        ("z, corrected", "az_imu_mps2", "az_imu_sd_mps2", AXES["z"], [6, 3])]),
 ]  # fmt: skip
 WHY_ABSENT = {"alpha": NO_ATTITUDE, "axial": NO_ACCELEROMETER, "lateral": NO_ACCELEROMETER}
 FLOOR = {"speed", "mach", "pressure", "alpha", "deflection"}
@@ -57,10 +56,10 @@ FLOOR = {"speed", "mach", "pressure", "alpha", "deflection"}
 def line(
     label: str, values: FloatArray, sd: FloatArray | None, colour: str, dash: list[int], decimals: int
 ) -> dict[str, Any]:
-    """One line of a panel; ``sd`` becomes a band of three."""
+    """One line of a panel with its standard deviation where it is known."""
     out: dict[str, Any] = {"label": label, "y": rounded(values, decimals), "colour": colour, "dash": dash, "width": 1.6}
     if sd is not None and np.isfinite(sd).any():
-        out["sd3"] = rounded(3.0 * sd, decimals)
+        out["sd"] = rounded(sd, decimals)
     return out
 
 
@@ -71,21 +70,21 @@ def trajectory_rows(run: Run) -> Rows:
     return kept_rows([bet[c].to_numpy(float) for c in shown], TRAJECTORY_ROWS)
 
 
-def trajectory_panels(run: Run, rows: Rows) -> tuple[list[Panel], list[tuple[str, str]]]:
-    """Panels of the trajectory, and title and reason of those that the flight has no data for."""
+def trajectory_panels(run: Run, rows: Rows) -> tuple[list[Panel], list[tuple[str, str, str]]]:
+    """Panels of the trajectory, and id, title and reason of those that the flight has no data for."""
     bet = run.tables["bet"].iloc[rows]
     raw = {"altitude": heights(run)} | samples(run)
     panels, absent = [], []
-    for name, title, unit, scale, decimals, told in TRAJECTORY:
+    for name, title, unit, scale, decimals, drawn in TRAJECTORY:
         lines = []
-        for label, column, sd_column, colour, dash in told:
+        for label, column, sd_column, colour, dash in drawn:
             if bet[column].notna().any():
                 sd = None if sd_column is None else scale * bet[sd_column].to_numpy(float)
                 lines.append(line(label, scale * bet[column].to_numpy(float), sd, colour, dash, decimals))
         if lines:
             panels.append(panel(name, title, unit, "bet", lines, raw.get(name, [])))
         else:
-            absent.append((title, WHY_ABSENT.get(name, "The run's table holds no value of it.")))
+            absent.append((name, title, WHY_ABSENT.get(name, "The run's table holds no value of it.")))
     return panels, absent
 
 
@@ -111,13 +110,16 @@ def heights(run: Run) -> list[dict[str, Any]]:
 
 
 def samples(run: Run) -> dict[str, list[dict[str, Any]]]:
-    """Accelerometer's samples, turned into body axes and not corrected, by panel."""
+    """Accelerometer's samples in body axes, not corrected, by panel."""
     record = run.telemetry.accelerometer
     if record is None:
         return {}
     body = record.measured_sensor @ record.spec.dcm_body_sensor.T
-    x, y, z = (points(f"raw {a}", record.time_s, body[:, k], GREY, 3, RAW_POINTS) for k, a in enumerate("xyz"))
-    return {"axial": [x], "lateral": [y | {"colour": "#e5a06b"}, z | {"colour": "#7fc4ad"}]}
+    x, y, z = (
+        points(f"raw {axis}", record.time_s, body[:, k], colour, 3, RAW_POINTS)
+        for k, (axis, colour) in enumerate(RAW_AXES.items())
+    )
+    return {"axial": [x], "lateral": [y, z]}
 
 
 def points(label: str, time_s: FloatArray, values: FloatArray, colour: str, decimals: int, limit: int) -> Panel:
@@ -159,7 +161,7 @@ def deflection_panel(run: Run) -> Panel | None:
         )
         rows = kept_rows([theta], TRAJECTORY_ROWS // 2)
         one = line(LABEL[method], theta[rows], sd[rows], COLOUR[method], DASH[method], 4)
-        # pictures are few: each is a dot, which also tells the line apart without colours
+        # frames are few: each is a dot, which also sets the line apart without colours
         one["dots"] = method == "camera"
         lines.append(one | {"t": rounded(t[rows], 4), "width": 3.4 if method == "fused" else 1.4})
     if not lines:
@@ -193,20 +195,23 @@ def residual_panels(run: Run) -> list[Panel]:
     return out
 
 
-G0_MPS2 = 9.80665
 FILE = "bands.csv"
 LOW, MIDDLE, HIGH = "p2.3", "p50", "p97.7"
-COLOURS = (GREY, ORANGE, GREEN, DARK)
+COLOURS = (GREY, COLOUR["second"], COLOUR["corrected"], DARK)
 # quantity of a band: title, unit, and the flight's own from bet.csv
 FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "alpha_total_deg": ("Total angle of attack", "deg", lambda bet: bet["alpha_total_wind_deg"]),
     "normal_g": (
-        "Acceleration across the axis at the c.g.",
+        "Normal acceleration at the c.g.",
         "g",
-        lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / G0_MPS2,
+        lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / earth.STANDARD_GRAVITY_MPS2,
     ),
-    "axial_g": ("Acceleration along the axis at the c.g.", "g", lambda bet: -bet["ax_cg_mps2"] / G0_MPS2),
-    "rate_degps": ("Rate across the axis", "deg/s", lambda bet: np.hypot(bet["q_body_degps"], bet["r_body_degps"])),
+    "axial_g": (
+        "Axial deceleration at the c.g.",
+        "g",
+        lambda bet: -bet["ax_cg_mps2"] / earth.STANDARD_GRAVITY_MPS2,
+    ),
+    "rate_degps": ("Lateral rate", "deg/s", lambda bet: np.hypot(bet["q_body_degps"], bet["r_body_degps"])),
     "dynamic_pressure_pa": ("Dynamic pressure", "Pa", lambda bet: bet["dynamic_pressure_pa"]),
     "mach": ("Mach number", "", lambda bet: bet["mach"]),
     "altitude_m": ("Altitude", "m", lambda bet: bet["alt_m"]),
@@ -247,12 +252,12 @@ def read_bands(path: Path) -> pd.DataFrame:
         numbers = table[["time_s", LOW, MIDDLE, HIGH]].astype(float)
     except FileNotFoundError:
         where = "`postflight montecarlo run` and `postflight reconcile` write them"
-        raise GateError(f"{path}: no bands ({FILE}) here; {where}") from None
+        raise GateError(f"{path}: no bands ({FILE}) here; {where}", "bands-missing") from None
     except (ValueError, KeyError, OSError) as fault:
-        raise GateError(f"{file}: no table of bands: {fault}") from None
+        raise GateError(f"{file}: no table of bands: {fault}", "bands-unreadable") from None
     if "quantity" not in table or not len(table):
         words = "name histories in the dispersions file's [outputs] and merge the study again"
-        raise GateError(f"{file}: holds no band of any quantity; {words}")
+        raise GateError(f"{file}: holds no band of any quantity; {words}", "bands-empty")
     label = table["label"].astype(str) if "label" in table else path.resolve().name
     nominal = table["nominal"].astype(float) if "nominal" in table else np.nan
     return numbers.assign(label=label, quantity=table["quantity"].astype(str), nominal=nominal)
@@ -293,7 +298,8 @@ def panels(run: Run, bands: pd.DataFrame, prefix: str) -> list[Panel]:
     if not out:
         raise GateError(
             f"bands of {', '.join(sorted(set(bands['quantity'])))} from {span[0]:.0f} to {span[1]:.0f} s: none of a "
-            f"quantity ({', '.join([*FLOWN, 'deflection_deg'])}) and time of this flight's pulse"
+            f"quantity ({', '.join([*FLOWN, 'deflection_deg'])}) and time of this flight's pulse",
+            "bands-of-another-flight",
         )
     return out
 
@@ -312,7 +318,7 @@ def band_lines(label: str, band: pd.DataFrame, share: float, colour: str) -> lis
     """Median with its band, and the nominal flight where there is one."""
     t = rounded(band["time_s"].to_numpy(), 3)
     low, middle, high = (rounded(band[c].to_numpy(), 4) for c in (LOW, MIDDLE, HIGH))
-    words = f"{label}, half above; {100 * share:.0f} % of the pulse inside"
+    words = f"{label}, median; {100 * share:.0f} % of the pulse inside"
     lines = [
         {"label": words, "t": t, "y": middle, "low": low, "high": high, "colour": colour, "dash": [], "width": 1.2}
     ]

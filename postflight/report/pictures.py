@@ -1,6 +1,7 @@
-"""The film strip: frames of the onboard video with the virtual camera laid over, as JPEG.
+"""What does the report show of video and vehicle? Onboard frames with the virtual camera over them; the 3-D view.
 
-The vehicle as polygons for the page's 3-D view, and how it lay in the air at every time drawn.
+The vehicle is polygons in body axes, undeflected, with the deflection and the relative wind at every time drawn; the
+page rotates the aeroshell about the joint itself.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory, lv_direction
 from flightmodel.film import Image
 from flightmodel.geometry import aft_profile, forward_profile, revolved, rim_curve
 from flightmodel.vehicle import Vehicle
-from postflight.plots.run_figures import bending_at, oriented_camera
+from postflight.plots.overlay import deflection_at, oriented_camera
 from postflight.report.source import Rows, Run, rounded
 
 FRAMES, WIDTH_PX, DASH_PX = 12, 480, 12
@@ -40,7 +41,7 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
     history = DeflectionHistory(time_s, np.deg2rad(theta_deg), np.deg2rad(plane_deg), None, "camera", "")
     oriented, benchmark = oriented_camera(run.telemetry, history)
     overlay = Overlay(oriented.view, run.telemetry.required_vehicle().meshes)
-    before = horizon_row(oriented.view, *bending_at(history, float(frames.time_s[benchmark])))
+    before = horizon_row(oriented.view, *deflection_at(history, float(frames.time_s[benchmark])))
     chosen = sorted({*_without_near(picks, (benchmark, largest)), benchmark, largest})
     rows = dict(zip(answered.tolist(), table.itertuples(index=False), strict=True))
     out: list[dict[str, Any]] = []
@@ -48,19 +49,19 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
     for k, image in zip(chosen, frames.pictures(chosen), strict=True):
         if image.size == 0:
             continue
-        said: dict[str, Any] = {"t": round(float(frames.time_s[k]), 4), "benchmark": k == benchmark}
-        said |= {"largest": k == largest, "theta": None, "sd": None}
+        frame: dict[str, Any] = {"t": round(float(frames.time_s[k]), 4), "benchmark": k == benchmark}
+        frame |= {"largest": k == largest, "theta": None, "sd": None}
         if k in rows:
             theta, plane = np.deg2rad([rows[k].theta_deg, rows[k].plane_lv_deg])
             picture = overlay.blended(image, float(theta), float(plane))
             picture = dashed_row(picture, before)
             draw_row(picture, horizon_row(oriented.view, float(theta), float(plane)), YELLOW)
-            said |= {"theta": round(rows[k].theta_deg, 3), "sd": round(rows[k].theta_sd_deg, 3)}
+            frame |= {"theta": round(rows[k].theta_deg, 3), "sd": round(rows[k].theta_sd_deg, 3)}
         else:
             picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
-        out.append(said)
+        out.append(frame)
         drawn.append(picture)
-    return [said | {"jpeg": text} for said, text in zip(out, jpegs(drawn), strict=True)]
+    return [frame | {"jpeg": text} for frame, text in zip(out, jpegs(drawn), strict=True)]
 
 
 def dashed_row(picture: Image, row: int) -> Image:
@@ -82,12 +83,12 @@ def _without_near(picks: list[int], wanted: tuple[int, ...]) -> list[int]:
 def jpegs(pictures: list[Image]) -> list[str]:
     """Data URIs of RGB pictures ``(h, w, 3)``, as fine as lets all of them together stay small."""
     small = [narrowed(picture) for picture in pictures]
-    told: list[str] = []
+    out: list[str] = []
     for quality in QUALITIES:
-        told = [jpeg(picture, quality) for picture in small]
-        if sum(map(len, told)) <= LARGEST_CHARACTERS:
+        out = [jpeg(picture, quality) for picture in small]
+        if sum(map(len, out)) <= LARGEST_CHARACTERS:
             break
-    return told
+    return out
 
 
 def narrowed(picture: Image) -> Image:
@@ -109,7 +110,7 @@ LEAST_SECTIONS, POINTS_PER_TORUS, CONE_PIECES, POSES = 48, 7, 8, 3000
 
 
 def solid(vehicle: Vehicle) -> dict[str, Any]:
-    """Vertices, mm in body axes of the unbent vehicle, and quadrangles of aft side, forward skin and centerbody.
+    """Vertices, mm in body axes of the undeflected vehicle, and quadrangles of aft side, forward skin and centerbody.
 
     Seen from outside, a quadrangle's vertices go round against the clock.
     """
@@ -150,7 +151,7 @@ def _mm(points_m: FloatArray) -> list[list[int]]:
 
 
 def poses(run: Run, rows: Rows) -> dict[str, Any]:
-    """Bending vector (body y, z, deg) by the best method, and where the air comes from (body y, z, deg), over time.
+    """Deflection (body y, z, deg) by the best method, and direction of the relative wind (body y, z, deg), over time.
 
     Vectors, so that a page may draw straight lines between them where clocking angles would wrap.
     """
@@ -164,8 +165,8 @@ def poses(run: Run, rows: Rows) -> dict[str, Any]:
     if method is not None:
         table = thinned(run.tables[f"deflection_{method}"])
         t = table["t_s"].to_numpy()
-        out["bend"] = {"t": rounded(t, 3), "method": method, "hole": hole_s(t)}
-        out["bend"] |= _lateral(table["theta_deg"], table["plane_lv_deg"])
+        out["deflection"] = {"t": rounded(t, 3), "method": method, "hole": hole_s(t)}
+        out["deflection"] |= _lateral(table["theta_deg"], table["plane_lv_deg"])
     return out
 
 
@@ -185,8 +186,8 @@ def _lateral(size: Any, clock: Any) -> dict[str, list[float | None]]:
 
 
 def best_method(run: Run) -> str | None:
-    """Fusion, or else the method that is surest at peak dynamic pressure; None where none answers there."""
-    told = {name: m for name, m in run.summary["methods"].items() if m["deflection_deg"] is not None}
-    if "fused" in told:
+    """Fusion, or else the method with the smallest sd at peak dynamic pressure; None where none answers there."""
+    answers = {name: m for name, m in run.summary["methods"].items() if m["deflection_deg"] is not None}
+    if "fused" in answers:
         return "fused"
-    return min(told, key=lambda name: told[name]["sd_deg"], default=None)
+    return min(answers, key=lambda name: answers[name]["sd_deg"], default=None)

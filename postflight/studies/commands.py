@@ -17,7 +17,7 @@ from postflight.flight import Flight, reconstruct_flight
 from postflight.montecarlo.bands import write_csv
 from postflight.montecarlo.study import read_study
 from postflight.plots import studies
-from postflight.plots.paper_figures import save
+from postflight.plots.style import save
 from postflight.progress import progress_bar
 from postflight.studies import joints
 from postflight.studies.joints import table_3_1

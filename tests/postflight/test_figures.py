@@ -11,8 +11,13 @@ from flightmodel.telemetry import Motion
 from flightmodel.trajectory import difference
 from postflight.attitude import check_attitude
 from postflight.flight import flight_from
-from postflight.plots.paper_figures import figure_residuals, save
-from postflight.plots.trajectory import figure_attitude, figure_filter_and_smoother, figure_sensitivity
+from postflight.plots.style import save
+from postflight.plots.trajectory import (
+    figure_attitude,
+    figure_filter_and_smoother,
+    figure_residuals,
+    figure_sensitivity,
+)
 from postflight.sensitivity import sensitivity
 from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
@@ -90,5 +95,5 @@ def test_without_attitude_nothing_is_drawn_of_it(ballistic, tmp_path):
 
 def test_attitude_check_says_when_it_is_not_independent(flight, tmp_path):
     drawn(figure_attitude(flight, flight.attitude), tmp_path / "attitude.png")
-    resting = replace(flight.attitude, dependence="the filter read these sensors too")
+    resting = replace(flight.attitude, dependence="filter")
     assert "not independent" in figure_attitude(flight, resting).get_suptitle()
