@@ -94,7 +94,7 @@ def figure_table_3_1(table: pd.DataFrame, synthetic: str) -> Figure:
     for axis in (right.xaxis, right.yaxis):
         axis.set_major_formatter(ScalarFormatter())
         axis.set_minor_formatter("")
-    left.legend()
+    left.legend(fontsize=7)
     figure.suptitle("Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)")
     note(figure, synthetic)
     return figure

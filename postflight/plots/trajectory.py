@@ -28,14 +28,14 @@ def figure_flown(flight: Flight) -> Figure:
     high.plot(air.time_s, air.altitude_m / 1e3, color=COLOUR["estimate"])
     high.set_ylabel("altitude (km)")
     fast.plot(air.time_s, np.linalg.norm(bet.velocity_ecef_mps, axis=1), color=COLOUR["estimate"])
-    fast.set(ylabel="speed against\nthe ground (m/s)", ylim=(0, None))
+    fast.set(ylabel="ground speed (m/s)", ylim=(0, None))
     for part, colour, label in (
         (slice(0, 3), COLOUR["estimate"], "position (m)"),
         (slice(3, 6), COLOUR["second"], "velocity (m/s)"),
     ):
         sure.semilogy(air.time_s, np.linalg.norm(bet.sd()[:, part], axis=1), color=colour, label=label)
     sure.set(ylabel="standard deviation", xlabel=TIME)
-    sure.legend()
+    sure.legend(loc="best")
     found = [f for f in flight.reconstruction.findings if f.source == "motion"]
     for ax in (high, fast, sure):
         for f in found:
