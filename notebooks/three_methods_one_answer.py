@@ -86,7 +86,7 @@ input_table(answers.fused)
 camera = answers.histories["camera"]
 turned = replace(camera, plane_lv_rad=camera.plane_lv_rad + np.deg2rad(40.0))
 try:
-    misled = fuse_flight(flight.pulse, turned).agreement.words
+    misled = fuse_flight(flight.loads, turned).agreement.words
 except DivergenceError as fault:
     misled = str(fault)
 print(misled)

@@ -13,17 +13,22 @@ from estimators.fusion import Fused
 from estimators.southwell import Limbs
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
-from postflight.flight import Answers, Flight
+from postflight.deflections import Deflections
 from postflight.plots.overlay import benchmark_and_largest
 from postflight.plots.paper_figures import trajectory_angle, window
 from postflight.plots.style import COLOUR, LABEL, STROKE, TIME, WIDE_BAND, band, in_style, stamp
+from postflight.reconstruction import Reconstruction
 
 MANY_ANSWERS = 400  # of a history, above which its single answers are not marked
 
 
 @in_style
 def figure_summary(
-    flight: Flight, answers: Answers, truth: tuple[FloatArray, FloatArray] | None = None, *, pictures: bool = True
+    flight: Reconstruction,
+    answers: Deflections,
+    truth: tuple[FloatArray, FloatArray] | None = None,
+    *,
+    pictures: bool = True,
 ) -> Figure:
     """The answer on one page: onboard frames above, deflection by every method, angle of attack and pressure below.
 

@@ -34,15 +34,12 @@ def deflection_at(history: DeflectionHistory, time_s: float) -> tuple[float, flo
     return (theta, plane) if abs(theta) > RESOLVED_RAD and abs(history.time_s[k] - time_s) < 1e-3 else (0.0, 0.0)
 
 
-def oriented_camera(
-    telemetry: Telemetry, history: DeflectionHistory, joint_m: float | None = None
-) -> tuple[OrientedCamera, int]:
+def oriented_camera(telemetry: Telemetry, history: DeflectionHistory) -> tuple[OrientedCamera, int]:
     """Camera oriented on the benchmark frame with the deflection of the history there, and that frame's index."""
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
     benchmark = frames.benchmark
-    station = vehicle.joint.station_m if joint_m is None else joint_m
-    oriented = orient_camera(frames.picture(benchmark), vehicle.geometry, frames.camera, station)
+    oriented = orient_camera(frames.picture(benchmark), vehicle.geometry, frames.camera, vehicle.joint.station_m)
     return with_bent_benchmark(oriented, *deflection_at(history, float(frames.time_s[benchmark]))), benchmark
 
 
@@ -80,9 +77,7 @@ def write_overlay(
     path.write_bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
-def write_overlay_film(
-    telemetry: Telemetry, history: DeflectionHistory, path: Path, joint_m: float | None, report: Progress
-) -> None:
+def write_overlay_film(telemetry: Telemetry, history: DeflectionHistory, path: Path, progress: Progress) -> None:
     """Write the film: the virtual view over the right half, its edge in yellow, the benchmark's in grey, the answer.
 
     A frame that was rejected is shown as it is, with the remark. The file appears when it is whole.
@@ -94,7 +89,7 @@ def write_overlay_film(
     """
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
-    oriented, benchmark = oriented_camera(telemetry, history, joint_m)
+    oriented, benchmark = oriented_camera(telemetry, history)
     overlay = Overlay(oriented.view, vehicle.meshes)
     before = horizon_row(oriented.view, *deflection_at(history, float(frames.time_s[benchmark])))
     partial = path.with_suffix(".part.webm")
@@ -106,7 +101,7 @@ def write_overlay_film(
         raise GateError(f"{path}: this build of OpenCV cannot write VP9 films; leave out --film", "film-codec-missing")
     try:
         for k, image in enumerate(frames.pictures()):
-            report(k / len(frames.time_s), f"drawing frame {k + 1} of {len(frames.time_s)}")
+            progress(k / len(frames.time_s), f"drawing frame {k + 1} of {len(frames.time_s)}")
             theta, plane = float(history.theta_rad[k]), float(history.plane_lv_rad[k])
             time = f"{frames.time_s[k]:8.2f} s   "
             if image.shape != size[::-1]:

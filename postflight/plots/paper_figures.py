@@ -26,14 +26,14 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.geometry import BodyMesh
-from postflight.flight import Flight
 from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, stamp
+from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds
 
 LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
 
 
-def window(flight: Flight) -> tuple[float, float]:
+def window(flight: Reconstruction) -> tuple[float, float]:
     """Times shown, s: from 80 km or so to well after the pressure pulse."""
     pulse = flight.air.time_s[pressure_pulse(flight.air.dynamic_pressure_pa)]
     width = pulse[-1] - pulse[0]
@@ -41,7 +41,7 @@ def window(flight: Flight) -> tuple[float, float]:
     return float(max(first, flight.air.time_s[0])), float(min(last, flight.air.time_s[-1]))
 
 
-def trajectory_angle(ax: Axes, flight: Flight, label: str) -> None:
+def trajectory_angle(ax: Axes, flight: Reconstruction, label: str) -> None:
     """Draw the trajectory's total angle of attack with its standard deviation."""
     air = flight.air
     alpha, sd = np.rad2deg(air.alpha_total_wind_rad), np.rad2deg(air.alpha_total_wind_sd_rad)
@@ -50,11 +50,11 @@ def trajectory_angle(ax: Axes, flight: Flight, label: str) -> None:
 
 
 @in_style
-def figure_1_3(flight: Flight, bounds: Bounds) -> Figure:
+def figure_1_3(flight: Reconstruction, bounds: Bounds) -> Figure:
     """Total angle of attack and normal acceleration against a rigid vehicle's Monte Carlo bounds (Figure 1.3)."""
     figure = Figure(figsize=(7.2, 7.0))
     upper, lower = figure.subplots(2, 1, sharex=True)
-    air, pulse = flight.air, flight.required_pulse()
+    air, pulse = flight.air, flight.required_loads()
     for ax, bound, nominal in (
         (upper, bounds.alpha_total_deg, bounds.nominal_alpha_deg),
         (lower, bounds.normal_g, bounds.nominal_normal_g),
@@ -121,12 +121,12 @@ def figure_2_3(
 
 
 @in_style
-def figure_2_5(flight: Flight) -> Figure:
+def figure_2_5(flight: Reconstruction) -> Figure:
     """Angle of attack by the trajectory and inferred from the uncorrected accelerometers (Figure 2.5)."""
     figure = Figure(figsize=(7.2, 4.2))
     ax = figure.subplots()
     trajectory_angle(ax, flight, "centerbody by the trajectory, 1 sd")
-    pulse = flight.required_pulse()
+    pulse = flight.required_loads()
     use = pulse.informative
     inferred = aerodynamic_angle(flight.telemetry.required_vehicle().aero, pulse.mach, pulse.specific_force_body_mps2)
     _look_up(ax, pulse.time_s, use, inferred, COLOUR["measured"], "C_N/C_A look-up, accelerometers uncorrected")
@@ -139,11 +139,11 @@ def figure_2_5(flight: Flight) -> Figure:
 
 
 @in_style
-def figure_2_7(flight: Flight, history: DeflectionHistory) -> Figure:
+def figure_2_7(flight: Reconstruction, history: DeflectionHistory) -> Figure:
     """The same with the accelerometers rotated by the estimated deflection, and the trajectory less it (Figure 2.7)."""
     figure = Figure(figsize=(7.2, 4.2))
     ax = figure.subplots()
-    pulse, aero = flight.required_pulse(), flight.telemetry.required_vehicle().aero
+    pulse, aero = flight.required_loads(), flight.telemetry.required_vehicle().aero
     use, force = pulse.informative, pulse.specific_force_body_mps2
     raw = aerodynamic_angle(aero, pulse.mach, force)
     rotated = aeroshell_acceleration(force, np.nan_to_num(history.theta_rad), psi_from_acceleration(force))
@@ -161,7 +161,7 @@ def _look_up(ax: Axes, time_s: FloatArray, use: BoolArray, angle_rad: FloatArray
     ax.plot(time_s, np.where(use, np.rad2deg(angle_rad), np.nan), color=colour, label=label)
 
 
-def _angles(figure: Figure, ax: Axes, flight: Flight, title: str, number: str) -> Figure:
+def _angles(figure: Figure, ax: Axes, flight: Reconstruction, title: str, number: str) -> Figure:
     ax.set(xlim=window(flight), ylim=(0, LOOK_UP_END_DEG), ylabel="total angle of attack (deg)", xlabel=TIME)
     ax.legend()
     figure.suptitle(f"{title} (AIAA 2011-2571, Figure {number})")

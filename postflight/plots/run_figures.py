@@ -12,19 +12,20 @@ from estimators.trim import static_trim
 from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
-from postflight.flight import Answers, Flight
+from postflight.deflections import Deflections
 from postflight.plots import deflection, paper_figures, trajectory
 from postflight.plots.overlay import deflection_at, oriented_camera, write_overlay
 from postflight.plots.style import save, stamp
+from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds, rigid_bounds
 
 PAPER_OFFSETS_M = (0.01, 0.0254)  # of the c.g., beside the vehicle's own, as in the paper's Figure 2.9
 
 
-def draw_run(flight: Flight, answers: Answers, folder: Path, report: Progress) -> Bounds | None:
+def draw_run(flight: Reconstruction, answers: Deflections, folder: Path, report: Progress) -> Bounds | None:
     """Draw everything that the run's answers allow; return the rigid vehicle's bands where it was flown."""
     bounds = None
-    if flight.pulse is not None:
+    if flight.loads is not None:
         report(0.0, "flying the rigid vehicle")
         bounds = rigid_bounds(flight, progress=lambda f, what: report(0.6 * f, what))
         save(paper_figures.figure_1_3(flight, bounds), folder / "figure_1_3.png")
@@ -32,8 +33,8 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Progress) -
     else:
         save(trajectory.figure_flown(flight), folder / "flown.png")
     report(0.6, "drawing")
-    if flight.day is not None:
-        save(trajectory.figure_air(flight, flight.day), folder / "air.png")
+    if flight.as_flown is not None:
+        save(trajectory.figure_air(flight, flight.as_flown), folder / "air.png")
     if flight.attitude is not None and flight.attitude.comparison is not None:
         save(trajectory.figure_attitude(flight, flight.attitude), folder / "attitude_check.png")
     save(trajectory.figure_filter_and_smoother(flight), folder / "filter_and_smoother.png")
@@ -51,8 +52,8 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Progress) -
         ):
             stamp(figure, flight.telemetry)
             save(figure, folder / name)
-    if flight.pulse is not None:
-        _draw_static_trim(flight.pulse, flight.telemetry, folder)
+    if flight.loads is not None:
+        _draw_static_trim(flight.loads, flight.telemetry, folder)
     if answers.histories:
         save(deflection.figure_summary(flight, answers), folder / "summary.png")
     report(1.0, "drawn")
@@ -75,17 +76,17 @@ def _draw_static_trim(pulse: PulseData, telemetry: Telemetry, folder: Path) -> N
     save(figure, folder / "figure_2_9.png")
 
 
-def draw_sensitivity(flight: Flight, table: pd.DataFrame, folder: Path) -> None:
+def draw_sensitivity(flight: Reconstruction, table: pd.DataFrame, folder: Path) -> None:
     """Draw the changes in the reruns, where any succeeded."""
     if table["quantity"].notna().any():
         save(trajectory.figure_sensitivity(flight, table), folder / "sensitivity.png")
 
 
-def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, joint_m: float | None = None) -> None:
+def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path) -> None:
     """Draw benchmark frame and frame of the largest deflection with the virtual camera over them (Figure 2.3)."""
     frames = telemetry.frames
     assert frames is not None
-    oriented, benchmark = oriented_camera(telemetry, history, joint_m)
+    oriented, benchmark = oriented_camera(telemetry, history)
     largest = int(np.nanargmax(np.abs(history.theta_rad)))
     pick = [benchmark, largest]
     times = [float(t) for t in frames.time_s[pick]]

@@ -11,8 +11,8 @@ from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import difference, resample
 from postflight.attitude import AttitudeCheck
-from postflight.flight import Flight
 from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, in_style, limits, residual_unit, stamp
+from postflight.reconstruction import Reconstruction
 from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.atmosphere import ReconstructedAir
 
@@ -20,11 +20,11 @@ LEAST_LOST = 1e-3  # of the filter's variance that the smoother takes away, for 
 
 
 @in_style
-def figure_flown(flight: Flight) -> Figure:
+def figure_flown(flight: Reconstruction) -> Figure:
     """Altitude, speed and their standard deviations: the picture of a flight without a vehicle file."""
     figure = Figure(figsize=(7.2, 7.0))
     high, fast, sure = figure.subplots(3, 1, sharex=True)
-    bet, air = flight.reconstruction.smoothed, flight.air
+    bet, air = flight.solution.smoothed, flight.air
     high.plot(air.time_s, air.altitude_m / 1e3, color=COLOUR["estimate"])
     high.set_ylabel("altitude (km)")
     fast.plot(air.time_s, np.linalg.norm(bet.velocity_ecef_mps, axis=1), color=COLOUR["estimate"])
@@ -36,7 +36,7 @@ def figure_flown(flight: Flight) -> Figure:
         sure.semilogy(air.time_s, np.linalg.norm(bet.sd()[:, part], axis=1), color=colour, label=label)
     sure.set(ylabel="standard deviation", xlabel=TIME)
     sure.legend(loc="best")
-    found = [f for f in flight.reconstruction.findings if f.source == "motion"]
+    found = [f for f in flight.solution.findings if f.source == "motion"]
     for ax in (high, fast, sure):
         for f in found:
             ax.axvspan(f.start_s, f.end_s, color=COLOUR["flagged"], alpha=0.3, lw=0)
@@ -46,9 +46,9 @@ def figure_flown(flight: Flight) -> Figure:
 
 
 @in_style
-def figure_residuals(flight: Flight) -> Figure:
+def figure_residuals(flight: Reconstruction) -> Figure:
     """Innovations of each source and component that were tried, with the predicted 3-sd lines; edited points marked."""
-    table = flight.reconstruction.residuals
+    table = flight.solution.residuals
     pairs = list(table[table["used"]].groupby(["source", "component"], sort=False))
     figure = Figure(figsize=(7.2, 1.5 * len(pairs) + 0.8))
     axes = figure.subplots(len(pairs), 1, sharex=True, squeeze=False)[:, 0]
@@ -84,9 +84,9 @@ def _edited(ax: Axes, time_s: FloatArray, residual: FloatArray, limit: float) ->
 
 
 @in_style
-def figure_filter_and_smoother(flight: Flight) -> Figure:
+def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
     """Standard deviations of filter and smoother, and their difference over its own (McReynolds)."""
-    bet = flight.reconstruction
+    bet = flight.solution
     filtered, smoothed = bet.filtered, bet.smoothed
     assert filtered.covariance is not None
     assert smoothed.covariance is not None
@@ -123,7 +123,7 @@ def figure_filter_and_smoother(flight: Flight) -> Figure:
 
 
 @in_style
-def figure_air(flight: Flight, day: ReconstructedAir) -> Figure:
+def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
     """As-flown density and wind along altitude with prior and posterior bands; measured over predicted drag."""
     figure = Figure(figsize=(9.6, 6.6))
     upper, lower = list(np.asarray(figure.subfigures(2, 1, height_ratios=(1.7, 1.0))))
@@ -177,14 +177,14 @@ def _drag(ax: Axes, drag: pd.DataFrame) -> None:
 
 
 @in_style
-def figure_attitude(flight: Flight, check: AttitudeCheck) -> Figure:
+def figure_attitude(flight: Reconstruction, check: AttitudeCheck) -> Figure:
     """Attitude from magnetometer and Sun minus the trajectory's about three body axes, with its 3-sd band."""
     comparison = check.comparison
     assert comparison is not None
     figure = Figure(figsize=(7.2, 7.0))
     axes = figure.subplots(3, 1, sharex=True)
     t, off, sd = comparison.time_s, np.rad2deg(comparison.difference_body_rad), np.rad2deg(comparison.sd_body_rad)
-    own = np.rad2deg(resample(flight.reconstruction.smoothed, t).sd()[:, 6:9])
+    own = np.rad2deg(resample(flight.solution.smoothed, t).sd()[:, 6:9])
     # stretches without Sun or field have no rows; a line across them would show what nobody measured
     whole = np.append(np.diff(t) < 1.5 * float(np.median(np.diff(t))), True)
     for k, (ax, axis) in enumerate(zip(axes, "xyz", strict=True)):
@@ -208,7 +208,7 @@ def figure_attitude(flight: Flight, check: AttitudeCheck) -> Figure:
 
 
 @in_style
-def figure_sensitivity(flight: Flight, table: pd.DataFrame) -> Figure:
+def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
     """Change of each group of quantities at peak pressure in standard deviations, a bar a rerun.
 
     Diamonds: the same over what the change itself should be, where that is known.
