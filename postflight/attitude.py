@@ -30,7 +30,7 @@ from recon.vector_attitude import (
     track,
 )
 
-RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
+_RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
 # why the check is not independent, by code
 DEPENDENCE = {
     "": "",
@@ -107,7 +107,7 @@ def check_attitude(telemetry: Telemetry, bet: TrajectorySolution) -> AttitudeChe
         t, points = track(telemetry)
         ends = np.clip(bet.smoothed.time_s[[0, -1]], t[0], t[-1])
         at = np.union1d(t[(t > ends[0]) & (t < ends[1])], ends)
-        chosen = Settings(rate_hz=RATE_HZ, confidence=settings.check_confidence)
+        chosen = Settings(rate_hz=_RATE_HZ, confidence=settings.check_confidence)
         history = reconstruct_attitude(telemetry, (at, interpolate_rows(at, t, points)), chosen)
         comparison = compare(history, bet.smoothed, settings.check_confidence)
         found += history.findings

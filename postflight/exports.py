@@ -38,11 +38,11 @@ from flightmodel.checks import ConfigError, FloatArray, GateError, writing
 from flightmodel.config import parse_utc
 from postflight.run_folder import DIGITS, newest_run, write_file
 
-UNITS = {
+_UNITS = {
     "m": "m", "mps": "m s-1", "mps2": "m s-2", "deg": "degree", "degps": "degree s-1", "pa": "Pa", "kgpm3": "kg m-3",
     "k": "K", "s": "s",
 }  # fmt: skip
-STANDARD = {  # names of the CF conventions
+_STANDARD = {  # names of the CF conventions
     "lat_deg": "latitude",
     "lon_deg": "longitude",
     "alt_m": "height_above_reference_ellipsoid",
@@ -53,12 +53,12 @@ STANDARD = {  # names of the CF conventions
     "wind_e_mps": "eastward_wind",
     "speed_ground_mps": "platform_speed_wrt_ground",
 }
-COORDINATES = "time lat_deg lon_deg alt_m"
-GAP_FACTOR = 5.0  # of the usual step of a deflection: a longer one is a gap
-KML_STEP_S = 0.5  # between points of the track
-MAT_HEADER = b"MATLAB 5.0 MAT-file, postflight export"  # scipy writes the time of writing there
-OEM_FRAME = "ITRF2000"
-OEM_STATE = ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m", "vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"]
+_COORDINATES = "time lat_deg lon_deg alt_m"
+_GAP_FACTOR = 5.0  # of the usual step of a deflection: a longer one is a gap
+_KML_STEP_S = 0.5  # between points of the track
+_MAT_HEADER = b"MATLAB 5.0 MAT-file, postflight export"  # scipy writes the time of writing there
+_OEM_FRAME = "ITRF2000"
+_OEM_STATE = ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m", "vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"]
 
 
 @dataclass(frozen=True)
@@ -132,17 +132,17 @@ def read_source(folder: Path) -> Source:
     )  # fmt: skip
 
 
-def unit_of(column: str) -> str:
+def _unit(column: str) -> str:
     """UDUNITS name of a column's unit, by its suffix; ``1`` for none."""
     tail = column.removesuffix("_sd").rsplit("_", 1)[-1]
     if column == "lat_deg":
         return "degrees_north"
     if column == "lon_deg":
         return "degrees_east"
-    return UNITS.get(tail, "1")
+    return _UNITS.get(tail, "1")
 
 
-def merged(source: Source) -> pd.DataFrame:
+def _merged(source: Source) -> pd.DataFrame:
     """Trajectory, UTC and deflections, one row a time."""
     t = source.trajectory["t_s"].to_numpy()
     parts = {"t_s": t, "utc": [source.utc(x) + "Z" for x in t]}
@@ -161,7 +161,7 @@ def _at(table: pd.DataFrame, t: FloatArray) -> dict[tuple[str, str], FloatArray]
     theta = table["theta_deg"].to_numpy()
     after = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
     step = np.diff(at)
-    outside = (t < at[0]) | (t > at[-1]) | (step[after - 1] > GAP_FACTOR * np.median(step))
+    outside = (t < at[0]) | (t > at[-1]) | (step[after - 1] > _GAP_FACTOR * np.median(step))
     y, z = (np.interp(t, at, theta * f(plane)) for f in (np.cos, np.sin))
     values = (
         np.hypot(y, z),
@@ -172,23 +172,23 @@ def _at(table: pd.DataFrame, t: FloatArray) -> dict[tuple[str, str], FloatArray]
     return {key: np.where(outside, np.nan, value) for key, value in zip(keys, values, strict=True)}
 
 
-def csv_bytes(source: Source) -> bytes:
+def _csv(source: Source) -> bytes:
     """One CSV."""
     out = io.StringIO()
-    merged(source).to_csv(out, index=False, float_format=DIGITS, lineterminator="\n")
+    _merged(source).to_csv(out, index=False, float_format=DIGITS, lineterminator="\n")
     return out.getvalue().encode()
 
 
-def parquet_bytes(source: Source) -> bytes:
+def _parquet(source: Source) -> bytes:
     """Parquet with the unit of each column in its field's metadata."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = merged(source)
+    table = _merged(source)
     utc = pd.to_datetime(table["utc"], format="ISO8601").astype("datetime64[us, UTC]")
     table = table.assign(utc=utc)
     arrow = pa.Table.from_pandas(table, preserve_index=False)
-    fields = [f.with_metadata({"unit": unit_of(f.name)}) for f in arrow.schema]
+    fields = [f.with_metadata({"unit": _unit(f.name)}) for f in arrow.schema]
     about = {"title": source.title, "run": source.run, "point": source.header["point"]}
     arrow = arrow.cast(pa.schema(fields, metadata={**(arrow.schema.metadata or {}), **about}))
     out = io.BytesIO()
@@ -196,7 +196,7 @@ def parquet_bytes(source: Source) -> bytes:
     return out.getvalue()
 
 
-def mat_bytes(source: Source) -> bytes:
+def _mat(source: Source) -> bytes:
     """MATLAB 5; names longer than MATLAB's 63 letters do not occur."""
     from scipy.io import savemat
 
@@ -216,14 +216,14 @@ def mat_bytes(source: Source) -> bytes:
         del content["deflection"]
     out = io.BytesIO()
     savemat(out, content, long_field_names=True, oned_as="column", do_compression=True)
-    return MAT_HEADER.ljust(116) + out.getvalue()[116:]
+    return _MAT_HEADER.ljust(116) + out.getvalue()[116:]
 
 
 def _struct(table: pd.DataFrame) -> dict[str, np.ndarray]:
     return {name: table[name].to_numpy(dtype=float)[:, None] for name in table.columns}
 
 
-def netcdf_bytes(source: Source) -> bytes:
+def _netcdf(source: Source) -> bytes:
     """NetCDF after the CF conventions."""
     from scipy.io import netcdf_file
 
@@ -240,7 +240,7 @@ def netcdf_bytes(source: Source) -> bytes:
     identity = file.createVariable("trajectory_id", "c", ("name_length",))
     identity[:] = np.frombuffer(label, dtype="S1") if label else b" "
     identity.cf_role = "trajectory_id"
-    _table(file, source, source.trajectory, "time", "", COORDINATES)
+    _table(file, source, source.trajectory, "time", "", _COORDINATES)
     for method, table in source.deflections.items():
         if len(table):
             _table(file, source, table, f"time_{method}", f"_{method}", f"time_{method}")
@@ -262,20 +262,20 @@ def _table(file: object, source: Source, table: pd.DataFrame, time: str, ending:
             continue
         variable = create(column + ending, "d", (time,))
         variable[:] = table[column].to_numpy(dtype=float)
-        variable.units = unit_of(column)
+        variable.units = _unit(column)
         variable.long_name = column.replace("_", " ")
         variable._FillValue = np.nan
-        if column in STANDARD:
-            variable.standard_name = STANDARD[column]
+        if column in _STANDARD:
+            variable.standard_name = _STANDARD[column]
         if column not in coordinates.split():
             variable.coordinates = coordinates
 
 
-def kml_bytes(source: Source) -> bytes:
+def _kml(source: Source) -> bytes:
     """KML: track, line and events."""
     table = source.trajectory
     t = table["t_s"].to_numpy()
-    keep = np.flatnonzero(np.diff(np.floor((t - t[0]) / KML_STEP_S + 1e-9), prepend=-1.0) > 0.0)
+    keep = np.flatnonzero(np.diff(np.floor((t - t[0]) / _KML_STEP_S + 1e-9), prepend=-1.0) > 0.0)
     keep = np.unique(np.append(keep, len(t) - 1))
     place = table[["lon_deg", "lat_deg", "alt_m"]].to_numpy()
     description = (
@@ -312,11 +312,11 @@ def kml_bytes(source: Source) -> bytes:
     return text.encode()
 
 
-def oem_bytes(source: Source) -> bytes:
+def _oem(source: Source) -> bytes:
     """CCSDS OEM: km, km/s, km^2."""
     table = source.trajectory
     t = table["t_s"].to_numpy()
-    state = table[OEM_STATE].to_numpy() / 1000.0
+    state = table[_OEM_STATE].to_numpy() / 1000.0
     name = "".join(c if c.isalnum() and c.isascii() else "_" for c in source.name) or "flight"
     lines = [
         "CCSDS_OEM_VERS = 2.0",
@@ -329,7 +329,7 @@ def oem_bytes(source: Source) -> bytes:
         f"OBJECT_NAME = {name}",
         f"OBJECT_ID = {source.epoch:%Y}-000A",
         "CENTER_NAME = EARTH",
-        f"REF_FRAME = {OEM_FRAME}",
+        f"REF_FRAME = {_OEM_FRAME}",
         "TIME_SYSTEM = UTC",
         f"START_TIME = {source.utc(t[0])}",
         f"STOP_TIME = {source.utc(t[-1])}",
@@ -341,7 +341,7 @@ def oem_bytes(source: Source) -> bytes:
     lines += [f"{source.utc(at)} {' '.join(f'{v:.9f}' for v in row)}" for at, row in zip(t, state, strict=True)]
     lines += ["", "COVARIANCE_START"]
     for at, covariance in zip(source.covariance_time_s, source.covariance[:, :6, :6] / 1e6, strict=True):
-        lines += [f"EPOCH = {source.utc(at)}", f"COV_REF_FRAME = {OEM_FRAME}"]
+        lines += [f"EPOCH = {source.utc(at)}", f"COV_REF_FRAME = {_OEM_FRAME}"]
         lines += [" ".join(f"{v:.9e}" for v in covariance[k, : k + 1]) for k in range(6)]
     return ("\n".join([*lines, "COVARIANCE_STOP"]) + "\n").encode()
 
@@ -353,12 +353,12 @@ def _printable(text: str, instead: str = " ", *, ascii_only: bool = False) -> st
 
 # format: what writes it, the suffix of its file
 FORMS: dict[str, tuple[Callable[[Source], bytes], str]] = {
-    "csv": (csv_bytes, ".csv"),
-    "parquet": (parquet_bytes, ".parquet"),
-    "mat": (mat_bytes, ".mat"),
-    "nc": (netcdf_bytes, ".nc"),
-    "kml": (kml_bytes, ".kml"),
-    "oem": (oem_bytes, ".oem"),
+    "csv": (_csv, ".csv"),
+    "parquet": (_parquet, ".parquet"),
+    "mat": (_mat, ".mat"),
+    "nc": (_netcdf, ".nc"),
+    "kml": (_kml, ".kml"),
+    "oem": (_oem, ".oem"),
 }
 EXTRAS = {"pyarrow": "parquet"}  # library, and the extra of the installation that brings it
 console = Console(soft_wrap=True)

@@ -27,9 +27,9 @@ from postflight.reconstruction import Reconstruction
 from recon.atmosphere import LEAST_AXIAL_MPS2
 
 Columns = dict[str, FloatArray]
-FORMAT = 1
-COVARIANCE_RATE_HZ = 1.0
-FRAMES = {
+_FORMAT = 1
+_COVARIANCE_RATE_HZ = 1.0
+_FRAMES = {
     "eci": "equal to ECEF at time zero (epoch_utc), then fixed in space",
     "ecef": "WGS-84, Earth-fixed; velocities relative to the rotating Earth",
     "ned": "north, east, down at the vehicle, geodetic",
@@ -43,7 +43,7 @@ FRAMES = {
     "force": "specific force in body axes; C_A along -x, C_N the size of the normal force, reference area below",
 }
 # quantity of `kinematics.derived`, its column, and the column of its sd
-DERIVED = {
+_DERIVED = {
     "latitude": ("lat_deg", "lat_sd_deg"),
     "longitude": ("lon_deg", "lon_sd_deg"),
     "altitude": ("alt_m", "alt_sd_m"),
@@ -72,17 +72,17 @@ DERIVED = {
     "clock_wind": ("clock_lv_deg", "clock_lv_sd_deg"),
     "clock_inertial": ("clock_inertial_lv_deg", "clock_inertial_lv_sd_deg"),
 }
-NEED_ATTITUDE = ("roll", "pitch", "yaw", "alpha", "beta", "clock", "alpha_total")
-FORCE_NAMES = (
+_NEED_ATTITUDE = ("roll", "pitch", "yaw", "alpha", "beta", "clock", "alpha_total")
+_FORCE_NAMES = (
     *(f"a{a}_imu_mps2" for a in "xyz"),
     *(f"a{a}_imu_sd_mps2" for a in "xyz"),
     *(f"a{a}_cg_mps2" for a in "xyz"),
     *(f"a{a}_cg_sd_mps2" for a in "xyz"),
     "c_a", "c_a_sd", "c_n", "c_n_sd", "cn_over_ca", "cn_over_ca_sd",
 )  # fmt: skip
-STATISTICS = ("source", "component", "unit", "count", "edited", "mean", "sd", "rms_normalised", "lag1", "nis")
+_STATISTICS = ("source", "component", "unit", "count", "edited", "mean", "sd", "rms_normalised", "lag1", "nis")
 # peak of the size of which column of bet.csv, and the column of its standard deviation
-PEAKS = {
+_PEAKS = {
     "dynamic pressure": ("dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
     "Mach number": ("mach", "mach_sd"),
     "airspeed": ("airspeed_mps", "airspeed_sd_mps"),
@@ -90,7 +90,7 @@ PEAKS = {
     "total angle of attack in the pulse": ("alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
     "altitude": ("alt_m", "alt_sd_m"),
 }
-EVENT_COLUMNS = {
+_EVENT_COLUMNS = {
     "alt_m": "alt_sd_m",
     "speed_ground_mps": "speed_ground_sd_mps",
     "flight_path_deg": "flight_path_sd_deg",
@@ -159,8 +159,8 @@ def _derived(flight: Reconstruction) -> Columns:
     arm = np.zeros(3) if vehicle is None else vehicle.cg_m
     value, sd = derived_with_sd(flight.solution.smoothed, profile, arm)
     out: Columns = {}
-    for name, (column, sd_column) in DERIVED.items():
-        unknown = not flight.has_attitude and name.startswith(NEED_ATTITUDE)
+    for name, (column, sd_column) in _DERIVED.items():
+        unknown = not flight.has_attitude and name.startswith(_NEED_ATTITUDE)
         for key, numbers in ((column, value[name]), (sd_column, sd[name])):
             out[key] = np.full(len(numbers), np.nan) if unknown else np.rad2deg(numbers) if is_angle(name) else numbers
     air = flight.air
@@ -175,7 +175,7 @@ def _force(flight: Reconstruction) -> Columns:
     """Specific force at the sensor and at the c.g., and the force coefficients that follow with the sounding's air."""
     bet, telemetry = flight.solution, flight.telemetry
     t = bet.smoothed.time_s
-    out = {name: np.full(len(t), np.nan) for name in FORCE_NAMES}
+    out = {name: np.full(len(t), np.nan) for name in _FORCE_NAMES}
     rows = whole_windows(bet, t)
     if telemetry.accelerometer is None or not rows.any():
         return out
@@ -235,7 +235,7 @@ def header(flight: Reconstruction) -> dict[str, Any]:
     telemetry, bet = flight.telemetry, flight.solution
     settings = bet.provenance["settings"]
     return {
-        "format": FORMAT,
+        "format": _FORMAT,
         "postflight": version("postflight"),
         "flight": telemetry.name,
         "synthetic": telemetry.synthetic,
@@ -244,7 +244,7 @@ def header(flight: Reconstruction) -> dict[str, Any]:
         "end_s": bet.provenance["end_s"],
         "point": "datum (the nose); air data and flow angles at the c.g.",
         "motion": bet.provenance["motion"],
-        "frames": FRAMES,
+        "frames": _FRAMES,
         "standard_deviations": "1 sd, of the smoothed trajectory and, in air data, of the sounding",
         "vehicle": _vehicle(flight),
         "atmosphere": _atmosphere(flight),
@@ -315,11 +315,11 @@ def event_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for name, t in sorted(named, key=lambda m: m[1]):
         row: dict[str, object] = {"event": name, "t_s": t}
-        for column, sd_column in EVENT_COLUMNS.items():
+        for column, sd_column in _EVENT_COLUMNS.items():
             row[column] = np.interp(t, table["t_s"], table[column])
             row[_three_sd(column)] = 3.0 * np.interp(t, table["t_s"], table[sd_column])
         rows.append(row)
-    names = [c for column in EVENT_COLUMNS for c in (column, _three_sd(column))]
+    names = [c for column in _EVENT_COLUMNS for c in (column, _three_sd(column))]
     return pd.DataFrame(rows, columns=["event", "t_s", *names])
 
 
@@ -334,7 +334,7 @@ def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     q = table["dynamic_pressure_pa"].to_numpy()
     pulse = q >= 0.5 * q.max()
     rows = []
-    for name, (column, sd_column) in PEAKS.items():
+    for name, (column, sd_column) in _PEAKS.items():
         values, sd = (table[c].to_numpy(dtype=float) for c in (column, sd_column))
         size = np.abs(values)
         use = np.isfinite(size) & (pulse if "pulse" in name else size > -1.0)
@@ -367,7 +367,7 @@ def residual_statistics(flight: Reconstruction) -> pd.DataFrame:
             values = (float(r.mean()), float(r.std(ddof=1)), float(np.sqrt((z**2).mean())), _lag1(z))
         edited = len(part) - len(good)
         rows.append((source, component, unit, len(part), edited, *values, nis.get(source, np.nan)))
-    return pd.DataFrame(rows, columns=list(STATISTICS))
+    return pd.DataFrame(rows, columns=list(_STATISTICS))
 
 
 def _lag1(z: FloatArray) -> float:
@@ -376,9 +376,9 @@ def _lag1(z: FloatArray) -> float:
 
 
 def slow_covariance(flight: Reconstruction) -> dict[str, FloatArray]:
-    """Whole covariances (k, 9, 9) at `COVARIANCE_RATE_HZ`: position ECEF m, velocity ECEF m/s, rotation body rad."""
+    """Whole covariances (k, 9, 9) at `_COVARIANCE_RATE_HZ`: position ECEF m, velocity ECEF m/s, rotation body rad."""
     bet = flight.solution.smoothed
     assert bet.covariance is not None
-    ticks = np.floor(bet.time_s * COVARIANCE_RATE_HZ + 1e-6)
+    ticks = np.floor(bet.time_s * _COVARIANCE_RATE_HZ + 1e-6)
     rows = np.flatnonzero(np.diff(ticks, prepend=-np.inf) > 0.0)
     return {"t_s": bet.time_s[rows], "covariance": bet.covariance[rows]}

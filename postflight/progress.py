@@ -12,7 +12,7 @@ from rich.console import Console
 
 from flightmodel.checks import Progress
 
-EVERY_S = 10.0  # between plain lines; a shorter command prints none
+_EVERY_S = 10.0  # between plain lines; a shorter command prints none
 
 
 @contextmanager
@@ -20,7 +20,7 @@ def progress_bar() -> Iterator[Progress]:
     """Progress on standard error: a bar with remaining time, or a line every ten seconds where that is no terminal."""
     screen = Console(stderr=True, soft_wrap=True)
     if not screen.is_terminal:
-        with plain_lines(screen, EVERY_S) as report:
+        with plain_lines(screen, _EVERY_S) as report:
             yield report
         return
     columns = (

@@ -29,7 +29,7 @@ from postflight.product import bet_table, event_table, header, peak_table, resid
 from postflight.reconstruction import Reconstruction
 
 DIGITS = "%.10g"
-COPY = "copy the flight folder to where you may write"
+_COPY = "copy the flight folder to where you may write"
 PARTIAL = ".partial-"  # before the number of the process that writes it
 
 
@@ -57,7 +57,7 @@ class RunFolder:
 
     def __enter__(self) -> RunFolder:
         """Make the partial folder beside the final one."""
-        with writing(self.parent, COPY):
+        with writing(self.parent, _COPY):
             self.parent.mkdir(exist_ok=True)
             remove_abandoned(self.parent)
             self.path = Path(tempfile.mkdtemp(prefix=f"{PARTIAL}{os.getpid()}-", dir=self.parent))
@@ -68,7 +68,7 @@ class RunFolder:
         """Rename when whole; remove otherwise, also where the end itself is interrupted."""
         partial = self.path
         try:
-            with writing(self.parent, COPY):
+            with writing(self.parent, _COPY):
                 if isinstance(fault, OSError):
                     raise fault
                 if kind is None:

@@ -24,7 +24,7 @@ from postflight.run_folder import newest_run
 # what the demo flight with nominal instrument errors must reach
 DEFLECTION_LIMIT_DEG = {"camera": 0.7, "misalignment": 0.7, "trim": 1.2, "fused": 0.5}
 BET_LIMITS = {"position_rms_m": 30.0, "velocity_rms_mps": 0.5, "alpha_total_rms_deg": 0.5}
-STATE_COLUMNS = (
+_STATE_COLUMNS = (
     "t_s",
     *(f"r{a}_ecef_m" for a in "xyz"),
     *(f"v{a}_ecef_mps" for a in "xyz"),
@@ -66,7 +66,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     if not (truth_folder / "truth.csv").is_file():
         raise GateError(f"{flight_folder}: no truth/truth.csv to score against", "truth-missing")
     run = run or newest_run(flight_folder)
-    truth = _read(truth_folder / "truth.csv", (*STATE_COLUMNS, "dynamic_pressure_pa", "alpha_body_deg"))
+    truth = _read(truth_folder / "truth.csv", (*_STATE_COLUMNS, "dynamic_pressure_pa", "alpha_body_deg"))
     deflection = _read(truth_folder / "deflection.csv", ("t_s", "theta_deg"))
     peak_s, _ = peak_pressure(truth["t_s"].to_numpy(), truth["dynamic_pressure_pa"].to_numpy())
     true_deg = float(np.interp(peak_s, deflection["t_s"], deflection["theta_deg"]))
@@ -82,7 +82,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
         elif row["deflection_deg"] is not None and not abs(row["error_deg"]) <= DEFLECTION_LIMIT_DEG[method]:
             words = f"{method}: error {row['error_deg']:+.2f} deg beyond {DEFLECTION_LIMIT_DEG[method]} deg"
             failures.append(Fault(words, "deflection-error"))
-    bet = _bet_errors(_read(run / "bet.csv", (*STATE_COLUMNS, "alpha_total_wind_deg")), truth)
+    bet = _bet_errors(_read(run / "bet.csv", (*_STATE_COLUMNS, "alpha_total_wind_deg")), truth)
     failures += [
         Fault(f"BET {name}: {bet[name]:.3f} beyond {limit}", "trajectory-error")
         for name, limit in BET_LIMITS.items()
@@ -122,7 +122,7 @@ def _method_row(path: Path, at_s: float, true_deg: float) -> dict[str, Any]:
     return row
 
 
-def trajectory_from_table(table: pd.DataFrame, epoch_utc: str = "2000-01-01T00:00:00Z") -> Trajectory:
+def _trajectory(table: pd.DataFrame, epoch_utc: str = "2000-01-01T00:00:00Z") -> Trajectory:
     """Trajectory from the columns that ``truth.csv`` and ``bet.csv`` share."""
 
     def columns(pattern: str, letters: str) -> FloatArray:
@@ -143,7 +143,7 @@ def trajectory_from_table(table: pd.DataFrame, epoch_utc: str = "2000-01-01T00:0
 def _bet_errors(bet: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:
     """Root-mean-square errors over the pressure pulse."""
     bet = bet[(bet["t_s"] >= truth["t_s"].iloc[0]) & (bet["t_s"] <= truth["t_s"].iloc[-1])]
-    estimate, true = trajectory_from_table(bet), trajectory_from_table(truth)
+    estimate, true = _trajectory(bet), _trajectory(truth)
     error = difference(estimate, resample(true, estimate.time_s))
 
     def along(column: str) -> FloatArray:

@@ -19,7 +19,7 @@ from postflight.plots.paper_figures import trajectory_angle, window
 from postflight.plots.style import COLOUR, LABEL, STROKE, TIME, WIDE_BAND, band, in_style, stamp
 from postflight.reconstruction import Reconstruction
 
-MANY_ANSWERS = 400  # of a history, above which its single answers are not marked
+_MANY_ANSWERS = 400  # of a history, above which its single answers are not marked
 
 
 @in_style
@@ -74,7 +74,7 @@ def _methods(
     """Deflection over time, each method with a band of one standard deviation; truth as (s, deg) where known."""
     for method, history in histories.items():
         theta, sd = np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)
-        mark = "" if len(history.time_s) > MANY_ANSWERS else "."
+        mark = "" if len(history.time_s) > _MANY_ANSWERS else "."
         style: dict[str, Any] = {"color": COLOUR[method], "ls": STROKE[method], "marker": mark, "ms": 3}
         ax.plot(history.time_s, theta, label=LABEL[method], **style)
         band(ax, history.time_s, theta, sd, COLOUR[method], alpha=WIDE_BAND)

@@ -30,7 +30,7 @@ from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, stamp
 from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds
 
-LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
+_LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
 
 
 def window(flight: Reconstruction) -> tuple[float, float]:
@@ -132,8 +132,8 @@ def figure_2_5(flight: Reconstruction) -> Figure:
     _look_up(ax, pulse.time_s, use, inferred, COLOUR["measured"], "C_N/C_A look-up, accelerometers uncorrected")
     beyond = use & ~np.isfinite(inferred)
     if beyond.any():
-        edge = np.full(beyond.sum(), LOOK_UP_END_DEG - 1.0)
-        label = f"beyond the look-up ({LOOK_UP_END_DEG:.0f} deg)"
+        edge = np.full(beyond.sum(), _LOOK_UP_END_DEG - 1.0)
+        label = f"beyond the look-up ({_LOOK_UP_END_DEG:.0f} deg)"
         ax.plot(pulse.time_s[beyond], edge, "^", ms=3, color=COLOUR["measured"], label=label)
     return _angles(figure, ax, flight, "Angle of attack: trajectory against uncorrected accelerometers", "2.5")
 
@@ -162,7 +162,7 @@ def _look_up(ax: Axes, time_s: FloatArray, use: BoolArray, angle_rad: FloatArray
 
 
 def _angles(figure: Figure, ax: Axes, flight: Reconstruction, title: str, number: str) -> Figure:
-    ax.set(xlim=window(flight), ylim=(0, LOOK_UP_END_DEG), ylabel="total angle of attack (deg)", xlabel=TIME)
+    ax.set(xlim=window(flight), ylim=(0, _LOOK_UP_END_DEG), ylabel="total angle of attack (deg)", xlabel=TIME)
     ax.legend()
     figure.suptitle(f"{title} (AIAA 2011-2571, Figure {number})")
     stamp(figure, flight.telemetry)

@@ -17,8 +17,8 @@ from postflight.reconciliation.fit import Reconciled
 from postflight.reconciliation.modes import ModalStiffness
 from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities
 
-FOUND = COLOUR["estimate"]
-HIGHEST_HZ = 5.0
+_FOUND = COLOUR["estimate"]
+_HIGHEST_HZ = 5.0
 
 
 @in_style
@@ -49,7 +49,7 @@ def figure_reconciled(
 
 def _pair(ax: Axes, t: FloatArray, measured: FloatArray, flown: FloatArray, label: str) -> None:
     ax.plot(t, measured, color=COLOUR["measured"], label="measured")
-    ax.plot(t, flown, color=FOUND, lw=1.0, ls="--", label="simulated with the estimated joint")
+    ax.plot(t, flown, color=_FOUND, lw=1.0, ls="--", label="simulated with the estimated joint")
     ax.set_ylabel(label)
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
 
@@ -68,8 +68,8 @@ def _deflection(ax: Axes, history: DeflectionHistory, fused: DeflectionHistory |
         theta = np.rad2deg(fused.theta_rad)
         ax.plot(fused.time_s, theta, color=COLOUR["fused"], lw=2.5, alpha=0.6, label="fused methods")
     theta, sd = np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)
-    ax.plot(history.time_s, theta, color=FOUND, label="with the estimated joint")
-    band(ax, history.time_s, theta, sd, FOUND, label="1 sd")
+    ax.plot(history.time_s, theta, color=_FOUND, label="with the estimated joint")
+    band(ax, history.time_s, theta, sd, _FOUND, label="1 sd")
     ax.set_ylabel("deflection (deg)")
     ax.set_ylim(bottom=0.0)
     ax.legend()
@@ -79,7 +79,7 @@ def _ridge(ax: Axes, found: Reconciled) -> None:
     """Ellipses of 1 and 2 sd of stiffness and size of the offset."""
     mean, covariance = stiffness_and_offset(found)
     ellipses(ax, mean, covariance)
-    ax.plot(*mean, color=FOUND, marker="+", ms=10, lw=0)
+    ax.plot(*mean, color=_FOUND, marker="+", ms=10, lw=0)
     ax.set_xlabel("bending stiffness (N m/rad)")
     ax.set_ylabel("c.g. offset (cm)")
     share = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
@@ -121,7 +121,7 @@ def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
 def _histogram(ax: Axes, values: FloatArray, best: float, sd: float) -> None:
     ax.hist(values, bins=40, density=True, color=COLOUR["prior_band"])
     x = np.linspace(*ax.get_xlim(), 200)
-    ax.plot(x, np.exp(-0.5 * ((x - best) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi)), color=FOUND, lw=1.0)
+    ax.plot(x, np.exp(-0.5 * ((x - best) / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi)), color=_FOUND, lw=1.0)
     ax.set_yticks([])
 
 
@@ -131,21 +131,21 @@ def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
     figure = Figure(figsize=(9.0, 4.8))
     left, right = figure.subplots(1, 2, width_ratios=[2.0, 1.0])
     left.grid(visible=False)
-    shown = np.abs(found.frequency_hz) < HIGHEST_HZ
+    shown = np.abs(found.frequency_hz) < _HIGHEST_HZ
     picture = left.pcolormesh(
         found.time_s, found.frequency_hz[shown], found.power.T[shown], shading="nearest", cmap="Greys", vmin=0.0
     )
     figure.colorbar(picture, ax=left, label="ln of power over noise")
     for sense in (1.0, -1.0):
-        left.plot(found.time_s, sense * found.joint_hz, color=FOUND, label="joint" if sense > 0.0 else None)
+        left.plot(found.time_s, sense * found.joint_hz, color=_FOUND, label="joint" if sense > 0.0 else None)
         label = "aerodynamic" if sense > 0.0 else None
         left.plot(found.time_s, sense * found.aerodynamic_hz, color=COLOUR["second"], ls="--", label=label)
     left.set(xlabel=TIME, ylabel="frequency in non-spinning axes (Hz)")
     left.legend()
     simulated = found.stiffness_nmprad / found.factor[int(np.argmax(found.gathered))]
-    right.plot(found.factor * simulated, found.gathered, color=FOUND)
+    right.plot(found.factor * simulated, found.gathered, color=_FOUND)
     low, high = found.stiffness_nmprad - found.sd_nmprad, found.stiffness_nmprad + found.sd_nmprad
-    right.axvspan(low, high, color=FOUND, alpha=BAND, lw=0, label="1 sd")
+    right.axvspan(low, high, color=_FOUND, alpha=BAND, lw=0, label="1 sd")
     right.set(xlabel="bending stiffness (N m/rad)", ylabel="power along the joint's track")
     right.legend()
     figure.suptitle("Modes of the lateral motion and the linear model")

@@ -19,7 +19,7 @@ from postflight.plots.style import save, stamp
 from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds, rigid_bounds
 
-PAPER_OFFSETS_M = (0.01, 0.0254)  # of the c.g., beside the vehicle's own, as in the paper's Figure 2.9
+_PAPER_OFFSETS_M = (0.01, 0.0254)  # of the c.g., beside the vehicle's own, as in the paper's Figure 2.9
 
 
 def draw_run(flight: Reconstruction, answers: Deflections, folder: Path, report: Progress) -> Bounds | None:
@@ -69,7 +69,7 @@ def _draw_static_trim(pulse: PulseData, telemetry: Telemetry, folder: Path) -> N
     except GateError:
         return
     own = float(np.linalg.norm(vehicle.cg_m[1:]))
-    offsets = sorted({round(own, 5), *PAPER_OFFSETS_M})
+    offsets = sorted({round(own, 5), *_PAPER_OFFSETS_M})
     title = f"Static trim at {pressure:.0f} Pa, Mach {mach:.1f} (AIAA 2011-2571, Figure 2.9)"
     figure = paper_figures.figure_2_9(static, offsets, vehicle.joint.bending_stiffness_nmprad, title)
     stamp(figure, telemetry)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 
 _NAMES = {STABLE: "stable", UNSTABLE: "unstable", DIVERGENT: "divergent"}
-FILL = {zone: ZONE[name][0] for zone, name in _NAMES.items()}
-MARK = {zone: (mark, ZONE[_NAMES[zone]][1]) for zone, mark in ((STABLE, "o"), (UNSTABLE, "^"), (DIVERGENT, "x"))}
+_FILL = {zone: ZONE[name][0] for zone, name in _NAMES.items()}
+_MARK = {zone: (mark, ZONE[_NAMES[zone]][1]) for zone, mark in ((STABLE, "o"), (UNSTABLE, "^"), (DIVERGENT, "x"))}
 
 
 @in_style
@@ -36,7 +36,7 @@ def figure_axdahl_zones(linear: StabilityMap, flown: StabilityMap) -> Figure:
     figure = Figure(figsize=(8.6, 5.6))
     axis = figure.subplots()
     x, y = 1e-3 * linear.stiffness_nmprad, 100.0 * linear.damping_ratio
-    axis.contourf(x, y, linear.zone.T, levels=[-0.5, 0.5, 1.5, 2.5], colors=[FILL[k] for k in sorted(FILL)])
+    axis.contourf(x, y, linear.zone.T, levels=[-0.5, 0.5, 1.5, 2.5], colors=[_FILL[k] for k in sorted(_FILL)])
     divergent = linear.zone == DIVERGENT
     for inside, levels in ((divergent, [2.0, 4.0]), (~divergent, [-0.05, 0.0, 0.05, 0.1])):
         growth = np.where(inside, linear.growth_rate_radps, np.nan).T
@@ -44,10 +44,10 @@ def figure_axdahl_zones(linear: StabilityMap, flown: StabilityMap) -> Figure:
         axis.clabel(lines, fontsize=8, fmt="%g 1/s")
     k, c = np.meshgrid(1e-3 * flown.stiffness_nmprad, 100.0 * flown.damping_ratio, indexing="ij")
     handles: list[Patch | Line2D] = []
-    for zone, (mark, colour) in MARK.items():
+    for zone, (mark, colour) in _MARK.items():
         inside = flown.zone == zone
         axis.plot(k[inside], c[inside], mark, color=colour, markersize=4.5, fillstyle="none", linestyle="none")
-        handles.append(Patch(facecolor=FILL[zone], label=f"{ZONES[zone]}: linear model"))
+        handles.append(Patch(facecolor=_FILL[zone], label=f"{ZONES[zone]}: linear model"))
         handles.append(
             Line2D([], [], marker=mark, color=colour, fillstyle="none", linestyle="none", label=f"{ZONES[zone]}: flown")
         )

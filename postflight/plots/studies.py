@@ -15,9 +15,9 @@ from postflight.plots.style import COLOUR, MANY, STROKES, TIME, in_style, note, 
 from postflight.studies.joints import JointStudy
 from postflight.studies.preflight import Bounds
 
-MOST_BARS = 15
-HIGHEST = {"alpha_total_deg": 25.0, "normal_g": 2.5}  # shown of a joint study; a tumble goes beyond
-LABEL = {
+_MOST_BARS = 15
+_HIGHEST = {"alpha_total_deg": 25.0, "normal_g": 2.5}  # shown of a joint study; a tumble goes beyond
+_LABEL = {
     "alpha_total_deg": "centerbody total\nangle of attack (deg)",
     "alpha_shell_deg": "aeroshell total\nangle of attack (deg)",
     "deflection_deg": "deflection (deg)",
@@ -39,7 +39,7 @@ def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
     for ax, name in zip(axes, names, strict=True):
         rows = bands[bands["history"] == name]
         percentiles(ax, *(rows[c].to_numpy() for c in ("time_s", "p2.3", "p50", "p97.7")))
-        ax.set_ylabel(LABEL[name])
+        ax.set_ylabel(_LABEL[name])
         ax.margins(x=0)
     axes[0].legend()
     axes[-1].set_xlabel(TIME)
@@ -51,8 +51,8 @@ def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
 @in_style
 def figure_sobol(table: pd.DataFrame, title: str, synthetic: str) -> Figure:
     """First-order and total indices with their intervals, the largest total on top."""
-    left_out = max(0, len(table) - MOST_BARS)
-    table = table.sort_values("total", kind="stable").tail(MOST_BARS)
+    left_out = max(0, len(table) - _MOST_BARS)
+    table = table.sort_values("total", kind="stable").tail(_MOST_BARS)
     place = np.arange(len(table))
     figure = Figure(figsize=(7.2, 0.36 * len(table) + 1.6))
     ax = figure.subplots()
@@ -106,7 +106,7 @@ def figure_joints(study: JointStudy, quantity: str, label: str, title: str, synt
     figure = Figure(figsize=(7.2, 4.4))
     ax = figure.subplots()
     largest = 0.0
-    highest, beyond = HIGHEST[quantity], []
+    highest, beyond = _HIGHEST[quantity], []
     for k, flight in enumerate(study.flights):
         tumbling = flight.alpha_total_deg > 90.0
         shown = int(np.argmax(tumbling)) if tumbling.any() else len(tumbling)

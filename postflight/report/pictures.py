@@ -22,7 +22,7 @@ from flightmodel.vehicle import Vehicle
 from postflight.plots.overlay import deflection_at, oriented_camera
 from postflight.report.source import Rows, Run, rounded
 
-FRAMES, WIDTH_PX, DASH_PX = 12, 480, 12
+_FRAMES, _WIDTH_PX, _DASH_PX = 12, 480, 12
 QUALITIES, LARGEST_CHARACTERS = (78, 60, 40, 20), 600_000  # the whole strip stays below, or has the last quality
 
 
@@ -36,7 +36,7 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
         return []
     answered = np.searchsorted(frames.time_s, table["t_s"] - 1e-6)
     largest = int(answered[int(table["theta_deg"].argmax())])
-    picks = np.linspace(answered[0], answered[-1], FRAMES).round().astype(int).tolist()
+    picks = np.linspace(answered[0], answered[-1], _FRAMES).round().astype(int).tolist()
     time_s, theta_deg, plane_deg = (table[name].to_numpy() for name in ("t_s", "theta_deg", "plane_lv_deg"))
     history = DeflectionHistory(time_s, np.deg2rad(theta_deg), np.deg2rad(plane_deg), None, "camera", "")
     oriented, benchmark = oriented_camera(run.telemetry, history)
@@ -54,7 +54,7 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
         if k in rows:
             theta, plane = np.deg2rad([rows[k].theta_deg, rows[k].plane_lv_deg])
             picture = overlay.blended(image, float(theta), float(plane))
-            picture = dashed_row(picture, before)
+            picture = _dashed_row(picture, before)
             draw_row(picture, horizon_row(oriented.view, float(theta), float(plane)), YELLOW)
             frame |= {"theta": round(rows[k].theta_deg, 3), "sd": round(rows[k].theta_sd_deg, 3)}
         else:
@@ -64,11 +64,11 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
     return [frame | {"jpeg": text} for frame, text in zip(out, jpegs(drawn), strict=True)]
 
 
-def dashed_row(picture: Image, row: int) -> Image:
+def _dashed_row(picture: Image, row: int) -> Image:
     """Picture with the grey line in dashes, so that it stands apart from the yellow one without colours."""
     drawn = picture.copy()
     draw_row(drawn, row, GREY)
-    dash = (np.arange(picture.shape[1]) // DASH_PX % 2 == 0)[None, :, None]
+    dash = (np.arange(picture.shape[1]) // _DASH_PX % 2 == 0)[None, :, None]
     return np.where(dash, drawn, picture)
 
 
@@ -92,11 +92,11 @@ def jpegs(pictures: list[Image]) -> list[str]:
 
 
 def narrowed(picture: Image) -> Image:
-    """Picture made ``WIDTH_PX`` wide where it is wider."""
+    """Picture made ``_WIDTH_PX`` wide where it is wider."""
     height, width = picture.shape[:2]
-    if width <= WIDTH_PX:
+    if width <= _WIDTH_PX:
         return picture
-    size = (WIDTH_PX, round(height * WIDTH_PX / width))
+    size = (_WIDTH_PX, round(height * _WIDTH_PX / width))
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
@@ -106,7 +106,7 @@ def jpeg(picture: Image, quality: int) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
 
 
-LEAST_SECTIONS, POINTS_PER_TORUS, CONE_PIECES, POSES = 48, 7, 8, 3000
+_LEAST_SECTIONS, _POINTS_PER_TORUS, _CONE_PIECES, _POSES = 48, 7, 8, 3000
 
 
 def solid(vehicle: Vehicle) -> dict[str, Any]:
@@ -115,20 +115,20 @@ def solid(vehicle: Vehicle) -> dict[str, Any]:
     Seen from outside, a quadrangle's vertices go round against the clock.
     """
     geometry = vehicle.geometry
-    per_gore = max(1, -(-LEAST_SECTIONS // geometry.gore_count))
+    per_gore = max(1, -(-_LEAST_SECTIONS // geometry.gore_count))
     sections = per_gore * geometry.gore_count
-    aft = aft_profile(geometry, POINTS_PER_TORUS)
+    aft = aft_profile(geometry, _POINTS_PER_TORUS)
     forward = forward_profile(geometry)
-    forward = np.concatenate([forward[:-1], np.linspace(forward[-2], forward[-1], CONE_PIECES + 1)[1:]])
+    forward = np.concatenate([forward[:-1], np.linspace(forward[-2], forward[-1], _CONE_PIECES + 1)[1:]])
     # the centerbody shows where it comes out of the shell; it ends in a lid
-    stations = np.linspace(aft[0, 0], geometry.centerbody_length_m, CONE_PIECES)
-    body = np.column_stack([stations, np.full(CONE_PIECES, geometry.centerbody_radius_m)])
+    stations = np.linspace(aft[0, 0], geometry.centerbody_length_m, _CONE_PIECES)
+    body = np.column_stack([stations, np.full(_CONE_PIECES, geometry.centerbody_radius_m)])
     body = np.concatenate([body, [[geometry.centerbody_length_m, 0.0]]])
     return {
-        "aft": surface(aft[::-1], sections)
+        "aft": _surface(aft[::-1], sections)
         | {"gores": np.repeat(np.arange(sections) // per_gore, len(aft) - 1).tolist()},
-        "forward": surface(forward, sections),
-        "centerbody": surface(body, sections),
+        "forward": _surface(forward, sections),
+        "centerbody": _surface(body, sections),
         "rim": _mm(rim_curve(geometry, np.linspace(0.0, 2.0 * np.pi, 73))),
         "joint": round(1e3 * vehicle.joint.station_m),
         "length": round(1e3 * geometry.centerbody_length_m),
@@ -136,7 +136,7 @@ def solid(vehicle: Vehicle) -> dict[str, Any]:
     }
 
 
-def surface(profile_station_radius_m: FloatArray, sections: int) -> dict[str, Any]:
+def _surface(profile_station_radius_m: FloatArray, sections: int) -> dict[str, Any]:
     """Surface of revolution of a meridian that has the vehicle on its right, going out from the nose or aft."""
     clocks = 2.0 * np.pi * np.arange(sections) / sections
     m, faces = len(profile_station_radius_m), []
@@ -157,22 +157,22 @@ def poses(run: Run, rows: Rows) -> dict[str, Any]:
     """
     bet = run.tables["bet"].iloc[rows]
     known = bet["alpha_total_wind_deg"].notna()
-    thin = thinned(bet[known])
+    thin = _thinned(bet[known])
     out: dict[str, Any] = {
         "flow": {"t": rounded(thin["t_s"].to_numpy(), 3)} | _lateral(thin["alpha_total_wind_deg"], thin["clock_lv_deg"])
     }
     method = best_method(run)
     if method is not None:
-        table = thinned(run.tables[f"deflection_{method}"])
+        table = _thinned(run.tables[f"deflection_{method}"])
         t = table["t_s"].to_numpy()
         out["deflection"] = {"t": rounded(t, 3), "method": method, "hole": hole_s(t)}
         out["deflection"] |= _lateral(table["theta_deg"], table["plane_lv_deg"])
     return out
 
 
-def thinned(table: pd.DataFrame) -> pd.DataFrame:
-    """Rows at equal steps, at most ``POSES``."""
-    return table.iloc[:: -(-len(table) // POSES) or 1]
+def _thinned(table: pd.DataFrame) -> pd.DataFrame:
+    """Rows at equal steps, at most ``_POSES``."""
+    return table.iloc[:: -(-len(table) // _POSES) or 1]
 
 
 def hole_s(time_s: FloatArray) -> float:

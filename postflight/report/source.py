@@ -20,8 +20,8 @@ from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Telemetry
 from postflight.run_folder import newest_run, run_hash
 
-NEEDED = ("bet", "events", "peaks", "residuals", "verdicts", "findings")
-CHECKS = ("name", "value", "low", "high", "passed", "remark", "code")
+_NEEDED = ("bet", "events", "peaks", "residuals", "verdicts", "findings")
+_CHECKS = ("name", "value", "low", "high", "passed", "remark", "code")
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Run:
         table = self.tables.get("consistency_checks")
         if table is None:
             table = self.tables["verdicts"].rename(columns={"words": "remark"})
-        return table[[name for name in CHECKS if name in table]]
+        return table[[name for name in _CHECKS if name in table]]
 
     def peak(self, name: str) -> pd.Series | None:
         """Row of ``peaks.csv``; None where the flight has none of that name."""
@@ -83,7 +83,7 @@ def read_run(flight_folder: Path, path: Path | None = None, telemetry: Telemetry
         tables = {p.stem: pd.read_csv(p) for p in sorted(path.glob("*.csv"))}
     except (FileNotFoundError, ValueError) as fault:
         raise GateError(f"{path}: not a whole run ({fault}); {again}", "run-incomplete") from None
-    missing = [f"{name}.csv" for name in NEEDED if name not in tables]
+    missing = [f"{name}.csv" for name in _NEEDED if name not in tables]
     if missing:
         raise GateError(f"{path}: not a whole run, without {', '.join(missing)}; {again}", "run-incomplete")
     telemetry = read_flight(flight_folder) if telemetry is None else telemetry

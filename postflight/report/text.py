@@ -21,21 +21,21 @@ from postflight.report.pictures import best_method, hole_s
 from postflight.report.source import Run
 from postflight.sensitivity import largest_of_groups
 
-SIDES_95 = 1.96
-HOW = {
+_SIDES_95 = 1.96
+_HOW = {
     "camera": "Edge, seams and dots of the aeroshell in the onboard video.",
     "misalignment": "The deflection that reconciles the accelerometers with the trajectory's angle of attack.",
     "trim": "The offset of the aeroshell's force that balances the moments at the flown angle of attack.",
     "fused": "All methods, weighted, with the inputs they share.",
 }
-BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "trim": "the trim angle alone"}
-ALONE = {"state": "alone", "mark": "○", "remark": "no independent measurement to compare with"}
+_BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "trim": "the trim angle alone"}
+_ALONE = {"state": "alone", "mark": "○", "remark": "no independent measurement to compare with"}
 NOT_ASKED = "not asked for in this run"
 SHOWN_ROWS = 200
-NEAR_PEAK_S, OSCILLATES_SD = 1.0, 4.0  # window about the peak; range in it that one number does not describe
+_NEAR_PEAK_S, _OSCILLATES_SD = 1.0, 4.0  # window about the peak; range in it that one number does not describe
 
 
-def utc(run: Run, time_s: float) -> str:
+def _utc(run: Run, time_s: float) -> str:
     """Clock time of a mission time, ``12:59:20.62``."""
     stamp = parse_utc(run.telemetry.t0_utc) + timedelta(seconds=float(time_s), milliseconds=5)
     return stamp.strftime("%H:%M:%S.") + f"{stamp.microsecond // 10000:02d}"
@@ -52,8 +52,8 @@ def title(run: Run) -> str:
     best = best_method(run)
     if best is not None:
         answer = run.summary["methods"][best]
-        by = "" if best == "fused" else f", by {BY[best]}"
-        return f"Deflection {pair(answer['deflection_deg'], answer['sd_deg'])}° at {peak_name(run)}{by}"
+        by = "" if best == "fused" else f", by {_BY[best]}"
+        return f"Deflection {pair(answer['deflection_deg'], answer['sd_deg'])}° at {_peak_name(run)}{by}"
     asked = run.facts["settings"]["methods"]
     end = "no method gave a deflection" if asked else "no deflection was asked for"
     highest = run.peak("altitude")
@@ -62,7 +62,7 @@ def title(run: Run) -> str:
     return f"{run.telemetry.name}: trajectory reconstructed; {end}"
 
 
-def peak_name(run: Run) -> str:
+def _peak_name(run: Run) -> str:
     """Peak dynamic pressure, or the largest there is where the data end before the peak."""
     row = run.peak("dynamic pressure")
     return "peak dynamic pressure" if row is None or bool(row["inside"]) else "the largest dynamic pressure in the data"
@@ -78,8 +78,8 @@ def lead(run: Run) -> list[str]:
     k = int(np.abs(place["t_s"].to_numpy() - at).argmin())
     out = [s["agreement"][0].upper() + s["agreement"][1:] + "."] if s["agreement"] else []
     out.append(
-        f"{peak_name(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
-        f"({utc(run, at)} UTC), Mach {place['mach'].iloc[k]:.2f}, {place['alt_m'].iloc[k] / 1e3:.1f} km."
+        f"{_peak_name(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
+        f"({_utc(run, at)} UTC), Mach {place['mach'].iloc[k]:.2f}, {place['alt_m'].iloc[k] / 1e3:.1f} km."
     )
     oscillation = _oscillation(run)
     if oscillation:
@@ -94,11 +94,11 @@ def _oscillation(run: Run) -> str:
     if best is None:
         return ""
     answer, table = run.summary["methods"][best], run.tables[f"deflection_{best}"]
-    near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < NEAR_PEAK_S]
-    if len(near) < 2 or near.max() - near.min() < OSCILLATES_SD * answer["sd_deg"]:
+    near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < _NEAR_PEAK_S]
+    if len(near) < 2 or near.max() - near.min() < _OSCILLATES_SD * answer["sd_deg"]:
         return ""
     return (
-        f"It oscillates between {near.min():.1f} and {near.max():.1f}° within {NEAR_PEAK_S:.0f} s of that time; "
+        f"It oscillates between {near.min():.1f} and {near.max():.1f}° within {_NEAR_PEAK_S:.0f} s of that time; "
         f"largest {answer['largest_deg']:.1f}° at {answer['largest_at_s']:.2f} s."
     )
 
@@ -110,28 +110,28 @@ def cards(run: Run) -> list[dict[str, Any]]:
 
 def _card(run: Run, method: str) -> dict[str, Any]:
     answer = run.summary["methods"].get(method)
-    card: dict[str, Any] = {"method": method, "label": LABEL[method], "how": HOW[method], "colour": COLOUR[method]}
+    card: dict[str, Any] = {"method": method, "label": LABEL[method], "how": _HOW[method], "colour": COLOUR[method]}
     if answer is None or answer["deflection_deg"] is None:
         reason = NOT_ASKED if answer is None else answer["reason"]
         return card | {"state": "none", "mark": "–", "remark": "no answer", "reason": reason}
     value, sd = answer["deflection_deg"], answer["sd_deg"]
     card |= {
         "value": f"{value:.2f}", "sd": f"{sd:.2f}", "number": value, "number_sd": sd,
-        "low": f"{value - SIDES_95 * sd:.2f}", "high": f"{value + SIDES_95 * sd:.2f}",
+        "low": f"{value - _SIDES_95 * sd:.2f}", "high": f"{value + _SIDES_95 * sd:.2f}",
         "plane": plane_at(run, method), "largest": f"{answer['largest_deg']:.2f}", "largest_s": answer["largest_at_s"],
         "assumptions": answer["assumptions"],
     }  # fmt: skip
-    return card | agreement(run, method)
+    return card | _agreement(run, method)
 
 
-def agreement(run: Run, method: str) -> dict[str, str]:
+def _agreement(run: Run, method: str) -> dict[str, str]:
     """Whether a method agrees with the others, by the tests of every pair; of the fusion, whether all do."""
     table = run.tables.get("fusion_agreement")
     if table is None or not len(table):
-        return dict(ALONE)
+        return dict(_ALONE)
     mine = table if method == "fused" else table[[method in m.split(" and ") for m in table["methods"]]]
     if not len(mine):
-        return dict(ALONE)
+        return dict(_ALONE)
     failed = mine[~mine["passed"].astype(bool)]
     least = f"smallest probability of a pair {mine['chance'].min():.2g}; limit {1 - CONFIDENCE:.2g}"
     if not len(failed):
@@ -162,9 +162,9 @@ def plane_at(run: Run, method: str) -> str:
     return f"{float(clock):.{places}f} ± {sd:.{places}f}"
 
 
-def scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
+def _scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
     """Common scale of the cards' whiskers, deg: all 95 % intervals with a margin."""
-    ends = [c["number"] + s * SIDES_95 * c["number_sd"] for c in shown if "number" in c for s in (-1.0, 1.0)]
+    ends = [c["number"] + s * _SIDES_95 * c["number_sd"] for c in shown if "number" in c for s in (-1.0, 1.0)]
     if not ends:
         return 0.0, 1.0
     margin = 0.06 * (max(ends) - min(ends)) + 0.01
@@ -173,16 +173,16 @@ def scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
 
 def with_whiskers(shown: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Cards with the places of their whiskers on a scale of 0 to 200; the fusion's 95 % as a band behind each."""
-    low, high = scale(shown)
+    low, high = _scale(shown)
     place = lambda x: round(200.0 * (x - low) / (high - low), 1)  # noqa: E731
     fused = next((c for c in shown if c["method"] == "fused" and "number" in c), None)
     for c in shown:
         if "number" not in c:
             continue
         x, sd = c["number"], c["number_sd"]
-        c["whisker"] = [place(x + k * sd) for k in (-SIDES_95, -1.0, 0.0, 1.0, SIDES_95)]
+        c["whisker"] = [place(x + k * sd) for k in (-_SIDES_95, -1.0, 0.0, 1.0, _SIDES_95)]
         if fused is not None:
-            c["behind"] = [place(fused["number"] + k * fused["number_sd"]) for k in (-SIDES_95, SIDES_95)]
+            c["behind"] = [place(fused["number"] + k * fused["number_sd"]) for k in (-_SIDES_95, _SIDES_95)]
     return shown
 
 
@@ -199,7 +199,7 @@ def events(run: Run) -> list[dict[str, Any]]:
             name: f"{x:.{digits}f} ± {three_sd / 3.0:.{digits}f}" if np.isfinite(x) else "not known"
             for name, (x, three_sd, digits) in shown.items()
         }
-        rows.append({"number": k, "name": e.event, "t": f"{e.t_s:.2f}", "utc": utc(run, e.t_s)} | cells)
+        rows.append({"number": k, "name": e.event, "t": f"{e.t_s:.2f}", "utc": _utc(run, e.t_s)} | cells)
     return rows
 
 

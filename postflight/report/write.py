@@ -31,11 +31,11 @@ from postflight.report.panels import (
 from postflight.report.source import Run, read_run, rounded
 from postflight.run_folder import write_file
 
-NAME = "report.html"
+_NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
 STYLES = ("uPlot.min.css", "page.css")
 # what a script element must not hold literally: its own end, a comment's start, and line ends of JavaScript alone
-ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
+_ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
 
 def write_report(
@@ -55,7 +55,7 @@ def write_report(
         Where the run cannot be read, or the file not be written.
     """
     run = read_run(flight_folder, path, telemetry)
-    target = run.path / NAME if target is None else target
+    target = run.path / _NAME if target is None else target
     write_whole(target, page(run, studies))
     return target
 
@@ -74,7 +74,7 @@ def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
     variables = " ".join(f"--{name}: {value};" for name, value in PAGE.items())
     style = "\n".join([f":root {{ {variables} }}", *(read(name) for name in STYLES)])
     frames = pictures.film_strip(run)
-    data, absent = numbers(run, frames, studies)
+    data, absent = _numbers(run, frames, studies)
     environment = Environment(
         loader=DictLoader({"page": read("page.html")}),
         autoescape=True,
@@ -86,8 +86,8 @@ def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
         run=run,
         script=Markup(script),
         style=Markup(style),
-        script_hash=content_hash(script),
-        style_hash=content_hash(style),
+        script_hash=_content_hash(script),
+        style_hash=_content_hash(style),
         licence=read("uPlot.LICENSE"),
         data=Markup(safe_json(data)),
         frames=frames,
@@ -125,7 +125,7 @@ def _texts(run: Run) -> dict[str, Any]:
     }
 
 
-def numbers(
+def _numbers(
     run: Run, frames: list[dict[str, Any]], studies: tuple[Path, ...]
 ) -> tuple[dict[str, Any], list[tuple[str, str, str]]]:
     """Everything that the scripts draw, and id, title and reason of the panels that the flight has no data for."""
@@ -143,8 +143,8 @@ def numbers(
         "t0_ms": round(1e3 * parse_utc(run.telemetry.t0_utc).timestamp()),
         "span": span,
         "colours": PAGE | {"residual": COLOUR["estimate"]},
-        "pulse": pulse_window(bet),
-        "first": span if deflection is None else pulse_window(bet),
+        "pulse": _pulse_window(bet),
+        "first": span if deflection is None else _pulse_window(bet),
         "peak": round(float(run.summary["peak_dynamic_pressure_s"]), 3),
         "bet": rounded(bet["t_s"].to_numpy()[rows], 4),
         "rows": [len(rows), len(bet)],
@@ -160,7 +160,7 @@ def numbers(
     return data, absent
 
 
-def pulse_window(bet: pd.DataFrame) -> list[float]:
+def _pulse_window(bet: pd.DataFrame) -> list[float]:
     """From well before the pressure pulse to well after it, s."""
     t = bet["t_s"].to_numpy()
     inside = t[pressure_pulse(bet["dynamic_pressure_pa"].to_numpy())]
@@ -174,11 +174,11 @@ def pulse_window(bet: pd.DataFrame) -> list[float]:
 def safe_json(value: Any) -> str:
     """JSON that may stand in a script element."""
     out = json.dumps(value, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
-    for sign, code in ESCAPED.items():
+    for sign, code in _ESCAPED.items():
         out = out.replace(sign, code)
     return out
 
 
-def content_hash(inline: str) -> str:
+def _content_hash(inline: str) -> str:
     """Source expression of a content security policy that allows this inline text and nothing else."""
     return "sha256-" + base64.b64encode(hashlib.sha256(inline.encode()).digest()).decode()

@@ -140,10 +140,8 @@ def test_names_stay_text_in_kml(folder, tmp_path):
     etree = pytest.importorskip("lxml.etree")
     from dataclasses import replace
 
-    from postflight.exports import kml_bytes
-
     source = replace(read_source(folder), name="<script>alert(1)</script> & \x00")
-    root = etree.fromstring(kml_bytes(source))
+    root = etree.fromstring(exports.FORMS["kml"][0](source))
     assert not root.findall(".//script")
     assert root.find(f".//{KML}name").text.startswith("<script>")
 

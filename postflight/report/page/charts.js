@@ -187,10 +187,13 @@ function addLegend(chart, parts) {
     });
     legend.append(button);
     clock.onCursor.push((t) => {
-      const y = between(own.t, line.y, t), sd = line.sd ? between(own.t, line.sd, t) : null;
+      // between frames a straight line is no answer with that sd: the nearest frame's value, with its time
+      const inside = t >= own.t[0] && t <= own.t[own.t.length - 1];
+      const at = line.dots && inside ? own.t[nearestRow(own.t, t)] : t;
+      const y = between(own.t, line.y, at), sd = line.sd ? between(own.t, line.sd, at) : null;
       const least = Math.abs(y) >= 1000 ? 0 : Math.abs(y) >= 100 ? 1 : 2;
       const digits = sd > 0 ? Math.min(4, Math.max(least, -Math.floor(Math.log10(2 * sd)))) : least;
-      value.textContent = y === null ? "–" : `${y.toFixed(digits)}${sd === null ? "" : ` ± ${sd.toFixed(digits)}`}${unit}`;
+      value.textContent = y === null ? "–" : `${y.toFixed(digits)}${sd === null ? "" : ` ± ${sd.toFixed(digits)}`}${unit}${line.dots ? ` at ${at.toFixed(2)} s` : ""}`;
     });
   });
   for (const points of chart.panel.raw) {
