@@ -313,7 +313,7 @@ def deflection(
             run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 history = answers.histories["camera"]
-                run_figures.draw_camera(telemetry, history, out.path / "figures")
+                run_figures.draw_camera(flight, history, out.path / "figures")
                 if film:
                     write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", progress=report)
     for finding in telemetry.findings:

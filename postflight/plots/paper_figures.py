@@ -28,7 +28,7 @@ from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.geometry import BodyMesh
 from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, stamp
 from postflight.reconstruction import Reconstruction
-from postflight.studies.preflight import Bounds
+from postflight.studies.preflight import Bounds, rigid_bounds
 
 _LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
 
@@ -50,8 +50,12 @@ def trajectory_angle(ax: Axes, flight: Reconstruction, label: str) -> None:
 
 
 @in_style
-def figure_1_3(flight: Reconstruction, bounds: Bounds) -> Figure:
-    """Total angle of attack and normal acceleration against a rigid vehicle's Monte Carlo bounds (Figure 1.3)."""
+def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: int = 100) -> Figure:
+    """Total angle of attack and normal acceleration against a rigid vehicle's Monte Carlo bounds (Figure 1.3).
+
+    Without ``bounds`` the rigid vehicle is simulated ``flights`` times from this flight's own state.
+    """
+    bounds = bounds or rigid_bounds(flight, flights)
     figure = Figure(figsize=(7.2, 7.0))
     upper, lower = figure.subplots(2, 1, sharex=True)
     air, pulse = flight.air, flight.required_loads()
