@@ -12,10 +12,9 @@ from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.telemetry import Telemetry
 from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, ellipses, in_style, limits, stamp
-from postflight.reconciliation.answer import stiffness_and_offset
-from postflight.reconciliation.fit import Reconciled
+from postflight.reconciliation.fit import JointFit
 from postflight.reconciliation.modes import ModalStiffness
-from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities
+from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities, stiffness_and_offset
 
 _FOUND = COLOUR["estimate"]
 _HIGHEST_HZ = 5.0
@@ -23,13 +22,13 @@ _HIGHEST_HZ = 5.0
 
 @in_style
 def figure_reconciled(
-    found: Reconciled, telemetry: Telemetry, history: DeflectionHistory, fused: DeflectionHistory | None
+    found: JointFit, telemetry: Telemetry, history: DeflectionHistory, fused: DeflectionHistory | None
 ) -> Figure:
     """Rate and lateral force, measured and simulated; deflection; stiffness against offset."""
     figure = Figure(figsize=(10.0, 9.0))
     axes = figure.subplots(3, 2)
-    seen, read = found.problem.observed, found.problem.predicted(found.unknowns)
-    flown = read.windows + found.problem.instrument_rows(read) @ found.unknowns.instruments
+    seen, read = found.problem.measured, found.problem.predict(found.parameters)
+    flown = read.windows + found.problem.instrument_response(read) @ found.parameters.instruments
     t = seen.time_s.ravel()
     rate, force_g = np.rad2deg(flown[..., 1].ravel()), flown[..., 4].ravel() / STANDARD_GRAVITY_MPS2
     _pair(axes[0, 0], t, np.rad2deg(seen.rate_radps[..., 1].ravel()), rate, "body rate y (deg/s)")
@@ -75,7 +74,7 @@ def _deflection(ax: Axes, history: DeflectionHistory, fused: DeflectionHistory |
     ax.legend()
 
 
-def _ridge(ax: Axes, found: Reconciled) -> None:
+def _ridge(ax: Axes, found: JointFit) -> None:
     """Ellipses of 1 and 2 sd of stiffness and size of the offset."""
     mean, covariance = stiffness_and_offset(found)
     ellipses(ax, mean, covariance)
@@ -90,7 +89,7 @@ def _ridge(ax: Axes, found: Reconciled) -> None:
 @in_style
 def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
     """Every pair of quantities: samples, and the ellipses of 1 and 2 sd of the linear problem."""
-    table = quantities(posterior.found.problem.unknown, posterior.samples)
+    table = quantities(posterior.fit.problem.vehicle_parameters, posterior.samples)
     best, covariance = linear_quantities(posterior)
     n = len(best)
     figure = Figure(figsize=(2.0 * n, 2.0 * n))
@@ -142,8 +141,8 @@ def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
         left.plot(found.time_s, sense * found.aerodynamic_hz, color=COLOUR["second"], ls="--", label=label)
     left.set(xlabel=TIME, ylabel="frequency in non-spinning axes (Hz)")
     left.legend()
-    simulated = found.stiffness_nmprad / found.factor[int(np.argmax(found.gathered))]
-    right.plot(found.factor * simulated, found.gathered, color=_FOUND)
+    simulated = found.stiffness_nmprad / found.factor[int(np.argmax(found.mean_log_power))]
+    right.plot(found.factor * simulated, found.mean_log_power, color=_FOUND)
     low, high = found.stiffness_nmprad - found.sd_nmprad, found.stiffness_nmprad + found.sd_nmprad
     right.axvspan(low, high, color=_FOUND, alpha=BAND, lw=0, label="1 sd")
     right.set(xlabel="bending stiffness (N m/rad)", ylabel="power along the joint's track")
