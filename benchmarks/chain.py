@@ -13,7 +13,7 @@ from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from flightmodel.flightfolder import read_flight
 from postflight.flight import estimate_camera, reconstruct_flight
-from postflight.loads import pulse_data
+from postflight.loads import loads_from_solution
 from recon.reconstruct import reconstruct
 from synthetic_flight import simulate
 from synthetic_flight.folder import simulate_to_folder
@@ -54,7 +54,7 @@ def main():
         flight = reconstruct_flight(folder)
         bet, air = flight.reconstruction, flight.air
         rows.append(("deflection from video", best(lambda: estimate_camera(telemetry))))
-        pulse = pulse_data(telemetry, bet, air)
+        pulse = loads_from_solution(telemetry, bet, air)
         rows.append(("deflection from misalignment", best(lambda: estimate_misalignment(pulse))))
         rows.append(("deflection from trim", best(lambda: estimate_trim(pulse))))
     print(f"{'':55s}{'seconds':>10s}{'x real time':>14s}")

@@ -26,7 +26,7 @@ def found_clock(seed, folder, late_s, camera_sd_rad):
     seen = dispersed.columns(told_s - late_s, pulse.time_s, truth["theta_yz"])
     camera = dispersed.camera_history(np.random.default_rng([seed, 7, 2009]), seen, told_s, camera_sd_rad)
     try:
-        clock = fuse_flight(pulse, camera, film_clock_sd_s=TOLD_SD_S).film_clock
+        clock = fuse_flight(pulse, camera, camera_time_bias_sd_s=TOLD_SD_S).camera_time_bias
     except DivergenceError as fault:
         print(f"flight {seed}: {fault}")
         return None

@@ -65,7 +65,7 @@ pd.DataFrame(at_peak, index=["deflection deg", "sd deg"]).T.round(3)
 # The difference of two readings holds no bending, only what they lean on; its chi-square is the test of the pair.
 
 # %%
-print(answers.fused.agreement.words)
+print(answers.fused.agreement.remark)
 agreement_table(answers.fused)
 
 # %% [markdown]
@@ -86,7 +86,7 @@ input_table(answers.fused)
 camera = answers.histories["camera"]
 turned = replace(camera, plane_lv_rad=camera.plane_lv_rad + np.deg2rad(40.0))
 try:
-    misled = fuse_flight(flight.pulse, turned).agreement.words
+    misled = fuse_flight(flight.pulse, turned).agreement.remark
 except DivergenceError as fault:
     misled = str(fault)
 print(misled)

@@ -256,10 +256,10 @@ def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> N
     console.print(table)
     if answers.fused is not None:
         found = answers.fused.agreement
-        console.print(f"{'' if not found.suspects else '[red]consistency_check[/] '}{escape(found.words)}")
-        clock = answers.fused.film_clock
-        if clock is not None:
-            console.print(f"{'[red]consistency_check[/] ' if clock.is_off else ''}{escape(clock.words)}")
+        console.print(f"{'' if not found.hypotheses else '[red]consistency_check[/] '}{escape(found.remark)}")
+        bias = answers.fused.camera_time_bias
+        if bias is not None:
+            console.print(f"{'[red]consistency_check[/] ' if bias.is_off else ''}{escape(bias.remark)}")
     for method, row in rows.items():
         if "reason" in row:
             console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from estimators.benchmark import benchmark_bending
-from estimators.camera import ReadFilm, read_film, sensitivity_table
+from estimators.benchmark import benchmark_deflection
+from estimators.camera import FilmFit, read_film, sensitivity_table
 from estimators.fusion import smoothed
-from estimators.loads import PulseData
+from estimators.loads import FlightLoads
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from flightmodel.airdata import AirData, air_data, peak_pressure
@@ -29,8 +29,8 @@ from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
 from postflight.attitude import AttitudeCheck, check_attitude
 from postflight.fusing import FusedAnswer, fuse_flight
-from postflight.loads import day_air, pulse_data
-from recon.atmosphere import ReconstructedAir
+from postflight.loads import loads_from_solution
+from recon.atmosphere import ReconstructedAir, as_flown_atmosphere
 from recon.consistency import ConsistencyCheck
 from recon.fault_isolation import suspects
 from recon.reconstruct import Reconstruction, reconstruct
@@ -54,7 +54,7 @@ class Flight:
     telemetry: Telemetry
     reconstruction: Reconstruction
     air: AirData
-    pulse: PulseData | None
+    pulse: FlightLoads | None
     day: ReconstructedAir | None = None
     missing: tuple[str, ...] = ()
     attitude: AttitudeCheck | None = None
@@ -81,7 +81,7 @@ class Flight:
         """Whether inertial sensors carried the attitude; in ballistic flight it is not known."""
         return self.reconstruction.provenance["motion"] != "ballistic"
 
-    def required_pulse(self) -> PulseData:
+    def required_pulse(self) -> FlightLoads:
         """Sensors and flow at the c.g.; `GateError` with the reason where there are none."""
         if self.pulse is None:
             raise GateError("; ".join(self.missing))
@@ -145,8 +145,8 @@ def flight_from(telemetry: Telemetry, bet: Reconstruction) -> Flight:
     try:
         telemetry.required_vehicle()
         telemetry.required_triads()
-        pulse = pulse_data(telemetry, bet, air)
-        day = day_air(telemetry, bet, profile, bet.settings.check_confidence)
+        pulse = loads_from_solution(telemetry, bet, air)
+        day = as_flown_atmosphere(telemetry, bet, profile, bet.settings.check_confidence)
     except GateError as fault:
         missing.append(str(fault))
     return Flight(telemetry, bet, air, pulse, day, tuple(missing))
@@ -172,7 +172,7 @@ def estimate_camera(
 ) -> DeflectionHistory:
     """Deflection from the onboard video, in an assumed plane or with the plane found in every frame.
 
-    The benchmark frame is taken as not bent; `told_by_the_joint` knows better where there are inertial sensors.
+    The benchmark frame is taken as undeflected; see `with_benchmark_deflection` where there are inertial sensors.
 
     Raises
     ------
@@ -187,7 +187,7 @@ def camera_film(
     plane_lv_rad: float | None = None,
     joint_station_m: float | None = None,
     progress: Progress | None = None,
-) -> ReadFilm:
+) -> FilmFit:
     """What the onboard video shows, frame by frame; `GateError` where there is none or it cannot be used."""
     frames = telemetry.frames
     if frames is None:
@@ -206,22 +206,22 @@ def camera_film(
     )
 
 
-def told_by_the_joint(film: ReadFilm, flight: Flight | None, telemetry: Telemetry) -> DeflectionHistory:
-    """Camera's history with the benchmark frame as bent as the moment in the joint says; as not bent without one.
+def with_benchmark_deflection(film: FilmFit, flight: Flight | None, telemetry: Telemetry) -> DeflectionHistory:
+    """Camera's history with the benchmark frame's deflection from the moment in the joint; undeflected without one.
 
-    Why there is none stands in the history's words.
+    The history's assumptions then give the reason.
     """
     try:
         if flight is None:
             telemetry.required_triads()
-            raise GateError("no trajectory was made")
-        clock_sd_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
-        frames = film.against_benchmark(clock_sd_s)
-        return film.history(benchmark_bending(frames, flight.required_pulse(), film.oriented.held.benchmark_rad))
+            raise GateError("no trajectory was reconstructed", code="trajectory-missing")
+        time_bias_sd_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
+        frames = film.relative_to_benchmark(time_bias_sd_s)
+        return film.history(benchmark_deflection(frames, flight.required_pulse(), film.oriented.apriori.benchmark_rad))
     except GateError as fault:
         plain = film.history()
-        words = f"{plain.assumptions}; the benchmark's bending is not told by the joint ({fault})"
-        return replace(plain, assumptions=words)
+        remark = f"{plain.assumptions}; no benchmark deflection from the moment in the joint ({fault})"
+        return replace(plain, assumptions=remark)
 
 
 def camera_sensitivity(telemetry: Telemetry, history: DeflectionHistory) -> pd.DataFrame:
@@ -270,8 +270,8 @@ def estimate(
         try:
             if method == "camera":
                 film = camera_film(telemetry, plane_lv_rad, joint_station_m, _part(report, k, len(methods)))
-                # the fusion finds the benchmark's bending itself, from the same sensors: it is given the plain history
-                plain, history = film.history(), told_by_the_joint(film, flight, telemetry)
+                # the fusion estimates the benchmark's deflection itself, from the same sensors: it gets the plain one
+                plain, history = film.history(), with_benchmark_deflection(film, flight, telemetry)
             else:
                 assert flight is not None
                 pulse = flight.required_pulse()

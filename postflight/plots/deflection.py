@@ -121,21 +121,21 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
     return figure
 
 
-def figure_told_apart(fused: Fused, singular_values: FloatArray) -> Figure:
-    """Show what the readings cannot tell apart: singular values, and what is left of correlation.
+def figure_correlation(fused: Fused, singular_values: FloatArray) -> Figure:
+    """Inputs that are not separately observable: singular values, and correlation given all readings.
 
-    A direction of the inputs of singular value ``s`` keeps ``1 / (1 + s^2)`` of the variance it was told with.
+    A direction of the inputs with the singular value ``s`` keeps ``1 / (1 + s^2)`` of its a priori variance.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 6.0), layout="constrained")
     values, table = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
-    told = int(np.sum(singular_values > 1.0))
+    better = int(np.sum(singular_values > 1.0))
     values.semilogy(np.arange(1, len(singular_values) + 1), singular_values, ".", color="#CC79A7")
     values.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
     values.set(xlabel="direction of the inputs", ylabel="singular value", ylim=(1e-3, None))
     values.set_title(
-        f"of {told} of {len(singular_values)} directions the readings say\nmore than was told before (above the line)",
+        f"information gain: {better} of {len(singular_values)} directions\nbetter known than a priori (above line)",
         fontsize=10,
     )
     values.grid(alpha=0.3)
@@ -145,7 +145,7 @@ def figure_told_apart(fused: Fused, singular_values: FloatArray) -> Figure:
     table.set_yticks(names, fused.names, fontsize=7)
     apart = np.abs(np.triu(fused.correlation, 1))
     i, j = np.unravel_index(np.argmax(apart), apart.shape)
-    least = f"least told apart: {fused.names[i]} and {fused.names[j]} ({fused.correlation[i, j]:+.2f})"
+    least = f"strongest correlation: {fused.names[i]} and {fused.names[j]} ({fused.correlation[i, j]:+.2f})"
     table.set_title(f"correlation given all readings, at {fused.at_s:.1f} s\n{least}", fontsize=10)
     figure.colorbar(image, ax=table, shrink=0.7)
     return figure

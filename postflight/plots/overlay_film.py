@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row, write_words
+from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row, write_lines
 from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import film_frames
@@ -50,17 +50,17 @@ def write_overlay_film(
             said = f"{frames.time_s[k]:8.2f} s   "
             if image.shape != size[::-1]:
                 picture = np.zeros((size[1], size[0], 3), dtype=np.uint8)
-                write_words(picture, [said + "cannot be decoded"])
+                write_lines(picture, [said + "cannot be decoded"])
             elif not np.isfinite(theta):
                 picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
-                write_words(picture, [said + "not used"])
+                write_lines(picture, [said + "not used"])
             else:
                 picture = overlay.blended(image, theta, plane)
                 draw_row(picture, before, GREY)
                 draw_row(picture, horizon_row(oriented.view, theta, plane), YELLOW)
                 sd = float(np.rad2deg(history.theta_sd_rad[k]))
                 bent = f"{np.rad2deg(theta):5.2f} +/- {sd:.2f} deg   plane {np.rad2deg(plane):4.0f} deg LV"
-                write_words(picture, [said + bent])
+                write_lines(picture, [said + bent])
             writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         writer.release()
         if next(film_frames(partial, [len(frames.time_s) - 1])).size == 0:  # OpenCV tells of no full disk

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from estimators.benchmark import orient_camera, with_bent_benchmark
+from estimators.benchmark import orient_camera, with_deflected_benchmark
 from estimators.camera_fit import OrientedCamera
-from estimators.loads import PulseData
+from estimators.loads import FlightLoads
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row
 from estimators.trim import static_trim
 from flightmodel.checks import FloatArray, GateError
@@ -20,7 +20,7 @@ from flightmodel.telemetry import Telemetry
 from postflight.flight import Answers, Flight
 from postflight.plots import paper_figures
 from postflight.plots import trajectory as product_figures
-from postflight.plots.deflection import figure_camera_overlay, figure_fusion, figure_static_trim, figure_told_apart
+from postflight.plots.deflection import figure_camera_overlay, figure_correlation, figure_fusion, figure_static_trim
 from postflight.studies.preflight import Bounds, rigid_bounds
 
 UNBENT_RAD = 1e-4  # less than a fit resolves: the benchmark frame where it was taken as not bent
@@ -53,8 +53,8 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
         draw_camera(flight.telemetry, answers.histories["camera"], folder)
     if answers.fused is not None:
         fused = answers.fused
-        answer = figure_fusion(fused.fused, fused.limbs, f"{fused.agreement.words}; {fused.limbs_words}")
-        apart = figure_told_apart(fused.fused, fused.agreement.singular_values)
+        answer = figure_fusion(fused.fused, fused.limbs, f"{fused.agreement.remark}; {fused.limbs_remark}")
+        apart = figure_correlation(fused.fused, fused.agreement.singular_values)
         for name, figure in (("fusion.png", answer), ("told_apart.png", apart)):
             paper_figures.stamp(figure, flight.telemetry)
             paper_figures.save(figure, folder / name)
@@ -66,7 +66,7 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
     return bounds
 
 
-def draw_static_trim(pulse: PulseData, telemetry: Telemetry, folder: Path) -> None:
+def draw_static_trim(pulse: FlightLoads, telemetry: Telemetry, folder: Path) -> None:
     """Draw Figure 2.9 for the vehicle at the flight's peak of dynamic pressure, with its own offset and the paper's."""
     vehicle, k = pulse.vehicle, int(np.argmax(pulse.dynamic_pressure_pa))
     mach, pressure = float(pulse.mach[k]), float(pulse.dynamic_pressure_pa[k])
@@ -97,7 +97,7 @@ def oriented_camera(
     benchmark = frames.benchmark
     station = vehicle.joint.station_m if joint_m is None else joint_m
     oriented = orient_camera(frames.picture(benchmark), vehicle.geometry, frames.camera, station)
-    return with_bent_benchmark(oriented, *bending_at(history, float(frames.time_s[benchmark]))), benchmark
+    return with_deflected_benchmark(oriented, *bending_at(history, float(frames.time_s[benchmark]))), benchmark
 
 
 def bending_at(history: DeflectionHistory, time_s: float) -> tuple[float, float]:

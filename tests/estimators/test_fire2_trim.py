@@ -44,7 +44,7 @@ def test_rigid_pitching_at_the_frequency_of_the_published_slope_needs_no_bending
 
     A tenth of the frequency more and it does not: what closes it is the frequency.
     """
-    pulse, _ = pulse_of(np.random.default_rng(0), 60)
+    loads, _ = pulse_of(np.random.default_rng(0), 60)
     model, pressure = fire2(), 4000.0
     frequency = np.sqrt(-pressure * AREA_M2 * LENGTH_M * PUBLISHED_SLOPE / DEFINITION["inertia_kgm2"]["Iy"])
     assert frequency / (2.0 * np.pi) == pytest.approx(1.11, abs=0.005)  # Hz at 4 kPa, without spin
@@ -54,7 +54,7 @@ def test_rigid_pitching_at_the_frequency_of_the_published_slope_needs_no_bending
         # nose up (towards -z) is a turn about +y; the flow's side is where the body's axis does not point
         turn = np.column_stack([np.zeros(60), -((faster * frequency) ** 2) * swing, np.zeros(60)])
         moving = replace(
-            pulse,
+            loads,
             flow_yz_rad=flow,
             mach=np.full(60, 35.0),
             dynamic_pressure_pa=np.full(60, pressure),

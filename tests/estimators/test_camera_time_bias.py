@@ -1,4 +1,4 @@
-"""A film's clock against the gyros', and the camera's history smoothed in time: planted offsets, errors as stated."""
+"""Camera time bias against the gyros', and the camera's history smoothed in time: planted biases, errors as stated."""
 
 from dataclasses import replace
 
@@ -8,19 +8,19 @@ from scipy.stats import chi2
 
 from estimators import fusion
 from estimators.evidence import (
-    FILM_CLOCK,
+    CAMERA_TIME_BIAS,
     LIGHT_TIME_S,
     Evidence,
+    delayed,
     evidence_of_history,
-    forgetful,
+    gauss_markov_basis,
     moved_evidence,
-    read_later,
 )
-from estimators.fusion import clock_is_seen, fuse, smoothed
-from estimators.loads import carried
+from estimators.fusion import fuse, smoothed, time_bias_is_observable
+from flightmodel import rotations
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
-from postflight.fusing import FilmClock, fuse_flight
+from postflight.fusing import CameraTimeBias, fuse_flight
 
 from .conftest import pulse_of
 
@@ -41,7 +41,7 @@ def bent(time_s, swing=1.0):
 def camera(rng, late_s, rate=2, swing=1.0, sd=CAMERA_SD):
     """Camera's history with the errors that the fusion takes it to have, its times late."""
     t = TIME_S[::rate]
-    light = forgetful(t, LIGHT_TIME_S)
+    light = gauss_markov_basis(t, LIGHT_TIME_S)
     drawn = np.sqrt(0.5) * (rng.standard_normal(2) + light @ rng.standard_normal((light.shape[1], 2)))
     cov = np.tile(sd**2 * np.eye(2), (len(t), 1, 1))
     return history_from_lateral(t, bent(t - late_s, swing) + sd * drawn, cov, "camera", "")
@@ -59,7 +59,7 @@ def sensed(rng, swing=1.0):
 def clock_of(told):
     """Offset and sd, s."""
     got = fuse(lambda inputs, about: [moved_evidence(e, inputs, about) for e in told])
-    mean, cov = got.inputs[FILM_CLOCK]
+    mean, cov = got.inputs[CAMERA_TIME_BIAS]
     return TOLD_SD_S * float(mean[0]), TOLD_SD_S * float(np.sqrt(cov[0, 0])), got
 
 
@@ -82,9 +82,9 @@ def test_planted_offsets_are_found_with_honest_sd():
 
 
 def test_the_fused_deflection_is_that_of_the_right_times():
-    def answer(late_s, told_late_s, clock_sd_s):
+    def answer(late_s, told_late_s, time_bias_sd_s):
         rng = np.random.default_rng(3)
-        told = [sensed(rng), evidence_of_history(camera(rng, late_s), clock_sd_s)]
+        told = [sensed(rng), evidence_of_history(camera(rng, late_s), time_bias_sd_s)]
         told[1] = replace(told[1], time_s=told[1].time_s - told_late_s)
         got = fuse(lambda inputs, about: [moved_evidence(e, inputs, about) for e in told]).history
         return got.theta_yz_rad[(got.time_s > 431.0) & (got.time_s < 439.0)]
@@ -95,7 +95,7 @@ def test_the_fused_deflection_is_that_of_the_right_times():
     assert np.sqrt(np.mean((blind - known) ** 2)) > 5.0 * np.sqrt(np.mean((found - known) ** 2))
 
 
-def test_a_deflection_that_stands_still_tells_no_time():
+def test_a_time_bias_is_not_observable_from_a_constant_deflection():
     def told(moving):
         rng = np.random.default_rng(5)
         shift = 0.0 if moving else np.deg2rad([2.0, 1.0]) - bent(TIME_S)
@@ -104,31 +104,32 @@ def test_a_deflection_that_stands_still_tells_no_time():
         history = history_from_lateral(seen.time_s, yz, seen.lateral_cov, "camera", "")
         return [replace(one, theta_yz_rad=one.theta_yz_rad + shift), evidence_of_history(history, TOLD_SD_S)]
 
-    assert clock_is_seen(lambda _inputs, _about: told(True))
-    assert not clock_is_seen(lambda _inputs, _about: told(False))
-    # of a clock alone, and of none but the gyros', nothing can be said
-    assert not clock_is_seen(lambda _inputs, _about: told(True)[1:])
-    assert not clock_is_seen(lambda _inputs, _about: told(True)[:1])
+    assert time_bias_is_observable(lambda _inputs, _about: told(True))
+    assert not time_bias_is_observable(lambda _inputs, _about: told(False))
+    # nor from one time reference alone
+    assert not time_bias_is_observable(lambda _inputs, _about: told(True)[1:])
+    assert not time_bias_is_observable(lambda _inputs, _about: told(True)[:1])
 
 
-def test_a_clock_taken_as_right_moves_nothing_but_is_told():
-    pulse, truth = pulse_of(np.random.default_rng(11), len(TIME_S), bent(TIME_S, 0.7))
+def test_a_time_bias_stated_as_zero_is_tested_but_not_applied():
+    loads, truth = pulse_of(np.random.default_rng(11), len(TIME_S), bent(TIME_S, 0.7))
     late = 0.12
     cov = np.tile(CAMERA_SD**2 * np.eye(2), (len(TIME_S), 1, 1))
     told = history_from_lateral(TIME_S + late, truth, cov, "camera", "")
-    trusted, allowed = fuse_flight(pulse, told), fuse_flight(pulse, told, film_clock_sd_s=TOLD_SD_S)
-    assert FILM_CLOCK not in trusted.fused.inputs
-    assert not trusted.film_clock.applied
-    assert trusted.film_clock.is_off
-    assert "late by 0.1" in trusted.film_clock.words
-    assert "time_bias_sd_s in [frames] is 0" in trusted.film_clock.words
-    assert allowed.film_clock.applied
-    for clock in (trusted.film_clock, allowed.film_clock):
+    trusted, allowed = fuse_flight(loads, told), fuse_flight(loads, told, camera_time_bias_sd_s=TOLD_SD_S)
+    assert CAMERA_TIME_BIAS not in trusted.fused.inputs
+    assert not trusted.camera_time_bias.applied
+    assert trusted.camera_time_bias.is_off
+    assert "+0.1" in trusted.camera_time_bias.remark
+    assert "time_bias_sd_s" in trusted.camera_time_bias.remark
+    assert trusted.time_bias_summary()["words"] == trusted.camera_time_bias.remark
+    assert allowed.camera_time_bias.applied
+    for clock in (trusted.camera_time_bias, allowed.camera_time_bias):
         assert clock.offset_s == pytest.approx(late, abs=max(4.0 * clock.sd_s, 0.01))
-    assert fuse_flight(pulse, None).film_clock is None
-    assert fuse_flight(pulse, None).clock_summary() is None
-    assert allowed.clock_summary()["applied"]
-    assert not FilmClock(0.01, 0.01, False).is_off
+    assert fuse_flight(loads, None).camera_time_bias is None
+    assert fuse_flight(loads, None).time_bias_summary() is None
+    assert allowed.time_bias_summary()["applied"]
+    assert not CameraTimeBias(0.01, 0.01, False).is_off
 
 
 def test_late_triads_are_set_right():
@@ -145,7 +146,7 @@ def test_late_triads_are_set_right():
         flow = 0.3 * rate[:, 1:]
         return replace(
             pulse_of(np.random.default_rng(1), len(TIME_S), bent(TIME_S))[0],
-            specific_force_body_mps2=force + carried(rate, turn, arm),
+            specific_force_body_mps2=force + rotations.lever_arm_acceleration(rate, turn, arm),
             flow_yz_rad=flow,
             rate_body_radps=rate,
             angular_acceleration_body_radps2=turn,
@@ -153,7 +154,7 @@ def test_late_triads_are_set_right():
         )
 
     got, want = (
-        read_later(told(late_force, late_rate), np.full(len(TIME_S), True), late_force, late_rate),
+        delayed(told(late_force, late_rate), np.full(len(TIME_S), True), late_force, late_rate),
         told(0.0, 0.0),
     )
     for name in ("specific_force_body_mps2", "flow_yz_rad", "rate_body_radps", "angular_acceleration_body_radps2"):
@@ -162,23 +163,26 @@ def test_late_triads_are_set_right():
 
 
 def test_the_triads_clocks_are_in_the_films_sd():
-    pulse, truth = pulse_of(np.random.default_rng(11), len(TIME_S), bent(TIME_S, 0.7))
+    loads, truth = pulse_of(np.random.default_rng(11), len(TIME_S), bent(TIME_S, 0.7))
     cov = np.tile(np.deg2rad(0.05) ** 2 * np.eye(2), (len(TIME_S), 1, 1))
     told = history_from_lateral(TIME_S, truth, cov, "camera", "")
-    late = read_later(pulse, np.full(len(TIME_S), True), -0.01, -0.01)
-    trusting = fuse_flight(late, told, film_clock_sd_s=TOLD_SD_S).film_clock
-    stated = replace(late, force_clock_sd_s=0.01, rate_clock_sd_s=0.01)
-    allowing = fuse_flight(stated, told, film_clock_sd_s=TOLD_SD_S).film_clock
+    late = delayed(loads, np.full(len(TIME_S), True), -0.01, -0.01)
+    trusting = fuse_flight(late, told, camera_time_bias_sd_s=TOLD_SD_S).camera_time_bias
+    stated = replace(late, accelerometer_time_bias_sd_s=0.01, gyro_time_bias_sd_s=0.01)
+    allowing = fuse_flight(stated, told, camera_time_bias_sd_s=TOLD_SD_S).camera_time_bias
     assert trusting.offset_s == pytest.approx(-0.01, abs=3.0 * trusting.sd_s)
     assert allowing.sd_s**2 > trusting.sd_s**2 + 0.5 * 0.01**2
     assert abs(allowing.offset_s) < 2.0 * allowing.sd_s
 
 
-def test_a_late_film_that_leaves_no_common_answer_is_told_as_such():
-    pulse, truth = pulse_of(np.random.default_rng(11), len(TIME_S), bent(TIME_S, 0.8))
+def test_a_time_bias_that_leaves_no_common_answer_is_named():
+    loads, truth = pulse_of(np.random.default_rng(11), len(TIME_S), bent(TIME_S, 0.8))
     cov = np.tile(np.deg2rad(0.01) ** 2 * np.eye(2), (len(TIME_S), 1, 1))
-    with pytest.raises(DivergenceError, match=r"answer if the film's clock is late by 0\.3.* time_bias_sd_s in"):
-        fuse_flight(pulse, history_from_lateral(TIME_S + 0.3, truth, cov, "camera", ""))
+    with pytest.raises(DivergenceError) as refusal:
+        fuse_flight(loads, history_from_lateral(TIME_S + 0.3, truth, cov, "camera", ""))
+    assert refusal.value.codes == ("camera-time-bias",)
+    assert "camera time bias +0.3" in str(refusal.value)
+    assert "time_bias_sd_s" in str(refusal.value)
 
 
 def test_the_smooth_history_errs_less_than_the_frames_and_says_how_much():
@@ -214,5 +218,6 @@ def test_holes_widen_the_smooth_history_and_long_ones_stay():
     beside = (got.time_s > 433.2) & (got.time_s < 433.6)
     assert got.theta_sd_rad[inside].max() > 1.2 * got.theta_sd_rad[beside].max()
     assert not ((got.time_s > 437.1) & (got.time_s < 437.9)).any()
-    with pytest.raises(DivergenceError, match="no smooth history of 3 readings"):
+    with pytest.raises(DivergenceError) as refusal:
         smoothed(history_from_lateral(TIME_S[:3], bent(TIME_S[:3]), np.tile(np.eye(2), (3, 1, 1)), "camera", ""))
+    assert refusal.value.codes == ("too-few-readings",)
