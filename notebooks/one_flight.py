@@ -54,7 +54,7 @@ telemetry = flight.telemetry
 rows = [(name, len(r.time_s), r.time_s[0], r.time_s[-1]) for name, r in telemetry.radars.items()]
 for triad in (telemetry.accelerometer, telemetry.rates):
     rows.append((triad.spec.name, len(triad.time_s), triad.time_s[0], triad.time_s[-1]))
-print(*telemetry.findings, *flight.reconstruction.findings, sep="\n")
+print(*telemetry.findings, *flight.solution.findings, sep="\n")
 pd.DataFrame(rows, columns=["sensor", "samples", "from s", "to s"])
 
 # %% [markdown]

@@ -86,7 +86,7 @@ input_table(answers.fused)
 camera = answers.histories["camera"]
 turned = replace(camera, plane_lv_rad=camera.plane_lv_rad + np.deg2rad(40.0))
 try:
-    misled = fuse_flight(flight.pulse, turned).agreement.remark
+    misled = fuse_flight(flight.loads, turned).agreement.remark
 except DivergenceError as fault:
     misled = str(fault)
 print(misled)
@@ -104,7 +104,7 @@ true_deg = float(np.interp(flight.peak_s, truth["t_s"], truth["theta_deg"]))
 for method, (theta, sd) in at_peak.items():
     print(f"{method}: {theta:.2f} +/- {sd:.2f} deg, truth {true_deg:.2f}, off by {(theta - true_deg) / sd:+.1f} sd")
     assert abs(theta - true_deg) < 3.0 * sd
-assert all(pair.chance > 0.01 for pair in answers.fused.agreement.pairs)
+assert all(pair.p_value > 0.01 for pair in answers.fused.agreement.pairs)
 assert all(at_peak["fused"][1] < at_peak[m][1] for m in at_peak if m != "fused")
-assert "the camera's orientation, benchmark or plane would explain it best" in misled
+assert "the camera's orientation, benchmark or plane explains it best" in misled
 print("proved: one answer, and a test that notices when it is none")

@@ -16,21 +16,21 @@ from flightmodel import rotations
 from flightmodel.airdata import AirData, angle_partials, lateral_angles
 from flightmodel.telemetry import Telemetry
 from recon.atmosphere import HALF_WINDOW_S, cg_accelerations, windows_are_whole
-from recon.reconstruct import Reconstruction
+from recon.reconstruct import TrajectorySolution
 
 # of the angular acceleration this half window leaves out 0.5 % at 1 Hz and 3 % at 2.5 Hz; at least some samples must
 # lie in it
 _HALF_WINDOW_S, _LEAST_SAMPLES = 0.02, 2.5
 
 
-def loads_from_solution(telemetry: Telemetry, bet: Reconstruction, air: AirData) -> FlightLoads:
+def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirData) -> FlightLoads:
     """Corrected sensors at the c.g. and the flow, at the trajectory's even output rate, where no telemetry gap is near.
 
     Parameters
     ----------
     telemetry : Telemetry
         With a vehicle and inertial sensors.
-    bet : Reconstruction
+    bet : TrajectorySolution
     air : AirData
         At the times of the smoothed trajectory.
 

@@ -36,7 +36,7 @@ from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, resample
 from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
 from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
-from recon.reconstruct import Reconstruction
+from recon.reconstruct import TrajectorySolution
 
 KNOT_M, KNOT_S, TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
 LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration says nothing about the air
@@ -408,7 +408,7 @@ class CgAccelerations:
     samples: float
 
 
-def windows_are_whole(bet: Reconstruction, grid: FloatArray) -> BoolArray:
+def windows_are_whole(bet: TrajectorySolution, grid: FloatArray) -> BoolArray:
     """Mask (n,) of times with sensor data on both sides and no telemetry gap near."""
     t_imu, h = bet.imu_time_s, HALF_WINDOW_S
     if len(t_imu) < 2:
@@ -419,7 +419,7 @@ def windows_are_whole(bet: Reconstruction, grid: FloatArray) -> BoolArray:
 
 
 def cg_accelerations(
-    bet: Reconstruction, t: FloatArray, cg_from_sensor_m: FloatArray, h: float = HALF_WINDOW_S
+    bet: TrajectorySolution, t: FloatArray, cg_from_sensor_m: FloatArray, h: float = HALF_WINDOW_S
 ) -> CgAccelerations:
     """Corrected sensors, averaged over ``h`` s on both sides of times whose windows are whole."""
     t_imu = bet.imu_time_s
@@ -433,7 +433,7 @@ def cg_accelerations(
 
 
 def as_flown_atmosphere(
-    telemetry: Telemetry, bet: Reconstruction, profile: AtmosphereProfile, confidence: float
+    telemetry: Telemetry, bet: TrajectorySolution, profile: AtmosphereProfile, confidence: float
 ) -> ReconstructedAir:
     """Density and winds along altitude from the reconstruction and the corrected deceleration.
 
@@ -454,7 +454,7 @@ def as_flown_atmosphere(
     return reconstruct_air(_air_samples(telemetry, bet), profile, drag, confidence)
 
 
-def _air_samples(telemetry: Telemetry, bet: Reconstruction) -> AirSamples:
+def _air_samples(telemetry: Telemetry, bet: TrajectorySolution) -> AirSamples:
     """Means over windows of `_WINDOW_S`, side by side, wherever no telemetry gap is near."""
     cg = telemetry.required_vehicle().cg_m
     accelerometer, _ = telemetry.required_triads()
@@ -482,7 +482,7 @@ def _air_samples(telemetry: Telemetry, bet: Reconstruction) -> AirSamples:
     )
 
 
-def _window_times(bet: Reconstruction) -> FloatArray:
+def _window_times(bet: TrajectorySolution) -> FloatArray:
     """Middles of the windows in which the sensors are whole."""
     t_imu, t_bet = bet.imu_time_s, bet.smoothed.time_s
     reach = 0.5 * _WINDOW_S + _EDGE_S
@@ -495,7 +495,7 @@ def _window_times(bet: Reconstruction) -> FloatArray:
     return t[whole]
 
 
-def _force_means(bet: Reconstruction, arm_body_m: FloatArray, t: FloatArray) -> FloatArray:
+def _force_means(bet: TrajectorySolution, arm_body_m: FloatArray, t: FloatArray) -> FloatArray:
     """Specific force at a point ``arm_body_m`` from the accelerometer, body axes, means over the windows."""
     t_imu, rate, half = bet.imu_time_s, bet.rate_body_radps, 0.5 * _WINDOW_S
     swing = np.cross(rate, np.cross(rate, arm_body_m))

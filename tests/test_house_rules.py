@@ -88,7 +88,12 @@ def test_degrees_stay_in_files_command_and_figures(path):
 def modules_imported(path, known):
     """Modules of this project that a file imports anywhere, also inside functions."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    tree = ast.parse(path.read_text())
+    for_types = [n for n in ast.walk(tree) if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"]
+    ignored = {part for block in for_types for part in ast.walk(block)}
+    for node in ast.walk(tree):
+        if node in ignored:
+            continue
         if isinstance(node, ast.ImportFrom) and node.module:
             found |= {f"{node.module}.{a.name}" for a in node.names} | {node.module}
         elif isinstance(node, ast.Import):
