@@ -61,7 +61,7 @@ def told(measured: dict[str, tuple[float, float]], ours: str) -> None:
 
 def scipy_fit(oriented, image) -> Callable[[], object]:
     """Fit the same points with scipy and OpenCV; what was found is given."""
-    view, marks = oriented.view, oriented.marks
+    view, marks = oriented.view, oriented.features
     horizon = find_horizon(image, oriented.lines, view.camera.size_px)
     answer = oriented.fit(image)
     bending = np.array([*answer.rotation_yz_rad, answer.flattening_rad])

@@ -85,7 +85,7 @@ def _feature_residuals(
 
 
 @inlined
-def _huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
+def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
     """Weights, zero where a residual is NaN; the number of edge points with one."""
     edges = 0
     # each kind's sd is inflated to the scatter of its residuals; then Huber's weights
@@ -178,7 +178,7 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
             spots, across, place, feature_offset, terms, lens, outlier, m, spot_pixels, spot_jacobian, residual, rows,
             shape,
         )  # fmt: skip
-        edges = _huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight)
+        edges = huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight)
         if edges < fewest:
             return TOO_FEW, edges
         _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, design, normal, right)

@@ -43,7 +43,7 @@ def _clipped(value, per_step, first, last):
 
 
 @inlined
-def _fill(ax, ay, bx, by, cx, cy, da, db, dc, face, depth, nearest):
+def fill(ax, ay, bx, by, cx, cy, da, db, dc, face, depth, nearest):
     """Enter one triangle at the pixel centres it covers, where it is the closest so far."""
     h, w = depth.shape
     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
@@ -117,7 +117,7 @@ def raster(vertices, faces, lens, sight, widest, deepest, depth, nearest):
             inside += 1 if in_camera[p, 2] > field_cos * in_camera[p, 3] else 0
         if narrow and (inside == 0 or inside == 3):
             if inside == 3:
-                _fill(
+                fill(
                     pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1],
                     in_camera[a, 3], in_camera[b, 3], in_camera[c, 3], f, depth, nearest,
                 )  # fmt: skip
@@ -153,7 +153,7 @@ def raster(vertices, faces, lens, sight, widest, deepest, depth, nearest):
                     ax, ay = _pixel_of(t[0, 0], t[0, 1], t[0, 2], lens)
                     bx, by = _pixel_of(t[1, 0], t[1, 1], t[1, 2], lens)
                     cx, cy = _pixel_of(t[2, 0], t[2, 1], t[2, 2], lens)
-                    _fill(ax, ay, bx, by, cx, cy, length[0], length[1], length[2], f, depth, nearest)
+                    fill(ax, ay, bx, by, cx, cy, length[0], length[1], length[2], f, depth, nearest)
                 continue
             end = (side + 1) % 3
             for child in range(2):

@@ -164,7 +164,7 @@ def fault_hypotheses(loads: FlightLoads, input_posterior: InputPosterior, plane_
 
     Parameters
     ----------
-    pulse : PulseData
+    loads : FlightLoads
     input_posterior : InputPosterior
         For the place of each input's unit normals.
     plane_sd_rad : float

@@ -199,7 +199,7 @@ class AprioriSd:
 
 @dataclass(frozen=True)
 class FrameFit:
-    """The deflection seen in one frame.
+    """The deflection estimated from one frame.
 
     Parameters
     ----------

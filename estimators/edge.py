@@ -30,10 +30,10 @@ from flightmodel.checks import BoolArray, Fault, FloatArray
 Image = NDArray[np.uint8]
 NO_FAULT = Fault("")
 
-_STEP_PX = 0.5
+STEP_PX = 0.5
 _SMOOTHING_PX = 0.8
-_WHOLE_BLUR_PX = 1.27
-_EDGE_HALF = 7
+WHOLE_BLUR_PX = 1.27
+EDGE_HALF = 7
 _NEAR_PX = 8.0
 _LEAST_CONTRAST = 8.0
 _LEAST_SHARE = 0.4
@@ -165,18 +165,18 @@ def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> Ho
 def _lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Place along each line, px inwards from its origin, its sd without floor, whether there is one."""
     n = len(lines.origin_px)
-    grey, inside = _sampled(image, lines, round((lines.outer_px + lines.inner_px) / _STEP_PX))
+    grey, inside = _sampled(image, lines, round((lines.outer_px + lines.inner_px) / STEP_PX))
     level, scatter, first = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
-    span = int(6.0 / _STEP_PX)
+    span = int(6.0 / STEP_PX)
     _edge_kernels.sky_levels(grey, inside, span, level, scatter, first)
     noise = max(float(np.median(scatter)) / (0.6745 * np.sqrt(2.0)), 0.3)
     place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
-    limits = (span, int(3.0 / _STEP_PX), _LEAST_CONTRAST)
+    limits = (span, int(3.0 / STEP_PX), _LEAST_CONTRAST)
     _edge_kernels.first_rises(
-        grey, inside, level, first, noise, float(np.median(level)), limits, _STEP_PX, _EDGE_PLACES, _EDGE_BASES,
+        grey, inside, level, first, noise, float(np.median(level)), limits, STEP_PX, EDGE_PLACES, EDGE_BASES,
         place, sd, good,
     )  # fmt: skip
-    return _STEP_PX * place - lines.outer_px, sd, good
+    return STEP_PX * place - lines.outer_px, sd, good
 
 
 def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
@@ -189,14 +189,14 @@ def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
         With origins where the edge is expected; their lengths are not used.
     """
     near = ScanLines(lines.origin_px, lines.inward_px, _NEAR_PX, _NEAR_PX, lines.index)
-    grey, inside = _sampled(image, near, len(_NEAR_ALONG))
+    grey, inside = _sampled(image, near, len(NEAR_ALONG))
     n = len(near.origin_px)
     place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
     if not n:
         return no_horizon(NO_FAULT)
     # the noise, from samples so far apart that smoothing did not correlate them
     noise = max(float(np.median(np.abs(grey[:, 6] - grey[:, 0]))) / (0.6745 * np.sqrt(2.0)), 0.3)
-    _edge_kernels.steps_near(grey, inside, noise, _LEAST_CONTRAST, _NEAR_PLACES, _NEAR_BASES, place, sd, good)
+    _edge_kernels.steps_near(grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, sd, good)
     points = near.origin_px + place[:, None] * near.inward_px
     return HorizonLine(points[good], near.inward_px[good], np.hypot(sd[good], _SD_FLOOR_PX), near.index[good])
 
@@ -215,7 +215,7 @@ def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, Bo
     grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
     size, corner = np.array([w, h], dtype=float), low.astype(float)
     _edge_kernels.sample_lines(
-        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, _STEP_PX, corner, size, grey, inside
+        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, size, grey, inside
     )
     return grey, inside
 
@@ -224,7 +224,7 @@ def _edge_bases(places: FloatArray, along: FloatArray) -> FloatArray:
     """Orthonormal bases ``(places, 2, samples)`` of a blurred step and a blurred ramp for each place."""
     bases = []
     for place in places:
-        z = (along - place) / _WHOLE_BLUR_PX
+        z = (along - place) / WHOLE_BLUR_PX
         step = ndtr(z)
         ramp = z * step + np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
         basis = np.linalg.qr(np.column_stack([step, ramp]))[0]
@@ -232,8 +232,8 @@ def _edge_bases(places: FloatArray, along: FloatArray) -> FloatArray:
     return np.ascontiguousarray(bases)
 
 
-_EDGE_PLACES: FloatArray = np.linspace(-1.5, 1.5, 31)
-_EDGE_BASES = _edge_bases(_EDGE_PLACES, np.linspace(-_STEP_PX * _EDGE_HALF, _STEP_PX * _EDGE_HALF, 2 * _EDGE_HALF + 1))
-_NEAR_ALONG: FloatArray = np.linspace(-_NEAR_PX, _NEAR_PX, round(2.0 * _NEAR_PX / _STEP_PX) + 1)
-_NEAR_PLACES: FloatArray = np.linspace(-4.75, 4.75, 39)
-_NEAR_BASES = _edge_bases(_NEAR_PLACES, _NEAR_ALONG)
+EDGE_PLACES: FloatArray = np.linspace(-1.5, 1.5, 31)
+EDGE_BASES = _edge_bases(EDGE_PLACES, np.linspace(-STEP_PX * EDGE_HALF, STEP_PX * EDGE_HALF, 2 * EDGE_HALF + 1))
+NEAR_ALONG: FloatArray = np.linspace(-_NEAR_PX, _NEAR_PX, round(2.0 * _NEAR_PX / STEP_PX) + 1)
+NEAR_PLACES: FloatArray = np.linspace(-4.75, 4.75, 39)
+NEAR_BASES = _edge_bases(NEAR_PLACES, NEAR_ALONG)

@@ -13,8 +13,8 @@ form; with it the balance holds through an oscillation. With ``alpha_shell = alp
 ``alpha_shell`` and of ``z_0 + xbar alpha_BET - u/C_A`` are parallel, so one monotone equation in the angle's size
 remains.
 
-Static flexible trim (`static_trim`): the decelerating shell pushes the centerbody from its front end, so that inertia
-is a negative spring. Small angles, one plane, offset ``z_0`` of the centerbody's c.g.::
+Static flexible trim (`static_trim`): the decelerating shell decelerates the centerbody at its front end, so that the
+inertial reaction is a negative spring. Small angles, one plane, offset ``z_0`` of the centerbody's c.g.::
 
     moment about the c.g.:    alpha = C_A (xbar theta + z_0) / (C_N,alpha L)
     centerbody about joint:   K theta = xbar q S (C_A theta + C_N,alpha alpha) + q S C_A z_0
@@ -57,7 +57,7 @@ LIMIT_RAD = np.deg2rad(30.0)
 _AVERAGED_S = 1.0
 _ITERATIONS, _STEP_RAD = 5, 1e-4
 _NODE = np.sqrt(3.0)  # outer nodes of the three-point Gauss-Hermite rule, sd
-_SLOPE_AT_RAD = np.deg2rad(2.0)  # where the static trim takes the coefficients' slopes by alpha
+SLOPE_AT_RAD = np.deg2rad(2.0)  # where the static trim takes the coefficients' slopes by alpha
 _ASSUMPTIONS = (
     "moment balance about the c.g. with measured angular acceleration; pre-flight coefficients and c.g. offset; joint "
     f"as in the vehicle file; no answer below {MIN_AXIAL_MPS2 / 9.80665:.1f} g axial"
@@ -236,13 +236,13 @@ def trim_evidence(
         axial_n = loads.dynamic_pressure_pa[use] * model.area_m2 * model.aero.at(mach, 0.0)[:, 0]
         turn = loads.angular_acceleration_sd_radps2 * model.inertia_kgm2[1, 1] / axial_n
         noise = (turn**2)[:, None, None] * by_moment @ by_moment.transpose(0, 2, 1)
-        by_acceleration = by_moment * (_shell_inertia(vehicle) / axial_n)[:, None, None]
+        by_acceleration = by_moment * (shell_inertia(vehicle) / axial_n)[:, None, None]
     read = about - (by_moment @ (base - moment)[:, :, None])[:, :, 0]
     read = np.where(known[:, None], read, np.nan)
     return Evidence("trim", loads.time_s[use], read, by_acceleration, inputs, noise, _AVERAGED_S)
 
 
-def _trim_curvature(loads: FlightLoads, joint_station_m: float | None = None, dynamic: bool = True) -> FloatArray:
+def trim_curvature(loads: FlightLoads, joint_station_m: float | None = None, dynamic: bool = True) -> FloatArray:
     """Half the second derivative of the reading by C_m (n, 2), rad: the one input uncertain enough for it to matter."""
     use, read = loads.informative, []
     for size in (_NODE, 0.0, -_NODE):
@@ -252,7 +252,7 @@ def _trim_curvature(loads: FlightLoads, joint_station_m: float | None = None, dy
     return (read[0] + read[2] - 2.0 * read[1]) / (2.0 * _NODE**2)
 
 
-def _shell_inertia(vehicle: Vehicle) -> float:
+def shell_inertia(vehicle: Vehicle) -> float:
     """Moment about the vehicle's c.g. per angular acceleration of the shell against the body, kg m^2."""
     shell, body = vehicle.aeroshell, vehicle.centerbody
     arm_shell, arm_body = (vehicle.joint_m[0] - part.cg_m[0] for part in (shell, body))
@@ -268,7 +268,7 @@ def estimate_trim(loads: FlightLoads, joint_station_m: float | None = None, dyna
     C_m, C_N and C_A, dynamic pressure and the angular acceleration, and bounds the joint's oscillation.
     """
     evidence = trim_evidence(loads, joint_station_m, dynamic)
-    half_curvature_rad = _trim_curvature(loads, joint_station_m, dynamic)
+    half_curvature_rad = trim_curvature(loads, joint_station_m, dynamic)
     return history_of_evidence(replace(evidence, half_curvature_rad=half_curvature_rad), loads, _ASSUMPTIONS)
 
 
@@ -334,7 +334,7 @@ def static_trim(vehicle: Vehicle, mach: float, dynamic_pressure_pa: float) -> St
     """
     model = trim_model(vehicle)
     axial, _, _, _ = vehicle.aero.at(mach, 0.0)
-    _, normal, moment, _ = vehicle.aero.at(mach, _SLOPE_AT_RAD) / _SLOPE_AT_RAD
+    _, normal, moment, _ = vehicle.aero.at(mach, SLOPE_AT_RAD) / SLOPE_AT_RAD
     restoring = -(moment * model.length_m + normal * model.x_cg_m)
     if not restoring > 0.0:
         raise GateError(

@@ -134,7 +134,7 @@ def test_ideal_data_give_the_deflection_back():
     at = np.searchsorted(loads.time_s, got.history.time_s)
     inner = (got.history.time_s > TIME_S[8]) & (got.history.time_s < TIME_S[-9])
     np.testing.assert_allclose(got.history.theta_yz_rad[inner], truth[at][inner], atol=np.deg2rad(0.1))
-    assert agreement(loads_reader(loads, METHODS, [])({}, got.deflection)).suspects == ()
+    assert agreement(loads_reader(loads, METHODS, [])({}, got.deflection)).hypotheses == ()
 
 
 def test_a_camera_off_by_a_sd_is_found_out():

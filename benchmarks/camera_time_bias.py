@@ -1,9 +1,9 @@
-"""Is a film's clock found as well as is said? Offsets planted in the camera's times, over dispersed flights.
+"""Is the camera time bias estimated as well as stated? Biases planted in the camera's times, over dispersed flights.
 
 Run: ``python benchmarks/camera_time_bias.py [FLIGHTS [FIRST SEED]] [FOLDER]`` (100 flights; those that
 ``estimator_coverage.py`` kept in FOLDER, or flown now). Offsets of 0, 0.05 and 0.2 s in turn, late and early; the
-film's clock is told to be good to 0.3 s. The camera's history is drawn, not rendered: 4 frames a second, errors of 0.15
-or 0.40 deg and twice that across.
+a priori sd of the bias is 0.3 s. The camera's history is drawn, not rendered: 4 frames a second, errors of 0.15 or 0.40
+deg in the plane and twice that normal to it.
 """
 
 import estimator_coverage as dispersed
