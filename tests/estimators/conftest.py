@@ -11,9 +11,9 @@ AERO = VEHICLE.aero
 
 
 def pulse_of(rng, n, theta_yz=None, vehicle=VEHICLE):
-    """Ideal data of a bent shell in trim: force exactly by rotation, moments exactly in balance; any plane.
+    """Ideal data of a deflected shell in trim: force exactly by rotation, moments exactly in balance; any plane.
 
-    A deflection history that is given is flown through a smooth pulse, by ``vehicle``; the analyst is told `VEHICLE`.
+    A deflection history that is given is flown through a smooth pulse, by ``vehicle``; the analyst has `VEHICLE`.
     """
     model, smooth = trim_model(vehicle), theta_yz is not None
     mach = np.linspace(4.5, 2.6, n) if smooth else rng.uniform(2.6, 4.5, n)

@@ -1,4 +1,4 @@
-"""The benchmark frame's bending told by the moment in the joint: the law, its error bar, and where it does not hold."""
+"""The benchmark frame's deflection from the moment in the joint: the law, its error bar, and where it does not hold."""
 
 from dataclasses import replace
 
@@ -26,13 +26,13 @@ def flown():
     t = TIME_S - TIME_S[0]
     axial = 4.0 + 78.0 * np.exp(-(((t - 21.0) / 8.0) ** 2))
     side = 0.07 * axial[:, None] * np.stack([np.cos(0.3 + 0.03 * t), np.sin(0.3 + 0.03 * t)], axis=-1)
-    swing = np.stack([0.25 * np.sin(15.7 * t), -0.2 * np.cos(15.7 * t), 0.25 * np.sin(15.7 * t + 1.0)], axis=-1)
+    ring = np.stack([0.25 * np.sin(15.7 * t), -0.2 * np.cos(15.7 * t), 0.25 * np.sin(15.7 * t + 1.0)], axis=-1)
     root = np.zeros((n, 3, 9))
     root[:, 1, 0] = root[:, 2, 1] = 0.03
     root[:, 1, 2] = root[:, 2, 3] = 2e-3 * axial
     return replace(
         start, time_s=TIME_S, specific_force_body_mps2=np.column_stack([-axial, side]), force_root_mps2=root,
-        rate_body_radps=np.tile([0.6, 0.0, 0.0], (n, 1)), angular_acceleration_body_radps2=swing * [0.0, 1.0, 1.0],
+        rate_body_radps=np.tile([0.6, 0.0, 0.0], (n, 1)), angular_acceleration_body_radps2=ring * [0.0, 1.0, 1.0],
         angular_acceleration_sd_radps2=0.01,
     )  # fmt: skip
 
@@ -42,9 +42,9 @@ PULSE = flown()
 
 def drawn(rng, freeplay_rad=0.0):
     """A film's readings, and the true bendings in its frames: compliance, sensors' and camera's errors are drawn."""
-    said = joint_moment(PULSE)
+    stated = joint_moment(PULSE)
     compliance = 1.0 / rng.uniform(3000.0, 9000.0)
-    moment = said.value_nm + said.by_input_nm @ rng.standard_normal(said.by_input_nm.shape[2])
+    moment = stated.value_nm + stated.by_input_nm @ rng.standard_normal(stated.by_input_nm.shape[2])
     side = moment / np.linalg.norm(moment, axis=1, keepdims=True)
     theta = compliance * moment + freeplay_rad * side
     theta_yz = np.stack([np.interp(FRAMES_S, TIME_S, column) for column in theta.T], axis=-1)
@@ -57,15 +57,15 @@ def drawn(rng, freeplay_rad=0.0):
     return RelativeDeflections(FRAMES_S, read, covariance, np.tile(np.eye(2), (n, 1, 1)), FRAMES_S[0]), theta_yz
 
 
-def told(count, freeplay_rad=0.0):
+def errors_of(count, freeplay_rad=0.0):
     """Errors (count, 2) and standard deviations (count, 2), rad."""
     rng, rows = np.random.default_rng(4), []
     for _ in range(count):
-        frames, bent = drawn(rng, freeplay_rad)
+        frames, true = drawn(rng, freeplay_rad)
         got = benchmark_deflection(frames, PULSE, PRIOR_RAD)
-        rows.append((got.theta_yz_rad - bent[0], np.sqrt(np.diag(got.covariance)), bent[0]))
-    error, sd, bent = np.moveaxis(np.array(rows), 1, 0)
-    return error, sd, bent
+        rows.append((got.theta_yz_rad - true[0], np.sqrt(np.diag(got.covariance)), true[0]))
+    error, sd, true = np.moveaxis(np.array(rows), 1, 0)
+    return error, sd, true
 
 
 def test_the_moment_is_that_about_the_joint():
@@ -88,8 +88,8 @@ def test_the_moment_is_that_about_the_joint():
 
 def test_errors_lie_in_their_bars_whatever_the_compliance():
     """200 draws of two axes."""
-    error, sd, bent = told(200)
-    assert np.sqrt(np.mean(error**2)) < 0.7 * np.sqrt(np.mean(bent**2))
+    error, sd, true = errors_of(200)
+    assert np.sqrt(np.mean(error**2)) < 0.7 * np.sqrt(np.mean(true**2))
     # slack and freeplay that the film cannot rule out stay in the bar: it is wide, but a quarter of the former 0.12 deg
     assert np.sqrt(np.mean(sd**2)) < D(0.04)
     assert np.mean(np.abs(error) < sd) > 0.61
@@ -98,24 +98,24 @@ def test_errors_lie_in_their_bars_whatever_the_compliance():
 
 def test_its_error_goes_against_that_of_the_readings_as_it_says():
     """100 draws of two axes, mean over all frames; mirror images of the camera's errors make the rest fall out."""
-    rng, k, products, said = np.random.default_rng(5), 20, [], []
+    rng, k, products, stated = np.random.default_rng(5), 20, [], []
     for _ in range(100):
-        frames, bent = drawn(rng)
-        error = frames.theta_yz_rad - (bent - bent[0])
+        frames, true = drawn(rng)
+        error = frames.theta_yz_rad - (true - true[0])
         mirrored = replace(frames, theta_yz_rad=frames.theta_yz_rad - 2.0 * error)
         got, other = (benchmark_deflection(f, PULSE, PRIOR_RAD) for f in (frames, mirrored))
         products.append(error.mean(axis=0) * 0.5 * (got.theta_yz_rad - other.theta_yz_rad))
-        said.append(0.5 * np.diag((got.with_readings + other.with_readings).mean(axis=0)))
+        stated.append(0.5 * np.diag((got.with_readings + other.with_readings).mean(axis=0)))
         whole = np.block([[frames.covariance[k], got.with_readings[k]], [got.with_readings[k].T, got.covariance]])
         assert np.linalg.eigvalsh(whole).min() > 0.0
     mean, sd_of_mean = np.mean(products), np.std(products) / np.sqrt(np.size(products))
     assert mean < -4.0 * sd_of_mean
-    assert np.mean(said) == pytest.approx(mean, abs=3.0 * sd_of_mean)
+    assert np.mean(stated) == pytest.approx(mean, abs=3.0 * sd_of_mean)
 
 
 def test_with_freeplay_the_bar_grows():
-    error, sd, _ = told(40, D(0.3))
-    _, without, _ = told(20)
+    error, sd, _ = errors_of(40, D(0.3))
+    _, without, _ = errors_of(20)
     assert sd.mean() > 2.0 * without.mean()
     assert np.mean(np.abs(error) < sd) > 0.4
     assert np.mean(np.abs(error) < 2.0 * sd) > 0.7
@@ -149,20 +149,20 @@ def test_what_is_not_observable_is_refused_with_the_reason():
 
 
 def test_a_known_benchmark_deflection_is_as_good_as_none():
-    """Benchmark bent by 0.4 deg, more than an error bar allows: missing everywhere, and put back."""
+    """Benchmark deflected by 0.4 deg, more than its prior allows: missing everywhere, and added again."""
     theta_deg, plane_deg = [0.4, 4.0, 3.5], [40.0, 190.0, 170.0]
     frames = film(3, theta_deg, plane_deg)
     read = read_film(np.array([421.0, 440.0, 441.0]), frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None)
-    bent = D(0.4) * np.array([-np.cos(D(40.0)), np.sin(D(40.0))])
+    true = D(0.4) * np.array([-np.cos(D(40.0)), np.sin(D(40.0))])
     plain = read.history()
-    put_back = read.history(BenchmarkDeflection(bent, D(0.01) ** 2 * np.eye(2)))
+    put_back = read.history(BenchmarkDeflection(true, D(0.01) ** 2 * np.eye(2)))
     assert np.abs(plain.theta_rad[1:] - D(np.array(theta_deg[1:]))).max() > D(0.25)
     assert np.abs(put_back.theta_rad[1:] - D(np.array(theta_deg[1:]))).max() < D(0.12)
     assert (put_back.theta_sd_rad < 0.7 * plain.theta_sd_rad)[1:].all()
     assert "0.40 deg towards 40 deg LV" in put_back.assumptions
     # what its error and the readings' share is in the bar; a frame that was refused has none
     together = np.array([np.full((2, 2), np.nan), -2e-8 * np.eye(2), -2e-8 * np.eye(2)])
-    less = read.history(BenchmarkDeflection(bent, D(0.01) ** 2 * np.eye(2), together))
+    less = read.history(BenchmarkDeflection(true, D(0.01) ** 2 * np.eye(2), together))
     shared = together @ read.relative_to_benchmark().per_benchmark.transpose(0, 2, 1)
     shared = shared + shared.transpose(0, 2, 1)
     np.testing.assert_allclose((less.lateral_cov - put_back.lateral_cov)[1:], shared[1:], atol=1e-14)

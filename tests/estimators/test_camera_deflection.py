@@ -52,7 +52,7 @@ def view():
 def ensemble():
     """Truth (theta, plane) and answers, plane found and plane assumed, of 12 flights with their own lens and light.
 
-    The benchmark frame is bent by 0.1 deg a lateral axis, one sd, in a plane nobody is told.
+    The benchmark frame is deflected by 0.1 deg a lateral axis, one sd, in an unknown plane.
     """
     rows = []
     for seed in range(12):
@@ -239,10 +239,10 @@ def test_camera_orientation_is_found_on_the_benchmark():
 
 
 def test_a_benchmark_that_was_bent_gives_its_camera_back():
-    straight, bent = (orient_camera(film(4, [deg], [170.0])[0], GEOMETRY, MOUNT, JOINT_M) for deg in (0.0, 0.5))
-    mended = with_deflected_benchmark(bent, D(0.5), D(170.0))
+    straight, off_nominal = (orient_camera(film(4, [deg], [170.0])[0], GEOMETRY, MOUNT, JOINT_M) for deg in (0.0, 0.5))
+    mended = with_deflected_benchmark(off_nominal, D(0.5), D(170.0))
     points = dot_positions(GEOMETRY)
-    wanted, off, better = (o.view.sight(points, np.zeros(3)).pixels for o in (straight, bent, mended))
+    wanted, off, better = (o.view.sight(points, np.zeros(3)).pixels for o in (straight, off_nominal, mended))
     seen = np.isfinite(wanted + off + better).all(axis=1)
     before, after = (np.sqrt(np.mean((p - wanted)[seen] ** 2)) for p in (off, better))
     # to first order, and within what two frames' noise leaves

@@ -34,7 +34,7 @@ N = 160
 TIME_S = 430.0 + 0.05 * np.arange(N)
 
 
-def bent():
+def motion():
     """A deflection that grows and swings slowly, in a plane that is none of the axes'."""
     x = (TIME_S - 434.0) / 4.0
     size = np.deg2rad(3.5) * np.exp(-(x**2)) + np.deg2rad(0.4) * np.sin(2 * np.pi * 0.6 * (TIME_S - 430.0))
@@ -57,17 +57,17 @@ def linear_evidence(rng, name, inputs, noise_sd=1e-3):
     return Evidence(name, TIME_S, np.zeros((N, 2)), np.tile(-1e-3 * np.eye(2), (N, 1, 1)), response, cov, 0.1)
 
 
-def linear_reader(told):
+def linear_reader(readings):
     """Readings that move with the inputs exactly as their responses say."""
-    return lambda inputs, _about: [moved_evidence(e, inputs) for e in told]
+    return lambda inputs, _about: [moved_evidence(e, inputs) for e in readings]
 
 
 def test_posterior_is_that_of_the_joint_gaussian():
     """The same problem by the covariance form: condition prior on readings, no normal equations."""
     rng = np.random.default_rng(0)
-    told = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"))]
-    told = [replace(e, theta_yz_rad=bent() + 1e-3 * rng.normal(size=(N, 2))) for e in told]
-    got = fuse(linear_reader(told))
+    readings = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"))]
+    readings = [replace(e, theta_yz_rad=motion() + 1e-3 * rng.normal(size=(N, 2))) for e in readings]
+    got = fuse(linear_reader(readings))
     spline = fusion.Spline.over(TIME_S[0], TIME_S[-1])
     curvature = spline.rows(spline.knots_s, 2) / fusion.ACCELERATION_SD_RADPS2
     prior = np.linalg.inv(curvature.T @ curvature + np.eye(spline.count) / fusion.SIZE_SD_RAD**2)
@@ -75,7 +75,7 @@ def test_posterior_is_that_of_the_joint_gaussian():
     before = np.eye(size + 3)
     before[:size, :size] = np.kron(np.eye(2), prior)
     rows, want = zip(
-        *(fusion.whitened(e, spline, {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}, {}) for e in told),
+        *(fusion.whitened(e, spline, {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}, {}) for e in readings),
         strict=True,
     )
     rows, want = np.concatenate(rows), np.concatenate(want)
@@ -95,16 +95,18 @@ def test_linear_readings_err_as_the_posterior_says(monkeypatch):
     monkeypatch.setattr(fusion, "LEFT_OUT_RAD", 1e-5)
     rng = np.random.default_rng(1)
     template = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"), 2e-3)]
-    truth, squares = bent(), []
+    truth, squares = motion(), []
     for _ in range(40):
         x = {k: rng.normal(size=1) for k in "pqr"}
         second = np.gradient(np.gradient(truth, TIME_S, axis=0), TIME_S, axis=0)
-        told = []
+        readings = []
         for e in template:
             read = truth + np.einsum("nij,nj->ni", e.by_acceleration_s2, second)
             read -= sum(j @ x[k] for k, j in e.by_input.items())
-            told.append(replace(e, theta_yz_rad=read + np.sqrt(e.independent_cov[0, 0, 0]) * rng.normal(size=(N, 2))))
-        got = fuse(linear_reader(told))
+            readings.append(
+                replace(e, theta_yz_rad=read + np.sqrt(e.independent_cov[0, 0, 0]) * rng.normal(size=(N, 2)))
+            )
+        got = fuse(linear_reader(readings))
         k = N // 2
         d = got.history.theta_yz_rad[k] - truth[k]
         squares.append(d @ np.linalg.solve(got.history.lateral_cov[k], d))
@@ -115,12 +117,12 @@ def test_linear_readings_err_as_the_posterior_says(monkeypatch):
 def test_a_ringing_joint_is_no_scale_error():
     """Swings at the stiffest joint's 2.85 Hz are followed, and not taken for a scale factor, known to 0.3 %."""
     w = 2.0 * np.pi * 2.85
-    theta = bent() + (np.deg2rad(0.3) * np.sin(w * (TIME_S - 430.0)))[:, None] * np.array([0.8, -0.6])
-    second = -(w**2) * (theta - bent()) + np.gradient(np.gradient(bent(), TIME_S, axis=0), TIME_S, axis=0)
-    swing = np.tile(1e-3 * np.eye(2), (N, 1, 1))
+    theta = motion() + (np.deg2rad(0.3) * np.sin(w * (TIME_S - 430.0)))[:, None] * np.array([0.8, -0.6])
+    second = -(w**2) * (theta - motion()) + np.gradient(np.gradient(motion(), TIME_S, axis=0), TIME_S, axis=0)
+    inertial = np.tile(1e-3 * np.eye(2), (N, 1, 1))
     read = theta + 1e-3 * second
     scale = {"scale": 0.003 * read[:, :, None]}
-    one = Evidence("a", TIME_S, read, swing, scale, np.tile((2e-4) ** 2 * np.eye(2), (N, 1, 1)), 0.1)
+    one = Evidence("a", TIME_S, read, inertial, scale, np.tile((2e-4) ** 2 * np.eye(2), (N, 1, 1)), 0.1)
     got = fuse(linear_reader([one]))
     assert abs(got.inputs["scale"][0][0]) < 0.5
     inner = slice(10, -10)
@@ -129,7 +131,7 @@ def test_a_ringing_joint_is_no_scale_error():
 
 
 def test_ideal_data_give_the_deflection_back():
-    loads, truth = pulse_of(np.random.default_rng(2), N, bent())
+    loads, truth = pulse_of(np.random.default_rng(2), N, motion())
     got = fuse(loads_reader(loads, METHODS, []))
     at = np.searchsorted(loads.time_s, got.history.time_s)
     inner = (got.history.time_s > TIME_S[8]) & (got.history.time_s < TIME_S[-9])
@@ -139,21 +141,21 @@ def test_ideal_data_give_the_deflection_back():
 
 def test_a_camera_off_by_a_sd_is_found_out():
     """Its error is an input as any other, and its readings move with it."""
-    loads, truth = pulse_of(np.random.default_rng(9), N, bent())
+    loads, truth = pulse_of(np.random.default_rng(9), N, motion())
     off = np.deg2rad(0.8)
     cov = np.tile(off**2 * np.eye(2), (N, 1, 1))
     camera = evidence_of_history(history_from_lateral(TIME_S, truth + np.array([off, 0.0]), cov, "camera", ""))
     got = fuse(loads_reader(loads, METHODS, [camera]))
     k = N // 2
     np.testing.assert_allclose(got.deflection(TIME_S[k : k + 1])[0], truth[k], atol=np.deg2rad(0.12))
-    told = camera.by_input["camera"] @ got.inputs["camera"][0]
-    np.testing.assert_allclose(told[k], [-off, 0.0], atol=np.deg2rad(0.15))
+    readings = camera.by_input["camera"] @ got.inputs["camera"][0]
+    np.testing.assert_allclose(readings[k], [-off, 0.0], atol=np.deg2rad(0.15))
 
 
 def test_fused_is_better_than_each_and_learns_the_coefficient():
     """A C_m that is two sd off is found from the difference of the methods, and its own sd shrinks."""
     flown = moved_vehicle(VEHICLE, {"C_m": 2.0})
-    loads, _ = pulse_of(np.random.default_rng(3), N, bent(), flown)
+    loads, _ = pulse_of(np.random.default_rng(3), N, motion(), flown)
     got = fuse(loads_reader(loads, METHODS, []))
     mean, cov = got.inputs["C_m"]
     assert np.sqrt(cov[0, 0]) < 0.8
@@ -202,7 +204,7 @@ def test_a_gauss_markov_basis_has_its_correlation():
 
 
 def test_no_common_answer_is_refused():
-    loads, _ = pulse_of(np.random.default_rng(7), N, bent())
+    loads, _ = pulse_of(np.random.default_rng(7), N, motion())
     far = trim_evidence(loads).theta_yz_rad + np.deg2rad(25.0)
 
     def apart(inputs, about):
@@ -227,7 +229,7 @@ def test_no_common_answer_is_refused():
 )
 def test_a_large_planted_fault_is_named(moved, hypothesis):
     """The scores' ranking, far from the noise; how often it is right near it is measured over flights."""
-    loads, truth = pulse_of(np.random.default_rng(8), N, bent(), moved_vehicle(VEHICLE, moved))
+    loads, truth = pulse_of(np.random.default_rng(8), N, motion(), moved_vehicle(VEHICLE, moved))
     cov = np.tile(np.deg2rad(0.1) ** 2 * np.eye(2), (N, 1, 1))
     camera = evidence_of_history(history_from_lateral(TIME_S, truth, cov, "camera", ""))
     read = loads_reader(loads, METHODS, [camera])
@@ -263,20 +265,20 @@ def test_the_gain_of_a_fault_is_its_likelihood_ratio():
 
 def test_faults_move_the_readings_by_their_sizes():
     """Each column's response is what the error itself does to the readings, to first order."""
-    loads, _ = pulse_of(np.random.default_rng(13), N, bent())
+    loads, _ = pulse_of(np.random.default_rng(13), N, motion())
     use = loads.through_pulse
     got = fuse(loads_reader(loads, METHODS, []))
     faults = fault_hypotheses(loads, got.input_posterior, np.deg2rad(1.0))
     assert set(faults) == {COEFFICIENTS, MOUNT, OFFSET}  # no camera, no plane of its own
-    for suspect, column, moved in (
+    for hypothesis, column, moved in (
         (COEFFICIENTS, 0, {"C_m": 0.15 / VEHICLE.uncertainty.cm}),
         (OFFSET, 1, {"initial offset z": 0.005 / np.sqrt(2.0) / offset_sd_m(VEHICLE)}),
     ):
-        inputs = {name: faults[suspect][at, column] for name, at in got.input_posterior.place.items()}
+        inputs = {name: faults[hypothesis][at, column] for name, at in got.input_posterior.place.items()}
         for name, value in moved.items():
             assert inputs.pop(name)[0] == pytest.approx(value)
         assert not any(x.any() for x in inputs.values())
-    # the conftest's accelerometer knows three biases: a turn of the drag is what they can make of it
+    # the conftest's accelerometer has three biases: a rotation of the drag is what they can produce
     turn = loads.force_root_mps2[use] @ faults[MOUNT][got.input_posterior.place[ACCELEROMETER], 1]
     want = np.cross(FAULT_MOUNT_RAD / np.sqrt(2.0) * np.array([0.0, 0.0, 1.0]), loads.specific_force_body_mps2[use])
     assert np.linalg.norm(turn - want) < 0.5 * np.linalg.norm(want)

@@ -31,7 +31,7 @@ def test_eq_4_vector():
 
 
 def test_eq_4_is_the_rotation_of_the_deflection_history():
-    # psi along a_N and theta > 0 is a bending in the plane opposite a_N: one sign convention throughout
+    # psi along a_N and theta > 0 is a deflection in the plane opposite a_N: one sign convention throughout
     rng = np.random.default_rng(0)
     for _ in range(20):
         a = np.array([-80.0, *rng.normal(size=2) * 4])
@@ -61,7 +61,7 @@ def test_paper_s_form_brings_both_angles_together():
     np.testing.assert_allclose(got, theta, atol=1e-9)
     turned = aeroshell_acceleration(force, got, psi_from_acceleration(force))
     np.testing.assert_allclose(aerodynamic_angle(AERO, mach, turned), alpha_shell, atol=1e-4)
-    # in one plane the general form says the same
+    # in one plane the general form is the same
     lateral = -force[:, 1:] / np.linalg.norm(force[:, 1:], axis=1, keepdims=True)
     general = solve_deflection(AERO, mach, force_tilt(force), lateral * (alpha_shell + theta)[:, None])
     np.testing.assert_allclose(np.linalg.norm(general, axis=1), got, atol=1e-9)
@@ -111,6 +111,6 @@ def test_uncorrected_look_up_reads_far_too_high():
     loads, truth = pulse_of(rng, n=30)
     raw = aerodynamic_angle(AERO, loads.mach, loads.specific_force_body_mps2)
     bet = np.linalg.norm(loads.flow_yz_rad, axis=1)
-    bent = np.linalg.norm(truth, axis=1) > np.deg2rad(2.0)
-    assert (raw[bent & np.isfinite(raw)] > 1.5 * bet[bent & np.isfinite(raw)]).mean() > 0.8
+    deflected = np.linalg.norm(truth, axis=1) > np.deg2rad(2.0)
+    assert (raw[deflected & np.isfinite(raw)] > 1.5 * bet[deflected & np.isfinite(raw)]).mean() > 0.8
     assert np.isnan(aerodynamic_angle(AERO, np.array([3.0]), np.array([[1.0, 0.1, 0.0]]))).all()

@@ -17,7 +17,7 @@ STATIC = static_trim(VEHICLE, 3.2, 1180.0)
 
 
 def test_trim_agrees_with_the_nonlinear_balance():
-    # the same angle from the bending through eqs. [5] and [6]: linear coefficients leave 2 % at 5 deg
+    # the same angle from the deflection through eqs. [5] and [6]: linear coefficients leave 2 % at 5 deg
     model = trim_model(VEHICLE)
     offset = float(np.linalg.norm(model.offset_yz_m))
     for stiffness in (4335.0, 6242.4, 11098.0, 1e5):
@@ -74,8 +74,8 @@ def test_intervals_cover_as_they_say(pressure_sd):
     for _ in range(300):
         passing = np.sqrt(0.5) * sd * rng.normal(size=12)
         swings = LEFT_OUT * np.sqrt(q.max() / q) * theta * rng.normal(size=12)
-        told = q * (1.0 + pressure_sd * rng.normal())
-        line = southwell(told, theta + np.sqrt(0.5) * sd * rng.normal() + passing + swings, sd, pressure_sd)
+        stated = q * (1.0 + pressure_sd * rng.normal())
+        line = southwell(stated, theta + np.sqrt(0.5) * sd * rng.normal() + passing + swings, sd, pressure_sd)
         low, high = np.array([line.critical_interval_pa, line.offset_interval_rad]).T
         inside.append((low < [1500.0, 0.02]) & (high > [1500.0, 0.02]))
     share = np.mean(inside, axis=0)
