@@ -20,7 +20,7 @@ from synthetic_flight import simulate
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import child_rng, fly_scenario, initial_state, read_scenario
 from synthetic_flight.simulate import integrate
-from synthetic_flight.weather import day_atmosphere
+from synthetic_flight.weather import day_of_flight_atmosphere
 
 ROUNDS = int(sys.argv[1]) if len(sys.argv) > 1 else 3
 
@@ -38,7 +38,7 @@ def best(work):
 def main():
     scenario = read_scenario("irve2_reference")
     vehicle = scenario.vehicle
-    table = simulate.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    table = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
     state = initial_state(scenario)
     rows = []
     kernel = best(lambda: integrate(vehicle, table, state, 0.002, 2, 110001, 52501))

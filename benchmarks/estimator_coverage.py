@@ -123,7 +123,7 @@ def flown_pulse(seed, rigid=False):
         "factors": np.array([factors[k] for k in ("ca", "cn", "cm")]),
         "offset": flown.cg_m - told.cg_m,
         "peak": np.array(peak_pressure(truth.time_s, truth.dynamic_pressure_pa)[0]),
-        "words": np.array(truth.words),
+        "words": np.array(truth.remark),
     }
     return pulse, known
 

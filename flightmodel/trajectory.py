@@ -93,6 +93,14 @@ class Trajectory(Tabular):
             columns["attitude_sd_deg"] = np.rad2deg(np.sqrt(variance[:, 6:].sum(axis=1)))
         return pd.DataFrame(columns)
 
+    def at(self, time_s: FloatArray) -> Trajectory:
+        """Trajectory at other times ``(m,)``, see `resample`."""
+        return resample(self, time_s)
+
+    def minus(self, other: Trajectory) -> FloatArray:
+        """Difference ``(n, 9)`` from another trajectory of the same times, see `difference`."""
+        return difference(self, other)
+
     def _about(self) -> str:
         span = f"{self.time_s[0]:.2f} to {self.time_s[-1]:.2f} s after {self.epoch_utc}"
         return f"{self.point}, {len(self.time_s)} samples, {span}"

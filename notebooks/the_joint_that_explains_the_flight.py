@@ -33,10 +33,10 @@ import pandas as pd
 
 from flightmodel.flightfolder import read_flight
 from postflight.flight import PULSE_RATE_HZ, reconstruct_telemetry
-from postflight.reconciliation.answer import deflection_of, joint_table
 from postflight.reconciliation.command import reconciled_bounds
 from postflight.reconciliation.fit import reconcile
-from postflight.reconciliation.modes import stiffness_by_modes
+from postflight.reconciliation.modes import stiffness_from_modes
+from postflight.reconciliation.posterior import deflection_of, joint_table
 from postflight.studies.commands import shares
 from postflight.studies.preflight import rigid_bounds
 from recon.settings import Settings
@@ -94,7 +94,7 @@ table.round(4)
 # falls: no fit of the motion, another part of the data. Where nothing rings it has no answer, and says so.
 
 # %%
-modal = stiffness_by_modes(flight)
+modal = stiffness_from_modes(flight)
 print(f"by its frequency alone: {modal.stiffness_nmprad:.0f} +/- {modal.sd_nmprad:.0f} N m/rad")
 
 # %% [markdown]

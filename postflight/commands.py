@@ -74,8 +74,8 @@ def simulate(scenario: str, folder: Path, seed: int, force: bool) -> None:
         truth = simulate_to_folder(chosen, seed, folder, report, replace=force)
     print_truth(truth, folder)
     print_events(flight_events(truth, chosen.spec.time.inflated_s))
-    if truth.words:
-        console.print(f"[yellow]{escape(truth.words)}[/]")
+    if truth.remark:
+        console.print(f"[yellow]{escape(truth.remark)}[/]")
 
 
 def print_truth(truth: Truth, folder: Path) -> None:

@@ -84,6 +84,22 @@ class FusedAnswer:
             "words": self.limbs_remark,
         }
 
+    def input_frame(self) -> pd.DataFrame:
+        """Posterior of each input's leading unit normal, and its correlation with the deflection.
+
+        Columns ``input, moved_sd, sd_left, correlation_with_deflection_y, correlation_with_deflection_z``.
+        """
+        rows = []
+        for k, (name, (mean, cov)) in enumerate(self.fused.inputs.items()):
+            rows.append((name, mean[0], np.sqrt(cov[0, 0]), *self.fused.correlation[2 + k, :2]))
+        names = ["input", "moved_sd", "sd_left", "correlation_with_deflection_y", "correlation_with_deflection_z"]
+        return pd.DataFrame(rows, columns=names)
+
+    def agreement_frame(self) -> pd.DataFrame:
+        """One row a pair of methods: ``methods, chi_square, degrees, chance, passed``."""
+        rows = [(" and ".join(p.methods), p.chi_square, p.degrees, p.p_value, p.passed) for p in self.agreement.pairs]
+        return pd.DataFrame(rows, columns=["methods", "chi_square", "degrees", "chance", "passed"])
+
 
 def fuse_flight(
     loads: FlightLoads,
@@ -187,21 +203,3 @@ def _tested_time_bias(reader: Callable[[float], Read]) -> CameraTimeBias | None:
 def _time_bias(fused: Fused, prior_sd_s: float, applied: bool) -> CameraTimeBias:
     mean, covariance = fused.inputs[CAMERA_TIME_BIAS]
     return CameraTimeBias(prior_sd_s * float(mean[0]), prior_sd_s * float(np.sqrt(covariance[0, 0])), applied)
-
-
-def input_table(answer: FusedAnswer) -> pd.DataFrame:
-    """Posterior of each input's leading unit normal, and its correlation with the deflection.
-
-    Columns ``input, moved_sd, sd_left, correlation_with_deflection_y, correlation_with_deflection_z``.
-    """
-    fused, rows = answer.fused, []
-    for k, (name, (mean, cov)) in enumerate(fused.inputs.items()):
-        rows.append((name, mean[0], np.sqrt(cov[0, 0]), *fused.correlation[2 + k, :2]))
-    names = ["input", "moved_sd", "sd_left", "correlation_with_deflection_y", "correlation_with_deflection_z"]
-    return pd.DataFrame(rows, columns=names)
-
-
-def agreement_table(answer: FusedAnswer) -> pd.DataFrame:
-    """Return one row a pair of methods: ``methods, chi_square, degrees, chance, passed``."""
-    rows = [(" and ".join(p.methods), p.chi_square, p.degrees, p.p_value, p.passed) for p in answer.agreement.pairs]
-    return pd.DataFrame(rows, columns=["methods", "chi_square", "degrees", "chance", "passed"])

@@ -26,7 +26,6 @@ from flightmodel.checks import GateError, writing
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import NO_VIDEO, Deflections
-from postflight.fusing import agreement_table, input_table
 from postflight.product import bet_table, event_table, header, peak_table, residual_statistics, slow_covariance
 from postflight.reconstruction import Reconstruction
 
@@ -209,8 +208,8 @@ def write_answers(run: RunFolder, answers: Deflections) -> None:
     if answers.smooth_camera is not None:
         run.write_csv("camera_smooth.csv", answers.smooth_camera.to_frame())
     if answers.fused is not None:
-        run.write_csv("fusion_inputs.csv", input_table(answers.fused))
-        run.write_csv("fusion_agreement.csv", agreement_table(answers.fused))
+        run.write_csv("fusion_inputs.csv", answers.fused.input_frame())
+        run.write_csv("fusion_agreement.csv", answers.fused.agreement_frame())
 
 
 def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:

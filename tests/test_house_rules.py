@@ -126,3 +126,22 @@ def test_nothing_in_the_tree_knows_this_machine():
         path = ROOT / entry
         if path.suffix in (".py", ".md", ".toml", ".cff", ".yml") and path.is_file():
             assert not absolute.search(path.read_text()), f"{entry} holds a path of one machine"
+
+
+PYTHON_BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+# what a user reads and copies: it imports `postflight` alone of this project's packages
+SHOWN = [
+    *sorted((ROOT / "notebooks").glob("*.py")),
+    *sorted((ROOT / "examples").rglob("*.py")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+    ROOT / "README.md",
+]
+
+
+@pytest.mark.parametrize("path", SHOWN, ids=name)
+def test_what_users_read_goes_through_the_front_door(path):
+    text = path.read_text()
+    for code in [text] if path.suffix == ".py" else PYTHON_BLOCK.findall(text):
+        for module in imports(ast.parse(code)):
+            if module.split(".")[0] in PACKAGES:
+                assert module == "postflight", f"{module} is internal: import postflight alone"

@@ -11,23 +11,22 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
 from postflight.plots.paper_figures import COLOUR, stamp
-from postflight.reconciliation.answer import stiffness_and_offset
-from postflight.reconciliation.fit import Reconciled
+from postflight.reconciliation.fit import JointFit
 from postflight.reconciliation.modes import ModalStiffness
-from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities
+from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities, stiffness_and_offset
 
 FOUND, MEASURED = "#0072B2", "#000000"
 HIGHEST_HZ = 5.0
 
 
 def figure_reconciled(
-    found: Reconciled, telemetry: Telemetry, bent: DeflectionHistory, fused: DeflectionHistory | None
+    found: JointFit, telemetry: Telemetry, bent: DeflectionHistory, fused: DeflectionHistory | None
 ) -> Figure:
     """Rate and lateral force, measured and flown by the joint found; deflection; stiffness against offset."""
     figure = Figure(figsize=(10.0, 9.0), layout="constrained")
     axes = figure.subplots(3, 2)
-    seen, read = found.problem.observed, found.problem.predicted(found.unknowns)
-    flown = read.windows + found.problem.instrument_rows(read) @ found.unknowns.instruments
+    seen, read = found.problem.measured, found.problem.predict(found.parameters)
+    flown = read.windows + found.problem.instrument_response(read) @ found.parameters.instruments
     t = seen.time_s.ravel()
     rate, force = np.rad2deg(flown[..., 1].ravel()), flown[..., 4].ravel() / 9.80665
     _pair(axes[0, 0], t, np.rad2deg(seen.rate_radps[..., 1].ravel()), rate, "body rate y (deg/s)")
@@ -77,7 +76,7 @@ def _deflection(ax: Axes, history: DeflectionHistory, fused: DeflectionHistory |
     ax.legend(frameon=False, fontsize=8, loc="upper left")
 
 
-def _ridge(ax: Axes, found: Reconciled) -> None:
+def _ridge(ax: Axes, found: JointFit) -> None:
     """Ellipses of 1 and 2 sd of stiffness and size of the offset."""
     mean, covariance = stiffness_and_offset(found)
     root = np.linalg.cholesky(covariance)
@@ -95,7 +94,7 @@ def _ridge(ax: Axes, found: Reconciled) -> None:
 
 def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
     """Every pair of quantities: samples, and the ellipses of 1 and 2 sd of the linear problem."""
-    table = quantities(posterior.found.problem.unknown, posterior.samples)
+    table = quantities(posterior.fit.problem.vehicle_parameters, posterior.samples)
     best, covariance = linear_quantities(posterior)
     n = len(best)
     figure = Figure(figsize=(2.0 * n, 2.0 * n), layout="constrained")
@@ -150,12 +149,12 @@ def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
     left.set_xlabel("time after launch (s)")
     left.set_ylabel("frequency in axes that do not spin (Hz)")
     left.legend(frameon=False, fontsize=8, loc="upper left")
-    told = found.stiffness_nmprad / found.factor[int(np.argmax(found.gathered))]
-    right.plot(found.factor * told, found.gathered, color=FOUND, lw=1.2)
+    told = found.stiffness_nmprad / found.factor[int(np.argmax(found.mean_log_power))]
+    right.plot(found.factor * told, found.mean_log_power, color=FOUND, lw=1.2)
     low, high = found.stiffness_nmprad - found.sd_nmprad, found.stiffness_nmprad + found.sd_nmprad
     right.axvspan(low, high, color=FOUND, alpha=0.2, lw=0, label="1 sd")
     right.set_xlabel("bending stiffness (N m/rad)")
-    right.set_ylabel("gathered along the joint's track")
+    right.set_ylabel("mean_log_power along the joint's track")
     right.grid(alpha=0.3)
     right.spines[["top", "right"]].set_visible(False)
     right.legend(frameon=False, fontsize=8)
