@@ -10,15 +10,15 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-from flightmodel.checks import GateError
+from flightmodel.checks import GateError, Progress
 from flightmodel.flightfolder import read_flight
 from postflight import run_folder
 from postflight.commands import compile_kernels, console
 from postflight.deflections import estimate
 from postflight.flight import PULSE_RATE_HZ, Flight
-from postflight.plots.paper_figures import save
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
-from postflight.progress import Report, progress_bar
+from postflight.plots.style import save
+from postflight.progress import progress_bar
 from postflight.reconciliation.fit import JointFit, select_laws
 from postflight.reconciliation.modes import ModalStiffness, stiffness_from_modes
 from postflight.reconciliation.posterior import (
@@ -143,7 +143,7 @@ def _print_posterior(posterior: Posterior) -> None:
     console.print(printed)
 
 
-def reconciled_bounds(fit: JointFit, flight: Reconstruction, report: Report) -> Bounds:
+def reconciled_bounds(fit: JointFit, flight: Reconstruction, report: Progress) -> Bounds:
     """Bands of entries with the fitted joint, offset and stability, dispersed by their standard deviations."""
     joint, offset, stability = posterior_sd(fit)
     vehicle = fit.vehicle
