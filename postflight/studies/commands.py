@@ -18,7 +18,7 @@ from postflight.flight import read_flight
 from postflight.montecarlo.bands import write_csv
 from postflight.montecarlo.study import read_study
 from postflight.plots import studies
-from postflight.plots.paper_figures import save
+from postflight.plots.style import save
 from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies import joints

@@ -146,8 +146,8 @@ def test_statistics_of_white_residuals_are_one_and_none() -> None:
             "predicted_sd": 5.0, "accepted": np.arange(n) % 100 != 0,
         }
     )  # fmt: skip
-    bet = type("Bet", (), {"residuals": part, "verdicts": ()})()
-    row = product.residual_statistics(type("Flight", (), {"reconstruction": bet})()).iloc[0]
+    bet = type("Bet", (), {"residuals": part, "consistency_checks": ()})()
+    row = product.residual_statistics(type("Flight", (), {"solution": bet})()).iloc[0]
     assert (row["count"], row.edited, row.unit) == (n, 20, "m")
     assert row.rms_normalised == pytest.approx(1.0, abs=0.06)
     assert abs(row.lag1) < 0.09
