@@ -25,9 +25,9 @@ from flightmodel import earth
 from flightmodel.airdata import air_data, pressure_pulse
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray, GateError, Progress
-from flightmodel.telemetry import Sounding, Telemetry
+from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, interpolate_rows, resample
-from postflight.flight import Flight
+from postflight.flight import Flight, calm, with_density, with_mass
 from postflight.product import bet_table
 from postflight.reconstruction import Reconstruction, reconstruction_from
 from recon.reconstruct import reconstruct_once, trackers
@@ -115,38 +115,14 @@ def reruns(telemetry: Telemetry, settings: Settings) -> tuple[Rerun, ...]:
         out.append(Rerun("with attitude sensors", telemetry, replace(settings, attitude_sensors=True), data=1))
     if not ballistic and directions and telemetry.attitude_prior is not None:
         out.append(Rerun("without attitude prior", replace(telemetry, attitude_prior=None), settings))
-    air = {"winds off": _calm(telemetry.sounding)}
-    air |= {f"density {sign:+d} sd": _denser(telemetry.sounding, sign) for sign in (1, -1)}
+    sounding = telemetry.sounding
+    air = {"winds off": calm(sounding)}
+    air |= {f"density {sign:+d} sd": with_density(sounding, np.exp(sign * sounding.density_sd)) for sign in (1, -1)}
     out += [Rerun(name, replace(telemetry, sounding=s), settings, ballistic) for name, s in air.items()]
     if telemetry.vehicle is not None or ballistic:
         for part in (MASS_PART, -MASS_PART):
-            out.append(Rerun(f"mass {100 * part:+.0f} %", _heavier(telemetry, 1.0 + part), settings, ballistic))
+            out.append(Rerun(f"mass {100 * part:+.0f} %", with_mass(telemetry, 1.0 + part), settings, ballistic))
     return tuple(out)
-
-
-def _calm(sounding: Sounding) -> Sounding:
-    still = np.zeros_like(sounding.wind_north_mps)
-    return replace(sounding, wind_north_mps=still, wind_east_mps=still)
-
-
-def _denser(sounding: Sounding, sign: int) -> Sounding:
-    """Sounding with density moved by its own sd, temperature kept."""
-    factor = np.exp(sign * sounding.density_sd)
-    density, pressure = factor * sounding.density_kgpm3, factor * sounding.pressure_pa
-    return replace(sounding, density_kgpm3=density, pressure_pa=pressure)
-
-
-def _heavier(telemetry: Telemetry, factor: float) -> Telemetry:
-    """Telemetry of a vehicle whose parts are all heavier, and with less drag area per mass."""
-    motion = replace(telemetry.motion, drag_area_per_mass_m2pkg=telemetry.motion.drag_area_per_mass_m2pkg / factor)
-    vehicle = telemetry.vehicle
-    if vehicle is not None:
-        shell, body = (
-            part.model_copy(update={"mass_kg": factor * part.mass_kg})
-            for part in (vehicle.aeroshell, vehicle.centerbody)
-        )
-        vehicle = replace(vehicle, aeroshell=shell, centerbody=body)
-    return replace(telemetry, motion=motion, vehicle=vehicle)
 
 
 def sensitivity(flight: Reconstruction, progress: Progress | None = None) -> pd.DataFrame:
