@@ -13,7 +13,7 @@ from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from postflight.deflections import estimate_camera
 from postflight.flight import read_flight
-from postflight.loads import pulse_data
+from postflight.loads import loads_from_solution
 from postflight.reconstruction import reconstruct
 from recon.reconstruct import reconstruct as solve
 from synthetic_flight import simulate
@@ -54,7 +54,7 @@ def main():
         rows.append(("reconstruct 230 s at 250 Hz", best(lambda: solve(flight.telemetry))))
         bet = reconstruct(flight)
         rows.append(("deflection from video", best(lambda: estimate_camera(flight))))
-        pulse = pulse_data(flight.telemetry, bet.solution, bet.air)
+        pulse = loads_from_solution(flight.telemetry, bet.solution, bet.air)
         rows.append(("deflection from misalignment", best(lambda: estimate_misalignment(pulse))))
         rows.append(("deflection from trim", best(lambda: estimate_trim(pulse))))
     print(f"{'':55s}{'seconds':>10s}{'x real time':>14s}")

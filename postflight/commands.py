@@ -273,10 +273,10 @@ def print_answers(answers: Deflections) -> None:
     console.print(table)
     if answers.fused is not None:
         found = answers.fused.agreement
-        console.print(f"{'' if not found.suspects else '[red]check failed[/] '}{escape(found.words)}")
-        clock = answers.fused.film_clock
-        if clock is not None:
-            console.print(f"{'[red]check failed[/] ' if clock.is_off else ''}{escape(clock.words)}")
+        console.print(f"{'' if not found.hypotheses else '[red]check failed[/] '}{escape(found.remark)}")
+        bias = answers.fused.camera_time_bias
+        if bias is not None:
+            console.print(f"{'[red]check failed[/] ' if bias.is_off else ''}{escape(bias.remark)}")
     for method, row in run_folder.method_summary(answers, at_s).items():
         if "reason" in row:
             console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")

@@ -22,9 +22,8 @@ from flightmodel import earth, events, rotations
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from postflight.kinematics import derived_with_sd, is_angle
-from postflight.loads import sensed, whole_windows
 from postflight.reconstruction import Reconstruction
-from recon.atmosphere import LEAST_AXIAL_MPS2
+from recon.atmosphere import LEAST_AXIAL_MPS2, cg_accelerations, windows_are_whole
 
 Columns = dict[str, FloatArray]
 _FORMAT = 1
@@ -176,12 +175,12 @@ def _force(flight: Reconstruction) -> Columns:
     bet, telemetry = flight.solution, flight.telemetry
     t = bet.smoothed.time_s
     out = {name: np.full(len(t), np.nan) for name in _FORCE_NAMES}
-    rows = whole_windows(bet, t)
+    rows = windows_are_whole(bet, t)
     if telemetry.accelerometer is None or not rows.any():
         return out
     spec, vehicle = telemetry.accelerometer.spec, telemetry.vehicle
     arm = np.zeros(3) if vehicle is None else vehicle.cg_m - spec.position_from_datum_body_m
-    at = sensed(bet, t[rows], arm)
+    at = cg_accelerations(bet, t[rows], arm)
     cov = bet.specific_force_cov[rows] + spec.noise_sd**2 / at.samples * np.eye(3)
     sd = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     found = _vector("a{}_imu_mps2", "xyz", at.specific_force_sensor_mps2) | _vector("a{}_imu_sd_mps2", "xyz", sd)

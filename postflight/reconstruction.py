@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from estimators.loads import PulseData
+from estimators.loads import FlightLoads
 from flightmodel import airdata
 from flightmodel.airdata import AirData, peak_pressure
 from flightmodel.atmosphere import BOTTOM_M, TOP_M, profile_from_sounding
@@ -18,8 +18,8 @@ from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
 from postflight.attitude import AttitudeCheck, check_attitude
 from postflight.flight import Flight
-from postflight.loads import day_air, pulse_data
-from recon.atmosphere import ReconstructedAir
+from postflight.loads import loads_from_solution
+from recon.atmosphere import ReconstructedAir, as_flown_atmosphere
 from recon.consistency import ConsistencyCheck
 from recon.fault_isolation import suspects
 from recon.reconstruct import TrajectorySolution
@@ -52,7 +52,7 @@ class Reconstruction(Tabular):
     flight: Flight
     solution: TrajectorySolution
     air: AirData
-    loads: PulseData | None
+    loads: FlightLoads | None
     as_flown: ReconstructedAir | None = None
     missing: tuple[str, ...] = ()
     attitude: AttitudeCheck | None = None
@@ -89,7 +89,7 @@ class Reconstruction(Tabular):
         """Whether inertial sensors carried the attitude; in ballistic flight it is not known."""
         return self.solution.provenance["motion"] != "ballistic"
 
-    def required_loads(self) -> PulseData:
+    def required_loads(self) -> FlightLoads:
         """Motion and flow at the c.g.; `GateError` with the reason where there are none."""
         if self.loads is None:
             raise GateError("; ".join(self.missing), "loads-missing")
@@ -158,9 +158,9 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     try:
         telemetry.required_vehicle()
         telemetry.required_triads()
-        loads = pulse_data(telemetry, solution, air)
+        loads = loads_from_solution(telemetry, solution, air)
         profile = profile_from_sounding(telemetry.sounding)
-        as_flown = day_air(telemetry, solution, profile, solution.settings.check_confidence)
+        as_flown = as_flown_atmosphere(telemetry, solution, profile, solution.settings.check_confidence)
     except GateError as fault:
         missing.append(str(fault))
     return Reconstruction(flight, solution, air, loads, as_flown, tuple(missing))

@@ -24,7 +24,6 @@ from flightmodel.checks import GateError, writing
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import NO_VIDEO, Deflections
-from postflight.fusing import agreement_table, input_table
 from postflight.product import bet_table, event_table, header, peak_table, residual_statistics, slow_covariance
 from postflight.reconstruction import Reconstruction
 
@@ -215,8 +214,8 @@ def write_answers(run: RunFolder, answers: Deflections) -> None:
     if answers.smooth_camera is not None:
         run.write_csv("camera_smooth.csv", answers.smooth_camera.to_frame())
     if answers.fused is not None:
-        run.write_csv("fusion_inputs.csv", input_table(answers.fused))
-        run.write_csv("fusion_agreement.csv", agreement_table(answers.fused))
+        run.write_csv("fusion_inputs.csv", answers.fused.input_frame())
+        run.write_csv("fusion_agreement.csv", answers.fused.agreement_frame())
 
 
 def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
@@ -249,8 +248,8 @@ def summary(flight: Reconstruction, answers: Deflections) -> dict[str, Any]:
         "alpha_total_wind_deg": float(np.rad2deg(air.alpha_total_wind_rad[k])) if flight.has_attitude else None,
         "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])) if flight.has_attitude else None,
         "methods": method_summary(answers, peak),
-        "agreement": None if answers.fused is None else answers.fused.agreement.words,
-        "film_clock": None if answers.fused is None else answers.fused.clock_summary(),
+        "agreement": None if answers.fused is None else answers.fused.agreement.remark,
+        "film_clock": None if answers.fused is None else answers.fused.time_bias_summary(),
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),
         "missing": list(flight.missing),
         "attitude_check": attitude_summary(flight.attitude),

@@ -15,9 +15,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from estimators.benchmark import orient_camera, with_bent_benchmark
+from estimators.benchmark import orient_camera, with_deflected_benchmark
 from estimators.camera_fit import OrientedCamera
-from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row, write_words
+from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row, write_lines
 from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Image, film_frames
@@ -40,7 +40,7 @@ def oriented_camera(telemetry: Telemetry, history: DeflectionHistory) -> tuple[O
     assert frames is not None
     benchmark = frames.benchmark
     oriented = orient_camera(frames.picture(benchmark), vehicle.geometry, frames.camera, vehicle.joint.station_m)
-    return with_bent_benchmark(oriented, *deflection_at(history, float(frames.time_s[benchmark]))), benchmark
+    return with_deflected_benchmark(oriented, *deflection_at(history, float(frames.time_s[benchmark]))), benchmark
 
 
 def benchmark_and_largest(telemetry: Telemetry, history: DeflectionHistory) -> tuple[Image, str]:
@@ -106,17 +106,17 @@ def write_overlay_film(telemetry: Telemetry, history: DeflectionHistory, path: P
             time = f"{frames.time_s[k]:8.2f} s   "
             if image.shape != size[::-1]:
                 picture = np.zeros((size[1], size[0], 3), dtype=np.uint8)
-                write_words(picture, [time + "cannot be decoded"])
+                write_lines(picture, [time + "cannot be decoded"])
             elif not np.isfinite(theta):
                 picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
-                write_words(picture, [time + "not used"])
+                write_lines(picture, [time + "not used"])
             else:
                 picture = overlay.blended(image, theta, plane)
                 draw_row(picture, before, GREY)
                 draw_row(picture, horizon_row(oriented.view, theta, plane), YELLOW)
                 sd = float(np.rad2deg(history.theta_sd_rad[k]))
                 answer = f"{np.rad2deg(theta):5.2f} +/- {sd:.2f} deg   plane {np.rad2deg(plane):4.0f} deg LV"
-                write_words(picture, [time + answer])
+                write_lines(picture, [time + answer])
             writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         writer.release()
         if next(film_frames(partial, [len(frames.time_s) - 1])).size == 0:  # OpenCV reports no full disk

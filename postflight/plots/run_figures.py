@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from estimators.loads import PulseData
+from estimators.loads import FlightLoads
 from estimators.trim import static_trim
 from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
@@ -55,7 +55,7 @@ def draw_run(flight: Reconstruction, answers: Deflections, folder: Path, report:
         draw_camera(flight.flight, answers.histories["camera"], folder)
     if answers.fused is not None:
         answer = answers.fused
-        words = f"{answer.agreement.words}; {answer.limbs_words}"
+        words = f"{answer.agreement.remark}; {answer.limbs_remark}"
         for name, figure in (
             ("fusion.png", figure_fusion(answer.fused, answer.limbs, words)),
             ("told_apart.png", figure_correlation(answer.fused, answer.agreement.singular_values)),
@@ -70,7 +70,7 @@ def draw_run(flight: Reconstruction, answers: Deflections, folder: Path, report:
     return bounds
 
 
-def _draw_static_trim(pulse: PulseData, telemetry: Telemetry, folder: Path) -> None:
+def _draw_static_trim(pulse: FlightLoads, telemetry: Telemetry, folder: Path) -> None:
     """Draw Figure 2.9 for the vehicle at the flight's peak of dynamic pressure; none where it has no static trim."""
     vehicle, k = pulse.vehicle, int(np.argmax(pulse.dynamic_pressure_pa))
     mach, pressure = float(pulse.mach[k]), float(pulse.dynamic_pressure_pa[k])

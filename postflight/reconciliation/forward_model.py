@@ -29,9 +29,8 @@ from flightmodel.rotations import skew
 from flightmodel.telemetry import Sounding
 from flightmodel.trajectory import Trajectory, resample
 from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
-from postflight.loads import sensed, whole_windows
 from postflight.reconstruction import Reconstruction
-from recon.atmosphere import CONSTANT_PART
+from recon.atmosphere import CONSTANT_PART, cg_accelerations, windows_are_whole
 from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
 from synthetic_flight import simulate
 from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
@@ -288,7 +287,7 @@ def select_measurements(flight: Reconstruction, loaded: bool = False) -> Measure
     spans = int((last_s - first_s) / SPAN_S)
     starts = np.asarray(first_s + SPAN_S * np.arange(max(spans, 0) + 1), dtype=np.float64)
     t = (starts[:-1, None] + WINDOW_S * (np.arange(WINDOWS) + 0.5)).ravel()
-    whole = whole_windows(bet, t)
+    whole = windows_are_whole(bet, t)
     if spans < LEAST_SPANS or whole.mean() < 0.5:
         raise GateError(
             f"reconciliation: {whole.sum() * WINDOW_S:.1f} s of whole sensor data between 100 km ({first_s:.1f} s) "
@@ -296,7 +295,7 @@ def select_measurements(flight: Reconstruction, loaded: bool = False) -> Measure
             "time are wanted",
             code="data-gap",
         )
-    means = sensed(bet, t, np.zeros(3), 0.5 * WINDOW_S)
+    means = cg_accelerations(bet, t, np.zeros(3), 0.5 * WINDOW_S)
     near = np.abs(bet.smoothed.time_s[:, None] - t).argmin(axis=0)
     shape = (spans, WINDOWS)
 

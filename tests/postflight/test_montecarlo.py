@@ -31,6 +31,7 @@ from postflight.montecarlo.execution import Wanted, status, study_of
 from postflight.montecarlo.study import Stop, read_study
 from synthetic_flight import ensemble
 
+from .killing import start_command
 from .short_flights import DISPERSIONS, ENTRY, write_short
 
 FLIGHTS = 24
@@ -95,15 +96,8 @@ def test_bands_in_slabs_are_the_same(reference, path, tmp_path, monkeypatch):
 
 
 def command(path, folder, *more):
-    line = [sys.executable, "-m", "postflight.cli", "montecarlo", "run", str(path), str(folder), *more]
-    # a job in the background of a shell ignores Ctrl-C, and so would its children
-    return subprocess.Popen(
-        line,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    arguments = ("montecarlo", "run", path, folder, *more)
+    return start_command(*arguments, stdout=subprocess.DEVNULL, start_new_session=True)
 
 
 def chunks_in(folder):

@@ -1,6 +1,6 @@
 """For which stiffness and damping of its joint does a vehicle diverge, oscillate with growing amplitude, or settle?
 
-Run: ``python examples/axdahl_zones.py [PICTURE]`` (half a minute); without a name it draws
+Run: ``python -m tests.oracles.axdahl_zones [PICTURE]`` (half a minute); without a name it draws
 ``docs/images/axdahl_zones.png``.
 
 Axdahl's stability map twice: from eigenvalues (`synthetic_flight.linear`) and from flights of the nonlinear simulator.
@@ -271,4 +271,4 @@ def main(picture: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "docs" / "images" / "axdahl_zones.png")
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "docs" / "images" / "axdahl_zones.png")
