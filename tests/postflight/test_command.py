@@ -376,7 +376,7 @@ def test_estimators_that_cannot_answer_exit_4_and_say_why(two_runs) -> None:
 @pytest.mark.slow
 def test_nonsense_is_not_reported_as_a_good_trajectory(two_runs) -> None:
     first, _, saved, _ = two_runs
-    checks = pd.read_csv(io.BytesIO(saved["verdicts.csv"]))
+    checks = pd.read_csv(io.BytesIO(saved["consistency_checks.csv"]))
     passed = checks["passed"].astype(bool)
     # numbers without physics: hardly a check passes, and each that fails is named on the screen
     assert passed.sum() < 0.5 * len(checks)
