@@ -22,15 +22,20 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import hashlib
+import importlib
+import importlib.util
 import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
 import tomllib
+import traceback
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +47,12 @@ FAST = "not slow and not long and not browser and not realdata"
 LONGEST_S = 420.0  # an error may also make a loop endless
 RECORD = "POSTFLIGHT_MUTANTS_RECORD"
 MOST_NAMED = 400  # tests by name in one command line
+FIRST = 10  # of the tests that run a line, so many are tried before all others: collecting takes time too
+ENDLESS = -1000
+PRELOADED = (
+    "numpy", "scipy.interpolate", "scipy.optimize", "scipy.stats", "scipy.signal", "scipy.ndimage", "pandas", "numba",
+    "pydantic", "cv2", "matplotlib.pyplot", "pytest", "hypothesis", "pymap3d", "filterpy.kalman",
+)  # fmt: skip
 HOME = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "postflight" / "mutants"
 
 
@@ -155,34 +166,94 @@ def environment(tree: Path, interpreted: bool) -> dict[str, str]:
         "NUMBA_CACHE_DIR": str(tree.parent / f"{tree.name}-numba"),
         "OMP_NUM_THREADS": "1",
         "OPENBLAS_NUM_THREADS": "1",
-        "PYTHONDONTWRITEBYTECODE": "1",  # a planted error and its undoing may fall in one second of a file's time
         "MPLBACKEND": "Agg",
     }
     kept = {k: v for k, v in os.environ.items() if k not in (RECORD, "NUMBA_DISABLE_JIT")}
     return kept | more | ({"NUMBA_DISABLE_JIT": "1"} if interpreted else {})
 
 
-def run_tests(tree: Path, tests: list[str], interpreted: bool, record: Path | None = None) -> tuple[str, str, float]:
-    """``("passed" | "failed" | "endless" | "broken", by what, seconds)`` of tests by file or name."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-m", FAST, "-p", "no:cacheprovider", "--no-header", *tests]
-    of = environment(tree, interpreted)
-    if record is not None:
-        command = [c for c in command if c != "-x"] + ["-p", "mutants"]
-        of[RECORD] = str(record)
-    start = time.monotonic()
+class Server:
+    """A process that has imported what the tests need of others' libraries, and forks for every run of tests."""
+
+    def __init__(self, tree: Path) -> None:
+        self.tree, self.process = tree, None
+
+    def run(self, tests: list[str], interpreted: bool, record: Path | None = None) -> tuple[str, str, float]:
+        """``("passed" | "failed" | "endless" | "broken", by what, seconds)`` of tests by file or name."""
+        if self.process is None or self.process.poll() is not None:
+            self.process = subprocess.Popen(
+                [sys.executable, __file__, "--serve"], cwd=self.tree, env=environment(self.tree, False), text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            )  # fmt: skip
+        words = self.tree.parent / f"{self.tree.name}.out"
+        # short arguments: a fork, not a command line
+        job = {"tests": tests, "interpreted": interpreted, "record": str(record or ""), "out": str(words)}
+        start = time.monotonic()
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps(job) + "\n")
+        self.process.stdin.flush()
+        code = int(self.process.stdout.readline())
+        seconds = time.monotonic() - start
+        if code == ENDLESS:
+            return "endless", f"no end in {LONGEST_S:.0f} s", seconds
+        said = words.read_text(errors="replace")
+        by = re.search(r"^(?:FAILED|ERROR) (\S+)", said, re.M)
+        if code in (0, 5):
+            return "passed", "", seconds
+        if code in (1, 2) and by:
+            return "failed", by[1], seconds
+        return "broken", said[-2000:], seconds
+
+
+def serve() -> None:
+    """Run tests on demand, each time in a child; nothing of the packages is imported before."""
+    for name in PRELOADED:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+    for line in sys.stdin:
+        job = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            os.setsid()
+            os._exit(_run_in_child(job))
+        end = time.monotonic() + (1e9 if job["record"] else LONGEST_S)
+        code = None
+        while code is None and time.monotonic() < end:
+            done, status = os.waitpid(child, os.WNOHANG)
+            code = os.waitstatus_to_exitcode(status) if done else None
+            time.sleep(0.02)
+        if code is None:
+            os.killpg(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+        print(ENDLESS if code is None else code, flush=True)
+
+
+def _run_in_child(job: dict) -> int:
+    with Path(job["out"]).open("w") as words:
+        for stream in (1, 2):
+            os.dup2(words.fileno(), stream)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    if job["interpreted"]:
+        import numba
+
+        numba.config.DISABLE_JIT = 1
+        os.environ["NUMBA_DISABLE_JIT"] = "1"
+    options = ["-q", "-m", FAST, "-p", "no:cacheprovider", "--no-header", "--tb=line"]
+    if job["record"]:
+        os.environ[RECORD] = job["record"]
+        options += ["-p", "mutants"]
+    else:
+        options.append("-x")
+    import pytest
+
     try:
-        done = subprocess.run(
-            command, cwd=tree, env=of, capture_output=True, text=True, timeout=None if record else LONGEST_S
-        )
-    except subprocess.TimeoutExpired:
-        return "endless", f"no end in {LONGEST_S:.0f} s", LONGEST_S
-    seconds = time.monotonic() - start
-    by = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.M)
-    if done.returncode in (0, 5):
-        return "passed", "", seconds
-    if done.returncode in (1, 2) and by:
-        return "failed", by[1], seconds
-    return "broken", (done.stdout + done.stderr)[-2000:], seconds
+        code = int(pytest.main([*options, *job["tests"]]))
+    except BaseException:
+        traceback.print_exc()
+        code = 3
+    sys.stdout.flush()
+    return code
 
 
 # ---- which test calls what: hooks of a recorded run (pytest -p mutants) ---------------------------------------------
@@ -252,14 +323,14 @@ def pytest_sessionfinish(session):
         Path(target).write_text(json.dumps(tests))
 
 
-def recorded(tree: Path, package: str) -> dict[str, dict]:
+def recorded(server: Server, package: str) -> dict[str, dict]:
     """Tests of a package with what each called; recorded anew where package or tests changed."""
     kept = HOME / f"calls-{package}.json"
     mark = HOME / f"calls-{package}.digest"
-    now = digest(tree, *PACKAGES, f"tests/{package}")
+    now = digest(server.tree, *PACKAGES, f"tests/{package}")
     if not (kept.exists() and mark.exists() and mark.read_text() == now):
         print(f"recording which tests of {package} call what ...", flush=True)
-        state, by, seconds = run_tests(tree, [f"tests/{package}"], False, kept)
+        state, by, seconds = server.run([f"tests/{package}"], False, kept)
         if state != "passed":
             sys.exit(f"{package}: its own tests do not pass as they are: {state} {by}")
         mark.write_text(now)
@@ -279,37 +350,54 @@ def chosen(tree: Path, one: Mutant, calls: dict[str, dict]) -> list[str]:
     return sorted(mine, key=lambda name: calls[name]["seconds"])[:MOST_NAMED]
 
 
-def plant(tree: Path, one: Mutant, calls: dict[str, dict], whole: bool) -> dict:
-    path = tree / one.path
+def plant(server: Server, one: Mutant, calls: dict[str, dict], whole: bool) -> dict:
+    path = server.tree / one.path
     text, times = path.read_text(), path.stat()
-    tests = chosen(tree, one, calls)
-    path.write_text(text.replace(one.was, one.now))
+    tests = chosen(server.tree, one, calls)
+    stages = [tests[:FIRST], tests[FIRST:]] if not one.tests else [tests]
+    stages += [[f"tests/{one.package}"]] if whole else []
+    state, by, seconds = "passed", "", 0.0
+    write(path, text.replace(one.was, one.now))
     try:
-        state, by, seconds = run_tests(tree, tests, one.in_kernel) if tests else ("passed", "", 0.0)
-        if state == "passed" and whole:
-            state, by, more = run_tests(tree, [f"tests/{one.package}"], False)
-            seconds += more
+        for number, stage in enumerate(stages):
+            if stage and state == "passed":
+                is_last = whole and number == len(stages) - 1
+                state, by, more = server.run(stage, one.in_kernel and not is_last)
+                seconds += more
     finally:
-        path.write_text(text)
+        write(path, text)
         os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
     fate = {"passed": "survived", "failed": "killed", "endless": "killed"}.get(state, "broken")
     return {"fate": fate, "by": by, "seconds": round(seconds, 1), "tests": len(tests), "whole": whole}
 
 
-def check_as_it_is(tree: Path, mutants: list[Mutant]) -> None:
+def write(path: Path, text: str) -> None:
+    """Write a source and forget its bytecode, which knows a file's time to the second only."""
+    path.write_text(text)
+    Path(importlib.util.cache_from_source(str(path))).unlink(missing_ok=True)
+
+
+def check_as_it_is(server: Server, mutants: list[Mutant]) -> None:
     """The interpreted tests pass without an error planted; of the others the recording has shown it."""
     files = sorted({t for one in mutants if one.in_kernel for t in one.tests})
     for name in files:
-        state, by, seconds = run_tests(tree, [name], True)
+        state, by, seconds = server.run([name], True)
         print(f"  as it is, interpreted: {name} {state} {seconds:.0f} s", flush=True)
         if state != "passed":
             sys.exit(f"{name} does not pass with interpreted kernels: {state} {by}")
 
 
-def key_of(tree: Path, one: Mutant) -> str:
-    marks = digest(tree, *PACKAGES, f"tests/{one.package}")
-    words = json.dumps([one.package, one.was, one.now, one.tests, marks])
+def key_of(one: Mutant) -> str:
+    words = json.dumps([one.package, one.was, one.now, one.tests])
     return hashlib.sha256(words.encode()).hexdigest()[:24]
+
+
+def marks_of(tree: Path, one: Mutant, result: dict) -> str:
+    """What a result rests on: all source and, of a killed one, the test that noticed it; else the package's tests."""
+    by = tree / result["by"].split("::")[0]
+    if result["fate"] == "killed" and by.is_file():
+        return digest(tree, *PACKAGES) + hashlib.sha256(by.read_bytes()).hexdigest()[:16]
+    return digest(tree, *PACKAGES, f"tests/{one.package}")
 
 
 def main() -> int:
@@ -338,39 +426,41 @@ def main() -> int:
         print(f"{len(mutants)} entries")
         return 0
     HOME.mkdir(parents=True, exist_ok=True)
-    trees: SimpleQueue[Path] = SimpleQueue()
-    for number in range(options.workers):
-        copy_tree(HOME / f"tree-{number}")
-        trees.put(HOME / f"tree-{number}")
+    free: SimpleQueue[Server] = SimpleQueue()
+    servers = [Server(HOME / f"tree-{number}") for number in range(options.workers)]
+    for server in servers:
+        copy_tree(server.tree)
+        free.put(server)
     first = HOME / "tree-0"
-    keys = {one: key_of(first, one) for one in mutants}
-    kept_path, last_path = HOME / "results.json", HOME / "last.json"
+    keys = {one: key_of(one) for one in mutants}
+    kept_path = HOME / "results.json"
     kept = json.loads(kept_path.read_text()) if kept_path.exists() and not options.anew else {}
-    last = json.loads(last_path.read_text()) if last_path.exists() else {}
     if options.survivors:
-        mutants = [one for one in mutants if last.get(one.was + one.now) != "killed"]
-    to_run = [one for one in mutants if keys[one] not in kept or (options.whole and is_open(kept[keys[one]]))]
-    calls = {p: recorded(first, p) for p in dict.fromkeys(one.package for one in to_run if not one.tests)}
-    check_as_it_is(first, to_run)
+        mutants = [one for one in mutants if kept.get(keys[one], {}).get("fate") != "killed"]
+    to_run = [one for one in mutants if is_open(first, one, kept.get(keys[one]), options.whole)]
+    calls = {p: recorded(servers[0], p) for p in dict.fromkeys(one.package for one in to_run if not one.tests)}
+    check_as_it_is(servers[0], to_run)
 
     def run(one: Mutant) -> None:
-        tree = trees.get()
+        server = free.get()
         try:
-            kept[keys[one]] = plant(tree, one, calls.get(one.package, {}), options.whole)
+            result = plant(server, one, calls.get(one.package, {}), options.whole)
         finally:
-            trees.put(tree)
-        last[one.was + one.now] = kept[keys[one]]["fate"]
+            free.put(server)
+        kept[keys[one]] = result | {"marks": marks_of(first, one, result)}
         kept_path.write_text(json.dumps(kept, indent=1))
-        last_path.write_text(json.dumps(last, indent=1))
-        print(row(one, kept[keys[one]]), flush=True)
+        print(row(one, result), flush=True)
 
     with ThreadPoolExecutor(options.workers) as pool:
         list(pool.map(run, to_run))
     return table(mutants, {one: kept[keys[one]] for one in mutants})
 
 
-def is_open(result: dict) -> bool:
-    return result["fate"] == "survived" and not result["whole"]
+def is_open(tree: Path, one: Mutant, result: dict | None, whole: bool) -> bool:
+    """Whether an entry has to be run: never was, source or tests changed since, or more tests are asked for."""
+    if result is None or result["fate"] == "broken" or result["marks"] != marks_of(tree, one, result):
+        return True
+    return whole and result["fate"] == "survived" and not result["whole"]
 
 
 def row(one: Mutant, result: dict) -> str:
@@ -401,4 +491,4 @@ def table(mutants: list[Mutant], results: dict[Mutant, dict]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(serve() if "--serve" in sys.argv else main())
