@@ -149,7 +149,7 @@ def short_fall():
 def turned_round(telemetry, turns):
     """The same azimuths a whole turn on."""
     radars = {
-        name: replace(record, range_az_el=record.range_az_el + [0.0, 2.0 * np.pi * turns, 0.0])
+        name: replace(record, range_az_el=record.range_az_el + np.array([0.0, 2.0 * np.pi * turns, 0.0]))
         for name, record in telemetry.radars.items()
     }
     return replace(telemetry, radars=radars)
