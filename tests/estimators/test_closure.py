@@ -1,7 +1,7 @@
 """The estimators' balances close on true histories of the simulator, at rest, at 6 rpm and at 30 rpm.
 
 True motion, true air and true forces go in, nothing is measured; what an estimator then reads beyond the true
-deflection is what its equation leaves out of the simulator's physics. The flow is taken at the nose, where the simulator
+deflection is what its equation leaves out of the simulator's physics. The flow is taken at the nose, as the simulator
 takes it.
 """
 

@@ -10,7 +10,8 @@ from recon import _filter_kernels, _measurement_kernels, ballistic, ekf
 from recon.motion import strapdown_motion
 from recon.packed import Wander, unpacked
 from recon.shock import readable_scores
-from recon.strapdown import correct, propagate
+from recon.state import States
+from recon.strapdown import correct, propagate, propagate_plain
 
 from . import linear
 from .ballistic_flight import SPEC, across_plane, entry_state, fly, watch, windy_sounding
@@ -53,7 +54,7 @@ def test_considered_errors_get_no_gain():
 
 def test_shock_scores_are_those_of_the_readable_form():
     problem = linear.random_problem(3, drivers=6)
-    out, innovations = linear.run(problem)
+    _, innovations = linear.run(problem)
     columns = np.array([9, 10, 12])
     begin, end = np.array([7, 2], dtype=np.int64), np.array([11, 9], dtype=np.int64)
     score, variance = np.zeros((2, 3)), np.zeros((2, 3, 3))
@@ -119,6 +120,40 @@ def test_motion_at_a_node_is_newton_s_on_a_turning_earth():
     np.testing.assert_allclose(acceleration, want, rtol=1e-11)
     np.testing.assert_allclose(seen_rate, w, rtol=1e-11)
     assert np.linalg.norm(2.0 * np.cross(spin, velocity)) > 0.1
+
+
+@pytest.mark.parametrize(("first", "last", "clocks"), [(0, 7, False), (7, 0, True)])
+def test_strapdown_steps_are_those_of_the_readable_form(first, last, clocks):
+    rng = np.random.default_rng(3)
+    n = 8
+    motion = strapdown_motion(
+        np.cumsum(rng.uniform(0.004, 0.02, n)),
+        rng.normal(0.0, 20.0, (n, 3)),
+        rng.normal(0.0, 0.6, (n, 3)),
+        rng.uniform(1.0, 2.0, (n, 3)) * 1e-4,
+        rng.uniform(1.0, 2.0, (n, 3)) * 1e-6,
+        *(rotations.dcm_from_q(rotations.exp(rng.normal(0.0, 1.0, 3))) for _ in range(2)),
+        clocks,
+    )
+    errors = np.r_[rng.normal(0.0, 0.05, 18), [4e-4, -3e-4] if clocks else []]
+    start = States(
+        earth.ecef_from_geodetic(-0.6, 1.2, 9e4), np.array([1500.0, -900.0, 700.0]),
+        rotations.exp(rng.normal(0, 1, 3)), errors,
+    )  # fmt: skip
+    fast, plain = propagate(motion, first, last, start), propagate_plain(motion, first, last, start)
+    assert np.abs(fast.state.position_ecef_m - plain.state.position_ecef_m).max() < 1e-8
+    assert np.abs(fast.state.velocity_ecef_mps - plain.state.velocity_ecef_mps).max() < 1e-11
+    assert np.abs(rotations.boxminus(fast.state.q_ecef_body, plain.state.q_ecef_body)).max() < 1e-13
+    # Coriolis on gradient and noise is left out of the kernel's derivatives: 1e-6 a step of what they are; a gradient
+    # of gravity of 1.5e-6 /s^2 over 0.1 s is compared with itself
+    for rows in (slice(0, 3), slice(3, 6), slice(6, 9)):
+        for columns in range(0, fast.transition.shape[1], 3):
+            got, want = (s.transition[rows, columns : columns + 3] for s in (fast, plain))
+            still = np.eye(fast.transition.shape[1])[rows, columns : columns + 3]
+            assert np.abs(got - want).max() < 1e-4 * np.abs(want - still).max() + 1e-18, (rows, columns)
+    sd = np.sqrt(np.diagonal(plain.noise))
+    # the turn of half a step is left out of the noise's lever
+    assert np.abs((fast.noise - plain.noise) / np.outer(sd, sd)).max() < 1e-3
 
 
 @pytest.fixture(scope="module")
