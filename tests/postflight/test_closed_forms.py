@@ -1,0 +1,352 @@
+"""Small parts of the pipeline against closed forms, drawn statistics and sums written out."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from flightmodel import earth
+from postflight import preflight, scoring, sensed
+from postflight.exports.kml import kml_bytes
+from postflight.exports.oem import PLACE, oem_bytes
+from postflight.exports.source import Source
+from postflight.intake.odd_field import turning_field
+from postflight.intake.track import compare, track_force
+from postflight.intake.units import slope_through_mean, unit_that_explains
+from postflight.montecarlo.design import design_for
+from postflight.montecarlo.intervals import is_narrow, percentile_interval
+from postflight.montecarlo.merge import coverage
+from postflight.montecarlo.sobol import indices
+from postflight.product.kinematics import _angles_of
+from postflight.product.trajectory_table import _coefficients
+from postflight.reconciliation.modes import FACTORS, _along, _peak
+from postflight.report.bands import FLOWN
+
+G0 = 9.80665
+
+
+# ------------------------------------------------------------------------------------------------- corrected sensors
+
+
+def test_window_means_are_integrals_of_the_lines_between_samples():
+    t = np.array([0.0, 0.1, 0.35, 0.4, 0.9])
+    values = np.column_stack([np.array([0.0, 1.0, -1.0, 2.0, 0.5]), 3.0 * t])
+    start, end = np.array([0.05, 0.02]), np.array([0.37, 0.88])
+    fine = np.linspace(0.0, 1.0, 200001)
+    for k, (a, b) in enumerate(zip(start, end, strict=True)):
+        x = a + (b - a) * fine
+        want = [np.trapezoid(np.interp(x, t, c), x) / (b - a) for c in values.T]
+        np.testing.assert_allclose(sensed.window_means(t, values, start, end)[k], want, rtol=1e-8)
+
+
+def rotating(noise=0.0, seed=0):
+    """Sensors of a body that speeds up evenly about z: rate a t, felt by an accelerometer at rest about it."""
+    t = np.arange(0.0, 4.0, 0.01)
+    rng = np.random.default_rng(seed)
+    rate = np.column_stack([0.0 * t, 0.0 * t, 0.8 * t]) + noise * rng.standard_normal((len(t), 3))
+    return SimpleNamespace(imu_time_s=t, specific_force_body_mps2=np.zeros((len(t), 3)), rate_body_radps=rate)
+
+
+def test_angular_acceleration_is_the_slope_and_carries_the_force_to_the_cg():
+    at, arm = np.array([1.0, 2.5]), np.array([0.5, 0.2, 0.0])
+    seen = sensed.sensed(rotating(), at, arm)
+    np.testing.assert_allclose(seen.angular_acceleration_radps2, np.tile([0.0, 0.0, 0.8], (2, 1)), atol=1e-9)
+    w = np.column_stack([0.0 * at, 0.0 * at, 0.8 * at])
+    want = np.cross([0.0, 0.0, 0.8], arm) + np.cross(w, np.cross(w, arm))
+    np.testing.assert_allclose(seen.specific_force_cg_mps2, want, rtol=1e-9)
+
+
+def test_angular_acceleration_s_noise_is_that_of_two_means():
+    # the difference of two means of 2 h of white samples over 2 h, drawn: 600 know an sd to 3 %
+    noise, h = 0.01, sensed.HALF_WINDOW_S
+    drawn = [
+        sensed.sensed(rotating(noise, seed), np.array([2.0]), np.zeros(3)).angular_acceleration_radps2[0]
+        for seed in range(200)
+    ]
+    samples = 2.0 * h / 0.01
+    assert np.std(drawn, axis=0).mean() == pytest.approx(np.sqrt(2.0 / samples) * noise / (2.0 * h), rel=0.12)
+
+
+# ------------------------------------------------------------------------------------------------------------ product
+
+
+def test_speed_path_and_heading_of_known_velocities():
+    speed, path, heading = _angles_of(np.array([[0.0, 3.0, -4.0], [-2.0, 0.0, 0.0], [1.0, 0.0, 1.0]]))
+    np.testing.assert_allclose(speed, [5.0, 2.0, np.sqrt(2.0)])
+    np.testing.assert_allclose(np.rad2deg(path), [np.rad2deg(np.arctan2(4.0, 3.0)), 0.0, -45.0], atol=1e-12)
+    np.testing.assert_allclose(np.rad2deg(heading), [90.0, 180.0, 0.0])
+
+
+def test_force_coefficients_scatter_as_they_say():
+    # forces and pressures drawn about one sample: 4000 know an sd to 1.1 %
+    rng, n = np.random.default_rng(1), 4000
+    force, root = np.array([-60.0, 2.0, -3.0]), np.diag([0.6, 0.05, 0.08])
+    push, push_sd = 45.0, 0.03
+    one = _coefficients(force[None], (root @ root.T)[None], np.array([push]), np.array([push_sd]))
+    drawn = _coefficients(
+        force + rng.standard_normal((n, 3)) @ root, np.tile(root @ root.T, (n, 1, 1)),
+        push * np.exp(push_sd * rng.standard_normal(n)), np.full(n, push_sd),
+    )  # fmt: skip
+    assert one["c_a"][0] == pytest.approx(60.0 / 45.0)
+    assert one["cn_over_ca"][0] == pytest.approx(np.hypot(2.0, 3.0) / 60.0)
+    for name in ("c_a", "c_n", "cn_over_ca"):
+        assert np.std(drawn[name]) == pytest.approx(one[f"{name}_sd"][0], rel=0.05), name
+
+
+# -------------------------------------------------------------------------------------------------------- Monte Carlo
+
+
+@pytest.mark.parametrize(("percentile", "n"), [(50.0, 41), (90.0, 80)])
+def test_percentile_intervals_hold_the_truth_as_often_as_they_say(percentile, n):
+    rng, confidence = np.random.default_rng(3), 0.80
+    truth = np.quantile(rng.standard_normal(400001), percentile / 100.0)
+    held = []
+    for _ in range(600):
+        low, high = percentile_interval(rng.standard_normal(n), percentile, confidence)
+        held.append(low <= truth <= high)
+    # at least as often, by no more than one order statistic of a binomial of this size; 600 know a share to 1.6 %
+    assert confidence - 0.05 < np.mean(held) < confidence + 0.12
+
+
+def test_an_interval_is_narrow_when_it_is_no_wider_than_asked():
+    values = np.random.default_rng(1).standard_normal(200)
+    low, high = percentile_interval(values, 50.0, 0.95)
+    assert is_narrow(values, 50.0, 0.95, 1.001 * (high - low))
+    assert not is_narrow(values, 50.0, 0.95, 0.999 * (high - low))
+    assert not is_narrow(values[:3], 97.7, 0.95, 1e9)
+
+
+def test_sobol_indices_of_a_product_and_a_large_mean():
+    # y = 100 + a + 2 b + 3 a' b' of uniform factors (primed: about 1/2): by hand 1/12, 4/12 and 9/144 of variance
+    design = design_for(("x.a", "x.b"), "factor", 2048, 5)
+    draws = [design.draws_of(run) for run in range(design.flights)]
+    a, b = (np.array([d[name] for d in draws]) for name in ("x.a", "x.b"))
+    table, left_out = indices(design, 100.0 + a + 2.0 * b + 3.0 * (a - 0.5) * (b - 0.5))
+    whole = 1.0 / 12.0 + 4.0 / 12.0 + 9.0 / 144.0
+    assert left_out == 0
+    np.testing.assert_allclose(table["first"], np.array([1.0, 4.0]) / 12.0 / whole, atol=0.02)
+    np.testing.assert_allclose(table["total"], (np.array([1.0, 4.0]) / 12.0 + 9.0 / 144.0) / whole, atol=0.02)
+
+
+def test_saltelli_s_third_block_is_a_with_one_column_of_b():
+    design = design_for(("x.a", "x.b", "y.c"), "factor", 8, 1)
+    blocks = [[design.draws_of(8 * k + row) for row in range(8)] for k in range(5)]
+    for row in range(8):
+        for column, name in enumerate(design.factors):
+            for k in range(3):
+                source = blocks[1] if k == column else blocks[0]
+                assert blocks[2 + k][row][name] == source[row][name]
+
+
+def test_coverage_counts_one_and_two_standard_deviations():
+    error = np.array([0.5, -0.9, 1.5, -1.9, 2.5, 0.1])
+    table = pd.DataFrame({"trim_error_deg": 0.2 * error, "trim_sd_deg": np.full(6, 0.2)})
+    found = coverage(table)["trim"]
+    assert found["inside_1_sd"] == pytest.approx(3.0 / 6.0)
+    assert found["inside_2_sd"] == pytest.approx(5.0 / 6.0)
+    assert found["rms_over_sd"] == pytest.approx(np.sqrt(np.mean(error**2)))
+
+
+# ---------------------------------------------------------------------------------------------------- scores and bands
+
+
+def test_inside_a_band_is_between_its_limits():
+    t = np.array([0.0, 1.0])
+    got = preflight.inside(
+        np.array([0.5] * 3), np.array([0.4, 1.0, 2.6]), t, np.array([0.0, 1.0]), np.array([2.0, 3.0])
+    )
+    assert got.tolist() == [False, True, False]
+
+
+def test_acceleration_across_the_axis_is_that_of_both_axes():
+    bet = pd.DataFrame({"ay_cg_mps2": [3.0 * G0], "az_cg_mps2": [-4.0 * G0]})
+    assert float(np.asarray(FLOWN["normal_g"][2](bet))[0]) == pytest.approx(5.0)
+
+
+def test_errors_of_a_trajectory_over_its_pulse_are_those_that_were_planted():
+    # a straight flight off by known vectors, everywhere alike: rms are their lengths; the angle's is its own
+    n = 41
+    t = np.arange(n) * 0.5
+    truth = pd.DataFrame(0.0, index=range(n), columns=list(scoring.STATE_COLUMNS))
+    truth["t_s"], truth["qw_ecef_body"] = t, 1.0
+    truth["rx_ecef_m"], truth["vx_ecef_mps"] = 6.5e6 + 100.0 * t, 100.0
+    truth["dynamic_pressure_pa"] = 1000.0 * np.exp(-(((t - 10.0) / 3.0) ** 2))
+    truth["alpha_body_deg"] = 5.0
+    bet = truth.drop(columns=["dynamic_pressure_pa", "alpha_body_deg"]).copy()
+    bet["ry_ecef_m"] += 3.0
+    bet["rz_ecef_m"] -= 4.0
+    bet["vz_ecef_mps"] += 0.2
+    bet["alpha_total_wind_deg"] = 5.3
+    found = scoring._bet_errors(bet, truth)
+    assert found["position_rms_m"] == pytest.approx(5.0)
+    assert found["velocity_rms_mps"] == pytest.approx(0.2)
+    assert found["alpha_total_rms_deg"] == pytest.approx(0.3)
+    # half the peak: |t - 10| < 3 sqrt(ln 2) = 2.498
+    assert found["pulse_start_s"] == 8.0
+    assert found["pulse_end_s"] == 12.0
+
+
+def test_a_method_s_row_is_estimate_minus_truth(tmp_path):
+    table = pd.DataFrame(
+        {"t_s": [1.0, 2.0, 3.0], "theta_deg": [3.0, 3.5, 4.0], "plane_lv_deg": 180.0, "theta_sd_deg": 0.2}
+    )
+    table.to_csv(tmp_path / "deflection_trim.csv", index=False)
+    row = scoring._method_row(tmp_path / "deflection_trim.csv", 2.0, 3.0)
+    assert row["error_deg"] == pytest.approx(0.5)
+    assert row["sd_deg"] == pytest.approx(0.2)
+
+
+# ------------------------------------------------------------------------------------------------------------ exports
+
+
+def source():
+    t = np.arange(0.0, 3.0, 0.5)
+    state = {name: (1000.0 * (k + 1) + 7.0 * t) for k, name in enumerate(PLACE)}
+    place = {"lat_deg": 37.0 + 0.01 * t, "lon_deg": -75.0 + 0.02 * t, "alt_m": 9e4 - 1e3 * t}
+    covariance = np.tile(np.diag([4.0, 9.0, 16.0, 0.01, 0.04, 0.09, 1.0, 1.0, 1.0]), (3, 1, 1))
+    return Source(
+        "flight", "run", datetime(2009, 8, 17, 12, 50, tzinfo=UTC), "2026-01-01T00:00:00Z", True, {"point": "datum"},
+        pd.DataFrame({"t_s": t} | state | place), pd.DataFrame({"event": ["apogee"], "t_s": [1.25]}), {},
+        np.arange(3.0), covariance,
+    )  # fmt: skip
+
+
+def test_oem_is_in_kilometres_and_their_squares():
+    lines = oem_bytes(source()).decode().splitlines()
+    first = lines[lines.index("META_STOP") + 2].split()
+    assert first[0] == "2009-08-17T12:50:00.000000"
+    np.testing.assert_allclose([float(x) for x in first[1:]], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    assert lines[lines.index("META_STOP") + 3].split()[0] == "2009-08-17T12:50:00.500000"
+    diagonal = [float(lines[lines.index("COVARIANCE_START") + 3 + k].split()[k]) for k in range(6)]
+    np.testing.assert_allclose(diagonal, np.array([4.0, 9.0, 16.0, 0.01, 0.04, 0.09]) / 1e6)
+
+
+def test_kml_has_longitude_before_latitude():
+    words = kml_bytes(source()).decode()
+    lon, lat, alt = (float(x) for x in words.split("<gx:coord>")[1].split("<")[0].split())
+    assert (lon, lat, alt) == (-75.0, 37.0, 9e4)
+
+
+# ------------------------------------------------------------------------------------------------------ intake checks
+
+
+def falling(width_s=4.0, noise_m=0.0, seed=0, thrust=0.0):
+    """ECEF places of a fall from 100 km, with a steady push along its start's radius."""
+    t = np.arange(0.0, 60.0, 0.1)
+    r, v = np.array([6.478e6, 0.0, 0.0]), np.array([-200.0, 900.0, 100.0])
+    out = []
+    h = 0.1
+    for _ in t:
+        out.append(r)
+
+        def a(r):
+            return earth.gravitation(r) + np.array([thrust, 0.0, 0.0])
+
+        k1 = a(r)
+        k2 = a(r + 0.5 * h * v)
+        k3 = a(r + 0.5 * h * v + 0.25 * h * h * k1)
+        k4 = a(r + h * v + 0.5 * h * h * k2)
+        r, v = r + h * v + h * h / 6.0 * (k1 + k2 + k3), v + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    eci = np.array(out) + noise_m * np.random.default_rng(seed).standard_normal((len(t), 3))
+    from flightmodel import rotations
+
+    return t, rotations.rotate(earth.q_ecef_eci(t), eci)
+
+
+def test_a_track_tells_no_force_of_a_free_fall_and_the_whole_of_a_push():
+    for thrust in (0.0, 12.0):
+        force = track_force(*falling(thrust=thrust), 4.0)
+        np.testing.assert_allclose(force.force_mps2, np.tile([thrust, 0.0, 0.0], (len(force.time_s), 1)), atol=2e-3)
+
+
+def test_a_track_s_forces_scatter_as_they_say():
+    normalised = []
+    for seed in range(6):
+        force = track_force(*falling(noise_m=3.0, seed=seed), 4.0)
+        sd = np.sqrt(np.diagonal(force.covariance, axis1=1, axis2=2))
+        normalised.append(force.force_mps2 / sd)
+    # some 160 windows of three axes, half of them overlapping, of 40 samples each: an sd to 4 %
+    assert np.std(np.concatenate(normalised)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_late_track_and_its_scale_are_found():
+    # a force that swells and ebbs, told by an accelerometer 0.4 s earlier than by the track's tags
+    force = track_force(*falling(), 2.0)
+    t = np.arange(-10.0, 75.0, 0.01)
+
+    def size(at):
+        return 30.0 + 25.0 * np.sin(0.35 * at)
+
+    swelling = replace(
+        force, force_mps2=np.column_stack([size(force.time_s - 0.4), 0.0 * force.time_s, 0.0 * force.time_s]),
+        covariance=np.tile(1e-4 * np.eye(3), (len(force.time_s), 1, 1)),
+    )  # fmt: skip
+    found = compare(swelling, t, np.column_stack([size(t) / 1.3, 0.0 * t, 0.0 * t]))
+    # the windows' kernel takes 1 % of the swelling, which moves no peak
+    assert found.lag_s == pytest.approx(0.4, abs=0.01)
+    assert found.scale == pytest.approx(1.3, rel=0.02)
+
+
+def test_slope_s_sd_is_its_scatter():
+    rng, x = np.random.default_rng(2), np.linspace(0.0, 3.0, 30)
+    found = np.array([slope_through_mean(x, 2.0 * x + 0.5 + 0.3 * rng.standard_normal(30)) for _ in range(1500)])
+    assert found[:, 0].mean() == pytest.approx(2.0, abs=0.01)
+    assert np.std(found[:, 0]) == pytest.approx(np.sqrt(np.mean(found[:, 1] ** 2)), rel=0.08)
+
+
+@pytest.mark.parametrize(("ratio", "unit", "wanted"), [(G0, "mps2", "g"), (1.0 / G0, "g", "mps2"), (0.3048, "m", "ft")])
+def test_unit_that_explains_makes_values_as_many_times_as_large(ratio, unit, wanted):
+    assert unit_that_explains(ratio, unit) == wanted
+    assert unit_that_explains(1.0, unit) == unit
+    assert unit_that_explains(1.7 * ratio, unit) is None
+
+
+def test_a_field_that_turns_as_the_gyros_say_raises_nothing():
+    # a field at rest in space, seen from a body that turns: b' = b x w. With the gyros' signs turned it is explained
+    # by no reading as they stand
+    t = np.arange(0.0, 40.0, 0.02)
+    w = np.column_stack([0.5 + 0.2 * np.sin(0.4 * t), 0.3 * np.cos(0.7 * t), 0.25 * np.sin(0.9 * t)])
+    b, fields = np.array([2e-5, -1e-5, 4e-5]), []
+    for k in range(len(t)):
+        fields.append(b)
+        half = b + 0.01 * np.cross(b, w[k])
+        b = b + 0.02 * np.cross(half, w[k])
+        b = b * np.linalg.norm(fields[0]) / np.linalg.norm(b)
+
+    def told(rate):
+        def record(values):
+            spec = SimpleNamespace(dcm_body_sensor=np.eye(3), name="")
+            return SimpleNamespace(time_s=t, measured_sensor=values, spec=spec)
+
+        rates = SimpleNamespace(columns={}, declared=lambda short: f"{short}_radps")
+        spec = SimpleNamespace(sensors=SimpleNamespace(rates=rates))
+        return SimpleNamespace(triads={"rates": record(rate), "magnetometer": record(np.array(fields))}, spec=spec)
+
+    findings, clock = turning_field(told(w))
+    assert findings == []
+    assert clock is not None
+    assert abs(clock[0]) < 0.02
+    findings, _ = turning_field(told(-w))
+    assert len(findings) == 1
+
+
+# ----------------------------------------------------------------------------------------------------- reconciliation
+
+
+def test_what_is_gathered_along_a_track_is_both_senses_mean():
+    frequency = np.fft.fftfreq(64, 1.0 / 32.0)
+    power = np.zeros((2, 64))
+    power[0] = np.where(np.abs(frequency) == 3.0, np.where(frequency > 0, 2.0, 1.0), 0.0)
+    got = _along(frequency, power, np.array([3.0, np.nan]))
+    np.testing.assert_allclose(got, [1.5, 0.0])
+    half_way = _along(frequency, power, np.array([3.25, np.nan]))
+    np.testing.assert_allclose(half_way, [0.75, 0.0])
+
+
+def test_the_best_factor_is_a_parabola_s_top():
+    x = np.log(FACTORS)
+    for top in (0.013, -0.2):
+        assert _peak(5.0 - 3.0 * (x - top) ** 2) == pytest.approx(top, abs=1e-9)
