@@ -176,6 +176,17 @@ def test_ballistic_steps_are_those_of_the_readable_form(carried, first, last):
     assert (np.abs(fast.transition - plain.transition) <= 1e-8 * size).all()
 
 
+def test_a_step_of_hard_braking_is_of_fourth_order(carried):
+    # a drag that takes a tenth of the speed in a step: rules of second order differ by 0.1^3 of it, 1 m/s
+    motion, index, start = carried
+    braked = replace(start, sensor_errors=np.r_[6.0, start.sensor_errors[1:]])
+    fast = propagate(motion, index[0], index[1], braked)
+    plain = ballistic.propagate_plain(motion, index[0], index[1], braked)
+    lost = np.linalg.norm(fast.state.velocity_ecef_mps - start.velocity_ecef_mps)
+    assert lost > 50.0
+    np.testing.assert_allclose(fast.state.velocity_ecef_mps, plain.state.velocity_ecef_mps, atol=1e-7 * lost)
+
+
 def short_fall():
     t, states = fly(3, end_s=6.2)
     return watch(t, states, 3)

@@ -123,3 +123,16 @@ def test_air_turns_with_the_earth_and_blows_from_where_it_should(generic_vehicle
     _, blown = kernel_rates(state, generic_vehicle, packing.atmosphere_table(windy()))
     sound = float(calm.at(still[0]).sound_speed_mps)
     assert blown[2] * sound == pytest.approx(np.hypot(12.0, 23.0), rel=1e-6)
+
+
+def test_a_locked_joint_carries_the_difference_of_gravity(generic_vehicle):
+    # without air and at rest: the joint's force is what keeps the body from falling as its own place asks for
+    state = entry_45_km()
+    state[14:20] = 0.0
+    got, aux = kernel_rates(state, generic_vehicle, packing.vacuum_table(), locked=True)
+    about, loads = dynamics.offsets(state, generic_vehicle), dynamics.flight_loads(state, generic_vehicle, None)
+    turn = rotations.rotate(state[6:10], got[14:17])
+    body = generic_vehicle.centerbody
+    want = body.mass_kg * (got[3:6] + np.cross(turn, about["body"][0])) - loads.force_body_n
+    assert 1e-6 < np.linalg.norm(want) < 1e-2
+    np.testing.assert_allclose(aux[6:9], want, atol=2e-9)
