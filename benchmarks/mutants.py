@@ -411,6 +411,7 @@ def main() -> int:
     parser.add_argument("--anew", action="store_true", help="forget kept results")
     parser.add_argument("--survivors", action="store_true", help="only those that survived when last run")
     parser.add_argument("--kernels", choices=("with", "without", "only"), default="with")
+    parser.add_argument("--named", action="store_true", help="only entries that name their tests: nothing is recorded")
     parser.add_argument("--list", action="store_true", help="where each entry is; runs nothing")
     options = parser.parse_args()
     mutants = [
@@ -418,6 +419,7 @@ def main() -> int:
         for one in read_entries(ROOT)
         if one.package in (options.package or PACKAGES)
         and options.only in f"{one.error} {one.was} {one.path}"
+        and (one.tests or not options.named)
         and options.kernels in ("with", "only" if one.in_kernel else "without")
     ]
     if options.list:
