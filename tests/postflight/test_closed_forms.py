@@ -8,7 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from flightmodel import earth
+from flightmodel import earth, rotations
+from flightmodel.airdata import lateral_angles
+from flightmodel.instruments import TriadSpec
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight import preflight, scoring, sensed
 from postflight.exports.kml import kml_bytes
 from postflight.exports.oem import PLACE, oem_bytes
@@ -68,6 +71,42 @@ def test_angular_acceleration_s_noise_is_that_of_two_means():
     ]
     samples = 2.0 * h / 0.01
     assert np.std(drawn, axis=0).mean() == pytest.approx(np.sqrt(2.0 / samples) * noise / (2.0 * h), rel=0.12)
+
+
+def made_pulse(seed=0, noise=0.004):
+    """Pulse data of a body that flies straight and turns evenly, with noise of the gyros alone."""
+    bet, rng = rotating(noise, seed), np.random.default_rng(5)
+    grid = np.arange(0.5, 3.5, 0.1)
+    n = len(grid)
+    bet.smoothed, bet.output_rate_hz = SimpleNamespace(time_s=grid), 10.0
+    bet.accelerometer_root = 1e-3 * rng.normal(size=(n, 6, 9))
+    vehicle = vehicle_from_toml(vehicle_path("irve2_reference"))
+    force = TriadSpec("accelerometer", vehicle.cg_m, np.eye(3), 0.01, 0.0, 0.0, 0.0)
+    rates = TriadSpec("rates", np.zeros(3), np.eye(3), noise, 0.0, 0.0, 0.0)
+    triads = tuple(SimpleNamespace(spec=s) for s in (force, rates))
+    telemetry = SimpleNamespace(required_vehicle=lambda: vehicle, required_triads=lambda: triads)
+    velocity = np.tile([800.0, 30.0, -20.0], (n, 1))
+    one = np.ones(n)
+    air = SimpleNamespace(
+        velocity_air_body_mps=velocity, lateral_flow_cov=np.zeros((n, 2, 2)), altitude_m=one, mach=one,
+        air=SimpleNamespace(wind_sd_mps=4.0 * one), dynamic_pressure_pa=one, dynamic_pressure_sd_pa=one,
+        airspeed_mps=800.0 * one,
+    )  # fmt: skip
+    return sensed.pulse_data(telemetry, bet, air), bet.accelerometer_root, velocity
+
+
+def test_pulse_data_state_their_noise_and_the_flow_s_errors():
+    pulse, root, velocity = made_pulse()
+    drawn = np.concatenate([made_pulse(seed)[0].angular_acceleration_body_radps2[::5, :2] for seed in range(25)])
+    # some 300 draws know an sd to 4 %; windows that do not end on samples weigh some of them by halves
+    assert pulse.angular_acceleration_sd_radps2 == pytest.approx(np.std(drawn), rel=0.25)
+    # a wind across moves the flow by itself over the speed along the axis
+    np.testing.assert_allclose(pulse.wind_flow_sd_rad, 4.0 / 800.0)
+    # an attitude error e of the body shows the same flow in axes turned by e
+    for k in range(9):
+        turned = rotations.rotate(rotations.conjugate(rotations.exp(root[:, :3, k])), velocity)
+        change = lateral_angles(turned) - lateral_angles(velocity)
+        np.testing.assert_allclose(pulse.flow_root_rad[:, :, k], change, atol=0.02 * np.abs(change).max())
 
 
 # ------------------------------------------------------------------------------------------------------------ product
@@ -251,8 +290,6 @@ def falling(width_s=4.0, noise_m=0.0, seed=0, thrust=0.0):
         k4 = a(r + h * v + 0.5 * h * h * k2)
         r, v = r + h * v + h * h / 6.0 * (k1 + k2 + k3), v + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     eci = np.array(out) + noise_m * np.random.default_rng(seed).standard_normal((len(t), 3))
-    from flightmodel import rotations
-
     return t, rotations.rotate(earth.q_ecef_eci(t), eci)
 
 
