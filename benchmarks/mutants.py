@@ -193,7 +193,7 @@ class Server:
         assert self.process.stdout is not None
         self.process.stdin.write(json.dumps(job) + "\n")
         self.process.stdin.flush()
-        code = int(self.process.stdout.readline())
+        code = int(self.process.stdout.readline() or 3)  # nothing: the server itself was ended
         seconds = time.monotonic() - start
         if code == ENDLESS:
             return "endless", f"no end in {LONGEST_S:.0f} s", seconds

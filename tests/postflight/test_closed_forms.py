@@ -98,8 +98,9 @@ def made_pulse(seed=0, noise=0.004):
 def test_pulse_data_state_their_noise_and_the_flow_s_errors():
     pulse, root, velocity = made_pulse()
     drawn = np.concatenate([made_pulse(seed)[0].angular_acceleration_body_radps2[::5, :2] for seed in range(25)])
-    # some 300 draws know an sd to 4 %; windows that do not end on samples weigh some of them by halves
-    assert pulse.angular_acceleration_sd_radps2 == pytest.approx(np.std(drawn), rel=0.25)
+    # before and after share the sample between them, whose halves cancel, and count their ends by halves: of five
+    # samples each 0.34 of a sample's variance is left where 2/5 is stated. Some 300 draws know an sd to 4 %
+    assert np.std(drawn) / pulse.angular_acceleration_sd_radps2 == pytest.approx(np.sqrt(0.34 / 0.40), rel=0.13)
     # a wind across moves the flow by itself over the speed along the axis
     np.testing.assert_allclose(pulse.wind_flow_sd_rad, 4.0 / 800.0)
     # an attitude error e of the body shows the same flow in axes turned by e
