@@ -10,9 +10,11 @@ import pytest
 
 from flightmodel import earth, rotations
 from flightmodel.airdata import lateral_angles
+from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.instruments import TriadSpec
+from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight import preflight, scoring, sensed
+from postflight import day_air, preflight, scoring, sensed
 from postflight.exports.kml import kml_bytes
 from postflight.exports.oem import PLACE, oem_bytes
 from postflight.exports.source import Source
@@ -23,7 +25,7 @@ from postflight.montecarlo.design import design_for
 from postflight.montecarlo.intervals import is_narrow, percentile_interval
 from postflight.montecarlo.merge import coverage
 from postflight.montecarlo.sobol import indices
-from postflight.product.kinematics import _angles_of
+from postflight.product.kinematics import Inputs, _angles_of, derived
 from postflight.product.trajectory_table import _coefficients
 from postflight.reconciliation.modes import FACTORS, _along, _peak
 from postflight.report.bands import FLOWN
@@ -73,6 +75,28 @@ def test_angular_acceleration_s_noise_is_that_of_two_means():
     assert np.std(drawn, axis=0).mean() == pytest.approx(np.sqrt(2.0 / samples) * noise / (2.0 * h), rel=0.12)
 
 
+def test_windows_of_the_air_carry_the_force_by_both_terms_of_the_lever():
+    # evenly faster turning about z: w' x arm and the mean of w x (w x arm) over a window, whose square grows
+    at, arm = np.array([1.5, 2.2]), np.array([0.5, 0.2, 0.3])
+    half = 0.5 * day_air.WINDOW_S
+    mean_square = 0.8**2 * ((at + half) ** 3 - (at - half) ** 3) / (6.0 * half)
+    want = np.cross([0.0, 0.0, 0.8], arm) - mean_square[:, None] * (arm * [1.0, 1.0, 0.0])
+    np.testing.assert_allclose(day_air._force_means(rotating(), arm, at), want, atol=1e-4)
+
+
+def test_drag_is_known_as_well_as_coefficient_and_mass(monkeypatch):
+    vehicle, seen = vehicle_from_toml(vehicle_path("irve2_reference")), []
+    monkeypatch.setattr(day_air, "air_samples", lambda *_: None)
+    monkeypatch.setattr(day_air, "reconstruct_air", lambda _samples, _profile, drag, _confidence: seen.append(drag))
+    day_air.day_air(SimpleNamespace(required_vehicle=lambda: vehicle), None, None, 0.99)
+    # acceleration is C q S / m: relative errors of C and of m add as independent ones
+    rng, known = np.random.default_rng(1), vehicle.uncertainty
+    for sd, own in ((seen[0].ca_sd, known.ca), (seen[0].cn_sd, known.cn)):
+        drawn = (1.0 + own * rng.standard_normal(200000)) / (1.0 + known.mass * rng.standard_normal(200000))
+        assert sd == pytest.approx(np.std(drawn), rel=0.01)
+    assert seen[0].area_per_mass_m2pkg == pytest.approx(vehicle.reference.area_m2 / vehicle.mass_kg)
+
+
 def made_pulse(seed=0, noise=0.004):
     """Pulse data of a body that flies straight and turns evenly, with noise of the gyros alone."""
     bet, rng = rotating(noise, seed), np.random.default_rng(5)
@@ -118,6 +142,25 @@ def test_speed_path_and_heading_of_known_velocities():
     np.testing.assert_allclose(speed, [5.0, 2.0, np.sqrt(2.0)])
     np.testing.assert_allclose(np.rad2deg(path), [np.rad2deg(np.arctan2(4.0, 3.0)), 0.0, -45.0], atol=1e-12)
     np.testing.assert_allclose(np.rad2deg(heading), [90.0, 180.0, 0.0])
+
+
+def test_what_drifts_with_the_wind_has_no_airspeed():
+    # carried north by 12 and east by 23 m/s in such a wind; against the Earth it moves, against inertial space faster
+    calm = standard_atmosphere()
+    wind = np.tile([12.0, -23.0, 0.0], (len(calm.altitude_m), 1))
+    r = earth.ecef_from_geodetic(0.6, -1.2, 3e4)[None]
+    v = earth.ecef_from_ned(np.array([12.0, -23.0, 0.0]), r[0])[None]
+    path = Trajectory("2009-08-17T12:50:00Z", np.zeros(1), "datum", r, v, np.array([[1.0, 0.0, 0.0, 0.0]]), 0.0 * r)
+    nothing = Inputs(path, np.zeros((1, 2)), np.zeros(1), np.zeros(1))
+    made = derived(nothing, replace(calm, wind_ned_mps=wind), np.zeros(3))
+    assert made["speed_wind"][0] < 1e-9
+    assert made["speed_ground"][0] == pytest.approx(np.hypot(12.0, 23.0))
+    inertial = v[0] + np.cross(earth.OMEGA_ECEF_RADPS, r[0])
+    assert made["speed_inertial"][0] == pytest.approx(np.linalg.norm(inertial))
+    blown = replace(nothing, wind_mps=np.array([[4.0, 3.0]]))
+    made = derived(blown, replace(calm, wind_ned_mps=wind), np.zeros(3))
+    assert made["speed_wind"][0] == pytest.approx(5.0, rel=1e-6)
+    assert made["dynamic_pressure"][0] == pytest.approx(0.5 * made["density"][0] * 25.0, rel=1e-6)
 
 
 def test_force_coefficients_scatter_as_they_say():

@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from flightmodel.instruments import TriadSpec
-from flightmodel.telemetry import TriadRecord
+from flightmodel.instruments import GnssSpec, TriadSpec
+from flightmodel.telemetry import GnssRecord, TriadRecord
+from flightmodel.trajectory import Trajectory
 from recon.attitude_check import _suspects
+from recon.consistency import source_verdicts
+from recon.disagreement import _apart
 from recon.displaced import _jumps
 from recon.disturbance import with_stated
 from recon.error_model import triad_blocks
-from recon.gaps import Unused, _between_slow, _missed_alike, bridge
+from recon.gaps import Unused, _between_slow, _bridges, _missed_alike, bridge
 from recon.inertial import unbent
+from recon.measurements import gnss_instruments, magnetometer_instrument
 from recon.motion import strapdown_motion
 from recon.startup import fit_first_points
 from recon.stuck import repeat_by_noise
@@ -137,3 +141,80 @@ def test_a_wild_point_does_not_move_the_start(monkeypatch):
     at, speed = fit_first_points((), 101.0)
     np.testing.assert_allclose(at, place, atol=1.0)
     np.testing.assert_allclose(speed, velocity, atol=1.0)
+
+
+def test_whiteness_is_judged_of_residuals_over_their_own_sd():
+    # a first-order process in units of an sd that changes a hundredfold from point to point: its correlation is told
+    rng, n = np.random.default_rng(6), 4000
+    z = np.zeros(n)
+    for k in range(1, n):
+        z[k] = 0.5 * z[k - 1] + rng.standard_normal()
+    sd = np.where(np.arange(n) % 2, 100.0, 1.0)
+    residual, covariance = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
+    residual[:, 0], covariance[:, 0, 0] = sd * z, sd**2
+    variance = np.tile([1.0, np.inf, np.inf], (n, 1))
+    radar = SimpleNamespace(name="radar", components=("range",))
+    problem = SimpleNamespace(
+        time_s=np.arange(n) * 1.0, node=np.arange(n), instruments=[radar],
+        observed=SimpleNamespace(variance=variance, source=np.zeros(n, dtype=int), usable=np.ones(n, dtype=bool)),
+    )  # fmt: skip
+    innovations = SimpleNamespace(residual=residual, covariance=covariance, nis=z**2, accepted=np.ones(n, dtype=bool))
+    found = {v.name: v.value for v in source_verdicts(problem, innovations, 0.99)}
+    assert found["whiteness radar range"] == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_receiver_s_arm_reads_antenna_from_accelerometer():
+    antenna, accelerometer = np.array([0.3, -0.2, 0.1]), np.array([-1.0, 0.05, 0.0])
+    spec = GnssSpec("receiver", antenna, 4.0, 6.0, 0.1, 0.2)
+    place = np.array([[6.4e6, 1e5, 2e5], [6.4e6, 1.01e5, 2e5]])
+    for one in gnss_instruments("receiver", GnssRecord(spec, np.arange(2.0), place, place), accelerometer):
+        np.testing.assert_allclose(one.arm_body_m, antenna - accelerometer)
+
+
+def test_a_cubic_bridge_is_a_parabola_s_own_course():
+    t = np.concatenate([np.arange(0.0, 1.0, 0.01), np.arange(1.5, 2.5, 0.01)])
+    x = np.column_stack([3.0 * t**2 - t, 5.0 - 2.0 * t])
+    times = np.linspace(1.05, 1.45, 9)
+    cubic, _ = _bridges(t, x, 99, 100, times)
+    np.testing.assert_allclose(cubic, np.column_stack([3.0 * times**2 - times, 5.0 - 2.0 * times]), atol=1e-9)
+
+
+def test_what_a_bridge_misses_is_as_large_as_its_density_says():
+    # a wandering signal with a gap of 0.1 s: the integral's miss over the root of density times length, of 40 records
+    ratios = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0.0, 8.0, 0.004)
+        x = np.cumsum(rng.normal(0.0, 0.3, (len(t), 3)), axis=0)
+        hole = (t > 4.0) & (t < 4.1)
+        made = bridge(TriadRecord(spec(), t[~hole], x[~hole]))
+        inside = (made.time_s >= 3.999) & (made.time_s <= 4.101)
+        filled = np.trapezoid(made.measured_sensor[inside], made.time_s[inside], axis=0)
+        true = (t >= 3.999) & (t <= 4.101)
+        missed = filled - np.trapezoid(x[true], t[true], axis=0)
+        k = int(np.searchsorted(made.time_s, 4.05))
+        ratios += list(missed / np.sqrt(made.density[k] * 0.104))
+    # 120 know an rms to 7 %; the worse side's scatter of 24 overlapping pieces lies above the true one
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.2
+
+
+def test_a_rounded_field_errs_by_its_rounding_too():
+    made = TriadSpec("magnetometer", np.zeros(3), np.eye(3), 2e-8, 0.0, 0.0, 0.0, resolution=1e-7)
+    record = TriadRecord(made, np.arange(4.0), np.full((4, 3), 3e-5))
+    one = magnetometer_instrument("magnetometer", record, np.full((2, 3), 3e-5), np.array([0, 2]))
+    # a reading rounded to whole steps is off by anything up to half of one
+    rounding = np.mean(np.linspace(-0.5e-7, 0.5e-7, 100001) ** 2)
+    np.testing.assert_allclose(one.variance, 2e-8**2 + rounding, rtol=1e-4)
+
+
+def test_a_solution_is_apart_beyond_what_leaving_a_source_out_costs():
+    # variances of 4 without and 3 with a source: 1 is lost, so at 99.9 % of three axes 4.03 m may lie between
+    def path(shift, variance):
+        r = np.tile([6.5e6, 0.0, 0.0], (3, 1)) + [0.0, shift, 0.0]
+        cov = np.tile(variance * np.eye(9), (3, 1, 1))
+        q = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
+        return Trajectory("2009-08-17T12:50:00Z", np.arange(3.0), "datum", r, 0.0 * r, q, 0.0 * r, cov)
+
+    for shift, apart in ((3.9, False), (4.2, True)):
+        _, _, far = _apart(path(0.0, 3.0), path(shift, 4.0))
+        assert far.tolist() == [apart] * 3
