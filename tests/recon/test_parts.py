@@ -210,7 +210,7 @@ def test_a_rounded_field_errs_by_its_rounding_too():
 def test_a_solution_is_apart_beyond_what_leaving_a_source_out_costs():
     # variances of 4 without and 3 with a source: 1 is lost, so at 99.9 % of three axes 4.03 m may lie between
     def path(shift, variance):
-        r = np.tile([6.5e6, 0.0, 0.0], (3, 1)) + [0.0, shift, 0.0]
+        r = np.tile([6.5e6, shift, 0.0], (3, 1))
         cov = np.tile(variance * np.eye(9), (3, 1, 1))
         q = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
         return Trajectory("2009-08-17T12:50:00Z", np.arange(3.0), "datum", r, 0.0 * r, q, 0.0 * r, cov)
