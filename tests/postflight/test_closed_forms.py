@@ -25,6 +25,7 @@ from postflight.montecarlo.design import design_for
 from postflight.montecarlo.intervals import is_narrow, percentile_interval
 from postflight.montecarlo.merge import coverage
 from postflight.montecarlo.sobol import indices
+from postflight.product import trajectory_table
 from postflight.product.kinematics import Inputs, _angles_of, derived
 from postflight.product.trajectory_table import _coefficients
 from postflight.reconciliation.modes import FACTORS, _along, _peak
@@ -161,6 +162,23 @@ def test_what_drifts_with_the_wind_has_no_airspeed():
     made = derived(blown, replace(calm, wind_ned_mps=wind), np.zeros(3))
     assert made["speed_wind"][0] == pytest.approx(5.0, rel=1e-6)
     assert made["dynamic_pressure"][0] == pytest.approx(0.5 * made["density"][0] * 25.0, rel=1e-6)
+
+
+def test_inertial_velocity_errs_with_the_place_by_the_earth_s_turning():
+    # a place that is known to 1 km and a velocity known well: v + W x r errs by W times the place, 0.07 m/s
+    r = earth.ecef_from_geodetic(0.0, 0.4, 5e4)[None]
+    covariance = np.diag([1e6] * 3 + [1e-8] * 3 + [1e-6] * 3)[None]
+    path = Trajectory(
+        "2009-08-17T12:50:00Z", np.zeros(1), "datum", r, 0.0 * r, np.array([[1.0, 0.0, 0.0, 0.0]]), 0.0 * r, covariance
+    )  # fmt: skip
+    rates = SimpleNamespace(spec=SimpleNamespace(noise_sd=0.03))
+    bet = SimpleNamespace(smoothed=path, rate_cov=np.tile(0.04**2 * np.eye(3), (1, 1, 1)))
+    made = trajectory_table._inertial(SimpleNamespace(reconstruction=bet))
+    assert made["vx_eci_sd_mps"][0] == pytest.approx(1000.0 * earth.OMEGA_RADPS, rel=1e-4)
+    assert made["vz_eci_sd_mps"][0] == pytest.approx(1e-4, rel=1e-4)
+    # rates: what was estimated of the errors, and a sample's own noise
+    flight = SimpleNamespace(reconstruction=bet, telemetry=SimpleNamespace(rates=rates))
+    np.testing.assert_allclose(trajectory_table._rate_sd(flight), 0.05)
 
 
 def test_force_coefficients_scatter_as_they_say():
