@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from flightmodel import rotations
 from flightmodel.instruments import GnssSpec, TriadSpec
 from flightmodel.telemetry import GnssRecord, TriadRecord
-from flightmodel.trajectory import Trajectory
-from recon.attitude_check import _suspects
+from flightmodel.trajectory import Trajectory, difference
+from recon.attitude_check import _suspects, compare
 from recon.consistency import source_verdicts
 from recon.disagreement import _apart
 from recon.displaced import _jumps
@@ -19,7 +20,10 @@ from recon.gaps import Unused, _between_slow, _bridges, _missed_alike, bridge
 from recon.inertial import unbent
 from recon.measurements import gnss_instruments, magnetometer_instrument
 from recon.motion import strapdown_motion
+from recon.packed import packed
+from recon.product import Mounting, datum_trajectory
 from recon.startup import fit_first_points
+from recon.state import States, boxplus
 from recon.stuck import repeat_by_noise
 
 
@@ -218,3 +222,58 @@ def test_a_solution_is_apart_beyond_what_leaving_a_source_out_costs():
     for shift, apart in ((3.9, False), (4.2, True)):
         _, _, far = _apart(path(0.0, 3.0), path(shift, 4.0))
         assert far.tolist() == [apart] * 3
+
+
+def datum_of(state, covariance, noise_sd=0.0):
+    arm = np.array([-1.2, 0.3, 0.2])
+    rate = SimpleNamespace(
+        time_s=np.array([0.0, 1.0]), measured_sensor=np.tile([0.6, -0.3, 0.4], (2, 1)),
+        spec=SimpleNamespace(noise_sd=noise_sd),
+    )  # fmt: skip
+    problem = SimpleNamespace(
+        time_s=np.array([0.0, 1.0]), kept=np.array([True, True]), motion=SimpleNamespace(dcm_body_rate=np.eye(3))
+    )
+    mounting = Mounting("2009-08-17T12:50:00Z", arm, rate)
+    return datum_trajectory(problem, mounting, state, packed(np.tile(covariance, (2, 1, 1)))), arm
+
+
+def test_the_datum_errs_as_the_moved_state_does():
+    # one direction of all 27 errors: the covariance is the square of what the datum moves by
+    rng = np.random.default_rng(2)
+    state = States(
+        np.tile([6.4e6, 1e5, 2e5], (2, 1)), np.tile([1e3, -2e3, 3e2], (2, 1)),
+        np.tile(rotations.exp(np.array([0.4, -0.2, 0.9])), (2, 1)), np.zeros((2, 18)),
+    )  # fmt: skip
+    e = rng.normal(size=27) * np.repeat([1.0, 0.1, 1e-3, 1e-2, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3], 3)
+    made, arm = datum_of(state, np.outer(e, e) + 1e-24 * np.eye(27))
+    up, down = (datum_of(boxplus(state, np.tile(s * e, (2, 1))), np.eye(27))[0] for s in (1.0, -1.0))
+    moved = 0.5 * difference(up, down)[0]
+    size = np.abs(moved)
+    for rows in (slice(0, 3), slice(3, 6), slice(6, 9)):
+        got = made.covariance[0][rows, rows]
+        np.testing.assert_allclose(got, np.outer(moved[rows], moved[rows]), atol=0.02 * size[rows].max() ** 2)
+    # a sample's own noise of the rate moves the datum by its lever
+    quiet, _ = datum_of(state, 1e-24 * np.eye(27))
+    noisy, _ = datum_of(state, 1e-24 * np.eye(27), 0.02)
+    added = np.trace(noisy.covariance[0][3:6, 3:6] - quiet.covariance[0][3:6, 3:6])
+    assert added == pytest.approx(2.0 * 0.02**2 * (arm @ arm), rel=1e-6)
+
+
+def test_two_attitudes_differ_as_both_may_err():
+    # history and trajectory drawn about one attitude, each with its own covariance: the mean NEES is three
+    rng, n = np.random.default_rng(8), 600
+    t, one = np.arange(n) * 0.1, np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    cov = np.tile(np.eye(9) * 4e-4, (n, 1, 1))
+    r = np.tile([6.5e6, 0.0, 0.0], (n, 1))
+    theirs = Trajectory(
+        "2009-08-17T12:50:00Z", t, "datum", r, 0.0 * r,
+        rotations.boxplus(one, 0.02 * rng.standard_normal((n, 3))), 0.0 * r, cov,
+    )  # fmt: skip
+    history = SimpleNamespace(
+        time_s=t, q_ecef_body=rotations.boxplus(one, 0.01 * rng.standard_normal((n, 3))),
+        covariance=np.tile(1e-4 * np.eye(3), (n, 1, 1)), sightings=(),
+    )  # fmt: skip
+    found = compare(history, theirs)
+    # 600 draws of three know the mean to 3 %
+    assert found.mean_nees == pytest.approx(3.0, abs=0.4)
+    assert found.share_inside == pytest.approx(0.9973, abs=0.005)
