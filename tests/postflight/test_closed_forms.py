@@ -10,7 +10,7 @@ import pytest
 
 from flightmodel import earth, rotations
 from flightmodel.airdata import lateral_angles
-from flightmodel.atmosphere import standard_atmosphere
+from flightmodel.atmosphere import standard_atmosphere, standard_sounding
 from flightmodel.instruments import TriadSpec
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
@@ -260,6 +260,40 @@ def test_inside_a_band_is_between_its_limits():
         np.array([0.5] * 3), np.array([0.4, 1.0, 2.6]), t, np.array([0.0, 1.0]), np.array([2.0, 3.0])
     )
     assert got.tolist() == [False, True, False]
+
+
+def test_dispersed_air_scatters_as_the_sounding_says():
+    profile, draws = standard_atmosphere(), []
+    for seed in range(200):
+        made = preflight._dispersed_air(profile, np.random.default_rng(seed))
+        draws.append(np.column_stack([made.wind_ned_mps[:, :2], made.log_density_ratio]))
+    # 200 draws of some ten independent heights: an sd to 2 %
+    spread = np.sqrt(np.mean(np.square(draws), axis=(0)))
+    for column, sd in ((0, profile.wind_sd_mps), (1, profile.wind_sd_mps), (2, profile.density_sd)):
+        assert np.mean(spread[:, column] / sd) == pytest.approx(1.0, abs=0.06)
+
+
+def test_an_entry_starts_with_its_cg_where_the_datum_s_flight_has_it():
+    vehicle = vehicle_from_toml(vehicle_path("irve2_reference"))
+    t = np.arange(0.0, 80.0, 1.0)
+    q = rotations.exp(np.array([0.3, -1.1, 0.6]))
+    v = earth.ecef_from_ned(np.array([200.0, 100.0, 1500.0]), earth.ecef_from_geodetic(0.6, -1.2, 9e4))
+    r = earth.ecef_from_geodetic(0.6, -1.2, 9.9e4) + (t[:, None] - 1.0) * v
+    n = len(t)
+    path = Trajectory(
+        "2009-08-17T12:50:00Z", t, "datum", r, np.tile(v, (n, 1)), np.tile(q, (n, 1)), np.zeros((n, 3)),
+        np.tile(1e-12 * np.eye(9), (n, 1, 1)),
+    )  # fmt: skip
+    _, _, height = earth.geodetic_from_ecef(r)
+    air = SimpleNamespace(altitude_m=height, flight_path_angle_rad=np.full(n, -1.4), time_s=t)
+    telemetry = SimpleNamespace(sounding=standard_sounding(), required_vehicle=lambda: vehicle)
+    flight = SimpleNamespace(air=air, telemetry=telemetry, reconstruction=SimpleNamespace(smoothed=path))
+    entry = preflight._Entry(flight, vehicle, None)
+    start, _ = entry.start(None)
+    k = int(np.searchsorted(t, entry.start_s))
+    want = r[k] + rotations.rotate(q, vehicle.cg_m)
+    got = rotations.rotate(earth.q_ecef_eci(entry.start_s), start.state[:3])
+    np.testing.assert_allclose(got, want, atol=1e-6)
 
 
 def test_acceleration_across_the_axis_is_that_of_both_axes():
