@@ -18,6 +18,7 @@ from postflight import day_air, preflight, scoring, sensed
 from postflight.exports.kml import kml_bytes
 from postflight.exports.oem import PLACE, oem_bytes
 from postflight.exports.source import Source
+from postflight.intake import odd_force
 from postflight.intake.odd_field import turning_field
 from postflight.intake.track import compare, track_force
 from postflight.intake.units import slope_through_mean, unit_that_explains
@@ -406,7 +407,8 @@ def test_a_track_s_forces_scatter_as_they_say():
 
 
 def test_a_late_track_and_its_scale_are_found():
-    # a force that swells and ebbs, told by an accelerometer 0.4 s earlier than by the track's tags
+    # a force that swells and ebbs, told by an accelerometer 0.41 s earlier than by the track's tags: between two of the
+    # lags that are tried, 25 ms apart
     force = track_force(*falling(), 2.0)
     t = np.arange(-10.0, 75.0, 0.01)
 
@@ -414,12 +416,12 @@ def test_a_late_track_and_its_scale_are_found():
         return 30.0 + 25.0 * np.sin(0.35 * at)
 
     swelling = replace(
-        force, force_mps2=np.column_stack([size(force.time_s - 0.4), 0.0 * force.time_s, 0.0 * force.time_s]),
+        force, force_mps2=np.column_stack([size(force.time_s - 0.41), 0.0 * force.time_s, 0.0 * force.time_s]),
         covariance=np.tile(1e-4 * np.eye(3), (len(force.time_s), 1, 1)),
     )  # fmt: skip
     found = compare(swelling, t, np.column_stack([size(t) / 1.3, 0.0 * t, 0.0 * t]))
     # the windows' kernel takes 1 % of the swelling, which moves no peak
-    assert found.lag_s == pytest.approx(0.4, abs=0.01)
+    assert found.lag_s == pytest.approx(0.41, abs=0.004)
     assert found.scale == pytest.approx(1.3, rel=0.02)
 
 
@@ -435,6 +437,22 @@ def test_unit_that_explains_makes_values_as_many_times_as_large(ratio, unit, wan
     assert unit_that_explains(ratio, unit) == wanted
     assert unit_that_explains(1.0, unit) == unit
     assert unit_that_explains(1.7 * ratio, unit) is None
+
+
+def test_what_stands_still_and_reads_one_is_in_g(monkeypatch):
+    t, rng = np.arange(0.0, 5.0, 0.01), np.random.default_rng(1)
+    monkeypatch.setattr(odd_force, "accelerometer_unit", lambda _: "mps2")
+
+    def record(values):
+        return SimpleNamespace(time_s=t, measured_sensor=values + 1e-4 * rng.standard_normal((len(t), 3)))
+
+    still = record(np.zeros(3))
+    for size, count in ((1.0, 1), (G0, 0)):
+        found = SimpleNamespace(triads={"accelerometer": record(np.array([0.0, 0.6, -0.8]) * size), "rates": still})
+        findings = odd_force.at_rest(found)
+        assert len(findings) == count
+        if count:
+            assert "they look like 'g'" in str(findings[0])
 
 
 def test_a_field_that_turns_as_the_gyros_say_raises_nothing():

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from flightmodel import rotations
+from flightmodel import earth, rotations
 from flightmodel.atmosphere import profile_from_sounding, standard_sounding
 from flightmodel.trajectory import resample
 from postflight.reconciliation.candidate import (
@@ -20,6 +20,8 @@ from postflight.reconciliation.candidate import (
 )
 from postflight.reconciliation.observed import SPAN_S, WINDOW_S, WINDOWS, Observed
 from postflight.reconciliation.problem import Problem
+from postflight.reconciliation.spans import Flights, _start_states
+from synthetic_flight import dynamics
 from synthetic_flight.packing import ATMOSPHERE_START_M, ATMOSPHERE_STEP_M
 from synthetic_flight.simulate import fly
 from tests.estimators.test_closure import EPOCH, START_S, VEHICLE, start
@@ -95,6 +97,23 @@ def test_spans_flown_from_the_truth_read_and_end_as_the_truth():
     across = [1, 2, 4, 5, 7, 8, 10, 11]
     np.testing.assert_allclose(read.end[:-1, across], u.motion[1:, across], atol=5e-5)
     np.testing.assert_allclose(read.end[:-1, [0, 3, 6]], u.motion[1:, [0, 3, 6]], atol=2e-3)
+
+
+def test_spans_start_with_the_datum_where_it_was_reconstructed():
+    # the composite c.g. of a bent vehicle is put so that the body's datum has the reconstruction's place and velocity
+    one, u = problem(), true_unknowns()
+    spans = np.arange(SPANS)
+    zero = np.zeros_like(spans)
+    flights = Flights(spans, zero, u.motion, zero, [one.candidate(u.vehicle)], [])
+    state = _start_states(one.observed, flights)
+    place, velocity = dynamics.points(state, VEHICLE)["body"]
+    back = rotations.rotate(state[:, 6:10], np.tile(-VEHICLE.centerbody.cg_m, (SPANS, 1)))
+    swing = np.cross(rotations.rotate(state[:, 6:10], state[:, 14:17]), back)
+    to_ecef = earth.q_ecef_eci(one.observed.start.time_s[:-1])
+    r = rotations.rotate(to_ecef, place + back)
+    v = rotations.rotate(to_ecef, velocity + swing) - np.cross(earth.OMEGA_ECEF_RADPS, r)
+    np.testing.assert_allclose(r, one.observed.start.position_ecef_m[:-1], atol=1e-6)
+    np.testing.assert_allclose(v, one.observed.start.velocity_ecef_mps[:-1], atol=1e-8)
 
 
 def test_a_late_clock_shows_what_was_earlier():
