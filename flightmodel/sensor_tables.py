@@ -26,6 +26,13 @@ from flightmodel.film import Frames, doubt_of_film, fault_of_film, fault_of_imag
 from flightmodel.flightfile import FlightFile
 from flightmodel.gate import Gate, Table, find_faults, oversampled, rows_to_use
 from flightmodel.instruments import (
+    ACCELEROMETER,
+    BAROMETER,
+    GNSS,
+    MAGNETOMETER,
+    RADAR,
+    RATES,
+    SUN,
     AtmosphereEntry,
     BarometerEntry,
     BarometerSpec,
@@ -69,28 +76,9 @@ def read_radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
         return None
     gate.findings.extend(find_faults(name, table.time_s, ("range", "az", "el"), values))
     gate.findings.extend(oversampled(name, table.time_s, source.every_s))
-    return RadarRecord(_site(name, source), table.time_s, values, source.tracks, source.every_s)
-
-
-def _site(name: str, source: RadarEntry) -> RadarSite:
-    lat, lon, angle_sd, angle_bias_sd = np.deg2rad(
-        [source.latitude_deg, source.longitude_deg, source.angle_sd_deg, source.angle_bias_sd_deg]
-    )
-    mislevel, droop, skew, square, wander = np.deg2rad(
-        [
-            source.mislevel_sd_deg,
-            source.droop_sd_deg,
-            source.skew_sd_deg,
-            source.nonorthogonality_sd_deg,
-            source.wander_sd_deg,
-        ]
-    )
-    own = [None if sd is None else float(np.deg2rad(sd)) for sd in (source.azimuth_sd_deg, source.elevation_sd_deg)]
-    return RadarSite(
-        name, lat, lon, source.height_m, source.range_sd_m, angle_sd, source.range_bias_sd_m, angle_bias_sd,
-        source.time_bias_sd_s, mislevel, droop, skew, square, wander, source.wander_time_constant_s,
-        source.refraction_sd, source.range_scale_sd, *own,
-    )  # fmt: skip
+    place = np.deg2rad([source.latitude_deg, source.longitude_deg])
+    site = RadarSite(name, float(place[0]), float(place[1]), source.height_m, **RADAR.from_file(source))
+    return RadarRecord(site, table.time_s, values, source.tracks, source.every_s)
 
 
 def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:
@@ -117,7 +105,8 @@ def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:
         return None
     gate.findings.extend(find_faults(name, time_s, ("x", "y", "z"), position))
     gate.findings.extend(oversampled(name, time_s, source.every_s))
-    return GnssRecord(_gnss_spec(name, source), time_s, position, velocity, source.every_s)
+    spec = GnssSpec(name, np.array(source.antenna_from_datum_body_m), **GNSS.from_file(source))
+    return GnssRecord(spec, time_s, position, velocity, source.every_s)
 
 
 def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> BoolArray:
@@ -213,20 +202,6 @@ def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: Fl
     return nothing
 
 
-def _gnss_spec(name: str, source: GnssEntry) -> GnssSpec:
-    return GnssSpec(
-        name,
-        np.array(source.antenna_from_datum_body_m),
-        source.horizontal_sd_m,
-        source.vertical_sd_m,
-        source.speed_sd_mps,
-        source.vertical_speed_sd_mps,
-        source.wander_sd_m,
-        source.wander_time_constant_s,
-        source.time_bias_sd_s,
-    )
-
-
 def read_barometer(
     gate: Gate, name: str, source: BarometerEntry, sounding: Sounding | None, measured_air: bool
 ) -> BarometerRecord | None:
@@ -267,17 +242,8 @@ def read_barometer(
         gate.faults.append(f"{label}: {table.path}: every reading is missing; remove the barometer")
         return None
     gate.findings.extend(find_faults(name, table.time_s, (form,), height[:, None]))
-    spec = BarometerSpec(
-        name,
-        source.sd_m,
-        source.bias_sd_m,
-        source.scale_sd,
-        source.wander_sd_m,
-        source.wander_time_constant_s,
-        source.time_bias_sd_s,
-    )
     gate.findings.extend(oversampled(name, table.time_s, source.every_s))
-    return BarometerRecord(spec, table.time_s, height, source.every_s)
+    return BarometerRecord(BarometerSpec(name, **BAROMETER.from_file(source)), table.time_s, height, source.every_s)
 
 
 def _barometer_form(gate: Gate, table: Table, source: BarometerEntry) -> str | None:
@@ -305,6 +271,7 @@ TRIAD_COLUMNS = {
     RatesEntry: tables.RATES,
     MagnetometerEntry: tables.MAGNETOMETER,
 }
+TRIADS = {TriadEntry: ACCELEROMETER, RatesEntry: RATES, MagnetometerEntry: MAGNETOMETER}
 BODY = "body"  # the mount of a triad along body axes
 # package of the vehicle file where flight.toml names none
 DEFAULT_PACKAGE = {TriadEntry: "suba", RatesEntry: BODY, MagnetometerEntry: "magnetometer"}
@@ -329,7 +296,10 @@ def read_triad(gate: Gate, name: str, spec: FlightFile, vehicle: Vehicle | None)
         return None
     if isinstance(source, MagnetometerEntry) and source.reversed:
         values = -values
-    record, told = averaged(TriadRecord(_triad_spec(name, source, *mounting), table.time_s, values))
+    stated = TRIADS[type(source)].from_file(source)
+    if stated["bias_wander_sd"] == 0.0:
+        stated["bias_time_constant_s"] = np.inf
+    record, told = averaged(TriadRecord(TriadSpec(name, *mounting, **stated), table.time_s, values))
     gate.findings.extend(told)
     return record
 
@@ -359,34 +329,6 @@ def _mounting(
     return np.array(mount.position_from_datum_body_m), mount.dcm_body_sensor
 
 
-def _triad_spec(name: str, source: Triad, place_m: FloatArray, dcm: FloatArray) -> TriadSpec:
-    soft_iron = 0.0
-    if isinstance(source, RatesEntry):
-        in_files = [source.noise_sd_degps, source.bias_sd_degps, source.resolution_degps, source.bias_wander_sd_degps]
-        noise, bias, step, wander = np.deg2rad(in_files)
-    elif isinstance(source, MagnetometerEntry):
-        in_files = [source.noise_sd_ut, source.bias_sd_ut, source.resolution_ut, source.bias_wander_sd_ut]
-        noise, bias, step, wander = 1e-6 * np.array(in_files)
-        soft_iron = source.soft_iron_sd
-    else:
-        noise, bias, step = source.noise_sd_mps2, source.bias_sd_mps2, source.resolution_mps2
-        wander = source.bias_wander_sd_mps2
-    return TriadSpec(
-        name,
-        place_m,
-        dcm,
-        float(noise),
-        float(bias),
-        source.scale_sd,
-        float(np.deg2rad(source.mount_sd_deg)),
-        float(step),
-        soft_iron,
-        float(wander),
-        source.bias_time_constant_s if wander > 0.0 else np.inf,
-        0.0 if isinstance(source, MagnetometerEntry) else source.time_bias_sd_s,
-    )
-
-
 def read_sun(gate: Gate, source: SunEntry) -> SunRecord | None:
     """Read the Sun heads; None, with the faults kept, where anything in the table is refused."""
     heads = len(source.heads_lv_deg)
@@ -408,10 +350,8 @@ def read_sun(gate: Gate, source: SunEntry) -> SunRecord | None:
         gate.faults.append(f"sensors.sun: {table.path}: no head ever sees the Sun; remove [sensors.sun]")
         return None
     gate.findings.extend(find_faults("sun", table.time_s, tuple(q.short for q in quantities), values, dark))
-    noise, bias, mount, field = np.deg2rad(
-        [source.noise_sd_deg, source.bias_sd_deg, source.mount_sd_deg, source.field_deg]
-    )
-    spec = SunHeads("sun", np.deg2rad(source.heads_lv_deg), field, noise, bias, mount)
+    clock, field = np.deg2rad(source.heads_lv_deg), float(np.deg2rad(source.field_deg))
+    spec = SunHeads("sun", clock, field, **SUN.from_file(source))
     return SunRecord(spec, table.time_s, values.reshape(-1, heads, 2))
 
 
