@@ -30,13 +30,14 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 from estimators.loads import PulseData, carried
+from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
+from flightmodel.statistics import correlation_root
 from flightmodel.vehicle import Vehicle
 
-WIND_LENGTH_M, DENSITY_LENGTH_M, CONSTANT_PART, TRAJECTORY_TIME_S = 3000.0, 5000.0, 0.5, 20.0
+CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0
 LIGHT_TIME_S = 2.5
-KNOTS_A_LENGTH = 3  # knots of a forgetful history, over what it forgets
 ACCELEROMETER, ATTITUDE, WIND, PRESSURE = "accelerometer", "BET attitude", "wind", "dynamic pressure"
 FILM_CLOCK, RATE_STEP_S = "film's clock", 0.005
 FORCE_CLOCK, RATE_CLOCK = "accelerometer's clock", "gyros' clock"
@@ -117,15 +118,15 @@ def flow_inputs(pulse: PulseData, use: BoolArray) -> dict[str, FloatArray]:
     turn = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=1)
     return {
         ACCELEROMETER: root,
-        ATTITUDE: _turned(turn, trajectory[:, None] * forgetful(pulse.time_s[use], TRAJECTORY_TIME_S)),
-        WIND: _turned(turn, wind[:, None] * _sounded(pulse.altitude_m[use], WIND_LENGTH_M)),
+        ATTITUDE: _turned(turn, trajectory[:, None] * correlation_root(pulse.time_s[use], TRAJECTORY_TIME_S)),
+        WIND: _turned(turn, wind[:, None] * sounding_correlation_root(pulse.altitude_m[use], WIND_LENGTH_M)),
     }
 
 
 def pressure_input(pulse: PulseData, use: BoolArray) -> FloatArray:
     """Dynamic pressure's error ``(n, k)``, a fraction, per unit normal."""
     relative = pulse.dynamic_pressure_sd_pa[use] / pulse.dynamic_pressure_pa[use]
-    return np.asarray(relative[:, None] * _sounded(pulse.altitude_m[use], DENSITY_LENGTH_M))
+    return np.asarray(relative[:, None] * sounding_correlation_root(pulse.altitude_m[use], DENSITY_LENGTH_M))
 
 
 def read_later(pulse: PulseData, use: BoolArray, force_s: float, rate_s: float) -> PulseData:
@@ -155,12 +156,6 @@ def read_later(pulse: PulseData, use: BoolArray, force_s: float, rate_s: float) 
     )
 
 
-def _sounded(altitude_m: FloatArray, length_m: float) -> FloatArray:
-    """Error of unit variance of a sounding ``(n, k)``, per unit normal: a constant part and one that forgets."""
-    constant = np.full(len(altitude_m), np.sqrt(CONSTANT_PART))
-    return np.column_stack([constant, np.sqrt(1.0 - CONSTANT_PART) * forgetful(altitude_m, length_m)])
-
-
 def _turned(turn: FloatArray, columns: FloatArray) -> FloatArray:
     """Body components ``(n, 2, 2 k)`` of two like histories (n, k) in axes that do not roll."""
     n, k = columns.shape
@@ -170,24 +165,6 @@ def _turned(turn: FloatArray, columns: FloatArray) -> FloatArray:
 def _roll(pulse: PulseData) -> FloatArray:
     rate, step = pulse.rate_body_radps[:, 0], np.diff(pulse.time_s)
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
-
-
-def forgetful(at: FloatArray, length: float) -> FloatArray:
-    """Gauss-Markov history of unit variance: its values (n,) per unit normal ``(n, k)``; ``at`` in any order."""
-    if len(at) == 0 or np.ptp(at) == 0.0:
-        return np.ones((len(at), 1))
-    low, high = float(at.min()), float(at.max())
-    knots = np.linspace(low, high, max(2, int(np.ceil(KNOTS_A_LENGTH * (high - low) / length)) + 1))
-    correlation = np.exp(-np.abs(knots[:, None] - knots[None, :]) / length)
-    position = np.clip((at - low) / max(knots[1] - knots[0], 1e-12), 0.0, len(knots) - 1.0)
-    k = np.minimum(position.astype(int), len(knots) - 2)
-    fraction = position - k
-    between = np.zeros((len(at), len(knots)))
-    row = np.arange(len(at))
-    between[row, k], between[row, k + 1] = 1.0 - fraction, fraction
-    out = between @ np.linalg.cholesky(correlation)
-    # straight lines between knots are a little too small
-    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
 def offset_sd_m(vehicle: Vehicle) -> float:
@@ -251,9 +228,7 @@ def evidence_of_history(history: DeflectionHistory, clock_sd_s: float = 0.0, pla
     value, axes = np.linalg.eigh(cov)
     # symmetric square root: smooth in time whatever the order of the eigenvalues
     root = (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
-    lasting = np.full(len(time_s), np.sqrt(CONSTANT_PART))
-    columns = np.column_stack([lasting, np.sqrt(1.0 - CONSTANT_PART) * forgetful(time_s, LIGHT_TIME_S)])
-    inputs = {history.method: _turned(root, columns)}
+    inputs = {history.method: _turned(root, correlation_root(time_s, LIGHT_TIME_S, CONSTANT_PART))}
     if plane_sd_rad > 0.0:
         across = np.stack([-theta_yz[:, 1], theta_yz[:, 0]], axis=-1)
         inputs[CAMERA_PLANE] = plane_sd_rad * across[:, :, None]

@@ -31,13 +31,14 @@ from estimators.loads import MIN_AXIAL_MPS2, PulseData, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 
 # each step contracts by d atan(C_N/C_A)/d alpha, at most 0.15: twelve leave 1e-10
 AVERAGED_S = 0.1  # short against the joint's 2.5 Hz
 ITERATIONS, STEP_RAD = 12, 1e-4
 ASSUMPTIONS = (
     "plane free; all aerodynamic force on the aeroshell; C_N/C_A of the pre-flight model; no twist; no answer where "
-    f"the axial deceleration is below {MIN_AXIAL_MPS2 / 9.80665:.1f} g"
+    f"the axial deceleration is below {MIN_AXIAL_MPS2 / STANDARD_GRAVITY_MPS2:.1f} g"
 )
 
 

@@ -30,6 +30,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from flightmodel.checks import FloatArray, GateError, nearest_name
 from flightmodel.config import Section, Time
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 
 
 def _in_order(value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
@@ -119,8 +120,8 @@ UNITS: dict[str, tuple[str, float, float]] = {
     "mil": ("angle", 2.0 * np.pi / 6400.0, 0.0),
     "deg1e7": ("angle", 1e-7 * np.pi / 180.0, 0.0),  # whole numbers, as many receivers write a latitude
     "mps2": ("acceleration", 1.0, 0.0),
-    "g": ("acceleration", 9.80665, 0.0),
-    "mg": ("acceleration", 9.80665e-3, 0.0),
+    "g": ("acceleration", STANDARD_GRAVITY_MPS2, 0.0),
+    "mg": ("acceleration", 1e-3 * STANDARD_GRAVITY_MPS2, 0.0),
     "ftps2": ("acceleration", 0.3048, 0.0),
     "radps": ("rate", 1.0, 0.0),
     "degps": ("rate", np.pi / 180.0, 0.0),

@@ -163,13 +163,13 @@ def run_flight(
         if "camera" in methods and "camera" not in wanted:
             answers.refused["camera"] = NO_VIDEO
         with run_folder.RunFolder(folder, flight.telemetry, settings) as out:
-            run_folder.write_reconstruction(out, flight)
+            event_rows = run_folder.write_reconstruction(out, flight)
             run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 out.write_csv(
                     "camera_sensitivity.csv", camera_sensitivity(flight.telemetry, answers.histories["camera"])
                 )
-            out.write_json("summary.json", run_folder.summary(flight, answers))
+            out.write_json("summary.json", run_folder.summary(flight, answers, event_rows))
             bounds = run_figures.draw_run(flight, answers, out.path / "figures", step(0.7 * share, share))
             if bounds is not None:
                 out.write_csv("rigid_bounds.csv", bounds.table())

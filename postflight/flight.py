@@ -19,11 +19,12 @@ from estimators.fusion import smoothed
 from estimators.loads import PulseData
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
-from flightmodel.airdata import AirData, air_data, peak_pressure
+from flightmodel.airdata import AirData, air_data
 from flightmodel.atmosphere import BOTTOM_M, TOP_M, profile_from_sounding
 from flightmodel.checks import DivergenceError, GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import geodetic_from_ecef
+from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
@@ -90,7 +91,7 @@ class Flight:
     @property
     def peak_s(self) -> float:
         """Time of peak dynamic pressure by the BET and the day's density, s."""
-        return peak_pressure(self.air.time_s, self.air.dynamic_pressure_pa)[0]
+        return find_peak(self.air.time_s, self.air.dynamic_pressure_pa)[0]
 
     @property
     def peak_is_inside(self) -> bool:

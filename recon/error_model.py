@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M
 from flightmodel.checks import FloatArray, GateError, nearest_name
 from flightmodel.instruments import (
     ACCELEROMETER,
@@ -34,7 +35,6 @@ from recon.state import Wander
 
 Spec = TriadSpec | RadarSite | GnssSpec | BarometerSpec | SunHeads
 AXES = ("x", "y", "z")
-DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0  # over which the air's errors forget: facts of soundings, 5 and 3 km
 
 
 @dataclass(frozen=True)

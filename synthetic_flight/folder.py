@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flightmodel import earth
-from flightmodel.atmosphere import G0_MPS2
 from flightmodel.checks import FloatArray, GateError, Progress, writing
-from flightmodel.events import descent_moments, first_fall, has_peak, peak, splashdown_index, values_at
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.events import descent_events, find_peak, first_fall, has_peak, splashdown_index, values_at
 from flightmodel.instruments import ACCELEROMETER, MAGNETOMETER, RADAR, RATES, SUN
 from synthetic_flight import sensing, weather
 from synthetic_flight.film import write_video
@@ -382,12 +382,12 @@ def flight_events(truth: Truth, inflated_s: float | None = None) -> list[Event]:
     density, pressure = truth.density_kgpm3[rows], truth.dynamic_pressure_pa[rows]
     airspeed = np.sqrt(2.0 * pressure / density)
     flux = heat_flux(density, airspeed, truth.vehicle.geometry.nose_radius_m)
-    named = [("separation", float(t[0])), *descent_moments(t, altitude, truth.mach[rows])]
+    named = [("separation", float(t[0])), *descent_events(t, altitude, truth.mach[rows])]
     if inflated_s is not None and t[0] < inflated_s < t[-1]:
         named.append(("inflation", inflated_s))
     for name, values in (("peak heating", flux), ("peak dynamic pressure", pressure)):
         if has_peak(values):
-            named.append((name, peak(t, values)[0]))
+            named.append((name, find_peak(t, values)[0]))
     if whole is not None:
         splash = first_fall(t, altitude, 0.0)
         named.append(("splashdown", float(t[-1]) if splash is None else splash))
@@ -404,7 +404,7 @@ def flight_events(truth: Truth, inflated_s: float | None = None) -> list[Event]:
             truth.alpha_shell_rad[rows],
             truth.alpha_body_rad[rows],
             truth.deflection.theta_rad[rows],
-            np.linalg.norm(force, axis=1) / G0_MPS2,
+            np.linalg.norm(force, axis=1) / STANDARD_GRAVITY_MPS2,
         ]
     )
     return [_event(name, at, values_at(t, columns, at)) for name, at in sorted(named, key=lambda one: one[1])]

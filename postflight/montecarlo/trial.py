@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flightmodel.airdata import air_data, peak_pressure
+from flightmodel.airdata import air_data
+from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import difference, resample
 from postflight.flight import estimate, reconstruct_telemetry
@@ -76,7 +77,7 @@ def trial(plan: Plan, seed: int, run: int) -> dict[str, float]:
         telemetry = replace(read_flight(folder), vehicle=told)
     flight = reconstruct_telemetry(telemetry)
     answers = estimate(flight, telemetry, METHODS)
-    peak_s, _ = peak_pressure(truth.time_s, truth.dynamic_pressure_pa)
+    peak_s, _ = find_peak(truth.time_s, truth.dynamic_pressure_pa)
     out = dict.fromkeys(SCALARS, np.nan)
     out["truth_deg"] = float(np.rad2deg(np.interp(peak_s, truth.time_s, truth.deflection.theta_rad)))
     for method, history in answers.histories.items():

@@ -14,6 +14,7 @@ from estimators.misalignment import aerodynamic_angle, aeroshell_acceleration, p
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.telemetry import Telemetry
 from postflight.flight import Answers, Flight
 from postflight.plots.ensembles import words_in_corner
@@ -81,7 +82,7 @@ def figure_1_3(flight: Flight, bounds: Bounds) -> Figure:
     upper.fill_between(air.time_s, alpha - sd, alpha + sd, color="#0072B2", alpha=0.2, lw=0)
     ground = np.rad2deg(air.alpha_total_ground_rad)
     upper.plot(air.time_s, ground, color="#56B4E9", lw=1, ls="--", label="BET, no wind")
-    normal = np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / 9.80665
+    normal = np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2
     lower.plot(pulse.time_s, normal, color="#0072B2", lw=1.4, label="measured, at the c.g.")
     upper.set(ylabel="total angle of attack (deg)", ylim=(0, 16), xlim=_window(flight))
     lower.set(ylabel="normal acceleration (g)", ylim=(0, None), xlabel="time after launch (s)")

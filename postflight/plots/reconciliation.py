@@ -9,6 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.telemetry import Telemetry
 from postflight.plots.paper_figures import COLOUR, stamp
 from postflight.reconciliation.answer import stiffness_and_offset
@@ -29,9 +30,11 @@ def figure_reconciled(
     seen, read = found.problem.observed, found.problem.predicted(found.unknowns)
     flown = read.windows + found.problem.instrument_rows(read) @ found.unknowns.instruments
     t = seen.time_s.ravel()
-    rate, force = np.rad2deg(flown[..., 1].ravel()), flown[..., 4].ravel() / 9.80665
+    rate, force = np.rad2deg(flown[..., 1].ravel()), flown[..., 4].ravel() / STANDARD_GRAVITY_MPS2
     _pair(axes[0, 0], t, np.rad2deg(seen.rate_radps[..., 1].ravel()), rate, "body rate y (deg/s)")
-    _pair(axes[0, 1], t, seen.specific_force_mps2[..., 1].ravel() / 9.80665, force, "specific force y (g)")
+    _pair(
+        axes[0, 1], t, seen.specific_force_mps2[..., 1].ravel() / STANDARD_GRAVITY_MPS2, force, "specific force y (g)"
+    )
     left = found.residuals.sensors
     _residuals(axes[1, 0], t, left[..., :3], "rates: residual / sd")
     _residuals(axes[1, 1], t, left[..., 3:], "specific force: residual / sd")

@@ -21,7 +21,13 @@ from functools import cached_property
 
 import numpy as np
 
-from flightmodel.atmosphere import profile_from_sounding
+from flightmodel.atmosphere import (
+    DENSITY_LENGTH_M,
+    WIND_LENGTH_M,
+    profile_from_sounding,
+    sounding_correlation,
+    unresolved_variance,
+)
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.rotations import skew
@@ -30,8 +36,6 @@ from flightmodel.trajectory import Trajectory, resample
 from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
 from postflight.flight import Flight
 from postflight.loads import sensed, whole_windows
-from recon.atmosphere import CONSTANT_PART
-from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
 from synthetic_flight import simulate
 
 # at 1200 m/s a tenth of a second: gusts at the joint's own 2 to 4 Hz are the knots', not noise; coarser in thin air
@@ -164,10 +168,9 @@ class AirUnknowns:
     def precision(self) -> FloatArray:
         """Inverse covariance (3, k, k) of the sounding's errors: half constant, half forgetting along altitude."""
         at = profile_from_sounding(self.sounding).at(self.knots_m)
-        apart = np.abs(self.knots_m[:, None] - self.knots_m)
         out = []
         for sd, length in ((at.density_sd, DENSITY_LENGTH_M), *[(at.wind_sd_mps, WIND_LENGTH_M)] * 2):
-            correlation = CONSTANT_PART + (1.0 - CONSTANT_PART) * np.exp(-apart / length)
+            correlation = sounding_correlation(self.knots_m, length)
             out.append(np.linalg.inv(sd[:, None] * correlation * sd))
         return np.array(out)
 
@@ -177,7 +180,7 @@ class AirUnknowns:
         at = profile_from_sounding(self.sounding).at(self.knots_m)
 
         def left(sd: FloatArray, length_m: float) -> FloatArray:
-            bridged = self.fine * sd * np.sqrt((1.0 - CONSTANT_PART) * apart / (3.0 * length_m))
+            bridged = self.fine * sd * np.sqrt(unresolved_variance(apart, length_m))
             return np.asarray(np.interp(altitude_m, self.knots_m, bridged))
 
         return left(at.density_sd, DENSITY_LENGTH_M), left(at.wind_sd_mps, WIND_LENGTH_M)

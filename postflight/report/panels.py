@@ -193,7 +193,6 @@ def residual_panels(run: Run) -> list[Panel]:
     return out
 
 
-G0_MPS2 = 9.80665
 FILE = "bands.csv"
 LOW, MIDDLE, HIGH = "p2.3", "p50", "p97.7"
 COLOURS = (GREY, ORANGE, GREEN, DARK)
@@ -203,9 +202,13 @@ FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "normal_g": (
         "Acceleration across the axis at the c.g.",
         "g",
-        lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / G0_MPS2,
+        lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / earth.STANDARD_GRAVITY_MPS2,
     ),
-    "axial_g": ("Acceleration along the axis at the c.g.", "g", lambda bet: -bet["ax_cg_mps2"] / G0_MPS2),
+    "axial_g": (
+        "Acceleration along the axis at the c.g.",
+        "g",
+        lambda bet: -bet["ax_cg_mps2"] / earth.STANDARD_GRAVITY_MPS2,
+    ),
     "rate_degps": ("Rate across the axis", "deg/s", lambda bet: np.hypot(bet["q_body_degps"], bet["r_body_degps"])),
     "dynamic_pressure_pa": ("Dynamic pressure", "Pa", lambda bet: bet["dynamic_pressure_pa"]),
     "mach": ("Mach number", "", lambda bet: bet["mach"]),

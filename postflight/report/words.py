@@ -71,12 +71,12 @@ def lead(run: Run) -> list[str]:
     at = s["peak_dynamic_pressure_s"]
     row = run.peak("dynamic pressure")
     sd = f" ± {row['sd']:.0f}" if row is not None and np.isfinite(row["sd"]) else ""
-    place = run.tables["bet"]
-    k = int(np.abs(place["t_s"].to_numpy() - at).argmin())
+    events = run.tables["events"]
+    there = events.iloc[int((events["t_s"] - at).abs().argmin())]
     out = [s["agreement"][0].upper() + s["agreement"][1:] + "."] if s["agreement"] else []
     out.append(
         f"{peak_words(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
-        f"({utc(run, at)} UTC), Mach {place['mach'].iloc[k]:.2f}, {place['alt_m'].iloc[k] / 1e3:.1f} km."
+        f"({utc(run, at)} UTC), Mach {there['mach']:.2f}, {there['alt_m'] / 1e3:.1f} km."
     )
     swing = swing_words(run)
     if swing:

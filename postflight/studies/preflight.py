@@ -16,6 +16,7 @@ import pandas as pd
 from flightmodel import rotations
 from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
 from flightmodel.checks import BoolArray, FloatArray, GateError, Progress
+from flightmodel.statistics import percentile_band
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Uncertainty, Vehicle
 from postflight.flight import Flight
@@ -41,7 +42,6 @@ from synthetic_flight.weather import correlated
 START_ALTITUDE_M = 100e3
 # the rigid vehicle's fastest motion is its pitch at 1 Hz; fourth-order steps of 10 ms hold it to 1e-6
 RIGID_STEP_S, FLEXIBLE_STEP_S, RECORD_S, SPAN_S = 0.01, 0.005, 0.05, 70.0
-PERCENTILES = (2.3, 50.0, 97.7)
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ def entry_bounds(
         report(runs.stop / flights, f"{what} flight {runs.stop} of {flights}")
     return Bounds(
         time_s=entry.start_s + RECORD_S * np.arange(entry.records),
-        alpha_total_deg=np.percentile(alpha, PERCENTILES, axis=0),
-        normal_g=np.percentile(normal, PERCENTILES, axis=0),
+        alpha_total_deg=percentile_band(alpha),
+        normal_g=percentile_band(normal),
         nominal_alpha_deg=nominal[0],
         nominal_normal_g=nominal[1],
         flights=flights,

@@ -12,7 +12,6 @@ from estimators.evidence import (
     LIGHT_TIME_S,
     Evidence,
     evidence_of_history,
-    forgetful,
     moved_evidence,
     read_later,
 )
@@ -20,6 +19,7 @@ from estimators.fusion import clock_is_seen, fuse, smoothed
 from estimators.loads import carried
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
+from flightmodel.statistics import correlation_root
 from postflight.fusing import FilmClock, fuse_flight
 
 from .conftest import pulse_of
@@ -41,7 +41,7 @@ def bent(time_s, swing=1.0):
 def camera(rng, late_s, rate=2, swing=1.0, sd=CAMERA_SD):
     """Camera's history with the errors that the fusion takes it to have, its times late."""
     t = TIME_S[::rate]
-    light = forgetful(t, LIGHT_TIME_S)
+    light = correlation_root(t, LIGHT_TIME_S)
     drawn = np.sqrt(0.5) * (rng.standard_normal(2) + light @ rng.standard_normal((light.shape[1], 2)))
     cov = np.tile(sd**2 * np.eye(2), (len(t), 1, 1))
     return history_from_lateral(t, bent(t - late_s, swing) + sd * drawn, cov, "camera", "")
