@@ -26,10 +26,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.flight import reconstruct_telemetry
+from postflight.flight import Flight
 from postflight.reconciliation.answer import deflection_of, joint_table
 from postflight.reconciliation.fit import explain
 from postflight.reconciliation.modes import stiffness_by_modes
+from postflight.reconstruction import reconstruct
 from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed
 
@@ -66,7 +67,7 @@ def reconstructed(seed, vehicle):
     with tempfile.TemporaryDirectory() as temporary:
         truth = simulate_to_folder(scenario, seed, Path(temporary) / "flight")
         telemetry = read_flight(Path(temporary) / "flight")
-    return reconstruct_telemetry(telemetry), truth
+    return reconstruct(Flight(telemetry)), truth
 
 
 def errors(found, vehicle, factors):

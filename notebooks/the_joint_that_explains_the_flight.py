@@ -104,7 +104,7 @@ print(f"by its frequency alone: {modal.stiffness_nmprad:.0f} +/- {modal.sd_nmpra
 
 # %%
 flexible = reconciled_bounds(found, flight, lambda _fraction, _what: None)
-pulse = flight.required_pulse()
+pulse = flight.required_loads()
 lateral_g = np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / 9.80665
 alpha_deg = np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad))
 own = {"time_s": pulse.time_s, "alpha_total_deg": alpha_deg, "normal_g": lateral_g}

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -21,9 +21,11 @@ from flightmodel import earth, events, rotations
 from flightmodel.airdata import derived_with_sd, is_angle
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
-from postflight.flight import Flight
 from postflight.loads import sensed, whole_windows
 from recon.atmosphere import LEAST_AXIAL_MPS2
+
+if TYPE_CHECKING:
+    from postflight.reconstruction import Reconstruction
 
 FORMAT = 1
 FRAMES = {
@@ -41,9 +43,9 @@ FRAMES = {
 }
 
 
-def header(flight: Flight) -> dict[str, Any]:
+def header(flight: Reconstruction) -> dict[str, Any]:
     """Head of ``bet.csv`` for ``bet_header.json``; nothing in it depends on when or where it was made."""
-    telemetry, bet = flight.telemetry, flight.reconstruction
+    telemetry, bet = flight.telemetry, flight.solution
     settings = bet.provenance["settings"]
     return {
         "format": FORMAT,
@@ -66,7 +68,7 @@ def header(flight: Flight) -> dict[str, Any]:
     }
 
 
-def _vehicle(flight: Flight) -> dict[str, Any] | None:
+def _vehicle(flight: Reconstruction) -> dict[str, Any] | None:
     vehicle = flight.telemetry.vehicle
     if vehicle is None:
         return None
@@ -81,7 +83,7 @@ def _vehicle(flight: Flight) -> dict[str, Any] | None:
     }
 
 
-def _atmosphere(flight: Flight) -> dict[str, Any]:
+def _atmosphere(flight: Reconstruction) -> dict[str, Any]:
     sounding = flight.telemetry.sounding
     files = [name for name in flight.telemetry.hashes if "atmosphere" in name or "sounding" in name]
     return {
@@ -94,7 +96,7 @@ def _atmosphere(flight: Flight) -> dict[str, Any]:
     }
 
 
-def _sensors(flight: Flight) -> list[dict[str, Any]]:
+def _sensors(flight: Reconstruction) -> list[dict[str, Any]]:
     """Every sensor with its stated accuracies, SI units and radians."""
     telemetry = flight.telemetry
     out: list[dict[str, Any]] = []
@@ -141,7 +143,7 @@ EVENT_COLUMNS = {
 }
 
 
-def event_table(flight: Flight, table: pd.DataFrame) -> pd.DataFrame:
+def event_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     """Events of the flight with what ``bet.csv`` has at their times: each value with three standard deviations."""
     air = flight.air
     named = [(name, t) for name, t in flight.telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
@@ -173,7 +175,7 @@ def _three_sd(column: str) -> str:
     return f"{stem}_3sd_{unit}" if stem else f"{column}_3sd"
 
 
-def peak_table(flight: Flight, table: pd.DataFrame) -> pd.DataFrame:
+def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     """Largest values with their times; ``inside`` is false where one lies at an end of the data."""
     q = table["dynamic_pressure_pa"].to_numpy()
     pulse, time_s = q >= 0.5 * q.max(), table["t_s"].to_numpy()
@@ -194,19 +196,17 @@ def peak_table(flight: Flight, table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["peak", "column", "t_s", "value", "sd", "inside"])
 
 
-def residual_statistics(flight: Flight) -> pd.DataFrame:
+def residual_statistics(flight: Reconstruction) -> pd.DataFrame:
     """How the residuals of each source and component behaved; edited points count in ``count`` and ``edited`` alone.
 
     Mean and sd are in metres and radians (m/s for velocities); ``rms_normalised`` is over the predicted sd and should
     be one, ``lag1`` the autocorrelation of successive ones and should be none; ``nis`` repeats the source's verdict.
     """
     nis = {
-        v.name.removeprefix("NIS "): v.value
-        for v in flight.reconstruction.consistency_checks
-        if v.name.startswith("NIS ")
+        v.name.removeprefix("NIS "): v.value for v in flight.solution.consistency_checks if v.name.startswith("NIS ")
     }
     rows = []
-    for (source, component), part in flight.reconstruction.residuals.groupby(["source", "component"], sort=False):
+    for (source, component), part in flight.solution.residuals.groupby(["source", "component"], sort=False):
         good = part[part["accepted"]]
         r, z = good["residual"].to_numpy(), (good["residual"] / good["predicted_sd"]).to_numpy()
         unit = "rad" if component in ("azimuth", "elevation") else "m"
@@ -230,9 +230,9 @@ def _lag1(z: FloatArray) -> float:
     return float(centred[1:] @ centred[:-1] / max(float(centred @ centred), 1e-300))
 
 
-def slow_covariance(flight: Flight) -> dict[str, FloatArray]:
+def slow_covariance(flight: Reconstruction) -> dict[str, FloatArray]:
     """Whole covariances (k, 9, 9) at `COVARIANCE_RATE_HZ`: position ECEF m, velocity ECEF m/s, rotation body rad."""
-    bet = flight.reconstruction.smoothed
+    bet = flight.solution.smoothed
     assert bet.covariance is not None
     ticks = np.floor(bet.time_s * COVARIANCE_RATE_HZ + 1e-6)
     rows = np.flatnonzero(np.diff(ticks, prepend=-np.inf) > 0.0)
@@ -285,9 +285,9 @@ def three(pattern: str, letters: str, values: FloatArray) -> Columns:
     return {pattern.format(a): c for a, c in zip(letters, values.T, strict=True)}
 
 
-def bet_table(flight: Flight) -> pd.DataFrame:
+def bet_table(flight: Reconstruction) -> pd.DataFrame:
     """Best estimated trajectory, one row an output time."""
-    bet = flight.reconstruction.smoothed
+    bet = flight.solution.smoothed
     sd = bet.sd()
     columns: Columns = {"t_s": bet.time_s}
     columns |= three("r{}_ecef_m", "xyz", bet.position_ecef_m)
@@ -308,17 +308,17 @@ def bet_table(flight: Flight) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _rate_sd(flight: Flight) -> FloatArray:
+def _rate_sd(flight: Reconstruction) -> FloatArray:
     """Standard deviations (n, 3) of the rates: estimated errors and a sample's white noise."""
-    bet, rates = flight.reconstruction, flight.telemetry.rates
+    bet, rates = flight.solution, flight.telemetry.rates
     if not len(bet.rate_cov) or rates is None:
         return np.full((len(bet.smoothed.time_s), 3), np.nan)
     return np.asarray(np.sqrt(np.diagonal(bet.rate_cov, axis1=1, axis2=2) + rates.spec.noise_sd**2))
 
 
-def _inertial(flight: Flight) -> Columns:
+def _inertial(flight: Reconstruction) -> Columns:
     """Position and velocity in ECI with standard deviations."""
-    bet = flight.reconstruction.smoothed
+    bet = flight.solution.smoothed
     assert bet.covariance is not None
     turn = rotations.conjugate(earth.q_ecef_eci(bet.time_s))
     dcm = rotations.dcm_from_q(turn)
@@ -333,11 +333,11 @@ def _inertial(flight: Flight) -> Columns:
     return out | three("r{}_eci_sd_m", "xyz", sd[:, 0:3]) | three("v{}_eci_sd_mps", "xyz", sd[:, 3:6])
 
 
-def _derived(flight: Flight) -> Columns:
+def _derived(flight: Reconstruction) -> Columns:
     """Air data, flow angles and attitude angles; winds."""
     vehicle, profile = flight.telemetry.vehicle, profile_from_sounding(flight.telemetry.sounding)
     arm = np.zeros(3) if vehicle is None else vehicle.cg_m
-    value, sd = derived_with_sd(flight.reconstruction.smoothed, profile, arm)
+    value, sd = derived_with_sd(flight.solution.smoothed, profile, arm)
     out: Columns = {}
     for name, (column, sd_column) in DERIVED.items():
         unknown = not flight.has_attitude and name.startswith(NEED_ATTITUDE)
@@ -351,9 +351,9 @@ def _derived(flight: Flight) -> Columns:
     return out | {"wind_sd_mps": air.air.wind_sd_mps}
 
 
-def _force(flight: Flight) -> Columns:
+def _force(flight: Reconstruction) -> Columns:
     """Specific force at the sensor and at the c.g., and the force coefficients that follow with the sounding's air."""
-    bet, telemetry = flight.reconstruction, flight.telemetry
+    bet, telemetry = flight.solution, flight.telemetry
     t = bet.smoothed.time_s
     out = {name: np.full(len(t), np.nan) for name in FORCE_NAMES}
     rows = whole_windows(bet, t)
@@ -395,13 +395,13 @@ def _coefficients(force: FloatArray, cov: FloatArray, push: FloatArray, push_sd:
     return {name: np.where(weak, np.nan, numbers) for name, numbers in out.items()}
 
 
-def _day(flight: Flight) -> Columns:
+def _day(flight: Reconstruction) -> Columns:
     """Density over the sounding's by the deceleration, on the descent."""
     n = len(flight.air.time_s)
     out = {"density_ratio": np.full(n, np.nan), "density_ratio_sd": np.full(n, np.nan)}
-    if flight.day is None:
+    if flight.as_flown is None:
         return out
-    p, span = flight.day.profile, flight.day.drag["time_s"]
+    p, span = flight.as_flown.profile, flight.as_flown.drag["time_s"]
     h = flight.air.altitude_m
     rows = (flight.air.time_s >= span.min()) & (flight.air.time_s <= span.max())
     rows &= (h >= p["altitude_m"].min()) & (h <= p["altitude_m"].max())

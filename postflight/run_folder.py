@@ -23,12 +23,12 @@ import numpy as np
 import pandas as pd
 
 from flightmodel.checks import GateError, writing
-from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
-from postflight.flight import NO_VIDEO, Answers, Flight
+from postflight.deflections import NO_VIDEO, Deflections
 from postflight.fusing import agreement_table, input_table
 from postflight.product import bet_table, event_table, header, peak_table, residual_statistics, slow_covariance
+from postflight.reconstruction import Reconstruction
 
 DIGITS = "%.10g"
 COPY = "copy the flight folder to where you may write"
@@ -143,25 +143,7 @@ def newest_run(flight_folder: Path) -> Path:
     return runs[-1]
 
 
-def deflection_table(history: DeflectionHistory) -> pd.DataFrame:
-    """Angle and plane with standard deviations; rows without an answer are left out."""
-    keep = np.isfinite(history.theta_rad)
-    plane_sd = np.full(len(keep), np.nan)
-    if history.covariance is not None:
-        plane_sd = np.sqrt(history.covariance[:, 1, 1])
-    table = pd.DataFrame(
-        {
-            "t_s": history.time_s,
-            "theta_deg": np.rad2deg(history.theta_rad),
-            "theta_sd_deg": np.rad2deg(history.theta_sd_rad),
-            "plane_lv_deg": np.rad2deg(history.plane_lv_rad),
-            "plane_sd_deg": np.rad2deg(plane_sd),
-        }
-    )
-    return table[keep]
-
-
-def method_summary(answers: Answers, at_s: float) -> dict[str, dict[str, Any]]:
+def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any]]:
     """Each method's deflection at one time, and the reason where it has none."""
     out: dict[str, dict[str, Any]] = {}
     for method, history in answers.histories.items():
@@ -179,13 +161,13 @@ def method_summary(answers: Answers, at_s: float) -> dict[str, dict[str, Any]]:
             out[method]["deflection_deg"] = out[method]["sd_deg"] = None
             out[method]["reason"] = f"no data at {at_s:.2f} s; answers span {known[0]:.2f} to {known[-1]:.2f} s"
     for method, reason in answers.refused.items():
-        out[method] = {"deflection_deg": None, "sd_deg": None, "reason": reason, "applicable": reason != NO_VIDEO}
+        out[method] = {"deflection_deg": None, "sd_deg": None, "reason": reason, "applicable": reason.code != NO_VIDEO}
     return out
 
 
-def write_reconstruction(run: RunFolder, flight: Flight) -> pd.DataFrame:
+def write_reconstruction(run: RunFolder, flight: Reconstruction) -> pd.DataFrame:
     """Write trajectory, covariance, residuals, checks, sensor errors, events, air, findings; return the events."""
-    bet = flight.reconstruction
+    bet = flight.solution
     table = bet_table(flight)
     run.write_csv("bet.csv", table)
     run.write_json("bet_header.json", header(flight))
@@ -203,10 +185,10 @@ def write_reconstruction(run: RunFolder, flight: Flight) -> pd.DataFrame:
     run.write_csv("sensor_errors.csv", bet.sensor_errors)
     event_rows = event_table(flight, table)
     run.write_csv("events.csv", event_rows)
-    if flight.day is not None:
-        run.write_csv("air_profile.csv", flight.day.profile)
-        run.write_csv("drag_ratio.csv", flight.day.drag)
-        run.write_csv("air_parameters.csv", flight.day.parameters)
+    if flight.as_flown is not None:
+        run.write_csv("air_profile.csv", flight.as_flown.profile)
+        run.write_csv("drag_ratio.csv", flight.as_flown.drag)
+        run.write_csv("air_parameters.csv", flight.as_flown.parameters)
     if flight.attitude is not None and flight.attitude.comparison is not None:
         run.write_csv("attitude_check.csv", attitude_table(flight.attitude, bet))
     findings = [vars(f) for f in (*flight.findings, *without_attitude(flight))]
@@ -214,7 +196,7 @@ def write_reconstruction(run: RunFolder, flight: Flight) -> pd.DataFrame:
     return event_rows
 
 
-def without_attitude(flight: Flight) -> tuple[Finding, ...]:
+def without_attitude(flight: Reconstruction) -> tuple[Finding, ...]:
     """Finding that says what is not in the tables of a flight without inertial sensors; none with them."""
     if flight.has_attitude:
         return ()
@@ -222,12 +204,12 @@ def without_attitude(flight: Flight) -> tuple[Finding, ...]:
     return (Finding("attitude", words, np.nan, np.nan),)
 
 
-def write_answers(run: RunFolder, answers: Answers) -> None:
+def write_answers(run: RunFolder, answers: Deflections) -> None:
     """One CSV a method that answered."""
     for method, history in answers.histories.items():
-        run.write_csv(f"deflection_{method}.csv", deflection_table(history))
+        run.write_csv(f"deflection_{method}.csv", history.to_frame())
     if answers.smooth_camera is not None:
-        run.write_csv("camera_smooth.csv", deflection_table(answers.smooth_camera))
+        run.write_csv("camera_smooth.csv", answers.smooth_camera.to_frame())
     if answers.fused is not None:
         run.write_csv("fusion_inputs.csv", input_table(answers.fused))
         run.write_csv("fusion_agreement.csv", agreement_table(answers.fused))
@@ -250,7 +232,7 @@ def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
     }
 
 
-def summary(flight: Flight, answers: Answers, event_rows: pd.DataFrame) -> dict[str, Any]:
+def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFrame) -> dict[str, Any]:
     """Return the results of a run in short, for ``summary.json``; ``event_rows`` is its `event_table`."""
     at_peak = event_rows.iloc[int((event_rows["t_s"] - flight.peak_s).abs().argmin())]
     alpha = [float(at_peak["alpha_total_wind_deg"]), float(at_peak["alpha_total_wind_3sd_deg"]) / 3.0]

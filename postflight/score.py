@@ -15,6 +15,7 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.events import find_peak
+from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, difference, resample
 from postflight.run_folder import newest_run
 
@@ -31,14 +32,22 @@ STATE_COLUMNS = (
 PAPER_DEG = {"camera": 4.2, "misalignment": 3.5, "trim": 3.75}
 
 
-@dataclass(frozen=True)
-class Score:
+@dataclass(frozen=True, repr=False)
+class Score(Tabular):
     """A run against its truth: ``methods`` and ``bet`` as printed by ``score --json``, and what failed, in words."""
 
     peak_s: float
     methods: dict[str, dict[str, Any]]
     bet: dict[str, float]
     failures: tuple[str, ...]
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a method at the true peak: ``method, deflection_deg, sd_deg, truth_deg, error_deg, ...``."""
+        return pd.DataFrame([{"method": name, **row} for name, row in self.methods.items()])
+
+    def _about(self) -> str:
+        found = f"{len(self.failures)} limits exceeded" if self.failures else "truth recovered within every limit"
+        return f"at the true peak, {self.peak_s:.3f} s: {found}"
 
     def as_json(self) -> dict[str, Any]:
         """Return one object for machines."""

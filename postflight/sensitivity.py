@@ -27,8 +27,9 @@ from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.telemetry import Sounding, Telemetry
 from flightmodel.trajectory import Trajectory, difference, interpolate_rows, resample
-from postflight.flight import Flight, flight_from
+from postflight.flight import Flight
 from postflight.product import bet_table
+from postflight.reconstruction import Reconstruction, reconstruction_from
 from recon.reconstruct import reconstruct_once, trackers
 from recon.settings import Settings
 
@@ -148,7 +149,7 @@ def _heavier(telemetry: Telemetry, factor: float) -> Telemetry:
     return replace(telemetry, motion=motion, vehicle=vehicle)
 
 
-def sensitivity(flight: Flight, progress: Progress | None = None) -> pd.DataFrame:
+def sensitivity(flight: Reconstruction, progress: Progress | None = None) -> pd.DataFrame:
     """Rerun a reconstructed flight with each source left out and each assumption changed.
 
     Parameters
@@ -166,31 +167,31 @@ def sensitivity(flight: Flight, progress: Progress | None = None) -> pd.DataFram
         to nothing), and the largest change over the pulse. A rerun that fails is one row with its ``reason``.
     """
     report = progress or (lambda _fraction, _what: None)
-    telemetry, settings = flight.telemetry, flight.reconstruction.settings
+    telemetry, settings = flight.telemetry, flight.solution.settings
     planned = reruns(telemetry, settings)
-    learnt = flight.reconstruction.learnt  # a rerun with other priors would differ by them, too
+    learnt = flight.solution.learnt  # a rerun with other priors would differ by them, too
     report(0.0, "base")
     # where trackers contradict each other the base's covariance was enlarged, and is no optimal filter's
     own = flight
-    if flight.reconstruction.left_out:
-        own = flight_from(telemetry, reconstruct_once(telemetry, settings, learnt=learnt))
+    if flight.solution.left_out:
+        own = reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, settings, learnt=learnt))
     rows: list[dict[str, object]] = []
     for k, rerun in enumerate(planned):
         report(k / len(planned), rerun.name)
         try:
-            bet = flight.reconstruction
+            bet = flight.solution
             if rerun.filtered:
                 bet = reconstruct_once(rerun.telemetry, rerun.settings, learnt=learnt)
-            rows += _rows(rerun, flight, own, flight_from(rerun.telemetry, bet))
+            rows += _rows(rerun, flight, own, reconstruction_from(Flight(rerun.telemetry), bet))
         except GateError as fault:
             rows.append({"rerun": rerun.name, "reason": str(fault)})
     report(1.0, "done")
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def _rows(rerun: Rerun, base: Flight, own: Flight, other: Flight) -> list[dict[str, object]]:
+def _rows(rerun: Rerun, base: Reconstruction, own: Reconstruction, other: Reconstruction) -> list[dict[str, object]]:
     """Every quantity of one rerun; `GateError` where it does not cover the peak."""
-    at, peak = _times(base, other.reconstruction.smoothed)
+    at, peak = _times(base, other.solution.smoothed)
     views = [View.of(flight, at) for flight in (base, own, other)]
     change = views[2].minus(views[0])
     out: list[dict[str, object]] = []
@@ -222,7 +223,7 @@ def _rows(rerun: Rerun, base: Flight, own: Flight, other: Flight) -> list[dict[s
     return out
 
 
-def _times(base: Flight, other: Trajectory) -> tuple[FloatArray, int]:
+def _times(base: Reconstruction, other: Trajectory) -> tuple[FloatArray, int]:
     """Times (k,) of the pulse that both cover, about `PULSE_STEP_S` apart, and which of them is the peak."""
     t = base.air.time_s
     peak_s = float(t[np.argmin(np.abs(t - base.peak_s))])
@@ -247,10 +248,10 @@ class View:
     sd: dict[str, FloatArray]
 
     @classmethod
-    def of(cls, flight: Flight, at: FloatArray) -> View:
+    def of(cls, flight: Reconstruction, at: FloatArray) -> View:
         """Flight at times ``at`` (k,)."""
         cut = at_times(flight, at)
-        path, table = cut.reconstruction.smoothed, bet_table(cut)
+        path, table = cut.solution.smoothed, bet_table(cut)
         for column, ratio in (("day_kgpm3", "density_ratio"), ("day_sd_kgpm3", "density_ratio_sd")):
             table[column] = table[ratio] * table["rho_kgpm3"]
         turn = _turn(path)
@@ -273,9 +274,9 @@ class View:
         return out | {name: self.value[name] - base.value[name] for name in DERIVED}
 
 
-def at_times(flight: Flight, at: FloatArray) -> Flight:
+def at_times(flight: Reconstruction, at: FloatArray) -> Reconstruction:
     """Flight whose trajectory and air are given at times ``at`` (k,) alone."""
-    bet, telemetry = flight.reconstruction, flight.telemetry
+    bet, telemetry = flight.solution, flight.telemetry
     t, path = bet.smoothed.time_s, resample(bet.smoothed, at)
     force, rate = (
         interpolate_rows(at, t, c.reshape(-1, 9)).reshape(-1, 3, 3) if len(c) else c
@@ -284,7 +285,7 @@ def at_times(flight: Flight, at: FloatArray) -> Flight:
     arm = np.zeros(3) if telemetry.vehicle is None else telemetry.vehicle.cg_m
     air = air_data(path, profile_from_sounding(telemetry.sounding), arm)
     return replace(
-        flight, reconstruction=replace(bet, smoothed=path, specific_force_cov=force, rate_cov=rate), air=air, pulse=None
+        flight, solution=replace(bet, smoothed=path, specific_force_cov=force, rate_cov=rate), air=air, loads=None
     )
 
 

@@ -49,7 +49,7 @@ SHEETS = {
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class TrajectorySolution:
     """The best estimated trajectory and everything that was learnt on the way.
 
     Parameters
@@ -115,7 +115,7 @@ class Reconstruction:
 
 def reconstruct(
     telemetry: Telemetry, settings: Settings | None = None, progress: Progress | None = None
-) -> Reconstruction:
+) -> TrajectorySolution:
     """Reconstruct a flight; where a verdict on a tracker is red, find out what each tracker does to it.
 
     Parameters
@@ -144,8 +144,8 @@ def reconstruct(
 
 
 def _with_wider(
-    telemetry: Telemetry, settings: Settings, found: Reconstruction, wider: dict[str, float]
-) -> Reconstruction:
+    telemetry: Telemetry, settings: Settings, found: TrajectorySolution, wider: dict[str, float]
+) -> TrajectorySolution:
     """Reconstruction that does not hold on to the data sheets its verdicts, which stay, found wrong."""
     again = reconstruct_once(telemetry, settings, learnt=replace(found.learnt, wider=wider))
     told = sheet_findings(again.sensor_errors, wider, *again.smoothed.time_s[[0, -1]].tolist())
@@ -153,7 +153,7 @@ def _with_wider(
     return replace(again, consistency_checks=found.consistency_checks, residuals=found.residuals, findings=findings)
 
 
-def _clocks_that_differ(telemetry: Telemetry, found: Reconstruction) -> dict[str, float]:
+def _clocks_that_differ(telemetry: Telemetry, found: TrajectorySolution) -> dict[str, float]:
     """Standard deviations to take instead of those of the inertial clocks, where they differ by more than stated."""
     lag, triads = found.learnt.lag, (telemetry.accelerometer, telemetry.rates)
     if lag is None:
@@ -168,13 +168,13 @@ def trackers(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
 
 
 def _examined(
-    telemetry: Telemetry, settings: Settings, found: Reconstruction, sources: tuple[str, ...], report: Progress
-) -> Reconstruction:
+    telemetry: Telemetry, settings: Settings, found: TrajectorySolution, sources: tuple[str, ...], report: Progress
+) -> TrajectorySolution:
     """Reconstruction whose covariance and findings know how far the trackers contradict each other."""
     coarse = min(settings.output_rate_hz, EXAMINED_RATE_HZ)
     withheld: dict[str, pd.DataFrame] = {}
 
-    def unknown(made: Reconstruction) -> int:
+    def unknown(made: TrajectorySolution) -> int:
         return sum(f.source == unmodelled.SOURCE for f in made.findings)
 
     def rerun(source: str) -> tuple[Trajectory, tuple[ConsistencyCheck, ...], bool]:
@@ -211,7 +211,7 @@ def reconstruct_once(
     settings: Settings,
     progress: Progress | None = None,
     learnt: Learnt = NOTHING,
-) -> Reconstruction:
+) -> TrajectorySolution:
     """Reconstruct a flight with the covariance as the filter has it, whatever its verdicts say.
 
     ``learnt`` is what an earlier reconstruction found of the same data; displaced readings are judged where it does
@@ -245,7 +245,7 @@ def reconstruct_once(
     if bridges is not None:
         found += time_bias.jump_findings(learnt.jumps or (), (bridges.force.spec.name, bridges.rate.spec.name))
     report(1.0, "done")
-    return Reconstruction(
+    return TrajectorySolution(
         smoothed=product.datum_trajectory(problem, mount, reference, smoothed.triangles),
         filtered=product.datum_trajectory(problem, mount, run.states(), run.filtered.p_plus),
         sensor_errors=table,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from flightmodel.atmosphere import AtmosphereProfile, us76
 from flightmodel.checks import ConfigError, FloatArray, check_finite
 from flightmodel.deflection import DeflectionHistory, lv_clock
 from flightmodel.events import splashdown_index
+from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import _kernels, dynamics
@@ -25,12 +27,15 @@ from synthetic_flight import _kernels as at
 from synthetic_flight._kernels import AUX, STATES
 from synthetic_flight.dynamics import check_step
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 BENDING_LIMIT_RAD = 0.5 * np.pi
 TUMBLE_RAD = 0.5 * np.pi
 
 
-@dataclass(frozen=True)
-class Truth:
+@dataclass(frozen=True, repr=False)
+class Truth(Tabular):
     """What the synthetic vehicle did; every array has one row a record. Estimators never see it.
 
     Parameters
@@ -79,6 +84,44 @@ class Truth:
     def time_s(self) -> FloatArray:
         """Times of the records, s."""
         return self.trajectory.time_s
+
+    def to_frame(self) -> pd.DataFrame:
+        """Flight, deflection and invariants, one row a record.
+
+        Returns
+        -------
+        DataFrame
+            ``t_s, altitude_m, density_kgpm3, mach, dynamic_pressure_pa, alpha_shell_deg, alpha_body_deg, theta_deg,
+            plane_lv_deg, twist_deg, energy_j`` (kinetic, gravitational and in the joint), ``angular_momentum_nms``
+            (magnitude, about the c.g., inertial) and ``sensed_power_w`` (of the non-gravitational force at the c.g.).
+        """
+        import pandas as pd
+
+        state, vehicle = self.state_eci, self.vehicle
+        velocity_body = rotations.rotate(rotations.conjugate(state[:, 6:10]), state[:, 3:6])
+        force = vehicle.mass_kg * self.specific_force_body(vehicle.cg_m)
+        return pd.DataFrame(
+            {
+                "t_s": self.time_s,
+                "altitude_m": self.altitude_m,
+                "density_kgpm3": self.density_kgpm3,
+                "mach": self.mach,
+                "dynamic_pressure_pa": self.dynamic_pressure_pa,
+                "alpha_shell_deg": np.rad2deg(self.alpha_shell_rad),
+                "alpha_body_deg": np.rad2deg(self.alpha_body_rad),
+                "theta_deg": np.rad2deg(self.deflection.theta_rad),
+                "plane_lv_deg": np.rad2deg(self.deflection.plane_lv_rad),
+                "twist_deg": np.rad2deg(self.twist_rad),
+                "energy_j": dynamics.energy(state, vehicle),
+                "angular_momentum_nms": np.linalg.norm(dynamics.angular_momentum(state, vehicle), axis=1),
+                "sensed_power_w": np.sum(force * velocity_body, axis=1),
+            }
+        )
+
+    def _about(self) -> str:
+        k = int(np.argmax(self.dynamic_pressure_pa))
+        peak = f"peak q {self.dynamic_pressure_pa[k]:.0f} Pa at {self.time_s[k]:.2f} s"
+        return f"synthetic flight of {self.vehicle.name}, {len(self.time_s)} records, {peak}"
 
     def specific_force_body(self, position_from_datum_body_m: FloatArray) -> FloatArray:
         """Specific force ``(n, 3)``, body axes, m/s^2, that an ideal accelerometer feels at a point of the centerbody.

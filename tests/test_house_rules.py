@@ -88,7 +88,12 @@ def test_degrees_stay_in_files_command_and_figures(path):
 def modules_imported(path, known):
     """Modules of this project that a file imports anywhere, also inside functions."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    tree = ast.parse(path.read_text())
+    for_types = [n for n in ast.walk(tree) if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"]
+    ignored = {part for block in for_types for part in ast.walk(block)}
+    for node in ast.walk(tree):
+        if node in ignored:
+            continue
         if isinstance(node, ast.ImportFrom) and node.module:
             found |= {f"{node.module}.{a.name}" for a in node.names} | {node.module}
         elif isinstance(node, ast.Import):
@@ -121,3 +126,22 @@ def test_nothing_in_the_tree_knows_this_machine():
         path = ROOT / entry
         if path.suffix in (".py", ".md", ".toml", ".cff", ".yml") and path.is_file():
             assert not absolute.search(path.read_text()), f"{entry} holds a path of one machine"
+
+
+PYTHON_BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+# what a user reads and copies: it imports `postflight` alone of this project's packages
+SHOWN = [
+    *sorted((ROOT / "notebooks").glob("*.py")),
+    *sorted((ROOT / "examples").rglob("*.py")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+    ROOT / "README.md",
+]
+
+
+@pytest.mark.parametrize("path", SHOWN, ids=name)
+def test_what_users_read_goes_through_the_front_door(path):
+    text = path.read_text()
+    for code in [text] if path.suffix == ".py" else PYTHON_BLOCK.findall(text):
+        for module in imports(ast.parse(code)):
+            if module.split(".")[0] in PACKAGES:
+                assert module == "postflight", f"{module} is internal: import postflight alone"

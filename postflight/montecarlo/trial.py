@@ -19,7 +19,9 @@ from flightmodel.airdata import air_data
 from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import difference, resample
-from postflight.flight import estimate, reconstruct_telemetry
+from postflight.deflections import estimate
+from postflight.flight import Flight
+from postflight.reconstruction import reconstruct
 from synthetic_flight.dispersions import Dispersions, dispersed_case, draws, run_seed
 from synthetic_flight.ensemble import Plan, Row, reason_of
 from synthetic_flight.folder import simulate_to_folder
@@ -75,8 +77,8 @@ def trial(plan: Plan, seed: int, run: int) -> dict[str, float]:
         folder = Path(temporary) / "flight"
         truth = simulate_to_folder(scenario, run_seed(seed, run), folder)
         telemetry = replace(read_flight(folder), vehicle=told)
-    flight = reconstruct_telemetry(telemetry)
-    answers = estimate(flight, telemetry, METHODS)
+    flight = reconstruct(Flight(telemetry))
+    answers = estimate(flight, METHODS)
     peak_s, _ = find_peak(truth.time_s, truth.dynamic_pressure_pa)
     out = dict.fromkeys(SCALARS, np.nan)
     out["truth_deg"] = float(np.rad2deg(np.interp(peak_s, truth.time_s, truth.deflection.theta_rad)))
@@ -85,7 +87,7 @@ def trial(plan: Plan, seed: int, run: int) -> dict[str, float]:
         out |= {f"{method}_deg": float(theta), f"{method}_sd_deg": float(sd)}
         out[f"{method}_error_deg"] = float(theta) - out["truth_deg"]
     at = np.array([peak_s])
-    found, path = resample(flight.reconstruction.smoothed, at), resample(truth.trajectory, at)
+    found, path = resample(flight.solution.smoothed, at), resample(truth.trajectory, at)
     error = difference(found, path)[0]
     out["bet_position_m"], out["bet_velocity_mps"], turned = (
         float(np.linalg.norm(error[k : k + 3])) for k in (0, 3, 6)

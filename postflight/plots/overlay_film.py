@@ -19,9 +19,7 @@ from postflight.flight import Progress
 from postflight.plots.run_figures import bending_at, oriented_camera
 
 
-def write_overlay_film(
-    telemetry: Telemetry, history: DeflectionHistory, path: Path, joint_m: float | None, report: Progress
-) -> None:
+def write_overlay_film(telemetry: Telemetry, history: DeflectionHistory, path: Path, progress: Progress) -> None:
     """Write the film: the virtual view over the right half, its horizon in yellow, the benchmark's in grey, the answer.
 
     A frame that was refused is shown as it is, and says so. The file appears when it is whole.
@@ -33,7 +31,7 @@ def write_overlay_film(
     """
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
-    oriented, benchmark = oriented_camera(telemetry, history, joint_m)
+    oriented, benchmark = oriented_camera(telemetry, history)
     overlay = Overlay(oriented.view, vehicle.meshes)
     before = horizon_row(oriented.view, *bending_at(history, float(frames.time_s[benchmark])))
     partial = path.with_suffix(".part.webm")
@@ -45,7 +43,7 @@ def write_overlay_film(
         raise GateError(f"{path}: this build of OpenCV cannot write VP9 films; leave out --film")
     try:
         for k, image in enumerate(frames.pictures()):
-            report(k / len(frames.time_s), f"drawing frame {k + 1} of {len(frames.time_s)}")
+            progress(k / len(frames.time_s), f"drawing frame {k + 1} of {len(frames.time_s)}")
             theta, plane = float(history.theta_rad[k]), float(history.plane_lv_rad[k])
             said = f"{frames.time_s[k]:8.2f} s   "
             if image.shape != size[::-1]:

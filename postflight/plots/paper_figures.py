@@ -16,8 +16,9 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.telemetry import Telemetry
-from postflight.flight import Answers, Flight
+from postflight.deflections import Deflections
 from postflight.plots.ensembles import words_in_corner
+from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds
 
 # distinct in hue and in grey (Okabe and Ito)
@@ -51,7 +52,7 @@ def stamp(figure: Figure, telemetry: Telemetry) -> None:
     words_in_corner(figure, f"{telemetry.name}: {tag}")
 
 
-def _window(flight: Flight) -> tuple[float, float]:
+def _window(flight: Reconstruction) -> tuple[float, float]:
     """Return from 80 km or so to well after the pulse."""
     pulse = flight.air.time_s[pressure_pulse(flight.air.dynamic_pressure_pa)]
     width = pulse[-1] - pulse[0]
@@ -59,11 +60,11 @@ def _window(flight: Flight) -> tuple[float, float]:
     return float(max(first, flight.air.time_s[0])), float(min(last, flight.air.time_s[-1]))
 
 
-def figure_1_3(flight: Flight, bounds: Bounds) -> Figure:
+def figure_1_3(flight: Reconstruction, bounds: Bounds) -> Figure:
     """Total angle of attack and normal acceleration against a rigid vehicle's Monte Carlo bounds (Figure 1.3)."""
     figure = Figure(figsize=(7.2, 7.0), layout="constrained")
     upper, lower = _axes(figure, 2)
-    air, pulse = flight.air, flight.required_pulse()
+    air, pulse = flight.air, flight.required_loads()
     for ax, band, nominal in (
         (upper, bounds.alpha_total_deg, bounds.nominal_alpha_deg),
         (lower, bounds.normal_g, bounds.nominal_normal_g),
@@ -93,12 +94,12 @@ def figure_1_3(flight: Flight, bounds: Bounds) -> Figure:
     return figure
 
 
-def figure_2_5(flight: Flight) -> Figure:
+def figure_2_5(flight: Reconstruction) -> Figure:
     """BET angle of attack and the one inferred from the uncorrected accelerometers (Figure 2.5)."""
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
     (ax,) = _axes(figure)
     _bet_line(ax, flight, "BET, centerbody")
-    pulse = flight.required_pulse()
+    pulse = flight.required_loads()
     use = pulse.informative
     inferred = aerodynamic_angle(flight.telemetry.required_vehicle().aero, pulse.mach, pulse.specific_force_body_mps2)
     ax.plot(pulse.time_s, _where(use, inferred), color="black", lw=1.2, label="C_N/C_A look-up, no adjustment")
@@ -110,11 +111,11 @@ def figure_2_5(flight: Flight) -> Figure:
     return figure
 
 
-def figure_2_7(flight: Flight, history: DeflectionHistory) -> Figure:
+def figure_2_7(flight: Reconstruction, history: DeflectionHistory) -> Figure:
     """The same with the accelerometers turned by the estimated deflection, and the BET biased by it (Figure 2.7)."""
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
     (ax,) = _axes(figure)
-    pulse, aero = flight.required_pulse(), flight.telemetry.required_vehicle().aero
+    pulse, aero = flight.required_loads(), flight.telemetry.required_vehicle().aero
     use, force = pulse.informative, pulse.specific_force_body_mps2
     raw = aerodynamic_angle(aero, pulse.mach, force)
     turned = aeroshell_acceleration(force, np.nan_to_num(history.theta_rad), psi_from_acceleration(force))
@@ -132,7 +133,7 @@ def figure_2_7(flight: Flight, history: DeflectionHistory) -> Figure:
     return figure
 
 
-def _bet_line(ax: Axes, flight: Flight, label: str) -> None:
+def _bet_line(ax: Axes, flight: Reconstruction, label: str) -> None:
     air = flight.air
     alpha, sd = np.rad2deg(air.alpha_total_wind_rad), np.rad2deg(air.alpha_total_wind_sd_rad)
     ax.plot(air.time_s, alpha, color="#0072B2", lw=1.4, label=label)
@@ -164,8 +165,8 @@ def draw_histories(
 
 
 def figure_summary(
-    flight: Flight,
-    answers: Answers,
+    flight: Reconstruction,
+    answers: Deflections,
     truth: tuple[FloatArray, FloatArray] | None = None,
     frames: tuple[NDArray[np.uint8], str] | None = None,
 ) -> Figure:
@@ -215,11 +216,11 @@ def _top(histories: Iterable[DeflectionHistory]) -> float:
     return 1.25 * float(max(largest, default=5.0))
 
 
-def figure_flown(flight: Flight) -> Figure:
+def figure_flown(flight: Reconstruction) -> Figure:
     """Altitude, speed and their standard deviations: the picture of a flight without a vehicle to speak of."""
     figure = Figure(figsize=(7.2, 7.0), layout="constrained")
     high, fast, sure = _axes(figure, 3)
-    bet, air = flight.reconstruction.smoothed, flight.air
+    bet, air = flight.solution.smoothed, flight.air
     high.plot(air.time_s, air.altitude_m / 1e3, color="#0072B2", lw=1.4)
     high.set_ylabel("altitude (km)")
     fast.plot(air.time_s, np.linalg.norm(bet.velocity_ecef_mps, axis=1), color="#0072B2", lw=1.4)
@@ -229,7 +230,7 @@ def figure_flown(flight: Flight) -> Figure:
         sure.semilogy(air.time_s, np.linalg.norm(sd[:, part], axis=1), color=colour, lw=1.2, label=label)
     sure.set(ylabel="standard deviation", xlabel="time after launch (s)")
     sure.legend(fontsize=8, frameon=False)
-    found = [f for f in flight.reconstruction.findings if f.source == "motion"]
+    found = [f for f in flight.solution.findings if f.source == "motion"]
     for ax in (high, fast, sure):
         for f in found:
             ax.axvspan(f.start_s, f.end_s, color="#E69F00", alpha=0.3, lw=0)
@@ -248,9 +249,9 @@ def residual_unit(component: str) -> tuple[float, str]:
     return (1e3, "mrad") if component in ("azimuth", "elevation") else (1.0, "m")
 
 
-def figure_residuals(flight: Flight) -> Figure:
+def figure_residuals(flight: Reconstruction) -> Figure:
     """Innovations of each source and component that were tried, with the predicted 3-sd lines; edited points marked."""
-    table = flight.reconstruction.residuals
+    table = flight.solution.residuals
     pairs = list(table[table["used"]].groupby(["source", "component"], sort=False))
     figure = Figure(figsize=(7.2, 1.5 * len(pairs) + 0.8), layout="constrained")
     for ax, (name, rows) in zip(_axes(figure, len(pairs)), pairs, strict=True):

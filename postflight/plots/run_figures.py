@@ -17,10 +17,11 @@ from estimators.trim import static_trim
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
-from postflight.flight import Answers, Flight
+from postflight.deflections import Deflections
 from postflight.plots import paper_figures
 from postflight.plots import trajectory as product_figures
 from postflight.plots.deflection import figure_camera_overlay, figure_fusion, figure_static_trim, figure_told_apart
+from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds, rigid_bounds
 
 UNBENT_RAD = 1e-4  # less than a fit resolves: the benchmark frame where it was taken as not bent
@@ -28,10 +29,10 @@ UNBENT_RAD = 1e-4  # less than a fit resolves: the benchmark frame where it was 
 Report = Callable[[float, str], None]
 
 
-def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> Bounds | None:
+def draw_run(flight: Reconstruction, answers: Deflections, folder: Path, report: Report) -> Bounds | None:
     """Draw everything that the run's answers allow; return the rigid vehicle's bands where it was flown."""
     bounds = None
-    if flight.pulse is not None:
+    if flight.loads is not None:
         report(0.0, "flying the rigid vehicle")
         bounds = rigid_bounds(flight, progress=lambda f, what: report(0.6 * f, what))
         paper_figures.save(paper_figures.figure_1_3(flight, bounds), folder / "figure_1_3.png")
@@ -39,8 +40,8 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
     else:
         paper_figures.save(paper_figures.figure_flown(flight), folder / "flown.png")
     report(0.6, "drawing")
-    if flight.day is not None:
-        paper_figures.save(product_figures.figure_air(flight, flight.day), folder / "air.png")
+    if flight.as_flown is not None:
+        paper_figures.save(product_figures.figure_air(flight, flight.as_flown), folder / "air.png")
     if flight.attitude is not None and flight.attitude.comparison is not None:
         paper_figures.save(product_figures.figure_attitude(flight, flight.attitude), folder / "attitude_check.png")
     paper_figures.save(product_figures.figure_filter_and_smoother(flight), folder / "filter_and_smoother.png")
@@ -58,8 +59,8 @@ def draw_run(flight: Flight, answers: Answers, folder: Path, report: Report) -> 
         for name, figure in (("fusion.png", answer), ("told_apart.png", apart)):
             paper_figures.stamp(figure, flight.telemetry)
             paper_figures.save(figure, folder / name)
-    if flight.pulse is not None:
-        draw_static_trim(flight.pulse, flight.telemetry, folder)
+    if flight.loads is not None:
+        draw_static_trim(flight.loads, flight.telemetry, folder)
     if answers.histories:
         paper_figures.save(summary_figure(flight, answers), folder / "summary.png")
     report(1.0, "drawn")
@@ -82,20 +83,18 @@ def draw_static_trim(pulse: PulseData, telemetry: Telemetry, folder: Path) -> No
     paper_figures.save(figure, folder / "figure_2_9.png")
 
 
-def draw_sensitivity(flight: Flight, table: pd.DataFrame, folder: Path) -> None:
+def draw_sensitivity(flight: Reconstruction, table: pd.DataFrame, folder: Path) -> None:
     """Draw what moved in the reruns, where any succeeded."""
     if table["quantity"].notna().any():
         paper_figures.save(product_figures.figure_sensitivity(flight, table), folder / "sensitivity.png")
 
 
-def oriented_camera(
-    telemetry: Telemetry, history: DeflectionHistory, joint_m: float | None = None
-) -> tuple[OrientedCamera, int]:
+def oriented_camera(telemetry: Telemetry, history: DeflectionHistory) -> tuple[OrientedCamera, int]:
     """Camera oriented on the benchmark frame, the shell there as bent as the history says, and that frame's index."""
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
     benchmark = frames.benchmark
-    station = vehicle.joint.station_m if joint_m is None else joint_m
+    station = vehicle.joint.station_m
     oriented = orient_camera(frames.picture(benchmark), vehicle.geometry, frames.camera, station)
     return with_bent_benchmark(oriented, *bending_at(history, float(frames.time_s[benchmark]))), benchmark
 
@@ -107,11 +106,11 @@ def bending_at(history: DeflectionHistory, time_s: float) -> tuple[float, float]
     return (theta, plane) if abs(theta) > UNBENT_RAD and abs(history.time_s[k] - time_s) < 1e-3 else (0.0, 0.0)
 
 
-def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, joint_m: float | None = None) -> None:
+def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path) -> None:
     """Benchmark frame and frame of the largest deflection with the virtual camera over them (Figure 2.3)."""
     frames = telemetry.frames
     assert frames is not None
-    oriented, benchmark = oriented_camera(telemetry, history, joint_m)
+    oriented, benchmark = oriented_camera(telemetry, history)
     meshes = telemetry.required_vehicle().meshes
     largest = int(np.nanargmax(np.abs(history.theta_rad)))
     pick = [benchmark, largest]
@@ -127,7 +126,7 @@ def draw_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, 
 
 
 def summary_figure(
-    flight: Flight, answers: Answers, truth: tuple[FloatArray, FloatArray] | None = None
+    flight: Reconstruction, answers: Deflections, truth: tuple[FloatArray, FloatArray] | None = None
 ) -> paper_figures.Figure:
     """Return the one-page picture; with the truth where it is known and everything is estimated."""
     if "camera" not in answers.histories:

@@ -11,8 +11,8 @@ from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import difference, resample
 from postflight.attitude import AttitudeCheck
-from postflight.flight import Flight
 from postflight.plots.paper_figures import stamp
+from postflight.reconstruction import Reconstruction
 from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.atmosphere import ReconstructedAir
 
@@ -36,7 +36,7 @@ def _bands(
     ax.plot(middle, height_km, color=BLUE, lw=1.4)
 
 
-def figure_air(flight: Flight, day: ReconstructedAir) -> Figure:
+def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
     """Density ratio and winds along altitude with prior and posterior bands; measured over predicted drag."""
     figure = Figure(figsize=(9.6, 6.6), layout="constrained")
     upper, lower = list(np.asarray(figure.subfigures(2, 1, height_ratios=(1.7, 1.0))))
@@ -73,7 +73,7 @@ def figure_air(flight: Flight, day: ReconstructedAir) -> Figure:
     return figure
 
 
-def figure_sensitivity(flight: Flight, table: pd.DataFrame) -> Figure:
+def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
     """Change of each group of quantities at peak pressure in standard deviations, a bar a rerun.
 
     Diamonds: the same over what the change itself should be, where that is known.
@@ -113,7 +113,7 @@ def figure_sensitivity(flight: Flight, table: pd.DataFrame) -> Figure:
     return figure
 
 
-def figure_attitude(flight: Flight, check: AttitudeCheck) -> Figure:
+def figure_attitude(flight: Reconstruction, check: AttitudeCheck) -> Figure:
     """Attitude from magnetometer and Sun minus the trajectory's about three body axes, with what it may be."""
     comparison = check.comparison
     assert comparison is not None
@@ -121,7 +121,7 @@ def figure_attitude(flight: Flight, check: AttitudeCheck) -> Figure:
     axes = figure.subplots(3, 1, sharex=True)
     _clean(*axes)
     t, off, sd = comparison.time_s, np.rad2deg(comparison.difference_body_rad), np.rad2deg(comparison.sd_body_rad)
-    own = np.rad2deg(resample(flight.reconstruction.smoothed, t).sd()[:, 6:9])
+    own = np.rad2deg(resample(flight.solution.smoothed, t).sd()[:, 6:9])
     # stretches without Sun or field have no rows; a line across them would show what nobody knows
     whole = np.append(np.diff(t) < 1.5 * float(np.median(np.diff(t))), True)
     for k, ax in enumerate(axes):
@@ -149,9 +149,9 @@ def figure_attitude(flight: Flight, check: AttitudeCheck) -> Figure:
     return figure
 
 
-def figure_filter_and_smoother(flight: Flight) -> Figure:
+def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
     """What the filter knew at each time and what the smoother knows, and their difference over its sd (McReynolds)."""
-    bet = flight.reconstruction
+    bet = flight.solution
     filtered, smoothed = bet.filtered, bet.smoothed
     assert filtered.covariance is not None
     assert smoothed.covariance is not None

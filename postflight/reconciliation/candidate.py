@@ -34,8 +34,8 @@ from flightmodel.rotations import skew
 from flightmodel.telemetry import Sounding
 from flightmodel.trajectory import Trajectory, resample
 from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
-from postflight.flight import Flight
 from postflight.loads import sensed, whole_windows
+from postflight.reconstruction import Reconstruction
 from synthetic_flight import simulate
 
 # at 1200 m/s a tenth of a second: gusts at the joint's own 2 to 4 Hz are the knots', not noise; coarser in thin air
@@ -261,7 +261,7 @@ class Observed:
         return len(self.time_s)
 
 
-def observe(flight: Flight, loaded: bool = False) -> Observed:
+def observe(flight: Reconstruction, loaded: bool = False) -> Observed:
     """Take what a joint can be reconciled with from a reconstructed flight, 100 km down to the end of the pulse.
 
     Parameters
@@ -276,7 +276,7 @@ def observe(flight: Flight, loaded: bool = False) -> Observed:
     GateError
         Where sensors or vehicle are missing, or no pressure pulse was reconstructed.
     """
-    pulse, bet, air = flight.required_pulse(), flight.reconstruction, flight.air
+    pulse, bet, air = flight.required_loads(), flight.solution, flight.air
     accelerometer, rates = flight.telemetry.required_triads()
     falling = (air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0)
     if loaded:

@@ -14,7 +14,8 @@ from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight import run_folder
 from postflight.commands import compile_kernels, console
-from postflight.flight import PULSE_RATE_HZ, Flight, estimate, reconstruct_telemetry
+from postflight.deflections import estimate
+from postflight.flight import PULSE_RATE_HZ, Flight
 from postflight.plots.paper_figures import save
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.progress import Report, progress_bar
@@ -22,6 +23,7 @@ from postflight.reconciliation.answer import correlations, deflection_of, found_
 from postflight.reconciliation.fit import Reconciled, explain
 from postflight.reconciliation.modes import ModalStiffness, stiffness_by_modes
 from postflight.reconciliation.posterior import Posterior, posterior_summary, quantities, require_samplers, sample_all
+from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies.commands import bands, held_against
 from postflight.studies.preflight import Bounds, entry_bounds, rigid_bounds
 from postflight.warmup import RECONSTRUCTION
@@ -43,10 +45,10 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
         compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
-        flight = reconstruct_telemetry(
-            telemetry, Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
+        flight = reconstruct(
+            Flight(telemetry), Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
         )
-        answers = estimate(flight, telemetry, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
+        answers = estimate(flight, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
         fitting = 0.3 if sampled else 0.6
         explained = explain(flight, laws, lambda f, what: report(0.3 + fitting * f, what))
         found, odds = explained.found, explained.log_odds
@@ -63,7 +65,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             out.write_csv("joint.csv", table)
             out.write_csv("joint_correlations.csv", correlations(found))
             bent = deflection_of(found)
-            out.write_csv("deflection_reconciled.csv", run_folder.deflection_table(bent))
+            out.write_csv("deflection_reconciled.csv", bent.to_frame())
             story = summary(found, table, odds) | modal_summary(modal, no_modes) | posterior_words(posterior)
             out.write_json("reconciliation.json", story)
             out.write_csv("bands.csv", bands(rigid, flexible))
@@ -93,7 +95,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     console.print(f"results in {escape(str(out.path))}")
 
 
-def _modes(flight: Flight) -> tuple[ModalStiffness | None, str]:
+def _modes(flight: Reconstruction) -> tuple[ModalStiffness | None, str]:
     """Stiffness by the joint's frequency, or why there is none."""
     try:
         return stiffness_by_modes(flight), ""
@@ -131,7 +133,7 @@ def print_posterior(posterior: Posterior) -> None:
     console.print(printed)
 
 
-def reconciled_bounds(found: Reconciled, flight: Flight, report: Report) -> Bounds:
+def reconciled_bounds(found: Reconciled, flight: Reconstruction, report: Report) -> Bounds:
     """Bands of entries with the joint, offset and stability found, dispersed as far as they are open still."""
     joint, offset, stability = found_sd(found)
     vehicle = found.vehicle

@@ -36,9 +36,9 @@ import numpy as np
 
 from flightmodel.checks import FloatArray, Progress
 from flightmodel.vehicle import Vehicle
-from postflight.flight import Flight
 from postflight.reconciliation.candidate import FREEPLAY_SD_RAD, AirUnknowns, Observed, VehicleUnknowns, observe
 from postflight.reconciliation.problem import BENDING, Linear, Normal, Problem, Residuals, Unknowns, step_from
+from postflight.reconstruction import Reconstruction
 
 WIDER = (30.0, 10.0, 3.0)
 MOST_STEPS = 20  # after the widened ones
@@ -106,7 +106,7 @@ class Reconciled:
 
 
 def reconcile(
-    flight: Flight, laws: tuple[str, ...] = (), loaded: bool = False, progress: Progress | None = None
+    flight: Reconstruction, laws: tuple[str, ...] = (), loaded: bool = False, progress: Progress | None = None
 ) -> Reconciled:
     """Fit joint, offset and static stability to a reconstructed flight.
 
@@ -152,7 +152,7 @@ def in_fine_air(
     return solve(replace(found.problem, air=air), found.unknowns, progress=part, mend=mend)
 
 
-def problem_of(flight: Flight, observed: Observed, laws: tuple[str, ...]) -> Problem:
+def problem_of(flight: Reconstruction, observed: Observed, laws: tuple[str, ...]) -> Problem:
     """Problem of a flight."""
     air = AirUnknowns(flight.telemetry.sounding, float(observed.altitude_m.min()))
     return Problem(observed, VehicleUnknowns(flight.telemetry.required_vehicle(), laws), air)
@@ -202,7 +202,7 @@ FALSE_COST, LEAST_GAIN = 150.0, 10.0  # of a span's 60 readings with both its jo
 
 
 def reconcile_loose(
-    flight: Flight, observed: Observed, laws: tuple[str, ...] = ("freeplay",), progress: Progress | None = None
+    flight: Reconstruction, observed: Observed, laws: tuple[str, ...] = ("freeplay",), progress: Progress | None = None
 ) -> Reconciled:
     """Fit a joint with freeplay, and what else ``laws`` of `candidate.LAWS` name, to the loaded part of a flight.
 
@@ -310,7 +310,7 @@ class Explained:
         return {law: having.log_evidence - lacking.log_evidence for law, (lacking, having) in self.compared.items()}
 
 
-def explain(flight: Flight, asked: tuple[str, ...] = (), progress: Progress | None = None) -> Explained:
+def explain(flight: Reconstruction, asked: tuple[str, ...] = (), progress: Progress | None = None) -> Explained:
     """Fit the joint; of the laws of `candidate.LAWS` that are ``asked`` for keep those that the evidence favours.
 
     Raises

@@ -18,8 +18,8 @@ import numpy as np
 
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.vehicle import Vehicle
-from postflight.flight import Flight
 from postflight.reconciliation.candidate import STIFFNESS_LOG_SD, VehicleUnknowns
+from postflight.reconstruction import Reconstruction
 from synthetic_flight.linear import linear_matrix, modes, slopes_at
 
 RATE_HZ = 50.0
@@ -63,7 +63,7 @@ class ModalStiffness:
     gathered: FloatArray
 
 
-def stiffness_by_modes(flight: Flight) -> ModalStiffness:
+def stiffness_by_modes(flight: Reconstruction) -> ModalStiffness:
     """Track the joint's mode through the pressure pulse.
 
     Raises
@@ -71,7 +71,7 @@ def stiffness_by_modes(flight: Flight) -> ModalStiffness:
     GateError
         Where vehicle or sensors are missing, the pulse is shorter than a few windows, or no mode stands out.
     """
-    pulse, told = flight.required_pulse(), flight.telemetry.required_vehicle()
+    pulse, told = flight.required_loads(), flight.telemetry.required_vehicle()
     t, log_power = _spectra(flight, pulse.time_s)
     pressure = np.interp(t, pulse.time_s, pulse.dynamic_pressure_pa)
     use = pressure > LEAST_PRESSURE_PA
@@ -97,9 +97,9 @@ def stiffness_by_modes(flight: Flight) -> ModalStiffness:
     )
 
 
-def _spectra(flight: Flight, span_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _spectra(flight: Reconstruction, span_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and logarithms (n, PADDED) of power over noise, means of rates and force."""
-    bet = flight.reconstruction
+    bet = flight.solution
     grid = np.arange(span_s[0], span_s[-1], 1.0 / RATE_HZ)
     if len(grid) < WINDOW + HOP:
         raise GateError(

@@ -74,9 +74,12 @@ AGAIN = """\
 
 The same from the library, to be asked otherwise:
 
-    from postflight.flight import METHODS, estimate, reconstruct_flight
-    flight = reconstruct_flight(folder)
-    answers = estimate(flight, flight.telemetry, METHODS)"""
+    import postflight as pf
+    flight = pf.read_flight(folder)
+    bet = pf.reconstruct(flight)
+    answers = pf.fuse(bet)
+    changed = pf.fuse(pf.reconstruct(flight.with_(c_n=1.1)))
+    pf.compare(answers, changed)"""
 
 
 def write_notebook(flight_folder: Path, target: Path | None = None) -> Path:

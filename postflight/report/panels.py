@@ -19,7 +19,7 @@ from flightmodel import earth
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR
-from postflight.flight import METHODS
+from postflight.deflections import METHODS
 from postflight.plots.paper_figures import COLOUR, LABEL, residual_unit
 from postflight.report.source import Rows, Run, kept_rows, rounded
 from postflight.studies.preflight import inside

@@ -12,7 +12,7 @@ import pandas as pd
 from estimators.agreement import CONFIDENCE
 from flightmodel.config import parse_utc
 from flightmodel.deflection import lateral_axes, lv_clock, lv_direction, missed_between
-from postflight.flight import METHODS
+from postflight.deflections import METHODS
 from postflight.plots.paper_figures import COLOUR, LABEL
 from postflight.report.pictures import best_method, hole_s
 from postflight.report.source import Run

@@ -14,12 +14,13 @@ from flightmodel.checks import GateError
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.commands import compile_kernels, console
-from postflight.flight import Flight, reconstruct_flight
+from postflight.flight import read_flight
 from postflight.montecarlo.bands import write_csv
 from postflight.montecarlo.study import read_study
 from postflight.plots import studies
 from postflight.plots.paper_figures import save
 from postflight.progress import progress_bar
+from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies import joints
 from postflight.studies.joints import table_3_1
 from postflight.studies.preflight import Bounds, entry_bounds, inside
@@ -103,8 +104,8 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
     joint = read_study(dispersions).spec.joint
     compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
     with progress_bar() as report:
-        flight = reconstruct_flight(flight_folder, None, lambda f, what: report(0.4 * f, what))
-        flight.required_pulse()
+        flight = reconstruct(read_flight(flight_folder), None, lambda f, what: report(0.4 * f, what))
+        flight.required_loads()
         rigid = entry_bounds(flight, None, flights, seed, lambda f, what: report(0.4 + 0.3 * f, what))
         flexible = entry_bounds(flight, joint, flights, seed, lambda f, what: report(0.7 + 0.3 * f, what))
     table, flown, picture = held_against(flight, rigid, flexible)
@@ -125,9 +126,11 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
     console.print(f"results in {escape(str(folder))}")
 
 
-def held_against(flight: Flight, rigid: Bounds, flexible: Bounds) -> tuple[pd.DataFrame, pd.DataFrame, studies.Figure]:
+def held_against(
+    flight: Reconstruction, rigid: Bounds, flexible: Bounds
+) -> tuple[pd.DataFrame, pd.DataFrame, studies.Figure]:
     """Return `shares`, the flight's own columns ``time_s, alpha_total_deg, normal_g``, and both as a picture."""
-    pulse = flight.required_pulse()
+    pulse = flight.required_loads()
     flown = pd.DataFrame(
         {
             "time_s": pulse.time_s,
@@ -147,12 +150,12 @@ def held_against(flight: Flight, rigid: Bounds, flexible: Bounds) -> tuple[pd.Da
     return table, flown, picture
 
 
-def _pulse_span(flight: Flight) -> tuple[float, float]:
+def _pulse_span(flight: Reconstruction) -> tuple[float, float]:
     times = flight.air.time_s[pressure_pulse(flight.air.dynamic_pressure_pa)]
     return float(times[0]), float(times[-1])
 
 
-def shares(flight: Flight, flown: pd.DataFrame, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
+def shares(flight: Reconstruction, flown: pd.DataFrame, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
     """Share of the pulse's samples between the outer percentiles, by joint and quantity; how far outside the others.
 
     Columns ``joint, quantity, share_inside, largest_excess`` (over the upper percentile, in the quantity's unit); where

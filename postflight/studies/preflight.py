@@ -19,7 +19,7 @@ from flightmodel.checks import BoolArray, FloatArray, GateError, Progress
 from flightmodel.statistics import percentile_band
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Uncertainty, Vehicle
-from postflight.flight import Flight
+from postflight.reconstruction import Reconstruction
 from synthetic_flight import simulate
 from synthetic_flight.dispersions import (
     AeroDispersions,
@@ -99,13 +99,13 @@ def dispersions_of(known: Uncertainty, joint: JointDispersions | None) -> Disper
     )
 
 
-def rigid_bounds(flight: Flight, flights: int = 100, seed: int = 0, progress: Progress | None = None) -> Bounds:
+def rigid_bounds(flight: Reconstruction, flights: int = 100, seed: int = 0, progress: Progress | None = None) -> Bounds:
     """Fly the rigid vehicle ``flights`` times; run ``k`` is the same flight whatever the number."""
     return entry_bounds(flight, None, flights, seed, progress)
 
 
 def entry_bounds(
-    flight: Flight,
+    flight: Reconstruction,
     joint: JointDispersions | None,
     flights: int = 100,
     seed: int = 0,
@@ -163,7 +163,7 @@ def inside(
 class _Entry:
     """The entry of one flight, ready to be flown from dispersed starts."""
 
-    def __init__(self, flight: Flight, vehicle: Vehicle, joint: JointDispersions | None) -> None:
+    def __init__(self, flight: Reconstruction, vehicle: Vehicle, joint: JointDispersions | None) -> None:
         air = flight.air
         below = np.flatnonzero((air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0))
         if not len(below):
@@ -173,7 +173,7 @@ class _Entry:
         self.vehicle, self.locked = vehicle, joint is None
         self.dispersions = dispersions_of(vehicle.uncertainty, joint)
         self.profile = profile_from_sounding(flight.telemetry.sounding)
-        self.at_start = resample(flight.reconstruction.smoothed, np.array([self.start_s]))
+        self.at_start = resample(flight.solution.smoothed, np.array([self.start_s]))
         step = RIGID_STEP_S if self.locked else FLEXIBLE_STEP_S
         self.schedule = Schedule(step, round(RECORD_S / step), self.records, self.records if self.locked else 0)
 

@@ -9,7 +9,8 @@ import pytest
 
 from flightmodel import earth, rotations
 from postflight.attitude import attitude_table, check_attitude
-from postflight.flight import flight_from
+from postflight.flight import Flight
+from postflight.reconstruction import reconstruction_from
 from postflight.run_folder import attitude_summary
 from recon.fault_isolation import suspects
 from recon.reconstruct import reconstruct_once
@@ -48,7 +49,7 @@ def test_a_good_flight_passes_and_the_check_is_independent(check, telemetry, bet
     said = attitude_summary(check)
     assert said["passed"]
     assert said["independent"]
-    flight = replace(flight_from(telemetry, bet), attitude=check)
+    flight = replace(reconstruction_from(Flight(telemetry), bet), attitude=check)
     assert set(check.consistency_checks) <= set(flight.consistency_checks)
 
 

@@ -12,8 +12,10 @@ from click.testing import CliRunner
 from flightmodel.checks import ConfigError, GateError
 from postflight import exports, run_folder
 from postflight.cli import cli
+from postflight.deflections import Deflections
 from postflight.exports import read_source
-from postflight.flight import Answers, reconstruct_flight
+from postflight.flight import read_flight
+from postflight.reconstruction import reconstruct
 
 FLIGHT = Path(__file__).parents[1] / "data" / "real_flights" / "rocketpy_prometheus"
 KML = "{http://www.opengis.net/kml/2.2}"
@@ -25,10 +27,10 @@ def folder(tmp_path_factory):
     """A recorded rocket's run, with deflections beside it as a run of an entry vehicle has them."""
     folder = tmp_path_factory.mktemp("exports") / "flight"
     shutil.copytree(FLIGHT, folder)
-    flight = reconstruct_flight(folder)
+    flight = reconstruct(read_flight(folder))
     with run_folder.RunFolder(folder, flight.telemetry, {}) as out:
         event_rows = run_folder.write_reconstruction(out, flight)
-        out.write_json("summary.json", run_folder.summary(flight, Answers(), event_rows))
+        out.write_json("summary.json", run_folder.summary(flight, Deflections(), event_rows))
     (run,) = (folder / "runs").iterdir()
     t = np.arange(20.0, 26.0, 0.11)
     t = t[(t < 22.0) | (t > 24.0)]

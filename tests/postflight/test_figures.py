@@ -10,9 +10,10 @@ import pytest
 from flightmodel.telemetry import Motion
 from flightmodel.trajectory import difference
 from postflight.attitude import check_attitude
-from postflight.flight import flight_from
+from postflight.flight import Flight
 from postflight.plots.paper_figures import figure_residuals, save
 from postflight.plots.trajectory import figure_attitude, figure_filter_and_smoother, figure_sensitivity
+from postflight.reconstruction import reconstruction_from
 from postflight.sensitivity import sensitivity
 from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
@@ -27,7 +28,7 @@ def flight(mini_flight):
     track[50::100, 0] += 1000.0
     telemetry = replace(telemetry, radars=telemetry.radars | {"north": replace(north, range_az_el=track)})
     bet = reconstruct_once(telemetry, Settings(output_rate_hz=5.0))
-    return replace(flight_from(telemetry, bet), attitude=check_attitude(telemetry, bet))
+    return replace(reconstruction_from(Flight(telemetry), bet), attitude=check_attitude(telemetry, bet))
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def ballistic(mini_flight):
     bare = dict.fromkeys(("accelerometer", "rates", "magnetometer", "sun", "vehicle", "attitude_prior"))
     motion = Motion("ballistic", 0.05)
     telemetry = replace(telemetry, **bare, gnss={}, barometers={}, motion=motion)
-    return flight_from(telemetry, reconstruct_once(telemetry, Settings(output_rate_hz=5.0, passes=1)))
+    return reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, Settings(output_rate_hz=5.0, passes=1)))
 
 
 def drawn(figure, path):
@@ -48,7 +49,7 @@ def drawn(figure, path):
 def test_edited_points_are_counted_and_lie_in_view(flight, tmp_path):
     figure = figure_residuals(flight)
     drawn(figure, tmp_path / "residuals.png")
-    table = flight.reconstruction.residuals
+    table = flight.solution.residuals
     count = int((~table.accepted & (table.source == "north") & (table.component == "range")).sum())
     assert count >= 5
     axes = figure.get_axes()
@@ -65,7 +66,7 @@ def test_difference_of_filter_and_smoother_is_over_its_own_sd(flight, tmp_path):
     drawn(figure, tmp_path / "filter.png")
     axes = figure.get_axes()
     assert len(axes) == 6
-    bet = flight.reconstruction
+    bet = flight.solution
     off = difference(bet.filtered, bet.smoothed)
     var = (np.diagonal(p.covariance, axis1=1, axis2=2) for p in (bet.filtered, bet.smoothed))
     ratio = off / np.sqrt(np.abs(np.subtract(*var)) + 1e-30)

@@ -14,7 +14,9 @@ from flightmodel import airdata, earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.trajectory import Trajectory
 from postflight import product, run_folder
-from postflight.flight import Answers, reconstruct_flight
+from postflight.deflections import Deflections
+from postflight.flight import read_flight
+from postflight.reconstruction import reconstruct
 
 DOCS = Path(__file__).parents[2] / "docs" / "bet-product.md"
 
@@ -22,7 +24,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "bet-product.md"
 @pytest.fixture(scope="module")
 def short(clean_flight):
     """The hand-made flight: ten seconds, no physics asked."""
-    flight = reconstruct_flight(clean_flight.root)
+    flight = reconstruct(read_flight(clean_flight.root))
     return flight, product.bet_table(flight)
 
 
@@ -134,11 +136,11 @@ def test_peak_is_one_number_in_events_peaks_and_summary(short) -> None:
     rows = product.event_table(flight, table)
     event = rows[rows["event"].str.contains("dynamic pressure")].iloc[0]
     peak = product.peak_table(flight, table).set_index("peak").loc["dynamic pressure"]
-    said = run_folder.summary(flight, Answers(), rows)
-    assert event.t_s == peak.t_s == said["peak_dynamic_pressure_s"] == flight.peak_s
-    assert event.dynamic_pressure_pa == peak.value == said["peak_dynamic_pressure_pa"]
+    summary = run_folder.summary(flight, Deflections(), rows)
+    assert event.t_s == peak.t_s == summary["peak_dynamic_pressure_s"] == flight.peak_s
+    assert event.dynamic_pressure_pa == peak.value == summary["peak_dynamic_pressure_pa"]
     assert event.dynamic_pressure_3sd_pa == pytest.approx(3.0 * peak.sd, rel=1e-12)
-    assert event.alpha_total_wind_deg == said["alpha_total_wind_deg"]
+    assert event.alpha_total_wind_deg == summary["alpha_total_wind_deg"]
     # between the records, so that a sample instead of the interpolated value would show
     assert (table.t_s - flight.peak_s).abs().min() > 1e-4
     assert event.dynamic_pressure_pa >= table.dynamic_pressure_pa.max() * (1.0 - 1e-9)
@@ -147,8 +149,8 @@ def test_peak_is_one_number_in_events_peaks_and_summary(short) -> None:
 def test_residual_statistics_count_every_point(short) -> None:
     flight, _ = short
     stats = product.residual_statistics(flight)
-    assert stats["count"].sum() == len(flight.reconstruction.residuals)
-    assert stats.edited.sum() == (~flight.reconstruction.residuals.accepted).sum()
+    assert stats["count"].sum() == len(flight.solution.residuals)
+    assert stats.edited.sum() == (~flight.solution.residuals.accepted).sum()
 
 
 def test_statistics_of_white_residuals_are_one_and_none() -> None:
@@ -161,7 +163,7 @@ def test_statistics_of_white_residuals_are_one_and_none() -> None:
         }
     )  # fmt: skip
     bet = type("Bet", (), {"residuals": part, "consistency_checks": ()})()
-    row = product.residual_statistics(type("Flight", (), {"reconstruction": bet})()).iloc[0]
+    row = product.residual_statistics(type("Flight", (), {"solution": bet})()).iloc[0]
     assert (row["count"], row.edited, row.unit) == (n, 20, "m")
     assert row.rms_normalised == pytest.approx(1.0, abs=0.06)
     assert abs(row.lag1) < 0.09

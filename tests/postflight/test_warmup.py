@@ -22,14 +22,15 @@ class Listener(event.Listener):
 
 event.register("numba:compile", Listener())
 from dataclasses import replace
-from postflight.flight import reconstruct_flight
+from postflight.reconstruction import reconstruct
+from postflight.flight import read_flight
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 
 scenario = read_scenario("irve2_reference")
 scenario = replace(scenario, spec=scenario.spec.model_copy(update={"video": None}))
 simulate_to_folder(scenario, 0, Path(sys.argv[1]))
-reconstruct_flight(Path(sys.argv[1]))
+reconstruct(read_flight(Path(sys.argv[1])))
 print(compiled)
 """
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from postflight import commands
-from postflight.flight import METHODS
+from postflight.deflections import METHODS
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 from tests.postflight.short_flights import write_pulse

@@ -17,7 +17,7 @@ from flightmodel import rotations
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight.cli import cli
-from postflight.flight import reconstruct_telemetry
+from postflight.flight import Flight
 from postflight.reconciliation.answer import joint_table, vehicle_lines
 from postflight.reconciliation.candidate import AirUnknowns, VehicleUnknowns, observe
 from postflight.reconciliation.fit import explain, false_spans, reconcile, reconcile_loose
@@ -33,6 +33,7 @@ from postflight.reconciliation.problem import (
     Unknowns,
     fly_spans,
 )
+from postflight.reconstruction import reconstruct
 from synthetic_flight import simulate
 from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed
@@ -55,7 +56,7 @@ def flown(tmp_path_factory):
 def loose(tmp_path_factory):
     """The same with freeplay."""
     folder, _, vehicle = fly(tmp_path_factory, FREEPLAY_DEG)
-    return reconstruct_telemetry(read_flight(folder)), vehicle
+    return reconstruct(Flight(read_flight(folder))), vehicle
 
 
 def fly(tmp_path_factory, freeplay_deg):
@@ -82,7 +83,7 @@ def fly(tmp_path_factory, freeplay_deg):
 
 @pytest.fixture(scope="module")
 def problem(flown):
-    flight = reconstruct_telemetry(read_flight(flown[0]))
+    flight = reconstruct(Flight(read_flight(flown[0])))
     observed = observe(flight)
     air = AirUnknowns(flight.telemetry.sounding, float(observed.altitude_m.min()))
     return Problem(observed, VehicleUnknowns(flight.telemetry.required_vehicle()), air)
@@ -159,7 +160,7 @@ def test_spans_of_the_true_flight_join(problem, flown):
 def test_the_flight_tells_how_fine_its_air_was(step_m, low, high, tmp_path_factory, monkeypatch):
     """Synthetic air is straight between points; knots are 125 m apart."""
     monkeypatch.setattr("synthetic_flight.weather.STEP_M", step_m)
-    found = reconcile(reconstruct_telemetry(read_flight(fly(tmp_path_factory, 0.0)[0])))
+    found = reconcile(reconstruct(Flight(read_flight(fly(tmp_path_factory, 0.0)[0]))))
     assert low < found.problem.air.fine < high
 
 
@@ -214,7 +215,7 @@ def test_freeplay_is_told_from_a_plain_joint(loose, flown):
     told = explain(loose[0], ("freeplay",))
     assert told.log_odds["freeplay"] > 3.0
     assert told.found.problem.unknown.laws == ("freeplay",)
-    plain = explain(reconstruct_telemetry(read_flight(flown[0])), ("freeplay", "hardening"))
+    plain = explain(reconstruct(Flight(read_flight(flown[0]))), ("freeplay", "hardening"))
     assert plain.log_odds["freeplay"] < 0.0
     assert "freeplay" not in plain.found.problem.unknown.laws
 
@@ -222,7 +223,7 @@ def test_freeplay_is_told_from_a_plain_joint(loose, flown):
 @pytest.mark.long
 def test_the_posterior_is_that_of_new_fits(flown):
     """Interpolated log probability against new fits, two sd away; widths against the linear problem."""
-    found = reconcile(reconstruct_telemetry(read_flight(flown[0])))
+    found = reconcile(reconstruct(Flight(read_flight(flown[0]))))
     sampled = sample(found)
     assert np.abs(sampled.refit_error).max() < 2.0  # of a cost of four there
     table = posterior_summary(sampled).set_index("quantity")
@@ -232,9 +233,9 @@ def test_the_posterior_is_that_of_new_fits(flown):
 
 
 def test_a_flight_without_a_pulse_is_refused_in_words(flown):
-    flight = reconstruct_telemetry(read_flight(flown[0]))
+    flight = reconstruct(Flight(read_flight(flown[0])))
     with pytest.raises(GateError, match="no vehicle is told"):
-        observe(replace(flight, pulse=None, missing=("no vehicle is told",)))
+        observe(replace(flight, loads=None, missing=("no vehicle is told",)))
     high = replace(flight, air=replace(flight.air, altitude_m=flight.air.altitude_m + 200e3))
     with pytest.raises(GateError, match="never comes below 100 km"):
         observe(high)

@@ -12,7 +12,7 @@ import pytest
 
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight import commands
-from postflight.flight import METHODS
+from postflight.deflections import METHODS
 from postflight.plots import paper_figures
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
