@@ -103,7 +103,8 @@ def us76(altitude_m: FloatArray | float) -> tuple[FloatArray, FloatArray, FloatA
     z = np.asarray(altitude_m, dtype=float)
     if not ((z >= BOTTOM_M) & (z <= TOP_M)).all():
         raise GateError(
-            f"US76: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_M:.0f} to {TOP_M:.0f} m"
+            f"US76: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_M:.0f} to {TOP_M:.0f} m",
+            code="altitude-range",
         )
     low = np.minimum(z, 86000.0)
     t_low, p_low = _below_86_km(EARTH_RADIUS_US76_M * low / (EARTH_RADIUS_US76_M + low))

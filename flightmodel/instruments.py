@@ -24,7 +24,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, Field, create_model, model_validator
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import Fault, FloatArray
 from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place
 from flightmodel.tables import Declared, Source
 
@@ -510,10 +510,10 @@ class Mounted(Source):
             dcm = self.dcm_body_sensor
             if not np.allclose(dcm @ dcm.T, np.eye(3)):
                 words = "two sensor axes point along the same body axis; each wants one of its own"
-                faults.append(("axes", list(self.axes), words))
+                faults.append(("axes", list(self.axes), Fault(words, "axes-parallel")))
             elif np.linalg.det(dcm) < 0.0:
-                words = "these axes are left-handed (a mirror image); turn one of the signs or swap two axes"
-                faults.append(("axes", list(self.axes), words))
+                words = "these axes are left-handed (a mirror image); change one of the signs or swap two axes"
+                faults.append(("axes", list(self.axes), Fault(words, "axes-left-handed")))
         elif self.position_from_datum_body_m is not None and self.mount != "body":
             words = 'goes with axes = ["+x", "+y", "+z"] or mount = "body"; a package of the vehicle has its own place'
             faults.append(("position_from_datum_body_m", list(self.position_from_datum_body_m), words))

@@ -11,7 +11,7 @@ import pandas as pd
 
 from estimators.agreement import CONFIDENCE
 from flightmodel.config import parse_utc
-from flightmodel.deflection import lateral_axes, lv_clock, lv_direction, missed_between
+from flightmodel.deflection import interpolation_error, lateral_axes, lv_clock, lv_direction
 from postflight.deflections import METHODS
 from postflight.plots.paper_figures import COLOUR, LABEL
 from postflight.report.pictures import best_method, hole_s
@@ -154,7 +154,7 @@ def plane_at(run: Run, method: str) -> str:
     yz = np.array(seen["theta_deg"])[:, None] * lv_direction(np.deg2rad(np.array(seen["plane_lv_deg"])))[:, 1:]
     here = np.array([np.interp(at, t, c) for c in yz.T])
     clock = lv_clock(here)
-    missed = missed_between(t, yz @ lateral_axes(clock)[1], at) / np.linalg.norm(here)
+    missed = interpolation_error(t, yz @ lateral_axes(clock)[1], at) / np.linalg.norm(here)
     clock, sd = np.rad2deg(clock), float(np.hypot(sd, np.rad2deg(missed)))
     places = 0 if sd >= 1.0 else 1
     return f"{float(clock):.{places}f} ± {sd:.{places}f}"
