@@ -156,11 +156,11 @@ class DeflectionHistory(Tabular):
         if t[k + 1] - t[k] > HOLE_FACTOR * np.median(np.diff(t)) and time_s not in (t[k], t[k + 1]):
             return float("nan"), float("nan")
         theta, sd = self.theta_rad[known], self.theta_sd_rad[known]
-        missed = missed_between(t, theta, time_s)
+        missed = interpolation_error(t, theta, time_s)
         return float(np.interp(time_s, t, theta)), float(np.hypot(np.interp(time_s, t, sd), missed))
 
 
-def missed_between(known_s: FloatArray, values: FloatArray, time_s: float) -> float:
+def interpolation_error(known_s: FloatArray, values: FloatArray, time_s: float) -> float:
     """What a straight line between values ``(n,)`` misses of a curve: of their second difference ``s (1 - s) / 2``.
 
     It is taken as large as the largest about ``time_s``: among few of them all may be small where values are no denser

@@ -32,7 +32,6 @@ from flightmodel.sensor_tables import (
 from flightmodel.telemetry import (
     AttitudePrior,
     BarometerRecord,
-    Disturbed,
     Finding,
     GnssRecord,
     Motion,
@@ -41,6 +40,7 @@ from flightmodel.telemetry import (
     SunRecord,
     Telemetry,
     TriadRecord,
+    UnmodelledSpan,
 )
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
@@ -86,8 +86,8 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     gate = Gate(folder, parse_utc(spec.t0_utc))
     if progress is not None:
         gate.tell = _share_of(folder, spec, progress)
-    for words in spec.misfits(needs_path):
-        gate.refuse_config(words)
+    for misfit in spec.misfits(needs_path):
+        gate.refuse_config(misfit)
     vehicle = _vehicle(gate, spec.vehicle) if spec.vehicle is not None else None
     triads = {name: read_triad(gate, name, spec, vehicle) for name in ("accelerometer", "rates", "magnetometer")}
     sun = read_sun(gate, spec.sensors.sun) if spec.sensors.sun else None
@@ -99,7 +99,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
             'accelerometer and rates are there, but with model = "ballistic" gravitation and drag carry the flight: '
             "they are not used for its path and attitude; take [motion] out unless that is meant"
         )
-        gate.findings.append(Finding("motion", words, np.nan, np.nan))
+        gate.findings.append(Finding("motion", words, np.nan, np.nan, code="inertial-unused"))
     measured = spec.atmosphere is not None
     barometers = {
         name: read_barometer(gate, name, entry, sounding, measured) for name, entry in spec.barometers.items()
@@ -158,7 +158,9 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
     if stop - start < LEAST_SPAN_S:
         who = "accelerometer, rates and" if telemetry.accelerometer is not None else "the flight's"
         trackers = " and ".join(kind for kind, some in (("radars", found.radars), ("receivers", found.gnss)) if some)
-        raise GateError(f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)")
+        raise GateError(
+            f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)", code="no-common-time"
+        )
     return telemetry
 
 
@@ -190,7 +192,7 @@ def _vehicle(gate: Gate, name: str) -> Vehicle | None:
         return None
     for body, mesh in vehicle.meshes.items():
         words = f"{mesh.words}; it is drawn, while the camera's fit is of [geometry]"
-        gate.findings.append(Finding(f"mesh of the {body}", words, np.nan, np.nan))
+        gate.findings.append(Finding(f"mesh of the {body}", words, np.nan, np.nan, code="mesh-repaired"))
     return vehicle
 
 
@@ -201,7 +203,7 @@ def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
     words = (
         "no [atmosphere]: the US Standard Atmosphere 1976 without wind stands for it, density to 10 %, wind to 15 m/s"
     )
-    gate.findings.append(Finding("atmosphere", words, np.nan, np.nan))
+    gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
     return standard_sounding()
 
 
@@ -214,7 +216,7 @@ def _attitude_prior(
         q = np.array(entry.q_ecef_body)
         norm = float(np.linalg.norm(q))
         if abs(norm - 1.0) > 1e-3:
-            gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1")
+            gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1", "quaternion-norm")
             return None
         return AttitudePrior(entry.t_s, q / norm, sd)
     if entry.latitude_deg is not None and entry.longitude_deg is not None:
@@ -255,7 +257,9 @@ def _motion(entry: MotionEntry) -> Motion:
         acceleration_density=entry.acceleration_density,
         powered_s=entry.powered_s or (),
         powered_sd_mps2=entry.powered_sd_mps2,
-        disturbed=tuple(Disturbed(d.from_s, d.to_s, d.sd_mps2, float(np.deg2rad(d.sd_degps))) for d in entry.disturbed),
+        disturbed=tuple(
+            UnmodelledSpan(d.from_s, d.to_s, d.sd_mps2, float(np.deg2rad(d.sd_degps))) for d in entry.disturbed
+        ),
     )
 
 

@@ -175,7 +175,7 @@ class AttitudePrior:
 
 
 @dataclass(frozen=True)
-class Disturbed:
+class UnmodelledSpan:
     """Span in which more acts, or is shaken out of the sensors, than is modelled or than their noise tells.
 
     Parameters
@@ -224,7 +224,7 @@ class Motion:
     acceleration_density: float = 0.002
     powered_s: tuple[tuple[float, float], ...] = ()
     powered_sd_mps2: float = 50.0
-    disturbed: tuple[Disturbed, ...] = ()
+    disturbed: tuple[UnmodelledSpan, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,8 @@ class Telemetry:
         if self.vehicle is None:
             raise GateError(
                 f"flight '{self.name}' names no vehicle, whose mass properties and coefficients are needed here; add "
-                'vehicle = "..." to flight.toml (a vehicle that ships with the toolkit, or the path of a vehicle file)'
+                'vehicle = "..." to flight.toml (a vehicle that ships with the toolkit, or the path of a vehicle file)',
+                code="vehicle-missing",
             )
         return self.vehicle
 
@@ -304,6 +305,7 @@ class Telemetry:
         if self.accelerometer is None or self.rates is None:
             raise GateError(
                 f"flight '{self.name}' has no inertial sensors, which are needed here; add [sensors.accelerometer] and "
-                "[sensors.rates] to flight.toml"
+                "[sensors.rates] to flight.toml",
+                code="inertial-missing",
             )
         return self.accelerometer, self.rates

@@ -19,9 +19,9 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import earth, events, rotations
+from flightmodel.airdata import derived_with_sd, is_angle
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
-from postflight.kinematics import derived_with_sd, is_angle
 from postflight.reconstruction import Reconstruction
 from recon.atmosphere import LEAST_AXIAL_MPS2, cg_accelerations, windows_are_whole
 
@@ -310,16 +310,24 @@ def event_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     named = [(name, t) for name, t in flight.telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
     peak = "peak dynamic pressure" if flight.peak_is_inside else "largest dynamic pressure (edge of data)"
     named.append((peak, flight.peak_s))
-    named += events.descent_moments(air.time_s, air.altitude_m, air.mach)
+    named += events.descent_events(air.time_s, air.altitude_m, air.mach)
     rows = []
-    for name, t in sorted(named, key=lambda m: m[1]):
+    for name, t in sorted(named, key=lambda event: event[1]):
         row: dict[str, object] = {"event": name, "t_s": t}
         for column, sd_column in _EVENT_COLUMNS.items():
-            row[column] = np.interp(t, table["t_s"], table[column])
-            row[_three_sd(column)] = 3.0 * np.interp(t, table["t_s"], table[sd_column])
+            row[column], sd = value_and_sd(table, column, sd_column, t)
+            row[_three_sd(column)] = 3.0 * sd
         rows.append(row)
     names = [c for column in _EVENT_COLUMNS for c in (column, _three_sd(column))]
     return pd.DataFrame(rows, columns=["event", "t_s", *names])
+
+
+def value_and_sd(table: pd.DataFrame, column: str, sd_column: str, at_s: float) -> tuple[float, float]:
+    """Value of a column of ``bet.csv`` at a time, and its standard deviation, in the column's unit."""
+    time_s, values, sd = (table[name].to_numpy(dtype=float) for name in ("t_s", column, sd_column))
+    value = events.value_at(time_s, values, at_s)
+    # a cubic through a touch of zero may pass below it
+    return max(value, 0.0) if values.min() >= 0.0 else value, float(np.interp(at_s, time_s, sd))
 
 
 def _three_sd(column: str) -> str:
@@ -331,11 +339,10 @@ def _three_sd(column: str) -> str:
 def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     """Peak values with times and standard deviations; ``inside`` is false where one lies at an end of the data."""
     q = table["dynamic_pressure_pa"].to_numpy()
-    pulse = q >= 0.5 * q.max()
+    pulse, time_s = q >= 0.5 * q.max(), table["t_s"].to_numpy()
     rows = []
     for name, (column, sd_column) in _PEAKS.items():
-        values, sd = (table[c].to_numpy(dtype=float) for c in (column, sd_column))
-        size = np.abs(values)
+        size = np.abs(table[column].to_numpy(dtype=float))
         use = np.isfinite(size) & (pulse if "pulse" in name else size > -1.0)
         if name in ("Mach number", "airspeed"):
             use &= flight.air.altitude_m < events.HIGHEST_M
@@ -343,7 +350,10 @@ def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
             continue
         k = int(np.flatnonzero(use)[np.argmax(size[use])])
         inside = 0 < k < len(size) - 1 and bool(use[k - 1] and use[k + 1])
-        rows.append((name, column, table["t_s"].iloc[k], values[k], sd[k], inside))
+        first = int(np.clip(k - 1, 0, len(size) - 3))
+        near = slice(first, first + 3)
+        at = events.find_peak(time_s[near], size[near])[0] if use[near].all() else time_s[k]
+        rows.append((name, column, at, *value_and_sd(table, column, sd_column, at), inside))
     return pd.DataFrame(rows, columns=["peak", "column", "t_s", "value", "sd", "inside"])
 
 

@@ -9,10 +9,11 @@ import pandas as pd
 
 from estimators.loads import FlightLoads
 from flightmodel import airdata
-from flightmodel.airdata import AirData, peak_pressure
+from flightmodel.airdata import AirData
 from flightmodel.atmosphere import BOTTOM_M, TOP_M, profile_from_sounding
 from flightmodel.checks import DivergenceError, GateError, Progress
 from flightmodel.earth import geodetic_from_ecef
+from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
@@ -98,7 +99,7 @@ class Reconstruction(Tabular):
     @property
     def peak_s(self) -> float:
         """Time of peak dynamic pressure by the BET and the sounding's density, s."""
-        return peak_pressure(self.air.time_s, self.air.dynamic_pressure_pa)[0]
+        return find_peak(self.air.time_s, self.air.dynamic_pressure_pa)[0]
 
     @property
     def peak_is_inside(self) -> bool:

@@ -159,8 +159,8 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
     return out
 
 
-def write_reconstruction(run: RunFolder, flight: Reconstruction) -> None:
-    """Write trajectory, header, covariance, residuals, checks, sensor errors, events, air, attitude check, findings."""
+def write_reconstruction(run: RunFolder, flight: Reconstruction) -> pd.DataFrame:
+    """Write trajectory, covariance, residuals, checks, sensor errors, events, air, findings; return the events."""
     bet = flight.solution
     table = bet_table(flight)
     run.write_csv("bet.csv", table)
@@ -177,7 +177,8 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction) -> None:
     # the table's name and columns of version 0.1, for scripts that read it; to go with version 0.3
     run.write_csv("verdicts.csv", checks.drop(columns="code").rename(columns={"remark": "words"}))
     run.write_csv("sensor_errors.csv", bet.sensor_errors)
-    run.write_csv("events.csv", event_table(flight, table))
+    event_rows = event_table(flight, table)
+    run.write_csv("events.csv", event_rows)
     if flight.as_flown is not None:
         run.write_csv("air_profile.csv", flight.as_flown.profile)
         run.write_csv("drag_ratio.csv", flight.as_flown.drag)
@@ -186,6 +187,7 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction) -> None:
         run.write_csv("attitude_check.csv", attitude_table(flight.attitude, bet))
     findings = [vars(f) for f in (*flight.findings, *without_attitude(flight))]
     run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s", "code"]))
+    return event_rows
 
 
 def without_attitude(flight: Reconstruction) -> tuple[Finding, ...]:
@@ -224,19 +226,19 @@ def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
     }
 
 
-def summary(flight: Reconstruction, answers: Deflections) -> dict[str, Any]:
-    """Return the main results of a run, for ``summary.json``."""
-    air, peak = flight.air, flight.peak_s
-    k = int(np.searchsorted(air.time_s, peak).clip(0, len(air.time_s) - 1))
+def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFrame) -> dict[str, Any]:
+    """Return the results of a run in short, for ``summary.json``; ``event_rows`` is its `event_table`."""
+    at_peak = event_rows.iloc[int((event_rows["t_s"] - flight.peak_s).abs().argmin())]
+    alpha = [float(at_peak["alpha_total_wind_deg"]), float(at_peak["alpha_total_wind_3sd_deg"]) / 3.0]
     checks = flight.consistency_checks
     return {
         "flight": flight.telemetry.name,
         "synthetic": flight.telemetry.synthetic,
-        "peak_dynamic_pressure_pa": float(air.dynamic_pressure_pa[k]),
-        "peak_dynamic_pressure_s": float(peak),
-        "alpha_total_wind_deg": float(np.rad2deg(air.alpha_total_wind_rad[k])) if flight.has_attitude else None,
-        "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])) if flight.has_attitude else None,
-        "methods": method_summary(answers, peak),
+        "peak_dynamic_pressure_pa": float(at_peak["dynamic_pressure_pa"]),
+        "peak_dynamic_pressure_s": float(flight.peak_s),
+        "alpha_total_wind_deg": alpha[0] if flight.has_attitude else None,
+        "alpha_total_wind_sd_deg": alpha[1] if flight.has_attitude else None,
+        "methods": method_summary(answers, flight.peak_s),
         "agreement": None if answers.fused is None else answers.fused.agreement.remark,
         "film_clock": None if answers.fused is None else answers.fused.time_bias_summary(),
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),

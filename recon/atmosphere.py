@@ -29,13 +29,19 @@ import pandas as pd
 from flightmodel import earth, rotations
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.airdata import lateral_angles
-from flightmodel.atmosphere import AtmosphereProfile
+from flightmodel.atmosphere import (
+    DENSITY_LENGTH_M,
+    WIND_LENGTH_M,
+    AtmosphereProfile,
+    sounding_correlation,
+    unresolved_variance,
+)
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.sphere_cone import knudsen
+from flightmodel.statistics import correlation
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, resample
 from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
-from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
 from recon.reconstruct import TrajectorySolution
 
 KNOT_M, KNOT_S, TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
@@ -43,7 +49,6 @@ LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration says nothing about the air
 LEAST_SAMPLES = 20
 # of the deceleration, along and across: what coefficients and a swinging joint leave open
 MODEL_PART, LATERAL_PART, MODEL_FLOOR_MPS2 = 0.01, 0.02, 0.03
-CONSTANT_PART = 0.5  # of a sounding's error variance: calibration, drag coefficient of the sphere
 GAIN_SD, GROWTH_SD, OFFSET_SD_RAD = 1.0, 0.3, np.deg2rad(3.0)
 BAD_AIR = "is further from the sounding than its accuracy allows: the air was other than sounded, or the drag"
 BAD_DRAG = "is further from the pre-flight value than stated: check mass, area and coefficients"
@@ -191,10 +196,8 @@ def _interpolation(at: FloatArray, knots: FloatArray) -> FloatArray:
     return out
 
 
-def _process_information(knots: FloatArray, length: float, constant: float = 0.0) -> FloatArray:
-    """Inverse covariance (k, k) of a process of unit variance on knots: a constant part and one that forgets."""
-    forgets = np.exp(-np.abs(knots[:, None] - knots[None, :]) / length)
-    return np.asarray(np.linalg.inv(constant + (1.0 - constant) * forgets))
+def _inverse(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(covariance))
 
 
 def _knots(at: FloatArray, spacing: float) -> FloatArray:
@@ -225,8 +228,8 @@ def reconstruct_air(
     prior_sd = np.array([drag.ca_sd, drag.cn_sd, GAIN_SD, GROWTH_SD, *[OFFSET_SD_RAD] * 4])
     blocks = [by_height] * 3 + [np.tile(sd, (len(samples.time_s), 1)) for sd in prior_sd] + [by_time] * 6
     lengths = (DENSITY_LENGTH_M, WIND_LENGTH_M, WIND_LENGTH_M)
-    information = [_process_information(height, length, CONSTANT_PART) for length in lengths]
-    information += [np.eye(1)] * len(prior_sd) + [_process_information(moment, TRAJECTORY_TIME_S)] * 6
+    information = [_inverse(sounding_correlation(height, length)) for length in lengths]
+    information += [np.eye(1)] * len(prior_sd) + [_inverse(correlation(moment, TRAJECTORY_TIME_S))] * 6
     estimate, covariance, residual = _least_squares(model, blocks, information)
     sd = np.sqrt(np.diag(covariance))
     return ReconstructedAir(
@@ -281,7 +284,7 @@ def _profile(model: _Model, height: FloatArray, estimate: FloatArray, sd: FloatA
     density, north, east = (slice(i * k, (i + 1) * k) for i in range(3))
     ratio = np.exp(estimate[density] * density_sd)
     # samples tell the mean wind about a knot; the air's own structure between knots lies on top of that
-    within = (1.0 - CONSTANT_PART) * KNOT_M / (3.0 * WIND_LENGTH_M)
+    within = unresolved_variance(KNOT_M, WIND_LENGTH_M)
     north_sd, east_sd = (np.sqrt(np.minimum(sd[part] ** 2 + within, 1.0)) for part in (north, east))
     table = pd.DataFrame(
         {

@@ -25,11 +25,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flightmodel import earth, rotations
+from flightmodel import earth, instruments, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
 from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, SLOTS, SUN, VELOCITY
-from recon.error_model import AXES, ErrorModel
+from recon.error_model import ErrorModel
 from recon.state import IntArray, right_jacobian
 
 SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
@@ -41,21 +41,15 @@ COMPONENTS = {
     FIELD: ("field x", "field y", "field z"),
     SUN: ("azimuth", "elevation"),
 }
-_WANDER = ("wander north", "wander east", "wander down", "time bias")
+# time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
-    RADAR: (
-        "range bias", "azimuth bias", "elevation bias", "time bias", "tilt north", "tilt east", "droop", "skew",
-        "non-orthogonality", "traverse wander", "elevation wander", "refraction", "range scale",
-    ),
-    POSITION: _WANDER,
-    VELOCITY: ("", "", "", "time bias"),
-    HEIGHT: ("bias", "scale", "wander", "time bias"),
-    FIELD: (
-        *(f"{kind} {axis}" for kind in ("bias", "scale", "mount") for axis in AXES),
-        "soft iron xy", "soft iron xz", "soft iron yz",
-    ),
-    SUN: ("bias across", "bias along", "", "", *(f"mount {axis}" for axis in AXES)),
-}  # fmt: skip
+    RADAR: instruments.RADAR.states,
+    POSITION: instruments.GNSS.states,
+    VELOCITY: ("", "", "", instruments.GNSS.states[3]),
+    HEIGHT: instruments.BAROMETER.states,
+    FIELD: instruments.MAGNETOMETER.states,
+    SUN: (*instruments.SUN.states[:2], "", "", *instruments.SUN.states[2:]),
+}
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,13 @@ import numpy as np
 from flightmodel import earth, geomagnetism_and_sun, rotations
 from flightmodel.checks import FloatArray, GateError, nearest_name
 from flightmodel.gate import spaced
+from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER
+from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import AttitudePrior, Telemetry
 from recon import error_model, measurements
 from recon._measurement_kernels import HEIGHT, POSITION, RADAR, VELOCITY
 from recon.ballistic import ballistic_motion
-from recon.error_model import ErrorModel
+from recon.error_model import ErrorModel, instrument_blocks
 from recon.imu_screening import Bridged
 from recon.measurements import Instrument
 from recon.motion import SAME_INSTANT_S, inertial_motion
@@ -232,17 +234,15 @@ def build_error_model(telemetry: Telemetry, bridges: Bridges | None, attitude_se
     if bridges is None:
         blocks = error_model.ballistic_blocks(telemetry.motion)
     else:
-        blocks = error_model.triad_blocks(bridges.force.spec, "m/s2")
-        blocks += error_model.triad_blocks(bridges.rate.spec, "rad/s")
-        blocks += error_model.clock_blocks(bridges.force.spec, bridges.rate.spec)
+        blocks = error_model.imu_blocks(bridges.force.spec, bridges.rate.spec)
     for radar in telemetry.radars.values():
-        blocks += error_model.radar_blocks(radar.site)
+        blocks += instrument_blocks(RADAR_ERRORS, radar.site)
     for fixes in telemetry.gnss.values():
-        blocks += error_model.gnss_blocks(fixes.spec)
+        blocks += instrument_blocks(GNSS, fixes.spec)
     for heights in telemetry.barometers.values():
-        blocks += error_model.barometer_blocks(heights.spec)
+        blocks += instrument_blocks(BAROMETER, heights.spec)
     if attitude_sensors and telemetry.magnetometer is not None:
-        blocks += error_model.magnetometer_blocks(telemetry.magnetometer.spec)
+        blocks += instrument_blocks(MAGNETOMETER, telemetry.magnetometer.spec)
     if attitude_sensors and telemetry.sun is not None:
         blocks += error_model.sun_blocks(telemetry.sun.spec)
     return ErrorModel(tuple(blocks))

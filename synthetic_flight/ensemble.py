@@ -25,7 +25,6 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.airdata import total_angle
-from flightmodel.atmosphere import G0_MPS2
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import dynamics, simulate
@@ -209,7 +208,7 @@ class Records:
     @cached_property
     def normal_g(self) -> FloatArray:
         """Size of the centerbody's lateral specific force, ``(n,)``."""
-        return np.hypot(*self.specific_force_body_mps2[:, 1:].T) / G0_MPS2
+        return np.hypot(*self.specific_force_body_mps2[:, 1:].T) / earth.STANDARD_GRAVITY_MPS2
 
 
 QUANTITIES: dict[str, Callable[[Records], FloatArray]] = {
@@ -217,7 +216,7 @@ QUANTITIES: dict[str, Callable[[Records], FloatArray]] = {
     "alpha_shell_deg": lambda r: np.rad2deg(r.aux[:, 4]),
     "deflection_deg": lambda r: np.rad2deg(r.aux[:, 5]),
     "normal_g": lambda r: r.normal_g,
-    "axial_g": lambda r: -r.specific_force_body_mps2[:, 0] / G0_MPS2,
+    "axial_g": lambda r: -r.specific_force_body_mps2[:, 0] / earth.STANDARD_GRAVITY_MPS2,
     "dynamic_pressure_pa": lambda r: r.aux[:, 3],
     "mach": lambda r: r.aux[:, 2],
     "altitude_m": lambda r: r.aux[:, 0],

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+from flightmodel.airdata import Inputs, _angles_of, derived
 
 from flightmodel import earth, rotations
 from flightmodel.airdata import lateral_angles
@@ -19,7 +20,6 @@ from postflight.checks import inertial
 from postflight.checks.pressure_and_field import turning_field
 from postflight.checks.track_force import compare, slope_through_mean, track_force, unit_that_explains
 from postflight.exports import PLACE, Source, kml_bytes, oem_bytes
-from postflight.kinematics import Inputs, _angles_of, derived
 from postflight.montecarlo.bands import coverage, is_narrow, percentile_interval
 from postflight.montecarlo.study import design_for, indices
 from postflight.product import _coefficients

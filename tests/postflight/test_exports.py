@@ -29,8 +29,8 @@ def folder(tmp_path_factory):
     shutil.copytree(FLIGHT, folder)
     flight = reconstruct(read_flight(folder))
     with run_folder.RunFolder(folder, flight.telemetry, {}) as out:
-        run_folder.write_reconstruction(out, flight)
-        out.write_json("summary.json", run_folder.summary(flight, Deflections()))
+        event_rows = run_folder.write_reconstruction(out, flight)
+        out.write_json("summary.json", run_folder.summary(flight, Deflections(), event_rows))
     (run,) = (folder / "runs").iterdir()
     t = np.arange(20.0, 26.0, 0.11)
     t = t[(t < 22.0) | (t > 24.0)]

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from flightmodel import rotations
-from flightmodel.atmosphere import standard_atmosphere
+from flightmodel.atmosphere import sounding_correlation, standard_atmosphere
 from flightmodel.checks import GateError
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from recon import atmosphere
@@ -51,9 +51,7 @@ def drawn(samples, rng):
     seen = np.zeros((len(samples.time_s), atmosphere.SEEN))
     knots = []
     for k, length in enumerate((5000.0, 3000.0, 3000.0)):
-        root = np.linalg.cholesky(
-            np.linalg.inv(atmosphere._process_information(height, length, atmosphere.CONSTANT_PART))
-        )
+        root = np.linalg.cholesky(sounding_correlation(height, length))
         knots.append(root @ rng.standard_normal(len(height)))
         seen[:, k] = at @ knots[-1]
     sd = np.array([0.03, 0.07, 0.3, 0.1, *[np.deg2rad(1.0)] * 4])

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flightmodel import instruments
 from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import GnssRecord, RadarRecord, TriadRecord
-from recon import error_model
-from recon.error_model import ErrorModel, triad_blocks
+from recon.error_model import ErrorModel, instrument_blocks
 from recon.motion import inertial_motion
 from recon.reconstruct import bridge_triads, reconstruct
 from recon.settings import Settings
@@ -162,13 +162,13 @@ def test_considering_takes_components_groups_and_whole_kinds(mini_everything):
 
 def test_a_wandering_bias_walks():
     spec = TriadSpec("t", np.zeros(3), np.eye(3), 0.1, 0.03, 0.0, 0.0, bias_wander_sd=0.04, bias_time_constant_s=50.0)
-    model = ErrorModel(tuple(triad_blocks(spec, "m/s2")))
+    model = ErrorModel(tuple(instrument_blocks(instruments.ACCELEROMETER, spec)))
     assert np.allclose(model.prior_sd[:3], 0.05)
     assert np.allclose(model.wander.walk_var_per_s[:3], 2.0 * 0.04**2 / 50.0)
     assert list(model.wandering) == [0, 1, 2]
-    still = ErrorModel(tuple(triad_blocks(ACCELEROMETER, "m/s2")))
+    still = ErrorModel(tuple(instrument_blocks(instruments.ACCELEROMETER, ACCELEROMETER)))
     assert len(still.wandering) == 0
-    assert [b.components[0] for b in error_model.radar_blocks(FULL_SITES[0])][-1] == "range scale"
+    assert [b.components[0] for b in instrument_blocks(instruments.RADAR, FULL_SITES[0])][-1] == "range scale"
 
 
 def test_the_motion_holds_both_triads_at_nodes_and_samples(mini_sense):
