@@ -108,11 +108,8 @@ def raster(vertices, faces, lens, sight, widest, deepest, depth, nearest):
         a, b, c = faces[f]
         narrow, inside = True, 0
         for p, q in ((a, b), (b, c), (c, a)):
-            dot = (
-                in_camera[p, 0] * in_camera[q, 0]
-                + in_camera[p, 1] * in_camera[q, 1]
-                + in_camera[p, 2] * in_camera[q, 2]
-            )
+            u, v = in_camera[p], in_camera[q]
+            dot = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
             narrow = narrow and dot > widest_cos * in_camera[p, 3] * in_camera[q, 3]
             inside += 1 if in_camera[p, 2] > field_cos * in_camera[p, 3] else 0
         if narrow and (inside == 0 or inside == 3):

@@ -24,8 +24,8 @@ from flightmodel.checks import GateError, writing
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import NO_VIDEO, Deflections
-from postflight.product import bet_table, event_table, header, peak_table, residual_statistics, slow_covariance
-from postflight.reconstruction import Reconstruction
+from postflight.product import event_table, header, peak_table, residual_statistics, slow_covariance
+from postflight.reconstruction import Reconstruction, bet_table
 
 DIGITS = "%.10g"
 _COPY = "copy the flight folder to where you may write"

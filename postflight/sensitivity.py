@@ -28,8 +28,7 @@ from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, interpolate_rows, resample
 from postflight.flight import Flight, calm, with_density, with_mass
-from postflight.product import bet_table
-from postflight.reconstruction import Reconstruction, reconstruction_from
+from postflight.reconstruction import Reconstruction, bet_table, reconstruction_from
 from recon.reconstruct import reconstruct_once, trackers
 from recon.settings import Settings
 

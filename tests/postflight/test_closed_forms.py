@@ -7,10 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from flightmodel.airdata import Inputs, _angles_of, derived
 
 from flightmodel import earth, rotations
-from flightmodel.airdata import lateral_angles
+from flightmodel.airdata import Inputs, _angles_of, derived, lateral_angles
 from flightmodel.atmosphere import standard_atmosphere, standard_sounding
 from flightmodel.instruments import TriadSpec
 from flightmodel.trajectory import Trajectory
