@@ -109,14 +109,14 @@ bet.sensor_errors.set_index("name").loc[["baro bias", "baro scale", "vehicle dra
 # holds the trajectory's covariance, the receiver's slow errors and its noise. Their ratio should scatter by about one.
 
 # %%
-scarce = reconstruct(telemetry, Settings(withhold_every=2))  # every fourth fix is used, three are foretold
-table = summary(scarce.withheld)
+scarce = reconstruct(telemetry, Settings(hold_out_every=2))  # every fourth fix is used, three are foretold
+table = summary(scarce.held_out)
 table
 
 
 # %%
-def normalised(axes, withheld, source):
-    rows = withheld[withheld.source == source]
+def normalised(axes, held_out, source):
+    rows = held_out[held_out.source == source]
     for ax, (component, part) in zip(axes, rows.groupby("component", sort=False), strict=True):
         z = part.residual / part.predicted_sd
         ax.axhspan(-2, 2, color="0.92", lw=0)
@@ -126,7 +126,7 @@ def normalised(axes, withheld, source):
 
 
 figure, axes = plt.subplots(3, 1, figsize=(8, 5.5), sharex=True, layout="constrained")
-normalised(axes, scarce.withheld, "gps")
+normalised(axes, scarce.held_out, "gps")
 figure.suptitle("Withheld fixes against the trajectory, in predicted standard deviations (grey: two of them)")
 plt.show()
 

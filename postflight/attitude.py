@@ -17,7 +17,7 @@ from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import interpolate_rows, resample
 from postflight.kinematics import euler_321
 from recon.consistency import ConsistencyCheck
-from recon.reconstruct import Reconstruction
+from recon.reconstruct import TrajectorySolution
 from recon.vector_attitude import (
     LEAST_INSIDE,
     AttitudeComparison,
@@ -84,7 +84,7 @@ class AttitudeCheck:
         )
 
 
-def check_attitude(telemetry: Telemetry, bet: Reconstruction) -> AttitudeCheck | None:
+def check_attitude(telemetry: Telemetry, bet: TrajectorySolution) -> AttitudeCheck | None:
     """Attitude from directions over the trajectory's span, compared; None without sensors or without an attitude."""
     if telemetry.magnetometer is None or telemetry.sun is None or bet.provenance["motion"] == "ballistic":
         return None
@@ -109,7 +109,7 @@ def check_attitude(telemetry: Telemetry, bet: Reconstruction) -> AttitudeCheck |
     return AttitudeCheck(history, comparison, dependence, tuple(found), settings.check_confidence)
 
 
-def attitude_table(check: AttitudeCheck, bet: Reconstruction) -> pd.DataFrame:
+def attitude_table(check: AttitudeCheck, bet: TrajectorySolution) -> pd.DataFrame:
     """Return ``attitude_check.csv``: the independent attitude, its difference from the trajectory's, and all sds."""
     history, comparison = check.history, check.comparison
     assert history is not None

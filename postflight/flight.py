@@ -32,8 +32,8 @@ from postflight.fusing import FusedAnswer, fuse_flight
 from postflight.loads import day_air, pulse_data
 from recon.atmosphere import ReconstructedAir
 from recon.consistency import ConsistencyCheck
-from recon.fault_isolation import suspects
-from recon.reconstruct import Reconstruction, reconstruct
+from recon.fault_isolation import isolate_faults
+from recon.reconstruct import TrajectorySolution, reconstruct
 from recon.settings import Settings
 
 METHODS = ("camera", "misalignment", "trim", "fused")
@@ -52,7 +52,7 @@ class Flight:
     """
 
     telemetry: Telemetry
-    reconstruction: Reconstruction
+    reconstruction: TrajectorySolution
     air: AirData
     pulse: PulseData | None
     day: ReconstructedAir | None = None
@@ -74,7 +74,7 @@ class Flight:
     @property
     def suspects(self) -> tuple[str, ...]:
         """What is most likely wrong, the first first; none where every verdict passes."""
-        return suspects(self.consistency_checks, self.reconstruction.left_out)
+        return isolate_faults(self.consistency_checks, self.reconstruction.left_out)
 
     @property
     def has_attitude(self) -> bool:
@@ -135,7 +135,7 @@ def reconstruct_telemetry(
     return flight
 
 
-def flight_from(telemetry: Telemetry, bet: Reconstruction) -> Flight:
+def flight_from(telemetry: Telemetry, bet: TrajectorySolution) -> Flight:
     """Air data, pulse and air of the day along a trajectory; `DivergenceError` where it leaves the air's tables."""
     profile = profile_from_sounding(telemetry.sounding)
     _check_flown(bet.smoothed)

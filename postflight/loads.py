@@ -20,7 +20,7 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, resample
 from recon.atmosphere import AirSamples, Drag, ReconstructedAir, reconstruct_air
-from recon.reconstruct import Reconstruction
+from recon.reconstruct import TrajectorySolution
 
 # half the window over which sensors are averaged: well below the joint's 2.5 Hz, well above the sampling interval
 HALF_WINDOW_S = 0.05
@@ -57,7 +57,7 @@ class Sensed:
     samples: float
 
 
-def whole_windows(bet: Reconstruction, grid: FloatArray) -> BoolArray:
+def whole_windows(bet: TrajectorySolution, grid: FloatArray) -> BoolArray:
     """Mask (n,) of times with sensor data to both sides and no telemetry gap near."""
     t_imu, h = bet.imu_time_s, HALF_WINDOW_S
     if len(t_imu) < 2:
@@ -67,7 +67,7 @@ def whole_windows(bet: Reconstruction, grid: FloatArray) -> BoolArray:
     return np.asarray(inside & (t_imu[nearest] - t_imu[nearest - 1] <= 2.0 * h))
 
 
-def sensed(bet: Reconstruction, t: FloatArray, cg_from_sensor_m: FloatArray, h: float = HALF_WINDOW_S) -> Sensed:
+def sensed(bet: TrajectorySolution, t: FloatArray, cg_from_sensor_m: FloatArray, h: float = HALF_WINDOW_S) -> Sensed:
     """What the corrected sensors say at times whose windows, ``h`` s to both sides, are whole."""
     t_imu = bet.imu_time_s
     force = window_means(t_imu, bet.specific_force_body_mps2, t - h, t + h)
@@ -79,7 +79,7 @@ def sensed(bet: Reconstruction, t: FloatArray, cg_from_sensor_m: FloatArray, h: 
     return Sensed(force, at_cg, rate, turn, max(1.0, 2 * h / float(np.median(np.diff(t_imu)))))
 
 
-def pulse_data(telemetry: Telemetry, bet: Reconstruction, air: AirData) -> PulseData:
+def pulse_data(telemetry: Telemetry, bet: TrajectorySolution, air: AirData) -> PulseData:
     """Corrected sensors at the c.g. and the flow, at the BET's even output rate, where no telemetry gap is near."""
     grid = bet.smoothed.time_s
     ticks = grid * bet.output_rate_hz
@@ -123,7 +123,7 @@ LARGEST_GAP_S = 0.1
 
 
 def day_air(
-    telemetry: Telemetry, bet: Reconstruction, profile: AtmosphereProfile, confidence: float
+    telemetry: Telemetry, bet: TrajectorySolution, profile: AtmosphereProfile, confidence: float
 ) -> ReconstructedAir:
     """Density and winds along altitude from the reconstruction and the corrected deceleration.
 
@@ -144,7 +144,7 @@ def day_air(
     return reconstruct_air(air_samples(telemetry, bet), profile, drag, confidence)
 
 
-def air_samples(telemetry: Telemetry, bet: Reconstruction) -> AirSamples:
+def air_samples(telemetry: Telemetry, bet: TrajectorySolution) -> AirSamples:
     """Means over windows of `WINDOW_S`, side by side, wherever no telemetry gap is near."""
     cg = telemetry.required_vehicle().cg_m
     accelerometer, _ = telemetry.required_triads()
@@ -172,7 +172,7 @@ def air_samples(telemetry: Telemetry, bet: Reconstruction) -> AirSamples:
     )
 
 
-def _window_times(bet: Reconstruction) -> FloatArray:
+def _window_times(bet: TrajectorySolution) -> FloatArray:
     """Middles of the windows in which the sensors are whole."""
     t_imu, t_bet = bet.imu_time_s, bet.smoothed.time_s
     reach = 0.5 * WINDOW_S + EDGE_S
@@ -185,7 +185,7 @@ def _window_times(bet: Reconstruction) -> FloatArray:
     return t[whole]
 
 
-def _force_means(bet: Reconstruction, arm_body_m: FloatArray, t: FloatArray) -> FloatArray:
+def _force_means(bet: TrajectorySolution, arm_body_m: FloatArray, t: FloatArray) -> FloatArray:
     """Specific force at a point ``arm_body_m`` from the accelerometer, body axes, means over the windows."""
     t_imu, rate, half = bet.imu_time_s, bet.rate_body_radps, 0.5 * WINDOW_S
     swing = np.cross(rate, np.cross(rate, arm_body_m))

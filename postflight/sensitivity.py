@@ -168,19 +168,19 @@ def sensitivity(flight: Flight, progress: Progress | None = None) -> pd.DataFram
     report = progress or (lambda _fraction, _what: None)
     telemetry, settings = flight.telemetry, flight.reconstruction.settings
     planned = reruns(telemetry, settings)
-    learnt = flight.reconstruction.learnt  # a rerun with other priors would differ by them, too
+    adaptation = flight.reconstruction.adaptation  # a rerun with other priors would differ by them, too
     report(0.0, "base")
     # where trackers contradict each other the base's covariance was enlarged, and is no optimal filter's
     own = flight
     if flight.reconstruction.left_out:
-        own = flight_from(telemetry, reconstruct_once(telemetry, settings, learnt=learnt))
+        own = flight_from(telemetry, reconstruct_once(telemetry, settings, adaptation=adaptation))
     rows: list[dict[str, object]] = []
     for k, rerun in enumerate(planned):
         report(k / len(planned), rerun.name)
         try:
             bet = flight.reconstruction
             if rerun.filtered:
-                bet = reconstruct_once(rerun.telemetry, rerun.settings, learnt=learnt)
+                bet = reconstruct_once(rerun.telemetry, rerun.settings, adaptation=adaptation)
             rows += _rows(rerun, flight, own, flight_from(rerun.telemetry, bet))
         except GateError as fault:
             rows.append({"rerun": rerun.name, "reason": str(fault)})

@@ -1,9 +1,9 @@
-"""Which systematic errors the filter knows of, how large they may be, how they wander, and which are only considered.
+"""Which systematic errors are estimated, with what a priori sd and correlation, and which are only considered?
 
 Every block is a first-order Gauss-Markov process about zero, ``de/dt = -e / tau + noise``, started at its prior
-standard deviation and kept there by its noise; an infinite ``tau`` is a constant. What belongs to the air forgets with
-altitude instead: ``exp(-|climb| / length)``. A *considered* error (Schmidt) is never estimated, but what it may have
-done stays in the covariance of everything else. The drivers of the motion come first (`recon.motion`).
+standard deviation and kept there by its noise; an infinite ``tau`` is a constant. Errors of the air decorrelate with
+altitude instead: ``exp(-|climb| / length)``. A *considered* error (Schmidt) is never estimated, but its effect stays in
+the covariance of everything else. The drivers of the motion come first (`recon.motion`).
 
 References
 ----------
@@ -23,12 +23,12 @@ from flightmodel.telemetry import Motion as MotionSpec
 from recon.state import Wander
 
 AXES = ("x", "y", "z")
-DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0  # over which the air's errors forget: facts of soundings, 5 and 3 km
+DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0  # correlation lengths of the air's errors, by soundings
 
 
 @dataclass(frozen=True)
 class Block:
-    """One kind of error of one instrument: components with one unit, one prior and one way of forgetting."""
+    """One kind of error of one instrument: components with one unit, one prior and one correlation."""
 
     instrument: str
     components: tuple[str, ...]
@@ -76,7 +76,7 @@ class ErrorModel:
 
     @property
     def wander(self) -> Wander:
-        """How every error wanders; a considered one stays what it is."""
+        """Gauss-Markov model of every error; a considered one is constant."""
         considered = np.array(self._each("considered"), dtype=bool)
         tau, length, walk = (
             np.array(self._each(name), dtype=float) for name in ("time_constant_s", "altitude_m", "walk_var_per_s")
@@ -114,7 +114,7 @@ class ErrorModel:
             if not any(_fits(b, [name]) for b in self.blocks)
         ]
         if faults:
-            raise GateError(faults)
+            raise GateError(faults, code="error-unknown")
         return ErrorModel(blocks)
 
 
@@ -130,12 +130,12 @@ def _fits(block: Block, names: list[str]) -> bool:
 
 
 def triad_blocks(spec: TriadSpec, unit: str) -> list[Block]:
-    """Bias, scale and mount of one triad; a prior of zero becomes a millionth of a typical one."""
+    """Bias, scale and mount of one sensor of three axes; a prior of zero becomes a millionth of a typical one."""
 
     def block(kind: str, unit: str, sd: float, walk: float = 0.0) -> Block:
         return Block(spec.name, tuple(f"{kind} {axis}" for axis in AXES), unit, max(sd, 1e-9), walk_var_per_s=walk)
 
-    # a wandering part beside a constant one: over times below its time constant it walks, and one error holds both
+    # a Gauss-Markov part beside a constant one: below its time constant it is a random walk, and one error holds both
     walk = 2.0 * spec.bias_wander_sd**2 / spec.bias_time_constant_s
     return [
         block("bias", unit, float(np.hypot(spec.bias_sd, spec.bias_wander_sd)), walk),
@@ -145,7 +145,7 @@ def triad_blocks(spec: TriadSpec, unit: str) -> list[Block]:
 
 
 def clock_blocks(force: TriadSpec, rate: TriadSpec) -> list[Block]:
-    """Time biases of both triads; none where neither may err."""
+    """Time biases of both sensors; none where neither may err."""
     if max(force.time_bias_sd_s, rate.time_bias_sd_s) <= 0.0:
         return []
     return [Block(spec.name, ("time bias",), "s", max(spec.time_bias_sd_s, 1e-9)) for spec in (force, rate)]
@@ -183,7 +183,7 @@ def radar_blocks(site: RadarSite) -> list[Block]:
 
 
 def gnss_blocks(spec: GnssSpec) -> list[Block]:
-    """Slowly wandering position error along north, east and down, and the latency of one receiver."""
+    """Gauss-Markov position error along north, east and down, and the latency of one receiver."""
     axes = tuple(f"wander {axis}" for axis in ("north", "east", "down"))
     blocks = [
         Block(spec.name, axes, "m", spec.wander_sd_m, spec.wander_time_constant_s),
