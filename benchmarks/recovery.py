@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from postflight import run_folder
-from postflight.flight import METHODS, estimate, reconstruct_flight
+from postflight.deflections import METHODS, estimate
+from postflight.flight import read_flight
+from postflight.reconstruction import reconstruct
 from postflight.score import BET_LIMITS, score_run
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
@@ -30,9 +32,9 @@ def main():
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary) / "flight"
             simulate_to_folder(scenario, seed, folder)
-            flight = reconstruct_flight(folder)
+            flight = reconstruct(read_flight(folder))
             methods = METHODS if flight.telemetry.frames else METHODS[1:]
-            answers = estimate(flight, flight.telemetry, methods)
+            answers = estimate(flight, methods)
             with run_folder.RunFolder(folder, flight.telemetry, {}) as run:
                 run_folder.write_reconstruction(run, flight)
                 run_folder.write_answers(run, answers)

@@ -17,25 +17,25 @@ BESIDE = {
     "benchmarks.md": "benchmarks/README.md",
     "changes.md": "CHANGELOG.md",
 }
-# what a user of the library calls; the rest is read in the code
-REFERENCE = {
-    "flightmodel": ["flightfolder", "telemetry", "vehicle", "trajectory", "deflection", "film", "camera", "earth",
-                    "atmosphere", "airdata", "aerodynamics", "rotations", "checks"],
-    "recon": ["reconstruct", "error_model", "strapdown", "consistency", "vector_attitude", "product"],
-    "estimators": ["camera", "misalignment", "trim", "fusion", "agreement", "southwell", "calibration"],
-    "synthetic_flight": ["scenarios", "simulate", "folder", "ensemble", "linear", "stability_map"],
-    "postflight": ["flight", "run_folder", "sensitivity", "score"],
-}  # fmt: skip
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+
+
+def reference():
+    """The page of the public interface, made from its docstrings: conventions, then every name."""
+    import postflight
+    from postflight import plots
+
+    names = [f"## {name}\n\n::: {postflight._DOOR[name]}.{name}\n" for name in postflight.__all__ if name != "plots"]
+    figures = [f"### {name}\n\n::: postflight.plots.{plots._MODULE[name]}.{name}\n" for name in plots.__all__]
+    text = "\n".join([*names, f"## plots\n\n{plots.__doc__}", *figures])
+    return f"# The public interface\n\n```text\n{postflight.__doc__.strip()}\n```\n\n{text}"
 
 
 def on_files(files, config):
     """Add pages that are made: of files beside ``docs/``, of docstrings, a list of decisions."""
     for page, source in BESIDE.items():
         files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
-    for package, modules in REFERENCE.items():
-        text = f"# {package}\n\n" + "\n\n".join(f"::: {package}.{module}" for module in modules) + "\n"
-        files.append(File.generated(config, f"reference/{package}.md", content=text))
+    files.append(File.generated(config, "reference/postflight.md", content=reference()))
     decisions = sorted((ROOT / "docs/decisions").glob("0*.md"))
     listed = "\n".join(f"- [{path.read_text().splitlines()[0].lstrip('# ')}]({path.name})" for path in decisions)
     files.append(File.generated(config, "decisions/index.md", content=f"# Decisions\n\n{listed}\n"))

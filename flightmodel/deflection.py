@@ -13,10 +13,15 @@ vector of the shell against the body is ``theta * x_hat x d``; that of the body 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from flightmodel.checks import FloatArray, check_finite, check_increasing, check_shape
+from flightmodel.tabular import Tabular
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 HOLE_FACTOR = 3.0
 UNIFORM_VAR = np.pi**2 / 3.0  # of a clocking angle that may be anything
@@ -41,8 +46,8 @@ def rotation_vector_body_shell(theta_rad: FloatArray, plane_lv_rad: FloatArray) 
     return np.asarray(theta_rad, dtype=float)[..., None] * np.cross(x_hat, d)
 
 
-@dataclass(frozen=True)
-class DeflectionHistory:
+@dataclass(frozen=True, repr=False)
+class DeflectionHistory(Tabular):
     """Bending angle and plane over time.
 
     Parameters
@@ -77,6 +82,38 @@ class DeflectionHistory:
         check_shape(f"{self.method}.plane_lv_rad", self.plane_lv_rad, (n,))
         if self.covariance is not None:
             check_shape(f"{self.method}.covariance", self.covariance, (n, 2, 2))
+
+    def to_frame(self) -> pd.DataFrame:
+        """Angle and plane with standard deviations; rows without an answer are left out.
+
+        Returns
+        -------
+        DataFrame
+            ``t_s, theta_deg, theta_sd_deg, plane_lv_deg, plane_sd_deg``.
+        """
+        import pandas as pd
+
+        plane_sd = np.full(len(self.time_s), np.nan)
+        if self.covariance is not None:
+            plane_sd = np.sqrt(self.covariance[:, 1, 1])
+        table = pd.DataFrame(
+            {
+                "t_s": self.time_s,
+                "theta_deg": np.rad2deg(self.theta_rad),
+                "theta_sd_deg": np.rad2deg(self.theta_sd_rad),
+                "plane_lv_deg": np.rad2deg(self.plane_lv_rad),
+                "plane_sd_deg": np.rad2deg(plane_sd),
+            }
+        )
+        return table[np.isfinite(self.theta_rad)]
+
+    def _about(self) -> str:
+        known = np.isfinite(self.theta_rad)
+        if not known.any():
+            return f"{self.method}, no answer"
+        k = int(np.nanargmax(self.theta_rad))
+        largest = f"largest {np.rad2deg(self.theta_rad[k]):.2f} deg at {self.time_s[k]:.2f} s"
+        return f"{self.method}, {known.sum()} samples, {largest}"
 
     @property
     def theta_sd_rad(self) -> FloatArray:

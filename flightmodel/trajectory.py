@@ -7,15 +7,20 @@ The followed point is the structural datum (the nose), fixed hardware: the c.g. 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing, check_shape, check_unit_quaternion
+from flightmodel.tabular import Tabular
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Tabular):
     """Position, velocity and attitude over time.
 
     Parameters
@@ -58,6 +63,47 @@ class Trajectory:
         check_unit_quaternion("q_ecef_body", self.q_ecef_body)
         if self.covariance is not None:
             check_shape("covariance", self.covariance, (n, 9, 9))
+
+    def to_frame(self) -> pd.DataFrame:
+        """Place, velocity and attitude, one row a time.
+
+        Returns
+        -------
+        DataFrame
+            ``t_s, x_ecef_m, ..., vz_ecef_mps, qw, qx, qy, qz, p_degps, q_degps, r_degps`` (rates of the body against
+            inertial space), ``lat_deg, lon_deg, alt_m``, and with a covariance ``position_sd_m, velocity_sd_mps,
+            attitude_sd_deg``, roots of its traces.
+        """
+        import pandas as pd
+
+        latitude, longitude, altitude = earth.geodetic_from_ecef(self.position_ecef_m)
+        columns = {"t_s": self.time_s}
+        for pattern, letters, values in (
+            ("{}_ecef_m", "xyz", self.position_ecef_m),
+            ("v{}_ecef_mps", "xyz", self.velocity_ecef_mps),
+            ("q{}", "wxyz", self.q_ecef_body),
+            ("{}_degps", "pqr", np.rad2deg(self.omega_body_eci_body_radps)),
+        ):
+            columns |= {pattern.format(letter): values[:, k] for k, letter in enumerate(letters)}
+        columns |= {"lat_deg": np.rad2deg(latitude), "lon_deg": np.rad2deg(longitude), "alt_m": altitude}
+        if self.covariance is not None:
+            variance = self.sd() ** 2
+            columns["position_sd_m"] = np.sqrt(variance[:, :3].sum(axis=1))
+            columns["velocity_sd_mps"] = np.sqrt(variance[:, 3:6].sum(axis=1))
+            columns["attitude_sd_deg"] = np.rad2deg(np.sqrt(variance[:, 6:].sum(axis=1)))
+        return pd.DataFrame(columns)
+
+    def at(self, time_s: FloatArray) -> Trajectory:
+        """Trajectory at other times ``(m,)``, see `resample`."""
+        return resample(self, time_s)
+
+    def minus(self, other: Trajectory) -> FloatArray:
+        """Difference ``(n, 9)`` from another trajectory of the same times, see `difference`."""
+        return difference(self, other)
+
+    def _about(self) -> str:
+        span = f"{self.time_s[0]:.2f} to {self.time_s[-1]:.2f} s after {self.epoch_utc}"
+        return f"{self.point}, {len(self.time_s)} samples, {span}"
 
     def sd(self) -> FloatArray:
         """Standard deviations ``(n, 9)`` in the covariance's coordinates; NaN without covariance."""

@@ -303,6 +303,17 @@ def vehicle_path(name: str, beside: Path | None = None) -> Path:
     return DATA / "vehicles" / f"{name}.toml"
 
 
+def read_vehicle(name: str | Path) -> Vehicle:
+    """Read a vehicle: a path to a TOML file, or the name of a vehicle that ships with the toolkit.
+
+    Raises
+    ------
+    ConfigError
+        With every fault of the file, unknown keys with the nearest known one.
+    """
+    return vehicle_from_toml(vehicle_path(str(name)))
+
+
 def vehicle_from_toml(path: Path) -> Vehicle:
     """Read a vehicle file.
 

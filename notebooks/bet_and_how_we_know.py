@@ -14,10 +14,10 @@
 # %% [markdown]
 # # The best-estimated trajectory, and how we know
 #
-# Two radars say where the vehicle was, accelerometers and gyros how it moved between. A filter and a smoother weigh
-# them and give a trajectory with a covariance. The covariance is the claim; this essay tests it in three ways that
-# need no truth, plants a fault that they must find, and only then looks at the truth. The flight is **synthetic**
-# and short: the 46 s about its pressure pulse.
+# Two radars measure where the vehicle was, accelerometers and gyros how it moved between. Filter and smoother weigh
+# them and give a trajectory with a covariance. The covariance is the claim; this notebook tests it in ways that need no
+# truth, plants a fault that they must find, and only then looks at the truth. The flight is **synthetic** and short:
+# the 46 s about its pressure pulse.
 
 # %%
 # %matplotlib inline
@@ -31,14 +31,10 @@ import numpy as np
 import pandas as pd
 from scipy.stats import chi2
 
-from flightmodel.flightfolder import read_flight
-from flightmodel.trajectory import Trajectory, difference, resample
-from recon.reconstruct import reconstruct
-from synthetic_flight.folder import simulate_to_folder
-from synthetic_flight.scenarios import read_scenario
+import postflight as pf
 
 folder = Path(mkdtemp()) / "flight"
-text = Path(read_scenario("irve2_reference").source).read_text()
+text = Path(pf.read_scenario("irve2_reference").source).read_text()
 for pattern, new in (
     (r"(?m)^stop_s = 530\.0", "stop_s = 458.0"),
     (r"telemetry_from_s = 300\.0", "telemetry_from_s = 412.0"),
@@ -48,42 +44,42 @@ for pattern, new in (
 ):
     text = re.sub(pattern, new, text)
 (folder.parent / "short.toml").write_text(text)
-simulate_to_folder(read_scenario(str(folder.parent / "short.toml")), 3, folder)
-telemetry = read_flight(folder)
-bet = reconstruct(telemetry)
+pf.simulate(folder.parent / "short.toml", folder, seed=3)
+flight = pf.read_flight(folder)
+bet = pf.reconstruct(flight)
+bet
 
 # %% [markdown]
 # ## Residuals: as large as predicted, and white?
 #
-# Every measurement is predicted before it is used. Divided by its predicted standard deviation, the difference must
-# be a draw from a unit normal, and know nothing of the one before.
+# Every measurement is predicted before it is used. Divided by its predicted standard deviation, the residual must be a
+# draw from a unit normal, independent of the one before.
 
 # %%
-residuals = bet.residuals
+residuals = bet.solution.residuals
 normal = residuals["residual"] / residuals["predicted_sd"]
 figure, axis = plt.subplots(figsize=(9, 3))
 for source, rows in residuals.groupby("source"):
     axis.plot(rows["time_s"], normal[rows.index], ".", ms=2, label=source)
-axis.set_ylabel("residual / predicted sd")
-axis.set_xlabel("s after launch")
+axis.set(ylabel="residual / predicted sd", xlabel="time after launch, s")
 axis.legend()
-table = pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.remark) for v in bet.consistency_checks],
-                     columns=["verdict", "passed", "value", "in words"])  # fmt: skip
-table
+pd.DataFrame([(c.name, c.passed, round(c.value, 3), c.remark) for c in bet.consistency_checks],
+             columns=["consistency check", "passed", "value", "remark"])  # fmt: skip
 
 # %% [markdown]
-# ## Does a planted fault turn a verdict red?
+# ## Does a planted fault turn a consistency check red?
 #
 # A test that cannot fail proves nothing. One radar is moved by 60 m in range halfway through, which no data sheet
 # allows for, and everything is done again.
 
 # %%
+telemetry = flight.telemetry
 name = next(iter(telemetry.radars))
 radar = telemetry.radars[name]
 moved = radar.range_az_el.copy()
 moved[radar.time_s > 440.0, 0] += 60.0
-faulty = reconstruct(replace(telemetry, radars={**telemetry.radars, name: replace(radar, range_az_el=moved)}))
-red = [v.name for v in faulty.consistency_checks if not v.passed]
+faulty = replace(telemetry, radars={**telemetry.radars, name: replace(radar, range_az_el=moved)})
+red = [c.name for c in pf.reconstruct(replace(flight, telemetry=faulty)).consistency_checks if not c.passed]
 print("red with the fault:", *red, sep="\n  ")
 
 # %% [markdown]
@@ -93,34 +89,37 @@ print("red with the fault:", *red, sep="\n  ")
 
 # %%
 table = pd.read_csv(folder / "truth" / "truth.csv")
-inside = (table["t_s"] >= bet.smoothed.time_s[0]) & (table["t_s"] <= bet.smoothed.time_s[-1])
+estimate = bet.trajectory
+inside = (table["t_s"] >= estimate.time_s[0]) & (table["t_s"] <= estimate.time_s[-1])
 rows = table[inside].iloc[::5]
 columns = (("r{}_ecef_m", "xyz"), ("v{}_ecef_mps", "xyz"), ("q{}_ecef_body", "wxyz"), ("{}_body_degps", "pqr"))
 at = [rows[[name.format(letter) for letter in letters]].to_numpy() for name, letters in columns]
 q = at[2] / np.linalg.norm(at[2], axis=1)[:, None]
-true = Trajectory(telemetry.t0_utc, rows["t_s"].to_numpy(), bet.smoothed.point, at[0], at[1], q, np.deg2rad(at[3]))
-mine = resample(bet.smoothed, true.time_s)
-errors = difference(mine, true) / mine.sd()
+true = pf.Trajectory(telemetry.t0_utc, rows["t_s"].to_numpy(), estimate.point, at[0], at[1], q, np.deg2rad(at[3]))
+mine = estimate.at(true.time_s)
+error = mine.minus(true)
+normalised = error / mine.sd()
 figure, axes = plt.subplots(3, 1, sharex=True, figsize=(9, 5))
 for k, what in enumerate(("position", "velocity", "attitude")):
-    axes[k].plot(true.time_s, errors[:, 3 * k : 3 * k + 3])
+    axes[k].plot(true.time_s, normalised[:, 3 * k : 3 * k + 3])
     axes[k].axhspan(-3, 3, color="0.9", zorder=0)
-    axes[k].set_ylabel(f"{what} / sd")
-share = np.mean(np.abs(errors) < 3.0, axis=0)
-squared = np.einsum("ni,nij,nj->n", difference(mine, true), np.linalg.inv(mine.covariance), difference(mine, true))
+    axes[k].set_ylabel(f"{what} error / sd")
+share = np.mean(np.abs(normalised) < 3.0, axis=0)
+squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(mine.covariance), error)
 print(f"inside 3 sd: {share.min():.2f} of the time at least; mean squared error over covariance {squared.mean():.1f} "
       "where 9 is expected")  # fmt: skip
 
 # %% [markdown]
 # ## The claim
 #
-# All verdicts of the sound flight pass; the planted fault turns at least one red, and one of these names the radar;
-# and the errors, which nothing above has seen, lie inside three of the stated standard deviations.
+# All consistency checks of the sound flight pass; the planted fault turns at least one red, and one of these names the
+# radar; and the errors, which nothing above has seen, lie inside three of the stated standard deviations.
 
 # %%
-assert all(v.passed for v in bet.consistency_checks)
-assert any(name in words for words in red)
+assert all(c.passed for c in bet.consistency_checks)
+radar_name = next(iter(telemetry.radars))
+assert any(radar_name in check for check in red)
 assert share.min() > 0.95
 low, high = chi2.ppf([0.005, 0.995], 9)  # errors last as long as the flight: they are one draw of nine
 assert low < squared.mean() < high
-print("proved: the covariance is honest here, and a fault is seen")
+print("proved: the covariance is honest here, and a fault is detected")

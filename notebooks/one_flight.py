@@ -12,11 +12,11 @@
 # ---
 
 # %% [markdown]
-# # One flight, and how far its aeroshell bent
+# # One flight, and how far its aeroshell deflected
 #
-# A flight folder goes in; a trajectory, three estimates of the deflection and a verdict come out. Every figure here is
-# the library's own. The flight is **synthetic** unless you point `POSTFLIGHT_FLIGHT` at a folder of your own: nothing
-# below, up to the last section, looks at its truth.
+# A flight folder goes in; a trajectory, three estimates of the deflection and their consistency come out. The flight
+# is **synthetic** unless `POSTFLIGHT_FLIGHT` names a folder of your own: nothing below, up to the last section, looks
+# at its truth.
 
 # %%
 # %matplotlib inline
@@ -28,69 +28,57 @@ import numpy as np
 import pandas as pd
 from IPython.display import Image, display
 
-from flightmodel.airdata import pressure_pulse
-from postflight.flight import METHODS, estimate, reconstruct_flight
-from postflight.plots import paper_figures, run_figures
-from postflight.product import bet_table, event_table
-from postflight.run_folder import method_summary
-from postflight.studies.preflight import rigid_bounds
+import postflight as pf
 
 folder = Path(os.environ.get("POSTFLIGHT_FLIGHT", "../demo-flight"))
 if not (folder / "flight.toml").exists():
-    from synthetic_flight.folder import simulate_to_folder
-    from synthetic_flight.scenarios import read_scenario
-
-    simulate_to_folder(read_scenario("irve2_reference"), 0, folder)
+    pf.simulate("irve2_reference", folder)
 
 # %% [markdown]
-# ## What came down
+# ## What was measured
 #
 # Two radars, accelerometers in their own clocked package, rate gyros, the day's sounding, and video. The gate checks
 # all of it; what an analyst should know of the data is a finding, not a repair.
 
 # %%
-flight = reconstruct_flight(folder)
-telemetry = flight.telemetry
-rows = [(name, len(r.time_s), r.time_s[0], r.time_s[-1]) for name, r in telemetry.radars.items()]
-for triad in (telemetry.accelerometer, telemetry.rates):
-    rows.append((triad.spec.name, len(triad.time_s), triad.time_s[0], triad.time_s[-1]))
-print(*telemetry.findings, *flight.reconstruction.findings, sep="\n")
-pd.DataFrame(rows, columns=["sensor", "samples", "from s", "to s"])
+flight = pf.read_flight(folder)
+print(*flight.findings, sep="\n")
+flight
 
 # %% [markdown]
 # ## The best-estimated trajectory, and how we know
 #
-# Radar says where, accelerometers and gyros say how it moved between; the filter and smoother weigh them, and estimate
-# the sensors' own errors on the way. If its assumptions hold, the residuals are as large as predicted and white.
+# Radars measure the position, accelerometers and gyros the motion between; filter and smoother weigh them, and estimate
+# the sensors' own errors. If the assumptions hold, the residuals are as large as predicted and white.
 
 # %%
-event_table(flight, bet_table(flight)).round(2)
+bet = pf.reconstruct(flight)
+bet
 
 # %%
-pd.DataFrame([(v.name, v.passed, round(v.value, 3), v.remark) for v in flight.consistency_checks],
-             columns=["verdict", "passed", "value", "in words"])  # fmt: skip
+pd.DataFrame([(c.name, c.passed, round(c.value, 3), c.remark) for c in bet.consistency_checks],
+             columns=["consistency check", "passed", "value", "remark"])  # fmt: skip
 
 # %%
-paper_figures.figure_residuals(flight)
+pf.plots.figure_residuals(bet)
 
 # %% [markdown]
 # ## The anomaly
 #
-# A rigid vehicle, flown a hundred times from the reconstructed state with pre-flight uncertainties, gives the grey
-# band. The flight leaves it: total angle of attack by several degrees, normal acceleration by several times.
+# A rigid vehicle, flown sixty times from the reconstructed state with pre-flight uncertainties, gives the grey band.
+# The flight leaves it: total angle of attack by several degrees, normal acceleration by several times.
 
 # %%
-bounds = rigid_bounds(flight, flights=60)
-paper_figures.figure_1_3(flight, bounds)
+pf.plots.figure_1_3(bet, flights=60)
 
 # %% [markdown]
-# ## The sharp contrast
+# ## The contrast
 #
-# All aerodynamic force is on the aeroshell, so $a_N/(-a_x) = C_N/C_A$ of the *shell's* angle of attack. Read without
-# correction, the accelerometers ask for an angle that the trajectory denies.
+# All aerodynamic force is on the aeroshell, so $a_N/(-a_x) = C_N/C_A$ of the *shell's* angle of attack. Without a
+# deflection the accelerometers ask for an angle that the trajectory excludes.
 
 # %%
-paper_figures.figure_2_5(flight)
+pf.plots.figure_2_5(bet)
 
 # %% [markdown]
 # ## Three ways to the deflection
@@ -101,17 +89,16 @@ paper_figures.figure_2_5(flight)
 # 3. **Trim**: which sideways shift of the c.g. balances the moments at the angle that was flown?
 
 # %%
-methods = tuple(m for m in METHODS if m != "camera" or telemetry.frames is not None)
-answers = estimate(flight, telemetry, methods)
-pd.DataFrame(method_summary(answers, flight.peak_s)).T[["deflection_deg", "sd_deg", "largest_deg", "largest_at_s"]]
+answer = pf.fuse(bet)
+answer
 
 # %%
-paper_figures.figure_2_7(flight, answers.histories["misalignment"])
+pf.plots.figure_2_7(bet, answer.histories["misalignment"])
 
 # %%
-if "camera" in answers.histories:
+if "camera" in answer.histories:
     with TemporaryDirectory() as pictures:
-        run_figures.draw_camera(telemetry, answers.histories["camera"], Path(pictures))
+        pf.plots.draw_camera(flight, answer.histories["camera"], Path(pictures))
         display(Image((Path(pictures) / "figure_2_3.png").read_bytes()))
 
 # %% [markdown]
@@ -121,9 +108,8 @@ if "camera" in answers.histories:
 # coefficients and c.g. offset. Through the pressure pulse they agree within their error bars.
 
 # %%
-grid = flight.air.time_s[pressure_pulse(flight.air.dynamic_pressure_pa)]
-grid = grid[(grid > flight.peak_s - 6.0) & (grid < flight.peak_s + 6.0)]
-at = {m: np.array([h.at(t) for t in grid]) for m, h in answers.histories.items()}
+grid = np.arange(bet.peak_s - 6.0, bet.peak_s + 6.0, 0.1)
+at = {m: np.array([h.at(t) for t in grid]) for m, h in answer.histories.items()}
 names = list(at)
 for k, one in enumerate(names):
     for other in names[k + 1 :]:
@@ -142,4 +128,4 @@ for k, one in enumerate(names):
 if (folder / "truth" / "deflection.csv").exists():
     truth = pd.read_csv(folder / "truth" / "deflection.csv")
     overlay = (truth["t_s"].to_numpy(), truth["theta_deg"].to_numpy())
-    display(paper_figures.figure_summary(flight, answers, overlay))
+    display(pf.plots.figure_summary(bet, answer, overlay))

@@ -1,3 +1,112 @@
-"""Where the parts meet: the command, the pipeline, results, scores and figures."""
+"""What an entry vehicle really did, and how far its flexible aeroshell deflected: the public interface.
+
+``import postflight as pf`` is all that a notebook or a script needs::
+
+    flight = pf.read_flight("my-flight")        # telemetry behind the gate
+    bet = pf.reconstruct(flight)                # best-estimated trajectory, air data, consistency checks
+    answer = pf.fuse(bet)                       # the deflection by every method, and fused
+    changed = flight.with_(c_n=1.1, wind=None)  # a what-if is a changed flight
+
+Every result prints itself in one line, shows as a table in a notebook, and gives its data by ``to_frame()`` with units
+in the column names. Everything that is not listed here is internal.
+
+Conventions
+-----------
+- SI and radians in memory, degrees in tables and files; a name ends in its unit (``_m``, ``_mps``, ``_rad``, ``_deg``).
+- Frames: ``eci`` (equal to ECEF at the flight's t0, then fixed), ``ecef`` (WGS-84), ``ned``, ``body`` (centerbody: x
+  out of the nose), ``shell`` (aeroshell; equal to body undeflected), ``lv`` (clocking angles about the axis), ``cam``
+  (OpenCV).
+- ``v_to = dcm_to_from @ v_from``; quaternions ``q_to_from`` are Hamilton, scalar first.
+- ``theta`` is the angle between the x axes of the two bodies, ``plane_lv`` the clocking angle towards which the shell's
+  nose axis tilts in the body frame.
+- ``error = estimate - truth``, ``residual = measured - predicted``; +/- is one standard deviation (``_sd``).
+- Times are seconds after the flight's t0; heights are above the WGS-84 ellipsoid; wind is the velocity of the air mass.
+
+CONVENTIONS.md has them all. Refusals are `ValueError` with a stable code for each fault (``error.codes``).
+"""
 
 from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from flightmodel.deflection import DeflectionHistory
+    from flightmodel.trajectory import Trajectory
+    from flightmodel.vehicle import read_vehicle
+    from postflight import plots
+    from postflight.deflections import Deflections, estimate_camera, estimate_misalignment, estimate_trim, fuse
+    from postflight.flight import Flight, read_flight
+    from postflight.interface import check_flight, compare, monte_carlo, score, simulate, write_report
+    from postflight.reconciliation.command import reconcile
+    from postflight.reconstruction import Reconstruction, air_data, reconstruct
+    from recon.settings import Settings
+    from synthetic_flight.scenarios import read_scenario
+
+# imported on first use, so that `postflight --help` answers at once
+_DOOR = {
+    "read_flight": "postflight.flight",
+    "Flight": "postflight.flight",
+    "check_flight": "postflight.interface",
+    "reconstruct": "postflight.reconstruction",
+    "Settings": "recon.settings",
+    "Reconstruction": "postflight.reconstruction",
+    "Trajectory": "flightmodel.trajectory",
+    "air_data": "postflight.reconstruction",
+    "estimate_camera": "postflight.deflections",
+    "estimate_misalignment": "postflight.deflections",
+    "estimate_trim": "postflight.deflections",
+    "fuse": "postflight.deflections",
+    "Deflections": "postflight.deflections",
+    "DeflectionHistory": "flightmodel.deflection",
+    "read_vehicle": "flightmodel.vehicle",
+    "read_scenario": "synthetic_flight.scenarios",
+    "simulate": "postflight.interface",
+    "score": "postflight.interface",
+    "monte_carlo": "postflight.interface",
+    "reconcile": "postflight.reconciliation.command",
+    "compare": "postflight.interface",
+    "write_report": "postflight.interface",
+}
+
+__all__ = [
+    "DeflectionHistory",
+    "Deflections",
+    "Flight",
+    "Reconstruction",
+    "Settings",
+    "Trajectory",
+    "air_data",
+    "check_flight",
+    "compare",
+    "estimate_camera",
+    "estimate_misalignment",
+    "estimate_trim",
+    "fuse",
+    "monte_carlo",
+    "plots",
+    "read_flight",
+    "read_scenario",
+    "read_vehicle",
+    "reconcile",
+    "reconstruct",
+    "score",
+    "simulate",
+    "write_report",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on its first use."""
+    if name == "plots":
+        return import_module("postflight.plots")
+    if name not in _DOOR:
+        raise AttributeError(f"module 'postflight' has no attribute '{name}'; public names: {', '.join(__all__)}")
+    found = getattr(import_module(_DOOR[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """Public names."""
+    return sorted(__all__)

@@ -173,10 +173,24 @@ class FiniteRange(click.FloatRange):
         return number
 
 
+def what_ifs(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that change a flight's assumptions or the reconstruction's settings."""
+    command = click.option(
+        "--without", multiple=True, metavar="SOURCE", help="Leave this tracker out; repeat for several."
+    )(command)
+    return click.option(
+        "--set",
+        "settings",
+        multiple=True,
+        metavar="NAME=VALUE",
+        help="Change an assumption (c_n=1.1, mass_kg=158, wind=none) or setting (engine=filterpy); repeat for several.",
+    )(command)
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(package_name="postflight")
 def cli() -> None:
-    """What an entry vehicle really did, and how far its flexible aeroshell bent.
+    """What an entry vehicle really did, and how far its flexible aeroshell deflected.
 
     A flight is a folder: flight.toml, telemetry/, and for synthetic flights truth/, which no estimator opens.
     """
@@ -215,11 +229,14 @@ def simulate(arguments: tuple[str, ...], seed: int, force: bool) -> None:
 @click.argument("folder", type=FOLDER)
 @click.option("--rate", type=FiniteRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
 @click.option("--sensitivity", is_flag=True, help="Also rerun without each source, wind, and with other air and mass.")
-def reconstruct(folder: Path, rate: float, sensitivity: bool) -> None:
+@what_ifs
+def reconstruct(
+    folder: Path, rate: float, sensitivity: bool, settings: tuple[str, ...], without: tuple[str, ...]
+) -> None:
     """Reconstruct the best-estimated trajectory of the flight in FOLDER."""
     from postflight import commands
 
-    commands.run(folder, (), rate, sensitivity)
+    commands.run(folder, (), commands.changes_of(settings, without, rate), sensitivity)
 
 
 @cli.command()
@@ -243,7 +260,7 @@ def reconstruct(folder: Path, rate: float, sensitivity: bool) -> None:
 )
 @click.option("--film", is_flag=True, help="Also write the film with the virtual camera over it (VP9 WebM).")
 def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None, film: bool) -> None:
-    """Estimate how far the aeroshell bent in the flight in FOLDER."""
+    """Estimate how far the aeroshell deflected in the flight in FOLDER."""
     from postflight import commands
 
     commands.deflection(folder, methods, plane, joint, film)
@@ -263,12 +280,13 @@ def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> 
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--rate", type=FiniteRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
-def run(folder: Path, rate: float) -> None:
+@what_ifs
+def run(folder: Path, rate: float, settings: tuple[str, ...], without: tuple[str, ...]) -> None:
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
     from postflight import commands
-    from postflight.flight import METHODS
+    from postflight.deflections import METHODS
 
-    commands.run(folder, METHODS, rate)
+    commands.run(folder, METHODS, commands.changes_of(settings, without, rate))
 
 
 @cli.command()

@@ -6,7 +6,9 @@ import json
 import re
 import sys
 import time
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,27 +18,19 @@ from rich.table import Table
 
 from estimators.calibration import calibrate_lens, read_corners
 from flightmodel.camera import Lens
-from flightmodel.checks import ConfigError, DivergenceError, FloatArray, GateError
-from flightmodel.deflection import lv_clock
-from flightmodel.flightfolder import read_flight
+from flightmodel.checks import ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
 from postflight import run_folder, warmup
-from postflight.flight import (
-    METHODS,
-    NO_VIDEO,
-    PULSE_RATE_HZ,
-    Answers,
-    Flight,
-    camera_sensitivity,
-    estimate,
-    reconstruct_telemetry,
-)
-from postflight.plots import paper_figures, run_figures
-from postflight.plots.overlay_film import write_overlay_film
-from postflight.progress import Report, progress_bar
+from postflight.deflections import METHODS, NO_VIDEO, Deflections, camera_sensitivity, estimate
+from postflight.flight import read_flight
+from postflight.plots import run_figures
+from postflight.plots.deflection import figure_summary
+from postflight.plots.overlay import write_overlay_film
+from postflight.plots.style import save
+from postflight.progress import progress_bar
+from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
-from recon.settings import Settings
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
@@ -82,8 +76,8 @@ def simulate(scenario: str, folder: Path, seed: int, force: bool) -> None:
         truth = simulate_to_folder(chosen, seed, folder, report, replace=force)
     print_truth(truth, folder)
     print_events(flight_events(truth, chosen.spec.time.inflated_s))
-    if truth.words:
-        console.print(f"[yellow]{escape(truth.words)}[/]")
+    if truth.remark:
+        console.print(f"[yellow]{escape(truth.remark)}[/]")
 
 
 def print_truth(truth: Truth, folder: Path) -> None:
@@ -122,70 +116,94 @@ def print_events(flown: list[Event]) -> None:
     console.print(table)
 
 
-def run(folder: Path, methods: tuple[str, ...], rate_hz: float, reruns: bool = False) -> None:
+def run(folder: Path, methods: tuple[str, ...], changes: dict[str, Any], reruns: bool = False) -> None:
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers."""
-    flight, answers, written = run_flight(folder, methods, rate_hz, reruns)
-    print_flight(flight, pd.read_csv(written / "events.csv"))
+    bet, answers, written = run_flight(folder, methods, changes, reruns)
+    print_flight(bet, pd.read_csv(written / "events.csv"))
     if reruns:
         print_sensitivity(pd.read_csv(written / "sensitivity.csv"))
     if methods:
-        print_answers(answers, flight.peak_s)
+        print_answers(answers)
     console.print(f"results in {escape(str(written))}, to read in report.html")
-    if any(reason != NO_VIDEO for reason in answers.refused.values()):
+    if any(reason.code != NO_VIDEO for reason in answers.refused.values()):
         sys.exit(EXIT_NO_ANSWER)
 
 
 def run_flight(
-    folder: Path, methods: tuple[str, ...], rate_hz: float, reruns: bool = False
-) -> tuple[Flight, Answers, Path]:
+    folder: Path, methods: tuple[str, ...], changes: dict[str, Any], reruns: bool = False
+) -> tuple[Reconstruction, Deflections, Path]:
     """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too."""
-    settings = {"methods": list(methods), "output_rate_hz": rate_hz, "sensitivity": reruns}
     log: list[str] = []
     with progress_bar() as report:
 
-        def step(low: float, high: float) -> Report:
-            def tell(fraction: float, what: str) -> None:
+        def step(low: float, high: float) -> Progress:
+            def show(fraction: float, what: str) -> None:
                 if not log or log[-1] != what:
                     log.append(what)
                 report(low + (high - low) * fraction, what)
 
-            return tell
+            return show
 
         share = 0.2 if reruns else 1.0  # of the time, for all but the reruns
-        step(0.0, 0.05 * share)(0.0, "reading telemetry")
-        telemetry = read_flight(folder, lambda f: report(0.05 * share * f, "reading telemetry"))
+        flight = read_flight(folder, step(0.0, 0.05 * share)).with_(**changes)
         compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *(["camera"] if "camera" in methods else []))
-        flight = reconstruct_telemetry(
-            telemetry, Settings(output_rate_hz=rate_hz, pulse_rate_hz=PULSE_RATE_HZ), step(0.05 * share, 0.5 * share)
-        )
+        bet = reconstruct(flight, None, step(0.05 * share, 0.5 * share))
         wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
-        answers = estimate(flight, flight.telemetry, wanted, step(0.5 * share, 0.7 * share))
+        answers = estimate(bet, wanted, step(0.5 * share, 0.7 * share))
         if "camera" in methods and "camera" not in wanted:
-            answers.refused["camera"] = NO_VIDEO
+            answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
+        settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
+        if flight.changes:
+            settings["changes"] = list(flight.changes)
         with run_folder.RunFolder(folder, flight.telemetry, settings) as out:
-            run_folder.write_reconstruction(out, flight)
+            run_folder.write_reconstruction(out, bet)
             run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
-                out.write_csv(
-                    "camera_sensitivity.csv", camera_sensitivity(flight.telemetry, answers.histories["camera"])
-                )
-            out.write_json("summary.json", run_folder.summary(flight, answers))
-            bounds = run_figures.draw_run(flight, answers, out.path / "figures", step(0.7 * share, share))
+                out.write_csv("camera_sensitivity.csv", camera_sensitivity(flight, answers.histories["camera"]))
+            out.write_json("summary.json", run_folder.summary(bet, answers))
+            bounds = run_figures.draw_run(bet, answers, out.path / "figures", step(0.7 * share, share))
             if bounds is not None:
                 out.write_csv("rigid_bounds.csv", bounds.table())
             if reruns:
-                table = sensitivity(flight, step(share, 1.0))
+                table = sensitivity(bet, step(share, 1.0))
                 out.write_csv("sensitivity.csv", table)
-                run_figures.draw_sensitivity(flight, table, out.path / "figures")
+                run_figures.draw_sensitivity(bet, table, out.path / "figures")
             step(1.0, 1.0)(0.0, "writing the report")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
             (out.path / "log.jsonl").write_text(lines)
             out.write_facts()
-            write_report(folder, out.path, telemetry)
-    return flight, answers, out.path
+            write_report(folder, out.path, flight.telemetry)
+    return bet, answers, out.path
 
 
-def print_flight(flight: Flight, events: pd.DataFrame) -> None:
+def changes_of(settings: tuple[str, ...], without: tuple[str, ...], rate_hz: float | None = None) -> dict[str, Any]:
+    """What-ifs of the command line: ``NAME=VALUE`` with the value written as in TOML, and sources left out."""
+    changes: dict[str, Any] = {} if rate_hz is None else {"output_rate_hz": rate_hz}
+    faults = []
+    for text in settings:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not equals or not name:
+            faults.append(Fault(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
+            continue
+        changes[name] = _toml_value(value)
+    if without:
+        changes["without"] = (*changes.get("without", ()), *without)
+    if faults:
+        raise ConfigError(faults)
+    return changes
+
+
+def _toml_value(text: str) -> Any:
+    """A value as TOML writes it; ``none`` is None, and what is no TOML is a word."""
+    if text.lower() == "none":
+        return None
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
     """Events, verdicts and findings."""
     table = Table(title=f"Best-estimated trajectory of {escape(flight.telemetry.name)}")
     for name in ("event", "t s", "altitude km", "Mach", "q Pa", "alpha total deg"):
@@ -201,15 +219,15 @@ def print_flight(flight: Flight, events: pd.DataFrame) -> None:
     for finding in (*flight.findings, *run_folder.without_attitude(flight)):
         console.print(f"[yellow]found[/] {escape(str(finding))}")
     for reason in flight.missing:
-        console.print(f"[yellow]left out[/] air of the day: {escape(reason)}")
+        console.print(f"[yellow]left out[/] as-flown atmosphere: {escape(reason)}")
     if flight.attitude is not None and flight.attitude.comparison is not None:
-        console.print(escape(flight.attitude.words))
+        console.print(escape(flight.attitude.remark))
     failed = [v for v in flight.consistency_checks if not v.passed]
     passed = len(flight.consistency_checks) - len(failed)
-    console.print(f"{passed} of {len(flight.consistency_checks)} verdicts on the trajectory pass")
+    console.print(f"{passed} of {len(flight.consistency_checks)} consistency checks pass")
     for consistency_check in failed:
         numbers = f"{consistency_check.value:.3g} outside {consistency_check.low:.3g} to {consistency_check.high:.3g}"
-        console.print(f"[red]verdict[/] {consistency_check.name}: {consistency_check.remark} ({numbers})")
+        console.print(f"[red]check failed[/] {consistency_check.name}: {consistency_check.remark} ({numbers})")
     for k, words in enumerate(flight.suspects):
         console.print(f"[red]{'suspect' if k == 0 else 'also'}[/] {escape(words)}")
 
@@ -237,30 +255,29 @@ def print_sensitivity(found: pd.DataFrame) -> None:
         )
 
 
-def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> None:
-    """Deflection at one time, method by method; ``note`` says which time that is."""
-    when = f" at {peak_s:.2f} s" if np.isfinite(peak_s) else ""
-    table = Table(title=f"Deflection of the aeroshell against the centerbody{when}{note}")
+def print_answers(answers: Deflections) -> None:
+    """Deflection method by method at peak dynamic pressure; without a trajectory at the largest."""
+    at_s = answers.reference_s
+    note = "peak q" if answers.bet is not None else "its largest; no trajectory was made"
+    when = f" at {at_s:.2f} s" if np.isfinite(at_s) else ""
+    table = Table(title=f"Deflection of the aeroshell against the centerbody{when} ({note})")
     for name in ("method", "deflection deg", "1 sd", "plane LV deg", "largest deg", "at s"):
         table.add_column(name, justify="left" if name == "method" else "right")
-    rows = run_folder.method_summary(answers, peak_s)
-    for method, row in rows.items():
-        if row["deflection_deg"] is None:
-            table.add_row(method, "no answer", "", "", "", "")
+    for row in answers.to_frame().itertuples(index=False):
+        if not np.isfinite(row.theta_deg):
+            table.add_row(row.method, "no answer", "", "", "", "")
             continue
-        history = answers.histories[method]
-        yz = [np.interp(peak_s, history.time_s, c) for c in np.nan_to_num(history.theta_yz_rad).T]
-        plane = np.rad2deg(lv_clock(np.array(yz)))
-        angle, largest = f"{row['deflection_deg']:.2f}", f"{row['largest_deg']:.2f}"
-        table.add_row(method, angle, f"{row['sd_deg']:.2f}", f"{plane:.0f}", largest, f"{row['largest_at_s']:.2f}")
+        numbers = (row.theta_deg, row.theta_sd_deg)
+        largest = (f"{row.largest_deg:.2f}", f"{row.largest_t_s:.2f}")
+        table.add_row(row.method, *(f"{x:.2f}" for x in numbers), f"{row.plane_lv_deg:.0f}", *largest)
     console.print(table)
     if answers.fused is not None:
         found = answers.fused.agreement
-        console.print(f"{'' if not found.suspects else '[red]consistency_check[/] '}{escape(found.words)}")
-        clock = answers.fused.film_clock
-        if clock is not None:
-            console.print(f"{'[red]consistency_check[/] ' if clock.is_off else ''}{escape(clock.words)}")
-    for method, row in rows.items():
+        console.print(f"{'' if not found.hypotheses else '[red]check failed[/] '}{escape(found.remark)}")
+        bias = answers.fused.camera_time_bias
+        if bias is not None:
+            console.print(f"{'[red]check failed[/] ' if bias.is_off else ''}{escape(bias.remark)}")
+    for method, row in run_folder.method_summary(answers, at_s).items():
         if "reason" in row:
             console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")
 
@@ -268,43 +285,42 @@ def print_answers(answers: Answers, peak_s: float, note: str = " (peak q)") -> N
 def deflection(
     folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None, film: bool = False
 ) -> None:
-    """Estimate the deflection alone; the camera needs no trajectory, and is told more where one can be made."""
-    telemetry = read_flight(folder, needs_path=set(methods) != {"camera"})
+    """Estimate the deflection alone; the camera needs no trajectory, and is corrected where one can be made."""
+    assumed = {"camera_plane_lv_deg": plane_deg, "joint_station_m": joint_m}
+    flight = read_flight(folder, needs_path=set(methods) != {"camera"})
+    flight = flight.with_(**{name: value for name, value in assumed.items() if value is not None})
+    telemetry = flight.telemetry
     if not methods:
         methods = tuple(m for m in METHODS if m != "camera" or telemetry.frames is not None)
-    plane_rad = None if plane_deg is None else float(np.deg2rad(plane_deg))
     settings = {"methods": list(methods), "plane_deg": plane_deg, "joint_m": joint_m}
     alone = set(methods) == {"camera"}
-    makes_bet = not alone or (plane_rad is None and telemetry.can_tell_moment)
+    makes_bet = not alone or (plane_deg is None and telemetry.can_tell_moment)
     if makes_bet:
         compile_kernels(*warmup.RECONSTRUCTION)
     if "camera" in methods:
         compile_kernels("camera")
     with progress_bar() as report:
-        flight, trouble = None, ""
+        bet, trouble = None, ""
         try:
             if makes_bet:
-                flight = reconstruct_telemetry(telemetry, None, lambda f, what: report(0.6 * f, what))
+                bet = reconstruct(flight, None, lambda f, what: report(0.6 * f, what))
         except (GateError, DivergenceError) as fault:
             if not alone:
                 raise
             trouble = str(fault)
-        tell: Report = lambda f, what: report(0.6 + 0.3 * f, what)  # noqa: E731
-        answers = estimate(flight, telemetry, methods, tell, plane_rad, joint_m)
+        answers = estimate(bet or flight, methods, lambda f, what: report(0.6 + 0.3 * f, what))
         with run_folder.RunFolder(folder, telemetry, settings) as out:
             run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 history = answers.histories["camera"]
-                run_figures.draw_camera(telemetry, history, out.path / "figures", joint_m)
+                run_figures.draw_camera(flight, history, out.path / "figures")
                 if film:
-                    write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", joint_m, report)
+                    write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", progress=report)
     for finding in telemetry.findings:
         console.print(f"[yellow]found[/] {escape(str(finding))}")
     if trouble:
         console.print(f"[yellow]no trajectory[/], the camera answers alone: {escape(trouble)}")
-    # without a trajectory the camera's own largest deflection is what can be named
-    peak_s = flight.peak_s if flight else largest_s(answers)
-    print_answers(answers, peak_s, " (peak q)" if flight else " (its largest; no trajectory was made)")
+    print_answers(answers)
     if "camera" in answers.histories:
         console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
     elif film:
@@ -323,13 +339,6 @@ def calibrate(corners: Path, size: str, lens: Lens) -> None:
     words = f"{found.corners} corners in {found.pictures} pictures, rms {found.rms_px:.3f} px"
     console.print(f"# {words}", highlight=False)
     console.print(escape(found.toml()), highlight=False)
-
-
-def largest_s(answers: Answers) -> float:
-    """Time of the largest deflection of the first method that answered, s."""
-    for history in answers.histories.values():
-        return float(history.time_s[np.nanargmax(history.theta_rad)])
-    return float("nan")
 
 
 def score(folder: Path, as_json: bool) -> None:
@@ -375,13 +384,13 @@ def demo(folder: Path, seed: int) -> None:
     console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
     compile_kernels("simulator", "ensembles", *warmup.RECONSTRUCTION, "camera")
     simulate(REFERENCE, folder, seed, force=True)
-    flight, answers, written = run_flight(folder, METHODS, 20.0)
-    print_flight(flight, pd.read_csv(written / "events.csv"))
+    bet, answers, written = run_flight(folder, METHODS, {})
+    print_flight(bet, pd.read_csv(written / "events.csv"))
     for method, reason in answers.refused.items():
         console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
     result = score_run(folder, written)
     picture = folder / "demo.png"
-    paper_figures.save(run_figures.summary_figure(flight, answers, truth_history(folder)), picture)
+    save(figure_summary(bet, answers, truth_history(folder)), picture)
     print_score(result)
     console.print(f"results, figures and report.html in {escape(str(written))}")
     console.print(f"the answer as a picture, with the truth: {escape(str(picture))}")

@@ -32,7 +32,7 @@ INSTRUMENTS = [
 MODELS = [
     scenarios.TimeSpan,
     scenarios.Initial,
-    weather.DayAtmosphere,
+    weather.DayOfFlightAtmosphere,
     weather.Pocket,
     weather.Shear,
     weather.Turbulence,
@@ -177,4 +177,4 @@ def test_site_builds_without_a_warning_and_asks_for_nothing(tmp_path: Path):
         assert not asked, f"{name} loads something from elsewhere"
         assert not re.search(r'class="arithmatex"', text), f"{name} has a formula that is not drawn"
     assert "<math" in pages["derivations.html"]
-    assert "estimate_misalignment" in pages["reference/estimators.html"]
+    assert "estimate_misalignment" in pages["reference/postflight.html"]

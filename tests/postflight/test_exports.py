@@ -12,8 +12,10 @@ from click.testing import CliRunner
 from flightmodel.checks import ConfigError, GateError
 from postflight import exports, run_folder
 from postflight.cli import cli
+from postflight.deflections import Deflections
 from postflight.exports import read_source
-from postflight.flight import Answers, reconstruct_flight
+from postflight.flight import read_flight
+from postflight.reconstruction import reconstruct
 
 FLIGHT = Path(__file__).parents[1] / "data" / "real_flights" / "rocketpy_prometheus"
 KML = "{http://www.opengis.net/kml/2.2}"
@@ -25,10 +27,10 @@ def folder(tmp_path_factory):
     """A recorded rocket's run, with deflections beside it as a run of an entry vehicle has them."""
     folder = tmp_path_factory.mktemp("exports") / "flight"
     shutil.copytree(FLIGHT, folder)
-    flight = reconstruct_flight(folder)
+    flight = reconstruct(read_flight(folder))
     with run_folder.RunFolder(folder, flight.telemetry, {}) as out:
         run_folder.write_reconstruction(out, flight)
-        out.write_json("summary.json", run_folder.summary(flight, Answers()))
+        out.write_json("summary.json", run_folder.summary(flight, Deflections()))
     (run,) = (folder / "runs").iterdir()
     t = np.arange(20.0, 26.0, 0.11)
     t = t[(t < 22.0) | (t > 24.0)]
@@ -138,10 +140,8 @@ def test_names_stay_text_in_kml(folder, tmp_path):
     etree = pytest.importorskip("lxml.etree")
     from dataclasses import replace
 
-    from postflight.exports import kml_bytes
-
     source = replace(read_source(folder), name="<script>alert(1)</script> & \x00")
-    root = etree.fromstring(kml_bytes(source))
+    root = etree.fromstring(exports.FORMS["kml"][0](source))
     assert not root.findall(".//script")
     assert root.find(f".//{KML}name").text.startswith("<script>")
 
@@ -167,7 +167,9 @@ def test_oem_by_another_reader(written, run_table):
 @pytest.mark.parametrize("form", ["csv", "parquet", "mat", "nc", "kml", "oem"])
 def test_the_same_run_gives_the_same_bytes(form, folder):
     source = read_source(folder)
-    assert exports.FORMS[form](source) == exports.FORMS[form](read_source(folder))
+    write, suffix = exports.FORMS[form]
+    assert suffix == f".{form}"
+    assert write(source) == write(read_source(folder))
 
 
 def test_missing_extra_is_said_with_the_command(folder, monkeypatch):
@@ -179,17 +181,21 @@ def test_missing_extra_is_said_with_the_command(folder, monkeypatch):
         return imported(name, own, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ConfigError, match=r"pip install 'postflight\[parquet\]'") as fault:
+    with pytest.raises(ConfigError) as fault:
         exports.export(folder, "parquet", None)
+    assert fault.value.codes == ("library-missing",)
+    assert "pip install 'postflight[parquet]'" in str(fault.value)
     assert fault.value.exit_code == 2
     assert not (folder / "exports").exists()
 
 
 def test_flight_without_a_run_is_refused(tmp_path):
-    with pytest.raises(GateError, match="no finished run"):
+    with pytest.raises(GateError) as fault:
         exports.export(tmp_path, "csv", None)
+    assert fault.value.codes == ("run-missing",)
 
 
 def test_run_folders_stay_as_they_are(folder):
-    with pytest.raises(ConfigError, match="stay as they were"):
+    with pytest.raises(ConfigError) as fault:
         exports.export(folder, "csv", folder / "runs" / "x.csv")
+    assert fault.value.codes == ("export-into-run",)

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import matplotlib
 import numpy as np
 import pytest
 
 from flightmodel.telemetry import Motion
 from flightmodel.trajectory import difference
+from postflight import plots
 from postflight.attitude import check_attitude
-from postflight.flight import flight_from
-from postflight.plots.paper_figures import figure_residuals, save
-from postflight.plots.trajectory import figure_attitude, figure_filter_and_smoother, figure_sensitivity
+from postflight.flight import Flight
+from postflight.plots import style
+from postflight.plots.style import save
+from postflight.plots.trajectory import (
+    figure_attitude,
+    figure_filter_and_smoother,
+    figure_residuals,
+    figure_sensitivity,
+)
+from postflight.reconstruction import reconstruction_from
 from postflight.sensitivity import sensitivity
 from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
@@ -27,7 +36,7 @@ def flight(mini_flight):
     track[50::100, 0] += 1000.0
     telemetry = replace(telemetry, radars=telemetry.radars | {"north": replace(north, range_az_el=track)})
     bet = reconstruct_once(telemetry, Settings(output_rate_hz=5.0))
-    return replace(flight_from(telemetry, bet), attitude=check_attitude(telemetry, bet))
+    return replace(reconstruction_from(Flight(telemetry), bet), attitude=check_attitude(telemetry, bet))
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +46,7 @@ def ballistic(mini_flight):
     bare = dict.fromkeys(("accelerometer", "rates", "magnetometer", "sun", "vehicle", "attitude_prior"))
     motion = Motion("ballistic", 0.05)
     telemetry = replace(telemetry, **bare, gnss={}, barometers={}, motion=motion)
-    return flight_from(telemetry, reconstruct_once(telemetry, Settings(output_rate_hz=5.0, passes=1)))
+    return reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, Settings(output_rate_hz=5.0, passes=1)))
 
 
 def drawn(figure, path):
@@ -48,7 +57,7 @@ def drawn(figure, path):
 def test_edited_points_are_counted_and_lie_in_view(flight, tmp_path):
     figure = figure_residuals(flight)
     drawn(figure, tmp_path / "residuals.png")
-    table = flight.reconstruction.residuals
+    table = flight.solution.residuals
     count = int((~table.accepted & (table.source == "north") & (table.component == "range")).sum())
     assert count >= 5
     axes = figure.get_axes()
@@ -65,7 +74,7 @@ def test_difference_of_filter_and_smoother_is_over_its_own_sd(flight, tmp_path):
     drawn(figure, tmp_path / "filter.png")
     axes = figure.get_axes()
     assert len(axes) == 6
-    bet = flight.reconstruction
+    bet = flight.solution
     off = difference(bet.filtered, bet.smoothed)
     var = (np.diagonal(p.covariance, axis1=1, axis2=2) for p in (bet.filtered, bet.smoothed))
     ratio = off / np.sqrt(np.abs(np.subtract(*var)) + 1e-30)
@@ -88,7 +97,25 @@ def test_without_attitude_nothing_is_drawn_of_it(ballistic, tmp_path):
     drawn(figure_sensitivity(ballistic, found), tmp_path / "sensitivity.png")
 
 
-def test_attitude_check_says_when_it_is_not_independent(flight, tmp_path):
+def test_attitude_figure_states_dependence(flight, tmp_path):
     drawn(figure_attitude(flight, flight.attitude), tmp_path / "attitude.png")
-    resting = replace(flight.attitude, dependence="the filter read these sensors too")
+    resting = replace(flight.attitude, dependence="filter")
     assert "not independent" in figure_attitude(flight, resting).get_suptitle()
+
+
+def test_same_data_give_the_same_bytes_and_the_callers_style_stays(flight, tmp_path):
+    before = dict(matplotlib.rcParams)
+    for name in ("a.png", "b.png"):
+        save(figure_filter_and_smoother(flight), tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert dict(matplotlib.rcParams) == before
+
+
+@pytest.mark.parametrize("name", plots.__all__)
+def test_every_figure_is_at_the_door(name):
+    assert getattr(plots, name) is not None
+
+
+@pytest.mark.parametrize("colours", [[style.COLOUR[m] for m in style.STROKE], list(style.AXES.values()), style.MANY])
+def test_lines_that_share_axes_differ_in_colour(colours):
+    assert len(set(colours)) == len(colours)

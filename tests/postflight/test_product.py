@@ -14,7 +14,8 @@ from flightmodel import earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.trajectory import Trajectory
 from postflight import kinematics, product
-from postflight.flight import reconstruct_flight
+from postflight.flight import read_flight
+from postflight.reconstruction import reconstruct
 
 DOCS = Path(__file__).parents[2] / "docs" / "bet-product.md"
 
@@ -22,7 +23,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "bet-product.md"
 @pytest.fixture(scope="module")
 def short(clean_flight):
     """The hand-made flight: ten seconds, no physics asked."""
-    flight = reconstruct_flight(clean_flight.root)
+    flight = reconstruct(read_flight(clean_flight.root))
     return flight, product.bet_table(flight)
 
 
@@ -132,8 +133,8 @@ def test_events_carry_three_standard_deviations(short) -> None:
 def test_residual_statistics_count_every_point(short) -> None:
     flight, _ = short
     stats = product.residual_statistics(flight)
-    assert stats["count"].sum() == len(flight.reconstruction.residuals)
-    assert stats.edited.sum() == (~flight.reconstruction.residuals.accepted).sum()
+    assert stats["count"].sum() == len(flight.solution.residuals)
+    assert stats.edited.sum() == (~flight.solution.residuals.accepted).sum()
 
 
 def test_statistics_of_white_residuals_are_one_and_none() -> None:
@@ -145,8 +146,8 @@ def test_statistics_of_white_residuals_are_one_and_none() -> None:
             "predicted_sd": 5.0, "accepted": np.arange(n) % 100 != 0,
         }
     )  # fmt: skip
-    bet = type("Bet", (), {"residuals": part, "verdicts": ()})()
-    row = product.residual_statistics(type("Flight", (), {"reconstruction": bet})()).iloc[0]
+    bet = type("Bet", (), {"residuals": part, "consistency_checks": ()})()
+    row = product.residual_statistics(type("Flight", (), {"solution": bet})()).iloc[0]
     assert (row["count"], row.edited, row.unit) == (n, 20, "m")
     assert row.rms_normalised == pytest.approx(1.0, abs=0.06)
     assert abs(row.lag1) < 0.09

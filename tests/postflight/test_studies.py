@@ -8,8 +8,9 @@ from flightmodel import rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.checks import ConfigError
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.flight import reconstruct_flight
+from postflight.flight import read_flight
 from postflight.montecarlo.study import read_study
+from postflight.reconstruction import reconstruct
 from postflight.studies import commands, joints
 from postflight.studies.preflight import dispersions_of, entry_bounds, inside, rigid_bounds
 from synthetic_flight import simulate
@@ -91,13 +92,13 @@ def flight(tmp_path_factory):
     spec = scenario.spec.model_copy(update={"time": time, "attitude_prior": prior, "video": None})
     folder = tmp_path_factory.mktemp("preflight") / "flight"
     simulate_to_folder(type(scenario)(spec, scenario.vehicle, scenario.source), 4, folder)
-    return folder, reconstruct_flight(folder)
+    return folder, reconstruct(read_flight(folder))
 
 
 @pytest.mark.slow
 def test_the_flight_leaves_rigid_bounds_and_stays_in_flexible_ones(flight, tmp_path, monkeypatch):
     folder, reconstructed = flight
-    monkeypatch.setattr(commands, "reconstruct_flight", lambda *_: reconstructed)
+    monkeypatch.setattr(commands, "reconstruct", lambda *_: reconstructed)
     commands.preflight(folder, tmp_path, VEHICLE, 160, 0)
     table = pd.read_csv(tmp_path / "preflight.csv").set_index(["joint", "quantity"])
     # the paper: peak normal acceleration over twice the bound, 4 to 5 deg over the median

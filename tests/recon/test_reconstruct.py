@@ -286,8 +286,8 @@ def test_attitude_may_be_known_after_the_start(mini_sense, mini_truth):
     assert (np.mean(values, axis=0) < high).all()
 
 
-def red(reconstruction):
-    return {v.name for v in reconstruction.consistency_checks if not v.passed}
+def red(solution):
+    return {v.name for v in solution.consistency_checks if not v.passed}
 
 
 def test_doubled_radar_noise_turns_nis_red(mini_sense):

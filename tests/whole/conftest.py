@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from postflight import commands
-from postflight.flight import METHODS
+from postflight.deflections import METHODS
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 from tests.postflight.short_flights import write_pulse
@@ -64,7 +64,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The pulse of a synthetic flight with its film, simulated and run; to be copied."""
     folder = tmp_path_factory.mktemp("short") / "flight"
     simulate_to_folder(read_scenario(str(write_pulse(folder.parent / "pulse.toml"))), SEED, folder)
-    commands.run_flight(folder, METHODS, 20.0)
+    commands.run_flight(folder, METHODS, {})
     return folder
 
 

@@ -15,7 +15,8 @@ from scipy.stats import chi2
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Telemetry, TriadRecord
-from postflight.flight import Flight, reconstruct_telemetry
+from postflight.flight import Flight
+from postflight.reconstruction import Reconstruction, reconstruct
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 
@@ -42,7 +43,7 @@ def days(tmp_path_factory: pytest.TempPathFactory):
         folder = root / str(seed)
         truth = simulate_to_folder(scenario, seed, folder)
         wrong = np.random.default_rng(seed).standard_normal(2) * [CA_SD, CN_SD]
-        flight = reconstruct_telemetry(with_coefficients(read_flight(folder), *np.exp(wrong)))
+        flight = reconstruct(Flight(with_coefficients)(read_flight(folder), *np.exp(wrong)))
         out.append((flight, truth.profile, wrong))
     return out
 
@@ -52,10 +53,10 @@ def with_coefficients(telemetry: Telemetry, ca: float, cn: float) -> Telemetry:
     return replace(telemetry, vehicle=replace(vehicle, aero=vehicle.aero.scaled(ca, cn)))
 
 
-def errors(flight: Flight, truth, height_m: float):
+def errors(flight: Reconstruction, truth, height_m: float):
     """Error over sd of density ratio and both winds at one height, sd over prior of density and of winds."""
-    assert flight.day is not None
-    p = flight.day.profile
+    assert flight.as_flown is not None
+    p = flight.as_flown.profile
     row = p.iloc[int(np.argmin(np.abs(p.altitude_m - height_m)))]
     assert row.altitude_m == pytest.approx(height_m)
     sounded, true = profile_from_sounding(flight.telemetry.sounding).at(height_m), truth.at(height_m)
@@ -84,7 +85,7 @@ def test_density_and_winds_are_as_uncertain_as_claimed(days, height_km: int) -> 
 def test_density_is_nearer_to_the_truth_than_the_sounding(days) -> None:
     before, after = [], []
     for flight, truth, _ in days:
-        p = flight.day.profile
+        p = flight.as_flown.profile
         ratio = truth.at(p.altitude_m.to_numpy()).density_kgpm3
         ratio = ratio / profile_from_sounding(flight.telemetry.sounding).at(p.altitude_m.to_numpy()).density_kgpm3
         before.append(np.mean((ratio - 1.0) ** 2))
@@ -94,7 +95,7 @@ def test_density_is_nearer_to_the_truth_than_the_sounding(days) -> None:
 
 @pytest.mark.long
 def test_axial_coefficient_is_as_uncertain_as_claimed(days) -> None:
-    z = [(f.day.parameters.estimate[0] + wrong[0]) / f.day.parameters.sd[0] for f, _, wrong in days]
+    z = [(f.as_flown.parameters.estimate[0] + wrong[0]) / f.as_flown.parameters.sd[0] for f, _, wrong in days]
     low, high = chi2.ppf([0.0005, 0.9995], DAYS) / DAYS
     assert low < np.mean(np.square(z)) < high
 
@@ -102,13 +103,13 @@ def test_axial_coefficient_is_as_uncertain_as_claimed(days) -> None:
 @pytest.mark.long
 def test_nominal_days_turn_no_verdict_on_the_air_red(days) -> None:
     """Five verdicts at 99.9 % in a dozen flights: one red in seventeen such ensembles; the seeds are fixed."""
-    assert not [v.name for flight, _, _ in days for v in flight.day.consistency_checks if not v.passed]
+    assert not [v.name for flight, _, _ in days for v in flight.as_flown.consistency_checks if not v.passed]
 
 
 # --------------------------------------------------------------------------------------------------------------- teeth
 
 
-def red(flight: Flight) -> dict[str, str]:
+def red(flight: Reconstruction) -> dict[str, str]:
     return {v.name: v.remark for v in flight.consistency_checks if not v.passed}
 
 
@@ -122,7 +123,7 @@ def test_denser_air_between_45_and_55_km_is_named(good: Telemetry) -> None:
     s = good.sounding
     layer = (s.altitude_m >= 45e3) & (s.altitude_m <= 55e3)
     wrong = replace(s, density_kgpm3=np.where(layer, s.density_kgpm3 / 1.15, s.density_kgpm3))
-    found = red(reconstruct_telemetry(replace(good, sounding=wrong)))
+    found = red(reconstruct(Flight(replace(good, sounding=wrong))))
     assert set(found) == {"sounding density"}
     assert 44.0 <= float(found["sounding density"].split(" at ")[1].split(" km")[0]) <= 56.0
 
@@ -131,7 +132,7 @@ def test_denser_air_between_45_and_55_km_is_named(good: Telemetry) -> None:
 def test_shear_that_was_not_sounded_is_named(good: Telemetry, sign: float) -> None:
     s = good.sounding
     wrong = replace(s, wind_east_mps=s.wind_east_mps + np.where(s.altitude_m < 40e3, sign * 40.0, 0.0))
-    found = red(reconstruct_telemetry(replace(good, sounding=wrong)))
+    found = red(reconstruct(Flight(replace(good, sounding=wrong))))
     assert "wind east" in found["sounding wind"]
     assert float(found["sounding wind"].split(" at ")[1].split(" km")[0]) < 40.0
 
@@ -141,7 +142,7 @@ def test_accelerometer_mounted_two_degrees_wrong_is_named(good: Telemetry, axis:
     record = good.accelerometer
     c = record.spec.dcm_body_sensor
     turned = record.measured_sensor @ c.T @ Rotation.from_euler(axis, 2.0, degrees=True).as_matrix() @ c
-    found = red(reconstruct_telemetry(replace(good, accelerometer=replace(record, measured_sensor=turned))))
+    found = red(reconstruct(Flight(replace(good, accelerometer=replace(record, measured_sensor=turned)))))
     assert "accelerometer mount" in found["data sheet accelerometer"]
 
 
@@ -151,16 +152,16 @@ def test_gyro_scale_wrong_by_three_percent_is_named(good: Telemetry, axis: int) 
     scale = np.ones(3)
     scale[axis] = 1.03
     found = red(
-        reconstruct_telemetry(
-            replace(good, rates=TriadRecord(record.spec, record.time_s, record.measured_sensor * scale))
+        reconstruct(
+            Flight(replace)(good, rates=TriadRecord(record.spec, record.time_s, record.measured_sensor * scale))
         )
     )
     assert "rates" in found["data sheet rates"]
 
 
 def test_flight_without_a_vehicle_still_has_a_trajectory(good: Telemetry) -> None:
-    flight = reconstruct_telemetry(replace(good, vehicle=None))
-    assert flight.day is None
-    assert flight.pulse is None
+    flight = reconstruct(Flight(replace(good, vehicle=None)))
+    assert flight.as_flown is None
+    assert flight.loads is None
     assert "names no vehicle" in flight.missing[0]
     assert flight.air.mach.max() > 3.0

@@ -1,0 +1,282 @@
+"""The deflection of the aeroshell by every method that a flight has data for, and fused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pandas as pd
+
+from estimators.benchmark import benchmark_deflection
+from estimators.camera import FilmFit, read_film, sensitivity_table
+from estimators.fusion import smoothed
+from estimators.misalignment import estimate_misalignment as misalignment_history
+from estimators.trim import estimate_trim as trim_history
+from flightmodel.checks import DivergenceError, Fault, GateError, Progress
+from flightmodel.deflection import DeflectionHistory, lv_clock
+from flightmodel.tabular import Tabular
+from postflight.flight import Flight
+from postflight.fusing import FusedAnswer, fuse_flight
+from postflight.reconstruction import Reconstruction
+
+METHODS = ("camera", "misalignment", "trim", "fused")
+NO_VIDEO = "video-missing"
+# assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
+PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
+
+
+@dataclass(frozen=True, repr=False)
+class Deflections(Tabular):
+    """Deflection histories by method, why a method gave none, and what stands behind the fused one.
+
+    Parameters
+    ----------
+    histories : dict of DeflectionHistory
+        By method: ``"camera"``, ``"misalignment"``, ``"trim"``, ``"fused"``.
+    refused : dict of Fault
+        Why a method gave none.
+    fused : FusedAnswer or None
+        Posterior of the deflection and of all inputs, and whether the methods agree.
+    smooth_camera : DeflectionHistory or None
+        The camera's alone as a second-order process, where it estimated the plane.
+    bet : Reconstruction or None
+        What they were made from; None where the camera answered without a trajectory.
+    """
+
+    histories: dict[str, DeflectionHistory] = field(default_factory=dict)
+    refused: dict[str, Fault] = field(default_factory=dict)
+    fused: FusedAnswer | None = None
+    smooth_camera: DeflectionHistory | None = None
+    bet: Reconstruction | None = None
+
+    @property
+    def history(self) -> DeflectionHistory:
+        """The fused history; `GateError` with the reason where there is none."""
+        if "fused" not in self.histories:
+            reason = self.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))
+            raise GateError([reason])
+        return self.histories["fused"]
+
+    @property
+    def reference_s(self) -> float:
+        """Time at which methods are compared, s: peak dynamic pressure, else the first history's largest deflection."""
+        if self.bet is not None:
+            return self.bet.peak_s
+        return next((float(h.time_s[np.nanargmax(h.theta_rad)]) for h in self.histories.values()), float("nan"))
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a method, at `reference_s`.
+
+        Returns
+        -------
+        DataFrame
+            ``method, t_s, theta_deg, theta_sd_deg, plane_lv_deg, largest_deg, largest_t_s, reason``.
+        """
+        rows: list[tuple[object, ...]] = []
+        at_s = self.reference_s
+        for method, history in self.histories.items():
+            theta, sd = np.rad2deg(history.at(at_s))
+            known = np.isfinite(history.theta_rad)
+            lateral = [np.interp(at_s, history.time_s[known], c[known]) for c in history.theta_yz_rad.T]
+            k = int(np.nanargmax(history.theta_rad))
+            plane = np.rad2deg(lv_clock(np.array(lateral))) if np.isfinite(theta) else np.nan
+            rows.append((method, at_s, theta, sd, plane, np.rad2deg(history.theta_rad[k]), history.time_s[k], ""))
+        rows += [(method, at_s, *[np.nan] * 5, str(reason)) for method, reason in self.refused.items()]
+        names = ("method", "t_s", "theta_deg", "theta_sd_deg", "plane_lv_deg", "largest_deg", "largest_t_s", "reason")
+        return pd.DataFrame(rows, columns=list(names))
+
+    def _about(self) -> str:
+        shown = [
+            f"{method} {np.rad2deg(theta):.2f} +/- {np.rad2deg(sd):.2f} deg"
+            for method, (theta, sd) in ((m, h.at(self.reference_s)) for m, h in self.histories.items())
+        ]
+        return f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
+
+
+def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = None) -> DeflectionHistory:
+    """Deflection from the onboard video.
+
+    Parameters
+    ----------
+    flown : Flight or Reconstruction
+        With a reconstruction the deflection in the benchmark frame is found from the moment in the joint; with a
+        flight alone the benchmark frame is taken as undeflected.
+    progress : callable, optional
+
+    Returns
+    -------
+    DeflectionHistory
+        In the flight's assumed plane (``camera_plane_lv_rad``), or with the plane estimated in every frame.
+
+    Raises
+    ------
+    GateError
+        Where there is no video or it cannot be used.
+    """
+    if isinstance(flown, Flight):
+        return camera_film(flown, progress).history()
+    return with_benchmark_deflection(camera_film(flown.flight, progress), flown.flight, flown)
+
+
+def estimate_misalignment(bet: Reconstruction) -> DeflectionHistory:
+    """Deflection that reconciles the accelerometers with the trajectory, seed paper eqs. [1] to [4].
+
+    Raises
+    ------
+    GateError
+        Where there are no inertial sensors or no vehicle.
+    """
+    return misalignment_history(bet.required_loads())
+
+
+def estimate_trim(bet: Reconstruction) -> DeflectionHistory:
+    """Deflection whose c.g. offset trims the vehicle at the angle it flew, seed paper eqs. [5] and [6].
+
+    Raises
+    ------
+    GateError
+        Where there are no inertial sensors or no vehicle.
+    """
+    return trim_history(bet.required_loads())
+
+
+def fuse(bet: Reconstruction, progress: Progress | None = None) -> Deflections:
+    """Deflection by every method that the flight has data for, and one posterior of them all.
+
+    Parameters
+    ----------
+    bet : Reconstruction
+    progress : callable, optional
+
+    Returns
+    -------
+    Deflections
+        ``.history`` is the fused one; a method without an answer is in ``.refused`` with its reason.
+    """
+    wanted = tuple(m for m in METHODS if m != "camera" or bet.telemetry.frames is not None)
+    return estimate(bet, wanted, progress)
+
+
+def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress: Progress | None = None) -> Deflections:
+    """Run the methods asked for; one that cannot answer says why, and does not stop the others.
+
+    A `Flight` without a trajectory has an answer of the camera alone.
+    """
+    report = progress or (lambda _fraction, _what: None)
+    flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
+    answers = Deflections(bet=bet)
+    fused, plain = None, None
+    for k, method in enumerate(methods):
+        report(k / len(methods), f"deflection from {method}")
+        try:
+            if method == "camera":
+                film = camera_film(flight, _part(report, k, len(methods)))
+                # the fusion estimates the deflection at the benchmark itself: it takes the plain history
+                plain, history = film.history(), with_benchmark_deflection(film, flight, bet)
+            elif bet is None:
+                raise GateError(f"{method}: needs a trajectory", "trajectory-missing")
+            elif method == "misalignment":
+                history = estimate_misalignment(bet)
+            elif method == "trim":
+                history = estimate_trim(bet)
+            else:
+                camera = plain if "camera" in answers.histories else _camera_for_fusion(flight, answers.refused)
+                time_bias_s = 0.0 if flight.telemetry.frames is None else flight.telemetry.frames.time_bias_sd_s
+                fused = fuse_flight(bet.required_loads(), camera, None, time_bias_s)
+                history = fused.fused.history
+        except GateError as fault:
+            answers.refused[method] = Fault(str(fault), fault.codes[0])
+            continue
+        answered = np.isfinite(history.theta_rad)
+        if method == "camera" and answered.any() and not answered[film.time_s != film.benchmark_s].any():
+            words = f"no frame but the benchmark frame can be used ({history.assumptions})"
+            answers.refused[method] = Fault(words, "camera-no-frame")
+        elif answered.any():
+            answers.histories[method] = history
+        else:
+            answers.refused[method] = Fault(f"no sample has an answer ({history.assumptions})", "no-answer")
+    report(1.0, "estimated")
+    return replace(answers, fused=fused, smooth_camera=_smooth_camera(flight, answers.histories))
+
+
+def _part(report: Progress, number: int, parts: int) -> Progress:
+    """Report the progress of one of several parts as progress of the whole."""
+    return lambda fraction, what: report((number + fraction) / parts, what)
+
+
+def _smooth_camera(flight: Flight, histories: dict[str, DeflectionHistory]) -> DeflectionHistory | None:
+    """The camera's history as a second-order process; None in an assumed plane, or where too few frames answered."""
+    if "camera" not in histories or flight.camera_plane_lv_rad is not None:
+        return None
+    try:
+        return smoothed(histories["camera"])
+    except DivergenceError:
+        return None
+
+
+def _camera_for_fusion(flight: Flight, refused: dict[str, Fault]) -> DeflectionHistory | None:
+    """Camera's history where the camera itself was not asked for; None without usable video."""
+    if "camera" in refused or flight.telemetry.frames is None:
+        return None
+    try:
+        return estimate_camera(flight)
+    except GateError:
+        return None
+
+
+def camera_film(flight: Flight, progress: Progress | None = None) -> FilmFit:
+    """What the onboard video shows, frame by frame; `GateError` where there is none or it cannot be used."""
+    frames = flight.telemetry.frames
+    if frames is None:
+        raise GateError("the flight has no video", NO_VIDEO)
+    vehicle = flight.telemetry.required_vehicle()
+    return read_film(
+        frames.time_s,
+        frames.pictures(),
+        vehicle.geometry,
+        frames.camera,
+        vehicle.joint.station_m,
+        benchmark_time_s=frames.benchmark_s,
+        plane_lv_rad=flight.camera_plane_lv_rad,
+        benchmark=frames.picture(frames.benchmark),
+        progress=progress,
+    )
+
+
+def with_benchmark_deflection(film: FilmFit, flight: Flight, bet: Reconstruction | None) -> DeflectionHistory:
+    """Camera's history with the benchmark frame deflected by the moment in the joint; undeflected without one.
+
+    Why there is none stands in the history's assumptions.
+    """
+    telemetry = flight.telemetry
+    try:
+        if bet is None:
+            telemetry.required_triads()
+            raise GateError("no trajectory was made", "trajectory-missing")
+        time_bias_sd_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
+        frames = film.relative_to_benchmark(time_bias_sd_s)
+        return film.history(benchmark_deflection(frames, bet.required_loads(), film.oriented.apriori.benchmark_rad))
+    except GateError as fault:
+        plain = film.history()
+        words = f"{plain.assumptions}; the benchmark's deflection is not corrected by the joint's moment ({fault})"
+        return replace(plain, assumptions=words)
+
+
+def camera_sensitivity(flight: Flight, history: DeflectionHistory) -> pd.DataFrame:
+    """Deflection read from the frame of the largest one under other assumptions: the seed paper's Table 2.1.
+
+    Columns ``joint_station_m, plane_lv_deg, deflection_deg, paper_deg``. It need not equal the paper's column: one
+    camera sees the component towards it, and the shell and lens are not IRVE-II's.
+    """
+    frames, vehicle = flight.telemetry.frames, flight.telemetry.required_vehicle()
+    assert frames is not None
+    straight, deflected = (frames.picture(k) for k in (frames.benchmark, int(np.nanargmax(history.theta_rad))))
+    stations = np.array([0.0, vehicle.joint.station_m])
+    planes = np.deg2rad(list(PAPER_TABLE_2_1_DEG))
+    angles = sensitivity_table(straight, deflected, vehicle.geometry, frames.camera, planes, stations)
+    rows = [
+        (station, plane, np.rad2deg(angle), paper)
+        for station, line in zip(stations, angles, strict=True)
+        for (plane, paper), angle in zip(PAPER_TABLE_2_1_DEG.items(), line, strict=True)
+    ]
+    return pd.DataFrame(rows, columns=["joint_station_m", "plane_lv_deg", "deflection_deg", "paper_deg"])

@@ -1,0 +1,252 @@
+"""Public verbs on folders and studies: check, simulate, score, dispersed flights, what-ifs compared, reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from flightmodel.airdata import pressure_pulse
+from flightmodel.checks import GateError, Progress
+from flightmodel.tabular import Tabular
+from flightmodel.trajectory import difference, resample
+from postflight.checks.folder_check import Report, check_folder
+from postflight.deflections import Deflections
+from postflight.montecarlo import execution
+from postflight.montecarlo.bands import Merged, merge, write_merged
+from postflight.montecarlo.study import read_study
+from postflight.reconstruction import Reconstruction
+from postflight.report import write
+from postflight.score import Score, score_run
+from synthetic_flight.ensemble import available_cores
+from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.scenarios import Scenario, fly_scenario, read_scenario
+from synthetic_flight.simulate import Truth
+
+
+def check_flight(folder: str | Path) -> Report:
+    """Facts, findings and cross-checks of a flight folder before it is run: units, axes, clocks, gaps, tracks.
+
+    Never refuses: what `read_flight` would refuse is listed in the report.
+    """
+    return check_folder(Path(folder))
+
+
+def simulate(
+    scenario: str | Path | Scenario,
+    folder: str | Path | None = None,
+    seed: int = 0,
+    replace: bool = False,
+    progress: Progress | None = None,
+) -> Truth:
+    """Fly a scenario with the two-body simulator; with a folder, write telemetry and truth there as a flight folder.
+
+    Parameters
+    ----------
+    scenario : str, path or Scenario
+        Name of a shipped one, a TOML file, or one that was read.
+    folder : path, optional
+        New flight folder: ``telemetry/`` for the estimators, ``truth/`` apart.
+    seed : int
+        Draws the day's atmosphere and every instrument's errors.
+    replace : bool
+        Replace an existing *synthetic* flight folder; anything else is never touched.
+    progress : callable, optional
+
+    Returns
+    -------
+    Truth
+        What the vehicle did, for comparison; no estimator takes it.
+
+    Raises
+    ------
+    ConfigError
+        The scenario cannot be used.
+    GateError
+        The folder exists, or the flight diverged before the telemetry begins.
+    """
+    chosen = scenario if isinstance(scenario, Scenario) else read_scenario(str(scenario))
+    if folder is None:
+        return fly_scenario(chosen, seed)
+    return simulate_to_folder(chosen, seed, Path(folder), progress, replace)
+
+
+def score(folder: str | Path, run: str | Path | None = None) -> Score:
+    """Compare a finished run of a synthetic flight (the newest, or the one given) with its truth.
+
+    Raises
+    ------
+    GateError
+        Where there is no truth or no finished run.
+    """
+    return score_run(Path(folder), None if run is None else Path(run))
+
+
+def monte_carlo(
+    dispersions: str | Path,
+    folder: str | Path,
+    flights: int | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Merged:
+    """Fly a study of dispersed flights into a folder, or what is missing of it, and merge it.
+
+    Parameters
+    ----------
+    dispersions : str or path
+        Name of a shipped dispersions file, or a TOML file.
+    folder : path
+        Holds one study; killed runs are resumed, more flights extend it.
+    flights : int, optional
+        In place of the file's number.
+    workers : int, optional
+        Processes; every core by default.
+    progress : callable, optional
+
+    Returns
+    -------
+    Merged
+        Tables ``flights``, ``percentiles`` and ``bands``.
+
+    Raises
+    ------
+    ConfigError
+        The dispersions file cannot be used.
+    GateError
+        The folder holds another study.
+    """
+    study, folder = read_study(str(dispersions)), Path(folder)
+    wanted = execution.Wanted(flights or study.spec.flights, workers or available_cores(), None, study.spec.stop)
+    count = execution.run(study, folder, wanted, progress or (lambda _fraction, _what: None))
+    merged = merge(study, folder, count)
+    write_merged(folder, merged)
+    return merged
+
+
+def write_report(folder: str | Path, run: str | Path | None = None) -> Path:
+    """Write the report of a finished run (the newest, or the one given) as one HTML file; return where it lies.
+
+    Raises
+    ------
+    GateError
+        Where the run cannot be read, or the file not be written.
+    """
+    return write.write_report(Path(folder), None if run is None else Path(run))
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison(Tabular):
+    """Two looks at one flight, side by side; see `compare`."""
+
+    table: pd.DataFrame
+    names: tuple[str, str]
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a quantity: ``quantity, unit, first, first_sd, second, second_sd, difference``."""
+        return self.table
+
+    def _about(self) -> str:
+        return f"{self.names[0]} against {self.names[1]}, {len(self.table)} quantities"
+
+
+def compare(first: Reconstruction | Deflections, second: Reconstruction | Deflections) -> Comparison:
+    """Set two looks at one flight side by side, e.g. the flight and a what-if.
+
+    Parameters
+    ----------
+    first, second : Reconstruction or Deflections
+        From `reconstruct`, or from `fuse` to compare the deflections too.
+
+    Returns
+    -------
+    Comparison
+        Peak dynamic pressure and its time, Mach number and total angle of attack there, largest differences of the
+        trajectories over the pressure pulse, deflection by method, numbers of consistency checks that pass;
+        ``difference`` is second minus first. The two share their data: their sd says nothing of the difference.
+
+    Raises
+    ------
+    GateError
+        Where the two flights have no time in common.
+    """
+    bets = [x if isinstance(x, Reconstruction) else _bet_of(x) for x in (first, second)]
+    rows = _peak_rows(bets[0], bets[1]) + _trajectory_rows(bets[0], bets[1])
+    if isinstance(first, Deflections) and isinstance(second, Deflections):
+        rows += _deflection_rows(first, second)
+    rows.append(("consistency checks passed", "", _passed(bets[0]), np.nan, _passed(bets[1]), np.nan))
+    table = pd.DataFrame(rows, columns=["quantity", "unit", "first", "first_sd", "second", "second_sd"])
+    table["difference"] = table["second"] - table["first"]
+    a, b = ("; ".join((bet.flight.name, *bet.flight.changes)) for bet in bets)
+    return Comparison(table, (a, b))
+
+
+Row = tuple[str, str, float, float, float, float]
+DEG = 180.0 / np.pi
+
+
+def _bet_of(answer: Deflections) -> Reconstruction:
+    if answer.bet is None:
+        raise GateError("compare: these deflections were made without a trajectory", "trajectory-missing")
+    return answer.bet
+
+
+def _passed(bet: Reconstruction) -> float:
+    return float(sum(check.passed for check in bet.consistency_checks))
+
+
+def _peak_rows(first: Reconstruction, second: Reconstruction) -> list[Row]:
+    values = []
+    for bet in (first, second):
+        air, at = bet.air, bet.peak_s
+
+        def there(column: object, time_s: object = air.time_s, at: float = at) -> float:
+            return float(np.interp(at, time_s, column))  # type: ignore[call-overload]
+
+        values.append(
+            {
+                ("time of peak dynamic pressure", "s"): (at, np.nan),
+                ("peak dynamic pressure", "Pa"): (there(air.dynamic_pressure_pa), there(air.dynamic_pressure_sd_pa)),
+                ("Mach number at peak q", ""): (there(air.mach), np.nan),
+                ("total angle of attack at peak q", "deg"): (
+                    np.rad2deg(there(air.alpha_total_wind_rad)),
+                    np.rad2deg(there(air.alpha_total_wind_sd_rad)),
+                ),
+            }
+        )
+    return [(*key, *values[0][key], *values[1][key]) for key in values[0]]
+
+
+def _trajectory_rows(first: Reconstruction, second: Reconstruction) -> list[Row]:
+    """Largest differences of the trajectories where dynamic pressure exceeds half its peak; the first is zero."""
+    t = first.air.time_s
+    use = pressure_pulse(first.air.dynamic_pressure_pa)
+    other = second.trajectory.time_s
+    use &= (t >= other[0]) & (t <= other[-1])
+    if not use.any():
+        raise GateError("compare: the two trajectories have no time of the pressure pulse in common", "no-common-time")
+    apart = difference(resample(second.trajectory, t[use]), resample(first.trajectory, t[use]))
+    rows: list[Row] = []
+    for k, (name, unit, scale) in enumerate(
+        (("position", "m", 1.0), ("velocity", "m/s", 1.0), ("attitude", "deg", DEG))
+    ):
+        largest = scale * float(np.linalg.norm(apart[:, 3 * k : 3 * k + 3], axis=1).max())
+        rows.append((f"largest difference of {name} over the pulse", unit, 0.0, np.nan, largest, np.nan))
+    return rows
+
+
+def _deflection_rows(first: Deflections, second: Deflections) -> list[Row]:
+    rows: list[Row] = []
+    for method in dict.fromkeys((*first.histories, *second.histories)):
+        (a, a_sd), (b, b_sd) = (_at_peak(answer, method) for answer in (first, second))
+        rows.append((f"deflection by {method} at peak q", "deg", a, a_sd, b, b_sd))
+    return rows
+
+
+def _at_peak(answer: Deflections, method: str) -> tuple[float, float]:
+    """Deflection and its sd, deg; NaN where the method gave none."""
+    if method not in answer.histories:
+        return float("nan"), float("nan")
+    theta, sd = answer.histories[method].at(answer.reference_s)
+    return float(np.rad2deg(theta)), float(np.rad2deg(sd))

@@ -1,0 +1,184 @@
+"""The public interface: every name is there and documented, what-ifs are changed flights, results show themselves."""
+
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import postflight as pf
+from flightmodel.checks import ConfigError
+from flightmodel.tabular import Tabular
+
+UNITS = {"s", "m", "deg", "degps", "mps", "mps2", "pa", "k", "kgpm3", "px", "hz", "g", "nm", "j", "nms", "w", "kgm2"}
+
+
+SHORTER = (
+    (r"(?m)^stop_s = 530\.0", "stop_s = 458.0"),
+    (r"telemetry_from_s = 300\.0", "telemetry_from_s = 412.0"),
+    (r"(?m)^t_s = 300\.0", "t_s = 412.0"),
+    (r"rate_hz = 250\.0", "rate_hz = 100.0"),
+    (r"(?ms)^\[video\].*?(?=^\[)", ""),
+)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """A synthetic flight of the 46 s about its pressure pulse, without video."""
+    folder = tmp_path_factory.mktemp("door")
+    text = Path(pf.read_scenario("irve2_reference").source).read_text()
+    for pattern, new in SHORTER:
+        text, count = re.subn(pattern, new, text)
+        assert count, pattern
+    (folder / "short.toml").write_text(text)
+    truth = pf.simulate(folder / "short.toml", folder / "flight", seed=3)
+    assert "peak q" in repr(truth)
+    return pf.read_flight(folder / "flight")
+
+
+@pytest.fixture(scope="module")
+def bet(flight):
+    return pf.reconstruct(flight)
+
+
+@pytest.fixture(scope="module")
+def answer(bet):
+    return pf.fuse(bet)
+
+
+@pytest.mark.parametrize("name", pf.__all__)
+def test_every_public_name_is_there_and_says_what_it_is(name):
+    found = getattr(pf, name)
+    doc = inspect.getdoc(found)
+    assert doc
+    assert len(doc) > 40
+    assert name in dir(pf)
+
+
+@pytest.mark.parametrize("name", [n for n in pf.__all__ if inspect.isfunction(getattr(pf, n))])
+def test_public_functions_are_typed(name):
+    signature = inspect.signature(getattr(pf, name))
+    assert signature.return_annotation is not inspect.Signature.empty
+    assert all(p.annotation is not inspect.Parameter.empty for p in signature.parameters.values())
+
+
+def test_unknown_names_are_refused_with_the_known_ones():
+    with pytest.raises(AttributeError, match="read_flight"):
+        pf.read_fligth  # noqa: B018
+
+
+def test_the_door_imports_nothing_heavy():
+    heavy = "('numpy', 'pandas', 'scipy', 'matplotlib', 'numba')"
+    code = f"import sys, postflight; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# what-ifs
+
+
+def test_a_what_if_is_another_flight_and_leaves_the_first_as_it_is(flight):
+    mass, still = flight.vehicle.mass_kg, np.abs(flight.telemetry.sounding.wind_north_mps).max()
+    changed = flight.with_(
+        mass_kg=158.0, wind=None, joint_station_m=0.1, without=next(iter(flight.telemetry.radars)), output_rate_hz=10.0
+    )
+    assert changed.vehicle.mass_kg == pytest.approx(158.0)
+    assert not changed.telemetry.sounding.wind_north_mps.any()
+    assert changed.vehicle.joint.station_m == 0.1
+    assert changed.settings.without == tuple(flight.telemetry.radars)[:1]
+    assert changed.settings.output_rate_hz == 10.0
+    assert len(changed.changes) == 5
+    assert flight.vehicle.mass_kg == mass
+    assert np.abs(flight.telemetry.sounding.wind_north_mps).max() == still
+    assert flight.changes == ()
+
+
+def test_factors_multiply_what_they_name_alone(flight):
+    changed = flight.with_(c_n=1.1, density=0.9)
+    aero, was = changed.vehicle.aero.coefficients, flight.vehicle.aero.coefficients
+    np.testing.assert_allclose(aero, was * [1.0, 1.1, 1.0, 1.0], rtol=1e-15)
+    air, before = changed.telemetry.sounding, flight.telemetry.sounding
+    np.testing.assert_allclose(air.density_kgpm3, 0.9 * before.density_kgpm3, rtol=1e-15)
+    np.testing.assert_allclose(air.pressure_pa, 0.9 * before.pressure_pa, rtol=1e-15)
+    np.testing.assert_array_equal(air.temperature_k, before.temperature_k)
+
+
+def test_a_shift_of_the_cg_is_the_whole_vehicles(flight):
+    shift = np.array([0.0, 0.002, -0.001])
+    moved = flight.with_(cg_shift_body_m=shift).vehicle.cg_m - flight.vehicle.cg_m
+    np.testing.assert_allclose(moved, shift, atol=1e-15)
+
+
+def test_every_fault_of_a_what_if_is_named_at_once(flight):
+    with pytest.raises(ConfigError) as refusal:
+        flight.with_(cn=1.1, mass_kg="heavy", density=-1.0, engine="steam", cg_shift_body_m=(0.0, 1.0))
+    assert refusal.value.codes[:3] == ("what-if-unknown", "what-if-value", "what-if-value")
+    assert len(refusal.value.faults) == 5
+    assert "c_n" in refusal.value.faults[0]
+
+
+def test_an_assumption_reaches_every_estimator_that_uses_it(flight, bet, answer):
+    """C_N is used by misalignment, trim and fusion, and by no part of the trajectory."""
+    other = pf.reconstruct(flight.with_(c_n=1.2))
+    np.testing.assert_array_equal(other.trajectory.position_ecef_m, bet.trajectory.position_ecef_m)
+    changed = pf.fuse(other)
+    assert set(answer.histories) == {"misalignment", "trim", "fused"}
+    for method in ("misalignment", "trim"):
+        history = answer.histories[method]
+        moved = np.abs(changed.histories[method].theta_rad - history.theta_rad)
+        assert np.nanmax(moved) > np.deg2rad(0.1), method
+    if "fused" in changed.histories:
+        assert np.nanmax(np.abs(changed.history.theta_rad - answer.history.theta_rad)) > np.deg2rad(0.05)
+    else:
+        assert changed.refused["fused"].code
+
+
+def test_a_tracker_left_out_is_not_used(flight):
+    names = list(flight.telemetry.radars)
+    bet = pf.reconstruct(flight.with_(without=(names[0],)))
+    used = bet.solution.residuals.groupby("source")["used"].any()
+    assert not used[names[0]]
+    assert used[names[1]]
+
+
+def test_two_looks_side_by_side(bet, answer, flight):
+    same = pf.compare(answer, answer).to_frame()
+    assert same["difference"].abs().max() < 1e-9  # an attitude against itself is zero to rounding
+    assert {"deflection by misalignment at peak q", "deflection by fused at peak q"} <= set(same["quantity"])
+    other = pf.compare(bet, pf.reconstruct(flight.with_(density=1.1))).to_frame().set_index("quantity")
+    row = other.loc["peak dynamic pressure"]
+    assert row["second"] / row["first"] == pytest.approx(1.1, rel=1e-3)
+
+
+# results show themselves
+
+
+def test_results_are_one_line_in_a_terminal_and_a_table_in_a_notebook(flight, bet, answer):
+    for result in (flight, bet, bet.trajectory, answer, answer.histories["misalignment"], pf.compare(bet, bet)):
+        assert isinstance(result, Tabular)
+        assert len(repr(result)) < 400
+        assert "\n" not in repr(result)
+        assert "<table" in result._repr_html_()
+
+
+def test_text_of_a_flight_is_escaped_in_a_notebook(flight):
+    from dataclasses import replace
+
+    hostile = replace(flight, telemetry=replace(flight.telemetry, name="<script>alert(1)</script>"))
+    assert "<script>" not in hostile._repr_html_()
+
+
+def test_columns_name_their_units(flight, bet, answer):
+    for frame in (bet.trajectory.to_frame(), answer.histories["misalignment"].to_frame(), answer.to_frame()):
+        for column, kind in frame.dtypes.items():
+            if kind.kind == "f" and not column.startswith("q"):
+                assert column.rsplit("_", 1)[-1] in UNITS, column
+
+
+def test_a_reconstruction_gives_the_columns_of_the_product(bet):
+    table = bet.to_frame()
+    assert {"t_s", "alt_m", "mach", "dynamic_pressure_pa", "alpha_total_wind_deg"} <= set(table.columns)
+    assert len(table) == len(bet.trajectory.time_s)
