@@ -93,7 +93,7 @@ def consistency_check(
     )
 
 
-def _nis_check(source: str, nis: FloatArray, components: int, confidence: float) -> ConsistencyCheck:
+def nis_check(source: str, nis: FloatArray, components: int, confidence: float) -> ConsistencyCheck:
     """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all."""
     from scipy.stats import chi2
 
@@ -111,7 +111,7 @@ def _nis_check(source: str, nis: FloatArray, components: int, confidence: float)
     )  # fmt: skip
 
 
-def _whiteness_check(source: str, component: str, normalised: FloatArray, confidence: float) -> ConsistencyCheck:
+def whiteness_check(source: str, component: str, normalised: FloatArray, confidence: float) -> ConsistencyCheck:
     """Lag-one autocorrelation of one component's normalised innovations (n,) against its band."""
     from scipy.stats import norm
 
@@ -210,11 +210,11 @@ def source_checks(problem: Problem, innovations: Innovations, confidence: float)
         use = mine & settled & innovations.accepted
         checks = []
         if use.sum() >= 10:
-            checks.append(_nis_check(instrument.name, innovations.nis[use], int(measured[use].sum()), confidence))
+            checks.append(nis_check(instrument.name, innovations.nis[use], int(measured[use].sum()), confidence))
             for i, component in enumerate(instrument.components):
                 rows = use & measured[:, i]
                 if rows.sum() >= 10:
-                    checks.append(_whiteness_check(instrument.name, component, normalised[rows, i], confidence))
+                    checks.append(whiteness_check(instrument.name, component, normalised[rows, i], confidence))
         checks.append(edit_check(instrument.name, innovations.accepted[mine]))
         out += [replace(v, source=instrument.owner) for v in checks]
     return out

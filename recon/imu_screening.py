@@ -433,7 +433,7 @@ def repeated_samples(measured: FloatArray, noise_sd: float) -> tuple[BoolArray, 
     n = len(measured)
     out: BoolArray = np.zeros(n, dtype=bool)
     moving = np.append(True, (measured[1:] != measured[:-1]).any(axis=1))
-    likely = float(np.prod([_repeat_by_noise(column, noise_sd) for column in measured.T]))
+    likely = float(np.prod([repeat_by_noise(column, noise_sd) for column in measured.T]))
     with np.errstate(divide="ignore"):
         least = max(_LEAST_REPEATED, np.log(_CHANCE / max(n, 1) ** 2) / np.log(min(likely, 1.0 - 1e-9)))
     lag = _lag_to_the_same(measured)
@@ -491,7 +491,7 @@ def frozen_samples(column: FloatArray, noise_sd: float) -> BoolArray:
     if not len(first):
         out[:] = bool(len(column) >= _LEAST_FROZEN_SAMPLES and same.all() and noise_sd > 0.0)
         return out
-    chance = np.maximum(_repeat_by_noise(column, noise_sd), _repeat_nearby(same, first, last))
+    chance = np.maximum(repeat_by_noise(column, noise_sd), _repeat_nearby(same, first, last))
     with np.errstate(divide="ignore"):
         surprise = (last - first) * np.log(chance)
     at_stop = (column[first] == np.nanmin(column)) | (column[first] == np.nanmax(column))
@@ -502,7 +502,7 @@ def frozen_samples(column: FloatArray, noise_sd: float) -> BoolArray:
     return out
 
 
-def _repeat_by_noise(column: FloatArray, noise_sd: float) -> float:
+def repeat_by_noise(column: FloatArray, noise_sd: float) -> float:
     """Largest probability that noise leaves a reading where it is."""
     if noise_sd <= 0.0:
         return 1.0

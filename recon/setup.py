@@ -214,7 +214,7 @@ def _attitude_instruments(
     telemetry: Telemetry, tracking: tuple[Instrument, ...], start_s: float, end_s: float
 ) -> tuple[Instrument, ...]:
     """Magnetometer and Sun heads as measurements, thinned; positions for the field come from the tracking data."""
-    t, points = _track_points(tracking)
+    t, points = track_points(tracking)
     out: list[Instrument] = []
     if telemetry.magnetometer is not None:
         record = telemetry.magnetometer
@@ -264,7 +264,7 @@ def _span(
     instruments: tuple[Instrument, ...], settings: Settings, sensors: InertialSensors | None
 ) -> tuple[float, float]:
     """First and last time that inertial sensors and at least one tracker cover, within the settings' span."""
-    t, _ = _track_points(instruments)
+    t, _ = track_points(instruments)
     if len(t) == 0:
         raise GateError(
             "no radar or receiver has a usable point that is not left out; a trajectory needs at least one",
@@ -298,7 +298,7 @@ def _pulse_times(
     instruments: tuple[Instrument, ...], force: BridgedSensor, start_s: float, end_s: float, rate_hz: float
 ) -> list[FloatArray]:
     """Multiples of the pulse's step where the descent's specific force exceeds half its largest; empty without one."""
-    at, points = _track_points(instruments)
+    at, points = track_points(instruments)
     apex_s = float(at[int(np.argmax(np.linalg.norm(points, axis=1)))])
     inside = (force.time_s >= max(start_s, apex_s)) & (force.time_s <= end_s)
     if inside.sum() < 2:
@@ -356,7 +356,7 @@ def _start_attitude(
     return step.state.q_ecef_body, total, cross
 
 
-def _track_points(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:
+def track_points(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:
     """Times (k,) and points (k, 3), ECEF m, of every measurement that fixes a position by itself, in order."""
     times, points = [], []
     for i in instruments:
@@ -379,7 +379,7 @@ def _ned_from_radar(range_az_el: FloatArray) -> FloatArray:
     return np.column_stack([slant * np.cos(el) * np.cos(az), slant * np.cos(el) * np.sin(az), -slant * np.sin(el)])
 
 
-def _fit_start(instruments: tuple[Instrument, ...], start_s: float) -> tuple[FloatArray, FloatArray]:
+def fit_start(instruments: tuple[Instrument, ...], start_s: float) -> tuple[FloatArray, FloatArray]:
     """Position and velocity (3,) of the tracked point at the start: a parabola through the seconds about it.
 
     With fewer than `_LEAST_POINTS` in them a line through two is used (a rocket on its pad whose receiver gives no fix
@@ -391,7 +391,7 @@ def _fit_start(instruments: tuple[Instrument, ...], start_s: float) -> tuple[Flo
     GateError
         With fewer than three points.
     """
-    t, p = _track_points(instruments)
+    t, p = track_points(instruments)
     t, p = t[t >= start_s - FIT_SPAN_S] - start_s, p[t >= start_s - FIT_SPAN_S]
     if len(t) < 3:
         what = f"tracking: {len(t)} points after {start_s:.3f} s; at least 3 are needed to start"
@@ -415,7 +415,7 @@ def _cross_path_direction(instruments: tuple[Instrument, ...]) -> FloatArray:
 
     Each counts by its direction from the median alone, so that an outlier has no more weight than another.
     """
-    _, points = _track_points(instruments)
+    _, points = track_points(instruments)
     middle = np.median(points, axis=0)
     up = middle / np.linalg.norm(middle)
     level = points - middle
@@ -431,7 +431,7 @@ def track_fit_states(instruments: tuple[Instrument, ...], time_s: FloatArray, er
     Parabolas through the points within `_TRACK_SPAN_S` of a node give position and velocity; cubics that meet both
     bridge the gaps between. None where fewer than two nodes have points about them.
     """
-    t, p = _track_points(instruments)
+    t, p = track_points(instruments)
     first, last = np.searchsorted(t, time_s - _TRACK_SPAN_S), np.searchsorted(t, time_s + _TRACK_SPAN_S)
     fitted = np.flatnonzero(last - first >= _LEAST_POINTS)
     # a parabola is not extrapolated
@@ -472,7 +472,7 @@ def _start_by_inertial_sensors(
 ) -> tuple[States, FloatArray]:
     """State at the start and its covariance (9 + m, 9 + m)."""
     q, var, cross = _start_attitude(prior, start_s, force, rate, model)
-    position, velocity = _fit_start(instruments, start_s)
+    position, velocity = fit_start(instruments, start_s)
     sample = np.array([[np.interp(start_s, rate.time_s, column) for column in rate.measured_sensor.T]])
     w = correct(sample, np.zeros(9), rate.spec.dcm_body_sensor)[0]
     arm = next(i.arm_body_m for i in instruments if i.kind in (RADAR, POSITION))
@@ -491,7 +491,7 @@ def _start_ballistic(
     instruments: tuple[Instrument, ...], start_s: float, model: ErrorModel
 ) -> tuple[States, FloatArray]:
     """State at the start and its covariance (9 + m, 9 + m), without attitude."""
-    position, velocity = _fit_start(instruments, start_s)
+    position, velocity = fit_start(instruments, start_s)
     covariance = _covariance(model)
     covariance[range(6, 9), range(6, 9)] = _FIXED_RAD**2
     return States(position, velocity, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(model.size)), covariance
