@@ -1,9 +1,10 @@
-"""Which systematic errors the filter knows of, how large they may be, how they wander, and which are only considered.
+"""Which systematic errors does the filter model, how large may they be, and how do they vary?
 
 Every block is a first-order Gauss-Markov process about zero, ``de/dt = -e / tau + noise``, started at its prior
-standard deviation and kept there by its noise; an infinite ``tau`` is a constant. What belongs to the air forgets with
-altitude instead: ``exp(-|climb| / length)``. A *considered* error (Schmidt) is never estimated, but what it may have
-done stays in the covariance of everything else. The drivers of the motion come first (`recon.motion`).
+standard deviation and kept there by its noise; an infinite ``tau`` is a constant. Errors of the air decorrelate with
+altitude instead: ``exp(-|climb| / length)``. Instruments' blocks follow from their rows (`flightmodel.instruments`).
+A *considered* error (Schmidt) is never estimated, but what it may have done stays in the covariance of everything else.
+The drivers of the motion come first (`recon.motion`).
 
 References
 ----------
@@ -39,7 +40,7 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class Block:
-    """One kind of error of one instrument: components with one unit, one prior and one way of forgetting."""
+    """One kind of error of one instrument: components with one unit, one prior and one correlation."""
 
     instrument: str
     components: tuple[str, ...]
