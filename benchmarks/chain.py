@@ -13,14 +13,14 @@ from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from postflight.deflections import estimate_camera
 from postflight.flight import read_flight
-from postflight.loads import pulse_data
+from postflight.loads import loads_from_solution
 from postflight.reconstruction import reconstruct
 from recon.reconstruct import reconstruct as solve
 from synthetic_flight import simulate
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import child_rng, fly_scenario, initial_state, read_scenario
 from synthetic_flight.simulate import integrate
-from synthetic_flight.weather import day_atmosphere
+from synthetic_flight.weather import day_of_flight_atmosphere
 
 ROUNDS = int(sys.argv[1]) if len(sys.argv) > 1 else 3
 
@@ -38,7 +38,7 @@ def best(work):
 def main():
     scenario = read_scenario("irve2_reference")
     vehicle = scenario.vehicle
-    table = simulate.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    table = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
     state = initial_state(scenario)
     rows = []
     kernel = best(lambda: integrate(vehicle, table, state, 0.002, 2, 110001, 52501))
@@ -54,7 +54,7 @@ def main():
         rows.append(("reconstruct 230 s at 250 Hz", best(lambda: solve(flight.telemetry))))
         bet = reconstruct(flight)
         rows.append(("deflection from video", best(lambda: estimate_camera(flight))))
-        pulse = pulse_data(flight.telemetry, bet.solution, bet.air)
+        pulse = loads_from_solution(flight.telemetry, bet.solution, bet.air)
         rows.append(("deflection from misalignment", best(lambda: estimate_misalignment(pulse))))
         rows.append(("deflection from trim", best(lambda: estimate_trim(pulse))))
     print(f"{'':55s}{'seconds':>10s}{'x real time':>14s}")

@@ -50,10 +50,10 @@ def everything(folder, side_by_side):
     from synthetic_flight import simulate
     from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
     from synthetic_flight.scenarios import child_rng, fly_scenario, initial_state, read_scenario
-    from synthetic_flight.weather import day_atmosphere
+    from synthetic_flight.weather import day_of_flight_atmosphere
 
     scenario = read_scenario("irve2_reference")
-    table = simulate.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    table = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
     start = Start(initial_state(scenario), simulate.parameter_vector(scenario.vehicle), table)
     short = Schedule(step_s=0.005, per_record=1, records=2)
     stages = {

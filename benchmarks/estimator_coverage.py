@@ -26,9 +26,9 @@ from scipy.stats import chi2
 from flightmodel.statistics import correlation_root
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from estimators.agreement import BLAME, CAMERA_TURNED, COEFFICIENTS, MOUNT, OFFSET
+from estimators.agreement import CAMERA_MISALIGNED, COEFFICIENTS, HYPOTHESES, MOUNT, OFFSET
 from estimators.evidence import LIGHT_TIME_S
-from estimators.loads import PulseData
+from estimators.loads import FlightLoads
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from flightmodel import rotations
@@ -41,7 +41,7 @@ from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.fusing import fuse_flight
-from postflight.loads import pulse_data
+from postflight.loads import loads_from_solution
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from synthetic_flight.folder import simulate_to_folder
@@ -53,7 +53,7 @@ COEFFICIENT_SD = {"ca": 0.05, "cn": 0.10, "cm": 0.15}
 CMQ_SD = 0.15
 RATE_HZ = 20.0
 STATED = ("vehicle", "force_clock_sd_s", "rate_clock_sd_s", "cg_from_sensor_m")  # the same in every flight
-ARRAYS = [f.name for f in fields(PulseData) if f.name not in STATED]
+ARRAYS = [f.name for f in fields(FlightLoads) if f.name not in STATED]
 CAMERA_SD = {"clean": np.deg2rad(0.15), "degraded": np.deg2rad(0.40)}
 CAMERA_CLOCK = np.deg2rad(153.0)
 FORCE_ALONE = "accelerometer's mounting, the attitude right"
@@ -63,7 +63,7 @@ PLANTED = {  # and the right suspect
     MOUNT: MOUNT,
     FORCE_ALONE: MOUNT,
     OFFSET: OFFSET,
-    CAMERA_TURNED: CAMERA_TURNED,
+    CAMERA_MISALIGNED: CAMERA_MISALIGNED,
 }
 TURN_YZ_RAD = np.deg2rad(0.5) * np.array([0.6, 0.8])
 
@@ -97,7 +97,7 @@ def flown_vehicle(told, seed, rigid=False):
 
 
 def flown_pulse(seed, rigid=False):
-    """One flight: what the estimators see (`PulseData`), and the truth at the same times."""
+    """One flight: what the estimators see (`FlightLoads`), and the truth at the same times."""
     told = told_vehicle(seed)
     flown, factors = flown_vehicle(told, seed, rigid)
     scenario = replace(dispersed.dispersed_scenario("irve2_reference", seed), vehicle=flown)
@@ -106,7 +106,9 @@ def flown_pulse(seed, rigid=False):
         truth = simulate_to_folder(scenario, seed, folder)
         telemetry = replace(read_flight(folder), vehicle=told)
     bet = reconstruct(telemetry, Settings(output_rate_hz=RATE_HZ))
-    pulse = pulse_data(telemetry, bet, air_data(bet.smoothed, profile_from_sounding(telemetry.sounding), told.cg_m))
+    pulse = loads_from_solution(
+        telemetry, bet, air_data(bet.smoothed, profile_from_sounding(telemetry.sounding), told.cg_m)
+    )
     t = pulse.time_s
     path = resample(truth.trajectory, t)
     air = air_data(path, truth.profile, flown.cg_m)
@@ -124,7 +126,7 @@ def flown_pulse(seed, rigid=False):
         "factors": np.array([factors[k] for k in ("ca", "cn", "cm")]),
         "offset": flown.cg_m - told.cg_m,
         "peak": np.array(find_peak(truth.time_s, truth.dynamic_pressure_pa)[0]),
-        "words": np.array(truth.words),
+        "words": np.array(truth.remark),
     }
     return pulse, known
 
@@ -145,7 +147,7 @@ def fly_and_keep(seed, folder, rigid):
 
 
 def kept_flight(folder, seed, rigid=False):
-    """Return `PulseData` and truth of a flight that was kept."""
+    """Return `FlightLoads` and truth of a flight that was kept."""
     with np.load(kept_path(folder, seed, rigid)) as data:
         arrays = {k: data[f"pulse_{k}"] for k in ARRAYS}
         arrays["angular_acceleration_sd_radps2"] = float(arrays["angular_acceleration_sd_radps2"])
@@ -153,7 +155,7 @@ def kept_flight(folder, seed, rigid=False):
     spec, vehicle = read_scenario("irve2_reference").spec, told_vehicle(seed)
     arm = vehicle.cg_m - vehicle.sensors[ACCELEROMETER_MOUNT].position_from_datum_body_m
     stated = (vehicle, spec.accelerometer.time_bias_s, spec.rates.time_bias_s, arm)
-    return PulseData(**arrays, **dict(zip(STATED, stated, strict=True))), truth
+    return FlightLoads(**arrays, **dict(zip(STATED, stated, strict=True))), truth
 
 
 def fly_missing(folder, seeds, rigid=False, workers=2):
@@ -203,7 +205,7 @@ def planted(pulse, camera, what):
             pulse.vehicle, centerbody=body.model_copy(update={"cg_from_datum_body_m": (x, y + 0.004, z - 0.003)})
         )
         return replace(pulse, vehicle=told), camera
-    if what == CAMERA_TURNED:
+    if what == CAMERA_MISALIGNED:
         return pulse, replace(camera, plane_lv_rad=camera.plane_lv_rad + np.deg2rad(25.0))
     return pulse, camera
 
@@ -226,8 +228,8 @@ def scored(seed, folder, rigid, what):
         answers[f"fused, {name}"] = safely(out, lambda c=camera: fuse_flight(pulse, c).fused.history)
     if what is not None:
         found = safely(out, lambda: fuse_flight(pulse, cameras["clean"]).agreement)
-        out["named"] = None if found is None else found.named
-        out["red"] = found is None or bool(found.suspects)
+        out["named"] = None if found is None else found.likeliest
+        out["red"] = found is None or bool(found.hypotheses)
     out["rows"] = {name: row_of(h, pulse, truth) for name, h in answers.items() if h is not None}
     return out
 
@@ -286,7 +288,7 @@ def report(results, rigid):
 def report_planted(results, what):
     rows = [r for r in results if not r["words"]]
     red = sum(r["red"] for r in rows)
-    # a refusal names its suspects in its words
+    # a refusal names its fault hypotheses in its message
     told = [r["named"] if r["named"] is not None else named_in(r["refused"][0]) for r in rows]
     refused = sum(r["named"] is None for r in rows)
     right = PLANTED[what]
@@ -296,8 +298,10 @@ def report_planted(results, what):
 
 
 def named_in(words):
-    """Suspects that a refusal names, the first first."""
-    return tuple(sorted((s for s in BLAME if f"the {s} would" in words or f"the {s} or" in words), key=words.index))
+    """Fault hypotheses that a refusal names, the likeliest first."""
+    return tuple(
+        sorted((s for s in HYPOTHESES if f"the {s} explains" in words or f"the {s} or" in words), key=words.index)
+    )
 
 
 def seeds_and_folder():

@@ -10,7 +10,7 @@ from flightmodel.vehicle import Vehicle
 from synthetic_flight import simulate
 from synthetic_flight.scenarios import child_rng, initial_state, read_scenario
 from synthetic_flight.simulate import integrate
-from synthetic_flight.weather import day_atmosphere
+from synthetic_flight.weather import day_of_flight_atmosphere
 
 START_S, PULSE_S = 400.0, 60.0  # 100 km, and through the largest dynamic pressure (about 435 s)
 
@@ -29,7 +29,7 @@ def reference_problem() -> Problem:
     """Fly the reference scenario, joint locked until inflation, to where the benchmarks start."""
     scenario = read_scenario("irve2_reference")
     time_s = scenario.spec.time
-    air = simulate.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    air = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
     locked = round(time_s.inflated_s - time_s.start_s)
     states, _ = integrate(
         scenario.vehicle, air, initial_state(scenario), 0.004, 250, round(START_S - time_s.start_s) + 1, locked

@@ -27,9 +27,9 @@ from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.flight import Flight
-from postflight.reconciliation.answer import deflection_of, joint_table
-from postflight.reconciliation.fit import explain
-from postflight.reconciliation.modes import stiffness_by_modes
+from postflight.reconciliation.fit import select_laws
+from postflight.reconciliation.modes import stiffness_from_modes
+from postflight.reconciliation.posterior import deflection_of, joint_table
 from postflight.reconstruction import reconstruct
 from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed
@@ -85,7 +85,7 @@ def errors(found, vehicle, factors):
 def modal_errors(flight, vehicle):
     """Error and sd of the log stiffness by the joint's frequency; NaN where the mode is not seen."""
     try:
-        found = stiffness_by_modes(flight)
+        found = stiffness_from_modes(flight)
     except GateError as fault:
         print(f"  {fault}")
         return [np.nan, np.nan]
@@ -116,29 +116,27 @@ def main():
     for seed in range(first, first + count):
         vehicle, factors = flown_vehicle(seed, **law)
         flight, truth = reconstructed(seed, vehicle)
-        if truth.words:
-            print(f"{seed}: {truth.words}; left out", flush=True)
+        if truth.remark:
+            print(f"{seed}: {truth.remark}; left out", flush=True)
             continue
         begun = time.process_time()
-        explained = explain(flight, asked)
-        took, found = time.process_time() - begun, explained.found
-        words = f"{seed}: {found.steps} steps{'' if found.converged else ' (not settled)'}, {took:.0f} s"
+        selection = select_laws(flight, asked)
+        took, found = time.process_time() - begun, selection.fit
+        words = f"{seed}: {found.steps} steps{'' if found.converged else ' (not converged)'}, {took:.0f} s"
         if asked:
-            odds.append([explained.log_odds[name] for name in asked])
+            odds.append([selection.log_odds[name] for name in asked])
             other = reconstructed(seed, flown_vehicle(seed)[0])[1] if any(law.values()) else truth
-            effects.append(effects_sd(explained.compared[asked[0]][0], truth, other))
-            told = ", ".join(f"{name} {value:+.1f}" for name, value in explained.log_odds.items())
+            effects.append(effects_sd(selection.compared[asked[0]][0], truth, other))
+            told = ", ".join(f"{name} {value:+.1f}" for name, value in selection.log_odds.items())
             equal, missed = effects[-1]
             words += f", log odds of {told}, effect {equal:.1f} sd, missed by the plain fit {missed:.1f} sd"
-            if "freeplay" in found.problem.unknown.laws:
+            if "freeplay" in found.problem.vehicle_parameters.laws:
                 got = joint_table(found).set_index("quantity").loc["freeplay"]
                 words += f", freeplay {got.found:.4f} +/- {got.sd:.4f} deg"
         rows.append([*errors(found, vehicle, factors), *modal_errors(flight, vehicle)])
         largest = np.rad2deg(np.nanmax(truth.deflection.theta_rad))
-        print(
-            f"{words}, bent {largest:.1f} deg, errors / sd {np.round(np.array(rows[-1]).reshape(-1, 2), 3).tolist()}",
-            flush=True,
-        )
+        ratios = np.round(np.array(rows[-1]).reshape(-1, 2), 3).tolist()
+        print(f"{words}, deflection up to {largest:.1f} deg, errors / sd {ratios}", flush=True)
     a = np.array(rows)
     names = "log stiffness", "log damping ratio", "offset y cm", "offset z cm", "static stability", "by the frequency"
     for k, name in enumerate(names):

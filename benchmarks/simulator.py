@@ -52,7 +52,7 @@ PEERS = {
 
 
 def ours(problem, rate_hz, seconds=PULSE_S):
-    """Nose position and bending angle ten times a second."""
+    """Nose position and deflection ten times a second."""
     states, aux = fly(problem, rate_hz, seconds)
     return dynamics.points(states, problem.vehicle)["nose"][0], aux[:, 5]
 
@@ -73,11 +73,13 @@ def dop853(problem, seconds, rtol):
     # tolerance of the state's own sizes: kilometres of motion, not the distance from the Earth's centre
     atol = rtol * np.repeat([1e4, 1e3, 1.0], [3, 3, 14])
     flown = solve_ivp(derivative, (0.0, seconds), problem.entry, "DOP853", times, rtol=0.01 * rtol, atol=atol).y.T
-    return dynamics.points(flown, problem.vehicle)["nose"][0], dynamics.bending(flown[:, 6:10], flown[:, 10:14])[0]
+    return dynamics.points(flown, problem.vehicle)["nose"][0], dynamics.deflection_angle(
+        flown[:, 6:10], flown[:, 10:14]
+    )[0]
 
 
 def error(flown, reference):
-    """Largest difference in position, m, and bending angle, deg."""
+    """Largest difference in position, m, and deflection, deg."""
     return (
         float(np.linalg.norm(flown[0] - reference[0], axis=1).max()),
         float(np.rad2deg(np.abs(flown[1] - reference[1]).max())),

@@ -14,16 +14,16 @@ import numpy as np
 from estimator_coverage import CAMERA_SD, camera_history, flown_aero, fly_missing, kept_flight, seeds_and_folder
 from scipy.stats import norm
 
-from estimators.agreement import CAMERA_TURNED, COEFFICIENTS, MOUNT, OFFSET, gross_errors
+from estimators.agreement import CAMERA_MISALIGNED, COEFFICIENTS, MOUNT, OFFSET, fault_hypotheses
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.fusing import CAMERA_PLANE_SD_RAD, fuse_flight
 
 DRAWS, FALSE_ALARMS = 200, (0.05, 0.10)
-SIDES = {  # of what `estimator_coverage.planted` plants, in columns of the gross errors
+SIDES = {  # of what `estimator_coverage.planted` plants, in columns of the fault hypotheses
     COEFFICIENTS: np.ones(2),
     MOUNT: np.sqrt(2.0) * np.array([0.6, 0.8]),
     OFFSET: np.sqrt(2.0) * np.array([0.8, -0.6]),
-    CAMERA_TURNED: np.ones(1),
+    CAMERA_MISALIGNED: np.ones(1),
 }
 
 
@@ -34,10 +34,10 @@ def told_apart(seed, folder):
     pulse = replace(pulse, vehicle=replace(flown_aero(pulse.vehicle, truth, known), uncertainty=known))
     use, rng = pulse.through_pulse, np.random.default_rng([seed, 3, 2009])
     camera = camera_history(rng, truth["theta_yz"][use], pulse.time_s[use], CAMERA_SD["clean"])
-    learnt = fuse_flight(pulse, camera).fused.learnt
-    gross = gross_errors(pulse, learnt, CAMERA_PLANE_SD_RAD)
-    columns = np.hstack([gross[suspect] for suspect in SIDES])
-    return columns.T @ (columns - learnt.covariance @ columns)
+    input_posterior = fuse_flight(pulse, camera).fused.input_posterior
+    faults = fault_hypotheses(pulse, input_posterior, CAMERA_PLANE_SD_RAD)
+    columns = np.hstack([faults[suspect] for suspect in SIDES])
+    return columns.T @ (columns - input_posterior.covariance @ columns)
 
 
 def likelihoods(u, inner, places):

@@ -28,9 +28,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import estimator_coverage as dispersed
 
-from estimators.benchmark import benchmark_bending
+from estimators.benchmark import benchmark_deflection
 from estimators.camera import read_film
-from estimators.loads import PulseData
+from estimators.loads import FlightLoads
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
 from synthetic_flight.film import Imaging, Scene, film
@@ -70,7 +70,7 @@ def one_flight(job: tuple[str, int]) -> tuple[int, list[tuple[float, ...]], str]
     return seed, rows, ""
 
 
-def flown_scene(pulse: PulseData, bent: np.ndarray, rng: np.random.Generator, kind: str) -> Scene:
+def flown_scene(pulse: FlightLoads, bent: np.ndarray, rng: np.random.Generator, kind: str) -> Scene:
     """What a kept flight's camera sees; light and Earth at random sides, and they turn with the roll."""
     t = pulse.time_s
     seen = dispersed.columns(FLOWN_S, t, bent)
@@ -108,7 +108,7 @@ def one_flown(job: tuple[str, int]) -> tuple[int, list[tuple[float, ...]], str]:
     k = int(np.argmin(np.abs(FLOWN_S - truth["peak"])))
     try:
         read = read_film(FLOWN_S, frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None)
-        told = benchmark_bending(read.against_benchmark(), pulse, read.oriented.held.benchmark_rad)
+        told = benchmark_deflection(read.relative_to_benchmark(), pulse, read.oriented.apriori.benchmark_rad)
     except GateError as fault:
         return seed, [], str(fault)
     rows = []

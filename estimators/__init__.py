@@ -1,3 +1,3 @@
-"""How far the aeroshell bent: one question an estimator, one `DeflectionHistory` as its answer; none sees the truth."""
+"""How far was the aeroshell deflected? Each estimator answers with one `DeflectionHistory`; none sees the truth."""
 
 from __future__ import annotations

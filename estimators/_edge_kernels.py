@@ -1,4 +1,6 @@
-"""Compiled search for the shell's edge and for dark marks on it. Readable twin: `tests.estimators.plain_horizon`."""
+"""Compiled search for the shell's edge and for dark features on it; the models are in `estimators.edge` and
+`estimators.features`.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,8 @@ from flightmodel._kernels import inlined, kernel
 
 
 @inlined
-def grey_inside(image, u, v):
-    """As `grey_at`, for places that are known to lie in the picture."""
+def _grey_inside(image, u, v):
+    """As `_grey_at`, for places that lie in the picture."""
     j, i = int(u), int(v)
     a, b = u - j, v - i
     upper = (1.0 - a) * image[i, j] + a * image[i, j + 1]
@@ -19,15 +21,15 @@ def grey_inside(image, u, v):
 
 
 @inlined
-def grey_at(image, u, v):
+def _grey_at(image, u, v):
     """Grey level between pixels, bilinear; the border's beyond the picture."""
     h, w = image.shape
-    return grey_inside(image, min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001))
+    return _grey_inside(image, min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001))
 
 
 @kernel
-def levels(image, rows, columns, count):
-    """Count grey levels (256,) of every so manieth row and column."""
+def grey_histogram(image, rows, columns, count):
+    """Count grey levels (256,) of every ``rows``-th row and ``columns``-th column."""
     count[:] = 0
     for i in range(0, image.shape[0], rows):
         for j in range(0, image.shape[1], columns):
@@ -43,11 +45,11 @@ def sample_lines(image, origin, inward, first, step, corner, size, grey, inside)
             along = first + k * step
             u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
             inside[i, k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
-            grey[i, k] = grey_at(image, u - corner[0], v - corner[1])
+            grey[i, k] = _grey_at(image, u - corner[0], v - corner[1])
 
 
 @inlined
-def median_of(values, count):
+def _median(values, count):
     """Median of the first values, which are sorted in place (insertion: they are few)."""
     for i in range(1, count):
         key = values[i]
@@ -73,7 +75,7 @@ def sky_levels(grey, inside, span, level, scatter, first):
         for j in range(span):
             few[j] = grey[i, min(first[i] + j, m - 1)]
         scatter[i] = abs(few[span // 2] - few[0])
-        level[i] = median_of(few, span)
+        level[i] = _median(few, span)
 
 
 @kernel
@@ -107,7 +109,7 @@ def first_rises(grey, inside, level, first, noise, common, limits, step, places,
             count = int(3.5 / step) - int(2.0 / step)
             for j in range(count):
                 few[j] = grey[i, min(inner + int(2.0 / step) + j, m - 1)]
-            shell = median_of(few, count)
+            shell = _median(few, count)
             half = 0.5 * (level[i] + shell)
             crossing = -1
             for k in range(max(rise - int(3.0 / step), 0), min(rise + int(5.0 / step), m)):
@@ -149,7 +151,7 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
             continue
         for k in range(level_of):
             few[k] = grey[i, k]
-        level = median_of(few, level_of)
+        level = _median(few, level_of)
         total = 0.0
         for k in range(m):
             value[k] = grey[i, k] - level
@@ -172,8 +174,8 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
                 behind += value[k]
                 count += 1
         height = abs(behind / max(count, 1))
-        left_over = math.sqrt(max(total - explained[best], 0.0) / m)
-        if height > contrast and left_over < 2.0 * noise + 0.15 * height:
+        residual_rms = math.sqrt(max(total - explained[best], 0.0) / m)
+        if height > contrast and residual_rms < 2.0 * noise + 0.15 * height:
             place[i] = places[best] + (places[1] - places[0]) * shift
             # as for a crossing found by itself: 2.4 noises over the slope of a blurred step
             sd[i] = 7.6 * noise / height
@@ -185,7 +187,7 @@ def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
     """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
 
     A profile is the mean of three lines a pixel apart; the dip under the line between its ends, as a share of that
-    line, has its centroid where the mark is. ``sd`` is infinite where no dip stands out of the noise, or where it is
+    line, has its centroid where the feature is. ``sd`` is infinite where no dip stands out of the noise, or where it is
     cut off by the window.
     """
     m = 2 * reach + 1
@@ -202,8 +204,8 @@ def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
                 break
             for k in range(m):
                 u, v = u0 + (k - reach) * du, v0 + (k - reach) * dv
-                beside = grey_inside(image, u - dv, v + du) + grey_inside(image, u + dv, v - du)
-                dip[k] = (grey_inside(image, u, v) + beside) / 3.0
+                beside = _grey_inside(image, u - dv, v + du) + _grey_inside(image, u + dv, v - du)
+                dip[k] = (_grey_inside(image, u, v) + beside) / 3.0
             left, right = 0.5 * (dip[0] + dip[1]), 0.5 * (dip[m - 1] + dip[m - 2])
             deepest = 0
             for k in range(m):
@@ -214,7 +216,7 @@ def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
             if depth < max(5.0 * noise, 6.0) or deepest < 2 or deepest > m - 3:
                 sd[i] = np.inf
                 break
-            # paint takes away a share of the light, whatever the light's slope across the mark
+            # paint takes away a share of the light, whatever the light's slope across the feature
             slope = (right - left) / (m - 1.0)
             total, moment, reach_in = 0.0, 0.0, half_widths[i]
             for k in range(m):

@@ -1,4 +1,4 @@
-"""Compiled rasteriser: triangles through a lens into a picture of distances. Oracle in the tests: ray casting."""
+"""Compiled rasteriser: triangles through a lens into a picture of distances; the tests compare it with ray casting."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from estimators._sight_kernels import FISHEYE
 from flightmodel._kernels import inlined, kernel
 
-WIDE_PX = 8
-BORDER_COS = math.cos(math.radians(0.5))
+_WIDE_PX = 8
+_BORDER_COS = math.cos(math.radians(0.5))
 
 
 @inlined
-def pixel_of(x, y, z, lens):
+def _pixel_of(x, y, z, lens):
     """Pixel of a point in camera axes; see `flightmodel.camera` for the lenses."""
     model, _, focal, centre, k, _, _ = lens
     if model == FISHEYE:
@@ -33,7 +33,7 @@ def pixel_of(x, y, z, lens):
 
 
 @inlined
-def cut(value, per_step, first, last):
+def _clipped(value, per_step, first, last):
     """Part of ``first`` to ``last`` in which ``value + k / per_step`` is not negative; all of it for no step."""
     if per_step > 0.0:
         first = max(first, -value * per_step)
@@ -54,8 +54,8 @@ def fill(ax, ay, bx, by, cx, cy, da, db, dc, face, depth, nearest):
         # barycentric coordinates are linear: start of a row, and step along it
         step_b, step_c = (cy - ay) * per, (ay - by) * per
         j0, j1 = math.ceil(max(left, 0.0)), math.floor(min(right, w - 1.0))
-        # of a wide triangle most of the box around it is empty: its part of each row is worked out
-        wide = j1 - j0 >= WIDE_PX
+        # of a wide triangle most of the box around it is empty: its part of each row is computed
+        wide = j1 - j0 >= _WIDE_PX
         per_b = 1.0 / step_b if abs(step_b) > 1e-12 else 0.0
         per_c = 1.0 / step_c if abs(step_c) > 1e-12 else 0.0
         per_a = -1.0 / (step_b + step_c) if abs(step_b + step_c) > 1e-12 else 0.0
@@ -64,9 +64,9 @@ def fill(ax, ay, bx, by, cx, cy, da, db, dc, face, depth, nearest):
             share_c = ((bx - ax) * (i - ay) - (by - ay) * (j0 - ax)) * per
             first, last = 0.0, j1 - j0 + 0.0
             if wide:
-                first, last = cut(share_b, per_b, first, last)
-                first, last = cut(share_c, per_c, first, last)
-                first, last = cut(1.0 - share_b - share_c, per_a, first, last)
+                first, last = _clipped(share_b, per_b, first, last)
+                first, last = _clipped(share_c, per_c, first, last)
+                first, last = _clipped(1.0 - share_b - share_c, per_a, first, last)
                 first, last = math.floor(max(first, 0.0)), math.ceil(min(last, j1 - j0 + 0.0))
                 share_b += first * step_b
                 share_c += first * step_c
@@ -90,36 +90,37 @@ def raster(vertices, faces, lens, sight, widest, deepest, depth, nearest):
     """
     widest_cos = math.cos(widest)
     # where the picture ends well within the lens's field, that field's border needs no care
-    border_cos = BORDER_COS if lens[1] - widest < sight else widest_cos
+    border_cos = _BORDER_COS if lens[1] - widest < sight else widest_cos
     position, axes = lens[5], lens[6]
     field_cos = math.cos(lens[1])
     n = len(vertices)
-    seen, pixels = np.empty((n, 4)), np.empty((n, 2))
+    in_camera, pixels = np.empty((n, 4)), np.empty((n, 2))
     for i in range(n):
         dx, dy, dz = vertices[i, 0] - position[0], vertices[i, 1] - position[1], vertices[i, 2] - position[2]
         for m in range(3):
-            seen[i, m] = axes[m, 0] * dx + axes[m, 1] * dy + axes[m, 2] * dz
-        seen[i, 3] = math.sqrt(dx * dx + dy * dy + dz * dz)
-        if seen[i, 2] > field_cos * seen[i, 3]:
-            pixels[i, 0], pixels[i, 1] = pixel_of(seen[i, 0], seen[i, 1], seen[i, 2], lens)
+            in_camera[i, m] = axes[m, 0] * dx + axes[m, 1] * dy + axes[m, 2] * dz
+        in_camera[i, 3] = math.sqrt(dx * dx + dy * dy + dz * dz)
+        if in_camera[i, 2] > field_cos * in_camera[i, 3]:
+            pixels[i, 0], pixels[i, 1] = _pixel_of(in_camera[i, 0], in_camera[i, 1], in_camera[i, 2], lens)
     stack, level = np.empty((deepest + 2, 3, 3)), np.empty(deepest + 2, dtype=np.int64)
     length, t = np.empty(3), np.empty((3, 3))
     for f in range(len(faces)):
         a, b, c = faces[f]
         narrow, inside = True, 0
         for p, q in ((a, b), (b, c), (c, a)):
-            dot = seen[p, 0] * seen[q, 0] + seen[p, 1] * seen[q, 1] + seen[p, 2] * seen[q, 2]
-            narrow = narrow and dot > widest_cos * seen[p, 3] * seen[q, 3]
-            inside += 1 if seen[p, 2] > field_cos * seen[p, 3] else 0
+            u, v = in_camera[p], in_camera[q]
+            dot = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+            narrow = narrow and dot > widest_cos * in_camera[p, 3] * in_camera[q, 3]
+            inside += 1 if in_camera[p, 2] > field_cos * in_camera[p, 3] else 0
         if narrow and (inside == 0 or inside == 3):
             if inside == 3:
                 fill(
                     pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1],
-                    seen[a, 3], seen[b, 3], seen[c, 3], f, depth, nearest,
+                    in_camera[a, 3], in_camera[b, 3], in_camera[c, 3], f, depth, nearest,
                 )  # fmt: skip
             continue
         for m in range(3):
-            stack[0, 0, m], stack[0, 1, m], stack[0, 2, m] = seen[a, m], seen[b, m], seen[c, m]
+            stack[0, 0, m], stack[0, 1, m], stack[0, 2, m] = in_camera[a, m], in_camera[b, m], in_camera[c, m]
         level[0] = 0
         top = 1
         while top > 0:
@@ -146,9 +147,9 @@ def raster(vertices, faces, lens, sight, widest, deepest, depth, nearest):
             if here >= deepest or side_cos > limit:
                 # what is still wide after that is closer than a picture can show
                 if inside == 3 and side_cos > widest_cos:
-                    ax, ay = pixel_of(t[0, 0], t[0, 1], t[0, 2], lens)
-                    bx, by = pixel_of(t[1, 0], t[1, 1], t[1, 2], lens)
-                    cx, cy = pixel_of(t[2, 0], t[2, 1], t[2, 2], lens)
+                    ax, ay = _pixel_of(t[0, 0], t[0, 1], t[0, 2], lens)
+                    bx, by = _pixel_of(t[1, 0], t[1, 1], t[1, 2], lens)
+                    cx, cy = _pixel_of(t[2, 0], t[2, 1], t[2, 2], lens)
                     fill(ax, ay, bx, by, cx, cy, length[0], length[1], length[2], f, depth, nearest)
                 continue
             end = (side + 1) % 3

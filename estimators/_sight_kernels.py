@@ -1,7 +1,7 @@
-"""Compiled projection of points of the bent shell with all derivatives. Readable twin: `tests.estimators.plain_sight`.
+"""Compiled projection of points of the deflected shell with all derivatives; see `estimators.virtual_camera`.
 
-Columns of a derivative are those of `estimators.virtual_camera`: bending (2), flattening, camera turn (3), focal scale,
-principal point (2), k1, k2, camera position (3), shell radius, joint station.
+Columns of a derivative are those of `estimators.virtual_camera`: deflection (2), flattening, camera rotation (3), focal
+scale, principal point (2), k1, k2, camera position (3), shell radius, joint station.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from flightmodel._kernels import inlined, kernel
 
 FISHEYE, PINHOLE = 0, 1
 COLUMNS = 16
-SPARSE = 10
+_SPARSE = 10
 
 
 @inlined
-def fisheye_sight(x, y, z, k):
+def _fisheye_sight(x, y, z, k):
     """Normalised image point of Kannala and Brandt's lens, derivatives by x, y, z, and by k1 and k2."""
     r2 = x * x + y * y
     r = math.sqrt(r2)
@@ -44,8 +44,8 @@ def fisheye_sight(x, y, z, k):
 
 
 @inlined
-def pinhole_sight(x, y, z, k):
-    """As `fisheye_sight`, for OpenCV's pinhole with radial k1, k2, k3 (``k[0], k[1], k[4]``) and tangential p1, p2."""
+def _pinhole_sight(x, y, z, k):
+    """As `_fisheye_sight`, for OpenCV's pinhole with radial k1, k2, k3 (``k[0], k[1], k[4]``) and tangential p1, p2."""
     u, v = x / z, y / z
     r2 = u * u + v * v
     radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
@@ -64,14 +64,14 @@ def pinhole_sight(x, y, z, k):
 
 
 @inlined
-def project_points(points, bend, lens, pixels, jacobian):
+def project_points(points, terms, lens, pixels, jacobian):
     """Pixels ``(n, 2)`` of shell points ``(n, 3)`` and their derivatives ``(n, 2, 16)``; NaN outside the lens's field.
 
-    ``bend``: rotation (3, 3), its left Jacobian's y and z columns (3, 2), joint station, flattening, and station and
-    radius of the ring about which it turns. ``lens``: model, half field, focal lengths (2), principal point (2),
-    coefficients (5), camera position (3) and camera axes (3, 3).
+    ``terms``: rotation (3, 3), its left Jacobian's y and z columns (3, 2), joint station, flattening, and station and
+    radius of the ring about which the shell flattens. ``lens``: model, half field, focal lengths (2), principal point
+    (2), coefficients (5), camera position (3) and camera axes (3, 3).
     """
-    rotation, left, joint, flattening, ring_station, ring_radius = bend
+    rotation, left, joint, flattening, ring_station, ring_radius = terms
     model, half_field, focal, centre, k, position, axes = lens
     by_body = np.empty((2, 3))
     for i in range(len(points)):
@@ -94,9 +94,9 @@ def project_points(points, bend, lens, pixels, jacobian):
             jacobian[i] = 0.0
             continue
         if model == FISHEYE:
-            u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = fisheye_sight(x, y, z, k)
+            u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = _fisheye_sight(x, y, z, k)
         else:
-            u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = pinhole_sight(x, y, z, k)
+            u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = _pinhole_sight(x, y, z, k)
         pixels[i, 0], pixels[i, 1] = focal[0] * u + centre[0], focal[1] * v + centre[1]
         for c in range(2):
             f = focal[c]
@@ -155,13 +155,13 @@ def feet(found, vertex, jacobian, residual, rows, at):
     n = len(vertex)
     for i in range(len(found)):
         u, v = found[i]
-        # an edge is smooth: the closest of every so manieth vertex has the closest of all next to it
+        # an edge is smooth: the closest of every tenth vertex has the closest of all next to it
         nearest, least = 0, 1e300
-        for j in range(0, n, SPARSE):
+        for j in range(0, n, _SPARSE):
             square = (vertex[j, 0] - u) ** 2 + (vertex[j, 1] - v) ** 2
             if square < least:
                 nearest, least = j, square
-        for j in range(max(nearest - SPARSE, 0), min(nearest + SPARSE + 1, n)):
+        for j in range(max(nearest - _SPARSE, 0), min(nearest + _SPARSE + 1, n)):
             square = (vertex[j, 0] - u) ** 2 + (vertex[j, 1] - v) ** 2
             if square < least:
                 nearest, least = j, square
@@ -189,7 +189,7 @@ def feet(found, vertex, jacobian, residual, rows, at):
 
 
 @inlined
-def turn(wy, wz, rotation, left):
+def rotation_of(wy, wz, rotation, left):
     """Rotation matrix of a rotation vector ``(0, wy, wz)`` and the y and z columns of its left Jacobian."""
     angle2 = wy * wy + wz * wz
     angle = math.sqrt(angle2)
@@ -210,15 +210,15 @@ def turn(wy, wz, rotation, left):
 
 
 @kernel
-def turned(wy, wz, rotation, left):
-    """`turn` for callers in Python."""
-    turn(wy, wz, rotation, left)
+def rotation_matrix(wy, wz, rotation, left):
+    """`rotation_of` for callers in Python."""
+    rotation_of(wy, wz, rotation, left)
 
 
 @kernel
-def project_shell(points, bend, lens, pixels, jacobian):
+def project_shell(points, terms, lens, pixels, jacobian):
     """`project_points` for callers in Python."""
-    project_points(points, bend, lens, pixels, jacobian)
+    project_points(points, terms, lens, pixels, jacobian)
 
 
 @kernel

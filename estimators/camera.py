@@ -1,14 +1,18 @@
-"""How far did the shell bend, seen by the onboard camera?
+"""How far was the aeroshell deflected, by the onboard camera?
 
-The camera is oriented on a benchmark frame in which the joint is taken as not bent (`estimators.benchmark`); in every
-other frame the deflection is the rotation of the shell whose projected edge and marks fit the found ones
-(`estimators.camera_fit`): two parameters when the plane is found, one in an assumed plane (the seed paper's way, plane
-along the camera's line of sight).
+The camera is oriented on a benchmark frame in which the joint is taken as undeflected (`estimators.benchmark`); in
+every other frame the deflection is the rotation of the shell whose projected edge and features fit the found ones
+(`estimators.camera_fit`): two parameters when the plane is estimated, one in an assumed plane (the seed paper's way,
+plane along the camera's line of sight).
 
-With an assumed plane that is off by ``d`` the answer is ``theta (cos d + s sin d)``, ``s`` the answer to a unit bending
-across the plane; its mean square error ``theta^2 (s^2 sd^2 + 3 (1/2 + s^2)^2 sd^4)`` is in the variance.
+With an assumed plane that is off by ``d`` the answer is ``theta (cos d + s sin d)``, ``s`` the answer to a unit
+deflection normal to the plane; its mean square error ``theta^2 (s^2 sd^2 + 3 (1/2 + s^2)^2 sd^4)`` is in the variance.
 
-Sources: seed paper, CAD-based estimate, Table 2.1.
+Assumed: as in `estimators.camera_fit`.
+
+References
+----------
+Seed paper, CAD-based estimate, Table 2.1.
 """
 
 from __future__ import annotations
@@ -20,8 +24,8 @@ from pathlib import Path
 
 import numpy as np
 
-from estimators.benchmark import USUAL_RMS_PX, USUAL_SHARE, BenchmarkBending, ReadFrames, orient_camera
-from estimators.camera_fit import FrameFit, HeldFixed, Image, OrientedCamera
+from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, orient_camera
+from estimators.camera_fit import USUAL_RMS_PX, AprioriSd, FrameFit, Image, OrientedCamera
 from flightmodel.checks import FloatArray, GateError, Progress, check_finite, check_increasing
 from flightmodel.deflection import (
     DeflectionHistory,
@@ -36,15 +40,15 @@ from flightmodel.vehicle import CameraMount
 _SWAP = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from a rotation about body y and z to the lateral vector
 
 
-def axis_of(plane_lv_rad: float) -> FloatArray:
-    """Rotation vector (y, z) of a unit bending in a plane."""
+def _axis_of(plane_lv_rad: float) -> FloatArray:
+    """Rotation vector (y, z) of a unit deflection in a plane."""
     out: FloatArray = rotation_vector_body_shell(np.array(1.0), np.array(plane_lv_rad))[1:]
     return out
 
 
 @dataclass(frozen=True)
-class ReadFilm:
-    """What was read in every frame of a film, and how.
+class FilmFit:
+    """The fit of every frame of a film, and its assumptions.
 
     Parameters
     ----------
@@ -54,7 +58,7 @@ class ReadFilm:
     benchmark_s : float
         Time of the benchmark frame.
     plane_lv_rad : float or None
-        Assumed plane; None: found in every frame.
+        Assumed plane; None: estimated in every frame.
     plane_sd_rad : float
         Of the assumed plane.
     """
@@ -66,39 +70,44 @@ class ReadFilm:
     plane_lv_rad: float | None
     plane_sd_rad: float
 
-    def against_benchmark(self, clock_sd_s: float = 0.0) -> ReadFrames:
-        """What the frames say of the bending beyond the benchmark frame's, where their planes were found.
+    def relative_to_benchmark(self, time_bias_sd_s: float = 0.0) -> RelativeDeflections:
+        """Deflections relative to the benchmark frame's, where the planes were estimated.
 
         Raises
         ------
         GateError
-            Where a plane was assumed: one component is no vector.
+            Where a plane was assumed: only one component was read.
         """
         if self.plane_lv_rad is not None:
-            raise GateError("in an assumed plane one component of the bending is read")
+            raise GateError("in an assumed plane only one component of the deflection is read", code="plane-assumed")
         rest = np.array([fit.per_benchmark for fit in self.fits])
-        held = self.oriented.held.benchmark_rad**2 * rest @ rest.transpose(0, 2, 1)
-        covariance = np.array([fit.covariance for fit in self.fits]) - held
+        prior = self.oriented.apriori.benchmark_rad**2 * rest @ rest.transpose(0, 2, 1)
+        covariance = np.array([fit.covariance for fit in self.fits]) - prior
         theta_yz = np.array([fit.rotation_yz_rad for fit in self.fits]) @ _SWAP.T
-        return ReadFrames(
-            self.time_s, theta_yz, _SWAP @ covariance @ _SWAP.T, _SWAP @ rest @ _SWAP.T, self.benchmark_s, clock_sd_s
+        return RelativeDeflections(
+            self.time_s,
+            theta_yz,
+            _SWAP @ covariance @ _SWAP.T,
+            _SWAP @ rest @ _SWAP.T,
+            self.benchmark_s,
+            time_bias_sd_s,
         )
 
-    def history(self, benchmark: BenchmarkBending | None = None) -> DeflectionHistory:
-        """History of the bending, with the benchmark frame taken as not bent, or as bent as is told.
+    def history(self, benchmark: BenchmarkDeflection | None = None) -> DeflectionHistory:
+        """History of the deflection, with the benchmark frame undeflected or with a given deflection there.
 
-        ``method = "camera"``. NaN where a frame was refused; the reasons stand in ``assumptions``. In an assumed plane
+        ``method = "camera"``. NaN where a frame was refused, with the reasons in ``assumptions``. In an assumed plane
         the angle has a sign.
         """
         if benchmark is not None:
-            read = self.against_benchmark()
+            read = self.relative_to_benchmark()
             back = read.per_benchmark
             covariance = read.covariance + back @ benchmark.covariance @ back.transpose(0, 2, 1)
             if benchmark.with_readings is not None:
                 crossed = benchmark.with_readings @ back.transpose(0, 2, 1)
                 covariance = covariance + crossed + crossed.transpose(0, 2, 1)
             theta_yz = read.theta_yz_rad + back @ benchmark.theta_yz_rad
-            return history_from_lateral(self.time_s, theta_yz, covariance, "camera", self._words(benchmark))
+            return history_from_lateral(self.time_s, theta_yz, covariance, "camera", self._remark(benchmark))
         n = len(self.time_s)
         theta, plane, covariance = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2, 2), np.nan)
         for k, fit in enumerate(self.fits):
@@ -107,39 +116,40 @@ class ReadFilm:
             if self.plane_lv_rad is None:
                 theta[k], plane[k], covariance[k] = polar(fit.rotation_yz_rad, fit.covariance)
             else:
-                theta[k] = fit.rotation_yz_rad @ axis_of(self.plane_lv_rad)
+                theta[k] = fit.rotation_yz_rad @ _axis_of(self.plane_lv_rad)
                 s, sd2 = fit.plane_leak, self.plane_sd_rad**2
                 off = theta[k] ** 2 * (s**2 * sd2 + 3.0 * (0.5 + s**2) ** 2 * sd2**2)
                 cross = -theta[k] * s * sd2
                 covariance[k] = [[fit.covariance[0, 0] + off, cross], [cross, sd2]]
         if self.plane_lv_rad is not None:
             plane[:] = self.plane_lv_rad
-        return DeflectionHistory(self.time_s, theta, plane, covariance, "camera", self._words(None))
+        return DeflectionHistory(self.time_s, theta, plane, covariance, "camera", self._remark(None))
 
-    def _words(self, benchmark: BenchmarkBending | None) -> str:
-        seen, oriented = [fit for fit in self.fits if not fit.refused], self.oriented
-        edge = np.median([len(fit.horizon.points_px) for fit in seen]) / len(oriented.lines.origin_px) if seen else 0.0
-        marks = float(np.median([fit.marks for fit in seen])) if seen else 0.0
-        how = (
-            "plane found in every frame"
+    def _remark(self, benchmark: BenchmarkDeflection | None) -> str:
+        """What was assumed, how much of the shell was in view, and which frames were refused."""
+        used, oriented = [fit for fit in self.fits if not fit.refused], self.oriented
+        edge = np.median([len(fit.horizon.points_px) for fit in used]) / len(oriented.lines.origin_px) if used else 0.0
+        features = float(np.median([fit.features for fit in used])) if used else 0.0
+        plane = (
+            "plane estimated in every frame"
             if self.plane_lv_rad is None
             else f"plane assumed at {np.rad2deg(self.plane_lv_rad):.0f} +/- {np.rad2deg(self.plane_sd_rad):.0f} deg LV"
         )
-        bent = f"taken as not bent within {np.rad2deg(oriented.held.benchmark_rad):.2f} deg"
-        bent = bent if benchmark is None else benchmark.words
-        words = [
-            f"{how}; joint {oriented.view.joint_station_m:.3f} m aft of the nose",
-            f"camera oriented on the frame at {self.benchmark_s:.3f} s, {bent} "
+        there = f"taken as undeflected within {np.rad2deg(oriented.apriori.benchmark_rad):.2f} deg"
+        there = there if benchmark is None else benchmark.remark
+        remarks = [
+            f"{plane}; joint {oriented.view.joint_station_m:.3f} m aft of the nose",
+            f"camera oriented on the frame at {self.benchmark_s:.3f} s, {there} "
             f"(rms {oriented.residual_rms_px:.2f} px)",
             f"from {100.0 * edge:.0f} % of the edge"
-            + (f" and {marks:.0f} rows of seams and dots" if marks >= 1.0 else "; no seam and no dot could be used, "
-               "which leaves flattening and ovality of the shell in the error bar"),
+            + (f" and {features:.0f} rows of seams and dots" if features >= 1.0 else "; no seam and no dot could be "
+               "used, which leaves flattening and ovality of the shell in the error bar"),
         ]  # fmt: skip
-        if oriented.residual_rms_px > USUAL_RMS_PX and oriented.marks_share < USUAL_SHARE:
-            words.append(
-                f"the benchmark frame shows {100.0 * oriented.marks_share:.0f} % of the marks, and the vehicle file's "
-                "lens and shell leave more than a pixel of its edge unexplained: the error bar does not hold; check "
-                "mount, lens and [cameras.NAME.uncertainty]"
+        if oriented.has_bad_benchmark:
+            remarks.append(
+                f"the benchmark frame shows {100.0 * oriented.features_share:.0f} % of the features, and its rms "
+                f"exceeds {USUAL_RMS_PX:.1f} px: the stated uncertainty is too small; check mount, lens, shell and "
+                "[cameras.NAME.uncertainty] in the vehicle file"
             )
         refused: dict[str, list[float]] = {}
         for t, fit in zip(self.time_s, self.fits, strict=True):
@@ -148,12 +158,12 @@ class ReadFilm:
         if refused:
             listed = ", ".join(f"{_spans(times)}: {reason}" for reason, times in list(refused.items())[:5])
             more = ", ..." if len(refused) > 5 else ""
-            words.append(f"{len(self.fits) - len(seen)} of {len(self.fits)} frames refused ({listed}{more})")
-        return "; ".join(words)
+            remarks.append(f"{len(self.fits) - len(used)} of {len(self.fits)} frames refused ({listed}{more})")
+        return "; ".join(remarks)
 
 
 def _spans(times_s: list[float]) -> str:
-    """Some times in words: one, or how many from the first to the last."""
+    """One time, or how many from the first to the last."""
     if len(times_s) == 1:
         return f"{times_s[0]:.3f} s"
     return f"{len(times_s)} between {times_s[0]:.3f} and {times_s[-1]:.3f} s"
@@ -168,11 +178,11 @@ def read_film(
     benchmark_time_s: float = 421.0,
     plane_lv_rad: float | None = float(np.deg2rad(153.0)),
     plane_sd_rad: float = float(np.deg2rad(25.0)),
-    held: HeldFixed | None = None,
+    apriori: AprioriSd | None = None,
     benchmark: Image | None = None,
     progress: Progress | None = None,
-) -> ReadFilm:
-    """Orient the camera on the benchmark frame, and fit the bending in every frame.
+) -> FilmFit:
+    """Orient the camera on the benchmark frame, and fit the deflection in every frame.
 
     Frames are taken one at a time: memory does not grow with their number.
 
@@ -185,16 +195,16 @@ def read_film(
     geometry, camera_mount, joint_station_m
         Nominal shell, camera and joint (m aft of the nose).
     benchmark_time_s : float
-        The frame nearest to it is taken as not bent.
+        The frame nearest to it is taken as undeflected.
     plane_lv_rad : float or None
-        Assumed plane (seed paper: along camera 5, 153 deg); None finds the plane in every frame.
+        Assumed plane (seed paper: along camera 5, 153 deg); None estimates the plane in every frame.
     plane_sd_rad : float
         Standard deviation of the assumed plane.
-    held : HeldFixed, optional
+    apriori : AprioriSd, optional
     benchmark : (h, w) uint8, optional
-        The benchmark frame, where ``frames`` can be gone through only once.
+        The benchmark frame, where ``frames`` can be iterated only once.
     progress : callable, optional
-        Told the fraction done and what is being done.
+        Takes the fraction done and what is being done.
 
     Raises
     ------
@@ -204,14 +214,14 @@ def read_film(
     times = np.asarray(frame_times_s, dtype=float)
     check_finite("frame_times_s", times)
     check_increasing("frame_times_s", times)
-    nearest = benchmark_index(times, benchmark_time_s)
+    nearest = _benchmark_index(times, benchmark_time_s)
     if benchmark is None:
         frames = list(frames)
         if len(frames) != len(times):
-            raise GateError(f"{len(times)} frame times for {len(frames)} frames")
-        benchmark = read_frame(frames[nearest])
-    oriented = orient_camera(benchmark, geometry, camera_mount, joint_station_m, held)
-    axis = None if plane_lv_rad is None else axis_of(plane_lv_rad)
+            raise GateError(f"{len(times)} frame times for {len(frames)} frames", code="frame-count")
+        benchmark = _read_frame(frames[nearest])
+    oriented = orient_camera(benchmark, geometry, camera_mount, joint_station_m, apriori)
+    axis = None if plane_lv_rad is None else _axis_of(plane_lv_rad)
     fits: list[FrameFit] = []
     start = np.zeros(2)
     for picture in _decoded_ahead(frames):
@@ -220,17 +230,17 @@ def read_film(
         fits.append(oriented.fit(picture, axis, start))
         start = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad
     if len(fits) != len(times):
-        raise GateError(f"{len(times)} frame times for {len(fits)} frames")
-    return ReadFilm(times, tuple(fits), oriented, float(times[nearest]), plane_lv_rad, plane_sd_rad)
+        raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
+    return FilmFit(times, tuple(fits), oriented, float(times[nearest]), plane_lv_rad, plane_sd_rad)
 
 
 def _decoded_ahead(frames: Iterable[Image | str | Path]) -> Iterator[Image]:
-    """Pictures of frames, the next one decoded while this one is looked at."""
+    """Pictures of frames, the next one decoded while this one is fitted."""
     source = iter(frames)
 
     def following() -> Image | None:
         picture = next(source, None)
-        return None if picture is None else read_frame(picture)
+        return None if picture is None else _read_frame(picture)
 
     with ThreadPoolExecutor(1) as decoder:
         coming = decoder.submit(following)
@@ -239,24 +249,27 @@ def _decoded_ahead(frames: Iterable[Image | str | Path]) -> Iterator[Image]:
             yield picture
 
 
-def benchmark_index(times_s: FloatArray, benchmark_time_s: float) -> int:
+def _benchmark_index(times_s: FloatArray, benchmark_time_s: float) -> int:
     """Index of the frame nearest to the benchmark time; refused where there is none within 2 s."""
     if len(times_s) == 0:
-        raise GateError("no frames")
+        raise GateError("no frames", code="frame-missing")
     nearest = int(np.argmin(np.abs(times_s - benchmark_time_s)))
     if abs(times_s[nearest] - benchmark_time_s) > 2.0:
-        raise GateError(f"no frame within 2 s of the benchmark time {benchmark_time_s} s; frames span "
-                        f"{times_s[0]:.2f} to {times_s[-1]:.2f} s")  # fmt: skip
+        raise GateError(
+            f"no frame within 2 s of the benchmark time {benchmark_time_s} s; frames span {times_s[0]:.2f} to "
+            f"{times_s[-1]:.2f} s",
+            code="benchmark-missing",
+        )
     return nearest
 
 
-def read_frame(picture: Image | str | Path) -> Image:
-    """Return a grey picture ``(h, w)`` uint8 from an array or a file; an unreadable file gives an empty picture."""
+def _read_frame(picture: Image | str | Path) -> Image:
+    """Grey picture ``(h, w)`` uint8 from an array or a file; an unreadable file gives an empty picture."""
     return read_image(Path(picture)) if isinstance(picture, str | Path) else picture
 
 
 def polar(rotation_yz_rad: FloatArray, covariance: FloatArray) -> tuple[float, float, FloatArray]:
-    """Angle, plane (rad) and their covariance ``(2, 2)`` from a rotation about body y and z.
+    """Angle, plane, rad, and their covariance ``(2, 2)`` from a rotation about body y and z.
 
     See `flightmodel.deflection.polar_from_lateral`; the shell's rotation ``theta x_hat x d`` has the lateral vector
     ``theta d = (w_z, -w_y)``.
@@ -282,10 +295,10 @@ def sensitivity_table(
         and at the midpoint of the innermost torus (0.20 m).
     """
     # the joint is assumed here, not uncertain
-    held = HeldFixed(joint_station_m=1e-4)
-    oriented = orient_camera(benchmark, geometry, camera_mount, float(joint_stations_m[0]), held)
+    apriori = AprioriSd(joint_station_m=1e-4)
+    oriented = orient_camera(benchmark, geometry, camera_mount, float(joint_stations_m[0]), apriori)
     rows = []
     for station in joint_stations_m:
         here = replace(oriented, view=replace(oriented.view, joint_station_m=float(station)))
-        rows.append([float(here.fit(deflected, axis_of(p)).rotation_yz_rad @ axis_of(p)) for p in planes_lv_rad])
+        rows.append([float(here.fit(deflected, _axis_of(p)).rotation_yz_rad @ _axis_of(p)) for p in planes_lv_rad])
     return np.array(rows)

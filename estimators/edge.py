@@ -9,10 +9,10 @@ smoothed grey level crosses half way to the shell's level just inside, then refi
 a step with a ramp behind it, since the shell darkens or brightens towards its limb; the place is sought on a grid, the
 step and the ramp by least squares. With ``n`` the noise left after smoothing, the standard deviation is ``2.4 n`` over
 the slope at the crossing, floored at 0.05 px. The blur (lens and smoothing together) is assumed; a wrong one by a tenth
-and shades that are no ramp still move the edge by about 0.1 px, for `estimators.virtual_camera.HeldFixed` to allow for.
+and shades that are no ramp still move the edge by about 0.1 px, for `estimators.camera_fit.AprioriSd` to allow for.
 
-Assumed: the sky is darker than the shell's rim; the Sun is out of view. A frame in which this does not hold is not
-used, and says why.
+Assumed: the sky is darker than the shell's rim; the Sun is out of view. A frame in which this does not hold is refused,
+with the reason.
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from estimators import _edge_kernels
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.checks import BoolArray, Fault, FloatArray
 
 Image = NDArray[np.uint8]
+NO_FAULT = Fault("")
 
 STEP_PX = 0.5
-SMOOTHING_PX = 0.8
+_SMOOTHING_PX = 0.8
 WHOLE_BLUR_PX = 1.27
 EDGE_HALF = 7
-NEAR_PX = 8.0
-LEAST_CONTRAST = 8.0
-LEAST_SHARE = 0.4
-SD_FLOOR_PX = 0.05
-SMOOTHING = cv2.getGaussianKernel(7, SMOOTHING_PX, cv2.CV_32F)
+_NEAR_PX = 8.0
+_LEAST_CONTRAST = 8.0
+_LEAST_SHARE = 0.4
+_SD_FLOOR_PX = 0.05
+_SMOOTHING = cv2.getGaussianKernel(7, _SMOOTHING_PX, cv2.CV_32F)
 
 
 @dataclass(frozen=True)
@@ -77,15 +78,15 @@ class HorizonLine:
         Standard deviation of each point along ``inward_px``.
     line : (n,) int
         Index of the scan line that each point was found on (`ScanLines.index`).
-    refused : str
-        Why the frame cannot be used; empty when it can.
+    refused : Fault
+        Why the frame cannot be used, with its code; empty when it can.
     """
 
     points_px: FloatArray
     inward_px: FloatArray
     sd_px: FloatArray
     line: NDArray[np.intp]
-    refused: str = ""
+    refused: Fault = NO_FAULT
 
     @property
     def is_usable(self) -> bool:
@@ -104,29 +105,30 @@ class HorizonLine:
         return float(c0 - c1**2 / (4.0 * c2)) if c2 > 1e-6 else float(v.min())
 
 
-def no_horizon(reason: str) -> HorizonLine:
+def no_horizon(reason: Fault) -> HorizonLine:
     """No edge points, and why."""
     return HorizonLine(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.intp), reason)
 
 
-def fault_of_frame(image: Image, size_px: tuple[int, int]) -> str:
-    """Say why a frame cannot be used before any edge is searched: size, darkness, saturation; empty when it can."""
+def fault_of_frame(image: Image, size_px: tuple[int, int]) -> Fault:
+    """Why a frame cannot be used, before any edge is searched: size, darkness, saturation; empty when it can."""
     if image.size == 0:
-        return "cannot be decoded"
+        return Fault("cannot be decoded", "frame-undecodable")
     if image.ndim != 2 or image.dtype != np.uint8:
-        return f"not an 8-bit grey image (shape {image.shape}, {image.dtype})"
+        return Fault(f"not an 8-bit grey image (shape {image.shape}, {image.dtype})", "frame-not-grey")
     if image.shape != (size_px[1], size_px[0]):
-        return f"size {image.shape[1]} x {image.shape[0]} where the camera has {size_px[0]} x {size_px[1]}"
+        size = f"size {image.shape[1]} x {image.shape[0]} where the camera has {size_px[0]} x {size_px[1]}"
+        return Fault(size, "frame-size")
     count = np.empty(256, dtype=np.int64)
-    _edge_kernels.levels(image, 8, 4, count)
+    _edge_kernels.grey_histogram(image, 8, 4, count)
     below = np.cumsum(count)
     low, high = (float(np.searchsorted(below, share * below[-1], side="right")) for share in (0.05, 0.95))
-    if high < 2.0 * LEAST_CONTRAST:
-        return f"too dark: 95 % of the pixels are no brighter than grey level {high:.0f} of 255"
-    _edge_kernels.levels(image, 4, 4, count)
+    if high < 2.0 * _LEAST_CONTRAST:
+        return Fault(f"too dark: 95 % of the pixels are no brighter than grey level {high:.0f} of 255", "frame-dark")
+    _edge_kernels.grey_histogram(image, 4, 4, count)
     if low > 250.0 or count[254:].sum() > 0.5 * count.sum():
-        return "saturated: more than half of the pixels are at full scale"
-    return ""
+        return Fault("saturated: more than half of the pixels are at full scale", "frame-saturated")
+    return NO_FAULT
 
 
 def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> HorizonLine:
@@ -149,16 +151,18 @@ def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> Ho
     fault = fault_of_frame(image, size_px)
     if fault:
         return no_horizon(fault)
-    place, sd, good = lasting_rises(image, lines)
-    refused = ""
-    if good.mean() < LEAST_SHARE:
-        share = f"{100.0 * good.mean():.0f} % of the scan lines cross one ({100 * LEAST_SHARE:.0f} % wanted)"
-        refused = f"no clear edge: {share}"
+    place, sd, good = _lasting_rises(image, lines)
+    refused = NO_FAULT
+    if good.mean() < _LEAST_SHARE:
+        share = f"{100.0 * good.mean():.0f} % of the scan lines cross one ({100 * _LEAST_SHARE:.0f} % needed)"
+        refused = Fault(f"no clear edge: {share}", "edge-not-clear")
     points = lines.origin_px + place[:, None] * lines.inward_px
-    return HorizonLine(points[good], lines.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), lines.index[good], refused)
+    return HorizonLine(
+        points[good], lines.inward_px[good], np.hypot(sd[good], _SD_FLOOR_PX), lines.index[good], refused
+    )
 
 
-def lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
+def _lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Place along each line, px inwards from its origin, its sd without floor, whether there is one."""
     n = len(lines.origin_px)
     grey, inside = _sampled(image, lines, round((lines.outer_px + lines.inner_px) / STEP_PX))
@@ -167,7 +171,7 @@ def lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArra
     _edge_kernels.sky_levels(grey, inside, span, level, scatter, first)
     noise = max(float(np.median(scatter)) / (0.6745 * np.sqrt(2.0)), 0.3)
     place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
-    limits = (span, int(3.0 / STEP_PX), LEAST_CONTRAST)
+    limits = (span, int(3.0 / STEP_PX), _LEAST_CONTRAST)
     _edge_kernels.first_rises(
         grey, inside, level, first, noise, float(np.median(level)), limits, STEP_PX, EDGE_PLACES, EDGE_BASES,
         place, sd, good,
@@ -184,17 +188,17 @@ def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
     lines : ScanLines
         With origins where the edge is expected; their lengths are not used.
     """
-    near = ScanLines(lines.origin_px, lines.inward_px, NEAR_PX, NEAR_PX, lines.index)
+    near = ScanLines(lines.origin_px, lines.inward_px, _NEAR_PX, _NEAR_PX, lines.index)
     grey, inside = _sampled(image, near, len(NEAR_ALONG))
     n = len(near.origin_px)
     place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
     if not n:
-        return no_horizon("")
-    # the noise, from samples so far apart that smoothing did not tie them together
+        return no_horizon(NO_FAULT)
+    # the noise, from samples so far apart that smoothing did not correlate them
     noise = max(float(np.median(np.abs(grey[:, 6] - grey[:, 0]))) / (0.6745 * np.sqrt(2.0)), 0.3)
-    _edge_kernels.steps_near(grey, inside, noise, LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, sd, good)
+    _edge_kernels.steps_near(grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, sd, good)
     points = near.origin_px + place[:, None] * near.inward_px
-    return HorizonLine(points[good], near.inward_px[good], np.hypot(sd[good], SD_FLOOR_PX), near.index[good])
+    return HorizonLine(points[good], near.inward_px[good], np.hypot(sd[good], _SD_FLOOR_PX), near.index[good])
 
 
 def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
@@ -206,7 +210,7 @@ def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, Bo
     low = np.clip(np.floor(ends.min(axis=0)).astype(int) - 4, 0, [w - 4, h - 4])
     high = np.clip(np.ceil(ends.max(axis=0)).astype(int) + 5, low + 4, [w, h])
     band = image[low[1] : high[1], low[0] : high[0]]
-    smooth = cv2.sepFilter2D(band, cv2.CV_32F, SMOOTHING, SMOOTHING)
+    smooth = cv2.sepFilter2D(band, cv2.CV_32F, _SMOOTHING, _SMOOTHING)
     n = len(lines.origin_px)
     grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
     size, corner = np.array([w, h], dtype=float), low.astype(float)
@@ -230,6 +234,6 @@ def _edge_bases(places: FloatArray, along: FloatArray) -> FloatArray:
 
 EDGE_PLACES: FloatArray = np.linspace(-1.5, 1.5, 31)
 EDGE_BASES = _edge_bases(EDGE_PLACES, np.linspace(-STEP_PX * EDGE_HALF, STEP_PX * EDGE_HALF, 2 * EDGE_HALF + 1))
-NEAR_ALONG: FloatArray = np.linspace(-NEAR_PX, NEAR_PX, round(2.0 * NEAR_PX / STEP_PX) + 1)
+NEAR_ALONG: FloatArray = np.linspace(-_NEAR_PX, _NEAR_PX, round(2.0 * _NEAR_PX / STEP_PX) + 1)
 NEAR_PLACES: FloatArray = np.linspace(-4.75, 4.75, 39)
 NEAR_BASES = _edge_bases(NEAR_PLACES, NEAR_ALONG)

@@ -1,23 +1,25 @@
-"""What one method says of the deflection, and what it leans on, so that methods can be weighed against each other.
+"""What does one method read of the deflection, and which uncertain inputs does it depend on?
 
-Every method reads the deflection with an error that is linear in named inputs that several methods share (the flow's
-angle, coefficients, masses, the accelerometer's errors) and in the swinging of the joint::
+Every method reads the deflection with an error that is linear in named inputs, which several methods share (the flow's
+angle, coefficients, masses, the accelerometer's errors), and in the oscillation of the joint::
 
     read(t) = theta(t) + A(t) theta''(t) - sum over inputs J_i(t) x_i + independent error,      x_i ~ N(0, 1)
 
-Each input is scaled to unit normals: ``J`` is the change of what is read per standard deviation that it is moved.
-Inputs with a history (wind, attitude) are many unit normals with their own spread over time. What two methods share is
-then correlated by having the same names, and nothing else needs saying. Of coefficients known to a tenth the readings
-are curved functions: their curvature shifts the mean of what the deflection may be and widens it.
+Each input is scaled to unit normals: ``J`` is the change of the reading per standard deviation of the input. An input
+with a history (wind, attitude) is many unit normals, each with its own course over time. Inputs of the same name are
+the same random variables in all methods: that is all of their correlation. The readings are curved functions of the
+worst known coefficient: the curvature shifts the mean of the deflection and widens it.
 
-The flow's error has three parts: what goes with the accelerometer's errors (found together by the reconstruction), what
-is left of the trajectory's, and the wind's. The last two do not turn with the vehicle: they are written in axes that do
-not roll, where the trajectory's forgets over `TRAJECTORY_TIME_S` and the wind's has a constant half and a half that
-forgets over `WIND_LENGTH_M` of altitude, as the reconstruction of the air takes it. The same goes for the density in
-the dynamic pressure, over `DENSITY_LENGTH_M`.
+The flow's error has three parts: that of the accelerometer's errors (estimated together with the attitude), the rest
+of the trajectory's, and the wind's. The last two do not roll with the vehicle: they are written in axes that do not
+roll. The trajectory's is a Gauss-Markov process with the correlation time `TRAJECTORY_TIME_S`; the wind's is half
+constant bias, half Gauss-Markov with the correlation length `WIND_LENGTH_M` of altitude, as in the reconstruction of
+the atmosphere; so is the density's in the dynamic pressure, with `DENSITY_LENGTH_M`.
 
-Accelerometer and gyros have clocks of their own, known to a millisecond or so: what swings is read that much late, and
-what the gyros carry from the accelerometer to the c.g. does not fit what it felt. The film's clock is told by both.
+Accelerometer and gyros have time biases of a millisecond or so: what oscillates is read late, and what the gyros carry
+from the accelerometer to the c.g. does not match the force. The camera's time bias is relative to both.
+
+Assumed: small errors, so that responses add; Gaussian priors of the stated standard deviations.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
-from estimators.loads import PulseData, carried
+from estimators.loads import FlightLoads
+from flightmodel import rotations
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
@@ -39,18 +42,18 @@ from flightmodel.vehicle import Vehicle
 CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0
 LIGHT_TIME_S = 2.5
 ACCELEROMETER, ATTITUDE, WIND, PRESSURE = "accelerometer", "BET attitude", "wind", "dynamic pressure"
-FILM_CLOCK, RATE_STEP_S = "film's clock", 0.005
-FORCE_CLOCK, RATE_CLOCK = "accelerometer's clock", "gyros' clock"
-CAMERA_PLANE = "camera's plane"
+CAMERA_TIME_BIAS, _RATE_STEP_S = "camera time bias", 0.005
+ACCELEROMETER_TIME_BIAS, GYRO_TIME_BIAS = "accelerometer time bias", "gyro time bias"
+CAMERA_PLANE = "camera clocking"
 Deflection = Callable[[FloatArray], FloatArray]
-SWING_WINDOW_S = 2.0  # about a period of the slow aerodynamic mode, over which the joint's swinging is averaged
-BODIES = ("aeroshell", "centerbody")
+_OSCILLATION_WINDOW_S = 2.0  # about a period of the slow aerodynamic mode, over which the joint's is averaged
+_BODIES = ("aeroshell", "centerbody")
 VEHICLE_INPUTS = (
     "C_A",
     "C_N",
     "C_m",
     "C_mq",
-    *(f"{body} {what}" for body in BODIES for what in ("mass", "c.g. station", "inertia")),
+    *(f"{body} {what}" for body in _BODIES for what in ("mass", "c.g. station", "inertia")),
     "initial offset y",
     "initial offset z",
 )
@@ -58,7 +61,7 @@ VEHICLE_INPUTS = (
 
 @dataclass(frozen=True)
 class Evidence:
-    """What one method read at the times it answers; see the module's equation.
+    """Readings of one method at the times it answers; see the module's equation.
 
     Parameters
     ----------
@@ -71,13 +74,13 @@ class Evidence:
     by_input : dict of str to (n, 2, k) float
         ``J``, rad per unit normal.
     independent_cov : (n, 2, 2) float
-        Of what no other sample and no other method shares, rad^2.
+        Error that no other sample and no other method shares, rad^2.
     averaged_s : float
-        Span over which readings may be averaged without loss of what they say.
+        Span over which readings may be averaged without loss of information, s.
     bend : (n, 2) float or None
-        Half the second derivative of the reading by its most uncertain input, rad; None where that is nothing.
-    clock_sd_s : float
-        How well the clock that ``time_s`` was read from is known against the gyros'; zero: it is theirs.
+        Half the second derivative of the reading by its most uncertain input, rad; None: negligible.
+    time_bias_sd_s : float
+        A priori sd of the time bias of ``time_s`` against the gyros' time tags, s; zero: the same clock.
     """
 
     method: str
@@ -87,13 +90,13 @@ class Evidence:
     by_input: dict[str, FloatArray]
     independent_cov: FloatArray
     averaged_s: float
-    bend: FloatArray | None = None
-    clock_sd_s: float = 0.0
+    half_curvature_rad: FloatArray | None = None
+    time_bias_sd_s: float = 0.0
 
     @property
     def mean_yz_rad(self) -> FloatArray:
-        """Mean ``(n, 2)`` of the deflection over what the inputs may be."""
-        return self.theta_yz_rad if self.bend is None else self.theta_yz_rad + self.bend
+        """Mean ``(n, 2)`` of the deflection over the inputs' distribution."""
+        return self.theta_yz_rad if self.half_curvature_rad is None else self.theta_yz_rad + self.half_curvature_rad
 
     @property
     def covariance(self) -> FloatArray:
@@ -101,54 +104,56 @@ class Evidence:
         total = self.independent_cov.copy()
         for response in self.by_input.values():
             total += response @ response.transpose(0, 2, 1)
-        if self.bend is not None:
-            total += 2.0 * self.bend[:, :, None] * self.bend[:, None, :]
+        if self.half_curvature_rad is not None:
+            total += 2.0 * self.half_curvature_rad[:, :, None] * self.half_curvature_rad[:, None, :]
         return total
 
 
-def flow_inputs(pulse: PulseData, use: BoolArray) -> dict[str, FloatArray]:
-    """Flow's error ``(n, 2, k)``, rad, per unit normal of each of its three parts."""
-    root = pulse.flow_root_rad[use]
-    wind = pulse.wind_flow_sd_rad[use]
-    left = pulse.flow_cov[use] - root @ root.transpose(0, 2, 1) - (wind**2)[:, None, None] * np.eye(2)
+def flow_inputs(loads: FlightLoads, use: BoolArray) -> dict[str, FloatArray]:
+    """Flow's error ``(n, 2, k)``, rad, per unit normal, by the name of each of its three parts."""
+    root = loads.flow_root_rad[use]
+    wind = loads.wind_flow_sd_rad[use]
+    left = loads.flow_cov[use] - root @ root.transpose(0, 2, 1) - (wind**2)[:, None, None] * np.eye(2)
     trajectory = np.sqrt(np.maximum(0.5 * np.trace(left, axis1=1, axis2=2), 0.0))
-    roll = _roll(pulse)[use]
+    roll = _roll(loads)[use]
     c, s = np.cos(roll), np.sin(roll)
     # body components of vectors that do not roll
-    turn = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=1)
+    body_from_fixed = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=1)
     return {
         ACCELEROMETER: root,
-        ATTITUDE: _turned(turn, trajectory[:, None] * correlation_root(pulse.time_s[use], TRAJECTORY_TIME_S)),
-        WIND: _turned(turn, wind[:, None] * sounding_correlation_root(pulse.altitude_m[use], WIND_LENGTH_M)),
+        ATTITUDE: _rolled(
+            body_from_fixed, trajectory[:, None] * correlation_root(loads.time_s[use], TRAJECTORY_TIME_S)
+        ),
+        WIND: _rolled(body_from_fixed, wind[:, None] * sounding_correlation_root(loads.altitude_m[use], WIND_LENGTH_M)),
     }
 
 
-def pressure_input(pulse: PulseData, use: BoolArray) -> FloatArray:
+def pressure_input(loads: FlightLoads, use: BoolArray) -> FloatArray:
     """Dynamic pressure's error ``(n, k)``, a fraction, per unit normal."""
-    relative = pulse.dynamic_pressure_sd_pa[use] / pulse.dynamic_pressure_pa[use]
-    return np.asarray(relative[:, None] * sounding_correlation_root(pulse.altitude_m[use], DENSITY_LENGTH_M))
+    relative = loads.dynamic_pressure_sd_pa[use] / loads.dynamic_pressure_pa[use]
+    return np.asarray(relative[:, None] * sounding_correlation_root(loads.altitude_m[use], DENSITY_LENGTH_M))
 
 
-def read_later(pulse: PulseData, use: BoolArray, force_s: float, rate_s: float) -> PulseData:
-    """Pulse with what accelerometer and gyros say so much later: as it is where their clocks are so late.
+def delayed(loads: FlightLoads, use: BoolArray, force_s: float, rate_s: float) -> FlightLoads:
+    """Loads with accelerometer and gyros read so much later, to first order: corrected for these time biases, s.
 
-    With the gyros' clock go the attitude, and so the flow's angle, and what carries the force from the accelerometer to
-    the c.g.; pressure and Mach number are too slow to tell.
+    With the gyros go the attitude, and so the flow's angle, and the lever-arm acceleration from the accelerometer to
+    the c.g.; pressure and Mach number change too slowly to matter.
     """
     if force_s == rate_s == 0.0 or np.count_nonzero(use) < 2:
-        return pulse
-    t = pulse.time_s[use]
+        return loads
+    t = loads.time_s[use]
 
     def later(values: FloatArray, late_s: float) -> FloatArray:
         out = values.copy()
         out[use] += late_s * CubicSpline(t, values[use])(t, 1)
         return out
 
-    force, flow = pulse.specific_force_body_mps2, pulse.flow_yz_rad
-    rate, turn = pulse.rate_body_radps, pulse.angular_acceleration_body_radps2
-    arm = carried(rate, turn, pulse.cg_from_sensor_m)
+    force, flow = loads.specific_force_body_mps2, loads.flow_yz_rad
+    rate, turn = loads.rate_body_radps, loads.angular_acceleration_body_radps2
+    arm = rotations.lever_arm_acceleration(rate, turn, loads.cg_from_sensor_m)
     return replace(
-        pulse,
+        loads,
         specific_force_body_mps2=later(force - arm, force_s) + later(arm, rate_s),
         flow_yz_rad=later(flow, rate_s),
         rate_body_radps=later(rate, rate_s),
@@ -156,32 +161,32 @@ def read_later(pulse: PulseData, use: BoolArray, force_s: float, rate_s: float) 
     )
 
 
-def _turned(turn: FloatArray, columns: FloatArray) -> FloatArray:
-    """Body components ``(n, 2, 2 k)`` of two like histories (n, k) in axes that do not roll."""
+def _rolled(body_from_fixed: FloatArray, columns: FloatArray) -> FloatArray:
+    """Body components ``(n, 2, 2 k)`` of two like histories (n, k), one an axis that does not roll."""
     n, k = columns.shape
-    return np.asarray(np.einsum("nij,nk->nijk", turn, columns).reshape(n, 2, 2 * k))
+    return np.asarray(np.einsum("nij,nk->nijk", body_from_fixed, columns).reshape(n, 2, 2 * k))
 
 
-def _roll(pulse: PulseData) -> FloatArray:
-    rate, step = pulse.rate_body_radps[:, 0], np.diff(pulse.time_s)
+def _roll(loads: FlightLoads) -> FloatArray:
+    rate, step = loads.rate_body_radps[:, 0], np.diff(loads.time_s)
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
 
 
 def offset_sd_m(vehicle: Vehicle) -> float:
-    """Initial offset's standard deviation, each axis, carried by the centerbody's c.g."""
-    masses = np.array([getattr(vehicle, name).mass_kg for name in BODIES])
+    """Standard deviation, m, of the initial c.g. offset, each axis, as a shift of the centerbody's c.g."""
+    masses = np.array([getattr(vehicle, name).mass_kg for name in _BODIES])
     return float(vehicle.uncertainty.cg_lateral_m * np.hypot(*masses) / masses[1])
 
 
 def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
     """Vehicle with its uncertain inputs moved by so many standard deviations, by the inputs' names.
 
-    Stated uncertainties of mass, c.g. and inertia are each body's own; lateral c.g.s of the two bodies act together as
-    the initial offset, carried by the centerbody.
+    Stated uncertainties of mass, c.g. and inertia are each body's own; the lateral c.g.s of both bodies act together as
+    the initial offset, taken as the centerbody's.
     """
     known, side = vehicle.uncertainty, offset_sd_m(vehicle)
     bodies = {}
-    for name in BODIES:
+    for name in _BODIES:
         body = getattr(vehicle, name)
         x, y, z = body.cg_from_datum_body_m
         x -= moved.get(f"{name} c.g. station", 0.0) * known.cg_station_m
@@ -213,14 +218,14 @@ def _scaling(vehicle: Vehicle, moved: dict[str, float]) -> tuple[float, float, f
     return ca, cn, cm, moved.get("C_mq", 0.0) * known.cmq
 
 
-def evidence_of_history(history: DeflectionHistory, clock_sd_s: float = 0.0, plane_sd_rad: float = 0.0) -> Evidence:
-    """Evidence from a history alone, e.g. the camera's, whose clock may be off by ``clock_sd_s``.
+def evidence_of_history(history: DeflectionHistory, time_bias_sd_s: float = 0.0, plane_sd_rad: float = 0.0) -> Evidence:
+    """Evidence from a history alone, e.g. the camera's, with a time bias of ``time_bias_sd_s``.
 
-    All its planes may be turned together by ``plane_sd_rad``: as by a camera that is clocked otherwise than it is told.
+    All its planes have a common error of ``plane_sd_rad``: a camera clocked otherwise than the vehicle file states.
 
-    Of what a history's errors share from sample to sample its covariance says nothing. `CONSTANT_PART` is taken as one
-    error in all samples (orientation, benchmark), the rest as one that forgets over `LIGHT_TIME_S` (light, which turns
-    with the vehicle); nothing averages out from frame to frame.
+    A history's covariance does not state how its errors are correlated in time. `CONSTANT_PART` of the variance is
+    taken as a constant bias (orientation, benchmark), the rest as Gauss-Markov with the correlation time `LIGHT_TIME_S`
+    (light, which rolls with the vehicle); nothing averages out from frame to frame.
     """
     cov = history.lateral_cov
     known = np.isfinite(history.theta_rad) & np.isfinite(cov[:, 0, 0])
@@ -228,10 +233,10 @@ def evidence_of_history(history: DeflectionHistory, clock_sd_s: float = 0.0, pla
     value, axes = np.linalg.eigh(cov)
     # symmetric square root: smooth in time whatever the order of the eigenvalues
     root = (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
-    inputs = {history.method: _turned(root, correlation_root(time_s, LIGHT_TIME_S, CONSTANT_PART))}
+    inputs = {history.method: _rolled(root, correlation_root(time_s, LIGHT_TIME_S, CONSTANT_PART))}
     if plane_sd_rad > 0.0:
-        across = np.stack([-theta_yz[:, 1], theta_yz[:, 0]], axis=-1)
-        inputs[CAMERA_PLANE] = plane_sd_rad * across[:, :, None]
+        normal = np.stack([-theta_yz[:, 1], theta_yz[:, 0]], axis=-1)
+        inputs[CAMERA_PLANE] = plane_sd_rad * normal[:, :, None]
     return Evidence(
         history.method,
         time_s,
@@ -240,66 +245,67 @@ def evidence_of_history(history: DeflectionHistory, clock_sd_s: float = 0.0, pla
         inputs,
         np.zeros_like(cov),
         averaged_s=float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0,
-        clock_sd_s=clock_sd_s,
+        time_bias_sd_s=time_bias_sd_s,
     )
 
 
 def moved_evidence(one: Evidence, inputs: dict[str, FloatArray], about: Deflection | None = None) -> Evidence:
     """Evidence of a method whose readings are linear in their inputs, with these moved.
 
-    A clock that is late by ``late`` read ``theta(t - late)`` at what it calls ``t``: its times are moved, and what is
-    left of its error enters by the rate of the deflection ``about`` (from times to lateral vectors) at those.
+    With a time bias ``b`` the reading tagged ``t`` is ``theta(t - b)``: its times are moved, and the rest of the bias
+    enters by the rate of the deflection ``about`` (from times to lateral vectors) at those.
     """
-    linear = {name: j for name, j in one.by_input.items() if name != FILM_CLOCK}
+    linear = {name: j for name, j in one.by_input.items() if name != CAMERA_TIME_BIAS}
     change = sum((j @ inputs[name] for name, j in linear.items() if name in inputs), np.zeros(2))
     moved = replace(one, theta_yz_rad=one.theta_yz_rad + change)
-    if one.clock_sd_s == 0.0:
+    if one.time_bias_sd_s == 0.0:
         return moved
-    time_s = one.time_s - one.clock_sd_s * float(inputs.get(FILM_CLOCK, np.zeros(1))[0])
+    time_s = one.time_s - one.time_bias_sd_s * float(inputs.get(CAMERA_TIME_BIAS, np.zeros(1))[0])
     if about is None:
         return replace(moved, time_s=time_s)
-    rate = (about(time_s + RATE_STEP_S) - about(time_s - RATE_STEP_S)) / (2.0 * RATE_STEP_S)
-    return replace(moved, time_s=time_s, by_input=linear | {FILM_CLOCK: one.clock_sd_s * rate[:, :, None]})
+    rate = (about(time_s + _RATE_STEP_S) - about(time_s - _RATE_STEP_S)) / (2.0 * _RATE_STEP_S)
+    return replace(moved, time_s=time_s, by_input=linear | {CAMERA_TIME_BIAS: one.time_bias_sd_s * rate[:, :, None]})
 
 
-def history_of_evidence(evidence: Evidence, pulse: PulseData, assumptions: str) -> DeflectionHistory:
+def history_of_evidence(evidence: Evidence, loads: FlightLoads, assumptions: str) -> DeflectionHistory:
     """History of a method by itself, sample by sample: NaN where it has no answer.
 
-    The joint's swinging is bounded: by the rms of the readings' own curvature over `SWING_WINDOW_S`.
+    The term of the joint's oscillation is bounded by the rms of the readings' own second derivative over
+    `_OSCILLATION_WINDOW_S`.
     """
-    rows = np.searchsorted(pulse.time_s, evidence.time_s)
-    theta_yz, cov = np.full((len(pulse.time_s), 2), np.nan), np.full((len(pulse.time_s), 2, 2), np.nan)
+    rows = np.searchsorted(loads.time_s, evidence.time_s)
+    theta_yz, cov = np.full((len(loads.time_s), 2), np.nan), np.full((len(loads.time_s), 2, 2), np.nan)
     theta_yz[rows] = evidence.mean_yz_rad
-    cov[rows] = evidence.covariance + _swing_var(evidence)[:, None, None] * np.eye(2)
-    return history_from_lateral(pulse.time_s, theta_yz, cov, evidence.method, assumptions)
+    cov[rows] = evidence.covariance + _oscillation_var(evidence)[:, None, None] * np.eye(2)
+    return history_from_lateral(loads.time_s, theta_yz, cov, evidence.method, assumptions)
 
 
-def _swing_var(evidence: Evidence) -> FloatArray:
+def _oscillation_var(evidence: Evidence) -> FloatArray:
     t, theta_yz = evidence.time_s, evidence.theta_yz_rad
     if len(t) < 5:
         return np.zeros(len(t))
     second = np.gradient(np.gradient(theta_yz, t, axis=0), t, axis=0)
-    window = max(1, round(SWING_WINDOW_S / float(np.median(np.diff(t)))))
+    window = max(1, round(_OSCILLATION_WINDOW_S / float(np.median(np.diff(t)))))
     mean_square = uniform_filter1d(np.sum(second**2, axis=1), window, mode="nearest")
     return np.asarray(0.5 * mean_square * np.mean(np.sum(evidence.by_acceleration_s2**2, axis=2), axis=1))
 
 
-def corrected_pulse(pulse: PulseData, use: BoolArray, inputs: dict[str, FloatArray]) -> PulseData:
-    """Pulse with its inputs as they are where they are so many standard deviations off what was told.
+def corrected_loads(loads: FlightLoads, use: BoolArray, inputs: dict[str, FloatArray]) -> FlightLoads:
+    """Loads corrected for inputs that are so many standard deviations off their stated values.
 
-    Histories of flow inputs are defined on the samples in ``use`` alone; the others stay.
+    Flow inputs with a history are defined on the samples in ``use`` alone; the other samples stay.
     """
-    flow, force = pulse.flow_yz_rad.copy(), pulse.specific_force_body_mps2.copy()
-    for name, part in flow_inputs(pulse, use).items():
+    flow, force = loads.flow_yz_rad.copy(), loads.specific_force_body_mps2.copy()
+    for name, part in flow_inputs(loads, use).items():
         flow[use] += part @ inputs.get(name, np.zeros(part.shape[2]))
-    force[use] += pulse.force_root_mps2[use] @ inputs.get(ACCELEROMETER, np.zeros(9))
-    pressure = pulse.dynamic_pressure_pa.copy()
+    force[use] += loads.force_root_mps2[use] @ inputs.get(ACCELEROMETER, np.zeros(9))
+    pressure = loads.dynamic_pressure_pa.copy()
     if PRESSURE in inputs:
-        pressure[use] *= 1.0 + pressure_input(pulse, use) @ inputs[PRESSURE]
-    late = [float(inputs[name][0]) if name in inputs else 0.0 for name in (FORCE_CLOCK, RATE_CLOCK)]
-    moved = replace(pulse, flow_yz_rad=flow, specific_force_body_mps2=force)
+        pressure[use] *= 1.0 + pressure_input(loads, use) @ inputs[PRESSURE]
+    bias = [float(inputs[name][0]) if name in inputs else 0.0 for name in (ACCELEROMETER_TIME_BIAS, GYRO_TIME_BIAS)]
+    moved = replace(loads, flow_yz_rad=flow, specific_force_body_mps2=force)
     return replace(
-        read_later(moved, use, late[0] * pulse.force_clock_sd_s, late[1] * pulse.rate_clock_sd_s),
+        delayed(moved, use, bias[0] * loads.accelerometer_time_bias_sd_s, bias[1] * loads.gyro_time_bias_sd_s),
         dynamic_pressure_pa=np.maximum(pressure, 1e-3),
-        vehicle=moved_vehicle(pulse.vehicle, {k: float(v[0]) for k, v in inputs.items() if k in VEHICLE_INPUTS}),
+        vehicle=moved_vehicle(loads.vehicle, {k: float(v[0]) for k, v in inputs.items() if k in VEHICLE_INPUTS}),
     )

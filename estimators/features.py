@@ -1,22 +1,25 @@
-"""Where do the marks painted on the shell, gore seams and photogrammetry dots, appear in a frame?
+"""Where do the features painted on the shell, gore seams and photogrammetry dots, appear in a frame?
 
-Each mark is measured along one direction in the picture: a piece of a seam across it, a dot along rows and along
-columns. The marks that a camera can see are chosen once, on the unbent shell: those that face it and that no torus and
-no part of the centerbody hides. In a frame they are looked for a few pixels around where a first fit of the edge
-expects them; a mark is taken where the grey level dips clearly below the line between the ends of its profile, and its
-place is the dip's centroid (`estimators._edge_kernels.dark_centres`).
+Each feature is measured along one direction in the picture: a piece of a seam across it, a dot along rows and along
+columns. The features in view are chosen once, on the undeflected shell: those that face the camera and that no torus
+and no part of the centerbody hides. In a frame they are looked for a few pixels around their prediction by a first fit;
+a feature is taken where the grey level dips clearly below the line between the ends of its profile, and its place is
+the dip's centroid,
 
-Assumed: marks darker than the cloth. Marks that are not there, or drowned in noise, give no measurement and no harm.
+    place = sum over x of x dip(x) / sum over x of dip(x).
 
-Where does the pattern of marks fit a frame, when it may be anywhere within degrees?
+Where the prediction may be off by degrees, the parameters (the camera's pose, or the deflection) at which all features
+fit are searched (`fit_feature_map`). This needs no edge: behind the rim may be the Earth, whose limb and clouds are
+edges too, while seams and dots are nowhere but on the shell. The frame is transformed to the darkness of each pixel
+against its surroundings (black hat), blurred: the feature map; the score of a hypothesis is the map's mean at the
+projected features. The maximum is found by the cross-entropy method, from wide to narrow and from a coarse blur to a
+fine one: draws from a normal distribution, which then moves to the best of them.
 
-A search over parameters (the camera's pose, or the bending) that needs no edge: behind the rim may be the Earth, whose
-limb and clouds are edges too, while seams and dots are nowhere but on the shell. The frame is turned into a picture of
-how much darker each pixel is than its surroundings (black hat), blurred; the score of a hypothesis is the mean of that
-picture at the projected marks. The maximum is found by the cross-entropy method, from wide to narrow and from a coarse
-blur to a fine one: draws from a normal distribution, which then moves to the best of them.
+Assumed: features darker than the cloth. One that is not painted, or lost in noise, gives no measurement and no harm.
 
-Sources: R. Y. Rubinstein, D. P. Kroese, "The Cross-Entropy Method", 2004.
+References
+----------
+R. Y. Rubinstein, D. P. Kroese, "The Cross-Entropy Method", 2004.
 """
 
 from __future__ import annotations
@@ -34,26 +37,35 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.geometry import aft_profile, dot_positions, revolved, seam_clocks_rad, torus_circles
 
 Image = NDArray[np.uint8]
+Pixels = Callable[[FloatArray], FloatArray]
+"""From parameters ``(k,)`` to the features' pixels ``(n, 2)``, NaN outside the lens's field."""
 
-LEAST_FACING = 0.3
-HALF_SEAM_M, HALF_DOT_M = 0.006, 0.011
-SEAM_STEP_PX = 10.0
-SD_FLOOR_PX = 0.05
-BORDER_PX = 12.0
+_LEAST_FACING = 0.3
+_HALF_SEAM_M, _HALF_DOT_M = 0.006, 0.011
+_SEAM_STEP_PX = 10.0
+_SD_FLOOR_PX = 0.05
+_BORDER_PX = 12.0
+# the search of the feature map
+_HAT_PX = 17
+_BLURS_PX = (9.0, 9.0, 6.0, 4.0, 3.0, 2.0, 2.0)
+_DRAWS, _ELITE = 240, 16
+_NARROWEST, _FARTHEST_SD = 0.02, 2.5
+_DARKEST = 30.0
+_LEAST_RISE, _OTHERS = 3.0, 60
 
 
 @dataclass(frozen=True)
-class Marks:
-    """Marks that a camera can see, one row a direction in which one is measured.
+class ImageFeatures:
+    """Features in the camera's view, one row a direction in which one is measured.
 
     Parameters
     ----------
     points_shell_m : (n, 3) float
-        On the unbent shell, from the datum.
+        On the undeflected shell, from the datum.
     across_px : (n, 2) float
         Unit vectors in the picture.
     half_width_px : (n,) int
-        How far from its middle a mark is dark, blur included.
+        How far from its middle a feature is dark, blur included.
     is_dot : (n,) bool
     """
 
@@ -63,26 +75,26 @@ class Marks:
     is_dot: BoolArray
 
     def find(self, image: Image, expected_px: FloatArray, reach_px: int, noise: float) -> tuple[FloatArray, FloatArray]:
-        """Distance ``(n,)`` of each mark from where it is expected ``(n, 2)``, along its direction, and its sd, px.
+        """Distance ``(n,)`` of each feature from its prediction ``(n, 2)``, along its direction, and its sd, px.
 
         The sd is infinite where there is none within ``reach_px``.
         """
         offset, sd = np.zeros(len(expected_px)), np.full(len(expected_px), np.inf)
         _edge_kernels.dark_centres(image, expected_px, self.across_px, reach_px, self.half_width_px, noise, offset, sd)
-        return offset, np.hypot(sd, SD_FLOOR_PX)
+        return offset, np.hypot(sd, _SD_FLOOR_PX)
 
 
-def visible_marks(view: VirtualCamera) -> Marks:
-    """Choose the marks on the unbent shell that a camera sees well inside its picture."""
+def visible_features(view: VirtualCamera) -> ImageFeatures:
+    """Features of the undeflected shell well inside the camera's picture."""
     rows: list[tuple[FloatArray, FloatArray, FloatArray, bool]] = []
     geometry, focal = view.geometry, float(view.camera.focal_px.mean())
     profile = aft_profile(geometry)
     for clock in seam_clocks_rad(geometry):
         curve = revolved(profile, clock)
-        seen = _seen(view, curve, _aft_normals(profile, clock))
+        in_view = _in_view(view, curve, _aft_normals(profile, clock))
         pixels = view.sight(curve, np.zeros(3)).pixels
         along = np.gradient(pixels, axis=0)
-        pieces = _spaced(pixels, seen & np.isfinite(along).all(axis=1), SEAM_STEP_PX)
+        pieces = _spaced(pixels, in_view & np.isfinite(along).all(axis=1), _SEAM_STEP_PX)
         tangent = along[pieces]
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
         rows.append(
@@ -94,15 +106,15 @@ def visible_marks(view: VirtualCamera) -> Marks:
     outboard = dots * np.array([0.0, 1.0, 1.0])
     outboard /= np.linalg.norm(outboard, axis=1, keepdims=True)
     normals = -np.cos(half) * outboard - np.sin(half) * np.array([1.0, 0.0, 0.0])
-    dots = dots[_seen(view, dots, normals)]
+    dots = dots[_in_view(view, dots, normals)]
     for axis in np.eye(2):
         rows.append((dots, np.tile(axis, (len(dots), 1)), _away(view, dots), True))
     points = np.concatenate([r[0] for r in rows])
     across = np.concatenate([r[1] for r in rows])
     is_dot = np.concatenate([np.full(len(r[0]), r[3]) for r in rows])
-    size_m = np.where(is_dot, HALF_DOT_M, HALF_SEAM_M)
+    size_m = np.where(is_dot, _HALF_DOT_M, _HALF_SEAM_M)
     half_width = np.ceil(focal * size_m / np.concatenate([r[2] for r in rows]) + 2.0).astype(np.int64)
-    return Marks(points, across, half_width, is_dot)
+    return ImageFeatures(points, across, half_width, is_dot)
 
 
 def _away(view: VirtualCamera, points: FloatArray) -> FloatArray:
@@ -115,88 +127,77 @@ def _aft_normals(profile: FloatArray, clock_lv_rad: float) -> FloatArray:
     along = np.gradient(profile, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     # outwards along the meridian, the free side lies to the left: aft of it
-    turned = np.column_stack([along[:, 1], -along[:, 0]])
-    return revolved(turned, clock_lv_rad)
+    normal = np.column_stack([along[:, 1], -along[:, 0]])
+    return revolved(normal, clock_lv_rad)
 
 
-def _spaced(pixels: FloatArray, seen: BoolArray, step_px: float) -> NDArray[np.intp]:
-    """Indices of seen points at least ``step_px`` apart along a curve."""
+def _spaced(pixels: FloatArray, visible: BoolArray, step_px: float) -> NDArray[np.intp]:
+    """Indices of visible points at least ``step_px`` apart along a curve."""
     chosen: list[int] = []
-    for k in np.flatnonzero(seen):
+    for k in np.flatnonzero(visible):
         if not chosen or np.hypot(*(pixels[k] - pixels[chosen[-1]])) >= step_px:
             chosen.append(int(k))
     return np.array(chosen, dtype=np.intp)
 
 
-def _seen(view: VirtualCamera, points: FloatArray, normals: FloatArray) -> BoolArray:
-    """Whether points ``(n, 3)`` of the unbent shell with outward normals face the camera, unhidden, in the picture."""
+def _in_view(view: VirtualCamera, points: FloatArray, normals: FloatArray) -> BoolArray:
+    """Whether points ``(n, 3)`` of the undeflected shell with outward normals are visible in the picture."""
     eye = view.camera.position_body_m
     sight: Sight = view.sight(points, np.zeros(3))
-    inside = np.isfinite(sight.pixels[:, 0]) & view.camera.is_inside(np.nan_to_num(sight.pixels, nan=-1e6), BORDER_PX)
+    inside = np.isfinite(sight.pixels[:, 0]) & view.camera.is_inside(np.nan_to_num(sight.pixels, nan=-1e6), _BORDER_PX)
     towards = eye - points
     distance = np.linalg.norm(towards, axis=1)
-    facing = np.einsum("ni,ni->n", normals, towards) / distance > LEAST_FACING
-    seen = inside & facing
+    facing = np.einsum("ni,ni->n", normals, towards) / distance > _LEAST_FACING
+    visible = inside & facing
     share = np.linspace(0.04, 0.97, 80)[:, None, None]
-    way = points[seen] + share * towards[seen]
+    way = points[visible] + share * towards[visible]
     station, radius = torus_circles(view.geometry)
     s, r = -way[..., 0], np.hypot(way[..., 1], way[..., 2])
-    clear = np.ones(int(seen.sum()), dtype=np.bool_)
+    clear = np.ones(int(visible.sum()), dtype=np.bool_)
     for s_i, r_i in zip(station, radius, strict=True):
         clear &= (np.hypot(s - s_i, r - r_i) > view.geometry.torus_minor_radius_m).all(axis=0)
     # the lens may sit on the skin itself
     skin = min(view.geometry.centerbody_radius_m, float(np.hypot(eye[1], eye[2])) - 1e-3)
     clear &= (r > skin).all(axis=0)
-    seen[seen] = clear
-    return np.asarray(seen)
+    visible[visible] = clear
+    return np.asarray(visible)
 
 
-Pixels = Callable[[FloatArray], FloatArray]
-"""From parameters ``(k,)`` to the marks' pixels ``(n, 2)``, NaN outside the lens's field."""
-
-HAT_PX = 17
-BLURS_PX = (9.0, 9.0, 6.0, 4.0, 3.0, 2.0, 2.0)
-DRAWS, ELITE = 240, 16
-NARROWEST, FARTHEST_SD = 0.02, 2.5
-DARKEST = 30.0
-LEAST_RISE, OTHERS = 3.0, 60
-
-
-def fitted_pattern(image: Image, pixels: Pixels, starts: list[FloatArray], sd: FloatArray) -> FloatArray | None:
-    """Parameters ``(k,)`` at which the marks fit a frame best; None where no place stands out.
+def fit_feature_map(image: Image, pixels: Pixels, starts: list[FloatArray], sd: FloatArray) -> FloatArray | None:
+    """Parameters ``(k,)`` at which the features fit a frame best; None where no maximum is significant.
 
     Parameters
     ----------
     image : (h, w) uint8
     pixels : callable
     starts : list of (k,) float
-        Where to look, each the mean of a normal distribution; the best of all is taken.
+        Where to search, each the mean of a normal distribution; the best of all is taken.
     sd : (k,) float
     """
-    hat = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (HAT_PX, HAT_PX))
+    hat = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_HAT_PX, _HAT_PX))
     smooth = cv2.GaussianBlur(image, (0, 0), 1.2)
     dark = cv2.morphologyEx(smooth, cv2.MORPH_BLACKHAT, hat).astype(np.float32)
-    # a mark is a mark, however strong: deep shadows between tori must not outweigh it
-    dark = np.minimum(dark, DARKEST)
-    scores = [cv2.GaussianBlur(dark, (0, 0), blur) for blur in BLURS_PX]
+    # all features weigh alike, however dark: deep shadows between tori must not outweigh them
+    dark = np.minimum(dark, _DARKEST)
+    scores = [cv2.GaussianBlur(dark, (0, 0), blur) for blur in _BLURS_PX]
     rng = np.random.default_rng(0)
     found = []
     for start in starts:
         centre, spread = start.copy(), sd.copy()
         for score in scores:
-            drawn = centre + spread * rng.standard_normal((DRAWS, len(sd)))
+            drawn = centre + spread * rng.standard_normal((_DRAWS, len(sd)))
             drawn[0] = centre
-            # not beyond what is held possible, where all marks may come together on one dark spot
-            drawn = np.clip(drawn, start - FARTHEST_SD * sd, start + FARTHEST_SD * sd)
+            # not beyond the prior, where all features may come together on one dark spot
+            drawn = np.clip(drawn, start - _FARTHEST_SD * sd, start + _FARTHEST_SD * sd)
             values = np.array([_score(score, pixels(p)) for p in drawn])
-            best = drawn[np.argsort(-values)[:ELITE]]
-            centre, spread = best.mean(axis=0), np.maximum(best.std(axis=0), NARROWEST * sd)
+            best = drawn[np.argsort(-values)[:_ELITE]]
+            centre, spread = best.mean(axis=0), np.maximum(best.std(axis=0), _NARROWEST * sd)
         found.append((_score(scores[-1], pixels(centre)), centre))
     highest, where = max(found, key=lambda pair: pair[0])
-    others = [_score(scores[-1], pixels(p)) for p in starts[0] + sd * rng.standard_normal((OTHERS, len(sd)))]
+    others = [_score(scores[-1], pixels(p)) for p in starts[0] + sd * rng.standard_normal((_OTHERS, len(sd)))]
     usual = float(np.median(others))
     scatter = 1.4826 * float(np.median(np.abs(np.array(others) - usual)))
-    return where if highest - usual > LEAST_RISE * scatter else None
+    return where if highest - usual > _LEAST_RISE * scatter else None
 
 
 def _score(picture: NDArray[np.float32], pixels: FloatArray) -> float:

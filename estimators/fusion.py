@@ -1,19 +1,23 @@
-"""What was the deflection, given all that was read of it at once? One posterior for angle and plane over the pulse.
+"""What was the deflection, given all readings at once? One posterior for angle and plane over the pressure pulse.
 
-Unknown are the deflection's history, a cubic spline of its lateral vector whose second derivative is white (the joint
-as a second-order process of which only the size is taken as known), and every input that the methods lean on
+Unknown are the deflection's history, a cubic spline of its lateral vector with a white second derivative at its knots
+(the joint as a second-order process of known size), and every input on which the methods depend
 (`estimators.evidence`). Readings and priors are Gaussian and linear in both::
 
     read(t) = theta(t) + A(t) theta''(t) - J(t) x + e,     theta'' ~ N(0, ACCELERATION_SD^2) a knot,     x ~ N(0, 1)
 
-so that the posterior is one least-squares problem, solved again with the readings taken at the inputs just found until
-these settle (Gauss and Newton's): a smoother with the deflection as its state, in which what methods
-share is correlated and what one method learns of an input helps the others. Its covariance is the Cramer-Rao bound of
-the same data and priors. One method alone gives that method's own smooth history.
+so the posterior is one least-squares problem: its normal equations are solved (`NormalEquations`), again with the
+readings taken at the inputs just estimated, until these settle (Gauss-Newton). It is a smoother with the deflection as
+its state, in which shared errors are correlated and an input observed by one method improves the others. Its covariance
+is the Cramer-Rao bound of the same data and priors. One method alone gives that method's own smooth history.
 
-Normal equations of the fusion: a cubic spline for the deflection's lateral vector, unit normals for every input.
+Assumed: Gaussian errors; neglected terms of the methods' equations as `LEFT_OUT_RAD`, decorrelated after
+`LEFT_OUT_TIME_S`; a prior of the deflection's size so wide that it carries no information.
 
-A prior holds the spline's second derivative at its knots white, and says next to nothing of the deflection's size.
+References
+----------
+B. D. Tapley, B. E. Schutz, G. H. Born, "Statistical Orbit Determination", 2004, chapter 4 (least squares with a priori
+information).
 """
 
 from __future__ import annotations
@@ -29,32 +33,39 @@ from scipy.linalg.lapack import dpotri
 from scipy.ndimage import uniform_filter1d
 
 from estimators.evidence import (
-    FILM_CLOCK,
+    CAMERA_TIME_BIAS,
     LIGHT_TIME_S,
     Deflection,
     Evidence,
-    corrected_pulse,
+    corrected_loads,
     evidence_of_history,
     moved_evidence,
 )
-from estimators.loads import PulseData
+from estimators.loads import FlightLoads
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
 
-KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its swinging
-# of the joint, at each knot; three of it are 1 deg of swinging at the joint's 2.85 Hz, 20 deg at the slow aerodynamic
-# mode's 0.65 Hz, so that swinging is no reason to believe in other inputs
+KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its oscillation
+# of the joint, at each knot; three of it are 1 deg of oscillation at the joint's 2.85 Hz, 20 deg at the slow
+# aerodynamic mode's 0.65 Hz, so that an oscillation is not taken for an error of other inputs
 ACCELERATION_SD_RADPS2 = 2.0
-SIZE_SD_RAD = 1.0  # of the deflection itself: says nothing
-# what the methods' equations leave out, second order in the angles and gusts shorter than the wind's knots: with true
-# inputs 0.01 to 0.02 deg rms over the pulses of thirty flights, forgotten within half a second
+SIZE_SD_RAD = 1.0  # of the deflection itself: no information
+# neglected by the methods' equations, second order in the angles and gusts shorter than the wind's knots: with true
+# inputs 0.01 to 0.02 deg rms over the pulses of thirty flights, decorrelated within half a second
 LEFT_OUT_RAD, LEFT_OUT_TIME_S = np.deg2rad(0.02), 0.4
+LEAST_SAMPLES = 8
+_MOST_INPUT_SD, SETTLED_SD, MOST_STEPS, _WHOLE_STEPS = 8.0, 0.05, 30, 4
+_NEAR_S = 0.5  # an answer is given no further from a reading
+_BIAS_STEP_S, _FARTHEST_BIAS_SD = 0.01, 3.0
+MOVES = 1.75  # rms rate of the deflection over its sd; of noise alone it is 1
+_SMOOTH_RATE_HZ = 50.0
 Inputs = dict[str, FloatArray]
+Read = Callable[[Inputs, Deflection | None], list[Evidence]]
 
 
 @dataclass(frozen=True)
-class Learnt:
-    """What readings say of all inputs: ``mean`` (k,) and ``covariance`` (k, k) of their unit normals, by place."""
+class InputPosterior:
+    """Posterior of all inputs: ``mean`` (k,) and ``covariance`` (k, k) of their unit normals, ``place`` of each."""
 
     mean: FloatArray
     covariance: FloatArray
@@ -71,7 +82,7 @@ class Spline:
 
     @classmethod
     def over(cls, low: float, high: float) -> Spline:
-        """Return the spline whose knots reach from ``low`` to ``high``, s."""
+        """Spline whose knots reach from ``low`` to ``high``, s."""
         inner = low + KNOT_S * np.arange(int(np.ceil((high - low) / KNOT_S)) + 1)
         full = np.concatenate([inner[0] - KNOT_S * np.arange(3, 0, -1), inner, inner[-1] + KNOT_S * np.arange(1, 4)])
         return cls(np.asarray(inner), len(full) - 4, np.asarray(full))
@@ -85,7 +96,7 @@ class Spline:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of the deflection's spline (y, then z) and of the inputs; where each input's normals stand."""
+    """Normal equations of the deflection's spline (y, then z) and of the inputs' unit normals, at ``place``."""
 
     spline: Spline
     place: dict[str, slice]
@@ -93,26 +104,26 @@ class NormalEquations:
     right: FloatArray
 
     @classmethod
-    def of(cls, told: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> NormalEquations:
-        """Return the equations of what methods read at ``inputs``; the spline reaches over ``span_s``."""
+    def of(cls, readings: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> NormalEquations:
+        """Equations of the methods' readings at ``inputs``; the spline reaches over ``span_s``."""
         spline = Spline.over(*span_s)
         place: dict[str, slice] = {}
         total = 0
-        for name, response in (item for e in told for item in e.by_input.items()):
+        for name, response in (item for e in readings for item in e.by_input.items()):
             if name not in place:
                 place[name] = slice(total, total + response.shape[2])
                 total = place[name].stop
         size = 2 * spline.count
         normal, right = np.zeros((size + total,) * 2), np.zeros(size + total)
-        for one in told:
+        for one in readings:
             rows, want = whitened(one, spline, place, inputs)
             normal += rows.T @ rows
             right += rows.T @ want
         curvature = spline.rows(spline.knots_s, 2) / ACCELERATION_SD_RADPS2
-        bending = curvature.T @ curvature + np.eye(spline.count) / SIZE_SD_RAD**2
+        smooth = curvature.T @ curvature + np.eye(spline.count) / SIZE_SD_RAD**2
         for axis in range(2):
             part = slice(axis * spline.count, (axis + 1) * spline.count)
-            normal[part, part] += bending
+            normal[part, part] += smooth
         normal[range(size, len(right)), range(size, len(right))] += 1.0
         return cls(spline, place, normal, right)
 
@@ -135,19 +146,21 @@ class NormalEquations:
         try:
             return np.asarray(cho_factor(self.normal)[0])
         except np.linalg.LinAlgError:
-            raise DivergenceError(f"{method}: the readings do not determine the deflection") from None
+            raise DivergenceError(
+                f"{method}: the readings do not determine the deflection", code="deflection-undetermined"
+            ) from None
 
 
 def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inputs) -> tuple[FloatArray, FloatArray]:
-    """Rows ``(2 n, unknowns)`` of the least-squares problem and what they should give, errors of unit variance."""
+    """Rows ``(2 n, unknowns)`` of the least-squares problem and their right-hand side, errors of unit variance."""
     keep = np.isfinite(one.theta_yz_rad).all(axis=1)
     n, m = int(keep.sum()), spline.count
     value, second = spline.rows(one.time_s[keep]), spline.rows(one.time_s[keep], 2)
-    swing = one.by_acceleration_s2[keep]
+    inertial = one.by_acceleration_s2[keep]
     rows = np.zeros((n, 2, 2 * m + max((p.stop for p in place.values()), default=0)))
     for axis in range(2):
         for other in range(2):
-            rows[:, axis, other * m : (other + 1) * m] = swing[:, axis, other, None] * second
+            rows[:, axis, other * m : (other + 1) * m] = inertial[:, axis, other, None] * second
         rows[:, axis, axis * m : (axis + 1) * m] += value
     want = one.theta_yz_rad[keep].copy()
     for name, every in one.by_input.items():
@@ -172,46 +185,36 @@ def means_over_spans(time_s: FloatArray, width_s: float, from_s: float) -> Float
     return out
 
 
-LEAST_SAMPLES = 8
-MOST_INPUT_SD, SETTLED_SD, MOST_STEPS, WHOLE_STEPS = 8.0, 0.05, 30, 4
-NEAR_S = 0.5  # an answer is given no further from a reading
-CLOCK_STEP_S, FARTHEST_CLOCK_SD = 0.01, 3.0
-MOVES = 1.75  # rms rate of the deflection against its sd; of noise alone it is 1
-SMOOTH_RATE_HZ = 50.0
-
-Read = Callable[[Inputs, Deflection | None], list[Evidence]]
-
-
 class Method(Protocol):
-    """Reads the deflection from a pulse where a mask says, linear about a deflection; inputs' responses on demand."""
+    """Reads the deflection where a mask is set, linear about a deflection; the inputs' responses on demand."""
 
     def __call__(
-        self, pulse: PulseData, use: BoolArray, about_yz_rad: FloatArray | None, *, with_inputs: bool = True
+        self, loads: FlightLoads, use: BoolArray, about_yz_rad: FloatArray | None, *, with_inputs: bool = True
     ) -> Evidence:
-        """Return what it reads."""
+        """Readings of the method."""
 
 
 @dataclass(frozen=True)
 class Fused:
-    """Posterior of the deflection and of what the methods lean on.
+    """Posterior of the deflection and of the inputs on which the methods depend.
 
     Parameters
     ----------
     history : DeflectionHistory
         At the times of the method with most samples.
-    learnt : Learnt
+    input_posterior : InputPosterior
         Of the inputs, given all readings.
     correlation : (g, g) float
         Of the inputs' leading unit normals and of the deflection's two components at ``at_s``, in order of ``names``.
     names : tuple of str
     at_s : float
-        Where the readings bear most: the time of the smallest deflection error.
+        Time of the smallest deflection sd.
     deflection : callable
         From times to lateral vectors (n, 2), rad.
     """
 
     history: DeflectionHistory
-    learnt: Learnt
+    input_posterior: InputPosterior
     correlation: FloatArray
     names: tuple[str, ...]
     at_s: float
@@ -220,26 +223,26 @@ class Fused:
     @property
     def inputs(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Mean (k,) and covariance (k, k) of each input's unit normals, given all readings."""
-        known = self.learnt
-        return {name: (known.mean[at], known.covariance[at, at]) for name, at in known.place.items()}
+        post = self.input_posterior
+        return {name: (post.mean[at], post.covariance[at, at]) for name, at in post.place.items()}
 
 
 class FarInputsError(DivergenceError):
-    """Readings agree only with inputs far beyond what is known of them: ``learnt`` says which."""
+    """Readings agree only with inputs far beyond their stated sd: ``input_posterior`` has which."""
 
-    def __init__(self, words: str, learnt: Learnt) -> None:
-        super().__init__(words)
-        self.learnt = learnt
+    def __init__(self, message: str, input_posterior: InputPosterior) -> None:
+        super().__init__(message, code="inputs-far-off")
+        self.input_posterior = input_posterior
 
 
 def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> Fused:
-    """Fuse what the methods read; one method alone is smoothed.
+    """Fuse the methods' readings; one method alone is smoothed.
 
     Parameters
     ----------
     read : callable
         From inputs, moved by so many standard deviations, and a deflection to be linear about (from times to lateral
-        vectors; None: each method's own) to what the methods then read.
+        vectors; None: each method's own) to the methods' readings.
     method : str
         Name of the answer.
     at_s : (n,) float, optional
@@ -250,47 +253,53 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     DivergenceError
         Where there is too little to read, or the inputs do not settle.
     FarInputsError
-        Where the readings ask for inputs far beyond what is known of them.
+        Where the readings ask for inputs far beyond their stated sd.
     """
-    told = [e for e in read({}, None) if np.isfinite(e.theta_yz_rad).all(axis=1).sum() >= LEAST_SAMPLES]
-    if not told:
-        raise DivergenceError(f"{method}: no method has {LEAST_SAMPLES} readings of the deflection")
-    methods = [e.method for e in told]
-    # first every sample by itself, without what they share: a deflection to be linear about
-    inputs: Inputs = _started_clock(told, method)
-    span = _span(told)
-    apart = [_apart(moved_evidence(e, inputs)) for e in told]
-    problem = NormalEquations.of(apart, {}, span)
+    readings = [e for e in read({}, None) if np.isfinite(e.theta_yz_rad).all(axis=1).sum() >= LEAST_SAMPLES]
+    if not readings:
+        raise DivergenceError(
+            f"{method}: no method has {LEAST_SAMPLES} readings of the deflection", code="too-few-readings"
+        )
+    methods = [e.method for e in readings]
+    # first every sample by itself, without shared errors: a deflection to be linear about
+    inputs: Inputs = _initial_time_bias(readings, method)
+    span = _span(readings)
+    alone = [_uncorrelated(moved_evidence(e, inputs)) for e in readings]
+    problem = NormalEquations.of(alone, {}, span)
     found = problem.mean(method)
     for step in range(MOST_STEPS):
-        told = [e for e in read(inputs, problem.deflection(found)) if e.method in methods]
-        problem, before = NormalEquations.of(told, inputs, span), found
+        readings = [e for e in read(inputs, problem.deflection(found)) if e.method in methods]
+        problem, before = NormalEquations.of(readings, inputs, span), found
         found, covariance = problem.solved(method)
         size = 2 * problem.spline.count
         new = {name: found[size:][place] for name, place in problem.place.items()}
         sd = np.sqrt(np.diag(covariance))
         moved = float((np.abs(found[:size] - before[:size]) / sd[:size]).max())
-        if FILM_CLOCK in new:
-            clock = np.abs(new[FILM_CLOCK] - inputs.get(FILM_CLOCK, 0.0)) / sd[size:][problem.place[FILM_CLOCK]]
-            moved = max(moved, float(clock.max()))
+        if CAMERA_TIME_BIAS in new:
+            bias = (
+                np.abs(new[CAMERA_TIME_BIAS] - inputs.get(CAMERA_TIME_BIAS, 0.0))
+                / sd[size:][problem.place[CAMERA_TIME_BIAS]]
+            )
+            moved = max(moved, float(bias.max()))
         if moved < SETTLED_SD and step > 0:
-            learnt = Learnt(found[size:], covariance[size:, size:], problem.place)
-            _check(new, learnt, method)
-            times = max(told, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
-            return _posterior(found, covariance, problem, learnt, told, method, times)
-        # Newton's whole steps first, then half steps, which cannot swing to and fro
-        part = 1.0 if step < WHOLE_STEPS else 0.5
+            input_posterior = InputPosterior(found[size:], covariance[size:, size:], problem.place)
+            _check_inputs(new, input_posterior, method)
+            times = max(readings, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
+            return _posterior(found, covariance, problem, input_posterior, readings, method, times)
+        # whole Gauss-Newton steps first, then half steps, which cannot oscillate
+        part = 1.0 if step < _WHOLE_STEPS else 0.5
         inputs = {name: part * x + (1.0 - part) * inputs.get(name, 0.0 * x) for name, x in new.items()}
     raise DivergenceError(
-        f"{method}: the deflection does not settle: after {MOST_STEPS} steps it still moves by {moved:.2g} "
-        "standard deviations; see each method's own answer"
+        f"{method}: the deflection did not converge: after {MOST_STEPS} steps it still moves by {moved:.2g} sd, where "
+        f"{SETTLED_SD:g} are allowed; see each method's own answer",
+        code="fusion-not-converged",
     )
 
 
-def smoothed(history: DeflectionHistory, rate_hz: float = SMOOTH_RATE_HZ) -> DeflectionHistory:
+def smoothed(history: DeflectionHistory, rate_hz: float = _SMOOTH_RATE_HZ) -> DeflectionHistory:
     """One method's history as a smooth one, every ``1 / rate_hz`` s: the joint as a second-order process.
 
-    Between readings and through short holes its error bar grows; further than `NEAR_S` from a reading it has no answer.
+    Its sd grows between readings and through short holes; further than `_NEAR_S` from a reading it has no answer.
 
     Raises
     ------
@@ -299,38 +308,41 @@ def smoothed(history: DeflectionHistory, rate_hz: float = SMOOTH_RATE_HZ) -> Def
     """
     known = history.time_s[np.isfinite(history.theta_rad)]
     if len(known) < LEAST_SAMPLES:
-        raise DivergenceError(f"{history.method}: no smooth history of {len(known)} readings")
+        raise DivergenceError(
+            f"{history.method}: no smooth history of {len(known)} readings; {LEAST_SAMPLES} are the least",
+            code="too-few-readings",
+        )
     first, last = np.ceil(known[0] * rate_hz), np.floor(known[-1] * rate_hz)
     one = evidence_of_history(history)
     return fuse(lambda _inputs, _about: [one], history.method, np.arange(first, last + 1.0) / rate_hz).history
 
 
-def _apart(one: Evidence) -> Evidence:
-    """Evidence whose every sample stands by itself."""
+def _uncorrelated(one: Evidence) -> Evidence:
+    """Evidence with every sample's error independent of the others."""
     return replace(one, by_input={}, independent_cov=one.covariance)
 
 
-def _span(told: list[Evidence]) -> tuple[float, float]:
-    """First and last time that any clock may mean."""
-    wide = [FARTHEST_CLOCK_SD * e.clock_sd_s for e in told]
-    low = min(e.time_s[0] - w for e, w in zip(told, wide, strict=True))
-    return float(low), float(max(e.time_s[-1] + w for e, w in zip(told, wide, strict=True)))
+def _span(readings: list[Evidence]) -> tuple[float, float]:
+    """First and last time of all readings, whatever their time biases."""
+    wide = [_FARTHEST_BIAS_SD * e.time_bias_sd_s for e in readings]
+    low = min(e.time_s[0] - w for e, w in zip(readings, wide, strict=True))
+    return float(low), float(max(e.time_s[-1] + w for e, w in zip(readings, wide, strict=True)))
 
 
-def clock_is_seen(read: Read) -> bool:
-    """Whether the deflection by the methods on the gyros' clock moves enough to tell another clock's offset.
+def time_bias_is_observable(read: Read) -> bool:
+    """Whether the deflection by the methods with the gyros' time tags moves enough for a time bias to be observed.
 
-    A deflection that stands still fits any offset, and the rate of what is but noise would fit a wrong one closely.
+    A constant deflection fits any time bias, and the rate of mere noise would fit a wrong one with a small sd.
     """
-    told = [e for e in read({}, None) if np.isfinite(e.theta_yz_rad).all(axis=1).sum() >= LEAST_SAMPLES]
-    off, own = [e for e in told if e.clock_sd_s > 0.0], [e for e in told if e.clock_sd_s == 0.0]
+    readings = [e for e in read({}, None) if np.isfinite(e.theta_yz_rad).all(axis=1).sum() >= LEAST_SAMPLES]
+    off, own = [e for e in readings if e.time_bias_sd_s > 0.0], [e for e in readings if e.time_bias_sd_s == 0.0]
     if not off or not own:
         return False
     span = _span(own)
-    # what lasts in a reading does not move
+    # a constant error does not move
     problem = NormalEquations.of([replace(e, by_input={}) for e in own], {}, span)
     try:
-        found, covariance = problem.solved("clock")
+        found, covariance = problem.solved("camera time bias")
     except DivergenceError:
         return False
     m = problem.spline.count
@@ -341,20 +353,20 @@ def clock_is_seen(read: Read) -> bool:
     return square > MOVES**2 * variance
 
 
-def _started_clock(told: list[Evidence], method: str) -> Inputs:
-    """Offset of a clock that is not the gyros', in its standard deviations, to start from; none where it is theirs.
+def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
+    """Time bias to start from, in its standard deviations; none where all methods share the gyros' time tags.
 
-    The joint rings several times within what such a clock may be off: the sum of squares has a minimum at every swing,
-    and the lowest is looked for, with the clock's own term. What lasts longer than `LIGHT_TIME_S` says nothing of it.
+    The joint oscillates several times within the bias's a priori sd: the sum of squares has a minimum at every period,
+    and the lowest is looked for, with the prior's term. Errors longer than `LIGHT_TIME_S` carry no information on it.
     """
-    off, own = [e for e in told if e.clock_sd_s > 0.0], [e for e in told if e.clock_sd_s == 0.0]
+    off, own = [e for e in readings if e.time_bias_sd_s > 0.0], [e for e in readings if e.time_bias_sd_s == 0.0]
     if not off or not own:
         return {}
     one, span = off[0], _span(own)
-    problem = NormalEquations.of([_apart(e) for e in own], {}, span)
-    bent = problem.deflection(problem.mean(method))
-    reach = FARTHEST_CLOCK_SD * one.clock_sd_s
-    late_s = np.arange(-np.ceil(reach / CLOCK_STEP_S), np.ceil(reach / CLOCK_STEP_S) + 1.0) * CLOCK_STEP_S
+    problem = NormalEquations.of([_uncorrelated(e) for e in own], {}, span)
+    deflection = problem.deflection(problem.mean(method))
+    reach = _FARTHEST_BIAS_SD * one.time_bias_sd_s
+    late_s = np.arange(-np.ceil(reach / _BIAS_STEP_S), np.ceil(reach / _BIAS_STEP_S) + 1.0) * _BIAS_STEP_S
     inside = (one.time_s > span[0] + reach) & (one.time_s < span[1] - reach) & np.isfinite(one.theta_yz_rad[:, 0])
     time_s, read = one.time_s[inside], one.theta_yz_rad[inside]
     if len(time_s) < LEAST_SAMPLES:
@@ -362,58 +374,58 @@ def _started_clock(told: list[Evidence], method: str) -> Inputs:
     window = max(3, round(LIGHT_TIME_S / float(np.median(np.diff(time_s)))))
     square = np.empty(len(late_s))
     for k, late in enumerate(late_s):
-        off_rad = read - bent(time_s - late)
+        off_rad = read - deflection(time_s - late)
         square[k] = np.sum((off_rad - uniform_filter1d(off_rad, window, axis=0, mode="nearest")) ** 2)
     variance = float(square.min()) / (2.0 * len(time_s)) + LEFT_OUT_RAD**2
-    best = int(np.argmin(square / variance + (late_s / one.clock_sd_s) ** 2))
-    return {FILM_CLOCK: np.array([late_s[best] / one.clock_sd_s])}
+    best = int(np.argmin(square / variance + (late_s / one.time_bias_sd_s) ** 2))
+    return {CAMERA_TIME_BIAS: np.array([late_s[best] / one.time_bias_sd_s])}
 
 
-def pulse_reader(
-    pulse: PulseData, methods: dict[str, Method],
-    others: list[Evidence],
+def loads_reader(
+    loads: FlightLoads, methods: dict[str, Method], others: list[Evidence]
 ) -> Read:  # fmt: skip
-    """Return what `fuse` reads: methods that look at the pulse, and others whose readings are what they are.
+    """Reader for `fuse`: methods that read the flight loads, and others whose readings are given.
 
-    Inputs scale what was measured, and would scale its noise too, which no input can have made smaller: they act on
-    the measurements' part that the spline can follow alone.
+    Inputs scale the measurements, and would scale their noise too, which no input can have made smaller: they act only
+    on the measurements' part that the spline can follow.
     """
-    use = pulse.through_pulse
-    smooth = _smoothed(pulse, use)
+    use = loads.through_pulse
+    smooth = _smoothed_loads(loads, use)
 
     def read(inputs: Inputs, about: Deflection | None) -> list[Evidence]:
         if about is None:
-            return [*(method(pulse, use, None) for method in methods.values()), *others]
-        at, moved, out = about(pulse.time_s[use]), corrected_pulse(smooth, use, inputs), []
+            return [*(method(loads, use, None) for method in methods.values()), *others]
+        at, moved, out = about(loads.time_s[use]), corrected_loads(smooth, use, inputs), []
         for method in methods.values():
             found = method(moved, use, at)
-            raw, even = (method(one, use, at, with_inputs=False).theta_yz_rad for one in (pulse, smooth))
+            raw, even = (method(one, use, at, with_inputs=False).theta_yz_rad for one in (loads, smooth))
             out.append(replace(found, theta_yz_rad=found.theta_yz_rad + raw - even))
         return [*out, *(moved_evidence(other, inputs, about) for other in others)]
 
     return read
 
 
-def _smoothed(pulse: PulseData, use: BoolArray) -> PulseData:
-    """Pulse whose force, rate and angular acceleration are what a spline with `KNOT_S` can follow."""
-    t = pulse.time_s[use]
+def _smoothed_loads(loads: FlightLoads, use: BoolArray) -> FlightLoads:
+    """Loads with force, rate and angular acceleration smoothed to a spline with knots `KNOT_S` apart."""
+    t = loads.time_s[use]
     value = Spline.over(float(t[0]), float(t[-1])).rows(t)
     names = ("specific_force_body_mps2", "rate_body_radps", "angular_acceleration_body_radps2")
     moved = {}
     for name in names:
-        moved[name] = getattr(pulse, name).copy()
+        moved[name] = getattr(loads, name).copy()
         moved[name][use] = value @ lstsq(value, moved[name][use], lapack_driver="gelsy")[0]
-    return replace(pulse, **moved)
+    return replace(loads, **moved)
 
 
-def _check(inputs: Inputs, learnt: Learnt, method: str) -> None:
+def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) -> None:
     for name, moved in inputs.items():
         worst = float(np.abs(moved).max())
-        if not worst <= MOST_INPUT_SD:
+        if not worst <= _MOST_INPUT_SD:
             raise FarInputsError(
-                f"{method}: the readings agree only if {name} is {worst:.0f} standard deviations off what is stated; "
-                "check what the flight and vehicle files say of it, and each method's own answer",
-                learnt,
+                f"{method}: the readings agree only with {name} {worst:.0f} sd off its stated value, where "
+                f"{_MOST_INPUT_SD:.0f} are allowed; check it in the flight and vehicle files, and each method's own "
+                "answer",
+                input_posterior,
             )
 
 
@@ -421,17 +433,17 @@ def _posterior(
     found: FloatArray,
     covariance: FloatArray,
     problem: NormalEquations,
-    learnt: Learnt,
-    told: list[Evidence],
+    input_posterior: InputPosterior,
+    readings: list[Evidence],
     method: str,
     t: FloatArray,
 ) -> Fused:
     spline = problem.spline
     m, size = spline.count, 2 * spline.count
-    read = np.concatenate([e.time_s for e in told])
+    read = np.concatenate([e.time_s for e in readings])
     read.sort()
     after = np.searchsorted(read, t).clip(1, len(read) - 1)
-    t = t[np.minimum(np.abs(read[after] - t), np.abs(t - read[after - 1])) <= NEAR_S]
+    t = t[np.minimum(np.abs(read[after] - t), np.abs(t - read[after - 1])) <= _NEAR_S]
     value = spline.rows(t)
     theta_yz = np.stack([value @ found[axis * m : (axis + 1) * m] for axis in range(2)], axis=-1)
     cov = np.zeros((len(t), 2, 2))
@@ -439,8 +451,8 @@ def _posterior(
         for j in range(2):
             block = covariance[i * m : (i + 1) * m, j * m : (j + 1) * m]
             cov[:, i, j] = np.sum((value @ block) * value, axis=1)
-    words = f"from {', '.join(e.method for e in told)} with what they share; joint as a second-order process"
-    history = history_from_lateral(t, theta_yz, cov, method, words)
+    remark = f"from {', '.join(e.method for e in readings)} with their shared errors; joint as a second-order process"
+    history = history_from_lateral(t, theta_yz, cov, method, remark)
     best = int(np.argmin(np.trace(cov, axis1=1, axis2=2)))
     pick = np.zeros((2 + len(problem.place), len(found)))
     pick[0, :m], pick[1, m:size] = value[best], value[best]
@@ -449,4 +461,4 @@ def _posterior(
     joint = pick @ covariance @ pick.T
     sd = np.sqrt(np.diag(joint))
     names = ("deflection y", "deflection z", *problem.place)
-    return Fused(history, learnt, joint / np.outer(sd, sd), names, float(t[best]), problem.deflection(found))
+    return Fused(history, input_posterior, joint / np.outer(sd, sd), names, float(t[best]), problem.deflection(found))

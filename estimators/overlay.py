@@ -1,8 +1,11 @@
-"""Pictures for the eye: the virtual camera's view beside and over what the real one filmed (seed paper Figure 2.3).
+"""What would the real camera have shown at the estimated deflection? Pictures for the eye (seed paper Figure 2.3).
 
-The shell is rendered bent as the estimate says, shaded by how it faces the camera, with the mesh's lines on it; where
-the centerbody covers it, it is not drawn. A user's own meshes of either body take the place of the parametric ones.
-Yellow is the smallest row of the virtual edge, the seed paper's horizon line.
+The virtual camera's view is drawn beside and over the filmed frame: the shell deflected as estimated, shaded by how it
+faces the camera, ``grey = 60 + 150 |n . v|``, with the mesh's lines on it; where the centerbody hides it, it is not
+drawn. A user's own meshes of either body take the place of the parametric ones. Yellow is the smallest row of the
+virtual edge, the seed paper's horizon line.
+
+Assumed: as in `estimators.virtual_camera`; a mesh is drawn only, the fit is of the parametric shell.
 """
 
 from __future__ import annotations
@@ -14,19 +17,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.virtual_camera import VirtualCamera, bending_of, render
+from estimators.virtual_camera import VirtualCamera, deformation_of, render
 from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.geometry import BodyMesh, bend, outboard, vehicle_meshes
 
 Picture = NDArray[np.uint8]
 
-YELLOW, GREY, BLACK, WHITE = (255, 230, 0), (170, 170, 170), (0, 0, 0), (255, 255, 255)
-COLOUR, BODY_COLOUR = np.array([0.45, 0.75, 1.0]), np.array([0.95, 0.85, 0.65])
-LINE_SHARE = 90.0
-SHARE = 0.65
-TORUS_SECTIONS = 20
-SMOOTH_RAD = float(np.deg2rad(15.0))  # faces of a user's mesh that meet at less are one piece
+YELLOW, GREY, _BLACK, _WHITE = (255, 230, 0), (170, 170, 170), (0, 0, 0), (255, 255, 255)
+_COLOUR, _BODY_COLOUR = np.array([0.45, 0.75, 1.0]), np.array([0.95, 0.85, 0.65])
+_LINE_SHARE = 90.0
+_SHARE = 0.65
+_TORUS_SECTIONS = 20
+_SMOOTH_RAD = float(np.deg2rad(15.0))  # faces of a user's mesh that meet at less are one piece
 
 
 @dataclass(frozen=True)
@@ -38,24 +41,24 @@ class _Drawing:
     piece: NDArray[np.int64]
     colour: FloatArray
 
-    def seen_from(self, camera: Camera, vertices_m: FloatArray) -> tuple[FloatArray, Picture]:
+    def rendered(self, camera: Camera, vertices_m: FloatArray) -> tuple[FloatArray, Picture]:
         """Depth ``(h, w)``, m, and picture ``(h, w, 3)``, RGB, with the vertices where they are now, body axes."""
-        seen = render(camera, vertices_m, self.faces)
+        view = render(camera, vertices_m, self.faces)
         corners = vertices_m[self.faces]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         away = corners.mean(axis=1) - camera.position_body_m
         length = np.linalg.norm(normal, axis=1) * np.linalg.norm(away, axis=1)
         facing = np.abs(np.einsum("ni,ni->n", normal, away)) / np.maximum(length, 1e-12)
         tone = ((60.0 + 150.0 * facing)[:, None] * self.colour).astype(np.uint8)
-        picture = np.zeros((*seen.face.shape, 3), dtype=np.uint8)
-        picture[seen.is_hit] = tone[seen.face[seen.is_hit]]
+        picture = np.zeros((*view.face.shape, 3), dtype=np.uint8)
+        picture[view.is_hit] = tone[view.face[view.is_hit]]
         # a line where the piece changes to the right or below
-        piece = np.where(seen.is_hit, self.piece[seen.face], -1)
-        line = np.zeros_like(seen.is_hit)
+        piece = np.where(view.is_hit, self.piece[view.face], -1)
+        line = np.zeros_like(view.is_hit)
         line[:, 1:] |= piece[:, 1:] != piece[:, :-1]
         line[1:] |= piece[1:] != piece[:-1]
-        picture[line & seen.is_hit] = LINE_SHARE * self.colour
-        return seen.depth_m, picture
+        picture[line & view.is_hit] = _LINE_SHARE * self.colour
+        return view.depth_m, picture
 
 
 @dataclass
@@ -67,7 +70,7 @@ class Overlay:
     view : VirtualCamera
     meshes : mapping of str to BodyMesh
         A user's own, of ``aeroshell`` or ``centerbody``, drawn in place of the stacked tori and of the centerbody,
-        which is not drawn otherwise. Where the shell's edge is (`horizon_row`) stays what the fit says.
+        which is not drawn otherwise. The shell's edge (`horizon_row`) stays that of the fit.
     """
 
     view: VirtualCamera
@@ -77,21 +80,21 @@ class Overlay:
     body: Picture = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Build the shell's mesh; find how far each pixel's ray goes to the centerbody, and what it shows there."""
+        """Build the shell's mesh; render the centerbody and its distance in each pixel."""
         self.shell = _drawing(self.meshes["aeroshell"]) if "aeroshell" in self.meshes else _stacked(self.view)
         camera = self.view.camera
         self.body = np.zeros((camera.height_px, camera.width_px, 3), dtype=np.uint8)
         if "centerbody" in self.meshes:
-            drawing = _drawing(self.meshes["centerbody"], BODY_COLOUR)
+            drawing = _drawing(self.meshes["centerbody"], _BODY_COLOUR)
             clear = replace(camera, position_body_m=outboard(camera.position_body_m))
-            self.before_m, self.body = drawing.seen_from(clear, drawing.vertices_m)
+            self.before_m, self.body = drawing.rendered(clear, drawing.vertices_m)
         else:
             self.before_m = np.where(centerbody_pixels(self.view), 0.0, np.inf)
 
     def view_of(self, theta_rad: float, plane_lv_rad: float) -> tuple[Picture, BoolArray]:
         """Virtual picture ``(h, w, 3)`` RGB of the bodies, black elsewhere, and where they are in it ``(h, w)``."""
-        bent = bend(self.shell.vertices_m, theta_rad, plane_lv_rad, self.view.joint_station_m)
-        depth, picture = self.shell.seen_from(self.view.camera, bent)
+        deflected = bend(self.shell.vertices_m, theta_rad, plane_lv_rad, self.view.joint_station_m)
+        depth, picture = self.shell.rendered(self.view.camera, deflected)
         shell = depth < self.before_m
         picture = np.where(shell[..., None], picture, self.body)
         return picture, np.asarray(shell | self.body.any(axis=2))
@@ -102,7 +105,7 @@ class Overlay:
         left = image.shape[1] // 2 if from_column is None else from_column
         picture, shell = self.view_of(theta_rad, plane_lv_rad)
         shell[:, :left] = False
-        out[shell] = ((1.0 - SHARE) * out[shell] + SHARE * picture[shell]).astype(np.uint8)
+        out[shell] = ((1.0 - _SHARE) * out[shell] + _SHARE * picture[shell]).astype(np.uint8)
         cv2.line(out, (left, 0), (left, image.shape[0] - 1), (90, 90, 90), 1)
         return out
 
@@ -117,7 +120,7 @@ class Overlay:
 
 def _stacked(view: VirtualCamera) -> _Drawing:
     """Stacked tori and forward skin; two triangles make one piece."""
-    meshes = vehicle_meshes(view.geometry, clock_sections=72, torus_sections=TORUS_SECTIONS)
+    meshes = vehicle_meshes(view.geometry, clock_sections=72, torus_sections=_TORUS_SECTIONS)
     meshes.pop("centerbody")
     vertices, faces, count = [], [], 0
     for mesh in meshes.values():
@@ -125,17 +128,17 @@ def _stacked(view: VirtualCamera) -> _Drawing:
         faces.append(np.asarray(mesh.faces) + count)
         count += len(mesh.vertices)
     triangles = np.concatenate(faces)
-    return _Drawing(np.concatenate(vertices), triangles, np.arange(len(triangles)) // 2, COLOUR)
+    return _Drawing(np.concatenate(vertices), triangles, np.arange(len(triangles)) // 2, _COLOUR)
 
 
-def _drawing(mesh: BodyMesh, colour: FloatArray = COLOUR) -> _Drawing:
+def _drawing(mesh: BodyMesh, colour: FloatArray = _COLOUR) -> _Drawing:
     """A user's mesh; faces that go over into each other smoothly are one piece."""
     import trimesh
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
-    smooth = solid.face_adjacency[solid.face_adjacency_angles < SMOOTH_RAD]
+    smooth = solid.face_adjacency[solid.face_adjacency_angles < _SMOOTH_RAD]
     n = len(mesh.faces)
     graph = coo_array((np.ones(len(smooth)), (smooth[:, 0], smooth[:, 1])), shape=(n, n))
     _, piece = connected_components(graph, directed=False)
@@ -148,17 +151,17 @@ def centerbody_pixels(view: VirtualCamera) -> BoolArray:
     v, u = np.indices((camera.height_px, camera.width_px), dtype=float)
     rays = np.nan_to_num(camera.rays_body(np.column_stack([u.ravel(), v.ravel()])))
     x, y, z = camera.position_body_m
-    across, inward = np.maximum(rays[:, 1] ** 2 + rays[:, 2] ** 2, 1e-12), -(y * rays[:, 1] + z * rays[:, 2])
+    lateral, inward = np.maximum(rays[:, 1] ** 2 + rays[:, 2] ** 2, 1e-12), -(y * rays[:, 1] + z * rays[:, 2])
     excess = y**2 + z**2 - min(view.geometry.centerbody_radius_m, float(np.hypot(y, z)) - 1e-3) ** 2
-    square = inward**2 - across * excess
-    station = -x - rays[:, 0] * (inward - np.sqrt(np.maximum(square, 0.0))) / across
+    square = inward**2 - lateral * excess
+    station = -x - rays[:, 0] * (inward - np.sqrt(np.maximum(square, 0.0))) / lateral
     met = (square > 0.0) & (inward > 0.0) & (station > 0.0) & (station < view.geometry.centerbody_length_m)
     return np.asarray(met.reshape(v.shape))
 
 
 def horizon_row(view: VirtualCamera, theta_rad: float, plane_lv_rad: float) -> int:
     """Smallest row of the virtual camera's shell edge, px."""
-    edge = view.edge(bending_of(theta_rad, plane_lv_rad)).pixels
+    edge = view.edge(deformation_of(theta_rad, plane_lv_rad)).pixels
     return round(float(edge[view.camera.is_inside(edge), 1].min()))
 
 
@@ -167,9 +170,9 @@ def draw_row(picture: Picture, row: int, colour: tuple[int, int, int]) -> None:
     picture[max(row - 1, 0) : row + 1] = colour
 
 
-def write_words(picture: Picture, lines: list[str]) -> None:
+def write_lines(picture: Picture, lines: list[str]) -> None:
     """Write lines of text into the upper left corner, black behind white."""
-    for k, words in enumerate(lines):
+    for k, text in enumerate(lines):
         at = (10, 22 + 20 * k)
-        cv2.putText(picture, words, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, BLACK, 3, cv2.LINE_AA)
-        cv2.putText(picture, words, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, WHITE, 1, cv2.LINE_AA)
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _BLACK, 3, cv2.LINE_AA)
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _WHITE, 1, cv2.LINE_AA)

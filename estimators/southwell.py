@@ -1,18 +1,24 @@
-"""How stiff is the joint and how large was the offset? Both from how the bending grew with the load.
+"""How stiff is the joint and how large was the offset, from the growth of the deflection with the load?
 
 A joint that yields by ``theta = (z_0 / xbar) u / (1 - u)``, ``u = q kappa / K`` (`estimators.trim`), gives a
 straight line of ``1 / theta`` against ``1 / q``, as R. V. Southwell plotted columns near buckling::
 
     1 / theta = (xbar / z_0) (q_crit / q - 1),     q_crit = K / kappa
 
-Where it crosses zero is the dynamic pressure at which the joint diverges; its height at infinite load is the offset.
-``1 / theta`` of a small deflection is all error, so the curve itself is fitted: bending along its mean direction
-against ``u / (1 - u)``, whitened by the history's covariance, of which `evidence.CONSTANT_PART` lasts. Rise and fall of
-the pulse are fitted apart too: what differs is hysteresis (freeplay, a joint that sags, gas that warms).
+It crosses zero at the dynamic pressure at which the joint diverges; its height at infinite load is the offset.
+``1 / theta`` of a small deflection is all error, so the curve itself is fitted: deflection along its mean direction
+against ``u / (1 - u)``, whitened by the history's covariance, of which `evidence.CONSTANT_PART` is a constant bias.
+Rise and fall of the pulse are fitted separately too: their difference is hysteresis (freeplay, a joint that sags, gas
+that warms).
 
 Assumed: quasi-static means over `SPAN_S`, a linear joint, kappa and the offset's plane constant over the pulse. Means
-of true histories lie about such a line by `LEFT_OUT` at peak pressure, by more where swinging is slower. The dynamic
+of true histories lie about such a line by `LEFT_OUT` at peak pressure, by more where oscillation is slower. The dynamic
 pressure's own error scales ``q_crit`` and leaves ``q / q_crit`` as it is.
+
+References
+----------
+R. V. Southwell, "On the analysis of experimental observations in problems of elastic stability", Proceedings of the
+Royal Society A 135 (1932) 601.
 """
 
 from __future__ import annotations
@@ -29,10 +35,10 @@ from flightmodel.deflection import DeflectionHistory
 
 SPAN_S = 1.6  # a period of the slow aerodynamic mode
 LEAST_SPANS = 4
-MOST_LOG_SD = 3.0  # of offset or margin: known to a factor of twenty is not known
+_MOST_LOG_SD = 3.0  # of offset or margin: a factor of twenty
 CONFIDENCE = 0.90
-LEFT_OUT = 0.10  # of the bending at peak, as means of swings leave out; elsewhere as their period, 1/sqrt(q)
-MOST_LOADS = 50.0  # a joint this many times stiffer than its load does not show its stiffness
+LEFT_OUT = 0.10  # sd of means against the static line, of the deflection at peak; elsewhere as the period, 1/sqrt(q)
+_MOST_LOADS = 50.0  # the stiffness of a joint this many times stiffer than its load is not observable
 
 
 @dataclass(frozen=True)
@@ -61,20 +67,20 @@ class Southwell:
     theta_sd_rad: FloatArray
 
     def deflection(self, pressure_pa: FloatArray) -> FloatArray:
-        """Bending, rad, at dynamic pressures below the critical one; NaN at and above it."""
+        """Deflection, rad, at dynamic pressures below the critical one; NaN at and above it."""
         u = np.asarray(pressure_pa) / self.critical_pressure_pa
         return np.where(u < 1.0, self.offset_angle_rad * u / np.where(u < 1.0, 1.0 - u, 1.0), np.nan)
 
 
 @dataclass(frozen=True)
 class Limbs:
-    """Southwell lines of rise, fall and both; ``hysteresis_sd`` by how many standard deviations the two differ."""
+    """Southwell lines of rise, fall and both; ``hysteresis_sd``: difference of the two in standard deviations."""
 
     both: Southwell
     rise: Southwell | None
     fall: Southwell | None
     hysteresis_sd: float
-    words: str
+    remark: str
 
 
 def southwell_limbs(
@@ -82,51 +88,50 @@ def southwell_limbs(
 ) -> Limbs:
     """Fit a history against the dynamic pressure (n,) at ``time_s``: whole pulse, rise, and fall.
 
-    ``pressure_sd`` is how well the pressure at its peak is known, a fraction.
+    ``pressure_sd`` is the sd of the pressure at its peak, a fraction.
 
     Raises
     ------
     DivergenceError
-        Where the whole pulse gives no line; a limb that gives none is left out, in words.
+        Where the whole pulse gives no line; a limb that gives none is left out, with a remark.
     """
-    t, q, theta, sd = span_means(history, time_s, pressure_pa)
+    t, q, theta, sd = _span_means(history, time_s, pressure_pa)
     both = southwell(q, theta, sd, pressure_sd)
     top = t[np.argmax(q)]
     limbs: dict[str, Southwell | None] = {}
-    words = []
+    remarks = []
     for name, part in (("rise", t <= top), ("fall", t >= top)):
         try:
             limbs[name] = southwell(q[part], theta[part], sd[part], pressure_sd)
         except DivergenceError as fault:
             limbs[name] = None
-            words.append(f"no line of the {name} alone ({fault})")
+            remarks.append(f"no line of the {name} alone ({fault})")
     rise, fall = limbs["rise"], limbs["fall"]
     apart = float("nan")
     if rise is not None and fall is not None:
         middle = np.array([0.8 * float(q.max())])
         change = float(np.log(fall.deflection(middle)[0] / rise.deflection(middle)[0]))
         apart = change / float(np.hypot(_log_sd(rise, middle[0]), _log_sd(fall, middle[0])))
-        consistency_check = (
-            "hysteresis" if abs(apart) > norm.ppf(0.5 + 0.5 * CONFIDENCE) else "no hysteresis beyond the error bars"
-        )
-        words.insert(0, f"{consistency_check}: fall over rise {np.exp(change):.2f} at 80 % of peak load")
-    return Limbs(both, rise, fall, apart, "; ".join(words))
+        limit = norm.ppf(0.5 + 0.5 * CONFIDENCE)
+        found = "hysteresis" if abs(apart) > limit else "no significant hysteresis"
+        remarks.insert(0, f"fall over rise {np.exp(change):.2f} at 80 % of peak load ({apart:+.1f} sd): {found}")
+    return Limbs(both, rise, fall, apart, "; ".join(remarks))
 
 
-def span_means(
+def _span_means(
     history: DeflectionHistory, time_s: FloatArray, pressure_pa: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Means over spans: time, pressure, bending along its mean direction, and the sd of what does not last."""
+    """Means over spans: time, pressure, deflection along its mean direction, and its sd."""
     cov = history.lateral_cov
     known = np.isfinite(history.theta_rad) & np.isfinite(cov[:, 0, 0])
     t, yz, cov = history.time_s[known], history.theta_yz_rad[known], cov[known]
     q = np.interp(t, time_s, pressure_pa)
     if len(t) == 0:
-        raise DivergenceError("Southwell plot: the history has no answers with an error bar")
+        raise DivergenceError("Southwell plot: the history has no answer with a sd", code="too-few-spans")
     weight = q / np.trace(cov, axis1=1, axis2=2)
-    way = weight @ yz
-    way = way / np.linalg.norm(way)
-    along, sd = yz @ way, np.sqrt(np.einsum("i,nij,j->n", way, cov, way))
+    direction = weight @ yz
+    direction = direction / np.linalg.norm(direction)
+    along, sd = yz @ direction, np.sqrt(np.einsum("i,nij,j->n", direction, cov, direction))
     _, which, count = np.unique(np.floor((t - t[0]) / SPAN_S), return_inverse=True, return_counts=True)
     mean = [np.bincount(which, v) / count for v in (t, q, along, sd)]
     return mean[0], mean[1], mean[2], mean[3]
@@ -135,19 +140,21 @@ def span_means(
 def southwell(
     pressure_pa: FloatArray, theta_rad: FloatArray, theta_sd_rad: FloatArray, pressure_sd: float = 0.0
 ) -> Southwell:
-    """Fit bending against dynamic pressure, of which all values may be off by a common fraction ``pressure_sd``.
+    """Fit deflection against dynamic pressure, all of whose values have a common relative error ``pressure_sd``.
 
     Raises
     ------
     DivergenceError
-        Where there are too few spans, or bending does not grow faster than the load, or not towards one side.
+        Where there are too few spans, or the deflection does not grow faster than the load, or not towards one side.
     """
     if len(theta_rad) < LEAST_SPANS:
-        raise DivergenceError(f"Southwell plot: {len(theta_rad)} spans of {SPAN_S} s where {LEAST_SPANS} are wanted")
-    lasting = np.sqrt(CONSTANT_PART) * theta_sd_rad
+        raise DivergenceError(
+            f"Southwell plot: {len(theta_rad)} spans of {SPAN_S} s where {LEAST_SPANS} are needed", code="too-few-spans"
+        )
+    constant = np.sqrt(CONSTANT_PART) * theta_sd_rad
     top = float(pressure_pa.max())
-    swings = (LEFT_OUT * theta_rad) ** 2 * top / pressure_pa
-    cov = np.outer(lasting, lasting) + np.diag((1.0 - CONSTANT_PART) * theta_sd_rad**2 + swings)
+    neglected = (LEFT_OUT * theta_rad) ** 2 * top / pressure_pa
+    cov = np.outer(constant, constant) + np.diag((1.0 - CONSTANT_PART) * theta_sd_rad**2 + neglected)
     whiten = np.linalg.inv(np.linalg.cholesky(cov))
 
     def model(x: FloatArray) -> FloatArray:
@@ -158,14 +165,18 @@ def southwell(
     fit = least_squares(lambda x: whiten @ (model(x) - theta_rad), start, max_nfev=200)
     beyond = float(np.exp(fit.x[0]))
     normal = fit.jac.T @ fit.jac
-    if not fit.success or np.linalg.cond(normal) > 1e12 or beyond > MOST_LOADS:
-        raise DivergenceError("Southwell plot: bending does not grow faster than the load: stiffness does not show")
-    # of the logarithm of q_crit = top (1 + e^x)
-    turn = np.diag([beyond / (1.0 + beyond), 1.0])
-    covariance = turn @ np.linalg.inv(normal) @ turn
-    if np.diag(np.linalg.inv(normal)).max() > MOST_LOG_SD**2:
+    if not fit.success or np.linalg.cond(normal) > 1e12 or beyond > _MOST_LOADS:
         raise DivergenceError(
-            "Southwell plot: the bending is lost in its error bars: neither stiffness nor offset shows"
+            "Southwell plot: the deflection does not grow faster than the load: stiffness not observable",
+            code="stiffness-not-observable",
+        )
+    # of the logarithm of q_crit = top (1 + e^x)
+    scale = np.diag([beyond / (1.0 + beyond), 1.0])
+    covariance = scale @ np.linalg.inv(normal) @ scale
+    if np.diag(np.linalg.inv(normal)).max() > _MOST_LOG_SD**2:
+        raise DivergenceError(
+            "Southwell plot: the deflection is within its error bars: neither stiffness nor offset observable",
+            code="stiffness-not-observable",
         )
     k = norm.ppf(0.5 + 0.5 * CONFIDENCE)
     crit, offset = top * (1.0 + beyond), float(np.exp(fit.x[1]))
@@ -181,7 +192,7 @@ def southwell(
 
 
 def _log_sd(line: Southwell, pressure_pa: float) -> float:
-    """Sd of the logarithm of the bending at a pressure."""
+    """Sd of the logarithm of the deflection at a pressure."""
     u = pressure_pa / line.critical_pressure_pa
     partial = np.array([-1.0 / (1.0 - u), 1.0])
     return float(np.sqrt(partial @ line.covariance @ partial))

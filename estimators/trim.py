@@ -1,22 +1,20 @@
-"""How far must the shell be bent for the vehicle to trim at the angle it flew? (Seed paper eqs. [5] and [6].)
+"""What deflection makes the vehicle trim at the angle it flew, and how does a compliant joint trim?
 
-Bending shifts the centerbody's c.g. sideways, and the shell trims where the moment about the c.g. vanishes::
+Seed paper eqs. [5], [6] and Figure 2.9.
+
+A deflection shifts the centerbody's c.g. sideways, and the shell trims where the moment about the c.g. vanishes::
 
     z_cg = z_0 + xbar theta,      xbar = x m_cb / m                                    eq. [5]
     C_A z_cg = -(C_m l + C_N x_cg)(alpha_shell) alpha_hat_shell + u                    eq. [6]
 
 as lateral vectors in body y, z, along the flow's side (so ``z_cg`` is positive towards the flow: the paper's sign
-turned). ``u`` is the measured moment ``I w' + w x I w`` less pitch damping, over ``q S``: zero in the paper's static
-form; it lets the balance hold through an oscillation. With ``alpha_shell = alpha_BET - theta`` the vectors of
+reversed). ``u`` is the measured moment ``I w' + w x I w`` less pitch damping, over ``q S``: zero in the paper's static
+form; with it the balance holds through an oscillation. With ``alpha_shell = alpha_BET - theta`` the vectors of
 ``alpha_shell`` and of ``z_0 + xbar alpha_BET - u/C_A`` are parallel, so one monotone equation in the angle's size
 remains.
 
-Assumed: pre-flight coefficients and offset, no aerodynamic moment on the centerbody, inertia of the unbent vehicle.
-
-At what angle does a vehicle with a yielding joint trim, and how stiff must the joint be? (Seed paper Figure 2.9.)
-
-The decelerating shell pushes the centerbody from its front end, so that inertia is a negative spring. Small angles, one
-plane, offset ``z_0`` carried by the centerbody::
+Static flexible trim (`static_trim`): the decelerating shell decelerates the centerbody at its front end, so that the
+inertial reaction is a negative spring. Small angles, one plane, offset ``z_0`` of the centerbody's c.g.::
 
     moment about the c.g.:    alpha = C_A (xbar theta + z_0) / (C_N,alpha L)
     centerbody about joint:   K theta = xbar q S (C_A theta + C_N,alpha alpha) + q S C_A z_0
@@ -26,6 +24,8 @@ plane, offset ``z_0`` carried by the centerbody::
 ``L`` is the distance from the c.g. aft to the metacentre, ``C_N,alpha L = -(C_m,alpha l + C_N,alpha x_cg)``. At
 ``u = 1`` the joint diverges: ``K_crit = q kappa``. For trim growth of at most ``g`` the joint must be stiffer than
 ``q_max kappa (1 + g) / g``. Freeplay of ``d`` acts as an offset of ``xbar d`` once the joint is loaded.
+
+Assumed: pre-flight coefficients and offset, no aerodynamic moment on the centerbody, the undeflected vehicle's inertia.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimators.evidence import (
+    GYRO_TIME_BIAS,
     PRESSURE,
-    RATE_CLOCK,
     VEHICLE_INPUTS,
     Evidence,
+    delayed,
     flow_inputs,
     history_of_evidence,
     moved_coefficients,
     moved_vehicle,
     pressure_input,
-    read_later,
 )
-from estimators.loads import MIN_AXIAL_MPS2, PulseData, lateral_and_size
+from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, flow_coefficients, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
@@ -54,12 +54,12 @@ from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.vehicle import Vehicle
 
 LIMIT_RAD = np.deg2rad(30.0)
-# near 2.3 Hz the shell's inertia balances the air's stiffness, and the balance says nothing of the bending
-AVERAGED_S = 1.0
-ITERATIONS, STEP_RAD = 5, 1e-4
-NODE = np.sqrt(3.0)  # outer nodes of the three-point Gauss-Hermite rule, sd
-KNOTS_RAD = np.linspace(0.0, LIMIT_RAD, 121)
-ASSUMPTIONS = (
+# near 2.3 Hz the shell's inertia balances the aerodynamic stiffness: no information on the deflection
+_AVERAGED_S = 1.0
+_ITERATIONS, _STEP_RAD = 5, 1e-4
+_NODE = np.sqrt(3.0)  # outer nodes of the three-point Gauss-Hermite rule, sd
+SLOPE_AT_RAD = np.deg2rad(2.0)  # where the static trim takes the coefficients' slopes by alpha
+_ASSUMPTIONS = (
     "moment balance about the c.g. with measured angular acceleration; pre-flight coefficients and c.g. offset; joint "
     f"as in the vehicle file; no answer below {MIN_AXIAL_MPS2 / STANDARD_GRAVITY_MPS2:.1f} g axial"
 )
@@ -75,13 +75,13 @@ class TrimModel:
     x_cg_m : float
         C.g. aft of the nose.
     xbar_m : float
-        ``x m_cb / m``: sideways shift of the vehicle's c.g. per radian of bending.
+        ``x m_cb / m``: sideways shift of the vehicle's c.g. per radian of deflection.
     offset_yz_m : (2,) float
         Initial lateral c.g. offset.
     length_m, area_m2 : float
         Reference length and area.
     inertia_kgm2 : (3, 3) float
-        Of the unbent vehicle about its c.g.
+        Of the undeflected vehicle about its c.g.
     """
 
     aero: AeroTable
@@ -125,19 +125,6 @@ def trim_model(vehicle: Vehicle, joint_station_m: float | None = None) -> TrimMo
     )
 
 
-def deflection_for_trim_angle(model: TrimModel, mach: float, alpha_shell_rad: float) -> float:
-    """Deflection, rad, that trims the shell at an angle, offset and deflection in one plane (the paper's use)."""
-    z = float(model.offset_for_angle(np.asarray(mach), np.asarray(alpha_shell_rad)))
-    return (z - float(np.linalg.norm(model.offset_yz_m))) / model.xbar_m
-
-
-def trim_angle_for_deflection(model: TrimModel, mach: float, theta_rad: float) -> float:
-    """Trim angle of the shell, rad, for a deflection in the plane of the offset; NaN beyond 30 deg."""
-    z = float(np.linalg.norm(model.offset_yz_m)) + model.xbar_m * theta_rad
-    table = model.offset_for_angle(np.full(len(KNOTS_RAD), mach), KNOTS_RAD)
-    return float(np.interp(z, table, KNOTS_RAD, left=np.nan, right=np.nan))
-
-
 def solve_trim(model: TrimModel, mach: FloatArray, flow_yz_rad: FloatArray, moment_yz_m: FloatArray) -> FloatArray:
     """Deflection vectors ``(n, 2)``, rad, from the centerbody's flow angle; NaN where the shell's passes 30 deg.
 
@@ -150,31 +137,31 @@ def solve_trim(model: TrimModel, mach: FloatArray, flow_yz_rad: FloatArray, mome
 
     # nearly straight and rising: Newton's steps settle at once
     alpha = np.zeros(len(size))
-    for _ in range(ITERATIONS):
+    for _ in range(_ITERATIONS):
         here = excess(alpha)
-        slope = (excess(alpha + STEP_RAD) - here) / STEP_RAD
+        slope = (excess(alpha + _STEP_RAD) - here) / _STEP_RAD
         alpha = np.clip(alpha - here / slope, 0.0, LIMIT_RAD)
     alpha = np.where(excess(np.full(len(size), LIMIT_RAD)) < 0.0, np.nan, alpha)
     return flow_yz_rad - direction * alpha[:, None]
 
 
-def moment_term(model: TrimModel, pulse: PulseData, use: BoolArray, dynamic: bool) -> FloatArray:
+def moment_term(model: TrimModel, loads: FlightLoads, use: BoolArray, dynamic: bool) -> FloatArray:
     """``u / C_A`` as lateral vectors ``(n, 2)``, m; zero in the static form."""
     if not dynamic:
         return np.zeros((int(use.sum()), 2))
-    return _moment_with(model, pulse, use, _at_centerbody(model, pulse, use))
+    return _moment_with(model, loads, use, _at_centerbody(model, loads, use))
 
 
-def _at_centerbody(model: TrimModel, pulse: PulseData, use: BoolArray) -> FloatArray:
+def _at_centerbody(model: TrimModel, loads: FlightLoads, use: BoolArray) -> FloatArray:
     """Coefficients ``(n, 4)`` at the centerbody's angle of attack."""
-    alpha = np.minimum(np.linalg.norm(pulse.flow_yz_rad[use], axis=1), np.pi)
-    return model.aero.at(pulse.mach[use], alpha)
+    alpha = np.minimum(np.linalg.norm(loads.flow_yz_rad[use], axis=1), np.pi)
+    return model.aero.at(loads.mach[use], alpha)
 
 
-def _moment_with(model: TrimModel, pulse: PulseData, use: BoolArray, coefficients: FloatArray) -> FloatArray:
+def _moment_with(model: TrimModel, loads: FlightLoads, use: BoolArray, coefficients: FloatArray) -> FloatArray:
     """``u / C_A`` as lateral vectors ``(n, 2)``, m, with these coefficients ``(n, 4)``."""
-    w, turn = pulse.rate_body_radps[use], pulse.angular_acceleration_body_radps2[use]
-    pressure, speed = pulse.dynamic_pressure_pa[use], pulse.airspeed_mps[use]
+    w, turn = loads.rate_body_radps[use], loads.angular_acceleration_body_radps2[use]
+    pressure, speed = loads.dynamic_pressure_pa[use], loads.airspeed_mps[use]
     moment = turn @ model.inertia_kgm2.T + np.cross(w, w @ model.inertia_kgm2.T)
     q_area = pressure * model.area_m2
     damping = (q_area * model.length_m**2 * coefficients[:, 3] / (2.0 * speed))[:, None] * w
@@ -184,74 +171,86 @@ def _moment_with(model: TrimModel, pulse: PulseData, use: BoolArray, coefficient
 
 
 def trim_evidence(
-    pulse: PulseData,
+    loads: FlightLoads,
     joint_station_m: float | None = None,
     dynamic: bool = True,
     use: BoolArray | None = None,
     about_yz_rad: FloatArray | None = None,
     with_inputs: bool = True,
 ) -> Evidence:
-    """Bending from the moment balance at every sample with enough deceleration, with its responses.
+    """Deflection from the moment balance at every sample with enough deceleration, with its responses.
 
-    The shell does not turn with the centerbody while the joint swings: the balance reads ``theta`` plus its share of
-    ``(I_A + mu r_A (r_A - r_B)) theta''``, with ``mu`` the bodies' reduced mass. Responses are taken, and the reading
-    is linear, about a given deflection, else about the reading itself. Those to inputs can be left out.
+    The shell does not rotate with the centerbody while the joint oscillates: the balance reads ``theta`` plus its share
+    of ``(I_A + mu r_A (r_A - r_B)) theta''``, with ``mu`` the bodies' reduced mass.
+
+    Parameters
+    ----------
+    loads : FlightLoads
+    joint_station_m : float, optional
+        Assumed joint, m aft of the nose; None: the vehicle's.
+    dynamic : bool
+        False leaves the measured moment out (the paper's static form).
+    use, about_yz_rad, with_inputs
+        As in `estimators.misalignment.misalignment_evidence`.
     """
-    use = pulse.informative if use is None else use
-    vehicle = pulse.vehicle
+    use = loads.informative if use is None else use
+    vehicle = loads.vehicle
     model = trim_model(vehicle, joint_station_m)
-    mach, flow = pulse.mach[use], pulse.flow_yz_rad[use]
-    on_body = _at_centerbody(model, pulse, use)
-    moment = _moment_with(model, pulse, use, on_body) if dynamic else np.zeros((len(mach), 2))
+    mach, flow = loads.mach[use], loads.flow_yz_rad[use]
+    on_body = _at_centerbody(model, loads, use)
+    moment = _moment_with(model, loads, use, on_body) if dynamic else np.zeros((len(mach), 2))
     about = solve_trim(model, mach, flow, moment) if about_yz_rad is None else about_yz_rad
     known: BoolArray = np.asarray(np.isfinite(about).all(axis=1))
     about = np.where(known[:, None], about, flow)
 
-    def on_shell(d_theta: FloatArray, d_flow: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        direction, alpha = lateral_and_size(flow + d_flow - about - d_theta)
-        return about + d_theta, direction, vehicle.aero.at(mach, np.minimum(alpha, np.pi))
+    def imbalance(d_theta: FloatArray, d_flow: FloatArray) -> FloatArray:
+        shell = flow_coefficients(vehicle.aero, mach, flow + d_flow - about - d_theta)
+        return _imbalance(model, about + d_theta, *shell)
 
-    step, still = STEP_RAD * np.eye(2), np.zeros(2)
-    theta, direction, coefficients = on_shell(still, still)
+    step, none = _STEP_RAD * np.eye(2), np.zeros(2)
+    direction, coefficients = flow_coefficients(vehicle.aero, mach, flow + none - about - none)
+    theta = about + none
     base = _imbalance(model, theta, direction, coefficients)
-    by_moment = np.linalg.inv(np.stack([_imbalance(model, *on_shell(e, still)) - base for e in step], -1) / STEP_RAD)
+    by_moment = np.linalg.inv(np.stack([imbalance(e, none) - base for e in step], -1) / _STEP_RAD)
     inputs: dict[str, FloatArray] = {}
     if with_inputs:
-        by_flow = -by_moment @ np.stack([_imbalance(model, *on_shell(still, e)) - base for e in step], -1) / STEP_RAD
-        inputs = {name: by_flow @ part for name, part in flow_inputs(pulse, use).items()}
-        if pulse.rate_clock_sd_s > 0.0:
-            later = read_later(pulse, use, 0.0, pulse.rate_clock_sd_s)
+        by_flow = -by_moment @ np.stack([imbalance(none, e) - base for e in step], -1) / _STEP_RAD
+        inputs = {name: by_flow @ part for name, part in flow_inputs(loads, use).items()}
+        if loads.gyro_time_bias_sd_s > 0.0:
+            later = delayed(loads, use, 0.0, loads.gyro_time_bias_sd_s)
             late = _moment_with(model, later, use, on_body) - moment if dynamic else np.zeros_like(flow)
-            inputs[RATE_CLOCK] = (by_flow @ (later.flow_yz_rad[use] - flow)[:, :, None]) + by_moment @ late[:, :, None]
+            by_bias = by_flow @ (later.flow_yz_rad[use] - flow)[:, :, None]
+            inputs[GYRO_TIME_BIAS] = by_bias + by_moment @ late[:, :, None]
 
     def excess(moved: dict[str, float]) -> FloatArray:
         of = trim_model(moved_vehicle(vehicle, moved), joint_station_m)
         shell, body = (moved_coefficients(vehicle, moved, c) for c in (coefficients, on_body))
-        return _imbalance(of, theta, direction, shell) - (_moment_with(of, pulse, use, body) if dynamic else 0.0)
+        return _imbalance(of, theta, direction, shell) - (_moment_with(of, loads, use, body) if dynamic else 0.0)
 
     for name in VEHICLE_INPUTS if with_inputs else ():
         up, down = (excess({name: size}) for size in (1.0, -1.0))
         inputs[name] = -by_moment @ (0.5 * (up - down))[:, :, None]
-    noise, swing = np.zeros((len(mach), 2, 2)), np.zeros((len(mach), 2, 2))
+    noise, by_acceleration = np.zeros((len(mach), 2, 2)), np.zeros((len(mach), 2, 2))
     if dynamic:
         if with_inputs:
-            inputs[PRESSURE] = -by_moment @ (moment[:, :, None] * pressure_input(pulse, use)[:, None, :])
-        axial_n = pulse.dynamic_pressure_pa[use] * model.area_m2 * model.aero.at(mach, 0.0)[:, 0]
-        turn = pulse.angular_acceleration_sd_radps2 * model.inertia_kgm2[1, 1] / axial_n
+            inputs[PRESSURE] = -by_moment @ (moment[:, :, None] * pressure_input(loads, use)[:, None, :])
+        axial_n = loads.dynamic_pressure_pa[use] * model.area_m2 * model.aero.at(mach, 0.0)[:, 0]
+        turn = loads.angular_acceleration_sd_radps2 * model.inertia_kgm2[1, 1] / axial_n
         noise = (turn**2)[:, None, None] * by_moment @ by_moment.transpose(0, 2, 1)
-        swing = by_moment * (shell_inertia(vehicle) / axial_n)[:, None, None]
+        by_acceleration = by_moment * (shell_inertia(vehicle) / axial_n)[:, None, None]
     read = about - (by_moment @ (base - moment)[:, :, None])[:, :, 0]
-    return Evidence("trim", pulse.time_s[use], np.where(known[:, None], read, np.nan), swing, inputs, noise, AVERAGED_S)
+    read = np.where(known[:, None], read, np.nan)
+    return Evidence("trim", loads.time_s[use], read, by_acceleration, inputs, noise, _AVERAGED_S)
 
 
-def trim_bend(pulse: PulseData, joint_station_m: float | None = None, dynamic: bool = True) -> FloatArray:
-    """Half the second derivative of the reading by C_m (n, 2), rad: the one input known so badly that it counts."""
-    use, read = pulse.informative, []
-    for size in (NODE, 0.0, -NODE):
-        model = trim_model(moved_vehicle(pulse.vehicle, {"C_m": size}), joint_station_m)
-        moment = moment_term(model, pulse, use, dynamic)
-        read.append(solve_trim(model, pulse.mach[use], pulse.flow_yz_rad[use], moment))
-    return (read[0] + read[2] - 2.0 * read[1]) / (2.0 * NODE**2)
+def trim_curvature(loads: FlightLoads, joint_station_m: float | None = None, dynamic: bool = True) -> FloatArray:
+    """Half the second derivative of the reading by C_m (n, 2), rad: the one input uncertain enough for it to matter."""
+    use, read = loads.informative, []
+    for size in (_NODE, 0.0, -_NODE):
+        model = trim_model(moved_vehicle(loads.vehicle, {"C_m": size}), joint_station_m)
+        moment = moment_term(model, loads, use, dynamic)
+        read.append(solve_trim(model, loads.mach[use], loads.flow_yz_rad[use], moment))
+    return (read[0] + read[2] - 2.0 * read[1]) / (2.0 * _NODE**2)
 
 
 def shell_inertia(vehicle: Vehicle) -> float:
@@ -263,18 +262,15 @@ def shell_inertia(vehicle: Vehicle) -> float:
     return float(own + reduced * arm_shell * (arm_shell - arm_body))
 
 
-def estimate_trim(pulse: PulseData, joint_station_m: float | None = None, dynamic: bool = True) -> DeflectionHistory:
-    """Bending and plane from the moment balance at every sample with enough deceleration; NaN elsewhere.
+def estimate_trim(loads: FlightLoads, joint_station_m: float | None = None, dynamic: bool = True) -> DeflectionHistory:
+    """Deflection and plane from the moment balance at every sample with enough deceleration; NaN elsewhere.
 
     The covariance propagates the BET's flow angle with the wind's, the initial offset, masses, c.g. stations, inertias,
-    C_m, C_N and C_A, dynamic pressure and the angular acceleration, and bounds the joint's swinging.
+    C_m, C_N and C_A, dynamic pressure and the angular acceleration, and bounds the joint's oscillation.
     """
-    evidence = trim_evidence(pulse, joint_station_m, dynamic)
-    bend = trim_bend(pulse, joint_station_m, dynamic)
-    return history_of_evidence(replace(evidence, bend=bend), pulse, ASSUMPTIONS)
-
-
-SLOPE_AT_RAD = np.deg2rad(2.0)  # coefficients' slopes by alpha are taken from there
+    evidence = trim_evidence(loads, joint_station_m, dynamic)
+    half_curvature_rad = trim_curvature(loads, joint_station_m, dynamic)
+    return history_of_evidence(replace(evidence, half_curvature_rad=half_curvature_rad), loads, _ASSUMPTIONS)
 
 
 @dataclass(frozen=True)
@@ -288,7 +284,7 @@ class StaticTrim:
     rigid_gain_radpm : float
         Trim angle of the rigid vehicle per metre of offset.
     xbar_m : float
-        Shift of the c.g. per radian of bending.
+        Shift of the c.g. per radian of deflection.
     """
 
     critical_stiffness_nmprad: float
@@ -296,7 +292,7 @@ class StaticTrim:
     xbar_m: float
 
     def load(self, stiffness_nmprad: FloatArray) -> FloatArray:
-        """``u``, the share of the joint's stiffness that the deceleration takes; NaN where it diverges."""
+        """``u``, the share of the joint's stiffness that the deceleration offsets; NaN where it diverges."""
         u = self.critical_stiffness_nmprad / np.asarray(stiffness_nmprad, dtype=float)
         return np.where(u < 1.0, u, np.nan)
 
@@ -305,7 +301,7 @@ class StaticTrim:
         return np.asarray(self.rigid_gain_radpm * offset_m / (1.0 - self.load(stiffness_nmprad)))
 
     def deflection(self, stiffness_nmprad: FloatArray, offset_m: float) -> FloatArray:
-        """Bending, rad; NaN where the joint diverges."""
+        """Deflection, rad; NaN where the joint diverges."""
         u = self.load(stiffness_nmprad)
         return np.asarray(offset_m / self.xbar_m * u / (1.0 - u))
 
@@ -318,7 +314,10 @@ class StaticTrim:
             Where the growth is not positive: no finite stiffness does.
         """
         if not growth > 0.0:
-            raise GateError(f"static trim: a growth of {growth:g} needs an infinitely stiff joint; give more than 0")
+            raise GateError(
+                f"static trim: a growth of {growth:g} needs an infinitely stiff joint; give more than 0",
+                code="trim-growth-not-positive",
+            )
         return self.critical_stiffness_nmprad * (1.0 + growth) / growth
 
     def offset_with_freeplay(self, offset_m: float, freeplay_rad: float) -> float:
@@ -339,6 +338,9 @@ def static_trim(vehicle: Vehicle, mach: float, dynamic_pressure_pa: float) -> St
     _, normal, moment, _ = vehicle.aero.at(mach, SLOPE_AT_RAD) / SLOPE_AT_RAD
     restoring = -(moment * model.length_m + normal * model.x_cg_m)
     if not restoring > 0.0:
-        raise GateError(f"static trim: the shell is unstable at Mach {mach:g}: it has no trim angle")
+        raise GateError(
+            f"static trim: the shell is statically unstable at Mach {mach:g}: it has no trim angle",
+            code="statically-unstable",
+        )
     kappa = model.area_m2 * axial * model.xbar_m * (1.0 + normal * model.xbar_m / restoring)
     return StaticTrim(float(dynamic_pressure_pa * kappa), float(axial / restoring), model.xbar_m)

@@ -1,25 +1,24 @@
-"""What would the camera see if the shell were bent by this much?
+"""What would the camera see if the shell were deflected by this much?
 
-The shell's edge against the sky is the outermost torus's limb, a closed-form curve of the bent geometry; it is
-projected, never rendered, and so are the marks painted on the shell. A point ``P`` of the shell appears at
+The shell's edge against the sky is the outermost torus's limb, a closed-form curve of the deformed geometry; it is
+projected, never rendered, and so are the features painted on the shell. A point ``P`` of the shell appears at
 
     px = project(c; J + R(w) (P + kappa f(P) - J)),     w = theta x_hat x d(plane)
 
 with the joint ``J``, the camera ``c``, and a flattening ``kappa``: the cone opens like an umbrella about its innermost
 torus, ``f`` being the motion per radian. Sliding along the surface moves a limb point along the edge only, so the
-edge's motion across itself is that of the material point: derivatives are exact without differentiating the limb.
+edge's motion normal to itself is that of the material point: derivatives are exact without differentiating the limb.
 
-Sources: seed paper, CAD-based estimate and Figures 2.1 to 2.3.
+`render` fills triangles through the lens with a depth buffer, for overlays, masks and checks; a fit projects the edge
+instead, which costs hundreds of times less. A straight edge in space is straight in the picture only over a small
+triangle, so larger ones are split until they span less than `WIDEST_RAD` as seen from the camera; that also follows
+those that reach beyond the lens's field or behind the camera.
 
-What does a camera with a real lens see of a scene of triangles?
+Assumed: a rigid shell but for the flattening, tori of circular section; the lens of `flightmodel.camera`.
 
-Vertices are projected through the lens and triangles filled in the picture with a depth buffer. An edge that is
-straight in space is straight in the picture only where a triangle is small, so larger ones are split until they span
-less than ``WIDEST_RAD`` as seen from the camera; that also follows those that reach beyond the lens's field or behind
-the camera. Pieces that lie outside the picture are dropped on the way.
-
-Rendering is for overlays, masks and checks: a fit projects the edge instead (`estimators.virtual_camera`), which costs
-hundreds of times less. Held to ray casting in the tests.
+References
+----------
+Seed paper, CAD-based estimate and Figures 2.1 to 2.3.
 """
 
 from __future__ import annotations
@@ -37,13 +36,14 @@ from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.deflection import rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry, torus_circles
 
-OUT_OF_SIGHT = "the camera does not see the shell's edge; check its mount and lens in the vehicle file"
-EDGE_POINTS = 201
-OUTER_PX, INNER_PX = 75.0, 45.0
+_EDGE_POINTS = 201
+_OUTER_PX, _INNER_PX = 75.0, 45.0
+WIDEST_RAD, _MARGIN_RAD = float(np.deg2rad(5.0)), float(np.deg2rad(0.5))
+_DEEPEST_SPLIT = 20
 
-BENDING, FLATTENING, CAMERA, HELD = slice(0, 2), 2, slice(3, 11), slice(11, 16)
+DEFLECTION, FLATTENING, CAMERA, HELD = slice(0, 2), 2, slice(3, 11), slice(11, 16)
 """Columns of a derivative: the shell's rotation vector about body y and z (px/rad) and its flattening (px/rad); the
-scene's turn in camera axes (3, px/rad), focal scale, principal point (2), k1, k2 (px); camera position in body axes
+scene's rotation in camera axes (3, px/rad), focal scale, principal point (2), k1, k2 (px); camera position in body axes
 (3), shell radius and joint station (px/m)."""
 
 
@@ -85,7 +85,7 @@ class ProjectedEdge:
 
 @dataclass(frozen=True)
 class VirtualCamera:
-    """A camera that looks at a shell bent about a joint.
+    """A camera that looks at a shell deflected about a joint.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class VirtualCamera:
         """Choose the clocking angles at which the edge is computed: half way round, on the camera's side."""
         y, z = self.camera.position_body_m[1:]
         clock = np.arctan2(z, -y)
-        object.__setattr__(self, "clocks_rad", clock + np.deg2rad(100.0) * np.linspace(-1.0, 1.0, EDGE_POINTS))
+        object.__setattr__(self, "clocks_rad", clock + np.deg2rad(100.0) * np.linspace(-1.0, 1.0, _EDGE_POINTS))
 
     @property
     def joint_m(self) -> FloatArray:
@@ -114,7 +114,7 @@ class VirtualCamera:
 
     @property
     def shell_terms(self) -> tuple[FloatArray, tuple[float, float, float], tuple[float, float], float]:
-        """What the compiled fit wants of the shell: see `estimators._fit_kernels.fit_frame`."""
+        """The shell in the compiled fit: see `estimators._fit_kernels.fit_frame`."""
         return self.clocks_rad, *self._circles, self.joint_station_m
 
     @cached_property
@@ -123,48 +123,60 @@ class VirtualCamera:
         station, radius = (part.tolist() for part in torus_circles(self.geometry))
         return (station[-1], radius[-1], self.geometry.torus_minor_radius_m), (station[0], radius[0])
 
-    def _turn(self, bending: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rotation matrix (3, 3) of a bending, and the y and z columns (3, 2) of its left Jacobian."""
+    def _rotation(self, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotation matrix (3, 3) of a deformation, and the y and z columns (3, 2) of its left Jacobian."""
         rotation, left = np.empty((3, 3)), np.empty((3, 2))
-        _sight_kernels.turned(float(bending[0]), float(bending[1]), rotation, left)
+        _sight_kernels.rotation_matrix(float(deformation[0]), float(deformation[1]), rotation, left)
         return rotation, left
 
-    def sight(self, points_shell_m: FloatArray, bending: FloatArray) -> Sight:
-        """Project points ``(n, 3)`` of the unbent shell, m from the datum, for a bending.
+    def sight(self, points_shell_m: FloatArray, deformation: FloatArray) -> Sight:
+        """Project points ``(n, 3)`` of the undeflected shell, m from the datum, for a deformation.
 
-        ``bending`` (3,) is the shell's rotation vector against the body about body y and z, and its flattening, rad.
+        ``deformation`` (3,) is the shell's rotation vector against the body about body y and z and its flattening, rad.
         """
-        rotation, left = self._turn(bending)
+        rotation, left = self._rotation(deformation)
         _, ring = self._circles
-        bend = (rotation, left, self.joint_station_m, float(bending[2]), *ring)
+        terms = (rotation, left, self.joint_station_m, float(deformation[2]), *ring)
         pixels, jacobian = np.empty((len(points_shell_m), 2)), np.empty((len(points_shell_m), 2, 16))
         _sight_kernels.project_shell(
-            np.ascontiguousarray(points_shell_m), bend, self.camera.lens_terms, pixels, jacobian
+            np.ascontiguousarray(points_shell_m), terms, self.camera.lens_terms, pixels, jacobian
         )
         return Sight(pixels, jacobian)
 
-    def edge(self, bending: FloatArray) -> ProjectedEdge:
-        """Project the shell's edge for a bending (3,); see `sight`."""
-        turn, _ = self._turn(bending)
-        eye = turn.T @ (self.camera.position_body_m - self.joint_m) + self.joint_m
+    def edge(self, deformation: FloatArray) -> ProjectedEdge:
+        """Project the shell's edge for a deformation (3,); see `sight`.
+
+        Raises
+        ------
+        GateError
+            Where the edge is out of the camera's view.
+        """
+        rotation, _ = self._rotation(deformation)
+        eye = rotation.T @ (self.camera.position_body_m - self.joint_m) + self.joint_m
         (station, radius, minor), ring = self._circles
         points = np.empty((len(self.clocks_rad), 3))
-        flat = float(bending[2])
+        flat = float(deformation[2])
         circle = (station + flat * (radius - ring[1]), radius - flat * (station - ring[0]), minor)
         if not _sight_kernels.limb(circle, eye, self.clocks_rad, points):
-            raise GateError(f"the camera at {np.round(eye, 3).tolist()} m lies inside the outermost torus")
-        seen = self.sight(self._unflattened(points, flat), bending)
-        inside = np.isfinite(seen.pixels[:, 0])
-        pixels = seen.pixels[inside]
+            raise GateError(
+                f"the camera at {np.round(eye, 3).tolist()} m lies inside the outermost torus",
+                code="camera-inside-shell",
+            )
+        sight = self.sight(self._unflattened(points, flat), deformation)
+        inside = np.isfinite(sight.pixels[:, 0])
+        pixels = sight.pixels[inside]
         if len(pixels) < 3:
-            raise GateError(OUT_OF_SIGHT)
+            raise GateError(
+                "the camera does not see the shell's edge; check its mount and lens in the vehicle file",
+                "edge-out-of-view",
+            )
         tangent = np.empty_like(pixels)
         tangent[1:-1] = pixels[2:] - pixels[:-2]
         tangent[0], tangent[-1] = pixels[1] - pixels[0], pixels[-1] - pixels[-2]
         tangent /= np.hypot(tangent[:, 0], tangent[:, 1])[:, None]
-        # clocks grow to the left, so the shell lies to the left of the way along the edge
+        # clocking angles grow to the left, so the shell lies to the left along the edge
         inward = np.column_stack([tangent[:, 1], -tangent[:, 0]])
-        return ProjectedEdge(pixels, inward, seen.jacobian[inside], self.clocks_rad[inside])
+        return ProjectedEdge(pixels, inward, sight.jacobian[inside], self.clocks_rad[inside])
 
     def _unflattened(self, points: FloatArray, flattening: float) -> FloatArray:
         """Points ``(n, 3)`` of the shell before it flattened."""
@@ -177,35 +189,38 @@ class VirtualCamera:
         return np.column_stack([x, scale * points[:, 1], scale * points[:, 2]])
 
     def edge_of(self, theta_rad: float, plane_lv_rad: float) -> ProjectedEdge:
-        """Project the shell's edge for a bending angle and plane."""
-        return self.edge(bending_of(theta_rad, plane_lv_rad))
+        """Project the shell's edge for a deflection angle and plane, rad."""
+        return self.edge(deformation_of(theta_rad, plane_lv_rad))
 
     def edge_clocks(self, count: int = 240) -> FloatArray:
-        """Clocking angles of places evenly spread along the unbent edge, inside the picture and clear of its border."""
+        """Clocking angles of places spread evenly along the undeflected edge, inside the picture and off its border."""
         edge = self.edge(np.zeros(3))
         inside = np.flatnonzero(self.camera.is_inside(edge.pixels, 6.0))
         if len(inside) < 2:
-            raise GateError(OUT_OF_SIGHT)
+            raise GateError(
+                "the camera does not see the shell's edge; check its mount and lens in the vehicle file",
+                "edge-out-of-view",
+            )
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(edge.pixels[inside], axis=0), axis=1))])
         return np.interp(np.linspace(0.0, length[-1], count), length, edge.clocks_rad[inside])
 
-    def lines_at(self, clocks_rad: FloatArray, bending: FloatArray) -> ScanLines:
-        """Lay searches across the edge of a bending (3,) at clocking angles; those out of the field are left out."""
-        edge = self.edge(bending)
+    def lines_at(self, clocks_rad: FloatArray, deformation: FloatArray) -> ScanLines:
+        """Scan lines normal to the edge of a deformation (3,) at clocking angles; those out of the field left out."""
+        edge = self.edge(deformation)
         index = np.flatnonzero((clocks_rad >= edge.clocks_rad[0]) & (clocks_rad <= edge.clocks_rad[-1]))
         both = (edge.pixels, edge.inward_px)
         origin, inward = (
             np.column_stack([np.interp(clocks_rad[index], edge.clocks_rad, a[:, k]) for k in (0, 1)]) for a in both
         )
         inward /= np.linalg.norm(inward, axis=1, keepdims=True)
-        return ScanLines(origin, inward, OUTER_PX, INNER_PX, index)
+        return ScanLines(origin, inward, _OUTER_PX, _INNER_PX, index)
 
     def scan_lines(self) -> ScanLines:
-        """Lay searches across the unbent edge."""
+        """Scan lines normal to the undeflected edge."""
         return self.lines_at(self.edge_clocks(), np.zeros(3))
 
     def mismatch(self, horizon: HorizonLine, edge: ProjectedEdge) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Compare found edge points with a projected edge.
+        """Residuals of found edge points against a projected edge.
 
         Returns
         -------
@@ -222,14 +237,10 @@ class VirtualCamera:
         return residual, rows, np.interp(at, np.arange(len(edge.clocks_rad)), edge.clocks_rad)
 
 
-def bending_of(theta_rad: float, plane_lv_rad: float) -> FloatArray:
-    """Bending (3,) of `VirtualCamera.sight` for an angle and a plane, not flattened."""
+def deformation_of(theta_rad: float, plane_lv_rad: float) -> FloatArray:
+    """Deformation (3,) of `VirtualCamera.sight` for a deflection's angle and plane, without flattening."""
     out: FloatArray = rotation_vector_body_shell(np.array(theta_rad), np.array(plane_lv_rad))
     return np.array([out[1], out[2], 0.0])
-
-
-WIDEST_RAD, MARGIN_RAD = float(np.deg2rad(5.0)), float(np.deg2rad(0.5))
-DEEPEST_SPLIT = 20
 
 
 @dataclass(frozen=True)
@@ -273,6 +284,6 @@ def render(camera: Camera, vertices_body_m: FloatArray, faces: NDArray[np.int64]
     depth, nearest = np.full(shape, np.inf), np.full(shape, -1, dtype=np.int64)
     _raster_kernels.raster(
         np.ascontiguousarray(vertices_body_m, dtype=float), np.ascontiguousarray(faces, dtype=np.int64),
-        camera.lens_terms, camera.picture_half_angle_rad + MARGIN_RAD, WIDEST_RAD, DEEPEST_SPLIT, depth, nearest,
+        camera.lens_terms, camera.picture_half_angle_rad + _MARGIN_RAD, WIDEST_RAD, _DEEPEST_SPLIT, depth, nearest,
     )  # fmt: skip
     return Rendered(depth, nearest)

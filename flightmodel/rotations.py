@@ -123,3 +123,11 @@ def left_jacobian(rotation_rad: FloatArray) -> FloatArray:
         np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * cross + (angle - np.sin(angle)) / angle**3 * cross @ cross
     )
     return out
+
+
+def lever_arm_acceleration(
+    rate_radps: FloatArray, angular_acceleration_radps2: FloatArray, arm_m: FloatArray
+) -> FloatArray:
+    """Specific force ``(n, 3)`` at the end of an arm less that at its beginning, m/s^2: ``w' x r + w x (w x r)``."""
+    swing = np.cross(rate_radps, np.cross(rate_radps, arm_m))
+    return np.asarray(np.cross(angular_acceleration_radps2, arm_m) + swing)

@@ -1,6 +1,8 @@
-"""Does an attitude from magnetometer and Sun sensors alone agree with the trajectory's? The range's check, every run.
+"""Does an attitude from magnetometer and Sun sensors alone agree with the trajectory's? A range's check, every run.
 
-See docs/attitude.md, and `recon.vector_attitude` for the comparison itself.
+The history of `recon.vector_attitude` minus the smoothed trajectory's attitude, about three body axes, against the sum
+of both covariances: NEES ``d^T (P_directions + P_trajectory)^-1 d`` and the share inside three standard deviations. It
+is independent where the trajectory neither used these sensors nor was started from them. See docs/attitude.md.
 """
 
 from __future__ import annotations
@@ -28,21 +30,26 @@ from recon.vector_attitude import (
     track,
 )
 
-RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
-DEPENDS = "this check is not independent: the trajectory's "
+_RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
+# why the check is not independent, by code
+DEPENDENCE = {
+    "": "",
+    "filter": "this check is not independent: the trajectory's filter used these sensors too",
+    "start": "this check is not independent: the trajectory's attitude was started from these sensors",
+}
 
 
 @dataclass(frozen=True)
 class AttitudeCheck:
-    """What the directions say of the attitude.
+    """Attitude from directions, and its comparison with the trajectory's.
 
     Parameters
     ----------
     history : AttitudeHistory or None
-        None where the sensors fix no attitude; a finding says why.
+        None where the sensors determine no attitude; a finding gives the reason.
     comparison : AttitudeComparison or None
     dependence : str
-        Words where the trajectory itself rests on these sensors; empty where the check is independent.
+        ``"filter"`` or ``"start"`` where the trajectory itself depends on these sensors, empty where it does not.
     findings : tuple of Finding
     confidence : float
     """
@@ -54,10 +61,10 @@ class AttitudeCheck:
     confidence: float
 
     @property
-    def words(self) -> str:
-        """Verdict in words, with what takes from it."""
-        said = "" if self.comparison is None else self.comparison.words
-        return "; ".join(part for part in (said, self.dependence) if part)
+    def remark(self) -> str:
+        """Result in a sentence, with what limits it."""
+        result = "" if self.comparison is None else self.comparison.words
+        return "; ".join(part for part in (result, DEPENDENCE[self.dependence]) if part)
 
     @property
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
@@ -67,7 +74,7 @@ class AttitudeCheck:
         nees, inside = self.comparison.mean_nees, self.comparison.share_inside
         high = float(chi2.ppf(self.confidence, 3))
         return (
-            ConsistencyCheck("attitude-nees", "attitude check size", nees, 0.0, high, nees <= high, self.words),
+            ConsistencyCheck("attitude-nees", "attitude check size", nees, 0.0, high, nees <= high, self.remark),
             ConsistencyCheck(
                 "attitude-coverage",
                 "attitude check share inside",
@@ -75,7 +82,7 @@ class AttitudeCheck:
                 LEAST_INSIDE,
                 1.0,
                 inside >= LEAST_INSIDE,
-                self.words,
+                self.remark,
             ),
             *(
                 ConsistencyCheck(**{**vars(v), "name": f"attitude check {v.name}"})
@@ -91,21 +98,21 @@ def check_attitude(telemetry: Telemetry, bet: TrajectorySolution) -> AttitudeChe
     settings = bet.settings
     dependence = ""
     if settings.attitude_sensors:
-        dependence = DEPENDS + "filter read these sensors too"
+        dependence = "filter"
     elif telemetry.attitude_prior is None:
-        dependence = DEPENDS + "attitude was started from these sensors"
+        dependence = "start"
     history, comparison = None, None
     found: list[Finding] = []
     try:
         t, points = track(telemetry)
         ends = np.clip(bet.smoothed.time_s[[0, -1]], t[0], t[-1])
         at = np.union1d(t[(t > ends[0]) & (t < ends[1])], ends)
-        chosen = Settings(rate_hz=RATE_HZ, confidence=settings.check_confidence)
+        chosen = Settings(rate_hz=_RATE_HZ, confidence=settings.check_confidence)
         history = reconstruct_attitude(telemetry, (at, interpolate_rows(at, t, points)), chosen)
         comparison = compare(history, bet.smoothed, settings.check_confidence)
         found += history.findings
     except GateError as fault:
-        found.append(Finding("attitude check", str(fault), np.nan, np.nan))
+        found.append(Finding("attitude check", str(fault), np.nan, np.nan, "attitude-check-missing"))
     return AttitudeCheck(history, comparison, dependence, tuple(found), settings.check_confidence)
 
 

@@ -22,8 +22,10 @@ from flightmodel.checks import ConfigError, DivergenceError, Fault, FloatArray, 
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, NO_VIDEO, Deflections, camera_sensitivity, estimate
 from postflight.flight import read_flight
-from postflight.plots import paper_figures, run_figures
-from postflight.plots.overlay_film import write_overlay_film
+from postflight.plots import run_figures
+from postflight.plots.deflection import figure_summary
+from postflight.plots.overlay import write_overlay_film
+from postflight.plots.style import save
 from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
@@ -74,8 +76,8 @@ def simulate(scenario: str, folder: Path, seed: int, force: bool) -> None:
         truth = simulate_to_folder(chosen, seed, folder, report, replace=force)
     print_truth(truth, folder)
     print_events(flight_events(truth, chosen.spec.time.inflated_s))
-    if truth.words:
-        console.print(f"[yellow]{escape(truth.words)}[/]")
+    if truth.remark:
+        console.print(f"[yellow]{escape(truth.remark)}[/]")
 
 
 def print_truth(truth: Truth, folder: Path) -> None:
@@ -219,7 +221,7 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
     for reason in flight.missing:
         console.print(f"[yellow]left out[/] as-flown atmosphere: {escape(reason)}")
     if flight.attitude is not None and flight.attitude.comparison is not None:
-        console.print(escape(flight.attitude.words))
+        console.print(escape(flight.attitude.remark))
     failed = [v for v in flight.consistency_checks if not v.passed]
     passed = len(flight.consistency_checks) - len(failed)
     console.print(f"{passed} of {len(flight.consistency_checks)} consistency checks pass")
@@ -271,10 +273,10 @@ def print_answers(answers: Deflections) -> None:
     console.print(table)
     if answers.fused is not None:
         found = answers.fused.agreement
-        console.print(f"{'' if not found.suspects else '[red]check failed[/] '}{escape(found.words)}")
-        clock = answers.fused.film_clock
-        if clock is not None:
-            console.print(f"{'[red]check failed[/] ' if clock.is_off else ''}{escape(clock.words)}")
+        console.print(f"{'' if not found.hypotheses else '[red]check failed[/] '}{escape(found.remark)}")
+        bias = answers.fused.camera_time_bias
+        if bias is not None:
+            console.print(f"{'[red]check failed[/] ' if bias.is_off else ''}{escape(bias.remark)}")
     for method, row in run_folder.method_summary(answers, at_s).items():
         if "reason" in row:
             console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")
@@ -311,7 +313,7 @@ def deflection(
             run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 history = answers.histories["camera"]
-                run_figures.draw_camera(telemetry, history, out.path / "figures")
+                run_figures.draw_camera(flight, history, out.path / "figures")
                 if film:
                     write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", progress=report)
     for finding in telemetry.findings:
@@ -388,7 +390,7 @@ def demo(folder: Path, seed: int) -> None:
         console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
     result = score_run(folder, written)
     picture = folder / "demo.png"
-    paper_figures.save(run_figures.summary_figure(bet, answers, truth_history(folder)), picture)
+    save(figure_summary(bet, answers, truth_history(folder)), picture)
     print_score(result)
     console.print(f"results, figures and report.html in {escape(str(written))}")
     console.print(f"the answer as a picture, with the truth: {escape(str(picture))}")

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from estimators.benchmark import benchmark_bending
-from estimators.camera import ReadFilm, read_film, sensitivity_table
+from estimators.benchmark import benchmark_deflection
+from estimators.camera import FilmFit, read_film, sensitivity_table
 from estimators.fusion import smoothed
 from estimators.misalignment import estimate_misalignment as misalignment_history
 from estimators.trim import estimate_trim as trim_history
@@ -224,7 +224,7 @@ def _camera_for_fusion(flight: Flight, refused: dict[str, Fault]) -> DeflectionH
         return None
 
 
-def camera_film(flight: Flight, progress: Progress | None = None) -> ReadFilm:
+def camera_film(flight: Flight, progress: Progress | None = None) -> FilmFit:
     """What the onboard video shows, frame by frame; `GateError` where there is none or it cannot be used."""
     frames = flight.telemetry.frames
     if frames is None:
@@ -243,7 +243,7 @@ def camera_film(flight: Flight, progress: Progress | None = None) -> ReadFilm:
     )
 
 
-def with_benchmark_deflection(film: ReadFilm, flight: Flight, bet: Reconstruction | None) -> DeflectionHistory:
+def with_benchmark_deflection(film: FilmFit, flight: Flight, bet: Reconstruction | None) -> DeflectionHistory:
     """Camera's history with the benchmark frame deflected by the moment in the joint; undeflected without one.
 
     Why there is none stands in the history's assumptions.
@@ -253,9 +253,9 @@ def with_benchmark_deflection(film: ReadFilm, flight: Flight, bet: Reconstructio
         if bet is None:
             telemetry.required_triads()
             raise GateError("no trajectory was made", "trajectory-missing")
-        clock_sd_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
-        frames = film.against_benchmark(clock_sd_s)
-        return film.history(benchmark_bending(frames, bet.required_loads(), film.oriented.held.benchmark_rad))
+        time_bias_sd_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
+        frames = film.relative_to_benchmark(time_bias_sd_s)
+        return film.history(benchmark_deflection(frames, bet.required_loads(), film.oriented.apriori.benchmark_rad))
     except GateError as fault:
         plain = film.history()
         words = f"{plain.assumptions}; the benchmark's deflection is not corrected by the joint's moment ({fault})"

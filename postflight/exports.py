@@ -1,26 +1,21 @@
-"""What is exported: the newest run's trajectory, deflections, events and covariances, as its files hold them.
+"""How does a run leave for another program? `postflight export`: the newest run as one file in the program's format.
 
-One table for spreadsheets and data frames: the trajectory's rows with UTC, and deflections at their times.
+=========  ==========================================================================================================
+csv        trajectory with UTC, deflections interpolated to its times
+parquet    the same, with the unit of each column in its metadata
+mat        MATLAB 5: structures ``trajectory``, ``deflection.<method>``, ``covariance`` and ``about``
+nc         NetCDF classic, CF conventions 1.8: a trajectory, and deflections at their own times
+kml        KML 2.2: the track with its times (gx:Track), the same as a line, events as points
+oem        CCSDS Orbit Ephemeris Message 2.0 (KVN): Earth-fixed states, covariances once a second
+=========  ==========================================================================================================
 
-Deflections stand at their own times in the run; here they are interpolated between neighbours, their two components
-apart (a clock angle has a jump), and left empty outside and in gaps.
-
-KML 2.2 for a globe: the track with its times (gx:Track), the same as a line, and the events as points.
-
-KML heights are above sea level, the trajectory's above the WGS-84 ellipsoid; they are written as they are, and the
-file's description says so.
-
-MATLAB (version 5): structures ``trajectory``, ``deflection.<method>`` and ``about``, a column vector a column.
-
-NetCDF after the CF conventions 1.8 (classic format, by scipy): a trajectory, and deflections at their own times.
-
-CCSDS Orbit Ephemeris Message 2.0 (KVN): places and velocities Earth-fixed, covariances once a second.
+A file is written whole or not at all, with the same bytes for the same run. Deflections have times of their own; in the
+tables their two components are interpolated separately (a clock angle jumps at 360 deg), and left empty outside and
+in gaps. KML heights are meant above sea level and written above the WGS-84 ellipsoid, which the description says.
 
 References
 ----------
 CCSDS 502.0-B-2, Orbit Data Messages, 2009. WGS-84 (G1150 and later) and ITRF2000 agree to centimetres.
-
-What ``postflight export`` does: one file, whole or not at all, the same bytes for the same run.
 """
 
 from __future__ import annotations
@@ -39,14 +34,31 @@ import pandas as pd
 from rich import markup
 from rich.console import Console
 
-from flightmodel.checks import ConfigError, FloatArray, GateError
+from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
 from flightmodel.config import parse_utc
-from postflight.run_folder import DIGITS, newest_run, write_file
+from postflight.run_folder import DIGITS, newest_run
 
-UNITS = {
+_UNITS = {
     "m": "m", "mps": "m s-1", "mps2": "m s-2", "deg": "degree", "degps": "degree s-1", "pa": "Pa", "kgpm3": "kg m-3",
     "k": "K", "s": "s",
 }  # fmt: skip
+_STANDARD = {  # names of the CF conventions
+    "lat_deg": "latitude",
+    "lon_deg": "longitude",
+    "alt_m": "height_above_reference_ellipsoid",
+    "p_pa": "air_pressure",
+    "t_k": "air_temperature",
+    "rho_kgpm3": "air_density",
+    "wind_n_mps": "northward_wind",
+    "wind_e_mps": "eastward_wind",
+    "speed_ground_mps": "platform_speed_wrt_ground",
+}
+_COORDINATES = "time lat_deg lon_deg alt_m"
+_GAP_FACTOR = 5.0  # of the usual step of a deflection: a longer one is a gap
+_KML_STEP_S = 0.5  # between points of the track
+_MAT_HEADER = b"MATLAB 5.0 MAT-file, postflight export"  # scipy writes the time of writing there
+_OEM_FRAME = "ITRF2000"
+_OEM_STATE = ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m", "vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"]
 
 
 @dataclass(frozen=True)
@@ -98,18 +110,8 @@ class Source:
         return f"Best-estimated trajectory and deflections of the {kind} {self.name}"
 
 
-def unit_of(column: str) -> str:
-    """UDUNITS name of a column's unit, by its suffix; ``1`` for none."""
-    tail = column.removesuffix("_sd").rsplit("_", 1)[-1]
-    if column == "lat_deg":
-        return "degrees_north"
-    if column == "lon_deg":
-        return "degrees_east"
-    return UNITS.get(tail, "1")
-
-
 def read_source(folder: Path) -> Source:
-    """Read the newest run of a flight folder; `GateError` where there is none or its files are not whole."""
+    """Read the newest run of a flight folder; `GateError` where there is none or its files are incomplete."""
     run = newest_run(folder)
     try:
         header = json.loads((run / "bet_header.json").read_text())
@@ -120,9 +122,9 @@ def read_source(folder: Path) -> Source:
             times, covariance = stored["t_s"], stored["covariance"]
     except FileNotFoundError as fault:
         words = f"has no {Path(str(fault.filename)).name}: it made no trajectory; `postflight run {folder}` does"
-        raise GateError(f"{run}: {words}") from None
+        raise GateError(f"{run}: {words}", "trajectory-missing") from None
     except (ValueError, KeyError, OSError) as fault:
-        raise GateError(f"{run}: cannot be read back ({fault}); run it again") from None
+        raise GateError(f"{run}: cannot be read back ({fault}); run it again", "run-incomplete") from None
     deflections = {p.stem.removeprefix("deflection_"): pd.read_csv(p) for p in sorted(run.glob("deflection_*.csv"))}
     return Source(
         header["flight"], run.name, parse_utc(header["epoch_utc"]), facts["finished_utc"], bool(header["synthetic"]),
@@ -130,10 +132,17 @@ def read_source(folder: Path) -> Source:
     )  # fmt: skip
 
 
-GAP_FACTOR = 5.0
+def _unit(column: str) -> str:
+    """UDUNITS name of a column's unit, by its suffix; ``1`` for none."""
+    tail = column.removesuffix("_sd").rsplit("_", 1)[-1]
+    if column == "lat_deg":
+        return "degrees_north"
+    if column == "lon_deg":
+        return "degrees_east"
+    return _UNITS.get(tail, "1")
 
 
-def merged(source: Source) -> pd.DataFrame:
+def _merged(source: Source) -> pd.DataFrame:
     """Trajectory, UTC and deflections, one row a time."""
     t = source.trajectory["t_s"].to_numpy()
     parts = {"t_s": t, "utc": [source.utc(x) + "Z" for x in t]}
@@ -152,7 +161,7 @@ def _at(table: pd.DataFrame, t: FloatArray) -> dict[tuple[str, str], FloatArray]
     theta = table["theta_deg"].to_numpy()
     after = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
     step = np.diff(at)
-    outside = (t < at[0]) | (t > at[-1]) | (step[after - 1] > GAP_FACTOR * np.median(step))
+    outside = (t < at[0]) | (t > at[-1]) | (step[after - 1] > _GAP_FACTOR * np.median(step))
     y, z = (np.interp(t, at, theta * f(plane)) for f in (np.cos, np.sin))
     values = (
         np.hypot(y, z),
@@ -163,23 +172,23 @@ def _at(table: pd.DataFrame, t: FloatArray) -> dict[tuple[str, str], FloatArray]
     return {key: np.where(outside, np.nan, value) for key, value in zip(keys, values, strict=True)}
 
 
-def csv_bytes(source: Source) -> bytes:
+def _csv(source: Source) -> bytes:
     """One CSV."""
     out = io.StringIO()
-    merged(source).to_csv(out, index=False, float_format=DIGITS, lineterminator="\n")
+    _merged(source).to_csv(out, index=False, float_format=DIGITS, lineterminator="\n")
     return out.getvalue().encode()
 
 
-def parquet_bytes(source: Source) -> bytes:
+def _parquet(source: Source) -> bytes:
     """Parquet with the unit of each column in its field's metadata."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = merged(source)
+    table = _merged(source)
     utc = pd.to_datetime(table["utc"], format="ISO8601").astype("datetime64[us, UTC]")
     table = table.assign(utc=utc)
     arrow = pa.Table.from_pandas(table, preserve_index=False)
-    fields = [f.with_metadata({"unit": unit_of(f.name)}) for f in arrow.schema]
+    fields = [f.with_metadata({"unit": _unit(f.name)}) for f in arrow.schema]
     about = {"title": source.title, "run": source.run, "point": source.header["point"]}
     arrow = arrow.cast(pa.schema(fields, metadata={**(arrow.schema.metadata or {}), **about}))
     out = io.BytesIO()
@@ -187,60 +196,8 @@ def parquet_bytes(source: Source) -> bytes:
     return out.getvalue()
 
 
-STEP_S = 0.5  # between points
-
-
-def kml_bytes(source: Source) -> bytes:
-    """Return one .kml file."""
-    table = source.trajectory
-    t = table["t_s"].to_numpy()
-    keep = np.flatnonzero(np.diff(np.floor((t - t[0]) / STEP_S + 1e-9), prepend=-1.0) > 0.0)
-    keep = np.unique(np.append(keep, len(t) - 1))
-    place = table[["lon_deg", "lat_deg", "alt_m"]].to_numpy()
-    words = (
-        f"{source.title}; {source.header['point']}. Heights are above the WGS-84 ellipsoid, drawn as above sea level: "
-        "up to 107 m apart."
-    )
-    whens = "".join(f"<when>{source.utc(t[k])}Z</when>\n" for k in keep)
-    track = "".join(f"<gx:coord>{' '.join(f'{v:.9g}' for v in place[k])}</gx:coord>\n" for k in keep)
-    line = "\n".join(",".join(f"{v:.9g}" for v in place[k]) for k in keep)
-    points = ""
-    for event in source.events.itertuples(index=False):
-        at = ",".join(f"{np.interp(event.t_s, t, c):.9g}" for c in place.T)
-        points += (
-            f"<Placemark><name>{escape(_printable(str(event.event)))}</name><TimeStamp><when>{source.utc(event.t_s)}Z"
-            f"</when></TimeStamp><Point><altitudeMode>absolute</altitudeMode><coordinates>{at}</coordinates></Point>"
-            "</Placemark>\n"
-        )
-    text = f"""<?xml version="1.0" encoding="UTF-8"?>
-<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
-<Document>
-<name>{escape(_printable(source.name))}</name>
-<description>{escape(_printable(words))}</description>
-<Style id="flight"><LineStyle><color>ff0080ff</color><width>2</width></LineStyle></Style>
-<Placemark><name>track</name><styleUrl>#flight</styleUrl><gx:Track><altitudeMode>absolute</altitudeMode>
-{whens}{track}</gx:Track></Placemark>
-<Placemark><name>line</name><styleUrl>#flight</styleUrl><LineString><altitudeMode>absolute</altitudeMode><coordinates>
-{line}
-</coordinates></LineString></Placemark>
-<Folder><name>events</name>
-{points}</Folder>
-</Document>
-</kml>
-"""
-    return text.encode()
-
-
-def _printable(text: str) -> str:
-    """Text without characters that XML has no place for."""
-    return "".join(c if c.isprintable() else " " for c in text)
-
-
-HEADER = b"MATLAB 5.0 MAT-file, postflight export"  # scipy writes the time of writing there
-
-
-def mat_bytes(source: Source) -> bytes:
-    """Return one .mat file; names longer than MATLAB's 63 letters do not occur."""
+def _mat(source: Source) -> bytes:
+    """MATLAB 5; names longer than MATLAB's 63 letters do not occur."""
     from scipy.io import savemat
 
     content = {
@@ -259,29 +216,15 @@ def mat_bytes(source: Source) -> bytes:
         del content["deflection"]
     out = io.BytesIO()
     savemat(out, content, long_field_names=True, oned_as="column", do_compression=True)
-    return HEADER.ljust(116) + out.getvalue()[116:]
+    return _MAT_HEADER.ljust(116) + out.getvalue()[116:]
 
 
 def _struct(table: pd.DataFrame) -> dict[str, np.ndarray]:
     return {name: table[name].to_numpy(dtype=float)[:, None] for name in table.columns}
 
 
-STANDARD = {
-    "lat_deg": "latitude",
-    "lon_deg": "longitude",
-    "alt_m": "height_above_reference_ellipsoid",
-    "p_pa": "air_pressure",
-    "t_k": "air_temperature",
-    "rho_kgpm3": "air_density",
-    "wind_n_mps": "northward_wind",
-    "wind_e_mps": "eastward_wind",
-    "speed_ground_mps": "platform_speed_wrt_ground",
-}
-COORDINATES = "time lat_deg lon_deg alt_m"
-
-
-def netcdf_bytes(source: Source) -> bytes:
-    """Return one .nc file."""
+def _netcdf(source: Source) -> bytes:
+    """NetCDF after the CF conventions."""
     from scipy.io import netcdf_file
 
     out = io.BytesIO()
@@ -297,7 +240,7 @@ def netcdf_bytes(source: Source) -> bytes:
     identity = file.createVariable("trajectory_id", "c", ("name_length",))
     identity[:] = np.frombuffer(label, dtype="S1") if label else b" "
     identity.cf_role = "trajectory_id"
-    _table(file, source, source.trajectory, "time", "", COORDINATES)
+    _table(file, source, source.trajectory, "time", "", _COORDINATES)
     for method, table in source.deflections.items():
         if len(table):
             _table(file, source, table, f"time_{method}", f"_{method}", f"time_{method}")
@@ -319,29 +262,66 @@ def _table(file: object, source: Source, table: pd.DataFrame, time: str, ending:
             continue
         variable = create(column + ending, "d", (time,))
         variable[:] = table[column].to_numpy(dtype=float)
-        variable.units = unit_of(column)
+        variable.units = _unit(column)
         variable.long_name = column.replace("_", " ")
         variable._FillValue = np.nan
-        if column in STANDARD:
-            variable.standard_name = STANDARD[column]
+        if column in _STANDARD:
+            variable.standard_name = _STANDARD[column]
         if column not in coordinates.split():
             variable.coordinates = coordinates
 
 
-FRAME = "ITRF2000"
-PLACE = ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m", "vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"]
-
-
-def oem_bytes(source: Source) -> bytes:
-    """Return one .oem file: km, km/s, km^2."""
+def _kml(source: Source) -> bytes:
+    """KML: track, line and events."""
     table = source.trajectory
     t = table["t_s"].to_numpy()
-    state = table[PLACE].to_numpy() / 1000.0
+    keep = np.flatnonzero(np.diff(np.floor((t - t[0]) / _KML_STEP_S + 1e-9), prepend=-1.0) > 0.0)
+    keep = np.unique(np.append(keep, len(t) - 1))
+    place = table[["lon_deg", "lat_deg", "alt_m"]].to_numpy()
+    description = (
+        f"{source.title}; {source.header['point']}. Heights are above the WGS-84 ellipsoid, drawn as above sea level: "
+        "up to 107 m apart."
+    )
+    whens = "".join(f"<when>{source.utc(t[k])}Z</when>\n" for k in keep)
+    track = "".join(f"<gx:coord>{' '.join(f'{v:.9g}' for v in place[k])}</gx:coord>\n" for k in keep)
+    line = "\n".join(",".join(f"{v:.9g}" for v in place[k]) for k in keep)
+    points = ""
+    for event in source.events.itertuples(index=False):
+        at = ",".join(f"{np.interp(event.t_s, t, c):.9g}" for c in place.T)
+        points += (
+            f"<Placemark><name>{escape(_printable(str(event.event)))}</name><TimeStamp><when>{source.utc(event.t_s)}Z"
+            f"</when></TimeStamp><Point><altitudeMode>absolute</altitudeMode><coordinates>{at}</coordinates></Point>"
+            "</Placemark>\n"
+        )
+    text = f"""<?xml version="1.0" encoding="UTF-8"?>
+<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
+<Document>
+<name>{escape(_printable(source.name))}</name>
+<description>{escape(_printable(description))}</description>
+<Style id="flight"><LineStyle><color>ff0080ff</color><width>2</width></LineStyle></Style>
+<Placemark><name>track</name><styleUrl>#flight</styleUrl><gx:Track><altitudeMode>absolute</altitudeMode>
+{whens}{track}</gx:Track></Placemark>
+<Placemark><name>line</name><styleUrl>#flight</styleUrl><LineString><altitudeMode>absolute</altitudeMode><coordinates>
+{line}
+</coordinates></LineString></Placemark>
+<Folder><name>events</name>
+{points}</Folder>
+</Document>
+</kml>
+"""
+    return text.encode()
+
+
+def _oem(source: Source) -> bytes:
+    """CCSDS OEM: km, km/s, km^2."""
+    table = source.trajectory
+    t = table["t_s"].to_numpy()
+    state = table[_OEM_STATE].to_numpy() / 1000.0
     name = "".join(c if c.isalnum() and c.isascii() else "_" for c in source.name) or "flight"
     lines = [
         "CCSDS_OEM_VERS = 2.0",
-        "COMMENT " + _ascii(source.title),
-        f"COMMENT point: {_ascii(source.header['point'])}",
+        "COMMENT " + _printable(source.title, "?", ascii_only=True),
+        f"COMMENT point: {_printable(source.header['point'], '?', ascii_only=True)}",
         f"CREATION_DATE = {source.finished_utc[:19]}",
         "ORIGINATOR = POSTFLIGHT",
         "",
@@ -349,7 +329,7 @@ def oem_bytes(source: Source) -> bytes:
         f"OBJECT_NAME = {name}",
         f"OBJECT_ID = {source.epoch:%Y}-000A",
         "CENTER_NAME = EARTH",
-        f"REF_FRAME = {FRAME}",
+        f"REF_FRAME = {_OEM_FRAME}",
         "TIME_SYSTEM = UTC",
         f"START_TIME = {source.utc(t[0])}",
         f"STOP_TIME = {source.utc(t[-1])}",
@@ -361,24 +341,26 @@ def oem_bytes(source: Source) -> bytes:
     lines += [f"{source.utc(at)} {' '.join(f'{v:.9f}' for v in row)}" for at, row in zip(t, state, strict=True)]
     lines += ["", "COVARIANCE_START"]
     for at, covariance in zip(source.covariance_time_s, source.covariance[:, :6, :6] / 1e6, strict=True):
-        lines += [f"EPOCH = {source.utc(at)}", f"COV_REF_FRAME = {FRAME}"]
+        lines += [f"EPOCH = {source.utc(at)}", f"COV_REF_FRAME = {_OEM_FRAME}"]
         lines += [" ".join(f"{v:.9e}" for v in covariance[k, : k + 1]) for k in range(6)]
     return ("\n".join([*lines, "COVARIANCE_STOP"]) + "\n").encode()
 
 
-def _ascii(text: str) -> str:
-    return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
+def _printable(text: str, instead: str = " ", *, ascii_only: bool = False) -> str:
+    """Text with ``instead`` for every character that a format has no place for."""
+    return "".join(c if c.isprintable() and (c.isascii() or not ascii_only) else instead for c in text)
 
 
-FORMS: dict[str, Callable[[Source], bytes]] = {
-    "csv": csv_bytes,
-    "parquet": parquet_bytes,
-    "mat": mat_bytes,
-    "nc": netcdf_bytes,
-    "kml": kml_bytes,
-    "oem": oem_bytes,
+# format: what writes it, the suffix of its file
+FORMS: dict[str, tuple[Callable[[Source], bytes], str]] = {
+    "csv": (_csv, ".csv"),
+    "parquet": (_parquet, ".parquet"),
+    "mat": (_mat, ".mat"),
+    "nc": (_netcdf, ".nc"),
+    "kml": (_kml, ".kml"),
+    "oem": (_oem, ".oem"),
 }
-EXTRAS = {"pyarrow": "parquet"}
+EXTRAS = {"pyarrow": "parquet"}  # library, and the extra of the installation that brings it
 console = Console(soft_wrap=True)
 
 
@@ -393,21 +375,20 @@ def export(folder: Path, form: str, out: Path | None) -> None:
         Where the flight has no run with a trajectory.
     """
     source = read_source(folder)
-    path = out or folder / "exports" / f"{source.run}.{form}"
+    write, suffix = FORMS[form]
+    path = out or folder / "exports" / f"{source.run}{suffix}"
     if (folder / "runs").resolve() in path.resolve().parents:
-        raise ConfigError(f"{path}: run folders stay as they were written; name another place")
+        raise ConfigError(f"{path}: run folders stay as they were written; name another place", "export-into-run")
     try:
-        content = FORMS[form](source)
+        content = write(source)
     except ImportError as fault:
         name = (fault.name or "").partition(".")[0]
         if name not in EXTRAS:
             raise
         words = f"--to {form} needs {name}, which is not installed: pip install 'postflight[{EXTRAS[name]}]'"
-        raise ConfigError(words) from None
-    try:
+        raise ConfigError(words, "library-missing") from None
+    with writing(path, "name another place with --out"):
         write_file(path, content)
-    except OSError as fault:
-        raise GateError(f"{path}: cannot be written: {fault.strerror or fault}") from None
     console.print(
         f"{markup.escape(str(path))} ({len(content) / 1e6:.1f} MB) of run {markup.escape(source.run)}", highlight=False
     )

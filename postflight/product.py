@@ -1,34 +1,25 @@
-"""What the numbers of a trajectory product refer to: epoch, frames, vehicle, air, sensors, settings, version.
+"""What stands beside the trajectory of a run? Its header, events and peaks, residual statistics, covariances.
 
-Tables beside the trajectory: events and peaks with their uncertainty, and how the residuals behaved.
-
-The best estimated trajectory as a table: every column an analyst asks for, each with its standard deviation.
-
-Columns, units and frames: docs/bet-product.md. What a flight cannot have (attitude in ballistic flight, sensors in a
-telemetry gap, force coefficients where nothing pushes) is an empty cell.
+``bet_header.json`` states what the numbers refer to (epoch, frames, vehicle, atmosphere, sensors, settings, version);
+events and peaks are read from the trajectory's table, residual statistics and covariances from the reconstruction.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from flightmodel import earth, events, rotations
-from flightmodel.airdata import derived_with_sd, is_angle
-from flightmodel.atmosphere import profile_from_sounding
+from flightmodel import events
 from flightmodel.checks import FloatArray
-from postflight.loads import sensed, whole_windows
-from recon.atmosphere import LEAST_AXIAL_MPS2
+from postflight.reconstruction import Reconstruction
 
-if TYPE_CHECKING:
-    from postflight.reconstruction import Reconstruction
-
-FORMAT = 1
-FRAMES = {
+_FORMAT = 1
+_COVARIANCE_RATE_HZ = 1.0
+_FRAMES = {
     "eci": "equal to ECEF at time zero (epoch_utc), then fixed in space",
     "ecef": "WGS-84, Earth-fixed; velocities relative to the rotating Earth",
     "ned": "north, east, down at the vehicle, geodetic",
@@ -38,8 +29,26 @@ FRAMES = {
     "rates": "p, q, r: of the body relative to inertial space, body components",
     "flow": "with (u, v, w) the velocity relative to the air in body axes: alpha = atan2(w, u), beta = asin(v / V), "
     "total alpha = atan2(hypot(v, w), u); clock: LV clocking angle of (v, w)",
-    "wind": "where the air goes",
-    "force": "specific force in body axes; C_A along -x, C_N the size of the lateral force, reference area below",
+    "wind": "velocity of the air mass, north and east",
+    "force": "specific force in body axes; C_A along -x, C_N the size of the normal force, reference area below",
+}
+_STATISTICS = ("source", "component", "unit", "count", "edited", "mean", "sd", "rms_normalised", "lag1", "nis")
+# peak of the size of which column of bet.csv, and the column of its standard deviation
+_PEAKS = {
+    "dynamic pressure": ("dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
+    "Mach number": ("mach", "mach_sd"),
+    "airspeed": ("airspeed_mps", "airspeed_sd_mps"),
+    "axial deceleration": ("ax_cg_mps2", "ax_cg_sd_mps2"),
+    "total angle of attack in the pulse": ("alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
+    "altitude": ("alt_m", "alt_sd_m"),
+}
+_EVENT_COLUMNS = {
+    "alt_m": "alt_sd_m",
+    "speed_ground_mps": "speed_ground_sd_mps",
+    "flight_path_deg": "flight_path_sd_deg",
+    "mach": "mach_sd",
+    "dynamic_pressure_pa": "dynamic_pressure_sd_pa",
+    "alpha_total_wind_deg": "alpha_total_wind_sd_deg",
 }
 
 
@@ -48,7 +57,7 @@ def header(flight: Reconstruction) -> dict[str, Any]:
     telemetry, bet = flight.telemetry, flight.solution
     settings = bet.provenance["settings"]
     return {
-        "format": FORMAT,
+        "format": _FORMAT,
         "postflight": version("postflight"),
         "flight": telemetry.name,
         "synthetic": telemetry.synthetic,
@@ -57,7 +66,7 @@ def header(flight: Reconstruction) -> dict[str, Any]:
         "end_s": bet.provenance["end_s"],
         "point": "datum (the nose); air data and flow angles at the c.g.",
         "motion": bet.provenance["motion"],
-        "frames": FRAMES,
+        "frames": _FRAMES,
         "standard_deviations": "1 sd, of the smoothed trajectory and, in air data, of the sounding",
         "vehicle": _vehicle(flight),
         "atmosphere": _atmosphere(flight),
@@ -92,26 +101,22 @@ def _atmosphere(flight: Reconstruction) -> dict[str, Any]:
         "highest_m": float(sounding.altitude_m[-1]),
         "density_sd": [float(np.min(sounding.density_sd)), float(np.max(sounding.density_sd))],
         "wind_sd_mps": [float(np.min(sounding.wind_sd_mps)), float(np.max(sounding.wind_sd_mps))],
-        "columns": "rho, p, t, mach, winds, alpha: the sounding's air; density_ratio: what the deceleration adds to it",
+        "columns": "rho, p, t, mach, winds, alpha: with the sounding's air; density_ratio: as-flown density over the "
+        "sounding's",
     }
 
 
 def _sensors(flight: Reconstruction) -> list[dict[str, Any]]:
     """Every sensor with its stated accuracies, SI units and radians."""
-    telemetry = flight.telemetry
-    out: list[dict[str, Any]] = []
-    for record in (telemetry.accelerometer, telemetry.rates, telemetry.magnetometer):
-        if record is not None:
-            out.append({"samples": len(record.time_s), **_plain(asdict(record.spec))})
-    if telemetry.sun is not None:
-        out.append({"samples": len(telemetry.sun.time_s), **_plain(asdict(telemetry.sun.spec))})
-    for radar in telemetry.radars.values():
-        out.append({"samples": len(radar.time_s), "tracks": radar.point, **_plain(asdict(radar.site))})
-    for fixes in telemetry.gnss.values():
-        out.append({"samples": len(fixes.time_s), **_plain(asdict(fixes.spec))})
-    for heights in telemetry.barometers.values():
-        out.append({"samples": len(heights.time_s), **_plain(asdict(heights.spec))})
-    return out
+    has = flight.telemetry
+    onboard = [r for r in (has.accelerometer, has.rates, has.magnetometer, has.sun) if r is not None]
+    out = [{"samples": len(r.time_s), **_plain(asdict(r.spec))} for r in onboard]
+    out += [{"samples": len(r.time_s), "tracks": r.point, **_plain(asdict(r.site))} for r in has.radars.values()]
+    return out + [
+        {"samples": len(r.time_s), **_plain(asdict(r.spec))}
+        for records in (has.gnss, has.barometers)
+        for r in records.values()
+    ]
 
 
 def _plain(value: Any) -> Any:
@@ -122,29 +127,8 @@ def _plain(value: Any) -> Any:
     return value
 
 
-COVARIANCE_RATE_HZ = 1.0
-STATISTICS = ("source", "component", "unit", "count", "edited", "mean", "sd", "rms_normalised", "lag1", "nis")
-# column of bet.csv whose largest size is looked for, and the column of its standard deviation
-PEAKS = {
-    "dynamic pressure": ("dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
-    "Mach number": ("mach", "mach_sd"),
-    "airspeed": ("airspeed_mps", "airspeed_sd_mps"),
-    "axial deceleration": ("ax_cg_mps2", "ax_cg_sd_mps2"),
-    "total angle of attack in the pulse": ("alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
-    "altitude": ("alt_m", "alt_sd_m"),
-}
-EVENT_COLUMNS = {
-    "alt_m": "alt_sd_m",
-    "speed_ground_mps": "speed_ground_sd_mps",
-    "flight_path_deg": "flight_path_sd_deg",
-    "mach": "mach_sd",
-    "dynamic_pressure_pa": "dynamic_pressure_sd_pa",
-    "alpha_total_wind_deg": "alpha_total_wind_sd_deg",
-}
-
-
 def event_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
-    """Events of the flight with what ``bet.csv`` has at their times: each value with three standard deviations."""
+    """Events with the values of ``bet.csv`` there; the ``_3sd_`` columns hold three standard deviations."""
     air = flight.air
     named = [(name, t) for name, t in flight.telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
     peak = "peak dynamic pressure" if flight.peak_is_inside else "largest dynamic pressure (edge of data)"
@@ -153,11 +137,11 @@ def event_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for name, t in sorted(named, key=lambda event: event[1]):
         row: dict[str, object] = {"event": name, "t_s": t}
-        for column, sd_column in EVENT_COLUMNS.items():
+        for column, sd_column in _EVENT_COLUMNS.items():
             row[column], sd = value_and_sd(table, column, sd_column, t)
             row[_three_sd(column)] = 3.0 * sd
         rows.append(row)
-    names = [c for column in EVENT_COLUMNS for c in (column, _three_sd(column))]
+    names = [c for column in _EVENT_COLUMNS for c in (column, _three_sd(column))]
     return pd.DataFrame(rows, columns=["event", "t_s", *names])
 
 
@@ -176,11 +160,11 @@ def _three_sd(column: str) -> str:
 
 
 def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
-    """Largest values with their times; ``inside`` is false where one lies at an end of the data."""
+    """Peak values with times and standard deviations; ``inside`` is false where one lies at an end of the data."""
     q = table["dynamic_pressure_pa"].to_numpy()
     pulse, time_s = q >= 0.5 * q.max(), table["t_s"].to_numpy()
     rows = []
-    for name, (column, sd_column) in PEAKS.items():
+    for name, (column, sd_column) in _PEAKS.items():
         size = np.abs(table[column].to_numpy(dtype=float))
         use = np.isfinite(size) & (pulse if "pulse" in name else size > -1.0)
         if name in ("Mach number", "airspeed"):
@@ -197,32 +181,25 @@ def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
 
 
 def residual_statistics(flight: Reconstruction) -> pd.DataFrame:
-    """How the residuals of each source and component behaved; edited points count in ``count`` and ``edited`` alone.
+    """Statistics of the residuals of each source and component; edited points are in ``count`` and ``edited`` alone.
 
     Mean and sd are in metres and radians (m/s for velocities); ``rms_normalised`` is over the predicted sd and should
-    be one, ``lag1`` the autocorrelation of successive ones and should be none; ``nis`` repeats the source's verdict.
+    be one; ``lag1``, the autocorrelation of successive residuals, should be zero; ``nis`` is the source's own.
     """
-    nis = {
-        v.name.removeprefix("NIS "): v.value for v in flight.solution.consistency_checks if v.name.startswith("NIS ")
-    }
+    checks = flight.solution.consistency_checks
+    nis = {check.name.removeprefix("NIS "): check.value for check in checks if check.code == "nis"}
     rows = []
     for (source, component), part in flight.solution.residuals.groupby(["source", "component"], sort=False):
         good = part[part["accepted"]]
         r, z = good["residual"].to_numpy(), (good["residual"] / good["predicted_sd"]).to_numpy()
         unit = "rad" if component in ("azimuth", "elevation") else "m"
         unit = "m/s" if "velocity" in f"{source} {component}" else unit
-        values = (_mean(r), _sd(r), float(np.sqrt(_mean(z**2))), _lag1(z)) if len(r) > 2 else (np.nan,) * 4
+        values = (np.nan,) * 4
+        if len(r) > 2:
+            values = (float(r.mean()), float(r.std(ddof=1)), float(np.sqrt((z**2).mean())), _lag1(z))
         edited = len(part) - len(good)
         rows.append((source, component, unit, len(part), edited, *values, nis.get(source, np.nan)))
-    return pd.DataFrame(rows, columns=list(STATISTICS))
-
-
-def _mean(values: FloatArray) -> float:
-    return float(np.mean(values))
-
-
-def _sd(values: FloatArray) -> float:
-    return float(np.std(values, ddof=1))
+    return pd.DataFrame(rows, columns=list(_STATISTICS))
 
 
 def _lag1(z: FloatArray) -> float:
@@ -231,180 +208,9 @@ def _lag1(z: FloatArray) -> float:
 
 
 def slow_covariance(flight: Reconstruction) -> dict[str, FloatArray]:
-    """Whole covariances (k, 9, 9) at `COVARIANCE_RATE_HZ`: position ECEF m, velocity ECEF m/s, rotation body rad."""
+    """Whole covariances (k, 9, 9) at `_COVARIANCE_RATE_HZ`: position ECEF m, velocity ECEF m/s, rotation body rad."""
     bet = flight.solution.smoothed
     assert bet.covariance is not None
-    ticks = np.floor(bet.time_s * COVARIANCE_RATE_HZ + 1e-6)
+    ticks = np.floor(bet.time_s * _COVARIANCE_RATE_HZ + 1e-6)
     rows = np.flatnonzero(np.diff(ticks, prepend=-np.inf) > 0.0)
     return {"t_s": bet.time_s[rows], "covariance": bet.covariance[rows]}
-
-
-Columns = dict[str, FloatArray]
-# quantity of `airdata.derived`, its column, and the column of its sd
-DERIVED = {
-    "latitude": ("lat_deg", "lat_sd_deg"),
-    "longitude": ("lon_deg", "lon_sd_deg"),
-    "altitude": ("alt_m", "alt_sd_m"),
-    "speed_inertial": ("speed_inertial_mps", "speed_inertial_sd_mps"),
-    "path_inertial": ("flight_path_inertial_deg", "flight_path_inertial_sd_deg"),
-    "heading_inertial": ("heading_inertial_deg", "heading_inertial_sd_deg"),
-    "speed_ground": ("speed_ground_mps", "speed_ground_sd_mps"),
-    "path_ground": ("flight_path_deg", "flight_path_sd_deg"),
-    "heading_ground": ("heading_deg", "heading_sd_deg"),
-    "speed_wind": ("airspeed_mps", "airspeed_sd_mps"),
-    "path_wind": ("flight_path_wind_deg", "flight_path_wind_sd_deg"),
-    "heading_wind": ("heading_wind_deg", "heading_wind_sd_deg"),
-    "roll": ("roll_ned_deg", "roll_ned_sd_deg"),
-    "pitch": ("pitch_ned_deg", "pitch_ned_sd_deg"),
-    "yaw": ("yaw_ned_deg", "yaw_ned_sd_deg"),
-    "mach": ("mach", "mach_sd"),
-    "dynamic_pressure": ("dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
-    "density": ("rho_kgpm3", "rho_sd_kgpm3"),
-    "pressure": ("p_pa", "p_sd_pa"),
-    "temperature": ("t_k", "t_sd_k"),
-    "alpha": ("alpha_deg", "alpha_sd_deg"),
-    "beta": ("beta_deg", "beta_sd_deg"),
-    "alpha_total_wind": ("alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
-    "alpha_total_ground": ("alpha_total_ground_deg", "alpha_total_ground_sd_deg"),
-    "alpha_total_inertial": ("alpha_total_inertial_deg", "alpha_total_inertial_sd_deg"),
-    "clock_wind": ("clock_lv_deg", "clock_lv_sd_deg"),
-    "clock_inertial": ("clock_inertial_lv_deg", "clock_inertial_lv_sd_deg"),
-}
-NEED_ATTITUDE = ("roll", "pitch", "yaw", "alpha", "beta", "clock", "alpha_total")
-FORCE_NAMES = (
-    *(f"a{a}_imu_mps2" for a in "xyz"),
-    *(f"a{a}_imu_sd_mps2" for a in "xyz"),
-    *(f"a{a}_cg_mps2" for a in "xyz"),
-    *(f"a{a}_cg_sd_mps2" for a in "xyz"),
-    "c_a", "c_a_sd", "c_n", "c_n_sd", "cn_over_ca", "cn_over_ca_sd",
-)  # fmt: skip
-
-
-def three(pattern: str, letters: str, values: FloatArray) -> Columns:
-    """Columns of a vector."""
-    return {pattern.format(a): c for a, c in zip(letters, values.T, strict=True)}
-
-
-def bet_table(flight: Reconstruction) -> pd.DataFrame:
-    """Best estimated trajectory, one row an output time."""
-    bet = flight.solution.smoothed
-    sd = bet.sd()
-    columns: Columns = {"t_s": bet.time_s}
-    columns |= three("r{}_ecef_m", "xyz", bet.position_ecef_m)
-    columns |= three("v{}_ecef_mps", "xyz", bet.velocity_ecef_mps)
-    columns |= three("q{}_ecef_body", "wxyz", bet.q_ecef_body)
-    columns |= three("{}_body_degps", "pqr", np.rad2deg(bet.omega_body_eci_body_radps))
-    columns |= three("r{}_ecef_sd_m", "xyz", sd[:, 0:3])
-    columns |= three("v{}_ecef_sd_mps", "xyz", sd[:, 3:6])
-    columns |= three("rotation_{}_body_sd_deg", "xyz", np.rad2deg(sd[:, 6:9]))
-    columns |= three("{}_body_sd_degps", "pqr", np.rad2deg(_rate_sd(flight)))
-    columns |= _inertial(flight)
-    columns |= _derived(flight)
-    columns |= _force(flight)
-    columns |= _day(flight)
-    if not flight.has_attitude:  # the trajectory's own attitude is a placeholder there
-        blank = np.full(len(bet.time_s), np.nan)
-        columns |= {name: blank for name in columns if "_body" in name}
-    return pd.DataFrame(columns)
-
-
-def _rate_sd(flight: Reconstruction) -> FloatArray:
-    """Standard deviations (n, 3) of the rates: estimated errors and a sample's white noise."""
-    bet, rates = flight.solution, flight.telemetry.rates
-    if not len(bet.rate_cov) or rates is None:
-        return np.full((len(bet.smoothed.time_s), 3), np.nan)
-    return np.asarray(np.sqrt(np.diagonal(bet.rate_cov, axis1=1, axis2=2) + rates.spec.noise_sd**2))
-
-
-def _inertial(flight: Reconstruction) -> Columns:
-    """Position and velocity in ECI with standard deviations."""
-    bet = flight.solution.smoothed
-    assert bet.covariance is not None
-    turn = rotations.conjugate(earth.q_ecef_eci(bet.time_s))
-    dcm = rotations.dcm_from_q(turn)
-    r = rotations.rotate(turn, bet.position_ecef_m)
-    v = rotations.rotate(turn, bet.velocity_ecef_mps) + np.cross(earth.OMEGA_ECEF_RADPS, r)
-    move = np.zeros((len(r), 6, 6))
-    move[:, 0:3, 0:3] = move[:, 3:6, 3:6] = dcm
-    move[:, 3:6, 0:3] = rotations.skew(earth.OMEGA_ECEF_RADPS) @ dcm
-    moved = move @ bet.covariance[:, :6, :6] @ move.transpose(0, 2, 1)
-    sd = np.sqrt(np.diagonal(moved, axis1=1, axis2=2))
-    out = three("r{}_eci_m", "xyz", r) | three("v{}_eci_mps", "xyz", v)
-    return out | three("r{}_eci_sd_m", "xyz", sd[:, 0:3]) | three("v{}_eci_sd_mps", "xyz", sd[:, 3:6])
-
-
-def _derived(flight: Reconstruction) -> Columns:
-    """Air data, flow angles and attitude angles; winds."""
-    vehicle, profile = flight.telemetry.vehicle, profile_from_sounding(flight.telemetry.sounding)
-    arm = np.zeros(3) if vehicle is None else vehicle.cg_m
-    value, sd = derived_with_sd(flight.solution.smoothed, profile, arm)
-    out: Columns = {}
-    for name, (column, sd_column) in DERIVED.items():
-        unknown = not flight.has_attitude and name.startswith(NEED_ATTITUDE)
-        for key, numbers in ((column, value[name]), (sd_column, sd[name])):
-            out[key] = np.full(len(numbers), np.nan) if unknown else np.rad2deg(numbers) if is_angle(name) else numbers
-    air = flight.air
-    for kind in ("wind", "ground", "inertial"):  # to first order, as the estimators have them
-        if flight.has_attitude:
-            out[f"alpha_total_{kind}_sd_deg"] = np.rad2deg(getattr(air, f"alpha_total_{kind}_sd_rad"))
-    out |= {"wind_n_mps": air.air.wind_ned_mps[:, 0], "wind_e_mps": air.air.wind_ned_mps[:, 1]}
-    return out | {"wind_sd_mps": air.air.wind_sd_mps}
-
-
-def _force(flight: Reconstruction) -> Columns:
-    """Specific force at the sensor and at the c.g., and the force coefficients that follow with the sounding's air."""
-    bet, telemetry = flight.solution, flight.telemetry
-    t = bet.smoothed.time_s
-    out = {name: np.full(len(t), np.nan) for name in FORCE_NAMES}
-    rows = whole_windows(bet, t)
-    if telemetry.accelerometer is None or not rows.any():
-        return out
-    spec, vehicle = telemetry.accelerometer.spec, telemetry.vehicle
-    arm = np.zeros(3) if vehicle is None else vehicle.cg_m - spec.position_from_datum_body_m
-    at = sensed(bet, t[rows], arm)
-    cov = bet.specific_force_cov[rows] + spec.noise_sd**2 / at.samples * np.eye(3)
-    sd = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
-    found = three("a{}_imu_mps2", "xyz", at.specific_force_sensor_mps2) | three("a{}_imu_sd_mps2", "xyz", sd)
-    if vehicle is not None:
-        force = at.specific_force_cg_mps2
-        found |= three("a{}_cg_mps2", "xyz", force) | three("a{}_cg_sd_mps2", "xyz", sd)
-        q, q_sd = (getattr(flight.air, f"dynamic_pressure{end}_pa")[rows] for end in ("", "_sd"))
-        heavy = vehicle.mass_kg / vehicle.reference.area_m2
-        found |= _coefficients(force, cov, q / heavy, np.hypot(q_sd / q, vehicle.uncertainty.mass))
-    for name, numbers in found.items():
-        out[name][rows] = numbers
-    return out
-
-
-def _coefficients(force: FloatArray, cov: FloatArray, push: FloatArray, push_sd: FloatArray) -> Columns:
-    """C_A, C_N and their ratio with sds; ``push`` (n,) is q S / m, m/s^2, ``push_sd`` a fraction."""
-    axial, normal = -force[:, 0], np.hypot(force[:, 1], force[:, 2])
-    way = force[:, 1:] / np.maximum(normal, 1e-12)[:, None]
-    axial_part = np.sqrt(cov[:, 0, 0]) / np.abs(axial)
-    normal_sd = np.sqrt(np.einsum("ni,nij,nj->n", way, cov[:, 1:, 1:], way))
-    ca, cn, ratio = axial / push, normal / push, normal / axial
-    out = {
-        "c_a": ca,
-        "c_a_sd": np.abs(ca) * np.hypot(axial_part, push_sd),
-        "c_n": cn,
-        "c_n_sd": np.hypot(normal_sd / push, cn * push_sd),
-        "cn_over_ca": ratio,
-        "cn_over_ca_sd": np.hypot(normal_sd / axial, ratio * axial_part),
-    }
-    weak = axial < LEAST_AXIAL_MPS2
-    return {name: np.where(weak, np.nan, numbers) for name, numbers in out.items()}
-
-
-def _day(flight: Reconstruction) -> Columns:
-    """Density over the sounding's by the deceleration, on the descent."""
-    n = len(flight.air.time_s)
-    out = {"density_ratio": np.full(n, np.nan), "density_ratio_sd": np.full(n, np.nan)}
-    if flight.as_flown is None:
-        return out
-    p, span = flight.as_flown.profile, flight.as_flown.drag["time_s"]
-    h = flight.air.altitude_m
-    rows = (flight.air.time_s >= span.min()) & (flight.air.time_s <= span.max())
-    rows &= (h >= p["altitude_m"].min()) & (h <= p["altitude_m"].max())
-    for name in out:
-        out[name][rows] = np.interp(h[rows], p["altitude_m"], p[name])
-    return out

@@ -1,9 +1,7 @@
-"""Run folders: every result of one run as CSV and JSON, whole or not there at all.
+"""Where are the results of a run? In ``runs/<utc>-<hash8>/``, as CSV and JSON, complete or not there at all.
 
-``runs/<utc>-<hash8>/``: the hash covers inputs, settings and version, so equal runs carry equal hashes, and the same
-inputs give the same bytes in every file but ``run.json``, which alone holds times and machine.
-
-A file that is whole or not there at all.
+The hash covers inputs, settings and version, so equal runs carry equal hashes, and the same inputs give the same bytes
+in every file but ``run.json``, which alone holds times and machine. What the tables contain: `postflight.product`.
 """
 
 from __future__ import annotations
@@ -26,12 +24,11 @@ from flightmodel.checks import GateError, writing
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import NO_VIDEO, Deflections
-from postflight.fusing import agreement_table, input_table
-from postflight.product import bet_table, event_table, header, peak_table, residual_statistics, slow_covariance
-from postflight.reconstruction import Reconstruction
+from postflight.product import event_table, header, peak_table, residual_statistics, slow_covariance
+from postflight.reconstruction import Reconstruction, bet_table
 
 DIGITS = "%.10g"
-COPY = "copy the flight folder to where you may write"
+_COPY = "copy the flight folder to where you may write"
 PARTIAL = ".partial-"  # before the number of the process that writes it
 
 
@@ -48,7 +45,7 @@ class RunFolder:
 
     def __enter__(self) -> RunFolder:
         """Make the partial folder beside the final one."""
-        with writing(self.parent, COPY):
+        with writing(self.parent, _COPY):
             self.parent.mkdir(exist_ok=True)
             remove_abandoned(self.parent)
             self.path = Path(tempfile.mkdtemp(prefix=f"{PARTIAL}{os.getpid()}-", dir=self.parent))
@@ -59,7 +56,7 @@ class RunFolder:
         """Rename when whole; remove otherwise, also where the end itself is interrupted."""
         partial = self.path
         try:
-            with writing(self.parent, COPY):
+            with writing(self.parent, _COPY):
                 if isinstance(fault, OSError):
                     raise fault
                 if kind is None:
@@ -68,7 +65,7 @@ class RunFolder:
             shutil.rmtree(partial, ignore_errors=True)
 
     def write_facts(self) -> datetime:
-        """Write ``run.json`` and return the run's time: when everything is there, or earlier for who reads it."""
+        """Write ``run.json`` and return the run's time: at the end, or earlier for what reads it (the report)."""
         now = datetime.now(UTC)
         facts = {
             "finished_utc": now.isoformat(timespec="seconds"),
@@ -102,16 +99,13 @@ class RunFolder:
 
 
 def run_hash(inputs_sha256: dict[str, str], settings: dict[str, Any], made_by: str) -> str:
-    """Eight digits that equal runs share: of inputs, settings and version."""
+    """Eight hexadecimal digits of inputs, settings and version, which equal runs share."""
     facts = json.dumps([inputs_sha256, settings, made_by], sort_keys=True)
     return hashlib.sha256(facts.encode()).hexdigest()[:8]
 
 
 def remove_abandoned(parent: Path) -> None:
-    """Remove the folders that processes which are gone left half-written: killed where they could not tidy up.
-
-    Such a folder is named `PARTIAL`, process number, ``-`` and anything.
-    """
+    """Remove incomplete folders, named `PARTIAL`, process number, ``-`` and anything, of processes that ended."""
     for path in parent.iterdir():
         number, dash, _ = path.name.removeprefix(PARTIAL).partition("-")
         if not path.name.startswith(PARTIAL) or not dash or not number.isdigit():
@@ -139,7 +133,7 @@ def newest_run(flight_folder: Path) -> Path:
     finished = (flight_folder / "runs").glob("*/summary.json")
     runs = sorted(path.parent for path in finished if not path.parent.name.startswith("."))
     if not runs:
-        raise GateError(f"{flight_folder}: no finished run; use `postflight run {flight_folder}` first")
+        raise GateError(f"{flight_folder}: no finished run; use `postflight run {flight_folder}` first", "run-missing")
     return runs[-1]
 
 
@@ -192,27 +186,27 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction) -> pd.DataFrame
     if flight.attitude is not None and flight.attitude.comparison is not None:
         run.write_csv("attitude_check.csv", attitude_table(flight.attitude, bet))
     findings = [vars(f) for f in (*flight.findings, *without_attitude(flight))]
-    run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s"]))
+    run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s", "code"]))
     return event_rows
 
 
 def without_attitude(flight: Reconstruction) -> tuple[Finding, ...]:
-    """Finding that says what is not in the tables of a flight without inertial sensors; none with them."""
+    """Finding on the empty columns of a flight without inertial sensors; none with them."""
     if flight.has_attitude:
         return ()
     words = "no inertial sensors carried the attitude: attitude, rates and flow angles are empty in bet.csv"
-    return (Finding("attitude", words, np.nan, np.nan),)
+    return (Finding("attitude", words, np.nan, np.nan, "attitude-missing"),)
 
 
 def write_answers(run: RunFolder, answers: Deflections) -> None:
-    """One CSV a method that answered."""
+    """Write a table for each method that answered, and those of the fusion."""
     for method, history in answers.histories.items():
         run.write_csv(f"deflection_{method}.csv", history.to_frame())
     if answers.smooth_camera is not None:
         run.write_csv("camera_smooth.csv", answers.smooth_camera.to_frame())
     if answers.fused is not None:
-        run.write_csv("fusion_inputs.csv", input_table(answers.fused))
-        run.write_csv("fusion_agreement.csv", agreement_table(answers.fused))
+        run.write_csv("fusion_inputs.csv", answers.fused.input_frame())
+        run.write_csv("fusion_agreement.csv", answers.fused.agreement_frame())
 
 
 def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
@@ -225,7 +219,7 @@ def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
     return {
         "passed": all(v.passed for v in check.consistency_checks),
         "independent": not check.dependence,
-        "words": check.words,
+        "words": check.remark,
         "rms_body_deg": [float(x) for x in np.rad2deg(np.sqrt(np.mean(comparison.difference_body_rad**2, axis=0)))],
         "mean_body_deg": [float(x) for x in np.rad2deg(comparison.mean_body_rad)],
         "share_inside_3sd": comparison.share_inside,
@@ -236,7 +230,7 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
     """Return the results of a run in short, for ``summary.json``; ``event_rows`` is its `event_table`."""
     at_peak = event_rows.iloc[int((event_rows["t_s"] - flight.peak_s).abs().argmin())]
     alpha = [float(at_peak["alpha_total_wind_deg"]), float(at_peak["alpha_total_wind_3sd_deg"]) / 3.0]
-    consistency_checks = flight.consistency_checks
+    checks = flight.consistency_checks
     return {
         "flight": flight.telemetry.name,
         "synthetic": flight.telemetry.synthetic,
@@ -245,24 +239,13 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
         "alpha_total_wind_deg": alpha[0] if flight.has_attitude else None,
         "alpha_total_wind_sd_deg": alpha[1] if flight.has_attitude else None,
         "methods": method_summary(answers, flight.peak_s),
-        "agreement": None if answers.fused is None else answers.fused.agreement.words,
-        "film_clock": None if answers.fused is None else answers.fused.clock_summary(),
+        "agreement": None if answers.fused is None else answers.fused.agreement.remark,
+        "film_clock": None if answers.fused is None else answers.fused.time_bias_summary(),
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),
         "missing": list(flight.missing),
         "attitude_check": attitude_summary(flight.attitude),
-        "verdicts_passed": sum(v.passed for v in consistency_checks),
+        "verdicts_passed": sum(check.passed for check in checks),
         "suspect": flight.suspects[0] if flight.suspects else None,
         "suspects": list(flight.suspects),
-        "verdicts_failed": [f"{v.name}: {v.remark}" for v in consistency_checks if not v.passed],
+        "verdicts_failed": [f"{check.name}: {check.remark}" for check in checks if not check.passed],
     }
-
-
-def write_file(path: Path, content: bytes | str) -> None:
-    """Write bytes, or text as UTF-8, beside its place and rename it; folders on the way are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
-    try:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

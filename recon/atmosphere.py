@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from flightmodel import earth, rotations
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.airdata import lateral_angles
 from flightmodel.atmosphere import (
@@ -38,7 +39,10 @@ from flightmodel.atmosphere import (
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.sphere_cone import knudsen
 from flightmodel.statistics import correlation
+from flightmodel.telemetry import Telemetry
+from flightmodel.trajectory import Trajectory, resample
 from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
+from recon.reconstruct import TrajectorySolution
 
 KNOT_M, KNOT_S, TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
 LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration says nothing about the air
@@ -51,6 +55,12 @@ BAD_DRAG = "is further from the pre-flight value than stated: check mass, area a
 LARGEST_RMS = 2.0
 LEAST_LEFT = 0.1  # of the joint's stiffness, when the air's push has taken its part
 SETTLED_SD, MOST_STEPS = 1e-2, 20
+# half the window over which sensors are averaged: well below the joint's period, well above the sampling interval
+HALF_WINDOW_S = 0.05
+_WINDOW_S = 0.4  # over which the joint's oscillation is averaged
+_EDGE_S = 0.05  # half the windows over which rates are averaged at both ends
+_POINTS = 9  # at which a window's attitude is interpolated
+_LARGEST_GAP_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -362,3 +372,145 @@ def _consistency_checks(
         judged("pre-flight C_A", ["C_A"], 3 * k, BAD_DRAG),
     )
     return tuple(v for v in found if v is not None)
+
+
+def _window_means(time_s: FloatArray, values: FloatArray, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
+    """Means ``(k, m)`` of piecewise linear ``values`` (n, m) over windows; uneven samples are weighted by time."""
+    area = np.concatenate(
+        [np.zeros((1, values.shape[1])), np.cumsum(0.5 * np.diff(time_s)[:, None] * (values[1:] + values[:-1]), axis=0)]
+    )
+
+    def integral(at: FloatArray) -> FloatArray:
+        at = np.clip(at, time_s[0], time_s[-1])
+        k = np.clip(np.searchsorted(time_s, at, side="right") - 1, 0, len(time_s) - 2)
+        h = (at - time_s[k])[:, None]
+        slope = (values[k + 1] - values[k]) / (time_s[k + 1] - time_s[k])[:, None]
+        return area[k] + values[k] * h + 0.5 * slope * h**2
+
+    width = np.clip(end_s, time_s[0], time_s[-1]) - np.clip(start_s, time_s[0], time_s[-1])
+    return (integral(end_s) - integral(start_s)) / np.maximum(width, 1e-9)[:, None]
+
+
+@dataclass(frozen=True)
+class CgAccelerations:
+    """Window means of the corrected inertial sensors at times (k,), body axes.
+
+    Parameters
+    ----------
+    specific_force_sensor_mps2, specific_force_cg_mps2 : (k, 3) float
+        At the accelerometer, and carried to the c.g. by the gyros.
+    rate_radps, angular_acceleration_radps2 : (k, 3) float
+    samples : float
+        Number of samples in a window.
+    """
+
+    specific_force_sensor_mps2: FloatArray
+    specific_force_cg_mps2: FloatArray
+    rate_radps: FloatArray
+    angular_acceleration_radps2: FloatArray
+    samples: float
+
+
+def windows_are_whole(bet: TrajectorySolution, grid: FloatArray) -> BoolArray:
+    """Mask (n,) of times with sensor data on both sides and no telemetry gap near."""
+    t_imu, h = bet.imu_time_s, HALF_WINDOW_S
+    if len(t_imu) < 2:
+        return np.zeros(len(grid), dtype=bool)
+    inside = (grid - 2 * h >= t_imu[0]) & (grid + 2 * h <= t_imu[-1])
+    nearest = np.searchsorted(t_imu, grid).clip(1, len(t_imu) - 1)
+    return np.asarray(inside & (t_imu[nearest] - t_imu[nearest - 1] <= 2.0 * h))
+
+
+def cg_accelerations(
+    bet: TrajectorySolution, t: FloatArray, cg_from_sensor_m: FloatArray, h: float = HALF_WINDOW_S
+) -> CgAccelerations:
+    """Corrected sensors, averaged over ``h`` s on both sides of times whose windows are whole."""
+    t_imu = bet.imu_time_s
+    force = _window_means(t_imu, bet.specific_force_body_mps2, t - h, t + h)
+    rate = _window_means(t_imu, bet.rate_body_radps, t - h, t + h)
+    after = _window_means(t_imu, bet.rate_body_radps, t, t + 2 * h)
+    before = _window_means(t_imu, bet.rate_body_radps, t - 2 * h, t)
+    turn = (after - before) / (2 * h)
+    at_cg = force + rotations.lever_arm_acceleration(rate, turn, cg_from_sensor_m)
+    return CgAccelerations(force, at_cg, rate, turn, max(1.0, 2 * h / float(np.median(np.diff(t_imu)))))
+
+
+def as_flown_atmosphere(
+    telemetry: Telemetry, bet: TrajectorySolution, profile: AtmosphereProfile, confidence: float
+) -> ReconstructedAir:
+    """Density and winds along altitude from the reconstruction and the corrected deceleration.
+
+    Raises
+    ------
+    GateError
+        Where there is no vehicle or no inertial sensor, or the air never pushes hard enough.
+    """
+    vehicle = telemetry.required_vehicle()
+    known = vehicle.uncertainty
+    drag = Drag(
+        vehicle.aero,
+        vehicle.reference.area_m2 / vehicle.mass_kg,
+        float(np.hypot(known.ca, known.mass)),
+        float(np.hypot(known.cn, known.mass)),
+        vehicle.reference.length_m,
+    )
+    return reconstruct_air(_air_samples(telemetry, bet), profile, drag, confidence)
+
+
+def _air_samples(telemetry: Telemetry, bet: TrajectorySolution) -> AirSamples:
+    """Means over windows of `_WINDOW_S`, side by side, wherever no telemetry gap is near."""
+    cg = telemetry.required_vehicle().cg_m
+    accelerometer, _ = telemetry.required_triads()
+    t = _window_times(bet)
+    force = _force_means(bet, cg - accelerometer.spec.position_from_datum_body_m, t)
+    inside = _WINDOW_S * ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5)
+    dense = resample(bet.smoothed, (t[:, None] + inside).ravel())
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(values.reshape(len(t), _POINTS, *values.shape[1:]).mean(axis=1))
+
+    middle = resample(bet.smoothed, t)
+    lat, lon, altitude = earth.geodetic_from_ecef(middle.position_ecef_m)
+    dcm_ned_ecef = earth.dcm_ned_ecef(lat, lon)
+    dcm = rotations.dcm_from_q(dense.q_ecef_body)
+    spin = dense.omega_body_eci_body_radps - dcm.transpose(0, 2, 1) @ earth.OMEGA_ECEF_RADPS
+    velocity = dense.velocity_ecef_mps + np.einsum("nij,nj->ni", dcm, np.cross(spin, cg))
+    return AirSamples(
+        t,
+        altitude,
+        np.einsum("nij,nj->ni", dcm_ned_ecef, mean(velocity)),
+        dcm_ned_ecef @ mean(dcm),
+        force,
+        _error_roots(middle, dcm_ned_ecef),
+    )
+
+
+def _window_times(bet: TrajectorySolution) -> FloatArray:
+    """Middles of the windows in which the sensors are whole."""
+    t_imu, t_bet = bet.imu_time_s, bet.smoothed.time_s
+    reach = 0.5 * _WINDOW_S + _EDGE_S
+    first, last = max(t_imu[0], t_bet[0]) + reach, min(t_imu[-1], t_bet[-1]) - reach
+    t = np.arange(first, last, _WINDOW_S)
+    gaps = np.flatnonzero(np.diff(t_imu) > _LARGEST_GAP_S)
+    whole = np.ones(len(t), dtype=bool)
+    for k in gaps:
+        whole &= (t + reach < t_imu[k]) | (t - reach > t_imu[k + 1])
+    return t[whole]
+
+
+def _force_means(bet: TrajectorySolution, arm_body_m: FloatArray, t: FloatArray) -> FloatArray:
+    """Specific force at a point ``arm_body_m`` from the accelerometer, body axes, means over the windows."""
+    t_imu, rate, half = bet.imu_time_s, bet.rate_body_radps, 0.5 * _WINDOW_S
+    swing = np.cross(rate, np.cross(rate, arm_body_m))
+    force = _window_means(t_imu, bet.specific_force_body_mps2 + swing, t - half, t + half)
+    ends = [_window_means(t_imu, rate, at - _EDGE_S, at + _EDGE_S) for at in (t - half, t + half)]
+    return force + np.cross((ends[1] - ends[0]) / _WINDOW_S, arm_body_m)
+
+
+def _error_roots(trajectory: Trajectory, dcm_ned_ecef: FloatArray) -> FloatArray:
+    """Roots (n, 6, 6) of the covariance of velocity and rotation in NED axes."""
+    assert trajectory.covariance is not None
+    turn = np.zeros((len(trajectory.time_s), 6, 6))
+    turn[:, 0:3, 0:3] = dcm_ned_ecef
+    turn[:, 3:6, 3:6] = dcm_ned_ecef @ rotations.dcm_from_q(trajectory.q_ecef_body)
+    return np.asarray(np.linalg.cholesky(turn @ trajectory.covariance[:, 3:9, 3:9] @ turn.transpose(0, 2, 1)))

@@ -1,26 +1,25 @@
-"""Compiled two-body dynamics: right-hand side, Runge-Kutta steps, recording; one flight or many side by side.
-
-Readable twin: `synthetic_flight.dynamics`.
+"""How do two rigid bodies on a compliant joint move? Compiled right-hand side, Runge-Kutta steps and recording.
 
 State (20): position and velocity of the composite c.g. (ECI), quaternions ECI from body and ECI from shell, rates of
-body and shell (own axes). The joint's constraint is eliminated, so nothing drifts: its force comes from one 3x3
-symmetric positive-definite solve (the constraint force equation of a spherical joint), in shell axes, where the
-shell's inertia, its arm to the joint and the aerodynamic wrench need no turning.
+body and shell (own axes). ``m_B a_B = F_B + Fc`` and ``m_A a_A = F_A - Fc`` with one acceleration of the joint's point:
+the constraint is eliminated, so nothing drifts, and the joint's force ``Fc`` comes from one 3x3 symmetric
+positive-definite solve (constraint force equation of a spherical joint), in shell axes, where the shell's inertia, its
+arm to the joint and the aerodynamic wrench need no rotation. The readable form that tests compare with is
+`tests.oracles.two_body`.
 
-One flight is a long chain of dependent arithmetic, so a processor mostly waits. Flights do not depend on each other,
-so they fly in lanes: row ``r`` of the workspace ``s`` holds one quantity of every flight, ``s[r * lanes + i]``, and
-loops over ``i`` become vector instructions. The number of lanes is the length of the tuple ``lanes``, which the
-compiler knows; one lane is the plain simulator. Loops are short, so that the processor works at the chains of several
-lanes at once; table look-ups, which do not vectorise, have loops of their own. All rows lie in one array, so that the
-compiler sees that none overlap. Branches in vector loops must be arithmetic (`tests` watch the machine code).
+One flight is a long chain of dependent arithmetic, in which a processor mostly waits. Flights do not depend on each
+other, so they fly in lanes: row ``r`` of the workspace ``s`` holds one quantity of every flight, ``s[r * lanes + i]``,
+and loops over ``i`` become vector instructions. The number of lanes is the length of the tuple ``lanes``, a constant of
+the compiler; one lane is the plain simulator. Loops are short, so that the chains of several lanes overlap; table
+look-ups, which do not vectorise, have loops of their own. All rows lie in one array, so that the compiler sees that
+none overlap. Branches in vector loops must be arithmetic (a test reads the machine code).
 
-The workspace of the flight kernels: which row holds what, and how three, six or nine rows are read as one.
+Order of this file: the workspace's rows and access to them; attitudes; atmosphere and aerodynamic wrench; accelerations
+of the two bodies; integration; Gauss-Markov noise.
 
-Row ``r`` holds one quantity of every lane, ``s[r * lanes + i]``.
-
-Compiled air: where the nose is, what blows there, and the aerodynamic wrench; vector loops over lanes.
-
-Readable twin: `synthetic_flight.dynamics.aerodynamics`. The workspace: `synthetic_flight._kernels`.
+References
+----------
+Bose et al., AIAA 2011-2571, section III (constraint force equation).
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ import math
 from flightmodel import _kernels as la
 from flightmodel._kernels import inlined, kernel
 
-# of a flight: state, and what is recorded beside it
+# columns of a record: state, and the auxiliary quantities beside it
 STATES, AUX = 20, 18
 
 # parameters of a vehicle: masses of body and shell, 1/m_B, 1/m_A, m_A/m, -m_B/m, 1/m; of the body, then of the shell,
@@ -43,14 +42,14 @@ PARAMETERS = 67
 
 # rows: state, trial state of a Runge-Kutta stage, its derivative, the next state
 Y, TRIAL, RATE, NEXT = 0, 20, 40, 60
-# what is recorded: altitude, density, Mach, dynamic pressure, shell's total angle of attack, bending angle; in shell
-# axes force and moment of the joint on the body and aerodynamic force
+# recorded: altitude, density, Mach, dynamic pressure, shell's total angle of attack, deflection; in shell axes force
+# and moment of the joint on the body, and aerodynamic force
 ALTITUDE, DENSITY, MACH, PRESSURE, ALPHA, THETA, FORCE, MOMENT, AERO = 80, 81, 82, 83, 84, 85, 86, 89, 92
 # ECI from shell, shell from body (matrices), and scalar and x part of the latter's quaternion
 R_A, C_AB, TWIST = 95, 104, 113
 # in shell axes: body's rate, its arm to the joint, its c.g. from the shell's, gravitation at the shell's c.g. less that
-# at the body's, moment on the shell about its c.g. without the joint's
-RATE_B, ARM_B, BETWEEN, TIDE, SHELL = 115, 118, 121, 124, 127
+# at the body's, moment on the shell about its c.g. without that of the joint
+RATE_B, ARM_B, BETWEEN, GRAVITY_GRADIENT, SHELL = 115, 118, 121, 124, 127
 # sine and cosine of latitude, of longitude; sound, north and east wind, free-molecular fraction
 SIN, COS, SIN_LON, COS_LON, SOUND, NORTH, EAST, FREE = 130, 131, 132, 133, 134, 135, 136, 137
 # C_A C_N C_m C_mq; flow at the nose, shell axes; its size, its lateral part; Mach bracket of the last look-up
@@ -60,12 +59,12 @@ ROWS = P + PARAMETERS
 
 
 @inlined
-def three(s, row, w, i):
+def _three(s, row, w, i):
     return s[row * w + i], s[(row + 1) * w + i], s[(row + 2) * w + i]
 
 
 @inlined
-def six(s, row, w, i):
+def _six(s, row, w, i):
     return (
         s[row * w + i], s[(row + 1) * w + i], s[(row + 2) * w + i],
         s[(row + 3) * w + i], s[(row + 4) * w + i], s[(row + 5) * w + i],
@@ -73,7 +72,7 @@ def six(s, row, w, i):
 
 
 @inlined
-def nine(s, row, w, i):
+def _nine(s, row, w, i):
     return (
         s[row * w + i], s[(row + 1) * w + i], s[(row + 2) * w + i],
         s[(row + 3) * w + i], s[(row + 4) * w + i], s[(row + 5) * w + i],
@@ -82,32 +81,68 @@ def nine(s, row, w, i):
 
 
 @inlined
-def put(s, row, w, i, x, y, z):
+def _put(s, row, w, i, x, y, z):
     s[row * w + i], s[(row + 1) * w + i], s[(row + 2) * w + i] = x, y, z
 
 
 @inlined
-def put_nine(s, row, w, i, m):
-    put(s, row, w, i, m[0], m[1], m[2])
-    put(s, row + 3, w, i, m[3], m[4], m[5])
-    put(s, row + 6, w, i, m[6], m[7], m[8])
+def _put_nine(s, row, w, i, m):
+    _put(s, row, w, i, m[0], m[1], m[2])
+    _put(s, row + 3, w, i, m[3], m[4], m[5])
+    _put(s, row + 6, w, i, m[6], m[7], m[8])
 
 
 @inlined
-def place(s, lanes, planet):
-    """Where the nose is above the Earth, and how fast the air there turns with it."""
+def _attitudes(s, lanes):
+    """Rotations, kinematic rates, and the body's rate and arms in shell axes."""
     w = len(lanes)
     for i in range(w):
-        r, share = nine(s, R_A, w, i), s[(P + SHARE_A) * w + i]
-        dx, dy, dz = three(s, BETWEEN, w, i)
-        nx, ny, nz = three(s, P + NOSE_A, w, i)
+        t = (TRIAL + 6) * w + i
+        b0, b1, b2, b3 = s[t], s[t + w], s[t + 2 * w], s[t + 3 * w]
+        a0, a1, a2, a3 = s[t + 4 * w], s[t + 5 * w], s[t + 6 * w], s[t + 7 * w]
+        q0, q1 = a0 * b0 + a1 * b1 + a2 * b2 + a3 * b3, a0 * b1 - a1 * b0 - a2 * b3 + a3 * b2
+        q2, q3 = a0 * b2 + a1 * b3 - a2 * b0 - a3 * b1, a0 * b3 - a1 * b2 + a2 * b1 - a3 * b0
+        s[TWIST * w + i], s[(TWIST + 1) * w + i] = q0, q1
+        _put_nine(s, R_A, w, i, la.rotation(a0, a1, a2, a3))
+        c = la.rotation(q0, q1, q2, q3)
+        _put_nine(s, C_AB, w, i, c)
+        wb0, wb1, wb2 = _three(s, TRIAL + 14, w, i)
+        x, y, z = la.times(c, wb0, wb1, wb2)
+        _put(s, RATE_B, w, i, x, y, z)
+        ax, ay, az = _three(s, P + P_A, w, i)
+        x, y, z = _three(s, P + P_B, w, i)
+        x, y, z = la.times(c, x, y, z)
+        _put(s, ARM_B, w, i, x, y, z)
+        _put(s, BETWEEN, w, i, ax - x, ay - y, az - z)
+        wa0, wa1, wa2 = _three(s, TRIAL + 17, w, i)
+        _spin(s, w, i, RATE + 6, b0, b1, b2, b3, wb0, wb1, wb2)
+        _spin(s, w, i, RATE + 10, a0, a1, a2, a3, wa0, wa1, wa2)
+        x, y, z = _three(s, TRIAL + 3, w, i)
+        _put(s, RATE, w, i, x, y, z)
+
+
+@inlined
+def _spin(s, w, i, row, q0, q1, q2, q3, w0, w1, w2):
+    t = row * w + i
+    s[t], s[t + w] = 0.5 * (-q1 * w0 - q2 * w1 - q3 * w2), 0.5 * (q0 * w0 + q2 * w2 - q3 * w1)
+    s[t + 2 * w], s[t + 3 * w] = 0.5 * (q0 * w1 + q3 * w0 - q1 * w2), 0.5 * (q0 * w2 + q1 * w1 - q2 * w0)
+
+
+@inlined
+def _position(s, lanes, planet):
+    """Altitude, latitude and longitude of the nose, and velocity of the air there that rotates with the Earth."""
+    w = len(lanes)
+    for i in range(w):
+        r, share = _nine(s, R_A, w, i), s[(P + SHARE_A) * w + i]
+        dx, dy, dz = _three(s, BETWEEN, w, i)
+        nx, ny, nz = _three(s, P + NOSE_A, w, i)
         dx, dy, dz = la.times(r, nx + share * dx, ny + share * dy, nz + share * dz)
-        x, y, z = three(s, TRIAL, w, i)
+        x, y, z = _three(s, TRIAL, w, i)
         x, y, z = x + dx, y + dy, z + dz
         sin_lat, cos_lat, altitude, per_radius = la.geodetic(x, y, z, planet)
         s[SIN * w + i], s[COS * w + i], s[ALTITUDE * w + i] = sin_lat, cos_lat, altitude
         s[SIN_LON * w + i], s[COS_LON * w + i] = y * per_radius, x * per_radius
-        put(s, FLOW, w, i, -planet[4] * y, planet[4] * x, 0.0)
+        _put(s, FLOW, w, i, -planet[4] * y, planet[4] * x, 0.0)
 
 
 @inlined
@@ -121,8 +156,8 @@ def _between(a, b, f):
 
 
 @inlined
-def air(s, lanes, atmosphere, grid):
-    """Air of the row of the table below the nose, and what changes up to the next; end values outside."""
+def _air(s, lanes, atmosphere, grid):
+    """Air at the nose, between two rows of the table; the first and last rows hold outside of it."""
     w, last = len(lanes), atmosphere.shape[1] - 2
     for i in range(w):
         a = atmosphere[min(i, atmosphere.shape[0] - 1)]
@@ -138,41 +173,41 @@ def air(s, lanes, atmosphere, grid):
 
 
 @inlined
-def flow(s, lanes):
+def _flow(s, lanes):
     """Flow at the nose in shell axes, Mach number, dynamic pressure, total angle of attack."""
     w = len(lanes)
     for i in range(w):
-        r, share = nine(s, R_A, w, i), s[(P + SHARE_A) * w + i]
+        r, share = _nine(s, R_A, w, i), s[(P + SHARE_A) * w + i]
         sin_lat, cos_lat, sl, cl = s[SIN * w + i], s[COS * w + i], s[SIN_LON * w + i], s[COS_LON * w + i]
         north, east = s[NORTH * w + i], s[EAST * w + i]
-        vx, vy, vz = three(s, TRIAL + 3, w, i)
-        ex, ey, ez = three(s, FLOW, w, i)
+        vx, vy, vz = _three(s, TRIAL + 3, w, i)
+        ex, ey, ez = _three(s, FLOW, w, i)
         vx += north * sin_lat * cl + east * sl - ex
         vy += north * sin_lat * sl - east * cl - ey
         u, v, z = la.back(r, vx, vy, vz - north * cos_lat - ez)
-        wb0, wb1, wb2 = three(s, RATE_B, w, i)
-        wa0, wa1, wa2 = three(s, TRIAL + 17, w, i)
-        bx, by, bz = three(s, ARM_B, w, i)
-        ax, ay, az = three(s, P + P_A, w, i)
-        nx, ny, nz = three(s, P + NOSE_A, w, i)
+        wb0, wb1, wb2 = _three(s, RATE_B, w, i)
+        wa0, wa1, wa2 = _three(s, TRIAL + 17, w, i)
+        bx, by, bz = _three(s, ARM_B, w, i)
+        ax, ay, az = _three(s, P + P_A, w, i)
+        nx, ny, nz = _three(s, P + NOSE_A, w, i)
         sx, sy, sz = la.cross(wb0, wb1, wb2, bx, by, bz)
         tx, ty, tz = la.cross(wa0, wa1, wa2, nx + share * ax, ny + share * ay, nz + share * az)
         u, v, z = u + tx - share * sx, v + ty - share * sy, z + tz - share * sz
         lateral = math.sqrt(v * v + z * z)
         speed = math.sqrt(u * u + v * v + z * z)
-        put(s, FLOW, w, i, u, v, z)
+        _put(s, FLOW, w, i, u, v, z)
         s[SPEED * w + i], s[LATERAL * w + i], s[ALPHA * w + i] = speed, lateral, la.atan2(lateral, u)
         s[MACH * w + i] = speed / s[SOUND * w + i]
         s[PRESSURE * w + i] = 0.5 * s[DENSITY * w + i] * speed * speed
 
 
 @inlined
-def look_up(s, lanes, grid, mach_knots, table, free):
-    """C_A, C_N, C_m, C_mq, bilinear, held at the first and last Mach number, bridged to free-molecular ones."""
+def _coefficients(s, lanes, grid, mach_knots, table, free):
+    """C_A, C_N, C_m, C_mq: bilinear, held at the first and last Mach number, bridged to free-molecular ones."""
     w = len(lanes)
     for i in range(w):
         mach = s[MACH * w + i]
-        m = int(s[BRACKET * w + i])  # the last one found: seldom left
+        m = int(s[BRACKET * w + i])  # the last bracket found: seldom left
         while m < mach_knots.shape[0] - 2 and mach > mach_knots[m + 1]:
             m += 1
         while m > 0 and mach < mach_knots[m]:
@@ -195,9 +230,9 @@ def look_up(s, lanes, grid, mach_knots, table, free):
 
 
 @inlined
-def wrench(s, w, i):
+def _wrench(s, w, i):
     """Force at the nose on the shell, and y and z of the moment about it; shell axes."""
-    _, v, z = three(s, FLOW, w, i)
+    _, v, z = _three(s, FLOW, w, i)
     speed, area, length = s[SPEED * w + i], s[(P + REFERENCE) * w + i], s[(P + REFERENCE + 1) * w + i]
     f = (P + FACTOR) * w + i
     n = COEF * w + i
@@ -212,64 +247,45 @@ def wrench(s, w, i):
     return -qs * ca, -qs * cn * ny, -qs * cn * nz, turn * nz + damping * wa1, damping * wa2 - turn * ny
 
 
-@kernel
-def gauss_markov(keep, white, out):
-    """Noise of unit variance into ``out`` (n, m): ``keep`` (n - 1,) of the last row is left in the next."""
-    for i in range(out.shape[1]):
-        out[0, i] = white[0, i]
-        for k in range(1, out.shape[0]):
-            out[k, i] = keep[k - 1] * out[k - 1, i] + math.sqrt(1.0 - keep[k - 1] * keep[k - 1]) * white[k, i]
+@inlined
+def _loads(s, lanes, planet):
+    """Acceleration of the composite c.g. by gravity and aerodynamics, and the loads on the two bodies."""
+    w = len(lanes)
+    for i in range(w):
+        r, per_mass = _nine(s, R_A, w, i), s[(P + PER_MASS) * w + i]
+        mb, ma = s[(P + M_B) * w + i], s[(P + M_A) * w + i]
+        fb, fa = s[(P + SHARE_B) * w + i], s[(P + SHARE_A) * w + i]
+        dx, dy, dz = _three(s, BETWEEN, w, i)
+        dx, dy, dz = la.times(r, dx, dy, dz)
+        x, y, z = _three(s, TRIAL, w, i)
+        g0, g1, g2 = la.gravitation(x + fb * dx, y + fb * dy, z + fb * dz, planet)
+        h0, h1, h2 = la.gravitation(x + fa * dx, y + fa * dy, z + fa * dz, planet)
+        x, y, z = la.back(r, h0 - g0, h1 - g1, h2 - g2)
+        _put(s, GRAVITY_GRADIENT, w, i, x, y, z)
+        fx, fy, fz, my, mz = _wrench(s, w, i)
+        _put(s, AERO, w, i, fx, fy, fz)
+        nx, ny, nz = _three(s, P + NOSE_A, w, i)
+        x, y, z = la.cross(nx, ny, nz, fx, fy, fz)
+        _put(s, SHELL, w, i, x, y + my, z + mz)
+        x, y, z = la.times(r, fx, fy, fz)
+        x, y, z = mb * g0 + ma * h0 + x, mb * g1 + ma * h1 + y, mb * g2 + ma * h2 + z
+        _put(s, RATE + 3, w, i, x * per_mass, y * per_mass, z * per_mass)
 
 
 @inlined
 def beyond_freeplay(theta, freeplay, half, per_four_half):
-    """Bending angle beyond the dead band, with a corner that is smooth in slope over +/- ``half``."""
+    """Deflection beyond the dead band, with a corner that is smooth in slope over +/- ``half``."""
     inside = min(max(theta - freeplay + half, 0.0), 2.0 * half)
     return inside * inside * per_four_half + max(theta - freeplay - half, 0.0)
 
 
 @inlined
-def _attitudes(s, lanes):
-    """Rotations, and what of the body is wanted in shell axes."""
-    w = len(lanes)
-    for i in range(w):
-        t = (TRIAL + 6) * w + i
-        b0, b1, b2, b3 = s[t], s[t + w], s[t + 2 * w], s[t + 3 * w]
-        a0, a1, a2, a3 = s[t + 4 * w], s[t + 5 * w], s[t + 6 * w], s[t + 7 * w]
-        q0, q1 = a0 * b0 + a1 * b1 + a2 * b2 + a3 * b3, a0 * b1 - a1 * b0 - a2 * b3 + a3 * b2
-        q2, q3 = a0 * b2 + a1 * b3 - a2 * b0 - a3 * b1, a0 * b3 - a1 * b2 + a2 * b1 - a3 * b0
-        s[TWIST * w + i], s[(TWIST + 1) * w + i] = q0, q1
-        put_nine(s, R_A, w, i, la.rotation(a0, a1, a2, a3))
-        c = la.rotation(q0, q1, q2, q3)
-        put_nine(s, C_AB, w, i, c)
-        wb0, wb1, wb2 = three(s, TRIAL + 14, w, i)
-        x, y, z = la.times(c, wb0, wb1, wb2)
-        put(s, RATE_B, w, i, x, y, z)
-        ax, ay, az = three(s, P + P_A, w, i)
-        x, y, z = three(s, P + P_B, w, i)
-        x, y, z = la.times(c, x, y, z)
-        put(s, ARM_B, w, i, x, y, z)
-        put(s, BETWEEN, w, i, ax - x, ay - y, az - z)
-        wa0, wa1, wa2 = three(s, TRIAL + 17, w, i)
-        _spin(s, w, i, RATE + 6, b0, b1, b2, b3, wb0, wb1, wb2)
-        _spin(s, w, i, RATE + 10, a0, a1, a2, a3, wa0, wa1, wa2)
-        x, y, z = three(s, TRIAL + 3, w, i)
-        put(s, RATE, w, i, x, y, z)
-
-
-@inlined
-def _spin(s, w, i, row, q0, q1, q2, q3, w0, w1, w2):
-    t = row * w + i
-    s[t], s[t + w] = 0.5 * (-q1 * w0 - q2 * w1 - q3 * w2), 0.5 * (q0 * w0 + q2 * w2 - q3 * w1)
-    s[t + 2 * w], s[t + 3 * w] = 0.5 * (q0 * w1 + q3 * w0 - q1 * w2), 0.5 * (q0 * w2 + q1 * w1 - q2 * w0)
-
-
-@inlined
 def _joint(s, lanes):
-    """Moment of the joint on the body, and the bending angle.
+    """Moment of the joint on the body, and the deflection.
 
-    Bending potential of the angle between the two x axes, torsion potential of the twist left after swinging one x
-    axis onto the other; both moments are exact gradients, so springs conserve energy at any angle.
+    Bending potential of the angle between the two x axes, torsion potential of the twist that is left after the
+    shortest rotation of one x axis onto the other; both moments are exact gradients, so springs conserve energy at any
+    angle. both moments are exact gradients, so springs conserve energy at any angle.
     """
     w = len(lanes)
     for i in range(w):
@@ -282,120 +298,95 @@ def _joint(s, lanes):
         k = d * (s[j] + s[j + w] * d * d) / (sine + 1e-300)
         twist = 2.0 * la.atan2(s[(TWIST + 1) * w + i], s[TWIST * w + i])
         twist -= 2.0 * math.pi * ((1.0 if twist > math.pi else 0.0) - (1.0 if twist < -math.pi else 0.0))
-        b0, b1, b2 = three(s, RATE_B, w, i)
-        a0, a1, a2 = three(s, TRIAL + 17, w, i)
+        b0, b1, b2 = _three(s, RATE_B, w, i)
+        a0, a1, a2 = _three(s, TRIAL + 17, w, i)
         w0, w1, w2, damp = b0 - a0, b1 - a1, b2 - a2, s[j + 3 * w] + s[j + 4 * w] * theta * theta
         along = 0.5 * (w0 * (1.0 + x) + w1 * y + w2 * z)
         t = -(s[j + 2 * w] * twist + (s[j + 5 * w] - damp) * along) / (1.0 + x)
         s[THETA * w + i] = theta
-        put(s, MOMENT, w, i, t * (1.0 + x) - damp * w0, k * z + t * y - damp * w1, t * z - k * y - damp * w2)
+        _put(s, MOMENT, w, i, t * (1.0 + x) - damp * w0, k * z + t * y - damp * w1, t * z - k * y - damp * w2)
 
 
 @inlined
-def _pull(s, lanes, planet):
-    """Acceleration of the composite c.g. under gravity and aerodynamics, and the loads on the two bodies."""
-    w = len(lanes)
-    for i in range(w):
-        r, per_mass = nine(s, R_A, w, i), s[(P + PER_MASS) * w + i]
-        mb, ma = s[(P + M_B) * w + i], s[(P + M_A) * w + i]
-        fb, fa = s[(P + SHARE_B) * w + i], s[(P + SHARE_A) * w + i]
-        dx, dy, dz = three(s, BETWEEN, w, i)
-        dx, dy, dz = la.times(r, dx, dy, dz)
-        x, y, z = three(s, TRIAL, w, i)
-        g0, g1, g2 = la.gravitation(x + fb * dx, y + fb * dy, z + fb * dz, planet)
-        h0, h1, h2 = la.gravitation(x + fa * dx, y + fa * dy, z + fa * dz, planet)
-        x, y, z = la.back(r, h0 - g0, h1 - g1, h2 - g2)
-        put(s, TIDE, w, i, x, y, z)
-        fx, fy, fz, my, mz = wrench(s, w, i)
-        put(s, AERO, w, i, fx, fy, fz)
-        nx, ny, nz = three(s, P + NOSE_A, w, i)
-        x, y, z = la.cross(nx, ny, nz, fx, fy, fz)
-        put(s, SHELL, w, i, x, y + my, z + mz)
-        x, y, z = la.times(r, fx, fy, fz)
-        x, y, z = mb * g0 + ma * h0 + x, mb * g1 + ma * h1 + y, mb * g2 + ma * h2 + z
-        put(s, RATE + 3, w, i, x * per_mass, y * per_mass, z * per_mass)
-
-
-@inlined
-def _hinged(s, lanes):
+def _joined(s, lanes):
     """Angular accelerations of both bodies with the joint's force from the constraint force equation."""
     w = len(lanes)
     for i in range(w):
-        c, per_a = nine(s, C_AB, w, i), s[(P + PER_A) * w + i]
-        wb0, wb1, wb2 = three(s, TRIAL + 14, w, i)
-        wa0, wa1, wa2 = three(s, TRIAL + 17, w, i)
-        inverse_b, inverse_a = six(s, P + W_B, w, i), six(s, P + W_A, w, i)
-        g0, g1, g2 = la.gyroscopic(six(s, P + I_B, w, i), wb0, wb1, wb2)
-        h0, h1, h2 = la.gyroscopic(six(s, P + I_A, w, i), wa0, wa1, wa2)
-        jx, jy, jz = three(s, MOMENT, w, i)
+        c, per_a = _nine(s, C_AB, w, i), s[(P + PER_A) * w + i]
+        wb0, wb1, wb2 = _three(s, TRIAL + 14, w, i)
+        wa0, wa1, wa2 = _three(s, TRIAL + 17, w, i)
+        inverse_b, inverse_a = _six(s, P + W_B, w, i), _six(s, P + W_A, w, i)
+        g0, g1, g2 = la.gyroscopic(_six(s, P + I_B, w, i), wb0, wb1, wb2)
+        h0, h1, h2 = la.gyroscopic(_six(s, P + I_A, w, i), wa0, wa1, wa2)
+        jx, jy, jz = _three(s, MOMENT, w, i)
         x, y, z = la.back(c, jx, jy, jz)
         eb0, eb1, eb2 = la.symmetric(inverse_b, x - g0, y - g1, z - g2)
-        x, y, z = three(s, SHELL, w, i)
+        x, y, z = _three(s, SHELL, w, i)
         ea0, ea1, ea2 = la.symmetric(inverse_a, x - jx - h0, y - jy - h1, z - jz - h2)
-        # what would part the two joint points, without the joint's force
-        p0, p1, p2 = three(s, P + P_B, w, i)
+        # relative acceleration of the two joint points without the joint's force
+        p0, p1, p2 = _three(s, P + P_B, w, i)
         x, y, z = la.cross(eb0, eb1, eb2, p0, p1, p2)
         u, v, t = la.centripetal(wb0, wb1, wb2, p0, p1, p2)
         x, y, z = la.times(c, x + u, y + v, z + t)
-        a0, a1, a2 = three(s, P + P_A, w, i)
+        a0, a1, a2 = _three(s, P + P_A, w, i)
         u, v, t = la.cross(ea0, ea1, ea2, a0, a1, a2)
         g0, g1, g2 = la.centripetal(wa0, wa1, wa2, a0, a1, a2)
-        h0, h1, h2 = three(s, TIDE, w, i)
+        h0, h1, h2 = _three(s, GRAVITY_GRADIENT, w, i)
         x, y, z = h0 + u + g0 - x, h1 + v + g1 - y, h2 + t + g2 - z
-        fx, fy, fz = three(s, AERO, w, i)
-        n, m = la.turned(c, six(s, P + N_B, w, i)), six(s, P + N_A, w, i)
+        fx, fy, fz = _three(s, AERO, w, i)
+        n, m = la.turned(c, _six(s, P + N_B, w, i)), _six(s, P + N_A, w, i)
         k = per_a + s[(P + PER_B) * w + i]
         n = (n[0] + m[0] + k, n[1] + m[1], n[2] + m[2], n[3] + m[3] + k, n[4] + m[4], n[5] + m[5] + k)
         fx, fy, fz = la.solved(n, x + fx * per_a, y + fy * per_a, z + fz * per_a)
-        put(s, FORCE, w, i, fx, fy, fz)
+        _put(s, FORCE, w, i, fx, fy, fz)
         x, y, z = la.back(c, fx, fy, fz)
         x, y, z = la.cross(p0, p1, p2, x, y, z)
         x, y, z = la.symmetric(inverse_b, x, y, z)
-        put(s, RATE + 14, w, i, eb0 + x, eb1 + y, eb2 + z)
+        _put(s, RATE + 14, w, i, eb0 + x, eb1 + y, eb2 + z)
         x, y, z = la.cross(a0, a1, a2, fx, fy, fz)
         x, y, z = la.symmetric(inverse_a, x, y, z)
-        put(s, RATE + 17, w, i, ea0 - x, ea1 - y, ea2 - z)
+        _put(s, RATE + 17, w, i, ea0 - x, ea1 - y, ea2 - z)
 
 
 @inlined
-def _locked(s, lanes):
+def _rigid(s, lanes):
     """Angular acceleration of one rigid body, and the moment and force that the lock of the joint carries."""
     w = len(lanes)
     for i in range(w):
-        c, mb, share = nine(s, C_AB, w, i), s[(P + M_B) * w + i], s[(P + SHARE_B) * w + i]
-        w0, w1, w2 = three(s, TRIAL + 17, w, i)
-        d0, d1, d2 = three(s, BETWEEN, w, i)
+        c, mb, share = _nine(s, C_AB, w, i), s[(P + M_B) * w + i], s[(P + SHARE_B) * w + i]
+        w0, w1, w2 = _three(s, TRIAL + 17, w, i)
+        d0, d1, d2 = _three(s, BETWEEN, w, i)
         m, square = mb * share, d0 * d0 + d1 * d1 + d2 * d2
-        b, a = la.turned(c, six(s, P + I_B, w, i)), six(s, P + I_A, w, i)
+        b, a = la.turned(c, _six(s, P + I_B, w, i)), _six(s, P + I_A, w, i)
         n = (
             a[0] + b[0] + m * (square - d0 * d0), a[1] + b[1] - m * d0 * d1, a[2] + b[2] - m * d0 * d2,
             a[3] + b[3] + m * (square - d1 * d1), a[4] + b[4] - m * d1 * d2, a[5] + b[5] + m * (square - d2 * d2),
         )  # fmt: skip
         g0, g1, g2 = la.gyroscopic(n, w0, w1, w2)
-        f0, f1, f2 = three(s, AERO, w, i)
-        t0, t1, t2 = three(s, TIDE, w, i)
-        # moments about the composite c.g.: aerodynamics (known about the shell's c.g.) and gravity's gradient
+        f0, f1, f2 = _three(s, AERO, w, i)
+        t0, t1, t2 = _three(s, GRAVITY_GRADIENT, w, i)
+        # moments about the composite c.g.: aerodynamics (given about the shell's c.g.) and gravity gradient
         f = s[(P + SHARE_A) * w + i]
         x, y, z = la.cross(d0, d1, d2, f * f0 - m * t0, f * f1 - m * t1, f * f2 - m * t2)
-        u, v, t = three(s, SHELL, w, i)
+        u, v, t = _three(s, SHELL, w, i)
         e0, e1, e2 = la.solved(n, u + x - g0, v + y - g1, t + z - g2)
-        # the body's c.g. moves with the composite c.g. and turns about it
+        # the body's c.g. moves with the composite c.g. and rotates about it
         x, y, z = la.centripetal(w0, w1, w2, d0, d1, d2)
         u, v, t = la.cross(e0, e1, e2, d0, d1, d2)
         per_mass = s[(P + PER_MASS) * w + i]
         fx = mb * (share * (t0 + x + u) + f0 * per_mass)
         fy = mb * (share * (t1 + y + v) + f1 * per_mass)
         fz = mb * (share * (t2 + z + t) + f2 * per_mass)
-        put(s, FORCE, w, i, fx, fy, fz)
+        _put(s, FORCE, w, i, fx, fy, fz)
         # moment on the body about its c.g. that is not the force's at the joint
         g0, g1, g2 = la.gyroscopic(b, w0, w1, w2)
         x, y, z = la.symmetric(b, e0, e1, e2)
-        u, v, t = three(s, ARM_B, w, i)
+        u, v, t = _three(s, ARM_B, w, i)
         u, v, t = la.cross(u, v, t, fx, fy, fz)
-        put(s, MOMENT, w, i, x + g0 - u, y + g1 - v, z + g2 - t)
+        _put(s, MOMENT, w, i, x + g0 - u, y + g1 - v, z + g2 - t)
         x, y, z = la.back(c, e0, e1, e2)
-        put(s, RATE + 14, w, i, x, y, z)
-        put(s, RATE + 17, w, i, e0, e1, e2)
+        _put(s, RATE + 14, w, i, x, y, z)
+        _put(s, RATE + 17, w, i, e0, e1, e2)
         s[THETA * w + i] = la.atan2(math.sqrt(c[6] * c[6] + c[3] * c[3]), c[0])
 
 
@@ -403,21 +394,21 @@ def _locked(s, lanes):
 def rates(s, lanes, atmosphere, grid, mach_knots, table, free, planet, locked):
     """Time derivative of the trial state of every lane, and what is recorded."""
     _attitudes(s, lanes)
-    place(s, lanes, planet)
-    air(s, lanes, atmosphere, grid)
-    flow(s, lanes)
-    look_up(s, lanes, grid, mach_knots, table, free)
-    _pull(s, lanes, planet)
+    _position(s, lanes, planet)
+    _air(s, lanes, atmosphere, grid)
+    _flow(s, lanes)
+    _coefficients(s, lanes, grid, mach_knots, table, free)
+    _loads(s, lanes, planet)
     if locked:
-        _locked(s, lanes)
+        _rigid(s, lanes)
     else:
         _joint(s, lanes)
-        _hinged(s, lanes)
+        _joined(s, lanes)
 
 
 @inlined
 def _record(s, w, record, limit, out, out_aux, written):
-    """Write state and record of every lane that still flies, forces and moments in ECI; true while one flies."""
+    """Write state and record of every lane that still flies, forces and moments in ECI; true while any flies."""
     flying = False
     for i in range(w):
         if written[i] < record:
@@ -427,9 +418,9 @@ def _record(s, w, record, limit, out, out_aux, written):
             out[i, record, k] = s[(Y + k) * w + i]
         for k in range(6):
             out_aux[i, record, k] = s[(ALTITUDE + k) * w + i]
-        r = nine(s, R_A, w, i)
+        r = _nine(s, R_A, w, i)
         for k in range(3):
-            x, y, z = three(s, FORCE + 3 * k, w, i)
+            x, y, z = _three(s, FORCE + 3 * k, w, i)
             n = 6 + 3 * k
             out_aux[i, record, n], out_aux[i, record, n + 1], out_aux[i, record, n + 2] = la.times(r, x, y, z)
             out_aux[i, record, 15 + k] = s[(RATE + 14 + k) * w + i]
@@ -473,7 +464,7 @@ def _finish(s, w, step):
 def integrate(lanes, s, tables, planet, step, per_record, records, lock_records, limit, out, out_aux, written):
     """Fly ``records - 1`` intervals of ``per_record`` RK4 steps; joint locked for the first ``lock_records`` intervals.
 
-    ``written`` becomes the number of records of every lane, negative where the flight ended because the bending angle
+    ``written`` becomes the number of records of every lane, negative where the flight ended because the deflection
     passed ``limit`` or was not a number any more.
     """
     w = len(lanes)
@@ -491,3 +482,12 @@ def integrate(lanes, s, tables, planet, step, per_record, records, lock_records,
                 if stage < 3:
                     _advance(s, w, stage, step)
             _finish(s, w, step)
+
+
+@kernel
+def gauss_markov(keep, white, out):
+    """Gauss-Markov noise of unit variance into ``out`` (n, m); ``keep`` (n - 1,): correlation from row to row."""
+    for i in range(out.shape[1]):
+        out[0, i] = white[0, i]
+        for k in range(1, out.shape[0]):
+            out[k, i] = keep[k - 1] * out[k - 1, i] + math.sqrt(1.0 - keep[k - 1] * keep[k - 1]) * white[k, i]

@@ -1,9 +1,9 @@
-"""What is uncertain of a flight, and by how much: a dispersions file, and the flight that one set of draws makes.
+"""Which quantities of a flight are dispersed, by how much, and which flight follows from one set of draws?
 
-Every dispersed quantity is a *factor* and takes one number between 0 and 1, from which its value follows by the inverse
-of its distribution; the day's air takes its whole random structure from the digits of that number. Run ``k`` draws the
-number of each factor from ``SeedSequence(seed, spawn_key=(k, name of the factor))``: it is the same on one worker or a
-thousand, and one factor more or less leaves the others' numbers as they are.
+Every dispersed quantity is a *factor* and takes one number ``u`` between 0 and 1; its deviation is ``F^-1(u)`` of its
+distribution. The day-of-flight atmosphere takes its whole random structure from the digits of its number. Run ``k``
+draws the number of each factor from ``SeedSequence(seed, spawn_key=(k, name of the factor))``: it is the same on one
+worker or a thousand, and one factor more or less leaves the others' numbers as they are. Factors are independent.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from flightmodel.config import KeyFaults, NonNegative, Section, Time
 from flightmodel.vehicle import CompliantJoint, MassProperties, Vehicle
 from synthetic_flight.instrument_errors import name_key
 from synthetic_flight.scenarios import Initial, Scenario
-from synthetic_flight.weather import day_atmosphere
+from synthetic_flight.weather import day_of_flight_atmosphere
 
 SMALLEST = 2.0**-54  # a draw of exactly zero would be an infinite deviation
 WIND_FADE_M = (110e3, 130e3)
@@ -31,7 +31,7 @@ T = TypeVar("T", bound=Section)
 
 
 class Shift(Section):
-    """What is added to a value: normal with a standard deviation, or uniform between two bounds."""
+    """Deviation that is added to a value: normal with a standard deviation, or uniform between two bounds."""
 
     normal: NonNegative | None = None
     uniform: tuple[Number, Number] | None = None
@@ -54,7 +54,7 @@ class Shift(Section):
 
 
 class Factor(Shift):
-    """What a value is multiplied by, less one: normal, uniform, or by a lognormal factor."""
+    """Relative deviation, a factor less one: normal, uniform, or of a lognormal factor."""
 
     lognormal: NonNegative | None = None
 
@@ -79,7 +79,7 @@ class InitialDispersions(Section):
 
 
 class MassDispersions(Section):
-    """Of the two bodies; a station grows aft, the offset is the vehicle's c.g., carried by the centerbody."""
+    """Of the two bodies; a station grows aft, the offset is that of the vehicle's c.g., carried by the centerbody."""
 
     aeroshell_mass: Factor | None = None
     centerbody_mass: Factor | None = None
@@ -113,7 +113,7 @@ class JointDispersions(Section):
 
 
 class AirDispersions(Section):
-    """Of the air: a day of its own for every flight or one day for all, a factor on all density, a wind everywhere."""
+    """Of the atmosphere: a day for every flight or one for all, a factor on the density, a wind at all altitudes."""
 
     day: bool = True
     density: Factor | None = None
@@ -122,7 +122,7 @@ class AirDispersions(Section):
 
 
 class Window(Section):
-    """Which part of the flight is looked at, s, and how finely: for peaks, and for histories."""
+    """Part of the flight that is recorded, s, and its steps: for peaks, and for histories."""
 
     from_s: Time
     to_s: Time
@@ -194,12 +194,12 @@ def draw_one(seed: int, run: int, name: str) -> float:
 
 
 def run_seed(seed: int, run: int) -> int:
-    """Return the seed of all that one run draws beside its factors: its day and its instruments."""
+    """Return the seed of all that one run draws beside its factors: its atmosphere and its instruments."""
     return int(np.random.SeedSequence(seed, spawn_key=(run,)).generate_state(1, np.uint64)[0] >> 1)
 
 
 def rng_from_draw(u: float) -> np.random.Generator:
-    """Return the generator of a factor that is more than a number: a profile."""
+    """Return the generator of a factor that is a whole profile."""
     return np.random.default_rng(np.random.SeedSequence(int(u * 2.0**53)))
 
 
@@ -213,7 +213,7 @@ class Case:
 
     @property
     def vehicle(self) -> Vehicle:
-        """As it flies, but for `scales`."""
+        """Vehicle as flown, but for `scales`."""
         return self.scenario.vehicle
 
 
@@ -228,7 +228,7 @@ def dispersed_case(scenario: Scenario, dispersions: Dispersions, u: dict[str, fl
     Raises
     ------
     GateError
-        Where the draws make what cannot fly: a negative mass, freeplay or stiffness, a latitude beyond the pole.
+        Where the draws are outside what can fly: a negative mass, freeplay or stiffness, a latitude beyond the pole.
     """
     deviation = {name: law.at(u[name]) for name, law in dispersions.factors().items() if law is not None}
 
@@ -240,8 +240,8 @@ def dispersed_case(scenario: Scenario, dispersions: Dispersions, u: dict[str, fl
     initial = _checked(Initial, moved, "initial")
     spec = scenario.spec.model_copy(update={"initial": initial})
     flown = replace(scenario, spec=spec, vehicle=dispersed_vehicle(scenario.vehicle, of))
-    # one day for all is the day of the middle of its distribution's digits, the same whatever the seed
-    profile = day_atmosphere(scenario.spec.atmosphere, rng_from_draw(u.get("atmosphere.day", 0.5)))
+    # one day for all flights is that of u = 0.5, whatever the seed
+    profile = day_of_flight_atmosphere(scenario.spec.atmosphere, rng_from_draw(u.get("atmosphere.day", 0.5)))
     scales = dispersed_scales(of)
     return Case(flown, _dispersed_air(profile, of), scales)
 
@@ -251,13 +251,14 @@ def dispersed_scales(of: Callable[[str], float]) -> tuple[float, float, float, f
     ca, cn, cm = (1.0 + of(f"aerodynamics.{name}") for name in ("ca", "cn", "cm"))
     if min(ca, cn, cm) <= 0.0:
         raise GateError(
-            f"drawn outside what can fly: aerodynamics: factors {ca:.3g}, {cn:.3g}, {cm:.3g} on C_A, C_N, C_m"
+            f"drawn outside what can fly: aerodynamics: factors {ca:.3g}, {cn:.3g}, {cm:.3g} on C_A, C_N, C_m",
+            code="draw-impossible",
         )
     return ca, cn, cm, of("aerodynamics.cmq")
 
 
 def dispersed_vehicle(vehicle: Vehicle, of: Callable[[str], float]) -> Vehicle:
-    """Vehicle with the deviations that ``of`` gives by the factor's name; coefficients are left as they are."""
+    """Vehicle with the deviations that ``of`` gives by the factor's name; coefficients unchanged."""
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
     # the offset is the whole vehicle's, the centerbody carries it
     carried = (vehicle.mass_kg / body.mass_kg) * np.array([0.0, of("mass.offset_y_m"), of("mass.offset_z_m")])
@@ -294,14 +295,16 @@ def _checked(model: type[T], values: dict[str, Any], where: str) -> T:
     try:
         return model.model_validate(values)
     except ValidationError as fault:
-        words = [f"{where}.{'.'.join(map(str, e['loc']))} = {e['input']!r:.40}: {e['msg']}" for e in fault.errors()]
-        raise GateError(f"drawn outside what can fly: {'; '.join(words)}") from None
+        keys = [f"{where}.{'.'.join(map(str, e['loc']))} = {e['input']!r:.40}: {e['msg']}" for e in fault.errors()]
+        raise GateError(f"drawn outside what can fly: {'; '.join(keys)}", code="draw-impossible") from None
 
 
 def _dispersed_air(profile: AtmosphereProfile, of: Callable[[str], float]) -> AtmosphereProfile:
     density, wind = 1.0 + of("atmosphere.density"), [of("atmosphere.wind_north_mps"), of("atmosphere.wind_east_mps")]
     if density <= 0.0:
-        raise GateError(f"drawn outside what can fly: atmosphere.density: a factor of {density:.3g}")
+        raise GateError(
+            f"drawn outside what can fly: atmosphere.density: a factor of {density:.3g}", code="draw-impossible"
+        )
     if density == 1.0 and not any(wind):
         return profile
     winds = profile.wind_ned_mps.copy()

@@ -1,19 +1,14 @@
-"""Thousands of flights: many side by side in vector registers, on every core, memory flat in their number.
+"""What do thousands of dispersed flights do: their peaks, and their histories over a window?
 
 Sixteen flights fly in the lanes of one kernel call (`synthetic_flight._kernels`), and kernel calls run in threads,
-since compiled code holds no interpreter lock. Flight ``run`` is the same to the last bit wherever and beside whichever
-other flights it flies: every lane goes through the same instructions.
+since compiled code holds no interpreter lock. Flight ``run`` is the same to the last bit in any company: every lane
+goes through the same instructions. Memory does not grow with the number of flights.
 
-What is kept of a flight of an ensemble: named histories over its window, and named numbers.
-
-``peak_X`` is the largest sample of the quantity X in the window, ``X_at_peak_pressure`` its sample where dynamic
-pressure is largest. Angles are degrees and accelerations g, since these numbers are for files and figures. A joint that
-diverges ends its flight: histories hold their last value from there on, so that bands do not forget that flight.
-
-Flights of a dispersions file, side by side: from draws to named numbers and histories.
-
-The joint is locked until the shell is inflated. There the vehicle is rigid and outside the air, and flown with longer
-steps; then with the scenario's own. Only the window is recorded.
+The joint is locked until the shell is inflated. Until then the vehicle is rigid and outside the atmosphere, and flown
+with longer steps; then with the scenario's own. Only the window is recorded. Of each flight named numbers and histories
+are kept: ``peak_X`` is the largest sample of the quantity X in the window, ``X_at_peak_pressure`` its sample at the
+largest dynamic pressure. Angles are degrees and accelerations g, since these numbers are for files and figures. A joint
+that diverges ends its flight: histories hold their last value from there on, so that bands include that flight.
 """
 
 from __future__ import annotations
@@ -30,7 +25,7 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.airdata import total_angle
-from flightmodel.checks import ConfigError, FloatArray, GateError, nearest_name
+from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import dynamics, simulate
 from synthetic_flight.dispersions import Case, Dispersions, Window, dispersed_case
@@ -51,10 +46,10 @@ class Start:
     state : (20,) float
         At the start (`synthetic_flight.simulate.state_from_ecef`).
     parameters : (67,) float
-        `packing.parameter_vector` of the dispersed vehicle. All flights share one coefficient table; the last four
-        parameters scale C_A, C_N, C_m and shift C_mq.
+        `synthetic_flight.simulate.parameter_vector` of the dispersed vehicle. All flights share one coefficient table;
+        the last four parameters scale C_A, C_N, C_m and shift C_mq.
     atmosphere : (rows, 6) float
-        `packing.atmosphere_table` of the flight's own day.
+        `synthetic_flight.simulate.atmosphere_table` of the flight's own atmosphere.
     """
 
     state: FloatArray
@@ -116,7 +111,10 @@ def fly_ensemble(
     """
     workers = available_cores() if workers is None else workers
     if workers < 1 or schedule.records < 1 or schedule.per_record < 1 or not schedule.step_s > 0.0:
-        raise ConfigError(f"fly_ensemble: workers, steps and records must be positive; got {workers}, {schedule}")
+        raise ConfigError(
+            f"fly_ensemble: workers, steps and records must be positive; got {workers}, {schedule}",
+            code="ensemble-arguments",
+        )
     check_step(vehicle, schedule.step_s)
     remaining = iter(runs)
     with ThreadPoolExecutor(workers) as pool:
@@ -124,13 +122,13 @@ def fly_ensemble(
         while True:
             while len(waiting) < workers + 1 and (block := list(islice(remaining, LANES))):
                 starts = [start_of(run) for run in block]
-                waiting.append((block, pool.submit(fly_block, vehicle, block, starts, schedule)))
+                waiting.append((block, pool.submit(_fly_block, vehicle, block, starts, schedule)))
             if not waiting:
                 return
             yield from waiting.popleft()[1].result()
 
 
-def fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule: Schedule) -> list[Flown]:
+def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule: Schedule) -> list[Flown]:
     """Fly at most `LANES` flights side by side, in this thread; see `fly_ensemble`."""
     padded = starts + [starts[-1]] * (LANES - len(starts))
     shared = all(s.atmosphere is starts[0].atmosphere for s in starts)
@@ -158,7 +156,7 @@ def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[
             ends = [f.states[-1] if len(f.states) and not f.diverged else np.full(len(s.state), np.nan)
                     for f, s in zip(flown, starts, strict=True)]  # fmt: skip
             starts = [replace(s, state=end) for s, end in zip(starts, ends, strict=True)]
-        flown = fly_block(vehicle, runs, starts, leg)
+        flown = _fly_block(vehicle, runs, starts, leg)
     return flown
 
 
@@ -167,7 +165,7 @@ _TABLE_M = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS)
 
 @dataclass(frozen=True)
 class Records:
-    """One flown flight: ``states`` (n, 20), ``aux`` (n, 18), its vehicle and its table of the air."""
+    """One flight: ``states`` (n, 20), ``aux`` (n, 18), its vehicle and its atmosphere table (rows, 6)."""
 
     states: FloatArray
     aux: FloatArray
@@ -176,10 +174,10 @@ class Records:
 
     @cached_property
     def specific_force_body_mps2(self) -> FloatArray:
-        """Of the centerbody's point where the unbent vehicle's c.g. is, ``(n, 3)``, body axes.
+        """Of the centerbody's point at the undeflected vehicle's c.g., ``(n, 3)``, body axes.
 
-        The joint's force moved there by lever arms; the difference of gravitation over half a metre (1e-6 m/s^2) is
-        left out.
+        Joint force over mass, moved there by lever-arm terms; the difference of gravitation over half a metre (1e-6
+        m/s^2) is neglected.
         """
         body = self.vehicle.centerbody
         arm, rate, turn = self.vehicle.cg_m - body.cg_m, self.states[:, 14:17], self.aux[:, 15:18]
@@ -194,7 +192,7 @@ class Records:
         arm = self.vehicle.cg_m - self.vehicle.centerbody.cg_m
         at = position + rotations.rotate(q, np.broadcast_to(arm, position.shape))
         velocity = velocity + rotations.rotate(q, np.cross(rate, arm)) - np.cross(earth.OMEGA_ECEF_RADPS, at)
-        # ECI turned about the Earth's axis alone: latitude is right, and north and east at this longitude of ECI
+        # ECI differs from ECEF by a rotation about the Earth's axis: north and east at this longitude of ECI are right
         latitude, longitude, _ = earth.geodetic_from_ecef(at)
         wind = np.zeros_like(velocity)
         for axis in (0, 1):
@@ -232,11 +230,14 @@ SCALARS = (
 )
 
 
-def check_names(names: tuple[str, ...], known: tuple[str, ...]) -> None:
+def check_outputs(names: tuple[str, ...], known: tuple[str, ...]) -> None:
     """Raise `ConfigError` with every name that is unknown or comes twice."""
-    faults = [f"unknown output '{n}'{nearest_name(n, known)}; known: {', '.join(known)}" for n in names
-              if n not in known]  # fmt: skip
-    faults += [f"output '{n}' comes twice" for n in dict.fromkeys(names) if names.count(n) > 1]
+    faults = [
+        Fault(f"unknown output '{n}'{nearest_name(n, known)}; known: {', '.join(known)}", "output-unknown")
+        for n in names
+        if n not in known
+    ]
+    faults += [Fault(f"output '{n}' comes twice", "output-twice") for n in dict.fromkeys(names) if names.count(n) > 1]
     if faults:
         raise ConfigError(faults)
 
@@ -255,7 +256,7 @@ def scalars_of(records: Records, names: tuple[str, ...], window: Window) -> dict
     return found
 
 
-def histories_of(records: Records, names: tuple[str, ...], window: Window) -> FloatArray:
+def _histories_of(records: Records, names: tuple[str, ...], window: Window) -> FloatArray:
     """Return the named histories of one flight, ``(names, points)``."""
     points = len(window.history_time_s())
     rows = np.minimum(window.per_history * np.arange(points), len(records.aux) - 1)
@@ -265,11 +266,11 @@ def histories_of(records: Records, names: tuple[str, ...], window: Window) -> Fl
 def records_of(flown: Flown, vehicle: Vehicle, atmosphere: FloatArray) -> Records:
     """Return what a flight recorded; `GateError` where it did not reach its window."""
     if not len(flown.aux):
-        raise GateError("the joint diverged, or the state was no number any more, before the window")
+        raise GateError("no record: the joint diverged, or the state was not finite, before the window", "no-record")
     return Records(flown.states, flown.aux, vehicle, atmosphere)
 
 
-# a rigid vehicle outside the air turns at some tenths of a radian a second: errors of 1e-9 a step
+# a rigid vehicle outside the atmosphere rotates at some tenths of a radian a second: errors of 1e-9 a step
 LOCKED_STEP_S = 0.02
 
 
@@ -296,13 +297,20 @@ class Row:
 
 
 def legs(time: TimeSpan, window: Window, locked: bool) -> list[Schedule]:
-    """Schedules from the scenario's start to the end of the window."""
+    """Schedules from the scenario's start to the end of the window.
+
+    Raises
+    ------
+    ConfigError
+        Where the window does not lie between inflation and the scenario's end.
+    """
     begins = time.start_s
     inflated = begins if time.inflated_s is None else max(time.inflated_s, begins)
     if not inflated <= window.from_s < window.to_s <= time.stop_s:
         raise ConfigError(
             f"window: {max(inflated, begins):g} (inflated) <= from_s = {window.from_s:g} < to_s = {window.to_s:g} <= "
-            f"{time.stop_s:g} (the scenario's stop_s) is wanted"
+            f"{time.stop_s:g} (the scenario's stop_s) is wanted",
+            code="window-outside-flight",
         )
     out = []
     for start, end, step, lock in (
@@ -341,8 +349,8 @@ def fly_runs(plan: Plan, runs: list[int], draws_of: Callable[[int], dict[str, fl
         try:
             case = dispersed_case(plan.scenario, plan.dispersions, draws_of(run))
             waiting.append((run, case, start_of(case, schedules[-1].step_s, locked)))
-        except Exception as fault:  # one flight's defect must not cost the others: its row says what
-            out[run] = _failed(plan, run, reason_of(fault))
+        except Exception as fault:  # one flight's defect must not cost the others: its row has the reason
+            out[run] = _failed(plan, run, failure_reason(fault))
         if len(waiting) == LANES:
             _fly(plan, waiting, schedules, out)
             waiting = []
@@ -351,8 +359,8 @@ def fly_runs(plan: Plan, runs: list[int], draws_of: Callable[[int], dict[str, fl
     return [out[run] for run in runs]
 
 
-def reason_of(fault: Exception) -> str:
-    """Return why a flight failed: a refusal's own words, any other fault's with its kind."""
+def failure_reason(fault: Exception) -> str:
+    """Return why a flight failed: the message of a refusal, that of any other exception with its type."""
     return str(fault) if isinstance(fault, GateError) else f"{type(fault).__name__}: {fault}"
 
 
@@ -372,4 +380,4 @@ def _fly(plan: Plan, waiting: list[tuple[int, Case, Start]], schedules: list[Sch
             continue
         ended = plan.window.from_s + plan.window.record_s * (len(flown.aux) - 1) if flown.diverged else np.nan
         numbers = scalars_of(records, plan.scalars, plan.window)
-        out[run] = Row(run, "", ended, numbers, histories_of(records, plan.histories, plan.window))
+        out[run] = Row(run, "", ended, numbers, _histories_of(records, plan.histories, plan.window))

@@ -1,24 +1,21 @@
-"""What would an onboard camera see of the aeroshell, seen through the lens that really flew?
+"""What would the onboard camera have filmed of the deflected aeroshell, through the lens as built?
 
-Every pixel looks along its own ray; rays march to the shell by its distance function and are anti-aliased along the
-edge by how much of a pixel the shell covers. With the shell's tori in the half-plane (station ``s``, radius ``r``),
-generator and aft normal components ``a`` and ``b`` of the point from the innermost centre,
+The picture is ray-marched, not the estimator's projection: every pixel has its own ray, which marches to the shell by
+its distance function and is anti-aliased along the edge by the share of the pixel that the shell covers. With the
+shell's tori in the half-plane (station ``s``, radius ``r``), generator and aft normal components ``a`` and ``b`` of the
+point from the innermost centre,
 
     distance = hypot(a - p round(a / p), b) - a_minor,       t <- t + distance,
 
-one expression for the whole stack. A shell that is flattened or oval is looked at in the half-plane turned back about
-the innermost ring by ``flattening + cosine cos 2 clock + sine sin 2 clock + lobes cos 3 clock``. Shading is Lambert's
-with one Sun and a weak sky; seams and dots are painted by surface coordinates. Behind the rim is a dark sky, and the
-Earth where it is told to be. Assumed: no shadows.
+one expression for the whole stack. A shell that is out of shape is evaluated in the half-plane rotated back about the
+innermost ring by ``flattening + cosine cos 2 clock + sine sin 2 clock + lobes cos 3 clock``. Shading is Lambert's with
+one Sun and a weak sky; seams and dots are painted by surface coordinates. Behind the rim is a dark sky, and the Earth
+where the scenario has it. Assumed: no shadows. Then come interlace and motion, vignetting, blur, sensor noise and
+compression.
 
-What would the onboard camera have filmed? Frames of the bent aeroshell, through a lens nobody told the estimator.
-
-The picture is ray-marched (`synthetic_flight.film`), not the estimator's projection; then come interlace and
-motion, vignetting, blur, sensor noise and compression. The real lens and pointing are drawn once a flight
-(`real_camera`), and so is how far the shell is out of shape, built and under load: an estimator that starts from the
-nominal mount must orient itself and live with a shell that is not quite the drawing's.
-
-The film of a flight: what there is to see at each frame's time, written as images or as a playable film.
+Lens and pointing as built are drawn once a flight (`as_built_camera`), and so is the shell's departure from its shape,
+as built and under load: an estimator starts from the nominal mount and the nominal shell. The film of a flight is
+written as images or as a playable film, with a table of the frames' times.
 """
 
 from __future__ import annotations
@@ -57,7 +54,7 @@ LIMB_GLOW_RAD = float(np.deg2rad(0.4))
 
 @dataclass(frozen=True)
 class Warp:
-    """How a shell is out of shape: cone opened like an umbrella, as a saddle, in three lobes, rad.
+    """Departure of a shell from its nominal shape: half angle, saddle, three lobes, rad.
 
     Parameters
     ----------
@@ -66,7 +63,7 @@ class Warp:
     cosine_rad, sine_rad : float
         Times ``cos 2 clock`` and ``sin 2 clock``.
     lobes_rad : float
-        Times ``cos 3 clock``: a shape that no estimator models.
+        Times ``cos 3 clock``: no estimator models it.
     """
 
     flattening_rad: float = 0.0
@@ -124,7 +121,7 @@ class ShellRenderer:
         self, theta_rad: float, plane_lv_rad: float, sun_direction_body: FloatArray,
         warp: Warp | None = None, background: Background | None = None,
     ) -> Float32:  # fmt: skip
-        """Scene radiance ``(h, w)`` before the lens's and sensor's faults; one is full scale."""
+        """Scene radiance ``(h, w)`` before errors of lens and sensor; one is full scale."""
         self.stack.warp = warp
         rotation = rotation_vector_body_shell(np.array(theta_rad), np.array(plane_lv_rad))
         dcm_shell_body = rotations.dcm_from_q(rotations.exp(-rotation))
@@ -139,7 +136,7 @@ class ShellRenderer:
             live = np.flatnonzero((near < FARTHEST_M) & self.is_clear[top : top + STRIP_ROWS].reshape(-1))
             if len(live) == 0:
                 continue
-            rays = _Rays(_turned(to_shell, self.rays[:, top : top + STRIP_ROWS].reshape(3, -1)[:, live]), eye)
+            rays = _Rays(_rotated(to_shell, self.rays[:, top : top + STRIP_ROWS].reshape(3, -1)[:, live]), eye)
             t, gap = self.stack.march(rays, near[live], MARCHING_STEPS)
             slow = np.flatnonzero(gap > 0.002)
             t[slow], gap[slow] = self.stack.march(rays.some(slow), t[slow], 9 * MARCHING_STEPS, 1.6)
@@ -150,10 +147,10 @@ class ShellRenderer:
         return self._composed(depth, shade, to_shell, eye, np.asarray(sun_direction_body, dtype=float), behind)
 
     def _near_depth(self, to_shell: Float32, eye: FloatArray) -> Float32:
-        """Depth ``(h, w)``, m, a little in front of the shell, from a patient march of every fourth ray."""
+        """Depth ``(h, w)``, m, a little in front of the shell, from a march of many steps of every fourth ray."""
         coarse = self.rays[:, COARSE // 2 :: COARSE, COARSE // 2 :: COARSE]
         shape = coarse.shape[1:]
-        rays = _Rays(_turned(to_shell, coarse.reshape(3, -1)), eye)
+        rays = _Rays(_rotated(to_shell, coarse.reshape(3, -1)), eye)
         t, gap = self.stack.march(rays, np.full(rays.across.shape, 0.05, dtype=np.float32), COARSE_STEPS)
         near = np.where(gap < 0.004, t, np.float32(np.inf)).reshape(shape)
         near = cv2.erode(near, np.ones((3, 3), np.uint8)) - np.float32(0.005)
@@ -162,18 +159,18 @@ class ShellRenderer:
     def _composed(
         self, depth: Float32, shade: Float32, to_shell: Float32, eye: FloatArray, sun_body: FloatArray, behind: Float32
     ) -> Float32:
-        """Shell over sky, its edge weighed by coverage, the centerbody over both."""
+        """Shell over sky, its edge weighted by coverage, the centerbody over both."""
         hit = np.isfinite(depth).astype(np.uint8)
         kernel = np.ones((7, 7), np.uint8)
         v, u = np.nonzero((cv2.dilate(hit, kernel) != cv2.erode(hit, kernel)) & self.is_clear)
         cover = hit.astype(np.float32)
         if len(u):
-            rays = _Rays(_turned(to_shell, self.rays[:, v, u]), eye)
+            rays = _Rays(_rotated(to_shell, self.rays[:, v, u]), eye)
             sun = to_shell.astype(float) @ sun_body
             t, gap = self.stack.closest(rays, cv2.erode(depth, kernel)[v, u])
             pixel_m = t / np.float32(self.camera.focal_px.mean())
             cover[v, u] = np.clip(0.5 - gap / pixel_m, 0.0, 1.0)
-            # at the edge the surface is seen at grazing incidence: its shade there holds for the whole pixel
+            # at the edge the line of sight grazes the surface: its shade there is that of the whole pixel
             graze = ~hit[v, u].astype(bool)
             shade[v[graze], u[graze]] = self.stack.shade(rays, t, sun)[graze]
         picture = cover * shade + (1.0 - cover) * behind
@@ -220,14 +217,14 @@ class ShellRenderer:
         return shade
 
 
-def _turned(dcm: Float32, vectors: Float32) -> Float32:
-    """Turn vectors ``(3, n)`` without BLAS, whose idle threads would wait on the other core."""
+def _rotated(dcm: Float32, vectors: Float32) -> Float32:
+    """Rotate vectors ``(3, n)`` without BLAS, whose idle threads would wait on the other core."""
     x, y, z = vectors
     return np.stack([row[0] * x + row[1] * y + row[2] * z for row in dcm])
 
 
 def _sky(rays: Float32, camera: Camera) -> Float32:
-    """Almost black, a little brighter towards the shell's rim, as scattered light in a lens leaves it."""
+    """Radiance of the sky: almost black, brighter towards the shell's rim by light scattered in the lens."""
     upward = -np.tensordot(camera.dcm_cam_body[1], rays, axes=1)
     sky: Float32 = (0.035 + 0.035 * np.exp(-3.0 * np.clip(upward, 0.0, 1.0))).astype(np.float32)
     return sky
@@ -275,7 +272,7 @@ class _Stack:
         s = rays.minus_dx * t
         if self.warp is not None:
             y, z = rays.eye[1] + t * rays.direction[1], rays.eye[2] + t * rays.direction[2]
-            s, r = self._turned_back(y, z, s - rays.eye[0], r)
+            s, r = self._on_nominal_shape(y, z, s - rays.eye[0], r)
             s += rays.eye[0]
         a = self.cos * s
         s *= self.sin
@@ -297,8 +294,8 @@ class _Stack:
         a -= self.minor
         return a
 
-    def _turned_back(self, y: Float32, z: Float32, s: Float32, r: Float32) -> tuple[Float32, Float32]:
-        """Station and radius of points on the shell in shape that is there when it is out of shape."""
+    def _on_nominal_shape(self, y: Float32, z: Float32, s: Float32, r: Float32) -> tuple[Float32, Float32]:
+        """Station and radius, on the nominal shell, of points of the shell that is out of shape."""
         assert self.warp is not None
         per = 1.0 / np.maximum(r * r, np.float32(1e-6))
         # cos and sin of twice the clocking angle, whose cosine is -y / r
@@ -312,7 +309,7 @@ class _Stack:
     def march(self, rays: _Rays, start: Float32, steps: int, stretch: float = 1.0) -> tuple[Float32, Float32]:
         """Depth along rays from ``start (n,)`` and the distance left there, m, ``(n,)`` each.
 
-        Near the surface steps may be stretched (below 2): one too far comes back.
+        Near the surface steps may be stretched by a factor below 2: the distance is signed, and an overshoot returns.
         """
         t = start.copy()
         gap = self.gap(rays, t)
@@ -339,7 +336,7 @@ class _Stack:
         sx, sy, sz = (np.float32(e) for e in sun_shell)
         x, y, z = ex + t * dx, ey + t * dy, ez + t * dz
         r = np.sqrt(y * y + z * z)
-        s, rho = (-x, r) if self.warp is None else self._turned_back(y, z, -x, r)
+        s, rho = (-x, r) if self.warp is None else self._on_nominal_shape(y, z, -x, r)
         a = (s - self.s0) * self.cos + (rho - self.r0) * self.sin
         b = (s - self.s0) * self.sin - (rho - self.r0) * self.cos
         a -= self.pitch * np.clip(np.rint(a / self.pitch), 0.0, self.last)
@@ -371,7 +368,7 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Imaging:
-    """How the real camera differs from its drawing, and how it records; one standard deviation where drawn.
+    """Errors of the camera as built, and of its recording; one standard deviation where drawn.
 
     Parameters
     ----------
@@ -390,7 +387,7 @@ class Imaging:
     blur_px : float
         Standard deviation of the point-spread function.
     vignetting : float
-        How much darker the lens is at right angles to its axis, share of one.
+        Share of light that is lost at right angles to the lens's axis.
     interlace_s : float
         Time from the first field to the second, rows taken in turns; each is open for as long. Zero: the whole frame
         at once.
@@ -420,20 +417,20 @@ class Imaging:
 
 @dataclass(frozen=True)
 class Scene:
-    """What there is to film, frame by frame.
+    """What the camera has before it, frame by frame.
 
     Parameters
     ----------
     theta_rad, plane_lv_rad : (n,) float
-        Bending.
+        Deflection.
     sun_body : (n, 3) float
-        Unit vectors towards the Sun, body axes; zero vectors for darkness.
+        Unit vectors towards the Sun, body axes; zero vectors in darkness.
     nadir_body : (n, 3) float, optional
         Unit vectors to the ground; without them there is no Earth in view.
     altitude_m : (n,) float, optional
     load : (n,) float, optional
         Share of the largest dynamic pressure, for the shell's shape; zero without.
-    bending_rate_yz_radps : (n, 2) float, optional
+    deflection_rate_yz_radps : (n, 2) float, optional
         Rate of ``theta`` as a lateral vector, for what moves between two fields.
     """
 
@@ -443,21 +440,21 @@ class Scene:
     nadir_body: FloatArray | None = None
     altitude_m: FloatArray | None = None
     load: FloatArray | None = None
-    bending_rate_yz_radps: FloatArray | None = None
+    deflection_rate_yz_radps: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Check lengths and values once."""
         n = len(self.theta_rad)
         shapes = {"theta_rad": (n,), "plane_lv_rad": (n,), "sun_body": (n, 3), "nadir_body": (n, 3),
-                  "altitude_m": (n,), "load": (n,), "bending_rate_yz_radps": (n, 2)}  # fmt: skip
+                  "altitude_m": (n,), "load": (n,), "deflection_rate_yz_radps": (n, 2)}  # fmt: skip
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value is not None:
                 check_finite(f"scene.{name}", check_shape(f"scene.{name}", np.asarray(value, dtype=float), shape))
 
 
-def real_camera(camera_mount: CameraMount, rng: np.random.Generator, imaging: Imaging | None = None) -> Camera:
-    """Draw the camera as it really was built in: pointing, lens and position are off."""
+def as_built_camera(camera_mount: CameraMount, rng: np.random.Generator, imaging: Imaging | None = None) -> Camera:
+    """Draw the camera as built: with errors of pointing, lens and position."""
     imaging = imaging or Imaging()
     nominal = camera_from_mount(camera_mount)
     draw = rng.standard_normal(10)
@@ -465,13 +462,13 @@ def real_camera(camera_mount: CameraMount, rng: np.random.Generator, imaging: Im
     lens[0] += imaging.k1_sd * draw[6]
     if imaging.k2_sd:
         lens[1] += imaging.k2_sd * rng.standard_normal()
-    off = replace(
+    built = replace(
         nominal,
         centre_px=nominal.centre_px + imaging.centre_sd_px * draw[4:6],
         distortion=lens,
         position_body_m=nominal.position_body_m + imaging.position_sd_m * draw[7:10],
     )
-    return off.turned(imaging.pointing_sd_rad * draw[:3], 1.0 + imaging.focal_sd * draw[3])
+    return built.turned(imaging.pointing_sd_rad * draw[:3], 1.0 + imaging.focal_sd * draw[3])
 
 
 def film(
@@ -488,7 +485,7 @@ def film(
     ----------
     vehicle_geometry : ShellGeometry
     camera_mount : CameraMount
-        Nominal; the real camera is drawn from ``rng`` first (`real_camera`).
+        Nominal; the camera as built is drawn from ``rng`` first (`real_camera`).
     joint_station_m : float
         Joint aft of the nose, m.
     scene : Scene
@@ -506,15 +503,15 @@ def film(
         When lengths differ or a value is not finite.
     """
     imaging = imaging or Imaging()
-    camera = real_camera(camera_mount, rng, imaging)
+    camera = as_built_camera(camera_mount, rng, imaging)
     renderer = ShellRenderer(vehicle_geometry, camera, joint_station_m, imaging.vignetting)
     renderer.stack.painted = imaging.painted
     built, loaded = _shapes(imaging, rng)
 
     def radiance(k: int, after_s: float) -> Float32:
         theta, plane = float(scene.theta_rad[k]), float(scene.plane_lv_rad[k])
-        if after_s and scene.bending_rate_yz_radps is not None:
-            lateral = theta * np.array([-np.cos(plane), np.sin(plane)]) + after_s * scene.bending_rate_yz_radps[k]
+        if after_s and scene.deflection_rate_yz_radps is not None:
+            lateral = theta * np.array([-np.cos(plane), np.sin(plane)]) + after_s * scene.deflection_rate_yz_radps[k]
             theta, plane = float(np.hypot(*lateral)), float(np.arctan2(lateral[1], -lateral[0]))
         load = 0.0 if scene.load is None else float(scene.load[k])
         warp = None if built is None or loaded is None else built.plus(loaded.times(load))
@@ -547,14 +544,14 @@ def render_video(
     rng: np.random.Generator,
     imaging: Imaging | None = None,
 ) -> Iterator[Image]:
-    """Film bendings in the light of the Sun alone; see `film` and `Scene`."""
+    """Film deflections in the light of the Sun alone; see `film` and `Scene`."""
     theta_rad = check_shape("theta_rad", theta_rad, (None,))
     scene = Scene(theta_rad, plane_lv_rad, sun_direction_body)
     return film(vehicle_geometry, camera_mount, joint_station_m, scene, rng, imaging)
 
 
 def _shapes(imaging: Imaging, rng: np.random.Generator) -> tuple[Warp, Warp] | tuple[None, None]:
-    """Draw how far the shell is out of shape, as built and under the largest load."""
+    """Draw the shell's departure from its shape, as built and under the largest load."""
     if not imaging.built_sd_rad and not imaging.loaded_sd_rad:
         return None, None
     share = np.array([1.0, 0.5, 0.5, 0.5])
@@ -584,41 +581,41 @@ def write_video(scenario: Scenario, seed: int, truth: Truth, telemetry: Path, re
     assert spec is not None
     rng = child_rng(seed, spec.camera)
     at = sensing.sample_times(spec.start_s, min(spec.stop_s, float(truth.time_s[-1])), spec.rate_hz)
-    mount, imaging = vehicle.cameras[spec.camera], imaging_of(spec.imaging)
+    mount, imaging = vehicle.cameras[spec.camera], _imaging_from_quality(spec.imaging)
     frames = film(vehicle.geometry, mount, vehicle.joint.station_m, scene(truth, at, spec.earth), rng, imaging)
-    told = _reported(frames, len(at), report)
+    images = _reported(frames, len(at), report)
     if spec.format == "png":
-        names: list[object] = list(_write_images(told, telemetry / spec.camera))
+        names: list[object] = list(_write_images(images, telemetry / spec.camera))
     else:
-        _write_film(told, telemetry / f"{spec.camera}.{spec.format}", spec, (mount.width_px, mount.height_px))
+        _write_film(images, telemetry / f"{spec.camera}.{spec.format}", spec, (mount.width_px, mount.height_px))
         names = list(range(len(at)))
     late = spec.time_offset_s * float(rng.standard_normal())
     table = pd.DataFrame({"t_s": at + late, "frame": names})
     table.to_csv(telemetry / "frames.csv", index=False, float_format="%.6f", lineterminator="\n")
 
 
-def imaging_of(told: FilmQuality) -> Imaging:
-    """How a scenario says that the film is, in memory's units."""
+def _imaging_from_quality(quality: FilmQuality) -> Imaging:
+    """Errors of the film as the scenario states them, in SI units and radians."""
     return Imaging(
-        pointing_sd_rad=float(np.deg2rad(told.pointing_deg)),
-        focal_sd=told.focal,
-        centre_sd_px=told.centre_px,
-        k1_sd=told.k1,
-        k2_sd=told.k2,
-        position_sd_m=told.position_m,
-        noise_sd=told.noise_grey,
-        blur_px=told.blur_px,
-        vignetting=told.vignetting,
-        interlace_s=told.interlace_s,
-        quality=told.quality,
-        painted=told.painted,
-        built_sd_rad=float(np.deg2rad(told.built_deg)),
-        loaded_sd_rad=float(np.deg2rad(told.loaded_deg)),
+        pointing_sd_rad=float(np.deg2rad(quality.pointing_deg)),
+        focal_sd=quality.focal,
+        centre_sd_px=quality.centre_px,
+        k1_sd=quality.k1,
+        k2_sd=quality.k2,
+        position_sd_m=quality.position_m,
+        noise_sd=quality.noise_grey,
+        blur_px=quality.blur_px,
+        vignetting=quality.vignetting,
+        interlace_s=quality.interlace_s,
+        quality=quality.quality,
+        painted=quality.painted,
+        built_sd_rad=float(np.deg2rad(quality.built_deg)),
+        loaded_sd_rad=float(np.deg2rad(quality.loaded_deg)),
     )
 
 
 def scene(truth: Truth, at_s: FloatArray, with_earth: bool) -> Scene:
-    """What there is to film at times ``(n,)``."""
+    """What the camera has before it at times ``(n,)``."""
     yz = np.column_stack([np.interp(at_s, truth.time_s, c) for c in truth.deflection.theta_yz_rad.T])
     step = 0.005
     ends = [np.column_stack([np.interp(at_s + d, truth.time_s, c) for c in truth.deflection.theta_yz_rad.T])
@@ -631,7 +628,7 @@ def scene(truth: Truth, at_s: FloatArray, with_earth: bool) -> Scene:
         nadir_body=_to_body(truth, at_s, -_up_ecef(truth, at_s)) if with_earth else None,
         altitude_m=np.interp(at_s, truth.time_s, truth.altitude_m) if with_earth else None,
         load=np.interp(at_s, truth.time_s, pressure) / max(float(pressure.max()), 1e-9),
-        bending_rate_yz_radps=(ends[1] - ends[0]) / (2.0 * step),
+        deflection_rate_yz_radps=(ends[1] - ends[0]) / (2.0 * step),
     )
 
 
@@ -657,7 +654,7 @@ def _write_images(frames: Iterable[Image], folder: Path) -> Iterable[str]:
     folder.mkdir()
     for k, frame in enumerate(frames):
         name = f"frame_{k:05d}.png"
-        # through Python's own file, which tells of a full disk
+        # through Python's own file, which raises on a full disk
         (folder / name).write_bytes(cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
         yield name
 
@@ -666,7 +663,8 @@ def _write_film(frames: Iterable[Image], path: Path, spec: Video, size_px: tuple
     code = cv2.VideoWriter.fourcc(*CODECS[path.suffix[1:]])
     writer = cv2.VideoWriter(str(path), code, float(spec.rate_hz), size_px)
     if not writer.isOpened():
-        raise GateError(f'{path}: this build of OpenCV cannot write such a film; write images: video.format = "png"')
+        message = f'{path}: this build of OpenCV cannot write such a film; write images: video.format = "png"'
+        raise GateError(message, code="film-codec")
     count = 0
     try:
         for frame in frames:
@@ -674,5 +672,6 @@ def _write_film(frames: Iterable[Image], path: Path, spec: Video, size_px: tuple
             count += 1
     finally:
         writer.release()
-    if count and next(film_frames(path, [count - 1])).size == 0:  # OpenCV tells of no full disk
-        raise GateError(f"{path.name}: the film could not be written whole; make room, or write to another disk")
+    if count and next(film_frames(path, [count - 1])).size == 0:  # OpenCV does not report a full disk
+        message = f"{path.name}: the film could not be written whole; make room, or write to another disk"
+        raise GateError(message, code="disk-full")

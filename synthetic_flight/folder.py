@@ -1,17 +1,13 @@
-"""Writing a synthetic flight as a range would deliver a real one: telemetry in one place, the truth apart.
+"""How is a synthetic flight delivered? As a range delivers a real one: telemetry and data sheets, the truth apart.
 
-The folder is made beside its destination and renamed when whole, so a killed run leaves nothing half-written.
+``telemetry/`` holds the tables, ``flight.toml`` the a priori standard deviations of the instruments' data sheets and
+nothing that was drawn, ``truth/`` the true trajectory, deflection and events. A vehicle that ships with the toolkit is
+named, another one is copied in with its coefficient table, so that nothing refers to a place outside. The folder is
+made beside its destination and renamed when whole: a killed run leaves nothing half-written.
 
-What an analyst is told of a synthetic flight: ``flight.toml``, and beside it the vehicle file it needs.
-
-The folder holds by itself: a vehicle that ships with the toolkit is named, another one is copied in with its
-coefficient table, and nothing refers to a place outside.
-
-What happened when: the moments a flight is told by, each with the true state of the vehicle, from the records.
-
-Separation (the first record), inflation (the joint unlocks), apogee, 80 km, peak heating, Mach 3.5, peak dynamic
-pressure, 40 km, Mach 1, splashdown; those that the flown span does not hold are absent. Heating is the stagnation
-point's by Sutton and Graves, ``1.7415e-4 sqrt(rho / r_nose) V^3`` W/m^2 with the vehicle's own nose radius.
+Events, each with the true state: separation (the first record), inflation (the joint unlocks), apogee, 80 km, peak
+heating, Mach 3.5, peak dynamic pressure, 40 km, Mach 1, splashdown; those outside the flown span are absent. Heat flux
+is that of the stagnation point, ``1.7415e-4 sqrt(rho / r_nose) V^3`` W/m^2, with the vehicle's nose radius.
 
 References
 ----------
@@ -57,7 +53,7 @@ def simulate_to_folder(
     ----------
     scenario : Scenario
     seed : int
-        Draws the day's air and every instrument's errors.
+        Draws the day-of-flight atmosphere and every instrument's errors.
     destination : Path
     progress : callable, optional
         Called with the fraction done and what is being done.
@@ -93,10 +89,11 @@ def simulate_to_folder(
 def _check_telemetry(scenario: Scenario, truth: Truth) -> None:
     ended, begins = truth.time_s[-1], scenario.spec.time.telemetry_from_s
     if ended < begins + SHORTEST_TELEMETRY_S:
-        why = truth.words or ("it came down" if truth.altitude_m[-1] <= 0.0 else "stop_s is too early")
+        why = truth.remark or ("it came down" if truth.altitude_m[-1] <= 0.0 else "stop_s is too early")
         raise GateError(
             f"scenario '{scenario.spec.name}': the flight ends at {ended:.2f} s ({why}); time.telemetry_from_s = "
-            f"{begins:g} leaves less than {SHORTEST_TELEMETRY_S:g} s to deliver"
+            f"{begins:g} leaves less than {SHORTEST_TELEMETRY_S:g} s to deliver",
+            code="telemetry-too-short",
         )
 
 
@@ -117,7 +114,7 @@ def _put_in_place(partial: Path, destination: Path) -> None:
 
 def _remove_leftovers(destination: Path) -> None:
     """Remove what killed processes left beside the destination; an old flight without a successor is put back."""
-    if not Path("/proc/self").exists():  # no telling which process still lives
+    if not Path("/proc/self").exists():  # whether a process still runs cannot be found out
         return
     for left in destination.parent.glob(f".{destination.name}-*-*"):
         what, _, number = left.name.removeprefix(f".{destination.name}-").partition("-")
@@ -135,9 +132,14 @@ def check_destination(destination: Path, replace: bool) -> None:
         return
     ours = (destination / "truth" / "run.json").is_file() and (destination / "flight.toml").is_file()
     if not replace:
-        raise GateError(f"{destination}: exists already; choose another folder, or give --force to replace it")
+        raise GateError(
+            f"{destination}: exists already; choose another folder, or give --force to replace it", code="folder-exists"
+        )
     if not ours:
-        raise GateError(f"{destination}: is not a synthetic flight folder, so --force does not replace it")
+        raise GateError(
+            f"{destination}: is not a synthetic flight folder, so --force does not replace it",
+            code="folder-not-synthetic",
+        )
 
 
 def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Progress) -> None:
@@ -213,18 +215,18 @@ def _write_truth(scenario: Scenario, seed: int, truth: Truth, folder: Path) -> N
         "alpha_body_deg": np.rad2deg(truth.alpha_body_rad[rows]),
     }
     _csv(folder / "truth.csv", columns, "%.10g")
-    bent = truth.deflection
+    deflection = truth.deflection
     columns = {
         "t_s": t,
-        "theta_deg": np.rad2deg(bent.theta_rad[rows]),
-        "plane_lv_deg": np.rad2deg(bent.plane_lv_rad[rows]),
+        "theta_deg": np.rad2deg(deflection.theta_rad[rows]),
+        "plane_lv_deg": np.rad2deg(deflection.plane_lv_rad[rows]),
         "twist_deg": np.rad2deg(truth.twist_rad[rows]),
     }
     _csv(folder / "deflection.csv", columns, "%.8f")
-    moments = event_table(flight_events(truth, scenario.spec.time.inflated_s))
-    moments.to_csv(folder / "events.csv", index=False, float_format="%.8g", lineterminator="\n")
+    events = event_table(flight_events(truth, scenario.spec.time.inflated_s))
+    events.to_csv(folder / "events.csv", index=False, float_format="%.8g", lineterminator="\n")
     shutil.copyfile(scenario.source, folder / "scenario.toml")
-    run = {"scenario": scenario.spec.name, "seed": seed, "words": truth.words, "synthetic": True}
+    run = {"scenario": scenario.spec.name, "seed": seed, "words": truth.remark, "synthetic": True}
     (folder / "run.json").write_text(json.dumps(run, indent=2) + "\n")
 
 
@@ -250,7 +252,7 @@ def _text(value: str) -> str:
 
 
 def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
-    """Return ``flight.toml`` with nominal errors: what an analyst would be told, nothing that was drawn."""
+    """Return ``flight.toml`` with the errors of the data sheets, without anything that was drawn."""
     spec = scenario.spec
     acc, gyro = spec.accelerometer, spec.rates
     lines = [
@@ -338,11 +340,11 @@ SUTTON_GRAVES = 1.7415e-4
 
 @dataclass(frozen=True)
 class Event:
-    """A moment of the flight and the true state at it.
+    """An event of the flight and the true state at it.
 
-    Altitude, Mach number and dynamic pressure are those at the shell's nose, place and velocity (relative to the
-    rotating Earth) those of the datum; angles of attack are total and against the wind; ``sensed_g`` is the size of
-    the specific force at the vehicle's unbent c.g., in standard gravities.
+    Altitude, Mach number and dynamic pressure are those at the shell's nose, position and velocity (relative to the
+    rotating Earth) those of the datum; angles of attack are total and relative to the wind; ``sensed_g`` is the
+    magnitude of the specific force at the undeflected vehicle's c.g., in standard gravities.
     """
 
     name: str
@@ -414,7 +416,7 @@ def _event(name: str, at_s: float, state: FloatArray) -> Event:
     place, velocity = state[1:4], state[4:7]
     latitude, longitude, _ = earth.geodetic_from_ecef(place)
     north, east, down = earth.ned_from_ecef(velocity, place)
-    # angles and force have no sign: a cubic through a touch of zero may pass below it
+    # angles and force are magnitudes: a cubic near zero may pass below it
     sizes = [float(x) for x in (*state[7:11], *np.maximum(state[11:], 0.0))]
     path = float(np.arctan2(-down, np.hypot(north, east)))
     speed = float(np.linalg.norm(velocity))

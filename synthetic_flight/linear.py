@@ -1,4 +1,4 @@
-"""When is a vehicle on a soft joint stable? The planar linear model, with speed and pressure frozen.
+"""When is a vehicle on a compliant joint stable? The planar linear model, at constant speed and dynamic pressure.
 
 ``y`` is the lateral displacement of the joint, ``theta_A`` and ``theta_B`` the angles of the axes of shell and body;
 positive angles move the aft end to ``+y``. Flow angles are taken at the shell's nose (docs/decisions/0005)::
@@ -9,8 +9,8 @@ positive angles move the aft end to ``+y``. Flow angles are taken at the shell's
                                   + K (theta_B - theta_A) + C (theta_B' - theta_A')
     m_B r_B y'' + I_B theta_B'' = m_B a_x r_B theta_B - K (theta_B - theta_A) - C (theta_B' - theta_A')
 
-with ``a_x = q S C_A / m`` and inertias about the joint. Assumed: both bodies axisymmetric with c.g.s on the axis, air
-at one density, small angles. Springs count with their slope at zero, without freeplay.
+with ``a_x = q S C_A / m`` and inertias about the joint. Assumed: both bodies axisymmetric with c.g.s on the axis,
+constant density, small angles, springs at their stiffness at rest, no freeplay.
 
 References
 ----------
@@ -87,7 +87,7 @@ def linear_matrix(vehicle: Vehicle, slopes: Slopes, pressure_pa: float, speed_mp
 
 @dataclass(frozen=True)
 class Modes:
-    """What the eigenvalues of `linear_matrix` say.
+    """Eigenvalues of `linear_matrix` and the zone of stability they give.
 
     Parameters
     ----------
@@ -132,9 +132,9 @@ def critical_stiffness_nmprad(vehicle: Vehicle, slopes: Slopes, pressure_pa: flo
 
 
 def static_trim(vehicle: Vehicle, slopes: Slopes, pressure_pa: float, offset_m: float) -> tuple[float, float]:
-    """Angle of attack of the shell and bending angle, rad, that a lateral c.g. offset in the centerbody trims to.
+    """Angle of attack of the shell and deflection, rad, at which a lateral c.g. offset in the centerbody trims.
 
-    ``offset_m`` is the offset it makes of the vehicle's c.g. Diverges as the stiffness nears the critical one.
+    ``offset_m`` is that of the vehicle's c.g. Diverges as the stiffness nears the critical one.
     """
     xbar, margin = _levers(vehicle, slopes)
     softness = critical_stiffness_nmprad(vehicle, slopes, pressure_pa) / vehicle.joint.bending_stiffness_nmprad

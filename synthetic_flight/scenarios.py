@@ -1,4 +1,10 @@
-"""What is to be flown: a scenario file, its vehicle, and the flight of it on a day that a seed draws."""
+"""What is to be flown? A scenario file with its vehicle, and the true flight of it with the atmosphere of one seed.
+
+A scenario gives start, end and steps, the initial state of the composite c.g. ``(r, v, q, omega)`` at zero deflection,
+the day-of-flight atmosphere and the instruments. Every random part draws from ``SeedSequence(seed, spawn_key=name)``
+with a name of its own, so that one instrument more or less leaves the others' noise as it is. Files are checked whole:
+one refusal names every fault.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +16,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from flightmodel import earth, rotations
-from flightmodel.checks import ConfigError, FloatArray, GateError, nearest_name
+from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.config import (
     Angle,
     Duration,
@@ -38,7 +44,7 @@ from synthetic_flight.instrument_errors import (
     name_key,
 )
 from synthetic_flight.simulate import Truth, fly, state_from_ecef
-from synthetic_flight.weather import DayAtmosphere, day_atmosphere
+from synthetic_flight.weather import DayOfFlightAtmosphere, day_of_flight_atmosphere
 
 Altitude = Annotated[float, Field(ge=0.0, le=1e6)]
 MOST_RECORDS, MOST_STEPS, MOST_SAMPLES, MOST_FRAMES = 5_000_000, 2_000_000_000, 5_000_000, 20_000
@@ -109,7 +115,7 @@ class ScenarioFile(Section):
     vehicle: str
     time: TimeSpan
     initial: Initial
-    atmosphere: DayAtmosphere
+    atmosphere: DayOfFlightAtmosphere
     accelerometer: Accelerometer
     rates: Rates
     radars: dict[Name, Radar]
@@ -193,11 +199,11 @@ def read_scenario(name: str) -> Scenario:
     shipped = shipped_scenarios()
     if not name.endswith(".toml") and name not in shipped:
         hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
-        raise ConfigError(f"no scenario '{name}'{hint}")
+        raise ConfigError(f"no scenario '{name}'{hint}", code="scenario-unknown")
     path = Path(name) if name.endswith(".toml") else DATA / "scenarios" / f"{name}.toml"
     tables = read_toml(path)
     spec, vehicle = None, None
-    faults: list[str] = []
+    faults: list[Fault] = []
     try:
         spec = parse_section(ScenarioFile, tables, str(path))
     except ConfigError as fault:
@@ -210,19 +216,20 @@ def read_scenario(name: str) -> Scenario:
             raise
         faults += fault.faults
     if spec is not None and vehicle is not None:
-        faults += check_against_vehicle(spec, vehicle, path)
+        faults += _vehicle_faults(spec, vehicle, path)
         if not faults:
             return Scenario(spec, vehicle, path)
     raise ConfigError(faults)
 
 
-def check_against_vehicle(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[str]:
-    """Say which sensor packages and cameras the scenario ``path`` needs and the vehicle lacks."""
+def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Fault]:
+    """Return which sensor packages and cameras the scenario ``path`` needs and the vehicle lacks."""
     packages, cameras = list(vehicle.sensors), list(vehicle.cameras)
     faults = []
     if ACCELEROMETER_MOUNT not in packages:
         wanted = f"key 'sensors.{ACCELEROMETER_MOUNT}' is missing: the accelerometer's package"
-        faults.append(f"{vehicle.source}: {wanted}; known there: {', '.join(packages) or 'none'}")
+        message = f"{vehicle.source}: {wanted}; known there: {', '.join(packages) or 'none'}"
+        faults.append(Fault(message, "mount-unknown"))
     needed = []
     if spec.magnetometer is not None:
         needed.append(("magnetometer.mount", spec.magnetometer.mount, packages, "sensors"))
@@ -231,7 +238,8 @@ def check_against_vehicle(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> l
     for key, name, known, table in needed:
         if name not in known:
             hint = f"{nearest_name(name, known)}; known there: {', '.join(known) or 'none'}"
-            faults.append(f"{path}: key '{key}' = {name!r}: {vehicle.source} has no [{table}.{name}]{hint}")
+            message = f"{path}: key '{key}' = {name!r}: {vehicle.source} has no [{table}.{name}]{hint}"
+            faults.append(Fault(message, "camera-unknown" if table == "cameras" else "mount-unknown"))
     return faults
 
 
@@ -241,7 +249,7 @@ def child_rng(seed: int, name: str) -> np.random.Generator:
 
 
 def initial_state(scenario: Scenario) -> FloatArray:
-    """State (20,) at the scenario's start, joint straight."""
+    """State (20,) at the scenario's start, joint undeflected."""
     spec, start = scenario.spec.initial, scenario.spec.time.start_s
     lat, lon, path, azimuth, nose_az, nose_el, roll = np.deg2rad(
         [
@@ -267,9 +275,9 @@ def initial_state(scenario: Scenario) -> FloatArray:
 
 
 def fly_scenario(scenario: Scenario, seed: int) -> Truth:
-    """Fly a scenario on the day that ``seed`` draws."""
+    """Fly a scenario with the day-of-flight atmosphere that ``seed`` draws."""
     time = scenario.spec.time
-    profile = day_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere"))
+    profile = day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere"))
     return fly(
         scenario.vehicle,
         profile,

@@ -1,14 +1,16 @@
-"""Flying a scenario: from its start to its end, every record of what really happened.
+"""What is the true motion of a given vehicle in a given atmosphere from a given state?
 
-Fixed steps of fourth order (Runge-Kutta); the joint may be locked until the aeroshell is inflated. A flight that
-tumbles or whose joint passes 90 deg is not an exception: it ends there, and the truth says so and when.
+``y' = f(y, t)`` of two rigid bodies on a compliant joint (`synthetic_flight._kernels`), integrated by fourth-order
+Runge-Kutta with a fixed step; the joint may be locked until the aeroshell is inflated. A flight that tumbles is
+flagged, one whose deflection passes 90 deg ends there; neither is an error.
 
-How a vehicle and the air are laid out for the compiled flight kernels.
+The kernels take a vehicle as a vector of 67 parameters (`parameter_vector`) and the atmosphere as a table with a row
+every 50 m (`atmosphere_table`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -22,21 +24,21 @@ from flightmodel.events import splashdown_index
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import Vehicle
-from synthetic_flight import _kernels, dynamics
 from synthetic_flight import _kernels as at
+from synthetic_flight import dynamics
 from synthetic_flight._kernels import AUX, STATES
 from synthetic_flight.dynamics import check_step
 
 if TYPE_CHECKING:
     import pandas as pd
 
-BENDING_LIMIT_RAD = 0.5 * np.pi
+DEFLECTION_LIMIT_RAD = 0.5 * np.pi
 TUMBLE_RAD = 0.5 * np.pi
 
 
 @dataclass(frozen=True, repr=False)
 class Truth(Tabular):
-    """What the synthetic vehicle did; every array has one row a record. Estimators never see it.
+    """True motion of the synthetic vehicle; every array has one row a record. Estimators never see it.
 
     Parameters
     ----------
@@ -57,7 +59,9 @@ class Truth(Tabular):
     tumbled_s : float or None
         When the shell's total angle of attack first passed 90 deg with dynamic pressure above 1 Pa.
     diverged_s : float or None
-        When the bending angle passed 90 deg; the flight ends there.
+        When the deflection passed 90 deg; the flight ends there.
+    remark : str
+        What happened out of the ordinary.
     """
 
     trajectory: Trajectory
@@ -78,7 +82,7 @@ class Truth(Tabular):
     profile: AtmosphereProfile
     tumbled_s: float | None
     diverged_s: float | None
-    words: str = field(default="")
+    remark: str = ""
 
     @property
     def time_s(self) -> FloatArray:
@@ -124,7 +128,7 @@ class Truth(Tabular):
         return f"synthetic flight of {self.vehicle.name}, {len(self.time_s)} records, {peak}"
 
     def specific_force_body(self, position_from_datum_body_m: FloatArray) -> FloatArray:
-        """Specific force ``(n, 3)``, body axes, m/s^2, that an ideal accelerometer feels at a point of the centerbody.
+        """Specific force ``(n, 3)``, body axes, m/s^2, of an ideal accelerometer at a point of the centerbody.
 
         Joint force over mass, moved from the body's c.g. by lever-arm terms, plus the difference of gravitation
         between the two points.
@@ -152,9 +156,9 @@ def state_from_ecef(
     r = rotations.rotate(to_eci, position_ecef_m)
     v = rotations.rotate(to_eci, velocity_ecef_mps + np.cross(earth.OMEGA_ECEF_RADPS, position_ecef_m))
     q_b = rotations.multiply(to_eci, q_ecef_body)
-    bent = np.array([1.0, 0.0, 0.0, 0.0]) if q_body_shell is None else q_body_shell
-    omega_shell = rotations.rotate(rotations.conjugate(bent), omega_body_radps)
-    return np.concatenate([r, v, q_b, rotations.multiply(q_b, bent), omega_body_radps, omega_shell])
+    q_body_shell = np.array([1.0, 0.0, 0.0, 0.0]) if q_body_shell is None else q_body_shell
+    omega_shell = rotations.rotate(rotations.conjugate(q_body_shell), omega_body_radps)
+    return np.concatenate([r, v, q_b, rotations.multiply(q_b, q_body_shell), omega_body_radps, omega_shell])
 
 
 def integrate(
@@ -167,11 +171,18 @@ def integrate(
     lock_records: int = 0,
     planet: earth.Planet = earth.WGS84,
 ) -> tuple[FloatArray, FloatArray]:
-    """States ``(n, 20)`` and auxiliaries ``(n, 18)`` of a flight; fewer than ``records`` where the joint diverged."""
+    """States ``(n, 20)`` and auxiliaries ``(n, 18)`` of a flight; fewer than ``records`` where the joint diverged.
+
+    Raises
+    ------
+    ConfigError
+        Where the state's shape, the step or a count is impossible.
+    """
     if state.shape != (STATES,) or records < 1 or per_record < 1 or not step_s > 0.0:
         raise ConfigError(
             f"integrate: a state (20,), step_s > 0, per_record and records >= 1 are wanted; got state {state.shape}, "
-            f"step_s {step_s:g}, per_record {per_record}, records {records}"
+            f"step_s {step_s:g}, per_record {per_record}, records {records}",
+            code="integration-arguments",
         )
     parameters = parameter_vector(vehicle)[None]
     lanes = integrate_lanes(
@@ -198,7 +209,7 @@ def integrate_lanes(
     lanes = len(states)
     out, aux = np.empty((lanes, records, STATES)), np.empty((lanes, records, AUX))
     written = np.zeros(lanes, dtype=np.int64)
-    _kernels.integrate(
+    at.integrate(
         (0,) * lanes,
         workspace(states, parameters),
         kernel_tables(vehicle, atmosphere),
@@ -207,13 +218,13 @@ def integrate_lanes(
         per_record,
         records,
         lock_records,
-        BENDING_LIMIT_RAD,
+        DEFLECTION_LIMIT_RAD,
         out,
         aux,
         written,
     )
     counts = np.abs(written)
-    return [(*flown_records(out[k, :n], aux[k, :n]), bool(written[k] < 0)) for k, n in enumerate(counts.tolist())]
+    return [(*_finite_records(out[k, :n], aux[k, :n]), bool(written[k] < 0)) for k, n in enumerate(counts.tolist())]
 
 
 def fly(
@@ -248,11 +259,14 @@ def fly(
     if not (0.0 < step_s <= record_s <= stop_s - start_s):
         raise ConfigError(
             f"fly: 0 < step <= record <= stop - start is wanted; got step {step_s:g} s, record {record_s:g} s, "
-            f"start {start_s:g} s, stop {stop_s:g} s"
+            f"start {start_s:g} s, stop {stop_s:g} s",
+            code="flight-times",
         )
     per_record = round(record_s / step_s)
     if abs(per_record * step_s - record_s) > 1e-9:
-        raise ConfigError(f"fly: record {record_s:g} s must be a whole multiple of step {step_s:g} s")
+        raise ConfigError(
+            f"fly: record {record_s:g} s must be a whole multiple of step {step_s:g} s", code="record-step"
+        )
     check_finite("fly: state at the start", state)
     if inflated_s is None or inflated_s < stop_s:
         check_step(vehicle, step_s)
@@ -291,17 +305,17 @@ def _truth(
     v_ecef = rotations.rotate(to_ecef, cg_v + np.cross(rate, arm)) - np.cross(earth.OMEGA_ECEF_RADPS, r_ecef)
     q_ecef_body = rotations.continuous(rotations.multiply(to_ecef, q_b))
     trajectory = Trajectory(epoch_utc, time_s, "datum", r_ecef, v_ecef, q_ecef_body, states[:, 14:17].copy())
-    theta, nose = dynamics.bending(q_b, q_a)
+    theta, nose = dynamics.deflection_angle(q_b, q_a)
     to_body = rotations.conjugate(q_b)
     air = airdata.air_data(trajectory, profile, vehicle.cg_m)
     tumbling = (aux[:, 4] > TUMBLE_RAD) & (aux[:, 3] > 1.0)
     tumbled_s = float(time_s[np.argmax(tumbling)]) if tumbling.any() else None
     diverged_s = float(time_s[-1]) if diverged else None
-    words = []
+    remarks = []
     if tumbled_s is not None:
-        words.append(f"tumbled at {tumbled_s:.2f} s")
+        remarks.append(f"tumbled at {tumbled_s:.2f} s")
     if diverged_s is not None:
-        words.append(f"joint diverged past 90 deg at {diverged_s:.2f} s; the flight ends there")
+        remarks.append(f"deflection beyond 90 deg at {diverged_s:.2f} s; the flight ends there")
     return Truth(
         trajectory=trajectory,
         state_eci=states,
@@ -321,7 +335,7 @@ def _truth(
         profile=profile,
         tumbled_s=tumbled_s,
         diverged_s=diverged_s,
-        words="; ".join(words),
+        remark="; ".join(remarks),
     )
 
 
@@ -404,20 +418,20 @@ def kernel_tables(vehicle: Vehicle, atmosphere: FloatArray) -> tuple[FloatArray,
     free = np.zeros(coefficients.shape[1:])
     if vehicle.aero.free_molecular is not None:
         free, air = np.ascontiguousarray(vehicle.aero.free_molecular), air.copy()
-        with np.errstate(divide="ignore"):  # no air: infinitely far between molecules
+        with np.errstate(divide="ignore"):  # no air: infinite mean free path
             air[..., 5] = sphere_cone.bridge(sphere_cone.knudsen(air[..., 0], vehicle.reference.length_m))
     return np.ascontiguousarray(air), grid, np.ascontiguousarray(vehicle.aero.mach), coefficients, free
 
 
 def workspace(states: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Lanes' rows before a flight: states ``(lanes, 20)`` and parameter vectors ``(lanes, 67)`` of every lane."""
+    """Flat workspace of the kernels of states ``(lanes, 20)`` and parameter vectors ``(lanes, 67)``."""
     s = np.zeros((at.ROWS, len(states)))
     s[at.Y : at.Y + at.STATES] = states.T
     s[at.P :] = parameters.T
     return s.ravel()
 
 
-def flown_records(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _finite_records(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Records up to the first that is not finite."""
     finite = np.isfinite(states).all(axis=-1)
     n = len(states) if finite.all() else int(np.argmin(finite))

@@ -1,10 +1,12 @@
-"""What air the day brings, and what a range that sounded it would report: truth and sounding differ as real ones do.
+"""What is the true atmosphere of the day of flight, and what would a sounding of it report?
 
-The truth is a base (US76, or NRLMSIS of a day) times a smooth wave and random structure, with a smooth August wind;
-then whatever the scenario puts into it by name: density pockets, wind shears, turbulence, single gusts. Two soundings
-can be had of it. The simple one errs by a constant part, a gravity wave and small structure of the size that the
-filter assumes. The range's is a balloon below 30 km and a datasonde and an inflatable sphere above, each with its own
-accuracy, smoothed to the vertical wavelength that a falling sphere resolves, and some hours old.
+``rho = rho_base exp(wave + structure)`` with a base of US76, or NRLMSIS of one day, a smooth gravity wave and a
+Gauss-Markov structure of 5 km correlation length; winds are a smooth August profile with a structure of 3 km. Then
+come the disturbances that the scenario names: density pockets, wind shears, turbulence, discrete gusts.
+
+Two soundings can be had of it. The simple one errs by a constant part, a gravity wave and small structure of the size
+that the filter assumes. The range's is a balloon below 30 km, a datasonde and an inflatable sphere above, each with its
+own accuracy, smoothed to the vertical wavelength that a falling sphere resolves, and some hours old.
 
 References
 ----------
@@ -27,11 +29,11 @@ from synthetic_flight.instrument_errors import gauss_markov
 
 Wind = Annotated[float, Field(ge=-500.0, le=500.0)]
 WindSize = Annotated[float, Field(ge=0.0, le=500.0)]
-# the dynamics' own table of the air has a row every 50 m: nothing thinner than four rows can be flown through
+# the dynamics' table of the atmosphere has a row every 50 m: a layer must span at least four of them
 Thickness = Annotated[float, Field(ge=200.0, le=110e3)]
 Altitude = Annotated[float, Field(gt=0.0, lt=110e3)]
 STEP_M, TOP_M = 250.0, 130000.0
-POINTS_A_STRUCTURE = 10
+POINTS_PER_LENGTH = 10  # knots along a disturbance's thickness
 # gain 1/2 of a Gaussian of standard deviation s at wavelength l: s = l sqrt(ln 2 / 2) / pi
 HALF_GAIN = float(np.sqrt(0.5 * np.log(2.0)) / np.pi)
 
@@ -45,7 +47,7 @@ class Pocket(Section):
 
 
 class Shear(Section):
-    """A change of wind across a layer; the wind above is changed by the whole of it."""
+    """A change of wind through a layer; above it the wind is changed by the whole of it."""
 
     altitude_m: Altitude
     north_mps: Wind
@@ -78,15 +80,15 @@ class DiscreteGust(Section):
 
 
 class RangeSounding(Section):
-    """The range's own sounding: how old it is at the flight, how high it reached, what it resolves."""
+    """The range's sounding: its age at the flight, its top, the vertical wavelength it resolves."""
 
     age_h: Annotated[float, Field(ge=0.0, le=240.0)] = 3.0
     top_m: Annotated[float, Field(ge=35e3, le=100e3)] = 90e3
     resolution_m: Annotated[float, Field(ge=500.0, le=20e3)] = 2000.0
 
 
-class DayAtmosphere(Section):
-    """The day's departure from its base and the size of the sounding's errors."""
+class DayOfFlightAtmosphere(Section):
+    """Departure of the day-of-flight atmosphere from its base, and the size of the sounding's errors."""
 
     base: Literal["us76", "nrlmsis_2009_08_17"] = "us76"
     winds: bool = True
@@ -130,20 +132,20 @@ def dryden_transverse(count: int, step_m: float, length_m: float, rng: np.random
     return np.fft.fft(np.sqrt(np.maximum(power, 0.0) / n) * white).real[:count]
 
 
-def raised_cosine(altitude_m: FloatArray, centre_m: float, thickness_m: float) -> FloatArray:
+def _raised_cosine(altitude_m: FloatArray, centre_m: float, thickness_m: float) -> FloatArray:
     """One at the centre, a half ``thickness_m / 2`` beside it, zero from ``thickness_m`` on."""
     x = np.clip((altitude_m - centre_m) / thickness_m, -1.0, 1.0)
     return 0.5 * (1.0 + np.cos(np.pi * x))
 
 
-def smooth_step(altitude_m: FloatArray, centre_m: float, thickness_m: float) -> FloatArray:
+def _smooth_step(altitude_m: FloatArray, centre_m: float, thickness_m: float) -> FloatArray:
     """Rise from zero to one over ``thickness_m`` around the centre, by a half cosine."""
     x = np.clip((altitude_m - centre_m) / thickness_m, -0.5, 0.5)
     return 0.5 * (1.0 + np.sin(np.pi * x))
 
 
-def day_atmosphere(spec: DayAtmosphere, rng: np.random.Generator) -> AtmosphereProfile:
-    """Draw the air that the vehicle really meets: structure from 0 to 130 km, its base beyond.
+def day_of_flight_atmosphere(spec: DayOfFlightAtmosphere, rng: np.random.Generator) -> AtmosphereProfile:
+    """Draw the true atmosphere of the flight: structure from 0 to 130 km, its base above.
 
     Turbulence draws from children of ``rng``, one a band, so it leaves all other draws as they are.
     """
@@ -182,7 +184,7 @@ def _resampled(profile: AtmosphereProfile, z: FloatArray) -> AtmosphereProfile:
 
 
 def _on_base(day: AtmosphereProfile, base: AtmosphereProfile) -> AtmosphereProfile:
-    """Put the day's structure on a modelled base; above the structure, which fades over 10 km, the base alone."""
+    """Add the day's structure to a modelled base; above 130 km it fades over 10 km to the base alone."""
     z = np.union1d(base.altitude_m, np.union1d(day.altitude_m, np.arange(TOP_M, TOP_M + 60e3, 1000.0)))
     under = _resampled(base, z)
     fade = np.exp(-np.maximum(z - TOP_M, 0.0) / day.fade_m)
@@ -196,15 +198,17 @@ def _on_base(day: AtmosphereProfile, base: AtmosphereProfile) -> AtmosphereProfi
     )
 
 
-def _with_structures(day: AtmosphereProfile, spec: DayAtmosphere, rng: np.random.Generator) -> AtmosphereProfile:
-    """Add pockets, shears and gusts, on knots fine enough for the thinnest of them."""
+def _with_structures(
+    day: AtmosphereProfile, spec: DayOfFlightAtmosphere, rng: np.random.Generator
+) -> AtmosphereProfile:
+    """Add pockets, shears and gusts, with knots that resolve the thinnest of them."""
     knots = [day.altitude_m]
     parts: list[Pocket | Shear | DiscreteGust] = [*spec.pockets, *spec.shears, *spec.discrete_gusts]
     for part in parts:
         reach = part.thickness_m
-        knots.append(np.linspace(part.altitude_m - reach, part.altitude_m + reach, 2 * POINTS_A_STRUCTURE + 1))
+        knots.append(np.linspace(part.altitude_m - reach, part.altitude_m + reach, 2 * POINTS_PER_LENGTH + 1))
     bands = [
-        np.linspace(g.from_m, g.to_m, int(np.ceil((g.to_m - g.from_m) / g.length_m * POINTS_A_STRUCTURE)) + 1)
+        np.linspace(g.from_m, g.to_m, int(np.ceil((g.to_m - g.from_m) / g.length_m * POINTS_PER_LENGTH)) + 1)
         for g in spec.gusts
     ]
     z = np.unique(np.round(np.concatenate([*knots, *bands]), 3))
@@ -212,20 +216,20 @@ def _with_structures(day: AtmosphereProfile, spec: DayAtmosphere, rng: np.random
     z, ratio, wind = fine.altitude_m, fine.log_density_ratio.copy(), fine.wind_ned_mps.copy()
     thinner = np.ones(len(z))
     for pocket in spec.pockets:
-        thinner *= 1.0 - pocket.depth * raised_cosine(z, pocket.altitude_m, pocket.thickness_m)
+        thinner *= 1.0 - pocket.depth * _raised_cosine(z, pocket.altitude_m, pocket.thickness_m)
     for shear in spec.shears:
-        # the change fades out where the winds do
-        rise = smooth_step(z, shear.altitude_m, shear.thickness_m) * np.interp(z, [110e3, 130e3], [1.0, 0.0])
+        # fades out above 110 km as the winds do
+        rise = _smooth_step(z, shear.altitude_m, shear.thickness_m) * np.interp(z, [110e3, 130e3], [1.0, 0.0])
         wind[:, :2] += rise[:, None] * (shear.north_mps, shear.east_mps)
     for gust in spec.discrete_gusts:
-        shape = raised_cosine(z, gust.altitude_m, gust.thickness_m)
+        shape = _raised_cosine(z, gust.altitude_m, gust.thickness_m)
         wind[:, :2] += shape[:, None] * (gust.north_mps, gust.east_mps)
     for band, gusts, child in zip(bands, spec.gusts, rng.spawn(len(bands)), strict=True):
         edge = np.clip(np.minimum(band - gusts.from_m, gusts.to_m - band) / gusts.length_m, 0.0, 1.0)
         for axis in (0, 1):
             drawn = dryden_transverse(len(band), band[1] - band[0], gusts.length_m, child)
             wind[:, axis] += np.interp(z, band, gusts.sd_mps * edge * drawn, left=0.0, right=0.0)
-    # a pocket at unchanged pressure is warmer by what it is thinner
+    # ideal gas at unchanged pressure: temperature grows as density falls
     warmer = fine.at(z).temperature_k * (1.0 / thinner - 1.0)
     return AtmosphereProfile(
         z, ratio + np.log(thinner), fine.temperature_offset_k + warmer, wind, fine.density_sd, fine.wind_sd_mps
@@ -233,21 +237,21 @@ def _with_structures(day: AtmosphereProfile, spec: DayAtmosphere, rng: np.random
 
 
 def sense_atmosphere(
-    profile: AtmosphereProfile, spec: DayAtmosphere, rng: np.random.Generator
+    profile: AtmosphereProfile, spec: DayOfFlightAtmosphere, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sound the day: by the simple model, or by the range's where the scenario has ``[atmosphere.sounding]``.
+    """Sounding of the day: the simple one, or the range's where the scenario has ``[atmosphere.sounding]``.
 
     Returns
     -------
     altitude_m (n,), density_temperature (n, 2) in kg/m^3 and K, wind_ned_mps (n, 2) north and east
     """
     if spec.sounding is not None:
-        return range_sounding(profile, spec.sounding, spec.sounding_scale, rng)
+        return _range_sounding(profile, spec.sounding, spec.sounding_scale, rng)
     z = np.arange(0.0, 95001.0, 1000.0)
     fine = z[:, None] + np.linspace(-1000.0, 1000.0, 9)
     air = profile.at(np.maximum(fine, 0.0))
     density = np.exp(np.log(air.density_kgpm3).mean(axis=1))
-    # smoothing an exponential over 2 km does not move its log-mean, so only structure is lost
+    # the mean of the logarithm over 2 km removes structure alone: that of an exponential does not move
     wind = air.wind_ned_mps.mean(axis=1)[:, :2]
     density_sd, wind_sd = default_sounding_sd(z)
 
@@ -264,8 +268,8 @@ def sense_atmosphere(
 BALLOON_TOP_M = 30e3
 
 
-def range_accuracy(altitude_m: FloatArray, pressure_pa: FloatArray, temperature_k: FloatArray) -> FloatArray:
-    """One standard deviation of the range's instruments: density (fraction), temperature K, wind m/s, ``(n, 3)``.
+def range_sounding_sd(altitude_m: FloatArray, pressure_pa: FloatArray, temperature_k: FloatArray) -> FloatArray:
+    """Standard deviation of the range's instruments: density (fraction), temperature K, wind m/s, ``(n, 3)``.
 
     Balloon below 30 km: 0.5 K, 1 m/s, and a pressure cell of 1 hPa up to where that is 1 %, which the hydrostatic
     equation carries on above. Above: sphere density 3 % to 80 km, 10 % at 90 km; datasonde temperature 1 K at 30 to
@@ -281,14 +285,15 @@ def range_accuracy(altitude_m: FloatArray, pressure_pa: FloatArray, temperature_
     return np.column_stack([density, temperature, wind])
 
 
-def range_sounding(
+def _range_sounding(
     profile: AtmosphereProfile, spec: RangeSounding, scale: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sound the day with a balloon, a datasonde and an inflatable sphere, ``spec.age_h`` hours before the flight.
+    """Sounding by balloon, datasonde and inflatable sphere, ``spec.age_h`` hours before the flight.
 
-    Half of each instrument's variance is constant through its profile (calibration, drag coefficient, the pressure
-    cell), half varies over 5 km (density, temperature) or 3 km (winds). The air itself has changed since by 0.5 % and
-    1 m/s an hour. Above the balloon only structure longer than ``resolution_m`` is left (half gain there).
+    Half of each instrument's variance is a constant bias through its profile (calibration, drag coefficient, pressure
+    cell), half is Gauss-Markov with a correlation length of 5 km (density, temperature) or 3 km (winds). The atmosphere
+    has changed since by 0.5 % and 1 m/s an hour. Above the balloon only structure longer than ``resolution_m`` is left
+    (gain 1/2 there).
 
     Returns
     -------
@@ -297,7 +302,7 @@ def range_sounding(
     step = 250.0
     grid = np.arange(0.0, spec.top_m + 5001.0, step)
     air, standard = profile.at(grid), standard_atmosphere().at(grid)
-    # density as its log ratio to the standard: smoothing then removes structure alone
+    # density as the logarithm of its ratio to the standard: smoothing then removes structure alone
     columns = np.column_stack(
         [np.log(air.density_kgpm3 / standard.density_kgpm3), air.temperature_k, air.wind_ned_mps[:, :2]]
     )
@@ -308,7 +313,7 @@ def range_sounding(
     measured = np.where(grid[:, None] < BALLOON_TOP_M, columns, smoothed)
     z = np.arange(0.0, spec.top_m + 1.0, 500.0)
     rows = np.searchsorted(grid, z)
-    sd = range_accuracy(z, air.pressure_pa[rows], air.temperature_k[rows])[:, [0, 1, 2, 2]]
+    sd = range_sounding_sd(z, air.pressure_pa[rows], air.temperature_k[rows])[:, [0, 1, 2, 2]]
     stale = spec.age_h * np.array([0.005, 0.0, 1.0, 1.0])
     for k, length in enumerate((5000.0, 5000.0, 3000.0, 3000.0)):
         constant = np.where(z < BALLOON_TOP_M, *rng.standard_normal(2))

@@ -32,7 +32,7 @@ INSTRUMENTS = [
 MODELS = [
     scenarios.TimeSpan,
     scenarios.Initial,
-    weather.DayAtmosphere,
+    weather.DayOfFlightAtmosphere,
     weather.Pocket,
     weather.Shear,
     weather.Turbulence,

@@ -48,6 +48,27 @@ def test_file_is_short_and_keeps_to_the_doors(path):
             assert path.name.endswith(door), f"{module} is imported in files named {door} alone"
 
 
+# a value of a colour: by digits, by matplotlib's cycle or grey level, or by name
+A_COLOUR = re.compile(r"#[0-9a-fA-F]{3,8}|C\d|0\.\d+|black|white|gr[ae]y|red|green|blue|yellow|orange")
+DRAWN = [p for p in (ROOT / "postflight").rglob("*") if p.suffix in (".css", ".html", ".js") and ".min." not in p.name]
+
+
+@pytest.mark.parametrize("path", [p for p in CODE if name(p).startswith("postflight/")], ids=name)
+def test_colours_are_asked_for_by_meaning(path):
+    if name(path) == "postflight/plots/style.py":
+        return
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            literal = A_COLOUR.fullmatch(node.value) if "plots/" in name(path) else None
+            literal = literal or re.fullmatch("#[0-9a-fA-F]{6}", node.value)
+            assert not literal, f"{node.value}: colours stand in postflight/plots/style.py"
+
+
+@pytest.mark.parametrize("path", DRAWN, ids=name)
+def test_page_takes_its_colours_from_the_figures_table(path):
+    assert not re.findall(r"#[0-9a-fA-F]{6}\b|#[0-9a-fA-F]{3}\b(?=[;\" ])|rgba?\(\d+, ?\d+", path.read_text())
+
+
 @pytest.mark.parametrize("path", CODE, ids=name)
 def test_functions_fit_a_screen(path):
     for node in ast.walk(ast.parse(path.read_text())):
@@ -89,13 +110,10 @@ def modules_imported(path, known):
     """Modules of this project that a file imports anywhere, also inside functions."""
     found = set()
     tree = ast.parse(path.read_text())
-    for_types = [n for n in ast.walk(tree) if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"]
-    ignored = {part for block in for_types for part in ast.walk(block)}
     for node in ast.walk(tree):
-        if node in ignored:
-            continue
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {f"{node.module}.{a.name}" for a in node.names} | {node.module}
+            named = {f"{node.module}.{a.name}" for a in node.names}
+            found |= named & known or {node.module}  # of a package either its modules or what it says itself
         elif isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
     return found & known

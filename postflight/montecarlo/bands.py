@@ -1,19 +1,16 @@
-"""Chunks of a study on disk: whole or not there at all, the same bytes from the same flights.
+"""Which percentiles and bands have the outputs of a study, and how certain are they with so many flights?
 
-``chunk-000012.npz`` holds runs, reasons of those that failed, when a joint diverged, the named numbers as float64 and
-the histories as float32. A file that was damaged counts as missing, and is flown again.
+Chunks on disk: ``chunk-000012.npz`` holds runs, reasons of those that failed, times of divergence, the named numbers as
+float64 and the histories as float32. Files are whole or absent, with the same bytes from the same flights; a damaged
+one counts as missing and is flown again.
 
-How well so many flights know a percentile: intervals by order statistics, and the rule that says when to stop.
+Intervals: of n independent flights the number below the true percentile p is binomial, ``k ~ B(n, p)``, whatever the
+distribution; so the k-th and l-th smallest values contain it with a known probability (`scipy.stats.quantile_test`). A
+stop rule that is evaluated after every chunk tends to stop when the interval happens to be narrow, so its coverage is a
+little below the nominal one (docs/monte-carlo.md has the measured figure).
 
-Of n independent flights the number below the true percentile p is binomial, whatever the distribution; so the k-th and
-l-th smallest values hold it with a probability that is known (`scipy.stats.quantile_test`). Stopping when the interval
-looks narrow favours moments when it looks narrower than it is: a rule that looks after every chunk covers a little less
-than it says (docs/monte-carlo.md has the measured figure).
-
-From chunks to answers: a table of flights, percentiles with intervals, bands of histories, in bounded memory.
-
-Percentiles of histories are exact: each is taken from all flights, for as many times at once as fit into
-`BAND_BYTES`, however many flights there are. Flights that failed are in the table of flights and nowhere else.
+Bands of histories are exact percentiles over all flights, for as many times at once as fit into `BAND_BYTES`, whatever
+the number of flights. Flights that failed are in the table of flights and nowhere else.
 """
 
 from __future__ import annotations
@@ -30,10 +27,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import quantile_test
 
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import FloatArray, GateError, write_file
 from flightmodel.statistics import BAND_COLUMNS, BAND_PERCENTILES, percentile_band
 from postflight.montecarlo.study import CONFIDENCE, Study
-from postflight.run_folder import write_file
 from synthetic_flight.ensemble import Row
 
 PARTIAL = ".part"
@@ -116,7 +112,7 @@ def read_chunk(folder: Path, number: int, runs: list[int] | None = None, histori
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove what killed processes of this machine left half-written."""
+    """Remove half-written files of killed processes of this machine."""
     for path in (folder / "chunks").glob(f".*{PARTIAL}"):
         number = path.name.removesuffix(PARTIAL).rpartition("-")[2]
         try:
@@ -128,7 +124,7 @@ def remove_partial(folder: Path) -> None:
 
 
 def percentile_interval(values: FloatArray, percentile: float, confidence: float) -> tuple[float, float]:
-    """Two-sided confidence interval of a percentile; NaN at the side that too few flights leave open.
+    """Two-sided confidence interval of a percentile; NaN at a side where flights are too few.
 
     Parameters
     ----------
@@ -179,7 +175,8 @@ def merge(study: Study, folder: Path, flights: int) -> Merged:
         chunk = read_chunk(folder, k, runs, histories=False)
         if chunk is None:
             missing = sum(read_chunk(folder, j, r, False) is None for j, r in enumerate(wanted))
-            raise GateError(f"{folder}: {missing} of {len(wanted)} chunks are missing; the same run command flies them")
+            message = f"{folder}: {missing} of {len(wanted)} chunks are missing; the same run command flies them"
+            raise GateError(message, code="chunk-missing")
         parts.append(chunk)
     names = list(study.plan.scalars)
     table = pd.DataFrame(np.concatenate([c.scalars for c in parts]), columns=names)
@@ -227,7 +224,8 @@ def _bands(study: Study, folder: Path, wanted: list[list[int]], flown: FloatArra
         for number, runs in enumerate(wanted):
             chunk = read_chunk(folder, number, runs)
             if chunk is None:
-                raise GateError(f"{folder}: chunk {number} was damaged while it was read; run again")
+                message = f"{folder}: chunk {number} was damaged while it was read; run again"
+                raise GateError(message, code="chunk-damaged")
             kept = chunk.histories[chunk.flown][:, :, part]
             slab[:, :, row : row + len(kept)] = np.moveaxis(kept, 0, -1)
             row += len(kept)

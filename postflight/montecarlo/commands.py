@@ -1,4 +1,4 @@
-"""What ``postflight montecarlo`` does: fly, look, merge, try again, with progress and a table at the end."""
+"""What does ``postflight montecarlo`` do? Fly a study, report its state, merge it, fly failed runs again."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from postflight.montecarlo import execution
 from postflight.montecarlo.bands import Merged, merge, write_csv, write_merged
 from postflight.montecarlo.execution import Wanted
 from postflight.montecarlo.study import Stop, Study, indices, read_study, sobol_study
-from postflight.plots import ensembles
-from postflight.plots.paper_figures import save
+from postflight.plots.studies import figure_bands, figure_sobol
+from postflight.plots.style import save
 from postflight.progress import progress_bar
 from postflight.warmup import RECONSTRUCTION
-from synthetic_flight.ensemble import available_cores, check_names
+from synthetic_flight.ensemble import available_cores, check_outputs
 
 
 def run(
@@ -33,9 +33,8 @@ def run(
     finish(study, folder, count)
     if stop is not None:
         met = count < wanted.flights
-        words = "" if met else f" was not reached in {count} flights"
-        rule = f"an interval of {stop.output} narrower than {stop.width:g}"
-        console.print(f"{escape(rule)}{words or f' took {count} flights'}")
+        rule = f"interval of {stop.output} narrower than {stop.width:g}"
+        console.print(f"{escape(rule)}: {'reached with' if met else 'not reached in'} {count} flights")
 
 
 def stop_from(text: str, study: Study) -> Stop:
@@ -46,8 +45,9 @@ def stop_from(text: str, study: Study) -> Stop:
     except ValueError:
         number = np.nan
     if not 0.0 < number < np.inf:
-        raise ConfigError(f"--until-width {text}: OUTPUT=WIDTH is wanted, e.g. peak_normal_g=0.05")
-    check_names((output,), study.plan.scalars)
+        message = f"--until-width {text}: OUTPUT=WIDTH is wanted, e.g. peak_normal_g=0.05"
+        raise ConfigError(message, code="option-format")
+    check_outputs((output,), study.plan.scalars)
     base = study.spec.stop or Stop(output=output, width=number)
     return base.model_copy(update={"output": output, "width": number})
 
@@ -65,19 +65,20 @@ def finish(study: Study, folder: Path, flights: int) -> Merged:
     write_merged(folder, merged)
     title = f"{flights} dispersed flights: 2.3, 50 and 97.7 % of them"
     if len(merged.bands):
-        save(ensembles.figure_bands(merged.bands, title, words_of(study)), folder / "bands.png")
-    print_merged(merged, folder)
+        save(figure_bands(merged.bands, title, _origin(study)), folder / "bands.png")
+    _print_merged(merged, folder)
     if merged.summary["failed"] == flights:
-        raise GateError(f"{folder}: every flight failed; the first: {merged.flights['reason'].iloc[0]}")
+        message = f"{folder}: every flight failed; the first: {merged.flights['reason'].iloc[0]}"
+        raise GateError(message, code="every-flight-failed")
     return merged
 
 
-def words_of(study: Study) -> str:
-    """Say in a figure's corner what was flown."""
+def _origin(study: Study) -> str:
+    """Return the figures' corner text: what was flown."""
     return f"{study.source.name}: SYNTHETIC flights of {study.plan.scenario.spec.name}"
 
 
-def print_merged(merged: Merged, folder: Path) -> None:
+def _print_merged(merged: Merged, folder: Path) -> None:
     """Percentiles with their intervals, and what failed."""
     table = Table(title=f"{merged.summary['flights']} flights: percentiles")
     for name in ("output", "2.3 %", "50 %", "97.7 %", "95 % interval of the last"):
@@ -90,7 +91,7 @@ def print_merged(merged: Merged, folder: Path) -> None:
     for name, row in merged.summary.get("coverage", {}).items():
         console.print(f"{name}: " + ", ".join(f"{key} {value:.3g}" for key, value in row.items()), highlight=False)
     if merged.summary["diverged"]:
-        console.print(f"[yellow]found[/] the joint of {merged.summary['diverged']} flights diverged past 90 deg")
+        console.print(f"[yellow]found[/] deflection beyond 90 deg in {merged.summary['diverged']} flights")
     if merged.summary["failed"]:
         words = f"{merged.summary['failed']} flights failed; their reasons are in flights.csv"
         console.print(f"[red]failed[/] {words}; `postflight montecarlo retry-failed {escape(str(folder))}`")
@@ -98,7 +99,7 @@ def print_merged(merged: Merged, folder: Path) -> None:
 
 
 def status(folder: Path) -> None:
-    """Say how far a folder is."""
+    """Print how many flights of a folder are flown."""
     found = execution.status(folder)
     console.print(
         f"{found.flights} of {found.flights_wanted} flights in {found.chunks} of {found.chunks_wanted} chunks; "
@@ -131,7 +132,7 @@ def sobol_indices(
 ) -> None:
     """Fly Saltelli's design and print the indices of every output; draw those of ``output``."""
     study = sobol_study(read_study(name), by, base)
-    check_names((output,), study.plan.scalars)
+    check_outputs((output,), study.plan.scalars)
     assert study.design is not None
     fly(study, folder, Wanted(study.design.flights, workers or available_cores(), scheduler))
     finish_sobol(study, folder, output)
@@ -153,15 +154,15 @@ def finish_sobol(study: Study, folder: Path, output: str | None = None) -> None:
         table["points"] = design.base - left_out
         tables.append(table)
     if not tables:
-        raise GateError(f"{folder}: no output has indices")
+        raise GateError(f"{folder}: no output has indices", code="sobol-spread")
     every = pd.concat(tables, ignore_index=True)
     write_merged(folder, merged)
     write_csv(folder / "sobol.csv", every)
     shown = every[every["output"] == (output or every["output"].iloc[0])]
     if shown.empty:
-        raise GateError(f"{folder}: {output} has no indices")
+        raise GateError(f"{folder}: {output} has no indices", code="sobol-spread")
     title = f"Sobol indices of {shown['output'].iloc[0]}: {design.flights} flights"
-    save(ensembles.figure_sobol(shown, title, words_of(study)), folder / "sobol.png")
+    save(figure_sobol(shown, title, _origin(study)), folder / "sobol.png")
     printed = Table(title=title)
     for head in ("factor", "first order", "95 %", "total", "95 %"):
         printed.add_column(head, justify="left" if head == "factor" else "right", no_wrap=head == "factor")

@@ -1,12 +1,12 @@
-"""Who flies the chunks: this process, processes of this machine, or the workers of a Dask scheduler.
+"""How is a study flown: by which processes, and how is it interrupted, resumed, extended and stopped?
 
-All three call the same function with the same runs, and a flight is the same to the last bit in any company, so where
-it was flown cannot be told from its numbers. Chunks come back as they are done, in any order.
+Chunks are flown in this process, in processes of this machine, or by the workers of a Dask scheduler. All three call
+the same function with the same runs, and a flight is the same to the last bit in any company, so its numbers do not
+depend on where it was flown. Chunks come back in any order.
 
-A folder of flights: begun, killed, resumed, extended, stopped when enough; never two studies in one.
-
-``study.json`` says what decides the numbers and how many flights are wanted; ``chunks/`` holds them. Every step is
-whole or not there at all, so that a run may be killed at any time and the same command goes on.
+A folder holds one study: ``study.json`` the settings that determine the numbers and how many flights are wanted,
+``chunks/`` the flights. Files are whole or absent, so that a run may be killed at any time and the same command
+resumes it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ import os
 import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from itertools import islice
 from multiprocessing.connection import wait as wait_for
@@ -30,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from flightmodel.checks import ConfigError, GateError
+from flightmodel.checks import ConfigError, GateError, Progress, write_file
 from postflight.montecarlo import trial
 from postflight.montecarlo.bands import (
     Chunk,
@@ -42,14 +43,13 @@ from postflight.montecarlo.bands import (
     write_chunk,
 )
 from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
-from postflight.run_folder import write_file
 from synthetic_flight.ensemble import fly_runs
 
 Job = tuple[int, list[int]]
 Done = tuple[int, Chunk]
-AHEAD = 2  # chunks a worker has or waits for: enough that none waits, few enough that results do not pile up
+AHEAD = 2  # chunks queued a worker: none waits, and results do not pile up
 CONNECT_S = 20
-END_S = 5.0  # within which an ended worker process is gone
+END_S = 5.0  # to wait for a terminated worker process
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -57,7 +57,7 @@ def fly_chunk(study: Study, job: Job) -> Done:
     """Fly the runs of one job; a flight that fails is a row with its reason."""
     number, runs = job
     if study.spec.mode == "whole":
-        rows = trial.fly_whole(study.plan, study.spec.seed, runs)
+        rows = trial.run_trials(partial(trial.whole_trial, study.plan, study.spec.seed), study.plan, runs)
     else:
         rows = fly_runs(study.plan, runs, study.draws_of)
     return number, chunk_from_rows(rows, study.plan.scalars)
@@ -75,7 +75,7 @@ def fly_jobs(study: Study, jobs: list[Job], workers: int, scheduler: str | None)
 
 
 def _begin() -> None:
-    """Prepare a worker process: Ctrl-C is its parent's to handle, and it does not outlive its parent."""
+    """Prepare a worker process: its parent handles Ctrl-C, and it ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -90,7 +90,7 @@ def _begin() -> None:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Let processes that start now keep their linear algebra to one thread: there are as many of them as cores."""
+    """Limit linear algebra of processes that start now to one thread: there are as many of them as cores."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
@@ -120,8 +120,9 @@ def _in_processes(study: Study, jobs: list[Job], workers: int) -> Iterator[Done]
                 waiting |= {pool.submit(fly_chunk, study, job) for job in islice(ahead, 1)}
     except BrokenProcessPool:
         raise GateError(
-            "a worker process was ended from outside (out of memory?); every finished chunk is kept: the same command "
-            "goes on from there, with fewer --workers if memory is short"
+            "a worker process was killed (out of memory?); every finished chunk is kept: the same command resumes from "
+            "there, with fewer --workers if memory is short",
+            code="worker-killed",
         ) from None
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -136,17 +137,18 @@ def _on_dask(study: Study, jobs: list[Job], address: str) -> Iterator[Done]:
     try:
         from distributed import Client, as_completed
     except ImportError:
-        raise ConfigError("--scheduler needs Dask: pip install 'postflight[cluster]'") from None
+        raise ConfigError("--scheduler needs Dask: pip install 'postflight[cluster]'", code="package-missing") from None
     try:
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as fault:
-        raise ConfigError(f"--scheduler {address}: no scheduler answers there: {fault}") from None
+        message = f"--scheduler {address}: no scheduler answers there: {fault}"
+        raise ConfigError(message, code="scheduler-unreachable") from None
     with client, client.as_current():
         ahead = iter(jobs)
 
         def submit(count: int) -> list[Any]:
-            # a chunk whose worker is lost is flown again elsewhere by the scheduler; the study goes with every one, as
-            # data that were sent once would be lost with the last worker that holds them
+            # the scheduler flies a chunk again whose worker is lost; the study goes with every chunk, since data that
+            # were sent once would be lost with the last worker that holds them
             return [client.submit(fly_chunk, study, job, pure=False) for job in islice(ahead, count)]
 
         threads = max(1, sum(client.nthreads().values()))
@@ -157,13 +159,12 @@ def _on_dask(study: Study, jobs: list[Job], address: str) -> Iterator[Done]:
                 going.add(one)
 
 
-Report = Callable[[float, str], None]
 MOST_DIFFERENCES = 12
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is asked of a study: so many flights, or fewer where the rule says enough; who flies them."""
+    """What is asked of a study: the number of flights, a stop rule, workers or a scheduler."""
 
     flights: int
     workers: int = 1
@@ -177,7 +178,7 @@ def begin(study: Study, folder: Path, flights: int) -> None:
     Raises
     ------
     ConfigError
-        Where the folder holds a study with other settings (which, and both values), or more flights, or other things.
+        Where the folder holds a study with other settings (which, and both values), or more flights, or other files.
     """
     path = folder / "study.json"
     settings = json.loads(json.dumps(study.settings()))
@@ -185,11 +186,16 @@ def begin(study: Study, folder: Path, flights: int) -> None:
         held = read_settings(folder)
         _check_same(folder, held["settings"], settings)
         if held["version"] != version("postflight"):
-            raise ConfigError(f"{folder}: flown by version {held['version']}, this is {version('postflight')}")
+            message = (
+                f"{folder}: flown by version {held['version']}, this is {version('postflight')}; name a new folder"
+            )
+            raise ConfigError(message, code="study-version")
         if flights < held["flights"]:
-            raise ConfigError(f"{folder}: holds a study of {held['flights']} flights; at least as many are wanted")
+            message = f"{folder}: holds a study of {held['flights']} flights; at least as many are wanted"
+            raise ConfigError(message, code="study-larger")
     elif folder.exists() and any(folder.iterdir()):
-        raise ConfigError(f"{folder}: is not empty and holds no study.json; name a new folder")
+        message = f"{folder}: is not empty and holds no study.json; name a new folder"
+        raise ConfigError(message, code="folder-not-empty")
     (folder / "chunks").mkdir(parents=True, exist_ok=True)
     remove_partial(folder)
     _note(folder, settings, flights, study.named)
@@ -209,9 +215,10 @@ def read_settings(folder: Path) -> dict[str, Any]:
         if not all(isinstance(held[key], kind) for key, kind in kinds):
             raise ValueError("not a study")
     except FileNotFoundError:
-        raise GateError(f"{folder}: no study.json; begin with `postflight montecarlo run`") from None
+        message = f"{folder}: no study.json; begin with `postflight montecarlo run`"
+        raise GateError(message, code="study-missing") from None
     except (ValueError, KeyError, TypeError) as fault:
-        raise GateError(f"{path}: damaged: {fault}") from None
+        raise GateError(f"{path}: damaged: {fault}", code="study-damaged") from None
     found: dict[str, Any] = held
     return found
 
@@ -222,7 +229,7 @@ def study_of(folder: Path) -> tuple[Study, int]:
     Raises
     ------
     ConfigError
-        Where the file is gone, or says something else by now.
+        Where the file is gone, or has other settings now.
     """
     held = read_settings(folder)
     study = read_study(held["source"])
@@ -241,11 +248,12 @@ def _check_same(folder: Path, held: dict[str, Any], asked: dict[str, Any]) -> No
         for k in differ[:MOST_DIFFERENCES]
     ]
     more = [f"{folder}: {len(differ)} settings differ in all"] * (len(differ) > MOST_DIFFERENCES)
-    raise ConfigError([*lines, *more, f"{folder}: name a new folder, or take the settings back"])
+    remedy = f"{folder}: name a new folder, or restore the settings"
+    raise ConfigError([*lines, *more, remedy], code="study-differs")
 
 
 class _Enough:
-    """Says after how many flights to stop, looking at whole chunks from the first on, in order of run number."""
+    """Stop rule, evaluated on whole chunks from the first on, in order of run number."""
 
     def __init__(self, study: Study, stop: Stop | None, flights: int) -> None:
         self.study, self.stop, self.flights = study, stop, flights
@@ -270,11 +278,11 @@ class _Enough:
         return self.reached is not None
 
 
-def run(study: Study, folder: Path, wanted: Wanted, report: Report) -> int:
+def run(study: Study, folder: Path, wanted: Wanted, report: Progress) -> int:
     """Fly what is missing of a study; return how many flights it has: those wanted, or fewer where these are enough.
 
-    The stop rule looks at flights in the order of their numbers, so it stops at the same flight on any number of
-    workers; what was flown beyond it is removed.
+    The stop rule takes flights in the order of their numbers, so it stops at the same flight on any number of workers;
+    flights beyond it are removed.
     """
     flights = wanted.flights
     begin(study, folder, flights)
@@ -308,7 +316,7 @@ def run(study: Study, folder: Path, wanted: Wanted, report: Report) -> int:
 
 @dataclass(frozen=True)
 class Status:
-    """What a folder holds: chunks of those wanted, flights, reasons of failures by number, flights that diverged."""
+    """Contents of a folder: chunks and flights of those wanted, reasons of failures with counts, diverged flights."""
 
     chunks: int
     chunks_wanted: int
@@ -319,7 +327,7 @@ class Status:
 
 
 def status(folder: Path) -> Status:
-    """Look at a folder without its dispersions file."""
+    """Contents of a folder, without its dispersions file."""
     held = read_settings(folder)
     size, wanted = held["settings"]["chunk"], held["flights"]
     count = flights = diverged = 0
@@ -335,7 +343,7 @@ def status(folder: Path) -> Status:
     return Status(count, total, flights, wanted, failed, diverged)
 
 
-def retry_failed(study: Study, folder: Path, wanted: Wanted, report: Report) -> tuple[int, int]:
+def retry_failed(study: Study, folder: Path, wanted: Wanted, report: Progress) -> tuple[int, int]:
     """Fly failed runs again; return how many there were and how many still fail.
 
     A flight's numbers depend on its run alone: one that failed on bad luck of the machine may fly now, one that was

@@ -1,20 +1,13 @@
-"""What a Monte Carlo study is: a dispersions file with its scenario, and all that decides its numbers.
+"""What is a Monte Carlo study, which draws does each run have, and which dispersion contributes most to an output?
 
-Two studies are the same where their settings are: everything but how many flights are wanted and when to stop. A folder
-holds flights of one study alone.
+A study is a dispersions file with its scenario. Two studies are the same where their settings are: everything but the
+number of flights and the stop rule. Runs draw at random, or by Saltelli's design for Sobol indices: two independent
+samples A and B of ``n`` points of the unit cube from one Sobol' sequence, and for every column the sample A with that
+column from B, ``n (columns + 2)`` flights. A column is a factor, or a section of the dispersions file with all its
+factors; the day-of-flight atmosphere, a whole profile, is drawn from the digits of one coordinate and so is one factor.
 
-Saltelli's design: which draws each run of a Sobol study has.
-
-Two independent samples A and B of ``n`` points of the unit cube from one Sobol' sequence, and for every column the
-sample A with that column from B, ``n (columns + 2)`` flights. A column is a factor, or a section of the dispersions
-file with all its factors; the day's air, a whole profile, is drawn from the digits of one coordinate and so is one
-factor like the others.
-
-Which uncertainty makes an output uncertain: Sobol indices over the factors of a dispersions file.
-
-First order is the share of the variance that a column of the design (`postflight.montecarlo.study`) explains alone,
-total its share with all that it does together with others. `scipy.stats.sobol_indices` gives the same numbers but wants
-every flight to succeed.
+``S_i = V(E(y | x_i)) / V(y)`` is the share of the variance by column i alone (first order), ``S_Ti`` its share with all
+interactions (total). `scipy.stats.sobol_indices` gives the same numbers but needs every flight to succeed.
 
 References
 ----------
@@ -35,12 +28,12 @@ import pandas as pd
 from pydantic import Field
 from scipy.stats import bootstrap
 
-from flightmodel.checks import ConfigError, FloatArray, GateError, nearest_name
+from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.config import Section, parse_section, read_toml
 from flightmodel.vehicle import DATA, Vehicle
 from postflight.montecarlo import trial
 from synthetic_flight.dispersions import SMALLEST, Dispersions, Window, draws
-from synthetic_flight.ensemble import QUANTITIES, SCALARS, Plan, check_names, legs
+from synthetic_flight.ensemble import QUANTITIES, SCALARS, Plan, check_outputs, legs
 from synthetic_flight.scenarios import read_scenario
 
 MOST_FLIGHTS = 10_000_000
@@ -49,14 +42,14 @@ Flights = Annotated[int, Field(ge=1, le=MOST_FLIGHTS)]
 
 
 class Outputs(Section):
-    """What is kept of every flight: named numbers, and histories for the bands."""
+    """Recorded of every flight: named numbers, and histories for the bands."""
 
     scalars: tuple[str, ...]
     histories: tuple[str, ...] = ()
 
 
 class Stop(Section):
-    """Enough flights: the interval of one output's percentile is narrower than a width, in the output's unit."""
+    """Stop rule: the interval of one output's percentile is narrower than a width, in the output's unit."""
 
     output: str
     width: Annotated[float, Field(gt=0.0)]
@@ -88,7 +81,7 @@ class Study:
         With the outputs that the mode gives.
     source : Path
     design : Design or None
-        Where draws come from another design than random ones (`postflight.montecarlo.study`).
+        Saltelli's, where draws are not random.
     """
 
     spec: DispersionsFile
@@ -98,7 +91,7 @@ class Study:
 
     @property
     def named(self) -> str:
-        """How the dispersions file is found again: the name of a shipped one, or its whole path."""
+        """Name of a shipped dispersions file, or the whole path of another."""
         shipped = self.source.parent == DATA / "dispersions"
         return self.source.stem if shipped else str(self.source.resolve())
 
@@ -118,16 +111,16 @@ class Study:
         return -(-flights // self.spec.chunk)
 
     def settings(self) -> dict[str, Any]:
-        """All that decides the numbers, flat: key to value."""
+        """All settings that determine the numbers, flat: key to value."""
         scenario = self.plan.scenario
         out = _flat("", self.spec.model_dump(mode="json", exclude={"flights", "stop", "scenario"}))
         out |= _flat("scenario.", scenario.spec.model_dump(mode="json"))
-        out |= _flat("vehicle.", vehicle_facts(scenario.vehicle))
+        out |= _flat("vehicle.", _vehicle_facts(scenario.vehicle))
         return out | ({} if self.design is None else _flat("sobol.", self.design.settings()))
 
 
-def vehicle_facts(vehicle: Vehicle) -> dict[str, Any]:
-    """What of a vehicle decides how it flies and what the analyst knows of it."""
+def _vehicle_facts(vehicle: Vehicle) -> dict[str, Any]:
+    """Properties of a vehicle that determine its flight and its reconstruction."""
     table = vehicle.aero.coefficients.tobytes() + vehicle.aero.mach.tobytes() + vehicle.aero.alpha_rad.tobytes()
     if vehicle.aero.free_molecular is not None:
         table += vehicle.aero.free_molecular.tobytes()
@@ -139,7 +132,8 @@ def vehicle_facts(vehicle: Vehicle) -> dict[str, Any]:
 def sobol_study(study: Study, by: str, base: int) -> Study:
     """Return a study that flies Saltelli's design instead of random draws, one column a factor or a section."""
     if study.spec.mode == "whole":
-        raise ConfigError(f"{study.source}: mode = 'whole': Sobol indices are of simulations alone")
+        message = f"{study.source}: mode = 'whole': Sobol indices are of mode = 'simulation' alone"
+        raise ConfigError(message, code="sobol-mode")
     design = design_for(tuple(study.spec.factors()), by, base, study.spec.seed)
     return replace(study, plan=replace(study.plan, histories=()), design=design)
 
@@ -165,7 +159,7 @@ def dispersions_path(name: str) -> Path:
     shipped = shipped_dispersions()
     if name not in shipped:
         hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
-        raise ConfigError(f"no dispersions file '{name}'{hint}")
+        raise ConfigError(f"no dispersions file '{name}'{hint}", code="dispersions-unknown")
     return DATA / "dispersions" / f"{name}.toml"
 
 
@@ -187,7 +181,7 @@ def read_study(name: str) -> Study:
     spec = parse_section(DispersionsFile, read_toml(path), str(path))
     own = path.parent / spec.scenario
     scenario = read_scenario(str(own) if spec.scenario.endswith(".toml") else spec.scenario)
-    faults: list[str] = []
+    faults: list[Fault] = []
     known = trial.SCALARS if spec.mode == "whole" else SCALARS
     histories = () if spec.mode == "whole" else tuple(QUANTITIES)
     for key, names, allowed in (
@@ -196,15 +190,15 @@ def read_study(name: str) -> Study:
         ("stop.output", () if spec.stop is None else (spec.stop.output,), spec.outputs.scalars),
     ):
         try:
-            check_names(names, allowed)
+            check_outputs(names, allowed)
         except ConfigError as fault:
-            faults += [f"{path}: key '{key}': {words}" for words in fault.faults]
+            faults += [Fault(f"{path}: key '{key}': {words}", words.code) for words in fault.faults]
     if spec.mode == "whole":
-        faults += [f"{path}: {words}" for words in trial.not_possible(spec)]
+        faults += [Fault(f"{path}: {words}", words.code) for words in trial.impossible_dispersions(spec)]
     try:
         legs(scenario.spec.time, spec.window, spec.joint_is == "locked")
     except ConfigError as fault:
-        faults += [f"{path}: {words}" for words in fault.faults]
+        faults += [Fault(f"{path}: {words}", words.code) for words in fault.faults]
     if faults:
         raise ConfigError(faults)
     return Study(spec, Plan(scenario, spec, spec.window, spec.outputs.scalars, spec.outputs.histories), path)
@@ -244,7 +238,7 @@ class Design:
         return self.base * (len(self.names) + 2)
 
     def settings(self) -> dict[str, Any]:
-        """What decides the numbers."""
+        """Settings that determine the numbers."""
         return {"base": self.base, "by": "factor" if self.columns == self.factors else "section"}
 
     @cached_property
@@ -277,10 +271,11 @@ def design_for(factors: tuple[str, ...], by: str, base: int, seed: int) -> Desig
         Where the base is no power of two, or fewer than two columns are dispersed.
     """
     if base < 8 or base > LARGEST_BASE or base & (base - 1):
-        raise ConfigError(f"--base {base}: a power of two from 8 to {LARGEST_BASE} is wanted")
+        raise ConfigError(f"--base {base}: a power of two from 8 to {LARGEST_BASE} is wanted", code="sobol-base")
     columns = tuple(f.split(".")[0] if by == "section" else f for f in factors)
     if len(set(columns)) < 2:
-        raise ConfigError(f"Sobol indices: at least two dispersed {by}s are wanted; got {', '.join(columns) or 'none'}")
+        message = f"Sobol indices: at least two dispersed {by}s are wanted; got {', '.join(columns) or 'none'}"
+        raise ConfigError(message, code="sobol-columns")
     return Design(factors, columns, base, seed)
 
 
@@ -314,7 +309,8 @@ def indices(design: Design, values: FloatArray, seed: int = 0) -> tuple[pd.DataF
     if kept.shape[1] < 8 or not np.ptp(kept) > 0.0:
         raise GateError(
             f"Sobol indices: {kept.shape[1]} whole points of {design.base} with a spread of "
-            f"{np.ptp(kept) if kept.size else 0.0:g}; more flights, or an output that varies, are wanted"
+            f"{np.ptp(kept) if kept.size else 0.0:g}; more flights, or an output that varies, are wanted",
+            code="sobol-spread",
         )
 
     found = bootstrap(

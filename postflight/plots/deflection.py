@@ -1,108 +1,105 @@
-"""Figures of the deflection estimates; every function returns a `matplotlib.figure.Figure` that needs no display."""
+"""How large was the deflection, and how sure is that? The methods over time, their fusion, what limits it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+from estimators.fusion import Fused
+from estimators.southwell import Limbs
 from flightmodel.checks import FloatArray
+from flightmodel.deflection import DeflectionHistory
+from postflight.deflections import Deflections
+from postflight.plots.overlay import benchmark_and_largest
+from postflight.plots.paper_figures import trajectory_angle, window
+from postflight.plots.style import COLOUR, LABEL, STROKE, TIME, WIDE_BAND, band, in_style, stamp
+from postflight.reconstruction import Reconstruction
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from estimators.camera_fit import OrientedCamera
-    from estimators.fusion import Fused
-    from estimators.southwell import Limbs
-    from estimators.trim import StaticTrim
-    from flightmodel.geometry import BodyMesh
+_MANY_ANSWERS = 400  # of a history, above which its single answers are not marked
 
 
-def figure_camera_overlay(
-    oriented: OrientedCamera,
-    frames: Sequence[NDArray[np.uint8]],
-    times_s: Sequence[float],
-    theta_rad: Sequence[float],
-    plane_lv_rad: Sequence[float],
-    meshes: Mapping[str, BodyMesh] | None = None,
+@in_style
+def figure_summary(
+    flight: Reconstruction,
+    answers: Deflections,
+    truth: tuple[FloatArray, FloatArray] | None = None,
+    *,
+    pictures: bool = True,
 ) -> Figure:
-    """Frames side by side, the virtual camera over the right part of each (seed paper Figure 2.3).
-
-    The dashed yellow line is the smallest row of the virtual camera's edge, the solid one that of the edge found in
-    the frame; where they coincide the hypothesised deflection fits.
+    """The answer on one page: onboard frames above, deflection by every method, angle of attack and pressure below.
 
     Parameters
     ----------
-    oriented : OrientedCamera
-    frames : sequence of (h, w) uint8
-        Benchmark first, then e.g. the frame of the largest deflection.
-    times_s, theta_rad, plane_lv_rad : sequence of float
-        Of each frame.
-    meshes : mapping, optional
-        A user's own, by body; see `estimators.overlay.Overlay`.
+    truth : ((n,) s, (n,) deg), optional
+        Of a synthetic flight, to be given only when everything is estimated.
+    pictures : bool
+        Whether benchmark frame and frame of the largest deflection stand on top, where the camera answered.
     """
-    from matplotlib.figure import Figure
-
-    from estimators.edge import find_horizon
-    from estimators.overlay import Overlay, horizon_row
-
-    figure = Figure(figsize=(6.0 * len(frames), 4.4), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, len(frames)))
-    view, overlay = oriented.view, Overlay(oriented.view, meshes or {})
-    for k, axis in enumerate(axes):
-        theta, plane = float(theta_rad[k]), float(plane_lv_rad[k])
-        axis.imshow(overlay.blended(np.asarray(frames[k]), theta, plane), interpolation="nearest")
-        axis.axhline(horizon_row(view, theta, plane), color="yellow", linestyle="--", linewidth=1.0)
-        found = find_horizon(np.asarray(frames[k]), oriented.lines, view.camera.size_px)
-        if found.is_usable:
-            axis.axhline(found.lowest_row_px, color="yellow", linewidth=1.4)
-        bent = f"{np.rad2deg(theta):.1f} deg in plane {np.rad2deg(plane):.0f} deg" if theta else "taken as not bent"
-        axis.set_title(f"({chr(97 + k)}) {times_s[k]:.2f} s: {bent}", fontsize=10)
-        axis.set_axis_off()
+    pictures = pictures and "camera" in answers.histories
+    figure = Figure(figsize=(9.0, 9.0 if pictures else 6.4))
+    place = figure
+    if pictures:
+        top, place = list(np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 1.9))))
+        picture = top.subplots()
+        strip, caption = benchmark_and_largest(flight.telemetry, answers.histories["camera"])
+        picture.imshow(strip)
+        picture.set_title(caption, fontsize=8)
+        picture.axis("off")
+    upper, lower = place.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
+    _methods(upper, answers.histories, truth)
+    upper.axvline(flight.peak_s, color=COLOUR["limit"], lw=0.8, ls=":")
+    largest = [np.nanmax(np.rad2deg(h.theta_rad)) for h in answers.histories.values() if np.isfinite(h.theta_rad).any()]
+    top_deg = 1.25 * float(max(largest, default=5.0))
+    upper.set(ylabel="deflection of aeroshell\nagainst centerbody (deg)", xlim=window(flight), ylim=(0, top_deg))
+    upper.legend(title="bands: 1 sd; dotted: peak dynamic pressure")
+    trajectory_angle(lower, flight, "centerbody total angle of attack, 1 sd")
+    lower.set(ylabel="angle of attack (deg)", xlabel=TIME, ylim=(0, 16))
+    lower.legend()
+    pressure = lower.twinx()
+    pressure.plot(flight.air.time_s, flight.air.dynamic_pressure_pa, color=COLOUR["prior"], lw=1)
+    pressure.set(ylabel="dynamic pressure (Pa), grey", ylim=(0, None))
+    pressure.grid(visible=False)
+    figure.suptitle("Deflection of the aeroshell by each method")
+    stamp(figure, flight.telemetry)
     return figure
 
 
-def figure_static_trim(static: StaticTrim, offsets_m: Sequence[float], joint_nmprad: float, title: str) -> Figure:
-    """Trim angle over joint stiffness for several offsets, with the divergence limit (seed paper Figure 2.9)."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
-    axis = figure.subplots()
-    stiffness = np.geomspace(2e3, 1e5, 600)
-    axis.set_xlim(2e3, 1e5)
-    for offset in offsets_m:
-        axis.semilogx(stiffness, np.rad2deg(static.trim_angle(stiffness, offset)), label=f"{100 * offset:.2f} cm")
-    axis.axvline(static.critical_stiffness_nmprad, color="black", linestyle="--", linewidth=1.0, label="divergence")
-    axis.axvline(joint_nmprad, color="grey", linewidth=1.0, label="the vehicle's joint")
-    margin = static.stiffness_for_growth(0.25)
-    axis.axvline(margin, color="grey", linestyle=":", linewidth=1.0, label="25 % growth")
-    axis.set(xlabel="joint stiffness, N m/rad", ylabel="trim angle of attack of the shell, deg", ylim=(0.0, 20.0))
-    axis.set_title(title, fontsize=10)
-    axis.grid(alpha=0.3, which="both")
-    axis.legend(title="initial c.g. offset", fontsize=8)
-    return figure
+def _methods(
+    ax: Axes, histories: dict[str, DeflectionHistory], truth: tuple[FloatArray, FloatArray] | None = None
+) -> None:
+    """Deflection over time, each method with a band of one standard deviation; truth as (s, deg) where known."""
+    for method, history in histories.items():
+        theta, sd = np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)
+        mark = "" if len(history.time_s) > _MANY_ANSWERS else "."
+        style: dict[str, Any] = {"color": COLOUR[method], "ls": STROKE[method], "marker": mark, "ms": 3}
+        ax.plot(history.time_s, theta, label=LABEL[method], **style)
+        band(ax, history.time_s, theta, sd, COLOUR[method], alpha=WIDE_BAND)
+    if truth is not None:
+        ax.plot(*truth, color=COLOUR["truth"], lw=0.8, label="truth (synthetic)")
 
 
+@in_style
 def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
-    """Fused angle and plane, the Southwell plot, and what the methods together say of what they lean on."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 7.5), layout="constrained")
+    """Fused angle and plane, the Southwell plot, and the estimate of each input the methods depend on."""
+    figure = Figure(figsize=(11.0, 7.5))
     (angle, line), (plane, inputs) = figure.subplots(2, 2)
     history = fused.history
-    bent = history.theta_sd_rad < history.theta_rad
-    _band(angle, history.time_s, np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad))
-    angle.set(ylabel="deflection, deg", xlabel="time, s", ylim=(0.0, None))
-    covariance = history.covariance
-    assert covariance is not None
-    plane_sd = np.rad2deg(np.sqrt(covariance[:, 1, 1]))
-    clock = np.where(bent, np.rad2deg(history.plane_lv_rad), np.nan)
-    _band(plane, history.time_s, clock, plane_sd)
-    plane.set(ylabel="plane, deg LV (where bent by more than its sd)", xlabel="time, s", ylim=(0.0, 360.0))
+    theta, sd = np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)
+    assert history.covariance is not None
+    plane_sd = np.rad2deg(np.sqrt(history.covariance[:, 1, 1]))
+    clock = np.where(sd < theta, np.rad2deg(history.plane_lv_rad), np.nan)
+    for ax, values, spread, label, top in (
+        (angle, theta, sd, "deflection (deg)", None),
+        (plane, clock, plane_sd, "plane (deg LV), where deflection > its sd", 360.0),
+    ):
+        ax.plot(history.time_s, values, color=COLOUR["fused"], label="fused")
+        band(ax, history.time_s, values, spread, COLOUR["fused"], label="1 sd")
+        ax.set(ylabel=label, xlabel=TIME, ylim=(0.0, top))
+        ax.legend()
     if limbs is None:
         line.set_axis_off()
         line.text(0.5, 0.5, "no Southwell line", ha="center", transform=line.transAxes)
@@ -111,67 +108,58 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
     names = list(fused.inputs)
     mean = [fused.inputs[n][0][0] for n in names]
     left = [np.sqrt(fused.inputs[n][1][0, 0]) for n in names]
-    inputs.errorbar(mean, range(len(names)), xerr=left, fmt="o", color="#CC79A7", capsize=3)
-    inputs.axvspan(-1.0, 1.0, color="grey", alpha=0.15)
+    inputs.errorbar(mean, range(len(names)), xerr=left, fmt="o", color=COLOUR["fused"], capsize=3)
+    inputs.axvspan(-1.0, 1.0, color=COLOUR["prior_band"], lw=0, zorder=0)
     inputs.set_yticks(range(len(names)), names, fontsize=8)
-    inputs.set(xlabel="found, in stated standard deviations (grey: stated)")
-    for axis in (angle, plane, line, inputs):
-        axis.grid(alpha=0.3)
+    inputs.set(xlabel="estimate and 1 sd, in a priori standard deviations (grey: a priori)")
     figure.suptitle(fill(words, 130), fontsize=10)
     return figure
 
 
-def figure_told_apart(fused: Fused, singular_values: FloatArray) -> Figure:
-    """Show what the readings cannot tell apart: singular values, and what is left of correlation.
+def _southwell(ax: Axes, limbs: Limbs) -> None:
+    both = limbs.both
+    clear = both.theta_rad > 2.0 * both.theta_sd_rad
+    q, theta, sd = both.pressure_pa[clear], both.theta_rad[clear], both.theta_sd_rad[clear]
+    error = np.rad2deg(sd) / np.rad2deg(theta) ** 2
+    ax.errorbar(1e3 / q, 1.0 / np.rad2deg(theta), yerr=error, fmt="o", color=COLOUR["measured"])
+    over = np.linspace(1e3 / both.critical_pressure_pa, 1e3 / q.min() if len(q) else 5.0, 200)[1:]
+    for name, limb, colour in (
+        ("both", both, COLOUR["measured"]),
+        ("rise", limbs.rise, COLOUR["estimate"]),
+        ("fall", limbs.fall, COLOUR["second"]),
+    ):
+        if limb is not None:
+            ax.plot(over, 1.0 / np.rad2deg(limb.deflection(1e3 / over)), color=colour, label=name, lw=1.0)
+    low, high = both.critical_interval_pa
+    ax.set(xlabel="1000 / dynamic pressure (1/Pa)", ylabel="1 / deflection (1/deg)", xlim=(0.0, None), ylim=(0.0, None))
+    ax.set_title(f"Southwell: critical pressure {both.critical_pressure_pa:.0f} Pa (90 %: {low:.0f} to {high:.0f})")
+    ax.legend()
 
-    A direction of the inputs of singular value ``s`` keeps ``1 / (1 + s^2)`` of the variance it was told with.
+
+@in_style
+def figure_correlation(fused: Fused, singular_values: FloatArray) -> Figure:
+    """Which directions of the inputs the measurements determine, and which inputs stay correlated.
+
+    A direction of the inputs of singular value ``s`` keeps ``1 / (1 + s^2)`` of its a priori variance.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 6.0), layout="constrained")
+    figure = Figure(figsize=(11.0, 6.0))
     values, table = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
-    told = int(np.sum(singular_values > 1.0))
-    values.semilogy(np.arange(1, len(singular_values) + 1), singular_values, ".", color="#CC79A7")
-    values.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
+    better = int(np.sum(singular_values > 1.0))
+    values.semilogy(np.arange(1, len(singular_values) + 1), singular_values, ".", color=COLOUR["fused"])
+    values.axhline(1.0, color=COLOUR["limit"], lw=0.8, ls="--")
     values.set(xlabel="direction of the inputs", ylabel="singular value", ylim=(1e-3, None))
     values.set_title(
-        f"of {told} of {len(singular_values)} directions the readings say\nmore than was told before (above the line)",
-        fontsize=10,
+        f"information gain: {better} of {len(singular_values)} parameter directions\n"
+        "are better determined than a priori (above the line)"
     )
-    values.grid(alpha=0.3)
     image = table.imshow(fused.correlation, cmap="PuOr", vmin=-1.0, vmax=1.0)
+    table.grid(visible=False)
     names = range(len(fused.names))
     table.set_xticks(names, fused.names, rotation=90, fontsize=7)
     table.set_yticks(names, fused.names, fontsize=7)
-    apart = np.abs(np.triu(fused.correlation, 1))
-    i, j = np.unravel_index(np.argmax(apart), apart.shape)
-    least = f"least told apart: {fused.names[i]} and {fused.names[j]} ({fused.correlation[i, j]:+.2f})"
-    table.set_title(f"correlation given all readings, at {fused.at_s:.1f} s\n{least}", fontsize=10)
+    size = np.abs(np.triu(fused.correlation, 1))
+    i, j = np.unravel_index(np.argmax(size), size.shape)
+    most = f"largest: {fused.names[i]} and {fused.names[j]} ({fused.correlation[i, j]:+.2f})"
+    table.set_title(f"correlation given all readings, at {fused.at_s:.1f} s\n{most}")
     figure.colorbar(image, ax=table, shrink=0.7)
     return figure
-
-
-def _band(axis: Axes, time_s: FloatArray, value: FloatArray, sd: FloatArray) -> None:
-    axis.plot(time_s, value, color="#CC79A7")
-    axis.fill_between(time_s, value - 2.0 * sd, value + 2.0 * sd, color="#CC79A7", alpha=0.2, label="2 sd")
-
-
-def _southwell(axis: Axes, limbs: Limbs) -> None:
-    both = limbs.both
-    seen = both.theta_rad > 2.0 * both.theta_sd_rad
-    q, theta, sd = both.pressure_pa[seen], both.theta_rad[seen], both.theta_sd_rad[seen]
-    axis.errorbar(
-        1e3 / q, 1.0 / np.rad2deg(theta), yerr=np.rad2deg(sd) / np.rad2deg(theta) ** 2, fmt="o", color="black"
-    )
-    over = np.linspace(1e3 / both.critical_pressure_pa, 1e3 / q.min() if len(q) else 5.0, 200)[1:]
-    for name, limb, colour in (
-        ("both", both, "black"),
-        ("rise", limbs.rise, "#0072B2"),
-        ("fall", limbs.fall, "#D55E00"),
-    ):
-        if limb is not None:
-            axis.plot(over, 1.0 / np.rad2deg(limb.deflection(1e3 / over)), color=colour, label=name, linewidth=1.0)
-    low, high = both.critical_interval_pa
-    axis.set(xlabel="1000 / dynamic pressure, 1/Pa", ylabel="1 / deflection, 1/deg", xlim=(0.0, None), ylim=(0.0, None))
-    axis.set_title(f"diverges at {both.critical_pressure_pa:.0f} Pa (90 %: {low:.0f} to {high:.0f})", fontsize=10)
-    axis.legend(fontsize=8)

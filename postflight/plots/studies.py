@@ -1,81 +1,131 @@
-"""Figures of the paper's studies: 1.3 before and after the joint is made flexible, Table 3.1, 3.1, 3.2 and 3.3."""
+"""How do many flights scatter? Monte Carlo bands, Sobol indices, and the paper's studies of the joint.
+
+The paper's (AIAA 2011-2571): Table 3.1 as a figure, Figures 3.1 to 3.3, and Figure 1.3 before and after the joint is
+made flexible.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
-from flightmodel.checks import FloatArray
-from postflight.plots.ensembles import words_in_corner
+from postflight.plots.style import COLOUR, MANY, STROKES, TIME, in_style, note, percentiles
 from postflight.studies.joints import JointStudy
 from postflight.studies.preflight import Bounds
 
-# distinct in hue and, with their strokes, in grey (Okabe and Ito)
-COLOURS = ("#000000", "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
-STROKES = ((0, (4, 2)), "-", "-", (0, (5, 1)), "-", (0, (1, 1)), (0, (3, 1, 1, 1)))
-BLUE, ORANGE = "#0072B2", "#E69F00"
-HIGHEST = {"alpha_total_deg": 25.0, "normal_g": 2.5}
+_MOST_BARS = 15
+_HIGHEST = {"alpha_total_deg": 25.0, "normal_g": 2.5}  # shown of a joint study; a tumble goes beyond
+_LABEL = {
+    "alpha_total_deg": "centerbody total\nangle of attack (deg)",
+    "alpha_shell_deg": "aeroshell total\nangle of attack (deg)",
+    "deflection_deg": "deflection (deg)",
+    "normal_g": "centerbody normal\nacceleration (g)",
+    "axial_g": "axial deceleration (g)",
+    "dynamic_pressure_pa": "dynamic pressure (Pa)",
+    "mach": "Mach number",
+    "altitude_m": "altitude (m)",
+    "rate_degps": "lateral rate (deg/s)",
+}
 
 
-def _tidy(ax: Axes) -> None:
-    ax.grid(alpha=0.3)
-    ax.spines[["top", "right"]].set_visible(False)
+@in_style
+def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
+    """Every history with its 2.3, 50 and 97.7 percentiles."""
+    names = list(dict.fromkeys(bands["history"]))
+    figure = Figure(figsize=(7.2, 2.2 * len(names) + 0.8))
+    axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, name in zip(axes, names, strict=True):
+        rows = bands[bands["history"] == name]
+        percentiles(ax, *(rows[c].to_numpy() for c in ("time_s", "p2.3", "p50", "p97.7")))
+        ax.set_ylabel(_LABEL[name])
+        ax.margins(x=0)
+    axes[0].legend()
+    axes[-1].set_xlabel(TIME)
+    figure.suptitle(title, fontsize=10)
+    note(figure, synthetic)
+    return figure
 
 
+@in_style
+def figure_sobol(table: pd.DataFrame, title: str, synthetic: str) -> Figure:
+    """First-order and total indices with their intervals, the largest total on top."""
+    left_out = max(0, len(table) - _MOST_BARS)
+    table = table.sort_values("total", kind="stable").tail(_MOST_BARS)
+    place = np.arange(len(table))
+    figure = Figure(figsize=(7.2, 0.36 * len(table) + 1.6))
+    ax = figure.subplots()
+    for k, (name, label, colour) in enumerate(
+        (("first", "first order: alone", COLOUR["second"]), ("total", "total: with others", COLOUR["estimate"]))
+    ):
+        at = place + 0.2 * (2 * k - 1)
+        interval = [np.abs(table[f"{name}_{end}_95"] - table[name]) for end in ("low", "high")]
+        ax.barh(at, table[name], 0.36, color=colour, label=label)
+        ax.errorbar(table[name], at, xerr=interval, fmt="none", ecolor=COLOUR["limit"], lw=0.9)
+    ax.set_yticks(place, table["factor"], fontsize=8)
+    ax.axvline(0.0, color=COLOUR["zero"], lw=0.8)
+    more = f"; {left_out} factors with smaller totals are not shown" if left_out else ""
+    ax.set_xlabel(f"share of the variance (bars) and 95 % interval (lines){more}")
+    ax.grid(visible=False, axis="y")
+    ax.legend(loc="lower right")
+    figure.suptitle(title, fontsize=10)
+    note(figure, synthetic)
+    return figure
+
+
+@in_style
 def figure_table_3_1(table: pd.DataFrame, synthetic: str) -> Figure:
     """Stiffness and damping against frequency and damping ratio: the paper's as points, the equations as lines."""
-    figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+    figure = Figure(figsize=(7.2, 3.6))
     left, right = figure.subplots(1, 2)
     springs, dampers = table[table["quantity"] == "K"], table[table["study"] == "damping"]
     for ax, rows, x, y, label in (
         (left, springs, "frequency_hz", "bending stiffness (N m/rad)", "free-free frequency (Hz)"),
         (right, dampers, "damping_percent", "damping (N m s/rad)", "share of critical at 2.5 Hz (%)"),
     ):
-        ax.plot(rows[x], rows["equation"], color=BLUE, lw=1.4, label="eqs. [7], [8], reduced inertia 17.569 kg m²")
-        ax.plot(rows[x], rows["paper"].astype(float), "o", ms=5, mfc="none", color="black", label="paper, Table 3.1")
-        ax.plot(rows[x], rows["vehicle"], color=ORANGE, lw=1.0, ls="--", label="with the vehicle's own inertias")
+        equation = "eqs. [7], [8], reduced inertia 17.569 kg m²"
+        ax.plot(rows[x], rows["equation"], color=COLOUR["estimate"], label=equation)
+        paper = rows["paper"].astype(float)
+        ax.plot(rows[x], paper, "o", ms=5, mfc="none", color=COLOUR["paper"], label="paper, Table 3.1")
+        ax.plot(rows[x], rows["vehicle"], color=COLOUR["nominal"], lw=1.0, ls="--", label="the vehicle's own inertias")
         ax.set(xlabel=label, ylabel=y)
-        _tidy(ax)
     right.set(xscale="log", yscale="log", xticks=[0.5, 1, 2.5, 5, 10, 20], yticks=[3, 10, 30, 100])
     for axis in (right.xaxis, right.yaxis):
         axis.set_major_formatter(ScalarFormatter())
         axis.set_minor_formatter("")
-    left.legend(fontsize=7, frameon=False, loc="upper left")
-    figure.suptitle("Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)", fontsize=10)
-    words_in_corner(figure, synthetic)
+    left.legend(fontsize=7)
+    figure.suptitle("Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)")
+    note(figure, synthetic)
     return figure
 
 
+@in_style
 def figure_joints(study: JointStudy, quantity: str, label: str, title: str, synthetic: str) -> Figure:
     """One quantity of every flight of a study over time, up to a tumble; the legend names those beyond the axis."""
-    figure = Figure(figsize=(7.2, 4.4), layout="constrained")
+    figure = Figure(figsize=(7.2, 4.4))
     ax = figure.subplots()
     largest = 0.0
-    highest, beyond = HIGHEST[quantity], []
+    highest, beyond = _HIGHEST[quantity], []
     for k, flight in enumerate(study.flights):
         tumbling = flight.alpha_total_deg > 90.0
         shown = int(np.argmax(tumbling)) if tumbling.any() else len(tumbling)
         values = getattr(flight, quantity)[:shown]
         name = f"{flight.label}, tumbles at {flight.time_s[shown]:.1f} s" if tumbling.any() else flight.label
-        ax.plot(flight.time_s[:shown], values, color=COLOURS[k], ls=STROKES[k], lw=1.6 if k == 0 else 1.2, label=name)
+        ax.plot(flight.time_s[:shown], values, color=MANY[k], ls=STROKES[k], lw=1.6 if k == 0 else 1.2, label=name)
         largest = max(largest, float(np.max(values)))
         if np.max(values) > highest:
             beyond.append(flight.label)
-    ax.axvline(study.peak_s, color="0.5", lw=0.8, ls=":")
-    ax.set(xlabel="time after launch (s); dotted: peak dynamic pressure", ylabel=label)
-    ax.set_ylim(0.0, min(highest, 1.15 * largest))
+    ax.axvline(study.peak_s, color=COLOUR["limit"], lw=0.8, ls=":")
+    ax.set(xlabel=f"{TIME}; dotted: peak dynamic pressure", ylabel=label, ylim=(0.0, min(highest, 1.15 * largest)))
     ax.set_xlim(study.flights[0].time_s[0], study.flights[0].time_s[-1])
-    _tidy(ax)
-    note = f"beyond the axis: {', '.join(beyond)}" if beyond else None
-    ax.legend(fontsize=8, frameon=False, loc="upper left", title=note, title_fontsize=7)
-    figure.suptitle(title, fontsize=10)
-    words_in_corner(figure, synthetic)
+    ax.legend(title=f"beyond the axis: {', '.join(beyond)}" if beyond else None)
+    figure.suptitle(title)
+    note(figure, synthetic)
     return figure
 
 
+@in_style
 def figure_preflight(
     rigid: Bounds, flexible: Bounds, flight: pd.DataFrame, window: tuple[float, float], words: str, synthetic: str
 ) -> Figure:
@@ -90,35 +140,24 @@ def figure_preflight(
     words : str
         Which share of the pulse is inside, under the title.
     """
-    figure = Figure(figsize=(9.0, 6.4), layout="constrained")
+    figure = Figure(figsize=(9.0, 6.4))
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
-    for column, (bounds, name) in enumerate(((rigid, "joint locked"), (flexible, "flexible joint"))):
-        for row, (quantity, band, nominal, label) in enumerate(
-            (
-                ("alpha_total_deg", bounds.alpha_total_deg, bounds.nominal_alpha_deg, "total angle of attack (deg)"),
-                ("normal_g", bounds.normal_g, bounds.nominal_normal_g, "normal acceleration (g)"),
-            )
-        ):
-            ax = axes[row, column]
-            _band(ax, bounds.time_s, band, nominal)
-            ax.plot(flight["time_s"], flight[quantity], color="black", lw=1.2, label="flight, reconstructed")
-            _tidy(ax)
-            if column == 0:
-                ax.set_ylabel(label)
-        axes[0, column].set_title(f"{name}: {bounds.flights} flights", fontsize=9)
-        axes[1, column].set_xlabel("time after launch (s)")
     shown = (flight["time_s"] >= window[0]) & (flight["time_s"] <= window[1])
-    for row, quantity in enumerate(("alpha_total_deg", "normal_g")):
-        top = float(flight.loc[shown, quantity].max())
-        axes[row, 0].set_ylim(0.0, 2.2 * top)
+    rows = (
+        ("alpha_total_deg", "nominal_alpha_deg", "total angle of attack (deg)"),
+        ("normal_g", "nominal_normal_g", "normal acceleration (g)"),
+    )
+    for column, (bounds, name) in enumerate(((rigid, "joint locked"), (flexible, "flexible joint"))):
+        for ax, (quantity, nominal, _) in zip(axes[:, column], rows, strict=True):
+            percentiles(ax, bounds.time_s, *getattr(bounds, quantity))
+            ax.plot(bounds.time_s, getattr(bounds, nominal), color=COLOUR["nominal"], lw=1.0, ls="--", label="nominal")
+            ax.plot(flight["time_s"], flight[quantity], color=COLOUR["measured"], label="flight, reconstructed")
+        axes[0, column].set_title(f"{name}: {bounds.flights} flights")
+        axes[1, column].set_xlabel(TIME)
+    for ax, (quantity, _, label) in zip(axes[:, 0], rows, strict=True):
+        ax.set(ylabel=label, ylim=(0.0, 2.2 * float(flight.loc[shown, quantity].max())))
     axes[0, 0].set_xlim(*window)
-    axes[0, 0].legend(fontsize=8, frameon=False, loc="upper left")
+    axes[0, 0].legend()
     figure.suptitle(f"Flight against bounds of its own entry (AIAA 2011-2571, Figure 1.3)\n{words}", fontsize=10)
-    words_in_corner(figure, synthetic)
+    note(figure, synthetic)
     return figure
-
-
-def _band(ax: Axes, time_s: FloatArray, band: FloatArray, nominal: FloatArray) -> None:
-    ax.fill_between(time_s, band[0], band[2], color=BLUE, alpha=0.25, lw=0, label="2.3 to 97.7 %")
-    ax.plot(time_s, band[1], color=BLUE, lw=1.2, label="50 %")
-    ax.plot(time_s, nominal, color="#D55E00", lw=1.0, ls="--", label="nominal")

@@ -1,4 +1,4 @@
-"""Figures of the trajectory as a product: the air of the day, residuals, filter against smoother, angles with bands."""
+"""How good is the reconstructed trajectory? Path, residuals, filter and smoother, air, attitude, sensitivity."""
 
 from __future__ import annotations
 
@@ -11,68 +11,203 @@ from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import difference, resample
 from postflight.attitude import AttitudeCheck
-from postflight.plots.paper_figures import stamp
+from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, in_style, limits, residual_unit, stamp
 from postflight.reconstruction import Reconstruction
 from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.atmosphere import ReconstructedAir
 
-LEAST_LOST = 1e-3  # of the filter's variance that the smoother takes away, for a difference to be drawn
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "0.55"
+_LEAST_LOST = 1e-3  # of the filter's variance that the smoother takes away, for a difference to be drawn
 
 
-def _clean(*axes: Axes) -> None:
-    for ax in axes:
-        ax.grid(alpha=0.3)
-        ax.spines[["top", "right"]].set_visible(False)
-
-
-def _bands(
-    ax: Axes, height_km: FloatArray, middle: FloatArray, sd: FloatArray, prior: FloatArray, prior_sd: FloatArray
-) -> None:
-    """Prior and posterior along altitude, one sd and (pale) three of the posterior."""
-    ax.fill_betweenx(height_km, prior - prior_sd, prior + prior_sd, color="0.87", lw=0, label="sounding, 1 sd")
-    ax.plot(prior, height_km, color=GREY, lw=1, ls=":")
-    ax.fill_betweenx(height_km, middle - sd, middle + sd, color=BLUE, alpha=0.25, lw=0, label="reconstructed, 1 sd")
-    ax.plot(middle, height_km, color=BLUE, lw=1.4)
-
-
-def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
-    """Density ratio and winds along altitude with prior and posterior bands; measured over predicted drag."""
-    figure = Figure(figsize=(9.6, 6.6), layout="constrained")
-    upper, lower = list(np.asarray(figure.subfigures(2, 1, height_ratios=(1.7, 1.0))))
-    axes = upper.subplots(1, 3, sharey=True)
-    ratio_ax = lower.subplots()
-    _clean(*axes, ratio_ax)
-    p = day.profile
-    z = p["altitude_m"].to_numpy() / 1000.0
-    wind = profile_from_sounding(flight.telemetry.sounding).at(1000.0 * z).wind_ned_mps
-    column = {name: p[name].to_numpy() for name in p}
-    one = np.ones(len(z))
-    prior_wind = column["wind_prior_sd_mps"]
-    _bands(axes[0], z, column["density_ratio"], column["density_ratio_sd"], one, column["density_ratio_prior_sd"])
-    for ax, k, way in ((axes[1], 0, "north"), (axes[2], 1, "east")):
-        _bands(
-            ax, z, wind[:, k] + column[f"wind_{way}_change_mps"], column[f"wind_{way}_sd_mps"], wind[:, k], prior_wind
-        )
-        ax.set_xlabel(f"wind towards {way} (m/s)")
-    axes[0].set(xlabel="density / sounding's density", ylabel="altitude (km)")
-    axes[1].legend(fontsize=8, frameon=False, loc="lower left")
-    d = day.drag
-    mach, ratio, prior_sd = (d[name].to_numpy() for name in ("mach", "ratio", "ratio_prior_sd"))
-    order = np.argsort(mach)
-    ratio_ax.fill_between(mach[order], 1.0 - prior_sd[order], 1.0 + prior_sd[order], color="0.87", lw=0,
-                          label="density and C_A before the flight, 1 sd")  # fmt: skip
-    ratio_ax.axhline(1.0, color=GREY, lw=1, ls=":")
-    ratio_ax.plot(mach, ratio, ".", ms=3, color=BLUE, label="axial force, measured / predicted (0.4 s means)")
-    low, high = np.percentile(ratio, [1, 99])
-    room = max(1.3 * np.abs(np.array([low, high]) - 1.0).max(), 1.5 * float(np.median(prior_sd)))
-    ratio_ax.set(xlabel="Mach number", ylabel="drag ratio", ylim=(1.0 - room, 1.0 + room))
-    ratio_ax.legend(fontsize=8, frameon=False, loc="lower right", ncols=2)
-    figure.suptitle("Air of the day: from the deceleration along the reconstructed trajectory", fontsize=11)
+@in_style
+def figure_flown(flight: Reconstruction) -> Figure:
+    """Altitude, speed and their standard deviations: the picture of a flight without a vehicle file."""
+    figure = Figure(figsize=(7.2, 7.0))
+    high, fast, sure = figure.subplots(3, 1, sharex=True)
+    bet, air = flight.solution.smoothed, flight.air
+    high.plot(air.time_s, air.altitude_m / 1e3, color=COLOUR["estimate"])
+    high.set_ylabel("altitude (km)")
+    fast.plot(air.time_s, np.linalg.norm(bet.velocity_ecef_mps, axis=1), color=COLOUR["estimate"])
+    fast.set(ylabel="ground speed (m/s)", ylim=(0, None))
+    for part, colour, label in (
+        (slice(0, 3), COLOUR["estimate"], "position (m)"),
+        (slice(3, 6), COLOUR["second"], "velocity (m/s)"),
+    ):
+        sure.semilogy(air.time_s, np.linalg.norm(bet.sd()[:, part], axis=1), color=colour, label=label)
+    sure.set(ylabel="standard deviation", xlabel=TIME)
+    sure.legend(loc="best")
+    found = [f for f in flight.solution.findings if f.source == "motion"]
+    for ax in (high, fast, sure):
+        for f in found:
+            ax.axvspan(f.start_s, f.end_s, color=COLOUR["flagged"], alpha=0.3, lw=0)
+    figure.suptitle("Reconstructed flight" + ("; shaded: unmodelled acceleration" if found else ""))
     stamp(figure, flight.telemetry)
     return figure
 
 
+@in_style
+def figure_residuals(flight: Reconstruction) -> Figure:
+    """Innovations of each source and component that were tried, with the predicted 3-sd lines; edited points marked."""
+    table = flight.solution.residuals
+    pairs = list(table[table["used"]].groupby(["source", "component"], sort=False))
+    figure = Figure(figsize=(7.2, 1.5 * len(pairs) + 0.8))
+    axes = figure.subplots(len(pairs), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, ((source, component), rows) in zip(axes, pairs, strict=True):
+        scale, unit = residual_unit(component)
+        good = rows["accepted"].to_numpy(dtype=bool)
+        t, r = rows["time_s"].to_numpy(), scale * rows["residual"].to_numpy()
+        sd = scale * rows["predicted_sd"].to_numpy()
+        ax.plot(t[good], r[good], ".", ms=1.5 if len(t) > 500 else 3, color=COLOUR["estimate"])
+        limit = 6.0 * float(np.median(sd))
+        _edited(ax, t[~good], r[~good], limit)
+        if not good.all():
+            count = f"{np.count_nonzero(~good)} of {len(good)} edited"
+            ax.set_title(count, fontsize=7, color=COLOUR["edited"], loc="right", pad=2)
+        for sign in (-3, 3):
+            ax.plot(t, sign * sd, color=COLOUR["limit"], lw=0.7)
+        ax.set_ylabel(f"{source}\n{component} ({unit})", fontsize=7)
+        ax.set_ylim(-limit, limit)
+    axes[-1].set_xlabel(TIME)
+    figure.suptitle(
+        "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside", fontsize=10
+    )
+    stamp(figure, flight.telemetry)
+    return figure
+
+
+def _edited(ax: Axes, time_s: FloatArray, residual: FloatArray, limit: float) -> None:
+    """Crosses, or arrows at the edge where a residual lies beyond it."""
+    shown = np.clip(residual, -0.95 * limit, 0.95 * limit)
+    beyond = np.abs(residual) > 0.95 * limit
+    for rows, mark in ((~beyond, "x"), (beyond & (shown > 0.0), "^"), (beyond & (shown < 0.0), "v")):
+        ax.plot(time_s[rows], shown[rows], mark, ms=4, color=COLOUR["edited"])
+
+
+@in_style
+def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
+    """Standard deviations of filter and smoother, and their difference over its own (McReynolds)."""
+    bet = flight.solution
+    filtered, smoothed = bet.filtered, bet.smoothed
+    assert filtered.covariance is not None
+    assert smoothed.covariance is not None
+    groups = [("position", "m", 1.0), ("velocity", "m/s", 1.0), ("attitude", "deg", 180.0 / np.pi)]
+    groups = groups if flight.has_attitude else groups[:2]
+    figure = Figure(figsize=(10.0, 0.8 + 2.2 * len(groups)))
+    grid = figure.subplots(len(groups), 2, sharex=True)
+    t, off = smoothed.time_s, difference(filtered, smoothed)
+    var_filter, var_smoother = (np.diagonal(p, axis1=1, axis2=2) for p in (filtered.covariance, smoothed.covariance))
+    lost = var_filter - var_smoother
+    # towards the end both are the same, and the ratio of nothing to nothing
+    sure = lost > _LEAST_LOST * var_filter
+    ratio = np.where(sure, off / np.sqrt(np.where(sure, lost, 1.0)), np.nan)
+    for k, ((name, unit, scale), (spread, apart)) in enumerate(zip(groups, grid, strict=True)):
+        part = slice(3 * k, 3 * k + 3)
+        for var, label in ((var_filter, "filter"), (var_smoother, "smoother")):
+            spread.semilogy(t, scale * np.sqrt(var[:, part].sum(axis=1)), color=COLOUR[label], label=label)
+        spread.set_ylabel(f"{name}, sd ({unit})")
+        for column, (axis, colour) in zip(ratio[:, part].T, AXES.items(), strict=True):
+            apart.plot(t, column, color=colour, lw=0.8, label=axis)
+        limits(apart)
+        far = 4.5
+        if np.isfinite(ratio[:, part]).any():
+            far = min(max(far, 1.1 * float(np.nanpercentile(np.abs(ratio[:, part]), 99.5))), 30.0)
+        apart.set_ylim(-far, far)
+        apart.set_ylabel(f"difference over\nits sd ({'body' if name == 'attitude' else 'ECEF'})")
+        apart.legend(ncols=3, loc="upper right")
+    grid[0, 0].legend(ncols=2, loc="upper right")
+    for ax in grid[-1]:
+        ax.set_xlabel(TIME)
+    figure.suptitle("Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)")
+    stamp(figure, flight.telemetry)
+    return figure
+
+
+@in_style
+def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
+    """As-flown density and wind along altitude with prior and posterior bands; measured over predicted drag."""
+    figure = Figure(figsize=(9.6, 6.6))
+    upper, lower = list(np.asarray(figure.subfigures(2, 1, height_ratios=(1.7, 1.0))))
+    axes = upper.subplots(1, 3, sharey=True)
+    column = {name: day.profile[name].to_numpy() for name in day.profile}
+    height_km = column["altitude_m"] / 1000.0
+    wind = profile_from_sounding(flight.telemetry.sounding).at(1000.0 * height_km).wind_ned_mps
+    one = np.ones(len(height_km))
+    ratio_sd, prior_ratio_sd, prior_wind_sd = (
+        column[n] for n in ("density_ratio_sd", "density_ratio_prior_sd", "wind_prior_sd_mps")
+    )
+    _along_height(axes[0], height_km, (column["density_ratio"], ratio_sd), (one, prior_ratio_sd))
+    for k, (ax, way) in enumerate(zip(axes[1:], ("north", "east"), strict=True)):
+        found = wind[:, k] + column[f"wind_{way}_change_mps"], column[f"wind_{way}_sd_mps"]
+        _along_height(ax, height_km, found, (wind[:, k], prior_wind_sd))
+        ax.set_xlabel(f"wind velocity, {way} (m/s)")
+    axes[0].set(xlabel="density / sounding's density", ylabel="altitude (km)")
+    axes[1].legend(loc="lower left")
+    _drag(lower.subplots(), day.drag)
+    figure.suptitle("As-flown atmosphere from the deceleration along the reconstructed trajectory")
+    stamp(figure, flight.telemetry)
+    return figure
+
+
+def _along_height(
+    ax: Axes, height_km: FloatArray, found: tuple[FloatArray, FloatArray], prior: tuple[FloatArray, FloatArray]
+) -> None:
+    """Values and standard deviations (n,), prior and posterior, along altitude."""
+    for (middle, sd), colour, edge, alpha, stroke, label in (
+        (prior, COLOUR["prior_band"], COLOUR["prior"], 1.0, ":", "sounding, 1 sd"),
+        (found, COLOUR["estimate"], COLOUR["estimate"], BAND, "-", "reconstructed, 1 sd"),
+    ):
+        ax.fill_betweenx(height_km, middle - sd, middle + sd, color=colour, alpha=alpha, lw=0, label=label)
+        ax.plot(middle, height_km, color=edge, ls=stroke)
+
+
+def _drag(ax: Axes, drag: pd.DataFrame) -> None:
+    """Axial force, measured over predicted, along Mach number."""
+    mach, ratio, prior_sd = (drag[name].to_numpy() for name in ("mach", "ratio", "ratio_prior_sd"))
+    order = np.argsort(mach)
+    one = np.ones(len(mach))
+    label = "a priori density and C_A, 1 sd"
+    band(ax, mach[order], one, prior_sd[order], COLOUR["prior_band"], alpha=1.0, label=label)
+    ax.axhline(1.0, color=COLOUR["prior"], lw=1, ls=":")
+    label = "axial force, measured / predicted (0.4 s means)"
+    ax.plot(mach, ratio, ".", ms=3, color=COLOUR["estimate"], label=label)
+    low, high = np.percentile(ratio, [1, 99])
+    room = max(1.3 * np.abs(np.array([low, high]) - 1.0).max(), 1.5 * float(np.median(prior_sd)))
+    ax.set(xlabel="Mach number", ylabel="drag ratio", ylim=(1.0 - room, 1.0 + room))
+    ax.legend(loc="lower right", ncols=2)
+
+
+@in_style
+def figure_attitude(flight: Reconstruction, check: AttitudeCheck) -> Figure:
+    """Attitude from magnetometer and Sun minus the trajectory's about three body axes, with its 3-sd band."""
+    comparison = check.comparison
+    assert comparison is not None
+    figure = Figure(figsize=(7.2, 7.0))
+    axes = figure.subplots(3, 1, sharex=True)
+    t, off, sd = comparison.time_s, np.rad2deg(comparison.difference_body_rad), np.rad2deg(comparison.sd_body_rad)
+    own = np.rad2deg(resample(flight.solution.smoothed, t).sd()[:, 6:9])
+    # stretches without Sun or field have no rows; a line across them would show what nobody measured
+    whole = np.append(np.diff(t) < 1.5 * float(np.median(np.diff(t))), True)
+    for k, (ax, axis) in enumerate(zip(axes, "xyz", strict=True)):
+        wide = 3.0 * sd[:, k]
+        ax.fill_between(t, -wide, wide, where=whole, color=COLOUR["prior_band"], lw=0, label="3 sd of the difference")
+        for sign, label in ((-3.0, None), (3.0, "3 sd of the trajectory")):
+            edge = np.where(whole, sign * own[:, k], np.nan)
+            ax.plot(t, edge, color=COLOUR["limit"], lw=0.8, ls=":", label=label)
+        label = "magnetometer and Sun minus trajectory"
+        ax.plot(t, np.where(whole, off[:, k], np.nan), color=COLOUR["estimate"], lw=0.9, label=label)
+        ax.axhline(0.0, color=COLOUR["zero"], lw=0.6)
+        ax.set_ylabel(f"about body {axis} (deg)\nrms {float(np.sqrt(np.mean(off[:, k] ** 2))):.2f}")
+        far = 1.4 * max(float(np.percentile(np.abs(off[:, k]), 99.5)), 3.0 * float(np.median(sd[:, k])))
+        ax.set_ylim(-far, far)
+    figure.legend(*axes[0].get_legend_handles_labels(), ncols=3, loc="outside lower left")
+    axes[-1].set_xlabel(TIME)
+    remark = "\n(not independent: the trajectory depends on these sensors too)" if check.dependence else ""
+    figure.suptitle("Attitude from magnetometer and Sun sensors alone against the trajectory's" + remark)
+    stamp(figure, flight.telemetry)
+    return figure
+
+
+@in_style
 def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
     """Change of each group of quantities at peak pressure in standard deviations, a bar a rerun.
 
@@ -83,108 +218,27 @@ def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
     shown = largest_of_groups(table)
     groups = [g for g in GROUPS if g in set(shown["group"])]
     columns = 4
-    figure = Figure(figsize=(10.5, 0.6 + (0.9 + 0.22 * len(names)) * -(-len(groups) // columns)), layout="constrained")
+    figure = Figure(figsize=(10.5, 0.6 + (0.9 + 0.22 * len(names)) * -(-len(groups) // columns)))
     grid = figure.subplots(-(-len(groups) // columns), columns, sharey=True, squeeze=False).ravel()
+    y = np.arange(len(names))
     for ax, group in zip(grid, groups, strict=False):
         part = shown[shown["group"] == group].set_index("rerun").reindex(names)
-        y = np.arange(len(names))
         over_sd, over_expected = (part[c].to_numpy(dtype=float) for c in ("change_over_sd", "change_over_expected_sd"))
-        ax.barh(y, np.nan_to_num(over_sd), height=0.7, color=BLUE, alpha=0.75)
-        ax.plot(over_expected, y, "D", ms=4, color=ORANGE)
+        ax.barh(y, np.nan_to_num(over_sd), height=0.7, color=COLOUR["estimate"], alpha=0.75)
+        ax.plot(over_expected, y, "D", ms=4, color=COLOUR["second"])
         far = float(np.nanmax(np.abs(np.concatenate([over_sd, over_expected, [3.0]]))))
-        for edge in (-3.0, 3.0):
-            ax.axvline(edge, color="0.3", lw=0.7, ls=":")
-        ax.axvline(0.0, color="0.3", lw=0.7)
+        limits(ax, vertical=True)
+        ax.axvline(0.0, color=COLOUR["zero"], lw=0.7)
         ax.set(xlim=(-1.15 * far, 1.15 * far), title=group)
-        ax.title.set_fontsize(9)
         ax.set_yticks(y, [f"{n} (failed)" if n in failed else n for n in names], fontsize=8)
         ax.tick_params(axis="x", labelsize=7)
-        ax.set_axisbelow(True)
-        _clean(ax)
     grid[0].invert_yaxis()
     for ax in grid[len(groups) :]:
         ax.set_visible(False)
     figure.suptitle(
-        "What moves when a source is left out or an assumption changed, at peak dynamic pressure\n"
+        "Change at peak dynamic pressure when a source is left out or an assumption changed\n"
         "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3",
         fontsize=10,
     )
-    stamp(figure, flight.telemetry)
-    return figure
-
-
-def figure_attitude(flight: Reconstruction, check: AttitudeCheck) -> Figure:
-    """Attitude from magnetometer and Sun minus the trajectory's about three body axes, with what it may be."""
-    comparison = check.comparison
-    assert comparison is not None
-    figure = Figure(figsize=(7.2, 7.0), layout="constrained")
-    axes = figure.subplots(3, 1, sharex=True)
-    _clean(*axes)
-    t, off, sd = comparison.time_s, np.rad2deg(comparison.difference_body_rad), np.rad2deg(comparison.sd_body_rad)
-    own = np.rad2deg(resample(flight.solution.smoothed, t).sd()[:, 6:9])
-    # stretches without Sun or field have no rows; a line across them would show what nobody knows
-    whole = np.append(np.diff(t) < 1.5 * float(np.median(np.diff(t))), True)
-    for k, ax in enumerate(axes):
-        ax.fill_between(
-            t, -3.0 * sd[:, k], 3.0 * sd[:, k], where=whole, color="0.87", lw=0, label="3 sd of the difference"
-        )
-        for sign in (-3.0, 3.0):
-            label = "3 sd of the trajectory" if sign > 0 else None
-            ax.plot(t, np.where(whole, sign * own[:, k], np.nan), color=GREY, lw=0.8, ls=":", label=label)
-        ax.plot(
-            t, np.where(whole, off[:, k], np.nan), color=BLUE, lw=0.9, label="magnetometer and Sun minus trajectory"
-        )
-        ax.axhline(0.0, color="0.3", lw=0.6)
-        rms = float(np.sqrt(np.mean(off[:, k] ** 2)))
-        ax.set_ylabel(f"about body {'xyz'[k]} (deg)\nrms {rms:.2f}", fontsize=9)
-        far = 1.4 * max(float(np.percentile(np.abs(off[:, k]), 99.5)), 3.0 * float(np.median(sd[:, k])))
-        ax.set_ylim(-far, far)
-    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=7, frameon=False, ncols=3, loc="outside lower left")
-    axes[-1].set_xlabel("time after launch (s)")
-    title = "Attitude from magnetometer and Sun sensors alone against the trajectory's"
-    figure.suptitle(
-        title + ("\n(not independent: the trajectory rests on them too)" if check.dependence else ""), fontsize=10
-    )
-    stamp(figure, flight.telemetry)
-    return figure
-
-
-def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
-    """What the filter knew at each time and what the smoother knows, and their difference over its sd (McReynolds)."""
-    bet = flight.solution
-    filtered, smoothed = bet.filtered, bet.smoothed
-    assert filtered.covariance is not None
-    assert smoothed.covariance is not None
-    groups = [("position", "m", 1.0), ("velocity", "m/s", 1.0), ("attitude", "deg", 180.0 / np.pi)]
-    groups = groups if flight.has_attitude else groups[:2]
-    figure = Figure(figsize=(10.0, 0.8 + 2.2 * len(groups)), layout="constrained")
-    grid = figure.subplots(len(groups), 2, sharex=True)
-    _clean(*grid.ravel())
-    t, off = smoothed.time_s, difference(filtered, smoothed)
-    var_filter, var_smoother = (np.diagonal(p, axis1=1, axis2=2) for p in (filtered.covariance, smoothed.covariance))
-    lost = var_filter - var_smoother
-    # towards the end both are the same, and the ratio of nothing to nothing
-    sure = lost > LEAST_LOST * var_filter
-    ratio = np.where(sure, off / np.sqrt(np.where(sure, lost, 1.0)), np.nan)
-    for k, ((name, unit, scale), (known, apart)) in enumerate(zip(groups, grid, strict=True)):
-        part = slice(3 * k, 3 * k + 3)
-        for var, colour, label in ((var_filter, ORANGE, "filter"), (var_smoother, BLUE, "smoother")):
-            known.semilogy(t, scale * np.sqrt(var[:, part].sum(axis=1)), color=colour, lw=1.2, label=label)
-        known.set_ylabel(f"{name}, sd ({unit})", fontsize=9)
-        for column, colour, axis in zip(ratio[:, part].T, (BLUE, ORANGE, GREEN), "xyz", strict=True):
-            apart.plot(t, column, color=colour, lw=0.8, label=axis)
-        for edge in (-3.0, 3.0):
-            apart.axhline(edge, color="0.3", lw=0.8, ls=":")
-        far = 4.5
-        if np.isfinite(ratio[:, part]).any():
-            far = min(max(far, 1.1 * float(np.nanpercentile(np.abs(ratio[:, part]), 99.5))), 30.0)
-        frame = "body" if name == "attitude" else "ECEF"
-        apart.set_ylim(-far, far)
-        apart.set_ylabel(f"difference over\nits sd ({frame})", fontsize=9)
-        apart.legend(fontsize=7, frameon=False, ncols=3, loc="upper right")
-    grid[0, 0].legend(fontsize=8, frameon=False, ncols=2, loc="upper right")
-    for ax in grid[-1]:
-        ax.set_xlabel("time after launch (s)")
-    figure.suptitle("Filter against smoother: how well each knows, and their difference (dotted: 3 sd)", fontsize=10)
     stamp(figure, flight.telemetry)
     return figure

@@ -1,8 +1,8 @@
-"""What ``postflight reconcile`` does: fit the joint to a flight, write tables and a figure, print the story."""
+"""What does ``postflight reconcile`` do? Fit the joint to a flight, write tables and figures, print the result."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,21 +10,34 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-from flightmodel.checks import GateError
+from flightmodel.checks import GateError, Progress
+from flightmodel.deflection import DeflectionHistory
 from flightmodel.flightfolder import read_flight
+from flightmodel.tabular import Tabular
 from postflight import run_folder
 from postflight.commands import compile_kernels, console
 from postflight.deflections import estimate
 from postflight.flight import PULSE_RATE_HZ, Flight
-from postflight.plots.paper_figures import save
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
-from postflight.progress import Report, progress_bar
-from postflight.reconciliation.answer import correlations, deflection_of, found_sd, joint_table, vehicle_lines
-from postflight.reconciliation.fit import Reconciled, explain
-from postflight.reconciliation.modes import ModalStiffness, stiffness_by_modes
-from postflight.reconciliation.posterior import Posterior, posterior_summary, quantities, require_samplers, sample_all
+from postflight.plots.style import save
+from postflight.progress import progress_bar
+from postflight.reconciliation.fit import JointFit, select_laws
+from postflight.reconciliation.fit import reconcile as fit_joint
+from postflight.reconciliation.modes import ModalStiffness, stiffness_from_modes
+from postflight.reconciliation.posterior import (
+    Posterior,
+    correlations,
+    deflection_of,
+    joint_table,
+    posterior_sd,
+    posterior_summary,
+    quantities,
+    require_samplers,
+    sample_selection,
+    vehicle_file_lines,
+)
 from postflight.reconstruction import Reconstruction, reconstruct
-from postflight.studies.commands import bands, held_against
+from postflight.studies.commands import bands, compared_with_bounds
 from postflight.studies.preflight import Bounds, entry_bounds, rigid_bounds
 from postflight.warmup import RECONSTRUCTION
 from recon.settings import Settings
@@ -32,12 +45,73 @@ from synthetic_flight.dispersions import Factor, JointDispersions
 
 ENTRIES = 300
 STRONG = 3.0  # logarithm of odds of twenty to one
-MISFIT = 1.5  # rms of the sensors' residuals over their sd; some 0.6 where the joint explains the flight
-LAW_WORDS = {"freeplay": "freeplay", "hardening": "a spring whose slope changes with the angle"}
+MISFIT = 1.5  # rms of the sensors' residuals over their sd; about 0.6 where the joint explains the flight
+LAW_NAMES = {"freeplay": "freeplay", "hardening": "a spring whose slope changes with the angle"}
+
+
+@dataclass(frozen=True, repr=False)
+class Reconciliation(Tabular):
+    """The joint that explains a flight; see `reconcile`.
+
+    Parameters
+    ----------
+    bet : Reconstruction
+    fit : JointFit
+        The fit with all its parameters, covariance and residuals.
+    """
+
+    bet: Reconstruction
+    fit: JointFit
+
+    @property
+    def deflection(self) -> DeflectionHistory:
+        """Deflection of the simulated flight with the fitted joint."""
+        return deflection_of(self.fit)
+
+    def modal_stiffness(self) -> ModalStiffness:
+        """Bending stiffness from the joint's frequency alone; `GateError` where the mode is not detected."""
+        return stiffness_from_modes(self.bet)
+
+    def bounds(self, flights: int = 60, progress: Progress | None = None) -> tuple[Bounds, Bounds]:
+        """Bands of dispersed entries with the joint locked, and with the fitted joint."""
+        report = progress or (lambda _fraction, _what: None)
+        rigid = rigid_bounds(self.bet, flights, progress=lambda f, what: report(0.3 * f, what))
+        return rigid, reconciled_bounds(self.fit, self.bet, lambda f, what: report(0.3 + 0.7 * f, what))
+
+    def shares_inside(self, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
+        """Share of the pressure pulse inside each band: ``joint, quantity, share_inside, ...``."""
+        return compared_with_bounds(self.bet, rigid, flexible)[0]
+
+    def to_frame(self) -> pd.DataFrame:
+        """The rows of ``joint.csv``: stiffness, damping, offset, stability, with a priori and posterior sd."""
+        return joint_table(self.fit)
+
+    def _about(self) -> str:
+        row = self.to_frame().set_index("quantity").loc["bending stiffness"]
+        how = "converged" if self.fit.converged else "NOT converged"
+        return f"bending stiffness {row['found']:.0f} +/- {row['sd']:.0f} N m/rad, {how}"
+
+
+def reconcile(bet: Reconstruction, progress: Progress | None = None) -> Reconciliation:
+    """Find the stiffness, damping and c.g. offset with which the simulator flies like the flight.
+
+    Parameters
+    ----------
+    bet : Reconstruction
+    progress : callable, optional
+
+    Raises
+    ------
+    GateError
+        Where sensors or vehicle are missing, or there is no pressure pulse.
+    DivergenceError
+        Where the vehicle file's joint diverges.
+    """
+    return Reconciliation(bet, fit_joint(bet, progress=progress))
 
 
 def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
-    """Reconstruct, reconcile, write a run folder and print what was found."""
+    """Reconstruct, reconcile, write a run folder and print the result."""
     settings = {"reconcile": True, "laws": list(laws), "posterior": sampled, "output_rate_hz": 20.0}
     if sampled:
         require_samplers()
@@ -50,39 +124,39 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         )
         answers = estimate(flight, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
         fitting = 0.3 if sampled else 0.6
-        explained = explain(flight, laws, lambda f, what: report(0.3 + fitting * f, what))
-        found, odds = explained.found, explained.log_odds
+        selection = select_laws(flight, laws, lambda f, what: report(0.3 + fitting * f, what))
+        fit, odds = selection.fit, selection.log_odds
         posterior = None
         if sampled:
-            posterior, nested = sample_all(explained, lambda f, what: report(0.6 + 0.3 * f, what))
+            posterior, nested = sample_selection(selection, lambda f, what: report(0.6 + 0.3 * f, what))
             odds |= nested
         modal, no_modes = _modes(flight)
         rigid = rigid_bounds(flight, ENTRIES, progress=lambda f, what: report(0.9 + 0.05 * f, what))
-        flexible = reconciled_bounds(found, flight, lambda f, what: report(0.95 + 0.05 * f, what))
-        shares, _, bands_picture = held_against(flight, rigid, flexible)
+        flexible = reconciled_bounds(fit, flight, lambda f, what: report(0.95 + 0.05 * f, what))
+        shares, _, bands_picture = compared_with_bounds(flight, rigid, flexible)
         with run_folder.RunFolder(folder, telemetry, settings) as out:
-            table = joint_table(found)
+            table = joint_table(fit)
             out.write_csv("joint.csv", table)
-            out.write_csv("joint_correlations.csv", correlations(found))
-            bent = deflection_of(found)
-            out.write_csv("deflection_reconciled.csv", bent.to_frame())
-            story = summary(found, table, odds) | modal_summary(modal, no_modes) | posterior_words(posterior)
-            out.write_json("reconciliation.json", story)
+            out.write_csv("joint_correlations.csv", correlations(fit))
+            deflection = deflection_of(fit)
+            out.write_csv("deflection_reconciled.csv", deflection.to_frame())
+            facts = _summary(fit, table, odds) | _modal_summary(modal, no_modes) | _posterior_summary(posterior)
+            out.write_json("reconciliation.json", facts)
             out.write_csv("bands.csv", bands(rigid, flexible))
             out.write_csv("bands_shares.csv", shares)
             save(bands_picture, out.path / "figures" / "bands.png")
             if modal is not None:
                 save(figure_modes(modal, telemetry), out.path / "figures" / "modes.png")
-            (out.path / "joint.toml").write_text(vehicle_lines(found))
+            (out.path / "joint.toml").write_text(vehicle_file_lines(fit))
             if posterior is not None:
-                out.write_csv("posterior.csv", quantities(found.problem.unknown, posterior.samples))
+                out.write_csv("posterior.csv", quantities(fit.problem.vehicle_parameters, posterior.samples))
                 out.write_csv("posterior_summary.csv", posterior_summary(posterior))
                 save(figure_posterior(posterior, telemetry), out.path / "figures" / "posterior.png")
             fused = answers.histories.get("fused")
-            save(figure_reconciled(found, telemetry, bent, fused), out.path / "figures" / "reconciled.png")
-    print_joint(found, table, odds)
+            save(figure_reconciled(fit, telemetry, deflection, fused), out.path / "figures" / "reconciled.png")
+    _print_joint(fit, table, odds)
     if posterior is not None:
-        print_posterior(posterior)
+        _print_posterior(posterior)
     if modal is None:
         console.print(f"stiffness by the joint's frequency: none ({escape(no_modes)})")
     else:
@@ -96,33 +170,33 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
 
 
 def _modes(flight: Reconstruction) -> tuple[ModalStiffness | None, str]:
-    """Stiffness by the joint's frequency, or why there is none."""
+    """Stiffness by the joint's frequency, or why it cannot be estimated."""
     try:
-        return stiffness_by_modes(flight), ""
+        return stiffness_from_modes(flight), ""
     except GateError as fault:
         return None, str(fault)
 
 
-def modal_summary(modal: ModalStiffness | None, no_modes: str) -> dict[str, object]:
-    """Return the second way's answer, for ``reconciliation.json``."""
+def _modal_summary(modal: ModalStiffness | None, no_modes: str) -> dict[str, object]:
+    """Return the stiffness by the joint's frequency, for ``reconciliation.json``."""
     if modal is None:
         return {"stiffness_by_modes_nmprad": None, "no_modes": no_modes}
     return {"stiffness_by_modes_nmprad": modal.stiffness_nmprad, "stiffness_by_modes_sd_nmprad": modal.sd_nmprad}
 
 
-def posterior_words(posterior: Posterior | None) -> dict[str, object]:
-    """Return how far the samples may be trusted, for ``reconciliation.json``."""
+def _posterior_summary(posterior: Posterior | None) -> dict[str, object]:
+    """Return the errors of the sampling, for ``reconciliation.json``."""
     if posterior is None:
         return {}
     return {
         "posterior_refit_error_of_cost": posterior.refit_error.tolist(),
-        "posterior_steps_to_forget": posterior.steps_to_forget,
-        "posterior_log_evidence_over_laplace": posterior.log_evidence - posterior.found.log_evidence,
+        "posterior_steps_to_forget": posterior.autocorrelation_steps,
+        "posterior_log_evidence_over_laplace": posterior.log_evidence - posterior.fit.log_evidence,
         "posterior_log_evidence_sd": posterior.log_evidence_sd,
     }
 
 
-def print_posterior(posterior: Posterior) -> None:
+def _print_posterior(posterior: Posterior) -> None:
     """Table of the samples beside the linear problem."""
     printed = Table(title="Posterior (emcee)")
     for name in ("quantity", "most probable", "linear sd", "median", "sd", "90 % interval"):
@@ -133,49 +207,51 @@ def print_posterior(posterior: Posterior) -> None:
     console.print(printed)
 
 
-def reconciled_bounds(found: Reconciled, flight: Reconstruction, report: Report) -> Bounds:
-    """Bands of entries with the joint, offset and stability found, dispersed as far as they are open still."""
-    joint, offset, stability = found_sd(found)
-    vehicle = found.vehicle
+def reconciled_bounds(fit: JointFit, flight: Reconstruction, report: Progress) -> Bounds:
+    """Bands of entries with the fitted joint, offset and stability, dispersed by their standard deviations."""
+    joint, offset, stability = posterior_sd(fit)
+    vehicle = fit.vehicle
     known = vehicle.uncertainty.model_copy(update={"cg_lateral_m": offset, "cm": stability})
     laws = JointDispersions(stiffness=Factor(lognormal=joint[0]), damping=Factor(lognormal=joint[1]))
     return entry_bounds(flight, laws, ENTRIES, progress=report, vehicle=replace(vehicle, uncertainty=known))
 
 
-def summary(found: Reconciled, table: pd.DataFrame, odds: dict[str, float]) -> dict[str, object]:
-    """Return the short story, for ``reconciliation.json``."""
+def _summary(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> dict[str, object]:
+    """Return the fit's quality and the joint, for ``reconciliation.json``."""
     return {
-        "converged": found.converged,
-        "steps": found.steps,
-        "sensor_residual_rms_sd": found.sensor_rms_sd,
-        "join_rms_sd": float(np.sqrt(np.mean(found.residuals.joins**2))),
-        "share_of_fine_air": found.problem.air.fine,
+        "converged": fit.converged,
+        "steps": fit.steps,
+        "sensor_residual_rms_sd": fit.sensor_rms_sd,
+        "join_rms_sd": float(np.sqrt(np.mean(fit.residuals.joins**2))),
+        "share_of_fine_air": fit.problem.air.turbulence_share,
         "joint": table.to_dict(orient="records"),
         "log_odds": odds,
     }
 
 
-def print_joint(found: Reconciled, table: pd.DataFrame, odds: dict[str, float]) -> None:
-    """Table of the joint, and a word where the fit did not settle or does not fit."""
+def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> None:
+    """Table of the joint, and warnings where the fit did not converge or does not explain the flight."""
     printed = Table(title="The joint that explains the flight")
-    for name in ("quantity", "told", "found", "1 sd", "90 % interval"):
+    for name in ("quantity", "vehicle file", "found", "1 sd", "90 % interval"):
         printed.add_column(name, justify="left" if name == "quantity" else "right")
     for r in table.itertuples(index=False):
         name = f"{r.quantity} ({r.unit})" if r.unit else str(r.quantity)
         printed.add_row(name, f"{r.told:.4g}", f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}")
     console.print(printed)
-    for law, words in LAW_WORDS.items():
+    for law, name in LAW_NAMES.items():
         if law not in odds:
             continue
         side = "for" if odds[law] > 0.0 else "against"
         evidence = "no clear evidence" if abs(odds[law]) < STRONG else f"strong evidence {side}"
-        console.print(f"{words}: {evidence} (odds e^{odds[law]:+.1f})")
-    if odds.get("hardening", 0.0) > STRONG and "hardening" not in found.problem.unknown.laws:
-        console.print("[yellow]the slope falls with the angle: freeplay in part of the pulse, or a joint that gives[/]")
-    if found.sensor_rms_sd > MISFIT:
+        console.print(f"{name}: {evidence} (odds e^{odds[law]:+.1f})")
+    if odds.get("hardening", 0.0) > STRONG and "hardening" not in fit.problem.vehicle_parameters.laws:
         console.print(
-            f"[yellow]the sensors lie {found.sensor_rms_sd:.1f} sd (rms) from the flight flown: no such joint explains "
-            "it; a joint with freeplay does that to a fit without --freeplay[/]"
+            "[yellow]the stiffness falls with the angle: freeplay in part of the pulse, or a joint that yields[/]"
         )
-    if not found.converged:
-        console.print("[yellow]the fit had not settled after its last step: take the intervals as too narrow[/]")
+    if fit.sensor_rms_sd > MISFIT:
+        console.print(
+            f"[yellow]sensor residuals {fit.sensor_rms_sd:.1f} sd (rms), expected below {MISFIT:g}: such a joint does "
+            "not explain the flight; if the joint has freeplay, fit it with --freeplay[/]"
+        )
+    if not fit.converged:
+        console.print(f"[yellow]not converged after {fit.steps} steps: the intervals are too narrow[/]")

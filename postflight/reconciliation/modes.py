@@ -1,13 +1,13 @@
-"""A second way to the stiffness: at which frequency does the joint swing, and how does that follow dynamic pressure?
+"""Which stiffness of the joint follows from the frequency of its oscillation alone?
 
-Lateral rates and specific force, turned into axes that do not spin, are cut into overlapping windows; of their spectra
-the part above the noise is summed along the frequency that the linear model (`synthetic_flight.linear`) predicts for
-the joint's mode at every window's dynamic pressure, Mach number and speed, for both senses of rotation. The stiffness
-for which most is gathered is the answer: no start, no damping, no offset and no wind take part, only the vehicle's
-masses, stations, inertias and coefficients, whose uncertainty is carried by differences.
+Independent of the fit: lateral rates and specific force, rotated into axes that do not spin, are cut into overlapping
+windows. The logarithm of their spectra over the noise is averaged along the frequency ``f(K; q, Mach, V)`` that the
+linear model (`synthetic_flight.linear`) predicts for the joint's mode in every window, for both senses of rotation. The
+stiffness ``K`` with the largest mean is the estimate. Start, damping, offset and wind take no part; the uncertainty of
+masses, stations, inertias and coefficients is propagated by differences.
 
-Assumed: small angles, pressure frozen over a window, and a spin slow against the mode (both senses are summed, so that
-what spin adds to one it takes from the other).
+Assumed: small angles, constant dynamic pressure over a window, and a spin slow against the mode (both senses are
+averaged, so that their opposite shifts cancel).
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ import numpy as np
 
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.vehicle import Vehicle
-from postflight.reconciliation.candidate import STIFFNESS_LOG_SD, VehicleUnknowns
+from postflight.reconciliation.forward_model import STIFFNESS_LOG_SD, VehicleParameters
 from postflight.reconstruction import Reconstruction
 from synthetic_flight.linear import linear_matrix, modes, slopes_at
 
 RATE_HZ = 50.0
 WINDOW, HOP, PADDED = 256, 32, 2048
 LEAST_PRESSURE_PA = 20.0
-FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 141))  # of the stiffness that was told
+FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 141))  # of the vehicle file's stiffness
 BLOCKS = 6
 DIFFERENCE = 0.05  # of a standard deviation
-# mean logarithm of power over noise along the best track: noise alone has -0.2 +- 0.17, the best of all tracks 0.2
-LEAST_GATHERED = 0.65
+# mean logarithm of power over noise along the best track: noise alone -0.2 +/- 0.17, the best of all its tracks 0.2
+LEAST_LOG_POWER = 0.65
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ModalStiffness:
     Parameters
     ----------
     stiffness_nmprad, sd_nmprad : float
-        The sd holds the scatter between parts of the pulse and the vehicle's uncertainty.
+        The sd combines the scatter between parts of the pulse and the vehicle's uncertainty.
     time_s : (n,) float
         Middles of the windows.
     frequency_hz : (k,) float
@@ -48,8 +48,8 @@ class ModalStiffness:
         Logarithm of the spectra over their noise, rates and force together.
     joint_hz, aerodynamic_hz : (n,) float
         Frequencies of the linear model with this stiffness.
-    factor, gathered : (m,) float
-        Of the told stiffness, and what lies along its track.
+    factor, mean_log_power : (m,) float
+        Of the vehicle file's stiffness, and mean logarithm of power over noise along its track.
     """
 
     stiffness_nmprad: float
@@ -60,10 +60,10 @@ class ModalStiffness:
     joint_hz: FloatArray
     aerodynamic_hz: FloatArray
     factor: FloatArray
-    gathered: FloatArray
+    mean_log_power: FloatArray
 
 
-def stiffness_by_modes(flight: Reconstruction) -> ModalStiffness:
+def stiffness_from_modes(flight: Reconstruction) -> ModalStiffness:
     """Track the joint's mode through the pressure pulse.
 
     Raises
@@ -71,29 +71,34 @@ def stiffness_by_modes(flight: Reconstruction) -> ModalStiffness:
     GateError
         Where vehicle or sensors are missing, the pulse is shorter than a few windows, or no mode stands out.
     """
-    pulse, told = flight.required_loads(), flight.telemetry.required_vehicle()
+    pulse, nominal = flight.required_loads(), flight.telemetry.required_vehicle()
     t, log_power = _spectra(flight, pulse.time_s)
     pressure = np.interp(t, pulse.time_s, pulse.dynamic_pressure_pa)
     use = pressure > LEAST_PRESSURE_PA
     if use.sum() < BLOCKS:
-        raise GateError(f"modes: {use.sum()} windows with more than {LEAST_PRESSURE_PA:g} Pa; {BLOCKS} are wanted")
+        message = f"modes: {use.sum()} windows with more than {LEAST_PRESSURE_PA:g} Pa; {BLOCKS} are wanted"
+        raise GateError(message, code="pulse-too-short")
     t, log_power, pressure = t[use], log_power[use], pressure[use]
     flow = pressure, np.interp(t, pulse.time_s, pulse.mach), np.interp(t, pulse.time_s, pulse.airspeed_mps)
     frequency = np.asarray(np.fft.fftfreq(PADDED, 1.0 / RATE_HZ), dtype=np.float64)
-    along = np.array([_along(frequency, log_power, track) for track in _tracks(told, flow)])
-    gathered = along.mean(axis=1)
-    if gathered.max() < LEAST_GATHERED:
-        raise GateError("modes: the joint's swinging does not stand out of the noise anywhere in the pulse")
-    best = _peak(gathered)
+    power = np.array([_track_power(frequency, log_power, track) for track in _tracks(nominal, flow)])
+    mean_log_power = power.mean(axis=1)
+    if mean_log_power.max() < LEAST_LOG_POWER:
+        message = (
+            f"modes: largest mean logarithm of power over noise {mean_log_power.max():.2f}, at least "
+            f"{LEAST_LOG_POWER:g} is wanted: the joint's oscillation cannot be detected in the pulse"
+        )
+        raise GateError(message, code="mode-not-detected")
+    best = _peak(mean_log_power)
     parts = np.array_split(np.arange(len(t)), BLOCKS)
-    left_out = np.array([_peak(np.delete(along, part, axis=1).mean(axis=1)) for part in parts])
-    scatter = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((left_out - left_out.mean()) ** 2))
-    sd = float(np.hypot(scatter, _vehicle_sd(told, float(np.exp(best)), flow)))
-    stiffness = told.joint.bending_stiffness_nmprad * float(np.exp(best))
-    aerodynamic, joint = _frequencies(_stiffer(told, float(np.exp(best))), flow)
+    jackknife = np.array([_peak(np.delete(power, part, axis=1).mean(axis=1)) for part in parts])
+    scatter = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((jackknife - jackknife.mean()) ** 2))
+    sd = float(np.hypot(scatter, _vehicle_sd(nominal, float(np.exp(best)), flow)))
+    stiffness = nominal.joint.bending_stiffness_nmprad * float(np.exp(best))
+    aerodynamic, joint = _frequencies(_stiffer(nominal, float(np.exp(best))), flow)
     order = np.argsort(frequency)
     return ModalStiffness(
-        stiffness, stiffness * sd, t, frequency[order], log_power[:, order], joint, aerodynamic, FACTORS, gathered
+        stiffness, stiffness * sd, t, frequency[order], log_power[:, order], joint, aerodynamic, FACTORS, mean_log_power
     )
 
 
@@ -103,7 +108,8 @@ def _spectra(flight: Reconstruction, span_s: FloatArray) -> tuple[FloatArray, Fl
     grid = np.arange(span_s[0], span_s[-1], 1.0 / RATE_HZ)
     if len(grid) < WINDOW + HOP:
         raise GateError(
-            f"modes: {len(grid) / RATE_HZ:.1f} s of pulse; at least {(WINDOW + HOP) / RATE_HZ:.1f} s are wanted"
+            f"modes: {len(grid) / RATE_HZ:.1f} s of pulse; at least {(WINDOW + HOP) / RATE_HZ:.1f} s are wanted",
+            code="pulse-too-short",
         )
     rate = np.column_stack([np.interp(grid, bet.imu_time_s, c) for c in bet.rate_body_radps.T])
     force = np.column_stack([np.interp(grid, bet.imu_time_s, c) for c in bet.specific_force_body_mps2.T])
@@ -111,27 +117,27 @@ def _spectra(flight: Reconstruction, span_s: FloatArray) -> tuple[FloatArray, Fl
     starts = np.arange(0, len(grid) - WINDOW, HOP)
     total = np.zeros((len(starts), PADDED))
     for lateral in (rate[:, 1] + 1j * rate[:, 2], force[:, 1] + 1j * force[:, 2]):
-        # differences take the slow motion's leakage down
-        moved = np.diff(lateral * despun, append=0.0)
-        pieces = moved[starts[:, None] + np.arange(WINDOW)] * np.hanning(WINDOW)
+        # differences reduce the leakage of slow motion
+        difference = np.diff(lateral * despun, append=0.0)
+        pieces = difference[starts[:, None] + np.arange(WINDOW)] * np.hanning(WINDOW)
         power = np.abs(np.fft.fft(pieces, PADDED, axis=1)) ** 2
         total += 0.5 * np.log(power / np.median(power, axis=1, keepdims=True))
     return grid[starts] + 0.5 * WINDOW / RATE_HZ, total
 
 
-def _tracks(told: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
+def _tracks(nominal: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
     """Frequencies of the joint's mode (factors, n), Hz: between every tenth of `FACTORS` by straight lines."""
     coarse = FACTORS[::10]
-    known = np.array([_frequencies(_stiffer(told, factor), flow)[1] for factor in coarse])
+    known = np.array([_frequencies(_stiffer(nominal, factor), flow)[1] for factor in coarse])
     return np.column_stack([np.interp(np.log(FACTORS), np.log(coarse), column) for column in known.T])
 
 
-def _stiffer(told: Vehicle, factor: float) -> Vehicle:
-    return VehicleUnknowns(told).vehicle(_at_stiffness(told, factor))
+def _stiffer(nominal: Vehicle, factor: float) -> Vehicle:
+    return VehicleParameters(nominal).vehicle(_at_stiffness(nominal, factor))
 
 
-def _at_stiffness(told: Vehicle, factor: float) -> FloatArray:
-    x = np.zeros(len(VehicleUnknowns(told).names))
+def _at_stiffness(nominal: Vehicle, factor: float) -> FloatArray:
+    x = np.zeros(len(VehicleParameters(nominal).names))
     x[0] = np.log(factor) / STIFFNESS_LOG_SD
     return x
 
@@ -148,8 +154,8 @@ def _frequencies(vehicle: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArra
     return out[0], out[1]
 
 
-def _along(frequency_hz: FloatArray, log_power: FloatArray, track_hz: FloatArray) -> FloatArray:
-    """Mean of both senses at a track's frequencies, (n,); zero where the track ends."""
+def _track_power(frequency_hz: FloatArray, log_power: FloatArray, track_hz: FloatArray) -> FloatArray:
+    """Mean of both senses at a track's frequencies, (n,); zero where the mode does not oscillate."""
     step = frequency_hz[1]
     known = np.isfinite(track_hz)
     near = np.where(known, np.nan_to_num(track_hz) / step, 0.0)
@@ -162,26 +168,26 @@ def _along(frequency_hz: FloatArray, log_power: FloatArray, track_hz: FloatArray
     return np.where(known, out, 0.0)
 
 
-def _peak(gathered: FloatArray) -> float:
-    """Logarithm of the factor with most gathered, by a parabola."""
-    k = int(np.clip(np.argmax(gathered), 1, len(gathered) - 2))
-    left, middle, right = gathered[k - 1 : k + 2]
-    bow = left - 2.0 * middle + right
-    shift = 0.0 if bow >= 0.0 else float(np.clip(0.5 * (left - right) / bow, -1.0, 1.0))
+def _peak(mean_log_power: FloatArray) -> float:
+    """Logarithm of the factor at the largest mean, by a parabola."""
+    k = int(np.clip(np.argmax(mean_log_power), 1, len(mean_log_power) - 2))
+    left, middle, right = mean_log_power[k - 1 : k + 2]
+    curvature = left - 2.0 * middle + right
+    shift = 0.0 if curvature >= 0.0 else float(np.clip(0.5 * (left - right) / curvature, -1.0, 1.0))
     return float(np.log(FACTORS[k]) + shift * np.log(FACTORS[1] / FACTORS[0]))
 
 
-def _vehicle_sd(told: Vehicle, factor: float, flow: tuple[FloatArray, FloatArray, FloatArray]) -> float:
-    """One sd of the stiffness's logarithm for what is open of the vehicle, the joint's frequency held."""
-    unknown = VehicleUnknowns(told)
+def _vehicle_sd(nominal: Vehicle, factor: float, flow: tuple[FloatArray, FloatArray, FloatArray]) -> float:
+    """Sd of the logarithm of the stiffness by the vehicle's uncertainty, at the same frequency of the joint."""
+    parameters = VehicleParameters(nominal)
 
     def mean_log_hz(x: FloatArray) -> float:
-        return float(np.nanmean(np.log(_frequencies(unknown.flown(x), flow)[1])))
+        return float(np.nanmean(np.log(_frequencies(parameters.flown(x), flow)[1])))
 
-    x = _at_stiffness(told, factor)
+    x = _at_stiffness(nominal, factor)
     base = mean_log_hz(x)
     slopes = {}
-    for k, name in enumerate(unknown.names):
+    for k, name in enumerate(parameters.names):
         if name not in ("damping", "offset y", "offset z"):
             moved = x.copy()
             moved[k] += DIFFERENCE

@@ -1,13 +1,16 @@
-"""Posterior of the few unknowns that are sought, sampled by emcee, and its volume by dynesty.
+"""Which values of stiffness, damping, offset and stability has a fitted joint, and with which uncertainty?
 
-The other unknowns (some 2700: motion, air, instruments, masses) are put at their most probable for each candidate of
-the few (a profile). To that end they follow the linear problem about the best fit and are then corrected by the
-gradient at the candidate with the derivatives of the best fit, which costs one flight of all spans a correction. The
-profile is taken at some two hundred candidates and interpolated between them by radial functions; the samplers see the
-interpolation. What that leaves out is told by `Posterior.refit_error`: candidates fitted anew with new derivatives.
+From the linear problem: covariance ``P = (J^T W J + P_0^-1)^-1`` of all parameters, widened by `fit.SD_FACTORS`, and by
+differences the standard deviations and 90 % intervals of what an engineer asks for.
 
-The samples are widened as the fit's covariance is (`fit.WIDER_SD`); for the evidence they are not.
-A profile is no marginal: that the others' scatter differs from candidate to candidate is left out.
+By sampling: posterior of the few parameters sought by emcee, its volume by dynesty. The nuisance parameters (some 2700:
+motion, atmosphere, instruments, masses) are put at their most probable values for each candidate of the few (a profile
+likelihood). To that end they follow the linear problem about the best fit and are then corrected by the gradient at the
+candidate with the derivatives of the best fit, which costs one flight of all spans a correction. The profile is taken
+at some two hundred candidates and interpolated between them by radial functions; the samplers evaluate the
+interpolation, whose error is `Posterior.refit_error`: candidates fitted anew with new derivatives. The samples are
+widened as the fit's covariance is; for the evidence they are not. A profile is no marginal: that the scatter of the
+nuisance parameters differs from candidate to candidate is neglected.
 
 References
 ----------
@@ -26,48 +29,199 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
+from scipy.stats import norm
 
-from flightmodel.checks import ConfigError, FloatArray
+from flightmodel.checks import ConfigError, FloatArray, Progress
+from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_clock
 from flightmodel.vehicle import Vehicle
-from postflight.reconciliation.candidate import FREEPLAY_SD_RAD, HARDENING_SD, VehicleUnknowns
-from postflight.reconciliation.fit import Explained, Progress, Reconciled
-from postflight.reconciliation.problem import Linear, Normal, Unknowns, step_from
+from postflight.reconciliation.fit import JointFit, LawSelection, part_of
+from postflight.reconciliation.forward_model import (
+    DAMPING_LOG_SD,
+    DEFLECTION,
+    FREEPLAY_SD_RAD,
+    HARDENING_SD,
+    MOTION,
+    OFFSET_SD_M,
+    STIFFNESS_LOG_SD,
+    WINDOWS,
+    VehicleParameters,
+)
+from postflight.reconciliation.gauss_newton import Linearization, NormalEquations, Parameters, descend
 
+INTERVAL = 0.90
 SEED = 2009
 PER_UNKNOWN, REACH, CORRECTIONS = 32, 5.0, 3  # candidates; reach in sd of the linear problem
 REFITS, REFIT_STEPS, REFIT_REACH = 4, 2, 2.0
 WALKERS, MOVES, BURNT, THINNED = 32, 2500, 500, 20
-NEVER = -1e300
-OPEN_ODDS = 20.0  # logarithm beyond which no better integral changes the answer
-DIFFERENCE = 1e-4  # of a standard deviation of the prior
+LOWEST_LOG = -1e300
+OPEN_ODDS = 20.0  # logarithm of odds beyond which no better integral changes the selection
+DIFFERENCE = 1e-4  # of an a priori standard deviation
 LIVE, LEFT = 250, 0.05  # nested sampling's live points; log evidence still to be found when it stops
+
+
+def _damping_ratio(vehicle: Vehicle) -> float:
+    return vehicle.joint.bending_damping_nmsprad / vehicle.critical_damping_nmsprad()
+
+
+# name, unit, value of a vehicle, and whether its uncertainty is that of its logarithm
+QUANTITIES: tuple[tuple[str, str, Callable[[Vehicle], float], bool], ...] = (
+    ("bending stiffness", "N m/rad", lambda v: v.joint.bending_stiffness_nmprad, True),
+    ("free-free frequency", "Hz", lambda v: v.free_free_frequency_hz(), True),
+    ("damping", "N m s/rad", lambda v: v.joint.bending_damping_nmsprad, True),
+    ("damping ratio", "", _damping_ratio, True),
+    ("c.g. offset y", "cm", lambda v: 100.0 * float(v.cg_m[1]), False),
+    ("c.g. offset z", "cm", lambda v: 100.0 * float(v.cg_m[2]), False),
+    ("c.g. offset", "cm", lambda v: 100.0 * float(np.hypot(*v.cg_m[1:])), False),
+    ("c.g. offset's clock", "deg LV", lambda v: float(np.rad2deg(lv_clock(v.cg_m[1:]))), False),
+)
+
+
+@dataclass(frozen=True)
+class _LinearQuantity:
+    """A quantity that grows with one of the vehicle's parameters: ``nominal + scale x[index]``."""
+
+    label: str
+    column: str
+    unit: str
+    nominal: float
+    scale: float
+    index: int
+    is_size: bool = False  # either sign of the parameter is the same
+
+    def of(self, x: FloatArray) -> FloatArray:
+        """Values (...) of parameters (..., v)."""
+        value = self.nominal + self.scale * x[..., self.index]
+        return np.abs(value) if self.is_size else value
+
+
+def _linear_quantities(parameters: VehicleParameters) -> list[_LinearQuantity]:
+    """Static stability, and the coefficients of the laws that the joint has."""
+    known = {
+        "static stability": ("static stability", "static_stability", "", 1.0, parameters.nominal.uncertainty.cm),
+        "freeplay": ("freeplay", "freeplay_deg", "deg", 0.0, float(np.rad2deg(FREEPLAY_SD_RAD))),
+        "hardening": ("hardening at 4 deg", "hardening_at_4_deg", "", 0.0, HARDENING_SD),
+    }
+    names = parameters.names
+    return [
+        _LinearQuantity(*about, names.index(name), name == "freeplay") for name, about in known.items() if name in names
+    ]
+
+
+def joint_table(fit: JointFit) -> pd.DataFrame:
+    """One row a quantity: ``quantity, unit, told (the vehicle file's), found, sd, low, high`` (90 % interval).
+
+    Positive quantities have sd and interval from their logarithm.
+    """
+    vehicle_parameters, x = fit.problem.vehicle_parameters, fit.parameters.vehicle
+    n = len(x)
+    covariance = fit.covariance[:n, :n]
+    reach = float(norm.ppf(0.5 + 0.5 * INTERVAL))
+    nominal, best = vehicle_parameters.vehicle(np.zeros(n)), vehicle_parameters.vehicle(x)
+    moved = [[vehicle_parameters.vehicle(x + side * DIFFERENCE * unit) for side in (-1.0, 1.0)] for unit in np.eye(n)]
+    rows = []
+    for name, unit, value, by_factor in QUANTITIES:
+        f = (lambda v, g=value: float(np.log(g(v)))) if by_factor else value
+        slope = np.array([(f(high) - f(low)) / (2.0 * DIFFERENCE) for low, high in moved])
+        sd, at = float(np.sqrt(slope @ covariance @ slope)), f(best)
+        low, high = at - reach * sd, at + reach * sd
+        if by_factor:
+            low, high, sd = float(np.exp(low)), float(np.exp(high)), float(np.exp(at)) * sd
+        rows.append((name, unit, value(nominal), value(best), sd, low, high))
+    for linear in _linear_quantities(vehicle_parameters):
+        at, sd = float(linear.of(x)), linear.scale * float(np.sqrt(covariance[linear.index, linear.index]))
+        rows.append((linear.label, linear.unit, linear.nominal, at, sd, at - reach * sd, at + reach * sd))
+    return pd.DataFrame(rows, columns=["quantity", "unit", "told", "found", "sd", "low", "high"])
+
+
+def posterior_sd(fit: JointFit) -> tuple[tuple[float, float], float, float]:
+    """Sd of stiffness and damping (logarithms), of the offset (mean of y and z), m, and of the static stability."""
+    names = fit.problem.vehicle_parameters.names
+    sd = dict(zip(names, np.sqrt(np.diag(fit.covariance)[: len(names)]).tolist(), strict=True))
+    offset = float(OFFSET_SD_M * np.hypot(sd["offset y"], sd["offset z"]) / np.sqrt(2.0))
+    joint = STIFFNESS_LOG_SD * sd["stiffness"], DAMPING_LOG_SD * sd["damping"]
+    return joint, offset, fit.problem.vehicle_parameters.nominal.uncertainty.cm * sd["static stability"]
+
+
+def correlations(fit: JointFit) -> pd.DataFrame:
+    """Correlation of the vehicle's parameters, those sought first."""
+    names = fit.problem.vehicle_parameters.names
+    covariance = fit.covariance[: len(names), : len(names)]
+    sd = np.sqrt(np.diag(covariance))
+    return pd.DataFrame(covariance / np.outer(sd, sd), columns=list(names)).assign(unknown=list(names))
+
+
+def stiffness_and_offset(fit: JointFit) -> tuple[FloatArray, FloatArray]:
+    """Mean (2,) and covariance (2, 2) of stiffness, N m/rad, and size of the offset, cm."""
+    vehicle_parameters, x = fit.problem.vehicle_parameters, fit.parameters.vehicle
+    vehicle = vehicle_parameters.vehicle(x)
+    offset = vehicle.cg_m[1:]
+    size = float(np.hypot(*offset))
+    slope = np.zeros((2, len(x)))
+    slope[0, 0] = STIFFNESS_LOG_SD * vehicle.joint.bending_stiffness_nmprad
+    slope[1, 2:4] = 100.0 * OFFSET_SD_M * offset / max(size, 1e-9)
+    covariance = slope @ fit.covariance[: len(x), : len(x)] @ slope.T
+    return np.array([vehicle.joint.bending_stiffness_nmprad, 100.0 * size]), covariance
+
+
+def deflection_of(fit: JointFit) -> DeflectionHistory:
+    """Deflection of the fitted flight in every window; covariance by the spans' starts."""
+    problem, measured = fit.problem, fit.problem.measured
+    rotation = problem.predict(fit.parameters).deflection.reshape(-1, 3)
+    # rotation vector y z to lateral vector: the shell's nose moves along its cross product with x
+    lateral = np.column_stack([rotation[:, 2], -rotation[:, 1]])
+    at_start = np.empty((measured.spans, 2, 2))
+    for span in range(measured.spans):
+        at = problem.first_motion + MOTION * span + DEFLECTION.start + np.array([2, 1])
+        at_start[span] = fit.covariance[np.ix_(at, at)] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    assumptions = "by the simulator with the reconciled joint, from accelerometers and rates"
+    covariance = np.repeat(at_start, WINDOWS, axis=0)
+    return history_from_lateral(measured.time_s.ravel(), lateral, covariance, "reconciled", assumptions)
+
+
+def vehicle_file_lines(fit: JointFit) -> str:
+    """Lines of a vehicle file with the fitted joint and centerbody c.g."""
+    vehicle = fit.problem.vehicle_parameters.vehicle(fit.parameters.vehicle)
+    joint, body = vehicle.joint, vehicle.centerbody
+    lines = [
+        f"# reconciled with a flight of {fit.problem.vehicle_parameters.nominal.name}",
+        "[centerbody]",
+        f"cg_from_datum_body_m = [{', '.join(f'{c:.6g}' for c in body.cg_from_datum_body_m)}]",
+        "[joint]",
+        f"bending_stiffness_nmprad = {joint.bending_stiffness_nmprad:.6g}",
+        f"bending_damping_nmsprad = {joint.bending_damping_nmsprad:.6g}",
+    ]
+    if "freeplay" in fit.problem.vehicle_parameters.laws:
+        lines.append(f"freeplay_deg = {joint.freeplay_deg:.6g}")
+    if "hardening" in fit.problem.vehicle_parameters.laws:
+        lines.append(f"hardening_nmprad3 = {joint.hardening_nmprad3:.6g}")
+    return "\n".join(lines) + "\n"
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Samples of the few unknowns.
+    """Samples of the parameters sought.
 
     Parameters
     ----------
-    found : Reconciled
+    fit : JointFit
     samples : (n, v) float
-        The vehicle's unknowns, standard deviations of their priors; those carried along follow those sought.
+        The vehicle's parameters, a priori standard deviations; nuisance parameters follow those sought.
     log_evidence : float
-        As `Reconciled.log_evidence`, by nested sampling of the profile in place of Laplace's method.
+        As `JointFit.log_evidence`, by nested sampling of the profile in place of Laplace's method.
     log_evidence_sd : float
         Of the nested sampling.
     refit_error : (REFITS,) float
         Interpolated cost less that of a new fit, at candidates two sd away.
-    steps_to_forget : float
+    autocorrelation_steps : float
         Longest autocorrelation time of the walkers, steps.
     """
 
-    found: Reconciled
+    fit: JointFit
     samples: FloatArray
     log_evidence: float
     log_evidence_sd: float
     refit_error: FloatArray
-    steps_to_forget: float
+    autocorrelation_steps: float
 
 
 def require_samplers() -> None:
@@ -76,81 +230,79 @@ def require_samplers() -> None:
     if missing:
         raise ConfigError(
             f"--posterior: {' and '.join(missing)} not installed; pip install 'postflight[posterior]', or leave the "
-            "option out: the intervals are then Gaussian"
+            "option out: the intervals are then Gaussian",
+            code="package-missing",
         )
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Cost of candidates of the few unknowns, the others at their most probable.
+    """Cost of candidates of the parameters sought, the others at their most probable.
 
-    A candidate is counted from the best fit, ``(p,)``, in independent standard deviations of the linear problem.
+    A candidate ``(p,)`` is the difference to the best fit in independent standard deviations of the linear problem.
     """
 
-    found: Reconciled
+    fit: JointFit
 
     @property
     def count(self) -> int:
-        """How many unknowns are sought."""
-        return self.found.problem.unknown.physical
+        """How many parameters are sought."""
+        return self.fit.problem.vehicle_parameters.sought
 
     @cached_property
     def root(self) -> FloatArray:
-        """From a candidate to the unknowns sought: root (p, p) of their linear covariance."""
-        return np.asarray(np.linalg.cholesky(self.found.linear_covariance[: self.count, : self.count]))
+        """From a candidate to the parameters sought: root (p, p) of their linear covariance."""
+        return np.asarray(np.linalg.cholesky(self.fit.linear_covariance[: self.count, : self.count]))
 
     @cached_property
-    def _about(self) -> tuple[Linear, FloatArray, Normal]:
-        """Linear problem at the best fit, its steps (n, p) of all unknowns to a candidate, equations of the others."""
-        p, problem = self.count, self.found.problem
-        linear = problem.linear(self.found.unknowns)
-        matrix, right = problem.normal(self.found.unknowns, linear)
-        others = Normal(matrix[p:, p:], right[p:])
+    def _linear_problem(self) -> tuple[Linearization, FloatArray, NormalEquations]:
+        """Derivatives at the best fit, steps (n, p) of all parameters to a candidate, equations of the others."""
+        p, problem = self.count, self.fit.problem
+        linear = problem.linearize(self.fit.parameters)
+        matrix, right = problem.normal_equations(self.fit.parameters, linear)
+        others = NormalEquations(matrix[p:, p:], right[p:])
         return linear, np.concatenate([self.root, -others.solve(matrix[p:, :p] @ self.root)]), others
 
     def one_sided(self, z: FloatArray) -> NDArray[np.bool_]:
-        """Which candidates (n,) lie on the best fit's side of no freeplay: the other side is the same again."""
-        names, best = self.found.problem.unknown.names, self.found.unknowns.vehicle
+        """Mask (n,) of candidates with freeplay of the best fit's sign: those of the other sign are the same again."""
+        names, best = self.fit.problem.vehicle_parameters.names, self.fit.parameters.vehicle
         if "freeplay" not in names:
             return np.ones(len(z), dtype=bool)
         k = names.index("freeplay")
         return np.asarray((best[k] + z @ self.root[k]) * best[k] > 0.0)
 
     def vehicles(self, z: FloatArray) -> FloatArray:
-        """Vehicle's unknowns (n, v) of candidates (n, p), those carried along by the linear problem."""
-        names = self.found.problem.unknown.names
-        away = z @ self._about[1][: len(names)].T * self.found.wider[: len(names)]
-        return np.asarray(self.found.unknowns.vehicle + away)
+        """Vehicle's parameters (n, v) of candidates (n, p), nuisance parameters by the linear problem."""
+        names = self.fit.problem.vehicle_parameters.names
+        away = z @ self._linear_problem[1][: len(names)].T * self.fit.sd_factors[: len(names)]
+        return np.asarray(self.fit.parameters.vehicle + away)
 
-    def at(self, z: FloatArray) -> tuple[float, Unknowns]:
-        """Cost of a candidate and all its unknowns."""
-        problem, p = self.found.problem, self.count
-        linear, steps, others = self._about
-        u = self.found.unknowns.moved(steps @ z)
+    def at(self, z: FloatArray) -> tuple[float, Parameters]:
+        """Cost of a candidate and all its parameters."""
+        problem, p = self.fit.problem, self.count
+        linear, steps, others = self._linear_problem
+        u = self.fit.parameters.plus(steps @ z)
         residuals = problem.residuals(u)
         best = residuals.cost, u
         for _ in range(CORRECTIONS):
             if not np.isfinite(residuals.cost):
                 break
-            right = problem.right(u, linear, residuals)
-            u = u.moved(np.concatenate([np.zeros(p), others.solve(right[p:])]))
+            right = problem.right_hand_side(u, linear, residuals)
+            u = u.plus(np.concatenate([np.zeros(p), others.solve(right[p:])]))
             residuals = problem.residuals(u)
             best = min(best, (residuals.cost, u), key=lambda pair: pair[0])
         return best
 
     def refitted(self, z: FloatArray) -> float:
         """Cost of a candidate by new steps of all others, with new derivatives."""
-        problem = self.found.problem
-        held = replace(problem, held=problem.unknown.names[: self.count])
+        problem = self.fit.problem
+        held = replace(problem, held=problem.vehicle_parameters.names[: self.count])
         cost, u = self.at(z)
-        for _ in range(REFIT_STEPS):
-            step = step_from(held, u)
-            u, cost = step.to, min(cost, step.residuals.cost)
-        return cost
+        return min(cost, *(step.residuals.cost for step in descend([held] * REFIT_STEPS, u)))
 
 
-def sample(found: Reconciled, progress: Progress | None = None) -> Posterior:
-    """Sample the few unknowns' posterior; the same fit gives the same samples.
+def sample(fit: JointFit, progress: Progress | None = None) -> Posterior:
+    """Sample the posterior of the parameters sought; the same fit gives the same samples.
 
     Raises
     ------
@@ -159,7 +311,7 @@ def sample(found: Reconciled, progress: Progress | None = None) -> Posterior:
     """
     require_samplers()
     report = progress or (lambda _fraction, _what: None)
-    profile, rng = Profile(found), np.random.default_rng(SEED)
+    profile, rng = Profile(fit), np.random.default_rng(SEED)
     p = profile.count
     candidates = PER_UNKNOWN * p
     where = rng.standard_normal((candidates, p))
@@ -167,39 +319,33 @@ def sample(found: Reconciled, progress: Progress | None = None) -> Posterior:
     where[0] = 0.0
     cost = np.empty(candidates)
     for k, z in enumerate(where):
-        cost[k] = profile.at(z)[0] - found.residuals.cost
+        cost[k] = profile.at(z)[0] - fit.residuals.cost
         report(0.8 * k / candidates, "profile of the posterior")
-    flown = np.isfinite(cost)
-    between = RBFInterpolator(where[flown], cost[flown], kernel="cubic", degree=2)
+    finite = np.isfinite(cost)
+    interpolated = RBFInterpolator(where[finite], cost[finite], kernel="cubic", degree=2)
 
     def log_probability(z: FloatArray) -> FloatArray:
         inside = (np.linalg.norm(z, axis=1) < REACH) & profile.one_sided(z)
-        return np.where(inside, -0.5 * between(z), -np.inf)
+        return np.where(inside, -0.5 * interpolated(z), -np.inf)
 
     report(0.8, "posterior: re-fits")
     away = rng.standard_normal((REFITS, p))
     away *= REFIT_REACH / np.linalg.norm(away, axis=1)[:, None]
-    refit_error = between(away) - [profile.refitted(z) - found.residuals.cost for z in away]
+    refit_error = interpolated(away) - [profile.refitted(z) - fit.residuals.cost for z in away]
     report(0.9, "posterior: emcee")
-    chain, forgot = _walk(log_probability, p, rng)
+    chain, autocorrelation = _walk(log_probability, p, rng)
     report(0.95, "posterior: dynesty")
     volume, volume_sd = _volume(log_probability, p)
-    evidence = found.log_evidence + volume - 0.5 * p * np.log(2.0 * np.pi)
+    evidence = fit.log_evidence + volume - 0.5 * p * np.log(2.0 * np.pi)
     report(1.0, "posterior sampled")
-    return Posterior(found, profile.vehicles(chain), evidence, volume_sd, np.asarray(refit_error), forgot)
+    return Posterior(fit, profile.vehicles(chain), evidence, volume_sd, np.asarray(refit_error), autocorrelation)
 
 
-def quantities(unknown: VehicleUnknowns, x: FloatArray) -> pd.DataFrame:
-    """Return what an engineer asks for, by vehicle's unknowns ``(n, v)``, one row each."""
-    out = pd.DataFrame([_joint(unknown.vehicle(row)) for row in x])
-    for name, column, start, scale in (
-        ("static stability", "static_stability", 1.0, unknown.told.uncertainty.cm),
-        ("freeplay", "freeplay_deg", 0.0, float(np.rad2deg(FREEPLAY_SD_RAD))),
-        ("hardening", "hardening_at_4_deg", 0.0, HARDENING_SD),
-    ):
-        if name in unknown.names:
-            value = start + scale * x[:, unknown.names.index(name)]
-            out[column] = np.abs(value) if name == "freeplay" else value
+def quantities(vehicle_parameters: VehicleParameters, x: FloatArray) -> pd.DataFrame:
+    """Engineering quantities of vehicle parameters ``(n, v)``, one row each."""
+    out = pd.DataFrame([_joint(vehicle_parameters.vehicle(row)) for row in x])
+    for linear in _linear_quantities(vehicle_parameters):
+        out[linear.column] = linear.of(x)
     return out
 
 
@@ -216,44 +362,38 @@ def _joint(vehicle: Vehicle) -> dict[str, float]:
 
 def linear_quantities(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     """Values (q,) of `quantities` at the best fit and their covariance (q, q) by the linear problem."""
-    unknown, x = posterior.found.problem.unknown, posterior.found.unknowns.vehicle
+    vehicle_parameters, x = posterior.fit.problem.vehicle_parameters, posterior.fit.parameters.vehicle
     n = len(x)
     at = np.concatenate([x[None], x + DIFFERENCE * np.eye(n), x - DIFFERENCE * np.eye(n)])
-    values = quantities(unknown, at).to_numpy()
+    values = quantities(vehicle_parameters, at).to_numpy()
     slope = (values[1 : n + 1] - values[n + 1 :]) / (2.0 * DIFFERENCE)
-    return values[0], slope.T @ posterior.found.covariance[:n, :n] @ slope
+    return values[0], slope.T @ posterior.fit.covariance[:n, :n] @ slope
 
 
 def posterior_summary(posterior: Posterior) -> pd.DataFrame:
     """One row a quantity: ``quantity, best, linear_sd, median, sd, low, high`` (90 % interval of the samples)."""
-    table = quantities(posterior.found.problem.unknown, posterior.samples)
+    table = quantities(posterior.fit.problem.vehicle_parameters, posterior.samples)
     best, covariance = linear_quantities(posterior)
     low, median, high = table.quantile([0.05, 0.5, 0.95]).to_numpy()
     out = {"quantity": list(table), "best": best, "linear_sd": np.sqrt(np.diag(covariance)), "median": median}
     return pd.DataFrame({**out, "sd": table.std().to_numpy(), "low": low, "high": high})
 
 
-def sample_all(explained: Explained, progress: Progress) -> tuple[Posterior, dict[str, float]]:
-    """Posterior of the joint found, and log odds by nested sampling of the laws that Laplace's method leaves open."""
-    fits = [explained.found]
-    for law, (lacking, having) in explained.compared.items():
-        if abs(explained.log_odds[law]) < OPEN_ODDS:
+def sample_selection(selection: LawSelection, progress: Progress) -> tuple[Posterior, dict[str, float]]:
+    """Posterior of the selected joint, and log odds by nested sampling where Laplace's method is not decisive."""
+    fits = [selection.fit]
+    for law, (lacking, having) in selection.compared.items():
+        if abs(selection.log_odds[law]) < OPEN_ODDS:
             fits += [fit for fit in (lacking, having) if not any(fit is each for each in fits)]
-    sampled = []
-    for k, fit in enumerate(fits):
+    sampled = [sample(fit, part_of(progress, k / len(fits), (k + 1) / len(fits))) for k, fit in enumerate(fits)]
 
-        def part(fraction: float, what: str, k: int = k) -> None:
-            progress((k + fraction) / len(fits), what)
-
-        sampled.append(sample(fit, part))
-
-    def evidence(fit: Reconciled) -> float:
-        return next((each.log_evidence for each in sampled if each.found is fit), fit.log_evidence)
+    def evidence(fit: JointFit) -> float:
+        return next((each.log_evidence for each in sampled if each.fit is fit), fit.log_evidence)
 
     odds = {
         law: evidence(having) - evidence(lacking)
-        for law, (lacking, having) in explained.compared.items()
-        if abs(explained.log_odds[law]) < OPEN_ODDS
+        for law, (lacking, having) in selection.compared.items()
+        if abs(selection.log_odds[law]) < OPEN_ODDS
     }
     return sampled[0], odds
 
@@ -269,8 +409,8 @@ def _walk(
     seeded = np.random.RandomState(SEED).get_state()
     sampler = emcee.EnsembleSampler(WALKERS, p, log_probability, vectorize=True)
     sampler.run_mcmc(emcee.State(start, random_state=seeded), MOVES)
-    forgot = sampler.get_autocorr_time(tol=0, discard=BURNT)
-    return np.asarray(sampler.get_chain(discard=BURNT, thin=THINNED, flat=True)), float(np.max(forgot))
+    autocorrelation = sampler.get_autocorr_time(tol=0, discard=BURNT)
+    return np.asarray(sampler.get_chain(discard=BURNT, thin=THINNED, flat=True)), float(np.max(autocorrelation))
 
 
 def _volume(log_probability: Callable[[FloatArray], FloatArray], p: int) -> tuple[float, float]:
@@ -281,7 +421,7 @@ def _volume(log_probability: Callable[[FloatArray], FloatArray], p: int) -> tupl
         return REACH * (2.0 * cube - 1.0)
 
     def one(z: FloatArray) -> float:
-        return max(float(log_probability(z[None])[0]), NEVER)
+        return max(float(log_probability(z[None])[0]), LOWEST_LOG)
 
     sampler = dynesty.NestedSampler(one, within, p, nlive=LIVE, rstate=np.random.default_rng(SEED))
     sampler.run_nested(dlogz=LEFT, print_progress=False)

@@ -14,8 +14,8 @@ from pathlib import Path
 from postflight.report.source import Run, read_run
 from postflight.report.write import write_whole
 
-NAME = "notebook.ipynb"
-START = """\
+_NAME = "notebook.ipynb"
+_START = """\
 import json
 from pathlib import Path
 
@@ -31,12 +31,12 @@ telemetry = read_flight(folder)
 summary = json.loads((run / "summary.json").read_text())
 print(telemetry.name, "(synthetic)" if telemetry.synthetic else "", telemetry.t0_utc)
 print(*telemetry.findings, sep="\\n")"""
-SENSORS = """\
+_SENSORS = """\
 records = {"accelerometer": telemetry.accelerometer, "rates": telemetry.rates, **telemetry.radars, **telemetry.gnss,
            **telemetry.barometers}
 rows = [(name, len(r.time_s), r.time_s[0], r.time_s[-1]) for name, r in records.items() if r is not None]
 pd.DataFrame(rows, columns=["sensor", "samples", "from s", "to s"])"""
-TRAJECTORY = """\
+_TRAJECTORY = """\
 bet = pd.read_csv(run / "bet.csv")
 shown = [c for c in ("alt_m", "mach", "dynamic_pressure_pa", "alpha_total_wind_deg") if bet[c].notna().any()]
 figure, axes = plt.subplots(len(shown), 1, sharex=True, figsize=(9, 2 * len(shown)))
@@ -44,15 +44,15 @@ for axis, column in zip(axes, shown):
     axis.plot(bet["t_s"], bet[column])
     if f"{column[:-4]}_sd_deg" in bet and column.endswith("_deg"):
         sd = bet[f"{column[:-4]}_sd_deg"]
-        axis.fill_between(bet["t_s"], bet[column] - 3 * sd, bet[column] + 3 * sd, alpha=0.3)
+        axis.fill_between(bet["t_s"], bet[column] - sd, bet[column] + sd, alpha=0.3)
     axis.set_ylabel(column)
 axes[-1].set_xlabel("t_s")
 pd.read_csv(run / "events.csv")"""
-CONSISTENCY_CHECKS = """\
-verdicts = pd.read_csv(run / "verdicts.csv")
-print(f"{verdicts['passed'].sum()} of {len(verdicts)} pass")
-verdicts"""
-ANSWERS = """\
+_CONSISTENCY_CHECKS = """\
+checks = pd.read_csv(run / "consistency_checks.csv")
+print(f"{checks['passed'].sum()} of {len(checks)} pass")
+checks"""
+_ANSWERS = """\
 answers = pd.DataFrame(summary["methods"]).T
 if answers.empty:
     print("the run asked no estimator; `postflight run` asks all of them")
@@ -65,14 +65,14 @@ else:
     if plt.gca().get_legend_handles_labels()[0]:
         plt.legend()
 answers"""
-PROOF = """\
+_PROOF = """\
 facts = json.loads((run / "run.json").read_text())
 assert facts["inputs_sha256"] == telemetry.hashes, "the telemetry changed since the run"
 print(f"postflight {facts['version']}: results of exactly these {len(telemetry.hashes)} inputs")"""
-AGAIN = """\
+_AGAIN = """\
 ## Going on
 
-The same from the library, to be asked otherwise:
+The same from the library, with other settings:
 
     import postflight as pf
     flight = pf.read_flight(folder)
@@ -91,29 +91,29 @@ def write_notebook(flight_folder: Path, target: Path | None = None) -> Path:
         Where the run cannot be read, or the file not be written.
     """
     run = read_run(flight_folder)
-    target = run.path / NAME if target is None else target
+    target = run.path / _NAME if target is None else target
     away = os.path.relpath(flight_folder.resolve(), target.parent.resolve())
-    write_whole(target, notebook(run, Path(away).as_posix()))
+    write_whole(target, _notebook(run, Path(away).as_posix()))
     return target
 
 
-def notebook(run: Run, folder: str) -> str:
+def _notebook(run: Run, folder: str) -> str:
     """Text of the notebook; ``folder`` is the flight's path from where it lies."""
     title = html.escape(" ".join(run.telemetry.name.split())).replace("[", "\\[").replace("`", "'")
     cells = [
-        ("markdown", f"# {title}\n\nRun `{run.path.name}`. What went in, what came out, and what tests it."),
-        ("code", START.replace("{folder!r}", repr(folder)).replace("{run!r}", repr(run.path.name))),
-        ("markdown", "## What was measured"),
-        ("code", SENSORS),
-        ("markdown", "## The best-estimated trajectory, with three standard deviations"),
-        ("code", TRAJECTORY),
-        ("markdown", "## Verdicts: do residuals and sensors behave as assumed?"),
-        ("code", CONSISTENCY_CHECKS),
-        ("markdown", "## How far the shell bent, and why not where there is no answer"),
-        ("code", ANSWERS),
-        ("markdown", "## The claim: these results are of these inputs"),
-        ("code", PROOF),
-        ("markdown", AGAIN),
+        ("markdown", f"# {title}\n\nRun `{run.path.name}`. Inputs, results and consistency checks."),
+        ("code", _START.replace("{folder!r}", repr(folder)).replace("{run!r}", repr(run.path.name))),
+        ("markdown", "## Measurements"),
+        ("code", _SENSORS),
+        ("markdown", "## Best-estimated trajectory, with one standard deviation"),
+        ("code", _TRAJECTORY),
+        ("markdown", "## Consistency checks: do residuals and sensors behave as assumed?"),
+        ("code", _CONSISTENCY_CHECKS),
+        ("markdown", "## Deflection by method, and the reason where there is none"),
+        ("code", _ANSWERS),
+        ("markdown", "## Provenance: these results are of these inputs"),
+        ("code", _PROOF),
+        ("markdown", _AGAIN),
     ]
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     book = {

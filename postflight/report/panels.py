@@ -1,9 +1,8 @@
-"""Numbers behind the page's time panels: what is drawn over time, with three standard deviations, gaps left as gaps.
+"""What does the report draw over time? Trajectory, deflection, residuals, and the flight against bands of others.
 
-The flight against bands of flights that were flown before it, or beside it: a rigid vehicle's, a study's, others.
-
-A table of bands has a row a time, quantity and label: median and outer percentiles, and a nominal flight where there is
-one. The run's own is the rigid vehicle's; `montecarlo` and `reconcile` write others (``bands.csv``).
+Lines carry their standard deviation ``sd``, which the page draws as a band of three and prints as one; gaps stay gaps.
+A table of bands (``bands.csv``, which `montecarlo` and `reconcile` write, and the run's own rigid vehicle) has a row
+for each time, quantity and label: median, 2.3 and 97.7 percentile, and a nominal flight where there is one.
 """
 
 from __future__ import annotations
@@ -20,84 +19,84 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR
 from postflight.deflections import METHODS
-from postflight.plots.paper_figures import COLOUR, LABEL, residual_unit
+from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, residual_unit
 from postflight.report.source import Rows, Run, kept_rows, rounded
 from postflight.studies.preflight import inside
 
-TRAJECTORY_ROWS, RAW_POINTS, TRACK_POINTS, RESIDUAL_POINTS = 6000, 8000, 6000, 16000
-BLUE, ORANGE, GREEN, GREY, DARK = "#0072B2", "#D55E00", "#009E73", "#8a929a", "#3a4149"
-DASH: dict[str, list[int]] = {"camera": [], "misalignment": [8, 4], "trim": [10, 3, 2, 3], "fused": []}
-NO_ACCELEROMETER = "The flight has no accelerometer."
-NO_ATTITUDE = "Nothing on board carried the attitude, so the angle of attack is not known."
-NO_DEFLECTION = "No method gave a deflection; the reasons stand with the verdicts above."
+_TRAJECTORY_ROWS, _RAW_POINTS, _TRACK_POINTS, _RESIDUAL_POINTS = 6000, 8000, 6000, 16000
+_BLUE, _GREY, _DARK = COLOUR["estimate"], COLOUR["prior"], COLOUR["limit"]
+_DASH: dict[str, list[int]] = {"camera": [], "misalignment": [8, 4], "trim": [10, 3, 2, 3], "fused": []}
+_NO_ACCELEROMETER = "The flight has no accelerometer."
+_NO_ATTITUDE = "No inertial sensors carried the attitude, so the angle of attack is not known."
+NO_DEFLECTION = "No method gave a deflection; the reasons stand on the cards above."
 
 Panel = dict[str, Any]
 # id, title, unit, scale of the column, decimals, and its lines: label, column, its sd, colour, dash
-TRAJECTORY: list[tuple[str, str, str, float, int, list[tuple[str, str, str | None, str, list[int]]]]] = [
-    ("altitude", "Altitude", "km", 1e-3, 4, [("reconstructed", "alt_m", "alt_sd_m", BLUE, [])]),
+_TRAJECTORY: list[tuple[str, str, str, float, int, list[tuple[str, str, str | None, str, list[int]]]]] = [
+    ("altitude", "Altitude", "km", 1e-3, 4, [("reconstructed", "alt_m", "alt_sd_m", _BLUE, [])]),
     ("speed", "Speed", "m/s", 1.0, 2, [
-        ("against the air", "airspeed_mps", "airspeed_sd_mps", BLUE, []),
-        ("against the ground", "speed_ground_mps", None, DARK, [6, 4])]),
-    ("mach", "Mach number", "", 1.0, 4, [("against the air", "mach", "mach_sd", BLUE, [])]),
+        ("airspeed", "airspeed_mps", "airspeed_sd_mps", _BLUE, []),
+        ("ground speed", "speed_ground_mps", None, _DARK, [6, 4])]),
+    ("mach", "Mach number", "", 1.0, 4, [("by airspeed and the sounding's temperature", "mach", "mach_sd", _BLUE, [])]),
     ("pressure", "Dynamic pressure", "Pa", 1.0, 3,
-     [("with the sounding's density", "dynamic_pressure_pa", "dynamic_pressure_sd_pa", BLUE, [])]),
+     [("with the sounding's density", "dynamic_pressure_pa", "dynamic_pressure_sd_pa", _BLUE, [])]),
     ("alpha", "Total angle of attack of the centerbody", "deg", 1.0, 3, [
-        ("against the air", "alpha_total_wind_deg", "alpha_total_wind_sd_deg", BLUE, []),
-        ("without wind", "alpha_total_ground_deg", None, DARK, [6, 4])]),
-    ("axial", "Acceleration along the axis (body x)", "m/s²", 1.0, 4,
-     [("x, corrected, mean of 0.1 s", "ax_imu_mps2", "ax_imu_sd_mps2", BLUE, [])]),
-    ("lateral", "Accelerations across the axis (body y, z)", "m/s²", 1.0, 4, [
-        ("y, corrected", "ay_imu_mps2", "ay_imu_sd_mps2", ORANGE, []),
-        ("z, corrected", "az_imu_mps2", "az_imu_sd_mps2", GREEN, [6, 3])]),
+        ("wind-relative", "alpha_total_wind_deg", "alpha_total_wind_sd_deg", _BLUE, []),
+        ("without wind", "alpha_total_ground_deg", None, _DARK, [6, 4])]),
+    ("axial", "Axial acceleration (body x)", "m/s²", 1.0, 4,
+     [("x, corrected, mean of 0.1 s", "ax_imu_mps2", "ax_imu_sd_mps2", _BLUE, [])]),
+    ("lateral", "Normal accelerations (body y, z)", "m/s²", 1.0, 4, [
+        ("y, corrected", "ay_imu_mps2", "ay_imu_sd_mps2", AXES["y"], []),
+        ("z, corrected", "az_imu_mps2", "az_imu_sd_mps2", AXES["z"], [6, 3])]),
 ]  # fmt: skip
-WHY_ABSENT = {"alpha": NO_ATTITUDE, "axial": NO_ACCELEROMETER, "lateral": NO_ACCELEROMETER}
-FLOOR = {"speed", "mach", "pressure", "alpha", "deflection"}
+_WHY_ABSENT = {"alpha": _NO_ATTITUDE, "axial": _NO_ACCELEROMETER, "lateral": _NO_ACCELEROMETER}
+_FLOOR = {"speed", "mach", "pressure", "alpha", "deflection"}
 
 
-def line(
+def _line(
     label: str, values: FloatArray, sd: FloatArray | None, colour: str, dash: list[int], decimals: int
 ) -> dict[str, Any]:
-    """One line of a panel; ``sd`` becomes a band of three."""
+    """One line of a panel with its standard deviation where it is known."""
     out: dict[str, Any] = {"label": label, "y": rounded(values, decimals), "colour": colour, "dash": dash, "width": 1.6}
     if sd is not None and np.isfinite(sd).any():
-        out["sd3"] = rounded(3.0 * sd, decimals)
+        out["sd"] = rounded(sd, decimals)
     return out
 
 
 def trajectory_rows(run: Run) -> Rows:
     """Rows of ``bet.csv`` that are drawn."""
     bet = run.tables["bet"]
-    shown = [column for *_, lines in TRAJECTORY for _, column, *_ in lines]
-    return kept_rows([bet[c].to_numpy(float) for c in shown], TRAJECTORY_ROWS)
+    shown = [column for *_, lines in _TRAJECTORY for _, column, *_ in lines]
+    return kept_rows([bet[c].to_numpy(float) for c in shown], _TRAJECTORY_ROWS)
 
 
-def trajectory_panels(run: Run, rows: Rows) -> tuple[list[Panel], list[tuple[str, str]]]:
-    """Panels of the trajectory, and title and reason of those that the flight has no data for."""
+def trajectory_panels(run: Run, rows: Rows) -> tuple[list[Panel], list[tuple[str, str, str]]]:
+    """Panels of the trajectory, and id, title and reason of those that the flight has no data for."""
     bet = run.tables["bet"].iloc[rows]
-    raw = {"altitude": heights(run)} | samples(run)
+    raw = {"altitude": _tracker_heights(run)} | _raw_accelerations(run)
     panels, absent = [], []
-    for name, title, unit, scale, decimals, told in TRAJECTORY:
+    for name, title, unit, scale, decimals, drawn in _TRAJECTORY:
         lines = []
-        for label, column, sd_column, colour, dash in told:
+        for label, column, sd_column, colour, dash in drawn:
             if bet[column].notna().any():
                 sd = None if sd_column is None else scale * bet[sd_column].to_numpy(float)
-                lines.append(line(label, scale * bet[column].to_numpy(float), sd, colour, dash, decimals))
+                lines.append(_line(label, scale * bet[column].to_numpy(float), sd, colour, dash, decimals))
         if lines:
-            panels.append(panel(name, title, unit, "bet", lines, raw.get(name, [])))
+            panels.append(_panel(name, title, unit, "bet", lines, raw.get(name, [])))
         else:
-            absent.append((title, WHY_ABSENT.get(name, "The run's table holds no value of it.")))
+            absent.append((name, title, _WHY_ABSENT.get(name, "The run's table holds no value of it.")))
     return panels, absent
 
 
-def panel(
+def _panel(
     name: str, title: str, unit: str, time: str | None, lines: list[dict[str, Any]], raw: list[dict[str, Any]]
 ) -> Panel:
     """One panel; lines hold times of their own where ``time`` is None."""
     out: Panel = {"id": name, "title": title, "unit": unit, "time": time, "lines": lines, "raw": raw}
-    return out | {"floor": 0} if name in FLOOR else out
+    return out | {"floor": 0} if name in _FLOOR else out
 
 
-def heights(run: Run) -> list[dict[str, Any]]:
+def _tracker_heights(run: Run) -> list[dict[str, Any]]:
     """Heights by each tracker's own points, as measured."""
     tracks: list[tuple[str, FloatArray, FloatArray]] = []
     for name, radar in run.telemetry.radars.items():
@@ -107,20 +106,23 @@ def heights(run: Run) -> list[dict[str, Any]]:
     tracks += [(name, fixes.time_s, fixes.position_ecef_m) for name, fixes in run.telemetry.gnss.items()]
     known = [(name, t, earth.geodetic_from_ecef(places)[2]) for name, t, places in tracks]
     known += [(name, b.time_s, b.height_m) for name, b in run.telemetry.barometers.items()]
-    return [points(name, t, h / 1e3, GREY, 4, TRACK_POINTS // len(known)) for name, t, h in known]
+    return [_points(name, t, h / 1e3, _GREY, 4, _TRACK_POINTS // len(known)) for name, t, h in known]
 
 
-def samples(run: Run) -> dict[str, list[dict[str, Any]]]:
-    """Accelerometer's samples, turned into body axes and not corrected, by panel."""
+def _raw_accelerations(run: Run) -> dict[str, list[dict[str, Any]]]:
+    """Accelerometer's samples in body axes, not corrected, by panel."""
     record = run.telemetry.accelerometer
     if record is None:
         return {}
     body = record.measured_sensor @ record.spec.dcm_body_sensor.T
-    x, y, z = (points(f"raw {a}", record.time_s, body[:, k], GREY, 3, RAW_POINTS) for k, a in enumerate("xyz"))
-    return {"axial": [x], "lateral": [y | {"colour": "#e5a06b"}, z | {"colour": "#7fc4ad"}]}
+    x, y, z = (
+        _points(f"raw {axis}", record.time_s, body[:, k], colour, 3, _RAW_POINTS)
+        for k, (axis, colour) in enumerate(RAW_AXES.items())
+    )
+    return {"axial": [x], "lateral": [y, z]}
 
 
-def points(label: str, time_s: FloatArray, values: FloatArray, colour: str, decimals: int, limit: int) -> Panel:
+def _points(label: str, time_s: FloatArray, values: FloatArray, colour: str, decimals: int, limit: int) -> Panel:
     """Dots at times of their own, thinned to ``limit`` with every extreme kept; NaN left out."""
     known = np.isfinite(values)
     time_s, values = time_s[known], values[known]
@@ -157,14 +159,14 @@ def deflection_panel(run: Run) -> Panel | None:
         t, (theta, sd) = with_holes(
             table["t_s"].to_numpy(), [table[c].to_numpy(float) for c in ("theta_deg", "theta_sd_deg")]
         )
-        rows = kept_rows([theta], TRAJECTORY_ROWS // 2)
-        one = line(LABEL[method], theta[rows], sd[rows], COLOUR[method], DASH[method], 4)
-        # pictures are few: each is a dot, which also tells the line apart without colours
+        rows = kept_rows([theta], _TRAJECTORY_ROWS // 2)
+        one = _line(LABEL[method], theta[rows], sd[rows], COLOUR[method], _DASH[method], 4)
+        # frames are few: each is a dot, which also sets the line apart without colours
         one["dots"] = method == "camera"
         lines.append(one | {"t": rounded(t[rows], 4), "width": 3.4 if method == "fused" else 1.4})
     if not lines:
         return None
-    out = panel("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, [])
+    out = _panel("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, [])
     return out | {"ceiling": round(1.3 * max(max(x for x in one["y"] if x is not None) for one in lines), 2)}
 
 
@@ -182,7 +184,7 @@ def residual_panels(run: Run) -> list[Panel]:
         scale, unit = residual_unit(component)
         r, sd = (scale * rows[c].to_numpy(float) for c in ("residual", "predicted_sd"))
         good = rows["accepted"].to_numpy(bool)
-        kept = kept_rows([r, np.where(good, np.nan, r)], RESIDUAL_POINTS // len(pairs))
+        kept = kept_rows([r, np.where(good, np.nan, r)], _RESIDUAL_POINTS // len(pairs))
         gate = float(np.sqrt(chi2.ppf(chance, int(rows["together"].max()))))
         out.append(
             {"id": f"residual_{len(out)}", "title": f"{source}: {component}", "unit": unit, "gate": round(gate, 3),
@@ -193,23 +195,23 @@ def residual_panels(run: Run) -> list[Panel]:
     return out
 
 
-FILE = "bands.csv"
-LOW, MIDDLE, HIGH = "p2.3", "p50", "p97.7"
-COLOURS = (GREY, ORANGE, GREEN, DARK)
+_FILE = "bands.csv"
+_LOW, _MIDDLE, _HIGH = "p2.3", "p50", "p97.7"
+_COLOURS = (_GREY, COLOUR["second"], COLOUR["corrected"], _DARK)
 # quantity of a band: title, unit, and the flight's own from bet.csv
-FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
+_FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "alpha_total_deg": ("Total angle of attack", "deg", lambda bet: bet["alpha_total_wind_deg"]),
     "normal_g": (
-        "Acceleration across the axis at the c.g.",
+        "Normal acceleration at the c.g.",
         "g",
         lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / earth.STANDARD_GRAVITY_MPS2,
     ),
     "axial_g": (
-        "Acceleration along the axis at the c.g.",
+        "Axial deceleration at the c.g.",
         "g",
         lambda bet: -bet["ax_cg_mps2"] / earth.STANDARD_GRAVITY_MPS2,
     ),
-    "rate_degps": ("Rate across the axis", "deg/s", lambda bet: np.hypot(bet["q_body_degps"], bet["r_body_degps"])),
+    "rate_degps": ("Lateral rate", "deg/s", lambda bet: np.hypot(bet["q_body_degps"], bet["r_body_degps"])),
     "dynamic_pressure_pa": ("Dynamic pressure", "Pa", lambda bet: bet["dynamic_pressure_pa"]),
     "mach": ("Mach number", "", lambda bet: bet["mach"]),
     "altitude_m": ("Altitude", "m", lambda bet: bet["alt_m"]),
@@ -223,10 +225,10 @@ def rigid_panels(run: Run) -> list[Panel]:
         return []
     parts = []
     for quantity, unit in (("alpha_total", "deg"), ("normal", "g")):
-        columns = {LOW: "low", MIDDLE: "median", HIGH: "high", "nominal": "nominal"}
+        columns = {_LOW: "low", _MIDDLE: "median", _HIGH: "high", "nominal": "nominal"}
         part = {new: bounds[f"{quantity}_{old}_{unit}"] for new, old in columns.items()}
         parts.append(pd.DataFrame({"quantity": f"{quantity}_{unit}", "time_s": bounds["t_s"], **part}))
-    return panels(run, pd.concat(parts).assign(label="rigid"), "rigid")
+    return _band_panels(run, pd.concat(parts).assign(label="rigid"), "rigid")
 
 
 def study_panels(run: Run, paths: tuple[Path, ...]) -> list[Panel]:
@@ -239,29 +241,29 @@ def study_panels(run: Run, paths: tuple[Path, ...]) -> list[Panel]:
     """
     if not paths:
         return []
-    return panels(run, pd.concat([read_bands(path) for path in paths]), "bands")
+    return _band_panels(run, pd.concat([_read_bands(path) for path in paths]), "bands")
 
 
-def read_bands(path: Path) -> pd.DataFrame:
+def _read_bands(path: Path) -> pd.DataFrame:
     """Read the bands of a folder, or of a file of its own: label, quantity, time, percentiles and nominal."""
-    file = path / FILE if path.is_dir() else path
+    file = path / _FILE if path.is_dir() else path
     try:
         table = pd.read_csv(file).rename(columns={"history": "quantity", "joint": "label"})
-        numbers = table[["time_s", LOW, MIDDLE, HIGH]].astype(float)
+        numbers = table[["time_s", _LOW, _MIDDLE, _HIGH]].astype(float)
     except FileNotFoundError:
         where = "`postflight montecarlo run` and `postflight reconcile` write them"
-        raise GateError(f"{path}: no bands ({FILE}) here; {where}") from None
+        raise GateError(f"{path}: no bands ({_FILE}) here; {where}", "bands-missing") from None
     except (ValueError, KeyError, OSError) as fault:
-        raise GateError(f"{file}: no table of bands: {fault}") from None
+        raise GateError(f"{file}: no table of bands: {fault}", "bands-unreadable") from None
     if "quantity" not in table or not len(table):
         words = "name histories in the dispersions file's [outputs] and merge the study again"
-        raise GateError(f"{file}: holds no band of any quantity; {words}")
+        raise GateError(f"{file}: holds no band of any quantity; {words}", "bands-empty")
     label = table["label"].astype(str) if "label" in table else path.resolve().name
     nominal = table["nominal"].astype(float) if "nominal" in table else np.nan
     return numbers.assign(label=label, quantity=table["quantity"].astype(str), nominal=nominal)
 
 
-def panels(run: Run, bands: pd.DataFrame, prefix: str) -> list[Panel]:
+def _band_panels(run: Run, bands: pd.DataFrame, prefix: str) -> list[Panel]:
     """One panel for each quantity that the flight has too, with the bands of every label."""
     bet = run.tables["bet"]
     span = bands["time_s"].min(), bands["time_s"].max()
@@ -274,8 +276,8 @@ def panels(run: Run, bands: pd.DataFrame, prefix: str) -> list[Panel]:
             title, unit = "Deflection of the aeroshell (fusion)", "deg"
             t, flown = fused["t_s"].to_numpy(), fused["theta_deg"].to_numpy()
             inner = np.interp(t, bet["t_s"], pulse) > 0.5
-        elif quantity in FLOWN:
-            title, unit, own = FLOWN[str(quantity)]
+        elif quantity in _FLOWN:
+            title, unit, own = _FLOWN[str(quantity)]
             t, flown, inner = bet["t_s"].to_numpy()[shown], np.asarray(own(bet[shown]), dtype=float), pulse[shown]
         else:
             continue
@@ -283,43 +285,46 @@ def panels(run: Run, bands: pd.DataFrame, prefix: str) -> list[Panel]:
             continue
         lines, top = [], float(np.nanmax(flown))
         for k, (label, band) in enumerate(of_quantity.groupby("label", sort=False)):
-            share = share_inside(t[inner], flown[inner], band)
+            share = _share_inside(t[inner], flown[inner], band)
             if np.isfinite(share):
-                lines += band_lines(str(label), band, share, COLOURS[k % len(COLOURS)])
-                top = max(top, float(np.nanmax(band[MIDDLE])))
+                lines += _band_lines(str(label), band, share, _COLOURS[k % len(_COLOURS)])
+                top = max(top, float(np.nanmax(band[_MIDDLE])))
         if lines:
-            kept = kept_rows([flown], TRAJECTORY_ROWS)
-            lines.append(line("this flight", flown[kept], None, BLUE, [], 4) | {"t": rounded(t[kept], 3)})
+            kept = kept_rows([flown], _TRAJECTORY_ROWS)
+            lines.append(_line("this flight", flown[kept], None, _BLUE, [], 4) | {"t": rounded(t[kept], 3)})
             # a rigid vehicle may tumble late, out of what is of interest here
-            one = panel(f"{prefix}_{quantity}", title, unit, None, lines, [])
+            one = _panel(f"{prefix}_{quantity}", title, unit, None, lines, [])
             out.append(one | {"ceiling": round(1.5 * top, 2)} | ({"floor": 0} if unit in ("deg", "g") else {}))
     if not out:
         raise GateError(
             f"bands of {', '.join(sorted(set(bands['quantity'])))} from {span[0]:.0f} to {span[1]:.0f} s: none of a "
-            f"quantity ({', '.join([*FLOWN, 'deflection_deg'])}) and time of this flight's pulse"
+            f"quantity ({', '.join([*_FLOWN, 'deflection_deg'])}) and time of this flight's pulse",
+            "bands-of-another-flight",
         )
     return out
 
 
-def share_inside(time_s: FloatArray, flown: FloatArray, band: pd.DataFrame) -> float:
+def _share_inside(time_s: FloatArray, flown: FloatArray, band: pd.DataFrame) -> float:
     """Part of the flight's samples, of those at the band's times, that lie inside; NaN where there is none."""
     t = band["time_s"].to_numpy()
     known = np.isfinite(flown) & (time_s >= t[0]) & (time_s <= t[-1])
     if not known.any():
         return float("nan")
-    low, high = band[LOW].to_numpy(), band[HIGH].to_numpy()
+    low, high = band[_LOW].to_numpy(), band[_HIGH].to_numpy()
     return float(np.mean(inside(time_s[known], flown[known], t, low, high)))
 
 
-def band_lines(label: str, band: pd.DataFrame, share: float, colour: str) -> list[dict[str, Any]]:
+def _band_lines(label: str, band: pd.DataFrame, share: float, colour: str) -> list[dict[str, Any]]:
     """Median with its band, and the nominal flight where there is one."""
     t = rounded(band["time_s"].to_numpy(), 3)
-    low, middle, high = (rounded(band[c].to_numpy(), 4) for c in (LOW, MIDDLE, HIGH))
-    words = f"{label}, half above; {100 * share:.0f} % of the pulse inside"
+    low, middle, high = (rounded(band[c].to_numpy(), 4) for c in (_LOW, _MIDDLE, _HIGH))
+    words = f"{label}, median; {100 * share:.0f} % of the pulse inside"
     lines = [
         {"label": words, "t": t, "y": middle, "low": low, "high": high, "colour": colour, "dash": [], "width": 1.2}
     ]
     if band["nominal"].notna().any():
         nominal = rounded(band["nominal"].to_numpy(), 4)
-        lines.append({"label": f"{label}, nominal", "t": t, "y": nominal, "colour": DARK, "dash": [2, 3], "width": 1.2})
+        lines.append(
+            {"label": f"{label}, nominal", "t": t, "y": nominal, "colour": _DARK, "dash": [2, 3], "width": 1.2}
+        )
     return lines

@@ -1,6 +1,7 @@
-"""The film strip: frames of the onboard video with the virtual camera laid over, as JPEG.
+"""What does the report show of video and vehicle? Onboard frames with the virtual camera over them; the 3-D view.
 
-The vehicle as polygons for the page's 3-D view, and how it lay in the air at every time drawn.
+The vehicle is polygons in body axes, undeflected, with the deflection and the relative wind at every time drawn; the
+page rotates the aeroshell about the joint itself.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory, lv_direction
 from flightmodel.film import Image
 from flightmodel.geometry import aft_profile, forward_profile, revolved, rim_curve
 from flightmodel.vehicle import Vehicle
-from postflight.plots.run_figures import bending_at, oriented_camera
+from postflight.plots.overlay import deflection_at, oriented_camera
 from postflight.report.source import Rows, Run, rounded
 
-FRAMES, WIDTH_PX, DASH_PX = 12, 480, 12
+_FRAMES, _WIDTH_PX, _DASH_PX = 12, 480, 12
 QUALITIES, LARGEST_CHARACTERS = (78, 60, 40, 20), 600_000  # the whole strip stays below, or has the last quality
 
 
@@ -35,12 +36,12 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
         return []
     answered = np.searchsorted(frames.time_s, table["t_s"] - 1e-6)
     largest = int(answered[int(table["theta_deg"].argmax())])
-    picks = np.linspace(answered[0], answered[-1], FRAMES).round().astype(int).tolist()
+    picks = np.linspace(answered[0], answered[-1], _FRAMES).round().astype(int).tolist()
     time_s, theta_deg, plane_deg = (table[name].to_numpy() for name in ("t_s", "theta_deg", "plane_lv_deg"))
     history = DeflectionHistory(time_s, np.deg2rad(theta_deg), np.deg2rad(plane_deg), None, "camera", "")
     oriented, benchmark = oriented_camera(run.telemetry, history)
     overlay = Overlay(oriented.view, run.telemetry.required_vehicle().meshes)
-    before = horizon_row(oriented.view, *bending_at(history, float(frames.time_s[benchmark])))
+    before = horizon_row(oriented.view, *deflection_at(history, float(frames.time_s[benchmark])))
     chosen = sorted({*_without_near(picks, (benchmark, largest)), benchmark, largest})
     rows = dict(zip(answered.tolist(), table.itertuples(index=False), strict=True))
     out: list[dict[str, Any]] = []
@@ -48,26 +49,26 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
     for k, image in zip(chosen, frames.pictures(chosen), strict=True):
         if image.size == 0:
             continue
-        said: dict[str, Any] = {"t": round(float(frames.time_s[k]), 4), "benchmark": k == benchmark}
-        said |= {"largest": k == largest, "theta": None, "sd": None}
+        frame: dict[str, Any] = {"t": round(float(frames.time_s[k]), 4), "benchmark": k == benchmark}
+        frame |= {"largest": k == largest, "theta": None, "sd": None}
         if k in rows:
             theta, plane = np.deg2rad([rows[k].theta_deg, rows[k].plane_lv_deg])
             picture = overlay.blended(image, float(theta), float(plane))
-            picture = dashed_row(picture, before)
+            picture = _dashed_row(picture, before)
             draw_row(picture, horizon_row(oriented.view, float(theta), float(plane)), YELLOW)
-            said |= {"theta": round(rows[k].theta_deg, 3), "sd": round(rows[k].theta_sd_deg, 3)}
+            frame |= {"theta": round(rows[k].theta_deg, 3), "sd": round(rows[k].theta_sd_deg, 3)}
         else:
             picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
-        out.append(said)
+        out.append(frame)
         drawn.append(picture)
-    return [said | {"jpeg": text} for said, text in zip(out, jpegs(drawn), strict=True)]
+    return [frame | {"jpeg": text} for frame, text in zip(out, jpegs(drawn), strict=True)]
 
 
-def dashed_row(picture: Image, row: int) -> Image:
+def _dashed_row(picture: Image, row: int) -> Image:
     """Picture with the grey line in dashes, so that it stands apart from the yellow one without colours."""
     drawn = picture.copy()
     draw_row(drawn, row, GREY)
-    dash = (np.arange(picture.shape[1]) // DASH_PX % 2 == 0)[None, :, None]
+    dash = (np.arange(picture.shape[1]) // _DASH_PX % 2 == 0)[None, :, None]
     return np.where(dash, drawn, picture)
 
 
@@ -82,20 +83,20 @@ def _without_near(picks: list[int], wanted: tuple[int, ...]) -> list[int]:
 def jpegs(pictures: list[Image]) -> list[str]:
     """Data URIs of RGB pictures ``(h, w, 3)``, as fine as lets all of them together stay small."""
     small = [narrowed(picture) for picture in pictures]
-    told: list[str] = []
+    out: list[str] = []
     for quality in QUALITIES:
-        told = [jpeg(picture, quality) for picture in small]
-        if sum(map(len, told)) <= LARGEST_CHARACTERS:
+        out = [jpeg(picture, quality) for picture in small]
+        if sum(map(len, out)) <= LARGEST_CHARACTERS:
             break
-    return told
+    return out
 
 
 def narrowed(picture: Image) -> Image:
-    """Picture made ``WIDTH_PX`` wide where it is wider."""
+    """Picture made ``_WIDTH_PX`` wide where it is wider."""
     height, width = picture.shape[:2]
-    if width <= WIDTH_PX:
+    if width <= _WIDTH_PX:
         return picture
-    size = (WIDTH_PX, round(height * WIDTH_PX / width))
+    size = (_WIDTH_PX, round(height * _WIDTH_PX / width))
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
@@ -105,29 +106,29 @@ def jpeg(picture: Image, quality: int) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
 
 
-LEAST_SECTIONS, POINTS_PER_TORUS, CONE_PIECES, POSES = 48, 7, 8, 3000
+_LEAST_SECTIONS, _POINTS_PER_TORUS, _CONE_PIECES, _POSES = 48, 7, 8, 3000
 
 
 def solid(vehicle: Vehicle) -> dict[str, Any]:
-    """Vertices, mm in body axes of the unbent vehicle, and quadrangles of aft side, forward skin and centerbody.
+    """Vertices, mm in body axes of the undeflected vehicle, and quadrangles of aft side, forward skin and centerbody.
 
     Seen from outside, a quadrangle's vertices go round against the clock.
     """
     geometry = vehicle.geometry
-    per_gore = max(1, -(-LEAST_SECTIONS // geometry.gore_count))
+    per_gore = max(1, -(-_LEAST_SECTIONS // geometry.gore_count))
     sections = per_gore * geometry.gore_count
-    aft = aft_profile(geometry, POINTS_PER_TORUS)
+    aft = aft_profile(geometry, _POINTS_PER_TORUS)
     forward = forward_profile(geometry)
-    forward = np.concatenate([forward[:-1], np.linspace(forward[-2], forward[-1], CONE_PIECES + 1)[1:]])
+    forward = np.concatenate([forward[:-1], np.linspace(forward[-2], forward[-1], _CONE_PIECES + 1)[1:]])
     # the centerbody shows where it comes out of the shell; it ends in a lid
-    stations = np.linspace(aft[0, 0], geometry.centerbody_length_m, CONE_PIECES)
-    body = np.column_stack([stations, np.full(CONE_PIECES, geometry.centerbody_radius_m)])
+    stations = np.linspace(aft[0, 0], geometry.centerbody_length_m, _CONE_PIECES)
+    body = np.column_stack([stations, np.full(_CONE_PIECES, geometry.centerbody_radius_m)])
     body = np.concatenate([body, [[geometry.centerbody_length_m, 0.0]]])
     return {
-        "aft": surface(aft[::-1], sections)
+        "aft": _surface(aft[::-1], sections)
         | {"gores": np.repeat(np.arange(sections) // per_gore, len(aft) - 1).tolist()},
-        "forward": surface(forward, sections),
-        "centerbody": surface(body, sections),
+        "forward": _surface(forward, sections),
+        "centerbody": _surface(body, sections),
         "rim": _mm(rim_curve(geometry, np.linspace(0.0, 2.0 * np.pi, 73))),
         "joint": round(1e3 * vehicle.joint.station_m),
         "length": round(1e3 * geometry.centerbody_length_m),
@@ -135,7 +136,7 @@ def solid(vehicle: Vehicle) -> dict[str, Any]:
     }
 
 
-def surface(profile_station_radius_m: FloatArray, sections: int) -> dict[str, Any]:
+def _surface(profile_station_radius_m: FloatArray, sections: int) -> dict[str, Any]:
     """Surface of revolution of a meridian that has the vehicle on its right, going out from the nose or aft."""
     clocks = 2.0 * np.pi * np.arange(sections) / sections
     m, faces = len(profile_station_radius_m), []
@@ -150,28 +151,28 @@ def _mm(points_m: FloatArray) -> list[list[int]]:
 
 
 def poses(run: Run, rows: Rows) -> dict[str, Any]:
-    """Bending vector (body y, z, deg) by the best method, and where the air comes from (body y, z, deg), over time.
+    """Deflection (body y, z, deg) by the best method, and direction of the relative wind (body y, z, deg), over time.
 
     Vectors, so that a page may draw straight lines between them where clocking angles would wrap.
     """
     bet = run.tables["bet"].iloc[rows]
     known = bet["alpha_total_wind_deg"].notna()
-    thin = thinned(bet[known])
+    thin = _thinned(bet[known])
     out: dict[str, Any] = {
         "flow": {"t": rounded(thin["t_s"].to_numpy(), 3)} | _lateral(thin["alpha_total_wind_deg"], thin["clock_lv_deg"])
     }
     method = best_method(run)
     if method is not None:
-        table = thinned(run.tables[f"deflection_{method}"])
+        table = _thinned(run.tables[f"deflection_{method}"])
         t = table["t_s"].to_numpy()
-        out["bend"] = {"t": rounded(t, 3), "method": method, "hole": hole_s(t)}
-        out["bend"] |= _lateral(table["theta_deg"], table["plane_lv_deg"])
+        out["deflection"] = {"t": rounded(t, 3), "method": method, "hole": hole_s(t)}
+        out["deflection"] |= _lateral(table["theta_deg"], table["plane_lv_deg"])
     return out
 
 
-def thinned(table: pd.DataFrame) -> pd.DataFrame:
-    """Rows at equal steps, at most ``POSES``."""
-    return table.iloc[:: -(-len(table) // POSES) or 1]
+def _thinned(table: pd.DataFrame) -> pd.DataFrame:
+    """Rows at equal steps, at most ``_POSES``."""
+    return table.iloc[:: -(-len(table) // _POSES) or 1]
 
 
 def hole_s(time_s: FloatArray) -> float:
@@ -185,8 +186,8 @@ def _lateral(size: Any, clock: Any) -> dict[str, list[float | None]]:
 
 
 def best_method(run: Run) -> str | None:
-    """Fusion, or else the method that is surest at peak dynamic pressure; None where none answers there."""
-    told = {name: m for name, m in run.summary["methods"].items() if m["deflection_deg"] is not None}
-    if "fused" in told:
+    """Fusion, or else the method with the smallest sd at peak dynamic pressure; None where none answers there."""
+    answers = {name: m for name, m in run.summary["methods"].items() if m["deflection_deg"] is not None}
+    if "fused" in answers:
         return "fused"
-    return min(told, key=lambda name: told[name]["sd_deg"], default=None)
+    return min(answers, key=lambda name: answers[name]["sd_deg"], default=None)

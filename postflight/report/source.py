@@ -1,6 +1,6 @@
-"""What is at hand for a report: a finished run's files, and the telemetry that they were made from.
+"""What is a report made from? A finished run's files, the telemetry behind them, and the rows of them to draw.
 
-Fewer points for the eye: what is drawn of long series, with every extreme kept.
+Of long series the smallest and the largest value of each of equal runs of rows are drawn: every extreme stays.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Telemetry
 from postflight.run_folder import newest_run, run_hash
 
-NEEDED = ("bet", "events", "peaks", "residuals", "verdicts", "findings")
+_NEEDED = ("bet", "events", "peaks", "residuals", "verdicts", "findings")
+_CHECKS = ("name", "value", "low", "high", "passed", "remark", "code")
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,14 @@ class Run:
         """What stands for inputs, settings and version in the folder's name."""
         return run_hash(self.facts["inputs_sha256"], self.facts["settings"], self.facts["version"])
 
+    @property
+    def checks(self) -> pd.DataFrame:
+        """Consistency checks; of a run of version 0.1 those of ``verdicts.csv``, without codes."""
+        table = self.tables.get("consistency_checks")
+        if table is None:
+            table = self.tables["verdicts"].rename(columns={"words": "remark"})
+        return table[[name for name in _CHECKS if name in table]]
+
     def peak(self, name: str) -> pd.Series | None:
         """Row of ``peaks.csv``; None where the flight has none of that name."""
         rows = self.tables["peaks"][self.tables["peaks"]["peak"] == name]
@@ -58,7 +67,7 @@ class Run:
 
 
 def read_run(flight_folder: Path, path: Path | None = None, telemetry: Telemetry | None = None) -> Run:
-    """Read a run, the newest unless told, and its telemetry unless it is at hand.
+    """Read a run, the newest unless one is named, and its telemetry unless it is at hand.
 
     Raises
     ------
@@ -68,19 +77,21 @@ def read_run(flight_folder: Path, path: Path | None = None, telemetry: Telemetry
     path = newest_run(flight_folder) if path is None else path
     again = f"use `postflight run {flight_folder}` again"
     try:
-        told = [json.loads((path / f"{name}.json").read_text()) for name in ("summary", "run", "bet_header")]
+        summary, facts, header = (
+            json.loads((path / f"{name}.json").read_text()) for name in ("summary", "run", "bet_header")
+        )
         tables = {p.stem: pd.read_csv(p) for p in sorted(path.glob("*.csv"))}
     except (FileNotFoundError, ValueError) as fault:
-        raise GateError(f"{path}: not a whole run ({fault}); {again}") from None
-    missing = [f"{name}.csv" for name in NEEDED if name not in tables]
+        raise GateError(f"{path}: not a whole run ({fault}); {again}", "run-incomplete") from None
+    missing = [f"{name}.csv" for name in _NEEDED if name not in tables]
     if missing:
-        raise GateError(f"{path}: not a whole run, without {', '.join(missing)}; {again}")
+        raise GateError(f"{path}: not a whole run, without {', '.join(missing)}; {again}", "run-incomplete")
     telemetry = read_flight(flight_folder) if telemetry is None else telemetry
-    summary, facts, header = told
     then, now = facts["inputs_sha256"], telemetry.hashes
     changed = sorted(name for name in then.keys() | now.keys() if then.get(name) != now.get(name))
     if changed:
-        raise GateError(f"{flight_folder}: changed since the run {path.name}: {', '.join(changed)}; {again}")
+        words = f"{flight_folder}: changed since the run {path.name}: {', '.join(changed)}; {again}"
+        raise GateError(words, "inputs-changed")
     return Run(telemetry, path, summary, facts, header, tables)
 
 

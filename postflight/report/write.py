@@ -14,10 +14,11 @@ from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import writing
+from flightmodel.checks import write_file, writing
 from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
-from postflight.report import pictures, words
+from postflight.plots.style import COLOUR, PAGE
+from postflight.report import pictures, text
 from postflight.report.panels import (
     NO_DEFLECTION,
     deflection_panel,
@@ -28,13 +29,12 @@ from postflight.report.panels import (
     trajectory_rows,
 )
 from postflight.report.source import Run, read_run, rounded
-from postflight.run_folder import write_file
 
-NAME = "report.html"
+_NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
 STYLES = ("uPlot.min.css", "page.css")
 # what a script element must not hold literally: its own end, a comment's start, and line ends of JavaScript alone
-ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
+_ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
 
 def write_report(
@@ -54,15 +54,15 @@ def write_report(
         Where the run cannot be read, or the file not be written.
     """
     run = read_run(flight_folder, path, telemetry)
-    target = run.path / NAME if target is None else target
+    target = run.path / _NAME if target is None else target
     write_whole(target, page(run, studies))
     return target
 
 
-def write_whole(target: Path, text: str) -> None:
+def write_whole(target: Path, content: str) -> None:
     """Write a file that appears at once, or a `GateError` with its name."""
     with writing(target, "name another place with --output"):
-        write_file(target, text)
+        write_file(target, content)
 
 
 def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
@@ -70,9 +70,10 @@ def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
     here = files("postflight.report").joinpath("page")
     read = lambda name: here.joinpath(name).read_text(encoding="utf-8")  # noqa: E731
     script = "\n".join(read(name) for name in SCRIPTS)
-    style = "\n".join(read(name) for name in STYLES)
+    variables = " ".join(f"--{name}: {value};" for name, value in PAGE.items())
+    style = "\n".join([f":root {{ {variables} }}", *(read(name) for name in STYLES)])
     frames = pictures.film_strip(run)
-    data, absent = numbers(run, frames, studies)
+    data, absent = _numbers(run, frames, studies)
     environment = Environment(
         loader=DictLoader({"page": read("page.html")}),
         autoescape=True,
@@ -84,51 +85,49 @@ def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
         run=run,
         script=Markup(script),
         style=Markup(style),
-        script_hash=content_hash(script),
-        style_hash=content_hash(style),
+        script_hash=_content_hash(script),
+        style_hash=_content_hash(style),
         licence=read("uPlot.LICENSE"),
         data=Markup(safe_json(data)),
         frames=frames,
         absent=absent,
         drawn=data,
         studies=[path.resolve().name for path in studies],
-        **told(run),
+        **_texts(run),
     )
 
 
-def told(run: Run) -> dict[str, Any]:
-    """Everything on the page that is words or tables."""
+def _texts(run: Run) -> dict[str, Any]:
+    """Everything on the page that is text or tables."""
     more = {
         "camera_sensitivity": "Deflection by video under assumed joints and planes, beside Table 2.1 of AIAA 2011-2571",
-        "fusion_inputs": "What the methods together say of each input they lean on",
-        "fusion_agreement": "Test of every pair of methods",
-        "air_parameters": "Coefficient scales and flexure found with the air of the day",
+        "fusion_inputs": "Inputs of the methods, estimated with the deflection",
+        "fusion_agreement": "Chi-square test of every pair of methods",
+        "air_parameters": "Coefficient scales and flexure, estimated with the as-flown atmosphere",
         "residual_statistics": "Residuals by source and component",
-        "sensor_errors": "Estimated errors of the sensors",
-        "peaks": "Largest values",
+        "sensor_errors": "Estimated sensor errors",
+        "peaks": "Peak values",
     }
-    consistency_checks, again = run.tables["verdicts"], run.tables.get("sensitivity")
+    checks, again = run.checks, run.tables.get("sensitivity")
     return {
-        "title": words.title(run),
-        "lead": words.lead(run),
-        "cards": words.with_whiskers(words.cards(run)),
-        "moments": words.moments(run),
-        "findings": words.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
-        "verdicts": words.table_rows(
-            consistency_checks.assign(passed=consistency_checks["passed"].map({True: "✓ pass", False: "✕ fail"}))
-        ),
-        "extra": [(words_, words.table_rows(run.tables[name])) for name, words_ in more.items() if name in run.tables],
-        "sensitivity": words.sensitivity_rows(again) if again is not None else None,
-        "vehicle": [(k, words.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
-        "settings": [(k, words.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
+        "title": text.title(run),
+        "lead": text.lead(run),
+        "cards": text.with_whiskers(text.cards(run)),
+        "events": text.events(run),
+        "findings": text.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
+        "checks": text.table_rows(checks.assign(passed=checks["passed"].map({True: "✓ pass", False: "✕ fail"}))),
+        "extra": [(title, text.table_rows(run.tables[name])) for name, title in more.items() if name in run.tables],
+        "sensitivity": text.sensitivity_rows(again) if again is not None else None,
+        "vehicle": [(k, text.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
+        "settings": [(k, text.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
         "date": parse_utc(run.telemetry.t0_utc).strftime("%-d %B %Y"),
     }
 
 
-def numbers(
+def _numbers(
     run: Run, frames: list[dict[str, Any]], studies: tuple[Path, ...]
-) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """Everything that the page's scripts draw, and the panels that the flight has no data for, with the reason."""
+) -> tuple[dict[str, Any], list[tuple[str, str, str]]]:
+    """Everything that the scripts draw, and id, title and reason of the panels that the flight has no data for."""
     bet = run.tables["bet"]
     rows = trajectory_rows(run)
     panels, absent = trajectory_panels(run, rows)
@@ -136,14 +135,15 @@ def numbers(
     if deflection is not None:
         panels.insert(0, deflection)
     else:
-        absent.insert(0, ("Deflection", NO_DEFLECTION))
+        absent.insert(0, ("deflection", "Deflection", NO_DEFLECTION))
     vehicle = run.telemetry.vehicle
     span = [float(bet["t_s"].iloc[0]), float(bet["t_s"].iloc[-1])]
     data = {
         "t0_ms": round(1e3 * parse_utc(run.telemetry.t0_utc).timestamp()),
         "span": span,
-        "pulse": pulse_window(bet),
-        "first": span if deflection is None else pulse_window(bet),
+        "colours": PAGE | {"residual": COLOUR["estimate"]},
+        "pulse": _pulse_window(bet),
+        "first": span if deflection is None else _pulse_window(bet),
         "peak": round(float(run.summary["peak_dynamic_pressure_s"]), 3),
         "bet": rounded(bet["t_s"].to_numpy()[rows], 4),
         "rows": [len(rows), len(bet)],
@@ -159,7 +159,7 @@ def numbers(
     return data, absent
 
 
-def pulse_window(bet: pd.DataFrame) -> list[float]:
+def _pulse_window(bet: pd.DataFrame) -> list[float]:
     """From well before the pressure pulse to well after it, s."""
     t = bet["t_s"].to_numpy()
     inside = t[pressure_pulse(bet["dynamic_pressure_pa"].to_numpy())]
@@ -172,12 +172,12 @@ def pulse_window(bet: pd.DataFrame) -> list[float]:
 
 def safe_json(value: Any) -> str:
     """JSON that may stand in a script element."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
-    for sign, code in ESCAPED.items():
-        text = text.replace(sign, code)
-    return text
+    out = json.dumps(value, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+    for sign, code in _ESCAPED.items():
+        out = out.replace(sign, code)
+    return out
 
 
-def content_hash(text: str) -> str:
+def _content_hash(inline: str) -> str:
     """Source expression of a content security policy that allows this inline text and nothing else."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return "sha256-" + base64.b64encode(hashlib.sha256(inline.encode()).digest()).decode()

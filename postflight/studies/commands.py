@@ -1,4 +1,4 @@
-"""What ``postflight study`` does: one of the paper's studies as tables and figures in a folder."""
+"""What does ``postflight study`` do? One of the paper's studies as tables and figures in a folder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from postflight.flight import read_flight
 from postflight.montecarlo.bands import write_csv
 from postflight.montecarlo.study import read_study
 from postflight.plots import studies
-from postflight.plots.paper_figures import save
+from postflight.plots.style import save
 from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies import joints
@@ -77,16 +77,16 @@ def stiffness(scenario: str, folder: Path, seed: int) -> None:
 
 
 def write_study(study: joints.JointStudy, folder: Path, name: str, pictures: dict[str, studies.Figure]) -> None:
-    """Write tables and figures of a study of the joint, and print it beside the paper's words."""
+    """Write tables and figures of a study of the joint, and print it beside the paper's statements."""
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / f"{name}.csv", study.table)
     write_csv(folder / f"{name}_paper.csv", study.paper)
     write_csv(folder / f"{name}_histories.csv", joints.histories(study))
     for file, figure in pictures.items():
         save(figure, folder / file)
-    words = f"around peak pressure ({study.peak_s:.1f} s) and {joints.LATER_S[0]:g} to {joints.LATER_S[1]:g} s later"
-    table = Table(title=f"Centerbody {words}")
-    for head in ("joint", "alpha deg", "later", "normal g", "peak g", "bent deg", "tumbled s"):
+    later = f"{joints.LATER_S[0]:g} to {joints.LATER_S[1]:g} s later"
+    table = Table(title=f"Centerbody around peak pressure ({study.peak_s:.1f} s) and {later}")
+    for head in ("joint", "alpha deg", "later", "normal g", "peak g", "deflection deg", "tumbled s"):
         table.add_column(head, justify="left" if head == "joint" else "right")
     for r in study.table.itertuples():
         cells = (r.alpha_mean_deg, r.alpha_later_mean_deg, r.normal_mean_g, r.normal_peak_g, r.deflection_mean_deg)
@@ -100,7 +100,7 @@ def write_study(study: joints.JointStudy, folder: Path, name: str, pictures: dic
 
 
 def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int, seed: int) -> None:
-    """Fly the bounds of a flight's own entry with the joint locked and flexible; say where the flight lies."""
+    """Fly the bounds of a flight's own entry with the joint locked and flexible; print where the flight lies."""
     joint = read_study(dispersions).spec.joint
     compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
     with progress_bar() as report:
@@ -108,7 +108,7 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
         flight.required_loads()
         rigid = entry_bounds(flight, None, flights, seed, lambda f, what: report(0.4 + 0.3 * f, what))
         flexible = entry_bounds(flight, joint, flights, seed, lambda f, what: report(0.7 + 0.3 * f, what))
-    table, flown, picture = held_against(flight, rigid, flexible)
+    table, flown, picture = compared_with_bounds(flight, rigid, flexible)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "preflight.csv", table)
     write_csv(folder / "preflight_bands.csv", bands(rigid, flexible))
@@ -126,7 +126,7 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
     console.print(f"results in {escape(str(folder))}")
 
 
-def held_against(
+def compared_with_bounds(
     flight: Reconstruction, rigid: Bounds, flexible: Bounds
 ) -> tuple[pd.DataFrame, pd.DataFrame, studies.Figure]:
     """Return `shares`, the flight's own columns ``time_s, alpha_total_deg, normal_g``, and both as a picture."""
@@ -139,14 +139,14 @@ def held_against(
         }
     )
     table = shares(flight, flown, rigid, flexible)
-    words = "inside, of the pulse: " + "; ".join(
+    remark = "inside, of the pulse: " + "; ".join(
         f"{joint} {quantity.split('_')[0]} {100 * share:.0f} %"
         for joint, quantity, share in zip(table["joint"], table["quantity"], table["share_inside"], strict=True)
     )
     tag = "SYNTHETIC flight" if flight.telemetry.synthetic else "flight"
     span = _pulse_span(flight)
     window = span[0] - 10.0, span[1] + 5.0
-    picture = studies.figure_preflight(rigid, flexible, flown, window, words, f"{flight.telemetry.name}: {tag}")
+    picture = studies.figure_preflight(rigid, flexible, flown, window, remark, f"{flight.telemetry.name}: {tag}")
     return table, flown, picture
 
 
@@ -156,7 +156,7 @@ def _pulse_span(flight: Reconstruction) -> tuple[float, float]:
 
 
 def shares(flight: Reconstruction, flown: pd.DataFrame, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
-    """Share of the pulse's samples between the outer percentiles, by joint and quantity; how far outside the others.
+    """Share of the pulse's samples between the outer percentiles, by joint and quantity; excess of the others.
 
     Columns ``joint, quantity, share_inside, largest_excess`` (over the upper percentile, in the quantity's unit); where
     the flight has its peak, ``over_median_at_peak`` and ``peak_over_upper`` (a ratio); ``diverged`` flights.
@@ -164,7 +164,7 @@ def shares(flight: Reconstruction, flown: pd.DataFrame, rigid: Bounds, flexible:
     first, last = _pulse_span(flight)
     rows = flown[(flown["time_s"] >= first) & (flown["time_s"] <= last)]
     if rows.empty:
-        raise GateError("pre-flight bounds: the flight has no sample in its pulse")
+        raise GateError("pre-flight bounds: the flight has no sample in its pulse", code="pulse-missing")
     time_s, out = rows["time_s"].to_numpy(), []
     for joint, bounds in (("rigid", rigid), ("flexible", flexible)):
         for quantity, band in (("alpha_total_deg", bounds.alpha_total_deg), ("normal_g", bounds.normal_g)):

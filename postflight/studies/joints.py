@@ -1,15 +1,18 @@
-"""The paper's studies of the joint: damping at 2.5 Hz (Figure 3.1), stiffness at 0.5 % (Figures 3.2 and 3.3).
+"""How do stiffness and damping of the joint change the flight? The paper's studies, and its Table 3.1.
 
-The scenario is flown on one day with the joints of the paper's Table 3.1, side by side, and once with the joint locked,
-the paper's "No CFE". The paper's curves are pictures; what it says of them in words is put beside what is found here.
+Damping at 2.5 Hz (Figure 3.1) and stiffness at 0.5 % of critical (Figures 3.2 and 3.3): the scenario is flown in one
+atmosphere with the joints of Table 3.1, side by side, and once with the joint locked, the paper's "No CFE". The paper's
+curves are pictures; its statements about them are put beside the numbers found here.
 
-Table 3.1: which stiffness and damping are a free-free frequency and a share of critical damping?
+Table 3.1: ``K = I (2 pi f)^2`` and ``c = zeta 2 sqrt(K I)`` (seed paper eqs. [7], [8]) with the reduced inertia ``I =
+I_a I_cb / (I_a + I_cb)`` about the joint. The paper does not print its inertias, but ``K / f^2 = 693.6`` in every row.
+With it all numbers follow to the last digit printed, where halves are rounded up (3511.35 to 3511.4) and the damping
+study's row is taken in multiples of its first entry as printed (40 x 2.7597 = 110.388, where eq. [8] gives 110.390).
+The vehicle's own inertia gives a second set.
 
-``K = I (2 pi f)^2`` and ``c = zeta 2 sqrt(K I)`` (seed paper eqs. [7], [8]) with the reduced inertia ``I = I_a I_cb /
-(I_a + I_cb)`` about the joint. The paper does not print its inertias, but its table holds one number of them: every row
-has ``K / f^2 = 693.6``. With it all numbers follow to the last digit printed, where halves are rounded up (3511.35 to
-3511.4) and the damping study's row is taken in multiples of its first entry as printed (40 x 2.7597 = 110.388, where
-eq. [8] gives 110.390). The vehicle's own inertia gives a second set.
+References
+----------
+Bose et al., AIAA 2011-2571, section III.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from synthetic_flight.dispersions import Window
 from synthetic_flight.dynamics import check_step
 from synthetic_flight.ensemble import Records, Start, fly_legs, legs, records_of
 from synthetic_flight.scenarios import Scenario, child_rng, initial_state
-from synthetic_flight.weather import day_atmosphere
+from synthetic_flight.weather import day_of_flight_atmosphere
 
 BEFORE_S, AFTER_S, RECORD_S = 20.0, 20.0, 0.02
 MEAN_HALF_WINDOW_S = 1.5  # two periods of the aerodynamic mode to both sides of the peak
@@ -62,7 +65,7 @@ class JointStudy:
 
 
 def damping_study(scenario: Scenario, seed: int) -> JointStudy:
-    """Fly the damping of Figure 3.1: 0.5 to 20 % of critical at 2.5 Hz, on the day that ``seed`` draws."""
+    """Fly the damping of Figure 3.1: 0.5 to 20 % of critical at 2.5 Hz, in the atmosphere of ``seed``."""
     stiffness = float({hz: k for hz, k, _ in PAPER_STIFFNESS}[STUDY_HZ])
     joints = [(f"{100 * ratio:g} %", stiffness, float(c)) for ratio, c in PAPER_DAMPING]
     flights, peak_s = _fly(scenario, seed, joints)
@@ -92,7 +95,7 @@ def damping_study(scenario: Scenario, seed: int) -> JointStudy:
 
 
 def stiffness_study(scenario: Scenario, seed: int) -> JointStudy:
-    """Fly the stiffness of Figures 3.2 and 3.3: 2 to 4 Hz at 0.5 % of critical, on the day that ``seed`` draws."""
+    """Fly the stiffness of Figures 3.2 and 3.3: 2 to 4 Hz at 0.5 % of critical, in the atmosphere of ``seed``."""
     joints = [(f"{hz:g} Hz", float(k), float(c)) for hz, k, c in PAPER_STIFFNESS]
     flights, peak_s = _fly(scenario, seed, joints)
     table = _table(flights, peak_s)
@@ -130,7 +133,7 @@ def _fly(
 ) -> tuple[tuple[JointFlight, ...], float]:
     """Fly a locked joint, then the given ones, through the pulse of the locked flight."""
     time = scenario.spec.time
-    table = simulate.atmosphere_table(day_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere")))
+    table = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere")))
     state = initial_state(scenario)
     first = max(time.start_s, time.inflated_s or time.start_s)
     peak_s = _pressure_peak(scenario, Start(state, simulate.parameter_vector(scenario.vehicle), table), first)
@@ -159,8 +162,8 @@ def _pressure_peak(scenario: Scenario, start: Start, from_s: float) -> float:
 
 def _kept(label: str, window: Window, records: Records, diverged: bool) -> JointFlight:
     time_s = window.from_s + window.record_s * np.arange(len(records.aux), dtype=np.float64)
-    bent, pressure = np.rad2deg(records.aux[:, 5]), records.aux[:, 3]
-    return JointFlight(label, time_s, records.alpha_total_deg, records.normal_g, bent, pressure, diverged)
+    deflection_deg, pressure = np.rad2deg(records.aux[:, 5]), records.aux[:, 3]
+    return JointFlight(label, time_s, records.alpha_total_deg, records.normal_g, deflection_deg, pressure, diverged)
 
 
 def _table(flights: tuple[JointFlight, ...], peak_s: float) -> pd.DataFrame:

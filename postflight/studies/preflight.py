@@ -1,9 +1,14 @@
-"""What the vehicle would have done by all that was known before: the view that the flight is held against (Figure 1.3).
+"""In which bands did the pre-flight uncertainty expect the flight's angle of attack and normal acceleration?
 
 The vehicle is flown many times from the reconstructed state above the atmosphere, with mass properties, coefficients,
-damping, density, winds and start attitude dispersed by their pre-flight uncertainty: with its joint locked, as before
-the paper's reconciliation, or with a flexible joint that is dispersed too, as after it. Unlike a true pre-flight study
-(`postflight montecarlo`) it does not disperse the launch, so its bands are about this flight's own entry.
+damping, density, winds and start attitude dispersed by their pre-flight uncertainty; the bands are percentiles of the
+histories (2.3, 50, 97.7 %). The joint is locked, as before the paper's reconciliation, or flexible and dispersed, as
+after it. Unlike a true pre-flight study (`postflight montecarlo`) the launch is not dispersed: the bands are about this
+flight's own entry.
+
+References
+----------
+Bose et al., AIAA 2011-2571, Figure 1.3.
 """
 
 from __future__ import annotations
@@ -40,15 +45,15 @@ from synthetic_flight.simulate import state_from_ecef
 from synthetic_flight.weather import correlated
 
 START_ALTITUDE_M = 100e3
-# the rigid vehicle's fastest motion is its pitch at 1 Hz; fourth-order steps of 10 ms hold it to 1e-6
+# the rigid vehicle's fastest motion is its pitch at 1 Hz: errors of 1e-6 by fourth-order steps of 10 ms
 RIGID_STEP_S, FLEXIBLE_STEP_S, RECORD_S, SPAN_S = 0.01, 0.005, 0.05, 70.0
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Percentile bands ``(3, n)`` of dispersed entries, and the nominal one ``(n,)``; a flight that ended early holds.
+    """Percentile bands ``(3, n)`` of dispersed entries, and the nominal history ``(n,)``.
 
-    ``ended`` of ``flights`` did not reach the end: their joint passed 90 deg.
+    ``ended`` of ``flights`` ended early, their deflection beyond 90 deg; they hold their last value from there on.
     """
 
     time_s: FloatArray
@@ -71,8 +76,8 @@ class Bounds:
         return pd.DataFrame(columns).assign(flights=self.flights)
 
 
-def dispersions_of(known: Uncertainty, joint: JointDispersions | None) -> Dispersions:
-    """Dispersions that a vehicle's file states; with a flexible joint where its own are given."""
+def dispersions_of(stated: Uncertainty, joint: JointDispersions | None) -> Dispersions:
+    """Dispersions that a vehicle file states; with a flexible joint where those of the joint are given."""
 
     def normal(sd: float) -> Factor:
         return Factor(normal=sd)
@@ -83,24 +88,24 @@ def dispersions_of(known: Uncertainty, joint: JointDispersions | None) -> Disper
     return Dispersions(
         joint_is="locked" if joint is None else "flexible",
         mass=MassDispersions(
-            aeroshell_mass=normal(known.mass),
-            centerbody_mass=normal(known.mass),
-            aeroshell_inertia=normal(known.inertia),
-            centerbody_inertia=normal(known.inertia),
-            aeroshell_cg_station_m=shift(known.cg_station_m),
-            centerbody_cg_station_m=shift(known.cg_station_m),
-            offset_y_m=shift(known.cg_lateral_m),
-            offset_z_m=shift(known.cg_lateral_m),
+            aeroshell_mass=normal(stated.mass),
+            centerbody_mass=normal(stated.mass),
+            aeroshell_inertia=normal(stated.inertia),
+            centerbody_inertia=normal(stated.inertia),
+            aeroshell_cg_station_m=shift(stated.cg_station_m),
+            centerbody_cg_station_m=shift(stated.cg_station_m),
+            offset_y_m=shift(stated.cg_lateral_m),
+            offset_z_m=shift(stated.cg_lateral_m),
         ),
         aerodynamics=AeroDispersions(
-            ca=normal(known.ca), cn=normal(known.cn), cm=normal(known.cm), cmq=shift(known.cmq)
+            ca=normal(stated.ca), cn=normal(stated.cn), cm=normal(stated.cm), cmq=shift(stated.cmq)
         ),
         joint=joint or JointDispersions(),
     )
 
 
 def rigid_bounds(flight: Reconstruction, flights: int = 100, seed: int = 0, progress: Progress | None = None) -> Bounds:
-    """Fly the rigid vehicle ``flights`` times; run ``k`` is the same flight whatever the number."""
+    """Fly the rigid vehicle ``flights`` times; run ``k`` is the same flight whatever their number."""
     return entry_bounds(flight, None, flights, seed, progress)
 
 
@@ -119,9 +124,9 @@ def entry_bounds(
     flight : Flight
         With a vehicle; its reconstruction gives the start, its sounding the air.
     joint : JointDispersions or None
-        What is uncertain of the joint; None locks it.
+        Dispersions of the joint; None locks it.
     vehicle : Vehicle, optional
-        Flown instead of the one that the flight's analyst was told, such as a reconciled one.
+        Flown instead of the flight's own, such as a reconciled one.
 
     Raises
     ------
@@ -154,7 +159,7 @@ def entry_bounds(
 def inside(
     time_s: FloatArray, values: FloatArray, band_time_s: FloatArray, low: FloatArray, high: FloatArray
 ) -> BoolArray:
-    """Whether values at times lie between two limits that are given at other times."""
+    """Mask (n,) of values at times (n,) between two limits that are given at other times."""
     return np.asarray(
         (values >= np.interp(time_s, band_time_s, low)) & (values <= np.interp(time_s, band_time_s, high))
     )
@@ -167,7 +172,7 @@ class _Entry:
         air = flight.air
         below = np.flatnonzero((air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0))
         if not len(below):
-            raise GateError("pre-flight bounds: the reconstruction never comes below 100 km")
+            raise GateError("pre-flight bounds: the reconstruction never comes below 100 km", code="entry-missing")
         self.start_s = float(air.time_s[below[0]])
         self.records = round(min(SPAN_S, air.time_s[-1] - self.start_s) / RECORD_S)
         self.vehicle, self.locked = vehicle, joint is None
@@ -179,18 +184,18 @@ class _Entry:
 
     def start(self, run: tuple[int, int] | None) -> tuple[Start, Vehicle]:
         """Start and vehicle of one run, given as seed and number; None is the nominal one."""
-        vehicle, scales, profile, turn = self.vehicle, (1.0, 1.0, 1.0, 0.0), self.profile, np.zeros(3)
+        vehicle, scales, profile, rotation = self.vehicle, (1.0, 1.0, 1.0, 0.0), self.profile, np.zeros(3)
         if run is not None:
             u = draws(self.dispersions, *run)
             deviation = {name: law.at(u[name]) for name, law in self.dispersions.factors().items() if law is not None}
             vehicle = dispersed_vehicle(self.vehicle, lambda name: deviation.get(name, 0.0))
             scales = dispersed_scales(lambda name: deviation.get(name, 0.0))
-            profile = _dispersed_air(self.profile, rng_from_draw(draw_one(*run, "sounding")))
+            profile = _dispersed_atmosphere(self.profile, rng_from_draw(draw_one(*run, "sounding")))
             attitude = rng_from_draw(draw_one(*run, "attitude")).standard_normal(3)
-            turn = attitude * self.at_start.sd()[0, 6:9]
+            rotation = attitude * self.at_start.sd()[0, 6:9]
         if not self.locked:
             check_step(vehicle, self.schedule.step_s)
-        q = rotations.boxplus(self.at_start.q_ecef_body[0], turn)
+        q = rotations.boxplus(self.at_start.q_ecef_body[0], rotation)
         position = self.at_start.position_ecef_m[0] + rotations.rotate(q, vehicle.cg_m)
         velocity, omega = self.at_start.velocity_ecef_mps[0], self.at_start.omega_body_eci_body_radps[0]
         state = state_from_ecef(self.start_s, position, velocity, q, omega)
@@ -204,13 +209,14 @@ class _Entry:
 
     def _kept(self, flown: Flown, start: Start, vehicle: Vehicle) -> tuple[FloatArray, FloatArray, bool]:
         if not len(flown.aux):
-            raise GateError("pre-flight bounds: a flight has no record; the reconstruction's start is no flight")
+            message = "pre-flight bounds: a flight has no record; the reconstruction's state at 100 km cannot be flown"
+            raise GateError(message, code="no-record")
         records = Records(flown.states, flown.aux, vehicle, start.atmosphere)
         rows = np.minimum(np.arange(self.records), len(flown.aux) - 1)
         return records.alpha_total_deg[rows], records.normal_g[rows], flown.diverged
 
 
-def _dispersed_air(profile: AtmosphereProfile, rng: np.random.Generator) -> AtmosphereProfile:
+def _dispersed_atmosphere(profile: AtmosphereProfile, rng: np.random.Generator) -> AtmosphereProfile:
     z = profile.altitude_m
     wind = profile.wind_ned_mps.copy()
     for axis in (0, 1):

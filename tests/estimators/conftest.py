@@ -1,6 +1,6 @@
 import numpy as np
 
-from estimators.loads import PulseData
+from estimators.loads import FlightLoads
 from estimators.trim import trim_model
 from flightmodel import rotations
 from flightmodel.deflection import lv_clock, rotation_vector_body_shell
@@ -11,9 +11,9 @@ AERO = VEHICLE.aero
 
 
 def pulse_of(rng, n, theta_yz=None, vehicle=VEHICLE):
-    """Ideal data of a bent shell in trim: force exactly by rotation, moments exactly in balance; any plane.
+    """Ideal data of a deflected shell in trim: force exactly by rotation, moments exactly in balance; any plane.
 
-    A deflection history that is given is flown through a smooth pulse, by ``vehicle``; the analyst is told `VEHICLE`.
+    A deflection history that is given is flown through a smooth pulse, by ``vehicle``; the analyst has `VEHICLE`.
     """
     model, smooth = trim_model(vehicle), theta_yz is not None
     mach = np.linspace(4.5, 2.6, n) if smooth else rng.uniform(2.6, 4.5, n)
@@ -35,7 +35,7 @@ def pulse_of(rng, n, theta_yz=None, vehicle=VEHICLE):
     root = np.array([[0.05, 0, 0], [0.01, 0.09, 0], [0.0, -0.04, 0.12]])
     flow_root = np.deg2rad(np.array([[0.25, 0.0], [0.1, 0.2]]))
     speed = mach * 320.0
-    pulse = PulseData(
+    loads = FlightLoads(
         time_s=430.0 + 0.05 * np.arange(n),
         specific_force_body_mps2=force,
         force_noise_sd_mps2=0.01,
@@ -54,4 +54,4 @@ def pulse_of(rng, n, theta_yz=None, vehicle=VEHICLE):
         airspeed_mps=speed,
         vehicle=VEHICLE,
     )
-    return pulse, theta_yz
+    return loads, theta_yz

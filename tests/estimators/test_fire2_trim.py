@@ -20,7 +20,7 @@ PUBLISHED_SLOPE = -0.1423  # C_m,alpha about the c.g., 1/rad
 
 
 def fire2():
-    """Balance about the c.g. of coefficients that refer to a station behind it; bending shifts nothing."""
+    """Balance about the c.g. of coefficients that refer to a station behind it; deflection shifts nothing."""
     rows = np.genfromtxt(DATA / "fire2_aerodynamics_mach35.csv", delimiter=",", names=True)
     uniform = np.arange(0.0, rows["alpha_deg"][-1] + 1.0, 5.0)
     columns = [np.interp(uniform, rows["alpha_deg"], sign * rows[c]) for c, sign in (("CX", -1), ("CR", 1), ("CM", 1))]
@@ -44,17 +44,17 @@ def test_rigid_pitching_at_the_frequency_of_the_published_slope_needs_no_bending
 
     A tenth of the frequency more and it does not: what closes it is the frequency.
     """
-    pulse, _ = pulse_of(np.random.default_rng(0), 60)
+    loads, _ = pulse_of(np.random.default_rng(0), 60)
     model, pressure = fire2(), 4000.0
     frequency = np.sqrt(-pressure * AREA_M2 * LENGTH_M * PUBLISHED_SLOPE / DEFINITION["inertia_kgm2"]["Iy"])
     assert frequency / (2.0 * np.pi) == pytest.approx(1.11, abs=0.005)  # Hz at 4 kPa, without spin
-    swing = np.deg2rad(4.0) * np.sin(0.3 * np.arange(60.0))
-    flow = np.column_stack([np.zeros(60), swing])
+    angle = np.deg2rad(4.0) * np.sin(0.3 * np.arange(60.0))
+    flow = np.column_stack([np.zeros(60), angle])
     for faster, closes in ((1.0, True), (1.1, False)):
         # nose up (towards -z) is a turn about +y; the flow's side is where the body's axis does not point
-        turn = np.column_stack([np.zeros(60), -((faster * frequency) ** 2) * swing, np.zeros(60)])
+        turn = np.column_stack([np.zeros(60), -((faster * frequency) ** 2) * angle, np.zeros(60)])
         moving = replace(
-            pulse,
+            loads,
             flow_yz_rad=flow,
             mach=np.full(60, 35.0),
             dynamic_pressure_pa=np.full(60, pressure),
@@ -62,7 +62,7 @@ def test_rigid_pitching_at_the_frequency_of_the_published_slope_needs_no_bending
             angular_acceleration_body_radps2=turn,
         )
         moment = moment_term(model, moving, np.ones(60, dtype=bool), True)
-        bent = solve_trim(replace(model, xbar_m=1e-9), moving.mach, flow, moment)
-        worst = np.rad2deg(np.abs(bent).max())
+        found = solve_trim(replace(model, xbar_m=1e-9), moving.mach, flow, moment)
+        worst = np.rad2deg(np.abs(found).max())
         # C_A falls by 0.5 % to 4 deg
         assert (worst < 0.05) == closes

@@ -6,7 +6,6 @@ import pytest
 from estimators.misalignment import (
     aerodynamic_angle,
     aeroshell_acceleration,
-    deflection_along_acceleration,
     estimate_misalignment,
     force_tilt,
     psi_from_acceleration,
@@ -14,6 +13,7 @@ from estimators.misalignment import (
 )
 from flightmodel import rotations
 from flightmodel.deflection import lv_clock, rotation_vector_body_shell
+from tests.oracles.paper_forms import deflection_along_acceleration
 
 from .conftest import AERO, pulse_of
 
@@ -31,7 +31,7 @@ def test_eq_4_vector():
 
 
 def test_eq_4_is_the_rotation_of_the_deflection_history():
-    # psi along a_N and theta > 0 is a bending in the plane opposite a_N: one sign convention throughout
+    # psi along a_N and theta > 0 is a deflection in the plane opposite a_N: one sign convention throughout
     rng = np.random.default_rng(0)
     for _ in range(20):
         a = np.array([-80.0, *rng.normal(size=2) * 4])
@@ -61,7 +61,7 @@ def test_paper_s_form_brings_both_angles_together():
     np.testing.assert_allclose(got, theta, atol=1e-9)
     turned = aeroshell_acceleration(force, got, psi_from_acceleration(force))
     np.testing.assert_allclose(aerodynamic_angle(AERO, mach, turned), alpha_shell, atol=1e-4)
-    # in one plane the general form says the same
+    # in one plane the general form is the same
     lateral = -force[:, 1:] / np.linalg.norm(force[:, 1:], axis=1, keepdims=True)
     general = solve_deflection(AERO, mach, force_tilt(force), lateral * (alpha_shell + theta)[:, None])
     np.testing.assert_allclose(np.linalg.norm(general, axis=1), got, atol=1e-9)
@@ -71,15 +71,15 @@ def test_paper_s_form_brings_both_angles_together():
 @pytest.mark.parametrize("seed", range(4))
 def test_recovers_any_plane_exactly_from_ideal_data(seed):
     rng = np.random.default_rng(seed)
-    pulse, truth = pulse_of(rng, n=40)
-    history = estimate_misalignment(pulse)
+    loads, truth = pulse_of(rng, n=40)
+    history = estimate_misalignment(loads)
     # lateral vectors add to second order only: 0.1 rad of each angle leaves 0.1^3/3
     np.testing.assert_allclose(history.theta_yz_rad, truth, atol=5e-4)
 
 
 def test_no_answer_where_there_is_no_deceleration():
-    pulse, _ = pulse_of(np.random.default_rng(1), n=10)
-    weak = replace(pulse, specific_force_body_mps2=pulse.specific_force_body_mps2 * 0.01)
+    loads, _ = pulse_of(np.random.default_rng(1), n=10)
+    weak = replace(loads, specific_force_body_mps2=loads.specific_force_body_mps2 * 0.01)
     history = estimate_misalignment(weak)
     assert np.isnan(history.theta_rad).all()
     assert "below 0.3 g" in history.assumptions
@@ -108,9 +108,9 @@ def test_sd_equals_a_monte_carlo():
 def test_uncorrected_look_up_reads_far_too_high():
     # the "sharp contrast" of the seed paper's Figure 2.5
     rng = np.random.default_rng(3)
-    pulse, truth = pulse_of(rng, n=30)
-    raw = aerodynamic_angle(AERO, pulse.mach, pulse.specific_force_body_mps2)
-    bet = np.linalg.norm(pulse.flow_yz_rad, axis=1)
-    bent = np.linalg.norm(truth, axis=1) > np.deg2rad(2.0)
-    assert (raw[bent & np.isfinite(raw)] > 1.5 * bet[bent & np.isfinite(raw)]).mean() > 0.8
+    loads, truth = pulse_of(rng, n=30)
+    raw = aerodynamic_angle(AERO, loads.mach, loads.specific_force_body_mps2)
+    bet = np.linalg.norm(loads.flow_yz_rad, axis=1)
+    deflected = np.linalg.norm(truth, axis=1) > np.deg2rad(2.0)
+    assert (raw[deflected & np.isfinite(raw)] > 1.5 * bet[deflected & np.isfinite(raw)]).mean() > 0.8
     assert np.isnan(aerodynamic_angle(AERO, np.array([3.0]), np.array([[1.0, 0.1, 0.0]]))).all()

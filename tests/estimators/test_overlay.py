@@ -1,4 +1,4 @@
-"""A user's own meshes in the overlay: where the vehicle's own bodies are drawn, bent like them, hidden like them."""
+"""Own meshes in the overlay: where the vehicle's own bodies are drawn, deflected like them, hidden like them."""
 
 import os
 from pathlib import Path

@@ -5,14 +5,13 @@ import pytest
 
 from estimators.evidence import VEHICLE_INPUTS, moved_vehicle
 from estimators.trim import (
-    deflection_for_trim_angle,
     estimate_trim,
     moment_term,
     solve_trim,
-    trim_angle_for_deflection,
     trim_evidence,
     trim_model,
 )
+from tests.oracles.paper_forms import deflection_for_trim_angle, trim_angle_for_deflection
 
 from .conftest import VEHICLE, pulse_of
 
@@ -58,19 +57,19 @@ def test_moment_about_the_cg_vanishes_as_a_cross_product():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_recovers_any_plane_from_ideal_data(seed):
-    pulse, truth = pulse_of(np.random.default_rng(seed), n=40)
+    loads, truth = pulse_of(np.random.default_rng(seed), n=40)
     for dynamic in (False, True):
-        np.testing.assert_allclose(trim_evidence(pulse, dynamic=dynamic).theta_yz_rad, truth, atol=2e-4)
+        np.testing.assert_allclose(trim_evidence(loads, dynamic=dynamic).theta_yz_rad, truth, atol=2e-4)
 
 
 def test_measured_moment_moves_the_balance_by_its_offset():
-    pulse, truth = pulse_of(np.random.default_rng(5), n=20)
+    loads, truth = pulse_of(np.random.default_rng(5), n=20)
     turn = np.array([0.0, 0.4, -0.7])
-    turning = replace(pulse, angular_acceleration_body_radps2=np.tile(turn, (20, 1)))
-    u = moment_term(MODEL, turning, pulse.informative, True)
+    turning = replace(loads, angular_acceleration_body_radps2=np.tile(turn, (20, 1)))
+    u = moment_term(MODEL, turning, loads.informative, True)
     moment = MODEL.inertia_kgm2 @ turn
-    ca = MODEL.aero.at(pulse.mach, np.linalg.norm(pulse.flow_yz_rad, axis=1))[:, 0]
-    pressure = pulse.dynamic_pressure_pa * MODEL.area_m2 * ca
+    ca = MODEL.aero.at(loads.mach, np.linalg.norm(loads.flow_yz_rad, axis=1))[:, 0]
+    pressure = loads.dynamic_pressure_pa * MODEL.area_m2 * ca
     # a lateral force offset u times the axial force is the moment: u x x_hat
     want = np.cross(np.column_stack([np.zeros(20), u]), [1.0, 0.0, 0.0]) * pressure[:, None]
     np.testing.assert_allclose(want[:, 1:], np.broadcast_to(moment[1:], (20, 2)), rtol=1e-12)

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import matplotlib
 import numpy as np
 import pytest
 
 from flightmodel.telemetry import Motion
 from flightmodel.trajectory import difference
+from postflight import plots
 from postflight.attitude import check_attitude
 from postflight.flight import Flight
-from postflight.plots.paper_figures import figure_residuals, save
-from postflight.plots.trajectory import figure_attitude, figure_filter_and_smoother, figure_sensitivity
+from postflight.plots import style
+from postflight.plots.style import save
+from postflight.plots.trajectory import (
+    figure_attitude,
+    figure_filter_and_smoother,
+    figure_residuals,
+    figure_sensitivity,
+)
 from postflight.reconstruction import reconstruction_from
 from postflight.sensitivity import sensitivity
 from recon.reconstruct import reconstruct_once
@@ -89,7 +97,25 @@ def test_without_attitude_nothing_is_drawn_of_it(ballistic, tmp_path):
     drawn(figure_sensitivity(ballistic, found), tmp_path / "sensitivity.png")
 
 
-def test_attitude_check_says_when_it_is_not_independent(flight, tmp_path):
+def test_attitude_figure_states_dependence(flight, tmp_path):
     drawn(figure_attitude(flight, flight.attitude), tmp_path / "attitude.png")
-    resting = replace(flight.attitude, dependence="the filter read these sensors too")
+    resting = replace(flight.attitude, dependence="filter")
     assert "not independent" in figure_attitude(flight, resting).get_suptitle()
+
+
+def test_same_data_give_the_same_bytes_and_the_callers_style_stays(flight, tmp_path):
+    before = dict(matplotlib.rcParams)
+    for name in ("a.png", "b.png"):
+        save(figure_filter_and_smoother(flight), tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert dict(matplotlib.rcParams) == before
+
+
+@pytest.mark.parametrize("name", plots.__all__)
+def test_every_figure_is_at_the_door(name):
+    assert getattr(plots, name) is not None
+
+
+@pytest.mark.parametrize("colours", [[style.COLOUR[m] for m in style.STROKE], list(style.AXES.values()), style.MANY])
+def test_lines_that_share_axes_differ_in_colour(colours):
+    assert len(set(colours)) == len(colours)

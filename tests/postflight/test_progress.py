@@ -1,4 +1,4 @@
-"""Progress where standard error is no terminal: plain lines, now and then, and none of what is quickly done."""
+"""Progress where standard error is no terminal: plain lines, now and then, and none of a short command."""
 
 import time
 
@@ -7,11 +7,11 @@ from rich.console import Console
 from postflight.progress import plain_lines, progress_bar
 
 
-def test_lines_tell_the_step_again_and_again(capsys):
-    with plain_lines(Console(stderr=True, soft_wrap=True), 0.05) as tell:
-        tell(0.25, "filter [pass 1]")
+def test_lines_repeat_a_long_step(capsys):
+    with plain_lines(Console(stderr=True, soft_wrap=True), 0.05) as report:
+        report(0.25, "filter [pass 1]")
         time.sleep(0.4)
-        tell(2.0, "done")
+        report(2.0, "done")
         time.sleep(0.1)
     lines = capsys.readouterr().err.splitlines()
     assert 3 <= len(lines) <= 10
@@ -19,9 +19,9 @@ def test_lines_tell_the_step_again_and_again(capsys):
     assert lines[-1].endswith("s: 100 %, done")
 
 
-def test_what_is_quickly_done_says_nothing(capsys):
-    with progress_bar() as tell:
-        tell(0.5, "half")
+def test_a_short_command_prints_nothing(capsys):
+    with progress_bar() as report:
+        report(0.5, "half")
     seen = capsys.readouterr()
     assert seen.err == ""
     assert seen.out == ""

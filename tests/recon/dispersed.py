@@ -127,7 +127,7 @@ def fly_and_score(seed, scenario="irve2_reference", settings=None):
     at = np.round(peak + np.array(PEAK_OFFSETS_S), 1) - 1e-6
     return Scored(
         seed,
-        truth.words,
+        truth.remark,
         peak,
         float(truth.dynamic_pressure_pa.max()),
         scored(bet.smoothed, truth.trajectory, at),

@@ -14,12 +14,13 @@ from scipy.integrate import solve_ivp
 
 from flightmodel import rotations
 from synthetic_flight import dynamics
+from tests.oracles import two_body
 
 from .rigid import on_the_ground
 
 DATA = Path(__file__).parents[1] / "data" / "adams_joints"
 WEIGHT_N = np.array([0.0, 0.0, -9.80665])  # of 1 kg
-LOADS = dynamics.Loads(np.zeros(3), WEIGHT_N, np.zeros(3))
+LOADS = two_body.Loads(np.zeros(3), WEIGHT_N, np.zeros(3))
 
 
 def swing(body, q_ground, q_pendulum, time_s):
@@ -28,7 +29,7 @@ def swing(body, q_ground, q_pendulum, time_s):
     # the joint is the origin: place the composite c.g. accordingly
     state[0:3] = -dynamics.offsets(state, body)["joint"][0]
     run = solve_ivp(
-        lambda _, y: dynamics.rates(y, body, LOADS),
+        lambda _, y: two_body.rates(y, body, LOADS),
         (0.0, time_s[-1]),
         state,
         method="DOP853",
@@ -39,11 +40,11 @@ def swing(body, q_ground, q_pendulum, time_s):
     states = run.y.T
     where = dynamics.points(states, body)
     origin, drift = where["joint"]
-    solved = [dynamics.accelerations(s, body, LOADS) for s in states]
+    solved = [two_body.accelerations(s, body, LOADS) for s in states]
     q = states[:, 10:14] / np.linalg.norm(states[:, 10:14], axis=1, keepdims=True)
     rate = rotations.rotate(q, states[:, 17:20])
     moments = [
-        dynamics.joint_moment(body, s[6:10], s[10:14], -w + rotations.rotate(s[6:10], s[14:17]))
+        two_body.joint_moment(body, s[6:10], s[10:14], -w + rotations.rotate(s[6:10], s[14:17]))
         for s, w in zip(states, rate, strict=True)
     ]
     assert np.abs(origin).max() < 1e-6

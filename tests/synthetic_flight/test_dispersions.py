@@ -23,7 +23,7 @@ from synthetic_flight.dispersions import (
 )
 from synthetic_flight.ensemble import QUANTITIES, Plan, Start, fly_legs, fly_runs, legs, records_of, scalars_of
 from synthetic_flight.scenarios import child_rng, fly_scenario, initial_state, read_scenario
-from synthetic_flight.weather import day_atmosphere
+from synthetic_flight.weather import day_of_flight_atmosphere
 from tests.postflight.short_flights import write_short
 
 WINDOW = Window(from_s=402.0, to_s=410.0, record_s=0.02, history_s=0.1)
@@ -86,7 +86,7 @@ def test_wrong_dispersions_are_refused(tables, words):
 def test_an_undispersed_flight_is_the_simulators_own(short):
     """Legs, longer steps before inflation and outputs against `fly_scenario`, on the same day."""
     truth = fly_scenario(short, 5)
-    table = simulate.atmosphere_table(day_atmosphere(short.spec.atmosphere, child_rng(5, "atmosphere")))
+    table = simulate.atmosphere_table(day_of_flight_atmosphere(short.spec.atmosphere, child_rng(5, "atmosphere")))
     start = Start(initial_state(short), simulate.parameter_vector(short.vehicle), table)
     plan = legs(short.spec.time, WINDOW, locked=False)
     records = records_of(fly_legs(short.vehicle, [0], [start], plan)[0], short.vehicle, table)
@@ -155,7 +155,7 @@ def test_what_cannot_fly_is_a_row_with_its_reason(short):
     assert "joint.freeplay_deg = -0.6" in rows[0].reason
     assert rows[1].reason == ""
     assert np.isfinite(rows[1].histories).all()
-    assert "too long for the joint's bending" in rows[2].reason
+    assert "bending" in rows[2].reason
     assert np.isnan(rows[0].scalars["peak_deflection_deg"])
     assert np.isnan(rows[2].histories).all()
 
@@ -172,13 +172,15 @@ def test_a_joint_that_diverges_holds_its_last_value(short):
 
 
 def test_windows_that_do_not_fit_are_refused(short):
-    with pytest.raises(ConfigError, match=r"401 \(inflated\) <= from_s = 400\.5"):
+    with pytest.raises(ConfigError, match=r"401 .*400\.5") as refusal:
         legs(short.spec.time, Window(from_s=400.5, to_s=405.0), locked=False)
-    with pytest.raises(ValueError, match="a whole multiple of record_s"):
+    assert refusal.value.codes == ("window-outside-flight",)
+    with pytest.raises(ValueError, match="record_s"):
         Window(from_s=1.0, to_s=2.0, record_s=0.02, history_s=0.05)
 
 
 def test_a_factor_on_coefficients_must_stay_positive(short):
     laws = Dispersions(aerodynamics={"ca": {"uniform": [-3.0, -2.0]}})
-    with pytest.raises(GateError, match="on C_A, C_N, C_m"):
+    with pytest.raises(GateError) as refusal:
         dispersed_case(short, laws, dict.fromkeys(laws.factors(), 0.5))
+    assert refusal.value.codes == ("draw-impossible",)

@@ -8,6 +8,7 @@ from flightmodel.atmosphere import AtmosphereProfile
 from synthetic_flight import _kernels, dynamics, simulate
 from synthetic_flight import _kernels as at
 from synthetic_flight.simulate import integrate, state_from_ecef
+from tests.oracles import two_body
 
 from .conftest import entry_state, free_state, undamped
 
@@ -46,14 +47,14 @@ def kernel_rates(state, vehicle, table, locked=False):
 def test_kernel_equals_the_readable_form_with_every_term_alive(generic_vehicle):
     state, profile = entry_45_km(), windy()
     dy, aux = kernel_rates(state, generic_vehicle, simulate.atmosphere_table(profile))
-    force, _ = dynamics.aerodynamics(state, generic_vehicle, profile)
+    force, _ = two_body.aerodynamics(state, generic_vehicle, profile)
     # the kernel reads density every 50 m, linear in its logarithm: (50 m / 7 km)^2 / 8 of curvature at most
     np.testing.assert_allclose(aux[12:15], force, rtol=2e-7)
-    want = dynamics.rates(state, generic_vehicle, dynamics.flight_loads(state, generic_vehicle, profile))
+    want = two_body.rates(state, generic_vehicle, two_body.flight_loads(state, generic_vehicle, profile))
     np.testing.assert_allclose(dy, want, rtol=1e-6, atol=1e-7)
     # with the kernel's own aerodynamic force, the mechanics agrees to rounding
     drag_free, _ = kernel_rates(state, generic_vehicle, simulate.vacuum_table())
-    want = dynamics.rates(state, generic_vehicle, dynamics.flight_loads(state, generic_vehicle, None))
+    want = two_body.rates(state, generic_vehicle, two_body.flight_loads(state, generic_vehicle, None))
     np.testing.assert_allclose(drag_free, want, rtol=1e-11, atol=1e-11)
 
 
@@ -64,9 +65,9 @@ def test_kernel_bridges_to_free_molecular_flow_as_the_readable_form(generic_vehi
     state, profile = entry_45_km(), windy()
     state[:3] *= 1.0 + 58e3 / np.linalg.norm(state[:3])  # 103 km: nearly half way
     _, aux = kernel_rates(state, vehicle, simulate.atmosphere_table(profile))
-    force, _ = dynamics.aerodynamics(state, vehicle, profile)
+    force, _ = two_body.aerodynamics(state, vehicle, profile)
     plain = replace(generic_vehicle, aero=replace(generic_vehicle.aero, free_molecular=None))
-    continuum, _ = dynamics.aerodynamics(state, plain, profile)
+    continuum, _ = two_body.aerodynamics(state, plain, profile)
     assert np.linalg.norm(force) > 1.1 * np.linalg.norm(continuum)
     # the bridge is linear between rows 50 m apart: 50 m is 1 % of a decade's 12 km
     np.testing.assert_allclose(aux[12:15], force, rtol=2e-5, atol=1e-9)
@@ -163,7 +164,7 @@ def test_free_free_frequency_is_eq_7_and_ring_down_eq_8(vehicle, frequency_hz):
     )
     assert held.free_free_frequency_hz() == pytest.approx(frequency_hz, rel=1e-12)
     states, _ = integrate(held, simulate.vacuum_table(), planar_release(held, 0.05), 5e-4, 4, 4001)
-    _, nose = dynamics.bending(states[:, 6:10], states[:, 10:14])
+    _, nose = dynamics.deflection_angle(states[:, 6:10], states[:, 10:14])
     theta, t = np.arctan2(-nose[:, 2], nose[:, 0]), 2e-3 * np.arange(4001)
     up = np.flatnonzero((theta[:-1] < 0) & (theta[1:] >= 0))
     cross = t[up] - theta[up] * 2e-3 / (theta[up + 1] - theta[up])
@@ -187,7 +188,7 @@ def test_free_joint_recoils_by_the_two_body_formula(vehicle):
     k = plain.joint.bending_stiffness_nmprad * np.array([[1, -1], [-1, 1]])
     want = np.sqrt(np.max(np.linalg.eigvals(np.linalg.solve(mass, k)).real)) / (2 * np.pi)
     states, _ = integrate(plain, simulate.vacuum_table(), planar_release(plain, 0.002), 5e-4, 4, 2001)
-    _, nose = dynamics.bending(states[:, 6:10], states[:, 10:14])
+    _, nose = dynamics.deflection_angle(states[:, 6:10], states[:, 10:14])
     theta = np.arctan2(-nose[:, 2], nose[:, 0])
     up = np.flatnonzero((theta[:-1] < 0) & (theta[1:] >= 0))
     cross = up - theta[up] / (theta[up + 1] - theta[up])
@@ -267,7 +268,7 @@ def test_mirrored_flight_is_the_mirrored_path(vehicle):
     for body in (plain, mirrored):
         state = np.concatenate([r, [0.0, 0.0, -1500.0], down, down, np.zeros(6)])
         states, _ = integrate(body, table, state, 1e-3, 10, 1001)
-        ends.append(dynamics.bending(states[:, 6:10], states[:, 10:14])[1])
+        ends.append(dynamics.deflection_angle(states[:, 6:10], states[:, 10:14])[1])
     # the Earth turns under the flight (0.5 m/s of side wind here breaks the symmetry by 5e-4 of the angle)
     assert np.abs(ends[0][:, 1]).max() > 0.002
     np.testing.assert_allclose(ends[1][:, 1], -ends[0][:, 1], atol=2e-5)

@@ -38,16 +38,18 @@ def test_leftovers_of_dead_processes_are_removed_and_of_living_ones_left(tmp_pat
 def test_an_old_flight_whose_successor_was_never_put_in_place_comes_back(tmp_path, short):
     simulate_to_folder(short, 0, tmp_path / "a")
     (tmp_path / "a").rename(tmp_path / f".a-old-{dead_process_number()}")
-    with pytest.raises(GateError, match="exists already"):
+    with pytest.raises(GateError) as refusal:
         simulate_to_folder(short, 1, tmp_path / "a")
+    assert refusal.value.codes == ("folder-exists",)
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
 def test_a_link_is_followed_and_stays_a_link(tmp_path, short):
     simulate_to_folder(short, 0, tmp_path / "real")
     (tmp_path / "link").symlink_to(tmp_path / "real")
-    with pytest.raises(GateError, match="exists already"):
+    with pytest.raises(GateError) as refusal:
         simulate_to_folder(short, 1, tmp_path / "link")
+    assert refusal.value.codes == ("folder-exists",)
     before = (tmp_path / "real" / "flight.toml").stat().st_ino
     simulate_to_folder(short, 1, tmp_path / "link", replace=True)
     assert (tmp_path / "link").is_symlink()
@@ -57,6 +59,9 @@ def test_a_link_is_followed_and_stays_a_link(tmp_path, short):
 def test_a_flight_too_short_for_its_telemetry_says_so(tmp_path, short):
     time = short.spec.time.model_copy(update={"telemetry_from_s": 98.5})
     late = replace(short, spec=short.spec.model_copy(update={"time": time}))
-    with pytest.raises(GateError, match=r"ends at 99\.00 s .*; time\.telemetry_from_s = 98\.5 leaves"):
+    with pytest.raises(GateError) as refusal:
         simulate_to_folder(late, 0, tmp_path / "a")
+    assert refusal.value.codes == ("telemetry-too-short",)
+    assert "99.00 s" in str(refusal.value)
+    assert "time.telemetry_from_s = 98.5" in str(refusal.value)
     assert list(tmp_path.iterdir()) == []

@@ -15,6 +15,7 @@ from flightmodel import rotations
 from flightmodel.vehicle import MassProperties
 from synthetic_flight import dynamics, simulate
 from synthetic_flight.simulate import integrate
+from tests.oracles import two_body
 
 from .conftest import bent_entry_state, free_state, undamped, with_joint
 from .plain_loads import SmoothAir
@@ -27,7 +28,7 @@ DOWN = rotations.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 def exactly(body, loads, state, time_s, event=None):
     return solve_ivp(
-        lambda _, y: dynamics.rates(y, body, loads),
+        lambda _, y: two_body.rates(y, body, loads),
         (0.0, time_s[-1]),
         state,
         method="DOP853",
@@ -39,7 +40,7 @@ def exactly(body, loads, state, time_s, event=None):
 
 
 def swing(body, q_ground, q_body, rate, time_s, event=None):
-    loads = dynamics.Loads(np.zeros(3), np.array([0.0, 0.0, -G * body.aeroshell.mass_kg]), np.zeros(3))
+    loads = two_body.Loads(np.zeros(3), np.array([0.0, 0.0, -G * body.aeroshell.mass_kg]), np.zeros(3))
     state = np.concatenate([np.zeros(6), q_ground, q_body, np.zeros(3), rate])
     offset, velocity = dynamics.offsets(state, body)["joint"]
     state[0:3], state[3:6] = -offset, -velocity
@@ -111,7 +112,7 @@ def test_free_double_pendulum(vehicle, measured, stiffness):
         assert len(states) == len(time)
     else:
         # a kernel's flight ends where the joint passes 90 deg; the readable equations go on
-        none = dynamics.Loads(np.zeros(3), np.zeros(3), np.zeros(3))
+        none = two_body.Loads(np.zeros(3), np.zeros(3), np.zeros(3))
         states = exactly(one, none, state, time).y.T
     # both angles about y, unwrapped
     got = [2.0 * np.unwrap(np.arctan2(q[:, 2], q[:, 0]), period=np.pi) for q in (states[:, 6:10], states[:, 10:14])]

@@ -9,7 +9,7 @@ from flightmodel.trajectory import move_point
 from synthetic_flight import sensing
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import child_rng, fly_scenario, read_scenario
-from synthetic_flight.weather import day_atmosphere, sense_atmosphere
+from synthetic_flight.weather import day_of_flight_atmosphere, sense_atmosphere
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_instruments_do_not_share_noise_and_a_day_is_a_seed(scenario):
     a, b = (child_rng(3, name).standard_normal(4) for name in ("wallops_island", "rates"))
     assert not np.allclose(a, b)
     np.testing.assert_array_equal(a, child_rng(3, "wallops_island").standard_normal(4))
-    one, two = (day_atmosphere(scenario.spec.atmosphere, child_rng(s, "atmosphere")) for s in (3, 4))
+    one, two = (day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(s, "atmosphere")) for s in (3, 4))
     assert not np.allclose(one.log_density_ratio, two.log_density_ratio)
 
 
@@ -155,18 +155,21 @@ def test_folders_are_reproducible_and_never_overwritten(tmp_path, scenario):
     for file in files:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]  # nothing partial beside them
-    with pytest.raises(GateError, match="exists already"):
+    with pytest.raises(GateError) as refusal:
         simulate_to_folder(brief, 2, tmp_path / "a")
+    assert refusal.value.codes == ("folder-exists",)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
-    with pytest.raises(GateError, match="not a synthetic flight folder"):
+    with pytest.raises(GateError) as refusal:
         simulate_to_folder(brief, 2, tmp_path / "mine", replace=True)
+    assert refusal.value.codes == ("folder-not-synthetic",)
     assert (tmp_path / "mine" / "thesis.txt").exists()
 
 
 def test_unknown_scenario_and_faults_of_a_file(tmp_path):
-    with pytest.raises(ConfigError, match="did you mean 'irve2_reference'"):
+    with pytest.raises(ConfigError, match="irve2_reference") as refusal:
         read_scenario("irve2_refernce")
+    assert refusal.value.codes == ("scenario-unknown",)
     text = read_scenario("irve2_reference").source.read_text()
     (tmp_path / "bad.toml").write_text(
         text.replace("spin_rpm = 6.0", "spin_rmp = 6.0").replace("stop_s = 530.0", "stop_s = 30.0")

@@ -44,7 +44,9 @@ def test_too_long_a_step_is_refused_with_the_longest(vehicle):
 
     stiff = with_joint(vehicle, bending_stiffness_nmprad=1.0e7)
     state = free_state(vehicle)
-    with pytest.raises(ConfigError, match=r"step of 4 ms is too long for the joint's bending at 1\d\d\.\d Hz: at most"):
+    with pytest.raises(ConfigError, match=r"4 ms .*bending.* 1\d\d\.\d Hz") as refusal:
         fly(stiff, standard_atmosphere(), state, 0.0, 1.0, "2009-08-17T12:52:00Z", 0.004, 0.004)
-    with pytest.raises(ConfigError, match="torsion at 53"):
+    assert refusal.value.codes == ("step-too-long",)
+    with pytest.raises(ConfigError, match=r"torsion.* 53\.") as refusal:
         list(fly_ensemble(vehicle, lambda _: None, [0], Schedule(0.01, 1, 2)))
+    assert refusal.value.codes == ("step-too-long",)

@@ -1,8 +1,12 @@
 """The whole chain on one flight: fly, forget the truth, reconstruct, find the deflection three ways, score.
 
-Limits are those that the demo flight must reach with nominal instrument errors. Bounds on the consistency of errors
-with their standard deviations are four sd of a single draw (exceeded once in 16 000 by chance), or for a whole history
-the mean square of error / sd, which is correlated in time and so is given one wide two-sided band.
+Deflections must lie within four of their own standard deviations (exceeded once in 16 000 draws) and within four of
+the rms errors that many days with these instruments showed: at peak pressure the largest errors of 21 days were 0.27
+deg (misalignment) and 0.31 deg (trim), 2.2 of an rms of 0.14 as the largest of 21 draws is; rms of a hundred films
+0.14 deg, of a hundred fused flights 0.08 deg (README.md, docs/camera.md, docs/deflection.md). Over a history, whose
+errors are correlated, the rms of one flight stays below 2.6 of these (1 in 100), and the mean square of error / sd
+has the 99.9 % band of a chi-square with three degrees of freedom: constant errors, the wind's and the attitude's.
+Bounds on the trajectory's errors are four sd of a single draw.
 """
 
 from __future__ import annotations
@@ -14,9 +18,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import chi2
 
 METHODS = ("camera", "misalignment", "trim", "fused")
-DEFLECTION_LIMIT_DEG = {"camera": 0.7, "misalignment": 0.7, "trim": 1.2, "fused": 0.5}
+RMS_DEG = {"camera": 0.14, "misalignment": 0.14, "trim": 0.14, "fused": 0.08}
+# stated at peak: a bar that is far off its size on the demo flight is wrong whatever the error (0.10, 0.16, 0.49, 0.08)
+SD_DEG = {"camera": (0.01, 0.20), "misalignment": (0.10, 0.25), "trim": (0.25, 0.75), "fused": (0.05, 0.13)}
+MEAN_SQUARE = chi2.ppf([0.0005, 0.9995], 3) / 3.0
 PULSE_FRACTION = 0.5  # the pressure pulse: dynamic pressure above half its peak
 
 pytestmark = pytest.mark.slow
@@ -161,10 +169,11 @@ def test_deflection_at_peak_is_recovered(scored: dict, method: str) -> None:
     row = scored["methods"][method]
     assert {"deflection_deg", "sd_deg", "truth_deg", "error_deg"} <= set(row)
     assert row["error_deg"] == pytest.approx(row["deflection_deg"] - row["truth_deg"], abs=1e-9)
-    assert abs(row["error_deg"]) < DEFLECTION_LIMIT_DEG[method]
+    assert abs(row["error_deg"]) < 4.0 * RMS_DEG[method]
     assert abs(row["error_deg"]) < 4.0 * row["sd_deg"]
-    assert 0.01 < row["sd_deg"] < DEFLECTION_LIMIT_DEG[method]
-    assert row["truth_deg"] > 1.0, "nothing bent, nothing shown"
+    low, high = SD_DEG[method]
+    assert low < row["sd_deg"] < high
+    assert row["truth_deg"] > 1.0, "without a deflection nothing is shown"
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -180,15 +189,15 @@ def test_score_is_what_the_files_say(scored: dict, run_folder: Path, true_deflec
 
 @pytest.mark.parametrize("method", METHODS)
 def test_deflection_history_follows_the_truth(run_folder: Path, true_deflection, truth, method: str) -> None:
-    """Not only at the peak: over the pulse each method's rms error is within its limit and fits its sd."""
+    """Not only at the peak: over the pulse each method's rms error is within its limit and consistent with its sd."""
     table = pd.read_csv(run_folder / f"deflection_{method}.csv")
     pressure = np.interp(table["t_s"], truth["t_s"], truth["dynamic_pressure_pa"])
     table = table[pressure > PULSE_FRACTION * truth["dynamic_pressure_pa"].max()]
     assert len(table) > 30
     error = table["theta_deg"] - np.interp(table["t_s"], true_deflection["t_s"], true_deflection["theta_deg"])
-    assert np.sqrt((error**2).mean()) < DEFLECTION_LIMIT_DEG[method]
-    assert (np.abs(error) < 4.0 * table["theta_sd_deg"]).mean() > 0.99
-    assert 0.02 < ((error / table["theta_sd_deg"]) ** 2).mean() < 6.0
+    assert np.sqrt((error**2).mean()) < 2.6 * RMS_DEG[method]
+    assert (np.abs(error) < 4.0 * table["theta_sd_deg"]).all()
+    assert MEAN_SQUARE[0] < ((error / table["theta_sd_deg"]) ** 2).mean() < MEAN_SQUARE[1]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -243,11 +252,11 @@ def _change(path: Path, column: str, change) -> None:
 @pytest.mark.parametrize("method", [METHODS[0], *(pytest.param(m, marks=pytest.mark.long) for m in METHODS[1:])])
 def test_score_exits_5_where_a_deflection_is_wrong(command, flown, run_folder, tmp_path, method: str) -> None:
     folder, run = _spoiled(flown, run_folder, tmp_path)
-    _change(run / f"deflection_{method}.csv", "theta_deg", lambda v: v + 1.5 * DEFLECTION_LIMIT_DEG[method])
+    _change(run / f"deflection_{method}.csv", "theta_deg", lambda v: v + 8.0 * RMS_DEG[method])
     done = command("score", folder, "--json")
     assert done.returncode == 5
     result = json.loads(done.stdout)
-    assert abs(result["methods"][method]["error_deg"]) > DEFLECTION_LIMIT_DEG[method]
+    assert abs(result["methods"][method]["error_deg"]) > 4.0 * RMS_DEG[method]
 
 
 @pytest.mark.parametrize(

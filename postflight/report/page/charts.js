@@ -8,19 +8,19 @@ function translucent(colour, share) {
   return `rgba(${r},${g},${b},${share})`;
 }
 
-// times, values, and edges of the band of one line; the band ends at the panel's floor
+// times, values, and edges of the band of three sd of one line; the band ends at the panel's floor
 function edges(line, panel) {
   const floor = panel.floor === undefined ? -Infinity : panel.floor;
   const part = (sign) => line.y.map((y, k) =>
-    (y === null || line.sd3[k] === null ? null : Math.max(y + sign * line.sd3[k], floor)));
+    (y === null || line.sd[k] === null ? null : Math.max(y + sign * 3 * line.sd[k], floor)));
   const t = line.t || data[panel.time];
   if (line.low) return { t, y: line.y, low: line.low, high: line.high };
-  if (line.sd3) return { t, y: line.y, low: part(-1), high: part(1) };
+  if (line.sd) return { t, y: line.y, low: part(-1), high: part(1) };
   return { t, y: line.y };
 }
 
-function chartData(told) {
-  const tables = told.map((e) => (e.low ? [e.t, e.y, e.low, e.high] : [e.t, e.y]));
+function chartData(parts) {
+  const tables = parts.map((e) => (e.low ? [e.t, e.y, e.low, e.high] : [e.t, e.y]));
   if (tables.every((table) => table[0] === tables[0][0])) return [tables[0][0], ...tables.flatMap((table) => table.slice(1))];
   return uPlot.join(tables);
 }
@@ -35,10 +35,10 @@ function clipped(u, draw) {
   ctx.restore();
 }
 
-// vertical lines with the numbers of the table of moments, in two rows where they stand close
+// vertical lines with the numbers of the table of events, in two rows where they stand close
 function drawEvents(u, numbered) {
   clipped(u, (ctx, bbox, ratio) => {
-    ctx.strokeStyle = ctx.fillStyle = "#57616b";
+    ctx.strokeStyle = ctx.fillStyle = data.colours.soft;
     ctx.lineWidth = ratio;
     ctx.font = `${10 * ratio}px system-ui, sans-serif`;
     ctx.textAlign = "left";
@@ -69,7 +69,7 @@ function drawPoints(u, points, size) {
     for (let k = first; k < points.t.length && points.t[k] <= u.scales.x.max; k++) {
       const y = points.y[k], x = u.valToPos(points.t[k], "x", true);
       if (y === null) continue;
-      ctx.fillStyle = ctx.strokeStyle = bad.has(k) ? "#a33c00" : points.colour;
+      ctx.fillStyle = ctx.strokeStyle = bad.has(k) ? data.colours.bad : points.colour;
       if (y > high || y < low) {
         const up = y > high, base = up ? bbox.top + 7 * ratio : bbox.top + bbox.height - 7 * ratio;
         ctx.beginPath();
@@ -89,8 +89,8 @@ function drawPoints(u, points, size) {
 }
 
 function axes(withUtc, small) {
-  const grid = { stroke: "#eceff2", width: 1 }, ticks = { stroke: "#c4ccd3", width: 1, size: 5 };
-  const look = { stroke: "#57616b", font: FONT, grid, ticks };
+  const grid = { stroke: data.colours.grid, width: 1 }, ticks = { stroke: data.colours.tick, width: 1, size: 5 };
+  const look = { stroke: data.colours.soft, font: FONT, grid, ticks };
   const digits = (splits) => [0, 1, 2, 3].find((d) => splits.every((t) => Math.abs(t - t.toFixed(d)) < 1e-6)) ?? 3;
   return [
     { ...look, size: withUtc ? 46 : 30, space: withUtc ? 90 : 60, gap: 4,
@@ -118,7 +118,7 @@ function scaleOf(panel) {
   };
 }
 
-function makeChart(panel, told, series, bands, options) {
+function makeChart(panel, parts, series, bands, options) {
   const figure = document.getElementById(`panel-${panel.id}`), host = figure.querySelector(".plot");
   const u = new uPlot({
     width: host.clientWidth,
@@ -139,7 +139,7 @@ function makeChart(panel, told, series, bands, options) {
         clock.show(from, to);
       }],
     },
-  }, told, host);
+  }, parts, host);
   const cursor = document.createElement("div");
   cursor.className = "cursor";
   u.over.append(cursor);
@@ -170,11 +170,11 @@ function swatch(line) {
 }
 
 // a button a line: its look, its name, its value at the cursor; pressing it hides or shows the line
-function addLegend(chart, told) {
+function addLegend(chart, parts) {
   const legend = chart.figure.querySelector(".legend"), unit = chart.panel.unit ? ` ${chart.panel.unit}` : "";
   let index = 1;
   chart.panel.lines.forEach((line, k) => {
-    const own = told[k], count = own.low ? 3 : 1, from = index, value = document.createElement("b");
+    const own = parts[k], count = own.low ? 3 : 1, from = index, value = document.createElement("b");
     index += count;
     const button = document.createElement("button");
     button.type = "button";
@@ -187,9 +187,13 @@ function addLegend(chart, told) {
     });
     legend.append(button);
     clock.onCursor.push((t) => {
-      const y = between(own.t, line.y, t), sd3 = line.sd3 ? between(own.t, line.sd3, t) : null;
-      const digits = Math.abs(y) >= 1000 ? 0 : Math.abs(y) >= 100 ? 1 : 2;
-      value.textContent = y === null ? "–" : `${y.toFixed(digits)}${sd3 === null ? "" : ` ± ${sd3.toFixed(digits)}`}${unit}`;
+      // between frames a straight line is no answer with that sd: the nearest frame's value, with its time
+      const inside = t >= own.t[0] && t <= own.t[own.t.length - 1];
+      const at = line.dots && inside ? own.t[nearestRow(own.t, t)] : t;
+      const y = between(own.t, line.y, at), sd = line.sd ? between(own.t, line.sd, at) : null;
+      const least = Math.abs(y) >= 1000 ? 0 : Math.abs(y) >= 100 ? 1 : 2;
+      const digits = sd > 0 ? Math.min(4, Math.max(least, -Math.floor(Math.log10(2 * sd)))) : least;
+      value.textContent = y === null ? "–" : `${y.toFixed(digits)}${sd === null ? "" : ` ± ${sd.toFixed(digits)}`}${unit}${line.dots ? ` at ${at.toFixed(2)} s` : ""}`;
     });
   });
   for (const points of chart.panel.raw) {
@@ -200,21 +204,21 @@ function addLegend(chart, told) {
 }
 
 function timePanel(panel, options) {
-  const told = panel.lines.map((line) => edges(line, panel)), series = [], bands = [];
+  const parts = panel.lines.map((line) => edges(line, panel)), series = [], bands = [];
   panel.lines.forEach((line, k) => {
     series.push({ stroke: line.colour, width: line.width, dash: line.dash, points: line.dots ? { show: true, size: 4, width: 0, fill: line.colour } : { show: false } });
-    if (!told[k].low) return;
-    const edge = { stroke: "rgba(0,0,0,0)", width: 0, points: { show: false } };
+    if (!parts[k].low) return;
+    const edge = { stroke: "transparent", width: 0, points: { show: false } };
     bands.push({ series: [series.length + 2, series.length + 1], fill: translucent(line.colour, line.low ? 0.28 : 0.15) });
     series.push(edge, edge);
   });
-  addLegend(makeChart(panel, chartData(told), series, bands, { height: panel.id === "deflection" ? TALL : HEIGHT, dot: 1.6, ...options }), told);
+  addLegend(makeChart(panel, chartData(parts), series, bands, { height: panel.id === "deflection" ? TALL : HEIGHT, dot: 1.6, ...options }), parts);
 }
 
 function residualPanel(panel, options) {
   const line = (factor) => panel.sd.map((sd) => factor * sd);
-  const thin = { stroke: "#57616b", width: 1, points: { show: false } }, gate = { ...thin, stroke: "#a33c00", dash: [6, 4] };
-  const whole = { ...panel, lines: [], raw: [{ t: panel.t, y: panel.y, bad: panel.bad, colour: "#0072B2" }] };
+  const thin = { stroke: data.colours.soft, width: 1, points: { show: false } }, gate = { ...thin, stroke: data.colours.bad, dash: [6, 4] };
+  const whole = { ...panel, lines: [], raw: [{ t: panel.t, y: panel.y, bad: panel.bad, colour: data.colours.residual }] };
   const chart = makeChart(whole, [panel.t, line(3), line(-3), line(panel.gate), line(-panel.gate)],
     [thin, thin, gate, gate], [], { height: SMALL, dot: 2, ...options });
   chart.figure.querySelector(".legend").textContent =

@@ -1,4 +1,4 @@
-// The film strip: choosing a picture sets the time; beside the charts stands the picture nearest to the cursor.
+// The film strip: choosing a frame sets the time; beside the charts stands the frame nearest to the cursor.
 
 function startFilm() {
   const buttons = [...document.querySelectorAll(".frame")];
@@ -14,7 +14,7 @@ function startFilm() {
     large.dataset.time = frame.t;
     large.src = picture.src;
     large.alt = picture.alt;
-    words.textContent = `Nearest picture: ${frame.t.toFixed(2)} s` +
+    words.textContent = `Nearest frame: ${frame.t.toFixed(2)} s` +
       (frame.theta === null ? ", not used" : `, ${frame.theta.toFixed(2)}° ± ${frame.sd.toFixed(2)} by video`);
   });
 }

@@ -1,4 +1,4 @@
-// Everything begins here; for paper, what is folded opens and charts take the width of a sheet.
+// Starts all parts; for print, details open and charts take the width of a page.
 
 startControls();
 const fitCharts = startCharts();

@@ -1,5 +1,5 @@
 "use strict";
-// The page's one time: the cursor and the window, and whoever wants to know when they change.
+// The page's one time: the cursor and the window, and the functions to call when they change.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 // twice a screen's pixels at least, so that charts print sharp
@@ -15,7 +15,7 @@ const clock = {
   set(t) {
     if (!Number.isFinite(t)) return;
     clock.now = Math.min(Math.max(t, data.span[0]), data.span[1]);
-    for (const tell of clock.onCursor) tell(clock.now);
+    for (const call of clock.onCursor) call(clock.now);
   },
 
   show(from, to) {
@@ -25,7 +25,7 @@ const clock = {
     if (to - from < least) return;
     clock.from = from;
     clock.to = to;
-    for (const tell of clock.onWindow) tell(from, to);
+    for (const call of clock.onWindow) call(from, to);
   },
 
   // zoom about the cursor, or about the middle where the cursor is out of sight
@@ -95,9 +95,9 @@ function startControls() {
   slider.addEventListener("keydown", clock.key);
   clock.onCursor.push((t) => {
     slider.value = t;
-    const said = `${t.toFixed(2)} s   ${utcWords(t, 2)} UTC`;
-    words.textContent = said;
-    slider.setAttribute("aria-valuetext", said);
+    const reading = `${t.toFixed(2)} s   ${utcWords(t, 2)} UTC`;
+    words.textContent = reading;
+    slider.setAttribute("aria-valuetext", reading);
   });
   for (const [id, act] of [["pulse", clock.pulse], ["whole", clock.whole],
     ["closer", () => clock.zoom(0.6)], ["wider", () => clock.zoom(1 / 0.6)]]) {

@@ -1,8 +1,8 @@
-// The vehicle at the cursor's time: centerbody, bent shell and the air that meets it, as shaded polygons on a canvas.
-// Body axes: x out of the nose, which points down here; the wind comes from below. Polygons far away are drawn first.
+// The vehicle at the cursor's time: centerbody, deflected aeroshell and the wind, as shaded polygons on a canvas.
+// Body axes: x out of the nose, which points down here; the relative wind comes from below. Far polygons are drawn first.
 
-// turn points, mm, about the joint by the rotation vector x cross b (Rodrigues), b in deg
-function bender(b, times, joint) {
+// rotation of points, mm, about the joint by the rotation vector x cross b (Rodrigues), b in deg
+function rotation(b, times, joint) {
   const size = b ? Math.hypot(b[0], b[1]) : 0;
   if (!size) return (p) => p;
   const angle = size * times * Math.PI / 180, c = Math.cos(angle), s = Math.sin(angle);
@@ -17,22 +17,22 @@ function startVehicle() {
   const canvas = document.getElementById("vehicle");
   if (!canvas || !data.solid) return;
   const ctx = canvas.getContext("2d"), solid = data.solid, words = document.getElementById("vehicle-words");
-  const slider = document.getElementById("exaggeration"), said = document.getElementById("exaggeration-words");
+  const slider = document.getElementById("exaggeration"), factor = document.getElementById("exaggeration-words");
   const RAD = Math.PI / 180, view = { azimuth: 0, elevation: 24 * RAD };
   const parts = [
-    { ...solid.forward, bends: true, tone: () => [196, 186, 166] },
-    { ...solid.aft, bends: true, tone: (k) => (solid.aft.gores[k] % 2 ? [236, 226, 204] : [224, 211, 184]) },
-    { ...solid.centerbody, bends: false, tone: () => [150, 160, 170] },
+    { ...solid.forward, deflects: true, tone: () => [196, 186, 166] },
+    { ...solid.aft, deflects: true, tone: (k) => (solid.aft.gores[k] % 2 ? [236, 226, 204] : [224, 211, 184]) },
+    { ...solid.centerbody, deflects: false, tone: () => [150, 160, 170] },
   ];
   let wanted = false;
 
   // straight lines between answers, nothing in holes and outside
-  function lateral(told, t, hole) {
-    if (!told || !told.t.length || t < told.t[0] || t > told.t[told.t.length - 1]) return null;
-    const k = rowBefore(told.t, t), n = Math.min(k + 1, told.t.length - 1), step = told.t[n] - told.t[k];
-    if (hole && step > hole && t !== told.t[k]) return null;
-    const s = step > 0 ? (t - told.t[k]) / step : 0;
-    return [told.y[k] + s * (told.y[n] - told.y[k]), told.z[k] + s * (told.z[n] - told.z[k])];
+  function lateral(history, t, hole) {
+    if (!history || !history.t.length || t < history.t[0] || t > history.t[history.t.length - 1]) return null;
+    const k = rowBefore(history.t, t), n = Math.min(k + 1, history.t.length - 1), step = history.t[n] - history.t[k];
+    if (hole && step > hole && t !== history.t[k]) return null;
+    const s = step > 0 ? (t - history.t[k]) / step : 0;
+    return [history.y[k] + s * (history.y[n] - history.y[k]), history.z[k] + s * (history.z[n] - history.z[k])];
   }
 
   function axesOfView() {
@@ -47,8 +47,8 @@ function startVehicle() {
 
   function draw() {
     wanted = false;
-    const bend = lateral(data.poses.bend, clock.now, data.poses.bend && data.poses.bend.hole);
-    const flow = lateral(data.poses.flow, clock.now, 1), times = +slider.value, turn = bender(bend, times, solid.joint);
+    const deflection = lateral(data.poses.deflection, clock.now, data.poses.deflection && data.poses.deflection.hole);
+    const flow = lateral(data.poses.flow, clock.now, 1), times = +slider.value, turn = rotation(deflection, times, solid.joint);
     const { to, up, right } = axesOfView(), w = canvas.width, h = canvas.height;
     const size = 0.41 * Math.min(w, h) / solid.radius, middle = [-0.22 * solid.length, 0, 0];
     const flat = (p) => {
@@ -62,7 +62,7 @@ function startVehicle() {
     const polygons = [];
     const light = [0.35, 0.75, 0.55];
     for (const part of parts) {
-      const points = part.vertices.map((p) => (part.bends ? turn(p) : p)).map(flat);
+      const points = part.vertices.map((p) => (part.deflects ? turn(p) : p)).map(flat);
       part.faces.forEach((face, k) => {
         const n = normal(face, points, size), shade = 0.55 + 0.45 * Math.abs(dot(n, light));
         const depth = face.reduce((sum, i) => sum + points[i][2], 0) / face.length;
@@ -81,12 +81,12 @@ function startVehicle() {
       ctx.stroke();
     }
     for (const arrow of arrows.filter((a) => flat(a[0])[2] > 0)) drawArrow(arrow, flat);
-    path(solid.rim.map(flat), "#57616b", 1.6, [7, 6]);
-    path(solid.rim.map(turn).map(flat), "#1c2126", 2.4, []);
+    path(solid.rim.map(flat), data.colours.soft, 1.6, [7, 6]);
+    path(solid.rim.map(turn).map(flat), data.colours.ink, 2.4, []);
     const far = -1.35 * solid.length, nose = 0.3 * solid.length;
-    path([[nose, 0, 0], [far, 0, 0]].map(flat), "#57616b", 1.6, [7, 6]);
-    path([[nose, 0, 0], [far, 0, 0]].map(turn).map(flat), "#1c2126", 2.4, []);
-    tell(bend, flow, times);
+    path([[nose, 0, 0], [far, 0, 0]].map(flat), data.colours.soft, 1.6, [7, 6]);
+    path([[nose, 0, 0], [far, 0, 0]].map(turn).map(flat), data.colours.ink, 2.4, []);
+    describe(deflection, flow, times);
   }
 
   // of a polygon in the picture's axes, of length one
@@ -109,7 +109,7 @@ function startVehicle() {
     ctx.setLineDash([]);
   }
 
-  // arrows of the air, from ahead towards the vehicle; flow: lateral part of the velocity against the air, deg
+  // arrows of the relative wind, from ahead towards the vehicle; flow: lateral part of the velocity relative to the air, deg
   function wind(flow) {
     const total = Math.hypot(flow[0], flow[1]), angle = total * RAD, share = total ? Math.sin(angle) / total : 0;
     const ahead = [Math.cos(angle), share * flow[0], share * flow[1]], r = solid.radius;
@@ -124,10 +124,10 @@ function startVehicle() {
 
   function drawArrow([tail, head], flat) {
     const [x0, y0] = flat(tail), [x1, y1] = flat(head), long = Math.hypot(x1 - x0, y1 - y0);
-    path([[x0, y0], [x1, y1]], "#005a8c", 3, []);
+    path([[x0, y0], [x1, y1]], data.colours.accent, 3, []);
     if (long < 4) return;
     const [dx, dy] = [(x1 - x0) / long, (y1 - y0) / long], s = Math.min(16, long / 2);
-    ctx.fillStyle = "#005a8c";
+    ctx.fillStyle = data.colours.accent;
     ctx.beginPath();
     ctx.moveTo(x1 + dx * s * 0.4, y1 + dy * s * 0.4);
     ctx.lineTo(x1 - dx * s - dy * s * 0.45, y1 - dy * s + dx * s * 0.45);
@@ -135,14 +135,14 @@ function startVehicle() {
     ctx.fill();
   }
 
-  function tell(bend, flow, times) {
-    const angle = bend ? Math.hypot(bend[0], bend[1]) : null, towards = flow ? Math.hypot(flow[0], flow[1]) : null;
-    canvas.dataset.bend = angle === null ? "" : angle.toFixed(3);
-    const plane = bend ? ((Math.atan2(bend[1], -bend[0]) / RAD) + 360) % 360 : 0;
-    words.textContent = (angle === null ? "No deflection is known at this time: drawn straight. "
-      : `Shell bent ${angle.toFixed(2)}° in the plane ${plane.toFixed(0)}° LV${times > 1 ? `, drawn ${times} times as much` : ""}. `) +
-      (towards === null ? "The angle of attack is not known. " : `Air (arrows) ${towards.toFixed(1)}° off the axis. `) +
-      "Dashed: rim and axis not bent.";
+  function describe(deflection, flow, times) {
+    const angle = deflection ? Math.hypot(deflection[0], deflection[1]) : null, towards = flow ? Math.hypot(flow[0], flow[1]) : null;
+    canvas.dataset.deflection = angle === null ? "" : angle.toFixed(3);
+    const plane = deflection ? ((Math.atan2(deflection[1], -deflection[0]) / RAD) + 360) % 360 : 0;
+    words.textContent = (angle === null ? "No deflection at this time: drawn undeflected. "
+      : `Deflection ${angle.toFixed(2)}° in the plane ${plane.toFixed(0)}° LV${times > 1 ? `, drawn ${times} times as large` : ""}. `) +
+      (towards === null ? "Angle of attack not known. " : `Angle of attack ${towards.toFixed(1)}° (arrows: relative wind). `) +
+      "Dashed: rim and axis undeflected.";
   }
 
   function redraw() {
@@ -151,9 +151,9 @@ function startVehicle() {
     requestAnimationFrame(draw);
   }
 
-  function across() {
-    const bend = lateral(data.poses.bend, clock.now) || [1, 0];
-    view.azimuth = Math.atan2(bend[1], bend[0]) + Math.PI / 2;
+  function normalView() {
+    const deflection = lateral(data.poses.deflection, clock.now) || [1, 0];
+    view.azimuth = Math.atan2(deflection[1], deflection[0]) + Math.PI / 2;
     view.elevation = 14 * RAD;
     redraw();
   }
@@ -175,11 +175,11 @@ function startVehicle() {
     turnView(by[0] * 5 * RAD, by[1] * 5 * RAD);
   });
   slider.addEventListener("input", () => {
-    said.textContent = +slider.value > 1 ? `${slider.value} times` : "as it is";
+    factor.textContent = +slider.value > 1 ? `${slider.value} times` : "as it is";
     redraw();
   });
-  document.getElementById("across").addEventListener("click", across);
+  document.getElementById("across").addEventListener("click", normalView);
   document.getElementById("behind").addEventListener("click", () => { view.elevation = Math.PI / 2; redraw(); });
   clock.onCursor.push(redraw);
-  across();
+  normalView();
 }

@@ -13,7 +13,7 @@ import pytest
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight import commands
 from postflight.deflections import METHODS
-from postflight.plots import paper_figures
+from postflight.plots import run_figures
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 from tests.postflight.short_flights import write_pulse
@@ -42,8 +42,8 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     flight = flight.replace('name = "irve2_reference"', f'name = "{HOSTILE}"', 1)
     (folder / "flight.toml").write_text(flight + f"\n[[events]]\nname = '{HOSTILE_EVENT}'\nt_s = 430.0\n")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper_figures, "save", lambda *_: None)  # nobody looks at them here
-        commands.run_flight(folder, METHODS, 20.0)
+        patch.setattr(run_figures, "save", lambda *_: None)  # nobody looks at them here
+        commands.run_flight(folder, METHODS, {})
     return folder
 
 
@@ -96,5 +96,5 @@ def rocket(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Flight folder of a rocket that flew, without vehicle file, inertial sensors and video, with one run."""
     folder = tmp_path_factory.mktemp("rocket") / "flight"
     shutil.copytree(ROOT / "tests" / "data" / "real_flights" / "rocketpy_prometheus", folder)
-    commands.run_flight(folder, METHODS, 20.0)
+    commands.run_flight(folder, METHODS, {})
     return folder

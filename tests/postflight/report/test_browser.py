@@ -59,7 +59,7 @@ def test_hostile_names_stay_text(opened) -> None:
     seen = opened()
     assert seen.dialogs == []
     assert HOSTILE in seen.page.locator(".kicker").inner_text()
-    assert HOSTILE_EVENT in seen.page.locator("#moments").inner_text()
+    assert HOSTILE_EVENT in seen.page.locator("#events").inner_text()
     assert seen.page.evaluate("data.events.map((e) => e.name)").count(HOSTILE_EVENT) == 1
     assert seen.page.locator("script").count() == 2
     seen.page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
@@ -105,12 +105,12 @@ def test_view_follows_time_and_sliders_and_turns(opened) -> None:
     page = opened().page
     page.wait_for_timeout(100)
     slider, canvas = page.locator("#time"), page.locator("#vehicle")
-    at_peak, pixels = float(canvas.get_attribute("data-bend")), page.evaluate(PIXELS)
+    at_peak, pixels = float(canvas.get_attribute("data-deflection")), page.evaluate(PIXELS)
     assert at_peak > 3.0
     slider.fill("426")
     page.wait_for_timeout(100)
     early = page.evaluate(PIXELS)
-    assert float(canvas.get_attribute("data-bend")) < 1.5
+    assert float(canvas.get_attribute("data-deflection")) < 1.5
     assert early != pixels
     assert page.locator("#nearest").get_attribute("data-time") == "426"
     slider.fill("440.6")
@@ -196,13 +196,13 @@ def test_cursor_stays_at_its_time_on_paper(opened) -> None:
     assert page.evaluate("charts.map((c) => c.u.width)") != widths
 
 
-def test_shell_is_bent_as_the_library_bends_it(opened) -> None:
+def test_aeroshell_deflects_on_the_page_as_in_the_library(opened) -> None:
     page = opened().page
     theta, plane, station = np.deg2rad(7.0), np.deg2rad(215.0), 0.2
     points = np.array([[-0.4, 1.1, 0.3], [0.0, 0.0, -1.4], [-0.2, 0.0, 0.0]])
     lateral = (7.0 * lv_direction(plane)[1:]).tolist()
     drawn = page.evaluate(
-        "([points, b, joint]) => points.map(bender(b, 1, joint))", [(1e3 * points).tolist(), lateral, 1e3 * station]
+        "([points, b, joint]) => points.map(rotation(b, 1, joint))", [(1e3 * points).tolist(), lateral, 1e3 * station]
     )
     assert np.array(drawn) / 1e3 == pytest.approx(bend(points, theta, plane, station), abs=1e-9)
 

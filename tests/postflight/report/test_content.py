@@ -14,7 +14,8 @@ import pytest
 
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_clock
-from postflight.report import pictures, words
+from postflight.report import pictures
+from postflight.report import text as texts
 from postflight.report.panels import with_holes
 from postflight.report.source import extreme_rows, kept_rows, read_run, rounded
 from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
@@ -45,7 +46,7 @@ def test_a_plane_between_sparse_answers_errs_as_it_says():
     clock = np.rad2deg(lv_clock(np.column_stack([y, z])))
     table = pd.DataFrame({"t_s": t, "theta_deg": np.hypot(y, z), "plane_lv_deg": clock, "plane_sd_deg": 0.01})
     flown = SimpleNamespace(tables={"deflection_camera": table}, summary={"peak_dynamic_pressure_s": at})
-    plane, sd = map(float, words.plane_at(flown, "camera").split(" ± "))
+    plane, sd = map(float, texts.plane_at(flown, "camera").split(" ± "))
     turn = 2.0 * np.pi * at / 1.5
     true = float(np.rad2deg(lv_clock(np.array([3.0 + np.cos(turn), np.sin(turn)]))))
     assert 0.3 * sd < abs(plane - true) < 2.0 * sd
@@ -72,7 +73,7 @@ def test_same_run_gives_the_same_bytes(reported: Path, report: Path, tmp_path: P
 
 def test_page_names_the_run_by_the_digits_of_its_folder(run, text: str) -> None:
     assert run.path.name.endswith(f"-{run.hash8}")
-    assert f"Run {run.hash8} of postflight" in text
+    assert text.count(f"{run.hash8} ") >= 2
 
 
 def test_nothing_of_the_clock_or_the_machine(run, text: str) -> None:
@@ -90,9 +91,9 @@ def test_hostile_names_are_escaped(text: str) -> None:
 
 @pytest.mark.parametrize("value", ["</script>", "<!--", "a\u2028b\u2029c", "&amp;", 'quote " and \\'])
 def test_json_in_a_script_is_safe_and_the_same(value: str) -> None:
-    told = safe_json({"name": value})
-    assert not re.search("[<>&\u2028\u2029]", told)
-    assert json.loads(told) == {"name": value}
+    out = safe_json({"name": value})
+    assert not re.search("[<>&\u2028\u2029]", out)
+    assert json.loads(out) == {"name": value}
 
 
 def test_page_files_are_in_the_package() -> None:
@@ -106,12 +107,9 @@ def test_page_files_are_in_the_package() -> None:
 
 
 def test_title_is_the_answer(run, text: str) -> None:
-    told = run.summary["methods"]["fused"]
-    assert (
-        words.title(run)
-        == f"The aeroshell bent {told['deflection_deg']:.1f}\u00a0±\u00a0{told['sd_deg']:.1f}° at peak dynamic pressure"
-    )
-    assert f"<h1>{words.title(run)}</h1>" in text
+    answer = run.summary["methods"]["fused"]
+    assert f" {answer['deflection_deg']:.1f}\u00a0±\u00a0{answer['sd_deg']:.1f}° " in texts.title(run)
+    assert f"<h1>{texts.title(run)}</h1>" in text
 
 
 @pytest.mark.parametrize(
@@ -119,12 +117,12 @@ def test_title_is_the_answer(run, text: str) -> None:
                                 (0.5, 0.02, "0.50 ± 0.02"), (1.0, 0.0, "1.00 ± 0.00")],
 )  # fmt: skip
 def test_pair_has_the_digits_that_its_sd_deserves(value: float, sd: float, wanted: str) -> None:
-    assert words.pair(value, sd).replace("\u00a0", " ") == wanted
+    assert texts.pair(value, sd).replace("\u00a0", " ") == wanted
 
 
-def test_cards_say_what_the_tests_of_pairs_say(run) -> None:
+def test_cards_carry_the_result_of_the_tests_of_pairs(run) -> None:
     pairs = run.tables["fusion_agreement"]
-    for card in words.cards(run):
+    for card in texts.cards(run):
         method = card["method"]
         mine = pairs if method == "fused" else pairs[[method in m.split(" and ") for m in pairs["methods"]]]
         assert card["state"] == ("agrees" if mine["passed"].all() else "differs")
@@ -135,9 +133,10 @@ def test_a_pair_that_disagrees_is_named(run) -> None:
     table = run.tables["fusion_agreement"].assign(passed=[True, False, True], chance=[0.5, 1e-4, 0.5])
     one = type(run)(**{**vars(run), "tables": run.tables | {"fusion_agreement": table}})
     first, second = table["methods"][1].split(" and ")
-    cards = {card["method"]: card for card in words.cards(one)}
+    cards = {card["method"]: card for card in texts.cards(one)}
     assert cards[first]["state"] == cards[second]["state"] == cards["fused"]["state"] == "differs"
-    assert cards[first]["words"] == f"disagrees with {second}"
+    assert second in cards[first]["remark"]
+    assert first in cards[second]["remark"]
     assert [c["state"] for m, c in cards.items() if m not in (first, second, "fused")] == ["agrees"]
 
 
@@ -149,7 +148,7 @@ def test_drawn_numbers_are_the_runs(run, text: str) -> None:
     assert np.abs(bet["t_s"].to_numpy()[rows] - data["bet"]).max() < 1e-4
     drawn = panels["pressure"]["lines"][0]
     assert drawn["y"] == pytest.approx(bet["dynamic_pressure_pa"].to_numpy()[rows], abs=6e-4)
-    assert drawn["sd3"] == pytest.approx(3.0 * bet["dynamic_pressure_sd_pa"].to_numpy()[rows], abs=6e-4)
+    assert drawn["sd"] == pytest.approx(bet["dynamic_pressure_sd_pa"].to_numpy()[rows], abs=6e-4)
     assert max(drawn["y"]) == pytest.approx(bet["dynamic_pressure_pa"].max(), abs=6e-4)
     fused = next(one for one in panels["deflection"]["lines"] if one["label"] == "all fused")
     table = run.tables["deflection_fused"]
@@ -175,14 +174,15 @@ def test_rocket_without_vehicle_says_why(rocket: Path) -> None:
     run = read_run(rocket)
     text = (run.path / "report.html").read_text()
     data = payload(text)
-    assert words.title(run).replace("\u00a0", " ").startswith("Prometheus rose to 5.50 ± 0.01 km; no method could say")
+    title = texts.title(run).replace("\u00a0", " ")
+    assert title.startswith("Prometheus")
+    assert "5.50 ± 0.01 km" in title
     assert [p["id"] for p in data["panels"]] == ["altitude", "speed", "mach", "pressure"]
     assert data["solid"] is None
-    for why in (
-        "names no vehicle", "the flight has no video", "The flight has no video.", "its shape is not known",
-        "The flight has no accelerometer", "Nothing on board carried the attitude", "no rigid vehicle to fly beside it",
-    ):  # fmt: skip
-        assert why in text
+    absent = set(re.findall(r'data-absent="([^"]*)"', text))
+    assert absent == {"panel-deflection", "panel-alpha", "panel-axial", "panel-lateral", "vehicle", "video", "rigid"}
+    assert text.count('class="card none') == 4
+    assert {card["reason"] for card in texts.cards(run)} == {m["reason"] for m in run.summary["methods"].values()}
     assert data["first"] == data["span"]
 
 
@@ -192,22 +192,23 @@ def test_run_of_the_trajectory_alone(run) -> None:
     facts = {**run.facts, "settings": {**run.facts["settings"], "methods": []}}
     one = type(run)(**{**vars(run), "summary": bare, "tables": tables, "facts": facts})
     text = page(one)
-    assert "how far it bent was not asked" in text
-    assert text.count("not asked for in this run") >= 4
-    assert "This run holds no flights of the rigid vehicle" in text
+    assert "°" not in texts.title(one)
+    assert {card["reason"] for card in texts.cards(one)} == {texts.NOT_ASKED}
+    assert {"panel-deflection", "video", "rigid"} == set(re.findall(r'data-absent="([^"]*)"', text))
 
 
-def test_failed_verdicts_and_findings_are_told(run) -> None:
-    bad = {**run.summary, "verdicts_failed": ["NIS north: too large <b>"], "suspects": ["north: its clock"]}
+def test_failed_checks_and_findings_are_shown(run) -> None:
+    bad = {**run.summary, "verdicts_failed": ["NIS north: too large <b>"], "suspects": ["north: its <i> time bias"]}
     found = pd.DataFrame([("north", "gap of 3 s", 430.0, 433.0)] * 300, columns=["source", "what", "start_s", "end_s"])
     one = type(run)(**{**vars(run), "summary": bad, "tables": run.tables | {"findings": found}})
     text = page(one)
     assert "✕ NIS north: too large &lt;b&gt;" in text
-    assert "Suspect: north: its clock" in text
-    assert "100 more rows stand in the run's folder" in text
+    assert ": north: its &lt;i&gt; time bias" in text
+    assert "gap of 3 s" in text
+    assert texts.table_rows(found)["more"] == 300 - texts.SHOWN_ROWS
 
 
-def test_sensitivity_is_told_by_groups() -> None:
+def test_sensitivity_is_shown_by_groups() -> None:
     columns = ["rerun", "quantity", "change_over_sd", "change_over_expected_sd", "reason"]
     table = pd.DataFrame(
         [
@@ -218,10 +219,10 @@ def test_sensitivity_is_told_by_groups() -> None:
         ],
         columns=columns,
     )
-    told = words.sensitivity_rows(table)
-    assert told["names"] == ["rerun", "position", "Mach number"]
-    assert told["rows"] == [["without north", "+1.25", "–"], ["winds off", "no rerun: it diverged", ""]]
-    assert words.sensitivity_rows(table[3:]) == {
+    shown = texts.sensitivity_rows(table)
+    assert shown["names"] == ["rerun", "position", "Mach number"]
+    assert shown["rows"] == [["without north", "+1.25", "–"], ["winds off", "no rerun: it diverged", ""]]
+    assert texts.sensitivity_rows(table[3:]) == {
         "names": ["rerun", "reason"], "rows": [["winds off", "no rerun: it diverged"]], "more": 0,
     }  # fmt: skip
 
@@ -233,8 +234,10 @@ def test_changed_telemetry_is_refused(rocket: Path, tmp_path: Path) -> None:
     shutil.copytree(rocket, tmp_path / "flight")
     path = tmp_path / "flight" / "flight.toml"
     path.write_text(path.read_text() + "\n# another thought\n")
-    with pytest.raises(GateError, match=r"changed since the run .*: flight\.toml; use `postflight run"):
+    with pytest.raises(GateError) as refusal:
         read_run(tmp_path / "flight")
+    assert refusal.value.codes == ("inputs-changed",)
+    assert "flight.toml" in str(refusal.value)
 
 
 @pytest.mark.parametrize("name", ["bet.csv", "summary.json", "residuals.csv"])
@@ -242,8 +245,9 @@ def test_run_that_is_not_whole_is_refused(rocket: Path, tmp_path: Path, name: st
     shutil.copytree(rocket, tmp_path / "flight")
     path = next((tmp_path / "flight" / "runs").iterdir())
     (path / name).unlink()
-    with pytest.raises(GateError, match=r"not a whole run|no finished run"):
+    with pytest.raises(GateError) as refusal:
         read_run(tmp_path / "flight", path)
+    assert refusal.value.codes == ("run-incomplete",)
 
 
 def test_command_writes_where_told_and_says_so(command, rocket: Path, tmp_path: Path) -> None:
@@ -254,7 +258,7 @@ def test_command_writes_where_told_and_says_so(command, rocket: Path, tmp_path: 
     assert (done.returncode, (tmp_path / "new" / "a.html").read_bytes()) == (0, (tmp_path / "a.html").read_bytes())
     done = command("report", rocket, "--output", tmp_path / "a.html" / "b.html")
     assert done.returncode == 3
-    assert "cannot be written" in done.stderr
+    assert str(tmp_path / "a.html") in done.stderr
     assert command("report", tmp_path).returncode == 3
 
 
@@ -294,7 +298,7 @@ def test_noisy_film_does_not_swell_the_report(noise: float, coarse: bool) -> Non
     rng = np.random.default_rng(1)
     ramp = np.broadcast_to(np.linspace(60.0, 190.0, 1280)[None, :, None], (720, 1280, 3))
     film = [np.clip(ramp + noise * rng.standard_normal(ramp.shape), 0, 255).astype(np.uint8) for _ in range(14)]
-    told = pictures.jpegs(film)
-    assert sum(map(len, told)) <= pictures.LARGEST_CHARACTERS
+    made = pictures.jpegs(film)
+    assert sum(map(len, made)) <= pictures.LARGEST_CHARACTERS
     finest = [pictures.jpeg(pictures.narrowed(picture), pictures.QUALITIES[0]) for picture in film]
-    assert (told != finest) == coarse
+    assert (made != finest) == coarse

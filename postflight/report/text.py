@@ -1,4 +1,7 @@
-"""The answer in words: title, verdict cards, the flight's moments, what was given to it and what it leaned on."""
+"""What does the report say? Title, lead, a card for each method, events, tables: everything that is text.
+
+A ± is one standard deviation; a card's interval says its probability (95 %).
+"""
 
 from __future__ import annotations
 
@@ -13,25 +16,26 @@ from estimators.agreement import CONFIDENCE
 from flightmodel.config import parse_utc
 from flightmodel.deflection import interpolation_error, lateral_axes, lv_clock, lv_direction
 from postflight.deflections import METHODS
-from postflight.plots.paper_figures import COLOUR, LABEL
+from postflight.plots.style import COLOUR, LABEL
 from postflight.report.pictures import best_method, hole_s
 from postflight.report.source import Run
 from postflight.sensitivity import largest_of_groups
 
-SIDES_95 = 1.96
-HOW = {
-    "camera": "Edge, seams and dots of the shell as the onboard camera saw them.",
-    "misalignment": "The bending that reconciles the accelerometers with the trajectory's angle of attack.",
-    "trim": "The shift of the shell's force that balances the moments at the angle that was flown.",
-    "fused": "All of them, weighed by what they share.",
+_SIDES_95 = 1.96
+_HOW = {
+    "camera": "Edge, seams and dots of the aeroshell in the onboard video.",
+    "misalignment": "The deflection that reconciles the accelerometers with the trajectory's angle of attack.",
+    "trim": "The offset of the aeroshell's force that balances the moments at the flown angle of attack.",
+    "fused": "All methods, weighted, with the inputs they share.",
 }
-BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "trim": "the trim angle alone"}
+_BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "trim": "the trim angle alone"}
+_ALONE = {"state": "alone", "mark": "○", "remark": "no independent measurement to compare with"}
 NOT_ASKED = "not asked for in this run"
 SHOWN_ROWS = 200
-SWING_S, SWINGS_SD = 1.0, 4.0
+_NEAR_PEAK_S, _OSCILLATES_SD = 1.0, 4.0  # window about the peak; range in it that one number does not describe
 
 
-def utc(run: Run, time_s: float) -> str:
+def _utc(run: Run, time_s: float) -> str:
     """Clock time of a mission time, ``12:59:20.62``."""
     stamp = parse_utc(run.telemetry.t0_utc) + timedelta(seconds=float(time_s), milliseconds=5)
     return stamp.strftime("%H:%M:%S.") + f"{stamp.microsecond // 10000:02d}"
@@ -47,19 +51,18 @@ def title(run: Run) -> str:
     """Return the answer in one sentence."""
     best = best_method(run)
     if best is not None:
-        told = run.summary["methods"][best]
-        size = pair(told["deflection_deg"], told["sd_deg"])
-        by = "" if best == "fused" else f", by {BY[best]}"
-        return f"The aeroshell bent {size}° at {peak_words(run)}{by}"
+        answer = run.summary["methods"][best]
+        by = "" if best == "fused" else f", by {_BY[best]}"
+        return f"Deflection {pair(answer['deflection_deg'], answer['sd_deg'])}° at {_peak_name(run)}{by}"
     asked = run.facts["settings"]["methods"]
-    end = "no method could say how far anything bent" if asked else "how far it bent was not asked"
+    end = "no method gave a deflection" if asked else "no deflection was asked for"
     highest = run.peak("altitude")
     if highest is not None and bool(highest["inside"]):
-        return f"{run.telemetry.name} rose to {pair(highest['value'] / 1e3, highest['sd'] / 1e3)}\u00a0km; {end}"
-    return f"{run.telemetry.name}: the trajectory is known; {end}"
+        return f"{run.telemetry.name}: apogee {pair(highest['value'] / 1e3, highest['sd'] / 1e3)}\u00a0km; {end}"
+    return f"{run.telemetry.name}: trajectory reconstructed; {end}"
 
 
-def peak_words(run: Run) -> str:
+def _peak_name(run: Run) -> str:
     """Peak dynamic pressure, or the largest there is where the data end before the peak."""
     row = run.peak("dynamic pressure")
     return "peak dynamic pressure" if row is None or bool(row["inside"]) else "the largest dynamic pressure in the data"
@@ -75,29 +78,28 @@ def lead(run: Run) -> list[str]:
     there = events.iloc[int((events["t_s"] - at).abs().argmin())]
     out = [s["agreement"][0].upper() + s["agreement"][1:] + "."] if s["agreement"] else []
     out.append(
-        f"{peak_words(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
-        f"({utc(run, at)} UTC), Mach {there['mach']:.2f}, {there['alt_m'] / 1e3:.1f} km."
+        f"{_peak_name(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
+        f"({_utc(run, at)} UTC), Mach {there['mach']:.2f}, {there['alt_m'] / 1e3:.1f} km."
     )
-    swing = swing_words(run)
-    if swing:
-        out.insert(0, swing)
-    total = len(run.tables["verdicts"])
-    out.append(f"{s['verdicts_passed']} of {total} verdicts on the trajectory pass.")
+    oscillation = _oscillation(run)
+    if oscillation:
+        out.insert(0, oscillation)
+    out.append(f"{s['verdicts_passed']} of {len(run.checks)} consistency checks of the trajectory pass.")
     return out
 
 
-def swing_words(run: Run) -> str:
-    """Sentence on a deflection that swings around the peak; empty where one number says it."""
+def _oscillation(run: Run) -> str:
+    """Sentence on a deflection that oscillates around the peak; empty where one number describes it."""
     best = best_method(run)
     if best is None:
         return ""
-    told, table = run.summary["methods"][best], run.tables[f"deflection_{best}"]
-    near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < SWING_S]
-    if len(near) < 2 or near.max() - near.min() < SWINGS_SD * told["sd_deg"]:
+    answer, table = run.summary["methods"][best], run.tables[f"deflection_{best}"]
+    near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < _NEAR_PEAK_S]
+    if len(near) < 2 or near.max() - near.min() < _OSCILLATES_SD * answer["sd_deg"]:
         return ""
     return (
-        f"It swings: between {near.min():.1f} and {near.max():.1f}° within {SWING_S:.0f} s of that moment; "
-        f"largest {told['largest_deg']:.1f}° at {told['largest_at_s']:.2f} s."
+        f"It oscillates between {near.min():.1f} and {near.max():.1f}° within {_NEAR_PEAK_S:.0f} s of that time; "
+        f"largest {answer['largest_deg']:.1f}° at {answer['largest_at_s']:.2f} s."
     )
 
 
@@ -107,42 +109,42 @@ def cards(run: Run) -> list[dict[str, Any]]:
 
 
 def _card(run: Run, method: str) -> dict[str, Any]:
-    told = run.summary["methods"].get(method)
-    card: dict[str, Any] = {"method": method, "label": LABEL[method], "how": HOW[method], "colour": COLOUR[method]}
-    if told is None or told["deflection_deg"] is None:
-        reason = NOT_ASKED if told is None else told["reason"]
-        return card | {"state": "none", "mark": "–", "words": "no answer", "reason": reason}
-    value, sd = told["deflection_deg"], told["sd_deg"]
+    answer = run.summary["methods"].get(method)
+    card: dict[str, Any] = {"method": method, "label": LABEL[method], "how": _HOW[method], "colour": COLOUR[method]}
+    if answer is None or answer["deflection_deg"] is None:
+        reason = NOT_ASKED if answer is None else answer["reason"]
+        return card | {"state": "none", "mark": "–", "remark": "no answer", "reason": reason}
+    value, sd = answer["deflection_deg"], answer["sd_deg"]
     card |= {
         "value": f"{value:.2f}", "sd": f"{sd:.2f}", "number": value, "number_sd": sd,
-        "low": f"{value - SIDES_95 * sd:.2f}", "high": f"{value + SIDES_95 * sd:.2f}",
-        "plane": plane_at(run, method), "largest": f"{told['largest_deg']:.2f}", "largest_s": told["largest_at_s"],
-        "assumptions": told["assumptions"],
+        "low": f"{value - _SIDES_95 * sd:.2f}", "high": f"{value + _SIDES_95 * sd:.2f}",
+        "plane": plane_at(run, method), "largest": f"{answer['largest_deg']:.2f}", "largest_s": answer["largest_at_s"],
+        "assumptions": answer["assumptions"],
     }  # fmt: skip
-    return card | agreement(run, method)
+    return card | _agreement(run, method)
 
 
-def agreement(run: Run, method: str) -> dict[str, str]:
+def _agreement(run: Run, method: str) -> dict[str, str]:
     """Whether a method agrees with the others, by the tests of every pair; of the fusion, whether all do."""
     table = run.tables.get("fusion_agreement")
     if table is None or not len(table):
-        return {"state": "alone", "mark": "○", "words": "held against no other method"}
+        return dict(_ALONE)
     mine = table if method == "fused" else table[[method in m.split(" and ") for m in table["methods"]]]
     if not len(mine):
-        return {"state": "alone", "mark": "○", "words": "held against no other method"}
+        return dict(_ALONE)
     failed = mine[~mine["passed"].astype(bool)]
-    least = f"least chance of a pair {mine['chance'].min():.2g}, wanted above {1 - CONFIDENCE:.2g}"
+    least = f"smallest probability of a pair {mine['chance'].min():.2g}; limit {1 - CONFIDENCE:.2g}"
     if not len(failed):
         who = "all pairs agree" if method == "fused" else "agrees with the others"
-        return {"state": "agrees", "mark": "✓", "words": who, "detail": least}
+        return {"state": "agrees", "mark": "✓", "remark": who, "detail": least}
     if method == "fused":
-        return {"state": "differs", "mark": "✕", "words": "pairs disagree", "detail": "; ".join(failed["methods"])}
+        return {"state": "differs", "mark": "✕", "remark": "pairs disagree", "detail": "; ".join(failed["methods"])}
     others = [o for m in failed["methods"] for o in m.split(" and ") if o != method]
-    return {"state": "differs", "mark": "✕", "words": f"disagrees with {', '.join(others)}", "detail": least}
+    return {"state": "differs", "mark": "✕", "remark": f"disagrees with {', '.join(others)}", "detail": least}
 
 
 def plane_at(run: Run, method: str) -> str:
-    """Plane of the bending at peak dynamic pressure, deg LV clocking, with its sd; empty where it is not known."""
+    """Plane of the deflection at peak dynamic pressure, deg LV clocking, with its sd; empty where it is not known."""
     table, at = run.tables[f"deflection_{method}"], run.summary["peak_dynamic_pressure_s"]
     t = table["t_s"].to_numpy()
     k = int(np.abs(t - at).argmin())
@@ -150,8 +152,8 @@ def plane_at(run: Run, method: str) -> str:
     if abs(t[k] - at) > max(hole_s(t), 1e-3) or not sd < 90.0:
         return ""
     known = np.isfinite(table["theta_deg"]).to_numpy()
-    seen, t = table[known], t[known]
-    yz = np.array(seen["theta_deg"])[:, None] * lv_direction(np.deg2rad(np.array(seen["plane_lv_deg"])))[:, 1:]
+    answers, t = table[known], t[known]
+    yz = np.array(answers["theta_deg"])[:, None] * lv_direction(np.deg2rad(np.array(answers["plane_lv_deg"])))[:, 1:]
     here = np.array([np.interp(at, t, c) for c in yz.T])
     clock = lv_clock(here)
     missed = interpolation_error(t, yz @ lateral_axes(clock)[1], at) / np.linalg.norm(here)
@@ -160,9 +162,9 @@ def plane_at(run: Run, method: str) -> str:
     return f"{float(clock):.{places}f} ± {sd:.{places}f}"
 
 
-def scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
+def _scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
     """Common scale of the cards' whiskers, deg: all 95 % intervals with a margin."""
-    ends = [c["number"] + s * SIDES_95 * c["number_sd"] for c in shown if "number" in c for s in (-1.0, 1.0)]
+    ends = [c["number"] + s * _SIDES_95 * c["number_sd"] for c in shown if "number" in c for s in (-1.0, 1.0)]
     if not ends:
         return 0.0, 1.0
     margin = 0.06 * (max(ends) - min(ends)) + 0.01
@@ -171,30 +173,33 @@ def scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
 
 def with_whiskers(shown: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Cards with the places of their whiskers on a scale of 0 to 200; the fusion's 95 % as a band behind each."""
-    low, high = scale(shown)
+    low, high = _scale(shown)
     place = lambda x: round(200.0 * (x - low) / (high - low), 1)  # noqa: E731
     fused = next((c for c in shown if c["method"] == "fused" and "number" in c), None)
     for c in shown:
         if "number" not in c:
             continue
         x, sd = c["number"], c["number_sd"]
-        c["whisker"] = [place(x + k * sd) for k in (-SIDES_95, -1.0, 0.0, 1.0, SIDES_95)]
+        c["whisker"] = [place(x + k * sd) for k in (-_SIDES_95, -1.0, 0.0, 1.0, _SIDES_95)]
         if fused is not None:
-            c["behind"] = [place(fused["number"] + k * fused["number_sd"]) for k in (-SIDES_95, SIDES_95)]
+            c["behind"] = [place(fused["number"] + k * fused["number_sd"]) for k in (-_SIDES_95, _SIDES_95)]
     return shown
 
 
-def moments(run: Run) -> list[dict[str, Any]]:
+def events(run: Run) -> list[dict[str, Any]]:
     """Rows of the table of events; the numbers are those of the vertical lines."""
     rows = []
     for k, e in enumerate(run.tables["events"].itertuples(index=False), 1):
-        told = {
-            "altitude": (e.alt_m / 1e3, e.alt_3sd_m / 1e3, 3), "speed": (e.speed_ground_mps, e.speed_ground_3sd_mps, 1),
-            "mach": (e.mach, e.mach_3sd, 2), "pressure": (e.dynamic_pressure_pa, e.dynamic_pressure_3sd_pa, 1),
+        shown = {
+            "altitude": (e.alt_m / 1e3, e.alt_3sd_m / 1e3, 3), "speed": (e.speed_ground_mps, e.speed_ground_3sd_mps, 2),
+            "mach": (e.mach, e.mach_3sd, 3), "pressure": (e.dynamic_pressure_pa, e.dynamic_pressure_3sd_pa, 1),
             "alpha": (e.alpha_total_wind_deg, e.alpha_total_wind_3sd_deg, 2),
         }  # fmt: skip
-        cells = {n: f"{x:.{d}f} ± {s:.{d}f}" if np.isfinite(x) else "not known" for n, (x, s, d) in told.items()}
-        rows.append({"number": k, "name": e.event, "t": f"{e.t_s:.2f}", "utc": utc(run, e.t_s)} | cells)
+        cells = {
+            name: f"{x:.{digits}f} ± {three_sd / 3.0:.{digits}f}" if np.isfinite(x) else "not known"
+            for name, (x, three_sd, digits) in shown.items()
+        }
+        rows.append({"number": k, "name": e.event, "t": f"{e.t_s:.2f}", "utc": _utc(run, e.t_s)} | cells)
     return rows
 
 

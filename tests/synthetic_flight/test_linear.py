@@ -22,6 +22,7 @@ from synthetic_flight.linear import (
     slopes_at,
     static_trim,
 )
+from tests.oracles import two_body
 
 from .newtonian import METACENTRE_M, FrozenAir, linear_table, newtonian, r1, table
 
@@ -90,11 +91,11 @@ def planar_state(vehicle, x, speed_mps=SPEED_MPS, height_m=40e3):
 def planar_rates(vehicle, x, air, speed_mps=SPEED_MPS):
     """``x'`` from the nonlinear equations, without gravity; and the joint's acceleration along the flight."""
     state, side, ahead = planar_state(vehicle, x, speed_mps)
-    force, moment = dynamics.aerodynamics(state, vehicle, air)
+    force, moment = two_body.aerodynamics(state, vehicle, air)
     nose = rotations.rotate(state[10:14], -vehicle.aeroshell.cg_m)
-    loads = dynamics.Loads(np.zeros(3), force, moment + np.cross(nose, force))
-    _, _, a, turn_a, _ = dynamics.accelerations(state, vehicle, loads)
-    turn_b = dynamics.accelerations(state, vehicle, loads)[1]
+    loads = two_body.Loads(np.zeros(3), force, moment + np.cross(nose, force))
+    _, _, a, turn_a, _ = two_body.accelerations(state, vehicle, loads)
+    turn_b = two_body.accelerations(state, vehicle, loads)[1]
     arm = rotations.rotate(state[10:14], vehicle.joint_m - vehicle.aeroshell.cg_m)
     rate = rotations.rotate(state[10:14], state[17:20])
     at_joint = a + np.cross(turn_a, arm) + np.cross(rate, np.cross(rate, arm))

@@ -15,7 +15,7 @@ from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
 from flightmodel.geometry import ShellGeometry, bend, vehicle_meshes
 from flightmodel.vehicle import CameraMount
-from synthetic_flight.film import Imaging, ShellRenderer, real_camera, record, render_video
+from synthetic_flight.film import Imaging, ShellRenderer, as_built_camera, record, render_video
 
 TABLES = tomllib.loads((Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml").read_text())
 GEOMETRY = ShellGeometry.model_validate(TABLES["geometry"])
@@ -32,7 +32,7 @@ def sun(clock_deg, from_aft_deg=61.0):
 @pytest.fixture(scope="module")
 def off_camera():
     """A real camera with everything off nominal, and its renderer."""
-    camera = real_camera(MOUNT, np.random.default_rng(5))
+    camera = as_built_camera(MOUNT, np.random.default_rng(5))
     return camera, ShellRenderer(GEOMETRY, camera, JOINT_M)
 
 
@@ -137,7 +137,7 @@ def test_film_is_reproducible_and_the_real_camera_scatters_as_declared():
     np.testing.assert_array_equal(films[0], films[1])
     assert np.abs(films[0][1].astype(float) - films[2][1]).mean() > 1.0
     nominal = camera_from_mount(MOUNT)
-    drawn = [real_camera(MOUNT, np.random.default_rng(s)) for s in range(200)]
+    drawn = [as_built_camera(MOUNT, np.random.default_rng(s)) for s in range(200)]
     focal = np.array([c.focal_px[0] / nominal.focal_px[0] - 1.0 for c in drawn])
     swing = np.array([np.arccos(np.clip(c.dcm_cam_body[2] @ nominal.dcm_cam_body[2], -1, 1)) for c in drawn])
     # chi-square bounds of 200 (scale) and 400 (two axes) draws at 4 sd

@@ -9,11 +9,11 @@ from flightmodel.checks import ConfigError
 from flightmodel.config import parse_section
 from synthetic_flight import simulate
 from synthetic_flight.weather import (
-    DayAtmosphere,
+    DayOfFlightAtmosphere,
     RangeSounding,
-    day_atmosphere,
+    day_of_flight_atmosphere,
     dryden_transverse,
-    range_accuracy,
+    range_sounding_sd,
     sense_atmosphere,
 )
 
@@ -22,7 +22,7 @@ Z = np.arange(500.0, 129e3, 37.0)
 
 
 def day(seed=3, **keys):
-    return day_atmosphere(parse_section(DayAtmosphere, keys, "test"), np.random.default_rng(seed))
+    return day_of_flight_atmosphere(parse_section(DayOfFlightAtmosphere, keys, "test"), np.random.default_rng(seed))
 
 
 def test_every_structure_leaves_the_random_day_as_it_is():
@@ -95,7 +95,7 @@ def test_modelled_base_is_flown_and_carries_the_days_structure():
 
 
 def errors_of_range(age_h, seeds=200):
-    spec = DayAtmosphere(**STILL, sounding=RangeSounding(age_h=age_h))
+    spec = DayOfFlightAtmosphere(**STILL, sounding=RangeSounding(age_h=age_h))
     truth = day(**STILL)
     found = []
     for seed in range(seeds):
@@ -115,7 +115,7 @@ def errors_of_range(age_h, seeds=200):
 
 def test_range_sounding_errs_as_its_instruments_do():
     z, real, fresh = errors_of_range(0.0)
-    want = range_accuracy(z, real.pressure_pa, real.temperature_k)[:, [0, 1, 2, 2]]
+    want = range_sounding_sd(z, real.pressure_pa, real.temperature_k)[:, [0, 1, 2, 2]]
     low, high = chi2.ppf([1e-5, 1 - 1e-5], fresh.shape[0]) / fresh.shape[0]
     # smoothing rounds the corners of US76's own temperature by up to 0.35 K at its layer bases
     bias = np.array([0.0, 0.35, 0.0, 0.0])
@@ -133,7 +133,7 @@ def test_range_sounding_errs_as_its_instruments_do():
 
 def test_an_old_sounding_errs_by_what_the_air_changed():
     z, real, old = errors_of_range(6.0)
-    want = range_accuracy(z, real.pressure_pa, real.temperature_k)[:, [0, 2]]
+    want = range_sounding_sd(z, real.pressure_pa, real.temperature_k)[:, [0, 2]]
     low, high = chi2.ppf([1e-5, 1 - 1e-5], old.shape[0]) / old.shape[0]
     for altitude in (10e3, 40e3, 60e3):
         k = int(np.searchsorted(z, altitude))
@@ -157,7 +157,7 @@ def test_range_sounding_resolves_two_kilometres(wavelength_m, gain):
         density_sd=np.ones(len(z)),
         wind_sd_mps=np.ones(len(z)),
     )
-    spec = DayAtmosphere(sounding=RangeSounding(), sounding_scale=0.0)
+    spec = DayOfFlightAtmosphere(sounding=RangeSounding(), sounding_scale=0.0)
     got, air, _ = sense_atmosphere(wavy, spec, np.random.default_rng(0))
     inside = (got > 40e3) & (got < 80e3)
     wave = np.log(air[:, 0] / us76(got)[0])[inside]
@@ -171,7 +171,7 @@ def test_range_sounding_resolves_two_kilometres(wavelength_m, gain):
 
 
 def test_top_and_faults_of_the_tables():
-    spec = DayAtmosphere(sounding=RangeSounding(top_m=72e3))
+    spec = DayOfFlightAtmosphere(sounding=RangeSounding(top_m=72e3))
     z, _, _ = sense_atmosphere(day(), spec, np.random.default_rng(0))
     assert z[-1] == 72e3
     with pytest.raises(ConfigError) as caught:

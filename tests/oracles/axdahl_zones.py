@@ -1,11 +1,15 @@
-"""Where do stiffness and damping of the joint make a vehicle diverge, oscillate ever wider, or settle?
+"""For which stiffness and damping of its joint does a vehicle diverge, oscillate with growing amplitude, or settle?
 
-Axdahl's map, drawn twice: from eigenvalues (`synthetic_flight.linear`) and from flights of the nonlinear simulator. The
-flights need speed and pressure that stay put although the vehicle decelerates. They get them by falling at terminal
-speed through air of one density: gravity then is to each body what deceleration is, ``g = q S C_A / m``, so the linear
-equations hold unchanged. On Earth that fixes ``q_E = m g / (S C_A)``; a flight at pressure ``q`` and speed ``V`` is
-similar to a fall at ``q_E`` and ``V sqrt(q_E / q)`` with stiffness scaled by ``q_E / q``, and its rates are ``sqrt(q /
-q_E)`` times those of the fall. Falls start above the pole, where the Earth's rotation does not blow from the side.
+Run: ``python -m tests.oracles.axdahl_zones [PICTURE]`` (half a minute); without a name it draws
+``docs/images/axdahl_zones.png``.
+
+Axdahl's stability map twice: from eigenvalues (`synthetic_flight.linear`) and from flights of the nonlinear simulator.
+The flights need constant speed and dynamic pressure although the vehicle decelerates. They get them by falling at
+terminal speed through air of constant density: gravity then acts on each body as deceleration does, ``g = q S C_A /
+m``, so the linear equations hold unchanged. On Earth that fixes ``q_E = m g / (S C_A)``; a flight at dynamic pressure
+``q`` and speed ``V`` is similar to a fall at ``q_E`` and ``V sqrt(q_E / q)`` with stiffness scaled by ``q_E / q``, and
+its rates are ``sqrt(q / q_E)`` times those of the fall. Falls start above the pole, where the air that rotates with the
+Earth has no velocity.
 
 References
 ----------
@@ -14,24 +18,49 @@ Axdahl, AIAA 2009-2963; summary in Bose et al., AIAA 2011-2571.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+import postflight as pf
 from flightmodel import earth, rotations
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.atmosphere import AtmosphereProfile, us76
 from flightmodel.checks import FloatArray
-from flightmodel.vehicle import MassProperties, Vehicle
+from flightmodel.vehicle import MassProperties, Vehicle, vehicle_from_toml, vehicle_path
 from synthetic_flight import simulate
-from synthetic_flight.linear import DIVERGENT, STABLE, UNSTABLE, Slopes, critical_stiffness_nmprad, linear_matrix, modes
+from synthetic_flight.linear import (
+    DIVERGENT,
+    STABLE,
+    UNSTABLE,
+    ZONES,
+    Slopes,
+    critical_stiffness_nmprad,
+    linear_matrix,
+    modes,
+)
 from synthetic_flight.simulate import integrate
 
+# the reference vehicle at Mach 3.2 with 0.7 of the Newtonian static stability, C_mq constant and destabilising
+SLOPES = Slopes(ca=1.54, cn_alpha=0.3065, cm_alpha=-0.2333, cmq=0.2)
+PRESSURE_PA, SPEED_MPS = 1150.0, 1040.0
 FALL_S, FALL_STEP_S, RECORD_S = 120.0, 0.01, 0.1
 LARGE_RAD = 0.2
 START_M = 60.0e3
+ZONE_NAMES = {STABLE: "stable", UNSTABLE: "unstable", DIVERGENT: "divergent"}
+# area and mark of each zone: colours of the project's figures
+FILL = {zone: pf.plots.ZONE[name][0] for zone, name in ZONE_NAMES.items()}
+MARK = {
+    zone: (mark, pf.plots.ZONE[ZONE_NAMES[zone]][1])
+    for zone, mark in ((STABLE, "o"), (UNSTABLE, "^"), (DIVERGENT, "x"))
+}
 
 
 @dataclass(frozen=True)
@@ -122,7 +151,7 @@ def flown_map(
     stiffness_nmprad: FloatArray,
     damping_ratio: FloatArray,
 ) -> StabilityMap:
-    """Map from flights of the nonlinear simulator, released half a milliradian off their path."""
+    """Map from flights of the nonlinear simulator, released with the shell tilted by half a milliradian."""
     plain = on_axis(vehicle, slopes)
     start = _release()
     gravity = float(np.linalg.norm(earth.gravitation(start[:3] - np.array([0.0, 0.0, 0.5 * START_M]))))
@@ -159,7 +188,7 @@ def _map(
 
 
 def _even_air(density_kgpm3: float) -> AtmosphereProfile:
-    """Still air of one density over the whole fall: what the standard atmosphere lacks of it, at the tables' knots."""
+    """Still air of constant density over the whole fall, as a ratio to the standard atmosphere at the tables' knots."""
     z = np.arange(-1000.0, START_M + 20.0e3, simulate.ATMOSPHERE_STEP_M)
     ratio = np.log(density_kgpm3 / us76(z)[0])
     nothing, one = np.zeros(len(z)), np.ones(len(z))
@@ -189,3 +218,57 @@ def _growth(states: FloatArray) -> tuple[float, int]:
         return growth, STABLE
     bending = (axes[1] - axes[0])[end - quarter : end, 0]
     return growth, UNSTABLE if bending.min() < 0.0 < bending.max() else DIVERGENT
+
+
+@pf.plots.in_style
+def figure_axdahl_zones(linear: StabilityMap, flown: StabilityMap) -> Figure:
+    """Zones of the linear model as areas with lines of growth rate, flights of the simulator as marks.
+
+    Parameters
+    ----------
+    linear, flown : StabilityMap
+        Of one vehicle at one pressure and speed; grids may differ, damping ratios above zero.
+    """
+    figure = Figure(figsize=(8.6, 5.6))
+    axis = figure.subplots()
+    x, y = 1e-3 * linear.stiffness_nmprad, 100.0 * linear.damping_ratio
+    axis.contourf(x, y, linear.zone.T, levels=[-0.5, 0.5, 1.5, 2.5], colors=[FILL[k] for k in sorted(FILL)])
+    divergent = linear.zone == DIVERGENT
+    for inside, levels in ((divergent, [2.0, 4.0]), (~divergent, [-0.05, 0.0, 0.05, 0.1])):
+        growth = np.where(inside, linear.growth_rate_radps, np.nan).T
+        lines = axis.contour(x, y, growth, levels=levels, colors=pf.plots.COLOUR["limit"], linewidths=0.8)
+        axis.clabel(lines, fontsize=8, fmt="%g 1/s")
+    k, c = np.meshgrid(1e-3 * flown.stiffness_nmprad, 100.0 * flown.damping_ratio, indexing="ij")
+    handles: list[Patch | Line2D] = []
+    for zone, (mark, colour) in MARK.items():
+        inside = flown.zone == zone
+        axis.plot(k[inside], c[inside], mark, color=colour, markersize=4.5, fillstyle="none", linestyle="none")
+        handles.append(Patch(facecolor=FILL[zone], label=f"{ZONES[zone]}: linear model"))
+        handles.append(
+            Line2D([], [], marker=mark, color=colour, fillstyle="none", linestyle="none", label=f"{ZONES[zone]}: flown")
+        )
+    axis.axvline(1e-3 * linear.critical_stiffness_nmprad, color=pf.plots.COLOUR["limit"], linestyle="--", linewidth=1.0)
+    label = "static limit q S C_A xbar (1 + xbar/L)"
+    handles.append(Line2D([], [], color=pf.plots.COLOUR["limit"], linestyle="--", label=label))
+    axis.set(xscale="log", yscale="log", xlabel="bending stiffness (kN m/rad)", ylabel="joint damping (% of critical)")
+    axis.set_title(
+        f"q {linear.pressure_pa:.0f} Pa, V {linear.speed_mps:.0f} m/s, C_mq {linear.slopes.cmq:+.1f} constant",
+        fontsize=10,
+    )
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    ticks = [t for t in (2, 3, 4, 6, 10, 20, 40, 100) if x[0] <= t <= x[-1]]
+    axis.set_xticks(ticks, [str(t) for t in ticks])
+    axis.minorticks_off()
+    return figure
+
+
+def main(picture: Path) -> None:
+    """Draw the map of the reference vehicle."""
+    setting = (vehicle_from_toml(vehicle_path("irve2_reference")), SLOPES, PRESSURE_PA, SPEED_MPS)
+    fine = linear_map(*setting, np.geomspace(2.0e3, 5.0e4, 160), np.geomspace(1e-3, 0.4, 120))
+    flights = flown_map(*setting, np.geomspace(2.1e3, 4.7e4, 26), np.geomspace(1.2e-3, 0.34, 15))
+    figure_axdahl_zones(fine, flights).savefig(picture, dpi=130)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "docs" / "images" / "axdahl_zones.png")

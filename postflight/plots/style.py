@@ -1,0 +1,172 @@
+"""How does every figure of the project look? Colours by meaning, axes, bands, legends, the corner's note, the file.
+
+A figure function is wrapped by `in_style`, which sets matplotlib's parameters while it draws and leaves those of the
+caller as they are. Colours are asked for by what they mean (``COLOUR["truth"]``), never by value: the eight of Okabe
+and Ito, which stay apart for colour-blind readers, with strokes that stay apart in grey. The report's page takes its
+colours from the same tables, so this module imports matplotlib only when something is drawn.
+
+A shaded band is one standard deviation to both sides unless its label gives another size.
+
+References
+----------
+M. Okabe, K. Ito, *Color Universal Design*, 2008.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+import numpy as np
+
+from flightmodel.checks import FloatArray
+from flightmodel.telemetry import Telemetry
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_BLACK, _BLUE, _VERMILION, _GREEN = "#000000", "#0072B2", "#D55E00", "#009E73"
+_PURPLE, _ORANGE, _SKY, _YELLOW = "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"
+_INK, _DARK, _GREY, _PALE, _WHITE = "#1C2126", "#57616B", "#8A929A", "#DDE2E7", "#FFFFFF"
+
+COLOUR = {
+    # deflection by method
+    "camera": _BLUE,
+    "misalignment": _VERMILION,
+    "trim": _GREEN,
+    "fused": _PURPLE,
+    "truth": _BLACK,
+    # a quantity and what it is compared with
+    "measured": _BLACK,
+    "estimate": _BLUE,
+    "corrected": _GREEN,
+    "second": _VERMILION,
+    "nominal": _ORANGE,
+    "ground": _SKY,
+    "paper": _BLACK,
+    "filter": _VERMILION,
+    "smoother": _BLUE,
+    # what was known before
+    "prior": _GREY,
+    "prior_band": _PALE,
+    # marks
+    "edited": _VERMILION,
+    "limit": _DARK,
+    "zero": _DARK,
+    "flagged": _ORANGE,
+    "edge": _YELLOW,
+    "note": _DARK,
+    "gap": _WHITE,
+}
+AXES = {"x": _BLUE, "y": _VERMILION, "z": _GREEN}
+RAW_AXES = {"x": _GREY, "y": "#E5A06B", "z": "#7FC4AD"}  # of the samples as measured: the same hues, paler
+ZONE = {"stable": ("#D6EAD9", "#2F7D3B"), "unstable": ("#F9E3BD", "#B36B00"), "divergent": ("#F1C3BD", "#A3201A")}
+# for many lines side by side, the reference first, each with its stroke
+MANY = (_BLACK, _BLUE, _ORANGE, _GREEN, _PURPLE, _SKY, _VERMILION)
+STROKES: tuple[Any, ...] = ((0, (4, 2)), "-", "-", (0, (5, 1)), "-", (0, (1, 1)), (0, (3, 1, 1, 1)))
+# the report's page: text, background, lines; each is a variable of its CSS
+PAGE = {
+    "ink": _INK, "soft": _DARK, "line": _PALE, "ground": _WHITE, "pale": "#F5F7F9", "answer": "#F2F7FB",
+    "behind": "#E9EEF3", "grid": "#ECEFF2", "tick": "#C4CCD3", "border": "#B9C2CA", "accent": "#005A8C",
+    "good": "#00674C", "bad": "#A33C00",
+}  # fmt: skip
+
+LABEL = {
+    "camera": "video (virtual camera)",
+    "misalignment": "accelerometers (misalignment)",
+    "trim": "trim angle",
+    "fused": "all fused",
+}
+STROKE = {"camera": "-", "misalignment": "--", "trim": "-.", "fused": "-"}
+TIME = "time after launch (s)"
+BAND, WIDE_BAND = 0.2, 0.15  # opacities: of one band, and of several that overlap
+_SMALL, _LEGEND, _TITLE, _MAIN = 7, 8, 9, 10
+_DPI = 110
+_PARAMETERS: dict[Any, Any] = {
+    "figure.constrained_layout.use": True,
+    "figure.titlesize": _MAIN,
+    "font.size": 9.5,
+    "axes.titlesize": _TITLE,
+    "axes.labelsize": 9,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.alpha": 0.3,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "lines.linewidth": 1.2,
+    "legend.frameon": False,
+    "legend.fontsize": _LEGEND,
+    "legend.title_fontsize": _LEGEND,
+    "legend.loc": "upper left",
+}
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def in_style(draw: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let a figure function draw with the project's parameters; the caller's own stay as they are."""
+
+    @wraps(draw)
+    def styled(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        import matplotlib
+
+        with matplotlib.rc_context(_PARAMETERS):
+            return draw(*args, **kwargs)
+
+    return styled
+
+
+def band(
+    ax: Axes, x: FloatArray, middle: FloatArray, sd: FloatArray, colour: str, *, alpha: float = BAND, label: str = ""
+) -> None:
+    """Shade one standard deviation to both sides of a curve (n,)."""
+    ax.fill_between(x, middle - sd, middle + sd, color=colour, alpha=alpha, lw=0, label=label or None)
+
+
+def percentiles(ax: Axes, time_s: FloatArray, low: FloatArray, middle: FloatArray, high: FloatArray) -> None:
+    """Draw the 2.3, 50 and 97.7 percentiles of many flights over time."""
+    ax.fill_between(time_s, low, high, color=COLOUR["estimate"], alpha=BAND, lw=0, label="2.3 to 97.7 %")
+    ax.plot(time_s, middle, color=COLOUR["estimate"], label="50 %")
+
+
+def limits(ax: Axes, levels: Iterable[float] = (-3.0, 3.0), *, vertical: bool = False) -> None:
+    """Draw the dotted lines that a ratio to its standard deviation should stay between."""
+    for level in levels:
+        (ax.axvline if vertical else ax.axhline)(level, color=COLOUR["limit"], lw=0.8, ls=":")
+
+
+def ellipses(ax: Axes, mean: FloatArray, covariance: FloatArray) -> None:
+    """Draw the ellipses of one and two standard deviations of two quantities: mean (2,), covariance (2, 2)."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 200)
+    circle = np.linalg.cholesky(covariance) @ np.stack([np.cos(turn), np.sin(turn)])
+    for size, stroke in ((1.0, "-"), (2.0, "--")):
+        ax.plot(*(mean[:, None] + size * circle), color=COLOUR["estimate"], ls=stroke, label=f"{size:g} sd")
+
+
+def residual_unit(component: str) -> tuple[float, str]:
+    """Scale and unit in which a component's residuals are drawn."""
+    if component.startswith("velocity"):
+        return 1.0, "m/s"
+    if component.startswith("field"):
+        return 1e6, "uT"
+    return (1e3, "mrad") if component in ("azimuth", "elevation") else (1.0, "m")
+
+
+def note(figure: Figure, words: str) -> None:
+    """Write in the lower right corner what was flown."""
+    figure.supxlabel(words, x=0.995, ha="right", fontsize=_SMALL, color=COLOUR["note"])
+
+
+def stamp(figure: Figure, telemetry: Telemetry) -> None:
+    """Name the flight in the corner, and whether it is synthetic."""
+    note(figure, f"{telemetry.name}: {'SYNTHETIC flight' if telemetry.synthetic else 'flight'}")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a PNG whose bytes depend on the picture alone."""
+    figure.savefig(path, dpi=_DPI, metadata={"Software": None})

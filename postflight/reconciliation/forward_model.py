@@ -1,0 +1,469 @@
+"""What would the sensors have measured in short spans of a flight, with another joint, vehicle and atmosphere?
+
+The measurements are corrected inertial data: rates and specific force at the accelerometer, means over windows of 40
+ms. They hold all that was measured of the joint's motion; angle of attack and normal acceleration follow from them,
+from attitude and atmosphere, and deflections by misalignment and trim are made of the same sensors and would
+count them twice. Spans of ten windows, about a period of the joint, start from a motion of their own at the
+reconstruction's position and velocity and are flown by the simulator, many at once.
+
+Sought are the joint's parameters (stiffness, damping, freeplay and hardening where asked for), the lateral c.g. offset
+and the static stability. Nuisance parameters are all else that the motion depends on within its a priori uncertainty:
+masses, stations, inertias, other coefficients, the instruments' constant errors, and the atmosphere. Parameters of
+vehicle and instruments count in a priori standard deviations; those of the atmosphere are the logarithm of the density
+ratio and the difference of the winds, m/s, to the sounding, at knots along altitude.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flightmodel import earth, rotations
+from flightmodel.atmosphere import (
+    DENSITY_LENGTH_M,
+    WIND_LENGTH_M,
+    profile_from_sounding,
+    sounding_correlation,
+    unresolved_variance,
+)
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.instruments import TriadSpec
+from flightmodel.rotations import skew
+from flightmodel.telemetry import Sounding
+from flightmodel.trajectory import Trajectory, resample
+from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
+from postflight.reconstruction import Reconstruction
+from recon.atmosphere import cg_accelerations, windows_are_whole
+from synthetic_flight import simulate
+from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
+
+# at 1200 m/s a tenth of a second: knots resolve gusts at the joint's 2 to 4 Hz; coarser in thin air
+KNOT_M, UPPER_KNOT_M = 125.0, 250.0
+UPPER_M, TOP_M, BELOW_M = 75e3, 105e3, 1e3
+# a priori standard deviations; of factors those of their logarithms
+STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 0.5, 1.0, 0.005
+FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
+# hardening is counted as the share by which the tangent stiffness has grown at this angle; negative: it softens
+HARDENING_AT_RAD = np.deg2rad(4.0)
+JOINT = ("stiffness", "damping", "offset y", "offset z", "static stability")
+LAWS = ("freeplay", "hardening")
+NUISANCE = (
+    "C_A", "C_N", "C_mq", "mass of the shell", "mass of the centerbody", "station of the shell's c.g.",
+    "station of the centerbody's c.g.", "shell's c.g. y", "shell's c.g. z", "inertia of the shell",
+    "inertia of the centerbody",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class VehicleParameters:
+    """From parameters, in a priori standard deviations, to vehicles.
+
+    Parameters
+    ----------
+    nominal : Vehicle
+        Of the vehicle file.
+    laws : tuple of str
+        Terms of the spring beside its stiffness, of `LAWS`.
+    corner : float, optional
+        Half width of the dead band's rounded corners over the freeplay; the vehicle file's by default.
+    """
+
+    nominal: Vehicle
+    laws: tuple[str, ...] = ()
+    corner: float | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, the joint's first."""
+        return (*JOINT, *self.laws, *NUISANCE)
+
+    @property
+    def sought(self) -> int:
+        """How many of them are sought; the others are nuisance parameters."""
+        return len(JOINT) + len(self.laws)
+
+    def vehicle(self, x: FloatArray) -> Vehicle:
+        """Vehicle of parameters (v,), with nominal coefficients (`factors` scales them)."""
+        nominal, known, v = self.nominal, self.nominal.uncertainty, dict(zip(self.names, x.tolist(), strict=True))
+        joint, shell, body = nominal.joint, nominal.aeroshell, nominal.centerbody
+        stiffer = STIFFNESS_LOG_SD * v["stiffness"]
+        stiffness = joint.bending_stiffness_nmprad * np.exp(stiffer)
+        # the parameter is the damping ratio: at a given ratio damping grows with the root of the stiffness
+        damping = joint.bending_damping_nmsprad * np.exp(DAMPING_LOG_SD * v["damping"] + 0.5 * stiffer)
+        changed = {"bending_stiffness_nmprad": stiffness, "bending_damping_nmsprad": damping}
+        if "freeplay" in v:
+            changed["freeplay_deg"] = float(np.rad2deg(FREEPLAY_SD_RAD) * abs(v["freeplay"]))
+            if self.corner is not None:
+                changed["freeplay_corner"] = self.corner
+        if "hardening" in v:
+            changed["hardening_nmprad3"] = stiffness * HARDENING_SD * v["hardening"] / (3.0 * HARDENING_AT_RAD**2)
+        # the whole vehicle's offset; the centerbody carries it
+        lateral = known.cg_lateral_m * np.array([v["shell's c.g. y"], v["shell's c.g. z"]])
+        offset = OFFSET_SD_M * np.array([v["offset y"], v["offset z"]]) * nominal.mass_kg - lateral * shell.mass_kg
+        return replace(
+            nominal,
+            joint=joint.model_copy(update=changed),
+            aeroshell=_perturbed(shell, known, v["mass of the shell"], v["station of the shell's c.g."], lateral,
+                             v["inertia of the shell"]),
+            centerbody=_perturbed(body, known, v["mass of the centerbody"], v["station of the centerbody's c.g."],
+                              offset / body.mass_kg, v["inertia of the centerbody"]),
+        )  # fmt: skip
+
+    def flown(self, x: FloatArray) -> Vehicle:
+        """Vehicle of parameters (v,) with its own coefficients."""
+        vehicle = self.vehicle(x)
+        return replace(vehicle, aero=vehicle.aero.scaled(*self.factors(x)))
+
+    def factors(self, x: FloatArray) -> tuple[float, float, float, float]:
+        """Factors on C_A, C_N, C_m and shift of C_mq."""
+        known, v = self.nominal.uncertainty, dict(zip(self.names, x.tolist(), strict=True))
+        return (
+            1.0 + known.ca * v["C_A"], 1.0 + known.cn * v["C_N"], 1.0 + known.cm * v["static stability"],
+            known.cmq * v["C_mq"],
+        )  # fmt: skip
+
+
+def _perturbed(
+    part: MassProperties, known: Uncertainty, mass: float, station: float, lateral_m: FloatArray, inertia: float
+) -> MassProperties:
+    """Return a body with mass, c.g. and inertia off by so many standard deviations, and a lateral shift, m."""
+    x, y, z = part.cg_from_datum_body_m
+    moved = {
+        "mass_kg": part.mass_kg * (1.0 + known.mass * mass),
+        "cg_from_datum_body_m": (x + known.cg_station_m * station, y + float(lateral_m[0]), z + float(lateral_m[1])),
+        "inertia_kgm2": tuple(map(tuple, (part.inertia * (1.0 + known.inertia * inertia)).tolist())),
+    }
+    return part.model_copy(update=moved)
+
+
+@dataclass(frozen=True)
+class AtmosphereParameters:
+    """From differences to the sounding at knots, ``(3, k)``, to kernel tables: log density, north and east wind.
+
+    Parameters
+    ----------
+    sounding : Sounding
+    lowest_m : float
+        Of the flight.
+    fine : float
+        Structure between the knots over that of the sounding's statistics (`fit.estimate_turbulence_share`).
+    """
+
+    sounding: Sounding
+    lowest_m: float
+    turbulence_share: float = 1.0
+
+    @cached_property
+    def knots_m(self) -> FloatArray:
+        """Altitudes (k,) at which the atmosphere may differ from the sounding."""
+        lower = np.arange(UPPER_M, min(self.lowest_m, UPPER_M) - BELOW_M, -KNOT_M)[:0:-1]
+        return np.concatenate([lower, np.arange(UPPER_M, TOP_M, UPPER_KNOT_M)])
+
+    def knot_spacing_m(self, altitude_m: FloatArray) -> FloatArray:
+        """Distance of the knots about altitudes."""
+        apart = np.diff(self.knots_m, append=2 * self.knots_m[-1] - self.knots_m[-2])
+        return np.asarray(np.interp(altitude_m, self.knots_m, apart))
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """Inverse covariance (3, k, k) of the sounding: half constant bias, half Gauss-Markov along altitude."""
+        at = profile_from_sounding(self.sounding).at(self.knots_m)
+        out = []
+        for sd, length in ((at.density_sd, DENSITY_LENGTH_M), *[(at.wind_sd_mps, WIND_LENGTH_M)] * 2):
+            correlation = sounding_correlation(self.knots_m, length)
+            out.append(np.linalg.inv(sd[:, None] * correlation * sd))
+        return np.array(out)
+
+    def unresolved_structure(self, altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Standard deviations (n,) of log density and of wind, m/s, of the structure between the knots."""
+        apart = np.diff(self.knots_m, append=2 * self.knots_m[-1] - self.knots_m[-2])
+        at = profile_from_sounding(self.sounding).at(self.knots_m)
+
+        def bridge(sd: FloatArray, length_m: float) -> FloatArray:
+            bridged = self.turbulence_share * sd * np.sqrt(unresolved_variance(apart, length_m))
+            return np.asarray(np.interp(altitude_m, self.knots_m, bridged))
+
+        return bridge(at.density_sd, DENSITY_LENGTH_M), bridge(at.wind_sd_mps, WIND_LENGTH_M)
+
+    @cached_property
+    def _sounded(self) -> tuple[FloatArray, FloatArray]:
+        table = simulate.atmosphere_table(profile_from_sounding(self.sounding))
+        rows = simulate.ATMOSPHERE_START_M + simulate.ATMOSPHERE_STEP_M * np.arange(len(table), dtype=np.float64)
+        return table, np.asarray(rows)
+
+    def table(self, difference: FloatArray) -> FloatArray:
+        """Kernel table (rows, 6) of the atmosphere."""
+        table, rows = self._sounded
+        table = table.copy()
+        ratio, north, east = (np.interp(rows, self.knots_m, part) for part in difference)
+        table[:, 0] *= np.exp(ratio)
+        table[:-1, 1] += np.diff(ratio)
+        table[:, 3] += north
+        table[:, 4] += east
+        return table
+
+
+START_ALTITUDE_M = 100e3
+WINDOW_S = 0.04  # passes 98 % of the joint's oscillation at 2.5 Hz; the simulated flight is averaged alike
+WINDOWS = 10  # a span
+SPAN_S = WINDOWS * WINDOW_S
+LEAST_SPANS = 20
+LOADED = 0.1  # of the largest dynamic pressure
+# a priori sd of deflection and its rate (about x, y, z) at the first start: at rest above the atmosphere; under load
+REST_SD, LOADED_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0]), np.deg2rad([1e-3, 3.0, 3.0, 0.1, 30.0, 30.0])
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Windows of corrected sensors, body axes, and where each of ``s`` spans starts.
+
+    Parameters
+    ----------
+    start : Trajectory
+        Of the datum, at the starts of the spans and at the end of the last, ``s + 1`` points.
+    dynamic_pressure_pa, altitude_m : (s,) float
+        At the middles of the spans, by the sounding.
+    time_s : (s, WINDOWS) float
+        Middles of the windows.
+    rate_radps, specific_force_mps2 : (s, WINDOWS, 3) float
+        NaN where data are missing; specific force at the accelerometer.
+    rate_sd_radps, force_sd_mps2 : float
+        White noise of a window, each axis.
+    rate_response, force_response : (4, 3, 9) float
+        Response to nine unit normals that stand for the constant errors: of the gyros a priori by the data sheet's
+        bias, scale and mounting, of the accelerometer a posteriori by the reconstruction. First the constant part, then
+        the factors of the true x, y and z.
+    clock_sd_s : (2,) float
+        Of the gyros' and of the accelerometer's clock.
+    accelerometer_m : (3,) float
+        From the datum, body axes.
+    first_deflection_sd : (6,) float
+        Of the shell's rotation vector against the body, rad, and its rate, rad/s, at the first start.
+    """
+
+    start: Trajectory
+    dynamic_pressure_pa: FloatArray
+    altitude_m: FloatArray
+    time_s: FloatArray
+    rate_radps: FloatArray
+    specific_force_mps2: FloatArray
+    rate_sd_radps: float
+    force_sd_mps2: float
+    rate_response: FloatArray
+    force_response: FloatArray
+    clock_sd_s: FloatArray
+    accelerometer_m: FloatArray
+    first_deflection_sd: FloatArray
+
+    @property
+    def spans(self) -> int:
+        """Number of spans."""
+        return len(self.time_s)
+
+
+def select_measurements(flight: Reconstruction, loaded: bool = False) -> Measurements:
+    """Select the data of a reconstructed flight to which a joint is fitted, 100 km down to the end of the pulse.
+
+    Parameters
+    ----------
+    flight : Flight
+    loaded : bool
+        Begin only where a tenth of the largest dynamic pressure loads the joint: in thinner air a shell with freeplay
+        oscillates between the edges of its dead band, and its impacts cannot be predicted from a span's start.
+
+    Raises
+    ------
+    GateError
+        Where sensors or vehicle are missing, or no pressure pulse was reconstructed.
+    """
+    pulse, bet, air = flight.required_loads(), flight.solution, flight.air
+    accelerometer, rates = flight.telemetry.required_triads()
+    falling = (air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0)
+    if loaded:
+        falling &= air.dynamic_pressure_pa > LOADED * pulse.dynamic_pressure_pa.max()
+    if not falling.any():
+        raise GateError("reconciliation: the reconstruction never comes below 100 km", code="entry-missing")
+    first_s = float(np.ceil(air.time_s[np.argmax(falling)] / WINDOW_S) * WINDOW_S)
+    last_s = float(pulse.time_s[np.flatnonzero(pulse.through_pulse)[-1]])
+    spans = int((last_s - first_s) / SPAN_S)
+    starts = np.asarray(first_s + SPAN_S * np.arange(max(spans, 0) + 1), dtype=np.float64)
+    t = (starts[:-1, None] + WINDOW_S * (np.arange(WINDOWS) + 0.5)).ravel()
+    whole = windows_are_whole(bet, t)
+    if spans < LEAST_SPANS or whole.mean() < 0.5:
+        raise GateError(
+            f"reconciliation: {whole.sum() * WINDOW_S:.1f} s of whole sensor data between 100 km ({first_s:.1f} s) "
+            f"and the end of the pressure pulse ({last_s:.1f} s); at least {LEAST_SPANS * SPAN_S:g} s and half of the "
+            "time are wanted",
+            code="data-gap",
+        )
+    means = cg_accelerations(bet, t, np.zeros(3), 0.5 * WINDOW_S)
+    near = np.abs(bet.smoothed.time_s[:, None] - t).argmin(axis=0)
+    shape = (spans, WINDOWS)
+
+    def windows(values: FloatArray) -> FloatArray:
+        return np.where(whole[:, None], values, np.nan).reshape(*shape, 3)
+
+    middle = starts[:-1] + 0.5 * SPAN_S
+    return Measurements(
+        resample(bet.smoothed, starts),
+        np.interp(middle, air.time_s, air.dynamic_pressure_pa),
+        np.interp(middle, air.time_s, air.altitude_m),
+        t.reshape(shape),
+        windows(means.rate_radps),
+        windows(means.specific_force_sensor_mps2),
+        float(rates.spec.noise_sd / np.sqrt(means.samples)),
+        float(accelerometer.spec.noise_sd / np.sqrt(means.samples)),
+        _rate_response(rates.spec),
+        _affine(means.specific_force_sensor_mps2[whole], bet.accelerometer_root[near][whole, 3:]),
+        np.array([rates.spec.time_bias_sd_s, accelerometer.spec.time_bias_sd_s]),
+        accelerometer.spec.position_from_datum_body_m,
+        LOADED_SD if loaded else REST_SD,
+    )
+
+
+def _rate_response(spec: TriadSpec) -> FloatArray:
+    """Response (4, 3, 9) to unit normals of bias, scale and mounting."""
+    out = np.zeros((4, 3, 9))
+    out[0, :, 0:3] = spec.bias_sd * np.eye(3)
+    out[1:, :, 3:6] = spec.scale_sd * np.einsum("kj,ij->kij", np.eye(3), np.eye(3))
+    out[1:, :, 6:9] = spec.mount_sd_rad * skew(np.eye(3))
+    return out
+
+
+def _affine(values: FloatArray, responses: FloatArray) -> FloatArray:
+    """Response (4, 3, 9), affine in the readings (n, 3), that fits ``responses`` (n, 3, 9)."""
+    ones = np.column_stack([np.ones(len(values)), values])
+    fitted, *_ = np.linalg.lstsq(ones, responses.reshape(len(values), -1), rcond=None)
+    return np.asarray(fitted.reshape(4, *responses.shape[1:]))
+
+
+STEP_S = 0.004
+PER_RECORD = 5  # two records a window: its mean is Simpson's of its ends and middle
+RECORDS = 2 * WINDOWS + 1
+# of a span's start: rotation from the reconstructed attitude, body's rate, shell's rotation vector from the body (x is
+# its twist), shell's rate relative to the body, shell axes
+MOTION = 12
+ATTITUDE, RATE, DEFLECTION, DEFLECTION_RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class TrialVehicle:
+    """A vehicle with its vector for the kernels, `simulate.parameter_vector` (67,)."""
+
+    vehicle: Vehicle
+    kernel_vector: FloatArray
+
+
+@dataclass(frozen=True)
+class SpanFlights:
+    """Spans to fly: numbers of span, vehicle and atmosphere table of each, and the motion at its start.
+
+    Parameters
+    ----------
+    span, vehicle, table : (m,) int
+    motion : (m, 12) float
+    vehicles : list of TrialVehicle
+    tables : list of (rows, 6) float
+        Kernel tables of the atmosphere.
+    """
+
+    span: Index
+    vehicle: Index
+    motion: FloatArray
+    table: Index
+    vehicles: list[TrialVehicle]
+    tables: list[FloatArray]
+
+
+@dataclass(frozen=True)
+class PredictedSpans:
+    """Predicted sensor data of ``m`` spans; NaN after a divergence.
+
+    Parameters
+    ----------
+    windows, slope : (m, WINDOWS, 6) float
+        Rates, rad/s, and specific force, m/s^2, means over windows, and their rates of change.
+    deflection : (m, WINDOWS, 3) float
+        Shell's rotation vector from the body at the windows' middles, rad.
+    end : (m, 12) float
+        Motion at the end of the span, in the coordinates of the next one's start.
+    """
+
+    windows: FloatArray
+    slope: FloatArray
+    deflection: FloatArray
+    end: FloatArray
+
+
+def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) -> PredictedSpans:
+    """Fly spans and predict the sensors' windows; ``nominal`` gives the coefficient table."""
+    starts = _start_states(measured, flights)
+
+    def start_of(k: int) -> Start:
+        vehicle = flights.vehicles[flights.vehicle[k]]
+        return Start(starts[k], vehicle.kernel_vector, flights.tables[flights.table[k]])
+
+    states, aux = np.full((len(starts), RECORDS, 20), np.nan), np.full((len(starts), RECORDS, 18), np.nan)
+    for flown in fly_ensemble(nominal, start_of, range(len(starts)), Schedule(STEP_S, PER_RECORD, RECORDS)):
+        states[flown.run, : len(flown.states)], aux[flown.run, : len(flown.aux)] = flown.states, flown.aux
+    windows, slope = _windows(measured, flights, states, aux)
+    middle = states[:, 1::2]
+    deflection = rotations.log(rotations.multiply(rotations.conjugate(middle[..., 6:10]), middle[..., 10:14]))
+    return PredictedSpans(windows, slope, deflection, _ends(measured, flights.span, states[:, -1]))
+
+
+def _start_states(measured: Measurements, flights: SpanFlights) -> FloatArray:
+    """States (m, 20) as `synthetic_flight.simulate.state_from_ecef` lays them out, of the deflected vehicle's c.g."""
+    at, span, motion = measured.start, flights.span, flights.motion
+    vehicles = [c.vehicle for c in flights.vehicles]
+    cg = np.array([v.cg_m for v in vehicles])[flights.vehicle]
+    # of the shell's c.g., from the joint; its share in the vehicle's
+    arm = np.array([v.aeroshell.cg_m - v.joint_m for v in vehicles])[flights.vehicle]
+    share = np.array([v.aeroshell.mass_kg / v.mass_kg for v in vehicles])[flights.vehicle, None]
+    q = rotations.boxplus(at.q_ecef_body[span], motion[:, ATTITUDE])
+    omega, q_body_shell = motion[:, RATE], rotations.exp(motion[:, DEFLECTION])
+    shell_rate = rotations.rotate(rotations.conjugate(q_body_shell), omega) + motion[:, DEFLECTION_RATE]
+    offset = cg + share * (rotations.rotate(q_body_shell, arm) - arm)
+    drift = rotations.rotate(q_body_shell, np.cross(shell_rate, arm)) - np.cross(omega, arm)
+    r = at.position_ecef_m[span] + rotations.rotate(q, offset)
+    v = at.velocity_ecef_mps[span] + rotations.rotate(q, np.cross(omega, cg) + share * drift)
+    to_eci = rotations.conjugate(earth.q_ecef_eci(at.time_s[span]))
+    q_body = rotations.multiply(to_eci, q)
+    return np.column_stack(
+        [
+            rotations.rotate(to_eci, r),
+            rotations.rotate(to_eci, v + np.cross(earth.OMEGA_ECEF_RADPS, r)),
+            q_body,
+            rotations.multiply(q_body, q_body_shell),
+            omega,
+            shell_rate,
+        ]
+    )
+
+
+def _windows(
+    measured: Measurements, flights: SpanFlights, states: FloatArray, aux: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    bodies = [c.vehicle.centerbody for c in flights.vehicles]
+    arm = np.array([measured.accelerometer_m - body.cg_m for body in bodies])[flights.vehicle][:, None]
+    mass = np.array([body.mass_kg for body in bodies])[flights.vehicle][:, None, None]
+    omega, turn = states[..., 14:17], aux[..., 15:18]
+    force = rotations.rotate(rotations.conjugate(states[..., 6:10]), aux[..., 6:9]) / mass
+    force = force + np.cross(turn, arm) + np.cross(omega, np.cross(omega, arm))
+    records = np.concatenate([omega, force], axis=2)
+    before, middle, after = records[:, 0:-1:2], records[:, 1::2], records[:, 2::2]
+    return (before + 4.0 * middle + after) / 6.0, (after - before) / (2.0 * PER_RECORD * STEP_S)
+
+
+def _ends(measured: Measurements, span: Index, state: FloatArray) -> FloatArray:
+    """Motion (m, 12) in the coordinates of the next span's start."""
+    q_body, q_shell = state[:, 6:10], state[:, 10:14]
+    q = rotations.multiply(earth.q_ecef_eci(measured.start.time_s[span] + SPAN_S), q_body)
+    rotation = rotations.boxminus(q, measured.start.q_ecef_body[span + 1])
+    q_body_shell = rotations.multiply(rotations.conjugate(q_body), q_shell)
+    shell_rate = state[:, 17:20] - rotations.rotate(rotations.conjugate(q_body_shell), state[:, 14:17])
+    return np.column_stack([rotation, state[:, 14:17], rotations.log(q_body_shell), shell_rate])

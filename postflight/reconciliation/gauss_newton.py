@@ -1,0 +1,478 @@
+"""Which parameters of joint, vehicle, instruments, atmosphere and motion fit the measurements best? Gauss-Newton steps.
+
+The flight is cut into spans, each flown from a motion of its own (multiple shooting: a flight of fifty seconds depends
+on its start so strongly that a fit of it stops in one of many false minima). Minimised over all parameters together is
+
+    | (sensors - predicted) / sd |^2 + | (end of a span - start of the next) / sd |^2 + | a priori residuals |^2
+
+Ends and starts differ by what atmospheric structure between its knots does to the motion (process noise of the joins).
+A step is Gauss-Newton's with the second-order correction of geodesic acceleration, since the valley is long and curved
+(stiffness, inertias and stability nearly scale together); it is damped where the curvature is larger than that.
+
+References
+----------
+H. G. Bock, "Recent advances in parameter identification techniques for O.D.E.", 1983 (multiple shooting).
+M. K. Transtrum, J. P. Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
+minimization", 2012 (geodesic acceleration).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from flightmodel.checks import DivergenceError, FloatArray
+from postflight.reconciliation.forward_model import (
+    ATTITUDE,
+    MOTION,
+    RATE,
+    AtmosphereParameters,
+    Index,
+    Measurements,
+    PredictedSpans,
+    SpanFlights,
+    TrialVehicle,
+    VehicleParameters,
+    fly_spans,
+)
+from synthetic_flight import simulate
+
+INSTRUMENTS = 20
+# process noise of the joins per rad of flow angle that turbulence between knots GUST_KNOT_M apart makes, at the largest
+# dynamic pressure: rotation rad, rate rad/s, deflection rad, its rate rad/s; and the noise that is left in vacuum
+GUST = np.array([0.3, 0.3, 0.3, 3.0, 3.0, 3.0, 0.0, 0.3, 0.3, 0.0, 9.0, 9.0])
+VACUUM_SD = np.deg2rad([0.001, 0.001, 0.001, 0.003, 0.003, 0.003, 1e-4, 0.001, 0.001, 0.03, 0.01, 0.01])
+GUST_KNOT_M = 300.0
+LARGE_ANGLE_RAD = np.deg2rad(5.0)  # angle of attack at which density structure rotates the vehicle
+GUST_RATE, GUST_FORCE_MPS2 = 2.0, 60.0  # of the windows' rates and lateral force, as if white from window to window
+MOTION_STEP = np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3))
+VEHICLE_STEP, AIR_STEP = 1e-5, np.array([1e-6, 2e-4, 2e-4])
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """All parameters: vehicle (v,), instruments (20,), air (3, k), motion at the start of each span (s, 12)."""
+
+    vehicle: FloatArray
+    instruments: FloatArray
+    air: FloatArray
+    motion: FloatArray
+
+    def plus(self, step: FloatArray) -> Parameters:
+        """Parameters moved by a step (n,) of all of them in this order."""
+        parts = (self.vehicle, self.instruments, self.air, self.motion)
+        ends = np.cumsum([part.size for part in parts])[:-1]
+        return Parameters(*(p + d.reshape(p.shape) for p, d in zip(parts, np.split(step, ends), strict=True)))
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """In standard deviations: sensors (s, WINDOWS, 6), joins (s - 1, 12); ``cost``: sum of squares with priors."""
+
+    sensors: FloatArray
+    joins: FloatArray
+    cost: float
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Residuals and minus their derivatives by the parameters: columns and responses, span by span."""
+
+    residuals: Residuals
+    sensors: list[tuple[Index, FloatArray]]
+    joins: list[tuple[Index, FloatArray]]
+    count: int
+
+    def transpose_times(self, sensors: FloatArray, joins: FloatArray) -> FloatArray:
+        """Transpose of the derivatives times numbers laid out as the residuals."""
+        out = np.zeros(self.count)
+        for parts, values in ((self.sensors, sensors), (self.joins, joins)):
+            for (column, response), value in zip(parts, values, strict=True):
+                out[column] += response.T @ value.ravel()
+        return out
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Least-squares problem of one flight.
+
+    Parameters
+    ----------
+    measured : Measurements
+    vehicle_parameters : VehicleParameters
+    air : AtmosphereParameters
+    held : tuple of str
+        Parameters of the vehicle that no step moves.
+    sd_factor : float or (s,) float
+        Factor on all standard deviations, or on each span's.
+    """
+
+    measured: Measurements
+    vehicle_parameters: VehicleParameters
+    air: AtmosphereParameters
+    held: tuple[str, ...] = ()
+    sd_factor: float | FloatArray = 1.0
+
+    @property
+    def first_instrument(self) -> int:
+        """Column of the first instrument parameter; the air's follow them."""
+        return len(self.vehicle_parameters.names)
+
+    @property
+    def first_motion(self) -> int:
+        """Column of the first motion parameter."""
+        return self.first_instrument + INSTRUMENTS + 3 * len(self.air.knots_m)
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return self.first_motion + MOTION * self.measured.spans
+
+    @cached_property
+    def turbulence_rad(self) -> FloatArray:
+        """Flow angle (s,), rad, by atmospheric structure between the knots, times the share of the largest pressure.
+
+        The structure between two knots acts for a time that grows with their spacing, and at random from one stretch to
+        the next: its effect over a span grows, per angle, with the root of the spacing (docs/reconciliation.md).
+        """
+        measured = self.measured
+        correlated = np.sqrt(self.air.knot_spacing_m(measured.altitude_m) / GUST_KNOT_M)
+        density, wind = self.air.unresolved_structure(measured.altitude_m)
+        speed = np.linalg.norm(measured.start.velocity_ecef_mps[:-1], axis=1)
+        load = measured.dynamic_pressure_pa / measured.dynamic_pressure_pa.max()
+        return np.asarray(load * correlated * np.hypot(wind / speed, density * LARGE_ANGLE_RAD))
+
+    @cached_property
+    def data(self) -> FloatArray:
+        """Windows (s, WINDOWS, 6) as measured; zero where data are missing."""
+        return np.nan_to_num(np.concatenate([self.measured.rate_radps, self.measured.specific_force_mps2], axis=2))
+
+    @cached_property
+    def weight(self) -> FloatArray:
+        """Inverse standard deviations of the windows (s, WINDOWS, 6), zero where data are missing."""
+        measured = self.measured
+        size = np.abs(measured.specific_force_mps2)
+        density, _ = self.air.unresolved_structure(measured.altitude_m)
+        gust = self.turbulence_rad[:, None, None]
+        rate_sd = np.hypot(measured.rate_sd_radps, GUST_RATE * gust) * np.ones_like(size)
+        unresolved = np.hypot(density[:, None, None] * size, GUST_FORCE_MPS2 * gust)
+        force_sd = np.hypot(measured.force_sd_mps2, unresolved)
+        weight = 1.0 / (self._sd_factors[:, None, None] * np.concatenate([rate_sd, force_sd], axis=2))
+        return np.where(np.isfinite(measured.specific_force_mps2[..., :1]), np.nan_to_num(weight), 0.0)
+
+    @cached_property
+    def join_weight(self) -> FloatArray:
+        """Inverse standard deviations (s - 1, 12) of ends against starts."""
+        factor = np.maximum(self._sd_factors[:-1], self._sd_factors[1:])
+        return np.asarray(1.0 / (factor[:, None] * np.hypot(GUST * self.turbulence_rad[:-1, None], VACUUM_SD)))
+
+    @property
+    def log_weight(self) -> float:
+        """Sum of the logarithms of all weights."""
+        return float(np.log(self.weight[self.weight > 0.0]).sum() + np.log(self.join_weight).sum())
+
+    @property
+    def _sd_factors(self) -> FloatArray:
+        return np.asarray(np.broadcast_to(self.sd_factor, self.measured.spans))
+
+    @cached_property
+    def nearby_knots(self) -> list[Index]:
+        """Knots of the atmosphere that each span passes."""
+        z, knots = self.measured.altitude_m, self.air.knots_m
+        reach = 0.55 * np.abs(np.gradient(z)) + 50.0
+        apart = np.diff(knots, append=2 * knots[-1] - knots[-2])
+        return [np.flatnonzero(np.abs(knots - at) < r + apart) for at, r in zip(z, reach, strict=True)]
+
+    @cached_property
+    def attitude_precision(self) -> FloatArray:
+        """Inverse covariance (3, 3) of the reconstructed attitude at the first start."""
+        covariance = self.measured.start.covariance
+        assert covariance is not None
+        return np.asarray(np.linalg.inv(covariance[0, 6:9, 6:9]))
+
+    def start(self) -> Parameters:
+        """Nominal vehicle, instruments and sounding, motion as reconstructed."""
+        motion = np.zeros((self.measured.spans, MOTION))
+        motion[:, RATE] = self.measured.start.omega_body_eci_body_radps[:-1]
+        air = np.zeros((3, len(self.air.knots_m)))
+        return Parameters(np.zeros(len(self.vehicle_parameters.names)), np.zeros(INSTRUMENTS), air, motion)
+
+    def trial_vehicle(self, x: FloatArray) -> TrialVehicle:
+        """Vehicle of parameters (v,) in standard deviations."""
+        vehicle = self.vehicle_parameters.vehicle(x)
+        return TrialVehicle(vehicle, simulate.parameter_vector(vehicle, *self.vehicle_parameters.factors(x)))
+
+    def predict(self, u: Parameters) -> PredictedSpans:
+        """Fly every span once; windows without the instruments' errors."""
+        spans = np.arange(self.measured.spans)
+        zero = np.zeros_like(spans)
+        flights = SpanFlights(spans, zero, u.motion, zero, [self.trial_vehicle(u.vehicle)], [self.air.table(u.air)])
+        return fly_spans(self.measured, self.vehicle_parameters.nominal, flights)
+
+    def instrument_response(self, predicted: PredictedSpans) -> FloatArray:
+        """Response of the windows to the instruments' parameters, (s, WINDOWS, 6, 20).
+
+        Scale and mounting errors act on the predicted motion, not on the measured one: on measured rates a gyro's scale
+        would lower the cost by scaling the noise.
+        """
+        measured = self.measured
+        rows = np.zeros((*predicted.windows.shape, INSTRUMENTS))
+        for axes, columns, response in (
+            (slice(0, 3), slice(0, 9), measured.rate_response),
+            (slice(3, 6), slice(9, 18), measured.force_response),
+        ):
+            rows[..., axes, columns] = response[0] + np.tensordot(predicted.windows[..., axes], response[1:], axes=1)
+        # a late time tag carries an earlier value
+        rows[..., :3, 18] = -measured.clock_sd_s[0] * predicted.slope[..., :3]
+        rows[..., 3:, 19] = -measured.clock_sd_s[1] * predicted.slope[..., 3:]
+        return rows
+
+    def sensed_change(self, u: Parameters, windows: FloatArray, slope: FloatArray) -> FloatArray:
+        """Changes (..., 6) of the sensed windows by those of the predicted windows and of their slope."""
+        measured = self.measured
+        gain = np.eye(6)
+        gain[:3, :3] += np.einsum("kij,j->ik", measured.rate_response[1:], u.instruments[0:9])
+        gain[3:, 3:] += np.einsum("kij,j->ik", measured.force_response[1:], u.instruments[9:18])
+        late = np.repeat(measured.clock_sd_s * u.instruments[18:20], 3)
+        return np.asarray(windows @ gain.T - late * slope)
+
+    def residuals(self, u: Parameters, predicted: PredictedSpans | None = None) -> Residuals:
+        """Residuals of measurements, joins and priors; where a span diverges the cost is infinite."""
+        predicted = predicted or self.predict(u)
+        errors = self.instrument_response(predicted) @ u.instruments
+        sensors = (self.data - predicted.windows - errors) * self.weight
+        joins = (predicted.end[:-1] - u.motion[1:]) * self.join_weight
+        with np.errstate(over="ignore", invalid="ignore"):  # a trial vehicle that tumbles
+            total = float((sensors**2).sum() + (joins**2).sum()) + self.prior_cost(u)
+        return Residuals(sensors, joins, total if np.isfinite(total) else np.inf)
+
+    def prior_cost(self, u: Parameters) -> float:
+        """Sum of squares of the a priori residuals."""
+        return sum(float(value @ precision @ value) for _, precision, value in self._priors(u))
+
+    def linearize(self, u: Parameters) -> Linearization:
+        """Residuals and their derivatives at ``u``, by forward differences of flown spans."""
+        flights, columns, steps = self._perturbed(u)
+        moved, base = fly_spans(self.measured, self.vehicle_parameters.nominal, flights), self.predict(u)
+        rows = self.instrument_response(base)
+        at, sensors, joins = 0, [], []
+        for span, (column, step) in enumerate(zip(columns, steps, strict=True)):
+            part = slice(at, at := at + len(column))
+            step[self.held_columns] = np.inf  # no step moves what is held
+            change = self.sensed_change(
+                u, moved.windows[part] - base.windows[span], moved.slope[part] - base.slope[span]
+            )
+            response = change / step[:, None, None] * self.weight[span]
+            errors = (rows[span] * self.weight[span][..., None]).reshape(-1, INSTRUMENTS)
+            both = np.concatenate([column, self.first_instrument + np.arange(INSTRUMENTS)])
+            sensors.append((both, np.column_stack([response.reshape(len(step), -1).T, errors])))
+            if span + 1 < self.measured.spans:
+                ended = (moved.end[part] - base.end[span]) / step[:, None]
+                following = self.first_motion + MOTION * (span + 1) + np.arange(MOTION)
+                response = np.column_stack([-ended.T, np.eye(MOTION)]) * self.join_weight[span][:, None]
+                joins.append((np.concatenate([column, following]), response))
+        return Linearization(self.residuals(u, base), sensors, joins, self.count)
+
+    def normal_equations(self, u: Parameters, linear: Linearization) -> tuple[FloatArray, FloatArray]:
+        """NormalEquations matrix and right-hand side of a step from ``u``."""
+        matrix = np.zeros((self.count, self.count))
+        for column, response in (*linear.sensors, *linear.joins):
+            matrix[np.ix_(column, column)] += response.T @ response
+        for part, precision, _ in self._priors(u):
+            matrix[part, part] += precision
+        return matrix, self.right_hand_side(u, linear, linear.residuals)
+
+    def right_hand_side(self, u: Parameters, linear: Linearization, residuals: Residuals) -> FloatArray:
+        """Right-hand side of a step from ``u`` with its residuals, by derivatives at ``u`` or nearby."""
+        right = linear.transpose_times(residuals.sensors, residuals.joins)
+        for part, precision, value in self._priors(u):
+            right[part] -= precision @ value
+        right[self.held_columns] = 0.0
+        return right
+
+    @property
+    def held_columns(self) -> list[int]:
+        """Columns of the parameters that are held."""
+        return [self.vehicle_parameters.names.index(name) for name in self.held]
+
+    def _perturbed(self, u: Parameters) -> tuple[SpanFlights, list[Index], list[FloatArray]]:
+        """Spans with one parameter moved, which parameter (columns) and by how much, span by span."""
+        v, knots = self.first_instrument, len(self.air.knots_m)
+        vehicles = [self.trial_vehicle(u.vehicle + VEHICLE_STEP * unit) for unit in np.eye(v)]
+        vehicles.append(self.trial_vehicle(u.vehicle))
+        tables, number = [self.air.table(u.air)], {}
+        for kind in range(3):
+            for knot in range(knots):
+                air = u.air.copy()
+                air[kind, knot] += AIR_STEP[kind]
+                number[kind, knot] = len(tables)
+                tables.append(self.air.table(air))
+        rows: list[tuple[int, int, FloatArray, int]] = []
+        columns, steps = [], []
+        for span in range(self.measured.spans):
+            motion = u.motion[span]
+            rows += [(span, j, motion, 0) for j in range(v)]
+            rows += [(span, v, motion + d, 0) for d in np.diag(MOTION_STEP)]
+            places = [(kind, knot) for kind in range(3) for knot in self.nearby_knots[span].tolist()]
+            rows += [(span, v, motion, number[place]) for place in places]
+            in_air = [v + INSTRUMENTS + kind * knots + knot for kind, knot in places]
+            columns.append(np.array([*range(v), *(self.first_motion + MOTION * span + np.arange(MOTION)), *in_air]))
+            steps.append(np.array([VEHICLE_STEP] * v + MOTION_STEP.tolist() + [AIR_STEP[kind] for kind, _ in places]))
+        which = np.array([(row[0], row[1], row[3]) for row in rows]).T
+        motions = np.array([row[2] for row in rows])
+        return SpanFlights(which[0], which[1], motions, which[2], vehicles, tables), columns, steps
+
+    def _priors(self, u: Parameters) -> list[tuple[slice, FloatArray, FloatArray]]:
+        """Columns of parameters, their a priori inverse covariance, their values."""
+        free, knots, first = self.first_instrument + INSTRUMENTS, len(self.air.knots_m), self.first_motion
+        return [
+            (slice(0, free), np.eye(free), np.concatenate([u.vehicle, u.instruments])),
+            *[
+                (slice(free + kind * knots, free + (kind + 1) * knots), self.air.precision[kind], u.air[kind])
+                for kind in range(3)
+            ],
+            (slice(first, first + 3), self.attitude_precision, u.motion[0, ATTITUDE]),
+            (slice(first + 6, first + MOTION), np.diag(self.measured.first_deflection_sd**-2.0), u.motion[0, 6:]),
+        ]
+
+
+STEP_FRACTIONS = (1.0, 0.5, 0.25)  # of a step
+LOOK_AHEAD = 0.1  # of a step, over which its curvature is taken
+# shares of the diagonal that are added, until the cost falls by a fair part of the undamped step's predicted decrease
+DAMPINGS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
+FIRST_DAMPING, MOST_DAMPING, FAIR = 1e-2, 1e3, 0.5
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """NormalEquations equations of a step, scaled to a diagonal of one."""
+
+    matrix: FloatArray
+    right: FloatArray
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """One over the root of the diagonal."""
+        return np.asarray(1.0 / np.sqrt(np.diag(self.matrix)))
+
+    def factor(self, damping: float) -> FloatArray:
+        """Lower Cholesky factor of the scaled matrix with a share of the diagonal added."""
+        scaled = self.matrix * self.scale[:, None] * self.scale
+        scaled[np.diag_indices_from(scaled)] += damping
+        return np.asarray(cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)[0])
+
+    @cached_property
+    def undamped(self) -> FloatArray:
+        """Factor of the matrix as it is."""
+        return self.factor(0.0)
+
+    def solver(self, damping: float) -> Callable[[FloatArray], FloatArray]:
+        """Solver of the equations with a share of the diagonal added."""
+        factor, scale = self.factor(damping) if damping else self.undamped, self.scale
+        return lambda right: np.asarray((cho_solve((factor, True), (right.T * scale).T).T * scale).T)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solution of the equations."""
+        return self.solver(0.0)(right)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (n, n) of all parameters."""
+        return self.solve(np.eye(len(self.right)))
+
+    @property
+    def log_det(self) -> float:
+        """Logarithm of the determinant."""
+        return float(2.0 * (np.log(np.diag(self.undamped)).sum() - np.log(self.scale).sum()))
+
+
+@dataclass(frozen=True)
+class Step:
+    """End of a step, decrease of the cost that the linear problem predicts, residuals at the end, its equations."""
+
+    end: Parameters
+    predicted_decrease: float
+    residuals: Residuals
+    normal: NormalEquations
+
+
+def step_from(problem: Problem, u: Parameters) -> Step:
+    """Take the best of some damped steps with geodesic acceleration.
+
+    Raises
+    ------
+    DivergenceError
+        Where the spans cannot be flown with these parameters.
+    """
+    linear = problem.linearize(u)
+    if not np.isfinite(linear.residuals.cost):
+        raise DivergenceError(
+            "reconciliation: a span of the flight cannot be flown with the vehicle file's joint, which diverges; give "
+            "a stiffer joint in the vehicle file to start from",
+            code="joint-diverges",
+        )
+    normal = NormalEquations(*problem.normal_equations(u, linear))
+    predicted_decrease = float(normal.solve(normal.right) @ normal.right)
+    best = linear.residuals, u
+    for damping in DAMPINGS:
+        best = _better(problem, u, linear, normal, damping, best)
+        if linear.residuals.cost - best[0].cost > FAIR * predicted_decrease:
+            break
+    damping = FIRST_DAMPING
+    while best[0].cost >= linear.residuals.cost and damping < MOST_DAMPING:
+        best = _better(problem, u, linear, normal, damping, best)
+        damping *= 10.0
+    return Step(best[1], predicted_decrease, best[0], normal)
+
+
+def _better(
+    problem: Problem,
+    u: Parameters,
+    linear: Linearization,
+    normal: NormalEquations,
+    damping: float,
+    best: tuple[Residuals, Parameters],
+) -> tuple[Residuals, Parameters]:
+    """Return the lowest of the best so far and of fractions of one step with its curvature."""
+    solved = normal.solver(damping)
+    step = solved(normal.right)
+    ahead, behind = (problem.residuals(u.plus(side * LOOK_AHEAD * step)) for side in (1.0, -1.0))
+    curvature = solved(
+        linear.transpose_times(
+            (ahead.sensors - 2.0 * linear.residuals.sensors + behind.sensors) / LOOK_AHEAD**2,
+            (ahead.joins - 2.0 * linear.residuals.joins + behind.joins) / LOOK_AHEAD**2,
+        )
+    )
+    # a curved path, whose straight part alone may go too far
+    curved = [part * step + 0.5 * part**2 * curvature for part in STEP_FRACTIONS]
+    paths = curved if np.isfinite(curvature).all() else [step]
+    return min([best, *((problem.residuals(end), end) for end in map(u.plus, paths))], key=lambda pair: pair[0].cost)
+
+
+def descend(
+    problems: Iterable[Problem],
+    start: Parameters,
+    correct: Callable[[Problem, Parameters], Parameters] | None = None,
+) -> Iterator[Step]:
+    """Take one step on each problem in turn, each from the end of the one before.
+
+    Parameters
+    ----------
+    problems : iterable of Problem
+    start : Parameters
+    correct : callable, optional
+        Improves the parameters of a problem before each step.
+
+    Yields
+    ------
+    Step
+    """
+    end = start
+    for problem in problems:
+        step = step_from(problem, correct(problem, end) if correct else end)
+        end = step.end
+        yield step

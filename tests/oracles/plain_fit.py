@@ -1,0 +1,51 @@
+"""The fit of one frame in plain numpy, step by step: what the compiled one is held to."""
+
+import numpy as np
+
+from estimators.camera_fit import (
+    JOINT,
+    LAST_STEP_RAD,
+    OUTLIER_PX,
+    STEPS,
+    edge_residuals,
+    feature_residuals,
+    huber_gain,
+    joined,
+)
+from estimators.virtual_camera import DEFLECTION, FLATTENING
+
+
+def plain_fit(oriented, horizon, place, start):
+    """Bending (3,) from edge points and marks found, plane free."""
+    deformation, lines = np.array(start, dtype=float), len(oriented.lines.origin_px)
+    before, apriori = oriented.benchmark_residuals, oriented.apriori
+    prior = np.array(
+        [
+            apriori.flattening_rad,
+            apriori.joint_station_m,
+            *[apriori.ovality_rad] * 2,
+            *[np.sqrt(2.0) * apriori.edge_px] * 3,
+        ]
+    )
+    for _ in range(STEPS):
+        residuals = edge_residuals(oriented.view, horizon, deformation)
+        if place is not None:
+            residuals = joined(
+                residuals, feature_residuals(oriented.view, oriented.features, place, deformation, lines)
+            )
+        both = np.flatnonzero(np.isin(residuals.index, before.index) & np.isfinite(residuals.residual_px))
+        at = np.searchsorted(before.index, residuals.index[both])
+        residual = residuals.residual_px[both] - before.residual_px[at]
+        sd = np.hypot(residuals.sd_px[both], before.sd_px[at])
+        used = (residuals.index[both] < lines) | (np.abs(residual) < OUTLIER_PX)
+        rows, shape = residuals.rows[both][used], residuals.shape[both][used]
+        moved = type(residuals)(residual[used], rows, shape, sd[used], residuals.index[both][used])
+        design = np.column_stack([rows[:, DEFLECTION], rows[:, FLATTENING], rows[:, JOINT], shape])
+        gain, formal, _ = huber_gain(moved, design, np.diag(np.concatenate([np.zeros(2), prior**-2.0])), lines)
+        pull = np.zeros(len(formal))
+        pull[2] = deformation[2] / prior[0] ** 2
+        step = gain @ moved.residual_px - formal @ pull
+        deformation += step[:3]
+        if np.abs(step[:3]).max() < LAST_STEP_RAD:
+            break
+    return deformation
