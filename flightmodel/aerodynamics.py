@@ -1,4 +1,4 @@
-"""What the air does to the aeroshell: coefficients over Mach number and total angle of attack.
+"""What does the air do to the aeroshell, and where do the coefficients come from?
 
 Coefficients refer to ``q S`` and ``q S l`` and act at the nose (datum) of the shell, in the plane of the total angle
 of attack: ``C_A`` along -x, ``C_N`` against the lateral velocity, ``C_m`` nose-up positive (so a stable shape has
@@ -6,28 +6,25 @@ C_m < 0), ``C_mq`` per ``omega l / (2 V)`` on the transverse rates. Between the 
 the seed paper's blend from Mach 5.7 to 3.5 where the table has no knot in between. Where molecules seldom meet, they
 pass to the free-molecular coefficients, if the table has them (`flightmodel.sphere_cone`).
 
-How gridded coefficient tables come out of DAVE-ML files (ANSI/AIAA S-119).
-
-Read are ``variableDef``, ``breakpointDef``, ``griddedTableDef`` (alone, or inside a ``functionDefn``) and ``function``
-of one dependent and one or two independent variables, Mach number and total angle of attack. The last breakpoint set
-of a table varies fastest, as the standard says. Anything else a coefficient depends on is refused by name: this is a
-reader of tables, not of models. Entities and document type subsets are refused before anything is expanded, and
-nothing outside the file is ever opened.
-
-References
-----------
-ANSI/AIAA S-119-2011 (R2016), "Flight Dynamics Model Exchange Standard"; DAVE-ML 2.0 reference.
-
-Where a vehicle's coefficients come from: a table with its sidecar, or the shape of a sphere-cone alone.
-
-A table (CSV, or DAVE-ML) has beside it a TOML file of the same stem that says what its numbers refer to; they are
-turned to what `AeroTable` holds: axial and normal force in body axes, moments about the nose, damping per
-``omega l / (2 V)``, all on the vehicle's own reference area and length:
+They come from a table with its sidecar, or from the shape of a sphere-cone alone. A table (CSV, or DAVE-ML) has beside
+it a TOML file of the same stem with what its numbers refer to; they are converted to what `AeroTable` holds: axial and
+normal force in body axes, moments about the nose, damping per ``omega l / (2 V)``, all on the vehicle's own reference
+area and length:
 
     C_m,nose = C_m,ref - C_N x_ref / l
 
 with ``x_ref`` the station, aft of the nose, that the table's moments are about. Damping is taken over as it is: moving
 it would need the force due to pitch rate, which such tables do not hold.
+
+Of DAVE-ML are read ``variableDef``, ``breakpointDef``, ``griddedTableDef`` (alone, or inside a ``functionDefn``) and
+``function`` of one dependent and one or two independent variables, Mach number and total angle of attack. The last
+breakpoint set of a table varies fastest, as the standard has it. Anything else a coefficient depends on is refused by
+name: this is a reader of tables, not of models. Entities and document type subsets are refused before anything is
+expanded, and nothing outside the file is ever opened.
+
+References
+----------
+ANSI/AIAA S-119-2011 (R2016), "Flight Dynamics Model Exchange Standard"; DAVE-ML 2.0 reference.
 """
 
 from __future__ import annotations

@@ -39,13 +39,16 @@ class Fault(str):
         return fault
 
 
+NO_FAULT = Fault("")
+
+
 class GateError(ValueError):
     """Data refused at a gate; carries every fault found, one line each.
 
     Parameters
     ----------
     faults : str or sequence of str
-        Each says what is wrong, where (file and line, or source and time), and what to try; a `Fault` has its own code.
+        Each: what is wrong, where (file and line, or source and time), and what to try; a `Fault` has its own code.
     code : str
         Code of those faults that have none of their own.
     """

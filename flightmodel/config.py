@@ -31,7 +31,7 @@ LARGEST_TOML_BYTES = 10_000_000
 # also the name of a table in TOML, of a file and of a column
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
 FILL_IN_VALUE = "FILL IN"  # where a new file leaves a value to its user
-FILL_IN = "still to fill in"  # and what is said of it
+FILL_IN = "still to fill in"  # and the message for it
 NAME_RULE = "a name has 1 to 64 letters (a to z), digits, _ and -"
 
 

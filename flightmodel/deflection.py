@@ -1,4 +1,4 @@
-"""How the aeroshell is bent against the centerbody: one type for the truth and for every estimate of it.
+"""How far is the aeroshell deflected against the centerbody? One type for the truth and for every estimate of it.
 
 The bending angle ``theta`` is the angle between the two bodies' x axes. Its plane is the clocking angle, in the
 launch-vehicle (LV) frame, towards which the shell's nose axis tilts in the centerbody's frame; the shell's rim on
@@ -175,7 +175,7 @@ def interpolation_error(known_s: FloatArray, values: FloatArray, time_s: float) 
 
 
 def lateral_axes(plane_lv_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit lateral vectors ``(n, 2)`` along clocking angles, and across them: the derivative of ``(-cos, sin)``."""
+    """Unit lateral vectors ``(n, 2)`` along clocking angles, and normal to them: the derivative of ``(-cos, sin)``."""
     return lv_direction(plane_lv_rad)[..., 1:], np.stack([np.sin(plane_lv_rad), np.cos(plane_lv_rad)], axis=-1)
 
 

@@ -19,12 +19,12 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from flightmodel.checks import Fault, FloatArray
+from flightmodel.checks import NO_FAULT, Fault, FloatArray
 from flightmodel.vehicle import CameraMount
 
 Image = NDArray[np.uint8]
 
-# read at the first film: what cannot be decoded is said by frame, decoders' own lines on standard error say no more
+# read at the first film: what cannot be decoded is reported by frame; decoders' own lines on standard error add nothing
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 WEBM_START = b"\x1aE\xdf\xa3"
@@ -46,7 +46,7 @@ class Frames:
     paths : tuple of Path
         Of each frame's image, or the film alone.
     benchmark_s : float
-        When the shell is taken as not bent.
+        When the deflection is taken as zero.
     numbers : (n,) int or None
         Of each frame in the film; None for images.
     time_bias_sd_s : float
@@ -114,7 +114,7 @@ def _grey(picture: NDArray[np.uint8]) -> Image:
     return picture
 
 
-def film_timing_fault(path: Path) -> str:
+def film_timing_fault(path: Path) -> Fault:
     """Say why frame numbers of a film may be off; empty where every frame that it counts can be decoded.
 
     A frame that cannot be decoded is stepped over without a word, and every later one then has a number less. What
@@ -137,7 +137,7 @@ def film_timing_fault(path: Path) -> str:
             f"{len(times)} frames can be decoded where the film's own count is {counts}: {remedy}", "film-count"
         )
     if len(times) < 3:
-        return ""
+        return NO_FAULT
     step = np.diff(times)
     step = np.append(times[0] + np.median(step), step)  # the first frame's time is 0
     uneven = np.flatnonzero(np.abs(step - np.median(step)) > 0.5 * np.median(step))
@@ -146,7 +146,7 @@ def film_timing_fault(path: Path) -> str:
         return Fault(
             f"time jumps {where} ({len(uneven)} such jumps): a frame lost or an uneven rate; {remedy}", "film-rate"
         )
-    return ""
+    return NO_FAULT
 
 
 def film_fault(path: Path, camera: CameraMount, last_number: int) -> str:
@@ -198,7 +198,7 @@ def image_fault(path: Path, camera: CameraMount) -> str:
         return Fault(f"has far more pixels than the camera's {wanted[0]} x {wanted[1]}", "image-size")
     except (OSError, ValueError, SyntaxError):
         return Fault(f"cannot be decoded as an image (known are {', '.join(PICTURE_KINDS)})", "image-unreadable")
-    if sorted(size) == sorted(wanted) and not _is_whole_png(path):  # a turned JPEG says so in its metadata
+    if sorted(size) == sorted(wanted) and not _is_whole_png(path):  # a rotated JPEG has that in its metadata
         height, width = read_image(path).shape
         if height == 0:
             return Fault("cannot be decoded as an image", "image-unreadable")

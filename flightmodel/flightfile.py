@@ -1,4 +1,4 @@
-"""What ``flight.toml`` says: the flight, its instruments and their tables, how it starts and how it moves."""
+"""What may ``flight.toml`` hold? The flight, its instruments and their tables, how it starts and how it moves."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class AttitudeEntry(Section):
         pointing = (self.azimuth_deg, self.elevation_deg, self.roll_deg)
         place = (self.latitude_deg, self.longitude_deg)
         if self.q_ecef_body is not None and any(v is not None for v in (*pointing, *place)):
-            raise ValueError("q_ecef_body says it all; remove azimuth_deg, elevation_deg, roll_deg and the place")
+            raise ValueError("q_ecef_body is whole; remove azimuth_deg, elevation_deg, roll_deg and the place")
         if self.q_ecef_body is None and any(v is None for v in pointing):
             raise ValueError("write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis")
         if (place[0] is None) != (place[1] is None):
@@ -118,7 +118,7 @@ class MotionEntry(Section):
 
 
 class EventEntry(Section):
-    """A named moment."""
+    """A named event."""
 
     name: str
     t_s: Time

@@ -73,7 +73,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     folder : Path
         Flight folder with ``flight.toml``.
     progress : callable, optional
-        Is told which part of large tables is read.
+        Called with the fraction of the large tables that is read.
     needs_path : bool
         Whether a folder without radar and receiver is refused even where it has a film.
 
@@ -85,7 +85,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     spec = read_flight_file(folder)
     gate = Gate(folder, parse_utc(spec.t0_utc))
     if progress is not None:
-        gate.tell = _share_of(folder, spec, progress)
+        gate.progress = _share_of(folder, spec, progress)
     for misfit in spec.misfits(needs_path):
         gate.refuse_config(misfit)
     vehicle = _vehicle(gate, spec.vehicle) if spec.vehicle is not None else None
@@ -117,7 +117,7 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
     folder : Path
         Flight folder with ``flight.toml``.
     progress : callable, optional
-        Is told which part of large tables is read.
+        Called with the fraction of the large tables that is read.
     needs_path : bool
         Whether a folder without radar and receiver is refused even where it has a film.
 
@@ -170,12 +170,12 @@ def _share_of(folder: Path, spec: FlightFile, progress: Callable[[float], None])
     paths = [folder / source.file for source in spec.sources]
     total, done = sum(path.stat().st_size for path in paths if path.is_file()), 0
 
-    def tell(more: int) -> None:
+    def more_read(more: int) -> None:
         nonlocal done
         done += more
         progress(min(1.0, done / total))
 
-    return tell
+    return more_read
 
 
 def _there(records: dict[str, Record | None]) -> dict[str, Record]:
@@ -188,8 +188,8 @@ def _vehicle(gate: Gate, name: str) -> Vehicle | None:
     try:
         vehicle = vehicle_from_toml(vehicle_path(name, gate.folder))
     except GateError as fault:
-        for said in fault.faults:
-            gate.refuse_config(Fault(f"vehicle: {said}", said.code))
+        for each in fault.faults:
+            gate.refuse_config(Fault(f"vehicle: {each}", each.code))
         return None
     for body, mesh in vehicle.meshes.items():
         words = f"{mesh.words}; it is drawn, while the camera's fit is of [geometry]"
@@ -211,7 +211,7 @@ def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
 def _attitude_prior(
     gate: Gate, entry: AttitudeEntry, radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]
 ) -> AttitudePrior | None:
-    """Attitude to start from; None, with a fault kept, where it cannot be told."""
+    """Attitude to start from; None, with a fault kept, where no place is known for it."""
     sd = np.deg2rad(entry.sd_deg)
     if entry.q_ecef_body is not None:
         q = np.array(entry.q_ecef_body)

@@ -1,24 +1,22 @@
-"""The gate of a flight folder: keeps faults and findings while files are read, and opens where there is no fault.
+"""May this table be used, which of its rows, in which order, and what is notable in it?
 
-What an analyst should know of a sensor's samples: gaps, missing, frozen and saturated runs, each with its times.
+`Gate` keeps faults (with their codes) while the files of a flight folder are read, and opens where there is none. A
+table's rows pass these steps:
 
-Of very many of one kind the longest are told one by one and the others together: a list that nobody reads hides them.
+1. **Order.** Telemetry comes in packets: a row or a whole block may come twice, late, or in the wrong order. Rows that
+   repeat an earlier one (time and every value) are left out; rows out of order are put in order. Two kinds of rows
+   contradict others: those of one time with different values, and late ones for which there is no room, because rows
+   that came before stand there at their usual interval (a clock that was reset lays one stretch of the flight over
+   another so). A few of them are left out: of one time all, for nothing shows which is right. With `FEW` of the rows or
+   more the table is refused. It is refused with fewer, too, where a late block contradicts and the rows run on from it
+   into new times at their usual interval: what was sent late ends with a jump forward, a clock that was set back does
+   not, and then all that follows has wrong times.
+2. **Choice.** Rows inside the spans that flight.toml states, and of repeated times the first; times are those after
+   ``time.offset_s`` was added. Of an oversampled tracker's rows some are read but only predicted.
+3. **Range.** Values beyond what any entry vehicle's instrument reads are refused: a wrong unit, or a broken word.
+4. **Findings.** Gaps, missing, frozen and saturated runs, each with its times.
 
-In which order do the rows of a table belong, and which are not to be believed? Data as ranges deliver them.
-
-Telemetry comes in packets: a row or a whole block may come twice, late, or in the wrong order. Rows that repeat an
-earlier one (time and every value) are left out; rows out of order are put in order. Two kinds of rows contradict
-others: those of one time with different values, and late ones for which there is no room, because rows that came before
-stand there at their usual interval (a clock that was reset lays one stretch of the flight over another so). A few of
-them are left out: of one time all, for nobody can say which is right. With `FEW` of the rows or more the table is
-refused. It is refused with fewer, too, where a late block contradicts and the rows run on from it into new times at
-their usual interval: what was sent late ends with a jump forward, a clock that was set back does not, and then all
-that follows has wrong times. Nothing of it happens in silence: each repair has its words, its number of rows and
-blocks, and its times.
-
-Which rows of a table are used: those inside the spans that flight.toml states, and of repeated times the first.
-
-Times are those after ``time.offset_s`` was added. Of an oversampled tracker's rows some are read but only predicted.
+Every repair is a finding with its number of rows and blocks and its times; nothing is repaired in silence.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from flightmodel import tables
-from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import NO_FAULT, BoolArray, ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.csv_reading import file_sha256, read_numbers
 from flightmodel.tables import IntArray, Source
 from flightmodel.telemetry import Finding
@@ -85,7 +83,7 @@ class Gate:
     config: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     digests: dict[Path, str] = field(default_factory=dict)
-    tell: Callable[[int], None] = lambda _bytes: None  # of how many bytes more were read
+    progress: Callable[[int], None] = lambda _bytes: None  # called with the bytes read since the last call
 
     def sha256(self, path: Path) -> str:
         """SHA-256 of a file, from its reading where that made one."""
@@ -174,7 +172,7 @@ class Gate:
             return None
         wanted = {places[q.short][0]: q.required or q.short in source.columns for q in quantities}
         time = source.time_column if timed else None
-        found = read_numbers(path, wanted, time, self.t0, self.tell)
+        found = read_numbers(path, wanted, time, self.t0, self.progress)
         if found is None or len(wanted) < len(places):
             return None
         time_s = found.time
@@ -357,9 +355,6 @@ REMEDY = "keep one row of each time, or, where the clock was reset, give each st
 NAMED = 5  # times that a finding names one by one
 
 
-NO_FAULT = Fault("")
-
-
 @dataclass(frozen=True)
 class Delivery:
     """What becomes of a table's rows.
@@ -538,7 +533,7 @@ def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArr
     use = np.diff(time_s, prepend=-np.inf) > 0.0
     if not use.all():
         again = time_s[~use]
-        words = f"{len(again)} rows repeat the time of the row before and are left out, as time.repeats says"
+        words = f"{len(again)} rows repeat the time of the row before and are left out, as time.repeats asks"
         findings.append(Finding(name, words, float(again[0]), float(again[-1]), code="rows-repeated"))
     if source.use_s is not None:
         inside = np.any([(time_s >= start) & (time_s <= stop) for start, stop in source.use_s], axis=0)
@@ -568,5 +563,5 @@ def oversampled(name: str, time_s: FloatArray, every_s: float) -> list[Finding]:
     idle = int((~spaced(time_s, every_s)).sum())
     if not idle:
         return []
-    words = f"{idle} of {len(time_s)} rows lie closer than every_s = {every_s:g} s: they check the trajectory, no more"
+    words = f"{idle} of {len(time_s)} rows lie closer than every_s = {every_s:g} s: they are predicted and not used"
     return [Finding(name, words, np.nan, np.nan, code="rows-oversampled")]

@@ -1,4 +1,4 @@
-"""Which way the Earth's field and the Sun point: the two directions that an attitude can be told from.
+"""Which way do the Earth's field and the Sun point? Two directions from which an attitude can be found.
 
 Field: the International Geomagnetic Reference Field (IGRF-14, degree 13) by ppigrf, constant over a flight (its secular
 change is 100 nT a year, 0.01 nT an hour). What IGRF leaves out, crust and currents above, is of order 100 nT.

@@ -1,4 +1,4 @@
-"""What does the inflated aeroshell look like from its aft side?
+"""What does the inflated aeroshell look like from its aft side, and does a user's mesh of it fit the vehicle?
 
 A stack of ``n`` tori, tangent to one another along the generator of a cone of half-angle ``H`` that touches the nose
 sphere of radius ``Rn``. In the half-plane (station aft of the nose ``s``, radius ``r``) the centre of torus ``i`` is
@@ -7,19 +7,17 @@ sphere of radius ``Rn``. In the half-plane (station aft of the nose ``s``, radiu
     f(r) = Rn (1 - sin H) + (r - Rn cos H) / tan H    (the cone's forward face)
 
 with minor radius ``a`` and spacing ``p``. Body axes: datum at the nose, x forward, so ``x = -s``. *Shell* axes equal
-body axes when the joint is not bent; `bend` carries shell points to the body. Assumed: the skin follows the tori, the
-shell bends nowhere but at the joint, gore seams are meridians of the aft side evenly clocked from 0 deg LV.
+body axes at zero deflection; `bend` carries shell points to the body. Assumed: the skin follows the tori, the shell
+deflects at the joint alone, gore seams are meridians of the aft side evenly clocked from 0 deg LV.
 
-Meshes of a user's own for aeroshell and centerbody (STL, OBJ, GLB): read, laid into the vehicle, checked against it.
-
-A mesh says what a body looks like; `flightmodel.geometry` stays what the camera's fit projects. So that both are one
-vehicle, the mesh must have its size, and a shell's rim must be the circle that ``[geometry]`` has. A point ``p`` of the
-file lies in body axes at
+Meshes (STL, OBJ, GLB) replace the look of aeroshell and centerbody; the stack of tori stays what the camera's fit
+projects. So that both are one vehicle, the mesh must have its size, and a shell's rim must be the circle that
+``[geometry]`` has. A point ``p`` of the file lies in body axes at
 
     unit_m R (p - nose),     rows of R: forward, -zero_clock, forward x -zero_clock.
 
-A mesh must be closed: every edge bounds an even number of faces. Then rays tell inside from outside by the parity of
-what they cross, whichever way faces are wound.
+A mesh must be closed: every edge bounds an even number of faces. Then rays separate inside from outside by the parity
+of what they cross, whichever way faces are wound.
 """
 
 from __future__ import annotations

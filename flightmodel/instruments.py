@@ -8,7 +8,7 @@ write for a new error is its partial derivative in `recon._measurement_kernels`.
 
 Every error is a constant of the flight, normal about zero with the stated standard deviation, unless its row names a
 time constant: then it is first-order Gauss-Markov. Standard deviations stand in files as an analyst writes them, angles
-in degrees; records hold SI. Where each default comes from is said in ``docs/flight-folder.md``.
+in degrees; records hold SI. Where each default comes from stands in ``docs/flight-folder.md``.
 
 References
 ----------
@@ -481,7 +481,7 @@ def dcm_body_from_sun_head(clock_lv_rad: float) -> FloatArray:
 def sun_angles_from_direction(direction_head: FloatArray) -> FloatArray:
     """Azimuth about the head's x from z towards y, and elevation from there towards x, rad ``(..., 2)``.
 
-    ``direction_head`` (..., 3) are unit vectors in head axes. A point ``d`` away across the line of sight differs by
+    ``direction_head`` (..., 3) are unit vectors in head axes. A point ``d`` away normal to the line of sight differs by
     ``d / cos(elevation)`` in azimuth.
     """
     x, y, z = np.moveaxis(np.asarray(direction_head, dtype=float), -1, 0)
@@ -506,7 +506,7 @@ class Mounted(Source):
         faults: list[tuple[str, object, str]] = []
         if self.axes is not None:
             if self.mount is not None:
-                faults.append(("axes", list(self.axes), f"mount = '{self.mount}' says it too; keep one of the two"))
+                faults.append(("axes", list(self.axes), f"mount = '{self.mount}' states the same; keep one of the two"))
             dcm = self.dcm_body_sensor
             if not np.allclose(dcm @ dcm.T, np.eye(3)):
                 words = "two sensor axes point along the same body axis; each wants one of its own"
@@ -528,7 +528,7 @@ class Mounted(Source):
 
     @property
     def place_m(self) -> FloatArray:
-        """Place from the datum, body axes, (3,), m; the datum where nothing is said."""
+        """Place from the datum, body axes, (3,), m; the datum where none is stated."""
         return np.array(self.position_from_datum_body_m or (0.0, 0.0, 0.0))
 
 

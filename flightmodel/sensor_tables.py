@@ -1,13 +1,12 @@
-"""Tables of what tells where the vehicle is: radars, satellite navigation receivers, barometers.
+"""How does each instrument's table become a checked record in SI?
 
-Tables of what flew on board: triads with their mounting, Sun heads, video frames.
+One reader an instrument (`read_radar`, `read_gnss`, `read_barometer`, `read_triad`, `read_sun`, `read_frames`,
+`read_sounding`): columns through the gate, what flight.toml states of errors through the instrument's table of rows
+(`flightmodel.instruments`), faults and findings into the gate. A reader returns None where anything was refused.
 
-Triads sampled far faster than a vehicle moves: means of blocks of samples in their place.
-
-A block's mean keeps the integral that mechanisation forms from its samples, and the density of their noise; what is
-lost is motion within a block. Memory and time of everything after the reading go with the number of samples.
-
-The day's sounding through the gate: rows in order, winds turned to where the air goes, what is missing said.
+Triads sampled far faster than a vehicle moves are replaced by means of blocks of about 1 ms. A block's mean keeps the
+integral that the strapdown equations form from its samples, and the density of their noise; what is lost is motion
+within a block. Winds that are given by where they come from become the velocity of the air mass (north, east).
 """
 
 from __future__ import annotations
@@ -199,7 +198,7 @@ def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: Fl
     velocity = np.column_stack([table.columns[short] for short in form])
     whole = np.isfinite(velocity).all(axis=1)
     if form == NED_SPEEDS:
-        # a velocity without a position cannot be turned
+        # a velocity without a position has no local axes
         whole &= np.isfinite(position_ecef_m).all(axis=1)
         nothing[whole] = earth.ecef_from_ned(velocity[whole], position_ecef_m[whole])
     else:
@@ -212,7 +211,7 @@ def read_barometer(
 ) -> BarometerRecord | None:
     """Read one barometer as heights above the ellipsoid; None, with the faults kept, where it is refused.
 
-    Pressures become heights by the flight's air; ``measured_air`` says whether that is a sounding or the standard's.
+    Pressures become heights by the flight's air; ``measured_air``: whether that is a sounding, not the standard's.
     """
     label = f"barometers.{name}"
     table = gate.table(label, source, tables.BAROMETER)
@@ -228,7 +227,7 @@ def read_barometer(
         low, high = float(limits[0]), float(limits[1])
         gate.refuse_rows(table, "pressure", low, high, "no static pressure between -2 and 80 km")
     else:
-        gate.refuse_rows(table, "height", LEAST_HEIGHT_M, HIGHEST_BAROMETER_M, "no height that a barometer tells")
+        gate.refuse_rows(table, "height", LEAST_HEIGHT_M, HIGHEST_BAROMETER_M, "no height that a barometer can measure")
     if len(gate.faults) > before:
         return None
     if form == "pressure":
@@ -237,7 +236,7 @@ def read_barometer(
         words = f"pressures became heights by {air}"
         if source.use_s is None:
             words += (
-                "; near and above the speed of sound a port does not tell static pressure: use_s can leave that out"
+                "; near and above the speed of sound a port does not measure static pressure: use_s can leave that out"
             )
         gate.findings.append(Finding(name, words, np.nan, np.nan, code="heights-from-pressure"))
     else:
@@ -306,8 +305,8 @@ def read_triad(gate: Gate, name: str, spec: FlightFile, vehicle: Vehicle | None)
     stated = TRIADS[type(source)].from_file(source)
     if stated["bias_wander_sd"] == 0.0:
         stated["bias_time_constant_s"] = np.inf
-    record, told = averaged(TriadRecord(TriadSpec(name, *mounting, **stated), table.time_s, values))
-    gate.findings.extend(told)
+    record, findings = averaged(TriadRecord(TriadSpec(name, *mounting, **stated), table.time_s, values))
+    gate.findings.extend(findings)
     return record
 
 
@@ -319,11 +318,11 @@ def _mounting(
     if source.axes is not None or package == BODY:
         return source.place_m, source.dcm_body_sensor
     if spec.vehicle is None:
-        said = "nothing is said of its mount" if source.mount is None else f"mount = '{package}' is a vehicle's package"
+        why = "it states no mount" if source.mount is None else f"mount = '{package}' is a vehicle's package"
         words = (
             'write mount = "body" (along body axes) or axes = ["+x", "+y", "+z"] with the body axis of each of its axes'
         )
-        gate.refuse_config(f"sensors.{name}: {said}, and flight.toml names no vehicle; {words}", "mount-missing")
+        gate.refuse_config(f"sensors.{name}: {why}, and flight.toml names no vehicle; {words}", "mount-missing")
         return None
     if vehicle is None:  # refused already
         return None
@@ -456,11 +455,9 @@ def _film_numbers(
     if again:
         words = f"{path.name}: {again} of {len(numbers)} lines name the same frame as the line before; check the list"
         gate.findings.append(Finding("frames", words, np.nan, np.nan, code="frame-repeated"))
-    doubt = film_timing_fault(film)
-    if doubt:
-        gate.findings.append(
-            Finding("frames", f"{film.name}: {doubt}", np.nan, np.nan, code=getattr(doubt, "code", "film-rate"))
-        )
+    timing = film_timing_fault(film)
+    if timing:
+        gate.findings.append(Finding("frames", f"{film.name}: {timing}", np.nan, np.nan, timing.code))
     return numbers
 
 
@@ -535,8 +532,8 @@ def _winds(gate: Gate, table: Table) -> tuple[FloatArray, FloatArray] | None:
     if {"wind_north", "wind_east"} <= set(c):
         return c["wind_north"], c["wind_east"]
     if {"wind_speed", "wind_from"} <= set(c):
-        words = "wind is given by where it comes from: turned to where the air goes"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="wind-direction-turned"))
+        words = "wind is given by where it comes from: converted to the velocity of the air mass"
+        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="wind-direction-converted"))
         return -c["wind_speed"] * np.cos(c["wind_from"]), -c["wind_speed"] * np.sin(c["wind_from"])
     needs = "wind_n_mps and wind_e_mps, or wind speed and direction from"
     gate.refuse(f"{SOURCE}: {table.path}: line 1: needs {needs}", "table-column-missing")
@@ -560,7 +557,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> 
         gate.refuse(f"{table.at(k)}: altitude {c['alt'][k]:.1f} m stands twice; keep one row", "altitude-twice")
         return None
     if alt[-1] < LOWEST_TOP_M:
-        words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, no wind is known"
+        words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, winds fade to zero"
         gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="sounding-short"))
     pressure = rho * R_AIR_JPKGK * temperature
     if "pressure" in c:

@@ -1,15 +1,12 @@
-"""How ``flight.toml`` names a table: its file, its time column, columns of other names, and which rows are used.
+"""How do columns and times of a CSV become SI arrays and seconds after t0?
 
-How columns of a table become SI arrays: canonical names with unit suffixes, declared names and units, time formats.
+A canonical column has its unit in its name (``range_m``, ``az_deg``). Anything else is accepted only where flight.toml
+declares column and unit (`Source`); nothing is guessed. This is the only place where degrees, g, yards and the like
+become SI and radians.
 
-A canonical column says its unit in its name (``range_m``, ``az_deg``). Anything else is accepted only where the
-flight file declares column and unit; nothing is guessed. This is the only place where degrees, g, yards and the
-like turn into SI and radians.
-
-What second of the flight does a clock's text mean? ISO 8601 in UTC, or IRIG day of year, to seconds after t0.
-
-Day-of-year times ``DDD:HH:MM:SS.fff`` lie in t0's year, or in the next one where that is nearer (a flight across New
-Year). Cells of the usual width are read many at a time; others, one by one, to the same number.
+Times are numbers in a unit, ISO 8601 in UTC, or IRIG day of year ``DDD:HH:MM:SS.fff``; the latter lie in t0's year, or
+in the next one where that is nearer (a flight across New Year). Cells of the usual width are read many at a time;
+others, one by one, to the same number.
 """
 
 from __future__ import annotations
@@ -63,7 +60,7 @@ class ColumnEntry(Section):
 class TimeEntry(Section):
     """The time column of a table, or three columns with hour, minute and second of the day (UTC).
 
-    ``offset_s`` is added to every time. ``repeats`` says what becomes of rows that repeat the time of the row before.
+    ``offset_s`` is added to every time. ``repeats`` decides on rows that repeat the time of the row before.
     """
 
     column: str = "t_s"

@@ -176,7 +176,7 @@ class AttitudePrior:
 
 @dataclass(frozen=True)
 class UnmodelledSpan:
-    """Span in which more acts, or is shaken out of the sensors, than is modelled or than their noise tells.
+    """Span with acceleration or rotation that neither the model nor the sensors' stated noise covers.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ class Motion:
     drag_sd, drag_time_constant_s : float
         Standard deviation of its natural logarithm, and how long it stays what it is (Gauss-Markov).
     side_sd : float
-        Of forces across the flow, as a fraction of the drag; they change as the drag does.
+        Of forces normal to the flow, as a fraction of the drag; they change as the drag does.
     acceleration_density : float
         Root power spectral density, (m/s^2)/sqrt(Hz) per axis, of what ballistic flight leaves out everywhere.
     powered_s : tuple of (float, float)

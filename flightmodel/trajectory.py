@@ -1,4 +1,4 @@
-"""Where a vehicle was and how it was turned: one type for truth and estimate, so that they can be subtracted.
+"""Where was a vehicle and how was it oriented? One type for truth and estimate, so that they can be subtracted.
 
 The followed point is the structural datum (the nose), fixed hardware: the c.g. is one of the things estimated.
 *Body* is the centerbody, where the sensors are.
