@@ -23,10 +23,12 @@ FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>
 def reference():
     """The page of the public interface, made from its docstrings: conventions, then every name."""
     import postflight
+    from postflight import plots
 
     names = [f"## {name}\n\n::: {postflight._DOOR[name]}.{name}\n" for name in postflight.__all__ if name != "plots"]
-    plots = "## plots\n\n::: postflight.plots\n"
-    return f"# The public interface\n\n```text\n{postflight.__doc__.strip()}\n```\n\n" + "\n".join([*names, plots])
+    figures = [f"### {name}\n\n::: postflight.plots.{plots._MODULE[name]}.{name}\n" for name in plots.__all__]
+    text = "\n".join([*names, f"## plots\n\n{plots.__doc__}", *figures])
+    return f"# The public interface\n\n```text\n{postflight.__doc__.strip()}\n```\n\n{text}"
 
 
 def on_files(files, config):

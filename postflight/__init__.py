@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from postflight.deflections import Deflections, estimate_camera, estimate_misalignment, estimate_trim, fuse
     from postflight.flight import Flight, read_flight
     from postflight.interface import check_flight, compare, monte_carlo, score, simulate, write_report
-    from postflight.reconciliation.fit import reconcile
+    from postflight.reconciliation.command import reconcile
     from postflight.reconstruction import Reconstruction, air_data, reconstruct
     from recon.settings import Settings
     from synthetic_flight.scenarios import read_scenario
@@ -64,7 +64,7 @@ _DOOR = {
     "simulate": "postflight.interface",
     "score": "postflight.interface",
     "monte_carlo": "postflight.interface",
-    "reconcile": "postflight.reconciliation.fit",
+    "reconcile": "postflight.reconciliation.command",
     "compare": "postflight.interface",
     "write_report": "postflight.interface",
 }

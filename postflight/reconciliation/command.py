@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.checks import GateError, Progress
+from flightmodel.deflection import DeflectionHistory
 from flightmodel.flightfolder import read_flight
+from flightmodel.tabular import Tabular
 from postflight import run_folder
 from postflight.commands import compile_kernels, console
 from postflight.deflections import estimate
@@ -20,6 +22,7 @@ from postflight.plots.reconciliation import figure_modes, figure_posterior, figu
 from postflight.plots.style import save
 from postflight.progress import progress_bar
 from postflight.reconciliation.fit import JointFit, select_laws
+from postflight.reconciliation.fit import reconcile as fit_joint
 from postflight.reconciliation.modes import ModalStiffness, stiffness_from_modes
 from postflight.reconciliation.posterior import (
     Posterior,
@@ -44,6 +47,67 @@ ENTRIES = 300
 STRONG = 3.0  # logarithm of odds of twenty to one
 MISFIT = 1.5  # rms of the sensors' residuals over their sd; about 0.6 where the joint explains the flight
 LAW_NAMES = {"freeplay": "freeplay", "hardening": "a spring whose slope changes with the angle"}
+
+
+@dataclass(frozen=True, repr=False)
+class Reconciliation(Tabular):
+    """The joint that explains a flight; see `reconcile`.
+
+    Parameters
+    ----------
+    bet : Reconstruction
+    fit : JointFit
+        The fit with all its parameters, covariance and residuals.
+    """
+
+    bet: Reconstruction
+    fit: JointFit
+
+    @property
+    def deflection(self) -> DeflectionHistory:
+        """Deflection of the simulated flight with the fitted joint."""
+        return deflection_of(self.fit)
+
+    def modal_stiffness(self) -> ModalStiffness:
+        """Bending stiffness from the joint's frequency alone; `GateError` where nothing oscillates."""
+        return stiffness_from_modes(self.bet)
+
+    def bounds(self, flights: int = 60, progress: Progress | None = None) -> tuple[Bounds, Bounds]:
+        """Bands of dispersed entries with the joint locked, and with the fitted joint."""
+        report = progress or (lambda _fraction, _what: None)
+        rigid = rigid_bounds(self.bet, flights, progress=lambda f, what: report(0.3 * f, what))
+        return rigid, reconciled_bounds(self.fit, self.bet, lambda f, what: report(0.3 + 0.7 * f, what))
+
+    def shares_inside(self, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
+        """Share of the pressure pulse inside each band: ``joint, quantity, share_inside, ...``."""
+        return compared_with_bounds(self.bet, rigid, flexible)[0]
+
+    def to_frame(self) -> pd.DataFrame:
+        """The rows of ``joint.csv``: stiffness, damping, offset, stability, with a priori and posterior sd."""
+        return joint_table(self.fit)
+
+    def _about(self) -> str:
+        row = self.to_frame().set_index("quantity").loc["bending stiffness"]
+        how = "converged" if self.fit.converged else "NOT converged"
+        return f"bending stiffness {row['found']:.0f} +/- {row['sd']:.0f} N m/rad, {how}"
+
+
+def reconcile(bet: Reconstruction, progress: Progress | None = None) -> Reconciliation:
+    """Find the stiffness, damping and c.g. offset with which the simulator flies like the flight.
+
+    Parameters
+    ----------
+    bet : Reconstruction
+    progress : callable, optional
+
+    Raises
+    ------
+    GateError
+        Where sensors or vehicle are missing, or there is no pressure pulse.
+    DivergenceError
+        Where no candidate flies through.
+    """
+    return Reconciliation(bet, fit_joint(bet, progress=progress))
 
 
 def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:

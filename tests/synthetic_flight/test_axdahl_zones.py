@@ -5,22 +5,13 @@ at terminal speed in air of one density. Zones: divergent below a stiffness that
 moderate stiffness and damping; oscillating ever wider at high stiffness where C_mq > 0.
 """
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from synthetic_flight.linear import DIVERGENT, STABLE, UNSTABLE
+from tests.oracles import axdahl_zones
 
 from .test_linear import PRESSURE_PA, SPEED_MPS, r1_slopes
-
-EXAMPLE = Path(__file__).parents[2] / "examples" / "axdahl_zones.py"
-_spec = importlib.util.spec_from_file_location("axdahl_zones", EXAMPLE)
-example = importlib.util.module_from_spec(_spec)
-sys.modules["axdahl_zones"] = example  # dataclasses look their module up
-_spec.loader.exec_module(example)
 
 STIFFNESS = np.geomspace(2.2e3, 4.0e4, 14)
 DAMPING = np.geomspace(2e-3, 0.3, 9)
@@ -28,7 +19,7 @@ DAMPING = np.geomspace(2e-3, 0.3, 9)
 
 def test_zones_lie_as_axdahl_has_them(vehicle):
     # the static limit hardly moves with damping; stable at moderate stiffness; unstable again when stiff
-    found = example.linear_map(vehicle, r1_slopes(0.2), PRESSURE_PA, SPEED_MPS, STIFFNESS, DAMPING)
+    found = axdahl_zones.linear_map(vehicle, r1_slopes(0.2), PRESSURE_PA, SPEED_MPS, STIFFNESS, DAMPING)
     soft = found.zone == DIVERGENT
     below = found.critical_stiffness_nmprad > STIFFNESS
     assert (soft == below[:, None]).all()
@@ -36,14 +27,16 @@ def test_zones_lie_as_axdahl_has_them(vehicle):
     assert (found.zone[moderate][:, DAMPING > 0.1] == STABLE).all()
     assert (found.zone[STIFFNESS > 2.0e4][:, DAMPING < 0.15] == UNSTABLE).all()
     # without propelling pitch damping nothing but divergence is left once the joint is damped by 5 %
-    damped = example.linear_map(vehicle, r1_slopes(-0.2), PRESSURE_PA, SPEED_MPS, STIFFNESS, DAMPING[DAMPING > 0.05])
+    damped = axdahl_zones.linear_map(
+        vehicle, r1_slopes(-0.2), PRESSURE_PA, SPEED_MPS, STIFFNESS, DAMPING[DAMPING > 0.05]
+    )
     assert (damped.zone[~below] == STABLE).all()
 
 
 @pytest.mark.slow
 def test_flown_zones_agree_with_the_linear_model(vehicle, measured):
     setting = (vehicle, r1_slopes(0.2), PRESSURE_PA, SPEED_MPS, STIFFNESS, DAMPING)
-    linear, flown = example.linear_map(*setting), example.flown_map(*setting)
+    linear, flown = axdahl_zones.linear_map(*setting), axdahl_zones.flown_map(*setting)
     # a fall of 120 s is 340 s at this pressure: growth below 0.01 1/s is hidden by the other modes' beat
     clear = np.abs(linear.growth_rate_radps) > 0.01
     measured("share of the grid within 0.01 1/s of a boundary", 1.0 - clear.mean(), 0.10)
@@ -55,5 +48,5 @@ def test_flown_zones_agree_with_the_linear_model(vehicle, measured):
     difference = np.abs(flown.growth_rate_radps - linear.growth_rate_radps)[grows]
     allowed = 0.01 + 0.02 * linear.growth_rate_radps[grows]
     measured("growth rate, of 0.01 1/s + 2 %", np.max(difference / allowed), 1.0)
-    figure = example.figure_axdahl_zones(linear, flown)
+    figure = axdahl_zones.figure_axdahl_zones(linear, flown)
     assert len(figure.axes) == 1

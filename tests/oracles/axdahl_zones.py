@@ -1,6 +1,6 @@
 """For which stiffness and damping of its joint does a vehicle diverge, oscillate with growing amplitude, or settle?
 
-Run: ``python examples/axdahl_zones.py [PICTURE]`` (half a minute); without a name it draws
+Run: ``python -m tests.oracles.axdahl_zones [PICTURE]`` (half a minute); without a name it draws
 ``docs/images/axdahl_zones.png``.
 
 Axdahl's stability map twice: from eigenvalues (`synthetic_flight.linear`) and from flights of the nonlinear simulator.
@@ -29,6 +29,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+import postflight as pf
 from flightmodel import earth, rotations
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.atmosphere import AtmosphereProfile, us76
@@ -53,8 +54,13 @@ PRESSURE_PA, SPEED_MPS = 1150.0, 1040.0
 FALL_S, FALL_STEP_S, RECORD_S = 120.0, 0.01, 0.1
 LARGE_RAD = 0.2
 START_M = 60.0e3
-FILL = {STABLE: "#d6ead9", UNSTABLE: "#f9e3bd", DIVERGENT: "#f1c3bd"}
-MARK = {STABLE: ("o", "#2f7d3b"), UNSTABLE: ("^", "#b36b00"), DIVERGENT: ("x", "#a3201a")}
+ZONE_NAMES = {STABLE: "stable", UNSTABLE: "unstable", DIVERGENT: "divergent"}
+# area and mark of each zone: colours of the project's figures
+FILL = {zone: pf.plots.ZONE[name][0] for zone, name in ZONE_NAMES.items()}
+MARK = {
+    zone: (mark, pf.plots.ZONE[ZONE_NAMES[zone]][1])
+    for zone, mark in ((STABLE, "o"), (UNSTABLE, "^"), (DIVERGENT, "x"))
+}
 
 
 @dataclass(frozen=True)
@@ -214,6 +220,7 @@ def _growth(states: FloatArray) -> tuple[float, int]:
     return growth, UNSTABLE if bending.min() < 0.0 < bending.max() else DIVERGENT
 
 
+@pf.plots.in_style
 def figure_axdahl_zones(linear: StabilityMap, flown: StabilityMap) -> Figure:
     """Zones of the linear model as areas with lines of growth rate, flights of the simulator as marks.
 
@@ -222,14 +229,14 @@ def figure_axdahl_zones(linear: StabilityMap, flown: StabilityMap) -> Figure:
     linear, flown : StabilityMap
         Of one vehicle at one pressure and speed; grids may differ, damping ratios above zero.
     """
-    figure = Figure(figsize=(8.6, 5.6), layout="constrained")
+    figure = Figure(figsize=(8.6, 5.6))
     axis = figure.subplots()
     x, y = 1e-3 * linear.stiffness_nmprad, 100.0 * linear.damping_ratio
     axis.contourf(x, y, linear.zone.T, levels=[-0.5, 0.5, 1.5, 2.5], colors=[FILL[k] for k in sorted(FILL)])
     divergent = linear.zone == DIVERGENT
     for inside, levels in ((divergent, [2.0, 4.0]), (~divergent, [-0.05, 0.0, 0.05, 0.1])):
         growth = np.where(inside, linear.growth_rate_radps, np.nan).T
-        lines = axis.contour(x, y, growth, levels=levels, colors="0.35", linewidths=0.8)
+        lines = axis.contour(x, y, growth, levels=levels, colors=pf.plots.COLOUR["limit"], linewidths=0.8)
         axis.clabel(lines, fontsize=8, fmt="%g 1/s")
     k, c = np.meshgrid(1e-3 * flown.stiffness_nmprad, 100.0 * flown.damping_ratio, indexing="ij")
     handles: list[Patch | Line2D] = []
@@ -240,14 +247,15 @@ def figure_axdahl_zones(linear: StabilityMap, flown: StabilityMap) -> Figure:
         handles.append(
             Line2D([], [], marker=mark, color=colour, fillstyle="none", linestyle="none", label=f"{ZONES[zone]}: flown")
         )
-    axis.axvline(1e-3 * linear.critical_stiffness_nmprad, color="0.2", linestyle="--", linewidth=1.0)
-    handles.append(Line2D([], [], color="0.2", linestyle="--", label="static limit q S C_A xbar (1 + xbar/L)"))
-    axis.set(xscale="log", yscale="log", xlabel="bending stiffness, kN m/rad", ylabel="joint damping, % of critical")
+    axis.axvline(1e-3 * linear.critical_stiffness_nmprad, color=pf.plots.COLOUR["limit"], linestyle="--", linewidth=1.0)
+    label = "static limit q S C_A xbar (1 + xbar/L)"
+    handles.append(Line2D([], [], color=pf.plots.COLOUR["limit"], linestyle="--", label=label))
+    axis.set(xscale="log", yscale="log", xlabel="bending stiffness (kN m/rad)", ylabel="joint damping (% of critical)")
     axis.set_title(
         f"q {linear.pressure_pa:.0f} Pa, V {linear.speed_mps:.0f} m/s, C_mq {linear.slopes.cmq:+.1f} constant",
         fontsize=10,
     )
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
     ticks = [t for t in (2, 3, 4, 6, 10, 20, 40, 100) if x[0] <= t <= x[-1]]
     axis.set_xticks(ticks, [str(t) for t in ticks])
     axis.minorticks_off()
@@ -263,4 +271,4 @@ def main(picture: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "docs" / "images" / "axdahl_zones.png")
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "docs" / "images" / "axdahl_zones.png")
