@@ -95,6 +95,17 @@ def writing(where: Path, remedy: str) -> Iterator[None]:
         raise GateError(f"{where}: {words}") from None
 
 
+def write_file(path: Path, content: bytes | str) -> None:
+    """Write bytes, or text as UTF-8, whole or not at all: beside its place, then renamed; folders are made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".partial-{path.name}")
+    try:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
 def nearest_name(name: str, known: Iterable[str]) -> str:
     """Return ``" (did you mean 'x'?)"`` for a misspelt name, or an empty string."""
     folded = {candidate.lower(): candidate for candidate in known}

@@ -34,9 +34,9 @@ import pandas as pd
 from rich import markup
 from rich.console import Console
 
-from flightmodel.checks import ConfigError, FloatArray, GateError, writing
+from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
 from flightmodel.config import parse_utc
-from postflight.run_folder import DIGITS, newest_run, write_file
+from postflight.run_folder import DIGITS, newest_run
 
 _UNITS = {
     "m": "m", "mps": "m s-1", "mps2": "m s-2", "deg": "degree", "degps": "degree s-1", "pa": "Pa", "kgpm3": "kg m-3",

@@ -1,13 +1,15 @@
-"""Compiling the kernels before their first use: in processes side by side, with a word about the wait.
+"""How are kernels compiled before their first use? Side by side in processes, with a message about the wait.
 
 Kernels are compiled for the very processor they run on and kept in a cache whose name carries a hash of their sources
-(`flightmodel._kernels`). Without this a first command would compile them one after another, in silence.
+(`flightmodel._kernels`). Without this a first command would compile them one after another, in silence. Each group
+calls its kernels once on a tiny problem; a file in the cache marks it as compiled.
 
 Run as ``python -m postflight.warmup GROUP`` it compiles one group in its own process.
 """
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -119,7 +121,7 @@ def _camera() -> None:
     (frame,) = render_video(vehicle.geometry, mount, joint_m, np.zeros(1), np.zeros(1), sun, np.random.default_rng(0))
     fit = orient_camera(frame, vehicle.geometry, mount, joint_m).fit(frame)
     if fit.refused:  # then a part of the kernels was not called
-        raise GateError(fit.refused)
+        raise GateError(fit.refused, code="kernels-not-called")
 
 
 GROUPS: dict[str, Callable[[], None]] = {
@@ -130,30 +132,37 @@ GROUPS: dict[str, Callable[[], None]] = {
     "tables": _tables,
     "camera": _camera,
 }
-
-
 RECONSTRUCTION = ("filter", "smoothers")
 
 
 def _stamp(group: str) -> Path | None:
-    return CACHE / f"{group}.compiled" if CACHE is not None else None
+    """Mark of a compiled group. numba keeps compiled code by the sources' location, and so does the mark."""
+    if CACHE is None:
+        return None
+    location = hashlib.sha256(str(Path(earth.__file__).parent).encode()).hexdigest()[:8]
+    return CACHE / f"{group}-{location}.compiled"
 
 
 def missing(groups: Iterable[str]) -> list[str]:
-    """Groups of kernels that were not compiled on this machine from these sources yet."""
+    """Return groups of kernels that were not compiled on this machine from these sources yet."""
     stamps = ((group, _stamp(group)) for group in groups)
     return [group for group, stamp in stamps if stamp is not None and not stamp.exists()]
 
 
-def prepare(groups: Iterable[str], say: Callable[[str], None]) -> None:
+def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
     """Compile what is missing, every group in a process of its own.
 
-    What fails there is said, and compiles at its first use.
+    Parameters
+    ----------
+    groups : iterable of str
+        Keys of `GROUPS`.
+    report : callable
+        Takes a message: what is compiled, and each group that failed here and will be compiled at its first use.
     """
     wanted = missing(groups)
     if not wanted:
         return
-    say(f"compiling kernels for this machine, once (up to a minute): {', '.join(wanted)}")
+    report(f"compiling kernels for this machine, once (up to a minute): {', '.join(wanted)}")
     quiet, command = subprocess.DEVNULL, [sys.executable, "-m", "postflight.warmup"]
     running = {
         group: subprocess.Popen([*command, group], stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True)
@@ -164,7 +173,7 @@ def prepare(groups: Iterable[str], say: Callable[[str], None]) -> None:
             why = process.communicate()[1]
             if process.returncode:
                 reason = why.strip().splitlines()[-1] if why.strip() else f"exit code {process.returncode}"
-                say(f"kernels of {group} were not compiled beforehand, but will be at their first use: {reason}")
+                report(f"kernels of {group} were not compiled beforehand, but will be at their first use: {reason}")
     except BaseException:
         for process in running.values():
             process.terminate()

@@ -1,1 +1,1 @@
-"""What is odd about the sensors of a flight folder: cross-checks of units, axes, clocks and tracks."""
+"""Cross-checks of a flight folder before a run: units, axes, time tags and tracks of its sensors."""

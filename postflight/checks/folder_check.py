@@ -1,38 +1,44 @@
-"""What should an analyst know of a flight folder before running it? Facts, findings, oddities and what is refused.
+"""What should an analyst know of a flight folder before running it? Facts, findings, cross-checks and what is refused.
 
-Facts: rows, span, rate of every table. Findings: what the readers saw (gaps, frozen, saturated, told twice, out of
-order). Oddities: what sensors say against each other and against physics, each only where it can be proved from the
-data: units, axes, clocks. What cannot be told is not mentioned.
-
-What ``postflight check`` prints, for a reader or as JSON, and the code it leaves with.
+Facts: rows, span, rate of every table. Findings: what the readers saw (gaps, frozen, saturated, repeated, unordered
+rows). Cross-checks: sensors against each other and against physics, in units, axes, time tags; a remark is made only
+where the data prove it. A sensor with a remark is not compared further, so that one fault makes one remark. Each
+finding, remark and refusal has a stable code.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from flightmodel import earth
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.config import FILL_IN, read_toml
 from flightmodel.flightfolder import Sources, read_sources
-from flightmodel.telemetry import Finding
+from flightmodel.tabular import Tabular
+from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.checks import inertial, pressure_and_field, tracks
+from postflight.checks import carried_force, inertial, pressure_and_field, tracks
 from postflight.checks.track_force import best_comparison, track_force
-from postflight.intake.flight_form import left_to_fill_in
+from postflight.checks.units_and_axes import TimeBias
+from postflight.intake.flight_form import placeholders
 
-CLOCK_SD, CLOCK_S = 5.0, 0.1  # a clock is doubted beyond so many standard deviations and seconds
-TOLD_S = 0.5  # a clock is told to better than this, or not at all
-FITS = 5.0  # reduced chi-square beyond which one lag and one scale do not describe it
+_SHARP_S = 0.5  # a time bias of a larger standard deviation is not reported
+_FITS = 5.0  # reduced chi-square beyond which one lag and one scale do not describe the comparison
+_FORCE_WIDTH_S = 8.0
+WIDE = 160  # of a log file: a table need not be squeezed there
+_LONGEST_NAME = 28  # that leaves room for the rest of a table on 80 columns
+console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else WIDE)
 
 
 @dataclass(frozen=True)
@@ -48,39 +54,73 @@ class Fact:
     missing: int
 
 
-@dataclass(frozen=True)
-class Clock:
-    """How late ``source``'s times are against ``against``'s, with one standard deviation."""
-
-    source: str
-    against: str
-    late_s: float
-    sd_s: float
-
-
-@dataclass
-class Report:
+@dataclass(repr=False)
+class Report(Tabular):
     """Everything that a check found; ``exit_code`` as the command leaves with."""
 
     facts: list[Fact] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
-    oddities: list[Finding] = field(default_factory=list)
-    clocks: list[Clock] = field(default_factory=list)
+    cross_checks: list[Finding] = field(default_factory=list)
+    time_biases: list[TimeBias] = field(default_factory=list)
     fill_in: list[str] = field(default_factory=list)
-    refused: list[str] = field(default_factory=list)
+    refused: list[Fault] = field(default_factory=list)
     exit_code: int = 0
 
+    def to_frame(self) -> pd.DataFrame:
+        """Return findings, suspicious cross-checks, placeholders and refusals: one row each, with its code."""
+        seen = [("found", f) for f in self.findings] + [("suspicious", f) for f in self.cross_checks]
+        rows = [(kind, f.code, f.source, f.what, f.start_s, f.end_s) for kind, f in seen]
+        rows += [("to fill in", "placeholder", "", words, np.nan, np.nan) for words in self.fill_in]
+        rows += [("refused", fault.code, "", str(fault), np.nan, np.nan) for fault in self.refused]
+        return pd.DataFrame(rows, columns=["kind", "code", "source", "message", "start_s", "end_s"])
+
+    def _about(self) -> str:
+        """How many of each kind."""
+        counts = (
+            (len(self.findings), "findings", "finding"),
+            (len(self.cross_checks), "suspicious cross-checks", "suspicious cross-check"),
+            (len(self.fill_in), "values still to fill in", "value still to fill in"),
+            (len(self.refused), "refused", "refused"),
+        )
+        stated = ", ".join(f"{count} {what if count > 1 else one}" for count, what, one in counts if count)
+        return stated or "no findings; all can be read"
+
     def as_json(self) -> dict[str, Any]:
-        """Everything as JSON; times that are none become null."""
-        out: dict[str, Any] = asdict(self)
-        for rows in (out["facts"], out["findings"], out["oddities"]):
-            for row in rows:
-                row |= {k: None for k, v in row.items() if isinstance(v, float) and not np.isfinite(v)}
-        return out
+        """Return everything as JSON; times that are none become null."""
+        return {
+            "facts": _rows(self.facts),
+            "findings": _rows(self.findings),
+            "cross_checks": _rows(self.cross_checks),
+            "oddities": _rows(self.cross_checks),  # the former name, until the next release
+            "clocks": _rows(self.time_biases),
+            "fill_in": self.fill_in,
+            "refused": self.refused,
+            "refused_codes": [fault.code for fault in self.refused],
+            "exit_code": self.exit_code,
+        }
+
+
+def _rows(items: Iterable[Any]) -> list[dict[str, Any]]:
+    """Dataclasses as JSON objects."""
+    return [
+        {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in asdict(item).items()}
+        for item in items
+    ]
 
 
 def check_folder(folder: Path) -> Report:
-    """Read a flight folder as far as it can be read and say what is odd; nothing is written."""
+    """Read a flight folder as far as it can be read and cross-check it; nothing is written.
+
+    Parameters
+    ----------
+    folder : Path
+        With a flight.toml.
+
+    Returns
+    -------
+    Report
+        Refusals are in it and never raised.
+    """
     report = Report()
     try:
         found = read_sources(folder)
@@ -93,11 +133,11 @@ def check_folder(folder: Path) -> Report:
     report.facts = _facts(found)
     report.findings = sorted(gate.findings, key=lambda f: (f.source, np.nan_to_num(f.start_s, nan=-np.inf)))
     with np.errstate(invalid="ignore"):
-        _compare(found, report)
+        _cross_check(found, report)
     return report
 
 
-def _vehicle_faults(folder: Path) -> list[str]:
+def _vehicle_faults(folder: Path) -> list[Fault]:
     """Faults of the vehicle file, which is not reached where flight.toml has some."""
     try:
         named = read_toml(folder / "flight.toml").get("vehicle")
@@ -108,13 +148,13 @@ def _vehicle_faults(folder: Path) -> list[str]:
     try:
         vehicle_from_toml(vehicle_path(named, folder))
     except GateError as fault:
-        return [f"vehicle: {words}" for words in fault.faults]
+        return [Fault(f"vehicle: {words}", words.code) for words in fault.faults]
     return []
 
 
-def _refuse(report: Report, folder: Path, faults: list[str], code: int) -> None:
-    report.fill_in = left_to_fill_in(folder)
-    report.refused = [words for words in faults if FILL_IN not in words]
+def _refuse(report: Report, folder: Path, faults: Sequence[str], code: int) -> None:
+    report.fill_in = placeholders(folder)
+    report.refused = [Fault(words) for words in faults if FILL_IN not in words]
     report.exit_code = code
 
 
@@ -142,82 +182,85 @@ def _facts(found: Sources) -> list[Fact]:
     return out
 
 
-def _compare(found: Sources, report: Report) -> None:
+def _cross_check(found: Sources, report: Report) -> None:
     """Sensors against each other and against physics."""
-    report.oddities += tracks.apart_in_time(found) + inertial.at_rest(found) + inertial.lever(found)
-    trackers = tracks.tracks(found)
+    remarks = report.cross_checks
+    remarks += tracks.outside_time(found) + inertial.at_rest(found) + inertial.lever(found)
     for name, radar in found.radars.items():
-        report.oddities += tracks.free_fall(found, name, radar)
+        remarks += tracks.free_fall(found, name, radar)
     for name, fixes in found.gnss.items():
-        report.oddities += tracks.receiver_velocity(found, name, fixes)
-    doubted = {f.source for f in report.oddities}
-    for name in trackers:
-        if name not in doubted:
-            _against_accelerometer(found, name, report)
-    names = [name for name in trackers if name not in doubted]
+        remarks += tracks.receiver_velocity(found, name, fixes)
+    suspicious = {f.source for f in remarks}
+    trackers = {name: record for name, record in tracks.tracks(found).items() if name not in suspicious}
+    for name, record in trackers.items():
+        _against_accelerometer(found, name, record, report)
+    names = list(trackers)
     for k, first in enumerate(names):
         for second in names[k + 1 :]:
-            odd, clock = tracks.apart(found, first, second)
-            report.oddities += odd
-            if clock is not None and clock[1] < TOLD_S:
-                report.clocks.append(Clock(second, first, *clock))
-    if names:
-        _against_place(found, names, report)
-    odd, clock = pressure_and_field.turning_field(found)
-    report.oddities += odd
-    if clock is not None and clock[1] < TOLD_S:
-        _say_clock(report, Clock("magnetometer", "rates", *clock), found.triads["magnetometer"].time_s)
+            apart, bias = tracks.tracker_pair(found, first, second)
+            remarks += apart
+            _keep_sharp(report, bias)
+    if trackers:
+        _against_place(found, trackers, report)
+    rotation, lag = pressure_and_field.field_rotation(found)
+    remarks += rotation
+    if lag is not None:
+        bias = _keep_sharp(report, TimeBias("magnetometer", "rates", *lag))
+        remarks += bias.remarks(*_span(found.triads["magnetometer"].time_s)) if bias else []
 
 
-def _against_accelerometer(found: Sources, name: str, report: Report) -> None:
-    sensed = found.triads.get("accelerometer")
-    record = tracks.tracks(found)[name]
+def _against_accelerometer(found: Sources, name: str, record: RadarRecord | GnssRecord, report: Report) -> None:
+    """Scale, time tags, axes and attitude of the inertial sensors against one track's specific force."""
+    sensed, remarks = found.triads.get("accelerometer"), report.cross_checks
     if sensed is None:
         return
     position = tracks.position_of(record)
     seen = best_comparison(record.time_s, position, sensed.time_s, sensed.measured_sensor)
-    if seen is not None and seen.misfit < FITS:
-        already = any(f.source == "accelerometer" for f in report.oddities)
-        report.oddities += [] if already else inertial.against_track(found, name, seen)
-        if seen.lag_sd_s < TOLD_S:
-            _say_clock(report, Clock(name, "accelerometer", seen.lag_s, seen.lag_sd_s), record.time_s)
-    force = track_force(record.time_s, position, 8.0)
-    if force is not None and not any(f.source == "accelerometer" and "drag" in f.what for f in report.oddities):
-        report.oddities += inertial.entry_axis(found, force)
-    if force is not None and not report.oddities:
-        report.oddities += inertial.turned_force(found, force)
-    if force is not None and not report.oddities:
-        report.oddities += tracks.attitude_and_force(found, force)
+    if seen is not None and seen.misfit < _FITS:
+        if not any(f.source == "accelerometer" for f in remarks):
+            remarks += inertial.against_track(found, name, seen)
+        bias = _keep_sharp(report, TimeBias(name, "accelerometer", seen.lag_s, seen.lag_sd_s))
+        remarks += bias.remarks(*_span(record.time_s)) if bias else []
+    force = track_force(record.time_s, position, _FORCE_WIDTH_S)
+    if force is None:
+        return
+    if not any(f.code == "accelerometer-axes" for f in remarks):
+        remarks += inertial.entry_axis(found, force)
+    if not remarks:
+        remarks += carried_force.gyro_axes(found, force)
+    if not remarks:
+        remarks += carried_force.attitude_prior(found, force)
 
 
-def _say_clock(report: Report, clock: Clock, time_s: FloatArray) -> None:
-    report.clocks.append(clock)
-    if abs(clock.late_s) > max(CLOCK_SD * clock.sd_s, CLOCK_S):
-        which = "later than" if clock.late_s > 0 else "earlier than"
-        words = f"its times are {which} the {clock.against}'s by {abs(clock.late_s):.3f} +- {clock.sd_s:.3f} s"
-        hint = f"; if it is the one that is wrong: time.offset_s = {-clock.late_s:.3f}"
-        report.oddities.append(Finding(clock.source, words + hint, float(time_s[0]), float(time_s[-1])))
+def _keep_sharp(report: Report, bias: TimeBias | None) -> TimeBias | None:
+    """Add a time bias to the report where its standard deviation is small enough; None where it is not."""
+    if bias is None or not bias.sd_s < _SHARP_S:
+        return None
+    report.time_biases.append(bias)
+    return bias
 
 
-def _against_place(found: Sources, names: list[str], report: Report) -> None:
-    """Barometers and the magnetometer's size against the first track that is not in doubt."""
-    record = tracks.tracks(found)[next((n for n in names if n in found.gnss), names[0])]
+def _span(time_s: FloatArray) -> tuple[float, float]:
+    return float(time_s[0]), float(time_s[-1])
+
+
+def _against_place(found: Sources, trackers: dict[str, RadarRecord | GnssRecord], report: Report) -> None:
+    """Barometers and the magnetometer's magnitude against the first track, a receiver's where there is one."""
+    record = trackers[next((name for name in trackers if name in found.gnss), next(iter(trackers)))]
     position = tracks.position_of(record)
     whole = np.isfinite(position).all(axis=1)
     t, position = record.time_s[whole], position[whole]
     height = earth.geodetic_from_ecef(position)[2]
     for name, barometer in found.barometers.items():
-        report.oddities += pressure_and_field.barometer_unit(found, name, barometer, t, height)
-    report.oddities += pressure_and_field.field_size(found, t, position)
+        report.cross_checks += pressure_and_field.barometer_unit(found, name, barometer, t, height)
+    report.cross_checks += pressure_and_field.field_size(found, t, position)
 
 
-WIDE = 160  # of a log file: a table need not be squeezed there
-console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else WIDE)
-LONGEST_NAME = 28  # that leaves room for the rest of a table on 80 columns
+# the command
 
 
 def check(folder: Path, as_json: bool) -> None:
-    """Print what a flight folder holds, what is odd about it and what is refused; leave with its exit code."""
+    """Print what a flight folder holds, what is suspicious and what is refused; leave with its exit code."""
     report = check_folder(folder)
     if as_json:
         sys.stdout.write(json.dumps(report.as_json(), indent=2, allow_nan=False) + "\n")
@@ -228,41 +271,30 @@ def check(folder: Path, as_json: bool) -> None:
 
 
 def print_report(report: Report) -> None:
-    """Tables and lines for a reader."""
+    """Print tables and lines for a reader, codes in brackets."""
     if report.facts:
         table = Table(title="Sensors")
         for name in ("source", "rows", "from s", "to s", "rate Hz", "missing", "file"):
             left = name in ("source", "file")
             # names stay whole on one line, as two radars may differ in their ends; files are folded
-            whole = name != "file" and max(len(f.source) for f in report.facts) <= LONGEST_NAME
+            whole = name != "file" and max(len(f.source) for f in report.facts) <= _LONGEST_NAME
             table.add_column(name, justify="left" if left else "right", overflow="fold", no_wrap=whole)
         for f in report.facts:
             span = (f"{f.start_s:.3f}", f"{f.end_s:.3f}", f"{f.rate_hz:.4g}")
             table.add_row(escape(f.source), str(f.rows), *span, str(f.missing), escape(f.file))
         console.print(table)
-    _lines("[yellow]found[/]", report.findings)
-    _lines("[red]odd[/]  ", report.oddities)
-    for clock in report.clocks:
-        late = f"{clock.late_s:+.3f} +- {clock.sd_s:.3f} s late against {clock.against}"
-        console.print(f"clock {escape(clock.source)}: {escape(late)}", highlight=False)
+    for finding in report.findings:
+        _line("[yellow]found[/]", str(finding), finding.code)
+    for remark in report.cross_checks:
+        _line("[red]suspicious[/]", str(remark), remark.code)
+    for bias in report.time_biases:
+        _line("time bias", f"{bias.source}: {bias.late_s:+.3f} +/- {bias.sd_s:.3f} s against {bias.against}")
     for words in report.fill_in:
-        console.print(f"[cyan]to fill in[/] {escape(words)}", highlight=False)
-    for words in report.refused:
-        console.print(f"[red]refused[/] {escape(words)}", highlight=False)
-    console.print(_summary(report))
+        _line("[cyan]to fill in[/]", words)
+    for fault in report.refused:
+        _line("[red]refused[/]", fault, fault.code)
+    console.print(report._about())
 
 
-def _lines(mark: str, findings: list[Finding]) -> None:
-    for finding in findings:
-        console.print(f"{mark} {escape(str(finding))}", highlight=False)
-
-
-def _summary(report: Report) -> str:
-    counts = (
-        (len(report.findings), "findings", "finding"),
-        (len(report.oddities), "oddities", "oddity"),
-        (len(report.fill_in), "values still to fill in", "value still to fill in"),
-        (len(report.refused), "refused", "refused"),
-    )
-    said = ", ".join(f"{count} {what if count > 1 else one}" for count, what, one in counts if count)
-    return said or "nothing found that would be in the way"
+def _line(mark: str, words: str, code: str = "") -> None:
+    console.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}", highlight=False)

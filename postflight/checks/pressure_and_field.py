@@ -1,8 +1,11 @@
-"""Do barometer and magnetometer say what the place asks for, and do the gyros turn the field as it turns?
+"""Do barometer and magnetometer fit the track, and does the field rotate in the body as the gyros indicate?
 
-A field that is fixed in space turns in the body as ``db/dt = (b - b0) x w``, with ``b0`` the vehicle's own iron. Every
-order and sign of the gyros' axes is tried, with a scale: the declared one is doubted only where it explains little of
-the turning and another explains nearly all.
+Heights by pressure change as a track's do; the magnetometer's magnitude is within a factor of five of the Earth's field
+(IGRF) at the track. A field that is fixed in space rotates in the body as ``db/dt = (b - b0) x w``, with ``b0`` the
+vehicle's own iron. Every order and sign of the gyros' axes is tried, with a scale: the declared one is suspicious only
+where it explains little of the rotation and another explains nearly all.
+
+Assumptions: iron is fixed in the body; the field hardly changes along the path within a cell.
 """
 
 from __future__ import annotations
@@ -14,27 +17,46 @@ from flightmodel.checks import FloatArray
 from flightmodel.flightfolder import Sources
 from flightmodel.geomagnetism_and_sun import magnetic_field_ned_t
 from flightmodel.telemetry import BarometerRecord, Finding, TriadRecord
-from postflight.checks.inertial import all_axes, matrix, named
-from postflight.checks.track_force import slope_through_mean, unit_of, unit_that_explains
+from postflight.checks.units_and_axes import (
+    AS_DECLARED,
+    all_axes,
+    axes_matrix,
+    axes_named,
+    interval_around,
+    slope_through_mean,
+    unit_hint,
+    unit_of,
+    unit_that_explains,
+    window_means,
+)
 
-DECADE = 5.0  # iron and calibration change a field's size by less
-CELL_RAD = 0.3  # turned within a cell: as long as the field's direction allows, against the readings' noise
-EXPLAINED = 0.6  # of the turning's square; noise and iron that is not fixed are the rest
-MOST_SAMPLES = 4000
-LARGEST_LAG_S, COARSE_S = 0.5, 0.025
+_DECADE = 5.0  # iron and calibration change a field's magnitude by less
+_CELL_RAD = 0.3  # rotation within a cell: as long as the field's direction allows, against the readings' noise
+_EXPLAINED = 0.6  # of the rotation's square; noise and iron that is not fixed are the rest
+_MOST_SAMPLES = 4000
+_LARGEST_LAG_S, _COARSE_S = 0.5, 0.025
 
 
 def barometer_unit(
     found: Sources, name: str, record: BarometerRecord, time_s: FloatArray, height_m: FloatArray
 ) -> list[Finding]:
-    """Tell of a barometer whose heights change by another factor than a track's ``height_m`` (n,)."""
+    """Check a barometer's unit by its changes of height against a track's: ``barometer-unit`` or none.
+
+    Parameters
+    ----------
+    found : Sources
+    name : str
+        Of the barometer in flight.toml.
+    record : BarometerRecord
+    time_s, height_m : (n,) float
+        Of the track, above the ellipsoid.
+    """
     entry = found.spec.barometers[name]
     if "height" not in entry.columns and "pressure" in entry.columns:
         return []
     t = record.time_s[np.isfinite(record.height_m)]
     inside = (t > time_s[0]) & (t < time_s[-1])
-    after = np.clip(np.searchsorted(time_s, t), 1, len(time_s) - 1)
-    inside &= time_s[after] - time_s[after - 1] < 5.0
+    inside &= interval_around(time_s, t) < 5.0
     if inside.sum() < 20:
         return []
     own = record.height_m[np.isfinite(record.height_m)][inside]
@@ -43,15 +65,23 @@ def barometer_unit(
         return []
     ratio, sd = slope_through_mean(own, track)
     declared = unit_of(entry, tables.BAROMETER[0])
-    unit = unit_that_explains(ratio, declared, 0.1)
-    if unit in (None, declared) or sd > 0.05 * ratio:
+    hint = unit_hint(declared, unit_that_explains(ratio, declared, 0.1))
+    if not hint or sd > 0.05 * ratio:
         return []
-    words = f"its height changes by 1/{ratio:.3g} of the track's: taken as '{declared}', it looks like '{unit}'"
-    return [Finding(name, words, float(t[inside][0]), float(t[inside][-1]))]
+    words = f"its height changes by 1/{ratio:.3g} of the track's{hint}"
+    return [Finding(name, words, float(t[inside][0]), float(t[inside][-1]), "barometer-unit")]
 
 
 def field_size(found: Sources, time_s: FloatArray, position_ecef_m: FloatArray) -> list[Finding]:
-    """Tell of a magnetometer whose reading is far from the Earth's field at the place."""
+    """Check the magnitude of the magnetometer's reading against the Earth's field: ``magnetometer-unit`` or none.
+
+    Parameters
+    ----------
+    found : Sources
+    time_s : (n,) float
+    position_ecef_m : (n, 3) float
+        Of a track.
+    """
     record = found.triads.get("magnetometer")
     if record is None:
         return []
@@ -64,53 +94,63 @@ def field_size(found: Sources, time_s: FloatArray, position_ecef_m: FloatArray) 
     lat, lon, height = earth.geodetic_from_ecef(where)
     expected = float(np.median(np.linalg.norm(magnetic_field_ned_t(lat, lon, height, found.spec.t0_utc), axis=1)))
     ratio = expected / max(float(np.median(seen)), 1e-30)
-    if 1 / DECADE < ratio < DECADE:
+    if 1 / _DECADE < ratio < _DECADE:
         return []
     source = found.spec.sensors.magnetometer
     assert source is not None
     declared = unit_of(source, tables.MAGNETOMETER[0])
-    unit = unit_that_explains(ratio, declared, np.log(3.0))
-    hint = f": taken as '{declared}', it looks like '{unit}'" if unit not in (None, declared) else ""
+    hint = unit_hint(declared, unit_that_explains(ratio, declared, np.log(3.0)))
     words = f"reads {1e6 * float(np.median(seen)):.3g} uT where the Earth's field is {1e6 * expected:.3g} uT{hint}"
-    return [Finding("magnetometer", words, float(record.time_s[rows][0]), float(record.time_s[rows][-1]))]
+    times = record.time_s[rows]
+    return [Finding("magnetometer", words, float(times[0]), float(times[-1]), "magnetometer-unit")]
 
 
-def turning_field(found: Sources) -> tuple[list[Finding], tuple[float, float] | None]:
-    """Compare gyros with the field's turning: findings, and how late the magnetometer is (s, sd), if that is told."""
+def field_rotation(found: Sources) -> tuple[list[Finding], tuple[float, float] | None]:
+    """Compare the gyros with the rotation of the magnetic field in the body.
+
+    Returns
+    -------
+    findings : list of Finding
+        ``gyro-axes``, ``gyro-unit``, or none.
+    lag : (float, float) or None
+        How late the magnetometer's time tags are against the gyros', s, and its standard deviation; None where the
+        gyros do not explain the rotation.
+    """
     gyros, field = found.triads.get("rates"), found.triads.get("magnetometer")
     source = found.spec.sensors.rates
     if gyros is None or field is None or source is None:
         return [], None
-    grid = _grid(gyros, field, CELL_RAD)
+    grid = _grid(gyros, field, _CELL_RAD)
     if grid is None:
         return [], None
     w, b = _on(gyros, grid), _on(field, grid)
     if not np.isfinite(w).all() or not np.isfinite(b).all():
         return [], None
     change = np.gradient(b, grid, axis=0)
-    turns = {axes: _explained(w @ matrix(*axes).T, b, change) for axes in all_axes()}
-    own, scale = turns[(0, 1, 2), (1, 1, 1)]
-    best = max(turns, key=lambda axes: turns[axes][0])
+    shares = {axes: _explained(w @ axes_matrix(*axes).T, b, change) for axes in all_axes()}
+    own, scale = shares[AS_DECLARED]
+    best = max(share for share, _ in shares.values())
     span = (float(grid[0]), float(grid[-1]))
-    if turns[best][0] > EXPLAINED and own < 0.5 * turns[best][0]:
-        near = [axes for axes in turns if turns[axes][0] > turns[best][0] - 0.02]
-        others = " or ".join(named(*axes) for axes in near[:3])
+    if best > _EXPLAINED and own < 0.5 * best:
+        near = [axes for axes, (share, _) in shares.items() if share > best - 0.02]
+        others = " or ".join(axes_named(*axes) for axes in near[:3])
         words = (
-            f"turn the magnetometer's field as no vehicle does: {100 * own:.0f} % of its turning is explained; with "
-            f"body x, y, z read from {others} it is {100 * turns[best][0]:.0f} %: check order, signs and both mounts"
+            f"explain {100 * own:.0f} % of the field's rotation in the body; with body x, y, z read from {others} it "
+            f"is {100 * best:.0f} %: check order, signs and both mounts"
         )
-        return [Finding("rates", words, *span)], None
+        return [Finding("rates", words, *span, "gyro-axes")], None
     out: list[Finding] = []
-    if own > EXPLAINED and not 0.8 < scale < 1.25:
+    if own > _EXPLAINED and not 0.8 < scale < 1.25:
         declared = unit_of(source, tables.RATES[0])
-        unit = unit_that_explains(scale, declared, 0.2)
-        hint = f": taken as '{declared}', they look like '{unit}'" if unit not in (None, declared) else ""
-        out.append(Finding("rates", f"the field turns {scale:.3g} times as fast as they say{hint}", *span))
-    return out, _clock(gyros, field) if own > EXPLAINED else None
+        hint = unit_hint(declared, unit_that_explains(scale, declared, 0.2))
+        out.append(
+            Finding("rates", f"the field rotates {scale:.3g} times as fast as they read{hint}", *span, "gyro-unit")
+        )
+    return out, _lag(gyros, field) if own > _EXPLAINED else None
 
 
 def _grid(gyros: TriadRecord, field: TriadRecord, cell_rad: float) -> FloatArray | None:
-    """Even times of cells in which the gyros turn ``cell_rad`` or less; None where the two hardly overlap."""
+    """Even times of cells in which the body rotates by ``cell_rad`` or less; None where the two hardly overlap."""
     start, end = max(gyros.time_s[0], field.time_s[0]), min(gyros.time_s[-1], field.time_s[-1])
     rows = (gyros.time_s >= start) & (gyros.time_s <= end)
     if rows.sum() < 50:
@@ -119,7 +159,7 @@ def _grid(gyros: TriadRecord, field: TriadRecord, cell_rad: float) -> FloatArray
     fast = float(np.nanpercentile(size, 95))
     if not fast > 0.0:
         return None
-    step = max(float(np.median(np.diff(field.time_s))), (end - start) / MOST_SAMPLES, min(cell_rad / fast, 1.0))
+    step = max(float(np.median(np.diff(field.time_s))), (end - start) / _MOST_SAMPLES, min(cell_rad / fast, 1.0))
     return np.arange(start + step, end - step, step)
 
 
@@ -128,46 +168,44 @@ def _on(record: TriadRecord, grid: FloatArray) -> FloatArray:
     whole = np.isfinite(record.measured_sensor).all(axis=1)
     t, v = record.time_s[whole], record.measured_sensor[whole] @ record.spec.dcm_body_sensor.T
     step = grid[1] - grid[0]
-    total = np.vstack([np.zeros(3), np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t)[:, None], axis=0)])
-    ends = [np.column_stack([np.interp(grid + side, t, c) for c in total.T]) for side in (-step, step)]
-    return np.asarray((ends[1] - ends[0]) / (2 * step))
+    return window_means(t, v, grid, -step, step)
 
 
 def _explained(w: FloatArray, b: FloatArray, change: FloatArray) -> tuple[float, float]:
-    """Share of the turning's square that is explained, and the scale of ``w``."""
+    """Share of the rotation's square that is explained, and the scale of ``w``."""
     # db/dt = k b x w + w x (k b0): linear in k and k b0
     design = np.stack([np.cross(b, w).ravel(), *(np.cross(w, axis).ravel() for axis in np.eye(3))])
     design = design / (norm := np.sqrt(np.maximum(np.einsum("ik,ik->i", design, design), 1e-300)))[:, None]
     wanted = change.ravel()
     # normal equations: four columns of one size need no better
     fit = np.linalg.pinv(np.einsum("ik,jk->ij", design, design)) @ np.einsum("ik,k->i", design, wanted)
-    left = wanted - np.einsum("i,ik->k", fit, design)
+    residual = wanted - np.einsum("i,ik->k", fit, design)
     fit = fit / norm
     total = float(change.ravel() @ change.ravel())
-    share = 1.0 - float(left @ left) / total if total > 0.0 and fit[0] > 0.0 else 0.0
+    share = 1.0 - float(residual @ residual) / total if total > 0.0 and fit[0] > 0.0 else 0.0
     return share, float(fit[0])
 
 
-def _clock(gyros: TriadRecord, field: TriadRecord) -> tuple[float, float] | None:
-    """How late the magnetometer is against the gyros: the top of a parabola about the best of a row of lags."""
-    grid = _grid(gyros, field, 0.0)  # as fine as can be: lags are told by what happens fast
+def _lag(gyros: TriadRecord, field: TriadRecord) -> tuple[float, float] | None:
+    """How late the magnetometer is against the gyros, s, with its sd: the top of a parabola about the best of a row."""
+    grid = _grid(gyros, field, 0.0)  # as fine as can be: lags show in what happens fast
     if grid is None:
         return None
     b = _on(field, grid)
     change = np.gradient(b, grid, axis=0)
     step = grid[1] - grid[0]
-    coarse = np.arange(-LARGEST_LAG_S, LARGEST_LAG_S + 1e-9, COARSE_S)
+    coarse = np.arange(-_LARGEST_LAG_S, _LARGEST_LAG_S + 1e-9, _COARSE_S)
     near = coarse[int(np.argmax([_explained(_on(gyros, grid - lag), b, change)[0] for lag in coarse]))]
-    lags = near + np.arange(-COARSE_S, COARSE_S + 1e-9, max(step / 2, 0.005))
+    lags = near + np.arange(-_COARSE_S, _COARSE_S + 1e-9, max(step / 2, 0.005))
     shares = [_explained(_on(gyros, grid - lag), b, change)[0] for lag in lags]
     k = int(np.argmax(shares))
     if not 0 < k < len(lags) - 1:
         return None
     low, mid, high = shares[k - 1 : k + 2]
     spacing = lags[1] - lags[0]
-    bend = (2 * mid - low - high) / spacing**2
-    if bend <= 0.0:
+    curvature = (2 * mid - low - high) / spacing**2
+    if curvature <= 0.0:
         return None
     lag = float(lags[k] + 0.5 * spacing * (high - low) / (2 * mid - low - high))
     # residuals of neighbouring samples go together: a tenth of them is taken as independent
-    return lag, float(np.sqrt(2.0 * (1.0 - mid) / bend / (0.1 * 3 * len(grid))))
+    return lag, float(np.sqrt(2.0 * (1.0 - mid) / curvature / (0.1 * 3 * len(grid))))

@@ -1,12 +1,12 @@
-"""Which non-gravitational acceleration does a track tell, and how does it compare with what an accelerometer says?
+"""Which specific force does a track imply, and how does it compare with an accelerometer's?
 
-A quadratic is fitted to the places (inertial axes) of each window of width ``W``; its second derivative less
+A quadratic is fitted to the positions (inertial axes) of each window of width ``W``; its second derivative less
 gravitation is the mean specific force there, weighted over the window by ``(1 - u^2)^2`` with ``u = 2 (t - t_k) / W``:
-the kernel of the second derivative of a least-squares quadratic. The same kernel over the accelerometer's readings
-makes both comparable without integrating attitudes, as sizes alone are compared. A clock that is late by ``d``, and a
-scale ``k``, then follow from ``F_track(t) = k a(t - d)`` by least squares.
+the kernel of the second derivative of a least-squares quadratic (Savitzky and Golay, Anal. Chem. 36, 1964). The same
+kernel over the accelerometer's readings makes both comparable without integrating attitudes, as magnitudes alone are
+compared. A time bias ``d`` of the track and a scale ``k`` follow from ``F_track(t) = k a(t - d)`` by least squares.
 
-Which unit would explain a factor between what a column says and what other sensors ask for?
+Assumptions: the force hardly changes its direction within a window, and the track's errors scatter within it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray
-from flightmodel.tables import UNITS, Quantity, Source, place
+from postflight.checks.units_and_axes import interval_around, trapezoid_integral
 
-LEAST_SAMPLES = 6  # of a window
-LEAST_WINDOWS = 8
-STRIDES = 2  # windows overlap by half
-SIGNAL = 4.0  # sizes below so many standard deviations are mostly noise
-LARGEST_LAG_S = 5.0
-LAG_STEPS = 401
-LEAST_MISFIT = 0.25  # a window's scatter holds what a quadratic leaves out, and is too large by as much
-OVERLAP = np.sqrt(1.5)  # neighbouring windows share half of their samples
+_LEAST_SAMPLES = 6  # of a window
+_LEAST_WINDOWS = 8
+_STRIDES = 2  # windows overlap by half
+_SIGNAL = 4.0  # magnitudes below so many standard deviations are mostly noise
+_LARGEST_LAG_S = 5.0
+_LAG_STEPS = 401
+_LEAST_MISFIT = 0.25  # a window's scatter holds what a quadratic leaves out, and is too large by as much
+_OVERLAP = np.sqrt(1.5)  # neighbouring windows share half of their samples
+_WIDTHS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class TrackForce:
     force_mps2 : (n, 3) float
         Specific force, the same axes.
     covariance : (n, 3, 3) float
-        Of acceleration and force, from the scatter of the places about their quadratic.
+        Of acceleration and force, from the scatter of the positions about their quadratic.
     """
 
     time_s: FloatArray
@@ -54,17 +55,22 @@ class TrackForce:
     covariance: FloatArray
 
     def size(self) -> tuple[FloatArray, FloatArray]:
-        """Size of the force (n,) with its standard deviation along its direction, m/s^2."""
+        """Return the magnitude (n,) of the force and its standard deviation along its direction, m/s^2."""
         size = np.linalg.norm(self.force_mps2, axis=1)
         along = self.force_mps2 / np.maximum(size, 1e-12)[:, None]
         sd = np.sqrt(np.einsum("ki,kij,kj->k", along, self.covariance, along))
-        spread = np.einsum("kii->k", self.covariance) - sd**2  # across it: lengthens
+        spread = np.einsum("kii->k", self.covariance) - sd**2  # normal to it: lengthens
         return np.sqrt(np.maximum(size**2 - spread, 0.0)), np.maximum(sd, 1e-6)
+
+    @property
+    def relative_velocity_mps(self) -> FloatArray:
+        """Velocity (n, 3) relative to the rotating Earth, inertial axes."""
+        return self.velocity_mps - np.cross(earth.OMEGA_ECEF_RADPS, self.position_m)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Track against accelerometer: the track's clock is late by ``lag_s``, its force ``scale`` times what is read."""
+    """Track against accelerometer: the track's tags are ``lag_s`` late, its force ``scale`` times the reading."""
 
     lag_s: float
     lag_sd_s: float
@@ -76,35 +82,84 @@ class Comparison:
 
 
 def track_force(time_s: FloatArray, position_ecef_m: FloatArray, width_s: float) -> TrackForce | None:
-    """Fit quadratics to windows of a track (positions ECEF ``(n, 3)``, m); None where too few windows are whole."""
+    """Fit quadratics to windows of a track.
+
+    Parameters
+    ----------
+    time_s : (n,) float
+    position_ecef_m : (n, 3) float
+        NaN is missing.
+    width_s : float
+        Of a window.
+
+    Returns
+    -------
+    TrackForce or None
+        None where fewer than eight windows are covered by samples.
+    """
     whole = np.isfinite(position_ecef_m).all(axis=1)
     t, p = time_s[whole], position_ecef_m[whole]
-    if len(t) < LEAST_SAMPLES:
+    if len(t) < _LEAST_SAMPLES:
         return None
     p = rotations.rotate(rotations.conjugate(earth.q_ecef_eci(t)), p)
     rows = []
-    for centre in np.arange(t[0] + width_s / 2, t[-1] - width_s / 2, width_s / STRIDES):
+    for centre in np.arange(t[0] + width_s / 2, t[-1] - width_s / 2, width_s / _STRIDES):
         low, high = np.searchsorted(t, [centre - width_s / 2, centre + width_s / 2])
         count = high - low
         edges = np.concatenate([[centre - width_s / 2], t[low:high], [centre + width_s / 2]])
-        if count < LEAST_SAMPLES or np.diff(edges).max() > 0.35 * width_s:
+        if count < _LEAST_SAMPLES or np.diff(edges).max() > 0.35 * width_s:
             continue
         middle = float(t[low:high].mean())  # the quadratic's second derivative belongs there
         u = t[low:high] - middle
         design = np.column_stack([np.ones(count), u, 0.5 * u * u])
         fit, *_ = np.linalg.lstsq(design, p[low:high], rcond=None)
-        off = p[low:high] - design @ fit
+        residual = p[low:high] - design @ fit
         variance = np.linalg.inv(design.T @ design)[2, 2]
-        rows.append((middle, *fit, off.T @ off / (count - 3) * variance))
-    if len(rows) < LEAST_WINDOWS:
+        rows.append((middle, *fit, residual.T @ residual / (count - 3) * variance))
+    if len(rows) < _LEAST_WINDOWS:
         return None
     centres, place, velocity, acceleration, covariance = (np.array(part) for part in zip(*rows, strict=True))
     force = acceleration - earth.gravitation(place)
     return TrackForce(centres, width_s, place, velocity, acceleration, force, covariance)
 
 
-def smoothed(time_s: FloatArray, values: FloatArray, width_s: float) -> tuple[FloatArray, FloatArray]:
-    """Values (n,) seen through the windows' kernel, on an even grid of times; NaN near gaps and ends."""
+def best_comparison(
+    time_s: FloatArray, position_ecef_m: FloatArray, sensed_time_s: FloatArray, sensed_mps2: FloatArray
+) -> Comparison | None:
+    """Compare at several window widths and return the comparison of the smallest lag sd (then scale sd).
+
+    Parameters
+    ----------
+    time_s : (n,) float
+    position_ecef_m : (n, 3) float
+        Of the track.
+    sensed_time_s : (m,) float
+    sensed_mps2 : (m, 3) float
+        The accelerometer's readings, in any axes.
+
+    Returns
+    -------
+    Comparison or None
+        None where no force above the noise changes with time.
+    """
+    found = []
+    for width in _WIDTHS_S:
+        force = track_force(time_s, position_ecef_m, width)
+        one = _compare(force, sensed_time_s, sensed_mps2) if force is not None else None
+        if one is not None:
+            found.append(one)
+    return min(found, key=lambda c: (c.lag_sd_s, c.scale_sd)) if found else None
+
+
+def coasting(force: TrackForce, time_s: FloatArray, sensed_mps2: FloatArray, below_mps2: float) -> BoolArray:
+    """Return the windows in which an accelerometer (times (n,), readings (n, 3)) reads less than ``below_mps2``."""
+    grid, seen = _smoothed(time_s, np.linalg.norm(sensed_mps2, axis=1), force.width_s)
+    at = np.interp(force.time_s, grid, seen, left=np.nan, right=np.nan)
+    return np.asarray(np.nan_to_num(at, nan=np.inf) < below_mps2)
+
+
+def _smoothed(time_s: FloatArray, values: FloatArray, width_s: float) -> tuple[FloatArray, FloatArray]:
+    """Values (n,) through the windows' kernel, on an even grid of times; NaN near gaps and ends."""
     whole = np.isfinite(values)
     t, v = time_s[whole], values[whole]
     step = max(float(np.median(np.diff(t))), width_s / 200)
@@ -115,34 +170,30 @@ def smoothed(time_s: FloatArray, values: FloatArray, width_s: float) -> tuple[Fl
     if len(grid) < len(kernel):
         return grid, np.full(len(grid), np.nan)
     # cells of means first: a fast sensor's noise would fold into the grid
-    total = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t))])
+    total = trapezoid_integral(t, v[:, None])[:, 0]
     mean = np.interp(grid + step / 2, t, total) - np.interp(grid - step / 2, t, total)
     width = np.minimum(grid + step / 2, t[-1]) - np.maximum(grid - step / 2, t[0])
     out = np.convolve(mean / width, kernel, mode="same")
-    after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
-    bad = (t[after] - t[after - 1]) > max(0.25 * width_s, 3 * step)
+    bad = interval_around(t, grid) > max(0.25 * width_s, 3 * step)
     bad[[0, -1]] = True
     near = np.convolve(bad.astype(float), np.ones(2 * half + 1), mode="same") > 0.5
     return grid, np.where(near, np.nan, out)
 
 
-def compare(force: TrackForce, time_s: FloatArray, sensed_mps2: FloatArray) -> Comparison | None:
-    """Late clock and scale of a track against the size of an accelerometer's readings ``(n, 3)``.
-
-    None where nothing can be told: no force above the noise, or none that changes.
-    """
+def _compare(force: TrackForce, time_s: FloatArray, sensed_mps2: FloatArray) -> Comparison | None:
+    """Time bias and scale of a track against the magnitude of an accelerometer's readings (n, 3)."""
     size, sd = force.size()
-    use = size > SIGNAL * sd
-    grid, seen = smoothed(time_s, np.linalg.norm(sensed_mps2, axis=1), force.width_s)
-    inside = (force.time_s > grid[0] + LARGEST_LAG_S) & (force.time_s < grid[-1] - LARGEST_LAG_S)
+    use = size > _SIGNAL * sd
+    grid, seen = _smoothed(time_s, np.linalg.norm(sensed_mps2, axis=1), force.width_s)
+    inside = (force.time_s > grid[0] + _LARGEST_LAG_S) & (force.time_s < grid[-1] - _LARGEST_LAG_S)
     late = force.time_s[use & inside]
-    if len(late) < LEAST_WINDOWS:
+    if len(late) < _LEAST_WINDOWS:
         return None
     f, sd = size[use & inside], sd[use & inside]
-    lags = np.linspace(-LARGEST_LAG_S, LARGEST_LAG_S, LAG_STEPS)
+    lags = np.linspace(-_LARGEST_LAG_S, _LARGEST_LAG_S, _LAG_STEPS)
     model = np.array([np.interp(late - lag, grid, seen) for lag in lags])
     whole = np.isfinite(model).all(axis=0)
-    if whole.sum() < LEAST_WINDOWS:
+    if whole.sum() < _LEAST_WINDOWS:
         return None
     model, f, sd, late = model[:, whole], f[whole], sd[whole], late[whole]
     sd = np.hypot(sd, 0.01 * f)  # the kernel's own error where samples are few
@@ -151,65 +202,13 @@ def compare(force: TrackForce, time_s: FloatArray, sensed_mps2: FloatArray) -> C
     chi2 = ((f - scale[:, None] * model) ** 2 * weight).sum(axis=1)
     k = int(np.argmin(chi2))
     misfit = float(chi2[k]) / (len(f) - 2)
-    scale_sd = float(1.0 / np.sqrt((model[k] ** 2 * weight).sum())) * np.sqrt(max(misfit, LEAST_MISFIT)) * OVERLAP
-    if 0 < k < LAG_STEPS - 1:
+    inflation = np.sqrt(max(misfit, _LEAST_MISFIT))
+    scale_sd = float(1.0 / np.sqrt((model[k] ** 2 * weight).sum())) * inflation * _OVERLAP
+    lag, lag_sd = 0.0, np.inf
+    if 0 < k < _LAG_STEPS - 1:
         low, mid, high = chi2[k - 1 : k + 2]
         step = lags[1] - lags[0]
         curvature = (low - 2 * mid + high) / step**2
         lag = float(lags[k] + 0.5 * step * (low - high) / (low - 2 * mid + high))
-        lag_sd = float(np.sqrt(2.0 / curvature) * np.sqrt(max(misfit, LEAST_MISFIT)) * OVERLAP)
-    else:
-        lag, lag_sd = 0.0, np.inf
+        lag_sd = float(np.sqrt(2.0 / curvature) * inflation * _OVERLAP)
     return Comparison(lag, lag_sd, float(scale[k]), float(scale_sd), misfit, float(late[0]), float(late[-1]))
-
-
-def best_comparison(
-    time_s: FloatArray, position_ecef_m: FloatArray, sensed_time_s: FloatArray, sensed_mps2: FloatArray
-) -> Comparison | None:
-    """Compare at several widths of window and return what tells the clock best (the scale, where none tells it)."""
-    found = []
-    for width in (1.0, 2.0, 4.0, 8.0, 16.0):
-        force = track_force(time_s, position_ecef_m, width)
-        one = compare(force, sensed_time_s, sensed_mps2) if force is not None else None
-        if one is not None:
-            found.append(one)
-    return min(found, key=lambda c: (c.lag_sd_s, c.scale_sd)) if found else None
-
-
-def coasting(force: TrackForce, time_s: FloatArray, sensed_mps2: FloatArray, below_mps2: float) -> BoolArray:
-    """In which windows an accelerometer reads less than ``below_mps2``."""
-    grid, seen = smoothed(time_s, np.linalg.norm(sensed_mps2, axis=1), force.width_s)
-    at = np.interp(force.time_s, grid, seen, left=np.nan, right=np.nan)
-    return np.asarray(np.nan_to_num(at, nan=np.inf) < below_mps2)
-
-
-PLAIN = 0.05  # units differ by less than this factor from what is seen, or do not explain it
-
-
-def unit_of(source: Source, quantity: Quantity) -> str:
-    """Unit in which flight.toml, or the column's own name, says a quantity stands."""
-    return place(quantity, source.declared(quantity.short))[1]
-
-
-def unit_that_explains(ratio: float, unit: str, within: float = PLAIN) -> str | None:
-    """Return the unit of the same kind in which values read as ``unit`` would be ``ratio`` times as large, or None.
-
-    Where the values fit as they are, that is ``unit`` itself.
-    """
-    kind, factor, _ = UNITS[unit]
-    if not np.isfinite(ratio) or ratio <= 0.0:
-        return None
-    off = {name: abs(float(np.log(f / factor / ratio))) for name, (k, f, _) in UNITS.items() if k == kind}
-    best = min(off, key=lambda name: (off[name], name != unit))
-    return best if off[best] < within else None
-
-
-def slope_through_mean(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Slope of ``y`` over ``x`` with its standard deviation; infinite where x does not change."""
-    dx, dy = x - x.mean(), y - y.mean()
-    square = float(dx @ dx)
-    if square == 0.0 or len(x) < 3:
-        return 0.0, np.inf
-    slope = float(dx @ dy) / square
-    left = dy - slope * dx
-    return slope, float(np.sqrt(left @ left / (len(x) - 2) / square))

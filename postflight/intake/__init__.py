@@ -1,3 +1,1 @@
-"""How an analyst's own data come in: a folder to start from, columns proposed, and what is odd about the sensors."""
-
-from __future__ import annotations
+"""An analyst's own data: forms to start from, and what each delivered file and column is."""

@@ -1,19 +1,16 @@
-"""A coefficient table as it is delivered: recognised by its columns, put beside the vehicle file with its sidecar.
+"""What becomes of each delivered file: a telemetry table, a radiosonde, coefficients, video, or nothing?
 
-A radiosonde's table as the day's air: density from pressure, temperature and humidity, at geometric heights.
+``postflight import`` reads all files, proposes what each column is, and only then writes: tables to ``telemetry/`` as
+CSV, images and films there as they are, coefficient tables beside the vehicle file with a sidecar to fill in, and the
+proposals at the end of flight.toml. Nothing is overwritten, and nothing is written where a file is refused.
 
-``rho = p / (R T_v)`` with the virtual temperature ``T_v = T / (1 - 0.378 e / p)`` and the vapour pressure ``e`` of the
-dew point (Bolton, "The computation of equivalent potential temperature", 1980, eq. 10). Radiosondes give geopotential
-heights ``h``; ``z = R h / (R - h)`` with R = 6356.766 km (US Standard Atmosphere 1976, eq. 19). Levels that hold only
+A radiosonde's density follows from its pressure, temperature and humidity, ``rho = p / (R T_v)`` with the virtual
+temperature ``T_v = T / (1 - 0.378 e / p)`` and the vapour pressure ``e`` of the dew point (Bolton, "The computation
+of equivalent potential temperature", Monthly Weather Review 108, 1980, eq. 10). Geopotential heights ``h`` become
+geometric, ``z = R h / (R - h)`` with R = 6356.766 km (US Standard Atmosphere 1976, eq. 19). Levels that hold only
 wind or only temperature take the other from their neighbours: temperature along the logarithm of pressure, wind by
-components along height; nothing beyond the first and last level that has it. Winds stay as they are told, by where they
-come from: `flightmodel.sensor_tables` turns them, and says so.
-
-Onboard video as it is delivered: a folder of pictures or a film, and the list of when each frame was taken.
-
-What ``postflight import`` does: files into the folder, proposals into flight.toml, and a table of both to read.
-
-Tables go to ``telemetry/`` as CSV, pictures and films there as they are, coefficient tables beside the vehicle file.
+components along height; nothing is extrapolated. Wind directions stay where the wind comes from:
+`flightmodel.sensor_tables` makes velocities of the air mass of them, with a finding.
 """
 
 from __future__ import annotations
@@ -36,40 +33,55 @@ from rich.table import Table
 
 from flightmodel.aerodynamics import COLUMNS, named_columns
 from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
-from flightmodel.checks import ConfigError, FloatArray, GateError, writing
-from flightmodel.config import FILL_IN_VALUE, read_toml
+from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
+from flightmodel.config import read_toml
 from flightmodel.tables import to_si
 from flightmodel.vehicle import DATA, vehicle_path
-from postflight.intake.flight_form import left_to_fill_in, section_text, start_text, template
-from postflight.intake.headers import fold, take_apart
-from postflight.intake.propose import (
+from postflight.intake.column_recognition import (
     ASKED,
+    FILL_IN_TOML,
     STATED,
-    Mapped,
-    Reader,
+    ColumnProposal,
+    Recogniser,
     SourceProposal,
+    TimeProposal,
+    add_clock_columns,
+    column_names,
+    column_unit,
     find_time,
-    single_unit,
-    split_clocks,
 )
-from postflight.intake.read_table import LooseTable, read_loose, read_matlab
-from postflight.run_folder import write_file
+from postflight.intake.flight_form import placeholders, section_text, start_text, template
+from postflight.intake.freeform_tables import FreeFormTable, read_matlab, read_text_table
+from postflight.intake.headers import fold, parse_column_name
 
-WIND = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:])
-DAVEML = (".dml",)
+_WIND_AXES = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:])
+_DAVEML = (".dml",)
+_MATLAB = (".mat",)
+_TABLES = (".csv", ".tsv", ".dat", ".asc", ".tab", *_MATLAB)  # what is named so and holds no table is refused
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+_FILMS = (".webm", ".mp4", ".avi")
+_FRAME_TOKENS = {"frame", "frames", "frameno", "picture", "image", "bild"}
+_BELONG = 0.9  # of a list's names, in the folder that it is of
+_RADIOSONDE = {"alt", "temperature", "pressure", "wind_speed", "wind_from"}
+_ZERO_C_K = 273.15
+_LOWEST_M, _HIGHEST_M = -1000.0, 2e5
+console = Console(soft_wrap=True)
 
 
-def coefficient_columns(table: LooseTable) -> dict[str, str] | None:
+# coefficients
+
+
+def coefficient_columns(table: FreeFormTable) -> dict[str, str] | None:
     """Return which column is which coefficient; None where Mach, angle or a coefficient is missing (damping may be)."""
-    for wanted in (COLUMNS, WIND):
+    for wanted in (COLUMNS, _WIND_AXES):
         found = named_columns(wanted, table.names)
         if not set(wanted[:5]) - set(found):
             return found
     return None
 
 
-def as_coefficients(table: LooseTable, columns: dict[str, str]) -> bytes:
-    """Return the CSV with the columns' names that the reader of coefficient tables knows; others stay."""
+def as_coefficients(table: FreeFormTable, columns: dict[str, str]) -> bytes:
+    """Return the CSV with the columns' names of the reader of coefficient tables; other columns stay."""
     back = {column: name for name, column in columns.items()}
     names = [back.get(name, name) for name in table.names]
     changed = [f"{old} as {new}" for old, new in zip(table.names, names, strict=True) if old != new]
@@ -82,18 +94,18 @@ def as_coefficients(table: LooseTable, columns: dict[str, str]) -> bytes:
 
 
 def sidecar_text(columns: dict[str, str]) -> str:
-    """Return the sidecar to fill in; what the columns' names say is filled in."""
+    """Return the sidecar to fill in; what the columns' names state is filled in."""
     moment = fold(columns.get("cm", ""))
     nose = re.search(r"nose|nase", moment)
     axes = "wind" if "cd" in columns else "body"
-    value = "0.0".ljust(9) if nose else f'"{FILL_IN_VALUE}"'
-    why = f"; '{columns['cm']}' says the nose" if nose else ""
+    value = "0.0".ljust(9) if nose else FILL_IN_TOML
+    why = f"; by '{columns['cm']}'" if nose else ""
     return (
-        "# What the numbers of the coefficient table of this name refer to. Values that say FILL IN are needed.\n"
-        f'source = "{FILL_IN_VALUE}"                      # where they come from\n'
-        f'licence = "{FILL_IN_VALUE}"                     # on what terms\n'
-        f'area_m2 = "{FILL_IN_VALUE}"                     # m2: reference area of the coefficients\n'
-        f'length_m = "{FILL_IN_VALUE}"                    # m: reference length of the moments\n'
+        "# What the numbers of the coefficient table of this name refer to. Values FILL IN are needed.\n"
+        f"source = {FILL_IN_TOML}                      # where they come from\n"
+        f"licence = {FILL_IN_TOML}                     # on what terms\n"
+        f"area_m2 = {FILL_IN_TOML}                     # m2: reference area of the coefficients\n"
+        f"length_m = {FILL_IN_TOML}                    # m: reference length of the moments\n"
         f"moment_reference_station_m = {value}   # m aft of the nose: the point that C_m is about{why}\n"
         f'axes = "{axes}"                           # "body": C_A and C_N; "wind": C_D and C_L\n'
         'damping_per = "ql/2V"                   # or "ql/V"\n'
@@ -102,7 +114,7 @@ def sidecar_text(columns: dict[str, str]) -> str:
     )
 
 
-def named_in_form(text: str, beside: str) -> str | None:
+def _named_in_form(text: str, beside: str) -> str | None:
     """Return a vehicle file's text with the table named; None where its coefficients are no longer the form's own.
 
     Parameters
@@ -123,8 +135,8 @@ def named_in_form(text: str, beside: str) -> str | None:
     return "\n".join([*lines[:at], *made, *lines[at + len(asked) :]]) + "\n"
 
 
-def how_to_name(table: Path, vehicle: Path, named: bool) -> list[str]:
-    """Say what makes a vehicle take its coefficients from a table, or that it does."""
+def _how_to_name(table: Path, vehicle: Path, named: bool) -> list[str]:
+    """Sentences on what makes a vehicle take its coefficients from a table."""
     beside = table.relative_to(vehicle.parent).as_posix()
     by_hand = f'in {vehicle} write  [aerodynamics]  table = "{beside}"  and take [aerodynamics.sphere_cone] out'
     return [
@@ -133,60 +145,66 @@ def how_to_name(table: Path, vehicle: Path, named: bool) -> list[str]:
     ]
 
 
-NEEDED = {"alt", "temperature", "pressure"}
-ZERO_C_K = 273.15
-LOWEST_M, HIGHEST_M = -1000.0, 2e5
+# radiosondes
 
 
-def radiosonde_table(table: LooseTable) -> LooseTable | None:
+def radiosonde_table(table: FreeFormTable) -> FreeFormTable | None:
     """Return the table of heights, density, temperature, pressure and wind; None where this is no radiosonde's.
 
     A table that has densities is none: its columns are declared as they are.
     """
-    reader = Reader(table)
-    found = {q.short: m for q, m in reader.air_columns().items()}
-    wind = {"wind_speed", "wind_from"} <= set(found)
-    if "rho" in found or not set(found) >= NEEDED or not wind or any(not m.unit for m in found.values()):
+    recogniser = Recogniser(table)
+    found = {q.short: m for q, m in recogniser.air_columns().items()}
+    if "rho" in found or not set(found) >= _RADIOSONDE or any(not m.unit for m in found.values()):
         return None
     c = {short: to_si(table.numbers(table.names.index(m.column)), m.unit) for short, m in found.items()}
-    notes = [*table.notes, f"radiosonde: {', '.join(f'{m.column} as {s} in {m.unit}' for s, m in found.items())}"]
-    dew = _dew_point(reader)
+    dew = _dew_point(recogniser)
     height, p = c["alt"], c["pressure"]
     with np.errstate(invalid="ignore"):
-        whole = (height > LOWEST_M) & (height < HIGHEST_M) & (p > 0.0)
+        whole = (height > _LOWEST_M) & (height < _HIGHEST_M) & (p > 0.0)
     height = np.where(whole, height, np.nan)
-    temperature, filled_t = _between(-np.log(np.where(whole, p, 1.0)), c["temperature"], whole)
+    up = -np.log(np.where(whole, p, 1.0))
+    temperature, filled_t = _between(up, c["temperature"], whole)
+    dew_k = _between(up, dew, whole)[0] if dew is not None else np.full(len(p), np.nan)
     flow = c["wind_speed"][:, None] * np.column_stack([np.cos(c["wind_from"]), np.sin(c["wind_from"])])
-    sides = [_between(height, component, whole) for component in flow.T]
-    wetness = _between(-np.log(np.where(whole, p, 1.0)), dew, whole)[0] if dew is not None else np.full(len(p), np.nan)
-    celsius = np.nan_to_num(wetness - ZERO_C_K, nan=-200.0)
-    vapour = np.where(celsius > -150.0, 611.2 * np.exp(17.67 * celsius / np.maximum(celsius + 243.5, 1.0)), 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        density = p * (1.0 - 0.378 * vapour / p) / (R_AIR_JPKGK * temperature)
+    (north, filled_wind), (east, _) = (_between(height, component, whole) for component in flow.T)
     geometric = EARTH_RADIUS_US76_M * height / (EARTH_RADIUS_US76_M - height)
-    from_deg = np.mod(np.rad2deg(np.arctan2(sides[1][0], sides[0][0])), 360.0)
-    columns = [geometric, density, temperature, p, np.hypot(sides[0][0], sides[1][0]), from_deg]
-    keep = whole & np.isfinite(np.column_stack(columns)).all(axis=1)
+    from_deg = np.mod(np.rad2deg(np.arctan2(east, north)), 360.0)
+    density = _moist_density(p, temperature, dew_k)
+    columns = np.column_stack([geometric, density, temperature, p, np.hypot(north, east), from_deg])
+    keep = whole & np.isfinite(columns).all(axis=1)
     rows = np.flatnonzero(keep)[np.argsort(geometric[keep], kind="stable")]
     rows = rows[np.diff(geometric[rows], prepend=-np.inf) > 0.0]
     if len(rows) < 3:
         return None
-    notes += [
-        f"temperature of {(filled_t & keep).sum()} levels and wind of {(sides[0][1] & keep).sum()} taken from their "
+    notes = [
+        *table.notes,
+        f"radiosonde: {', '.join(f'{m.column} as {s} in {m.unit}' for s, m in found.items())}",
+        f"temperature of {(filled_t & keep).sum()} levels and wind of {(filled_wind & keep).sum()} taken from their "
         "neighbours",
         f"{len(height) - len(rows)} levels left out: no height or pressure, or beyond the first or last that has both",
         "density by gas law" + (" with the dew point's vapour" if dew is not None else ", as of dry air"),
         "geopotential heights became geometric ones",
     ]
     names = ["alt_m", "rho_kgpm3", "t_k", "p_pa", "wind_speed_mps", "wind_from_deg"]
-    cells = [[f"{v:.8g}" for v in row] for row in np.column_stack(columns)[rows]]
-    return LooseTable(table.label, names, [""] * len(names), cells, notes)
+    cells = [[f"{v:.8g}" for v in row] for row in columns[rows]]
+    return FreeFormTable(table.label, names, [""] * len(names), cells, notes)
 
 
-def _dew_point(reader: Reader) -> FloatArray | None:
-    for k in reader.columns_of("dewpoint"):
-        values = reader.table.numbers(k)
-        units = reader.named[k].units("temperature") or [single_unit("temperature", "temperature", values)[0]]
+def _moist_density(pressure_pa: FloatArray, temperature_k: FloatArray, dew_point_k: FloatArray) -> FloatArray:
+    """Density (n,), kg/m^3, by the gas law with the virtual temperature; dry where the dew point is NaN."""
+    celsius = np.nan_to_num(dew_point_k - _ZERO_C_K, nan=-200.0)
+    vapour = np.where(celsius > -150.0, 611.2 * np.exp(17.67 * celsius / np.maximum(celsius + 243.5, 1.0)), 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        dry_part = 1.0 - 0.378 * vapour / pressure_pa
+        return np.asarray(pressure_pa * dry_part / (R_AIR_JPKGK * temperature_k))
+
+
+def _dew_point(recogniser: Recogniser) -> FloatArray | None:
+    """Dew points (n,), K; None where no column in a known unit holds them."""
+    for k in recogniser.columns_of("dewpoint"):
+        values = recogniser.table.numbers(k)
+        units = recogniser.named[k].units("temperature") or [column_unit("temperature", "temperature", values)[0]]
         if units[0]:
             return to_si(values, units[0])
     return None
@@ -204,10 +222,7 @@ def _between(at: FloatArray, values: FloatArray, whole: np.ndarray) -> tuple[Flo
     return out, missing & np.isfinite(out)
 
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-FILMS = (".webm", ".mp4", ".avi")
-FRAME_WORDS = {"frame", "frames", "frameno", "picture", "image", "bild"}
-BELONG = 0.9  # of a list's names, in the folder that it is of
+# video
 
 
 @dataclass(frozen=True)
@@ -224,16 +239,16 @@ class Video:
         return not self.names
 
 
-def video_of(path: Path, telemetry: Path) -> Video | None:
+def _video_of(path: Path, telemetry: Path) -> Video | None:
     """Return a folder that holds pictures, or a film; None for anything else."""
     place = telemetry / re.sub(r"[^A-Za-z0-9_.-]+", "_", path.resolve().name)
     if path.is_dir():
-        names = sorted(p.name for p in path.iterdir() if p.suffix.lower() in PICTURES and p.is_file())
+        names = sorted(p.name for p in path.iterdir() if p.suffix.lower() in _PICTURES and p.is_file())
         return Video(path, place, tuple(names)) if names else None
-    return Video(path, place) if path.suffix.lower() in FILMS and path.is_file() else None
+    return Video(path, place) if path.suffix.lower() in _FILMS and path.is_file() else None
 
 
-def copied(video: Video) -> None:
+def _copy(video: Video) -> None:
     """Copy pictures or film beside their place and rename, so that they are whole or not there."""
     video.place.parent.mkdir(parents=True, exist_ok=True)
     partial = video.place.with_name(f".partial-{video.place.name}")
@@ -251,13 +266,13 @@ def copied(video: Video) -> None:
 
 
 def frame_list(
-    table: LooseTable, videos: Iterable[Video], cameras: Iterable[str], folder: Path
+    table: FreeFormTable, videos: Iterable[Video], cameras: Iterable[str], folder: Path
 ) -> SourceProposal | None:
     """Return what a list of frames is for, its column named ``frame``; None where the table is no such list.
 
     Parameters
     ----------
-    table : LooseTable
+    table : FreeFormTable
         Its column of names or numbers is renamed, with a note; folders before a picture's name are taken away.
     videos : iterable of Video
         Folders of pictures and films that the list may be of.
@@ -266,38 +281,38 @@ def frame_list(
     folder : Path
         The flight folder.
     """
-    time = find_time(table, [take_apart(n, u) for n, u in zip(table.names, table.units, strict=True)])
+    time = find_time(table, column_names(table))
     if time is None:
         return None
     used = set(time.columns)
     free = [k for k, name in enumerate(table.names) if name not in used]
-    pictures = next((k for k in free if _cells(table, k) and all(_is_picture(c) for c in _cells(table, k)[:20])), None)
+    pictures = next((k for k in free if (some := table.cells(k)[:20]) and all(_is_picture(c) for c in some)), None)
     if pictures is None:
         numbers = [k for k in free if _is_frame_number(table, k)]
         if len(free) != 1 or not numbers:  # a counter beside other columns is a recorder's
             return None
     at = pictures if pictures is not None else numbers[0]
     _rename(table, at, bare=pictures is not None)
-    names = set(_cells(table, at))
+    names = set(table.cells(at))
     films = [v for v in videos if v.is_film]
-    folders = [v for v in videos if not v.is_film and len(names & set(v.names)) >= BELONG * len(names)]
+    folders = [v for v in videos if not v.is_film and len(names & set(v.names)) >= _BELONG * len(names)]
     key, fitting = ("folder", folders) if pictures is not None else ("film", films)
-    there = f'"{fitting[0].place.relative_to(folder).as_posix()}"' if len(fitting) == 1 else f'"{FILL_IN_VALUE}"'
+    there = f'"{fitting[0].place.relative_to(folder).as_posix()}"' if len(fitting) == 1 else FILL_IN_TOML
     where = "where the pictures lie" if key == "folder" else "the first frame's number in it is 0"
     mounted = list(cameras)
-    camera = f'"{mounted[0]}"' if len(mounted) == 1 else f'"{FILL_IN_VALUE}"'
+    camera = f'"{mounted[0]}"' if len(mounted) == 1 else FILL_IN_TOML
     which = f"of the vehicle file: {', '.join(mounted)}" if mounted else "a [cameras.NAME] of the vehicle file"
     keys = [
         (key, there, where if len(fitting) == 1 else f"{where}; none, or several, would fit"),
         ("camera", camera, which),
-        ("benchmark_s", f'"{FILL_IN_VALUE}"', f"s: when the shell is taken as not bent{_span(table, time)}"),
+        ("benchmark_s", FILL_IN_TOML, f"s: when the shell is taken as undeflected{_span(table, time)}"),
     ]
     why = "names of pictures" if pictures is not None else "numbers of frames"
-    return SourceProposal("frames", [Mapped("frame", "frame", "", STATED, why, canonical=True)], keys, time)
+    return SourceProposal("frames", [ColumnProposal("frame", "frame", "", STATED, why, canonical=True)], keys, time)
 
 
-def without_list(video: Video, folder: Path) -> str:
-    """Return the comment that stands in flight.toml where no list says when a video's frames were taken."""
+def _without_list(video: Video, folder: Path) -> str:
+    """Return the comment for flight.toml where no list has the times of a video's frames."""
     place = video.place.relative_to(folder).as_posix()
     what = "is a film" if video.is_film else f"holds {len(video.names)} pictures"
     frame = "number" if video.is_film else "name"
@@ -305,14 +320,12 @@ def without_list(video: Video, folder: Path) -> str:
     return (
         f"# QUESTION: {place} {what}; when was each frame taken? A table t_s, frame (its {frame}) is wanted:\n"
         f'# [frames]\n# file = "telemetry/frames.csv"\n# {key} = "{place}"\n'
-        f'# camera = "{FILL_IN_VALUE}"\n# benchmark_s = "{FILL_IN_VALUE}"\n'
+        f"# camera = {FILL_IN_TOML}\n# benchmark_s = {FILL_IN_TOML}\n"
     )
 
 
-def cameras_of(folder: Path, tables: dict[str, Any]) -> list[str]:
+def _cameras_of(folder: Path, tables: dict[str, Any]) -> list[str]:
     """Names of the cameras in the vehicle file that flight.toml names; none where it cannot be read yet."""
-    from flightmodel.vehicle import vehicle_path
-
     try:
         made = tomllib.loads(vehicle_path(str(tables.get("vehicle", "")), folder).read_text(encoding="utf-8-sig"))
         return list(made.get("cameras", {}))
@@ -320,21 +333,17 @@ def cameras_of(folder: Path, tables: dict[str, Any]) -> list[str]:
         return []
 
 
-def _cells(table: LooseTable, k: int) -> list[str]:
-    return [row[k] for row in table.rows if k < len(row) and row[k]]
-
-
 def _is_picture(cell: str) -> bool:
-    return Path(cell.replace("\\", "/")).suffix.lower() in PICTURES
+    return Path(cell.replace("\\", "/")).suffix.lower() in _PICTURES
 
 
-def _is_frame_number(table: LooseTable, k: int) -> bool:
+def _is_frame_number(table: FreeFormTable, k: int) -> bool:
     values = table.numbers(k)
-    named = set(take_apart(table.names[k]).tokens) & FRAME_WORDS
+    named = set(parse_column_name(table.names[k]).tokens) & _FRAME_TOKENS
     return bool(named) and bool((np.isfinite(values) & (values >= 0.0) & (values == np.round(values))).all())
 
 
-def _rename(table: LooseTable, k: int, bare: bool) -> None:
+def _rename(table: FreeFormTable, k: int, bare: bool) -> None:
     """Name a column ``frame``, and leave a picture's bare name, each with a note."""
     if bare:
         long = [row for row in table.rows if k < len(row) and re.search(r"[/\\]", row[k])]
@@ -349,23 +358,21 @@ def _rename(table: LooseTable, k: int, bare: bool) -> None:
         table.raw = None
 
 
-def _span(table: LooseTable, time: Any) -> str:
+def _span(table: FreeFormTable, time: TimeProposal) -> str:
     if time.format != "seconds":
         return ""
     known = table.numbers(table.names.index(time.columns[0]))
     return f"; the list goes from {np.nanmin(known):g} to {np.nanmax(known):g}"
 
 
-console = Console(soft_wrap=True)
-MATLAB = (".mat",)
-TABLES = (".csv", ".tsv", ".dat", ".asc", ".tab", *MATLAB)  # what is named so and holds no table is refused
+# the delivery
 
 
 @dataclass
-class Delivered:
-    """What came: tables, videos, new files, the vehicle file anew, and what is left alone, with why."""
+class _Delivery:
+    """What came: tables, videos, new files, the vehicle file anew, and what is left out, with why."""
 
-    tables: list[LooseTable] = field(default_factory=list)
+    tables: list[FreeFormTable] = field(default_factory=list)
     videos: list[Video] = field(default_factory=list)
     daveml: dict[Path, bytes] = field(default_factory=dict)
     files: dict[Path, bytes | str] = field(default_factory=dict)
@@ -377,16 +384,24 @@ class Delivered:
 def import_files(files: tuple[Path, ...], folder: Path) -> None:
     """Read, propose, write, print.
 
+    Parameters
+    ----------
+    files : tuple of Path
+        Tables, folders of images, films, coefficient tables.
+    folder : Path
+        A flight folder with a flight.toml.
+
     Raises
     ------
     ConfigError
-        Where the folder has no flight.toml, or a file of that name is there already.
+        ``flight-file-missing``, or ``file-exists`` where one would be overwritten.
     GateError
-        For tables in which no table is found: all of them; nothing is written then.
+        Every table file in which no table is found, with the codes of `postflight.intake.freeform_tables`.
     """
     path = folder / "flight.toml"
     if not path.exists():
-        raise ConfigError(f"{folder}: no flight.toml; make one with `postflight init {folder}`")
+        words = f"no flight.toml; make one with `postflight init {folder}`"
+        raise ConfigError(f"{folder}: {words}", code="flight-file-missing")
     tables = read_toml(path)
     came = _delivered(files, folder)
     _coefficients(came, folder, tables)
@@ -394,20 +409,19 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
     every = [*places, *(v.place for v in came.videos), *came.files]
     there = [str(p) for k, p in enumerate(every) if p.exists() or p in every[:k]]
     if there:
-        raise ConfigError(
-            [f"{p}: exists already, and nothing is overwritten; rename the new one, or remove it there" for p in there]
-        )
+        words = "exists already, and nothing is overwritten; rename the new one, or remove it there"
+        raise ConfigError([f"{p}: {words}" for p in there], code="file-exists")
     added, shown = _proposals(came, places, folder, tables)
     text = path.read_text(encoding="utf-8-sig").rstrip() + "\n" + added
     tomllib.loads(text)  # what is written can be read
     for video in came.videos:
-        copied(video)
+        _copy(video)
     for table, place in zip(came.tables, places, strict=True):
         write_file(place, table.as_csv())
     for place, content in (*came.files.items(), *came.vehicle.items()):
         write_file(place, content)
     write_file(path, text)
-    print_proposals(shown)
+    _print_proposals(shown)
     for video in came.videos:
         what = "film" if video.is_film else f"{len(video.names)} pictures"
         console.print(f"{escape(str(video.place))}: {what}", highlight=False)
@@ -415,51 +429,51 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
         console.print(escape(words), highlight=False)
     for words in came.skipped:
         console.print(f"[yellow]left out[/] {escape(words)}", highlight=False)
-    print_left(folder)
+    _print_placeholders(folder)
 
 
-def print_left(folder: Path) -> None:
-    """Say which values are still to write, file by file."""
-    left = left_to_fill_in(folder)
+def _print_placeholders(folder: Path) -> None:
+    """Print which values are still to fill in, file by file."""
+    still_open = placeholders(folder)
     by_file: dict[str, list[str]] = {}
-    for words in left:
+    for words in still_open:
         file, key = words.split(": key '", 1)
         by_file.setdefault(file, []).append(key.rsplit("'", 1)[0])
     for file, keys in by_file.items():
         console.print(f"[cyan]to fill in[/] {escape(file)}: {escape(', '.join(keys))}", highlight=False)
-    said = f"{len(left)} values are left to you. Next: postflight check {folder}"
-    console.print(escape(said), highlight=False)
+    following = f"{len(still_open)} values to fill in. Next: postflight check {folder}"
+    console.print(escape(following), highlight=False)
 
 
-def _delivered(files: tuple[Path, ...], folder: Path) -> Delivered:
+def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
     """Sort and read what was delivered; `GateError` with every table that cannot be read."""
-    came = Delivered()
+    came = _Delivery()
     faults: list[str] = []
     for file in files:
-        video = video_of(file, folder / "telemetry")
+        video = _video_of(file, folder / "telemetry")
         if video is not None:
             came.videos.append(video)
             came.skipped += _beside_pictures(file, video)
         elif file.is_dir():
             came.skipped.append(f"{file}: a folder without pictures; name the files in it: {file / '*'}")
-        elif file.suffix.lower() in DAVEML:
+        elif file.suffix.lower() in _DAVEML:
             came.daveml[file] = _bytes_of(file)
-        elif file.suffix.lower() in PICTURES:
+        elif file.suffix.lower() in _PICTURES:
             came.skipped.append(f"{file}: a picture alone; name the folder that holds a video's pictures")
         else:
             try:
-                came.tables += read_matlab(file) if file.suffix.lower() in MATLAB else [read_loose(file)]
+                came.tables += read_matlab(file) if file.suffix.lower() in _MATLAB else [read_text_table(file)]
             except ConfigError:
                 raise
             except GateError as fault:
-                if file.suffix.lower() in TABLES or not file.is_file():
+                if file.suffix.lower() in _TABLES or not file.is_file():
                     faults += fault.faults
                 else:
                     came.skipped += fault.faults
     if faults:
         raise GateError(faults)
     if not (came.tables or came.videos or came.daveml):
-        raise GateError(came.skipped)
+        raise GateError(came.skipped, code="nothing-to-import")
     came.tables = [radiosonde_table(table) or table for table in came.tables]
     return came
 
@@ -475,10 +489,11 @@ def _bytes_of(file: Path) -> bytes:
     try:
         return file.read_bytes()
     except OSError as fault:
-        raise GateError(f"{file}: cannot be read: {fault.strerror or fault}") from None
+        words = f"cannot be read: {fault.strerror or fault}"
+        raise GateError(f"{file}: {words}", code="file-unreadable") from None
 
 
-def _coefficients(came: Delivered, folder: Path, tables: dict[str, Any]) -> None:
+def _coefficients(came: _Delivery, folder: Path, tables: dict[str, Any]) -> None:
     """Move coefficient tables to the files, beside the vehicle file, each with a form for its sidecar."""
     vehicle = _own_vehicle(folder, tables)
     found: list[tuple[Path, bytes, dict[str, str], list[str]]] = []
@@ -493,12 +508,14 @@ def _coefficients(came: Delivered, folder: Path, tables: dict[str, Any]) -> None
     for place, content, columns, notes in found:
         if place.with_suffix(".toml") == vehicle:  # the sidecar has the table's stem
             place = place.with_stem(f"{place.stem}_coefficients")
+        if place in came.files:
+            raise ConfigError(f"{place}: two delivered tables of this name; rename one", code="file-exists")
         came.files |= {place: content, place.with_suffix(".toml"): sidecar_text(columns)}
         text = came.vehicle.get(vehicle) or (vehicle.read_text(encoding="utf-8-sig") if vehicle.is_file() else "")
-        named = named_in_form(text, place.name)
+        named = _named_in_form(text, place.name)
         if named is not None:
             came.vehicle[vehicle] = named
-        came.notes += [f"{place}: {words}" for words in (*notes, *how_to_name(place, vehicle, named is not None))]
+        came.notes += [f"{place}: {words}" for words in (*notes, *_how_to_name(place, vehicle, named is not None))]
 
 
 def _own_vehicle(folder: Path, tables: dict[str, Any]) -> Path:
@@ -515,33 +532,33 @@ def _plain(label: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "_", label).strip("_") or "table"
 
 
-def _place(folder: Path, table: LooseTable) -> Path:
+def _place(folder: Path, table: FreeFormTable) -> Path:
     return folder / "telemetry" / f"{_plain(table.label)}.csv"
 
 
 def _proposals(
-    came: Delivered, places: list[Path], folder: Path, tables: dict[str, Any]
-) -> tuple[str, list[tuple[LooseTable, list[SourceProposal], list[str]]]]:
+    came: _Delivery, places: list[Path], folder: Path, tables: dict[str, Any]
+) -> tuple[str, list[tuple[FreeFormTable, list[SourceProposal], list[str]]]]:
     """Text to add to flight.toml, and what to print."""
     taken = _sections(tables)
-    added, shown, doubtful = [], [], []
+    added, shown, unrecognised = [], [], []
     videos = [*came.videos, *_earlier_videos(folder)]
-    cameras = cameras_of(folder, tables)
+    cameras = _cameras_of(folder, tables)
     for table, place in zip(came.tables, places, strict=True):
-        split_clocks(table)
+        add_clock_columns(table)
         frames = frame_list(table, videos, cameras, folder)
-        reader = Reader(table)
-        found, left = reader.everything() if frames is None else ([frames], [])
-        if frames is None and reader.may_be_inertial():
-            doubtful.append(table.label)
-        shown.append((table, found, left))
+        recogniser = Recogniser(table)
+        found, unused = recogniser.proposals() if frames is None else ([frames], [])
+        if frames is None and recogniser.may_be_inertial():
+            unrecognised.append(table.label)
+        shown.append((table, found, unused))
         for source in found:
             file = place.relative_to(folder).as_posix()
             added.append(section_text(source, file, table.notes, source.section in taken))
             taken.add(source.section)
-    said = "".join(added)
-    added += [without_list(v, folder) for v in came.videos if v.place.relative_to(folder).as_posix() not in said]
-    start = start_text(taken, tables, doubtful)
+    listed = "".join(added)
+    added += [_without_list(v, folder) for v in came.videos if v.place.relative_to(folder).as_posix() not in listed]
+    start = start_text(taken, tables, unrecognised)
     return "".join(f"\n{text}" for text in (*added, start) if text), shown
 
 
@@ -549,7 +566,7 @@ def _earlier_videos(folder: Path) -> list[Video]:
     """Pictures and films that an earlier import brought."""
     telemetry = folder / "telemetry"
     there = sorted(telemetry.iterdir()) if telemetry.is_dir() else []
-    return [v for p in there if not p.name.startswith(".") and (v := video_of(p, telemetry)) is not None]
+    return [v for p in there if not p.name.startswith(".") and (v := _video_of(p, telemetry)) is not None]
 
 
 def _sections(tables: dict[str, Any]) -> set[str]:
@@ -559,9 +576,9 @@ def _sections(tables: dict[str, Any]) -> set[str]:
     return out
 
 
-def print_proposals(shown: list[tuple[LooseTable, list[SourceProposal], list[str]]]) -> None:
-    """One table for each file: column, what it is taken for, unit, and why; below it what was changed and not used."""
-    for table, found, left in shown:
+def _print_proposals(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> None:
+    """Print a table for each file: column, quantity, unit, and why; below it what was changed and not used."""
+    for table, found, unused in shown:
         screen = Table(title=escape(table.label), title_justify="left")
         for name in ("column", "as", "unit", "how", "why"):
             screen.add_column(name, overflow="fold")
@@ -578,5 +595,5 @@ def print_proposals(shown: list[tuple[LooseTable, list[SourceProposal], list[str
         else:
             words = f"{table.label}: nothing recognised among {', '.join(table.names)}"
             console.print(f"[yellow]{escape(words)}[/]; its columns can be declared in flight.toml by hand")
-        for words in (*table.notes, *([f"not used: {', '.join(left)}"] if left and found else [])):
+        for words in (*table.notes, *([f"not used: {', '.join(unused)}"] if unused and found else [])):
             console.print(f"  {escape(words)}", highlight=False)

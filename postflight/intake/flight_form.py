@@ -1,13 +1,11 @@
-"""Which keys may a file hold? JSON Schema for editors, from the very models that read the files.
+"""What do flight.toml and the vehicle file hold before the analyst's own values: forms, schema, placeholders,
+proposals?
 
-What a key means is taken from the comments of the templates that ``postflight init`` writes. The schema says less than
-the reader: it knows types, bounds and names, not what goes together.
-
-Which values has an analyst still to write? Counted in the same way by ``import`` and by ``check``.
-
-How a proposal stands in flight.toml: tables to correct, with why each column was taken for what, and questions.
-
-What ``postflight init`` writes: a flight folder to fill in, with the schemas that editors check by.
+Forms are templates whose comments explain each key; a value ``"FILL IN"`` is a placeholder that no reader accepts.
+The JSON Schema for editors is made from the very models that read the files, with the templates' comments as
+descriptions; it states types, bounds and names, not what goes together. A proposal of ``postflight import`` becomes a
+table of flight.toml with the reason for each column, and comments with ``QUESTION`` where more than one reading is
+possible.
 """
 
 from __future__ import annotations
@@ -25,43 +23,61 @@ from rich.console import Console
 from rich.markup import escape
 
 from flightmodel.aerodynamics import Sidecar
-from flightmodel.checks import ConfigError
+from flightmodel.checks import ConfigError, write_file
 from flightmodel.config import FILL_IN, FILL_IN_VALUE, read_toml
 from flightmodel.flightfile import FlightFile
-from flightmodel.tables import UNITS
+from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES, UNITS
 from flightmodel.vehicle import DATA, VehicleFile, vehicle_from_toml, vehicle_path
-from postflight.intake.propose import ASKED, Mapped, SourceProposal, TimeMapped, quoted
-from postflight.run_folder import write_file
-from synthetic_flight.scenarios import ScenarioFile
+from postflight.intake.column_recognition import (
+    ASKED,
+    FILL_IN_TOML,
+    STATED,
+    ColumnProposal,
+    SourceProposal,
+    TimeProposal,
+    quoted,
+)
 
-MODELS: dict[str, type[BaseModel]] = {
-    "flight": FlightFile,
-    "vehicle": VehicleFile,
-    "scenario": ScenarioFile,
-    "coefficients": Sidecar,
-}
-HEADER = re.compile(r"^(?:# )?\[\[?([\w.]+)\]\]?")
-KEY = re.compile(r"^(?:# )?(\w+) = (.*?)\s+# (.*)$")
+_EVERY_QUANTITY = (*ACCELEROMETER, *RATES, *MAGNETOMETER, *RADAR, *GNSS, *BAROMETER, *ATMOSPHERE)
+KINDS = ("flight", "vehicle", "scenario", "coefficients")
+_HEADER = re.compile(r"^(?:# )?\[\[?([\w.]+)\]\]?")
+_KEY = re.compile(r"^(?:# )?(\w+) = (.*?)\s+# (.*)$")
+_WIDTH = 62  # of a line's value, before its comment
+_VEHICLE_LINE = '# vehicle = "vehicle/vehicle.toml"    #'
+console = Console(soft_wrap=True)
+
+
+# forms and schema
 
 
 def template(kind: str) -> str:
-    """Text of the template of a ``flight`` or a ``vehicle``."""
+    """Return the text of the form of a ``flight`` or a ``vehicle``."""
     return (files("postflight.intake") / "templates" / f"{kind}.toml").read_text(encoding="utf-8")
 
 
 def template_keys(kind: str) -> Iterator[tuple[str, str, str, str]]:
-    """Table, key, value as written and comment of each line of a template that names a key."""
+    """Yield table, key, value as written and comment of each line of a template that names a key."""
     table = ""
     for line in template(kind).splitlines():
-        if header := HEADER.match(line):
+        if header := _HEADER.match(line):
             table = header[1]
-        elif key := KEY.match(line):
+        elif key := _KEY.match(line):
             yield table, key[1], key[2], key[3]
 
 
+def model(kind: str) -> type[BaseModel]:
+    """Return the model that reads files of this kind, one of `KINDS`."""
+    if kind == "scenario":
+        from synthetic_flight.scenarios import ScenarioFile  # init, import and check need no simulator
+
+        return ScenarioFile
+    models: dict[str, type[BaseModel]] = {"flight": FlightFile, "vehicle": VehicleFile, "coefficients": Sidecar}
+    return models[kind]
+
+
 def schema(kind: str) -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of a file of this kind."""
-    made = MODELS[kind].model_json_schema()
+    """Return the JSON Schema (draft 2020-12) of a file of this kind, one of `KINDS`."""
+    made = model(kind).model_json_schema()
     made = {"$schema": "https://json-schema.org/draft/2020-12/schema", **made}
     if kind in ("flight", "vehicle"):
         for table, key, _, comment in template_keys(kind):
@@ -100,24 +116,27 @@ def _resolved(made: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
             return node
 
 
-def left_to_fill_in(folder: Path) -> list[str]:
-    """Values that say FILL IN, each with file and key: of flight.toml, its vehicle file, and the table's sidecar.
+# placeholders
+
+
+def placeholders(folder: Path) -> list[str]:
+    """Return the placeholders of flight.toml, its vehicle file and the coefficients' sidecar, with file and key.
 
     Files that cannot be read hold none: they are refused elsewhere.
     """
     flight = _tables(folder / "flight.toml")
-    out = _said(folder / "flight.toml", flight)
+    out = _placeholders_of(folder / "flight.toml", flight)
     named = flight.get("vehicle")
     if not isinstance(named, str) or not named.endswith(".toml"):
         return out
     path = vehicle_path(named, folder)
     vehicle = _tables(path)
-    out += _said(path, vehicle)
+    out += _placeholders_of(path, vehicle)
     aerodynamics = vehicle.get("aerodynamics")
     table = aerodynamics.get("table") if isinstance(aerodynamics, dict) else None
     if isinstance(table, str):
         sidecar = (path.parent / table).with_suffix(".toml")
-        out += _said(sidecar, _tables(sidecar))
+        out += _placeholders_of(sidecar, _tables(sidecar))
     return out
 
 
@@ -128,29 +147,40 @@ def _tables(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _said(path: Path, tables: dict[str, Any]) -> list[str]:
-    return [f"{path}: key '{key}' {FILL_IN}" for key in _keys(tables, "")]
+def _placeholders_of(path: Path, tables: dict[str, Any]) -> list[str]:
+    return [f"{path}: key '{key}' {FILL_IN}" for key in _open_keys(tables, "")]
 
 
-def _keys(value: Any, at: str) -> Iterator[str]:
-    """Dotted names of what says FILL IN; a list counts once."""
+def _open_keys(value: Any, at: str) -> Iterator[str]:
+    """Dotted names of placeholders; a list counts once."""
     if isinstance(value, dict):
         for key, inner in value.items():
-            yield from _keys(inner, f"{at}.{key}" if at else key)
+            yield from _open_keys(inner, f"{at}.{key}" if at else key)
     elif isinstance(value, list) and any(isinstance(inner, (dict, list)) for inner in value):
         for k, inner in enumerate(value):
-            yield from _keys(inner, f"{at}.{k}")
-    elif any(
-        isinstance(v, str) and v.startswith(FILL_IN_VALUE) for v in (value if isinstance(value, list) else [value])
-    ):
-        yield at
+            yield from _open_keys(inner, f"{at}.{k}")
+    else:
+        leaves = value if isinstance(value, list) else [value]
+        if any(isinstance(leaf, str) and leaf.startswith(FILL_IN_VALUE) for leaf in leaves):
+            yield at
 
 
-WIDTH = 62  # of a line's value, before its comment
+# proposals
 
 
 def section_text(source: SourceProposal, file: str, notes: list[str], taken: bool) -> str:
-    """Return the TOML of one table; as comments below a question where flight.toml has that table already."""
+    """Return the TOML of one proposal.
+
+    Parameters
+    ----------
+    source : SourceProposal
+    file : str
+        Of its table, relative to flight.toml.
+    notes : list of str
+        What was changed in the file, as comments.
+    taken : bool
+        Whether flight.toml has that table already: all becomes comments below a question.
+    """
     lines = [f"[{source.section}]"]
     lines += [f"# {note}" for note in notes]
     lines.append(f"file = {quoted(file)}")
@@ -167,38 +197,44 @@ def section_text(source: SourceProposal, file: str, notes: list[str], taken: boo
     return "\n".join(lines) + "\n"
 
 
-def start_text(sections: set[str], tables: dict[str, Any], doubtful: list[str]) -> str:
-    """Return what the tables ask for besides: how the vehicle was turned, or how it moves without inertial sensors.
+def start_text(sections: set[str], tables: dict[str, Any], unrecognised: list[str]) -> str:
+    """Return what the tables need besides: an attitude, or a model of motion where there are no inertial sensors.
 
-    ``doubtful`` names files with columns that were recognised as nothing and may be an accelerometer's or gyros'.
+    Parameters
+    ----------
+    sections : set of str
+        Tables of flight.toml, proposed ones among them, as ``sensors.rates``.
+    tables : dict
+        Of flight.toml as it is.
+    unrecognised : list of str
+        Names of files with columns that were recognised as nothing and may be an accelerometer's or gyros'.
     """
-    inertial = {"sensors.accelerometer", "sensors.rates"} <= sections
-    if inertial:
-        return _ballistic_doubt(tables) + _attitude_text(tables)
+    if {"sensors.accelerometer", "sensors.rates"} <= sections:
+        return _ballistic_question(tables) + _attitude_text(tables)
     tracked = any(s.startswith(("radars.", "gnss.")) for s in sections)
     if not tracked or "motion" in tables:
         return ""
     text = (
         "[motion]                          # no accelerometer with gyros yet: gravitation and drag carry the flight\n"
         'model = "ballistic"               # take [motion] out once both are there\n'
-        'drag_area_per_mass_m2pkg = "FILL IN"  # m2/kg: C_D S / m, to a factor of 2.7\n'
+        f"drag_area_per_mass_m2pkg = {FILL_IN_TOML}  # m2/kg: C_D S / m, to a factor of 2.7\n"
     )
-    if not doubtful:
+    if not unrecognised:
         return text
     first = (
-        f"# QUESTION: {one_line(', '.join(doubtful))} may hold an accelerometer or gyros: declare the columns above.\n"
+        f"# QUESTION: {_one_line(', '.join(unrecognised))} may hold an accelerometer or gyros: declare the columns.\n"
         "# Only a flight without both moves like this:\n"
     )
-    return first + "".join(f"# {line}\n" for line in text.replace("FILL IN", "...").splitlines())
+    return first + "".join(f"# {line}\n" for line in text.replace(FILL_IN_VALUE, "...").splitlines())
 
 
-def _ballistic_doubt(tables: dict[str, Any]) -> str:
-    """Return the question that an earlier ``[motion]`` is, once inertial sensors are there."""
+def _ballistic_question(tables: dict[str, Any]) -> str:
+    """Return the question about an earlier ``[motion]``, once inertial sensors are there."""
     motion = tables.get("motion")
     if not isinstance(motion, dict) or motion.get("model") != "ballistic":
         return ""
     return (
-        '# QUESTION: [motion] above says model = "ballistic", so accelerometer and gyros would not carry the flight:\n'
+        '# QUESTION: [motion] above has model = "ballistic", so accelerometer and gyros would not carry the flight:\n'
         "# take [motion] out, unless that is meant.\n"
     )
 
@@ -207,21 +243,21 @@ def _attitude_text(tables: dict[str, Any]) -> str:
     if "attitude_prior" in tables:
         return ""
     return (
-        "[attitude_prior]                  # how the vehicle was turned at one time; or q_ecef_body, scalar first\n"
-        't_s = "FILL IN"                   # s after t0\n'
-        'azimuth_deg = "FILL IN"           # deg from true north: where the nose points\n'
-        'elevation_deg = "FILL IN"         # deg above the horizon\n'
-        'roll_deg = "FILL IN"              # deg; at 0 body y is level and points right of one who looks along x\n'
+        "[attitude_prior]                  # attitude at one time, by three angles or q_ecef_body, scalar first\n"
+        f"t_s = {FILL_IN_TOML}                   # s after t0\n"
+        f"azimuth_deg = {FILL_IN_TOML}           # deg from true north: where the nose points\n"
+        f"elevation_deg = {FILL_IN_TOML}         # deg above the horizon\n"
+        f"roll_deg = {FILL_IN_TOML}              # deg; at 0 body y is level, to the right of one who looks along x\n"
         "# q_ecef_body = [1.0, 0.0, 0.0, 0.0]  # instead of these three: body to ECEF, scalar FIRST, e.g.\n"
         "sd_deg = 3.0                      # deg, one number or one for body x, y, z\n"
     )
 
 
 def _line(text: str, comment: str) -> str:
-    return f"{text:<{WIDTH}} # {comment}" if comment else text
+    return f"{text:<{_WIDTH}} # {comment}" if comment else text
 
 
-def _time_lines(time: TimeMapped) -> list[str]:
+def _time_lines(time: TimeProposal) -> list[str]:
     parts = []
     if time.format == "utc_hms":
         parts.append(f"columns = [{', '.join(quoted(c) for c in time.columns)}]")
@@ -230,9 +266,9 @@ def _time_lines(time: TimeMapped) -> list[str]:
     if time.format != "seconds":
         parts.append(f'format = "{time.format}"')
     elif time.unit != "s":
-        parts.append(f'unit = "{time.unit or "FILL IN"}"')
+        parts.append(f'unit = "{time.unit or FILL_IN_VALUE}"')
     if time.offset_asked:
-        parts.append('offset_s = "FILL IN"')
+        parts.append(f"offset_s = {FILL_IN_TOML}")
     why = time.why
     if time.format == "seconds" and not time.unit:
         why = f"which unit? s, ms, us, min; {why}"
@@ -243,33 +279,29 @@ def _time_lines(time: TimeMapped) -> list[str]:
     return [_line(f"time = {{ {', '.join(parts)} }}", why)] if parts else ([f"# time: {why}"] if time.others else [])
 
 
-def _column_line(mapped: Mapped) -> str:
-    text = f'{mapped.short} = {{ column = {quoted(mapped.column)}, unit = "{mapped.unit or "FILL IN"}" }}'
-    if mapped.how == ASKED:
-        return _line(text, f"which unit? {', '.join(units_of(mapped.short))}; {one_line(mapped.why)}")
-    return _line(text, one_line(mapped.why) if mapped.how == "stated" else f"by its numbers: {one_line(mapped.why)}")
+def _column_line(m: ColumnProposal) -> str:
+    text = f'{m.short} = {{ column = {quoted(m.column)}, unit = "{m.unit or FILL_IN_VALUE}" }}'
+    if m.how == ASKED:
+        return _line(text, f"which unit? {', '.join(_units_of(m.short))}; {_one_line(m.why)}")
+    return _line(text, _one_line(m.why) if m.how == STATED else f"by its numbers: {_one_line(m.why)}")
 
 
-def units_of(short: str) -> list[str]:
+def _units_of(short: str) -> list[str]:
     """Units that a quantity may have, the usual ones first."""
-    from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES
-
-    every = (*ACCELEROMETER, *RATES, *MAGNETOMETER, *RADAR, *GNSS)
-    known = next((q for q in (*every, *BAROMETER, *ATMOSPHERE) if q.short == short), None)
+    known = next((q for q in _EVERY_QUANTITY if q.short == short), None)
     return [u for u, (kind, _, _) in UNITS.items() if known is not None and kind == known.kind]
 
 
-def one_line(text: str) -> str:
+def _one_line(text: str) -> str:
     """Text that is safe in a comment."""
     return re.sub(r"[\x00-\x1f\x7f]", " ", text)
 
 
-console = Console(soft_wrap=True)
-VEHICLE_LINE = '# vehicle = "vehicle/vehicle.toml"    #'
+# the command
 
 
 def init(folder: Path, vehicle: str | None) -> None:
-    """Write the files and say what comes next.
+    """Write the forms of a new flight folder and print what comes next.
 
     Parameters
     ----------
@@ -281,14 +313,13 @@ def init(folder: Path, vehicle: str | None) -> None:
     Raises
     ------
     ConfigError
-        Where a file that would be written exists, or no such vehicle is known.
+        ``file-exists`` where a file would be overwritten, or what `flightmodel.vehicle` refuses.
     """
     texts, copies = _contents(folder, vehicle)
     there = [path for path in (*texts, *copies) if path.exists()]
     if there:
-        raise ConfigError(
-            [f"{path}: exists already, and nothing is overwritten; name another folder" for path in there]
-        )
+        words = "exists already, and nothing is overwritten; name another folder"
+        raise ConfigError([f"{path}: {words}" for path in there], code="file-exists")
     (folder / "telemetry").mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
         write_file(path, text)
@@ -297,10 +328,9 @@ def init(folder: Path, vehicle: str | None) -> None:
         shutil.copyfile(source, path)
     for path in (*texts, *copies):
         console.print(f"written {escape(str(path))}", highlight=False)
-    left = sum(text.count(f'"{FILL_IN_VALUE}"') for text in texts.values())
-    console.print(
-        f"{left} values say FILL IN. Next: postflight import FILES... --into {escape(str(folder))}", highlight=False
-    )
+    still_open = sum(text.count(FILL_IN_TOML) for text in texts.values())
+    following = f"{still_open} values to fill in. Next: postflight import FILES... --into {escape(str(folder))}"
+    console.print(following, highlight=False)
 
 
 def _contents(folder: Path, vehicle: str | None) -> tuple[dict[Path, str], dict[Path, Path]]:
@@ -318,10 +348,7 @@ def _contents(folder: Path, vehicle: str | None) -> tuple[dict[Path, str], dict[
             read = vehicle_from_toml(source)
             named = f"vehicle/{source.name}"
             copies = {folder / "vehicle" / name: source.parent / name for name in (source.name, *read.files)}
-    assert VEHICLE_LINE in flight
-    texts[folder / "flight.toml"] = flight.replace(VEHICLE_LINE, _vehicle_line(named))
+    assert _VEHICLE_LINE in flight
+    line = f"vehicle = {quoted(named)}".ljust(_VEHICLE_LINE.index("#", 1)) + "#"
+    texts[folder / "flight.toml"] = flight.replace(_VEHICLE_LINE, line)
     return texts, copies
-
-
-def _vehicle_line(vehicle: str) -> str:
-    return f"vehicle = {json.dumps(vehicle, ensure_ascii=False)}".ljust(VEHICLE_LINE.index("#", 1)) + "#"

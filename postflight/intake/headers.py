@@ -1,4 +1,9 @@
-"""What words in a header mean: names of quantities in English and German, abbreviations, and units however written."""
+"""What does a column's name mean? Header vocabulary in English and German: quantities, axes, units however written.
+
+A name is folded (lower case, no umlauts or raised digits), its unit split off, the rest cut into tokens; a quantity is
+recognised where a token is in its vocabulary, whole or cut short. What the vocabulary leaves open (``G`` is g or gauss)
+stays open here: `postflight.intake.column_recognition` decides by the numbers, or asks.
+"""
 
 from __future__ import annotations
 
@@ -7,237 +12,110 @@ from dataclasses import dataclass
 
 from flightmodel.tables import UNITS
 
-FOLD = str.maketrans(
+_FOLD = str.maketrans(
+    {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "µ": "u", "μ": "u", "²": "2", "³": "3", "⁻": "-"}
+    | dict.fromkeys("·^*", "")
+)
+# unit in flight.toml -> spellings in files (folded, without spaces) beside its own name
+_SPELLINGS = {
+    "s": "sec secs seconds sekunden sek",
+    "ms": "msec milliseconds",
+    "us": "usec microseconds",
+    "min": "minutes",
+    "m": "metres meters meter metre",
+    "ft": "feet foot",
+    "yd": "yards yard yds",
+    "nmi": "nm",
+    "km": "kilometer",
+    "kft": "kilofeet",
+    "deg": "degrees degree grad degn dege",
+    "rad": "radians radian",
+    "mil": "mils",
+    "mps2": "m/s2 m/s/s ms-2 ms2 m/sec2 m_s2",
+    "g": "gs g's gee gn g0",
+    "gauss": "g gs",
+    "mg": "milli-g",
+    "ftps2": "ft/s2 ft/sec2",
+    "degps": "deg/s deg/sec dps grad/s degs-1 deg_s",
+    "radps": "rad/s rad_s rads-1 rad/sec",
+    "rpm": "1/min u/min",
+    "t": "tesla",
+    "ut": "microtesla",
+    "nt": "nanotesla",
+    "mps": "m/s ms-1 m/sec m_s",
+    "cmps": "cm/s",
+    "mmps": "mm/s",
+    "kmh": "km/h kph km_h",
+    "kt": "knots knot kn kts",
+    "ftps": "ft/s fps ft_s",
+    "kgpm3": "kg/m3 kgm-3",
+    "gpm3": "g/m3",
+    "k": "kelvin",
+    "degc": "c celsius",
+    "hpa": "mbar mb",
+    "percent": "%",
+}
+# spelling -> units in flight.toml; several where the quantity decides
+UNIT_SPELLINGS: dict[str, tuple[str, ...]] = {name: (name,) for name in UNITS if name != "1"}
+for _unit, _written in _SPELLINGS.items():
+    for _spelling in _written.split():
+        UNIT_SPELLINGS[_spelling] = (*UNIT_SPELLINGS.get(_spelling, ()), _unit)
+SEVERAL_MEANINGS = {"rps": "rad/s or revolutions a second"}
+
+
+def _vocabulary(words: dict[str, str]) -> dict[str, set[str]]:
+    return {quantity: set(tokens.split()) for quantity, tokens in words.items()}
+
+
+QUANTITIES = _vocabulary(
     {
-        "ä": "ae",
-        "ö": "oe",
-        "ü": "ue",
-        "ß": "ss",
-        "µ": "u",
-        "μ": "u",
-        "²": "2",
-        "³": "3",
-        "·": "",
-        "^": "",
-        "*": "",
-        "⁻": "-",
+        "time": "t time zeit tplus met tlog uhrzeit irig utc timestamp tow gmt sod sekunde",
+        "range": "range rng slant slantrange entfernung distanz schraegentfernung dist distance",
+        "az": "az azimuth azimut azi azm peilung bearing",
+        "el": "el elevation elev elv hoehenwinkel erhebung elevationswinkel",
+        "lat": "lat latitude breite breitengrad phi",
+        "lon": "lon long lng longitude laenge laengengrad",
+        "alt": "alt altitude height hoehe hgt hght h geopot z",
+        "pressure": "pressure press druck luftdruck p pres static",
+        "temperature": "temperature temp temperatur t lufttemperatur",
+        "dewpoint": "td dwpt dewpoint taupunkt dew",
+        "rho": "rho density dichte dens luftdichte",
+        "wind_speed": "windspeed wspd ff sknt windgeschwindigkeit smps wind",
+        "wind_from": "winddir wdir dd drct windrichtung from wd",
+        "wind_north": "windn v vgrd meridional",
+        "wind_east": "winde u ugrd zonal",
+        "nsat": "nsat sats satellites satelliten numsv nsats sat",
     }
 )
-# a unit as files write it (folded, without spaces) -> names in flight.toml; several where the quantity decides
-UNIT_WORDS: dict[str, tuple[str, ...]] = {
-    **{name: (name,) for name in UNITS if name != "1"},
-    "sec": ("s",),
-    "secs": ("s",),
-    "seconds": ("s",),
-    "sekunden": ("s",),
-    "sek": ("s",),
-    "msec": ("ms",),
-    "usec": ("us",),
-    "microseconds": ("us",),
-    "milliseconds": ("ms",),
-    "minutes": ("min",),
-    "metres": ("m",),
-    "meters": ("m",),
-    "meter": ("m",),
-    "metre": ("m",),
-    "feet": ("ft",),
-    "foot": ("ft",),
-    "yards": ("yd",),
-    "yard": ("yd",),
-    "yds": ("yd",),
-    "nm": ("nmi",),
-    "kilometer": ("km",),
-    "kilofeet": ("kft",),
-    "degrees": ("deg",),
-    "degree": ("deg",),
-    "grad": ("deg",),
-    "degn": ("deg",),
-    "dege": ("deg",),
-    "radians": ("rad",),
-    "radian": ("rad",),
-    "mils": ("mil",),
-    "m/s2": ("mps2",),
-    "m/s/s": ("mps2",),
-    "ms-2": ("mps2",),
-    "ms2": ("mps2",),
-    "m/sec2": ("mps2",),
-    "gs": ("g", "gauss"),
-    "g's": ("g",),
-    "g": ("g", "gauss"),
-    "gee": ("g",),
-    "gn": ("g",),
-    "g0": ("g",),
-    "milli-g": ("mg",),
-    "ft/s2": ("ftps2",),
-    "ft/sec2": ("ftps2",),
-    "deg/s": ("degps",),
-    "deg/sec": ("degps",),
-    "dps": ("degps",),
-    "grad/s": ("degps",),
-    "degs-1": ("degps",),
-    "rad/s": ("radps",),
-    "rad_s": ("radps",),
-    "deg_s": ("degps",),
-    "m_s2": ("mps2",),
-    "m_s": ("mps",),
-    "ft_s": ("ftps",),
-    "km_h": ("kmh",),
-    "rads-1": ("radps",),
-    "rad/sec": ("radps",),
-    "1/min": ("rpm",),
-    "u/min": ("rpm",),
-    "tesla": ("t",),
-    "microtesla": ("ut",),
-    "nanotesla": ("nt",),
-    "m/s": ("mps",),
-    "ms-1": ("mps",),
-    "m/sec": ("mps",),
-    "cm/s": ("cmps",),
-    "mm/s": ("mmps",),
-    "km/h": ("kmh",),
-    "kph": ("kmh",),
-    "knots": ("kt",),
-    "knot": ("kt",),
-    "kn": ("kt",),
-    "kts": ("kt",),
-    "ft/s": ("ftps",),
-    "fps": ("ftps",),
-    "kg/m3": ("kgpm3",),
-    "kgm-3": ("kgpm3",),
-    "g/m3": ("gpm3",),
-    "kelvin": ("k",),
-    "c": ("degc",),
-    "celsius": ("degc",),
-    "mbar": ("hpa",),
-    "mb": ("hpa",),
-    "%": ("percent",),
-}
-SEVERAL_MEANINGS = {"rps": "rad/s or revolutions a second"}
-# tokens of a name -> quantity
-QUANTITY_WORDS: dict[str, set[str]] = {
-    "time": {
-        "t",
-        "time",
-        "zeit",
-        "tplus",
-        "met",
-        "tlog",
-        "uhrzeit",
-        "irig",
-        "utc",
-        "timestamp",
-        "tow",
-        "gmt",
-        "sod",
-        "sekunde",
-    },
-    "range": {"range", "rng", "slant", "slantrange", "entfernung", "distanz", "schraegentfernung", "dist", "distance"},
-    "az": {"az", "azimuth", "azimut", "azi", "azm", "peilung", "bearing"},
-    "el": {"el", "elevation", "elev", "elv", "hoehenwinkel", "erhebung", "elevationswinkel"},
-    "lat": {"lat", "latitude", "breite", "breitengrad", "phi"},
-    "lon": {"lon", "long", "lng", "longitude", "laenge", "laengengrad"},
-    "alt": {"alt", "altitude", "height", "hoehe", "hgt", "hght", "h", "geopot", "z"},
-    "pressure": {"pressure", "press", "druck", "luftdruck", "p", "pres", "static"},
-    "temperature": {"temperature", "temp", "temperatur", "t", "lufttemperatur"},
-    "dewpoint": {"td", "dwpt", "dewpoint", "taupunkt", "dew"},
-    "rho": {"rho", "density", "dichte", "dens", "luftdichte"},
-    "wind_speed": {"windspeed", "wspd", "ff", "sknt", "windgeschwindigkeit", "smps", "wind"},
-    "wind_from": {"winddir", "wdir", "dd", "drct", "windrichtung", "from", "wd"},
-    "wind_north": {"windn", "v", "vgrd", "meridional"},
-    "wind_east": {"winde", "u", "ugrd", "zonal"},
-    "nsat": {"nsat", "sats", "satellites", "satelliten", "numsv", "nsats", "sat"},
-}
-TRIAD_WORDS: dict[str, set[str]] = {
-    "acceleration": {
-        "a",
-        "acc",
-        "accel",
-        "acceleration",
-        "accelerometer",
-        "beschleunigung",
-        "beschl",
-        "f",
-        "n",  # load factor
-        "nf",
-        "sf",
-        "load",
-        "loadfactor",
-    },
-    "rate": {
-        "w",
-        "om",
-        "omega",
-        "gyro",
-        "gyr",
-        "rate",
-        "rates",
-        "drehrate",
-        "kreisel",
-        "angular",
-        "winkelgeschwindigkeit",
-    },
-    "magnetic field": {"m", "h", "mag", "magnet", "magnetometer", "b", "field", "feld", "magnetfeld"},
-    "speed": {"v", "vel", "velocity", "geschwindigkeit"},
-    "length": {"pos", "position", "r", "ecef"},
-}
+# three orthogonal sensors, or a vector; n and nf are load factors
+VECTORS = _vocabulary(
+    {
+        "acceleration": "a acc accel acceleration accelerometer beschleunigung beschl f n nf sf load loadfactor",
+        "rate": "w om omega gyro gyr rate rates drehrate kreisel angular winkelgeschwindigkeit",
+        "magnetic field": "m h mag magnet magnetometer b field feld magnetfeld",
+        "speed": "v vel velocity geschwindigkeit",
+        "length": "pos position r ecef",
+    }
+)
+_ABOUT_AXES = (
+    "roll rollrate rollen rollgeschwindigkeit p",
+    "pitch pitchrate nicken nick nickrate nickgeschwindigkeit q",
+    "yaw yawrate gieren gier gierrate giergeschwindigkeit r",
+)
+_DIRECTIONS = ("n north nord", "e east ost", "d down unten")
+BODY_RATES = {name for names in _ABOUT_AXES for name in names.split()}
+NED = {name for names in _DIRECTIONS for name in names.split()}
 AXES = {
-    "x": 0,
-    "y": 1,
-    "z": 2,
-    "roll": 0,
-    "pitch": 1,
-    "yaw": 2,
-    "rollrate": 0,
-    "pitchrate": 1,
-    "yawrate": 2,
-    "rollen": 0,
-    "nicken": 1,
-    "gieren": 2,
-    "nick": 1,
-    "gier": 2,
-    "nickrate": 1,
-    "gierrate": 2,
-    "p": 0,
-    "q": 1,
-    "r": 2,
-    "rollgeschwindigkeit": 0,
-    "nickgeschwindigkeit": 1,
-    "giergeschwindigkeit": 2,
-    "n": 0,
-    "e": 1,
-    "d": 2,
-    "north": 0,
-    "east": 1,
-    "down": 2,
-    "nord": 0,
-    "ost": 1,
-    "unten": 2,
+    name: axis
+    for family in (("x", "y", "z"), _ABOUT_AXES, _DIRECTIONS)
+    for axis, names in enumerate(family)
+    for name in names.split()
 }
-BODY_RATES = {"roll", "pitch", "yaw", "p", "q", "r", "nick", "gier", "rollen", "nicken", "gieren"} | {
-    "rollrate",
-    "pitchrate",
-    "yawrate",
-    "nickrate",
-    "gierrate",
-    "rollgeschwindigkeit",
-    "nickgeschwindigkeit",
-    "giergeschwindigkeit",
-}
-NED = {"n", "e", "d", "north", "east", "down", "nord", "ost", "unten"}
-
-
-EVERY_WORD = {w for words in (*QUANTITY_WORDS.values(), *TRIAD_WORDS.values(), AXES) for w in words}
-
-
-def means(tokens: tuple[str, ...], words: set[str]) -> set[str]:
-    """Tokens of a name that say one of these words, whole or cut short (``azim``), where that is no word of its own."""
-    said = set(tokens) & words
-    cut = {t for t in tokens if len(t) >= 3 and t not in EVERY_WORD}
-    return said | {t for t in cut if any(w.startswith(t) and len(w) >= 6 for w in words)}
+_EVERY_TOKEN = {token for tokens in (*QUANTITIES.values(), *VECTORS.values(), AXES) for token in tokens}
 
 
 @dataclass(frozen=True)
-class Named:
+class ColumnName:
     """A column's name taken apart: tokens of what it is, and the unit's text where it names one."""
 
     name: str
@@ -245,27 +123,17 @@ class Named:
     unit_text: str
 
     def units(self, kind: str) -> list[str]:
-        """Names in flight.toml of the stated unit that fit a kind of quantity; empty where none is stated or fits."""
-        return [u for u in UNIT_WORDS.get(unit_key(self.unit_text), ()) if UNITS[u][0] == kind]
+        """Return the stated unit's names in flight.toml that fit a kind of quantity; empty where none does."""
+        return [u for u in UNIT_SPELLINGS.get(unit_key(self.unit_text), ()) if UNITS[u][0] == kind]
 
     @property
     def kinds(self) -> set[str]:
         """Kinds of quantity that the stated unit allows; empty where none is stated."""
-        return {UNITS[u][0] for u in UNIT_WORDS.get(unit_key(self.unit_text), ())}
+        return {UNITS[u][0] for u in UNIT_SPELLINGS.get(unit_key(self.unit_text), ())}
 
 
-def fold(text: str) -> str:
-    """Lower case, without umlauts, Greek mu and raised digits."""
-    return text.replace("°C", "degc").replace("°", "deg").lower().translate(FOLD)
-
-
-def unit_key(text: str) -> str:
-    """A unit's text as `UNIT_WORDS` has it."""
-    return fold(text).replace(" ", "").strip("()[]{}<>.")
-
-
-def take_apart(name: str, unit_row: str = "") -> Named:
-    """Tokens and unit of a column's name; a row of units below the header goes before the name's own."""
+def parse_column_name(name: str, unit_row: str = "") -> ColumnName:
+    """Return tokens and unit of a column's name; a row of units below the header goes before the name's own."""
     base, unit = name.strip(), ""
     bracket = re.match(r"^(.*?)\s*[(\[{<]\s*([^()\[\]{}<>]+?)\s*[)\]}>]\s*$", base)
     if bracket and bracket[1]:
@@ -273,9 +141,25 @@ def take_apart(name: str, unit_row: str = "") -> Named:
     else:
         for mark in re.finditer(r"[_\s/.,]+(?:in\s+)?", base):
             head, tail = base[: mark.start()], base[mark.end() :]
-            if head and (unit_key(tail) in UNIT_WORDS or unit_key(tail) in SEVERAL_MEANINGS):
+            if head and (unit_key(tail) in UNIT_SPELLINGS or unit_key(tail) in SEVERAL_MEANINGS):
                 base, unit = head, tail
                 break
     stated = unit_row.strip().strip("()[]{}<>") or unit
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", base)
-    return Named(name, tuple(re.findall(r"[a-z]+|\d+", fold(spaced))), stated)
+    return ColumnName(name, tuple(re.findall(r"[a-z]+|\d+", fold(spaced))), stated)
+
+
+def matching(tokens: tuple[str, ...], vocabulary: set[str]) -> set[str]:
+    """Return the tokens in a vocabulary, whole or cut short (``azim``) where that is no token of its own."""
+    cut = {t for t in tokens if len(t) >= 3 and t not in _EVERY_TOKEN}
+    return set(tokens) & vocabulary | {t for t in cut if any(w.startswith(t) and len(w) >= 6 for w in vocabulary)}
+
+
+def fold(text: str) -> str:
+    """Return lower case without umlauts, Greek mu and raised digits."""
+    return text.replace("°C", "degc").replace("°", "deg").lower().translate(_FOLD)
+
+
+def unit_key(text: str) -> str:
+    """Return a unit's text as `UNIT_SPELLINGS` has it."""
+    return fold(text).replace(" ", "").strip("()[]{}<>.")

@@ -27,9 +27,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import quantile_test
 
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import FloatArray, GateError, write_file
 from postflight.montecarlo.study import CONFIDENCE, PERCENTILES, Study
-from postflight.run_folder import write_file
 from synthetic_flight.ensemble import Row
 
 PARTIAL = ".part"

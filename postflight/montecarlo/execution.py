@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from flightmodel.checks import ConfigError, GateError, Progress
+from flightmodel.checks import ConfigError, GateError, Progress, write_file
 from postflight.montecarlo import trial
 from postflight.montecarlo.bands import (
     Chunk,
@@ -43,7 +43,6 @@ from postflight.montecarlo.bands import (
     write_chunk,
 )
 from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
-from postflight.run_folder import write_file
 from synthetic_flight.ensemble import fly_runs
 
 Job = tuple[int, list[int]]

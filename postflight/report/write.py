@@ -14,7 +14,7 @@ from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import writing
+from flightmodel.checks import write_file, writing
 from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
 from postflight.plots.style import COLOUR, PAGE
@@ -29,7 +29,6 @@ from postflight.report.panels import (
     trajectory_rows,
 )
 from postflight.report.source import Run, read_run, rounded
-from postflight.run_folder import write_file
 
 _NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")

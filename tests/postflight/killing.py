@@ -1,26 +1,37 @@
-"""Killing a `postflight run` and looking at what it leaves; also for ``benchmarks/kill.py``."""
+"""The command in a process of its own, interrupted or killed, and what it leaves; also for ``benchmarks/kill.py``."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 EXIT_NO_ANSWER = 4  # the hand-made flight holds no physics, so no estimator answers
 Files = dict[str, bytes]
 
 
-def start_run(flight: Path) -> subprocess.Popen[bytes]:
-    """Start the command in a process of its own."""
+def start_command(*arguments: str | Path, **options: Any) -> subprocess.Popen[Any]:
+    """Start the command with Ctrl-C as a terminal has it.
+
+    A shell's background job, and some CI, starts the tests with SIGINT ignored, and children inherit that.
+    """
     return subprocess.Popen(
-        [sys.executable, "-m", "postflight.cli", "run", str(flight)],
-        stdout=subprocess.DEVNULL,
+        [sys.executable, "-m", "postflight.cli", *map(str, arguments)],
         stderr=subprocess.PIPE,
         env={**os.environ, "NO_COLOR": "1"},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        **options,
     )
+
+
+def start_run(flight: Path) -> subprocess.Popen[bytes]:
+    """Run the whole chain on a flight."""
+    return start_command("run", flight, stdout=subprocess.DEVNULL)
 
 
 def contents(folder: Path) -> Files:

@@ -1,7 +1,8 @@
-"""`postflight check`: nothing odd is said of flights that are right, and every planted fault is said, with its time."""
+"""`postflight check`: no remark on flights that are right, and one with its code on every planted fault."""
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -50,37 +51,38 @@ def change(folder, name, function):
     function(table).to_csv(path, index=False)
 
 
-def oddities(folder):
-    return [f"{f.source}: {f.what}" for f in check_folder(folder).oddities]
+def remarks(folder):
+    """Cross-checks' remarks as (source, code)."""
+    return [(f.source, f.code) for f in check_folder(folder).cross_checks]
 
 
-def said(folder, *words):
-    found = oddities(folder)
-    assert any(all(w in line for w in words) for line in found), found
-    return found
+def only(folder):
+    """The one remark: source, code, words."""
+    (remark,) = check_folder(folder).cross_checks
+    return remark.source, remark.code, remark.what
 
 
 # flights that are right
 
 
-def test_package_as_delivered_has_nothing_odd():
+def test_package_as_delivered_has_no_remark():
     report = check_folder(PACKAGE)
-    assert not report.oddities
+    assert not report.cross_checks
     assert report.exit_code == 0
     assert {f.what for f in report.findings} >= {"gap of 0.460 s", "gap of 4.100 s"}
-    # each radar's clock is told to better than 0.2 s, and right
-    clocks = [c for c in report.clocks if c.against == "accelerometer"]
-    assert len(clocks) == 2
-    assert all(c.sd_s < 0.2 and abs(c.late_s) < 3 * c.sd_s for c in clocks)
+    # each radar's time bias has an sd below 0.2 s and is within three of the true zero
+    biases = [c for c in report.time_biases if c.against == "accelerometer"]
+    assert len(biases) == 2
+    assert all(c.sd_s < 0.2 and abs(c.late_s) < 3 * c.sd_s for c in biases)
 
 
 @needs_data
 @pytest.mark.parametrize("name", sorted(p.name for p in REAL_FLIGHTS.iterdir()))
-def test_recorded_flights_as_described_have_nothing_odd(name, tmp_path):
+def test_recorded_flights_as_described_have_no_remark(name, tmp_path):
     tables = REAL_FLIGHTS / name if any((REAL_FLIGHTS / name).glob("*.csv")) else Path(str(REAL)) / name
     for path in (REAL_FLIGHTS / name / "flight.toml", *tables.glob("*.csv")):
         shutil.copy(path, tmp_path)
-    assert not oddities(tmp_path)
+    assert not remarks(tmp_path)
 
 
 # planted faults of units
@@ -88,43 +90,51 @@ def test_recorded_flights_as_described_have_nothing_odd(name, tmp_path):
 
 def test_accelerometer_in_g_read_as_metres(folder):
     edit(folder, ('unit = "g"', 'unit = "mps2"'))
-    found = said(folder, "accelerometer", "'mps2'", "look like 'g'")
-    assert len(found) == 1
+    source, code, words = only(folder)
+    assert (source, code) == ("accelerometer", "accelerometer-unit")
+    assert "'mps2'" in words
+    assert "'g'" in words
 
 
 def test_accelerometer_in_feet_read_as_metres(folder):
     edit(folder, ('unit = "g"', 'unit = "mps2"'))
     change(folder, "suba_accel.csv", lambda t: t.assign(**{c: t[c] * 32.174 for c in t.columns[1:]}))
-    assert len(said(folder, "accelerometer", "look like 'ftps2'")) == 1
+    source, code, words = only(folder)
+    assert (source, code) == ("accelerometer", "accelerometer-unit")
+    assert "'ftps2'" in words
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("ft", 1.0), ("m", 0.9144e-3)])
 def test_range_in_another_unit(folder, unit, factor):
     edit(folder, ('column = "RANGE (yd)", unit = "yd"', f'column = "RANGE (yd)", unit = "{unit}"'))
     change(folder, ISLAND, lambda t: t.assign(**{"RANGE (yd)": t["RANGE (yd)"] * factor}))
-    found = said(folder, "wallops_island", "does not fall as the Earth pulls")
-    if factor == 1.0:
-        said(folder, "wallops_island", "range in 'yd' instead of")
-        said(folder, "wallops_mainland", "range in 'yd' instead of")
-    else:
-        assert "range in 'km' instead of 'm'" in found[0]
+    found = check_folder(folder).cross_checks
+    assert [(f.source, f.code) for f in found] == [("wallops_island", "radar-unit"), ("wallops_mainland", "radar-unit")]
+    for remark, right in zip(found, ("yd" if factor == 1.0 else "km", "yd"), strict=True):
+        assert f"range in '{right}' instead of '{unit}'" in remark.what
 
 
 def test_angles_in_radians_read_as_degrees(folder):
     change(folder, ISLAND, lambda t: t.assign(**{c: np.deg2rad(t[c]) for c in ("AZ (deg)", "EL (deg)")}))
-    assert len(said(folder, "wallops_island", "az in 'rad' instead of 'deg'", "el in 'rad'")) == 1
+    source, code, words = only(folder)
+    assert (source, code) == ("wallops_island", "radar-unit")
+    assert "az in 'rad' instead of 'deg'" in words
+    assert "el in 'rad' instead of 'deg'" in words
 
 
 def test_azimuth_and_elevation_exchanged(folder):
     change(folder, ISLAND, lambda t: t.rename(columns={"AZ (deg)": "EL (deg)", "EL (deg)": "AZ (deg)"}))
+    # azimuths of 130 deg are no elevations: refused before any cross-check
     report = check_folder(folder)
-    words = [f.what for f in report.oddities] + report.refused
-    assert any("exchanged" in w or "no elevation" in w for w in words), words
+    assert report.exit_code == 3
+    assert any("no elevation" in words for words in report.refused), report.refused
 
 
 def test_rates_in_degrees_read_as_radians(folder):
     edit(folder, ('unit = "degps"', 'unit = "radps"'))
-    assert len(said(folder, "rates", "whirl the accelerometer", "look like 'degps'")) == 1
+    source, code, words = only(folder)
+    assert (source, code) == ("rates", "gyro-unit")
+    assert "'degps'" in words
 
 
 # planted faults of axes
@@ -137,17 +147,19 @@ def test_accelerometer_axes_in_another_order(folder):
         ('column = "AZ (g)"', 'column = "AX (g)"'),
         ('"TMP"', '"AZ (g)"'),
     )
-    said(folder, "accelerometer", "the drag on the way down is read mostly along the sensor's +x")
+    (remark,) = [f for f in check_folder(folder).cross_checks if f.code == "accelerometer-axes"]
+    assert "sensor's +x" in remark.what
 
 
 def test_accelerometer_of_the_other_sign(folder):
     change(folder, "suba_accel.csv", lambda t: t.assign(**{c: -t[c] for c in t.columns[1:]}))
-    said(folder, "accelerometer", "[1.00,")
+    (remark,) = [f for f in check_folder(folder).cross_checks if f.code == "accelerometer-axes"]
+    assert "[1.00," in remark.what
 
 
 def test_roll_and_pitch_rates_exchanged(folder):
     edit(folder, ("ROLL RATE", "TMP"), ("PITCH RATE", "ROLL RATE"), ("TMP", "PITCH RATE"))
-    said(folder, "rates", "turn the force")
+    assert remarks(folder) == [("rates", "gyro-rotation")]
 
 
 # planted faults on recorded flights
@@ -166,7 +178,9 @@ def test_barometer_in_feet_read_as_metres(tmp_path):
     table = pd.read_csv(path)
     table.assign(height_m=table["baro_alt_msl_m"] / 0.3048).drop(columns="pressure_pa").to_csv(path, index=False)
     edit(folder, ('columns = { pressure = { column = "pressure_pa", unit = "pa" } }\n', ""))
-    assert len(said(folder, "baro", "taken as 'm', it looks like 'ft'")) == 1
+    source, code, words = only(folder)
+    assert (source, code) == ("baro", "barometer-unit")
+    assert "'ft'" in words
 
 
 @needs_data
@@ -176,29 +190,38 @@ class TestRecorded:
         path = folder / "adis16405.csv"
         table = pd.read_csv(path)
         table.assign(**{f"a{a}_mps2": table[f"a{a}_mps2"] / 9.80665 for a in "xyz"}).to_csv(path, index=False)
-        assert len(said(folder, "accelerometer", "where it stands still", "look like 'g'")) == 1
+        source, code, words = only(folder)
+        assert (source, code) == ("accelerometer", "accelerometer-unit")
+        assert "at rest" in words  # by the rest, not by a track
+        assert "'g'" in words
 
     def test_receiver_climbs_downward(self, tmp_path):
         folder = recorded("navego_synthetic", tmp_path)
         path = folder / "gnss.csv"
         table = pd.read_csv(path)
         table.assign(vd_mps=-table["vd_mps"]).to_csv(path, index=False)
-        assert not oddities(folder), "a car's climb tells nothing against the fixes' noise"
+        assert not remarks(folder), "a car's climb is below the fixes' noise"
         table.assign(vn_mps=-table["vn_mps"]).to_csv(path, index=False)
-        assert len(said(folder, "receiver", "the other way", "north")) == 1
+        source, code, words = only(folder)
+        assert (source, code) == ("receiver", "gnss-velocity-sign")
+        assert "north" in words
 
     def test_receiver_in_knots(self, tmp_path):
         folder = recorded("navego_synthetic", tmp_path)
         text = "".join(f'v{a} = {{ column = "v{a}_mps", unit = "kt" }}\n' for a in "ned")
         edit(folder, ("[gnss.receiver.columns]\n", f"[gnss.receiver.columns]\n{text}"))
-        assert len(said(folder, "receiver", "taken as 'kt', they look like 'mps'")) == 1
+        source, code, words = only(folder)
+        assert (source, code) == ("receiver", "gnss-velocity-unit")
+        assert "'mps'" in words
 
     def test_magnetometer_a_decade_off(self, tmp_path):
         folder = recorded("psas_l12", tmp_path)
         edit(folder, ('column = "mx_T", unit = "t"', 'column = "mx_T", unit = "gauss"'))
         edit(folder, ('column = "my_T", unit = "t"', 'column = "my_T", unit = "gauss"'))
         edit(folder, ('column = "mz_T", unit = "t"', 'column = "mz_T", unit = "gauss"'))
-        assert len(said(folder, "magnetometer", "looks like 't'")) == 1
+        source, code, words = only(folder)
+        assert (source, code) == ("magnetometer", "magnetometer-unit")
+        assert "'t'" in words
 
     @pytest.mark.parametrize("axes", ['["+y", "-x", "+z"]', '["-x", "-y", "+z"]'])
     def test_gyros_along_other_axes(self, tmp_path, axes):
@@ -206,20 +229,22 @@ class TestRecorded:
         text = (folder / "flight.toml").read_text()
         head, tail = text.split("[sensors.rates]")
         (folder / "flight.toml").write_text(head + "[sensors.rates]" + tail.replace('["+x", "+y", "+z"]', axes, 1))
-        said(folder, "rates", "as no vehicle does")
+        assert ("rates", "gyro-axes") in remarks(folder)
 
     def test_rates_in_degrees_read_as_radians(self, tmp_path):
         folder = recorded("psas_l12", tmp_path)
         edit(folder, ('unit = "degps"', 'unit = "radps"'))
-        report = check_folder(folder)
-        assert any("taken as 'radps', they look like 'degps'" in f.what for f in report.oddities), report.oddities
+        units = [f.what for f in check_folder(folder).cross_checks if (f.source, f.code) == ("rates", "gyro-unit")]
+        assert units
+        assert all("'radps'" in words and "'degps'" in words for words in units)
 
     def test_magnetometer_late(self, tmp_path):
         folder = recorded("psas_l12", tmp_path)
         edit(folder, ("reversed = true", "reversed = true\ntime = { offset_s = 0.2 }"))
-        (odd,) = check_folder(folder).oddities
-        assert odd.source == "magnetometer"
-        assert "later than the rates's by 0.2" in odd.what
+        report = check_folder(folder)
+        assert [(f.source, f.code) for f in report.cross_checks] == [("magnetometer", "clock-lag")]
+        (bias,) = [b for b in report.time_biases if (b.source, b.against) == ("magnetometer", "rates")]
+        assert bias.late_s == pytest.approx(0.2, abs=0.05)
 
 
 # planted faults of clocks
@@ -229,11 +254,10 @@ class TestRecorded:
 def test_accelerometer_and_gyros_late(folder, late_s):
     edit(folder, ('time = { column = "TPLUS (s)" }', f'time = {{ column = "TPLUS (s)", offset_s = {late_s} }}'))
     report = check_folder(folder)
-    odd = [f for f in report.oddities if "accelerometer's by" in f.what]
-    assert {f.source for f in odd} == {"wallops_island", "wallops_mainland"}
-    for clock in report.clocks:
-        if clock.against == "accelerometer":
-            assert abs(clock.late_s + late_s) < 3.5 * clock.sd_s
+    assert {f.source for f in report.cross_checks if f.code == "clock-lag"} == {"wallops_island", "wallops_mainland"}
+    biases = [b for b in report.time_biases if b.against == "accelerometer"]
+    assert {b.source for b in biases} == {"wallops_island", "wallops_mainland"}
+    assert all(abs(b.late_s + late_s) < 3.5 * b.sd_s for b in biases)
 
 
 def test_one_radar_late(folder):
@@ -243,15 +267,15 @@ def test_one_radar_late(folder):
     )
     edit(folder, (head, tail))
     report = check_folder(folder)
-    pair = next(c for c in report.clocks if {c.source, c.against} == {"wallops_island", "wallops_mainland"})
+    pair = next(c for c in report.time_biases if {c.source, c.against} == {"wallops_island", "wallops_mainland"})
     sign = 1.0 if pair.source == "wallops_island" else -1.0
     assert abs(sign * pair.late_s - 0.4) < 3 * pair.sd_s
-    said(folder, "wallops_mainland", "earlier than wallops_island")
+    assert (pair.source, "clock-lag") in [(f.source, f.code) for f in report.cross_checks]
 
 
 def test_radar_at_another_site(folder):
     edit(folder, ("latitude_deg = 37.8410", "latitude_deg = 38.8410"))
-    said(folder, "wallops_mainland", "km from where wallops_island has it")
+    assert ("wallops_mainland", "tracker-distance") in remarks(folder)
 
 
 # the start
@@ -260,17 +284,22 @@ def test_radar_at_another_site(folder):
 def test_attitude_with_the_scalar_last_and_turned_the_other_way(folder):
     q = "[0.41731, -0.53156, -0.11720, 0.72771]"
     edit(folder, (q, "[-0.53156, -0.11720, 0.72771, 0.41731]"))
-    found = said(folder, "attitude_prior", "away from where the track has it", "with the scalar last")
-    assert len(found) == 1
+    source, code, words = only(folder)
+    assert (source, code) == ("attitude_prior", "attitude-prior")
+    assert "scalar last" in words
     edit(folder, ("[-0.53156, -0.11720, 0.72771, 0.41731]", "[0.41731, 0.53156, 0.11720, -0.72771]"))
-    said(folder, "attitude_prior", "as from ECEF to body")
+    source, code, words = only(folder)
+    assert (source, code) == ("attitude_prior", "attitude-prior")
+    assert "from ECEF to body" in words
 
 
 def test_time_zero_an_hour_off(folder):
     edit(folder, ("12:52:00", "13:52:00"))
     edit(folder, ("t_s = 300.0", "t_s = 3900.0"))
-    found = said(folder, "wallops_island", "lies beside the accelerometer's time", "Moved by 1 h (a time zone?)")
-    assert [line.split(":")[0] for line in found] == ["wallops_island", "wallops_mainland", "attitude_prior"]
+    found = check_folder(folder).cross_checks
+    assert [f.source for f in found] == ["wallops_island", "wallops_mainland", "attitude_prior"]
+    assert {f.code for f in found} == {"time-span"}
+    assert "1 h" in found[0].what
 
 
 def test_inertial_sensors_beside_ballistic_motion(folder):
@@ -318,10 +347,31 @@ def test_json_is_whole_and_exit_code_0(folder):
     found = json.loads(result.stdout)
     assert {f["source"] for f in found["facts"]} == {"accelerometer", "rates", "wallops_island", "wallops_mainland"}
     assert found["facts"][0]["rate_hz"] == pytest.approx(200.0, rel=1e-3)
-    assert not found["oddities"]
+    assert found["cross_checks"] == found["oddities"] == found["refused"] == []
+    assert {f["code"] for f in found["findings"]} == {f.code for f in check_folder(folder).findings}
 
 
-def test_what_cannot_be_read_is_said_beside_what_can(folder):
+def test_json_and_screen_give_the_code_of_each_remark(folder):
+    edit(folder, ("latitude_deg = 37.8410", "latitude_deg = 38.8410"))
+    result = CliRunner().invoke(cli, ["check", str(folder), "--json"])
+    assert result.exit_code == 0
+    rows = json.loads(result.stdout)["cross_checks"]
+    assert rows
+    assert all(re.fullmatch(r"[a-z]+(-[a-z]+)+", row["code"]) for row in rows)
+    screen = CliRunner().invoke(cli, ["check", str(folder)]).stdout
+    assert all(f"[{row['code']}]" in screen for row in rows)
+
+
+def test_report_as_a_table_has_a_row_for_each_finding_and_refusal(folder):
+    change(folder, ISLAND, lambda t: t.drop(columns="EL (deg)"))
+    report = check_folder(folder)
+    assert report.to_frame()["kind"].tolist() == ["found"] * len(report.findings) + ["refused"]
+    assert f"{len(report.findings)} findings, 1 refused" in repr(report)
+    edit(folder, ("37.8410", '"FILL IN"'))
+    assert check_folder(folder).to_frame()["code"].tolist() == ["placeholder"]
+
+
+def test_what_cannot_be_read_is_refused_beside_what_can(folder):
     change(folder, ISLAND, lambda t: t.drop(columns="EL (deg)"))
     result = CliRunner().invoke(cli, ["check", str(folder), "--json"])
     assert result.exit_code == 3

@@ -1,5 +1,6 @@
-"""`postflight import`: tables as others write them come in with the same numbers, and what is unclear is asked."""
+"""`postflight import`: tables in any layout come in with the same numbers, and what is unclear is asked."""
 
+import json
 import re
 import shutil
 import tomllib
@@ -10,6 +11,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
+from flightmodel.checks import ConfigError, GateError
 from flightmodel.flightfolder import read_flight, read_sources
 from postflight.cli import cli
 
@@ -165,9 +167,10 @@ def test_matlab_73_is_read_or_refused_with_the_extra(folder, tables, tmp_path, m
     np.testing.assert_array_equal(got[["t_s", "ax_g", "ay_g", "az_g"]].to_numpy(), accel.to_numpy())
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
     path.rename(tmp_path / "again.mat")
-    with pytest.raises(Exception, match=r"pip install 'postflight\[matlab\]'") as fault:
+    with pytest.raises(ConfigError) as refusal:
         run("import", tmp_path / "again.mat", "--into", folder)
-    assert fault.value.exit_code == 2
+    assert refusal.value.codes == ("h5py-missing",)
+    assert "postflight[matlab]" in str(refusal.value)
 
 
 # what is unclear is asked
@@ -186,11 +189,13 @@ def test_units_that_numbers_cannot_tell_are_questions(folder, tmp_path):
     found = tomllib.loads(text_of(folder))
     assert all(c["unit"] == "FILL IN" for c in found["sensors"]["rates"]["columns"].values())
     assert all(c["unit"] == "FILL IN" for c in found["radars"]["radar"]["columns"].values())
-    assert "which unit? m, cm, mm, km, yd, ft" in text_of(folder)
+    assert re.search(r"range = .*m, cm, mm, km, yd, ft", text_of(folder))  # the choices stand beside the question
     answer(folder)
-    out = run("check", folder)
+    out = run("check", folder, "--json")
     assert out.exit_code == 2
-    assert out.output.count("still to fill in") >= 6
+    still_open = {words.split("'")[1] for words in json.loads(out.stdout)["fill_in"]}
+    assert still_open >= {f"sensors.rates.columns.{short}.unit" for short in "pqr"}
+    assert still_open >= {f"radars.radar.columns.{short}.unit" for short in ("range", "az", "el")}
 
 
 @pytest.mark.parametrize(("level", "unit"), [(9.81, "mps2"), (1.001, "g"), (32.2, "ftps2"), (3.0, "FILL IN")])
@@ -239,7 +244,7 @@ def test_two_of_one_sensor_are_a_question(folder, tmp_path):
     for name in ("one", "two"):
         frame(ax_g=1.0, ay_g=0.0, az_g=0.0).to_csv(tmp_path / f"{name}.csv", index=False)
     run("import", tmp_path / "one.csv", tmp_path / "two.csv", "--into", folder)
-    assert "# QUESTION: [sensors.accelerometer] is there already" in text_of(folder)
+    assert re.search(r"# QUESTION: \[sensors\.accelerometer\]", text_of(folder))
     assert tomllib.loads(text_of(folder))["sensors"]["accelerometer"]["file"] == "telemetry/one.csv"
 
 
@@ -247,21 +252,52 @@ def test_nothing_is_overwritten_and_no_half_import_is_left(folder, tmp_path):
     frame(ax_g=1.0, ay_g=0.0, az_g=0.0).to_csv(tmp_path / "one.csv", index=False)
     (tmp_path / "bad.csv").write_text("nothing\nhere\n")
     before = text_of(folder)
-    with pytest.raises(Exception, match="no table found"):
+    with pytest.raises(GateError) as refusal:
         run("import", tmp_path / "one.csv", tmp_path / "bad.csv", "--into", folder)
+    assert refusal.value.codes == ("table-missing",)
     assert text_of(folder) == before
     assert not list((folder / "telemetry").iterdir())
     run("import", tmp_path / "one.csv", "--into", folder)
-    with pytest.raises(Exception, match="exists already"):
+    with pytest.raises(ConfigError) as refusal:
         run("import", tmp_path / "one.csv", "--into", folder)
+    assert refusal.value.codes == ("file-exists",)
 
 
 def test_hostile_names_stay_text(folder, tmp_path):
     evil = 'ax"] \\ #[x] (g)'
     table = frame(**{evil: 1.0, "ay (g)": 0.0, "az (g)": 0.0})
     table.to_csv(tmp_path / "a.csv", index=False)
+    before = tomllib.loads(text_of(folder))
     run("import", tmp_path / "a.csv", "--into", folder)
-    tomllib.loads(text_of(folder))
+    found = tomllib.loads(text_of(folder))
+    assert set(found) <= set(before) | {"sensors"}
+    assert evil in pd.read_csv(folder / "telemetry" / "a.csv").columns
+
+
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        (b"nothing\nhere\n", "table-missing"),
+        (b"\0\1\2" * 50, "table-binary"),
+        (None, "file-missing"),
+    ],
+)
+def test_files_that_are_no_tables_are_refused_with_their_code(folder, tmp_path, content, code):
+    if content is not None:
+        (tmp_path / "bad.csv").write_bytes(content)
+    with pytest.raises(GateError) as refusal:
+        run("import", tmp_path / "bad.csv", "--into", folder)
+    assert refusal.value.codes == (code,)
+
+
+def test_damaged_matlab_files_and_folders_without_a_flight_are_refused_with_their_code(folder, tmp_path):
+    (tmp_path / "bad.mat").write_bytes(b"MATLAB 5.0 MAT-file".ljust(200))
+    with pytest.raises(GateError) as refusal:
+        run("import", tmp_path / "bad.mat", "--into", folder)
+    assert refusal.value.codes == ("matlab-unreadable",)
+    with pytest.raises(ConfigError) as refusal:
+        run("import", tmp_path / "bad.mat", "--into", tmp_path / "elsewhere")
+    assert refusal.value.codes == ("flight-file-missing",)
 
 
 # recorded flights, whose own flight.toml is the answer
@@ -295,7 +331,7 @@ def test_recorded_flights_are_recognised_as_their_flight_file_has_them(name, fol
 
 
 def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
-    from flightmodel.checks import GateError
+    from postflight.intake.column_recognition import Recogniser, add_clock_columns
     from postflight.intake.deliveries import (
         Video,
         as_coefficients,
@@ -305,8 +341,7 @@ def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
         sidecar_text,
     )
     from postflight.intake.flight_form import section_text
-    from postflight.intake.propose import Reader, split_clocks
-    from postflight.intake.read_table import read_loose
+    from postflight.intake.freeform_tables import read_text_table
 
     rng = np.random.default_rng(7)
     whole = [b"\n".join((PACKAGE / name).read_bytes().split(b"\n")[:30]) for name in ("rates.csv", "met_composite.csv")]
@@ -323,11 +358,11 @@ def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
             content[at : at + int(rng.choice([0, 1, 3, 20]))] = bits[rng.integers(len(bits))]
         (tmp_path / "x.csv").write_bytes(bytes(content))
         try:
-            table = read_loose(tmp_path / "x.csv")
+            table = read_text_table(tmp_path / "x.csv")
         except GateError:
             continue
         table = radiosonde_table(table) or table
-        split_clocks(table)
+        add_clock_columns(table)
         columns = coefficient_columns(table)
         if columns is not None:
             as_coefficients(table, columns)
@@ -335,7 +370,7 @@ def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
         frames = frame_list(table, [video], ["a"], tmp_path)
         coefficients_read += columns is not None
         frames_read += frames is not None
-        for source in [frames] if frames is not None else Reader(table).everything()[0]:
+        for source in [frames] if frames is not None else Recogniser(table).proposals()[0]:
             tomllib.loads(section_text(source, "telemetry/x.csv", table.notes, taken=False))
         read += 1
     assert read > 200

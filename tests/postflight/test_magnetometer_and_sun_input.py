@@ -1,4 +1,4 @@
-"""The gate with magnetometer and Sun sensors: the same words for their faults as for those of the other sensors."""
+"""The gate with magnetometer and Sun sensors: their faults are refused as those of the other sensors are."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SUN_HEADER = "t_s," + ",".join(f"az_sun{k}_deg,el_sun{k}_deg" for k in (1, 2, 3,
 
 
 @pytest.fixture
-def told(flight):
+def equipped(flight):
     """The hand-made folder with both sensors: two heads see the Sun, then the next two, as the vehicle turns."""
     t = np.arange(420.0, 430.0, 0.05)
     turn = 0.6 * (t - 420.0)
@@ -57,11 +57,11 @@ def findings(flight, source):
     return [str(f) for f in read_flight(flight.root).findings if f.source == source]
 
 
-def test_both_are_read_in_si_with_their_data_sheets(told):
-    telemetry = read_flight(told.root)
+def test_both_are_read_in_si_with_their_data_sheets(equipped):
+    telemetry = read_flight(equipped.root)
     assert telemetry.findings == ()
     magnetometer, sun = telemetry.magnetometer, telemetry.sun
-    first = [float(v) for v in told.lines("magnetometer.csv")[1].split(",")]
+    first = [float(v) for v in equipped.lines("magnetometer.csv")[1].split(",")]
     np.testing.assert_allclose(magnetometer.measured_sensor[0], np.array(first[1:]) * 1e-6, rtol=1e-12)
     assert magnetometer.spec.bias_sd == pytest.approx(0.7e-6)
     assert magnetometer.spec.soft_iron_sd == 0.004
@@ -69,13 +69,13 @@ def test_both_are_read_in_si_with_their_data_sheets(told):
     np.testing.assert_array_equal(magnetometer.spec.dcm_body_sensor, mount.dcm_body_sensor)
     assert sun.az_el_head_rad.shape == (200, 4, 2)
     assert (np.isfinite(sun.az_el_head_rad[:, :, 0]).sum(axis=1) >= 1).all()
-    np.testing.assert_allclose(sun.az_el_head_rad[0, 0, 1], np.deg2rad(float(told.column("sun.csv", 2)[0])))
+    np.testing.assert_allclose(sun.az_el_head_rad[0, 0, 1], np.deg2rad(float(equipped.column("sun.csv", 2)[0])))
     np.testing.assert_allclose(sun.spec.clock_lv_rad, np.deg2rad([45.0, 135.0, 225.0, 315.0]))
     assert sun.spec.noise_sd_rad == pytest.approx(np.deg2rad(0.8))
     assert {"telemetry/magnetometer.csv", "telemetry/sun.csv"} <= set(telemetry.hashes)
 
 
-def test_neither_is_asked_for(clean_flight):
+def test_neither_is_needed(clean_flight):
     telemetry = read_flight(clean_flight.root)
     assert telemetry.magnetometer is None
     assert telemetry.sun is None
@@ -88,114 +88,114 @@ def test_neither_is_asked_for(clean_flight):
         ("sun.csv", "az_sun3_deg", "az_sun_3_deg"),
     ],
 )
-def test_wrong_column_names_the_nearest(told, name, known, wrong):
-    told.header(name, known, wrong)
-    refused(told, name, "line 1", f"no column '{known}'", f"did you mean '{wrong}'")
+def test_wrong_column_names_the_nearest(equipped, name, known, wrong):
+    equipped.header(name, known, wrong)
+    refused(equipped, name, "line 1", f"no column '{known}'", f"did you mean '{wrong}'")
 
 
-def test_column_without_unit_tells_how_to_declare_it(told):
-    told.header("magnetometer.csv", "bx_magnetometer_ut", "bx")
-    refused(told, "sensors.magnetometer", "names no unit", "columns.bx = { column", kind=GateError)
+def test_column_without_unit_is_refused_with_how_to_declare_it(equipped):
+    equipped.header("magnetometer.csv", "bx_magnetometer_ut", "bx")
+    refused(equipped, "sensors.magnetometer", "names no unit", "columns.bx = { column", kind=GateError)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("nt", 1e3), ("gauss", 1e-2), ("t", 1e-6)])
-def test_declared_units_equal_the_canonical_result(told, unit, factor):
-    before = read_flight(told.root).magnetometer.measured_sensor
-    told.header("magnetometer.csv", "bz_magnetometer_ut", "B-Z")
-    told.map_column("magnetometer.csv", 3, lambda cell: f"{float(cell) * factor:.12g}")
-    told.append(f'[sensors.magnetometer.columns]\nbz = {{ column = "B-Z", unit = "{unit}" }}')
-    np.testing.assert_allclose(read_flight(told.root).magnetometer.measured_sensor, before, rtol=1e-9)
+def test_declared_units_equal_the_canonical_result(equipped, unit, factor):
+    before = read_flight(equipped.root).magnetometer.measured_sensor
+    equipped.header("magnetometer.csv", "bz_magnetometer_ut", "B-Z")
+    equipped.map_column("magnetometer.csv", 3, lambda cell: f"{float(cell) * factor:.12g}")
+    equipped.append(f'[sensors.magnetometer.columns]\nbz = {{ column = "B-Z", unit = "{unit}" }}')
+    np.testing.assert_allclose(read_flight(equipped.root).magnetometer.measured_sensor, before, rtol=1e-9)
 
 
-def test_wrong_unit_is_refused_with_those_that_fit(told):
-    told.append('[sensors.magnetometer.columns]\nbz = { column = "bz_magnetometer_ut", unit = "mps2" }')
-    refused(told, "not one of magnetic field", "ut, nt, gauss")
+def test_wrong_unit_is_refused_with_those_that_fit(equipped):
+    equipped.append('[sensors.magnetometer.columns]\nbz = { column = "bz_magnetometer_ut", unit = "mps2" }')
+    refused(equipped, "not one of magnetic field", "ut, nt, gauss")
 
 
-def test_nanotesla_written_as_microtesla_are_refused(told):
-    told.map_column("magnetometer.csv", 1, lambda cell: f"{float(cell) * 1e3:.3f}")
-    refused(told, "magnetometer.csv: line 2", "beyond any magnetic field", "check its unit")
+def test_nanotesla_written_as_microtesla_are_refused(equipped):
+    equipped.map_column("magnetometer.csv", 1, lambda cell: f"{float(cell) * 1e3:.3f}")
+    refused(equipped, "magnetometer.csv: line 2", "beyond any magnetic field", "check its unit")
 
 
-def test_impossible_sun_angle_is_refused_with_its_line(told):
-    told.cell("sun.csv", 7, 1, "260.0")
-    text = refused(told, "sensors.sun", "no angle of a head", "az1")
+def test_impossible_sun_angle_is_refused_with_its_line(equipped):
+    equipped.cell("sun.csv", 7, 1, "260.0")
+    text = refused(equipped, "sensors.sun", "no angle of a head", "az1")
     assert re.search(r"line 7\b", text)
 
 
 @pytest.mark.parametrize("name", ["magnetometer.csv", "sun.csv"])
-def test_time_running_backwards_names_line_and_values(told, name):
-    told.cell(name, 9, 0, "420.1")
-    refused(told, name, "line 9", "time runs backwards")
+def test_time_running_backwards_names_line_and_values(equipped, name):
+    equipped.cell(name, 9, 0, "420.1")
+    refused(equipped, name, "line 9", "time runs backwards")
 
 
 @pytest.mark.parametrize("name", ["magnetometer", "sun"])
-def test_rows_that_come_twice_or_late_are_findings(told, name):
-    before = read_flight(told.root)
-    rows = told.lines(f"{name}.csv")
-    told.write_lines(f"{name}.csv", [*rows[:41], rows[42], rows[41], *rows[43:], *rows[1:4]])
-    after = read_flight(told.root)
+def test_rows_that_come_twice_or_late_are_findings(equipped, name):
+    before = read_flight(equipped.root)
+    rows = equipped.lines(f"{name}.csv")
+    equipped.write_lines(f"{name}.csv", [*rows[:41], rows[42], rows[41], *rows[43:], *rows[1:4]])
+    after = read_flight(equipped.root)
     np.testing.assert_array_equal(after.magnetometer.measured_sensor, before.magnetometer.measured_sensor)
     np.testing.assert_array_equal(after.sun.az_el_head_rad, before.sun.az_el_head_rad)
-    assert sorted(findings(told, name)) == [
+    assert sorted(findings(equipped, name)) == [
         f"{name}: 1 row in 1 block came late or out of order: put in order (at 422.000 s)",
         f"{name}: 3 rows in 1 block repeat earlier rows: left out (420.000 to 420.100 s)",
     ]
 
 
-def test_mount_that_the_vehicle_lacks(told):
-    told.declare('mount = "magnetometre"', 'file = "telemetry/magnetometer.csv"')
-    refused(told, "sensors.magnetometer.mount", "did you mean 'magnetometer'", kind=ConfigError)
+def test_mount_that_the_vehicle_lacks(equipped):
+    equipped.declare('mount = "magnetometre"', 'file = "telemetry/magnetometer.csv"')
+    refused(equipped, "sensors.magnetometer.mount", "did you mean 'magnetometer'", kind=ConfigError)
 
 
-def test_misspelt_key_names_the_nearest(told):
-    told.replace("flight.toml", "soft_iron_sd", "soft_irn_sd")
-    refused(told, "soft_irn_sd", "did you mean 'soft_iron_sd'", kind=ConfigError)
+def test_misspelt_key_names_the_nearest(equipped):
+    equipped.replace("flight.toml", "soft_iron_sd", "soft_irn_sd")
+    refused(equipped, "soft_irn_sd", "did you mean 'soft_iron_sd'", kind=ConfigError)
 
 
-def test_all_faults_come_at_once(told):
-    told.header("magnetometer.csv", "by_magnetometer_ut", "by_wrong_ut")
-    told.cell("sun.csv", 4, 2, "bright")
-    told.cell("rates.csv", 5, 1, "fast")
-    refused(told, "by_magnetometer_ut", "'bright' is no finite number", "'fast' is no finite number")
+def test_all_faults_come_at_once(equipped):
+    equipped.header("magnetometer.csv", "by_magnetometer_ut", "by_wrong_ut")
+    equipped.cell("sun.csv", 4, 2, "bright")
+    equipped.cell("rates.csv", 5, 1, "fast")
+    refused(equipped, "by_magnetometer_ut", "'bright' is no finite number", "'fast' is no finite number")
 
 
-def test_gap_frozen_and_saturated_runs_are_findings(told):
-    lines = told.lines("magnetometer.csv")
-    told.write_lines("magnetometer.csv", lines[:61] + lines[75:])
+def test_gap_frozen_and_saturated_runs_are_findings(equipped):
+    lines = equipped.lines("magnetometer.csv")
+    equipped.write_lines("magnetometer.csv", lines[:61] + lines[75:])
     for line in range(100, 121):
-        told.cell("magnetometer.csv", line, 2, "11.111")
+        equipped.cell("magnetometer.csv", line, 2, "11.111")
     for line in range(20, 27):
-        told.cell("magnetometer.csv", line, 1, "60.0")
-    words = findings(told, "magnetometer")
+        equipped.cell("magnetometer.csv", line, 1, "60.0")
+    words = findings(equipped, "magnetometer")
     assert any("gap of 0.750 s" in w for w in words)
     assert any("by frozen" in w and "21 samples" in w for w in words)
     assert any("bx saturated at 6e-05" in w and "7 samples" in w for w in words)
 
 
-def test_sun_is_missing_only_where_no_head_sees_it(told):
+def test_sun_is_missing_only_where_no_head_sees_it(equipped):
     for line in range(50, 60):
         for column in range(1, 9):
-            told.cell("sun.csv", line, column, "")
+            equipped.cell("sun.csv", line, column, "")
     for line in range(100, 120):
-        seen = next(c for c in range(1, 9, 2) if told.lines("sun.csv")[line - 1].split(",")[c])
-        told.cell("sun.csv", line, seen + 1, "11.5")
-    words = findings(told, "sun")
+        seen = next(c for c in range(1, 9, 2) if equipped.lines("sun.csv")[line - 1].split(",")[c])
+        equipped.cell("sun.csv", line, seen + 1, "11.5")
+    words = findings(equipped, "sun")
     assert any("10 samples missing (422.400 to 422.850 s)" in w for w in words)
     assert any("frozen" in w and "el" in w for w in words)
     assert sum("missing" in w for w in words) == 1
 
 
-def test_empty_sensors_are_refused(told):
+def test_empty_sensors_are_refused(equipped):
     for column in (1, 2, 3):
-        told.map_column("magnetometer.csv", column, lambda _: "")
+        equipped.map_column("magnetometer.csv", column, lambda _: "")
     for column in range(1, 9):
-        told.map_column("sun.csv", column, lambda _: "")
-    refused(told, "every sample is missing", "no head ever sees the Sun")
+        equipped.map_column("sun.csv", column, lambda _: "")
+    refused(equipped, "every sample is missing", "no head ever sees the Sun")
 
 
-def test_number_of_heads_is_that_of_flight_toml(told):
-    told.replace("flight.toml", "[45.0, 135.0, 225.0, 315.0]", "[45.0, 135.0, 225.0, 270.0, 315.0]")
-    refused(told, "no column 'az_sun5_deg'")
-    told.replace("flight.toml", "[45.0, 135.0, 225.0, 270.0, 315.0]", "[45.0, 135.0]")
-    assert read_flight(told.root).sun.az_el_head_rad.shape == (200, 2, 2)
+def test_number_of_heads_is_that_of_flight_toml(equipped):
+    equipped.replace("flight.toml", "[45.0, 135.0, 225.0, 315.0]", "[45.0, 135.0, 225.0, 270.0, 315.0]")
+    refused(equipped, "no column 'az_sun5_deg'")
+    equipped.replace("flight.toml", "[45.0, 135.0, 225.0, 270.0, 315.0]", "[45.0, 135.0]")
+    assert read_flight(equipped.root).sun.az_el_head_rad.shape == (200, 2, 2)

@@ -40,23 +40,34 @@ def test_after_warmup_a_flight_and_its_reconstruction_compile_nothing(tmp_path):
     run = [sys.executable, "-m", "postflight.cli", "warmup"]
     first = subprocess.run(run, capture_output=True, text=True)
     assert first.returncode == 0, first.stderr
-    assert "not compiled" not in first.stderr
     again = subprocess.run(run, capture_output=True, text=True)
-    assert "compiling" not in again.stderr
+    assert not again.stderr
     flown = subprocess.run([sys.executable, "-c", COUNT, str(tmp_path / "flight")], capture_output=True, text=True)
     assert flown.stdout.strip() == "[]", flown.stderr
 
 
-def test_what_is_missing_is_compiled_once_and_said(tmp_path):
+def test_what_is_missing_is_compiled_once_and_reported(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     run = [sys.executable, "-c", "from postflight.warmup import prepare; prepare(['tables'], print)"]
     first, again = (subprocess.run(run, env=environment, capture_output=True, text=True) for _ in range(2))
-    assert first.stdout.startswith("compiling kernels for this machine, once")
-    assert "not compiled" not in first.stdout
+    assert len(first.stdout.splitlines()) == 1
+    assert "tables" in first.stdout
+    assert [p.name.split("-")[0] for p in (tmp_path / "cache").rglob("*.compiled")] == ["tables"]
     assert (again.returncode, again.stdout) == (0, ""), again.stderr
 
 
-def test_without_a_folder_to_keep_kernels_in_warmup_says_so(tmp_path):
+def test_a_group_that_fails_is_reported_with_its_reason(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    code = "from postflight import warmup; warmup.prepare(['no such group'], print)"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    compiling, failed = done.stdout.splitlines()
+    assert "no such group" in compiling
+    assert "KeyError" in failed
+    assert not list((tmp_path / "cache").rglob("*.compiled"))
+
+
+def test_warmup_without_a_folder_to_keep_kernels_in_is_refused(tmp_path):
     (tmp_path / "file").touch()
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "file"), "MPLCONFIGDIR": str(tmp_path)}
     environment.pop("NUMBA_CACHE_DIR", None)

@@ -1,16 +1,10 @@
-"""Which columns of a table are which sensor's? Names, units and, where both leave it open, the numbers.
+"""Which columns of a table are which sensor's, in which unit, and where is the time?
 
-What is proposed of a table: which column is which, in which unit, how its time is written, and why.
-
-``how`` is ``stated`` where the header says it, ``numbers`` where only one reading of the numbers is possible, ``asked``
-where neither tells: that becomes a question, never a guess.
-
-Which unit do the numbers themselves allow? Only where one alone is possible; else the analyst is asked.
-
-Bounds are nature's: 9.8 m/s^2 where a vehicle stands, a field of 22 to 67 uT at the ground (15 to 100 with iron),
-800 to 1100 hPa near the ground, no angle beyond a full turn, no body that turns with more than 400 rad/s.
-
-Where does a table's time stand, and how is it written?
+Quantity and unit come from the header's vocabulary (`postflight.intake.headers`). Where the header leaves a unit
+open, the numbers decide if one unit alone is possible: 9.8 m/s^2 where a vehicle stands, a field of 22 to 67 uT at
+the ground (15 to 100 with iron), 800 to 1100 hPa near the ground, no angle beyond a full turn, no body that rotates
+at more than 400 rad/s. Otherwise it is asked: a proposal's ``how`` is ``stated`` (header), ``numbers`` or ``asked``,
+and never a guess.
 
 Times of day (``HH:MM:SS``) become three columns and seconds since 1970 become ISO UTC, as flight.toml reads those.
 """
@@ -26,26 +20,62 @@ import numpy as np
 
 from flightmodel import tables
 from flightmodel.checks import FloatArray
+from flightmodel.config import FILL_IN_VALUE
 from flightmodel.tables import UNITS, Quantity
+from postflight.intake.freeform_tables import FreeFormTable
 from postflight.intake.headers import (
     AXES,
     BODY_RATES,
     NED,
-    QUANTITY_WORDS,
+    QUANTITIES,
     SEVERAL_MEANINGS,
-    TRIAD_WORDS,
-    Named,
-    means,
-    take_apart,
+    VECTORS,
+    ColumnName,
+    matching,
+    parse_column_name,
     unit_key,
 )
-from postflight.intake.read_table import LooseTable
 
 STATED, NUMBERS, ASKED = "stated", "numbers", "asked"
+FILL_IN_TOML = f'"{FILL_IN_VALUE}"'
+_STEADY = 0.02  # of the mean: at rest the noise is no larger
+_STEADY_ROWS = 50
+_BANDS: dict[str, list[tuple[float, float, str]]] = {
+    "acceleration": [(9.6, 10.0, "mps2"), (0.98, 1.02, "g"), (980.0, 1020.0, "mg"), (31.6, 32.8, "ftps2")],
+    "magnetic field": [(15.0, 100.0, "ut"), (0.15, 1.0, "gauss"), (15e-6, 100e-6, "t"), (15e3, 100e3, "nt")],
+    "pressure": [(6e4, 1.1e5, "pa"), (600.0, 1100.0, "hpa"), (60.0, 110.0, "kpa")],
+    "temperature": [(150.0, 400.0, "k"), (-120.0, 60.0, "degc")],
+    "density": [(0.5, 1.5, "kgpm3"), (500.0, 1500.0, "gpm3")],
+}
+_FASTEST_RADPS = 400.0
+_G_OR_GAUSS = {"acceleration", "magnetic field"}
+_FIELD_GAUSS = (0.15, 0.9)  # the Earth's, with some iron, and less than 1 g
+_EARTH_RADII_M = (6.2e6, 7.5e6)
+_IRIG = re.compile(r"^\d{1,3}:\d{1,2}:\d{2}:\d{2}([.,]\d+)?$")
+_OF_DAY = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
+_ISO = re.compile(r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}")
+_CLOCK_PARTS = (
+    {"h", "hour", "hours", "stunde", "hh"},
+    {"m", "min", "minute", "mm"},
+    {"s", "sec", "second", "sekunde", "ss"},
+)
+_SINCE_1970 = {"time", "t", "unix", "epoch", "timestamp", "zeit"}
+_NOT_FROM_T0 = {"tow", "sod", "utc", "gmt", "gps", "week"}  # seconds of these do not start at t0
+_UNIX_S = (1e9, 2.5e9)
+_FASTEST_S, _SLOWEST_S = 2e-5, 60.0
+_THREE_AXIS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
+    "acceleration": ("sensors.accelerometer", tables.ACCELEROMETER),
+    "rate": ("sensors.rates", tables.RATES),
+    "magnetic field": ("sensors.magnetometer", tables.MAGNETOMETER),
+}
+_MOUNT = 'a package of the vehicle file, or "body"; or axes = ["+x", "+y", "+z"]: which body axis is each of its axes?'
+_AIR = ("alt", "rho", "temperature", "pressure", "wind_speed", "wind_from")
+_AIR_BY_COMPONENTS = ("wind_north", "wind_east")
+_Family = tuple[tuple[str, ...], str]
 
 
 @dataclass(frozen=True)
-class Mapped:
+class ColumnProposal:
     """One column: the quantity's short name in flight.toml, its unit (empty where it is asked), how and why."""
 
     short: str
@@ -57,8 +87,8 @@ class Mapped:
 
 
 @dataclass(frozen=True)
-class TimeMapped:
-    """Where the time stands: columns, format, unit (of seconds; empty where it is asked), other candidates."""
+class TimeProposal:
+    """Where the time is: columns, format, unit (of seconds; empty where it is asked), other candidates."""
 
     columns: tuple[str, ...]
     format: str
@@ -74,46 +104,38 @@ class SourceProposal:
     """One table of flight.toml: its header (``sensors.rates``), columns, further keys as (key, TOML value, comment)."""
 
     section: str
-    columns: list[Mapped]
+    columns: list[ColumnProposal]
     keys: list[tuple[str, str, str]] = field(default_factory=list)
-    time: TimeMapped | None = None
+    time: TimeProposal | None = None
 
 
-STEADY = 0.02  # of the mean: what stands still is no noisier
-STEADY_ROWS = 50
-BANDS: dict[str, list[tuple[float, float, str]]] = {
-    "acceleration": [(9.6, 10.0, "mps2"), (0.98, 1.02, "g"), (980.0, 1020.0, "mg"), (31.6, 32.8, "ftps2")],
-    "magnetic field": [(15.0, 100.0, "ut"), (0.15, 1.0, "gauss"), (15e-6, 100e-6, "t"), (15e3, 100e3, "nt")],
-    "pressure": [(6e4, 1.1e5, "pa"), (600.0, 1100.0, "hpa"), (60.0, 110.0, "kpa")],
-    "temperature": [(150.0, 400.0, "k"), (-120.0, 60.0, "degc")],
-    "density": [(0.5, 1.5, "kgpm3"), (500.0, 1500.0, "gpm3")],
-}
+# units by numbers
 
 
-def triad_unit(kind: str, values: FloatArray) -> tuple[str, str]:
-    """Unit of a triad (n, 3) of a kind, and why; an empty unit with what was seen where several are possible."""
+def _vector_unit(kind: str, values: FloatArray) -> tuple[str, str]:
+    """Return the unit of three axes (n, 3) of a kind, and why; an empty unit with what was seen where that is open."""
     size = np.linalg.norm(values, axis=1)
     size = size[np.isfinite(size)]
     if not len(size):
         return "", "no numbers"
     if kind == "acceleration":
-        for part, where in ((size[:STEADY_ROWS], "first"), (size[-STEADY_ROWS:], "last")):
+        for part, where in ((size[:_STEADY_ROWS], "first"), (size[-_STEADY_ROWS:], "last")):
             mean = float(part.mean())
-            if len(part) == STEADY_ROWS and part.std() < STEADY * mean:
+            if len(part) == _STEADY_ROWS and part.std() < _STEADY * mean:
                 unit = _band(kind, mean)
                 if unit:
-                    return unit, f"steady at {mean:.4g} in the {where} rows, as where it stands still"
-        return "", f"size {float(np.median(size)):.3g} (median), nowhere steady at 1 g"
+                    return unit, f"steady at {mean:.4g} in the {where} rows, as at rest"
+        return "", f"magnitude {float(np.median(size)):.3g} (median), nowhere steady at 1 g"
     if kind == "magnetic field":
         middle = float(np.median(size))
-        return _band(kind, middle), f"size {middle:.3g} (median)"
-    if kind == "rate" and size.max() > 400.0:
-        return "degps", f"up to {size.max():.4g}: no body turns so many rad/s"
-    return "", f"size up to {float(size.max()):.3g}"
+        return _band(kind, middle), f"magnitude {middle:.3g} (median)"
+    if kind == "rate" and size.max() > _FASTEST_RADPS:
+        return "degps", f"up to {size.max():.4g}: no body rotates at so many rad/s"
+    return "", f"magnitude up to {float(size.max()):.3g}"
 
 
-def single_unit(short: str, kind: str, values: FloatArray) -> tuple[str, str]:
-    """Unit of one column, and why; an empty unit with what was seen where several are possible."""
+def column_unit(short: str, kind: str, values: FloatArray) -> tuple[str, str]:
+    """Return the unit of one column (n,), and why; an empty unit with what was seen where that is open."""
     known = values[np.isfinite(values)]
     if not len(known):
         return "", "no numbers"
@@ -135,32 +157,26 @@ def single_unit(short: str, kind: str, values: FloatArray) -> tuple[str, str]:
 
 
 def _band(kind: str, value: float) -> str:
-    fitting = [unit for low, high, unit in BANDS[kind] if low <= value <= high]
+    fitting = [unit for low, high, unit in _BANDS[kind] if low <= value <= high]
     return fitting[0] if len(fitting) == 1 else ""
 
 
-IRIG = re.compile(r"^\d{1,3}:\d{1,2}:\d{2}:\d{2}([.,]\d+)?$")
-OF_DAY = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
-ISO = re.compile(r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}")
-PARTS = ({"h", "hour", "hours", "stunde", "hh"}, {"m", "min", "minute", "mm"}, {"s", "sec", "second", "sekunde", "ss"})
-ELSEWHERE = {"tow", "sod", "utc", "gmt", "gps", "week"}  # seconds of these do not start at t0
-UNIX = (1e9, 2.5e9)
-FASTEST_S, SLOWEST_S = 2e-5, 60.0
+# time
 
 
-def split_clocks(table: LooseTable) -> None:
-    """Add columns for times of day and for seconds since 1970; each is noted."""
+def add_clock_columns(table: FreeFormTable) -> None:
+    """Add columns for times of day and for seconds since 1970; each is noted in the table."""
     for k, name in enumerate(list(table.names)):
-        first = [row[k] for row in table.rows[:20] if k < len(row) and row[k]]
-        if first and all(OF_DAY.match(c) for c in first):
-            parts = [OF_DAY.match(row[k]) if k < len(row) else None for row in table.rows]
+        first = table.cells(k, 20)
+        if first and all(_OF_DAY.match(c) for c in first):
+            parts = [_OF_DAY.match(row[k]) if k < len(row) else None for row in table.rows]
             for number, short in enumerate(("h", "m", "s"), start=1):
                 _add(table, f"{name}_{short}", [m[number].replace(",", ".") if m else "" for m in parts])
             table.notes.append(f"times of day in '{name}' became columns {name}_h, {name}_m, {name}_s")
-        elif first and set(re.findall(r"[a-z]+", name.lower())) & {"time", "t", "unix", "epoch", "timestamp", "zeit"}:
+        elif first and set(re.findall(r"[a-z]+", name.lower())) & _SINCE_1970:
             values = table.numbers(k)
             scale = next(
-                (s for s in (1.0, 1e-3, 1e-6) if UNIX[0] < np.nanmin(values, initial=np.inf) * s < UNIX[1]), None
+                (s for s in (1.0, 1e-3, 1e-6) if _UNIX_S[0] < np.nanmin(values, initial=np.inf) * s < _UNIX_S[1]), None
             )
             if scale is not None:
                 stamps = (values * scale * 1e6).round()
@@ -169,7 +185,7 @@ def split_clocks(table: LooseTable) -> None:
                 table.notes.append(f"seconds since 1970 in '{name}' became ISO UTC in {name}_utc")
 
 
-def _add(table: LooseTable, name: str, cells: list[str]) -> None:
+def _add(table: FreeFormTable, name: str, cells: list[str]) -> None:
     table.raw = None
     table.names.append(name)
     table.units.append("")
@@ -177,51 +193,54 @@ def _add(table: LooseTable, name: str, cells: list[str]) -> None:
         row.append(cell)
 
 
-def find_time(table: LooseTable, named: list[Named]) -> TimeMapped | None:
+def column_names(table: FreeFormTable) -> list[ColumnName]:
+    """Return the table's column names taken apart."""
+    return [parse_column_name(n, u) for n, u in zip(table.names, table.units, strict=True)]
+
+
+def find_time(table: FreeFormTable, named: list[ColumnName]) -> TimeProposal | None:
     """Return how the table's time is written, or None where no column holds one."""
-    for pattern, form in ((IRIG, "irig_doy"), (ISO, "utc")):
+    for pattern, form in ((_IRIG, "irig_doy"), (_ISO, "utc")):
         for k, name in enumerate(table.names):
-            first = [row[k] for row in table.rows[:20] if k < len(row) and row[k]]
+            first = table.cells(k, 20)
             if first and all(pattern.match(c) for c in first):
-                return TimeMapped((name,), form, "", STATED, f"written as {first[0]}")
+                return TimeProposal((name,), form, "", STATED, f"written as {first[0]}")
     parts = _hour_minute_second(table, named)
     seconds = [k for k in range(len(named)) if _is_time(named[k], table.numbers(k))]
     # a time of day is known to the second of UTC; a counter's zero is not
     if parts and not any(table.names[k] == "t_s" for k in seconds):
         others = tuple(table.names[k] for k in seconds)
-        return TimeMapped(parts, "utc_hms", "", STATED, "hour, minute and second of the day", others=others)
+        return TimeProposal(parts, "utc_hms", "", STATED, "hour, minute and second of the day", others=others)
     if not seconds:
         return None
     best = min(seconds, key=lambda k: (table.names[k] != "t_s", not named[k].units("time"), k))
     others = tuple(table.names[k] for k in seconds if k != best) + (parts or ())
     unit, how, why = _time_unit(named[best], table.numbers(best))
-    asked = bool(set(named[best].tokens) & ELSEWHERE)
-    return TimeMapped((table.names[best],), "seconds", unit, how, why, asked, others)
+    asked = bool(set(named[best].tokens) & _NOT_FROM_T0)
+    return TimeProposal((table.names[best],), "seconds", unit, how, why, asked, others)
 
 
-def _hour_minute_second(table: LooseTable, named: list[Named]) -> tuple[str, ...] | None:
+def _hour_minute_second(table: FreeFormTable, named: list[ColumnName]) -> tuple[str, ...] | None:
+    """Columns of hour, minute and second whose names differ in their last part alone."""
+    parts = [re.findall("[a-z]+", n.name.lower()) for n in named]
     found = []
-    for words, top in zip(PARTS, (24, 60, 61), strict=True):
-        last = [k for k, n in enumerate(named) if (re.findall("[a-z]+", n.name.lower()) or [""])[-1] in words]
-        last = [k for k in last if len(re.findall("[a-z]+", named[k].name.lower())) > 1 or len(named[k].name) > 1]
+    for spellings, top in zip(_CLOCK_PARTS, (24, 60, 61), strict=True):
+        last = [k for k, p in enumerate(parts) if p and p[-1] in spellings and (len(p) > 1 or len(named[k].name) > 1)]
         fitting = [
             k for k in last if np.nanmax(table.numbers(k), initial=-1.0) < top and np.nanmin(table.numbers(k)) >= 0
         ]
         found.append(fitting)
     for h in found[0]:
-        stem = re.findall("[a-z]+", table.names[h].lower())[:-1]
-        mates = [
-            next((k for k in some if re.findall("[a-z]+", table.names[k].lower())[:-1] == stem), None) for some in found
-        ]
+        mates = [next((k for k in some if parts[k][:-1] == parts[h][:-1]), None) for some in found]
         if None not in mates and len(set(mates)) == 3:
             return tuple(table.names[k] for k in mates if k is not None)
     return None
 
 
-def _is_time(named: Named, values: FloatArray) -> bool:
-    if not (set(named.tokens) & QUANTITY_WORDS["time"] or named.units("time")) or named.kinds - {"time"} - {
-        "magnetic field"
-    }:
+def _is_time(named: ColumnName, values: FloatArray) -> bool:
+    if not (set(named.tokens) & QUANTITIES["time"] or named.units("time")):
+        return False
+    if named.kinds - {"time", "magnetic field"}:  # T, of a name's time, is also tesla
         return False
     known = values[np.isfinite(values)]
     if len(known) < 3 or len(known) < 0.9 * len(values):
@@ -230,7 +249,7 @@ def _is_time(named: Named, values: FloatArray) -> bool:
     return bool((step >= 0.0).mean() > 0.98 and (step > 0.0).any())
 
 
-def _time_unit(named: Named, values: FloatArray) -> tuple[str, str, str]:
+def _time_unit(named: ColumnName, values: FloatArray) -> tuple[str, str, str]:
     units = named.units("time")
     if units:
         return units[0], STATED, f"'{named.unit_text}' in the header"
@@ -239,31 +258,20 @@ def _time_unit(named: Named, values: FloatArray) -> tuple[str, str, str]:
     usual = float(np.median(step[step > 0.0]))
     whole = bool((known == np.round(known)).all())
     seen = f"steps of {usual:.4g}"
-    if not whole and usual < SLOWEST_S and usual * 1e-3 < FASTEST_S * 10:
+    if not whole and usual < _SLOWEST_S and usual * 1e-3 < _FASTEST_S * 10:
         return "s", NUMBERS, f"{seen}: as ms they would be {1e3 / usual:.3g} Hz"
     return "", ASKED, seen
 
 
-TRIADS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
-    "acceleration": ("sensors.accelerometer", tables.ACCELEROMETER),
-    "rate": ("sensors.rates", tables.RATES),
-    "magnetic field": ("sensors.magnetometer", tables.MAGNETOMETER),
-}
-G_OR_GAUSS = {"acceleration", "magnetic field"}
-FIELD_GAUSS = (0.15, 0.9)  # the Earth's, with some iron, and less than 1 g
-EARTH_RADII_M = (6.2e6, 7.5e6)
-MOUNT = 'a package of the vehicle file, or "body"; or axes = ["+x", "+y", "+z"]: which body axis is each of its axes?'
-AIR = ("alt", "rho", "temperature", "pressure", "wind_speed", "wind_from")
-AIR_BY_PARTS = ("wind_north", "wind_east")
-Family = tuple[tuple[str, ...], str]
+# sensors
 
 
-class Reader:
+class Recogniser:
     """One table being recognised; columns are claimed once."""
 
-    def __init__(self, table: LooseTable) -> None:
+    def __init__(self, table: FreeFormTable) -> None:
         self.table = table
-        self.named = [take_apart(n, u) for n, u in zip(table.names, table.units, strict=True)]
+        self.named = column_names(table)
         self.time = find_time(table, self.named)
         self.free = set(range(len(table.names)))
         self.spare: set[int] = set()  # understood, and not used
@@ -271,161 +279,157 @@ class Reader:
             self.free -= {table.names.index(c) for c in (*self.time.columns, *self.time.others)}
         self.name = re.sub(r"[^A-Za-z0-9_-]+", "_", table.label).strip("_")[:64] or "table"
 
-    def everything(self) -> tuple[list[SourceProposal], list[str]]:
+    def proposals(self) -> tuple[list[SourceProposal], list[str]]:
         """Return what the table holds, and the names of columns that were recognised as nothing.
 
-        Triads first, whose columns come in threes; then radar, receiver, barometer, sounding.
+        Three-axis sensors first, whose columns come in threes; then radar, receiver, barometer, sounding.
         """
-        if self.is_sounding():
+        if self._is_sounding():
             self.time = None
-            found = self.sounding()
+            found = self._sounding()
         elif self.time is None:
             found = []
         else:
-            found = self.triads() + self.radar() + self.receiver() + self.barometer()
+            found = self._three_axis_sensors() + self._radar() + self._receiver() + self._barometer()
         for source in found:
             source.time = self.time
         return found, [self.table.names[k] for k in sorted(self.free | self.spare)]
 
-    # threes
+    # three axes
 
-    def families(self) -> dict[Family, dict[int, int]]:
+    def _families(self) -> dict[_Family, dict[int, int]]:
         """Columns whose names differ by an axis alone: (stem, family) -> column by axis."""
-        out: dict[Family, dict[int, int]] = {}
+        out: dict[_Family, dict[int, int]] = {}
         for k in sorted(self.free):
             for stem, family, axis in _axes_of(self.named[k].tokens):
                 out.setdefault((stem, family), {}).setdefault(axis, k)
         return {key: by_axis for key, by_axis in out.items() if len(by_axis) == 3}
 
-    def triads(self) -> list[SourceProposal]:
+    def _three_axis_sensors(self) -> list[SourceProposal]:
         """Accelerometer, gyros, magnetometer."""
         found: dict[str, SourceProposal] = {}
-        for (stem, family), by_axis in self.families().items():
+        for (stem, family), by_axis in self._families().items():
             at = [by_axis[a] for a in range(3)]
             if not set(at) <= self.free:
                 continue
-            kind, why = self._triad_kind(stem, family, at)
-            if kind not in TRIADS or TRIADS[kind][0] in found:
+            kind, why = self._vector_kind(stem, family, at)
+            if kind not in _THREE_AXIS or _THREE_AXIS[kind][0] in found:
                 continue
-            section, quantities = TRIADS[kind]
-            source = SourceProposal(section, self._triad_columns(kind, quantities, at, why))
-            if family != "body" and not all(m.canonical for m in source.columns):
-                source.keys.append(("mount", '"FILL IN"', MOUNT))
+            section, quantities = _THREE_AXIS[kind]
+            source = SourceProposal(section, self._vector_columns(kind, quantities, at, why))
             if family == "numbered":
-                source.keys[-1] = ("mount", '"FILL IN"', f"{MOUNT} (1, 2, 3 are taken for x, y, z)")
+                source.keys.append(("mount", FILL_IN_TOML, f"{_MOUNT} (1, 2, 3 are taken for x, y, z)"))
+            elif family != "body" and not all(m.canonical for m in source.columns):
+                source.keys.append(("mount", FILL_IN_TOML, _MOUNT))
             self.free -= set(at)
             found[section] = source
         return list(found.values())
 
-    def _triad_kind(self, stem: tuple[str, ...], family: str, at: list[int]) -> tuple[str, str]:
+    def _vector_kind(self, stem: tuple[str, ...], family: str, at: list[int]) -> tuple[str, str]:
         stated = self._stated(at)
-        worded = [kind for kind, words in TRIAD_WORDS.items() if means(stem, words)]
+        worded = [kind for kind, vocabulary in VECTORS.items() if matching(stem, vocabulary)]
         if family == "body" and (not stem or "rate" in worded or stated == {"rate"}):
             return ("rate", "names of body rates") if stated in (set(), {"rate"}) else ("", "")
         fitting = [kind for kind in worded if not stated or kind in stated]
         if len(stated) == 1:
             kind = next(iter(stated))
-            # a unit alone does not say which vector it is, except where only one sensor has it
+            # a unit alone does not identify a vector, except where only one sensor has it
             if kind in ("rate", "magnetic field", "acceleration") or kind in worded:
                 return kind, "unit"
             return "", ""
-        if stated == G_OR_GAUSS and not worded and self._is_g(at):
+        if stated == _G_OR_GAUSS and not worded and self._is_g(at):
             return "acceleration", "three axes"
         if stated and len(fitting) != 1:
             return "", ""
         return (fitting[0], "name") if len(fitting) == 1 else ("", "")
 
     def _is_g(self, at: list[int]) -> bool:
-        """Whether ``g`` is no gauss: a small letter, or of a size that the Earth's field has nowhere."""
+        """Whether ``g`` is no gauss: a small letter, or of a magnitude that the Earth's field has nowhere."""
         if all(unit_key(self.named[k].unit_text) == self.named[k].unit_text for k in at):
             return True
         size = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1)
         size = size[np.isfinite(size)]
-        return len(size) > 0 and not FIELD_GAUSS[0] < float(np.median(size)) < FIELD_GAUSS[1]
+        return len(size) > 0 and not _FIELD_GAUSS[0] < float(np.median(size)) < _FIELD_GAUSS[1]
 
     def may_be_inertial(self) -> bool:
         """Whether columns that were recognised as nothing differ by x, y, z alone, as an inertial sensor's do."""
         if self.time is None:
             return False
-        left = {"_".join(self.named[k].tokens): self.named[k].kinds for k in self.free}
-        for name, kinds in left.items():
+        unused = {"_".join(self.named[k].tokens): self.named[k].kinds for k in self.free}
+        for name, kinds in unused.items():
             for at in (k for k, letter in enumerate(name) if letter == "x"):
                 mates = [name[:at] + axis + name[at + 1 :] for axis in "yz"]
-                if all(mate in left for mate in mates) and not kinds - {"acceleration", "rate", "magnetic field"}:
+                if all(mate in unused for mate in mates) and not kinds - {"acceleration", "rate", "magnetic field"}:
                     return True
         return False
 
     def _stated(self, at: Iterable[int]) -> set[str]:
         return set.intersection(*(self.named[k].kinds for k in at))
 
-    def _triad_columns(self, kind: str, quantities: Iterable[Quantity], at: list[int], why: str) -> list[Mapped]:
-        guess, seen = triad_unit(kind, np.column_stack([self.table.numbers(k) for k in at]))
+    def _vector_columns(
+        self, kind: str, quantities: Iterable[Quantity], at: list[int], why: str
+    ) -> list[ColumnProposal]:
+        by_numbers, seen = _vector_unit(kind, np.column_stack([self.table.numbers(k) for k in at]))
         out = []
         for q, k in zip(quantities, at, strict=True):
             unit = next(iter(self.named[k].units(kind)), "")
             how, reason = (STATED, f"{why}, '{self.named[k].unit_text}' in the header") if unit else ("", "")
             if not unit:
                 meaning = SEVERAL_MEANINGS.get(self.named[k].unit_text, "")
-                unit, how, reason = guess, NUMBERS if guess else ASKED, "; ".join(filter(None, (meaning, why, seen)))
-            out.append(self._mapped(q, k, unit, how, reason))
+                unit, how = by_numbers, NUMBERS if by_numbers else ASKED
+                reason = "; ".join(filter(None, (meaning, why, seen)))
+            out.append(self._proposal(q, k, unit, how, reason))
         return out
 
     # one by one
 
     def columns_of(self, short: str) -> list[int]:
-        """Free columns whose name says a quantity, the plainest first."""
-        words = QUANTITY_WORDS[short]
-        found = [
-            k for k in sorted(self.free) if means(self.named[k].tokens, words) or "".join(self.named[k].tokens) in words
-        ]
+        """Return free columns whose name has a quantity's vocabulary, those with the fewest other tokens first."""
+        words = QUANTITIES[short]
+        tokens = {k: self.named[k].tokens for k in sorted(self.free)}
+        found = [k for k, own in tokens.items() if matching(own, words) or "".join(own) in words]
         if short == "wind_speed":  # "wind from" is no speed
-            found = [k for k in found if not set(self.named[k].tokens) & QUANTITY_WORDS["wind_from"]]
-        return sorted(found, key=lambda k: (len(set(self.named[k].tokens) - words), k))
+            found = [k for k in found if not set(tokens[k]) & QUANTITIES["wind_from"]]
+        return sorted(found, key=lambda k: (len(set(tokens[k]) - words), k))
 
-    def single(self, quantity: Quantity, word: str = "") -> Mapped | None:
-        """Return the column of one quantity, claimed; None where there is none."""
-        for k in self.columns_of(word or quantity.short):
+    def _single(self, quantity: Quantity, vocabulary: str = "") -> ColumnProposal | None:
+        """Claim the column of one quantity; None where there is none."""
+        for k in self.columns_of(vocabulary or quantity.short):
             stated = self.named[k].kinds
             if stated and quantity.kind not in stated:
                 continue
             self.free.discard(k)
             unit = next(iter(self.named[k].units(quantity.kind)), "")
             if unit:
-                return self._mapped(quantity, k, unit, STATED, f"'{self.named[k].unit_text}' in the header")
-            unit, seen = single_unit(quantity.short, quantity.kind, self.table.numbers(k))
-            return self._mapped(quantity, k, unit, NUMBERS if unit else ASKED, seen)
+                return self._proposal(quantity, k, unit, STATED, f"'{self.named[k].unit_text}' in the header")
+            unit, seen = column_unit(quantity.short, quantity.kind, self.table.numbers(k))
+            return self._proposal(quantity, k, unit, NUMBERS if unit else ASKED, seen)
         return None
 
-    def _mapped(self, quantity: Quantity, k: int, unit: str, how: str, why: str) -> Mapped:
+    def _proposal(self, quantity: Quantity, k: int, unit: str, how: str, why: str) -> ColumnProposal:
         name = self.table.names[k]
-        canonical = name == quantity.canonical
-        return Mapped(
-            quantity.short,
-            name,
-            unit,
-            STATED if canonical else how,
-            "its canonical name" if canonical else why,
-            canonical,
-        )
+        if name == quantity.canonical:
+            return ColumnProposal(quantity.short, name, unit, STATED, "its canonical name", canonical=True)
+        return ColumnProposal(quantity.short, name, unit, how, why)
 
-    def radar(self) -> list[SourceProposal]:
+    def _radar(self) -> list[SourceProposal]:
         """Slant range, azimuth, elevation."""
         if not all(self.columns_of(q.short) for q in tables.RADAR):
             return []
-        found = [self.single(q) for q in tables.RADAR]
+        found = [self._single(q) for q in tables.RADAR]
         if any(m is None for m in found):
             return []
-        keys = [(key, '"FILL IN"', words) for key, words in (
+        keys = [(key, FILL_IN_TOML, words) for key, words in (
             ("latitude_deg", "deg: the radar's site, WGS-84"), ("longitude_deg", "deg, east positive"),
             ("height_m", "m above the ellipsoid"),
         )]  # fmt: skip
         return [SourceProposal(f"radars.{self.name}", [m for m in found if m], keys)]
 
-    def receiver(self) -> list[SourceProposal]:
+    def _receiver(self) -> list[SourceProposal]:
         """Positions by latitude and longitude or ECEF, velocities."""
         quantity = {q.short: q for q in tables.GNSS}
         ecef = self._vectors("length", ("x", "y", "z"))
-        lat_lon = [] if ecef else [m for s in ("lat", "lon") if (m := self.single(quantity[s]))]
+        lat_lon = [] if ecef else [m for s in ("lat", "lon") if (m := self._single(quantity[s]))]
         if not ecef and len(lat_lon) < 2:
             return []
         found, keys = list(ecef or lat_lon), []
@@ -444,82 +448,79 @@ class Reader:
             if self.table.names[satellites[0]] != "nsat":
                 name = quoted(self.table.names[satellites[0]])
                 keys.append(("satellites_column", name, "counted there; min_satellites = 8 leaves poor fixes out"))
-        for short in ("lat", "lon", "alt") if ecef else ():  # the same places once more
+        for short in ("lat", "lon", "alt") if ecef else ():  # the same positions once more
             self._set_aside(set(self.columns_of(short)))
         return [SourceProposal(f"gnss.{self.name}", found, keys)]
 
-    def _vectors(self, kind: str, shorts: tuple[str, ...]) -> list[Mapped]:
+    def _vectors(self, kind: str, shorts: tuple[str, ...]) -> list[ColumnProposal]:
         quantities = [next(q for q in tables.GNSS if q.short == s) for s in shorts]
         ned = shorts[0] == "vn"
-        for (stem, family), by_axis in self.families().items():
+        for (stem, family), by_axis in self._families().items():
             at = [by_axis[a] for a in range(3)]
             stated = self._stated(at)
             if not set(at) <= self.free or (stated and kind not in stated) or (family == "ned") != ned:
                 continue
-            if not stated and not set(stem) & TRIAD_WORDS[kind]:
+            if not stated and not set(stem) & VECTORS[kind]:
                 continue
             if not ned and "ecef" not in stem and not (kind == "length" and self._earth_sized(at)):
                 continue
             self.free -= set(at)
-            return [self._of_vector(q, k, kind) for q, k in zip(quantities, at, strict=True)]
+            units = [next(iter(self.named[k].units(kind)), "") for k in at]
+            return [
+                self._proposal(q, k, unit, STATED if unit else ASKED, f"'{self.named[k].unit_text}' in the header")
+                for q, k, unit in zip(quantities, at, units, strict=True)
+            ]
         return []
-
-    def _of_vector(self, quantity: Quantity, k: int, kind: str) -> Mapped:
-        unit = next(iter(self.named[k].units(kind)), "")
-        return self._mapped(quantity, k, unit, STATED if unit else ASKED, f"'{self.named[k].unit_text}' in the header")
 
     def _earth_sized(self, at: list[int]) -> bool:
         unit = next(iter(self.named[at[0]].units("length")), "m")
         size: FloatArray = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1) * UNITS[unit][1]
-        return bool(EARTH_RADII_M[0] < np.nanmedian(size) < EARTH_RADII_M[1])
+        return bool(_EARTH_RADII_M[0] < np.nanmedian(size) < _EARTH_RADII_M[1])
 
-    def _height(self, quantity: Quantity) -> tuple[Mapped | None, list[tuple[str, str, str]]]:
+    def _height(self, quantity: Quantity) -> tuple[ColumnProposal | None, list[tuple[str, str, str]]]:
         candidates = self.columns_of("alt")
         ell = [k for k in candidates if set(self.named[k].tokens) & {"ell", "ellipsoid", "hae", "wgs", "wgs84"}]
         msl = [k for k in candidates if set(self.named[k].tokens) & {"msl", "amsl", "geoid", "nn", "sea"}]
         if ell:  # asks for no undulation
             self._set_aside(set(candidates) - {ell[0]})
-            return self.single(quantity), [("height_is", '"ellipsoid"', "the column's name says it")]
-        undulation = (
-            "geoid_undulation_m",
-            '"FILL IN"',
-            "m: geoid above the ellipsoid at the place (EGM96), -107 to 85",
-        )
+            return self._single(quantity), [("height_is", '"ellipsoid"', "by the column's name")]
+        where = "m: geoid above the ellipsoid at the place (EGM96), -107 to 85"
+        undulation = ("geoid_undulation_m", FILL_IN_TOML, where)
         if msl:
             self._set_aside(set(candidates) - {msl[0]})
-            return self.single(quantity), [("height_is", '"msl"', "the column's name says it"), undulation]
-        return self.single(quantity), [("height_is", '"FILL IN"', '"ellipsoid", or "msl" with geoid_undulation_m')]
+            return self._single(quantity), [("height_is", '"msl"', "by the column's name"), undulation]
+        return self._single(quantity), [("height_is", FILL_IN_TOML, '"ellipsoid", or "msl" with geoid_undulation_m')]
 
     def _set_aside(self, at: set[int]) -> None:
         self.spare |= at & self.free
         self.free -= at
 
-    def barometer(self) -> list[SourceProposal]:
+    def _barometer(self) -> list[SourceProposal]:
         """Static pressure, or heights."""
         height, pressure = tables.BAROMETER
-        found = self.single(pressure)
+        found = self._single(pressure)
         if found is None:
-            found = self.single(height, "alt")
+            found = self._single(height, "alt")
         if found is None:
             return []
         what = '"ellipsoid", or "msl" with geoid_undulation_m = ... (m, geoid above ellipsoid); pressures too'
-        return [SourceProposal(f"barometers.{self.name}", [found], [("height_is", '"FILL IN"', what)])]
+        return [SourceProposal(f"barometers.{self.name}", [found], [("height_is", FILL_IN_TOML, what)])]
 
-    def air_columns(self) -> dict[Quantity, Mapped]:
-        """Columns of a sounding; winds by speed and direction go before those by components."""
-        found = {q: m for q in tables.ATMOSPHERE if q.short in AIR and (m := self.single(q))}
+    def air_columns(self) -> dict[Quantity, ColumnProposal]:
+        """Claim the columns of a sounding; winds by speed and direction go before those by components."""
+        found = {q: m for q in tables.ATMOSPHERE if q.short in _AIR and (m := self._single(q))}
         if not {"wind_speed", "wind_from"} <= {q.short for q in found}:
-            found |= {q: m for q in tables.ATMOSPHERE if q.short in AIR_BY_PARTS and (m := self.single(q))}
+            found |= {q: m for q in tables.ATMOSPHERE if q.short in _AIR_BY_COMPONENTS and (m := self._single(q))}
         return found
 
-    def is_sounding(self) -> bool:
+    def _is_sounding(self) -> bool:
         """Whether height, temperature and wind's direction or density are there, and nothing of a tracker."""
         tracker = all(self.columns_of(s) for s in ("lat", "lon")) or all(self.columns_of(q.short) for q in tables.RADAR)
         air = all(self.columns_of(s) for s in ("alt", "temperature"))
         return air and not tracker and bool(self.columns_of("wind_from") or self.columns_of("rho"))
 
-    def sounding(self) -> list[SourceProposal]:
-        """A table by altitude, as it stands; `postflight.intake.deliveries` derives densities before."""
+    def _sounding(self) -> list[SourceProposal]:
+        """Columns of a table by altitude, as they are; `postflight.intake.deliveries` derives densities before."""
         found = list(self.air_columns().values())
         shorts = {m.short for m in found}
         return [SourceProposal("atmosphere", found)] if {"alt", "temperature", "rho"} <= shorts else []
@@ -528,7 +529,7 @@ class Reader:
 def _axes_of(tokens: tuple[str, ...]) -> list[tuple[tuple[str, ...], str, int]]:
     """Ways to read an axis out of a name: (rest of the name, family, axis)."""
     out = []
-    stems = {w for words in TRIAD_WORDS.values() for w in words} | {"g"}
+    stems = {token for vocabulary in VECTORS.values() for token in vocabulary} | {"g"}
     for k, token in enumerate(tokens):
         rest = tokens[:k] + tokens[k + 1 :]
         if token in AXES:

@@ -1,12 +1,13 @@
-"""Reading a table as somebody else wrote it: any delimiter, comments, a row of units, decimal commas, old encodings.
+"""How is a table read that somebody else wrote? Text in any layout, and vectors in MATLAB files.
 
-Nothing is dropped or changed in silence: every conversion is among the table's notes. What comes out is a table of text
-cells that `flightmodel.tables.read_table` can read once it is written as plain CSV.
+Text: any delimiter, comments, a preface, a row of units, decimal commas, old encodings, columns between dashed rules.
+The table is where most columns stand: names, then three rows of numbers of the same count. MATLAB: version 5 to 7 by
+scipy, 7.3 (HDF5) by h5py where it is installed; vectors of one length beside each other (at the top, or in one
+structure) are a table, a matrix with as many rows gives a column for each of its own. Only numbers are read, no
+objects.
 
-Tables in MATLAB files: numbers alone, no objects, nothing that could run.
-
-Version 5 to 7 by scipy, version 7.3 (HDF5) by h5py where it is installed. Vectors of one length beside each
-other (at the top, or in one structure) are a table; a matrix with as many rows gives a column for each of its columns.
+Nothing is dropped or changed without a note. What comes out are text cells that `flightmodel.tables.read_table` reads
+once they are written as plain CSV.
 """
 
 from __future__ import annotations
@@ -23,24 +24,36 @@ from typing import Any
 import numpy as np
 
 from flightmodel.checks import ConfigError, FloatArray, GateError
-from postflight.intake.headers import SEVERAL_MEANINGS, UNIT_WORDS, unit_key
+from postflight.intake.headers import SEVERAL_MEANINGS, UNIT_SPELLINGS, unit_key
 
-LARGEST_BYTES = 2 * 1024**3
-LARGEST = 1e100  # what is beyond is a broken word
-HEAD_LINES = 80  # names and first rows are within
-COMMENT = re.compile(r"^\s*(#+|%+|//+|\*+|;|!|\")\s*")
-NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
-COMMA_NUMBER = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
-CLOCK = re.compile(r"^(\d{1,3}[:/])?\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?$|^\d{4}-\d{2}-\d{2}[T ]")
-DELIMITERS = ("\t", ";", ",", "|", None)  # None: runs of spaces
-MISSING = {"", "nan", "na", "n/a", "null", "-", "--", "---", "none"}
+_LARGEST_BYTES = 2 * 1024**3
+_LARGEST = 1e100  # what is beyond is a broken word
+_HEAD_LINES = 80  # names and first rows are within
+_COMMENT = re.compile(r"^\s*(#+|%+|//+|\*+|;|!|\")\s*")
+_NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
+_COMMA_NUMBER = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
+_CLOCK = re.compile(r"^(\d{1,3}[:/])?\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?$|^\d{4}-\d{2}-\d{2}[T ]")
+_DELIMITERS = ("\t", ";", ",", "|", None)  # None: runs of spaces
+_MISSING = {"", "nan", "na", "n/a", "null", "-", "--", "---", "none"}
+_MOST_NUMBERS = 200_000_000  # of a MATLAB file
+_LEAST_ROWS = 3
 
 
 @dataclass
-class LooseTable:
-    """A table of text cells with names, units as a row below the header gave them, and what was changed.
+class FreeFormTable:
+    """A table of text cells.
 
-    ``raw`` is the file's content where it is plain CSV already.
+    Parameters
+    ----------
+    label : str
+        The file's stem, with the structure's name for MATLAB.
+    names, units : list of str
+        Of the columns; units as a row below the header gives them, empty for none.
+    rows : list of list of str
+    notes : list of str
+        What was changed or left out.
+    raw : bytes or None
+        The file's content where it is plain CSV already.
     """
 
     label: str
@@ -51,7 +64,7 @@ class LooseTable:
     raw: bytes | None = None
 
     def numbers(self, column: int) -> FloatArray:
-        """Return a column as float64; what is no number is NaN."""
+        """Return a column (n,) as float64; what is no number is NaN."""
         out = np.full(len(self.rows), np.nan)
         for k, row in enumerate(self.rows):
             if column < len(row):
@@ -59,7 +72,11 @@ class LooseTable:
                     out[k] = float(row[column])
                 except ValueError:
                     continue
-        return np.where(np.abs(out) < LARGEST, out, np.nan)
+        return np.where(np.abs(out) < _LARGEST, out, np.nan)
+
+    def cells(self, column: int, rows: int | None = None) -> list[str]:
+        """Return a column's cells that are not empty, of its first ``rows``."""
+        return [row[column] for row in self.rows[:rows] if column < len(row) and row[column]]
 
     def as_csv(self) -> bytes:
         """Return the plain CSV that is written."""
@@ -72,33 +89,39 @@ class LooseTable:
         return out.getvalue().encode()
 
 
-def read_loose(path: Path) -> LooseTable:
-    """Read one text table; `GateError` where no table of numbers with names is found."""
+def read_text_table(path: Path) -> FreeFormTable:
+    """Read one text table.
+
+    Raises
+    ------
+    GateError
+        ``table-missing`` where no names above three rows of numbers are found, ``table-too-large``,
+        ``table-binary``, or ``file-missing``.
+    """
     try:
-        if path.stat().st_size > LARGEST_BYTES:
-            raise GateError(f"{path}: larger than 2 GB; split it")
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise GateError(f"{path}: larger than 2 GB; split it", code="table-too-large")
         raw = path.read_bytes()
     except FileNotFoundError:
-        raise GateError(f"{path}: no such file") from None
+        raise GateError(f"{path}: no such file", code="file-missing") from None
     text, notes = _decoded(path, raw)
     lines = [line for line in text.splitlines() if line.strip()]
     ruled = _ruled(path, lines)
     if ruled is not None:
         ruled.notes[:0] = notes
         return ruled
-    found = _layout(lines[:HEAD_LINES])
+    found = _layout(lines[:_HEAD_LINES])
     if found is None:
-        raise GateError(
-            f"{path}: no table found: a line of names, three rows of numbers below it and one delimiter are wanted"
-        )
+        words = "no table found: a line of names, three rows of numbers below it and one delimiter are wanted"
+        raise GateError(f"{path}: {words}", code="table-missing")
     delimiter, first, header, unit_row = found
     names = [n.strip() for n in header]
     units = [u.strip() for u in unit_row] if unit_row else [""] * len(names)
     rows = [_split(line, delimiter) for line in lines[first:] if not _is_comment(line, delimiter)]
     if delimiter != ",":
         notes.append(f"delimiter {'spaces' if delimiter is None else repr(delimiter)} became a comma")
-    if delimiter != "," and _decimal_comma(rows[:HEAD_LINES]):
-        rows = [[c.replace(",", ".") if COMMA_NUMBER.match(c) else c for c in row] for row in rows]
+    if delimiter != "," and _decimal_comma(rows[:_HEAD_LINES]):
+        rows = [[c.replace(",", ".") if _COMMA_NUMBER.match(c) else c for c in row] for row in rows]
         notes.append("decimal commas became points")
     if unit_row:
         notes.append("the row of units below the names was taken out")
@@ -110,15 +133,15 @@ def read_loose(path: Path) -> LooseTable:
             names[k] = f"{name or 'column'}_{k + 1}"
             notes.append(f"column {k + 1} was named '{name}' like another: now '{names[k]}'")
     plain = not notes and all(len(r) == len(names) for r in rows)
-    return LooseTable(path.stem, names, units, rows, notes, raw if plain else None)
+    return FreeFormTable(path.stem, names, units, rows, notes, raw if plain else None)
 
 
-def _ruled(path: Path, lines: list[str]) -> LooseTable | None:
+def _ruled(path: Path, lines: list[str]) -> FreeFormTable | None:
     """Read a table of right-aligned columns between dashed rules (as the University of Wyoming lists soundings).
 
     Empty cells are blanks there: a cell ends below the end of its name.
     """
-    rules = [k for k, line in enumerate(lines[:HEAD_LINES]) if re.fullmatch(r"\s*-{10,}\s*", line)]
+    rules = [k for k, line in enumerate(lines[:_HEAD_LINES]) if re.fullmatch(r"\s*-{10,}\s*", line)]
     for top, bottom in pairwise(rules):
         if bottom - top not in (2, 3):
             continue
@@ -128,12 +151,12 @@ def _ruled(path: Path, lines: list[str]) -> LooseTable | None:
         rows = []
         for line in lines[bottom + 1 :]:
             cells = _columns_below(line, ends)
-            if not NUMBER.match(cells[0]):
+            if not _NUMBER.match(cells[0]):
                 break
             rows.append(cells)
         if len(rows) >= 3:
             note = f"columns between rules became CSV; {len(lines) - len(rows)} lines of names, units and text left out"
-            return LooseTable(path.stem, names, units, rows, [note])
+            return FreeFormTable(path.stem, names, units, rows, [note])
     return None
 
 
@@ -147,7 +170,7 @@ def _decoded(path: Path, raw: bytes) -> tuple[str, list[str]]:
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16", errors="replace"), ["UTF-16 became UTF-8"]
     if b"\0" in raw[:65536]:
-        raise GateError(f"{path}: binary data where a text table is wanted")
+        raise GateError(f"{path}: binary data where a text table is wanted", code="table-binary")
     try:
         return raw.decode("utf-8-sig"), []
     except UnicodeDecodeError:
@@ -156,7 +179,7 @@ def _decoded(path: Path, raw: bytes) -> tuple[str, list[str]]:
 
 def _is_comment(line: str, delimiter: str | None) -> bool:
     """Whether a line is a comment; where semicolons part the cells, an empty first cell makes none."""
-    return bool(COMMENT.match(line)) and not (delimiter == ";" and line.lstrip().startswith(";"))
+    return bool(_COMMENT.match(line)) and not (delimiter == ";" and line.lstrip().startswith(";"))
 
 
 def _split(line: str, delimiter: str | None) -> list[str]:
@@ -168,15 +191,15 @@ def _split(line: str, delimiter: str | None) -> list[str]:
 
 
 def _is_data(cells: list[str]) -> bool:
-    known = [c for c in cells if c.lower() not in MISSING]
-    good = sum(1 for c in known if NUMBER.match(c) or COMMA_NUMBER.match(c) or CLOCK.match(c))
+    known = [c for c in cells if c.lower() not in _MISSING]
+    good = sum(1 for c in known if _NUMBER.match(c) or _COMMA_NUMBER.match(c) or _CLOCK.match(c))
     return len(cells) >= 2 and bool(known) and good >= max(1, 0.5 * len(known))
 
 
 def _layout(lines: list[str]) -> tuple[str | None, int, list[str], list[str]] | None:
     """Delimiter, first line of data, names and row of units (empty for none) of the widest table of numbers."""
     best = None
-    for delimiter in DELIMITERS:
+    for delimiter in _DELIMITERS:
         cut = [_split(line, delimiter) for line in lines]
         for first in range(1, len(lines) - 2):
             three = cut[first : first + 3]
@@ -203,7 +226,7 @@ def _names_above(
     for k in range(first - 1, max(-1, first - 6), -1):
         cells = cut[k]
         if len(cells) != count or _is_comment(lines[k], delimiter):
-            cells = _split(COMMENT.sub("", lines[k]), delimiter)
+            cells = _split(_COMMENT.sub("", lines[k]), delimiter)
         if len(cells) != count:
             continue
         if not units and _are_units(cells):
@@ -216,32 +239,42 @@ def _names_above(
 
 def _are_units(cells: list[str]) -> bool:
     known = [c for c in cells if c.strip("()[]{}<>- ")]
-    fitting = sum(1 for c in known if unit_key(c) in UNIT_WORDS or unit_key(c) in SEVERAL_MEANINGS or CLOCK.match(c))
+    fitting = sum(
+        1 for c in known if unit_key(c) in UNIT_SPELLINGS or unit_key(c) in SEVERAL_MEANINGS or _CLOCK.match(c)
+    )
     formats = sum(1 for c in known if re.match(r"^(DDD|hh|HH)?:?[hH:mMsS.]+$", c))
     return bool(known) and fitting + formats >= 0.6 * len(known) and not any(len(c) > 24 for c in known) and fitting > 0
 
 
 def _decimal_comma(rows: list[list[str]]) -> bool:
     cells = [c for row in rows for c in row]
-    return any(COMMA_NUMBER.match(c) for c in cells) and not any(NUMBER.match(c) and "." in c for c in cells)
+    return any(_COMMA_NUMBER.match(c) for c in cells) and not any(_NUMBER.match(c) and "." in c for c in cells)
 
 
-MOST_NUMBERS = 200_000_000
-LEAST_ROWS = 3
+# MATLAB
 
 
-def read_matlab(path: Path) -> list[LooseTable]:
-    """Read every table of a MATLAB file; `GateError` where there is none."""
+def read_matlab(path: Path) -> list[FreeFormTable]:
+    """Read every table of a MATLAB file.
+
+    Raises
+    ------
+    GateError
+        ``table-missing`` where no two columns of numbers have one length, ``matlab-unreadable``,
+        ``table-too-large``, or ``file-missing``.
+    ConfigError
+        ``h5py-missing`` for version 7.3 without h5py.
+    """
     try:
         with path.open("rb") as file:
             head = file.read(128)
     except FileNotFoundError:
-        raise GateError(f"{path}: no such file") from None
+        raise GateError(f"{path}: no such file", code="file-missing") from None
     variables, left_out = _version_73(path) if b"MATLAB 7.3" in head or head[:4] == b"\x89HDF" else _version_5(path)
     groups: dict[tuple[str, int], dict[str, FloatArray]] = {}
     for parent, name, values in variables:
         rows = max(values.shape)
-        if rows < LEAST_ROWS or values.ndim != 2:
+        if rows < _LEAST_ROWS or values.ndim != 2:
             left_out.append(name)
             continue
         block = values if values.shape[0] == rows else values.T
@@ -256,11 +289,10 @@ def read_matlab(path: Path) -> list[LooseTable]:
         notes = ["MATLAB numbers became CSV"]
         if left_out:
             notes.append(f"left out, as no columns of numbers: {', '.join(sorted(left_out)[:8])}")
-        tables.append(LooseTable(label, list(columns), [""] * len(columns), cells, notes))
+        tables.append(FreeFormTable(label, list(columns), [""] * len(columns), cells, notes))
     if not tables:
-        raise GateError(
-            f"{path}: no two columns of numbers of one length; left out: {', '.join(left_out) or 'nothing'}"
-        )
+        words = f"no two columns of numbers of one length; left out: {', '.join(left_out) or 'nothing'}"
+        raise GateError(f"{path}: {words}", code="table-missing")
     return tables
 
 
@@ -269,13 +301,14 @@ def _version_5(path: Path) -> tuple[list[tuple[str, str, FloatArray]], list[str]
     from scipy.io.matlab import MatReadError
 
     try:
-        if sum(int(np.prod(shape)) for _, shape, _ in whosmat(path)) > MOST_NUMBERS:
-            raise GateError(f"{path}: more than {MOST_NUMBERS} numbers; split it")
+        if sum(int(np.prod(shape)) for _, shape, _ in whosmat(path)) > _MOST_NUMBERS:
+            raise GateError(f"{path}: more than {_MOST_NUMBERS} numbers; split it", code="table-too-large")
         content = loadmat(path, chars_as_strings=True)
     except (ValueError, TypeError, OSError, MatReadError, NotImplementedError, KeyError) as fault:
         if isinstance(fault, GateError):
             raise
-        raise GateError(f"{path}: not a MATLAB file that can be read ({fault}); save it with -v7, or as CSV") from None
+        words = f"not a MATLAB file that can be read ({fault}); save it with -v7, or as CSV"
+        raise GateError(f"{path}: {words}", code="matlab-unreadable") from None
     found, left_out = [], []
     for parent, name, value in _walk(content):
         if _is_numbers(value):
@@ -308,7 +341,7 @@ def _version_73(path: Path) -> tuple[list[tuple[str, str, FloatArray]], list[str
         words = (
             "a MATLAB 7.3 file needs h5py: pip install 'postflight[matlab]', or save it in MATLAB with -v7, or as CSV"
         )
-        raise ConfigError(f"{path}: {words}") from None
+        raise ConfigError(f"{path}: {words}", code="h5py-missing") from None
     found: list[tuple[str, str, FloatArray]] = []
     left_out: list[str] = []
 
@@ -316,7 +349,7 @@ def _version_73(path: Path) -> tuple[list[tuple[str, str, FloatArray]], list[str
         if not isinstance(item, h5py.Dataset) or name.startswith("#"):
             return
         parent, _, own = name.rpartition("/")
-        if item.dtype.kind in "fiu" and item.ndim <= 2 and 0 < item.size <= MOST_NUMBERS:
+        if item.dtype.kind in "fiu" and item.ndim <= 2 and 0 < item.size <= _MOST_NUMBERS:
             found.append((parent.replace("/", "_"), own, np.atleast_2d(np.asarray(item[()], dtype=float))))
         else:
             left_out.append(own)
@@ -325,5 +358,6 @@ def _version_73(path: Path) -> tuple[list[tuple[str, str, FloatArray]], list[str
         with h5py.File(path, "r") as file:
             file.visititems(visit)
     except OSError as fault:
-        raise GateError(f"{path}: not a MATLAB file that can be read ({fault})") from None
+        words = f"not a MATLAB file that can be read ({fault})"
+        raise GateError(f"{path}: {words}", code="matlab-unreadable") from None
     return found, left_out

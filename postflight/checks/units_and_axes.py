@@ -1,0 +1,119 @@
+"""Which unit, which order of axes and which time bias reconcile one record with another?
+
+A unit is named where another of the same kind meets the ratio of two records within a few per cent,
+``f_unit / f_declared = ratio``. Axes are any of the 48 orders and signs of three columns. A time bias is a
+cross-check's remark where it exceeds five standard deviations and 0.1 s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from flightmodel.checks import FloatArray
+from flightmodel.tables import UNITS, Quantity, Source, place
+from flightmodel.telemetry import Finding
+
+Axes = tuple[tuple[int, ...], tuple[int, ...]]
+AS_DECLARED: Axes = ((0, 1, 2), (1, 1, 1))
+_SAME_UNIT = 0.05  # logarithm: a unit explains a ratio within this
+_SIGNIFICANT_SD, _SIGNIFICANT_S = 5.0, 0.1
+
+
+def unit_of(source: Source, quantity: Quantity) -> str:
+    """Return the unit that flight.toml, or the column's own name, states for a quantity."""
+    return place(quantity, source.declared(quantity.short))[1]
+
+
+def unit_that_explains(ratio: float, unit: str, within: float = _SAME_UNIT) -> str | None:
+    """Return the unit in which values read as ``unit`` would be ``ratio`` times as large; None where there is none.
+
+    Parameters
+    ----------
+    ratio : float
+        Expected over read, in SI.
+    unit : str
+        As declared; it is returned where the values fit as they are.
+    within : float
+        Largest difference of the logarithms.
+    """
+    kind, factor, _ = UNITS[unit]
+    if not np.isfinite(ratio) or ratio <= 0.0:
+        return None
+    off = {name: abs(float(np.log(f / factor / ratio))) for name, (k, f, _) in UNITS.items() if k == kind}
+    best = min(off, key=lambda name: (off[name], name != unit))
+    return best if off[best] < within else None
+
+
+def unit_hint(declared: str, unit: str | None) -> str:
+    """Return the end of a message that names the unit the numbers fit; empty where that is none or the declared one."""
+    return f": declared in '{declared}', consistent with '{unit}'" if unit not in (None, declared) else ""
+
+
+def all_axes() -> list[Axes]:
+    """Return the 48 (order, signs) in which three columns may stand for body x, y, z; the first is as declared."""
+    return [(order, signs) for order in permutations(range(3)) for signs in product((1, -1), repeat=3)]
+
+
+def axes_matrix(order: Sequence[int], signs: Sequence[int]) -> FloatArray:
+    """Return the matrix (3, 3) that makes body components of the columns."""
+    return np.asarray(np.eye(3)[list(order)] * np.array(signs)[:, None])
+
+
+def axes_named(order: Sequence[int], signs: Sequence[int]) -> str:
+    """Name the rates that stand for body x, y and z: ``+q, -p, +r``."""
+    return ", ".join(f"{'+' if s > 0 else '-'}{'pqr'[k]}" for k, s in zip(order, signs, strict=True))
+
+
+@dataclass(frozen=True)
+class TimeBias:
+    """How late ``source``'s time tags are against ``against``'s, s, with one standard deviation."""
+
+    source: str
+    against: str
+    late_s: float
+    sd_s: float
+
+    def remarks(self, start_s: float, end_s: float) -> list[Finding]:
+        """Return the cross-check's remark over the span of the comparison; none where the bias is not significant."""
+        if abs(self.late_s) <= max(_SIGNIFICANT_SD * self.sd_s, _SIGNIFICANT_S):
+            return []
+        which = "later" if self.late_s > 0 else "earlier"
+        words = (
+            f"time tags are {abs(self.late_s):.3f} +/- {self.sd_s:.3f} s {which} than those of {self.against}; "
+            f"if {self.source} is the one in error, add {-self.late_s:.3f} to its time.offset_s"
+        )
+        return [Finding(self.source, words, start_s, end_s, "clock-lag")]
+
+
+def slope_through_mean(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return the slope of ``y`` (n,) over ``x`` (n,) and its standard deviation; infinite where x is constant."""
+    dx, dy = x - x.mean(), y - y.mean()
+    square = float(dx @ dx)
+    if square == 0.0 or len(x) < 3:
+        return 0.0, np.inf
+    slope = float(dx @ dy) / square
+    residual = dy - slope * dx
+    return slope, float(np.sqrt(residual @ residual / (len(x) - 2) / square))
+
+
+def trapezoid_integral(time_s: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the running integral (n, k) of samples (n, k) by the trapezoid rule, zero at the first."""
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time_s)[:, None]
+    return np.vstack([np.zeros(values.shape[1]), np.cumsum(steps, axis=0)])
+
+
+def window_means(time_s: FloatArray, values: FloatArray, grid_s: FloatArray, low_s: float, high_s: float) -> FloatArray:
+    """Return means (m, k) of samples (n, k) over windows from ``grid_s + low_s`` to ``grid_s + high_s``."""
+    total = trapezoid_integral(time_s, values)
+    low, high = (np.column_stack([np.interp(grid_s + side, time_s, c) for c in total.T]) for side in (low_s, high_s))
+    return np.asarray((high - low) / (high_s - low_s))
+
+
+def interval_around(time_s: FloatArray, at_s: FloatArray) -> FloatArray:
+    """Return the interval (m,) between the samples (n,) on either side of each time (m,), s."""
+    after = np.clip(np.searchsorted(time_s, at_s), 1, len(time_s) - 1)
+    return np.asarray(time_s[after] - time_s[after - 1])
