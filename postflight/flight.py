@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -45,7 +45,7 @@ class Flight(Tabular):
     """
 
     telemetry: Telemetry
-    settings: Settings = cast(Settings, None)
+    settings: Settings = None  # type: ignore[assignment]
     camera_plane_lv_rad: float | None = None
     folder: Path | None = None
     changes: tuple[str, ...] = ()

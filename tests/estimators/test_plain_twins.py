@@ -25,7 +25,7 @@ from .conftest import VEHICLE
 
 MOUNT = VEHICLE.cameras["camera5"]
 FISHEYE = camera_from_mount(MOUNT).turned(np.array([0.01, -0.006, 0.008]), 0.99)
-BENDING = np.array([0.031, -0.048, 0.004])
+DEFORMATION = np.array([0.031, -0.048, 0.004])
 JOINT_M = 0.2
 
 
@@ -77,13 +77,13 @@ def moved(view, points, bending, column, step):
 @pytest.mark.parametrize("lens", ["fisheye", "pinhole"])
 def test_projection_and_all_its_derivatives_are_those_of_the_plain_one(lens):
     view, points = view_of(lens), some_points()
-    sight = view.sight(points, BENDING)
+    sight = view.sight(points, DEFORMATION)
     assert np.isfinite(sight.pixels).all()
-    want = plain_sight.project(points, BENDING, JOINT_M, view.shell_terms[2], view.camera)
+    want = plain_sight.project(points, DEFORMATION, JOINT_M, view.shell_terms[2], view.camera)
     np.testing.assert_allclose(sight.pixels, want, atol=1e-8)
     for column in range(16):
         step = 1e-3 if column in (7, 8) else 1e-6
-        up, down = (moved(view, points, BENDING, column, side * step) for side in (1.0, -1.0))
+        up, down = (moved(view, points, DEFORMATION, column, side * step) for side in (1.0, -1.0))
         slope = (up - down) / (2.0 * step)
         size = max(1.0, np.abs(slope).max())
         np.testing.assert_allclose(sight.jacobian[:, :, column], slope, atol=3e-6 * size, err_msg=str(column))
@@ -268,7 +268,7 @@ def fitted(view, edge, marks, prior, start):
 PRIOR = np.array([0.004, 0.05, 0.002, 0.002, 0.3, 0.3, 0.3])
 
 
-def test_exact_points_give_their_bending_back_whatever_was_left_over_at_the_benchmark():
+def test_exact_points_give_their_deformation_back_whatever_the_benchmark_s_residuals():
     view = view_of("fisheye")
     for left in (0.0, 0.8):
         edge, marks = fit_inputs(view, [0.03, -0.04, 0.0], left)

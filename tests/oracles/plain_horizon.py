@@ -1,4 +1,4 @@
-"""Search for the shell's edge and for dark marks in plain numpy: what the compiled one is held to.
+"""Search for the shell's edge and for dark features in plain numpy: the compiled one is compared with it.
 
 An edge is a step blurred by the lens, on a level that may slope behind it; its place is where the profile's projection
 on the best of many such shapes is largest, refined by a parabola. A mark is a dip under the line between a profile's

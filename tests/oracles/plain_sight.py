@@ -1,4 +1,4 @@
-"""Projection of the bent shell in plain numpy and OpenCV, derivatives by differences: what the compiled one is held to.
+"""Projection of the deformed shell in plain numpy and OpenCV, derivatives by differences.
 
 A point of the unbent shell is flattened about its ring (station aft, radius), turned about the joint by a rotation
 vector (0, y, z), looked at by a camera and put through its lens. `project` does that; every derivative of the compiled
