@@ -32,17 +32,6 @@ _COPY = "copy the flight folder to where you may write"
 PARTIAL = ".partial-"  # before the number of the process that writes it
 
 
-def write_file(path: Path, content: bytes | str) -> None:
-    """Write bytes, or text as UTF-8, beside its place and rename it; folders on the way are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
-    try:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
 class RunFolder:
     """A run folder under construction: use as a context; it is renamed into place when the block ends well."""
 
