@@ -21,15 +21,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from flightmodel.checks import FloatArray, GateError, nearest_name
 from flightmodel.config import Section, Time
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def _in_order(value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
@@ -261,6 +263,8 @@ def read_table(path: Path, label: str) -> pd.DataFrame:
     if faults:
         raise GateError(faults)
     body = "\n".join(line for _, line in numbered)
+    import pandas as pd  # a quarter of a second, which a first flight needs not wait for
+
     frame = pd.read_csv(io.StringIO(body), dtype=str, skipinitialspace=True, keep_default_na=False, index_col=False)
     frame.columns = pd.Index(names)
     frame.attrs["lines"] = lines
@@ -300,6 +304,8 @@ def line_of(frame: pd.DataFrame, row: int) -> int:
 
 def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: list[str]) -> FloatArray:
     """Column as float64; empty and NaN cells are missing, any other text is a fault with its file line."""
+    import pandas as pd
+
     text = frame[column].str.strip()
     values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, copy=True)
     missing = text.str.lower().isin(["", "nan", "na", "null", "-"]).to_numpy()
@@ -436,6 +442,8 @@ def clock_times(cells: Sequence[str], form: str, t0: datetime) -> FloatArray:
     if form == "irig_doy":
         out = _irig_times(cells, t0)
     else:
+        import pandas as pd
+
         stamps = pd.DatetimeIndex(pd.to_datetime(list(cells), utc=True, errors="coerce", format="ISO8601"))
         out = (stamps - pd.Timestamp(t0)).total_seconds().to_numpy(dtype=float)
     # clocks are written to a microsecond at best: remove the rounding of the large offset

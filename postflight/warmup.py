@@ -9,6 +9,7 @@ Run as ``python -m postflight.warmup GROUP`` it compiles one group in its own pr
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -135,7 +136,11 @@ RECONSTRUCTION = ("filter", "smoothers")
 
 
 def _stamp(group: str) -> Path | None:
-    return CACHE / f"{group}.compiled" if CACHE is not None else None
+    """Mark of a compiled group. numba keeps compiled code by the sources' location, and so does the mark."""
+    if CACHE is None:
+        return None
+    location = hashlib.sha256(str(Path(earth.__file__).parent).encode()).hexdigest()[:8]
+    return CACHE / f"{group}-{location}.compiled"
 
 
 def missing(groups: Iterable[str]) -> list[str]:

@@ -25,6 +25,7 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.airdata import total_angle
+from flightmodel.atmosphere import G0_MPS2
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import dynamics, simulate
@@ -160,7 +161,6 @@ def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[
     return flown
 
 
-G0_MPS2 = 9.80665
 _TABLE_M = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS)
 
 

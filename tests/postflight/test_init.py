@@ -102,8 +102,7 @@ def test_new_folder_says_what_is_still_to_fill_in(tmp_path):
     (tmp_path / "flight" / "flight.toml").write_text(text)
     found = json.loads(run("check", tmp_path / "flight", "--json").stdout)
     assert len(found["fill_in"]) == left
-    assert len(found["refused"]) == 1
-    assert "[radars.NAME]" in found["refused"][0]
+    assert sum("[radars.NAME]" in words for words in found["refused"]) == 1
 
 
 def test_filled_in_vehicle_form_is_a_vehicle(tmp_path):

@@ -66,13 +66,15 @@ def test_air_and_mass_move_what_is_derived_and_not_the_trajectory(pulse):
     assert rows(table, "winds off").loc["Mach number", "change"] != 0.0
 
 
-def test_the_only_tracker_is_refused_in_words_and_the_rest_goes_on(short):
+def test_the_only_tracker_is_refused_and_the_rest_goes_on(short):
     telemetry = replace(short.telemetry, radars={"north": short.telemetry.radars["north"]})
     found = sensitivity(reconstruct(Flight(telemetry), Settings()))
     lone = found[found.rerun == "without north"]
     assert len(lone) == 1
     assert lone["quantity"].isna().all()
-    assert "at least one" in lone.reason.iloc[0]
+    with pytest.raises(GateError) as refusal:
+        reconstruct_once(telemetry, Settings(without=("north",)))
+    assert lone.reason.iloc[0] == str(refusal.value)
     assert "without north" not in set(largest_of_groups(found).rerun)
     assert len(rows(found, "winds off")) > 5
 

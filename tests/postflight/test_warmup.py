@@ -52,7 +52,7 @@ def test_what_is_missing_is_compiled_once_and_reported(tmp_path):
     first, again = (subprocess.run(run, env=environment, capture_output=True, text=True) for _ in range(2))
     assert len(first.stdout.splitlines()) == 1
     assert "tables" in first.stdout
-    assert [p.name for p in (tmp_path / "cache").rglob("*.compiled")] == ["tables.compiled"]
+    assert [p.name.split("-")[0] for p in (tmp_path / "cache").rglob("*.compiled")] == ["tables"]
     assert (again.returncode, again.stdout) == (0, ""), again.stderr
 
 
