@@ -111,11 +111,11 @@ def test_ecef_columns_are_read_before_geodetic_ones_and_velocities_either_way(fo
     header = "t_s,lat_deg,lon_deg,alt_m,x_ecef_m,y_ecef_m,z_ecef_m"
     folder.table("gps.csv", f"{header},vx_ecef_mps,vy_ecef_mps,vz_ecef_mps", T, *geodetic, *at.T, *v.T)
     one = folder.read('[gnss.gps]\nfile = "gps.csv"\n', BALLISTIC).gnss["gps"]
-    np.testing.assert_allclose(one.position_ecef_m, at, atol=0.01)
-    np.testing.assert_allclose(one.velocity_ecef_mps, v, atol=1e-6)
+    np.testing.assert_allclose(one.position_ecef_m, at, rtol=0.0, atol=0.01)
+    np.testing.assert_allclose(one.velocity_ecef_mps, v, rtol=0.0, atol=1e-6)
     folder.table("gps.csv", f"{header},vn_mps,ve_mps,vd_mps", T, *geodetic, *at.T, *ned.T)
     two = folder.read('[gnss.gps]\nfile = "gps.csv"\n', BALLISTIC).gnss["gps"]
-    np.testing.assert_allclose(two.velocity_ecef_mps, v, atol=1e-6)
+    np.testing.assert_allclose(two.velocity_ecef_mps, v, rtol=0.0, atol=1e-6)
     silent = folder.read('[gnss.gps]\nfile = "gps.csv"\nvelocity = false\n', BALLISTIC).gnss["gps"]
     assert np.isnan(silent.velocity_ecef_mps).all()
     # geodetic columns that are declared are meant

@@ -495,3 +495,28 @@ def test_the_best_factor_is_a_parabola_s_top():
     x = np.log(FACTORS)
     for top in (0.013, -0.2):
         assert _peak(5.0 - 3.0 * (x - top) ** 2) == pytest.approx(top, abs=1e-9)
+
+
+def test_a_failed_flight_is_in_no_band(tmp_path):
+    # failed flights stand before and between the good ones; what they left in the histories is not a flight's
+    (tmp_path / "chunks").mkdir()
+    time_s = np.arange(4.0)
+    levels = ((np.nan, 10.0, 1e9, 20.0), (30.0, np.nan, 50.0))
+    wanted, run = [], 0
+    for number, held in enumerate(levels):
+        runs = list(range(run, run + len(held)))
+        run += len(held)
+        bad = tuple("lost" if not 0.0 < level < 1e3 else "" for level in held)
+        histories = (np.array(held)[:, None, None] + time_s).astype(np.float32)
+        columns = np.full(len(held), np.nan)
+        write_chunk(tmp_path, number, Chunk(np.array(runs), bad, columns, columns[:, None], histories))
+        wanted.append(runs)
+    window = SimpleNamespace(history_time_s=lambda: time_s)
+    study = SimpleNamespace(plan=SimpleNamespace(window=window, histories=["q"]))
+    flown = np.array([False, True, False, True, True, False, True])
+    bands = _bands(study, tmp_path, wanted, flown)
+    # of 10, 20, 30 and 50 the middle is 25; the ends lie 2.3 % of three intervals inside
+    np.testing.assert_array_equal(bands["flights"], 4)
+    np.testing.assert_allclose(bands["p50"], 25.0 + time_s)
+    np.testing.assert_allclose(bands["p2.3"], 10.0 + 0.069 * 10.0 + time_s, rtol=1e-6)
+    np.testing.assert_allclose(bands["p97.7"], 50.0 - 0.069 * 20.0 + time_s, rtol=1e-6)
