@@ -107,7 +107,7 @@ def problem_of(motion, node, start, z):
 def ours(problem):
     """Filter and smoother, moments at every radar point."""
     run = ekf.forward(problem)
-    return run, smoother.smooth(problem, run, True, "bryson-frazier")
+    return run, smoother.smooth(problem, run)
 
 
 class Plain:

@@ -150,6 +150,7 @@ class FlightFile(Section):
     atmosphere: AtmosphereEntry | None = None
     frames: FramesEntry | None = None
     events: list[EventEntry] = []
+    reconstruction: dict[str, Any] = {}  # checked by `recon.settings.Settings`
 
     @field_validator("t0_utc")
     @classmethod

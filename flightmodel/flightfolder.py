@@ -151,6 +151,7 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         gnss=found.gnss,
         barometers=found.barometers,
         motion=_motion(spec.motion),
+        reconstruction=dict(spec.reconstruction),
     )
     if not found.radars and not found.gnss:
         return telemetry

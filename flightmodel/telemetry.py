@@ -276,6 +276,7 @@ class Telemetry:
     gnss: dict[str, GnssRecord] = field(default_factory=dict)
     barometers: dict[str, BarometerRecord] = field(default_factory=dict)
     motion: Motion = Motion()
+    reconstruction: dict[str, object] = field(default_factory=dict)  # settings of [reconstruction]
 
     def span_s(self) -> tuple[float, float]:
         """First and last time that all triads and at least one radar or receiver cover together."""

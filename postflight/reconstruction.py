@@ -33,7 +33,7 @@ from recon.atmosphere import (
     windows_are_whole,
 )
 from recon.consistency import ConsistencyCheck
-from recon.fault_isolation import suspects
+from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
 from recon.settings import Settings
@@ -134,7 +134,7 @@ class Reconstruction(Tabular):
     @property
     def suspects(self) -> tuple[str, ...]:
         """Fault hypotheses, the most likely first; none where every consistency check passes."""
-        return suspects(self.consistency_checks, self.solution.left_out)
+        return isolate_faults(self.consistency_checks, self.solution.left_out)
 
     @property
     def has_attitude(self) -> bool:

@@ -170,12 +170,15 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction) -> pd.DataFrame
     run.write_csv("peaks.csv", peak_table(flight, table))
     run.write_csv("residual_statistics.csv", residual_statistics(flight))
     run.write_csv("residuals.csv", bet.residuals)
-    if len(bet.withheld):
-        run.write_csv("withheld.csv", bet.withheld)
+    if len(bet.held_out):
+        run.write_csv("withheld.csv", bet.held_out)
     checks = pd.DataFrame([vars(v) for v in flight.consistency_checks])
     run.write_csv("consistency_checks.csv", checks)
     # the table's name and columns of version 0.1, for scripts that read it; to go with version 0.3
-    run.write_csv("verdicts.csv", checks.drop(columns="code").rename(columns={"remark": "words"}))
+    run.write_csv(
+        "verdicts.csv",
+        checks.drop(columns=["code", "source", "component", "symptom"]).rename(columns={"remark": "words"}),
+    )
     run.write_csv("sensor_errors.csv", bet.sensor_errors)
     event_rows = event_table(flight, table)
     run.write_csv("events.csv", event_rows)

@@ -144,19 +144,19 @@ def sensitivity(flight: Reconstruction, progress: Progress | None = None) -> pd.
     report = progress or (lambda _fraction, _what: None)
     telemetry, settings = flight.telemetry, flight.solution.settings
     planned = reruns(telemetry, settings)
-    learnt = flight.solution.learnt  # other priors would add to the change
+    adaptation = flight.solution.adaptation  # other priors would add to the change
     report(0.0, "base")
     # where a tracker was left out the base's covariance was enlarged, and is not that of an optimal filter
     own = flight
     if flight.solution.left_out:
-        own = reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, settings, learnt=learnt))
+        own = reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, settings, adaptation=adaptation))
     rows: list[dict[str, object]] = []
     for k, rerun in enumerate(planned):
         report(k / len(planned), rerun.name)
         try:
             bet = flight.solution
             if rerun.filtered:
-                bet = reconstruct_once(rerun.telemetry, rerun.settings, learnt=learnt)
+                bet = reconstruct_once(rerun.telemetry, rerun.settings, adaptation=adaptation)
             rows += _rows(rerun, flight, own, reconstruction_from(Flight(rerun.telemetry), bet))
         except GateError as fault:
             rows.append({"rerun": rerun.name, "reason": str(fault)})

@@ -1,10 +1,9 @@
-"""Which systematic errors does the filter model, how large may they be, and how do they vary?
+"""Which systematic errors are estimated, with what a priori sd and correlation, and which are only considered?
 
 Every block is a first-order Gauss-Markov process about zero, ``de/dt = -e / tau + noise``, started at its prior
 standard deviation and kept there by its noise; an infinite ``tau`` is a constant. Errors of the air decorrelate with
-altitude instead: ``exp(-|climb| / length)``. Instruments' blocks follow from their rows (`flightmodel.instruments`).
-A *considered* error (Schmidt) is never estimated, but what it may have done stays in the covariance of everything else.
-The drivers of the motion come first (`recon.motion`).
+altitude instead: ``exp(-|climb| / length)``. A *considered* error (Schmidt) is never estimated, but its effect stays in
+the covariance of everything else. The drivers of the motion come first (`recon.motion`).
 
 References
 ----------
@@ -88,7 +87,7 @@ class ErrorModel:
 
     @property
     def wander(self) -> Wander:
-        """How every error wanders; a considered one stays what it is."""
+        """Gauss-Markov model of every error; a considered one is constant."""
         considered = np.array(self._each("considered"), dtype=bool)
         tau, length, walk = (
             np.array(self._each(name), dtype=float) for name in ("time_constant_s", "altitude_m", "walk_var_per_s")
@@ -126,7 +125,7 @@ class ErrorModel:
             if not any(_fits(b, [name]) for b in self.blocks)
         ]
         if faults:
-            raise GateError(faults)
+            raise GateError(faults, code="error-unknown")
         return ErrorModel(blocks)
 
 

@@ -43,7 +43,7 @@ def forces(samples, x):
 
 def test_forces_are_those_that_the_simulator_s_vehicle_feels():
     samples = true_samples()
-    got, felt = forces(samples, np.zeros(atmosphere.SEEN)), samples.specific_force_body_mps2
+    got, felt = forces(samples, np.zeros(atmosphere._UNKNOWNS)), samples.specific_force_body_mps2
     np.testing.assert_allclose(got[:, 0], felt[:, 0], rtol=1e-3)
     # across: the simulator takes the flow at the nose, half a metre ahead, where turning by 0.3 rad/s moves it by
     # 0.15 m/s of 1050; pitch damping makes no force
@@ -56,12 +56,12 @@ def test_a_trajectory_s_errors_are_taken_off_it():
     # true one without
     samples = true_samples(error_root=1.0)
     e, d = np.array([3.0, -5.0, 2.0]), np.array([0.004, -0.006, 0.003])
-    x = np.zeros(atmosphere.SEEN)
+    x = np.zeros(atmosphere._UNKNOWNS)
     x[11:14], x[14:17] = e, d
     # NED axes: an estimated body that is turned by d against the true one
     turn = rotations.dcm_from_q(rotations.exp(d))
     wrong = replace(samples, velocity_ned_mps=samples.velocity_ned_mps + e, dcm_ned_body=turn @ samples.dcm_ned_body)
-    nothing = np.zeros(atmosphere.SEEN)
+    nothing = np.zeros(atmosphere._UNKNOWNS)
     want, got = forces(samples, nothing), forces(wrong, x)
     without = forces(wrong, nothing)
     # second order of 0.008 rad is left of what the errors do
@@ -73,9 +73,9 @@ def test_structure_between_knots_keeps_a_wind_from_being_known_better():
     # data without end: what a mean over a knot cannot tell of a wind that forgets over 3 km stays in its sd
     samples = true_samples()
     model = atmosphere._Model(samples, windy(), DRAG)
-    height = atmosphere._knots(samples.altitude_m, atmosphere.KNOT_M)
+    height = atmosphere._knots(samples.altitude_m, atmosphere._KNOT_M)
     k = len(height)
     table = atmosphere._profile(model, height, np.zeros(3 * k), np.full(3 * k, 1e-6))
     # half of the variance forgets: about a knot, between neighbours a km apart, a third of its first-order loss
-    left = np.sqrt((1.0 - atmosphere.CONSTANT_PART) * atmosphere.KNOT_M / (3.0 * atmosphere.WIND_LENGTH_M))
+    left = np.sqrt((1.0 - atmosphere.CONSTANT_PART) * atmosphere._KNOT_M / (3.0 * atmosphere.WIND_LENGTH_M))
     np.testing.assert_allclose(table.wind_north_sd_mps / table.wind_prior_sd_mps, left, rtol=1e-3)

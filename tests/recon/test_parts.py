@@ -12,15 +12,23 @@ from flightmodel.telemetry import GnssRecord, TriadRecord
 from flightmodel.trajectory import Trajectory, difference
 from recon.consistency import source_checks
 from recon.error_model import instrument_blocks
-from recon.fault_isolation import _apart
-from recon.imu_screening import Unused, _between_slow, _bridges, _jumps, _missed_alike, bridge, repeat_by_noise
+from recon.fault_isolation import _compared
+from recon.imu_screening import (
+    _bridges,
+    _interpolation_density,
+    _jumps,
+    _same_side_count,
+    _Unused,
+    bridge,
+    repeat_by_noise,
+)
 from recon.measurements import gnss_instruments, magnetometer_instrument
-from recon.motion import strapdown_motion, unbent
+from recon.motion import strapdown_motion, with_exact_integrals
 from recon.product import Mounting, datum_trajectory
 from recon.setup import fit_start
 from recon.state import States, boxplus, packed
-from recon.unmodelled import with_stated
-from recon.vector_attitude import _suspects, compare
+from recon.unmodelled_acceleration import with_stated
+from recon.vector_attitude import _inconsistent_sensors, compare
 
 
 def spec(**more):
@@ -53,10 +61,10 @@ def test_noise_of_samples_drives_their_integral_with_its_density():
     assert spread > 0.0
 
 
-def test_unbent_samples_have_the_curve_s_integral():
+def test_samples_moved_for_straight_joins_have_the_curve_s_integral():
     t = np.arange(0.0, 1.0, 0.05)
     curve = np.column_stack([t**2, np.sin(4.0 * t), 1.0 - 3.0 * t])
-    bent = unbent(t, curve)
+    bent = with_exact_integrals(t, curve)
     inner = slice(2, -2)
     got = np.trapezoid(bent[inner], t[inner], axis=0)
     low, high = t[inner][0], t[inner][-1]
@@ -74,7 +82,7 @@ def test_what_a_line_misses_between_slow_samples_is_its_own_integral():
     t = np.concatenate([np.arange(0.0, 5.0, 0.01), 5.0 + np.arange(0.0, 4.0, 0.2)])
     x = (3.0 * (t - 6.0) ** 2)[:, None]
     usual = np.where(t < 5.0, 0.01, 0.2)
-    density = _between_slow(x, usual)
+    density = _interpolation_density(x, usual)
     k = 510
     a, b = t[k], t[k + 1]
     missed = 0.5 * (b - a) * (x[k, 0] + x[k + 1, 0]) - ((b - 6.0) ** 3 - (a - 6.0) ** 3)
@@ -88,7 +96,7 @@ def test_gaps_at_one_stop_are_missed_to_one_side_all_of_them():
     for first, sign in ((10, 1), (30, 1), (50, 1), (70, -1)):
         stop[first : first + 8] = sign
     starts, ends = t[[9, 29, 49, 69, 89]], t[[18, 38, 58, 78, 94]]
-    counted = _missed_alike(Unused(t, np.full((100, 1), np.nan), stop), starts, ends)
+    counted = _same_side_count(_Unused(t, np.full((100, 1), np.nan), stop), starts, ends)
     assert counted.ravel().tolist() == [3, 3, 3, 1, 1]
 
 
@@ -128,7 +136,7 @@ def test_a_sensor_is_named_beyond_what_chance_leaves_of_all_axes():
     limit = norm.isf(0.005 / 6.0)
     for factor, named in ((0.95, False), (1.05, True)):
         turns = {"magnetometer": np.array([0.0, factor * limit * 0.01, 0.0]), "sun1": np.zeros(3)}
-        words = _suspects(turns, {"magnetometer": 0.01, "sun1": 0.01}, 0.99)
+        words = _inconsistent_sensors(turns, {"magnetometer": 0.01, "sun1": 0.01}, 0.99)
         assert ("magnetometer" in words) is named
 
 
@@ -137,7 +145,7 @@ def test_a_wild_point_does_not_move_the_start(monkeypatch):
     place, velocity = np.array([6.4e6, 1e5, -2e5]), np.array([-300.0, 800.0, 50.0])
     points = place + (t - 101.0)[:, None] * velocity
     points[3] += [5e4, -2e4, 1e4]
-    monkeypatch.setattr("recon.setup.places", lambda _: (t, points))
+    monkeypatch.setattr("recon.setup.track_points", lambda _: (t, points))
     at, speed = fit_start((), 101.0)
     np.testing.assert_allclose(at, place, atol=1.0)
     np.testing.assert_allclose(speed, velocity, atol=1.0)
@@ -153,14 +161,14 @@ def test_whiteness_is_judged_of_residuals_over_their_own_sd():
     residual, covariance = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
     residual[:, 0], covariance[:, 0, 0] = sd * z, sd**2
     variance = np.tile([1.0, np.inf, np.inf], (n, 1))
-    radar = SimpleNamespace(name="radar", components=("range",))
+    radar = SimpleNamespace(name="radar", owner="radar", components=("range",))
     problem = SimpleNamespace(
         time_s=np.arange(n) * 1.0, node=np.arange(n), instruments=[radar],
         observed=SimpleNamespace(variance=variance, source=np.zeros(n, dtype=int), usable=np.ones(n, dtype=bool)),
     )  # fmt: skip
     innovations = SimpleNamespace(residual=residual, covariance=covariance, nis=z**2, accepted=np.ones(n, dtype=bool))
-    found = {v.name: v.value for v in source_checks(problem, innovations, 0.99)}
-    assert found["whiteness radar range"] == pytest.approx(0.5, abs=0.05)
+    found = {(v.code, v.source, v.component): v.value for v in source_checks(problem, innovations, 0.99)}
+    assert found["whiteness", "radar", "range"] == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_receiver_s_arm_reads_antenna_from_accelerometer():
@@ -216,7 +224,7 @@ def test_a_solution_is_apart_beyond_what_leaving_a_source_out_costs():
         return Trajectory("2009-08-17T12:50:00Z", np.arange(3.0), "datum", r, 0.0 * r, q, 0.0 * r, cov)
 
     for shift, apart in ((3.9, False), (4.2, True)):
-        _, _, far = _apart(path(0.0, 3.0), path(shift, 4.0))
+        _, _, far = _compared(path(0.0, 3.0), path(shift, 4.0))
         assert far.tolist() == [apart] * 3
 
 
@@ -267,7 +275,7 @@ def test_two_attitudes_differ_as_both_may_err():
     )  # fmt: skip
     history = SimpleNamespace(
         time_s=t, q_ecef_body=rotations.boxplus(one, 0.01 * rng.standard_normal((n, 3))),
-        covariance=np.tile(1e-4 * np.eye(3), (n, 1, 1)), sightings=(),
+        covariance=np.tile(1e-4 * np.eye(3), (n, 1, 1)), observations=(),
     )  # fmt: skip
     found = compare(history, theirs)
     # 600 draws of three know the mean to 3 %

@@ -1,4 +1,4 @@
-"""The filter's kernels on problems small enough to run interpreted, against the readable twins and brute force."""
+"""The filter's kernels on problems small enough to run interpreted, against the numpy twins and brute force."""
 
 from dataclasses import replace
 
@@ -7,19 +7,17 @@ import pytest
 
 from flightmodel import earth, rotations
 from recon import _filter_kernels, _measurement_kernels, ballistic, ekf
+from recon._glr_kernels import offset_scores
 from recon.motion import strapdown_motion
 from recon.state import States, Wander, unpacked
-from recon.strapdown import correct, propagate, propagate_plain
-from recon.unmodelled import readable_scores
+from recon.strapdown import correct, propagate
+from tests.oracles import ballistic as plain_ballistic
+from tests.oracles import bryson_frazier
+from tests.oracles import strapdown as plain_strapdown
 
 from . import linear
 from .ballistic_flight import SPEC, across_plane, entry_state, fly, watch, windy_sounding
 from .problems import build
-
-try:
-    from recon._shock_kernels import offset_scores
-except ImportError:  # kernels may share a file
-    from recon._filter_kernels import offset_scores
 
 DRIVERS = np.array([0.1, 0.05, -0.08, 0.7, -1.1, 0.6])
 
@@ -42,7 +40,7 @@ def test_smoothers_equal_conditioning_the_joint_gaussian():
 
 def test_considered_errors_get_no_gain():
     problem = linear.random_problem(1, drivers=6, considered=(1, 7))
-    fast, slow = (linear.run(problem, engine) for engine in ("compiled", "readable"))
+    fast, slow = (linear.run(problem, engine) for engine in ekf.ENGINES)
     np.testing.assert_allclose(fast[0].x_plus, slow[0].x_plus, atol=1e-9)
     np.testing.assert_allclose(fast[0].p_minus, slow[0].p_minus, atol=1e-8)
     assert (fast[1].gain[:, [10, 16]] == 0.0).all()
@@ -51,7 +49,7 @@ def test_considered_errors_get_no_gain():
         np.testing.assert_allclose(fast[0].x_plus[k, [10, 16]], fast[0].x_minus[k, [10, 16]], atol=0.0)
 
 
-def test_shock_scores_are_those_of_the_readable_form():
+def test_glr_scores_are_those_of_the_numpy_form():
     problem = linear.random_problem(3, drivers=6)
     _, innovations = linear.run(problem)
     columns = np.array([9, 10, 12])
@@ -59,7 +57,7 @@ def test_shock_scores_are_those_of_the_readable_form():
     score, variance = np.zeros((2, 3)), np.zeros((2, 3, 3))
     offset_scores(problem.steps, problem.observed, problem.slots, innovations, columns, begin, end, 2, score, variance)
     for k in range(2):
-        s, v = readable_scores(
+        s, v = bryson_frazier.offset_scores(
             problem.steps, problem.observed, problem.slots, innovations, columns, int(begin[k]), int(end[k])
         )
         np.testing.assert_allclose(score[k], s, rtol=1e-8)
@@ -139,7 +137,7 @@ def test_strapdown_steps_are_those_of_the_readable_form(first, last, clocks):
         earth.ecef_from_geodetic(-0.6, 1.2, 9e4), np.array([1500.0, -900.0, 700.0]),
         rotations.exp(rng.normal(0, 1, 3)), errors,
     )  # fmt: skip
-    fast, plain = propagate(motion, first, last, start), propagate_plain(motion, first, last, start)
+    fast, plain = propagate(motion, first, last, start), plain_strapdown.propagate(motion, first, last, start)
     assert np.abs(fast.state.position_ecef_m - plain.state.position_ecef_m).max() < 1e-8
     assert np.abs(fast.state.velocity_ecef_mps - plain.state.velocity_ecef_mps).max() < 1e-11
     assert np.abs(rotations.boxminus(fast.state.q_ecef_body, plain.state.q_ecef_body)).max() < 1e-13
@@ -168,7 +166,7 @@ def carried():
 def test_ballistic_steps_are_those_of_the_readable_form(carried, first, last):
     motion, index, start = carried
     fast = propagate(motion, index[first], index[last], start)
-    plain = ballistic.propagate_plain(motion, index[first], index[last], start)
+    plain = plain_ballistic.propagate(motion, index[first], index[last], start)
     np.testing.assert_allclose(fast.state.position_ecef_m, plain.state.position_ecef_m, atol=1e-6)
     np.testing.assert_allclose(fast.state.velocity_ecef_mps, plain.state.velocity_ecef_mps, atol=1e-8)
     size = np.abs(plain.transition).reshape(3, 3, 5, 3).max(axis=(1, 3)).repeat(3, axis=0).repeat(3, axis=1)
@@ -180,7 +178,7 @@ def test_a_step_of_hard_braking_is_of_fourth_order(carried):
     motion, index, start = carried
     braked = replace(start, sensor_errors=np.r_[6.0, start.sensor_errors[1:]])
     fast = propagate(motion, index[0], index[1], braked)
-    plain = ballistic.propagate_plain(motion, index[0], index[1], braked)
+    plain = plain_ballistic.propagate(motion, index[0], index[1], braked)
     lost = np.linalg.norm(fast.state.velocity_ecef_mps - start.velocity_ecef_mps)
     assert lost > 50.0
     np.testing.assert_allclose(fast.state.velocity_ecef_mps, plain.state.velocity_ecef_mps, atol=1e-7 * lost)
@@ -213,7 +211,7 @@ SHORT = {"start_s": None, "end_s": 6.1, "output_rate_hz": 1.0}  # six seconds ar
 def test_a_short_fall_is_filtered_alike_by_both_engines_whatever_turn_the_azimuth_is_on():
     telemetry = far_off(short_fall(), [3], 900.0)
     problem = build(telemetry, **SHORT)
-    plain = ekf.forward(problem, None, "readable")
+    plain = ekf.forward(problem, None, ekf.FILTERPY)
     run = ekf.forward(build(turned_round(telemetry, 1), **SHORT))
     assert np.array_equal(run.innovations.accepted, plain.innovations.accepted)
     sd = np.sqrt(np.diagonal(unpacked(plain.filtered.p_minus), axis1=1, axis2=2))

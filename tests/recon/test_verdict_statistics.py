@@ -1,4 +1,4 @@
-"""Verdicts fail as often as their confidence says, neither more nor less, and their bands are the textbook's."""
+"""Consistency checks fail as often as their confidence states, and their bands are those of the textbook."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def allowed(probability):
 def test_white_residuals_fail_whiteness_as_often_as_stated(confidence):
     # the mean is taken off and lag products end at the ends: the sd of rho is 1/sqrt(n) to 1 % at 400
     rng = np.random.default_rng(11)
-    found = [whiteness_check("a", rng.standard_normal(400), confidence) for _ in range(DRAWS)]
+    found = [whiteness_check("a", "range", rng.standard_normal(400), confidence) for _ in range(DRAWS)]
     assert share_failed(found) == pytest.approx(1.0 - confidence, abs=allowed(1.0 - confidence) + 0.01)
     # both sides alike
     high = np.mean([v.value > v.high for v in found])
@@ -36,7 +36,7 @@ def test_whiteness_is_the_correlation_of_neighbours():
         x = np.zeros(40000)
         for k in range(1, len(x)):
             x[k] = rho * x[k - 1] + rng.standard_normal()
-        assert whiteness_check("a", 7.0 + 3.0 * x, 0.99).value == pytest.approx(rho, abs=0.015)
+        assert whiteness_check("a", "range", 7.0 + 3.0 * x, 0.99).value == pytest.approx(rho, abs=0.015)
 
 
 @pytest.mark.parametrize("components", [1, 3])
@@ -57,13 +57,19 @@ def test_stated_errors_as_large_as_stated_fail_as_often_as_stated():
     prior, sd = np.array([1.0, 0.2, 3.0, 1e-3, 5.0]), np.array([0.3, 0.05, 2.0, 4e-4, 1.0])
     spread = np.sqrt(prior**2 - sd**2)
     found = [
-        data_sheet_check("a", list("abcde"), spread * rng.standard_normal(5), prior, sd, confidence)
+        data_sheet_check("data-sheet", "a", "a", list("abcde"), spread * rng.standard_normal(5), prior, sd, confidence)
         for _ in range(DRAWS)
     ]  # fmt: skip
     assert share_failed(found) == pytest.approx(1.0 - confidence, abs=allowed(0.10) + 0.006)
     # what was not learnt is not judged
-    assert data_sheet_check("a", ["a"], np.array([9.0]), np.array([1.0]), np.array([0.99]), confidence) is None
-    assert data_sheet_check("a", ["a"], np.array([9.0]), np.array([1.0]), np.array([0.97]), confidence) is not None
+    assert (
+        data_sheet_check("data-sheet", "a", "a", ["b"], np.array([9.0]), np.array([1.0]), np.array([0.99]), confidence)
+        is None
+    )
+    assert (
+        data_sheet_check("data-sheet", "a", "a", ["b"], np.array([9.0]), np.array([1.0]), np.array([0.97]), confidence)
+        is not None
+    )
 
 
 def test_filter_and_smoother_differ_by_the_difference_of_their_covariances():
