@@ -23,17 +23,20 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
+from flightmodel.statistics import correlation_root
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from estimators.agreement import CAMERA_MISALIGNED, COEFFICIENTS, HYPOTHESES, MOUNT, OFFSET
-from estimators.evidence import LIGHT_TIME_S, gauss_markov_basis
+from estimators.evidence import LIGHT_TIME_S
 from estimators.loads import FlightLoads
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from flightmodel import rotations
-from flightmodel.airdata import air_data, lateral_angles, peak_pressure
+from flightmodel.airdata import air_data, lateral_angles
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import DivergenceError, GateError
 from flightmodel.deflection import history_from_lateral
+from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
@@ -122,7 +125,7 @@ def flown_pulse(seed, rigid=False):
         "turn": columns(t, truth.time_s, truth.angular_acceleration_body_radps2),
         "factors": np.array([factors[k] for k in ("ca", "cn", "cm")]),
         "offset": flown.cg_m - told.cg_m,
-        "peak": np.array(peak_pressure(truth.time_s, truth.dynamic_pressure_pa)[0]),
+        "peak": np.array(find_peak(truth.time_s, truth.dynamic_pressure_pa)[0]),
         "words": np.array(truth.remark),
     }
     return pulse, known
@@ -178,7 +181,7 @@ def camera_history(rng, truth_yz, time_s, sd_rad):
     t, bent = time_s[frames], truth_yz[frames]
     towards = np.array([-np.cos(CAMERA_CLOCK), np.sin(CAMERA_CLOCK)])
     axes = np.stack([towards, [-towards[1], towards[0]]], axis=-1) * [sd_rad, 2.0 * sd_rad]
-    lasting, light = rng.standard_normal(2), gauss_markov_basis(t, LIGHT_TIME_S)
+    lasting, light = rng.standard_normal(2), correlation_root(t, LIGHT_TIME_S)
     drawn = np.sqrt(0.5) * (lasting + light @ rng.standard_normal((light.shape[1], 2)))
     cov = np.tile(axes @ axes.T, (len(t), 1, 1))
     return history_from_lateral(t, bent + drawn @ axes.T, cov, "camera", "drawn, not rendered")

@@ -25,10 +25,10 @@ import numpy as np
 from problem import minima
 
 from flightmodel import earth, rotations
-from flightmodel.instruments import RadarSite, TriadSpec
+from flightmodel.instruments import RADAR, RadarSite, TriadSpec
 from flightmodel.telemetry import RadarRecord
 from recon import ekf, smoother
-from recon.error_model import ErrorModel, radar_blocks, triad_blocks
+from recon.error_model import ErrorModel, imu_blocks, instrument_blocks
 from recon.measurements import radar_instrument
 from recon.motion import SAME_INSTANT_S, strapdown_motion
 from recon.problem import Problem, observe
@@ -94,7 +94,7 @@ def problem_of(motion, node, start, z):
     """Our problem, 31 errors."""
     time_s = motion.time_s[node]
     instrument = radar_instrument("radar", RadarRecord(SITE, time_s, z), np.array([0.4, 0.0, 0.01]))
-    model = ErrorModel(tuple(triad_blocks(FORCE, "m/s2") + triad_blocks(RATES, "rad/s") + radar_blocks(SITE)))
+    model = ErrorModel(tuple(imu_blocks(FORCE, RATES) + instrument_blocks(RADAR, SITE)))
     observed, row = observe(time_s, (instrument,), SAME_INSTANT_S)
     sd = np.concatenate([np.full(3, 1000.0), np.full(3, 100.0), np.full(3, 3.0 * DEG), model.prior_sd])
     gate = np.array([0.0, 15.0, 18.0, 21.1])
@@ -107,7 +107,7 @@ def problem_of(motion, node, start, z):
 def ours(problem):
     """Filter and smoother, moments at every radar point."""
     run = ekf.forward(problem)
-    return run, smoother.smooth(problem, run, True, "bryson-frazier")
+    return run, smoother.smooth(problem, run)
 
 
 class Plain:

@@ -1,5 +1,5 @@
 """Compiled search for the shell's edge and for dark features on it; the models are in `estimators.edge` and
-`estimators.features`.
+`estimators.features`; readable twin: ``tests/oracles/plain_horizon.py``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Compiled Gauss-Newton fit of one frame; the model is in `estimators.camera_fit`."""
+"""Compiled Gauss-Newton fit of one frame; the model is in `estimators.camera_fit`.
+
+Readable twin: ``tests/oracles/plain_fit.py``.
+"""
 
 from __future__ import annotations
 

@@ -94,36 +94,32 @@ def raster(vertices, faces, lens, sight, widest, deepest, depth, nearest):
     position, axes = lens[5], lens[6]
     field_cos = math.cos(lens[1])
     n = len(vertices)
-    in_camera, pixels = np.empty((n, 4)), np.empty((n, 2))
+    corner, pixels = np.empty((n, 4)), np.empty((n, 2))
     for i in range(n):
         dx, dy, dz = vertices[i, 0] - position[0], vertices[i, 1] - position[1], vertices[i, 2] - position[2]
         for m in range(3):
-            in_camera[i, m] = axes[m, 0] * dx + axes[m, 1] * dy + axes[m, 2] * dz
-        in_camera[i, 3] = math.sqrt(dx * dx + dy * dy + dz * dz)
-        if in_camera[i, 2] > field_cos * in_camera[i, 3]:
-            pixels[i, 0], pixels[i, 1] = _pixel_of(in_camera[i, 0], in_camera[i, 1], in_camera[i, 2], lens)
+            corner[i, m] = axes[m, 0] * dx + axes[m, 1] * dy + axes[m, 2] * dz
+        corner[i, 3] = math.sqrt(dx * dx + dy * dy + dz * dz)
+        if corner[i, 2] > field_cos * corner[i, 3]:
+            pixels[i, 0], pixels[i, 1] = _pixel_of(corner[i, 0], corner[i, 1], corner[i, 2], lens)
     stack, level = np.empty((deepest + 2, 3, 3)), np.empty(deepest + 2, dtype=np.int64)
     length, t = np.empty(3), np.empty((3, 3))
     for f in range(len(faces)):
         a, b, c = faces[f]
         narrow, inside = True, 0
         for p, q in ((a, b), (b, c), (c, a)):
-            dot = (
-                in_camera[p, 0] * in_camera[q, 0]
-                + in_camera[p, 1] * in_camera[q, 1]
-                + in_camera[p, 2] * in_camera[q, 2]
-            )
-            narrow = narrow and dot > widest_cos * in_camera[p, 3] * in_camera[q, 3]
-            inside += 1 if in_camera[p, 2] > field_cos * in_camera[p, 3] else 0
+            dot = corner[p, 0] * corner[q, 0] + corner[p, 1] * corner[q, 1] + corner[p, 2] * corner[q, 2]
+            narrow = narrow and dot > widest_cos * corner[p, 3] * corner[q, 3]
+            inside += 1 if corner[p, 2] > field_cos * corner[p, 3] else 0
         if narrow and (inside == 0 or inside == 3):
             if inside == 3:
                 fill(
                     pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1],
-                    in_camera[a, 3], in_camera[b, 3], in_camera[c, 3], f, depth, nearest,
+                    corner[a, 3], corner[b, 3], corner[c, 3], f, depth, nearest,
                 )  # fmt: skip
             continue
         for m in range(3):
-            stack[0, 0, m], stack[0, 1, m], stack[0, 2, m] = in_camera[a, m], in_camera[b, m], in_camera[c, m]
+            stack[0, 0, m], stack[0, 1, m], stack[0, 2, m] = corner[a, m], corner[b, m], corner[c, m]
         level[0] = 0
         top = 1
         while top > 0:

@@ -1,5 +1,7 @@
 """Compiled projection of points of the deflected shell with all derivatives; see `estimators.virtual_camera`.
 
+Readable twin: ``tests/oracles/plain_sight.py``.
+
 Columns of a derivative are those of `estimators.virtual_camera`: deflection (2), flattening, camera rotation (3), focal
 scale, principal point (2), k1, k2, camera position (3), shell radius, joint station.
 """

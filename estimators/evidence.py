@@ -33,13 +33,14 @@ from scipy.ndimage import uniform_filter1d
 
 from estimators.loads import FlightLoads
 from flightmodel import rotations
+from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
+from flightmodel.statistics import correlation_root
 from flightmodel.vehicle import Vehicle
 
-WIND_LENGTH_M, DENSITY_LENGTH_M, CONSTANT_PART, TRAJECTORY_TIME_S = 3000.0, 5000.0, 0.5, 20.0
+CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0
 LIGHT_TIME_S = 2.5
-_KNOTS_A_LENGTH = 3  # knots of a Gauss-Markov history per correlation length
 ACCELEROMETER, ATTITUDE, WIND, PRESSURE = "accelerometer", "BET attitude", "wind", "dynamic pressure"
 CAMERA_TIME_BIAS, _RATE_STEP_S = "camera time bias", 0.005
 ACCELEROMETER_TIME_BIAS, GYRO_TIME_BIAS = "accelerometer time bias", "gyro time bias"
@@ -121,16 +122,16 @@ def flow_inputs(loads: FlightLoads, use: BoolArray) -> dict[str, FloatArray]:
     return {
         ACCELEROMETER: root,
         ATTITUDE: _rolled(
-            body_from_fixed, trajectory[:, None] * gauss_markov_basis(loads.time_s[use], TRAJECTORY_TIME_S)
+            body_from_fixed, trajectory[:, None] * correlation_root(loads.time_s[use], TRAJECTORY_TIME_S)
         ),
-        WIND: _rolled(body_from_fixed, wind[:, None] * _sounding_error(loads.altitude_m[use], WIND_LENGTH_M)),
+        WIND: _rolled(body_from_fixed, wind[:, None] * sounding_correlation_root(loads.altitude_m[use], WIND_LENGTH_M)),
     }
 
 
 def pressure_input(loads: FlightLoads, use: BoolArray) -> FloatArray:
     """Dynamic pressure's error ``(n, k)``, a fraction, per unit normal."""
     relative = loads.dynamic_pressure_sd_pa[use] / loads.dynamic_pressure_pa[use]
-    return np.asarray(relative[:, None] * _sounding_error(loads.altitude_m[use], DENSITY_LENGTH_M))
+    return np.asarray(relative[:, None] * sounding_correlation_root(loads.altitude_m[use], DENSITY_LENGTH_M))
 
 
 def delayed(loads: FlightLoads, use: BoolArray, force_s: float, rate_s: float) -> FlightLoads:
@@ -160,12 +161,6 @@ def delayed(loads: FlightLoads, use: BoolArray, force_s: float, rate_s: float) -
     )
 
 
-def _sounding_error(altitude_m: FloatArray, length_m: float) -> FloatArray:
-    """Sounding's error of unit variance ``(n, k)``, per unit normal: constant bias and Gauss-Markov."""
-    constant = np.full(len(altitude_m), np.sqrt(CONSTANT_PART))
-    return np.column_stack([constant, np.sqrt(1.0 - CONSTANT_PART) * gauss_markov_basis(altitude_m, length_m)])
-
-
 def _rolled(body_from_fixed: FloatArray, columns: FloatArray) -> FloatArray:
     """Body components ``(n, 2, 2 k)`` of two like histories (n, k), one an axis that does not roll."""
     n, k = columns.shape
@@ -175,24 +170,6 @@ def _rolled(body_from_fixed: FloatArray, columns: FloatArray) -> FloatArray:
 def _roll(loads: FlightLoads) -> FloatArray:
     rate, step = loads.rate_body_radps[:, 0], np.diff(loads.time_s)
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
-
-
-def gauss_markov_basis(at: FloatArray, length: float) -> FloatArray:
-    """Gauss-Markov process of unit variance with a correlation length: values at (n,) per unit normal, ``(n, k)``."""
-    if len(at) == 0 or np.ptp(at) == 0.0:
-        return np.ones((len(at), 1))
-    low, high = float(at.min()), float(at.max())
-    knots = np.linspace(low, high, max(2, int(np.ceil(_KNOTS_A_LENGTH * (high - low) / length)) + 1))
-    correlation = np.exp(-np.abs(knots[:, None] - knots[None, :]) / length)
-    position = np.clip((at - low) / max(knots[1] - knots[0], 1e-12), 0.0, len(knots) - 1.0)
-    k = np.minimum(position.astype(int), len(knots) - 2)
-    fraction = position - k
-    between = np.zeros((len(at), len(knots)))
-    row = np.arange(len(at))
-    between[row, k], between[row, k + 1] = 1.0 - fraction, fraction
-    out = between @ np.linalg.cholesky(correlation)
-    # linear interpolation between knots loses a little of the variance
-    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
 def offset_sd_m(vehicle: Vehicle) -> float:
@@ -256,9 +233,7 @@ def evidence_of_history(history: DeflectionHistory, time_bias_sd_s: float = 0.0,
     value, axes = np.linalg.eigh(cov)
     # symmetric square root: smooth in time whatever the order of the eigenvalues
     root = (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
-    constant = np.full(len(time_s), np.sqrt(CONSTANT_PART))
-    columns = np.column_stack([constant, np.sqrt(1.0 - CONSTANT_PART) * gauss_markov_basis(time_s, LIGHT_TIME_S)])
-    inputs = {history.method: _rolled(root, columns)}
+    inputs = {history.method: _rolled(root, correlation_root(time_s, LIGHT_TIME_S, CONSTANT_PART))}
     if plane_sd_rad > 0.0:
         normal = np.stack([-theta_yz[:, 1], theta_yz[:, 0]], axis=-1)
         inputs[CAMERA_PLANE] = plane_sd_rad * normal[:, :, None]

@@ -13,10 +13,11 @@ import numpy as np
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import BoolArray, FloatArray, check_shape
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.vehicle import Vehicle
 
 # below this axial deceleration the ratio of forces and the moment balance carry no information
-MIN_AXIAL_MPS2 = 0.3 * 9.80665
+MIN_AXIAL_MPS2 = 0.3 * STANDARD_GRAVITY_MPS2
 
 
 @dataclass(frozen=True)

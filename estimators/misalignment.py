@@ -31,13 +31,14 @@ from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, flow_coefficients, lat
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 
 _AVERAGED_S = 0.1  # short against the period of the joint, 0.4 s
 # each step contracts by d atan(C_N/C_A)/d alpha, at most 0.15: twelve leave 1e-10
 _ITERATIONS, _STEP_RAD = 12, 1e-4
 _ASSUMPTIONS = (
     "plane estimated; all aerodynamic force on the aeroshell; C_N/C_A of the pre-flight model; no twist; no answer "
-    f"where the axial deceleration is below {MIN_AXIAL_MPS2 / 9.80665:.1f} g"
+    f"where the axial deceleration is below {MIN_AXIAL_MPS2 / STANDARD_GRAVITY_MPS2:.1f} g"
 )
 
 

@@ -50,6 +50,7 @@ from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, flow_coefficients, lat
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.vehicle import Vehicle
 
 LIMIT_RAD = np.deg2rad(30.0)
@@ -60,7 +61,7 @@ _NODE = np.sqrt(3.0)  # outer nodes of the three-point Gauss-Hermite rule, sd
 SLOPE_AT_RAD = np.deg2rad(2.0)  # where the static trim takes the coefficients' slopes by alpha
 _ASSUMPTIONS = (
     "moment balance about the c.g. with measured angular acceleration; pre-flight coefficients and c.g. offset; joint "
-    f"as in the vehicle file; no answer below {MIN_AXIAL_MPS2 / 9.80665:.1f} g axial"
+    f"as in the vehicle file; no answer below {MIN_AXIAL_MPS2 / STANDARD_GRAVITY_MPS2:.1f} g axial"
 )
 
 

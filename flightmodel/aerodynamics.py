@@ -1,4 +1,4 @@
-"""What the air does to the aeroshell: coefficients over Mach number and total angle of attack.
+"""What does the air do to the aeroshell, and where do the coefficients come from?
 
 Coefficients refer to ``q S`` and ``q S l`` and act at the nose (datum) of the shell, in the plane of the total angle
 of attack: ``C_A`` along -x, ``C_N`` against the lateral velocity, ``C_m`` nose-up positive (so a stable shape has
@@ -6,28 +6,25 @@ C_m < 0), ``C_mq`` per ``omega l / (2 V)`` on the transverse rates. Between the 
 the seed paper's blend from Mach 5.7 to 3.5 where the table has no knot in between. Where molecules seldom meet, they
 pass to the free-molecular coefficients, if the table has them (`flightmodel.sphere_cone`).
 
-How gridded coefficient tables come out of DAVE-ML files (ANSI/AIAA S-119).
-
-Read are ``variableDef``, ``breakpointDef``, ``griddedTableDef`` (alone, or inside a ``functionDefn``) and ``function``
-of one dependent and one or two independent variables, Mach number and total angle of attack. The last breakpoint set
-of a table varies fastest, as the standard says. Anything else a coefficient depends on is refused by name: this is a
-reader of tables, not of models. Entities and document type subsets are refused before anything is expanded, and
-nothing outside the file is ever opened.
-
-References
-----------
-ANSI/AIAA S-119-2011 (R2016), "Flight Dynamics Model Exchange Standard"; DAVE-ML 2.0 reference.
-
-Where a vehicle's coefficients come from: a table with its sidecar, or the shape of a sphere-cone alone.
-
-A table (CSV, or DAVE-ML) has beside it a TOML file of the same stem that says what its numbers refer to; they are
-turned to what `AeroTable` holds: axial and normal force in body axes, moments about the nose, damping per
-``omega l / (2 V)``, all on the vehicle's own reference area and length:
+They come from a table with its sidecar, or from the shape of a sphere-cone alone. A table (CSV, or DAVE-ML) has beside
+it a TOML file of the same stem with what its numbers refer to; they are converted to what `AeroTable` holds: axial and
+normal force in body axes, moments about the nose, damping per ``omega l / (2 V)``, all on the vehicle's own reference
+area and length:
 
     C_m,nose = C_m,ref - C_N x_ref / l
 
 with ``x_ref`` the station, aft of the nose, that the table's moments are about. Damping is taken over as it is: moving
 it would need the force due to pitch rate, which such tables do not hold.
+
+Of DAVE-ML are read ``variableDef``, ``breakpointDef``, ``griddedTableDef`` (alone, or inside a ``functionDefn``) and
+``function`` of one dependent and one or two independent variables, Mach number and total angle of attack. The last
+breakpoint set of a table varies fastest, as the standard has it. Anything else a coefficient depends on is refused by
+name: this is a reader of tables, not of models. Entities and document type subsets are refused before anything is
+expanded, and nothing outside the file is ever opened.
+
+References
+----------
+ANSI/AIAA S-119-2011 (R2016), "Flight Dynamics Model Exchange Standard"; DAVE-ML 2.0 reference.
 """
 
 from __future__ import annotations
@@ -44,7 +41,7 @@ from xml.parsers import expat
 import numpy as np
 from pydantic import Field, model_validator
 
-from flightmodel.checks import ConfigError, FloatArray, GateError, TableRangeError
+from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, TableRangeError
 from flightmodel.config import FileBeside, Fraction, KeyFaults, Length, Place, Section, parse_section, read_toml
 from flightmodel.sphere_cone import (
     bridge,
@@ -115,7 +112,8 @@ class AeroTable:
             bad = int(np.argmin(inside))
             raise TableRangeError(
                 f"aerodynamic table: Mach {m.flat[bad]:.3f}, angle {np.rad2deg(a.flat[bad]):.2f} deg "
-                f"lies outside Mach >= 0, 0 to {np.rad2deg(self.alpha_rad[-1]):.0f} deg"
+                f"lies outside Mach >= 0, 0 to {np.rad2deg(self.alpha_rad[-1]):.0f} deg",
+                code="aero-range",
             )
         from scipy.interpolate import RegularGridInterpolator  # half a second to import
 
@@ -167,18 +165,20 @@ def check_axial_flow(path: Path, table: AeroTable) -> None:
         if abs(value) > AXIAL_TOLERANCE
     ]
     if faults:
-        raise GateError(faults[:MOST_FAULTS])
+        raise GateError(faults[:MOST_FAULTS], code="aero-axial-flow")
 
 
-def _row_faults(row: list[float], names: tuple[str, ...]) -> list[str]:
+def _row_faults(row: list[float], names: tuple[str, ...]) -> list[Fault]:
     """Say what no row of a coefficient table may hold; ``row`` is finite, in the order of ``names``."""
     mach, alpha = row[:2]
-    faults = [] if mach >= 0.0 else [f"column '{names[0]}': {mach:g}; a Mach number is not negative"]
+    faults = (
+        [] if mach >= 0.0 else [Fault(f"column '{names[0]}': {mach:g}; a Mach number is not negative", "aero-mach")]
+    )
     if not 0.0 <= alpha <= 180.0:
-        faults.append(f"column '{names[1]}': {alpha:g}; an angle from 0 to 180 deg is wanted")
+        faults.append(Fault(f"column '{names[1]}': {alpha:g}; an angle from 0 to 180 deg is wanted", "aero-angle"))
     if alpha == 0.0:
         off = [k for k in (3, 4) if abs(row[k]) > AXIAL_TOLERANCE]
-        faults += [f"column '{names[k]}': {row[k]:g} at angle 0; {AXIAL_RULE}" for k in off]
+        faults += [Fault(f"column '{names[k]}': {row[k]:g} at angle 0; {AXIAL_RULE}", "aero-axial-flow") for k in off]
     return faults
 
 
@@ -217,9 +217,9 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such aerodynamic table") from None
+        raise ConfigError(f"{path}: no such aerodynamic table", code="file-missing") from None
     except (OSError, UnicodeDecodeError) as fault:
-        raise GateError(f"{path}: cannot be read as a table: {fault}") from None
+        raise GateError(f"{path}: cannot be read as a table: {fault}", code="file-unreadable") from None
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
     header = [cell.strip() for cell in lines[0][1].split("#")[0].split(",")] if lines else []
     header = [c.lower() if c.lower() in names else c for c in header]
@@ -228,34 +228,54 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
         near = named_columns(names, header)
         meant = [f"'{near[c]}' looks like {c}: name it so" for c in missing if c in near]
         words = f"columns {', '.join(missing)} are missing; wanted {', '.join(names)}; found {', '.join(header)}"
-        raise GateError("; ".join([f"{path}: {words}", *meant]))
+        raise GateError("; ".join([f"{path}: {words}", *meant]), code="aero-column-missing")
     twice = [c for c in names if header.count(c) > 1]
     if twice:
-        raise GateError(f"{path}, line {lines[0][0]}: columns {', '.join(twice)} stand twice; keep one of each")
+        raise GateError(
+            f"{path}, line {lines[0][0]}: columns {', '.join(twice)} stand twice; keep one of each", code="column-twice"
+        )
     rows, faults = [], []
     for k, line in lines[1:]:
         cells = [cell.strip() for cell in line.split("#")[0].split(",")]
         if len(cells) != len(header):
-            faults.append(f"{path}, line {k}: {len(cells)} cells where {len(header)} are wanted; got '{line.strip()}'")
+            faults.append(
+                Fault(
+                    f"{path}, line {k}: {len(cells)} cells where {len(header)} are wanted; got '{line.strip()}'",
+                    "row-ragged",
+                )
+            )
             continue
         row = [_number(cells[header.index(c)]) for c in names]
         rows.append(row)
         bad = [c for c, value in zip(names, row, strict=True) if not np.isfinite(value)]
-        faults += [f"{path}, line {k}: column '{c}': '{cells[header.index(c)]}' is no finite number" for c in bad]
-        faults += [] if bad else [f"{path}, line {k}: {words}" for words in _row_faults(row, names)]
+        at = f"{path}, line {k}"
+        faults += [
+            Fault(f"{at}: column '{c}': '{cells[header.index(c)]}' is no finite number", "not-a-number") for c in bad
+        ]
+        faults += [] if bad else [Fault(f"{at}: {fault}", fault.code) for fault in _row_faults(row, names)]
     if faults:
-        raise GateError(faults[:MOST_FAULTS] + [f"{path}: {len(faults)} faults in all"] * (len(faults) > MOST_FAULTS))
+        more = Fault(f"{path}: {len(faults)} faults in all", "more-faults")
+        raise GateError([*faults[:MOST_FAULTS], *[more] * (len(faults) > MOST_FAULTS)])
     values = np.array(rows, dtype=float).reshape(-1, len(names))
     values = values[np.lexsort((values[:, 1], values[:, 0]))]
     mach, alpha_deg = np.unique(values[:, 0]), np.unique(values[:, 1])
     if len(values) != len(mach) * len(alpha_deg) or len(np.unique(values[:, :2], axis=0)) != len(values):
         faults.append(
-            f"{path}: {len(values)} rows where {len(mach)} Mach x {len(alpha_deg)} angles, each once, are wanted"
+            Fault(
+                f"{path}: {len(values)} rows where {len(mach)} Mach x {len(alpha_deg)} angles, each once, are wanted",
+                "aero-grid",
+            )
         )
     if len(alpha_deg) < 2 or len(mach) < 2 or np.ptp(np.diff(alpha_deg)) > 1e-9 or alpha_deg[0] != 0.0:
-        faults.append(f"{path}: angles must be evenly spaced from 0, and at least two, as Mach numbers")
+        faults.append(
+            Fault(f"{path}: angles must be evenly spaced from 0, and at least two, as Mach numbers", "aero-grid")
+        )
     elif abs(alpha_deg[-1] - 180.0) > 1e-9:
-        faults.append(f"{path}: angles end at {alpha_deg[-1]:g} deg; give rows to 180: above the air all are met")
+        faults.append(
+            Fault(
+                f"{path}: angles end at {alpha_deg[-1]:g} deg; give rows to 180: above the air all are met", "aero-grid"
+            )
+        )
     if faults:
         raise GateError(faults)
     grid = values[:, 2:].reshape(len(mach), len(alpha_deg), 4)
@@ -313,10 +333,18 @@ def read_daveml(path: Path, force_names: tuple[str, str] = ("CA", "CN")) -> Aero
         match = [i for i, v in variables.items() if i in names or v.get("name", "") in names]
         if not match:
             if coefficient != "CMQ":
-                faults.append(f"{path}: no variable for {coefficient}: name it one of {', '.join(sorted(names))}")
+                faults.append(
+                    Fault(
+                        f"{path}: no variable for {coefficient}: name it one of {', '.join(sorted(names))}",
+                        "daveml-variable",
+                    )
+                )
         elif match[0] not in functions:
             faults.append(
-                f"{path}: variable '{match[0]}' has no gridded function; tabulate it (calculations are not read)"
+                Fault(
+                    f"{path}: variable '{match[0]}' has no gridded function; tabulate it (calculations are not read)",
+                    "daveml-variable",
+                )
             )
         else:
             grid = _grid(path, functions[match[0]], match[0], variables, points, tables, faults)
@@ -331,13 +359,18 @@ def _parse(path: Path) -> ET.Element:
     try:
         data = path.read_bytes()
     except OSError as fault:
-        raise GateError(f"{path}: cannot be read: {fault.strerror or fault}") from None
+        raise GateError(f"{path}: cannot be read: {fault.strerror or fault}", code="file-unreadable") from None
     if len(data) > LARGEST_BYTES:
-        raise GateError(f"{path}: {len(data)} bytes; DAVE-ML files above {LARGEST_BYTES} are not read")
+        raise GateError(
+            f"{path}: {len(data)} bytes; DAVE-ML files above {LARGEST_BYTES} are not read", code="file-too-large"
+        )
     scout = expat.ParserCreate()
 
     def refuse(*_: Any) -> None:
-        raise GateError(f"{path}: declares XML entities or its own document type; remove the DOCTYPE's [...] part")
+        raise GateError(
+            f"{path}: declares XML entities or its own document type; remove the DOCTYPE's [...] part",
+            code="daveml-doctype",
+        )
 
     def doctype(_name: str, _system: str | None, _public: str | None, has_subset: int) -> None:
         if has_subset:
@@ -349,11 +382,11 @@ def _parse(path: Path) -> ET.Element:
         scout.Parse(data, True)
         root = ET.fromstring(data)
     except (expat.ExpatError, ET.ParseError) as fault:
-        raise GateError(f"{path}: not valid XML: {fault}") from None
+        raise GateError(f"{path}: not valid XML: {fault}", code="daveml-not-xml") from None
     for element in root.iter():
         element.tag = str(element.tag).rsplit("}", 1)[-1]
     if root.tag != "DAVEfunc":
-        raise GateError(f"{path}: its root is '{root.tag}', not DAVEfunc")
+        raise GateError(f"{path}: its root is '{root.tag}', not DAVEfunc", code="daveml-not-xml")
     return root
 
 
@@ -364,7 +397,7 @@ def _numbers(path: Path, element: ET.Element | None, where: str, faults: list[st
     except ValueError:
         values = np.array([])
     if len(values) == 0 or not np.isfinite(values).all():
-        faults.append(f"{path}: '{where}' holds no list of finite numbers")
+        faults.append(Fault(f"{path}: '{where}' holds no list of finite numbers", "daveml-numbers"))
     return values
 
 
@@ -380,30 +413,50 @@ def _grid(
         alias = {name, variables[name].get("name", "")} if name in variables else {name}
         axes.append("mach" if alias & MACH_NAMES else "alpha" if alias & ALPHA_NAMES else "")
         if not axes[-1]:
-            faults.append(f"{path}: '{output}' depends on '{name}'; only Mach number and angle of attack are read")
+            faults.append(
+                Fault(
+                    f"{path}: '{output}' depends on '{name}'; only Mach number and angle of attack are read",
+                    "daveml-input",
+                )
+            )
     definition = function.find("functionDefn")
     table = definition.find("griddedTableDef") if definition is not None else None
     if definition is not None and table is None:
         link = definition.find("griddedTableRef")
         table = tables.get(link.get("gtID", "")) if link is not None else None
     if table is None:
-        faults.append(f"{path}: the function of '{output}' has no griddedTableDef; ungridded tables are not read")
+        faults.append(
+            Fault(
+                f"{path}: the function of '{output}' has no griddedTableDef; ungridded tables are not read",
+                "daveml-ungridded",
+            )
+        )
         return None
     units = table.get("units") or (variables[output].get("units") or "")
     if units not in NO_UNITS:
-        faults.append(f"{path}: '{output}' is in '{units}'; coefficients without unit are read")
+        faults.append(Fault(f"{path}: '{output}' is in '{units}'; coefficients without unit are read", "daveml-unit"))
     grids = []
     for reference, name, axis in zip(table.findall("breakpointRefs/bpRef"), inputs, axes, strict=False):
         knots = points.get(reference.get("bpID", ""), np.array([]))
         unit = (variables[name].get("units") or "") if name in variables else ""
         if axis == "alpha" and unit not in ANGLE_UNITS:
-            faults.append(f"{path}: '{name}' is in '{unit}'; deg or rad is read")
+            faults.append(Fault(f"{path}: '{name}' is in '{unit}'; deg or rad is read", "daveml-unit"))
         if len(knots) < 2 or (np.diff(knots) <= 0).any():
-            faults.append(f"{path}: breakpoints '{reference.get('bpID')}' do not increase or are not defined")
+            faults.append(
+                Fault(
+                    f"{path}: breakpoints '{reference.get('bpID')}' do not increase or are not defined",
+                    "daveml-breakpoints",
+                )
+            )
         grids.append(knots * ANGLE_UNITS.get(unit, 1.0) if axis == "alpha" else knots)
     values = _numbers(path, table.find("dataTable"), output, faults)
     if len(grids) != len(inputs) or not inputs or values.size != np.prod([len(g) for g in grids]):
-        faults.append(f"{path}: '{output}' has {values.size} values where its breakpoints want another number")
+        faults.append(
+            Fault(
+                f"{path}: '{output}' has {values.size} values where its breakpoints want another number",
+                "daveml-breakpoints",
+            )
+        )
     return None if len(faults) > before else (axes, grids, values.reshape([len(g) for g in grids]))
 
 
@@ -421,7 +474,9 @@ def _on_one_grid(path: Path, found: list[tuple[list[str], list[FloatArray], Floa
         or abs(alpha[-1] - np.pi) > 1e-8
         or np.abs(alpha / step - np.round(alpha / step)).max() > 1e-5
     ):
-        raise GateError(f"{path}: angles must run from 0 to 180 deg in multiples of their smallest step")
+        raise GateError(
+            f"{path}: angles must run from 0 to 180 deg in multiples of their smallest step", code="aero-grid"
+        )
     mach = mach if len(mach) > 1 else np.array([mach[0], mach[0] + 1.0])
     at = {"mach": mach[:, None], "alpha": even[None, :]}
     c = np.zeros((len(mach), len(even), 4))
@@ -607,13 +662,15 @@ def read_with_sidecar(path: Path) -> tuple[AeroTable, Sidecar]:
         sidecar = parse_section(Sidecar, read_toml(beside), str(beside))
     except ConfigError as fault:
         wanted = "; a table needs one beside it: source, licence, area_m2, length_m, moment_reference_station_m"
-        faults += fault.faults if beside.exists() else [f"{beside}: no such file{wanted}"]
+        faults += fault.faults if beside.exists() else [Fault(f"{beside}: no such file{wanted}", "sidecar-missing")]
     wind = sidecar is not None and sidecar.axes == "wind"
     names = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:]) if wind else COLUMNS
     try:
         daveml = path.suffix.lower() in (".dml", ".xml")
         if not path.is_file():
-            raise ConfigError(f"{path}: no such aerodynamic table; key 'aerodynamics.table' names it")
+            raise ConfigError(
+                f"{path}: no such aerodynamic table; key 'aerodynamics.table' names it", code="file-missing"
+            )
         table = read_daveml(path, ("CD", "CL") if wind else ("CA", "CN")) if daveml else read_aero_table(path, names)
         if daveml:
             check_axial_flow(path, table)

@@ -1,22 +1,30 @@
-"""How fast, at what pressure and at what angle the air met the vehicle: one definition of flow angles.
+"""How fast, at what pressure and at what angle did the air meet the vehicle, and how uncertain is that?
 
 From the velocity relative to the air in body axes ``(u, v, w)``: angle of attack ``atan2(w, u)``, sideslip
 ``asin(v / V)``, total angle of attack ``atan2(hypot(v, w), u)``, clock the LV clocking angle of the lateral velocity
-``(v, w)``. The centerbody's angles are what sensors see; the aeroshell's differ by the deflection.
+``(v, w)``; Mach number ``V / sqrt(gamma R T)``, dynamic pressure ``rho V^2 / 2``. The centerbody's angles are what
+sensors measure; the aeroshell's differ by the deflection.
+
+Uncertainties come in two forms. `air_data` has those that the estimators use, to first order in the angle. For all
+other derived quantities `derived_with_sd` takes the root of the trajectory's covariance and the air's standard
+deviations as directions in which the inputs may err: half the central difference along each is what a quantity may err
+by, and their root sum of squares is its standard deviation. Angles are differenced the short way round.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from flightmodel import earth, rotations
-from flightmodel.atmosphere import AirState, AtmosphereProfile
+from flightmodel.atmosphere import GAMMA, R_AIR_JPKGK, AirState, AtmosphereProfile
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
-from flightmodel.events import peak
 from flightmodel.trajectory import Trajectory
+
+VELOCITIES = ("inertial", "ground", "wind")
+ANGLES = ("latitude", "longitude", "roll", "pitch", "yaw", "alpha", "beta")
 
 
 @dataclass(frozen=True)
@@ -73,11 +81,6 @@ def angle_partials(velocity_body_mps: FloatArray) -> FloatArray:
     return out
 
 
-def peak_pressure(time_s: FloatArray, dynamic_pressure_pa: FloatArray) -> tuple[float, float]:
-    """Time and value of the largest dynamic pressure, by a parabola through the three samples around it."""
-    return peak(time_s, dynamic_pressure_pa)
-
-
 def pressure_pulse(dynamic_pressure_pa: FloatArray) -> BoolArray:
     """Mask of the pressure pulse: the unbroken run around the peak where dynamic pressure exceeds half its peak.
 
@@ -93,6 +96,88 @@ def pressure_pulse(dynamic_pressure_pa: FloatArray) -> BoolArray:
     return mask
 
 
+@dataclass(frozen=True)
+class Inputs:
+    """What may err: a trajectory's rows, and departures of winds (n, 2), log density (n,), temperature (n,)."""
+
+    trajectory: Trajectory
+    wind_mps: FloatArray
+    log_density: FloatArray
+    temperature_k: FloatArray
+
+
+@dataclass(frozen=True)
+class _Flow:
+    """Air and velocities at a point of the body: the one place where flow angles, Mach number and q come from.
+
+    ``point_ecef_mps`` and ``body_mps`` hold the point's velocity (n, 3) for each name of `VELOCITIES`.
+    """
+
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    altitude_m: FloatArray
+    dcm_ned_ecef: FloatArray
+    dcm_ecef_body: FloatArray
+    air: AirState
+    temperature_k: FloatArray
+    density_kgpm3: FloatArray
+    point_ecef_mps: dict[str, FloatArray]
+    body_mps: dict[str, FloatArray]
+
+    @property
+    def airspeed_mps(self) -> FloatArray:
+        return np.linalg.norm(self.body_mps["wind"], axis=1)
+
+    @property
+    def mach(self) -> FloatArray:
+        return self.airspeed_mps / np.sqrt(GAMMA * R_AIR_JPKGK * self.temperature_k)
+
+    @property
+    def dynamic_pressure_pa(self) -> FloatArray:
+        return 0.5 * self.density_kgpm3 * self.airspeed_mps**2
+
+    @property
+    def alpha_rad(self) -> FloatArray:
+        return np.arctan2(self.body_mps["wind"][:, 2], self.body_mps["wind"][:, 0])
+
+    @property
+    def beta_rad(self) -> FloatArray:
+        return np.arcsin(np.clip(self.body_mps["wind"][:, 1] / self.airspeed_mps, -1.0, 1.0))
+
+
+def _flow(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) -> _Flow:
+    path = inputs.trajectory
+    r, q = path.position_ecef_m, path.q_ecef_body
+    lat, lon, altitude = earth.geodetic_from_ecef(r)
+    air = profile.at(altitude)
+    dcm_ned_ecef, dcm_ecef_body = earth.dcm_ned_ecef(lat, lon), rotations.dcm_from_q(q)
+    spin = path.omega_body_eci_body_radps - dcm_ecef_body.transpose(0, 2, 1) @ earth.OMEGA_ECEF_RADPS
+    ground = path.velocity_ecef_mps + rotations.rotate(q, np.cross(spin, arm_body_m))
+    wind_ned = air.wind_ned_mps + np.pad(inputs.wind_mps, ((0, 0), (0, 1)))
+    point = {
+        "inertial": ground + np.cross(earth.OMEGA_ECEF_RADPS, r),
+        "ground": ground,
+        "wind": ground - np.einsum("nji,nj->ni", dcm_ned_ecef, wind_ned),
+    }
+    return _Flow(
+        latitude_rad=lat,
+        longitude_rad=lon,
+        altitude_m=altitude,
+        dcm_ned_ecef=dcm_ned_ecef,
+        dcm_ecef_body=dcm_ecef_body,
+        air=air,
+        temperature_k=air.temperature_k + inputs.temperature_k,
+        density_kgpm3=air.density_kgpm3 * np.exp(inputs.log_density),
+        point_ecef_mps=point,
+        body_mps={name: np.einsum("nji,nj->ni", dcm_ecef_body, v) for name, v in point.items()},
+    )
+
+
+def _as_stated(trajectory: Trajectory) -> Inputs:
+    n = len(trajectory.time_s)
+    return Inputs(trajectory, np.zeros((n, 2)), np.zeros(n), np.zeros(n))
+
+
 def air_data(trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: FloatArray) -> AirData:
     """Air data of the body along a trajectory.
 
@@ -103,45 +188,39 @@ def air_data(trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: Flo
     arm_body_m : (3,) float
         Point whose velocity meets the air (the c.g.), from the trajectory's point, body axes.
     """
-    r, q = trajectory.position_ecef_m, trajectory.q_ecef_body
-    lat, lon, altitude = earth.geodetic_from_ecef(r)
-    air = profile.at(altitude)
-    dcm_ecef_body = rotations.dcm_from_q(q)
-    spin = trajectory.omega_body_eci_body_radps - dcm_ecef_body.transpose(0, 2, 1) @ earth.OMEGA_ECEF_RADPS
-    v_ground = trajectory.velocity_ecef_mps + rotations.rotate(q, np.cross(spin, arm_body_m))
-    v_ned = np.einsum("nij,nj->ni", earth.dcm_ned_ecef(lat, lon), v_ground)
-    v_air = v_ground - np.einsum("nji,nj->ni", earth.dcm_ned_ecef(lat, lon), air.wind_ned_mps)
-    v_inertial = v_ground + np.cross(earth.OMEGA_ECEF_RADPS, r)
-    in_body = [np.einsum("nji,nj->ni", dcm_ecef_body, v) for v in (v_air, v_ground, v_inertial)]
-    speed = np.linalg.norm(in_body[0], axis=1)
-    pressure = 0.5 * air.density_kgpm3 * speed**2
-    wind_var = air.wind_sd_mps**2
-    still = np.zeros(len(speed))
-    variances: tuple[FloatArray, ...] = (wind_var, still, still)
-    covs = [_lateral_cov(trajectory, dcm_ecef_body, v, var) for v, var in zip(in_body, variances, strict=True)]
-    speed_var = _speed_var(trajectory, v_air, speed) + wind_var
+    flow = _flow(_as_stated(trajectory), profile, arm_body_m)
+    air, speed, pressure = flow.air, flow.airspeed_mps, flow.dynamic_pressure_pa
+    wind_var, still = air.wind_sd_mps**2, np.zeros(len(speed))
+    total = {name: total_angle(flow.body_mps[name]) for name in VELOCITIES}
+    cov = {
+        name: _lateral_cov(trajectory, flow.dcm_ecef_body, flow.body_mps[name], wind_var if name == "wind" else still)
+        for name in VELOCITIES
+    }
+    sd = {name: _total_sd(flow.body_mps[name], cov[name]) for name in VELOCITIES}
+    speed_var = _speed_var(trajectory, flow.point_ecef_mps["wind"], speed) + wind_var
+    v_ned = np.einsum("nij,nj->ni", flow.dcm_ned_ecef, flow.point_ecef_mps["ground"])
     return AirData(
         time_s=trajectory.time_s,
-        altitude_m=altitude,
-        latitude_rad=lat,
-        longitude_rad=lon,
+        altitude_m=flow.altitude_m,
+        latitude_rad=flow.latitude_rad,
+        longitude_rad=flow.longitude_rad,
         air=air,
-        velocity_air_body_mps=in_body[0],
+        velocity_air_body_mps=flow.body_mps["wind"],
         airspeed_mps=speed,
-        mach=speed / air.sound_speed_mps,
+        mach=flow.mach,
         dynamic_pressure_pa=pressure,
         dynamic_pressure_sd_pa=pressure * np.sqrt(air.density_sd**2 + 4.0 * speed_var / speed**2),
-        alpha_rad=np.arctan2(in_body[0][:, 2], in_body[0][:, 0]),
-        beta_rad=np.arcsin(in_body[0][:, 1] / speed),
-        alpha_total_wind_rad=total_angle(in_body[0]),
-        alpha_total_ground_rad=total_angle(in_body[1]),
-        alpha_total_inertial_rad=total_angle(in_body[2]),
-        alpha_total_wind_sd_rad=_total_sd(in_body[0], covs[0]),
-        alpha_total_ground_sd_rad=_total_sd(in_body[1], covs[1]),
-        alpha_total_inertial_sd_rad=_total_sd(in_body[2], covs[2]),
-        clock_lv_rad=lv_clock(in_body[0][:, 1:]),
-        lateral_flow_cov=covs[0],
-        flight_path_angle_rad=np.arctan2(-v_ned[:, 2], np.hypot(v_ned[:, 0], v_ned[:, 1])),
+        alpha_rad=flow.alpha_rad,
+        beta_rad=flow.beta_rad,
+        alpha_total_wind_rad=total["wind"],
+        alpha_total_ground_rad=total["ground"],
+        alpha_total_inertial_rad=total["inertial"],
+        alpha_total_wind_sd_rad=sd["wind"],
+        alpha_total_ground_sd_rad=sd["ground"],
+        alpha_total_inertial_sd_rad=sd["inertial"],
+        clock_lv_rad=lv_clock(flow.body_mps["wind"][:, 1:]),
+        lateral_flow_cov=cov["wind"],
+        flight_path_angle_rad=_path_angles(v_ned)[1],
     )
 
 
@@ -175,3 +254,96 @@ def _speed_var(trajectory: Trajectory, v_air: FloatArray, speed: FloatArray) -> 
         return np.full(len(speed), np.nan)
     unit = v_air / speed[:, None]
     return np.einsum("ni,nij,nj->n", unit, trajectory.covariance[:, 3:6, 3:6], unit)
+
+
+def _path_angles(velocity_ned: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Speed, flight-path angle above the horizon, heading from north."""
+    north, east, down = velocity_ned.T
+    speed = np.sqrt(north**2 + east**2 + down**2)
+    return speed, np.arctan2(-down, np.hypot(north, east)), np.mod(np.arctan2(east, north), 2.0 * np.pi)
+
+
+def euler_321(dcm_ned_body: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Roll, pitch, yaw (n,), rad: yaw about down, then pitch, then roll, from NED to body."""
+    c = dcm_ned_body
+    return (
+        np.arctan2(c[:, 2, 1], c[:, 2, 2]),
+        np.arcsin(np.clip(-c[:, 2, 0], -1.0, 1.0)),
+        np.mod(np.arctan2(c[:, 1, 0], c[:, 0, 0]), 2.0 * np.pi),
+    )
+
+
+def derived(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) -> dict[str, FloatArray]:
+    """All derived quantities (n,), rad and SI; the air meets the point ``arm_body_m`` from the trajectory's.
+
+    Speeds, path angles and headings are those of the trajectory's point, against the air those of the other point.
+    """
+    path, flow = inputs.trajectory, _flow(inputs, profile, arm_body_m)
+    carried = np.cross(earth.OMEGA_ECEF_RADPS, path.position_ecef_m)
+    along = {
+        "inertial": path.velocity_ecef_mps + carried,
+        "ground": path.velocity_ecef_mps,
+        "wind": flow.point_ecef_mps["wind"],
+    }
+    out = {"latitude": flow.latitude_rad, "longitude": flow.longitude_rad, "altitude": flow.altitude_m}
+    for name in VELOCITIES:
+        parts = _path_angles(np.einsum("nij,nj->ni", flow.dcm_ned_ecef, along[name]))
+        out |= {f"{what}_{name}": part for what, part in zip(("speed", "path", "heading"), parts, strict=True)}
+        out[f"alpha_total_{name}"] = total_angle(flow.body_mps[name])
+        out[f"clock_{name}"] = lv_clock(flow.body_mps[name][:, 1:])
+    out |= dict(zip(("roll", "pitch", "yaw"), euler_321(flow.dcm_ned_ecef @ flow.dcm_ecef_body), strict=True))
+    out |= {"alpha": flow.alpha_rad, "beta": flow.beta_rad, "mach": flow.mach}
+    out |= {"temperature": flow.temperature_k, "density": flow.density_kgpm3}
+    out["pressure"] = flow.density_kgpm3 * R_AIR_JPKGK * flow.temperature_k
+    out["dynamic_pressure"] = flow.dynamic_pressure_pa
+    return out
+
+
+def is_angle(name: str) -> bool:
+    """Whether a quantity wraps."""
+    return name in ANGLES or name.startswith(("path_", "heading_", "clock_", "alpha_total_"))
+
+
+def temperature_sd(altitude_m: FloatArray) -> FloatArray:
+    """Usual error of datasonde and sphere temperatures, K: 1 at 30 km, 3 at 70 km, 5 from 80 km (1 sd)."""
+    return np.asarray(np.interp(altitude_m, [30e3, 70e3, 80e3], [1.0, 3.0, 5.0]))
+
+
+def derived_with_sd(
+    trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: FloatArray
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Quantities (n,) and their standard deviations, which carry the trajectory's covariance and the air's errors."""
+    assert trajectory.covariance is not None
+    n, nothing = len(trajectory.time_s), _as_stated(trajectory)
+    value = derived(nothing, profile, arm_body_m)
+    air = profile.at(value["altitude"])
+    root: FloatArray = np.asarray(np.linalg.cholesky(trajectory.covariance + 1e-18 * np.eye(9)), dtype=np.float64)
+    warm = temperature_sd(value["altitude"])
+
+    def moved(k: int, sign: float) -> dict[str, FloatArray]:
+        if k < 9:
+            step = sign * root[:, :, k]
+            path = replace(
+                trajectory,
+                position_ecef_m=trajectory.position_ecef_m + step[:, 0:3],
+                velocity_ecef_mps=trajectory.velocity_ecef_mps + step[:, 3:6],
+                q_ecef_body=rotations.boxplus(trajectory.q_ecef_body, step[:, 6:9]),
+            )
+            return derived(replace(nothing, trajectory=path), profile, arm_body_m)
+        if k < 11:
+            wind = np.zeros((n, 2))
+            wind[:, k - 9] = sign * air.wind_sd_mps
+            return derived(replace(nothing, wind_mps=wind), profile, arm_body_m)
+        if k == 11:
+            return derived(replace(nothing, log_density=sign * air.density_sd), profile, arm_body_m)
+        return derived(replace(nothing, temperature_k=sign * warm), profile, arm_body_m)
+
+    variance = {name: np.zeros(n) for name in value}
+    for k in range(13):
+        up, down = moved(k, 1.0), moved(k, -1.0)
+        for name in value:
+            gap = up[name] - down[name]
+            if is_angle(name):
+                gap = np.mod(gap + np.pi, 2.0 * np.pi) - np.pi
+            variance[name] += (0.5 * gap) ** 2
+    return value, {name: np.sqrt(v) for name, v in variance.items()}

@@ -22,12 +22,13 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.statistics import correlation, correlation_root
 from flightmodel.telemetry import Sounding
 
 GAMMA = 1.4
 R_AIR_JPKGK = 8314.32 / 28.9644
 EARTH_RADIUS_US76_M = 6356766.0
-G0_MPS2 = 9.80665
 # geopotential base m, base temperature K, lapse K/m
 _LAYERS = np.array(
     [
@@ -69,6 +70,10 @@ _UPPER = np.array(
         [1000, 3.561e-15, 7.5138e-9],
     ]
 )
+# a sounding's errors: correlation lengths of density and wind, and the part of the variance that is one constant over
+# all altitudes (calibration, drag coefficient of the sphere); assumed, after falling spheres and datasondes
+DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0
+SOUNDING_CONSTANT_PART = 0.5
 TABLES = Path(__file__).parent / "data" / "atmosphere"
 TOP_M = 1.0e6
 BOTTOM_M = -5000.0
@@ -98,7 +103,8 @@ def us76(altitude_m: FloatArray | float) -> tuple[FloatArray, FloatArray, FloatA
     z = np.asarray(altitude_m, dtype=float)
     if not ((z >= BOTTOM_M) & (z <= TOP_M)).all():
         raise GateError(
-            f"US76: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_M:.0f} to {TOP_M:.0f} m"
+            f"US76: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_M:.0f} to {TOP_M:.0f} m",
+            code="altitude-range",
         )
     low = np.minimum(z, 86000.0)
     t_low, p_low = _below_86_km(EARTH_RADIUS_US76_M * low / (EARTH_RADIUS_US76_M + low))
@@ -122,8 +128,10 @@ def _below_86_km(h: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _pressure_ratio(dh: FloatArray, t0: FloatArray, lapse: FloatArray) -> FloatArray:
     isothermal = np.abs(lapse) < 1e-12
     safe = np.where(isothermal, 1.0, lapse)
-    power = np.where(isothermal, 0.0, G0_MPS2 / (R_AIR_JPKGK * safe))
-    return np.where(isothermal, np.exp(-G0_MPS2 * dh / (R_AIR_JPKGK * t0)), (t0 / (t0 + lapse * dh)) ** power)
+    power = np.where(isothermal, 0.0, STANDARD_GRAVITY_MPS2 / (R_AIR_JPKGK * safe))
+    return np.where(
+        isothermal, np.exp(-STANDARD_GRAVITY_MPS2 * dh / (R_AIR_JPKGK * t0)), (t0 / (t0 + lapse * dh)) ** power
+    )
 
 
 def _temperature_above_86_km(z: FloatArray) -> FloatArray:
@@ -179,6 +187,21 @@ def default_sounding_sd(altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]
     knots = [32500.0, 37500.0, 57500.0, 62500.0, 77500.0, 82500.0]
     density = np.interp(altitude_m, knots, [0.02, 0.03, 0.03, 0.05, 0.05, 0.10])
     return density, np.interp(altitude_m, knots, [2.0, 4.0, 4.0, 8.0, 8.0, 15.0])
+
+
+def sounding_correlation(altitude_m: FloatArray, length_m: float) -> FloatArray:
+    """Correlation ``(n, n)`` of a sounding's error between altitudes (n,); the length is that of density or wind."""
+    return correlation(altitude_m, length_m, SOUNDING_CONSTANT_PART)
+
+
+def sounding_correlation_root(altitude_m: FloatArray, length_m: float) -> FloatArray:
+    """Root ``(n, k)`` of `sounding_correlation`: a sounding's error, over its sd, per unit normal."""
+    return correlation_root(altitude_m, length_m, SOUNDING_CONSTANT_PART)
+
+
+def unresolved_variance(spacing_m: FloatArray | float, length_m: float) -> FloatArray:
+    """Part of a sounding's error variance that straight lines between knots ``spacing_m`` apart leave out."""
+    return np.asarray((1.0 - SOUNDING_CONSTANT_PART) * spacing_m / (3.0 * length_m))
 
 
 @dataclass(frozen=True)

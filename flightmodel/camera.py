@@ -89,7 +89,7 @@ class Camera:
             object.__setattr__(self, name, value)
         dcm = self.dcm_cam_body
         if not np.allclose(dcm @ dcm.T, np.eye(3), atol=1e-9) or np.linalg.det(dcm) < 0.0:
-            raise GateError("camera.dcm_cam_body: not a rotation matrix")
+            raise GateError("camera.dcm_cam_body: not a rotation matrix", code="camera-rotation")
         object.__setattr__(self, "half_field_rad", one_to_one_half_angle_rad(self.distortion, self.lens))
 
     @property

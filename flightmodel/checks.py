@@ -39,13 +39,16 @@ class Fault(str):
         return fault
 
 
+NO_FAULT = Fault("")
+
+
 class GateError(ValueError):
     """Data refused at a gate; carries every fault found, one line each.
 
     Parameters
     ----------
     faults : str or sequence of str
-        Each says what is wrong, where (file and line, or source and time), and what to try; a `Fault` has its own code.
+        Each: what is wrong, where (file and line, or source and time), and what to try; a `Fault` has its own code.
     code : str
         Code of those faults that have none of their own.
     """
@@ -92,7 +95,7 @@ def writing(where: Path, remedy: str) -> Iterator[None]:
             raise  # a file elsewhere, named by the fault itself
         remedy = "make room, or write to another disk" if full else remedy
         words = f"cannot be written: {fault.strerror or fault}; nothing half-written is left; {remedy}"
-        raise GateError(f"{where}: {words}") from None
+        raise GateError(f"{where}: {words}", code="cannot-write") from None
 
 
 def write_file(path: Path, content: bytes | str) -> None:
@@ -121,7 +124,7 @@ def check_shape(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> 
     out = np.ascontiguousarray(array, dtype=np.float64)
     fits = out.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, out.shape, strict=True))
     if not fits:
-        raise GateError(f"{name}: shape {out.shape} where {shape} is wanted")
+        raise GateError(f"{name}: shape {out.shape} where {shape} is wanted", code="array-shape")
     return out
 
 
@@ -130,7 +133,9 @@ def check_finite(name: str, array: FloatArray) -> None:
     bad = ~np.isfinite(array)
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise GateError(f"{name}: {int(bad.sum())} values are not finite, the first at index {first}")
+        raise GateError(
+            f"{name}: {int(bad.sum())} values are not finite, the first at index {first}", code="not-finite"
+        )
 
 
 def check_increasing(name: str, time_s: FloatArray) -> None:
@@ -139,7 +144,8 @@ def check_increasing(name: str, time_s: FloatArray) -> None:
     if (step <= 0).any():
         k = int(np.argmax(step <= 0))
         raise GateError(
-            f"{name}: time does not increase at index {k + 1}: {time_s[k]:.6f} s then {time_s[k + 1]:.6f} s"
+            f"{name}: time does not increase at index {k + 1}: {time_s[k]:.6f} s then {time_s[k + 1]:.6f} s",
+            code="not-increasing",
         )
 
 
@@ -147,11 +153,15 @@ def check_unit_quaternion(name: str, q: FloatArray, tolerance: float = 1e-6) -> 
     """Raise `GateError` where a quaternion's norm differs from one by more than ``tolerance``."""
     off = np.abs(np.linalg.norm(q, axis=-1) - 1.0)
     if (off > tolerance).any():
-        raise GateError(f"{name}: not a unit quaternion (norm off by {float(off.max()):.2e})")
+        raise GateError(
+            f"{name}: not a unit quaternion (norm off by {float(off.max()):.2e})", code="not-unit-quaternion"
+        )
 
 
 def check_positive_definite(name: str, matrix: FloatArray) -> None:
     """Raise `GateError` where a symmetric matrix has an eigenvalue that is not positive."""
     lowest = float(np.linalg.eigvalsh(matrix).min())
     if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0) or lowest <= 0.0:
-        raise GateError(f"{name}: not symmetric positive definite (lowest eigenvalue {lowest:.3g})")
+        raise GateError(
+            f"{name}: not symmetric positive definite (lowest eigenvalue {lowest:.3g})", code="not-positive-definite"
+        )

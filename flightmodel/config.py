@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
-from flightmodel.checks import ConfigError, nearest_name
+from flightmodel.checks import ConfigError, Fault, nearest_name
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
 Positive = Annotated[float, Field(gt=0.0)]
@@ -31,7 +31,7 @@ LARGEST_TOML_BYTES = 10_000_000
 # also the name of a table in TOML, of a file and of a column
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
 FILL_IN_VALUE = "FILL IN"  # where a new file leaves a value to its user
-FILL_IN = "still to fill in"  # and what is said of it
+FILL_IN = "still to fill in"  # and the message for it
 NAME_RULE = "a name has 1 to 64 letters (a to z), digits, _ and -"
 
 
@@ -52,7 +52,7 @@ class KeyFaults(ValueError):
     Parameters
     ----------
     faults : list of (str, object, str)
-        Key below the table that is checked, its value, what is wrong and what to try.
+        Key below the table that is checked, its value, what is wrong and what to try; a `Fault` has its own code.
     """
 
     def __init__(self, faults: list[tuple[str, object, str]]) -> None:
@@ -111,21 +111,26 @@ SectionT = TypeVar("SectionT", bound=Section)
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file, or raise `ConfigError` with the file, line and column."""
     if "\0" in str(path):
-        raise ConfigError(f"{str(path)!r}: a path holds no NUL character")
+        raise ConfigError(f"{str(path)!r}: a path holds no NUL character", code="path-nul")
     try:
         if path.is_file() and path.stat().st_size > LARGEST_TOML_BYTES:
-            raise ConfigError(f"{path}: more than {LARGEST_TOML_BYTES // 10**6} MB; no configuration is that long")
+            raise ConfigError(
+                f"{path}: more than {LARGEST_TOML_BYTES // 10**6} MB; no configuration is that long",
+                code="file-too-large",
+            )
         return tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
+        raise ConfigError(f"{path}: no such file", code="file-missing") from None
     except RecursionError:
-        raise ConfigError(f"{path}: not valid TOML: arrays or tables lie too deep in each other") from None
+        raise ConfigError(
+            f"{path}: not valid TOML: arrays or tables lie too deep in each other", code="toml-syntax"
+        ) from None
     except ConfigError:
         raise
     except ValueError as fault:  # also integers of thousands of digits
-        raise ConfigError(f"{path}: not valid TOML: {fault}") from None
+        raise ConfigError(f"{path}: not valid TOML: {fault}", code="toml-syntax") from None
     except OSError as fault:
-        raise ConfigError(f"{path}: cannot be read: {fault.strerror or fault}") from None
+        raise ConfigError(f"{path}: cannot be read: {fault.strerror or fault}", code="file-unreadable") from None
 
 
 def parse_section(model: type[SectionT], tables: dict[str, Any], where: str) -> SectionT:
@@ -135,7 +140,7 @@ def parse_section(model: type[SectionT], tables: dict[str, Any], where: str) -> 
     except ValidationError as fault:
         raise ConfigError([text for item in fault.errors() for text in _sentences(where, model, item)]) from None
     except RecursionError:
-        raise ConfigError(f"{where}: arrays or tables lie too deep in each other") from None
+        raise ConfigError(f"{where}: arrays or tables lie too deep in each other", code="toml-syntax") from None
 
 
 def _shown(value: object) -> str:
@@ -147,23 +152,31 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _sentences(where: str, model: type[BaseModel], item: Any) -> list[str]:
+def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Fault]:
+    """Faults that one item of pydantic's list means."""
     path = [str(part) for part in item["loc"]]
     if path and path[-1] == "[key]":
-        return [f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}"]
+        return [Fault(f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}", "key-name")]
     key = ".".join(path)
     if item["type"] == "extra_forbidden":
         known = _keys_beside(model, path[:-1])
-        return [f"{where}: unknown key '{key}'{nearest_name(path[-1], known)}; known here: {', '.join(sorted(known))}"]
+        hint = f"{nearest_name(path[-1], known)}; known here: {', '.join(sorted(known))}"
+        return [Fault(f"{where}: unknown key '{key}'{hint}", "key-unknown")]
     if item["type"] == "missing":
-        return [f"{where}: key '{key}' is missing"]
+        return [Fault(f"{where}: key '{key}' is missing", "key-missing")]
     words = item["msg"].removeprefix("Value error, ")
     cause = item.get("ctx", {}).get("error")
     if isinstance(cause, KeyFaults):
-        return [f"{where}: key '{'.'.join([*path, name])}' = {_shown(v)}: {text}" for name, v, text in cause.faults]
+        return [
+            Fault(
+                f"{where}: key '{'.'.join([*path, name])}' = {_shown(v)}: {text}",
+                getattr(text, "code", "keys-conflict"),
+            )
+            for name, v, text in cause.faults
+        ]
     if isinstance(item["input"], (dict, BaseModel)):
-        return [f"{where}: key '{key}': {words}"]
-    return [f"{where}: key '{key}' = {_shown(item['input'])}: {words}"]
+        return [Fault(f"{where}: key '{key}': {words}", "keys-conflict")]
+    return [Fault(f"{where}: key '{key}' = {_shown(item['input'])}: {words}", "key-value")]
 
 
 def _keys_beside(model: Any, path: list[str]) -> list[str]:

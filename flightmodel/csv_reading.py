@@ -1,18 +1,16 @@
 """How are the numbers of a large, well-formed CSV read in a fraction of a second? In one pass, or from the cache.
 
 The file's bytes go through compiled code (`flightmodel._csv_kernels`) in pieces side by side, straight into one block
-of float64; columns that nobody asked for are stepped over. Whatever is not plain (quotes, text in a number's place, a
+of float64; columns that are not asked for are stepped over. Whatever is not plain (quotes, text in a number's place, a
 row of another length, a name that stands twice, a blank line between rows) gives no answer here: the careful reader of
-`flightmodel.tables` then reads the file as text and says what is wrong and where. On files that both read they agree
+`flightmodel.tables` then reads the file as text and reports what is wrong and where. On files that both read they agree
 to the last bit.
 
-Where do numbers that were read once from a large CSV wait for the next reading? In the user's cache, by content.
-
-One entry is the block of columns that one reading asked for, named after the file's size and SHA-256 and a digest of
-what was asked. Neither path nor time of change is part of it: a file that is moved is found again, one that is changed
-is not. ``POSTFLIGHT_CACHE=off`` turns the cache off; XDG_CACHE_HOME moves it. An entry appears whole or not at all, so
-that processes need not know of each other; a damaged one is dropped and written anew. Beyond `LIMIT_BYTES` the
-entries that were not used for longest go.
+The cache is the user's, by content: one entry is the block of columns that one reading asked for, named after the
+file's size and SHA-256 and a digest of what was asked. Neither path nor time of change is part of it: a file that is
+moved is found again, one that is changed is not. ``POSTFLIGHT_CACHE=off`` turns the cache off; XDG_CACHE_HOME moves it.
+An entry appears whole or not at all, so that processes need no lock; a damaged one is dropped and written anew. Beyond
+`LIMIT_BYTES` the entries that were not used for longest go.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How the aeroshell is bent against the centerbody: one type for the truth and for every estimate of it.
+"""How far is the aeroshell deflected against the centerbody? One type for the truth and for every estimate of it.
 
 The bending angle ``theta`` is the angle between the two bodies' x axes. Its plane is the clocking angle, in the
 launch-vehicle (LV) frame, towards which the shell's nose axis tilts in the centerbody's frame; the shell's rim on
@@ -156,11 +156,11 @@ class DeflectionHistory(Tabular):
         if t[k + 1] - t[k] > HOLE_FACTOR * np.median(np.diff(t)) and time_s not in (t[k], t[k + 1]):
             return float("nan"), float("nan")
         theta, sd = self.theta_rad[known], self.theta_sd_rad[known]
-        missed = missed_between(t, theta, time_s)
+        missed = interpolation_error(t, theta, time_s)
         return float(np.interp(time_s, t, theta)), float(np.hypot(np.interp(time_s, t, sd), missed))
 
 
-def missed_between(known_s: FloatArray, values: FloatArray, time_s: float) -> float:
+def interpolation_error(known_s: FloatArray, values: FloatArray, time_s: float) -> float:
     """What a straight line between values ``(n,)`` misses of a curve: of their second difference ``s (1 - s) / 2``.
 
     It is taken as large as the largest about ``time_s``: among few of them all may be small where values are no denser
@@ -175,7 +175,7 @@ def missed_between(known_s: FloatArray, values: FloatArray, time_s: float) -> fl
 
 
 def lateral_axes(plane_lv_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit lateral vectors ``(n, 2)`` along clocking angles, and across them: the derivative of ``(-cos, sin)``."""
+    """Unit lateral vectors ``(n, 2)`` along clocking angles, and normal to them: the derivative of ``(-cos, sin)``."""
     return lv_direction(plane_lv_rad)[..., 1:], np.stack([np.sin(plane_lv_rad), np.cos(plane_lv_rad)], axis=-1)
 
 

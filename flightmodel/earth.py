@@ -1,17 +1,15 @@
-"""Where things are on a rotating WGS-84 Earth, and how it pulls.
+"""Where are things on a rotating WGS-84 Earth, how does it attract them, and which way does a body point there?
 
 Gravitation is the gradient of ``U = GM/r (1 - J2 (a/r)^2 (3 sin^2 phi' - 1)/2)`` (phi' geocentric latitude). ECI
 equals ECEF at the epoch (time zero) and is fixed after it.
 
+An attitude from azimuth, elevation and roll is ``q_ecef_body = q_ecef_ned * q_ned_body`` with ``q_ned_body`` the turns
+by azimuth about down, by elevation about the body's y, by roll about its x. At roll 0 the body's y axis is horizontal,
+to the right of one who looks along x; of a rocket that stands upright with azimuth 0 it points east and z points north.
+
 References
 ----------
 NIMA TR8350.2 (WGS-84), 3rd ed. Conversions: pymap3d.
-
-How an attitude follows from where the nose points: azimuth, elevation and roll of the body at a place.
-
-``q_ecef_body = q_ecef_ned * q_ned_body`` with ``q_ned_body`` the turns by azimuth about down, by elevation about the
-body's y, by roll about its x. At roll 0 the body's y axis is horizontal, to the right of one who looks along x; of a
-rocket that stands upright with azimuth 0 it points east and z points north.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""When something happened between two records: peaks and crossings to a small fraction of the step between them.
+"""When did something happen between two records, and what was the state at that time?
 
 A peak is that of the parabola through the three samples around the largest; a crossing is the root, inside its own
-step, of the cubic through the four samples around it. Truth and estimate name the moments of a descent alike.
+step, of the cubic through the four samples around it; a value at a time is that of the same cubic. Events, peaks,
+summary and report of an estimate and the events of a truth all take their times and values from here.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from flightmodel.checks import BoolArray, FloatArray
 HIGHEST_M = 130e3
 
 
-def peak(time_s: FloatArray, values: FloatArray) -> tuple[float, float]:
+def find_peak(time_s: FloatArray, values: FloatArray) -> tuple[float, float]:
     """Time and size of the largest value, by a parabola through the three samples around it."""
     k = int(np.clip(np.argmax(values), 1, len(time_s) - 2))
     fit = np.polynomial.Polynomial.fit(time_s[k - 1 : k + 2], values[k - 1 : k + 2], 2)
@@ -67,7 +68,7 @@ def first_fall(time_s: FloatArray, values: FloatArray, level: float, allowed: Bo
 def splashdown_index(altitude_m: FloatArray) -> int | None:
     """Count of the records up to and with the first at or below zero height after one above; None where none is.
 
-    A flight that keeps ``records[:splashdown_index]`` ends at the sea, and its last step holds the moment itself.
+    A flight that keeps ``records[:splashdown_index]`` ends at the sea, and its last step holds the time itself.
     """
     fell = (altitude_m[:-1] > 0.0) & (altitude_m[1:] <= 0.0)
     return int(np.argmax(fell)) + 2 if fell.any() else None
@@ -81,11 +82,17 @@ def values_at(time_s: FloatArray, columns: FloatArray, at_s: float) -> FloatArra
     return np.array(weights) @ v
 
 
-def descent_moments(time_s: FloatArray, altitude_m: FloatArray, mach: FloatArray) -> list[tuple[str, float]]:
+def value_at(time_s: FloatArray, values: FloatArray, at_s: float) -> float:
+    """One quantity (n,) at one time, as `values_at`; beside a missing sample by a straight line."""
+    cubic = float(values_at(time_s, values[:, None], at_s)[0])
+    return cubic if np.isfinite(cubic) else float(np.interp(at_s, time_s, values))
+
+
+def descent_events(time_s: FloatArray, altitude_m: FloatArray, mach: FloatArray) -> list[tuple[str, float]]:
     """Name and time of apogee, of 80 and 40 km and of Mach 3.5 and 1 on the way down, of those that lie inside."""
-    moments: list[tuple[str, float | None]] = []
+    found: list[tuple[str, float | None]] = []
     if has_peak(altitude_m):
-        moments.append(("apogee", peak(time_s, altitude_m)[0]))
+        found.append(("apogee", find_peak(time_s, altitude_m)[0]))
     down = (np.arange(len(time_s)) > np.argmax(altitude_m)) & (altitude_m < HIGHEST_M)
     for name, values, level in (
         ("80 km", altitude_m, 80e3),
@@ -93,5 +100,5 @@ def descent_moments(time_s: FloatArray, altitude_m: FloatArray, mach: FloatArray
         ("Mach 3.5", mach, 3.5),
         ("Mach 1", mach, 1.0),
     ):
-        moments.append((name, first_fall(time_s, values, level, down)))
-    return [(name, at) for name, at in moments if at is not None]
+        found.append((name, first_fall(time_s, values, level, down)))
+    return [(name, at) for name, at in found if at is not None]

@@ -19,12 +19,12 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import NO_FAULT, Fault, FloatArray
 from flightmodel.vehicle import CameraMount
 
 Image = NDArray[np.uint8]
 
-# read at the first film: what cannot be decoded is said by frame, decoders' own lines on standard error say no more
+# read at the first film: what cannot be decoded is reported by frame; decoders' own lines on standard error add nothing
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 WEBM_START = b"\x1aE\xdf\xa3"
@@ -46,7 +46,7 @@ class Frames:
     paths : tuple of Path
         Of each frame's image, or the film alone.
     benchmark_s : float
-        When the shell is taken as not bent.
+        When the deflection is taken as zero.
     numbers : (n,) int or None
         Of each frame in the film; None for images.
     time_bias_sd_s : float
@@ -114,8 +114,8 @@ def _grey(picture: NDArray[np.uint8]) -> Image:
     return picture
 
 
-def doubt_of_film(path: Path) -> str:
-    """Say why frame numbers of a film may be off; empty where every frame that it tells of can be decoded.
+def film_timing_fault(path: Path) -> Fault:
+    """Say why frame numbers of a film may be off; empty where every frame that it counts can be decoded.
 
     A frame that cannot be decoded is stepped over without a word, and every later one then has a number less. What
     gives it away is the file's own count of frames (WebM's is its length times its rate), or a jump in its times. The
@@ -133,53 +133,61 @@ def doubt_of_film(path: Path) -> str:
         film.release()
     remedy = "numbers in the list may name later pictures; extract the frames as images, or check the list"
     if counts > 0 and not (len(times) >= counts - 1 if estimated else len(times) == counts):
-        return f"{len(times)} frames can be decoded where the film tells of {counts}: {remedy}"
+        return Fault(
+            f"{len(times)} frames can be decoded where the film's own count is {counts}: {remedy}", "film-count"
+        )
     if len(times) < 3:
-        return ""
+        return NO_FAULT
     step = np.diff(times)
     step = np.append(times[0] + np.median(step), step)  # the first frame's time is 0
     uneven = np.flatnonzero(np.abs(step - np.median(step)) > 0.5 * np.median(step))
     if len(uneven):
         where = f"{1e-3 * times[uneven[0]]:.3f} s into the film, before its frame {uneven[0]}"
-        return f"time jumps {where} ({len(uneven)} such jumps): a lost frame or an uneven rate; {remedy}"
-    return ""
+        return Fault(
+            f"time jumps {where} ({len(uneven)} such jumps): a frame lost or an uneven rate; {remedy}", "film-rate"
+        )
+    return NO_FAULT
 
 
-def fault_of_film(path: Path, camera: CameraMount, last_number: int) -> str:
+def film_fault(path: Path, camera: CameraMount, last_number: int) -> str:
     """Say why a film cannot be used; empty when it can."""
     if not path.is_file():
-        return "no such file"
+        return Fault("no such file", "file-missing")
     if path.stat().st_size == 0:
-        return "is empty"
+        return Fault("is empty", "file-empty")
     with path.open("rb") as file:
         start = file.read(12)
     # by content: a list of other places to play from would be opened too
     if not (start[:4] == WEBM_START or start[4:8] == b"ftyp" or (start[:4] == b"RIFF" and start[8:12] == b"AVI ")):
-        return UNKNOWN_FILM
+        return Fault(UNKNOWN_FILM, "film-unreadable")
     film = cv2.VideoCapture(str(path))
     try:
         if not film.isOpened():
-            return f"{UNKNOWN_FILM}; if it is one, it is cut off (an .mp4 has its index at its end)"
+            return Fault(
+                f"{UNKNOWN_FILM}; if it is one, it is cut off (an .mp4 has its index at its end)", "film-unreadable"
+            )
         width, height = (round(film.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if (width, height) != (camera.width_px, camera.height_px):
-            return f"is {width} x {height} pixels, the camera {camera.width_px} x {camera.height_px}"
+            return Fault(
+                f"is {width} x {height} pixels, the camera {camera.width_px} x {camera.height_px}", "image-size"
+            )
         count = round(film.get(cv2.CAP_PROP_FRAME_COUNT))
         if 0 < count <= last_number:
-            return f"has {count} frames; the list asks for frame {last_number} (the first is 0)"
+            return Fault(f"has {count} frames; the list asks for frame {last_number} (the first is 0)", "frame-missing")
         if not film.grab():
-            return "holds no frame that can be decoded"
+            return Fault("holds no frame that can be decoded", "film-unreadable")
     finally:
         film.release()
     return ""
 
 
-def fault_of_image(path: Path, camera: CameraMount) -> str:
+def image_fault(path: Path, camera: CameraMount) -> str:
     """Say why an image file cannot be used; empty when it can. A whole PNG is not decoded for it.
 
     Its size is read from its head first: an image of another size than the camera's is never unpacked.
     """
     if not path.is_file():
-        return "no such file"
+        return Fault("no such file", "file-missing")
     wanted = (camera.width_px, camera.height_px)
     try:
         with warnings.catch_warnings():
@@ -187,16 +195,16 @@ def fault_of_image(path: Path, camera: CameraMount) -> str:
             with PIL.Image.open(path, formats=PICTURE_KINDS) as head:
                 size = head.size
     except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
-        return f"has far more pixels than the camera's {wanted[0]} x {wanted[1]}"
+        return Fault(f"has far more pixels than the camera's {wanted[0]} x {wanted[1]}", "image-size")
     except (OSError, ValueError, SyntaxError):
-        return f"cannot be decoded as an image (known are {', '.join(PICTURE_KINDS)})"
-    if sorted(size) == sorted(wanted) and not _is_whole_png(path):  # a turned JPEG says so in its metadata
+        return Fault(f"cannot be decoded as an image (known are {', '.join(PICTURE_KINDS)})", "image-unreadable")
+    if sorted(size) == sorted(wanted) and not _is_whole_png(path):  # a rotated JPEG has that in its metadata
         height, width = read_image(path).shape
         if height == 0:
-            return "cannot be decoded as an image"
+            return Fault("cannot be decoded as an image", "image-unreadable")
         size = (width, height)
     if size != wanted:
-        return f"is {size[0]} x {size[1]} pixels, the camera {wanted[0]} x {wanted[1]}"
+        return Fault(f"is {size[0]} x {size[1]} pixels, the camera {wanted[0]} x {wanted[1]}", "image-size")
     return ""
 
 

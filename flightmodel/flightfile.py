@@ -1,4 +1,4 @@
-"""What ``flight.toml`` says: the flight, its instruments and their tables, how it starts and how it moves."""
+"""What may ``flight.toml`` hold? The flight, its instruments and their tables, how it starts and how it moves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from flightmodel.checks import ConfigError
+from flightmodel.checks import ConfigError, Fault
 from flightmodel.config import (
     Angle,
     Duration,
@@ -70,7 +70,7 @@ class AttitudeEntry(Section):
         pointing = (self.azimuth_deg, self.elevation_deg, self.roll_deg)
         place = (self.latitude_deg, self.longitude_deg)
         if self.q_ecef_body is not None and any(v is not None for v in (*pointing, *place)):
-            raise ValueError("q_ecef_body says it all; remove azimuth_deg, elevation_deg, roll_deg and the place")
+            raise ValueError("q_ecef_body is whole; remove azimuth_deg, elevation_deg, roll_deg and the place")
         if self.q_ecef_body is None and any(v is None for v in pointing):
             raise ValueError("write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis")
         if (place[0] is None) != (place[1] is None):
@@ -78,8 +78,8 @@ class AttitudeEntry(Section):
         return self
 
 
-class DisturbedEntry(Section):
-    """A span in which more acts than sensors or model tell; `flightmodel.telemetry.Disturbed`."""
+class UnmodelledEntry(Section):
+    """A span with unmodelled acceleration or rotation; `flightmodel.telemetry.UnmodelledSpan`."""
 
     from_s: Time
     to_s: Time
@@ -87,11 +87,11 @@ class DisturbedEntry(Section):
     sd_degps: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
 
     @model_validator(mode="after")
-    def _something(self) -> DisturbedEntry:
+    def _something(self) -> UnmodelledEntry:
         if not self.from_s < self.to_s:
             raise KeyFaults([("to_s", self.to_s, f"a span ends after it begins; it begins at {self.from_s:g} s")])
         if self.sd_mps2 == 0.0 and self.sd_degps == 0.0:
-            raise KeyFaults([("sd_mps2", 0.0, "say what is disturbed: sd_mps2, sd_degps or both")])
+            raise KeyFaults([("sd_mps2", 0.0, "state sd_mps2, sd_degps or both")])
         return self
 
 
@@ -106,7 +106,7 @@ class MotionEntry(Section):
     acceleration_density: Annotated[float, Field(ge=0.0, le=100.0)] = 0.002
     powered_s: Spans | None = None
     powered_sd_mps2: Annotated[float, Field(ge=1e-9, le=1e4)] = 50.0
-    disturbed: list[DisturbedEntry] = []
+    disturbed: list[UnmodelledEntry] = []
 
     @model_validator(mode="after")
     def _drag_known(self) -> MotionEntry:
@@ -118,7 +118,7 @@ class MotionEntry(Section):
 
 
 class EventEntry(Section):
-    """A named moment."""
+    """A named event."""
 
     name: str
     t_s: Time
@@ -150,6 +150,7 @@ class FlightFile(Section):
     atmosphere: AtmosphereEntry | None = None
     frames: FramesEntry | None = None
     events: list[EventEntry] = []
+    reconstruction: dict[str, Any] = {}  # checked by `recon.settings.Settings`
 
     @field_validator("t0_utc")
     @classmethod
@@ -164,44 +165,44 @@ class FlightFile(Section):
         single = [s for s in (*onboard, self.atmosphere, self.frames) if s is not None]
         return [*single, *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
-    def misfits(self, needs_path: bool = True) -> list[str]:
+    def misfits(self, needs_path: bool = True) -> list[Fault]:
         """Return what does not go together, each with what to write instead.
 
         Without ``needs_path`` a folder with a film and neither radar nor receiver is whole.
         """
-        out: list[str] = []
+        out: list[Fault] = []
         if needs_path or self.radars or self.gnss or self.frames is None:
             out += self._misfits_of_path()
         if self.frames and self.vehicle is None:
-            out.append('frames: their camera stands in a vehicle file; add vehicle = "..."')
+            out.append(Fault('frames: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing"))
         names = [*self.radars, *self.gnss, *self.barometers]
         for name in sorted({n for n in names if names.count(n) > 1}):
-            out.append(f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name")
+            words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
+            out.append(Fault(words, "name-twice"))
         return out
 
-    def _misfits_of_path(self) -> list[str]:
+    def _misfits_of_path(self) -> list[Fault]:
         """Return what keeps a path from being found."""
         out = []
         triads = [name for name in ("accelerometer", "rates") if getattr(self.sensors, name) is not None]
         if not self.radars and not self.gnss:
-            also = "; a barometer alone knows no place" if self.barometers else ""
-            out.append(f"no [radars.NAME] and no [gnss.NAME]: a trajectory needs at least one of them{also}")
+            also = "; a barometer alone gives no place" if self.barometers else ""
+            words = f"no [radars.NAME] and no [gnss.NAME]: a trajectory needs at least one of them{also}"
+            out.append(Fault(words, "tracker-missing"))
         if len(triads) == 1:
             other = "rates" if triads == ["accelerometer"] else "accelerometer"
-            out.append(
-                f"[sensors.{triads[0]}] without [sensors.{other}]: only both together carry a state; add the other"
-            )
+            words = f"[sensors.{triads[0]}] without [sensors.{other}]: only both together carry a state; add the other"
+            out.append(Fault(words, "inertial-missing"))
         if self.motion.model == "strapdown" and not triads:
             words = (
                 'needs [sensors.accelerometer] and [sensors.rates]; without them write model = "ballistic" in [motion]'
             )
-            out.append(f'motion.model = "strapdown" {words}')
+            out.append(Fault(f'motion.model = "strapdown" {words}', "inertial-missing"))
         attitude = self.attitude_prior or (self.sensors.magnetometer and self.sensors.sun)
         if self.motion.model == "strapdown" and not attitude:
             words = "write [attitude_prior] (a quaternion, or azimuth_deg, elevation_deg and roll_deg)"
-            out.append(
-                f"nothing says how the vehicle was turned: {words}, or both [sensors.magnetometer] and [sensors.sun]"
-            )
+            words = f"no initial attitude: {words}, or both [sensors.magnetometer] and [sensors.sun]"
+            out.append(Fault(words, "attitude-missing"))
         return out
 
 
@@ -209,5 +210,5 @@ def read_flight_file(folder: Path) -> FlightFile:
     """Read and check ``flight.toml`` of a flight folder; `ConfigError` with every fault."""
     path = folder / "flight.toml"
     if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such flight folder")
+        raise ConfigError(f"{folder}: no such flight folder", code="folder-missing")
     return parse_section(FlightFile, read_toml(path), str(path))

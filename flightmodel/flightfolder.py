@@ -32,7 +32,6 @@ from flightmodel.sensor_tables import (
 from flightmodel.telemetry import (
     AttitudePrior,
     BarometerRecord,
-    Disturbed,
     Finding,
     GnssRecord,
     Motion,
@@ -41,6 +40,7 @@ from flightmodel.telemetry import (
     SunRecord,
     Telemetry,
     TriadRecord,
+    UnmodelledSpan,
 )
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
@@ -73,7 +73,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     folder : Path
         Flight folder with ``flight.toml``.
     progress : callable, optional
-        Is told which part of large tables is read.
+        Called with the fraction of the large tables that is read.
     needs_path : bool
         Whether a folder without radar and receiver is refused even where it has a film.
 
@@ -85,9 +85,9 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     spec = read_flight_file(folder)
     gate = Gate(folder, parse_utc(spec.t0_utc))
     if progress is not None:
-        gate.tell = _share_of(folder, spec, progress)
-    for words in spec.misfits(needs_path):
-        gate.refuse_config(words)
+        gate.progress = _share_of(folder, spec, progress)
+    for misfit in spec.misfits(needs_path):
+        gate.refuse_config(misfit)
     vehicle = _vehicle(gate, spec.vehicle) if spec.vehicle is not None else None
     triads = {name: read_triad(gate, name, spec, vehicle) for name in ("accelerometer", "rates", "magnetometer")}
     sun = read_sun(gate, spec.sensors.sun) if spec.sensors.sun else None
@@ -99,7 +99,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
             'accelerometer and rates are there, but with model = "ballistic" gravitation and drag carry the flight: '
             "they are not used for its path and attitude; take [motion] out unless that is meant"
         )
-        gate.findings.append(Finding("motion", words, np.nan, np.nan))
+        gate.findings.append(Finding("motion", words, np.nan, np.nan, code="inertial-unused"))
     measured = spec.atmosphere is not None
     barometers = {
         name: read_barometer(gate, name, entry, sounding, measured) for name, entry in spec.barometers.items()
@@ -117,7 +117,7 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
     folder : Path
         Flight folder with ``flight.toml``.
     progress : callable, optional
-        Is told which part of large tables is read.
+        Called with the fraction of the large tables that is read.
     needs_path : bool
         Whether a folder without radar and receiver is refused even where it has a film.
 
@@ -151,6 +151,7 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         gnss=found.gnss,
         barometers=found.barometers,
         motion=_motion(spec.motion),
+        reconstruction=dict(spec.reconstruction),
     )
     if not found.radars and not found.gnss:
         return telemetry
@@ -158,7 +159,9 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
     if stop - start < LEAST_SPAN_S:
         who = "accelerometer, rates and" if telemetry.accelerometer is not None else "the flight's"
         trackers = " and ".join(kind for kind, some in (("radars", found.radars), ("receivers", found.gnss)) if some)
-        raise GateError(f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)")
+        raise GateError(
+            f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)", code="no-common-time"
+        )
     return telemetry
 
 
@@ -167,12 +170,12 @@ def _share_of(folder: Path, spec: FlightFile, progress: Callable[[float], None])
     paths = [folder / source.file for source in spec.sources]
     total, done = sum(path.stat().st_size for path in paths if path.is_file()), 0
 
-    def tell(more: int) -> None:
+    def more_read(more: int) -> None:
         nonlocal done
         done += more
         progress(min(1.0, done / total))
 
-    return tell
+    return more_read
 
 
 def _there(records: dict[str, Record | None]) -> dict[str, Record]:
@@ -185,12 +188,12 @@ def _vehicle(gate: Gate, name: str) -> Vehicle | None:
     try:
         vehicle = vehicle_from_toml(vehicle_path(name, gate.folder))
     except GateError as fault:
-        for said in fault.faults:
-            gate.refuse_config(Fault(f"vehicle: {said}", said.code))
+        for each in fault.faults:
+            gate.refuse_config(Fault(f"vehicle: {each}", each.code))
         return None
     for body, mesh in vehicle.meshes.items():
         words = f"{mesh.words}; it is drawn, while the camera's fit is of [geometry]"
-        gate.findings.append(Finding(f"mesh of the {body}", words, np.nan, np.nan))
+        gate.findings.append(Finding(f"mesh of the {body}", words, np.nan, np.nan, code="mesh-repaired"))
     return vehicle
 
 
@@ -201,20 +204,20 @@ def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
     words = (
         "no [atmosphere]: the US Standard Atmosphere 1976 without wind stands for it, density to 10 %, wind to 15 m/s"
     )
-    gate.findings.append(Finding("atmosphere", words, np.nan, np.nan))
+    gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
     return standard_sounding()
 
 
 def _attitude_prior(
     gate: Gate, entry: AttitudeEntry, radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]
 ) -> AttitudePrior | None:
-    """Attitude to start from; None, with a fault kept, where it cannot be told."""
+    """Attitude to start from; None, with a fault kept, where no place is known for it."""
     sd = np.deg2rad(entry.sd_deg)
     if entry.q_ecef_body is not None:
         q = np.array(entry.q_ecef_body)
         norm = float(np.linalg.norm(q))
         if abs(norm - 1.0) > 1e-3:
-            gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1")
+            gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1", "quaternion-norm")
             return None
         return AttitudePrior(entry.t_s, q / norm, sd)
     if entry.latitude_deg is not None and entry.longitude_deg is not None:
@@ -255,7 +258,9 @@ def _motion(entry: MotionEntry) -> Motion:
         acceleration_density=entry.acceleration_density,
         powered_s=entry.powered_s or (),
         powered_sd_mps2=entry.powered_sd_mps2,
-        disturbed=tuple(Disturbed(d.from_s, d.to_s, d.sd_mps2, float(np.deg2rad(d.sd_degps))) for d in entry.disturbed),
+        disturbed=tuple(
+            UnmodelledSpan(d.from_s, d.to_s, d.sd_mps2, float(np.deg2rad(d.sd_degps))) for d in entry.disturbed
+        ),
     )
 
 

@@ -1,24 +1,22 @@
-"""The gate of a flight folder: keeps faults and findings while files are read, and opens where there is no fault.
+"""May this table be used, which of its rows, in which order, and what is notable in it?
 
-What an analyst should know of a sensor's samples: gaps, missing, frozen and saturated runs, each with its times.
+`Gate` keeps faults (with their codes) while the files of a flight folder are read, and opens where there is none. A
+table's rows pass these steps:
 
-Of very many of one kind the longest are told one by one and the others together: a list that nobody reads hides them.
+1. **Order.** Telemetry comes in packets: a row or a whole block may come twice, late, or in the wrong order. Rows that
+   repeat an earlier one (time and every value) are left out; rows out of order are put in order. Two kinds of rows
+   contradict others: those of one time with different values, and late ones for which there is no room, because rows
+   that came before stand there at their usual interval (a clock that was reset lays one stretch of the flight over
+   another so). A few of them are left out: of one time all, for nothing shows which is right. With `FEW` of the rows or
+   more the table is refused. It is refused with fewer, too, where a late block contradicts and the rows run on from it
+   into new times at their usual interval: what was sent late ends with a jump forward, a clock that was set back does
+   not, and then all that follows has wrong times.
+2. **Choice.** Rows inside the spans that flight.toml states, and of repeated times the first; times are those after
+   ``time.offset_s`` was added. Of an oversampled tracker's rows some are read but only predicted.
+3. **Range.** Values beyond what any entry vehicle's instrument reads are refused: a wrong unit, or a broken word.
+4. **Findings.** Gaps, missing, frozen and saturated runs, each with its times.
 
-In which order do the rows of a table belong, and which are not to be believed? Data as ranges deliver them.
-
-Telemetry comes in packets: a row or a whole block may come twice, late, or in the wrong order. Rows that repeat an
-earlier one (time and every value) are left out; rows out of order are put in order. Two kinds of rows contradict
-others: those of one time with different values, and late ones for which there is no room, because rows that came before
-stand there at their usual interval (a clock that was reset lays one stretch of the flight over another so). A few of
-them are left out: of one time all, for nobody can say which is right. With `FEW` of the rows or more the table is
-refused. It is refused with fewer, too, where a late block contradicts and the rows run on from it into new times at
-their usual interval: what was sent late ends with a jump forward, a clock that was set back does not, and then all
-that follows has wrong times. Nothing of it happens in silence: each repair has its words, its number of rows and
-blocks, and its times.
-
-Which rows of a table are used: those inside the spans that flight.toml states, and of repeated times the first.
-
-Times are those after ``time.offset_s`` was added. Of an oversampled tracker's rows some are read but only predicted.
+Every repair is a finding with its number of rows and blocks and its times; nothing is repaired in silence.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from flightmodel import tables
-from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import NO_FAULT, BoolArray, ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.csv_reading import file_sha256, read_numbers
 from flightmodel.tables import IntArray, Source
 from flightmodel.telemetry import Finding
@@ -85,7 +83,7 @@ class Gate:
     config: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     digests: dict[Path, str] = field(default_factory=dict)
-    tell: Callable[[int], None] = lambda _bytes: None  # of how many bytes more were read
+    progress: Callable[[int], None] = lambda _bytes: None  # called with the bytes read since the last call
 
     def sha256(self, path: Path) -> str:
         """SHA-256 of a file, from its reading where that made one."""
@@ -110,12 +108,13 @@ class Gate:
     def wrong_place(self, path: Path, named: str) -> str:
         """Return why a named file may not be read: outside the folder, or below its truth; empty where it may."""
         if "\0" in named:
-            return f"file {named!r}: a path holds no NUL character"
+            return Fault(f"file {named!r}: a path holds no NUL character", "path-nul")
         root, target = self.folder.resolve(), path.resolve()
         if Path(named).is_absolute() or not target.is_relative_to(root):
-            return f"file '{named}' lies outside the flight folder; copy it inside and name it relative to flight.toml"
+            words = f"file '{named}' lies outside the flight folder; copy it inside and name it relative to flight.toml"
+            return Fault(words, "path-outside-folder")
         if target.is_relative_to(root / "truth"):
-            return f"file '{named}' lies below truth/, which no estimator may open"
+            return Fault(f"file '{named}' lies below truth/, which no estimator may open", "path-in-truth")
         return ""
 
     def path(self, named: str) -> Path | None:
@@ -142,7 +141,7 @@ class Gate:
         shorts = [q.short for q in quantities]
         for key in (k for k in source.columns if k not in shorts):
             hint = nearest_name(key, shorts)
-            self.refuse_config(f"{label}.columns.{key}: no such quantity{hint}")
+            self.refuse_config(f"{label}.columns.{key}: no such quantity{hint}", "quantity-unknown")
         path = self.path(source.file)
         if path is None:
             return None
@@ -173,7 +172,7 @@ class Gate:
             return None
         wanted = {places[q.short][0]: q.required or q.short in source.columns for q in quantities}
         time = source.time_column if timed else None
-        found = read_numbers(path, wanted, time, self.t0, self.tell)
+        found = read_numbers(path, wanted, time, self.t0, self.progress)
         if found is None or len(wanted) < len(places):
             return None
         time_s = found.time
@@ -214,7 +213,10 @@ class Gate:
         self.findings.extend(findings)
         if rows.sum() < 2:
             span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
-            self.faults.append(f"{table.label}: {table.path}: use_s leaves {rows.sum()} rows of {span}; two are needed")
+            self.refuse(
+                f"{table.label}: {table.path}: use_s leaves {rows.sum()} rows of {span}; two are needed",
+                "use-span-empty",
+            )
         return table.of_rows(rows)
 
     def _ordered(self, table: Table) -> Table:
@@ -223,11 +225,11 @@ class Gate:
             return table
         delivery = in_order(table.time_s, list(table.columns.values()), table.lines)
         if delivery.refusal:
-            self.faults.append(f"{table.label}: {table.path}: {delivery.refusal}")
+            self.refuse(f"{table.label}: {table.path}: {delivery.refusal}", delivery.refusal.code)
         if delivery.refusal or not delivery.repairs:
             return table
         source = table.label.partition(".")[2] or table.label
-        self.findings.extend(Finding(source, *repair) for repair in delivery.repairs)
+        self.findings.extend(replace(repair, source=source) for repair in delivery.repairs)
         rows = delivery.rows
         held = {short: column[rows] for short, column in table.columns.items()}
         return Table(table.path, table.label, table.time_s[rows], held, table.lines[rows])
@@ -244,15 +246,16 @@ class Gate:
         if wild.any():
             k = int(np.argmax(wild))
             count = f"({int(wild.sum())} in all)"
-            self.faults.append(
-                f"{table.at(k)}: {short} = {values[k]:.6g} (SI) is {words} {count}; check its unit or leave it empty"
+            self.refuse(
+                f"{table.at(k)}: {short} = {values[k]:.6g} (SI) is {words} {count}; check its unit or leave it empty",
+                "value-range",
             )
 
 
 GAP_FACTOR = 5.0  # an interval this many times the usual one is a gap
 FROZEN_S, FROZEN_SAMPLES = 0.5, 10  # a column unchanged for this long, in at least so many samples, is frozen
 SATURATED_SAMPLES = 5  # this many samples in a row at a column's largest or smallest value are a stop
-MANY = 20  # runs of one kind that are told one by one
+MANY = 20  # runs of one kind that are listed one by one
 Indices = NDArray[np.int64]
 
 
@@ -276,18 +279,26 @@ def find_faults(
         missing = np.logical_or.reduce([np.isnan(column) for column in values.T])
     step = np.diff(time_s)
     wide = np.flatnonzero(step > GAP_FACTOR * float(np.median(step)))
-    found = told(source, time_s, wide, wide + 1, lambda k: f"gap of {step[wide[k]]:.3f} s", "gaps")
+    found = findings_of_runs(
+        source, time_s, wide, wide + 1, lambda k: Fault(f"gap of {step[wide[k]]:.3f} s", "data-gap"), "gaps"
+    )
     first, last = runs(missing)
-    found += told(source, time_s, first, last, lambda k: f"{last[k] - first[k] + 1} samples missing", "missing runs")
+    found += findings_of_runs(
+        source, time_s, first, last,
+        lambda k: Fault(f"{last[k] - first[k] + 1} samples missing", "samples-missing"), "missing runs",
+    )  # fmt: skip
     for name, column in zip(names, values.T, strict=True):
         found += _stuck(source, time_s, name, column)
     return found
 
 
-def told(
-    source: str, time_s: FloatArray, first: Indices, last: Indices, words: Callable[[int], str], kind: str
+def findings_of_runs(
+    source: str, time_s: FloatArray, first: Indices, last: Indices, words: Callable[[int], Fault], kind: str
 ) -> list[Finding]:
-    """Findings of runs of samples ``first`` to ``last``; ``words`` of each, and of what ``kind`` they are."""
+    """Findings of runs of samples ``first`` to ``last``; ``words`` of each with their code, and ``kind`` in the plural.
+
+    Of very many the longest are listed one by one and the others together.
+    """
     size = last - first + 1
     alone = np.ones(len(size), dtype=bool)
     if len(size) > MANY:
@@ -295,11 +306,12 @@ def told(
         alone = size > least
         alone[np.flatnonzero(size == least)[: MANY - int(alone.sum())]] = True
     chosen = np.flatnonzero(alone).tolist()
-    found = [Finding(source, words(k), float(time_s[first[k]]), float(time_s[last[k]])) for k in chosen]
+    found = [Finding(source, words(k), float(time_s[first[k]]), float(time_s[last[k]]), words(k).code) for k in chosen]
     if not alone.all():
         size, first, last = size[~alone], first[~alone], last[~alone]
         together = f"{len(size)} further {kind}, {size.sum()} samples, at most {size.max()} in a row"
-        found.append(Finding(source, together, float(time_s[first[0]]), float(time_s[last[-1]])))
+        code = words(int(np.flatnonzero(~alone)[0])).code
+        found.append(Finding(source, together, float(time_s[first[0]]), float(time_s[last[-1]]), code))
     return found
 
 
@@ -326,12 +338,14 @@ def _stuck(source: str, time_s: FloatArray, name: str, column: FloatArray) -> li
     some = saturated | frozen
     first, last, saturated, frozen = first[some], last[some], saturated[some], frozen[some]
 
-    def words(k: int) -> str:
+    def words(k: int) -> Fault:
         # a long run at an extreme may be either: a stop reached, or a sensor that stuck there
-        what = "saturated or frozen" if saturated[k] and frozen[k] else "frozen" if frozen[k] else "saturated"
-        return f"{name} {what} at {column[first[k]]:.6g} (SI) for {last[k] - first[k] + 1} samples"
+        both = saturated[k] and frozen[k]
+        what = "frozen or saturated" if both else "frozen" if frozen[k] else "saturated"
+        text = f"{name} {what} at {column[first[k]]:.6g} (SI) for {last[k] - first[k] + 1} samples"
+        return Fault(text, f"data-{what.replace(' ', '-')}")
 
-    return told(source, time_s, first, last, words, f"runs of one value of {name}")
+    return findings_of_runs(source, time_s, first, last, words, f"runs of one value of {name}")
 
 
 FEW = 0.01  # part of the rows that may contradict others
@@ -349,15 +363,15 @@ class Delivery:
     ----------
     rows : (k,) int
         Rows to use, in order of time.
-    repairs : tuple of (str, float, float)
-        What was done, from which to which time, s.
-    refusal : str
+    repairs : tuple of Finding
+        What was done, from which to which time; their source is left open.
+    refusal : Fault
         Why the table cannot be used; empty where it can.
     """
 
     rows: IntArray
-    repairs: tuple[tuple[str, float, float], ...] = ()
-    refusal: str = ""
+    repairs: tuple[Finding, ...] = ()
+    refusal: Fault = NO_FAULT
 
 
 def in_order(time_s: FloatArray, values: list[FloatArray], lines: IntArray) -> Delivery:
@@ -388,13 +402,17 @@ def in_order(time_s: FloatArray, values: list[FloatArray], lines: IntArray) -> D
         return Delivery(everything, refusal=_refusal_of_clock(time_s, lines, row, contradicting))
     late = np.setdiff1d(late, squeezed)
     repairs = (
-        (again, f"{_blocks(again)} repeat earlier rows: left out"),
-        (late, f"{_blocks(late)} came late or out of order: put in order"),
-        (torn, f"{_blocks(torn)} give different values for one time ({_times(time_s, torn)}): none of them is used"),
-        (squeezed, f"{_blocks(squeezed)} came late where earlier rows leave no room: not used"),
+        (again, "repeat earlier rows: left out", "rows-repeated"),
+        (late, "came late or out of order: put in order", "rows-reordered"),
+        (torn, f"give different values for one time ({_times(time_s, torn)}): none of them is used", "rows-contradict"),
+        (squeezed, "came late where earlier rows leave no room: not used", "rows-no-room"),
     )
-    told = tuple((words, float(time_s[k].min()), float(time_s[k].max())) for k, words in repairs if len(k))
-    return Delivery(used[np.argsort(time_s[used], kind="stable")], told)
+    findings = tuple(
+        Finding("", f"{_blocks(k)} {words}", float(time_s[k].min()), float(time_s[k].max()), code)
+        for k, words, code in repairs
+        if len(k)
+    )
+    return Delivery(used[np.argsort(time_s[used], kind="stable")], findings)
 
 
 def _of_one_time(time_s: FloatArray, values: list[FloatArray]) -> tuple[IntArray, IntArray]:
@@ -459,13 +477,14 @@ def _neighbours_that_came_before(times: FloatArray) -> tuple[IntArray, IntArray]
     return before, after
 
 
-def _refusal_of_clock(time_s: FloatArray, lines: IntArray, row: int, contradicting: IntArray) -> str:
+def _refusal_of_clock(time_s: FloatArray, lines: IntArray, row: int, contradicting: IntArray) -> Fault:
     """Why a table is refused whose clock was set back in ``row``."""
     later = contradicting[contradicting >= row]
-    return (
+    words = (
         f"{_backwards(time_s, lines, row)}, and the rows run on from there as after a reset clock ({len(later)} of "
         f"them contradict earlier ones, all later ones may have wrong times); {REMEDY}"
     )
+    return Fault(words, "clock-set-back")
 
 
 def _backwards(time_s: FloatArray, lines: IntArray, row: int) -> str:
@@ -473,18 +492,21 @@ def _backwards(time_s: FloatArray, lines: IntArray, row: int) -> str:
     return f"line {int(lines[row])}: time runs backwards or repeats: {step}"
 
 
-def _refusal(time_s: FloatArray, lines: IntArray, again: IntArray, torn: IntArray, squeezed: IntArray) -> str:
+def _refusal(time_s: FloatArray, lines: IntArray, again: IntArray, torn: IntArray, squeezed: IntArray) -> Fault:
     """Why the table is refused, with the first line at fault."""
     if len(torn) and len(torn) >= len(squeezed):
         instants, first = np.unique(time_s[torn], return_index=True)
         row = int(np.setdiff1d(torn, torn[first])[0])
         other = int(torn[first[np.searchsorted(instants, time_s[row])]])
         words = f"with other values than in line {int(lines[other])} ({len(torn)} such rows in all)"
-        return f"{_backwards(time_s, lines, row)}, {words}; {REMEDY}"
+        return Fault(f"{_backwards(time_s, lines, row)}, {words}; {REMEDY}", "rows-contradict")
     if len(squeezed):
         words = f"where earlier rows leave no room ({len(squeezed)} such rows in all)"
-        return f"{_backwards(time_s, lines, int(squeezed[0]))}, {words}; {REMEDY}"
-    return f"{_backwards(time_s, lines, int(again[0]))}, with the same values throughout: fewer than two different rows"
+        return Fault(f"{_backwards(time_s, lines, int(squeezed[0]))}, {words}; {REMEDY}", "rows-no-room")
+    words = (
+        f"{_backwards(time_s, lines, int(again[0]))}, with the same values throughout: fewer than two different rows"
+    )
+    return Fault(words, "too-few-rows")
 
 
 def _blocks(rows: IntArray) -> str:
@@ -511,15 +533,15 @@ def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArr
     use = np.diff(time_s, prepend=-np.inf) > 0.0
     if not use.all():
         again = time_s[~use]
-        words = f"{len(again)} rows repeat the time of the row before and are left out, as time.repeats says"
-        findings.append(Finding(name, words, float(again[0]), float(again[-1])))
+        words = f"{len(again)} rows repeat the time of the row before and are left out, as time.repeats asks"
+        findings.append(Finding(name, words, float(again[0]), float(again[-1]), code="rows-repeated"))
     if source.use_s is not None:
         inside = np.any([(time_s >= start) & (time_s <= stop) for start, stop in source.use_s], axis=0)
         left = int((use & ~inside).sum())
         if left:
             spans = ", ".join(f"{start:g} to {stop:g} s" for start, stop in source.use_s)
             words = f"{left} of {int(use.sum())} rows lie outside use_s ({spans}) and are left out"
-            findings.append(Finding(name, words, np.nan, np.nan))
+            findings.append(Finding(name, words, np.nan, np.nan, code="rows-outside-span"))
         use &= inside
     return use, findings
 
@@ -541,5 +563,5 @@ def oversampled(name: str, time_s: FloatArray, every_s: float) -> list[Finding]:
     idle = int((~spaced(time_s, every_s)).sum())
     if not idle:
         return []
-    words = f"{idle} of {len(time_s)} rows lie closer than every_s = {every_s:g} s: they check the trajectory, no more"
-    return [Finding(name, words, np.nan, np.nan)]
+    words = f"{idle} of {len(time_s)} rows lie closer than every_s = {every_s:g} s: they are predicted and not used"
+    return [Finding(name, words, np.nan, np.nan, code="rows-oversampled")]

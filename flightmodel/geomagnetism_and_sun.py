@@ -1,4 +1,4 @@
-"""Which way the Earth's field and the Sun point: the two directions that an attitude can be told from.
+"""Which way do the Earth's field and the Sun point? Two directions from which an attitude can be found.
 
 Field: the International Geomagnetic Reference Field (IGRF-14, degree 13) by ppigrf, constant over a flight (its secular
 change is 100 nT a year, 0.01 nT an hour). What IGRF leaves out, crust and currents above, is of order 100 nT.
@@ -59,7 +59,7 @@ def magnetic_field_ned_t(
 
     stamp = parse_utc(at_utc)
     if not IGRF_FROM <= stamp <= IGRF_TO:
-        raise GateError(f"magnetic field: {at_utc} lies outside IGRF-14, 1900 to 2030")
+        raise GateError(f"magnetic field: {at_utc} lies outside IGRF-14, 1900 to 2030", code="epoch-range")
     lat, lon, height = np.atleast_1d(*np.broadcast_arrays(latitude_rad, longitude_rad, height_m))
     east, north, up = ppigrf.igrf(np.rad2deg(lon), np.rad2deg(lat), height / 1e3, stamp.replace(tzinfo=None))
     return np.column_stack([north[0], east[0], -up[0]]) * 1e-9

@@ -1,4 +1,4 @@
-"""What does the inflated aeroshell look like from its aft side?
+"""What does the inflated aeroshell look like from its aft side, and does a user's mesh of it fit the vehicle?
 
 A stack of ``n`` tori, tangent to one another along the generator of a cone of half-angle ``H`` that touches the nose
 sphere of radius ``Rn``. In the half-plane (station aft of the nose ``s``, radius ``r``) the centre of torus ``i`` is
@@ -7,19 +7,17 @@ sphere of radius ``Rn``. In the half-plane (station aft of the nose ``s``, radiu
     f(r) = Rn (1 - sin H) + (r - Rn cos H) / tan H    (the cone's forward face)
 
 with minor radius ``a`` and spacing ``p``. Body axes: datum at the nose, x forward, so ``x = -s``. *Shell* axes equal
-body axes when the joint is not bent; `bend` carries shell points to the body. Assumed: the skin follows the tori, the
-shell bends nowhere but at the joint, gore seams are meridians of the aft side evenly clocked from 0 deg LV.
+body axes at zero deflection; `bend` carries shell points to the body. Assumed: the skin follows the tori, the shell
+deflects at the joint alone, gore seams are meridians of the aft side evenly clocked from 0 deg LV.
 
-Meshes of a user's own for aeroshell and centerbody (STL, OBJ, GLB): read, laid into the vehicle, checked against it.
-
-A mesh says what a body looks like; `flightmodel.geometry` stays what the camera's fit projects. So that both are one
-vehicle, the mesh must have its size, and a shell's rim must be the circle that ``[geometry]`` has. A point ``p`` of the
-file lies in body axes at
+Meshes (STL, OBJ, GLB) replace the look of aeroshell and centerbody; the stack of tori stays what the camera's fit
+projects. So that both are one vehicle, the mesh must have its size, and a shell's rim must be the circle that
+``[geometry]`` has. A point ``p`` of the file lies in body axes at
 
     unit_m R (p - nose),     rows of R: forward, -zero_clock, forward x -zero_clock.
 
-A mesh must be closed: every edge bounds an even number of faces. Then rays tell inside from outside by the parity of
-what they cross, whichever way faces are wound.
+A mesh must be closed: every edge bounds an even number of faces. Then rays separate inside from outside by the parity
+of what they cross, whichever way faces are wound.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flightmodel import rotations
-from flightmodel.checks import ConfigError, FloatArray, GateError
+from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
 from flightmodel.config import FileBeside, KeyFaults, Length, Section
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 
@@ -189,7 +187,10 @@ def torus_limb(
     b_term = np.full_like(a_term, station[torus_index] + viewpoint_shell_m[0])
     ratio = -minor / np.maximum(np.hypot(a_term, b_term), 1e-12)
     if (np.abs(ratio) >= 1.0).any():
-        raise GateError(f"viewpoint {np.round(viewpoint_shell_m, 3).tolist()} m lies inside torus {torus_index}")
+        raise GateError(
+            f"viewpoint {np.round(viewpoint_shell_m, 3).tolist()} m lies inside torus {torus_index}",
+            code="viewpoint-inside",
+        )
     v = np.arctan2(b_term, a_term) + np.arccos(ratio)
     points = (radius[torus_index] + minor * np.cos(v))[:, None] * outboard
     points[:, 0] = -(station[torus_index] + minor * np.sin(v))
@@ -243,6 +244,7 @@ Faces = NDArray[np.int64]
 
 KINDS = (".stl", ".obj", ".glb")
 LARGEST_BYTES, MOST_FACES, MOST_NODES = 50_000_000, 500_000, 10_000
+EMPTY = Fault("is empty: it has no face", "mesh-empty")
 UNITS_M = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
 WRONG_UNIT, SUGGESTED = 1.6, 1.1  # units lie a factor of 2.5 apart; one that makes the size right to a tenth is named
 SAME_RIM, SAME_END = 0.1, 0.25  # of the rim's radius, of the centerbody's length
@@ -358,26 +360,29 @@ def read_mesh(path: Path) -> tuple[FloatArray, Faces]:
         Where it is too large, cut off, of another kind, empty, or not closed.
     """
     if not path.is_file():
-        raise ConfigError(f"{path}: no such mesh; key 'meshes' names it")
+        raise ConfigError(f"{path}: no such mesh; key 'meshes' names it", code="file-missing")
     size = path.stat().st_size
     if size > LARGEST_BYTES:
-        raise GateError(f"{path}: {size / 1e6:.0f} MB where {LARGEST_BYTES // 10**6} at most are taken; thin it out")
+        raise GateError(
+            f"{path}: {size / 1e6:.0f} MB where {LARGEST_BYTES // 10**6} at most are taken; thin it out",
+            code="file-too-large",
+        )
     data, kind = path.read_bytes(), path.suffix.lower()[1:]
-    fault = {"stl": _fault_of_stl, "obj": _fault_of_obj, "glb": _fault_of_glb}[kind](data) if data else "is empty"
+    fault = {"stl": _fault_of_stl, "obj": _fault_of_obj, "glb": _fault_of_glb}[kind](data) if data else EMPTY
     if fault:
-        raise GateError(f"{path}: {fault}")
+        raise GateError(f"{path}: {fault}", code=getattr(fault, "code", "mesh-unreadable"))
     vertices, faces = _decoded(path, data, kind)
     rest = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     faces = faces[rest]
     if len(faces) == 0:
-        raise GateError(f"{path}: is empty: it has no face")
+        raise GateError(f"{path}: {EMPTY}", code=EMPTY.code)
     ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     edges, count = np.unique(ends[:, 0] * len(vertices) + ends[:, 1], return_counts=True)
     odd = edges[count % 2 == 1]
     if len(odd):
         place = np.round(vertices[odd[0] // len(vertices)], 4).tolist()
         words = f"{len(odd)} of its {len(edges)} edges bound one face or three, the first at {place} in the file's unit"
-        raise GateError(f"{path}: is not watertight: {words}; {TO_CLOSE}")
+        raise GateError(f"{path}: is not watertight: {words}; {TO_CLOSE}", code="mesh-not-watertight")
     return vertices, faces
 
 
@@ -396,13 +401,17 @@ def _decoded(path: Path, data: bytes, kind: str) -> tuple[FloatArray, Faces]:
             is_finite = bool(np.isfinite(whole.vertices).all())
             mesh = trimesh.Trimesh(whole.vertices, whole.faces, process=True)
     except Exception as fault:  # a decoder of untrusted files raises whatever its parts raise
-        raise GateError(f"{path}: cannot be decoded as {kind.upper()} ({type(fault).__name__}: {fault})") from None
+        raise GateError(
+            f"{path}: cannot be decoded as {kind.upper()} ({type(fault).__name__}: {fault})", code="mesh-unreadable"
+        ) from None
     if total == 0:
-        raise GateError(f"{path}: is empty: it has no face")
+        raise GateError(f"{path}: {EMPTY}", code=EMPTY.code)
     if total > MOST_FACES:
-        raise GateError(f"{path}: {total} faces where {MOST_FACES} at most are taken; thin it out")
+        raise GateError(
+            f"{path}: {total} faces where {MOST_FACES} at most are taken; thin it out", code="mesh-too-fine"
+        )
     if not is_finite:
-        raise GateError(f"{path}: vertices are not finite numbers")
+        raise GateError(f"{path}: vertices are not finite numbers", code="not-finite")
     return np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
 
 
@@ -414,10 +423,10 @@ def _fault_of_stl(data: bytes) -> str:
     """Say why an STL file is not to be decoded; the count in a binary one's head must fit its size."""
     told = int.from_bytes(data[80:84], "little")
     if len(data) >= 84 and len(data) == 84 + 50 * told:
-        return _too_many(told) if told else "is empty: it has no face"
+        return _too_many(told) if told else EMPTY
     if data.lstrip()[:5].lower() == b"solid" and (b"facet" in data or b"endsolid" in data):
         if b"facet" not in data:
-            return "is empty: it has no face"
+            return EMPTY
         if b"endsolid" not in data[-1000:]:
             return "is cut off: the last line, endsolid, is missing"
         return _too_many(data.count(b"endfacet"))
@@ -430,7 +439,7 @@ def _fault_of_stl(data: bytes) -> str:
 def _fault_of_obj(data: bytes) -> str:
     """Say why an OBJ file is not to be decoded."""
     corners = [len(line.split()) - 1 for line in data.splitlines() if line.lstrip()[:2] == b"f "]
-    return _too_many(sum(max(n - 2, 0) for n in corners)) if corners else "is empty: it has no face"
+    return _too_many(sum(max(n - 2, 0) for n in corners)) if corners else EMPTY
 
 
 def _fault_of_glb(data: bytes) -> str:
@@ -481,7 +490,9 @@ def _laid(body: str, spec: MeshFile, vertices: FloatArray, faces: Faces, geometr
         fits = {n: u for n, u in UNITS_M.items() if 1.0 / SUGGESTED < size * u / wanted_m < SUGGESTED}
         try_this = " or ".join(f"unit_m = {u:g} ({n})" for n, u in fits.items()) or f"unit_m = {wanted_m / size:.4g}"
         words = f"{named}would be {size * spec.unit_m:.4g} m in size where [geometry] has {wanted_m:.4g} m"
-        raise ConfigError(f"{key}.unit_m' = {spec.unit_m:g}: {words}; try {try_this}, or correct [geometry]")
+        raise ConfigError(
+            f"{key}.unit_m' = {spec.unit_m:g}: {words}; try {try_this}, or correct [geometry]", code="mesh-size"
+        )
     placed = spec.unit_m * (vertices - np.array(spec.nose)) @ spec.rows.T
     head = f"{named}{len(faces)} faces, {size * spec.unit_m:.3f} m in size"
     if body == "centerbody":
@@ -489,17 +500,17 @@ def _laid(body: str, spec: MeshFile, vertices: FloatArray, faces: Faces, geometr
         ends = tuple(round(float(end), 4) + 0.0 for end in (-placed[:, 0].max(), -placed[:, 0].min()))
         if max(abs(ends[1] - length), abs(ends[0])) > max(SAME_END * length, 2.0 * across):
             words = f"reaches from station {ends[0]:.3f} to {ends[1]:.3f} m where [geometry] has 0 to {length:g} m"
-            raise ConfigError(f"{key}': {named}{words}; check forward and nose")
+            raise ConfigError(f"{key}': {named}{words}; check forward and nose", code="mesh-pose")
         return BodyMesh(placed, faces, f"{head}, from station {ends[0]:.3f} to {ends[1]:.3f} m")
     front_m, turn_it = float(-placed[:, 0].max()), "check forward, zero_clock and nose"
     if front_m < -SAME_RIM * rim_m:
         tip = np.array(spec.nose) - (front_m / spec.unit_m) * spec.rows[0]
         words = f"reaches {-front_m:.3f} m ahead of the vehicle's nose; if forward is right, nose = {_shown(tip)}"
-        raise ConfigError(f"{key}.nose' = {list(spec.nose)}: {named}{words}")
+        raise ConfigError(f"{key}.nose' = {list(spec.nose)}: {named}{words}", code="mesh-pose")
     rim = rim_circle(placed)
     if rim.rms_m > NO_CIRCLE * rim.radius_m:
         words = f"its outline from ahead is no circle (rms {rim.rms_m:.3f} m)"
-        raise ConfigError(f"{key}.forward' = '{spec.forward}': {named}{words}; {turn_it}")
+        raise ConfigError(f"{key}.forward' = '{spec.forward}': {named}{words}; {turn_it}", code="mesh-pose")
     off_m = float(np.hypot(*rim.centre_m))
     words = (
         f"rim of radius {rim.radius_m:.3f} m at station {rim.station_m:.3f} m, {off_m:.3f} m off the axis, where "
@@ -507,7 +518,7 @@ def _laid(body: str, spec: MeshFile, vertices: FloatArray, faces: Faces, geometr
     )
     if max(abs(rim.radius_m - rim_m), off_m) > SAME_RIM * rim_m:
         allowed = f"{SAME_RIM * rim_m:.3f} m of difference is allowed"
-        raise ConfigError(f"{key}': {named}{words}; {allowed}; {turn_it}, or correct [geometry]")
+        raise ConfigError(f"{key}': {named}{words}; {allowed}; {turn_it}, or correct [geometry]", code="mesh-pose")
     apart = abs(rim.station_m - rim_station_m) > SAME_RIM * rim_m
     return BodyMesh(placed, faces, f"{head}; {words}{', so it will not lie over the filmed shell' if apart else ''}")
 
@@ -548,7 +559,10 @@ def _check_lenses(named: str, mesh: BodyMesh, lenses_m: dict[str, FloatArray]) -
     inside = [name for name, lens in lenses_m.items() if encloses(mesh, outboard(lens))]
     if inside:
         words = f"the lenses of {', '.join(inside)} lie inside it and would see nothing"
-        raise ConfigError(f"{named}: {words}; leave their housings out of the mesh, or check forward, nose and cameras")
+        raise ConfigError(
+            f"{named}: {words}; leave their housings out of the mesh, or check forward, nose and cameras",
+            code="lens-inside-mesh",
+        )
 
 
 def outboard(lens_m: FloatArray) -> FloatArray:

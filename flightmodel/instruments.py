@@ -1,22 +1,200 @@
-"""What sensor makers and estimators must both know of an instrument: where it sits, how it errs on paper.
+"""What of an instrument do the flight file, the filter and the simulator have to agree on?
 
-What ``flight.toml`` says of each instrument: its table, where it sits, and how it errs on paper.
+Each instrument is one record in SI: where it sits, and one row an error. A row (`ErrorRow`) states the error's prior in
+flight.toml, the error states it becomes in the filter, and the sizes from which the simulator draws it. From the rows
+follow the keys of flight.toml (`RadarEntry`, ...), the filter's blocks (`recon.error_model`), the keys of a scenario
+file and the lines of flight.toml that a synthetic flight gets (`synthetic_flight.instrument_errors`). What is left to
+write for a new error is its partial derivative in `recon._measurement_kernels`.
 
-Standard deviations stand as an analyst writes them, angles in degrees; the records hold SI. Where each default comes
-from is said in ``docs/flight-folder.md``.
+Every error is a constant of the flight, normal about zero with the stated standard deviation, unless its row names a
+time constant: then it is first-order Gauss-Markov. Standard deviations stand in files as an analyst writes them, angles
+in degrees; records hold SI. Where each default comes from stands in ``docs/flight-folder.md``.
+
+References
+----------
+Range Commanders Council 753-95 (error model of tracking radars).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, field, fields, replace
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BaseModel, Field, create_model, model_validator
 
-from flightmodel.checks import FloatArray
-from flightmodel.config import Angle, Duration, Fraction, KeyFaults, Place
+from flightmodel.checks import Fault, FloatArray
+from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place
 from flightmodel.tables import Declared, Source
+
+Sd = Annotated[float, Field(ge=1e-12, le=1e6)]  # its square is a number that can be divided by
+SdOrNone = Annotated[float, Field(ge=0.0, le=1e6)]
+SlowClock = Annotated[float, Field(ge=0.0, le=60.0)]
+Undulation = Annotated[float, Field(ge=-120.0, le=120.0)]  # of the geoid, whose extremes are -106 and +85 m
+BodyAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+AXIS = {
+    sign + name: factor * np.eye(3)[k] for k, name in enumerate("xyz") for sign, factor in (("+", 1.0), ("-", -1.0))
+}
+# sizes that a scenario may give: of triads in their own everyday unit, of lengths in metres
+Size = Annotated[float, Field(ge=0.0, le=1e4)]
+LateClock = Annotated[float, Field(ge=0.0, le=10.0)]
+TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
+SIMULATED = {"m": Size, "s": LateClock, "rad": ErrorAngle, "1": Fraction, "": Size}  # by the unit of the error
+
+Response = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """One error of an instrument: how it is stated, estimated and simulated.
+
+    Parameters
+    ----------
+    name : str
+        Field of the instrument's record, SI: ``"droop_sd_rad"``.
+    unit : str
+        Of the error states, SI; ``"1"`` for a factor. Of a triad's signal, "" until `triad_table` names it.
+    prior : float or None
+        Default in flight.toml, in the file's unit.
+    limits : type
+        Numbers that flight.toml may state.
+    states : tuple of str
+        Error states of the filter, in its order; none for white noise.
+    least : float or None
+        The states are always there, with at least this standard deviation (SI). None: only where one is stated.
+    time_constant : tuple of str, float, str
+        Field of the record and flight.toml's key, its default there, s, and the scenario's key; empty for a constant.
+    simulated : tuple of str or None
+        The scenario's keys; several are independent errors which one prior covers. None: the file's key without
+        ``_sd``. Empty: the simulator has no such error.
+    required : bool
+        The scenario must give the first of them; all others are 0 where it does not.
+    step : str
+        The scenario's key of a quantisation step, which stands in for noise of 0.
+    left_out : bool
+        Flight.toml of a synthetic flight does not hold it where it is 0.
+    response : tuple of int, callable; or None
+        Component of the reading that the simulator adds it to, and what it adds there: of the error (1,), slant range
+        m, azimuth and elevation rad (n,).
+    """
+
+    name: str
+    unit: str
+    prior: float | None
+    limits: Any = SdOrNone
+    states: tuple[str, ...] = ()
+    least: float | None = None
+    time_constant: tuple[str, float, str] = ("", 0.0, "")
+    simulated: tuple[str, ...] | None = ()
+    required: bool = False
+    step: str = ""
+    left_out: bool = False
+    response: tuple[int, Response] | None = None
+    to_si: float = 1.0
+    suffix: str = ""
+
+    @property
+    def key(self) -> str:
+        """Key in flight.toml."""
+        return (f"{self.name.removesuffix('_rad')}_deg" if self.name.endswith("_rad") else self.name) + self.suffix
+
+    @property
+    def scenario_keys(self) -> tuple[str, ...]:
+        """Keys in a scenario file."""
+        named = (self.key.replace("_sd", ""),) if self.simulated is None else self.simulated
+        return tuple(key.replace("{suffix}", self.suffix) for key in named)
+
+    @property
+    def title(self) -> str:
+        """Name of the error: ``"range scale"``."""
+        return self.name.partition("_sd")[0].replace("_", " ")
+
+
+def error_row(
+    unit: str, prior: float | None, limits: Any = SdOrNone, at: Any = MISSING, late: bool = False, **row: Any
+) -> Any:
+    """Field of an instrument's record with its `ErrorRow`.
+
+    ``at`` is the record's own default; ``late`` fields are given by keyword alone.
+    """
+    return field(default=at, kw_only=late, metadata={"row": ErrorRow("", unit, prior, limits, **row)})
+
+
+@dataclass(frozen=True)
+class InstrumentTable:
+    """Rows of one kind of instrument, in the order in which the filter holds its states."""
+
+    rows: tuple[ErrorRow, ...]
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Error states of the filter, all rows'."""
+        return tuple(state for row in self.rows for state in row.states)
+
+    def from_file(self, entry: BaseModel) -> dict[str, Any]:
+        """Numbers of the record, SI, by its field's name, from an entry of flight.toml."""
+        out: dict[str, Any] = {}
+        for row in self.rows:
+            stated = getattr(entry, row.key)
+            out[row.name] = None if stated is None else float(stated * row.to_si)
+            if row.time_constant[0]:
+                out[row.time_constant[0]] = getattr(entry, row.time_constant[0])
+        return out
+
+    def from_scenario(self, section: BaseModel) -> dict[str, tuple[float, ...]]:
+        """Sizes of the independent errors of each row that the simulator draws, SI, by its record's field.
+
+        Time constants stand by their own names.
+        """
+        out = {row.name: tuple(getattr(section, key) * row.to_si for key in row.scenario_keys) for row in self.rows}
+        constants = [row.time_constant for row in self.rows if row.time_constant[2]]
+        return out | {name: (getattr(section, key),) for name, _, key in constants}
+
+    def file_keys(self) -> dict[str, tuple[Any, float | None]]:
+        """Type and default of each key of flight.toml."""
+        out: dict[str, tuple[Any, float | None]] = {}
+        for row in self.rows:
+            out[row.key] = (row.limits if row.prior is not None else row.limits | None, row.prior)
+            key, default, _ = row.time_constant
+            if key:
+                out[key] = (Duration, default)
+        return out
+
+    def scenario_keys(self) -> dict[str, tuple[Any, Any]]:
+        """Type and default of each key of a scenario's section; ``...`` where it must be given."""
+        out: dict[str, tuple[Any, Any]] = {}
+        for row in self.rows:
+            for k, key in enumerate(row.scenario_keys):
+                out[key] = (SIMULATED[row.unit if not row.suffix else ""], ... if row.required and k == 0 else 0.0)
+            _, default, key = row.time_constant
+            if key:
+                out[key] = (TimeConstant, default)
+        return out
+
+
+def with_keys(keys: dict[str, tuple[Any, Any]]) -> Callable[[type[Model]], type[Model]]:
+    """Class decorator that adds keys to a section of a file; those that the class has itself stay as they are."""
+
+    def added(section: type[Model]) -> type[Model]:
+        new: dict[str, Any] = {key: form for key, form in keys.items() if not hasattr(section, key)}
+        new = {key: form for key, form in new.items() if key not in section.model_fields}
+        return create_model(
+            section.__name__, __base__=section, __module__=section.__module__, __doc__=section.__doc__, **new
+        )
+
+    return added
+
+
+def table_of(record: type) -> InstrumentTable:
+    """Rows of an instrument's record, named and with the factor from the file's unit to SI."""
+    rows = []
+    for each in fields(record):
+        if "row" in each.metadata:
+            to_si = float(np.deg2rad(1.0)) if each.name.endswith("_rad") else 1.0
+            rows.append(replace(each.metadata["row"], name=each.name, to_si=to_si))
+    return InstrumentTable(tuple(rows))
 
 
 @dataclass(frozen=True)
@@ -34,29 +212,67 @@ class TriadSpec:
     noise_sd, bias_sd, scale_sd, mount_sd_rad : float
         White noise per sample (m/s^2, rad/s or T), bias (hard iron with it), scale factor, mounting rotation per axis;
         one standard deviation each, as the data sheet gives them.
+    time_bias_sd_s : float
+        Of its clock: time tag minus true time, constant over a flight.
     resolution : float
         Quantisation step, m/s^2, rad/s or T; 0 for none.
     soft_iron_sd : float
-        Of a magnetometer: elements of the symmetric matrix by which the vehicle's iron bends the field.
+        Of a magnetometer: elements of the symmetric matrix by which the vehicle's iron distorts the field.
     bias_wander_sd, bias_time_constant_s : float
         A second part of the bias that varies slowly (Gauss-Markov): its standard deviation, in the triad's unit, and
         time constant; 0 for none.
-    time_bias_sd_s : float
-        Of its clock: time tag minus true time, constant over a flight.
     """
 
     name: str
     position_from_datum_body_m: FloatArray
     dcm_body_sensor: FloatArray
-    noise_sd: float
-    bias_sd: float
-    scale_sd: float
-    mount_sd_rad: float
-    resolution: float = 0.0
-    soft_iron_sd: float = 0.0
-    bias_wander_sd: float = 0.0
+    noise_sd: float = error_row("", 0.0, Sd, simulated=None, required=True)
+    bias_sd: float = error_row(
+        "", 0.0, states=("bias x", "bias y", "bias z"), least=1e-9, simulated=None, required=True
+    )
+    scale_sd: float = error_row(
+        "1", 0.003, states=("scale x", "scale y", "scale z"), least=1e-9, required=True,
+        simulated=("scale", "scale_asymmetry"),
+    )  # fmt: skip
+    mount_sd_rad: float = error_row(
+        "rad", 0.2, states=("mount x", "mount y", "mount z"), least=1e-9, required=True,
+        simulated=("mount_deg", "nonorthogonality_deg"),
+    )  # fmt: skip
+    time_bias_sd_s: float = error_row("s", 0.001, at=0.0, late=True, states=("time bias",), simulated=None)
+    resolution: float = error_row("", 0.0, at=0.0, simulated=None)
+    soft_iron_sd: float = error_row(
+        "1", 0.0, at=0.0, states=("soft iron xy", "soft iron xz", "soft iron yz"), simulated=None
+    )
+    bias_wander_sd: float = error_row(
+        "", 0.0, at=0.0, simulated=("drift{suffix}",), left_out=True,
+        time_constant=("bias_time_constant_s", 100.0, "drift_time_constant_s"),
+    )  # fmt: skip
     bias_time_constant_s: float = np.inf
-    time_bias_sd_s: float = 0.0
+
+
+def _triad_table(unit: str, state_unit: str, to_si: float, without: tuple[str, ...], **changed: Any) -> InstrumentTable:
+    """Rows of a triad whose signal stands in files in ``unit``; ``changed`` are its own defaults and the like."""
+    rows = []
+    for row in table_of(TriadSpec).rows:
+        if row.name in without:
+            continue
+        if row.unit == "":
+            row = replace(row, unit=state_unit, to_si=to_si, suffix=f"_{unit}")
+        rows.append(replace(row, **changed.get(row.name, {})))
+    return InstrumentTable(tuple(rows))
+
+
+ACCELEROMETER = _triad_table(
+    "mps2", "m/s2", 1.0, ("soft_iron_sd",), noise_sd={"prior": 0.049}, bias_sd={"prior": 0.098}
+)
+RATES = _triad_table(
+    "degps", "rad/s", float(np.deg2rad(1.0)), ("soft_iron_sd",),
+    noise_sd={"prior": 0.05}, bias_sd={"prior": 0.05}, mount_sd_rad={"prior": 0.15},
+)  # fmt: skip
+MAGNETOMETER = _triad_table(
+    "ut", "T", 1e-6, ("time_bias_sd_s",),
+    noise_sd={"prior": 0.2}, bias_sd={"prior": 0.5, "simulated": ("bias_ut", "hard_iron_ut")},
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -69,46 +285,65 @@ class RadarSite:
         As in the flight file.
     latitude_rad, longitude_rad, height_m : float
         WGS-84.
-    range_sd_m, angle_sd_rad : float
-        White noise per sample; the angle's across the line of sight, so azimuth scatters ``1 / cos(elevation)`` more.
-    azimuth_sd_rad, elevation_sd_rad : float or None
-        The same of one angle, where the two differ; azimuth's across the line of sight too.
-    range_bias_sd_m, angle_bias_sd_rad, time_bias_sd_s : float
-        Systematic errors, constant over a flight, one standard deviation.
-    mislevel_sd_rad, droop_sd_rad, skew_sd_rad, nonorthogonality_sd_rad : float
-        Systematic errors of the pedestal (RCC 753-95): its tilt about north and about east, and the factors of cos E in
-        elevation, sec E and tan E in azimuth. 0 where nothing is stated.
-    wander_sd_rad, wander_time_constant_s : float
-        Slow (Gauss-Markov) error of both angles across the line of sight.
-    refraction_sd : float
-        Of the part of the air's bending that is left in the elevations: 1 where nothing is known of a correction.
-    range_scale_sd : float
-        Of range error over range: velocity of light, oscillator.
+
+    All others are standard deviations, one row each.
     """
 
     name: str
     latitude_rad: float
     longitude_rad: float
     height_m: float
-    range_sd_m: float
-    angle_sd_rad: float
-    range_bias_sd_m: float
-    angle_bias_sd_rad: float
-    time_bias_sd_s: float
-    mislevel_sd_rad: float = 0.0
-    droop_sd_rad: float = 0.0
-    skew_sd_rad: float = 0.0
-    nonorthogonality_sd_rad: float = 0.0
-    wander_sd_rad: float = 0.0
+    # white noise per sample; the angle's normal to the line of sight, so azimuth scatters 1 / cos E more
+    range_sd_m: float = error_row("m", 5.0, Sd, simulated=("range_sd_m",), required=True, step="range_resolution_m")
+    angle_sd_rad: float = error_row(
+        "rad", 0.0086, Sd, simulated=("angle_sd_deg",), required=True, step="angle_resolution_deg"
+    )
+    # constants of the flight; over its arc an encoder's waves are hardly separable from a bias
+    range_bias_sd_m: float = error_row("m", 3.0, states=("range bias",), least=1e-6, simulated=None, required=True)
+    angle_bias_sd_rad: float = error_row(
+        "rad", 0.003, states=("azimuth bias", "elevation bias"), least=1e-12, required=True,
+        simulated=("angle_bias_deg", "encoder_once_deg", "encoder_twice_deg"),
+    )  # fmt: skip
+    time_bias_sd_s: float = error_row("s", 0.001, states=("time bias",), least=1e-12, simulated=None, required=True)
+    # the pedestal: its tilt about north and about east (an exact rotation), then factors of its two axes
+    mislevel_sd_rad: float = error_row(
+        "rad", 0.0, at=0.0, states=("tilt north", "tilt east"), simulated=None, left_out=True
+    )
+    droop_sd_rad: float = error_row(
+        "rad", 0.0, at=0.0, states=("droop",), simulated=None, left_out=True,
+        response=(2, lambda error, _slant, _az, el: error * np.cos(el)),
+    )  # fmt: skip
+    skew_sd_rad: float = error_row(
+        "rad", 0.0, at=0.0, states=("skew",), simulated=None, left_out=True,
+        response=(1, lambda error, _slant, _az, el: error / np.cos(el)),
+    )  # fmt: skip
+    nonorthogonality_sd_rad: float = error_row(
+        "rad", 0.0, at=0.0, states=("non-orthogonality",), simulated=None, left_out=True,
+        response=(1, lambda error, _slant, _az, el: error * np.tan(el)),
+    )  # fmt: skip
+    # slow error of both angles, normal to the line of sight
+    wander_sd_rad: float = error_row(
+        "rad", 0.0, at=0.0, states=("traverse wander", "elevation wander"), simulated=None, left_out=True,
+        time_constant=("wander_time_constant_s", 20.0, "wander_time_constant_s"),
+    )  # fmt: skip
     wander_time_constant_s: float = 20.0
-    refraction_sd: float = 0.0
-    range_scale_sd: float = 0.0
-    azimuth_sd_rad: float | None = None
-    elevation_sd_rad: float | None = None
+    # part of the air's refraction that is left in the elevations: 1 where nothing is known of a correction
+    refraction_sd: float = error_row(
+        "1", 0.0, Annotated[float, Field(ge=0.0, le=10.0)], at=0.0, states=("refraction",),
+        simulated=("refraction_left",), left_out=True,
+    )  # fmt: skip
+    # range error over range: velocity of light, oscillator
+    range_scale_sd: float = error_row(
+        "1", 0.0, Annotated[float, Field(ge=0.0, le=0.1)], at=0.0, states=("range scale",), simulated=None,
+        left_out=True, response=(0, lambda error, slant, _az, _el: error * slant),
+    )  # fmt: skip
+    # white noise of one angle, where the two differ; azimuth's normal to the line of sight too
+    azimuth_sd_rad: float | None = error_row("rad", None, Sd, at=None)
+    elevation_sd_rad: float | None = error_row("rad", None, Sd, at=None)
 
     @property
     def angles_sd_rad(self) -> tuple[float, float]:
-        """White noise across the line of sight, in azimuth's direction and in elevation's."""
+        """White noise normal to the line of sight, in azimuth's direction and in elevation's."""
         azimuth, elevation = self.azimuth_sd_rad, self.elevation_sd_rad
         return (
             self.angle_sd_rad if azimuth is None else azimuth,
@@ -131,7 +366,7 @@ class GnssSpec:
     speed_sd_mps, vertical_speed_sd_mps : float
         White noise of a velocity: of each horizontal axis, and of the vertical one.
     wander_sd_m, wander_time_constant_s : float
-        Slowly wandering (Gauss-Markov) part of the position's error, of each axis; 0 for none. Satellites' clocks and
+        Slowly varying (Gauss-Markov) part of the position's error, of each axis; 0 for none. Satellites' clocks and
         orbits, the ionosphere and reflections change in minutes, so that one fix repeats the error of the last.
     time_bias_sd_s : float
         Time tag minus true time, constant over a flight: a receiver's latency, or the second that its clock rounds to.
@@ -139,13 +374,16 @@ class GnssSpec:
 
     name: str
     antenna_from_datum_body_m: FloatArray
-    horizontal_sd_m: float
-    vertical_sd_m: float
-    speed_sd_mps: float
-    vertical_speed_sd_mps: float
-    wander_sd_m: float = 0.0
+    horizontal_sd_m: float = error_row("m", 5.0, Sd)
+    vertical_sd_m: float = error_row("m", 10.0, Sd)
+    speed_sd_mps: float = error_row("m/s", 0.5, Sd)
+    vertical_speed_sd_mps: float = error_row("m/s", 1.0, Sd)
+    wander_sd_m: float = error_row(
+        "m", 3.0, at=0.0, states=("wander north", "wander east", "wander down"),
+        time_constant=("wander_time_constant_s", 100.0, ""),
+    )  # fmt: skip
     wander_time_constant_s: float = 100.0
-    time_bias_sd_s: float = 0.0
+    time_bias_sd_s: float = error_row("s", 0.5, SlowClock, at=0.0, states=("time bias",))
 
 
 @dataclass(frozen=True)
@@ -164,18 +402,20 @@ class BarometerSpec:
         Error proportional to the height above the first reading: a day warmer or colder than the profile, of which
         1 % in temperature is 1 % in height.
     wander_sd_m, wander_time_constant_s : float
-        Slowly wandering (Gauss-Markov) error: the vehicle's own flow, winds; 0 for none.
+        Slowly varying (Gauss-Markov) error: the vehicle's own flow, winds; 0 for none.
     time_bias_sd_s : float
         Time tag minus true time, with the lag of a vented bay.
     """
 
     name: str
-    sd_m: float
-    bias_sd_m: float
-    scale_sd: float
-    wander_sd_m: float = 0.0
+    sd_m: float = error_row("m", 3.0, Sd)
+    bias_sd_m: float = error_row("m", 60.0, states=("bias",))
+    scale_sd: float = error_row("1", 0.03, Fraction, states=("scale",))
+    wander_sd_m: float = error_row(
+        "m", 5.0, at=0.0, states=("wander",), time_constant=("wander_time_constant_s", 30.0, "")
+    )
     wander_time_constant_s: float = 100.0
-    time_bias_sd_s: float = 0.0
+    time_bias_sd_s: float = error_row("s", 0.2, SlowClock, at=0.0, states=("time bias",))
 
 
 @dataclass(frozen=True)
@@ -191,20 +431,23 @@ class SunHeads:
     field_rad : float
         Full cone about a head's axis in which it sees the Sun.
     noise_sd_rad, bias_sd_rad, mount_sd_rad : float
-        White noise per sample and constant error across the line of sight, mounting rotation per axis of each head.
+        White noise per sample and constant error normal to the line of sight, mounting rotation per axis of each head.
     """
 
     name: str
     clock_lv_rad: FloatArray
     field_rad: float
-    noise_sd_rad: float
-    bias_sd_rad: float
-    mount_sd_rad: float
+    noise_sd_rad: float = error_row("rad", 1.0, Sd, simulated=None, required=True, step="resolution_deg")
+    bias_sd_rad: float = error_row("rad", 0.5, states=("bias across", "bias along"), simulated=None, required=True)
+    mount_sd_rad: float = error_row("rad", 0.2, states=("mount x", "mount y", "mount z"), simulated=None, required=True)
 
     @property
     def dcm_body_head(self) -> FloatArray:
         """Nominal mounting of each head, ``v_body = dcm_body_head[k] @ v_head``, (k, 3, 3)."""
         return np.array([dcm_body_from_sun_head(float(clock)) for clock in self.clock_lv_rad])
+
+
+RADAR, GNSS, BAROMETER, SUN = (table_of(record) for record in (RadarSite, GnssSpec, BarometerSpec, SunHeads))
 
 
 def dcm_body_from_clocking(x_axis_lv_rad: float, y_axis_lv_rad: float) -> FloatArray:
@@ -238,7 +481,7 @@ def dcm_body_from_sun_head(clock_lv_rad: float) -> FloatArray:
 def sun_angles_from_direction(direction_head: FloatArray) -> FloatArray:
     """Azimuth about the head's x from z towards y, and elevation from there towards x, rad ``(..., 2)``.
 
-    ``direction_head`` (..., 3) are unit vectors in head axes. A point ``d`` away across the line of sight differs by
+    ``direction_head`` (..., 3) are unit vectors in head axes. A point ``d`` away normal to the line of sight differs by
     ``d / cos(elevation)`` in azimuth.
     """
     x, y, z = np.moveaxis(np.asarray(direction_head, dtype=float), -1, 0)
@@ -251,36 +494,26 @@ def direction_from_sun_angles(az_el_rad: FloatArray) -> FloatArray:
     return np.stack([np.sin(el), np.cos(el) * np.sin(az), np.cos(el) * np.cos(az)], axis=-1)
 
 
-Sd = Annotated[float, Field(ge=1e-12, le=1e6)]  # its square is a number that can be divided by
-SdOrNone = Annotated[float, Field(ge=0.0, le=1e6)]
-Undulation = Annotated[float, Field(ge=-120.0, le=120.0)]  # of the geoid, whose extremes are -106 and +85 m
-BodyAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
-AXIS = {
-    sign + name: factor * np.eye(3)[k] for k, name in enumerate("xyz") for sign, factor in (("+", 1.0), ("-", -1.0))
-}
-
-
 class Mounted(Source):
     """A triad: which way its axes point, by a package of the vehicle file (``mount``) or by body axes (``axes``)."""
 
     mount: str | None = None
     axes: tuple[BodyAxis, BodyAxis, BodyAxis] | None = None
     position_from_datum_body_m: tuple[Place, Place, Place] | None = None
-    bias_time_constant_s: Duration = 100.0
 
     @model_validator(mode="after")
     def _one_mount(self) -> Mounted:
         faults: list[tuple[str, object, str]] = []
         if self.axes is not None:
             if self.mount is not None:
-                faults.append(("axes", list(self.axes), f"mount = '{self.mount}' says it too; keep one of the two"))
+                faults.append(("axes", list(self.axes), f"mount = '{self.mount}' states the same; keep one of the two"))
             dcm = self.dcm_body_sensor
             if not np.allclose(dcm @ dcm.T, np.eye(3)):
                 words = "two sensor axes point along the same body axis; each wants one of its own"
-                faults.append(("axes", list(self.axes), words))
+                faults.append(("axes", list(self.axes), Fault(words, "axes-parallel")))
             elif np.linalg.det(dcm) < 0.0:
-                words = "these axes are left-handed (a mirror image); turn one of the signs or swap two axes"
-                faults.append(("axes", list(self.axes), words))
+                words = "these axes are left-handed (a mirror image); change one of the signs or swap two axes"
+                faults.append(("axes", list(self.axes), Fault(words, "axes-left-handed")))
         elif self.position_from_datum_body_m is not None and self.mount != "body":
             words = 'goes with axes = ["+x", "+y", "+z"] or mount = "body"; a package of the vehicle has its own place'
             faults.append(("position_from_datum_body_m", list(self.position_from_datum_body_m), words))
@@ -295,58 +528,36 @@ class Mounted(Source):
 
     @property
     def place_m(self) -> FloatArray:
-        """Place from the datum, body axes, (3,), m; the datum where nothing is said."""
+        """Place from the datum, body axes, (3,), m; the datum where none is stated."""
         return np.array(self.position_from_datum_body_m or (0.0, 0.0, 0.0))
 
 
+@with_keys(ACCELEROMETER.file_keys())
 class TriadEntry(Mounted):
     """Accelerometer triad: file, mounting, errors from the data sheet (one standard deviation)."""
 
-    noise_sd_mps2: Sd = 0.049
-    bias_sd_mps2: SdOrNone = 0.098
-    bias_wander_sd_mps2: SdOrNone = 0.0
-    scale_sd: SdOrNone = 0.003
-    mount_sd_deg: SdOrNone = 0.2
-    time_bias_sd_s: SdOrNone = 0.001
-    resolution_mps2: SdOrNone = 0.0
 
-
+@with_keys(RATES.file_keys())
 class RatesEntry(Mounted):
     """Rate gyros, along body axes unless ``axes`` say otherwise."""
 
-    noise_sd_degps: Sd = 0.05
-    bias_sd_degps: SdOrNone = 0.05
-    bias_wander_sd_degps: SdOrNone = 0.0
-    scale_sd: SdOrNone = 0.003
-    mount_sd_deg: SdOrNone = 0.15
-    time_bias_sd_s: SdOrNone = 0.001
-    resolution_degps: SdOrNone = 0.0
 
-
+@with_keys(MAGNETOMETER.file_keys())
 class MagnetometerEntry(Mounted):
     """Magnetometer: file, mounting, errors; the bias holds the vehicle's hard iron too.
 
     ``reversed`` is for one that reads the field with the opposite sign along all its axes.
     """
 
-    noise_sd_ut: Sd = 0.2
-    bias_sd_ut: SdOrNone = 0.5
-    bias_wander_sd_ut: SdOrNone = 0.0
-    scale_sd: SdOrNone = 0.003
-    soft_iron_sd: SdOrNone = 0.0
-    mount_sd_deg: SdOrNone = 0.2
-    resolution_ut: SdOrNone = 0.0
     reversed: bool = False
 
 
+@with_keys(SUN.file_keys())
 class SunEntry(Source):
     """Two-axis Sun sensors, one head looking outward at each clocking angle; an empty cell where a head sees no Sun."""
 
     heads_lv_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=8)] = (45.0, 135.0, 225.0, 315.0)
     field_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 180.0
-    noise_sd_deg: Sd = 1.0
-    bias_sd_deg: SdOrNone = 0.5
-    mount_sd_deg: SdOrNone = 0.2
 
 
 class TrackingSource(Source):
@@ -358,6 +569,7 @@ class TrackingSource(Source):
     every_s: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
 
 
+@with_keys(RADAR.file_keys())
 class RadarEntry(TrackingSource):
     """A tracking radar and its site (WGS-84)."""
 
@@ -365,21 +577,6 @@ class RadarEntry(TrackingSource):
     longitude_deg: Annotated[float, Field(ge=-360.0, le=360.0)]
     height_m: Annotated[float, Field(ge=-1e3, le=1e5)]
     tracks: Literal["cg", "datum"] = "cg"
-    range_sd_m: Sd = 5.0
-    angle_sd_deg: Sd = 0.0086
-    azimuth_sd_deg: Sd | None = None
-    elevation_sd_deg: Sd | None = None
-    range_bias_sd_m: SdOrNone = 3.0
-    angle_bias_sd_deg: SdOrNone = 0.003
-    time_bias_sd_s: SdOrNone = 0.001
-    mislevel_sd_deg: SdOrNone = 0.0
-    droop_sd_deg: SdOrNone = 0.0
-    skew_sd_deg: SdOrNone = 0.0
-    nonorthogonality_sd_deg: SdOrNone = 0.0
-    wander_sd_deg: SdOrNone = 0.0
-    wander_time_constant_s: Duration = 20.0
-    refraction_sd: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
-    range_scale_sd: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
 
 
 class Heights(TrackingSource):
@@ -407,17 +604,11 @@ class Heights(TrackingSource):
         return self.geoid_undulation_m or 0.0
 
 
+@with_keys(GNSS.file_keys())
 class GnssEntry(Heights):
     """A satellite navigation receiver: its table, antenna, errors, and which fixes are good enough."""
 
     antenna_from_datum_body_m: tuple[Place, Place, Place] = (0.0, 0.0, 0.0)
-    horizontal_sd_m: Sd = 5.0
-    vertical_sd_m: Sd = 10.0
-    speed_sd_mps: Sd = 0.5
-    vertical_speed_sd_mps: Sd = 1.0
-    wander_sd_m: SdOrNone = 3.0
-    wander_time_constant_s: Duration = 100.0
-    time_bias_sd_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.5
     velocity: bool = True
     min_satellites: Annotated[int, Field(ge=1, le=64)] | None = None
     satellites_column: str = "nsat"
@@ -430,15 +621,9 @@ class GnssEntry(Heights):
         return Declared(counts[short], "1") if short in counts else super().declared(short)
 
 
+@with_keys(BAROMETER.file_keys())
 class BarometerEntry(Heights):
     """A static pressure sensor: its table of heights or pressures, and its errors."""
-
-    sd_m: Sd = 3.0
-    bias_sd_m: SdOrNone = 60.0
-    scale_sd: Fraction = 0.03
-    wander_sd_m: SdOrNone = 5.0
-    wander_time_constant_s: Duration = 30.0
-    time_bias_sd_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.2
 
 
 class AtmosphereEntry(Source):

@@ -1,13 +1,12 @@
-"""Tables of what tells where the vehicle is: radars, satellite navigation receivers, barometers.
+"""How does each instrument's table become a checked record in SI?
 
-Tables of what flew on board: triads with their mounting, Sun heads, video frames.
+One reader an instrument (`read_radar`, `read_gnss`, `read_barometer`, `read_triad`, `read_sun`, `read_frames`,
+`read_sounding`): columns through the gate, what flight.toml states of errors through the instrument's table of rows
+(`flightmodel.instruments`), faults and findings into the gate. A reader returns None where anything was refused.
 
-Triads sampled far faster than a vehicle moves: means of blocks of samples in their place.
-
-A block's mean keeps the integral that mechanisation forms from its samples, and the density of their noise; what is
-lost is motion within a block. Memory and time of everything after the reading go with the number of samples.
-
-The day's sounding through the gate: rows in order, winds turned to where the air goes, what is missing said.
+Triads sampled far faster than a vehicle moves are replaced by means of blocks of about 1 ms. A block's mean keeps the
+integral that the strapdown equations form from its samples, and the density of their noise; what is lost is motion
+within a block. Winds that are given by where they come from become the velocity of the air mass (north, east).
 """
 
 from __future__ import annotations
@@ -22,10 +21,17 @@ from numpy.typing import NDArray
 from flightmodel import earth, tables
 from flightmodel.atmosphere import R_AIR_JPKGK, default_sounding_sd, height_from_pressure, profile_from_sounding
 from flightmodel.checks import BoolArray, FloatArray, nearest_name
-from flightmodel.film import Frames, doubt_of_film, fault_of_film, fault_of_image
+from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault
 from flightmodel.flightfile import FlightFile
 from flightmodel.gate import Gate, Table, find_faults, oversampled, rows_to_use
 from flightmodel.instruments import (
+    ACCELEROMETER,
+    BAROMETER,
+    GNSS,
+    MAGNETOMETER,
+    RADAR,
+    RATES,
+    SUN,
     AtmosphereEntry,
     BarometerEntry,
     BarometerSpec,
@@ -65,32 +71,15 @@ def read_radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
     azimuth = np.mod(table.columns["az"], 2.0 * np.pi)
     values = np.column_stack([table.columns["range"], azimuth, table.columns["el"]])
     if not np.isfinite(values).all(axis=1).any():
-        gate.faults.append(f"{label}: {table.path}: no track point with range, azimuth and elevation; remove the radar")
+        gate.refuse(
+            f"{label}: {table.path}: no track point with range, azimuth and elevation; remove the radar", "no-samples"
+        )
         return None
     gate.findings.extend(find_faults(name, table.time_s, ("range", "az", "el"), values))
     gate.findings.extend(oversampled(name, table.time_s, source.every_s))
-    return RadarRecord(_site(name, source), table.time_s, values, source.tracks, source.every_s)
-
-
-def _site(name: str, source: RadarEntry) -> RadarSite:
-    lat, lon, angle_sd, angle_bias_sd = np.deg2rad(
-        [source.latitude_deg, source.longitude_deg, source.angle_sd_deg, source.angle_bias_sd_deg]
-    )
-    mislevel, droop, skew, square, wander = np.deg2rad(
-        [
-            source.mislevel_sd_deg,
-            source.droop_sd_deg,
-            source.skew_sd_deg,
-            source.nonorthogonality_sd_deg,
-            source.wander_sd_deg,
-        ]
-    )
-    own = [None if sd is None else float(np.deg2rad(sd)) for sd in (source.azimuth_sd_deg, source.elevation_sd_deg)]
-    return RadarSite(
-        name, lat, lon, source.height_m, source.range_sd_m, angle_sd, source.range_bias_sd_m, angle_bias_sd,
-        source.time_bias_sd_s, mislevel, droop, skew, square, wander, source.wander_time_constant_s,
-        source.refraction_sd, source.range_scale_sd, *own,
-    )  # fmt: skip
+    place = np.deg2rad([source.latitude_deg, source.longitude_deg])
+    site = RadarSite(name, float(place[0]), float(place[1]), source.height_m, **RADAR.from_file(source))
+    return RadarRecord(site, table.time_s, values, source.tracks, source.every_s)
 
 
 def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:
@@ -110,14 +99,15 @@ def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:
     if position is None or len(gate.faults) + len(gate.config) > before:
         return None
     if not np.isfinite(position).all(axis=1).any():
-        gate.faults.append(f"{label}: {table.path}: no fix with a whole position; remove the receiver")
+        gate.refuse(f"{label}: {table.path}: no fix with a whole position; remove the receiver", "no-samples")
         return None
     velocity = _velocities(gate, table, source, position)
     if velocity is None:
         return None
     gate.findings.extend(find_faults(name, time_s, ("x", "y", "z"), position))
     gate.findings.extend(oversampled(name, time_s, source.every_s))
-    return GnssRecord(_gnss_spec(name, source), time_s, position, velocity, source.every_s)
+    spec = GnssSpec(name, np.array(source.antenna_from_datum_body_m), **GNSS.from_file(source))
+    return GnssRecord(spec, time_s, position, velocity, source.every_s)
 
 
 def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> BoolArray:
@@ -129,11 +119,12 @@ def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> B
         if not enough.all():
             what = "satellites" if short == "nsat" else "mode"
             words = f"{int((~enough).sum())} of {len(enough)} fixes have {what} below {count} and are left out"
-            gate.findings.append(Finding(name, words, np.nan, np.nan))
+            gate.findings.append(Finding(name, words, np.nan, np.nan, code="fixes-poor"))
         good &= enough
     if good.sum() < 2:
-        gate.faults.append(
-            f"{table.label}: {table.path}: {good.sum()} fixes are good enough by flight.toml; lower what it asks"
+        gate.refuse(
+            f"{table.label}: {table.path}: {good.sum()} fixes are good enough by flight.toml; lower what it asks",
+            "fixes-poor",
         )
     return good
 
@@ -144,16 +135,18 @@ def _positions(gate: Gate, table: Table, source: GnssEntry) -> FloatArray | None
     stated = [form for form in (ECEF, GEODETIC) if set(form) & set(source.columns)]
     if len(stated) == 2:
         gate.refuse_config(
-            f"{table.label}.columns declares {' '.join(ECEF)} and {' '.join(GEODETIC)}; keep one of the two"
+            f"{table.label}.columns declares {' '.join(ECEF)} and {' '.join(GEODETIC)}; keep one of the two",
+            "columns-ambiguous",
         )
         return None
     form = stated[0] if stated else ECEF if whole[ECEF] else GEODETIC
     if not whole[form]:
         canonical = {q.short: q.canonical for q in tables.GNSS}
         absent = ", ".join(canonical[short] for short in form if short not in table.columns)
-        gate.faults.append(
+        gate.refuse(
             f"{table.label}: {table.path}: line 1: no column {absent}; a position is lat_deg, lon_deg, alt_m, or "
-            f"x_ecef_m, y_ecef_m, z_ecef_m; other columns are declared in {table.label}.columns"
+            f"x_ecef_m, y_ecef_m, z_ecef_m; other columns are declared in {table.label}.columns",
+            "table-column-missing",
         )
         return None
     if form == ECEF:
@@ -163,7 +156,7 @@ def _positions(gate: Gate, table: Table, source: GnssEntry) -> FloatArray | None
         return np.where(np.isfinite(radius)[:, None], position, np.nan)
     if source.height_is is None:
         words = 'alt is above what? write height_is = "ellipsoid", or height_is = "msl" with geoid_undulation_m'
-        gate.refuse_config(f"{table.label}: {words}; the two differ by up to 107 m")
+        gate.refuse_config(f"{table.label}: {words}; the two differ by up to 107 m", "height-datum")
         return None
     gate.refuse_rows(table, "lat", -0.5 * np.pi, 0.5 * np.pi, "no latitude")
     gate.refuse_rows(table, "alt", LEAST_HEIGHT_M, np.inf, "below any ground")
@@ -178,7 +171,7 @@ def _refuse_fixes(gate: Gate, table: Table, bad: BoolArray, words: str) -> None:
     if bad.any():
         k, count = int(np.argmax(bad)), int(bad.sum())
         hint = "as receivers write that have none: leave the cells empty, or ask for min_satellites or min_fix_mode"
-        gate.faults.append(f"{table.at(k)}: the fix {words} ({count} in all), {hint}")
+        gate.refuse(f"{table.at(k)}: the fix {words} ({count} in all), {hint}", "fix-impossible")
 
 
 def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: FloatArray) -> FloatArray | None:
@@ -191,7 +184,7 @@ def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: Fl
         if found and found != set(form):
             absent = ", ".join(sorted(set(form) - found))
             words = f"a velocity lacks {absent}; declare it in {table.label}.columns, or write velocity = false"
-            gate.faults.append(f"{table.label}: {table.path}: line 1: {words}")
+            gate.refuse(f"{table.label}: {table.path}: line 1: {words}", "table-column-missing")
             return None
     stated = [form for form in there if set(form) & set(source.columns)]
     form = stated[0] if len(stated) == 1 else ECEF_SPEEDS if there[ECEF_SPEEDS] else NED_SPEEDS
@@ -205,7 +198,7 @@ def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: Fl
     velocity = np.column_stack([table.columns[short] for short in form])
     whole = np.isfinite(velocity).all(axis=1)
     if form == NED_SPEEDS:
-        # a velocity without a position cannot be turned
+        # a velocity without a position has no local axes
         whole &= np.isfinite(position_ecef_m).all(axis=1)
         nothing[whole] = earth.ecef_from_ned(velocity[whole], position_ecef_m[whole])
     else:
@@ -213,26 +206,12 @@ def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: Fl
     return nothing
 
 
-def _gnss_spec(name: str, source: GnssEntry) -> GnssSpec:
-    return GnssSpec(
-        name,
-        np.array(source.antenna_from_datum_body_m),
-        source.horizontal_sd_m,
-        source.vertical_sd_m,
-        source.speed_sd_mps,
-        source.vertical_speed_sd_mps,
-        source.wander_sd_m,
-        source.wander_time_constant_s,
-        source.time_bias_sd_s,
-    )
-
-
 def read_barometer(
     gate: Gate, name: str, source: BarometerEntry, sounding: Sounding | None, measured_air: bool
 ) -> BarometerRecord | None:
     """Read one barometer as heights above the ellipsoid; None, with the faults kept, where it is refused.
 
-    Pressures become heights by the flight's air; ``measured_air`` says whether that is a sounding or the standard's.
+    Pressures become heights by the flight's air; ``measured_air``: whether that is a sounding, not the standard's.
     """
     label = f"barometers.{name}"
     table = gate.table(label, source, tables.BAROMETER)
@@ -248,7 +227,7 @@ def read_barometer(
         low, high = float(limits[0]), float(limits[1])
         gate.refuse_rows(table, "pressure", low, high, "no static pressure between -2 and 80 km")
     else:
-        gate.refuse_rows(table, "height", LEAST_HEIGHT_M, HIGHEST_BAROMETER_M, "no height that a barometer tells")
+        gate.refuse_rows(table, "height", LEAST_HEIGHT_M, HIGHEST_BAROMETER_M, "no height that a barometer can measure")
     if len(gate.faults) > before:
         return None
     if form == "pressure":
@@ -257,27 +236,18 @@ def read_barometer(
         words = f"pressures became heights by {air}"
         if source.use_s is None:
             words += (
-                "; near and above the speed of sound a port does not tell static pressure: use_s can leave that out"
+                "; near and above the speed of sound a port does not measure static pressure: use_s can leave that out"
             )
-        gate.findings.append(Finding(name, words, np.nan, np.nan))
+        gate.findings.append(Finding(name, words, np.nan, np.nan, code="heights-from-pressure"))
     else:
         height = table.columns["height"]
     height = height + source.to_ellipsoid_m
     if not np.isfinite(height).any():
-        gate.faults.append(f"{label}: {table.path}: every reading is missing; remove the barometer")
+        gate.refuse(f"{label}: {table.path}: every reading is missing; remove the barometer", "no-samples")
         return None
     gate.findings.extend(find_faults(name, table.time_s, (form,), height[:, None]))
-    spec = BarometerSpec(
-        name,
-        source.sd_m,
-        source.bias_sd_m,
-        source.scale_sd,
-        source.wander_sd_m,
-        source.wander_time_constant_s,
-        source.time_bias_sd_s,
-    )
     gate.findings.extend(oversampled(name, table.time_s, source.every_s))
-    return BarometerRecord(spec, table.time_s, height, source.every_s)
+    return BarometerRecord(BarometerSpec(name, **BAROMETER.from_file(source)), table.time_s, height, source.every_s)
 
 
 def _barometer_form(gate: Gate, table: Table, source: BarometerEntry) -> str | None:
@@ -288,13 +258,15 @@ def _barometer_form(gate: Gate, table: Table, source: BarometerEntry) -> str | N
     form = clear[0] if clear else None
     if not there:
         words = "no column height_m and none pressure_pa; declare one of the two"
-        gate.faults.append(f"{table.label}: {table.path}: line 1: {words} in {table.label}.columns")
+        gate.refuse(f"{table.label}: {table.path}: line 1: {words} in {table.label}.columns", "table-column-missing")
     elif form is None:
         words = "heights and pressures are both there; declare the one to read"
-        gate.refuse_config(f"{table.label}: {words} in {table.label}.columns, as height or as pressure")
+        gate.refuse_config(
+            f"{table.label}: {words} in {table.label}.columns, as height or as pressure", "columns-ambiguous"
+        )
     if form is not None and source.height_is is None:
         words = 'say height_is = "ellipsoid", or height_is = "msl" with geoid_undulation_m (pressures too)'
-        gate.refuse_config(f"{table.label}: heights above what? {words}")
+        gate.refuse_config(f"{table.label}: heights above what? {words}", "height-datum")
         return None
     return form
 
@@ -305,6 +277,7 @@ TRIAD_COLUMNS = {
     RatesEntry: tables.RATES,
     MagnetometerEntry: tables.MAGNETOMETER,
 }
+TRIADS = {TriadEntry: ACCELEROMETER, RatesEntry: RATES, MagnetometerEntry: MAGNETOMETER}
 BODY = "body"  # the mount of a triad along body axes
 # package of the vehicle file where flight.toml names none
 DEFAULT_PACKAGE = {TriadEntry: "suba", RatesEntry: BODY, MagnetometerEntry: "magnetometer"}
@@ -322,15 +295,18 @@ def read_triad(gate: Gate, name: str, spec: FlightFile, vehicle: Vehicle | None)
         return None
     values = np.column_stack([table.columns[q.short] for q in quantities])
     if not np.isfinite(values).all(axis=1).any():
-        gate.faults.append(f"sensors.{name}: {table.path}: every sample is missing")
+        gate.refuse(f"sensors.{name}: {table.path}: every sample is missing", "no-samples")
         return None
     gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in quantities), values))
     if mounting is None:
         return None
     if isinstance(source, MagnetometerEntry) and source.reversed:
         values = -values
-    record, told = averaged(TriadRecord(_triad_spec(name, source, *mounting), table.time_s, values))
-    gate.findings.extend(told)
+    stated = TRIADS[type(source)].from_file(source)
+    if stated["bias_wander_sd"] == 0.0:
+        stated["bias_time_constant_s"] = np.inf
+    record, findings = averaged(TriadRecord(TriadSpec(name, *mounting, **stated), table.time_s, values))
+    gate.findings.extend(findings)
     return record
 
 
@@ -342,49 +318,23 @@ def _mounting(
     if source.axes is not None or package == BODY:
         return source.place_m, source.dcm_body_sensor
     if spec.vehicle is None:
-        said = "nothing is said of its mount" if source.mount is None else f"mount = '{package}' is a vehicle's package"
+        why = "it states no mount" if source.mount is None else f"mount = '{package}' is a vehicle's package"
         words = (
             'write mount = "body" (along body axes) or axes = ["+x", "+y", "+z"] with the body axis of each of its axes'
         )
-        gate.refuse_config(f"sensors.{name}: {said}, and flight.toml names no vehicle; {words}")
+        gate.refuse_config(f"sensors.{name}: {why}, and flight.toml names no vehicle; {words}", "mount-missing")
         return None
     if vehicle is None:  # refused already
         return None
     if package not in vehicle.sensors:
         known = [*vehicle.sensors, BODY]
         hint = nearest_name(package, known)
-        gate.refuse_config(f"sensors.{name}.mount = '{package}'{hint}: not on vehicle '{vehicle.name}'")
+        gate.refuse_config(
+            f"sensors.{name}.mount = '{package}'{hint}: not on vehicle '{vehicle.name}'", "mount-unknown"
+        )
         return None
     mount = vehicle.sensors[package]
     return np.array(mount.position_from_datum_body_m), mount.dcm_body_sensor
-
-
-def _triad_spec(name: str, source: Triad, place_m: FloatArray, dcm: FloatArray) -> TriadSpec:
-    soft_iron = 0.0
-    if isinstance(source, RatesEntry):
-        in_files = [source.noise_sd_degps, source.bias_sd_degps, source.resolution_degps, source.bias_wander_sd_degps]
-        noise, bias, step, wander = np.deg2rad(in_files)
-    elif isinstance(source, MagnetometerEntry):
-        in_files = [source.noise_sd_ut, source.bias_sd_ut, source.resolution_ut, source.bias_wander_sd_ut]
-        noise, bias, step, wander = 1e-6 * np.array(in_files)
-        soft_iron = source.soft_iron_sd
-    else:
-        noise, bias, step = source.noise_sd_mps2, source.bias_sd_mps2, source.resolution_mps2
-        wander = source.bias_wander_sd_mps2
-    return TriadSpec(
-        name,
-        place_m,
-        dcm,
-        float(noise),
-        float(bias),
-        source.scale_sd,
-        float(np.deg2rad(source.mount_sd_deg)),
-        float(step),
-        soft_iron,
-        float(wander),
-        source.bias_time_constant_s if wander > 0.0 else np.inf,
-        0.0 if isinstance(source, MagnetometerEntry) else source.time_bias_sd_s,
-    )
 
 
 def read_sun(gate: Gate, source: SunEntry) -> SunRecord | None:
@@ -405,13 +355,11 @@ def read_sun(gate: Gate, source: SunEntry) -> SunRecord | None:
     seen = np.isfinite(values.reshape(-1, heads, 2)).all(axis=2)
     dark = np.asarray(seen.sum(axis=1) == 0)
     if dark.all():
-        gate.faults.append(f"sensors.sun: {table.path}: no head ever sees the Sun; remove [sensors.sun]")
+        gate.refuse(f"sensors.sun: {table.path}: no head ever sees the Sun; remove [sensors.sun]", "no-samples")
         return None
     gate.findings.extend(find_faults("sun", table.time_s, tuple(q.short for q in quantities), values, dark))
-    noise, bias, mount, field = np.deg2rad(
-        [source.noise_sd_deg, source.bias_sd_deg, source.mount_sd_deg, source.field_deg]
-    )
-    spec = SunHeads("sun", np.deg2rad(source.heads_lv_deg), field, noise, bias, mount)
+    clock, field = np.deg2rad(source.heads_lv_deg), float(np.deg2rad(source.field_deg))
+    spec = SunHeads("sun", clock, field, **SUN.from_file(source))
     return SunRecord(spec, table.time_s, values.reshape(-1, heads, 2))
 
 
@@ -419,14 +367,18 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
     """Read the list of frames and check every picture; None, with the faults kept, where anything is refused."""
     label = "frames"
     if source.columns:
-        gate.refuse_config("frames.columns: the frame list has only t_s and frame")
+        gate.refuse_config("frames.columns: the frame list has only t_s and frame", "quantity-unknown")
     if (source.folder is None) == (source.film is None):
-        gate.refuse_config("frames: one of folder (of images) and film (a .webm, .mp4 or .avi file) is wanted")
+        gate.refuse_config(
+            "frames: one of folder (of images) and film (a .webm, .mp4 or .avi file) is wanted", "frames-source"
+        )
         return None
     path, images = gate.path(source.file), gate.path(source.film or source.folder or "")
     if vehicle is not None and source.camera not in vehicle.cameras:
         hint = nearest_name(source.camera, list(vehicle.cameras))
-        gate.refuse_config(f"frames.camera = '{source.camera}'{hint}: not on vehicle '{vehicle.name}'")
+        gate.refuse_config(
+            f"frames.camera = '{source.camera}'{hint}: not on vehicle '{vehicle.name}'", "camera-unknown"
+        )
         return None
     if path is None or images is None or vehicle is None:
         return None
@@ -435,7 +387,9 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
         return None
     time_s = tables.times_s(table, source.time_column, gate.t0, path, label, gate.faults)
     if "frame" not in table.columns:
-        gate.faults.append(f"{label}: {path}: line 1: no column 'frame'{nearest_name('frame', table.columns)}")
+        gate.refuse(
+            f"{label}: {path}: line 1: no column 'frame'{nearest_name('frame', table.columns)}", "table-column-missing"
+        )
         return None
     camera = vehicle.cameras[source.camera]
     used = np.ones(len(table), dtype=bool)
@@ -451,11 +405,11 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
     if time_s is None:
         return None
     if not len(time_s):
-        gate.faults.append(f"{label}: {path}: use_s leaves no frame")
+        gate.refuse(f"{label}: {path}: use_s leaves no frame", "use-span-empty")
         return None
     if not time_s[0] - 2.0 <= source.benchmark_s <= time_s[-1] + 2.0:
         span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
-        gate.refuse_config(f"frames.benchmark_s = {source.benchmark_s}: frames span {span}")
+        gate.refuse_config(f"frames.benchmark_s = {source.benchmark_s}: frames span {span}", "benchmark-outside-film")
         return None
     return Frames(camera, source.camera, time_s, paths, source.benchmark_s, numbers, source.time_bias_sd_s)
 
@@ -467,10 +421,12 @@ def _image_paths(
     names, paths = table["frame"].astype(str).str.strip(), []
     for row in np.flatnonzero(used).tolist():
         image = images / names.iloc[row]
-        wrong = gate.wrong_place(image, names.iloc[row]) or fault_of_image(image, camera)
+        wrong = gate.wrong_place(image, names.iloc[row]) or image_fault(image, camera)
         if wrong:
             where = f"frames: {path}: line {tables.line_of(table, row)}: {image}"
-            gate.faults.append(f"{where}: {wrong}; replace the file or remove the line")
+            gate.refuse(
+                f"{where}: {wrong}; replace the file or remove the line", getattr(wrong, "code", "image-unreadable")
+            )
         paths.append(image)
     return tuple(paths)
 
@@ -483,23 +439,25 @@ def _film_numbers(
     whole = text.str.fullmatch(r"\d{1,9}").to_numpy(dtype=bool)
     for row in np.flatnonzero(used & ~whole)[:5].tolist():
         where = f"frames: {path}: line {tables.line_of(table, row)}: frame '{text.iloc[row]}'"
-        gate.faults.append(f'{where}: with film = "{film.name}" a frame\'s number is wanted, the first being 0')
+        gate.refuse(
+            f'{where}: with film = "{film.name}" a frame\'s number is wanted, the first being 0', "frame-number"
+        )
     numbers = np.array([int(t) for t in text.to_numpy()[used & whole]], dtype=np.int64)
     if len(numbers) and (np.diff(numbers) < 0).any():
         row = int(np.flatnonzero(used & whole)[int(np.argmax(np.diff(numbers) < 0)) + 1])
         where = f"frames: {path}: line {tables.line_of(table, row)}"
-        gate.faults.append(f"{where}: frame numbers fall where times rise; sort the list by time")
-    wrong = fault_of_film(film, camera, int(numbers.max(initial=0)))
+        gate.refuse(f"{where}: frame numbers fall where times rise; sort the list by time", "frame-number")
+    wrong = film_fault(film, camera, int(numbers.max(initial=0)))
     if wrong:
-        gate.faults.append(f"frames: {film}: {wrong}")
+        gate.refuse(f"frames: {film}: {wrong}", getattr(wrong, "code", "film-unreadable"))
         return numbers
     again = int((np.diff(numbers) == 0).sum())
     if again:
         words = f"{path.name}: {again} of {len(numbers)} lines name the same frame as the line before; check the list"
-        gate.findings.append(Finding("frames", words, np.nan, np.nan))
-    doubt = doubt_of_film(film)
-    if doubt:
-        gate.findings.append(Finding("frames", f"{film.name}: {doubt}", np.nan, np.nan))
+        gate.findings.append(Finding("frames", words, np.nan, np.nan, code="frame-repeated"))
+    timing = film_timing_fault(film)
+    if timing:
+        gate.findings.append(Finding("frames", f"{film.name}: {timing}", np.nan, np.nan, timing.code))
     return numbers
 
 
@@ -530,7 +488,7 @@ def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
         record.spec, noise_sd=record.spec.noise_sd / np.sqrt(count), resolution=record.spec.resolution / np.sqrt(count)
     )
     words = f"{len(block)} samples at {1.0 / usual:.0f} Hz, of which means of {count} are used"
-    return TriadRecord(spec, time_s, means), [Finding(spec.name, words, np.nan, np.nan)]
+    return TriadRecord(spec, time_s, means), [Finding(spec.name, words, np.nan, np.nan, code="samples-averaged")]
 
 
 def _means(column: FloatArray, first: NDArray[np.int64], least: float) -> FloatArray:
@@ -574,11 +532,11 @@ def _winds(gate: Gate, table: Table) -> tuple[FloatArray, FloatArray] | None:
     if {"wind_north", "wind_east"} <= set(c):
         return c["wind_north"], c["wind_east"]
     if {"wind_speed", "wind_from"} <= set(c):
-        words = "wind is given by where it comes from: turned to where the air goes"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan))
+        words = "wind is given by where it comes from: converted to the velocity of the air mass"
+        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="wind-direction-converted"))
         return -c["wind_speed"] * np.cos(c["wind_from"]), -c["wind_speed"] * np.sin(c["wind_from"])
     needs = "wind_n_mps and wind_e_mps, or wind speed and direction from"
-    gate.faults.append(f"{SOURCE}: {table.path}: line 1: needs {needs}")
+    gate.refuse(f"{SOURCE}: {table.path}: line 1: needs {needs}", "table-column-missing")
     return None
 
 
@@ -588,26 +546,28 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> 
     if not whole.all():
         k, count = int(np.argmin(whole)), int((~whole).sum())
         words = f"{count} rows with a missing value left out, the first at line {int(table.lines[k])}"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan))
+        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="rows-incomplete"))
     rows = np.flatnonzero(whole)[np.argsort(c["alt"][whole], kind="stable")]
     alt, rho, temperature = c["alt"][rows], c["rho"][rows], c["temperature"][rows]
     if len(rows) < 2:
-        gate.faults.append(f"{SOURCE}: {table.path}: fewer than two complete rows")
+        gate.refuse(f"{SOURCE}: {table.path}: fewer than two complete rows", "too-few-rows")
         return None
     if (np.diff(alt) <= 0).any():
         k = int(rows[int(np.argmax(np.diff(alt) <= 0)) + 1])
-        gate.faults.append(f"{table.at(k)}: altitude {c['alt'][k]:.1f} m stands twice; keep one row")
+        gate.refuse(f"{table.at(k)}: altitude {c['alt'][k]:.1f} m stands twice; keep one row", "altitude-twice")
         return None
     if alt[-1] < LOWEST_TOP_M:
-        words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, no wind is known"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan))
+        words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, winds fade to zero"
+        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="sounding-short"))
     pressure = rho * R_AIR_JPKGK * temperature
     if "pressure" in c:
         off = np.abs(c["pressure"][rows] / pressure - 1.0)
         if np.nanmax(off, initial=0.0) > GAS_LAW_TOLERANCE:
             k = int(rows[int(np.nanargmax(off))])
             words = f"pressure departs from density and temperature by {100 * np.nanmax(off):.0f} % at line "
-            gate.findings.append(Finding(SOURCE, f"{words}{int(table.lines[k])}; density is used", np.nan, np.nan))
+            gate.findings.append(
+                Finding(SOURCE, f"{words}{int(table.lines[k])}; density is used", np.nan, np.nan, code="gas-law")
+            )
     density_sd, wind_sd = default_sounding_sd(alt)
     for key, default in (("rho_sd", density_sd), ("wind_sd", wind_sd)):
         if key in c:

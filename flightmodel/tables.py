@@ -1,15 +1,12 @@
-"""How ``flight.toml`` names a table: its file, its time column, columns of other names, and which rows are used.
+"""How do columns and times of a CSV become SI arrays and seconds after t0?
 
-How columns of a table become SI arrays: canonical names with unit suffixes, declared names and units, time formats.
+A canonical column has its unit in its name (``range_m``, ``az_deg``). Anything else is accepted only where flight.toml
+declares column and unit (`Source`); nothing is guessed. This is the only place where degrees, g, yards and the like
+become SI and radians.
 
-A canonical column says its unit in its name (``range_m``, ``az_deg``). Anything else is accepted only where the
-flight file declares column and unit; nothing is guessed. This is the only place where degrees, g, yards and the
-like turn into SI and radians.
-
-What second of the flight does a clock's text mean? ISO 8601 in UTC, or IRIG day of year, to seconds after t0.
-
-Day-of-year times ``DDD:HH:MM:SS.fff`` lie in t0's year, or in the next one where that is nearer (a flight across New
-Year). Cells of the usual width are read many at a time; others, one by one, to the same number.
+Times are numbers in a unit, ISO 8601 in UTC, or IRIG day of year ``DDD:HH:MM:SS.fff``; the latter lie in t0's year, or
+in the next one where that is nearer (a flight across New Year). Cells of the usual width are read many at a time;
+others, one by one, to the same number.
 """
 
 from __future__ import annotations
@@ -27,8 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from flightmodel.checks import FloatArray, GateError, nearest_name
+from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
 from flightmodel.config import Section, Time
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,7 +60,7 @@ class ColumnEntry(Section):
 class TimeEntry(Section):
     """The time column of a table, or three columns with hour, minute and second of the day (UTC).
 
-    ``offset_s`` is added to every time. ``repeats`` says what becomes of rows that repeat the time of the row before.
+    ``offset_s`` is added to every time. ``repeats`` decides on rows that repeat the time of the row before.
     """
 
     column: str = "t_s"
@@ -121,8 +119,8 @@ UNITS: dict[str, tuple[str, float, float]] = {
     "mil": ("angle", 2.0 * np.pi / 6400.0, 0.0),
     "deg1e7": ("angle", 1e-7 * np.pi / 180.0, 0.0),  # whole numbers, as many receivers write a latitude
     "mps2": ("acceleration", 1.0, 0.0),
-    "g": ("acceleration", 9.80665, 0.0),
-    "mg": ("acceleration", 9.80665e-3, 0.0),
+    "g": ("acceleration", STANDARD_GRAVITY_MPS2, 0.0),
+    "mg": ("acceleration", 1e-3 * STANDARD_GRAVITY_MPS2, 0.0),
     "ftps2": ("acceleration", 0.3048, 0.0),
     "radps": ("rate", 1.0, 0.0),
     "degps": ("rate", np.pi / 180.0, 0.0),
@@ -238,27 +236,33 @@ def read_table(path: Path, label: str) -> pd.DataFrame:
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
-        raise GateError(f"{label}: {path}: no such file") from None
+        raise GateError(f"{label}: {path}: no such file", code="file-missing") from None
     except (UnicodeDecodeError, OSError) as fault:
-        raise GateError(f"{label}: {path}: not a readable CSV table: {fault}") from None
+        raise GateError(f"{label}: {path}: not a readable CSV table: {fault}", code="table-unreadable") from None
     if "\0" in text:
-        raise GateError(f"{label}: {path}: not a readable CSV table: it holds binary data")
+        raise GateError(f"{label}: {path}: not a readable CSV table: it holds binary data", code="table-unreadable")
     numbered = [(k, line) for k, line in enumerate(text.splitlines(), start=1) if line.strip()]
     if len(numbered) < 3:
         rows = max(0, len(numbered) - 1)
-        raise GateError(f"{label}: {path}: {rows} data rows; at least two are needed")
+        raise GateError(f"{label}: {path}: {rows} data rows; at least two are needed", code="too-few-rows")
     lines = np.array([k for k, _ in numbered[1:]])
     opened = _open_quote(numbered)
     if opened:
-        raise GateError(f"{label}: {path}: line {opened}: a quote opens and is not closed on the line; mend it")
+        raise GateError(
+            f"{label}: {path}: line {opened}: a quote opens and is not closed on the line; mend it", code="table-quote"
+        )
     names, counts = _cells(numbered)
-    faults = [f"{label}: {path}: line {numbered[0][0]}: column '{n}' stands twice" for n in _twice(names)]
+    head = f"{label}: {path}: line {numbered[0][0]}"
+    faults = [Fault(f"{head}: column '{n}' stands twice", "column-twice") for n in _twice(names)]
     ragged = np.flatnonzero(counts != len(names))
     if len(ragged):
         k = int(ragged[0])
         faults.append(
-            f"{label}: {path}: line {lines[k]}: {counts[k]} cells where the header has {len(names)} "
-            f"({len(ragged)} in all); mend or remove them"
+            Fault(
+                f"{label}: {path}: line {lines[k]}: {counts[k]} cells where the header has {len(names)} "
+                f"({len(ragged)} in all); mend or remove them",
+                "row-ragged",
+            )
         )
     if faults:
         raise GateError(faults)
@@ -314,7 +318,12 @@ def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: li
         first = int(np.argmax(bad))
         where = f"{label}: {path}: line {line_of(frame, first)}, column '{column}'"
         count = f"({int(bad.sum())} in all)"
-        faults.append(f"{where}: '{text.iloc[first]}' is no finite number {count}; leave a missing value empty")
+        faults.append(
+            Fault(
+                f"{where}: '{text.iloc[first]}' is no finite number {count}; leave a missing value empty",
+                "not-a-number",
+            )
+        )
     return values + 0.0  # no negative zero: whole-number columns know none
 
 
@@ -357,7 +366,12 @@ def column_si(
         return None
     if not fits(quantity, unit):
         fitting = ", ".join(u for u, (kind, _, _) in UNITS.items() if kind == quantity.kind)
-        faults.append(f"{label}: {path}: column '{column}': unit '{unit}' is not one of {quantity.kind}: {fitting}")
+        faults.append(
+            Fault(
+                f"{label}: {path}: column '{column}': unit '{unit}' is not one of {quantity.kind}: {fitting}",
+                "unit-unknown",
+            )
+        )
         return None
     return to_si(numbers(frame, column, path, label, faults), unit)
 
@@ -372,7 +386,8 @@ def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, la
         )
     else:
         hint = nearest_name(column, frame.columns)
-    return f"{label}: {path}: line 1: no column '{column}'{hint}; found {', '.join(frame.columns)}"
+    words = f"{label}: {path}: line 1: no column '{column}'{hint}; found {', '.join(frame.columns)}"
+    return Fault(words, "table-column-missing")
 
 
 def unordered_times_s(
@@ -383,7 +398,9 @@ def unordered_times_s(
     if absent:
         found = ", ".join(frame.columns)
         hint = nearest_name(absent[0], frame.columns)
-        faults.append(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}")
+        faults.append(
+            Fault(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}", "table-column-missing")
+        )
         return None
     if spec.format == "seconds":
         values = to_si(numbers(frame, spec.column, path, label, faults), spec.unit)
@@ -395,9 +412,12 @@ def unordered_times_s(
     if bad.any():
         first = int(np.argmax(bad))
         faults.append(
-            f"{label}: {path}: line {line_of(frame, first)}: time "
-            f"'{':'.join(frame[column].iloc[first] for column in spec.parts)}' is not in format "
-            f"'{spec.format}' ({int(bad.sum())} in all)"
+            Fault(
+                f"{label}: {path}: line {line_of(frame, first)}: time "
+                f"'{':'.join(frame[column].iloc[first] for column in spec.parts)}' is not in format "
+                f"'{spec.format}' ({int(bad.sum())} in all)",
+                "time-format",
+            )
         )
         return None
     return values
@@ -415,8 +435,11 @@ def times_s(
     if back.any():
         k = int(np.argmax(back))
         faults.append(
-            f"{label}: {path}: line {line_of(frame, k + 1)}: time runs backwards or repeats: {values[k]:.6f} s then "
-            f"{values[k + 1]:.6f} s ({int(back.sum())} in all); sort the rows or remove the duplicates"
+            Fault(
+                f"{label}: {path}: line {line_of(frame, k + 1)}: time runs backwards or repeats: {values[k]:.6f} s "
+                f"then {values[k + 1]:.6f} s ({int(back.sum())} in all); sort the rows or remove the duplicates",
+                "time-backwards",
+            )
         )
         return None
     return values

@@ -175,8 +175,8 @@ class AttitudePrior:
 
 
 @dataclass(frozen=True)
-class Disturbed:
-    """Span in which more acts, or is shaken out of the sensors, than is modelled or than their noise tells.
+class UnmodelledSpan:
+    """Span with acceleration or rotation that neither the model nor the sensors' stated noise covers.
 
     Parameters
     ----------
@@ -205,14 +205,14 @@ class Motion:
     drag_sd, drag_time_constant_s : float
         Standard deviation of its natural logarithm, and how long it stays what it is (Gauss-Markov).
     side_sd : float
-        Of forces across the flow, as a fraction of the drag; they change as the drag does.
+        Of forces normal to the flow, as a fraction of the drag; they change as the drag does.
     acceleration_density : float
         Root power spectral density, (m/s^2)/sqrt(Hz) per axis, of what ballistic flight leaves out everywhere.
     powered_s : tuple of (float, float)
         Spans in which thrust or an opening parachute acts.
     powered_sd_mps2 : float
         Acceleration that may act there, of each axis.
-    disturbed : tuple of Disturbed
+    disturbed : tuple of UnmodelledSpan
         Spans with a size of their own, with or without inertial sensors.
     """
 
@@ -224,7 +224,7 @@ class Motion:
     acceleration_density: float = 0.002
     powered_s: tuple[tuple[float, float], ...] = ()
     powered_sd_mps2: float = 50.0
-    disturbed: tuple[Disturbed, ...] = ()
+    disturbed: tuple[UnmodelledSpan, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -276,6 +276,7 @@ class Telemetry:
     gnss: dict[str, GnssRecord] = field(default_factory=dict)
     barometers: dict[str, BarometerRecord] = field(default_factory=dict)
     motion: Motion = Motion()
+    reconstruction: dict[str, object] = field(default_factory=dict)  # settings of [reconstruction]
 
     def span_s(self) -> tuple[float, float]:
         """First and last time that all triads and at least one radar or receiver cover together."""
@@ -289,7 +290,8 @@ class Telemetry:
         if self.vehicle is None:
             raise GateError(
                 f"flight '{self.name}' names no vehicle, whose mass properties and coefficients are needed here; add "
-                'vehicle = "..." to flight.toml (a vehicle that ships with the toolkit, or the path of a vehicle file)'
+                'vehicle = "..." to flight.toml (a vehicle that ships with the toolkit, or the path of a vehicle file)',
+                code="vehicle-missing",
             )
         return self.vehicle
 
@@ -304,6 +306,7 @@ class Telemetry:
         if self.accelerometer is None or self.rates is None:
             raise GateError(
                 f"flight '{self.name}' has no inertial sensors, which are needed here; add [sensors.accelerometer] and "
-                "[sensors.rates] to flight.toml"
+                "[sensors.rates] to flight.toml",
+                code="inertial-missing",
             )
         return self.accelerometer, self.rates

@@ -1,4 +1,4 @@
-"""Where a vehicle was and how it was turned: one type for truth and estimate, so that they can be subtracted.
+"""Where was a vehicle and how was it oriented? One type for truth and estimate, so that they can be subtracted.
 
 The followed point is the structural datum (the nose), fixed hardware: the c.g. is one of the things estimated.
 *Body* is the centerbody, where the sensors are.
@@ -123,7 +123,9 @@ def resample(trajectory: Trajectory, time_s: FloatArray) -> Trajectory:
     t = trajectory.time_s
     at = np.asarray(time_s, dtype=float)
     if at.min() < t[0] - 1e-9 or at.max() > t[-1] + 1e-9:
-        raise GateError(f"resample: {at.min():.3f} to {at.max():.3f} s lies outside {t[0]:.3f} to {t[-1]:.3f} s")
+        raise GateError(
+            f"resample: {at.min():.3f} to {at.max():.3f} s lies outside {t[0]:.3f} to {t[-1]:.3f} s", code="time-range"
+        )
     at = np.clip(at, t[0], t[-1])
     from scipy.interpolate import CubicHermiteSpline  # half a second to import
 
@@ -168,7 +170,10 @@ def move_point(trajectory: Trajectory, to: str, to_from_point_body_m: FloatArray
 def difference(estimate: Trajectory, truth: Trajectory) -> FloatArray:
     """Error ``(n, 9)``, estimate minus truth, in the covariance's coordinates; times and points must be equal."""
     if estimate.point != truth.point or not np.allclose(estimate.time_s, truth.time_s, atol=1e-9, rtol=0.0):
-        raise GateError("difference: the trajectories follow different points or times; resample or move one first")
+        raise GateError(
+            "difference: the trajectories follow different points or times; resample or move one first",
+            code="trajectories-differ",
+        )
     return np.hstack(
         [
             estimate.position_ecef_m - truth.position_ecef_m,

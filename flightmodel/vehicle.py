@@ -293,13 +293,13 @@ class Vehicle:
 def vehicle_path(name: str, beside: Path | None = None) -> Path:
     """Find a vehicle file: a path (relative to ``beside``), or the name of a vehicle that ships with the toolkit."""
     if "\0" in name:
-        raise ConfigError(f"vehicle {name!r}: a path holds no NUL character")
+        raise ConfigError(f"vehicle {name!r}: a path holds no NUL character", code="path-nul")
     if name.endswith(".toml"):
         return (beside or Path()) / name
     shipped = [p.stem for p in (DATA / "vehicles").glob("*.toml")]
     if name not in shipped:
         hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
-        raise ConfigError(f"no vehicle '{name}'{hint}")
+        raise ConfigError(f"no vehicle '{name}'{hint}", code="vehicle-unknown")
     return DATA / "vehicles" / f"{name}.toml"
 
 

@@ -14,10 +14,10 @@ import pandas as pd
 from scipy.stats import chi2
 
 from flightmodel import earth, rotations
+from flightmodel.airdata import euler_321
 from flightmodel.checks import GateError
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import interpolate_rows, resample
-from postflight.kinematics import euler_321
 from recon.consistency import ConsistencyCheck
 from recon.reconstruct import TrajectorySolution
 from recon.vector_attitude import (

@@ -227,11 +227,11 @@ def simulate(arguments: tuple[str, ...], seed: int, force: bool) -> None:
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--rate", type=FiniteRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
+@click.option("--rate", type=FiniteRange(1.0, 200.0), help="Output rate, Hz; default: flight.toml's, or 20.")
 @click.option("--sensitivity", is_flag=True, help="Also rerun without each source, wind, and with other air and mass.")
 @what_ifs
 def reconstruct(
-    folder: Path, rate: float, sensitivity: bool, settings: tuple[str, ...], without: tuple[str, ...]
+    folder: Path, rate: float | None, sensitivity: bool, settings: tuple[str, ...], without: tuple[str, ...]
 ) -> None:
     """Reconstruct the best-estimated trajectory of the flight in FOLDER."""
     from postflight import commands
@@ -279,9 +279,9 @@ def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> 
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--rate", type=FiniteRange(1.0, 200.0), default=20.0, show_default=True, help="Output rate, Hz.")
+@click.option("--rate", type=FiniteRange(1.0, 200.0), help="Output rate, Hz; default: flight.toml's, or 20.")
 @what_ifs
-def run(folder: Path, rate: float, settings: tuple[str, ...], without: tuple[str, ...]) -> None:
+def run(folder: Path, rate: float | None, settings: tuple[str, ...], without: tuple[str, ...]) -> None:
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
     from postflight import commands
     from postflight.deflections import METHODS

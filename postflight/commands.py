@@ -156,11 +156,11 @@ def run_flight(
         if flight.changes:
             settings["changes"] = list(flight.changes)
         with run_folder.RunFolder(folder, flight.telemetry, settings) as out:
-            run_folder.write_reconstruction(out, bet)
+            event_rows = run_folder.write_reconstruction(out, bet)
             run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 out.write_csv("camera_sensitivity.csv", camera_sensitivity(flight, answers.histories["camera"]))
-            out.write_json("summary.json", run_folder.summary(bet, answers))
+            out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
             bounds = run_figures.draw_run(bet, answers, out.path / "figures", step(0.7 * share, share))
             if bounds is not None:
                 out.write_csv("rigid_bounds.csv", bounds.table())

@@ -23,7 +23,6 @@ from recon.settings import Settings
 
 PULSE_RATE_HZ = 50.0
 COEFFICIENT = {"c_a": 0, "c_n": 1, "c_m": 2}  # column of the coefficient table
-DEFAULT_SETTINGS = Settings(pulse_rate_hz=PULSE_RATE_HZ)
 SETTINGS = {f.name for f in fields(Settings)}
 
 
@@ -36,7 +35,7 @@ class Flight(Tabular):
     telemetry : Telemetry
         Everything measured, and what flight.toml states of vehicle, start and motion.
     settings : Settings
-        Of the reconstruction.
+        Of the reconstruction; those of ``[reconstruction]`` in flight.toml where not given.
     camera_plane_lv_rad : float or None
         Clocking angle of the plane in which the camera's deflection is assumed to lie; None where it is estimated.
     folder : Path or None
@@ -46,10 +45,16 @@ class Flight(Tabular):
     """
 
     telemetry: Telemetry
-    settings: Settings = DEFAULT_SETTINGS
+    settings: Settings = None  # type: ignore[assignment]
     camera_plane_lv_rad: float | None = None
     folder: Path | None = None
     changes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Take the settings that the flight's file states where none are given."""
+        if self.settings is None:
+            stated = {"pulse_rate_hz": PULSE_RATE_HZ, **self.telemetry.reconstruction}
+            object.__setattr__(self, "settings", Settings.from_mapping(stated))
 
     @property
     def name(self) -> str:
@@ -150,7 +155,9 @@ def read_flight(folder: str | Path, progress: Progress | None = None, needs_path
     report: Callable[[float], None] | None = None
     if progress is not None:
         report = lambda fraction: progress(fraction, "reading telemetry")  # noqa: E731
-    return Flight(read_telemetry(Path(folder), report, needs_path), folder=Path(folder))
+    telemetry = read_telemetry(Path(folder), report, needs_path)
+    settings = Settings.from_mapping({"pulse_rate_hz": PULSE_RATE_HZ, **telemetry.reconstruction})
+    return Flight(telemetry, settings, folder=Path(folder))
 
 
 def calm(sounding: Sounding) -> Sounding:

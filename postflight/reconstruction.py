@@ -1,4 +1,10 @@
-"""From a flight to its best-estimated trajectory, the air along it, and the checks of both."""
+"""Where was the vehicle, in which air, and how well is it known? A flight's best-estimated trajectory and its table.
+
+``bet.csv`` has every column an analyst asks for, each with its standard deviation. What a flight cannot have
+(attitude in ballistic flight, sensors in a telemetry gap, force coefficients where the dynamic pressure is too low)
+is an empty cell. A coefficient is ``C = m a / (q S)``, and its standard deviation carries those of the specific
+force, of dynamic pressure and of the mass. Columns, units and frames: docs/bet-product.md.
+"""
 
 from __future__ import annotations
 
@@ -8,23 +14,69 @@ import numpy as np
 import pandas as pd
 
 from estimators.loads import FlightLoads
-from flightmodel import airdata
-from flightmodel.airdata import AirData, peak_pressure
+from flightmodel import airdata, earth, rotations
+from flightmodel.airdata import AirData, derived_with_sd, is_angle
 from flightmodel.atmosphere import BOTTOM_M, TOP_M, profile_from_sounding
-from flightmodel.checks import DivergenceError, GateError, Progress
-from flightmodel.earth import geodetic_from_ecef
+from flightmodel.checks import DivergenceError, FloatArray, GateError, Progress
+from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
 from postflight.attitude import AttitudeCheck, check_attitude
 from postflight.flight import Flight
 from postflight.loads import loads_from_solution
-from recon.atmosphere import ReconstructedAir, as_flown_atmosphere
+from recon.atmosphere import (
+    LEAST_AXIAL_MPS2,
+    ReconstructedAir,
+    as_flown_atmosphere,
+    cg_accelerations,
+    windows_are_whole,
+)
 from recon.consistency import ConsistencyCheck
-from recon.fault_isolation import suspects
+from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
 from recon.settings import Settings
+
+Columns = dict[str, FloatArray]
+# quantity of `airdata.derived`, its column, and the column of its sd
+_DERIVED = {
+    "latitude": ("lat_deg", "lat_sd_deg"),
+    "longitude": ("lon_deg", "lon_sd_deg"),
+    "altitude": ("alt_m", "alt_sd_m"),
+    "speed_inertial": ("speed_inertial_mps", "speed_inertial_sd_mps"),
+    "path_inertial": ("flight_path_inertial_deg", "flight_path_inertial_sd_deg"),
+    "heading_inertial": ("heading_inertial_deg", "heading_inertial_sd_deg"),
+    "speed_ground": ("speed_ground_mps", "speed_ground_sd_mps"),
+    "path_ground": ("flight_path_deg", "flight_path_sd_deg"),
+    "heading_ground": ("heading_deg", "heading_sd_deg"),
+    "speed_wind": ("airspeed_mps", "airspeed_sd_mps"),
+    "path_wind": ("flight_path_wind_deg", "flight_path_wind_sd_deg"),
+    "heading_wind": ("heading_wind_deg", "heading_wind_sd_deg"),
+    "roll": ("roll_ned_deg", "roll_ned_sd_deg"),
+    "pitch": ("pitch_ned_deg", "pitch_ned_sd_deg"),
+    "yaw": ("yaw_ned_deg", "yaw_ned_sd_deg"),
+    "mach": ("mach", "mach_sd"),
+    "dynamic_pressure": ("dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
+    "density": ("rho_kgpm3", "rho_sd_kgpm3"),
+    "pressure": ("p_pa", "p_sd_pa"),
+    "temperature": ("t_k", "t_sd_k"),
+    "alpha": ("alpha_deg", "alpha_sd_deg"),
+    "beta": ("beta_deg", "beta_sd_deg"),
+    "alpha_total_wind": ("alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
+    "alpha_total_ground": ("alpha_total_ground_deg", "alpha_total_ground_sd_deg"),
+    "alpha_total_inertial": ("alpha_total_inertial_deg", "alpha_total_inertial_sd_deg"),
+    "clock_wind": ("clock_lv_deg", "clock_lv_sd_deg"),
+    "clock_inertial": ("clock_inertial_lv_deg", "clock_inertial_lv_sd_deg"),
+}
+_NEED_ATTITUDE = ("roll", "pitch", "yaw", "alpha", "beta", "clock", "alpha_total")
+_FORCE_NAMES = (
+    *(f"a{a}_imu_mps2" for a in "xyz"),
+    *(f"a{a}_imu_sd_mps2" for a in "xyz"),
+    *(f"a{a}_cg_mps2" for a in "xyz"),
+    *(f"a{a}_cg_sd_mps2" for a in "xyz"),
+    "c_a", "c_a_sd", "c_n", "c_n_sd", "cn_over_ca", "cn_over_ca_sd",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, repr=False)
@@ -82,7 +134,7 @@ class Reconstruction(Tabular):
     @property
     def suspects(self) -> tuple[str, ...]:
         """Fault hypotheses, the most likely first; none where every consistency check passes."""
-        return suspects(self.consistency_checks, self.solution.left_out)
+        return isolate_faults(self.consistency_checks, self.solution.left_out)
 
     @property
     def has_attitude(self) -> bool:
@@ -98,7 +150,7 @@ class Reconstruction(Tabular):
     @property
     def peak_s(self) -> float:
         """Time of peak dynamic pressure by the BET and the sounding's density, s."""
-        return peak_pressure(self.air.time_s, self.air.dynamic_pressure_pa)[0]
+        return find_peak(self.air.time_s, self.air.dynamic_pressure_pa)[0]
 
     @property
     def peak_is_inside(self) -> bool:
@@ -106,9 +158,7 @@ class Reconstruction(Tabular):
         return self.air.time_s[0] + 1.0 < self.peak_s < self.air.time_s[-1] - 1.0
 
     def to_frame(self) -> pd.DataFrame:
-        """The trajectory with air data and standard deviations: the columns of ``bet.csv`` (docs/bet-product.md)."""
-        from postflight.product import bet_table
-
+        """Trajectory and air data with their standard deviations: the columns of ``bet.csv`` (docs/bet-product.md)."""
         return bet_table(self)
 
     def _about(self) -> str:
@@ -188,7 +238,7 @@ def air_data(trajectory: Trajectory, flight: Flight) -> AirData:
 
 def _check_inside_tables(trajectory: Trajectory) -> None:
     """Raise `DivergenceError` where the reconstruction left the ground or the atmosphere's tables."""
-    _, _, altitude_m = geodetic_from_ecef(trajectory.position_ecef_m)
+    _, _, altitude_m = earth.geodetic_from_ecef(trajectory.position_ecef_m)
     wrong = (altitude_m < BOTTOM_M) | (altitude_m > TOP_M)
     if wrong.any():
         k = int(np.argmax(wrong))
@@ -197,3 +247,133 @@ def _check_inside_tables(trajectory: Trajectory) -> None:
             "Check the accelerometer's and gyros' units, signs and mounting, and the attitude prior",
             "trajectory-diverged",
         )
+
+
+def _vector(pattern: str, letters: str, values: FloatArray) -> Columns:
+    """Columns of a vector."""
+    return {pattern.format(a): c for a, c in zip(letters, values.T, strict=True)}
+
+
+def bet_table(flight: Reconstruction) -> pd.DataFrame:
+    """Best estimated trajectory, one row an output time."""
+    bet = flight.solution.smoothed
+    sd = bet.sd()
+    columns: Columns = {"t_s": bet.time_s}
+    columns |= _vector("r{}_ecef_m", "xyz", bet.position_ecef_m)
+    columns |= _vector("v{}_ecef_mps", "xyz", bet.velocity_ecef_mps)
+    columns |= _vector("q{}_ecef_body", "wxyz", bet.q_ecef_body)
+    columns |= _vector("{}_body_degps", "pqr", np.rad2deg(bet.omega_body_eci_body_radps))
+    columns |= _vector("r{}_ecef_sd_m", "xyz", sd[:, 0:3])
+    columns |= _vector("v{}_ecef_sd_mps", "xyz", sd[:, 3:6])
+    columns |= _vector("rotation_{}_body_sd_deg", "xyz", np.rad2deg(sd[:, 6:9]))
+    columns |= _vector("{}_body_sd_degps", "pqr", np.rad2deg(_rate_sd(flight)))
+    columns |= _inertial(flight)
+    columns |= _derived(flight)
+    columns |= _force(flight)
+    columns |= _density_ratio(flight)
+    if not flight.has_attitude:  # the trajectory's own attitude is a placeholder there
+        blank = np.full(len(bet.time_s), np.nan)
+        columns |= {name: blank for name in columns if "_body" in name}
+    return pd.DataFrame(columns)
+
+
+def _rate_sd(flight: Reconstruction) -> FloatArray:
+    """Standard deviations (n, 3) of the rates: estimated errors and a sample's white noise."""
+    bet, rates = flight.solution, flight.telemetry.rates
+    if not len(bet.rate_cov) or rates is None:
+        return np.full((len(bet.smoothed.time_s), 3), np.nan)
+    return np.asarray(np.sqrt(np.diagonal(bet.rate_cov, axis1=1, axis2=2) + rates.spec.noise_sd**2))
+
+
+def _inertial(flight: Reconstruction) -> Columns:
+    """Position and velocity in ECI with standard deviations."""
+    bet = flight.solution.smoothed
+    assert bet.covariance is not None
+    turn = rotations.conjugate(earth.q_ecef_eci(bet.time_s))
+    dcm = rotations.dcm_from_q(turn)
+    r = rotations.rotate(turn, bet.position_ecef_m)
+    v = rotations.rotate(turn, bet.velocity_ecef_mps) + np.cross(earth.OMEGA_ECEF_RADPS, r)
+    move = np.zeros((len(r), 6, 6))
+    move[:, 0:3, 0:3] = move[:, 3:6, 3:6] = dcm
+    move[:, 3:6, 0:3] = rotations.skew(earth.OMEGA_ECEF_RADPS) @ dcm
+    moved = move @ bet.covariance[:, :6, :6] @ move.transpose(0, 2, 1)
+    sd = np.sqrt(np.diagonal(moved, axis1=1, axis2=2))
+    out = _vector("r{}_eci_m", "xyz", r) | _vector("v{}_eci_mps", "xyz", v)
+    return out | _vector("r{}_eci_sd_m", "xyz", sd[:, 0:3]) | _vector("v{}_eci_sd_mps", "xyz", sd[:, 3:6])
+
+
+def _derived(flight: Reconstruction) -> Columns:
+    """Air data, flow angles and attitude angles; winds."""
+    vehicle, profile = flight.telemetry.vehicle, profile_from_sounding(flight.telemetry.sounding)
+    arm = np.zeros(3) if vehicle is None else vehicle.cg_m
+    value, sd = derived_with_sd(flight.solution.smoothed, profile, arm)
+    out: Columns = {}
+    for name, (column, sd_column) in _DERIVED.items():
+        unknown = not flight.has_attitude and name.startswith(_NEED_ATTITUDE)
+        for key, numbers in ((column, value[name]), (sd_column, sd[name])):
+            out[key] = np.full(len(numbers), np.nan) if unknown else np.rad2deg(numbers) if is_angle(name) else numbers
+    air = flight.air
+    for kind in ("wind", "ground", "inertial"):  # to first order, as the estimators have them
+        if flight.has_attitude:
+            out[f"alpha_total_{kind}_sd_deg"] = np.rad2deg(getattr(air, f"alpha_total_{kind}_sd_rad"))
+    out |= {"wind_n_mps": air.air.wind_ned_mps[:, 0], "wind_e_mps": air.air.wind_ned_mps[:, 1]}
+    return out | {"wind_sd_mps": air.air.wind_sd_mps}
+
+
+def _force(flight: Reconstruction) -> Columns:
+    """Specific force at the sensor and at the c.g., and the force coefficients that follow with the sounding's air."""
+    bet, telemetry = flight.solution, flight.telemetry
+    t = bet.smoothed.time_s
+    out = {name: np.full(len(t), np.nan) for name in _FORCE_NAMES}
+    rows = windows_are_whole(bet, t)
+    if telemetry.accelerometer is None or not rows.any():
+        return out
+    spec, vehicle = telemetry.accelerometer.spec, telemetry.vehicle
+    arm = np.zeros(3) if vehicle is None else vehicle.cg_m - spec.position_from_datum_body_m
+    at = cg_accelerations(bet, t[rows], arm)
+    cov = bet.specific_force_cov[rows] + spec.noise_sd**2 / at.samples * np.eye(3)
+    sd = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    found = _vector("a{}_imu_mps2", "xyz", at.specific_force_sensor_mps2) | _vector("a{}_imu_sd_mps2", "xyz", sd)
+    if vehicle is not None:
+        force = at.specific_force_cg_mps2
+        found |= _vector("a{}_cg_mps2", "xyz", force) | _vector("a{}_cg_sd_mps2", "xyz", sd)
+        q, q_sd = (getattr(flight.air, f"dynamic_pressure{end}_pa")[rows] for end in ("", "_sd"))
+        mass_per_area = vehicle.mass_kg / vehicle.reference.area_m2
+        found |= _coefficients(force, cov, q / mass_per_area, np.hypot(q_sd / q, vehicle.uncertainty.mass))
+    for name, numbers in found.items():
+        out[name][rows] = numbers
+    return out
+
+
+def _coefficients(force: FloatArray, cov: FloatArray, scale_mps2: FloatArray, scale_sd: FloatArray) -> Columns:
+    """C_A, C_N and their ratio with sds; ``scale_mps2`` (n,) is q S / m, ``scale_sd`` its sd as a fraction."""
+    axial, normal = -force[:, 0], np.hypot(force[:, 1], force[:, 2])
+    way = force[:, 1:] / np.maximum(normal, 1e-12)[:, None]
+    axial_part = np.sqrt(cov[:, 0, 0]) / np.abs(axial)
+    normal_sd = np.sqrt(np.einsum("ni,nij,nj->n", way, cov[:, 1:, 1:], way))
+    ca, cn, ratio = axial / scale_mps2, normal / scale_mps2, normal / axial
+    out = {
+        "c_a": ca,
+        "c_a_sd": np.abs(ca) * np.hypot(axial_part, scale_sd),
+        "c_n": cn,
+        "c_n_sd": np.hypot(normal_sd / scale_mps2, cn * scale_sd),
+        "cn_over_ca": ratio,
+        "cn_over_ca_sd": np.hypot(normal_sd / axial, ratio * axial_part),
+    }
+    weak = axial < LEAST_AXIAL_MPS2
+    return {name: np.where(weak, np.nan, numbers) for name, numbers in out.items()}
+
+
+def _density_ratio(flight: Reconstruction) -> Columns:
+    """As-flown density, from the deceleration, over the sounding's, on the descent."""
+    n = len(flight.air.time_s)
+    out = {"density_ratio": np.full(n, np.nan), "density_ratio_sd": np.full(n, np.nan)}
+    if flight.as_flown is None:
+        return out
+    p, span = flight.as_flown.profile, flight.as_flown.drag["time_s"]
+    h = flight.air.altitude_m
+    rows = (flight.air.time_s >= span.min()) & (flight.air.time_s <= span.max())
+    rows &= (h >= p["altitude_m"].min()) & (h <= p["altitude_m"].max())
+    for name in out:
+        out[name][rows] = np.interp(h[rows], p["altitude_m"], p[name])
+    return out

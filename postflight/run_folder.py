@@ -24,8 +24,8 @@ from flightmodel.checks import GateError, writing
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import NO_VIDEO, Deflections
-from postflight.product import bet_table, event_table, header, peak_table, residual_statistics, slow_covariance
-from postflight.reconstruction import Reconstruction
+from postflight.product import event_table, header, peak_table, residual_statistics, slow_covariance
+from postflight.reconstruction import Reconstruction, bet_table
 
 DIGITS = "%.10g"
 _COPY = "copy the flight folder to where you may write"
@@ -159,8 +159,8 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
     return out
 
 
-def write_reconstruction(run: RunFolder, flight: Reconstruction) -> None:
-    """Write trajectory, header, covariance, residuals, checks, sensor errors, events, air, attitude check, findings."""
+def write_reconstruction(run: RunFolder, flight: Reconstruction) -> pd.DataFrame:
+    """Write trajectory, covariance, residuals, checks, sensor errors, events, air, findings; return the events."""
     bet = flight.solution
     table = bet_table(flight)
     run.write_csv("bet.csv", table)
@@ -170,14 +170,18 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction) -> None:
     run.write_csv("peaks.csv", peak_table(flight, table))
     run.write_csv("residual_statistics.csv", residual_statistics(flight))
     run.write_csv("residuals.csv", bet.residuals)
-    if len(bet.withheld):
-        run.write_csv("withheld.csv", bet.withheld)
+    if len(bet.held_out):
+        run.write_csv("withheld.csv", bet.held_out)
     checks = pd.DataFrame([vars(v) for v in flight.consistency_checks])
     run.write_csv("consistency_checks.csv", checks)
     # the table's name and columns of version 0.1, for scripts that read it; to go with version 0.3
-    run.write_csv("verdicts.csv", checks.drop(columns="code").rename(columns={"remark": "words"}))
+    run.write_csv(
+        "verdicts.csv",
+        checks.drop(columns=["code", "source", "component", "symptom"]).rename(columns={"remark": "words"}),
+    )
     run.write_csv("sensor_errors.csv", bet.sensor_errors)
-    run.write_csv("events.csv", event_table(flight, table))
+    event_rows = event_table(flight, table)
+    run.write_csv("events.csv", event_rows)
     if flight.as_flown is not None:
         run.write_csv("air_profile.csv", flight.as_flown.profile)
         run.write_csv("drag_ratio.csv", flight.as_flown.drag)
@@ -186,6 +190,7 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction) -> None:
         run.write_csv("attitude_check.csv", attitude_table(flight.attitude, bet))
     findings = [vars(f) for f in (*flight.findings, *without_attitude(flight))]
     run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s", "code"]))
+    return event_rows
 
 
 def without_attitude(flight: Reconstruction) -> tuple[Finding, ...]:
@@ -224,19 +229,19 @@ def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
     }
 
 
-def summary(flight: Reconstruction, answers: Deflections) -> dict[str, Any]:
-    """Return the main results of a run, for ``summary.json``."""
-    air, peak = flight.air, flight.peak_s
-    k = int(np.searchsorted(air.time_s, peak).clip(0, len(air.time_s) - 1))
+def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFrame) -> dict[str, Any]:
+    """Return the results of a run in short, for ``summary.json``; ``event_rows`` is its `event_table`."""
+    at_peak = event_rows.iloc[int((event_rows["t_s"] - flight.peak_s).abs().argmin())]
+    alpha = [float(at_peak["alpha_total_wind_deg"]), float(at_peak["alpha_total_wind_3sd_deg"]) / 3.0]
     checks = flight.consistency_checks
     return {
         "flight": flight.telemetry.name,
         "synthetic": flight.telemetry.synthetic,
-        "peak_dynamic_pressure_pa": float(air.dynamic_pressure_pa[k]),
-        "peak_dynamic_pressure_s": float(peak),
-        "alpha_total_wind_deg": float(np.rad2deg(air.alpha_total_wind_rad[k])) if flight.has_attitude else None,
-        "alpha_total_wind_sd_deg": float(np.rad2deg(air.alpha_total_wind_sd_rad[k])) if flight.has_attitude else None,
-        "methods": method_summary(answers, peak),
+        "peak_dynamic_pressure_pa": float(at_peak["dynamic_pressure_pa"]),
+        "peak_dynamic_pressure_s": float(flight.peak_s),
+        "alpha_total_wind_deg": alpha[0] if flight.has_attitude else None,
+        "alpha_total_wind_sd_deg": alpha[1] if flight.has_attitude else None,
+        "methods": method_summary(answers, flight.peak_s),
         "agreement": None if answers.fused is None else answers.fused.agreement.remark,
         "film_clock": None if answers.fused is None else answers.fused.time_bias_summary(),
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),

@@ -15,9 +15,10 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import rotations
-from flightmodel.airdata import peak_pressure, pressure_pulse
+from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, difference, resample
 from postflight.run_folder import newest_run
@@ -78,7 +79,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     run = run or newest_run(flight_folder)
     truth = _read(truth_folder / "truth.csv", (*_STATE_COLUMNS, "dynamic_pressure_pa", "alpha_body_deg"))
     deflection = _read(truth_folder / "deflection.csv", ("t_s", "theta_deg"))
-    peak_s, _ = peak_pressure(truth["t_s"].to_numpy(), truth["dynamic_pressure_pa"].to_numpy())
+    peak_s, _ = find_peak(truth["t_s"].to_numpy(), truth["dynamic_pressure_pa"].to_numpy())
     true_deg = float(np.interp(peak_s, deflection["t_s"], deflection["theta_deg"]))
     refused = json.loads((run / "summary.json").read_text())["methods"]
     methods: dict[str, dict[str, Any]] = {}

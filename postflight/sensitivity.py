@@ -1,13 +1,13 @@
-"""How much hangs on each source and on each assumption? The flight again without it, and what moved by how much.
+"""How much does the result depend on each source and on each assumption? Reruns without it, and the changes.
 
-Each tracker is left out in turn, attitude sensors that were not used are used (or left out), the attitude's start is
-taken from them, winds are switched off, the sounding's density and the mass are moved by what they may err. Next to
-the reported standard deviation stands what the change itself should be: where a rerun knows less than the base and the
+Each tracker is left out in turn, attitude sensors that were not used are used (or left out), the initial attitude is
+taken from them, winds are set to zero, the sounding's density and the mass are changed by their uncertainty. Beside the
+reported standard deviation stands the expected one of the change: where a rerun has a subset of the base's data and the
 rest is the same, the difference of two optimal estimates has covariance ``P_without - P_with`` (Hausman). A change of
-three of these, not of three reported standard deviations, says that a source contradicts the others.
+three of these, not of three reported standard deviations, means that a source contradicts the others.
 
-With inertial sensors the air and the mass take no part in the trajectory: only what is derived from it is made anew.
-In ballistic flight they do, and the filter runs again.
+With inertial sensors the trajectory does not depend on atmosphere and mass: only derived quantities are computed anew.
+In ballistic flight it does, and the filter runs again.
 
 References
 ----------
@@ -25,17 +25,16 @@ from flightmodel import earth
 from flightmodel.airdata import air_data, pressure_pulse
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray, GateError, Progress
-from flightmodel.telemetry import Sounding, Telemetry
+from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, interpolate_rows, resample
-from postflight.flight import Flight
-from postflight.product import bet_table
-from postflight.reconstruction import Reconstruction, reconstruction_from
+from postflight.flight import Flight, calm, with_density, with_mass
+from postflight.reconstruction import Reconstruction, bet_table, reconstruction_from
 from recon.reconstruct import reconstruct_once, trackers
 from recon.settings import Settings
 
 MASS_PART = 0.01
 PULSE_STEP_S = 0.1
-LEAST_LOST = 0.02  # part of a variance that leaving out must cost; a smaller one is no measure of a change
+LEAST_GAIN = 0.02  # least relative change of a variance by which a change can be judged
 COLUMNS = (
     "rerun", "quantity", "unit", "t_s", "base", "base_sd", "change", "change_over_sd", "expected_sd",
     "change_over_expected_sd", "largest_change", "largest_at_s", "reason",
@@ -52,7 +51,7 @@ DERIVED = {
     "C_N": ("1", "c_n", "c_n_sd"),
     "C_N/C_A": ("1", "cn_over_ca", "cn_over_ca_sd"),
 }
-# quantity: its unit, its place in the trajectory's errors turned to NED and body axes, and its scale
+# quantity: its unit, its index in the trajectory's errors in NED and body axes, and its scale
 DIRECT = {
     "position north": ("m", 0, 1.0),
     "position east": ("m", 1, 1.0),
@@ -64,7 +63,7 @@ DIRECT = {
     "rotation about body z": ("deg", 8, 180.0 / np.pi),
 }
 UNITS = {name: about[0] for name, about in {**DIRECT, **DERIVED}.items()}
-# what is shown: the first of a group's quantities, or of a vector's parts the one that moved most
+# groups of the printed table and the figure, by the quantity that changed most
 GROUPS = {
     "position": ("position north", "position east", "altitude"),
     "velocity": ("velocity north", "velocity east", "velocity down"),
@@ -86,9 +85,9 @@ class Rerun:
     telemetry : Telemetry
     settings : Settings
     filtered : bool
-        Whether the trajectory itself hangs on what was changed.
+        Whether the trajectory itself depends on the change.
     data : int
-        -1 where data were left out, 1 where some were added, 0 where it is something else.
+        -1 where data were left out, 1 where some were added, 0 otherwise.
     """
 
     name: str
@@ -99,7 +98,7 @@ class Rerun:
 
 
 def reruns(telemetry: Telemetry, settings: Settings) -> tuple[Rerun, ...]:
-    """Return what can be left out or changed in a flight."""
+    """Return the reruns that a flight allows."""
     ballistic = telemetry.accelerometer is None or telemetry.motion.model == "ballistic"
     leave: dict[str, tuple[str, ...]] = {f"without {name}": (name,) for name in trackers(telemetry, settings)}
     heads = () if telemetry.sun is None else tuple(f"sun{k + 1}" for k in range(len(telemetry.sun.spec.clock_lv_rad)))
@@ -115,38 +114,14 @@ def reruns(telemetry: Telemetry, settings: Settings) -> tuple[Rerun, ...]:
         out.append(Rerun("with attitude sensors", telemetry, replace(settings, attitude_sensors=True), data=1))
     if not ballistic and directions and telemetry.attitude_prior is not None:
         out.append(Rerun("without attitude prior", replace(telemetry, attitude_prior=None), settings))
-    air = {"winds off": _calm(telemetry.sounding)}
-    air |= {f"density {sign:+d} sd": _denser(telemetry.sounding, sign) for sign in (1, -1)}
+    sounding = telemetry.sounding
+    air = {"winds off": calm(sounding)}
+    air |= {f"density {sign:+d} sd": with_density(sounding, np.exp(sign * sounding.density_sd)) for sign in (1, -1)}
     out += [Rerun(name, replace(telemetry, sounding=s), settings, ballistic) for name, s in air.items()]
     if telemetry.vehicle is not None or ballistic:
         for part in (MASS_PART, -MASS_PART):
-            out.append(Rerun(f"mass {100 * part:+.0f} %", _heavier(telemetry, 1.0 + part), settings, ballistic))
+            out.append(Rerun(f"mass {100 * part:+.0f} %", with_mass(telemetry, 1.0 + part), settings, ballistic))
     return tuple(out)
-
-
-def _calm(sounding: Sounding) -> Sounding:
-    still = np.zeros_like(sounding.wind_north_mps)
-    return replace(sounding, wind_north_mps=still, wind_east_mps=still)
-
-
-def _denser(sounding: Sounding, sign: int) -> Sounding:
-    """Sounding with density moved by its own sd, temperature kept."""
-    factor = np.exp(sign * sounding.density_sd)
-    density, pressure = factor * sounding.density_kgpm3, factor * sounding.pressure_pa
-    return replace(sounding, density_kgpm3=density, pressure_pa=pressure)
-
-
-def _heavier(telemetry: Telemetry, factor: float) -> Telemetry:
-    """Telemetry of a vehicle whose parts are all heavier, and which drag slows less."""
-    motion = replace(telemetry.motion, drag_area_per_mass_m2pkg=telemetry.motion.drag_area_per_mass_m2pkg / factor)
-    vehicle = telemetry.vehicle
-    if vehicle is not None:
-        shell, body = (
-            part.model_copy(update={"mass_kg": factor * part.mass_kg})
-            for part in (vehicle.aeroshell, vehicle.centerbody)
-        )
-        vehicle = replace(vehicle, aeroshell=shell, centerbody=body)
-    return replace(telemetry, motion=motion, vehicle=vehicle)
 
 
 def sensitivity(flight: Reconstruction, progress: Progress | None = None) -> pd.DataFrame:
@@ -162,26 +137,26 @@ def sensitivity(flight: Reconstruction, progress: Progress | None = None) -> pd.
     -------
     DataFrame
         One row a rerun and quantity, at the base's largest dynamic pressure ``t_s``: base value (empty for position and
-        rotation, which are told as changes alone) and its standard deviation, the rerun's change, that over the
-        standard deviation, over ``expected_sd`` (empty where the rerun is no subset of the base's data, or loses next
-        to nothing), and the largest change over the pulse. A rerun that fails is one row with its ``reason``.
+        rotation, which are given as changes alone) and its standard deviation, the rerun's change, that over the
+        standard deviation, over ``expected_sd`` (empty where the rerun is no subset of the base's data, or hardly
+        changes the variance), and the largest change over the pulse. A rerun that fails is one row with its ``reason``.
     """
     report = progress or (lambda _fraction, _what: None)
     telemetry, settings = flight.telemetry, flight.solution.settings
     planned = reruns(telemetry, settings)
-    learnt = flight.solution.learnt  # a rerun with other priors would differ by them, too
+    adaptation = flight.solution.adaptation  # other priors would add to the change
     report(0.0, "base")
-    # where trackers contradict each other the base's covariance was enlarged, and is no optimal filter's
+    # where a tracker was left out the base's covariance was enlarged, and is not that of an optimal filter
     own = flight
     if flight.solution.left_out:
-        own = reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, settings, learnt=learnt))
+        own = reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, settings, adaptation=adaptation))
     rows: list[dict[str, object]] = []
     for k, rerun in enumerate(planned):
         report(k / len(planned), rerun.name)
         try:
             bet = flight.solution
             if rerun.filtered:
-                bet = reconstruct_once(rerun.telemetry, rerun.settings, learnt=learnt)
+                bet = reconstruct_once(rerun.telemetry, rerun.settings, adaptation=adaptation)
             rows += _rows(rerun, flight, own, reconstruction_from(Flight(rerun.telemetry), bet))
         except GateError as fault:
             rows.append({"rerun": rerun.name, "reason": str(fault)})
@@ -200,7 +175,7 @@ def _rows(rerun: Rerun, base: Reconstruction, own: Reconstruction, other: Recons
         if not np.isfinite(sd[peak]):
             continue
         gained = rerun.data * (views[1].sd[name][peak] ** 2 - views[2].sd[name][peak] ** 2)
-        sharp = gained > LEAST_LOST * views[0].sd[name][peak] ** 2
+        sharp = gained > LEAST_GAIN * views[0].sd[name][peak] ** 2
         expected = float(np.sqrt(gained)) if sharp else np.nan
         largest = int(np.nanargmax(np.abs(moved))) if np.isfinite(moved).any() else peak
         out.append(
@@ -230,7 +205,8 @@ def _times(base: Reconstruction, other: Trajectory) -> tuple[FloatArray, int]:
     if not other.time_s[0] <= peak_s <= other.time_s[-1]:
         raise GateError(
             f"reaches from {other.time_s[0]:.3f} to {other.time_s[-1]:.3f} s only; the largest dynamic pressure is at "
-            f"{peak_s:.3f} s"
+            f"{peak_s:.3f} s",
+            code="rerun-span",
         )
     pulse = t[pressure_pulse(base.air.dynamic_pressure_pa)]
     pulse = pulse[(pulse >= other.time_s[0]) & (pulse <= other.time_s[-1])]
@@ -290,7 +266,7 @@ def at_times(flight: Reconstruction, at: FloatArray) -> Reconstruction:
 
 
 def _turn(path: Trajectory) -> FloatArray:
-    """Matrices (k, 9, 9) that turn errors from ECEF to north, east, down; rotations stay about body axes."""
+    """Matrices (k, 9, 9) of errors from ECEF to north, east, down; rotations stay about body axes."""
     latitude, longitude, _ = earth.geodetic_from_ecef(path.position_ecef_m)
     out = np.tile(np.eye(9), (len(path.time_s), 1, 1))
     out[:, 0:3, 0:3] = out[:, 3:6, 3:6] = earth.dcm_ned_ecef(latitude, longitude)
@@ -298,7 +274,7 @@ def _turn(path: Trajectory) -> FloatArray:
 
 
 def largest_of_groups(table: pd.DataFrame) -> pd.DataFrame:
-    """Rows of `sensitivity` that moved most in standard deviations, one a rerun and group, in a column ``group``.
+    """Rows of `sensitivity` with the largest change in standard deviations, one a rerun and ``group``.
 
     Failed reruns have no rows.
     """

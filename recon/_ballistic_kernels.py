@@ -1,4 +1,5 @@
-"""Compiled ballistic motion: gravity, drag and side force in the day's air. Readable twin: `recon.ballistic`.
+"""Compiled ballistic motion: gravity, drag and side force in the sounding's air. Model: `recon.ballistic`.
+
 
 The state is position and velocity; the six drivers are the logarithm of the drag area, two side forces as fractions of
 the drag, and density, wind north and wind east in units of their standard deviations.
@@ -12,8 +13,8 @@ import numpy as np
 
 from flightmodel._kernels import OMEGA_WGS84, WGS84, geodetic, gravitation, inlined
 
-# a filter that gropes may ask for a drag that stops the vehicle within a step: such a step is taken in parts. What drag
-# does falls with the speed it takes, so their number grows as the logarithm of the drag
+# a filter far from its track may ask for a drag that stops the vehicle within a step: such a step is taken in parts.
+# Drag falls with the speed it takes, so their number grows as the logarithm of the drag
 MOST_CHANGE = 0.2  # of the velocity in a part: the transition's second order then errs by 1e-2 of itself
 MOST_PARTS = 64  # backwards in time drag grows without bound
 
@@ -35,9 +36,9 @@ def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     uy = vy + sin_lat * se * north - ce * east
     uz = vz - cos_lat * north
     speed = math.sqrt(ux * ux + uy * uy + uz * uz) + 1e-9
-    # a filter that gropes may ask for any drag; e^8 is a parachute on a needle
+    # a filter far from its track may ask for any drag; e^8 is a parachute on a needle
     k = 0.5 * density * air.drag_m2pkg * math.exp(min(max(e0, -8.0), 8.0)) * speed
-    # across the flow: across the path's plane, and in it
+    # normal to the flow: normal to the path's plane, and in it
     m = 1.0 / speed
     px, py, pz = air.across[0], air.across[1], air.across[2]
     along = m * m * (px * ux + py * uy + pz * uz)

@@ -1,4 +1,4 @@
-"""Compiled error-state extended Kalman filter over nodes. Readable twin: `recon.ekf`, which also states the model.
+"""Compiled error-state extended Kalman filter over nodes. Model and twin on filterpy: `recon.ekf`.
 
 The transition is dense in its nine kinematic rows alone, so a prediction costs ``9 D N`` products instead of ``2 N^3``;
 a measurement's partials are dense in nine columns and its source's own errors.
@@ -16,7 +16,7 @@ from recon._measurement_kernels import RADAR, SLOTS, SUN, node_motion, predict
 from recon._strapdown_kernels import propagate_strapdown
 
 TWO_PI = 2.0 * math.pi
-LEAST_DECAY = 1e-3  # the smoother divides by it: what is forgotten to a thousandth is forgotten
+LEAST_DECAY = 1e-3  # the smoother divides by it; an error decorrelated to a thousandth is decorrelated
 
 
 @inlined
@@ -53,7 +53,7 @@ def height(p):
 
 
 @inlined
-def forget(wander, dt, climb, decay, noise_var):
+def decay_and_noise(wander, dt, climb, decay, noise_var):
     """Decay of each error over a step and the variance that keeps it at its prior; whether any error moves at all."""
     moving = False
     for j in range(len(decay)):
@@ -298,7 +298,7 @@ def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k
     climb = abs(height_of(position) - before)
     dt = motion.time_s[node_index[k]] - motion.time_s[node_index[a]]
     decay = steps.decay[a]
-    moving = forget(wander, dt, climb, decay, steps.noise_var[a])
+    moving = decay_and_noise(wander, dt, climb, decay, steps.noise_var[a])
     if follow:
         linear_step(x, phi, decay, x_next)
         turn = np.empty(3)

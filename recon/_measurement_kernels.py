@@ -1,4 +1,4 @@
-"""Compiled measurements: what each instrument should have read, and the partials. Readable twin: `recon.measurements`.
+"""Compiled measurement predictions and their partials. Model and numpy twin: `recon.measurements`.
 
 A kind fills ``h`` (3,), ``by_state`` (3, 9) by position, velocity, rotation, and ``by_error`` (3, `SLOTS`) by the
 source's own errors in the order of `recon.measurements.SLOT_NAMES`; ``e`` (SLOTS,) holds their values, zero where off.
@@ -72,18 +72,18 @@ def corrected(measured, errors, offset, dcm_body_sensor, out):
 
 
 @inlined
-def seen_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective):
-    """Where the instrument saw its point (3,), how fast it moved (3,), and the lever (3,) of rotation, in place.
+def observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective):
+    """Observed point (3,), its velocity (3,), and the lever (3,) of rotation, in place.
 
     ``p = r + C d - tau (v + C (w x d)) + tau^2 a / 2`` with ``w`` against the Earth.
     """
-    turn, swing = np.empty(3), np.empty(3)
+    turn, lever_velocity = np.empty(3), np.empty(3)
     for i in range(3):
         turn[i] = rate[i] - OMEGA_WGS84 * c[2, i]
-    cross_into(turn, arm, swing)
+    cross_into(turn, arm, lever_velocity)
     for i in range(3):
-        effective[i] = arm[i] - tau * swing[i]
-        moving = velocity[i] + c[i, 0] * swing[0] + c[i, 1] * swing[1] + c[i, 2] * swing[2]
+        effective[i] = arm[i] - tau * lever_velocity[i]
+        moving = velocity[i] + c[i, 0] * lever_velocity[0] + c[i, 1] * lever_velocity[1] + c[i, 2] * lever_velocity[2]
         point[i] = position[i] + c[i, 0] * arm[0] + c[i, 1] * arm[1] + c[i, 2] * arm[2]
         point[i] += tau * (0.5 * tau * acceleration[i] - moving)
         speed[i] = moving - tau * acceleration[i]
@@ -91,7 +91,7 @@ def seen_point(arm, tau, position, velocity, c, rate, acceleration, point, speed
 
 @inlined
 def state_rows(m, count, tau, c, effective, speed, by_state, by_error):
-    """Partials of readings with partials ``m`` (3, 3) by the seen point: by state, and by the time tag (slot 3)."""
+    """Partials of readings with partials ``m`` (3, 3) by the observed point: by state, and by the time tag (slot 3)."""
     row, lever = np.empty(3), np.empty(3)
     for i in range(count):
         by_error[i, 3] = -(m[i, 0] * speed[0] + m[i, 1] * speed[1] + m[i, 2] * speed[2])
@@ -106,7 +106,7 @@ def state_rows(m, count, tau, c, effective, speed, by_state, by_error):
 
 @inlined
 def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
-    """Range, azimuth, elevation and partials (3, 3) by the seen point; ``known[0]`` is the refractivity at the site."""
+    """Range, azimuth, elevation and partials (3, 3) by the observed point; ``known[0]`` is the site's refractivity."""
     ned = np.empty(3)
     for i in range(3):
         ned[i] = 0.0
@@ -114,35 +114,35 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
             ned[i] += dcm_ned_ecef[i, j] * (point[j] - site[j])
     north, east, down = ned[0], ned[1], ned[2]
     level2 = north * north + east * east
-    across = math.sqrt(level2)
+    horizontal = math.sqrt(level2)
     slant2 = level2 + down * down
     slant = math.sqrt(slant2)
     p = (
         (north / slant, east / slant, down / slant),
         (-east / level2, north / level2, 0.0),
-        (down * north / (slant2 * across), down * east / (slant2 * across), -across / slant2),
+        (down * north / (slant2 * horizontal), down * east / (slant2 * horizontal), -horizontal / slant2),
     )
-    sin_az, cos_az = east / across, north / across
-    sin_el, cos_el = -down / slant, across / slant
+    sin_az, cos_az = east / horizontal, north / horizontal
+    sin_el, cos_el = -down / slant, horizontal / slant
     sec = 1.0 / max(cos_el, 1e-3)
     tan = sin_el * sec
     by_error[0, 0], by_error[1, 1], by_error[2, 2] = 1.0, 1.0, 1.0
-    # a pedestal turned by (tn, te) about north and east: RCC 753-95, to first order
+    # a pedestal tilted by (tn, te) about north and east: RCC 753-95, to first order
     by_error[1, 4], by_error[1, 5] = -cos_az * tan, -sin_az * tan
     by_error[2, 4], by_error[2, 5] = sin_az, -cos_az
     by_error[2, 6], by_error[1, 7], by_error[1, 8] = cos_el, sec, tan
     by_error[1, 9], by_error[2, 10] = sec, 1.0
-    # bending of a ray through the whole air; near the horizon it stays what it is at 2 deg
+    # refraction of a ray through the whole atmosphere; near the horizon it stays at its value at 2 deg
     by_error[2, 11] = known[0] * cos_el / max(sin_el, 0.035)
     by_error[0, 12] = slant
     # the errors themselves change with azimuth and elevation: near the horizon that of the refraction by a tenth
     by_tilt = cos_az * e[4] + sin_az * e[5]
-    bend = 1.0 / (sin_el * sin_el) if sin_el > 0.035 else sin_el / 0.035
+    cosecant_square = 1.0 / (sin_el * sin_el) if sin_el > 0.035 else sin_el / 0.035
     g = (
         (1.0 + e[12], 0.0, 0.0),
         (0.0, 1.0 - tan * (cos_az * e[5] - sin_az * e[4]),
          sec * sec * (e[8] - by_tilt) + sec * tan * (e[7] + e[9])),
-        (0.0, by_tilt, 1.0 - sin_el * e[6] - known[0] * bend * e[11]),
+        (0.0, by_tilt, 1.0 - sin_el * e[6] - known[0] * cosecant_square * e[11]),
     )  # fmt: skip
     for i in range(3):
         for j in range(3):
@@ -150,7 +150,7 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
             for k in range(3):
                 f = g[i][0] * p[0][k] + g[i][1] * p[1][k] + g[i][2] * p[2][k]
                 m[i, j] += f * dcm_ned_ecef[k, j]
-    h[0], h[1], h[2] = slant, math.atan2(east, north), math.atan2(-down, across)
+    h[0], h[1], h[2] = slant, math.atan2(east, north), math.atan2(-down, horizontal)
     for i in range(3):
         for j in range(SLOTS):
             if j != 3:
@@ -159,7 +159,7 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
 
 @inlined
 def predict_place(kind, site, dcm_ned_ecef, e, point, speed, h, m, by_error):
-    """Position or velocity along a reference's axes, or height; partials by the seen point."""
+    """Position or velocity along a reference's axes, or height; partials by the observed point."""
     if kind == HEIGHT:
         sin_lat, cos_lat, height, per_p = geodetic(point[0], point[1], point[2], WGS84)
         level_part = (1.0 + e[1]) * cos_lat * per_p
@@ -208,7 +208,7 @@ def predict_field(dcm_body_sensor, known, e, c, h, by_state, by_error):
     for i in range(3):
         h[i] = e[i] + iron[i][0] * actual[0] + iron[i][1] * actual[1] + iron[i][2] * actual[2]
         by_error[i, i], by_error[i, 3 + i] = 1.0, actual[i]
-        # the body turned by d sees b + b x d, a mount turned by m about sensor axes likewise
+        # a body rotated by d measures b + b x d, a mount rotated by m about sensor axes likewise
         for j in range(3):
             row[j] = iron[i][0] * mount[j, 0] + iron[i][1] * mount[j, 1] + iron[i][2] * mount[j, 2]
         cross_into(row, body, lever)
@@ -225,7 +225,7 @@ def predict_field(dcm_body_sensor, known, e, c, h, by_state, by_error):
 
 @inlined
 def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
-    """Azimuth and elevation of the Sun in a head's axes; errors: bias across in azimuth, bias in elevation, mount."""
+    """Azimuth and elevation of the Sun in a head's axes; errors: biases normal to the line of sight, mount."""
     q, turn, mount, s, lever = np.empty(4), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     level(q)
     boxplus(q, e[4], e[5], e[6])
@@ -236,17 +236,17 @@ def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
         body[i] = c[0, i] * known[0] + c[1, i] * known[1] + c[2, i] * known[2]
     for i in range(3):
         s[i] = mount[0, i] * body[0] + mount[1, i] * body[1] + mount[2, i] * body[2]
-    across2 = s[1] * s[1] + s[2] * s[2] + 1e-30
-    across = math.sqrt(across2)
-    whole2 = across2 + s[0] * s[0]
-    less = e[0] / (across2 * across)  # of the bias across, as the Sun nears the head's x axis
+    normal2 = s[1] * s[1] + s[2] * s[2] + 1e-30
+    normal = math.sqrt(normal2)
+    whole2 = normal2 + s[0] * s[0]
+    less = e[0] / (normal2 * normal)  # of the bias, as the Sun nears the head's x axis
     p = (
-        (0.0, s[2] / across2 - less * s[1], -s[1] / across2 - less * s[2]),
-        (across / whole2, -s[0] * s[1] / (whole2 * across), -s[0] * s[2] / (whole2 * across)),
+        (0.0, s[2] / normal2 - less * s[1], -s[1] / normal2 - less * s[2]),
+        (normal / whole2, -s[0] * s[1] / (whole2 * normal), -s[0] * s[2] / (whole2 * normal)),
     )
-    h[0] = math.atan2(s[1], s[2]) + e[0] / across
-    h[1] = math.atan2(s[0], across) + e[1]
-    by_error[0, 0], by_error[1, 1] = 1.0 / across, 1.0
+    h[0] = math.atan2(s[1], s[2]) + e[0] / normal
+    h[1] = math.atan2(s[0], normal) + e[1]
+    by_error[0, 0], by_error[1, 1] = 1.0 / normal, 1.0
     for i in range(2):
         for j in range(3):
             row[j] = p[i][0] * mount[j, 0] + p[i][1] * mount[j, 1] + p[i][2] * mount[j, 2]
@@ -276,7 +276,7 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
         return
     point, speed, effective, m = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
     tau = e[3]
-    seen_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective)
+    observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective)
     if kind == RADAR:
         predict_radar(site, dcm, known, e, point, h, m, by_error)
         state_rows(m, 3, tau, c, effective, speed, by_state, by_error)
@@ -291,23 +291,23 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
 @inlined
 def velocity_rows(m, arm, rate, c, acceleration, by_state, by_error):
     """Partials of a velocity along axes ``m`` (3, 3): ``m (v + C (w x d) - tau a)``."""
-    turn, swing, row, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    turn, lever_velocity, row, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         turn[i] = rate[i] - OMEGA_WGS84 * c[2, i]
-    cross_into(turn, arm, swing)
+    cross_into(turn, arm, lever_velocity)
     for i in range(3):
         by_error[i, 3] = -(m[i, 0] * acceleration[0] + m[i, 1] * acceleration[1] + m[i, 2] * acceleration[2])
         for j in range(3):
             by_state[i, 3 + j] = m[i, j]
             row[j] = m[i, 0] * c[0, j] + m[i, 1] * c[1, j] + m[i, 2] * c[2, j]
-        cross_into(swing, row, lever)
+        cross_into(lever_velocity, row, lever)
         for j in range(3):
             by_state[i, 6 + j] = lever[j]
 
 
 @kernel
 def predict_one(kind, arm, site, dcm, known, e, position, velocity, q, rate, acceleration, h, by_state, by_error):
-    """`predict` from an attitude quaternion, for the readable filter and for tests."""
+    """`predict` from an attitude quaternion, for the filterpy engine and for tests."""
     c = np.empty((3, 3))
     dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
     predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error)
@@ -315,5 +315,5 @@ def predict_one(kind, arm, site, dcm, known, e, position, velocity, q, rate, acc
 
 @kernel
 def motion_at(motion, air, index, position, velocity, q, errors, rate, acceleration):
-    """`node_motion` without the attitude matrix, for the readable filter and for tests."""
+    """`node_motion` without the attitude matrix, for the filterpy engine and for tests."""
     node_motion(motion, air, index, position, velocity, q, errors, np.empty((3, 3)), rate, acceleration)

@@ -1,4 +1,4 @@
-"""Compiled Rauch-Tung-Striebel smoother. Readable twin, and the equations: `recon.smoother`."""
+"""Compiled Rauch-Tung-Striebel smoother. Twin of the filterpy engine, and the equations: `recon.smoother`."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def backward_gain(phi, noise, decay, noise_var, moving, still, p, columns, scale
         for j in range(size):
             gain[r, j] = -columns[r, j]
         gain[r, moving[r]] += 1.0
-    for r in range(9, d):  # errors that wander: 1 / decay
+    for r in range(9, d):  # Gauss-Markov errors: 1 / decay
         f = 1.0 / decay[moving[r] - 9]
         for j in range(size):
             gain[r, j] *= f
@@ -179,7 +179,7 @@ def backward_gain(phi, noise, decay, noise_var, moving, still, p, columns, scale
 def rauch_tung_striebel(steps, run, moving, x, covariance, variance):
     """Smooth backwards: errors ``x`` (n, N) in place of the filtered ones, moments at kept nodes where wanted.
 
-    ``moving`` (d,) are the nine kinematic errors and those that wander. ``covariance`` (k, D (D + 1) / 2) is empty
+    ``moving`` (d,) are the nine kinematic errors and Gauss-Markov ones. ``covariance`` (k, D (D + 1) / 2) is empty
     where only the mean is wanted.
     """
     n, size = x.shape

@@ -1,7 +1,7 @@
 """Compiled strapdown mechanisation with its transition matrix and process noise.
 
-Readable twin: `recon.strapdown`, which also states the model. Kernels take what the twin takes, as plain arrays, and
-check nothing. Error columns, 27 in all: position, velocity, rotation, then bias, scale and mount of the
+Model: `recon.strapdown`; readable twin: `tests.oracles.strapdown`. Kernels take what the twin takes, as plain arrays,
+and check nothing. Error columns, 27 in all: position, velocity, rotation, then bias, scale and mount of the
 accelerometer, then of the gyros; and two more, their clocks, where these may err.
 """
 
@@ -79,7 +79,7 @@ def mount_matrices(dcm_body_sensor, mount, body_actual, body_mount):
 def correct_sample(before, after, errors, offset, late, body_actual, body_mount, value, change, columns):
     """Mean of two samples in body axes into ``value`` (3,), with partials in ``columns`` (3, 9); ``change`` (3,) too.
 
-    ``errors[offset:offset + 6]`` are bias and scale of the triad; ``late`` says by what part of the step its tags are;
+    ``errors[offset:offset + 6]`` are bias and scale of the sensor; ``late`` is its tags' lateness in steps;
     ``change`` is the second sample less the first.
     """
     for j in range(3):
@@ -119,8 +119,8 @@ def coning_and_sculling(force, d_force, rate, d_rate, dt):
 
 
 @inlined
-def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, turned, pushed, moved):
-    """Carry the columns of ``phi`` (9, 27 or 29) over one step; ``turned``, ``pushed``, ``moved`` (3, ...) are scratch.
+def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, rotated, forced, moved):
+    """Carry the columns of ``phi`` (9, 27 or 29) over one step; ``rotated``, ``forced``, ``moved`` (3, ...): scratch.
 
     ``by_clock`` (2, 3) is what force and rate change in a second. Along rows, which lie side by side in memory: the
     compiler puts several columns into one instruction.
@@ -130,31 +130,31 @@ def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_cloc
     for i in range(3):
         a, b, c = half_turn[0, i], half_turn[1, i], half_turn[2, i]
         for j in range(width):
-            turned[i, j] = a * phi[6, j] + b * phi[7, j] + c * phi[8, j]
-            moved[i, j] = turned[i, j]
+            rotated[i, j] = a * phi[6, j] + b * phi[7, j] + c * phi[8, j]
+            moved[i, j] = rotated[i, j]
         for j in range(9):
             moved[i, 18 + j] += h * d_rate[i, j]
-            turned[i, 18 + j] += dt * d_rate[i, j]
+            rotated[i, 18 + j] += dt * d_rate[i, j]
         if width > 27:
             moved[i, 28] += h * by_clock[1, i]
-            turned[i, 28] += dt * by_clock[1, i]
+            rotated[i, 28] += dt * by_clock[1, i]
     f0, f1, f2 = force[0], force[1], force[2]
     for j in range(width):
         m0, m1, m2 = moved[0, j], moved[1, j], moved[2, j]
-        pushed[0, j] = m1 * f2 - m2 * f1
-        pushed[1, j] = m2 * f0 - m0 * f2
-        pushed[2, j] = m0 * f1 - m1 * f0
+        forced[0, j] = m1 * f2 - m2 * f1
+        forced[1, j] = m2 * f0 - m0 * f2
+        forced[2, j] = m0 * f1 - m1 * f0
     for i in range(3):
         for j in range(9):
-            pushed[i, 9 + j] += d_force[i, j]
+            forced[i, 9 + j] += d_force[i, j]
         if width > 27:
-            pushed[i, 27] += by_clock[0, i]
+            forced[i, 27] += by_clock[0, i]
     for i in range(3):
         a, b, c = dcm_mid[i, 0], dcm_mid[i, 1], dcm_mid[i, 2]
         x, y, z = gradient[i, 0], gradient[i, 1], gradient[i, 2]
         for j in range(width):
             moved[i, j] = (
-                a * pushed[0, j] + b * pushed[1, j] + c * pushed[2, j]
+                a * forced[0, j] + b * forced[1, j] + c * forced[2, j]
                 + x * (phi[0, j] + h * phi[3, j]) + y * (phi[1, j] + h * phi[4, j]) + z * (phi[2, j] + h * phi[5, j])
             )  # fmt: skip
     for j in range(width):
@@ -166,7 +166,7 @@ def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_cloc
         for j in range(width):
             phi[i, j] += dt * (phi[3 + i, j] + h * moved[i, j])
             phi[3 + i, j] += dt * moved[i, j]
-            phi[6 + i, j] = a * turned[0, j] + b * turned[1, j] + c * turned[2, j]
+            phi[6 + i, j] = a * rotated[0, j] + b * rotated[1, j] + c * rotated[2, j]
 
 
 @inlined
@@ -274,7 +274,7 @@ def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi,
     d_force, d_rate = np.empty((3, 9)), np.empty((3, 9))
     half_turn, dcm_mid, gradient = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     width = phi.shape[1]
-    turned, pushed, moved = np.empty((3, width)), np.empty((3, width)), np.empty((3, width))
+    rotated, forced, moved = np.empty((3, width)), np.empty((3, width)), np.empty((3, width))
     late_force, late_rate, by_clock = 0.0, 0.0, np.zeros((2, 3))
     if width > 27:
         late_force, late_rate = errors[18], errors[19]
@@ -291,5 +291,5 @@ def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi,
             by_clock[0, i], by_clock[1, i] = force_change[i] / dt, rate_change[i] / dt
         coning_and_sculling(force, force_change, rate, rate_change, dt)
         advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient)
-        advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, turned, pushed, moved)
+        advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, rotated, forced, moved)
         advance_noise(noise, dt, half_turn, dcm_mid, force, motion.force_density[j], motion.rate_density[j])

@@ -1,17 +1,17 @@
-"""What the air of the day was, given the trajectory: density and winds along altitude, from the measured deceleration.
+"""What was the as-flown atmosphere? Density and winds along altitude, from the trajectory and the deceleration.
 
-The sounding is a prior. Half the variance of its errors is constant along altitude, half forgets (exponentially, over
-5 km for density, 3 km for winds); the accelerometers then say at every height how hard the air pushed,
+The sounding is a prior. Half the variance of its errors is constant along altitude, half is Gauss-Markov (correlation
+length 5 km for density, 3 km for winds); the accelerometers measure the force of the air at every height,
 
     f = q S / m (-C_A(M, |a|) e_x - C_N(M, |a|) a/|a| + C_A t),   q = rho |u|^2 / 2,   u = v - wind,   a = a_body + t
 
-with ``a_body`` the flow's lateral angle against the centerbody and ``t = (G a_body + B) s / (1 - g s) + b`` what a bent
-shell, a shifted c.g. and a mounting add to it (``s`` is the share of the largest dynamic pressure): a compliant joint
-yields in proportion to the load, the more the nearer it is to divergence. ``B`` and ``b`` turn with the body, while
-winds do not: spin tells them apart. Coefficient scales are unknown within their pre-flight
-standard deviations, attitude and velocity within the trajectory's own covariance. All are found at once by least
-squares. Density and C_A enter as a product: without pressure ports a constant factor between them stays open, and the
-standard deviations say so.
+with ``a_body`` the flow's lateral angle relative to the centerbody and ``t = (G a_body + B) s / (1 - g s) + b`` the
+contribution of a deflected aeroshell, a shifted c.g. and a misalignment (``s`` is the share of the largest dynamic
+pressure): the deflection of a compliant joint is proportional to the load, and grows as the load nears divergence.
+``B`` and ``b`` rotate with the body, while winds do not: spin separates them. Coefficient scales are unknown within
+their pre-flight standard deviations, attitude and velocity within the trajectory's own covariance. All are estimated at
+once by least squares. Density and C_A enter as a product: without pressure ports a constant factor between them is not
+observable, and the standard deviations include it.
 
 References
 ----------
@@ -29,27 +29,32 @@ import pandas as pd
 from flightmodel import earth, rotations
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.airdata import lateral_angles
-from flightmodel.atmosphere import AtmosphereProfile
+from flightmodel.atmosphere import (
+    DENSITY_LENGTH_M,
+    WIND_LENGTH_M,
+    AtmosphereProfile,
+    sounding_correlation,
+    unresolved_variance,
+)
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.sphere_cone import knudsen
+from flightmodel.statistics import correlation
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, resample
 from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
-from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
 from recon.reconstruct import TrajectorySolution
 
-KNOT_M, KNOT_S, TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
-LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration says nothing about the air
-LEAST_SAMPLES = 20
-# of the deceleration, along and across: what coefficients and a swinging joint leave open
-MODEL_PART, LATERAL_PART, MODEL_FLOOR_MPS2 = 0.01, 0.02, 0.03
-CONSTANT_PART = 0.5  # of a sounding's error variance: calibration, drag coefficient of the sphere
-GAIN_SD, GROWTH_SD, OFFSET_SD_RAD = 1.0, 0.3, np.deg2rad(3.0)
-BAD_AIR = "is further from the sounding than its accuracy allows: the air was other than sounded, or the drag"
-BAD_DRAG = "is further from the pre-flight value than stated: check mass, area and coefficients"
-LARGEST_RMS = 2.0
-LEAST_LEFT = 0.1  # of the joint's stiffness, when the air's push has taken its part
-SETTLED_SD, MOST_STEPS = 1e-2, 20
+_KNOT_M, _KNOT_S, _TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
+LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration does not depend on the air measurably
+_LEAST_SAMPLES = 20
+# of the deceleration, axial and lateral: model error of coefficients and of an oscillating joint
+_AXIAL_PART, _LATERAL_PART, _MODEL_FLOOR_MPS2 = 0.01, 0.02, 0.03
+_GAIN_SD, _GROWTH_SD, _OFFSET_SD_RAD = 1.0, 0.3, np.deg2rad(3.0)
+_BAD_AIR = "is beyond the sounding's uncertainty: the air differed from the sounding, or the drag coefficient is wrong"
+_BAD_DRAG = "is beyond the pre-flight uncertainty: check mass, area and coefficients"
+_LARGEST_RMS = 2.0
+_LEAST_STIFFNESS = 0.1  # share of the joint's stiffness that aerodynamic load leaves
+_CONVERGED_SD, _MOST_STEPS = 1e-2, 20
 # half the window over which sensors are averaged: well below the joint's period, well above the sampling interval
 HALF_WINDOW_S = 0.05
 _WINDOW_S = 0.4  # over which the joint's oscillation is averaged
@@ -60,7 +65,7 @@ _LARGEST_GAP_S = 0.1
 
 @dataclass(frozen=True)
 class AirSamples:
-    """Means over windows long enough to average the joint's swinging.
+    """Means over windows long enough to average the joint's oscillation.
 
     Parameters
     ----------
@@ -68,7 +73,7 @@ class AirSamples:
     velocity_ned_mps : (n, 3) float
         Of the c.g. against the rotating Earth.
     dcm_ned_body : (n, 3, 3) float
-        Mean matrix of the window, which is not quite orthogonal: of body-axis components it makes means, too.
+        Mean matrix of the window, not quite orthogonal: it maps body-axis components to means, too.
     specific_force_body_mps2 : (n, 3) float
         At the c.g.
     error_root_ned : (n, 6, 6) float
@@ -89,7 +94,7 @@ class AirSamples:
 
 @dataclass(frozen=True)
 class Drag:
-    """What pushes: coefficients, reference area over mass, how well both are known (fractions), reference length."""
+    """Aerodynamic force model: coefficients, reference area over mass, sd of both (fractions), reference length."""
 
     table: AeroTable
     area_per_mass_m2pkg: float
@@ -100,7 +105,7 @@ class Drag:
 
 @dataclass(frozen=True)
 class ReconstructedAir:
-    """Air of the day with what was learnt from the flight.
+    """As-flown atmosphere.
 
     Parameters
     ----------
@@ -112,7 +117,7 @@ class ReconstructedAir:
         with the sounding's air and the pre-flight C_A.
     parameters : DataFrame
         ``name, unit, prior_sd, estimate, sd`` of coefficient scales, gain and offsets.
-    verdicts : tuple of Verdict
+    consistency_checks : tuple of ConsistencyCheck
     """
 
     profile: pd.DataFrame
@@ -121,7 +126,7 @@ class ReconstructedAir:
     consistency_checks: tuple[ConsistencyCheck, ...]
 
 
-PARAMETERS = {
+_PARAMETERS = {
     "C_A scale": "1",
     "C_N scale": "1",
     "flexure gain": "1",
@@ -131,17 +136,17 @@ PARAMETERS = {
     "offset y": "rad",
     "offset z": "rad",
 }
-SEEN = 3 + len(PARAMETERS) + 6  # by each sample: density, two winds, parameters, errors of velocity and attitude
+_UNKNOWNS = 3 + len(_PARAMETERS) + 6  # of each sample: density, two winds, parameters, errors of velocity and attitude
 
 
 class _Model:
-    """Forces as a function of the quantities that each sample sees, in the order of `SEEN`."""
+    """Forces as a function of the unknowns of each sample, in the order of `_UNKNOWNS`."""
 
     def __init__(self, samples: AirSamples, profile: AtmosphereProfile, drag: Drag) -> None:
         self.samples, self.drag = samples, drag
         self.air = profile.at(samples.altitude_m)
         self.knudsen = knudsen(self.air.density_kgpm3, drag.length_m)
-        still = np.zeros((len(samples.time_s), SEEN))
+        still = np.zeros((len(samples.time_s), _UNKNOWNS))
         self.largest_pa = float(self.forces(still, 1.0)[1].max())
 
     def forces(self, x: FloatArray, largest_pa: float | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -159,22 +164,22 @@ class _Model:
         mach = speed / air.sound_speed_mps
         body = lateral_angles(u)
         share = q / (self.largest_pa if largest_pa is None else largest_pa)
-        share = share / np.maximum(1.0 - growth * share, LEAST_LEFT)
+        share = share / np.maximum(1.0 - growth * share, _LEAST_STIFFNESS)
         tilt = share[:, None] * (gain[:, None] * body + x[:, 7:9]) + x[:, 9:11]
         flow = body + tilt
         size = np.linalg.norm(flow, axis=1)
         coefficients = self.drag.table.at(mach, np.clip(size, 0.0, np.pi), self.knudsen)
         ca, cn = coefficients[:, 0] * np.exp(ca_scale), coefficients[:, 1] * np.exp(cn_scale)
         direction = flow / np.maximum(size, 1e-12)[:, None]
-        push = (q * self.drag.area_per_mass_m2pkg)[:, None]
+        force = (q * self.drag.area_per_mass_m2pkg)[:, None]
         lateral = -cn[:, None] * direction + ca[:, None] * tilt
-        return push * np.column_stack([-ca, lateral]), q, mach
+        return force * np.column_stack([-ca, lateral]), q, mach
 
     def linearised(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Forces (n, 3) and partials (n, 3, SEEN), central differences."""
+        """Forces (n, 3) and partials (n, 3, _UNKNOWNS), central differences."""
         step = 1e-4
-        partials = np.empty((len(x), 3, SEEN))
-        for j in range(SEEN):
+        partials = np.empty((len(x), 3, _UNKNOWNS))
+        for j in range(_UNKNOWNS):
             up, down = x.copy(), x.copy()
             up[:, j] += step
             down[:, j] -= step
@@ -191,10 +196,8 @@ def _interpolation(at: FloatArray, knots: FloatArray) -> FloatArray:
     return out
 
 
-def _process_information(knots: FloatArray, length: float, constant: float = 0.0) -> FloatArray:
-    """Inverse covariance (k, k) of a process of unit variance on knots: a constant part and one that forgets."""
-    forgets = np.exp(-np.abs(knots[:, None] - knots[None, :]) / length)
-    return np.asarray(np.linalg.inv(constant + (1.0 - constant) * forgets))
+def _inverse(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(covariance))
 
 
 def _knots(at: FloatArray, spacing: float) -> FloatArray:
@@ -210,23 +213,24 @@ def reconstruct_air(
     Raises
     ------
     GateError
-        Where the air never pushes hard enough for `LEAST_SAMPLES` windows.
+        Where fewer than `_LEAST_SAMPLES` windows have a deceleration large enough, or no solution is found.
     """
     keep = -samples.specific_force_body_mps2[:, 0] >= LEAST_AXIAL_MPS2
-    if keep.sum() < LEAST_SAMPLES:
+    if keep.sum() < _LEAST_SAMPLES:
         raise GateError(
             f"air: {int(keep.sum())} windows with a deceleration above {LEAST_AXIAL_MPS2} m/s^2; "
-            f"{LEAST_SAMPLES} are the least from which density and winds can be learnt"
+            f"at least {_LEAST_SAMPLES} are needed to estimate density and winds",
+            code="air-not-observable",
         )
     samples = samples.rows(keep)
     model = _Model(samples, profile, drag)
-    height, moment = _knots(samples.altitude_m, KNOT_M), _knots(samples.time_s, KNOT_S)
-    by_height, by_time = _interpolation(samples.altitude_m, height), _interpolation(samples.time_s, moment)
-    prior_sd = np.array([drag.ca_sd, drag.cn_sd, GAIN_SD, GROWTH_SD, *[OFFSET_SD_RAD] * 4])
+    height, time = _knots(samples.altitude_m, _KNOT_M), _knots(samples.time_s, _KNOT_S)
+    by_height, by_time = _interpolation(samples.altitude_m, height), _interpolation(samples.time_s, time)
+    prior_sd = np.array([drag.ca_sd, drag.cn_sd, _GAIN_SD, _GROWTH_SD, *[_OFFSET_SD_RAD] * 4])
     blocks = [by_height] * 3 + [np.tile(sd, (len(samples.time_s), 1)) for sd in prior_sd] + [by_time] * 6
     lengths = (DENSITY_LENGTH_M, WIND_LENGTH_M, WIND_LENGTH_M)
-    information = [_process_information(height, length, CONSTANT_PART) for length in lengths]
-    information += [np.eye(1)] * len(prior_sd) + [_process_information(moment, TRAJECTORY_TIME_S)] * 6
+    information = [_inverse(sounding_correlation(height, length)) for length in lengths]
+    information += [np.eye(1)] * len(prior_sd) + [_inverse(correlation(time, _TRAJECTORY_TIME_S))] * 6
     estimate, covariance, residual = _least_squares(model, blocks, information)
     sd = np.sqrt(np.diag(covariance))
     return ReconstructedAir(
@@ -247,8 +251,8 @@ def _least_squares(
     x = np.zeros(len(prior))
     edges = np.cumsum([0, *(b.shape[1] for b in blocks)])
     measured = model.samples.specific_force_body_mps2
-    sd = np.hypot(MODEL_FLOOR_MPS2, np.array([MODEL_PART, LATERAL_PART, LATERAL_PART]) * np.abs(measured[:, :1]))
-    for _ in range(MOST_STEPS):
+    sd = np.hypot(_MODEL_FLOOR_MPS2, np.array([_AXIAL_PART, _LATERAL_PART, _LATERAL_PART]) * np.abs(measured[:, :1]))
+    for _ in range(_MOST_STEPS):
         local = np.column_stack([b @ x[i:j] for b, i, j in zip(blocks, edges[:-1], edges[1:], strict=True)])
         force, partials = model.linearised(local)
         residual = (measured - force) / sd
@@ -257,15 +261,16 @@ def _least_squares(
         ).reshape(-1, len(x))
         try:
             factor = cho_factor(jacobian.T @ jacobian + prior)
-        except (LinAlgError, ValueError):  # steps led to forces that are no numbers
+        except (LinAlgError, ValueError):  # steps led to forces that are not finite
             raise GateError(
                 "air: no density and winds near the sounding's explain the deceleration along this trajectory; see the "
-                "verdicts, and check the accelerometer's axes, units and mount"
+                "consistency checks, and check the accelerometer's axes, units and mount",
+                code="air-not-converged",
             ) from None
         step = cho_solve(factor, jacobian.T @ residual.ravel() - prior @ x)
         x = x + step
         covariance = cho_solve(factor, np.eye(len(x)))
-        if np.abs(step / np.sqrt(np.diag(covariance))).max() < SETTLED_SD:
+        if np.abs(step / np.sqrt(np.diag(covariance))).max() < _CONVERGED_SD:
             break
     return x, covariance, residual
 
@@ -280,8 +285,8 @@ def _profile(model: _Model, height: FloatArray, estimate: FloatArray, sd: FloatA
     )
     density, north, east = (slice(i * k, (i + 1) * k) for i in range(3))
     ratio = np.exp(estimate[density] * density_sd)
-    # samples tell the mean wind about a knot; the air's own structure between knots lies on top of that
-    within = (1.0 - CONSTANT_PART) * KNOT_M / (3.0 * WIND_LENGTH_M)
+    # samples determine the mean wind about a knot; the wind's structure between knots adds to its variance
+    within = unresolved_variance(_KNOT_M, WIND_LENGTH_M)
     north_sd, east_sd = (np.sqrt(np.minimum(sd[part] ** 2 + within, 1.0)) for part in (north, east))
     table = pd.DataFrame(
         {
@@ -301,11 +306,11 @@ def _profile(model: _Model, height: FloatArray, estimate: FloatArray, sd: FloatA
 
 def _parameters(prior_sd: FloatArray, estimate: FloatArray, sd: FloatArray) -> pd.DataFrame:
     """Coefficient scales and flexure; the rest of the unknowns (u,) is the trajectory's."""
-    n = len(PARAMETERS)
+    n = len(_PARAMETERS)
     return pd.DataFrame(
         {
-            "name": list(PARAMETERS),
-            "unit": list(PARAMETERS.values()),
+            "name": list(_PARAMETERS),
+            "unit": list(_PARAMETERS.values()),
             "prior_sd": prior_sd,
             "estimate": estimate[:n] * prior_sd,
             "sd": sd[:n] * prior_sd,
@@ -316,7 +321,7 @@ def _parameters(prior_sd: FloatArray, estimate: FloatArray, sd: FloatArray) -> p
 def _drag_ratio(model: _Model) -> pd.DataFrame:
     """Measured over predicted axial force, with the sounding's air and the pre-flight coefficients."""
     s = model.samples
-    force, q, mach = model.forces(np.zeros((len(s.time_s), SEEN)))
+    force, q, mach = model.forces(np.zeros((len(s.time_s), _UNKNOWNS)))
     return pd.DataFrame(
         {
             "time_s": s.time_s,
@@ -333,42 +338,37 @@ def _residual_checks(residual: FloatArray) -> list[ConsistencyCheck]:
     """Do the forces follow the model (n, 3)?"""
     out = []
     for name, part in (("axial", residual[:, :1]), ("lateral", residual[:, 1:])):
-        good, bad = "forces follow the model", "forces do not follow the model: coefficients, or what pushes is not air"
         rms = float(np.sqrt(np.mean(part**2)))
-        out.append(consistency_check("force-residuals", f"air residuals {name}", rms, 0.0, LARGEST_RMS, good, bad))
+        out.append(
+            consistency_check(
+                "force-residuals", f"air residuals {name}", rms, 0.0, _LARGEST_RMS, "forces follow the model",
+                "forces do not follow the model", advice="check coefficients, and for forces other than aerodynamic",
+                source="air", component=name,
+            )
+        )  # fmt: skip
     return out
 
 
 def _consistency_checks(
     height: FloatArray, estimate: FloatArray, sd: FloatArray, confidence: float
 ) -> tuple[ConsistencyCheck, ...]:
-    """Do density, winds and the axial coefficient lie where the sounding and the pre-flight model put them?"""
+    """Are density, winds and the axial coefficient consistent with the sounding and the pre-flight model?"""
     k = len(height)
-    heights = [f"{h / 1000:.0f} km" for h in height]
+    heights = [f"at {h / 1000:.0f} km" for h in height]
+    wind = [f"wind {way} {h}" for way in ("north", "east") for h in heights]
 
-    def judged(label: str, names: list[str], first: int, bad: str) -> ConsistencyCheck | None:
-        rows = slice(first, first + len(names))
-        good = "as far from its statement as stated; the furthest is"
-        return data_sheet_check(
-            label.lower().replace(" ", "-").replace("_", ""),
-            label,
-            names,
-            estimate[rows],
-            np.ones(len(names)),
-            sd[rows],
-            confidence,
-            bad,
-            good,
-        )
+    def check(code: str, label: str, names: list[str], first: int, bad: str) -> ConsistencyCheck | None:
+        rows, one = slice(first, first + len(names)), np.ones(len(names))
+        good = "within stated uncertainty; largest:"
+        return data_sheet_check(code, label, "", names, estimate[rows], one, sd[rows], confidence, bad, good)
 
-    wind = [f"wind {way} at {h}" for way in ("north", "east") for h in heights]
-    found = (
-        judged("sounding density", [f"density at {h}" for h in heights], 0, BAD_AIR),
-        judged("sounding wind", wind, k, BAD_AIR),
-        # C_N is not judged: a shell that bends changes the normal force as a wrong C_N does
-        judged("pre-flight C_A", ["C_A"], 3 * k, BAD_DRAG),
+    checks = (
+        check("sounding-density", "sounding density", [f"density {h}" for h in heights], 0, _BAD_AIR),
+        check("sounding-wind", "sounding wind", wind, k, _BAD_AIR),
+        # C_N is not checked: a deflected aeroshell changes the normal force as a wrong C_N does
+        check("pre-flight-ca", "pre-flight C_A", ["C_A"], 3 * k, _BAD_DRAG),
     )
-    return tuple(v for v in found if v is not None)
+    return tuple(v for v in checks if v is not None)
 
 
 def _window_means(time_s: FloatArray, values: FloatArray, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
@@ -440,7 +440,7 @@ def as_flown_atmosphere(
     Raises
     ------
     GateError
-        Where there is no vehicle or no inertial sensor, or the air never pushes hard enough.
+        Where there is no vehicle or no inertial sensor, or the deceleration is too small.
     """
     vehicle = telemetry.required_vehicle()
     known = vehicle.uncertainty
@@ -498,8 +498,8 @@ def _window_times(bet: TrajectorySolution) -> FloatArray:
 def _force_means(bet: TrajectorySolution, arm_body_m: FloatArray, t: FloatArray) -> FloatArray:
     """Specific force at a point ``arm_body_m`` from the accelerometer, body axes, means over the windows."""
     t_imu, rate, half = bet.imu_time_s, bet.rate_body_radps, 0.5 * _WINDOW_S
-    swing = np.cross(rate, np.cross(rate, arm_body_m))
-    force = _window_means(t_imu, bet.specific_force_body_mps2 + swing, t - half, t + half)
+    centripetal = np.cross(rate, np.cross(rate, arm_body_m))
+    force = _window_means(t_imu, bet.specific_force_body_mps2 + centripetal, t - half, t + half)
     ends = [_window_means(t_imu, rate, at - _EDGE_S, at + _EDGE_S) for at in (t - half, t + half)]
     return force + np.cross((ends[1] - ends[0]) / _WINDOW_S, arm_body_m)
 

@@ -1,48 +1,48 @@
-"""Is the reconstruction as good as it says? Verdicts in words, from the residuals and the two passes.
+"""Is the reconstruction as accurate as its covariance states? Consistency checks of residuals and of held-out data.
 
 Innovations of a filter whose model matches the data are white with the predicted covariance, so the sum of normalised
 innovations squared (NIS) is chi-square with as many degrees of freedom as components were measured, and the lag-one
 autocorrelation of a component is normal with sd ``1 / sqrt(N)``. Filter minus smoother has covariance ``P_filter -
-P_smoother`` (McReynolds); differences last, so one that is beyond three sd by chance may stay there for long: a tenth
-of them may. Points of the first seconds are left out: they chose the start. What the flight taught about a sensor
-error, ``estimate / sqrt(prior_sd^2 - sd^2)``, is standard normal where the data sheet is right; radars can absorb a
-wrong mounting so well that only this shows it.
+P_smoother`` (McReynolds); differences are correlated in time, so one that is beyond three sd by chance may stay there
+for long: a tenth of them may. Points of the first seconds are left out: the start was fitted to them. The normalised
+shift of a sensor error from its a priori value, ``estimate / sqrt(prior_sd^2 - sd^2)``, is standard normal where the
+data sheet is right; radars can absorb a wrong mounting so well that only this shows it.
 
-A failed verdict is a finding about the data or the model, not an error of the program. Each is two-sided at the
-settings' confidence, so that eighteen verdicts on a good flight are all green 98 times in a hundred (at 0.999).
+Measurements that are predicted but not used (held-out ones, those of an oversampled tracker, sources left out) check
+the smoothed trajectory: with state and error ``x_s`` of covariance ``P_s`` at their time,
+
+    residual = z - h(x_s),   variance = H P_s H^T + R
+
+and residuals over their standard deviations have a mean square of one. Neighbours share the trajectory's error, so
+that mean is less certain than their number suggests.
+
+A failed check is a finding about the data or the model, not an error of the program. Each is two-sided at the
+settings' confidence, so that eighteen checks of a consistent flight all pass 98 times in a hundred (at 0.999).
 
 References
 ----------
 Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", section 5.4.
 S. McReynolds, "Editing data using sequential smoothing techniques for discrete systems", AIAA 84-2024.
-
-How well does the trajectory foretell tracking that it never saw?
-
-Some measurements only check: rows of an oversampled tracker, those that settings withhold, sources left out. The
-smoothed state and error at their time, ``x_s`` with covariance ``P_s``, predict each one:
-
-    residual = z - h(x_s),   variance = H P_s H^T + R
-
-from all used data before and after it. Normalised by their standard deviations, residuals of an honest trajectory have
-a mean square of one. Neighbours share the trajectory's error, so that mean is less certain than their number says.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
 from flightmodel.checks import FloatArray
-from recon import _smoother_kernels, smoother
-from recon.ekf import ForwardPass
+from recon.ekf import COMPILED, ForwardPass
 from recon.problem import FIT_SPAN_S, Problem
-from recon.state import KINEMATIC, BoolArray, Innovations, IntArray, unpacked
+from recon.smoother import backward, jacobian
+from recon.state import BoolArray, Innovations, IntArray, unpacked
 
-MOST_EDITED = 0.05
-LEAST_INSIDE = 0.90
-MOST_KEPT_SD = 0.98
+_MOST_EDITED = 0.05  # share of a source's points
+_LEAST_INSIDE = 0.90
+MOST_KEPT_SD = 0.98  # of the a priori sd: an error that keeps more of it was not observable
+_MOST_PREDICTED = 4000  # held-out measurements; more are thinned evenly
+_COLUMNS = ("time_s", "source", "component", "residual", "predicted_sd")
 GROUPS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9)}
 
 
@@ -50,7 +50,22 @@ GROUPS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6,
 class ConsistencyCheck:
     """One statistic, the band it should lie in, whether it does, and what follows.
 
-    ``code`` is short and stable (``"nis"``, ``"whiteness"``); ``name`` adds what it is of, ``remark`` may be reworded.
+    Parameters
+    ----------
+    code : str
+        Short and stable: ``"nis"``, ``"whiteness"``, ...
+    name : str
+        The statistic and what it is of.
+    value, low, high : float
+    passed : bool
+    remark : str
+        What was found and, where the check failed, what that means and what to check.
+    source : str
+        Tracker or sensor that it is about; empty where it is about the flight.
+    component : str
+        Component or error of that source that it is about.
+    symptom : str
+        What was found, without what follows.
     """
 
     code: str
@@ -60,14 +75,22 @@ class ConsistencyCheck:
     high: float
     passed: bool
     remark: str
+    source: str = ""
+    component: str = ""
+    symptom: str = ""
 
 
 def consistency_check(
-    code: str, name: str, value: float, low: float, high: float, good: str, bad: str
-) -> ConsistencyCheck:
-    """Consistency check with the remark that fits."""
+    code: str, name: str, value: float, low: float, high: float, good: str, bad: str,
+    *, advice: str = "", source: str = "", component: str = "",
+) -> ConsistencyCheck:  # fmt: skip
+    """Consistency check with the symptom that fits, ``good`` or ``bad``; ``advice`` follows where it failed."""
     passed = bool(low <= value <= high)
-    return ConsistencyCheck(code, name, float(value), float(low), float(high), passed, good if passed else bad)
+    symptom = good if passed else bad
+    remark = f"{symptom}: {advice}" if advice and not passed else symptom
+    return ConsistencyCheck(
+        code, name, float(value), float(low), float(high), passed, remark, source, component, symptom
+    )
 
 
 def nis_check(source: str, nis: FloatArray, components: int, confidence: float) -> ConsistencyCheck:
@@ -77,17 +100,18 @@ def nis_check(source: str, nis: FloatArray, components: int, confidence: float) 
     n, tail = len(nis), 0.5 * (1.0 - confidence)
     low, high = (float(chi2.ppf(p, components)) / n for p in (tail, 1.0 - tail))
     mean = float(np.mean(nis))
-    bad = (
-        "residuals are smaller than predicted: the assumed noise is too large"
+    size, advice = (
+        ("smaller", "the assumed noise is too large")
         if mean < low
-        else "residuals are larger than predicted: noise is larger than assumed or an error is not modelled"
+        else ("larger", "noise is larger than assumed or an error is not modelled")
     )
     return consistency_check(
-        "nis", f"NIS {source}", mean, low, high, f"residuals as large as predicted ({n} points)", bad
-    )
+        "nis", f"NIS {source}", mean, low, high, f"residuals as large as predicted ({n} points)",
+        f"residuals are {size} than predicted", advice=advice, source=source,
+    )  # fmt: skip
 
 
-def whiteness_check(source: str, normalised: FloatArray, confidence: float) -> ConsistencyCheck:
+def whiteness_check(source: str, component: str, normalised: FloatArray, confidence: float) -> ConsistencyCheck:
     """Lag-one autocorrelation of one component's normalised innovations (n,) against its band."""
     from scipy.stats import norm
 
@@ -96,56 +120,52 @@ def whiteness_check(source: str, normalised: FloatArray, confidence: float) -> C
     rho = float(centred[1:] @ centred[:-1] / (centred @ centred))
     band = float(norm.ppf(0.5 * (1.0 + confidence))) / np.sqrt(n)
     return consistency_check(
-        "whiteness",
-        f"whiteness {source}",
-        rho,
-        -band,
-        band,
-        "successive residuals are independent",
-        "successive residuals are correlated: an error that lasts several points is not modelled",
-    )
+        "whiteness", f"whiteness {source} {component}", rho, -band, band, "successive residuals are uncorrelated",
+        "successive residuals are correlated", advice="an error that lasts several points is not modelled",
+        source=source, component=component,
+    )  # fmt: skip
 
 
 def edit_check(source: str, accepted: BoolArray) -> ConsistencyCheck:
     """Fraction of points that failed the gate."""
-    fraction = float(1.0 - np.mean(accepted))
     count = int(np.sum(~accepted))
+    symptom = f"{count} of {len(accepted)} points edited"
     return consistency_check(
-        "edited",
-        f"edited {source}",
-        fraction,
-        0.0,
-        MOST_EDITED,
-        f"{count} of {len(accepted)} points edited",
-        f"{count} of {len(accepted)} points edited: it and the rest of the data disagree, and either may be wrong",
-    )
+        "edited", f"edited {source}", float(1.0 - np.mean(accepted)), 0.0, _MOST_EDITED, symptom, symptom,
+        advice="it disagrees with the rest of the data, and either may be wrong", source=source,
+    )  # fmt: skip
 
 
 def data_sheet_check(
     code: str,
     label: str,
-    names: list[str],
+    source: str,
+    components: list[str],
     estimate: FloatArray,
     prior_sd: FloatArray,
     sd: FloatArray,
     confidence: float,
     bad: str = "is larger than the data sheet allows: check mounting, units and calibration",
-    good: str = "estimated errors are as large as stated; the largest is",
+    good: str = "estimated sensor errors are consistent with the data sheet; largest:",
 ) -> ConsistencyCheck | None:
-    """Largest normalised shift (k,) of stated errors from zero; None where nothing was learnt.
+    """Largest normalised shift (k,) of a priori errors of one source from zero; None where no error was observable.
 
-    The words name the error that moved most: ``bad`` follows its name, ``good`` goes before it.
+    The remark names the ``components`` entry that moved most: ``bad`` follows its name, ``good`` goes before it.
     """
     from scipy.stats import norm
 
-    learnt = sd < MOST_KEPT_SD * prior_sd
-    if not learnt.any():
+    observable = sd < MOST_KEPT_SD * prior_sd
+    if not observable.any():
         return None
-    shift = np.abs(estimate[learnt]) / np.sqrt(prior_sd[learnt] ** 2 - sd[learnt] ** 2)
-    tail = 0.5 * (1.0 - confidence) / int(learnt.sum())
-    worst = np.array(names, dtype=object)[learnt][int(np.argmax(shift))]
-    limit = float(norm.isf(tail))
-    return consistency_check(code, label, float(shift.max()), 0.0, limit, f"{good} {worst}", f"{worst} {bad}")
+    shift = np.abs(estimate[observable]) / np.sqrt(prior_sd[observable] ** 2 - sd[observable] ** 2)
+    tail = 0.5 * (1.0 - confidence) / int(observable.sum())
+    worst = str(np.array(components, dtype=object)[observable][int(np.argmax(shift))])
+    name = f"{source} {worst}".strip()
+    symptom, _, advice = bad.partition(": ")
+    return consistency_check(
+        code, label, float(shift.max()), 0.0, float(norm.isf(tail)), f"{good} {name}, {shift.max():.1f} sd",
+        f"{name} {symptom}", advice=advice, source=source, component=worst,
+    )  # fmt: skip
 
 
 def mcreynolds_checks(
@@ -165,18 +185,20 @@ def mcreynolds_checks(
                 "filter-smoother",
                 f"filter-smoother {name}",
                 share,
-                LEAST_INSIDE,
+                _LEAST_INSIDE,
                 1.0,
                 "filter and smoother differ as predicted",
-                "filter and smoother differ more than predicted: process noise or an error model is too small",
+                "filter and smoother differ more than predicted",
+                advice="process noise or an error model is too small",
+                component=name,
             )
         )
     return out
 
 
 def source_checks(problem: Problem, innovations: Innovations, confidence: float) -> list[ConsistencyCheck]:
-    """NIS, whiteness and edits of each source; one that was left out on purpose has none."""
-    out = []
+    """NIS, whiteness and edits of each source; one that was excluded by settings has none."""
+    out: list[ConsistencyCheck] = []
     time_s = problem.time_s[problem.node]
     settled = time_s > problem.time_s[0] + FIT_SPAN_S
     measured = np.isfinite(problem.observed.variance)
@@ -186,26 +208,23 @@ def source_checks(problem: Problem, innovations: Innovations, confidence: float)
         if not mine.any():
             continue
         use = mine & settled & innovations.accepted
+        checks = []
         if use.sum() >= 10:
-            count = int(measured[use].sum())
-            out.append(nis_check(instrument.name, innovations.nis[use], count, confidence))
+            checks.append(nis_check(instrument.name, innovations.nis[use], int(measured[use].sum()), confidence))
             for i, component in enumerate(instrument.components):
                 rows = use & measured[:, i]
                 if rows.sum() >= 10:
-                    out.append(whiteness_check(f"{instrument.name} {component}", normalised[rows, i], confidence))
-        out.append(edit_check(instrument.name, innovations.accepted[mine]))
+                    checks.append(whiteness_check(instrument.name, component, normalised[rows, i], confidence))
+        checks.append(edit_check(instrument.name, innovations.accepted[mine]))
+        out += [replace(v, source=instrument.owner) for v in checks]
     return out
 
 
-MOST_PREDICTED = 4000  # measurements; more are thinned evenly
-COLUMNS = ("time_s", "source", "component", "residual", "predicted_sd")
-
-
-def withheld_table(problem: Problem, run: ForwardPass, engine: str = "compiled") -> pd.DataFrame:
-    """One row for each component of the measurements that were not used: `COLUMNS`, in order of time."""
+def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -> pd.DataFrame:
+    """One row for each component of the measurements that were not used: `_COLUMNS`, in order of time."""
     rows = _chosen(problem)
     if len(rows) == 0:
-        return pd.DataFrame({name: [] for name in COLUMNS})
+        return pd.DataFrame({name: [] for name in _COLUMNS})
     node = problem.node
     wanted = np.unique(node[rows])
     kept = np.zeros(len(problem.time_s), dtype=bool)
@@ -215,7 +234,7 @@ def withheld_table(problem: Problem, run: ForwardPass, engine: str = "compiled")
     out = []
     for row in rows.tolist():
         k = int(node[row])
-        h = _jacobian(run.innovations, slots[problem.observed.source[row]], row, problem.size)
+        h = jacobian(run.innovations, slots[problem.observed.source[row]], row, problem.size)
         # the innovation is of the state that the measurements before it at the same node had left
         before = run.filtered.x_minus[k].copy()
         for earlier in range(int(problem.observed.first[k]), row):
@@ -228,7 +247,7 @@ def withheld_table(problem: Problem, run: ForwardPass, engine: str = "compiled")
         for i, component in enumerate(instrument.components):
             if np.isfinite(sd[i]):
                 out.append((problem.time_s[k], instrument.name, component, residual[i], sd[i]))
-    return pd.DataFrame(out, columns=list(COLUMNS))
+    return pd.DataFrame(out, columns=list(_COLUMNS))
 
 
 def summary(table: pd.DataFrame) -> pd.DataFrame:
@@ -245,10 +264,10 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _chosen(problem: Problem) -> IntArray:
-    """Measurements that were not used, thinned evenly to `MOST_PREDICTED`."""
+    """Measurements that were not used, thinned evenly to `_MOST_PREDICTED`."""
     rows = np.flatnonzero(~problem.observed.usable)
-    if len(rows) > MOST_PREDICTED:
-        rows = rows[np.linspace(0, len(rows) - 1, MOST_PREDICTED).astype(np.int64)]
+    if len(rows) > _MOST_PREDICTED:
+        rows = rows[np.linspace(0, len(rows) - 1, _MOST_PREDICTED).astype(np.int64)]
     return np.asarray(rows, dtype=np.int64)
 
 
@@ -261,17 +280,8 @@ def _smoothed(problem: Problem, run: ForwardPass, kept: BoolArray, engine: str) 
     wide = np.concatenate([phi, np.zeros((*phi.shape[:2], problem.size - phi.shape[2]))], axis=2)
     x = run.filtered.x_plus.copy()
     triangles = np.empty((int(kept.sum()), problem.size * (problem.size + 1) // 2))
-    backward = _smoother_kernels.rauch_tung_striebel if engine == "compiled" else smoother.rauch_tung_striebel
-    backward(
+    backward(engine)(
         run.steps._replace(transition=wide), run.filtered._replace(kept=rows), problem.moving, x, triangles,
         np.empty((len(triangles), problem.size)),
     )  # fmt: skip
     return x, unpacked(triangles)
-
-
-def _jacobian(innovations: Innovations, slot: IntArray, row: int, size: int) -> FloatArray:
-    """Partials (3, N) of one prediction by the whole state."""
-    h = np.zeros((3, size))
-    h[:, :KINEMATIC] = innovations.by_state[row]
-    h[:, KINEMATIC + slot[slot >= 0]] += innovations.by_error[row][:, slot >= 0]
-    return h

@@ -1,4 +1,4 @@
-"""The error-state extended Kalman filter, compiled and readable: two engines with the same numbers.
+"""How do measurements correct the state? The error-state extended Kalman filter, with two engines of one algebra.
 
 The filter's state is the error about a nominal state at each node, its *chart*. In the first pass the chart is the
 prediction itself; in later passes it is the smoothed trajectory of the pass before, about which everything is
@@ -11,8 +11,11 @@ the gain ``K = P H^T S^-1`` in which the rows of considered errors are zero (Sch
 
     P+ = (1 - K H) P (1 - K H)^T + K R K^T
 
-(Joseph), by which a considered error keeps its own variance. The compiled engine is `recon._filter_kernels`; the
-readable one below runs on filterpy's filter and is where another filter can be put in its place.
+(Joseph), by which a considered error keeps its own variance.
+
+Engines: ``"compiled"`` (the default, `recon._filter_kernels`) and ``"filterpy"``, filterpy's `ExtendedKalmanFilter`
+with sensor models in numpy, which is also where another filter can be put in its place. Both step the nominal state by
+the same compiled mechanisation. Measured speeds: docs/decisions/0007-two-engines.md.
 
 References
 ----------
@@ -49,7 +52,7 @@ from recon.state import (
 )
 from recon.strapdown import propagate
 
-ENGINES = ("compiled", "readable")
+COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class ForwardPass:
         return boxplus(self.charts, self.filtered.x_plus)
 
 
-def forward(problem: Problem, reference: States | None = None, engine: str = "compiled") -> ForwardPass:
+def forward(problem: Problem, reference: States | None = None, engine: str = COMPILED) -> ForwardPass:
     """Run the filter through all nodes, about its own estimate or about a reference trajectory."""
     steps, run, innovations = empty_pass(problem)
     n = len(problem.time_s)
@@ -79,13 +82,13 @@ def forward(problem: Problem, reference: States | None = None, engine: str = "co
         charts = Charts(*(np.array(part, order="C") for part in as_charts(reference)))
         start = boxminus(problem.start, reference[0])
     run.p_last[:] = problem.start_covariance
-    if engine == "compiled":
+    if engine == COMPILED:
         _filter_kernels.forward(
             *problem.motion.split(), problem.node_index, problem.sources(), problem.observed, problem.model.wander,
             problem.gate, reference is not None, start, steps, charts, run, innovations,
         )  # fmt: skip
     else:
-        Readable(problem, reference is not None, start, steps, charts, run, innovations).run_all()
+        _FilterpyPass(problem, reference is not None, start, steps, charts, run, innovations).run_all()
     states = States(charts.position, charts.velocity, rotations.continuous(charts.q), charts.errors)
     return ForwardPass(states, steps, run, innovations)
 
@@ -117,8 +120,8 @@ def empty_pass(problem: Problem) -> tuple[Steps, Filtered, Innovations]:
     return steps, run, innovations
 
 
-class Readable:
-    """One forward pass on filterpy's `ExtendedKalmanFilter`, written to be read."""
+class _FilterpyPass:
+    """One forward pass on filterpy's `ExtendedKalmanFilter`."""
 
     def __init__(
         self,
@@ -164,7 +167,7 @@ class Readable:
         if not self.follow:
             phi[:, ROTATION] = phi[:, ROTATION] @ right_jacobian(ekf.x[ROTATION])
         climb = abs(height(step.state) - height(estimate))
-        decay, noise_var = self._forget(problem.time_s[k] - problem.time_s[j], climb)
+        decay, noise_var = self._decay(problem.time_s[k] - problem.time_s[j], climb)
         reached = States(*as_charts(step.state)[:3], step.state.sensor_errors * decay)
         self.steps.transition[j], self.steps.noise[j] = phi, step.noise
         self.steps.decay[j], self.steps.noise_var[j] = decay, noise_var
@@ -180,7 +183,7 @@ class Readable:
             part[k] = value
         ekf.predict(u=-(ekf.F @ ekf.x))
 
-    def _forget(self, dt_s: float, climb_m: float) -> tuple[FloatArray, FloatArray]:
+    def _decay(self, dt_s: float, climb_m: float) -> tuple[FloatArray, FloatArray]:
         """Decay of each error over a step, and the variance that comes new."""
         w = self.wander
         decay = np.maximum(_filter_kernels.LEAST_DECAY, np.exp(-dt_s / w.time_constant_s - climb_m / w.altitude_m))
@@ -188,7 +191,7 @@ class Readable:
         return decay, np.where(stays, w.walk_var_per_s * dt_s, w.sd**2 * (1.0 - decay**2))
 
     def node_motion(self, k: int) -> NodeMotion:
-        """What measurements need to know of a node's motion."""
+        """Motion of a node, as measurements are predicted from it."""
         chart = self.chart(k)
         rate, acceleration = np.empty(3), np.empty(3)
         _measurement_kernels.motion_at(

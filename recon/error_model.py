@@ -1,9 +1,9 @@
-"""Which systematic errors the filter knows of, how large they may be, how they wander, and which are only considered.
+"""Which systematic errors are estimated, with what a priori sd and correlation, and which are only considered?
 
 Every block is a first-order Gauss-Markov process about zero, ``de/dt = -e / tau + noise``, started at its prior
-standard deviation and kept there by its noise; an infinite ``tau`` is a constant. What belongs to the air forgets with
-altitude instead: ``exp(-|climb| / length)``. A *considered* error (Schmidt) is never estimated, but what it may have
-done stays in the covariance of everything else. The drivers of the motion come first (`recon.motion`).
+standard deviation and kept there by its noise; an infinite ``tau`` is a constant. Errors of the air decorrelate with
+altitude instead: ``exp(-|climb| / length)``. A *considered* error (Schmidt) is never estimated, but its effect stays in
+the covariance of everything else. The drivers of the motion come first (`recon.motion`).
 
 References
 ----------
@@ -17,18 +17,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M
 from flightmodel.checks import FloatArray, GateError, nearest_name
-from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SunHeads, TriadSpec
+from flightmodel.instruments import (
+    ACCELEROMETER,
+    RATES,
+    SUN,
+    BarometerSpec,
+    GnssSpec,
+    InstrumentTable,
+    RadarSite,
+    SunHeads,
+    TriadSpec,
+)
 from flightmodel.telemetry import Motion as MotionSpec
 from recon.state import Wander
 
+Spec = TriadSpec | RadarSite | GnssSpec | BarometerSpec | SunHeads
 AXES = ("x", "y", "z")
-DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0  # over which the air's errors forget: facts of soundings, 5 and 3 km
 
 
 @dataclass(frozen=True)
 class Block:
-    """One kind of error of one instrument: components with one unit, one prior and one way of forgetting."""
+    """One kind of error of one instrument: components with one unit, one prior and one correlation."""
 
     instrument: str
     components: tuple[str, ...]
@@ -76,7 +87,7 @@ class ErrorModel:
 
     @property
     def wander(self) -> Wander:
-        """How every error wanders; a considered one stays what it is."""
+        """Gauss-Markov model of every error; a considered one is constant."""
         considered = np.array(self._each("considered"), dtype=bool)
         tau, length, walk = (
             np.array(self._each(name), dtype=float) for name in ("time_constant_s", "altitude_m", "walk_var_per_s")
@@ -114,7 +125,7 @@ class ErrorModel:
             if not any(_fits(b, [name]) for b in self.blocks)
         ]
         if faults:
-            raise GateError(faults)
+            raise GateError(faults, code="error-unknown")
         return ErrorModel(blocks)
 
 
@@ -129,26 +140,37 @@ def _fits(block: Block, names: list[str]) -> bool:
     return any(name in names for name in spelt)
 
 
-def triad_blocks(spec: TriadSpec, unit: str) -> list[Block]:
-    """Bias, scale and mount of one triad; a prior of zero becomes a millionth of a typical one."""
+def instrument_blocks(table: InstrumentTable, spec: Spec, name: str = "") -> list[Block]:
+    """Errors of one instrument, by its rows; those of which flight.toml states none are left out.
 
-    def block(kind: str, unit: str, sd: float, walk: float = 0.0) -> Block:
-        return Block(spec.name, tuple(f"{kind} {axis}" for axis in AXES), unit, max(sd, 1e-9), walk_var_per_s=walk)
+    Of a triad the constant and the slowly varying part of the bias are one error: over times below the latter's time
+    constant it walks. ``name`` is that of one head of several.
+    """
+    blocks = []
+    for row in table.rows:
+        sd = getattr(spec, row.name)
+        tau, walk = getattr(spec, row.time_constant[0]) if row.time_constant[0] else np.inf, 0.0
+        if isinstance(spec, TriadSpec) and row.name == "bias_sd":
+            sd = float(np.hypot(sd, spec.bias_wander_sd))
+            walk = 2.0 * spec.bias_wander_sd**2 / spec.bias_time_constant_s
+        if row.states and (sd > 0.0 or row.least is not None):
+            blocks.append(Block(name or spec.name, row.states, row.unit, max(sd, row.least or 0.0), tau, np.inf, walk))
+    return blocks
 
-    # a wandering part beside a constant one: over times below its time constant it walks, and one error holds both
-    walk = 2.0 * spec.bias_wander_sd**2 / spec.bias_time_constant_s
-    return [
-        block("bias", unit, float(np.hypot(spec.bias_sd, spec.bias_wander_sd)), walk),
-        block("scale", "1", spec.scale_sd),
-        block("mount", "rad", spec.mount_sd_rad),
-    ]
+
+def imu_blocks(force: TriadSpec, rate: TriadSpec) -> list[Block]:
+    """Errors of both inertial triads, then their time biases: of both, or of neither where neither may err."""
+    blocks = instrument_blocks(ACCELEROMETER, replace(force, time_bias_sd_s=0.0))
+    blocks += instrument_blocks(RATES, replace(rate, time_bias_sd_s=0.0))
+    if max(force.time_bias_sd_s, rate.time_bias_sd_s) > 0.0:
+        blocks += [Block(spec.name, ("time bias",), "s", max(spec.time_bias_sd_s, 1e-9)) for spec in (force, rate)]
+    return blocks
 
 
-def clock_blocks(force: TriadSpec, rate: TriadSpec) -> list[Block]:
-    """Time biases of both triads; none where neither may err."""
-    if max(force.time_bias_sd_s, rate.time_bias_sd_s) <= 0.0:
-        return []
-    return [Block(spec.name, ("time bias",), "s", max(spec.time_bias_sd_s, 1e-9)) for spec in (force, rate)]
+def sun_blocks(spec: SunHeads) -> list[Block]:
+    """Errors of every head, counted from 1."""
+    heads = range(1, len(spec.clock_lv_rad) + 1)
+    return [block for k in heads for block in instrument_blocks(SUN, spec, f"{spec.name}{k}")]
 
 
 def ballistic_blocks(motion: MotionSpec) -> list[Block]:
@@ -160,60 +182,3 @@ def ballistic_blocks(motion: MotionSpec) -> list[Block]:
         Block("air", ("density",), "sd", 1.0, altitude_m=DENSITY_LENGTH_M),
         Block("air", ("wind north", "wind east"), "sd", 1.0, altitude_m=WIND_LENGTH_M),
     ]
-
-
-def radar_blocks(site: RadarSite) -> list[Block]:
-    """Errors of one radar (RCC 753-95); those that the flight file states none of are left out."""
-    name, tau = site.name, site.wander_time_constant_s
-    always = [
-        Block(name, ("range bias",), "m", max(site.range_bias_sd_m, 1e-6)),
-        Block(name, ("azimuth bias", "elevation bias"), "rad", max(site.angle_bias_sd_rad, 1e-12)),
-        Block(name, ("time bias",), "s", max(site.time_bias_sd_s, 1e-12)),
-    ]
-    stated = [
-        Block(name, ("tilt north", "tilt east"), "rad", site.mislevel_sd_rad),
-        Block(name, ("droop",), "rad", site.droop_sd_rad),
-        Block(name, ("skew",), "rad", site.skew_sd_rad),
-        Block(name, ("non-orthogonality",), "rad", site.nonorthogonality_sd_rad),
-        Block(name, ("traverse wander", "elevation wander"), "rad", site.wander_sd_rad, tau),
-        Block(name, ("refraction",), "1", site.refraction_sd),
-        Block(name, ("range scale",), "1", site.range_scale_sd),
-    ]
-    return always + [b for b in stated if b.prior_sd > 0.0]
-
-
-def gnss_blocks(spec: GnssSpec) -> list[Block]:
-    """Slowly wandering position error along north, east and down, and the latency of one receiver."""
-    axes = tuple(f"wander {axis}" for axis in ("north", "east", "down"))
-    blocks = [
-        Block(spec.name, axes, "m", spec.wander_sd_m, spec.wander_time_constant_s),
-        Block(spec.name, ("time bias",), "s", spec.time_bias_sd_s),
-    ]
-    return [b for b in blocks if b.prior_sd > 0.0]
-
-
-def barometer_blocks(spec: BarometerSpec) -> list[Block]:
-    """Errors of a height from air pressure."""
-    blocks = [
-        Block(spec.name, ("bias",), "m", spec.bias_sd_m),
-        Block(spec.name, ("scale",), "1", spec.scale_sd),
-        Block(spec.name, ("wander",), "m", spec.wander_sd_m, spec.wander_time_constant_s),
-        Block(spec.name, ("time bias",), "s", spec.time_bias_sd_s),
-    ]
-    return [b for b in blocks if b.prior_sd > 0.0]
-
-
-def magnetometer_blocks(spec: TriadSpec) -> list[Block]:
-    """Bias, scale and mount of a magnetometer, and the iron of the vehicle about it."""
-    iron = Block(spec.name, ("soft iron xy", "soft iron xz", "soft iron yz"), "1", spec.soft_iron_sd)
-    return triad_blocks(spec, "T") + ([iron] if spec.soft_iron_sd > 0.0 else [])
-
-
-def sun_blocks(spec: SunHeads) -> list[Block]:
-    """Bias and mounting of every head, counted from 1."""
-    blocks: list[Block] = []
-    for number in range(1, len(spec.clock_lv_rad) + 1):
-        head = f"{spec.name}{number}"
-        blocks.append(Block(head, ("bias across", "bias along"), "rad", spec.bias_sd_rad))
-        blocks.append(Block(head, tuple(f"mount {axis}" for axis in AXES), "rad", spec.mount_sd_rad))
-    return [b for b in blocks if b.prior_sd > 0.0]

@@ -1,40 +1,35 @@
-"""One inertial triad without its missing samples, and what bridging them costs.
+"""Which samples of an inertial sensor can be used, and what does bridging the others cost? Gaps, frozen data, offsets.
 
 White noise of ``sd`` per sample at ``rate`` hertz drives the integrals with density ``sd^2 / rate``; quantisation adds
-``resolution^2 / 12`` to the variance of a sample. Missing are samples without a value, blocks that repeat others and,
-axis by axis, samples that are frozen or displaced (below). What counts as a gap follows from the samples nearby: a
-logger may change its rate in flight. Between slow samples the straight line misses about a twelfth of their second
-difference.
+``resolution^2 / 12`` to the variance of a sample. Not used are samples without a value, blocks that repeat others and,
+axis by axis, frozen samples and transient offsets that the trackers do not support. What counts as a gap follows from
+the samples nearby: a logger may change its rate in flight. Between slow samples the straight line misses about a
+twelfth of their second difference.
 
-A gap is bridged by a cubic that meets level and slope on both sides, or, where the signal swings, by a line from the
-mean before to the mean after. What either may miss is measured, not guessed: the same bridge is laid over pieces of the
-same length in the neighbouring good data, and the scatter E of its integral there, from the worse side, becomes the
-density ``E^2 / length`` inside the gap. The bridge that misses less is taken, axis by axis. Displaced samples may be
-right for all that: there, the square of what the bridge differs from them adds to ``E^2``. At a stop every bridge
-misses to one side, all of ``n`` alike, so that their sum errs by ``n E`` and not by the root of ``n`` times ``E``: each
+**Gaps** are bridged by a cubic that meets level and slope on both sides, or, where the signal oscillates, by a line
+from the mean before to the mean after. The error of either is measured: the same bridge is laid over pieces of the same
+length in the neighbouring good data, and the scatter E of its integral there, from the worse side, becomes the density
+``E^2 / length`` inside the gap. The bridge with the smaller error is taken, axis by axis. Rejected offsets may be real
+motion for all that: there, the square of what the bridge differs from them adds to ``E^2``. At a stop every bridge
+errs to one side, all of ``n`` alike, so that their sum errs by ``n E`` and not by the root of ``n`` times ``E``: each
 counts ``n`` times.
 
-Which samples of an inertial sensor are good readings in the wrong place: moved away and back, or told again?
+**Frozen data.** White noise on a constant signal leaves a reading of step ``d`` at one value for ``n`` samples with
+probability ``P^(n - 1)``, at most ``P = erf(d / (2 sqrt(2) sd))``. Where the readings next to a run repeat more often
+than that (a slow signal, a logger faster than its sensor) their share is ``P``. A sensor whose steps are coarser than
+its noise may rest at one value for minutes, and is accepted; so is a run from the first sample on, which may be a
+vehicle at rest.
 
-A vehicle's motion does not jump from one sample to the next and jump back to where it would have been; an offset that
-comes and goes does, and so do blocks of samples in the wrong order. The jump between two samples is the difference of
-the parabolas through `REACH` samples on either side, carried to the middle. It is a jump where it stands out from the
-jumps nearby (or from the sensor's noise, where that is larger), and the samples between jumps whose sum is nothing are
-*displaced*. One jump alone may be the vehicle's own: a stage, a parachute. The pulse of a thruster comes and goes, too;
-so displaced samples are accepted where the trackers support them (`recon.unmodelled`), and where they are not accepted
-they still add to the process noise.
+**Repeated blocks.** A block of samples that is equal, in all axes, to one before it was sent twice under different
+times. Noise makes two readings equal with probability ``P`` as above.
 
-A block of samples that is the very same, in all axes, as one before it was sent twice under different times. Noise of
-deviation ``sd`` makes a reading of step ``d`` equal to another with probability ``erf(d / (2 sqrt(2) sd))`` at most.
-
-Which samples of an inertial sensor hold one value for longer than chance allows: frozen, or at a stop.
-
-White noise on a signal that stands still leaves a reading of step ``d`` at one value for ``n`` samples with probability
-``P^(n - 1)``, at most ``P = erf(d / (2 sqrt(2) sd))``. Where the readings next to a run repeat more often than that (a
-slow signal, a logger faster than its sensor) their share is ``P``. A sensor whose steps are coarser than its noise may
-rest at one value for minutes, and is believed.
-
-A run from the first sample on may be a vehicle at rest, and is believed too.
+**Transient offsets.** A vehicle's motion does not jump from one sample to the next and jump back to where it would have
+been; a transient offset does, and so do blocks of samples in the wrong order. The jump between two samples is the
+difference of the parabolas through `_REACH` samples on either side, carried to the middle. It is one where it exceeds
+the jumps nearby (or the sensor's noise, where that is larger) by far, and the samples between jumps whose sum is zero
+are a transient offset. One jump alone may be the vehicle's own: a stage, a parachute. The pulse of a thruster comes and
+goes, too; so offsets are accepted where the trackers support them (`recon.abrupt_offsets`), and where they are not
+accepted they still add to the process noise.
 """
 
 from __future__ import annotations
@@ -51,17 +46,17 @@ from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import Finding, TriadRecord
 from recon.state import IntArray
 
-SLOPE_SPAN_S = 0.06
-NEARBY_STEPS = 31  # of which the median is the usual step
-SLOWER = 1.5  # than the record's own usual step
-GAP, LONG_GAP = 1.5, 4.5  # usual steps: a straight line serves up to the second, as good as the signal is smooth
-LEAST_SAMPLES = 10
-AXES = "xyz"
+_SLOPE_SPAN_S = 0.06
+_NEARBY_STEPS = 31  # of which the median is the usual step
+_SLOWER = 1.5  # than the record's own usual step
+_GAP, _LONG_GAP = 1.5, 4.5  # usual steps: a straight line serves up to the second, as good as the signal is smooth
+_LEAST_SAMPLES = 10
+_AXES = "xyz"
 
 
 @dataclass(frozen=True)
-class Bridged:
-    """One triad without its missing samples.
+class BridgedSensor:
+    """One inertial sensor (accelerometer or gyros, three axes) without its missing samples.
 
     Parameters
     ----------
@@ -72,8 +67,8 @@ class Bridged:
     in_gap : (n,) bool
         Whether the interval from each time to the next lies in a gap of any axis.
     findings : tuple of Finding
-    displaced : tuple of Displaced
-        Samples, believed or not, that jump away and back.
+    offsets : tuple of TransientOffset
+        All that were found, whether accepted or not.
     """
 
     spec: TriadSpec
@@ -82,27 +77,27 @@ class Bridged:
     density: FloatArray
     in_gap: BoolArray
     findings: tuple[Finding, ...]
-    displaced: tuple[Displaced, ...] = ()
+    offsets: tuple[TransientOffset, ...] = ()
 
 
-class Unused(NamedTuple):
-    """What is bridged: all times (n,), doubted values, else NaN, and at which stop samples are, 0 none (both n, k)."""
+class _Unused(NamedTuple):
+    """What is bridged: all times (n,), rejected values, else NaN, and at which stop samples are, 0 none (both n, k)."""
 
     time_s: FloatArray
-    doubted: FloatArray
+    rejected: FloatArray
     stop: IntArray
 
 
-def bridge(record: TriadRecord, triad: int = 0, doubted: tuple[Displaced, ...] = ()) -> Bridged:
-    """Bridge the gaps of one triad and say where noise grows with them.
+def bridge(record: TriadRecord, sensor: int = 0, rejected: tuple[TransientOffset, ...] = ()) -> BridgedSensor:
+    """Bridge the gaps of one sensor and enlarge the noise density in them.
 
     Parameters
     ----------
     record : TriadRecord
-    triad : int
+    sensor : int
         0 for the accelerometer, 1 for the gyros.
-    doubted : tuple of Displaced
-        Displaced samples that are not believed; all others are.
+    rejected : tuple of TransientOffset
+        Those that are not used; all others are.
 
     Raises
     ------
@@ -111,80 +106,83 @@ def bridge(record: TriadRecord, triad: int = 0, doubted: tuple[Displaced, ...] =
     """
     spec = record.spec
     t, x, good, findings = _usable(record)
-    displaced = _displaced(spec, t, x, good, triad)
-    suspect = _doubt(t, x, good, [d for d in doubted if d in displaced], findings, spec.name)
+    offsets = _find_offsets(spec, t, x, good, sensor)
+    excluded = _exclude(t, x, good, [d for d in rejected if d in offsets], findings, spec.name)
     stop = _at_a_stop(x, good)
     grid = _with_bridges(t)
     column, density = np.empty((len(grid), 3)), np.empty((len(grid), 3))
     in_gap = np.zeros(len(grid), dtype=bool)
-    told: dict[tuple[float, float], dict[str, float]] = {}
+    errors: dict[tuple[float, float], dict[str, float]] = {}
     masks: list[BoolArray] = list(np.unique(good, axis=1).T)  # axes that miss the same samples are bridged together
     for mask in masks:
         axes = np.flatnonzero((good == mask[:, None]).all(axis=0))
-        column[:, axes], density[:, axes], gaps, missed = _bridge_axes(
-            spec, t[mask], x[np.ix_(mask, axes)], grid, Unused(t, suspect[:, axes], stop[:, axes])
+        column[:, axes], density[:, axes], gaps, sizes_by_span = _bridge_axes(
+            spec, t[mask], x[np.ix_(mask, axes)], grid, _Unused(t, excluded[:, axes], stop[:, axes])
         )
         in_gap |= gaps
-        for span, sizes in missed.items():
-            told.setdefault(span, {}).update(zip((AXES[a] for a in axes), sizes, strict=True))
-    for (start, end), lost in sorted(told.items()):
+        for span, sizes in sizes_by_span.items():
+            errors.setdefault(span, {}).update(zip((_AXES[a] for a in axes), sizes, strict=True))
+    for (start, end), lost in sorted(errors.items()):
         names = ", ".join(sorted(lost))
         which = "samples" if len(lost) == 3 else f"usable samples of {names}"
-        words = f"no {which} for {end - start:.3f} s, bridged; integral over the gap uncertain by "
-        words += ", ".join(f"{lost[a]:.3g}" for a in sorted(lost)) + f" (SI; sensor {names})"
-        findings.append(Finding(spec.name, words, start, end))
+        remark = f"no {which} for {end - start:.3f} s, bridged; 1 sd of the integral over the gap "
+        remark += ", ".join(f"{lost[a]:.3g}" for a in sorted(lost)) + f" (SI; sensor {names})"
+        findings.append(Finding(spec.name, remark, start, end, "gap-bridged"))
     density = density @ (spec.dcm_body_sensor**2).T
-    return Bridged(spec, grid, column, density, in_gap, tuple(findings), displaced)
+    return BridgedSensor(spec, grid, column, density, in_gap, tuple(findings), offsets)
 
 
 def _usable(record: TriadRecord) -> tuple[FloatArray, FloatArray, BoolArray, list[Finding]]:
-    """Times, samples and which of them are good (n, 3), from the first to the last time that every axis tells."""
+    """Times, samples and which of them are good (n, 3), from the first to the last time that all axes measure."""
     t, x, spec = record.time_s, record.measured_sensor, record.spec
     good = np.isfinite(x)
-    findings = _left_out_as_repeated(spec, t, x, good)
+    findings = _exclude_repeated(spec, t, x, good)
     for axis in range(3):
         there = np.flatnonzero(good[:, axis])
-        good[there, axis] = ~stuck_samples(x[there, axis], spec.noise_sd)
+        good[there, axis] = ~frozen_samples(x[there, axis], spec.noise_sd)
         count = int(good[:, axis].sum())
-        if count < LEAST_SAMPLES:
-            one = len(there) >= LEAST_SAMPLES
+        if count < _LEAST_SAMPLES:
+            one = len(there) >= _LEAST_SAMPLES
             why = f"all {len(there)} samples hold one value" if one else f"only {count} usable samples"
-            raise GateError(f"{spec.name}: sensor axis {AXES[axis]}: {why}; check its columns and units")
+            what = f"{spec.name}: sensor axis {_AXES[axis]}: {why}; check its columns and units"
+            raise GateError(what, code="sensor-axis-unusable")
     inside = [np.flatnonzero(g) for g in good.T]
     first, last = max(int(k[0]) for k in inside), min(int(k[-1]) for k in inside)
     rows = np.arange(len(t))
     rows = rows[(rows >= first) & (rows <= last) & good.any(axis=1)]
-    ended = [AXES[a] for a in range(3) if np.isfinite(x[last + 1 :, a]).any() and inside[a][-1] == last]
-    if ended and last < len(t) - LEAST_SAMPLES:
-        words = f"{', '.join(ended)} holds one value to the end of the record: the trajectory ends before it"
-        findings.append(Finding(spec.name, words, float(t[last]), float(t[-1])))
+    ended = [_AXES[a] for a in range(3) if np.isfinite(x[last + 1 :, a]).any() and inside[a][-1] == last]
+    if ended and last < len(t) - _LEAST_SAMPLES:
+        remark = f"{', '.join(ended)} frozen at one value to the end of the record: the trajectory ends before it"
+        findings.append(Finding(spec.name, remark, float(t[last]), float(t[-1]), "frozen-data"))
     return t[rows], x[rows], good[rows], findings
 
 
-def _displaced(spec: TriadSpec, t: FloatArray, x: FloatArray, good: BoolArray, triad: int) -> tuple[Displaced, ...]:
-    """All runs of good samples (n, 3) that jump away and back."""
+def _find_offsets(
+    spec: TriadSpec, t: FloatArray, x: FloatArray, good: BoolArray, sensor: int
+) -> tuple[TransientOffset, ...]:
+    """All transient offsets among the good samples (n, 3)."""
     out = []
     for axis in range(3):
         rows = np.flatnonzero(good[:, axis])
-        for a, b, offset in displaced_runs(t[rows], x[rows, axis], spec.noise_sd):
-            out.append(Displaced(triad, axis, float(t[rows[a]]), float(t[rows[b]]), offset))
+        for a, b, offset in transient_offsets(t[rows], x[rows, axis], spec.noise_sd):
+            out.append(TransientOffset(sensor, axis, float(t[rows[a]]), float(t[rows[b]]), offset))
     return tuple(out)
 
 
-def _doubt(
-    t: FloatArray, x: FloatArray, good: BoolArray, doubted: list[Displaced], findings: list[Finding], name: str
+def _exclude(
+    t: FloatArray, x: FloatArray, good: BoolArray, rejected: list[TransientOffset], findings: list[Finding], name: str
 ) -> FloatArray:
-    """Take doubted samples out of ``good`` (n, 3), in place, and return them; NaN where there is none (n, 3)."""
+    """Take rejected samples out of ``good`` (n, 3), in place, and return them; NaN where there is none (n, 3)."""
     out = np.full(x.shape, np.nan)
-    for d in doubted:
+    for d in rejected:
         rows = np.flatnonzero((t >= d.start_s) & (t <= d.end_s) & good[:, d.axis])
         out[rows, d.axis], good[rows, d.axis] = x[rows, d.axis], False
-        words = f"{AXES[d.axis]} jumps by about {d.offset:.3g} (SI) and back: not used, but reckoned with"
-        findings.append(Finding(name, words, d.start_s, d.end_s))
+        remark = f"transient offset of {_AXES[d.axis]} by about {d.offset:.3g} (SI): excluded; added to process noise"
+        findings.append(Finding(name, remark, d.start_s, d.end_s, "transient-offset"))
     return out
 
 
-def _left_out_as_repeated(spec: TriadSpec, t: FloatArray, x: FloatArray, good: BoolArray) -> list[Finding]:
+def _exclude_repeated(spec: TriadSpec, t: FloatArray, x: FloatArray, good: BoolArray) -> list[Finding]:
     """Take blocks of samples that repeat others out of ``good`` (n, 3), in place; one finding for each."""
     whole = np.flatnonzero(good.all(axis=1))
     repeated, blocks = repeated_samples(x[whole], spec.noise_sd)
@@ -192,9 +190,10 @@ def _left_out_as_repeated(spec: TriadSpec, t: FloatArray, x: FloatArray, good: B
     return [
         Finding(
             spec.name,
-            f"{b - a + 1} samples repeat those from {t[whole[a0]]:.3f} s on under other times: not used",
+            f"{b - a + 1} samples repeat those from {t[whole[a0]]:.3f} s on under other times: excluded",
             float(t[whole[a]]),
             float(t[whole[b]]),
+            "repeated-block",
         )
         for a, b, a0 in blocks
     ]
@@ -205,37 +204,37 @@ def _with_bridges(t: FloatArray) -> FloatArray:
     step = np.diff(t)
     usual = usual_steps(step)
     extra = [t]
-    for k in np.flatnonzero(step > LONG_GAP * usual).tolist():
+    for k in np.flatnonzero(step > _LONG_GAP * usual).tolist():
         times = t[k] + np.arange(1, int(np.ceil(step[k] / usual[k] - 0.5))) * usual[k]
         extra.append(times[times < t[k + 1] - 0.5 * usual[k]])
     return np.sort(np.concatenate(extra), kind="stable")
 
 
 def _bridge_axes(
-    spec: TriadSpec, t: FloatArray, x: FloatArray, grid: FloatArray, unused: Unused
+    spec: TriadSpec, t: FloatArray, x: FloatArray, grid: FloatArray, unused: _Unused
 ) -> tuple[FloatArray, FloatArray, BoolArray, dict[tuple[float, float], FloatArray]]:
-    """Samples (n, k) on the grid, densities (n, k) in sensor axes, gaps (n,), and what each long bridge may miss."""
+    """Samples (n, k) on the grid, densities (n, k) in sensor axes, gaps (n,), and the error of each long bridge."""
     step = np.diff(t)
     usual = usual_steps(step)
     sample_var = max(spec.noise_sd**2 + spec.resolution**2 / 12.0, 1e-24)
-    density = sample_var * np.append(usual, usual[-1])[:, None] + _between_slow(x, usual)
+    density = sample_var * np.append(usual, usual[-1])[:, None] + _interpolation_density(x, usual)
     wide = np.zeros(len(t), dtype=bool)
-    wide[:-1] = step > GAP * usual
+    wide[:-1] = step > _GAP * usual
     density[:-1][wide[:-1]] = sample_var * step[wide[:-1], None]
     column = np.column_stack([np.interp(grid, t, axis) for axis in x.T])
-    missed = {}
-    gaps = np.flatnonzero(step > LONG_GAP * usual)
-    alike = _missed_alike(unused, t[gaps], t[gaps + 1])
-    for k, times in zip(gaps.tolist(), alike, strict=True):
-        sizes, swings = _missed_sd(t, x, k, step[k])
+    errors = {}
+    gaps = np.flatnonzero(step > _LONG_GAP * usual)
+    same_side = _same_side_count(unused, t[gaps], t[gaps + 1])
+    for k, times in zip(gaps.tolist(), same_side, strict=True):
+        sizes, oscillates = _bridge_error_sd(t, x, k, step[k])
         a, b = np.searchsorted(grid, [t[k], t[k + 1]])
         cubic, line = _bridges(t, x, k, k + 1, grid[a + 1 : b])
-        column[a + 1 : b] = np.where(swings, line, cubic)
-        sizes = np.hypot(sizes, _differs(unused, grid[a : b + 1], column[a : b + 1])) * np.sqrt(times)
+        column[a + 1 : b] = np.where(oscillates, line, cubic)
+        sizes = np.hypot(sizes, _difference_from_rejected(unused, grid[a : b + 1], column[a : b + 1])) * np.sqrt(times)
         density[k] += sizes**2 / step[k]
-        missed[float(t[k]), float(t[k + 1])] = sizes
+        errors[float(t[k]), float(t[k + 1])] = sizes
     held = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
-    return column, density[held], wide[held], missed
+    return column, density[held], wide[held], errors
 
 
 def _at_a_stop(x: FloatArray, good: BoolArray) -> IntArray:
@@ -245,47 +244,47 @@ def _at_a_stop(x: FloatArray, good: BoolArray) -> IntArray:
     return high.astype(np.int64) - low.astype(np.int64)
 
 
-def _missed_alike(unused: Unused, start_s: FloatArray, end_s: FloatArray) -> IntArray:
-    """How many gaps (g, k) from ``start_s`` to ``end_s`` are missed to the same side as each: those at one stop."""
+def _same_side_count(unused: _Unused, start_s: FloatArray, end_s: FloatArray) -> IntArray:
+    """How many gaps (g, k) from ``start_s`` to ``end_s`` err to the same side as each: those at one stop."""
     middle = np.searchsorted(unused.time_s, 0.5 * (start_s + end_s)) - 1
     side = unused.stop[middle]
     return np.where(side > 0, (side > 0).sum(axis=0), np.where(side < 0, (side < 0).sum(axis=0), 1))
 
 
-def _differs(unused: Unused, grid: FloatArray, bridge: FloatArray) -> FloatArray:
-    """Integral (k,) over a gap of what doubted samples, where there are any, differ from its bridge (g, k)."""
+def _difference_from_rejected(unused: _Unused, grid: FloatArray, bridge: FloatArray) -> FloatArray:
+    """Integral (k,) over a gap of what rejected samples, where there are any, differ from its bridge (g, k)."""
     a, b = np.searchsorted(unused.time_s, [grid[0], grid[-1]], side="right")
-    t, values = unused.time_s[a : b - 1], unused.doubted[a : b - 1]
+    t, values = unused.time_s[a : b - 1], unused.rejected[a : b - 1]
     if len(t) == 0:
         return np.zeros(bridge.shape[1])
-    apart = values - np.column_stack([np.interp(t, grid, axis) for axis in bridge.T])
+    off = values - np.column_stack([np.interp(t, grid, axis) for axis in bridge.T])
     step = (grid[-1] - grid[0]) / (len(t) + 1)
-    return np.asarray(np.abs(np.nansum(apart, axis=0)) * step)
+    return np.asarray(np.abs(np.nansum(off, axis=0)) * step)
 
 
 def usual_steps(step: FloatArray) -> FloatArray:
-    """Step (n,) that is usual about each step, the median of `NEARBY_STEPS`."""
+    """Step (n,) that is usual about each step, the median of `_NEARBY_STEPS`."""
     from scipy.ndimage import median_filter
 
-    return np.asarray(median_filter(step, size=min(NEARBY_STEPS, len(step)), mode="nearest"))
+    return np.asarray(median_filter(step, size=min(_NEARBY_STEPS, len(step)), mode="nearest"))
 
 
-def _between_slow(x: FloatArray, usual: FloatArray) -> FloatArray:
-    """Density (n, k) of what a straight line misses where samples come slower than the record's usual."""
+def _interpolation_density(x: FloatArray, usual: FloatArray) -> FloatArray:
+    """Density (n, k) of the error of a straight line where samples come slower than the record's usual."""
     out = np.zeros(x.shape)
-    slow = np.flatnonzero(usual > SLOWER * float(np.median(usual)))
+    slow = np.flatnonzero(usual > _SLOWER * float(np.median(usual)))
     slow = slow[(slow > 0) & (slow < len(x) - 1)]
-    bend = x[slow + 1] - 2.0 * x[slow] + x[slow - 1]
-    out[slow] = (bend / 12.0) ** 2 * usual[slow, None]
+    second_difference = x[slow + 1] - 2.0 * x[slow] + x[slow - 1]
+    out[slow] = (second_difference / 12.0) ** 2 * usual[slow, None]
     return out
 
 
 def _level_and_slope(t: FloatArray, x: FloatArray, at: int, side: int) -> tuple[FloatArray, FloatArray]:
     """Level and slope at sample ``at`` of a parabola through the samples on one side (-1 before, +1 after)."""
-    far = at + side * max(6, int(SLOPE_SPAN_S / max(abs(t[min(at + 1, len(t) - 1)] - t[at - 1]) / 2.0, 1e-4)))
+    far = at + side * max(6, int(_SLOPE_SPAN_S / max(abs(t[min(at + 1, len(t) - 1)] - t[at - 1]) / 2.0, 1e-4)))
     lo, hi = max(0, min(at, far)), min(len(t), max(at, far) + 1)
     tau = t[lo:hi] - t[at]
-    keep = np.abs(tau) <= 3.0 * SLOPE_SPAN_S  # not across another gap
+    keep = np.abs(tau) <= 3.0 * _SLOPE_SPAN_S  # not across another gap
     if keep.sum() < 4:
         return x[at], np.zeros(x.shape[1])
     coefficients = np.polynomial.polynomial.polyfit(tau[keep], x[lo:hi][keep], 2)
@@ -315,8 +314,8 @@ def _bridges(t: FloatArray, x: FloatArray, before: int, after: int, times: Float
     return cubic, m0 + ((times - t0) / (t1 - t0))[:, None] * (m1 - m0)
 
 
-def _missed_sd(t: FloatArray, x: FloatArray, k: int, length: float) -> tuple[FloatArray, BoolArray]:
-    """What the better bridge of the gap after sample ``k`` may miss of the integral (k,), and where it is the line."""
+def _bridge_error_sd(t: FloatArray, x: FloatArray, k: int, length: float) -> tuple[FloatArray, BoolArray]:
+    """Error sd (k,) of the better bridge's integral over the gap after sample ``k``, and where that is the line."""
     worse = np.zeros((2, x.shape[1]))
     found = False
     reach = max(2.0, 4.0 * length)
@@ -332,35 +331,37 @@ def _missed_sd(t: FloatArray, x: FloatArray, k: int, length: float) -> tuple[Flo
         if len(misses) >= 3:
             found = True
             worse = np.maximum(worse, np.sqrt(np.mean(np.square(misses), axis=0)))
-    if not found:  # nothing to learn from nearby: as if the signal could do anything it did in the whole record
+    if not found:  # no good data nearby: the scatter of the whole record
         return np.std(x, axis=0) * length, np.zeros(x.shape[1], dtype=bool)
     return worse.min(axis=0), np.asarray(worse[1] < worse[0])
 
 
-REACH = 6  # samples of the parabola on either side
-NEARBY, BESIDE = 201, 41  # jumps whose median size is the usual one: about a jump, and on either side of it
-STANDS_OUT = 7.0  # sd; a record of a million samples of white noise holds none
-NOTHING = 4.0  # sd of the sum of jumps that cancel
-LONGEST_S = 10.0
-UNEVEN = 0.25  # of the usual step: by no more do the steps about a jump differ
-LEAST_REPEATED = 10
-HASH = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)  # odd, of mixed bits
-SEED = 10  # samples in a row by which a block is found
+# ---- transient offsets
+
+_REACH = 6  # samples of the parabola on either side
+_NEARBY, _BESIDE = 201, 41  # jumps whose median size is the usual one: about a jump, and on either side of it
+_LEAST_JUMP_SD = 7.0  # a record of a million samples of white noise holds none
+_CANCEL_SD = 4.0  # of the sum of jumps that cancel
+_LONGEST_S = 10.0
+_UNEVEN = 0.25  # of the usual step: by no more do the steps about a jump differ
+_LEAST_REPEATED = 10
+_HASH = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)  # odd, of mixed bits
+_SEED = 10  # samples in a row by which a block is found
 
 
 @dataclass(frozen=True)
-class Displaced:
-    """Readings of one axis of a triad (0 accelerometer, 1 gyros) that jump away and back, by ``offset`` on average."""
+class TransientOffset:
+    """Readings of one axis of a sensor (0 accelerometer, 1 gyros) that jump away and back, by ``offset`` on average."""
 
-    triad: int
+    sensor: int
     axis: int
     start_s: float
     end_s: float
     offset: float
 
 
-def displaced_runs(time_s: FloatArray, column: FloatArray, noise_sd: float) -> list[tuple[int, int, float]]:
-    """First and last sample of each run between jumps that cancel, and the mean offset that the jumps tell.
+def transient_offsets(time_s: FloatArray, column: FloatArray, noise_sd: float) -> list[tuple[int, int, float]]:
+    """First and last sample of each run between jumps that cancel, and the mean offset by the jumps.
 
     Parameters
     ----------
@@ -370,15 +371,15 @@ def displaced_runs(time_s: FloatArray, column: FloatArray, noise_sd: float) -> l
         White noise of a sample, in the column's unit.
     """
     out: list[tuple[int, int, float]] = []
-    if len(column) < 4 * REACH:
+    if len(column) < 4 * _REACH:
         return out
     size, sd = _jumps(time_s, column, noise_sd)
-    at = _where_they_stand_out(size, sd)
+    at = _significant_jumps(size, sd)
     first = 0
     while first < len(at) - 1:
-        near = at[first:][time_s[at[first:]] - time_s[at[first]] <= LONGEST_S]
+        near = at[first:][time_s[at[first:]] - time_s[at[first]] <= _LONGEST_S]
         offset, offset_sd = np.cumsum(size[near]), np.sqrt(np.cumsum(sd[near] ** 2))
-        closes = np.flatnonzero(np.abs(offset[1:]) < NOTHING * offset_sd[1:])
+        closes = np.flatnonzero(np.abs(offset[1:]) < _CANCEL_SD * offset_sd[1:])
         if len(closes):
             last = int(closes[0]) + 1
             mean = np.average(offset[:last], weights=np.diff(time_s[near[: last + 1]]))
@@ -393,31 +394,31 @@ def _jumps(time_s: FloatArray, column: FloatArray, noise_sd: float) -> tuple[Flo
     from scipy.ndimage import median_filter, minimum_filter
 
     n = len(column)
-    reach = -(np.arange(REACH) + 0.5)
+    reach = -(np.arange(_REACH) + 0.5)
     weight = np.linalg.pinv(np.vander(reach, 3, increasing=True))[0]
     size = np.zeros(n - 1)
     for i, w in enumerate(weight):
-        size[REACH - 1 : n - REACH] += w * (
-            column[REACH + i : n - REACH + 1 + i] - column[REACH - 1 - i : n - REACH - i]
+        size[_REACH - 1 : n - _REACH] += w * (
+            column[_REACH + i : n - _REACH + 1 + i] - column[_REACH - 1 - i : n - _REACH - i]
         )
-    usual = 1.4826 * median_filter(np.abs(size), size=min(NEARBY, len(size)), mode="nearest")
-    beside = 1.4826 * median_filter(np.abs(size), size=min(BESIDE, len(size)), mode="nearest")
-    k, away = np.arange(len(size)), REACH + BESIDE // 2 + 1
+    usual = 1.4826 * median_filter(np.abs(size), size=min(_NEARBY, len(size)), mode="nearest")
+    beside = 1.4826 * median_filter(np.abs(size), size=min(_BESIDE, len(size)), mode="nearest")
+    k, away = np.arange(len(size)), _REACH + _BESIDE // 2 + 1
     for there in (np.maximum(k - away, 0), np.minimum(k + away, len(size) - 1)):
-        usual = np.maximum(usual, beside[there])  # where shaking begins, all are jumps
+        usual = np.maximum(usual, beside[there])  # where vibration begins, all are jumps
     step = np.diff(time_s)
-    even = np.abs(step / np.median(step) - 1.0) < UNEVEN
-    size[~minimum_filter(even, size=2 * REACH, mode="nearest")] = 0.0
+    even = np.abs(step / np.median(step) - 1.0) < _UNEVEN
+    size[~minimum_filter(even, size=2 * _REACH, mode="nearest")] = 0.0
     least = noise_sd * np.sqrt(2.0 * np.sum(weight**2))
     return size, np.maximum(np.maximum(usual, least), np.finfo(float).tiny)
 
 
-def _where_they_stand_out(size: FloatArray, sd: FloatArray) -> IntArray:
+def _significant_jumps(size: FloatArray, sd: FloatArray) -> IntArray:
     """Jumps (k,) larger than chance and than any other within reach."""
     from scipy.ndimage import maximum_filter
 
     height = np.abs(size) / sd
-    return np.flatnonzero((height > STANDS_OUT) & (height == maximum_filter(height, size=4 * REACH - 1)))
+    return np.flatnonzero((height > _LEAST_JUMP_SD) & (height == maximum_filter(height, size=4 * _REACH - 1)))
 
 
 def repeated_samples(measured: FloatArray, noise_sd: float) -> tuple[BoolArray, list[tuple[int, int, int]]]:
@@ -434,11 +435,11 @@ def repeated_samples(measured: FloatArray, noise_sd: float) -> tuple[BoolArray, 
     moving = np.append(True, (measured[1:] != measured[:-1]).any(axis=1))
     likely = float(np.prod([repeat_by_noise(column, noise_sd) for column in measured.T]))
     with np.errstate(divide="ignore"):
-        least = max(LEAST_REPEATED, np.log(CHANCE / max(n, 1) ** 2) / np.log(min(likely, 1.0 - 1e-9)))
+        least = max(_LEAST_REPEATED, np.log(_CHANCE / max(n, 1) ** 2) / np.log(min(likely, 1.0 - 1e-9)))
     lag = _lag_to_the_same(measured)
     blocks = []
     for a, b in zip(*runs(np.append(False, (lag[1:] == lag[:-1]) & (lag[1:] > 1))), strict=True):
-        if out[b] or moving[a - 1 : b + 1].sum() < min(least, SEED):
+        if out[b] or moving[a - 1 : b + 1].sum() < min(least, _SEED):
             continue
         # by chance one of its samples may repeat a nearer one, too, so that the block falls into parts
         shift = int(lag[b])
@@ -455,7 +456,7 @@ def repeated_samples(measured: FloatArray, noise_sd: float) -> tuple[BoolArray, 
 def _lag_to_the_same(measured: FloatArray) -> IntArray:
     """How many samples before each (n,) the nearest one stands that is equal in all axes; 0 for none."""
     bits = np.ascontiguousarray(measured + 0.0).view(np.uint64)  # -0 becomes 0
-    mark = bits[:, 0] * HASH[0] + bits[:, 1] * HASH[1] + bits[:, 2] * HASH[2]
+    mark = bits[:, 0] * _HASH[0] + bits[:, 1] * _HASH[1] + bits[:, 2] * _HASH[2]
     order = np.argsort(mark, kind="stable")
     lag = np.zeros(len(measured), dtype=np.int64)
     follows = (measured[order[1:]] == measured[order[:-1]]).all(axis=1)
@@ -463,15 +464,17 @@ def _lag_to_the_same(measured: FloatArray) -> IntArray:
     return lag
 
 
-LEAST_FROZEN_SAMPLES = 5
-NEIGHBOURS, LEAST_NEIGHBOURS = 200, 20  # readings on either side that tell how often values repeat
-CHANCE = 1e-6  # of one such run in a whole record
-CHANCE_AT_STOP = 1e-3  # of one among the runs at a column's largest or smallest value, which a stop explains
-SAME_STEP = 1e-9  # of the largest value: two readings closer than this differ by rounding
+# ---- frozen data
+
+_LEAST_FROZEN_SAMPLES = 5
+_NEIGHBOURS, _LEAST_NEIGHBOURS = 200, 20  # readings on either side that show how often values repeat
+_CHANCE = 1e-6  # of one such run in a whole record
+_CHANCE_AT_STOP = 1e-3  # of one among the runs at a column's largest or smallest value, which a stop explains
+_SAME_STEP = 1e-9  # of the largest value: two readings closer than this differ by rounding
 
 
-def stuck_samples(column: FloatArray, noise_sd: float) -> BoolArray:
-    """Samples (n,) of a column that tell nothing new; NaN is equal to nothing.
+def frozen_samples(column: FloatArray, noise_sd: float) -> BoolArray:
+    """Samples (n,) of a column that are frozen at one value for longer than chance allows; NaN equals nothing.
 
     Parameters
     ----------
@@ -483,18 +486,18 @@ def stuck_samples(column: FloatArray, noise_sd: float) -> BoolArray:
     same = column[1:] == column[:-1]
     first, last = runs(same)
     last = last + 1
-    long = last - first + 1 >= LEAST_FROZEN_SAMPLES
+    long = last - first + 1 >= _LEAST_FROZEN_SAMPLES
     first, last = first[long & (first > 0)], last[long & (first > 0)]
     if not len(first):
-        out[:] = bool(len(column) >= LEAST_FROZEN_SAMPLES and same.all() and noise_sd > 0.0)
+        out[:] = bool(len(column) >= _LEAST_FROZEN_SAMPLES and same.all() and noise_sd > 0.0)
         return out
     chance = np.maximum(repeat_by_noise(column, noise_sd), _repeat_nearby(same, first, last))
     with np.errstate(divide="ignore"):
         surprise = (last - first) * np.log(chance)
     at_stop = (column[first] == np.nanmin(column)) | (column[first] == np.nanmax(column))
-    stuck = surprise < np.log(CHANCE / len(column))
-    stuck |= at_stop & (surprise < np.log(CHANCE_AT_STOP / max(1, int(at_stop.sum()))))
-    for a, b in zip(first[stuck], last[stuck], strict=True):
+    frozen = surprise < np.log(_CHANCE / len(column))
+    frozen |= at_stop & (surprise < np.log(_CHANCE_AT_STOP / max(1, int(at_stop.sum()))))
+    for a, b in zip(first[frozen], last[frozen], strict=True):
         out[a : b + 1] = True
     return out
 
@@ -504,7 +507,7 @@ def repeat_by_noise(column: FloatArray, noise_sd: float) -> float:
     if noise_sd <= 0.0:
         return 1.0
     steps = np.abs(np.diff(column))
-    steps = steps[steps > SAME_STEP * np.nanmax(np.abs(column))]
+    steps = steps[steps > _SAME_STEP * np.nanmax(np.abs(column))]
     return float(erf(steps.min() / (2.0 * np.sqrt(2.0) * noise_sd))) if len(steps) else 1.0
 
 
@@ -514,8 +517,8 @@ def _repeat_nearby(same: BoolArray, first: IntArray, last: IntArray) -> FloatArr
 
     def share(low: IntArray, high: IntArray) -> FloatArray:
         size = high - low
-        return np.where(size >= LEAST_NEIGHBOURS, (count[high] - count[low] + 1.0) / (size + 2.0), 0.0)
+        return np.where(size >= _LEAST_NEIGHBOURS, (count[high] - count[low] + 1.0) / (size + 2.0), 0.0)
 
-    before = share(np.maximum(first - 1 - NEIGHBOURS, 0), np.maximum(first - 1, 0))
-    after = share(np.minimum(last + 1, len(same)), np.minimum(last + 1 + NEIGHBOURS, len(same)))
+    before = share(np.maximum(first - 1 - _NEIGHBOURS, 0), np.maximum(first - 1, 0))
+    after = share(np.minimum(last + 1, len(same)), np.minimum(last + 1 + _NEIGHBOURS, len(same)))
     return np.asarray(np.maximum(before, after))

@@ -1,22 +1,23 @@
-"""What each instrument should have read, how that changes with the state, and how noisy it is.
+"""What should each instrument have measured, how does that change with the state, and how large is its noise?
 
-A tracked point at ``d`` from the accelerometer in body axes, tagged ``t``, was seen at ``t - tau`` (``tau``: time tag
-minus true time), so
+A tracked point at ``d`` from the accelerometer in body axes, tagged ``t``, was observed at ``t - tau`` (``tau``: time
+tag minus true time), so
 
     p = r + C d - tau (v + C (w x d)) + tau^2 a / 2
 
 with ``w`` the body's rate against the Earth and ``a`` the acceleration. Then, each plus its errors and noise:
 
-* radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95) and what is left of
-  the air's bending, ``N cot(E)`` for a ray through the whole air;
+* radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95) and residual
+  refraction, ``N cot(E)`` for a ray through the whole atmosphere;
 * receiver: ``p`` north, east and down of a reference, and its velocity along the same axes;
 * barometer: geodetic height of ``p``;
 * magnetometer: ``S R(m)^T D^T C^T B + b``, S with scales and soft iron, m the mounting rotation, D its nominal axes;
 * Sun head: azimuth and elevation of ``R(m)^T D^T C^T s``.
 
 A tracker's angle noise is noise of its line of sight: ``angle_sd`` in elevation and in traverse, hence
-``angle_sd / cos(elevation)`` in azimuth. `Settings.angle_noise` says ``"axis"`` for a radar whose azimuth readings
-scatter by ``angle_sd`` at any elevation.
+``angle_sd / cos(elevation)`` in azimuth. `Settings.angle_noise` is ``"axis"`` for a radar whose azimuth readings
+scatter by ``angle_sd`` at any elevation. The numpy form below serves the filterpy engine; compiled:
+`recon._measurement_kernels`.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flightmodel import earth, rotations
+from flightmodel import earth, instruments, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
 from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, SLOTS, SUN, VELOCITY
-from recon.error_model import AXES, ErrorModel
+from recon.error_model import ErrorModel
 from recon.state import IntArray, right_jacobian
 
-SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
+_SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {
     RADAR: ("range", "azimuth", "elevation"),
     POSITION: ("north", "east", "down"),
@@ -41,21 +42,15 @@ COMPONENTS = {
     FIELD: ("field x", "field y", "field z"),
     SUN: ("azimuth", "elevation"),
 }
-_WANDER = ("wander north", "wander east", "wander down", "time bias")
+# time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
-    RADAR: (
-        "range bias", "azimuth bias", "elevation bias", "time bias", "tilt north", "tilt east", "droop", "skew",
-        "non-orthogonality", "traverse wander", "elevation wander", "refraction", "range scale",
-    ),
-    POSITION: _WANDER,
-    VELOCITY: ("", "", "", "time bias"),
-    HEIGHT: ("bias", "scale", "wander", "time bias"),
-    FIELD: (
-        *(f"{kind} {axis}" for kind in ("bias", "scale", "mount") for axis in AXES),
-        "soft iron xy", "soft iron xz", "soft iron yz",
-    ),
-    SUN: ("bias across", "bias along", "", "", *(f"mount {axis}" for axis in AXES)),
-}  # fmt: skip
+    RADAR: instruments.RADAR.states,
+    POSITION: instruments.GNSS.states,
+    VELOCITY: ("", "", "", instruments.GNSS.states[3]),
+    HEIGHT: instruments.BAROMETER.states,
+    FIELD: instruments.MAGNETOMETER.states,
+    SUN: (*instruments.SUN.states[:2], "", "", *instruments.SUN.states[2:]),
+}
 
 
 @dataclass(frozen=True)
@@ -65,11 +60,11 @@ class Instrument:
     Parameters
     ----------
     name, kind : str, int
-        Name of the source in tables and verdicts; kind of `recon._measurement_kernels`.
+        Name of the source in tables and checks; kind of `recon._measurement_kernels`.
     owner : str
         Instrument whose errors it carries; a receiver's position and velocity share one.
     arm_body_m : (3,) float
-        Seen point from the accelerometer, body axes.
+        Tracked point from the accelerometer, body axes.
     site_ecef_m : (3,) float
         Radar, or reference of a receiver; of a barometer, the height above which its scale acts, first.
     dcm : (3, 3) float
@@ -95,7 +90,7 @@ class Instrument:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """What its components are called."""
+        """Names of its components."""
         return COMPONENTS[self.kind]
 
     @property
@@ -132,7 +127,7 @@ def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, tra
     if traverse:
         elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
         sd[:, 1] /= np.maximum(np.cos(elevation), 1e-3)
-    known = np.tile([SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
+    known = np.tile([_SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
     place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
     return _instrument(
@@ -216,21 +211,23 @@ def predict(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Prediction (3,) and partials by state (3, 9) and by the instrument's own errors (3, `SLOTS`), in numpy.
 
-    ``e`` (`SLOTS`,) are the errors. Readable twin of `recon._measurement_kernels.predict`.
+    ``e`` (`SLOTS`,) are the errors. Twin of `recon._measurement_kernels.predict`.
     """
     by_state, by_error = np.zeros((3, 9)), np.zeros((3, SLOTS))
-    if instrument.kind == FIELD:
-        return _field(instrument.dcm, known, e, at.dcm_ecef_body, by_state, by_error)
-    if instrument.kind == SUN:
-        return _sun(instrument.dcm, known, e, at.dcm_ecef_body, by_state, by_error)
+    if instrument.kind in (FIELD, SUN):
+        body = at.dcm_ecef_body.T @ known
+        model = magnetometer_model if instrument.kind == FIELD else sun_model
+        reading, by_body, by_error[: len(instrument.components)] = model(instrument.dcm, body, e)
+        by_state[: len(reading), 6:9] = by_body @ rotations.skew(body)
+        return np.append(reading, np.zeros(3 - len(reading))), by_state, by_error
     c, arm, tau = at.dcm_ecef_body, instrument.arm_body_m, e[3]
-    swing = np.cross(at.rate_body_radps - earth.OMEGA_RADPS * c[2], arm)
-    moving = at.velocity_ecef_mps + c @ swing
+    lever_velocity = np.cross(at.rate_body_radps - earth.OMEGA_RADPS * c[2], arm)
+    moving = at.velocity_ecef_mps + c @ lever_velocity
     point = at.position_ecef_m + c @ arm - tau * moving + 0.5 * tau**2 * at.acceleration_ecef_mps2
     speed = moving - tau * at.acceleration_ecef_mps2
     if instrument.kind == VELOCITY:
         by_state[:, 3:6] = instrument.dcm
-        by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(swing)
+        by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(lever_velocity)
         by_error[:, 3] = -instrument.dcm @ at.acceleration_ecef_mps2
         return instrument.dcm @ speed, by_state, by_error
     if instrument.kind == RADAR:
@@ -242,7 +239,7 @@ def predict(
         h, m = _height(instrument, e, point, by_error)
     by_state[:, 0:3] = m
     by_state[:, 3:6] = -tau * m
-    by_state[:, 6:9] = -m @ c @ rotations.skew(arm - tau * swing)
+    by_state[:, 6:9] = -m @ c @ rotations.skew(arm - tau * lever_velocity)
     by_error[:, 3] = -m @ speed
     return h, by_state, by_error
 
@@ -275,8 +272,8 @@ def _radar(
     g[1, 1] += tan * (np.sin(az) * e[4] - np.cos(az) * e[5])
     g[1, 2] = sec**2 * (e[8] - np.cos(az) * e[4] - np.sin(az) * e[5]) + sec * tan * (e[7] + e[9])
     g[2, 1] = np.cos(az) * e[4] + np.sin(az) * e[5]
-    bend = 1.0 / np.sin(el) ** 2 if np.sin(el) > 0.035 else np.sin(el) / 0.035
-    g[2, 2] -= np.sin(el) * e[6] + known[0] * bend * e[11]
+    cosecant_square = 1.0 / np.sin(el) ** 2 if np.sin(el) > 0.035 else np.sin(el) / 0.035
+    g[2, 2] -= np.sin(el) * e[6] + known[0] * cosecant_square * e[11]
     others = np.delete(np.arange(SLOTS), 3)
     return np.array([slant, az, el]) + by_error[:, others] @ e[others], g @ partials @ instrument.dcm
 
@@ -292,40 +289,61 @@ def _height(
     return np.array([float(height) + e[0] + above * e[1] + e[2], 0.0, 0.0]), m
 
 
-def _field(
-    dcm_body_sensor: FloatArray, known: FloatArray, e: FloatArray, c: FloatArray, by_state: FloatArray,
-    by_error: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    mount = dcm_body_sensor @ rotations.dcm_from_q(rotations.exp(e[6:9]))
-    body = c.T @ known
-    x = mount.T @ body
-    iron = np.diag(1.0 + e[3:6])
+def magnetometer_model(
+    dcm_body_sensor: FloatArray, body: FloatArray, e: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Magnetometer reading (..., 3) of a field ``body`` (..., 3) in body axes, with its partials.
+
+    Parameters
+    ----------
+    dcm_body_sensor : (3, 3) float
+        Nominal mounting.
+    body : (..., 3) float
+    e : (..., SLOTS) float
+        Errors in the order of `SLOT_NAMES`; mount alone must be the same for all.
+
+    Returns
+    -------
+    h : (..., 3) float
+    by_body : (..., 3, 3) float
+        Partials by the field in body axes; those by a rotation of the body are ``by_body @ skew(body)``.
+    by_error : (..., 3, SLOTS) float
+    """
+    mount = e.reshape(-1, SLOTS)[0, 6:9]
+    to_sensor = (dcm_body_sensor @ rotations.dcm_from_q(rotations.exp(mount))).T
+    x = body @ to_sensor.T
+    iron = np.zeros((*x.shape, 3))
+    by_error = np.zeros((*x.shape, SLOTS))
+    for i in range(3):
+        iron[..., i, i] = 1.0 + e[..., 3 + i]
+        by_error[..., i, i], by_error[..., i, 3 + i] = 1.0, x[..., i]
     for slot, (i, j) in zip((9, 10, 11), ((0, 1), (0, 2), (1, 2)), strict=True):
-        iron[i, j] = iron[j, i] = e[slot]
-        by_error[i, slot], by_error[j, slot] = x[j], x[i]
-    by_state[:, 6:9] = iron @ mount.T @ rotations.skew(body)
-    by_error[:, 0:3], by_error[:, 3:6] = np.eye(3), np.diag(x)
-    by_error[:, 6:9] = iron @ rotations.skew(x) @ right_jacobian(e[6:9])
-    return iron @ x + e[0:3], by_state, by_error
+        iron[..., i, j] = iron[..., j, i] = e[..., slot]
+        by_error[..., i, slot], by_error[..., j, slot] = x[..., j], x[..., i]
+    by_error[..., 6:9] = iron @ rotations.skew(x) @ right_jacobian(mount)
+    return (iron @ x[..., None])[..., 0] + e[..., 0:3], iron @ to_sensor, by_error
 
 
-def _sun(
-    dcm_body_head: FloatArray, known: FloatArray, e: FloatArray, c: FloatArray, by_state: FloatArray,
-    by_error: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    mount = dcm_body_head @ rotations.dcm_from_q(rotations.exp(e[4:7]))
-    body = c.T @ known
-    x, y, z = s = mount.T @ body
-    across = np.hypot(y, z)
-    whole2 = across**2 + x**2
-    p = np.zeros((3, 3))
-    p[0] = 0.0, z / across**2 - e[0] * y / across**3, -y / across**2 - e[0] * z / across**3
-    p[1] = across / whole2, -x * y / (whole2 * across), -x * z / (whole2 * across)
-    by_state[:, 6:9] = p @ mount.T @ rotations.skew(body)
-    by_error[:, 4:7] = p @ rotations.skew(s) @ right_jacobian(e[4:7])
-    by_error[0, 0], by_error[1, 1] = 1.0 / across, 1.0
-    h = np.array([np.arctan2(y, z) + e[0] / across, np.arctan2(x, across) + e[1], 0.0])
-    return h, by_state, by_error
+def sun_model(dcm_body_head: FloatArray, body: FloatArray, e: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Azimuth and elevation (..., 2) of the Sun in a head, from its direction ``body`` (..., 3); as the magnetometer's.
+
+    Partials ``by_body`` (..., 2, 3) and ``by_error`` (..., 2, SLOTS); the errors are one for all.
+    """
+    e = e.reshape(-1, SLOTS)[0]
+    to_head = (dcm_body_head @ rotations.dcm_from_q(rotations.exp(e[4:7]))).T
+    s = body @ to_head.T
+    x, y, z = np.moveaxis(s, -1, 0)
+    normal = np.hypot(y, z)
+    whole2 = normal**2 + x**2
+    p = np.zeros((*body.shape[:-1], 2, 3))
+    p[..., 0, 1] = z / normal**2 - e[0] * y / normal**3
+    p[..., 0, 2] = -y / normal**2 - e[0] * z / normal**3
+    p[..., 1, 0], p[..., 1, 1], p[..., 1, 2] = normal / whole2, -x * y / (whole2 * normal), -x * z / (whole2 * normal)
+    by_error = np.zeros((*body.shape[:-1], 2, SLOTS))
+    by_error[..., 4:7] = p @ rotations.skew(s) @ right_jacobian(e[4:7])
+    by_error[..., 0, 0], by_error[..., 1, 1] = 1.0 / normal, 1.0
+    h = np.stack([np.arctan2(y, z) + e[0] / normal, np.arctan2(x, normal) + e[1]], axis=-1)
+    return h, p @ to_head, by_error
 
 
 def wrapped(instrument_kind: int, residual: FloatArray) -> FloatArray:

@@ -1,14 +1,15 @@
-"""What carries a state from one moment to another: inertial sensors, or a ballistic model of drag in the day's air.
+"""What propagates a state in time? Inertial sensors on one grid of times, or a ballistic model of drag in the air.
 
 Both drive the nine kinematic errors (position, velocity, rotation) through a few *drivers*, errors that the motion
 depends on: with inertial sensors their bias, scale and mount, 18 in all, and the errors of their clocks, 2, where such
-are stated; in ballistic flight drag, side forces, density
-and winds, 6 in all, and rotation stands still. So one filter serves both. Models and readable twins:
-`recon.strapdown`, `recon.ballistic`.
+are stated; in ballistic flight drag, side forces, density and winds, 6 in all, and rotation is held fixed. So one
+filter serves both. Models: `recon.strapdown`, `recon.ballistic`.
 
-Two bridged inertial triads on one grid, as the mechanisation wants them.
+Mechanisation joins samples by straight lines. `with_exact_integrals` moves them so that the lines have the integral of
+the curve, to fourth order,
 
-Mechanisation joins samples by straight lines. `unbent` moves them so that the lines have the integral of the curve;
+    x_k <- x_k - (x_{k+1} - 2 x_k + x_{k-1}) / 12
+
 else the error of the joins would be as large as the coning and sculling that are corrected for.
 """
 
@@ -20,10 +21,11 @@ import numpy as np
 
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import interpolate_rows
-from recon.imu_screening import Bridged
+from recon.imu_screening import BridgedSensor
 from recon.state import IntArray
 
-STRAPDOWN_DRIVERS, CLOCKS, BALLISTIC_DRIVERS = 18, 2, 6
+_STRAPDOWN_DRIVERS, _CLOCKS, _BALLISTIC_DRIVERS = 18, 2, 6
+SAME_INSTANT_S = 2e-6
 
 
 class Inertial(NamedTuple):
@@ -57,7 +59,7 @@ class Motion(NamedTuple):
         Whether there are no inertial sensors.
     time_s : (k,) float
     force_sensor_mps2, rate_sensor_radps : (k, 3) float
-        As measured, in sensor axes, gaps bridged, `recon.motion.unbent`; zeros in ballistic flight.
+        As measured, in sensor axes, gaps bridged, `with_exact_integrals`; zeros in ballistic flight.
     force_density, rate_density : (k, 3) float
         White-noise densities, (m/s^2)^2/Hz and (rad/s)^2/Hz, from a grid point to the next: along body axes, in
         ballistic flight along Earth-fixed axes.
@@ -70,9 +72,9 @@ class Motion(NamedTuple):
     air_from_m, air_step_m : float
         Their first altitude and spacing.
     drag_m2pkg : float
-        Drag area per mass before anything is learnt.
+        A priori drag area per mass.
     across_ecef : (3,) float
-        Direction across the plane of the path, for the axes of side forces.
+        Normal of the path's plane, for the axes of side forces.
     """
 
     ballistic: bool
@@ -102,7 +104,7 @@ class Motion(NamedTuple):
     @property
     def drivers(self) -> int:
         """Number of errors that the motion depends on."""
-        return BALLISTIC_DRIVERS if self.ballistic else STRAPDOWN_DRIVERS + CLOCKS * self.clocks
+        return _BALLISTIC_DRIVERS if self.ballistic else _STRAPDOWN_DRIVERS + _CLOCKS * self.clocks
 
 
 def strapdown_motion(
@@ -115,7 +117,7 @@ def strapdown_motion(
     dcm_body_rate: FloatArray,
     clocks: bool = False,
 ) -> Motion:
-    """Motion carried by inertial sensors."""
+    """Motion propagated by inertial sensors."""
     # numba compiles anew for every other memory layout
     return Motion(
         ballistic=False,
@@ -135,10 +137,7 @@ def strapdown_motion(
     )
 
 
-SAME_INSTANT_S = 2e-6
-
-
-def unbent(time_s: FloatArray, samples: FloatArray) -> FloatArray:
+def with_exact_integrals(time_s: FloatArray, samples: FloatArray) -> FloatArray:
     """Samples (n, 3) whose straight joins have the integral of the curve: less a twelfth of the second difference.
 
     Where steps are uneven by a twentieth, at gaps and ends, samples stay as they are. White noise keeps its integral.
@@ -146,15 +145,15 @@ def unbent(time_s: FloatArray, samples: FloatArray) -> FloatArray:
     out = samples.copy()
     step = np.diff(time_s)
     even = np.abs(np.diff(step)) < 0.05 * step[1:]
-    bend = samples[2:] - 2.0 * samples[1:-1] + samples[:-2]
-    out[1:-1][even] -= bend[even] / 12.0
+    second_difference = samples[2:] - 2.0 * samples[1:-1] + samples[:-2]
+    out[1:-1][even] -= second_difference[even] / 12.0
     return out
 
 
 def inertial_motion(
-    force: Bridged, rate: Bridged, node_time_s: FloatArray, clocks: bool = False
+    force: BridgedSensor, rate: BridgedSensor, node_time_s: FloatArray, clocks: bool = False
 ) -> tuple[Motion, IntArray]:
-    """Both triads from first to last node, on the faster one's times and the nodes', and each node's index."""
+    """Both sensors from first to last node, on the faster one's times and the nodes', and each node's index."""
     first, last = node_time_s[0], node_time_s[-1]
     finer = rate if np.median(np.diff(rate.time_s)) < 0.9 * np.median(np.diff(force.time_s)) else force
     inner = finer.time_s[(finer.time_s > first) & (finer.time_s < last)]
@@ -165,8 +164,8 @@ def inertial_motion(
     t = np.sort(np.concatenate([inner[clear], node_time_s]))
     motion = strapdown_motion(
         t,
-        interpolate_rows(t, force.time_s, unbent(force.time_s, force.measured_sensor)),
-        interpolate_rows(t, rate.time_s, unbent(rate.time_s, rate.measured_sensor)),
+        interpolate_rows(t, force.time_s, with_exact_integrals(force.time_s, force.measured_sensor)),
+        interpolate_rows(t, rate.time_s, with_exact_integrals(rate.time_s, rate.measured_sensor)),
         _held(t, force),
         _held(t, rate),
         force.spec.dcm_body_sensor,
@@ -176,7 +175,7 @@ def inertial_motion(
     return motion, np.searchsorted(t, node_time_s).astype(np.int64)
 
 
-def _held(at: FloatArray, triad: Bridged) -> FloatArray:
+def _held(at: FloatArray, sensor: BridgedSensor) -> FloatArray:
     """Density of the interval that each grid point opens."""
-    k = np.clip(np.searchsorted(triad.time_s, at + SAME_INSTANT_S, side="right") - 1, 0, len(triad.time_s) - 1)
-    return np.ascontiguousarray(triad.density[k])
+    k = np.clip(np.searchsorted(sensor.time_s, at + SAME_INSTANT_S, side="right") - 1, 0, len(sensor.time_s) - 1)
+    return np.ascontiguousarray(sensor.density[k])

@@ -1,4 +1,4 @@
-"""What the filter is asked: nodes, motion, instruments with their measurements, errors, start and gate."""
+"""What is given to the filter? Nodes, motion, instruments with their measurements, error model, start and gate."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Problem:
 
     @property
     def moving(self) -> IntArray:
-        """Errors that change: the nine kinematic ones and those that wander."""
+        """Errors that change: the nine kinematic ones and Gauss-Markov ones."""
         return np.concatenate([np.arange(KINEMATIC), KINEMATIC + self.model.wandering])
 
     def sources(self) -> Sources:
@@ -86,7 +86,8 @@ class Problem:
     def thinned(self, step_s: float) -> tuple[Problem, IntArray]:
         """Problem with at most one used measurement of an instrument every ``step_s``, and the nodes (k,) it keeps.
 
-        A node of every step stays even where nothing is measured: what a long step forgets, no smoother can undo.
+        A node of every step stays even where nothing is measured: after a long step a decorrelated error cannot be
+        smoothed.
         """
         node, used = self.node, np.flatnonzero(self.observed.usable)
         cell = np.floor(self.time_s[node[used]] / step_s).astype(np.int64)

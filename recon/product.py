@@ -1,4 +1,4 @@
-"""From nodes to what an analyst uses: trajectory of the datum, corrected sensor series, tables.
+"""What does an analyst get from the filter's nodes? Trajectory of the datum, corrected sensor series, tables.
 
 Moving from the accelerometer (at ``r`` from the datum, body axes) to the datum:
 
@@ -6,7 +6,7 @@ Moving from the accelerometer (at ``r`` from the datum, body axes) to the datum:
 
 and the errors move with them: ``dp = dp_imu + C [r x] d``, ``dv = dv_imu + C [(w x r) x] d + C [r x] dw`` with
 rotation error ``d`` and rate error ``dw`` from the gyros' estimated errors and white noise. In ballistic flight the
-tracked point is the datum, the attitude is not known, and its covariance says so.
+tracked point is the datum and the attitude unknown, with the covariance of an unknown attitude.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, interpolate_rows
-from recon.imu_screening import Bridged
+from recon.imu_screening import BridgedSensor
 from recon.problem import Problem
 from recon.smoother import Smoothed
 from recon.state import INERTIAL, KINEMATIC, BoolArray, Innovations, States, unpacked
 from recon.strapdown import correct, correction_partials
 
 SAME_STRETCH_S = 1.0
-MOST_STRETCHES = 12  # that are listed one by one
-UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
+_MOST_STRETCHES = 12  # that are listed one by one
+_UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
 
 
 @dataclass(frozen=True)
 class Mounting:
-    """What moving a node to the datum needs: epoch, accelerometer from datum (3,), m, and the gyros, if there are."""
+    """For moving a node to the datum: epoch, accelerometer from datum (3,), m, and the gyros, if there are."""
 
     epoch_utc: str
     arm_body_m: FloatArray
-    rate: Bridged | None
+    rate: BridgedSensor | None
 
 
 def datum_trajectory(problem: Problem, mounting: Mounting, states: States, triangles: FloatArray) -> Trajectory:
@@ -49,7 +49,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
     if mounting.rate is None:
         covariance[:, 6:9] = 0.0
         covariance[:, :, 6:9] = 0.0
-        covariance[:, range(6, 9), range(6, 9)] = UNKNOWN_ROTATION_VAR
+        covariance[:, range(6, 9), range(6, 9)] = _UNKNOWN_ROTATION_VAR
         return Trajectory(
             mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m, states.velocity_ecef_mps,
             states.q_ecef_body, np.tile(earth.OMEGA_ECEF_RADPS, (n, 1)), covariance,
@@ -60,13 +60,13 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
     c = rotations.dcm_from_q(states.q_ecef_body)
     omega = correct(measured, errors, motion.dcm_body_rate)
     r = mounting.arm_body_m
-    swing = np.cross(omega - earth.OMEGA_RADPS * c[:, 2], r)
+    lever_velocity = np.cross(omega - earth.OMEGA_RADPS * c[:, 2], r)
 
     move = np.zeros((n, 9, 27))
     move[:, range(9), range(9)] = 1.0
     lever = c @ rotations.skew(r)
     move[:, 0:3, 6:9] = lever
-    move[:, 3:6, 6:9] = c @ rotations.skew(swing)
+    move[:, 3:6, 6:9] = c @ rotations.skew(lever_velocity)
     move[:, 3:6, 18:27] = lever @ correction_partials(measured, errors, motion.dcm_body_rate)
     moved = move @ covariance @ np.swapaxes(move, 1, 2)
     moved[:, 3:6, 3:6] += mounting.rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
@@ -75,7 +75,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
         problem.time_s[kept],
         "datum",
         states.position_ecef_m - c @ r,
-        states.velocity_ecef_mps - np.einsum("nij,nj->ni", c, swing),
+        states.velocity_ecef_mps - np.einsum("nij,nj->ni", c, lever_velocity),
         states.q_ecef_body,
         omega,
         0.5 * (moved + np.swapaxes(moved, 1, 2)),
@@ -83,16 +83,16 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
 
 
 def corrected_series(
-    problem: Problem, force: Bridged, rate: Bridged, states: States
+    problem: Problem, force: BridgedSensor, rate: BridgedSensor, states: States
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (k,) and corrected specific force and rate (k, 3), body axes, at valid accelerometer samples."""
     t = force.time_s
-    opened_by_gap = np.zeros(len(t), dtype=bool)
-    opened_by_gap[1:] = force.in_gap[:-1]
-    bridged = force.in_gap & opened_by_gap  # samples of a bridge have a gap on both sides
+    after_gap = np.zeros(len(t), dtype=bool)
+    after_gap[1:] = force.in_gap[:-1]
+    bridged = force.in_gap & after_gap  # samples of a bridge have a gap on both sides
     k = np.clip(np.searchsorted(rate.time_s, t, side="right") - 1, 0, len(rate.time_s) - 1)
-    hidden = rate.in_gap[k] & (t - rate.time_s[k] > 1e-6)
-    keep = ~bridged & ~hidden & (t >= problem.time_s[0]) & (t <= problem.time_s[-1])
+    in_rate_gap = rate.in_gap[k] & (t - rate.time_s[k] > 1e-6)
+    keep = ~bridged & ~in_rate_gap & (t >= problem.time_s[0]) & (t <= problem.time_s[-1])
     t = t[keep]
     errors = interpolate_rows(t, problem.time_s, states.sensor_errors[:, :18])
     specific_force = correct(force.measured_sensor[keep], errors[:, 0:9], problem.motion.dcm_body_force)
@@ -113,8 +113,8 @@ def accelerometer_root(problem: Problem, states: States, triangles: FloatArray) 
     """Response (k, 6, 9) of rotation error and specific force error, body axes, at kept nodes to nine unit normals.
 
     The nine stand for the accelerometer's constant errors: ``root @ root.T`` of the lower rows is the covariance of
-    the corrected specific force, the upper rows are what of the attitude's error goes with them. Errors that wander
-    are taken as they are at mid-span.
+    the corrected specific force, the upper rows are the part of the attitude's error correlated with them.
+    Gauss-Markov errors are taken as they are at mid-span.
     """
     kept = np.flatnonzero(problem.kept)
     measured = problem.motion.force_sensor_mps2[problem.node_index[kept]]
@@ -137,7 +137,7 @@ def rate_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatAr
 
 
 def sensor_error_table(problem: Problem, states: States, smoothed: Smoothed) -> pd.DataFrame:
-    """Prior and posterior of every error; of those that wander, the value at mid-span."""
+    """Prior and posterior of every error; of Gauss-Markov errors, the value at mid-span."""
     kept = np.flatnonzero(problem.kept)
     row = len(kept) // 2
     model = problem.model
@@ -154,7 +154,7 @@ def sensor_error_table(problem: Problem, states: States, smoothed: Smoothed) -> 
 
 
 def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
-    """One row for each component that was measured; what is not ``used`` only checks."""
+    """One row for each component that was measured; what is not ``used`` is held out."""
     row, component = np.nonzero(np.isfinite(problem.observed.variance))
     source = problem.observed.source[row]
     names = np.array([i.name for i in problem.instruments], dtype=object)
@@ -173,7 +173,7 @@ def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
 
 
 def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
-    """Stretches in which measurements were edited; sources that were left out on purpose say nothing."""
+    """Stretches in which measurements were edited; sources excluded by settings have none."""
     out = []
     time_s = problem.time_s[problem.node]
     for number, instrument in enumerate(problem.instruments):
@@ -183,12 +183,12 @@ def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
             continue
         what = "track point" if instrument.name == instrument.owner else "reading"
         stretches = np.split(times, np.flatnonzero(np.diff(times) > SAME_STRETCH_S) + 1)
-        if len(stretches) > MOST_STRETCHES:
+        if len(stretches) > _MOST_STRETCHES:
             share = 100.0 * len(times) / int(mine.sum())
-            words = f"{len(times)} {what}s edited in {len(stretches)} stretches ({share:.0f} % of them)"
-            out.append(Finding(instrument.name, words, float(times[0]), float(times[-1])))
+            remark = f"{len(times)} {what}s edited in {len(stretches)} stretches ({share:.0f} % of them)"
+            out.append(Finding(instrument.name, remark, float(times[0]), float(times[-1]), "points-edited"))
             continue
         for stretch in stretches:
-            words = f"{len(stretch)} {what}{'s' if len(stretch) > 1 else ''} edited"
-            out.append(Finding(instrument.name, words, float(stretch[0]), float(stretch[-1])))
+            remark = f"{len(stretch)} {what}{'s' if len(stretch) > 1 else ''} edited"
+            out.append(Finding(instrument.name, remark, float(stretch[0]), float(stretch[-1]), "points-edited"))
     return out

@@ -1,12 +1,96 @@
-"""What an analyst may choose about a reconstruction."""
+"""What may an analyst choose about a reconstruction? Every setting with its type, allowed values and default, once.
+
+The same names are the keys of ``[reconstruction]`` in flight.toml; `Settings.from_mapping` reads them.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
 
-from flightmodel.checks import GateError, nearest_name
-from recon.ekf import ENGINES
-from recon.smoother import SMOOTHERS
+from flightmodel.checks import ConfigError, Fault, nearest_name
+from recon.ekf import COMPILED, ENGINES, FILTERPY
+
+_SYNONYMS = {"readable": FILTERPY}  # of an engine
+
+
+def _setting(default: object, allowed: str, convert: Callable[[Any], object], code: str = "setting-range") -> Any:
+    """Declare a setting; ``convert`` gives the value as it is kept, or raises `ValueError` or `TypeError`."""
+    return field(default=default, metadata={"allowed": allowed, "convert": convert, "code": code})
+
+
+def _as_number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise TypeError
+    return float(value)
+
+
+def _number(
+    default: float, low: float, high: float, also: float | None = None, below: bool = False, meaning: str = ""
+) -> Any:
+    """A number from ``low`` to ``high`` (``below`` it where asked), or ``also``, which means something special."""
+
+    def convert(value: Any) -> float:
+        number = _as_number(value)
+        if number != also and not (low <= number < high if below else low <= number <= high):
+            raise ValueError
+        return number
+
+    end = " (1 excluded)" if below else ""
+    return _setting(default, (f"{also:g} ({meaning}) or " if meaning else "") + f"{low:g} to {high:g}{end}", convert)
+
+
+def _integer(default: int, low: int, high: int, also: int | None = None, meaning: str = "") -> Any:
+    def convert(value: Any) -> int:
+        if isinstance(value, bool) or int(value) != value or (value != also and not low <= value <= high):
+            raise ValueError
+        return int(value)
+
+    return _setting(default, (f"{also} ({meaning}) or " if meaning else "") + f"{low} to {high}", convert)
+
+
+def _time() -> Any:
+    return _setting(None, "a time in s", lambda value: None if value is None else _as_number(value))
+
+
+def _flag(default: bool) -> Any:
+    def convert(value: Any) -> bool:
+        if not isinstance(value, bool):
+            raise TypeError
+        return value
+
+    return _setting(default, "true or false", convert)
+
+
+def _choice(default: str, known: tuple[str, ...], synonyms: Mapping[str, str] | None = None) -> Any:
+    def convert(value: Any) -> str:
+        name = (synonyms or {}).get(value, value) if isinstance(value, str) else ""
+        if name not in known:
+            raise ValueError(nearest_name(str(value), known))
+        return name
+
+    return _setting(default, f"one of {', '.join(known)}", convert, "setting-choice")
+
+
+def _names() -> Any:
+    def convert(value: Any) -> tuple[str, ...]:
+        if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
+            raise TypeError
+        return tuple(value)
+
+    return _setting((), "a list of names", convert)
+
+
+def _spans() -> Any:
+    def convert(value: Any) -> tuple[tuple[float, float], ...]:
+        spans = tuple((_as_number(a), _as_number(b)) for a, b in value)
+        if not all(a < b for a, b in spans):
+            raise ValueError
+        return spans
+
+    return _setting((), "a list of spans [from, to] in s that end after they begin", convert)
 
 
 @dataclass(frozen=True)
@@ -18,71 +102,92 @@ class Settings:
     output_rate_hz : float
         Of the trajectories.
     pulse_rate_hz : float
-        Of the trajectories where the accelerometers feel more than half of the descent's largest force; 0 for no other
-        rate there, so that equal spans have equal times.
+        Of the trajectories where the specific force exceeds half of the descent's largest; 0 for no other rate there,
+        so that equal spans have equal times.
     start_s, end_s : float or None
         Span; the data's own common span where None.
     passes : int
-        Most forward passes over all data. The first filter runs on thinned data about its own estimate, iterated until
-        attitudes settle; each pass over all data is linearised about the smoothed trajectory before it, and another
-        follows only where one moved the result by more than a hundredth of its standard deviation. With 0, a single
-        extended Kalman filter over all data about its own estimate.
+        Largest number of forward passes over all data. The first filter runs on thinned data about its own estimate,
+        iterated until attitudes converge; each pass over all data is linearised about the smoothed trajectory before
+        it, and another follows only where one moved the result by more than a hundredth of its standard deviation.
+        With 0, a single extended Kalman filter over all data about its own estimate.
     gate_probability : float
         A measurement is edited where its normalised innovation squared is beyond this chi-square quantile.
-    verdict_confidence : float
-        Two-sided confidence of each verdict.
+    check_confidence : float
+        Two-sided confidence of each consistency check.
     angle_noise : str
         ``"traverse"`` or ``"axis"``, see `recon.measurements`.
     consider : tuple of str
-        Errors that are not estimated but whose effect stays in the covariance: ``"accelerometer mount"``, ...
+        Errors that are not estimated but whose effect stays in the covariance (Schmidt): ``"accelerometer mount"``, ...
     without : tuple of str
         Sources (radars, receivers, barometers; ``"magnetometer"``, ``"sun1"``, ... where attitude sensors are on) that
         are predicted but never used, not even for the start.
-    withhold_every : int
-        Every so many measurements of each tracker one is predicted but not used; 0 for none.
-    withhold_s : tuple of (float, float)
-        Spans in which no tracker is used, all are predicted.
+    hold_out_every : int
+        Every so many measurements of each tracker one is held out: predicted but not used; 0 for none.
+    hold_out_spans_s : tuple of (float, float)
+        Spans in which all trackers are held out.
     attitude_sensors : bool
         Whether magnetometer and Sun sensors are measurements too; otherwise they only start and check the attitude.
-    engine, smoother : str
-        ``"compiled"`` or ``"readable"``; ``"rauch-tung-striebel"`` or ``"bryson-frazier"``. Where errors are considered
-        there is one smoother alone, see `recon.smoother`.
+    engine : str
+        ``"compiled"`` or ``"filterpy"``: the same answer, the second much slower (`recon.ekf`).
+
+    Raises
+    ------
+    ConfigError
+        With every value that is not allowed.
     """
 
-    output_rate_hz: float = 20.0
-    pulse_rate_hz: float = 0.0
-    start_s: float | None = None
-    end_s: float | None = None
-    passes: int = 3
-    gate_probability: float = 0.9999
-    check_confidence: float = 0.999
-    angle_noise: str = "traverse"
-    consider: tuple[str, ...] = ()
-    without: tuple[str, ...] = ()
-    withhold_every: int = 0
-    withhold_s: tuple[tuple[float, float], ...] = ()
-    attitude_sensors: bool = False
-    engine: str = "compiled"
-    smoother: str = "rauch-tung-striebel"
+    output_rate_hz: float = _number(20.0, 0.1, 1000.0)
+    pulse_rate_hz: float = _number(0.0, 0.1, 1000.0, also=0.0, meaning="none")
+    start_s: float | None = _time()
+    end_s: float | None = _time()
+    passes: int = _integer(3, 0, 10)
+    gate_probability: float = _number(0.9999, 0.5, 1.0, below=True)
+    check_confidence: float = _number(0.999, 0.5, 1.0, below=True)
+    angle_noise: str = _choice("traverse", ("traverse", "axis"))
+    consider: tuple[str, ...] = _names()
+    without: tuple[str, ...] = _names()
+    hold_out_every: int = _integer(0, 2, 1000, also=0, meaning="none")
+    hold_out_spans_s: tuple[tuple[float, float], ...] = _spans()
+    attitude_sensors: bool = _flag(False)
+    engine: str = _choice(COMPILED, ENGINES, _SYNONYMS)
 
     def __post_init__(self) -> None:
-        """Check once."""
+        """Check every value once."""
         faults = []
-        if not 0.1 <= self.output_rate_hz <= 1000.0:
-            faults.append(f"output_rate_hz {self.output_rate_hz} must lie in 0.1 to 1000")
-        if self.pulse_rate_hz != 0.0 and not 0.1 <= self.pulse_rate_hz <= 1000.0:
-            faults.append(f"pulse_rate_hz {self.pulse_rate_hz} must be 0 or lie in 0.1 to 1000")
-        if not 0 <= self.passes <= 10:
-            faults.append(f"passes {self.passes} must lie in 0 to 10")
-        if self.withhold_every != 0 and not 2 <= self.withhold_every <= 1000:
-            faults.append(f"withhold_every {self.withhold_every} must be 0 (none) or lie in 2 to 1000")
-        faults += [f"withhold_s {a:g} to {b:g} s: a span ends after it begins" for a, b in self.withhold_s if not a < b]
-        for name in ("gate_probability", "check_confidence"):
-            if not 0.5 <= getattr(self, name) < 1.0:
-                faults.append(f"{name} {getattr(self, name)} must lie in 0.5 to 1 (1 excluded)")
-        for name, known in (("angle_noise", ("traverse", "axis")), ("engine", ENGINES), ("smoother", SMOOTHERS)):
-            value = getattr(self, name)
-            if value not in known:
-                faults.append(f"{name} '{value}'{nearest_name(value, known)} must be one of {', '.join(known)}")
+        for setting in fields(self):
+            value, rule = getattr(self, setting.name), setting.metadata
+            try:
+                object.__setattr__(self, setting.name, rule["convert"](value))
+            except (TypeError, ValueError) as wrong:
+                shown = f"'{value}'" if isinstance(value, str) else f"{value}"
+                hint = str(wrong) if rule["code"] == "setting-choice" else ""
+                faults.append(Fault(f"{setting.name} {shown}{hint} must be {rule['allowed']}", rule["code"]))
         if faults:
-            raise GateError(faults)
+            raise ConfigError(faults)
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, object], where: str = "[reconstruction]") -> Settings:
+        """Settings from keys and values, as of ``[reconstruction]`` in flight.toml; the rest have their defaults.
+
+        Raises
+        ------
+        ConfigError
+            With every unknown key (and the nearest known one) and every value that is not allowed.
+        """
+        names = [setting.name for setting in fields(cls)]
+        faults = [
+            Fault(
+                f"{where} {key}{nearest_name(key, names)}: no such setting; known: {', '.join(names)}",
+                "setting-unknown",
+            )
+            for key in values
+            if key not in names
+        ]
+        try:
+            chosen = cls(**{key: value for key, value in values.items() if key in names})  # type: ignore[arg-type]
+        except ConfigError as wrong:
+            faults += [Fault(f"{where} {fault}", fault.code) for fault in wrong.faults]
+        if faults:
+            raise ConfigError(faults)
+        return chosen

@@ -1,11 +1,10 @@
-"""From telemetry to the filter's problem: span, nodes, instruments, errors, motion and start.
+"""What is the filter given? From telemetry to nodes, instruments, error model, motion and the state at the start.
 
-Where the filter starts: attitude from its prior through the gyros, position and velocity from early track points.
-
-Position and velocity get a prior so wide that it carries no information (`DIFFUSE_POSITION_M`,
-`DIFFUSE_VELOCITY_MPS`): the fit to the first seconds of tracking only chooses the point about which to linearise, so
-no point counts twice. The attitude's errors are correlated with those of the gyros that carried it. Ballistic flight
-has no attitude; its rotation stands still and is known.
+The attitude at the start comes from its prior through the gyros (or from magnetometer and Sun sensors), position and
+velocity from early track points. Position and velocity get a prior so wide that it carries no information
+(`_DIFFUSE_POSITION_M`, `_DIFFUSE_VELOCITY_MPS`): the fit to the first seconds of tracking only chooses the point about
+which to linearise, so no point counts twice. The attitude's errors are correlated with those of the gyros that
+propagated it. Ballistic flight has no attitude; its rotation is held fixed.
 """
 
 from __future__ import annotations
@@ -17,73 +16,84 @@ from types import MappingProxyType
 import numpy as np
 
 from flightmodel import earth, geomagnetism_and_sun, rotations
-from flightmodel.checks import FloatArray, GateError, nearest_name
+from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
 from flightmodel.gate import spaced
+from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER
+from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import AttitudePrior, Telemetry
 from recon import error_model, measurements
 from recon._measurement_kernels import HEIGHT, POSITION, RADAR, VELOCITY
 from recon.ballistic import ballistic_motion
-from recon.error_model import ErrorModel
-from recon.imu_screening import Bridged
+from recon.error_model import ErrorModel, instrument_blocks
+from recon.imu_screening import BridgedSensor
 from recon.measurements import Instrument
 from recon.motion import SAME_INSTANT_S, inertial_motion
 from recon.problem import FIT_SPAN_S, Problem, nearest_index, observe
 from recon.settings import Settings
 from recon.state import KINEMATIC, BoolArray, IntArray, States
 from recon.strapdown import correct, propagate
-from recon.unmodelled import with_stated
+from recon.unmodelled_acceleration import with_stated
 from recon.vector_attitude import start_attitude_from_vectors
 
-TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT)
-PULSE_CELL_S, LEAST_PULSE_MPS2 = 0.5, 5.0
-ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
-NONE: Mapping[str, FloatArray] = MappingProxyType({})
-BALLISTIC_STEP_S = 0.5  # drivers stand still within a step, and forget in seconds and kilometres
+_TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT)
+_PULSE_CELL_S, _LEAST_PULSE_MPS2 = 0.5, 5.0
+_ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
+_NO_POINTS: Mapping[str, FloatArray] = MappingProxyType({})
+_BALLISTIC_STEP_S = 0.5  # drivers are constant within a step, and decorrelate in seconds and kilometres
+_DIFFUSE_POSITION_M = 1000.0
+_DIFFUSE_VELOCITY_MPS = 100.0
+_LEAST_POINTS = 4
+_TRACK_SPAN_S = 2.5
+_FIXED_RAD = 1e-6  # sd of the rotation of ballistic flight, which is held fixed
+_GYRO = slice(18, 27)
 
 
 @dataclass(frozen=True)
-class Bridges:
-    """Both inertial triads without gaps."""
+class InertialSensors:
+    """Accelerometer and gyros without gaps."""
 
-    force: Bridged
-    rate: Bridged
+    force: BridgedSensor
+    rate: BridgedSensor
 
 
 def build_problem(
-    telemetry: Telemetry, settings: Settings, bridges: Bridges | None, denied: Mapping[str, FloatArray] = NONE
+    telemetry: Telemetry,
+    settings: Settings,
+    sensors: InertialSensors | None,
+    rejected: Mapping[str, FloatArray] = _NO_POINTS,
 ) -> Problem:
-    """Everything that the filter needs; points of a source at its ``denied`` times are predicted, never used.
+    """Everything that the filter needs; points of a source at its ``rejected`` times are predicted, never used.
 
     Raises
     ------
     GateError
         Where the data cannot start or carry a filter (no common span, too few points, prior out of reach).
     """
-    arm = _accelerometer_arm(bridges)
+    arm = _accelerometer_arm(sensors)
     instruments = tracking_instruments(telemetry, settings, arm)
-    model = _named_model(telemetry, settings, bridges, instruments)
-    used = tuple(_believed(i, denied) for i in instruments if not _left_out(i, settings))
-    start_s, end_s = _span(used, settings, bridges)
+    model = _named_model(telemetry, settings, sensors, instruments)
+    used = tuple(_without_rejected(i, rejected) for i in instruments if not _is_excluded(i, settings))
+    start_s, end_s = _span(used, settings, sensors)
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
-    if bridges is not None and settings.pulse_rate_hz > settings.output_rate_hz:
-        output_s = _union([output_s, *_pulse_times(instruments, bridges.force, start_s, end_s, settings.pulse_rate_hz)])
+    if sensors is not None and settings.pulse_rate_hz > settings.output_rate_hz:
+        output_s = _union([output_s, *_pulse_times(instruments, sensors.force, start_s, end_s, settings.pulse_rate_hz)])
     if settings.attitude_sensors:
-        instruments += attitude_instruments(telemetry, used, start_s, end_s)
+        instruments += _attitude_instruments(telemetry, used, start_s, end_s)
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
-    between = np.arange(start_s, end_s, BALLISTIC_STEP_S) if bridges is None else np.empty(0)
+    between = np.arange(start_s, end_s, _BALLISTIC_STEP_S) if sensors is None else np.empty(0)
     time_s = _union([output_s, between, *inside])
     observed, row = observe(time_s, instruments, SAME_INSTANT_S)
-    if bridges is None:
+    if sensors is None:
         motion, node_index = ballistic_motion(
-            telemetry.motion, telemetry.sounding, across_path(used), time_s, SAME_INSTANT_S
+            telemetry.motion, telemetry.sounding, _cross_path_direction(used), time_s, SAME_INSTANT_S
         )
-        start, covariance = start_ballistic(used, start_s, model)
+        start, covariance = _start_ballistic(used, start_s, model)
     else:
-        force, rate = bridges.force, bridges.rate
+        force, rate = sensors.force, sensors.rate
         clocks = model.column(rate.spec.name, "time bias") >= 0
         motion, node_index = inertial_motion(force, rate, time_s, clocks)
         prior = _attitude_prior(telemetry, start_s)
-        start, covariance = start_by_inertial_sensors(used, prior, start_s, force, rate, model)
+        start, covariance = _start_by_inertial_sensors(used, prior, start_s, force, rate, model)
     motion = with_stated(motion, telemetry.motion)
     from scipy.stats import chi2
 
@@ -91,12 +101,12 @@ def build_problem(
     kept: BoolArray = np.zeros(len(time_s), dtype=bool)
     kept[nearest_index(time_s, output_s)] = True
     problem = Problem(time_s, node_index, motion, model, instruments, row, observed, start, covariance, gate, kept)
-    return problem.without(_only_predicted(problem, settings, denied))
+    return problem.without(_only_predicted(problem, settings, rejected))
 
 
-def _believed(instrument: Instrument, denied: Mapping[str, FloatArray]) -> Instrument:
-    """Instrument without what it measured at denied times."""
-    keep = ~_at_any(instrument.time_s, denied.get(instrument.name))
+def _without_rejected(instrument: Instrument, rejected: Mapping[str, FloatArray]) -> Instrument:
+    """Instrument without its measurements at rejected times."""
+    keep = ~_at_any(instrument.time_s, rejected.get(instrument.name))
     parts = {name: getattr(instrument, name)[keep] for name in ("time_s", "value", "variance", "known")}
     return replace(instrument, **parts)
 
@@ -107,12 +117,12 @@ def _at_any(time_s: FloatArray, times: FloatArray | None) -> BoolArray:
     return np.asarray(np.abs(times[nearest_index(times, time_s)] - time_s) <= SAME_INSTANT_S)
 
 
-def _left_out(instrument: Instrument, settings: Settings) -> bool:
+def _is_excluded(instrument: Instrument, settings: Settings) -> bool:
     return instrument.name in settings.without or instrument.owner in settings.without
 
 
 def _named_model(
-    telemetry: Telemetry, settings: Settings, bridges: Bridges | None, trackers: tuple[Instrument, ...]
+    telemetry: Telemetry, settings: Settings, sensors: InertialSensors | None, trackers: tuple[Instrument, ...]
 ) -> ErrorModel:
     """Error model as the settings want it, or every fault of the names in them at once."""
     known = sorted({name for i in trackers for name in (i.name, i.owner)})
@@ -120,13 +130,16 @@ def _named_model(
         known += ["magnetometer"] if telemetry.magnetometer is not None else []
         known += [f"sun{k + 1}" for k in range(len(telemetry.sun.spec.clock_lv_rad))] if telemetry.sun else []
     faults = [
-        f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}"
+        Fault(
+            f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}", "source-unknown"
+        )
         for name in settings.without
         if name not in known
     ]
-    if settings.attitude_sensors and bridges is None:
-        faults.append("attitude_sensors: ballistic flight has no attitude that they could measure; leave them off")
-    model = build_error_model(telemetry, bridges, settings.attitude_sensors)
+    if settings.attitude_sensors and sensors is None:
+        remark = "attitude_sensors: ballistic flight has no attitude that they could measure; leave them off"
+        faults.append(Fault(remark, "setting-not-applicable"))
+    model = _build_error_model(telemetry, sensors, settings.attitude_sensors)
     try:
         model = model.considering(settings.consider)
     except GateError as unknown:
@@ -136,20 +149,20 @@ def _named_model(
     return model
 
 
-def _only_predicted(problem: Problem, settings: Settings, denied: Mapping[str, FloatArray]) -> BoolArray:
-    """Measurements (M,) that check the trajectory: whole sources, oversampled and denied ones, spans, every n-th."""
+def _only_predicted(problem: Problem, settings: Settings, rejected: Mapping[str, FloatArray]) -> BoolArray:
+    """Measurements (M,) that check the trajectory: whole sources, oversampled and rejected ones, spans, every n-th."""
     out: BoolArray = np.zeros(len(problem.row), dtype=bool)
     at = problem.time_s[problem.node]
     for number, i in enumerate(problem.instruments):
         mine = np.flatnonzero(problem.observed.source == number)
-        out[mine] = _left_out(i, settings) | _at_any(at[mine], denied.get(i.name))
-        if i.kind not in TRACKING:
+        out[mine] = _is_excluded(i, settings) | _at_any(at[mine], rejected.get(i.name))
+        if i.kind not in _TRACKING:
             continue
         out[mine] |= ~spaced(at[mine], i.every_s)
-        if settings.withhold_every:
+        if settings.hold_out_every:
             left = mine[~out[mine]]
-            out[left[settings.withhold_every - 1 :: settings.withhold_every]] = True
-        for start, end in settings.withhold_s:
+            out[left[settings.hold_out_every - 1 :: settings.hold_out_every]] = True
+        for start, end in settings.hold_out_spans_s:
             out[mine] |= (at[mine] >= start) & (at[mine] < end)
     return out
 
@@ -169,16 +182,17 @@ def _attitude_prior(telemetry: Telemetry, start_s: float) -> AttitudePrior:
             [
                 f"flight '{telemetry.name}' has no attitude to start from; add [attitude_prior], or both "
                 "[sensors.magnetometer] and [sensors.sun] with their tables, to flight.toml"
-            ]
+            ],
+            code="attitude-missing",
         )
     return start_attitude_from_vectors(telemetry, start_s).prior()
 
 
-def _accelerometer_arm(bridges: Bridges | None) -> FloatArray:
+def _accelerometer_arm(sensors: InertialSensors | None) -> FloatArray:
     """Accelerometer from the datum; in ballistic flight the followed point is the tracked one."""
-    if bridges is None:
+    if sensors is None:
         return np.zeros(3)
-    return bridges.force.spec.position_from_datum_body_m
+    return sensors.force.spec.position_from_datum_body_m
 
 
 def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: FloatArray) -> tuple[Instrument, ...]:
@@ -198,11 +212,11 @@ def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: F
     return tuple(out)
 
 
-def attitude_instruments(
+def _attitude_instruments(
     telemetry: Telemetry, tracking: tuple[Instrument, ...], start_s: float, end_s: float
 ) -> tuple[Instrument, ...]:
-    """Magnetometer and Sun heads as measurements, thinned; places for the field come from the tracking data."""
-    t, points = places(tracking)
+    """Magnetometer and Sun heads as measurements, thinned; positions for the field come from the tracking data."""
+    t, points = track_points(tracking)
     out: list[Instrument] = []
     if telemetry.magnetometer is not None:
         record = telemetry.magnetometer
@@ -223,40 +237,43 @@ def attitude_instruments(
 def _thinned(time_s: FloatArray, good: BoolArray, start_s: float, end_s: float) -> IntArray:
     """Rows of the first good sample of each cell of time within a span."""
     rows = np.flatnonzero(good & (time_s >= start_s) & (time_s <= end_s))
-    _, first = np.unique(np.floor(time_s[rows] * ATTITUDE_RATE_HZ), return_index=True)
+    _, first = np.unique(np.floor(time_s[rows] * _ATTITUDE_RATE_HZ), return_index=True)
     return rows[first]
 
 
-def build_error_model(telemetry: Telemetry, bridges: Bridges | None, attitude_sensors: bool) -> ErrorModel:
+def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, attitude_sensors: bool) -> ErrorModel:
     """All errors that the flight file states, drivers of the motion first."""
-    if bridges is None:
+    if sensors is None:
         blocks = error_model.ballistic_blocks(telemetry.motion)
     else:
-        blocks = error_model.triad_blocks(bridges.force.spec, "m/s2")
-        blocks += error_model.triad_blocks(bridges.rate.spec, "rad/s")
-        blocks += error_model.clock_blocks(bridges.force.spec, bridges.rate.spec)
+        blocks = error_model.imu_blocks(sensors.force.spec, sensors.rate.spec)
     for radar in telemetry.radars.values():
-        blocks += error_model.radar_blocks(radar.site)
+        blocks += instrument_blocks(RADAR_ERRORS, radar.site)
     for fixes in telemetry.gnss.values():
-        blocks += error_model.gnss_blocks(fixes.spec)
+        blocks += instrument_blocks(GNSS, fixes.spec)
     for heights in telemetry.barometers.values():
-        blocks += error_model.barometer_blocks(heights.spec)
+        blocks += instrument_blocks(BAROMETER, heights.spec)
     if attitude_sensors and telemetry.magnetometer is not None:
-        blocks += error_model.magnetometer_blocks(telemetry.magnetometer.spec)
+        blocks += instrument_blocks(MAGNETOMETER, telemetry.magnetometer.spec)
     if attitude_sensors and telemetry.sun is not None:
         blocks += error_model.sun_blocks(telemetry.sun.spec)
     return ErrorModel(tuple(blocks))
 
 
-def _span(instruments: tuple[Instrument, ...], settings: Settings, bridges: Bridges | None) -> tuple[float, float]:
+def _span(
+    instruments: tuple[Instrument, ...], settings: Settings, sensors: InertialSensors | None
+) -> tuple[float, float]:
     """First and last time that inertial sensors and at least one tracker cover, within the settings' span."""
-    t, _ = places(instruments)
+    t, _ = track_points(instruments)
     if len(t) == 0:
-        raise GateError("no radar or receiver has a usable point that is not left out; a trajectory needs at least one")
+        raise GateError(
+            "no radar or receiver has a usable point that is not left out; a trajectory needs at least one",
+            code="no-track-points",
+        )
     start_s, end_s = float(t[0]), float(t[-1])
-    if bridges is not None:
-        start_s = max(start_s, bridges.force.time_s[0], bridges.rate.time_s[0])
-        end_s = min(end_s, bridges.force.time_s[-1], bridges.rate.time_s[-1])
+    if sensors is not None:
+        start_s = max(start_s, sensors.force.time_s[0], sensors.rate.time_s[0])
+        end_s = min(end_s, sensors.force.time_s[-1], sensors.rate.time_s[-1])
     if settings.start_s is not None:
         start_s = max(start_s, settings.start_s)
     if settings.end_s is not None:
@@ -264,7 +281,8 @@ def _span(instruments: tuple[Instrument, ...], settings: Settings, bridges: Brid
     if end_s - start_s < 2.0 * FIT_SPAN_S:
         raise GateError(
             f"inertial sensors and trackers share only {start_s:.3f} to {end_s:.3f} s; "
-            f"at least {2.0 * FIT_SPAN_S:.0f} s are needed: check time bases and the chosen span"
+            f"at least {2.0 * FIT_SPAN_S:.0f} s are needed: check time bases and the chosen span",
+            code="span-too-short",
         )
     return float(start_s), float(end_s)
 
@@ -277,29 +295,29 @@ def _output_times(start_s: float, end_s: float, rate_hz: float) -> FloatArray:
 
 
 def _pulse_times(
-    instruments: tuple[Instrument, ...], force: Bridged, start_s: float, end_s: float, rate_hz: float
+    instruments: tuple[Instrument, ...], force: BridgedSensor, start_s: float, end_s: float, rate_hz: float
 ) -> list[FloatArray]:
     """Multiples of the pulse's step where the descent's specific force exceeds half its largest; empty without one."""
-    at, points = places(instruments)
+    at, points = track_points(instruments)
     apex_s = float(at[int(np.argmax(np.linalg.norm(points, axis=1)))])
     inside = (force.time_s >= max(start_s, apex_s)) & (force.time_s <= end_s)
     if inside.sum() < 2:
         return []
-    cell = np.floor((force.time_s[inside] - force.time_s[inside][0]) / PULSE_CELL_S).astype(np.int64)
+    cell = np.floor((force.time_s[inside] - force.time_s[inside][0]) / _PULSE_CELL_S).astype(np.int64)
     count = np.bincount(cell)
     size = np.bincount(cell, np.linalg.norm(force.measured_sensor[inside], axis=1)) / np.maximum(count, 1)
     size = np.interp(np.arange(len(size)), np.flatnonzero(count), size[count > 0])
-    if size.max() < LEAST_PULSE_MPS2:
+    if size.max() < _LEAST_PULSE_MPS2:
         return []
     peak, weak = int(np.argmax(size)), size < 0.5 * size.max()
     first = int(np.flatnonzero(weak[:peak])[-1]) + 1 if weak[:peak].any() else 0
     last = peak + int(np.argmax(weak[peak:])) if weak[peak:].any() else len(size)
-    begin = float(force.time_s[inside][0]) + PULSE_CELL_S * first
-    return [_output_times(begin, min(begin + PULSE_CELL_S * (last - first), end_s), rate_hz)[1:]]
+    begin = float(force.time_s[inside][0]) + _PULSE_CELL_S * first
+    return [_output_times(begin, min(begin + _PULSE_CELL_S * (last - first), end_s), rate_hz)[1:]]
 
 
 def _union(times: list[FloatArray]) -> FloatArray:
-    """All times in order, instants closer than `inertial.SAME_INSTANT_S` taken once."""
+    """All times in order, instants closer than `recon.motion.SAME_INSTANT_S` taken once."""
     t = np.sort(np.concatenate(times))
     kept = t[np.diff(t, prepend=-np.inf) > SAME_INSTANT_S]
     # in a chain of near instants the last may be far from the first
@@ -307,17 +325,8 @@ def _union(times: list[FloatArray]) -> FloatArray:
     return np.asarray(kept if len(far) == 0 else _union([kept, far]))
 
 
-DIFFUSE_POSITION_M = 1000.0
-DIFFUSE_VELOCITY_MPS = 100.0
-
-LEAST_POINTS = 4
-TRACK_SPAN_S = 2.5
-STILL_RAD = 1e-6
-GYRO = slice(18, 27)
-
-
-def start_attitude(
-    prior: AttitudePrior, start_s: float, force: Bridged, rate: Bridged, model: ErrorModel
+def _start_attitude(
+    prior: AttitudePrior, start_s: float, force: BridgedSensor, rate: BridgedSensor, model: ErrorModel
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Attitude (4,) at the start, its covariance (3, 3) and its covariance with the gyros' errors (3, 9).
 
@@ -333,21 +342,22 @@ def start_attitude(
     if lo < rate.time_s[0] - 0.1 or hi > rate.time_s[-1] + 0.1:
         raise GateError(
             f"attitude prior at {prior.time_s:.3f} s: gyro samples cover {rate.time_s[0]:.3f} to "
-            f"{rate.time_s[-1]:.3f} s and cannot carry it to the start at {start_s:.3f} s"
+            f"{rate.time_s[-1]:.3f} s and cannot carry it to the start at {start_s:.3f} s",
+            code="attitude-prior-out-of-reach",
         )
     motion, ends = inertial_motion(force, rate, np.array([lo, hi]))
     first, last = (int(ends[0]), int(ends[1])) if prior.time_s < start_s else (int(ends[1]), int(ends[0]))
-    somewhere = States(np.array([earth.SEMI_MAJOR_M, 0.0, 0.0]), np.zeros(3), q, np.zeros(model.size))
-    step = propagate(motion, first, last, somewhere)
-    by_attitude, by_gyro = step.transition[6:9, 6:9], step.transition[6:9, GYRO]
+    anywhere = States(np.array([earth.SEMI_MAJOR_M, 0.0, 0.0]), np.zeros(3), q, np.zeros(model.size))
+    step = propagate(motion, first, last, anywhere)
+    by_attitude, by_gyro = step.transition[6:9, 6:9], step.transition[6:9, _GYRO]
     gyro_var = np.diag(model.prior_sd[9:18] ** 2)
     cross = by_gyro @ gyro_var
     total = by_attitude @ var @ by_attitude.T + cross @ by_gyro.T + step.noise[6:9, 6:9]
     return step.state.q_ecef_body, total, cross
 
 
-def places(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:
-    """Times (k,) and points (k, 3), ECEF m, of everything that tells a place by itself, in order."""
+def track_points(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:
+    """Times (k,) and points (k, 3), ECEF m, of every measurement that fixes a position by itself, in order."""
     times, points = [], []
     for i in instruments:
         whole = np.isfinite(i.variance).all(axis=1)
@@ -369,26 +379,27 @@ def _ned_from_radar(range_az_el: FloatArray) -> FloatArray:
     return np.column_stack([slant * np.cos(el) * np.cos(az), slant * np.cos(el) * np.sin(az), -slant * np.sin(el)])
 
 
-def fit_first_points(instruments: tuple[Instrument, ...], start_s: float) -> tuple[FloatArray, FloatArray]:
+def fit_start(instruments: tuple[Instrument, ...], start_s: float) -> tuple[FloatArray, FloatArray]:
     """Position and velocity (3,) of the tracked point at the start: a parabola through the seconds about it.
 
-    Where they hold fewer than `LEAST_POINTS` a line through two will do (a rocket on its pad whose receiver is silent
-    under thrust), and only without two are later points asked. Points far from the curve, in units of the median
-    distance, lose their weight as the fit is repeated.
+    With fewer than `_LEAST_POINTS` in them a line through two is used (a rocket on its pad whose receiver gives no fix
+    under thrust), and only without two are later points used. Points far from the curve, in units of the median
+    distance, are down-weighted as the fit is repeated.
 
     Raises
     ------
     GateError
         With fewer than three points.
     """
-    t, p = places(instruments)
+    t, p = track_points(instruments)
     t, p = t[t >= start_s - FIT_SPAN_S] - start_s, p[t >= start_s - FIT_SPAN_S]
     if len(t) < 3:
-        raise GateError(f"tracking: {len(t)} points after {start_s:.3f} s; at least 3 are needed to start")
+        what = f"tracking: {len(t)} points after {start_s:.3f} s; at least 3 are needed to start"
+        raise GateError(what, code="too-few-track-points")
     near = int(np.searchsorted(t, FIT_SPAN_S))
-    count = near if near >= 2 else LEAST_POINTS
+    count = near if near >= 2 else _LEAST_POINTS
     t, p = t[:count], p[:count]
-    degree = 2 if len(t) >= LEAST_POINTS else 1
+    degree = 2 if len(t) >= _LEAST_POINTS else 1
     weight: FloatArray = np.ones(len(t))
     coefficients: FloatArray = np.zeros((3, 3))
     for _ in range(10):
@@ -399,73 +410,75 @@ def fit_first_points(instruments: tuple[Instrument, ...], start_s: float) -> tup
     return coefficients[0], coefficients[1]
 
 
-def across_path(instruments: tuple[Instrument, ...]) -> FloatArray:
-    """Level direction (3,), ECEF, in which the tracked places lie least far apart.
+def _cross_path_direction(instruments: tuple[Instrument, ...]) -> FloatArray:
+    """Horizontal direction (3,), ECEF, normal to the path: that in which the tracked positions scatter least.
 
-    Each counts by its direction from the middle one alone, so that a wild point has no more weight than another.
+    Each counts by its direction from the median alone, so that an outlier has no more weight than another.
     """
-    _, points = places(instruments)
+    _, points = track_points(instruments)
     middle = np.median(points, axis=0)
     up = middle / np.linalg.norm(middle)
     level = points - middle
     level -= np.outer(level @ up, up)
     level /= np.linalg.norm(level, axis=1, keepdims=True) + 1e-9
-    # of three axes the least is upright
+    # of three axes the least is vertical
     return np.asarray(np.linalg.eigh(level.T @ level)[1][:, 1])
 
 
-def along_track(instruments: tuple[Instrument, ...], time_s: FloatArray, errors: int) -> States | None:
-    """States at nodes (n,) that tracking alone tells, without attitude: where to linearise when a filter is lost.
+def track_fit_states(instruments: tuple[Instrument, ...], time_s: FloatArray, errors: int) -> States | None:
+    """States at nodes (n,) from tracking alone, without attitude: where to linearise when a filter lost the track.
 
-    Parabolas through the points within `TRACK_SPAN_S` of a node give position and velocity; cubics that meet both
-    cross the gaps between. None where fewer than two nodes have points about them.
+    Parabolas through the points within `_TRACK_SPAN_S` of a node give position and velocity; cubics that meet both
+    bridge the gaps between. None where fewer than two nodes have points about them.
     """
-    t, p = places(instruments)
-    first, last = np.searchsorted(t, time_s - TRACK_SPAN_S), np.searchsorted(t, time_s + TRACK_SPAN_S)
-    told = np.flatnonzero(last - first >= LEAST_POINTS)
-    # far from its own points a parabola says nothing
-    told = np.array([k for k in told if t[first[k]] <= time_s[k] <= t[last[k] - 1]], dtype=np.int64)
-    if len(told) < 2:
+    t, p = track_points(instruments)
+    first, last = np.searchsorted(t, time_s - _TRACK_SPAN_S), np.searchsorted(t, time_s + _TRACK_SPAN_S)
+    fitted = np.flatnonzero(last - first >= _LEAST_POINTS)
+    # a parabola is not extrapolated
+    fitted = np.array([k for k in fitted if t[first[k]] <= time_s[k] <= t[last[k] - 1]], dtype=np.int64)
+    if len(fitted) < 2:
         return None
     fits = np.array(
         [
             np.polynomial.polynomial.polyfit(t[a:b] - at, p[a:b], 2)[:2]
-            for a, b, at in zip(first[told], last[told], time_s[told], strict=True)
+            for a, b, at in zip(first[fitted], last[fitted], time_s[fitted], strict=True)
         ]
     )
     from scipy.interpolate import CubicHermiteSpline
 
-    path = CubicHermiteSpline(time_s[told], fits[:, 0], fits[:, 1])
-    inside = np.clip(time_s, time_s[told[0]], time_s[told[-1]])
+    path = CubicHermiteSpline(time_s[fitted], fits[:, 0], fits[:, 1])
+    inside = np.clip(time_s, time_s[fitted[0]], time_s[fitted[-1]])
     velocity = path.derivative()(inside)
     position = path(inside) + (time_s - inside)[:, None] * velocity
-    still = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_s), 1))
-    return States(position, velocity, still, np.zeros((len(time_s), errors)))
+    no_rotation = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_s), 1))
+    return States(position, velocity, no_rotation, np.zeros((len(time_s), errors)))
 
 
 def _covariance(model: ErrorModel) -> FloatArray:
     """Prior of everything but rotation."""
-    sd = np.concatenate([np.full(3, DIFFUSE_POSITION_M), np.full(3, DIFFUSE_VELOCITY_MPS), np.zeros(3), model.prior_sd])
+    sd = np.concatenate(
+        [np.full(3, _DIFFUSE_POSITION_M), np.full(3, _DIFFUSE_VELOCITY_MPS), np.zeros(3), model.prior_sd]
+    )
     return np.diag(sd**2)
 
 
-def start_by_inertial_sensors(
+def _start_by_inertial_sensors(
     instruments: tuple[Instrument, ...],
     prior: AttitudePrior,
     start_s: float,
-    force: Bridged,
-    rate: Bridged,
+    force: BridgedSensor,
+    rate: BridgedSensor,
     model: ErrorModel,
 ) -> tuple[States, FloatArray]:
     """State at the start and its covariance (9 + m, 9 + m)."""
-    q, var, cross = start_attitude(prior, start_s, force, rate, model)
-    position, velocity = fit_first_points(instruments, start_s)
+    q, var, cross = _start_attitude(prior, start_s, force, rate, model)
+    position, velocity = fit_start(instruments, start_s)
     sample = np.array([[np.interp(start_s, rate.time_s, column) for column in rate.measured_sensor.T]])
     w = correct(sample, np.zeros(9), rate.spec.dcm_body_sensor)[0]
     arm = next(i.arm_body_m for i in instruments if i.kind in (RADAR, POSITION))
     c = rotations.dcm_from_q(q)
-    swing = c @ np.cross(w - c.T @ earth.OMEGA_ECEF_RADPS, arm)
-    state = States(position - c @ arm, velocity - swing, q, np.zeros(model.size))
+    lever_velocity = c @ np.cross(w - c.T @ earth.OMEGA_ECEF_RADPS, arm)
+    state = States(position - c @ arm, velocity - lever_velocity, q, np.zeros(model.size))
     covariance = _covariance(model)
     covariance[6:9, 6:9] = var
     gyro = slice(KINEMATIC + 9, KINEMATIC + 18)
@@ -474,11 +487,11 @@ def start_by_inertial_sensors(
     return state, covariance
 
 
-def start_ballistic(
+def _start_ballistic(
     instruments: tuple[Instrument, ...], start_s: float, model: ErrorModel
 ) -> tuple[States, FloatArray]:
     """State at the start and its covariance (9 + m, 9 + m), without attitude."""
-    position, velocity = fit_first_points(instruments, start_s)
+    position, velocity = fit_start(instruments, start_s)
     covariance = _covariance(model)
-    covariance[range(6, 9), range(6, 9)] = STILL_RAD**2
+    covariance[range(6, 9), range(6, 9)] = _FIXED_RAD**2
     return States(position, velocity, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(model.size)), covariance

@@ -1,4 +1,4 @@
-"""What all data say about every time: smoothers of the forward pass.
+"""What is the best estimate at every time from the data of the whole flight? Fixed-interval smoothing.
 
 **Rauch-Tung-Striebel** on the stored priors. With ``x_{k+1} = F x_k + u + w``, ``cov(w) = Q`` and the filter's prior
 ``P = P_{k+1|k}``, the textbook gain ``C = P_{k|k} F^T P^-1`` equals ``C = F^-1 (1 - Q P^-1)``, and
@@ -10,52 +10,42 @@ a sum of two positive terms: no difference of nearly equal covariances is formed
 in ``C`` and stay exactly constant, so only the rows of *moving* errors are formed. ``P`` is scaled to a correlation
 matrix before it is solved with.
 
-**Bryson-Frazier**, the adjoint of the filter, which inverts nothing larger than an innovation's covariance. Backwards
-over a measurement and over a step,
-
-    l- = (1 - K H)^T l+ - H^T S^-1 (y - H x),   L- = (1 - K H)^T L+ (1 - K H) + H^T S^-1 H
-    l+ = F^T l-,                               L+ = F^T L- F
-    x_{k|N} = x_{k|k-1} - P_{k|k-1} l-,        P_{k|N} = P_{k|k-1} - P_{k|k-1} L- P_{k|k-1}
-
-It is faster, and loses digits where smoothing takes most of a prior's variance away.
-
-Both presume optimal gains, which a filter that only *considers* some errors has not. The second is then wrong. The
-first still knows its own covariance, but takes a later change of everything else as if considered errors could have
-changed with it: with a considered scale of an accelerometer it is ten times worse than the filter that it smooths. Then
-the **two-filter** smoother is used: an information filter from the end,
+It presumes optimal gains, which a filter that only *considers* some errors (Schmidt) has not: its own covariance is
+still right, but a later change of everything else is taken as if considered errors could have changed with it. With a
+considered scale of an accelerometer the result is ten times worse than the filter that it smooths. Then the
+**two-filter** smoother is used: an information filter from the end,
 
     l- = l+ + L+ K y + H^T R^-1 y,     L- = L+ + H^T R^-1 H        (y: the forward filter's residual)
     l+ = F^T (1 + L- Q)^-1 l-,         L+ = F^T (1 + L- Q)^-1 L- F
 
-tells what all later data say about the errors of the forward estimate, and Schmidt's rule uses that as one measurement,
+holds the information of all later data on the errors of the forward estimate, and Schmidt's rule uses that as one
+measurement,
 
     x_{k|N} = x_{k|k-1} + P_{k|k-1} (1 + L- P_{k|k-1})^-1 l-,     P_{k|N} = P_{k|k-1} (1 + L- P_{k|k-1})^-1
 
 in the rows of the estimated errors; considered ones stay at zero with their own variance. It is never worse than the
-filter, its covariance is exact, and without considered errors it equals the other two.
+filter, its covariance is exact, and without considered errors it equals Rauch-Tung-Striebel. The tests compare both
+with the Bryson-Frazier smoother and with the conditioning of one joint Gaussian.
 
 References
 ----------
 H. Rauch, F. Tung, C. Striebel, AIAA J. 3 (1965) 1445, eqs. (3.23)-(3.30).
-G. Bierman, "Fixed interval smoothing with discrete measurements", Int. J. Control 18 (1973) 65 (modified
-Bryson-Frazier).
 D. Fraser, J. Potter, "The optimum linear smoother as a combination of two optimum linear filters", IEEE Trans.
 Automatic Control 14 (1969) 387.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from flightmodel.checks import FloatArray
-from recon import _bryson_frazier_kernels, _smoother_kernels
-from recon.ekf import ForwardPass
+from recon import _smoother_kernels
+from recon.ekf import COMPILED, ForwardPass
 from recon.problem import Problem
 from recon.state import KINEMATIC, Filtered, Innovations, IntArray, Observed, States, Steps, boxplus, packed, unpacked
-
-SMOOTHERS = ("rauch-tung-striebel", "bryson-frazier")
 
 
 @dataclass(frozen=True)
@@ -80,16 +70,10 @@ class Smoothed:
         return boxplus(charts, self.x)
 
 
-def smooth(
-    problem: Problem,
-    run: ForwardPass,
-    with_covariance: bool = True,
-    method: str = "rauch-tung-striebel",
-    engine: str = "compiled",
-) -> Smoothed:
+def smooth(problem: Problem, run: ForwardPass, with_covariance: bool = True, engine: str = COMPILED) -> Smoothed:
     """Smooth a forward pass; without covariance where only a reference trajectory is wanted.
 
-    Where errors are only considered this is `two_filter`, whatever the method; it exists in numpy alone.
+    Where errors are only considered this is `two_filter`, which exists in numpy alone.
     """
     kept = int(problem.kept.sum()) if with_covariance else 0
     triangles, variance = np.empty((kept, problem.dense * (problem.dense + 1) // 2)), np.empty((kept, problem.size))
@@ -100,17 +84,15 @@ def smooth(
             run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, considered, x,
             triangles, variance,
         )  # fmt: skip
-    elif method == "bryson-frazier":
-        x = np.empty_like(run.filtered.x_plus)
-        adjoint = _bryson_frazier_kernels.bryson_frazier if engine == "compiled" else bryson_frazier
-        adjoint(
-            run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, x, triangles, variance
-        )
     else:
         x = run.filtered.x_plus.copy()
-        backward = _smoother_kernels.rauch_tung_striebel if engine == "compiled" else rauch_tung_striebel
-        backward(run.steps, run.filtered, problem.moving, x, triangles, variance)
+        backward(engine)(run.steps, run.filtered, problem.moving, x, triangles, variance)
     return Smoothed(x, triangles, variance)
+
+
+def backward(engine: str) -> Callable[..., None]:
+    """Rauch-Tung-Striebel's pass of an engine: arguments as `rauch_tung_striebel`."""
+    return _smoother_kernels.rauch_tung_striebel if engine == COMPILED else rauch_tung_striebel
 
 
 def step_gain(
@@ -143,7 +125,7 @@ def step_gain(
     return inverse @ gain, inverse @ rest @ inverse.T
 
 
-def _keep(run: Filtered, k: int, p: FloatArray, triangles: FloatArray, variance: FloatArray) -> None:
+def store_moments(run: Filtered, k: int, p: FloatArray, triangles: FloatArray, variance: FloatArray) -> None:
     """Store the moments of node ``k`` where they are wanted."""
     row = run.kept[k]
     if row >= 0 and len(triangles):
@@ -165,9 +147,9 @@ def full_step(steps: Steps, k: int) -> tuple[FloatArray, FloatArray]:
 def rauch_tung_striebel(
     steps: Steps, run: Filtered, moving: IntArray, x: FloatArray, triangles: FloatArray, variance: FloatArray
 ) -> None:
-    """Readable twin of `recon._smoother_kernels.rauch_tung_striebel`."""
+    """Smooth ``x`` (n, N), which comes as the filtered errors, in place; moments at kept nodes where wanted."""
     p = run.p_last.copy()
-    _keep(run, len(x) - 1, p, triangles, variance)
+    store_moments(run, len(x) - 1, p, triangles, variance)
     for k in reversed(range(len(x) - 1)):
         f, q = full_step(steps, k)
         prior = unpacked(run.p_minus[k + 1])
@@ -179,44 +161,23 @@ def rauch_tung_striebel(
         p[moving], p[:, moving] = rows, rows.T
         block = rows @ c.T + added
         p[np.ix_(moving, moving)] = 0.5 * (block + block.T)
-        _keep(run, k, p, triangles, variance)
+        store_moments(run, k, p, triangles, variance)
 
 
-def bryson_frazier(
-    steps: Steps, run: Filtered, observed: Observed, slots: IntArray, innovations: Innovations, x: FloatArray,
-    triangles: FloatArray, variance: FloatArray,
-) -> None:  # fmt: skip
-    """Readable twin of `recon._bryson_frazier_kernels`."""
-    n, size = x.shape
-    mean, information = np.zeros(size), np.zeros((size, size))
-    first, v = observed.first, innovations
-    for k in reversed(range(n)):
-        for row in reversed(range(first[k], first[k + 1])):
-            if not v.accepted[row]:
-                continue
-            used, h = read(observed, slots, v, row, size)
-            weight = h.T @ np.linalg.inv(v.covariance[row][np.ix_(used, used)])
-            rest = np.eye(size) - v.gain[row][:, used] @ h
-            mean = rest.T @ mean - weight @ v.residual[row, used]
-            information = rest.T @ information @ rest + weight @ h
-        p = unpacked(run.p_minus[k])
-        x[k] = run.x_minus[k] - p @ mean
-        _keep(run, k, p - p @ information @ p, triangles, variance)
-        if k > 0:
-            f, _ = full_step(steps, k - 1)
-            mean, information = f.T @ mean, f.T @ information @ f
-
-
-def read(
-    observed: Observed, slots: IntArray, innovations: Innovations, row: int, size: int
-) -> tuple[IntArray, FloatArray]:
-    """Which components a measurement has, and their partials by all errors (k, N)."""
-    used = np.flatnonzero(np.isfinite(observed.variance[row]))
-    slot = slots[observed.source[row]]
+def jacobian(innovations: Innovations, slot: IntArray, row: int, size: int) -> FloatArray:
+    """Partials (3, N) of one measurement's prediction by all errors; ``slot`` (SLOTS,) of its instrument."""
     h = np.zeros((3, size))
     h[:, :KINEMATIC] = innovations.by_state[row]
     h[:, KINEMATIC + slot[slot >= 0]] += innovations.by_error[row][:, slot >= 0]
-    return used, h[used]
+    return h
+
+
+def measured_rows(
+    observed: Observed, slots: IntArray, innovations: Innovations, row: int, size: int
+) -> tuple[IntArray, FloatArray]:
+    """Components (k,) that a measurement has, and their partials by all errors (k, N)."""
+    used = np.flatnonzero(np.isfinite(observed.variance[row]))
+    return used, jacobian(innovations, slots[observed.source[row]], row, size)[used]
 
 
 def _root(covariance: FloatArray) -> FloatArray:
@@ -239,7 +200,7 @@ def two_filter(
         for row in reversed(range(first[k], first[k + 1])):
             if not v.accepted[row]:
                 continue
-            used, h = read(observed, slots, v, row, size)
+            used, h = measured_rows(observed, slots, v, row, size)
             weight, y = h.T / observed.variance[row, used], v.residual[row, used]
             mean = mean + information @ (v.gain[row][:, used] @ y) + weight @ y
             information = information + weight @ h
@@ -251,7 +212,7 @@ def two_filter(
         if run.kept[k] >= 0 and len(triangles):
             p = half.T @ half
             p[np.ix_(considered, considered)] = prior[np.ix_(considered, considered)]
-            _keep(run, k, p, triangles, variance)
+            store_moments(run, k, p, triangles, variance)
         if k > 0:
             f, q = full_step(steps, k - 1)
             moving = np.flatnonzero(np.diag(q) > 0.0)

@@ -1,14 +1,13 @@
-"""What the filter estimates: nominal states at nodes, and the error coordinates about them.
+"""What does the filter estimate? Nominal states at nodes, error coordinates about them, and the arrays of a pass.
 
-A state is position and velocity of the accelerometer triad (ECEF, m and m/s relative to the Earth), attitude of the
+A state is position and velocity of the accelerometer (ECEF, m and m/s relative to the Earth), attitude of the
 body and the vector of sensor errors. Error coordinates add, except for rotation, which is a right-hand vector in body
 axes, rad: ``state = nominal [+] error``. Following the accelerometer rather than the datum keeps lever arms, and with
 them derivatives of the gyro signal, out of the integration; `recon.reconstruct` moves the answer to the datum.
 
-The filter's problem and its answer as plain tuples of arrays, which compiled and readable engines both take.
-
-``n`` nodes, ``M`` measurements, ``m`` errors beside the nine kinematic ones (``N = 9 + m``), the first ``s`` of them
-drivers of the motion (`recon.motion`), ``D = 9 + s``. Symmetric matrices are stored as packed lower triangles.
+A pass is plain tuples of arrays, which both engines take: ``n`` nodes, ``M`` measurements, ``m`` errors beside the nine
+kinematic ones (``N = 9 + m``), the first ``s`` of them drivers of the motion (`recon.motion`), ``D = 9 + s``. Symmetric
+matrices are stored as packed lower triangles.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class States:
     Parameters
     ----------
     position_ecef_m, velocity_ecef_mps : (n, 3) float
-        Of the accelerometer triad.
+        Of the accelerometer.
     q_ecef_body : (n, 4) float
     sensor_errors : (n, m) float
         In the order of `recon.error_model.ErrorModel`, which starts with the 18 errors of the inertial sensors.
@@ -129,9 +128,9 @@ class Observed(NamedTuple):
 
 
 class Wander(NamedTuple):
-    """How each error (m,) wanders.
+    """Gauss-Markov model of each error (m,).
 
-    Time constant and altitude over which it forgets and returns to its sd; variance by which it walks away in a second;
+    Time constant and altitude over which it decorrelates, at its stationary sd; variance of a random walk per second;
     whether it is only considered.
     """
 
@@ -185,7 +184,7 @@ class Filtered(NamedTuple):
 
 
 class Innovations(NamedTuple):
-    """What each measurement brought; components that were not measured are zero with unit variance.
+    """Innovation and gain of each measurement; components that were not measured are zero with unit variance.
 
     Parameters
     ----------

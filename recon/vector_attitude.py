@@ -1,21 +1,19 @@
-"""How was the vehicle turned, by magnetometer and Sun sensors alone?
+"""How was the vehicle oriented, by magnetometer and Sun sensors alone, and does the trajectory agree?
 
-Two directions known in space and measured in the vehicle fix three angles. A smoother over attitude, rate and the
-sensors' constant errors (`recon.vector_models`) makes a history of them that is known far better than one sample
-tells, because a spinning vehicle shows the errors of its sensors to be its own. No gyro, no accelerometer and no filter
-of the trajectory takes part.
+Two directions known in space and measured in the vehicle fix three angles (Wahba's problem),
 
-Where no head sees the Sun only two angles are known. Short stretches are bridged by the smoother, and their covariance
-says what that costs; longer ones, over which the vehicle may have turned by more than a quarter, have no rows.
+    b_body = C^T b_eci,   s_body = C^T s_eci
 
-Does the trajectory's attitude agree with one from magnetometer and Sun sensors alone, and what does that start with?
+and a smoother over attitude, rate and the sensors' constant errors (`recon.attitude_smoother`) makes a history of them
+that is far more accurate than one sample, because a spinning vehicle separates errors of its sensors from its motion.
+No gyro, no accelerometer and no filter of the trajectory takes part. Where no head sees the Sun only two angles are
+observable: short stretches are bridged by the smoother, with the covariance that this costs; longer ones, over which
+the vehicle may have rotated by more than a quarter turn, have no rows.
 
-The check that a range makes with its own attitude solution (seed paper, section on the reconstruction):
-`reconstruct_attitude` takes neither gyro nor accelerometer nor filter, `compare` holds it against a trajectory and
-names the sensor that contradicts it, `start_attitude_from_vectors` starts a filter where no attitude is stated.
-
-A comparison is of two independent attitudes only if the trajectory was made without these sensors: one whose filter
-read them too, or was started from them, agrees too well.
+`compare` checks a trajectory's attitude against the history and names the sensor that contradicts it, as a range does
+with its own attitude solution (seed paper, section on the reconstruction); `start_attitude_from_vectors` starts a
+filter where no attitude is stated. The comparison is of two independent attitudes only if the trajectory was made
+without these sensors: one whose filter used them too, or was started from them, agrees too well.
 """
 
 from __future__ import annotations
@@ -29,28 +27,29 @@ from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.telemetry import AttitudePrior, Finding, SunRecord, Telemetry, TriadRecord
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
-from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
-from recon.vector_models import (
+from recon.attitude_smoother import (
     ErrorTerms,
     Fit,
-    IntArray,
     Knots,
     Position,
-    Sightings,
-    Unstated,
+    UnstatedErrors,
+    VectorObservations,
     error_terms,
-    sight_magnetometer,
-    sight_sun,
+    observe_magnetometer,
+    observe_sun,
     smooth,
     solve_vectors,
     unit,
 )
+from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
+from recon.state import IntArray
 
-QUARTER_RAD = 0.5 * np.pi
-BLIND_RAD = 0.3  # a sample that leaves an angle as open as this starts nothing
-TRACK_BLOCK_S = 1.0
-MISFIT_ALLOWANCE = 0.15  # motion is no white noise, and blocks are not quite independent
-TABLE = ("name", "unit", "prior_sd", "estimate", "sd")
+_QUARTER_RAD = 0.5 * np.pi
+_BLIND_RAD = 0.3  # a single attitude with an angle as uncertain as this starts nothing
+_TRACK_BLOCK_S = 1.0
+LEAST_INSIDE = 0.90
+_MISFIT_ALLOWANCE = 0.15  # motion is no white noise, and blocks are not quite independent
+_TABLE = ("name", "unit", "prior_sd", "estimate", "sd")
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class Settings:
     longest_gap_s : float
         Without field or Sun, that is bridged; shorter where the vehicle turns by a quarter in less.
     confidence : float
-        Two-sided, of each verdict.
+        Two-sided, of each consistency check.
     unstated : Unstated
         Errors that no data sheet states.
     """
@@ -72,7 +71,7 @@ class Settings:
     rate_hz: float = 10.0
     longest_gap_s: float = 5.0
     confidence: float = 0.999
-    unstated: Unstated = field(default_factory=Unstated)
+    unstated: UnstatedErrors = field(default_factory=UnstatedErrors)
 
 
 @dataclass(frozen=True)
@@ -90,12 +89,12 @@ class AttitudeHistory:
         Of the body against inertial space, body axes.
     method : str
     findings : tuple of Finding
-    verdicts : tuple of Verdict
-        Whether each sensor's residuals and constant errors are as large as its data sheet says.
+    consistency_checks : tuple of ConsistencyCheck
+        Residuals and constant errors of each sensor against its data sheet.
     sensor_errors : DataFrame
         ``name, unit, prior_sd, estimate, sd`` (SI).
-    sightings : tuple of Sightings
-        What was fitted; knots are rows of the history.
+    observations : tuple of Sightings
+        Those fitted; knots are rows of the history.
     """
 
     time_s: FloatArray
@@ -106,7 +105,7 @@ class AttitudeHistory:
     findings: tuple[Finding, ...]
     consistency_checks: tuple[ConsistencyCheck, ...]
     sensor_errors: pd.DataFrame
-    sightings: tuple[Sightings, ...]
+    observations: tuple[VectorObservations, ...]
 
 
 def reconstruct_attitude(
@@ -121,7 +120,7 @@ def reconstruct_attitude(
     telemetry : Telemetry
     position : callable or (time_s (k,), position_ecef_m (k, 3)), optional
         Where the vehicle was. It only places the vehicle in the Earth's field, which changes by 25 nT/km at most: a
-        kilometre is 0.03 deg, so a raw track is plenty, and no attitude of a filter comes in by this door. Medians
+        kilometre is 0.03 deg, so a raw track is accurate enough, and no filter's attitude is used. Medians
         over a second of the flight's radars and receivers where it is not given.
     settings : Settings, optional
 
@@ -131,7 +130,7 @@ def reconstruct_attitude(
         Where magnetometer or Sun sensors are missing, share no time, or never fix an attitude.
     """
     settings = settings or Settings()
-    magnetometer, sun = required_vectors(telemetry)
+    magnetometer, sun = _required_vectors(telemetry)
     place, spans = _place(telemetry, position)
     spans += [(magnetometer.time_s[0], magnetometer.time_s[-1]), (sun.time_s[0], sun.time_s[-1])]
     start_s, end_s = max(a for a, _ in spans), min(b for _, b in spans)
@@ -140,26 +139,27 @@ def reconstruct_attitude(
     if last - first < 2:
         raise GateError(
             f"flight '{telemetry.name}': magnetometer, Sun sensors and position share {start_s:.3f} to {end_s:.3f} s, "
-            "too little for an attitude; check their time bases"
+            "too little for an attitude; check their time bases",
+            code="span-too-short",
         )
     knots_s = np.arange(first, last + 1.0) / settings.rate_hz
     terms = error_terms(magnetometer.spec, sun.spec, settings.unstated, float(knots_s[0]), float(knots_s[-1]))
-    sightings = [
-        sight_magnetometer(magnetometer, telemetry.t0_utc, knots_s, step_s, place, terms),
-        *sight_sun(sun, telemetry.t0_utc, knots_s, step_s, place, terms),
+    observations = [
+        observe_magnetometer(magnetometer, telemetry.t0_utc, knots_s, step_s, place, terms),
+        *observe_sun(sun, telemetry.t0_utc, knots_s, step_s, place, terms),
     ]
-    solved, q = _solve_each(telemetry.name, sightings, len(knots_s))
+    solved, q = _solve_each(telemetry.name, observations, len(knots_s))
     keep, findings = _bridged(knots_s, solved, q, settings)
     kept_s = knots_s[keep]
-    sightings = [_renumbered(seen, keep) for seen in sightings]
+    observations = [_renumbered(observed, keep) for observed in observations]
     q_start = rotations.slerp(knots_s[solved], q, kept_s) if len(solved) > 1 else q
     knots = Knots(kept_s, step_s, np.asarray(np.diff(np.flatnonzero(keep)) == 1))
-    fit, used = smooth(knots, [seen for seen in sightings if len(seen.knot)], terms, q_start)
-    return _history(knots, fit, terms, used, [*findings, *_fit_findings(fit, sightings, used, knots)], settings)
+    fit, used = smooth(knots, [observed for observed in observations if len(observed.knot)], terms, q_start)
+    return _history(knots, fit, terms, used, [*findings, *_fit_findings(fit, observations, used, knots)], settings)
 
 
-def required_vectors(telemetry: Telemetry) -> tuple[TriadRecord, SunRecord]:
-    """Magnetometer and Sun record, or `GateError` that says what flight.toml lacks."""
+def _required_vectors(telemetry: Telemetry) -> tuple[TriadRecord, SunRecord]:
+    """Magnetometer and Sun record, or `GateError` that names what flight.toml lacks."""
     wanted = {"magnetometer": telemetry.magnetometer, "sun": telemetry.sun}
     faults = [
         f"flight '{telemetry.name}' has no [sensors.{name}], and an attitude from directions needs both magnetometer "
@@ -168,7 +168,7 @@ def required_vectors(telemetry: Telemetry) -> tuple[TriadRecord, SunRecord]:
         if record is None
     ]
     if faults or telemetry.magnetometer is None or telemetry.sun is None:
-        raise GateError(faults)
+        raise GateError(faults, code="vector-sensors-missing")
     return telemetry.magnetometer, telemetry.sun
 
 
@@ -182,12 +182,13 @@ def _place(
         position = track(telemetry)
     time_s, points = position
     if len(time_s) == 0 or not np.isfinite(points).all():
-        raise GateError(f"flight '{telemetry.name}': position is empty or not finite; the field needs a place")
+        what = f"flight '{telemetry.name}': position is empty or not finite; the field needs a position"
+        raise GateError(what, code="position-missing")
     return lambda at: interpolate_rows(at, time_s, points), [(float(time_s[0]), float(time_s[-1]))]
 
 
 def track(telemetry: Telemetry) -> tuple[FloatArray, FloatArray]:
-    """Times (k,) and positions (k, 3), ECEF m: medians over `TRACK_BLOCK_S` of all radar points and receiver fixes."""
+    """Times (k,) and positions (k, 3), ECEF m: medians over `_TRACK_BLOCK_S` of all radar points and receiver fixes."""
     times = [r.time_s for r in telemetry.radars.values()] + [r.time_s for r in telemetry.gnss.values()]
     points = [
         earth.ecef_from_radar(r.range_az_el, r.site.latitude_rad, r.site.longitude_rad, r.site.height_m)
@@ -196,79 +197,95 @@ def track(telemetry: Telemetry) -> tuple[FloatArray, FloatArray]:
     t, p = np.concatenate(times), np.concatenate(points)
     whole = np.isfinite(p).all(axis=1)
     if not whole.any():
-        raise GateError(f"flight '{telemetry.name}': no radar point and no fix places the vehicle in the Earth's field")
-    block = np.floor(t[whole] / TRACK_BLOCK_S)
+        what = f"flight '{telemetry.name}': no radar point and no fix locates the vehicle in the Earth's field"
+        raise GateError(what, code="no-track-points")
+    block = np.floor(t[whole] / _TRACK_BLOCK_S)
     table = pd.DataFrame(np.column_stack([t, p])[whole]).groupby(block).median().to_numpy(copy=True)
-    # a block's ends are nearer to its median than a field of a kilometre
+    # within a block the vehicle moves by less than changes the field
     table[0, 0], table[-1, 0] = t[whole].min(), max(t[whole].max(), table[0, 0] + 1e-3)
     return table[:, 0], table[:, 1:]
 
 
-def _solve_each(name: str, sightings: list[Sightings], count: int) -> tuple[IntArray, FloatArray]:
-    """Knots that an attitude can be told at by themselves, and these attitudes (k, 4), against inertial axes."""
+def _solve_each(name: str, observations: list[VectorObservations], count: int) -> tuple[IntArray, FloatArray]:
+    """Knots at which the directions alone give an attitude, and these attitudes (k, 4), relative to inertial axes."""
     body, reference = np.zeros((count, 2, 3)), np.zeros((count, 2, 3))
     weight = np.zeros((count, 2))
-    for seen in sightings:
-        which = 0 if seen.is_field else 1
-        share = 1.0 / seen.constant_sd_rad**2
-        body[seen.knot, which] += share * seen.directions_body()
-        reference[seen.knot, which] = unit(seen.reference_eci)
-        weight[seen.knot, which] += share
+    for observed in observations:
+        which = 0 if observed.is_field else 1
+        share = 1.0 / observed.constant_sd_rad**2
+        body[observed.knot, which] += share * observed.directions_body()
+        reference[observed.knot, which] = unit(observed.reference_eci)
+        weight[observed.knot, which] += share
     both = np.flatnonzero((weight > 0.0).all(axis=1) & (np.linalg.norm(body, axis=2) > 0.0).all(axis=1))
     q, covariance = solve_vectors(unit(body[both]), reference[both], weight[both] ** -0.5)
-    sharp = np.linalg.eigvalsh(covariance)[:, -1] < BLIND_RAD**2
+    sharp = np.linalg.eigvalsh(covariance)[:, -1] < _BLIND_RAD**2
     if not sharp.any():
         why = (
-            "field and Sun stand so near to one line that a turn about it is not seen"
+            "field and Sun directions are so near to one line that rotation about it is not observable"
             if len(both)
             else "no head sees the Sun while the magnetometer measures"
         )
-        raise GateError(f"flight '{name}': no attitude from directions: {why}")
+        raise GateError(f"flight '{name}': no attitude from directions: {why}", code="attitude-not-observable")
     return both[sharp], rotations.continuous(q[sharp])
 
 
 def _bridged(
     knots_s: FloatArray, solved: IntArray, q: FloatArray, settings: Settings
 ) -> tuple[BoolArray, list[Finding]]:
-    """Knots to solve at: between those that tell an attitude, less gaps too long to be bridged, which are findings."""
+    """Knots to solve at: between those with an attitude, less gaps too long to be bridged, which are findings."""
     step = np.diff(knots_s[solved])
-    turned = np.linalg.norm(rotations.boxminus(q[1:], q[:-1]), axis=1)
-    rate = float(np.median(turned / step)) if len(step) else 0.0
-    longest = min(settings.longest_gap_s, QUARTER_RAD / max(rate, 1e-9))
+    rotated = np.linalg.norm(rotations.boxminus(q[1:], q[:-1]), axis=1)
+    rate = float(np.median(rotated / step)) if len(step) else 0.0
+    longest = min(settings.longest_gap_s, _QUARTER_RAD / max(rate, 1e-9))
     keep = np.zeros(len(knots_s), dtype=bool)
     keep[solved[0] : solved[-1] + 1] = True
     found = []
     for k in np.flatnonzero(step > longest):
         keep[solved[k] + 1 : solved[k + 1]] = False
-        words = f"no attitude for {step[k]:.1f} s: field or Sun missing, and up to {longest:.1f} s can be bridged"
-        found.append(Finding("attitude check", words, float(knots_s[solved[k]]), float(knots_s[solved[k + 1]])))
+        remark = f"no attitude for {step[k]:.1f} s: field or Sun missing, and up to {longest:.1f} s can be bridged"
+        span = float(knots_s[solved[k]]), float(knots_s[solved[k + 1]])
+        found.append(Finding("attitude check", remark, *span, "attitude-gap"))
     return keep, found
 
 
-def _renumbered(seen: Sightings, keep: BoolArray) -> Sightings:
-    rows = np.asarray(keep[seen.knot])
-    return seen.take(rows, (np.cumsum(keep) - 1)[seen.knot[rows]])
+def _renumbered(observed: VectorObservations, keep: BoolArray) -> VectorObservations:
+    rows = np.asarray(keep[observed.knot])
+    return observed.take(rows, (np.cumsum(keep) - 1)[observed.knot[rows]])
 
 
-def _fit_findings(fit: Fit, before: list[Sightings], after: list[Sightings], knots: Knots) -> list[Finding]:
+def _fit_findings(
+    fit: Fit, before: list[VectorObservations], after: list[VectorObservations], knots: Knots
+) -> list[Finding]:
     ends = float(knots.time_s[0]), float(knots.time_s[-1])
-    left = {seen.name: len(seen.knot) for seen in after}
+    kept = {observed.name: len(observed.knot) for observed in after}
     found = [
-        Finding(seen.name, f"{len(seen.knot) - left[seen.name]} blocks edited from the attitude check", *ends)
-        for seen in before
-        if len(seen.knot) > left.get(seen.name, len(seen.knot))
+        Finding(
+            observed.name,
+            f"{len(observed.knot) - kept[observed.name]} blocks edited from the attitude check",
+            *ends,
+            "blocks-edited",
+        )
+        for observed in before
+        if len(observed.knot) > kept.get(observed.name, len(observed.knot))
     ]
     if not fit.converged:
-        found.append(Finding("attitude check", f"not settled after {fit.steps} steps", *ends))
+        found.append(
+            Finding("attitude check", f"not converged after {fit.steps} steps", *ends, "attitude-not-converged")
+        )
     return found
 
 
 def _history(
-    knots: Knots, fit: Fit, terms: ErrorTerms, used: list[Sightings], findings: list[Finding], settings: Settings
+    knots: Knots,
+    fit: Fit,
+    terms: ErrorTerms,
+    used: list[VectorObservations],
+    findings: list[Finding],
+    settings: Settings,
 ) -> AttitudeHistory:
     sd = np.sqrt(np.diagonal(fit.error_covariance))
     table = pd.DataFrame(
-        dict(zip(TABLE, (list(terms.names), list(terms.units), terms.prior_sd, fit.errors, sd), strict=True))
+        dict(zip(_TABLE, (list(terms.names), list(terms.units), terms.prior_sd, fit.errors, sd), strict=True))
     )
     return AttitudeHistory(
         time_s=knots.time_s,
@@ -279,7 +296,7 @@ def _history(
         findings=tuple(findings),
         consistency_checks=tuple(_consistency_checks(fit, terms, settings.confidence)),
         sensor_errors=table,
-        sightings=tuple(used),
+        observations=tuple(used),
     )
 
 
@@ -296,32 +313,23 @@ def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[
                 "attitude-residuals",
                 f"residuals {name}",
                 squares / expected,
-                float(low) - MISFIT_ALLOWANCE,
-                float(high) + MISFIT_ALLOWANCE,
+                float(low) - _MISFIT_ALLOWANCE,
+                float(high) + _MISFIT_ALLOWANCE,
                 f"{name}: residuals as large as its noise",
-                f"{name}: residuals are not as large as its noise says: check noise, clocking and interference",
+                f"{name}: residuals are not as large as its noise",
+                advice="check noise, clocking and interference",
+                source=name,
             )
         )
     sd = np.sqrt(np.diagonal(fit.error_covariance))
     for name in dict.fromkeys(terms.instruments):
         own = terms.of(name)
-        names = [terms.names[i] for i in own]
-        said = data_sheet_check("data-sheet", name, names, fit.errors[own], terms.prior_sd[own], sd[own], confidence)
-        out += [said] if said is not None else []
+        errors = [terms.names[i].removeprefix(f"{name} ") for i in own]
+        check = data_sheet_check(
+            "attitude-data-sheet", name, name, errors, fit.errors[own], terms.prior_sd[own], sd[own], confidence
+        )
+        out += [check] if check is not None else []
     return out
-
-
-__all__ = [
-    "AttitudeComparison",
-    "AttitudeHistory",
-    "Settings",
-    "StartAttitude",
-    "Unstated",
-    "compare",
-    "reconstruct_attitude",
-    "start_attitude_from_vectors",
-]
-LEAST_INSIDE = 0.90
 
 
 @dataclass(frozen=True)
@@ -353,8 +361,8 @@ class AttitudeComparison:
         Of all differences, within three standard deviations.
     mean_nees : float
         Over time, of squared differences in units of their covariance; 3 is expected.
-    turn_body_rad, turn_sd_rad : dict
-        For each sensor the constant turn (3,) by which it differs from the trajectory, and how large that may be.
+    rotation_body_rad, rotation_sd_rad : dict
+        For each sensor the constant rotation (3,) by which it differs from the trajectory, and its predicted sd.
     passed : bool
     words : str
     """
@@ -366,8 +374,8 @@ class AttitudeComparison:
     mean_body_rad: FloatArray
     share_inside: float
     mean_nees: float
-    turn_body_rad: dict[str, FloatArray]
-    turn_sd_rad: dict[str, float]
+    rotation_body_rad: dict[str, FloatArray]
+    rotation_sd_rad: dict[str, float]
     passed: bool
     words: str
 
@@ -375,13 +383,13 @@ class AttitudeComparison:
 def compare(history: AttitudeHistory, trajectory: Trajectory, confidence: float = 0.999) -> AttitudeComparison:
     """History minus trajectory at the history's times within the trajectory.
 
-    Differences last, so that neither their number inside a band nor their mean square scatters as that of independent
-    ones. The mean square in units of the covariance is at most as spread as that of one time, so it passes below the
-    chi-square quantile of three degrees of freedom; a tenth of the differences may lie beyond three standard
-    deviations.
+    Differences are correlated in time, so that neither their number inside a band nor their mean square scatters as
+    that of independent ones. The mean square in units of the covariance is at most as spread as that of one time,
+    so it passes below the chi-square quantile of three degrees of freedom; a tenth of the differences may lie beyond
+    three standard deviations.
 
-    Where they do not agree, the constant turn of every sensor against the trajectory says which one it is; a turn that
-    all share speaks against the trajectory.
+    Where they do not agree, the constant rotation of every sensor relative to the trajectory indicates which one is
+    wrong; one that all share indicates the trajectory.
 
     Raises
     ------
@@ -395,7 +403,8 @@ def compare(history: AttitudeHistory, trajectory: Trajectory, confidence: float 
     if len(rows) == 0:
         raise GateError(
             f"attitude check: the history's {t[0]:.3f} to {t[-1]:.3f} s lie outside the trajectory's "
-            f"{trajectory.time_s[0]:.3f} to {trajectory.time_s[-1]:.3f} s"
+            f"{trajectory.time_s[0]:.3f} to {trajectory.time_s[-1]:.3f} s",
+            code="no-common-span",
         )
     other = resample(trajectory, t[rows])
     off = rotations.boxminus(history.q_ecef_body[rows], other.q_ecef_body)
@@ -407,56 +416,56 @@ def compare(history: AttitudeHistory, trajectory: Trajectory, confidence: float 
     passed = bool(nees <= chi2.ppf(confidence, 3) and inside >= LEAST_INSIDE)
     rms, predicted = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (off, sd))
     spread = float(np.sqrt(np.trace(theirs, axis1=1, axis2=2).mean() / 3.0))
-    turns, allowed = _turns(history, other, rows, spread)
+    offsets, allowed = _constant_rotations(history, other, rows, spread)
     words = (
         f"attitude from magnetometer and Sun {'agrees with' if passed else 'contradicts'} the trajectory: "
         f"{np.rad2deg(rms):.2f} deg rms where {np.rad2deg(predicted):.2f} deg is predicted, "
         f"{100.0 * inside:.0f} % inside three standard deviations"
     )
     if not passed:
-        words += f"; {_suspects(turns, allowed, confidence)}"
-    return AttitudeComparison(t[rows], off, sd, rms, off.mean(axis=0), inside, nees, turns, allowed, passed, words)
+        words += f"; {_inconsistent_sensors(offsets, allowed, confidence)}"
+    return AttitudeComparison(t[rows], off, sd, rms, off.mean(axis=0), inside, nees, offsets, allowed, passed, words)
 
 
-def _turns(
+def _constant_rotations(
     history: AttitudeHistory, other: Trajectory, rows: IntArray, spread_rad: float
 ) -> tuple[dict[str, FloatArray], dict[str, float]]:
-    """Constant turn (3,) of each sensor's directions against a trajectory at the history's ``rows``, and its size."""
-    turns, allowed = {}, {}
+    """Constant rotation (3,) of each sensor relative to a trajectory at the history's ``rows``, and its sd."""
+    offsets, allowed = {}, {}
     number = np.full(len(history.time_s), -1)
     number[rows] = np.arange(len(rows))
-    for seen in history.sightings:
-        at = number[seen.knot]
+    for observed in history.observations:
+        at = number[observed.knot]
         use = at >= 0
         if not use.any():
             continue
-        lag = seen.lag_s[use]
+        lag = observed.lag_s[use]
         q = rotations.multiply(
             rotations.conjugate(earth.q_ecef_eci(other.time_s[at[use]])),
             rotations.boxplus(other.q_ecef_body[at[use]], other.omega_body_eci_body_radps[at[use]] * lag[:, None]),
         )
-        predicted = rotations.rotate(rotations.conjugate(q), unit(seen.reference_eci[use]))
-        crossed = np.cross(predicted, seen.directions_body()[use]).sum(axis=0)
-        seen_twice = use.sum() * np.eye(3) - predicted.T @ predicted
-        # a sensor that saw one direction only is not said to be turned about it
-        turns[seen.name] = np.linalg.solve(seen_twice + 0.01 * use.sum() * np.eye(3), crossed)
-        allowed[seen.name] = float(np.hypot(seen.constant_sd_rad, spread_rad))
-    return turns, allowed
+        predicted = rotations.rotate(rotations.conjugate(q), unit(observed.reference_eci[use]))
+        crossed = np.cross(predicted, observed.directions_body()[use]).sum(axis=0)
+        information = use.sum() * np.eye(3) - predicted.T @ predicted
+        # a rotation about the only direction that a sensor observed stays zero
+        offsets[observed.name] = np.linalg.solve(information + 0.01 * use.sum() * np.eye(3), crossed)
+        allowed[observed.name] = float(np.hypot(observed.constant_sd_rad, spread_rad))
+    return offsets, allowed
 
 
-def _suspects(turns: dict[str, FloatArray], allowed: dict[str, float], confidence: float) -> str:
-    """Which sensors stand off the trajectory by more than they may."""
+def _inconsistent_sensors(offsets: dict[str, FloatArray], allowed: dict[str, float], confidence: float) -> str:
+    """Sensors whose constant rotation relative to the trajectory is larger than its sd allows."""
     from scipy.stats import norm
 
-    limit = float(norm.isf(0.5 * (1.0 - confidence) / (3 * len(turns))))
-    angle = {name: float(np.linalg.norm(turn)) for name, turn in turns.items()}
-    off = [name for name in turns if np.abs(turns[name]).max() > limit * allowed[name]]
-    said = ", ".join(f"{name} ({np.rad2deg(angle[name]):.1f} deg)" for name in sorted(off, key=lambda n: -angle[n]))
+    limit = float(norm.isf(0.5 * (1.0 - confidence) / (3 * len(offsets))))
+    angle = {name: float(np.linalg.norm(offset)) for name, offset in offsets.items()}
+    off = [name for name in offsets if np.abs(offsets[name]).max() > limit * allowed[name]]
+    listed = ", ".join(f"{name} ({np.rad2deg(angle[name]):.1f} deg)" for name in sorted(off, key=lambda n: -angle[n]))
     if not off:
-        return "no single sensor stands off: check noise, time tags and the trajectory's attitude"
-    if len(off) == len(turns) > 1:
-        return f"all sensors stand off it: {said}; the trajectory's attitude is doubtful, or what they share"
-    return f"what stands off it: {said}; check mounting, clocking and signs"
+        return "no single sensor is misaligned: check noise, time tags and the trajectory's attitude"
+    if len(off) == len(offsets) > 1:
+        return f"all sensors disagree with it: {listed}; check the trajectory's attitude, then what the sensors share"
+    return f"misaligned relative to it: {listed}; check mounting, clocking and signs"
 
 
 def start_attitude_from_vectors(
@@ -468,14 +477,14 @@ def start_attitude_from_vectors(
 ) -> StartAttitude:
     """Attitude near a time, from the data of ``span_s`` about it, to start a filter with.
 
-    A longer span teaches more about the sensors' constant errors; attitude and rate themselves follow within seconds.
+    A longer span determines the sensors' constant errors better; attitude and rate themselves follow within seconds.
 
     Raises
     ------
     GateError
         As `reconstruct_attitude`, and where there are no data in the span.
     """
-    magnetometer, sun = required_vectors(telemetry)
+    magnetometer, sun = _required_vectors(telemetry)
     begin = float(np.clip(around_s - 0.5 * span_s, sun.time_s[0], max(sun.time_s[0], sun.time_s[-1] - span_s)))
 
     def near(record: TriadRecord | SunRecord) -> BoolArray:
@@ -486,7 +495,8 @@ def start_attitude_from_vectors(
         raise GateError(
             f"flight '{telemetry.name}': no attitude from directions at {around_s:.3f} s: magnetometer covers "
             f"{magnetometer.time_s[0]:.3f} to {magnetometer.time_s[-1]:.3f} s, Sun sensors {sun.time_s[0]:.3f} to "
-            f"{sun.time_s[-1]:.3f} s"
+            f"{sun.time_s[-1]:.3f} s",
+            code="no-common-span",
         )
     part = replace(
         telemetry,

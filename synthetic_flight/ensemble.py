@@ -160,7 +160,6 @@ def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[
     return flown
 
 
-G0_MPS2 = 9.80665
 _TABLE_M = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS)
 
 
@@ -209,7 +208,7 @@ class Records:
     @cached_property
     def normal_g(self) -> FloatArray:
         """Size of the centerbody's lateral specific force, ``(n,)``."""
-        return np.hypot(*self.specific_force_body_mps2[:, 1:].T) / G0_MPS2
+        return np.hypot(*self.specific_force_body_mps2[:, 1:].T) / earth.STANDARD_GRAVITY_MPS2
 
 
 QUANTITIES: dict[str, Callable[[Records], FloatArray]] = {
@@ -217,7 +216,7 @@ QUANTITIES: dict[str, Callable[[Records], FloatArray]] = {
     "alpha_shell_deg": lambda r: np.rad2deg(r.aux[:, 4]),
     "deflection_deg": lambda r: np.rad2deg(r.aux[:, 5]),
     "normal_g": lambda r: r.normal_g,
-    "axial_g": lambda r: -r.specific_force_body_mps2[:, 0] / G0_MPS2,
+    "axial_g": lambda r: -r.specific_force_body_mps2[:, 0] / earth.STANDARD_GRAVITY_MPS2,
     "dynamic_pressure_pa": lambda r: r.aux[:, 3],
     "mach": lambda r: r.aux[:, 2],
     "altitude_m": lambda r: r.aux[:, 0],

@@ -26,12 +26,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flightmodel import earth
-from flightmodel.atmosphere import G0_MPS2
 from flightmodel.checks import FloatArray, GateError, Progress, writing
-from flightmodel.events import descent_moments, first_fall, has_peak, peak, splashdown_index, values_at
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.events import descent_events, find_peak, first_fall, has_peak, splashdown_index, values_at
+from flightmodel.instruments import ACCELEROMETER, MAGNETOMETER, RADAR, RATES, SUN
 from synthetic_flight import sensing, weather
 from synthetic_flight.film import write_video
-from synthetic_flight.instrument_errors import Magnetometer, Radar, SunSensors, Triad
+from synthetic_flight.instrument_errors import Magnetometer, SunSensors, stated_errors
 from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
@@ -229,8 +230,6 @@ def _write_truth(scenario: Scenario, seed: int, truth: Truth, folder: Path) -> N
     (folder / "run.json").write_text(json.dumps(run, indent=2) + "\n")
 
 
-# the last digit of the telemetry's files: noise below it is not in them, and no estimator takes a zero
-LAST_DIGIT = 1e-6
 VEHICLE_FOLDER = "vehicle"
 
 
@@ -252,11 +251,6 @@ def _text(value: str) -> str:
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _at_least(sd: float, resolution: float = 0.0) -> float:
-    """Return the stated standard deviation: of an ideal instrument that of its resolution or of the last digit."""
-    return sd if sd >= LAST_DIGIT else max(LAST_DIGIT, round(resolution / np.sqrt(12.0), 9))
-
-
 def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
     """Return ``flight.toml`` with the errors of the data sheets, without anything that was drawn."""
     spec = scenario.spec
@@ -276,21 +270,13 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
         "[sensors.accelerometer]",
         'file = "telemetry/accelerometer.csv"',
         f'mount = "{ACCELEROMETER_MOUNT}"',
-        f"noise_sd_mps2 = {_at_least(acc.noise_mps2)}",
-        f"bias_sd_mps2 = {acc.bias_mps2}",
-        *_triad_lines(acc),
-        f"time_bias_sd_s = {acc.time_bias_s}",
-        f"resolution_mps2 = {acc.resolution_mps2}",
-        *_drift_lines("mps2", acc.drift_mps2, acc.drift_time_constant_s),
+        *stated_errors(ACCELEROMETER, acc),
+        *stated_errors(ACCELEROMETER, acc, if_there=True),
         "",
         "[sensors.rates]",
         'file = "telemetry/rates.csv"',
-        f"noise_sd_degps = {_at_least(gyro.noise_degps)}",
-        f"bias_sd_degps = {gyro.bias_degps}",
-        *_triad_lines(gyro),
-        f"time_bias_sd_s = {gyro.time_bias_s}",
-        f"resolution_degps = {gyro.resolution_degps}",
-        *_drift_lines("degps", gyro.drift_degps, gyro.drift_time_constant_s),
+        *stated_errors(RATES, gyro),
+        *stated_errors(RATES, gyro, if_there=True),
     ]
     lines += _magnetometer_lines(spec.magnetometer) + _sun_lines(spec.sun)
     for name, radar in spec.radars.items():
@@ -301,13 +287,9 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
             f"latitude_deg = {radar.latitude_deg}",
             f"longitude_deg = {radar.longitude_deg}",
             f"height_m = {radar.height_m}",
-            f"range_sd_m = {_at_least(radar.range_sd_m, radar.range_resolution_m)}",
-            f"angle_sd_deg = {_at_least(radar.angle_sd_deg, radar.angle_resolution_deg)}",
-            f"range_bias_sd_m = {radar.range_bias_m}",
-            # over the arc of one flight an encoder's waves are hardly separable from a bias
-            f"angle_bias_sd_deg = {_rss(radar.angle_bias_deg, radar.encoder_once_deg, radar.encoder_twice_deg)}",
-            f"time_bias_sd_s = {radar.time_bias_s}",
-            *_pedestal_lines(radar),
+            *stated_errors(RADAR, radar),
+            *([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []),
+            *stated_errors(RADAR, radar, if_there=True),
         ]
     lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
     if spec.video is not None:
@@ -327,24 +309,6 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _rss(*sds: float) -> float:
-    """Return the root sum square of independent errors; of a single one, that number as it was written."""
-    present = [sd for sd in sds if sd > 0.0]
-    return present[0] if len(present) == 1 else float(f"{np.linalg.norm(present):.4g}")
-
-
-def _triad_lines(spec: Triad) -> list[str]:
-    """Non-orthogonality counts as part of the mounting error, scale asymmetry as part of the scale error."""
-    return [
-        f"scale_sd = {_rss(spec.scale, spec.scale_asymmetry)}",
-        f"mount_sd_deg = {_rss(spec.mount_deg, spec.nonorthogonality_deg)}",
-    ]
-
-
-def _drift_lines(unit: str, drift: float, time_constant_s: float) -> list[str]:
-    return [f"bias_wander_sd_{unit} = {drift}", f"bias_time_constant_s = {time_constant_s}"] if drift > 0.0 else []
-
-
 def _magnetometer_lines(spec: Magnetometer | None) -> list[str]:
     if spec is None:
         return []
@@ -353,13 +317,8 @@ def _magnetometer_lines(spec: Magnetometer | None) -> list[str]:
         "[sensors.magnetometer]",
         'file = "telemetry/magnetometer.csv"',
         f'mount = "{spec.mount}"',
-        f"noise_sd_ut = {_at_least(spec.noise_ut)}",
-        # a data sheet states one number for electronics and hard iron
-        f"bias_sd_ut = {np.hypot(spec.bias_ut, spec.hard_iron_ut):.4g}",
-        f"soft_iron_sd = {spec.soft_iron}",
-        *_triad_lines(spec),
-        f"resolution_ut = {spec.resolution_ut}",
-        *_drift_lines("ut", spec.drift_ut, spec.drift_time_constant_s),
+        *stated_errors(MAGNETOMETER, spec),
+        *stated_errors(MAGNETOMETER, spec, if_there=True),
     ]
 
 
@@ -372,24 +331,8 @@ def _sun_lines(spec: SunSensors | None) -> list[str]:
         'file = "telemetry/sun.csv"',
         f"heads_lv_deg = [{', '.join(str(clock) for clock in spec.heads_lv_deg)}]",
         f"field_deg = {spec.field_deg}",
-        f"noise_sd_deg = {_at_least(spec.noise_deg, spec.resolution_deg)}",
-        f"bias_sd_deg = {spec.bias_deg}",
-        f"mount_sd_deg = {spec.mount_deg}",
+        *stated_errors(SUN, spec),
     ]
-
-
-def _pedestal_lines(radar: Radar) -> list[str]:
-    """Systematic errors above zero."""
-    terms = ("mislevel", "droop", "skew", "nonorthogonality", "wander")
-    sizes = {name: getattr(radar, f"{name}_deg") for name in terms}
-    lines = [f"{name}_sd_deg = {size}" for name, size in sizes.items() if size > 0.0]
-    if radar.wander_deg > 0.0:
-        lines.append(f"wander_time_constant_s = {radar.wander_time_constant_s}")
-    if radar.refraction is not None and radar.refraction.residual != 0.0:
-        lines.append(f"refraction_sd = {abs(radar.refraction.residual)}")
-    if radar.range_scale > 0.0:
-        lines.append(f"range_scale_sd = {radar.range_scale}")
-    return ([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []) + lines
 
 
 SUTTON_GRAVES = 1.7415e-4
@@ -441,12 +384,12 @@ def flight_events(truth: Truth, inflated_s: float | None = None) -> list[Event]:
     density, pressure = truth.density_kgpm3[rows], truth.dynamic_pressure_pa[rows]
     airspeed = np.sqrt(2.0 * pressure / density)
     flux = heat_flux(density, airspeed, truth.vehicle.geometry.nose_radius_m)
-    named = [("separation", float(t[0])), *descent_moments(t, altitude, truth.mach[rows])]
+    named = [("separation", float(t[0])), *descent_events(t, altitude, truth.mach[rows])]
     if inflated_s is not None and t[0] < inflated_s < t[-1]:
         named.append(("inflation", inflated_s))
     for name, values in (("peak heating", flux), ("peak dynamic pressure", pressure)):
         if has_peak(values):
-            named.append((name, peak(t, values)[0]))
+            named.append((name, find_peak(t, values)[0]))
     if whole is not None:
         splash = first_fall(t, altitude, 0.0)
         named.append(("splashdown", float(t[-1]) if splash is None else splash))
@@ -463,7 +406,7 @@ def flight_events(truth: Truth, inflated_s: float | None = None) -> list[Event]:
             truth.alpha_shell_rad[rows],
             truth.alpha_body_rad[rows],
             truth.deflection.theta_rad[rows],
-            np.linalg.norm(force, axis=1) / G0_MPS2,
+            np.linalg.norm(force, axis=1) / STANDARD_GRAVITY_MPS2,
         ]
     )
     return [_event(name, at, values_at(t, columns, at)) for name, at in sorted(named, key=lambda one: one[1])]

@@ -1,21 +1,21 @@
-"""How three real sensors distort what three ideal ones would say; the parts of that which other instruments share.
+"""How does a scenario file describe instruments, and how do three real sensors distort what ideal ones would measure?
 
-In the order of the signal's way: bandwidth, delay, misalignment of the triad, axes that are not square to each other,
-scale (with another one for negative values), bias and its slow drift, noise, range, quantisation, dropped samples. What
-is constant over a flight is drawn once. Each quantity beyond the first four (mounting, scale, bias, noise) draws from a
-child of the instrument's generator with a name of its own, so that adding one leaves the others as they were.
+Keys and sizes of errors come from the tables of `flightmodel.instruments` (one standard deviation of what is drawn once
+a flight, degrees and everyday units); the classes here add what the simulator alone has: rates, bandwidth, dropouts,
+quantisation, waves of encoders, the air of a radar, the film. Every error beyond the first few may be left out and is
+then absent.
 
-How a scenario file describes the instruments: their places, rates and errors, degrees and everyday units.
-
-Every error beyond the first few may be left out and is then absent. Sizes are one standard deviation of what is drawn
-once a flight, unless said otherwise.
+A triad's signal, in the order of its way: bandwidth, delay, misalignment of the triad, axes that are not square to each
+other, scale (with another one for negative values), bias and its slow drift, noise, range, quantisation, dropped
+samples. Each quantity beyond the first four (mounting, scale, bias, noise) draws from a child of the instrument's
+generator with a name of its own, so that adding one leaves the others as they were.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -34,6 +34,7 @@ from flightmodel.config import (
     Section,
     Time,
 )
+from flightmodel.instruments import ACCELEROMETER, MAGNETOMETER, RADAR, RATES, SUN, InstrumentTable, with_keys
 from flightmodel.refraction import Refractivity
 from flightmodel.trajectory import interpolate_rows
 from synthetic_flight import _kernels
@@ -58,7 +59,7 @@ class TriadErrors:
     Parameters
     ----------
     mount_rad, scale, bias, noise : float
-        Turn of the triad per axis, scale factor, constant bias, white noise per sample.
+        Rotation of the triad per axis, scale factor, constant bias, white noise per sample.
     nonorthogonality_rad, scale_asymmetry, drift : float
         Standard deviations of each axis's tilt towards the others, of what negative values gain over the scale, and of
         a Gauss-Markov drift.
@@ -194,7 +195,7 @@ def measured(
 
 
 def tilted_axes(tilt_rad: FloatArray) -> FloatArray:
-    """Sensing directions, row by row, of axes that are not square: x stays, y leans to x, z to x and y, (3, 3)."""
+    """Sensing directions, row by row, of axes that are not square: x stays, y tilts to x, z to x and y, (3, 3)."""
     yx, zx, zy = tilt_rad
     rows = np.array([[1.0, 0.0, 0.0], [yx, 1.0, 0.0], [zx, zy, 1.0]])
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -217,12 +218,9 @@ def _none_or_some(hertz: float) -> float:
     return hertz
 
 
-# sizes of errors: of triads in their own everyday unit, of ranges in metres
-Size = Annotated[float, Field(ge=0.0, le=1e4)]
 RangeError = Annotated[float, Field(ge=0.0, le=1e4)]
 Bandwidth = Annotated[float, Field(ge=0.0, le=1e5), AfterValidator(_none_or_some)]
 Delay = Annotated[float, Field(ge=-10.0, le=10.0)]
-TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
 Limit = Annotated[float, Field(gt=0.0, le=1e6)]
 Offset = Annotated[float, Field(ge=-10.0, le=10.0)]
 Height = Annotated[float, Field(ge=-500.0, le=1e4)]
@@ -260,7 +258,7 @@ class Dropouts(Section):
 
 
 class Triad(Section):
-    """What accelerometers, gyros and magnetometers have in common.
+    """What accelerometers, gyros and magnetometers have in common beside the errors of their table.
 
     ``bandwidth_hz`` is the corner of a low-pass of ``filter_order`` (0 for none); beyond the low-pass's own lag a
     sample shows what was there ``delay_s`` earlier (negative where stamps were corrected for that lag), and by a
@@ -269,31 +267,35 @@ class Triad(Section):
     ``scale_asymmetry``.
     """
 
+    table: ClassVar[InstrumentTable]
+    full_scale_key: ClassVar[str]  # largest magnitude of each axis
     rate_hz: SampleRate
-    scale: Fraction
-    mount_deg: ErrorAngle
-    nonorthogonality_deg: ErrorAngle = 0.0
-    scale_asymmetry: Fraction = 0.0
-    drift_time_constant_s: TimeConstant = 100.0
     bandwidth_hz: Bandwidth = 0.0
     filter_order: Literal[1, 2] = 2
     delay_s: Delay = 0.0
     time_bias_s: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
     dropouts: Dropouts | None = None
 
-    def _errors(
-        self, unit: float, noise: float, bias: float, drift: float, resolution: float, limit: Limits | None
-    ) -> TriadErrors:
+    @property
+    def sizes(self) -> dict[str, tuple[float, ...]]:
+        """What is drawn, SI, by the field of `flightmodel.instruments.TriadSpec`."""
+        return self.table.from_scenario(self)
+
+    @property
+    def errors(self) -> TriadErrors:
+        """In SI."""
+        size, limit = self.sizes, getattr(self, self.full_scale_key)
+        unit = next(row.to_si for row in self.table.rows if row.name == "noise_sd")
         return TriadErrors(
-            mount_rad=float(np.deg2rad(self.mount_deg)),
-            scale=self.scale,
-            bias=bias * unit,
-            noise=noise * unit,
-            resolution=resolution * unit,
-            nonorthogonality_rad=float(np.deg2rad(self.nonorthogonality_deg)),
-            scale_asymmetry=self.scale_asymmetry,
-            drift=drift * unit,
-            drift_time_constant_s=self.drift_time_constant_s,
+            mount_rad=size["mount_sd_rad"][0],
+            scale=size["scale_sd"][0],
+            bias=size["bias_sd"][0],
+            noise=size["noise_sd"][0],
+            resolution=size["resolution"][0],
+            nonorthogonality_rad=size["mount_sd_rad"][1],
+            scale_asymmetry=size["scale_sd"][1],
+            drift=size["bias_wander_sd"][0],
+            drift_time_constant_s=size["bias_time_constant_s"][0],
             bandwidth_hz=self.bandwidth_hz,
             order=self.filter_order,
             delay_s=self.delay_s,
@@ -303,80 +305,50 @@ class Triad(Section):
         )
 
 
+@with_keys(ACCELEROMETER.scenario_keys())
 class Accelerometer(Triad):
     """Errors of the accelerometer triad; ``elements_sensor_m`` puts each of the three at its own place in the package.
 
     ``range_mps2`` is of each axis of the package (z is aft in Sub-A).
     """
 
-    noise_mps2: Size
-    bias_mps2: Size
-    drift_mps2: Size = 0.0
+    table, full_scale_key = ACCELEROMETER, "range_mps2"
     range_mps2: Limits | None = None
-    resolution_mps2: Size = 0.0
     elements_sensor_m: tuple[Vector, Vector, Vector] | None = None
 
-    @property
-    def errors(self) -> TriadErrors:
-        """In SI."""
-        return self._errors(
-            1.0, self.noise_mps2, self.bias_mps2, self.drift_mps2, self.resolution_mps2, self.range_mps2
-        )
 
-
+@with_keys(RATES.scenario_keys())
 class Rates(Triad):
     """Errors of the rate gyros."""
 
-    noise_degps: Size
-    bias_degps: Size
-    drift_degps: Size = 0.0
+    table, full_scale_key = RATES, "range_degps"
     range_degps: Limits | None = None
-    resolution_degps: Size = 0.0
-
-    @property
-    def errors(self) -> TriadErrors:
-        """In rad/s."""
-        unit = float(np.deg2rad(1.0))
-        return self._errors(
-            unit, self.noise_degps, self.bias_degps, self.drift_degps, self.resolution_degps, self.range_degps
-        )
 
 
+@with_keys(MAGNETOMETER.scenario_keys())
 class Magnetometer(Triad):
     """The magnetometer: ``mount`` names a package of the vehicle file.
 
     ``hard_iron_ut`` is the field of the vehicle's own magnets, per body axis; ``soft_iron`` the size of the elements of
-    the symmetric matrix by which its iron bends the field.
+    the symmetric matrix by which its iron distorts the field.
     """
 
+    table, full_scale_key = MAGNETOMETER, "range_ut"
     mount: str = "magnetometer"
-    noise_ut: Size
-    bias_ut: Size
-    hard_iron_ut: Size = 0.0
-    soft_iron: Fraction = 0.0
-    drift_ut: Size = 0.0
     range_ut: Limits | None = None
-    resolution_ut: Size = 0.0
-
-    @property
-    def errors(self) -> TriadErrors:
-        """In tesla."""
-        return self._errors(1e-6, self.noise_ut, self.bias_ut, self.drift_ut, self.resolution_ut, self.range_ut)
 
 
+@with_keys(SUN.scenario_keys())
 class SunSensors(Section):
     """Two-axis Sun sensors around the roll axis, one head at each clocking angle.
 
-    Noise and bias are across the line of sight. ``field_deg`` is the full cone about a head's axis. ``albedo`` is the
-    weight of the sunlit Earth against the Sun in a head that has the nadir in its field (0 for none).
+    Noise and bias are normal to the line of sight; ``field_deg`` is the full cone about a head's axis. ``albedo`` is
+    the weight of the sunlit Earth against the Sun in a head that has the nadir in its field (0 for none).
     """
 
     rate_hz: SampleRate
     heads_lv_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=8)] = (45.0, 135.0, 225.0, 315.0)
     field_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 180.0
-    noise_deg: ErrorAngle
-    bias_deg: ErrorAngle
-    mount_deg: ErrorAngle
     resolution_deg: ErrorAngle = 0.0
     delay_s: Delay = 0.0
     albedo: Fraction = 0.0
@@ -410,14 +382,14 @@ class AirRefraction(Section):
         return Refractivity(self.surface, self.scale_height_m, table[:, 0], table[:, 1])
 
 
+@with_keys(RADAR.scenario_keys())
 class Radar(Section):
     """A radar's site and errors, one standard deviation of each; the systematic ones are those of RCC 753-95.
 
-    ``mislevel_deg`` is the tilt of the pedestal about north and about east; ``skew_deg`` (RF axis against the elevation
-    axis) errs in azimuth by sec E, ``nonorthogonality_deg`` by tan E, ``droop_deg`` in elevation by cos E;
-    ``encoder_once_deg`` and ``encoder_twice_deg`` go once and twice a turn of each encoder. ``angle_servo_hz`` is the
-    bandwidth of a tracking servo without velocity lag. ``transit_time`` leaves in that an echo shows where the vehicle
-    was when it was hit. Points beyond ``max_range_m`` or below ``min_elevation_deg`` (the horizon) are not tracked.
+    Sizes of errors are those of `flightmodel.instruments.RadarSite`; ``encoder_once_deg`` and ``encoder_twice_deg`` go
+    once and twice a turn of each encoder. ``angle_servo_hz`` is the bandwidth of a tracking servo without velocity lag.
+    ``transit_time`` leaves in that an echo shows where the vehicle was when it was hit. Points beyond ``max_range_m``
+    or below ``min_elevation_deg`` (the horizon) are not tracked.
     """
 
     latitude_deg: Latitude
@@ -426,20 +398,6 @@ class Radar(Section):
     rate_hz: SampleRate
     offset_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 0.0
     tracks: Literal["cg", "datum"] = "cg"
-    range_sd_m: RangeError
-    angle_sd_deg: ErrorAngle
-    range_bias_m: RangeError
-    angle_bias_deg: ErrorAngle
-    time_bias_s: Annotated[float, Field(ge=0.0, le=10.0)]
-    range_scale: Fraction = 0.0
-    mislevel_deg: ErrorAngle = 0.0
-    skew_deg: ErrorAngle = 0.0
-    nonorthogonality_deg: ErrorAngle = 0.0
-    droop_deg: ErrorAngle = 0.0
-    encoder_once_deg: ErrorAngle = 0.0
-    encoder_twice_deg: ErrorAngle = 0.0
-    wander_deg: ErrorAngle = 0.0
-    wander_time_constant_s: TimeConstant = 20.0
     angle_servo_hz: Bandwidth = 0.0
     transit_time: bool = False
     refraction: AirRefraction | None = None
@@ -448,6 +406,11 @@ class Radar(Section):
     max_range_m: Annotated[float, Field(gt=0.0, le=1e9)] | None = None
     min_elevation_deg: Elevation = 0.0
     dropouts: Dropouts | None = None
+
+    @property
+    def refraction_left(self) -> float:
+        """Size of the part of refraction that the range's correction leaves."""
+        return 0.0 if self.refraction is None else abs(self.refraction.residual)
 
 
 class FilmQuality(Section):
@@ -497,3 +460,42 @@ class Attitude(Section):
 
     t_s: Time
     sd_deg: Annotated[float, Field(gt=0.0, le=180.0)]
+
+
+LAST_DIGIT = 1e-6  # of the telemetry's files: noise below it is not in them, and an estimator wants none of zero
+
+
+def stated_errors(table: InstrumentTable, section: Section, if_there: bool = False) -> list[str]:
+    """Lines of flight.toml that state an instrument's nominal errors, nothing that was drawn.
+
+    Parameters
+    ----------
+    table : InstrumentTable
+    section : Section
+        The instrument's of a scenario.
+    if_there : bool
+        Those rows alone that are left out where they are zero; without it, the others.
+    """
+    lines = []
+    for row in table.rows:
+        sds = [getattr(section, key) for key in row.scenario_keys]
+        if not sds or row.left_out != if_there or (row.left_out and not any(sds)):
+            continue
+        noise = not row.states and not row.left_out and row.name.partition("_sd")[1]
+        step = getattr(section, row.step) if row.step else 0.0
+        lines.append(f"{row.key} = {_noise_sd(sds[0], step) if noise else _together(*sds)}")
+        key, _, scenario_key = row.time_constant
+        if key:
+            lines.append(f"{key} = {getattr(section, scenario_key)}")
+    return lines
+
+
+def _noise_sd(sd: float, resolution: float) -> float:
+    """Return the stated standard deviation: an ideal instrument has that of its steps or of the last digit."""
+    return sd if sd >= LAST_DIGIT else max(LAST_DIGIT, round(resolution / np.sqrt(12.0), 9))
+
+
+def _together(*sds: float) -> float:
+    """Return the one number that is stated of independent errors; of a single one, that number as it was written."""
+    present = [sd for sd in sds if sd > 0.0]
+    return present[0] if len(present) == 1 else float(f"{np.linalg.norm(present):.4g}")

@@ -1,26 +1,17 @@
-"""What instruments on and around the vehicle would have measured: truth plus the errors of real instruments.
+"""What would the instruments on and around the vehicle have measured of a true flight?
 
-Each instrument draws from its own generator. Systematic errors are drawn once a flight. Radars are in
-`synthetic_flight.sensing`, Sun sensors in `synthetic_flight.sensing`, the sounding of the day in
-`synthetic_flight.weather`.
+Truth plus the errors of real instruments: those of the tables in `flightmodel.instruments`, with the sizes of the
+scenario, and the simulator's own (bandwidth, dropouts, quantisation). Each instrument draws from its own generator;
+systematic errors are drawn once a flight, each from a child of its own.
 
-What two-axis Sun sensors around the roll axis would have measured: two angles per head, where it sees the Sun.
+A **radar**, in the order of the echo's way: time of the stamp, transit, refraction and delay in the air, lag of the
+servo, errors of the pedestal and range scale as their rows say, waves of the encoders (once and twice a turn), tilt of
+the pedestal (an exact rotation against the local vertical), slow wander, bias, noise, quantisation, lost points.
 
-A head sees the Sun inside its cone while the Sun stands above the Earth's limb. Errors, per head: mounting, constant
-part and noise across the line of sight, and the pull of the sunlit Earth, by which the direction turns towards
+A **Sun head** sees the Sun inside its cone while the Sun stands above the Earth's limb. Per head: mounting, constant
+part and noise normal to the line of sight, and the pull of the sunlit Earth, by which the direction turns towards
 ``s + w (u . s)+ (R / r)^2 nadir`` (``u`` up, ``w`` the weight ``albedo``): a crude model of the light that comes back,
 largest over the subsolar point and zero on the night side.
-
-What a tracking radar would have measured of the vehicle, with the systematic errors that ranges calibrate for.
-
-In the order of the echo's way: time of the stamp, transit, bending and delay in the air, lag of the servo, errors of
-the pedestal, wander, bias, noise, quantisation, lost points. With azimuth A and elevation E as they arrive there,
-
-``dA = k sec E + n tan E + (tilt) + encoder(A) + wander sec E``,  ``dE = d cos E + (tilt) + encoder(E) + wander``,
-``dR = s R``,
-
-with skew k, non-orthogonality n, droop d, range scale s; the tilt is an exact rotation of the pedestal against the
-local vertical. Each factor is drawn once a flight from a generator of its own.
 
 References
 ----------
@@ -37,7 +28,7 @@ from scipy.interpolate import CubicHermiteSpline
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.geomagnetism_and_sun import is_sun_visible, magnetic_field_ecef_t, sun_direction_ecef
-from flightmodel.instruments import dcm_body_from_sun_head, sun_angles_from_direction
+from flightmodel.instruments import RADAR, SUN, dcm_body_from_sun_head, sun_angles_from_direction
 from flightmodel.refraction import refracted
 from flightmodel.trajectory import interpolate_rows
 from flightmodel.vehicle import Vehicle
@@ -71,7 +62,7 @@ def sense_accelerometer(
 ) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and specific force ``(n, 3)`` in the package's own axes, m/s^2, at its own place.
 
-    Where the three elements have places of their own, each feels what is felt there.
+    Where the three elements have places of their own, each feels the specific force there.
     """
     package, errors = vehicle.sensors[mount], spec.errors
     at = sample_times(start_s, truth.time_s[-1], spec.rate_hz)
@@ -103,22 +94,23 @@ def sense_magnetometer(
 ) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and magnetic field ``(n, 3)`` in the package's own axes, tesla.
 
-    The Earth's field at the package's own place, bent by the vehicle's iron (symmetric matrix) and added to the
+    The Earth's field at the package's own place, distorted by the vehicle's iron (symmetric matrix) and added to the
     field of its magnets; both are fixed to the vehicle.
     """
     package = vehicle.sensors[spec.mount]
     at = sample_times(start_s, truth.time_s[-1], spec.rate_hz)
-    # what the low-pass still remembers of before the first sample
+    # the low-pass needs what was before the first sample
     rows = truth.time_s >= start_s - abs(spec.delay_s) - (10.0 / spec.bandwidth_hz if spec.bandwidth_hz > 0.0 else 0.1)
     t, q = truth.time_s[rows], truth.trajectory.q_ecef_body[rows]
     arm = np.broadcast_to(package.position_from_datum_body_m, (len(t), 3))
     place = truth.trajectory.position_ecef_m[rows] + rotations.rotate(q, arm)
     field = rotations.rotate(rotations.conjugate(q), magnetic_field_ecef_t(place, truth.trajectory.epoch_utc))
-    if spec.soft_iron > 0.0:
-        upper = np.triu(spec.soft_iron * child(rng, "soft iron").standard_normal((3, 3)))
+    soft_iron, hard_iron_t = spec.sizes["soft_iron_sd"][0], spec.sizes["bias_sd"][1]
+    if soft_iron > 0.0:
+        upper = np.triu(soft_iron * child(rng, "soft iron").standard_normal((3, 3)))
         field = field @ (np.eye(3) + upper + np.triu(upper, 1).T)
-    if spec.hard_iron_ut > 0.0:
-        field = field + 1e-6 * spec.hard_iron_ut * child(rng, "hard iron").standard_normal(3)
+    if hard_iron_t > 0.0:
+        field = field + hard_iron_t * child(rng, "hard iron").standard_normal(3)
     return measured(at, sampled(at, t, field, spec.errors) @ package.dcm_body_sensor, spec.errors, rng)
 
 
@@ -166,7 +158,8 @@ def _head(
     rng: np.random.Generator,
 ) -> FloatArray:
     """Azimuth and elevation ``(n, 2)`` of one head."""
-    noise, bias, mount, step = np.deg2rad([spec.noise_deg, spec.bias_deg, spec.mount_deg, spec.resolution_deg])
+    noise, bias, mount = (size for (size,) in SUN.from_scenario(spec).values())
+    step = np.deg2rad(spec.resolution_deg)
     dcm = dcm_body_from_sun_head(clock_lv_rad) @ rotations.dcm_from_q(rotations.exp(mount * rng.standard_normal(3)))
     sun, glow = sun_body @ dcm, earth_body @ dcm
     edge = np.cos(0.5 * np.deg2rad(spec.field_deg))
@@ -191,7 +184,7 @@ def sense_radar(
 ) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and slant range m, azimuth, elevation rad ``(n, 3)`` of the vehicle's true c.g. (or its datum).
 
-    Angle noise is that of the beam: across the line of sight, so azimuth scatters by ``1 / cos(elevation)`` more. A
+    Angle noise is that of the beam: normal to the line of sight, so azimuth scatters by ``1 / cos(elevation)`` more. A
     positive time bias stamps a point later than it was measured.
 
     Raises
@@ -203,14 +196,16 @@ def sense_radar(
     if len(at) < 2:
         raise GateError(
             f"radars.{name}: {len(at)} points from {start_s + spec.offset_s:g} s to the flight's end at "
-            f"{truth.time_s[-1]:.2f} s; two are the least: raise rate_hz or lower offset_s"
+            f"{truth.time_s[-1]:.2f} s; two are the least: raise rate_hz or lower offset_s",
+            code="track-short",
         )
-    bias_sd = np.array([spec.range_bias_m, *np.deg2rad([spec.angle_bias_deg] * 2)])
+    size = RADAR.from_scenario(spec)
+    bias_sd = np.array([size["range_bias_sd_m"][0], *[size["angle_bias_sd_rad"][0]] * 2])
     bias = bias_sd * rng.standard_normal(3)
-    late = spec.time_bias_s * rng.standard_normal()
+    late = size["time_bias_sd_s"][0] * rng.standard_normal()
     seen_at = np.clip(at - late, truth.time_s[0], truth.time_s[-1])
     arrived = echo(truth, spec, seen_at)
-    noise_sd = np.array([spec.range_sd_m, *np.deg2rad([spec.angle_sd_deg] * 2)])
+    noise_sd = np.array([size["range_sd_m"][0], *[size["angle_sd_rad"][0]] * 2])
     noise = noise_sd * rng.standard_normal(arrived.shape)
     noise[:, 1] /= np.cos(arrived[:, 2])
     observed = in_air(arrived, spec) + servo_lag(truth, spec, seen_at)
@@ -231,7 +226,8 @@ def sense_radar(
             f"radars.{name}: fewer than two of {len(at)} points are tracked; elevation is {highest:.2f} deg at most "
             f"(min_elevation_deg = {spec.min_elevation_deg:g}), range {nearest:.0f} m at least (max_range_m = "
             f"{'none' if spec.max_range_m is None else format(spec.max_range_m, 'g')}), dropouts take "
-            f"{(~keep).sum()}; put the radar elsewhere or leave it out"
+            f"{(~keep).sum()}; put the radar elsewhere or leave it out",
+            code="track-short",
         )
     keep &= near & above
     return at[keep], measured[keep]
@@ -272,15 +268,15 @@ def in_air(geometric: FloatArray, spec: Radar) -> FloatArray:
         return geometric
     air = spec.refraction.air
     elevation = np.maximum(geometric[:, 2], LOWEST_RAD)
-    delay, bend = refracted(geometric[:, 0], elevation, np.deg2rad(spec.latitude_deg), spec.height_m, air)
-    return geometric + spec.refraction.residual * np.column_stack([delay, np.zeros_like(delay), bend])
+    delay, refraction = refracted(geometric[:, 0], elevation, np.deg2rad(spec.latitude_deg), spec.height_m, air)
+    return geometric + spec.refraction.residual * np.column_stack([delay, np.zeros_like(delay), refraction])
 
 
 def servo_lag(truth: Truth, spec: Radar, time_s: FloatArray) -> FloatArray:
     """Lag ``(n, 3)`` of the angles behind a servo without velocity lag: ``- acceleration / w^2`` when slow."""
     if spec.angle_servo_hz == 0.0:
         return np.zeros((len(time_s), 3))
-    # ten seconds before the first point the servo has forgotten its start (0.1 Hz and up)
+    # ten seconds before the first point the servo has lost its start (0.1 Hz and up)
     rows = truth.time_s >= time_s[0] - max(10.0, 3.0 / spec.angle_servo_hz)
     t = truth.time_s[rows]
     angles = np.unwrap(echo(truth, spec, t)[:, 1:], axis=0)
@@ -299,21 +295,23 @@ def pedestal_errors(observed: FloatArray, spec: Radar, rng: np.random.Generator)
 
     slant, az, el = observed.T
     out = np.zeros_like(observed)
-    out[:, 0] = drawn("range scale", spec.range_scale, 1) * slant
-    out[:, 1] = np.deg2rad(drawn("skew", spec.skew_deg, 1)) / np.cos(el)
-    out[:, 1] += np.deg2rad(drawn("nonorthogonality", spec.nonorthogonality_deg, 1)) * np.tan(el)
-    out[:, 2] = np.deg2rad(drawn("droop", spec.droop_deg, 1)) * np.cos(el)
-    for name, size, turns in (("once", spec.encoder_once_deg, 1), ("twice", spec.encoder_twice_deg, 2)):
-        wave = np.deg2rad(drawn(f"encoder {name}", size, 4))
+    size = RADAR.from_scenario(spec)
+    for row in RADAR.rows:
+        if row.response is not None:
+            component, response = row.response
+            out[:, component] += response(drawn(row.title, size[row.name][0], 1), slant, az, el)
+    for turns, (name, wave_rad) in enumerate(zip(("once", "twice"), size["angle_bias_sd_rad"][1:], strict=True), 1):
+        wave = drawn(f"encoder {name}", wave_rad, 4)
         out[:, 1] += wave[0] * np.sin(turns * az) + wave[1] * np.cos(turns * az)
         out[:, 2] += wave[2] * np.sin(turns * el) + wave[3] * np.cos(turns * el)
-    if spec.mislevel_deg > 0.0:
-        out[:, 1:] += mislevel(az, el, np.deg2rad(drawn("mislevel", spec.mislevel_deg, 2)))
+    tilt_rad = size["mislevel_sd_rad"][0]
+    if tilt_rad > 0.0:
+        out[:, 1:] += mislevel(az, el, drawn("mislevel", tilt_rad, 2))
     return out
 
 
 def mislevel(azimuth_rad: FloatArray, elevation_rad: FloatArray, tilt_rad: FloatArray) -> FloatArray:
-    """Errors ``(n, 2)`` in azimuth and elevation of a pedestal turned by ``tilt_rad`` (2,) about north and east."""
+    """Errors ``(n, 2)`` in azimuth and elevation of a pedestal rotated by ``tilt_rad`` (2,) about north and east."""
     turn = rotations.dcm_from_q(rotations.exp(np.array([*tilt_rad, 0.0])))
     level = np.column_stack(
         [
@@ -329,10 +327,11 @@ def mislevel(azimuth_rad: FloatArray, elevation_rad: FloatArray, tilt_rad: Float
 
 
 def wander(time_s: FloatArray, observed: FloatArray, spec: Radar, rng: np.random.Generator) -> FloatArray:
-    """Slow random error ``(n, 3)`` of both angles, of one size across the line of sight."""
+    """Slow random error ``(n, 3)`` of both angles, of one size normal to the line of sight."""
     out = np.zeros_like(observed)
-    if spec.wander_deg > 0.0:
-        size = float(np.deg2rad(spec.wander_deg))
-        out[:, 1:] = gauss_markov(time_s, size, spec.wander_time_constant_s, 2, child(rng, "wander"))
+    size = RADAR.from_scenario(spec)
+    (sd,), (tau_s,) = size["wander_sd_rad"], size["wander_time_constant_s"]
+    if sd > 0.0:
+        out[:, 1:] = gauss_markov(time_s, sd, tau_s, 2, child(rng, "wander"))
         out[:, 1] /= np.cos(observed[:, 2])
     return out

@@ -13,10 +13,11 @@ from estimators.calibration import read_corners
 from flightmodel.aerodynamics import read_aero_table
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.config import LARGEST_TOML_BYTES, parse_utc, read_toml
-from flightmodel.film import fault_of_image
+from flightmodel.film import image_fault
 from flightmodel.flightfolder import read_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from tests import fuzzing
+from tests.refusing import refuses
 
 MUTATIONS = 40  # a count, not a time: the same inputs on every machine
 
@@ -56,7 +57,7 @@ def test_a_start_outside_all_spaceflight_is_refused(tmp_path, text):
     fuzzing.write_flight(tmp_path / "f")
     file = tmp_path / "f/flight.toml"
     file.write_text(file.read_text().replace("2009-08-17T12:52:00Z", text))
-    with pytest.raises(ConfigError, match="t0_utc"):
+    with refuses("key-value", names=["t0_utc"], kind=ConfigError):
         read_flight(tmp_path / "f")
     with pytest.raises(ValueError, match="year"):
         parse_utc(text)
@@ -66,7 +67,7 @@ def test_a_path_with_nul_is_refused(tmp_path):
     fuzzing.write_flight(tmp_path / "f")
     file = tmp_path / "f/flight.toml"
     file.write_text(file.read_text().replace("telemetry/gnss.csv", "telemetry/gn\\u0000ss.csv"))
-    with pytest.raises(ConfigError, match="NUL"):
+    with refuses("path-nul", kind=ConfigError):
         read_flight(tmp_path / "f")
 
 
@@ -76,7 +77,7 @@ def test_number_that_overflows_in_si_is_refused_with_its_line(tmp_path):
     lines = file.read_text().splitlines()
     lines[4] = ",".join([lines[4].split(",")[0], "1e308", "0.1", "0.2"])
     file.write_text("\n".join(lines) + "\n")
-    with pytest.raises(GateError, match=r"line 5.*ax"):
+    with refuses("value-range", names=["line 5", "ax"]):
         read_flight(tmp_path / "f")
 
 
@@ -88,7 +89,7 @@ def test_sounding_with_an_sd_that_is_none_is_refused(tmp_path, column, value):
     file = tmp_path / "f/telemetry/atmosphere.csv"
     head, *rows = file.read_text().splitlines()
     file.write_text("\n".join([f"{head},{column}", *(f"{row},{value if k == 3 else 2}" for k, row in enumerate(rows))]))
-    with pytest.raises(GateError, match=r"line 5.*standard deviation"):
+    with refuses("value-range", names=["line 5"]):
         read_flight(tmp_path / "f")
 
 
@@ -98,14 +99,14 @@ def test_number_too_small_to_divide_by_is_refused(tmp_path, key):
     fuzzing.vehicle_cases(tmp_path / "v")
     file = tmp_path / "v/vehicle.toml"
     file.write_text(re.sub(rf"{key} = [\d.]+", f"{key} = 1e-320", file.read_text(), count=1))
-    with pytest.raises(ConfigError, match=f"{key}.*greater than"):
+    with refuses("key-value", names=[key], kind=ConfigError):
         vehicle_from_toml(file)
 
 
 @pytest.mark.parametrize("cell", ["1_0", "٣", "0x1"])
 def test_coefficient_is_a_plain_number(tmp_path, cell):
     (tmp_path / "aero.csv").write_text(fuzzing.AERO.replace("0.9,0,0,0", f"{cell},0,0,0"))
-    with pytest.raises(GateError, match=r"line 2.*no finite number"):
+    with refuses("not-a-number", names=["line 2"]):
         read_aero_table(tmp_path / "aero.csv")
 
 
@@ -113,7 +114,7 @@ def test_coefficient_column_that_stands_twice_is_refused(tmp_path):
     (tmp_path / "aero.csv").write_text(
         fuzzing.AERO.replace("cm,cmq", "ca,cm,cmq").replace("\n0,", "\n0,0,").replace("\n5,", "\n5,0,")
     )
-    with pytest.raises(GateError, match="ca stand twice"):
+    with refuses("column-twice", names=["ca"]):
         read_aero_table(tmp_path / "aero.csv")
 
 
@@ -137,10 +138,11 @@ def test_lost_frame_of_a_film_becomes_a_finding(cases):
     film, clean = case.files[0], case.files[0].read_bytes()
     at = clean.index(b"00dc", clean.index(b"00dc", clean.index(b"movi")) + 4)
     film.write_bytes(clean[:at] + b"JUNK" + clean[at + 4 :])
-    found = [f.what for f in read_flight(case.root).findings if f.source == "frames"]
+    found = [f for f in read_flight(case.root).findings if f.source == "frames"]
     film.write_bytes(clean)
-    assert len(found) == 1
-    assert "23 frames can be decoded where the film tells of 24" in found[0]
+    assert [f.code for f in found] == ["film-count"]
+    assert "23 " in found[0].what
+    assert "24" in found[0].what
     assert not [f for f in read_flight(case.root).findings if f.source == "frames"]
 
 
@@ -168,7 +170,7 @@ def test_picture_that_would_fill_the_memory_is_refused_by_its_head(tmp_path, mon
     path.write_bytes(data[: len(data) - tail])
     monkeypatch.setattr(cv2, "imread", lambda *_: pytest.fail("unpacked"))
     camera = next(iter(vehicle_from_toml(vehicle_path("irve2_reference")).cameras.values()))
-    assert "pixels" in fault_of_image(path, camera)
+    assert image_fault(path, camera).code == "image-size"
 
 
 @pytest.mark.parametrize(
@@ -180,7 +182,7 @@ def test_film_that_names_other_files_is_not_opened(cases, monkeypatch, text):
     film.write_bytes(text.encode())
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: pytest.fail("opened"))
     try:
-        with pytest.raises(GateError, match="cannot be opened as a film"):
+        with refuses("film-unreadable"):
             read_flight(case.root)
     finally:
         film.write_bytes(clean)
@@ -190,7 +192,7 @@ def test_configuration_of_gigabytes_is_refused_unread(tmp_path):
     path = tmp_path / "big.toml"
     with path.open("wb") as file:
         file.truncate(LARGEST_TOML_BYTES + 1)
-    with pytest.raises(ConfigError, match="10 MB"):
+    with refuses("file-too-large", kind=ConfigError):
         read_toml(path)
 
 

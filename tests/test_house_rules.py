@@ -110,13 +110,10 @@ def modules_imported(path, known):
     """Modules of this project that a file imports anywhere, also inside functions."""
     found = set()
     tree = ast.parse(path.read_text())
-    for_types = [n for n in ast.walk(tree) if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"]
-    ignored = {part for block in for_types for part in ast.walk(block)}
     for node in ast.walk(tree):
-        if node in ignored:
-            continue
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {f"{node.module}.{a.name}" for a in node.names} | {node.module}
+            named = {f"{node.module}.{a.name}" for a in node.names}
+            found |= named & known or {node.module}  # of a package either its modules or what it says itself
         elif isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
     return found & known

@@ -18,6 +18,7 @@ import numpy as np
 from flightmodel import earth, tables
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.flightfolder import Sources
+from flightmodel.instruments import RADAR
 from flightmodel.tables import UNITS
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from postflight.checks.track_force import TrackForce, coasting, track_force
@@ -308,7 +309,7 @@ def _sd_m(record: RadarRecord | GnssRecord, position_m: FloatArray) -> FloatArra
     site = record.site
     at = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
     slant = np.linalg.norm(position_m - at, axis=1)
-    own = (site.mislevel_sd_rad, site.droop_sd_rad, site.skew_sd_rad, site.nonorthogonality_sd_rad, site.wander_sd_rad)
-    angle = np.sqrt(2 * (site.angle_sd_rad**2 + site.angle_bias_sd_rad**2 + sum(sd**2 for sd in own)))
+    own = [getattr(site, row.name) for row in RADAR.rows if row.unit == "rad" and row.states]
+    angle = np.sqrt(2 * (site.angle_sd_rad**2 + sum(sd**2 for sd in own)))
     scale = site.range_scale_sd * slant
     return np.asarray(np.sqrt(site.range_sd_m**2 + site.range_bias_sd_m**2 + scale**2 + (angle * slant) ** 2))

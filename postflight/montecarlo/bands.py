@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 from scipy.stats import quantile_test
 
 from flightmodel.checks import FloatArray, GateError, write_file
-from postflight.montecarlo.study import CONFIDENCE, PERCENTILES, Study
+from flightmodel.statistics import BAND_COLUMNS, BAND_PERCENTILES, percentile_band
+from postflight.montecarlo.study import CONFIDENCE, Study
 from synthetic_flight.ensemble import Row
 
 PARTIAL = ".part"
@@ -196,18 +197,13 @@ def merge(study: Study, folder: Path, flights: int) -> Merged:
     return Merged(table, _percentiles(table[flown], names), bands, summary)
 
 
-def percentile_bands(values: FloatArray, axis: int = 0) -> FloatArray:
-    """`PERCENTILES` (3, ...) of values over an axis: low, median, high."""
-    return np.asarray(np.percentile(values, PERCENTILES, axis=axis))
-
-
 def _percentiles(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
     rows = []
     for name in names:
         values = table[name].to_numpy(dtype=float)
         values = values[np.isfinite(values)]
-        for percentile in PERCENTILES:
-            value = float(np.percentile(values, percentile)) if len(values) else np.nan
+        band = percentile_band(values) if len(values) else np.full(3, np.nan)
+        for percentile, value in zip(BAND_PERCENTILES, band.tolist(), strict=True):
             rows.append((name, len(values), percentile, value, *percentile_interval(values, percentile, CONFIDENCE)))
     return pd.DataFrame(rows, columns=["output", "flights", "percentile", "value", "low_95", "high_95"])
 
@@ -216,10 +212,10 @@ def _bands(study: Study, folder: Path, wanted: list[list[int]], flown: FloatArra
     """Percentiles of every history at every time; as many times at once as fit into memory."""
     time_s, names = study.plan.window.history_time_s(), study.plan.histories
     count, points = int(flown.sum()), len(time_s)
-    columns = ["history", "time_s", "flights", *(f"p{p:g}" for p in PERCENTILES)]
+    columns = ["history", "time_s", "flights", *BAND_COLUMNS]
     if not names or not count:
         return pd.DataFrame(columns=columns)
-    out = np.empty((len(names), points, len(PERCENTILES)))
+    out = np.empty((len(names), points, len(BAND_PERCENTILES)))
     width = max(1, BAND_BYTES // (4 * count * len(names)))
     for first in range(0, points, width):
         part = slice(first, min(first + width, points))
@@ -234,8 +230,8 @@ def _bands(study: Study, folder: Path, wanted: list[list[int]], flown: FloatArra
             slab[:, :, row : row + len(kept)] = np.moveaxis(kept, 0, -1)
             row += len(kept)
         for k in range(len(names)):  # one at a time: sorting takes a copy
-            out[k, part] = percentile_bands(slab[k], axis=-1).T
-    table = pd.DataFrame(out.reshape(-1, len(PERCENTILES)), columns=columns[3:])
+            out[k, part] = percentile_band(slab[k], axis=-1).T
+    table = pd.DataFrame(out.reshape(-1, len(BAND_PERCENTILES)), columns=columns[3:])
     table.insert(0, "history", np.repeat(names, points))
     table.insert(1, "time_s", np.tile(np.round(time_s, 9), len(names)))
     table.insert(2, "flights", count)

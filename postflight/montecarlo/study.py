@@ -36,7 +36,6 @@ from synthetic_flight.dispersions import SMALLEST, Dispersions, Window, draws
 from synthetic_flight.ensemble import QUANTITIES, SCALARS, Plan, check_outputs, legs
 from synthetic_flight.scenarios import read_scenario
 
-PERCENTILES = (2.3, 50.0, 97.7)
 MOST_FLIGHTS = 10_000_000
 CONFIDENCE = 0.95
 Flights = Annotated[int, Field(ge=1, le=MOST_FLIGHTS)]

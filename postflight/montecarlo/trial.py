@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flightmodel.airdata import air_data, peak_pressure
+from flightmodel.airdata import air_data
 from flightmodel.checks import Fault
+from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import difference, resample
 from postflight.deflections import estimate
@@ -89,7 +90,7 @@ def whole_trial(plan: Plan, seed: int, run: int) -> dict[str, float]:
         telemetry = replace(read_flight(folder), vehicle=nominal)
     flight = reconstruct(Flight(telemetry))
     answers = estimate(flight, METHODS)
-    peak_s, _ = peak_pressure(truth.time_s, truth.dynamic_pressure_pa)
+    peak_s, _ = find_peak(truth.time_s, truth.dynamic_pressure_pa)
     out = dict.fromkeys(SCALARS, np.nan)
     out["truth_deg"] = float(np.rad2deg(np.interp(peak_s, truth.time_s, truth.deflection.theta_rad)))
     for method, history in answers.histories.items():

@@ -69,7 +69,7 @@ class Reconciliation(Tabular):
         return deflection_of(self.fit)
 
     def modal_stiffness(self) -> ModalStiffness:
-        """Bending stiffness from the joint's frequency alone; `GateError` where nothing oscillates."""
+        """Bending stiffness from the joint's frequency alone; `GateError` where the mode is not detected."""
         return stiffness_from_modes(self.bet)
 
     def bounds(self, flights: int = 60, progress: Progress | None = None) -> tuple[Bounds, Bounds]:
@@ -105,7 +105,7 @@ def reconcile(bet: Reconstruction, progress: Progress | None = None) -> Reconcil
     GateError
         Where sensors or vehicle are missing, or there is no pressure pulse.
     DivergenceError
-        Where no candidate flies through.
+        Where the vehicle file's joint diverges.
     """
     return Reconciliation(bet, fit_joint(bet, progress=progress))
 

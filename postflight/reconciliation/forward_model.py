@@ -22,7 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel import earth, rotations
-from flightmodel.atmosphere import profile_from_sounding
+from flightmodel.atmosphere import (
+    DENSITY_LENGTH_M,
+    WIND_LENGTH_M,
+    profile_from_sounding,
+    sounding_correlation,
+    unresolved_variance,
+)
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.rotations import skew
@@ -30,8 +36,7 @@ from flightmodel.telemetry import Sounding
 from flightmodel.trajectory import Trajectory, resample
 from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
 from postflight.reconstruction import Reconstruction
-from recon.atmosphere import CONSTANT_PART, cg_accelerations, windows_are_whole
-from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
+from recon.atmosphere import cg_accelerations, windows_are_whole
 from synthetic_flight import simulate
 from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
 
@@ -166,10 +171,9 @@ class AtmosphereParameters:
     def precision(self) -> FloatArray:
         """Inverse covariance (3, k, k) of the sounding: half constant bias, half Gauss-Markov along altitude."""
         at = profile_from_sounding(self.sounding).at(self.knots_m)
-        apart = np.abs(self.knots_m[:, None] - self.knots_m)
         out = []
         for sd, length in ((at.density_sd, DENSITY_LENGTH_M), *[(at.wind_sd_mps, WIND_LENGTH_M)] * 2):
-            correlation = CONSTANT_PART + (1.0 - CONSTANT_PART) * np.exp(-apart / length)
+            correlation = sounding_correlation(self.knots_m, length)
             out.append(np.linalg.inv(sd[:, None] * correlation * sd))
         return np.array(out)
 
@@ -179,7 +183,7 @@ class AtmosphereParameters:
         at = profile_from_sounding(self.sounding).at(self.knots_m)
 
         def bridge(sd: FloatArray, length_m: float) -> FloatArray:
-            bridged = self.turbulence_share * sd * np.sqrt((1.0 - CONSTANT_PART) * apart / (3.0 * length_m))
+            bridged = self.turbulence_share * sd * np.sqrt(unresolved_variance(apart, length_m))
             return np.asarray(np.interp(altitude_m, self.knots_m, bridged))
 
         return bridge(at.density_sd, DENSITY_LENGTH_M), bridge(at.wind_sd_mps, WIND_LENGTH_M)

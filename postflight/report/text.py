@@ -14,7 +14,7 @@ import pandas as pd
 
 from estimators.agreement import CONFIDENCE
 from flightmodel.config import parse_utc
-from flightmodel.deflection import lateral_axes, lv_clock, lv_direction, missed_between
+from flightmodel.deflection import interpolation_error, lateral_axes, lv_clock, lv_direction
 from postflight.deflections import METHODS
 from postflight.plots.style import COLOUR, LABEL
 from postflight.report.pictures import best_method, hole_s
@@ -74,12 +74,12 @@ def lead(run: Run) -> list[str]:
     at = s["peak_dynamic_pressure_s"]
     row = run.peak("dynamic pressure")
     sd = f" ± {row['sd']:.0f}" if row is not None and np.isfinite(row["sd"]) else ""
-    place = run.tables["bet"]
-    k = int(np.abs(place["t_s"].to_numpy() - at).argmin())
+    events = run.tables["events"]
+    there = events.iloc[int((events["t_s"] - at).abs().argmin())]
     out = [s["agreement"][0].upper() + s["agreement"][1:] + "."] if s["agreement"] else []
     out.append(
         f"{_peak_name(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
-        f"({_utc(run, at)} UTC), Mach {place['mach'].iloc[k]:.2f}, {place['alt_m'].iloc[k] / 1e3:.1f} km."
+        f"({_utc(run, at)} UTC), Mach {there['mach']:.2f}, {there['alt_m'] / 1e3:.1f} km."
     )
     oscillation = _oscillation(run)
     if oscillation:
@@ -156,7 +156,7 @@ def plane_at(run: Run, method: str) -> str:
     yz = np.array(answers["theta_deg"])[:, None] * lv_direction(np.deg2rad(np.array(answers["plane_lv_deg"])))[:, 1:]
     here = np.array([np.interp(at, t, c) for c in yz.T])
     clock = lv_clock(here)
-    missed = missed_between(t, yz @ lateral_axes(clock)[1], at) / np.linalg.norm(here)
+    missed = interpolation_error(t, yz @ lateral_axes(clock)[1], at) / np.linalg.norm(here)
     clock, sd = np.rad2deg(clock), float(np.hypot(sd, np.rad2deg(missed)))
     places = 0 if sd >= 1.0 else 1
     return f"{float(clock):.{places}f} ± {sd:.{places}f}"

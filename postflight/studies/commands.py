@@ -11,6 +11,7 @@ from rich.table import Table
 
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import GateError
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.commands import compile_kernels, console
 from postflight.flight import read_flight
@@ -134,7 +135,7 @@ def compared_with_bounds(
         {
             "time_s": pulse.time_s,
             "alpha_total_deg": np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad)),
-            "normal_g": np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / 9.80665,
+            "normal_g": np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2,
         }
     )
     table = shares(flight, flown, rigid, flexible)

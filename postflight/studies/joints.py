@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from flightmodel.airdata import peak_pressure, pressure_pulse
+from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray
+from flightmodel.events import find_peak
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import simulate
 from synthetic_flight.dispersions import Window
@@ -156,9 +157,7 @@ def _fly(
 def _pressure_peak(scenario: Scenario, start: Start, from_s: float) -> float:
     window = Window(from_s=from_s, to_s=scenario.spec.time.stop_s, record_s=0.1)
     (flown,) = fly_legs(scenario.vehicle, [0], [start], legs(scenario.spec.time, window, True))
-    return peak_pressure(
-        window.from_s + window.record_s * np.arange(len(flown.aux), dtype=np.float64), flown.aux[:, 3]
-    )[0]
+    return find_peak(window.from_s + window.record_s * np.arange(len(flown.aux), dtype=np.float64), flown.aux[:, 3])[0]
 
 
 def _kept(label: str, window: Window, records: Records, diverged: bool) -> JointFlight:

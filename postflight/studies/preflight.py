@@ -21,9 +21,9 @@ import pandas as pd
 from flightmodel import rotations
 from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
 from flightmodel.checks import BoolArray, FloatArray, GateError, Progress
+from flightmodel.statistics import percentile_band
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Uncertainty, Vehicle
-from postflight.montecarlo.bands import percentile_bands
 from postflight.reconstruction import Reconstruction
 from synthetic_flight import simulate
 from synthetic_flight.dispersions import (
@@ -147,8 +147,8 @@ def entry_bounds(
         report(runs.stop / flights, f"{what} flight {runs.stop} of {flights}")
     return Bounds(
         time_s=entry.start_s + RECORD_S * np.arange(entry.records),
-        alpha_total_deg=percentile_bands(alpha),
-        normal_g=percentile_bands(normal),
+        alpha_total_deg=percentile_band(alpha),
+        normal_g=percentile_band(normal),
         nominal_alpha_deg=nominal[0],
         nominal_normal_g=nominal[1],
         flights=flights,

@@ -7,8 +7,9 @@ import pytest
 
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, benchmark_deflection, joint_moment
 from estimators.camera import read_film
-from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S, gauss_markov_basis
+from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from flightmodel.checks import GateError
+from flightmodel.statistics import correlation_root
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film
 
 from .conftest import VEHICLE, pulse_of
@@ -48,7 +49,7 @@ def drawn(rng, freeplay_rad=0.0):
     side = moment / np.linalg.norm(moment, axis=1, keepdims=True)
     theta = compliance * moment + freeplay_rad * side
     theta_yz = np.stack([np.interp(FRAMES_S, TIME_S, column) for column in theta.T], axis=-1)
-    light = gauss_markov_basis(FRAMES_S, LIGHT_TIME_S)
+    light = correlation_root(FRAMES_S, LIGHT_TIME_S)
     camera = np.sqrt(CONSTANT_PART) * rng.standard_normal(2)
     camera = camera + np.sqrt(1.0 - CONSTANT_PART) * light @ rng.standard_normal((light.shape[1], 2))
     n = len(FRAMES_S)

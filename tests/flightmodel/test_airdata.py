@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from flightmodel.airdata import air_data, lateral_angles, peak_pressure, pressure_pulse, total_angle
+from flightmodel.airdata import air_data, lateral_angles, pressure_pulse, total_angle
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.deflection import lv_clock
+from flightmodel.events import find_peak
 from flightmodel.trajectory import Trajectory
 
 WIND = np.array([11.0, -37.0, 0.0])
@@ -89,7 +90,7 @@ def test_standard_deviations_equal_a_monte_carlo():
 def test_peak_and_pulse():
     t = np.arange(0.0, 40.0, 0.5)
     q = 1200.0 * np.exp(-((t - 17.3) ** 2) / 40.0)
-    at, value = peak_pressure(t, q)
+    at, value = find_peak(t, q)
     assert at == pytest.approx(17.3, abs=0.01)
     assert value == pytest.approx(1200.0, rel=1e-3)
     pulse = pressure_pulse(q + 300.0 * (t > 38.0))

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from flightmodel import gate
-from flightmodel.gate import find_faults, runs, told
+from flightmodel.checks import Fault
+from flightmodel.gate import find_faults, findings_of_runs, runs
 
 
 @given(hnp.arrays(bool, st.integers(0, 40)))
@@ -45,7 +46,7 @@ def test_stuck_runs_are_those_that_one_would_count(column):
         frozen = b - a + 1 >= 10 and time_s[b] - time_s[a] >= 0.5
         saturated = b - a + 1 >= 5 and np.ptp(known) > 0.0 and column[a] in (known.min(), known.max())
         if frozen or saturated:
-            what = "saturated or frozen" if frozen and saturated else "frozen" if frozen else "saturated"
+            what = "frozen or saturated" if frozen and saturated else "frozen" if frozen else "saturated"
             wanted.append((f"x {what} at {column[a]:.6g} (SI) for {b - a + 1} samples", time_s[a], time_s[b]))
     found = find_faults("sensor", time_s, ("x",), column[:, None], np.zeros(len(column), dtype=bool))
     assert [(f.what, f.start_s, f.end_s) for f in found] == wanted
@@ -58,7 +59,7 @@ def test_of_very_many_the_longest_are_told_and_the_others_together(count):
     first = np.cumsum(np.append(5, length[:-1] + rng.integers(1, 9, size=count - 1)))
     last = first + length - 1
     time_s = np.arange(last[-1] + 1) * 0.01
-    found = told("s", time_s, first, last, lambda k: f"{length[k]} samples", "runs")
+    found = findings_of_runs("s", time_s, first, last, lambda k: Fault(f"{length[k]} samples", "run"), "runs")
     alone = [f for f in found if "further" not in f.what]
     assert len(alone) == min(count, gate.MANY)
     assert [f.start_s for f in alone] == sorted(f.start_s for f in alone)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from flightmodel.atmosphere import height_from_pressure, profile_from_sounding, 
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.earth import q_ecef_body_from_pointing
 from flightmodel.flightfolder import read_flight
+from tests.refusing import refuses
 
 DEG = np.pi / 180.0
 HEAD = 'name = "small"\nt0_utc = "2022-06-24T15:17:17.5Z"\n'
@@ -45,11 +48,9 @@ def folder(tmp_path):
             (tmp_path / "flight.toml").write_text("\n".join([HEAD, *sections]))
             return read_flight(tmp_path)
 
-        def refused(self, sections, *words, kind=ConfigError):
-            with pytest.raises(kind) as caught:
+        def refused(self, sections, codes, *names, kind=ConfigError):
+            with refuses(*codes.split(), names=[re.escape(name) for name in names], kind=kind):
                 self.read(*sections)
-            missing = [word for word in words if word not in str(caught.value)]
-            assert not missing, f"no {missing} in:\n{caught.value}"
 
     made = Folder()
     up = 10.0 * T
@@ -110,11 +111,11 @@ def test_ecef_columns_are_read_before_geodetic_ones_and_velocities_either_way(fo
     header = "t_s,lat_deg,lon_deg,alt_m,x_ecef_m,y_ecef_m,z_ecef_m"
     folder.table("gps.csv", f"{header},vx_ecef_mps,vy_ecef_mps,vz_ecef_mps", T, *geodetic, *at.T, *v.T)
     one = folder.read('[gnss.gps]\nfile = "gps.csv"\n', BALLISTIC).gnss["gps"]
-    np.testing.assert_allclose(one.position_ecef_m, at, atol=0.01)
-    np.testing.assert_allclose(one.velocity_ecef_mps, v, atol=1e-6)
+    np.testing.assert_allclose(one.position_ecef_m, at, rtol=0.0, atol=0.01)
+    np.testing.assert_allclose(one.velocity_ecef_mps, v, rtol=0.0, atol=1e-6)
     folder.table("gps.csv", f"{header},vn_mps,ve_mps,vd_mps", T, *geodetic, *at.T, *ned.T)
     two = folder.read('[gnss.gps]\nfile = "gps.csv"\n', BALLISTIC).gnss["gps"]
-    np.testing.assert_allclose(two.velocity_ecef_mps, v, atol=1e-6)
+    np.testing.assert_allclose(two.velocity_ecef_mps, v, rtol=0.0, atol=1e-6)
     silent = folder.read('[gnss.gps]\nfile = "gps.csv"\nvelocity = false\n', BALLISTIC).gnss["gps"]
     assert np.isnan(silent.velocity_ecef_mps).all()
     # geodetic columns that are declared are meant
@@ -246,7 +247,7 @@ def test_samples_outside_use_s_may_be_wild(folder):
     wild = np.where(T > 15.0, 1e9, 1400 + T)
     folder.table("baro.csv", "t_s,height_m", T, wild)
     assert folder.read(GNSS, BALLISTIC, BARO + "use_s = [[0.0, 15.0]]").barometers["baro"].height_m.max() < 1500
-    folder.refused([GNSS, BALLISTIC, BARO], "baro.csv: line", kind=GateError)
+    folder.refused([GNSS, BALLISTIC, BARO], "value-range", "baro.csv: line", kind=GateError)
 
 
 def test_hours_minutes_and_seconds_of_a_day(folder):
@@ -259,7 +260,7 @@ def test_hours_minutes_and_seconds_of_a_day(folder):
     (folder.root / "flight.toml").write_text("\n".join([head, section, BALLISTIC]))
     np.testing.assert_allclose(read_flight(folder.root).gnss["gps"].time_s, [-1.0, 1.0, 3.0, 5.0], atol=1e-6)
     folder.table("gps.csv", header, np.array([23.0, 24.0, 0.0, 0.0]), minutes, seconds, *place)
-    folder.refused([section, BALLISTIC], "24:59:59.5", "utc_hms", kind=GateError)
+    folder.refused([section, BALLISTIC], "time-format", "24:59:59.5", "utc_hms", kind=GateError)
 
 
 def test_motion_is_carried(folder):
@@ -273,9 +274,9 @@ def test_motion_is_carried(folder):
 
 def test_what_needs_a_vehicle_says_which_key_to_add(folder):
     telemetry = folder.read(GNSS, BALLISTIC)
-    with pytest.raises(GateError, match=r'add vehicle = "\.\.\." to flight\.toml'):
+    with refuses("vehicle-missing"):
         telemetry.required_vehicle()
-    with pytest.raises(GateError, match=r"add \[sensors.accelerometer\] and \[sensors.rates\]"):
+    with refuses("inertial-missing"):
         telemetry.required_triads()
 
 
@@ -283,81 +284,85 @@ def test_what_needs_a_vehicle_says_which_key_to_add(folder):
 
 
 def test_nothing_that_tracks_is_refused(folder):
-    folder.refused([BALLISTIC], "no [radars.NAME] and no [gnss.NAME]")
-    folder.refused([BALLISTIC, BARO], "a barometer alone knows no place")
+    folder.refused([BALLISTIC], "tracker-missing")
+    folder.refused([BALLISTIC, BARO], "tracker-missing")
 
 
 def test_one_triad_alone_is_refused(folder):
     only_force, only_rates = (TRIADS[: TRIADS.index("[sensors.rates]")], TRIADS[TRIADS.index("[sensors.rates]") :])
-    folder.refused([GNSS, PRIOR, only_force], "[sensors.accelerometer] without [sensors.rates]", "add the other")
-    folder.refused([GNSS, PRIOR, only_rates], "[sensors.rates] without [sensors.accelerometer]")
+    folder.refused([GNSS, PRIOR, only_force], "inertial-missing", "[sensors.rates]")
+    folder.refused([GNSS, PRIOR, only_rates], "inertial-missing", "[sensors.accelerometer]")
 
 
 def test_strapdown_without_sensors_or_attitude_is_refused(folder):
-    folder.refused([GNSS], 'motion.model = "strapdown"', "ballistic")
-    folder.refused([GNSS, TRIADS], "nothing says how the vehicle was turned", "[attitude_prior]", "[sensors.sun]")
+    folder.refused([GNSS], "attitude-missing inertial-missing", 'motion.model = "strapdown"')
+    folder.refused([GNSS, TRIADS], "attitude-missing", "[attitude_prior]", "[sensors.sun]")
 
 
 def test_ballistic_without_drag_is_refused(folder):
-    folder.refused([GNSS, '[motion]\nmodel = "ballistic"\n'], "motion.model", "drag_area_per_mass_m2pkg")
+    folder.refused(
+        [GNSS, '[motion]\nmodel = "ballistic"\n'], "keys-conflict", "motion.model", "drag_area_per_mass_m2pkg"
+    )
 
 
 @pytest.mark.parametrize(
-    ("axes", "words"),
+    ("axes", "code", "name"),
     [
-        ('["+x", "+y", "-z"]', "left-handed"),
-        ('["+x", "+x", "+z"]', "same body axis"),
-        ('["+x", "-x", "+z"]', "same body axis"),
-        ('["x", "+y", "+z"]', "axes.0"),
+        ('["+x", "+y", "-z"]', "axes-left-handed", "axes"),
+        ('["+x", "+x", "+z"]', "axes-parallel", "axes"),
+        ('["+x", "-x", "+z"]', "axes-parallel", "axes"),
+        ('["x", "+y", "+z"]', "key-value", "axes.0"),
     ],
 )
-def test_axes_that_are_none_are_refused(folder, axes, words):
+def test_axes_that_are_none_are_refused(folder, axes, code, name):
     folder.refused(
-        [GNSS, PRIOR, TRIADS.replace('mount = "body"', f"axes = {axes}")], "sensors.accelerometer.axes", words
+        [GNSS, PRIOR, TRIADS.replace('mount = "body"', f"axes = {axes}")], code, "sensors.accelerometer.axes", name
     )
 
 
 def test_mounts_that_contradict_or_lack_a_vehicle_are_refused(folder):
     folder.refused(
-        [GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "body"\naxes = ["+x", "+y", "+z"]')], "keep one"
+        [GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "body"\naxes = ["+x", "+y", "+z"]')], "keys-conflict"
     )
-    folder.refused(
-        [GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "suba"')], "names no vehicle", 'mount = "body"'
-    )
-    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"\n', "")], "nothing is said of its mount")
+    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "suba"')], "mount-missing", 'mount = "body"')
+    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"\n', "")], "mount-missing")
     place = 'mount = "suba"\nposition_from_datum_body_m = [0.0, 0.0, 0.0]'
-    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"', place)], "position_from_datum_body_m")
+    folder.refused(
+        [GNSS, PRIOR, TRIADS.replace('mount = "body"', place)], "keys-conflict", "position_from_datum_body_m"
+    )
     named = ['vehicle = "irve2_reference"', GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "sub"')]
-    folder.refused(named, "sensors.accelerometer.mount = 'sub'", "suba")
+    folder.refused(named, "mount-unknown", "sensors.accelerometer.mount = 'sub'", "suba")
 
 
 def test_heights_above_what_must_be_said(folder):
-    folder.refused([GNSS.replace('height_is = "ellipsoid"\n', ""), BALLISTIC], "gnss.gps", "alt is above what?")
-    folder.refused([GNSS.replace("ellipsoid", "msl"), BALLISTIC], "gnss.gps.height_is", "geoid_undulation_m")
-    folder.refused([GNSS + "geoid_undulation_m = 20.0\n", BALLISTIC], "used only with height_is")
-    folder.refused([GNSS, BARO.replace('height_is = "ellipsoid"\n', ""), BALLISTIC], "barometers.baro", "above what?")
-    folder.refused([GNSS.replace("ellipsoid", "geoid"), BALLISTIC], "gnss.gps.height_is", "'geoid'")
+    folder.refused([GNSS.replace('height_is = "ellipsoid"\n', ""), BALLISTIC], "height-datum", "gnss.gps")
+    folder.refused(
+        [GNSS.replace("ellipsoid", "msl"), BALLISTIC], "keys-conflict", "gnss.gps.height_is", "geoid_undulation_m"
+    )
+    folder.refused([GNSS + "geoid_undulation_m = 20.0\n", BALLISTIC], "keys-conflict", "height_is")
+    folder.refused([GNSS, BARO.replace('height_is = "ellipsoid"\n', ""), BALLISTIC], "height-datum", "barometers.baro")
+    folder.refused([GNSS.replace("ellipsoid", "geoid"), BALLISTIC], "key-value", "gnss.gps.height_is", "'geoid'")
 
 
 def test_bad_fixes_are_refused_by_line(folder):
     lat = np.where(T == 2.0, 0.0, LAT)
     lon = np.where(T == 2.0, 0.0, LON)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m", T, lat, lon, 1400 + T)
-    folder.refused([GNSS, BALLISTIC], "gps.csv: line 6", "latitude and longitude 0", "min_satellites", kind=GateError)
+    folder.refused([GNSS, BALLISTIC], "fix-impossible", "gps.csv: line 6", "min_satellites", kind=GateError)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m", T, LAT + 60 + 0 * T, LON + 0 * T, 1400 + T)
-    folder.refused([GNSS, BALLISTIC], "gps.csv: line 2", "no latitude", kind=GateError)
+    folder.refused([GNSS, BALLISTIC], "value-range", "gps.csv: line 2", kind=GateError)
     folder.table("gps.csv", "t_s,x_ecef_m,y_ecef_m,z_ecef_m", T, 0 * T, 0 * T, 0 * T)
-    folder.refused([GNSS, BALLISTIC], "inside the Earth", "40 in all", kind=GateError)
+    folder.refused([GNSS, BALLISTIC], "fix-impossible", "40 in all", kind=GateError)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg", T, LAT + 0 * T, LON + 0 * T)
-    folder.refused([GNSS, BALLISTIC], "no column alt_m", kind=GateError)
+    folder.refused([GNSS, BALLISTIC], "table-column-missing", "alt_m", kind=GateError)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,vn_mps", T, LAT + 0 * T, LON + 0 * T, 1400 + T, T)
-    folder.refused([GNSS, BALLISTIC], "a velocity lacks vd, ve", "velocity = false", kind=GateError)
+    folder.refused([GNSS, BALLISTIC], "table-column-missing", "vd, ve", "velocity = false", kind=GateError)
 
 
 def test_no_fix_good_enough_is_refused(folder):
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,nsat", T, LAT + 0 * T, LON + 0 * T, 1400 + T, 5 + 0 * T)
-    folder.refused([GNSS + "min_satellites = 6\n", BALLISTIC], "0 fixes are good enough", kind=GateError)
-    folder.refused([GNSS + "min_fix_mode = 3\n", BALLISTIC], "no column 'fix_mode'", kind=GateError)
+    folder.refused([GNSS + "min_satellites = 6\n", BALLISTIC], "fixes-poor", "0 fixes", kind=GateError)
+    folder.refused([GNSS + "min_fix_mode = 3\n", BALLISTIC], "table-column-missing", "'fix_mode'", kind=GateError)
 
 
 def test_declaring_both_kinds_of_position_is_refused(folder):
@@ -365,12 +370,12 @@ def test_declaring_both_kinds_of_position_is_refused(folder):
     header = "t_s,lat_deg,lon_deg,alt_m,x_ecef_m,y_ecef_m,z_ecef_m"
     at = earth.ecef_from_geodetic(LAT * DEG, LON * DEG, 1400 + T)
     folder.table("gps.csv", header, T, LAT + 0 * T, LON + 0 * T, 1400 + T, *at.T)
-    folder.refused([GNSS + both, BALLISTIC], "keep one of the two")
+    folder.refused([GNSS + both, BALLISTIC], "columns-ambiguous")
 
 
 def test_barometer_tables_that_are_not_clear_are_refused(folder):
     folder.table("baro.csv", "t_s,height_m,pressure_pa", T, 1400 + T, 86e3 - T)
-    folder.refused([GNSS, BARO, BALLISTIC], "heights and pressures are both there")
+    folder.refused([GNSS, BARO, BALLISTIC], "columns-ambiguous")
     declared = BARO + 'columns = { pressure = { column = "pressure_pa", unit = "pa" } }\n'
     np.testing.assert_allclose(
         folder.read(GNSS, declared, BALLISTIC).barometers["baro"].height_m,
@@ -378,55 +383,55 @@ def test_barometer_tables_that_are_not_clear_are_refused(folder):
         atol=1e-3,
     )
     folder.table("baro.csv", "t_s,alt", T, 1400 + T)
-    folder.refused([GNSS, BARO, BALLISTIC], "no column height_m and none pressure_pa", kind=GateError)
+    folder.refused([GNSS, BARO, BALLISTIC], "table-column-missing", "height_m", kind=GateError)
     folder.table("baro.csv", "t_s,pressure_pa", T, 860 * 1e3 - T)
-    folder.refused([GNSS, BARO, BALLISTIC], "baro.csv: line 2", "no static pressure", kind=GateError)
+    folder.refused([GNSS, BARO, BALLISTIC], "value-range", "baro.csv: line 2", kind=GateError)
 
 
 def test_prior_must_have_one_form(folder):
     words = "azimuth_deg, elevation_deg and roll_deg"
-    folder.refused([GNSS, TRIADS, PRIOR.replace("roll_deg = 10.0\n", "")], "attitude_prior", words)
-    folder.refused([GNSS, TRIADS, PRIOR + "q_ecef_body = [1.0, 0.0, 0.0, 0.0]\n"], "q_ecef_body says it all")
-    folder.refused([GNSS, TRIADS, PRIOR + "latitude_deg = 10.0\n"], "belong together")
-    folder.refused([GNSS, TRIADS, PRIOR + "sd_deg = [1.0, 2.0]\n"], "attitude_prior.sd_deg")
-    folder.refused([GNSS, TRIADS, PRIOR + "sd_deg = 0\n"], "attitude_prior.sd_deg", "above 0")
+    folder.refused([GNSS, TRIADS, PRIOR.replace("roll_deg = 10.0\n", "")], "keys-conflict", "attitude_prior", words)
+    folder.refused([GNSS, TRIADS, PRIOR + "q_ecef_body = [1.0, 0.0, 0.0, 0.0]\n"], "keys-conflict", "q_ecef_body")
+    folder.refused([GNSS, TRIADS, PRIOR + "latitude_deg = 10.0\n"], "keys-conflict")
+    folder.refused([GNSS, TRIADS, PRIOR + "sd_deg = [1.0, 2.0]\n"], "key-missing", "attitude_prior.sd_deg")
+    folder.refused([GNSS, TRIADS, PRIOR + "sd_deg = 0\n"], "key-value", "attitude_prior.sd_deg")
 
 
 @pytest.mark.parametrize(
-    ("line", "words"),
+    ("line", "code", "name"),
     [
-        ("use_s = [[5.0, 5.0]]", "ends after it begins"),
-        ("use_s = []", "use_s"),
-        ("use_s = [[100.0, 200.0]]", "use_s leaves 0 rows"),
-        ("min_satelites = 6", "did you mean 'min_satellites'"),
-        ("horizontal_sd_m = 0.0", "gnss.gps.horizontal_sd_m"),
-        ("time_bias_sd_s = 100.0", "gnss.gps.time_bias_sd_s"),
-        ("antenna_from_datum_body_m = [0.0, 0.0, 1000.0]", "antenna_from_datum_body_m"),
-        ('time = { format = "utc_hms" }', "belong together"),
-        ('time = { repeats = "last" }', "repeats"),
-        ("geoid_undulation_m = 500.0", "geoid_undulation_m"),
-        ("velocity = 1", "true or false"),
-        ('columns = { latt = { column = "lat_deg", unit = "deg" } }', "did you mean 'lat'"),
+        ("use_s = [[5.0, 5.0]]", "key-value", "use_s"),
+        ("use_s = []", "key-value", "use_s"),
+        ("use_s = [[100.0, 200.0]]", "use-span-empty", "0 rows"),
+        ("min_satelites = 6", "key-unknown", "'min_satellites'"),
+        ("horizontal_sd_m = 0.0", "key-value", "gnss.gps.horizontal_sd_m"),
+        ("time_bias_sd_s = 100.0", "key-value", "gnss.gps.time_bias_sd_s"),
+        ("antenna_from_datum_body_m = [0.0, 0.0, 1000.0]", "key-value", "antenna_from_datum_body_m"),
+        ('time = { format = "utc_hms" }', "keys-conflict", "time"),
+        ('time = { repeats = "last" }', "key-value", "repeats"),
+        ("geoid_undulation_m = 500.0", "key-value", "geoid_undulation_m"),
+        ("velocity = 1", "key-value", "velocity"),
+        ('columns = { latt = { column = "lat_deg", unit = "deg" } }', "quantity-unknown", "'lat'"),
     ],
 )
-def test_slips_of_the_pen_are_refused(folder, line, words):
-    folder.refused([GNSS + line, BALLISTIC], words, kind=GateError)
+def test_slips_of_the_pen_are_refused(folder, line, code, name):
+    folder.refused([GNSS + line, BALLISTIC], code, name, kind=GateError)
 
 
 def test_a_name_stands_once_and_a_sounding_has_no_spans(folder):
-    folder.refused(
-        [GNSS, BARO.replace("barometers.baro", "barometers.gps"), BALLISTIC], "the name 'gps' stands in more"
-    )
+    folder.refused([GNSS, BARO.replace("barometers.baro", "barometers.gps"), BALLISTIC], "name-twice", "'gps'")
     folder.table("air.csv", "alt_m,rho_kgpm3,t_k", T, 1.2 - 0.001 * T, 280 + T)
     folder.refused(
-        [GNSS, BALLISTIC, '[atmosphere]\nfile = "air.csv"\nuse_s = [[0.0, 5.0]]'], "atmosphere.use_s", "by altitude"
+        [GNSS, BALLISTIC, '[atmosphere]\nfile = "air.csv"\nuse_s = [[0.0, 5.0]]'], "keys-conflict", "atmosphere.use_s"
     )
 
 
 def test_video_needs_a_vehicle(folder):
-    folder.refused([GNSS, BALLISTIC, '[frames]\nfile = "gps.csv"\nfolder = "."'], "frames", 'add vehicle = "..."')
+    folder.refused(
+        [GNSS, BALLISTIC, '[frames]\nfile = "gps.csv"\nfolder = "."'], "vehicle-missing", "frames", 'vehicle = "..."'
+    )
 
 
 def test_no_second_in_common_is_refused(folder):
     late = GNSS.replace('"gps.csv"', '"gps.csv"\ntime = { offset_s = 19.0 }')
-    folder.refused([late, TRIADS, PRIOR], "accelerometer, rates and receivers have no second in common", kind=GateError)
+    folder.refused([late, TRIADS, PRIOR], "no-common-time", "accelerometer, rates and receivers", kind=GateError)

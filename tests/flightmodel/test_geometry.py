@@ -8,9 +8,9 @@ import pytest
 
 import flightmodel
 from flightmodel import geometry as shell
-from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
 from flightmodel.geometry import ShellGeometry
+from tests.refusing import refuses
 
 TOML = Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml"
 D = np.deg2rad
@@ -78,7 +78,7 @@ def test_limb_is_where_lines_of_sight_touch_the_torus(geometry, index):
 def test_a_viewpoint_inside_the_torus_is_refused(geometry):
     station, radius = shell.torus_circles(geometry)
     inside = -station[-1] * np.array([1.0, 0, 0]) + radius[-1] * lv_direction(1.0)
-    with pytest.raises(GateError, match="inside torus"):
+    with refuses("viewpoint-inside", names=["torus"]):
         shell.torus_limb(geometry, inside, np.array([1.0]))
 
 

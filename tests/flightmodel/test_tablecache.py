@@ -186,9 +186,9 @@ def test_a_block_beyond_half_the_limit_is_not_kept(cache, table, monkeypatch):
 
 def test_two_processes_at_once(cache, table):
     code = (
-        "import sys; from pathlib import Path; from flightmodel import quickread; "
-        "quickread.SMALLEST_BYTES = quickread.CACHED_BYTES = 0; "
-        "print([float(quickread.read_numbers(Path(sys.argv[1]), {'a': True}).columns['a'].sum()) for _ in range(20)])"
+        "import sys; from pathlib import Path; from flightmodel import csv_reading; "
+        "csv_reading.SMALLEST_BYTES = csv_reading.CACHED_BYTES = 0; "
+        "print([float(csv_reading.read_numbers(Path(sys.argv[1]), {'a': True}).columns['a'].sum()) for _ in range(20)])"
     )
     running = [
         subprocess.Popen([sys.executable, "-c", code, str(table)], stdout=subprocess.PIPE, text=True) for _ in range(2)

@@ -3,10 +3,11 @@ import shutil
 import numpy as np
 import pytest
 
-from flightmodel.checks import ConfigError, GateError
+from flightmodel.checks import ConfigError
 from flightmodel.config import parse_section
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_clock, lv_direction
 from flightmodel.vehicle import MassProperties, vehicle_from_toml, vehicle_path
+from tests.refusing import refuses
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +88,7 @@ def test_impossible_inertia_is_refused(tmp_path):
     path = edited(
         tmp_path, ("[[2.0, 0.0, 0.0], [0.0, 25.0, 0.0], [0.0, 0.0, 25.0]]", "[[60.0,0,0],[0,25.0,0],[0,0,25.0]]")
     )
-    with pytest.raises(ConfigError, match="triangle"):
+    with refuses("key-value", kind=ConfigError):
         vehicle_from_toml(path)
 
 
@@ -98,20 +99,20 @@ def test_three_moments_of_inertia_are_the_diagonal_and_other_forms_are_told(tmp_
 
     np.testing.assert_array_equal(body([7.0, 4, 4.0]).inertia, np.diag([7.0, 4.0, 4.0]))
     for wrong in (3.0, [1.0, 2.0], [[1.0, 2.0, 3.0]], [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], [1.0, [0, 1, 0], 2.0]):
-        with pytest.raises(ConfigError, match=r"three numbers .* or three rows of three") as caught:
+        with refuses("key-value", kind=ConfigError) as caught:
             body(wrong)
         assert len(caught.value.faults) == 1
-    with pytest.raises(ConfigError, match="still to fill in"):
+    with refuses("key-value", kind=ConfigError):
         body("FILL IN")
-    with pytest.raises(ConfigError, match="three numbers"):
+    with refuses("key-value", kind=ConfigError):
         body([True, 1.0, 1.0])
 
 
 def test_unknown_vehicle_and_bad_toml(tmp_path):
-    with pytest.raises(ConfigError, match="did you mean 'irve2_reference'"):
+    with refuses("vehicle-unknown", names=["'irve2_reference'"], kind=ConfigError):
         vehicle_path("irve2_refrence")
     (tmp_path / "bad.toml").write_text("a = = 1")
-    with pytest.raises(ConfigError, match="line 1"):
+    with refuses("toml-syntax", names=["line 1"], kind=ConfigError):
         vehicle_from_toml(tmp_path / "bad.toml")
 
 
@@ -158,5 +159,5 @@ def test_history_between_and_outside_its_answers():
     history = DeflectionHistory(t, theta, np.zeros(4), np.tile(np.eye(2) * 1e-4, (4, 1, 1)), "camera")
     assert history.at(1.5) == pytest.approx((0.03, 0.01))
     assert np.isnan(history.at(0.5)[0])
-    with pytest.raises(GateError, match="increase"):
+    with refuses("not-increasing"):
         DeflectionHistory(t[::-1].copy(), theta, np.zeros(4), None, "camera")

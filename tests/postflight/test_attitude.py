@@ -12,7 +12,7 @@ from postflight.attitude import DEPENDENCE, attitude_table, check_attitude
 from postflight.flight import Flight
 from postflight.reconstruction import reconstruction_from
 from postflight.run_folder import attitude_summary
-from recon.fault_isolation import suspects
+from recon.fault_isolation import isolate_faults
 from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
 
@@ -75,9 +75,9 @@ def test_a_magnetometer_that_was_turned_is_named(telemetry, bet):
     red = [v for v in found.consistency_checks if not v.passed]
     assert red
     assert attitude_summary(found)["passed"] is False
-    words = suspects(tuple(red), ())[0]
-    assert words.startswith("the attitude: ")
-    assert "magnetometer" in words
+    first = isolate_faults(tuple(red), ())[0]
+    assert first.code == "attitude"
+    assert "magnetometer" in first
 
 
 @pytest.mark.parametrize("how", ["start", "filter"])

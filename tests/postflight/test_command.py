@@ -6,7 +6,6 @@ import errno
 import io
 import json
 import os
-import re
 import resource
 import shutil
 import signal
@@ -376,12 +375,12 @@ def test_estimators_that_cannot_answer_exit_4_and_say_why(two_runs) -> None:
 @pytest.mark.slow
 def test_nonsense_is_not_reported_as_a_good_trajectory(two_runs) -> None:
     first, _, saved, _ = two_runs
-    checks = pd.read_csv(io.BytesIO(saved["consistency_checks.csv"]))
-    passed = checks["passed"].astype(bool)
-    # numbers without physics: hardly a check passes, and each that fails is named on the screen
-    assert passed.sum() < 0.5 * len(checks)
-    assert re.search(rf"\b{passed.sum()} of {len(checks)}\b", first.stdout)
-    assert not [name for name in checks.loc[~passed, "name"] if name not in first.stdout]
+    table = pd.read_csv(io.BytesIO(saved["consistency_checks.csv"]))
+    failed, passed = set(table.name[~table.passed]), set(table.name[table.passed])
+    # two radars that see two places: most points of both are edited
+    assert {"edited north", "edited south"} <= failed
+    # what failed is named on the terminal, what passed is not
+    assert {name for name in failed | passed if name in first.stdout} == failed
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ TABLES = {
         "": flightfile.FlightFile,
         "attitude_prior": flightfile.AttitudeEntry,
         "motion": flightfile.MotionEntry,
-        "motion.disturbed": flightfile.DisturbedEntry,
+        "motion.disturbed": flightfile.UnmodelledEntry,
         "sensors.accelerometer": instruments.TriadEntry,
         "sensors.rates": instruments.RatesEntry,
         "sensors.magnetometer": instruments.MagnetometerEntry,

@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from flightmodel import earth, rotations
+from flightmodel import airdata, earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.trajectory import Trajectory
-from postflight import kinematics, product
+from postflight import product, run_folder
+from postflight.deflections import Deflections
 from postflight.flight import read_flight
 from postflight.reconstruction import reconstruct
 
@@ -65,7 +66,7 @@ def test_euler_angles_turn_ned_into_body() -> None:
         turn[axis] = angle
         q = rotations.multiply(q, rotations.exp(turn))
     assert one @ rotations.dcm_from_q(q) @ one == pytest.approx(np.cos(pitch) * np.cos(yaw))
-    found = kinematics.euler_321(rotations.dcm_from_q(q)[None])
+    found = airdata.euler_321(rotations.dcm_from_q(q)[None])
     assert [x[0] for x in found] == pytest.approx([roll, pitch, yaw])
 
 
@@ -94,18 +95,18 @@ def test_standard_deviations_are_the_scatter_of_drawn_errors() -> None:
         )  # fmt: skip
 
     profile, arm = standard_atmosphere(), np.array([-0.5, 0.0, 0.0])
-    value, sd = kinematics.derived_with_sd(path(np.zeros((n, 9))), profile, arm)
+    value, sd = airdata.derived_with_sd(path(np.zeros((n, 9))), profile, arm)
     air = profile.at(value["altitude"])
-    drawn = kinematics.Inputs(
+    drawn = airdata.Inputs(
         path(error),
         air.wind_sd_mps[:, None] * rng.standard_normal((n, 2)),
         air.density_sd * rng.standard_normal(n),
-        kinematics.temperature_sd(value["altitude"]) * rng.standard_normal(n),
+        airdata.temperature_sd(value["altitude"]) * rng.standard_normal(n),
     )
-    scattered = kinematics.derived(drawn, profile, arm)
+    scattered = airdata.derived(drawn, profile, arm)
     for name, numbers in scattered.items():
         gap = numbers - value[name]
-        if kinematics.is_angle(name):
+        if airdata.is_angle(name):
             gap = np.mod(gap + np.pi, 2.0 * np.pi) - np.pi
         assert np.std(gap) == pytest.approx(sd[name][0], rel=0.08), name
 
@@ -128,6 +129,21 @@ def test_events_carry_three_standard_deviations(short) -> None:
     k = int((table.t_s - row.t_s).abs().argmin())
     assert row.alt_3sd_m == pytest.approx(3.0 * table.alt_sd_m[k], rel=0.05)
     assert "mach_3sd" in events.columns
+
+
+def test_peak_is_one_number_in_events_peaks_and_summary(short) -> None:
+    flight, table = short
+    rows = product.event_table(flight, table)
+    event = rows[rows["event"].str.contains("dynamic pressure")].iloc[0]
+    peak = product.peak_table(flight, table).set_index("peak").loc["dynamic pressure"]
+    summary = run_folder.summary(flight, Deflections(), rows)
+    assert event.t_s == peak.t_s == summary["peak_dynamic_pressure_s"] == flight.peak_s
+    assert event.dynamic_pressure_pa == peak.value == summary["peak_dynamic_pressure_pa"]
+    assert event.dynamic_pressure_3sd_pa == pytest.approx(3.0 * peak.sd, rel=1e-12)
+    assert event.alpha_total_wind_deg == summary["alpha_total_wind_deg"]
+    # between the records, so that a sample instead of the interpolated value would show
+    assert (table.t_s - flight.peak_s).abs().min() > 1e-4
+    assert event.dynamic_pressure_pa >= table.dynamic_pressure_pa.max() * (1.0 - 1e-9)
 
 
 def test_residual_statistics_count_every_point(short) -> None:

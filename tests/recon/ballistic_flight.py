@@ -6,12 +6,11 @@ from functools import cache
 import numpy as np
 
 from flightmodel import earth
-from flightmodel.atmosphere import standard_sounding
+from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, standard_sounding
 from flightmodel.instruments import GnssSpec, RadarSite
 from flightmodel.telemetry import GnssRecord, Motion, RadarRecord, Telemetry
 from recon.ballistic import ballistic_motion
 from recon.ekf import height
-from recon.error_model import DENSITY_LENGTH_M, WIND_LENGTH_M
 from recon.state import States
 from recon.strapdown import propagate
 

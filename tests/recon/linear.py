@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon import _bryson_frazier_kernels, _smoother_kernels, smoother
 from recon import _filter_kernels as kernels
+from recon import smoother
 from recon._measurement_kernels import SLOTS
-from recon.ekf import make_filter, schmidt_update
+from recon.ekf import COMPILED, make_filter, schmidt_update
 from recon.smoother import full_step
 from recon.state import Filtered, Innovations, Observed, Steps, Wander, packed
+from tests.oracles import bryson_frazier
 
 EMPTY = np.full(SLOTS, -1, dtype=np.int64)
 
@@ -77,10 +78,10 @@ def empty_answer(problem):
     )  # fmt: skip
 
 
-def run(problem, engine="compiled"):
+def run(problem, engine=COMPILED):
     """One forward pass: `Filtered` and `Innovations`."""
     out, innovations = empty_answer(problem)
-    one = _Compiled(problem, out, innovations) if engine == "compiled" else _Readable(problem, innovations)
+    one = _Compiled(problem, out, innovations) if engine == COMPILED else _Filterpy(problem, innovations)
     for k in range(len(problem.offset)):
         if k > 0:
             one.step(k - 1, problem.offset[k])
@@ -124,8 +125,8 @@ class _Compiled:
         )
 
 
-class _Readable:
-    """Filterpy's filter as `recon.ekf.Readable` uses it."""
+class _Filterpy:
+    """Filterpy's filter as the filterpy engine uses it."""
 
     def __init__(self, problem, innovations):
         self.problem, self.innovations = problem, innovations
@@ -149,7 +150,7 @@ class _Readable:
         v.gain[row][:, used] = schmidt_update(self.ekf, y, h, noise, problem.considered)
 
 
-def smooth(problem, out, innovations, method, engine="compiled"):
+def smooth(problem, out, innovations, method, engine=COMPILED):
     """Errors (n, N), packed covariances of the dense errors (n, ...) and variances (n, N) of one smoother."""
     n, size = out.x_plus.shape
     triangles, variance = np.empty_like(out.p_plus), np.empty((n, size))
@@ -160,12 +161,12 @@ def smooth(problem, out, innovations, method, engine="compiled"):
         )
     elif method == "bryson-frazier":
         x = np.empty_like(out.x_plus)
-        adjoint = _bryson_frazier_kernels.bryson_frazier if engine == "compiled" else smoother.bryson_frazier
-        adjoint(problem.steps, out, problem.observed, problem.slots, innovations, x, triangles, variance)
+        bryson_frazier.bryson_frazier(
+            problem.steps, out, problem.observed, problem.slots, innovations, x, triangles, variance
+        )
     else:
         x = out.x_plus.copy()
-        backward = _smoother_kernels.rauch_tung_striebel if engine == "compiled" else smoother.rauch_tung_striebel
-        backward(problem.steps, out, problem.moving, x, triangles, variance)
+        smoother.backward(engine)(problem.steps, out, problem.moving, x, triangles, variance)
     return x, triangles, variance
 
 

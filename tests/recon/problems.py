@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from recon.reconstruct import bridge_triads
+from recon.reconstruct import bridge_inertial_sensors
 from recon.settings import Settings
 from recon.setup import build_problem
 from recon.state import unpacked
@@ -11,7 +11,7 @@ from recon.state import unpacked
 def build(telemetry, **options):
     """The filter's problem of the first seconds of a flight."""
     options = {"output_rate_hz": 5.0, "end_s": 112.0} | options
-    return build_problem(telemetry, Settings(**options), bridge_triads(telemetry))
+    return build_problem(telemetry, Settings(**options), bridge_inertial_sensors(telemetry))
 
 
 def off_in_states(a, b, triangles):

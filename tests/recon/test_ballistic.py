@@ -14,6 +14,7 @@ from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.state import States, boxminus, boxplus
 from recon.strapdown import propagate
+from tests.oracles import ballistic as plain_ballistic
 
 from .ballistic_flight import LATITUDE, LONGITUDE, SPEC, across_plane, entry_state, fly, watch, windy_sounding
 
@@ -44,7 +45,7 @@ def test_kernel_equals_readable_twin(carried, first, last):
     """60 s of entry at up to 50 g amplify a position's rounding of 1e-9 m; 2e-6 m measured."""
     motion, index, start = carried
     fast = propagate(motion, index[first], index[last], start)
-    plain = ballistic.propagate_plain(motion, index[first], index[last], start)
+    plain = plain_ballistic.propagate(motion, index[first], index[last], start)
     assert np.abs(fast.state.position_ecef_m - plain.state.position_ecef_m).max() < 1e-9 * 6.4e6
     assert np.abs(fast.state.velocity_ecef_mps - plain.state.velocity_ecef_mps).max() < 1e-9 * 1900.0
     assert np.array_equal(fast.state.q_ecef_body, start.q_ecef_body)
@@ -118,7 +119,7 @@ def test_a_parachute_that_sinks_straight_down_has_side_forces_with_steady_axes()
     def push(drift):
         velocity = (down + drift) @ ned
         sides, none = (
-            ballistic.acceleration(motion, start.position_ecef_m, velocity, d) for d in (drivers, 0.0 * drivers)
+            plain_ballistic.acceleration(motion, start.position_ecef_m, velocity, d) for d in (drivers, 0.0 * drivers)
         )
         return sides - none
 
@@ -137,7 +138,7 @@ def test_a_drag_that_stops_the_vehicle_within_a_step_is_followed(drag):
     start = entry_state(9e3, (300.0, 0.0, 0.0), errors=6)
 
     def slope(_t, y):
-        return np.r_[y[3:], ballistic.acceleration(motion, y[:3], y[3:], np.zeros(6))]
+        return np.r_[y[3:], plain_ballistic.acceleration(motion, y[:3], y[3:], np.zeros(6))]
 
     def end(velocity):
         y = np.r_[start.position_ecef_m, velocity]
@@ -147,7 +148,7 @@ def test_a_drag_that_stops_the_vehicle_within_a_step_is_followed(drag):
     assert np.linalg.norm(truth[3:]) < 0.5 * 300.0
     assert np.abs(step.state.position_ecef_m - truth[:3]).max() < 1e-3
     assert np.abs(step.state.velocity_ecef_mps - truth[3:]).max() < 1e-3 * 300.0
-    plain = ballistic.propagate_plain(motion, index[0], index[1], start)
+    plain = plain_ballistic.propagate(motion, index[0], index[1], start)
     assert np.abs(step.state.velocity_ecef_mps - plain.state.velocity_ecef_mps).max() < 1e-9 * 300.0
     # differences of 1e-4 in a driver, of a force of 1e6 m/s^2 here
     assert np.abs(step.transition - plain.transition).max() < 1e-6 * np.abs(plain.transition).max()

@@ -2,7 +2,7 @@
 
 The correction is exact to fourth order where signals are straight in time. Samples of a sinusoid are not, and the
 error of joining them by straight lines is just as large as what is corrected for;
-`recon.motion.unbent` takes it away.
+`recon.motion.with_exact_integrals` takes it away.
 """
 
 from functools import cache
@@ -14,9 +14,10 @@ from scipy.integrate import solve_ivp
 
 from flightmodel import earth, rotations
 from recon import strapdown
-from recon.motion import strapdown_motion, unbent
+from recon.motion import strapdown_motion, with_exact_integrals
 from recon.state import States
-from recon.strapdown import propagate, propagate_plain
+from recon.strapdown import propagate
+from tests.oracles import strapdown as plain_strapdown
 
 SPAN_S = 2.0
 ANGLE, OMEGA, PUSH = 0.05, 2.0 * np.pi * 3.0, 30.0
@@ -83,14 +84,14 @@ def mechanised(motion, count, corrected=True, moved=True):
     if moved and motion is not None:
         longer = np.arange(-1, count + 2) * SPAN_S / count  # the motion goes on before and after
         _, rate, force = motion(longer)
-        rate, force = unbent(longer, rate)[1:-1], unbent(longer, force)[1:-1]
+        rate, force = with_exact_integrals(longer, rate)[1:-1], with_exact_integrals(longer, force)[1:-1]
     zero = np.zeros((count + 1, 3))
     grid = strapdown_motion(t, force, rate, zero, zero, np.eye(3), np.eye(3))
     start = States(POSITION, VELOCITY, q[0], np.zeros(18))
     if corrected:
         return propagate(grid, 0, count, start).state
     with mock.patch.object(strapdown.np, "cross", lambda _a, b: np.zeros_like(b)):
-        return propagate_plain(grid, 0, count, start).state
+        return plain_strapdown.propagate(grid, 0, count, start).state
 
 
 def errors(motion, known, what, **options):
@@ -147,8 +148,8 @@ def test_moved_samples_keep_the_integral_of_noise():
     x = rng.standard_normal((400, 3))
     # sums agree but for the ends; uneven steps stay
     inner = slice(50, 350)
-    assert np.abs(unbent(t, x)[inner].sum(axis=0) - x[inner].sum(axis=0)).max() < 1.0
+    assert np.abs(with_exact_integrals(t, x)[inner].sum(axis=0) - x[inner].sum(axis=0)).max() < 1.0
     t[200:] += 0.004
     even = np.r_[1:199, 201:399]
-    changed = np.flatnonzero((unbent(t, x) != x).any(axis=1))
+    changed = np.flatnonzero((with_exact_integrals(t, x) != x).any(axis=1))
     assert np.array_equal(changed, even)

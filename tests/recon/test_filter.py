@@ -8,7 +8,7 @@ import pytest
 from flightmodel import rotations
 from flightmodel.telemetry import RadarRecord
 from recon import _measurement_kernels, ekf
-from recon.ekf import forward
+from recon.ekf import FILTERPY, forward
 from recon.measurements import NodeMotion, predict, wrapped
 from recon.smoother import full_step, smooth
 from recon.state import packed, unpacked
@@ -104,7 +104,7 @@ def test_engines_have_the_same_numbers(passes, name, along_reference):
     """
     problem, first, reference, along = passes(name)
     run = along if along_reference else first
-    plain = forward(problem, reference if along_reference else None, "readable")
+    plain = forward(problem, reference if along_reference else None, FILTERPY)
     a, b = run.filtered, plain.filtered
     assert np.array_equal(run.innovations.accepted, plain.innovations.accepted)
     assert not run.innovations.accepted.all()
@@ -162,7 +162,7 @@ def test_linear_pass_equals_a_textbook_kalman_filter(passes, name):
 
 
 def textbook_measurement(problem, reference, row, slots):
-    """Prediction, partials by all errors, noise and used components of one measurement, from the readable twins."""
+    """Prediction, partials by all errors, noise and used components of one measurement, from the numpy twins."""
     k, source = problem.node[row], problem.observed.source[row]
     at, slot = reference[int(k)], slots[source]
     rate, acceleration = np.empty(3), np.empty(3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flightmodel.checks import GateError
+from flightmodel.checks import ConfigError
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 
@@ -28,5 +28,6 @@ def test_no_other_rate_where_none_is_asked_for(mini_sense, rate):
 
 
 def test_pulse_rate_is_checked():
-    with pytest.raises(GateError, match="pulse_rate_hz"):
+    with pytest.raises(ConfigError) as refusal:
         Settings(pulse_rate_hz=-1.0)
+    assert refusal.value.codes == ("setting-range",)

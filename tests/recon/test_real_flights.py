@@ -67,7 +67,7 @@ def red(flight):
 
 def foretold(flight, *sources):
     """Rms normalised residual of withheld measurements by source and component."""
-    table = summary(flight.withheld)
+    table = summary(flight.held_out)
     table = table[table.source.isin(sources)] if sources else table
     return dict(zip(table.source + " " + table.component, table.rms_normalised, strict=True))
 
@@ -126,13 +126,13 @@ class TestPrometheus:
         assert all(0.4 < r < 1.4 for r in ratio.values()), ratio
 
     def test_three_fixes_of_four_are_foretold(self, fly):
-        ratio = foretold(fly("rocketpy_prometheus", withhold_every=2), "gps")
+        ratio = foretold(fly("rocketpy_prometheus", hold_out_every=2), "gps")
         assert all(0.7 < r < 1.4 for r in ratio.values()), ratio
 
     def test_ten_seconds_under_the_drogue_and_before_apogee_are_foretold(self, fly):
-        r = fly("rocketpy_prometheus", withhold_s=((18.0, 28.0), (90.0, 100.0)))
-        inside = r.withheld[
-            (r.withheld.source == "gps") & (r.withheld.time_s.between(18, 28) | r.withheld.time_s.between(90, 100))
+        r = fly("rocketpy_prometheus", hold_out_spans_s=((18.0, 28.0), (90.0, 100.0)))
+        inside = r.held_out[
+            (r.held_out.source == "gps") & (r.held_out.time_s.between(18, 28) | r.held_out.time_s.between(90, 100))
         ]
         z = (inside.residual / inside.predicted_sd).groupby(inside.component).apply(lambda s: np.sqrt(np.mean(s**2)))
         # two holes of ten seconds: each is one error that lasts, so a component has about four independent ones
@@ -170,15 +170,15 @@ class TestBlackBrant:
 
     def test_points_between_are_foretold(self, fly):
         r = fly("radar_36353")
-        coast = r.withheld[r.withheld.time_s.between(150.0, 500.0)]
+        coast = r.held_out[r.held_out.time_s.between(150.0, 500.0)]
         z2 = ((coast.residual / coast.predicted_sd) ** 2).groupby(coast.component).mean()
         assert (np.sqrt(z2) > 0.7).all(), z2
         assert (np.sqrt(z2) < 1.4).all(), z2
 
     def test_forty_seconds_of_coast_and_eight_of_entry_are_foretold(self, fly):
-        r = fly("radar_36353", withhold_s=((300.0, 340.0), (500.0, 508.0)))
+        r = fly("radar_36353", hold_out_spans_s=((300.0, 340.0), (500.0, 508.0)))
         for start, end in ((300.0, 340.0), (500.0, 508.0)):
-            hole = r.withheld[r.withheld.time_s.between(start, end)]
+            hole = r.held_out[r.held_out.time_s.between(start, end)]
             z = (hole.residual / hole.predicted_sd).groupby(hole.component).apply(lambda s: np.sqrt(np.mean(s**2)))
             assert (z < 2.2).all(), z  # one hole is about two independent errors: 99.9 % of chi-square of two, 13.8 / 2
 
@@ -226,7 +226,7 @@ class TestPsas:
         assert h.max() - 1370.2 == pytest.approx(5103.0, abs=30.0)  # dead reckoning alone: 5626
 
     def test_a_second_and_a_half_of_fixes_are_foretold(self, fly):
-        r = fly("psas_l12", withhold_s=((31.0, 32.5),))
+        r = fly("psas_l12", hold_out_spans_s=((31.0, 32.5),))
         ratio = foretold(r, "venus8")
         # 8 m that wander within 10 s are one error per component in these two seconds: 99.9 % of chi-square of one
         assert all(value < 3.3 for value in ratio.values()), ratio
@@ -244,7 +244,7 @@ class TestPiccard:
         assert red(fly("euroc21_piccard")) <= {"NIS baro", "filter-smoother position"}
 
     def test_every_other_fix_is_foretold_by_the_rest(self, fly):
-        ratio = foretold(fly("euroc21_piccard", withhold_every=2), "gps")
+        ratio = foretold(fly("euroc21_piccard", hold_out_every=2), "gps")
         # nine fixes whose errors last: between one and nine independent ones
         assert all(0.2 < value < 1.6 for value in ratio.values()), ratio
 

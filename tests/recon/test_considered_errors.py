@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from recon.ekf import forward
-from recon.smoother import SMOOTHERS, smooth
+from recon.ekf import ENGINES, forward
+from recon.smoother import smooth
 from recon.state import unpacked
 
 from . import linear
@@ -47,7 +47,7 @@ def free(problem):
 def test_claims_are_exact(seed):
     """Filter, both smoothers that may follow it. Rounding as in the smoothers' own test; measured 3e-10 at most."""
     problem = problem_of(seed)
-    for engine in ("compiled", "readable"):
+    for engine in ENGINES:
         out, innovations = linear.run(problem, engine)
         filtered = exact(seed, "two-filter")[0]
         assert off(unpacked(out.p_plus), filtered) < 1e-10
@@ -121,8 +121,8 @@ def test_considering_on_a_flight(mini_sense, consider):
     reference = smooth(whole, first, with_covariance=False).states(first.charts)
     run, full = forward(some, reference), forward(whole, reference)
     smoothed, best = smooth(some, run), smooth(whole, full)
-    for method in SMOOTHERS:
-        assert np.array_equal(smooth(some, run, True, method).x, smoothed.x)
+    for engine in ENGINES:
+        assert np.array_equal(smooth(some, run, True, engine).x, smoothed.x)
     dense = [np.sqrt(np.diagonal(unpacked(t), axis1=1, axis2=2)) for t in (run.filtered.p_plus, smoothed.triangles)]
     assert (dense[1] <= dense[0] * (1.0 + 1e-7)).all()
     estimated = np.r_[np.arange(9), 9 + np.flatnonzero(~some.model.wander.considered)]

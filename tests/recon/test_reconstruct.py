@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from flightmodel.checks import GateError
+from flightmodel.checks import ConfigError, GateError
 from flightmodel.telemetry import RadarRecord, TriadRecord
 from flightmodel.trajectory import difference
+from recon.ekf import ENGINES
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 
+from .ballistic_flight import fly, watch
 from .conftest import gauss_markov
 
 SEEDS = 8
@@ -134,16 +136,51 @@ def test_biases_that_wander_are_followed(mini_sense, mini_truth):
     assert 0.5 * low < np.mean(np.square(biases)) < high  # a walk is wider than what it stands for
 
 
-def test_engines_and_smoothers_reconstruct_the_same_flight(mini_sense):
+def same(one, other):
+    """Both reconstructions agree: states to 1e-9 of themselves, everything to 1e-6 sd (measured 1e-8)."""
+    for a, b in ((one.smoothed, other.smoothed), (one.filtered, other.filtered)):
+        assert np.allclose(a.position_ecef_m, b.position_ecef_m, rtol=1e-9, atol=0.0)
+        assert np.allclose(a.velocity_ecef_mps, b.velocity_ecef_mps, rtol=1e-9, atol=1e-9 * 1e3)
+        assert np.abs(a.q_ecef_body - b.q_ecef_body).max() < 1e-9
+        assert np.abs(difference(a, b) / a.sd()).max() < 1e-6
+        assert np.allclose(a.sd(), b.sd(), rtol=1e-6)
+    assert np.allclose(one.sensor_errors.estimate, other.sensor_errors.estimate, atol=1e-6 * one.sensor_errors.sd)
+    assert np.allclose(one.sensor_errors.sd, other.sensor_errors.sd, rtol=1e-6)
+    for column in ("accepted", "used", "source", "component"):
+        assert (one.residuals[column] == other.residuals[column]).all()
+    assert np.allclose(one.residuals.residual / one.residuals.predicted_sd,
+                       other.residuals.residual / one.residuals.predicted_sd, atol=1e-6)  # fmt: skip
+    for v, w in zip(one.consistency_checks, other.consistency_checks, strict=True):
+        assert (v.code, v.source, v.component, v.passed) == (w.code, w.source, w.component, w.passed)
+        assert v.value == pytest.approx(w.value, rel=1e-5, abs=1e-6)
+
+
+def test_engines_reconstruct_the_same_flight_from_every_kind_of_source(mini_everything):
+    short = Settings(output_rate_hz=2.0, end_s=107.0, attitude_sensors=True, hold_out_every=7)
+    telemetry = mini_everything(2)
+    kinds = {*telemetry.radars, *telemetry.gnss, *telemetry.barometers, "magnetometer", "sun1"}
+    one, other = (reconstruct(telemetry, replace(short, engine=engine)) for engine in ENGINES)
+    assert kinds <= set(one.residuals.source)
+    same(one, other)
+    assert np.allclose(one.held_out.residual / one.held_out.predicted_sd,
+                       other.held_out.residual / one.held_out.predicted_sd, atol=1e-6)  # fmt: skip
+
+
+def test_engines_reconstruct_the_same_ballistic_flight():
+    t, states = fly(5, end_s=30.0)
+    fall = watch(t, states, 5)
+    same(*(reconstruct(fall, Settings(output_rate_hz=2.0, engine=engine)) for engine in ENGINES))
+
+
+def test_settings_of_the_flight_file_are_used_where_none_are_given(mini_sense):
     telemetry, _ = mini_sense(950)
-    short = replace(FAST, end_s=110.0)
-    one = reconstruct(telemetry, short)
-    for options in ({"engine": "readable"}, {"smoother": "bryson-frazier"}):
-        other = reconstruct(telemetry, replace(short, **options))
-        off = np.abs(difference(one.smoothed, other.smoothed)) / one.smoothed.sd()
-        assert off.max() < 1e-6
-        assert np.allclose(one.smoothed.sd(), other.smoothed.sd(), rtol=1e-6)
-        assert np.allclose(one.sensor_errors.estimate, other.sensor_errors.estimate, atol=1e-6 * one.sensor_errors.sd)
+    chosen = {"output_rate_hz": 2.0, "end_s": 110.0, "passes": 1, "without": ["west"]}
+    found = reconstruct(replace(telemetry, reconstruction=chosen))
+    assert found.settings == Settings.from_mapping(chosen)
+    assert found.smoothed.time_s[-1] <= 110.0
+    with pytest.raises(ConfigError) as refusal:
+        reconstruct(replace(telemetry, reconstruction={"output_rate": 2.0, "passes": 99}))
+    assert refusal.value.codes == ("setting-unknown", "setting-range")
 
 
 def test_a_single_filter_about_its_own_estimate_comes_near(mini_sense, mini_truth):
@@ -157,7 +194,7 @@ def test_a_single_filter_about_its_own_estimate_comes_near(mini_sense, mini_trut
 
 
 def test_rates_of_the_trajectory_are_those_measured(mini_sense):
-    """Samples are moved for the mechanisation alone (`recon.motion.unbent`); what is told of rates is not."""
+    """Samples are moved for the mechanisation alone (`recon.motion.with_exact_integrals`); corrected rates are not."""
     telemetry, _ = mini_sense(970)
     record = telemetry.rates
     jagged = record.measured_sensor + 0.01 * (-1.0) ** np.arange(len(record.time_s))[:, None]
@@ -225,7 +262,10 @@ def test_track_error_is_found_and_edited(mini_sense, mini_truth):
     edited = r.residuals[~r.residuals.accepted & (r.residuals.component == "range")]
     assert len(edited) >= 30
     assert set(np.round(np.arange(120.0, 123.0, 0.1), 1)) <= set(edited.time_s.round(1))
-    assert any(f.source == "north" and "30 track points" in f.what for f in r.findings)
+    (stretch,) = (
+        f for f in r.findings if (f.source, f.code) == ("north", "points-edited") and f.end_s - f.start_s > 2.5
+    )
+    assert (stretch.start_s, stretch.end_s) == (pytest.approx(120.0, abs=0.05), pytest.approx(122.9, abs=0.05))
     assert nees(r.smoothed, mini_truth).max() < chi2.ppf(0.999999, 9)
 
 
@@ -276,8 +316,9 @@ def test_wrong_mount_turns_a_verdict_red(mini_sense, degrees, consistency_check)
 
 def test_no_common_span_is_refused_in_words(mini_sense):
     telemetry, _ = mini_sense(900)
-    with pytest.raises(GateError, match="share only"):
+    with pytest.raises(GateError) as refusal:
         reconstruct(telemetry, Settings(start_s=158.0))
+    assert refusal.value.codes == ("span-too-short",)
 
 
 def test_progress_rises_to_one(mini_sense):

@@ -11,7 +11,7 @@ from recon.imu_screening import bridge
 from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
 from recon.state import States
-from recon.time_bias import ClockJump, lag_between, mended
+from recon.time_bias import ClockJump, lag_between, with_corrected_tags
 
 FINE_S, STEP_S, END_S, SPIN = 0.002, 0.005, 60.0, 0.6
 FORCE = TriadSpec("accelerometer", np.zeros(3), np.eye(3), 0.05, 0.1, 0.003, 0.002, time_bias_sd_s=0.001)
@@ -19,7 +19,7 @@ RATE = TriadSpec("rates", np.zeros(3), np.eye(3), 1e-3, 1e-3, 0.003, 0.002, time
 
 
 def swinging(late_s=0.0, damping=0.0, seed=0, kicks=0.0):
-    """Both triads of a vehicle that spins, swings in either plane, faster as pressure grows, and is kicked by gusts.
+    """Both sensors of a vehicle that spins, swings in either plane, faster as pressure grows, and is kicked by gusts.
 
     In a plane ``a'' = -w^2 a - damping a' + gusts``, which pushes it aside by ``-9 w^2 a`` beside a lever arm's 0.7
     ``a''``. The force's tags are ``late_s`` late.
@@ -82,19 +82,21 @@ def test_tags_are_set_back_behind_a_jump_or_forward_before_it():
     t = force.time_s
     late = replace(force, time_s=t + 0.02 * (t > 30.0))
     early = replace(force, time_s=t - 0.02 * (t <= 30.0))
-    np.testing.assert_allclose(mended(late, 0, (ClockJump((0,), 30.01, 0.02),)).time_s, t, atol=1e-12)
-    np.testing.assert_allclose(mended(early, 0, (ClockJump((0, 1), 29.99, 0.02, False),)).time_s, t, atol=1e-12)
-    assert np.array_equal(mended(late, 1, (ClockJump((0,), 30.01, 0.02),)).time_s, late.time_s)
+    np.testing.assert_allclose(with_corrected_tags(late, 0, (ClockJump((0,), 30.01, 0.02),)).time_s, t, atol=1e-12)
+    np.testing.assert_allclose(
+        with_corrected_tags(early, 0, (ClockJump((0, 1), 29.99, 0.02, False),)).time_s, t, atol=1e-12
+    )
+    assert np.array_equal(with_corrected_tags(late, 1, (ClockJump((0,), 30.01, 0.02),)).time_s, late.time_s)
 
 
-@pytest.mark.parametrize(("triads", "early"), [((0,), False), ((0, 1), False), ((0, 1), True)])
-def test_trackers_tell_a_jump_from_lost_samples(mini_sense, triads, early):
+@pytest.mark.parametrize(("sensors", "early"), [((0,), False), ((0, 1), False), ((0, 1), True)])
+def test_trackers_tell_a_jump_from_lost_samples(mini_sense, sensors, early):
     """8 g are felt when they come: 40 ms late from mid-pulse on, or early until then, is seen from the ground."""
     telemetry, _ = mini_sense(3, clock_sd_s=1e-3)
     clean = reconstruct_once(telemetry, Settings(output_rate_hz=5.0))
     records = [telemetry.accelerometer, telemetry.rates]
     lost, jumped = list(records), list(records)
-    for k in triads:
+    for k in sensors:
         r = records[k]
         gone = (r.time_s > 130.0) & (r.time_s < 130.04)
         lost[k] = replace(r, time_s=r.time_s[~gone], measured_sensor=r.measured_sensor[~gone])
@@ -103,28 +105,29 @@ def test_trackers_tell_a_jump_from_lost_samples(mini_sense, triads, early):
         reconstruct_once(replace(telemetry, accelerometer=a, rates=w), Settings(output_rate_hz=5.0))
         for a, w in (lost, jumped)
     ]
-    assert clean.learnt.jumps == ()
-    assert found[0].learnt.jumps == ()
-    (jump,) = found[1].learnt.jumps
-    assert jump.triads == triads
+    assert clean.adaptation.jumps == ()
+    assert found[0].adaptation.jumps == ()
+    (jump,) = found[1].adaptation.jumps
+    assert jump.sensors == sensors
     assert jump.after is not early
     assert jump.by_s == pytest.approx(0.04, abs=1e-3)
-    told = {f.source for f in found[1].findings if "jump" in f.what}
-    assert told == {records[k].spec.name for k in triads}
+    named = {f.source for f in found[1].findings if f.code == "clock-jump"}
+    assert named == {records[k].spec.name for k in sensors}
 
 
-def test_a_clock_beyond_its_sheet_is_told_by_the_swinging_and_followed(monkeypatch, mini_sense):
-    """What the swinging says goes into the second reconstruction; the verdict stays that of the first."""
-    from recon import reconstruct, time_bias
+def test_a_clock_beyond_its_data_sheet_is_estimated_from_the_oscillation(monkeypatch, mini_sense):
+    """The lag goes into the second reconstruction; the check stays that of the first."""
+    from recon import time_bias
+    from recon.reconstruct import reconstruct
 
     telemetry, _ = mini_sense(4, clock_sd_s=1e-3)
     rates = telemetry.rates
     early = replace(telemetry, rates=replace(rates, time_s=rates.time_s - 0.02))
-    told = time_bias.Lag(0.02, 0.002)
-    monkeypatch.setattr(reconstruct.triad_clocks, "lag_between", lambda *_: told)
+    lag = time_bias.Lag(0.02, 0.002)
+    monkeypatch.setattr(time_bias, "lag_between", lambda *_: lag)
     found = reconstruct(early, Settings(output_rate_hz=5.0))
-    (consistency_check,) = (v for v in found.consistency_checks if v.name.startswith("clocks of"))
-    assert not consistency_check.passed
+    (check,) = (v for v in found.consistency_checks if v.code == "clock-lag")
+    assert not check.passed
     table = found.sensor_errors.set_index("name")
     between = table.estimate["accelerometer time bias"] - table.estimate["rates time bias"]
     assert between == pytest.approx(0.02, abs=0.004)

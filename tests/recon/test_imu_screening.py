@@ -8,7 +8,7 @@ import pytest
 from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
-from recon.imu_screening import bridge, stuck_samples
+from recon.imu_screening import bridge, frozen_samples
 
 SPEC = TriadSpec("rates", np.zeros(3), np.eye(3), 0.01, 0.01, 0.003, 0.002)
 
@@ -39,13 +39,13 @@ def readings(resolution, noise_sd, seed=0, n=5000):
 def test_a_reading_that_stops_is_missing(length):
     x = readings(0.02, 0.02)
     x[500 : 500 + length] = x[500]
-    stuck = np.flatnonzero(stuck_samples(x, 0.02))
+    stuck = np.flatnonzero(frozen_samples(x, 0.02))
     assert stuck[0] in (499, 500)
     assert len(stuck) == pytest.approx(length, abs=3)
 
 
 def test_nothing_stops_in_a_thousand_noisy_records():
-    assert not any(stuck_samples(readings(0.02, 0.02, seed), 0.02).any() for seed in range(1000))
+    assert not any(frozen_samples(readings(0.02, 0.02, seed), 0.02).any() for seed in range(1000))
 
 
 @pytest.mark.parametrize("noise_sd", [0.0, 0.01])
@@ -53,20 +53,20 @@ def test_a_sensor_coarser_than_its_noise_may_rest(noise_sd):
     """Coast: a thousand samples within one step are no fault."""
     x = readings(0.2, noise_sd)
     assert (np.diff(x) == 0.0).mean() > 0.9
-    assert not stuck_samples(x, noise_sd).any()
+    assert not frozen_samples(x, noise_sd).any()
 
 
 def test_rest_before_the_flight_is_no_fault_but_a_whole_record_is():
     x = readings(0.02, 0.02)
     x[:800] = x[0]
-    assert not stuck_samples(x, 0.02).any()
-    assert stuck_samples(np.full(100, 0.3), 0.02).all()
+    assert not frozen_samples(x, 0.02).any()
+    assert frozen_samples(np.full(100, 0.3), 0.02).all()
 
 
 def test_clipped_peaks_are_missing():
     t = np.arange(5000) * 0.004
     x = np.clip(np.round(np.sin(t) / 0.01 + np.random.default_rng(0).normal(size=5000)) * 0.01, -0.9, 0.9)
-    at_stop = stuck_samples(x, 0.01)
+    at_stop = frozen_samples(x, 0.01)
     assert at_stop[np.abs(np.sin(t)) > 0.95].all()
     assert not at_stop[np.abs(np.sin(t)) < 0.85].any()
 
@@ -84,7 +84,7 @@ def test_an_axis_frozen_alone_leaves_the_others():
     assert np.abs(bridged.measured_sensor[:, 1] - good[:, 1])[2500:3000].sum() * 0.004 < 4.0 * missed[1]
     assert missed[1] > 10.0 * missed[0]
     assert [f.source for f in bridged.findings] == ["rates"]
-    assert "usable samples of y" in str(bridged.findings[0])
+    assert [f.code for f in bridged.findings] == ["gap-bridged"]
 
 
 def test_an_axis_that_never_moves_is_refused_and_one_that_stops_ends_the_record():
@@ -94,14 +94,17 @@ def test_an_axis_that_never_moves_is_refused_and_one_that_stops_ends_the_record(
     x[4000:, 2] = x[4000, 2]
     ended = bridge(TriadRecord(SPEC, t, x))
     assert ended.time_s[-1] == pytest.approx(t[3999])
-    assert "to the end of the record" in str(ended.findings[-1])
+    assert ended.findings[-1].code == "frozen-data"
+    assert (ended.findings[-1].start_s, ended.findings[-1].end_s) == (pytest.approx(t[3999]), pytest.approx(t[-1]))
     x[:, 2] = 0.02
-    with pytest.raises(GateError, match="axis z: all 5000 samples hold one value"):
+    with pytest.raises(GateError) as refusal:
         bridge(TriadRecord(SPEC, t, x))
+    assert refusal.value.codes == ("sensor-axis-unusable",)
+    assert "axis z: all 5000 samples" in str(refusal.value)
 
 
-def test_peaks_clipped_at_one_stop_are_missed_alike():
-    """Five bridges that miss to one side miss five times as much together: each has five times its variance."""
+def test_peaks_clipped_at_one_stop_err_alike():
+    """Five bridges that err to one side err five times as much together: each has five times its variance."""
     t = np.arange(0.0, 12.0, 0.01)
     rng = np.random.default_rng(2)
     x = np.column_stack([5.0 * np.sin(np.pi * t + k) for k in range(3)]) + 0.01 * rng.standard_normal((len(t), 3))
@@ -112,6 +115,12 @@ def test_peaks_clipped_at_one_stop_are_missed_alike():
     alone = bridge(TriadRecord(spec, t, lone))
     spans = [(f.start_s, f.end_s) for f in bridged.findings]
     assert len(spans) == 5
-    missed = [float(b.findings[0].what.split("uncertain by ")[1].split()[0]) for b in (bridged, alone)]
-    assert alone.findings[0].start_s == bridged.findings[0].start_s
-    assert missed[0] == pytest.approx(np.sqrt(5.0) * missed[1], rel=0.02)
+    first = bridged.findings[0]
+    assert alone.findings[0].start_s == first.start_s
+    length = first.end_s - first.start_s
+    # density of the bridge alone, without the samples' noise
+    integral_sd = [
+        np.sqrt(b.density[np.searchsorted(b.time_s, first.start_s) + 1, 1] * length - spec.noise_sd**2 * length**2)
+        for b in (bridged, alone)
+    ]
+    assert integral_sd[0] == pytest.approx(np.sqrt(5.0) * integral_sd[1], rel=0.02)

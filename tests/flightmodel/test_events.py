@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flightmodel.events import descent_moments, first_fall, has_peak, peak, values_at
+from flightmodel.events import descent_events, find_peak, first_fall, has_peak, values_at
 
 T = np.arange(0.0, 40.0, 0.5)
 
@@ -29,7 +29,7 @@ def test_a_sample_on_the_level_and_a_level_never_met():
 
 
 def test_peak_of_a_parabola_is_exact_and_ends_are_none():
-    at, value = peak(T, 7.0 - 0.3 * (T - 13.21) ** 2)
+    at, value = find_peak(T, 7.0 - 0.3 * (T - 13.21) ** 2)
     assert (at, value) == pytest.approx((13.21, 7.0))
     assert has_peak(np.array([1.0, 3.0, 2.0]))
     assert not has_peak(np.array([1.0, 2.0, 3.0]))
@@ -48,10 +48,10 @@ def test_a_descent_from_a_parabola():
     altitude = top - 0.5 * g * (t - 50.0) ** 2
     # a Mach number that falls with height: 7 above 70 km, 0 at the ground
     mach = np.minimum(altitude / 1e4, 7.0)
-    found = dict(descent_moments(t, altitude, mach))
+    found = dict(descent_events(t, altitude, mach))
     for name, level in (("80 km", 80e3), ("40 km", 40e3), ("Mach 3.5", 35e3), ("Mach 1", 10e3)):
         assert found[name] == pytest.approx(50.0 + np.sqrt(2 * (top - level) / g), abs=1e-7)
     assert found["apogee"] == pytest.approx(50.0, abs=1e-9)
     # begun on the way down and ended above 40 km: what lies outside is absent
     part = (altitude > 50e3) & (altitude < 70e3) & (t > 50.0)
-    assert dict(descent_moments(t[part], altitude[part], mach[part] + 2.0)) == {}
+    assert dict(descent_events(t[part], altitude[part], mach[part] + 2.0)) == {}

@@ -1,0 +1,63 @@
+"""How do errors hang together along time or altitude, and how is an ensemble of histories summed up?
+
+Correlated errors are one constant and one first-order Gauss-Markov process of the same unit variance,
+
+``rho(x, y) = c + (1 - c) exp(-|x - y| / L)``,
+
+with the constant part ``c`` and the correlation length (or time) ``L``. Ensembles are summed up by the percentiles that
+correspond to two standard deviations of a normal distribution and by the median.
+
+References
+----------
+A. Gelb (ed.), Applied Optimal Estimation, MIT Press, 1974, section 3.8 (exponentially correlated processes).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flightmodel.checks import FloatArray
+
+KNOTS_A_LENGTH = 3  # of a Gauss-Markov history, in one correlation length
+BAND_PERCENTILES = (2.3, 50.0, 97.7)
+BAND_COLUMNS = tuple(f"p{p:g}" for p in BAND_PERCENTILES)
+
+
+def correlation(at: FloatArray, length: float, constant_part: float = 0.0) -> FloatArray:
+    """Correlation ``(n, n)`` of an error at places ``(n,)``; ``length`` in their unit."""
+    apart = np.abs(at[:, None] - at[None, :])
+    return constant_part + (1.0 - constant_part) * np.exp(-apart / length)
+
+
+def correlation_root(at: FloatArray, length: float, constant_part: float = 0.0) -> FloatArray:
+    """Errors ``(n, k)`` of unit variance at places ``(n,)`` per unit normal: ``root @ root.T`` is their correlation.
+
+    The Gauss-Markov part is drawn at knots, a third of ``length`` apart or closer, with straight lines between; ``at``
+    may be in any order. A constant part, where there is one, is the first column.
+    """
+    root = _gauss_markov_root(at, length)
+    if constant_part == 0.0:
+        return root
+    constant = np.full(len(at), np.sqrt(constant_part))
+    return np.column_stack([constant, np.sqrt(1.0 - constant_part) * root])
+
+
+def _gauss_markov_root(at: FloatArray, length: float) -> FloatArray:
+    if len(at) == 0 or np.ptp(at) == 0.0:
+        return np.ones((len(at), 1))
+    low, high = float(at.min()), float(at.max())
+    knots = np.linspace(low, high, max(2, int(np.ceil(KNOTS_A_LENGTH * (high - low) / length)) + 1))
+    position = np.clip((at - low) / max(knots[1] - knots[0], 1e-12), 0.0, len(knots) - 1.0)
+    k = np.minimum(position.astype(int), len(knots) - 2)
+    fraction = position - k
+    between = np.zeros((len(at), len(knots)))
+    row = np.arange(len(at))
+    between[row, k], between[row, k + 1] = 1.0 - fraction, fraction
+    out = between @ np.linalg.cholesky(correlation(knots, length))
+    # straight lines between knots are a little too small
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+
+def percentile_band(values: FloatArray, axis: int = 0) -> FloatArray:
+    """Lower limit, median and upper limit of an ensemble along ``axis``, first in the result (`BAND_PERCENTILES`)."""
+    return np.asarray(np.percentile(values, BAND_PERCENTILES, axis=axis))

@@ -1,0 +1,67 @@
+"""Sizes of what the methods lean on: responses in axes that do not roll, and the share of a joint that swings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimators.evidence import ATTITUDE, WIND, Evidence, flow_inputs, history_of_evidence
+
+from .conftest import pulse_of
+
+
+def rolling(rate_radps, n=60):
+    pulse, _ = pulse_of(np.random.default_rng(2), n, theta_yz=np.full((n, 2), 0.02))
+    rate = np.zeros((n, 3))
+    rate[:, 0] = rate_radps(pulse.time_s - pulse.time_s[0])
+    return replace(pulse, rate_body_radps=rate), pulse.time_s - pulse.time_s[0]
+
+
+def test_flow_s_error_turns_against_a_roll_that_speeds_up():
+    # rate a t: the roll is a t^2 / 2 to rounding where the rate is integrated by trapezoids; by rectangles 20 ms of
+    # the last rate are missing or too many, 0.08 rad here
+    a = 1.1
+    pulse, t = rolling(lambda t: a * t)
+    everywhere = np.ones(len(t), dtype=bool)
+    inputs = flow_inputs(pulse, everywhere)
+    for name in (WIND, ATTITUDE):
+        # the first normal is along y of the axes that do not roll: in the body it turns backwards
+        along_y = inputs[name][:, :, 0]
+        seen = np.unwrap(np.arctan2(along_y[:, 1], along_y[:, 0]))
+        moving = np.linalg.norm(along_y, axis=1) > 1e-6 * np.linalg.norm(along_y, axis=1).max()
+        assert moving.sum() > 10
+        np.testing.assert_allclose(seen[moving], -0.5 * a * t[moving] ** 2, atol=1e-9)
+
+
+def test_flow_s_error_keeps_its_size_while_it_rolls():
+    # the three parts together are the stated covariance, at any roll
+    pulse, t = rolling(lambda t: 3.0 + 0.0 * t)
+    everywhere = np.ones(len(t), dtype=bool)
+    parts = flow_inputs(pulse, everywhere)
+    total = sum(j @ j.transpose(0, 2, 1) for j in parts.values())
+    wind = parts[WIND] @ parts[WIND].transpose(0, 2, 1)
+    np.testing.assert_allclose(wind, pulse.wind_flow_sd_rad[:, None, None] ** 2 * np.eye(2), rtol=0.15, atol=1e-12)
+    # knots of a history that forgets keep its variance to a few percent between them
+    trace = np.trace(total, axis1=1, axis2=2) / np.trace(pulse.flow_cov, axis1=1, axis2=2)
+    assert trace.min() > 0.85
+    assert trace.max() < 1.15
+
+
+@pytest.mark.parametrize("way", [[1.0, 0.0], [0.6, 0.8]])
+def test_a_swinging_joint_widens_by_the_mean_square_of_what_is_left_out(way):
+    # a reading that leaves out A theta'' of a sine errs by that, whose mean square over a period is the trace of what
+    # is added to the covariance; windows and differences (40 samples a period) leave 3 %
+    rate_hz, swing_hz, size, share = 100.0, 2.5, 0.01, 7e-4
+    t = np.arange(0.0, 12.0, 1.0 / rate_hz)
+    w = 2.0 * np.pi * swing_hz
+    theta = size * np.sin(w * t)[:, None] * np.array(way)
+    n = len(t)
+    by_acceleration = np.tile(share * np.eye(2), (n, 1, 1))
+    one = Evidence("trim", t, theta, by_acceleration, {}, np.zeros((n, 2, 2)), 1.0)
+    pulse, _ = pulse_of(np.random.default_rng(1), n, theta_yz=np.full((n, 2), 0.02))
+    history = history_of_evidence(one, replace(pulse, time_s=t), "")
+    lateral = history.lateral_cov
+    added = np.trace(lateral, axis1=1, axis2=2)
+    inner = (t > 2.0) & (t < 10.0) & (np.abs(np.sin(w * t)) > 0.7)  # where the plane is told at all
+    want = (share * size * w**2) ** 2 / 2.0
+    assert np.mean(added[inner]) == pytest.approx(want, rel=0.03)

@@ -1,0 +1,328 @@
+"""Compiled looks at pictures against plain ones, on points and scenes small enough to run interpreted."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.special import ndtr
+
+from estimators import _edge_kernels, _fit_kernels, _raster_kernels, _sight_kernels
+from estimators.edge import (
+    EDGE_BASES,
+    EDGE_HALF,
+    EDGE_PLACES,
+    NEAR_ALONG,
+    NEAR_BASES,
+    NEAR_PLACES,
+    STEP_PX,
+    WHOLE_BLUR_PX,
+)
+from estimators.virtual_camera import VirtualCamera
+from flightmodel.camera import Camera, camera_from_mount
+from flightmodel.deflection import lv_direction
+from tests.oracles import plain_horizon, plain_sight
+
+from .conftest import VEHICLE
+
+MOUNT = VEHICLE.cameras["camera5"]
+FISHEYE = camera_from_mount(MOUNT).turned(np.array([0.01, -0.006, 0.008]), 0.99)
+DEFORMATION = np.array([0.031, -0.048, 0.004])
+JOINT_M = 0.2
+
+
+def pinhole():
+    lens = np.array([-0.08, 0.02, 1e-3, -8e-4, 0.004])
+    return Camera(640, 480, np.array([420.0, 430.0]), np.array([310.0, 250.0]), lens, FISHEYE.position_body_m,
+                  FISHEYE.dcm_cam_body, "pinhole")  # fmt: skip
+
+
+def view_of(lens):
+    return VirtualCamera(VEHICLE.geometry, FISHEYE if lens == "fisheye" else pinhole(), JOINT_M)
+
+
+def some_points(count=5):
+    rng = np.random.default_rng(1)
+    y, z = FISHEYE.position_body_m[1:]
+    clocks = np.arctan2(z, -y) + np.deg2rad(rng.uniform(-25.0, 25.0, count))
+    outboard = np.array([lv_direction(c) for c in clocks])
+    station, radius = rng.uniform(0.4, 0.7, count), rng.uniform(1.1, 1.45, count)
+    return radius[:, None] * outboard - station[:, None] * np.array([1.0, 0.0, 0.0])
+
+
+def moved(view, points, bending, column, step):
+    """Pixels with one of the sixteen unknowns moved, by the plain projection."""
+    camera, ring = view.camera, view.shell_terms[2]
+    bent, lens, keep = np.array(bending), camera.distortion.copy(), {}
+    position, centre, joint = camera.position_body_m.copy(), camera.centre_px.copy(), view.joint_station_m
+    if column < 3:
+        bent[column] += step
+    elif column < 6:
+        keep["turn"] = step * np.eye(3)[column - 3]
+    elif column == 6:
+        keep["scale"] = 1.0 + step
+    elif column < 9:
+        centre[column - 7] += step
+    elif column < 11:
+        lens[column - 9] += step
+    elif column < 14:
+        position[column - 11] += step
+    elif column == 14:
+        keep["shell"] = step
+    else:
+        joint += step
+    other = Camera(camera.width_px, camera.height_px, camera.focal_px, centre, lens, position, camera.dcm_cam_body,
+                   camera.lens)  # fmt: skip
+    return plain_sight.project(points, bent, joint, ring, other, **keep)
+
+
+@pytest.mark.parametrize("lens", ["fisheye", "pinhole"])
+def test_projection_and_all_its_derivatives_are_those_of_the_plain_one(lens):
+    view, points = view_of(lens), some_points()
+    sight = view.sight(points, DEFORMATION)
+    assert np.isfinite(sight.pixels).all()
+    want = plain_sight.project(points, DEFORMATION, JOINT_M, view.shell_terms[2], view.camera)
+    np.testing.assert_allclose(sight.pixels, want, atol=1e-8)
+    for column in range(16):
+        step = 1e-3 if column in (7, 8) else 1e-6
+        up, down = (moved(view, points, DEFORMATION, column, side * step) for side in (1.0, -1.0))
+        slope = (up - down) / (2.0 * step)
+        size = max(1.0, np.abs(slope).max())
+        np.testing.assert_allclose(sight.jacobian[:, :, column], slope, atol=3e-6 * size, err_msg=str(column))
+
+
+def test_edge_of_a_torus_is_where_sight_touches_it():
+    circle = (0.62, 1.3, 0.12)
+    eye = np.array([-1.4, 0.25, -0.1])
+    clocks = np.deg2rad([10.0, 95.0, 250.0])
+    points = np.empty((3, 3))
+    assert _sight_kernels.limb(circle, eye, clocks, points)
+    np.testing.assert_allclose(points, plain_sight.limb(circle, eye, clocks), atol=1e-6)
+
+
+def test_distance_from_an_edge_has_a_side_and_a_foot():
+    t = np.linspace(0.0, 1.0, 31)
+    line = np.column_stack([100.0 + 200.0 * t, 50.0 + 30.0 * np.sin(3.0 * t)])
+    found = np.array([[140.0, 60.0], [201.3, 90.0], [251.0, 50.0]])
+    residual, rows, at = np.empty(3), np.empty((3, 16)), np.empty(3)
+    _sight_kernels.feet_on_edge(found, line, np.zeros((31, 2, 16)), residual, rows, at)
+    for point, r, foot in zip(found, residual, at, strict=True):
+        away, where = plain_sight.distance_from_line(point, line)
+        assert abs(r) == pytest.approx(away, rel=1e-9)
+        assert foot == pytest.approx(where, abs=1e-9)
+        # positive on the side to which (dy, -dx) of the way points
+        j = int(where)
+        way = line[j + 1] - line[j]
+        assert np.sign(r) == np.sign((point - line[j]) @ [way[1], -way[0]])
+
+
+def scene(place, noise, seed, across=(0.0, 1.0), size=(60, 80)):
+    """Grey picture of a step of 90 levels, blurred as the lens blurs, ``place`` px along ``across`` from the middle."""
+    v, u = np.indices(size, dtype=float)
+    along = (u - 40.0) * across[0] + (v - 30.0) * across[1] - place
+    # what the search's own smoothing adds to the lens's blur is in the shapes it looks for
+    picture = 30.0 + 90.0 * ndtr(along / np.sqrt(WHOLE_BLUR_PX**2 - 0.8**2))
+    return picture + noise * np.random.default_rng(seed).standard_normal(size)
+
+
+def smoothed(picture):
+    from scipy.ndimage import gaussian_filter
+
+    return gaussian_filter(picture, 0.8, mode="nearest").astype(np.float32)
+
+
+def near_steps(places, noise=0.0, told=0.3):
+    """Places found by the compiled search, along lines down the picture, of steps that lie at ``places``."""
+    out, sds = [], []
+    for seed, place in enumerate(places):
+        image = smoothed(scene(place, noise, seed))
+        origin, inward = np.array([[40.0, 30.0]]), np.array([[0.0, 1.0]])
+        grey, inside = np.empty((1, len(NEAR_ALONG))), np.empty((1, len(NEAR_ALONG)), dtype=np.bool_)
+        _edge_kernels.sample_lines(
+            image, origin, inward, NEAR_ALONG[0], STEP_PX, np.zeros(2), np.array([80.0, 60.0]), grey, inside
+        )
+        plain = plain_horizon.grey(image, np.full(len(NEAR_ALONG), 40.0), 30.0 + NEAR_ALONG)
+        np.testing.assert_allclose(grey[0], plain, atol=1e-4)
+        place_px, sd, good = np.zeros(1), np.full(1, np.inf), np.zeros(1, dtype=np.bool_)
+        _edge_kernels.steps_near(grey, inside, told, 8.0, NEAR_PLACES, NEAR_BASES, place_px, sd, good)
+        assert good[0]
+        if noise == 0.0:
+            profile = grey[0] - np.median(grey[0, :6])
+            assert place_px[0] == pytest.approx(plain_horizon.best_place(profile, NEAR_PLACES, NEAR_BASES), abs=1e-9)
+        out.append(place_px[0])
+        sds.append(sd[0])
+    return np.array(out), np.array(sds)
+
+
+def test_a_step_near_its_place_is_found_to_a_few_hundredths_of_a_pixel():
+    places = np.linspace(-2.3, 2.4, 9)
+    found, _ = near_steps(places)
+    np.testing.assert_allclose(found, places, atol=0.05)
+
+
+def first_rises_in(picture, noise):
+    """Places found by the wide search along lines down the picture, and their sd."""
+    m = 121
+    image = smoothed(picture)
+    columns = np.arange(10.0, 71.0, 4.0)
+    n = len(columns)
+    origin = np.column_stack([columns, np.full(n, 30.0)])
+    inward = np.tile([0.0, 1.0], (n, 1))
+    grey, inside = np.empty((n, m)), np.empty((n, m), dtype=np.bool_)
+    height, width = picture.shape
+    size = np.array([width, height], dtype=float)
+    _edge_kernels.sample_lines(image, origin, inward, -29.0, STEP_PX, np.zeros(2), size, grey, inside)
+    level, scatter, first = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
+    _edge_kernels.sky_levels(grey, inside, 12, level, scatter, first)
+    place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
+    _edge_kernels.first_rises(
+        grey, inside, level, first, noise, float(np.median(level)), (12, 6, 8.0), STEP_PX, EDGE_PLACES, EDGE_BASES,
+        place, sd, good,
+    )  # fmt: skip
+    return STEP_PX * place - 29.0, sd, good
+
+
+def test_a_lasting_rise_is_found_to_a_few_hundredths_of_a_pixel():
+    assert len(EDGE_BASES[0, 0]) == 2 * EDGE_HALF + 1
+    for place in (-3.2, 0.3, 2.65):
+        found, _, good = first_rises_in(scene(place, 0.0, 0), 0.3)
+        assert good.all()
+        np.testing.assert_allclose(found, place, atol=0.08)
+
+
+def test_rises_and_steps_scatter_as_they_say():
+    # of independent pictures; smoothed noise: what the kernel is told is the smoothed picture's own
+    noise = 3.0
+    told = noise / (2.0 * np.sqrt(np.pi) * 0.8)
+    found, sd = [], []
+    for seed in range(12):
+        place, one, good = first_rises_in(scene(0.3, noise, 100 + seed), told)
+        found += list(place[good] - 0.3)
+        sd += list(one[good])
+    # some 190 crossings know their sd to 5 %, 60 steps to 9 %; never more scatter than stated, never half of it
+    ratio = np.std(found) / np.sqrt(np.mean(np.square(sd)))
+    assert 0.5 < ratio < 1.15
+    places, said = near_steps(np.full(60, 0.4), noise, told)
+    assert 0.45 < np.std(places) / np.sqrt(np.mean(said**2)) < 1.15
+
+
+def mark(place, noise=0.0, seed=0):
+    """A dark line 3 px wide down the picture, ``place`` px right of column 30, on light that slopes."""
+    _, u = np.indices((40, 60), dtype=float)
+    light = 90.0 + 0.8 * u
+    off = u - 30.0 - place
+    dark = 0.5 * (ndtr((off + 1.5) / 0.9) - ndtr((off - 1.5) / 0.9))
+    return light * (1.0 - dark) + noise * np.random.default_rng(seed).standard_normal((40, 60))
+
+
+def centres(images, noise):
+    out = []
+    for image in images:
+        offset, sd = np.zeros(1), np.full(1, np.inf)
+        _edge_kernels.dark_centres(
+            image, np.array([[30.0, 20.0]]), np.array([[1.0, 0.0]]), 8, np.array([4]), noise, offset, sd
+        )
+        out.append((offset[0], sd[0]))
+    return np.array(out).T
+
+
+def test_a_dark_line_is_found_where_it_is_with_the_sd_its_noise_gives():
+    for place in (-1.7, 0.0, 0.45):
+        found, _ = centres([mark(place)], 0.3)
+        assert found[0] == pytest.approx(
+            plain_horizon.dip_centre(mark(place), (30.0, 20.0), (1.0, 0.0), 8, 4), abs=1e-9
+        )
+        assert found[0] == pytest.approx(place, abs=0.05)
+    noise = 2.0
+    found, sd = centres([mark(0.2, noise, seed) for seed in range(60)], noise)
+    assert np.isfinite(sd).all()
+    # the sd counts the noise of the whole window, +/- 4 px, as if the mark were as wide; where it is not dark, noise is
+    # cut off, so that of the sum of squares 60 as few as those of +/- 2 px, 10, are left. 60 draws know an sd to 9 %
+    assert 0.9 * np.sqrt(10.0 / 60.0) * 0.8 < np.std(found) / np.sqrt(np.mean(sd**2)) < 1.2
+
+
+def fit_inputs(view, bending, edge_left=0.0):
+    """Exact edge points and marks of a bending, as the compiled fit wants them."""
+    edge = view.edge(np.array(bending))
+    inside = np.flatnonzero(view.camera.is_inside(edge.pixels, 6.0))
+    chosen = inside[2:-2:6]
+    m = len(chosen)
+    found = edge.pixels[chosen] + edge_left * edge.inward_px[chosen]
+    light = np.column_stack([np.ones(m), np.linspace(-1.0, 1.0, m), np.linspace(-1.0, 1.0, m) ** 2])
+    points = np.ascontiguousarray(some_points(6))
+    pixels = view.sight(points, np.array(bending)).pixels
+    across = np.tile(np.eye(2), (3, 1))
+    place = np.einsum("ni,ni->n", pixels, across)
+    return (found, light, np.full(m, 0.3), np.full(m, edge_left)), (points, across, place, np.full(6, 0.2), np.zeros(6))
+
+
+def fitted(view, edge, marks, prior, start):
+    bending, count = np.array(start, dtype=float), len(edge[0]) + len(marks[0])
+    out = np.empty(count), np.zeros((count, 16)), np.zeros((count, 5)), np.empty(count)
+    limits = (1.5, 12.0, 1e-9, 30, 4)
+    state, _ = _fit_kernels.fit_frame(
+        bending, np.eye(2), view.shell_terms, view.camera.lens_terms, edge, marks, prior, limits, *out
+    )
+    assert state == _fit_kernels.DONE
+    return bending, out
+
+
+PRIOR = np.array([0.004, 0.05, 0.002, 0.002, 0.3, 0.3, 0.3])
+
+
+def test_exact_points_give_their_deformation_back_whatever_the_benchmark_s_residuals():
+    view = view_of("fisheye")
+    for left in (0.0, 0.8):
+        edge, marks = fit_inputs(view, [0.03, -0.04, 0.0], left)
+        bending, _ = fitted(view, edge, marks, PRIOR, [0.0, 0.0, 0.0])
+        np.testing.assert_allclose(bending, [0.03, -0.04, 0.0], atol=1e-6)
+
+
+def test_the_fit_is_the_most_probable_one():
+    # a shell that flattened more than the prior likes: the answer weighs the pictures against all priors, as an
+    # optimiser of the same sum finds it that knows nothing of normal equations
+    view, true = view_of("fisheye"), [0.03, -0.04, 0.012]
+    edge, marks = fit_inputs(view, true)
+    got, out = fitted(view, edge, marks, PRIOR, [0.02, -0.03, 0.0])
+    weight = out[3]
+    assert (weight > 0.0).all()
+
+    def residuals(x):
+        # shape unknowns linear, about the answer's own rows
+        bending, shape = x[:3], x[3:]
+        rows = []
+        m = len(edge[0])
+        line = view.edge(bending)
+        r, j, at = np.empty(m), np.empty((m, 16)), np.empty(m)
+        _sight_kernels.feet_on_edge(edge[0], line.pixels, line.jacobian, r, j, at)
+        rows.append(r - edge[3])
+        sight = view.sight(marks[0], bending)
+        rows.append(marks[2] - np.einsum("ni,ni->n", sight.pixels, marks[1]))
+        left = np.concatenate(rows) - out[1][:, 15] * shape[0] - out[2] @ shape[1:]
+        return np.concatenate([np.sqrt(weight) * left, bending[2:] / PRIOR[0], shape / PRIOR[1:]])
+
+    best = least_squares(residuals, np.concatenate([got, np.zeros(6)]), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    assert abs(best[2] - true[2]) > 1e-5  # the priors pull
+    np.testing.assert_allclose(got, best[:3], atol=2e-6)
+
+
+def test_large_residuals_pull_no_harder_than_huber_lets_them():
+    residual = np.array([0.1, -0.2, 0.15, -0.1, 0.05, 8.0, np.nan])
+    weight, scaled = np.empty(7), np.empty(7)
+    edges = _fit_kernels.huber_weights(7, 0, np.full(7, 0.2), np.empty(0), 1.5, residual, scaled, weight)
+    assert edges == 6
+    assert weight[6] == 0.0
+    scale = 1.0 / np.sqrt(weight[0])
+    assert scale == pytest.approx(0.2)
+    assert weight[5] * residual[5] * scale == pytest.approx(1.5)
+    np.testing.assert_allclose(weight[:5], weight[0])
+
+
+def test_distances_are_linear_between_a_triangle_s_corners():
+    depth, nearest = np.full((20, 30), np.inf), np.full((20, 30), -1)
+    corners, away = np.array([[3.0, 2.0], [25.0, 4.0], [8.0, 17.0]]), [5.0, 9.0, 14.0]
+    _raster_kernels.fill(*corners.ravel(), *away, 4, depth, nearest)
+    hit = nearest == 4
+    plane = np.linalg.solve(np.column_stack([corners, np.ones(3)]), away)
+    v, u = np.indices(depth.shape)
+    np.testing.assert_allclose(depth[hit], (plane[0] * u + plane[1] * v + plane[2])[hit], rtol=1e-9)
+    area = 0.5 * abs(np.linalg.det(np.column_stack([corners, np.ones(3)])))
+    assert hit.sum() == pytest.approx(area, rel=0.06)

@@ -1,0 +1,56 @@
+"""Correlated errors: the root squares to the correlation; bands are those of two standard deviations."""
+
+import numpy as np
+import pytest
+
+from flightmodel.atmosphere import (
+    SOUNDING_CONSTANT_PART,
+    WIND_LENGTH_M,
+    sounding_correlation,
+    sounding_correlation_root,
+    unresolved_variance,
+)
+from flightmodel.statistics import correlation, correlation_root, percentile_band
+
+
+def test_correlation_is_a_constant_part_and_a_decay():
+    at = np.array([0.0, 1.0, 4.0])
+    rho = correlation(at, 2.0, 0.3)
+    assert np.allclose(np.diag(rho), 1.0)
+    assert rho[0, 2] == pytest.approx(0.3 + 0.7 * np.exp(-2.0))
+    assert (np.linalg.eigvalsh(rho) > 0.0).all()
+
+
+def test_root_squares_to_the_correlation_at_its_knots():
+    # three knots a length: places on the knots, shuffled, so that order does not matter
+    at = 30e3 + 1000.0 * np.array([4.0, 0.0, 2.0, 6.0, 1.0, 3.0, 5.0])
+    root = sounding_correlation_root(at, WIND_LENGTH_M)
+    assert np.allclose(root @ root.T, sounding_correlation(at, WIND_LENGTH_M), atol=1e-12)
+
+
+def test_places_between_knots_keep_unit_variance():
+    root = correlation_root(np.linspace(0.0, 7.3, 50), 2.0, 0.4)
+    assert np.allclose((root**2).sum(axis=1), 1.0)
+    assert np.allclose(root[:, 0], np.sqrt(0.4))
+    assert correlation_root(np.full(4, 3.0), 2.0).shape == (4, 1)
+    assert correlation_root(np.empty(0), 2.0).shape == (0, 1)
+
+
+def test_what_straight_lines_leave_out_is_the_mean_of_the_bridge():
+    """Variance of a Gauss-Markov process about the line between its ends, averaged: to first order 2 h / L / 6."""
+    length, h = WIND_LENGTH_M, 100.0
+    x = np.linspace(0.0, 1.0, 1001)
+    rho = np.exp(-h / length)
+    to_ends = np.stack([np.exp(-x * h / length), np.exp(-(1.0 - x) * h / length)])
+    w = np.stack([1.0 - x, x])
+    variance = 1.0 - 2.0 * (w * to_ends).sum(axis=0) + (w**2).sum(axis=0) + 2.0 * rho * w[0] * w[1]
+    share = np.trapezoid(variance, x)
+    assert unresolved_variance(h, length) == pytest.approx((1.0 - SOUNDING_CONSTANT_PART) * share, rel=0.03)
+
+
+def test_bands_hold_two_standard_deviations_of_a_normal_ensemble():
+    from scipy.stats import norm
+
+    values = norm.ppf((np.arange(20000) + 0.5) / 20000.0)
+    assert percentile_band(values) == pytest.approx([-1.9954, 0.0, 1.9954], abs=2e-3)
+    assert percentile_band(np.tile(values, (3, 1)), axis=1).shape == (3, 3)

@@ -1,0 +1,77 @@
+"""Bryson-Frazier's fixed-interval smoother and the scores of offsets, in numpy: other formulations to compare with.
+
+Both use the adjoint of the filter (equations: `recon.abrupt_offsets`), which inverts nothing larger than an
+innovation's covariance:
+
+    x_{k|N} = x_{k|k-1} - P_{k|k-1} l-,        P_{k|N} = P_{k|k-1} - P_{k|k-1} L- P_{k|k-1}
+
+The smoother loses digits where smoothing takes most of a prior's variance away.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.smoother import Smoothed, full_step, measured_rows, store_moments
+from recon.state import unpacked
+
+
+def bryson_frazier(steps, run, observed, slots, innovations, x, triangles, variance):
+    """Smoothed errors ``x`` (n, N) in place, and moments at kept nodes, as `recon.smoother.rauch_tung_striebel`."""
+    n, size = x.shape
+    mean, information = np.zeros(size), np.zeros((size, size))
+    first, v = observed.first, innovations
+    for k in reversed(range(n)):
+        for row in reversed(range(first[k], first[k + 1])):
+            if not v.accepted[row]:
+                continue
+            used, h = measured_rows(observed, slots, v, row, size)
+            weight = h.T @ np.linalg.inv(v.covariance[row][np.ix_(used, used)])
+            rest = np.eye(size) - v.gain[row][:, used] @ h
+            mean = rest.T @ mean - weight @ v.residual[row, used]
+            information = rest.T @ information @ rest + weight @ h
+        p = unpacked(run.p_minus[k])
+        x[k] = run.x_minus[k] - p @ mean
+        store_moments(run, k, p - p @ information @ p, triangles, variance)
+        if k > 0:
+            f, _ = full_step(steps, k - 1)
+            mean, information = f.T @ mean, f.T @ information @ f
+
+
+def offset_scores(steps, observed, slots, innovations, columns, begin, end):
+    """Score (c,) and covariance (c, c) of one window; readable twin of `recon._glr_kernels.offset_scores`."""
+    n, size = len(observed.first) - 1, innovations.gain.shape[1]
+    mean, information, cross = np.zeros(size), np.zeros((size, size)), np.zeros((size, len(columns)))
+    score, variance = np.zeros(len(columns)), np.zeros((len(columns), len(columns)))
+    for k in reversed(range(n)):
+        for row in reversed(range(observed.first[k], observed.first[k + 1])):
+            if not innovations.accepted[row]:
+                continue
+            used, h = measured_rows(observed, slots, innovations, row, size)
+            weight = h.T @ np.linalg.inv(innovations.covariance[row][np.ix_(used, used)])
+            rest = np.eye(size) - innovations.gain[row][:, used] @ h
+            mean = rest.T @ mean - weight @ innovations.residual[row, used]
+            information = rest.T @ information @ rest + weight @ h
+            cross = rest.T @ cross
+        if k == 0:
+            break
+        f, _ = full_step(steps, k - 1)
+        if begin <= k - 1 < end:
+            push = np.zeros((size, len(columns)))
+            push[:9] = f[:9, columns]
+            score += push.T @ mean
+            variance += push.T @ cross + cross.T @ push + push.T @ information @ push
+            cross = cross + information @ push
+        mean, information, cross = f.T @ mean, f.T @ information @ f, f.T @ cross
+    return score, variance
+
+
+def smooth(problem, run):
+    """Smoothed errors (n, N), packed covariances (k, ...) and variances (k, N) at the kept nodes of a flight's pass."""
+    kept = int(problem.kept.sum())
+    x, variance = np.empty_like(run.filtered.x_plus), np.empty((kept, problem.size))
+    triangles = np.empty((kept, problem.dense * (problem.dense + 1) // 2))
+    bryson_frazier(
+        run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, x, triangles, variance
+    )
+    return Smoothed(x, triangles, variance)

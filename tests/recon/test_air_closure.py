@@ -1,0 +1,81 @@
+"""The model of the as-flown air against forces that it did not make itself: the simulator's, of a rigid vehicle."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from flightmodel import earth, rotations
+from flightmodel.airdata import air_data
+from flightmodel.atmosphere import standard_atmosphere
+from recon import atmosphere
+from synthetic_flight.simulate import fly
+from tests.estimators.test_closure import EPOCH, START_S, VEHICLE, start
+
+DRAG = atmosphere.Drag(
+    VEHICLE.aero, VEHICLE.reference.area_m2 / VEHICLE.mass_kg, 0.03, 0.07, VEHICLE.reference.length_m
+)  # fmt: skip
+
+
+def windy():
+    calm = standard_atmosphere()
+    return replace(calm, wind_ned_mps=np.tile([14.0, -25.0, 0.0], (len(calm.altitude_m), 1)))
+
+
+def true_samples(error_root=0.0):
+    state = start(6.0, [0.1, -0.15], [0.03, -0.04], [0.0, 0.0])
+    truth = fly(VEHICLE, windy(), state, START_S, START_S + 2.0, EPOCH, 0.002, 0.02, START_S + 9.0)
+    path, cg = truth.trajectory, VEHICLE.cg_m
+    seen = air_data(path, windy(), cg)
+    ned = earth.dcm_ned_ecef(seen.latitude_rad, seen.longitude_rad)
+    dcm = ned @ rotations.dcm_from_q(path.q_ecef_body)
+    spin = path.omega_body_eci_body_radps - earth.OMEGA_RADPS * rotations.dcm_from_q(path.q_ecef_body)[:, 2]
+    velocity = path.velocity_ecef_mps + rotations.rotate(path.q_ecef_body, np.cross(spin, cg))
+    n = len(path.time_s)
+    return atmosphere.AirSamples(
+        path.time_s, seen.altitude_m, np.einsum("nij,nj->ni", ned, velocity), dcm, truth.specific_force_body(cg),
+        np.tile(error_root * np.eye(6), (n, 1, 1)),
+    )  # fmt: skip
+
+
+def forces(samples, x):
+    return atmosphere._Model(samples, windy(), DRAG).forces(np.tile(x, (len(samples.time_s), 1)))[0]
+
+
+def test_forces_are_those_that_the_simulator_s_vehicle_feels():
+    samples = true_samples()
+    got, felt = forces(samples, np.zeros(atmosphere._UNKNOWNS)), samples.specific_force_body_mps2
+    np.testing.assert_allclose(got[:, 0], felt[:, 0], rtol=1e-3)
+    # across: the simulator takes the flow at the nose, half a metre ahead, where turning by 0.3 rad/s moves it by
+    # 0.15 m/s of 1050; pitch damping makes no force
+    assert np.abs(felt[:, 1:]).max() > 0.2
+    np.testing.assert_allclose(got[:, 1:], felt[:, 1:], atol=0.03 * np.abs(felt[:, 1:]).max())
+
+
+def test_a_trajectory_s_errors_are_taken_off_it():
+    # a trajectory whose velocity is off by e (and attitude by a turn d of the body) with these errors stated is the
+    # true one without
+    samples = true_samples(error_root=1.0)
+    e, d = np.array([3.0, -5.0, 2.0]), np.array([0.004, -0.006, 0.003])
+    x = np.zeros(atmosphere._UNKNOWNS)
+    x[11:14], x[14:17] = e, d
+    # NED axes: an estimated body that is turned by d against the true one
+    turn = rotations.dcm_from_q(rotations.exp(d))
+    wrong = replace(samples, velocity_ned_mps=samples.velocity_ned_mps + e, dcm_ned_body=turn @ samples.dcm_ned_body)
+    nothing = np.zeros(atmosphere._UNKNOWNS)
+    want, got = forces(samples, nothing), forces(wrong, x)
+    without = forces(wrong, nothing)
+    # second order of 0.008 rad is left of what the errors do
+    assert np.abs(got - want).max() < 0.03 * np.abs(without - want).max()
+    assert np.abs(without - want)[:, 1:].max() > 0.05
+
+
+def test_structure_between_knots_keeps_a_wind_from_being_known_better():
+    # data without end: what a mean over a knot cannot tell of a wind that forgets over 3 km stays in its sd
+    samples = true_samples()
+    model = atmosphere._Model(samples, windy(), DRAG)
+    height = atmosphere._knots(samples.altitude_m, atmosphere._KNOT_M)
+    k = len(height)
+    table = atmosphere._profile(model, height, np.zeros(3 * k), np.full(3 * k, 1e-6))
+    # half of the variance forgets: about a knot, between neighbours a km apart, a third of its first-order loss
+    left = np.sqrt((1.0 - atmosphere.CONSTANT_PART) * atmosphere._KNOT_M / (3.0 * atmosphere.WIND_LENGTH_M))
+    np.testing.assert_allclose(table.wind_north_sd_mps / table.wind_prior_sd_mps, left, rtol=1e-3)
