@@ -323,12 +323,11 @@ def test_gap_duplicates_out_of_order_frozen_and_saturated(folder):
         return t.iloc[rows]
 
     change(folder, "suba_accel.csv", spoil)
-    found = {f.code: str(f) for f in check_folder(folder).findings if f.source == "accelerometer"}
-    assert set(found) >= {"data-gap", "data-frozen", "data-saturated", "rows-repeated", "rows-reordered"}
-    assert "2.0" in found["data-gap"]
-    assert "ax" in found["data-frozen"]
-    assert "ay" in found["data-saturated"]
-    assert "10 rows" in found["rows-repeated"]
+    found = [(f.code, f.what) for f in check_folder(folder).findings if f.source == "accelerometer"]
+    planted = {"data-gap": "2.0", "data-frozen": "ax", "data-saturated": "ay", "rows-repeated": "10 rows"}
+    planted["rows-reordered"] = ""
+    for code, value in planted.items():
+        assert any(code == own and value in words for own, words in found), found
 
 
 # the command
