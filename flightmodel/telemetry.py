@@ -212,7 +212,7 @@ class Motion:
         Spans in which thrust or an opening parachute acts.
     powered_sd_mps2 : float
         Acceleration that may act there, of each axis.
-    disturbed : tuple of Disturbed
+    disturbed : tuple of UnmodelledSpan
         Spans with a size of their own, with or without inertial sensors.
     """
 

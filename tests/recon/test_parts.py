@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import norm
 
 from flightmodel import rotations
-from flightmodel.instruments import GnssSpec, TriadSpec
+from flightmodel.instruments import ACCELEROMETER, GnssSpec, TriadSpec
 from flightmodel.telemetry import GnssRecord, TriadRecord
 from flightmodel.trajectory import Trajectory, difference
 from recon.consistency import source_checks
-from recon.error_model import triad_blocks
+from recon.error_model import instrument_blocks
 from recon.fault_isolation import _compared
 from recon.imu_screening import (
     _bridges,
@@ -38,7 +38,7 @@ def spec(**more):
 def test_a_bias_that_wanders_starts_as_wide_as_both_and_walks_as_a_gauss_markov_process_does():
     # increments of a stationary process of sd s over dt: 2 s^2 (1 - exp(-dt/tau)), 2 s^2 / tau a second at first
     s, tau, dt = 0.04, 50.0, 0.01
-    block = triad_blocks(spec(bias_wander_sd=s, bias_time_constant_s=tau), "m/s^2")[0]
+    block = instrument_blocks(ACCELEROMETER, spec(bias_wander_sd=s, bias_time_constant_s=tau))[0]
     assert block.prior_sd == pytest.approx(np.sqrt(0.03**2 + s**2))
     assert block.walk_var_per_s * dt == pytest.approx(2.0 * s**2 * (1.0 - np.exp(-dt / tau)), rel=1e-3)
 
