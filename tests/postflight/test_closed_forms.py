@@ -19,7 +19,7 @@ from postflight.checks import inertial
 from postflight.checks.pressure_and_field import turning_field
 from postflight.checks.track_force import compare, slope_through_mean, track_force, unit_that_explains
 from postflight.exports import PLACE, Source, kml_bytes, oem_bytes
-from postflight.montecarlo.bands import coverage, is_narrow, percentile_interval
+from postflight.montecarlo.bands import Chunk, _bands, coverage, is_narrow, percentile_interval, write_chunk
 from postflight.montecarlo.study import design_for, indices
 from postflight.product import _coefficients
 from postflight.reconciliation.modes import FACTORS, _along, _peak
