@@ -16,7 +16,7 @@ from estimators.evidence import (
     moved_evidence,
     moved_vehicle,
 )
-from estimators.fusion import Learnt, fuse
+from estimators.fusion import InputPosterior, fuse
 from estimators.misalignment import misalignment_evidence
 from estimators.southwell import LEFT_OUT, southwell_limbs
 from estimators.trim import SLOPE_AT_RAD, solve_trim, static_trim, trim_curvature, trim_evidence, trim_model
@@ -139,7 +139,7 @@ def test_of_many_swings_that_fit_alike_the_clock_s_own_term_chooses():
         n = len(at)
         return Evidence(
             name, at, values, np.zeros((n, 2, 2)), {}, np.tile(sd_rad**2 * np.eye(2), (n, 1, 1)), 0.01,
-            clock_sd_s=clock_sd_s,
+            time_bias_sd_s=clock_sd_s,
         )  # fmt: skip
 
     late = 0.05
@@ -176,7 +176,7 @@ def test_pairs_that_agree_fail_as_often_as_chance_lets_them(noises):
     share = np.mean([p.chi_square for p in found]) / found[0].degrees
     # 400 draws of some 12 degrees know the mean to 2 %; what is left out takes up to a few percent of it
     assert 0.80 < share < 1.06
-    chances = np.array([p.chance for p in found])
+    chances = np.array([p.p_value for p in found])
     assert 0.35 < np.mean(chances < 0.5) < 0.58
     assert np.mean(chances < 0.1) < 0.15
 
@@ -194,7 +194,7 @@ def test_gain_is_the_likelihood_of_worse_known_inputs():
         return -0.5 * y @ np.linalg.solve(c, y) - 0.5 * np.linalg.slogdet(c)[1]
 
     covariance = np.linalg.inv(np.eye(2) + (j.T / noise) @ j)
-    learnt = Learnt(covariance @ (j.T / noise) @ y, covariance, {WIND: slice(0, 2)})
+    learnt = InputPosterior(covariance @ (j.T / noise) @ y, covariance, {WIND: slice(0, 2)})
     gain = agreement(methods, learnt).gains["sounded wind"]
     assert gain == pytest.approx(log_density(WIDER) - log_density(1.0), rel=1e-6)
 

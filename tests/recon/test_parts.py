@@ -17,7 +17,7 @@ from recon.imu_screening import Unused, _between_slow, _bridges, _jumps, _missed
 from recon.measurements import gnss_instruments, magnetometer_instrument
 from recon.motion import strapdown_motion, unbent
 from recon.product import Mounting, datum_trajectory
-from recon.setup import fit_start
+from recon.setup import fit_first_points
 from recon.state import States, boxplus, packed
 from recon.unmodelled import with_stated
 from recon.vector_attitude import _suspects, compare
@@ -138,7 +138,7 @@ def test_a_wild_point_does_not_move_the_start(monkeypatch):
     points = place + (t - 101.0)[:, None] * velocity
     points[3] += [5e4, -2e4, 1e4]
     monkeypatch.setattr("recon.setup.places", lambda _: (t, points))
-    at, speed = fit_start((), 101.0)
+    at, speed = fit_first_points((), 101.0)
     np.testing.assert_allclose(at, place, atol=1.0)
     np.testing.assert_allclose(speed, velocity, atol=1.0)
 

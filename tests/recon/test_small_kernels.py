@@ -7,6 +7,7 @@ import pytest
 
 from flightmodel import earth, rotations
 from recon import _filter_kernels, _measurement_kernels, ballistic, ekf
+from recon._shock_kernels import window_scores
 from recon.motion import strapdown_motion
 from recon.state import States, Wander, unpacked
 from recon.strapdown import correct, propagate, propagate_plain
@@ -15,11 +16,6 @@ from recon.unmodelled import readable_scores
 from . import linear
 from .ballistic_flight import SPEC, across_plane, entry_state, fly, watch, windy_sounding
 from .problems import build
-
-try:
-    from recon._shock_kernels import offset_scores
-except ImportError:  # kernels may share a file
-    from recon._filter_kernels import offset_scores
 
 DRIVERS = np.array([0.1, 0.05, -0.08, 0.7, -1.1, 0.6])
 
@@ -57,7 +53,7 @@ def test_shock_scores_are_those_of_the_readable_form():
     columns = np.array([9, 10, 12])
     begin, end = np.array([7, 2], dtype=np.int64), np.array([11, 9], dtype=np.int64)
     score, variance = np.zeros((2, 3)), np.zeros((2, 3, 3))
-    offset_scores(problem.steps, problem.observed, problem.slots, innovations, columns, begin, end, 2, score, variance)
+    window_scores(problem.steps, problem.observed, problem.slots, innovations, columns, begin, end, 2, score, variance)
     for k in range(2):
         s, v = readable_scores(
             problem.steps, problem.observed, problem.slots, innovations, columns, int(begin[k]), int(end[k])

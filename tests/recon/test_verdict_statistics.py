@@ -57,13 +57,14 @@ def test_stated_errors_as_large_as_stated_fail_as_often_as_stated():
     prior, sd = np.array([1.0, 0.2, 3.0, 1e-3, 5.0]), np.array([0.3, 0.05, 2.0, 4e-4, 1.0])
     spread = np.sqrt(prior**2 - sd**2)
     found = [
-        data_sheet_check("a", list("abcde"), spread * rng.standard_normal(5), prior, sd, confidence)
+        data_sheet_check("data-sheet", "a", list("abcde"), spread * rng.standard_normal(5), prior, sd, confidence)
         for _ in range(DRAWS)
     ]  # fmt: skip
     assert share_failed(found) == pytest.approx(1.0 - confidence, abs=allowed(0.10) + 0.006)
     # what was not learnt is not judged
-    assert data_sheet_check("a", ["a"], np.array([9.0]), np.array([1.0]), np.array([0.99]), confidence) is None
-    assert data_sheet_check("a", ["a"], np.array([9.0]), np.array([1.0]), np.array([0.97]), confidence) is not None
+    one, prior = np.array([9.0]), np.array([1.0])
+    assert data_sheet_check("data-sheet", "a", ["a"], one, prior, np.array([0.99]), confidence) is None
+    assert data_sheet_check("data-sheet", "a", ["a"], one, prior, np.array([0.97]), confidence) is not None
 
 
 def test_filter_and_smoother_differ_by_the_difference_of_their_covariances():
