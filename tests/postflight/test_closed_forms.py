@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from flightmodel import earth, rotations
-from flightmodel.airdata import Inputs, _angles_of, derived, lateral_angles
+from flightmodel.airdata import Inputs, _path_angles, derived, lateral_angles
 from flightmodel.atmosphere import standard_atmosphere, standard_sounding
 from flightmodel.instruments import TriadSpec
 from flightmodel.trajectory import Trajectory
@@ -22,8 +22,8 @@ from postflight.checks.units_and_axes import slope_through_mean, unit_that_expla
 from postflight.exports import _OEM_STATE, Source, _kml, _oem
 from postflight.montecarlo.bands import Chunk, _bands, coverage, is_narrow, percentile_interval, write_chunk
 from postflight.montecarlo.study import design_for, indices
-from postflight.product import _coefficients
 from postflight.reconciliation.modes import FACTORS, _peak, _track_power
+from postflight.reconstruction import _coefficients
 from postflight.report.panels import _FLOWN
 from postflight.score import _STATE_COLUMNS, _bet_errors, _method_row
 from postflight.studies import preflight
@@ -137,7 +137,7 @@ def test_pulse_data_state_their_noise_and_the_flow_s_errors():
 
 
 def test_speed_path_and_heading_of_known_velocities():
-    speed, path, heading = _angles_of(np.array([[0.0, 3.0, -4.0], [-2.0, 0.0, 0.0], [1.0, 0.0, 1.0]]))
+    speed, path, heading = _path_angles(np.array([[0.0, 3.0, -4.0], [-2.0, 0.0, 0.0], [1.0, 0.0, 1.0]]))
     np.testing.assert_allclose(speed, [5.0, 2.0, np.sqrt(2.0)])
     np.testing.assert_allclose(np.rad2deg(path), [np.rad2deg(np.arctan2(4.0, 3.0)), 0.0, -45.0], atol=1e-12)
     np.testing.assert_allclose(np.rad2deg(heading), [90.0, 180.0, 0.0])

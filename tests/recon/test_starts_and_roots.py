@@ -1,4 +1,4 @@
-"""Parts of a reconstruction by what they must obey: start, accelerometer's root, belief in readings, withheld noise."""
+"""Parts of a reconstruction by what they must obey: start, accelerometer's root, accepted readings, held-out noise."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,7 +8,8 @@ import pytest
 from scipy.stats import norm
 
 from flightmodel import earth, rotations
-from recon import atmosphere, setup, unmodelled
+from recon import abrupt_offsets, atmosphere, setup
+from recon._measurement_kernels import POSITION
 from recon.imu_screening import TransientOffset
 from recon.product import accelerometer_root
 from recon.reconstruct import reconstruct
@@ -32,14 +33,14 @@ def test_a_start_is_the_datum_s_where_the_antenna_moves_about_it(monkeypatch):
         return place + t * velocity + rotations.rotate(turned, arm)
 
     seen = antenna(0.0), (antenna(step) - antenna(-step)) / (2.0 * step)
-    monkeypatch.setattr(setup, "fit_first_points", lambda instruments, start_s: seen)
-    monkeypatch.setattr(setup, "start_attitude", lambda *_: (q, np.eye(3), np.zeros((3, 9))))
+    monkeypatch.setattr(setup, "fit_start", lambda instruments, start_s: seen)
+    monkeypatch.setattr(setup, "_start_attitude", lambda *_: (q, np.eye(3), np.zeros((3, 9))))
     rate = SimpleNamespace(
         time_s=np.array([9.0, 11.0]), measured_sensor=np.array([w, w]), spec=SimpleNamespace(dcm_body_sensor=np.eye(3))
     )
-    tracker = SimpleNamespace(kind=setup.POSITION, arm_body_m=arm)
+    tracker = SimpleNamespace(kind=POSITION, arm_body_m=arm)
     model = SimpleNamespace(size=18, prior_sd=np.ones(18))
-    state, _ = setup.start_by_inertial_sensors((tracker,), None, 10.0, None, rate, model)
+    state, _ = setup._start_by_inertial_sensors((tracker,), None, 10.0, None, rate, model)
     np.testing.assert_allclose(state.position_ecef_m, place, rtol=0.0, atol=1e-8)
     # differences of 6e6 m over 2 ms: 1e-6 m/s
     np.testing.assert_allclose(state.velocity_ecef_mps, velocity, rtol=0.0, atol=1e-5)
@@ -76,22 +77,22 @@ def test_the_accelerometer_s_root_holds_what_goes_together():
 @pytest.mark.parametrize(
     ("found", "offset"), [(0.0, 3.6), (0.0, 3.8), (1.0, 4.6), (1.0, 4.9), (-1.0, 2.5), (-1.0, 2.8)]
 )
-def test_readings_are_believed_at_a_thousand_to_one(monkeypatch, found, offset):
+def test_readings_are_accepted_at_a_thousand_to_one(monkeypatch, found, offset):
     # one Gaussian reading of the offset with unit sd, ``found``: right where it is a thousand times likelier without
     score = np.zeros((1, 6))
     score[0, 4] = -found
-    monkeypatch.setattr(unmodelled, "window_scores", lambda *_: (score, np.eye(6)[None]))
+    monkeypatch.setattr(abrupt_offsets, "offset_scores", lambda *_: (score, np.eye(6)[None]))
     problem = SimpleNamespace(
         time_s=np.arange(10.0), model=SimpleNamespace(wander=SimpleNamespace(considered=np.zeros(3, dtype=bool)))
     )
     runs = (TransientOffset(1, 1, 3.0, 5.0, offset),)
     against = norm.logpdf(found) - norm.logpdf(found, offset)
     assert abs(against - np.log(1000.0)) > 0.1
-    assert (unmodelled.doubtful(problem, None, runs) == ()) == (against > np.log(1000.0))
+    assert (abrupt_offsets.unsupported_offsets(problem, None, runs) == ()) == (against > np.log(1000.0))
 
 
-def test_withheld_readings_noise_is_in_what_is_predicted_of_them(mini_sense):
-    # a radar that is withheld moves nothing: with twice its noise stated only the prediction's variance grows, by 3
+def test_held_out_readings_noise_is_in_what_is_predicted_of_them(mini_sense):
+    # a radar that is held out moves nothing: with twice its noise stated only the prediction's variance grows, by 3
     telemetry, _ = mini_sense(1)
     west = telemetry.radars["west"]
     assert west.site.elevation_sd_rad is None
@@ -109,7 +110,7 @@ def test_withheld_readings_noise_is_in_what_is_predicted_of_them(mini_sense):
 def test_a_density_s_sd_is_of_the_density_not_of_its_logarithm():
     # half as dense again as the sounding: what an sd to either side does to the ratio
     samples = SimpleNamespace(altitude_m=np.linspace(30e3, 50e3, 200))
-    height = atmosphere._knots(samples.altitude_m, atmosphere.KNOT_M)
+    height = atmosphere._knots(samples.altitude_m, atmosphere._KNOT_M)
     k = len(height)
     n = np.ones(200)
     model = SimpleNamespace(samples=samples, air=SimpleNamespace(density_sd=0.1 * n, wind_sd_mps=5.0 * n))
