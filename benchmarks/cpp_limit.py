@@ -17,7 +17,7 @@ from problem import PULSE_S, minima, reference_problem
 from flightmodel import earth
 from synthetic_flight import _kernels, simulate
 from synthetic_flight._kernels import AUX, STATES
-from synthetic_flight.simulate import BENDING_LIMIT_RAD
+from synthetic_flight.simulate import DEFLECTION_LIMIT_RAD
 
 SOURCE = Path(__file__).parent / "plain_cpp" / "flight.cpp"
 COMMON = ["-std=c++17", "-O3", "-march=native", "-shared", "-fPIC", "-Wno-psabi"]
@@ -67,7 +67,7 @@ class Flights:
             steps,
             2,
             0,
-            BENDING_LIMIT_RAD,
+            DEFLECTION_LIMIT_RAD,
             out,
             aux,
             written,

@@ -155,9 +155,7 @@ def read_flight(folder: str | Path, progress: Progress | None = None, needs_path
     report: Callable[[float], None] | None = None
     if progress is not None:
         report = lambda fraction: progress(fraction, "reading telemetry")  # noqa: E731
-    telemetry = read_telemetry(Path(folder), report, needs_path)
-    settings = Settings.from_mapping({"pulse_rate_hz": PULSE_RATE_HZ, **telemetry.reconstruction})
-    return Flight(telemetry, settings, folder=Path(folder))
+    return Flight(read_telemetry(Path(folder), report, needs_path), folder=Path(folder))
 
 
 def calm(sounding: Sounding) -> Sounding:

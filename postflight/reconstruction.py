@@ -91,7 +91,7 @@ class Reconstruction(Tabular):
         Smoothed and filtered trajectory, sensor errors, residuals, consistency checks.
     air : AirData
         Along the trajectory, by the sounding.
-    loads : PulseData or None
+    loads : FlightLoads or None
         Motion and flow at the c.g., for the estimators of the deflection; None where ``missing`` says why.
     as_flown : ReconstructedAir or None
         As-flown density, winds and C_A, from the deceleration.

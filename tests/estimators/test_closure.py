@@ -15,8 +15,8 @@ from estimators.misalignment import misalignment_evidence
 from estimators.trim import moment_term, shell_inertia, trim_evidence, trim_model
 from flightmodel import airdata, earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
-from synthetic_flight import dynamics
 from synthetic_flight.simulate import fly, state_from_ecef
+from tests.oracles import two_body
 
 from .conftest import VEHICLE
 
@@ -159,8 +159,8 @@ def test_shell_inertia_is_the_momentum_that_a_swing_gives():
     bent = np.array([0.0, 1e-5, 0.0])
     q = np.array([1.0, 0.0, 0.0, 0.0])
     state = np.concatenate([[1e12, 0.0, 0.0], np.zeros(3), q, rotations.exp(bent), np.zeros(6)])
-    nothing = dynamics.Loads(np.zeros(3), np.zeros(3), np.zeros(3))
-    _, turn_body, _, turn_shell, _ = dynamics.accelerations(state, vehicle, nothing)
+    nothing = two_body.Loads(np.zeros(3), np.zeros(3), np.zeros(3))
+    _, turn_body, _, turn_shell, _ = two_body.accelerations(state, vehicle, nothing)
     swing = turn_shell[1] - turn_body[1]
     assert abs(swing) > 1e-3
     assert shell_inertia(vehicle) == pytest.approx(-vehicle.inertia[1, 1] * turn_body[1] / swing, rel=1e-8)

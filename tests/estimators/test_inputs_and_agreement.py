@@ -194,8 +194,8 @@ def test_gain_is_the_likelihood_of_worse_known_inputs():
         return -0.5 * y @ np.linalg.solve(c, y) - 0.5 * np.linalg.slogdet(c)[1]
 
     covariance = np.linalg.inv(np.eye(2) + (j.T / noise) @ j)
-    input_posterior = InputPosterior(covariance @ (j.T / noise) @ y, covariance, {WIND: slice(0, 2)})
-    gain = agreement(methods, input_posterior).gains["sounded wind"]
+    learnt = InputPosterior(covariance @ (j.T / noise) @ y, covariance, {WIND: slice(0, 2)})
+    gain = agreement(methods, learnt).gains["sounded wind"]
     assert gain == pytest.approx(log_density(WIDER) - log_density(1.0), rel=1e-6)
 
 

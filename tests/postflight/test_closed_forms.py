@@ -14,17 +14,20 @@ from flightmodel.atmosphere import standard_atmosphere, standard_sounding
 from flightmodel.instruments import TriadSpec
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight import loads, product, score
+from postflight import loads, product
 from postflight.checks import inertial
-from postflight.checks.pressure_and_field import turning_field
-from postflight.checks.track_force import compare, slope_through_mean, track_force, unit_that_explains
-from postflight.exports import PLACE, Source, kml_bytes, oem_bytes
-from postflight.montecarlo.bands import coverage, is_narrow, percentile_interval
+from postflight.checks.pressure_and_field import field_rotation
+from postflight.checks.track_force import _compare, track_force
+from postflight.checks.units_and_axes import slope_through_mean, unit_that_explains
+from postflight.exports import _OEM_STATE, Source, _kml, _oem
+from postflight.montecarlo.bands import Chunk, _bands, coverage, is_narrow, percentile_interval, write_chunk
 from postflight.montecarlo.study import design_for, indices
 from postflight.product import _coefficients
-from postflight.reconciliation.modes import FACTORS, _along, _peak
-from postflight.report.panels import FLOWN
+from postflight.reconciliation.modes import FACTORS, _peak, _track_power
+from postflight.report.panels import _FLOWN
+from postflight.score import _STATE_COLUMNS, _bet_errors, _method_row
 from postflight.studies import preflight
+from recon import atmosphere
 
 G0 = 9.80665
 
@@ -40,7 +43,7 @@ def test_window_means_are_integrals_of_the_lines_between_samples():
     for k, (a, b) in enumerate(zip(start, end, strict=True)):
         x = a + (b - a) * fine
         want = [np.trapezoid(np.interp(x, t, c), x) / (b - a) for c in values.T]
-        np.testing.assert_allclose(loads.window_means(t, values, start, end)[k], want, rtol=1e-8)
+        np.testing.assert_allclose(atmosphere._window_means(t, values, start, end)[k], want, rtol=1e-8)
 
 
 def rotating(noise=0.0, seed=0):
@@ -53,7 +56,7 @@ def rotating(noise=0.0, seed=0):
 
 def test_angular_acceleration_is_the_slope_and_carries_the_force_to_the_cg():
     at, arm = np.array([1.0, 2.5]), np.array([0.5, 0.2, 0.0])
-    seen = loads.sensed(rotating(), at, arm)
+    seen = atmosphere.cg_accelerations(rotating(), at, arm)
     np.testing.assert_allclose(seen.angular_acceleration_radps2, np.tile([0.0, 0.0, 0.8], (2, 1)), atol=1e-9)
     w = np.column_stack([0.0 * at, 0.0 * at, 0.8 * at])
     want = np.cross([0.0, 0.0, 0.8], arm) + np.cross(w, np.cross(w, arm))
@@ -62,9 +65,9 @@ def test_angular_acceleration_is_the_slope_and_carries_the_force_to_the_cg():
 
 def test_angular_acceleration_s_noise_is_that_of_two_means():
     # the difference of two means of 2 h of white samples over 2 h, drawn: 600 know an sd to 3 %
-    noise, h = 0.01, loads.HALF_WINDOW_S
+    noise, h = 0.01, atmosphere.HALF_WINDOW_S
     drawn = [
-        loads.sensed(rotating(noise, seed), np.array([2.0]), np.zeros(3)).angular_acceleration_radps2[0]
+        atmosphere.cg_accelerations(rotating(noise, seed), np.array([2.0]), np.zeros(3)).angular_acceleration_radps2[0]
         for seed in range(200)
     ]
     samples = 2.0 * h / 0.01
@@ -74,17 +77,17 @@ def test_angular_acceleration_s_noise_is_that_of_two_means():
 def test_windows_of_the_air_carry_the_force_by_both_terms_of_the_lever():
     # evenly faster turning about z: w' x arm and the mean of w x (w x arm) over a window, whose square grows
     at, arm = np.array([1.5, 2.2]), np.array([0.5, 0.2, 0.3])
-    half = 0.5 * loads.WINDOW_S
+    half = 0.5 * atmosphere._WINDOW_S
     mean_square = 0.8**2 * ((at + half) ** 3 - (at - half) ** 3) / (6.0 * half)
     want = np.cross([0.0, 0.0, 0.8], arm) - mean_square[:, None] * (arm * [1.0, 1.0, 0.0])
-    np.testing.assert_allclose(loads._force_means(rotating(), arm, at), want, atol=1e-4)
+    np.testing.assert_allclose(atmosphere._force_means(rotating(), arm, at), want, atol=1e-4)
 
 
 def test_drag_is_known_as_well_as_coefficient_and_mass(monkeypatch):
     vehicle, seen = vehicle_from_toml(vehicle_path("irve2_reference")), []
-    monkeypatch.setattr(loads, "air_samples", lambda *_: None)
-    monkeypatch.setattr(loads, "reconstruct_air", lambda _samples, _profile, drag, _confidence: seen.append(drag))
-    loads.as_flown_atmosphere(SimpleNamespace(required_vehicle=lambda: vehicle), None, None, 0.99)
+    monkeypatch.setattr(atmosphere, "_air_samples", lambda *_: None)
+    monkeypatch.setattr(atmosphere, "reconstruct_air", lambda _samples, _profile, drag, _confidence: seen.append(drag))
+    atmosphere.as_flown_atmosphere(SimpleNamespace(required_vehicle=lambda: vehicle), None, None, 0.99)
     # acceleration is C q S / m: relative errors of C and of m add as independent ones
     rng, known = np.random.default_rng(1), vehicle.uncertainty
     for sd, own in ((seen[0].ca_sd, known.ca), (seen[0].cn_sd, known.cn)):
@@ -168,11 +171,11 @@ def test_inertial_velocity_errs_with_the_place_by_the_earth_s_turning():
     )  # fmt: skip
     rates = SimpleNamespace(spec=SimpleNamespace(noise_sd=0.03))
     bet = SimpleNamespace(smoothed=path, rate_cov=np.tile(0.04**2 * np.eye(3), (1, 1, 1)))
-    made = product._inertial(SimpleNamespace(reconstruction=bet))
+    made = product._inertial(SimpleNamespace(solution=bet))
     assert made["vx_eci_sd_mps"][0] == pytest.approx(1000.0 * earth.OMEGA_RADPS, rel=1e-4)
     assert made["vz_eci_sd_mps"][0] == pytest.approx(1e-4, rel=1e-4)
     # rates: what was estimated of the errors, and a sample's own noise
-    flight = SimpleNamespace(reconstruction=bet, telemetry=SimpleNamespace(rates=rates))
+    flight = SimpleNamespace(solution=bet, telemetry=SimpleNamespace(rates=rates))
     np.testing.assert_allclose(product._rate_sd(flight), 0.05)
 
 
@@ -260,7 +263,7 @@ def test_inside_a_band_is_between_its_limits():
 def test_dispersed_air_scatters_as_the_sounding_says():
     profile, draws = standard_atmosphere(), []
     for seed in range(200):
-        made = preflight._dispersed_air(profile, np.random.default_rng(seed))
+        made = preflight._dispersed_atmosphere(profile, np.random.default_rng(seed))
         draws.append(np.column_stack([made.wind_ned_mps[:, :2], made.log_density_ratio]))
     # 200 draws of some ten independent heights: an sd to 2 %
     spread = np.sqrt(np.mean(np.square(draws), axis=(0)))
@@ -282,7 +285,7 @@ def test_an_entry_starts_with_its_cg_where_the_datum_s_flight_has_it():
     _, _, height = earth.geodetic_from_ecef(r)
     air = SimpleNamespace(altitude_m=height, flight_path_angle_rad=np.full(n, -1.4), time_s=t)
     telemetry = SimpleNamespace(sounding=standard_sounding(), required_vehicle=lambda: vehicle)
-    flight = SimpleNamespace(air=air, telemetry=telemetry, reconstruction=SimpleNamespace(smoothed=path))
+    flight = SimpleNamespace(air=air, telemetry=telemetry, solution=SimpleNamespace(smoothed=path))
     entry = preflight._Entry(flight, vehicle, None)
     start, _ = entry.start(None)
     k = int(np.searchsorted(t, entry.start_s))
@@ -293,14 +296,14 @@ def test_an_entry_starts_with_its_cg_where_the_datum_s_flight_has_it():
 
 def test_acceleration_across_the_axis_is_that_of_both_axes():
     bet = pd.DataFrame({"ay_cg_mps2": [3.0 * G0], "az_cg_mps2": [-4.0 * G0]})
-    assert float(np.asarray(FLOWN["normal_g"][2](bet))[0]) == pytest.approx(5.0)
+    assert float(np.asarray(_FLOWN["normal_g"][2](bet))[0]) == pytest.approx(5.0)
 
 
 def test_errors_of_a_trajectory_over_its_pulse_are_those_that_were_planted():
     # a straight flight off by known vectors, everywhere alike: rms are their lengths; the angle's is its own
     n = 41
     t = np.arange(n) * 0.5
-    truth = pd.DataFrame(0.0, index=range(n), columns=list(score.STATE_COLUMNS))
+    truth = pd.DataFrame(0.0, index=range(n), columns=list(_STATE_COLUMNS))
     truth["t_s"], truth["qw_ecef_body"] = t, 1.0
     truth["rx_ecef_m"], truth["vx_ecef_mps"] = 6.5e6 + 100.0 * t, 100.0
     truth["dynamic_pressure_pa"] = 1000.0 * np.exp(-(((t - 10.0) / 3.0) ** 2))
@@ -310,7 +313,7 @@ def test_errors_of_a_trajectory_over_its_pulse_are_those_that_were_planted():
     bet["rz_ecef_m"] -= 4.0
     bet["vz_ecef_mps"] += 0.2
     bet["alpha_total_wind_deg"] = 5.3
-    found = score._bet_errors(bet, truth)
+    found = _bet_errors(bet, truth)
     assert found["position_rms_m"] == pytest.approx(5.0)
     assert found["velocity_rms_mps"] == pytest.approx(0.2)
     assert found["alpha_total_rms_deg"] == pytest.approx(0.3)
@@ -324,7 +327,7 @@ def test_a_method_s_row_is_estimate_minus_truth(tmp_path):
         {"t_s": [1.0, 2.0, 3.0], "theta_deg": [3.0, 3.5, 4.0], "plane_lv_deg": 180.0, "theta_sd_deg": 0.2}
     )
     table.to_csv(tmp_path / "deflection_trim.csv", index=False)
-    row = score._method_row(tmp_path / "deflection_trim.csv", 2.0, 3.0)
+    row = _method_row(tmp_path / "deflection_trim.csv", 2.0, 3.0)
     assert row["error_deg"] == pytest.approx(0.5)
     assert row["sd_deg"] == pytest.approx(0.2)
 
@@ -334,7 +337,7 @@ def test_a_method_s_row_is_estimate_minus_truth(tmp_path):
 
 def source():
     t = np.arange(0.0, 3.0, 0.5)
-    state = {name: (1000.0 * (k + 1) + 7.0 * t) for k, name in enumerate(PLACE)}
+    state = {name: (1000.0 * (k + 1) + 7.0 * t) for k, name in enumerate(_OEM_STATE)}
     place = {"lat_deg": 37.0 + 0.01 * t, "lon_deg": -75.0 + 0.02 * t, "alt_m": 9e4 - 1e3 * t}
     covariance = np.tile(np.diag([4.0, 9.0, 16.0, 0.01, 0.04, 0.09, 1.0, 1.0, 1.0]), (3, 1, 1))
     return Source(
@@ -345,7 +348,7 @@ def source():
 
 
 def test_oem_is_in_kilometres_and_their_squares():
-    lines = oem_bytes(source()).decode().splitlines()
+    lines = _oem(source()).decode().splitlines()
     first = lines[lines.index("META_STOP") + 2].split()
     assert first[0] == "2009-08-17T12:50:00.000000"
     np.testing.assert_allclose([float(x) for x in first[1:]], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
@@ -355,7 +358,7 @@ def test_oem_is_in_kilometres_and_their_squares():
 
 
 def test_kml_has_longitude_before_latitude():
-    words = kml_bytes(source()).decode()
+    words = _kml(source()).decode()
     lon, lat, alt = (float(x) for x in words.split("<gx:coord>")[1].split("<")[0].split())
     assert (lon, lat, alt) == (-75.0, 37.0, 9e4)
 
@@ -413,7 +416,7 @@ def test_a_late_track_and_its_scale_are_found():
         force, force_mps2=np.column_stack([size(force.time_s - 0.41), 0.0 * force.time_s, 0.0 * force.time_s]),
         covariance=np.tile(1e-4 * np.eye(3), (len(force.time_s), 1, 1)),
     )  # fmt: skip
-    found = compare(swelling, t, np.column_stack([size(t) / 1.3, 0.0 * t, 0.0 * t]))
+    found = _compare(swelling, t, np.column_stack([size(t) / 1.3, 0.0 * t, 0.0 * t]))
     # the windows' kernel takes 1 % of the swelling, which moves no peak
     assert found.lag_s == pytest.approx(0.41, abs=0.004)
     assert found.scale == pytest.approx(1.3, rel=0.02)
@@ -435,7 +438,7 @@ def test_unit_that_explains_makes_values_as_many_times_as_large(ratio, unit, wan
 
 def test_what_stands_still_and_reads_one_is_in_g(monkeypatch):
     t, rng = np.arange(0.0, 5.0, 0.01), np.random.default_rng(1)
-    monkeypatch.setattr(inertial, "accelerometer_unit", lambda _: "mps2")
+    monkeypatch.setattr(inertial, "_accelerometer_unit", lambda _: "mps2")
 
     def record(values):
         return SimpleNamespace(time_s=t, measured_sensor=values + 1e-4 * rng.standard_normal((len(t), 3)))
@@ -446,7 +449,7 @@ def test_what_stands_still_and_reads_one_is_in_g(monkeypatch):
         findings = inertial.at_rest(found)
         assert len(findings) == count
         if count:
-            assert "they look like 'g'" in str(findings[0])
+            assert "consistent with 'g'" in str(findings[0])
 
 
 def test_a_field_that_turns_as_the_gyros_say_raises_nothing():
@@ -470,11 +473,11 @@ def test_a_field_that_turns_as_the_gyros_say_raises_nothing():
         spec = SimpleNamespace(sensors=SimpleNamespace(rates=rates))
         return SimpleNamespace(triads={"rates": record(rate), "magnetometer": record(np.array(fields))}, spec=spec)
 
-    findings, clock = turning_field(told(w))
+    findings, clock = field_rotation(told(w))
     assert findings == []
     assert clock is not None
     assert abs(clock[0]) < 0.02
-    findings, _ = turning_field(told(-w))
+    findings, _ = field_rotation(told(-w))
     assert len(findings) == 1
 
 
@@ -485,9 +488,9 @@ def test_what_is_gathered_along_a_track_is_both_senses_mean():
     frequency = np.fft.fftfreq(64, 1.0 / 32.0)
     power = np.zeros((2, 64))
     power[0] = np.where(np.abs(frequency) == 3.0, np.where(frequency > 0, 2.0, 1.0), 0.0)
-    got = _along(frequency, power, np.array([3.0, np.nan]))
+    got = _track_power(frequency, power, np.array([3.0, np.nan]))
     np.testing.assert_allclose(got, [1.5, 0.0])
-    half_way = _along(frequency, power, np.array([3.25, np.nan]))
+    half_way = _track_power(frequency, power, np.array([3.25, np.nan]))
     np.testing.assert_allclose(half_way, [0.75, 0.0])
 
 

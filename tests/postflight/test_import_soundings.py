@@ -1,4 +1,4 @@
-"""Soundings as stations and ranges write them become the day's air: winds turned, all that was done said."""
+"""Soundings as stations and ranges write them become as-flown air: winds as velocities, each change noted."""
 
 import os
 import re
@@ -35,7 +35,7 @@ def folder(tmp_path):
 
 
 def brought_in(folder, path):
-    """Sounding and findings as the reader has them after import."""
+    """Sounding and codes of findings as the reader has them after import, and what import printed."""
     result = CliRunner().invoke(cli, ["import", str(path), "--into", str(folder)])
     assert result.exit_code == 0, result.exception
     entry = AtmosphereEntry.model_validate(tomllib.loads((folder / "flight.toml").read_text())["atmosphere"])
@@ -61,9 +61,9 @@ def wyoming(path):
 
 
 def test_wyoming_list(folder, tmp_path):
-    s, findings, output = brought_in(folder, wyoming(tmp_path / "wal.txt"))
-    assert "wind-direction-converted" in findings
-    assert "levels left out" in output
+    s, codes, output = brought_in(folder, wyoming(tmp_path / "wal.txt"))
+    assert "wind-direction-converted" in codes
+    assert re.search(r"\b0 levels\b", output)  # none is left out
     # a knot is 0.5144 m/s; from 30 deg the air goes to 210 deg
     assert s.wind_north_mps[0] == pytest.approx(-14 * 0.514444 * np.cos(np.deg2rad(30)), rel=1e-5)
     assert s.wind_east_mps[0] == pytest.approx(-14 * 0.514444 * np.sin(np.deg2rad(30)), rel=1e-5)
@@ -86,17 +86,17 @@ def test_wind_by_components_of_where_it_goes(folder, tmp_path):
     table = pd.DataFrame({"alt_km": np.arange(0.0, 60.0, 5.0)})
     table = table.assign(density_kgpm3=1.2 * np.exp(-table.alt_km / 7.2), temp_K=250.0, u_mps=5.0, v_mps=-3.0)
     table.to_csv(tmp_path / "rocketsonde.csv", index=False)
-    s, findings, _ = brought_in(folder, tmp_path / "rocketsonde.csv")
-    assert "wind-direction-converted" not in findings
+    s, codes, _ = brought_in(folder, tmp_path / "rocketsonde.csv")
+    assert "wind-direction-converted" not in codes
     assert (s.wind_east_mps == 5.0).all()
     assert (s.wind_north_mps == -3.0).all()
 
 
 def test_delivered_composite_is_declared_as_it_stands(folder):
-    s, findings, _ = brought_in(folder, PACKAGE / "met_composite.csv")
+    s, codes, _ = brought_in(folder, PACKAGE / "met_composite.csv")
     delivered = pd.read_csv(PACKAGE / "met_composite.csv")
     np.testing.assert_array_equal(s.density_kgpm3, delivered["DENSITY (kg/m3)"])
-    assert "wind-direction-converted" in findings
+    assert "wind-direction-converted" in codes
     assert (folder / "telemetry" / "met_composite.csv").read_bytes() == (PACKAGE / "met_composite.csv").read_bytes()
 
 
@@ -118,8 +118,8 @@ def test_rocketsonde_with_german_names_and_a_time_column(folder, tmp_path):
 @pytest.mark.parametrize("name", ["KWAL_19990504_00Z", "KEPZ_19990504_00Z"])
 def test_radiosondes(name, folder):
     path = Path(str(REAL)) / "soundings" / f"{name}.csv"
-    s, findings, _ = brought_in(folder, path)
-    assert "wind-direction-converted" in findings
+    s, codes, _ = brought_in(folder, path)
+    assert "wind-direction-converted" in codes
     table = pd.read_csv(path)
     # the station's own components say where the air goes
     wind = table[table.from_deg.notna() & table.h_m.between(500, 16000)]
@@ -132,4 +132,4 @@ def test_radiosondes(name, folder):
     weight = 9.80665 / (1.0 + s.altitude_m / 6356766.0) ** 2 * s.density_kgpm3 / s.pressure_pa
     ratio = fall / (0.5 * (weight[1:] + weight[:-1]))
     assert np.median(ratio[thick]) == pytest.approx(1.0, abs=0.005)
-    assert re.search("density by gas law with the dew point", (folder / "flight.toml").read_text())
+    assert "dew point" in (folder / "flight.toml").read_text()

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 
 import jsonschema
@@ -15,6 +16,7 @@ from flightmodel import aerodynamics, flightfile, geometry, instruments, vehicle
 from flightmodel.tables import Source
 from postflight.cli import cli
 from postflight.intake.flight_form import KINDS, model, schema, template, template_keys
+from recon.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 TABLES = {
@@ -69,7 +71,8 @@ def test_template_names_every_key_with_its_default(kind, table):
         t.split(".")[len(table.split(".")) if table else 0] for t in TABLES[kind] if t != table and t.startswith(table)
     }
     shared = EVERY_TABLE | {"position_from_datum_body_m", "axes"} if issubclass(model, Source) else set()
-    missing = set(model.model_fields) - set(lines) - below - shared
+    settings = {"reconstruction"} if not table else set()  # tested below: no model of pydantic
+    missing = set(model.model_fields) - set(lines) - below - shared - settings
     assert not missing
     assert set(lines) <= set(model.model_fields)
     for key, (value, comment) in lines.items():
@@ -84,6 +87,19 @@ def test_template_names_every_key_with_its_default(kind, table):
             assert default == (stated,) * 3
         else:
             assert stated == default, key
+
+
+def test_template_names_every_setting_of_the_reconstruction_with_its_default():
+    lines = {
+        key: (value, comment) for where, key, value, comment in template_keys("flight") if where == "reconstruction"
+    }
+    assert set(lines) == {setting.name for setting in fields(Settings)}
+    stated = {key: tomllib.loads(f"v = {value}")["v"] for key, (value, _) in lines.items()}
+    Settings.from_mapping(stated)  # examples are allowed values
+    usual = Settings()
+    assert not [
+        k for k, (_, comment) in lines.items() if not comment.endswith("e.g.") and stated[k] != getattr(usual, k)
+    ]
 
 
 def test_new_folder_says_what_is_still_to_fill_in(tmp_path):

@@ -16,7 +16,7 @@ from flightmodel.trajectory import Trajectory
 from postflight import product, run_folder
 from postflight.deflections import Deflections
 from postflight.flight import read_flight
-from postflight.reconstruction import reconstruct
+from postflight.reconstruction import bet_table, reconstruct
 
 DOCS = Path(__file__).parents[2] / "docs" / "bet-product.md"
 
@@ -25,7 +25,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "bet-product.md"
 def short(clean_flight):
     """The hand-made flight: ten seconds, no physics asked."""
     flight = reconstruct(read_flight(clean_flight.root))
-    return flight, product.bet_table(flight)
+    return flight, bet_table(flight)
 
 
 def documented() -> list[str]:

@@ -5,7 +5,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from postflight.reconciliation.candidate import (
+
+from flightmodel import earth, rotations
+from flightmodel.atmosphere import profile_from_sounding, standard_sounding
+from flightmodel.trajectory import resample
+from postflight.reconciliation.forward_model import (
     DAMPING_LOG_SD,
     HARDENING_AT_RAD,
     HARDENING_SD,
@@ -14,15 +18,13 @@ from postflight.reconciliation.candidate import (
     STIFFNESS_LOG_SD,
     WINDOW_S,
     WINDOWS,
-    AirUnknowns,
-    Observed,
-    VehicleUnknowns,
+    AtmosphereParameters,
+    Measurements,
+    SpanFlights,
+    VehicleParameters,
+    _start_states,
 )
-from postflight.reconciliation.problem import Flights, Problem, _start_states
-
-from flightmodel import earth, rotations
-from flightmodel.atmosphere import profile_from_sounding, standard_sounding
-from flightmodel.trajectory import resample
+from postflight.reconciliation.gauss_newton import Problem
 from synthetic_flight import dynamics
 from synthetic_flight.simulate import ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, fly
 from tests.estimators.test_closure import EPOCH, START_S, VEHICLE, start
@@ -63,13 +65,13 @@ def problem():
     response[1:, :, 3:6] = 0.01 * np.einsum("kj,ij->kij", np.eye(3), np.eye(3))
     middle = START_S + SPAN_S * (np.arange(SPANS) + 0.5)
     pressure, altitude = (np.interp(middle, truth.time_s, x) for x in (truth.dynamic_pressure_pa, truth.altitude_m))
-    observed = Observed(
+    observed = Measurements(
         at, pressure, altitude,
         begin + 0.5 * WINDOW_S, means(rate, begin), means(force, begin), 1e-4, 1e-2, response, response, LATE_S, sensor,
         np.full(6, 0.1),
     )  # fmt: skip
-    air = AirUnknowns(standard_sounding(), float(truth.altitude_m.min()))
-    return Problem(observed, VehicleUnknowns(VEHICLE), air)
+    air = AtmosphereParameters(standard_sounding(), float(truth.altitude_m.min()))
+    return Problem(observed, VehicleParameters(VEHICLE), air)
 
 
 @cache
@@ -86,8 +88,8 @@ def true_unknowns():
 
 def test_spans_flown_from_the_truth_read_and_end_as_the_truth():
     one, u = problem(), true_unknowns()
-    read = one.predicted(u)
-    seen = one.observed
+    read = one.predict(u)
+    seen = one.measured
     # steps of 4 ms and Simpson's mean of three records: 2e-5 of swings of 0.5 rad/s and 30 m/s^2 at 3 Hz; about x the
     # joint twists at 15 Hz, of which Simpson's rule misses 5 %
     np.testing.assert_allclose(read.windows[..., 1:3], seen.rate_radps[..., 1:], atol=2e-5)
@@ -105,35 +107,35 @@ def test_spans_start_with_the_datum_where_it_was_reconstructed():
     one, u = problem(), true_unknowns()
     spans = np.arange(SPANS)
     zero = np.zeros_like(spans)
-    flights = Flights(spans, zero, u.motion, zero, [one.candidate(u.vehicle)], [])
-    state = _start_states(one.observed, flights)
+    flights = SpanFlights(spans, zero, u.motion, zero, [one.trial_vehicle(u.vehicle)], [])
+    state = _start_states(one.measured, flights)
     place, velocity = dynamics.points(state, VEHICLE)["body"]
     back = rotations.rotate(state[:, 6:10], np.tile(-VEHICLE.centerbody.cg_m, (SPANS, 1)))
     swing = np.cross(rotations.rotate(state[:, 6:10], state[:, 14:17]), back)
-    to_ecef = earth.q_ecef_eci(one.observed.start.time_s[:-1])
+    to_ecef = earth.q_ecef_eci(one.measured.start.time_s[:-1])
     r = rotations.rotate(to_ecef, place + back)
     v = rotations.rotate(to_ecef, velocity + swing) - np.cross(earth.OMEGA_ECEF_RADPS, r)
-    np.testing.assert_allclose(r, one.observed.start.position_ecef_m[:-1], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(r, one.measured.start.position_ecef_m[:-1], rtol=0.0, atol=1e-6)
     # the arm of 0.4 m turns with the rate against inertial space: the Earth's share of that is 3e-5 m/s
-    np.testing.assert_allclose(v, one.observed.start.velocity_ecef_mps[:-1], rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(v, one.measured.start.velocity_ecef_mps[:-1], rtol=0.0, atol=1e-4)
 
 
 def test_a_late_clock_shows_what_was_earlier():
     # readings with tags that are late by a standard deviation of each clock leave nothing once that is taken for true
     one, u = problem(), true_unknowns()
-    begin = one.observed.time_s - 0.5 * WINDOW_S
+    begin = one.measured.time_s - 0.5 * WINDOW_S
     truth = flown()
     inside = begin[1:-1] if SPANS > 2 else begin
     rate = means(truth.state_eci[:, 14:17], inside - LATE_S[0])
-    force = means(truth.specific_force_body(one.observed.accelerometer_m), inside - LATE_S[1])
-    read = one.predicted(u)
+    force = means(truth.specific_force_body(one.measured.accelerometer_m), inside - LATE_S[1])
+    read = one.predict(u)
     late = u.instruments.copy()
     late[18:20] = 1.0
-    shown = read.windows + one.instrument_rows(read) @ late
+    shown = read.windows + one.instrument_response(read) @ late
     # slopes are those of windows' ends: of a signal of 3 Hz over 40 ms they miss 2.4 %; second order of 1 ms 1 %
     for part, want, own in (
-        (slice(1, 3), rate[..., 1:], one.observed.rate_radps[1:-1, :, 1:]),
-        (slice(4, 6), force[..., 1:], one.observed.specific_force_mps2[1:-1, :, 1:]),
+        (slice(1, 3), rate[..., 1:], one.measured.rate_radps[1:-1, :, 1:]),
+        (slice(4, 6), force[..., 1:], one.measured.specific_force_mps2[1:-1, :, 1:]),
     ):
         left = np.abs(shown[1:-1][..., part] - want).max()
         assert left < 0.08 * np.abs(own - want).max()
@@ -149,30 +151,30 @@ def test_the_cost_falls_along_the_right_hand_side():
         instruments=0.5 * rng.standard_normal(20),
         air=0.02 * rng.standard_normal(u.air.shape) * np.array([[0.1], [10.0], [10.0]]),
     )
-    linear = one.linear(u)
-    right = one.right(u, linear, linear.found)
+    linear = one.linearize(u)
+    right = one.right_hand_side(u, linear, linear.residuals)
     assert len(right) == one.count
     first_air = one.first_instrument + 20
     for k in (0, 2, one.first_instrument, one.first_instrument + 18, first_air, one.first_motion + 1):
         step = np.zeros(one.count)
         step[k] = 1e-5
-        up, down = (one.residuals(u.moved(side * step)).cost for side in (1.0, -1.0))
+        up, down = (one.residuals(u.plus(side * step)).cost for side in (1.0, -1.0))
         slope = (up - down) / 2e-5
         assert slope == pytest.approx(-2.0 * right[k], rel=0.02, abs=1e-3 * np.abs(right).max()), k
     # the priors alone, exactly
     priors = one.prior_cost(u)
     assert priors > 0.0
-    nothing = replace(linear.found, sensors=0.0 * linear.found.sensors, joins=0.0 * linear.found.joins)
-    pull = one.right(u, linear, nothing)
+    nothing = replace(linear.residuals, sensors=0.0 * linear.residuals.sensors, joins=0.0 * linear.residuals.joins)
+    pull = one.right_hand_side(u, linear, nothing)
     for k in (1, one.first_instrument + 3, first_air + 2):
         step = np.zeros(one.count)
         step[k] = 1e-3
-        up, down = (one.prior_cost(u.moved(side * step)) for side in (1.0, -1.0))
+        up, down = (one.prior_cost(u.plus(side * step)) for side in (1.0, -1.0))
         assert (up - down) / 2e-3 == pytest.approx(-2.0 * pull[k], rel=1e-6)
 
 
 def vehicle_at(laws=(), **moved):
-    unknown = VehicleUnknowns(VEHICLE, laws)
+    unknown = VehicleParameters(VEHICLE, laws)
     x = np.zeros(len(unknown.names))
     for name, value in moved.items():
         x[unknown.names.index(name.replace("_", " ").replace("cg", "c.g."))] = value
@@ -194,7 +196,7 @@ def test_unknowns_move_what_their_names_say():
     )
     # the whole vehicle's offset; a shell that is heavy to one side leaves it where it is
     for shell_side in (0.0, 2.0):
-        unknown = VehicleUnknowns(VEHICLE)
+        unknown = VehicleParameters(VEHICLE)
         x = np.zeros(len(unknown.names))
         x[unknown.names.index("offset y")], x[unknown.names.index("shell's c.g. y")] = 1.0, shell_side
         np.testing.assert_allclose(unknown.vehicle(x).cg_m[1:] - told.cg_m[1:], [OFFSET_SD_M, 0.0], atol=1e-15)
@@ -205,7 +207,7 @@ def test_unknowns_move_what_their_names_say():
 
 
 def test_the_air_s_table_holds_the_difference_at_and_between_its_rows():
-    air = AirUnknowns(standard_sounding(), 43e3)
+    air = AtmosphereParameters(standard_sounding(), 43e3)
     difference = np.zeros((3, len(air.knots_m)))
     difference[0] = 0.1 * np.sin(air.knots_m / 3e3)
     difference[1] = 7.0
@@ -221,7 +223,7 @@ def test_the_air_s_table_holds_the_difference_at_and_between_its_rows():
 
 def test_the_sounding_s_errors_are_half_constant():
     # the precision is that of a covariance whose far corners stay at half the variance
-    air = AirUnknowns(standard_sounding(), 60e3)
+    air = AtmosphereParameters(standard_sounding(), 60e3)
     at = profile_from_sounding(standard_sounding()).at(air.knots_m)
     for kind, (sd, length) in enumerate(((at.density_sd, 5000.0), (at.wind_sd_mps, 3000.0), (at.wind_sd_mps, 3000.0))):
         covariance = np.linalg.inv(air.precision[kind])

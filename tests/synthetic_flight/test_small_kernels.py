@@ -8,6 +8,7 @@ import pytest
 from flightmodel import earth, rotations
 from synthetic_flight import _kernels, dynamics, simulate
 from synthetic_flight.simulate import integrate
+from tests.oracles import two_body
 
 from .test_dynamics import entry_45_km, kernel_rates, windy
 
@@ -27,14 +28,14 @@ def test_rates_are_those_of_the_readable_form(generic_vehicle, theta_deg):
     state, profile = bent_by(entry_45_km(), generic_vehicle, np.deg2rad(theta_deg)), windy()
     state[:3] *= 1.0 + 17.0 / np.linalg.norm(state[:3])  # between two rows of the air's table
     got, aux = kernel_rates(state, generic_vehicle, simulate.atmosphere_table(profile))
-    force, _ = dynamics.aerodynamics(state, generic_vehicle, profile)
+    force, _ = two_body.aerodynamics(state, generic_vehicle, profile)
     # log density is linear between rows: half way it errs by its curvature, 0.1 / (7 km)^2, times (50 m)^2 / 8: 6e-7
     np.testing.assert_allclose(aux[12:15], force, rtol=1e-6, atol=1e-9 * np.linalg.norm(force))
-    want = dynamics.rates(state, generic_vehicle, dynamics.flight_loads(state, generic_vehicle, profile))
+    want = two_body.rates(state, generic_vehicle, two_body.flight_loads(state, generic_vehicle, profile))
     for part in PARTS:  # loads a millionth off move each body's rates by as much of what the loads do
         assert np.linalg.norm(got[part] - want[part]) < 2e-6 * max(np.linalg.norm(want[part]), 1.0)
     airless, _ = kernel_rates(state, generic_vehicle, simulate.vacuum_table())
-    want = dynamics.rates(state, generic_vehicle, dynamics.flight_loads(state, generic_vehicle, None))
+    want = two_body.rates(state, generic_vehicle, two_body.flight_loads(state, generic_vehicle, None))
     np.testing.assert_allclose(airless, want, rtol=1e-11, atol=1e-11)
 
 
@@ -46,7 +47,7 @@ def test_a_locked_joint_makes_one_rigid_body(generic_vehicle):
     )  # one rate
     got, aux = kernel_rates(state, generic_vehicle, simulate.atmosphere_table(profile), locked=True)
     about = dynamics.offsets(state, generic_vehicle)
-    loads = dynamics.flight_loads(state, generic_vehicle, profile)
+    loads = two_body.flight_loads(state, generic_vehicle, profile)
     w = rotations.rotate(state[6:10], state[14:17])
     inertia, moment = np.zeros((3, 3)), loads.moment_shell_nm.copy()
     for part, name, q, force in (
@@ -130,7 +131,7 @@ def test_a_locked_joint_carries_the_difference_of_gravity(generic_vehicle):
     state = entry_45_km()
     state[14:20] = 0.0
     got, aux = kernel_rates(state, generic_vehicle, simulate.vacuum_table(), locked=True)
-    about, loads = dynamics.offsets(state, generic_vehicle), dynamics.flight_loads(state, generic_vehicle, None)
+    about, loads = dynamics.offsets(state, generic_vehicle), two_body.flight_loads(state, generic_vehicle, None)
     turn = rotations.rotate(state[6:10], got[14:17])
     body = generic_vehicle.centerbody
     want = body.mass_kg * (got[3:6] + np.cross(turn, about["body"][0])) - loads.force_body_n
