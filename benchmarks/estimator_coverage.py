@@ -52,7 +52,12 @@ KEPT = "/tmp/estimator_coverage"
 COEFFICIENT_SD = {"ca": 0.05, "cn": 0.10, "cm": 0.15}
 CMQ_SD = 0.15
 RATE_HZ = 20.0
-STATED = ("vehicle", "force_clock_sd_s", "rate_clock_sd_s", "cg_from_sensor_m")  # the same in every flight
+STATED = (
+    "vehicle",
+    "accelerometer_time_bias_sd_s",
+    "gyro_time_bias_sd_s",
+    "cg_from_sensor_m",
+)  # the same in every flight
 ARRAYS = [f.name for f in fields(FlightLoads) if f.name not in STATED]
 CAMERA_SD = {"clean": np.deg2rad(0.15), "degraded": np.deg2rad(0.40)}
 CAMERA_CLOCK = np.deg2rad(153.0)

@@ -77,5 +77,5 @@ def test_structure_between_knots_keeps_a_wind_from_being_known_better():
     k = len(height)
     table = atmosphere._profile(model, height, np.zeros(3 * k), np.full(3 * k, 1e-6))
     # half of the variance forgets: about a knot, between neighbours a km apart, a third of its first-order loss
-    left = np.sqrt((1.0 - atmosphere.CONSTANT_PART) * atmosphere._KNOT_M / (3.0 * atmosphere.WIND_LENGTH_M))
+    left = np.sqrt(0.5 * 1000.0 / (3.0 * 3000.0))
     np.testing.assert_allclose(table.wind_north_sd_mps / table.wind_prior_sd_mps, left, rtol=1e-3)

@@ -89,7 +89,7 @@ def test_wander_keeps_its_stated_size():
     wander = Wander(tau, length, sd, walk, np.zeros(4, dtype=bool))
     decay, new = np.empty(4), np.empty(4)
     for dt, climb in ((0.5, 30.0), (7.0, 900.0)):
-        assert _filter_kernels.forget(wander, dt, climb, decay, new)
+        assert _filter_kernels.decay_and_noise(wander, dt, climb, decay, new)
         forgets = [0, 1, 3]
         np.testing.assert_allclose((decay**2 * sd**2 + new)[forgets], sd[forgets] ** 2, rtol=1e-12)
         np.testing.assert_allclose(-np.log(decay[forgets]), (dt / tau + climb / length)[forgets], rtol=1e-12)
