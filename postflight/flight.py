@@ -22,7 +22,6 @@ from flightmodel.vehicle import Vehicle
 from recon.settings import Settings
 
 PULSE_RATE_HZ = 50.0
-COEFFICIENT = {"c_a": 0, "c_n": 1, "c_m": 2}  # column of the coefficient table
 SETTINGS = {f.name for f in fields(Settings)}
 
 
@@ -225,11 +224,8 @@ def _vehicle_of(telemetry: Telemetry, name: str) -> Vehicle:
 
 
 def _coefficient(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
-    vehicle, factor = _vehicle_of(telemetry, name), np.ones(4)
-    factor[COEFFICIENT[name]] = _number(name, value, 0.0, 10.0)
-    aero = vehicle.aero
-    free = None if aero.free_molecular is None else aero.free_molecular * factor
-    aero = replace(aero, coefficients=aero.coefficients * factor, free_molecular=free)
+    vehicle = _vehicle_of(telemetry, name)
+    aero = vehicle.aero.scaled(**{name.replace("_", ""): _number(name, value, 0.0, 10.0)})
     return replace(telemetry, vehicle=replace(vehicle, aero=aero))
 
 

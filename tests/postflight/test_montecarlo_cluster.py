@@ -51,9 +51,10 @@ def test_three_workers_make_the_same_bytes(reference, path, cluster, tmp_path):
 @pytest.mark.slow
 def test_a_killed_worker_costs_its_chunk_only(reference, path, cluster, tmp_path, monkeypatch):
     study, folder, come = read_study(str(path)), tmp_path / "study", []
+    fly_jobs = execution.fly_jobs
 
     def killing(*arguments):
-        for number, chunk in execution.fly_jobs(*arguments):
+        for number, chunk in fly_jobs(*arguments):
             come.append(number)
             if len(come) == 3:
                 with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:

@@ -61,7 +61,9 @@ def test_partials_are_derivatives(observed):
             h = 1e-9 if one.is_field and j in (0, 1, 2, *range(12, len(one.terms))) else 1e-5
             moved = slope(lambda _: q, lambda _: rate, lambda s, k=term: errors + s * np.eye(len(errors))[k], h)
             scale = max(np.abs(line.by_errors[:, :, j]).max(), 1e-3 * size)
-            assert np.abs(moved - line.by_errors[:, :, j]).max() < 1e-3 * scale, (one.name, j)
+            # a head's azimuth bias is a distance normal to the line of sight: its change with elevation is left out
+            bias = 0.0 if one.is_field else np.abs(errors[one.terms[:2]]).max()
+            assert np.abs(moved - line.by_errors[:, :, j]).max() < (1e-3 + bias) * scale, (one.name, j)
 
 
 def test_sensors_are_predicted_as_the_filter_predicts_them(observed):

@@ -43,7 +43,7 @@ def days(tmp_path_factory: pytest.TempPathFactory):
         folder = root / str(seed)
         truth = simulate_to_folder(scenario, seed, folder)
         wrong = np.random.default_rng(seed).standard_normal(2) * [CA_SD, CN_SD]
-        flight = reconstruct(Flight(with_coefficients)(read_flight(folder), *np.exp(wrong)))
+        flight = reconstruct(Flight(with_coefficients(read_flight(folder), *np.exp(wrong))))
         out.append((flight, truth.profile, wrong))
     return out
 

@@ -11,11 +11,11 @@ LEAST_PICTURES = {
     "real_rockets": 3,
     "flight_and_invariants": 2,
     "bet_and_how_we_know": 2,
-    "seeing_the_shell_bend": 3,
+    "deflection_by_video": 3,
     "three_methods_one_answer": 1,
     "the_joint_that_explains_the_flight": 2,
 }
-FLOWN = {"seeing_the_shell_bend", "three_methods_one_answer"}  # read this suite's own flight
+FLOWN = {"deflection_by_video", "three_methods_one_answer"}  # read this suite's own flight
 
 
 @pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda p: p.stem)
