@@ -14,7 +14,7 @@ from flightmodel.atmosphere import standard_atmosphere, standard_sounding
 from flightmodel.instruments import TriadSpec
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight import loads, product, reconstruction
+from postflight import loads, reconstruction
 from postflight.checks import inertial
 from postflight.checks.pressure_and_field import field_rotation
 from postflight.checks.track_force import _compare, track_force
@@ -176,7 +176,7 @@ def test_inertial_velocity_errs_with_the_place_by_the_earth_s_turning():
     assert made["vz_eci_sd_mps"][0] == pytest.approx(1e-4, rel=1e-4)
     # rates: what was estimated of the errors, and a sample's own noise
     flight = SimpleNamespace(solution=bet, telemetry=SimpleNamespace(rates=rates))
-    np.testing.assert_allclose(product._rate_sd(flight), 0.05)
+    np.testing.assert_allclose(reconstruction._rate_sd(flight), 0.05)
 
 
 def test_force_coefficients_scatter_as_they_say():
