@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from flightmodel import aerodynamics, flightfile, geometry, instruments, vehicle
 from flightmodel.tables import Source
 from postflight.cli import cli
+from postflight.flight import PULSE_RATE_HZ
 from postflight.intake.flight_form import KINDS, model, schema, template, template_keys
 from recon.settings import Settings
 
@@ -96,7 +97,7 @@ def test_template_names_every_setting_of_the_reconstruction_with_its_default():
     assert set(lines) == {setting.name for setting in fields(Settings)}
     stated = {key: tomllib.loads(f"v = {value}")["v"] for key, (value, _) in lines.items()}
     Settings.from_mapping(stated)  # examples are allowed values
-    usual = Settings()
+    usual = Settings(pulse_rate_hz=PULSE_RATE_HZ)  # as a flight has them without the section
     assert not [
         k for k, (_, comment) in lines.items() if not comment.endswith("e.g.") and stated[k] != getattr(usual, k)
     ]

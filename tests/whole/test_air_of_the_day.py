@@ -151,11 +151,8 @@ def test_gyro_scale_wrong_by_three_percent_is_named(good: Telemetry, axis: int) 
     record = good.rates
     scale = np.ones(3)
     scale[axis] = 1.03
-    found = red(
-        reconstruct(
-            Flight(replace)(good, rates=TriadRecord(record.spec, record.time_s, record.measured_sensor * scale))
-        )
-    )
+    wrong = replace(good, rates=TriadRecord(record.spec, record.time_s, record.measured_sensor * scale))
+    found = red(reconstruct(Flight(wrong)))
     assert "rates" in found["data sheet rates"]
 
 
