@@ -8,7 +8,7 @@ write for a new error is its partial derivative in `recon._measurement_kernels`.
 
 Every error is a constant of the flight, normal about zero with the stated standard deviation, unless its row names a
 time constant: then it is first-order Gauss-Markov. Standard deviations stand in files as an analyst writes them, angles
-in degrees; records hold SI. Where each default comes from stands in ``docs/flight-folder.md``.
+in degrees; records hold SI.
 
 References
 ----------
