@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -50,6 +51,13 @@ def test_a_plane_between_sparse_answers_errs_as_it_says():
     turn = 2.0 * np.pi * at / 1.5
     true = float(np.rad2deg(lv_clock(np.array([3.0 + np.cos(turn), np.sin(turn)]))))
     assert 0.3 * sd < abs(plane - true) < 2.0 * sd
+
+
+def test_a_what_if_says_what_was_assumed(run):
+    """The first sentence names every change; a run without changes has no such sentence."""
+    assert not [line for line in texts.lead(run) if "what-if" in line]
+    changed = replace(run, facts=run.facts | {"settings": {"changes": ["c_n = 1.1", "wind = None"]}})
+    assert "c_n = 1.1; wind = None" in texts.lead(changed)[0]
 
 
 # ------------------------------------------------------------------------------------------------------- one whole file
