@@ -182,3 +182,13 @@ def test_a_reconstruction_gives_the_columns_of_the_product(bet):
     table = bet.to_frame()
     assert {"t_s", "alt_m", "mach", "dynamic_pressure_pa", "alpha_total_wind_deg"} <= set(table.columns)
     assert len(table) == len(bet.trajectory.time_s)
+
+
+def test_force_coefficients_are_mass_times_acceleration_over_pressure_and_area(flight, bet):
+    table, vehicle = bet.to_frame(), flight.vehicle
+    known = table[np.isfinite(table["c_a"])]
+    assert len(known) > 100
+    force = vehicle.mass_kg * known[["ax_cg_mps2", "ay_cg_mps2", "az_cg_mps2"]].to_numpy()
+    pressure_area = known["dynamic_pressure_pa"].to_numpy() * vehicle.reference.area_m2
+    np.testing.assert_allclose(known["c_a"], -force[:, 0] / pressure_area, rtol=1e-9)
+    np.testing.assert_allclose(known["c_n"], np.hypot(*force[:, 1:].T) / pressure_area, rtol=1e-9)
