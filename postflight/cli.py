@@ -236,7 +236,7 @@ def reconstruct(
     """Reconstruct the best-estimated trajectory of the flight in FOLDER."""
     from postflight import commands
 
-    commands.run(folder, (), commands.changes_of(settings, without, rate), sensitivity)
+    commands.run(folder, (), commands.asked(settings, without, rate), sensitivity)
 
 
 @cli.command()
@@ -286,7 +286,7 @@ def run(folder: Path, rate: float | None, settings: tuple[str, ...], without: tu
     from postflight import commands
     from postflight.deflections import METHODS
 
-    commands.run(folder, METHODS, commands.changes_of(settings, without, rate))
+    commands.run(folder, METHODS, commands.asked(settings, without, rate))
 
 
 @cli.command()

@@ -7,6 +7,7 @@ import re
 import sys
 import time
 import tomllib
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from flightmodel.camera import Lens
 from flightmodel.checks import ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, NO_VIDEO, Deflections, camera_sensitivity, estimate
-from postflight.flight import read_flight
+from postflight.flight import Flight, read_flight
 from postflight.plots import run_figures
 from postflight.plots.deflection import figure_summary
 from postflight.plots.overlay import write_overlay_film
@@ -116,9 +117,9 @@ def print_events(flown: list[Event]) -> None:
     console.print(table)
 
 
-def run(folder: Path, methods: tuple[str, ...], changes: dict[str, Any], reruns: bool = False) -> None:
+def run(folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False) -> None:
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers."""
-    bet, answers, written = run_flight(folder, methods, changes, reruns)
+    bet, answers, written = run_flight(folder, methods, wanted, reruns)
     print_flight(bet, pd.read_csv(written / "events.csv"))
     if reruns:
         print_sensitivity(pd.read_csv(written / "sensitivity.csv"))
@@ -130,7 +131,7 @@ def run(folder: Path, methods: tuple[str, ...], changes: dict[str, Any], reruns:
 
 
 def run_flight(
-    folder: Path, methods: tuple[str, ...], changes: dict[str, Any], reruns: bool = False
+    folder: Path, methods: tuple[str, ...], asked_for: Asked, reruns: bool = False
 ) -> tuple[Reconstruction, Deflections, Path]:
     """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too."""
     log: list[str] = []
@@ -145,7 +146,7 @@ def run_flight(
             return show
 
         share = 0.2 if reruns else 1.0  # of the time, for all but the reruns
-        flight = read_flight(folder, step(0.0, 0.05 * share)).with_(**changes)
+        flight = asked_for.of(read_flight(folder, step(0.0, 0.05 * share)))
         compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *(["camera"] if "camera" in methods else []))
         bet = reconstruct(flight, None, step(0.05 * share, 0.5 * share))
         wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
@@ -176,21 +177,35 @@ def run_flight(
     return bet, answers, out.path
 
 
-def changes_of(settings: tuple[str, ...], without: tuple[str, ...], rate_hz: float | None = None) -> dict[str, Any]:
-    """What-ifs of the command line: ``NAME=VALUE`` with the value written as in TOML, and sources left out."""
-    changes: dict[str, Any] = {} if rate_hz is None else {"output_rate_hz": rate_hz}
+@dataclass(frozen=True)
+class Asked:
+    """What a command line asks of a flight: changed assumptions and settings, sources left out, the output rate."""
+
+    changes: dict[str, Any] = field(default_factory=dict)
+    without: tuple[str, ...] = ()
+    rate_hz: float | None = None
+
+    def of(self, flight: Flight) -> Flight:
+        """Return the flight as asked for; sources are left out beside those that flight.toml leaves out."""
+        if self.rate_hz is not None:  # how densely it is written is no assumption
+            flight = replace(flight, settings=replace(flight.settings, output_rate_hz=self.rate_hz))
+        flight = flight.with_(**self.changes)
+        return flight.with_(without=(*flight.settings.without, *self.without)) if self.without else flight
+
+
+def asked(settings: tuple[str, ...], without: tuple[str, ...], rate_hz: float | None) -> Asked:
+    """Read ``--set NAME=VALUE`` (the value as TOML writes it), ``--without`` and ``--rate``; every fault at once."""
+    changes: dict[str, Any] = {}
     faults = []
     for text in settings:
         name, equals, value = (part.strip() for part in text.partition("="))
-        if not equals or not name:
+        if equals and name:
+            changes[name] = _toml_value(value)
+        else:
             faults.append(Fault(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
-            continue
-        changes[name] = _toml_value(value)
-    if without:
-        changes["without"] = (*changes.get("without", ()), *without)
     if faults:
         raise ConfigError(faults)
-    return changes
+    return Asked(changes, without, rate_hz)
 
 
 def _toml_value(text: str) -> Any:
@@ -384,7 +399,7 @@ def demo(folder: Path, seed: int) -> None:
     console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
     compile_kernels("simulator", "ensembles", *warmup.RECONSTRUCTION, "camera")
     simulate(REFERENCE, folder, seed, force=True)
-    bet, answers, written = run_flight(folder, METHODS, {})
+    bet, answers, written = run_flight(folder, METHODS, Asked())
     print_flight(bet, pd.read_csv(written / "events.csv"))
     for method, reason in answers.refused.items():
         console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")

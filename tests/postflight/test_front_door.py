@@ -12,6 +12,7 @@ import pytest
 import postflight as pf
 from flightmodel.checks import ConfigError
 from flightmodel.tabular import Tabular
+from postflight import commands
 
 UNITS = {"s", "m", "deg", "degps", "mps", "mps2", "pa", "k", "kgpm3", "px", "hz", "g", "nm", "j", "nms", "w", "kgm2"}
 
@@ -142,6 +143,20 @@ def test_a_tracker_left_out_is_not_used(flight):
     used = bet.solution.residuals.groupby("source")["used"].any()
     assert not used[names[0]]
     assert used[names[1]]
+
+
+def test_a_command_leaves_out_more_and_writes_at_another_rate_without_a_what_if(flight):
+    first, second = flight.telemetry.radars
+    stated = flight.with_(without=(first,))
+    asked = commands.asked(("c_n=1.1", "wind=none"), (second,), 5.0).of(stated)
+    assert asked.settings.without == (first, second)
+    assert asked.settings.output_rate_hz == 5.0
+    assert asked.changes[1:3] == ("c_n = 1.1", "wind = None")
+    assert commands.asked((), (), 5.0).of(flight).changes == ()
+    assert commands.asked((f"without={first}",), (second,), None).of(flight).settings.without == (first, second)
+    with pytest.raises(ConfigError) as refusal:
+        commands.asked(("c_n", "=1"), (), None)
+    assert refusal.value.codes == ("set-form", "set-form")
 
 
 def test_two_looks_side_by_side(bet, answer, flight):

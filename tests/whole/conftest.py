@@ -64,7 +64,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The pulse of a synthetic flight with its film, simulated and run; to be copied."""
     folder = tmp_path_factory.mktemp("short") / "flight"
     simulate_to_folder(read_scenario(str(write_pulse(folder.parent / "pulse.toml"))), SEED, folder)
-    commands.run_flight(folder, METHODS, {})
+    commands.run_flight(folder, METHODS, commands.Asked())
     return folder
 
 

@@ -43,7 +43,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "flight.toml").write_text(flight + f"\n[[events]]\nname = '{HOSTILE_EVENT}'\nt_s = 430.0\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_figures, "save", lambda *_: None)  # nobody looks at them here
-        commands.run_flight(folder, METHODS, {})
+        commands.run_flight(folder, METHODS, commands.Asked())
     return folder
 
 
@@ -96,5 +96,5 @@ def rocket(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Flight folder of a rocket that flew, without vehicle file, inertial sensors and video, with one run."""
     folder = tmp_path_factory.mktemp("rocket") / "flight"
     shutil.copytree(ROOT / "tests" / "data" / "real_flights" / "rocketpy_prometheus", folder)
-    commands.run_flight(folder, METHODS, {})
+    commands.run_flight(folder, METHODS, commands.Asked())
     return folder
