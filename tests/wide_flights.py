@@ -4,8 +4,8 @@ Spin 0 to 60 rpm, joints of 1 to 50 kN m/rad (every eighth flight's is locked), 
 8 mm in any plane, vehicles of 60 to 400 kg: the reference vehicle's shape, with lengths as the cube root of the mass
 and 10 % of their own. The analyst is told the mass properties, the offset to a millimetre, the coefficients, and the
 reference vehicle's joint whatever flies. Not told are masses, c.g.s, the two inertias of each body (each by itself) and
-the centerbody's products, the joint, the coefficients (of the sizes that the told vehicle states), start, air, and every
-instrument's errors.
+the centerbody's products, the joint, the coefficients (in the sizes that the told vehicle states), start, air, and
+every instrument's errors.
 """
 
 from __future__ import annotations
