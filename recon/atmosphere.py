@@ -346,14 +346,17 @@ def _profile(model: _Model, height: FloatArray, estimate: FloatArray, sd: FloatA
     )
     density, north, east = (slice(i * k, (i + 1) * k) for i in range(3))
     ratio = np.exp(estimate[density] * density_sd)
-    # samples determine the mean wind about a knot; the wind's structure between knots adds to its variance
-    within = unresolved_variance(_KNOT_M, WIND_LENGTH_M)
-    north_sd, east_sd = (np.sqrt(np.minimum(sd[part] ** 2 + within, 1.0)) for part in (north, east))
+    # samples determine the means about a knot; the structure between knots adds to the variance
+    lengths = DENSITY_LENGTH_M, WIND_LENGTH_M, WIND_LENGTH_M
+    own_sd, north_sd, east_sd = (
+        np.sqrt(np.minimum(sd[part] ** 2 + unresolved_variance(_KNOT_M, length), 1.0))
+        for part, length in zip((density, north, east), lengths, strict=True)
+    )
     table = pd.DataFrame(
         {
             "altitude_m": height,
             "density_ratio": ratio,
-            "density_ratio_sd": ratio * sd[density] * density_sd,
+            "density_ratio_sd": ratio * own_sd * density_sd,
             "density_ratio_prior_sd": density_sd,
             "wind_north_change_mps": estimate[north] * wind_sd,
             "wind_north_sd_mps": north_sd * wind_sd,
