@@ -2,7 +2,7 @@
 
 Run: ``python benchmarks/atmosphere_coverage.py [FLIGHTS [FIRST SEED]] [--exact-shape] [--packages FOLDER]`` (40 flights
 from seed 100). Some 4 s a flight. Flights are `tests.wide_flights`; half of the variance of C_A's error changes with
-Mach number, as the estimator assumes, or none of it with ``--exact-shape``. Scored are, every kilometre, the true
+Mach number, or none of it with ``--exact-shape``, and the analyst is told which. Scored are, every kilometre, the true
 density over the sounding's and both winds, and in every flight the C_A scale: the log of flown over told ``C_A / m`` at
 the largest dynamic pressure, since a force over a mass is what an accelerometer sees.
 
@@ -15,6 +15,7 @@ airspeed: 2 m/s across at 1 km/s are 0.1 % of density.
 import json
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +25,12 @@ from flightmodel import earth
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
-from recon.atmosphere import CA_SHAPE_PART, as_flown_atmosphere
+from recon.atmosphere import as_flown_atmosphere
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from tests.wide_flights import flown, wide_flight
 
-ENTRY_S, CONFIDENCE = 400.0, 0.999
+SHAPE_PART, ENTRY_S, CONFIDENCE = 0.5, 400.0, 0.999
 
 
 def as_flown(telemetry):
@@ -67,10 +68,12 @@ def wide(seed, shape_part):
     return errors_of(found, true.density_kgpm3 / told.density_kgpm3, wind, ca), red(found)
 
 
-def package(folder):
+def package(folder, shape_part):
     """Errors of one flight of another simulator, and its red checks."""
     telemetry = read_flight(folder)
-    found, sounded = as_flown(telemetry)
+    vehicle = telemetry.required_vehicle()
+    known = vehicle.uncertainty.model_copy(update={"ca_shape_part": shape_part})
+    found, sounded = as_flown(replace(telemetry, vehicle=replace(vehicle, uncertainty=known)))
     truth = np.genfromtxt(folder / "truth" / "truth.csv", delimiter=",", names=True)
     truth = truth[truth["t_s"] > ENTRY_S]
     about = json.loads((folder / "truth" / "summary.json").read_text())
@@ -84,7 +87,7 @@ def package(folder):
     order = np.argsort(altitude)
     at = found.profile.altitude_m.to_numpy()
     mass = about["vehicle"]["mass_shell"] + about["vehicle"]["mass_body"]
-    ca = np.log(about["coefficient_factors"]["CA"] * telemetry.required_vehicle().mass_kg / mass)
+    ca = np.log(about["coefficient_factors"]["CA"] * vehicle.mass_kg / mass)
     return errors_of(found, np.interp(at, altitude[order], ratio[order]), None, ca), red(found)
 
 
@@ -110,7 +113,7 @@ def option(name):
 def main():
     numbers = [int(a) for a in sys.argv[1:] if a.isdigit()]
     count, first = numbers + [40, 100][len(numbers) :]
-    shape_part = 0.0 if "--exact-shape" in sys.argv else CA_SHAPE_PART
+    shape_part = 0.0 if "--exact-shape" in sys.argv else SHAPE_PART
     flights = []
     for seed in range(first, first + count):
         try:
@@ -124,7 +127,7 @@ def main():
     packages = option("--packages")
     if packages:
         names = sorted(p.parent.parent for p in Path(packages).glob("*/truth/truth.csv"))
-        scored = [package(folder) for folder in names]
+        scored = [package(folder, shape_part) for folder in names]
         report("flights of another simulator", scored)
         for folder, (found, names_red) in zip(names, scored, strict=True):
             (error, sd), density = found["C_A scale"][0], found["density"]

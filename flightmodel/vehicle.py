@@ -115,7 +115,8 @@ class CompliantJoint(Section):
 class Uncertainty(Section):
     """What is known of the vehicle before flight, one standard deviation; fractions where no unit is named.
 
-    Mass, c.g. and inertia are each body's own; C_mq's is absolute.
+    Mass, c.g. and inertia are each body's own; C_mq's is absolute. ``ca_shape_part`` is the part of the variance of C_A
+    that changes with Mach number; the rest is one factor at all of them.
     """
 
     mass: Fraction = 0.01
@@ -123,6 +124,7 @@ class Uncertainty(Section):
     cg_lateral_m: Metres = 0.001
     inertia: Fraction = 0.03
     ca: Fraction = 0.03
+    ca_shape_part: Fraction = 0.5
     cn: Fraction = 0.07
     cm: Fraction = 0.10
     cmq: Annotated[float, Field(ge=0.0, le=10.0)] = 0.15

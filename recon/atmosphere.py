@@ -32,7 +32,6 @@ from flightmodel.aerodynamics import AeroTable
 from flightmodel.airdata import lateral_angles
 from flightmodel.atmosphere import (
     DENSITY_LENGTH_M,
-    SOUNDING_CONSTANT_PART,
     WIND_LENGTH_M,
     AtmosphereProfile,
     sounding_correlation,
@@ -53,10 +52,9 @@ _LEAST_SAMPLES = 20
 # of the deceleration, axial and lateral: model error of coefficients and of an oscillating joint
 _AXIAL_PART, _LATERAL_PART, _MODEL_FLOOR_MPS2 = 0.01, 0.02, 0.03
 _FLEXURE_SD = (1.0, 0.3, *[float(np.deg2rad(3.0))] * 4)  # gain, growth, offsets
-# C_A's error: the part of its variance that changes with Mach number, and the ratio of Mach numbers over which that
-# forgets: about a flow regime, as the sources of coefficients (ranges, tunnels, CFD) change with it; assumed, the part
-# as a sounding's
-CA_SHAPE_PART, CA_SHAPE_LENGTH = 1.0 - SOUNDING_CONSTANT_PART, float(np.log(2.0))
+# log of the ratio of Mach numbers over which the error of C_A's shape forgets: about a flow regime, as the sources of
+# coefficients (ranges, tunnels, CFD) change from one to the next; assumed
+CA_SHAPE_LENGTH = float(np.log(2.0))
 _KNOT_LOG_MACH, _LEAST_MACH = 0.1, 0.1
 _BAD_AIR = "is beyond the sounding's uncertainty: the air differed from the sounding, or the drag coefficient is wrong"
 _BAD_DRAG = "is beyond the pre-flight uncertainty: check mass, area and coefficients"
@@ -346,17 +344,14 @@ def _profile(model: _Model, height: FloatArray, estimate: FloatArray, sd: FloatA
     )
     density, north, east = (slice(i * k, (i + 1) * k) for i in range(3))
     ratio = np.exp(estimate[density] * density_sd)
-    # samples determine the means about a knot; the structure between knots adds to the variance
-    lengths = DENSITY_LENGTH_M, WIND_LENGTH_M, WIND_LENGTH_M
-    own_sd, north_sd, east_sd = (
-        np.sqrt(np.minimum(sd[part] ** 2 + unresolved_variance(_KNOT_M, length), 1.0))
-        for part, length in zip((density, north, east), lengths, strict=True)
-    )
+    # samples determine the mean wind about a knot; the wind's structure between knots adds to its variance
+    within = unresolved_variance(_KNOT_M, WIND_LENGTH_M)
+    north_sd, east_sd = (np.sqrt(np.minimum(sd[part] ** 2 + within, 1.0)) for part in (north, east))
     table = pd.DataFrame(
         {
             "altitude_m": height,
             "density_ratio": ratio,
-            "density_ratio_sd": ratio * own_sd * density_sd,
+            "density_ratio_sd": ratio * sd[density] * density_sd,
             "density_ratio_prior_sd": density_sd,
             "wind_north_change_mps": estimate[north] * wind_sd,
             "wind_north_sd_mps": north_sd * wind_sd,
@@ -517,7 +512,7 @@ def as_flown_atmosphere(
         float(np.hypot(known.ca, known.mass)),
         float(np.hypot(known.cn, known.mass)),
         vehicle.reference.length_m,
-        float(np.sqrt(CA_SHAPE_PART) * known.ca),
+        float(np.sqrt(known.ca_shape_part) * known.ca),
     )
     return reconstruct_air(_air_samples(telemetry, bet), profile, drag, confidence)
 

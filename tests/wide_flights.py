@@ -5,7 +5,8 @@ Spin 0 to 60 rpm, joints of 1 to 50 kN m/rad (every eighth flight's is locked), 
 and 10 % of their own. The analyst is told the mass properties, the offset to a millimetre, the coefficients, and the
 reference vehicle's joint whatever flies. Not told are masses, c.g.s, the two inertias of each body (each by itself) and
 the centerbody's products, the joint, the coefficients (in the sizes that the told vehicle states), start, air, and
-every instrument's errors. With ``ca_shape_part``, so much of the variance of C_A's error changes with Mach number.
+every instrument's errors. The analyst knows what part of the variance of C_A's error changes with Mach number: none,
+or ``ca_shape_part``.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ def wide_flight(seed: int, ca_shape_part: float = 0.0) -> WideFlight:
     """Draw one flight; any ``ca_shape_part`` leaves all other draws as they are."""
     rng = np.random.default_rng([seed, 18, 2009])
     told = _told(rng)
+    told = replace(told, uncertainty=told.uncertainty.model_copy(update={"ca_shape_part": ca_shape_part}))
     flown, factors = _flown(told, rng, np.sqrt(1.0 - ca_shape_part))
     shape = np.sqrt(ca_shape_part) * told.uncertainty.ca * _unit_shape(np.random.default_rng([seed, 5, 18, 2009]))
     if ca_shape_part > 0.0:
