@@ -3,8 +3,8 @@
 Run: ``python benchmarks/atmosphere_coverage.py [FLIGHTS [FIRST SEED]] [--exact-shape] [--packages FOLDER]`` (40 flights
 from seed 100). Some 4 s a flight. Flights are `tests.wide_flights`; half of the variance of C_A's error changes with
 Mach number, or none of it with ``--exact-shape``, and the analyst is told which. Scored are, every kilometre, the true
-density over the sounding's and both winds, and in every flight the C_A scale: the log of flown over told ``C_A / m`` at
-the largest dynamic pressure, since a force over a mass is what an accelerometer sees.
+density over the sounding's and both winds, and in every flight the C_A scale: the log of flown over told ``C_A / m``,
+mean over the pressure pulse, since a force over a mass is what an accelerometer sees.
 
 ``--packages`` scores flights of another simulator too: each a flight folder with ``truth/truth.csv`` (``t_s``, ECEF
 position and velocity, ``dynamic_pressure_pa``) and ``truth/summary.json`` (``coefficient_factors``, ``vehicle`` with
@@ -62,8 +62,9 @@ def wide(seed, shape_part):
     found, sounded = as_flown(telemetry)
     altitude = found.profile.altitude_m.to_numpy()
     true, told = truth.profile.at(altitude), sounded.at(altitude)
-    peak_mach = found.drag.mach[found.drag.dynamic_pressure_pa.idxmax()]
-    ca = np.log(one.ca_factor(peak_mach) * one.told.mass_kg / one.flown.mass_kg)
+    q = found.drag.dynamic_pressure_pa
+    in_pulse = found.drag.mach[q >= 0.5 * q.max()].to_numpy()
+    ca = np.log(one.ca_factor(in_pulse) * one.told.mass_kg / one.flown.mass_kg).mean()
     wind = (true.wind_ned_mps - told.wind_ned_mps)[:, :2]
     return errors_of(found, true.density_kgpm3 / told.density_kgpm3, wind, ca), red(found)
 

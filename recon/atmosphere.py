@@ -257,12 +257,12 @@ def reconstruct_air(
     estimate, covariance, residual = _least_squares(model, blocks, information)
     sd = np.sqrt(np.diag(covariance))
     rows = slice(3 * len(height), 3 * len(height) + len(_PARAMETERS))
-    own, own_sd = estimate[rows], sd[rows]
-    own[0], own_sd[0] = _ca_at_peak(model, drag_ratio, blocks, estimate, covariance)
+    own, own_sd, prior_sd = estimate[rows].copy(), sd[rows].copy(), np.array([drag.ca_sd, drag.cn_sd, *_FLEXURE_SD])
+    prior_sd[0], own[0], own_sd[0] = _ca_of_pulse(model, drag_ratio, blocks, information, estimate, covariance)
     return ReconstructedAir(
         _profile(model, height, estimate, sd),
         drag_ratio,
-        _parameters(drag, own, own_sd),
+        _parameters(prior_sd, own, own_sd),
         (*_consistency_checks(height, estimate, sd, (own[0], own_sd[0]), confidence), *_residual_checks(residual)),
     )
 
@@ -287,17 +287,26 @@ def _prior(
     return blocks, information
 
 
-def _ca_at_peak(
-    model: _Model, drag_ratio: pd.DataFrame, blocks: list[FloatArray], estimate: FloatArray, covariance: FloatArray
-) -> tuple[float, float]:
-    """Log factor of C_A at the largest dynamic pressure, and its sd, in a priori standard deviations."""
+def _ca_of_pulse(
+    model: _Model,
+    drag_ratio: pd.DataFrame,
+    blocks: list[FloatArray],
+    information: list[FloatArray],
+    estimate: FloatArray,
+    covariance: FloatArray,
+) -> tuple[float, float, float]:
+    """Log factor of C_A, mean over the pressure pulse: its a priori sd, and estimate and sd in units of that.
+
+    At the peak alone it would lean to the sounding's own errors, which also say where that is.
+    """
     first = np.cumsum([0, *(b.shape[1] for b in blocks)])
-    shape = blocks[_SHAPE][int(np.argmax(drag_ratio["dynamic_pressure_pa"].to_numpy()))]
+    q = drag_ratio["dynamic_pressure_pa"].to_numpy()
+    shape = model.drag.ca_shape_sd * blocks[_SHAPE][q >= 0.5 * q.max()].mean(axis=0)
+    prior_sd = float(np.hypot(model.drag.ca_constant_sd, np.sqrt(shape @ _inverse(information[_SHAPE]) @ shape)))
     weights = np.zeros(len(estimate))
-    weights[first[3]] = model.drag.ca_constant_sd
-    weights[first[_SHAPE] : first[_SHAPE + 1]] = model.drag.ca_shape_sd * shape
-    weights /= model.drag.ca_sd
-    return float(weights @ estimate), float(np.sqrt(weights @ covariance @ weights))
+    weights[first[3]] = model.drag.ca_constant_sd / prior_sd
+    weights[first[_SHAPE] : first[_SHAPE + 1]] = shape / prior_sd
+    return prior_sd, float(weights @ estimate), float(np.sqrt(weights @ covariance @ weights))
 
 
 def _least_squares(
@@ -363,9 +372,8 @@ def _profile(model: _Model, height: FloatArray, estimate: FloatArray, sd: FloatA
     return table[(height >= at[0]) & (height <= at[-1])].reset_index(drop=True)
 
 
-def _parameters(drag: Drag, estimate: FloatArray, sd: FloatArray) -> pd.DataFrame:
+def _parameters(prior_sd: FloatArray, estimate: FloatArray, sd: FloatArray) -> pd.DataFrame:
     """Coefficient scales and flexure from estimates in a priori standard deviations."""
-    prior_sd = np.array([drag.ca_sd, drag.cn_sd, *_FLEXURE_SD])
     return pd.DataFrame(
         {
             "name": list(_PARAMETERS),

@@ -54,9 +54,9 @@ class WideFlight:
         """Vehicle as it is."""
         return self.scenario.vehicle
 
-    def ca_factor(self, mach: float) -> float:
-        """Flown over told C_A at a Mach number."""
-        return float(self.factors["ca"] * np.exp(np.interp(mach, SHAPE_MACH, self.ca_shape)))
+    def ca_factor(self, mach: np.ndarray) -> np.ndarray:
+        """Flown over told C_A at Mach numbers."""
+        return self.factors["ca"] * np.exp(np.interp(mach, SHAPE_MACH, self.ca_shape))
 
 
 def wide_flight(seed: int, ca_shape_part: float = 0.0) -> WideFlight:
