@@ -9,10 +9,16 @@ length 5 km for density, 3 km for winds); the accelerometers measure the force o
 with ``a_body`` the flow's lateral angle relative to the centerbody and ``t = (G a_body + B) s / (1 - g s) + b`` the
 contribution of a deflected aeroshell, a shifted c.g. and a misalignment (``s`` is the share of the largest dynamic
 pressure): the deflection of a compliant joint is proportional to the load, and grows as the load nears divergence.
-``B`` and ``b`` rotate with the body, while winds do not: spin separates them. Coefficient scales are unknown within
-their pre-flight standard deviations, attitude and velocity within the trajectory's own covariance. All are estimated at
-once by least squares. Density and C_A enter as a product: without pressure ports a constant factor between them is not
-observable, and the standard deviations include it.
+``B`` and ``b`` rotate with the body, while winds do not: spin separates them. Forces are means over windows, in which a
+spinning body turns: what the flow's angle does to C_A comes from the mean of its square, what it does across from its
+mean. Coefficients are unknown within their pre-flight standard deviations, C_A by a factor on all Mach numbers and by
+one that changes with them (Gauss-Markov along the logarithm of the Mach number; ``ca_shape_part`` of the variance);
+attitude and velocity within the trajectory's own covariance; the force within that of the accelerometer's errors and
+of the c.g. All are estimated at once by least squares.
+
+Density, C_A and 1 / m enter as a product: without pressure ports a constant factor among them is not observable, and
+the standard deviations include it. ``C_A scale`` is the log of flown over stated ``C_A / m``, mean over the pressure
+pulse.
 
 References
 ----------
@@ -134,7 +140,8 @@ class ReconstructedAir:
         ``time_s, altitude_m, mach, dynamic_pressure_pa, ratio, ratio_prior_sd``: measured over predicted axial force
         with the sounding's air and the pre-flight C_A.
     parameters : DataFrame
-        ``name, unit, prior_sd, estimate, sd`` of coefficient scales, gain and offsets.
+        ``name, unit, prior_sd, estimate, sd`` of coefficient scales, gain and offsets. Scales are logs of flown over
+        stated coefficient over mass, C_A's the mean over the pressure pulse.
     consistency_checks : tuple of ConsistencyCheck
     """
 
