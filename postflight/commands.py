@@ -32,6 +32,7 @@ from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
+from recon.setup import check_sources
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
@@ -186,11 +187,19 @@ class Asked:
     rate_hz: float | None = None
 
     def of(self, flight: Flight) -> Flight:
-        """Return the flight as asked for; sources are left out beside those that flight.toml leaves out."""
+        """Return the flight as asked for; sources are left out beside those that flight.toml leaves out.
+
+        Raises
+        ------
+        ConfigError
+            Assumptions that cannot be, sources that the flight does not have.
+        """
         if self.rate_hz is not None:  # how densely it is written is no assumption
             flight = replace(flight, settings=replace(flight.settings, output_rate_hz=self.rate_hz))
         flight = flight.with_(**self.changes)
-        return flight.with_(without=(*flight.settings.without, *self.without)) if self.without else flight
+        flight = flight.with_(without=(*flight.settings.without, *self.without)) if self.without else flight
+        check_sources(flight.telemetry, flight.settings)
+        return flight
 
 
 def asked(settings: tuple[str, ...], without: tuple[str, ...], rate_hz: float | None) -> Asked:

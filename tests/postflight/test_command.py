@@ -18,6 +18,7 @@ import pandas as pd
 import pytest
 
 from flightmodel.checks import GateError, writing
+from postflight import commands
 from postflight.run_folder import PARTIAL, remove_abandoned
 from tests.postflight.killing import kill_run, run_again, start_command
 
@@ -91,6 +92,16 @@ def test_wrong_usage_exits_2(command, tmp_path: Path, arguments: list[str]) -> N
     assert "Error" in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("options", [["--without", "nort"], ["--set", "without=nort"]])
+def test_unknown_source_exits_2_before_anything_is_compiled(command, flight, monkeypatch, options: list[str]) -> None:
+    monkeypatch.setattr(commands, "compile_kernels", lambda *_: pytest.fail("compiled first"))
+    done = command("reconstruct", flight.root, *options)
+    assert done.returncode == 2, done.stderr
+    assert "[source-unknown]" in done.stderr
+    assert "'north'" in done.stderr
+    assert not (flight.root / "runs").exists()
 
 
 def test_wrong_command_names_the_nearest_or_the_way_to_help(command) -> None:
