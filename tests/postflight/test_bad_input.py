@@ -16,7 +16,7 @@ import pytest
 
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.flightfolder import read_flight
-from tests.refusing import numbers_in
+from tests.refusing import numbers_in, printed_codes
 
 G0 = 9.80665
 YARD_M = 0.9144
@@ -692,14 +692,13 @@ def test_empty_cells_are_missing_not_zero(flight) -> None:
 
 
 @pytest.mark.parametrize("body", ["", "nan"])
-def test_radar_without_data_is_refused_with_a_remedy(flight, body: str) -> None:
+def test_radar_without_data_is_refused(flight, body: str) -> None:
     lines = flight.lines("radar_north.csv")
     if body:
         flight.write_lines("radar_north.csv", [lines[0], *(row.split(",")[0] + ",nan,nan,nan" for row in lines[1:])])
     else:
         flight.write_lines("radar_north.csv", lines[:1])
-    error = refused(flight, "radar_north.csv", "north", codes={"no-samples", "too-few-rows"})
-    assert re.search(r"remove|delete|drop|leave out|without|take", str(error), re.I), f"what to do? {error}"
+    refused(flight, "radar_north.csv", "north", codes={"no-samples" if body else "too-few-rows"})
 
 
 def test_accelerometer_all_missing_is_refused(flight) -> None:
@@ -787,7 +786,7 @@ def test_unknown_key_names_the_nearest(flight, old: str, new: str, nearest: str)
     flight.replace("flight.toml", old, new)
     wrong = new.split(" =")[0].strip("[]").split(".")[-1]
     error = refused(flight, "flight.toml", wrong, nearest, kind=ConfigError, codes={"key-missing", "key-unknown"})
-    one_line_with(error, f"did you mean '{nearest}'")
+    one_line_with(error, wrong, f"'{nearest}'")
 
 
 @pytest.mark.parametrize(("line", "text"), [(4, "name = "), (10, "[sensors.accelerometer"), (3, 'vehicle = "x" "y"')])
@@ -988,18 +987,19 @@ def test_refusal_has_its_exit_code_and_writes_nothing(flight, command, verb: str
 
 
 @pytest.mark.parametrize(
-    ("verb", "old", "new", "words"),
+    ("verb", "old", "new", "time_s"),
     [
-        ("reconstruct", "t_s = 420.0", "t_s = 900.0", ("attitude prior", "900")),
-        ("reconstruct", "t_s = 420.0", "t_s = -50.0", ("attitude prior", "-50")),
+        ("reconstruct", "t_s = 420.0", "t_s = 900.0", 900.0),
+        ("reconstruct", "t_s = 420.0", "t_s = -50.0", -50.0),
     ],
 )
-def test_time_outside_the_data_is_refused(flight, command, verb: str, old: str, new: str, words) -> None:
+def test_time_outside_the_data_is_refused(flight, command, verb: str, old: str, new: str, time_s: float) -> None:
     flight.replace("flight.toml", old, new)
     before = flight.contents()
     done = command(verb, flight.root)
-    assert done.returncode in (2, 3), done.stdout + done.stderr
-    assert all(word in done.stderr for word in words), done.stderr
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert printed_codes(done.stderr) == ["attitude-prior-out-of-reach"]
+    assert time_s in numbers_in(done.stderr)
     assert flight.contents() == before
 
 

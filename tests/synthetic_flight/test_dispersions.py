@@ -69,19 +69,18 @@ def test_laws_are_what_they_say():
 
 
 @pytest.mark.parametrize(
-    ("tables", "words"),
+    ("tables", "codes", "name"),
     [
-        ({"joint": {"stifness": {"normal": 0.1}}}, "did you mean 'stiffness'"),
-        ({"joint": {"stiffness": {"normal": 0.1, "uniform": [0, 1]}}}, "exactly one of normal, uniform, lognormal"),
-        ({"mass": {"offset_y_m": {"lognormal": 0.1}}}, "unknown key 'mass.offset_y_m.lognormal'"),
-        ({"mass": {"offset_y_m": {"uniform": [1, 1]}}}, "a lower and a higher bound"),
-        ({"initial": {"spin_rpm": {"normal": -1.0}}}, "greater than or equal to 0"),
+        ({"joint": {"stifness": {"normal": 0.1}}}, "key-unknown", "'stiffness'"),
+        ({"joint": {"stiffness": {"normal": 0.1, "uniform": [0, 1]}}}, "keys-conflict", "normal, uniform, lognormal"),
+        ({"mass": {"offset_y_m": {"lognormal": 0.1}}}, "key-unknown", "'mass.offset_y_m.lognormal'"),
+        ({"mass": {"offset_y_m": {"uniform": [1, 1]}}}, "keys-conflict", "'mass.offset_y_m.uniform'"),
+        ({"initial": {"spin_rpm": {"normal": -1.0}}}, "key-value", "'initial.spin_rpm.normal'"),
     ],
 )
-def test_wrong_dispersions_are_refused(tables, words):
-    with pytest.raises(ConfigError) as refused:
+def test_wrong_dispersions_are_refused(tables, codes, name):
+    with refuses(*codes.split(), names=[name], kind=ConfigError):
         parse_section(Dispersions, tables, "file.toml")
-    assert words in str(refused.value)
 
 
 def test_an_undispersed_flight_is_the_simulators_own(short):
