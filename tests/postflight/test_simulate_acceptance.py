@@ -234,8 +234,8 @@ DAVEML = (Path(__file__).parents[1] / "data" / "blunt_cone.dml").read_text()
     [
         ("mine.csv", None, None, "file-missing sidecar-missing", ("mine.csv", "mine.toml")),
         ("mine.csv", GRID, SIDECAR.replace("area_m2", "area"), "key-unknown key-missing", ("'area_m2'",)),
-        ("mine.csv", [*GRID[:4], *GRID[5:]], SIDECAR, "aero-grid", ("mine.csv",)),
-        ("mine.csv", GRID[:4], SIDECAR, "aero-grid", ("mine.csv",)),
+        ("mine.csv", [*GRID[:4], *GRID[5:]], SIDECAR, "aero-grid", ("mine.csv", "8 rows", "3 Mach", "3 angles")),
+        ("mine.csv", GRID[:4], SIDECAR, "aero-grid", ("mine.csv", "Mach")),
         ("mine.csv", [*GRID[:4], "3,0,abc,0,0,-0.1", *GRID[5:]], SIDECAR, "not-a-number", ("line 5", "'ca'", "abc")),
         ("mine.csv", [re.sub("^0,", "-1,", row) for row in GRID], SIDECAR, "aero-mach", ("'mach'",)),
         ("mine.dml", ["<html></html>"], SIDECAR, "daveml-not-xml", ("'html'", "DAVEfunc")),
