@@ -130,11 +130,6 @@ def seam_clocks_rad(geometry: ShellGeometry) -> FloatArray:
     return 2.0 * np.pi * np.arange(geometry.gore_count) / geometry.gore_count
 
 
-def seam_curves(geometry: ShellGeometry, points_per_torus: int = 25) -> FloatArray:
-    """Gore seams on the aft side, ``(gore_count, m, 3)``, shell axes, m."""
-    return revolved(aft_profile(geometry, points_per_torus), seam_clocks_rad(geometry))
-
-
 def dot_positions(geometry: ShellGeometry) -> FloatArray:
     """Photogrammetry dots, ``(k, 3)``, shell axes, m: on each torus's aft crest, in the middle of every gore."""
     half = np.deg2rad(geometry.half_angle_deg)
