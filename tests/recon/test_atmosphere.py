@@ -211,7 +211,8 @@ def straight_fall():
 def sds_by_hand(noise, height, altitude, log_mach, pulse):
     """Sd of log density at ``height`` and of log C_A, mean over the pulse, of Gauss processes seen with white noise.
 
-    Sounding 3 %, half of the variance constant, half correlated over 5 km; C_A likewise, over a factor of two in Mach.
+    Sounding 3 %, half of the variance constant, half correlated over 5 km; C_A 3 %, 2 % of it correlated over a factor of two
+    in Mach.
     """
 
     def air(a, b):
@@ -219,7 +220,7 @@ def sds_by_hand(noise, height, altitude, log_mach, pulse):
 
     def ca(a, b):
         apart = np.abs(np.subtract.outer(a, b))
-        return DRAG.ca_constant_sd**2 + DRAG.ca_shape_sd**2 * np.exp(-apart / np.log(2.0))
+        return 0.03**2 - 0.02**2 + 0.02**2 * np.exp(-apart / np.log(2.0))
 
     seen = air(altitude, altitude) + ca(log_mach, log_mach) + np.diag(noise**2)
     of_pulse = ca(log_mach[pulse], log_mach).mean(axis=0)
