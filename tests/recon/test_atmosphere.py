@@ -211,8 +211,8 @@ def straight_fall():
 def sds_by_hand(noise, height, altitude, log_mach, pulse):
     """Sd of log density at ``height`` and of log C_A, mean over the pulse, of Gauss processes seen with white noise.
 
-    Sounding 3 %, half of the variance constant, half correlated over 5 km; C_A 3 %, 2 % of it correlated over a factor of two
-    in Mach.
+    Sounding 3 %, half of the variance constant, half correlated over 5 km; C_A 3 %, of which 2 % are correlated over a
+    factor of two in Mach number.
     """
 
     def air(a, b):
