@@ -6,7 +6,7 @@ corrected sensors; it holds no truth. Lateral vectors are in body y, z.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class FlightLoads:
     ----------
     time_s : (n,) float
     specific_force_body_mps2 : (n, 3) float
-        At the c.g. of the undeflected vehicle, body axes.
+        At ``point_from_datum_m``, body axes.
     force_noise_sd_mps2 : float
         Its white noise, each axis.
     force_root_mps2 : (n, 3, 9) float
@@ -46,6 +46,8 @@ class FlightLoads:
     mach, dynamic_pressure_pa, dynamic_pressure_sd_pa, airspeed_mps : (n,) float
     vehicle : Vehicle
         Pre-flight model.
+    point_from_datum_m : (3,) float
+        Point of the centerbody at which force and flow are given: the c.g. of the undeflected vehicle, as told.
     accelerometer_time_bias_sd_s, gyro_time_bias_sd_s : float
         A priori sd of the sensors' time biases, s; zero: none.
     cg_from_sensor_m : (3,) float
@@ -74,6 +76,7 @@ class FlightLoads:
     dynamic_pressure_sd_pa: FloatArray
     airspeed_mps: FloatArray
     vehicle: Vehicle
+    point_from_datum_m: FloatArray
     accelerometer_time_bias_sd_s: float = 0.0
     gyro_time_bias_sd_s: float = 0.0
     cg_from_sensor_m: FloatArray = field(default_factory=lambda: np.zeros(3))
@@ -92,6 +95,11 @@ class FlightLoads:
         ):
             check_shape(f"loads.{name}", getattr(self, name), shape)
 
+    def rows(self, use: BoolArray) -> FlightLoads:
+        """Loads at chosen samples."""
+        chosen = {f.name: getattr(self, f.name)[use] for f in fields(self) if f.name in _HISTORIES}
+        return replace(self, **chosen)
+
     @property
     def informative(self) -> BoolArray:
         """Mask ``(n,)`` of samples where the deceleration is large enough."""
@@ -105,6 +113,26 @@ class FlightLoads:
         """
         after = np.flatnonzero(pressure_pulse(self.dynamic_pressure_pa))
         return np.asarray(self.informative & (np.arange(len(self.time_s)) <= after[-1]))
+
+
+_HISTORIES = frozenset(
+    {
+        "time_s",
+        "specific_force_body_mps2",
+        "force_root_mps2",
+        "flow_root_rad",
+        "rate_body_radps",
+        "angular_acceleration_body_radps2",
+        "flow_yz_rad",
+        "flow_cov",
+        "wind_flow_sd_rad",
+        "altitude_m",
+        "mach",
+        "dynamic_pressure_pa",
+        "dynamic_pressure_sd_pa",
+        "airspeed_mps",
+    }
+)
 
 
 def lateral_and_size(vectors_yz: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -68,6 +68,7 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
         dynamic_pressure_sd_pa=air.dynamic_pressure_sd_pa[inside],
         airspeed_mps=air.airspeed_mps[inside],
         vehicle=vehicle,
+        point_from_datum_m=vehicle.cg_m,
         accelerometer_time_bias_sd_s=accelerometer.spec.time_bias_sd_s,
         gyro_time_bias_sd_s=rates.spec.time_bias_sd_s,
         cg_from_sensor_m=arm,

@@ -55,7 +55,7 @@ def other_method(rng, oscillation=1.0):
         motion(TIME_S, oscillation) - response @ rng.standard_normal(2) + np.deg2rad(0.05) * rng.standard_normal((n, 2))
     )
     cov = np.tile(np.deg2rad(0.05) ** 2 * np.eye(2), (n, 1, 1))
-    return Evidence("sensed", TIME_S, read, np.zeros((n, 2, 2)), {"lasting": response}, cov, 0.1)
+    return Evidence("sensed", TIME_S, read, *[np.zeros((n, 2, 2))] * 2, {"lasting": response}, cov, 0.1)
 
 
 def time_bias_of(readings):
@@ -156,7 +156,7 @@ def test_late_triads_are_set_right():
         )
 
     got, want = (
-        delayed(readings(late_force, late_rate), np.full(len(TIME_S), True), late_force, late_rate),
+        delayed(readings(late_force, late_rate), late_force, late_rate),
         readings(0.0, 0.0),
     )
     for name in ("specific_force_body_mps2", "flow_yz_rad", "rate_body_radps", "angular_acceleration_body_radps2"):
@@ -168,7 +168,7 @@ def test_the_triads_clocks_are_in_the_films_sd():
     loads, truth = pulse_of(np.random.default_rng(11), len(TIME_S), motion(TIME_S, 0.7))
     cov = np.tile(np.deg2rad(0.05) ** 2 * np.eye(2), (len(TIME_S), 1, 1))
     readings = history_from_lateral(TIME_S, truth, cov, "camera", "")
-    late = delayed(loads, np.full(len(TIME_S), True), -0.01, -0.01)
+    late = delayed(loads, -0.01, -0.01)
     trusting = fuse_flight(late, readings, camera_time_bias_sd_s=PRIOR_SD_S).camera_time_bias
     stated = replace(late, accelerometer_time_bias_sd_s=0.01, gyro_time_bias_sd_s=0.01)
     allowing = fuse_flight(stated, readings, camera_time_bias_sd_s=PRIOR_SD_S).camera_time_bias
