@@ -99,7 +99,8 @@ class FusedAnswer:
     @property
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
         """Whether the methods agree, and whether the camera's time bias is what is stated."""
-        passed, likeliest = not self.agreement.hypotheses, self.agreement.likeliest
+        passed = not self.agreement.hypotheses and self.left_out is None and not self.alternatives
+        likeliest = self.agreement.likeliest
         least = min((p.p_value for p in self.agreement.pairs), default=1.0)
         source = "" if passed else self.left_out or (likeliest[0] if likeliest else "")
         name = "deflection methods agree: least chance of a pair"
