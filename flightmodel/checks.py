@@ -95,7 +95,7 @@ def writing(where: Path, remedy: str) -> Iterator[None]:
             raise  # a file elsewhere, named by the fault itself
         remedy = "make room, or write to another disk" if full else remedy
         words = f"cannot be written: {fault.strerror or fault}; nothing half-written is left; {remedy}"
-        raise GateError(f"{where}: {words}", code="cannot-write") from None
+        raise GateError(f"{where}: {words}", code="disk-full" if full else "cannot-write") from None
 
 
 def write_file(path: Path, content: bytes | str) -> None:

@@ -193,7 +193,8 @@ def _vehicle(gate: Gate, name: str) -> Vehicle | None:
         return None
     for body, mesh in vehicle.meshes.items():
         words = f"{mesh.words}; it is drawn, while the camera's fit is of [geometry]"
-        gate.findings.append(Finding(f"mesh of the {body}", words, np.nan, np.nan, code="mesh-repaired"))
+        code = "mesh-apart" if mesh.apart else "mesh-drawn"
+        gate.findings.append(Finding(f"mesh of the {body}", words, np.nan, np.nan, code))
     return vehicle
 
 

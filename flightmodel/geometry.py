@@ -130,11 +130,6 @@ def seam_clocks_rad(geometry: ShellGeometry) -> FloatArray:
     return 2.0 * np.pi * np.arange(geometry.gore_count) / geometry.gore_count
 
 
-def seam_curves(geometry: ShellGeometry, points_per_torus: int = 25) -> FloatArray:
-    """Gore seams on the aft side, ``(gore_count, m, 3)``, shell axes, m."""
-    return revolved(aft_profile(geometry, points_per_torus), seam_clocks_rad(geometry))
-
-
 def dot_positions(geometry: ShellGeometry) -> FloatArray:
     """Photogrammetry dots, ``(k, 3)``, shell axes, m: on each torus's aft crest, in the middle of every gore."""
     half = np.deg2rad(geometry.half_angle_deg)
@@ -300,11 +295,17 @@ class BodyMesh:
     faces : (m, 3) int
     words : str
         What it is, and how its rim agrees with ``[geometry]``.
+    apart : bool
+        Whether the rim is where ``[geometry]`` has none, so that the mesh will not lie over the filmed shell.
+    rim : Rim or None
+        An aeroshell's largest circle.
     """
 
     vertices_m: FloatArray
     faces: Faces
     words: str
+    apart: bool = False
+    rim: Rim | None = None
 
 
 def body_meshes(
@@ -520,7 +521,8 @@ def _laid(body: str, spec: MeshFile, vertices: FloatArray, faces: Faces, geometr
         allowed = f"{SAME_RIM * rim_m:.3f} m of difference is allowed"
         raise ConfigError(f"{key}': {named}{words}; {allowed}; {turn_it}, or correct [geometry]", code="mesh-pose")
     apart = abs(rim.station_m - rim_station_m) > SAME_RIM * rim_m
-    return BodyMesh(placed, faces, f"{head}; {words}{', so it will not lie over the filmed shell' if apart else ''}")
+    words += ", so it will not lie over the filmed shell" if apart else ""
+    return BodyMesh(placed, faces, f"{head}; {words}", apart, rim)
 
 
 @dataclass(frozen=True)

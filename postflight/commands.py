@@ -19,7 +19,7 @@ from rich.table import Table
 
 from estimators.calibration import calibrate_lens, read_corners
 from flightmodel.camera import Lens
-from flightmodel.checks import ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
+from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, NO_VIDEO, Deflections, camera_sensitivity, estimate
 from postflight.flight import Flight, read_flight
@@ -32,6 +32,7 @@ from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
+from recon.setup import check_sources
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
@@ -56,7 +57,8 @@ def warm_up() -> None:
     """Compile every group of kernels that is missing, and say where they lie."""
     compile_kernels(*warmup.GROUPS)
     if warmup.CACHE is None:
-        raise GateError("no folder to keep compiled kernels in can be written: set XDG_CACHE_HOME or NUMBA_CACHE_DIR")
+        words = "no folder to keep compiled kernels in can be written: set XDG_CACHE_HOME or NUMBA_CACHE_DIR"
+        raise GateError(words, "cannot-write")
     console.print(f"kernels are compiled: {escape(str(warmup.CACHE))}")
 
 
@@ -186,11 +188,19 @@ class Asked:
     rate_hz: float | None = None
 
     def of(self, flight: Flight) -> Flight:
-        """Return the flight as asked for; sources are left out beside those that flight.toml leaves out."""
+        """Return the flight as asked for; sources are left out beside those that flight.toml leaves out.
+
+        Raises
+        ------
+        ConfigError
+            Assumptions that cannot be, sources that the flight does not have.
+        """
         if self.rate_hz is not None:  # how densely it is written is no assumption
             flight = replace(flight, settings=replace(flight.settings, output_rate_hz=self.rate_hz))
         flight = flight.with_(**self.changes)
-        return flight.with_(without=(*flight.settings.without, *self.without)) if self.without else flight
+        flight = flight.with_(without=(*flight.settings.without, *self.without)) if self.without else flight
+        check_sources(flight.telemetry, flight.settings)
+        return flight
 
 
 def asked(settings: tuple[str, ...], without: tuple[str, ...], rate_hz: float | None) -> Asked:
@@ -230,11 +240,11 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         table.add_row(row.event, f"{row.t_s:.2f}", f"{row.alt_m / 1e3:.2f}", f"{row.mach:.2f}", pressure, alpha)
     console.print(table)
     if not flight.peak_is_inside:
-        console.print("[yellow]found[/] the data end before or begin after the peak of dynamic pressure")
+        line("[yellow]found[/]", "the data end before or begin after the peak of dynamic pressure", "peak-outside-data")
     for finding in (*flight.findings, *run_folder.without_attitude(flight)):
-        console.print(f"[yellow]found[/] {escape(str(finding))}")
+        line("[yellow]found[/]", str(finding), finding.code)
     for reason in flight.missing:
-        console.print(f"[yellow]left out[/] as-flown atmosphere: {escape(reason)}")
+        line("[yellow]left out[/]", f"as-flown atmosphere: {reason}", reason.code)
     if flight.attitude is not None and flight.attitude.comparison is not None:
         console.print(escape(flight.attitude.remark))
     failed = [v for v in flight.consistency_checks if not v.passed]
@@ -242,9 +252,15 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
     console.print(f"{passed} of {len(flight.consistency_checks)} consistency checks pass")
     for consistency_check in failed:
         numbers = f"{consistency_check.value:.3g} outside {consistency_check.low:.3g} to {consistency_check.high:.3g}"
-        console.print(f"[red]check failed[/] {consistency_check.name}: {consistency_check.remark} ({numbers})")
-    for k, words in enumerate(flight.suspects):
-        console.print(f"[red]{'suspect' if k == 0 else 'also'}[/] {escape(words)}")
+        words = f"{consistency_check.name}: {consistency_check.remark} ({numbers})"
+        line("[red]check failed[/]", words, consistency_check.code)
+    for k, suspect in enumerate(flight.suspects):
+        line(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)
+
+
+def line(mark: str, words: str, code: str = "") -> None:
+    """Print a finding, refusal or failed check with its code in brackets at the end."""
+    console.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}")
 
 
 def print_sensitivity(found: pd.DataFrame) -> None:
@@ -294,7 +310,7 @@ def print_answers(answers: Deflections) -> None:
         console.print(escape(bias.remark))
     for method, row in run_folder.method_summary(answers, at_s).items():
         if "reason" in row:
-            console.print(f"[yellow]no answer[/] from {method}: {escape(row['reason'])}")
+            line("[yellow]no answer[/]", f"from {method}: {row['reason']}", row["code"])
 
 
 def deflection(
@@ -315,14 +331,14 @@ def deflection(
     if "camera" in methods:
         compile_kernels("camera")
     with progress_bar() as report:
-        bet, trouble = None, ""
+        bet, trouble = None, NO_FAULT
         try:
             if makes_bet:
                 bet = reconstruct(flight, None, lambda f, what: report(0.6 * f, what))
         except (GateError, DivergenceError) as fault:
             if not alone:
                 raise
-            trouble = str(fault)
+            trouble = Fault(str(fault), fault.codes[0])
         answers = estimate(bet or flight, methods, lambda f, what: report(0.6 + 0.3 * f, what))
         with run_folder.RunFolder(folder, telemetry, settings) as out:
             run_folder.write_answers(out, answers)
@@ -332,14 +348,14 @@ def deflection(
                 if film:
                     write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", progress=report)
     for finding in telemetry.findings:
-        console.print(f"[yellow]found[/] {escape(str(finding))}")
+        line("[yellow]found[/]", str(finding), finding.code)
     if trouble:
-        console.print(f"[yellow]no trajectory[/], the camera answers alone: {escape(trouble)}")
+        line("[yellow]no trajectory[/],", f"the camera answers alone: {trouble}", trouble.code)
     print_answers(answers)
     if "camera" in answers.histories:
         console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
     elif film:
-        console.print("[yellow]no film[/] was drawn: there is no answer of the camera to lay over it")
+        line("[yellow]no film[/]", "was drawn: there is no answer of the camera to lay over it", "film-not-drawn")
     console.print(f"results in {escape(str(out.path))}")
     if answers.refused:
         sys.exit(EXIT_NO_ANSWER)
@@ -349,7 +365,7 @@ def calibrate(corners: Path, size: str, lens: Lens) -> None:
     """Calibrate a lens and print the lines of a vehicle file."""
     match = re.fullmatch(r"(\d{1,5})[x,](\d{1,5})", size.strip())
     if not match:
-        raise ConfigError(f"--size {size}: width and height like 640x480 are wanted")
+        raise ConfigError(f"--size {size}: width and height like 640x480 are wanted", "option-format")
     found = calibrate_lens(read_corners(corners), (int(match[1]), int(match[2])), lens)
     words = f"{found.corners} corners in {found.pictures} pictures, rms {found.rms_px:.3f} px"
     console.print(f"# {words}", highlight=False)
@@ -387,7 +403,7 @@ def print_score(result: Score) -> None:
         f"total angle of attack {bet['alpha_total_rms_deg']:.2f} deg"
     )
     for failure in result.failures:
-        console.print(f"[red]failed[/] {escape(failure)}")
+        line("[red]failed[/]", failure, failure.code)
     if not result.failures:
         console.print("[green]truth recovered[/] within every limit")
 
@@ -402,7 +418,7 @@ def demo(folder: Path, seed: int) -> None:
     bet, answers, written = run_flight(folder, METHODS, Asked())
     print_flight(bet, pd.read_csv(written / "events.csv"))
     for method, reason in answers.refused.items():
-        console.print(f"[yellow]no answer[/] from {method}: {escape(reason)}")
+        line("[yellow]no answer[/]", f"from {method}: {reason}", reason.code)
     result = score_run(folder, written)
     picture = folder / "demo.png"
     save(figure_summary(bet, answers, truth_history(folder)), picture)
@@ -419,5 +435,5 @@ def truth_history(folder: Path) -> tuple[FloatArray, FloatArray]:
     try:
         table = pd.read_csv(folder / "truth" / "deflection.csv")
     except FileNotFoundError:
-        raise GateError(f"{folder}: no truth/deflection.csv") from None
+        raise GateError(f"{folder}: no truth/deflection.csv", "truth-missing") from None
     return table["t_s"].to_numpy(), table["theta_deg"].to_numpy()

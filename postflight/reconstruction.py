@@ -17,7 +17,7 @@ from estimators.loads import FlightLoads
 from flightmodel import airdata, earth, rotations
 from flightmodel.airdata import AirData, derived_with_sd, is_angle
 from flightmodel.atmosphere import BOTTOM_M, TOP_M, profile_from_sounding
-from flightmodel.checks import DivergenceError, FloatArray, GateError, Progress
+from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress
 from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, Telemetry
@@ -95,7 +95,7 @@ class Reconstruction(Tabular):
         Motion and flow at the c.g., for the estimators of the deflection; None where ``missing`` says why.
     as_flown : ReconstructedAir or None
         As-flown density, winds and C_A, from the deceleration.
-    missing : tuple of str
+    missing : tuple of Fault
         Why there are no loads or no as-flown atmosphere.
     attitude : AttitudeCheck or None
         Comparison with an attitude from magnetometer and Sun sensors alone.
@@ -106,7 +106,7 @@ class Reconstruction(Tabular):
     air: AirData
     loads: FlightLoads | None
     as_flown: ReconstructedAir | None = None
-    missing: tuple[str, ...] = ()
+    missing: tuple[Fault, ...] = ()
     attitude: AttitudeCheck | None = None
 
     @property
@@ -132,7 +132,7 @@ class Reconstruction(Tabular):
         return (*self.telemetry.findings, *self.solution.findings, *attitude)
 
     @property
-    def suspects(self) -> tuple[str, ...]:
+    def suspects(self) -> tuple[Fault, ...]:
         """Fault hypotheses, the most likely first; none where every consistency check passes."""
         return isolate_faults(self.consistency_checks, self.solution.left_out)
 
@@ -204,7 +204,8 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     telemetry = flight.telemetry
     _check_inside_tables(solution.smoothed)
     air = air_data(solution.smoothed, flight)
-    loads, as_flown, missing = None, None, []
+    loads, as_flown = None, None
+    missing: list[Fault] = []
     try:
         telemetry.required_vehicle()
         telemetry.required_triads()
@@ -212,7 +213,7 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
         profile = profile_from_sounding(telemetry.sounding)
         as_flown = as_flown_atmosphere(telemetry, solution, profile, solution.settings.check_confidence)
     except GateError as fault:
-        missing.append(str(fault))
+        missing += fault.faults
     return Reconstruction(flight, solution, air, loads, as_flown, tuple(missing))
 
 

@@ -138,7 +138,7 @@ def newest_run(flight_folder: Path) -> Path:
 
 
 def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any]]:
-    """Each method's deflection at one time, and the reason where it has none."""
+    """Each method's deflection at one time, and reason and code where it has none."""
     out: dict[str, dict[str, Any]] = {}
     for method, history in answers.histories.items():
         theta, sd = np.rad2deg(history.at(at_s))
@@ -154,10 +154,16 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
             "assumptions": history.assumptions,
         }
         if not np.isfinite(theta):
-            out[method]["deflection_deg"] = out[method]["sd_deg"] = None
-            out[method]["reason"] = f"no data at {at_s:.2f} s; answers span {known[0]:.2f} to {known[-1]:.2f} s"
+            words = f"no data at {at_s:.2f} s; answers span {known[0]:.2f} to {known[-1]:.2f} s"
+            out[method] |= {"deflection_deg": None, "sd_deg": None, "reason": words, "code": "no-answer"}
     for method, reason in answers.refused.items():
-        out[method] = {"deflection_deg": None, "sd_deg": None, "reason": reason, "applicable": reason.code != NO_VIDEO}
+        out[method] = {
+            "deflection_deg": None,
+            "sd_deg": None,
+            "reason": reason,
+            "code": reason.code,
+            "applicable": reason.code != NO_VIDEO,
+        }
     return out
 
 

@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from flightmodel import earth, geomagnetism_and_sun, rotations
-from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.gate import spaced
 from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER
 from flightmodel.instruments import RADAR as RADAR_ERRORS
@@ -125,17 +125,7 @@ def _named_model(
     telemetry: Telemetry, settings: Settings, sensors: InertialSensors | None, trackers: tuple[Instrument, ...]
 ) -> ErrorModel:
     """Error model as the settings want it, or every fault of the names in them at once."""
-    known = sorted({name for i in trackers for name in (i.name, i.owner)})
-    if settings.attitude_sensors:
-        known += ["magnetometer"] if telemetry.magnetometer is not None else []
-        known += [f"sun{k + 1}" for k in range(len(telemetry.sun.spec.clock_lv_rad))] if telemetry.sun else []
-    faults = [
-        Fault(
-            f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}", "source-unknown"
-        )
-        for name in settings.without
-        if name not in known
-    ]
+    faults = _unknown_sources(telemetry, settings, trackers)
     if settings.attitude_sensors and sensors is None:
         remark = "attitude_sensors: ballistic flight has no attitude that they could measure; leave them off"
         faults.append(Fault(remark, "setting-not-applicable"))
@@ -145,8 +135,29 @@ def _named_model(
     except GateError as unknown:
         faults += unknown.faults
     if faults:
-        raise GateError(faults)
+        raise ConfigError(faults)
     return model
+
+
+def check_sources(telemetry: Telemetry, settings: Settings) -> None:
+    """Raise `ConfigError` where ``settings.without`` names what the flight does not have."""
+    faults = _unknown_sources(telemetry, settings, tracking_instruments(telemetry, settings, np.zeros(3)))
+    if faults:
+        raise ConfigError(faults)
+
+
+def _unknown_sources(telemetry: Telemetry, settings: Settings, trackers: tuple[Instrument, ...]) -> list[Fault]:
+    known = sorted({name for i in trackers for name in (i.name, i.owner)})
+    if settings.attitude_sensors:
+        known += ["magnetometer"] if telemetry.magnetometer is not None else []
+        known += [f"sun{k + 1}" for k in range(len(telemetry.sun.spec.clock_lv_rad))] if telemetry.sun else []
+    return [
+        Fault(
+            f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}", "source-unknown"
+        )
+        for name in settings.without
+        if name not in known
+    ]
 
 
 def _only_predicted(problem: Problem, settings: Settings, rejected: Mapping[str, FloatArray]) -> BoolArray:

@@ -25,7 +25,7 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.airdata import total_angle
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import NO_FAULT, ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import dynamics, simulate
 from synthetic_flight.dispersions import Case, Dispersions, Window, dispersed_case
@@ -290,7 +290,7 @@ class Row:
     """What is kept of one flight; ``reason`` says why there is nothing, ``diverged_s`` when its joint passed 90 deg."""
 
     run: int
-    reason: str
+    reason: Fault
     diverged_s: float
     scalars: dict[str, float]
     histories: FloatArray
@@ -359,12 +359,14 @@ def fly_runs(plan: Plan, runs: list[int], draws_of: Callable[[int], dict[str, fl
     return [out[run] for run in runs]
 
 
-def failure_reason(fault: Exception) -> str:
-    """Return why a flight failed: the message of a refusal, that of any other exception with its type."""
-    return str(fault) if isinstance(fault, GateError) else f"{type(fault).__name__}: {fault}"
+def failure_reason(fault: Exception) -> Fault:
+    """Return why a flight failed: message and code of a refusal, the message of any other exception with its type."""
+    if isinstance(fault, GateError):
+        return Fault(str(fault), fault.codes[0])
+    return Fault(f"{type(fault).__name__}: {fault}")
 
 
-def _failed(plan: Plan, run: int, reason: str) -> Row:
+def _failed(plan: Plan, run: int, reason: Fault) -> Row:
     points = len(plan.window.history_time_s())
     nothing = np.full((len(plan.histories), points), np.nan)
     return Row(run, reason, np.nan, dict.fromkeys(plan.scalars, np.nan), nothing)
@@ -376,8 +378,8 @@ def _fly(plan: Plan, waiting: list[tuple[int, Case, Start]], schedules: list[Sch
         try:
             records = records_of(flown, case.vehicle, start.atmosphere)
         except GateError as fault:
-            out[run] = _failed(plan, run, str(fault))
+            out[run] = _failed(plan, run, failure_reason(fault))
             continue
         ended = plan.window.from_s + plan.window.record_s * (len(flown.aux) - 1) if flown.diverged else np.nan
         numbers = scalars_of(records, plan.scalars, plan.window)
-        out[run] = Row(run, "", ended, numbers, _histories_of(records, plan.histories, plan.window))
+        out[run] = Row(run, NO_FAULT, ended, numbers, _histories_of(records, plan.histories, plan.window))

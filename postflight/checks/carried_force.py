@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel import earth, rotations, tables
-from flightmodel.checks import FloatArray
+from flightmodel.checks import Fault, FloatArray
 from flightmodel.flightfolder import Sources
 from flightmodel.telemetry import AttitudePrior, Finding, TriadRecord
 from postflight.checks.track_force import TrackForce
@@ -44,10 +44,10 @@ _RATES_RIGHT_RAD, _ATTITUDE_RIGHT_RAD = np.deg2rad(12.0), np.deg2rad(15.0)
 _ATTITUDE_SD = 4.0
 _FARTHEST_S = 600.0  # that gyros are trusted to carry an attitude
 _DEGREE = np.pi / 180.0
-# slips in writing a quaternion: the hint, and the order that undoes it (None: the conjugate)
+# slips in writing a quaternion: hint and code, and the order that undoes it (None: the conjugate)
 _SLIPS = {
-    "with the scalar last, so put its last number first": [3, 0, 1, 2],
-    "as from ECEF to body, so change the signs of its last three numbers": None,
+    Fault("with the scalar last, so put its last number first", "attitude-scalar-last"): [3, 0, 1, 2],
+    Fault("as from ECEF to body, so change the signs of its last three numbers", "attitude-inverted"): None,
 }
 
 
@@ -133,15 +133,15 @@ def attitude_prior(found: Sources, force: TrackForce) -> list[Finding]:
     if off[0] < max(_WRONG_RAD, _ATTITUDE_SD * _carried_sd_rad(prior, gyros, grid, w)):
         return []
     fitting = [slip for slip, value in zip(_SLIPS, off[1:], strict=True) if value < _ATTITUDE_RIGHT_RAD]
-    entry = found.spec.attitude_prior
+    entry, code = found.spec.attitude_prior, "attitude-prior"
     if entry is None or entry.q_ecef_body is None:
         hint = ": check azimuth_deg, elevation_deg, roll_deg, the place and the time"
     elif len(fitting) == 1:
-        hint = f"; it fits when read {fitting[0]}"
+        hint, code = f"; it fits when read {fitting[0]}", fitting[0].code
     else:
         hint = ": is q_ecef_body scalar first, from body to ECEF, and of that time?"
     words = f"the gyros carry the specific force from it {np.rad2deg(off[0]):.0f} deg away from the track's{hint}"
-    return [Finding("attitude_prior", words, prior.time_s, float(force.time_s[clear[-1]]), "attitude-prior")]
+    return [Finding("attitude_prior", words, prior.time_s, float(force.time_s[clear[-1]]), code)]
 
 
 def _as_stated_and_slipped(prior: AttitudePrior) -> FloatArray:

@@ -290,7 +290,7 @@ def print_report(report: Report) -> None:
     for bias in report.time_biases:
         _line("time bias", f"{bias.source}: {bias.late_s:+.3f} +/- {bias.sd_s:.3f} s against {bias.against}")
     for words in report.fill_in:
-        _line("[cyan]to fill in[/]", words)
+        _line("[cyan]to fill in[/]", words, "placeholder")
     for fault in report.refused:
         _line("[red]refused[/]", fault, fault.code)
     console.print(report._about())

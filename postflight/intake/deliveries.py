@@ -33,7 +33,7 @@ from rich.table import Table
 
 from flightmodel.aerodynamics import COLUMNS, named_columns
 from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
-from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
+from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, write_file, writing
 from flightmodel.config import read_toml
 from flightmodel.tables import to_si
 from flightmodel.vehicle import DATA, vehicle_path
@@ -377,7 +377,7 @@ class _Delivery:
     daveml: dict[Path, bytes] = field(default_factory=dict)
     files: dict[Path, bytes | str] = field(default_factory=dict)
     vehicle: dict[Path, str] = field(default_factory=dict)
-    skipped: list[str] = field(default_factory=list)
+    skipped: list[Fault] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -427,8 +427,8 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
         console.print(f"{escape(str(video.place))}: {what}", highlight=False)
     for words in came.notes:
         console.print(escape(words), highlight=False)
-    for words in came.skipped:
-        console.print(f"[yellow]left out[/] {escape(words)}", highlight=False)
+    for fault in came.skipped:
+        console.print(f"[yellow]left out[/] {escape(f'{fault} [{fault.code}]')}", highlight=False)
     _print_placeholders(folder)
 
 
@@ -455,11 +455,13 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
             came.videos.append(video)
             came.skipped += _beside_pictures(file, video)
         elif file.is_dir():
-            came.skipped.append(f"{file}: a folder without pictures; name the files in it: {file / '*'}")
+            words = f"{file}: a folder without pictures; name the files in it: {file / '*'}"
+            came.skipped.append(Fault(words, "nothing-to-import"))
         elif file.suffix.lower() in _DAVEML:
             came.daveml[file] = _bytes_of(file)
         elif file.suffix.lower() in _PICTURES:
-            came.skipped.append(f"{file}: a picture alone; name the folder that holds a video's pictures")
+            words = f"{file}: a picture alone; name the folder that holds a video's pictures"
+            came.skipped.append(Fault(words, "nothing-to-import"))
         else:
             try:
                 came.tables += read_matlab(file) if file.suffix.lower() in _MATLAB else [read_text_table(file)]
@@ -478,11 +480,12 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
     return came
 
 
-def _beside_pictures(folder: Path, video: Video) -> list[str]:
+def _beside_pictures(folder: Path, video: Video) -> list[Fault]:
     if video.is_film:
         return []
     others = sorted(p.name for p in folder.iterdir() if p.name not in video.names)
-    return [f"{folder}: beside its pictures {', '.join(others[:5])}{' ...' if others[5:] else ''}"] if others else []
+    words = f"{folder}: beside its pictures {', '.join(others[:5])}{' ...' if others[5:] else ''}"
+    return [Fault(words, "no-picture")] if others else []
 
 
 def _bytes_of(file: Path) -> bytes:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel.airdata import air_data
-from flightmodel.checks import Fault
+from flightmodel.checks import NO_FAULT, Fault
 from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import difference, resample
@@ -43,15 +43,15 @@ SCALARS = (
 
 def impossible_dispersions(dispersions: Dispersions) -> list[Fault]:
     """Return the keys of a dispersions file that whole trials cannot have."""
-    air, faults = dispersions.atmosphere, []
+    air, found = dispersions.atmosphere, []
     for key in ("density", "wind_north_mps", "wind_east_mps"):
         if getattr(air, key) is not None:
-            faults.append(f"key 'atmosphere.{key}': whole trials draw the scenario's own day alone; leave it out")
+            found.append(f"key 'atmosphere.{key}': whole trials draw the scenario's own day alone; leave it out")
     if not air.day:
-        faults.append("key 'atmosphere.day' = False: whole trials have a day each; leave it out")
+        found.append("key 'atmosphere.day' = False: whole trials have a day each; leave it out")
     if dispersions.joint_is == "locked":
-        faults.append("key 'joint_is' = 'locked': whole trials fly the joint; leave it out")
-    return [Fault(words, "whole-mode-dispersion") for words in faults]
+        found.append("key 'joint_is' = 'locked': whole trials fly the joint; leave it out")
+    return [Fault(words, "whole-mode-dispersion") for words in found]
 
 
 def run_trials(trial: Callable[[int], Mapping[str, float]], plan: Plan, runs: list[int]) -> list[Row]:
@@ -67,7 +67,7 @@ def run_trials(trial: Callable[[int], Mapping[str, float]], plan: Plan, runs: li
     rows = []
     for run in runs:
         numbers: Mapping[str, float] = dict.fromkeys(plan.scalars, np.nan)
-        reason = ""
+        reason = NO_FAULT
         try:
             numbers = trial(run)
         except Exception as fault:  # one flight's defect must not cost the others: its row has the reason

@@ -183,7 +183,7 @@ def test_a_time_bias_that_leaves_no_common_answer_is_named():
     with pytest.raises(DivergenceError) as refusal:
         fuse_flight(loads, history_from_lateral(TIME_S + 0.3, truth, cov, "camera", ""))
     assert refusal.value.codes == ("camera-time-bias",)
-    assert "camera time bias +0.3" in str(refusal.value)
+    assert "+0.3" in str(refusal.value)
     assert "time_bias_sd_s" in str(refusal.value)
 
 

@@ -1,5 +1,6 @@
 """Coefficients from tables with sidecars, from DAVE-ML, from a sphere-cone's shape: what they refer to is respected."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -76,16 +77,13 @@ def test_scales_damping_table_and_reference_of_a_sphere_cone():
 
 
 def test_all_faults_of_a_sphere_cone():
-    with pytest.raises(ConfigError) as caught:
+    names = ["'half_angle_deg'", r"sphere_cone\.nose_radius_m", r"sphere_cone\.mach"]
+    with refuses("key-unknown", "key-value", names=names, kind=ConfigError):
         parse_section(
             Aerodynamics,
             {"sphere_cone": CONE | {"half_angel_deg": 1.0, "nose_radius_m": -1.0, "mach": [1.0]}},
             "v.toml",
         )
-    text = str(caught.value)
-    assert "did you mean 'half_angle_deg'" in text
-    assert "nose_radius_m" in text
-    assert "sphere_cone.mach" in text
     for faulty, key in (
         ({"nose_radius_m": 4.0}, "nose_radius_m"),
         ({"cmq": None}, "cmq"),
@@ -178,17 +176,11 @@ def test_header_in_capitals_is_read_and_other_names_are_told_with_the_nearest(tm
     path.write_text(path.read_text().replace("mach,alpha_deg,ca,cn,cm,cmq", "Mach,Alpha_deg,CA,CN,CM,Cmq"))
     np.testing.assert_array_equal(read_with_sidecar(path)[0].coefficients, small.coefficients)
     path.write_text(path.read_text().replace("Mach,Alpha_deg,CA,CN,CM,Cmq", "Mach No,AoA (deg),CA,CN,Cm_nose,CN_alpha"))
-    with pytest.raises(GateError) as caught:
+    names = [r"\bmach, alpha_deg, cm, cmq\b", re.escape("Mach No, AoA (deg), ca, cn, Cm_nose, CN_alpha")]
+    with refuses("aero-column-missing", names=names) as caught:
         read_with_sidecar(path)
-    for words in (
-        "columns mach, alpha_deg, cm, cmq are missing",
-        "found Mach No, AoA (deg), ca, cn, Cm_nose, CN_alpha",
-        "'Mach No' looks like mach",
-        "'AoA (deg)' looks like alpha_deg",
-        "'Cm_nose' looks like cm",
-    ):
-        assert words in str(caught.value), words
-    assert "looks like cmq" not in str(caught.value)
+    hints = re.findall(r"'([^']+)'[^;]*? (\w+):", str(caught.value))
+    assert hints == [("Mach No", "mach"), ("AoA (deg)", "alpha_deg"), ("Cm_nose", "cm")]
 
 
 def test_tables_uncertainty_stands_where_the_vehicle_file_is_silent(tmp_path):

@@ -43,7 +43,7 @@ def test_aft_profile_and_seams_lie_on_the_tori_and_end_at_the_rim(geometry):
     station, radius = shell.torus_circles(geometry)
     gap = np.hypot(profile[:, :1] - station, profile[:, 1:] - radius).min(axis=1)
     np.testing.assert_allclose(gap, geometry.torus_minor_radius_m, atol=1e-12)
-    seams = shell.seam_curves(geometry)
+    seams = shell.revolved(profile, shell.seam_clocks_rad(geometry))
     assert seams.shape[0] == geometry.gore_count
     rim = shell.rim_curve(geometry, shell.seam_clocks_rad(geometry))
     np.testing.assert_allclose(seams[:, -1], rim, atol=1e-12)

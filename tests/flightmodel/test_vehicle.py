@@ -75,12 +75,9 @@ def edited(tmp_path, *changes):
 
 def test_every_fault_of_a_file_at_once_with_the_nearest_key(tmp_path):
     path = edited(tmp_path, ("half_angle_deg = 60.0", "half_angel_deg = 60.0"), ("mass_kg = 40.0", "mass_kg = -40.0"))
-    with pytest.raises(ConfigError) as caught:
+    names = ["half_angel_deg", "'half_angle_deg'", r"aeroshell\.mass_kg"]
+    with refuses("key-unknown", "key-missing", "key-value", names=names, kind=ConfigError) as caught:
         vehicle_from_toml(path)
-    text = str(caught.value)
-    assert "half_angel_deg" in text
-    assert "did you mean 'half_angle_deg'" in text
-    assert "aeroshell.mass_kg" in text
     assert len(caught.value.faults) >= 3  # the misspelt key, the one it leaves missing, the mass
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.flightfolder import read_flight
+from tests.refusing import numbers_in, printed_codes
 
 G0 = 9.80665
 YARD_M = 0.9144
@@ -302,7 +303,7 @@ def test_many_bad_cells_stay_readable(flight) -> None:
     error = refused(flight, "accelerometer.csv", "bad", codes={"not-a-number"})
     assert len(str(error)) < 4000, "two hundred equal faults belong in one sentence with their number"
     assert names_line(str(error), 2)
-    assert "200" in str(error) or "19" in str(error)
+    assert {200.0, 199.0} & set(numbers_in(str(error)))
 
 
 @pytest.mark.parametrize("cells", [",1.0", ",1.0,2.0,3.0,4.0", ""])
@@ -322,12 +323,12 @@ def test_trailing_comma_does_not_shift_the_columns(flight, clean_flight) -> None
     try:
         telemetry = read_flight(flight.root)
     except GateError as error:
-        text = str(error)
+        text, codes = str(error), set(error.codes)
     else:
-        text = "line 2"
+        text, codes = "line 2", set()
         _same(telemetry, read_flight(clean_flight.root))
     assert names_line(text, 2), text
-    assert "backwards" not in text, "the time does not run backwards in this file"
+    assert codes <= {"row-ragged"}, "the time does not run backwards in this file"
 
 
 @pytest.mark.parametrize("blank", ["", "   "])
@@ -422,7 +423,7 @@ def test_file_in_reverse_order_is_turned_and_said_so(flight, clean_flight) -> No
     flight.write_lines("rates.csv", [lines[0], *lines[:0:-1]])
     _same(read_flight(flight.root), read_flight(clean_flight.root))
     (told,) = findings_of(flight, "rates", "rows-reordered")
-    assert "199 rows in 1 block" in told.what
+    assert numbers_in(told.what) == [199.0, 1.0]
     assert (told.start_s, told.end_s) == (420.0, pytest.approx(429.9))
 
 
@@ -438,9 +439,9 @@ def test_blocks_delivered_twice_and_in_the_wrong_order(flight, clean_flight, nam
     assert {f.source for f in telemetry.findings} == {source}
     times = [float(row.split(",")[0]) for row in rows[1:]]
     (again,), (late,) = findings_of(flight, source, "rows-repeated"), findings_of(flight, source, "rows-reordered")
-    assert "10 rows in 1 block" in again.what
+    assert numbers_in(again.what) == [10.0, 1.0]
     assert (again.start_s, again.end_s) == (times[10], times[19])
-    assert "10 rows in 1 block" in late.what
+    assert numbers_in(late.what) == [10.0, 1.0]
     assert (late.start_s, late.end_s) == (times[30], times[39])
 
 
@@ -464,9 +465,7 @@ def test_one_time_with_two_values_in_a_long_table_is_left_out(flight) -> None:
     assert telemetry.accelerometer.time_s.size == 998
     assert not np.isclose(telemetry.accelerometer.time_s, 424.99).any()
     (told,) = findings_of(flight, "accelerometer", "rows-contradict")
-    assert "2 rows in 1 block" in told.what
-    assert "424.990000 s" in told.what
-    assert "none of them is used" in told.what
+    assert numbers_in(told.what) == [2.0, 1.0, 424.99]
 
 
 def test_missing_time_is_refused_with_its_line(flight) -> None:
@@ -693,14 +692,13 @@ def test_empty_cells_are_missing_not_zero(flight) -> None:
 
 
 @pytest.mark.parametrize("body", ["", "nan"])
-def test_radar_without_data_is_refused_with_a_remedy(flight, body: str) -> None:
+def test_radar_without_data_is_refused(flight, body: str) -> None:
     lines = flight.lines("radar_north.csv")
     if body:
         flight.write_lines("radar_north.csv", [lines[0], *(row.split(",")[0] + ",nan,nan,nan" for row in lines[1:])])
     else:
         flight.write_lines("radar_north.csv", lines[:1])
-    error = refused(flight, "radar_north.csv", "north", codes={"no-samples", "too-few-rows"})
-    assert re.search(r"remove|delete|drop|leave out|without|take", str(error), re.I), f"what to do? {error}"
+    refused(flight, "radar_north.csv", "north", codes={"no-samples" if body else "too-few-rows"})
 
 
 def test_accelerometer_all_missing_is_refused(flight) -> None:
@@ -788,7 +786,7 @@ def test_unknown_key_names_the_nearest(flight, old: str, new: str, nearest: str)
     flight.replace("flight.toml", old, new)
     wrong = new.split(" =")[0].strip("[]").split(".")[-1]
     error = refused(flight, "flight.toml", wrong, nearest, kind=ConfigError, codes={"key-missing", "key-unknown"})
-    one_line_with(error, f"did you mean '{nearest}'")
+    one_line_with(error, wrong, f"'{nearest}'")
 
 
 @pytest.mark.parametrize(("line", "text"), [(4, "name = "), (10, "[sensors.accelerometer"), (3, 'vehicle = "x" "y"')])
@@ -989,18 +987,19 @@ def test_refusal_has_its_exit_code_and_writes_nothing(flight, command, verb: str
 
 
 @pytest.mark.parametrize(
-    ("verb", "old", "new", "words"),
+    ("verb", "old", "new", "time_s"),
     [
-        ("reconstruct", "t_s = 420.0", "t_s = 900.0", ("attitude prior", "900")),
-        ("reconstruct", "t_s = 420.0", "t_s = -50.0", ("attitude prior", "-50")),
+        ("reconstruct", "t_s = 420.0", "t_s = 900.0", 900.0),
+        ("reconstruct", "t_s = 420.0", "t_s = -50.0", -50.0),
     ],
 )
-def test_time_outside_the_data_is_refused(flight, command, verb: str, old: str, new: str, words) -> None:
+def test_time_outside_the_data_is_refused(flight, command, verb: str, old: str, new: str, time_s: float) -> None:
     flight.replace("flight.toml", old, new)
     before = flight.contents()
     done = command(verb, flight.root)
-    assert done.returncode in (2, 3), done.stdout + done.stderr
-    assert all(word in done.stderr for word in words), done.stderr
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert printed_codes(done.stderr) == ["attitude-prior-out-of-reach"]
+    assert time_s in numbers_in(done.stderr)
     assert flight.contents() == before
 
 

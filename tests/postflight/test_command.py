@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -17,9 +18,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from flightmodel.checks import GateError, writing
+from flightmodel.checks import writing
+from postflight import commands
+from postflight.deflections import METHODS
 from postflight.run_folder import PARTIAL, remove_abandoned
 from tests.postflight.killing import kill_run, run_again, start_command
+from tests.refusing import printed_codes, refuses
 
 HEAVY = {"numpy", "scipy", "numba", "matplotlib", "cv2", "trimesh", "filterpy", "pandas", "ppigrf", "erfa"}
 COMMANDS = ("demo", "simulate", "reconstruct", "deflection", "run", "score", "report", "warmup")
@@ -93,6 +97,16 @@ def test_wrong_usage_exits_2(command, tmp_path: Path, arguments: list[str]) -> N
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("options", [["--without", "nort"], ["--set", "without=nort"]])
+def test_unknown_source_exits_2_before_anything_is_compiled(command, flight, monkeypatch, options: list[str]) -> None:
+    monkeypatch.setattr(commands, "compile_kernels", lambda *_: pytest.fail("compiled first"))
+    done = command("reconstruct", flight.root, *options)
+    assert done.returncode == 2, done.stderr
+    assert printed_codes(done.stderr) == ["source-unknown"]
+    assert "'north'" in done.stderr
+    assert not (flight.root / "runs").exists()
+
+
 def test_wrong_command_names_the_nearest_or_the_way_to_help(command) -> None:
     text = command("rnu").stderr
     assert "run" in text or "--help" in text
@@ -135,10 +149,12 @@ def test_bad_scenario_file_exits_2_and_writes_nothing(command, tmp_path: Path, t
 def test_simulate_without_a_scenario_flies_the_reference(command, tmp_path: Path) -> None:
     """The usage line says ``[SCENARIO] FOLDER``: a folder alone is enough (here a file, so that nothing is flown)."""
     (tmp_path / "out").write_text("a file, not a folder")
+    before = tree(tmp_path)
     done = command("simulate", "out", cwd=tmp_path)
-    assert "Missing argument" not in done.stderr
+    assert done.returncode == 3, done.stderr
+    assert printed_codes(done.stderr) == ["folder-exists"]
     assert "out" in done.stderr
-    assert (tmp_path / "out").read_text() == "a file, not a folder"
+    assert tree(tmp_path) == before
 
 
 # --------------------------------------------------------------------------------------------- places to write, or not
@@ -161,9 +177,9 @@ def test_read_only_folder(command, flight) -> None:
         done = command("reconstruct", flight.root)
     finally:
         flight.root.chmod(0o755)
-    assert done.returncode in (2, 3)
+    assert done.returncode == 3
+    assert printed_codes(done.stderr) == ["cannot-write"]
     assert "runs" in done.stderr
-    assert "written" in done.stderr or "denied" in done.stderr.lower()
     assert "Traceback" not in done.stderr
 
 
@@ -278,7 +294,7 @@ def test_terminated_run_leaves_no_run_that_looks_whole(flight, postflight) -> No
     (flight.root / "truth" / "truth.csv").write_text("t_s\n420.0\n")
     done = postflight("score", flight.root)
     assert done.returncode == 3
-    assert "no finished run" in done.stderr
+    assert printed_codes(done.stderr) == ["run-missing"]
 
 
 @pytest.mark.slow
@@ -314,7 +330,7 @@ def test_interrupt_before_anything_is_written(tmp_path: Path) -> None:
     _, errors = process.communicate(timeout=60)
     # an interrupt that met compiled code on its way lets Python end itself by the signal: 130 to a shell as well
     assert process.returncode in (130, -signal.SIGINT), errors
-    assert "interrupted; nothing half-written is left" in errors
+    assert "interrupted" in errors
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
 
@@ -325,7 +341,7 @@ def test_interrupt_before_anything_is_written(tmp_path: Path) -> None:
 def test_score_without_truth_exits_3(command, flight) -> None:
     done = command("score", flight.root, "--json")
     assert done.returncode == 3
-    assert "truth" in done.stderr
+    assert printed_codes(done.stderr) == ["truth-missing"]
     assert done.stdout == ""
 
 
@@ -340,6 +356,7 @@ def test_score_with_broken_truth_exits_3_without_traceback(command, flight) -> N
     (run / "bet.csv").write_text("t_s\n")
     done = command("score", flight.root)
     assert done.returncode == 3
+    assert printed_codes(done.stderr) == ["table-unreadable"]
     assert "Traceback" not in done.stderr
 
 
@@ -367,7 +384,9 @@ def test_estimators_that_cannot_answer_exit_4_and_say_why(two_runs) -> None:
     first, second, saved, _ = two_runs
     assert first.returncode == 4, first.stdout + first.stderr
     assert second.returncode == 4, second.stdout + second.stderr
-    assert first.stdout.count("no answer from") == 4
+    methods = json.loads(saved["summary.json"])["methods"]
+    assert {name for name, row in methods.items() if row["deflection_deg"] is None} == set(METHODS)
+    assert all(f"{name}: {row['reason']} [{row['code']}]" in first.stdout for name, row in methods.items())
     assert "Traceback" not in first.stderr + second.stderr
     assert {"bet.csv", "residuals.csv", "verdicts.csv", "findings.csv", "summary.json", "run.json"} <= set(saved)
 
@@ -453,8 +472,8 @@ def test_no_room_for_a_run(flight) -> None:
     before = flight.contents()
     done = limited("reconstruct", flight.root, largest_bytes=30_000)
     assert done.returncode == 3, done.stderr
-    assert "runs: cannot be written: File too large" in done.stderr
-    assert "make room" in done.stderr
+    assert printed_codes(done.stderr) == ["disk-full"]
+    assert str(flight.root / "runs") in done.stderr
     assert "Traceback" not in done.stderr
     assert flight.contents() - {"runs"} == before
 
@@ -463,21 +482,21 @@ def test_no_room_for_a_run(flight) -> None:
 def test_no_room_for_a_flight(tmp_path: Path) -> None:
     done = limited("simulate", "irve2_reference", tmp_path / "out", largest_bytes=30_000)
     assert done.returncode == 3, done.stderr
-    assert "out: cannot be written: File too large" in done.stderr
+    assert printed_codes(done.stderr) == ["disk-full"]
+    assert str(tmp_path / "out") in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_disk_that_is_full_or_read_only_is_told_with_its_place(tmp_path: Path) -> None:
-    for number, words in ((errno.ENOSPC, "make room"), (errno.EROFS, "elsewhere")):
-        with pytest.raises(GateError, match=words) as told, writing(tmp_path, "write elsewhere"):
+    for number, code in ((errno.ENOSPC, "disk-full"), (errno.EROFS, "cannot-write")):
+        with refuses(code, names=[re.escape(str(tmp_path)), os.strerror(number)]), writing(tmp_path, "write elsewhere"):
             raise OSError(number, os.strerror(number))
-        assert str(told.value).startswith(f"{tmp_path}: cannot be written: {os.strerror(number)}")
     with pytest.raises(FileNotFoundError), writing(tmp_path, "write elsewhere"):
         raise FileNotFoundError(errno.ENOENT, "no such file", "/elsewhere/input.csv")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_results_on_a_device_that_is_full(tmp_path: Path) -> None:
-    with pytest.raises(GateError, match="No space left"), writing(tmp_path, ""):
+    with refuses("disk-full", names=[re.escape(str(tmp_path))]), writing(tmp_path, ""):
         Path("/dev/full").write_text("x")

@@ -13,6 +13,7 @@ import postflight as pf
 from flightmodel.checks import ConfigError
 from flightmodel.tabular import Tabular
 from postflight import commands
+from tests.refusing import numbers_in
 
 UNITS = {"s", "m", "deg", "degps", "mps", "mps2", "pa", "k", "kgpm3", "px", "hz", "g", "nm", "j", "nms", "w", "kgm2"}
 
@@ -36,7 +37,7 @@ def flight(tmp_path_factory):
         assert count, pattern
     (folder / "short.toml").write_text(text)
     truth = pf.simulate(folder / "short.toml", folder / "flight", seed=3)
-    assert "peak q" in repr(truth)
+    assert round(truth.dynamic_pressure_pa.max()) in numbers_in(repr(truth))
     return pf.read_flight(folder / "flight")
 
 

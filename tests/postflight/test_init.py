@@ -157,7 +157,8 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_unknown_vehicle_is_refused_with_the_nearest(tmp_path):
     made = run("init", tmp_path / "x", "--vehicle", "irve2_referenc")
-    assert "did you mean 'irve2_reference'" in str(made.exception)
+    assert made.exception.codes == ("vehicle-unknown",)
+    assert "'irve2_reference'" in str(made.exception)
     assert not (tmp_path / "x").exists()
 
 
@@ -219,9 +220,14 @@ def test_schema_has_every_key(kind):
 
 
 def test_keys_of_flight_and_vehicle_are_described():
-    made = schema("flight")
-    assert "site" in made["$defs"]["RadarEntry"]["properties"]["latitude_deg"]["description"]
-    assert "aft of the nose" in schema("vehicle")["$defs"]["CompliantJoint"]["properties"]["station_m"]["description"]
+    for kind, table, model_name, key in (
+        ("flight", "radars.NAME", "RadarEntry", "latitude_deg"),
+        ("vehicle", "joint", "CompliantJoint", "station_m"),
+    ):
+        comments = {(where, name): comment for where, name, _, comment in template_keys(kind)}
+        comment = comments[table, key].removesuffix(", e.g.").removesuffix("e.g.")
+        assert len(comment) > 5
+        assert schema(kind)["$defs"][model_name]["properties"][key]["description"] == comment
 
 
 def test_quotes_in_a_file_name_stay_text(tmp_path):

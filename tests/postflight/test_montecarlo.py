@@ -30,6 +30,7 @@ from postflight.montecarlo.bands import (
 from postflight.montecarlo.execution import Wanted, status, study_of
 from postflight.montecarlo.study import Stop, read_study
 from synthetic_flight import ensemble
+from tests.refusing import refuses
 
 from .killing import start_command
 from .short_flights import DISPERSIONS, ENTRY, write_short
@@ -171,9 +172,8 @@ def test_a_longer_study_keeps_what_was_flown(reference, path, tmp_path):
     fly(path, folder)
     assert content(folder) == reference
     assert chunk_path(folder, 0).stat().st_mtime_ns == early
-    with pytest.raises(ConfigError, match=" 24 flights") as refusal:
+    with refuses("study-larger", names=[r"\b24\b"], kind=ConfigError):
         fly(path, folder, flights=10)
-    assert refusal.value.codes == ("study-larger",)
 
 
 def test_damaged_and_abandoned_files_are_flown_again(reference, path, tmp_path):
@@ -189,9 +189,8 @@ def test_damaged_and_abandoned_files_are_flown_again(reference, path, tmp_path):
     (folder / "chunks" / f".chunk-000001-{ended.pid}{PARTIAL}").write_bytes(b"half")
     assert status(folder).chunks == 3
     study = read_study(str(path))
-    with pytest.raises(GateError, match="3 of 6") as refusal:
+    with refuses("chunk-missing", names=[r"\b3\b.*\b6\b"]):
         merge(study, folder, FLIGHTS)
-    assert refusal.value.codes == ("chunk-missing",)
     fly(path, folder)
     assert content(folder) == reference
 
@@ -204,17 +203,14 @@ def test_other_settings_are_refused_with_what_differs(path, tmp_path):
     changed = write_short(
         other, DISPERSIONS.replace("normal = 300.0", "normal = 250.0").replace("seed = 7", "seed = 8")
     )
-    with pytest.raises(ConfigError) as refused:
+    names = [r"'initial\.altitude_m\.normal'.*\b300\.0\b.*\b250\.0\b", r"'seed'.*\b7\b.*\b8\b"]
+    with refuses("study-differs", names=names, kind=ConfigError) as refused:
         fly(changed, folder, flights=4)
-    assert set(refused.value.codes) == {"study-differs"}
-    message = str(refused.value)
-    assert "'initial.altitude_m.normal' is 300.0 there, 250.0 now" in message
-    assert "'seed' is 7 there, 8 now" in message
-    assert "mass" not in message
+    assert "mass" not in str(refused.value)
     scenario = other / "short.toml"
     scenario.write_text(scenario.read_text().replace("speed_mps = 1600.0", "speed_mps = 1601.0"))
     (other / "dispersions.toml").write_text(DISPERSIONS)
-    with pytest.raises(ConfigError, match=r"speed_mps' is 1600\.0 there, 1601\.0 now"):
+    with refuses("study-differs", names=[r"speed_mps'.*\b1600\.0\b.*\b1601\.0\b"], kind=ConfigError):
         fly(changed, folder, flights=4)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a").write_text("mine")
@@ -272,9 +268,8 @@ def test_a_failed_flight_is_a_row_and_can_be_flown_again(reference, path, tmp_pa
 
 def test_a_study_of_failures_alone_is_an_error(tmp_path):
     path = write_short(tmp_path, DISPERSIONS.replace("normal = 0.07", "uniform = [-3.0, -2.0]"))
-    with pytest.raises(GateError, match="on C_A, C_N, C_m") as refusal:
+    with refuses("every-flight-failed", names=["C_A, C_N, C_m"]):
         commands.run(str(path), tmp_path / "study", 6, 1, None, None)
-    assert refusal.value.codes == ("every-flight-failed",)
     assert len(pd.read_csv(tmp_path / "study" / "flights.csv")) == 6
 
 

@@ -14,6 +14,7 @@ import pytest
 from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight import cli
+from tests.refusing import numbers_in, printed_codes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_vehicle"
 GM, J2, EARTH_A, EARTH_RATE = 3.986004418e14, 1.082629821313e-3, 6378137.0, 7.292115e-5
@@ -73,6 +74,11 @@ MAGNETOMETER = (
 )
 
 
+BOTH = '[aerodynamics]\ntable = "x.csv"\n'
+POCKET = "{ altitude_m = 5e4, depth = 1.0, thickness_m = 1e3 }"
+GUST = "{ sd_mps = -1.0, length_m = 6e2, from_m = 4e4, to_m = 5e4 }"
+
+
 @pytest.fixture
 def simulate(tmp_path, monkeypatch, capsys):
     """Fly a scenario in which texts are replaced; the command runs in this process, so that a traceback fails here."""
@@ -110,77 +116,79 @@ def table(flight, name: str) -> pd.DataFrame:
     return pd.read_csv(flight.folder / f"{name}.csv")
 
 
-def refused(done, *words: str) -> None:
+def refused(done, codes: str, *names: str) -> None:
+    """Refused by exactly these codes, with every name or number in the message."""
     assert done.code in (2, 3), f"accepted, or another end: {done.code}"
-    for word in words:
-        assert word in done.err, done.err
+    assert set(printed_codes(done.err)) == set(codes.split()), done.err
+    for name in names:
+        assert name in done.err, done.err
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "codes", "names"),
     [
-        ("stop_s = 8.0", "stpo_s = 8.0", ("time.stpo_s", "'stop_s'")),
-        ("telemetry_from_s = 2.0", "telemetry_from_s = 9.0", ("telemetry_from_s",)),
-        ("density_sd = 0.0", "density_sd = -0.1", ("atmosphere.density_sd", "-0.1")),
-        ("winds = false", 'base = "us67"', ("atmosphere.base", "'us76'")),
-        ('"vehicle.toml"', '"irve2_referense"', ("did you mean 'irve2_reference'",)),
-        ("winds = false", "pockets = [{ altitude_m = 5e4, depth = 1.0, thickness_m = 1e3 }]", ("pockets.0.depth",)),
-        ("winds = false", "gusts = [{ sd_mps = -1.0, length_m = 6e2, from_m = 4e4, to_m = 5e4 }]", ("gusts.0.sd_mps",)),
+        ("stop_s = 8.0", "stpo_s = 8.0", "key-unknown key-missing", ("time.stpo_s", "'stop_s'")),
+        ("telemetry_from_s = 2.0", "telemetry_from_s = 9.0", "keys-conflict", ("telemetry_from_s",)),
+        ("density_sd = 0.0", "density_sd = -0.1", "key-value", ("atmosphere.density_sd", "-0.1")),
+        ("winds = false", 'base = "us67"', "key-value", ("atmosphere.base", "'us76'")),
+        ('"vehicle.toml"', '"irve2_referense"', "vehicle-unknown", ("'irve2_reference'",)),
+        ("winds = false", f"pockets = [{POCKET}]", "key-value", ("pockets.0.depth",)),
+        ("winds = false", f"gusts = [{GUST}]", "key-value", ("gusts.0.sd_mps",)),
     ],
 )
-def test_a_wrong_scenario_is_refused_with_file_key_and_remedy(simulate, old, new, words):
-    refused(simulate({old: new}), *words)
+def test_a_wrong_scenario_is_refused_with_file_key_and_remedy(simulate, old, new, codes, names):
+    refused(simulate({old: new}), codes, *names)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "key"),
+    ("old", "new", "code", "key"),
     [
-        ("latitude_deg = 37.3", "latitude_deg = 90.1", "initial.latitude_deg"),
-        ("latitude_deg = 37.841", "latitude_deg = 540.0", "radars.shore.latitude_deg"),
-        ("altitude_m = 60000.0", "altitude_m = -50.0", "initial.altitude_m"),
-        ("spin_rpm = 20.0", "spin_rpm = true", "initial.spin_rpm"),
-        ("stop_s = 8.0", 'stop_s = "8.0"', "time.stop_s"),
-        ("2009-08-17T12:52:00Z", "yesterday", "t0_utc"),
-        ("radars.shore]", 'radars."a/b"]', "radars"),
+        ("latitude_deg = 37.3", "latitude_deg = 90.1", "key-value", "initial.latitude_deg"),
+        ("latitude_deg = 37.841", "latitude_deg = 540.0", "key-value", "radars.shore.latitude_deg"),
+        ("altitude_m = 60000.0", "altitude_m = -50.0", "key-value", "initial.altitude_m"),
+        ("spin_rpm = 20.0", "spin_rpm = true", "key-value", "initial.spin_rpm"),
+        ("stop_s = 8.0", 'stop_s = "8.0"', "key-value", "time.stop_s"),
+        ("2009-08-17T12:52:00Z", "yesterday", "key-value", "t0_utc"),
+        ("radars.shore]", 'radars."a/b"]', "key-name", "radars"),
     ],
 )
-def test_a_value_without_sense_is_refused_with_its_key(simulate, old, new, key):
-    refused(simulate({old: new}), "scenario.toml", key)
+def test_a_value_without_sense_is_refused_with_its_key(simulate, old, new, code, key):
+    refused(simulate({old: new}), code, "scenario.toml", key)
 
 
 @pytest.mark.parametrize(
-    ("old", "new"),
+    ("old", "new", "code"),
     [
-        ("stop_s = 8.0", "stop_s = 1e300"),
-        ("record_s = 0.01", "record_s = 1e300"),
-        ("stop_s = 8.0", "stop_s = 8.0\ninflated_s = 1e300"),
-        ("step_s = 0.002\nrecord_s = 0.01", "step_s = 1e-10\nrecord_s = 1e-10"),
-        ("rate_hz = 100.0", "rate_hz = 1e300"),
-        ("rate_hz = 100.0", "rate_hz = 100.0\nbandwidth_hz = 1e300"),
-        ("rate_hz = 100.0", "rate_hz = 100.0\ndropouts = { rate_hz = 1e300, mean_s = 0.1 }"),
-        ("height_m = 12.0", "height_m = 12.0\noffset_s = 1e300"),
-        ("mount_deg = 0.2", "mount_deg = 1e300"),
-        ("density_sd = 0.0", "density_sd = 1e9"),
-        ("stop_s = 8.0", "stop_s = " + "9" * 5000),
+        ("stop_s = 8.0", "stop_s = 1e300", "key-value"),
+        ("record_s = 0.01", "record_s = 1e300", "key-value"),
+        ("stop_s = 8.0", "stop_s = 8.0\ninflated_s = 1e300", "key-value"),
+        ("step_s = 0.002\nrecord_s = 0.01", "step_s = 1e-10\nrecord_s = 1e-10", "key-value"),
+        ("rate_hz = 100.0", "rate_hz = 1e300", "key-value"),
+        ("rate_hz = 100.0", "rate_hz = 100.0\nbandwidth_hz = 1e300", "key-value"),
+        ("rate_hz = 100.0", "rate_hz = 100.0\ndropouts = { rate_hz = 1e300, mean_s = 0.1 }", "key-value"),
+        ("height_m = 12.0", "height_m = 12.0\noffset_s = 1e300", "key-value"),
+        ("mount_deg = 0.2", "mount_deg = 1e300", "key-value"),
+        ("density_sd = 0.0", "density_sd = 1e9", "key-value"),
+        ("stop_s = 8.0", "stop_s = " + "9" * 5000, "toml-syntax"),
     ],
 )
-def test_an_enormous_value_is_refused_in_words(simulate, old, new):
-    refused(simulate({old: new}), "scenario.toml")
+def test_an_enormous_value_is_refused_in_words(simulate, old, new, code):
+    refused(simulate({old: new}), code, "scenario.toml")
 
 
 @pytest.mark.parametrize("record_s", [0.0033, 3.0])
 def test_records_fit_the_step_and_the_flight_or_are_refused_with_file_and_key(simulate, record_s):
     done = simulate({"record_s = 0.01": f"record_s = {record_s}"})
     if done.code != 0:
-        refused(done, "scenario.toml", "record_s")
+        refused(done, "keys-conflict", "scenario.toml", "record_s")
     else:
         assert table(done, "truth/truth")["t_s"].iloc[-1] == pytest.approx(8.0, abs=1e-6)
 
 
 def test_packages_that_the_vehicle_lacks_are_named(simulate):
-    refused(simulate(vehicle={"[sensors.suba]": "[sensors.subb]"}, name="a"), "suba")
-    refused(simulate(more=MAGNETOMETER.replace("suba", "subb"), name="b"), "subb")
-    refused(simulate(more=VIDEO, name="c"), "camera5")
+    refused(simulate(vehicle={"[sensors.suba]": "[sensors.subb]"}, name="a"), "mount-unknown", "suba")
+    refused(simulate(more=MAGNETOMETER.replace("suba", "subb"), name="b"), "mount-unknown", "subb")
+    refused(simulate(more=VIDEO, name="c"), "camera-unknown", "camera5")
 
 
 @pytest.mark.parametrize("times", [(100.0, 110.0, 100.0), (5.0, 4.0, 5.0), (4.0, 5.0, 7.0)])
@@ -188,56 +196,58 @@ def test_video_that_does_not_fit_the_flight_is_refused(simulate, times):
     video = VIDEO
     for key, time in zip(("start_s = 4.0", "stop_s = 5.0", "benchmark_s = 4.0"), times, strict=True):
         video = video.replace(f"\n{key}", f"\n{key.split(' =')[0]} = {time}")
-    refused(simulate({'"vehicle.toml"': '"irve2_reference"'}, more=video), "video")
+    refused(simulate({'"vehicle.toml"': '"irve2_reference"'}, more=video), "keys-conflict", "video")
 
 
 def test_faults_of_scenario_and_vehicle_are_told_at_once(simulate):
-    refused(simulate({"stop_s": "stpo_s"}, {"torus_count": "torus_cuont"}), "time.stpo_s", "torus_cuont")
+    done = simulate({"stop_s": "stpo_s"}, {"torus_count": "torus_cuont"})
+    refused(done, "key-unknown key-missing", "time.stpo_s", "torus_cuont")
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "code", "key"),
     [
-        ("half_angle_deg = 70.0", "half_angle_deg = 90.0", "half_angle_deg"),
-        ("nose_radius_m = 0.30", "nose_radius_m = 1.5", "nose_radius_m"),
-        ("cmq = -0.10", "cmq = -0.10\nmach = [3.0, 1.0]", "increase"),
-        ("[aerodynamics.sphere_cone] ", '[aerodynamics]\ntable = "x.csv"\n[aerodynamics.sphere_cone] ', "table"),
-        ("mass_kg = 15.0", "mass_kg = 0.0", "aeroshell.mass_kg"),
-        ("[0.6, 0.0, 0.0]", "[9.6, 0.0, 0.0]", "triangle"),
-        ("station_m = 0.12", "station_m = 1e300", "station_m"),
-        ("station_m = 0.12", "station_m = 0.12\nfreeplay_deg = 400.0", "freeplay_deg"),
+        ("half_angle_deg = 70.0", "half_angle_deg = 90.0", "key-value", "half_angle_deg"),
+        ("nose_radius_m = 0.30", "nose_radius_m = 1.5", "keys-conflict", "nose_radius_m"),
+        ("cmq = -0.10", "cmq = -0.10\nmach = [3.0, 1.0]", "keys-conflict", "aerodynamics.sphere_cone.mach"),
+        ("[aerodynamics.sphere_cone] ", f"{BOTH}[aerodynamics.sphere_cone] ", "keys-conflict", "aerodynamics"),
+        ("mass_kg = 15.0", "mass_kg = 0.0", "key-value", "aeroshell.mass_kg"),
+        ("[0.6, 0.0, 0.0]", "[9.6, 0.0, 0.0]", "key-value", "9.6"),
+        ("station_m = 0.12", "station_m = 1e300", "key-value", "station_m"),
+        ("station_m = 0.12", "station_m = 0.12\nfreeplay_deg = 400.0", "key-value", "freeplay_deg"),
     ],
 )
-def test_a_wrong_vehicle_is_refused_with_its_key(simulate, old, new, words):
-    refused(simulate(vehicle={old: new}), "vehicle.toml", words)
+def test_a_wrong_vehicle_is_refused_with_its_key(simulate, old, new, code, key):
+    refused(simulate(vehicle={old: new}), code, "vehicle.toml", key)
 
 
 GRID = ["mach,alpha_deg,ca,cn,cm,cmq"] + [
     f"{mach},{angle},{1.5 * np.cos(np.radians(angle)):.5f},0.0,0.0,-0.1" for mach in (0, 3, 9) for angle in (0, 90, 180)
 ]
 SIDECAR = 'source = "x"\nlicence = "x"\narea_m2 = 3.1416\nlength_m = 2.0\nmoment_reference_station_m = 0.0\n'
+OOPS = "daveml-numbers daveml-breakpoints"
 DAVEML = (Path(__file__).parents[1] / "data" / "blunt_cone.dml").read_text()
 
 
 @pytest.mark.parametrize(
-    ("name", "rows", "sidecar", "words"),
+    ("name", "rows", "sidecar", "codes", "names"),
     [
-        ("mine.csv", None, None, ("mine.csv", "mine.toml")),
-        ("mine.csv", "\n".join(GRID), SIDECAR.replace("area_m2 = 3.1416", "area = 3.0"), ("'area_m2'",)),
-        ("mine.csv", "\n".join([*GRID[:4], *GRID[5:]]), SIDECAR, ("8 rows", "3 Mach x 3 angles")),
-        ("mine.csv", "\n".join(GRID[:4]), SIDECAR, ("mine.csv", "Mach")),
-        ("mine.csv", "\n".join([*GRID[:4], "3,0,abc,0.0,0.0,-0.1", *GRID[5:]]), SIDECAR, ("line 5", "'ca'", "abc")),
-        ("mine.csv", "\n".join(GRID).replace("\n0,", "\n-1,"), SIDECAR, ("mach",)),
-        ("mine.dml", "<html></html>", SIDECAR, ("'html', not DAVEfunc",)),
-        ("mine.dml", DAVEML.replace("1.5, 3.0, 6.0", "1.5, 6.0, 3.0"), SIDECAR, ("MACH1", "increase")),
-        ("mine.dml", DAVEML.replace("1.46, 1.20", "1.46, oops"), SIDECAR, ("'CA'",)),
+        ("mine.csv", None, None, "file-missing sidecar-missing", ("mine.csv", "mine.toml")),
+        ("mine.csv", GRID, SIDECAR.replace("area_m2", "area"), "key-unknown key-missing", ("'area_m2'",)),
+        ("mine.csv", [*GRID[:4], *GRID[5:]], SIDECAR, "aero-grid", ("mine.csv", "8 rows", "3 Mach", "3 angles")),
+        ("mine.csv", GRID[:4], SIDECAR, "aero-grid", ("mine.csv", "Mach")),
+        ("mine.csv", [*GRID[:4], "3,0,abc,0,0,-0.1", *GRID[5:]], SIDECAR, "not-a-number", ("line 5", "'ca'", "abc")),
+        ("mine.csv", [re.sub("^0,", "-1,", row) for row in GRID], SIDECAR, "aero-mach", ("'mach'",)),
+        ("mine.dml", ["<html></html>"], SIDECAR, "daveml-not-xml", ("'html'", "DAVEfunc")),
+        ("mine.dml", [DAVEML.replace("1.5, 3.0, 6.0", "1.5, 6.0, 3.0")], SIDECAR, "daveml-breakpoints", ("MACH1",)),
+        ("mine.dml", [DAVEML.replace("1.46, 1.20", "1.46, oops")], SIDECAR, OOPS, ("'CA'",)),
     ],
 )
-def test_a_wrong_table_is_refused(simulate, name, rows, sidecar, words):
+def test_a_wrong_table_is_refused(simulate, name, rows, sidecar, codes, names):
     text = (EXAMPLE / "vehicle.toml").read_text()
     cone = text[text.index("[aerodynamics.sphere_cone]") : text.index("[aerodynamics.free_molecular]")]
-    files = {name: rows, "mine.toml": sidecar} if rows is not None else {}
-    refused(simulate(vehicle={cone: f'[aerodynamics]\ntable = "{name}"\n\n'}, files=files), *words)
+    files = {name: "\n".join(rows), "mine.toml": sidecar} if rows is not None else {}
+    refused(simulate(vehicle={cone: f'[aerodynamics]\ntable = "{name}"\n\n'}, files=files), codes, *names)
 
 
 @pytest.mark.parametrize(
@@ -374,7 +384,8 @@ def test_a_joint_too_soft_ends_the_flight_with_its_time(simulate):
     read_flight(done.folder)
     early = {"telemetry_from_s = 2.0": "telemetry_from_s = 0.1"}
     done = simulate(early, {"bending_stiffness_nmprad = 2500.0": "bending_stiffness_nmprad = 20.0"})
-    assert "before telemetry begins" not in done.err, done.err  # it ends half a second after
+    assert printed_codes(done.err) == ["telemetry-too-short"]
+    assert 0.1 < numbers_in(done.err)[0] < 1.1  # it ends half a second after telemetry begins
 
 
 def test_a_step_too_large_for_the_joint_is_not_taken_for_a_divergence(simulate):
@@ -383,7 +394,7 @@ def test_a_step_too_large_for_the_joint_is_not_taken_for_a_divergence(simulate):
     if done.code == 0:  # flown after all: it must be flown well, that is nearly rigid
         assert table(done, "truth/deflection")["theta_deg"].max() < 0.01
     else:
-        refused(done, "step_s")
+        refused(done, "step-too-long", "step_s")
 
 
 def test_joint_keys_do_what_they_say(simulate):

@@ -18,6 +18,7 @@ from synthetic_flight.dispersions import Window
 from synthetic_flight.ensemble import Records, Start, fly_legs, legs
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import initial_state, read_scenario
+from tests.refusing import refuses
 
 VEHICLE = "irve2_reference"
 
@@ -148,5 +149,5 @@ def test_a_locked_joint_carries_the_force_of_the_rigid_body():
 
 
 def test_an_unknown_vehicle_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="no vehicle 'irve'"):
+    with refuses("vehicle-unknown", names=["'irve'"], kind=ConfigError):
         commands.stiffness_and_damping("irve", tmp_path)

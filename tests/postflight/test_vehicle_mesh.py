@@ -1,6 +1,7 @@
 """A vehicle with a mesh of the user's own, through the commands: copied along, told, hashed, refused."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import trimesh
 
 from flightmodel.vehicle import vehicle_from_toml
 from tests.flightmodel.meshes_of_vehicles import as_drawn, shell_mesh
+from tests.refusing import printed_codes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_vehicle"
 TABLE = '\n[meshes.aeroshell]\nfile = "shell.stl"\nunit_m = 0.001\nforward = "z"\nnose = [12.0, -7.0, 55.0]\n'
@@ -25,11 +27,12 @@ def test_a_mesh_goes_with_its_vehicle_and_is_checked_before_a_run(command, tmp_p
     assert done.returncode == 0, done.stderr
     found = json.loads(command("check", flight, "--json").stdout)
     assert found["exit_code"] == 0
-    assert "drawn, while the camera's fit is of [geometry]" in json.dumps(found)
+    assert [f["code"] for f in found["findings"] if "aeroshell" in f["source"]] == ["mesh-drawn"]
     copy = flight / "vehicle" / "shell.stl"
     assert copy.read_bytes() == (tmp_path / "shell.stl").read_bytes()
     holed = trimesh.Trimesh(mesh.vertices, mesh.faces[1:], process=False)
     holed.export(copy)
     done = command("check", flight)
     assert done.returncode == 2
-    assert "shell.stl: is not watertight: 3 of its" in " ".join((done.stdout + done.stderr).split())
+    assert printed_codes(done.stdout) == ["mesh-not-watertight"]
+    assert re.search(r"shell\.stl\b.*\b3\b", done.stdout, re.DOTALL)

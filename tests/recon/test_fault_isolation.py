@@ -116,11 +116,12 @@ def test_a_check_is_about_its_own_source_alone():
 
 
 def test_one_resolving_exclusion_names_the_tracker_and_nothing_else():
-    checks = failed("nis", "west", symptom="residuals are large"), failed("data-sheet", "accelerometer", "bias x")
+    symptom = "residuals at 99 sd"
+    checks = failed("nis", "west", symptom=symptom), failed("data-sheet", "accelerometer", "bias x")
     left_out = LeftOut("north", (checks[0],)), LeftOut("west", ())
     assert codes(checks, left_out) == [("tracker", ("west",))]
     (only,) = isolate_faults(checks, left_out)
-    assert "residuals are large" in only
+    assert symptom in only
 
 
 def test_two_resolving_exclusions_are_a_contradiction():
@@ -145,7 +146,7 @@ def test_mounts_are_observable_only_relative_to_each_other():
     checks = failed("data-sheet", "rates", "mount y"), failed("data-sheet", "accelerometer", "mount z")
     (only,) = isolate_faults(checks, ())
     assert (only.code, only.sources) == ("inertial-sensors", ("rates", "accelerometer"))
-    assert "rates mount y or accelerometer mount z" in only
+    assert all(f"{c.source} {c.component}" in only for c in checks)
 
 
 def test_a_clock_lag_is_laid_on_the_inertial_sensors():
@@ -153,13 +154,14 @@ def test_a_clock_lag_is_laid_on_the_inertial_sensors():
 
 
 def test_attitude_and_air_come_last():
+    symptom = "12 sd at 48 km"
     checks = (
-        failed("sounding-density", symptom="density at 48 km is far"), failed("data-sheet", "rates", "bias x"),
+        failed("sounding-density", symptom=symptom), failed("data-sheet", "rates", "bias x"),
         failed("attitude-nees", "magnetometer"), failed("attitude-data-sheet", "sun head 1", "bias az"),
     )  # fmt: skip
     found = isolate_faults(checks, ())
     assert [h.code for h in found] == ["inertial-sensors", "attitude", "air"]
-    assert found[-1] == "air: density at 48 km is far"
+    assert symptom in found[-1]
 
 
 def test_motion_is_named_where_nothing_else_is():

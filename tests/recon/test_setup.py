@@ -1,5 +1,6 @@
 """From telemetry to a problem, and every refusal: all faults at once, with the nearest known names."""
 
+import re
 from dataclasses import fields, replace
 
 import numpy as np
@@ -34,8 +35,8 @@ def test_settings_name_all_faults_at_once():
     assert [s.code for s in said].count("setting-choice") == 2
     assert [s.code for s in said].count("setting-range") == 9
     assert len(said) == 11
-    assert any("did you mean 'axis'" in s for s in said)
-    assert any("did you mean 'compiled'" in s for s in said)
+    choices = [s for s in said if s.code == "setting-choice"]
+    assert [re.search("'(axis|compiled)'", s)[1] for s in choices] == ["axis", "compiled"]
 
 
 def test_settings_come_from_a_mapping_of_the_same_names():
@@ -52,7 +53,7 @@ def test_settings_come_from_a_mapping_of_the_same_names():
         assert setting.metadata["allowed"]
     said = faults(Settings.from_mapping, {"outputrate_hz": 3.0, "smoother": "x", "passes": 1.5, "engine": []})
     assert [s.code for s in said] == ["setting-unknown", "setting-unknown", "setting-range", "setting-choice"]
-    assert "did you mean 'output_rate_hz'" in said[0]
+    assert "'output_rate_hz'" in said[0]
 
 
 def test_names_in_consider_and_without_are_refused_together(mini_everything):
@@ -64,7 +65,7 @@ def test_names_in_consider_and_without_are_refused_together(mini_everything):
     assert [s.code for s in said] == ["source-unknown"] * 2 + ["error-unknown"] * 2
     words = "\n".join(said)
     for hint in ("'north'", "'receiver'", "'accelerometer mount'"):
-        assert f"did you mean {hint}" in words
+        assert hint in words
     assert "'west'" not in words
 
 
@@ -84,7 +85,7 @@ def test_ballistic_flight_has_no_attitude_to_measure():
     said = faults(reconstruct, telemetry, Settings(attitude_sensors=True, without=("naer",)))
     assert len(said) == 2
     assert {s.code for s in said} == {"setting-not-applicable", "source-unknown"}
-    assert any("did you mean 'near'" in s for s in said)
+    assert any("'near'" in s for s in said if s.code == "source-unknown")
 
 
 @pytest.mark.parametrize("everything", [("north", "west"), ("north", "west", "receiver", "barometer")])

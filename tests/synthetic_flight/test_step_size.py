@@ -8,6 +8,7 @@ from synthetic_flight import simulate
 from synthetic_flight.dynamics import joint_modes, largest_step_s
 from synthetic_flight.ensemble import Schedule, fly_ensemble
 from synthetic_flight.simulate import fly, integrate
+from tests.refusing import refuses
 
 from .conftest import free_state
 
@@ -44,9 +45,7 @@ def test_too_long_a_step_is_refused_with_the_longest(vehicle):
 
     stiff = with_joint(vehicle, bending_stiffness_nmprad=1.0e7)
     state = free_state(vehicle)
-    with pytest.raises(ConfigError, match=r"4 ms .*bending.* 1\d\d\.\d Hz") as refusal:
+    with refuses("step-too-long", names=[r"\b4 ms", "bending", r"1\d\d\.\d Hz"], kind=ConfigError):
         fly(stiff, standard_atmosphere(), state, 0.0, 1.0, "2009-08-17T12:52:00Z", 0.004, 0.004)
-    assert refusal.value.codes == ("step-too-long",)
-    with pytest.raises(ConfigError, match=r"torsion.* 53\.") as refusal:
+    with refuses("step-too-long", names=["torsion", r"\b53\."], kind=ConfigError):
         list(fly_ensemble(vehicle, lambda _: None, [0], Schedule(0.01, 1, 2)))
-    assert refusal.value.codes == ("step-too-long",)
