@@ -184,7 +184,7 @@ def fault_hypotheses(loads: FlightLoads, input_posterior: InputPosterior, plane_
             out[hypothesis][input_posterior.place[name].start, k] = normals
     if ACCELEROMETER in input_posterior.place:
         pulse = loads.rows(loads.through_pulse)
-        force, root = pulse.specific_force_body_mps2, pulse.force_root_mps2.reshape(-1, 9)
+        force, root = pulse.specific_force_body_mps2, pulse.force_root_mps2.reshape(-1, pulse.force_root_mps2.shape[2])
         axes = FAULT_MOUNT_RAD / np.sqrt(2.0) * np.eye(3)[1:]
         misaligned = np.column_stack([np.cross(axis, force).ravel() for axis in axes])
         out[MOUNT] = np.zeros((size, 2))

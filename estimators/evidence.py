@@ -13,11 +13,12 @@ with a history (wind, attitude) is many unit normals, each with its own course o
 the same random variables in all methods: that is all of their correlation. The readings are curved functions of the
 worst known coefficient: the curvature shifts the mean of the deflection and widens it.
 
-The flow's error has three parts: that of the accelerometer's errors (estimated together with the attitude), the rest
-of the trajectory's, and the wind's. The last two do not roll with the vehicle: they are written in axes that do not
-roll. The trajectory's is a Gauss-Markov process with the correlation time `TRAJECTORY_TIME_S`; the wind's is half
-constant bias, half Gauss-Markov with the correlation length `WIND_LENGTH_M` of altitude, as in the reconstruction of
-the atmosphere; so is the density's in the dynamic pressure, with `DENSITY_LENGTH_M`.
+The flow's error has three parts: that of the inertial sensors' constant errors (estimated together with the attitude,
+and rolling with the vehicle), the rest of the trajectory's, and the wind's. The last two do not roll with the vehicle:
+they are written in axes that do not roll. The trajectory's is a Gauss-Markov process with the correlation time
+`TRAJECTORY_TIME_S`; the wind's is half constant bias, half Gauss-Markov with the correlation length `WIND_LENGTH_M` of
+altitude, as in the reconstruction of the atmosphere; so is the density's in the dynamic pressure, with
+`DENSITY_LENGTH_M`.
 
 Accelerometer and gyros have time biases of a millisecond or so: what oscillates is read late, and what the gyros carry
 from the accelerometer to the c.g. does not match the force. The camera's time bias is relative to both.
@@ -308,7 +309,8 @@ def evidence_of_balance(
     if with_inputs:
         by_flow = history("flow_yz_rad", _THETA_RAD)
         inputs = {name: by_flow @ part for name, part in flow_inputs(loads).items()}
-        inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + by_force @ loads.force_root_mps2
+        own = by_force @ loads.force_root_mps2 + history("rate_body_radps", _RATE_RADPS) @ loads.rate_root_radps
+        inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + own
         inputs |= _other_inputs(loads, base, solve, left)
     read = np.where(known[:, None], read, np.nan)
     return Evidence(method, loads.time_s, read, by_rate, by_turn, inputs, noise, averaged_s)
@@ -439,12 +441,15 @@ def corrected_loads(loads: FlightLoads, inputs: dict[str, FloatArray]) -> Flight
     flow, force = loads.flow_yz_rad.copy(), loads.specific_force_body_mps2.copy()
     for name, part in flow_inputs(loads).items():
         flow += part @ inputs.get(name, np.zeros(part.shape[2]))
-    force += loads.force_root_mps2 @ inputs.get(ACCELEROMETER, np.zeros(9))
+    rate = loads.rate_body_radps
+    if ACCELEROMETER in inputs:
+        force += loads.force_root_mps2 @ inputs[ACCELEROMETER]
+        rate = rate + loads.rate_root_radps @ inputs[ACCELEROMETER]
     pressure = loads.dynamic_pressure_pa
     if PRESSURE in inputs:
         pressure = np.maximum(pressure * (1.0 + pressure_input(loads) @ inputs[PRESSURE]), 1e-3)
     bias = [float(inputs[name][0]) if name in inputs else 0.0 for name in (ACCELEROMETER_TIME_BIAS, GYRO_TIME_BIAS)]
-    moved = replace(loads, flow_yz_rad=flow, specific_force_body_mps2=force)
+    moved = replace(loads, flow_yz_rad=flow, specific_force_body_mps2=force, rate_body_radps=rate)
     return replace(
         delayed(moved, bias[0] * loads.accelerometer_time_bias_sd_s, bias[1] * loads.gyro_time_bias_sd_s),
         dynamic_pressure_pa=pressure,

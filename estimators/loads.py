@@ -31,10 +31,12 @@ class FlightLoads:
         At ``point_from_datum_m``, body axes.
     force_noise_sd_mps2 : float
         Its white noise, each axis.
-    force_root_mps2 : (n, 3, 9) float
-        Its error per unit normal of nine that stand for the accelerometer's constant errors.
-    flow_root_rad : (n, 2, 9) float
-        The flow's error per unit normal of the same nine: attitude and accelerometer were estimated together.
+    force_root_mps2 : (n, 3, k) float
+        Its error per unit normal of those that stand for the constant errors of accelerometer and gyros.
+    flow_root_rad : (n, 2, k) float
+        The flow's error per unit normal of the same: attitude and sensors were estimated together.
+    rate_root_radps : (n, 3, k) float
+        The rate's.
     rate_body_radps, angular_acceleration_body_radps2 : (n, 3) float
     angular_acceleration_sd_radps2 : float
     flow_yz_rad : (n, 2) float
@@ -64,6 +66,7 @@ class FlightLoads:
     force_noise_sd_mps2: float
     force_root_mps2: FloatArray
     flow_root_rad: FloatArray
+    rate_root_radps: FloatArray
     rate_body_radps: FloatArray
     angular_acceleration_body_radps2: FloatArray
     angular_acceleration_sd_radps2: float
@@ -83,11 +86,12 @@ class FlightLoads:
 
     def __post_init__(self) -> None:
         """Check shapes once."""
-        n = len(self.time_s)
+        n, k = len(self.time_s), np.shape(self.force_root_mps2)[-1]
         for name, shape in (
             ("specific_force_body_mps2", (n, 3)),
-            ("force_root_mps2", (n, 3, 9)),
-            ("flow_root_rad", (n, 2, 9)),
+            ("force_root_mps2", (n, 3, k)),
+            ("flow_root_rad", (n, 2, k)),
+            ("rate_root_radps", (n, 3, k)),
             ("rate_body_radps", (n, 3)),
             ("angular_acceleration_body_radps2", (n, 3)),
             ("flow_yz_rad", (n, 2)),
@@ -121,6 +125,7 @@ _HISTORIES = frozenset(
         "specific_force_body_mps2",
         "force_root_mps2",
         "flow_root_rad",
+        "rate_root_radps",
         "rate_body_radps",
         "angular_acceleration_body_radps2",
         "flow_yz_rad",

@@ -69,6 +69,7 @@ def pulse_of(rng, n, theta_yz=None, vehicle=VEHICLE):
         force_noise_sd_mps2=0.01,
         force_root_mps2=np.tile(np.hstack([root, np.zeros((3, 6))]), (n, 1, 1)),
         flow_root_rad=np.zeros((n, 2, 9)),
+        rate_root_radps=np.zeros((n, 3, 9)),
         rate_body_radps=np.zeros((n, 3)),
         angular_acceleration_body_radps2=np.zeros((n, 3)),
         angular_acceleration_sd_radps2=0.0,

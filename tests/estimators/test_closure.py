@@ -48,6 +48,7 @@ def pulse_of_truth(truth):
         force_noise_sd_mps2=0.0,
         force_root_mps2=np.zeros((n, 3, 9)),
         flow_root_rad=np.zeros((n, 2, 9)),
+        rate_root_radps=np.zeros((n, 3, 9)),
         rate_body_radps=truth.state_eci[:, 14:17],
         angular_acceleration_body_radps2=truth.angular_acceleration_body_radps2,
         angular_acceleration_sd_radps2=0.0,
