@@ -104,7 +104,7 @@ def test_balances_of_a_locked_joint_close(rpm, bent_deg, cmq):
     force, moment = left_deg(truth, Swing.held(truth.deflection.theta_yz_rad))
     np.testing.assert_allclose(force, 0.0, atol=1e-5)
     # damping takes the c.g.'s airspeed, not the nose's: of a fast turn by the 30 deg's lever it leaves more
-    np.testing.assert_allclose(moment, 0.0, atol=2e-3 if bent_deg > 10.0 else 2e-4)
+    np.testing.assert_allclose(moment, 0.0, atol=5e-3 if bent_deg > 10.0 else 2e-4)
     if bent_deg < 10.0:
         # and the deflection is found from nothing
         pulse = pulse_of_truth(truth)
