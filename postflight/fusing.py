@@ -274,7 +274,10 @@ def _without_each(sources: _Sources, bias_sd_s: float) -> FusedAnswer | None:
             "misalignment alone": estimate_misalignment(sources.loads),
             "trim alone": estimate_trim(sources.loads),
         }
-    return _mixed(next(iter(among.values())), histories, np.ones(len(histories)), sources.loads) if among else None
+    if not among:
+        return None
+    base = among.get("trim", next(iter(among.values())))
+    return _mixed(base, histories, np.ones(len(histories)), sources.loads)
 
 
 def _with_faults_freed(sources: _Sources, answer: FusedAnswer, bias_sd_s: float) -> FusedAnswer:
