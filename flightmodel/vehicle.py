@@ -115,13 +115,15 @@ class CompliantJoint(Section):
 class Uncertainty(Section):
     """What is known of the vehicle before flight, one standard deviation; fractions where no unit is named.
 
-    Mass, c.g. and inertia are each body's own; C_mq's is absolute.
+    Mass, c.g. and inertia are each body's own; products of inertia are the centerbody's, of its transverse moment;
+    C_mq's is absolute.
     """
 
     mass: Fraction = 0.01
     cg_station_m: Metres = 0.01
     cg_lateral_m: Metres = 0.001
     inertia: Fraction = 0.03
+    inertia_products: Fraction = 0.002
     ca: Fraction = 0.03
     cn: Fraction = 0.07
     cm: Fraction = 0.10
