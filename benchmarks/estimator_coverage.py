@@ -1,13 +1,12 @@
-"""Do the deflection estimates err as they say? Dispersed flights with every error alive, scored at peak pressure.
+"""Do the deflection estimates err as they say? Flights far from the reference vehicle, scored at peak pressure.
 
-Run: ``python benchmarks/estimator_coverage.py [FLIGHTS [FIRST SEED]] [FOLDER] [--rigid | --planted]`` (100 flights from
-seed 0). Drawn anew for each seed: side and size of the offset that the analyst is told, and what the analyst is not
-told: masses, c.g.s, inertias, joint, coefficients (C_A 5 %, C_N 10 %, C_m 15 %, C_mq 0.15 between Mach 1.2 and 5),
-start, spin, air, the sounding's and every instrument's errors. No video. Some 5 s a flight on each of two cores; what
-the estimators see and the truth are kept in FOLDER, so that the estimators can be scored again without flying. The
-camera's history is drawn, not rendered. ``--rigid`` flies a stiff joint; ``--planted`` spoils one assumption at a time,
-with uncertainties as the reference vehicle's file states them; ``suspects_bound.py`` says how well the same errors
-could be told at all.
+Run: ``python benchmarks/estimator_coverage.py [FLIGHTS [FIRST SEED]] [FOLDER] [--planted] [--packages FOLDER]`` (100
+flights from seed 0). Drawn anew for each seed, as `tests.wide_flights` says: spin, joint, damping, offset, size and
+mass of the vehicle, and what the analyst is not told of it. No video. Some 4 s a flight on each of two cores; what the
+estimators see and the truth are kept in FOLDER, so that the estimators can be scored again without flying. The
+camera's history is drawn, not rendered. ``--planted`` spoils one assumption at a time, with uncertainties as the
+reference vehicle's file states them; ``suspects_bound.py`` says how well the same errors could be told at all.
+``--packages`` scores flights of another simulator: folders with flight.toml and truth/truth.csv.
 """
 
 import multiprocessing
@@ -21,6 +20,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from scipy.stats import chi2
 
 from flightmodel.statistics import correlation_root
@@ -35,7 +35,7 @@ from flightmodel import rotations
 from flightmodel.airdata import air_data, lateral_angles
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import DivergenceError, GateError
-from flightmodel.deflection import history_from_lateral
+from flightmodel.deflection import history_from_lateral, polar_from_lateral
 from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
@@ -44,20 +44,19 @@ from postflight.fusing import fuse_flight
 from postflight.loads import loads_from_solution
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
-from synthetic_flight.folder import simulate_to_folder
-from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, read_scenario
-from tests.recon import dispersed
+from synthetic_flight.scenarios import ACCELEROMETER_MOUNT
+from tests import wide_flights
 
-KEPT = "/tmp/estimator_coverage"
-COEFFICIENT_SD = {"ca": 0.05, "cn": 0.10, "cm": 0.15}
-CMQ_SD = 0.15
+KEPT = "/tmp/wide_estimator_coverage"
+COEFFICIENT_SD = wide_flights.COEFFICIENT_SD
 RATE_HZ = 20.0
 STATED = (
     "vehicle",
+    "point_from_datum_m",
     "accelerometer_time_bias_sd_s",
     "gyro_time_bias_sd_s",
     "cg_from_sensor_m",
-)  # the same in every flight
+)  # follow from what the analyst is told
 ARRAYS = [f.name for f in fields(FlightLoads) if f.name not in STATED]
 CAMERA_SD = {"clean": np.deg2rad(0.15), "degraded": np.deg2rad(0.40)}
 CAMERA_CLOCK = np.deg2rad(153.0)
@@ -73,64 +72,30 @@ PLANTED = {  # and the right suspect
 TURN_YZ_RAD = np.deg2rad(0.5) * np.array([0.6, 0.8])
 
 
-def told_vehicle(seed):
-    """Vehicle as the analyst knows it: the reference one with an offset of random side and size."""
-    rng = np.random.default_rng([seed, 1, 2009])
-    nominal = vehicle_from_toml(vehicle_path("irve2_reference"))
-    clock, size = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0015, 0.0050)
-    body = nominal.centerbody
-    lateral = size * nominal.mass_kg / body.mass_kg * np.array([-np.cos(clock), np.sin(clock)])
-    moved = body.model_copy(update={"cg_from_datum_body_m": (body.cg_from_datum_body_m[0], *map(float, lateral))})
-    known = nominal.uncertainty.model_copy(update=COEFFICIENT_SD)
-    return replace(nominal, centerbody=moved, uncertainty=known)
-
-
-def flown_vehicle(told, seed, rigid=False):
-    """Vehicle as it is: every number drawn around what is told, in the sizes that are told; and the drawn factors."""
-    rng = np.random.default_rng([seed, 2, 2009])
-    flown = dispersed.dispersed_vehicle(told, rng)
-    known = told.uncertainty
-    factors = {k: 1.0 + getattr(known, k) * rng.standard_normal() for k in ("ca", "cn", "cm")}
-    joint = flown.joint.model_copy(
-        update={
-            "bending_stiffness_nmprad": told.joint.bending_stiffness_nmprad * (300.0 if rigid else rng.uniform(1, 1.3)),
-            "bending_damping_nmsprad": flown.joint.bending_damping_nmsprad * (100.0 if rigid else 1.0),
-        }
-    )
-    aero = flown.aero.scaled(**factors, cmq_shift=CMQ_SD * rng.standard_normal())
-    return replace(flown, joint=joint, aero=aero), factors
-
-
-def flown_pulse(seed, rigid=False):
-    """One flight: what the estimators see (`FlightLoads`), and the truth at the same times."""
-    told = told_vehicle(seed)
-    flown, factors = flown_vehicle(told, seed, rigid)
-    scenario = replace(dispersed.dispersed_scenario("irve2_reference", seed), vehicle=flown)
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary) / "flight"
-        truth = simulate_to_folder(scenario, seed, folder)
-        telemetry = replace(read_flight(folder), vehicle=told)
+def loads_of(telemetry):
+    """What the estimators see of a flight (`FlightLoads`)."""
     bet = reconstruct(telemetry, Settings(output_rate_hz=RATE_HZ))
-    pulse = loads_from_solution(
-        telemetry, bet, air_data(bet.smoothed, profile_from_sounding(telemetry.sounding), told.cg_m)
-    )
+    profile = profile_from_sounding(telemetry.sounding)
+    return loads_from_solution(telemetry, bet, air_data(bet.smoothed, profile, telemetry.vehicle.cg_m))
+
+
+def flown_pulse(seed):
+    """One flight: what the estimators see, and the truth at the same times."""
+    one = wide_flights.wide_flight(seed)
+    with tempfile.TemporaryDirectory() as temporary:
+        telemetry, truth = wide_flights.flown(one, Path(temporary) / "flight")
+        pulse = loads_of(telemetry)
     t = pulse.time_s
     path = resample(truth.trajectory, t)
-    air = air_data(path, truth.profile, flown.cg_m)
-    bent = truth.deflection.theta_yz_rad
-    turned = np.gradient(np.gradient(bent, truth.time_s, axis=0), truth.time_s, axis=0)
-    force = truth.specific_force_body(told.cg_m)
+    air = air_data(path, truth.profile, one.told.cg_m)
     known = {
-        "theta_yz": columns(t, truth.time_s, bent),
-        "theta_yz_second": columns(t, truth.time_s, turned),
+        "theta_yz": columns(t, truth.time_s, truth.deflection.theta_yz_rad),
         "flow_yz": lateral_angles(air.velocity_air_body_mps),
         "pressure": air.dynamic_pressure_pa,
-        "mach": air.mach,
-        "force": columns(t, truth.time_s, force),
-        "turn": columns(t, truth.time_s, truth.angular_acceleration_body_radps2),
-        "factors": np.array([factors[k] for k in ("ca", "cn", "cm")]),
-        "offset": flown.cg_m - told.cg_m,
+        "factors": np.array([one.factors[k] for k in ("ca", "cn", "cm")]),
         "peak": np.array(find_peak(truth.time_s, truth.dynamic_pressure_pa)[0]),
+        "locked": np.array(one.locked),
+        "spin": np.array(one.scenario.spec.initial.spin_rpm),
         "words": np.array(truth.remark),
     }
     return pulse, known
@@ -140,36 +105,38 @@ def columns(at, time_s, values):
     return np.stack([np.interp(at, time_s, c) for c in values.T], axis=-1)
 
 
-def kept_path(folder, seed, rigid):
-    return Path(folder) / f"{'rigid' if rigid else 'flight'}_{seed:04d}.npz"
+def kept_path(folder, seed):
+    return Path(folder) / f"flight_{seed:04d}.npz"
 
 
-def fly_and_keep(seed, folder, rigid):
-    pulse, truth = flown_pulse(seed, rigid)
+def fly_and_keep(seed, folder):
+    pulse, truth = flown_pulse(seed)
     data = {f"pulse_{k}": getattr(pulse, k) for k in ARRAYS} | {f"true_{k}": v for k, v in truth.items()}
-    np.savez(kept_path(folder, seed, rigid), **data)
+    np.savez(kept_path(folder, seed), **data)
     return seed, str(truth["words"])
 
 
-def kept_flight(folder, seed, rigid=False):
+def kept_flight(folder, seed):
     """Return `FlightLoads` and truth of a flight that was kept."""
-    with np.load(kept_path(folder, seed, rigid)) as data:
+    with np.load(kept_path(folder, seed)) as data:
         arrays = {k: data[f"pulse_{k}"] for k in ARRAYS}
-        arrays["angular_acceleration_sd_radps2"] = float(arrays["angular_acceleration_sd_radps2"])
+        for name in ("angular_acceleration_sd_radps2", "force_noise_sd_mps2"):
+            arrays[name] = float(arrays[name])
         truth = {k.removeprefix("true_"): data[k] for k in data.files if k.startswith("true_")}
-    spec, vehicle = read_scenario("irve2_reference").spec, told_vehicle(seed)
+    one = wide_flights.wide_flight(seed)
+    spec, vehicle = one.scenario.spec, one.told
     arm = vehicle.cg_m - vehicle.sensors[ACCELEROMETER_MOUNT].position_from_datum_body_m
-    stated = (vehicle, spec.accelerometer.time_bias_s, spec.rates.time_bias_s, arm)
+    stated = (vehicle, vehicle.cg_m, spec.accelerometer.time_bias_s, spec.rates.time_bias_s, arm)
     return FlightLoads(**arrays, **dict(zip(STATED, stated, strict=True))), truth
 
 
-def fly_missing(folder, seeds, rigid=False, workers=2):
+def fly_missing(folder, seeds, workers=2):
     """Fly what is not kept yet, and say how far it is."""
     Path(folder).mkdir(parents=True, exist_ok=True)
-    missing = [s for s in seeds if not kept_path(folder, s, rigid).exists()]
+    missing = [s for s in seeds if not kept_path(folder, s).exists()]
     begun = time.perf_counter()
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
-        jobs = [pool.submit(fly_and_keep, s, folder, rigid) for s in missing]
+        jobs = [pool.submit(fly_and_keep, s, folder) for s in missing]
         for k, job in enumerate(as_completed(jobs), 1):
             seed, words = job.result()
             left = (time.perf_counter() - begun) / k * (len(jobs) - k)
@@ -215,28 +182,42 @@ def planted(pulse, camera, what):
     return pulse, camera
 
 
-def scored(seed, folder, rigid, what):
+def scored(seed, folder, what):
     """Errors and error bars at peak pressure of every method; what the agreement test says."""
-    pulse, truth = kept_flight(folder, seed, rigid)
+    pulse, truth = kept_flight(folder, seed)
     use = pulse.through_pulse
     if what is not None:  # errors told as the vehicle file has them, not at the sizes of the ensemble
         known = vehicle_from_toml(vehicle_path("irve2_reference")).uncertainty
         pulse = replace(pulse, vehicle=replace(flown_aero(pulse.vehicle, truth, known), uncertainty=known))
-    out = {"seed": seed, "words": str(truth["words"])}
+    out = {"seed": seed, "words": str(truth["words"]), "spin": float(truth["spin"]), "locked": bool(truth["locked"])}
     cameras = {}
     for k, (name, sd) in enumerate(CAMERA_SD.items()):
         rng = np.random.default_rng([seed, 3 + k, 2009])
         cameras[name] = camera_history(rng, truth["theta_yz"][use], pulse.time_s[use], sd)
     pulse, cameras["clean"] = planted(pulse, cameras["clean"], what)
-    answers = {} if what is not None else {"misalignment": estimate_misalignment(pulse), "trim": estimate_trim(pulse)}
-    for name, camera in () if what is not None else (("no video", None), *cameras.items()):
-        answers[f"fused, {name}"] = safely(out, lambda c=camera: fuse_flight(pulse, c).fused.history)
     if what is not None:
-        found = safely(out, lambda: fuse_flight(pulse, cameras["clean"]).agreement)
-        out["named"] = None if found is None else found.likeliest
-        out["red"] = found is None or bool(found.hypotheses)
-    out["rows"] = {name: row_of(h, pulse, truth) for name, h in answers.items() if h is not None}
+        found = safely(out, lambda: fuse_flight(pulse, cameras["clean"]))
+        return out | of_planted(found, pulse, truth)
+    answers = {"misalignment": estimate_misalignment(pulse), "trim": estimate_trim(pulse)}
+    for name, camera in {"no video": None, **cameras}.items():
+        found = safely(out, lambda c=camera: fuse_flight(pulse, c))
+        if found is not None:
+            answers[f"fused, {name}"] = found.fused.history
+            out.setdefault("disagree", {})[name] = found.agreement.likeliest
+            out["size"] = found.fused.process_size_radps2
+    out["rows"] = {name: row_of(h, pulse, truth) for name, h in answers.items()}
+    out["rows"]["angle of attack"] = angle_row(pulse, truth)
     return out
+
+
+def of_planted(found, pulse, truth):
+    """What the agreement test names, whether it alarms, and the fused error over its sd."""
+    if found is None:
+        return {"named": None, "red": True}
+    row = row_of(found.fused.history, pulse, truth)
+    return {
+        "named": found.agreement.likeliest, "red": bool(found.agreement.hypotheses), "z": row[0] / row[1], "e": row[0],
+    }  # fmt: skip
 
 
 def flown_aero(vehicle, truth, told):
@@ -269,25 +250,64 @@ def row_of(history, pulse, truth):
     )  # fmt: skip
 
 
-def report(results, rigid):
+def angle_row(pulse, truth):
+    """Error of the total angle of attack, as `row_of`; the plane's columns are its clock's."""
+    k = int(np.argmin(np.abs(pulse.time_s - truth["peak"])))
+    true, cov = truth["flow_yz"][k], pulse.flow_cov[k]
+    size, plane, polar = polar_from_lateral(pulse.flow_yz_rad[[k]], cov[None])
+    d = pulse.flow_yz_rad[k] - true
+    turn = plane[0] - np.arctan2(true[1], -true[0])
+    turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
+    sd = np.sqrt(np.diag(polar[0]))
+    return size[0] - np.hypot(*true), sd[0], turn, sd[1], np.hypot(*true), float(d @ np.linalg.solve(cov, d))
+
+
+def report(results):
     rows = [r for r in results if not r["words"]]
     print(f"\n{len(results)} flights, {len(results) - len(rows)} of them tumbled and left out; at peak pressure, deg")
-    print(f"{'':18}  rms   bias   rms/bound  1 sd %  2 sd %  refused   plane (bent > 1 deg): rms  1 sd %  2 sd %")
+    head = (
+        "rms   bias   rms of z  1 sd %  2 sd %  refused  lateral 68, 95 %   plane (bent > 1 deg): rms  1 sd %  2 sd %"
+    )
+    print(f"{'':18}  {head}")
     for name in dict.fromkeys(n for r in rows for n in r["rows"]):
         a = np.array([r["rows"][name] for r in rows if name in r["rows"]])
         z, bent = a[:, 0] / a[:, 1], a[:, 4] > np.deg2rad(1.0)
-        rms, bound = np.sqrt(np.mean(a[:, 0] ** 2)), np.sqrt(np.mean(a[:, 1] ** 2))
+        rms = np.sqrt(np.mean(a[:, 0] ** 2))
         share = [100.0 * np.mean(np.abs(z) < k) for k in (1, 2)]
-        words = f"{name:18}{np.rad2deg(rms):6.3f}{np.rad2deg(a[:, 0].mean()):+7.3f}{rms / bound:9.2f}"
+        words = f"{name:18}{np.rad2deg(rms):6.3f}{np.rad2deg(a[:, 0].mean()):+7.3f}{np.sqrt(np.mean(z**2)):9.2f}"
         words += f"{share[0]:10.0f}{share[1]:8.0f}{len(rows) - len(a):9d}"
+        inside = [100.0 * np.mean(a[:, 5] < chi2.ppf(p, 2)) for p in (0.6827, 0.9545)]
+        words += f"{inside[0]:9.0f}{inside[1]:5.0f}"
         if bent.any():
             zp = a[bent, 2] / a[bent, 3]
             plane = np.rad2deg(np.sqrt(np.mean(a[bent, 2] ** 2)))
             words += f"{plane:28.1f}{100 * np.mean(np.abs(zp) < 1):8.0f}{100 * np.mean(np.abs(zp) < 2):8.0f}"
         print(words)
-        if rigid:
-            inside = [100.0 * np.mean(a[:, 5] < chi2.ppf(p, 2)) for p in (0.6827, 0.9545)]
-            print(f"{'':18}lateral vector inside its 68.3 and 95.4 % ellipses: {inside[0]:.0f}, {inside[1]:.0f} %")
+    for video in ("no video", *CAMERA_SD):
+        said = [r["seed"] for r in rows if r.get("disagree", {}).get(video)]
+        print(f"said to disagree, {video}: {len(said)} of {len(rows)} {said}")
+
+
+def score_packages(folder):
+    """Flights of another simulator, with the truth beside them: errors at peak pressure, deg, and over their sd."""
+    for package in sorted(p.parent for p in Path(folder).glob("*/flight.toml")):
+        table = pd.read_csv(package / "truth" / "truth.csv")
+        pulse = loads_of(read_flight(package))
+        bent = np.deg2rad(table[["theta_y_deg", "theta_z_deg"]].to_numpy())
+        truth = {"theta_yz": columns(pulse.time_s, table.t_s.to_numpy(), bent)}
+        truth["peak"] = find_peak(table.t_s.to_numpy(), table.dynamic_pressure_pa.to_numpy())[0]
+        found = fuse_flight(pulse, None)
+        answers = {"misalignment": estimate_misalignment(pulse), "trim": estimate_trim(pulse)}
+        rows = {name: row_of(h, pulse, truth) for name, h in {**answers, "fused": found.fused.history}.items()}
+        words = "; ".join(
+            f"{n} {np.rad2deg(r[0]):+.3f} +/- {np.rad2deg(r[1]):.3f} ({r[0] / r[1]:+.2f} sd)" for n, r in rows.items()
+        )
+        said = ", ".join(found.agreement.likeliest) or "agree"
+        size = found.fused.process_size_radps2
+        print(
+            f"{package.name:14} bent {np.rad2deg(rows['trim'][4]):.2f}: {words}; {said}; process {size:.1f} rad/s2",
+            flush=True,
+        )
 
 
 def report_planted(results, what):
@@ -317,20 +337,21 @@ def seeds_and_folder():
 
 
 def main():
+    if "--packages" in sys.argv:
+        return score_packages(sys.argv[sys.argv.index("--packages") + 1])
     seeds, folder = seeds_and_folder()
-    rigid = "--rigid" in sys.argv
-    fly_missing(folder, seeds, rigid)
+    fly_missing(folder, seeds)
     whats = PLANTED if "--planted" in sys.argv else (None,)
     begun = time.perf_counter()
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:
         for what in whats:
-            work = partial(scored, folder=folder, rigid=rigid, what=what)
+            work = partial(scored, folder=folder, what=what)
             results = []
             for k, result in enumerate(pool.map(work, seeds), 1):
                 results.append(result)
                 if k % 20 == 0:
                     print(f"scored {k} of {len(seeds)}, {time.perf_counter() - begun:.0f} s", flush=True)
-            report(results, rigid) if what is None else report_planted(results, what)
+            report(results) if what is None else report_planted(results, what)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 The difference of two methods' readings at one time holds no deflection, only the inputs on which they depend::
 
-    d(t) = read_a - read_b - (A_a - A_b) theta'' = -(J_a - J_b) x + e,      x ~ N(0, 1)
+    d(t) = read_a - read_b - (B_a - B_b) theta' - (A_a - A_b) theta'' = -(J_a - J_b) x + e,      x ~ N(0, 1)
 
 taken at the sparser one's times and averaged over spans. Its chi-square against that covariance is the test of a pair.
 
@@ -84,7 +84,6 @@ _FAULT_PLANE_RAD = np.deg2rad(25.0)
 SPAN_S = 2.0
 _LEFT_OUT_RAD = np.deg2rad(0.05)  # neglected by the methods' equations, in each mean: up to 0.05 deg at the pulse's end
 _LARGEST_STEP = 2.5  # usual steps: over a wider hole readings are not interpolated
-_DERIVATIVE_STEP_S = 0.1
 _LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is compared with another
 # a sounding's errors may hold waves shorter than the fusion's model: 5 of 50 sound flights fail a pair at 1 %
 CONFIDENCE = 0.999
@@ -184,8 +183,8 @@ def fault_hypotheses(loads: FlightLoads, input_posterior: InputPosterior, plane_
         for k, (name, normals) in enumerate(there.items()):
             out[hypothesis][input_posterior.place[name].start, k] = normals
     if ACCELEROMETER in input_posterior.place:
-        use = loads.through_pulse
-        force, root = loads.specific_force_body_mps2[use], loads.force_root_mps2[use].reshape(-1, 9)
+        pulse = loads.rows(loads.through_pulse)
+        force, root = pulse.specific_force_body_mps2, pulse.force_root_mps2.reshape(-1, pulse.force_root_mps2.shape[2])
         axes = FAULT_MOUNT_RAD / np.sqrt(2.0) * np.eye(3)[1:]
         misaligned = np.column_stack([np.cross(axis, force).ravel() for axis in axes])
         out[MOUNT] = np.zeros((size, 2))
@@ -279,8 +278,10 @@ def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> tupl
 
     d = sparse.theta_yz_rad[both] - between(dense.theta_yz_rad)
     if deflection is not None:
-        response = sparse.by_acceleration_s2[both] - between(dense.by_acceleration_s2)
-        d -= np.einsum("nij,nj->ni", response, _second_derivative(deflection, time_s))
+        by_rate = sparse.by_rate_s[both] - between(dense.by_rate_s)
+        by_acceleration = sparse.by_acceleration_s2[both] - between(dense.by_acceleration_s2)
+        d -= np.einsum("nij,nj->ni", by_rate, deflection(time_s, 1))
+        d -= np.einsum("nij,nj->ni", by_acceleration, deflection(time_s, 2))
     names = dict.fromkeys([*sparse.by_input, *dense.by_input])
     responses = [_less(sparse.by_input.get(n), dense.by_input.get(n), both, between) for n in names]
     noise = sparse.independent_cov[both] + between(dense.independent_cov)
@@ -298,6 +299,7 @@ def _well_determined(one: Evidence) -> Evidence:
         one,
         time_s=one.time_s[keep],
         theta_yz_rad=one.theta_yz_rad[keep],
+        by_rate_s=one.by_rate_s[keep],
         by_acceleration_s2=one.by_acceleration_s2[keep],
         by_input={name: j[keep] for name, j in one.by_input.items()},
         independent_cov=one.independent_cov[keep],
@@ -313,8 +315,3 @@ def _less(
         assert dense is not None
         return -between(dense)
     return sparse[both] if dense is None else sparse[both] - between(dense)
-
-
-def _second_derivative(deflection: Deflection, time_s: FloatArray) -> FloatArray:
-    before, at, after = (deflection(time_s + shift) for shift in (-_DERIVATIVE_STEP_S, 0.0, _DERIVATIVE_STEP_S))
-    return np.asarray((before - 2.0 * at + after) / _DERIVATIVE_STEP_S**2)

@@ -3,18 +3,22 @@
 Every method reads the deflection with an error that is linear in named inputs, which several methods share (the flow's
 angle, coefficients, masses, the accelerometer's errors), and in the oscillation of the joint::
 
-    read(t) = theta(t) + A(t) theta''(t) - sum over inputs J_i(t) x_i + independent error,      x_i ~ N(0, 1)
+    read(t) = theta(t) + B(t) theta'(t) + A(t) theta''(t) - sum over inputs J_i(t) x_i + independent error
+
+with ``x_i ~ N(0, 1)``. The methods that read the loads balance forces or moments (`estimators.balance`): with what is
+left of a balance ``r``, linear about a deflection, a reading is ``theta - (dr/dtheta)^-1 r`` (`evidence_of_balance`).
 
 Each input is scaled to unit normals: ``J`` is the change of the reading per standard deviation of the input. An input
 with a history (wind, attitude) is many unit normals, each with its own course over time. Inputs of the same name are
 the same random variables in all methods: that is all of their correlation. The readings are curved functions of the
 worst known coefficient: the curvature shifts the mean of the deflection and widens it.
 
-The flow's error has three parts: that of the accelerometer's errors (estimated together with the attitude), the rest
-of the trajectory's, and the wind's. The last two do not roll with the vehicle: they are written in axes that do not
-roll. The trajectory's is a Gauss-Markov process with the correlation time `TRAJECTORY_TIME_S`; the wind's is half
-constant bias, half Gauss-Markov with the correlation length `WIND_LENGTH_M` of altitude, as in the reconstruction of
-the atmosphere; so is the density's in the dynamic pressure, with `DENSITY_LENGTH_M`.
+The flow's error has three parts: that of the inertial sensors' constant errors (estimated together with the attitude,
+and rolling with the vehicle), the rest of the trajectory's, and the wind's. The last two do not roll with the vehicle:
+they are written in axes that do not roll. The trajectory's is a Gauss-Markov process with the correlation time
+`TRAJECTORY_TIME_S`; the wind's is half constant bias, half Gauss-Markov with the correlation length `WIND_LENGTH_M` of
+altitude, as in the reconstruction of the atmosphere; so is the density's in the dynamic pressure, with
+`DENSITY_LENGTH_M`.
 
 Accelerometer and gyros have time biases of a millisecond or so: what oscillates is read late, and what the gyros carry
 from the accelerometer to the c.g. does not match the force. The camera's time bias is relative to both.
@@ -26,26 +30,33 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
+from estimators.balance import Coefficients, Swing
 from estimators.loads import FlightLoads
 from flightmodel import rotations
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
 from flightmodel.checks import BoolArray, FloatArray
-from flightmodel.deflection import DeflectionHistory, history_from_lateral
+from flightmodel.deflection import DeflectionHistory, history_from_lateral, standard_normals
 from flightmodel.statistics import correlation_root
 from flightmodel.vehicle import Vehicle
 
 CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0
 LIGHT_TIME_S = 2.5
 ACCELEROMETER, ATTITUDE, WIND, PRESSURE = "accelerometer", "BET attitude", "wind", "dynamic pressure"
-CAMERA_TIME_BIAS, _RATE_STEP_S = "camera time bias", 0.005
+CAMERA_TIME_BIAS = "camera time bias"
 ACCELEROMETER_TIME_BIAS, GYRO_TIME_BIAS = "accelerometer time bias", "gyro time bias"
 CAMERA_PLANE = "camera clocking"
-Deflection = Callable[[FloatArray], FloatArray]
+Residual = Callable[[Vehicle, Coefficients, Swing, FlightLoads], FloatArray]
+# steps of differences: of the deflection, its rate and acceleration, force, angular acceleration, flow, log pressure
+_NEWTON_STEPS, _SETTLED_RAD = 6, 1e-6  # from the small angles' solution four suffice
+_THETA_RAD, _RATE_RADPS, _TURN_RADPS2, _FORCE_MPS2, _PRESSURE = 1e-5, 1e-3, 1e-2, 1e-4, 1e-4
+_OF_SD = 0.01  # of a vehicle's input
+_LEAST_VAR = 1e-16  # rad^2, so that a root exists where nothing errs
 _OSCILLATION_WINDOW_S = 2.0  # about a period of the slow aerodynamic mode, over which the joint's is averaged
 _BODIES = ("aeroshell", "centerbody")
 VEHICLE_INPUTS = (
@@ -53,10 +64,18 @@ VEHICLE_INPUTS = (
     "C_N",
     "C_m",
     "C_mq",
-    *(f"{body} {what}" for body in _BODIES for what in ("mass", "c.g. station", "inertia")),
+    *(f"{body} {what}" for body in _BODIES for what in ("mass", "c.g. station", "roll inertia", "pitch inertia")),
+    *(f"centerbody product {axes}" for axes in ("xy", "xz")),
     "initial offset y",
     "initial offset z",
 )
+
+
+class Deflection(Protocol):
+    """Lateral deflection vectors (n, 2), rad, at times, or a derivative of them by time."""
+
+    def __call__(self, time_s: FloatArray, derivative: int = 0, /) -> FloatArray:
+        """Vectors or derivatives at times."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +88,8 @@ class Evidence:
     time_s : (n,) float
     theta_yz_rad : (n, 2) float
         Lateral deflection vectors in body y, z.
-    by_acceleration_s2 : (n, 2, 2) float
-        ``A``: reading per angular acceleration of the joint.
+    by_rate_s, by_acceleration_s2 : (n, 2, 2) float
+        ``B``, ``A``: reading per angular rate and acceleration of the joint.
     by_input : dict of str to (n, 2, k) float
         ``J``, rad per unit normal.
     independent_cov : (n, 2, 2) float
@@ -86,6 +105,7 @@ class Evidence:
     method: str
     time_s: FloatArray
     theta_yz_rad: FloatArray
+    by_rate_s: FloatArray
     by_acceleration_s2: FloatArray
     by_input: dict[str, FloatArray]
     independent_cov: FloatArray
@@ -109,45 +129,40 @@ class Evidence:
         return total
 
 
-def flow_inputs(loads: FlightLoads, use: BoolArray) -> dict[str, FloatArray]:
+def flow_inputs(loads: FlightLoads) -> dict[str, FloatArray]:
     """Flow's error ``(n, 2, k)``, rad, per unit normal, by the name of each of its three parts."""
-    root = loads.flow_root_rad[use]
-    wind = loads.wind_flow_sd_rad[use]
-    left = loads.flow_cov[use] - root @ root.transpose(0, 2, 1) - (wind**2)[:, None, None] * np.eye(2)
+    root, wind = loads.flow_root_rad, loads.wind_flow_sd_rad
+    left = loads.flow_cov - root @ root.transpose(0, 2, 1) - (wind**2)[:, None, None] * np.eye(2)
     trajectory = np.sqrt(np.maximum(0.5 * np.trace(left, axis1=1, axis2=2), 0.0))
-    roll = _roll(loads)[use]
+    roll = _roll(loads)
     c, s = np.cos(roll), np.sin(roll)
     # body components of vectors that do not roll
     body_from_fixed = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=1)
     return {
         ACCELEROMETER: root,
-        ATTITUDE: _rolled(
-            body_from_fixed, trajectory[:, None] * correlation_root(loads.time_s[use], TRAJECTORY_TIME_S)
-        ),
-        WIND: _rolled(body_from_fixed, wind[:, None] * sounding_correlation_root(loads.altitude_m[use], WIND_LENGTH_M)),
+        ATTITUDE: _rolled(body_from_fixed, trajectory[:, None] * correlation_root(loads.time_s, TRAJECTORY_TIME_S)),
+        WIND: _rolled(body_from_fixed, wind[:, None] * sounding_correlation_root(loads.altitude_m, WIND_LENGTH_M)),
     }
 
 
-def pressure_input(loads: FlightLoads, use: BoolArray) -> FloatArray:
+def pressure_input(loads: FlightLoads) -> FloatArray:
     """Dynamic pressure's error ``(n, k)``, a fraction, per unit normal."""
-    relative = loads.dynamic_pressure_sd_pa[use] / loads.dynamic_pressure_pa[use]
-    return np.asarray(relative[:, None] * sounding_correlation_root(loads.altitude_m[use], DENSITY_LENGTH_M))
+    relative = loads.dynamic_pressure_sd_pa / loads.dynamic_pressure_pa
+    return np.asarray(relative[:, None] * sounding_correlation_root(loads.altitude_m, DENSITY_LENGTH_M))
 
 
-def delayed(loads: FlightLoads, use: BoolArray, force_s: float, rate_s: float) -> FlightLoads:
+def delayed(loads: FlightLoads, force_s: float, rate_s: float) -> FlightLoads:
     """Loads with accelerometer and gyros read so much later, to first order: corrected for these time biases, s.
 
     With the gyros go the attitude, and so the flow's angle, and the lever-arm acceleration from the accelerometer to
     the c.g.; pressure and Mach number change too slowly to matter.
     """
-    if force_s == rate_s == 0.0 or np.count_nonzero(use) < 2:
+    t = loads.time_s
+    if force_s == rate_s == 0.0 or len(t) < 2:
         return loads
-    t = loads.time_s[use]
 
     def later(values: FloatArray, late_s: float) -> FloatArray:
-        out = values.copy()
-        out[use] += late_s * CubicSpline(t, values[use])(t, 1)
-        return out
+        return np.asarray(values + late_s * CubicSpline(t, values)(t, 1))
 
     force, flow = loads.specific_force_body_mps2, loads.flow_yz_rad
     rate, turn = loads.rate_body_radps, loads.angular_acceleration_body_radps2
@@ -181,8 +196,8 @@ def offset_sd_m(vehicle: Vehicle) -> float:
 def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
     """Vehicle with its uncertain inputs moved by so many standard deviations, by the inputs' names.
 
-    Stated uncertainties of mass, c.g. and inertia are each body's own; the lateral c.g.s of both bodies act together as
-    the initial offset, taken as the centerbody's.
+    Stated uncertainties of mass, c.g. and inertia are each body's own, of its roll and of its two transverse moments;
+    the lateral c.g.s of both bodies act together as the initial offset, taken as the centerbody's.
     """
     known, side = vehicle.uncertainty, offset_sd_m(vehicle)
     bodies = {}
@@ -193,7 +208,14 @@ def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
         if name == "centerbody":
             y += moved.get("initial offset y", 0.0) * side
             z += moved.get("initial offset z", 0.0) * side
-        inertia = (1.0 + moved.get(f"{name} inertia", 0.0) * known.inertia) * body.inertia
+        inertia = body.inertia.copy()
+        for k, what in enumerate(("roll inertia", "pitch inertia", "pitch inertia")):
+            inertia[k, k] *= 1.0 + moved.get(f"{name} {what}", 0.0) * known.inertia
+        if name == "centerbody":
+            size = 0.5 * known.inertia_products * (body.inertia[1, 1] + body.inertia[2, 2])
+            for k, axes in ((1, "xy"), (2, "xz")):
+                inertia[0, k] += size * moved.get(f"centerbody product {axes}", 0.0)
+                inertia[k, 0] = inertia[0, k]
         mass = body.mass_kg * (1.0 + moved.get(f"{name} mass", 0.0) * known.mass)
         bodies[name] = body.model_copy(
             update={
@@ -202,20 +224,117 @@ def moved_vehicle(vehicle: Vehicle, moved: dict[str, float]) -> Vehicle:
                 "inertia_kgm2": tuple(map(tuple, inertia.tolist())),
             }
         )
-    return replace(vehicle, aero=vehicle.aero.scaled(*_scaling(vehicle, moved)), **bodies)
-
-
-def moved_coefficients(vehicle: Vehicle, moved: dict[str, float], coefficients: FloatArray) -> FloatArray:
-    """Coefficients ``(..., 4)`` of the vehicle's table as `moved_vehicle` would have them."""
-    ca, cn, cm, cmq_shift = _scaling(vehicle, moved)
-    return coefficients * np.array([ca, cn, cm, 1.0]) + np.array([0.0, 0.0, 0.0, cmq_shift])
-
-
-def _scaling(vehicle: Vehicle, moved: dict[str, float]) -> tuple[float, float, float, float]:
-    """Factors on C_A, C_N, C_m and the shift of C_mq."""
-    known = vehicle.uncertainty
     ca, cn, cm = (1.0 + moved.get(k, 0.0) * sd for k, sd in (("C_A", known.ca), ("C_N", known.cn), ("C_m", known.cm)))
-    return ca, cn, cm, moved.get("C_mq", 0.0) * known.cmq
+    return replace(vehicle, aero=vehicle.aero.scaled(ca, cn, cm, moved.get("C_mq", 0.0) * known.cmq), **bodies)
+
+
+def held_balance(residual: Residual, loads: FlightLoads, start_yz_rad: FloatArray) -> Swing:
+    """Deflection that balances every sample with the joint at rest, by Newton's method; NaN where it does not settle.
+
+    ``start_yz_rad`` (n, 2) may hold NaN: no answer there.
+    """
+    vehicle = loads.vehicle
+    theta = np.where(np.isfinite(start_yz_rad), start_yz_rad, 0.0)
+    change = np.zeros_like(theta)
+    for _ in range(_NEWTON_STEPS):
+        base = residual(vehicle, vehicle.aero.at, Swing.held(theta), loads)
+        moved = [
+            residual(vehicle, vehicle.aero.at, Swing.held(theta + _THETA_RAD * e), loads) - base for e in np.eye(2)
+        ]
+        change = np.linalg.solve(np.stack(moved, -1) / _THETA_RAD, base[:, :, None])[:, :, 0]
+        theta = theta - change
+    settled: BoolArray = np.asarray(
+        np.isfinite(start_yz_rad).all(axis=1) & (np.linalg.norm(change, axis=1) < _SETTLED_RAD)
+    )
+    return Swing.held(np.where(settled[:, None], theta, np.nan))
+
+
+def evidence_of_balance(
+    method: str,
+    residual: Residual,
+    loads: FlightLoads,
+    swing: Swing,
+    averaged_s: float,
+    with_inputs: bool = True,
+) -> Evidence:
+    """Readings of a method that balances the loads, linear about a swing, with their responses to uncertain inputs.
+
+    Parameters
+    ----------
+    method : str
+    residual : callable
+        What is left of the balance (n, 2), of a vehicle, its coefficients, a swing and loads.
+    loads : FlightLoads
+        Of the samples to read.
+    swing : Swing
+    averaged_s : float
+        As in `Evidence`.
+    with_inputs : bool
+        False leaves the responses to inputs out.
+    """
+    vehicle = loads.vehicle
+    known: BoolArray = np.asarray(np.isfinite(swing.theta_yz_rad).all(axis=1))
+    swing = replace(swing, theta_yz_rad=np.where(known[:, None], swing.theta_yz_rad, 0.0))
+
+    def left(one: FlightLoads = loads, of: Vehicle = vehicle, at: Swing = swing) -> FloatArray:
+        return residual(of, of.aero.at, at, one)
+
+    base = left()
+
+    def column(changed: FloatArray, step: float) -> FloatArray:
+        return (changed - base) / step
+
+    along, none = np.eye(2), np.zeros(2)
+    by_theta = np.stack([column(left(at=swing.moved(_THETA_RAD * e, none, none)), _THETA_RAD) for e in along], -1)
+    by_rate = np.stack([column(left(at=swing.moved(none, _RATE_RADPS * e, none)), _RATE_RADPS) for e in along], -1)
+    by_turn = np.stack([column(left(at=swing.moved(none, none, _TURN_RADPS2 * e)), _TURN_RADPS2) for e in along], -1)
+    solve: FloatArray = np.asarray(np.linalg.inv(by_theta))
+    by_rate, by_turn = solve @ by_rate, solve @ by_turn
+    read = swing.theta_yz_rad - (solve @ base[:, :, None])[:, :, 0]
+    read += np.einsum("nij,nj->ni", by_rate, swing.rate_yz_radps)
+    read += np.einsum("nij,nj->ni", by_turn, swing.acceleration_yz_radps2)
+
+    def history(name: str, step: float) -> FloatArray:
+        """Response ``(n, 2, 3)`` of the reading to a measured vector."""
+        values = getattr(loads, name)
+        moved = [left(replace(loads, **{name: values + step * e})) for e in np.eye(values.shape[1])]
+        return np.asarray(-solve @ np.stack([column(m, step) for m in moved], -1))
+
+    by_force, by_turning = history("specific_force_body_mps2", _FORCE_MPS2), np.zeros((len(base), 2, 3))
+    if loads.angular_acceleration_sd_radps2 > 0.0:
+        by_turning = history("angular_acceleration_body_radps2", _TURN_RADPS2)
+    noise = loads.force_noise_sd_mps2**2 * by_force @ by_force.transpose(0, 2, 1)
+    noise += loads.angular_acceleration_sd_radps2**2 * by_turning @ by_turning.transpose(0, 2, 1)
+    inputs: dict[str, FloatArray] = {}
+    if with_inputs:
+        by_flow = history("flow_yz_rad", _THETA_RAD)
+        inputs = {name: by_flow @ part for name, part in flow_inputs(loads).items()}
+        own = by_force @ loads.force_root_mps2 + history("rate_body_radps", _RATE_RADPS) @ loads.rate_root_radps
+        inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + own
+        inputs |= _other_inputs(loads, base, solve, left)
+    read = np.where(known[:, None], read, np.nan)
+    return Evidence(method, loads.time_s, read, by_rate, by_turn, inputs, noise, averaged_s)
+
+
+def _other_inputs(
+    loads: FlightLoads, base: FloatArray, solve: FloatArray, left: Callable[..., FloatArray]
+) -> dict[str, FloatArray]:
+    """Responses (n, 2, k) to time biases, dynamic pressure and the vehicle's inputs; none that is nothing."""
+    out = {}
+    biases = {
+        ACCELEROMETER_TIME_BIAS: (loads.accelerometer_time_bias_sd_s, 0.0),
+        GYRO_TIME_BIAS: (0.0, loads.gyro_time_bias_sd_s),
+    }
+    for name, late_s in biases.items():
+        if any(late_s):
+            out[name] = (left(delayed(loads, *late_s)) - base)[:, :, None]
+    denser = replace(loads, dynamic_pressure_pa=loads.dynamic_pressure_pa * (1.0 + _PRESSURE))
+    by_pressure = (left(denser) - base) / _PRESSURE
+    out[PRESSURE] = by_pressure[:, :, None] * pressure_input(loads)[:, None, :]
+    for name in VEHICLE_INPUTS:
+        # slightly curved, and to be linear at the vehicle as stated
+        out[name] = (left(of=moved_vehicle(loads.vehicle, {name: _OF_SD})) - base)[:, :, None] / _OF_SD
+    return {name: -solve @ response for name, response in out.items() if response.any()}
 
 
 def evidence_of_history(history: DeflectionHistory, time_bias_sd_s: float = 0.0, plane_sd_rad: float = 0.0) -> Evidence:
@@ -241,7 +360,8 @@ def evidence_of_history(history: DeflectionHistory, time_bias_sd_s: float = 0.0,
         history.method,
         time_s,
         theta_yz,
-        np.zeros((len(theta_yz), 2, 2)),
+        np.zeros_like(cov),
+        np.zeros_like(cov),
         inputs,
         np.zeros_like(cov),
         averaged_s=float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0,
@@ -263,49 +383,75 @@ def moved_evidence(one: Evidence, inputs: dict[str, FloatArray], about: Deflecti
     time_s = one.time_s - one.time_bias_sd_s * float(inputs.get(CAMERA_TIME_BIAS, np.zeros(1))[0])
     if about is None:
         return replace(moved, time_s=time_s)
-    rate = (about(time_s + _RATE_STEP_S) - about(time_s - _RATE_STEP_S)) / (2.0 * _RATE_STEP_S)
-    return replace(moved, time_s=time_s, by_input=linear | {CAMERA_TIME_BIAS: one.time_bias_sd_s * rate[:, :, None]})
+    response = one.time_bias_sd_s * about(time_s, 1)[:, :, None]
+    return replace(moved, time_s=time_s, by_input=linear | {CAMERA_TIME_BIAS: response})
 
 
 def history_of_evidence(evidence: Evidence, loads: FlightLoads, assumptions: str) -> DeflectionHistory:
     """History of a method by itself, sample by sample: NaN where it has no answer.
 
-    The term of the joint's oscillation is bounded by the rms of the readings' own second derivative over
+    The terms of the joint's oscillation are bounded by the rms of the readings' own derivatives over
     `_OSCILLATION_WINDOW_S`.
     """
-    rows = np.searchsorted(loads.time_s, evidence.time_s)
-    theta_yz, cov = np.full((len(loads.time_s), 2), np.nan), np.full((len(loads.time_s), 2, 2), np.nan)
+    rows, n = np.searchsorted(loads.time_s, evidence.time_s), len(loads.time_s)
+    theta_yz, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
     theta_yz[rows] = evidence.mean_yz_rad
-    cov[rows] = evidence.covariance + _oscillation_var(evidence)[:, None, None] * np.eye(2)
-    return history_from_lateral(loads.time_s, theta_yz, cov, evidence.method, assumptions)
+    swinging = _oscillation_var(evidence)[:, None, None] * np.eye(2)
+    cov[rows] = evidence.covariance + swinging
+    draws = None
+    if evidence.half_curvature_rad is not None:
+        draws = np.full((n, len(standard_normals(3)), 2), np.nan)
+        draws[rows] = _curved_draws(evidence, swinging)
+    return history_from_lateral(loads.time_s, theta_yz, cov, evidence.method, assumptions, draws)
+
+
+def _curved_draws(evidence: Evidence, swinging: FloatArray) -> FloatArray:
+    """Deflections ``(n, k, 2)`` drawn with the reading's curvature by its most uncertain input, C_m."""
+    assert evidence.half_curvature_rad is not None
+    normals, by_moment = standard_normals(3), evidence.by_input["C_m"][:, :, 0]
+    others = evidence.independent_cov + swinging
+    for name, response in evidence.by_input.items():
+        if name != "C_m":
+            others = others + response @ response.transpose(0, 2, 1)
+    known: BoolArray = np.asarray(np.isfinite(evidence.theta_yz_rad).all(axis=1))
+    out = np.full((len(known), len(normals), 2), np.nan)
+    root = np.linalg.cholesky(others[known] + _LEAST_VAR * np.eye(2))
+    x = normals[None, :, 2:]
+    out[known] = evidence.theta_yz_rad[known, None] + normals[:, :2] @ root.transpose(0, 2, 1)
+    out[known] += by_moment[known, None] * x + evidence.half_curvature_rad[known, None] * x**2
+    return out
 
 
 def _oscillation_var(evidence: Evidence) -> FloatArray:
     t, theta_yz = evidence.time_s, evidence.theta_yz_rad
     if len(t) < 5:
         return np.zeros(len(t))
-    second = np.gradient(np.gradient(theta_yz, t, axis=0), t, axis=0)
+    rate = np.gradient(theta_yz, t, axis=0)
+    second = np.gradient(rate, t, axis=0)
     window = max(1, round(_OSCILLATION_WINDOW_S / float(np.median(np.diff(t)))))
-    mean_square = uniform_filter1d(np.sum(second**2, axis=1), window, mode="nearest")
-    return np.asarray(0.5 * mean_square * np.mean(np.sum(evidence.by_acceleration_s2**2, axis=2), axis=1))
+    total = np.zeros(len(t))
+    for derivative, response in ((rate, evidence.by_rate_s), (second, evidence.by_acceleration_s2)):
+        mean_square = uniform_filter1d(np.sum(derivative**2, axis=1), window, mode="nearest")
+        total += 0.5 * mean_square * np.mean(np.sum(response**2, axis=2), axis=1)
+    return total
 
 
-def corrected_loads(loads: FlightLoads, use: BoolArray, inputs: dict[str, FloatArray]) -> FlightLoads:
-    """Loads corrected for inputs that are so many standard deviations off their stated values.
-
-    Flow inputs with a history are defined on the samples in ``use`` alone; the other samples stay.
-    """
+def corrected_loads(loads: FlightLoads, inputs: dict[str, FloatArray]) -> FlightLoads:
+    """Loads corrected for inputs that are so many standard deviations off their stated values."""
     flow, force = loads.flow_yz_rad.copy(), loads.specific_force_body_mps2.copy()
-    for name, part in flow_inputs(loads, use).items():
-        flow[use] += part @ inputs.get(name, np.zeros(part.shape[2]))
-    force[use] += loads.force_root_mps2[use] @ inputs.get(ACCELEROMETER, np.zeros(9))
-    pressure = loads.dynamic_pressure_pa.copy()
+    for name, part in flow_inputs(loads).items():
+        flow += part @ inputs.get(name, np.zeros(part.shape[2]))
+    rate = loads.rate_body_radps
+    if ACCELEROMETER in inputs:
+        force += loads.force_root_mps2 @ inputs[ACCELEROMETER]
+        rate = rate + loads.rate_root_radps @ inputs[ACCELEROMETER]
+    pressure = loads.dynamic_pressure_pa
     if PRESSURE in inputs:
-        pressure[use] *= 1.0 + pressure_input(loads, use) @ inputs[PRESSURE]
+        pressure = np.maximum(pressure * (1.0 + pressure_input(loads) @ inputs[PRESSURE]), 1e-3)
     bias = [float(inputs[name][0]) if name in inputs else 0.0 for name in (ACCELEROMETER_TIME_BIAS, GYRO_TIME_BIAS)]
-    moved = replace(loads, flow_yz_rad=flow, specific_force_body_mps2=force)
+    moved = replace(loads, flow_yz_rad=flow, specific_force_body_mps2=force, rate_body_radps=rate)
     return replace(
-        delayed(moved, use, bias[0] * loads.accelerometer_time_bias_sd_s, bias[1] * loads.gyro_time_bias_sd_s),
-        dynamic_pressure_pa=np.maximum(pressure, 1e-3),
+        delayed(moved, bias[0] * loads.accelerometer_time_bias_sd_s, bias[1] * loads.gyro_time_bias_sd_s),
+        dynamic_pressure_pa=pressure,
         vehicle=moved_vehicle(loads.vehicle, {k: float(v[0]) for k, v in inputs.items() if k in VEHICLE_INPUTS}),
     )

@@ -1,15 +1,26 @@
 """What was the deflection, given all readings at once? One posterior for angle and plane over the pressure pulse.
 
 Unknown are the deflection's history, a cubic spline of its lateral vector with a white second derivative at its knots
-(the joint as a second-order process of known size), and every input on which the methods depend
-(`estimators.evidence`). Readings and priors are Gaussian and linear in both::
+(the joint as a second-order process), and every input on which the methods depend (`estimators.evidence`). Readings
+and priors are Gaussian and linear in both::
 
-    read(t) = theta(t) + A(t) theta''(t) - J(t) x + e,     theta'' ~ N(0, ACCELERATION_SD^2) a knot,     x ~ N(0, 1)
+    read(t) = theta(t) + B(t) theta'(t) + A(t) theta''(t) - J(t) x + e,   theta'' ~ N(0, s^2) a knot,   x ~ N(0, 1)
 
 so the posterior is one least-squares problem: its normal equations are solved (`NormalEquations`), again with the
 readings taken at the inputs just estimated, until these settle (Gauss-Newton). It is a smoother with the deflection as
 its state, in which shared errors are correlated and an input observed by one method improves the others. Its covariance
 is the Cramer-Rao bound of the same data and priors. One method alone gives that method's own smooth history.
+
+The size ``s`` of the process is the flight's own: a soft joint under spin accelerates a hundred times as much as a
+stiff one. It is the most probable one given the inputs, the deflection integrated over (type-II maximum likelihood):
+with the normal matrix ``N`` and right-hand side ``b`` of the readings and the process's precision ``Q(s)``,
+
+    log p(readings | s) = log det Q(s) / 2 - log det(N + Q(s)) / 2 + b' (N + Q(s))^-1 b / 2 + constant,
+
+times a prior of ``s`` (`SIZE_RADPS2`, `SIZE_LOG_SD`) that says little. The process has no say in the inputs: these are
+found with a free one (`_FREE_RADPS2`), so that only what the methods read counts. A swing is a line in the spectrum;
+priced by a white process at every one of some 600 knots it would be cheaper to take as an error of C_N, by up to ten
+of its standard deviations.
 
 Assumed: Gaussian errors; neglected terms of the methods' equations as `LEFT_OUT_RAD`, decorrelated after
 `LEFT_OUT_TIME_S`; a prior of the deflection's size so wide that it carries no information.
@@ -17,7 +28,7 @@ Assumed: Gaussian errors; neglected terms of the methods' equations as `LEFT_OUT
 References
 ----------
 B. D. Tapley, B. E. Schutz, G. H. Born, "Statistical Orbit Determination", 2004, chapter 4 (least squares with a priori
-information).
+information). D. J. C. MacKay, "Bayesian interpolation", Neural Computation 4 (1992) 415 (size of a smoothing prior).
 """
 
 from __future__ import annotations
@@ -28,9 +39,10 @@ from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.linalg import cho_factor, cho_solve, lstsq
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, lstsq
 from scipy.linalg.lapack import dpotri
 from scipy.ndimage import uniform_filter1d
+from scipy.optimize import minimize_scalar
 
 from estimators.evidence import (
     CAMERA_TIME_BIAS,
@@ -42,14 +54,15 @@ from estimators.evidence import (
     moved_evidence,
 )
 from estimators.loads import FlightLoads
-from flightmodel.checks import BoolArray, DivergenceError, FloatArray
+from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
 
 KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its oscillation
-# of the joint, at each knot; three of it are 1 deg of oscillation at the joint's 2.85 Hz, 20 deg at the slow
-# aerodynamic mode's 0.65 Hz, so that an oscillation is not taken for an error of other inputs
-ACCELERATION_SD_RADPS2 = 2.0
-SIZE_SD_RAD = 1.0  # of the deflection itself: no information
+# a priori of the process's size, median and sd of its logarithm: a degree of swing at 2 Hz, between a degree at 0.5 Hz
+# and ten at 3 Hz
+SIZE_RADPS2, SIZE_LOG_SD = 3.0, 1.5
+_SIZES_RADPS2, _FREE_RADPS2 = (1e-3, 1e3), 1e3  # within which it is looked for; ten degrees of swing at 12 Hz
+DEFLECTION_SD_RAD = 1.0  # of the deflection itself: no information
 # neglected by the methods' equations, second order in the angles and gusts shorter than the wind's knots: with true
 # inputs 0.01 to 0.02 deg rms over the pulses of thirty flights, decorrelated within half a second
 LEFT_OUT_RAD, LEFT_OUT_TIME_S = np.deg2rad(0.02), 0.4
@@ -96,12 +109,19 @@ class Spline:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of the deflection's spline (y, then z) and of the inputs' unit normals, at ``place``."""
+    """Normal equations of the deflection's spline and of the inputs' unit normals, without the process's prior.
+
+    Blocks: ``deflection`` (2 m, 2 m) of the spline's coefficients, y and z of each knot side by side, so that it is a
+    band; ``across`` (2 m, k); ``inputs`` (k, k), at ``place``. Right-hand sides (2 m,) and (k,).
+    """
 
     spline: Spline
     place: dict[str, slice]
-    normal: FloatArray
+    deflection: FloatArray
+    across: FloatArray
+    inputs: FloatArray
     right: FloatArray
+    right_inputs: FloatArray
 
     @classmethod
     def of(cls, readings: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> NormalEquations:
@@ -119,49 +139,98 @@ class NormalEquations:
             rows, want = whitened(one, spline, place, inputs)
             normal += rows.T @ rows
             right += rows.T @ want
-        curvature = spline.rows(spline.knots_s, 2) / ACCELERATION_SD_RADPS2
-        smooth = curvature.T @ curvature + np.eye(spline.count) / SIZE_SD_RAD**2
-        for axis in range(2):
-            part = slice(axis * spline.count, (axis + 1) * spline.count)
-            normal[part, part] += smooth
-        normal[range(size, len(right)), range(size, len(right))] += 1.0
-        return cls(spline, place, normal, right)
+        own = normal[size:, size:] + np.eye(total)
+        return cls(spline, place, normal[:size, :size], normal[:size, size:], own, right[:size], right[size:])
 
-    def deflection(self, found: FloatArray) -> Deflection:
-        """Lateral vectors (n, 2) of a solution, from times."""
-        coefficients = found[: 2 * self.spline.count].reshape(2, -1)
-        return lambda time_s: self.spline.rows(time_s) @ coefficients.T
-
-    def solved(self, method: str) -> tuple[FloatArray, FloatArray]:
-        """Posterior mean and covariance of all unknowns."""
-        factor = self._factor(method)
-        upper = np.triu(dpotri(factor)[0])
-        return cho_solve((factor, False), self.right), upper + np.triu(upper, 1).T
-
-    def mean(self, method: str) -> FloatArray:
-        """Posterior mean of all unknowns."""
-        return np.asarray(cho_solve((self._factor(method), False), self.right))
-
-    def _factor(self, method: str) -> FloatArray:
+    def solved(self, size_radps2: float, method: str) -> tuple[FloatArray, FloatArray]:
+        """Posterior mean and covariance of all unknowns, the process of a size."""
+        prior = np.kron(self._precision(size_radps2), np.eye(2))
+        normal = np.block([[self.deflection + prior, self.across], [self.across.T, self.inputs]])
         try:
-            return np.asarray(cho_factor(self.normal)[0])
+            factor = cho_factor(normal)[0]
         except np.linalg.LinAlgError:
-            raise DivergenceError(
-                f"{method}: the readings do not determine the deflection", code="deflection-undetermined"
-            ) from None
+            raise _undetermined(method) from None
+        upper = np.triu(dpotri(factor)[0])
+        right = np.concatenate([self.right, self.right_inputs])
+        return cho_solve((factor, False), right), upper + np.triu(upper, 1).T
+
+    def smoothed(self, inputs: InputPosterior, method: str) -> tuple[FloatArray, FloatArray, float]:
+        """Mean and covariance of all unknowns, of inputs found without the process, and the process's size."""
+        given = replace(self, right=self.right - self.across @ inputs.mean)
+        size_radps2 = given.process_size()
+        own = cho_solve_banded((self._factor(size_radps2, method), False), np.eye(len(self.right)))
+        by_input = -own @ self.across
+        across = by_input @ inputs.covariance
+        covariance = np.block([[own + across @ by_input.T, across], [across.T, inputs.covariance]])
+        return np.concatenate([own @ given.right, inputs.mean]), covariance, size_radps2
+
+    def process_size(self) -> float:
+        """Most probable size of the process, rad/s^2, of the deflection's block alone."""
+
+        def surprise(log_size: float) -> float:
+            size = float(np.exp(log_size))
+            factor = self._factor(size, "")
+            prior = 0.5 * ((log_size - np.log(SIZE_RADPS2)) / SIZE_LOG_SD) ** 2
+            # a determinant is the square of the product of its Cholesky factor's diagonal, the last row of the band
+            # and the process's is that of one axis, twice
+            free = np.log(cholesky_banded(_upper_band(self._precision(size)))[-1]).sum()
+            volume = np.log(factor[-1]).sum() - 2.0 * free
+            return float(prior + volume - 0.5 * self.right @ cho_solve_banded((factor, False), self.right))
+
+        found = minimize_scalar(surprise, bounds=np.log(_SIZES_RADPS2), method="bounded", options={"xatol": 0.05})
+        return float(np.exp(found.x))
+
+    def mean(self, size_radps2: float, method: str) -> FloatArray:
+        """Posterior mean of the deflection's coefficients alone."""
+        return np.asarray(cho_solve_banded((self._factor(size_radps2, method), False), self.right))
+
+    def _precision(self, size_radps2: float) -> FloatArray:
+        """Of the process's prior, one axis of the spline (count, count)."""
+        curvature: FloatArray = self.spline.rows(self.spline.knots_s, 2) / size_radps2
+        return np.asarray(curvature.T @ curvature + np.eye(self.spline.count) / DEFLECTION_SD_RAD**2)
+
+    def _factor(self, size_radps2: float, method: str) -> FloatArray:
+        """Cholesky factor of the deflection's block with the process's prior, an upper band."""
+        prior = np.kron(self._precision(size_radps2), np.eye(2))
+        try:
+            return np.asarray(cholesky_banded(_upper_band(self.deflection + prior)))
+        except np.linalg.LinAlgError:
+            raise _undetermined(method) from None
+
+    def history(self, found: FloatArray) -> Deflection:
+        """Lateral vectors (n, 2) of a solution, from times."""
+        coefficients = found[: 2 * self.spline.count].reshape(-1, 2)
+        return lambda time_s, derivative=0: self.spline.rows(time_s, derivative) @ coefficients
+
+
+def _undetermined(method: str) -> DivergenceError:
+    return DivergenceError(f"{method}: the readings do not determine the deflection", code="deflection-undetermined")
+
+
+def _upper_band(matrix: FloatArray) -> FloatArray:
+    """Symmetric matrix (n, n) as the rows of its upper band, the diagonal last."""
+    width = int(np.max(np.subtract(*np.nonzero(matrix)), initial=0))
+    out = np.zeros((width + 1, len(matrix)))
+    for k in range(width + 1):
+        out[width - k, k:] = np.diagonal(matrix, k)
+    return out
 
 
 def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inputs) -> tuple[FloatArray, FloatArray]:
-    """Rows ``(2 n, unknowns)`` of the least-squares problem and their right-hand side, errors of unit variance."""
+    """Rows ``(2 n, unknowns)`` of the least-squares problem and their right-hand side, errors of unit variance.
+
+    Unknowns are in the order of `NormalEquations`.
+    """
     keep = np.isfinite(one.theta_yz_rad).all(axis=1)
     n, m = int(keep.sum()), spline.count
-    value, second = spline.rows(one.time_s[keep]), spline.rows(one.time_s[keep], 2)
-    inertial = one.by_acceleration_s2[keep]
+    value, first, second = (spline.rows(one.time_s[keep], order) for order in range(3))
+    by_rate, by_acceleration = one.by_rate_s[keep], one.by_acceleration_s2[keep]
     rows = np.zeros((n, 2, 2 * m + max((p.stop for p in place.values()), default=0)))
     for axis in range(2):
         for other in range(2):
-            rows[:, axis, other * m : (other + 1) * m] = inertial[:, axis, other, None] * second
-        rows[:, axis, axis * m : (axis + 1) * m] += value
+            moving = by_rate[:, axis, other, None] * first + by_acceleration[:, axis, other, None] * second
+            rows[:, axis, other : 2 * m : 2] = moving
+        rows[:, axis, axis : 2 * m : 2] += value
     want = one.theta_yz_rad[keep].copy()
     for name, every in one.by_input.items():
         response = every[keep]
@@ -186,11 +255,9 @@ def means_over_spans(time_s: FloatArray, width_s: float, from_s: float) -> Float
 
 
 class Method(Protocol):
-    """Reads the deflection where a mask is set, linear about a deflection; the inputs' responses on demand."""
+    """Reads the deflection at all samples of loads, linear about a deflection; the inputs' responses on demand."""
 
-    def __call__(
-        self, loads: FlightLoads, use: BoolArray, about_yz_rad: FloatArray | None, *, with_inputs: bool = True
-    ) -> Evidence:
+    def __call__(self, loads: FlightLoads, about: Deflection | None = None, with_inputs: bool = True) -> Evidence:
         """Readings of the method."""
 
 
@@ -209,8 +276,9 @@ class Fused:
     names : tuple of str
     at_s : float
         Time of the smallest deflection sd.
-    deflection : callable
-        From times to lateral vectors (n, 2), rad.
+    deflection : Deflection
+    process_size_radps2 : float
+        Of the joint's acceleration at each knot, as this flight has it.
     """
 
     history: DeflectionHistory
@@ -219,6 +287,7 @@ class Fused:
     names: tuple[str, ...]
     at_s: float
     deflection: Deflection
+    process_size_radps2: float
 
     @property
     def inputs(self) -> dict[str, tuple[FloatArray, FloatArray]]:
@@ -266,11 +335,11 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     span = _span(readings)
     alone = [_uncorrelated(moved_evidence(e, inputs)) for e in readings]
     problem = NormalEquations.of(alone, {}, span)
-    found = problem.mean(method)
+    found = problem.mean(problem.process_size(), method)
     for step in range(MOST_STEPS):
-        readings = [e for e in read(inputs, problem.deflection(found)) if e.method in methods]
+        readings = [e for e in read(inputs, problem.history(found)) if e.method in methods]
         problem, before = NormalEquations.of(readings, inputs, span), found
-        found, covariance = problem.solved(method)
+        found, covariance = problem.solved(_FREE_RADPS2, method)
         size = 2 * problem.spline.count
         new = {name: found[size:][place] for name, place in problem.place.items()}
         sd = np.sqrt(np.diag(covariance))
@@ -285,7 +354,8 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
             input_posterior = InputPosterior(found[size:], covariance[size:, size:], problem.place)
             _check_inputs(new, input_posterior, method)
             times = max(readings, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
-            return _posterior(found, covariance, problem, input_posterior, readings, method, times)
+            answer = problem.smoothed(input_posterior, method)
+            return _posterior(answer, problem, input_posterior, readings, method, times)
         # whole Gauss-Newton steps first, then half steps, which cannot oscillate
         part = 1.0 if step < _WHOLE_STEPS else 0.5
         inputs = {name: part * x + (1.0 - part) * inputs.get(name, 0.0 * x) for name, x in new.items()}
@@ -342,14 +412,14 @@ def time_bias_is_observable(read: Read) -> bool:
     # a constant error does not move
     problem = NormalEquations.of([replace(e, by_input={}) for e in own], {}, span)
     try:
-        found, covariance = problem.solved("camera time bias")
+        found, covariance = problem.solved(problem.process_size(), "camera time bias")
     except DivergenceError:
         return False
-    m = problem.spline.count
     time_s = np.concatenate([e.time_s for e in off])
     rows = problem.spline.rows(time_s[(time_s > span[0]) & (time_s < span[1])], 1)
-    square = sum(float(np.sum((rows @ found[part]) ** 2)) for part in (slice(0, m), slice(m, 2 * m)))
-    variance = sum(float(np.sum((rows @ covariance[p, p]) * rows)) for p in (slice(0, m), slice(m, 2 * m)))
+    axes = slice(0, None, 2), slice(1, None, 2)
+    square = sum(float(np.sum((rows @ found[axis]) ** 2)) for axis in axes)
+    variance = sum(float(np.sum((rows @ covariance[axis, axis]) * rows)) for axis in axes)
     return square > MOVES**2 * variance
 
 
@@ -364,7 +434,7 @@ def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
         return {}
     one, span = off[0], _span(own)
     problem = NormalEquations.of([_uncorrelated(e) for e in own], {}, span)
-    deflection = problem.deflection(problem.mean(method))
+    deflection = problem.history(problem.mean(problem.process_size(), method))
     reach = _FARTHEST_BIAS_SD * one.time_bias_sd_s
     late_s = np.arange(-np.ceil(reach / _BIAS_STEP_S), np.ceil(reach / _BIAS_STEP_S) + 1.0) * _BIAS_STEP_S
     inside = (one.time_s > span[0] + reach) & (one.time_s < span[1] - reach) & np.isfinite(one.theta_yz_rad[:, 0])
@@ -389,31 +459,28 @@ def loads_reader(
     Inputs scale the measurements, and would scale their noise too, which no input can have made smaller: they act only
     on the measurements' part that the spline can follow.
     """
-    use = loads.through_pulse
-    smooth = _smoothed_loads(loads, use)
+    pulse = loads.rows(loads.through_pulse)
+    smooth = _smoothed_loads(pulse)
 
     def read(inputs: Inputs, about: Deflection | None) -> list[Evidence]:
         if about is None:
-            return [*(method(loads, use, None) for method in methods.values()), *others]
-        at, moved, out = about(loads.time_s[use]), corrected_loads(smooth, use, inputs), []
+            return [*(method(pulse) for method in methods.values()), *others]
+        moved, out = corrected_loads(smooth, inputs), []
         for method in methods.values():
-            found = method(moved, use, at)
-            raw, even = (method(one, use, at, with_inputs=False).theta_yz_rad for one in (loads, smooth))
+            found = method(moved, about)
+            raw, even = (method(one, about, with_inputs=False).theta_yz_rad for one in (pulse, smooth))
             out.append(replace(found, theta_yz_rad=found.theta_yz_rad + raw - even))
         return [*out, *(moved_evidence(other, inputs, about) for other in others)]
 
     return read
 
 
-def _smoothed_loads(loads: FlightLoads, use: BoolArray) -> FlightLoads:
+def _smoothed_loads(loads: FlightLoads) -> FlightLoads:
     """Loads with force, rate and angular acceleration smoothed to a spline with knots `KNOT_S` apart."""
-    t = loads.time_s[use]
+    t = loads.time_s
     value = Spline.over(float(t[0]), float(t[-1])).rows(t)
     names = ("specific_force_body_mps2", "rate_body_radps", "angular_acceleration_body_radps2")
-    moved = {}
-    for name in names:
-        moved[name] = getattr(loads, name).copy()
-        moved[name][use] = value @ lstsq(value, moved[name][use], lapack_driver="gelsy")[0]
+    moved = {name: value @ lstsq(value, getattr(loads, name), lapack_driver="gelsy")[0] for name in names}
     return replace(loads, **moved)
 
 
@@ -430,35 +497,35 @@ def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) 
 
 
 def _posterior(
-    found: FloatArray,
-    covariance: FloatArray,
+    answer: tuple[FloatArray, FloatArray, float],
     problem: NormalEquations,
     input_posterior: InputPosterior,
     readings: list[Evidence],
     method: str,
     t: FloatArray,
 ) -> Fused:
+    found, covariance, size_radps2 = answer
     spline = problem.spline
-    m, size = spline.count, 2 * spline.count
+    size = 2 * spline.count
     read = np.concatenate([e.time_s for e in readings])
     read.sort()
     after = np.searchsorted(read, t).clip(1, len(read) - 1)
     t = t[np.minimum(np.abs(read[after] - t), np.abs(t - read[after - 1])) <= _NEAR_S]
     value = spline.rows(t)
-    theta_yz = np.stack([value @ found[axis * m : (axis + 1) * m] for axis in range(2)], axis=-1)
+    theta_yz = problem.history(found)(t)
     cov = np.zeros((len(t), 2, 2))
     for i in range(2):
         for j in range(2):
-            block = covariance[i * m : (i + 1) * m, j * m : (j + 1) * m]
-            cov[:, i, j] = np.sum((value @ block) * value, axis=1)
+            cov[:, i, j] = np.sum((value @ covariance[i:size:2, j:size:2]) * value, axis=1)
     remark = f"from {', '.join(e.method for e in readings)} with their shared errors; joint as a second-order process"
     history = history_from_lateral(t, theta_yz, cov, method, remark)
     best = int(np.argmin(np.trace(cov, axis1=1, axis2=2)))
     pick = np.zeros((2 + len(problem.place), len(found)))
-    pick[0, :m], pick[1, m:size] = value[best], value[best]
+    pick[0, 0:size:2], pick[1, 1:size:2] = value[best], value[best]
     for k, place in enumerate(problem.place.values()):
         pick[2 + k, size + place.start] = 1.0
     joint = pick @ covariance @ pick.T
     sd = np.sqrt(np.diag(joint))
     names = ("deflection y", "deflection z", *problem.place)
-    return Fused(history, input_posterior, joint / np.outer(sd, sd), names, float(t[best]), problem.deflection(found))
+    correlation = joint / np.outer(sd, sd)
+    return Fused(history, input_posterior, correlation, names, float(t[best]), problem.history(found), size_radps2)

@@ -6,7 +6,7 @@ corrected sensors; it holds no truth. Lateral vectors are in body y, z.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -28,13 +28,15 @@ class FlightLoads:
     ----------
     time_s : (n,) float
     specific_force_body_mps2 : (n, 3) float
-        At the c.g. of the undeflected vehicle, body axes.
+        At ``point_from_datum_m``, body axes.
     force_noise_sd_mps2 : float
         Its white noise, each axis.
-    force_root_mps2 : (n, 3, 9) float
-        Its error per unit normal of nine that stand for the accelerometer's constant errors.
-    flow_root_rad : (n, 2, 9) float
-        The flow's error per unit normal of the same nine: attitude and accelerometer were estimated together.
+    force_root_mps2 : (n, 3, k) float
+        Its error per unit normal of those that stand for the constant errors of accelerometer and gyros.
+    flow_root_rad : (n, 2, k) float
+        The flow's error per unit normal of the same: attitude and sensors were estimated together.
+    rate_root_radps : (n, 3, k) float
+        The rate's.
     rate_body_radps, angular_acceleration_body_radps2 : (n, 3) float
     angular_acceleration_sd_radps2 : float
     flow_yz_rad : (n, 2) float
@@ -46,6 +48,8 @@ class FlightLoads:
     mach, dynamic_pressure_pa, dynamic_pressure_sd_pa, airspeed_mps : (n,) float
     vehicle : Vehicle
         Pre-flight model.
+    point_from_datum_m : (3,) float
+        Point of the centerbody at which force and flow are given: the c.g. of the undeflected vehicle, as told.
     accelerometer_time_bias_sd_s, gyro_time_bias_sd_s : float
         A priori sd of the sensors' time biases, s; zero: none.
     cg_from_sensor_m : (3,) float
@@ -62,6 +66,7 @@ class FlightLoads:
     force_noise_sd_mps2: float
     force_root_mps2: FloatArray
     flow_root_rad: FloatArray
+    rate_root_radps: FloatArray
     rate_body_radps: FloatArray
     angular_acceleration_body_radps2: FloatArray
     angular_acceleration_sd_radps2: float
@@ -74,23 +79,30 @@ class FlightLoads:
     dynamic_pressure_sd_pa: FloatArray
     airspeed_mps: FloatArray
     vehicle: Vehicle
+    point_from_datum_m: FloatArray
     accelerometer_time_bias_sd_s: float = 0.0
     gyro_time_bias_sd_s: float = 0.0
     cg_from_sensor_m: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         """Check shapes once."""
-        n = len(self.time_s)
+        n, k = len(self.time_s), np.shape(self.force_root_mps2)[-1]
         for name, shape in (
             ("specific_force_body_mps2", (n, 3)),
-            ("force_root_mps2", (n, 3, 9)),
-            ("flow_root_rad", (n, 2, 9)),
+            ("force_root_mps2", (n, 3, k)),
+            ("flow_root_rad", (n, 2, k)),
+            ("rate_root_radps", (n, 3, k)),
             ("rate_body_radps", (n, 3)),
             ("angular_acceleration_body_radps2", (n, 3)),
             ("flow_yz_rad", (n, 2)),
             ("flow_cov", (n, 2, 2)),
         ):
             check_shape(f"loads.{name}", getattr(self, name), shape)
+
+    def rows(self, use: BoolArray) -> FlightLoads:
+        """Loads at chosen samples."""
+        chosen = {f.name: getattr(self, f.name)[use] for f in fields(self) if f.name in _HISTORIES}
+        return replace(self, **chosen)
 
     @property
     def informative(self) -> BoolArray:
@@ -105,6 +117,27 @@ class FlightLoads:
         """
         after = np.flatnonzero(pressure_pulse(self.dynamic_pressure_pa))
         return np.asarray(self.informative & (np.arange(len(self.time_s)) <= after[-1]))
+
+
+_HISTORIES = frozenset(
+    {
+        "time_s",
+        "specific_force_body_mps2",
+        "force_root_mps2",
+        "flow_root_rad",
+        "rate_root_radps",
+        "rate_body_radps",
+        "angular_acceleration_body_radps2",
+        "flow_yz_rad",
+        "flow_cov",
+        "wind_flow_sd_rad",
+        "altitude_m",
+        "mach",
+        "dynamic_pressure_pa",
+        "dynamic_pressure_sd_pa",
+        "airspeed_mps",
+    }
+)
 
 
 def lateral_and_size(vectors_yz: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,33 +9,27 @@ with lateral vectors in body y, z; the tilt is ``atan(a_N / -a_x)`` against the 
 blunt cone grows by about 0.1 deg per degree, so the equation is a contraction and is solved by iteration. In one plane
 it is the paper's: the 1-2-1 rotation of eq. [4] makes the aerodynamic angle equal to the deflected BET angle.
 
-Assumed: no aerodynamic force on the centerbody, no twist, the c.g. of the undeflected vehicle (its motion with the
-oscillating joint is bounded in the error bar).
+That is the start of the solution. The answer balances the force without small angles, at the c.g. of the deflected
+vehicle, with centrifugal and Coriolis terms (`estimators.balance.force_residual`).
+
+Assumed: no aerodynamic force on the centerbody, no twist.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from estimators.evidence import (
-    ACCELEROMETER,
-    ACCELEROMETER_TIME_BIAS,
-    GYRO_TIME_BIAS,
-    Evidence,
-    delayed,
-    flow_inputs,
-    history_of_evidence,
-    moved_coefficients,
-)
-from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, flow_coefficients, lateral_and_size
+from estimators.balance import Swing, force_residual
+from estimators.evidence import Deflection, Evidence, evidence_of_balance, held_balance, history_of_evidence
+from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 
 _AVERAGED_S = 0.1  # short against the period of the joint, 0.4 s
 # each step contracts by d atan(C_N/C_A)/d alpha, at most 0.15: twelve leave 1e-10
-_ITERATIONS, _STEP_RAD = 12, 1e-4
+_ITERATIONS = 12
 _ASSUMPTIONS = (
     "plane estimated; all aerodynamic force on the aeroshell; C_N/C_A of the pre-flight model; no twist; no answer "
     f"where the axial deceleration is below {MIN_AXIAL_MPS2 / STANDARD_GRAVITY_MPS2:.1f} g"
@@ -87,76 +81,33 @@ def solve_deflection(aero: AeroTable, mach: FloatArray, tilt_yz: FloatArray, flo
     return theta
 
 
-def _predicted_tilt(theta_yz: FloatArray, direction: FloatArray, coefficients: FloatArray) -> FloatArray:
-    """Tilt of the force (n, 2), rad, for a deflection (n, 2), the shell's flow direction and coefficients."""
-    return theta_yz + direction * np.arctan(coefficients[:, 1] / coefficients[:, 0])[:, None]
+def _own_swing(loads: FlightLoads) -> Swing:
+    """Deflection that balances every sample by itself, as if the joint were at rest."""
+    vehicle = loads.vehicle
+    start = solve_deflection(vehicle.aero, loads.mach, force_tilt(loads.specific_force_body_mps2), loads.flow_yz_rad)
+    return held_balance(force_residual, loads, start)
 
 
-def misalignment_evidence(
-    loads: FlightLoads, use: BoolArray | None = None, about_yz_rad: FloatArray | None = None, with_inputs: bool = True
-) -> Evidence:
-    """Deflection at every sample where the deceleration carries information, with its responses to uncertain inputs.
-
-    An oscillating joint accelerates the shell's c.g., so the tilt of the measured force is that of the aerodynamic
-    force less ``m_A r_A theta'' / (m a_x)``.
+def misalignment_evidence(loads: FlightLoads, about: Deflection | None = None, with_inputs: bool = True) -> Evidence:
+    """Deflection at every sample, with its responses to uncertain inputs and to the joint's motion.
 
     Parameters
     ----------
     loads : FlightLoads
-    use : (n,) bool, optional
-        Samples to read; None: `FlightLoads.informative`.
-    about_yz_rad : (k, 2) float, optional
+        Of the samples to read, all with enough deceleration.
+    about : callable, optional
         Deflection about which the reading is linear; None: the reading itself.
     with_inputs : bool
         False leaves the responses to inputs out.
     """
-    use = loads.informative if use is None else use
-    force, flow, mach = loads.specific_force_body_mps2[use], loads.flow_yz_rad[use], loads.mach[use]
-    vehicle = loads.vehicle
-    tilt = force_tilt(force)
-    about = solve_deflection(vehicle.aero, mach, tilt, flow) if about_yz_rad is None else about_yz_rad
-
-    def predicted(d_theta: FloatArray, d_flow: FloatArray) -> FloatArray:
-        return _predicted_tilt(about + d_theta, *flow_coefficients(vehicle.aero, mach, flow + d_flow - about - d_theta))
-
-    step, none = _STEP_RAD * np.eye(2), np.zeros(2)
-    direction, coefficients = flow_coefficients(vehicle.aero, mach, flow + none - about - none)
-    base = _predicted_tilt(about + none, direction, coefficients)
-    by_tilt = np.linalg.inv(_columns(base, [predicted(e, none) for e in step]) / _STEP_RAD)
-    by_force = by_tilt @ (_columns(tilt, [force_tilt(force + _STEP_RAD * e) for e in np.eye(3)]) / _STEP_RAD)
-    inputs: dict[str, FloatArray] = {}
-    if with_inputs:
-        by_flow = -by_tilt @ _columns(base, [predicted(none, e) for e in step]) / _STEP_RAD
-        inputs = {name: by_flow @ part for name, part in flow_inputs(loads, use).items()}
-        inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + by_force @ loads.force_root_mps2[use]
-        biases = {
-            ACCELEROMETER_TIME_BIAS: (loads.accelerometer_time_bias_sd_s, 0.0),
-            GYRO_TIME_BIAS: (0.0, loads.gyro_time_bias_sd_s),
-        }
-        for name, late_s in biases.items():
-            if any(late_s):
-                later = delayed(loads, use, *late_s)
-                by_bias = by_force @ (later.specific_force_body_mps2[use] - force)[:, :, None]
-                inputs[name] = by_bias + by_flow @ (later.flow_yz_rad[use] - flow)[:, :, None]
-        for name in ("C_A", "C_N"):
-            moved = (moved_coefficients(vehicle, {name: k}, coefficients) for k in (1.0, -1.0))
-            up, down = (_predicted_tilt(about + none, direction, c) for c in moved)
-            inputs[name] = -by_tilt @ (0.5 * (up - down))[:, :, None]
-    arm = (vehicle.joint_m[0] - vehicle.aeroshell.cg_m[0]) * vehicle.aeroshell.mass_kg / vehicle.mass_kg
-    by_acceleration = -arm / -force[:, 0, None, None] * by_tilt
-    noise = loads.force_noise_sd_mps2**2 * by_force @ by_force.transpose(0, 2, 1)
-    read = about + (by_tilt @ (tilt - base)[:, :, None])[:, :, 0]
-    return Evidence("misalignment", loads.time_s[use], read, by_acceleration, inputs, noise, _AVERAGED_S)
+    swing = _own_swing(loads) if about is None else Swing.of(about, loads.time_s)
+    return evidence_of_balance("misalignment", force_residual, loads, swing, _AVERAGED_S, with_inputs)
 
 
 def estimate_misalignment(loads: FlightLoads) -> DeflectionHistory:
     """Deflection and plane at every sample where the deceleration carries information; NaN elsewhere.
 
-    The covariance propagates the errors of the accelerometer, of the BET's flow angle with the wind's, of C_N and C_A,
-    and bounds the joint's oscillation by the rms of the answer's own second derivative.
+    The covariance propagates the errors of the accelerometer, of the BET's flow angle with the wind's, of the
+    coefficients and mass properties, and bounds the joint's oscillation by the answer's own derivatives.
     """
-    return history_of_evidence(misalignment_evidence(loads), loads, _ASSUMPTIONS)
-
-
-def _columns(base: FloatArray, moved: list[FloatArray]) -> FloatArray:
-    return np.stack([m - base for m in moved], axis=-1)
+    return history_of_evidence(misalignment_evidence(loads.rows(loads.informative)), loads, _ASSUMPTIONS)

@@ -11,7 +11,8 @@ as lateral vectors in body y, z, along the flow's side (so ``z_cg`` is positive 
 reversed). ``u`` is the measured moment ``I w' + w x I w`` less pitch damping, over ``q S``: zero in the paper's static
 form; with it the balance holds through an oscillation. With ``alpha_shell = alpha_BET - theta`` the vectors of
 ``alpha_shell`` and of ``z_0 + xbar alpha_BET - u/C_A`` are parallel, so one monotone equation in the angle's size
-remains.
+remains (`solve_trim`). That is the start of the solution: the answer balances the moments without small angles, of both
+bodies' motion, with pitch damping at the shell's own angle and rate (`estimators.balance.moment_residual`).
 
 Static flexible trim (`static_trim`): the decelerating shell decelerates the centerbody at its front end, so that the
 inertial reaction is a negative spring. Small angles, one plane, offset ``z_0`` of the centerbody's c.g.::
@@ -25,7 +26,7 @@ inertial reaction is a negative spring. Small angles, one plane, offset ``z_0`` 
 ``u = 1`` the joint diverges: ``K_crit = q kappa``. For trim growth of at most ``g`` the joint must be stiffer than
 ``q_max kappa (1 + g) / g``. Freeplay of ``d`` acts as an offset of ``xbar d`` once the joint is loaded.
 
-Assumed: pre-flight coefficients and offset, no aerodynamic moment on the centerbody, the undeflected vehicle's inertia.
+Assumed: pre-flight coefficients and offset, no aerodynamic moment on the centerbody.
 """
 
 from __future__ import annotations
@@ -34,21 +35,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimators.balance import Swing, moment_residual
 from estimators.evidence import (
-    GYRO_TIME_BIAS,
-    PRESSURE,
-    VEHICLE_INPUTS,
+    Deflection,
     Evidence,
-    delayed,
-    flow_inputs,
+    evidence_of_balance,
+    held_balance,
     history_of_evidence,
-    moved_coefficients,
     moved_vehicle,
-    pressure_input,
 )
-from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, flow_coefficients, lateral_and_size
+from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, lateral_and_size
 from flightmodel.aerodynamics import AeroTable
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.vehicle import Vehicle
@@ -102,18 +100,9 @@ class TrimModel:
         return -(c[..., 2] * self.length_m + c[..., 1] * self.x_cg_m) / c[..., 0]
 
 
-def _imbalance(of: TrimModel, theta_yz_rad: FloatArray, direction: FloatArray, coefficients: FloatArray) -> FloatArray:
-    """Offset that the vehicle has less the one it would trim at, lateral (n, 2), m: ``u / C_A`` in balance.
-
-    ``direction`` (n, 2) is the unit vector of the shell's lateral flow, ``coefficients`` (n, 4) are those at its angle.
-    """
-    return of.offset_yz_m + of.xbar_m * theta_yz_rad - direction * of.trimmed_offset(coefficients)[:, None]
-
-
-def trim_model(vehicle: Vehicle, joint_station_m: float | None = None) -> TrimModel:
-    """Model of a vehicle; another joint station (the nose is 0) moves the point of rotation."""
-    station = vehicle.joint.station_m if joint_station_m is None else joint_station_m
-    arm = -vehicle.centerbody.cg_m[0] - station
+def trim_model(vehicle: Vehicle) -> TrimModel:
+    """Model of a vehicle."""
+    arm = -vehicle.centerbody.cg_m[0] - vehicle.joint.station_m
     return TrimModel(
         aero=vehicle.aero,
         x_cg_m=float(-vehicle.cg_m[0]),
@@ -145,132 +134,53 @@ def solve_trim(model: TrimModel, mach: FloatArray, flow_yz_rad: FloatArray, mome
     return flow_yz_rad - direction * alpha[:, None]
 
 
-def moment_term(model: TrimModel, loads: FlightLoads, use: BoolArray, dynamic: bool) -> FloatArray:
-    """``u / C_A`` as lateral vectors ``(n, 2)``, m; zero in the static form."""
-    if not dynamic:
-        return np.zeros((int(use.sum()), 2))
-    return _moment_with(model, loads, use, _at_centerbody(model, loads, use))
-
-
-def _at_centerbody(model: TrimModel, loads: FlightLoads, use: BoolArray) -> FloatArray:
-    """Coefficients ``(n, 4)`` at the centerbody's angle of attack."""
-    alpha = np.minimum(np.linalg.norm(loads.flow_yz_rad[use], axis=1), np.pi)
-    return model.aero.at(loads.mach[use], alpha)
-
-
-def _moment_with(model: TrimModel, loads: FlightLoads, use: BoolArray, coefficients: FloatArray) -> FloatArray:
-    """``u / C_A`` as lateral vectors ``(n, 2)``, m, with these coefficients ``(n, 4)``."""
-    w, turn = loads.rate_body_radps[use], loads.angular_acceleration_body_radps2[use]
-    pressure, speed = loads.dynamic_pressure_pa[use], loads.airspeed_mps[use]
+def moment_term(model: TrimModel, loads: FlightLoads) -> FloatArray:
+    """``u / C_A`` as lateral vectors ``(n, 2)``, m, of the undeflected vehicle's motion."""
+    alpha = np.minimum(np.linalg.norm(loads.flow_yz_rad, axis=1), np.pi)
+    coefficients = model.aero.at(loads.mach, alpha)
+    w, turn = loads.rate_body_radps, loads.angular_acceleration_body_radps2
     moment = turn @ model.inertia_kgm2.T + np.cross(w, w @ model.inertia_kgm2.T)
-    q_area = pressure * model.area_m2
-    damping = (q_area * model.length_m**2 * coefficients[:, 3] / (2.0 * speed))[:, None] * w
+    q_area = loads.dynamic_pressure_pa * model.area_m2
+    damping = (q_area * model.length_m**2 * coefficients[:, 3] / (2.0 * loads.airspeed_mps))[:, None] * w
     transverse = (moment - damping)[:, 1:]
     # a lateral vector u has u x x_hat = (0, u_z, -u_y)
     return np.column_stack([-transverse[:, 1], transverse[:, 0]]) / (q_area * coefficients[:, 0])[:, None]
 
 
-def trim_evidence(
-    loads: FlightLoads,
-    joint_station_m: float | None = None,
-    dynamic: bool = True,
-    use: BoolArray | None = None,
-    about_yz_rad: FloatArray | None = None,
-    with_inputs: bool = True,
-) -> Evidence:
-    """Deflection from the moment balance at every sample with enough deceleration, with its responses.
+def _own_swing(loads: FlightLoads) -> Swing:
+    """Deflection that balances every sample by itself, as if the joint were at rest; NaN where there is none."""
+    model = trim_model(loads.vehicle)
+    start = solve_trim(model, loads.mach, loads.flow_yz_rad, moment_term(model, loads))
+    return held_balance(moment_residual, loads, start)
 
-    The shell does not rotate with the centerbody while the joint oscillates: the balance reads ``theta`` plus its share
-    of ``(I_A + mu r_A (r_A - r_B)) theta''``, with ``mu`` the bodies' reduced mass.
 
-    Parameters
-    ----------
-    loads : FlightLoads
-    joint_station_m : float, optional
-        Assumed joint, m aft of the nose; None: the vehicle's.
-    dynamic : bool
-        False leaves the measured moment out (the paper's static form).
-    use, about_yz_rad, with_inputs
-        As in `estimators.misalignment.misalignment_evidence`.
+def trim_evidence(loads: FlightLoads, about: Deflection | None = None, with_inputs: bool = True) -> Evidence:
+    """Deflection from the moment balance at every sample, with its responses to inputs and to the joint's motion.
+
+    Parameters as of `estimators.misalignment.misalignment_evidence`.
     """
-    use = loads.informative if use is None else use
-    vehicle = loads.vehicle
-    model = trim_model(vehicle, joint_station_m)
-    mach, flow = loads.mach[use], loads.flow_yz_rad[use]
-    on_body = _at_centerbody(model, loads, use)
-    moment = _moment_with(model, loads, use, on_body) if dynamic else np.zeros((len(mach), 2))
-    about = solve_trim(model, mach, flow, moment) if about_yz_rad is None else about_yz_rad
-    known: BoolArray = np.asarray(np.isfinite(about).all(axis=1))
-    about = np.where(known[:, None], about, flow)
-
-    def imbalance(d_theta: FloatArray, d_flow: FloatArray) -> FloatArray:
-        shell = flow_coefficients(vehicle.aero, mach, flow + d_flow - about - d_theta)
-        return _imbalance(model, about + d_theta, *shell)
-
-    step, none = _STEP_RAD * np.eye(2), np.zeros(2)
-    direction, coefficients = flow_coefficients(vehicle.aero, mach, flow + none - about - none)
-    theta = about + none
-    base = _imbalance(model, theta, direction, coefficients)
-    by_moment = np.linalg.inv(np.stack([imbalance(e, none) - base for e in step], -1) / _STEP_RAD)
-    inputs: dict[str, FloatArray] = {}
-    if with_inputs:
-        by_flow = -by_moment @ np.stack([imbalance(none, e) - base for e in step], -1) / _STEP_RAD
-        inputs = {name: by_flow @ part for name, part in flow_inputs(loads, use).items()}
-        if loads.gyro_time_bias_sd_s > 0.0:
-            later = delayed(loads, use, 0.0, loads.gyro_time_bias_sd_s)
-            late = _moment_with(model, later, use, on_body) - moment if dynamic else np.zeros_like(flow)
-            by_bias = by_flow @ (later.flow_yz_rad[use] - flow)[:, :, None]
-            inputs[GYRO_TIME_BIAS] = by_bias + by_moment @ late[:, :, None]
-
-    def excess(moved: dict[str, float]) -> FloatArray:
-        of = trim_model(moved_vehicle(vehicle, moved), joint_station_m)
-        shell, body = (moved_coefficients(vehicle, moved, c) for c in (coefficients, on_body))
-        return _imbalance(of, theta, direction, shell) - (_moment_with(of, loads, use, body) if dynamic else 0.0)
-
-    for name in VEHICLE_INPUTS if with_inputs else ():
-        up, down = (excess({name: size}) for size in (1.0, -1.0))
-        inputs[name] = -by_moment @ (0.5 * (up - down))[:, :, None]
-    noise, by_acceleration = np.zeros((len(mach), 2, 2)), np.zeros((len(mach), 2, 2))
-    if dynamic:
-        if with_inputs:
-            inputs[PRESSURE] = -by_moment @ (moment[:, :, None] * pressure_input(loads, use)[:, None, :])
-        axial_n = loads.dynamic_pressure_pa[use] * model.area_m2 * model.aero.at(mach, 0.0)[:, 0]
-        turn = loads.angular_acceleration_sd_radps2 * model.inertia_kgm2[1, 1] / axial_n
-        noise = (turn**2)[:, None, None] * by_moment @ by_moment.transpose(0, 2, 1)
-        by_acceleration = by_moment * (shell_inertia(vehicle) / axial_n)[:, None, None]
-    read = about - (by_moment @ (base - moment)[:, :, None])[:, :, 0]
-    read = np.where(known[:, None], read, np.nan)
-    return Evidence("trim", loads.time_s[use], read, by_acceleration, inputs, noise, _AVERAGED_S)
+    swing = _own_swing(loads) if about is None else Swing.of(about, loads.time_s)
+    return evidence_of_balance("trim", moment_residual, loads, swing, _AVERAGED_S, with_inputs)
 
 
-def trim_curvature(loads: FlightLoads, joint_station_m: float | None = None, dynamic: bool = True) -> FloatArray:
+def trim_curvature(loads: FlightLoads) -> FloatArray:
     """Half the second derivative of the reading by C_m (n, 2), rad: the one input uncertain enough for it to matter."""
-    use, read = loads.informative, []
-    for size in (_NODE, 0.0, -_NODE):
-        model = trim_model(moved_vehicle(loads.vehicle, {"C_m": size}), joint_station_m)
-        moment = moment_term(model, loads, use, dynamic)
-        read.append(solve_trim(model, loads.mach[use], loads.flow_yz_rad[use], moment))
-    return (read[0] + read[2] - 2.0 * read[1]) / (2.0 * _NODE**2)
+    read = [
+        _own_swing(replace(loads, vehicle=moved_vehicle(loads.vehicle, {"C_m": size}))).theta_yz_rad
+        for size in (_NODE, 0.0, -_NODE)
+    ]
+    return np.asarray((read[0] + read[2] - 2.0 * read[1]) / (2.0 * _NODE**2))
 
 
-def shell_inertia(vehicle: Vehicle) -> float:
-    """Moment about the vehicle's c.g. per angular acceleration of the shell against the body, kg m^2."""
-    shell, body = vehicle.aeroshell, vehicle.centerbody
-    arm_shell, arm_body = (vehicle.joint_m[0] - part.cg_m[0] for part in (shell, body))
-    reduced = shell.mass_kg * body.mass_kg / vehicle.mass_kg
-    own = 0.5 * (shell.inertia[1, 1] + shell.inertia[2, 2])
-    return float(own + reduced * arm_shell * (arm_shell - arm_body))
-
-
-def estimate_trim(loads: FlightLoads, joint_station_m: float | None = None, dynamic: bool = True) -> DeflectionHistory:
+def estimate_trim(loads: FlightLoads) -> DeflectionHistory:
     """Deflection and plane from the moment balance at every sample with enough deceleration; NaN elsewhere.
 
     The covariance propagates the BET's flow angle with the wind's, the initial offset, masses, c.g. stations, inertias,
     C_m, C_N and C_A, dynamic pressure and the angular acceleration, and bounds the joint's oscillation.
     """
-    evidence = trim_evidence(loads, joint_station_m, dynamic)
-    half_curvature_rad = trim_curvature(loads, joint_station_m, dynamic)
-    return history_of_evidence(replace(evidence, half_curvature_rad=half_curvature_rad), loads, _ASSUMPTIONS)
+    rows = loads.rows(loads.informative)
+    evidence = replace(trim_evidence(rows), half_curvature_rad=trim_curvature(rows))
+    return history_of_evidence(evidence, loads, _ASSUMPTIONS)
 
 
 @dataclass(frozen=True)

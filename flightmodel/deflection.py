@@ -13,6 +13,7 @@ vector of the shell against the body is ``theta * x_hat x d``; that of the body 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 HOLE_FACTOR = 3.0
+QUANTILES = (0.05, 0.16, 0.50, 0.84, 0.95)
+QUANTILE_COLUMNS = tuple(f"theta_p{100 * p:.0f}_deg" for p in QUANTILES)
 UNIFORM_VAR = np.pi**2 / 3.0  # of a clocking angle that may be anything
 
 
@@ -64,6 +67,8 @@ class DeflectionHistory(Tabular):
         ``"camera"``, ``"misalignment"``, ``"trim"``, ``"fused"`` or ``"truth"``.
     assumptions : str
         In words.
+    draws_yz_rad : (n, k, 2) float or None
+        Lateral vectors drawn from a posterior that is not Gaussian; None: the covariance says it all.
     """
 
     time_s: FloatArray
@@ -72,6 +77,7 @@ class DeflectionHistory(Tabular):
     covariance: FloatArray | None
     method: str
     assumptions: str = field(default="")
+    draws_yz_rad: FloatArray | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         """Check shapes and time order once."""
@@ -89,7 +95,8 @@ class DeflectionHistory(Tabular):
         Returns
         -------
         DataFrame
-            ``t_s, theta_deg, theta_sd_deg, plane_lv_deg, plane_sd_deg``.
+            ``t_s, theta_deg, theta_sd_deg, plane_lv_deg, plane_sd_deg`` and, of the angle, ``theta_p5_deg``,
+            ``theta_p16_deg``, ``theta_p50_deg``, ``theta_p84_deg``, ``theta_p95_deg``.
         """
         import pandas as pd
 
@@ -104,6 +111,7 @@ class DeflectionHistory(Tabular):
                 "plane_lv_deg": np.rad2deg(self.plane_lv_rad),
                 "plane_sd_deg": np.rad2deg(plane_sd),
             }
+            | dict(zip(QUANTILE_COLUMNS, np.rad2deg(self.theta_quantiles_rad).T, strict=True))
         )
         return table[np.isfinite(self.theta_rad)]
 
@@ -121,6 +129,26 @@ class DeflectionHistory(Tabular):
         if self.covariance is None:
             return np.full(len(self.time_s), np.nan)
         return np.sqrt(self.covariance[:, 0, 0])
+
+    @property
+    def theta_quantiles_rad(self) -> FloatArray:
+        """Angle ``(n, 5)``, rad, below which `QUANTILES` of the posterior lie; NaN without covariance.
+
+        The length of a lateral vector is not normal: near zero a sd says too little of it, and it is never negative.
+        """
+        if self.draws_yz_rad is not None:
+            return np.asarray(np.quantile(np.linalg.norm(self.draws_yz_rad, axis=2), QUANTILES, axis=1).T)
+        out = np.full((len(self.time_s), len(QUANTILES)), np.nan)
+        cov = self.lateral_cov
+        # without a plane: as well known across as along
+        lost = np.isnan(cov[:, 0, 0]) & np.isfinite(self.theta_sd_rad)
+        cov[lost] = self.theta_sd_rad[lost, None, None] ** 2 * np.eye(2)
+        known = np.isfinite(cov[:, 0, 0]) & np.isfinite(self.theta_rad)
+        value, axes = np.linalg.eigh(cov[known])
+        root = axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]
+        drawn = self.theta_yz_rad[known][:, None, :] + standard_normals(2) @ root.transpose(0, 2, 1)
+        out[known] = np.quantile(np.linalg.norm(drawn, axis=2), QUANTILES, axis=1).T
+        return out
 
     @property
     def theta_yz_rad(self) -> FloatArray:
@@ -158,6 +186,15 @@ class DeflectionHistory(Tabular):
         theta, sd = self.theta_rad[known], self.theta_sd_rad[known]
         missed = interpolation_error(t, theta, time_s)
         return float(np.interp(time_s, t, theta)), float(np.hypot(np.interp(time_s, t, sd), missed))
+
+
+@cache
+def standard_normals(dimensions: int) -> FloatArray:
+    """Evenly spread draws ``(512, dimensions)`` of independent unit normals, always the same (Sobol)."""
+    from scipy.special import ndtri
+    from scipy.stats import qmc
+
+    return np.asarray(ndtri(qmc.Sobol(dimensions, rng=2009).random(512)))
 
 
 def interpolation_error(known_s: FloatArray, values: FloatArray, time_s: float) -> float:
@@ -200,11 +237,16 @@ def polar_from_lateral(
 
 
 def history_from_lateral(
-    time_s: FloatArray, theta_yz_rad: FloatArray, covariance_yz: FloatArray, method: str, assumptions: str
+    time_s: FloatArray,
+    theta_yz_rad: FloatArray,
+    covariance_yz: FloatArray,
+    method: str,
+    assumptions: str,
+    draws_yz_rad: FloatArray | None = None,
 ) -> DeflectionHistory:
     """History from lateral deflection vectors ``(n, 2)`` in body y, z and their covariance ``(n, 2, 2)``, rad.
 
     Rows that hold NaN stay NaN.
     """
     theta, plane, cov = polar_from_lateral(theta_yz_rad, covariance_yz)
-    return DeflectionHistory(time_s, theta, plane, cov, method, assumptions)
+    return DeflectionHistory(time_s, theta, plane, cov, method, assumptions, draws_yz_rad)

@@ -115,14 +115,16 @@ class CompliantJoint(Section):
 class Uncertainty(Section):
     """What is known of the vehicle before flight, one standard deviation; fractions where no unit is named.
 
-    Mass, c.g. and inertia are each body's own; C_mq's is absolute. ``ca_shape_part`` is the part of the variance of C_A
-    that changes with Mach number; the rest is one factor at all of them.
+    Mass, c.g. and inertia are each body's own; products of inertia are the centerbody's, of its transverse moment;
+    C_mq's is absolute. ``ca_shape_part`` is the part of the variance of C_A that changes with Mach number; the rest is
+    one factor at all of them.
     """
 
     mass: Fraction = 0.01
     cg_station_m: Metres = 0.01
     cg_lateral_m: Metres = 0.001
     inertia: Fraction = 0.03
+    inertia_products: Fraction = 0.002
     ca: Fraction = 0.03
     ca_shape_part: Fraction = 0.5
     cn: Fraction = 0.07

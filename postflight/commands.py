@@ -159,7 +159,7 @@ def run_flight(
         if flight.changes:
             settings["changes"] = list(flight.changes)
         with run_folder.RunFolder(folder, flight.telemetry, settings) as out:
-            event_rows = run_folder.write_reconstruction(out, bet)
+            event_rows = run_folder.write_reconstruction(out, bet, answers)
             run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 out.write_csv("camera_sensitivity.csv", camera_sensitivity(flight, answers.histories["camera"]))
@@ -292,22 +292,22 @@ def print_answers(answers: Deflections) -> None:
     note = "peak q" if answers.bet is not None else "its largest; no trajectory was made"
     when = f" at {at_s:.2f} s" if np.isfinite(at_s) else ""
     table = Table(title=f"Deflection of the aeroshell against the centerbody{when} ({note})")
-    for name in ("method", "deflection deg", "1 sd", "plane LV deg", "largest deg", "at s"):
+    for name in ("method", "deflection deg", "1 sd", "5 to 95 %", "plane LV deg", "largest deg", "at s"):
         table.add_column(name, justify="left" if name == "method" else "right")
     for row in answers.to_frame().itertuples(index=False):
         if not np.isfinite(row.theta_deg):
-            table.add_row(row.method, "no answer", "", "", "", "")
+            table.add_row(row.method, "no answer", "", "", "", "", "")
             continue
         numbers = (row.theta_deg, row.theta_sd_deg)
         largest = (f"{row.largest_deg:.2f}", f"{row.largest_t_s:.2f}")
-        table.add_row(row.method, *(f"{x:.2f}" for x in numbers), f"{row.plane_lv_deg:.0f}", *largest)
+        within = f"{row.theta_p5_deg:.2f} to {row.theta_p95_deg:.2f}"
+        table.add_row(row.method, *(f"{x:.2f}" for x in numbers), within, f"{row.plane_lv_deg:.0f}", *largest)
     console.print(table)
-    if answers.fused is not None:
-        found = answers.fused.agreement
-        console.print(f"{'' if not found.hypotheses else '[red]check failed[/] '}{escape(found.remark)}")
-        bias = answers.fused.camera_time_bias
-        if bias is not None:
-            console.print(f"{'[red]check failed[/] ' if bias.is_off else ''}{escape(bias.remark)}")
+    for check in answers.consistency_checks:
+        console.print(f"{'' if check.passed else '[red]check failed[/] '}{escape(check.remark)}")
+    bias = None if answers.fused is None else answers.fused.camera_time_bias
+    if bias is not None and bias.applied:
+        console.print(escape(bias.remark))
     for method, row in run_folder.method_summary(answers, at_s).items():
         if "reason" in row:
             line("[yellow]no answer[/]", f"from {method}: {row['reason']}", row["code"])

@@ -12,15 +12,17 @@ from estimators.camera import FilmFit, read_film, sensitivity_table
 from estimators.fusion import smoothed
 from estimators.misalignment import estimate_misalignment as misalignment_history
 from estimators.trim import estimate_trim as trim_history
-from flightmodel.checks import DivergenceError, Fault, GateError, Progress
-from flightmodel.deflection import DeflectionHistory, lv_clock
+from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress
+from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, lv_clock
 from flightmodel.tabular import Tabular
 from postflight.flight import Flight
 from postflight.fusing import FusedAnswer, fuse_flight
 from postflight.reconstruction import Reconstruction
+from recon.consistency import ConsistencyCheck
 
 METHODS = ("camera", "misalignment", "trim", "fused")
 NO_VIDEO = "video-missing"
+NO_COMMON_ANSWER = ("inputs-far-off", "fusion-not-converged", "camera-time-bias", "deflection-undetermined")
 # assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
 PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
 
@@ -64,13 +66,25 @@ class Deflections(Tabular):
             return self.bet.peak_s
         return next((float(h.time_s[np.nanargmax(h.theta_rad)]) for h in self.histories.values()), float("nan"))
 
+    @property
+    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+        """Whether the methods agree, and whether they have a common answer; none without a fusion."""
+        if self.fused is not None:
+            return self.fused.consistency_checks
+        reason = self.refused.get("fused")
+        if reason is None or reason.code not in NO_COMMON_ANSWER:
+            return ()
+        name, words = "deflection methods have a common answer", str(reason)
+        return (ConsistencyCheck("deflection-methods", name, 0.0, 1.0, 1.0, False, words),)
+
     def to_frame(self) -> pd.DataFrame:
         """One row a method, at `reference_s`.
 
         Returns
         -------
         DataFrame
-            ``method, t_s, theta_deg, theta_sd_deg, plane_lv_deg, largest_deg, largest_t_s, reason``.
+            ``method, t_s, theta_deg, theta_sd_deg, plane_lv_deg, largest_deg, largest_t_s, reason`` and the
+            quantiles of `DeflectionHistory.to_frame`.
         """
         rows: list[tuple[object, ...]] = []
         at_s = self.reference_s
@@ -80,10 +94,12 @@ class Deflections(Tabular):
             lateral = [np.interp(at_s, history.time_s[known], c[known]) for c in history.theta_yz_rad.T]
             k = int(np.nanargmax(history.theta_rad))
             plane = np.rad2deg(lv_clock(np.array(lateral))) if np.isfinite(theta) else np.nan
-            rows.append((method, at_s, theta, sd, plane, np.rad2deg(history.theta_rad[k]), history.time_s[k], ""))
-        rows += [(method, at_s, *[np.nan] * 5, str(reason)) for method, reason in self.refused.items()]
+            largest = np.rad2deg(history.theta_rad[k]), history.time_s[k]
+            rows.append((method, at_s, theta, sd, plane, *largest, "", *np.rad2deg(quantiles_at(history, at_s))))
+        nothing = [np.nan] * len(QUANTILE_COLUMNS)
+        rows += [(method, at_s, *[np.nan] * 5, str(reason), *nothing) for method, reason in self.refused.items()]
         names = ("method", "t_s", "theta_deg", "theta_sd_deg", "plane_lv_deg", "largest_deg", "largest_t_s", "reason")
-        return pd.DataFrame(rows, columns=list(names))
+        return pd.DataFrame(rows, columns=[*names, *QUANTILE_COLUMNS])
 
     def _about(self) -> str:
         shown = [
@@ -91,6 +107,14 @@ class Deflections(Tabular):
             for method, (theta, sd) in ((m, h.at(self.reference_s)) for m, h in self.histories.items())
         ]
         return f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
+
+
+def quantiles_at(history: DeflectionHistory, at_s: float) -> FloatArray:
+    """Quantiles (5,) of the angle at a time, rad, by straight lines between answers; NaN where it has none."""
+    known = np.isfinite(history.theta_quantiles_rad).all(axis=1)
+    if not np.isfinite(history.at(at_s)[0]) or not known.any():
+        return np.full(len(QUANTILE_COLUMNS), np.nan)
+    return np.array([np.interp(at_s, history.time_s[known], c) for c in history.theta_quantiles_rad[known].T])
 
 
 def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = None) -> DeflectionHistory:
@@ -182,7 +206,7 @@ def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress:
             else:
                 camera = plain if "camera" in answers.histories else _camera_for_fusion(flight, answers.refused)
                 time_bias_s = 0.0 if flight.telemetry.frames is None else flight.telemetry.frames.time_bias_sd_s
-                fused = fuse_flight(bet.required_loads(), camera, None, time_bias_s)
+                fused = fuse_flight(bet.required_loads(), camera, time_bias_s)
                 history = fused.fused.history
         except GateError as fault:
             answers.refused[method] = Fault(str(fault), fault.codes[0])

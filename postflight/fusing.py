@@ -4,27 +4,35 @@ Camera, misalignment and trim are fused into one posterior of the deflection and
 (`estimators.fusion`); every pair is tested and every input scored as a fault hypothesis (`estimators.agreement`); the
 fused history against dynamic pressure gives the Southwell lines (`estimators.southwell`). The camera's time bias is
 estimated with the rest where the deflection moves enough to observe it.
+
+Where the methods contradict each other, each is tried as the faulty one by leaving it out. If the others agree without
+one and only without that one, it stays out (`FusedAnswer.left_out`). If the readings cannot tell, the answer is the
+mixture of what may be true, with the differences in its covariance (`FusedAnswer.alternatives`): the others without
+each method, or a posterior in which the likeliest fault's inputs are as good as unknown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from estimators.agreement import Agreement, agreement, fault_hypotheses
-from estimators.evidence import CAMERA_TIME_BIAS, Evidence, evidence_of_history, moved_evidence
-from estimators.fusion import FarInputsError, Fused, Read, fuse, loads_reader, time_bias_is_observable
+from estimators.agreement import CONFIDENCE, HYPOTHESES, Agreement, agreement, fault_hypotheses
+from estimators.evidence import CAMERA_TIME_BIAS, evidence_of_history, moved_evidence
+from estimators.fusion import FarInputsError, Fused, Method, Read, fuse, loads_reader, time_bias_is_observable
 from estimators.loads import MIN_AXIAL_MPS2, FlightLoads
-from estimators.misalignment import misalignment_evidence
+from estimators.misalignment import estimate_misalignment, misalignment_evidence
 from estimators.southwell import Limbs, southwell_limbs
-from estimators.trim import trim_evidence
-from flightmodel.checks import BoolArray, DivergenceError, FloatArray, GateError
-from flightmodel.deflection import DeflectionHistory
+from estimators.trim import estimate_trim, trim_evidence
+from flightmodel.checks import DivergenceError, FloatArray, GateError
+from flightmodel.deflection import DeflectionHistory, history_from_lateral
+from recon.consistency import ConsistencyCheck
 
+_METHODS: dict[str, Method] = {"misalignment": misalignment_evidence, "trim": trim_evidence}
+_FREED = 10.0  # times its stated sd an input is as good as unknown: a fault of two stated sd is a fifth of it
+_LARGEST_LOG = 50.0  # of odds; more is rounding beside one
 _OFF_SD = 4.0
 CAMERA_PLANE_SD_RAD = np.deg2rad(1.0)  # of the camera's clocking about the axis
 _WIDE_BIAS_SD_S = 0.3  # a priori sd of a camera time bias that is stated as zero, when it is tested
@@ -55,7 +63,19 @@ class CameraTimeBias:
 class FusedAnswer:
     """Posterior of deflection and inputs, tests of the methods against each other, and the Southwell lines.
 
-    ``limbs`` is None where the pulse gives no line; ``limbs_remark`` says why, or what the lines show.
+    Parameters
+    ----------
+    fused : Fused
+        Of the methods that are used; its history holds the mixture where there are alternatives.
+    agreement : Agreement
+        Of all methods.
+    limbs : Limbs or None
+        None where the pulse gives no line; ``limbs_remark`` says why, or what the lines show.
+    camera_time_bias : CameraTimeBias or None
+    left_out : str or None
+        Method that contradicts the others, which agree without it.
+    alternatives : tuple of str
+        What the answer is a mixture of, in words; empty where the readings agree.
     """
 
     fused: Fused
@@ -63,6 +83,38 @@ class FusedAnswer:
     limbs: Limbs | None
     limbs_remark: str
     camera_time_bias: CameraTimeBias | None = None
+    left_out: str | None = None
+    alternatives: tuple[str, ...] = ()
+
+    @property
+    def remark(self) -> str:
+        """Whether the methods agree, and what was made of it where they do not."""
+        words = self.agreement.remark
+        if self.left_out is not None:
+            words += f"; the {self.left_out} contradicts the others, which agree without it: it is left out"
+        if self.alternatives:
+            words += f"; the answer spans what may be true ({'; '.join(self.alternatives)}), its sd their differences"
+        return words
+
+    @property
+    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+        """Whether the methods agree, and whether the camera's time bias is what is stated."""
+        passed = not self.agreement.hypotheses and self.left_out is None and not self.alternatives
+        likeliest = self.agreement.likeliest
+        least = min((p.p_value for p in self.agreement.pairs), default=1.0)
+        source = "" if passed else self.left_out or (likeliest[0] if likeliest else "")
+        name = "deflection methods agree: least chance of a pair"
+        checks = [
+            ConsistencyCheck("deflection-methods", name, least, 1.0 - CONFIDENCE, 1.0, passed, self.remark, source)
+        ]
+        bias = self.camera_time_bias
+        if bias is not None and not bias.applied:
+            size, source = abs(bias.offset_s) / bias.sd_s, "camera" if bias.is_off else ""
+            name = "camera time bias over its sd"
+            checks.append(
+                ConsistencyCheck("camera-time-bias", name, size, 0.0, _OFF_SD, not bias.is_off, bias.remark, source)
+            )
+        return tuple(checks)
 
     def time_bias_summary(self) -> dict[str, Any] | None:
         """Camera time bias for ``summary.json``; None without a camera history that observes it."""
@@ -104,7 +156,6 @@ class FusedAnswer:
 def fuse_flight(
     loads: FlightLoads,
     camera: DeflectionHistory | None,
-    joint_station_m: float | None = None,
     camera_time_bias_sd_s: float = 0.0,
 ) -> FusedAnswer:
     """Fuse accelerometers, moment balance and, where there is one, the camera's history.
@@ -118,8 +169,6 @@ def fuse_flight(
     loads : FlightLoads
     camera : DeflectionHistory or None
         With the benchmark frame taken as undeflected.
-    joint_station_m : float, optional
-        Assumed joint, m aft of the nose; None: the vehicle's.
     camera_time_bias_sd_s : float
 
     Raises
@@ -127,7 +176,7 @@ def fuse_flight(
     GateError
         Where the deceleration carries no information.
     DivergenceError
-        Where there is no common answer, with the reason.
+        Where no two methods have a common answer, with the reason.
     """
     if not loads.through_pulse.any():
         raise GateError(
@@ -136,46 +185,143 @@ def fuse_flight(
             code="deceleration-too-small",
         )
 
-    def trim(
-        loads: FlightLoads, use: BoolArray, about_yz_rad: FloatArray | None, *, with_inputs: bool = True
-    ) -> Evidence:
-        return trim_evidence(loads, joint_station_m, use=use, about_yz_rad=about_yz_rad, with_inputs=with_inputs)
-
-    def reader(bias_sd_s: float) -> Read:
-        others = [] if camera is None else [evidence_of_history(camera, bias_sd_s, CAMERA_PLANE_SD_RAD)]
-        methods = {"misalignment": misalignment_evidence, "trim": trim}
-        return loads_reader(loads, methods, [e for e in others if len(e.time_s)])
-
-    observable = camera is not None and time_bias_is_observable(reader(_WIDE_BIAS_SD_S))
+    sources = _Sources(loads, camera)
+    observable = camera is not None and time_bias_is_observable(sources.reader(sources.names, _WIDE_BIAS_SD_S))
     bias_sd_s = camera_time_bias_sd_s if observable else 0.0
-    read = reader(bias_sd_s)
+    bias = _tested_time_bias(sources) if observable and bias_sd_s == 0.0 else None
     try:
-        fused = fuse(read)
+        answer = sources.answer(sources.names, bias_sd_s)
     except DivergenceError as fault:
-        raise _explained(fault, loads, read, reader if observable and bias_sd_s == 0.0 else None) from None
+        resolved = _without_each(sources, bias_sd_s)
+        if resolved is None:
+            raise _explained(fault, sources, bias_sd_s, bias) from None
+        answer = replace(resolved, agreement=sources.tested(fault, bias_sd_s))
+    else:
+        if not all(pair.passed for pair in answer.agreement.pairs):
+            answer = replace(_without_each(sources, bias_sd_s) or answer, agreement=answer.agreement)
+        elif answer.agreement.hypotheses:
+            answer = _with_faults_freed(sources, answer, bias_sd_s)
+    return answer if answer.camera_time_bias is not None else replace(answer, camera_time_bias=bias)
+
+
+@dataclass(frozen=True)
+class _Sources:
+    """Methods of a flight that may be fused, all or some of them."""
+
+    loads: FlightLoads
+    camera: DeflectionHistory | None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Methods with readings."""
+        seen = self.camera is not None and np.isfinite(self.camera.theta_rad).any()
+        return (*_METHODS, "camera") if seen else tuple(_METHODS)
+
+    def reader(self, names: tuple[str, ...], bias_sd_s: float, freed: tuple[str, ...] = ()) -> Read:
+        """Reader of some methods; inputs in ``freed`` are as good as unknown."""
+        others = []
+        if "camera" in names and self.camera is not None:
+            others = [evidence_of_history(self.camera, bias_sd_s, CAMERA_PLANE_SD_RAD)]
+        read = loads_reader(self.loads, {n: m for n, m in _METHODS.items() if n in names}, others)
+
+        def scaled(values: dict[str, FloatArray]) -> dict[str, FloatArray]:
+            return {name: _FREED * x if name in freed else x for name, x in values.items()}
+
+        return lambda inputs, about: [
+            replace(one, by_input=scaled(one.by_input)) for one in read(scaled(inputs), about)
+        ]
+
+    def answer(self, names: tuple[str, ...], bias_sd_s: float, freed: tuple[str, ...] = ()) -> FusedAnswer:
+        """Common posterior of some methods and the test of their agreement; `DivergenceError` without one."""
+        read = self.reader(names, bias_sd_s, freed)
+        fused = fuse(read)
+        # at the stated inputs, but with the readings' slopes at the posterior's: far inputs are curved
+        inputs = {name: mean for name, (mean, _) in fused.inputs.items()}
+        back = {name: -mean for name, mean in inputs.items()}
+        stated = [moved_evidence(one, back, fused.deflection) for one in read(inputs, fused.deflection)]
+        faults = fault_hypotheses(self.loads, fused.input_posterior, CAMERA_PLANE_SD_RAD)
+        tests = agreement(stated, fused.input_posterior, fused.deflection, faults)
+        applied = CAMERA_TIME_BIAS in fused.inputs
+        return FusedAnswer(
+            fused, tests, *_limbs(fused, self.loads), _time_bias(fused, bias_sd_s, True) if applied else None
+        )
+
+    def tested(self, fault: DivergenceError, bias_sd_s: float) -> Agreement:
+        """Test of all methods' agreement without a common answer."""
+        posterior = fault.input_posterior if isinstance(fault, FarInputsError) else None
+        faults = None if posterior is None else fault_hypotheses(self.loads, posterior, CAMERA_PLANE_SD_RAD)
+        return agreement(self.reader(self.names, bias_sd_s)({}, None), posterior, faults=faults)
+
+
+def _without_each(sources: _Sources, bias_sd_s: float) -> FusedAnswer | None:
+    """Answer where all methods contradict each other: without the one at fault, or a mixture; None if there is none."""
+    rest: dict[str, FusedAnswer] = {}
+    for name in sources.names:
+        others = tuple(n for n in sources.names if n != name)
+        try:
+            rest[name] = sources.answer(others, bias_sd_s if "camera" in others else 0.0)
+        except DivergenceError:
+            continue
+    # a single method agrees with itself
+    sound = {n: a for n, a in rest.items() if a.agreement.pairs and all(p.passed for p in a.agreement.pairs)}
+    if len(sound) == 1:
+        ((name, answer),) = sound.items()
+        return replace(answer, left_out=name)
+    among = sound or rest
+    histories = {f"without {name}": answer.fused.history for name, answer in among.items()}
+    if len(sources.names) == 2:  # each by itself, sample by sample: trim alone does not follow the joint
+        histories = {
+            "misalignment alone": estimate_misalignment(sources.loads),
+            "trim alone": estimate_trim(sources.loads),
+        }
+    if not among:
+        return None
+    base = among.get("trim", next(iter(among.values())))
+    return _mixed(base, histories, np.ones(len(histories)), sources.loads)
+
+
+def _with_faults_freed(sources: _Sources, answer: FusedAnswer, bias_sd_s: float) -> FusedAnswer:
+    """Mixture of the answer as stated and those without the likeliest faults' inputs, by their odds."""
+    histories, odds = {"all inputs as stated": answer.fused.history}, [1.0]
+    for fault in answer.agreement.likeliest:
+        try:
+            freed = sources.answer(sources.names, bias_sd_s, HYPOTHESES[fault])
+        except DivergenceError:
+            continue
+        histories[f"another {fault}"] = freed.fused.history
+        odds.append(float(np.exp(min(answer.agreement.gains[fault], _LARGEST_LOG))))
+    return _mixed(answer, histories, np.array(odds), sources.loads) if len(odds) > 1 else answer
+
+
+def _mixed(
+    answer: FusedAnswer, histories: dict[str, DeflectionHistory], weights: FloatArray, loads: FlightLoads
+) -> FusedAnswer:
+    """Answer whose history is the mixture of several, at its own times; their differences are in the covariance."""
+    t, own = answer.fused.history.time_s, answer.fused.history
+    yz, cov, weight = [], [], []
+    for history, one in zip(histories.values(), weights / weights.sum(), strict=True):
+        known = np.isfinite(history.lateral_cov[:, 0, 0])
+        if known.sum() < 2:
+            continue
+        at = history.time_s[known]
+        yz.append(np.stack([np.interp(t, at, c) for c in history.theta_yz_rad[known].T], -1))
+        flat = history.lateral_cov[known].reshape(-1, 4)
+        cov.append(np.stack([np.interp(t, at, c) for c in flat.T], -1).reshape(-1, 2, 2))
+        weight.append(one)
+    share = np.array(weight)[:, None, None] / np.sum(weight)
+    mean = np.sum(share * np.array(yz), axis=0)
+    apart = np.array(yz) - mean
+    total = np.sum(share[..., None] * (np.array(cov) + apart[..., :, None] * apart[..., None, :]), axis=0)
+    fused = replace(answer.fused, history=history_from_lateral(t, mean, total, own.method, own.assumptions))
     limbs, remark = _limbs(fused, loads)
-    # at the stated inputs, but with the readings' slopes at the posterior's: far inputs are curved
-    inputs = {name: mean for name, (mean, _) in fused.inputs.items()}
-    back = {name: -mean for name, mean in inputs.items()}
-    stated = [moved_evidence(one, back, fused.deflection) for one in read(inputs, fused.deflection)]
-    bias = None
-    if bias_sd_s > 0.0:
-        bias = _time_bias(fused, bias_sd_s, True)
-    elif observable:
-        bias = _tested_time_bias(reader)
-    faults = fault_hypotheses(loads, fused.input_posterior, CAMERA_PLANE_SD_RAD)
-    tests = agreement(stated, fused.input_posterior, fused.deflection, faults)
-    return FusedAnswer(fused, tests, limbs, remark, bias)
+    return replace(answer, fused=fused, limbs=limbs, limbs_remark=remark, alternatives=tuple(histories))
 
 
 def _explained(
-    fault: DivergenceError, loads: FlightLoads, read: Read, reader: Callable[[float], Read] | None
+    fault: DivergenceError, sources: _Sources, bias_sd_s: float, bias: CameraTimeBias | None
 ) -> DivergenceError:
     """A failed fusion with the fault hypotheses, and the camera time bias with which there is an answer."""
-    posterior = fault.input_posterior if isinstance(fault, FarInputsError) else None
-    faults = None if posterior is None else fault_hypotheses(loads, posterior, CAMERA_PLANE_SD_RAD)
-    message = f"{fault}; {agreement(read({}, None), posterior, faults=faults).remark}"
-    bias = None if reader is None else _tested_time_bias(reader)
+    message = f"{fault}; {sources.tested(fault, bias_sd_s).remark}"
     if bias is None or not bias.is_off:
         return DivergenceError(message, code=fault.codes[0])
     return DivergenceError(f"{message}; there is an answer with a {bias.remark}", code="camera-time-bias")
@@ -192,10 +338,10 @@ def _limbs(fused: Fused, loads: FlightLoads) -> tuple[Limbs | None, str]:
     return limbs, limbs.remark
 
 
-def _tested_time_bias(reader: Callable[[float], Read]) -> CameraTimeBias | None:
+def _tested_time_bias(sources: _Sources) -> CameraTimeBias | None:
     """Estimate of a camera time bias stated as zero; None where there is no common answer with it free."""
     try:
-        return _time_bias(fuse(reader(_WIDE_BIAS_SD_S)), _WIDE_BIAS_SD_S, False)
+        return _time_bias(fuse(sources.reader(sources.names, _WIDE_BIAS_SD_S)), _WIDE_BIAS_SD_S, False)
     except DivergenceError:
         return None
 

@@ -49,12 +49,13 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
     arm = vehicle.cg_m - accelerometer.spec.position_from_datum_body_m
     at = cg_accelerations(bet, t, arm, h)
     velocity = air.velocity_air_body_mps[inside]
-    root = bet.accelerometer_root[inside]
+    root = bet.triad_root[inside]
     return FlightLoads(
         time_s=t,
         specific_force_body_mps2=at.specific_force_cg_mps2,
         force_noise_sd_mps2=float(accelerometer.spec.noise_sd / np.sqrt(at.samples)),
-        force_root_mps2=root[:, 3:],
+        force_root_mps2=root[:, 3:6],
+        rate_root_radps=root[:, 6:9],
         flow_root_rad=angle_partials(velocity) @ rotations.skew(velocity) @ root[:, :3],
         rate_body_radps=at.rate_radps,
         angular_acceleration_body_radps2=at.angular_acceleration_radps2,
@@ -68,6 +69,7 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
         dynamic_pressure_sd_pa=air.dynamic_pressure_sd_pa[inside],
         airspeed_mps=air.airspeed_mps[inside],
         vehicle=vehicle,
+        point_from_datum_m=vehicle.cg_m,
         accelerometer_time_bias_sd_s=accelerometer.spec.time_bias_sd_s,
         gyro_time_bias_sd_s=rates.spec.time_bias_sd_s,
         cg_from_sensor_m=arm,

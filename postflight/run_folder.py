@@ -23,7 +23,7 @@ import pandas as pd
 from flightmodel.checks import GateError, writing
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
-from postflight.deflections import NO_VIDEO, Deflections
+from postflight.deflections import NO_VIDEO, Deflections, quantiles_at
 from postflight.product import event_table, header, peak_table, residual_statistics, slow_covariance
 from postflight.reconstruction import Reconstruction, bet_table
 
@@ -144,9 +144,11 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
         theta, sd = np.rad2deg(history.at(at_s))
         known = history.time_s[np.isfinite(history.theta_rad)]
         largest = int(np.nanargmax(history.theta_rad))
+        quantiles = np.rad2deg(quantiles_at(history, at_s))
         out[method] = {
             "deflection_deg": float(theta),
             "sd_deg": float(sd),
+            "quantiles_deg": [float(x) for x in quantiles] if np.isfinite(quantiles).all() else None,
             "largest_deg": float(np.rad2deg(history.theta_rad[largest])),
             "largest_at_s": float(history.time_s[largest]),
             "assumptions": history.assumptions,
@@ -165,8 +167,11 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
     return out
 
 
-def write_reconstruction(run: RunFolder, flight: Reconstruction) -> pd.DataFrame:
-    """Write trajectory, covariance, residuals, checks, sensor errors, events, air, findings; return the events."""
+def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflections | None = None) -> pd.DataFrame:
+    """Write trajectory, covariance, residuals, checks, sensor errors, events, air, findings; return the events.
+
+    The checks of the deflection are among them where its ``answers`` are given.
+    """
     bet = flight.solution
     table = bet_table(flight)
     run.write_csv("bet.csv", table)
@@ -178,7 +183,8 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction) -> pd.DataFrame
     run.write_csv("residuals.csv", bet.residuals)
     if len(bet.held_out):
         run.write_csv("withheld.csv", bet.held_out)
-    checks = pd.DataFrame([vars(v) for v in flight.consistency_checks])
+    of_deflection = () if answers is None else answers.consistency_checks
+    checks = pd.DataFrame([vars(v) for v in (*flight.consistency_checks, *of_deflection)])
     run.write_csv("consistency_checks.csv", checks)
     # the table's name and columns of version 0.1, for scripts that read it; to go with version 0.3
     run.write_csv(
@@ -239,7 +245,7 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
     """Return the results of a run in short, for ``summary.json``; ``event_rows`` is its `event_table`."""
     at_peak = event_rows.iloc[int((event_rows["t_s"] - flight.peak_s).abs().argmin())]
     alpha = [float(at_peak["alpha_total_wind_deg"]), float(at_peak["alpha_total_wind_3sd_deg"]) / 3.0]
-    checks = flight.consistency_checks
+    checks = (*flight.consistency_checks, *answers.consistency_checks)
     return {
         "flight": flight.telemetry.name,
         "synthetic": flight.telemetry.synthetic,
@@ -248,7 +254,8 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
         "alpha_total_wind_deg": alpha[0] if flight.has_attitude else None,
         "alpha_total_wind_sd_deg": alpha[1] if flight.has_attitude else None,
         "methods": method_summary(answers, flight.peak_s),
-        "agreement": None if answers.fused is None else answers.fused.agreement.remark,
+        "agreement": None if answers.fused is None else answers.fused.remark,
+        "left_out": None if answers.fused is None else answers.fused.left_out,
         "film_clock": None if answers.fused is None else answers.fused.time_bias_summary(),
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),
         "missing": list(flight.missing),

@@ -127,6 +127,26 @@ def accelerometer_root(problem: Problem, states: States, triangles: FloatArray) 
     return np.concatenate([attitude, partials @ (axes * sd)], axis=1)
 
 
+def triad_root(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
+    """Response (k, 9, 18) of rotation, specific force and rate errors, body axes, at kept nodes to unit normals.
+
+    As `accelerometer_root`, of the constant errors of accelerometer and gyros together: what a gyro's mounting does to
+    the attitude rolls with the vehicle.
+    """
+    kept = np.flatnonzero(problem.kept)
+    node = problem.node_index[kept]
+    motion, errors = problem.motion, states.sensor_errors[kept]
+    force = correction_partials(motion.force_sensor_mps2[node], errors[:, 0:9], motion.dcm_body_force)
+    rate = correction_partials(motion.rate_sensor_radps[node], errors[:, 9:18], motion.dcm_body_rate)
+    covariance = unpacked(triangles, 27)
+    variance, axes = np.linalg.eigh(covariance[len(kept) // 2, 9:27, 9:27])
+    sd = np.sqrt(np.maximum(variance, 0.0))
+    inverse = np.divide(1.0, sd, out=np.zeros(18), where=sd > 1e-12)
+    attitude = covariance[:, 6:9, 9:27] @ (axes * inverse)
+    root = axes * sd
+    return np.concatenate([attitude, force @ root[0:9], rate @ root[9:18]], axis=1)
+
+
 def rate_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
     """Systematic error covariance (k, 3, 3) of the corrected rates at kept nodes, body axes, (rad/s)^2."""
     kept = np.flatnonzero(problem.kept)

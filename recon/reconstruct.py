@@ -95,6 +95,8 @@ class TrajectorySolution:
         trajectory's times; empty without inertial sensors.
     accelerometer_root : (n, 6, 9) float
         Rotation and specific force error per unit normal of the accelerometer's errors, `product.accelerometer_root`.
+    triad_root : (n, 9, 18) float
+        Rotation, specific force and rate error per unit normal of both triads' errors, `product.triad_root`.
     findings : tuple of Finding
         Gaps that were bridged, stretches of radar track that were edited, and so on.
     provenance : dict
@@ -116,6 +118,7 @@ class TrajectorySolution:
     specific_force_cov: FloatArray
     rate_cov: FloatArray
     accelerometer_root: FloatArray
+    triad_root: FloatArray
     findings: tuple[Finding, ...]
     provenance: dict[str, object]
     left_out: tuple[LeftOut, ...] = ()
@@ -285,6 +288,7 @@ def reconstruct_once(
         specific_force_cov=series[3],
         rate_cov=series[4],
         accelerometer_root=series[5],
+        triad_root=series[6],
         findings=(
             *findings,
             *(span.finding() for span in spans),
@@ -352,9 +356,9 @@ def _series(
 ) -> tuple[FloatArray, ...]:
     """Corrected specific force and rates with their times, and at kept nodes how well both are known."""
     if sensors is None:
-        return tuple(np.empty(s) for s in ((0,), (0, 3), (0, 3), (0, 3, 3), (0, 3, 3), (0, 6, 9)))
+        return tuple(np.empty(s) for s in ((0,), (0, 3), (0, 3), (0, 3, 3), (0, 3, 3), (0, 6, 9), (0, 9, 18)))
     series = product.corrected_series(problem, sensors.force, sensors.rate, states)
-    known = (product.specific_force_cov, product.rate_cov, product.accelerometer_root)
+    known = (product.specific_force_cov, product.rate_cov, product.accelerometer_root, product.triad_root)
     return (*series, *(make(problem, states, smoothed.triangles) for make in known))
 
 

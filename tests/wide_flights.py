@@ -19,15 +19,15 @@ import numpy as np
 from estimators.trim import static_trim
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.flightfolder import read_flight
-from flightmodel.telemetry import Telemetry
+from flightmodel.telemetry import Telemetry, TriadRecord
 from flightmodel.vehicle import CompliantJoint, Vehicle, vehicle_from_toml, vehicle_path
 from synthetic_flight.folder import simulate_to_folder
-from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, Scenario
+from synthetic_flight.scenarios import Scenario
 from synthetic_flight.simulate import Truth
 from tests.recon import dispersed
 
 SPIN_RPM, STIFFNESS_NMPRAD, DAMPING_RATIO = (0.0, 60.0), (1e3, 50e3), (0.002, 0.03)
-OFFSET_M, MASS_KG, LOCKED_NMPRAD = (0.0, 0.008), (60.0, 400.0), 2e6
+OFFSET_M, MASS_KG, LOCKED_HZ = (0.0, 0.008), (60.0, 400.0), 40.0
 LENGTH_SD, PRODUCT = 0.10, 0.002  # of the lengths; of a body's transverse inertia
 COEFFICIENT_SD = {"ca": 0.05, "cn": 0.10, "cm": 0.15, "cmq": 0.15}
 LAST_S = 462.0
@@ -157,7 +157,7 @@ def _joint(flown: Vehicle, rng: np.random.Generator, locked: bool) -> CompliantJ
     stiffness = _log_uniform(rng, (max(least, STIFFNESS_NMPRAD[0]), max(STIFFNESS_NMPRAD[1], 1.5 * least)))
     ratio = _log_uniform(rng, DAMPING_RATIO)
     if locked:
-        stiffness, ratio = LOCKED_NMPRAD, 0.1
+        stiffness, ratio = flown.joint.bending_stiffness_nmprad * (LOCKED_HZ / flown.free_free_frequency_hz()) ** 2, 0.1
     size = flown.transverse_inertia_about_joint()[1] / nominal.transverse_inertia_about_joint()[1]
     changed = {
         "bending_stiffness_nmprad": float(stiffness),
@@ -173,10 +173,14 @@ def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float
 
 
 def flown(one: WideFlight, folder: Path) -> tuple[Telemetry, Truth]:
-    """Fly, write the flight folder, and read it as its analyst has it: vehicle and accelerometer's place as told."""
+    """Fly, write the flight folder, and read it as its analyst has it: the told vehicle, sensors where they sit."""
     truth = simulate_to_folder(one.scenario, one.seed, folder, replace=True)
-    telemetry = read_flight(folder)  # its vehicle file is the reference vehicle's
-    force, _ = telemetry.required_triads()
-    place = np.array(one.told.sensors[ACCELEROMETER_MOUNT].position_from_datum_body_m)
-    force = replace(force, spec=replace(force.spec, position_from_datum_body_m=place))
-    return replace(telemetry, vehicle=one.told, accelerometer=force), truth
+    read = read_flight(folder)
+    mounts = {"accelerometer": "suba", "rates": "suba", "magnetometer": "magnetometer"}
+    placed = {}
+    for name, mount in mounts.items():
+        record: TriadRecord | None = getattr(read, name)
+        if record is not None:
+            place = np.array(one.told.sensors[mount].position_from_datum_body_m)
+            placed[name] = replace(record, spec=replace(record.spec, position_from_datum_body_m=place))
+    return replace(read, vehicle=one.told, **placed), truth

@@ -1,6 +1,6 @@
 """What does the report say? Title, lead, a card for each method, events, tables: everything that is text.
 
-A ± is one standard deviation; a card's interval says its probability (95 %).
+A ± is one standard deviation; a card's intervals are quantiles: 16 to 84 and 5 to 95 %.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import ndtri
 
 from estimators.agreement import CONFIDENCE
 from flightmodel.config import parse_utc
-from flightmodel.deflection import interpolation_error, lateral_axes, lv_clock, lv_direction
+from flightmodel.deflection import QUANTILES, interpolation_error, lateral_axes, lv_clock, lv_direction
 from postflight.deflections import METHODS
 from postflight.plots.style import COLOUR, LABEL
 from postflight.report.pictures import best_method, hole_s
 from postflight.report.source import Run
 from postflight.sensitivity import largest_of_groups
 
-_SIDES_95 = 1.96
 _HOW = {
     "camera": "Edge, seams and dots of the aeroshell in the onboard video.",
     "misalignment": "The deflection that reconciles the accelerometers with the trajectory's angle of attack.",
@@ -84,7 +84,7 @@ def lead(run: Run) -> list[str]:
     oscillation = _oscillation(run)
     if oscillation:
         out.insert(0, oscillation)
-    out.append(f"{s['verdicts_passed']} of {len(run.checks)} consistency checks of the trajectory pass.")
+    out.append(f"{s['verdicts_passed']} of {len(run.checks)} consistency checks pass.")
     changes = run.facts["settings"].get("changes")
     if changes:
         out.insert(0, f"A what-if, not the flight as its folder states it: {'; '.join(changes)}.")
@@ -118,9 +118,11 @@ def _card(run: Run, method: str) -> dict[str, Any]:
         reason = NOT_ASKED if answer is None else answer["reason"]
         return card | {"state": "none", "mark": "–", "remark": "no answer", "reason": reason}
     value, sd = answer["deflection_deg"], answer["sd_deg"]
+    # runs of before the quantiles have a sd alone
+    quantiles = answer.get("quantiles_deg") or [max(value + k * sd, 0.0) for k in ndtri(QUANTILES)]
     card |= {
         "value": f"{value:.2f}", "sd": f"{sd:.2f}", "number": value, "number_sd": sd,
-        "low": f"{value - _SIDES_95 * sd:.2f}", "high": f"{value + _SIDES_95 * sd:.2f}",
+        "low": f"{quantiles[0]:.2f}", "high": f"{quantiles[-1]:.2f}", "quantiles": quantiles,
         "plane": plane_at(run, method), "largest": f"{answer['largest_deg']:.2f}", "largest_s": answer["largest_at_s"],
         "assumptions": answer["assumptions"],
     }  # fmt: skip
@@ -166,8 +168,8 @@ def plane_at(run: Run, method: str) -> str:
 
 
 def _scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
-    """Common scale of the cards' whiskers, deg: all 95 % intervals with a margin."""
-    ends = [c["number"] + s * _SIDES_95 * c["number_sd"] for c in shown if "number" in c for s in (-1.0, 1.0)]
+    """Common scale of the cards' whiskers, deg: all intervals of 5 to 95 % with a margin."""
+    ends = [end for c in shown if "number" in c for end in (*c["quantiles"], c["number"])]
     if not ends:
         return 0.0, 1.0
     margin = 0.06 * (max(ends) - min(ends)) + 0.01
@@ -175,17 +177,17 @@ def _scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
 
 
 def with_whiskers(shown: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Cards with the places of their whiskers on a scale of 0 to 200; the fusion's 95 % as a band behind each."""
-    low, high = _scale(shown)
-    place = lambda x: round(200.0 * (x - low) / (high - low), 1)  # noqa: E731
+    """Cards with the places of their whiskers on a scale of 0 to 200; the fusion's 5 to 95 % as a band behind each."""
+    least, most = _scale(shown)
+    place = lambda x: round(200.0 * (x - least) / (most - least), 1)  # noqa: E731
     fused = next((c for c in shown if c["method"] == "fused" and "number" in c), None)
     for c in shown:
         if "number" not in c:
             continue
-        x, sd = c["number"], c["number_sd"]
-        c["whisker"] = [place(x + k * sd) for k in (-_SIDES_95, -1.0, 0.0, 1.0, _SIDES_95)]
+        low, inner_low, _, inner_high, high = c["quantiles"]
+        c["whisker"] = [place(x) for x in (low, inner_low, c["number"], inner_high, high)]
         if fused is not None:
-            c["behind"] = [place(fused["number"] + k * fused["number_sd"]) for k in (-_SIDES_95, _SIDES_95)]
+            c["behind"] = [place(fused["quantiles"][k]) for k in (0, -1)]
     return shown
 
 

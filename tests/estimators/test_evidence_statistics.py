@@ -22,8 +22,7 @@ def test_flow_s_error_turns_against_a_roll_that_speeds_up():
     # the last rate are missing or too many, 0.08 rad here
     a = 1.1
     pulse, t = rolling(lambda t: a * t)
-    everywhere = np.ones(len(t), dtype=bool)
-    inputs = flow_inputs(pulse, everywhere)
+    inputs = flow_inputs(pulse)
     for name in (WIND, ATTITUDE):
         # the first normal is along y of the axes that do not roll: in the body it turns backwards
         along_y = inputs[name][:, :, 0]
@@ -35,9 +34,8 @@ def test_flow_s_error_turns_against_a_roll_that_speeds_up():
 
 def test_flow_s_error_keeps_its_size_while_it_rolls():
     # the three parts together are the stated covariance, at any roll
-    pulse, t = rolling(lambda t: 3.0 + 0.0 * t)
-    everywhere = np.ones(len(t), dtype=bool)
-    parts = flow_inputs(pulse, everywhere)
+    pulse, _ = rolling(lambda t: 3.0 + 0.0 * t)
+    parts = flow_inputs(pulse)
     total = sum(j @ j.transpose(0, 2, 1) for j in parts.values())
     wind = parts[WIND] @ parts[WIND].transpose(0, 2, 1)
     np.testing.assert_allclose(wind, pulse.wind_flow_sd_rad[:, None, None] ** 2 * np.eye(2), rtol=0.15, atol=1e-12)
@@ -56,12 +54,13 @@ def test_a_swinging_joint_widens_by_the_mean_square_of_what_is_left_out(way):
     w = 2.0 * np.pi * swing_hz
     theta = size * np.sin(w * t)[:, None] * np.array(way)
     n = len(t)
-    by_acceleration = np.tile(share * np.eye(2), (n, 1, 1))
-    one = Evidence("trim", t, theta, by_acceleration, {}, np.zeros((n, 2, 2)), 1.0)
+    # by the rate as much again: of a sine its mean square is the acceleration's over the square of the frequency
+    by_acceleration, by_rate = np.tile(share * np.eye(2), (n, 1, 1)), np.tile(share * w * np.eye(2), (n, 1, 1))
+    one = Evidence("trim", t, theta, by_rate, by_acceleration, {}, np.zeros((n, 2, 2)), 1.0)
     pulse, _ = pulse_of(np.random.default_rng(1), n, theta_yz=np.full((n, 2), 0.02))
     history = history_of_evidence(one, replace(pulse, time_s=t), "")
     lateral = history.lateral_cov
     added = np.trace(lateral, axis1=1, axis2=2)
     inner = (t > 2.0) & (t < 10.0) & (np.abs(np.sin(w * t)) > 0.7)  # where the plane is told at all
-    want = (share * size * w**2) ** 2 / 2.0
+    want = (share * size * w**2) ** 2
     assert np.mean(added[inner]) == pytest.approx(want, rel=0.03)

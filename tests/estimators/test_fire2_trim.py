@@ -61,7 +61,7 @@ def test_rigid_pitching_at_the_frequency_of_the_published_slope_needs_no_bending
             rate_body_radps=np.zeros((60, 3)),
             angular_acceleration_body_radps2=turn,
         )
-        moment = moment_term(model, moving, np.ones(60, dtype=bool), True)
+        moment = moment_term(model, moving)
         found = solve_trim(replace(model, xbar_m=1e-9), moving.mach, flow, moment)
         worst = np.rad2deg(np.abs(found).max())
         # C_A falls by 0.5 % to 4 deg

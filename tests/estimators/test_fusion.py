@@ -41,11 +41,8 @@ def motion():
     return size[:, None] * np.array([0.8, -0.6])
 
 
-def trim(loads, use, about_yz_rad, *, with_inputs=True):
-    return trim_evidence(loads, use=use, about_yz_rad=about_yz_rad, with_inputs=with_inputs)
-
-
-METHODS = {"misalignment": misalignment_evidence, "trim": trim}
+METHODS = {"misalignment": misalignment_evidence, "trim": trim_evidence}
+STILL = np.zeros((N, 2, 2))
 
 
 def linear_evidence(rng, name, inputs, noise_sd=1e-3):
@@ -54,7 +51,7 @@ def linear_evidence(rng, name, inputs, noise_sd=1e-3):
     response = {k: 2e-3 * rng.normal(size=(1, 2, 1)) * (1.0 + 0.3 * np.sin(t + j))[:, None, None]
                 for j, k in enumerate(inputs)}  # fmt: skip
     cov = np.tile(noise_sd**2 * np.eye(2), (N, 1, 1))
-    return Evidence(name, TIME_S, np.zeros((N, 2)), np.tile(-1e-3 * np.eye(2), (N, 1, 1)), response, cov, 0.1)
+    return Evidence(name, TIME_S, np.zeros((N, 2)), STILL, np.tile(-1e-3 * np.eye(2), (N, 1, 1)), response, cov, 0.1)
 
 
 def linear_reader(readings):
@@ -69,25 +66,55 @@ def test_posterior_is_that_of_the_joint_gaussian():
     readings = [replace(e, theta_yz_rad=motion() + 1e-3 * rng.normal(size=(N, 2))) for e in readings]
     got = fuse(linear_reader(readings))
     spline = fusion.Spline.over(TIME_S[0], TIME_S[-1])
-    curvature = spline.rows(spline.knots_s, 2) / fusion.ACCELERATION_SD_RADPS2
-    prior = np.linalg.inv(curvature.T @ curvature + np.eye(spline.count) / fusion.SIZE_SD_RAD**2)
-    size = 2 * spline.count
-    before = np.eye(size + 3)
-    before[:size, :size] = np.kron(np.eye(2), prior)
-    rows, want = zip(
-        *(fusion.whitened(e, spline, {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}, {}) for e in readings),
-        strict=True,
-    )
+    curvature = spline.rows(spline.knots_s, 2)
+    place = {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}
+    rows, want = zip(*(fusion.whitened(e, spline, place, {}) for e in readings), strict=True)
     rows, want = np.concatenate(rows), np.concatenate(want)
-    gain = before @ rows.T @ np.linalg.inv(rows @ before @ rows.T + np.eye(len(want)))
-    mean, after = gain @ want, before - gain @ rows @ before
+    size = 2 * spline.count
+
+    def posterior(process_size, before_inputs, mean_inputs):
+        prior = np.linalg.inv((curvature.T @ curvature) / process_size**2 + np.eye(spline.count))
+        before = np.zeros((size + 3, size + 3))
+        before[:size, :size] = np.kron(prior, np.eye(2))
+        before[size:, size:] = before_inputs
+        gain = before @ rows.T @ np.linalg.inv(rows @ before @ rows.T + np.eye(len(want)))
+        shift = np.concatenate([np.zeros(size), mean_inputs])
+        return shift + gain @ (want - rows @ shift), before - gain @ rows @ before
+
+    # the inputs: with a process that is free
+    mean, after = posterior(1e3, np.eye(3), np.zeros(3))
+    np.testing.assert_allclose([got.inputs[k][0][0] for k in "pqr"], mean[size:], atol=1e-5)
+    np.testing.assert_allclose([got.inputs[k][1][0, 0] for k in "pqr"], np.diag(after)[size:], rtol=1e-4)
+    # the deflection, given these, with the process of the flight's own size; their covariance comes on top
+    x, x_cov = mean[size:], after[size:, size:]
+    given, own = posterior(got.process_size_radps2, np.zeros((3, 3)), x)
     value = spline.rows(got.history.time_s)
-    lateral = np.stack([value @ mean[: spline.count], value @ mean[spline.count : size]], axis=-1)
-    np.testing.assert_allclose(got.history.theta_yz_rad, lateral, atol=1e-8)
-    np.testing.assert_allclose([got.inputs[k][0][0] for k in "pqr"], mean[size:], atol=1e-6)
-    np.testing.assert_allclose([got.inputs[k][1][0, 0] for k in "pqr"], np.diag(after)[size:], rtol=1e-5)
-    cov = np.einsum("ni,ij,nj->n", value, after[: spline.count, : spline.count], value)
-    np.testing.assert_allclose(got.history.lateral_cov[:, 0, 0], cov, rtol=1e-4)
+    lateral = np.stack([value @ given[axis:size:2] for axis in (0, 1)], axis=-1)
+    np.testing.assert_allclose(got.history.theta_yz_rad, lateral, atol=1e-7)
+    steps = [(posterior(got.process_size_radps2, np.zeros((3, 3)), x + e)[0] - given)[0:size:2] for e in np.eye(3)]
+    total = own[0:size:2, 0:size:2] + np.stack(steps, -1) @ x_cov @ np.stack(steps)
+    np.testing.assert_allclose(
+        got.history.lateral_cov[:, 0, 0], np.einsum("ni,ij,nj->n", value, total, value), rtol=1e-3
+    )
+
+
+def test_the_size_of_the_process_is_the_most_probable_one():
+    """The evidence by the readings' whole covariance, for a few sizes: no normal equations, no band."""
+    rng = np.random.default_rng(21)
+    one = replace(linear_evidence(rng, "a", ()), theta_yz_rad=motion() + 1e-3 * rng.normal(size=(N, 2)))
+    spline = fusion.Spline.over(TIME_S[0], TIME_S[-1])
+    curvature = spline.rows(spline.knots_s, 2)
+    rows, want = fusion.whitened(one, spline, {}, {})
+
+    def surprise(size):
+        prior = np.kron(np.linalg.inv((curvature.T @ curvature) / size**2 + np.eye(spline.count)), np.eye(2))
+        cov = rows @ prior @ rows.T + np.eye(len(want))
+        a_priori = 0.5 * (np.log(size / fusion.SIZE_RADPS2) / fusion.SIZE_LOG_SD) ** 2
+        return a_priori + 0.5 * want @ np.linalg.solve(cov, want) + 0.5 * np.linalg.slogdet(cov)[1]
+
+    found = fuse(linear_reader([one])).process_size_radps2
+    assert 0.05 < found < 20.0
+    assert surprise(found) < min(surprise(0.8 * found), surprise(1.25 * found))
 
 
 def test_linear_readings_err_as_the_posterior_says(monkeypatch):
@@ -122,7 +149,7 @@ def test_a_ringing_joint_is_no_scale_error():
     inertial = np.tile(1e-3 * np.eye(2), (N, 1, 1))
     read = theta + 1e-3 * second
     scale = {"scale": 0.003 * read[:, :, None]}
-    one = Evidence("a", TIME_S, read, inertial, scale, np.tile((2e-4) ** 2 * np.eye(2), (N, 1, 1)), 0.1)
+    one = Evidence("a", TIME_S, read, STILL, inertial, scale, np.tile((2e-4) ** 2 * np.eye(2), (N, 1, 1)), 0.1)
     got = fuse(linear_reader([one]))
     assert abs(got.inputs["scale"][0][0]) < 0.5
     inner = slice(10, -10)
@@ -172,13 +199,13 @@ def test_moving_the_inputs_moves_the_reading_by_the_response():
     loads = replace(
         loads, accelerometer_time_bias_sd_s=2e-3, gyro_time_bias_sd_s=1e-3, cg_from_sensor_m=np.array([-0.4, 0.1, 0.2])
     )
-    use, rng = loads.informative, np.random.default_rng(5)
+    rng = np.random.default_rng(5)
     assert {ACCELEROMETER_TIME_BIAS, GYRO_TIME_BIAS} <= misalignment_evidence(loads).by_input.keys()
     for method in METHODS.values():
-        base = method(loads, use, None)
+        base = method(loads)
         for name, response in base.by_input.items():
             x = 1e-3 * rng.normal(size=response.shape[2])
-            moved = method(corrected_loads(loads, use, {name: x}), use, None)
+            moved = method(corrected_loads(loads, {name: x}))
             change = moved.theta_yz_rad - base.theta_yz_rad
             scale = np.abs(response).max() * 1e-3 + 1e-9
             np.testing.assert_allclose(change, response @ x, atol=0.05 * scale + 2e-8, err_msg=name)
@@ -186,12 +213,11 @@ def test_moving_the_inputs_moves_the_reading_by_the_response():
 
 def test_flow_parts_add_up_to_its_covariance():
     loads, _ = pulse_of(np.random.default_rng(6), 40)
-    use = loads.informative
-    parts = flow_inputs(loads, use)
+    parts = flow_inputs(loads)
     total = sum(j @ j.transpose(0, 2, 1) for j in parts.values())
-    np.testing.assert_allclose(np.trace(total, axis1=1, axis2=2), np.trace(loads.flow_cov[use], axis1=1, axis2=2))
+    np.testing.assert_allclose(np.trace(total, axis1=1, axis2=2), np.trace(loads.flow_cov, axis1=1, axis2=2))
     wind = parts[WIND] @ parts[WIND].transpose(0, 2, 1)
-    np.testing.assert_allclose(wind[:, 0, 0], loads.wind_flow_sd_rad[use] ** 2)
+    np.testing.assert_allclose(wind[:, 0, 0], loads.wind_flow_sd_rad**2)
 
 
 def test_a_gauss_markov_basis_has_its_correlation():
@@ -205,16 +231,16 @@ def test_a_gauss_markov_basis_has_its_correlation():
 
 def test_no_common_answer_is_refused():
     loads, _ = pulse_of(np.random.default_rng(7), N, motion())
-    far = trim_evidence(loads).theta_yz_rad + np.deg2rad(25.0)
+    far = trim_evidence(loads.rows(loads.through_pulse)).theta_yz_rad + np.deg2rad(25.0)
 
     def apart(inputs, about):
         own = loads_reader(loads, {"misalignment": misalignment_evidence}, [])(inputs, about)
-        other = trim_evidence(corrected_loads(loads, loads.through_pulse, inputs), use=loads.through_pulse)
+        other = trim_evidence(corrected_loads(loads, inputs).rows(loads.through_pulse))
         return [*own, replace(other, theta_yz_rad=far)]
 
     with pytest.raises(DivergenceError) as refusal:
         fuse(apart)
-    assert refusal.value.codes[0] in {"inputs-far-off", "fusion-not-converged"}
+    assert refusal.value.codes[0] in {"inputs-far-off", "fusion-not-converged", "deflection-undetermined"}
     with pytest.raises(DivergenceError) as refusal:
         fuse(lambda _i, _a: [])
     assert refusal.value.codes == ("too-few-readings",)

@@ -19,15 +19,11 @@ from estimators.evidence import (
 from estimators.fusion import InputPosterior, fuse
 from estimators.misalignment import misalignment_evidence
 from estimators.southwell import LEFT_OUT, southwell_limbs
-from estimators.trim import SLOPE_AT_RAD, solve_trim, static_trim, trim_curvature, trim_evidence, trim_model
+from estimators.trim import SLOPE_AT_RAD, static_trim, trim_curvature, trim_evidence
 from flightmodel.deflection import history_from_lateral
 from synthetic_flight.linear import Slopes, linear_matrix
 
 from .conftest import VEHICLE, pulse_of
-
-
-def trim(pulse, use, about_yz_rad, *, with_inputs=True):
-    return trim_evidence(pulse, use=use, about_yz_rad=about_yz_rad, with_inputs=with_inputs)
 
 
 def alive():
@@ -40,23 +36,23 @@ def alive():
         rate_body_radps=rng.normal(0.0, 0.2, (n, 3)),
         angular_acceleration_body_radps2=rng.normal(0.0, 0.6, (n, 3)),
         flow_root_rad=np.deg2rad(0.08) * rng.normal(size=(n, 2, 9)),
+        rate_root_radps=1e-3 * rng.normal(size=(n, 3, 9)),
         flow_cov=np.tile(np.deg2rad(0.6) ** 2 * np.eye(2), (n, 1, 1)),
         dynamic_pressure_sd_pa=0.04 * pulse.dynamic_pressure_pa,
     )
 
 
-@pytest.mark.parametrize("method", [misalignment_evidence, trim])
+@pytest.mark.parametrize("method", [misalignment_evidence, trim_evidence])
 def test_every_response_is_that_of_moving_the_input(method):
     # J against a finite change of 1e-3 sd: second order leaves 1e-3 of J at the most for all that is smooth
     pulse, rng = alive(), np.random.default_rng(5)
-    use = pulse.informative
-    base = method(pulse, use, None)
+    base = method(pulse)
     for name, response in base.by_input.items():
         x = 1e-3 * rng.normal(size=response.shape[2])
-        change = method(corrected_loads(pulse, use, {name: x}), use, None).theta_yz_rad - base.theta_yz_rad
+        change = method(corrected_loads(pulse, {name: x})).theta_yz_rad - base.theta_yz_rad
         scale = np.abs(response).max() * 1e-3 + 1e-9
         np.testing.assert_allclose(change, response @ x, atol=0.03 * scale + 2e-8, err_msg=name)
-    if method is trim:
+    if method is trim_evidence:
         assert np.abs(base.by_input[PRESSURE]).max() > 1e-4
 
 
@@ -64,9 +60,14 @@ def test_moved_vehicle_is_moved_as_its_names_say():
     known = VEHICLE.uncertainty
     aft = moved_vehicle(VEHICLE, {"aeroshell c.g. station": 1.0})
     assert aft.aeroshell.cg_m[0] - VEHICLE.aeroshell.cg_m[0] == pytest.approx(-known.cg_station_m)
-    heavy = moved_vehicle(VEHICLE, {"centerbody mass": 1.0, "aeroshell inertia": -2.0})
+    heavy = moved_vehicle(VEHICLE, {"centerbody mass": 1.0, "aeroshell pitch inertia": -2.0})
     assert heavy.centerbody.mass_kg / VEHICLE.centerbody.mass_kg == pytest.approx(1.0 + known.mass)
-    np.testing.assert_allclose(heavy.aeroshell.inertia, (1.0 - 2.0 * known.inertia) * VEHICLE.aeroshell.inertia)
+    factor = 1.0 - 2.0 * known.inertia
+    np.testing.assert_allclose(heavy.aeroshell.inertia, np.diag([1.0, factor, factor]) * VEHICLE.aeroshell.inertia)
+    rolled = moved_vehicle(VEHICLE, {"centerbody roll inertia": 1.0, "centerbody product xz": 2.0}).centerbody.inertia
+    size = known.inertia_products * VEHICLE.centerbody.inertia[1, 1]
+    np.testing.assert_allclose(rolled[0], [(1.0 + known.inertia) * VEHICLE.centerbody.inertia[0, 0], 0.0, 2.0 * size])
+    np.testing.assert_allclose(rolled, rolled.T)
     # the vehicle's offset errs as two bodies' lateral c.g.s err that are known by themselves
     masses = np.array([VEHICLE.aeroshell.mass_kg, VEHICLE.centerbody.mass_kg])
     want = known.cg_lateral_m * np.linalg.norm(masses) / masses.sum()
@@ -78,7 +79,9 @@ def test_moved_vehicle_is_moved_as_its_names_say():
 def test_a_curved_input_shifts_and_widens_by_its_second_moment():
     # b x^2 of a standard normal x: mean b, variance 2 b b'; five Gauss-Hermite nodes are exact
     curvature = np.array([[2e-3, -1e-3]])
-    one = Evidence("trim", np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2)), {}, np.zeros((1, 2, 2)), 1.0, curvature)
+    one = Evidence(
+        "trim", np.zeros(1), np.zeros((1, 2)), *[np.zeros((1, 2, 2))] * 2, {}, np.zeros((1, 2, 2)), 1.0, curvature
+    )
     node, weight = np.polynomial.hermite_e.hermegauss(5)
     weight = weight / weight.sum()
     values = curvature[0] * node[:, None] ** 2
@@ -91,11 +94,10 @@ def test_trim_s_curvature_is_half_its_second_difference_by_the_moment_s_coeffici
     pulse, _ = pulse_of(np.random.default_rng(9), 12)
 
     def read(size):
-        model = trim_model(moved_vehicle(pulse.vehicle, {"C_m": size}))
-        return solve_trim(model, pulse.mach, pulse.flow_yz_rad, np.zeros((12, 2)))
+        return trim_evidence(replace(pulse, vehicle=moved_vehicle(pulse.vehicle, {"C_m": size}))).theta_yz_rad
 
     want = 0.5 * (read(1.0) - 2.0 * read(0.0) + read(-1.0))
-    got = trim_curvature(pulse, dynamic=False)
+    got = trim_curvature(pulse)
     # steps of sqrt(3) sd against one: the fourth derivative's part differs
     np.testing.assert_allclose(got, want, atol=0.15 * np.abs(want).max())
     assert np.abs(want).max() > 1e-5
@@ -104,12 +106,12 @@ def test_trim_s_curvature_is_half_its_second_difference_by_the_moment_s_coeffici
 def test_trim_s_own_noise_is_that_of_the_angular_acceleration():
     one, _ = pulse_of(np.random.default_rng(10), 1)
     pulse = replace(one, angular_acceleration_sd_radps2=0.05)
-    use, rng = pulse.informative, np.random.default_rng(11)
+    rng = np.random.default_rng(11)
     evidence = trim_evidence(pulse)
     drawn = []
     for _ in range(600):
         turned = replace(pulse, angular_acceleration_body_radps2=0.05 * rng.standard_normal((1, 3)))
-        drawn.append(trim_evidence(turned, use=use, with_inputs=False).theta_yz_rad[0])
+        drawn.append(trim_evidence(turned, with_inputs=False).theta_yz_rad[0])
     # both axes alike: the pitch inertia stands for both, which differ by 1 %; 600 draws know a variance to 6 %
     ratio = np.trace(np.cov(np.array(drawn).T)) / np.trace(evidence.independent_cov[0])
     assert ratio == pytest.approx(1.0, abs=0.2)
@@ -138,7 +140,7 @@ def test_of_many_swings_that_fit_alike_the_clock_s_own_term_chooses():
     def told(name, at, values, sd_rad, time_bias_sd_s):
         n = len(at)
         return Evidence(
-            name, at, values, np.zeros((n, 2, 2)), {}, np.tile(sd_rad**2 * np.eye(2), (n, 1, 1)), 0.01,
+            name, at, values, *[np.zeros((n, 2, 2))] * 2, {}, np.tile(sd_rad**2 * np.eye(2), (n, 1, 1)), 0.01,
             time_bias_sd_s=time_bias_sd_s,
         )  # fmt: skip
 
@@ -163,7 +165,7 @@ def pair(rng, noises, shared=True):
         noise = noises[k] * rng.standard_normal((len(at), 2))
         cov = np.tile(noises[k] ** 2 * np.eye(2), (len(at), 1, 1))
         read = -(j @ x) + noise
-        out.append(Evidence(name, at, read, np.zeros((len(at), 2, 2)), {WIND: j} if shared else {}, cov, 0.05))
+        out.append(Evidence(name, at, read, *[np.zeros((len(at), 2, 2))] * 2, {WIND: j} if shared else {}, cov, 0.05))
     return out
 
 

@@ -74,8 +74,7 @@ def test_recovers_any_plane_exactly_from_ideal_data(seed):
     rng = np.random.default_rng(seed)
     loads, truth = pulse_of(rng, n=40)
     history = estimate_misalignment(loads)
-    # lateral vectors add to second order only: 0.1 rad of each angle leaves 0.1^3/3
-    np.testing.assert_allclose(history.theta_yz_rad, truth, atol=5e-4)
+    np.testing.assert_allclose(history.theta_yz_rad, truth, atol=1e-7)
 
 
 def test_no_answer_where_there_is_no_deceleration():

@@ -124,7 +124,7 @@ def made_pulse(seed=0, noise=0.004):
     grid = np.arange(0.5, 3.5, 0.1)
     n = len(grid)
     bet.smoothed, bet.output_rate_hz = SimpleNamespace(time_s=grid), 10.0
-    bet.accelerometer_root = 1e-3 * rng.normal(size=(n, 6, 9))
+    bet.triad_root = 1e-3 * rng.normal(size=(n, 9, 18))
     vehicle = vehicle_from_toml(vehicle_path("irve2_reference"))
     force = TriadSpec("accelerometer", vehicle.cg_m, np.eye(3), 0.01, 0.0, 0.0, 0.0)
     rates = TriadSpec("rates", np.zeros(3), np.eye(3), noise, 0.0, 0.0, 0.0)
@@ -137,7 +137,7 @@ def made_pulse(seed=0, noise=0.004):
         air=SimpleNamespace(wind_sd_mps=4.0 * one), dynamic_pressure_pa=one, dynamic_pressure_sd_pa=one,
         airspeed_mps=800.0 * one,
     )  # fmt: skip
-    return loads.loads_from_solution(telemetry, bet, air), bet.accelerometer_root, velocity
+    return loads.loads_from_solution(telemetry, bet, air), bet.triad_root, velocity
 
 
 def test_pulse_data_state_their_noise_and_the_flow_s_errors():
@@ -149,7 +149,7 @@ def test_pulse_data_state_their_noise_and_the_flow_s_errors():
     # a wind across moves the flow by itself over the speed along the axis
     np.testing.assert_allclose(pulse.wind_flow_sd_rad, 4.0 / 800.0)
     # an attitude error e of the body shows the same flow in axes turned by e
-    for k in range(9):
+    for k in range(18):
         turned = rotations.rotate(rotations.conjugate(rotations.exp(root[:, :3, k])), velocity)
         change = lateral_angles(turned) - lateral_angles(velocity)
         np.testing.assert_allclose(pulse.flow_root_rad[:, :, k], change, atol=0.02 * np.abs(change).max())

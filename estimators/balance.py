@@ -1,0 +1,199 @@
+"""What forces and moments does a deflected vehicle need to move as the centerbody's sensors say it moved?
+
+Momentum and angular momentum of two rigid bodies that turn against each other about the joint, exact in the deflection
+and in the rates. Body axes are the centerbody's; ``R(theta)`` turns shell axes into them, with ``rho`` the shell's c.g.
+from the joint and ``w``, ``w'`` the measured rate and angular acceleration. Measured is the specific force ``f`` at a
+point of the centerbody; the vehicle's c.g. lies ``d(theta)`` from it and moves::
+
+    F = m (f + d'' + 2 w x d' + w' x d + w x (w x d))                                        aerodynamic force
+    M = H' + w x H,   H = I_B w + R I_A R^T (w + phi) + mu r x (r' + w x r)                  about the c.g.
+
+with ``phi`` the shell's rate against the body, ``r`` from the centerbody's c.g. to the shell's, ``mu = m_A m_B / m``.
+Centrifugal, Coriolis and gyroscopic terms are all in these. Both must be those of the air, which acts on the shell
+alone, at its nose, in shell axes::
+
+    F = -q S (C_A x + C_N n),   M_nose = q S l (C_m n x x + C_mq l/(2V) w_A,transverse)
+
+``n`` is the unit vector of the nose's lateral velocity in the air and ``w_A`` the shell's own rate. What is left of the
+two balances are the residuals of the estimators: the force's *direction* (`force_residual`; neither mass nor dynamic
+pressure enters but through the motion) and the transverse *moment*, over ``q S C_A``, as a shift of the c.g.
+(`moment_residual`).
+
+Assumed: rigid bodies, no twist, no air on the centerbody, no difference of gravitation within the vehicle.
+
+References
+----------
+P. C. Hughes, "Spacecraft Attitude Dynamics", 1986, chapter 3 (two bodies on a spherical joint).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from estimators.loads import FlightLoads, lateral_and_size
+from flightmodel import rotations
+from flightmodel.airdata import lateral_angles
+from flightmodel.checks import FloatArray
+from flightmodel.vehicle import Vehicle
+
+# step of the time derivatives, s: of rates of some rad/s it leaves 1e-8 of truncation and 1e-9 of rounding
+_STEP_S = 1e-4
+_X = np.array([1.0, 0.0, 0.0])
+Coefficients = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Swing:
+    """Deflection as a lateral vector, rad, and its first and second derivative by time; (n, 2) each."""
+
+    theta_yz_rad: FloatArray
+    rate_yz_radps: FloatArray
+    acceleration_yz_radps2: FloatArray
+
+    @classmethod
+    def held(cls, theta_yz_rad: FloatArray) -> Swing:
+        """Deflection that does not move."""
+        still = np.zeros_like(theta_yz_rad)
+        return cls(theta_yz_rad, still, still)
+
+    @classmethod
+    def of(cls, deflection: Callable[[FloatArray, int], FloatArray], time_s: FloatArray) -> Swing:
+        """Deflection at times, from a function of times and the order of the derivative."""
+        return cls(*(deflection(time_s, order) for order in range(3)))
+
+    @cached_property
+    def around(self) -> tuple[Swing, Swing]:
+        """Deflection a step earlier and a step later, by its derivatives."""
+        a = self.acceleration_yz_radps2
+        earlier, later = (
+            Swing(self.theta_yz_rad + s * self.rate_yz_radps + 0.5 * s**2 * a, self.rate_yz_radps + s * a, a)
+            for s in (-_STEP_S, _STEP_S)
+        )
+        return earlier, later
+
+    @cached_property
+    def axes(self) -> FloatArray:
+        """Matrices ``(n, 3, 3)`` that turn shell components into the body's (`flightmodel.deflection`)."""
+        return rotations.dcm_from_q(rotations.exp(_rotation_vector(self.theta_yz_rad)))
+
+    @cached_property
+    def relative_rate(self) -> FloatArray:
+        """Rate of the shell against the body, body axes (n, 3): the rotation vector's left Jacobian times its rate."""
+        v, rate = _rotation_vector(self.theta_yz_rad), _rotation_vector(self.rate_yz_radps)
+        angle = np.linalg.norm(v, axis=1, keepdims=True)
+        half = np.sinc(0.5 * angle / np.pi)
+        once = np.cross(v, rate)
+        # (angle - sin angle) / angle^3, by its series where the difference would be rounding
+        small = angle < 1e-2
+        safe = np.where(small, 1.0, angle)
+        third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+        return np.asarray(rate + 0.5 * half**2 * once + third * np.cross(v, once))
+
+    def moved(self, theta: FloatArray, rate: FloatArray, acceleration: FloatArray) -> Swing:
+        """Deflection, rate and acceleration moved by so much."""
+        return Swing(self.theta_yz_rad + theta, self.rate_yz_radps + rate, self.acceleration_yz_radps2 + acceleration)
+
+
+def _rotation_vector(lateral_yz: FloatArray) -> FloatArray:
+    return np.stack([np.zeros(len(lateral_yz)), -lateral_yz[:, 1], lateral_yz[:, 0]], axis=-1)
+
+
+def _cg_from_point(vehicle: Vehicle, point_m: FloatArray, swing: Swing) -> FloatArray:
+    """Vehicle's c.g. from a point of the centerbody, (n, 3), m."""
+    shell = vehicle.aeroshell
+    moved = (swing.axes - np.eye(3)) @ (shell.cg_m - vehicle.joint_m)
+    return np.asarray(vehicle.cg_m - point_m + shell.mass_kg / vehicle.mass_kg * moved)
+
+
+def _angular_momentum(vehicle: Vehicle, swing: Swing, w: FloatArray) -> FloatArray:
+    """Angular momentum about the vehicle's c.g., body axes (n, 3)."""
+    shell, body = vehicle.aeroshell, vehicle.centerbody
+    turn, phi = swing.axes, swing.relative_rate
+    arm = turn @ (shell.cg_m - vehicle.joint_m)
+    apart = vehicle.joint_m + arm - body.cg_m
+    speed = np.cross(phi, arm) + np.cross(w, apart)
+    reduced = shell.mass_kg * body.mass_kg / vehicle.mass_kg
+    own = _turned(turn, _turned(turn.transpose(0, 2, 1), w + phi) @ shell.inertia.T)
+    return np.asarray(w @ body.inertia.T + own + reduced * np.cross(apart, speed))
+
+
+def _turned(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
+
+
+def _moment(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
+    """Moment about the c.g. that the motion needs, body axes (n, 3), N m."""
+    w, turning = loads.rate_body_radps, loads.angular_acceleration_body_radps2
+    earlier, later = (
+        _angular_momentum(vehicle, at, w + s * turning) for at, s in zip(swing.around, (-_STEP_S, _STEP_S), strict=True)
+    )
+    now = _angular_momentum(vehicle, swing, w)
+    return np.asarray((later - earlier) / (2.0 * _STEP_S) + np.cross(w, now))
+
+
+def specific_force(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
+    """Specific force at the moving c.g. of the deflected vehicle, body axes (n, 3), m/s^2."""
+    w, turning = loads.rate_body_radps, loads.angular_acceleration_body_radps2
+    earlier, now, later = (
+        _cg_from_point(vehicle, loads.point_from_datum_m, at) for at in (swing.around[0], swing, swing.around[1])
+    )
+    speed, acceleration = (later - earlier) / (2.0 * _STEP_S), (later - 2.0 * now + earlier) / _STEP_S**2
+    carried = rotations.lever_arm_acceleration(w, turning, now)
+    return np.asarray(loads.specific_force_body_mps2 + acceleration + 2.0 * np.cross(w, speed) + carried)
+
+
+def nose_flow(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
+    """Lateral flow angle at the shell's nose, shell y, z (n, 2), rad."""
+    direction, alpha = lateral_and_size(loads.flow_yz_rad)
+    along = np.column_stack([np.cos(alpha), direction * np.sin(alpha)[:, None]])
+    turn = swing.axes
+    arm = -turn @ vehicle.joint_m
+    moving = np.cross(loads.rate_body_radps, vehicle.joint_m + arm - loads.point_from_datum_m)
+    moving = moving + np.cross(swing.relative_rate, arm)
+    velocity = loads.airspeed_mps[:, None] * along + moving
+    return lateral_angles(_turned(turn.transpose(0, 2, 1), velocity))
+
+
+def force_residual(vehicle: Vehicle, coefficients: Coefficients, swing: Swing, loads: FlightLoads) -> FloatArray:
+    """Tilt of the force against the shell less the air's, ``atan(C_N/C_A)`` on the flow's side; shell y, z (n, 2), rad.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+        Mass properties and joint.
+    coefficients : callable
+        From Mach number and angle (n,) to C_A, C_N, C_m, C_mq (n, 4).
+    swing : Swing
+    loads : FlightLoads
+    """
+    force = _turned(swing.axes.transpose(0, 2, 1), specific_force(vehicle, swing, loads))
+    direction, alpha = lateral_and_size(nose_flow(vehicle, swing, loads))
+    c = coefficients(loads.mach, np.minimum(alpha, np.pi))
+    return np.asarray(lateral_angles(-force) - direction * np.arctan2(c[:, 1], c[:, 0])[:, None])
+
+
+def moment_residual(vehicle: Vehicle, coefficients: Coefficients, swing: Swing, loads: FlightLoads) -> FloatArray:
+    """Transverse moment of the air less the motion's over ``q S C_A``, a shift of the c.g.; body y, z (n, 2), m.
+
+    Parameters as of `force_residual`.
+    """
+    turn, length = swing.axes, vehicle.reference.length_m
+    direction, alpha = lateral_and_size(nose_flow(vehicle, swing, loads))
+    c = coefficients(loads.mach, np.minimum(alpha, np.pi))
+    side = np.column_stack([np.zeros(len(alpha)), direction])
+    rate = _turned(turn.transpose(0, 2, 1), loads.rate_body_radps + swing.relative_rate) * [0.0, 1.0, 1.0]
+    force = -(c[:, :1] * _X + c[:, 1:2] * side)
+    damping = c[:, 3:] * length / (2.0 * loads.airspeed_mps[:, None]) * rate
+    about_nose = length * (c[:, 2:3] * np.cross(side, _X) + damping)
+    force, about_nose = _turned(turn, force), _turned(turn, about_nose)
+    nose = vehicle.joint_m - turn @ vehicle.joint_m
+    cg = loads.point_from_datum_m + _cg_from_point(vehicle, loads.point_from_datum_m, swing)
+    of_air = about_nose + np.cross(nose - cg, force)
+    q_area = loads.dynamic_pressure_pa[:, None] * vehicle.reference.area_m2
+    left = (of_air - _moment(vehicle, swing, loads) / q_area) / c[:, :1]
+    # a lateral shift d of the c.g. against the axial force has the moment d x x_hat = (0, d_z, -d_y)
+    return np.column_stack([-left[:, 2], left[:, 1]])
