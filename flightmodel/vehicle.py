@@ -116,7 +116,8 @@ class Uncertainty(Section):
     """What is known of the vehicle before flight, one standard deviation; fractions where no unit is named.
 
     Mass, c.g. and inertia are each body's own; products of inertia are the centerbody's, of its transverse moment;
-    C_mq's is absolute.
+    C_mq's is absolute. ``ca_shape_part`` is the part of the variance of C_A that changes with Mach number; the rest is
+    one factor at all of them.
     """
 
     mass: Fraction = 0.01
@@ -125,6 +126,7 @@ class Uncertainty(Section):
     inertia: Fraction = 0.03
     inertia_products: Fraction = 0.002
     ca: Fraction = 0.03
+    ca_shape_part: Fraction = 0.5
     cn: Fraction = 0.07
     cm: Fraction = 0.10
     cmq: Annotated[float, Field(ge=0.0, le=10.0)] = 0.15

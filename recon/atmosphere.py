@@ -3,15 +3,22 @@
 The sounding is a prior. Half the variance of its errors is constant along altitude, half is Gauss-Markov (correlation
 length 5 km for density, 3 km for winds); the accelerometers measure the force of the air at every height,
 
-    f = q S / m (-C_A(M, |a|) e_x - C_N(M, |a|) a/|a| + C_A t),   q = rho |u|^2 / 2,   u = v - wind,   a = a_body + t
+    f_x  = -q S / m (C_A(M, |a|) (1 - t^2 / 2) + C_N(M, |a|) a.t / |a|)
+    f_yz =  q S / m (C_A t - C_N a / |a|),   q = rho |u|^2 / 2,   u = v - wind,   a = a_body + t
 
 with ``a_body`` the flow's lateral angle relative to the centerbody and ``t = (G a_body + B) s / (1 - g s) + b`` the
 contribution of a deflected aeroshell, a shifted c.g. and a misalignment (``s`` is the share of the largest dynamic
 pressure): the deflection of a compliant joint is proportional to the load, and grows as the load nears divergence.
-``B`` and ``b`` rotate with the body, while winds do not: spin separates them. Coefficient scales are unknown within
-their pre-flight standard deviations, attitude and velocity within the trajectory's own covariance. All are estimated at
-once by least squares. Density and C_A enter as a product: without pressure ports a constant factor between them is not
-observable, and the standard deviations include it.
+``B`` and ``b`` rotate with the body, while winds do not: spin separates them. Forces are means over windows, in which a
+spinning body turns: what the flow's angle does to C_A comes from the mean of its square, what it does across from its
+mean. Coefficients are unknown within their pre-flight standard deviations, C_A by a factor on all Mach numbers and by
+one that changes with them (Gauss-Markov along the logarithm of the Mach number; ``ca_shape_part`` of the variance);
+attitude and velocity within the trajectory's own covariance; the force within that of the accelerometer's errors and
+of the c.g. All are estimated at once by least squares.
+
+Density, C_A and 1 / m enter as a product: without pressure ports a constant factor among them is not observable, and
+the standard deviations include it. ``C_A scale`` is the log of flown over stated ``C_A / m``, mean over the pressure
+pulse.
 
 References
 ----------
@@ -40,7 +47,8 @@ from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.sphere_cone import knudsen
 from flightmodel.statistics import correlation
 from flightmodel.telemetry import Telemetry
-from flightmodel.trajectory import Trajectory, resample
+from flightmodel.trajectory import Trajectory, interpolate_rows, resample
+from flightmodel.vehicle import Vehicle
 from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
 from recon.reconstruct import TrajectorySolution
 
@@ -49,7 +57,11 @@ LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration does not depend on the air mea
 _LEAST_SAMPLES = 20
 # of the deceleration, axial and lateral: model error of coefficients and of an oscillating joint
 _AXIAL_PART, _LATERAL_PART, _MODEL_FLOOR_MPS2 = 0.01, 0.02, 0.03
-_GAIN_SD, _GROWTH_SD, _OFFSET_SD_RAD = 1.0, 0.3, np.deg2rad(3.0)
+_FLEXURE_SD = (1.0, 0.3, *[float(np.deg2rad(3.0))] * 4)  # gain, growth, offsets
+# log of the ratio of Mach numbers over which the error of C_A's shape forgets: about a flow regime, as the sources of
+# coefficients (ranges, tunnels, CFD) change from one to the next; assumed
+CA_SHAPE_LENGTH = float(np.log(2.0))
+_KNOT_LOG_MACH, _LEAST_MACH = 0.1, 0.1
 _BAD_AIR = "is beyond the sounding's uncertainty: the air differed from the sounding, or the drag coefficient is wrong"
 _BAD_DRAG = "is beyond the pre-flight uncertainty: check mass, area and coefficients"
 _LARGEST_RMS = 2.0
@@ -78,6 +90,8 @@ class AirSamples:
         At the c.g.
     error_root_ned : (n, 6, 6) float
         Root of the trajectory's covariance: velocity m/s and rotation rad, estimate minus truth, NED axes.
+    force_root_body_mps2 : (n, 3, 12) float
+        Error of the specific force per unit normal of nine errors of the accelerometer and three of the c.g.
     """
 
     time_s: FloatArray
@@ -86,6 +100,7 @@ class AirSamples:
     dcm_ned_body: FloatArray
     specific_force_body_mps2: FloatArray
     error_root_ned: FloatArray
+    force_root_body_mps2: FloatArray
 
     def rows(self, keep: BoolArray) -> AirSamples:
         """Chosen samples."""
@@ -94,13 +109,22 @@ class AirSamples:
 
 @dataclass(frozen=True)
 class Drag:
-    """Aerodynamic force model: coefficients, reference area over mass, sd of both (fractions), reference length."""
+    """Aerodynamic force model: coefficients, reference area over mass, sd of both (fractions), reference length.
+
+    ``ca_shape_sd`` is the part of ``ca_sd`` that changes with Mach number.
+    """
 
     table: AeroTable
     area_per_mass_m2pkg: float
     ca_sd: float
     cn_sd: float
     length_m: float
+    ca_shape_sd: float
+
+    @property
+    def ca_constant_sd(self) -> float:
+        """Part of ``ca_sd`` that is one factor at all Mach numbers."""
+        return float(np.sqrt(self.ca_sd**2 - self.ca_shape_sd**2))
 
 
 @dataclass(frozen=True)
@@ -116,7 +140,8 @@ class ReconstructedAir:
         ``time_s, altitude_m, mach, dynamic_pressure_pa, ratio, ratio_prior_sd``: measured over predicted axial force
         with the sounding's air and the pre-flight C_A.
     parameters : DataFrame
-        ``name, unit, prior_sd, estimate, sd`` of coefficient scales, gain and offsets.
+        ``name, unit, prior_sd, estimate, sd`` of coefficient scales, gain and offsets. Scales are logs of flown over
+        stated coefficient over mass, C_A's the mean over the pressure pulse.
     consistency_checks : tuple of ConsistencyCheck
     """
 
@@ -136,7 +161,9 @@ _PARAMETERS = {
     "offset y": "rad",
     "offset z": "rad",
 }
-_UNKNOWNS = 3 + len(_PARAMETERS) + 6  # of each sample: density, two winds, parameters, errors of velocity and attitude
+# of each sample: density, two winds, parameters, errors of velocity and attitude, C_A's shape, errors of the force
+_SHAPE, _FORCE, _FORCE_ERRORS = 3 + len(_PARAMETERS) + 6, 3 + len(_PARAMETERS) + 7, 12
+_UNKNOWNS = _FORCE + _FORCE_ERRORS
 
 
 class _Model:
@@ -166,20 +193,27 @@ class _Model:
         share = q / (self.largest_pa if largest_pa is None else largest_pa)
         share = share / np.maximum(1.0 - growth * share, _LEAST_STIFFNESS)
         tilt = share[:, None] * (gain[:, None] * body + x[:, 7:9]) + x[:, 9:11]
-        flow = body + tilt
-        size = np.linalg.norm(flow, axis=1)
+        flow, bend = body + tilt, gain * share
+        # mean squares and product over the window: what turns in it has no mean, but keeps the axis' angle to the flow
+        total = np.arctan2(np.sqrt(np.maximum(speed**2 - u[:, 0] ** 2, 0.0)), u[:, 0])
+        turning = np.maximum(total**2 - np.sum(body**2, axis=1), 0.0)
+        size = np.sqrt(np.sum(flow**2, axis=1) + (1.0 + bend) ** 2 * turning)
+        tilt_square = np.sum(tilt**2, axis=1) + bend**2 * turning
+        along = np.sum(tilt * flow, axis=1) + bend * (1.0 + bend) * turning
         coefficients = self.drag.table.at(mach, np.clip(size, 0.0, np.pi), self.knudsen)
-        ca, cn = coefficients[:, 0] * np.exp(ca_scale), coefficients[:, 1] * np.exp(cn_scale)
-        direction = flow / np.maximum(size, 1e-12)[:, None]
-        force = (q * self.drag.area_per_mass_m2pkg)[:, None]
-        lateral = -cn[:, None] * direction + ca[:, None] * tilt
-        return force * np.column_stack([-ca, lateral]), q, mach
+        ca = coefficients[:, 0] * np.exp(ca_scale + self.drag.ca_shape_sd * x[:, _SHAPE])
+        slope = coefficients[:, 1] * np.exp(cn_scale) / np.maximum(size, 1e-12)
+        axial = -ca * (1.0 - 0.5 * tilt_square) - slope * along
+        lateral = -slope[:, None] * flow + ca[:, None] * tilt
+        force = (q * self.drag.area_per_mass_m2pkg)[:, None] * np.column_stack([axial, lateral])
+        return force + np.einsum("nij,nj->ni", s.force_root_body_mps2, x[:, _FORCE:]), q, mach
 
     def linearised(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Forces (n, 3) and partials (n, 3, _UNKNOWNS), central differences."""
         step = 1e-4
         partials = np.empty((len(x), 3, _UNKNOWNS))
-        for j in range(_UNKNOWNS):
+        partials[:, :, _FORCE:] = self.samples.force_root_body_mps2
+        for j in range(_FORCE):
             up, down = x.copy(), x.copy()
             up[:, j] += step
             down[:, j] -= step
@@ -224,21 +258,62 @@ def reconstruct_air(
         )
     samples = samples.rows(keep)
     model = _Model(samples, profile, drag)
-    height, time = _knots(samples.altitude_m, _KNOT_M), _knots(samples.time_s, _KNOT_S)
-    by_height, by_time = _interpolation(samples.altitude_m, height), _interpolation(samples.time_s, time)
-    prior_sd = np.array([drag.ca_sd, drag.cn_sd, _GAIN_SD, _GROWTH_SD, *[_OFFSET_SD_RAD] * 4])
-    blocks = [by_height] * 3 + [np.tile(sd, (len(samples.time_s), 1)) for sd in prior_sd] + [by_time] * 6
-    lengths = (DENSITY_LENGTH_M, WIND_LENGTH_M, WIND_LENGTH_M)
-    information = [_inverse(sounding_correlation(height, length)) for length in lengths]
-    information += [np.eye(1)] * len(prior_sd) + [_inverse(correlation(time, _TRAJECTORY_TIME_S))] * 6
+    drag_ratio = _drag_ratio(model)
+    height = _knots(samples.altitude_m, _KNOT_M)
+    blocks, information = _prior(samples, drag, drag_ratio["mach"].to_numpy(), height)
     estimate, covariance, residual = _least_squares(model, blocks, information)
     sd = np.sqrt(np.diag(covariance))
+    rows = slice(3 * len(height), 3 * len(height) + len(_PARAMETERS))
+    own, own_sd, prior_sd = estimate[rows].copy(), sd[rows].copy(), np.array([drag.ca_sd, drag.cn_sd, *_FLEXURE_SD])
+    prior_sd[0], own[0], own_sd[0] = _ca_of_pulse(model, drag_ratio, blocks, information, estimate, covariance)
     return ReconstructedAir(
         _profile(model, height, estimate, sd),
-        _drag_ratio(model),
-        _parameters(prior_sd, estimate[3 * len(height) :], sd[3 * len(height) :]),
-        (*_consistency_checks(height, estimate, sd, confidence), *_residual_checks(residual)),
+        drag_ratio,
+        _parameters(prior_sd, own, own_sd),
+        (*_consistency_checks(height, estimate, sd, (own[0], own_sd[0]), confidence), *_residual_checks(residual)),
     )
+
+
+def _prior(
+    samples: AirSamples, drag: Drag, mach: FloatArray, height: FloatArray
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """`_UNKNOWNS` of the samples per unknown of the flight, (n, k) each, and a priori information (k, k) of these.
+
+    The flight's unknowns are in a priori standard deviations.
+    """
+    log_mach = np.log(np.maximum(mach, _LEAST_MACH))
+    time, by_mach = _knots(samples.time_s, _KNOT_S), _knots(log_mach, _KNOT_LOG_MACH)
+    one = np.ones((len(mach), 1))
+    blocks = [_interpolation(samples.altitude_m, height)] * 3
+    blocks += [sd * one for sd in (drag.ca_constant_sd, drag.cn_sd, *_FLEXURE_SD)]
+    blocks += [_interpolation(samples.time_s, time)] * 6 + [_interpolation(log_mach, by_mach)] + [one] * _FORCE_ERRORS
+    lengths = (DENSITY_LENGTH_M, WIND_LENGTH_M, WIND_LENGTH_M)
+    information = [_inverse(sounding_correlation(height, length)) for length in lengths]
+    information += [np.eye(1)] * len(_PARAMETERS) + [_inverse(correlation(time, _TRAJECTORY_TIME_S))] * 6
+    information += [_inverse(correlation(by_mach, CA_SHAPE_LENGTH))] + [np.eye(1)] * _FORCE_ERRORS
+    return blocks, information
+
+
+def _ca_of_pulse(
+    model: _Model,
+    drag_ratio: pd.DataFrame,
+    blocks: list[FloatArray],
+    information: list[FloatArray],
+    estimate: FloatArray,
+    covariance: FloatArray,
+) -> tuple[float, float, float]:
+    """Log factor of C_A, mean over the pressure pulse: its a priori sd, and estimate and sd in units of that.
+
+    At the peak alone it would lean to the sounding's own errors, which also say where that is.
+    """
+    first = np.cumsum([0, *(b.shape[1] for b in blocks)])
+    q = drag_ratio["dynamic_pressure_pa"].to_numpy()
+    shape = model.drag.ca_shape_sd * blocks[_SHAPE][q >= 0.5 * q.max()].mean(axis=0)
+    prior_sd = float(np.hypot(model.drag.ca_constant_sd, np.sqrt(shape @ _inverse(information[_SHAPE]) @ shape)))
+    weights = np.zeros(len(estimate))
+    weights[first[3]] = model.drag.ca_constant_sd / prior_sd
+    weights[first[_SHAPE] : first[_SHAPE + 1]] = shape / prior_sd
+    return prior_sd, float(weights @ estimate), float(np.sqrt(weights @ covariance @ weights))
 
 
 def _least_squares(
@@ -305,15 +380,14 @@ def _profile(model: _Model, height: FloatArray, estimate: FloatArray, sd: FloatA
 
 
 def _parameters(prior_sd: FloatArray, estimate: FloatArray, sd: FloatArray) -> pd.DataFrame:
-    """Coefficient scales and flexure; the rest of the unknowns (u,) is the trajectory's."""
-    n = len(_PARAMETERS)
+    """Coefficient scales and flexure from estimates in a priori standard deviations."""
     return pd.DataFrame(
         {
             "name": list(_PARAMETERS),
             "unit": list(_PARAMETERS.values()),
             "prior_sd": prior_sd,
-            "estimate": estimate[:n] * prior_sd,
-            "sd": sd[:n] * prior_sd,
+            "estimate": estimate * prior_sd,
+            "sd": sd * prior_sd,
         }
     )
 
@@ -350,23 +424,26 @@ def _residual_checks(residual: FloatArray) -> list[ConsistencyCheck]:
 
 
 def _consistency_checks(
-    height: FloatArray, estimate: FloatArray, sd: FloatArray, confidence: float
+    height: FloatArray, estimate: FloatArray, sd: FloatArray, ca: tuple[float, float], confidence: float
 ) -> tuple[ConsistencyCheck, ...]:
-    """Are density, winds and the axial coefficient consistent with the sounding and the pre-flight model?"""
+    """Are density, winds and C_A (estimate and sd over its a priori sd) consistent with sounding and vehicle file?"""
     k = len(height)
     heights = [f"at {h / 1000:.0f} km" for h in height]
     wind = [f"wind {way} {h}" for way in ("north", "east") for h in heights]
 
-    def check(code: str, label: str, names: list[str], first: int, bad: str) -> ConsistencyCheck | None:
-        rows, one = slice(first, first + len(names)), np.ones(len(names))
+    def check(
+        code: str, label: str, names: list[str], found: FloatArray, found_sd: FloatArray, bad: str
+    ) -> ConsistencyCheck | None:
         good = "within stated uncertainty; largest:"
-        return data_sheet_check(code, label, "", names, estimate[rows], one, sd[rows], confidence, bad, good)
+        return data_sheet_check(code, label, "", names, found, np.ones(len(names)), found_sd, confidence, bad, good)
 
+    density, winds = slice(0, k), slice(k, 3 * k)
+    names = [f"density {h}" for h in heights]
     checks = (
-        check("sounding-density", "sounding density", [f"density {h}" for h in heights], 0, _BAD_AIR),
-        check("sounding-wind", "sounding wind", wind, k, _BAD_AIR),
+        check("sounding-density", "sounding density", names, estimate[density], sd[density], _BAD_AIR),
+        check("sounding-wind", "sounding wind", wind, estimate[winds], sd[winds], _BAD_AIR),
         # C_N is not checked: a deflected aeroshell changes the normal force as a wrong C_N does
-        check("pre-flight-ca", "pre-flight C_A", ["C_A"], 3 * k, _BAD_DRAG),
+        check("pre-flight-ca", "pre-flight C_A", ["C_A"], np.array(ca[:1]), np.array(ca[1:]), _BAD_DRAG),
     )
     return tuple(v for v in checks if v is not None)
 
@@ -450,6 +527,7 @@ def as_flown_atmosphere(
         float(np.hypot(known.ca, known.mass)),
         float(np.hypot(known.cn, known.mass)),
         vehicle.reference.length_m,
+        float(np.sqrt(known.ca_shape_part) * known.ca),
     )
     return reconstruct_air(_air_samples(telemetry, bet), profile, drag, confidence)
 
@@ -459,7 +537,7 @@ def _air_samples(telemetry: Telemetry, bet: TrajectorySolution) -> AirSamples:
     cg = telemetry.required_vehicle().cg_m
     accelerometer, _ = telemetry.required_triads()
     t = _window_times(bet)
-    force = _force_means(bet, cg - accelerometer.spec.position_from_datum_body_m, t)
+    arm = cg - accelerometer.spec.position_from_datum_body_m
     inside = _WINDOW_S * ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5)
     dense = resample(bet.smoothed, (t[:, None] + inside).ravel())
 
@@ -477,8 +555,9 @@ def _air_samples(telemetry: Telemetry, bet: TrajectorySolution) -> AirSamples:
         altitude,
         np.einsum("nij,nj->ni", dcm_ned_ecef, mean(velocity)),
         dcm_ned_ecef @ mean(dcm),
-        force,
+        _force_means(bet, arm, t),
         _error_roots(middle, dcm_ned_ecef),
+        _force_roots(telemetry.required_vehicle(), bet, t),
     )
 
 
@@ -497,11 +576,29 @@ def _window_times(bet: TrajectorySolution) -> FloatArray:
 
 def _force_means(bet: TrajectorySolution, arm_body_m: FloatArray, t: FloatArray) -> FloatArray:
     """Specific force at a point ``arm_body_m`` from the accelerometer, body axes, means over the windows."""
+    half = 0.5 * _WINDOW_S
+    force = _window_means(bet.imu_time_s, bet.specific_force_body_mps2, t - half, t + half)
+    return force + _lever_means(bet, t) @ arm_body_m
+
+
+def _lever_means(bet: TrajectorySolution, t: FloatArray) -> FloatArray:
+    """Change of the specific force per metre from the accelerometer (k, 3, 3), body axes, means over the windows."""
     t_imu, rate, half = bet.imu_time_s, bet.rate_body_radps, 0.5 * _WINDOW_S
-    centripetal = np.cross(rate, np.cross(rate, arm_body_m))
-    force = _window_means(t_imu, bet.specific_force_body_mps2 + centripetal, t - half, t + half)
     ends = [_window_means(t_imu, rate, at - _EDGE_S, at + _EDGE_S) for at in (t - half, t + half)]
-    return force + np.cross((ends[1] - ends[0]) / _WINDOW_S, arm_body_m)
+    turn = (ends[1] - ends[0]) / _WINDOW_S
+    square = np.einsum("ni,nj->nij", rate, rate) - np.sum(rate**2, axis=1)[:, None, None] * np.eye(3)
+    centripetal = _window_means(t_imu, square.reshape(-1, 9), t - half, t + half).reshape(-1, 3, 3)
+    return np.asarray(centripetal + rotations.skew(turn))
+
+
+def _force_roots(vehicle: Vehicle, bet: TrajectorySolution, t: FloatArray) -> FloatArray:
+    """Errors of the specific force at the c.g. (k, 3, 12) per unit normal of the accelerometer's and the c.g.'s."""
+    known = vehicle.uncertainty
+    share = np.hypot(vehicle.aeroshell.mass_kg, vehicle.centerbody.mass_kg) / vehicle.mass_kg
+    cg_sd = share * np.array([known.cg_station_m, known.cg_lateral_m, known.cg_lateral_m])
+    own = bet.accelerometer_root[:, 3:]
+    sensor = interpolate_rows(t, bet.smoothed.time_s, own.reshape(len(own), -1)).reshape(-1, 3, 9)
+    return np.concatenate([sensor, _lever_means(bet, t) * cg_sd], axis=2)
 
 
 def _error_roots(trajectory: Trajectory, dcm_ned_ecef: FloatArray) -> FloatArray:

@@ -5,7 +5,8 @@ Spin 0 to 60 rpm, joints of 1 to 50 kN m/rad (every eighth flight's is locked), 
 and 10 % of their own. The analyst is told the mass properties, the offset to a millimetre, the coefficients, and the
 reference vehicle's joint whatever flies. Not told are masses, c.g.s, the two inertias of each body (each by itself) and
 the centerbody's products, the joint, the coefficients (in the sizes that the told vehicle states), start, air, and
-every instrument's errors.
+every instrument's errors. The analyst knows what part of the variance of C_A's error changes with Mach number: none,
+or ``ca_shape_part``.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from estimators.trim import static_trim
+from flightmodel.aerodynamics import AeroTable
 from flightmodel.flightfolder import read_flight
 from flightmodel.telemetry import Telemetry, TriadRecord
 from flightmodel.vehicle import CompliantJoint, Vehicle, vehicle_from_toml, vehicle_path
@@ -29,30 +31,43 @@ OFFSET_M, MASS_KG, LOCKED_HZ = (0.0, 0.008), (60.0, 400.0), 40.0
 LENGTH_SD, PRODUCT = 0.10, 0.002  # of the lengths; of a body's transverse inertia
 COEFFICIENT_SD = {"ca": 0.05, "cn": 0.10, "cm": 0.15, "cmq": 0.15}
 LAST_S = 462.0
+SHAPE_MACH = np.geomspace(0.1, 10.0, 47)  # a tenth apart in the logarithm
 PEAK_PA, LEAST_MARGIN = 1250.0, 1.3  # of the reference vehicle; of a joint's stiffness over that at which it diverges
 
 
 @dataclass(frozen=True)
 class WideFlight:
-    """What the analyst is told, and what flew; ``factors`` on C_A, C_N, C_m and the shift of C_mq."""
+    """What the analyst is told, and what flew; ``factors`` on C_A, C_N, C_m and the shift of C_mq.
+
+    ``ca_shape`` is the log of another factor on C_A at the Mach numbers ``SHAPE_MACH``.
+    """
 
     seed: int
     told: Vehicle
     scenario: Scenario
     factors: dict[str, float]
     locked: bool
+    ca_shape: np.ndarray
 
     @property
     def flown(self) -> Vehicle:
         """Vehicle as it is."""
         return self.scenario.vehicle
 
+    def ca_factor(self, mach: np.ndarray) -> np.ndarray:
+        """Flown over told C_A at Mach numbers."""
+        return self.factors["ca"] * np.exp(np.interp(mach, SHAPE_MACH, self.ca_shape))
 
-def wide_flight(seed: int) -> WideFlight:
-    """Draw one flight."""
+
+def wide_flight(seed: int, ca_shape_part: float = 0.0) -> WideFlight:
+    """Draw one flight; any ``ca_shape_part`` leaves all other draws as they are."""
     rng = np.random.default_rng([seed, 18, 2009])
     told = _told(rng)
-    flown, factors = _flown(told, rng)
+    told = replace(told, uncertainty=told.uncertainty.model_copy(update={"ca_shape_part": ca_shape_part}))
+    flown, factors = _flown(told, rng, np.sqrt(1.0 - ca_shape_part))
+    shape = np.sqrt(ca_shape_part) * told.uncertainty.ca * _unit_shape(np.random.default_rng([seed, 5, 18, 2009]))
+    if ca_shape_part > 0.0:
+        flown = replace(flown, aero=_reshaped(flown.aero, shape))
     locked = seed % 8 == 7
     flown = replace(flown, joint=_joint(flown, rng, locked))
     scenario = dispersed.dispersed_scenario("irve2_reference", seed)
@@ -60,7 +75,7 @@ def wide_flight(seed: int) -> WideFlight:
     initial = scenario.spec.initial.model_copy(update={"spin_rpm": spin})
     time = scenario.spec.time.model_copy(update={"stop_s": LAST_S})
     spec = scenario.spec.model_copy(update={"initial": initial, "time": time})
-    return WideFlight(seed, told, replace(scenario, spec=spec, vehicle=flown), factors, locked)
+    return WideFlight(seed, told, replace(scenario, spec=spec, vehicle=flown), factors, locked, shape)
 
 
 def _told(rng: np.random.Generator) -> Vehicle:
@@ -92,8 +107,26 @@ def _told(rng: np.random.Generator) -> Vehicle:
     return replace(nominal, reference=reference, joint=joint, sensors=sensors, uncertainty=known, **parts)
 
 
-def _flown(told: Vehicle, rng: np.random.Generator) -> tuple[Vehicle, dict[str, float]]:
-    """Vehicle as it is: every number drawn around what is told, in the sizes that are told."""
+def _unit_shape(rng: np.random.Generator) -> np.ndarray:
+    """Gauss-Markov error along the logarithm of the Mach number, which forgets over a factor of two."""
+    apart = np.abs(np.subtract.outer(np.log(SHAPE_MACH), np.log(SHAPE_MACH)))
+    return np.linalg.cholesky(np.exp(-apart / np.log(2.0))) @ rng.standard_normal(len(SHAPE_MACH))
+
+
+def _reshaped(aero: AeroTable, shape: np.ndarray) -> AeroTable:
+    """Table with a factor on C_A along Mach number, in rarefied flow as at the highest."""
+    mach = np.union1d(aero.mach, SHAPE_MACH)
+    coefficients = aero.at(mach[:, None], aero.alpha_rad)
+    coefficients[..., 0] *= np.exp(np.interp(mach, SHAPE_MACH, shape))[:, None]
+    free = None if aero.free_molecular is None else aero.free_molecular * [np.exp(shape[-1]), 1.0, 1.0, 1.0]
+    return replace(aero, mach=mach, coefficients=coefficients, free_molecular=free)
+
+
+def _flown(told: Vehicle, rng: np.random.Generator, constant_ca: float) -> tuple[Vehicle, dict[str, float]]:
+    """Vehicle as it is: every number drawn around what is told, in the sizes that are told.
+
+    ``constant_ca`` is the part of the told sd of C_A that is one factor.
+    """
     known, parts = told.uncertainty, {}
     for name in ("aeroshell", "centerbody"):
         part = getattr(told, name)
@@ -110,6 +143,7 @@ def _flown(told: Vehicle, rng: np.random.Generator) -> tuple[Vehicle, dict[str, 
         }
         parts[name] = part.model_copy(update=changed)
     factors = {k: float(1.0 + getattr(known, k) * rng.standard_normal()) for k in ("ca", "cn", "cm")}
+    factors["ca"] = 1.0 + constant_ca * (factors["ca"] - 1.0)
     shift = float(known.cmq * rng.standard_normal())
     aero = told.aero.scaled(**factors, cmq_shift=shift)
     return replace(told, aero=aero, **parts), {**factors, "cmq_shift": shift}

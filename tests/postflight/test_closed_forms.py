@@ -94,6 +94,28 @@ def test_drag_is_known_as_well_as_coefficient_and_mass(monkeypatch):
         drawn = (1.0 + own * rng.standard_normal(200000)) / (1.0 + known.mass * rng.standard_normal(200000))
         assert sd == pytest.approx(np.std(drawn), rel=0.01)
     assert seen[0].area_per_mass_m2pkg == pytest.approx(vehicle.reference.area_m2 / vehicle.mass_kg)
+    # half of the coefficient's variance, and nothing of the mass's, changes with Mach number
+    assert seen[0].ca_shape_sd == pytest.approx(known.ca * np.sqrt(0.5))
+    assert np.hypot(seen[0].ca_constant_sd, seen[0].ca_shape_sd) == pytest.approx(seen[0].ca_sd)
+
+
+def test_force_errors_are_those_of_the_accelerometer_and_of_the_c_g():
+    vehicle, bet, at = vehicle_from_toml(vehicle_path("irve2_reference")), rotating(), np.array([1.5, 2.2])
+    rng, grid = np.random.default_rng(2), np.arange(0.5, 3.5, 0.1)
+    root = rng.standard_normal((6, 9))
+    bet.smoothed, bet.accelerometer_root = SimpleNamespace(time_s=grid), np.tile(root, (len(grid), 1, 1))
+    got = atmosphere._force_roots(vehicle, bet, at)
+    np.testing.assert_allclose(got[:, :, :9], np.tile(root[3:], (2, 1, 1)))
+    known, masses = vehicle.uncertainty, [vehicle.aeroshell.mass_kg, vehicle.centerbody.mass_kg]
+    # both bodies' own places, drawn, and the force at the vehicle's c.g. against that at the stated one
+    sd = np.array([known.cg_station_m, known.cg_lateral_m, known.cg_lateral_m])
+    moved = np.einsum("b,nbi->ni", masses, rng.standard_normal((40000, 2, 3)) * sd) / sum(masses)
+    for k in range(2):
+        forces = moved @ (atmosphere._lever_means(bet, at)[k].T)
+        np.testing.assert_allclose(got[k, :, 9:] @ got[k, :, 9:].T, np.cov(forces.T), rtol=0.03, atol=1e-9)
+    still = atmosphere._force_means(bet, np.zeros(3), at)
+    carried = atmosphere._force_means(bet, np.array([0.0, 0.3, 0.0]), at) - still
+    np.testing.assert_allclose(carried, 0.3 * atmosphere._lever_means(bet, at)[:, :, 1], atol=1e-12)
 
 
 def made_pulse(seed=0, noise=0.004):

@@ -12,7 +12,7 @@ from synthetic_flight.simulate import fly
 from tests.estimators.test_closure import EPOCH, START_S, VEHICLE, start
 
 DRAG = atmosphere.Drag(
-    VEHICLE.aero, VEHICLE.reference.area_m2 / VEHICLE.mass_kg, 0.03, 0.07, VEHICLE.reference.length_m
+    VEHICLE.aero, VEHICLE.reference.area_m2 / VEHICLE.mass_kg, 0.03, 0.07, VEHICLE.reference.length_m, 0.02
 )  # fmt: skip
 
 
@@ -33,7 +33,7 @@ def true_samples(error_root=0.0):
     n = len(path.time_s)
     return atmosphere.AirSamples(
         path.time_s, seen.altitude_m, np.einsum("nij,nj->ni", ned, velocity), dcm, truth.specific_force_body(cg),
-        np.tile(error_root * np.eye(6), (n, 1, 1)),
+        np.tile(error_root * np.eye(6), (n, 1, 1)), np.zeros((n, 3, 12)),
     )  # fmt: skip
 
 
@@ -79,3 +79,27 @@ def test_structure_between_knots_keeps_a_wind_from_being_known_better():
     # half of the variance forgets: about a knot, between neighbours a km apart, a third of its first-order loss
     left = np.sqrt(0.5 * 1000.0 / (3.0 * 3000.0))
     np.testing.assert_allclose(table.wind_north_sd_mps / table.wind_prior_sd_mps, left, rtol=1e-3)
+
+
+def test_tilted_shell_pushes_along_its_own_axes():
+    # exactly: C_A against the shell's axis, C_N across it in the plane of the flow. A shell that adds (b, c) to the
+    # flow's lateral angles has its axis turned by (-b, -c)
+    tilt, flow = np.deg2rad([4.0, -2.0]), np.deg2rad([5.0, 7.0])
+    u = 1000.0 * np.array([np.cos(np.hypot(*flow)), *(np.sin(np.hypot(*flow)) * flow / np.hypot(*flow))])
+    size = np.hypot(*tilt)
+    axis = np.array([np.cos(size), *(-np.sin(size) * tilt / size)])
+    alpha = np.arccos(u @ axis / 1000.0)
+    across = u - (u @ axis) * axis
+    samples = atmosphere.AirSamples(
+        np.zeros(1), np.array([50e3]), u[None] + [14.0, -25.0, 0.0], np.eye(3)[None], np.zeros((1, 3)),
+        np.zeros((1, 6, 6)), np.zeros((1, 3, 12)),
+    )  # fmt: skip
+    x = np.zeros((1, atmosphere._UNKNOWNS))
+    x[:, 9:11] = tilt
+    got, q, mach = atmosphere._Model(samples, windy(), DRAG).forces(x)
+    ca, cn = DRAG.table.at(mach, alpha)[0, :2]
+    want = -q[0] * DRAG.area_per_mass_m2pkg * (ca * axis + cn * across / np.linalg.norm(across))
+    assert abs(got[0, 0] / want[0] - 1.0) < 3e-4
+    # without both terms of second order it would be off by more than ten times that
+    assert abs(-q[0] * DRAG.area_per_mass_m2pkg * ca / want[0] - 1.0) > 2e-3
+    np.testing.assert_allclose(got[0, 1:], want[1:], atol=3e-3 * abs(want[0]))

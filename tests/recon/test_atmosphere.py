@@ -15,7 +15,7 @@ from recon import atmosphere
 KNOWN = replace(standard_atmosphere(), wind_sd_mps=np.full(41, 4.0), density_sd=np.full(41, 0.03))
 VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
 DRAG = atmosphere.Drag(
-    VEHICLE.aero, VEHICLE.reference.area_m2 / VEHICLE.mass_kg, 0.03, 0.07, VEHICLE.reference.length_m
+    VEHICLE.aero, VEHICLE.reference.area_m2 / VEHICLE.mass_kg, 0.03, 0.07, VEHICLE.reference.length_m, 0.02
 )
 
 
@@ -30,7 +30,8 @@ def descent(spin_rpm=6.0, attitude_sd=1e-5):
     turn = rotations.exp(np.column_stack([spin_rpm * 2 * np.pi / 60.0 * t, 0 * t, 0 * t]))
     dcm = rotations.dcm_from_q(rotations.multiply(down, rotations.multiply(tip, turn)))
     root = np.tile(np.diag([0.02] * 3 + [attitude_sd] * 3), (len(t), 1, 1))
-    return atmosphere.AirSamples(t, altitude, velocity, dcm, np.full((len(t), 3), -10.0), root)
+    own = np.tile(np.hstack([0.01 * np.eye(3), np.zeros((3, 9))]), (len(t), 1, 1))
+    return atmosphere.AirSamples(t, altitude, velocity, dcm, np.full((len(t), 3), -10.0), root, own)
 
 
 def pushed(samples, seen, rng=None):
@@ -54,10 +55,16 @@ def drawn(samples, rng):
         root = np.linalg.cholesky(sounding_correlation(height, length))
         knots.append(root @ rng.standard_normal(len(height)))
         seen[:, k] = at @ knots[-1]
-    sd = np.array([0.03, 0.07, 0.3, 0.1, *[np.deg2rad(1.0)] * 4])
+    sd = np.array([DRAG.ca_constant_sd, 0.07, 0.3, 0.1, *[np.deg2rad(1.0)] * 4])
     own = sd * rng.standard_normal(8)
     seen[:, 3:11] = own
-    return seen, height, np.array(knots), own
+    q, mach = atmosphere._Model(samples, KNOWN, DRAG).forces(np.zeros_like(seen))[1:]
+    apart = np.abs(np.subtract.outer(np.log(mach), np.log(mach)))
+    root = np.linalg.cholesky(np.exp(-apart / np.log(2.0)) + 1e-9 * np.eye(len(mach)))
+    seen[:, atmosphere._SHAPE] = root @ rng.standard_normal(len(mach))
+    seen[:, atmosphere._FORCE :] = rng.standard_normal(12)
+    shape = seen[q >= 0.5 * q.max(), atmosphere._SHAPE].mean()
+    return seen, height, np.array(knots), own[0] + DRAG.ca_shape_sd * shape
 
 
 def test_sounding_without_errors_is_left_as_it_is():
@@ -78,7 +85,7 @@ def many():
     for seed in range(16):
         rng = np.random.default_rng(seed)
         samples = descent()
-        seen, height, knots, own = drawn(samples, rng)
+        seen, height, knots, true_ca = drawn(samples, rng)
         found = atmosphere.reconstruct_air(pushed(samples, seen, rng), KNOWN, DRAG)
         p, at = found.profile, np.isin(height, found.profile.altitude_m)
         truth = [np.exp(0.03 * knots[0, at]), 4.0 * knots[1, at], 4.0 * knots[2, at]]
@@ -87,7 +94,7 @@ def many():
             (p.wind_north_change_mps - truth[1]) / p.wind_north_sd_mps,
             (p.wind_east_change_mps - truth[2]) / p.wind_east_sd_mps,
         ]
-        ca = (found.parameters.estimate[0] - own[0]) / found.parameters.sd[0]
+        ca = (found.parameters.estimate[0] - true_ca) / found.parameters.sd[0]
         rows.append((np.array(z), ca, (p.density_ratio_sd / 0.03).mean(), (p.wind_north_sd_mps / 4.0).mean(), found))
     return rows
 
@@ -181,3 +188,89 @@ def test_thin_air_is_refused_in_words():
             replace(samples, specific_force_body_mps2=np.zeros((len(samples.time_s), 3))), KNOWN, DRAG
         )
     assert refusal.value.codes == ("air-not-observable",)
+
+
+# ------------------------------------------------------------------------------------------- standard deviations
+
+
+def straight_fall():
+    """A fall along the axis in still air of known wind: the axial force sees density and C_A, and nothing else."""
+    samples = descent(spin_rpm=0.0)
+    down = rotations.dcm_from_q(rotations.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
+    speed = np.linalg.norm(samples.velocity_ned_mps, axis=1)
+    n = len(speed)
+    return replace(
+        samples,
+        velocity_ned_mps=np.column_stack([np.zeros(n), np.zeros(n), speed]),
+        dcm_ned_body=np.tile(down, (n, 1, 1)),
+        error_root_ned=np.tile(1e-6 * np.eye(6), (n, 1, 1)),
+        force_root_body_mps2=np.zeros((n, 3, 12)),
+    )
+
+
+def sds_by_hand(noise, height, altitude, log_mach, pulse):
+    """Sd of log density at ``height`` and of log C_A, mean over the pulse, of Gauss processes seen with white noise.
+
+    Sounding 3 %, half of the variance constant, half correlated over 5 km; C_A 3 %, of which 2 % are correlated over a
+    factor of two in Mach number.
+    """
+
+    def air(a, b):
+        return 0.03**2 * (0.5 + 0.5 * np.exp(-np.abs(np.subtract.outer(a, b)) / 5000.0))
+
+    def ca(a, b):
+        apart = np.abs(np.subtract.outer(a, b))
+        return 0.03**2 - 0.02**2 + 0.02**2 * np.exp(-apart / np.log(2.0))
+
+    seen = air(altitude, altitude) + ca(log_mach, log_mach) + np.diag(noise**2)
+    of_pulse = ca(log_mach[pulse], log_mach).mean(axis=0)
+    cross = np.vstack([air(height, altitude), of_pulse])
+    prior = np.append(np.full(len(height), 0.03**2), of_pulse[pulse].mean())
+    return np.sqrt(prior - np.einsum("ij,ji->i", cross, np.linalg.solve(seen, cross.T))), np.sqrt(prior)
+
+
+def test_sds_are_those_of_two_gauss_processes_that_are_seen_as_one():
+    samples = straight_fall()
+    still = replace(KNOWN, wind_sd_mps=np.full(41, 1e-6))
+    model = atmosphere._Model(samples, still, DRAG)
+    force, q, mach = model.forces(np.zeros((len(samples.time_s), atmosphere._UNKNOWNS)))
+    samples = replace(samples, specific_force_body_mps2=force)
+    found = atmosphere.reconstruct_air(samples, still, DRAG)
+    keep = -force[:, 0] >= atmosphere.LEAST_AXIAL_MPS2
+    axial = -force[keep, 0]
+    noise = np.hypot(atmosphere._MODEL_FLOOR_MPS2 / axial, atmosphere._AXIAL_PART)
+    height = found.profile.altitude_m.to_numpy()
+    want, before = sds_by_hand(noise, height, samples.altitude_m[keep], np.log(mach[keep]), q[keep] >= 0.5 * q.max())
+    assert found.parameters.sd[0] == pytest.approx(want[-1], rel=0.04)
+    assert found.parameters.prior_sd[0] == pytest.approx(before[-1], rel=0.02)
+    np.testing.assert_allclose(found.profile.density_ratio_sd, want[:-1], rtol=0.04)
+    # and C_A's shape costs a part of what is known of density
+    exact = atmosphere.reconstruct_air(samples, still, replace(DRAG, ca_shape_sd=0.0))
+    assert found.profile.density_ratio_sd.mean() > 1.05 * exact.profile.density_ratio_sd.mean()
+
+
+def test_coefficient_wrong_by_a_quarter_fails_its_check():
+    samples = descent()
+    seen = np.zeros((len(samples.time_s), atmosphere._UNKNOWNS))
+    seen[:, 3] = np.log(1.25)
+    checks = atmosphere.reconstruct_air(pushed(samples, seen), KNOWN, DRAG).consistency_checks
+    assert "pre-flight-ca" in {v.code for v in checks if not v.passed}
+
+
+def test_flow_that_turns_within_a_window_keeps_its_angle():
+    """A body that coasts at 12 deg to the flow and spins by half a turn a window: C_A is that at 12 deg."""
+    table = VEHICLE.aero
+    quick = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 181)
+    axis = rotations.dcm_from_q(rotations.exp(np.array([0.0, -0.5 * np.pi + np.deg2rad(12.0), 0.0])))
+    spun = rotations.dcm_from_q(rotations.exp(np.column_stack([quick, 0.0 * quick, 0.0 * quick])))
+    mean = (axis @ spun).mean(axis=0)
+    samples = atmosphere.AirSamples(
+        np.zeros(1), np.array([50e3]), np.array([[0.0, 0.0, 1000.0]]), mean[None], np.zeros((1, 3)),
+        np.zeros((1, 6, 6)), np.zeros((1, 3, 12)),
+    )  # fmt: skip
+    force, q, mach = atmosphere._Model(samples, KNOWN, DRAG).forces(np.zeros((1, atmosphere._UNKNOWNS)))
+    ca, cn = table.at(mach, np.deg2rad(12.0))[0, :2]
+    load = q[0] * DRAG.area_per_mass_m2pkg
+    assert force[0, 0] == pytest.approx(-load * ca, rel=1e-3)
+    # across, the mean of what turns by half a turn: 2 / pi of it
+    assert np.linalg.norm(force[0, 1:]) == pytest.approx(load * cn * 2.0 / np.pi, rel=0.02)
