@@ -36,7 +36,7 @@ def alive():
         rate_body_radps=rng.normal(0.0, 0.2, (n, 3)),
         angular_acceleration_body_radps2=rng.normal(0.0, 0.6, (n, 3)),
         flow_root_rad=np.deg2rad(0.08) * rng.normal(size=(n, 2, 9)),
-        rate_root_radps=1e-3 * rng.normal(size=(n, 3, 9)),
+        rate_root_radps=0.02 * rng.normal(size=(n, 3, 9)),
         flow_cov=np.tile(np.deg2rad(0.6) ** 2 * np.eye(2), (n, 1, 1)),
         dynamic_pressure_sd_pa=0.04 * pulse.dynamic_pressure_pa,
     )
