@@ -12,10 +12,10 @@ from scipy.stats import chi2
 
 from postflight.reconciliation.fit import JointFit, mismatched_spans
 from postflight.reconciliation.forward_model import MOTION
-from recon.consistency import MOST_KEPT_SD, ConsistencyCheck, consistency_check
+from recon.consistency import ConsistencyCheck, consistency_check
 
 CONFIDENCE = 0.999  # as the reconstruction's checks
-MOST_MOVED_SD = 4.0  # of some forty parameters of a right fit one is beyond it in four fits of a thousand
+MOST_MOVED_SD = 4.0  # of some forty parameters of a right fit one is beyond it in two fits of a thousand
 JOINT_WORDS = (
     "another joint, or freeplay (--freeplay), than was fitted; mass properties or sensors' places that are wrong"
 )
@@ -41,14 +41,10 @@ def _residuals(fit: JointFit) -> ConsistencyCheck:
 
 
 def _moves(fit: JointFit) -> ConsistencyCheck:
-    """Largest move of what is stated of vehicle and instruments, over the sd that such a move should have."""
+    """Largest move of what is stated of vehicle and instruments, over its a priori sd."""
     names = fit.problem.vehicle_parameters.names
-    values = np.concatenate([fit.parameters.vehicle, fit.parameters.instruments])
-    sd = np.sqrt(np.diag(fit.covariance)[: len(values)])
-    known = (sd < MOST_KEPT_SD) & np.array(
-        [name not in OPEN for name in names] + [True] * len(fit.parameters.instruments)
-    )
-    moved = np.where(known, np.abs(values) / np.sqrt(np.maximum(1.0 - sd**2, 1.0 - MOST_KEPT_SD**2)), 0.0)
+    stated = np.array([name not in OPEN for name in names])
+    moved = np.abs(np.concatenate([fit.parameters.vehicle * stated, fit.parameters.instruments]))
     worst = int(np.argmax(moved))
     name = names[worst] if worst < len(names) else _instrument(worst - len(names))
     return consistency_check(
