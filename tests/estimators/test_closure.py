@@ -218,3 +218,28 @@ def test_readings_about_the_true_swing_are_the_deflection(rpm):
         read -= np.einsum("nij,nj->ni", one.by_acceleration_s2, spline(truth.time_s, 2))
         off = np.rad2deg(read - truth.deflection.theta_yz_rad)[inner]
         assert np.sqrt(np.mean(off**2)) < allowed
+
+
+def test_the_shell_s_rate_is_the_derivative_of_its_axes():
+    # of swings that go round: differences of the matrices, whose skew part is the rate
+    rng, step = np.random.default_rng(6), 1e-6
+    swing = Swing(rng.uniform(-0.5, 0.5, (40, 2)), rng.uniform(-3.0, 3.0, (40, 2)), np.zeros((40, 2)))
+    ahead, behind = (Swing.held(swing.theta_yz_rad + s * swing.rate_yz_radps).axes for s in (step, -step))
+    turning = (ahead - behind) / (2.0 * step) @ swing.axes.transpose(0, 2, 1)
+    rate = np.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], axis=-1)
+    np.testing.assert_allclose(swing.relative_rate, rate, atol=1e-8)
+
+
+def test_what_is_left_of_the_moments_is_a_shift_of_the_cg():
+    # the c.g. a millimetre to a side: the balance is left with that millimetre, on that side
+    state = start(6.0, [0.1, -0.15], [0.03, -0.04], [0.0, 0.0])
+    vehicle = living()
+    truth = fly(vehicle, standard_atmosphere(), state, START_S, START_S + 0.1, EPOCH, 0.002, 0.01, START_S + 9.0)
+    pulse, held = pulse_of_truth(truth), Swing.held(truth.deflection.theta_yz_rad)
+    share = vehicle.centerbody.mass_kg / vehicle.mass_kg
+    for axis in range(2):
+        place = np.array(vehicle.centerbody.cg_from_datum_body_m)
+        place[1 + axis] += 1e-3 / share
+        body = vehicle.centerbody.model_copy(update={"cg_from_datum_body_m": tuple(place.tolist())})
+        left = moment_residual(replace(vehicle, centerbody=body), vehicle.aero.at, held, pulse)
+        np.testing.assert_allclose(left, np.tile(1e-3 * np.eye(2)[axis], (len(left), 1)), atol=2e-5)
