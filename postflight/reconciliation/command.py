@@ -21,8 +21,10 @@ from postflight.flight import PULSE_RATE_HZ, Flight
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.plots.style import save
 from postflight.progress import progress_bar
+from postflight.reconciliation.credibility import credibility
 from postflight.reconciliation.fit import JointFit, select_laws
 from postflight.reconciliation.fit import reconcile as fit_joint
+from postflight.reconciliation.forward_model import SLOW_JOINT, integrable
 from postflight.reconciliation.modes import ModalStiffness, stiffness_from_modes
 from postflight.reconciliation.posterior import (
     Posterior,
@@ -34,18 +36,19 @@ from postflight.reconciliation.posterior import (
     quantities,
     require_samplers,
     sample_selection,
+    stiffness_bound,
     vehicle_file_lines,
 )
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies.commands import bands, compared_with_bounds
 from postflight.studies.preflight import Bounds, entry_bounds, rigid_bounds
 from postflight.warmup import RECONSTRUCTION
+from recon.consistency import ConsistencyCheck
 from recon.settings import Settings
 from synthetic_flight.dispersions import Factor, JointDispersions
 
 ENTRIES = 300
 STRONG = 3.0  # logarithm of odds of twenty to one
-MISFIT = 1.5  # rms of the sensors' residuals over their sd; about 0.6 where the joint explains the flight
 LAW_NAMES = {"freeplay": "freeplay", "hardening": "a spring whose slope changes with the angle"}
 
 
@@ -62,6 +65,11 @@ class Reconciliation(Tabular):
 
     bet: Reconstruction
     fit: JointFit
+
+    @property
+    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+        """Whether the fit can be believed."""
+        return credibility(self.fit)
 
     @property
     def deflection(self) -> DeflectionHistory:
@@ -89,6 +97,10 @@ class Reconciliation(Tabular):
     def _about(self) -> str:
         row = self.to_frame().set_index("quantity").loc["bending stiffness"]
         how = "converged" if self.fit.converged else "NOT converged"
+        failed = [each.code for each in self.consistency_checks if not each.passed]
+        how += f", checks failed: {', '.join(failed)}" if failed else ""
+        if row["kind"] == "lower bound":
+            return f"bending stiffness above {row['low']:.0f} N m/rad (95 %), {how}"
         return f"bending stiffness {row['found']:.0f} +/- {row['sd']:.0f} N m/rad, {how}"
 
 
@@ -138,6 +150,8 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             table = joint_table(fit)
             out.write_csv("joint.csv", table)
             out.write_csv("joint_correlations.csv", correlations(fit))
+            checks = credibility(fit)
+            out.write_csv("consistency_checks.csv", pd.DataFrame([vars(each) for each in checks]))
             deflection = deflection_of(fit)
             out.write_csv("deflection_reconciled.csv", deflection.to_frame())
             facts = _summary(fit, table, odds) | _modal_summary(modal, no_modes) | _posterior_summary(posterior)
@@ -155,6 +169,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             fused = answers.histories.get("fused")
             save(figure_reconciled(fit, telemetry, deflection, fused), out.path / "figures" / "reconciled.png")
     _print_joint(fit, table, odds)
+    _print_checks(checks)
     if posterior is not None:
         _print_posterior(posterior)
     if modal is None:
@@ -210,7 +225,8 @@ def _print_posterior(posterior: Posterior) -> None:
 def reconciled_bounds(fit: JointFit, flight: Reconstruction, report: Progress) -> Bounds:
     """Bands of entries with the fitted joint, offset and stability, dispersed by their standard deviations."""
     joint, offset, stability = posterior_sd(fit)
-    vehicle = fit.vehicle
+    # a joint that is only known to be stiff is flown no stiffer than the simulator's steps can follow
+    vehicle = fit.vehicle if stiffness_bound(fit) is None else integrable(fit.vehicle, SLOW_JOINT)
     known = vehicle.uncertainty.model_copy(update={"cg_lateral_m": offset, "cm": stability})
     laws = JointDispersions(stiffness=Factor(lognormal=joint[0]), damping=Factor(lognormal=joint[1]))
     return entry_bounds(flight, laws, ENTRIES, progress=report, vehicle=replace(vehicle, uncertainty=known))
@@ -220,22 +236,28 @@ def _summary(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> dict
     """Return the fit's quality and the joint, for ``reconciliation.json``."""
     return {
         "converged": fit.converged,
+        "passed": all(each.passed for each in credibility(fit)),
+        "failed_checks": [each.code for each in credibility(fit) if not each.passed],
+        "stiffness_lower_bound_nmprad": stiffness_bound(fit),
         "steps": fit.steps,
         "sensor_residual_rms_sd": fit.sensor_rms_sd,
         "join_rms_sd": float(np.sqrt(np.mean(fit.residuals.joins**2))),
         "share_of_fine_air": fit.problem.air.turbulence_share,
-        "joint": table.to_dict(orient="records"),
+        "joint": table.replace(np.inf, None).to_dict(orient="records"),
         "log_odds": odds,
     }
 
 
 def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> None:
-    """Table of the joint, and warnings where the fit did not converge or does not explain the flight."""
+    """Table of the joint, and the odds of the laws that were asked for."""
     printed = Table(title="The joint that explains the flight")
     for name in ("quantity", "vehicle file", "found", "1 sd", "90 % interval"):
         printed.add_column(name, justify="left" if name == "quantity" else "right")
     for r in table.itertuples(index=False):
         name = f"{r.quantity} ({r.unit})" if r.unit else str(r.quantity)
+        if r.kind == "lower bound":
+            printed.add_row(name, f"{r.told:.4g}", f"above {r.low:.3g}", "", "95 % lower bound")
+            continue
         printed.add_row(name, f"{r.told:.4g}", f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}")
     console.print(printed)
     for law, name in LAW_NAMES.items():
@@ -248,10 +270,12 @@ def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> 
         console.print(
             "[yellow]the stiffness falls with the angle: freeplay in part of the pulse, or a joint that yields[/]"
         )
-    if fit.sensor_rms_sd > MISFIT:
-        console.print(
-            f"[yellow]sensor residuals {fit.sensor_rms_sd:.1f} sd (rms), expected below {MISFIT:g}: such a joint does "
-            "not explain the flight; if the joint has freeplay, fit it with --freeplay[/]"
-        )
-    if not fit.converged:
-        console.print(f"[yellow]not converged after {fit.steps} steps: the intervals are too narrow[/]")
+
+
+def _print_checks(checks: tuple[ConsistencyCheck, ...]) -> None:
+    """Print how many checks pass, and in red those that fail."""
+    console.print(f"{sum(each.passed for each in checks)} of {len(checks)} consistency checks pass")
+    for each in checks:
+        if not each.passed:
+            numbers = f"{each.value:.3g} outside {each.low:.3g} to {each.high:.3g}"
+            console.print(f"[red]check failed[/] {each.name}: {escape(each.remark)} ({numbers})")

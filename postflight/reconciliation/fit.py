@@ -1,8 +1,8 @@
 """Which joint, c.g. offset and static stability explain the flight, and has the joint freeplay or hardening?
 
 ``max p(parameters | measurements)`` by Gauss-Newton (`gauss_newton`), first with all standard deviations many times
-wider, so that distant starts reach the minimum, at last with the estimated turbulence. The covariance is that of the
-linear problem at the solution, with standard deviations widened by measured factors (`SD_FACTORS`).
+wider, so that distant starts reach the minimum, at last with the estimated turbulence. The first stiffness is guessed
+on the loaded part of the flight (`start`). The covariance is that of the linear problem at the solution.
 
 Turbulence. A sounding's statistics extrapolated to a hundred metres are a guess, and a wrong guess biases the fit:
 turbulence assumed too strong leaves damping undetermined and low, too weak biases the offset. So the share of it is
@@ -35,6 +35,7 @@ from postflight.reconciliation.forward_model import (
     AtmosphereParameters,
     Measurements,
     VehicleParameters,
+    resolved_stiffness_nmprad,
     select_measurements,
 )
 from postflight.reconciliation.gauss_newton import (
@@ -45,6 +46,7 @@ from postflight.reconciliation.gauss_newton import (
     Residuals,
     descend,
 )
+from postflight.reconciliation.start import resolved, stiffness_guess
 from postflight.reconstruction import Reconstruction
 
 Correction = Callable[[Problem, Parameters], Parameters]
@@ -52,9 +54,6 @@ SD_FACTORS_EARLY = (30.0, 10.0, 3.0)
 MOST_STEPS = 20  # after the early ones
 # predicted decrease of the cost at which a fit ends: the last one, and the one before the turbulence is estimated
 TOLERANCE, EARLY_TOLERANCE = 0.05, 2.0
-# errors over the linear problem's sd in ten dispersed flights, seeds 0 to 9; of damping and static stability the ratio
-# is one (docs/reconciliation.md)
-SD_FACTORS = {"stiffness": 1.7, "offset y": 1.2, "offset z": 1.2}
 # of freeplay: factors on standard deviations, and half width of the band's corners over the freeplay
 CONTINUATION = ((30.0, 1.0), (10.0, 0.5), (3.0, 0.3), (3.0, 0.1), (1.0, 0.1), (1.0, 0.05))
 PLAIN_STEPS = 2
@@ -73,7 +72,7 @@ class JointFit:
     problem : Problem
     parameters : Parameters
         The most probable.
-    linear_covariance : (n, n) float
+    covariance : (n, n) float
         Of all parameters, in their order, of the linear problem at the solution.
     residuals : Residuals
     steps : int
@@ -82,23 +81,10 @@ class JointFit:
 
     problem: Problem
     parameters: Parameters
-    linear_covariance: FloatArray
+    covariance: FloatArray
     residuals: Residuals
     steps: int
     converged: bool
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Covariance (n, n) of all parameters, in their order: the linear one, widened by `SD_FACTORS`."""
-        return self.linear_covariance * np.outer(self.sd_factors, self.sd_factors)
-
-    @property
-    def sd_factors(self) -> FloatArray:
-        """Factors (n,) on the linear problem's standard deviations."""
-        out = np.ones(len(self.linear_covariance))
-        for name, factor in SD_FACTORS.items():
-            out[self.problem.vehicle_parameters.names.index(name)] = factor
-        return out
 
     @property
     def sensor_rms_sd(self) -> float:
@@ -108,8 +94,8 @@ class JointFit:
     @property
     def log_evidence(self) -> float:
         """Logarithm of the evidence by Laplace's method, up to a constant common to all models of a flight."""
-        sd = np.sqrt(np.diag(self.linear_covariance))
-        _, shape = np.linalg.slogdet(self.linear_covariance / np.outer(sd, sd))
+        sd = np.sqrt(np.diag(self.covariance))
+        _, shape = np.linalg.slogdet(self.covariance / np.outer(sd, sd))
         # freeplay has one sign: its prior is folded
         folded = np.log(2.0) if "freeplay" in self.problem.vehicle_parameters.laws else 0.0
         return float(folded + self.problem.log_weight + 0.5 * shape + np.log(sd).sum() - 0.5 * self.residuals.cost)
@@ -204,8 +190,10 @@ def reconcile(
     """
     problem = problem_of(flight, select_measurements(flight, loaded), laws)
     report = progress or (lambda _fraction, _what: None)
+    report(0.0, "reconciling, first guess of the stiffness")
+    problem, start = stiffness_guess(flight, problem)
     early = [replace(problem, sd_factor=factor) for factor in SD_FACTORS_EARLY]
-    first = solve(problem, problem.start(), early, part_of(report, 0.0, 0.6), tolerance=EARLY_TOLERANCE)
+    first = solve(problem, start, early, part_of(report, 0.15, 0.6), tolerance=EARLY_TOLERANCE)
     return _refit_with_turbulence(first, part_of(report, 0.6, 1.0))
 
 
@@ -253,8 +241,19 @@ def _refit_with_turbulence(fit: JointFit, report: Progress, correct: Correction 
     """Fit again with the turbulence that the measurements make most probable."""
     report(0.0, "estimating turbulence")
     air = replace(fit.problem.air, turbulence_share=estimate_turbulence_share(fit.problem, fit.parameters))
-    part = part_of(report, 0.2, 1.0)
-    return solve(replace(fit.problem, air=air), fit.parameters, progress=part, correct=correct)
+    problem = resolved(replace(fit.problem, air=air), fit.parameters.vehicle)
+    if is_unresolved(problem, fit.parameters):
+        problem = replace(problem, held=("stiffness", "damping"))
+    return solve(problem, fit.parameters, progress=part_of(report, 0.2, 1.0), correct=correct)
+
+
+def is_unresolved(problem: Problem, u: Parameters) -> bool:
+    """Whether the joint is too fast for the windows: its stiffness is then bounded, and no step moves it further.
+
+    Neither stiffness nor damping can be told, and steps along them would go on without gain.
+    """
+    vehicle = problem.vehicle_parameters.vehicle(u.vehicle)
+    return vehicle.joint.bending_stiffness_nmprad >= resolved_stiffness_nmprad(vehicle)
 
 
 def estimate_turbulence_share(problem: Problem, u: Parameters) -> float:

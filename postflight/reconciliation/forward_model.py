@@ -15,7 +15,7 @@ ratio and the difference of the winds, m/s, to the sounding, at knots along alti
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -38,13 +38,15 @@ from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
 from postflight.reconstruction import Reconstruction
 from recon.atmosphere import cg_accelerations, windows_are_whole
 from synthetic_flight import simulate
+from synthetic_flight.dynamics import joint_modes
 from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
 
 # at 1200 m/s a tenth of a second: knots resolve gusts at the joint's 2 to 4 Hz; coarser in thin air
 KNOT_M, UPPER_KNOT_M = 125.0, 250.0
 UPPER_M, TOP_M, BELOW_M = 75e3, 105e3, 1e3
 # a priori standard deviations; of factors those of their logarithms
-STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 0.5, 1.0, 0.005
+STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 1.5, 1.0, 0.005
+LEAST_INERTIA = 0.01  # of the told one: a trial step never makes an inertia negative
 FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
 # hardening is counted as the share by which the tangent stiffness has grown at this angle; negative: it softens
 HARDENING_AT_RAD = np.deg2rad(4.0)
@@ -53,7 +55,8 @@ LAWS = ("freeplay", "hardening")
 NUISANCE = (
     "C_A", "C_N", "C_mq", "mass of the shell", "mass of the centerbody", "station of the shell's c.g.",
     "station of the centerbody's c.g.", "shell's c.g. y", "shell's c.g. z", "inertia of the shell",
-    "inertia of the centerbody",
+    "inertia of the centerbody", "axial inertia of the shell", "axial inertia of the centerbody",
+    "centerbody's product xy", "centerbody's product xz", "centerbody's product yz",
 )  # fmt: skip
 
 
@@ -106,11 +109,9 @@ class VehicleParameters:
         return replace(
             nominal,
             joint=joint.model_copy(update=changed),
-            aeroshell=_perturbed(shell, known, v["mass of the shell"], v["station of the shell's c.g."], lateral,
-                             v["inertia of the shell"]),
-            centerbody=_perturbed(body, known, v["mass of the centerbody"], v["station of the centerbody's c.g."],
-                              offset / body.mass_kg, v["inertia of the centerbody"]),
-        )  # fmt: skip
+            aeroshell=_perturbed(shell, known, v, "shell", lateral),
+            centerbody=_perturbed(body, known, v, "centerbody", offset / body.mass_kg),
+        )
 
     def flown(self, x: FloatArray) -> Vehicle:
         """Vehicle of parameters (v,) with its own coefficients."""
@@ -127,14 +128,29 @@ class VehicleParameters:
 
 
 def _perturbed(
-    part: MassProperties, known: Uncertainty, mass: float, station: float, lateral_m: FloatArray, inertia: float
+    part: MassProperties, known: Uncertainty, v: dict[str, float], name: str, lateral_m: FloatArray
 ) -> MassProperties:
-    """Return a body with mass, c.g. and inertia off by so many standard deviations, and a lateral shift, m."""
+    """Return a body with mass, c.g. and inertia off by so many standard deviations, and a lateral shift, m.
+
+    Moments about the axis and across it have factors of their own: a spinning vehicle measures their difference.
+    """
     x, y, z = part.cg_from_datum_body_m
+    axial, across = (1.0 + known.inertia * v[f"{kind}inertia of the {name}"] for kind in ("axial ", ""))
+    root = np.sqrt(np.maximum([axial, across, across], LEAST_INERTIA))
+    inertia = part.inertia * np.outer(root, root)
+    if f"{name}'s product xy" in v:
+        size = known.inertia_products * 0.5 * (part.inertia[1, 1] + part.inertia[2, 2])
+        for row, column, axes in ((0, 1, "xy"), (0, 2, "xz"), (1, 2, "yz")):
+            inertia[row, column] += size * v[f"{name}'s product {axes}"]
+            inertia[column, row] = inertia[row, column]
     moved = {
-        "mass_kg": part.mass_kg * (1.0 + known.mass * mass),
-        "cg_from_datum_body_m": (x + known.cg_station_m * station, y + float(lateral_m[0]), z + float(lateral_m[1])),
-        "inertia_kgm2": tuple(map(tuple, (part.inertia * (1.0 + known.inertia * inertia)).tolist())),
+        "mass_kg": part.mass_kg * (1.0 + known.mass * v[f"mass of the {name}"]),
+        "cg_from_datum_body_m": (
+            x + known.cg_station_m * v[f"station of the {name}'s c.g."],
+            y + float(lateral_m[0]),
+            z + float(lateral_m[1]),
+        ),
+        "inertia_kgm2": tuple(map(tuple, inertia.tolist())),
     }
     return part.model_copy(update=moved)
 
@@ -216,6 +232,49 @@ LOADED = 0.1  # of the largest dynamic pressure
 REST_SD, LOADED_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0]), np.deg2rad([1e-3, 3.0, 3.0, 0.1, 30.0, 30.0])
 
 
+MOST_PHASE_RAD = 0.8  # of a joint's mode in a step, with an error of a percent a radian; unstable from 2.8
+# damping ratio of a mode that windows do not resolve: its oscillation decays within a few windows, and deflections lag
+# their load by few milliseconds. From so many periods a window (10.7 Hz) it grows, over so many more (to 12.5 Hz)
+UNRESOLVED_RATIO, UNRESOLVED_FROM, UNRESOLVED_BLEND = 0.2, 0.43, 0.07
+RESOLVED = 0.41  # periods a window (10.2 Hz) up to which a stiffness is told: a fit of a faster joint ends at the next
+
+
+@dataclass(frozen=True)
+class WindowSteps:
+    """Integration of a window: Simpson's mean over an even number of ``intervals`` of ``per_record`` steps each."""
+
+    intervals: int
+    per_record: int
+
+    @property
+    def step_s(self) -> float:
+        """Integration step."""
+        return WINDOW_S / (self.intervals * self.per_record)
+
+    @property
+    def records(self) -> int:
+        """Records of a span, its start among them."""
+        return WINDOWS * self.intervals + 1
+
+    @property
+    def simpson(self) -> FloatArray:
+        """Weights of a window's records."""
+        weights = np.full(self.intervals + 1, 2.0)
+        weights[1::2] = 4.0
+        weights[[0, -1]] = 1.0
+        return np.asarray(weights / (3.0 * self.intervals))
+
+
+SLOW_JOINT, FAST_JOINT = WindowSteps(2, 5), WindowSteps(4, 3)
+FAST_HZ = 6.0  # a window's mean of a faster oscillation is off by more than half a percent with two intervals
+
+
+def steps_for(vehicle: Vehicle) -> WindowSteps:
+    """Steps that resolve a vehicle's bending: a mean of too few records mistakes a fast oscillation for an offset."""
+    inertia, _, stiffness = joint_modes(vehicle)["bending"]
+    return SLOW_JOINT if np.sqrt(stiffness / inertia) < 2.0 * np.pi * FAST_HZ else FAST_JOINT
+
+
 @dataclass(frozen=True)
 class Measurements:
     """Windows of corrected sensors, body axes, and where each of ``s`` spans starts.
@@ -242,6 +301,8 @@ class Measurements:
         From the datum, body axes.
     first_deflection_sd : (6,) float
         Of the shell's rotation vector against the body, rad, and its rate, rad/s, at the first start.
+    steps : WindowSteps
+        Of the integration.
     """
 
     start: Trajectory
@@ -257,6 +318,7 @@ class Measurements:
     clock_sd_s: FloatArray
     accelerometer_m: FloatArray
     first_deflection_sd: FloatArray
+    steps: WindowSteps = field(default_factory=lambda: SLOW_JOINT)
 
     @property
     def spans(self) -> int:
@@ -340,9 +402,6 @@ def _affine(values: FloatArray, responses: FloatArray) -> FloatArray:
     return np.asarray(fitted.reshape(4, *responses.shape[1:]))
 
 
-STEP_S = 0.004
-PER_RECORD = 5  # two records a window: its mean is Simpson's of its ends and middle
-RECORDS = 2 * WINDOWS + 1
 # of a span's start: rotation from the reconstructed attitude, body's rate, shell's rotation vector from the body (x is
 # its twist), shell's rate relative to the body, shell axes
 MOTION = 12
@@ -399,6 +458,31 @@ class PredictedSpans:
     end: FloatArray
 
 
+def integrable(vehicle: Vehicle, steps: WindowSteps) -> Vehicle:
+    """Vehicle whose joint the steps can follow and the windows can resolve.
+
+    A stiffer spring than the steps can follow leaves a deflection too small to move a sensor. Slightly damped
+    oscillations near the windows' Nyquist frequency (12.5 Hz) or beyond it fit at many false frequencies: there the
+    joint is so much damped that it follows its load.
+    """
+    joint, changed = vehicle.joint, {}
+    for name, (inertia, _, stiffness) in joint_modes(vehicle).items():
+        most = inertia * (MOST_PHASE_RAD / steps.step_s) ** 2
+        # smooth, so that steps of a fit see where it ends; a tenth of the limit is lowered by 3e-5
+        limited = stiffness / (1.0 + (stiffness / most) ** 4) ** 0.25
+        changed[f"{name}_stiffness_nmprad"] = limited
+        frequency = np.sqrt(limited / inertia) / (2.0 * np.pi)
+        ratio = UNRESOLVED_RATIO * np.clip((frequency * WINDOW_S - UNRESOLVED_FROM) / UNRESOLVED_BLEND, 0.0, 1.0)
+        key = f"{name}_damping_nmsprad"
+        changed[key] = max(getattr(joint, key), float(ratio * 2.0 * np.sqrt(limited * inertia)))
+    return replace(vehicle, joint=joint.model_copy(update=changed))
+
+
+def resolved_stiffness_nmprad(vehicle: Vehicle) -> float:
+    """Bending stiffness, N m/rad, above which the windows do not resolve the joint's oscillation."""
+    return float(joint_modes(vehicle)["bending"][0] * (2.0 * np.pi * RESOLVED / WINDOW_S) ** 2)
+
+
 def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) -> PredictedSpans:
     """Fly spans and predict the sensors' windows; ``nominal`` gives the coefficient table."""
     starts = _start_states(measured, flights)
@@ -407,11 +491,14 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
         vehicle = flights.vehicles[flights.vehicle[k]]
         return Start(starts[k], vehicle.kernel_vector, flights.tables[flights.table[k]])
 
-    states, aux = np.full((len(starts), RECORDS, 20), np.nan), np.full((len(starts), RECORDS, 18), np.nan)
-    for flown in fly_ensemble(nominal, start_of, range(len(starts)), Schedule(STEP_S, PER_RECORD, RECORDS)):
+    steps = measured.steps
+    states = np.full((len(starts), steps.records, 20), np.nan)
+    aux = np.full((len(starts), steps.records, 18), np.nan)
+    schedule = Schedule(steps.step_s, steps.per_record, steps.records)
+    for flown in fly_ensemble(integrable(nominal, steps), start_of, range(len(starts)), schedule):
         states[flown.run, : len(flown.states)], aux[flown.run, : len(flown.aux)] = flown.states, flown.aux
     windows, slope = _windows(measured, flights, states, aux)
-    middle = states[:, 1::2]
+    middle = states[:, steps.intervals // 2 :: steps.intervals]
     deflection = rotations.log(rotations.multiply(rotations.conjugate(middle[..., 6:10]), middle[..., 10:14]))
     return PredictedSpans(windows, slope, deflection, _ends(measured, flights.span, states[:, -1]))
 
@@ -455,8 +542,11 @@ def _windows(
     force = rotations.rotate(rotations.conjugate(states[..., 6:10]), aux[..., 6:9]) / mass
     force = force + np.cross(turn, arm) + np.cross(omega, np.cross(omega, arm))
     records = np.concatenate([omega, force], axis=2)
-    before, middle, after = records[:, 0:-1:2], records[:, 1::2], records[:, 2::2]
-    return (before + 4.0 * middle + after) / 6.0, (after - before) / (2.0 * PER_RECORD * STEP_S)
+    steps = measured.steps
+    windows = np.arange(WINDOWS)[:, None] * steps.intervals + np.arange(steps.intervals + 1)
+    parts = records[:, windows]
+    slope = (parts[:, :, -1] - parts[:, :, 0]) / WINDOW_S
+    return np.einsum("k,mwkj->mwj", steps.simpson, parts), slope
 
 
 def _ends(measured: Measurements, span: Index, state: FloatArray) -> FloatArray:

@@ -30,6 +30,7 @@ from postflight.reconciliation.forward_model import (
     ATTITUDE,
     MOTION,
     RATE,
+    STIFFNESS_LOG_SD,
     AtmosphereParameters,
     Index,
     Measurements,
@@ -38,6 +39,7 @@ from postflight.reconciliation.forward_model import (
     TrialVehicle,
     VehicleParameters,
     fly_spans,
+    integrable,
 )
 from synthetic_flight import simulate
 
@@ -50,6 +52,7 @@ GUST_KNOT_M = 300.0
 LARGE_ANGLE_RAD = np.deg2rad(5.0)  # angle of attack at which density structure rotates the vehicle
 GUST_RATE, GUST_FORCE_MPS2 = 2.0, 60.0  # of the windows' rates and lateral force, as if white from window to window
 MOTION_STEP = np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3))
+LEAST_COMPLIANCE = 0.5  # of a joint's compliance: a step that lessens it by more is shortened
 VEHICLE_STEP, AIR_STEP = 1e-5, np.array([1e-6, 2e-4, 2e-4])
 
 
@@ -63,10 +66,27 @@ class Parameters:
     motion: FloatArray
 
     def plus(self, step: FloatArray) -> Parameters:
-        """Parameters moved by a step (n,) of all of them in this order."""
+        """Parameters moved by a step (n,) of all of them in this order, the stiffness by `stiffness_step`."""
+        return self.straight(np.concatenate([[stiffness_step(float(step[0]))], step[1:]]))
+
+    def straight(self, step: FloatArray) -> Parameters:
+        """Parameters with a step (n,) added."""
         parts = (self.vehicle, self.instruments, self.air, self.motion)
         ends = np.cumsum([part.size for part in parts])[:-1]
         return Parameters(*(p + d.reshape(p.shape) for p, d in zip(parts, np.split(step, ends), strict=True)))
+
+
+def stiffness_step(step: float) -> float:
+    """Change of the stiffness's parameter by a step that is straight in the compliance.
+
+    Deflections, and with them the measurements, follow the compliance 1/K: by its logarithm a step from a joint that is
+    too stiff would be many times too long. Compliance stays positive: below `LEAST_COMPLIANCE` of what it was it falls
+    as an exponential, with the slope that it has there.
+    """
+    change = STIFFNESS_LOG_SD * step
+    edge = 1.0 - LEAST_COMPLIANCE
+    log_softer = np.log1p(-change) if change < edge else np.log(LEAST_COMPLIANCE) - (change - edge) / LEAST_COMPLIANCE
+    return float(-log_softer / STIFFNESS_LOG_SD)
 
 
 @dataclass(frozen=True)
@@ -203,7 +223,7 @@ class Problem:
 
     def trial_vehicle(self, x: FloatArray) -> TrialVehicle:
         """Vehicle of parameters (v,) in standard deviations."""
-        vehicle = self.vehicle_parameters.vehicle(x)
+        vehicle = integrable(self.vehicle_parameters.vehicle(x), self.measured.steps)
         return TrialVehicle(vehicle, simulate.parameter_vector(vehicle, *self.vehicle_parameters.factors(x)))
 
     def predict(self, u: Parameters) -> PredictedSpans:
@@ -409,7 +429,8 @@ def step_from(problem: Problem, u: Parameters) -> Step:
         Where the spans cannot be flown with these parameters.
     """
     linear = problem.linearize(u)
-    if not np.isfinite(linear.residuals.cost):
+    right = linear.transpose_times(linear.residuals.sensors, linear.residuals.joins)
+    if not (np.isfinite(linear.residuals.cost) and np.isfinite(right).all()):
         raise DivergenceError(
             "reconciliation: a span of the flight cannot be flown with the vehicle file's joint, which diverges; give "
             "a stiffer joint in the vehicle file to start from",

@@ -1,16 +1,15 @@
 """Which values of stiffness, damping, offset and stability has a fitted joint, and with which uncertainty?
 
-From the linear problem: covariance ``P = (J^T W J + P_0^-1)^-1`` of all parameters, widened by `fit.SD_FACTORS`, and by
-differences the standard deviations and 90 % intervals of what an engineer asks for.
+From the linear problem: covariance ``P = (J^T W J + P_0^-1)^-1`` of all parameters, and by differences the standard
+deviations and 90 % intervals of what an engineer asks for.
 
 By sampling: posterior of the few parameters sought by emcee, its volume by dynesty. The nuisance parameters (some 2700:
 motion, atmosphere, instruments, masses) are put at their most probable values for each candidate of the few (a profile
 likelihood). To that end they follow the linear problem about the best fit and are then corrected by the gradient at the
 candidate with the derivatives of the best fit, which costs one flight of all spans a correction. The profile is taken
 at some two hundred candidates and interpolated between them by radial functions; the samplers evaluate the
-interpolation, whose error is `Posterior.refit_error`: candidates fitted anew with new derivatives. The samples are
-widened as the fit's covariance is; for the evidence they are not. A profile is no marginal: that the scatter of the
-nuisance parameters differs from candidate to candidate is neglected.
+interpolation, whose error is `Posterior.refit_error`: candidates fitted anew with new derivatives. A profile is no
+marginal: that the scatter of the nuisance parameters differs from candidate to candidate is neglected.
 
 References
 ----------
@@ -45,10 +44,16 @@ from postflight.reconciliation.forward_model import (
     STIFFNESS_LOG_SD,
     WINDOWS,
     VehicleParameters,
+    resolved_stiffness_nmprad,
 )
 from postflight.reconciliation.gauss_newton import Linearization, NormalEquations, Parameters, descend
 
-INTERVAL = 0.90
+INTERVAL, BOUND = 0.90, 0.95
+FROM_ZERO_SD = 3.0  # of the compliance: nearer to zero the stiffness has no upper limit
+FAR_SD = 10.0  # where the tail of a normal law is an exponential, to a percent
+LEAST_PRECISION = 1e-6  # of the stiffness's parameter, over the a priori one
+# what follows from the stiffness, and with which power of it
+BOUNDED = {"bending stiffness": 1.0, "free-free frequency": 0.5}
 SEED = 2009
 PER_UNKNOWN, REACH, CORRECTIONS = 32, 5.0, 3  # candidates; reach in sd of the linear problem
 REFITS, REFIT_STEPS, REFIT_REACH = 4, 2, 2.0
@@ -108,9 +113,11 @@ def _linear_quantities(parameters: VehicleParameters) -> list[_LinearQuantity]:
 
 
 def joint_table(fit: JointFit) -> pd.DataFrame:
-    """One row a quantity: ``quantity, unit, told (the vehicle file's), found, sd, low, high`` (90 % interval).
+    """One row a quantity: ``quantity, unit, told (the vehicle file's), found, sd, low, high`` (90 % interval), kind.
 
-    Positive quantities have sd and interval from their logarithm.
+    Positive quantities have sd and interval from their logarithm. Where the flight only bounds the stiffness
+    (`stiffness_bound`) the kind of what follows from it is "lower bound" and not "estimate": ``low`` is the bound that
+    holds with 95 %, ``high`` infinite, and ``found`` the most probable value, which the a priori one determines.
     """
     vehicle_parameters, x = fit.problem.vehicle_parameters, fit.parameters.vehicle
     n = len(x)
@@ -118,27 +125,63 @@ def joint_table(fit: JointFit) -> pd.DataFrame:
     reach = float(norm.ppf(0.5 + 0.5 * INTERVAL))
     nominal, best = vehicle_parameters.vehicle(np.zeros(n)), vehicle_parameters.vehicle(x)
     moved = [[vehicle_parameters.vehicle(x + side * DIFFERENCE * unit) for side in (-1.0, 1.0)] for unit in np.eye(n)]
+    bound = stiffness_bound(fit)
     rows = []
     for name, unit, value, by_factor in QUANTITIES:
         f = (lambda v, g=value: float(np.log(g(v)))) if by_factor else value
         slope = np.array([(f(high) - f(low)) / (2.0 * DIFFERENCE) for low, high in moved])
-        sd, at = float(np.sqrt(slope @ covariance @ slope)), f(best)
+        sd, at, kind = float(np.sqrt(slope @ covariance @ slope)), f(best), "estimate"
         low, high = at - reach * sd, at + reach * sd
         if by_factor:
             low, high, sd = float(np.exp(low)), float(np.exp(high)), float(np.exp(at)) * sd
-        rows.append((name, unit, value(nominal), value(best), sd, low, high))
+        if bound is not None and name in BOUNDED:
+            power = BOUNDED[name]
+            low = value(best) * (bound / best.joint.bending_stiffness_nmprad) ** power
+            high, kind = np.inf, "lower bound"
+        rows.append((name, unit, value(nominal), value(best), sd, low, high, kind))
     for linear in _linear_quantities(vehicle_parameters):
         at, sd = float(linear.of(x)), linear.scale * float(np.sqrt(covariance[linear.index, linear.index]))
-        rows.append((linear.label, linear.unit, linear.nominal, at, sd, at - reach * sd, at + reach * sd))
-    return pd.DataFrame(rows, columns=["quantity", "unit", "told", "found", "sd", "low", "high"])
+        rows.append((linear.label, linear.unit, linear.nominal, at, sd, at - reach * sd, at + reach * sd, "estimate"))
+    return pd.DataFrame(rows, columns=["quantity", "unit", "told", "found", "sd", "low", "high", "kind"])
+
+
+def stiffness_bound(fit: JointFit) -> float | None:
+    """Stiffness, N m/rad, that the joint has at least, with 95 %; None where the flight limits it above as well.
+
+    Measurements follow the compliance 1/K, which they know by a normal law, whatever its size. The a priori law is
+    taken out of the posterior; where less than `FROM_ZERO_SD` sd are left between compliance and zero, the joint may as
+    well be rigid, and the bound is that of a compliance of which nothing is known but that it is not negative. No bound
+    is higher than the stiffness whose oscillation the windows still resolve.
+    """
+    precision = max(1.0 / float(fit.covariance[0, 0]) - 1.0, LEAST_PRECISION)
+    x = float(fit.parameters.vehicle[0])
+    # compliance by the measurements alone, and its sd, over the most probable one
+    compliance, sd = 1.0 - STIFFNESS_LOG_SD * x / precision, STIFFNESS_LOG_SD / np.sqrt(precision)
+    below = -compliance / sd
+    if below < FAR_SD:
+        largest = compliance + sd * float(norm.isf((1.0 - BOUND) * norm.sf(below)))
+    else:  # what is left of a normal law so far out falls as an exponential
+        largest = -sd * float(np.log(1.0 - BOUND)) / below
+    best = fit.problem.vehicle_parameters.vehicle(fit.parameters.vehicle)
+    stiffness, resolved = best.joint.bending_stiffness_nmprad, resolved_stiffness_nmprad(best)
+    if compliance > FROM_ZERO_SD * sd and stiffness < resolved:
+        return None
+    return min(stiffness / largest, resolved)
 
 
 def posterior_sd(fit: JointFit) -> tuple[tuple[float, float], float, float]:
-    """Sd of stiffness and damping (logarithms), of the offset (mean of y and z), m, and of the static stability."""
+    """Sd of stiffness and damping (logarithms), of the offset (mean of y and z), m, and of the static stability.
+
+    Of a stiffness that is only bounded the sd is that with which the bound holds with 95 %.
+    """
     names = fit.problem.vehicle_parameters.names
     sd = dict(zip(names, np.sqrt(np.diag(fit.covariance)[: len(names)]).tolist(), strict=True))
     offset = float(OFFSET_SD_M * np.hypot(sd["offset y"], sd["offset z"]) / np.sqrt(2.0))
-    joint = STIFFNESS_LOG_SD * sd["stiffness"], DAMPING_LOG_SD * sd["damping"]
+    stiffness, bound = STIFFNESS_LOG_SD * sd["stiffness"], stiffness_bound(fit)
+    if bound is not None:
+        best = fit.problem.vehicle_parameters.vehicle(fit.parameters.vehicle).joint.bending_stiffness_nmprad
+        stiffness = min(stiffness, float(np.log(max(best / bound, 1.0)) / norm.ppf(BOUND)))
+    joint = stiffness, DAMPING_LOG_SD * sd["damping"]
     return joint, offset, fit.problem.vehicle_parameters.nominal.uncertainty.cm * sd["static stability"]
 
 
@@ -252,7 +295,7 @@ class Profile:
     @cached_property
     def root(self) -> FloatArray:
         """From a candidate to the parameters sought: root (p, p) of their linear covariance."""
-        return np.asarray(np.linalg.cholesky(self.fit.linear_covariance[: self.count, : self.count]))
+        return np.asarray(np.linalg.cholesky(self.fit.covariance[: self.count, : self.count]))
 
     @cached_property
     def _linear_problem(self) -> tuple[Linearization, FloatArray, NormalEquations]:
@@ -274,14 +317,14 @@ class Profile:
     def vehicles(self, z: FloatArray) -> FloatArray:
         """Vehicle's parameters (n, v) of candidates (n, p), nuisance parameters by the linear problem."""
         names = self.fit.problem.vehicle_parameters.names
-        away = z @ self._linear_problem[1][: len(names)].T * self.fit.sd_factors[: len(names)]
+        away = z @ self._linear_problem[1][: len(names)].T
         return np.asarray(self.fit.parameters.vehicle + away)
 
     def at(self, z: FloatArray) -> tuple[float, Parameters]:
         """Cost of a candidate and all its parameters."""
         problem, p = self.fit.problem, self.count
         linear, steps, others = self._linear_problem
-        u = self.fit.parameters.plus(steps @ z)
+        u = self.fit.parameters.straight(steps @ z)
         residuals = problem.residuals(u)
         best = residuals.cost, u
         for _ in range(CORRECTIONS):

@@ -1,17 +1,29 @@
 """Evidence, intervals, spectra and loosened joints of the reconciliation, each by its definition."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from postflight.reconciliation.credibility import MOST_MOVED_SD, credibility
 from postflight.reconciliation.fit import JointFit, with_freeplay
-from postflight.reconciliation.forward_model import FREEPLAY_SD_RAD, OFFSET_SD_M, VehicleParameters
-from postflight.reconciliation.gauss_newton import Parameters
+from postflight.reconciliation.forward_model import (
+    FAST_JOINT,
+    FREEPLAY_SD_RAD,
+    OFFSET_SD_M,
+    SLOW_JOINT,
+    STIFFNESS_LOG_SD,
+    VehicleParameters,
+    integrable,
+    resolved_stiffness_nmprad,
+    steps_for,
+)
+from postflight.reconciliation.gauss_newton import LEAST_COMPLIANCE, Parameters, stiffness_step
 from postflight.reconciliation.modes import HOP, PADDED, RATE_HZ, WINDOW, _spectra
-from postflight.reconciliation.posterior import joint_table
-from synthetic_flight.dynamics import beyond_freeplay
+from postflight.reconciliation.posterior import joint_table, stiffness_bound
+from synthetic_flight.dynamics import beyond_freeplay, joint_modes
 
 VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
 
@@ -71,3 +83,117 @@ def test_a_loosened_joint_carries_the_plain_one_s_moment(corner):
     np.testing.assert_allclose(beyond_freeplay(bent, freeplay, corner), sizes, rtol=1e-9)
     np.testing.assert_allclose(made.motion[:, 7] / made.motion[:, 8], -0.75)
     assert made.vehicle[5] * FREEPLAY_SD_RAD == pytest.approx(freeplay)
+
+
+def stiff(factor):
+    """The reference vehicle with another stiffness."""
+    joint = VEHICLE.joint
+    changed = {"bending_stiffness_nmprad": factor * joint.bending_stiffness_nmprad}
+    return replace(VEHICLE, joint=joint.model_copy(update=changed))
+
+
+@pytest.mark.parametrize("steps", [SLOW_JOINT, FAST_JOINT])
+def test_a_window_s_mean_is_simpson_s(steps):
+    # exact for a cubic, and the weights sum to one
+    t = np.linspace(0.0, 1.0, steps.intervals + 1)
+    assert steps.simpson @ np.ones_like(t) == pytest.approx(1.0)
+    assert steps.simpson @ (4.0 * t**3 - t) == pytest.approx(0.5)
+
+
+def test_a_joint_that_steps_and_windows_resolve_is_flown_as_it_is():
+    soft = integrable(VEHICLE, SLOW_JOINT).joint
+    assert soft.bending_stiffness_nmprad == pytest.approx(VEHICLE.joint.bending_stiffness_nmprad, rel=1e-6)
+    assert soft.bending_damping_nmsprad == VEHICLE.joint.bending_damping_nmsprad
+    assert steps_for(VEHICLE) is SLOW_JOINT
+    assert steps_for(stiff(20.0)) is FAST_JOINT
+
+
+def test_a_joint_beyond_the_windows_is_damped_and_no_stiffer_than_the_steps_follow():
+    locked = integrable(stiff(1e3), FAST_JOINT)
+    inertia, damping, stiffness = joint_modes(locked)["bending"]
+    assert np.sqrt(stiffness / inertia) * FAST_JOINT.step_s == pytest.approx(0.8, rel=1e-3)
+    assert damping / (2.0 * np.sqrt(stiffness * inertia)) == pytest.approx(0.2)
+
+
+def test_a_step_of_the_stiffness_is_straight_in_the_compliance():
+    def compliance(step):
+        return np.exp(-STIFFNESS_LOG_SD * stiffness_step(step))
+
+    assert compliance(-2.0) == pytest.approx(1.0 + 2.0 * STIFFNESS_LOG_SD)
+    assert compliance(0.2) == pytest.approx(1.0 - 0.2 * STIFFNESS_LOG_SD)
+    edge = (1.0 - LEAST_COMPLIANCE) / STIFFNESS_LOG_SD
+    slopes = [(compliance(edge + d) - compliance(edge)) / d for d in (-1e-6, 1e-6)]
+    assert slopes == pytest.approx([-STIFFNESS_LOG_SD] * 2, rel=1e-4)
+    assert 0.0 < compliance(5.0) < 0.01
+
+
+def found_at(x, precision):
+    """Fit whose measurements know the stiffness's parameter with a precision, and nothing else."""
+    parameters = VehicleParameters(VEHICLE)
+    vehicle, covariance = np.zeros(len(parameters.names)), np.eye(len(parameters.names))
+    vehicle[0], covariance[0, 0] = x, 1.0 / (precision + 1.0)
+    return SimpleNamespace(
+        problem=SimpleNamespace(vehicle_parameters=parameters),
+        parameters=SimpleNamespace(vehicle=vehicle),
+        covariance=covariance,
+    )
+
+
+def test_a_soft_joint_is_estimated_and_a_locked_one_bounded():
+    assert stiffness_bound(found_at(0.0, (STIFFNESS_LOG_SD / 0.02) ** 2)) is None
+    # a compliance 0.5 +/- 0.5 of the most probable joint's, of which only the positive part is possible
+    precision = (STIFFNESS_LOG_SD / 0.5) ** 2
+    x = 0.5 * precision / STIFFNESS_LOG_SD
+    found = found_at(x, precision)
+    drawn = 0.5 + 0.5 * np.random.default_rng(1).standard_normal(400_000)
+    largest = np.quantile(drawn[drawn > 0.0], 0.95)
+    best = VehicleParameters(VEHICLE).vehicle(found.parameters.vehicle)
+    expected = min(best.joint.bending_stiffness_nmprad / largest, resolved_stiffness_nmprad(best))
+    assert stiffness_bound(found) == pytest.approx(expected, rel=0.01)
+    row = joint_table(found).set_index("quantity").loc["bending stiffness"]
+    assert row.kind == "lower bound"
+    assert np.isinf(row.high)
+    assert row.low == pytest.approx(expected, rel=0.01)
+
+
+def test_the_bound_is_continuous_where_the_tail_is_an_exponential():
+    # compliances 9.9 and 10.1 sd below zero by the measurements
+    bounds = []
+    for below in (9.9, 10.1):
+        precision = 0.01
+        found = found_at(
+            (1.0 + below * STIFFNESS_LOG_SD / np.sqrt(precision)) * precision / STIFFNESS_LOG_SD, precision
+        )
+        best = found.problem.vehicle_parameters.vehicle(found.parameters.vehicle).joint.bending_stiffness_nmprad
+        bounds.append(stiffness_bound(found) / best)
+    assert bounds[0] == pytest.approx(bounds[1], rel=0.05)
+    assert bounds[0] > 0.0
+
+
+def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True):
+    """Fit of ten spans: its residuals, and the move of one stated number of the vehicle."""
+    parameters = VehicleParameters(VEHICLE)
+    values = np.zeros(len(parameters.names))
+    values[parameters.names.index("mass of the shell")] = vehicle
+    joins = np.zeros((9, 12))
+    joins[3, 4] = spans
+    residuals = SimpleNamespace(sensors=np.ones((10, 10, 6)), joins=joins, cost=cost)
+    problem = SimpleNamespace(
+        vehicle_parameters=parameters, measured=SimpleNamespace(spans=10), weight=np.ones((10, 10, 6))
+    )
+    unknown = SimpleNamespace(vehicle=values, instruments=np.zeros(20))
+    return JointFit(problem, unknown, 0.5 * np.eye(len(values) + 20), residuals, 4, converged)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "code"),
+    [
+        ({"cost": 1.3 * 597.0}, "joint-residuals"),
+        ({"vehicle": 1.1 * MOST_MOVED_SD}, "joint-moves"),
+        ({"spans": 12.0}, "joint-spans"),
+        ({"converged": False}, "joint-converged"),
+    ],
+)
+def test_a_fit_that_cannot_be_believed_turns_red(wrong, code):
+    assert all(each.passed for each in credibility(fit_with(cost=597.0)))
+    assert [each.code for each in credibility(fit_with(**{"cost": 597.0, **wrong})) if not each.passed] == [code]

@@ -1,0 +1,81 @@
+"""Can a fit be believed? Does it explain the measurements, with a vehicle and instruments that are as stated?
+
+Gauss-Newton steps also end where nothing flies as the flight did: in a false minimum, with a vehicle far from the
+stated one, or with a motion that does not join from span to span. Each check is a finding about data or model, as those
+of the reconstruction are (`recon.consistency`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from postflight.reconciliation.fit import JointFit, mismatched_spans
+from postflight.reconciliation.forward_model import MOTION
+from recon.consistency import ConsistencyCheck, consistency_check
+
+CONFIDENCE = 0.999  # as the reconstruction's checks
+MOST_MOVED_SD = 4.0  # of some forty parameters of a right fit one is beyond it in two fits of a thousand
+JOINT_WORDS = (
+    "another joint, or freeplay (--freeplay), than was fitted; mass properties or sensors' places that are wrong"
+)
+# their a priori law says next to nothing of them
+OPEN = ("stiffness", "damping", "freeplay", "hardening")
+
+
+def credibility(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
+    """Checks of residuals, moves, joins and convergence."""
+    return (_residuals(fit), _moves(fit), _spans(fit), _convergence(fit))
+
+
+def _residuals(fit: JointFit) -> ConsistencyCheck:
+    """All residuals against chi-square: one each for what was measured, joined and stated, less one a parameter."""
+    problem = fit.problem
+    # every parameter but the motion has an a priori residual; the first motion has nine of its twelve
+    degrees = int((problem.weight > 0.0).sum()) + fit.residuals.joins.size - MOTION * problem.measured.spans + 9
+    high = float(chi2.ppf(CONFIDENCE, degrees)) / degrees
+    return consistency_check(
+        "joint-residuals", "reconciliation: residuals", fit.residuals.cost / degrees, 0.0, high,
+        "residuals no larger than predicted", "residuals are larger than predicted", advice=JOINT_WORDS,
+    )  # fmt: skip
+
+
+def _moves(fit: JointFit) -> ConsistencyCheck:
+    """Largest move of what is stated of vehicle and instruments, over its a priori sd."""
+    names = fit.problem.vehicle_parameters.names
+    stated = np.array([name not in OPEN for name in names])
+    moved = np.abs(np.concatenate([fit.parameters.vehicle * stated, fit.parameters.instruments]))
+    worst = int(np.argmax(moved))
+    name = names[worst] if worst < len(names) else _instrument(worst - len(names))
+    return consistency_check(
+        "joint-moves", "reconciliation: moves of what is stated", float(moved[worst]), 0.0, MOST_MOVED_SD,
+        f"vehicle and instruments are as stated; largest: {name}, {moved[worst]:.1f} sd",
+        f"{name} is {moved[worst]:.1f} sd from what is stated",
+        advice="the interval of the joint cannot be believed; check the vehicle file and the sensors' places",
+        component=name,
+    )  # fmt: skip
+
+
+def _instrument(number: int) -> str:
+    if number >= 18:
+        return ("rates' clock", "accelerometer's clock")[number - 18]
+    return "rates' errors" if number < 9 else "accelerometer's errors"
+
+
+def _spans(fit: JointFit) -> ConsistencyCheck:
+    """Number of spans that do not match their measurements or their neighbours."""
+    count = int(mismatched_spans(fit).sum())
+    bad = f"{count} of {fit.problem.measured.spans} spans do not match sensors or neighbours"
+    return consistency_check(
+        "joint-spans", "reconciliation: spans", count, 0.0, 0.0, "all spans match sensors and neighbours", bad,
+        advice="the motion between them is not the fitted joint's",
+    )  # fmt: skip
+
+
+def _convergence(fit: JointFit) -> ConsistencyCheck:
+    """Whether the last step had nothing left to gain."""
+    return consistency_check(
+        "joint-converged", "reconciliation: convergence", float(not fit.converged), 0.0, 0.0,
+        f"converged in {fit.steps} steps", f"not converged after {fit.steps} steps",
+        advice="estimates and intervals are those of the last step",
+    )  # fmt: skip
