@@ -110,11 +110,15 @@ class Deflections(Tabular):
 
 
 def quantiles_at(history: DeflectionHistory, at_s: float) -> FloatArray:
-    """Quantiles (5,) of the angle at a time, rad, by straight lines between answers; NaN where it has none."""
-    known = np.isfinite(history.theta_quantiles_rad).all(axis=1)
-    if not np.isfinite(history.at(at_s)[0]) or not known.any():
+    """Quantiles (5,) of the angle at a time, rad, between answers as wide as the sd of `at`; NaN without one."""
+    quantiles, (theta, sd) = history.theta_quantiles_rad, history.at(at_s)
+    known = np.isfinite(quantiles).all(axis=1)
+    if not np.isfinite(theta) or not known.any():
         return np.full(len(QUANTILE_COLUMNS), np.nan)
-    return np.array([np.interp(at_s, history.time_s[known], c) for c in history.theta_quantiles_rad[known].T])
+    t = history.time_s[known]
+    between = np.array([np.interp(at_s, t, c) for c in quantiles[known].T])
+    middle, own = between[len(between) // 2], float(np.interp(at_s, t, history.theta_sd_rad[known]))
+    return np.asarray(np.maximum(middle + (between - middle) * (sd / own if own > 0.0 else 1.0), 0.0))
 
 
 def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = None) -> DeflectionHistory:

@@ -9,7 +9,7 @@ from estimators.agreement import OFFSET
 from estimators.evidence import moved_vehicle
 from flightmodel.checks import Fault
 from flightmodel.deflection import history_from_lateral
-from postflight.deflections import Deflections
+from postflight.deflections import Deflections, quantiles_at
 from postflight.fusing import fuse_flight
 from tests.estimators.conftest import VEHICLE, pulse_of
 
@@ -122,6 +122,20 @@ def test_a_slight_fault_widens_the_answer():
     # three sd of C_m: odds name it, no pair fails
     answer = fuse_flight(sound(moved_vehicle(VEHICLE, {"C_m": 4.0})), film(motion()))
     assert abs(error_sd(answer)[0]) < 2.0
+
+
+def test_quantiles_between_frames_are_as_wide_as_the_sd():
+    # of a sparse film that swings, what a straight line misses widens both
+    t = 430.0 + 0.25 * np.arange(20)
+    swing = np.deg2rad(4.0 + 0.8 * np.sin(2.0 * np.pi * 1.6 * t))[:, None] * np.array([0.8, -0.6])
+    sparse = film(swing, t, np.deg2rad(0.02))
+    for at_s in (t[7], t[7] + 0.12):
+        theta, sd = sparse.at(at_s)
+        low, inner_low, middle, inner_high, high = quantiles_at(sparse, at_s)
+        assert middle == pytest.approx(theta, abs=0.1 * sd)
+        assert 0.5 * (inner_high - inner_low) == pytest.approx(sd, rel=0.1)
+        assert 0.5 * (high - low) == pytest.approx(1.645 * sd, rel=0.1)
+    assert np.isnan(quantiles_at(sparse, 500.0)).all()
 
 
 def test_a_refused_fusion_is_a_red_check():
