@@ -56,6 +56,7 @@ Residual = Callable[[Vehicle, Coefficients, Swing, FlightLoads], FloatArray]
 _NEWTON_STEPS, _SETTLED_RAD = 6, 1e-6  # from the small angles' solution four suffice
 _THETA_RAD, _RATE_RADPS, _TURN_RADPS2, _FORCE_MPS2, _PRESSURE = 1e-5, 1e-3, 1e-2, 1e-4, 1e-4
 _OF_SD = 0.01  # of a vehicle's input
+_LEAST_DETERMINANT = 1e-9  # of a balance's derivative by the deflection: of a force 1, of a moment some 0.1 m^2
 _LEAST_VAR = 1e-16  # rad^2, so that a root exists where nothing errs
 _OSCILLATION_WINDOW_S = 2.0  # about a period of the slow aerodynamic mode, over which the joint's is averaged
 _BODIES = ("aeroshell", "centerbody")
@@ -241,12 +242,20 @@ def held_balance(residual: Residual, loads: FlightLoads, start_yz_rad: FloatArra
         moved = [
             residual(vehicle, vehicle.aero.at, Swing.held(theta + _THETA_RAD * e), loads) - base for e in np.eye(2)
         ]
-        change = np.linalg.solve(np.stack(moved, -1) / _THETA_RAD, base[:, :, None])[:, :, 0]
-        theta = theta - change
+        inverse, good = _inverse(np.stack(moved, -1) / _THETA_RAD)
+        change = np.where(good[:, None], (inverse @ base[:, :, None])[:, :, 0], np.inf)
+        theta = np.where(good[:, None], theta - change, theta)
     settled: BoolArray = np.asarray(
         np.isfinite(start_yz_rad).all(axis=1) & (np.linalg.norm(change, axis=1) < _SETTLED_RAD)
     )
     return Swing.held(np.where(settled[:, None], theta, np.nan))
+
+
+def _inverse(matrices: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Inverses of (n, 2, 2) and where they exist; identities elsewhere, as far from a solution."""
+    size = np.linalg.det(matrices)
+    good: BoolArray = np.asarray(np.isfinite(size) & (np.abs(size) > _LEAST_DETERMINANT))
+    return np.asarray(np.linalg.inv(np.where(good[:, None, None], matrices, np.eye(2)))), good
 
 
 def evidence_of_balance(
@@ -288,7 +297,8 @@ def evidence_of_balance(
     by_theta = np.stack([column(left(at=swing.moved(_THETA_RAD * e, none, none)), _THETA_RAD) for e in along], -1)
     by_rate = np.stack([column(left(at=swing.moved(none, _RATE_RADPS * e, none)), _RATE_RADPS) for e in along], -1)
     by_turn = np.stack([column(left(at=swing.moved(none, none, _TURN_RADPS2 * e)), _TURN_RADPS2) for e in along], -1)
-    solve: FloatArray = np.asarray(np.linalg.inv(by_theta))
+    solve, good = _inverse(by_theta)
+    known = np.asarray(known & good)
     by_rate, by_turn = solve @ by_rate, solve @ by_turn
     read = swing.theta_yz_rad - (solve @ base[:, :, None])[:, :, 0]
     read += np.einsum("nij,nj->ni", by_rate, swing.rate_yz_radps)

@@ -338,6 +338,11 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     found = problem.mean(problem.process_size(), method)
     for step in range(MOST_STEPS):
         readings = [e for e in read(inputs, problem.history(found)) if e.method in methods]
+        if min(np.isfinite(e.theta_yz_rad).all(axis=1).sum() for e in readings) < LEAST_SAMPLES:
+            raise DivergenceError(
+                f"{method}: the steps lead to deflections at which no method has an answer; see each method's own",
+                code="fusion-not-converged",
+            )
         problem, before = NormalEquations.of(readings, inputs, span), found
         found, covariance = problem.solved(_FREE_RADPS2, method)
         size = 2 * problem.spline.count

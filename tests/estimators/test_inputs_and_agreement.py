@@ -57,6 +57,21 @@ def test_every_response_is_that_of_moving_the_input(method):
         assert np.abs(base.by_input[PRESSURE]).max() > 1e-4
 
 
+@pytest.mark.parametrize("method", [misalignment_evidence, trim_evidence])
+def test_far_from_any_solution_there_is_no_reading_rather_than_an_error(method):
+    # turned over, or not a number: where the balance does not move with the deflection nothing is read
+    pulse = alive()
+    for far in (np.pi, 1e3, np.nan):
+
+        def about(time_s, derivative=0, far=far):
+            return np.full((len(time_s), 2), far if derivative == 0 else 0.0)
+
+        read = method(pulse, about).theta_yz_rad
+        assert read.shape == (len(pulse.time_s), 2)
+        if np.isnan(far):
+            assert np.isnan(read).all()
+
+
 def test_under_spin_the_gyros_errors_move_the_trim():
     # gyroscopic: a lateral rate that is read wrong, at 50 rpm; nothing else of the sensors errs here
     pulse, rng = alive(), np.random.default_rng(6)
