@@ -418,7 +418,9 @@ def history_of_evidence(evidence: Evidence, loads: FlightLoads, assumptions: str
 def _curved_draws(evidence: Evidence, swinging: FloatArray) -> FloatArray:
     """Deflections ``(n, k, 2)`` drawn with the reading's curvature by its most uncertain input, C_m."""
     assert evidence.half_curvature_rad is not None
-    normals, by_moment = standard_normals(3), evidence.by_input["C_m"][:, :, 0]
+    # without samples, or of a C_m that is known, there is no response
+    by_moment = evidence.by_input.get("C_m", np.zeros((len(evidence.time_s), 2, 1)))[:, :, 0]
+    normals = standard_normals(3)
     others = evidence.independent_cov + swinging
     for name, response in evidence.by_input.items():
         if name != "C_m":

@@ -20,7 +20,7 @@ from estimators.evidence import (
 from estimators.fusion import InputPosterior, fuse
 from estimators.misalignment import misalignment_evidence
 from estimators.southwell import LEFT_OUT, southwell_limbs
-from estimators.trim import SLOPE_AT_RAD, static_trim, trim_curvature, trim_evidence
+from estimators.trim import SLOPE_AT_RAD, estimate_trim, static_trim, trim_curvature, trim_evidence
 from flightmodel.deflection import history_from_lateral
 from synthetic_flight.linear import Slopes, linear_matrix
 
@@ -270,3 +270,13 @@ def test_critical_stiffness_is_where_the_linear_model_diverges():
 
     assert grows(0.995) > 0.05
     assert grows(1.005) < 0.01
+
+
+def test_a_flight_without_samples_or_with_a_known_moment_has_its_trim():
+    # no sample decelerates enough; C_m stated as known has no response
+    pulse, _ = pulse_of(np.random.default_rng(14), 12)
+    weak = replace(pulse, specific_force_body_mps2=0.01 * pulse.specific_force_body_mps2)
+    assert np.isnan(estimate_trim(weak).theta_rad).all()
+    known = replace(VEHICLE, uncertainty=VEHICLE.uncertainty.model_copy(update={"cm": 0.0}))
+    history = estimate_trim(replace(pulse, vehicle=known))
+    assert np.isfinite(history.theta_quantiles_rad).all()
