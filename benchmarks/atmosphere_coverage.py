@@ -2,8 +2,8 @@
 
 Run: ``python benchmarks/atmosphere_coverage.py [FLIGHTS [FIRST SEED]] [--exact-shape] [--packages FOLDER]`` (40 flights
 from seed 100). Some 4 s a flight. Flights are `tests.wide_flights`; half of the variance of C_A's error changes with
-Mach number, or none of it with ``--exact-shape``, and the analyst is told which. Scored are, every kilometre, the true
-density over the sounding's and both winds, and in every flight the C_A scale: the log of flown over told ``C_A / m``,
+Mach number, or none of it with ``--exact-shape``, and the analyst knows which. Scored are, every kilometre, the true
+density over the sounding's and both winds, and in every flight the C_A scale: the log of flown over stated ``C_A / m``,
 mean over the pressure pulse, since a force over a mass is what an accelerometer sees. Every flight is scored with the
 simulator's sounding, whose mean level errs by 0.6 sd, and with one drawn as the estimator takes it (0.7 sd).
 
@@ -41,11 +41,11 @@ from tests.wide_flights import flown, wide_flight
 SHAPE_PART, ENTRY_S, CONFIDENCE = 0.5, 400.0, 0.999
 
 
-def stated_sounding(true, told, rng):
+def stated_sounding(true, stated, rng):
     """Sounding of the true air whose errors are drawn as they are stated."""
-    z = np.arange(0.0, told.altitude_m[-1] + 1.0, 250.0)
+    z = np.arange(0.0, stated.altitude_m[-1] + 1.0, 250.0)
     air, standard = true.at(z), us76(z)
-    density_sd, wind_sd = (np.interp(z, told.altitude_m, sd) for sd in (told.density_sd, told.wind_sd_mps))
+    density_sd, wind_sd = (np.interp(z, stated.altitude_m, sd) for sd in (stated.density_sd, stated.wind_sd_mps))
 
     def error(length):
         root = sounding_correlation_root(z, length)
@@ -91,12 +91,12 @@ def scored(one, telemetry, solution, truth, sounded):
     """Errors with one sounding, and the red checks."""
     found = as_flown_atmosphere(telemetry, solution, sounded, CONFIDENCE)
     altitude = found.profile.altitude_m.to_numpy()
-    true, told = truth.profile.at(altitude), sounded.at(altitude)
+    true, stated = truth.profile.at(altitude), sounded.at(altitude)
     q = found.drag.dynamic_pressure_pa
     in_pulse = found.drag.mach[q >= 0.5 * q.max()].to_numpy()
-    ca = np.log(one.ca_factor(in_pulse) * one.told.mass_kg / one.flown.mass_kg).mean()
-    wind = (true.wind_ned_mps - told.wind_ned_mps)[:, :2]
-    return errors_of(found, true.density_kgpm3 / told.density_kgpm3, wind, ca), red(found)
+    ca = np.log(one.ca_factor(in_pulse) * one.stated.mass_kg / one.flown.mass_kg).mean()
+    wind = (true.wind_ned_mps - stated.wind_ned_mps)[:, :2]
+    return errors_of(found, true.density_kgpm3 / stated.density_kgpm3, wind, ca), red(found)
 
 
 def package(folder, shape_part):
@@ -113,10 +113,10 @@ def package(folder, shape_part):
     place = np.column_stack([truth[f"{axis}_ecef_m"] for axis in "xyz"])
     velocity = np.column_stack([truth[f"v{axis}_ecef_mps"] for axis in "xyz"])
     latitude, longitude, altitude = earth.geodetic_from_ecef(place)
-    told = sounded.at(altitude)
+    stated = sounded.at(altitude)
     ned = np.einsum("nij,nj->ni", earth.dcm_ned_ecef(latitude, longitude), velocity)
-    speed = np.linalg.norm(ned - told.wind_ned_mps, axis=1)
-    ratio = 2.0 * truth["dynamic_pressure_pa"] / speed**2 / told.density_kgpm3
+    speed = np.linalg.norm(ned - stated.wind_ned_mps, axis=1)
+    ratio = 2.0 * truth["dynamic_pressure_pa"] / speed**2 / stated.density_kgpm3
     order = np.argsort(altitude)
     at = found.profile.altitude_m.to_numpy()
     mass = about["vehicle"]["mass_shell"] + about["vehicle"]["mass_body"]

@@ -2,10 +2,10 @@
 
 Run: ``python benchmarks/estimator_coverage.py [FLIGHTS [FIRST SEED]] [FOLDER] [--planted] [--packages FOLDER]`` (100
 flights from seed 0). Drawn anew for each seed, as `tests.wide_flights` says: spin, joint, damping, offset, size and
-mass of the vehicle, and what the analyst is not told of it. No video. Some 4 s a flight on each of two cores; what the
+mass of the vehicle, and what is unknown of it. No video. Some 4 s a flight on each of two cores; what the
 estimators see and the truth are kept in FOLDER, so that the estimators can be scored again without flying. The
 camera's history is drawn, not rendered. ``--planted`` spoils one assumption at a time, with uncertainties as the
-reference vehicle's file states them; ``suspects_bound.py`` says how well the same errors could be told at all.
+reference vehicle's file states them; ``suspects_bound.py`` says how well the same errors could be found at all.
 ``--packages`` scores flights of another simulator: folders with flight.toml and truth/truth.csv.
 """
 
@@ -56,7 +56,7 @@ STATED = (
     "accelerometer_time_bias_sd_s",
     "gyro_time_bias_sd_s",
     "cg_from_sensor_m",
-)  # follow from what the analyst is told
+)  # follow from what the vehicle file states
 ARRAYS = [f.name for f in fields(FlightLoads) if f.name not in STATED]
 CAMERA_SD = {"clean": np.deg2rad(0.15), "degraded": np.deg2rad(0.40)}
 CAMERA_CLOCK = np.deg2rad(153.0)
@@ -87,7 +87,7 @@ def flown_pulse(seed):
         pulse = loads_of(telemetry)
     t = pulse.time_s
     path = resample(truth.trajectory, t)
-    air = air_data(path, truth.profile, one.told.cg_m)
+    air = air_data(path, truth.profile, one.stated.cg_m)
     known = {
         "theta_yz": columns(t, truth.time_s, truth.deflection.theta_yz_rad),
         "flow_yz": lateral_angles(air.velocity_air_body_mps),
@@ -124,7 +124,7 @@ def kept_flight(folder, seed):
             arrays[name] = float(arrays[name])
         truth = {k.removeprefix("true_"): data[k] for k in data.files if k.startswith("true_")}
     one = wide_flights.wide_flight(seed)
-    spec, vehicle = one.scenario.spec, one.told
+    spec, vehicle = one.scenario.spec, one.stated
     arm = vehicle.cg_m - vehicle.sensors[ACCELEROMETER_MOUNT].position_from_datum_body_m
     stated = (vehicle, vehicle.cg_m, spec.accelerometer.time_bias_s, spec.rates.time_bias_s, arm)
     return FlightLoads(**arrays, **dict(zip(STATED, stated, strict=True))), truth
@@ -162,8 +162,8 @@ def camera_history(rng, truth_yz, time_s, sd_rad):
 def planted(pulse, camera, what):
     """Pulse and camera with one assumption wrong, as the analyst would have it."""
     if what == COEFFICIENTS:
-        told = replace(pulse.vehicle, aero=pulse.vehicle.aero.scaled(cm=1.15, cn=1.15))
-        return replace(pulse, vehicle=told), camera
+        wrong = replace(pulse.vehicle, aero=pulse.vehicle.aero.scaled(cm=1.15, cn=1.15))
+        return replace(pulse, vehicle=wrong), camera
     if what in (MOUNT, FORCE_ALONE):
         # a reconstruction takes the force's direction for the attitude's: the flow turns by the same angle
         turned = rotations.exp(np.array([0.0, *TURN_YZ_RAD]))
@@ -173,10 +173,10 @@ def planted(pulse, camera, what):
     if what == OFFSET:
         body = pulse.vehicle.centerbody
         x, y, z = body.cg_from_datum_body_m
-        told = replace(
+        wrong = replace(
             pulse.vehicle, centerbody=body.model_copy(update={"cg_from_datum_body_m": (x, y + 0.004, z - 0.003)})
         )
-        return replace(pulse, vehicle=told), camera
+        return replace(pulse, vehicle=wrong), camera
     if what == CAMERA_MISALIGNED:
         return pulse, replace(camera, plane_lv_rad=camera.plane_lv_rad + np.deg2rad(25.0))
     return pulse, camera
@@ -186,7 +186,7 @@ def scored(seed, folder, what):
     """Errors and error bars at peak pressure of every method; what the agreement test says."""
     pulse, truth = kept_flight(folder, seed)
     use = pulse.through_pulse
-    if what is not None:  # errors told as the vehicle file has them, not at the sizes of the ensemble
+    if what is not None:  # errors stated as in the vehicle file, not at the sizes of the ensemble
         known = vehicle_from_toml(vehicle_path("irve2_reference")).uncertainty
         pulse = replace(pulse, vehicle=replace(flown_aero(pulse.vehicle, truth, known), uncertainty=known))
     out = {"seed": seed, "words": str(truth["words"]), "spin": float(truth["spin"]), "locked": bool(truth["locked"])}
@@ -220,10 +220,10 @@ def of_planted(found, pulse, truth):
     }  # fmt: skip
 
 
-def flown_aero(vehicle, truth, told):
-    """Vehicle whose coefficients are off by draws of the told sizes: the drawn ones of the ensemble, scaled down."""
+def flown_aero(vehicle, truth, stated):
+    """Vehicle whose coefficients are off by draws of the stated sizes: the drawn ones of the ensemble, scaled down."""
     z = (truth["factors"] - 1.0) / [COEFFICIENT_SD[k] for k in ("ca", "cn", "cm")]
-    wrong = truth["factors"] / (1.0 + z * [told.ca, told.cn, told.cm])
+    wrong = truth["factors"] / (1.0 + z * [stated.ca, stated.cn, stated.cm])
     return replace(vehicle, aero=vehicle.aero.scaled(*wrong))
 
 
@@ -314,12 +314,12 @@ def report_planted(results, what):
     rows = [r for r in results if not r["words"]]
     red = sum(r["red"] for r in rows)
     # a refusal names its fault hypotheses in its message
-    told = [r["named"] if r["named"] is not None else named_in(r["refused"][0]) for r in rows]
+    named = [r["named"] if r["named"] is not None else named_in(r["refused"][0]) for r in rows]
     refused = sum(r["named"] is None for r in rows)
     right = PLANTED[what]
-    first, any_of = sum(n[:1] == (right,) for n in told), sum(right in n for n in told)
+    first, any_of = sum(n[:1] == (right,) for n in named), sum(right in n for n in named)
     words = f"red {red} of {len(rows)} ({refused} no common answer), named {any_of}, first or alone {first}"
-    print(f"{what} wrong: {words}; {dict(Counter(' or '.join(n) for n in told if n))}", flush=True)
+    print(f"{what} wrong: {words}; {dict(Counter(' or '.join(n) for n in named if n))}", flush=True)
 
 
 def named_in(words):

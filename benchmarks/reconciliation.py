@@ -1,13 +1,13 @@
-"""Is the joint found, and do its intervals hold? Dispersed flights of a joint that the fit is not told.
+"""Is the joint found, and do its intervals hold? Dispersed flights of a joint that the fit does not know.
 
 Run: ``python benchmarks/reconciliation.py [FLIGHTS] [--first SEED] [--hardening SHARE | --freeplay DEG]`` (30 flights).
 Plain joints fly the wide flights of `tests.wide_flights`: spin to 60 rpm, joints of 1 to 50 kN m/rad (every eighth
-locked, of which a true lower bound is wanted), vehicles of 60 to 400 kg; told is the reference vehicle's joint
+locked, of which a true lower bound is wanted), vehicles of 60 to 400 kg; stated is the reference vehicle's joint
 whatever flies. Printed are errors, their rms over the stated standard deviation, and the shares inside one and two;
 fits with a failed consistency check are counted, and scored with the others.
 
 With ``--hardening`` the spring's slope is by that share steeper at 4 deg, with ``--freeplay`` the joint has so much of
-it; 0 flies plain joints. These flights are nearer to the reference vehicle: stiffness up to half above the told one,
+it; 0 flies plain joints. These flights are nearer to the reference vehicle: stiffness up to half above the stated one,
 damping ratio, size and side of the c.g.'s offset, masses, stations, inertias, coefficients, start, spin, air, the
 sounding's and every instrument's errors in the sizes that vehicle file and data sheets state. Then each flight is asked
 for the law (`postflight.reconciliation.fit`), and printed are the odds and the law's effect: the flight is flown once
@@ -147,9 +147,9 @@ def law_words(selection, asked, seed, truth, law, odds, effects):
     odds.append([selection.log_odds[name] for name in asked])
     other = reconstructed(seed, flown_vehicle(seed)[0])[1] if any(law.values()) else truth
     effects.append(effects_sd(selection.compared[asked[0]][0], truth, other))
-    told = ", ".join(f"{name} {value:+.1f}" for name, value in selection.log_odds.items())
+    listed = ", ".join(f"{name} {value:+.1f}" for name, value in selection.log_odds.items())
     equal, missed = effects[-1]
-    words = f", log odds of {told}, effect {equal:.1f} sd, missed by the plain fit {missed:.1f} sd"
+    words = f", log odds of {listed}, effect {equal:.1f} sd, missed by the plain fit {missed:.1f} sd"
     if "freeplay" in selection.fit.problem.vehicle_parameters.laws:
         got = joint_table(selection.fit).set_index("quantity").loc["freeplay"]
         words += f", freeplay {got.found:.4f} +/- {got.sd:.4f} deg"

@@ -2,9 +2,9 @@
 
 Spin 0 to 60 rpm, joints of 1 to 50 kN m/rad (every eighth flight's is locked), damping 0.2 to 3 %, c.g. offsets of 0 to
 8 mm in any plane, vehicles of 60 to 400 kg: the reference vehicle's shape, with lengths as the cube root of the mass
-and 10 % of their own. The analyst is told the mass properties, the offset to a millimetre, the coefficients, and the
-reference vehicle's joint whatever flies. Not told are masses, c.g.s, the two inertias of each body (each by itself) and
-the centerbody's products, the joint, the coefficients (in the sizes that the told vehicle states), start, air, and
+and 10 % of their own. The analyst has the mass properties, the offset to a millimetre, the coefficients, and the
+reference vehicle's joint whatever flies. Unknown are masses, c.g.s, the two inertias of each body (each by itself),
+the centerbody's products, the joint, the coefficients (in the sizes that the stated vehicle states), start, air, and
 every instrument's errors. The analyst knows what part of the variance of C_A's error changes with Mach number: none,
 or ``ca_shape_part``.
 """
@@ -37,13 +37,13 @@ PEAK_PA, LEAST_MARGIN = 1250.0, 1.3  # of the reference vehicle; of a joint's st
 
 @dataclass(frozen=True)
 class WideFlight:
-    """What the analyst is told, and what flew; ``factors`` on C_A, C_N, C_m and the shift of C_mq.
+    """What the vehicle file states, and what flew; ``factors`` on C_A, C_N, C_m and the shift of C_mq.
 
     ``ca_shape`` is the log of another factor on C_A at the Mach numbers ``SHAPE_MACH``.
     """
 
     seed: int
-    told: Vehicle
+    stated: Vehicle
     scenario: Scenario
     factors: dict[str, float]
     locked: bool
@@ -55,17 +55,17 @@ class WideFlight:
         return self.scenario.vehicle
 
     def ca_factor(self, mach: np.ndarray) -> np.ndarray:
-        """Flown over told C_A at Mach numbers."""
+        """Flown over stated C_A at Mach numbers."""
         return self.factors["ca"] * np.exp(np.interp(mach, SHAPE_MACH, self.ca_shape))
 
 
 def wide_flight(seed: int, ca_shape_part: float = 0.0) -> WideFlight:
     """Draw one flight; any ``ca_shape_part`` leaves all other draws as they are."""
     rng = np.random.default_rng([seed, 18, 2009])
-    told = _told(rng)
-    told = replace(told, uncertainty=told.uncertainty.model_copy(update={"ca_shape_part": ca_shape_part}))
-    flown, factors = _flown(told, rng, np.sqrt(1.0 - ca_shape_part))
-    shape = np.sqrt(ca_shape_part) * told.uncertainty.ca * _unit_shape(np.random.default_rng([seed, 5, 18, 2009]))
+    stated = _stated(rng)
+    stated = replace(stated, uncertainty=stated.uncertainty.model_copy(update={"ca_shape_part": ca_shape_part}))
+    flown, factors = _flown(stated, rng, np.sqrt(1.0 - ca_shape_part))
+    shape = np.sqrt(ca_shape_part) * stated.uncertainty.ca * _unit_shape(np.random.default_rng([seed, 5, 18, 2009]))
     if ca_shape_part > 0.0:
         flown = replace(flown, aero=_reshaped(flown.aero, shape))
     locked = seed % 8 == 7
@@ -75,10 +75,10 @@ def wide_flight(seed: int, ca_shape_part: float = 0.0) -> WideFlight:
     initial = scenario.spec.initial.model_copy(update={"spin_rpm": spin})
     time = scenario.spec.time.model_copy(update={"stop_s": LAST_S})
     spec = scenario.spec.model_copy(update={"initial": initial, "time": time})
-    return WideFlight(seed, told, replace(scenario, spec=spec, vehicle=flown), factors, locked, shape)
+    return WideFlight(seed, stated, replace(scenario, spec=spec, vehicle=flown), factors, locked, shape)
 
 
-def _told(rng: np.random.Generator) -> Vehicle:
+def _stated(rng: np.random.Generator) -> Vehicle:
     """Reference vehicle of another size and mass, its offset anywhere."""
     nominal = vehicle_from_toml(vehicle_path("irve2_reference"))
     mass = _log_uniform(rng, MASS_KG) / nominal.mass_kg
@@ -122,14 +122,14 @@ def _reshaped(aero: AeroTable, shape: np.ndarray) -> AeroTable:
     return replace(aero, mach=mach, coefficients=coefficients, free_molecular=free)
 
 
-def _flown(told: Vehicle, rng: np.random.Generator, constant_ca: float) -> tuple[Vehicle, dict[str, float]]:
-    """Vehicle as it is: every number drawn around what is told, in the sizes that are told.
+def _flown(stated: Vehicle, rng: np.random.Generator, constant_ca: float) -> tuple[Vehicle, dict[str, float]]:
+    """Vehicle as it is: every number drawn around what is stated, in the sizes that are stated.
 
-    ``constant_ca`` is the part of the told sd of C_A that is one factor.
+    ``constant_ca`` is the part of the stated sd of C_A that is one factor.
     """
-    known, parts = told.uncertainty, {}
+    known, parts = stated.uncertainty, {}
     for name in ("aeroshell", "centerbody"):
-        part = getattr(told, name)
+        part = getattr(stated, name)
         cg = part.cg_m + rng.standard_normal(3) * [known.cg_station_m, known.cg_lateral_m, known.cg_lateral_m]
         along, across = 1.0 + known.inertia * rng.standard_normal(2)
         inertia = part.inertia * np.diag([along, across, across])
@@ -145,8 +145,8 @@ def _flown(told: Vehicle, rng: np.random.Generator, constant_ca: float) -> tuple
     factors = {k: float(1.0 + getattr(known, k) * rng.standard_normal()) for k in ("ca", "cn", "cm")}
     factors["ca"] = 1.0 + constant_ca * (factors["ca"] - 1.0)
     shift = float(known.cmq * rng.standard_normal())
-    aero = told.aero.scaled(**factors, cmq_shift=shift)
-    return replace(told, aero=aero, **parts), {**factors, "cmq_shift": shift}
+    aero = stated.aero.scaled(**factors, cmq_shift=shift)
+    return replace(stated, aero=aero, **parts), {**factors, "cmq_shift": shift}
 
 
 def _joint(flown: Vehicle, rng: np.random.Generator, locked: bool) -> CompliantJoint:
@@ -173,7 +173,7 @@ def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float
 
 
 def flown(one: WideFlight, folder: Path) -> tuple[Telemetry, Truth]:
-    """Fly, write the flight folder, and read it as its analyst has it: the told vehicle, sensors where they sit."""
+    """Fly, write the flight folder, and read it as its analyst has it: the stated vehicle, sensors where they sit."""
     truth = simulate_to_folder(one.scenario, one.seed, folder, replace=True)
     read = read_flight(folder)
     mounts = {"accelerometer": "suba", "rates": "suba", "magnetometer": "magnetometer"}
@@ -181,6 +181,6 @@ def flown(one: WideFlight, folder: Path) -> tuple[Telemetry, Truth]:
     for name, mount in mounts.items():
         record: TriadRecord | None = getattr(read, name)
         if record is not None:
-            place = np.array(one.told.sensors[mount].position_from_datum_body_m)
+            place = np.array(one.stated.sensors[mount].position_from_datum_body_m)
             placed[name] = replace(record, spec=replace(record.spec, position_from_datum_body_m=place))
-    return replace(read, vehicle=one.told, **placed), truth
+    return replace(read, vehicle=one.stated, **placed), truth

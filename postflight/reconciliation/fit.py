@@ -250,7 +250,7 @@ def _refit_with_turbulence(fit: JointFit, report: Progress, correct: Correction 
 def is_unresolved(problem: Problem, u: Parameters) -> bool:
     """Whether the joint is too fast for the windows: its stiffness is then bounded, and no step moves it further.
 
-    Neither stiffness nor damping can be told, and steps along them would go on without gain.
+    Neither stiffness nor damping can be determined, and steps along them would go on without gain.
     """
     vehicle = problem.vehicle_parameters.vehicle(u.vehicle)
     return vehicle.joint.bending_stiffness_nmprad >= resolved_stiffness_nmprad(vehicle)

@@ -46,7 +46,7 @@ KNOT_M, UPPER_KNOT_M = 125.0, 250.0
 UPPER_M, TOP_M, BELOW_M = 75e3, 105e3, 1e3
 # a priori standard deviations; of factors those of their logarithms
 STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 1.5, 1.0, 0.005
-LEAST_INERTIA = 0.01  # of the told one: a trial step never makes an inertia negative
+LEAST_INERTIA = 0.01  # of the stated one: a trial step never makes an inertia negative
 FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
 # hardening is counted as the share by which the tangent stiffness has grown at this angle; negative: it softens
 HARDENING_AT_RAD = np.deg2rad(4.0)
@@ -236,7 +236,9 @@ MOST_PHASE_RAD = 0.8  # of a joint's mode in a step, with an error of a percent 
 # damping ratio of a mode that windows do not resolve: its oscillation decays within a few windows, and deflections lag
 # their load by few milliseconds. From so many periods a window (10.7 Hz) it grows, over so many more (to 12.5 Hz)
 UNRESOLVED_RATIO, UNRESOLVED_FROM, UNRESOLVED_BLEND = 0.2, 0.43, 0.07
-RESOLVED = 0.41  # periods a window (10.2 Hz) up to which a stiffness is told: a fit of a faster joint ends at the next
+RESOLVED = (
+    0.41  # periods a window (10.2 Hz) up to which a stiffness can be resolved: a fit of a faster joint ends at the next
+)
 
 
 @dataclass(frozen=True)

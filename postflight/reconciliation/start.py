@@ -1,8 +1,8 @@
 """From which stiffness does the fit begin?
 
-A joint may be ten times softer or a thousand times stiffer than the vehicle file tells, and Gauss-Newton steps from a
+A joint may be ten times softer or a thousand times stiffer than the vehicle file states, and Gauss-Newton steps from a
 joint that diverges under the flight's loads, or from one far too soft, end with another vehicle. So a few spans about
-the largest dynamic pressure are fitted from several stiffnesses, counted from the one at which the told vehicle
+the largest dynamic pressure are fitted from several stiffnesses, counted from the one at which the stated vehicle
 diverges, with wide standard deviations; the fit begins with the stiffness that explains them best.
 """
 
@@ -27,7 +27,7 @@ from postflight.reconciliation.gauss_newton import Parameters, Problem, descend
 from postflight.reconstruction import Reconstruction
 from synthetic_flight.linear import critical_stiffness_nmprad, slopes_at
 
-# over the stiffness at which the told vehicle diverges; from one to the next two steps reach
+# over the stiffness at which the stated vehicle diverges; from one to the next two steps reach
 CANDIDATES = (1.2, 1.8, 3.5, 10.0, 40.0, 200.0)
 STEPS, SD_FACTOR = 2, 30.0  # as the fit's own first step
 SPANS = 24  # about 10 s: several periods of the vehicle's own oscillation under load
@@ -89,11 +89,11 @@ def damping_guess(problem: Problem, x: FloatArray) -> float:
 
 
 def critical_stiffness(flight: Reconstruction) -> float:
-    """Bending stiffness, N m/rad, below which the told vehicle diverges at the flight's largest load."""
-    pulse, told = flight.required_loads(), flight.telemetry.required_vehicle()
+    """Bending stiffness, N m/rad, below which the stated vehicle diverges at the flight's largest load."""
+    pulse, stated = flight.required_loads(), flight.telemetry.required_vehicle()
     pressure, mach = pulse.dynamic_pressure_pa[::EVERY_LOAD].tolist(), pulse.mach[::EVERY_LOAD].tolist()
     at = zip(pressure, mach, strict=True)
-    return max(critical_stiffness_nmprad(told, slopes_at(told, each), load) for load, each in at)
+    return max(critical_stiffness_nmprad(stated, slopes_at(stated, each), load) for load, each in at)
 
 
 def loaded_part(measured: Measurements) -> Measurements:
