@@ -13,7 +13,7 @@ vector of the shell against the body is ``theta * x_hat x d``; that of the body 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,9 +44,14 @@ def lv_clock(lateral_yz: FloatArray) -> FloatArray:
 
 def rotation_vector_body_shell(theta_rad: FloatArray, plane_lv_rad: FloatArray) -> FloatArray:
     """Rotation vector, rad, of the shell against the body: ``q_body_shell = exp(it)``."""
-    d = lv_direction(plane_lv_rad)
-    x_hat = np.broadcast_to(np.array([1.0, 0.0, 0.0]), d.shape)
-    return np.asarray(theta_rad, dtype=float)[..., None] * np.cross(x_hat, d)
+    size = np.asarray(theta_rad, dtype=float)[..., None]
+    return rotation_vector_of_lateral(size * lv_direction(plane_lv_rad)[..., 1:])
+
+
+def rotation_vector_of_lateral(theta_yz_rad: FloatArray) -> FloatArray:
+    """Rotation vectors ``(..., 3)``, rad, of the shell against the body: ``x_hat x theta`` of lateral ones (..., 2)."""
+    y, z = np.moveaxis(theta_yz_rad, -1, 0)
+    return np.stack([np.zeros_like(y), -z, y], axis=-1)
 
 
 @dataclass(frozen=True, repr=False)
@@ -130,7 +135,7 @@ class DeflectionHistory(Tabular):
             return np.full(len(self.time_s), np.nan)
         return np.sqrt(self.covariance[:, 0, 0])
 
-    @property
+    @cached_property
     def theta_quantiles_rad(self) -> FloatArray:
         """Angle ``(n, 5)``, rad, below which `QUANTILES` of the posterior lie; NaN without covariance.
 
@@ -139,10 +144,7 @@ class DeflectionHistory(Tabular):
         if self.draws_yz_rad is not None:
             return np.asarray(np.quantile(np.linalg.norm(self.draws_yz_rad, axis=2), QUANTILES, axis=1).T)
         out = np.full((len(self.time_s), len(QUANTILES)), np.nan)
-        cov = self.lateral_cov
-        # without a plane: as well known across as along
-        lost = np.isnan(cov[:, 0, 0]) & np.isfinite(self.theta_sd_rad)
-        cov[lost] = self.theta_sd_rad[lost, None, None] ** 2 * np.eye(2)
+        cov = self.lateral_cov_without_plane
         known = np.isfinite(cov[:, 0, 0]) & np.isfinite(self.theta_rad)
         value, axes = np.linalg.eigh(cov[known])
         root = axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]
@@ -169,6 +171,14 @@ class DeflectionHistory(Tabular):
         cov = turn @ self.covariance @ turn.transpose(0, 2, 1)
         lost = self.covariance[:, 1, 1] > UNIFORM_VAR * (1.0 - 1e-6)
         return np.where(lost[:, None, None], np.nan, cov)
+
+    @property
+    def lateral_cov_without_plane(self) -> FloatArray:
+        """`lateral_cov` ``(n, 2, 2)``, rad^2; where the plane is not known, as well known across as along."""
+        cov = self.lateral_cov
+        lost = np.isnan(cov[:, 0, 0]) & np.isfinite(self.theta_sd_rad)
+        cov[lost] = self.theta_sd_rad[lost, None, None] ** 2 * np.eye(2)
+        return cov
 
     def at(self, time_s: float) -> tuple[float, float]:
         """Angle and its sd, rad, at one time by linear interpolation between answers; NaN outside them and in holes.

@@ -255,29 +255,39 @@ class _Sources:
 
 def _without_each(sources: _Sources, bias_sd_s: float) -> FusedAnswer | None:
     """Answer where all methods contradict each other: without the one at fault, or a mixture; None if there is none."""
-    rest: dict[str, FusedAnswer] = {}
+    if len(sources.names) == 2:
+        return _of_either(sources)
+    rest = {}
     for name in sources.names:
         others = tuple(n for n in sources.names if n != name)
         try:
             rest[name] = sources.answer(others, bias_sd_s if "camera" in others else 0.0)
         except DivergenceError:
             continue
-    # a single method agrees with itself
-    sound = {n: a for n, a in rest.items() if a.agreement.pairs and all(p.passed for p in a.agreement.pairs)}
+    sound = {n: a for n, a in rest.items() if all(p.passed for p in a.agreement.pairs)}
     if len(sound) == 1:
         ((name, answer),) = sound.items()
         return replace(answer, left_out=name)
     among = sound or rest
-    histories = {f"without {name}": answer.fused.history for name, answer in among.items()}
-    if len(sources.names) == 2:  # each by itself, sample by sample: trim alone does not follow the joint
-        histories = {
-            "misalignment alone": estimate_misalignment(sources.loads),
-            "trim alone": estimate_trim(sources.loads),
-        }
     if not among:
         return None
     base = among.get("trim", next(iter(among.values())))
+    histories = {f"without {name}": answer.fused.history for name, answer in among.items()}
     return _mixed(base, histories, np.ones(len(histories)), sources.loads)
+
+
+def _of_either(sources: _Sources) -> FusedAnswer | None:
+    """Mixture of misalignment alone and trim alone, each sample by sample: trim alone does not follow the joint."""
+    histories = {
+        "misalignment alone": estimate_misalignment(sources.loads),
+        "trim alone": estimate_trim(sources.loads),
+    }
+    for name in sources.names:
+        try:
+            return _mixed(sources.answer((name,), 0.0), histories, np.ones(2), sources.loads)
+        except DivergenceError:
+            continue
+    return None
 
 
 def _with_faults_freed(sources: _Sources, answer: FusedAnswer, bias_sd_s: float) -> FusedAnswer:
@@ -300,12 +310,13 @@ def _mixed(
     t, own = answer.fused.history.time_s, answer.fused.history
     yz, cov, weight = [], [], []
     for history, one in zip(histories.values(), weights / weights.sum(), strict=True):
-        known = np.isfinite(history.lateral_cov[:, 0, 0])
+        lateral_cov = history.lateral_cov_without_plane
+        known = np.isfinite(lateral_cov[:, 0, 0]) & np.isfinite(history.theta_rad)
         if known.sum() < 2:
             continue
         at = history.time_s[known]
         yz.append(np.stack([np.interp(t, at, c) for c in history.theta_yz_rad[known].T], -1))
-        flat = history.lateral_cov[known].reshape(-1, 4)
+        flat = lateral_cov[known].reshape(-1, 4)
         cov.append(np.stack([np.interp(t, at, c) for c in flat.T], -1).reshape(-1, 2, 2))
         weight.append(one)
     share = np.array(weight)[:, None, None] / np.sum(weight)

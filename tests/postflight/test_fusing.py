@@ -8,9 +8,9 @@ import pytest
 from estimators.agreement import OFFSET
 from estimators.evidence import moved_vehicle
 from flightmodel.checks import Fault
-from flightmodel.deflection import history_from_lateral
+from flightmodel.deflection import UNIFORM_VAR, DeflectionHistory, history_from_lateral
 from postflight.deflections import Deflections, quantiles_at
-from postflight.fusing import fuse_flight
+from postflight.fusing import _mixed, fuse_flight
 from tests.estimators.conftest import VEHICLE, pulse_of
 
 N = 160
@@ -146,3 +146,32 @@ def test_a_refused_fusion_is_a_red_check():
     # one that has nothing to say is none
     assert Deflections(refused={"fused": Fault("no vehicle", "vehicle-missing")}).consistency_checks == ()
     assert Deflections().consistency_checks == ()
+
+
+def test_two_methods_that_contradict_are_spanned_by_the_mixture_of_each_alone():
+    # the force is turned by 2 deg, far beyond what its bias and mounting are known to, without a film
+    loads = sound()
+    turn = np.deg2rad(2.0) * loads.specific_force_body_mps2[:, :1] * [0.0, 1.0, 0.0]
+    answer = fuse_flight(replace(loads, specific_force_body_mps2=loads.specific_force_body_mps2 + turn), None)
+    assert answer.alternatives == ("misalignment alone", "trim alone")
+    assert answer.left_out is None
+    assert not answer.consistency_checks[0].passed
+    off, sd = error_sd(answer)
+    assert abs(off) < 2.0
+    assert sd > 0.5
+
+
+def test_a_mixture_of_histories_whose_planes_are_all_lost_is_as_well_known_across_as_along():
+    answer = fuse_flight(sound(), None)
+    times = answer.fused.history.time_s
+    unknown = np.zeros((len(times), 2, 2))
+    unknown[:, 0, 0], unknown[:, 1, 1] = np.deg2rad(0.3) ** 2, UNIFORM_VAR
+    lost = {
+        name: DeflectionHistory(times, np.full(len(times), np.deg2rad(size)), np.zeros(len(times)), unknown, name, "")
+        for name, size in (("one", 0.1), ("other", 0.5))
+    }
+    mixed = _mixed(answer, lost, np.ones(2), sound()).fused.history
+    # same planes: 0.3 deg of each, and their sizes 0.2 deg on either side of the mean
+    expected = np.deg2rad([[np.hypot(0.3, 0.2), 0.0], [0.0, 0.3]]) ** 2
+    np.testing.assert_allclose(mixed.theta_rad, np.deg2rad(0.3))
+    np.testing.assert_allclose(mixed.lateral_cov[K], expected, atol=1e-12)
