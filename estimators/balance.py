@@ -34,16 +34,16 @@ from functools import cached_property
 
 import numpy as np
 
-from estimators.loads import FlightLoads, lateral_and_size
+from estimators.loads import FlightLoads, flow_coefficients, lateral_and_size
 from flightmodel import rotations
 from flightmodel.airdata import lateral_angles
 from flightmodel.checks import FloatArray
+from flightmodel.deflection import rotation_vector_of_lateral
 from flightmodel.vehicle import Vehicle
 
 # step of the time derivatives, s: of rates of some rad/s it leaves 1e-8 of truncation and 1e-9 of rounding
 _STEP_S = 1e-4
 _X = np.array([1.0, 0.0, 0.0])
-Coefficients = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -78,28 +78,17 @@ class Swing:
     @cached_property
     def axes(self) -> FloatArray:
         """Matrices ``(n, 3, 3)`` that turn shell components into the body's (`flightmodel.deflection`)."""
-        return rotations.dcm_from_q(rotations.exp(_rotation_vector(self.theta_yz_rad)))
+        return rotations.dcm_from_q(rotations.exp(rotation_vector_of_lateral(self.theta_yz_rad)))
 
     @cached_property
     def relative_rate(self) -> FloatArray:
         """Rate of the shell against the body, body axes (n, 3): the rotation vector's left Jacobian times its rate."""
-        v, rate = _rotation_vector(self.theta_yz_rad), _rotation_vector(self.rate_yz_radps)
-        angle = np.linalg.norm(v, axis=1, keepdims=True)
-        half = np.sinc(0.5 * angle / np.pi)
-        once = np.cross(v, rate)
-        # (angle - sin angle) / angle^3, by its series where the difference would be rounding
-        small = angle < 1e-2
-        safe = np.where(small, 1.0, angle)
-        third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
-        return np.asarray(rate + 0.5 * half**2 * once + third * np.cross(v, once))
+        turning = rotations.left_jacobian(rotation_vector_of_lateral(self.theta_yz_rad))
+        return _turned(turning, rotation_vector_of_lateral(self.rate_yz_radps))
 
     def moved(self, theta: FloatArray, rate: FloatArray, acceleration: FloatArray) -> Swing:
         """Deflection, rate and acceleration moved by so much."""
         return Swing(self.theta_yz_rad + theta, self.rate_yz_radps + rate, self.acceleration_yz_radps2 + acceleration)
-
-
-def _rotation_vector(lateral_yz: FloatArray) -> FloatArray:
-    return np.stack([np.zeros(len(lateral_yz)), -lateral_yz[:, 1], lateral_yz[:, 0]], axis=-1)
 
 
 def _cg_from_point(vehicle: Vehicle, point_m: FloatArray, swing: Swing) -> FloatArray:
@@ -158,33 +147,29 @@ def nose_flow(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
     return lateral_angles(_turned(turn.transpose(0, 2, 1), velocity))
 
 
-def force_residual(vehicle: Vehicle, coefficients: Coefficients, swing: Swing, loads: FlightLoads) -> FloatArray:
+def force_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
     """Tilt of the force against the shell less the air's, ``atan(C_N/C_A)`` on the flow's side; shell y, z (n, 2), rad.
 
     Parameters
     ----------
     vehicle : Vehicle
-        Mass properties and joint.
-    coefficients : callable
-        From Mach number and angle (n,) to C_A, C_N, C_m, C_mq (n, 4).
+        In place of the loads' own.
     swing : Swing
     loads : FlightLoads
     """
     force = _turned(swing.axes.transpose(0, 2, 1), specific_force(vehicle, swing, loads))
-    direction, alpha = lateral_and_size(nose_flow(vehicle, swing, loads))
-    c = coefficients(loads.mach, np.minimum(alpha, np.pi))
+    direction, c = flow_coefficients(vehicle.aero, loads.mach, nose_flow(vehicle, swing, loads))
     return np.asarray(lateral_angles(-force) - direction * np.arctan2(c[:, 1], c[:, 0])[:, None])
 
 
-def moment_residual(vehicle: Vehicle, coefficients: Coefficients, swing: Swing, loads: FlightLoads) -> FloatArray:
+def moment_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
     """Transverse moment of the air less the motion's over ``q S C_A``, a shift of the c.g.; body y, z (n, 2), m.
 
     Parameters as of `force_residual`.
     """
     turn, length = swing.axes, vehicle.reference.length_m
-    direction, alpha = lateral_and_size(nose_flow(vehicle, swing, loads))
-    c = coefficients(loads.mach, np.minimum(alpha, np.pi))
-    side = np.column_stack([np.zeros(len(alpha)), direction])
+    direction, c = flow_coefficients(vehicle.aero, loads.mach, nose_flow(vehicle, swing, loads))
+    side = np.column_stack([np.zeros(len(c)), direction])
     rate = _turned(turn.transpose(0, 2, 1), loads.rate_body_radps + swing.relative_rate) * [0.0, 1.0, 1.0]
     force = -(c[:, :1] * _X + c[:, 1:2] * side)
     damping = c[:, 3:] * length / (2.0 * loads.airspeed_mps[:, None]) * rate

@@ -36,7 +36,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
-from estimators.balance import Coefficients, Swing
+from estimators.balance import Swing
 from estimators.loads import FlightLoads
 from flightmodel import rotations
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
@@ -51,9 +51,9 @@ ACCELEROMETER, ATTITUDE, WIND, PRESSURE = "accelerometer", "BET attitude", "wind
 CAMERA_TIME_BIAS = "camera time bias"
 ACCELEROMETER_TIME_BIAS, GYRO_TIME_BIAS = "accelerometer time bias", "gyro time bias"
 CAMERA_PLANE = "camera clocking"
-Residual = Callable[[Vehicle, Coefficients, Swing, FlightLoads], FloatArray]
-# steps of differences: of the deflection, its rate and acceleration, force, angular acceleration, flow, log pressure
+Residual = Callable[[Vehicle, Swing, FlightLoads], FloatArray]
 _NEWTON_STEPS, _SETTLED_RAD = 6, 1e-6  # from the small angles' solution four suffice
+# steps of differences: of deflection and flow, the deflection's rate, angular accelerations, force, log pressure
 _THETA_RAD, _RATE_RADPS, _TURN_RADPS2, _FORCE_MPS2, _PRESSURE = 1e-5, 1e-3, 1e-2, 1e-4, 1e-4
 _OF_SD = 0.01  # of a vehicle's input
 _LEAST_DETERMINANT = 1e-9  # of a balance's derivative by the deflection: of a force 1, of a moment some 0.1 m^2
@@ -238,10 +238,8 @@ def held_balance(residual: Residual, loads: FlightLoads, start_yz_rad: FloatArra
     theta = np.where(np.isfinite(start_yz_rad), start_yz_rad, 0.0)
     change = np.zeros_like(theta)
     for _ in range(_NEWTON_STEPS):
-        base = residual(vehicle, vehicle.aero.at, Swing.held(theta), loads)
-        moved = [
-            residual(vehicle, vehicle.aero.at, Swing.held(theta + _THETA_RAD * e), loads) - base for e in np.eye(2)
-        ]
+        base = residual(vehicle, Swing.held(theta), loads)
+        moved = [residual(vehicle, Swing.held(theta + _THETA_RAD * e), loads) - base for e in np.eye(2)]
         inverse, good = _inverse(np.stack(moved, -1) / _THETA_RAD)
         change = np.where(good[:, None], (inverse @ base[:, :, None])[:, :, 0], np.inf)
         theta = np.where(good[:, None], theta - change, theta)
@@ -272,7 +270,7 @@ def evidence_of_balance(
     ----------
     method : str
     residual : callable
-        What is left of the balance (n, 2), of a vehicle, its coefficients, a swing and loads.
+        What is left of the balance (n, 2), of a vehicle, a swing and loads.
     loads : FlightLoads
         Of the samples to read.
     swing : Swing
@@ -286,7 +284,7 @@ def evidence_of_balance(
     swing = replace(swing, theta_yz_rad=np.where(known[:, None], swing.theta_yz_rad, 0.0))
 
     def left(one: FlightLoads = loads, of: Vehicle = vehicle, at: Swing = swing) -> FloatArray:
-        return residual(of, of.aero.at, at, one)
+        return residual(of, at, one)
 
     base = left()
 

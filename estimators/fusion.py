@@ -35,6 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -99,6 +100,11 @@ class Spline:
         inner = low + KNOT_S * np.arange(int(np.ceil((high - low) / KNOT_S)) + 1)
         full = np.concatenate([inner[0] - KNOT_S * np.arange(3, 0, -1), inner, inner[-1] + KNOT_S * np.arange(1, 4)])
         return cls(np.asarray(inner), len(full) - 4, np.asarray(full))
+
+    @cached_property
+    def curvature(self) -> FloatArray:
+        """Second derivative (knots, count) of every basis function at the knots."""
+        return self.rows(self.knots_s, 2)
 
     def rows(self, time_s: FloatArray, derivative: int = 0) -> FloatArray:
         """Values (n, count) of every basis function, or of its derivative."""
@@ -186,7 +192,7 @@ class NormalEquations:
 
     def _precision(self, size_radps2: float) -> FloatArray:
         """Of the process's prior, one axis of the spline (count, count)."""
-        curvature: FloatArray = self.spline.rows(self.spline.knots_s, 2) / size_radps2
+        curvature = self.spline.curvature / size_radps2
         return np.asarray(curvature.T @ curvature + np.eye(self.spline.count) / DEFLECTION_SD_RAD**2)
 
     def _factor(self, size_radps2: float, method: str) -> FloatArray:

@@ -7,6 +7,7 @@ corrected sensors; it holds no truth. Lateral vectors are in body y, z.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from flightmodel.vehicle import Vehicle
 
 # below this axial deceleration the ratio of forces and the moment balance carry no information
 MIN_AXIAL_MPS2 = 0.3 * STANDARD_GRAVITY_MPS2
+_POINTS = ("point_from_datum_m", "cg_from_sensor_m")  # arrays that are no histories
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class FlightLoads:
     vehicle : Vehicle
         Pre-flight model.
     point_from_datum_m : (3,) float
-        Point of the centerbody at which force and flow are given: the c.g. of the undeflected vehicle, as told.
+        Point of the centerbody at which force and flow are given: the c.g. of the undeflected vehicle, as stated.
     accelerometer_time_bias_sd_s, gyro_time_bias_sd_s : float
         A priori sd of the sensors' time biases, s; zero: none.
     cg_from_sensor_m : (3,) float
@@ -101,7 +103,8 @@ class FlightLoads:
 
     def rows(self, use: BoolArray) -> FlightLoads:
         """Loads at chosen samples."""
-        chosen = {f.name: getattr(self, f.name)[use] for f in fields(self) if f.name in _HISTORIES}
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _POINTS}
+        chosen: dict[str, Any] = {name: v[use] for name, v in values.items() if isinstance(v, np.ndarray)}
         return replace(self, **chosen)
 
     @property
@@ -117,27 +120,6 @@ class FlightLoads:
         """
         after = np.flatnonzero(pressure_pulse(self.dynamic_pressure_pa))
         return np.asarray(self.informative & (np.arange(len(self.time_s)) <= after[-1]))
-
-
-_HISTORIES = frozenset(
-    {
-        "time_s",
-        "specific_force_body_mps2",
-        "force_root_mps2",
-        "flow_root_rad",
-        "rate_root_radps",
-        "rate_body_radps",
-        "angular_acceleration_body_radps2",
-        "flow_yz_rad",
-        "flow_cov",
-        "wind_flow_sd_rad",
-        "altitude_m",
-        "mach",
-        "dynamic_pressure_pa",
-        "dynamic_pressure_sd_pa",
-        "airspeed_mps",
-    }
-)
 
 
 def lateral_and_size(vectors_yz: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -114,15 +114,14 @@ def skew(v: FloatArray) -> FloatArray:
 
 
 def left_jacobian(rotation_rad: FloatArray) -> FloatArray:
-    """Matrix ``(3, 3)`` with ``exp(w + dw) = exp(J dw) exp(w)`` to first order, for a rotation vector ``(3,)``."""
-    angle = float(np.linalg.norm(rotation_rad))
+    """Matrices ``(..., 3, 3)`` with ``exp(w + dw) = exp(J dw) exp(w)`` to first order, of rotation vectors (..., 3)."""
+    angle = np.linalg.norm(rotation_rad, axis=-1)[..., None, None]
     cross = skew(rotation_rad)
-    if angle < 1e-5:
-        return np.eye(3) + 0.5 * cross + cross @ cross / 6.0
-    out: FloatArray = (
-        np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * cross + (angle - np.sin(angle)) / angle**3 * cross @ cross
-    )
-    return out
+    # (angle - sin angle) / angle^3, by its series where the difference would be rounding
+    small = angle < 1e-2
+    safe = np.where(small, 1.0, angle)
+    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * cross + third * cross @ cross)
 
 
 def lever_arm_acceleration(

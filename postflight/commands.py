@@ -32,6 +32,7 @@ from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
+from recon.consistency import ConsistencyCheck
 from recon.setup import check_sources
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
@@ -247,15 +248,18 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         line("[yellow]left out[/]", f"as-flown atmosphere: {reason}", reason.code)
     if flight.attitude is not None and flight.attitude.comparison is not None:
         console.print(escape(flight.attitude.remark))
-    failed = [v for v in flight.consistency_checks if not v.passed]
-    passed = len(flight.consistency_checks) - len(failed)
-    console.print(f"{passed} of {len(flight.consistency_checks)} consistency checks pass")
-    for consistency_check in failed:
-        numbers = f"{consistency_check.value:.3g} outside {consistency_check.low:.3g} to {consistency_check.high:.3g}"
-        words = f"{consistency_check.name}: {consistency_check.remark} ({numbers})"
-        line("[red]check failed[/]", words, consistency_check.code)
+    print_checks(flight.consistency_checks)
     for k, suspect in enumerate(flight.suspects):
         line(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)
+
+
+def print_checks(checks: tuple[ConsistencyCheck, ...]) -> None:
+    """Print how many checks pass, and in red those that fail."""
+    failed = [check for check in checks if not check.passed]
+    console.print(f"{len(checks) - len(failed)} of {len(checks)} consistency checks pass")
+    for check in failed:
+        numbers = f"{check.value:.3g} outside {check.low:.3g} to {check.high:.3g}"
+        line("[red]check failed[/]", f"{check.name}: {check.remark} ({numbers})", check.code)
 
 
 def line(mark: str, words: str, code: str = "") -> None:
@@ -304,7 +308,10 @@ def print_answers(answers: Deflections) -> None:
         table.add_row(row.method, *(f"{x:.2f}" for x in numbers), within, f"{row.plane_lv_deg:.0f}", *largest)
     console.print(table)
     for check in answers.consistency_checks:
-        console.print(f"{'' if check.passed else '[red]check failed[/] '}{escape(check.remark)}")
+        if check.passed:
+            console.print(escape(check.remark))
+        else:
+            line("[red]check failed[/]", check.remark, check.code)
     bias = None if answers.fused is None else answers.fused.camera_time_bias
     if bias is not None and bias.applied:
         console.print(escape(bias.remark))

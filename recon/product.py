@@ -119,12 +119,16 @@ def accelerometer_root(problem: Problem, states: States, triangles: FloatArray) 
     kept = np.flatnonzero(problem.kept)
     measured = problem.motion.force_sensor_mps2[problem.node_index[kept]]
     partials = correction_partials(measured, states.sensor_errors[kept, 0:9], problem.motion.dcm_body_force)
-    covariance = unpacked(triangles, 18)
-    variance, axes = np.linalg.eigh(covariance[len(kept) // 2, 9:18, 9:18])
+    attitude, root = _constant_errors(unpacked(triangles, 18))
+    return np.concatenate([attitude, partials @ root], axis=1)
+
+
+def _constant_errors(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Responses of rotation (k, 3, m) and of the m errors behind the motion (m, m) to unit normals, at mid-span."""
+    variance, axes = np.linalg.eigh(covariance[len(covariance) // 2, 9:, 9:])
     sd = np.sqrt(np.maximum(variance, 0.0))
-    inverse = np.divide(1.0, sd, out=np.zeros(9), where=sd > 1e-12)
-    attitude = covariance[:, 6:9, 9:18] @ (axes * inverse)
-    return np.concatenate([attitude, partials @ (axes * sd)], axis=1)
+    inverse = np.divide(1.0, sd, out=np.zeros(len(sd)), where=sd > 1e-12)
+    return covariance[:, 6:9, 9:] @ (axes * inverse), axes * sd
 
 
 def triad_root(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
@@ -138,12 +142,7 @@ def triad_root(problem: Problem, states: States, triangles: FloatArray) -> Float
     motion, errors = problem.motion, states.sensor_errors[kept]
     force = correction_partials(motion.force_sensor_mps2[node], errors[:, 0:9], motion.dcm_body_force)
     rate = correction_partials(motion.rate_sensor_radps[node], errors[:, 9:18], motion.dcm_body_rate)
-    covariance = unpacked(triangles, 27)
-    variance, axes = np.linalg.eigh(covariance[len(kept) // 2, 9:27, 9:27])
-    sd = np.sqrt(np.maximum(variance, 0.0))
-    inverse = np.divide(1.0, sd, out=np.zeros(18), where=sd > 1e-12)
-    attitude = covariance[:, 6:9, 9:27] @ (axes * inverse)
-    root = axes * sd
+    attitude, root = _constant_errors(unpacked(triangles, 27))
     return np.concatenate([attitude, force @ root[0:9], rate @ root[9:18]], axis=1)
 
 

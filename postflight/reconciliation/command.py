@@ -15,7 +15,7 @@ from flightmodel.deflection import DeflectionHistory
 from flightmodel.flightfolder import read_flight
 from flightmodel.tabular import Tabular
 from postflight import run_folder
-from postflight.commands import compile_kernels, console
+from postflight.commands import compile_kernels, console, print_checks
 from postflight.deflections import estimate
 from postflight.flight import PULSE_RATE_HZ, Flight
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
@@ -154,7 +154,8 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             out.write_csv("consistency_checks.csv", pd.DataFrame([vars(each) for each in checks]))
             deflection = deflection_of(fit)
             out.write_csv("deflection_reconciled.csv", deflection.to_frame())
-            facts = _summary(fit, table, odds) | _modal_summary(modal, no_modes) | _posterior_summary(posterior)
+            facts = _summary(fit, table, odds, checks)
+            facts |= _modal_summary(modal, no_modes) | _posterior_summary(posterior)
             out.write_json("reconciliation.json", facts)
             out.write_csv("bands.csv", bands(rigid, flexible))
             out.write_csv("bands_shares.csv", shares)
@@ -169,7 +170,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             fused = answers.histories.get("fused")
             save(figure_reconciled(fit, telemetry, deflection, fused), out.path / "figures" / "reconciled.png")
     _print_joint(fit, table, odds)
-    _print_checks(checks)
+    print_checks(checks)
     if posterior is not None:
         _print_posterior(posterior)
     if modal is None:
@@ -232,12 +233,14 @@ def reconciled_bounds(fit: JointFit, flight: Reconstruction, report: Progress) -
     return entry_bounds(flight, laws, ENTRIES, progress=report, vehicle=replace(vehicle, uncertainty=known))
 
 
-def _summary(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> dict[str, object]:
+def _summary(
+    fit: JointFit, table: pd.DataFrame, odds: dict[str, float], checks: tuple[ConsistencyCheck, ...]
+) -> dict[str, object]:
     """Return the fit's quality and the joint, for ``reconciliation.json``."""
     return {
         "converged": fit.converged,
-        "passed": all(each.passed for each in credibility(fit)),
-        "failed_checks": [each.code for each in credibility(fit) if not each.passed],
+        "passed": all(each.passed for each in checks),
+        "failed_checks": [each.code for each in checks if not each.passed],
         "stiffness_lower_bound_nmprad": stiffness_bound(fit),
         "steps": fit.steps,
         "sensor_residual_rms_sd": fit.sensor_rms_sd,
@@ -270,12 +273,3 @@ def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> 
         console.print(
             "[yellow]the stiffness falls with the angle: freeplay in part of the pulse, or a joint that yields[/]"
         )
-
-
-def _print_checks(checks: tuple[ConsistencyCheck, ...]) -> None:
-    """Print how many checks pass, and in red those that fail."""
-    console.print(f"{sum(each.passed for each in checks)} of {len(checks)} consistency checks pass")
-    for each in checks:
-        if not each.passed:
-            numbers = f"{each.value:.3g} outside {each.low:.3g} to {each.high:.3g}"
-            console.print(f"[red]check failed[/] {each.name}: {escape(each.remark)} ({numbers})")

@@ -80,8 +80,8 @@ def living(cmq=None):
 def left_deg(truth, swing):
     """What is left of both balances at a swing, as a deflection, deg (n, 2) each."""
     pulse, vehicle = pulse_of_truth(truth), truth.vehicle
-    force = force_residual(vehicle, vehicle.aero.at, swing, pulse)
-    moment = moment_residual(vehicle, vehicle.aero.at, swing, pulse) / trim_model(vehicle).xbar_m
+    force = force_residual(vehicle, swing, pulse)
+    moment = moment_residual(vehicle, swing, pulse) / trim_model(vehicle).xbar_m
     return np.rad2deg(force), np.rad2deg(moment)
 
 
@@ -123,15 +123,15 @@ def test_each_term_of_the_balances_is_alive():
 
     def largest(**changed):
         one = replace(pulse, **changed)
-        force = force_residual(vehicle, vehicle.aero.at, bent, one)
-        moment = moment_residual(vehicle, vehicle.aero.at, bent, one) / trim_model(vehicle).xbar_m
+        force = force_residual(vehicle, bent, one)
+        moment = moment_residual(vehicle, bent, one) / trim_model(vehicle).xbar_m
         return [float(np.rad2deg(np.abs(x).max())) for x in (force, moment)]
 
     still = np.zeros_like(pulse.rate_body_radps)
     assert min(largest(rate_body_radps=still)) > 0.05  # centrifugal and gyroscopic
     assert largest(angular_acceleration_body_radps2=still)[1] > 0.5
     undamped = replace(vehicle, aero=vehicle.aero.with_constant_cmq(0.0))
-    assert np.rad2deg(np.abs(moment_residual(vehicle, undamped.aero.at, bent, pulse)).max()) > 0.01
+    assert np.rad2deg(np.abs(moment_residual(undamped, bent, pulse)).max()) > 0.01
     # the undeflected vehicle's inertia and c.g. instead of the deflected one's
     straight = _small_angle(vehicle, pulse)
     assert np.rad2deg(np.abs(straight - truth.deflection.theta_yz_rad).max()) > 0.05
@@ -241,5 +241,5 @@ def test_what_is_left_of_the_moments_is_a_shift_of_the_cg():
         place = np.array(vehicle.centerbody.cg_from_datum_body_m)
         place[1 + axis] += 1e-3 / share
         body = vehicle.centerbody.model_copy(update={"cg_from_datum_body_m": tuple(place.tolist())})
-        left = moment_residual(replace(vehicle, centerbody=body), vehicle.aero.at, held, pulse)
+        left = moment_residual(replace(vehicle, centerbody=body), held, pulse)
         np.testing.assert_allclose(left, np.tile(1e-3 * np.eye(2)[axis], (len(left), 1)), atol=2e-5)
