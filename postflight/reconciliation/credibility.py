@@ -31,8 +31,8 @@ def credibility(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
 def _residuals(fit: JointFit) -> ConsistencyCheck:
     """All residuals against chi-square: one each for what was measured, joined and stated, less one a parameter."""
     problem = fit.problem
-    # every parameter but the motion has an a priori residual; the first motion has nine of its twelve
-    degrees = int((problem.weight > 0.0).sum()) + fit.residuals.joins.size - MOTION * problem.measured.spans + 9
+    # every parameter but the motion has an a priori residual; the first motion has twelve of its fifteen
+    degrees = int((problem.weight > 0.0).sum()) + fit.residuals.joins.size - MOTION * problem.measured.spans + 12
     high = float(chi2.ppf(CONFIDENCE, degrees)) / degrees
     return consistency_check(
         "joint-residuals", "reconciliation: residuals", fit.residuals.cost / degrees, 0.0, high,

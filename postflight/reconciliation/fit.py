@@ -54,6 +54,9 @@ SD_FACTORS_EARLY = (30.0, 10.0, 3.0)
 MOST_STEPS = 20  # after the early ones
 # predicted decrease of the cost at which a fit ends: the last one, and the one before the turbulence is estimated
 TOLERANCE, EARLY_TOLERANCE = 0.05, 2.0
+# the coefficient table has kinks at its Mach numbers: in one of them the cost is lowest whatever its slopes predict. So
+# a fit ends, too, where no step lowers the cost by more than `STILL` and the slopes promise less than one sd
+STILL, KINKED = 0.01, 1.0
 # of freeplay: factors on standard deviations, and half width of the band's corners over the freeplay
 CONTINUATION = ((30.0, 1.0), (10.0, 0.5), (3.0, 0.3), (3.0, 0.1), (1.0, 0.1), (1.0, 0.05))
 PLAIN_STEPS = 2
@@ -228,10 +231,13 @@ def solve(
     report = progress or (lambda _fraction, _what: None)
     most = len(early) + MOST_STEPS
     report(0.0, "reconciling, step 1")
+    cost = np.inf
     for number, step in enumerate(descend([*early, *[problem] * MOST_STEPS], start, correct), 1):
-        converged = number > len(early) and step.predicted_decrease < tolerance
+        still = number > len(early) + 1 and step.predicted_decrease < KINKED and cost - step.residuals.cost < STILL
+        converged = number > len(early) and (step.predicted_decrease < tolerance or still)
         if converged or number == most:
             break
+        cost = step.residuals.cost
         report(number / most, f"reconciling, step {number + 1}")
     report(1.0, "reconciled")
     return JointFit(problem, step.end, step.normal.covariance, step.residuals, number, converged)

@@ -10,7 +10,11 @@ Sought are the joint's parameters (stiffness, damping, freeplay and hardening wh
 and the static stability. Nuisance parameters are all else that the motion depends on within its a priori uncertainty:
 masses, stations, inertias, other coefficients, the instruments' constant errors, and the atmosphere. Parameters of
 vehicle and instruments count in a priori standard deviations; those of the atmosphere are the logarithm of the density
-ratio and the difference of the winds, m/s, to the sounding, at knots along altitude.
+ratio and the differences of the winds, m/s, and of the temperature, K, to the sounding, at knots along altitude.
+
+The velocity at the starts is a parameter, too, and joined from span to span. What an accelerometer misaligned by 2 mrad
+or a gyro's mounting does to a reconstructed path of 9 g turns with the vehicle, as the c.g.'s offset does: at 50 rpm
+0.04 m/s, of 0.1 mm of offset.
 """
 
 from __future__ import annotations
@@ -22,8 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel import earth, rotations
+from flightmodel.airdata import temperature_sd
 from flightmodel.atmosphere import (
     DENSITY_LENGTH_M,
+    GAMMA,
+    R_AIR_JPKGK,
     WIND_LENGTH_M,
     profile_from_sounding,
     sounding_correlation,
@@ -43,6 +50,7 @@ from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
 
 # at 1200 m/s a tenth of a second: knots resolve gusts at the joint's 2 to 4 Hz; coarser in thin air
 KNOT_M, UPPER_KNOT_M = 125.0, 250.0
+TEMPERATURE_KNOT_M = 1e3  # of a correlation length of 5 km; by Mach number it moves the coefficients, slowly
 UPPER_M, TOP_M, BELOW_M = 75e3, 105e3, 1e3
 # a priori standard deviations; of factors those of their logarithms
 STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 1.5, 1.0, 0.005
@@ -157,7 +165,9 @@ def _perturbed(
 
 @dataclass(frozen=True)
 class AtmosphereParameters:
-    """From differences to the sounding at knots, ``(3, k)``, to kernel tables: log density, north and east wind.
+    """From differences to the sounding to kernel tables.
+
+    Differences of log density, north and east wind, m/s, at knots ``(3, k)``; of temperature, K, at knots of its own.
 
     Parameters
     ----------
@@ -177,6 +187,18 @@ class AtmosphereParameters:
         """Altitudes (k,) at which the atmosphere may differ from the sounding."""
         lower = np.arange(UPPER_M, min(self.lowest_m, UPPER_M) - BELOW_M, -KNOT_M)[:0:-1]
         return np.concatenate([lower, np.arange(UPPER_M, TOP_M, UPPER_KNOT_M)])
+
+    @cached_property
+    def temperature_knots_m(self) -> FloatArray:
+        """Altitudes (n,) at which the temperature may differ from the sounding."""
+        return np.arange(TOP_M, self.lowest_m - BELOW_M - TEMPERATURE_KNOT_M, -TEMPERATURE_KNOT_M)[::-1]
+
+    @cached_property
+    def temperature_precision(self) -> FloatArray:
+        """Inverse covariance (n, n) of the sounding's temperatures, correlated as its densities."""
+        knots = self.temperature_knots_m
+        sd = temperature_sd(knots)
+        return np.asarray(np.linalg.inv(sd[:, None] * sounding_correlation(knots, DENSITY_LENGTH_M) * sd))
 
     def knot_spacing_m(self, altitude_m: FloatArray) -> FloatArray:
         """Distance of the knots about altitudes."""
@@ -210,13 +232,15 @@ class AtmosphereParameters:
         rows = simulate.ATMOSPHERE_START_M + simulate.ATMOSPHERE_STEP_M * np.arange(len(table), dtype=np.float64)
         return table, np.asarray(rows)
 
-    def table(self, difference: FloatArray) -> FloatArray:
-        """Kernel table (rows, 6) of the atmosphere."""
+    def table(self, difference: FloatArray, warmer_k: FloatArray) -> FloatArray:
+        """Kernel table (rows, 6) of the atmosphere, of differences (3, k) and (n,)."""
         table, rows = self._sounded
         table = table.copy()
         ratio, north, east = (np.interp(rows, self.knots_m, part) for part in difference)
         table[:, 0] *= np.exp(ratio)
         table[:-1, 1] += np.diff(ratio)
+        temperature = table[:, 2] ** 2 / (GAMMA * R_AIR_JPKGK)
+        table[:, 2] *= np.sqrt(1.0 + np.interp(rows, self.temperature_knots_m, warmer_k) / temperature)
         table[:, 3] += north
         table[:, 4] += east
         return table
@@ -405,9 +429,10 @@ def _affine(values: FloatArray, responses: FloatArray) -> FloatArray:
 
 
 # of a span's start: rotation from the reconstructed attitude, body's rate, shell's rotation vector from the body (x is
-# its twist), shell's rate relative to the body, shell axes
-MOTION = 12
+# its twist), shell's rate relative to the body, shell axes; velocity less the reconstructed one, ECEF
+MOTION = 15
 ATTITUDE, RATE, DEFLECTION, DEFLECTION_RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+VELOCITY = slice(12, 15)
 Index = NDArray[np.int64]
 
 
@@ -426,7 +451,7 @@ class SpanFlights:
     Parameters
     ----------
     span, vehicle, table : (m,) int
-    motion : (m, 12) float
+    motion : (m, 15) float
     vehicles : list of TrialVehicle
     tables : list of (rows, 6) float
         Kernel tables of the atmosphere.
@@ -450,7 +475,7 @@ class PredictedSpans:
         Rates, rad/s, and specific force, m/s^2, means over windows, and their rates of change.
     deflection : (m, WINDOWS, 3) float
         Shell's rotation vector from the body at the windows' middles, rad.
-    end : (m, 12) float
+    end : (m, 15) float
         Motion at the end of the span, in the coordinates of the next one's start.
     """
 
@@ -502,24 +527,18 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
     windows, slope = _windows(measured, flights, states, aux)
     middle = states[:, steps.intervals // 2 :: steps.intervals]
     deflection = rotations.log(rotations.multiply(rotations.conjugate(middle[..., 6:10]), middle[..., 10:14]))
-    return PredictedSpans(windows, slope, deflection, _ends(measured, flights.span, states[:, -1]))
+    return PredictedSpans(windows, slope, deflection, _ends(measured, flights, states[:, -1]))
 
 
 def _start_states(measured: Measurements, flights: SpanFlights) -> FloatArray:
     """States (m, 20) as `synthetic_flight.simulate.state_from_ecef` lays them out, of the deflected vehicle's c.g."""
     at, span, motion = measured.start, flights.span, flights.motion
-    vehicles = [c.vehicle for c in flights.vehicles]
-    cg = np.array([v.cg_m for v in vehicles])[flights.vehicle]
-    # of the shell's c.g., from the joint; its share in the vehicle's
-    arm = np.array([v.aeroshell.cg_m - v.joint_m for v in vehicles])[flights.vehicle]
-    share = np.array([v.aeroshell.mass_kg / v.mass_kg for v in vehicles])[flights.vehicle, None]
     q = rotations.boxplus(at.q_ecef_body[span], motion[:, ATTITUDE])
     omega, q_body_shell = motion[:, RATE], rotations.exp(motion[:, DEFLECTION])
     shell_rate = rotations.rotate(rotations.conjugate(q_body_shell), omega) + motion[:, DEFLECTION_RATE]
-    offset = cg + share * (rotations.rotate(q_body_shell, arm) - arm)
-    drift = rotations.rotate(q_body_shell, np.cross(shell_rate, arm)) - np.cross(omega, arm)
-    r = at.position_ecef_m[span] + rotations.rotate(q, offset)
-    v = at.velocity_ecef_mps[span] + rotations.rotate(q, np.cross(omega, cg) + share * drift)
+    place, velocity = _cg_from_datum(flights, omega, q_body_shell, shell_rate)
+    r = at.position_ecef_m[span] + rotations.rotate(q, place)
+    v = at.velocity_ecef_mps[span] + motion[:, VELOCITY] + rotations.rotate(q, velocity)
     to_eci = rotations.conjugate(earth.q_ecef_eci(at.time_s[span]))
     q_body = rotations.multiply(to_eci, q)
     return np.column_stack(
@@ -532,6 +551,20 @@ def _start_states(measured: Measurements, flights: SpanFlights) -> FloatArray:
             shell_rate,
         ]
     )
+
+
+def _cg_from_datum(
+    flights: SpanFlights, omega: FloatArray, q_body_shell: FloatArray, shell_rate: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Place and velocity (m, 3) of the deflected vehicle's c.g. from the datum, body axes; shell's rate in its own."""
+    vehicles = [c.vehicle for c in flights.vehicles]
+    cg = np.array([v.cg_m for v in vehicles])[flights.vehicle]
+    # of the shell's c.g., from the joint; its share in the vehicle's
+    arm = np.array([v.aeroshell.cg_m - v.joint_m for v in vehicles])[flights.vehicle]
+    share = np.array([v.aeroshell.mass_kg / v.mass_kg for v in vehicles])[flights.vehicle, None]
+    place = cg + share * (rotations.rotate(q_body_shell, arm) - arm)
+    drift = rotations.rotate(q_body_shell, np.cross(shell_rate, arm)) - np.cross(omega, arm)
+    return place, np.cross(omega, cg) + share * drift
 
 
 def _windows(
@@ -551,11 +584,22 @@ def _windows(
     return np.einsum("k,mwkj->mwj", steps.simpson, parts), slope
 
 
-def _ends(measured: Measurements, span: Index, state: FloatArray) -> FloatArray:
-    """Motion (m, 12) in the coordinates of the next span's start."""
-    q_body, q_shell = state[:, 6:10], state[:, 10:14]
-    q = rotations.multiply(earth.q_ecef_eci(measured.start.time_s[span] + SPAN_S), q_body)
-    rotation = rotations.boxminus(q, measured.start.q_ecef_body[span + 1])
+def _ends(measured: Measurements, flights: SpanFlights, state: FloatArray) -> FloatArray:
+    """Motion (m, 15) in the coordinates of the next span's start."""
+    span, at = flights.span, measured.start
+    q_body, q_shell, omega, shell = state[:, 6:10], state[:, 10:14], state[:, 14:17], state[:, 17:20]
+    to_ecef = earth.q_ecef_eci(at.time_s[span] + SPAN_S)
+    q = rotations.multiply(to_ecef, q_body)
     q_body_shell = rotations.multiply(rotations.conjugate(q_body), q_shell)
-    shell_rate = state[:, 17:20] - rotations.rotate(rotations.conjugate(q_body_shell), state[:, 14:17])
-    return np.column_stack([rotation, state[:, 14:17], rotations.log(q_body_shell), shell_rate])
+    _, from_datum = _cg_from_datum(flights, omega, q_body_shell, shell)
+    r, v = rotations.rotate(to_ecef, state[:, 0:3]), rotations.rotate(to_ecef, state[:, 3:6])
+    velocity = v - np.cross(earth.OMEGA_ECEF_RADPS, r) - rotations.rotate(q, from_datum)
+    return np.column_stack(
+        [
+            rotations.boxminus(q, at.q_ecef_body[span + 1]),
+            omega,
+            rotations.log(q_body_shell),
+            shell - rotations.rotate(rotations.conjugate(q_body_shell), omega),
+            velocity - at.velocity_ecef_mps[span + 1],
+        ]
+    )

@@ -31,6 +31,7 @@ from postflight.reconciliation.forward_model import (
     MOTION,
     RATE,
     STIFFNESS_LOG_SD,
+    VELOCITY,
     AtmosphereParameters,
     Index,
     Measurements,
@@ -45,24 +46,28 @@ from synthetic_flight import simulate
 
 INSTRUMENTS = 20
 # process noise of the joins per rad of flow angle that turbulence between knots GUST_KNOT_M apart makes, at the largest
-# dynamic pressure: rotation rad, rate rad/s, deflection rad, its rate rad/s; and the noise that is left in vacuum
-GUST = np.array([0.3, 0.3, 0.3, 3.0, 3.0, 3.0, 0.0, 0.3, 0.3, 0.0, 9.0, 9.0])
-VACUUM_SD = np.deg2rad([0.001, 0.001, 0.001, 0.003, 0.003, 0.003, 1e-4, 0.001, 0.001, 0.03, 0.01, 0.01])
+# dynamic pressure: rotation rad, rate rad/s, deflection rad, its rate rad/s, velocity m/s (of a span's lateral force);
+# and the noise that is left in vacuum
+GUST = np.array([0.3, 0.3, 0.3, 3.0, 3.0, 3.0, 0.0, 0.3, 0.3, 0.0, 9.0, 9.0, 24.0, 24.0, 24.0])
+VACUUM_SD = np.append(
+    np.deg2rad([0.001, 0.001, 0.001, 0.003, 0.003, 0.003, 1e-4, 0.001, 0.001, 0.03, 0.01, 0.01]), [1e-3, 1e-3, 1e-3]
+)
 GUST_KNOT_M = 300.0
 LARGE_ANGLE_RAD = np.deg2rad(5.0)  # angle of attack at which density structure rotates the vehicle
 GUST_RATE, GUST_FORCE_MPS2 = 2.0, 60.0  # of the windows' rates and lateral force, as if white from window to window
-MOTION_STEP = np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3))
+MOTION_STEP = np.append(np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3)), [1e-3, 1e-3, 1e-3])
 LEAST_COMPLIANCE = 0.5  # of a joint's compliance: a step that lessens it by more is shortened
-VEHICLE_STEP, AIR_STEP = 1e-5, np.array([1e-6, 2e-4, 2e-4])
+VEHICLE_STEP, AIR_STEP, WARMTH_STEP_K = 1e-5, np.array([1e-6, 2e-4, 2e-4]), 1e-2
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """All parameters: vehicle (v,), instruments (20,), air (3, k), motion at the start of each span (s, 12)."""
+    """All parameters: vehicle (v,), instruments (20,), air (3, k), temperature (n,), motion at each start (s, 15)."""
 
     vehicle: FloatArray
     instruments: FloatArray
     air: FloatArray
+    warmer_k: FloatArray
     motion: FloatArray
 
     def plus(self, step: FloatArray) -> Parameters:
@@ -71,7 +76,7 @@ class Parameters:
 
     def straight(self, step: FloatArray) -> Parameters:
         """Parameters with a step (n,) added."""
-        parts = (self.vehicle, self.instruments, self.air, self.motion)
+        parts = (self.vehicle, self.instruments, self.air, self.warmer_k, self.motion)
         ends = np.cumsum([part.size for part in parts])[:-1]
         return Parameters(*(p + d.reshape(p.shape) for p, d in zip(parts, np.split(step, ends), strict=True)))
 
@@ -91,7 +96,7 @@ def stiffness_step(step: float) -> float:
 
 @dataclass(frozen=True)
 class Residuals:
-    """In standard deviations: sensors (s, WINDOWS, 6), joins (s - 1, 12); ``cost``: sum of squares with priors."""
+    """In standard deviations: sensors (s, WINDOWS, 6), joins (s - 1, 15); ``cost``: sum of squares with priors."""
 
     sensors: FloatArray
     joins: FloatArray
@@ -143,9 +148,14 @@ class Problem:
         return len(self.vehicle_parameters.names)
 
     @property
+    def first_temperature(self) -> int:
+        """Column of the first temperature."""
+        return self.first_instrument + INSTRUMENTS + 3 * len(self.air.knots_m)
+
+    @property
     def first_motion(self) -> int:
         """Column of the first motion parameter."""
-        return self.first_instrument + INSTRUMENTS + 3 * len(self.air.knots_m)
+        return self.first_temperature + len(self.air.temperature_knots_m)
 
     @property
     def count(self) -> int:
@@ -186,7 +196,7 @@ class Problem:
 
     @cached_property
     def join_weight(self) -> FloatArray:
-        """Inverse standard deviations (s - 1, 12) of ends against starts."""
+        """Inverse standard deviations (s - 1, 15) of ends against starts."""
         factor = np.maximum(self._sd_factors[:-1], self._sd_factors[1:])
         return np.asarray(1.0 / (factor[:, None] * np.hypot(GUST * self.turbulence_rad[:-1, None], VACUUM_SD)))
 
@@ -199,27 +209,26 @@ class Problem:
     def _sd_factors(self) -> FloatArray:
         return np.asarray(np.broadcast_to(self.sd_factor, self.measured.spans))
 
-    @cached_property
-    def nearby_knots(self) -> list[Index]:
-        """Knots of the atmosphere that each span passes."""
-        z, knots = self.measured.altitude_m, self.air.knots_m
-        reach = 0.55 * np.abs(np.gradient(z)) + 50.0
-        apart = np.diff(knots, append=2 * knots[-1] - knots[-2])
-        return [np.flatnonzero(np.abs(knots - at) < r + apart) for at, r in zip(z, reach, strict=True)]
+    def nearby_knots(self, span: int, knots_m: FloatArray) -> list[int]:
+        """Knots of the atmosphere that a span passes."""
+        z = self.measured.altitude_m
+        reach = 0.55 * np.abs(np.gradient(z)[span]) + 50.0
+        apart = np.diff(knots_m, append=2 * knots_m[-1] - knots_m[-2])
+        return np.flatnonzero(np.abs(knots_m - z[span]) < reach + apart).tolist()
 
-    @cached_property
-    def attitude_precision(self) -> FloatArray:
-        """Inverse covariance (3, 3) of the reconstructed attitude at the first start."""
+    def first_precision(self, rows: slice) -> FloatArray:
+        """Inverse covariance (3, 3) of the reconstructed path at the first start."""
         covariance = self.measured.start.covariance
         assert covariance is not None
-        return np.asarray(np.linalg.inv(covariance[0, 6:9, 6:9]))
+        return np.asarray(np.linalg.inv(covariance[0, rows, rows]))
 
     def start(self) -> Parameters:
         """Nominal vehicle, instruments and sounding, motion as reconstructed."""
         motion = np.zeros((self.measured.spans, MOTION))
         motion[:, RATE] = self.measured.start.omega_body_eci_body_radps[:-1]
         air = np.zeros((3, len(self.air.knots_m)))
-        return Parameters(np.zeros(len(self.vehicle_parameters.names)), np.zeros(INSTRUMENTS), air, motion)
+        warmer = np.zeros(len(self.air.temperature_knots_m))
+        return Parameters(np.zeros(len(self.vehicle_parameters.names)), np.zeros(INSTRUMENTS), air, warmer, motion)
 
     def trial_vehicle(self, x: FloatArray) -> TrialVehicle:
         """Vehicle of parameters (v,) in standard deviations."""
@@ -230,7 +239,8 @@ class Problem:
         """Fly every span once; windows without the instruments' errors."""
         spans = np.arange(self.measured.spans)
         zero = np.zeros_like(spans)
-        flights = SpanFlights(spans, zero, u.motion, zero, [self.trial_vehicle(u.vehicle)], [self.air.table(u.air)])
+        table = self.air.table(u.air, u.warmer_k)
+        flights = SpanFlights(spans, zero, u.motion, zero, [self.trial_vehicle(u.vehicle)], [table])
         return fly_spans(self.measured, self.vehicle_parameters.nominal, flights)
 
     def instrument_response(self, predicted: PredictedSpans) -> FloatArray:
@@ -321,30 +331,45 @@ class Problem:
 
     def _perturbed(self, u: Parameters) -> tuple[SpanFlights, list[Index], list[FloatArray]]:
         """Spans with one parameter moved, which parameter (columns) and by how much, span by span."""
-        v, knots = self.first_instrument, len(self.air.knots_m)
+        v = self.first_instrument
         vehicles = [self.trial_vehicle(u.vehicle + VEHICLE_STEP * unit) for unit in np.eye(v)]
         vehicles.append(self.trial_vehicle(u.vehicle))
-        tables, number = [self.air.table(u.air)], {}
-        for kind in range(3):
-            for knot in range(knots):
-                air = u.air.copy()
-                air[kind, knot] += AIR_STEP[kind]
-                number[kind, knot] = len(tables)
-                tables.append(self.air.table(air))
+        tables, air_columns, air_steps = self._perturbed_tables(u)
         rows: list[tuple[int, int, FloatArray, int]] = []
         columns, steps = [], []
         for span in range(self.measured.spans):
             motion = u.motion[span]
             rows += [(span, j, motion, 0) for j in range(v)]
             rows += [(span, v, motion + d, 0) for d in np.diag(MOTION_STEP)]
-            places = [(kind, knot) for kind in range(3) for knot in self.nearby_knots[span].tolist()]
-            rows += [(span, v, motion, number[place]) for place in places]
-            in_air = [v + INSTRUMENTS + kind * knots + knot for kind, knot in places]
-            columns.append(np.array([*range(v), *(self.first_motion + MOTION * span + np.arange(MOTION)), *in_air]))
-            steps.append(np.array([VEHICLE_STEP] * v + MOTION_STEP.tolist() + [AIR_STEP[kind] for kind, _ in places]))
+            near = self._nearby_air(span)
+            rows += [(span, v, motion, 1 + k) for k in near]
+            own = self.first_motion + MOTION * span + np.arange(MOTION)
+            columns.append(np.array([*range(v), *own, *air_columns[near]]))
+            steps.append(np.array([*([VEHICLE_STEP] * v), *MOTION_STEP, *air_steps[near]]))
         which = np.array([(row[0], row[1], row[3]) for row in rows]).T
         motions = np.array([row[2] for row in rows])
         return SpanFlights(which[0], which[1], motions, which[2], vehicles, tables), columns, steps
+
+    def _perturbed_tables(self, u: Parameters) -> tuple[list[FloatArray], Index, FloatArray]:
+        """Kernel tables of the air as it is and with each knot moved; columns and steps of the latter."""
+        tables, steps = [self.air.table(u.air, u.warmer_k)], []
+        for kind, step in enumerate(AIR_STEP):
+            for knot in range(len(self.air.knots_m)):
+                air = u.air.copy()
+                air[kind, knot] += step
+                tables.append(self.air.table(air, u.warmer_k))
+                steps.append(step)
+        for unit in np.eye(len(u.warmer_k)):
+            tables.append(self.air.table(u.air, u.warmer_k + WARMTH_STEP_K * unit))
+            steps.append(WARMTH_STEP_K)
+        return tables, self.first_instrument + INSTRUMENTS + np.arange(len(steps)), np.array(steps)
+
+    def _nearby_air(self, span: int) -> list[int]:
+        """Parameters of the air, counted from its first, that a span feels."""
+        knots = len(self.air.knots_m)
+        near = self.nearby_knots(span, self.air.knots_m)
+        warm = self.nearby_knots(span, self.air.temperature_knots_m)
+        return [*(kind * knots + k for kind in range(3) for k in near), *(3 * knots + k for k in warm)]
 
     def _priors(self, u: Parameters) -> list[tuple[slice, FloatArray, FloatArray]]:
         """Columns of parameters, their a priori inverse covariance, their values."""
@@ -355,8 +380,10 @@ class Problem:
                 (slice(free + kind * knots, free + (kind + 1) * knots), self.air.precision[kind], u.air[kind])
                 for kind in range(3)
             ],
-            (slice(first, first + 3), self.attitude_precision, u.motion[0, ATTITUDE]),
-            (slice(first + 6, first + MOTION), np.diag(self.measured.first_deflection_sd**-2.0), u.motion[0, 6:]),
+            (slice(self.first_temperature, first), self.air.temperature_precision, u.warmer_k),
+            (slice(first, first + 3), self.first_precision(slice(6, 9)), u.motion[0, ATTITUDE]),
+            (slice(first + 6, first + 12), np.diag(self.measured.first_deflection_sd**-2.0), u.motion[0, 6:12]),
+            (slice(first + 12, first + MOTION), self.first_precision(slice(3, 6)), u.motion[0, VELOCITY]),
         ]
 
 

@@ -39,7 +39,7 @@ def test_a_joint_with_freeplay_carries_the_plain_joints_moment(corner):
     motion = np.zeros((5, MOTION))
     motion[:, DEFLECTION.start + 1] = 0.6 * np.deg2rad([0.01, 0.1, 0.2, 0.5, 2.0])
     motion[:, DEFLECTION.start + 2] = -0.8 * np.deg2rad([0.01, 0.1, 0.2, 0.5, 2.0])
-    plain = Parameters(np.zeros(len(parameters.names) - 1), np.zeros(20), np.zeros((3, 4)), motion)
+    plain = Parameters(np.zeros(len(parameters.names) - 1), np.zeros(20), np.zeros((3, 4)), np.zeros(2), motion)
     loose = with_freeplay(SimpleNamespace(vehicle_parameters=parameters), plain, np.deg2rad(0.3), corner)
     size = np.linalg.norm(loose.motion[:, DEFLECTION], axis=1)
     expected = np.linalg.norm(motion[:, DEFLECTION], axis=1)

@@ -12,6 +12,7 @@ from postflight.reconciliation.fit import JointFit, with_freeplay
 from postflight.reconciliation.forward_model import (
     FAST_JOINT,
     FREEPLAY_SD_RAD,
+    MOTION,
     OFFSET_SD_M,
     SLOW_JOINT,
     STIFFNESS_LOG_SD,
@@ -75,9 +76,9 @@ def test_a_loosened_joint_carries_the_plain_one_s_moment(corner):
     # bent so much further that beyond the dead band as much is left as the plain joint was bent
     sizes, freeplay = np.deg2rad([0.02, 0.1, 0.6, 3.0]), np.deg2rad(0.25)
     names = ("stiffness", "damping", "offset y", "offset z", "static stability", "freeplay")
-    motion = np.zeros((4, 12))
+    motion = np.zeros((4, MOTION))
     motion[:, 7], motion[:, 8] = 0.6 * sizes, -0.8 * sizes
-    plain = Parameters(np.zeros(5), np.zeros(20), np.zeros((3, 4)), motion)
+    plain = Parameters(np.zeros(5), np.zeros(20), np.zeros((3, 4)), np.zeros(2), motion)
     made = with_freeplay(SimpleNamespace(vehicle_parameters=SimpleNamespace(names=names)), plain, freeplay, corner)
     bent = np.linalg.norm(made.motion[:, 7:9], axis=1)
     np.testing.assert_allclose(beyond_freeplay(bent, freeplay, corner), sizes, rtol=1e-9)

@@ -16,6 +16,7 @@ from postflight.reconciliation.forward_model import (
     OFFSET_SD_M,
     SPAN_S,
     STIFFNESS_LOG_SD,
+    VELOCITY,
     WINDOW_S,
     WINDOWS,
     AtmosphereParameters,
@@ -82,7 +83,8 @@ def true_unknowns():
     state = truth.state_eci[rows]
     bent = rotations.multiply(rotations.conjugate(state[:, 6:10]), state[:, 10:14])
     across = state[:, 17:20] - rotations.rotate(rotations.conjugate(bent), state[:, 14:17])
-    motion = np.column_stack([np.zeros((SPANS, 3)), state[:, 14:17], rotations.log(bent), across])
+    still = np.zeros((SPANS, 3))
+    motion = np.column_stack([still, state[:, 14:17], rotations.log(bent), across, still])
     return replace(one.start(), motion=motion)
 
 
@@ -100,6 +102,8 @@ def test_spans_flown_from_the_truth_read_and_end_as_the_truth():
     across = [1, 2, 4, 5, 7, 8, 10, 11]
     np.testing.assert_allclose(read.end[:-1, across], u.motion[1:, across], atol=5e-5)
     np.testing.assert_allclose(read.end[:-1, [0, 3, 6]], u.motion[1:, [0, 3, 6]], atol=2e-3)
+    # and with the path's velocity
+    np.testing.assert_allclose(read.end[:-1, VELOCITY], 0.0, atol=5e-4)
 
 
 def test_spans_start_with_the_datum_where_it_was_reconstructed():
@@ -118,6 +122,12 @@ def test_spans_start_with_the_datum_where_it_was_reconstructed():
     np.testing.assert_allclose(r, one.measured.start.position_ecef_m[:-1], rtol=0.0, atol=1e-6)
     # the arm of 0.4 m turns with the rate against inertial space: the Earth's share of that is 3e-5 m/s
     np.testing.assert_allclose(v, one.measured.start.velocity_ecef_mps[:-1], rtol=0.0, atol=1e-4)
+    # or so much faster
+    motion = u.motion.copy()
+    motion[:, VELOCITY] = [0.3, -0.2, 0.1]
+    faster = _start_states(one.measured, replace(flights, motion=motion))
+    gained = rotations.rotate(to_ecef, faster[:, 3:6] - state[:, 3:6])
+    np.testing.assert_allclose(gained, np.tile([0.3, -0.2, 0.1], (SPANS, 1)), atol=1e-9)
 
 
 def test_a_late_clock_shows_what_was_earlier():
@@ -150,12 +160,15 @@ def test_the_cost_falls_along_the_right_hand_side():
         vehicle=0.3 * rng.standard_normal(len(u.vehicle)),
         instruments=0.5 * rng.standard_normal(20),
         air=0.02 * rng.standard_normal(u.air.shape) * np.array([[0.1], [10.0], [10.0]]),
+        warmer_k=2.0 * rng.standard_normal(u.warmer_k.shape),
     )
     linear = one.linearize(u)
     right = one.right_hand_side(u, linear, linear.residuals)
     assert len(right) == one.count
     first_air = one.first_instrument + 20
-    for k in (0, 2, one.first_instrument, one.first_instrument + 18, first_air, one.first_motion + 1):
+    last = one.first_motion + VELOCITY.start + 1
+    late, warm = one.first_instrument + 18, one.first_temperature + 1
+    for k in (0, 2, one.first_instrument, late, first_air, warm, one.first_motion + 1, last):
         step = np.zeros(one.count)
         step[k] = 1e-5
         up, down = (one.residuals(u.plus(side * step)).cost for side in (1.0, -1.0))
@@ -166,7 +179,7 @@ def test_the_cost_falls_along_the_right_hand_side():
     assert priors > 0.0
     nothing = replace(linear.residuals, sensors=0.0 * linear.residuals.sensors, joins=0.0 * linear.residuals.joins)
     pull = one.right_hand_side(u, linear, nothing)
-    for k in (1, one.first_instrument + 3, first_air + 2):
+    for k in (1, one.first_instrument + 3, first_air + 2, one.first_temperature, last):
         step = np.zeros(one.count)
         step[k] = 1e-3
         up, down = (one.prior_cost(u.plus(side * step)) for side in (1.0, -1.0))
@@ -211,12 +224,15 @@ def test_the_air_s_table_holds_the_difference_at_and_between_its_rows():
     difference = np.zeros((3, len(air.knots_m)))
     difference[0] = 0.1 * np.sin(air.knots_m / 3e3)
     difference[1] = 7.0
-    plain, moved = air.table(0.0 * difference), air.table(difference)
+    warmer = np.full(len(air.temperature_knots_m), 5.0)
+    plain, moved = air.table(0.0 * difference, 0.0 * warmer), air.table(difference, warmer)
     rows = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(len(plain))
     inside = (rows > air.knots_m[0]) & (rows < air.knots_m[-2])
     want = np.interp(rows, air.knots_m, difference[0])
     np.testing.assert_allclose(np.log(moved[:, 0] / plain[:, 0])[inside], want[inside], atol=1e-12)
     np.testing.assert_allclose((moved[:, 3] - plain[:, 3])[inside], 7.0)
+    # 5 K warmer: the speed of sound, sqrt(1.4 * 287.053 T)
+    np.testing.assert_allclose((moved[:, 2] ** 2 - plain[:, 2] ** 2) / (1.4 * 287.053), 5.0, rtol=1e-5)
     # each row's change up to the next is the next one's density
     np.testing.assert_allclose(np.diff(np.log(moved[:, 0])), moved[:-1, 1], atol=1e-12)
 
