@@ -240,7 +240,8 @@ class AtmosphereParameters:
         table[:, 0] *= np.exp(ratio)
         table[:-1, 1] += np.diff(ratio)
         temperature = table[:, 2] ** 2 / (GAMMA * R_AIR_JPKGK)
-        table[:, 2] *= np.sqrt(1.0 + np.interp(rows, self.temperature_knots_m, warmer_k) / temperature)
+        # the root of the ratio of temperatures, which no trial step makes negative
+        table[:, 2] *= np.exp(0.5 * np.interp(rows, self.temperature_knots_m, warmer_k) / temperature)
         table[:, 3] += north
         table[:, 4] += east
         return table

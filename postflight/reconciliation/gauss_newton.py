@@ -489,15 +489,15 @@ def _better(
     solved = normal.solver(damping)
     step = solved(normal.right)
     ahead, behind = (problem.residuals(u.plus(side * LOOK_AHEAD * step)) for side in (1.0, -1.0))
-    curvature = solved(
-        linear.transpose_times(
-            (ahead.sensors - 2.0 * linear.residuals.sensors + behind.sensors) / LOOK_AHEAD**2,
-            (ahead.joins - 2.0 * linear.residuals.joins + behind.joins) / LOOK_AHEAD**2,
-        )
+    bend = linear.transpose_times(
+        (ahead.sensors - 2.0 * linear.residuals.sensors + behind.sensors) / LOOK_AHEAD**2,
+        (ahead.joins - 2.0 * linear.residuals.joins + behind.joins) / LOOK_AHEAD**2,
     )
-    # a curved path, whose straight part alone may go too far
-    curved = [part * step + 0.5 * part**2 * curvature for part in STEP_FRACTIONS]
-    paths = curved if np.isfinite(curvature).all() else [step]
+    paths = [step]
+    if np.isfinite(bend).all():
+        # a curved path, whose straight part alone may go too far
+        curvature = solved(bend)
+        paths = [part * step + 0.5 * part**2 * curvature for part in STEP_FRACTIONS]
     return min([best, *((problem.residuals(end), end) for end in map(u.plus, paths))], key=lambda pair: pair[0].cost)
 
 

@@ -21,7 +21,15 @@ from postflight.reconciliation.forward_model import (
     resolved_stiffness_nmprad,
     steps_for,
 )
-from postflight.reconciliation.gauss_newton import LEAST_COMPLIANCE, Parameters, stiffness_step
+from postflight.reconciliation.gauss_newton import (
+    LEAST_COMPLIANCE,
+    Linearization,
+    NormalEquations,
+    Parameters,
+    Residuals,
+    _better,
+    stiffness_step,
+)
 from postflight.reconciliation.modes import HOP, PADDED, RATE_HZ, WINDOW, _spectra
 from postflight.reconciliation.posterior import joint_table, stiffness_bound
 from synthetic_flight.dynamics import beyond_freeplay, joint_modes
@@ -84,6 +92,22 @@ def test_a_loosened_joint_carries_the_plain_one_s_moment(corner):
     np.testing.assert_allclose(beyond_freeplay(bent, freeplay, corner), sizes, rtol=1e-9)
     np.testing.assert_allclose(made.motion[:, 7] / made.motion[:, 8], -0.75)
     assert made.vehicle[5] * FREEPLAY_SD_RAD == pytest.approx(freeplay)
+
+
+def test_a_step_whose_look_ahead_tumbles_is_tried_straight():
+    # residual 1 - x, of which nothing can be flown between 0.05 and 0.9
+    def residuals(u):
+        x = float(u.instruments[0])
+        left = np.array([np.nan if 0.05 < abs(x) < 0.9 else 1.0 - x])
+        return Residuals(left, np.zeros(0), float(left[0] ** 2) if np.isfinite(left[0]) else np.inf)
+
+    u = Parameters(np.zeros(1), np.zeros(1), np.zeros((3, 0)), np.zeros(0), np.zeros((0, MOTION)))
+    first = residuals(u)
+    linear = Linearization(first, [(np.array([0, 1]), np.array([[0.0, 1.0]]))], [], 2)
+    normal = NormalEquations(np.eye(2), np.array([0.0, 1.0]))
+    found, end = _better(SimpleNamespace(residuals=residuals), u, linear, normal, 0.0, (first, u))
+    assert end.instruments[0] == pytest.approx(1.0)
+    assert found.cost == pytest.approx(0.0, abs=1e-12)
 
 
 def stiff(factor):
