@@ -265,9 +265,8 @@ def angle_row(pulse, truth):
 def report(results):
     rows = [r for r in results if not r["words"]]
     print(f"\n{len(results)} flights, {len(results) - len(rows)} of them tumbled and left out; at peak pressure, deg")
-    head = (
-        "rms   bias   rms of z  1 sd %  2 sd %  refused  lateral 68, 95 %   plane (bent > 1 deg): rms  1 sd %  2 sd %"
-    )
+    head = "rms   bias  rms of z, of the vector's  1 sd %  2 sd %  refused  lateral 68, 95 %"
+    head += "   plane (bent > 1 deg): rms  1 sd %  2 sd %"
     print(f"{'':18}  {head}")
     for name in dict.fromkeys(n for r in rows for n in r["rows"]):
         a = np.array([r["rows"][name] for r in rows if name in r["rows"]])
@@ -275,7 +274,7 @@ def report(results):
         rms = np.sqrt(np.mean(a[:, 0] ** 2))
         share = [100.0 * np.mean(np.abs(z) < k) for k in (1, 2)]
         words = f"{name:18}{np.rad2deg(rms):6.3f}{np.rad2deg(a[:, 0].mean()):+7.3f}{np.sqrt(np.mean(z**2)):9.2f}"
-        words += f"{share[0]:10.0f}{share[1]:8.0f}{len(rows) - len(a):9d}"
+        words += f"{np.sqrt(0.5 * np.mean(a[:, 5])):13.2f}{share[0]:14.0f}{share[1]:8.0f}{len(rows) - len(a):9d}"
         inside = [100.0 * np.mean(a[:, 5] < chi2.ppf(p, 2)) for p in (0.6827, 0.9545)]
         words += f"{inside[0]:9.0f}{inside[1]:5.0f}"
         if bent.any():
