@@ -30,8 +30,8 @@ from flightmodel.telemetry import RadarRecord
 from recon import ekf, smoother
 from recon.error_model import ErrorModel, imu_blocks, instrument_blocks
 from recon.measurements import radar_instrument
-from recon.motion import SAME_INSTANT_S, strapdown_motion
 from recon.problem import Problem, observe
+from recon.propagation import SAME_INSTANT_S, strapdown_motion
 from recon.state import States
 
 DEG = np.pi / 180.0
@@ -73,7 +73,7 @@ def flight(seconds):
     )
     node = np.arange(0, len(t), round(IMU_HZ / RADAR_HZ))
     track = [start.position_ecef_m]
-    from recon.strapdown import propagate
+    from recon.propagation import propagate
 
     state = start
     for a, b in pairwise(node):

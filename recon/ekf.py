@@ -36,6 +36,7 @@ from recon import _filter_kernels, _measurement_kernels
 from recon._measurement_kernels import SLOTS
 from recon.measurements import NodeMotion, predict, wrapped
 from recon.problem import Problem
+from recon.propagation import propagate
 from recon.state import (
     KINEMATIC,
     ROTATION,
@@ -50,7 +51,6 @@ from recon.state import (
     packed,
     right_jacobian,
 )
-from recon.strapdown import propagate
 
 COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")
 

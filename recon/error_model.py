@@ -3,7 +3,7 @@
 Every block is a first-order Gauss-Markov process about zero, ``de/dt = -e / tau + noise``, started at its prior
 standard deviation and kept there by its noise; an infinite ``tau`` is a constant. Errors of the air decorrelate with
 altitude instead: ``exp(-|climb| / length)``. A *considered* error (Schmidt) is never estimated, but its effect stays in
-the covariance of everything else. The drivers of the motion come first (`recon.motion`).
+the covariance of everything else. The drivers of the motion come first (`recon.propagation`).
 
 References
 ----------

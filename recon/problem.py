@@ -9,7 +9,7 @@ import numpy as np
 from flightmodel.checks import FloatArray
 from recon.error_model import ErrorModel
 from recon.measurements import Instrument
-from recon.motion import Motion
+from recon.propagation import Motion
 from recon.state import KINEMATIC, BoolArray, IntArray, Observed, Sources, States
 
 FIT_SPAN_S = 3.0  # of the track points that the start is fitted to

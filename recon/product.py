@@ -22,9 +22,9 @@ from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, interpolate_rows
 from recon.imu_screening import BridgedSensor
 from recon.problem import Problem
+from recon.propagation import correct, correction_partials
 from recon.smoother import Smoothed
 from recon.state import INERTIAL, KINEMATIC, BoolArray, Innovations, States, unpacked
-from recon.strapdown import correct, correction_partials
 
 SAME_STRETCH_S = 1.0
 _MOST_STRETCHES = 12  # that are listed one by one

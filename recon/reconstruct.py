@@ -7,7 +7,7 @@ result (`Settings.passes`):
     x_{k+1} = f(x_k, inertial samples) + w,   z = h(x_k) + v;   x = kinematics and sensor errors
 
 Aerodynamics and atmosphere take no part: the answer is inertial, and aerodynamic quantities can be derived from it. A
-flight without inertial sensors is propagated by gravity and drag in the sounding's air instead (`recon.ballistic`).
+flight without inertial sensors is propagated by gravity and drag in the sounding's air instead (`recon.propagation`).
 
 What the data contradict is found on the way and the flight reconstructed again: jumps of the inertial clocks, transient
 offsets of readings, a priori uncertainties that are too small, trackers that contradict the rest
@@ -36,9 +36,9 @@ from recon import (
     fault_isolation,
     imu_screening,
     product,
+    propagation,
     setup,
     smoother,
-    strapdown,
     time_bias,
     unmodelled_acceleration,
 )
@@ -457,4 +457,4 @@ def _first_reference(problem: Problem, settings: Settings) -> tuple[States, tupl
         if moved < _CONVERGED_RAD:
             break
     assert reference is not None
-    return strapdown.fill_between(problem.motion, problem.node_index, kept, reference), found
+    return propagation.fill_between(problem.motion, problem.node_index, kept, reference), found

@@ -23,16 +23,13 @@ from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import AttitudePrior, Telemetry
 from recon import error_model, measurements
 from recon._measurement_kernels import HEIGHT, POSITION, RADAR, VELOCITY
-from recon.ballistic import ballistic_motion
 from recon.error_model import ErrorModel, instrument_blocks
 from recon.imu_screening import BridgedSensor
 from recon.measurements import Instrument
-from recon.motion import SAME_INSTANT_S, inertial_motion
 from recon.problem import FIT_SPAN_S, Problem, nearest_index, observe
+from recon.propagation import SAME_INSTANT_S, ballistic_motion, correct, inertial_motion, propagate, with_disturbances
 from recon.settings import Settings
 from recon.state import KINEMATIC, BoolArray, IntArray, States
-from recon.strapdown import correct, propagate
-from recon.unmodelled_acceleration import with_stated
 from recon.vector_attitude import start_attitude_from_vectors
 
 _TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT)
@@ -84,9 +81,7 @@ def build_problem(
     time_s = _union([output_s, between, *inside])
     observed, row = observe(time_s, instruments, SAME_INSTANT_S)
     if sensors is None:
-        motion, node_index = ballistic_motion(
-            telemetry.motion, telemetry.sounding, _cross_path_direction(used), time_s, SAME_INSTANT_S
-        )
+        motion, node_index = ballistic_motion(telemetry.motion, telemetry.sounding, _cross_path_direction(used), time_s)
         start, covariance = _start_ballistic(used, start_s, model)
     else:
         force, rate = sensors.force, sensors.rate
@@ -94,7 +89,7 @@ def build_problem(
         motion, node_index = inertial_motion(force, rate, time_s, clocks)
         prior = _attitude_prior(telemetry, start_s)
         start, covariance = _start_by_inertial_sensors(used, prior, start_s, force, rate, model)
-    motion = with_stated(motion, telemetry.motion)
+    motion = with_disturbances(motion, telemetry.motion)
     from scipy.stats import chi2
 
     gate = np.array([0.0, *(float(chi2.ppf(settings.gate_probability, k)) for k in (1, 2, 3))])
@@ -328,7 +323,7 @@ def _pulse_times(
 
 
 def _union(times: list[FloatArray]) -> FloatArray:
-    """All times in order, instants closer than `recon.motion.SAME_INSTANT_S` taken once."""
+    """All times in order, instants closer than `recon.propagation.SAME_INSTANT_S` taken once."""
     t = np.sort(np.concatenate(times))
     kept = t[np.diff(t, prepend=-np.inf) > SAME_INSTANT_S]
     # in a chain of near instants the last may be far from the first

@@ -6,8 +6,8 @@ axes, rad: ``state = nominal [+] error``. Following the accelerometer rather tha
 them derivatives of the gyro signal, out of the integration; `recon.reconstruct` moves the answer to the datum.
 
 A pass is plain tuples of arrays, which both engines take: ``n`` nodes, ``M`` measurements, ``m`` errors beside the nine
-kinematic ones (``N = 9 + m``), the first ``s`` of them drivers of the motion (`recon.motion`), ``D = 9 + s``. Symmetric
-matrices are stored as packed lower triangles.
+kinematic ones (``N = 9 + m``), the first ``s`` of them drivers of the motion (`recon.propagation`), ``D = 9 + s``.
+Symmetric matrices are stored as packed lower triangles.
 """
 
 from __future__ import annotations

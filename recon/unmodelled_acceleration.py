@@ -8,8 +8,7 @@ again; without them it is soon so uncertain that any track would be, so five sec
 *unmodelled acceleration* is allowed between the last accepted and the first rejected point, white noise of density
 ``D`` along every axis, ten times larger each time it does not suffice.
 
-The analyst's own spans (``[[motion.disturbed]]``: vibration that rectifies to a bias, a saturated gyro, thrust) are the
-same noise, of accelerations and of rates.
+The analyst's own spans (``[[motion.disturbed]]``) are the same noise (`recon.propagation.with_disturbances`).
 """
 
 from __future__ import annotations
@@ -21,9 +20,7 @@ import numpy as np
 
 from flightmodel.checks import DivergenceError
 from flightmodel.telemetry import Finding
-from flightmodel.telemetry import Motion as MotionSpec
 from recon.ekf import ForwardPass
-from recon.motion import Motion
 from recon.problem import Problem
 from recon.state import Innovations
 
@@ -34,18 +31,6 @@ _LEAST_ACCEPTED_SHARE = 0.5
 _BEFORE_S, _AFTER_S = 1.5, 0.5  # a slow departure passes the gate for a while
 _FIRST_DENSITY, _GROWTH, _LARGEST_DENSITY = 0.1, 10.0, 1.1e6  # (m/s^2)^2/Hz
 MOST_SPANS = 10  # in which inertial sensors may fail to carry the track before the flight is refused
-_STATED_CORRELATION_S = 1.0  # correlation time of a stated disturbance
-
-
-def with_stated(motion: Motion, spec: MotionSpec) -> Motion:
-    """Motion with the noise of the spans that flight.toml states as disturbed."""
-    force, rate = motion.force_density.copy(), motion.rate_density.copy()
-    for d in spec.disturbed:
-        inside = (motion.time_s >= d.start_s) & (motion.time_s < d.end_s)
-        force[inside] += d.sd_mps2**2 * _STATED_CORRELATION_S
-        if not motion.ballistic:  # which has no rotation
-            rate[inside] += d.sd_radps**2 * _STATED_CORRELATION_S
-    return motion._replace(force_density=force, rate_density=rate)
 
 
 @dataclass(frozen=True)

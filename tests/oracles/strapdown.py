@@ -1,10 +1,10 @@
-"""Strapdown mechanisation with its transition and noise in numpy: readable twin of `recon._strapdown_kernels`."""
+"""Strapdown mechanisation with its transition and noise in numpy: readable twin of `recon._propagation_kernels`."""
 
 import numpy as np
 
 from flightmodel import earth, rotations
+from recon.propagation import Step, correct, correction_partials
 from recon.state import States
-from recon.strapdown import Step, correct, correction_partials
 
 
 def propagate(grid, first, last, start):

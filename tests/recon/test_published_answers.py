@@ -19,11 +19,10 @@ from recon._measurement_kernels import HEIGHT, SLOTS
 from recon.ekf import ENGINES, forward, height
 from recon.error_model import Block, ErrorModel
 from recon.measurements import Instrument
-from recon.motion import strapdown_motion
 from recon.problem import Problem, observe
+from recon.propagation import propagate, strapdown_motion
 from recon.smoother import smooth
 from recon.state import Observed, States, Steps, Wander, unpacked
-from recon.strapdown import propagate
 from tests.oracles import bryson_frazier
 
 from . import linear

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from recon import _filter_kernels, _measurement_kernels, ballistic, ekf
+from recon import _filter_kernels, _measurement_kernels, ekf, propagation
 from recon._glr_kernels import offset_scores
-from recon.motion import strapdown_motion
+from recon.propagation import correct, propagate, strapdown_motion
 from recon.state import States, Wander, unpacked
-from recon.strapdown import correct, propagate
 from tests.oracles import ballistic as plain_ballistic
 from tests.oracles import bryson_frazier
 from tests.oracles import strapdown as plain_strapdown
@@ -158,7 +157,7 @@ def carried():
     nodes = np.array([0.0, 0.11, 0.2])
     spec = replace(SPEC, drag_area_per_mass_m2pkg=0.01)
     state = entry_state(60e3, (800.0, 1500.0, 900.0))
-    motion, index = ballistic.ballistic_motion(spec, windy_sounding(), across_plane(state), nodes, 2e-6)
+    motion, index = propagation.ballistic_motion(spec, windy_sounding(), across_plane(state), nodes)
     return motion, index, replace(state, sensor_errors=np.concatenate([DRIVERS, [9.0, 9.0]]))
 
 

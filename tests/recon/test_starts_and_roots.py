@@ -12,10 +12,10 @@ from recon import abrupt_offsets, atmosphere, setup
 from recon._measurement_kernels import POSITION
 from recon.imu_screening import TransientOffset
 from recon.product import accelerometer_root
+from recon.propagation import correct
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.state import packed
-from recon.strapdown import correct
 
 
 def test_a_start_is_the_datum_s_where_the_antenna_moves_about_it(monkeypatch):

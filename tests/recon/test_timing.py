@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from flightmodel.telemetry import RadarRecord
 from flightmodel.trajectory import difference
-from recon.motion import SAME_INSTANT_S
 from recon.problem import nearest_index, observe
+from recon.propagation import SAME_INSTANT_S
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.setup import _union
