@@ -16,11 +16,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from flightmodel import earth, tables
 from flightmodel.atmosphere import R_AIR_JPKGK, default_sounding_sd, height_from_pressure, profile_from_sounding
-from flightmodel.checks import BoolArray, FloatArray, nearest_name
+from flightmodel.checks import BoolArray, FloatArray, IntArray, nearest_name
 from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault
 from flightmodel.flightfile import FlightFile
 from flightmodel.gate import Gate, Table, find_faults, oversampled, rows_to_use
@@ -433,7 +432,7 @@ def _image_paths(
 
 def _film_numbers(
     gate: Gate, film: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Number of every frame in the film; what is wrong becomes a fault."""
     text = table["frame"].astype(str).str.strip()
     whole = text.str.fullmatch(r"\d{1,9}").to_numpy(dtype=bool)
@@ -491,7 +490,7 @@ def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
     return TriadRecord(spec, time_s, means), [Finding(spec.name, words, np.nan, np.nan, code="samples-averaged")]
 
 
-def _means(column: FloatArray, first: NDArray[np.int64], least: float) -> FloatArray:
+def _means(column: FloatArray, first: IntArray, least: float) -> FloatArray:
     """Mean of the values that are there from each of ``first`` to the next; NaN where fewer than ``least`` are."""
     there = np.isfinite(column)
     count = np.add.reduceat(there, first, dtype=np.int64)

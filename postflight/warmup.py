@@ -22,11 +22,10 @@ from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from recon import ekf, propagation, smoother
-from recon.error_model import Block, ErrorModel
+from recon.ekf import Problem, observe
 from recon.measurements import Instrument
-from recon.problem import Problem, observe
 from recon.propagation import strapdown_motion
-from recon.state import States, packed
+from recon.state import Block, ErrorModel, States, packed
 
 
 def _vehicle_at_rest() -> tuple[Vehicle, FloatArray]:
@@ -76,7 +75,7 @@ def _tiny_problem() -> Problem:
         np.empty((0, 3)),
     )
     nodes = np.arange(3)
-    observed, row = observe(motion.time_s, (nothing,), 0.0)
+    observed, row = observe(motion.time_s, (nothing,))
     return Problem(
         motion.time_s, nodes, motion, model, (nothing,), row, observed, start, np.eye(27), np.ones(4), nodes >= 0
     )

@@ -28,12 +28,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, IntArray
 from recon import _glr_kernels
-from recon.ekf import ForwardPass
+from recon.ekf import ForwardPass, Problem
 from recon.imu_screening import TransientOffset
-from recon.problem import Problem
-from recon.state import IntArray
 
 _BIASES = np.array([9, 10, 11, 18, 19, 20])  # columns of the transition: accelerometer, then gyros
 LOG_LIKELIHOOD_LIMIT = np.log(1000.0)  # ratio from which one hypothesis is accepted over the other

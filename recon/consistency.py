@@ -32,11 +32,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import FloatArray
-from recon.ekf import COMPILED, ForwardPass
-from recon.problem import FIT_SPAN_S, Problem
+from flightmodel.checks import BoolArray, FloatArray, IntArray
+from recon.ekf import COMPILED, FIT_SPAN_S, ForwardPass, Innovations, Problem
 from recon.smoother import backward, jacobian
-from recon.state import BoolArray, Innovations, IntArray, unpacked
+from recon.state import unpacked
 
 _MOST_EDITED = 0.05  # share of a source's points
 _LEAST_INSIDE = 0.90

@@ -40,11 +40,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erf
 
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray
 from flightmodel.gate import runs
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import Finding, TriadRecord
-from recon.state import IntArray
 
 _SLOPE_SPAN_S = 0.06
 _NEARBY_STEPS = 31  # of which the median is the usual step

@@ -17,14 +17,14 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import earth, rotations
-from flightmodel.checks import FloatArray
+from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, interpolate_rows
+from recon.ekf import Innovations, Problem
 from recon.imu_screening import BridgedSensor
-from recon.problem import Problem
 from recon.propagation import correct, correction_partials
 from recon.smoother import Smoothed
-from recon.state import INERTIAL, KINEMATIC, BoolArray, Innovations, States, unpacked
+from recon.state import INERTIAL, KINEMATIC, States, unpacked
 
 SAME_STRETCH_S = 1.0
 _MOST_STRETCHES = 12  # that are listed one by one

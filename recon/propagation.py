@@ -53,13 +53,13 @@ import numpy as np
 
 from flightmodel import rotations
 from flightmodel.atmosphere import profile_from_sounding
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, IntArray
 from flightmodel.telemetry import Motion as MotionSpec
 from flightmodel.telemetry import Sounding
 from flightmodel.trajectory import interpolate_rows
 from recon import _filter_kernels
 from recon.imu_screening import BridgedSensor
-from recon.state import IntArray, States
+from recon.state import States
 
 _STRAPDOWN_DRIVERS, _CLOCKS, _BALLISTIC_DRIVERS = 18, 2, 6
 SAME_INSTANT_S = 2e-6

@@ -44,8 +44,8 @@ from recon import (
 )
 from recon.abrupt_offsets import unsupported_offsets
 from recon.consistency import ConsistencyCheck, held_out_table
+from recon.ekf import FIT_SPAN_S, Problem
 from recon.fault_isolation import INFLATION, NO_ADAPTATION, Adaptation, LeftOut
-from recon.problem import FIT_SPAN_S, Problem
 from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem
 from recon.smoother import Smoothed

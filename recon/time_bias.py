@@ -32,9 +32,8 @@ from flightmodel.telemetry import Finding, TriadRecord
 from flightmodel.trajectory import interpolate_rows
 from recon.abrupt_offsets import LOG_LIKELIHOOD_LIMIT, offset_scores
 from recon.consistency import ConsistencyCheck, consistency_check
-from recon.ekf import ForwardPass
+from recon.ekf import ForwardPass, Problem
 from recon.imu_screening import BridgedSensor, usual_steps
-from recon.problem import Problem
 from recon.state import KINEMATIC, States
 
 _WINDOW_S, _STEP_S = 4.0, 0.01

@@ -20,9 +20,7 @@ import numpy as np
 
 from flightmodel.checks import DivergenceError
 from flightmodel.telemetry import Finding
-from recon.ekf import ForwardPass
-from recon.problem import Problem
-from recon.state import Innovations
+from recon.ekf import ForwardPass, Innovations, Problem
 
 CODE = "unmodelled-acceleration"
 _REJECTED_S = 5.0  # no point accepted for so long in ballistic flight, or, in any, to the end of the track

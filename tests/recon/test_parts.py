@@ -11,7 +11,6 @@ from flightmodel.instruments import ACCELEROMETER, GnssSpec, TriadSpec
 from flightmodel.telemetry import GnssRecord, TriadRecord
 from flightmodel.trajectory import Trajectory, difference
 from recon.consistency import source_checks
-from recon.error_model import instrument_blocks
 from recon.fault_isolation import _compared
 from recon.imu_screening import (
     _bridges,
@@ -26,7 +25,7 @@ from recon.measurements import gnss_instruments, magnetometer_instrument
 from recon.product import Mounting, datum_trajectory
 from recon.propagation import strapdown_motion, with_disturbances, with_exact_integrals
 from recon.setup import fit_start
-from recon.state import States, boxplus, packed
+from recon.state import States, boxplus, instrument_blocks, packed
 from recon.vector_attitude import _inconsistent_sensors, compare
 
 
