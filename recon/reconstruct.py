@@ -40,17 +40,22 @@ from recon import (
     setup,
     smoother,
     time_bias,
-    unmodelled_acceleration,
 )
-from recon.abrupt_offsets import unsupported_offsets
 from recon.consistency import ConsistencyCheck, held_out_table
 from recon.ekf import FIT_SPAN_S, Problem
+from recon.fault_detection import (
+    UNMODELLED_CODE,
+    UnmodelledAcceleration,
+    track_is_lost,
+    unsupported_offsets,
+    with_one_more,
+    with_unmodelled,
+)
 from recon.fault_isolation import INFLATION, NO_ADAPTATION, Adaptation, LeftOut
 from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem
 from recon.smoother import Smoothed
 from recon.state import ROTATION, States, boxminus, unpacked
-from recon.unmodelled_acceleration import UnmodelledAcceleration, track_is_lost, with_one_more, with_unmodelled
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
 # code, name and advice for the a priori errors of a ballistic flight's air and vehicle
@@ -204,7 +209,7 @@ def _compared_leaving_one_out(
     held_out: dict[str, pd.DataFrame] = {}
 
     def unmodelled(made: TrajectorySolution) -> int:
-        return sum(f.code == unmodelled_acceleration.CODE for f in made.findings)
+        return sum(f.code == UNMODELLED_CODE for f in made.findings)
 
     def rerun(source: str) -> tuple[Trajectory, tuple[ConsistencyCheck, ...], bool]:
         report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
