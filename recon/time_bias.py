@@ -15,9 +15,9 @@ tracker takes part.
 
 **Jumps.** A clock that jumps ahead leaves a gap like any other, but behind it all tags are late by the gap (or all
 before it were early, where the clock was set right). For each short gap the trackers give the likelihood of so late a
-clock from there on against that of none (`recon.fault_detection`, with the clock's column in place of a bias's), and the
-lags before and after give that of one clock against the other. Where both together exceed a thousand to one, the tags
-are corrected.
+clock from there on against that of none (`recon.fault_detection`, with the clock's column in place of a bias's), and
+the lags before and after give that of one clock against the other. Where both together exceed a thousand to one, the
+tags are corrected.
 """
 
 from __future__ import annotations
