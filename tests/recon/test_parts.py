@@ -22,8 +22,8 @@ from recon.imu_screening import (
     repeat_by_noise,
 )
 from recon.measurements import gnss_instruments, magnetometer_instrument
-from recon.product import Mounting, datum_trajectory
 from recon.propagation import strapdown_motion, with_disturbances, with_exact_integrals
+from recon.reconstruct import Mounting, datum_trajectory
 from recon.setup import fit_start
 from recon.state import States, boxplus, instrument_blocks, packed
 from recon.vector_attitude import _inconsistent_sensors, compare

@@ -11,9 +11,8 @@ from flightmodel import earth, rotations
 from recon import atmosphere, fault_detection, setup
 from recon._measurement_kernels import POSITION
 from recon.imu_screening import TransientOffset
-from recon.product import accelerometer_root
 from recon.propagation import correct
-from recon.reconstruct import reconstruct
+from recon.reconstruct import accelerometer_root, reconstruct
 from recon.settings import Settings
 from recon.state import packed
 
