@@ -34,7 +34,8 @@ import pandas as pd
 
 from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.telemetry import Finding
-from recon.ekf import COMPILED, FIT_SPAN_S, ForwardPass, Innovations, Problem
+from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
+from recon.settings import COMPILED
 from recon.smoother import Smoothed, backward, jacobian
 from recon.state import KINEMATIC, States, boxminus, unpacked
 

@@ -40,9 +40,9 @@ from recon import _filter_kernels, _measurement_kernels
 from recon._measurement_kernels import SLOTS
 from recon.measurements import Instrument, NodeMotion, predict, wrapped
 from recon.propagation import SAME_INSTANT_S, Motion, propagate
+from recon.settings import COMPILED
 from recon.state import KINEMATIC, ROTATION, ErrorModel, States, boxminus, boxplus, packed, right_jacobian
 
-COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")
 FIT_SPAN_S = 3.0  # of the track points that the start is fitted to
 
 

@@ -43,7 +43,8 @@ import numpy as np
 
 from flightmodel.checks import FloatArray, IntArray
 from recon import _smoother_kernels
-from recon.ekf import COMPILED, Filtered, ForwardPass, Innovations, Observed, Problem, Steps
+from recon.ekf import Filtered, ForwardPass, Innovations, Observed, Problem, Steps
+from recon.settings import COMPILED
 from recon.state import KINEMATIC, States, boxplus, packed, unpacked
 
 

@@ -16,9 +16,10 @@ import pytest
 
 from flightmodel import earth
 from recon._measurement_kernels import HEIGHT, SLOTS
-from recon.ekf import ENGINES, Observed, Problem, Steps, forward, height, observe
+from recon.ekf import Observed, Problem, Steps, forward, height, observe
 from recon.measurements import Instrument
 from recon.propagation import propagate, strapdown_motion
+from recon.settings import ENGINES
 from recon.smoother import smooth
 from recon.state import Block, ErrorModel, States, Wander, unpacked
 from tests.oracles import bryson_frazier

@@ -9,9 +9,8 @@ from scipy.stats import chi2
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.telemetry import RadarRecord, TriadRecord
 from flightmodel.trajectory import difference
-from recon.ekf import ENGINES
 from recon.reconstruct import reconstruct
-from recon.settings import Settings
+from recon.settings import ENGINES, Settings
 
 from .ballistic_flight import fly, watch
 from .conftest import gauss_markov

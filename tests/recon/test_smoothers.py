@@ -7,7 +7,8 @@ import pytest
 
 from flightmodel.instruments import GnssSpec
 from recon import fault_detection, smoother
-from recon.ekf import COMPILED, ENGINES, FILTERPY, forward
+from recon.ekf import forward
+from recon.settings import COMPILED, ENGINES, FILTERPY
 from recon.smoother import full_step, smooth, step_gain
 from recon.state import unpacked
 from tests.oracles import bryson_frazier
