@@ -28,11 +28,10 @@ from flightmodel import earth, rotations
 from flightmodel.instruments import RADAR, RadarSite, TriadSpec
 from flightmodel.telemetry import RadarRecord
 from recon import ekf, smoother
-from recon.error_model import ErrorModel, imu_blocks, instrument_blocks
+from recon.ekf import Problem, observe
 from recon.measurements import radar_instrument
-from recon.motion import SAME_INSTANT_S, strapdown_motion
-from recon.problem import Problem, observe
-from recon.state import States
+from recon.propagation import strapdown_motion
+from recon.state import ErrorModel, States, imu_blocks, instrument_blocks
 
 DEG = np.pi / 180.0
 IMU_HZ, RADAR_HZ = 400.0, 10.0
@@ -73,7 +72,7 @@ def flight(seconds):
     )
     node = np.arange(0, len(t), round(IMU_HZ / RADAR_HZ))
     track = [start.position_ecef_m]
-    from recon.strapdown import propagate
+    from recon.propagation import propagate
 
     state = start
     for a, b in pairwise(node):
@@ -95,7 +94,7 @@ def problem_of(motion, node, start, z):
     time_s = motion.time_s[node]
     instrument = radar_instrument("radar", RadarRecord(SITE, time_s, z), np.array([0.4, 0.0, 0.01]))
     model = ErrorModel(tuple(imu_blocks(FORCE, RATES) + instrument_blocks(RADAR, SITE)))
-    observed, row = observe(time_s, (instrument,), SAME_INSTANT_S)
+    observed, row = observe(time_s, (instrument,))
     sd = np.concatenate([np.full(3, 1000.0), np.full(3, 100.0), np.full(3, 3.0 * DEG), model.prior_sd])
     gate = np.array([0.0, 15.0, 18.0, 21.1])
     return Problem(

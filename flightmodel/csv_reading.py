@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, IntArray
 from flightmodel.tables import TimeColumn, clock_times, column_names
 
 SMALLEST_BYTES = 512 * 1024  # below it the careful reader is as quick as loading compiled code
@@ -61,7 +61,7 @@ class _Layout:
     body: int
     first_line: int
     names: tuple[str, ...]  # of the numbers, in the order of the block's rows
-    slots: NDArray[np.int64]
+    slots: IntArray
     text: bool
 
 
@@ -244,7 +244,7 @@ def _edges(layout: _Layout, size: int, counted: list[tuple[int, int, bool]]) -> 
     return [*edges, (size, rows + int(not counted[-1][2]))]
 
 
-def _cells(data: Bytes, spans: NDArray[np.int64]) -> list[str]:
+def _cells(data: Bytes, spans: IntArray) -> list[str]:
     """Text of cells, without the spaces around them."""
     cells: list[str] = []
     for k in range(0, spans.shape[1], 16384):  # a table of characters at a time

@@ -61,13 +61,6 @@ def gravitation(position_m: FloatArray) -> FloatArray:
     return -GM_M3PS2 / r2**1.5 * bracket * p
 
 
-def gravitation_gradient(position_m: FloatArray) -> FloatArray:
-    """Gradient of gravitation ``(3, 3)`` at one position, central term only (J2 changes it by 0.2 %), 1/s^2."""
-    r = float(np.linalg.norm(position_m))
-    n = position_m / r
-    return GM_M3PS2 / r**3 * (3.0 * np.outer(n, n) - np.eye(3))
-
-
 def geodetic_from_ecef(position_ecef_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Geodetic latitude, longitude (rad) and height (m) of ECEF positions ``(..., 3)``."""
     p = np.asarray(position_ecef_m, dtype=float)

@@ -28,12 +28,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from flightmodel import tables
-from flightmodel.checks import NO_FAULT, BoolArray, ConfigError, Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import NO_FAULT, BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.csv_reading import file_sha256, read_numbers
-from flightmodel.tables import IntArray, Source
+from flightmodel.tables import Source
 from flightmodel.telemetry import Finding
 
 # no entry vehicle's instruments read beyond these; a larger number is a wrong unit or a broken word
@@ -256,7 +255,6 @@ GAP_FACTOR = 5.0  # an interval this many times the usual one is a gap
 FROZEN_S, FROZEN_SAMPLES = 0.5, 10  # a column unchanged for this long, in at least so many samples, is frozen
 SATURATED_SAMPLES = 5  # this many samples in a row at a column's largest or smallest value are a stop
 MANY = 20  # runs of one kind that are listed one by one
-Indices = NDArray[np.int64]
 
 
 def find_faults(
@@ -293,7 +291,7 @@ def find_faults(
 
 
 def findings_of_runs(
-    source: str, time_s: FloatArray, first: Indices, last: Indices, words: Callable[[int], Fault], kind: str
+    source: str, time_s: FloatArray, first: IntArray, last: IntArray, words: Callable[[int], Fault], kind: str
 ) -> list[Finding]:
     """Findings of runs of samples ``first`` to ``last``; ``words`` of each with their code, and ``kind`` in the plural.
 
@@ -315,7 +313,7 @@ def findings_of_runs(
     return found
 
 
-def runs(mask: BoolArray) -> tuple[Indices, Indices]:
+def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
     """First and last index of each unbroken run of true."""
     inside = np.flatnonzero(mask)
     breaks = np.flatnonzero(np.diff(inside) > 1)

@@ -2,7 +2,7 @@
 
 Each instrument is one record in SI: where it sits, and one row an error. A row (`ErrorRow`) states the error's prior in
 flight.toml, the error states it becomes in the filter, and the sizes from which the simulator draws it. From the rows
-follow the keys of flight.toml (`RadarEntry`, ...), the filter's blocks (`recon.error_model`), the keys of a scenario
+follow the keys of flight.toml (`RadarEntry`, ...), the filter's blocks (`recon.state`), the keys of a scenario
 file and the lines of flight.toml that a synthetic flight gets (`synthetic_flight.instrument_errors`). What is left to
 write for a new error is its partial derivative in `recon._measurement_kernels`.
 

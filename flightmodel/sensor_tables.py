@@ -16,13 +16,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from flightmodel import earth, tables
 from flightmodel.atmosphere import R_AIR_JPKGK, default_sounding_sd, height_from_pressure, profile_from_sounding
-from flightmodel.checks import BoolArray, FloatArray, nearest_name
+from flightmodel.checks import BoolArray, FloatArray, IntArray, nearest_name
 from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault
-from flightmodel.flightfile import FlightFile
 from flightmodel.gate import Gate, Table, find_faults, oversampled, rows_to_use
 from flightmodel.instruments import (
     ACCELEROMETER,
@@ -283,13 +281,15 @@ BODY = "body"  # the mount of a triad along body axes
 DEFAULT_PACKAGE = {TriadEntry: "suba", RatesEntry: BODY, MagnetometerEntry: "magnetometer"}
 
 
-def read_triad(gate: Gate, name: str, spec: FlightFile, vehicle: Vehicle | None) -> TriadRecord | None:
-    """Read a triad that flight.toml names; None where it names none, or, with the faults kept, where it is refused."""
-    source: Triad | None = getattr(spec.sensors, name)
-    if source is None:
-        return None
+def read_triad(
+    gate: Gate, name: str, source: Triad, vehicle: Vehicle | None, vehicle_stated: bool
+) -> TriadRecord | None:
+    """Read a triad; None, with the faults kept, where it is refused.
+
+    ``vehicle`` is None where flight.toml states none, and where the stated one is refused.
+    """
     quantities = TRIAD_COLUMNS[type(source)]
-    mounting = _mounting(gate, name, source, spec, vehicle)
+    mounting = _mounting(gate, name, source, vehicle, vehicle_stated)
     table = gate.table(f"sensors.{name}", source, quantities)
     if table is None or table.time_s is None:
         return None
@@ -311,13 +311,13 @@ def read_triad(gate: Gate, name: str, spec: FlightFile, vehicle: Vehicle | None)
 
 
 def _mounting(
-    gate: Gate, name: str, source: Triad, spec: FlightFile, vehicle: Vehicle | None
+    gate: Gate, name: str, source: Triad, vehicle: Vehicle | None, vehicle_stated: bool
 ) -> tuple[FloatArray, FloatArray] | None:
     """Place (3,) and ``dcm_body_sensor`` (3, 3); None, with a fault kept, where no package of that name is known."""
     package = source.mount or DEFAULT_PACKAGE[type(source)]
     if source.axes is not None or package == BODY:
         return source.place_m, source.dcm_body_sensor
-    if spec.vehicle is None:
+    if not vehicle_stated:
         why = "it states no mount" if source.mount is None else f"mount = '{package}' is a vehicle's package"
         words = (
             'write mount = "body" (along body axes) or axes = ["+x", "+y", "+z"] with the body axis of each of its axes'
@@ -433,7 +433,7 @@ def _image_paths(
 
 def _film_numbers(
     gate: Gate, film: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Number of every frame in the film; what is wrong becomes a fault."""
     text = table["frame"].astype(str).str.strip()
     whole = text.str.fullmatch(r"\d{1,9}").to_numpy(dtype=bool)
@@ -491,7 +491,7 @@ def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
     return TriadRecord(spec, time_s, means), [Finding(spec.name, words, np.nan, np.nan, code="samples-averaged")]
 
 
-def _means(column: FloatArray, first: NDArray[np.int64], least: float) -> FloatArray:
+def _means(column: FloatArray, first: IntArray, least: float) -> FloatArray:
     """Mean of the values that are there from each of ``first`` to the next; NaN where fewer than ``least`` are."""
     there = np.isfinite(column)
     count = np.add.reduceat(there, first, dtype=np.int64)

@@ -21,10 +21,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.config import Section, Time
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 
@@ -98,7 +97,6 @@ class Source(Section):
         return TimeColumn(parts[0], t.format, t.unit, parts, t.repeats)
 
 
-IntArray = NDArray[np.int64]
 # unit -> (kind of quantity, factor to SI, offset added after the factor)
 UNITS: dict[str, tuple[str, float, float]] = {
     "s": ("time", 1.0, 0.0),

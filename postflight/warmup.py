@@ -21,12 +21,11 @@ from flightmodel import earth
 from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
-from recon import ekf, smoother, strapdown
-from recon.error_model import Block, ErrorModel
+from recon import ekf, propagation, smoother
+from recon.ekf import Problem, observe
 from recon.measurements import Instrument
-from recon.motion import strapdown_motion
-from recon.problem import Problem, observe
-from recon.state import States, packed
+from recon.propagation import strapdown_motion
+from recon.state import Block, ErrorModel, States, packed
 
 
 def _vehicle_at_rest() -> tuple[Vehicle, FloatArray]:
@@ -76,7 +75,7 @@ def _tiny_problem() -> Problem:
         np.empty((0, 3)),
     )
     nodes = np.arange(3)
-    observed, row = observe(motion.time_s, (nothing,), 0.0)
+    observed, row = observe(motion.time_s, (nothing,))
     return Problem(
         motion.time_s, nodes, motion, model, (nothing,), row, observed, start, np.eye(27), np.ones(4), nodes >= 0
     )
@@ -97,8 +96,8 @@ def _smoothers() -> None:
     steps.transition[:, range(9), range(9)] = 1.0
     states = States(*(np.array([part] * 3) for part in ekf.as_charts(problem.start)))
     smoother.smooth(problem, ekf.ForwardPass(states, steps, run, innovations))
-    strapdown.fill_between(problem.motion, problem.node_index, problem.node_index[:1], states[:1])
-    strapdown.propagate(problem.motion, 0, 1, problem.start)
+    propagation.fill_between(problem.motion, problem.node_index, problem.node_index[:1], states[:1])
+    propagation.propagate(problem.motion, 0, 1, problem.start)
 
 
 def _tables() -> None:

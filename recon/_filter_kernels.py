@@ -11,9 +11,8 @@ import math
 import numpy as np
 
 from flightmodel._kernels import WGS84, boxplus, geodetic, inlined, kernel, merged
-from recon._ballistic_kernels import propagate_ballistic
 from recon._measurement_kernels import RADAR, SLOTS, SUN, node_motion, predict
-from recon._strapdown_kernels import propagate_strapdown
+from recon._propagation_kernels import propagate_ballistic, propagate_strapdown
 
 TWO_PI = 2.0 * math.pi
 LEAST_DECAY = 1e-3  # the smoother divides by it; an error decorrelated to a thousandth is decorrelated

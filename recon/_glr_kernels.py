@@ -1,4 +1,4 @@
-"""Compiled scores for the generalised likelihood-ratio test of offsets; the equations: `recon.abrupt_offsets`.
+"""Compiled scores for the generalised likelihood-ratio test of offsets; the equations: `recon.fault_detection`.
 
 The filter's adjoint (Bryson-Frazier) is carried backwards over measurements and steps. Readable twin:
 `tests.oracles.bryson_frazier`.

@@ -21,8 +21,7 @@ from flightmodel._kernels import (
     kernel,
     merged,
 )
-from recon._ballistic_kernels import ballistic_acceleration
-from recon._strapdown_kernels import cross_into, level, matmul_into
+from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN = range(6)
 SLOTS = 13

@@ -46,14 +46,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flightmodel import earth, rotations
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.geomagnetism_and_sun import magnetic_field_ecef_t, sun_direction_ecef
 from flightmodel.instruments import SunHeads, TriadSpec, direction_from_sun_angles, sun_angles_from_direction
 from flightmodel.telemetry import SunRecord, TriadRecord
 from recon._measurement_kernels import SLOTS
-from recon.error_model import AXES
 from recon.measurements import magnetometer_model, sun_model
-from recon.state import IntArray
+from recon.state import AXES
 
 Position = Callable[[FloatArray], FloatArray]
 _MAGNETOMETER, _HEADS = "magnetometer", "sun heads"

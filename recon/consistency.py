@@ -32,17 +32,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import FloatArray
-from recon.ekf import COMPILED, ForwardPass
-from recon.problem import FIT_SPAN_S, Problem
-from recon.smoother import backward, jacobian
-from recon.state import BoolArray, Innovations, IntArray, unpacked
+from flightmodel.checks import BoolArray, FloatArray, IntArray
+from flightmodel.telemetry import Finding
+from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
+from recon.settings import COMPILED
+from recon.smoother import Smoothed, backward, jacobian
+from recon.state import KINEMATIC, States, boxminus, unpacked
 
 _MOST_EDITED = 0.05  # share of a source's points
 _LEAST_INSIDE = 0.90
 MOST_KEPT_SD = 0.98  # of the a priori sd: an error that keeps more of it was not observable
 _MOST_PREDICTED = 4000  # held-out measurements; more are thinned evenly
 _COLUMNS = ("time_s", "source", "component", "residual", "predicted_sd")
+# code, name and advice for the a priori errors of a ballistic flight's air and vehicle
+_BALLISTIC_CHECKS = {
+    "air": ("sounding", "sounding", "is beyond the sounding's uncertainty: check its units, its time and place"),
+    "vehicle": (
+        "pre-flight-drag",
+        "pre-flight drag",
+        "is beyond the pre-flight uncertainty: check mass, area and coefficients",
+    ),
+}
+SAME_STRETCH_S = 1.0  # edited measurements closer than this are one stretch
+_MOST_STRETCHES = 12  # of edited measurements that are listed one by one
 GROUPS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9)}
 
 
@@ -220,6 +232,33 @@ def source_checks(problem: Problem, innovations: Innovations, confidence: float)
     return out
 
 
+def filter_against_smoother(
+    problem: Problem, run: ForwardPass, smoothed: Smoothed, reference: States
+) -> list[ConsistencyCheck]:
+    """Filter against smoother at the kept nodes after the first seconds."""
+    kept = np.flatnonzero(problem.kept)
+    settled = problem.time_s[kept] > problem.time_s[0] + FIT_SPAN_S
+    difference = boxminus(run.states()[kept], reference[kept])[settled, :KINEMATIC]
+    p_filter, p_smoother = (unpacked(t[settled], KINEMATIC) for t in (run.filtered.p_plus, smoothed.triangles))
+    groups = [name for name in GROUPS if name != "attitude" or not problem.motion.ballistic]
+    return mcreynolds_checks(difference, p_filter, p_smoother, groups)
+
+
+def data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) -> list[ConsistencyCheck]:
+    """One check for each instrument with errors that the flight made observable."""
+    out = []
+    owners = np.array(problem.model.instruments, dtype=object)
+    estimated = ~problem.model.wander.considered
+    for owner in dict.fromkeys(owners[estimated]):
+        name = str(owner)
+        rows = table[(owners == name) & estimated]
+        estimate, prior_sd, sd = rows[["estimate", "prior_sd", "sd"]].to_numpy(dtype=float).T
+        code, label, *bad = _BALLISTIC_CHECKS.get(name, ("data-sheet", f"data sheet {name}"))
+        errors = [error.removeprefix(f"{name} ") for error in rows["name"]]
+        out.append(data_sheet_check(code, label, name, errors, estimate, prior_sd, sd, confidence, *bad))
+    return [v for v in out if v is not None]
+
+
 def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -> pd.DataFrame:
     """One row for each component of the measurements that were not used: `_COLUMNS`, in order of time."""
     rows = _chosen(problem)
@@ -285,3 +324,44 @@ def _smoothed(problem: Problem, run: ForwardPass, kept: BoolArray, engine: str) 
         np.empty((len(triangles), problem.size)),
     )  # fmt: skip
     return x, unpacked(triangles)
+
+
+def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
+    """One row for each component that was measured; what is not ``used`` is held out."""
+    row, component = np.nonzero(np.isfinite(problem.observed.variance))
+    source = problem.observed.source[row]
+    names = np.array([i.name for i in problem.instruments], dtype=object)
+    components = np.array([(*i.components, "", "")[:3] for i in problem.instruments], dtype=object)
+    return pd.DataFrame(
+        {
+            "time_s": problem.time_s[problem.node[row]],
+            "source": names[source],
+            "component": components[source, component],
+            "residual": innovations.residual[row, component],
+            "predicted_sd": np.sqrt(innovations.covariance[row, component, component]),
+            "accepted": innovations.accepted[row],
+            "used": problem.observed.usable[row],
+        }
+    )
+
+
+def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
+    """Stretches in which measurements were edited; sources excluded by settings have none."""
+    out = []
+    time_s = problem.time_s[problem.node]
+    for number, instrument in enumerate(problem.instruments):
+        mine = (problem.observed.source == number) & problem.observed.usable
+        times = time_s[mine & ~accepted]
+        if len(times) == 0:
+            continue
+        what = "track point" if instrument.name == instrument.owner else "reading"
+        stretches = np.split(times, np.flatnonzero(np.diff(times) > SAME_STRETCH_S) + 1)
+        if len(stretches) > _MOST_STRETCHES:
+            share = 100.0 * len(times) / int(mine.sum())
+            remark = f"{len(times)} {what}s edited in {len(stretches)} stretches ({share:.0f} % of them)"
+            out.append(Finding(instrument.name, remark, float(times[0]), float(times[-1]), "points-edited"))
+            continue
+        for stretch in stretches:
+            remark = f"{len(stretch)} {what}{'s' if len(stretch) > 1 else ''} edited"
+            out.append(Finding(instrument.name, remark, float(stretch[0]), float(stretch[-1]), "points-edited"))
+    return out

@@ -13,6 +13,10 @@ the gain ``K = P H^T S^-1`` in which the rows of considered errors are zero (Sch
 
 (Joseph), by which a considered error keeps its own variance.
 
+A pass is plain tuples of arrays, which both engines take: ``n`` nodes, ``M`` measurements, ``m`` errors beside the nine
+kinematic ones (``N = 9 + m``), the first ``s`` of them drivers of the motion (`recon.propagation`), ``D = 9 + s``.
+Symmetric matrices are stored as packed lower triangles. A `Problem` is all that a pass is given.
+
 Engines: ``"compiled"`` (the default, `recon._filter_kernels`) and ``"filterpy"``, filterpy's `ExtendedKalmanFilter`
 with sensor models in numpy, which is also where another filter can be put in its place. Both step the nominal state by
 the same compiled mechanisation. Measured speeds: docs/decisions/0007-two-engines.md.
@@ -25,39 +29,257 @@ S. Schmidt, "Application of state-space methods to navigation problems", Advance
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flightmodel import rotations
-from flightmodel.checks import FloatArray
+from flightmodel.checks import BoolArray, FloatArray, IntArray
 from recon import _filter_kernels, _measurement_kernels
 from recon._measurement_kernels import SLOTS
-from recon.measurements import NodeMotion, predict, wrapped
-from recon.problem import Problem
-from recon.state import (
-    KINEMATIC,
-    ROTATION,
-    Charts,
-    Filtered,
-    Innovations,
-    IntArray,
-    States,
-    Steps,
-    boxminus,
-    boxplus,
-    packed,
-    right_jacobian,
-)
-from recon.strapdown import propagate
+from recon.measurements import Instrument, NodeMotion, predict, wrapped
+from recon.propagation import SAME_INSTANT_S, Motion, propagate
+from recon.settings import COMPILED
+from recon.state import KINEMATIC, ROTATION, ErrorModel, States, boxminus, boxplus, packed, right_jacobian
 
-COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")
+FIT_SPAN_S = 3.0  # of the track points that the start is fitted to
+
+
+class Sources(NamedTuple):
+    """Instruments, one row each: kind, lever arm, place, axes, and which error (-1: none) fills each of its slots."""
+
+    kind: IntArray
+    arm_body_m: FloatArray
+    site_ecef_m: FloatArray
+    dcm: FloatArray
+    slot: IntArray
+
+
+class Observed(NamedTuple):
+    """Measurements in order of nodes; those of node ``k`` are rows ``first[k]`` to ``first[k + 1]``.
+
+    Parameters
+    ----------
+    first : (n + 1,) int
+    source : (M,) int
+    value, variance : (M, 3) float
+        Variance is infinite where a component was not measured.
+    known : (M, 3) float
+        Field or direction to the Sun, Earth-fixed axes; of a radar, the refractivity at its site first.
+    usable : (M,) bool
+        Whether the filter may use it at all.
+    """
+
+    first: IntArray
+    source: IntArray
+    value: FloatArray
+    variance: FloatArray
+    known: FloatArray
+    usable: BoolArray
+
+
+class Charts(NamedTuple):
+    """Nominal states at all nodes: position, velocity (n, 3), attitude (n, 4), errors (n, m)."""
+
+    position: FloatArray
+    velocity: FloatArray
+    q: FloatArray
+    errors: FloatArray
+
+
+class Steps(NamedTuple):
+    """Each node to the next: transition (n - 1, 9, D), noise (n - 1, 9, 9), decay and noise of errors (n - 1, m)."""
+
+    transition: FloatArray
+    noise: FloatArray
+    decay: FloatArray
+    noise_var: FloatArray
+
+
+class Filtered(NamedTuple):
+    """Errors about the charts before and after each node's measurements, and their covariance.
+
+    Parameters
+    ----------
+    x_minus, x_plus : (n, N) float
+    p_minus : (n, N (N + 1) / 2) float
+        Packed.
+    kept : (n,) int
+        Row of ``p_plus`` that holds a node's covariance; -1 where it is not wanted.
+    p_plus : (k, D (D + 1) / 2) float
+        Packed.
+    p_last : (N, N) float
+        After the last measurement.
+    """
+
+    x_minus: FloatArray
+    x_plus: FloatArray
+    p_minus: FloatArray
+    kept: IntArray
+    p_plus: FloatArray
+    p_last: FloatArray
+
+
+class Innovations(NamedTuple):
+    """Innovation and gain of each measurement; components that were not measured are zero with unit variance.
+
+    Parameters
+    ----------
+    residual, covariance : (M, 3), (M, 3, 3) float
+    nis : (M,) float
+    accepted : (M,) bool
+    gain : (M, N, 3) float
+        Zero where not accepted.
+    by_state, by_error : (M, 3, 9), (M, 3, SLOTS) float
+        Partials of the prediction.
+    """
+
+    residual: FloatArray
+    covariance: FloatArray
+    nis: FloatArray
+    accepted: BoolArray
+    gain: FloatArray
+    by_state: FloatArray
+    by_error: FloatArray
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything the filter needs.
+
+    Parameters
+    ----------
+    time_s : (n,) float
+        Nodes, the first is the start.
+    node_index : (n,) int
+        Where each node stands in the motion's grid.
+    instruments : tuple of Instrument
+    row : (M,) int
+        Which of its instrument's measurements each observation is.
+    observed : Observed
+        All measurements by node.
+    start, start_covariance : States, (9 + m, 9 + m) float
+    gate : (4,) float
+        Largest normalised innovation squared that is used, by number of components.
+    kept : (n,) bool
+        Nodes at which covariances are wanted.
+    """
+
+    time_s: FloatArray
+    node_index: IntArray
+    motion: Motion
+    model: ErrorModel
+    instruments: tuple[Instrument, ...]
+    row: IntArray
+    observed: Observed
+    start: States
+    start_covariance: FloatArray
+    gate: FloatArray
+    kept: BoolArray
+
+    @property
+    def size(self) -> int:
+        """Number of errors in all."""
+        return KINEMATIC + self.model.size
+
+    @property
+    def dense(self) -> int:
+        """Kinematic errors and drivers."""
+        return KINEMATIC + self.motion.drivers
+
+    @property
+    def node(self) -> IntArray:
+        """Node of every measurement, (M,)."""
+        return np.repeat(np.arange(len(self.time_s)), np.diff(self.observed.first))
+
+    @property
+    def moving(self) -> IntArray:
+        """Errors that change: the nine kinematic ones and Gauss-Markov ones."""
+        return np.concatenate([np.arange(KINEMATIC), KINEMATIC + self.model.wandering])
+
+    def sources(self) -> Sources:
+        """Instruments as arrays."""
+        return Sources(
+            np.array([i.kind for i in self.instruments], dtype=np.int64),
+            np.array([i.arm_body_m for i in self.instruments]),
+            np.array([i.site_ecef_m for i in self.instruments]),
+            np.array([i.dcm for i in self.instruments]),
+            np.array([i.slots(self.model) for i in self.instruments]),
+        )
+
+    def without(self, unusable: BoolArray) -> Problem:
+        """Same problem in which some measurements (M,) are only predicted, never used."""
+        return replace(self, observed=self.observed._replace(usable=self.observed.usable & ~unusable))
+
+    def thinned(self, step_s: float) -> tuple[Problem, IntArray]:
+        """Problem with at most one used measurement of an instrument every ``step_s``, and the nodes (k,) it keeps.
+
+        A node of every step stays even where nothing is measured: after a long step a decorrelated error cannot be
+        smoothed.
+        """
+        node, used = self.node, np.flatnonzero(self.observed.usable)
+        cell = np.floor(self.time_s[node[used]] / step_s).astype(np.int64)
+        _, first = np.unique(np.column_stack([self.observed.source[used], cell]), axis=0, return_index=True)
+        chosen = np.sort(used[first])
+        _, first_of_step = np.unique(np.floor(self.time_s / step_s), return_index=True)
+        index = np.unique(np.concatenate([first_of_step, node[chosen]])).astype(np.int64)
+        observed = self.observed
+        thin = Observed(
+            np.searchsorted(node[chosen], np.concatenate([index, [len(self.time_s)]])).astype(np.int64),
+            observed.source[chosen],
+            observed.value[chosen],
+            observed.variance[chosen],
+            observed.known[chosen],
+            observed.usable[chosen],
+        )
+        return (
+            replace(
+                self,
+                time_s=self.time_s[index],
+                node_index=self.node_index[index],
+                row=self.row[chosen],
+                observed=thin,
+                kept=np.zeros(len(index), dtype=bool),
+            ),
+            index,
+        )
+
+
+def observe(time_s: FloatArray, instruments: tuple[Instrument, ...]) -> tuple[Observed, IntArray]:
+    """All measurements of instruments that lie on nodes (within `SAME_INSTANT_S`), by node, and their rows (M,)."""
+    source, row, node = [], [], []
+    for number, instrument in enumerate(instruments):
+        nearest = nearest_index(time_s, instrument.time_s)
+        on = np.flatnonzero(np.abs(time_s[nearest] - instrument.time_s) <= SAME_INSTANT_S)
+        source.append(np.full(len(on), number, dtype=np.int64))
+        row.append(on)
+        node.append(nearest[on])
+    sources, rows, nodes = (np.concatenate(part).astype(np.int64) for part in (source, row, node))
+    order = np.lexsort((rows, sources, nodes))
+    sources, rows, nodes = sources[order], rows[order], nodes[order]
+
+    def gathered(name: str) -> FloatArray:
+        out = np.empty((len(rows), 3))
+        for number, instrument in enumerate(instruments):
+            mine = sources == number
+            out[mine] = getattr(instrument, name)[rows[mine]]
+        return out
+
+    first = np.searchsorted(nodes, np.arange(len(time_s) + 1)).astype(np.int64)
+    usable = np.ones(len(rows), dtype=bool)
+    return Observed(first, sources, gathered("value"), gathered("variance"), gathered("known"), usable), rows
+
+
+def nearest_index(grid_s: FloatArray, at_s: FloatArray) -> IntArray:
+    """Index of the grid time nearest to each of ``at_s``."""
+    k = np.clip(np.searchsorted(grid_s, at_s), 1, len(grid_s) - 1)
+    return np.asarray(k - (at_s - grid_s[k - 1] < grid_s[k] - at_s), dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class ForwardPass:
-    """What the smoother needs of a linear (or linearised) filter, node by node; see `recon.state`."""
+    """What the smoother needs of a linear (or linearised) filter, node by node."""
 
     charts: States
     steps: Steps

@@ -36,10 +36,9 @@ import pandas as pd
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, difference, resample
-from recon.consistency import MOST_KEPT_SD, ConsistencyCheck, edit_check
+from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, edit_check
+from recon.ekf import Problem, nearest_index
 from recon.imu_screening import TransientOffset
-from recon.problem import Problem, nearest_index
-from recon.product import SAME_STRETCH_S
 from recon.state import KINEMATIC
 from recon.time_bias import ClockJump, Lag
 

@@ -28,7 +28,7 @@ been; a transient offset does, and so do blocks of samples in the wrong order. T
 difference of the parabolas through `_REACH` samples on either side, carried to the middle. It is one where it exceeds
 the jumps nearby (or the sensor's noise, where that is larger) by far, and the samples between jumps whose sum is zero
 are a transient offset. One jump alone may be the vehicle's own: a stage, a parachute. The pulse of a thruster comes and
-goes, too; so offsets are accepted where the trackers support them (`recon.abrupt_offsets`), and where they are not
+goes, too; so offsets are accepted where the trackers support them (`recon.fault_detection`), and where they are not
 accepted they still add to the process noise.
 """
 
@@ -40,11 +40,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erf
 
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray
 from flightmodel.gate import runs
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import Finding, TriadRecord
-from recon.state import IntArray
 
 _SLOPE_SPAN_S = 0.06
 _NEARBY_STEPS = 31  # of which the median is the usual step

@@ -27,11 +27,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel import earth, instruments, rotations
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, IntArray
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
 from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, SLOTS, SUN, VELOCITY
-from recon.error_model import ErrorModel
-from recon.state import IntArray, right_jacobian
+from recon.state import ErrorModel, right_jacobian
 
 _SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {

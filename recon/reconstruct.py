@@ -7,12 +7,21 @@ result (`Settings.passes`):
     x_{k+1} = f(x_k, inertial samples) + w,   z = h(x_k) + v;   x = kinematics and sensor errors
 
 Aerodynamics and atmosphere take no part: the answer is inertial, and aerodynamic quantities can be derived from it. A
-flight without inertial sensors is propagated by gravity and drag in the sounding's air instead (`recon.ballistic`).
+flight without inertial sensors is propagated by gravity and drag in the sounding's air instead (`recon.propagation`).
 
 What the data contradict is found on the way and the flight reconstructed again: jumps of the inertial clocks, transient
 offsets of readings, a priori uncertainties that are too small, trackers that contradict the rest
-(`recon.fault_isolation`). First passes use thinned data about the filter's own estimate, later ones all data about the
-smoothed trajectory (Gauss-Newton).
+(`recon.fault_detection`, `recon.fault_isolation`). First passes use thinned data about the filter's own estimate, later
+ones all data about the smoothed trajectory (Gauss-Newton).
+
+The answer is of the datum, and of the accelerometer's samples. From the accelerometer (at ``r`` from the datum, body
+axes) to the datum:
+
+    p = p_imu - C r,   v = v_imu - C (w x r),   w = gyro rate - C^T W
+
+and the errors move with them: ``dp = dp_imu + C [r x] d``, ``dv = dv_imu + C [(w x r) x] d + C [r x] dw`` with
+rotation error ``d`` and rate error ``dw`` from the gyros' estimated errors and white noise. In ballistic flight the
+tracked point is the datum and the attitude unknown, with the covariance of an unknown attitude.
 
 References
 ----------
@@ -27,42 +36,41 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 import pandas as pd
 
+from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray, Progress
 from flightmodel.telemetry import Finding, Telemetry
-from flightmodel.trajectory import Trajectory
+from flightmodel.trajectory import Trajectory, interpolate_rows
 from recon import (
     consistency,
     ekf,
     fault_isolation,
     imu_screening,
-    product,
+    propagation,
     setup,
     smoother,
-    strapdown,
     time_bias,
-    unmodelled_acceleration,
 )
-from recon.abrupt_offsets import unsupported_offsets
 from recon.consistency import ConsistencyCheck, held_out_table
+from recon.ekf import Problem
+from recon.fault_detection import (
+    UNMODELLED_CODE,
+    UnmodelledAcceleration,
+    track_is_lost,
+    unsupported_offsets,
+    with_one_more,
+    with_unmodelled,
+)
 from recon.fault_isolation import INFLATION, NO_ADAPTATION, Adaptation, LeftOut
-from recon.problem import FIT_SPAN_S, Problem
+from recon.imu_screening import BridgedSensor
+from recon.propagation import correct, correction_partials
 from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem
 from recon.smoother import Smoothed
-from recon.state import ROTATION, States, boxminus, unpacked
-from recon.unmodelled_acceleration import UnmodelledAcceleration, track_is_lost, with_one_more, with_unmodelled
+from recon.state import INERTIAL, KINEMATIC, ROTATION, States, unpacked
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
-# code, name and advice for the a priori errors of a ballistic flight's air and vehicle
-_BALLISTIC_CHECKS = {
-    "air": ("sounding", "sounding", "is beyond the sounding's uncertainty: check its units, its time and place"),
-    "vehicle": (
-        "pre-flight-drag",
-        "pre-flight drag",
-        "is beyond the pre-flight uncertainty: check mass, area and coefficients",
-    ),
-}
 _THINNED_STEP_S = 0.5
+_UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
 _MOST_THINNED_PASSES = 6
 _FARTHEST_SD = 3.0
 _CONVERGED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of its effect
@@ -94,9 +102,9 @@ class TrajectorySolution:
         Systematic error covariance of the corrected specific force, (m/s^2)^2, and rates, (rad/s)^2, on the
         trajectory's times; empty without inertial sensors.
     accelerometer_root : (n, 6, 9) float
-        Rotation and specific force error per unit normal of the accelerometer's errors, `product.accelerometer_root`.
+        Rotation and specific force error per unit normal of the accelerometer's errors, `accelerometer_root`.
     triad_root : (n, 9, 18) float
-        Rotation, specific force and rate error per unit normal of both triads' errors, `product.triad_root`.
+        Rotation, specific force and rate error per unit normal of both triads' errors, `triad_root`.
     findings : tuple of Finding
         Gaps that were bridged, stretches of radar track that were edited, and so on.
     provenance : dict
@@ -204,7 +212,7 @@ def _compared_leaving_one_out(
     held_out: dict[str, pd.DataFrame] = {}
 
     def unmodelled(made: TrajectorySolution) -> int:
-        return sum(f.code == unmodelled_acceleration.CODE for f in made.findings)
+        return sum(f.code == UNMODELLED_CODE for f in made.findings)
 
     def rerun(source: str) -> tuple[Trajectory, tuple[ConsistencyCheck, ...], bool]:
         report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
@@ -261,10 +269,10 @@ def reconstruct_once(
 
     report(0.95, "testing consistency")
     mount = _mounting(telemetry, sensors)
-    table = product.sensor_error_table(problem, reference, smoothed)
+    table = sensor_error_table(problem, reference, smoothed)
     checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
-    checks += _mcreynolds(problem, run, smoothed, reference)
-    checks += _data_sheet_checks(problem, table, settings.check_confidence)
+    checks += consistency.filter_against_smoother(problem, run, smoothed, reference)
+    checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
     if sensors is not None and adaptation.lag is None:
         lag = time_bias.lag_between(sensors.force, sensors.rate, reference, problem.time_s)
         if lag is not None:
@@ -276,10 +284,10 @@ def reconstruct_once(
         findings += time_bias.jump_findings(adaptation.jumps or (), (sensors.force.spec.name, sensors.rate.spec.name))
     report(1.0, "done")
     return TrajectorySolution(
-        smoothed=product.datum_trajectory(problem, mount, reference, smoothed.triangles),
-        filtered=product.datum_trajectory(problem, mount, run.states(), run.filtered.p_plus),
+        smoothed=datum_trajectory(problem, mount, reference, smoothed.triangles),
+        filtered=datum_trajectory(problem, mount, run.states(), run.filtered.p_plus),
         sensor_errors=table,
-        residuals=product.residual_table(problem, run.innovations),
+        residuals=consistency.residual_table(problem, run.innovations),
         held_out=held_out_table(problem, run, settings.engine),
         consistency_checks=tuple(checks),
         imu_time_s=series[0],
@@ -292,7 +300,7 @@ def reconstruct_once(
         findings=(
             *findings,
             *(span.finding() for span in spans),
-            *product.edit_findings(problem, run.innovations.accepted),
+            *consistency.edit_findings(problem, run.innovations.accepted),
         ),
         provenance={
             "flight": telemetry.name,
@@ -344,11 +352,11 @@ def bridge_inertial_sensors(telemetry: Telemetry, adaptation: Adaptation = NO_AD
     return InertialSensors(*out)
 
 
-def _mounting(telemetry: Telemetry, sensors: InertialSensors | None) -> product.Mounting:
+def _mounting(telemetry: Telemetry, sensors: InertialSensors | None) -> Mounting:
     if sensors is None:
-        return product.Mounting(telemetry.t0_utc, np.zeros(3), None)
+        return Mounting(telemetry.t0_utc, np.zeros(3), None)
     arm = sensors.force.spec.position_from_datum_body_m
-    return product.Mounting(telemetry.t0_utc, arm, sensors.rate)
+    return Mounting(telemetry.t0_utc, arm, sensors.rate)
 
 
 def _series(
@@ -357,36 +365,9 @@ def _series(
     """Corrected specific force and rates with their times, and at kept nodes how well both are known."""
     if sensors is None:
         return tuple(np.empty(s) for s in ((0,), (0, 3), (0, 3), (0, 3, 3), (0, 3, 3), (0, 6, 9), (0, 9, 18)))
-    series = product.corrected_series(problem, sensors.force, sensors.rate, states)
-    known = (product.specific_force_cov, product.rate_cov, product.accelerometer_root, product.triad_root)
+    series = corrected_series(problem, sensors.force, sensors.rate, states)
+    known = (specific_force_cov, rate_cov, accelerometer_root, triad_root)
     return (*series, *(make(problem, states, smoothed.triangles) for make in known))
-
-
-def _mcreynolds(
-    problem: Problem, run: ekf.ForwardPass, smoothed: Smoothed, reference: States
-) -> list[ConsistencyCheck]:
-    """Filter against smoother at the kept nodes after the first seconds."""
-    kept = np.flatnonzero(problem.kept)
-    settled = problem.time_s[kept] > problem.time_s[0] + FIT_SPAN_S
-    difference = boxminus(run.states()[kept], reference[kept])[settled, :9]
-    p_filter, p_smoother = (unpacked(t[settled], 9) for t in (run.filtered.p_plus, smoothed.triangles))
-    groups = [name for name in consistency.GROUPS if name != "attitude" or not problem.motion.ballistic]
-    return consistency.mcreynolds_checks(difference, p_filter, p_smoother, groups)
-
-
-def _data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) -> list[ConsistencyCheck]:
-    """One check for each instrument with errors that the flight made observable."""
-    out = []
-    owners = np.array(problem.model.instruments, dtype=object)
-    estimated = ~problem.model.wander.considered
-    for owner in dict.fromkeys(owners[estimated]):
-        name = str(owner)
-        rows = table[(owners == name) & estimated]
-        estimate, prior_sd, sd = rows[["estimate", "prior_sd", "sd"]].to_numpy(dtype=float).T
-        code, label, *bad = _BALLISTIC_CHECKS.get(name, ("data-sheet", f"data sheet {name}"))
-        errors = [error.removeprefix(f"{name} ") for error in rows["name"]]
-        out.append(consistency.data_sheet_check(code, label, name, errors, estimate, prior_sd, sd, confidence, *bad))
-    return [v for v in out if v is not None]
 
 
 def _iterate(
@@ -457,4 +438,145 @@ def _first_reference(problem: Problem, settings: Settings) -> tuple[States, tupl
         if moved < _CONVERGED_RAD:
             break
     assert reference is not None
-    return strapdown.fill_between(problem.motion, problem.node_index, kept, reference), found
+    return propagation.fill_between(problem.motion, problem.node_index, kept, reference), found
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """For moving a node to the datum: epoch, accelerometer from datum (3,), m, and the gyros, if there are."""
+
+    epoch_utc: str
+    arm_body_m: FloatArray
+    rate: BridgedSensor | None
+
+
+def datum_trajectory(problem: Problem, mounting: Mounting, states: States, triangles: FloatArray) -> Trajectory:
+    """Trajectory of the datum at the kept nodes from states at all nodes and packed covariances at the kept ones."""
+    kept = np.flatnonzero(problem.kept)
+    covariance = unpacked(triangles, KINEMATIC if mounting.rate is None else INERTIAL)
+    states = states[kept]
+    n = len(kept)
+    if mounting.rate is None:
+        covariance[:, 6:9] = 0.0
+        covariance[:, :, 6:9] = 0.0
+        covariance[:, range(6, 9), range(6, 9)] = _UNKNOWN_ROTATION_VAR
+        return Trajectory(
+            mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m, states.velocity_ecef_mps,
+            states.q_ecef_body, np.tile(earth.OMEGA_ECEF_RADPS, (n, 1)), covariance,
+        )  # fmt: skip
+    motion = problem.motion
+    measured = interpolate_rows(problem.time_s[kept], mounting.rate.time_s, mounting.rate.measured_sensor)
+    errors = states.sensor_errors[:, 9:18]
+    c = rotations.dcm_from_q(states.q_ecef_body)
+    omega = correct(measured, errors, motion.dcm_body_rate)
+    r = mounting.arm_body_m
+    lever_velocity = np.cross(omega - earth.OMEGA_RADPS * c[:, 2], r)
+
+    move = np.zeros((n, 9, 27))
+    move[:, range(9), range(9)] = 1.0
+    lever = c @ rotations.skew(r)
+    move[:, 0:3, 6:9] = lever
+    move[:, 3:6, 6:9] = c @ rotations.skew(lever_velocity)
+    move[:, 3:6, 18:27] = lever @ correction_partials(measured, errors, motion.dcm_body_rate)
+    moved = move @ covariance @ np.swapaxes(move, 1, 2)
+    moved[:, 3:6, 3:6] += mounting.rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
+    return Trajectory(
+        mounting.epoch_utc,
+        problem.time_s[kept],
+        "datum",
+        states.position_ecef_m - c @ r,
+        states.velocity_ecef_mps - np.einsum("nij,nj->ni", c, lever_velocity),
+        states.q_ecef_body,
+        omega,
+        0.5 * (moved + np.swapaxes(moved, 1, 2)),
+    )
+
+
+def corrected_series(
+    problem: Problem, force: BridgedSensor, rate: BridgedSensor, states: States
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times (k,) and corrected specific force and rate (k, 3), body axes, at valid accelerometer samples."""
+    t = force.time_s
+    after_gap = np.zeros(len(t), dtype=bool)
+    after_gap[1:] = force.in_gap[:-1]
+    bridged = force.in_gap & after_gap  # samples of a bridge have a gap on both sides
+    k = np.clip(np.searchsorted(rate.time_s, t, side="right") - 1, 0, len(rate.time_s) - 1)
+    in_rate_gap = rate.in_gap[k] & (t - rate.time_s[k] > 1e-6)
+    keep = ~bridged & ~in_rate_gap & (t >= problem.time_s[0]) & (t <= problem.time_s[-1])
+    t = t[keep]
+    errors = interpolate_rows(t, problem.time_s, states.sensor_errors[:, :18])
+    specific_force = correct(force.measured_sensor[keep], errors[:, 0:9], problem.motion.dcm_body_force)
+    measured_rate = interpolate_rows(t, rate.time_s, rate.measured_sensor)
+    return t, specific_force, correct(measured_rate, errors[:, 9:18], problem.motion.dcm_body_rate)
+
+
+def specific_force_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
+    """Systematic error covariance (k, 3, 3) of the corrected specific force at kept nodes, body axes, (m/s^2)^2."""
+    kept = np.flatnonzero(problem.kept)
+    measured = problem.motion.force_sensor_mps2[problem.node_index[kept]]
+    partials = correction_partials(measured, states.sensor_errors[kept, 0:9], problem.motion.dcm_body_force)
+    covariance = unpacked(triangles, 18)[:, 9:18, 9:18]
+    return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
+
+
+def accelerometer_root(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
+    """Response (k, 6, 9) of rotation error and specific force error, body axes, at kept nodes to nine unit normals.
+
+    The nine stand for the accelerometer's constant errors: ``root @ root.T`` of the lower rows is the covariance of
+    the corrected specific force, the upper rows are the part of the attitude's error correlated with them.
+    Gauss-Markov errors are taken as they are at mid-span.
+    """
+    kept = np.flatnonzero(problem.kept)
+    measured = problem.motion.force_sensor_mps2[problem.node_index[kept]]
+    partials = correction_partials(measured, states.sensor_errors[kept, 0:9], problem.motion.dcm_body_force)
+    attitude, root = _constant_errors(unpacked(triangles, 18))
+    return np.concatenate([attitude, partials @ root], axis=1)
+
+
+def _constant_errors(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Responses of rotation (k, 3, m) and of the m errors behind the motion (m, m) to unit normals, at mid-span."""
+    variance, axes = np.linalg.eigh(covariance[len(covariance) // 2, 9:, 9:])
+    sd = np.sqrt(np.maximum(variance, 0.0))
+    inverse = np.divide(1.0, sd, out=np.zeros(len(sd)), where=sd > 1e-12)
+    return covariance[:, 6:9, 9:] @ (axes * inverse), axes * sd
+
+
+def triad_root(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
+    """Response (k, 9, 18) of rotation, specific force and rate errors, body axes, at kept nodes to unit normals.
+
+    As `accelerometer_root`, of the constant errors of accelerometer and gyros together: what a gyro's mounting does to
+    the attitude rolls with the vehicle.
+    """
+    kept = np.flatnonzero(problem.kept)
+    node = problem.node_index[kept]
+    motion, errors = problem.motion, states.sensor_errors[kept]
+    force = correction_partials(motion.force_sensor_mps2[node], errors[:, 0:9], motion.dcm_body_force)
+    rate = correction_partials(motion.rate_sensor_radps[node], errors[:, 9:18], motion.dcm_body_rate)
+    attitude, root = _constant_errors(unpacked(triangles, 27))
+    return np.concatenate([attitude, force @ root[0:9], rate @ root[9:18]], axis=1)
+
+
+def rate_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
+    """Systematic error covariance (k, 3, 3) of the corrected rates at kept nodes, body axes, (rad/s)^2."""
+    kept = np.flatnonzero(problem.kept)
+    measured = problem.motion.rate_sensor_radps[problem.node_index[kept]]
+    partials = correction_partials(measured, states.sensor_errors[kept, 9:18], problem.motion.dcm_body_rate)
+    covariance = unpacked(triangles, 27)[:, 18:27, 18:27]
+    return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
+
+
+def sensor_error_table(problem: Problem, states: States, smoothed: Smoothed) -> pd.DataFrame:
+    """Prior and posterior of every error; of Gauss-Markov errors, the value at mid-span."""
+    kept = np.flatnonzero(problem.kept)
+    row = len(kept) // 2
+    model = problem.model
+    return pd.DataFrame(
+        {
+            "name": model.names,
+            "unit": model.units,
+            "treated": np.where(model.wander.considered, "considered", "estimated"),
+            "prior_sd": model.prior_sd,
+            "estimate": states.sensor_errors[kept[row]],
+            "sd": np.sqrt(smoothed.variance[row, 9:]),
+        }
+    )

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from flightmodel.checks import ConfigError, Fault, nearest_name
-from recon.ekf import COMPILED, ENGINES, FILTERPY
 
+COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")  # of `recon.ekf` and `recon.smoother`
 _SYNONYMS = {"readable": FILTERPY}  # of an engine
 
 

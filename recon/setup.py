@@ -16,23 +16,19 @@ from types import MappingProxyType
 import numpy as np
 
 from flightmodel import earth, geomagnetism_and_sun, rotations
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.gate import spaced
 from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import AttitudePrior, Telemetry
-from recon import error_model, measurements
+from recon import measurements
 from recon._measurement_kernels import HEIGHT, POSITION, RADAR, VELOCITY
-from recon.ballistic import ballistic_motion
-from recon.error_model import ErrorModel, instrument_blocks
+from recon.ekf import FIT_SPAN_S, Problem, nearest_index, observe
 from recon.imu_screening import BridgedSensor
 from recon.measurements import Instrument
-from recon.motion import SAME_INSTANT_S, inertial_motion
-from recon.problem import FIT_SPAN_S, Problem, nearest_index, observe
+from recon.propagation import SAME_INSTANT_S, ballistic_motion, correct, inertial_motion, propagate, with_disturbances
 from recon.settings import Settings
-from recon.state import KINEMATIC, BoolArray, IntArray, States
-from recon.strapdown import correct, propagate
-from recon.unmodelled_acceleration import with_stated
+from recon.state import KINEMATIC, ErrorModel, States, ballistic_blocks, imu_blocks, instrument_blocks, sun_blocks
 from recon.vector_attitude import start_attitude_from_vectors
 
 _TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT)
@@ -82,11 +78,9 @@ def build_problem(
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
     between = np.arange(start_s, end_s, _BALLISTIC_STEP_S) if sensors is None else np.empty(0)
     time_s = _union([output_s, between, *inside])
-    observed, row = observe(time_s, instruments, SAME_INSTANT_S)
+    observed, row = observe(time_s, instruments)
     if sensors is None:
-        motion, node_index = ballistic_motion(
-            telemetry.motion, telemetry.sounding, _cross_path_direction(used), time_s, SAME_INSTANT_S
-        )
+        motion, node_index = ballistic_motion(telemetry.motion, telemetry.sounding, _cross_path_direction(used), time_s)
         start, covariance = _start_ballistic(used, start_s, model)
     else:
         force, rate = sensors.force, sensors.rate
@@ -94,7 +88,7 @@ def build_problem(
         motion, node_index = inertial_motion(force, rate, time_s, clocks)
         prior = _attitude_prior(telemetry, start_s)
         start, covariance = _start_by_inertial_sensors(used, prior, start_s, force, rate, model)
-    motion = with_stated(motion, telemetry.motion)
+    motion = with_disturbances(motion, telemetry.motion)
     from scipy.stats import chi2
 
     gate = np.array([0.0, *(float(chi2.ppf(settings.gate_probability, k)) for k in (1, 2, 3))])
@@ -255,9 +249,9 @@ def _thinned(time_s: FloatArray, good: BoolArray, start_s: float, end_s: float) 
 def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, attitude_sensors: bool) -> ErrorModel:
     """All errors that the flight file states, drivers of the motion first."""
     if sensors is None:
-        blocks = error_model.ballistic_blocks(telemetry.motion)
+        blocks = ballistic_blocks(telemetry.motion)
     else:
-        blocks = error_model.imu_blocks(sensors.force.spec, sensors.rate.spec)
+        blocks = imu_blocks(sensors.force.spec, sensors.rate.spec)
     for radar in telemetry.radars.values():
         blocks += instrument_blocks(RADAR_ERRORS, radar.site)
     for fixes in telemetry.gnss.values():
@@ -267,7 +261,7 @@ def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, at
     if attitude_sensors and telemetry.magnetometer is not None:
         blocks += instrument_blocks(MAGNETOMETER, telemetry.magnetometer.spec)
     if attitude_sensors and telemetry.sun is not None:
-        blocks += error_model.sun_blocks(telemetry.sun.spec)
+        blocks += sun_blocks(telemetry.sun.spec)
     return ErrorModel(tuple(blocks))
 
 
@@ -328,7 +322,7 @@ def _pulse_times(
 
 
 def _union(times: list[FloatArray]) -> FloatArray:
-    """All times in order, instants closer than `recon.motion.SAME_INSTANT_S` taken once."""
+    """All times in order, instants closer than `recon.propagation.SAME_INSTANT_S` taken once."""
     t = np.sort(np.concatenate(times))
     kept = t[np.diff(t, prepend=-np.inf) > SAME_INSTANT_S]
     # in a chain of near instants the last may be far from the first

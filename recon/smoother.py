@@ -41,11 +41,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, IntArray
 from recon import _smoother_kernels
-from recon.ekf import COMPILED, ForwardPass
-from recon.problem import Problem
-from recon.state import KINEMATIC, Filtered, Innovations, IntArray, Observed, States, Steps, boxplus, packed, unpacked
+from recon.ekf import Filtered, ForwardPass, Innovations, Observed, Problem, Steps
+from recon.settings import COMPILED
+from recon.state import KINEMATIC, States, boxplus, packed, unpacked
 
 
 @dataclass(frozen=True)

@@ -1,30 +1,49 @@
-"""What does the filter estimate? Nominal states at nodes, error coordinates about them, and the arrays of a pass.
+"""What does the filter estimate? Kinematics and systematic errors of instruments, and error coordinates about them.
 
 A state is position and velocity of the accelerometer (ECEF, m and m/s relative to the Earth), attitude of the
 body and the vector of sensor errors. Error coordinates add, except for rotation, which is a right-hand vector in body
 axes, rad: ``state = nominal [+] error``. Following the accelerometer rather than the datum keeps lever arms, and with
 them derivatives of the gyro signal, out of the integration; `recon.reconstruct` moves the answer to the datum.
 
-A pass is plain tuples of arrays, which both engines take: ``n`` nodes, ``M`` measurements, ``m`` errors beside the nine
-kinematic ones (``N = 9 + m``), the first ``s`` of them drivers of the motion (`recon.motion`), ``D = 9 + s``. Symmetric
-matrices are stored as packed lower triangles.
+Every block of sensor errors (`ErrorModel`) is a first-order Gauss-Markov process about zero, ``de/dt = -e / tau +
+noise``, started at its prior standard deviation and kept there by its noise; an infinite ``tau`` is a constant. Errors
+of the air decorrelate with altitude instead: ``exp(-|climb| / length)``. A *considered* error (Schmidt) is never
+estimated, but its effect stays in the covariance of everything else. The drivers of the motion come first
+(`recon.propagation`).
+
+References
+----------
+S. Schmidt, "Application of state-space methods to navigation problems", Advances in Control Systems 3 (1966) 293.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flightmodel import rotations
-from flightmodel.checks import FloatArray
+from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.instruments import (
+    ACCELEROMETER,
+    RATES,
+    SUN,
+    BarometerSpec,
+    GnssSpec,
+    InstrumentTable,
+    RadarSite,
+    SunHeads,
+    TriadSpec,
+)
+from flightmodel.telemetry import Motion as MotionSpec
 
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 POSITION, VELOCITY, ROTATION = slice(0, 3), slice(3, 6), slice(6, 9)
 KINEMATIC, INERTIAL = 9, 27
+Spec = TriadSpec | RadarSite | GnssSpec | BarometerSpec | SunHeads
+AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -37,7 +56,7 @@ class States:
         Of the accelerometer.
     q_ecef_body : (n, 4) float
     sensor_errors : (n, m) float
-        In the order of `recon.error_model.ErrorModel`, which starts with the 18 errors of the inertial sensors.
+        In the order of `ErrorModel`, which starts with the 18 errors of the inertial sensors.
     """
 
     position_ecef_m: FloatArray
@@ -94,39 +113,6 @@ def right_jacobian(rotation_rad: FloatArray) -> FloatArray:
     return np.eye(3) - 0.5 * k + k @ k / 6.0
 
 
-class Sources(NamedTuple):
-    """Instruments, one row each: kind, lever arm, place, axes, and which error (-1: none) fills each of its slots."""
-
-    kind: IntArray
-    arm_body_m: FloatArray
-    site_ecef_m: FloatArray
-    dcm: FloatArray
-    slot: IntArray
-
-
-class Observed(NamedTuple):
-    """Measurements in order of nodes; those of node ``k`` are rows ``first[k]`` to ``first[k + 1]``.
-
-    Parameters
-    ----------
-    first : (n + 1,) int
-    source : (M,) int
-    value, variance : (M, 3) float
-        Variance is infinite where a component was not measured.
-    known : (M, 3) float
-        Field or direction to the Sun, Earth-fixed axes; of a radar, the refractivity at its site first.
-    usable : (M,) bool
-        Whether the filter may use it at all.
-    """
-
-    first: IntArray
-    source: IntArray
-    value: FloatArray
-    variance: FloatArray
-    known: FloatArray
-    usable: BoolArray
-
-
 class Wander(NamedTuple):
     """Gauss-Markov model of each error (m,).
 
@@ -139,71 +125,6 @@ class Wander(NamedTuple):
     sd: FloatArray
     walk_var_per_s: FloatArray
     considered: BoolArray
-
-
-class Charts(NamedTuple):
-    """Nominal states at all nodes: position, velocity (n, 3), attitude (n, 4), errors (n, m)."""
-
-    position: FloatArray
-    velocity: FloatArray
-    q: FloatArray
-    errors: FloatArray
-
-
-class Steps(NamedTuple):
-    """Each node to the next: transition (n - 1, 9, D), noise (n - 1, 9, 9), decay and noise of errors (n - 1, m)."""
-
-    transition: FloatArray
-    noise: FloatArray
-    decay: FloatArray
-    noise_var: FloatArray
-
-
-class Filtered(NamedTuple):
-    """Errors about the charts before and after each node's measurements, and their covariance.
-
-    Parameters
-    ----------
-    x_minus, x_plus : (n, N) float
-    p_minus : (n, N (N + 1) / 2) float
-        Packed.
-    kept : (n,) int
-        Row of ``p_plus`` that holds a node's covariance; -1 where it is not wanted.
-    p_plus : (k, D (D + 1) / 2) float
-        Packed.
-    p_last : (N, N) float
-        After the last measurement.
-    """
-
-    x_minus: FloatArray
-    x_plus: FloatArray
-    p_minus: FloatArray
-    kept: IntArray
-    p_plus: FloatArray
-    p_last: FloatArray
-
-
-class Innovations(NamedTuple):
-    """Innovation and gain of each measurement; components that were not measured are zero with unit variance.
-
-    Parameters
-    ----------
-    residual, covariance : (M, 3), (M, 3, 3) float
-    nis : (M,) float
-    accepted : (M,) bool
-    gain : (M, N, 3) float
-        Zero where not accepted.
-    by_state, by_error : (M, 3, 9), (M, 3, SLOTS) float
-        Partials of the prediction.
-    """
-
-    residual: FloatArray
-    covariance: FloatArray
-    nis: FloatArray
-    accepted: BoolArray
-    gain: FloatArray
-    by_state: FloatArray
-    by_error: FloatArray
 
 
 def packed(matrices: FloatArray) -> FloatArray:
@@ -220,3 +141,150 @@ def unpacked(triangles: FloatArray, count: int | None = None) -> FloatArray:
     out[..., rows, columns] = triangles[..., : len(rows)]
     out[..., columns, rows] = triangles[..., : len(rows)]
     return out
+
+
+@dataclass(frozen=True)
+class Block:
+    """One kind of error of one instrument: components with one unit, one prior and one correlation."""
+
+    instrument: str
+    components: tuple[str, ...]
+    unit: str
+    prior_sd: float
+    time_constant_s: float = np.inf
+    altitude_m: float = np.inf
+    walk_var_per_s: float = 0.0
+    considered: bool = False
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """All errors beside the nine kinematic ones, in the order of ``States.sensor_errors``; drivers first."""
+
+    blocks: tuple[Block, ...]
+
+    def _each(self, name: str) -> list[object]:
+        return [getattr(b, name) for b in self.blocks for _ in b.components]
+
+    @property
+    def names(self) -> list[str]:
+        """Instrument and component of every error."""
+        return [f"{b.instrument} {c}" for b in self.blocks for c in b.components]
+
+    @property
+    def instruments(self) -> list[str]:
+        """Instrument of every error."""
+        return [str(name) for name in self._each("instrument")]
+
+    @property
+    def units(self) -> list[str]:
+        """Unit of every error."""
+        return [str(unit) for unit in self._each("unit")]
+
+    @property
+    def prior_sd(self) -> FloatArray:
+        """Prior standard deviation of every error, (m,)."""
+        return np.array(self._each("prior_sd"), dtype=float)
+
+    @property
+    def size(self) -> int:
+        """Number of errors."""
+        return len(self.names)
+
+    @property
+    def wander(self) -> Wander:
+        """Gauss-Markov model of every error; a considered one is constant."""
+        considered = np.array(self._each("considered"), dtype=bool)
+        tau, length, walk = (
+            np.array(self._each(name), dtype=float) for name in ("time_constant_s", "altitude_m", "walk_var_per_s")
+        )
+        forever = np.where(considered, np.inf, tau), np.where(considered, np.inf, length)
+        return Wander(*forever, self.prior_sd, np.where(considered, 0.0, walk), considered)
+
+    @property
+    def wandering(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        """Which errors (w,) are not constant."""
+        w = self.wander
+        moves = np.isfinite(w.time_constant_s) | np.isfinite(w.altitude_m) | (w.walk_var_per_s > 0.0)
+        return np.flatnonzero(moves).astype(np.int64)
+
+    def column(self, instrument: str, component: str) -> int:
+        """Where an error stands among all errors; -1 where it is not modelled."""
+        name = f"{instrument} {component}"
+        names = self.names
+        return names.index(name) if name in names else -1
+
+    def considering(self, names: Iterable[str]) -> ErrorModel:
+        """Model in which the named errors are considered: ``"accelerometer mount"``, ``"radar1 time bias"``, ...
+
+        Raises
+        ------
+        GateError
+            Where a name fits no error; with the nearest known one.
+        """
+        wanted = list(names)
+        blocks = tuple(replace(b, considered=True) if _fits(b, wanted) else b for b in self.blocks)
+        known = sorted({f"{b.instrument} {_kind(c)}" for b in self.blocks for c in b.components})
+        faults = [
+            f"considered error '{name}'{nearest_name(name, known)}: no such error; known: {', '.join(known)}"
+            for name in wanted
+            if not any(_fits(b, [name]) for b in self.blocks)
+        ]
+        if faults:
+            raise GateError(faults, code="error-unknown")
+        return ErrorModel(blocks)
+
+
+def _kind(component: str) -> str:
+    """Component without its axis."""
+    stem, _, last = component.rpartition(" ")
+    return stem if last in (*AXES, "north", "east", "down") and stem else component
+
+
+def _fits(block: Block, names: list[str]) -> bool:
+    spelt = [f"{block.instrument} {part}" for c in block.components for part in (c, _kind(c))]
+    return any(name in names for name in spelt)
+
+
+def instrument_blocks(table: InstrumentTable, spec: Spec, name: str = "") -> list[Block]:
+    """Errors of one instrument, by its rows; those of which flight.toml states none are left out.
+
+    Of a triad the constant and the slowly varying part of the bias are one error: over times below the latter's time
+    constant it walks. ``name`` is that of one head of several.
+    """
+    blocks = []
+    for row in table.rows:
+        sd = getattr(spec, row.name)
+        tau, walk = getattr(spec, row.time_constant[0]) if row.time_constant[0] else np.inf, 0.0
+        if isinstance(spec, TriadSpec) and row.name == "bias_sd":
+            sd = float(np.hypot(sd, spec.bias_wander_sd))
+            walk = 2.0 * spec.bias_wander_sd**2 / spec.bias_time_constant_s
+        if row.states and (sd > 0.0 or row.least is not None):
+            blocks.append(Block(name or spec.name, row.states, row.unit, max(sd, row.least or 0.0), tau, np.inf, walk))
+    return blocks
+
+
+def imu_blocks(force: TriadSpec, rate: TriadSpec) -> list[Block]:
+    """Errors of both inertial triads, then their time biases: of both, or of neither where neither may err."""
+    blocks = instrument_blocks(ACCELEROMETER, replace(force, time_bias_sd_s=0.0))
+    blocks += instrument_blocks(RATES, replace(rate, time_bias_sd_s=0.0))
+    if max(force.time_bias_sd_s, rate.time_bias_sd_s) > 0.0:
+        blocks += [Block(spec.name, ("time bias",), "s", max(spec.time_bias_sd_s, 1e-9)) for spec in (force, rate)]
+    return blocks
+
+
+def sun_blocks(spec: SunHeads) -> list[Block]:
+    """Errors of every head, counted from 1."""
+    heads = range(1, len(spec.clock_lv_rad) + 1)
+    return [block for k in heads for block in instrument_blocks(SUN, spec, f"{spec.name}{k}")]
+
+
+def ballistic_blocks(motion: MotionSpec) -> list[Block]:
+    """Drivers of ballistic flight; density and winds in units of the sounding's standard deviations."""
+    tau = motion.drag_time_constant_s
+    return [
+        Block("vehicle", ("drag",), "1", motion.drag_sd, tau),
+        Block("vehicle", ("side force across", "side force within"), "1", motion.side_sd, tau),
+        Block("air", ("density",), "sd", 1.0, altitude_m=DENSITY_LENGTH_M),
+        Block("air", ("wind north", "wind east"), "sd", 1.0, altitude_m=WIND_LENGTH_M),
+    ]

@@ -15,9 +15,9 @@ tracker takes part.
 
 **Jumps.** A clock that jumps ahead leaves a gap like any other, but behind it all tags are late by the gap (or all
 before it were early, where the clock was set right). For each short gap the trackers give the likelihood of so late a
-clock from there on against that of none (`recon.abrupt_offsets`, with the clock's column in place of a bias's), and the
-lags before and after give that of one clock against the other. Where both together exceed a thousand to one, the tags
-are corrected.
+clock from there on against that of none (`recon.fault_detection`, with the clock's column in place of a bias's), and
+the lags before and after give that of one clock against the other. Where both together exceed a thousand to one, the
+tags are corrected.
 """
 
 from __future__ import annotations
@@ -30,11 +30,10 @@ import numpy as np
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.telemetry import Finding, TriadRecord
 from flightmodel.trajectory import interpolate_rows
-from recon.abrupt_offsets import LOG_LIKELIHOOD_LIMIT, offset_scores
 from recon.consistency import ConsistencyCheck, consistency_check
-from recon.ekf import ForwardPass
+from recon.ekf import ForwardPass, Problem
+from recon.fault_detection import LOG_LIKELIHOOD_LIMIT, offset_scores
 from recon.imu_screening import BridgedSensor, usual_steps
-from recon.problem import Problem
 from recon.state import KINEMATIC, States
 
 _WINDOW_S, _STEP_S = 4.0, 0.01

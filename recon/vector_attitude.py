@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import earth, rotations
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray
 from flightmodel.telemetry import AttitudePrior, Finding, SunRecord, Telemetry, TriadRecord
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from recon.attitude_smoother import (
@@ -42,7 +42,6 @@ from recon.attitude_smoother import (
     unit,
 )
 from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
-from recon.state import IntArray
 
 _QUARTER_RAD = 0.5 * np.pi
 _BLIND_RAD = 0.3  # a single attitude with an angle as uncertain as this starts nothing

@@ -28,7 +28,6 @@ from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
 
 STABLE, UNSTABLE, DIVERGENT = 0, 1, 2
-ZONES = ("stable", "dynamically unstable", "divergent")
 
 
 @dataclass(frozen=True)

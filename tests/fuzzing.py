@@ -26,8 +26,7 @@ from flightmodel import aerodynamics
 from flightmodel.aerodynamics import read_with_sidecar
 from flightmodel.checks import Fault, GateError
 from flightmodel.film import Frames
-from flightmodel.flightfile import read_flight_file
-from flightmodel.flightfolder import read_flight
+from flightmodel.flightfolder import read_flight, read_flight_file
 from flightmodel.vehicle import DATA, vehicle_from_toml
 from synthetic_flight.scenarios import read_scenario
 

@@ -11,7 +11,7 @@ import click
 import pytest
 from pydantic import BaseModel
 
-from flightmodel import aerodynamics, flightfile, geometry, instruments, tables, vehicle
+from flightmodel import aerodynamics, flightfolder, geometry, instruments, tables, vehicle
 from postflight.cli import cli
 from postflight.montecarlo import study
 from synthetic_flight import dispersions, ensemble, instrument_errors, scenarios, weather
@@ -70,9 +70,9 @@ DISPERSION_SECTIONS = [
 
 
 FLIGHT_SECTIONS = [
-    flightfile.FlightFile,
-    flightfile.AttitudeEntry,
-    flightfile.MotionEntry,
+    flightfolder.FlightFile,
+    flightfolder.AttitudeEntry,
+    flightfolder.MotionEntry,
     instruments.Mounted,
     instruments.MagnetometerEntry,
     instruments.GnssEntry,
@@ -128,7 +128,7 @@ def test_every_key_of_flight_toml_is_on_its_page(model: type[BaseModel]):
             {"file", "height_is", "geoid_undulation_m", "min_satellites", "min_fix_mode"},
         ),
         ("barometers", instruments.BarometerEntry, {"file", "height_is", "geoid_undulation_m", "use_s"}),
-        ("motion", flightfile.MotionEntry, {"model", "drag_area_per_mass_m2pkg", "powered_s"}),
+        ("motion", flightfolder.MotionEntry, {"model", "drag_area_per_mass_m2pkg", "powered_s"}),
     ],
 )
 def test_values_on_the_page_are_the_defaults(table: str, model: type[BaseModel], examples: set[str]):

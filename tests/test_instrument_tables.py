@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from flightmodel import instruments
 from flightmodel.instruments import RadarSite
-from recon.error_model import instrument_blocks
+from recon.state import instrument_blocks
 from synthetic_flight import instrument_errors as simulated
 from synthetic_flight.instrument_errors import stated_errors
 

@@ -28,7 +28,7 @@ from flightmodel.flightfolder import Sources, read_sources
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.checks import carried_force, inertial, pressure_and_field, tracks
+from postflight.checks import inertial, pressure_and_field, tracks
 from postflight.checks.track_force import best_comparison, track_force
 from postflight.checks.units_and_axes import TimeBias
 from postflight.intake.flight_form import placeholders
@@ -227,9 +227,9 @@ def _against_accelerometer(found: Sources, name: str, record: RadarRecord | Gnss
     if not any(f.code == "accelerometer-axes" for f in remarks):
         remarks += inertial.entry_axis(found, force)
     if not remarks:
-        remarks += carried_force.gyro_axes(found, force)
+        remarks += inertial.gyro_axes(found, force)
     if not remarks:
-        remarks += carried_force.attitude_prior(found, force)
+        remarks += inertial.attitude_prior(found, force)
 
 
 def _keep_sharp(report: Report, bias: TimeBias | None) -> TimeBias | None:

@@ -1,20 +1,41 @@
-"""Do the accelerometer's unit and axes fit rest, track and descent, and the gyros' unit the accelerometer?
+"""Do accelerometer, gyros and attitude prior fit rest, track and descent, in units, axes, signs?
 
 At rest the magnitude of specific force is 9.81 m/s^2. In flight it is that of a track's specific force
 (`postflight.checks.track_force`), and in descent a vehicle that flies nose first has its drag along -x of the body.
 Gyros that imply a centripetal acceleration ``|w x (w x r)|`` far above the reading are in a wrong unit.
+
+The gyros carry the accelerometer's force to where the track has it: the specific force in the body, ``f_i(t) = q(t)
+f_b(t)`` with ``q`` from the integrated rates, is compared with the track's over windows. Among themselves the windows
+fix no attitude: one rotation lays the carried forces over the track's (Wahba's problem, SIAM Review 7, 1965, solved by
+singular values), for every scale, order and sign of the rates. Declared rates are suspicious only where the force then
+wanders by far more than the track allows and exactly another choice brings it to rest. Rates read far too small are not
+detected: a body that hardly rotates is no contradiction where the force hardly does. From the attitude prior the
+carried force has a direction of its own; the prior is suspicious beyond four standard deviations of itself and of the
+gyros' drift since.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flightmodel import earth, tables
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel import earth, rotations, tables
+from flightmodel.checks import BoolArray, Fault, FloatArray
 from flightmodel.flightfolder import Sources
-from flightmodel.telemetry import Finding, TriadRecord
+from flightmodel.telemetry import AttitudePrior, Finding, TriadRecord
 from postflight.checks.track_force import Comparison, TrackForce
-from postflight.checks.units_and_axes import unit_hint, unit_of, unit_that_explains
+from postflight.checks.units_and_axes import (
+    AS_DECLARED,
+    Axes,
+    all_axes,
+    axes_matrix,
+    axes_named,
+    interval_around,
+    unit_hint,
+    unit_of,
+    unit_that_explains,
+    window_means,
+)
 
 _REST_S = 2.0
 _REST_SPREAD = 0.02  # of the reading's magnitude: at rest it is steadier
@@ -23,6 +44,23 @@ _FAR = 1.2  # a factor that no accelerometer's scale error makes
 _SURE = 6.0  # standard deviations
 _LEAST_DRAG = 0.5  # share of the force along -x of the body on an entry: 60 deg of total angle of attack
 _STRONG_MPS2 = 5.0
+_Rows = NDArray[np.intp]
+_Reading = tuple[float, Axes]
+_CELL_S = 0.05
+_GAP_S = 0.5
+_SPAN_S = 60.0  # in which a gyro's bias of 0.2 deg/s adds 12 deg
+_CLEAR = 12.0  # standard deviations of a window's force, so that its direction is known to 5 deg
+_LEAST_WINDOWS = 6
+_WRONG_RAD = np.deg2rad(30.0)
+_RATES_RIGHT_RAD, _ATTITUDE_RIGHT_RAD = np.deg2rad(12.0), np.deg2rad(15.0)
+_ATTITUDE_SD = 4.0
+_FARTHEST_S = 600.0  # that gyros are trusted to carry an attitude
+_DEGREE = np.pi / 180.0
+# slips in writing a quaternion: hint and code, and the order that undoes it (None: the conjugate)
+_SLIPS = {
+    Fault("with the scalar last, so put its last number first", "attitude-scalar-last"): [3, 0, 1, 2],
+    Fault("as from ECEF to body, so change the signs of its last three numbers", "attitude-inverted"): None,
+}
 
 
 def at_rest(found: Sources) -> list[Finding]:
@@ -144,3 +182,150 @@ def _sum_of_readings(record: TriadRecord, force: TrackForce, use: BoolArray) -> 
         rows[slice(*np.searchsorted(record.time_s, [t - half, t + half]))] = True
     seen = record.measured_sensor[rows]
     return np.asarray(seen[np.isfinite(seen).all(axis=1)].sum(axis=0))
+
+
+def gyro_axes(found: Sources, force: TrackForce) -> list[Finding]:
+    """Check scale, order and signs of the gyros by the force that they carry.
+
+    Parameters
+    ----------
+    found : Sources
+        Of a flight folder; without accelerometer and gyros there is no remark.
+    force : TrackForce
+        Of a track that is not suspicious.
+
+    Returns
+    -------
+    list of Finding
+        ``gyro-unit``, ``gyro-axes``, ``gyro-rotation`` (which of both is open), or none.
+    """
+    gyros, sensed = found.triads.get("rates"), found.triads.get("accelerometer")
+    source = found.spec.sensors.rates
+    if gyros is None or sensed is None or source is None:
+        return []
+    size, sd = force.size()
+    clear = np.flatnonzero(size > _CLEAR * sd)
+    if not len(clear):
+        return []
+    middle = force.time_s[clear[int(np.argmax(size[clear]))]]
+    clear = clear[np.abs(force.time_s[clear] - middle) < _SPAN_S / 2]
+    times = force.time_s[clear]
+    if len(clear) < _LEAST_WINDOWS:
+        return []
+    grid = np.arange(times[0] - force.width_s / 2, times[-1] + force.width_s / 2, _CELL_S)
+    w, a = (_cells(record, grid) for record in (gyros, sensed))
+    if not (np.isfinite(w).all() and np.isfinite(a).all()):
+        return []
+    readings = [(scale, axes) for scale in (1.0, _DEGREE, 1.0 / _DEGREE) for axes in all_axes()]
+    turn = np.stack([scale * axes_matrix(*axes) for scale, axes in readings])
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(readings), 1))
+    off = _wander(_carried(level, turn, grid, w, a, force, clear), force.force_mps2[clear])
+    own, best = off[readings.index((1.0, AS_DECLARED))], float(off.min())
+    if own < _WRONG_RAD or best > _RATES_RIGHT_RAD:
+        return []
+    near = [r for r, value in zip(readings, off, strict=True) if value < max(2 * best, _RATES_RIGHT_RAD)]
+    code, hint = _which(near, readings[int(np.argmin(off))], best, unit_of(source, tables.RATES[0]))
+    words = f"carry the specific force {np.rad2deg(own):.0f} deg away from the track's{hint}"
+    return [Finding("rates", words, float(times[0]), float(times[-1]), code)]
+
+
+def _which(near: list[_Reading], best: _Reading, off_rad: float, declared: str) -> tuple[str, str]:
+    """Code and hint of what would mend the rates: all good readings differ by unit alone, by axes alone, or by both."""
+    scale, axes = best
+    if all(r[1] == AS_DECLARED for r in near):
+        return "gyro-unit", unit_hint(declared, unit_that_explains(scale, declared))
+    if all(r[0] == 1.0 for r in near):
+        return "gyro-axes", f"; with body x, y, z read from {axes_named(*axes)} it is {np.rad2deg(off_rad):.0f} deg"
+    return "gyro-rotation", ": check their unit, order and signs"
+
+
+def attitude_prior(found: Sources, force: TrackForce) -> list[Finding]:
+    """Check the attitude prior by the force that the gyros carry from it: ``attitude-prior`` or none."""
+    prior, gyros, sensed = found.attitude_prior, found.triads.get("rates"), found.triads.get("accelerometer")
+    if prior is None or gyros is None or sensed is None:
+        return []
+    size, sd = force.size()
+    half = 0.5 * force.width_s
+    clear = np.flatnonzero((size > _CLEAR * sd) & (force.time_s - half > prior.time_s))
+    clear = clear[force.time_s[clear] < prior.time_s + _FARTHEST_S]
+    if not len(clear):
+        return []
+    clear = clear[force.time_s[clear] < force.time_s[clear[0]] + _SPAN_S]
+    if len(clear) < _LEAST_WINDOWS:
+        return []
+    grid = np.arange(prior.time_s, force.time_s[clear[-1]] + half, _CELL_S)
+    w, a = (_cells(record, grid) for record in (gyros, sensed))
+    first = int(np.searchsorted(grid, force.time_s[clear[0]] - half))
+    if not (np.isfinite(w).all() and np.isfinite(a[first:]).all()):
+        return []
+    q = _as_stated_and_slipped(prior)
+    sums = _carried(q, np.tile(np.eye(3), (len(q), 1, 1)), grid, w, np.nan_to_num(a), force, clear)
+    track = force.force_mps2[clear]
+    cosine = np.einsum("cki,ki->ck", sums, track) / (np.linalg.norm(sums, axis=2) * np.linalg.norm(track, axis=1))
+    off = np.sqrt(np.mean(np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2, axis=1))
+    if off[0] < max(_WRONG_RAD, _ATTITUDE_SD * _carried_sd_rad(prior, gyros, grid, w)):
+        return []
+    fitting = [slip for slip, value in zip(_SLIPS, off[1:], strict=True) if value < _ATTITUDE_RIGHT_RAD]
+    entry, code = found.spec.attitude_prior, "attitude-prior"
+    if entry is None or entry.q_ecef_body is None:
+        hint = ": check azimuth_deg, elevation_deg, roll_deg, the place and the time"
+    elif len(fitting) == 1:
+        hint, code = f"; it fits when read {fitting[0]}", fitting[0].code
+    else:
+        hint = ": is q_ecef_body scalar first, from body to ECEF, and of that time?"
+    words = f"the gyros carry the specific force from it {np.rad2deg(off[0]):.0f} deg away from the track's{hint}"
+    return [Finding("attitude_prior", words, prior.time_s, float(force.time_s[clear[-1]]), code)]
+
+
+def _as_stated_and_slipped(prior: AttitudePrior) -> FloatArray:
+    """Quaternions (1 + slips, 4), body to inertial axes: as stated, and with each slip undone."""
+    q = prior.q_ecef_body
+    every = [q, *(rotations.conjugate(q) if order is None else q[order] for order in _SLIPS.values())]
+    inertial = rotations.conjugate(earth.q_ecef_eci(prior.time_s))
+    return np.array([rotations.multiply(inertial, one) for one in every])
+
+
+def _carried_sd_rad(prior: AttitudePrior, gyros: TriadRecord, grid: FloatArray, w: FloatArray) -> float:
+    """Standard deviation of a right attitude at the end: the prior's, with the gyros' bias and scale."""
+    turned = float(np.linalg.norm(w, axis=1).sum()) * _CELL_S
+    s = gyros.spec
+    return float(np.linalg.norm([prior.sd_rad.max(), s.bias_sd * (grid[-1] - grid[0]), s.scale_sd * turned]))
+
+
+def _cells(record: TriadRecord, grid: FloatArray) -> FloatArray:
+    """Means (m, 3), body axes, over cells from each time of the grid on; NaN in gaps and beyond the ends."""
+    body = record.measured_sensor @ record.spec.dcm_body_sensor.T
+    whole = np.isfinite(body).all(axis=1)
+    t, v = record.time_s[whole], body[whole]
+    if len(t) < 2:
+        return np.full((len(grid), 3), np.nan)
+    bad = (grid < t[0]) | (grid + _CELL_S > t[-1]) | (interval_around(t, grid) > _GAP_S)
+    return np.where(bad[:, None], np.nan, window_means(t, v, grid, 0.0, _CELL_S))
+
+
+def _carried(
+    q: FloatArray, turn: FloatArray, grid: FloatArray, w: FloatArray, a: FloatArray, force: TrackForce, clear: _Rows
+) -> FloatArray:
+    """Forces (c, k, 3) of k windows, carried from attitudes (c, 4) by rates that matrices (c, 3, 3) make of ``w``."""
+    sums = np.zeros((len(q), len(clear), 3))
+    half = 0.5 * force.width_s
+    for k, t in enumerate(grid):
+        u = (t - force.time_s[clear]) / half
+        weight = np.maximum(1 - u * u, 0.0) ** 2
+        if weight.any():
+            sums += rotations.rotate(q, np.tile(a[k], (len(q), 1)))[:, None, :] * weight[None, :, None]
+        q = rotations.boxplus(q, (turn @ w[k]) * _CELL_S)
+    return sums
+
+
+def _wander(sums: FloatArray, track_mps2: FloatArray) -> FloatArray:
+    """Rms angle (c,) between carried forces (c, k, 3) and the track's (k, 3) after the best rotation of each, rad."""
+    track = track_mps2 / np.linalg.norm(track_mps2, axis=1)[:, None]
+    out = np.empty(len(sums))
+    for c, vectors in enumerate(sums):
+        seen = vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)[:, None]
+        left, _, right = np.linalg.svd(track.T @ seen)
+        best = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        angle = np.arccos(np.clip(np.einsum("ki,ki->k", track, seen @ best.T), -1.0, 1.0))
+        out[c] = float(np.sqrt(np.mean(angle**2)))
+    return out

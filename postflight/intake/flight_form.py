@@ -25,7 +25,7 @@ from rich.markup import escape
 from flightmodel.aerodynamics import Sidecar
 from flightmodel.checks import ConfigError, write_file
 from flightmodel.config import FILL_IN, FILL_IN_VALUE, read_toml
-from flightmodel.flightfile import FlightFile
+from flightmodel.flightfolder import FlightFile
 from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES, UNITS
 from flightmodel.vehicle import DATA, VehicleFile, vehicle_from_toml, vehicle_path
 from postflight.intake.column_recognition import (

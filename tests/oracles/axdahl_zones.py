@@ -40,7 +40,6 @@ from synthetic_flight.linear import (
     DIVERGENT,
     STABLE,
     UNSTABLE,
-    ZONES,
     Slopes,
     critical_stiffness_nmprad,
     linear_matrix,
@@ -49,6 +48,7 @@ from synthetic_flight.linear import (
 from synthetic_flight.simulate import integrate
 
 # the reference vehicle at Mach 3.2 with 0.7 of the Newtonian static stability, C_mq constant and destabilising
+ZONES = ("stable", "dynamically unstable", "divergent")  # STABLE, UNSTABLE, DIVERGENT
 SLOPES = Slopes(ca=1.54, cn_alpha=0.3065, cm_alpha=-0.2333, cmq=0.2)
 PRESSURE_PA, SPEED_MPS = 1150.0, 1040.0
 FALL_S, FALL_STEP_S, RECORD_S = 120.0, 0.01, 0.1

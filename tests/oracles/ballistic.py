@@ -1,11 +1,11 @@
-"""Ballistic motion with its transition and noise in numpy: readable twin of `recon._ballistic_kernels`."""
+"""Ballistic motion with its transition and noise in numpy: readable twin of `recon._propagation_kernels`."""
 
 import numpy as np
 
 from flightmodel import earth, rotations
-from recon._ballistic_kernels import MOST_CHANGE, MOST_PARTS
+from recon._propagation_kernels import MOST_CHANGE, MOST_PARTS
+from recon.propagation import Step
 from recon.state import States
-from recon.strapdown import Step
 
 
 def _flow(motion, position, velocity, drivers):

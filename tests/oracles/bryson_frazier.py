@@ -1,6 +1,6 @@
 """Bryson-Frazier's fixed-interval smoother and the scores of offsets, in numpy: other formulations to compare with.
 
-Both use the adjoint of the filter (equations: `recon.abrupt_offsets`), which inverts nothing larger than an
+Both use the adjoint of the filter (equations: `recon.fault_detection`), which inverts nothing larger than an
 innovation's covariance:
 
     x_{k|N} = x_{k|k-1} - P_{k|k-1} l-,        P_{k|N} = P_{k|k-1} - P_{k|k-1} L- P_{k|k-1}

@@ -1,10 +1,10 @@
-"""Strapdown mechanisation with its transition and noise in numpy: readable twin of `recon._strapdown_kernels`."""
+"""Strapdown mechanisation with its transition and noise in numpy: readable twin of `recon._propagation_kernels`."""
 
 import numpy as np
 
 from flightmodel import earth, rotations
+from recon.propagation import Step, correct, correction_partials
 from recon.state import States
-from recon.strapdown import Step, correct, correction_partials
 
 
 def propagate(grid, first, last, start):
@@ -58,10 +58,17 @@ def propagate(grid, first, last, start):
     return Step(States(position, velocity, q, errors), transition, noise)
 
 
+def gravitation_gradient(position_m):
+    """Gradient of gravitation (3, 3) at one position, central term only (J2 changes it by 0.2 %), 1/s^2."""
+    r = np.linalg.norm(position_m)
+    n = position_m / r
+    return earth.GM_M3PS2 / r**3 * (3.0 * np.outer(n, n) - np.eye(3))
+
+
 def _step_transition(dt, c, f, half, mid, drivers):
     """Kinematic part of one step's transition, in a (9, 9 + drivers) matrix whose sensor columns are zero."""
     spin = rotations.skew(earth.OMEGA_ECEF_RADPS)
-    gradient = earth.gravitation_gradient(mid) - spin @ spin
+    gradient = gravitation_gradient(mid) - spin @ spin
     coriolis = np.eye(3) - dt * spin
     by_position = coriolis @ gradient
     by_velocity = 0.5 * dt * by_position - 2.0 * spin

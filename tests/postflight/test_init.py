@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 from click.testing import CliRunner
 
-from flightmodel import aerodynamics, flightfile, geometry, instruments, vehicle
+from flightmodel import aerodynamics, flightfolder, geometry, instruments, vehicle
 from flightmodel.tables import Source
 from postflight.cli import cli
 from postflight.flight import PULSE_RATE_HZ
@@ -22,10 +22,10 @@ from recon.settings import Settings
 ROOT = Path(__file__).parents[2]
 TABLES = {
     "flight": {
-        "": flightfile.FlightFile,
-        "attitude_prior": flightfile.AttitudeEntry,
-        "motion": flightfile.MotionEntry,
-        "motion.disturbed": flightfile.UnmodelledEntry,
+        "": flightfolder.FlightFile,
+        "attitude_prior": flightfolder.AttitudeEntry,
+        "motion": flightfolder.MotionEntry,
+        "motion.disturbed": flightfolder.UnmodelledEntry,
         "sensors.accelerometer": instruments.TriadEntry,
         "sensors.rates": instruments.RatesEntry,
         "sensors.magnetometer": instruments.MagnetometerEntry,
@@ -35,7 +35,7 @@ TABLES = {
         "barometers.NAME": instruments.BarometerEntry,
         "atmosphere": instruments.AtmosphereEntry,
         "frames": instruments.FramesEntry,
-        "events": flightfile.EventEntry,
+        "events": flightfolder.EventEntry,
     },
     "vehicle": {
         "": vehicle.VehicleFile,

@@ -13,7 +13,7 @@ import pytest
 from flightmodel import airdata, earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.trajectory import Trajectory
-from postflight import product, run_folder
+from postflight import run_folder
 from postflight.deflections import Deflections
 from postflight.flight import read_flight
 from postflight.reconstruction import bet_table, reconstruct
@@ -112,7 +112,7 @@ def test_standard_deviations_are_the_scatter_of_drawn_errors() -> None:
 
 
 def test_header_says_what_the_numbers_refer_to(short) -> None:
-    head = json.loads(json.dumps(product.header(short[0])))
+    head = json.loads(json.dumps(run_folder.header(short[0])))
     assert head["epoch_utc"] == "2009-08-17T12:52:00Z"
     assert head["vehicle"]["reference_area_m2"] == pytest.approx(7.0686)
     assert head["vehicle"]["mass_kg"] == pytest.approx(155.0)
@@ -124,7 +124,7 @@ def test_header_says_what_the_numbers_refer_to(short) -> None:
 
 def test_events_carry_three_standard_deviations(short) -> None:
     flight, table = short
-    events = product.event_table(flight, table)
+    events = run_folder.event_table(flight, table)
     row = events.iloc[0]
     k = int((table.t_s - row.t_s).abs().argmin())
     assert row.alt_3sd_m == pytest.approx(3.0 * table.alt_sd_m[k], rel=0.05)
@@ -133,9 +133,9 @@ def test_events_carry_three_standard_deviations(short) -> None:
 
 def test_peak_is_one_number_in_events_peaks_and_summary(short) -> None:
     flight, table = short
-    rows = product.event_table(flight, table)
+    rows = run_folder.event_table(flight, table)
     event = rows[rows["event"].str.contains("dynamic pressure")].iloc[0]
-    peak = product.peak_table(flight, table).set_index("peak").loc["dynamic pressure"]
+    peak = run_folder.peak_table(flight, table).set_index("peak").loc["dynamic pressure"]
     summary = run_folder.summary(flight, Deflections(), rows)
     assert event.t_s == peak.t_s == summary["peak_dynamic_pressure_s"] == flight.peak_s
     assert event.dynamic_pressure_pa == peak.value == summary["peak_dynamic_pressure_pa"]
@@ -148,7 +148,7 @@ def test_peak_is_one_number_in_events_peaks_and_summary(short) -> None:
 
 def test_residual_statistics_count_every_point(short) -> None:
     flight, _ = short
-    stats = product.residual_statistics(flight)
+    stats = run_folder.residual_statistics(flight)
     assert stats["count"].sum() == len(flight.solution.residuals)
     assert stats.edited.sum() == (~flight.solution.residuals.accepted).sum()
 
@@ -163,7 +163,7 @@ def test_statistics_of_white_residuals_are_one_and_none() -> None:
         }
     )  # fmt: skip
     bet = type("Bet", (), {"residuals": part, "consistency_checks": ()})()
-    row = product.residual_statistics(type("Flight", (), {"solution": bet})()).iloc[0]
+    row = run_folder.residual_statistics(type("Flight", (), {"solution": bet})()).iloc[0]
     assert (row["count"], row.edited, row.unit) == (n, 20, "m")
     assert row.rms_normalised == pytest.approx(1.0, abs=0.06)
     assert abs(row.lag1) < 0.09
@@ -171,6 +171,6 @@ def test_statistics_of_white_residuals_are_one_and_none() -> None:
 
 
 def test_covariance_is_whole_once_a_second(short) -> None:
-    slow = product.slow_covariance(short[0])
+    slow = run_folder.slow_covariance(short[0])
     assert slow["covariance"].shape[1:] == (9, 9)
     assert 9 <= len(slow["t_s"]) <= 11

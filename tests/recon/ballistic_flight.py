@@ -9,10 +9,9 @@ from flightmodel import earth
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, standard_sounding
 from flightmodel.instruments import GnssSpec, RadarSite
 from flightmodel.telemetry import GnssRecord, Motion, RadarRecord, Telemetry
-from recon.ballistic import ballistic_motion
 from recon.ekf import height
+from recon.propagation import ballistic_motion, propagate
 from recon.state import States
-from recon.strapdown import propagate
 
 EPOCH = "2009-08-17T12:52:00Z"
 LATITUDE, LONGITUDE = -0.58, 0.31
@@ -56,7 +55,7 @@ def fly(seed, end_s=80.0, spec=SPEC, height_m=90e3, velocity_ned_mps=(300.0, 900
     t = np.arange(0.0, end_s + 1e-9, 0.05)
     state = entry_state(height_m, velocity_ned_mps, errors=6)
     across = across_plane(state)
-    motion, index = ballistic_motion(spec, windy_sounding(), across, t, 1e-6)
+    motion, index = ballistic_motion(spec, windy_sounding(), across, t)
     sd = np.array([spec.drag_sd, spec.side_sd, spec.side_sd, 1.0, 1.0, 1.0])
     length = np.array([np.inf] * 3 + [DENSITY_LENGTH_M] + [WIND_LENGTH_M] * 2)
     tau = np.array([spec.drag_time_constant_s] * 3 + [np.inf] * 3)

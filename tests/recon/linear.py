@@ -12,9 +12,10 @@ import numpy as np
 from recon import _filter_kernels as kernels
 from recon import smoother
 from recon._measurement_kernels import SLOTS
-from recon.ekf import COMPILED, make_filter, schmidt_update
+from recon.ekf import Filtered, Innovations, Observed, Steps, make_filter, schmidt_update
+from recon.settings import COMPILED
 from recon.smoother import full_step
-from recon.state import Filtered, Innovations, Observed, Steps, Wander, packed
+from recon.state import Wander, packed
 from tests.oracles import bryson_frazier
 
 EMPTY = np.full(SLOTS, -1, dtype=np.int64)

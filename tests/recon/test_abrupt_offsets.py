@@ -7,8 +7,8 @@ import pytest
 
 from flightmodel.telemetry import TriadRecord
 from recon import _glr_kernels
-from recon.abrupt_offsets import unsupported_offsets
 from recon.ekf import forward
+from recon.fault_detection import unsupported_offsets
 from recon.imu_screening import _REACH, TransientOffset, bridge, repeated_samples, transient_offsets
 from recon.reconstruct import bridge_inertial_sensors, reconstruct_once
 from recon.settings import Settings

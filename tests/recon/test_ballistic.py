@@ -8,12 +8,11 @@ from scipy.integrate import quad_vec, solve_ivp
 from scipy.stats import chi2
 
 from flightmodel import earth, rotations
-from recon import ballistic
-from recon.ballistic import ballistic_motion
+from recon import propagation
+from recon.propagation import ballistic_motion, propagate
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.state import States, boxminus, boxplus
-from recon.strapdown import propagate
 from tests.oracles import ballistic as plain_ballistic
 
 from .ballistic_flight import LATITUDE, LONGITUDE, SPEC, across_plane, entry_state, fly, watch, windy_sounding
@@ -33,7 +32,7 @@ def airless(motion):
 @pytest.fixture(scope="module")
 def carried():
     spec = replace(SPEC, drag_area_per_mass_m2pkg=0.01, powered_s=((10.0, 12.0),))
-    motion, index = ballistic_motion(spec, windy_sounding(), ACROSS, NODES, 2e-6)
+    motion, index = ballistic_motion(spec, windy_sounding(), ACROSS, NODES)
     start = entry_state(60e3, (800.0, 1500.0, 900.0))
     return motion, index, replace(start, sensor_errors=np.concatenate([DRIVERS, [9.0, 9.0]]))
 
@@ -75,14 +74,14 @@ def test_transition_is_the_derivative_in_every_column(carried, first, last):
 def test_entry_follows_an_independent_integrator(carried):
     """Forces written here from the day's air and the Earth's shape; DOP853. Step error of 0.05 s: 5e-5 m measured."""
     motion, index, start = carried
-    table = ballistic.air_table(windy_sounding())
+    table = propagation.air_table(windy_sounding())
     spin = earth.OMEGA_ECEF_RADPS
 
     def slope(_t, y):
         r, v = y[:3], y[3:]
         latitude, longitude, height = (float(x) for x in earth.geodetic_from_ecef(r))
-        row = int((height - ballistic.AIR_FROM_M) // ballistic.AIR_STEP_M)
-        w = (height - ballistic.AIR_FROM_M) / ballistic.AIR_STEP_M - row
+        row = int((height - propagation.AIR_FROM_M) // propagation.AIR_STEP_M)
+        w = (height - propagation.AIR_FROM_M) / propagation.AIR_STEP_M - row
         log_density, north, east, density_sd, wind_sd = (1.0 - w) * table[row] + w * table[row + 1]
         ned = earth.dcm_ned_ecef(latitude, longitude)
         wind = ned.T @ [north + DRIVERS[4] * wind_sd, east + DRIVERS[5] * wind_sd, 0.0]
@@ -107,10 +106,10 @@ def test_entry_follows_an_independent_integrator(carried):
 def test_a_parachute_that_sinks_straight_down_has_side_forces_with_steady_axes():
     """Level and upright axes turn by 90 deg for 0.1 m/s of drift here; the flow itself by 1 deg."""
     calm = replace(SPEC, drag_area_per_mass_m2pkg=0.4)
-    motion, _ = ballistic_motion(calm, windy_sounding(), ACROSS, np.array([0.0, 5.0]), 2e-6)
+    motion, _ = ballistic_motion(calm, windy_sounding(), ACROSS, np.array([0.0, 5.0]))
     start = entry_state(2e3, (0.0, 0.0, 7.0), errors=6)
     wind = np.array(
-        [np.interp(2e3, ballistic.AIR_FROM_M + 100.0 * np.arange(len(motion.air)), c) for c in motion.air.T]
+        [np.interp(2e3, propagation.AIR_FROM_M + 100.0 * np.arange(len(motion.air)), c) for c in motion.air.T]
     )
     ned = earth.dcm_ned_ecef(LATITUDE, LONGITUDE)
     down = np.array([wind[1], wind[2], 7.0])
@@ -134,7 +133,7 @@ def test_a_parachute_that_sinks_straight_down_has_side_forces_with_steady_axes()
 def test_a_drag_that_stops_the_vehicle_within_a_step_is_followed(drag):
     """Against Radau's method with differences of its ends; drag takes 3 to 300 times the airspeed in the step."""
     spec = replace(SPEC, drag_area_per_mass_m2pkg=drag)
-    motion, index = ballistic_motion(spec, windy_sounding(), ACROSS, np.array([0.0, 0.05]), 2e-6)
+    motion, index = ballistic_motion(spec, windy_sounding(), ACROSS, np.array([0.0, 0.05]))
     start = entry_state(9e3, (300.0, 0.0, 0.0), errors=6)
 
     def slope(_t, y):
@@ -158,16 +157,16 @@ def test_a_drag_that_stops_the_vehicle_within_a_step_is_followed(drag):
 
 
 def test_air_table_is_the_days_air():
-    table = ballistic.air_table(windy_sounding())
+    table = propagation.air_table(windy_sounding())
     sounding = windy_sounding()
-    row = int((12e3 - ballistic.AIR_FROM_M) / ballistic.AIR_STEP_M)
+    row = int((12e3 - propagation.AIR_FROM_M) / propagation.AIR_STEP_M)
     assert np.isclose(np.exp(table[row, 0]), sounding.density_kgpm3[12], rtol=1e-6)
     assert np.allclose(table[row, 1:], [sounding.wind_north_mps[12], sounding.wind_east_mps[12], 0.10, 15.0], rtol=1e-6)
 
 
 def test_without_air_energy_stays():
     """Jacobi's constant in the turning frame, with J2: 400 s over 600 km, Runge-Kutta steps of 0.05 s."""
-    motion, index = ballistic_motion(SPEC, windy_sounding(), ACROSS, np.array([0.0, 400.0]), 2e-6)
+    motion, index = ballistic_motion(SPEC, windy_sounding(), ACROSS, np.array([0.0, 400.0]))
     start = entry_state(200e3, (1500.0, 2500.0, -1500.0), errors=6)
 
     def jacobi(s):
@@ -189,7 +188,7 @@ def test_without_air_energy_stays():
 
 def test_air_takes_energy_only_and_wind_turns_with_the_earth():
     """A body at rest in still air that turns with the Earth feels no force of the air."""
-    motion, index = ballistic_motion(SPEC, windy_sounding(), ACROSS, np.array([0.0, 0.05]), 2e-6)
+    motion, index = ballistic_motion(SPEC, windy_sounding(), ACROSS, np.array([0.0, 0.05]))
     still = motion._replace(air=motion.air * [1.0, 0.0, 0.0, 1.0, 1.0])
     start = entry_state(20e3, (0.0, 0.0, 0.0), errors=6)
     with_air, without = (
@@ -204,7 +203,7 @@ def test_noise_is_the_integral_of_the_transition(carried):
     motion, index, start = carried
     nodes = np.linspace(0.0, 20.0, 81)
     spec = replace(SPEC, drag_area_per_mass_m2pkg=0.01, powered_s=((10.0, 12.0),), powered_sd_mps2=3.0)
-    motion, index = ballistic_motion(spec, windy_sounding(), ACROSS, nodes, 2e-6)
+    motion, index = ballistic_motion(spec, windy_sounding(), ACROSS, nodes)
     claimed = propagate(motion, index[0], index[-1], start).noise[:6, :6]
     states = [start]
     for k in range(80):
@@ -234,9 +233,9 @@ def test_noise_is_the_integral_of_the_transition(carried):
 
 def test_powered_spans_open_the_noise():
     spec = replace(SPEC, powered_s=((1.0, 2.0), (3.0, 3.5)), powered_sd_mps2=7.0)
-    motion, _ = ballistic_motion(spec, windy_sounding(), ACROSS, np.array([0.0, 0.5, 4.0]), 2e-6)
+    motion, _ = ballistic_motion(spec, windy_sounding(), ACROSS, np.array([0.0, 0.5, 4.0]))
     t = motion.time_s
-    assert np.diff(t).max() < ballistic.GRID_STEP_S + 1e-9
+    assert np.diff(t).max() < propagation.GRID_STEP_S + 1e-9
     powered = ((t >= 1.0) & (t < 2.0)) | ((t >= 3.0) & (t < 3.5))
     assert np.allclose(motion.force_density[powered], SPEC.acceleration_density**2 + 49.0)
     assert np.allclose(motion.force_density[~powered], SPEC.acceleration_density**2)

@@ -2,7 +2,7 @@
 
 The correction is exact to fourth order where signals are straight in time. Samples of a sinusoid are not, and the
 error of joining them by straight lines is just as large as what is corrected for;
-`recon.motion.with_exact_integrals` takes it away.
+`recon.propagation.with_exact_integrals` takes it away.
 """
 
 from functools import cache
@@ -13,10 +13,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from flightmodel import earth, rotations
-from recon import strapdown
-from recon.motion import strapdown_motion, with_exact_integrals
+from recon import propagation
+from recon.propagation import propagate, strapdown_motion, with_exact_integrals
 from recon.state import States
-from recon.strapdown import propagate
 from tests.oracles import strapdown as plain_strapdown
 
 SPAN_S = 2.0
@@ -90,7 +89,7 @@ def mechanised(motion, count, corrected=True, moved=True):
     start = States(POSITION, VELOCITY, q[0], np.zeros(18))
     if corrected:
         return propagate(grid, 0, count, start).state
-    with mock.patch.object(strapdown.np, "cross", lambda _a, b: np.zeros_like(b)):
+    with mock.patch.object(propagation.np, "cross", lambda _a, b: np.zeros_like(b)):
         return plain_strapdown.propagate(grid, 0, count, start).state
 
 

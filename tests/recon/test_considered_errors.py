@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from recon.ekf import ENGINES, forward
+from recon.ekf import forward
+from recon.settings import ENGINES
 from recon.smoother import smooth
 from recon.state import unpacked
 

@@ -8,8 +8,9 @@ import pytest
 from flightmodel import rotations
 from flightmodel.telemetry import RadarRecord
 from recon import _measurement_kernels, ekf
-from recon.ekf import FILTERPY, forward
+from recon.ekf import forward
 from recon.measurements import NodeMotion, predict, wrapped
+from recon.settings import ENGINES, FILTERPY
 from recon.smoother import full_step, smooth
 from recon.state import packed, unpacked
 
@@ -182,7 +183,7 @@ def textbook_measurement(problem, reference, row, slots):
 
 
 @pytest.mark.parametrize("name", ["considered", "all, considered", "ballistic, considered"])
-@pytest.mark.parametrize("engine", ekf.ENGINES)
+@pytest.mark.parametrize("engine", ENGINES)
 def test_considered_errors_never_move(problems, name, engine):
     problem = problems[name]
     run = forward(problem, engine=engine)

@@ -11,7 +11,6 @@ from flightmodel.instruments import ACCELEROMETER, GnssSpec, TriadSpec
 from flightmodel.telemetry import GnssRecord, TriadRecord
 from flightmodel.trajectory import Trajectory, difference
 from recon.consistency import source_checks
-from recon.error_model import instrument_blocks
 from recon.fault_isolation import _compared
 from recon.imu_screening import (
     _bridges,
@@ -23,11 +22,10 @@ from recon.imu_screening import (
     repeat_by_noise,
 )
 from recon.measurements import gnss_instruments, magnetometer_instrument
-from recon.motion import strapdown_motion, with_exact_integrals
-from recon.product import Mounting, datum_trajectory
+from recon.propagation import strapdown_motion, with_disturbances, with_exact_integrals
+from recon.reconstruct import Mounting, datum_trajectory
 from recon.setup import fit_start
-from recon.state import States, boxplus, packed
-from recon.unmodelled_acceleration import with_stated
+from recon.state import States, boxplus, instrument_blocks, packed
 from recon.vector_attitude import _inconsistent_sensors, compare
 
 
@@ -126,7 +124,7 @@ def test_a_stated_disturbance_keeps_its_value_for_a_second():
     one = np.full((5, 3), 1e-4)
     motion = strapdown_motion(np.arange(5.0), one, one, one, one, np.eye(3), np.eye(3))
     span = SimpleNamespace(start_s=1.0, end_s=3.0, sd_mps2=2.0, sd_radps=0.1)
-    made = with_stated(motion, SimpleNamespace(disturbed=(span,)))
+    made = with_disturbances(motion, SimpleNamespace(disturbed=(span,)))
     np.testing.assert_allclose(made.force_density[:, 0], [1e-4, 4.0001, 4.0001, 1e-4, 1e-4])
     np.testing.assert_allclose(made.rate_density[:, 0], [1e-4, 0.0101, 0.0101, 1e-4, 1e-4])
 

@@ -16,14 +16,12 @@ import pytest
 
 from flightmodel import earth
 from recon._measurement_kernels import HEIGHT, SLOTS
-from recon.ekf import ENGINES, forward, height
-from recon.error_model import Block, ErrorModel
+from recon.ekf import Observed, Problem, Steps, forward, height, observe
 from recon.measurements import Instrument
-from recon.motion import strapdown_motion
-from recon.problem import Problem, observe
+from recon.propagation import propagate, strapdown_motion
+from recon.settings import ENGINES
 from recon.smoother import smooth
-from recon.state import Observed, States, Steps, Wander, unpacked
-from recon.strapdown import propagate
+from recon.state import Block, ErrorModel, States, Wander, unpacked
 from tests.oracles import bryson_frazier
 
 from . import linear
@@ -65,7 +63,7 @@ def level_problem(series, noise_var, walk_var, mean, variance):
         "barometer", HEIGHT, "barometer", np.zeros(3), np.zeros(3), np.eye(3), motion.time_s[there], value, sd2,
         np.zeros_like(value),
     )  # fmt: skip
-    observed, row = observe(motion.time_s, (barometer,), 1e-6)
+    observed, row = observe(motion.time_s, (barometer,))
     start.sensor_errors[BIAS] = mean
     covariance = np.diag(np.r_[np.full(9 + BIAS, KNOWN_SD**2), variance])
     gate = np.full(4, np.inf)

@@ -9,9 +9,8 @@ from scipy.stats import chi2
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.telemetry import RadarRecord, TriadRecord
 from flightmodel.trajectory import difference
-from recon.ekf import ENGINES
 from recon.reconstruct import reconstruct
-from recon.settings import Settings
+from recon.settings import ENGINES, Settings
 
 from .ballistic_flight import fly, watch
 from .conftest import gauss_markov
@@ -194,7 +193,7 @@ def test_a_single_filter_about_its_own_estimate_comes_near(mini_sense, mini_trut
 
 
 def test_rates_of_the_trajectory_are_those_measured(mini_sense):
-    """Samples are moved for the mechanisation alone (`recon.motion.with_exact_integrals`); corrected rates are not."""
+    """Samples are moved for the mechanisation alone (`with_exact_integrals`); corrected rates are not."""
     telemetry, _ = mini_sense(970)
     record = telemetry.rates
     jagged = record.measured_sensor + 0.01 * (-1.0) ** np.arange(len(record.time_s))[:, None]

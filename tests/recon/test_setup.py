@@ -10,10 +10,10 @@ from flightmodel import instruments
 from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import GnssRecord, RadarRecord, TriadRecord
-from recon.error_model import ErrorModel, instrument_blocks
-from recon.motion import inertial_motion
+from recon.propagation import inertial_motion
 from recon.reconstruct import bridge_inertial_sensors, reconstruct
 from recon.settings import Settings
+from recon.state import ErrorModel, instrument_blocks
 
 from .ballistic_flight import fly, watch
 from .conftest import ACCELEROMETER, FULL_SITES

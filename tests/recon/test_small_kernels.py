@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from recon import _filter_kernels, _measurement_kernels, ballistic, ekf
+from recon import _filter_kernels, _measurement_kernels, ekf, propagation
 from recon._glr_kernels import offset_scores
-from recon.motion import strapdown_motion
+from recon.propagation import correct, propagate, strapdown_motion
+from recon.settings import ENGINES, FILTERPY
 from recon.state import States, Wander, unpacked
-from recon.strapdown import correct, propagate
 from tests.oracles import ballistic as plain_ballistic
 from tests.oracles import bryson_frazier
 from tests.oracles import strapdown as plain_strapdown
@@ -40,7 +40,7 @@ def test_smoothers_equal_conditioning_the_joint_gaussian():
 
 def test_considered_errors_get_no_gain():
     problem = linear.random_problem(1, drivers=6, considered=(1, 7))
-    fast, slow = (linear.run(problem, engine) for engine in ekf.ENGINES)
+    fast, slow = (linear.run(problem, engine) for engine in ENGINES)
     np.testing.assert_allclose(fast[0].x_plus, slow[0].x_plus, atol=1e-9)
     np.testing.assert_allclose(fast[0].p_minus, slow[0].p_minus, atol=1e-8)
     assert (fast[1].gain[:, [10, 16]] == 0.0).all()
@@ -158,7 +158,7 @@ def carried():
     nodes = np.array([0.0, 0.11, 0.2])
     spec = replace(SPEC, drag_area_per_mass_m2pkg=0.01)
     state = entry_state(60e3, (800.0, 1500.0, 900.0))
-    motion, index = ballistic.ballistic_motion(spec, windy_sounding(), across_plane(state), nodes, 2e-6)
+    motion, index = propagation.ballistic_motion(spec, windy_sounding(), across_plane(state), nodes)
     return motion, index, replace(state, sensor_errors=np.concatenate([DRIVERS, [9.0, 9.0]]))
 
 
@@ -211,7 +211,7 @@ SHORT = {"start_s": None, "end_s": 6.1, "output_rate_hz": 1.0}  # six seconds ar
 def test_a_short_fall_is_filtered_alike_by_both_engines_whatever_turn_the_azimuth_is_on():
     telemetry = far_off(short_fall(), [3], 900.0)
     problem = build(telemetry, **SHORT)
-    plain = ekf.forward(problem, None, ekf.FILTERPY)
+    plain = ekf.forward(problem, None, FILTERPY)
     run = ekf.forward(build(turned_round(telemetry, 1), **SHORT))
     assert np.array_equal(run.innovations.accepted, plain.innovations.accepted)
     sd = np.sqrt(np.diagonal(unpacked(plain.filtered.p_minus), axis1=1, axis2=2))

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from flightmodel.instruments import GnssSpec
-from recon import abrupt_offsets, smoother
-from recon.ekf import COMPILED, ENGINES, FILTERPY, forward
+from recon import fault_detection, smoother
+from recon.ekf import forward
+from recon.settings import COMPILED, ENGINES, FILTERPY
 from recon.smoother import full_step, smooth, step_gain
 from recon.state import unpacked
 from tests.oracles import bryson_frazier
@@ -174,8 +175,8 @@ def test_adjoint_keeps_its_digits_after_precise_points(mini_sense, mini_truth):
     assert off_in_covariance(one.triangles, other.triangles) < 1e-3
     assert (np.abs(one.x - other.x)[problem.kept] / np.sqrt(one.variance)).max() < 1e-3
     begin, end = np.array([0]), np.array([len(problem.time_s) - 1])
-    score, variance = abrupt_offsets.offset_scores(problem, run, begin, end)
-    slots, columns = problem.sources().slot, abrupt_offsets._BIASES
+    score, variance = fault_detection.offset_scores(problem, run, begin, end)
+    slots, columns = problem.sources().slot, fault_detection._BIASES
     s, v = bryson_frazier.offset_scores(run.steps, problem.observed, slots, run.innovations, columns, 0, end[0])
     sd = np.sqrt(np.diagonal(v))
     assert (np.abs(score[0] - s) / sd).max() < 1e-3

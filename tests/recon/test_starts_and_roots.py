@@ -8,14 +8,13 @@ import pytest
 from scipy.stats import norm
 
 from flightmodel import earth, rotations
-from recon import abrupt_offsets, atmosphere, setup
+from recon import atmosphere, fault_detection, setup
 from recon._measurement_kernels import POSITION
 from recon.imu_screening import TransientOffset
-from recon.product import accelerometer_root
-from recon.reconstruct import reconstruct
+from recon.propagation import correct
+from recon.reconstruct import accelerometer_root, reconstruct
 from recon.settings import Settings
 from recon.state import packed
-from recon.strapdown import correct
 
 
 def test_a_start_is_the_datum_s_where_the_antenna_moves_about_it(monkeypatch):
@@ -81,14 +80,14 @@ def test_readings_are_accepted_at_a_thousand_to_one(monkeypatch, found, offset):
     # one Gaussian reading of the offset with unit sd, ``found``: right where it is a thousand times likelier without
     score = np.zeros((1, 6))
     score[0, 4] = -found
-    monkeypatch.setattr(abrupt_offsets, "offset_scores", lambda *_: (score, np.eye(6)[None]))
+    monkeypatch.setattr(fault_detection, "offset_scores", lambda *_: (score, np.eye(6)[None]))
     problem = SimpleNamespace(
         time_s=np.arange(10.0), model=SimpleNamespace(wander=SimpleNamespace(considered=np.zeros(3, dtype=bool)))
     )
     runs = (TransientOffset(1, 1, 3.0, 5.0, offset),)
     against = norm.logpdf(found) - norm.logpdf(found, offset)
     assert abs(against - np.log(1000.0)) > 0.1
-    assert (abrupt_offsets.unsupported_offsets(problem, None, runs) == ()) == (against > np.log(1000.0))
+    assert (fault_detection.unsupported_offsets(problem, None, runs) == ()) == (against > np.log(1000.0))
 
 
 def test_held_out_readings_noise_is_in_what_is_predicted_of_them(mini_sense):

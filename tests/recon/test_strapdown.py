@@ -8,9 +8,8 @@ from scipy.interpolate import CubicSpline
 
 from flightmodel import earth, rotations
 from recon import ekf
-from recon.motion import strapdown_motion
+from recon.propagation import correct, correction_partials, fill_between, propagate, strapdown_motion
 from recon.state import States, boxminus, boxplus
-from recon.strapdown import correct, correction_partials, fill_between, propagate
 from tests.oracles import strapdown as plain_strapdown
 
 from .problems import build

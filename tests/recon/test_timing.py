@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from flightmodel.telemetry import RadarRecord
 from flightmodel.trajectory import difference
-from recon.motion import SAME_INSTANT_S
-from recon.problem import nearest_index, observe
+from recon.ekf import nearest_index, observe
+from recon.propagation import SAME_INSTANT_S
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.setup import _union
@@ -134,7 +134,7 @@ def test_near_instants_are_one_node_and_none_is_lost():
 def test_measurements_off_the_nodes_are_left_out(mini_sense):
     problem = build(mini_sense(1)[0])
     some = problem.time_s[::3]
-    observed, rows = observe(some, problem.instruments, SAME_INSTANT_S)
+    observed, rows = observe(some, problem.instruments)
     assert 0 < len(rows) < len(problem.row)
     assert observed.first[-1] == len(rows)
     assert (np.diff(observed.first) >= 0).all()

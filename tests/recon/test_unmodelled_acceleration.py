@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flightmodel.checks import DivergenceError
-from recon.unmodelled_acceleration import (
+from recon.fault_detection import (
     LEAST_REJECTED_POINTS,
     MOST_SPANS,
     UnmodelledAcceleration,
