@@ -1,9 +1,10 @@
 """How does every figure of the project look? Colours by meaning, axes, bands, legends, the corner's note, the file.
 
-A figure function is wrapped by `in_style`, which sets matplotlib's parameters while it draws and leaves those of the
-caller as they are. Colours are asked for by what they mean (``COLOUR["truth"]``), never by value: the eight of Okabe
-and Ito, which stay apart for colour-blind readers, with strokes that stay apart in grey. The report's page takes its
-colours from the same tables, so this module imports matplotlib only when something is drawn.
+A figure function is wrapped by `in_style`, which sets matplotlib's parameters while it draws, leaves those of the
+caller as they are, and takes no text as TeX: a name from a file is drawn as it stands. Colours are asked for by what
+they mean (``COLOUR["truth"]``), never by value: the eight of Okabe and Ito, which stay apart for colour-blind readers,
+with strokes that stay apart in grey. The report's page takes its colours from the same tables, so this module imports
+matplotlib only when something is drawn.
 
 A shaded band is one standard deviation to both sides unless its label gives another size.
 
@@ -114,11 +115,31 @@ def in_style(draw: Callable[_P, _R]) -> Callable[_P, _R]:
     @wraps(draw)
     def styled(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         import matplotlib
+        from matplotlib.figure import Figure
 
         with matplotlib.rc_context(_PARAMETERS):
-            return draw(*args, **kwargs)
+            drawn = draw(*args, **kwargs)
+            if isinstance(drawn, Figure):
+                _without_tex(drawn)
+            return drawn
 
     return styled
+
+
+def _without_tex(figure: Figure) -> None:
+    """Draw all texts as they stand, but for the ticks, which a logarithmic axis writes as TeX itself."""
+    from matplotlib.axis import Axis
+    from matplotlib.text import Text
+
+    ticks = {
+        id(text)
+        for axis in figure.findobj(Axis)
+        for tick in (*axis.majorTicks, *axis.minorTicks)
+        for text in (tick.label1, tick.label2)
+    }
+    for text in figure.findobj(Text):
+        if id(text) not in ticks:
+            text.set_parse_math(False)
 
 
 def band(
@@ -159,7 +180,7 @@ def residual_unit(component: str) -> tuple[float, str]:
 
 def note(figure: Figure, words: str) -> None:
     """Write in the lower right corner what was flown."""
-    figure.supxlabel(words, x=0.995, ha="right", fontsize=_SMALL, color=COLOUR["note"])
+    figure.supxlabel(words, x=0.995, ha="right", fontsize=_SMALL, color=COLOUR["note"], parse_math=False)
 
 
 def stamp(figure: Figure, telemetry: Telemetry) -> None:

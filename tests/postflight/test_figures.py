@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import matplotlib
+import matplotlib.figure
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from postflight import plots
 from postflight.attitude import check_attitude
 from postflight.flight import Flight
 from postflight.plots import style
-from postflight.plots.style import save
+from postflight.plots.style import in_style, save
 from postflight.plots.trajectory import (
     figure_attitude,
     figure_filter_and_smoother,
@@ -111,6 +112,23 @@ def test_same_data_give_the_same_bytes_and_the_callers_style_stays(flight, tmp_p
         save(figure_filter_and_smoother(flight), tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert dict(matplotlib.rcParams) == before
+
+
+def test_names_are_no_tex_and_logarithmic_ticks_are(flight, tmp_path):
+    name = r"costs $\frac{1}$ more"
+    telemetry = replace(flight.telemetry, name=name)
+    figure = figure_filter_and_smoother(replace(flight, flight=replace(flight.flight, telemetry=telemetry)))
+    drawn(figure, tmp_path / "named.png")
+    assert name in figure.get_supxlabel()
+    ticks = [tick.label1 for ax in figure.get_axes() for tick in ax.yaxis.majorTicks if ax.get_yscale() == "log"]
+    assert any(tick.get_text().startswith(r"$\mathdefault{10^") and tick.get_parse_math() for tick in ticks)
+    # a title, too
+    titled = in_style(lambda: matplotlib.figure.Figure())()
+    titled.suptitle(name)
+    with pytest.raises(ValueError, match="frac"):
+        titled.savefig(tmp_path / "tex.png")
+    as_text = in_style(lambda: titled)()
+    as_text.savefig(tmp_path / "text.png")
 
 
 @pytest.mark.parametrize("name", plots.__all__)
