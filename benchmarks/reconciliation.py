@@ -96,10 +96,12 @@ def errors(found, vehicle, factors):
     return [*out, table.found["static stability"] - factors["cm"], table.sd["static stability"]]
 
 
-def modal_errors(flight, vehicle):
+def modal_errors(flight, vehicle, fit):
     """Error and sd of the log stiffness by the joint's frequency; NaN where the mode is not seen."""
+    if stiffness_bound(fit) is not None:
+        return [np.nan, np.nan]
     try:
-        found = stiffness_from_modes(flight)
+        found = stiffness_from_modes(flight, fit.vehicle.joint.bending_stiffness_nmprad)
     except GateError as fault:
         print(f"  {fault}")
         return [np.nan, np.nan]
@@ -184,7 +186,7 @@ def main():
         bound, true = stiffness_bound(found), vehicle.joint.bending_stiffness_nmprad
         if bound is not None:
             words += f", stiffness above {bound:.0f} N m/rad ({'true' if true > bound else 'FALSE'}: {true:.0f})"
-        row = [*errors(found, vehicle, factors), *modal_errors(flight, vehicle)]
+        row = [*errors(found, vehicle, factors), *modal_errors(flight, vehicle, found)]
         if bound is not None:
             row[:4] = [np.nan] * 4
         rows.append(row)

@@ -89,9 +89,9 @@ _LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is compared with another
 CONFIDENCE = 0.999
 WIDER = 4.0
 _LEAST_INFORMATION = 0.05  # part of a direction's variance that the readings must have taken away
-# odds at which an input is named though every pair passes: for one hypothesis chance gives ten at most once in ten
-# flights (Markov's inequality), and gave them in one of thirty; higher where its stated error is only assumed
-_LARGEST_GAIN, _LARGEST_ASSUMED_GAIN = np.log(10.0), np.log(1e4)
+# odds at which an input is named though every pair passes, with which a twentieth of sound flights is said to disagree
+# (of 107, docs/deflection.md: at 5 one in fourteen); higher where its stated error is only assumed
+_LARGEST_GAIN, _LARGEST_ASSUMED_GAIN = np.log(7.0), np.log(1e4)
 _ASSUMED = ("mass properties", "attitude of the trajectory", "sounded wind", "sounded density")
 _ALSO = np.log(100.0)  # odds below which the next hypothesis is named too: odds were found to be overconfident
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -66,10 +67,10 @@ class Reconciliation(Tabular):
     bet: Reconstruction
     fit: JointFit
 
-    @property
+    @cached_property
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
         """Whether the fit can be believed."""
-        return credibility(self.fit)
+        return credibility(self.fit, _modes(self.bet, self.fit)[0])
 
     @property
     def deflection(self) -> DeflectionHistory:
@@ -77,8 +78,8 @@ class Reconciliation(Tabular):
         return deflection_of(self.fit)
 
     def modal_stiffness(self) -> ModalStiffness:
-        """Bending stiffness from the joint's frequency alone; `GateError` where the mode is not detected."""
-        return stiffness_from_modes(self.bet)
+        """Bending stiffness by the joint's frequency; `GateError` where the mode is not detected."""
+        return _modal(self.bet, self.fit)
 
     def bounds(self, flights: int = 60, progress: Progress | None = None) -> tuple[Bounds, Bounds]:
         """Bands of dispersed entries with the joint locked, and with the fitted joint."""
@@ -142,7 +143,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         if sampled:
             posterior, nested = sample_selection(selection, lambda f, what: report(0.6 + 0.3 * f, what))
             odds |= nested
-        modal, no_modes = _modes(flight)
+        modal, no_modes = _modes(flight, fit)
         rigid = rigid_bounds(flight, ENTRIES, progress=lambda f, what: report(0.9 + 0.05 * f, what))
         flexible = reconciled_bounds(fit, flight, lambda f, what: report(0.95 + 0.05 * f, what))
         shares, _, bands_picture = compared_with_bounds(flight, rigid, flexible)
@@ -150,7 +151,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             table = joint_table(fit)
             out.write_csv("joint.csv", table)
             out.write_csv("joint_correlations.csv", correlations(fit))
-            checks = credibility(fit)
+            checks = credibility(fit, modal)
             out.write_csv("consistency_checks.csv", pd.DataFrame([vars(each) for each in checks]))
             deflection = deflection_of(fit)
             out.write_csv("deflection_reconciled.csv", deflection.to_frame())
@@ -177,7 +178,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         console.print(f"stiffness by the joint's frequency: none ({escape(no_modes)})")
     else:
         by_modes = f"{modal.stiffness_nmprad:.0f} +/- {modal.sd_nmprad:.0f} N m/rad"
-        console.print(f"stiffness by the joint's frequency alone, independently: {by_modes}")
+        console.print(f"stiffness by the joint's frequency: {by_modes}")
     inside = ", ".join(
         f"{r.joint} {100 * r.share_inside:.0f} % ({r.quantity.split('_')[0]})" for r in shares.itertuples(index=False)
     )
@@ -185,10 +186,17 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     console.print(f"results in {escape(str(out.path))}")
 
 
-def _modes(flight: Reconstruction) -> tuple[ModalStiffness | None, str]:
+def _modal(flight: Reconstruction, fit: JointFit) -> ModalStiffness:
+    """Stiffness by the joint's frequency, looked for about the fit's."""
+    if stiffness_bound(fit) is not None:
+        raise GateError("modes: the joint is too stiff to be seen oscillating", code="mode-not-detected")
+    return stiffness_from_modes(flight, fit.vehicle.joint.bending_stiffness_nmprad)
+
+
+def _modes(flight: Reconstruction, fit: JointFit) -> tuple[ModalStiffness | None, str]:
     """Stiffness by the joint's frequency, or why it cannot be estimated."""
     try:
-        return stiffness_from_modes(flight), ""
+        return _modal(flight, fit), ""
     except GateError as fault:
         return None, str(fault)
 

@@ -12,9 +12,12 @@ from scipy.stats import chi2
 
 from postflight.reconciliation.fit import JointFit, mismatched_spans
 from postflight.reconciliation.forward_model import MOTION
+from postflight.reconciliation.modes import ModalStiffness
+from postflight.reconciliation.posterior import posterior_sd
 from recon.consistency import ConsistencyCheck, consistency_check
 
 CONFIDENCE = 0.999  # as the reconstruction's checks
+MOST_OFF_SD = 4.0  # as the camera's time bias
 MOST_MOVED_SD = 4.0  # of some forty parameters of a right fit one is beyond it in two fits of a thousand
 JOINT_WORDS = (
     "another joint, or freeplay (--freeplay), than was fitted; mass properties or sensors' places that are wrong"
@@ -23,9 +26,13 @@ JOINT_WORDS = (
 OPEN = ("stiffness", "damping", "freeplay", "hardening")
 
 
-def credibility(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
-    """Checks of residuals, moves, joins and convergence."""
-    return (_residuals(fit), _moves(fit), _spans(fit), _convergence(fit))
+def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[ConsistencyCheck, ...]:
+    """Checks of residuals, moves, joins and convergence, and against the stiffness by the joint's frequency."""
+    checks = (_residuals(fit), _moves(fit), _spans(fit), _convergence(fit))
+    # a loose joint oscillates at the frequency of a softer one
+    if modal is None or "freeplay" in fit.problem.vehicle_parameters.laws:
+        return checks
+    return (*checks, _frequency(fit, modal))
 
 
 def _residuals(fit: JointFit) -> ConsistencyCheck:
@@ -69,6 +76,18 @@ def _spans(fit: JointFit) -> ConsistencyCheck:
     return consistency_check(
         "joint-spans", "reconciliation: spans", count, 0.0, 0.0, "all spans match sensors and neighbours", bad,
         advice="the motion between them is not the fitted joint's",
+    )  # fmt: skip
+
+
+def _frequency(fit: JointFit, modal: ModalStiffness) -> ConsistencyCheck:
+    """Stiffness by the joint's frequency against the fit's: difference of the logarithms over its sd."""
+    sd = np.hypot(modal.sd_nmprad / modal.stiffness_nmprad, posterior_sd(fit)[0][0])
+    off = np.log(modal.stiffness_nmprad / fit.vehicle.joint.bending_stiffness_nmprad)
+    words = f"{modal.stiffness_nmprad:.0f} +/- {modal.sd_nmprad:.0f} N m/rad"
+    return consistency_check(
+        "joint-frequency", "reconciliation: stiffness by the joint's frequency", float(abs(off) / sd), 0.0, MOST_OFF_SD,
+        f"the joint oscillates as fitted ({words})", f"the joint oscillates as one of {words}",
+        advice=JOINT_WORDS,
     )  # fmt: skip
 
 

@@ -1,10 +1,11 @@
 """Which stiffness of the joint follows from the frequency of its oscillation alone?
 
-Independent of the fit: lateral rates and specific force, rotated into axes that do not spin, are cut into overlapping
-windows. The logarithm of their spectra over the noise is averaged along the frequency ``f(K; q, Mach, V)`` that the
-linear model (`synthetic_flight.linear`) predicts for the joint's mode in every window, for both senses of rotation. The
-stiffness ``K`` with the largest mean is the estimate. Start, damping, offset and wind take no part; the uncertainty of
-masses, stations, inertias and coefficients is propagated by differences.
+Of the fit it takes only where to look, within a factor of two of its stiffness. Lateral rates and specific force,
+rotated into axes that do not spin, are cut into overlapping windows. The logarithm of their spectra over the noise is
+averaged along the frequency ``f(K; q, Mach, V)`` that the linear model (`synthetic_flight.linear`) predicts for the
+joint's mode in every window, for both senses of rotation. The stiffness ``K`` with the largest mean is the estimate.
+Start, damping, offset and wind take no part; the uncertainty of masses, stations, inertias and coefficients is
+propagated by differences.
 
 Assumed: small angles, constant dynamic pressure over a window, and a spin slow against the mode (both senses are
 averaged, so that their opposite shifts cancel).
@@ -25,7 +26,10 @@ from synthetic_flight.linear import linear_matrix, modes, slopes_at
 RATE_HZ = 50.0
 WINDOW, HOP, PADDED = 256, 32, 2048
 LEAST_PRESSURE_PA = 20.0
-FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 141))  # of the vehicle file's stiffness
+# of the stiffness to look about: farther off the vehicle's oscillation in the flow passes for a softer joint's
+FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 141))
+MOST_SPIN = 0.1  # of the joint's frequency: the mode is off by the square of it, a percent
+EDGE = 5  # of `FACTORS` at either end: a largest mean there belongs to a line outside
 BLOCKS = 6
 DIFFERENCE = 0.05  # of a standard deviation
 # mean logarithm of power over noise along the best track: noise alone -0.2 +/- 0.17, the best of all its tracks 0.2
@@ -49,7 +53,7 @@ class ModalStiffness:
     joint_hz, aerodynamic_hz : (n,) float
         Frequencies of the linear model with this stiffness.
     factor, mean_log_power : (m,) float
-        Of the vehicle file's stiffness, and mean logarithm of power over noise along its track.
+        Of the stiffness looked about, and mean logarithm of power over noise along its track.
     """
 
     stiffness_nmprad: float
@@ -63,8 +67,8 @@ class ModalStiffness:
     mean_log_power: FloatArray
 
 
-def stiffness_from_modes(flight: Reconstruction) -> ModalStiffness:
-    """Track the joint's mode through the pressure pulse.
+def stiffness_from_modes(flight: Reconstruction, about_nmprad: float) -> ModalStiffness:
+    """Track the joint's mode through the pressure pulse, with stiffnesses up to twice and down to half of one.
 
     Raises
     ------
@@ -72,6 +76,7 @@ def stiffness_from_modes(flight: Reconstruction) -> ModalStiffness:
         Where vehicle or sensors are missing, the pulse is shorter than a few windows, or no mode stands out.
     """
     pulse, nominal = flight.required_loads(), flight.telemetry.required_vehicle()
+    about = about_nmprad / nominal.joint.bending_stiffness_nmprad
     t, log_power = _spectra(flight, pulse.time_s)
     pressure = np.interp(t, pulse.time_s, pulse.dynamic_pressure_pa)
     use = pressure > LEAST_PRESSURE_PA
@@ -81,7 +86,7 @@ def stiffness_from_modes(flight: Reconstruction) -> ModalStiffness:
     t, log_power, pressure = t[use], log_power[use], pressure[use]
     flow = pressure, np.interp(t, pulse.time_s, pulse.mach), np.interp(t, pulse.time_s, pulse.airspeed_mps)
     frequency = np.asarray(np.fft.fftfreq(PADDED, 1.0 / RATE_HZ), dtype=np.float64)
-    power = np.array([_track_power(frequency, log_power, track) for track in _tracks(nominal, flow)])
+    power = np.array([_track_power(frequency, log_power, track) for track in _tracks(nominal, about, flow)])
     mean_log_power = power.mean(axis=1)
     if mean_log_power.max() < LEAST_LOG_POWER:
         message = (
@@ -89,17 +94,39 @@ def stiffness_from_modes(flight: Reconstruction) -> ModalStiffness:
             f"{LEAST_LOG_POWER:g} is wanted: the joint's oscillation cannot be detected in the pulse"
         )
         raise GateError(message, code="mode-not-detected")
+    if not EDGE <= np.argmax(mean_log_power) < len(FACTORS) - EDGE:
+        message = (
+            f"modes: from {FACTORS[0] * about_nmprad:.0f} to {FACTORS[-1] * about_nmprad:.0f} N m/rad the power along "
+            "the joint's frequency is largest at an end: the line is another one's"
+        )
+        raise GateError(message, code="mode-not-detected")
     best = _peak(mean_log_power)
     parts = np.array_split(np.arange(len(t)), BLOCKS)
     jackknife = np.array([_peak(np.delete(power, part, axis=1).mean(axis=1)) for part in parts])
     scatter = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((jackknife - jackknife.mean()) ** 2))
-    sd = float(np.hypot(scatter, _vehicle_sd(nominal, float(np.exp(best)), flow)))
-    stiffness = nominal.joint.bending_stiffness_nmprad * float(np.exp(best))
-    aerodynamic, joint = _frequencies(_stiffer(nominal, float(np.exp(best))), flow)
+    factor = about * float(np.exp(best))
+    _check_spin(flight, _frequencies(_stiffer(nominal, factor), flow)[1], t)
+    sd = float(np.hypot(scatter, _vehicle_sd(nominal, factor, flow)))
+    stiffness = nominal.joint.bending_stiffness_nmprad * factor
+    aerodynamic, joint = _frequencies(_stiffer(nominal, factor), flow)
     order = np.argsort(frequency)
     return ModalStiffness(
         stiffness, stiffness * sd, t, frequency[order], log_power[:, order], joint, aerodynamic, FACTORS, mean_log_power
     )
+
+
+def _check_spin(flight: Reconstruction, joint_hz: FloatArray, time_s: FloatArray) -> None:
+    """Refuse a spin that is not slow against the mode."""
+    bet = flight.solution
+    during = (bet.imu_time_s >= time_s[0]) & (bet.imu_time_s <= time_s[-1])
+    spin_hz = float(np.median(np.abs(bet.rate_body_radps[during, 0]))) / (2.0 * np.pi)
+    mode_hz = float(np.nanmedian(joint_hz))
+    if spin_hz > MOST_SPIN * mode_hz:
+        message = (
+            f"modes: the vehicle spins at {60.0 * spin_hz:.0f} rpm, more than {MOST_SPIN:g} of the joint's "
+            f"{mode_hz:.1f} Hz: its frequency is not that of a vehicle that does not spin"
+        )
+        raise GateError(message, code="spin-too-fast")
 
 
 def _spectra(flight: Reconstruction, span_s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -125,10 +152,10 @@ def _spectra(flight: Reconstruction, span_s: FloatArray) -> tuple[FloatArray, Fl
     return grid[starts] + 0.5 * WINDOW / RATE_HZ, total
 
 
-def _tracks(nominal: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
+def _tracks(nominal: Vehicle, about: float, flow: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
     """Frequencies of the joint's mode (factors, n), Hz: between every tenth of `FACTORS` by straight lines."""
     coarse = FACTORS[::10]
-    known = np.array([_frequencies(_stiffer(nominal, factor), flow)[1] for factor in coarse])
+    known = np.array([_frequencies(_stiffer(nominal, about * factor), flow)[1] for factor in coarse])
     return np.column_stack([np.interp(np.log(FACTORS), np.log(coarse), column) for column in known.T])
 
 

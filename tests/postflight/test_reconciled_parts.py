@@ -222,3 +222,17 @@ def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True):
 def test_a_fit_that_cannot_be_believed_turns_red(wrong, code):
     assert all(each.passed for each in credibility(fit_with(cost=597.0)))
     assert [each.code for each in credibility(fit_with(**{"cost": 597.0, **wrong})) if not each.passed] == [code]
+
+
+@pytest.mark.parametrize(("factor", "passed"), [(1.4, True), (1.7, False), (0.6, False)])
+def test_a_joint_that_oscillates_at_another_frequency_turns_red(factor, passed):
+    # the fit knows the stiffness to 2 %, its frequency to a tenth: 1.4 is 3.3 sd, 1.7 is 5.2 and 0.6 as many
+    fit = fit_with(cost=597.0)
+    fit.covariance[0, 0] = (0.02 / STIFFNESS_LOG_SD) ** 2
+    stiffness = factor * VEHICLE.joint.bending_stiffness_nmprad
+    modal = SimpleNamespace(stiffness_nmprad=stiffness, sd_nmprad=0.1 * stiffness)
+    *others, check = credibility(fit, modal)
+    assert check.code == "joint-frequency"
+    assert check.value == pytest.approx(abs(np.log(factor)) / np.hypot(0.1, 0.02), rel=1e-6)
+    assert check.passed is passed
+    assert all(each.passed for each in others)
