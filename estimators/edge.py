@@ -38,6 +38,7 @@ _NEAR_PX = 8.0
 _LEAST_CONTRAST = 8.0
 _LEAST_SHARE = 0.4
 _SD_FLOOR_PX = 0.05
+_NEIGHBOURS, _COHERENT_PX = 4, 0.7  # on either side; an edge's own scatter is a few tenths of a pixel
 _SMOOTHING = cv2.getGaussianKernel(7, _SMOOTHING_PX, cv2.CV_32F)
 
 
@@ -87,6 +88,12 @@ class HorizonLine:
     sd_px: FloatArray
     line: NDArray[np.intp]
     refused: Fault = NO_FAULT
+
+    def some(self, chosen: BoolArray) -> HorizonLine:
+        """Chosen points."""
+        return HorizonLine(
+            self.points_px[chosen], self.inward_px[chosen], self.sd_px[chosen], self.line[chosen], self.refused
+        )
 
     @property
     def is_usable(self) -> bool:
@@ -199,6 +206,24 @@ def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
     _edge_kernels.steps_near(grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, sd, good)
     points = near.origin_px + place[:, None] * near.inward_px
     return HorizonLine(points[good], near.inward_px[good], np.hypot(sd[good], _SD_FLOOR_PX), near.index[good])
+
+
+def is_coherent(line: NDArray[np.intp], residual_px: FloatArray) -> BoolArray:
+    """Whether edge points (n,) lie where their neighbours on the edge do: steps in clouds behind the rim do not.
+
+    Parameters
+    ----------
+    line : (n,) int
+        Places of the edge, increasing.
+    residual_px : (n,) float
+        Against any smooth curve near the edge; NaN is not coherent.
+    """
+    kept = np.zeros(len(line), dtype=np.bool_)
+    for k in range(len(line)):
+        beside = np.abs(line - line[k]) <= _NEIGHBOURS
+        others = np.abs(residual_px[beside] - residual_px[k]) < _COHERENT_PX
+        kept[k] = others.sum() - 1 >= _NEIGHBOURS  # half of those there may be
+    return kept
 
 
 def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:

@@ -213,13 +213,14 @@ def mark(place, noise=0.0, seed=0):
     return light * (1.0 - dark) + noise * np.random.default_rng(seed).standard_normal((40, 60))
 
 
-def centres(images, noise):
+def centres(images, noise, sign=1.0):
     out = []
     for image in images:
         offset, sd = np.zeros(1), np.full(1, np.inf)
         _edge_kernels.dark_centres(
-            image, np.array([[30.0, 20.0]]), np.array([[1.0, 0.0]]), 8, np.array([4]), noise, offset, sd
-        )
+            image, np.array([[30.0, 20.0]]), np.array([[1.0, 0.0]]), 8, np.array([4]), np.array([sign]), noise,
+            offset, sd,
+        )  # fmt: skip
         out.append((offset[0], sd[0]))
     return np.array(out).T
 
@@ -231,6 +232,9 @@ def test_a_dark_line_is_found_where_it_is_with_the_sd_its_noise_gives():
             plain_horizon.dip_centre(mark(place), (30.0, 20.0), (1.0, 0.0), 8, 4), abs=1e-9
         )
         assert found[0] == pytest.approx(place, abs=0.05)
+        pale = centres([2.0 * (90.0 + 0.8 * np.indices((40, 60))[1]) - mark(place)], 0.3, -1.0)[0]
+        assert pale[0] == pytest.approx(place, abs=0.05)
+        assert not np.isfinite(centres([mark(place)], 0.3, -1.0)[1][0])
     noise = 2.0
     found, sd = centres([mark(0.2, noise, seed) for seed in range(60)], noise)
     assert np.isfinite(sd).all()
