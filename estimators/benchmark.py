@@ -173,7 +173,7 @@ def _by_stated_features(
         oriented = _oriented(nominal, benchmark, prior, apriori, visible_features)
     except GateError as fault:
         return None, Fault(f"the stated features do not orient the camera ({fault})", fault.codes[0])
-    if oriented.support > LEAST_FEATURES_SHARE and not oriented.has_bad_benchmark:
+    if oriented.support > LEAST_FEATURES_SHARE and oriented.residual_rms_px < USUAL_RMS_PX:
         return oriented, NO_FAULT
     words = (
         f"the benchmark frame shows {100.0 * oriented.support:.0f} % of the features that the vehicle file states, "

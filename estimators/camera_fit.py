@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,7 @@ _LEAST_TEXTURE = 60  # rows, of which two parameters may pick 24 that agree by c
 _SOUND_SCORE = 1.5  # the texture agrees with itself
 _EDGE_PASSES = 2
 _CONTRADICTION = 18.4  # chi-square of two components that one sound frame in 10,000 exceeds
+_LEAST_VAR = float(np.deg2rad(1e-3) ** 2)  # of a difference, far below what any film shows
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
 USUAL_SHARE, USUAL_RMS_PX = 0.75, 1.0  # features shown and rms of a benchmark frame that is not suspicious
@@ -274,6 +275,8 @@ class _Solution:
     before: FloatArray
     edge_count: int
     rms_px: float
+    residual_px: FloatArray
+    weight: FloatArray
 
 
 @dataclass(frozen=True)
@@ -390,11 +393,12 @@ class OrientedCamera:
         try:
             if isinstance(self.features, ImageFeatures) and len(self.features.points_shell_m):
                 place = self._approach(image, deformation, self.features)
+                horizon = steps_near(image, self.view.lines_at(self.clocks_rad, deformation))
             else:
-                place = self._approach_by_texture(image, deformation).place
-            horizon = self.coherent_edge(image, deformation)
+                seen = self._approach_by_texture(image, deformation)
+                place, horizon = seen.place, seen.edge
             last = self._solve(horizon, place, deformation, basis, _WORST_RMS_PX)
-            last = self._reconciled(horizon, place, deformation, last)
+            last = self._reconciled(image, horizon, place, deformation, last)
             if last.edge_count < LEAST_POINTS and last.rms_px > _FEATURES_RMS_PX:
                 raise _NoFitError(
                     f"no edge near the features, whose rms is {last.rms_px:.1f} px: not the shell's", "edge-not-shell"
@@ -410,14 +414,13 @@ class OrientedCamera:
         return self._answer(horizon, deformation, last, basis)
 
     def _reconciled(
-        self, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
+        self, image: Image, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
         both: _Solution,
     ) -> _Solution:  # fmt: skip
         """Edge and features where they agree, the edge alone where they contradict each other and it is whole.
 
         `_NoFitError` where they contradict each other and it is not.
         """
-        share = both.edge_count / max(int((self.benchmark_residuals.index < len(self.clocks_rad)).sum()), 1)
         seen = both.edge_count / len(self.clocks_rad)
         if place is None and seen < _SOUND_EDGE:
             raise _NoFitError(
@@ -432,10 +435,21 @@ class OrientedCamera:
                 f"where {USUAL_RMS_PX:.1f} px are allowed",
                 "edge-not-shell",
             )
-        if place is None or both.edge_count < LEAST_POINTS:
+        if place is None:
             return both
+        # to first order, which takes a tenth of a fit's time, then in full where that is not clear
+        if both.edge_count >= LEAST_POINTS:
+            step, alone_near = self._edge_step(both, deformation[2])
+            if self._contradiction(step, alone_near, both) < 0.5 * _CONTRADICTION:
+                return both
         alone = deformation.copy()
-        edge = self._solve(horizon, None, alone, np.eye(2), np.inf)
+        try:
+            near = self._independent_edge(image, horizon, alone)
+            edge = self._solve(near, None, alone, np.eye(2), np.inf)
+        except _NoFitError:
+            # steps in the clouds are no edge to contradict anything
+            return both
+        share = edge.edge_count / max(int((self.benchmark_residuals.index < len(self.clocks_rad)).sum()), 1)
         square = self._contradiction(alone[:2] - deformation[:2], edge, both)
         if square < _CONTRADICTION:
             return both
@@ -466,7 +480,7 @@ class OrientedCamera:
         covariance = camera @ self.posed_covariance @ camera.T + rest @ rest.T
         # of the best answers, the better one's error has no part in the difference
         value, axes = np.linalg.eigh(edge.formal - both.formal)
-        covariance += (axes * np.maximum(value, 0.0)) @ axes.T
+        covariance += (axes * np.maximum(value, _LEAST_VAR)) @ axes.T
         return float(difference @ np.linalg.solve(covariance, difference))
 
     def _approach_by_texture(self, image: Image, deformation: FloatArray) -> _Approached:
@@ -664,7 +678,43 @@ class OrientedCamera:
         formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(k), prior**-2])))
         before = self.benchmark_residuals.rows[found.benchmark_at[used]]
         edge_count = int(used[: found.edge_points].sum())
-        return _Solution((formal @ weighted)[:k], formal[:k, :k], rows, shape, before, edge_count, rms)
+        gain = (formal @ weighted)[:k]
+        return _Solution(gain, formal[:k, :k], rows, shape, before, edge_count, rms, residual, weight)
+
+    def _independent_edge(self, image: Image, horizon: HorizonLine, deformation: FloatArray) -> HorizonLine:
+        """Edge that owes nothing to the features, ``deformation`` moved near it; `_NoFitError` where there is none.
+
+        What was found near the features' answer where that is an edge, not steps in the clouds; else found from far.
+        """
+        near = horizon.some(is_coherent(horizon.line, edge_residuals(self.view, horizon, deformation).residual_px))
+        if len(near.points_px) >= LEAST_POINTS:
+            return near
+        far = find_horizon(image, self.lines, self.view.camera.size_px)
+        if far.refused:
+            raise _NoFitError(far.refused)
+        moved = np.zeros(3)
+        self._solve(far, None, moved, np.eye(2), _WORST_RMS_PX)
+        deformation[:] = moved
+        return self.coherent_edge(image, deformation)
+
+    def _edge_step(self, both: _Solution, flattening_rad: float) -> tuple[FloatArray, _Solution]:
+        """One step (2,) from an answer of edge and features to that of the edge alone, and its gain and covariance."""
+        edge, prior = slice(0, both.edge_count), self._shape_prior(2)
+        rows, shape, weight = both.rows[edge], both.shape[edge], both.weight[edge]
+        design = np.concatenate([rows[:, DEFLECTION], rows[:, [FLATTENING, JOINT]], shape], axis=1)
+        weighted = design.T * weight
+        formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(2), prior**-2])))
+        right = weighted @ both.residual_px[edge]
+        right[2] -= flattening_rad / prior[0] ** 2
+        step = formal @ right
+        # features that contradict the edge leave it residuals that are none of its scatter
+        left = both.residual_px[edge] - design @ step
+        scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
+        alone = replace(
+            both, gain=(formal @ weighted)[:2], formal=min(scatter, 1.0) * formal[:2, :2], rows=rows,
+            before=both.before[edge],
+        )  # fmt: skip
+        return step[:2], alone
 
     def _answer(self, horizon: HorizonLine, deformation: FloatArray, last: _Solution, basis: FloatArray) -> FrameFit:
         gain, before, leak = last.gain, last.before, 0.0

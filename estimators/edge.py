@@ -218,12 +218,16 @@ def is_coherent(line: NDArray[np.intp], residual_px: FloatArray) -> BoolArray:
     residual_px : (n,) float
         Against any smooth curve near the edge; NaN is not coherent.
     """
-    kept = np.zeros(len(line), dtype=np.bool_)
-    for k in range(len(line)):
-        beside = np.abs(line - line[k]) <= _NEIGHBOURS
-        others = np.abs(residual_px[beside] - residual_px[k]) < _COHERENT_PX
-        kept[k] = others.sum() - 1 >= _NEIGHBOURS  # half of those there may be
-    return kept
+    if not len(line):
+        return np.zeros(0, dtype=np.bool_)
+    # by place, with room for neighbours on both sides
+    places = np.full(int(line[-1]) + 1 + 2 * _NEIGHBOURS, np.nan)
+    places[line + _NEIGHBOURS] = residual_px
+    beside = np.lib.stride_tricks.sliding_window_view(places, 2 * _NEIGHBOURS + 1)[line]
+    with np.errstate(invalid="ignore"):
+        alike = np.abs(beside - residual_px[:, None]) < _COHERENT_PX
+    # half of those there may be, and the point itself
+    return np.asarray(alike.sum(axis=1) > _NEIGHBOURS)
 
 
 def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:

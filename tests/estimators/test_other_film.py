@@ -70,22 +70,24 @@ def test_where_features_contradict_the_edge_it_counts_if_it_is_whole():
     oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
     answer = oriented.fit(frames[1])
     true = np.array([*answer.rotation_yz_rad, 0.0])
-    near = steps_near(frames[1], oriented.view.lines_at(oriented.clocks_rad, true))
-    for off_deg, contradicts in ((0.0, False), (1.5, True)):
+    for off_deg, contradicts in ((0.0, False), (0.7, True), (3.0, True)):
         said = true + deformation_of(D(off_deg), D(153.0))
         points = oriented.features.points_shell_m
         where = np.einsum("ni,ni->n", oriented.view.sight(points, said).pixels, oriented.features.across_px)
         place = where, np.full(len(where), 0.1)
         moved = said.copy()
+        # the edge is searched where the features say that it is
+        near = steps_near(frames[1], oriented.view.lines_at(oriented.clocks_rad, said))
         both = oriented._solve(near, place, moved, np.eye(2), 9.0)
-        last = oriented._reconciled(near, place, moved, both)
+        last = oriented._reconciled(frames[1], near, place, moved, both)
         assert (last is not both) == contradicts
         np.testing.assert_allclose(moved[:2], true[:2], atol=D(0.25))
-    short = near.some(near.line < 150)
+    half = np.where(np.arange(720) > 300, frames[1], 0).astype(np.uint8)
+    short = steps_near(half, oriented.view.lines_at(oriented.clocks_rad, true))
     moved = said.copy()
     both = oriented._solve(short, place, moved, np.eye(2), 9.0)
     with pytest.raises(_NoFitError) as refusal:
-        oriented._reconciled(short, place, moved, both)
+        oriented._reconciled(half, short, place, moved, both)
     assert refusal.value.codes == ("features-contradict-edge",)
 
 
