@@ -50,7 +50,6 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from estimators.camera_fit import (
-    LEAST_POINTS,
     POSED,
     USUAL_RMS_PX,
     USUAL_SHARE,
@@ -81,6 +80,7 @@ from flightmodel.vehicle import CameraMount, CameraUncertainty
 _STEPS = 10
 LEAST_FEATURES_SHARE = 0.5  # of stated features, to be found in the benchmark frame
 TEXTURE_SD_PX = 0.05
+_LEAST_EDGE = 30  # coherent points beside the valleys: an eighth of the edge in view
 _WILD, _WILD_PX = 3.0, (1.0, 2.5)
 _REACHES_PX = (0, 12, 8)  # within which features are looked for in turn; 0: the edge alone
 _SETTLED_SD = 1e-2
@@ -254,9 +254,9 @@ def _fitted(
     if features.offset_px:
         # nothing but smooth curves: neighbours on an edge err together
         edge = residuals.index < len(look.clocks_rad)
-        if edge.sum() < LEAST_POINTS:
+        if edge.sum() < _LEAST_EDGE:
             raise GateError(
-                f"benchmark frame: {edge.sum()} points of the edge where {LEAST_POINTS} are needed; choose another "
+                f"benchmark frame: {edge.sum()} points of the edge where {_LEAST_EDGE} are needed; choose another "
                 "benchmark time",
                 code="edge-points-too-few",
             )

@@ -253,7 +253,8 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
         return fits
     words = "no feature agrees where most frames show some that do: whether the edge is the shell's is not known"
     lost = Fault(words, "features-lost")
-    return [refused_fit(fit.horizon, lost) if not fit.refused and fit.features == 0 else fit for fit in fits]
+    bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
+    return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
 
 
 @dataclass(frozen=True)

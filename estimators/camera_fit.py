@@ -69,7 +69,6 @@ TEXTURE_REACH_PX = 3  # the edge alone predicts to a pixel
 _WORST_TEXTURE_SD_PX = 0.5
 TOGETHER = 3.0  # root of the number of patches that err together: they overlap, and their neighbours see the same light
 _AGREED_PX, _LEAST_AGREED = 0.5, 0.5  # by chance a sixth of the patches lie within half a pixel of six
-_LEAST_TEXTURE = 60  # rows, of which two parameters may pick 24 that agree by chance
 _SOUND_SCORE = 1.5  # the texture agrees with itself
 _EDGE_PASSES = 2
 _CONTRADICTION = 18.4  # chi-square of two components that one sound frame in 10,000 exceeds
@@ -241,6 +240,8 @@ class FrameFit:
     horizon : HorizonLine
     refused : Fault
         Why there is no answer, with its code; empty when there is one.
+    contradicted : bool
+        Whether features were found that contradict a whole edge, which alone gave the answer.
     """
 
     rotation_yz_rad: FloatArray
@@ -252,6 +253,7 @@ class FrameFit:
     features: int
     horizon: HorizonLine
     refused: Fault = NO_FAULT
+    contradicted: bool = False
 
 
 _NOTHING = no_horizon(NO_FAULT)
@@ -399,6 +401,7 @@ class OrientedCamera:
                 place, horizon = seen.place, seen.edge
             last = self._solve(horizon, place, deformation, basis, _WORST_RMS_PX)
             last = self._reconciled(image, horizon, place, deformation, last)
+            contradicted = place is not None and last.edge_count == len(last.rows)
             if last.edge_count < LEAST_POINTS and last.rms_px > _FEATURES_RMS_PX:
                 raise _NoFitError(
                     f"no edge near the features, whose rms is {last.rms_px:.1f} px: not the shell's", "edge-not-shell"
@@ -411,7 +414,7 @@ class OrientedCamera:
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except _NoFitError as fault_of_fit:
             return refused_fit(horizon, fault_of_fit.faults[0])
-        return self._answer(horizon, deformation, last, basis)
+        return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
 
     def _reconciled(
         self, image: Image, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
@@ -556,7 +559,7 @@ class OrientedCamera:
     ) -> tuple[tuple[FloatArray, FloatArray] | None, float]:
         """Places of the texture that agree on one deformation, None where too few do; the share that does."""
         sharp = found[0], np.where(found[1] < _WORST_TEXTURE_SD_PX, found[1], np.inf)
-        if len(_has(sharp)) < _LEAST_TEXTURE:
+        if len(_has(sharp)) < _LEAST_FEATURES:
             return None, 0.0
         residual = self._fit_points(_NOTHING, sharp, deformation.copy(), np.eye(2)).residual_px
         agreed = float(np.mean(np.abs(residual) < _AGREED_PX))
