@@ -1,6 +1,6 @@
 """Compiled search for patches of the benchmark frame in another one; the model is in `estimators.texture`.
 
-Readable twin: OpenCV's ``matchTemplate`` with ``TM_CCOEFF_NORMED``, in ``tests/estimators/test_texture.py``.
+Readable twin: OpenCV's ``matchTemplate`` with ``TM_CCOEFF_NORMED``, in ``tests/estimators/test_plain_twins.py``.
 """
 
 from __future__ import annotations

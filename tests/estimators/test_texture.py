@@ -4,15 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
-from estimators import _texture_kernels
-from estimators.texture import HALF_PX, band_passed, surface_seen, texture_of
+from estimators.texture import surface_seen, texture_of
 from estimators.virtual_camera import VirtualCamera, deformation_of, render
 from flightmodel.camera import camera_from_mount
 from flightmodel.geometry import vehicle_meshes
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D
 
 VIEW = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
-SIZE = 2 * HALF_PX + 1
 
 
 def cloth(rng, shape=(480, 720)):
@@ -37,22 +35,6 @@ def test_a_pixel_looks_at_the_surface_that_rasterised_triangles_show():
     u, v = np.rint(pixels).astype(int).T
     same = np.abs(depth[v, u] - away)[hit] < 0.03  # a pixel beside a limb shows the torus behind
     assert same.mean() > 0.93
-
-
-def test_correlation_of_a_patch_is_opencv_s():
-    rng = np.random.default_rng(1)
-    picture = band_passed(cloth(rng, (80, 90)))
-    template = picture[30 : 30 + SIZE, 40 : 40 + SIZE].astype(float)
-    template = template - template.mean()
-    template /= np.linalg.norm(template)
-    reach, middle = 4, np.array([46.0, 38.0])
-    score = np.empty((2 * reach + 1, 2 * reach + 1))
-    assert _texture_kernels.correlations(picture, template, middle, np.eye(2), reach, score)
-    half = HALF_PX + reach
-    window = picture[38 - half : 39 + half, 46 - half : 47 + half]
-    expected = cv2.matchTemplate(window, template.astype(np.float32), cv2.TM_CCOEFF_NORMED)
-    np.testing.assert_allclose(score, expected, atol=1e-5)
-    assert not _texture_kernels.correlations(picture, template, np.array([3.0, 38.0]), np.eye(2), reach, score)
 
 
 def warped(picture, deformation):
