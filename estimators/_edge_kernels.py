@@ -183,12 +183,12 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
 
 
 @kernel
-def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
+def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset, sd):
     """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
 
-    A profile is the mean of three lines a pixel apart; the dip under the line between its ends, as a share of that
-    line, has its centroid where the feature is. ``sd`` is infinite where no dip stands out of the noise, or where it is
-    cut off by the window.
+    ``signs`` (n,): 1 for a dark one, -1 for one paler than what is beside it. A profile is the mean of three lines a
+    pixel apart; the dip under the line between its ends, as a share of that line, has its centroid where the feature
+    is. ``sd`` is infinite where no dip stands out of the noise, or where it is cut off by the window.
     """
     m = 2 * reach + 1
     dip = np.empty(m)
@@ -209,7 +209,7 @@ def dark_centres(image, origin, across, reach, half_widths, noise, offset, sd):
             left, right = 0.5 * (dip[0] + dip[1]), 0.5 * (dip[m - 1] + dip[m - 2])
             deepest = 0
             for k in range(m):
-                dip[k] = left + (right - left) * k / (m - 1.0) - dip[k]
+                dip[k] = signs[i] * (left + (right - left) * k / (m - 1.0) - dip[k])
                 if dip[k] > dip[deepest]:
                     deepest = k
             depth = dip[deepest]

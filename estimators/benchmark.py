@@ -41,6 +41,7 @@ chapters 2 and 5.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -62,25 +63,29 @@ from estimators.camera_fit import (
     huber_gain,
     joined,
 )
-from estimators.edge import HorizonLine, ScanLines, fault_of_frame, find_horizon, steps_near
+from estimators.edge import NO_FAULT, HorizonLine, ScanLines, fault_of_frame, find_horizon, is_coherent, steps_near
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
-from estimators.features import ImageFeatures, fit_feature_map, visible_features
+from estimators.features import Features, ImageFeatures, fit_feature_map, no_features, valleys, visible_features
 from estimators.loads import FlightLoads
+from estimators.texture import texture_of
 from estimators.virtual_camera import DEFLECTION, FLATTENING, VirtualCamera
 from flightmodel import rotations
 from flightmodel.camera import camera_from_mount
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.deflection import lv_clock, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry
 from flightmodel.vehicle import CameraMount, CameraUncertainty
 
 # orientation
 _STEPS = 10
+LEAST_FEATURES_SHARE = 0.5  # of stated features, to be found in the benchmark frame
+TEXTURE_SD_PX = 0.05
+_LEAST_EDGE = 30  # coherent points beside the valleys: an eighth of the edge in view
+_WILD, _WILD_PX = 3.0, (1.0, 2.5)
 _REACHES_PX = (0, 12, 8)  # within which features are looked for in turn; 0: the edge alone
 _SETTLED_SD = 1e-2
 _WORST_RMS_PX = 2.5
 _WORST_CORRECTIONS = 31.8  # chi-square of eight corrections that one sound frame in 10,000 exceeds
-_PAINTED_M = 0.003
 _FOCAL, _FOCAL_PIECE = 3, 0.08
 _BUILT_RAD = np.deg2rad(0.3)
 _POSES = POSED.stop - POSED.start
@@ -139,24 +144,74 @@ def orient_camera(
         raise GateError(f"benchmark frame: {fault}; choose another benchmark time", fault.code)
     nominal = VirtualCamera(geometry, camera_from_mount(camera_mount), joint_station_m)
     prior = _prior_sd(camera_mount.uncertainty, apriori)
+    refused = NO_FAULT
+    if geometry.features not in ("none", "texture"):
+        oriented, refused = _by_stated_features(nominal, benchmark, prior, apriori)
+        if oriented is not None:
+            return oriented
+    oriented = _oriented(nominal, benchmark, prior, apriori, valleys)
+    if oriented.has_bad_benchmark:
+        raise GateError(
+            f"benchmark frame: {100.0 * oriented.support:.0f} % of the valleys between tori are where the camera "
+            f"should see them, and the rms is {oriented.residual_rms_px:.1f} px where {USUAL_RMS_PX:.1f} px are "
+            "usual: choose another benchmark time, or check mount, lens, shell and [cameras.NAME.uncertainty] in the "
+            "vehicle file",
+            code="benchmark-implausible",
+        )
+    # the valleys' places change with the light: they orient the camera, and measure no motion
+    edge = oriented.benchmark_residuals.index < len(oriented.clocks_rad)
+    rows = oriented.benchmark_residuals.some(edge)
+    alone = replace(oriented, features=no_features(), benchmark_residuals=rows, stated_refused=refused)
+    return alone if geometry.features == "none" else _with_texture(alone, benchmark)
+
+
+def _by_stated_features(
+    nominal: VirtualCamera, benchmark: Image, prior: FloatArray, apriori: AprioriSd
+) -> tuple[OrientedCamera | None, Fault]:
+    """Camera oriented by the features that the vehicle file states, or why the frame does not bear them out."""
     try:
-        oriented = _fitted(nominal, benchmark, prior, apriori, np.zeros(_POSES), _REACHES_PX)
-        if oriented.features_share > USUAL_SHARE and oriented.residual_rms_px < USUAL_RMS_PX:
+        oriented = _oriented(nominal, benchmark, prior, apriori, visible_features)
+    except GateError as fault:
+        return None, Fault(f"the stated features do not orient the camera ({fault})", fault.codes[0])
+    if oriented.support > LEAST_FEATURES_SHARE and oriented.residual_rms_px < USUAL_RMS_PX:
+        return oriented, NO_FAULT
+    words = (
+        f"the benchmark frame shows {100.0 * oriented.support:.0f} % of the features that the vehicle file states, "
+        f"with an rms of {oriented.residual_rms_px:.1f} px"
+    )
+    return None, Fault(words, "features-not-found")
+
+
+def _with_texture(oriented: OrientedCamera, benchmark: Image) -> OrientedCamera:
+    """Add the benchmark frame's texture, which lies there exactly where it was taken from."""
+    texture = texture_of(oriented.view, benchmark)
+    place = np.einsum("ni,ni->n", oriented.view.sight(texture.points_shell_m, np.zeros(3)).pixels, texture.across_px)
+    found = place, np.full(len(place), TEXTURE_SD_PX)
+    rows = feature_residuals(oriented.view, texture, found, np.zeros(3), len(oriented.clocks_rad))
+    return replace(oriented, features=texture, benchmark_residuals=joined(oriented.benchmark_residuals, rows))
+
+
+def _oriented(
+    nominal: VirtualCamera, benchmark: Image, prior: FloatArray, apriori: AprioriSd,
+    features_of: Callable[[VirtualCamera], ImageFeatures],
+) -> OrientedCamera:  # fmt: skip
+    """Fit from the nominal pose and, where that is not sound, from where the feature map fits."""
+    try:
+        oriented = _fitted(nominal, benchmark, prior, apriori, np.zeros(_POSES), _REACHES_PX, features_of)
+        if oriented.support > USUAL_SHARE and oriented.residual_rms_px < USUAL_RMS_PX:
             return oriented
         trouble = None
     except GateError as no_edge:
         oriented, trouble = None, no_edge
-    # the edge may have been the Earth's: the feature map is the shell's alone
-    pose = _pose_of_feature_map(nominal, benchmark, prior)
+    # the edge may have been the Earth's: features and the valleys between tori are the shell's alone
+    pose = _pose_of_feature_map(nominal, benchmark, prior, features_of(nominal))
     if pose is not None:
         try:
-            other = _fitted(nominal, benchmark, prior, apriori, pose, _REACHES_PX[1:])
+            other = _fitted(nominal, benchmark, prior, apriori, pose, _REACHES_PX[1:], features_of)
         except GateError as fault_of_map:
             trouble = trouble or fault_of_map
         else:
-            if oriented is None or other.features_share / other.residual_rms_px > (
-                oriented.features_share / oriented.residual_rms_px
-            ):
+            if oriented is None or other.support / other.residual_rms_px > oriented.support / oriented.residual_rms_px:
                 return other
     if oriented is None:
         assert trouble is not None
@@ -175,21 +230,39 @@ def with_deflected_benchmark(oriented: OrientedCamera, theta_rad: float, plane_l
 
 def _fitted(
     nominal: VirtualCamera, benchmark: Image, prior: FloatArray, apriori: AprioriSd, pose: FloatArray,
-    reaches_px: tuple[int, ...],
+    reaches_px: tuple[int, ...], features_of: Callable[[VirtualCamera], ImageFeatures],
 ) -> OrientedCamera:  # fmt: skip
     """Fit the pose from a start, features looked for within each reach; refused where the edge is not the shell's."""
-    for reach in reaches_px:
-        features = visible_features(_posed(nominal, pose))
+    for number, reach in enumerate(reaches_px):
+        alone = number == 0 and bool(reach)  # from the map: what was found there first, the edge then
+        features = features_of(_posed(nominal, pose))
+        sd = np.append(prior, max(features.offset_px, 1e-6))
         for _ in range(_STEPS):
-            look = _look(_posed(nominal, pose), features, benchmark, reach)
+            look = _look(_posed(nominal, pose), features, benchmark, reach, features.placed_m)
             residuals = look.residuals
-            design = np.column_stack([residuals.rows[:, POSED], residuals.rows[:, FLATTENING], residuals.shape])
-            gain, formal, rms = huber_gain(residuals, design, np.diag(prior**-2.0), len(look.clocks_rad))
-            before = np.concatenate([pose, np.zeros(len(prior) - _POSES)])
-            step = gain @ residuals.residual_px - formal @ (before / prior**2)
+            if alone:
+                residuals = residuals.some(residuals.index >= len(look.clocks_rad))
+            offset = residuals.index >= len(look.clocks_rad)
+            shape = np.column_stack([residuals.rows[:, FLATTENING], residuals.shape, offset])
+            design = np.column_stack([residuals.rows[:, POSED], shape])
+            gain, formal, rms = huber_gain(residuals, design, np.diag(sd**-2.0), len(look.clocks_rad))
+            before = np.concatenate([pose, np.zeros(len(sd) - _POSES)])
+            step = gain @ residuals.residual_px - formal @ (before / sd**2)
             pose = pose + step[:_POSES]
             if np.abs(step[:_POSES] / prior[:_POSES]).max() < _SETTLED_SD:
                 break
+    if features.offset_px:
+        # nothing but smooth curves: neighbours on an edge err together
+        edge = residuals.index < len(look.clocks_rad)
+        if edge.sum() < _LEAST_EDGE:
+            raise GateError(
+                f"benchmark frame: {edge.sum()} points of the edge where {_LEAST_EDGE} are needed; choose another "
+                "benchmark time",
+                code="edge-points-too-few",
+            )
+        left = residuals.residual_px - design[:, _POSES:] @ (gain @ residuals.residual_px)[_POSES:]
+        together = np.where(edge, samples_together(left[edge]), 1.0)
+        gain, formal, _ = huber_gain(residuals, design, np.diag(sd**-2.0), len(look.clocks_rad), together)
     if rms > _WORST_RMS_PX:
         raise GateError(
             f"benchmark frame: rms {rms:.1f} px where {_WORST_RMS_PX} px are allowed: the edge is not the shell's; "
@@ -205,17 +278,36 @@ def _fitted(
             code="camera-far-from-prior",
         )
     # the error of where a feature was painted is in every frame alike: other frames weigh by its measurement alone
-    look = _look(_posed(nominal, pose), features, benchmark, reaches_px[-1], painted_m=0.0)
+    look = _look(_posed(nominal, pose), features, benchmark, reaches_px[-1], 0.0)
     per_deflection = gain[:_POSES] @ residuals.rows[:, DEFLECTION]
     return OrientedCamera(
         look.view, look.clocks_rad, look.lines, features, apriori, look.horizon, look.residuals, pose[:8],
-        formal[:_POSES, :_POSES], per_deflection, rms,
+        formal[:_POSES, :_POSES], per_deflection, rms, support=_share_found(look, features),
     )  # fmt: skip
 
 
-def _pose_of_feature_map(nominal: VirtualCamera, image: Image, prior: FloatArray) -> FloatArray | None:
-    """Pose (12,) of the feature map's maximum; None where it is not significant."""
-    points = visible_features(nominal).points_shell_m
+def _share_found(look: _Look, features: Features) -> float:
+    """Share of features in view that a look at the benchmark frame found."""
+    found = int((look.residuals.index >= len(look.clocks_rad)).sum())
+    return found / max(len(features.points_shell_m), 1)
+
+
+def samples_together(residual: FloatArray) -> float:
+    """How many neighbours in a row of residuals (n,) err together: one and twice the sum of its autocorrelation.
+
+    The sum ends where the autocorrelation first is not positive.
+    """
+    off = residual - residual.mean()
+    own = np.correlate(off, off, mode="full")[len(off) - 1 :] / max(float(off @ off), 1e-12)
+    ends = np.flatnonzero(own <= 0.0)
+    return 1.0 + 2.0 * float(own[1 : ends[0] if len(ends) else len(own)].sum())
+
+
+def _pose_of_feature_map(
+    nominal: VirtualCamera, image: Image, prior: FloatArray, painted: ImageFeatures
+) -> FloatArray | None:
+    """Pose (12,) at which features fit the frame best; None where it is not significant."""
+    points = painted.points_shell_m
     if len(points) == 0:
         return None
     at_rest = np.zeros(3)
@@ -228,7 +320,7 @@ def _pose_of_feature_map(nominal: VirtualCamera, image: Image, prior: FloatArray
     pieces = max(1, round(sd[_FOCAL] / _FOCAL_PIECE))
     sd[_FOCAL] = min(sd[_FOCAL], _FOCAL_PIECE)
     starts = [np.eye(8)[_FOCAL] * scale for scale in _FOCAL_PIECE * (np.arange(2 * pieces - 1) - (pieces - 1))]
-    found = fit_feature_map(image, pixels, starts, sd)
+    found = fit_feature_map(image, pixels, starts, sd, painted.signs)
     return None if found is None else np.concatenate([found, np.zeros(_POSES - 8)])
 
 
@@ -256,7 +348,7 @@ def _posed(nominal: VirtualCamera, pose: FloatArray) -> VirtualCamera:
 
 
 def _look(
-    view: VirtualCamera, features: ImageFeatures, image: Image, reach_px: int, painted_m: float = _PAINTED_M
+    view: VirtualCamera, features: Features, image: Image, reach_px: int, placed_m: float
 ) -> _Look:  # fmt: skip
     """Find the edge and, with a reach, the features around their prediction."""
     at_rest = np.zeros(3)
@@ -269,12 +361,16 @@ def _look(
         raise GateError(f"benchmark frame: {horizon.refused}; choose another benchmark time", horizon.refused.code)
     residuals = edge_residuals(view, horizon, at_rest)
     if reach_px:
+        # steps in the clouds behind the rim
+        off = np.abs(residuals.residual_px)
+        scatter = 1.4826 * float(np.nanmedian(off)) if len(off) else 0.0
+        residuals = residuals.some(off < np.clip(_WILD * scatter, *_WILD_PX))
+        residuals = residuals.some(is_coherent(residuals.index, residuals.residual_px))
         found = find_features(view, features, image, at_rest, reach_px)
         painted = feature_residuals(view, features, found, at_rest, len(clocks))
-        # features are painted to millimetres
         at = features.points_shell_m[painted.index - len(clocks)]
         away = np.linalg.norm(at - view.camera.position_body_m, axis=1)
-        painted = replace(painted, sd_px=np.hypot(painted.sd_px, painted_m * view.camera.focal_px.mean() / away))
+        painted = replace(painted, sd_px=np.hypot(painted.sd_px, placed_m * view.camera.focal_px.mean() / away))
         residuals = joined(residuals, painted)
     return _Look(view, lines, horizon, residuals.some(np.isfinite(residuals.residual_px)), clocks)
 

@@ -25,8 +25,9 @@ from pathlib import Path
 import numpy as np
 
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, orient_camera
-from estimators.camera_fit import USUAL_RMS_PX, AprioriSd, FrameFit, Image, OrientedCamera
-from flightmodel.checks import FloatArray, GateError, Progress, check_finite, check_increasing
+from estimators.camera_fit import AprioriSd, FrameFit, Image, OrientedCamera, refused_fit
+from estimators.texture import TrackedTexture
+from flightmodel.checks import Fault, FloatArray, GateError, Progress, check_finite, check_increasing
 from flightmodel.deflection import (
     DeflectionHistory,
     history_from_lateral,
@@ -37,6 +38,8 @@ from flightmodel.film import read_image
 from flightmodel.geometry import ShellGeometry
 from flightmodel.vehicle import CameraMount
 
+_MOST = 0.5  # of the answered frames
+_LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _SWAP = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from a rotation about body y and z to the lateral vector
 
 
@@ -125,6 +128,13 @@ class FilmFit:
             plane[:] = self.plane_lv_rad
         return DeflectionHistory(self.time_s, theta, plane, covariance, "camera", self._remark(None))
 
+    @property
+    def _kind_of_features(self) -> str:
+        if isinstance(self.oriented.features, TrackedTexture):
+            return "the shell's texture"
+        own = self.oriented.view.geometry.listed_features is not None
+        return "the vehicle file's features" if own else "seams and dots"
+
     def _remark(self, benchmark: BenchmarkDeflection | None) -> str:
         """What was assumed, how much of the shell was in view, and which frames were refused."""
         used, oriented = [fit for fit in self.fits if not fit.refused], self.oriented
@@ -142,15 +152,11 @@ class FilmFit:
             f"camera oriented on the frame at {self.benchmark_s:.3f} s, {there} "
             f"(rms {oriented.residual_rms_px:.2f} px)",
             f"from {100.0 * edge:.0f} % of the edge"
-            + (f" and {features:.0f} rows of seams and dots" if features >= 1.0 else "; no seam and no dot could be "
+            + (f" and {features:.0f} rows of {self._kind_of_features}" if features >= 1.0 else "; no feature could be "
                "used, which leaves flattening and ovality of the shell in the error bar"),
         ]  # fmt: skip
-        if oriented.has_bad_benchmark:
-            remarks.append(
-                f"the benchmark frame shows {100.0 * oriented.features_share:.0f} % of the features, and its rms "
-                f"exceeds {USUAL_RMS_PX:.1f} px: the stated uncertainty is too small; check mount, lens, shell and "
-                "[cameras.NAME.uncertainty] in the vehicle file"
-            )
+        if oriented.stated_refused:
+            remarks.append(f"{oriented.stated_refused}: they are not used")
         refused: dict[str, list[float]] = {}
         for t, fit in zip(self.time_s, self.fits, strict=True):
             if fit.refused:
@@ -181,6 +187,7 @@ def read_film(
     apriori: AprioriSd | None = None,
     benchmark: Image | None = None,
     progress: Progress | None = None,
+    joint_swing: JointSwing | None = None,
 ) -> FilmFit:
     """Orient the camera on the benchmark frame, and fit the deflection in every frame.
 
@@ -205,6 +212,8 @@ def read_film(
         The benchmark frame, where ``frames`` can be iterated only once.
     progress : callable, optional
         Takes the fraction done and what is being done.
+    joint_swing : JointSwing, optional
+        How fast the joint swings; frames that jump faster are refused. Without it none is.
 
     Raises
     ------
@@ -231,7 +240,69 @@ def read_film(
         start = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad
     if len(fits) != len(times):
         raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
+    fits = without_lost_features(fits)
+    if joint_swing is not None:
+        fits = without_jumps(times, fits, joint_swing)
     return FilmFit(times, tuple(fits), oriented, float(times[nearest]), plane_lv_rad, plane_sd_rad)
+
+
+def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
+    """Refuse frames answered by the edge alone in a film of which most frames show features that agree with it."""
+    with_features = [fit.features > 0 for fit in fits if not fit.refused]
+    if np.mean(with_features or [False]) < _MOST:
+        return fits
+    words = "no feature agrees where most frames show some that do: whether the edge is the shell's is not known"
+    lost = Fault(words, "features-lost")
+    bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
+    return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
+
+
+@dataclass(frozen=True)
+class JointSwing:
+    """Free oscillation of the joint: frequency, and damping over the critical one."""
+
+    frequency_hz: float
+    damping_ratio: float
+
+    def largest_change(self, level_rad: FloatArray, apart_s: FloatArray) -> FloatArray:
+        """Largest change of deflection (n,), rad, in a time (n,) about a level that a sudden load would hold it at.
+
+        Released from zero, the joint overshoots the level by ``exp(-pi zeta / sqrt(1 - zeta^2))`` of it; between two
+        times it moves by no more than ``2 sin(w t / 2)`` of that amplitude, twice of it from half a period on.
+        """
+        zeta = min(self.damping_ratio, 0.999)
+        overshoot = float(np.exp(-np.pi * zeta / np.sqrt(1.0 - zeta**2)))
+        phase = np.minimum(np.pi * self.frequency_hz * apart_s, 0.5 * np.pi)
+        return np.asarray((1.0 + overshoot) * level_rad * np.sin(phase))
+
+
+def without_jumps(time_s: FloatArray, fits: list[FrameFit], swing: JointSwing) -> list[FrameFit]:
+    """Refuse frames whose deflection no swing of the joint connects with the answered frames on both sides.
+
+    The level is the median of the angle over the answered frames nearest in time; what the errors of both frames
+    explain (3 sd) is no jump.
+    """
+    answered = np.array([k for k, fit in enumerate(fits) if not fit.refused], dtype=int)
+    if len(answered) < _LEVEL_FRAMES:
+        return fits
+    t = time_s[answered]
+    read = np.array([fits[k].rotation_yz_rad for k in answered])
+    var = np.array([np.trace(np.atleast_2d(fits[k].covariance)) for k in answered])
+    size = np.linalg.norm(read, axis=1)
+    half = _LEVEL_FRAMES // 2
+    level = np.array([np.median(size[max(k - half, 0) : k + half + 1]) for k in range(len(t))])
+    change, apart = np.linalg.norm(np.diff(read, axis=0), axis=1), np.diff(t)
+    both = np.maximum(level[1:], level[:-1])
+    allowed = swing.largest_change(both, apart) + 3.0 * np.sqrt(var[1:] + var[:-1])
+    jump = change > allowed
+    out = list(fits)
+    for k in np.flatnonzero(jump[1:] & jump[:-1]) + 1:
+        words = (
+            f"jumps by {np.rad2deg(min(change[k - 1], change[k])):.1f} deg from both neighbours, faster than the joint "
+            f"swings at {swing.frequency_hz:.1f} Hz"
+        )
+        out[answered[k]] = refused_fit(out[answered[k]].horizon, Fault(words, "jump-too-fast"))
+    return out
 
 
 def _decoded_ahead(frames: Iterable[Image | str | Path]) -> Iterator[Image]:

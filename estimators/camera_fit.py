@@ -30,14 +30,25 @@ Seed paper, CAD-based estimate. S. F. Schmidt's "consider" covariance, e.g. B. D
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimators import _fit_kernels
-from estimators.edge import NO_FAULT, HorizonLine, ScanLines, fault_of_frame, find_horizon, no_horizon, steps_near
-from estimators.features import ImageFeatures, fit_feature_map
+from estimators.edge import (
+    NO_FAULT,
+    HorizonLine,
+    ScanLines,
+    fault_of_frame,
+    find_horizon,
+    is_coherent,
+    no_horizon,
+    steps_near,
+)
+from estimators.features import Features, ImageFeatures, fit_feature_map, valleys
 from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.deflection import lv_clock
@@ -45,15 +56,25 @@ from flightmodel.deflection import lv_clock
 Image = NDArray[np.uint8]
 
 HUBER = 2.5
-_NOISE_GREY = 2.5
 STEPS = 12
 LAST_STEP_RAD = 2e-5
 OUTLIER_PX = 5.0
 REACH_PX = 8  # within which features are looked for around their prediction
 _WORST_RMS_PX, _FEATURES_RMS_PX = 2.5, 1.0
-_LEAST_POINTS, _LEAST_FEATURES = 60, 40
+LEAST_POINTS, _LEAST_FEATURES = 60, 40
 _FEW_FEATURES = 0.6  # of those found at the benchmark
 _FAR_RAD = np.deg2rad([4.0, 4.0])
+# texture
+TEXTURE_REACH_PX = 3  # the edge alone predicts to a pixel
+_WORST_TEXTURE_SD_PX = 0.5
+TOGETHER = 3.0  # root of the number of patches that err together: they overlap, and their neighbours see the same light
+_AGREED_PX, _LEAST_AGREED = 0.5, 0.5  # by chance a sixth of the patches lie within half a pixel of six
+_SOUND_SCORE = 1.5  # the texture agrees with itself
+_EDGE_PASSES = 2
+_CONTRADICTION = 18.4  # chi-square of two components that one sound frame in 10,000 exceeds
+_LEAST_VAR = float(np.deg2rad(1e-3) ** 2)  # of a difference, far below what any film shows
+_WHOLE_EDGE = 0.8  # of the benchmark's edge points
+_SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
 USUAL_SHARE, USUAL_RMS_PX = 0.75, 1.0  # features shown and rms of a benchmark frame that is not suspicious
 JOINT = HELD.stop - 1
 POSED = slice(CAMERA.start, JOINT)
@@ -109,19 +130,15 @@ def _ovality(rows: FloatArray, clocks_rad: FloatArray) -> tuple[FloatArray, Floa
 
 
 def find_features(
-    view: VirtualCamera, features: ImageFeatures, image: Image, deformation: FloatArray, reach_px: int
+    view: VirtualCamera, features: Features, image: Image, deformation: FloatArray, reach_px: int
 ) -> tuple[FloatArray, FloatArray]:
     """Place of each feature along its direction, px, and its sd; infinite where it was not found."""
-    expected = view.sight(features.points_shell_m, deformation).pixels
-    hidden = ~np.isfinite(expected[:, 0])
-    expected[hidden] = -1e6
-    offset, sd = features.find(image, expected, reach_px, _NOISE_GREY)
-    return np.einsum("ni,ni->n", expected, features.across_px) + offset, sd
+    return features.find(view, image, deformation, reach_px)
 
 
 def feature_residuals(
     view: VirtualCamera,
-    features: ImageFeatures,
+    features: Features,
     found: tuple[FloatArray, FloatArray],
     deformation: FloatArray,
     first_index: int,
@@ -144,11 +161,16 @@ def joined(first: FrameResiduals, second: FrameResiduals) -> FrameResiduals:
 
 
 def huber_gain(
-    residuals: FrameResiduals, design: FloatArray, information: FloatArray, lines: int
+    residuals: FrameResiduals,
+    design: FloatArray,
+    information: FloatArray,
+    lines: int,
+    together: FloatArray | float = 1.0,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Weigh one Gauss-Newton step by Huber's rule.
 
-    The sd of edge points and of features are each inflated to the scatter of their residuals.
+    The sd of edge points and of features are each inflated to the scatter of their residuals, and by the root of the
+    number ``together`` that err alike.
 
     Returns
     -------
@@ -164,7 +186,7 @@ def huber_gain(
         if group.any():
             centre = np.median(residual[group])
             scale[group] *= max(1.4826 * float(np.median(np.abs(residual[group] - centre) / scale[group])), 1.0)
-    weight = 1.0 / scale**2 / np.maximum(1.0, np.abs(residual) / (HUBER * scale))
+    weight = 1.0 / scale**2 / np.maximum(1.0, np.abs(residual) / (HUBER * scale)) / together
     weighted = design.T * weight
     covariance: FloatArray = np.linalg.inv(weighted @ design + information).astype(float)
     return covariance @ weighted, covariance, float(np.sqrt(np.average(residual**2, weights=weight)))
@@ -218,6 +240,8 @@ class FrameFit:
     horizon : HorizonLine
     refused : Fault
         Why there is no answer, with its code; empty when there is one.
+    contradicted : bool
+        Whether features were found that contradict a whole edge, which alone gave the answer.
     """
 
     rotation_yz_rad: FloatArray
@@ -229,6 +253,7 @@ class FrameFit:
     features: int
     horizon: HorizonLine
     refused: Fault = NO_FAULT
+    contradicted: bool = False
 
 
 _NOTHING = no_horizon(NO_FAULT)
@@ -252,6 +277,8 @@ class _Solution:
     before: FloatArray
     edge_count: int
     rms_px: float
+    residual_px: FloatArray
+    weight: FloatArray
 
 
 @dataclass(frozen=True)
@@ -266,12 +293,28 @@ class _Points:
     edge_points: int
 
 
+@dataclass(frozen=True)
+class _Approached:
+    """What is seen from near an answer: texture that agrees, the edge, and the share of each."""
+
+    place: tuple[FloatArray, FloatArray] | None
+    edge: HorizonLine
+    agreed: float
+    edge_share: float
+
+    @property
+    def score(self) -> float:
+        """Texture that agrees outweighs an edge, which may be the Earth's."""
+        return self.edge_share + (1.0 + self.agreed if self.place is not None else 0.0)
+
+
 def _has(found: tuple[FloatArray, FloatArray]) -> NDArray[np.intp]:
     """Rows of features that were found."""
     return np.flatnonzero(np.isfinite(found[1]))
 
 
-def _no_answer(horizon: HorizonLine, reason: Fault) -> FrameFit:
+def refused_fit(horizon: HorizonLine, reason: Fault) -> FrameFit:
+    """Return the fit of a frame that has no answer."""
     nan = np.full((2, 2), np.nan)
     return FrameFit(nan[0], nan, nan, 0.0, float("nan"), float("nan"), 0, horizon, reason)
 
@@ -287,7 +330,7 @@ class OrientedCamera:
         Places of the shell's edge that are looked for.
     lines : ScanLines
         Where they are searched without a deflection to start from.
-    features : ImageFeatures
+    features : Features
         Features that are looked for.
     apriori : AprioriSd
     benchmark : HorizonLine
@@ -301,12 +344,17 @@ class OrientedCamera:
         Their shift per radian of deflection of the benchmark frame.
     residual_rms_px : float
         Of the benchmark frame.
+    stated_refused : Fault
+        Why the features that the vehicle file states are not used; empty where they are, or where it states none.
+    support : float
+        Share of what the orientation looked for on the shell, features or the valleys between tori, that the benchmark
+        frame shows.
     """
 
     view: VirtualCamera
     clocks_rad: FloatArray
     lines: ScanLines
-    features: ImageFeatures
+    features: Features
     apriori: AprioriSd
     benchmark: HorizonLine
     benchmark_residuals: FrameResiduals = field(repr=False)
@@ -314,17 +362,19 @@ class OrientedCamera:
     posed_covariance: FloatArray = field(repr=False)
     posed_per_deflection: FloatArray = field(repr=False)
     residual_rms_px: float
+    stated_refused: Fault = NO_FAULT
+    support: float = 1.0
 
     @property
     def features_share(self) -> float:
         """Share of the features in view that the benchmark frame shows."""
         found = int((self.benchmark_residuals.index >= len(self.clocks_rad)).sum())
-        return found / max(len(self.features.is_dot), 1)
+        return found / max(len(self.features.points_shell_m), 1)
 
     @property
     def has_bad_benchmark(self) -> bool:
-        """Whether the benchmark frame shows few features and its residuals are large."""
-        return self.residual_rms_px > USUAL_RMS_PX and self.features_share < USUAL_SHARE
+        """Whether the benchmark frame shows little of the shell and its residuals are large."""
+        return self.residual_rms_px > USUAL_RMS_PX and self.support < USUAL_SHARE
 
     def fit(self, image: Image, plane_axis: FloatArray | None = None, start: FloatArray | None = None) -> FrameFit:
         """Find the deflection in a frame.
@@ -339,14 +389,20 @@ class OrientedCamera:
         """
         fault = fault_of_frame(image, self.view.camera.size_px)
         if fault:
-            return _no_answer(no_horizon(fault), fault)
+            return refused_fit(no_horizon(fault), fault)
         deformation, basis, horizon = np.zeros(3), np.eye(2), _NOTHING
         deformation[:2] = 0.0 if start is None else start
         try:
-            place = self._approach(image, deformation)
-            horizon = steps_near(image, self.view.lines_at(self.clocks_rad, deformation))
+            if isinstance(self.features, ImageFeatures) and len(self.features.points_shell_m):
+                place = self._approach(image, deformation, self.features)
+                horizon = steps_near(image, self.view.lines_at(self.clocks_rad, deformation))
+            else:
+                seen = self._approach_by_texture(image, deformation)
+                place, horizon = seen.place, seen.edge
             last = self._solve(horizon, place, deformation, basis, _WORST_RMS_PX)
-            if last.edge_count < _LEAST_POINTS and last.rms_px > _FEATURES_RMS_PX:
+            last = self._reconciled(image, horizon, place, deformation, last)
+            contradicted = place is not None and last.edge_count == len(last.rows)
+            if last.edge_count < LEAST_POINTS and last.rms_px > _FEATURES_RMS_PX:
                 raise _NoFitError(
                     f"no edge near the features, whose rms is {last.rms_px:.1f} px: not the shell's", "edge-not-shell"
                 )
@@ -357,10 +413,167 @@ class OrientedCamera:
                 deformation[:] = *(basis[:, 0] * (basis[:, 0] @ deformation[:2])), 0.0
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except _NoFitError as fault_of_fit:
-            return _no_answer(horizon, fault_of_fit.faults[0])
-        return self._answer(horizon, deformation, last, basis)
+            return refused_fit(horizon, fault_of_fit.faults[0])
+        return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
 
-    def _approach(self, image: Image, deformation: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    def _reconciled(
+        self, image: Image, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
+        both: _Solution,
+    ) -> _Solution:  # fmt: skip
+        """Edge and features where they agree, the edge alone where they contradict each other and it is whole.
+
+        `_NoFitError` where they contradict each other and it is not.
+        """
+        seen = both.edge_count / len(self.clocks_rad)
+        if place is None and seen < _SOUND_EDGE:
+            raise _NoFitError(
+                f"no feature agrees, and {100.0 * seen:.0f} % of the edge in view can be used where "
+                f"{100.0 * _SOUND_EDGE:.0f} % are needed",
+                "edge-too-short",
+            )
+        rms = max(both.rms_px, self._edge_rms_px)
+        if place is None and rms > USUAL_RMS_PX:
+            raise _NoFitError(
+                f"no feature agrees, and the edge alone has an rms of {rms:.1f} px, here or in the benchmark frame, "
+                f"where {USUAL_RMS_PX:.1f} px are allowed",
+                "edge-not-shell",
+            )
+        if place is None:
+            return both
+        # to first order, which takes a tenth of a fit's time, then in full where that is not clear
+        if both.edge_count >= LEAST_POINTS:
+            step, alone_near = self._edge_step(both, deformation[2])
+            if self._contradiction(step, alone_near, both) < 0.5 * _CONTRADICTION:
+                return both
+        alone = deformation.copy()
+        try:
+            near = self._independent_edge(image, horizon, alone)
+            edge = self._solve(near, None, alone, np.eye(2), np.inf)
+        except _NoFitError:
+            # steps in the clouds are no edge to contradict anything
+            return both
+        share = edge.edge_count / max(int((self.benchmark_residuals.index < len(self.clocks_rad)).sum()), 1)
+        square = self._contradiction(alone[:2] - deformation[:2], edge, both)
+        if square < _CONTRADICTION:
+            return both
+        if share < _WHOLE_EDGE or edge.rms_px > USUAL_RMS_PX:
+            raise _NoFitError(
+                f"edge and features contradict each other (chi-square {square:.0f} of 2), and {100.0 * share:.0f} % of "
+                "the edge are too few to go by",
+                "features-contradict-edge",
+            )
+        deformation[:] = alone
+        return edge
+
+    @property
+    def _edge_rms_px(self) -> float:
+        """Of the edge in the benchmark frame."""
+        before = self.benchmark_residuals
+        edge = before.residual_px[before.index < len(self.clocks_rad)]
+        return float(np.sqrt(np.mean(edge**2))) if len(edge) else float("inf")
+
+    def _contradiction(self, difference: FloatArray, edge: _Solution, both: _Solution) -> float:
+        """Chi-square (2) of the difference of two answers, of which one uses a part of the other's points."""
+        posed, missing = (
+            [s.gain @ (s.rows[:, POSED] - s.before[:, POSED]) for s in (edge, both)],
+            [s.gain @ s.before[:, DEFLECTION] for s in (edge, both)],
+        )
+        camera = posed[0] - posed[1]
+        rest = (missing[0] - missing[1] + camera @ self.posed_per_deflection) * self.apriori.benchmark_rad
+        covariance = camera @ self.posed_covariance @ camera.T + rest @ rest.T
+        # of the best answers, the better one's error has no part in the difference
+        value, axes = np.linalg.eigh(edge.formal - both.formal)
+        covariance += (axes * np.maximum(value, _LEAST_VAR)) @ axes.T
+        return float(difference @ np.linalg.solve(covariance, difference))
+
+    def _approach_by_texture(self, image: Image, deformation: FloatArray) -> _Approached:
+        """Move ``deformation`` in place to where the texture agrees with itself, else to where the edge is.
+
+        Where the search starts, then where the edge is found from far, then where the valleys between tori fit: the
+        first place is taken that is sound, else the one that shows most.
+        """
+        best: tuple[float, FloatArray, _Approached] | None = None
+        trouble = Fault("no edge near where one is expected", "edge-not-clear")
+        for guess in self._guesses(image, deformation.copy()):
+            moved = guess.copy()
+            try:
+                seen = self._seen_from(image, moved)
+            except _NoFitError as fault:
+                trouble = fault.faults[0]
+                continue
+            if best is None or seen.score > best[0]:
+                best = (seen.score, moved, seen)
+            if seen.score > _SOUND_SCORE:
+                break
+        if best is None:
+            raise _NoFitError(trouble)
+        deformation[:] = best[1]
+        return best[2]
+
+    def _guesses(self, image: Image, start: FloatArray) -> Iterator[FloatArray]:
+        """Deformations (3,) near which the shell may be, the likeliest first; each is only made when asked for."""
+        yield start
+        coarse = find_horizon(image, self.lines, self.view.camera.size_px)
+        if coarse.is_usable:
+            edge_alone = np.zeros(3)
+            with suppress(_NoFitError):
+                self._fit_points(coarse, None, edge_alone, np.eye(2))
+                yield edge_alone
+        yield from self._where_map_fits(image, valleys(self.view), start)
+
+    def _where_map_fits(self, image: Image, painted: ImageFeatures, start: FloatArray) -> Iterator[FloatArray]:
+        """Deformation (3,) at which features fit the frame best, where that is significant."""
+
+        def pixels(turned: FloatArray) -> FloatArray:
+            return self.view.sight(painted.points_shell_m, np.array([*turned, 0.0])).pixels
+
+        fitted = fit_feature_map(image, pixels, [start[:2].copy()], _FAR_RAD, painted.signs)
+        if fitted is not None:
+            yield np.array([*fitted, 0.0])
+
+    def _seen_from(self, image: Image, deformation: FloatArray) -> _Approached:
+        """Texture and edge near a guess, which is moved in place to where they are; `_NoFitError` without either."""
+        for reach in (REACH_PX, TEXTURE_REACH_PX):
+            found = find_features(self.view, self.features, image, deformation, reach)
+            if len(_has(found)) >= _LEAST_FEATURES:
+                self._fit_points(_NOTHING, found, deformation, np.eye(2))
+        place, agreed = self._agreeing(found, deformation)
+        if place is not None:
+            self._fit_points(_NOTHING, place, deformation, np.eye(2))
+        near = self.coherent_edge(image, deformation)
+        if place is None:
+            for _ in range(_EDGE_PASSES):
+                self._solve(near, None, deformation, np.eye(2), _WORST_RMS_PX)
+                near = self.coherent_edge(image, deformation)
+        whole = max(int((self.benchmark_residuals.index < len(self.clocks_rad)).sum()), 1)
+        return _Approached(place, near, agreed, len(near.points_px) / whole)
+
+    def coherent_edge(self, image: Image, deformation: FloatArray) -> HorizonLine:
+        """Edge near where a deformation (3,) puts it, without points that stand off their neighbours."""
+        near = steps_near(image, self.view.lines_at(self.clocks_rad, deformation))
+        residual = edge_residuals(self.view, near, deformation).residual_px
+        return near.some(is_coherent(near.line, residual))
+
+    def _agreeing(
+        self, found: tuple[FloatArray, FloatArray], deformation: FloatArray
+    ) -> tuple[tuple[FloatArray, FloatArray] | None, float]:
+        """Places of the texture that agree on one deformation, None where too few do; the share that does."""
+        sharp = found[0], np.where(found[1] < _WORST_TEXTURE_SD_PX, found[1], np.inf)
+        if len(_has(sharp)) < _LEAST_FEATURES:
+            return None, 0.0
+        residual = self._fit_points(_NOTHING, sharp, deformation.copy(), np.eye(2)).residual_px
+        agreed = float(np.mean(np.abs(residual) < _AGREED_PX))
+        if agreed < _LEAST_AGREED:
+            return None, agreed
+        scale = 1.4826 * float(np.nanmedian(np.abs(residual)))
+        kept = np.full_like(sharp[1], np.inf)
+        rows = _has(sharp)[np.abs(residual) < max(3.0 * scale, 0.3)]
+        kept[rows] = TOGETHER * sharp[1][rows]
+        return (sharp[0], kept), agreed
+
+    def _approach(
+        self, image: Image, deformation: FloatArray, painted: ImageFeatures
+    ) -> tuple[FloatArray, FloatArray] | None:
         """Move ``deformation`` in place to within a pixel or two, and find the features there; None where few.
 
         From where the search starts, if most features are found there; else from where the edge is found or where the
@@ -382,12 +595,8 @@ class OrientedCamera:
             except _NoFitError as fault:
                 trouble = fault.faults[0]
         if max(len(_has(f)) for f in found) < wanted:
-            points = self.features.points_shell_m
-            fitted = fit_feature_map(
-                image, lambda p: self.view.sight(points, np.array([*p, 0.0])).pixels, [deformation[:2].copy()], _FAR_RAD
-            )
-            if fitted is not None:
-                guesses.append(np.array([*fitted, 0.0]))
+            for fitted in self._where_map_fits(image, painted, deformation):
+                guesses.append(fitted)
                 found.append(find_features(self.view, self.features, image, guesses[-1], REACH_PX))
         best = int(np.argmax([len(_has(f)) for f in found]))
         if len(_has(found[best])) >= _LEAST_FEATURES:
@@ -438,14 +647,14 @@ class OrientedCamera:
         prior = self._shape_prior(k)
         count = len(edge_offset) + len(has)
         residual, rows, shape, weight = np.empty(count), np.zeros((count, 16)), np.zeros((count, 5)), np.empty(count)
-        limits = (HUBER, OUTLIER_PX, LAST_STEP_RAD, STEPS, 0 if len(has) >= _LEAST_FEATURES else _LEAST_POINTS)
+        limits = (HUBER, OUTLIER_PX, LAST_STEP_RAD, STEPS, 0 if len(has) >= _LEAST_FEATURES else LEAST_POINTS)
         state, number = _fit_kernels.fit_frame(
             deformation, np.ascontiguousarray(basis), view.shell_terms, view.camera.lens_terms, edge, features, prior,
             limits, residual, rows, shape, weight,
         )  # fmt: skip
         if state == _fit_kernels.TOO_FEW:
             raise _NoFitError(
-                f"{number} edge points also found at the benchmark where {_LEAST_POINTS} are needed",
+                f"{number} edge points also found at the benchmark where {LEAST_POINTS} are needed",
                 "edge-points-too-few",
             )
         if state == _fit_kernels.DIVERGED:
@@ -472,7 +681,43 @@ class OrientedCamera:
         formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(k), prior**-2])))
         before = self.benchmark_residuals.rows[found.benchmark_at[used]]
         edge_count = int(used[: found.edge_points].sum())
-        return _Solution((formal @ weighted)[:k], formal[:k, :k], rows, shape, before, edge_count, rms)
+        gain = (formal @ weighted)[:k]
+        return _Solution(gain, formal[:k, :k], rows, shape, before, edge_count, rms, residual, weight)
+
+    def _independent_edge(self, image: Image, horizon: HorizonLine, deformation: FloatArray) -> HorizonLine:
+        """Edge that owes nothing to the features, ``deformation`` moved near it; `_NoFitError` where there is none.
+
+        What was found near the features' answer where that is an edge, not steps in the clouds; else found from far.
+        """
+        near = horizon.some(is_coherent(horizon.line, edge_residuals(self.view, horizon, deformation).residual_px))
+        if len(near.points_px) >= LEAST_POINTS:
+            return near
+        far = find_horizon(image, self.lines, self.view.camera.size_px)
+        if far.refused:
+            raise _NoFitError(far.refused)
+        moved = np.zeros(3)
+        self._solve(far, None, moved, np.eye(2), _WORST_RMS_PX)
+        deformation[:] = moved
+        return self.coherent_edge(image, deformation)
+
+    def _edge_step(self, both: _Solution, flattening_rad: float) -> tuple[FloatArray, _Solution]:
+        """One step (2,) from an answer of edge and features to that of the edge alone, and its gain and covariance."""
+        edge, prior = slice(0, both.edge_count), self._shape_prior(2)
+        rows, shape, weight = both.rows[edge], both.shape[edge], both.weight[edge]
+        design = np.concatenate([rows[:, DEFLECTION], rows[:, [FLATTENING, JOINT]], shape], axis=1)
+        weighted = design.T * weight
+        formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(2), prior**-2])))
+        right = weighted @ both.residual_px[edge]
+        right[2] -= flattening_rad / prior[0] ** 2
+        step = formal @ right
+        # features that contradict the edge leave it residuals that are none of its scatter
+        left = both.residual_px[edge] - design @ step
+        scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
+        alone = replace(
+            both, gain=(formal @ weighted)[:2], formal=min(scatter, 1.0) * formal[:2, :2], rows=rows,
+            before=both.before[edge],
+        )  # fmt: skip
+        return step[:2], alone
 
     def _answer(self, horizon: HorizonLine, deformation: FloatArray, last: _Solution, basis: FloatArray) -> FrameFit:
         gain, before, leak = last.gain, last.before, 0.0

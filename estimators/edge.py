@@ -38,6 +38,7 @@ _NEAR_PX = 8.0
 _LEAST_CONTRAST = 8.0
 _LEAST_SHARE = 0.4
 _SD_FLOOR_PX = 0.05
+_NEIGHBOURS, _COHERENT_PX = 4, 0.7  # on either side; an edge's own scatter is a few tenths of a pixel
 _SMOOTHING = cv2.getGaussianKernel(7, _SMOOTHING_PX, cv2.CV_32F)
 
 
@@ -87,6 +88,12 @@ class HorizonLine:
     sd_px: FloatArray
     line: NDArray[np.intp]
     refused: Fault = NO_FAULT
+
+    def some(self, chosen: BoolArray) -> HorizonLine:
+        """Chosen points."""
+        return HorizonLine(
+            self.points_px[chosen], self.inward_px[chosen], self.sd_px[chosen], self.line[chosen], self.refused
+        )
 
     @property
     def is_usable(self) -> bool:
@@ -199,6 +206,28 @@ def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
     _edge_kernels.steps_near(grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, sd, good)
     points = near.origin_px + place[:, None] * near.inward_px
     return HorizonLine(points[good], near.inward_px[good], np.hypot(sd[good], _SD_FLOOR_PX), near.index[good])
+
+
+def is_coherent(line: NDArray[np.intp], residual_px: FloatArray) -> BoolArray:
+    """Whether edge points (n,) lie where their neighbours on the edge do: steps in clouds behind the rim do not.
+
+    Parameters
+    ----------
+    line : (n,) int
+        Places of the edge, increasing.
+    residual_px : (n,) float
+        Against any smooth curve near the edge; NaN is not coherent.
+    """
+    if not len(line):
+        return np.zeros(0, dtype=np.bool_)
+    # by place, with room for neighbours on both sides
+    places = np.full(int(line[-1]) + 1 + 2 * _NEIGHBOURS, np.nan)
+    places[line + _NEIGHBOURS] = residual_px
+    beside = np.lib.stride_tricks.sliding_window_view(places, 2 * _NEIGHBOURS + 1)[line]
+    with np.errstate(invalid="ignore"):
+        alike = np.abs(beside - residual_px[:, None]) < _COHERENT_PX
+    # half of those there may be, and the point itself
+    return np.asarray(alike.sum(axis=1) > _NEIGHBOURS)
 
 
 def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:

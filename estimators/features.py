@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -34,7 +35,16 @@ from numpy.typing import NDArray
 from estimators import _edge_kernels
 from estimators.virtual_camera import Sight, VirtualCamera
 from flightmodel.checks import BoolArray, FloatArray
-from flightmodel.geometry import aft_profile, dot_positions, revolved, seam_clocks_rad, torus_circles
+from flightmodel.geometry import (
+    FEATURE_KINDS,
+    ListedFeatures,
+    aft_profile,
+    dot_positions,
+    revolved,
+    seam_clocks_rad,
+    torus_circles,
+    torus_limb,
+)
 
 Image = NDArray[np.uint8]
 Pixels = Callable[[FloatArray], FloatArray]
@@ -52,6 +62,38 @@ _DRAWS, _ELITE = 240, 16
 _NARROWEST, _FARTHEST_SD = 0.02, 2.5
 _DARKEST = 30.0
 _LEAST_RISE, _OTHERS = 3.0, 60
+_NOISE_GREY = 2.5
+_VALLEY_STEP_PX, _HALF_VALLEY_PX = 10.0, 5
+_VALLEY_PLACED_M, _VALLEY_OFFSET_PX = 0.03, 3.0  # a tenth of a torus by the light; neighbours err together
+_GRAZING_M = 1e-6
+_ALONG_M = 0.002
+_WIDEST_HALF_PX = 5  # a feature and cloth on both sides fit in the window of the nearest search
+
+
+class Features(Protocol):
+    """What a frame is searched for beside the edge: painted features, or the shell's own texture.
+
+    One row a direction in which a place is measured.
+    """
+
+    @property
+    def points_shell_m(self) -> FloatArray:
+        """Points (n, 3) of the undeflected shell, from the datum, m."""
+        ...
+
+    @property
+    def across_px(self) -> FloatArray:
+        """Unit vectors (n, 2) in the picture."""
+        ...
+
+    def find(
+        self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Place (n,) of each row along its direction, px, and its sd, infinite where it was not found.
+
+        They are looked for within ``reach_px`` of where a deformation (3,) puts them; see `VirtualCamera.sight`.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -67,25 +109,63 @@ class ImageFeatures:
     half_width_px : (n,) int
         How far from its middle a feature is dark, blur included.
     is_dot : (n,) bool
+    signs : (n,) float
+        1 where darker than the cloth beside it, -1 where paler.
+    placed_m : float
+        A priori sd of each one's place on the shell; painted ones keep to millimetres.
+    offset_px : float
+        A priori sd of a shift along their directions that all have in common.
     """
 
     points_shell_m: FloatArray
     across_px: FloatArray
     half_width_px: NDArray[np.int64]
     is_dot: BoolArray
+    signs: FloatArray
+    placed_m: float = 0.003
+    offset_px: float = 0.0
 
-    def find(self, image: Image, expected_px: FloatArray, reach_px: int, noise: float) -> tuple[FloatArray, FloatArray]:
-        """Distance ``(n,)`` of each feature from its prediction ``(n, 2)``, along its direction, and its sd, px.
-
-        The sd is infinite where there is none within ``reach_px``.
-        """
-        offset, sd = np.zeros(len(expected_px)), np.full(len(expected_px), np.inf)
-        _edge_kernels.dark_centres(image, expected_px, self.across_px, reach_px, self.half_width_px, noise, offset, sd)
-        return offset, np.hypot(sd, _SD_FLOOR_PX)
+    def find(
+        self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """See `Features.find`."""
+        expected = view.sight(self.points_shell_m, deformation).pixels
+        expected[~np.isfinite(expected[:, 0])] = -1e6
+        offset, sd = np.zeros(len(expected)), np.full(len(expected), np.inf)
+        _edge_kernels.dark_centres(
+            image, expected, self.across_px, reach_px, self.half_width_px, self.signs, _NOISE_GREY, offset, sd
+        )
+        return np.einsum("ni,ni->n", expected, self.across_px) + offset, np.hypot(sd, _SD_FLOOR_PX)
 
 
 def visible_features(view: VirtualCamera) -> ImageFeatures:
-    """Features of the undeflected shell well inside the camera's picture."""
+    """Features of the undeflected shell well inside the camera's picture: the vehicle's own list, or those drawn."""
+    listed = view.geometry.listed_features
+    return _drawn(view) if listed is None else _listed(view, listed)
+
+
+def _listed(view: VirtualCamera, listed: ListedFeatures) -> ImageFeatures:
+    """An analyst's own features: a dot along rows and columns, a point of a line across it."""
+    visible = _in_view(view, listed.points_shell_m, listed.normals)
+    points, normals, kind = listed.points_shell_m[visible], listed.normals[visible], listed.kind[visible]
+    width, sign = listed.width_m[visible], np.where(listed.is_paler[visible], -1.0, 1.0)
+    round_ = np.column_stack([np.zeros(len(points)), -points[:, 2], points[:, 1]])
+    round_ /= np.linalg.norm(round_, axis=1, keepdims=True)
+    along = np.where((kind == FEATURE_KINDS.index("seam"))[:, None], np.cross(normals, round_), round_)
+    ends = [view.sight(points + side * _ALONG_M * along, np.zeros(3)).pixels for side in (-1.0, 1.0)]
+    tangent = ends[1] - ends[0]
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    dot = kind == FEATURE_KINDS.index("dot")
+    across = np.where(dot[:, None], np.array([1.0, 0.0]), np.column_stack([-tangent[:, 1], tangent[:, 0]]))
+    row = np.concatenate([np.arange(len(points)), np.flatnonzero(dot)])
+    across = np.concatenate([across, np.tile([0.0, 1.0], (int(dot.sum()), 1))])
+    half_m = 0.5 * width[row] * view.camera.focal_px.mean() / _away(view, points[row])
+    half_width = np.minimum(np.ceil(half_m + 2.0), _WIDEST_HALF_PX).astype(np.int64)
+    return ImageFeatures(points[row], across, half_width, dot[row], sign[row])
+
+
+def _drawn(view: VirtualCamera) -> ImageFeatures:
+    """Seams and dots where `flightmodel.geometry` draws them."""
     rows: list[tuple[FloatArray, FloatArray, FloatArray, bool]] = []
     geometry, focal = view.geometry, float(view.camera.focal_px.mean())
     profile = aft_profile(geometry)
@@ -114,7 +194,39 @@ def visible_features(view: VirtualCamera) -> ImageFeatures:
     is_dot = np.concatenate([np.full(len(r[0]), r[3]) for r in rows])
     size_m = np.where(is_dot, _HALF_DOT_M, _HALF_SEAM_M)
     half_width = np.ceil(focal * size_m / np.concatenate([r[2] for r in rows]) + 2.0).astype(np.int64)
-    return ImageFeatures(points, across, half_width, is_dot)
+    return ImageFeatures(points, across, half_width, is_dot, np.ones(len(points)))
+
+
+def no_features() -> ImageFeatures:
+    """Of a shell that shows nothing: its edge alone is looked for."""
+    nothing = np.zeros(0, dtype=np.int64)
+    return ImageFeatures(np.zeros((0, 3)), np.zeros((0, 2)), nothing, nothing.astype(np.bool_), np.zeros(0))
+
+
+def valleys(view: VirtualCamera) -> ImageFeatures:
+    """Dark valleys between the tori of the undeflected shell, whatever is painted on them.
+
+    One lies behind the limb of each inner torus, whose points are given; directions are outboard. How far behind the
+    limb its middle lies, and how dark it is, is the light's doing.
+    """
+    points, across = [], []
+    for torus in range(view.geometry.torus_count - 1):
+        limb = torus_limb(view.geometry, view.camera.position_body_m, view.clocks_rad, torus)
+        pixels = view.sight(limb, np.zeros(3)).pixels
+        along = np.gradient(pixels, axis=0)
+        clear = _unhidden(view, limb, np.asarray(np.isfinite(along).all(axis=1)))
+        clear &= view.camera.is_inside(np.nan_to_num(pixels, nan=-1e6), _BORDER_PX)
+        chosen = _spaced(pixels, clear, _VALLEY_STEP_PX)
+        points.append(limb[chosen])
+        # clocking angles grow to the left, so outboard lies to the right along a limb
+        across.append(np.column_stack([-along[chosen, 1], along[chosen, 0]]))
+    normal = np.concatenate([np.zeros((0, 2)), *across])
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    n = len(normal)
+    return ImageFeatures(
+        np.concatenate([np.zeros((0, 3)), *points]), normal, np.full(n, _HALF_VALLEY_PX), np.zeros(n, dtype=np.bool_),
+        np.ones(n), _VALLEY_PLACED_M, _VALLEY_OFFSET_PX,
+    )  # fmt: skip
 
 
 def _away(view: VirtualCamera, points: FloatArray) -> FloatArray:
@@ -148,14 +260,21 @@ def _in_view(view: VirtualCamera, points: FloatArray, normals: FloatArray) -> Bo
     towards = eye - points
     distance = np.linalg.norm(towards, axis=1)
     facing = np.einsum("ni,ni->n", normals, towards) / distance > _LEAST_FACING
-    visible = inside & facing
+    return _unhidden(view, points, inside & facing)
+
+
+def _unhidden(view: VirtualCamera, points: FloatArray, wanted: BoolArray) -> BoolArray:
+    """Whether no torus and no part of the centerbody hides wanted points ``(n, 3)`` of the undeflected shell."""
+    eye = view.camera.position_body_m
+    visible = wanted.copy()
     share = np.linspace(0.04, 0.97, 80)[:, None, None]
-    way = points[visible] + share * towards[visible]
+    way = points[visible] + share * (eye - points[visible])
     station, radius = torus_circles(view.geometry)
     s, r = -way[..., 0], np.hypot(way[..., 1], way[..., 2])
     clear = np.ones(int(visible.sum()), dtype=np.bool_)
     for s_i, r_i in zip(station, radius, strict=True):
-        clear &= (np.hypot(s - s_i, r - r_i) > view.geometry.torus_minor_radius_m).all(axis=0)
+        # what is looked at may lie on the very limb
+        clear &= (np.hypot(s - s_i, r - r_i) > view.geometry.torus_minor_radius_m - _GRAZING_M).all(axis=0)
     # the lens may sit on the skin itself
     skin = min(view.geometry.centerbody_radius_m, float(np.hypot(eye[1], eye[2])) - 1e-3)
     clear &= (r > skin).all(axis=0)
@@ -163,7 +282,9 @@ def _in_view(view: VirtualCamera, points: FloatArray, normals: FloatArray) -> Bo
     return np.asarray(visible)
 
 
-def fit_feature_map(image: Image, pixels: Pixels, starts: list[FloatArray], sd: FloatArray) -> FloatArray | None:
+def fit_feature_map(
+    image: Image, pixels: Pixels, starts: list[FloatArray], sd: FloatArray, signs: FloatArray
+) -> FloatArray | None:
     """Parameters ``(k,)`` at which the features fit a frame best; None where no maximum is significant.
 
     Parameters
@@ -173,38 +294,50 @@ def fit_feature_map(image: Image, pixels: Pixels, starts: list[FloatArray], sd: 
     starts : list of (k,) float
         Where to search, each the mean of a normal distribution; the best of all is taken.
     sd : (k,) float
+    signs : (n,) float
+        Of the features: 1 where darker, -1 where paler than what is beside them.
     """
     hat = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_HAT_PX, _HAT_PX))
     smooth = cv2.GaussianBlur(image, (0, 0), 1.2)
-    dark = cv2.morphologyEx(smooth, cv2.MORPH_BLACKHAT, hat).astype(np.float32)
+    hats = [cv2.morphologyEx(smooth, kind, hat).astype(np.float32) for kind in (cv2.MORPH_BLACKHAT, cv2.MORPH_TOPHAT)]
     # all features weigh alike, however dark: deep shadows between tori must not outweigh them
-    dark = np.minimum(dark, _DARKEST)
-    scores = [cv2.GaussianBlur(dark, (0, 0), blur) for blur in _BLURS_PX]
+    hats = [np.minimum(picture, _DARKEST) for picture in hats]
+    pale = (signs < 0.0).astype(np.int64)
+    blurred = [np.stack([cv2.GaussianBlur(picture, (0, 0), blur) for picture in hats]) for blur in _BLURS_PX]
+    maps = [_Map(pictures, pictures.mean(axis=(1, 2)).astype(float), pale) for pictures in blurred]
     rng = np.random.default_rng(0)
     found = []
     for start in starts:
         centre, spread = start.copy(), sd.copy()
-        for score in scores:
+        for one in maps:
             drawn = centre + spread * rng.standard_normal((_DRAWS, len(sd)))
             drawn[0] = centre
             # not beyond the prior, where all features may come together on one dark spot
             drawn = np.clip(drawn, start - _FARTHEST_SD * sd, start + _FARTHEST_SD * sd)
-            values = np.array([_score(score, pixels(p)) for p in drawn])
+            values = np.array([one.score(pixels(p)) for p in drawn])
             best = drawn[np.argsort(-values)[:_ELITE]]
             centre, spread = best.mean(axis=0), np.maximum(best.std(axis=0), _NARROWEST * sd)
-        found.append((_score(scores[-1], pixels(centre)), centre))
+        found.append((maps[-1].score(pixels(centre)), centre))
     highest, where = max(found, key=lambda pair: pair[0])
-    others = [_score(scores[-1], pixels(p)) for p in starts[0] + sd * rng.standard_normal((_OTHERS, len(sd)))]
+    others = [maps[-1].score(pixels(p)) for p in starts[0] + sd * rng.standard_normal((_OTHERS, len(sd)))]
     usual = float(np.median(others))
     scatter = 1.4826 * float(np.median(np.abs(np.array(others) - usual)))
     return where if highest - usual > _LEAST_RISE * scatter else None
 
 
-def _score(picture: NDArray[np.float32], pixels: FloatArray) -> float:
-    """Mean of a picture at pixels; those outside it count as its mean."""
-    h, w = picture.shape
-    at = np.nan_to_num(pixels, nan=-1.0)
-    u, v = np.rint(at).astype(int).T
-    inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
-    total = float(picture[v[inside], u[inside]].sum()) + float(picture.mean()) * int((~inside).sum())
-    return total / len(at)
+@dataclass(frozen=True)
+class _Map:
+    """How dark and how pale each pixel is against its surroundings, (2, h, w), and which of both each feature is."""
+
+    pictures: NDArray[np.float32]
+    means: FloatArray
+    which: NDArray[np.int64]
+
+    def score(self, pixels: FloatArray) -> float:
+        """Mean over features at pixels (n, 2); those outside the picture count as its mean."""
+        h, w = self.pictures.shape[1:]
+        at = np.nan_to_num(pixels, nan=-1.0)
+        u, v = np.rint(at).astype(int).T
+        inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
+        total = self.pictures[self.which[inside], v[inside], u[inside]].sum() + self.means[self.which[~inside]].sum()
+        return float(total) / len(at)

@@ -35,7 +35,7 @@ FILL_IN = "still to fill in"  # and the message for it
 NAME_RULE = "a name has 1 to 64 letters (a to z), digits, _ and -"
 
 
-def _beside(value: str) -> str:
+def beside(value: str) -> str:
     """Refuse a file name that leads out of the folder, so that a copy of the folder is whole."""
     paths = PurePosixPath(value), PureWindowsPath(value)
     if not value or "\0" in value or any(path.anchor or ".." in path.parts for path in paths):
@@ -43,7 +43,7 @@ def _beside(value: str) -> str:
     return value
 
 
-FileBeside = Annotated[str, AfterValidator(_beside)]
+FileBeside = Annotated[str, AfterValidator(beside)]
 
 
 class KeyFaults(ValueError):

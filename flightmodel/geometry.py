@@ -30,15 +30,49 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, model_validator
 
 from flightmodel import rotations
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
-from flightmodel.config import FileBeside, KeyFaults, Length, Section
+from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError
+from flightmodel.config import FileBeside, KeyFaults, Length, Section, beside
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 
 if TYPE_CHECKING:
     import trimesh
+
+FEATURES = ("none", "texture", "drawn")
+FEATURE_KINDS = ("dot", "seam", "hoop")  # of listed features
+
+
+def _known_features(value: str) -> str:
+    if value in FEATURES:
+        return value
+    if not value.lower().endswith(".csv"):
+        raise ValueError(f"{', '.join(FEATURES)} or a CSV of your own is wanted (docs/scenario-and-vehicle-files.md)")
+    return beside(value)
+
+
+@dataclass(frozen=True)
+class ListedFeatures:
+    """Features of an analyst's own list, ``n`` points.
+
+    Parameters
+    ----------
+    points_shell_m : (n, 3) float
+        On the undeflected shell, from the datum, shell axes.
+    normals : (n, 3) float
+        Outward.
+    kind : (n,) int
+        Index into `FEATURE_KINDS`; see `flightmodel.shell_features`.
+    width_m : (n,) float
+    is_paler : (n,) bool
+    """
+
+    points_shell_m: FloatArray
+    normals: FloatArray
+    kind: NDArray[np.int64]
+    width_m: FloatArray
+    is_paler: BoolArray
 
 
 class ShellGeometry(Section):
@@ -54,6 +88,19 @@ class ShellGeometry(Section):
     gore_count: Annotated[int, Field(ge=3, le=120)]
     centerbody_radius_m: Length
     centerbody_length_m: Length
+    features: Annotated[str, AfterValidator(_known_features)] = "texture"
+    _listed: ListedFeatures | None = PrivateAttr(default=None)
+
+    @property
+    def listed_features(self) -> ListedFeatures | None:
+        """The list that ``features`` names; None where it names none, or where it was not read."""
+        return self._listed
+
+    def with_listed(self, listed: ListedFeatures) -> ShellGeometry:
+        """Return this shell with the list that ``features`` names."""
+        shell = self.model_copy()
+        shell._listed = listed
+        return shell
 
     @model_validator(mode="after")
     def _possible(self) -> ShellGeometry:

@@ -31,6 +31,7 @@ from flightmodel.config import (
 from flightmodel.deflection import lv_direction
 from flightmodel.geometry import BodyMesh, MeshFiles, ShellGeometry, body_meshes
 from flightmodel.instruments import dcm_body_from_clocking
+from flightmodel.shell_features import read_features
 
 DATA = Path(__file__).parent / "data"
 SAME_SHAPE = 0.1  # the cone of the coefficients may be an effective one, but not another vehicle's
@@ -340,6 +341,9 @@ def vehicle_from_toml(path: Path) -> Vehicle:
     aero, table_sd = aerodynamics_from(spec.aerodynamics, shape, (path.parent, DATA / "aerodynamics"))
     lenses = {name: camera.position_m for name, camera in spec.cameras.items()}
     meshes = body_meshes(spec.meshes, path.parent, shell, lenses)
+    listed = [shell.features] if shell.features.lower().endswith(".csv") else []
+    if listed:
+        shell = shell.with_listed(read_features(path.parent / listed[0], shell))
     drawn = [mesh.file for mesh in (spec.meshes.aeroshell, spec.meshes.centerbody) if mesh is not None]
     # the vehicle file's own word first, then the table's
     stated = {k: v for k, v in table_sd if v is not None and k not in spec.uncertainty.model_fields_set}
@@ -351,10 +355,10 @@ def vehicle_from_toml(path: Path) -> Vehicle:
         centerbody=spec.centerbody,
         uncertainty=spec.uncertainty.model_copy(update=stated),
         aero=aero,
-        geometry=spec.geometry,
+        geometry=shell,
         sensors=dict(spec.sensors),
         cameras=dict(spec.cameras),
         source=path,
-        files=(*((table, str(Path(table).with_suffix(".toml"))) if own and table is not None else ()), *drawn),
+        files=(*((table, str(Path(table).with_suffix(".toml"))) if own and table is not None else ()), *drawn, *listed),
         meshes=meshes,
     )

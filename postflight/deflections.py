@@ -8,13 +8,14 @@ import numpy as np
 import pandas as pd
 
 from estimators.benchmark import benchmark_deflection
-from estimators.camera import FilmFit, read_film, sensitivity_table
+from estimators.camera import FilmFit, JointSwing, read_film, sensitivity_table
 from estimators.fusion import smoothed
 from estimators.misalignment import estimate_misalignment as misalignment_history
 from estimators.trim import estimate_trim as trim_history
 from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, lv_clock
 from flightmodel.tabular import Tabular
+from flightmodel.vehicle import Vehicle
 from postflight.flight import Flight
 from postflight.fusing import FusedAnswer, fuse_flight
 from postflight.reconstruction import Reconstruction
@@ -268,7 +269,16 @@ def camera_film(flight: Flight, progress: Progress | None = None) -> FilmFit:
         plane_lv_rad=flight.camera_plane_lv_rad,
         benchmark=frames.picture(frames.benchmark),
         progress=progress,
+        joint_swing=joint_swing(vehicle),
     )
+
+
+def joint_swing(vehicle: Vehicle) -> JointSwing | None:
+    """How fast the vehicle's joint swings; None without a spring that bends."""
+    critical = vehicle.critical_damping_nmsprad()
+    if not critical > 0.0:
+        return None
+    return JointSwing(vehicle.free_free_frequency_hz(), vehicle.joint.bending_damping_nmsprad / critical)
 
 
 def with_benchmark_deflection(film: FilmFit, flight: Flight, bet: Reconstruction | None) -> DeflectionHistory:

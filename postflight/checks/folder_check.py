@@ -29,6 +29,7 @@ from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.checks import inertial, pressure_and_field, tracks
+from postflight.checks.benchmark_frame import benchmark_frame
 from postflight.checks.track_force import best_comparison, track_force
 from postflight.checks.units_and_axes import TimeBias
 from postflight.intake.flight_form import placeholders
@@ -207,6 +208,8 @@ def _cross_check(found: Sources, report: Report) -> None:
     if lag is not None:
         bias = _keep_sharp(report, TimeBias("magnetometer", "rates", *lag))
         remarks += bias.remarks(*_span(found.triads["magnetometer"].time_s)) if bias else []
+    # last: gyros and attitude are only compared where nothing else is suspicious
+    remarks += benchmark_frame(found)
 
 
 def _against_accelerometer(found: Sources, name: str, record: RadarRecord | GnssRecord, report: Report) -> None:

@@ -23,7 +23,7 @@ from postflight.report.source import Run
 from postflight.sensitivity import largest_of_groups
 
 _HOW = {
-    "camera": "Edge, seams and dots of the aeroshell in the onboard video.",
+    "camera": "Edge and features, or texture, of the aeroshell in the onboard video.",
     "misalignment": "The deflection that reconciles the accelerometers with the trajectory's angle of attack.",
     "trim": "The offset of the aeroshell's force that balances the moments at the flown angle of attack.",
     "fused": "All methods, weighted, with the inputs they share.",

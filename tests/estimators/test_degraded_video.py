@@ -103,7 +103,8 @@ def film_without_earth(seed, painted):
     theta, plane = D(np.array([0.05, 3.9, 3.1])), D(np.array([20.0, 187.0, 230.0]))
     light = np.stack([sun(rng.uniform(0.0, 360.0)) for _ in TIMES])
     frames = list(film(GEOMETRY, MOUNT, JOINT_M, Scene(theta, plane, light), rng, Imaging(painted=painted)))
-    return read_film(TIMES, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None), theta, plane
+    shell = GEOMETRY if painted else GEOMETRY.model_copy(update={"features": "none"})
+    return read_film(TIMES, frames, shell, MOUNT, JOINT_M, plane_lv_rad=None), theta, plane
 
 
 def test_half_the_rim_out_of_view_widens_the_bar():

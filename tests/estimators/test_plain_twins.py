@@ -1,11 +1,12 @@
 """Compiled looks at pictures against plain ones, on points and scenes small enough to run interpreted."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from estimators import _edge_kernels, _fit_kernels, _raster_kernels, _sight_kernels
+from estimators import _edge_kernels, _fit_kernels, _raster_kernels, _sight_kernels, _texture_kernels
 from estimators.edge import (
     EDGE_BASES,
     EDGE_HALF,
@@ -213,15 +214,53 @@ def mark(place, noise=0.0, seed=0):
     return light * (1.0 - dark) + noise * np.random.default_rng(seed).standard_normal((40, 60))
 
 
-def centres(images, noise):
+def centres(images, noise, sign=1.0):
     out = []
     for image in images:
         offset, sd = np.zeros(1), np.full(1, np.inf)
         _edge_kernels.dark_centres(
-            image, np.array([[30.0, 20.0]]), np.array([[1.0, 0.0]]), 8, np.array([4]), noise, offset, sd
-        )
+            image, np.array([[30.0, 20.0]]), np.array([[1.0, 0.0]]), 8, np.array([4]), np.array([sign]), noise,
+            offset, sd,
+        )  # fmt: skip
         out.append((offset[0], sd[0]))
     return np.array(out).T
+
+
+def patch_of(rng):
+    """A picture of smooth noise, and the template about its middle."""
+    grey = cv2.GaussianBlur(rng.standard_normal((60, 64)), (0, 0), 2.0)
+    picture = np.ascontiguousarray(grey / grey.std(), dtype=np.float32)
+    template = picture[24:35, 27:38].astype(float)
+    template = template - template.mean()
+    return picture, template / np.linalg.norm(template)
+
+
+def test_correlation_of_a_patch_is_opencv_s():
+    picture, template = patch_of(np.random.default_rng(1))
+    reach, score = 4, np.empty((9, 9))
+    assert _texture_kernels.correlations(picture, template, np.array([34.0, 31.0]), np.eye(2), reach, score)
+    window = picture[31 - 9 : 31 + 10, 34 - 9 : 34 + 10]
+    expected = cv2.matchTemplate(window, template.astype(np.float32), cv2.TM_CCOEFF_NORMED)
+    np.testing.assert_allclose(score, expected, atol=1e-5)
+    assert not _texture_kernels.correlations(picture, template, np.array([3.0, 31.0]), np.eye(2), reach, score)
+
+
+def test_a_patch_is_found_between_pixels_through_the_map_that_predicts_it():
+    picture, template = patch_of(np.random.default_rng(2))
+    turn = np.array([[0.96, -0.12], [0.1, 1.03]])
+    for off in ((0.3, -0.4), (-1.6, 1.2)):
+        # the frame shows the template's surroundings, turned, about (32 + off, 29 + off)
+        v, u = np.mgrid[:60, :64].astype(float)
+        back = np.stack([u - 32.0 - off[0], v - 29.0 - off[1]], axis=-1) @ np.linalg.inv(turn).T
+        maps = [(back[..., k] + (32.0, 29.0)[k]).astype(np.float32) for k in (0, 1)]
+        frame = cv2.remap(picture, *maps, cv2.INTER_CUBIC)
+        place, sd = np.empty((1, 2)), np.empty((1, 2))
+        _texture_kernels.find_patches(
+            frame, template[None], np.array([[32.0, 29.0]]), turn[None], np.eye(2)[None], (3, 0.8, 14.0), place, sd
+        )
+        # a small window's own energy changes as it is shifted, which moves a parabola's top by a tenth of a pixel
+        np.testing.assert_allclose(place[0], np.array([32.0, 29.0]) + off, atol=0.15)
+        assert (sd < 0.3).all()
 
 
 def test_a_dark_line_is_found_where_it_is_with_the_sd_its_noise_gives():
@@ -231,6 +270,9 @@ def test_a_dark_line_is_found_where_it_is_with_the_sd_its_noise_gives():
             plain_horizon.dip_centre(mark(place), (30.0, 20.0), (1.0, 0.0), 8, 4), abs=1e-9
         )
         assert found[0] == pytest.approx(place, abs=0.05)
+        pale = centres([2.0 * (90.0 + 0.8 * np.indices((40, 60))[1]) - mark(place)], 0.3, -1.0)[0]
+        assert pale[0] == pytest.approx(place, abs=0.05)
+        assert not np.isfinite(centres([mark(place)], 0.3, -1.0)[1][0])
     noise = 2.0
     found, sd = centres([mark(0.2, noise, seed) for seed in range(60)], noise)
     assert np.isfinite(sd).all()

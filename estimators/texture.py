@@ -1,0 +1,236 @@
+"""Where has the shell's own surface, whatever is painted on it, moved to in a frame?
+
+Patches of the benchmark frame's picture are the templates. A pixel of the oriented camera looks at one point of the
+undeflected shell (sphere tracing against the tori), and a patch, small and on one torus, is a piece of the plane that
+touches the shell there. For a deflection, the plane's points say how the patch appears: the frame is sampled through
+that affine map, and the template is searched in it by normalised cross correlation,
+
+    rho(e) = <T, S(e)> / (|T| |S(e)|),
+
+with the means removed: a change of exposure, of contrast or of a shadow's depth leaves it as it is. The highest
+correlation, refined by a parabola in two dimensions, is the patch's place. Its covariance is that of a fit of the
+template to itself in the noise that the correlation shows,
+
+    cov(e) = (1 - rho^2) / (rho^2 N) (-rho'' / rho)^-1,      N independent samples of the patch,
+
+which is large along a line, the aperture's problem, and small across it. Both pictures are band-passed before: shades
+of light go, and noise finer than the lens's blur.
+
+Assumed: the light moves. A shadow's edge in the benchmark frame does not come along with the shell; such patches find
+nothing in another frame, or disagree with the rest, and Huber's weights see to them. Patches across the limb of a torus
+or the centerbody are not taken.
+
+References
+----------
+B. D. Lucas, T. Kanade, "An iterative image registration technique", 1981. J. P. Lewis, "Fast normalized
+cross-correlation", 1995. J. Shi, C. Tomasi, "Good features to track", 1994. J. Immerkaer, "Fast noise variance
+estimation", 1996.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators import _texture_kernels
+from estimators.virtual_camera import VirtualCamera
+from flightmodel.camera import Camera
+from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.geometry import ShellGeometry, torus_circles
+
+Image = NDArray[np.uint8]
+Picture = NDArray[np.float32]
+
+HALF_PX = 7  # of a patch: at most a third of a torus as a camera on the centerbody sees it
+_FINE_PX, _COARSE_PX = 0.8, 2.0  # of the band-pass: the lens's blur, and less than the patch
+_CELL_PX = 12  # one patch at the most in a square of this size, so that they spread over the shell
+_STEP_M = 0.002  # along the touching plane, for the affine map
+_LEAST_CORRELATION = 0.8
+_QUIET, _ABOVE_NOISE, _LEAST_GREY = 0.1, 3.0, 0.3
+_BAND = 0.275  # of white noise that passes the band: root of (1/a^2 + 1/b^2 - 4/(a^2 + b^2)) / 4 pi of both blurs
+_LEAST_FACING = 0.3
+_INDEPENDENT_PX = 4.0 * np.pi * _FINE_PX**2  # area over which the band-pass correlates noise
+_SD_FLOOR_PX = 0.05
+_TRACE_STEPS, _TRACED_M = 80, 5e-4
+_BORDER_PX = 12
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points (n, 3) of the undeflected shell that pixels look at, m; their outward normals; torus, -1 for none."""
+
+    points_shell_m: FloatArray
+    normals: FloatArray
+    torus: NDArray[np.int64]
+
+
+def surface_seen(geometry: ShellGeometry, camera: Camera, pixels: FloatArray) -> SurfacePoints:
+    """Points of the undeflected shell that pixels ``(n, 2)`` look at, by sphere tracing.
+
+    The distance to the tori and to the centerbody bounds the next step along each ray.
+    """
+    rays = np.nan_to_num(camera.rays_body(pixels))
+    station, radius = torus_circles(geometry)
+    eye, minor = camera.position_body_m, geometry.torus_minor_radius_m
+    # the lens may sit on the skin itself
+    skin = min(geometry.centerbody_radius_m, float(np.hypot(eye[1], eye[2])) - 1e-3)
+    along, n = np.full(len(rays), 0.02), len(rays)
+    nearest, off = np.zeros(n, dtype=np.int64), np.full(n, np.inf)
+    body = np.zeros(n, dtype=np.bool_)
+    for _ in range(_TRACE_STEPS):
+        p = eye + along[:, None] * rays
+        r = np.hypot(p[:, 1], p[:, 2])
+        to_tori = np.hypot(-p[:, :1] - station, r[:, None] - radius) - minor
+        nearest = np.argmin(to_tori, axis=1)
+        off = to_tori[np.arange(n), nearest]
+        body |= r < skin
+        along = along + np.where(body | (along > 10.0 * geometry.base_radius_m), 0.0, off)
+    hit = ~body & (off < _TRACED_M) & np.isfinite(rays).all(axis=1) & (np.linalg.norm(rays, axis=1) > 0.5)
+    p = eye + along[:, None] * rays
+    r = np.hypot(p[:, 1], p[:, 2])
+    aft, out = -p[:, 0] - station[nearest], r - radius[nearest]
+    normal = np.column_stack([-aft, out * p[:, 1] / r, out * p[:, 2] / r]) / minor
+    return SurfacePoints(p, normal, np.where(hit, nearest, -1))
+
+
+def band_passed(image: Image) -> Picture:
+    """Picture without shades and without noise finer than the lens's blur."""
+    grey = image.astype(np.float32)
+    fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sd) for sd in (_FINE_PX, _COARSE_PX))
+    return fine - coarse
+
+
+@dataclass(frozen=True)
+class TrackedTexture:
+    """Patches of the benchmark frame, two rows each: the directions in which a patch's place is sharp and less sharp.
+
+    Parameters
+    ----------
+    points_shell_m : (2 n, 3) float
+        Middle of each row's patch on the undeflected shell, from the datum.
+    across_px : (2 n, 2) float
+        Unit vectors in the picture.
+    tangents_shell : (n, 2, 3) float
+        Unit vectors along the shell.
+    templates : (n, 15, 15) float32
+        Of mean zero and norm one.
+    to_tangents : (n, 2, 2) float
+        From an offset in the benchmark's picture to metres along the tangents.
+    """
+
+    points_shell_m: FloatArray
+    across_px: FloatArray
+    tangents_shell: FloatArray = field(repr=False)
+    templates: FloatArray = field(repr=False)
+    to_tangents: FloatArray = field(repr=False)
+
+    def find(
+        self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Place (2 n,) of each row along its direction, px, and its sd; infinite where the patch was not found.
+
+        ``deformation`` (3,) predicts where it is looked for, within ``reach_px`` of the benchmark's picture.
+        """
+        middle, affine = self._predicted(view, deformation)
+        place, sd = np.zeros((len(middle), 2)), np.full((len(middle), 2), np.inf)
+        samples = (2 * HALF_PX + 1) ** 2 / _INDEPENDENT_PX
+        limits = (reach_px, _LEAST_CORRELATION, samples)
+        across = self.across_px.reshape(-1, 2, 2)
+        _texture_kernels.find_patches(band_passed(image), self.templates, middle, affine, across, limits, place, sd)
+        return place.ravel(), np.hypot(sd.ravel(), _SD_FLOOR_PX)
+
+    def _predicted(self, view: VirtualCamera, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Middle (n, 2) of each patch in the frame, and the map (n, 2, 2) from offsets in the benchmark's picture."""
+        points = self.points_shell_m[::2]
+        n = len(points)
+        beside = (points[:, None] + _STEP_M * self.tangents_shell).reshape(-1, 3)
+        pixels = view.sight(np.concatenate([points, beside]), deformation).pixels
+        middle = pixels[:n]
+        per_m = (pixels[n:].reshape(n, 2, 2) - middle[:, None]).transpose(0, 2, 1) / _STEP_M
+        return middle, per_m @ self.to_tangents
+
+
+def texture_of(view: VirtualCamera, benchmark: Image) -> TrackedTexture:
+    """Patches of the shell in a benchmark frame that show something, spread over what is in view.
+
+    Parameters
+    ----------
+    view : VirtualCamera
+        As oriented on this frame.
+    benchmark : (h, w) uint8
+    """
+    picture = band_passed(benchmark)
+    pixels = _spread_corners(benchmark, picture, _on_one_torus(view, benchmark.shape))
+    seen = surface_seen(view.geometry, view.camera, pixels.astype(float))
+    good = (seen.torus >= 0) & (seen.normals[:, 0] < 0.0)
+    pixels, points, normals = pixels[good], seen.points_shell_m[good], seen.normals[good]
+    towards = view.camera.position_body_m - points
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    facing = np.einsum("ni,ni->n", towards, normals) > _LEAST_FACING
+    pixels, points, normals = pixels[facing], points[facing], normals[facing]
+    n = len(pixels)
+    round_ = np.column_stack([np.zeros(n), -points[:, 2], points[:, 1]])
+    round_ /= np.linalg.norm(round_, axis=1, keepdims=True)
+    tangents = np.stack([round_, np.cross(normals, round_)], axis=1)
+    around = np.arange(-HALF_PX, HALF_PX + 1)
+    templates = picture[pixels[:, 1, None, None] + around[:, None], pixels[:, 0, None, None] + around]
+    across = np.array([_sharp_directions(t) for t in templates]).reshape(-1, 2)
+    templates = templates - templates.mean(axis=(1, 2), keepdims=True)
+    templates = (templates / np.linalg.norm(templates, axis=(1, 2), keepdims=True)).astype(np.float64)
+    points = np.repeat(points, 2, axis=0)
+    unit = np.tile(np.eye(2), (n, 1, 1))
+    texture = TrackedTexture(points, across, tangents, templates, unit)
+    _, per_m = texture._predicted(view, np.zeros(3))
+    return TrackedTexture(points, across, tangents, templates, np.asarray(np.linalg.inv(per_m), dtype=float))
+
+
+def _on_one_torus(view: VirtualCamera, shape: tuple[int, ...]) -> BoolArray:
+    """Mask (h, w) of pixels round which a whole patch shows one torus of the undeflected shell."""
+    h, w = shape
+    step = 4  # px between rays: tori are tens of pixels wide
+    u, v = np.meshgrid(np.arange(0, w, step), np.arange(0, h, step))
+    seen = surface_seen(view.geometry, view.camera, np.column_stack([u.ravel(), v.ravel()]).astype(float))
+    torus = seen.torus.reshape(u.shape).astype(np.float32)
+    kernel = np.ones((2 * (-(-HALF_PX // step)) + 1,) * 2, np.uint8)
+    same = (cv2.erode(torus, kernel) == cv2.dilate(torus, kernel)) & (torus >= 0.0)
+    mask = cv2.resize(same.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
+    margin = HALF_PX + _BORDER_PX
+    out = np.zeros(shape, dtype=np.bool_)
+    out[margin:-margin, margin:-margin] = mask[margin:-margin, margin:-margin] > 0
+    return out
+
+
+def _spread_corners(image: Image, picture: Picture, mask: BoolArray) -> NDArray[np.int64]:
+    """Pixels (n, 2) of the strongest corner in every cell of a grid, where there is one to be seen."""
+    if not mask.any():
+        return np.zeros((0, 2), dtype=np.int64)
+    size = 2 * HALF_PX + 1
+    level = np.sqrt(np.maximum(cv2.blur(picture**2, (size, size)), 0.0))
+    # the quietest places show what the recording alone makes of a smooth surface, where there is one
+    quietest = float(np.quantile(level[mask], _QUIET))
+    noise = max(min(quietest, _BAND * noise_of(image)), _LEAST_GREY)
+    strength = np.where(mask & (level > _ABOVE_NOISE * noise), cv2.cornerMinEigenVal(picture, size, 3), -1.0)
+    chosen = []
+    for top in range(0, mask.shape[0], _CELL_PX):
+        for left in range(0, mask.shape[1], _CELL_PX):
+            cell = strength[top : top + _CELL_PX, left : left + _CELL_PX]
+            v, u = np.unravel_index(int(np.argmax(cell)), cell.shape)
+            if cell[v, u] > 0.0:
+                chosen.append((left + u, top + v))
+    return np.array(chosen, dtype=np.int64).reshape(-1, 2)
+
+
+def noise_of(image: Image) -> float:
+    """Rms of a picture's noise from pixel to pixel, grey levels, by a mask that is blind to slopes and bends."""
+    second = cv2.filter2D(image.astype(np.float32), cv2.CV_32F, np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32))
+    return 1.4826 * float(np.median(np.abs(second))) / 6.0
+
+
+def _sharp_directions(template: Picture) -> FloatArray:
+    """Unit vectors (2, 2) of a patch's structure tensor, the sharper first."""
+    gv, gu = np.gradient(template.astype(float))
+    tensor = np.array([[np.sum(gu * gu), np.sum(gu * gv)], [np.sum(gu * gv), np.sum(gv * gv)]])
+    return np.asarray(np.linalg.eigh(tensor)[1].T[::-1])

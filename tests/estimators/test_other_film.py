@@ -1,0 +1,177 @@
+"""Film that another renderer made, of a shell painted otherwise; and what is refused where edge and features disagree.
+
+Frames: tests/data/README.md.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from estimators.benchmark import orient_camera, samples_together
+from estimators.camera import JointSwing, read_film, without_jumps, without_lost_features
+from estimators.camera_fit import FrameFit, _NoFitError
+from estimators.edge import is_coherent, no_horizon, steps_near
+from estimators.features import no_features
+from estimators.virtual_camera import deformation_of
+from flightmodel.checks import NO_FAULT
+from flightmodel.vehicle import read_vehicle
+from postflight.checks.benchmark_frame import benchmark_frame
+from postflight.deflections import joint_swing
+from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film
+
+FRAMES = Path(__file__).parents[1] / "data" / "other_film"
+TRUTH = pd.read_csv(FRAMES / "truth.csv")
+
+
+def footage(look):
+    """Frames of a look, and the truth in them."""
+    rows = TRUTH[TRUTH.frame.str.startswith(look)]
+    return [cv2.imread(str(FRAMES / name), cv2.IMREAD_GRAYSCALE) for name in rows.frame], rows
+
+
+def shell(features):
+    return GEOMETRY.model_copy(update={"features": features})
+
+
+@pytest.mark.parametrize("look", ["clean", "flown"])
+@pytest.mark.parametrize("stated", ["texture", "drawn"])
+def test_another_paint_is_read_by_its_texture_whatever_the_vehicle_file_states(look, stated):
+    frames, rows = footage(look)
+    read = read_film(rows.t_s.to_numpy(), frames, shell(stated), MOUNT, JOINT_M, plane_lv_rad=None)
+    history = read.history()
+    assert (read.oriented.stated_refused != "") == (stated == "drawn")
+    assert ("not used" in history.assumptions) == (stated == "drawn")
+    assert "the shell's texture" in history.assumptions
+    assert read.fits[1].features > 60
+    error = history.theta_rad[1] - D(rows.theta_deg.iloc[1])
+    # the benchmark frame's own 0.12 deg among it
+    assert abs(error) < D(0.25)
+    assert abs(error) < 3.0 * history.theta_sd_rad[1]
+
+
+def test_the_edge_alone_answers_where_it_is_whole_and_is_refused_where_clouds_lie_behind_it():
+    frames, rows = footage("clean")
+    read = read_film(rows.t_s.to_numpy(), frames, shell("none"), MOUNT, JOINT_M, plane_lv_rad=None)
+    assert read.fits[1].features == 0
+    assert abs(read.history().theta_rad[1] - D(rows.theta_deg.iloc[1])) < D(0.4)
+    half = np.where(np.arange(720) < 300, frames[1], 0).astype(np.uint8)
+    assert read.oriented.fit(half).refused.code in {"edge-too-short", "edge-points-too-few"}
+    clouded = orient_camera(footage("flown")[0][0], shell("none"), MOUNT, JOINT_M)
+    assert clouded.fit(footage("flown")[0][1]).refused
+
+
+def test_where_features_contradict_the_edge_it_counts_if_it_is_whole():
+    frames = film(5, [0.0, 3.0], [0.0, 188.0])
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    answer = oriented.fit(frames[1])
+    true = np.array([*answer.rotation_yz_rad, 0.0])
+    for off_deg, contradicts in ((0.0, False), (0.7, True), (3.0, True)):
+        said = true + deformation_of(D(off_deg), D(153.0))
+        points = oriented.features.points_shell_m
+        where = np.einsum("ni,ni->n", oriented.view.sight(points, said).pixels, oriented.features.across_px)
+        place = where, np.full(len(where), 0.1)
+        moved = said.copy()
+        # the edge is searched where the features say that it is
+        near = steps_near(frames[1], oriented.view.lines_at(oriented.clocks_rad, said))
+        both = oriented._solve(near, place, moved, np.eye(2), 9.0)
+        last = oriented._reconciled(frames[1], near, place, moved, both)
+        assert (last is not both) == contradicts
+        np.testing.assert_allclose(moved[:2], true[:2], atol=D(0.25))
+    half = np.where(np.arange(720) > 300, frames[1], 0).astype(np.uint8)
+    short = steps_near(half, oriented.view.lines_at(oriented.clocks_rad, true))
+    moved = said.copy()
+    both = oriented._solve(short, place, moved, np.eye(2), 9.0)
+    with pytest.raises(_NoFitError) as refusal:
+        oriented._reconciled(half, short, place, moved, both)
+    assert refusal.value.codes == ("features-contradict-edge",)
+
+
+def answers(theta_deg):
+    sd = D(0.05)
+    fits = [
+        FrameFit(D(np.array([theta, 0.0])), sd**2 * np.eye(2), np.eye(2), 0.0, 0.0, 0.3, 100, no_horizon(NO_FAULT))
+        for theta in theta_deg
+    ]
+    return fits
+
+
+def test_a_frame_that_lost_the_features_of_the_others_is_refused():
+    fits = answers([1.0, 2.0, 3.0, 2.5])
+    lost = [replace(fit, features=0) if k == 2 else fit for k, fit in enumerate(fits)]
+    assert [fit.refused for fit in without_lost_features(fits)] == [""] * 4
+    assert [
+        k for k, fit in enumerate(without_lost_features(lost)) if getattr(fit.refused, "code", "") == "features-lost"
+    ] == [2]
+    bare = [replace(fit, features=0) for fit in fits]
+    assert not any(fit.refused for fit in without_lost_features(bare))
+
+
+def test_a_jump_that_no_swing_makes_is_refused_and_a_swing_is_not():
+    swing = JointSwing(2.5, 0.02)
+    t = np.arange(30) / 30.0
+    theta = 3.0 + 2.5 * np.sin(2.0 * np.pi * 2.5 * t)
+    assert not any(fit.refused for fit in without_jumps(t, answers(theta), swing))
+    theta[12] += 6.0
+    refused = [k for k, fit in enumerate(without_jumps(t, answers(theta), swing)) if fit.refused]
+    assert refused == [12]
+    assert without_jumps(t, answers(theta), swing)[12].refused.code == "jump-too-fast"
+    # frames a second apart: half a period has passed, and only the overshoot bounds them
+    assert not any(fit.refused for fit in without_jumps(30.0 * t, answers(theta), swing))
+
+
+def test_a_swing_goes_no_farther_than_a_load_put_on_at_once():
+    level, t = D(2.0), np.linspace(0.0, 1.0, 400)
+    for zeta in (0.01, 0.3):
+        swing = JointSwing(2.5, zeta)
+        w = 2.0 * np.pi * 2.5
+        damped = w * np.sqrt(1.0 - zeta**2)
+        x = level * (1.0 - np.exp(-zeta * w * t) * (np.cos(damped * t) + zeta * w / damped * np.sin(damped * t)))
+        for steps in (3, 20, 90):
+            change = np.abs(x[steps:] - x[:-steps]).max()
+            assert change <= swing.largest_change(np.array([level]), np.array([t[steps]]))[0] * 1.001
+    vehicle = read_vehicle("irve2_reference")
+    own = joint_swing(vehicle)
+    assert own is not None
+    assert own.frequency_hz == vehicle.free_free_frequency_hz()
+
+
+def test_clouds_are_no_coherent_edge():
+    rng = np.random.default_rng(0)
+    line = np.arange(200)
+    smooth = 0.5 * np.sin(line / 30.0) + 0.1 * rng.standard_normal(200)
+    assert is_coherent(line, smooth).mean() > 0.97
+    assert is_coherent(line, rng.uniform(-4.5, 4.5, 200)).mean() < 0.1
+    assert not is_coherent(line, np.where(line == 50, np.nan, smooth))[50]
+
+
+def test_neighbours_that_err_together_are_counted():
+    rng = np.random.default_rng(1)
+    alone = rng.standard_normal(4000)
+    assert samples_together(alone) == pytest.approx(1.0, abs=0.3)
+    # Gauss-Markov: (1 + rho) / (1 - rho) samples are one
+    walk = np.zeros(4000)
+    for k in range(1, 4000):
+        walk[k] = 0.8 * walk[k - 1] + alone[k]
+    assert samples_together(walk) == pytest.approx(9.0, rel=0.35)
+
+
+def found(picture, features):
+    frames = SimpleNamespace(time_s=np.array([421.0]), benchmark=0, picture=lambda _k: picture, camera=MOUNT)
+    vehicle = replace(read_vehicle("irve2_reference"), geometry=shell(features))
+    return SimpleNamespace(frames=frames, vehicle=vehicle)
+
+
+def test_check_tries_the_benchmark_frame():
+    picture = footage("clean")[0][0]
+    assert benchmark_frame(found(picture, "texture")) == []
+    (remark,) = benchmark_frame(found(picture, "drawn"))
+    assert remark.code == "features-not-found"
+    (remark,) = benchmark_frame(found(np.zeros((480, 720), dtype=np.uint8), "texture"))
+    assert remark.code == "frame-dark"
+    assert benchmark_frame(SimpleNamespace(frames=None, vehicle=None)) == []
+    assert len(no_features().points_shell_m) == 0

@@ -1,0 +1,88 @@
+"""The shell's own texture as a measurement: where a pixel looks, how a patch is found, and what its sd says."""
+
+import cv2
+import numpy as np
+import pytest
+
+from estimators.texture import surface_seen, texture_of
+from estimators.virtual_camera import VirtualCamera, deformation_of, render
+from flightmodel.camera import camera_from_mount
+from flightmodel.geometry import vehicle_meshes
+from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D
+
+VIEW = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
+
+
+def cloth(rng, shape=(480, 720)):
+    """Random texture a few pixels wide."""
+    grey = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), 2.0)
+    return np.clip(120.0 + 30.0 * grey / grey.std(), 0, 255).astype(np.uint8)
+
+
+def test_a_pixel_looks_at_the_surface_that_rasterised_triangles_show():
+    pixels = np.random.default_rng(0).uniform([20.0, 20.0], [700.0, 460.0], (400, 2))
+    seen = surface_seen(GEOMETRY, VIEW.camera, pixels)
+    hit = seen.torus >= 0
+    assert 0.3 < hit.mean() < 0.95
+    np.testing.assert_allclose(VIEW.sight(seen.points_shell_m[hit], np.zeros(3)).pixels, pixels[hit], atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(seen.normals[hit], axis=1), 1.0, atol=0.01)
+    away = np.linalg.norm(seen.points_shell_m - VIEW.camera.position_body_m, axis=1)
+    meshes = vehicle_meshes(GEOMETRY, 240, 48)
+    tori = [mesh for name, mesh in meshes.items() if name.startswith("torus")] + [meshes["centerbody"]]
+    start = np.cumsum([0] + [len(mesh.vertices) for mesh in tori])
+    faces = np.concatenate([mesh.faces + first for mesh, first in zip(tori, start, strict=False)])
+    depth = render(VIEW.camera, np.concatenate([mesh.vertices for mesh in tori]), faces).depth_m
+    u, v = np.rint(pixels).astype(int).T
+    same = np.abs(depth[v, u] - away)[hit] < 0.03  # a pixel beside a limb shows the torus behind
+    assert same.mean() > 0.93
+
+
+def warped(picture, deformation):
+    """The picture as the camera sees it when its texture comes along with the deflected shell."""
+    v, u = np.mgrid[:480, :720].astype(float)
+    seen = surface_seen(GEOMETRY, VIEW.camera, np.column_stack([u.ravel(), v.ravel()]))
+    there = VIEW.sight(seen.points_shell_m, deformation).pixels - VIEW.sight(seen.points_shell_m, np.zeros(3)).pixels
+    moved = np.where((seen.torus >= 0)[:, None] & np.isfinite(there), there, 0.0).reshape(480, 720, 2)
+    back = np.zeros_like(moved)
+    for _ in range(6):  # where a pixel's content came from
+        back = np.stack(
+            [
+                cv2.remap(
+                    np.ascontiguousarray(moved[..., k]).astype(np.float32),
+                    (u - back[..., 0]).astype(np.float32), (v - back[..., 1]).astype(np.float32), cv2.INTER_LINEAR,
+                )
+                for k in (0, 1)
+            ],
+            axis=-1,
+        )  # fmt: skip
+    return cv2.remap(
+        picture, (u - back[..., 0]).astype(np.float32), (v - back[..., 1]).astype(np.float32), cv2.INTER_CUBIC
+    )
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.5])
+def test_texture_is_found_where_the_deflected_shell_has_it_whatever_the_exposure(gain):
+    rng = np.random.default_rng(2)
+    picture = cloth(rng)
+    texture = texture_of(VIEW, picture)
+    assert len(texture.templates) > 300
+    deformation = deformation_of(D(3.0), D(190.0))
+    frame = np.clip(gain * warped(picture, deformation) + rng.normal(0.0, 2.0, picture.shape), 0, 255).astype(np.uint8)
+    place, sd = texture.find(VIEW, frame, deformation_of(D(2.8), D(188.0)), 3)
+    found = np.isfinite(sd)
+    assert found.mean() > 0.5
+    true = np.einsum("ni,ni->n", VIEW.sight(texture.points_shell_m, deformation).pixels, texture.across_px)
+    off = (place - true)[found]
+    assert np.median(np.abs(off)) < 0.15
+    assert abs(np.median(off)) < 0.02
+    # on a film in moving light, where patches differ by more than noise, the sd is right; in white noise, which a
+    # template averages better than the band-pass correlates it, up to three times too large
+    assert 0.3 < np.median(np.abs(off) / sd[found]) / 0.6745 < 1.2
+
+
+def test_noise_alone_is_no_texture():
+    rng = np.random.default_rng(3)
+    texture = texture_of(VIEW, cloth(rng))
+    _, sd = texture.find(VIEW, cloth(np.random.default_rng(4)), np.zeros(3), 3)
+    assert np.isfinite(sd).mean() < 0.01
+    assert len(texture_of(VIEW, np.full((480, 720), 90, dtype=np.uint8)).templates) == 0
