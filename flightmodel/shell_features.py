@@ -16,14 +16,17 @@ Assumed: the undeflected shell, station aft of the nose; a point lies on the aft
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.geometry import FEATURE_KINDS, ListedFeatures, ShellGeometry, revolved, torus_circles
 from flightmodel.tables import line_of, numbers, read_table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SHADES = ("darker", "paler")
 NUMBERS = ("station_m", "radius_m", "clock_lv_deg", "width_m")
