@@ -510,11 +510,21 @@ def corrected_series(
     return t, specific_force, correct(measured_rate, errors[:, 9:18], problem.motion.dcm_body_rate)
 
 
+def _force_partials(problem: Problem, states: States) -> FloatArray:
+    """Partials (k, 3, 9) of the corrected specific force at kept nodes by the accelerometer's errors."""
+    measured = problem.motion.force_sensor_mps2[problem.node_index[problem.kept]]
+    return correction_partials(measured, states.sensor_errors[problem.kept, 0:9], problem.motion.dcm_body_force)
+
+
+def _rate_partials(problem: Problem, states: States) -> FloatArray:
+    """Partials (k, 3, 9) of the corrected rates at kept nodes by the gyros' errors."""
+    measured = problem.motion.rate_sensor_radps[problem.node_index[problem.kept]]
+    return correction_partials(measured, states.sensor_errors[problem.kept, 9:18], problem.motion.dcm_body_rate)
+
+
 def specific_force_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
     """Systematic error covariance (k, 3, 3) of the corrected specific force at kept nodes, body axes, (m/s^2)^2."""
-    kept = np.flatnonzero(problem.kept)
-    measured = problem.motion.force_sensor_mps2[problem.node_index[kept]]
-    partials = correction_partials(measured, states.sensor_errors[kept, 0:9], problem.motion.dcm_body_force)
+    partials = _force_partials(problem, states)
     covariance = unpacked(triangles, 18)[:, 9:18, 9:18]
     return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
 
@@ -526,11 +536,8 @@ def accelerometer_root(problem: Problem, states: States, triangles: FloatArray) 
     the corrected specific force, the upper rows are the part of the attitude's error correlated with them.
     Gauss-Markov errors are taken as they are at mid-span.
     """
-    kept = np.flatnonzero(problem.kept)
-    measured = problem.motion.force_sensor_mps2[problem.node_index[kept]]
-    partials = correction_partials(measured, states.sensor_errors[kept, 0:9], problem.motion.dcm_body_force)
     attitude, root = _constant_errors(unpacked(triangles, 18))
-    return np.concatenate([attitude, partials @ root], axis=1)
+    return np.concatenate([attitude, _force_partials(problem, states) @ root], axis=1)
 
 
 def _constant_errors(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -547,20 +554,14 @@ def triad_root(problem: Problem, states: States, triangles: FloatArray) -> Float
     As `accelerometer_root`, of the constant errors of accelerometer and gyros together: what a gyro's mounting does to
     the attitude rolls with the vehicle.
     """
-    kept = np.flatnonzero(problem.kept)
-    node = problem.node_index[kept]
-    motion, errors = problem.motion, states.sensor_errors[kept]
-    force = correction_partials(motion.force_sensor_mps2[node], errors[:, 0:9], motion.dcm_body_force)
-    rate = correction_partials(motion.rate_sensor_radps[node], errors[:, 9:18], motion.dcm_body_rate)
+    force, rate = _force_partials(problem, states), _rate_partials(problem, states)
     attitude, root = _constant_errors(unpacked(triangles, 27))
     return np.concatenate([attitude, force @ root[0:9], rate @ root[9:18]], axis=1)
 
 
 def rate_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
     """Systematic error covariance (k, 3, 3) of the corrected rates at kept nodes, body axes, (rad/s)^2."""
-    kept = np.flatnonzero(problem.kept)
-    measured = problem.motion.rate_sensor_radps[problem.node_index[kept]]
-    partials = correction_partials(measured, states.sensor_errors[kept, 9:18], problem.motion.dcm_body_rate)
+    partials = _rate_partials(problem, states)
     covariance = unpacked(triangles, 27)[:, 18:27, 18:27]
     return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
 
