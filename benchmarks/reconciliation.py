@@ -31,9 +31,9 @@ from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.flight import Flight
+from postflight.reconciliation.command import Reconciliation
 from postflight.reconciliation.credibility import credibility
 from postflight.reconciliation.fit import select_laws
-from postflight.reconciliation.modes import stiffness_from_modes
 from postflight.reconciliation.posterior import deflection_of, joint_table, stiffness_bound
 from postflight.reconstruction import reconstruct
 from synthetic_flight.folder import simulate_to_folder
@@ -98,10 +98,8 @@ def errors(found, vehicle, factors):
 
 def modal_errors(flight, vehicle, fit):
     """Error and sd of the log stiffness by the joint's frequency; NaN where the mode is not seen."""
-    if stiffness_bound(fit) is not None:
-        return [np.nan, np.nan]
     try:
-        found = stiffness_from_modes(flight, fit.vehicle.joint.bending_stiffness_nmprad)
+        found = Reconciliation(flight, fit).modal_stiffness()
     except GateError as fault:
         print(f"  {fault}")
         return [np.nan, np.nan]

@@ -230,7 +230,8 @@ class AtmosphereParameters:
     def _sounded(self) -> tuple[FloatArray, FloatArray]:
         table = simulate.atmosphere_table(profile_from_sounding(self.sounding))
         rows = simulate.ATMOSPHERE_START_M + simulate.ATMOSPHERE_STEP_M * np.arange(len(table), dtype=np.float64)
-        return table, np.asarray(rows)
+        passed = rows <= TOP_M  # of a table a knot, each copied for every flight, three quarters lie above
+        return table[passed], rows[passed]
 
     def table(self, difference: FloatArray, warmer_k: FloatArray) -> FloatArray:
         """Kernel table (rows, 6) of the atmosphere, of differences (3, k) and (n,)."""
@@ -261,9 +262,8 @@ MOST_PHASE_RAD = 0.8  # of a joint's mode in a step, with an error of a percent 
 # damping ratio of a mode that windows do not resolve: its oscillation decays within a few windows, and deflections lag
 # their load by few milliseconds. From so many periods a window (10.7 Hz) it grows, over so many more (to 12.5 Hz)
 UNRESOLVED_RATIO, UNRESOLVED_FROM, UNRESOLVED_BLEND = 0.2, 0.43, 0.07
-RESOLVED = (
-    0.41  # periods a window (10.2 Hz) up to which a stiffness can be resolved: a fit of a faster joint ends at the next
-)
+# periods a window (10.2 Hz) up to which a stiffness can be found: a fit of a faster joint ends at the next
+RESOLVED = 0.41
 
 
 @dataclass(frozen=True)

@@ -209,12 +209,12 @@ class Problem:
     def _sd_factors(self) -> FloatArray:
         return np.asarray(np.broadcast_to(self.sd_factor, self.measured.spans))
 
-    def nearby_knots(self, span: int, knots_m: FloatArray) -> list[int]:
-        """Knots of the atmosphere that a span passes."""
+    def _passed(self, knots_m: FloatArray) -> list[Index]:
+        """Numbers of the knots (k,) that each span passes."""
         z = self.measured.altitude_m
-        reach = 0.55 * np.abs(np.gradient(z)[span]) + 50.0
+        reach = 0.55 * np.abs(np.gradient(z)) + 50.0
         apart = np.diff(knots_m, append=2 * knots_m[-1] - knots_m[-2])
-        return np.flatnonzero(np.abs(knots_m - z[span]) < reach + apart).tolist()
+        return [np.flatnonzero(np.abs(knots_m - at) < r + apart) for at, r in zip(z, reach, strict=True)]
 
     def first_precision(self, rows: slice) -> FloatArray:
         """Inverse covariance (3, 3) of the reconstructed path at the first start."""
@@ -341,8 +341,8 @@ class Problem:
             motion = u.motion[span]
             rows += [(span, j, motion, 0) for j in range(v)]
             rows += [(span, v, motion + d, 0) for d in np.diag(MOTION_STEP)]
-            near = self._nearby_air(span)
-            rows += [(span, v, motion, 1 + k) for k in near]
+            near = self._nearby_air[span]
+            rows += [(span, v, motion, 1 + k) for k in near.tolist()]
             own = self.first_motion + MOTION * span + np.arange(MOTION)
             columns.append(np.array([*range(v), *own, *air_columns[near]]))
             steps.append(np.array([*([VEHICLE_STEP] * v), *MOTION_STEP, *air_steps[near]]))
@@ -364,12 +364,12 @@ class Problem:
             steps.append(WARMTH_STEP_K)
         return tables, self.first_instrument + INSTRUMENTS + np.arange(len(steps)), np.array(steps)
 
-    def _nearby_air(self, span: int) -> list[int]:
-        """Parameters of the air, counted from its first, that a span feels."""
+    @cached_property
+    def _nearby_air(self) -> list[Index]:
+        """Parameters of the air, counted from its first, that each span feels."""
         knots = len(self.air.knots_m)
-        near = self.nearby_knots(span, self.air.knots_m)
-        warm = self.nearby_knots(span, self.air.temperature_knots_m)
-        return [*(kind * knots + k for kind in range(3) for k in near), *(3 * knots + k for k in warm)]
+        by_span = zip(self._passed(self.air.knots_m), self._passed(self.air.temperature_knots_m), strict=True)
+        return [np.concatenate([near, knots + near, 2 * knots + near, 3 * knots + warm]) for near, warm in by_span]
 
     def _priors(self, u: Parameters) -> list[tuple[slice, FloatArray, FloatArray]]:
         """Columns of parameters, their a priori inverse covariance, their values."""

@@ -105,10 +105,10 @@ def stiffness_from_modes(flight: Reconstruction, about_nmprad: float) -> ModalSt
     jackknife = np.array([_peak(np.delete(power, part, axis=1).mean(axis=1)) for part in parts])
     scatter = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((jackknife - jackknife.mean()) ** 2))
     factor = about * float(np.exp(best))
-    _check_spin(flight, _frequencies(_stiffer(nominal, factor), flow)[1], t)
+    aerodynamic, joint = _frequencies(_stiffer(nominal, factor), flow)
+    _check_spin(flight, joint, t)
     sd = float(np.hypot(scatter, _vehicle_sd(nominal, factor, flow)))
     stiffness = nominal.joint.bending_stiffness_nmprad * factor
-    aerodynamic, joint = _frequencies(_stiffer(nominal, factor), flow)
     order = np.argsort(frequency)
     return ModalStiffness(
         stiffness, stiffness * sd, t, frequency[order], log_power[:, order], joint, aerodynamic, FACTORS, mean_log_power
