@@ -39,6 +39,7 @@ from flightmodel.geometry import (
     FEATURE_KINDS,
     ListedFeatures,
     aft_profile,
+    circumferential,
     dot_positions,
     revolved,
     seam_clocks_rad,
@@ -149,9 +150,8 @@ def _listed(view: VirtualCamera, listed: ListedFeatures) -> ImageFeatures:
     visible = _in_view(view, listed.points_shell_m, listed.normals)
     points, normals, kind = listed.points_shell_m[visible], listed.normals[visible], listed.kind[visible]
     width, sign = listed.width_m[visible], np.where(listed.is_paler[visible], -1.0, 1.0)
-    round_ = np.column_stack([np.zeros(len(points)), -points[:, 2], points[:, 1]])
-    round_ /= np.linalg.norm(round_, axis=1, keepdims=True)
-    along = np.where((kind == FEATURE_KINDS.index("seam"))[:, None], np.cross(normals, round_), round_)
+    round_shell = circumferential(points)
+    along = np.where((kind == FEATURE_KINDS.index("seam"))[:, None], np.cross(normals, round_shell), round_shell)
     ends = [view.sight(points + side * _ALONG_M * along, np.zeros(3)).pixels for side in (-1.0, 1.0)]
     tangent = ends[1] - ends[0]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -275,9 +275,7 @@ def _unhidden(view: VirtualCamera, points: FloatArray, wanted: BoolArray) -> Boo
     for s_i, r_i in zip(station, radius, strict=True):
         # what is looked at may lie on the very limb
         clear &= (np.hypot(s - s_i, r - r_i) > view.geometry.torus_minor_radius_m - _GRAZING_M).all(axis=0)
-    # the lens may sit on the skin itself
-    skin = min(view.geometry.centerbody_radius_m, float(np.hypot(eye[1], eye[2])) - 1e-3)
-    clear &= (r > skin).all(axis=0)
+    clear &= (r > view.skin_m).all(axis=0)
     visible[visible] = clear
     return np.asarray(visible)
 

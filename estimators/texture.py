@@ -37,9 +37,8 @@ from numpy.typing import NDArray
 
 from estimators import _texture_kernels
 from estimators.virtual_camera import VirtualCamera
-from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray
-from flightmodel.geometry import ShellGeometry, torus_circles
+from flightmodel.geometry import circumferential, torus_circles
 
 Image = NDArray[np.uint8]
 Picture = NDArray[np.float32]
@@ -67,16 +66,15 @@ class SurfacePoints:
     torus: NDArray[np.int64]
 
 
-def surface_seen(geometry: ShellGeometry, camera: Camera, pixels: FloatArray) -> SurfacePoints:
+def surface_seen(view: VirtualCamera, pixels: FloatArray) -> SurfacePoints:
     """Points of the undeflected shell that pixels ``(n, 2)`` look at, by sphere tracing.
 
     The distance to the tori and to the centerbody bounds the next step along each ray.
     """
+    geometry, camera = view.geometry, view.camera
     rays = np.nan_to_num(camera.rays_body(pixels))
     station, radius = torus_circles(geometry)
     eye, minor = camera.position_body_m, geometry.torus_minor_radius_m
-    # the lens may sit on the skin itself
-    skin = min(geometry.centerbody_radius_m, float(np.hypot(eye[1], eye[2])) - 1e-3)
     along, n = np.full(len(rays), 0.02), len(rays)
     nearest, off = np.zeros(n, dtype=np.int64), np.full(n, np.inf)
     body = np.zeros(n, dtype=np.bool_)
@@ -86,7 +84,7 @@ def surface_seen(geometry: ShellGeometry, camera: Camera, pixels: FloatArray) ->
         to_tori = np.hypot(-p[:, :1] - station, r[:, None] - radius) - minor
         nearest = np.argmin(to_tori, axis=1)
         off = to_tori[np.arange(n), nearest]
-        body |= r < skin
+        body |= r < view.skin_m
         along = along + np.where(body | (along > 10.0 * geometry.base_radius_m), 0.0, off)
     hit = ~body & (off < _TRACED_M) & np.isfinite(rays).all(axis=1) & (np.linalg.norm(rays, axis=1) > 0.5)
     p = eye + along[:, None] * rays
@@ -164,7 +162,7 @@ def texture_of(view: VirtualCamera, benchmark: Image) -> TrackedTexture:
     """
     picture = band_passed(benchmark)
     pixels = _spread_corners(benchmark, picture, _on_one_torus(view, benchmark.shape))
-    seen = surface_seen(view.geometry, view.camera, pixels.astype(float))
+    seen = surface_seen(view, pixels.astype(float))
     good = (seen.torus >= 0) & (seen.normals[:, 0] < 0.0)
     pixels, points, normals = pixels[good], seen.points_shell_m[good], seen.normals[good]
     towards = view.camera.position_body_m - points
@@ -172,9 +170,8 @@ def texture_of(view: VirtualCamera, benchmark: Image) -> TrackedTexture:
     facing = np.einsum("ni,ni->n", towards, normals) > _LEAST_FACING
     pixels, points, normals = pixels[facing], points[facing], normals[facing]
     n = len(pixels)
-    round_ = np.column_stack([np.zeros(n), -points[:, 2], points[:, 1]])
-    round_ /= np.linalg.norm(round_, axis=1, keepdims=True)
-    tangents = np.stack([round_, np.cross(normals, round_)], axis=1)
+    round_shell = circumferential(points)
+    tangents = np.stack([round_shell, np.cross(normals, round_shell)], axis=1)
     around = np.arange(-HALF_PX, HALF_PX + 1)
     templates = picture[pixels[:, 1, None, None] + around[:, None], pixels[:, 0, None, None] + around]
     across = np.array([_sharp_directions(t) for t in templates]).reshape(-1, 2)
@@ -192,7 +189,7 @@ def _on_one_torus(view: VirtualCamera, shape: tuple[int, ...]) -> BoolArray:
     h, w = shape
     step = 4  # px between rays: tori are tens of pixels wide
     u, v = np.meshgrid(np.arange(0, w, step), np.arange(0, h, step))
-    seen = surface_seen(view.geometry, view.camera, np.column_stack([u.ravel(), v.ravel()]).astype(float))
+    seen = surface_seen(view, np.column_stack([u.ravel(), v.ravel()]).astype(float))
     torus = seen.torus.reshape(u.shape).astype(np.float32)
     kernel = np.ones((2 * (-(-HALF_PX // step)) + 1,) * 2, np.uint8)
     same = (cv2.erode(torus, kernel) == cv2.dilate(torus, kernel)) & (torus >= 0.0)

@@ -113,6 +113,11 @@ class VirtualCamera:
         return np.array([-self.joint_station_m, 0.0, 0.0])
 
     @property
+    def skin_m(self) -> float:
+        """Radius within which the centerbody hides what lies behind; the lens may sit on the skin itself."""
+        return min(self.geometry.centerbody_radius_m, float(np.hypot(*self.camera.position_body_m[1:])) - 1e-3)
+
+    @property
     def shell_terms(self) -> tuple[FloatArray, tuple[float, float, float], tuple[float, float], float]:
         """The shell in the compiled fit: see `estimators._fit_kernels.fit_frame`."""
         return self.clocks_rad, *self._circles, self.joint_station_m

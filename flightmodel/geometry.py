@@ -166,10 +166,16 @@ def forward_profile(geometry: ShellGeometry) -> FloatArray:
 
 
 def revolved(profile_station_radius_m: FloatArray, clock_lv_rad: FloatArray | float) -> FloatArray:
-    """Points ``(..., m, 3)`` in shell axes, m, of a meridian ``(m, 2)`` at clocking angles ``(...)``."""
+    """Points ``(..., m, 3)`` in shell axes, m, of a meridian ``(m, 2)``, or one each, at clocking angles ``(...)``."""
     outboard = lv_direction(np.asarray(clock_lv_rad, dtype=float))[..., None, :]
-    station, radius = profile_station_radius_m.T
-    return -station[:, None] * np.array([1.0, 0.0, 0.0]) + radius[:, None] * outboard
+    station, radius = np.moveaxis(profile_station_radius_m, -1, 0)
+    return -station[..., None] * np.array([1.0, 0.0, 0.0]) + radius[..., None] * outboard
+
+
+def circumferential(points_shell_m: FloatArray) -> FloatArray:
+    """Unit vectors ``(n, 3)`` about the shell's axis, right-handed, at points ``(n, 3)``, shell axes."""
+    about = np.cross([1.0, 0.0, 0.0], points_shell_m)
+    return np.asarray(about / np.linalg.norm(about, axis=1, keepdims=True))
 
 
 def seam_clocks_rad(geometry: ShellGeometry) -> FloatArray:

@@ -60,11 +60,15 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
     kind = _words(frame, "kind", FEATURE_KINDS, path, faults)
     shade = _words(frame, "shade", SHADES, path, faults)
     if not faults:
-        off = _off_surface_m(geometry, station, radius)
+        from_circle, away = _nearest_circle(geometry, station, radius)
         checks = (
             (np.isfinite(clock) & (np.abs(clock) <= 360.0), "clock_lv_deg", "an angle within 360 deg is wanted"),
             ((width > 0.0) & (width <= _WIDEST_M), "width_m", f"0 to {_WIDEST_M} m is wanted"),
-            (np.abs(off) <= _OFF_SURFACE_M, "radius_m", f"within {_OFF_SURFACE_M} m of a torus's surface is wanted"),
+            (
+                np.abs(away - geometry.torus_minor_radius_m) <= _OFF_SURFACE_M,
+                "radius_m",
+                f"within {_OFF_SURFACE_M} m of a torus's surface is wanted",
+            ),
         )
         for good, column, wanted in checks:
             if not good.all():
@@ -77,8 +81,10 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
     if faults:
         raise GateError(faults)
     at = np.deg2rad(clock)
-    points = revolved(np.column_stack([station, radius]), at)[np.arange(len(at)), np.arange(len(at))]
-    return ListedFeatures(points, _normals(geometry, station, radius, at), kind, width, shade == 1)
+    points, normals = (
+        _at_clocks(place, at) for place in (np.column_stack([station, radius]), from_circle / away[:, None])
+    )
+    return ListedFeatures(points, normals, kind, width, shade == 1)
 
 
 def _words(
@@ -95,7 +101,7 @@ def _words(
     return cells.map({word: k for k, word in enumerate(known)}).to_numpy(dtype=np.int64)
 
 
-def _nearest(geometry: ShellGeometry, station: FloatArray, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _nearest_circle(geometry: ShellGeometry, station: FloatArray, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Place (n, 2), station and radius, from the nearest torus's centre circle, and the distance from it, m."""
     centres = np.column_stack(torus_circles(geometry))
     away = np.column_stack([station, radius])[:, None] - centres
@@ -104,13 +110,6 @@ def _nearest(geometry: ShellGeometry, station: FloatArray, radius: FloatArray) -
     return place, np.asarray(np.linalg.norm(place, axis=1))
 
 
-def _off_surface_m(geometry: ShellGeometry, station: FloatArray, radius: FloatArray) -> FloatArray:
-    off = _nearest(geometry, station, radius)[1] - geometry.torus_minor_radius_m
-    return np.where(np.isfinite(off), off, np.inf)
-
-
-def _normals(geometry: ShellGeometry, station: FloatArray, radius: FloatArray, clock: FloatArray) -> FloatArray:
-    place, away = _nearest(geometry, station, radius)
-    both = place / away[:, None]
-    rows = np.arange(len(clock))
-    return revolved(both, clock)[rows, rows]
+def _at_clocks(station_radius: FloatArray, clock_rad: FloatArray) -> FloatArray:
+    """Vectors (n, 3) in shell axes of stations and radii (n, 2), each at its own clocking angle (n,)."""
+    return np.asarray(revolved(station_radius[:, None], clock_rad)[:, 0])

@@ -21,7 +21,7 @@ def cloth(rng, shape=(480, 720)):
 
 def test_a_pixel_looks_at_the_surface_that_rasterised_triangles_show():
     pixels = np.random.default_rng(0).uniform([20.0, 20.0], [700.0, 460.0], (400, 2))
-    seen = surface_seen(GEOMETRY, VIEW.camera, pixels)
+    seen = surface_seen(VIEW, pixels)
     hit = seen.torus >= 0
     assert 0.3 < hit.mean() < 0.95
     np.testing.assert_allclose(VIEW.sight(seen.points_shell_m[hit], np.zeros(3)).pixels, pixels[hit], atol=1e-3)
@@ -40,7 +40,7 @@ def test_a_pixel_looks_at_the_surface_that_rasterised_triangles_show():
 def warped(picture, deformation):
     """The picture as the camera sees it when its texture comes along with the deflected shell."""
     v, u = np.mgrid[:480, :720].astype(float)
-    seen = surface_seen(GEOMETRY, VIEW.camera, np.column_stack([u.ravel(), v.ravel()]))
+    seen = surface_seen(VIEW, np.column_stack([u.ravel(), v.ravel()]))
     there = VIEW.sight(seen.points_shell_m, deformation).pixels - VIEW.sight(seen.points_shell_m, np.zeros(3)).pixels
     moved = np.where((seen.torus >= 0)[:, None] & np.isfinite(there), there, 0.0).reshape(480, 720, 2)
     back = np.zeros_like(moved)
