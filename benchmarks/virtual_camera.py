@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from estimators.benchmark import orient_camera
 from estimators.camera import read_film
-from estimators.camera_fit import REACH_PX, find_features
+from estimators.camera_fit import REACH_PX
 from estimators.edge import find_horizon
 from estimators.virtual_camera import render
 from flightmodel import rotations
@@ -65,7 +65,7 @@ def scipy_fit(oriented, image) -> Callable[[], object]:
     horizon = find_horizon(image, oriented.lines, view.camera.size_px)
     answer = oriented.fit(image)
     bending = np.array([*answer.rotation_yz_rad, answer.flattening_rad])
-    place, sd = find_features(view, marks, image, bending, REACH_PX)
+    place, sd = marks.find(view, image, bending, REACH_PX)
     has = np.isfinite(sd)
     camera, joint = view.camera, view.joint_m
     matrix = np.array(

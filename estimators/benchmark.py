@@ -59,7 +59,6 @@ from estimators.camera_fit import (
     OrientedCamera,
     edge_residuals,
     feature_residuals,
-    find_features,
     huber_gain,
     joined,
 )
@@ -366,7 +365,7 @@ def _look(
         scatter = 1.4826 * float(np.nanmedian(off)) if len(off) else 0.0
         residuals = residuals.some(off < np.clip(_WILD * scatter, *_WILD_PX))
         residuals = residuals.some(is_coherent(residuals.index, residuals.residual_px))
-        found = find_features(view, features, image, at_rest, reach_px)
+        found = features.find(view, image, at_rest, reach_px)
         painted = feature_residuals(view, features, found, at_rest, len(clocks))
         at = features.points_shell_m[painted.index - len(clocks)]
         away = np.linalg.norm(at - view.camera.position_body_m, axis=1)

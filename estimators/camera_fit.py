@@ -33,6 +33,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,13 +128,6 @@ def _light_columns(view: VirtualCamera, horizon: HorizonLine) -> FloatArray:
 def _ovality(rows: FloatArray, clocks_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Derivatives by a flattening that varies round the shell as ``cos 2 clock`` and as ``sin 2 clock``."""
     return rows[:, FLATTENING] * np.cos(2.0 * clocks_rad), rows[:, FLATTENING] * np.sin(2.0 * clocks_rad)
-
-
-def find_features(
-    view: VirtualCamera, features: Features, image: Image, deformation: FloatArray, reach_px: int
-) -> tuple[FloatArray, FloatArray]:
-    """Place of each feature along its direction, px, and its sd; infinite where it was not found."""
-    return features.find(view, image, deformation, reach_px)
 
 
 def feature_residuals(
@@ -365,11 +359,14 @@ class OrientedCamera:
     stated_refused: Fault = NO_FAULT
     support: float = 1.0
 
-    @property
-    def features_share(self) -> float:
-        """Share of the features in view that the benchmark frame shows."""
-        found = int((self.benchmark_residuals.index >= len(self.clocks_rad)).sum())
-        return found / max(len(self.features.points_shell_m), 1)
+    @cached_property
+    def _benchmark_edge(self) -> BoolArray:
+        """Which of the points found in the benchmark frame are the edge's, the others are features."""
+        return np.asarray(self.benchmark_residuals.index < len(self.clocks_rad))
+
+    def _edge_share(self, points: int) -> float:
+        """So many edge points over those of the benchmark frame."""
+        return points / max(int(self._benchmark_edge.sum()), 1)
 
     @property
     def has_bad_benchmark(self) -> bool:
@@ -452,7 +449,7 @@ class OrientedCamera:
         except _NoFitError:
             # steps in the clouds are no edge to contradict anything
             return both
-        share = edge.edge_count / max(int((self.benchmark_residuals.index < len(self.clocks_rad)).sum()), 1)
+        share = self._edge_share(edge.edge_count)
         square = self._contradiction(alone[:2] - deformation[:2], edge, both)
         if square < _CONTRADICTION:
             return both
@@ -468,8 +465,7 @@ class OrientedCamera:
     @property
     def _edge_rms_px(self) -> float:
         """Of the edge in the benchmark frame."""
-        before = self.benchmark_residuals
-        edge = before.residual_px[before.index < len(self.clocks_rad)]
+        edge = self.benchmark_residuals.residual_px[self._benchmark_edge]
         return float(np.sqrt(np.mean(edge**2))) if len(edge) else float("inf")
 
     def _contradiction(self, difference: FloatArray, edge: _Solution, both: _Solution) -> float:
@@ -534,7 +530,7 @@ class OrientedCamera:
     def _seen_from(self, image: Image, deformation: FloatArray) -> _Approached:
         """Texture and edge near a guess, which is moved in place to where they are; `_NoFitError` without either."""
         for reach in (REACH_PX, TEXTURE_REACH_PX):
-            found = find_features(self.view, self.features, image, deformation, reach)
+            found = self.features.find(self.view, image, deformation, reach)
             if len(_has(found)) >= _LEAST_FEATURES:
                 self._fit_points(_NOTHING, found, deformation, np.eye(2))
         place, agreed = self._agreeing(found, deformation)
@@ -545,8 +541,7 @@ class OrientedCamera:
             for _ in range(_EDGE_PASSES):
                 self._solve(near, None, deformation, np.eye(2), _WORST_RMS_PX)
                 near = self.coherent_edge(image, deformation)
-        whole = max(int((self.benchmark_residuals.index < len(self.clocks_rad)).sum()), 1)
-        return _Approached(place, near, agreed, len(near.points_px) / whole)
+        return _Approached(place, near, agreed, self._edge_share(len(near.points_px)))
 
     def coherent_edge(self, image: Image, deformation: FloatArray) -> HorizonLine:
         """Edge near where a deformation (3,) puts it, without points that stand off their neighbours."""
@@ -579,9 +574,9 @@ class OrientedCamera:
         From where the search starts, if most features are found there; else from where the edge is found or where the
         feature map fits, whichever shows most: behind the rim may be the Earth, whose limb is an edge too.
         """
-        wanted = _FEW_FEATURES * int((self.benchmark_residuals.index >= len(self.clocks_rad)).sum())
+        wanted = _FEW_FEATURES * int((~self._benchmark_edge).sum())
         guesses = [deformation.copy()]
-        found = [find_features(self.view, self.features, image, deformation, REACH_PX)]
+        found = [self.features.find(self.view, image, deformation, REACH_PX)]
         trouble = NO_FAULT
         if len(_has(found[0])) < max(wanted, _LEAST_FEATURES):
             coarse = find_horizon(image, self.lines, self.view.camera.size_px)
@@ -591,18 +586,18 @@ class OrientedCamera:
                 if coarse.is_usable:
                     self._fit_points(coarse, None, edge_alone, np.eye(2))
                     guesses.append(edge_alone)
-                    found.append(find_features(self.view, self.features, image, edge_alone, REACH_PX))
+                    found.append(self.features.find(self.view, image, edge_alone, REACH_PX))
             except _NoFitError as fault:
                 trouble = fault.faults[0]
         if max(len(_has(f)) for f in found) < wanted:
             for fitted in self._where_map_fits(image, painted, deformation):
                 guesses.append(fitted)
-                found.append(find_features(self.view, self.features, image, guesses[-1], REACH_PX))
+                found.append(self.features.find(self.view, image, guesses[-1], REACH_PX))
         best = int(np.argmax([len(_has(f)) for f in found]))
         if len(_has(found[best])) >= _LEAST_FEATURES:
             deformation[:] = guesses[best]
             self._fit_points(_NOTHING, found[best], deformation, np.eye(2))
-            return find_features(self.view, self.features, image, deformation, REACH_PX)
+            return self.features.find(self.view, image, deformation, REACH_PX)
         if trouble:
             raise _NoFitError(trouble)
         deformation[:] = guesses[1]

@@ -12,7 +12,7 @@ import pytest
 import flightmodel
 from estimators.benchmark import orient_camera, with_deflected_benchmark
 from estimators.camera import polar, read_film, sensitivity_table
-from estimators.camera_fit import REACH_PX, find_features
+from estimators.camera_fit import REACH_PX
 from estimators.edge import HorizonLine, find_horizon
 from estimators.overlay import Overlay
 from estimators.virtual_camera import VirtualCamera
@@ -197,7 +197,7 @@ def test_the_compiled_fit_is_the_plain_one():
     oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
     horizon = find_horizon(frames[1], oriented.lines, oriented.view.camera.size_px)
     edge_alone = plain_fit(oriented, horizon, None, np.zeros(3))
-    place = find_features(oriented.view, oriented.features, frames[1], edge_alone, REACH_PX)
+    place = oriented.features.find(oriented.view, frames[1], edge_alone, REACH_PX)
     for marks in (None, place):
         plain, compiled = plain_fit(oriented, horizon, marks, edge_alone), edge_alone.copy()
         oriented._solve(horizon, marks, compiled, np.eye(2), 2.5)

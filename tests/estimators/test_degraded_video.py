@@ -73,7 +73,7 @@ def test_every_flight_is_answered_and_errors_lie_in_their_bars(ensemble):
 def test_the_lens_is_found_on_the_benchmark(ensemble):
     frames, _, _ = degraded(0)
     oriented = orient_camera(frames[0], GEOMETRY, UNCALIBRATED, JOINT_M)
-    assert oriented.features_share > 0.8
+    assert oriented.support > 0.8
     assert oriented.residual_rms_px < 1.0
 
 
