@@ -1,16 +1,23 @@
 """What are a lens's focal length, principal point and distortion, by the corners of a flat checkerboard in pictures?
 
 OpenCV finds, from some twenty pictures, the lens that minimises the corners' distances, each picture with a pose of
-its own. The standard deviations are those of the linearised fit, every picture's pose free, times the residuals' size:
+its own. Corners of one picture err together (a bent board, blur, light, what the lens's model leaves out there), so the
+standard deviations are the jackknife's over pictures: with the pose of picture k projected out of its partials A_k and
+residuals r_k, the fit without it is, to first order,
 
-    P = s^2 (J' J)^-1,     s^2 = r' r / (n - unknowns)
+    x_k - x = -(N - N_k)^-1 A_k' r_k,     N_k = A_k' A_k,     N = sum N_k
+    P = (K - 1) / K  sum (x_k - mean) (x_k - mean)'
 
-Assumed: a flat board, corners with independent errors of one size.
+K pictures give it K - 1 degrees of freedom; the standard deviation is widened to what holds 68 % by Student's t. It is
+never below that of independent corners, s^2 N^-1: few pictures can agree by chance.
+
+Assumed: a flat board, pictures with independent errors.
 
 References
 ----------
 Z. Zhang, "A flexible new technique for camera calibration", IEEE PAMI 22(11), 2000; OpenCV, modules ``cv2`` and
-``cv2.fisheye``.
+``cv2.fisheye``; R. M. Bell and D. F. McCaffrey, "Bias reduction in standard errors for linear regression with
+multi-stage samples", Survey Methodology 28(2), 2002 (the jackknife of clusters by its linear form).
 """
 
 from __future__ import annotations
@@ -22,6 +29,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from flightmodel import tables
 from flightmodel.camera import Lens
@@ -149,32 +157,49 @@ def calibrate_lens(corners: pd.DataFrame, size_px: tuple[int, int], lens: Lens =
         ) from failed
     distortion = np.asarray(found, dtype=float).ravel()
     residual, jacobian = _reprojected(boards, pixels, matrix, distortion, rotations, shifts, lens)
-    variance = float(residual @ residual) / max(len(residual) - jacobian.shape[1], 1)
-    sd = np.sqrt(variance) * _unit_sd(jacobian)[: 4 + len(distortion)]
+    sd = _sd(residual, jacobian, 4 + len(distortion), [corner.size for corner in pixels])
     rms = float(np.sqrt(2.0 * np.mean(residual**2)))
     focal, centre = matrix[[0, 1], [0, 1]], matrix[:2, 2]
     return LensCalibration(lens, focal, centre, distortion, sd, rms, len(boards), len(corners))
 
 
-def _unit_sd(jacobian: FloatArray) -> FloatArray:
-    """Standard deviations of a linear fit's unknowns for readings of one each.
+def _sd(residual: FloatArray, jacobian: FloatArray, unknowns: int, readings: Sequence[int]) -> FloatArray:
+    """Standard deviations (unknowns,) of the lens, by what the fit would be without each picture.
 
     Raises
     ------
     GateError
-        Where some unknowns can be changed together and no corner moves.
+        Where some unknowns can be changed together and no corner moves, with all pictures or without one.
     """
+    _check_condition(jacobian)
+    normal, gradient = [], []
+    for k, rows in enumerate(np.split(np.arange(len(residual)), np.cumsum(readings)[:-1])):
+        pose, _ = np.linalg.qr(jacobian[rows, unknowns + 6 * k : unknowns + 6 * (k + 1)])
+        by_lens = jacobian[rows, :unknowns]
+        by_lens = by_lens - pose @ (pose.T @ by_lens)
+        normal.append(by_lens.T @ by_lens)
+        gradient.append(by_lens.T @ residual[rows])
+    whole = np.sum(normal, axis=0)
+    variance = float(residual @ residual) / max(len(residual) - jacobian.shape[1], 1)
+    independent = variance * np.diag(np.linalg.inv(whole))
+    without = np.array([np.linalg.solve(whole - n, -g) for n, g in zip(normal, gradient, strict=True)])
+    k = len(normal)
+    jackknife = (k - 1) / k * np.sum((without - without.mean(axis=0)) ** 2, axis=0)
+    wider = float(stats.t.ppf(stats.norm.cdf(1.0), k - 1))
+    return np.asarray(np.sqrt(np.maximum(independent, wider**2 * jackknife)))
+
+
+def _check_condition(jacobian: FloatArray) -> None:
+    """Refuse a fit of which some unknowns can be changed together and no corner moves."""
     size = np.linalg.norm(jacobian, axis=0)
-    triangle = np.linalg.qr(jacobian / np.where(size > 0.0, size, 1.0), mode="r")
-    # not by the normal matrix, whose inverse can have a negative diagonal
-    if not size.all() or np.linalg.cond(triangle) > _LARGEST_CONDITION:
+    # not by the normal matrix, whose condition number is the square
+    if not size.all() or np.linalg.cond(jacobian / np.where(size > 0.0, size, 1.0)) > _LARGEST_CONDITION:
         raise GateError(
             f"calibration: ill-conditioned: condition number above {_LARGEST_CONDITION:.0e}; take pictures in which "
             "the board is tilted to several sides and reaches the edges; check that each picture's corners lie "
             "where that picture has them",
             code="calibration-ill-conditioned",
         )
-    return np.asarray(np.linalg.norm(np.linalg.inv(triangle), axis=1) / size)
 
 
 def _faults(corners: pd.DataFrame, size_px: tuple[int, int]) -> list[Fault]:
