@@ -6,10 +6,13 @@ The commands ``postflight montecarlo`` and ``postflight study``: many flights at
 
 from __future__ import annotations
 
+import _thread
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any, Literal
 
 import click
@@ -398,23 +401,36 @@ cli.add_command(montecarlo)
 cli.add_command(study)
 
 
+_IMPORTING_S = 0.02  # after which an interrupt amid an import is tried again
+
+
 def terminate(_number: int, _frame: object) -> None:
     """Leave as after Ctrl-C, so that what is half-written is removed; exit code as the shell gives it."""
     sys.exit(EXIT_TERMINATED)
 
 
+def interrupt(_number: int, frame: FrameType | None) -> None:
+    """Stop by `KeyboardInterrupt`, but not amid an import: libraries turn it there into errors of their own."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            again = threading.Timer(_IMPORTING_S, _thread.interrupt_main)
+            again.daemon = True
+            again.start()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
 def main() -> None:
     """Run the command; known faults become messages and exit codes, never a traceback."""
     signal.signal(signal.SIGTERM, terminate)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the parent has it ignored
+        signal.signal(signal.SIGINT, interrupt)
     try:
         cli.main(standalone_mode=False)
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
-    except (click.exceptions.Abort, KeyboardInterrupt, RuntimeError) as fault:
-        # before Python 3.12 a Ctrl-C while a class is made (libraries being imported) comes wrapped
-        known = isinstance(fault, click.exceptions.Abort | KeyboardInterrupt)
-        if not known and not isinstance(fault.__cause__, KeyboardInterrupt):
-            raise
+    except (click.exceptions.Abort, KeyboardInterrupt):
         click.echo("interrupted; nothing half-written is left", err=True)
         sys.exit(EXIT_INTERRUPTED)
     except click.ClickException as fault:

@@ -19,7 +19,7 @@ import pandas as pd
 import pytest
 
 from flightmodel.checks import writing
-from postflight import commands
+from postflight import cli, commands
 from postflight.deflections import METHODS
 from postflight.run_folder import PARTIAL, remove_abandoned
 from tests.postflight.killing import kill_run, run_again, start_command
@@ -333,6 +333,20 @@ def test_interrupt_before_anything_is_written(tmp_path: Path) -> None:
     assert "interrupted" in errors
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupt_amid_an_import_waits_for_its_end() -> None:
+    """Compiled libraries turn a KeyboardInterrupt there into an ImportError, or print its traceback themselves."""
+    importing = compile("cli.interrupt(2, sys._getframe())", "<frozen importlib._bootstrap>", "exec")
+    with pytest.raises(KeyboardInterrupt):
+        cli.interrupt(2, sys._getframe())
+    before = signal.signal(signal.SIGINT, cli.interrupt)
+    try:
+        exec(importing, {"cli": cli, "sys": sys})
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(10.0)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # ---------------------------------------------------------------------------------------------------------------- score
