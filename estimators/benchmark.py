@@ -62,9 +62,10 @@ from estimators.camera_fit import (
     huber_gain,
     joined,
 )
-from estimators.edge import NO_FAULT, HorizonLine, ScanLines, fault_of_frame, find_horizon, is_coherent, steps_near
+from estimators.edge import NO_FAULT, HorizonLine, ScanLines, fault_of_frame, is_coherent
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.features import Features, ImageFeatures, fit_feature_map, no_features, valleys, visible_features
+from estimators.frame_edits import MARK_SD_PX, EditedFrame, MarkedFeatures, marked_on_shell, unedited
 from estimators.loads import FlightLoads
 from estimators.texture import texture_of
 from estimators.virtual_camera import DEFLECTION, FLATTENING, VirtualCamera
@@ -114,23 +115,27 @@ class _Look:
 
 
 def orient_camera(
-    benchmark: Image,
+    benchmark: Image | EditedFrame,
     geometry: ShellGeometry,
     camera_mount: CameraMount,
     joint_station_m: float,
     apriori: AprioriSd | None = None,
+    pose: FloatArray | None = None,
 ) -> OrientedCamera:
     """Fit the camera's orientation and lens on a frame taken as undeflected.
 
     Parameters
     ----------
-    benchmark : (h, w) uint8
+    benchmark : (h, w) uint8, or with what an analyst decided about it
     geometry : ShellGeometry
     camera_mount : CameraMount
         Nominal position, pointing and lens, with their a priori sd.
     joint_station_m : float
         Joint aft of the nose, m.
     apriori : AprioriSd, optional
+    pose : (4,) float, optional
+        Rotation of the camera about its own axes, rad, and a factor on its focal length, which the analyst states
+        against the mount's.
 
     Raises
     ------
@@ -138,17 +143,21 @@ def orient_camera(
         When the frame cannot be used, with the reason.
     """
     apriori = apriori or AprioriSd()
-    fault = fault_of_frame(benchmark, (camera_mount.width_px, camera_mount.height_px))
+    frame = unedited(benchmark)
+    fault = fault_of_frame(frame.image, (camera_mount.width_px, camera_mount.height_px))
     if fault:
         raise GateError(f"benchmark frame: {fault}; choose another benchmark time", fault.code)
-    nominal = VirtualCamera(geometry, camera_from_mount(camera_mount), joint_station_m)
+    camera = camera_from_mount(camera_mount)
+    if pose is not None:
+        camera = camera.turned(pose[:3], float(pose[3]))
+    nominal = VirtualCamera(geometry, camera, joint_station_m)
     prior = _prior_sd(camera_mount.uncertainty, apriori)
     refused = NO_FAULT
     if geometry.features not in ("none", "texture"):
-        oriented, refused = _by_stated_features(nominal, benchmark, prior, apriori)
+        oriented, refused = _by_stated_features(nominal, frame, prior, apriori)
         if oriented is not None:
-            return oriented
-    oriented = _oriented(nominal, benchmark, prior, apriori, valleys)
+            return _with_marked(oriented, frame)
+    oriented = _oriented(nominal, frame, prior, apriori, valleys)
     if oriented.has_bad_benchmark:
         raise GateError(
             f"benchmark frame: {100.0 * oriented.support:.0f} % of the valleys between tori are where the camera "
@@ -161,11 +170,11 @@ def orient_camera(
     edge = oriented.benchmark_residuals.index < len(oriented.clocks_rad)
     rows = oriented.benchmark_residuals.some(edge)
     alone = replace(oriented, features=no_features(), benchmark_residuals=rows, stated_refused=refused)
-    return alone if geometry.features == "none" else _with_texture(alone, benchmark)
+    return _with_marked(alone if geometry.features == "none" else _with_texture(alone, frame), frame)
 
 
 def _by_stated_features(
-    nominal: VirtualCamera, benchmark: Image, prior: FloatArray, apriori: AprioriSd
+    nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd
 ) -> tuple[OrientedCamera | None, Fault]:
     """Camera oriented by the features that the vehicle file states, or why the frame does not bear them out."""
     try:
@@ -181,17 +190,33 @@ def _by_stated_features(
     return None, Fault(words, "features-not-found")
 
 
-def _with_texture(oriented: OrientedCamera, benchmark: Image) -> OrientedCamera:
-    """Add the benchmark frame's texture, which lies there exactly where it was taken from."""
-    texture = texture_of(oriented.view, benchmark)
-    place = np.einsum("ni,ni->n", oriented.view.sight(texture.points_shell_m, np.zeros(3)).pixels, texture.across_px)
-    found = place, np.full(len(place), TEXTURE_SD_PX)
-    rows = feature_residuals(oriented.view, texture, found, np.zeros(3), len(oriented.clocks_rad))
-    return replace(oriented, features=texture, benchmark_residuals=joined(oriented.benchmark_residuals, rows))
+def _with_texture(oriented: OrientedCamera, benchmark: EditedFrame) -> OrientedCamera:
+    """Add the benchmark frame's texture."""
+    return _with_features(oriented, texture_of(oriented.view, benchmark.image), benchmark, TEXTURE_SD_PX, 0)
+
+
+def _with_marked(oriented: OrientedCamera, benchmark: EditedFrame) -> OrientedCamera:
+    """Add the features that an analyst marked in the benchmark frame."""
+    if not benchmark.features_px:
+        return oriented
+    before = oriented.features
+    marked = MarkedFeatures(before, *marked_on_shell(oriented.view, benchmark.features_px))
+    return _with_features(oriented, marked, benchmark, MARK_SD_PX, len(before.across_px))
+
+
+def _with_features(
+    oriented: OrientedCamera, features: Features, benchmark: EditedFrame, sd_px: float, first: int
+) -> OrientedCamera:
+    """Add features, from row ``first`` on new, which lie in the benchmark frame exactly where they were taken from."""
+    pixels = oriented.view.sight(features.points_shell_m, np.zeros(3)).pixels
+    new = (np.arange(len(pixels)) >= first) & benchmark.is_clear(np.nan_to_num(pixels, nan=-1.0))
+    found = np.einsum("ni,ni->n", pixels, features.across_px), np.where(new, sd_px, np.inf)
+    rows = feature_residuals(oriented.view, features, found, np.zeros(3), len(oriented.clocks_rad))
+    return replace(oriented, features=features, benchmark_residuals=joined(oriented.benchmark_residuals, rows))
 
 
 def _oriented(
-    nominal: VirtualCamera, benchmark: Image, prior: FloatArray, apriori: AprioriSd,
+    nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd,
     features_of: Callable[[VirtualCamera], ImageFeatures],
 ) -> OrientedCamera:  # fmt: skip
     """Fit from the nominal pose and, where that is not sound, from where the feature map fits."""
@@ -203,7 +228,7 @@ def _oriented(
     except GateError as no_edge:
         oriented, trouble = None, no_edge
     # the edge may have been the Earth's: features and the valleys between tori are the shell's alone
-    pose = _pose_of_feature_map(nominal, benchmark, prior, features_of(nominal))
+    pose = _pose_of_feature_map(nominal, benchmark.image, prior, features_of(nominal))
     if pose is not None:
         try:
             other = _fitted(nominal, benchmark, prior, apriori, pose, _REACHES_PX[1:], features_of)
@@ -228,7 +253,7 @@ def with_deflected_benchmark(oriented: OrientedCamera, theta_rad: float, plane_l
 
 
 def _fitted(
-    nominal: VirtualCamera, benchmark: Image, prior: FloatArray, apriori: AprioriSd, pose: FloatArray,
+    nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd, pose: FloatArray,
     reaches_px: tuple[int, ...], features_of: Callable[[VirtualCamera], ImageFeatures],
 ) -> OrientedCamera:  # fmt: skip
     """Fit the pose from a start, features looked for within each reach; refused where the edge is not the shell's."""
@@ -347,15 +372,15 @@ def _posed(nominal: VirtualCamera, pose: FloatArray) -> VirtualCamera:
 
 
 def _look(
-    view: VirtualCamera, features: Features, image: Image, reach_px: int, placed_m: float
+    view: VirtualCamera, features: Features, frame: EditedFrame, reach_px: int, placed_m: float
 ) -> _Look:  # fmt: skip
     """Find the edge and, with a reach, the features around their prediction."""
     at_rest = np.zeros(3)
     clocks = view.edge_clocks()
     lines = view.lines_at(clocks, at_rest)
-    horizon = find_horizon(image, lines, view.camera.size_px)
+    horizon = frame.far_edge(lines, view.camera.size_px)
     if reach_px:
-        horizon = steps_near(image, lines)
+        horizon = frame.near_edge(lines)
     elif not horizon.is_usable:
         raise GateError(f"benchmark frame: {horizon.refused}; choose another benchmark time", horizon.refused.code)
     residuals = edge_residuals(view, horizon, at_rest)
@@ -364,8 +389,9 @@ def _look(
         off = np.abs(residuals.residual_px)
         scatter = 1.4826 * float(np.nanmedian(off)) if len(off) else 0.0
         residuals = residuals.some(off < np.clip(_WILD * scatter, *_WILD_PX))
-        residuals = residuals.some(is_coherent(residuals.index, residuals.residual_px))
-        found = features.find(view, image, at_rest, reach_px)
+        if not horizon.is_by_hand:
+            residuals = residuals.some(is_coherent(residuals.index, residuals.residual_px))
+        found = frame.features(features, view, at_rest, reach_px)
         painted = feature_residuals(view, features, found, at_rest, len(clocks))
         at = features.points_shell_m[painted.index - len(clocks)]
         away = np.linalg.norm(at - view.camera.position_body_m, axis=1)

@@ -26,7 +26,9 @@ import numpy as np
 
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, orient_camera
 from estimators.camera_fit import AprioriSd, FrameFit, Image, OrientedCamera, refused_fit
+from estimators.frame_edits import edited
 from estimators.texture import TrackedTexture
+from flightmodel.camera_edits import NO_EDITS, CameraEdits
 from flightmodel.checks import Fault, FloatArray, GateError, Progress, check_finite, check_increasing
 from flightmodel.deflection import (
     DeflectionHistory,
@@ -64,6 +66,8 @@ class FilmFit:
         Assumed plane; None: estimated in every frame.
     plane_sd_rad : float
         Of the assumed plane.
+    by_hand : str
+        What an analyst edited.
     """
 
     time_s: FloatArray
@@ -72,6 +76,7 @@ class FilmFit:
     benchmark_s: float
     plane_lv_rad: float | None
     plane_sd_rad: float
+    by_hand: str = ""
 
     def relative_to_benchmark(self, time_bias_sd_s: float = 0.0) -> RelativeDeflections:
         """Deflections relative to the benchmark frame's, where the planes were estimated.
@@ -155,6 +160,8 @@ class FilmFit:
             + (f" and {features:.0f} rows of {self._kind_of_features}" if features >= 1.0 else "; no feature could be "
                "used, which leaves flattening and ovality of the shell in the error bar"),
         ]  # fmt: skip
+        if self.by_hand:
+            remarks.append(self.by_hand)
         if oriented.stated_refused:
             remarks.append(f"{oriented.stated_refused}: they are not used")
         refused: dict[str, list[float]] = {}
@@ -188,6 +195,7 @@ def read_film(
     benchmark: Image | None = None,
     progress: Progress | None = None,
     joint_swing: JointSwing | None = None,
+    edits: CameraEdits = NO_EDITS,
 ) -> FilmFit:
     """Orient the camera on the benchmark frame, and fit the deflection in every frame.
 
@@ -214,6 +222,8 @@ def read_film(
         Takes the fraction done and what is being done.
     joint_swing : JointSwing, optional
         How fast the joint swings; frames that jump faster are refused. Without it none is.
+    edits : CameraEdits, optional
+        What an analyst decided by eye.
 
     Raises
     ------
@@ -229,21 +239,44 @@ def read_film(
         if len(frames) != len(times):
             raise GateError(f"{len(times)} frame times for {len(frames)} frames", code="frame-count")
         benchmark = _read_frame(frames[nearest])
-    oriented = orient_camera(benchmark, geometry, camera_mount, joint_station_m, apriori)
+    benchmark_frame = edited(benchmark, edits, float(times[nearest]))
+    oriented = orient_camera(benchmark_frame, geometry, camera_mount, joint_station_m, apriori, edits.pose)
     axis = None if plane_lv_rad is None else _axis_of(plane_lv_rad)
     fits: list[FrameFit] = []
     start = np.zeros(2)
     for picture in _decoded_ahead(frames):
         if progress is not None and len(fits) % 10 == 0:
             progress(min(len(fits) / len(times), 1.0), f"frame {len(fits) + 1} of {len(times)}")
-        fits.append(oriented.fit(picture, axis, start))
+        t_s = float(times[min(len(fits), len(times) - 1)])
+        fits.append(oriented.fit(edited(picture, edits, t_s), axis, start))
         start = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad
     if len(fits) != len(times):
         raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
-    fits = without_lost_features(fits)
+    fits = judged(times, fits, joint_swing, edits)
+    remark = f"by hand: {edits}" if edits.rows else ""
+    return FilmFit(times, tuple(fits), oriented, float(times[nearest]), plane_lv_rad, plane_sd_rad, remark)
+
+
+def judged(
+    time_s: FloatArray, fits: list[FrameFit], joint_swing: JointSwing | None, edits: CameraEdits
+) -> list[FrameFit]:
+    """Fits of all frames of a film with those refused that the others or the analyst speak against.
+
+    An analyst's acceptance outweighs what the other frames say, never that a frame has no fit.
+    """
+    verdicts = [edits.verdict(float(t)) for t in time_s]
+    rejected = [v is not None and v.edit == "reject" for v in verdicts]
+    kept = [
+        refused_fit(fit.horizon, Fault(f"rejected by hand: {verdict.note or 'no reason given'}", "rejected-by-hand"))
+        if verdict is not None and out
+        else fit
+        for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
+    ]
+    found = without_lost_features(kept)
     if joint_swing is not None:
-        fits = without_jumps(times, fits, joint_swing)
-    return FilmFit(times, tuple(fits), oriented, float(times[nearest]), plane_lv_rad, plane_sd_rad)
+        found = without_jumps(time_s, found, joint_swing)
+    accepted = [v is not None and v.edit == "accept" for v in verdicts]
+    return [fit if yes else other for fit, other, yes in zip(kept, found, accepted, strict=True)]
 
 
 def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:

@@ -44,12 +44,11 @@ from estimators.edge import (
     HorizonLine,
     ScanLines,
     fault_of_frame,
-    find_horizon,
     is_coherent,
     no_horizon,
-    steps_near,
 )
 from estimators.features import Features, ImageFeatures, fit_feature_map, valleys
+from estimators.frame_edits import LEAST_MARKS, EditedFrame, MarkedFeatures, unedited
 from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.deflection import lv_clock
@@ -74,6 +73,7 @@ _SOUND_SCORE = 1.5  # the texture agrees with itself
 _EDGE_PASSES = 2
 _CONTRADICTION = 18.4  # chi-square of two components that one sound frame in 10,000 exceeds
 _LEAST_VAR = float(np.deg2rad(1e-3) ** 2)  # of a difference, far below what any film shows
+_BESIDE = 4  # places of 240 along the edge: a residual of the benchmark frame holds that far for a mark by hand
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
 USUAL_SHARE, USUAL_RMS_PX = 0.75, 1.0  # features shown and rms of a benchmark frame that is not suspicious
@@ -307,6 +307,11 @@ def _has(found: tuple[FloatArray, FloatArray]) -> NDArray[np.intp]:
     return np.flatnonzero(np.isfinite(found[1]))
 
 
+def _least_points(horizon: HorizonLine) -> int:
+    """How many edge points a fit needs."""
+    return LEAST_MARKS if horizon.is_by_hand else LEAST_POINTS
+
+
 def refused_fit(horizon: HorizonLine, reason: Fault) -> FrameFit:
     """Return the fit of a frame that has no answer."""
     nan = np.full((2, 2), np.nan)
@@ -373,33 +378,38 @@ class OrientedCamera:
         """Whether the benchmark frame shows little of the shell and its residuals are large."""
         return self.residual_rms_px > USUAL_RMS_PX and self.support < USUAL_SHARE
 
-    def fit(self, image: Image, plane_axis: FloatArray | None = None, start: FloatArray | None = None) -> FrameFit:
+    def fit(
+        self, picture: Image | EditedFrame, plane_axis: FloatArray | None = None, start: FloatArray | None = None
+    ) -> FrameFit:
         """Find the deflection in a frame.
 
         Parameters
         ----------
-        image : (h, w) uint8
+        picture : (h, w) uint8, or with what an analyst decided about it
         plane_axis : (2,) float or None
             Rotation vector about body y and z of a unit deflection in the assumed plane; None estimates the plane.
         start : (2,) float, optional
             Where to start, e.g. the answer of the frame before.
         """
-        fault = fault_of_frame(image, self.view.camera.size_px)
+        frame = unedited(picture)
+        fault = fault_of_frame(frame.image, self.view.camera.size_px)
         if fault:
             return refused_fit(no_horizon(fault), fault)
         deformation, basis, horizon = np.zeros(3), np.eye(2), _NOTHING
         deformation[:2] = 0.0 if start is None else start
         try:
-            if isinstance(self.features, ImageFeatures) and len(self.features.points_shell_m):
-                place = self._approach(image, deformation, self.features)
-                horizon = steps_near(image, self.view.lines_at(self.clocks_rad, deformation))
+            painted = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
+            if isinstance(painted, ImageFeatures) and len(painted.points_shell_m):
+                place = self._approach(frame, deformation, painted)
+                horizon = frame.near_edge(self.view.lines_at(self.clocks_rad, deformation))
             else:
-                seen = self._approach_by_texture(image, deformation)
+                seen = self._approach_by_texture(frame, deformation)
                 place, horizon = seen.place, seen.edge
+            place = frame.with_marked(self.features, place)
             last = self._solve(horizon, place, deformation, basis, _WORST_RMS_PX)
-            last = self._reconciled(image, horizon, place, deformation, last)
+            last = self._reconciled(frame, horizon, place, deformation, last)
             contradicted = place is not None and last.edge_count == len(last.rows)
-            if last.edge_count < LEAST_POINTS and last.rms_px > _FEATURES_RMS_PX:
+            if last.edge_count < _least_points(horizon) and last.rms_px > _FEATURES_RMS_PX:
                 raise _NoFitError(
                     f"no edge near the features, whose rms is {last.rms_px:.1f} px: not the shell's", "edge-not-shell"
                 )
@@ -414,22 +424,22 @@ class OrientedCamera:
         return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
 
     def _reconciled(
-        self, image: Image, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
-        both: _Solution,
+        self, frame: EditedFrame, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None,
+        deformation: FloatArray, both: _Solution,
     ) -> _Solution:  # fmt: skip
         """Edge and features where they agree, the edge alone where they contradict each other and it is whole.
 
         `_NoFitError` where they contradict each other and it is not.
         """
         seen = both.edge_count / len(self.clocks_rad)
-        if place is None and seen < _SOUND_EDGE:
+        if place is None and seen < _SOUND_EDGE and not horizon.is_by_hand:
             raise _NoFitError(
                 f"no feature agrees, and {100.0 * seen:.0f} % of the edge in view can be used where "
                 f"{100.0 * _SOUND_EDGE:.0f} % are needed",
                 "edge-too-short",
             )
         rms = max(both.rms_px, self._edge_rms_px)
-        if place is None and rms > USUAL_RMS_PX:
+        if place is None and rms > USUAL_RMS_PX and not horizon.is_by_hand:
             raise _NoFitError(
                 f"no feature agrees, and the edge alone has an rms of {rms:.1f} px, here or in the benchmark frame, "
                 f"where {USUAL_RMS_PX:.1f} px are allowed",
@@ -438,13 +448,13 @@ class OrientedCamera:
         if place is None:
             return both
         # to first order, which takes a tenth of a fit's time, then in full where that is not clear
-        if both.edge_count >= LEAST_POINTS:
+        if both.edge_count >= _least_points(horizon):
             step, alone_near = self._edge_step(both, deformation[2])
             if self._contradiction(step, alone_near, both) < 0.5 * _CONTRADICTION:
                 return both
         alone = deformation.copy()
         try:
-            near = self._independent_edge(image, horizon, alone)
+            near = self._independent_edge(frame, horizon, alone)
             edge = self._solve(near, None, alone, np.eye(2), np.inf)
         except _NoFitError:
             # steps in the clouds are no edge to contradict anything
@@ -482,7 +492,7 @@ class OrientedCamera:
         covariance += (axes * np.maximum(value, _LEAST_VAR)) @ axes.T
         return float(difference @ np.linalg.solve(covariance, difference))
 
-    def _approach_by_texture(self, image: Image, deformation: FloatArray) -> _Approached:
+    def _approach_by_texture(self, frame: EditedFrame, deformation: FloatArray) -> _Approached:
         """Move ``deformation`` in place to where the texture agrees with itself, else to where the edge is.
 
         Where the search starts, then where the edge is found from far, then where the valleys between tori fit: the
@@ -490,10 +500,10 @@ class OrientedCamera:
         """
         best: tuple[float, FloatArray, _Approached] | None = None
         trouble = Fault("no edge near where one is expected", "edge-not-clear")
-        for guess in self._guesses(image, deformation.copy()):
+        for guess in self._guesses(frame, deformation.copy()):
             moved = guess.copy()
             try:
-                seen = self._seen_from(image, moved)
+                seen = self._seen_from(frame, moved)
             except _NoFitError as fault:
                 trouble = fault.faults[0]
                 continue
@@ -506,16 +516,16 @@ class OrientedCamera:
         deformation[:] = best[1]
         return best[2]
 
-    def _guesses(self, image: Image, start: FloatArray) -> Iterator[FloatArray]:
+    def _guesses(self, frame: EditedFrame, start: FloatArray) -> Iterator[FloatArray]:
         """Deformations (3,) near which the shell may be, the likeliest first; each is only made when asked for."""
         yield start
-        coarse = find_horizon(image, self.lines, self.view.camera.size_px)
+        coarse = frame.far_edge(self.lines, self.view.camera.size_px)
         if coarse.is_usable:
             edge_alone = np.zeros(3)
             with suppress(_NoFitError):
                 self._fit_points(coarse, None, edge_alone, np.eye(2))
                 yield edge_alone
-        yield from self._where_map_fits(image, valleys(self.view), start)
+        yield from self._where_map_fits(frame.image, valleys(self.view), start)
 
     def _where_map_fits(self, image: Image, painted: ImageFeatures, start: FloatArray) -> Iterator[FloatArray]:
         """Deformation (3,) at which features fit the frame best, where that is significant."""
@@ -527,25 +537,27 @@ class OrientedCamera:
         if fitted is not None:
             yield np.array([*fitted, 0.0])
 
-    def _seen_from(self, image: Image, deformation: FloatArray) -> _Approached:
+    def _seen_from(self, frame: EditedFrame, deformation: FloatArray) -> _Approached:
         """Texture and edge near a guess, which is moved in place to where they are; `_NoFitError` without either."""
         for reach in (REACH_PX, TEXTURE_REACH_PX):
-            found = self.features.find(self.view, image, deformation, reach)
+            found = frame.features(self.features, self.view, deformation, reach)
             if len(_has(found)) >= _LEAST_FEATURES:
                 self._fit_points(_NOTHING, found, deformation, np.eye(2))
         place, agreed = self._agreeing(found, deformation)
         if place is not None:
             self._fit_points(_NOTHING, place, deformation, np.eye(2))
-        near = self.coherent_edge(image, deformation)
+        near = self.coherent_edge(frame, deformation)
         if place is None:
             for _ in range(_EDGE_PASSES):
                 self._solve(near, None, deformation, np.eye(2), _WORST_RMS_PX)
-                near = self.coherent_edge(image, deformation)
+                near = self.coherent_edge(frame, deformation)
         return _Approached(place, near, agreed, self._edge_share(len(near.points_px)))
 
-    def coherent_edge(self, image: Image, deformation: FloatArray) -> HorizonLine:
+    def coherent_edge(self, frame: EditedFrame, deformation: FloatArray) -> HorizonLine:
         """Edge near where a deformation (3,) puts it, without points that stand off their neighbours."""
-        near = steps_near(image, self.view.lines_at(self.clocks_rad, deformation))
+        near = frame.near_edge(self.view.lines_at(self.clocks_rad, deformation))
+        if near.is_by_hand:
+            return near
         residual = edge_residuals(self.view, near, deformation).residual_px
         return near.some(is_coherent(near.line, residual))
 
@@ -567,7 +579,7 @@ class OrientedCamera:
         return (sharp[0], kept), agreed
 
     def _approach(
-        self, image: Image, deformation: FloatArray, painted: ImageFeatures
+        self, frame: EditedFrame, deformation: FloatArray, painted: ImageFeatures
     ) -> tuple[FloatArray, FloatArray] | None:
         """Move ``deformation`` in place to within a pixel or two, and find the features there; None where few.
 
@@ -576,38 +588,44 @@ class OrientedCamera:
         """
         wanted = _FEW_FEATURES * int((~self._benchmark_edge).sum())
         guesses = [deformation.copy()]
-        found = [self.features.find(self.view, image, deformation, REACH_PX)]
+        found = [frame.features(self.features, self.view, deformation, REACH_PX)]
         trouble = NO_FAULT
         if len(_has(found[0])) < max(wanted, _LEAST_FEATURES):
-            coarse = find_horizon(image, self.lines, self.view.camera.size_px)
+            coarse = frame.far_edge(self.lines, self.view.camera.size_px)
             trouble = coarse.refused
             edge_alone = deformation.copy()
             try:
                 if coarse.is_usable:
                     self._fit_points(coarse, None, edge_alone, np.eye(2))
                     guesses.append(edge_alone)
-                    found.append(self.features.find(self.view, image, edge_alone, REACH_PX))
+                    found.append(frame.features(self.features, self.view, edge_alone, REACH_PX))
             except _NoFitError as fault:
                 trouble = fault.faults[0]
         if max(len(_has(f)) for f in found) < wanted:
-            for fitted in self._where_map_fits(image, painted, deformation):
+            for fitted in self._where_map_fits(frame.image, painted, deformation):
                 guesses.append(fitted)
-                found.append(self.features.find(self.view, image, guesses[-1], REACH_PX))
+                found.append(frame.features(self.features, self.view, guesses[-1], REACH_PX))
         best = int(np.argmax([len(_has(f)) for f in found]))
         if len(_has(found[best])) >= _LEAST_FEATURES:
             deformation[:] = guesses[best]
             self._fit_points(_NOTHING, found[best], deformation, np.eye(2))
-            return self.features.find(self.view, image, deformation, REACH_PX)
+            return frame.features(self.features, self.view, deformation, REACH_PX)
         if trouble:
             raise _NoFitError(trouble)
         deformation[:] = guesses[1]
         return None
 
-    def _at_benchmark(self, index: NDArray[np.intp]) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-        """Of points found at the benchmark too: residual (NaN where it was not found), sd, and its row."""
+    def _at_benchmark(
+        self, index: NDArray[np.intp], beside: int = 0
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+        """Of points found at the benchmark too, or so many places beside it: residual (NaN where not), sd, its row."""
         before = self.benchmark_residuals
-        at = np.minimum(np.searchsorted(before.index, index), len(before.index) - 1)
-        return np.where(before.index[at] == index, before.residual_px[at], np.nan), before.sd_px[at], at
+        last = len(before.index) - 1
+        at = np.minimum(np.searchsorted(before.index, index), last)
+        lower = np.maximum(at - 1, 0)
+        at = np.where(np.abs(before.index[lower] - index) < np.abs(before.index[at] - index), lower, at)
+        there = np.abs(before.index[at] - index) <= beside
+        return np.where(there, before.residual_px[at], np.nan), before.sd_px[at], at
 
     @property
     def _shape_sd(self) -> FloatArray:
@@ -627,7 +645,7 @@ class OrientedCamera:
         """Fit ``deformation`` (3,) in place to the edge and, where given, the found features."""
         view, k, lines = self.view, basis.shape[1], len(self.clocks_rad)
         has = _has(place) if place is not None else np.zeros(0, dtype=np.intp)
-        edge_offset, before_sd, edge_at = self._at_benchmark(horizon.line)
+        edge_offset, before_sd, edge_at = self._at_benchmark(horizon.line, _BESIDE if horizon.is_by_hand else 0)
         feature_offset, feature_before_sd, feature_at = self._at_benchmark(lines + has)
         edge = (horizon.points_px, _light_columns(view, horizon), np.hypot(horizon.sd_px, before_sd), edge_offset)
         spot, sd = (place[0][has], place[1][has]) if place is not None else (np.zeros(0), np.zeros(0))
@@ -642,14 +660,15 @@ class OrientedCamera:
         prior = self._shape_prior(k)
         count = len(edge_offset) + len(has)
         residual, rows, shape, weight = np.empty(count), np.zeros((count, 16)), np.zeros((count, 5)), np.empty(count)
-        limits = (HUBER, OUTLIER_PX, LAST_STEP_RAD, STEPS, 0 if len(has) >= _LEAST_FEATURES else LEAST_POINTS)
+        least = _least_points(horizon)
+        limits = (HUBER, OUTLIER_PX, LAST_STEP_RAD, STEPS, 0 if len(has) >= _LEAST_FEATURES else least)
         state, number = _fit_kernels.fit_frame(
             deformation, np.ascontiguousarray(basis), view.shell_terms, view.camera.lens_terms, edge, features, prior,
             limits, residual, rows, shape, weight,
         )  # fmt: skip
         if state == _fit_kernels.TOO_FEW:
             raise _NoFitError(
-                f"{number} edge points also found at the benchmark where {LEAST_POINTS} are needed",
+                f"{number} edge points also found at the benchmark where {least} are needed",
                 "edge-points-too-few",
             )
         if state == _fit_kernels.DIVERGED:
@@ -679,21 +698,23 @@ class OrientedCamera:
         gain = (formal @ weighted)[:k]
         return _Solution(gain, formal[:k, :k], rows, shape, before, edge_count, rms, residual, weight)
 
-    def _independent_edge(self, image: Image, horizon: HorizonLine, deformation: FloatArray) -> HorizonLine:
+    def _independent_edge(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> HorizonLine:
         """Edge that owes nothing to the features, ``deformation`` moved near it; `_NoFitError` where there is none.
 
         What was found near the features' answer where that is an edge, not steps in the clouds; else found from far.
         """
+        if horizon.is_by_hand:
+            return horizon
         near = horizon.some(is_coherent(horizon.line, edge_residuals(self.view, horizon, deformation).residual_px))
         if len(near.points_px) >= LEAST_POINTS:
             return near
-        far = find_horizon(image, self.lines, self.view.camera.size_px)
+        far = frame.far_edge(self.lines, self.view.camera.size_px)
         if far.refused:
             raise _NoFitError(far.refused)
         moved = np.zeros(3)
         self._solve(far, None, moved, np.eye(2), _WORST_RMS_PX)
         deformation[:] = moved
-        return self.coherent_edge(image, deformation)
+        return self.coherent_edge(frame, deformation)
 
     def _edge_step(self, both: _Solution, flattening_rad: float) -> tuple[FloatArray, _Solution]:
         """One step (2,) from an answer of edge and features to that of the edge alone, and its gain and covariance."""

@@ -17,7 +17,7 @@ with the reason.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -81,6 +81,8 @@ class HorizonLine:
         Index of the scan line that each point was found on (`ScanLines.index`).
     refused : Fault
         Why the frame cannot be used, with its code; empty when it can.
+    is_by_hand : bool
+        Whether an analyst marked the points.
     """
 
     points_px: FloatArray
@@ -88,11 +90,16 @@ class HorizonLine:
     sd_px: FloatArray
     line: NDArray[np.intp]
     refused: Fault = NO_FAULT
+    is_by_hand: bool = False
 
     def some(self, chosen: BoolArray) -> HorizonLine:
         """Chosen points."""
-        return HorizonLine(
-            self.points_px[chosen], self.inward_px[chosen], self.sd_px[chosen], self.line[chosen], self.refused
+        return replace(
+            self,
+            points_px=self.points_px[chosen],
+            inward_px=self.inward_px[chosen],
+            sd_px=self.sd_px[chosen],
+            line=self.line[chosen],
         )
 
     @property

@@ -19,6 +19,7 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+from flightmodel.camera_edits import NO_EDITS, CameraEdits
 from flightmodel.checks import NO_FAULT, Fault, FloatArray
 from flightmodel.vehicle import CameraMount
 
@@ -51,6 +52,8 @@ class Frames:
         Of each frame in the film; None for images.
     time_bias_sd_s : float
         How well the film's clock is known against the gyros', one standard deviation; zero: it is taken as right.
+    edits : CameraEdits
+        What an analyst decided by eye.
     """
 
     camera: CameraMount
@@ -60,6 +63,7 @@ class Frames:
     benchmark_s: float
     numbers: NDArray[np.int64] | None = None
     time_bias_sd_s: float = 0.0
+    edits: CameraEdits = NO_EDITS
 
     @property
     def benchmark(self) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from flightmodel.atmosphere import standard_sounding
+from flightmodel.camera_edits import EDITS_FILE
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
 from flightmodel.config import (
     Angle,
@@ -479,6 +480,8 @@ def _motion(entry: MotionEntry) -> Motion:
 def _hashes(gate: Gate, spec: FlightFile, vehicle: Vehicle | None, frames: Frames | None) -> dict[str, str]:
     """SHA-256 of every file that the results depend on; all frames' pictures share one."""
     names = {"flight.toml", *(source.file for source in spec.sources)}
+    if frames is not None and frames.edits.rows:
+        names.add(EDITS_FILE)
     digests = {name: gate.sha256(gate.folder / name) for name in sorted(names)}
     if vehicle is not None:
         digests[f"vehicle {vehicle.name}"] = hashlib.sha256(vehicle.source.read_bytes()).hexdigest()

@@ -19,7 +19,8 @@ import pandas as pd
 
 from flightmodel import earth, tables
 from flightmodel.atmosphere import R_AIR_JPKGK, default_sounding_sd, height_from_pressure, profile_from_sounding
-from flightmodel.checks import BoolArray, FloatArray, IntArray, nearest_name
+from flightmodel.camera_edits import EDITS_FILE, NO_EDITS, CameraEdits, read_edits
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault
 from flightmodel.gate import Gate, Table, find_faults, oversampled, rows_to_use
 from flightmodel.instruments import (
@@ -411,7 +412,26 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
         span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
         gate.refuse_config(f"frames.benchmark_s = {source.benchmark_s}: frames span {span}", "benchmark-outside-film")
         return None
-    return Frames(camera, source.camera, time_s, paths, source.benchmark_s, numbers, source.time_bias_sd_s)
+    edits = _edits(gate, source.camera, time_s, camera)
+    benchmark_s = source.benchmark_s if edits.benchmark_s is None else edits.benchmark_s
+    return Frames(camera, source.camera, time_s, paths, benchmark_s, numbers, source.time_bias_sd_s, edits)
+
+
+def _edits(gate: Gate, name: str, time_s: FloatArray, camera: CameraMount) -> CameraEdits:
+    """What an analyst decided about a camera's film; nothing, with the faults kept, where the table is refused."""
+    path = gate.folder / EDITS_FILE
+    if not path.exists():
+        return NO_EDITS
+    try:
+        edits = read_edits(path, name, time_s, (camera.width_px, camera.height_px))
+    except GateError as fault:
+        gate.faults.extend(fault.faults)
+        return NO_EDITS
+    if edits.rows:
+        gate.findings.append(
+            Finding("frames", f"edits by hand ({EDITS_FILE}): {edits}", np.nan, np.nan, "edited-by-hand")
+        )
+    return edits
 
 
 def _image_paths(

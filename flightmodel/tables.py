@@ -223,7 +223,7 @@ class TimeColumn:
             object.__setattr__(self, "parts", (self.column,))
 
 
-def read_table(path: Path, label: str) -> pd.DataFrame:
+def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
     """Read a CSV as text; ``attrs["lines"]`` holds each row's line in the file.
 
     Raises
@@ -240,9 +240,9 @@ def read_table(path: Path, label: str) -> pd.DataFrame:
     if "\0" in text:
         raise GateError(f"{label}: {path}: not a readable CSV table: it holds binary data", code="table-unreadable")
     numbered = [(k, line) for k, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    if len(numbered) < 3:
+    if len(numbered) <= least_rows:
         rows = max(0, len(numbered) - 1)
-        raise GateError(f"{label}: {path}: {rows} data rows; at least two are needed", code="too-few-rows")
+        raise GateError(f"{label}: {path}: {rows} data rows; at least {least_rows} needed", code="too-few-rows")
     lines = np.array([k for k, _ in numbered[1:]])
     opened = _open_quote(numbered)
     if opened:

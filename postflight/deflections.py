@@ -270,6 +270,7 @@ def camera_film(flight: Flight, progress: Progress | None = None) -> FilmFit:
         benchmark=frames.picture(frames.benchmark),
         progress=progress,
         joint_swing=joint_swing(vehicle),
+        edits=frames.edits,
     )
 
 

@@ -26,11 +26,13 @@ def benchmark_frame(found: Sources) -> list[Finding]:
     if frames is None or vehicle is None or not len(frames.time_s):
         return []
     from estimators.benchmark import orient_camera  # which a folder without video needs not wait for
+    from estimators.frame_edits import edited
 
     at = float(frames.time_s[frames.benchmark])
-    picture = frames.picture(frames.benchmark)
+    picture = edited(frames.picture(frames.benchmark), frames.edits, at)
+    geometry, joint_m, pose = vehicle.geometry, vehicle.joint.station_m, frames.edits.pose
     try:
-        oriented = orient_camera(picture, vehicle.geometry, frames.camera, vehicle.joint.station_m)
+        oriented = orient_camera(picture, geometry, frames.camera, joint_m, pose=pose)
     except GateError as fault:
         return [Finding(SOURCE, str(fault), at, at, fault.codes[0])]
     if oriented.stated_refused:

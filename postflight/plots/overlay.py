@@ -17,6 +17,7 @@ import numpy as np
 
 from estimators.benchmark import orient_camera, with_deflected_benchmark
 from estimators.camera_fit import OrientedCamera
+from estimators.frame_edits import edited
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row, write_lines
 from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
@@ -39,8 +40,11 @@ def oriented_camera(telemetry: Telemetry, history: DeflectionHistory) -> tuple[O
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
     benchmark = frames.benchmark
-    oriented = orient_camera(frames.picture(benchmark), vehicle.geometry, frames.camera, vehicle.joint.station_m)
-    return with_deflected_benchmark(oriented, *deflection_at(history, float(frames.time_s[benchmark]))), benchmark
+    at_s = float(frames.time_s[benchmark])
+    picture = edited(frames.picture(benchmark), frames.edits, at_s)
+    pose, joint_m = frames.edits.pose, vehicle.joint.station_m
+    oriented = orient_camera(picture, vehicle.geometry, frames.camera, joint_m, pose=pose)
+    return with_deflected_benchmark(oriented, *deflection_at(history, at_s)), benchmark
 
 
 def benchmark_and_largest(telemetry: Telemetry, history: DeflectionHistory) -> tuple[Image, str]:

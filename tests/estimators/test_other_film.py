@@ -17,7 +17,9 @@ from estimators.camera import JointSwing, read_film, without_jumps, without_lost
 from estimators.camera_fit import FrameFit, _NoFitError
 from estimators.edge import is_coherent, no_horizon, steps_near
 from estimators.features import no_features
+from estimators.frame_edits import EditedFrame
 from estimators.virtual_camera import deformation_of
+from flightmodel.camera_edits import NO_EDITS
 from flightmodel.checks import NO_FAULT
 from flightmodel.vehicle import read_vehicle
 from postflight.checks.benchmark_frame import benchmark_frame
@@ -79,7 +81,7 @@ def test_where_features_contradict_the_edge_it_counts_if_it_is_whole():
         # the edge is searched where the features say that it is
         near = steps_near(frames[1], oriented.view.lines_at(oriented.clocks_rad, said))
         both = oriented._solve(near, place, moved, np.eye(2), 9.0)
-        last = oriented._reconciled(frames[1], near, place, moved, both)
+        last = oriented._reconciled(EditedFrame(frames[1]), near, place, moved, both)
         assert (last is not both) == contradicts
         np.testing.assert_allclose(moved[:2], true[:2], atol=D(0.25))
     half = np.where(np.arange(720) > 300, frames[1], 0).astype(np.uint8)
@@ -87,7 +89,7 @@ def test_where_features_contradict_the_edge_it_counts_if_it_is_whole():
     moved = said.copy()
     both = oriented._solve(short, place, moved, np.eye(2), 9.0)
     with pytest.raises(_NoFitError) as refusal:
-        oriented._reconciled(half, short, place, moved, both)
+        oriented._reconciled(EditedFrame(half), short, place, moved, both)
     assert refusal.value.codes == ("features-contradict-edge",)
 
 
@@ -161,7 +163,9 @@ def test_neighbours_that_err_together_are_counted():
 
 
 def found(picture, features):
-    frames = SimpleNamespace(time_s=np.array([421.0]), benchmark=0, picture=lambda _k: picture, camera=MOUNT)
+    frames = SimpleNamespace(
+        time_s=np.array([421.0]), benchmark=0, picture=lambda _k: picture, camera=MOUNT, edits=NO_EDITS
+    )
     vehicle = replace(read_vehicle("irve2_reference"), geometry=shell(features))
     return SimpleNamespace(frames=frames, vehicle=vehicle)
 
