@@ -423,6 +423,34 @@ class OrientedCamera:
             return refused_fit(horizon, fault_of_fit.faults[0])
         return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
 
+    def points_at(
+        self, picture: Image | EditedFrame, own: FloatArray, tried: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Edge points and features found near a deformation (3,), and how far they are from another one.
+
+        Returns
+        -------
+        edge, features : (n, 6) float
+            Place found, unit vector along which it is measured, residual against the tried deformation beyond the
+            benchmark frame's, px; whether a fit at the first one uses it.
+        """
+        frame, lines = unedited(picture), len(self.clocks_rad)
+        found = frame.near_edge(self.view.lines_at(self.clocks_rad, own))
+        own_residual = edge_residuals(self.view, found, own).residual_px
+        coherent = np.isfinite(own_residual) if found.is_by_hand else is_coherent(found.line, own_residual)
+        offset, _, _ = self._at_benchmark(found.line, _BESIDE if found.is_by_hand else 0)
+        residual = edge_residuals(self.view, found, tried).residual_px - offset
+        edge = np.column_stack([found.points_px, found.inward_px, residual, coherent & np.isfinite(residual)])
+        place, sd = frame.features(self.features, self.view, own, REACH_PX)
+        place, sd = frame.with_marked(self.features, (place, sd)) or (place, sd)
+        has = np.flatnonzero(np.isfinite(sd))
+        points, across = self.features.points_shell_m[has], self.features.across_px[has]
+        offset, _, _ = self._at_benchmark(lines + has)
+        there, predicted = (self.view.sight(points, d).pixels for d in (own, tried))
+        off, residual = (place[has] - np.einsum("ni,ni->n", p, across) - offset for p in (there, predicted))
+        at = there + off[:, None] * across
+        return edge, np.column_stack([at, across, residual, np.abs(off) < OUTLIER_PX])
+
     def _reconciled(
         self, frame: EditedFrame, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None,
         deformation: FloatArray, both: _Solution,

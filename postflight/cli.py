@@ -270,6 +270,17 @@ def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, join
 
 
 @cli.command()
+@click.argument("folder", type=FOLDER)
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Of 127.0.0.1; default: any free one.")
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in the browser.")
+def camera(folder: Path, port: int, browser: bool) -> None:
+    """Work at the film in FOLDER by hand: step through it, try deflections, mask, mark, accept and reject."""
+    from postflight.camera_bench import command
+
+    command.open_bench(folder, port, browser)
+
+
+@cli.command()
 @click.argument("corners", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--size", required=True, metavar="WxH", help="Size of the pictures, e.g. 640x480.")
 @click.option("--lens", type=click.Choice(["fisheye", "pinhole"]), default="fisheye", show_default=True)

@@ -74,6 +74,8 @@ PAGE = {
     "behind": "#E9EEF3", "grid": "#ECEFF2", "tick": "#C4CCD3", "border": "#B9C2CA", "accent": "#005A8C",
     "good": "#00674C", "bad": "#A33C00",
 }  # fmt: skip
+# over a frame at the bench: points that a fit uses, that it rejects, the edge predicted, marks by hand
+OVER_FRAME = {"used": _GREEN, "left": _VERMILION, "outline": _YELLOW, "marks": _SKY}
 
 LABEL = {
     "camera": "video (virtual camera)",

@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,6 +62,11 @@ folder = "telemetry/camera5"
 camera = "camera5"
 benchmark_s = 421.0
 """
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+QUIET = ("disable-gpu", "disable-quic", "no-first-run", "disable-background-networking", "disable-component-update",
+         "disable-sync")  # fmt: skip
 
 
 class FlightFolder:
@@ -217,3 +222,18 @@ def mini_flight():
         return replace(mini.sense_everything(truth, seed, mini.SITES), sounding=air, vehicle=vehicle)
 
     return make
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[object]:
+    """A headless Chromium of this machine; skips where there is none."""
+    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if path is None:
+        pytest.skip("no Chromium on this machine")
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(
+            executable_path=path, headless=True, chromium_sandbox=False, args=[f"--{flag}" for flag in QUIET]
+        )
+        yield started
+        started.close()

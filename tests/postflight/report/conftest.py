@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,9 +20,6 @@ from tests.postflight.short_flights import write_pulse
 ROOT = Path(__file__).parents[3]
 HOSTILE = "<script>alert(1)</script>"
 HOSTILE_EVENT = '</script><img src=x onerror="alert(2)">'
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-QUIET = ("disable-gpu", "disable-quic", "no-first-run", "disable-background-networking", "disable-component-update",
-         "disable-sync")  # fmt: skip
 
 
 @pytest.fixture(scope="session")
@@ -51,21 +47,6 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def report(reported: Path) -> Path:
     """The report that the run wrote."""
     return next((reported / "runs").glob("*/report.html"))
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[object]:
-    """A headless Chromium of this machine; skips where there is none."""
-    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if path is None:
-        pytest.skip("no Chromium on this machine")
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with playwright.sync_playwright() as driver:
-        started = driver.chromium.launch(
-            executable_path=path, headless=True, chromium_sandbox=False, args=[f"--{flag}" for flag in QUIET]
-        )
-        yield started
-        started.close()
 
 
 @pytest.fixture

@@ -1,0 +1,1 @@
+"""A bench to work at a film by hand: `postflight camera FOLDER`."""

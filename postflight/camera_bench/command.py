@@ -1,0 +1,51 @@
+"""The command ``postflight camera``: a bench for a flight folder's film, until Ctrl-C."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+
+from rich.console import Console
+
+from flightmodel.camera_edits import EDITS_FILE
+from flightmodel.checks import GateError
+from postflight.camera_bench.server import HOST, serve
+from postflight.camera_bench.session import Session
+from postflight.commands import compile_kernels
+from postflight.flight import Flight, read_flight
+
+console = Console(soft_wrap=True, highlight=False)
+
+
+def open_bench(folder: Path, port: int, browser: bool) -> None:
+    """Serve the bench's page on this machine until interrupted.
+
+    Raises
+    ------
+    GateError
+        Where the folder has no video or cannot be read, or the port is taken.
+    """
+    session = session_of(read_flight(folder, needs_path=False), folder)
+    try:
+        server, address = serve(session, port)
+    except (OSError, SystemExit):  # the library ends the process itself
+        session.close()
+        raise GateError(f"--port {port}: {HOST} does not offer it; leave --port out", code="port-taken") from None
+    console.print(f"film of {folder} at {address}", markup=False)
+    console.print(f"decisions are saved in {folder / EDITS_FILE}; Ctrl-C ends the bench", markup=False)
+    if browser:
+        webbrowser.open(address)
+    try:
+        server.serve_forever()
+    finally:
+        server.server_close()
+        session.close()
+
+
+def session_of(flight: Flight, folder: Path) -> Session:
+    """Session for a flight's video; `GateError` where it has none."""
+    frames = flight.telemetry.frames
+    if frames is None:
+        raise GateError(f"{folder}: the flight has no video; [frames] in flight.toml names it", code="video-missing")
+    compile_kernels("camera")
+    return Session(folder, frames, flight.telemetry.required_vehicle())
