@@ -25,7 +25,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from flightmodel.checks import Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.config import Section, Time
-from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.units import UNITS, read_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,8 +51,8 @@ class ColumnEntry(Section):
     @field_validator("unit")
     @classmethod
     def _known(cls, value: str) -> str:
-        if value not in UNITS:
-            raise ValueError(f"unknown unit; known: {', '.join(UNITS)}")
+        if read_unit(value) is None:
+            raise ValueError(f"unknown unit; known: {', '.join(UNITS)}, and what pint reads, as slug/ft^3 or deg/hr")
         return value
 
 
@@ -95,56 +95,6 @@ class Source(Section):
         t = self.time
         parts = t.columns or (t.column,)
         return TimeColumn(parts[0], t.format, t.unit, parts, t.repeats)
-
-
-# unit -> (kind of quantity, factor to SI, offset added after the factor)
-UNITS: dict[str, tuple[str, float, float]] = {
-    "s": ("time", 1.0, 0.0),
-    "ms": ("time", 1e-3, 0.0),
-    "us": ("time", 1e-6, 0.0),
-    "min": ("time", 60.0, 0.0),
-    "m": ("length", 1.0, 0.0),
-    "cm": ("length", 0.01, 0.0),
-    "mm": ("length", 1e-3, 0.0),
-    "km": ("length", 1000.0, 0.0),
-    "yd": ("length", 0.9144, 0.0),
-    "ft": ("length", 0.3048, 0.0),
-    "kft": ("length", 304.8, 0.0),
-    "nmi": ("length", 1852.0, 0.0),
-    "rad": ("angle", 1.0, 0.0),
-    "mrad": ("angle", 1e-3, 0.0),
-    "deg": ("angle", np.pi / 180.0, 0.0),
-    "mil": ("angle", 2.0 * np.pi / 6400.0, 0.0),
-    "deg1e7": ("angle", 1e-7 * np.pi / 180.0, 0.0),  # whole numbers, as many receivers write a latitude
-    "mps2": ("acceleration", 1.0, 0.0),
-    "g": ("acceleration", STANDARD_GRAVITY_MPS2, 0.0),
-    "mg": ("acceleration", 1e-3 * STANDARD_GRAVITY_MPS2, 0.0),
-    "ftps2": ("acceleration", 0.3048, 0.0),
-    "radps": ("rate", 1.0, 0.0),
-    "degps": ("rate", np.pi / 180.0, 0.0),
-    "rpm": ("rate", 2.0 * np.pi / 60.0, 0.0),
-    "t": ("magnetic field", 1.0, 0.0),
-    "ut": ("magnetic field", 1e-6, 0.0),
-    "nt": ("magnetic field", 1e-9, 0.0),
-    "gauss": ("magnetic field", 1e-4, 0.0),
-    "mps": ("speed", 1.0, 0.0),
-    "cmps": ("speed", 0.01, 0.0),
-    "mmps": ("speed", 1e-3, 0.0),
-    "kmh": ("speed", 1.0 / 3.6, 0.0),
-    "kt": ("speed", 1852.0 / 3600.0, 0.0),
-    "ftps": ("speed", 0.3048, 0.0),
-    "kgpm3": ("density", 1.0, 0.0),
-    "gpm3": ("density", 1e-3, 0.0),
-    "k": ("temperature", 1.0, 0.0),
-    "degc": ("temperature", 1.0, 273.15),
-    "pa": ("pressure", 1.0, 0.0),
-    "hpa": ("pressure", 100.0, 0.0),
-    "kpa": ("pressure", 1000.0, 0.0),
-    "psi": ("pressure", 6894.757293168361, 0.0),
-    "1": ("fraction", 1.0, 0.0),
-    "percent": ("fraction", 0.01, 0.0),
-}
-KINDS = {kind for kind, _, _ in UNITS.values()}
 
 
 @dataclass(frozen=True)
@@ -334,12 +284,15 @@ def place(quantity: Quantity, declared: Declared | None) -> tuple[str, str]:
 
 def fits(quantity: Quantity, unit: str) -> bool:
     """Whether a quantity can have a unit."""
-    return unit in UNITS and UNITS[unit][0] == quantity.kind
+    found = read_unit(unit)
+    return found is not None and found.kind == quantity.kind
 
 
 def to_si(values: FloatArray, unit: str) -> FloatArray:
     """Turn numbers of a unit into SI, in place."""
-    _, factor, offset = UNITS[unit]
+    known = read_unit(unit)
+    assert known is not None
+    _, factor, offset = known
     if factor != 1.0:
         with np.errstate(over="ignore"):  # beyond any flight, and refused as such
             values *= factor

@@ -19,8 +19,8 @@ from flightmodel import earth, tables
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.flightfolder import Sources
 from flightmodel.instruments import RADAR
-from flightmodel.tables import UNITS
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
+from flightmodel.units import read_unit
 from postflight.checks.track_force import TrackForce, coasting, track_force
 from postflight.checks.units_and_axes import (
     TimeBias,
@@ -154,7 +154,8 @@ def _candidates(declared: tuple[str, ...]) -> list[tuple[str, ...]]:
 
 def _reread(record: RadarRecord, declared: tuple[str, ...], units: tuple[str, ...]) -> FloatArray | None:
     """Positions (n, 3) as other units, or exchanged angles, would have them, ECEF m; None where they cannot be."""
-    factor = [UNITS[new][1] / UNITS[old][1] for new, old in zip(units, declared, strict=False)]
+    pairs = [(read_unit(new), read_unit(old)) for new, old in zip(units[:3], declared[:3], strict=True)]
+    factor = [new.factor / old.factor for new, old in pairs if new is not None and old is not None]
     values = record.range_az_el * np.array(factor)
     if units[3] == "el az":
         values = values[:, [0, 2, 1]]

@@ -14,8 +14,9 @@ from itertools import permutations, product
 import numpy as np
 
 from flightmodel.checks import FloatArray
-from flightmodel.tables import UNITS, Quantity, Source, place
+from flightmodel.tables import Quantity, Source, place
 from flightmodel.telemetry import Finding
+from flightmodel.units import UNITS, read_unit
 
 Axes = tuple[tuple[int, ...], tuple[int, ...]]
 AS_DECLARED: Axes = ((0, 1, 2), (1, 1, 1))
@@ -40,10 +41,14 @@ def unit_that_explains(ratio: float, unit: str, within: float = _SAME_UNIT) -> s
     within : float
         Largest difference of the logarithms.
     """
-    kind, factor, _ = UNITS[unit]
+    declared = read_unit(unit)
+    if declared is None:
+        return None
+    kind, factor, _ = declared
     if not np.isfinite(ratio) or ratio <= 0.0:
         return None
-    off = {name: abs(float(np.log(f / factor / ratio))) for name, (k, f, _) in UNITS.items() if k == kind}
+    known = {**UNITS, unit: declared}
+    off = {name: abs(float(np.log(f / factor / ratio))) for name, (k, f, _) in known.items() if k == kind}
     best = min(off, key=lambda name: (off[name], name != unit))
     return best if off[best] < within else None
 

@@ -21,7 +21,7 @@ import numpy as np
 from flightmodel import tables
 from flightmodel.checks import FloatArray
 from flightmodel.config import FILL_IN_VALUE
-from flightmodel.tables import UNITS, Quantity
+from flightmodel.tables import Quantity
 from postflight.intake.freeform_tables import FreeFormTable
 from postflight.intake.headers import (
     AXES,
@@ -253,6 +253,8 @@ def _time_unit(named: ColumnName, values: FloatArray) -> tuple[str, str, str]:
     units = named.units("time")
     if units:
         return units[0], STATED, f"'{named.unit_text}' in the header"
+    if named.unknown_unit:
+        return "", ASKED, not_known(named)
     known = values[np.isfinite(values)]
     step = np.diff(known)
     usual = float(np.median(step[step > 0.0]))
@@ -374,7 +376,9 @@ class Recogniser:
         for q, k in zip(quantities, at, strict=True):
             unit = next(iter(self.named[k].units(kind)), "")
             how, reason = (STATED, f"{why}, '{self.named[k].unit_text}' in the header") if unit else ("", "")
-            if not unit:
+            if not unit and self.named[k].unknown_unit and unit_key(self.named[k].unit_text) not in SEVERAL_MEANINGS:
+                how, reason = ASKED, not_known(self.named[k])
+            elif not unit:
                 meaning = SEVERAL_MEANINGS.get(self.named[k].unit_text, "")
                 unit, how = by_numbers, NUMBERS if by_numbers else ASKED
                 reason = "; ".join(filter(None, (meaning, why, seen)))
@@ -402,6 +406,8 @@ class Recogniser:
             unit = next(iter(self.named[k].units(quantity.kind)), "")
             if unit:
                 return self._proposal(quantity, k, unit, STATED, f"'{self.named[k].unit_text}' in the header")
+            if self.named[k].unknown_unit:
+                return self._proposal(quantity, k, "", ASKED, not_known(self.named[k]))
             unit, seen = column_unit(quantity.short, quantity.kind, self.table.numbers(k))
             return self._proposal(quantity, k, unit, NUMBERS if unit else ASKED, seen)
         return None
@@ -474,7 +480,8 @@ class Recogniser:
 
     def _earth_sized(self, at: list[int]) -> bool:
         unit = next(iter(self.named[at[0]].units("length")), "m")
-        size: FloatArray = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1) * UNITS[unit][1]
+        axes = [tables.to_si(self.table.numbers(k).copy(), unit) for k in at]
+        size: FloatArray = np.linalg.norm(np.column_stack(axes), axis=1)
         return bool(_EARTH_RADII_M[0] < np.nanmedian(size) < _EARTH_RADII_M[1])
 
     def _height(self, quantity: Quantity) -> tuple[ColumnProposal | None, list[tuple[str, str, str]]]:
@@ -545,6 +552,11 @@ def _axes_of(tokens: tuple[str, ...]) -> list[tuple[tuple[str, ...], str, int]]:
         elif len(token) > 1 and token[-1] in "ned" and token[:-1] == "v":
             out.append((("v", *rest), "ned", AXES[token[-1]]))
     return out
+
+
+def not_known(named: ColumnName) -> str:
+    """What is said of a unit that is written and not known: it outweighs whatever the numbers look like."""
+    return f"'{named.unit_text}' in the header is no unit that is known"
 
 
 def quoted(name: str) -> str:

@@ -203,10 +203,12 @@ def _moist_density(pressure_pa: FloatArray, temperature_k: FloatArray, dew_point
 def _dew_point(recogniser: Recogniser) -> FloatArray | None:
     """Dew points (n,), K; None where no column in a known unit holds them."""
     for k in recogniser.columns_of("dewpoint"):
-        values = recogniser.table.numbers(k)
-        units = recogniser.named[k].units("temperature") or [column_unit("temperature", "temperature", values)[0]]
-        if units[0]:
-            return to_si(values, units[0])
+        values, named = recogniser.table.numbers(k), recogniser.named[k]
+        unit = next(iter(named.units("temperature")), "")
+        if not unit and not named.unknown_unit:
+            unit, _ = column_unit("temperature", "temperature", values)
+        if unit:
+            return to_si(values, unit)
     return None
 
 

@@ -26,7 +26,8 @@ from flightmodel.aerodynamics import Sidecar
 from flightmodel.checks import ConfigError, write_file
 from flightmodel.config import FILL_IN, FILL_IN_VALUE, read_toml
 from flightmodel.flightfolder import FlightFile
-from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES, UNITS
+from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES
+from flightmodel.units import UNITS
 from flightmodel.vehicle import DATA, VehicleFile, vehicle_from_toml, vehicle_path
 from postflight.intake.column_recognition import (
     ASKED,
@@ -280,7 +281,7 @@ def _time_lines(time: TimeProposal) -> list[str]:
 
 
 def _column_line(m: ColumnProposal) -> str:
-    text = f'{m.short} = {{ column = {quoted(m.column)}, unit = "{m.unit or FILL_IN_VALUE}" }}'
+    text = f"{m.short} = {{ column = {quoted(m.column)}, unit = {quoted(m.unit or FILL_IN_VALUE)} }}"
     if m.how == ASKED:
         return _line(text, f"which unit? {', '.join(_units_of(m.short))}; {_one_line(m.why)}")
     return _line(text, _one_line(m.why) if m.how == STATED else f"by its numbers: {_one_line(m.why)}")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from flightmodel.tables import UNITS
+from flightmodel.units import UNITS, read_unit
 
 _FOLD = str.maketrans(
     {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "µ": "u", "μ": "u", "²": "2", "³": "3", "⁻": "-"}
@@ -31,12 +31,18 @@ _SPELLINGS = {
     "deg": "degrees degree grad degn dege",
     "rad": "radians radian",
     "mil": "mils",
+    "gon": "gons",
+    "kyd": "kyds kiloyards",
+    "mi": "miles mile",
+    "mrad": "milliradians",
     "mps2": "m/s2 m/s/s ms-2 ms2 m/sec2 m_s2",
     "g": "gs g's gee gn g0",
     "gauss": "g gs",
     "mg": "milli-g",
     "ftps2": "ft/s2 ft/sec2",
     "degps": "deg/s deg/sec dps grad/s degs-1 deg_s",
+    "degph": "deg/hr deg/h dph grad/h deg/hour",
+    "mradps": "mrad/s",
     "radps": "rad/s rad_s rads-1 rad/sec",
     "rpm": "1/min u/min",
     "t": "tesla",
@@ -48,11 +54,19 @@ _SPELLINGS = {
     "kmh": "km/h kph km_h",
     "kt": "knots knot kn kts",
     "ftps": "ft/s fps ft_s",
+    "mph": "mi/h miles/hour",
     "kgpm3": "kg/m3 kgm-3",
     "gpm3": "g/m3",
     "k": "kelvin",
-    "degc": "c celsius",
-    "hpa": "mbar mb",
+    "degc": "c celsius degcelsius",
+    "degf": "f fahrenheit degfahrenheit",
+    "degr": "r rankine",
+    "slugpft3": "slug/ft3 slugs/ft3",
+    "lbpft3": "lb/ft3 lbm/ft3",
+    "hpa": "mbar mb millibar",
+    "psi": "psia lb/in2 lbf/in2",
+    "psf": "lb/ft2 lbf/ft2 psfa",
+    "mmhg": "torr",
     "percent": "%",
 }
 # spelling -> units in flight.toml; several where the quantity decides
@@ -60,6 +74,7 @@ UNIT_SPELLINGS: dict[str, tuple[str, ...]] = {name: (name,) for name in UNITS if
 for _unit, _written in _SPELLINGS.items():
     for _spelling in _written.split():
         UNIT_SPELLINGS[_spelling] = (*UNIT_SPELLINGS.get(_spelling, ()), _unit)
+_AFTER_TEMPERATURE = {"f", "r", "c"}  # elsewhere these letters at a name's end are a force, an axis, anything
 SEVERAL_MEANINGS = {"rps": "rad/s or revolutions a second"}
 
 
@@ -122,14 +137,32 @@ class ColumnName:
     tokens: tuple[str, ...]
     unit_text: str
 
+    @property
+    def _stated(self) -> tuple[str, ...]:
+        """Units that the stated text may mean, as flight.toml takes them; none where it is not known."""
+        key = unit_key(self.unit_text)
+        if key in UNIT_SPELLINGS or not key or key in SEVERAL_MEANINGS:
+            return UNIT_SPELLINGS.get(key, ())
+        return (self.unit_text,) if read_unit(self.unit_text) is not None else ()
+
     def units(self, kind: str) -> list[str]:
         """Return the stated unit's names in flight.toml that fit a kind of quantity; empty where none does."""
-        return [u for u in UNIT_SPELLINGS.get(unit_key(self.unit_text), ()) if UNITS[u][0] == kind]
+        return [u for u in self._stated if _kind(u) == kind]
 
     @property
     def kinds(self) -> set[str]:
         """Kinds of quantity that the stated unit allows; empty where none is stated."""
-        return {UNITS[u][0] for u in UNIT_SPELLINGS.get(unit_key(self.unit_text), ())}
+        return {_kind(u) for u in self._stated}
+
+    @property
+    def unknown_unit(self) -> str:
+        """Text that stands where a unit does and is none that is known; empty where there is none such."""
+        return "" if self._stated else self.unit_text
+
+
+def _kind(unit: str) -> str:
+    found = read_unit(unit)
+    return "" if found is None else found.kind
 
 
 def parse_column_name(name: str, unit_row: str = "") -> ColumnName:
@@ -141,12 +174,19 @@ def parse_column_name(name: str, unit_row: str = "") -> ColumnName:
     else:
         for mark in re.finditer(r"[_\s/.,]+(?:in\s+)?", base):
             head, tail = base[: mark.start()], base[mark.end() :]
-            if head and (unit_key(tail) in UNIT_SPELLINGS or unit_key(tail) in SEVERAL_MEANINGS):
+            if head and _is_suffix(head, unit_key(tail)):
                 base, unit = head, tail
                 break
     stated = unit_row.strip().strip("()[]{}<>") or unit
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", base)
     return ColumnName(name, tuple(re.findall(r"[a-z]+|\d+", fold(spaced))), stated)
+
+
+def _is_suffix(head: str, key: str) -> bool:
+    """Whether the end of a column's name, behind a mark, is a unit."""
+    if key in _AFTER_TEMPERATURE:
+        return bool(matching(tuple(re.findall(r"[a-z]+|\d+", fold(head))), QUANTITIES["temperature"] | {"td"}))
+    return key in UNIT_SPELLINGS or key in SEVERAL_MEANINGS
 
 
 def matching(tokens: tuple[str, ...], vocabulary: set[str]) -> set[str]:

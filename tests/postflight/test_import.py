@@ -13,6 +13,7 @@ from click.testing import CliRunner
 
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.flightfolder import read_flight, read_sources
+from flightmodel.units import read_unit
 from postflight.cli import cli
 
 ROOT = Path(__file__).parents[2]
@@ -376,3 +377,59 @@ def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):
     assert read > 200
     assert frames_read > 5
     assert coefficients_read > 20
+
+
+# ------------------------------------------------------------------------------------------ units that are written
+
+AIR = {"Height (m)": lambda t: 1000.0 * t, "Density (kg/m3)": lambda t: 1.2 * np.exp(-t / 7.0)}
+
+
+@pytest.mark.parametrize(
+    ("header", "value", "kelvin"),
+    [
+        ("Temp (F)", 14.0, 263.15), ("Temp [degF]", 14.0, 263.15), ("T_F", 14.0, 263.15), ("Temp (°F)", 14.0, 263.15),
+        ("Temperature (R)", 473.67, 263.15), ("T_R", 473.67, 263.15), ("Temp (C)", -10.0, 263.15),
+        ("Temp (degree_Rankine)", 473.67, 263.15),
+    ],
+)  # fmt: skip
+def test_a_temperature_is_read_in_the_unit_that_is_written(folder, tmp_path, header, value, kelvin):
+    frame(**AIR, **{header: value}).drop(columns="t_s").to_csv(tmp_path / "air.csv", index=False)
+    run("import", tmp_path / "air.csv", "--into", folder)
+    found = tomllib.loads(text_of(folder))["atmosphere"]["columns"]["temperature"]
+    unit = read_unit(found["unit"])
+    assert unit.factor * value + unit.offset == pytest.approx(kelvin)
+
+
+@pytest.mark.parametrize(
+    ("unit", "value", "si"),
+    [("slug/ft3", 0.002, 1.03076), ("lb/ft^3", 0.06, 0.961108), ("g/cm3", 0.0011, 1.1), ("lbm/ft3", 0.06, 0.961108)],
+)
+def test_a_density_is_read_in_the_unit_that_is_written(folder, tmp_path, unit, value, si):
+    air = frame(**{"Height (kft)": lambda t: 3.0 * t, f"Density ({unit})": value, "Temp (K)": 250.0})
+    air.drop(columns="t_s").to_csv(tmp_path / "air.csv", index=False)
+    run("import", tmp_path / "air.csv", "--into", folder)
+    found = tomllib.loads(text_of(folder))["atmosphere"]["columns"]
+    assert read_unit(found["rho"]["unit"]).factor * value == pytest.approx(si, rel=1e-5)
+    assert read_unit(found["alt"]["unit"]).factor == pytest.approx(304.8)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("deg/hr", 4.84814e-6), ("mrad/s", 1e-3), ("rev/min", None)])
+def test_a_rate_is_read_in_the_unit_that_is_written_or_asked_for(folder, tmp_path, unit, factor):
+    wave = lambda t: 900.0 * np.sin(t)  # noqa: E731 - by its numbers deg/s
+    names = {f"{name} rate ({unit})": wave for name in ("Roll", "Pitch", "Yaw")}
+    frame(**names).to_csv(tmp_path / "gyro.csv", index=False)
+    run("import", tmp_path / "gyro.csv", "--into", folder)
+    for column in tomllib.loads(text_of(folder))["sensors"]["rates"]["columns"].values():
+        if factor is None:
+            assert column["unit"] == "FILL IN"
+        else:
+            assert read_unit(column["unit"]).factor == pytest.approx(factor, rel=1e-5)
+    if factor is None:
+        assert f"'{unit}' in the header is no unit that is known" in text_of(folder)
+
+
+def test_text_in_a_unit_row_that_is_no_unit_is_asked_for(folder, tmp_path):
+    air = frame(height=lambda t: 1000.0 * t, density=lambda t: 1.2 * np.exp(-t / 7.0), temperature=-10.0)
+    written(tmp_path / "air.csv", air.drop(columns="t_s"), units=["m", "kg/m3", "cels."])
+    run("import", tmp_path / "air.csv", "--into", folder)
+    assert tomllib.loads(text_of(folder))["atmosphere"]["columns"]["temperature"]["unit"] == "FILL IN"
