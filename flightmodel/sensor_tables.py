@@ -16,11 +16,19 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.integrate import cumulative_trapezoid
 
 from flightmodel import earth, tables
-from flightmodel.atmosphere import R_AIR_JPKGK, default_sounding_sd, height_from_pressure, profile_from_sounding
+from flightmodel.atmosphere import (
+    EARTH_RADIUS_US76_M,
+    R_AIR_JPKGK,
+    default_sounding_sd,
+    height_from_pressure,
+    profile_from_sounding,
+)
 from flightmodel.camera_edits import EDITS_FILE, NO_EDITS, CameraEdits, read_edits
 from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault
 from flightmodel.gate import Gate, Table, find_faults, oversampled, rows_to_use
 from flightmodel.instruments import (
@@ -525,6 +533,8 @@ SMALLEST_SD = 1e-6  # a fraction, and m/s
 # pressure may depart from the gas law by this much before it is worth a word (separate instruments, humidity)
 GAS_LAW_TOLERANCE = 0.05
 LOWEST_TOP_M = 60e3
+BALLOON_TOP_M = 32e3  # above it the densities' own errors grow
+HYDROSTATIC_TOLERANCE = 0.15  # over a scale height, from two densities with errors of 2 %: 5 sd
 
 
 def read_sounding(gate: Gate, source: AtmosphereEntry) -> Sounding | None:
@@ -560,6 +570,21 @@ def _winds(gate: Gate, table: Table) -> tuple[FloatArray, FloatArray] | None:
     return None
 
 
+def hydrostatic_error(altitude_m: FloatArray, pressure_pa: FloatArray, temperature_k: FloatArray) -> float:
+    """How much too high temperatures read for the fall of the pressure ``rho R T`` with height, as a fraction.
+
+    By ``d ln p / dh = -g / (R T)`` over each scale height below `BALLOON_TOP_M`: the largest; zero without a whole one.
+    """
+    low = altitude_m < BALLOON_TOP_M
+    if low.sum() < 2:
+        return 0.0
+    h = EARTH_RADIUS_US76_M * altitude_m[low] / (EARTH_RADIUS_US76_M + altitude_m[low])
+    expected = STANDARD_GRAVITY_MPS2 / R_AIR_JPKGK * cumulative_trapezoid(1.0 / temperature_k[low], h, initial=0.0)
+    at = np.arange(np.floor(expected[-1]) + 1.0)
+    off = np.diff(np.interp(at, expected, -np.log(pressure_pa[low]))) - 1.0
+    return float(off[np.argmax(np.abs(off))]) if len(off) else 0.0
+
+
 def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> Sounding | None:
     c = table.columns
     whole = np.isfinite(c["alt"] + c["rho"] + c["temperature"] + winds[0] + winds[1])
@@ -588,6 +613,14 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> 
             gate.findings.append(
                 Finding(SOURCE, f"{words}{int(table.lines[k])}; density is used", np.nan, np.nan, code="gas-law")
             )
+    out_of_balance = hydrostatic_error(alt, pressure, temperature)
+    if abs(out_of_balance) > HYDROSTATIC_TOLERANCE:
+        size, side = 100.0 * abs(out_of_balance), "high" if out_of_balance > 0.0 else "low"
+        words = (
+            f"temperatures are up to {size:.0f} % too {side} for the fall of density with height (hydrostatic balance): "
+            "check the units of all three"
+        )
+        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="hydrostatic"))
     density_sd, wind_sd = default_sounding_sd(alt)
     for key, default in (("rho_sd", density_sd), ("wind_sd", wind_sd)):
         if key in c:
