@@ -617,8 +617,8 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> 
     if abs(out_of_balance) > HYDROSTATIC_TOLERANCE:
         size, side = 100.0 * abs(out_of_balance), "high" if out_of_balance > 0.0 else "low"
         words = (
-            f"temperatures are up to {size:.0f} % too {side} for the fall of density with height (hydrostatic balance): "
-            "check the units of all three"
+            f"temperatures are up to {size:.0f} % too {side} for the fall of density with height (hydrostatic "
+            "balance): check the units of all three"
         )
         gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="hydrostatic"))
     density_sd, wind_sd = default_sounding_sd(alt)
