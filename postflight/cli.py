@@ -21,6 +21,20 @@ import click
 FOLDER = click.Path(path_type=Path)
 
 
+class NamedChoice(click.Choice[str]):
+    """A choice that names the nearest one to a word that is none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Value, or a usage error."""
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter as fault:
+            from flightmodel.checks import nearest_name
+
+            hint = nearest_name(str(value), list(self.choices))
+            raise click.BadParameter(fault.message.rstrip(".") + hint, ctx, param) from None
+
+
 @click.group()
 def montecarlo() -> None:
     """Fly many dispersed flights, on this machine or a cluster; kill and resume at will.
@@ -92,7 +106,7 @@ def montecarlo_retry_failed(folder: Path, workers: int | None, scheduler: str | 
 @click.argument("folder", type=FOLDER)
 @click.option("--output", default="peak_deflection_deg", show_default=True, help="Whose indices are printed and drawn.")
 @click.option("--base", type=int, default=256, show_default=True, help="Points of the design, a power of two.")
-@click.option("--by", type=click.Choice(["factor", "section"]), default="section", show_default=True)
+@click.option("--by", type=NamedChoice(["factor", "section"]), default="section", show_default=True)
 @workers_and_scheduler
 def montecarlo_sobol(
     dispersions: str, folder: Path, output: str, base: int, by: str, workers: int | None, scheduler: str | None
@@ -247,7 +261,7 @@ def reconstruct(
 @click.option(
     "--method",
     "methods",
-    type=click.Choice(["camera", "misalignment", "trim", "fused"]),
+    type=NamedChoice(["camera", "misalignment", "trim", "fused"]),
     multiple=True,
     help="Estimator to run; repeat for several. Default: all that the flight has data for.",
 )
@@ -283,7 +297,7 @@ def camera(folder: Path, port: int, browser: bool) -> None:
 @cli.command()
 @click.argument("corners", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--size", required=True, metavar="WxH", help="Size of the pictures, e.g. 640x480.")
-@click.option("--lens", type=click.Choice(["fisheye", "pinhole"]), default="fisheye", show_default=True)
+@click.option("--lens", type=NamedChoice(["fisheye", "pinhole"]), default="fisheye", show_default=True)
 def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> None:
     """Calibrate a lens on checkerboard CORNERS (CSV: image, X_m, Y_m, u_px, v_px); print lines for a vehicle file."""
     from postflight import commands
@@ -382,7 +396,7 @@ def import_tables(files: tuple[Path, ...], folder: Path) -> None:
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--to", "form", required=True, type=click.Choice(["csv", "parquet", "mat", "nc", "kml", "oem"]))
+@click.option("--to", "form", required=True, type=NamedChoice(["csv", "parquet", "mat", "nc", "kml", "oem"]))
 @click.option("--out", type=FOLDER, help="File to write; default: exports/RUN.FORMAT in FOLDER.")
 def export(folder: Path, form: str, out: Path | None) -> None:
     """Write the newest run's trajectory and deflections for another program."""
@@ -392,7 +406,7 @@ def export(folder: Path, form: str, out: Path | None) -> None:
 
 
 @cli.command()
-@click.argument("kind", type=click.Choice(["flight", "vehicle", "scenario", "coefficients"]))
+@click.argument("kind", type=NamedChoice(["flight", "vehicle", "scenario", "coefficients"]))
 def schema(kind: str) -> None:
     """Print the JSON Schema of a flight.toml, vehicle or scenario file, or of a coefficient table's sidecar."""
     from postflight.intake.flight_form import schema_text

@@ -322,6 +322,22 @@ def inherited_sigint(request):
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (("deflection", "x", "--metod", "camera"), "--method"),
+        (("deflection", "x", "--method", "camra"), "'camera'"),
+        (("recncile", "x"), "'reconcile'"),
+        (("schema", "fligt"), "'flight'"),
+        (("export", "x", "--to", "cvs"), "'csv'"),
+    ],
+)
+def test_a_misspelt_command_option_or_choice_names_what_may_be_meant(command, arguments, meant) -> None:
+    done = command(*arguments)
+    assert done.returncode == 2
+    assert re.search(f"(?i)did you mean .?{meant}", done.stderr), done.stderr
+
+
 @pytest.mark.usefixtures("inherited_sigint")
 def test_interrupt_before_anything_is_written(tmp_path: Path) -> None:
     process = start("simulate", "irve2_reference", tmp_path / "out")
