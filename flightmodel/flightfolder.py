@@ -35,6 +35,7 @@ from flightmodel.earth import ecef_from_radar, geodetic_from_ecef, q_ecef_body_f
 from flightmodel.film import Frames
 from flightmodel.gate import Gate
 from flightmodel.instruments import (
+    SITES,
     AtmosphereEntry,
     BarometerEntry,
     FramesEntry,
@@ -42,6 +43,8 @@ from flightmodel.instruments import (
     MagnetometerEntry,
     RadarEntry,
     RatesEntry,
+    SitesEntry,
+    SitesSpec,
     SunEntry,
     TriadEntry,
 )
@@ -60,6 +63,7 @@ from flightmodel.telemetry import (
     BarometerRecord,
     Finding,
     GnssRecord,
+    KnownPlace,
     Motion,
     RadarRecord,
     Sounding,
@@ -89,6 +93,8 @@ class AttitudeEntry(Section):
     roll_deg: Angle | None = None
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
+    # of the place, which is compared with the trackers'; written to 0.001 deg it is within 100 m
+    place_sd_m: Annotated[float, Field(ge=1e-3, le=1e6)] = 100.0
     sd_deg: tuple[AttitudeSd, AttitudeSd, AttitudeSd] = (3.0, 3.0, 3.0)
 
     @field_validator(
@@ -113,6 +119,18 @@ class AttitudeEntry(Section):
         if (place[0] is None) != (place[1] is None):
             raise ValueError("latitude_deg and longitude_deg belong together")
         return self
+
+
+class PlaceEntry(Section):
+    """A place that the vehicle is known to have been at; `flightmodel.telemetry.KnownPlace`."""
+
+    name: Name
+    t_s: Time
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    height_m: Annotated[float, Field(ge=-1e3, le=1e5)] | None = None
+    sd_m: Annotated[float, Field(ge=1e-3, le=1e6)] = 5.0
+    height_sd_m: Annotated[float, Field(ge=1e-3, le=1e6)] = 5.0
 
 
 class UnmodelledEntry(Section):
@@ -188,6 +206,8 @@ class FlightFile(Section):
     motion: MotionEntry = MotionEntry()
     sensors: SensorsEntry = SensorsEntry()
     radars: dict[Name, RadarEntry] = {}
+    sites: SitesEntry = SitesEntry()
+    places: list[PlaceEntry] = []
     gnss: dict[Name, GnssEntry] = {}
     barometers: dict[Name, BarometerEntry] = {}
     atmosphere: AtmosphereEntry | None = None
@@ -218,9 +238,11 @@ class FlightFile(Section):
             out += self._misfits_of_path()
         if self.frames and self.vehicle is None:
             out.append(Fault('frames: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing"))
-        names = [*self.radars, *self.gnss, *self.barometers]
+        names = [*self.radars, *self.gnss, *self.barometers, SitesSpec.name]
         for name in sorted({n for n in names if names.count(n) > 1}):
             words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
+            if name == SitesSpec.name:
+                words = f"the name '{name}' stands for all radar sites together; call the tracker otherwise"
             out.append(Fault(words, "name-twice"))
         return out
 
@@ -363,6 +385,8 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         barometers=found.barometers,
         motion=_motion(spec.motion),
         reconstruction=dict(spec.reconstruction),
+        sites=SitesSpec(**SITES.from_file(spec.sites)),
+        places=_places(spec),
     )
     if not found.radars and not found.gnss:
         return telemetry
@@ -445,6 +469,20 @@ def _attitude_prior(
     azimuth, elevation, roll = np.deg2rad([entry.azimuth_deg, entry.elevation_deg, entry.roll_deg])
     q = q_ecef_body_from_pointing(azimuth, elevation, roll, float(latitude), float(longitude))
     return AttitudePrior(entry.t_s, q, sd)
+
+
+def _places(spec: FlightFile) -> tuple[KnownPlace, ...]:
+    """Places that are known: those of ``[[places]]``, and that of the attitude prior where one is stated."""
+    out = []
+    prior = spec.attitude_prior
+    if prior is not None and prior.latitude_deg is not None and prior.longitude_deg is not None:
+        lat, lon = (float(x) for x in np.deg2rad([prior.latitude_deg, prior.longitude_deg]))
+        out.append(KnownPlace("attitude_prior", prior.t_s, lat, lon, np.nan, prior.place_sd_m, np.inf))
+    for entry in spec.places:
+        lat, lon = (float(x) for x in np.deg2rad([entry.latitude_deg, entry.longitude_deg]))
+        height = np.nan if entry.height_m is None else entry.height_m
+        out.append(KnownPlace(entry.name, entry.t_s, lat, lon, height, entry.sd_m, entry.height_sd_m))
+    return tuple(out)
 
 
 def _first_place(radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]) -> tuple[float, float] | None:

@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import BaseModel, Field, create_model, model_validator
 
 from flightmodel.checks import Fault, FloatArray
-from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place
+from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place, Section
 from flightmodel.tables import Declared, Source
 
 Sd = Annotated[float, Field(ge=1e-12, le=1e6)]  # its square is a number that can be divided by
@@ -337,6 +337,10 @@ class RadarSite:
         "1", 0.0, Annotated[float, Field(ge=0.0, le=0.1)], at=0.0, states=("range scale",), simulated=None,
         left_out=True, response=(0, lambda error, slant, _az, _el: error * slant),
     )  # fmt: skip
+    # where the site is and where its azimuths start: stated minus true place, azimuth reading minus azimuth from north
+    survey_sd_m: float = error_row("m", 0.0, at=0.0, states=("survey north", "survey east"), left_out=True)
+    height_sd_m: float = error_row("m", 0.0, at=0.0, states=("survey height",), left_out=True)
+    north_sd_rad: float = error_row("rad", 0.0, at=0.0, states=("north",), left_out=True)
     # white noise of one angle, where the two differ; azimuth's normal to the line of sight too
     azimuth_sd_rad: float | None = error_row("rad", None, Sd, at=None)
     elevation_sd_rad: float | None = error_row("rad", None, Sd, at=None)
@@ -349,6 +353,26 @@ class RadarSite:
             self.angle_sd_rad if azimuth is None else azimuth,
             self.angle_sd_rad if elevation is None else elevation,
         )
+
+
+@dataclass(frozen=True)
+class SitesSpec:
+    """What the survey of all radar sites shares: one network, one datum of heights, one azimuth mark.
+
+    Parameters
+    ----------
+    survey_sd_m : float
+        Stated minus true place, each of north and east.
+    height_datum_sd_m : float
+        Stated minus true height: the geoid's undulation, a height system.
+    north_sd_rad : float
+        Azimuth readings minus azimuths from true north.
+    """
+
+    name: str = "sites"
+    survey_sd_m: float = error_row("m", 0.0, at=0.0, states=("survey north", "survey east"))
+    height_datum_sd_m: float = error_row("m", 0.0, at=0.0, states=("height datum",))
+    north_sd_rad: float = error_row("rad", 0.0, at=0.0, states=("north",))
 
 
 @dataclass(frozen=True)
@@ -447,7 +471,9 @@ class SunHeads:
         return np.array([dcm_body_from_sun_head(float(clock)) for clock in self.clock_lv_rad])
 
 
-RADAR, GNSS, BAROMETER, SUN = (table_of(record) for record in (RadarSite, GnssSpec, BarometerSpec, SunHeads))
+RADAR, SITES, GNSS, BAROMETER, SUN = (
+    table_of(record) for record in (RadarSite, SitesSpec, GnssSpec, BarometerSpec, SunHeads)
+)
 
 
 def dcm_body_from_clocking(x_axis_lv_rad: float, y_axis_lv_rad: float) -> FloatArray:
@@ -577,6 +603,11 @@ class RadarEntry(TrackingSource):
     longitude_deg: Annotated[float, Field(ge=-360.0, le=360.0)]
     height_m: Annotated[float, Field(ge=-1e3, le=1e5)]
     tracks: Literal["cg", "datum"] = "cg"
+
+
+@with_keys(SITES.file_keys())
+class SitesEntry(Section):
+    """What the survey of all radar sites shares."""
 
 
 class Heights(TrackingSource):

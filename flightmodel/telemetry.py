@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
-from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SunHeads, TriadSpec
+from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SitesSpec, SunHeads, TriadSpec
 from flightmodel.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -175,6 +175,29 @@ class AttitudePrior:
 
 
 @dataclass(frozen=True)
+class KnownPlace:
+    """Where the vehicle is known to have been by other means than its trackers: a pad, a place of recovery.
+
+    Parameters
+    ----------
+    name : str
+    time_s : float
+    latitude_rad, longitude_rad, height_m : float
+        WGS-84; the height is NaN where it is not known.
+    sd_m, height_sd_m : float
+        Of each of north and east, and of the height.
+    """
+
+    name: str
+    time_s: float
+    latitude_rad: float
+    longitude_rad: float
+    height_m: float
+    sd_m: float
+    height_sd_m: float
+
+
+@dataclass(frozen=True)
 class UnmodelledSpan:
     """Span with acceleration or rotation that neither the model nor the sensors' stated noise covers.
 
@@ -277,6 +300,8 @@ class Telemetry:
     barometers: dict[str, BarometerRecord] = field(default_factory=dict)
     motion: Motion = Motion()
     reconstruction: dict[str, object] = field(default_factory=dict)  # settings of [reconstruction]
+    sites: SitesSpec = field(default_factory=SitesSpec)
+    places: tuple[KnownPlace, ...] = ()
 
     def span_s(self) -> tuple[float, float]:
         """First and last time that all triads and at least one radar or receiver cover together."""

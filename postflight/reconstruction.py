@@ -37,6 +37,7 @@ from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
 from recon.settings import Settings
+from recon.survey import rests_on
 
 Columns = dict[str, FloatArray]
 # quantity of `airdata.derived`, its column, and the column of its sd
@@ -135,6 +136,11 @@ class Reconstruction(Tabular):
     def suspects(self) -> tuple[Fault, ...]:
         """Fault hypotheses, the most likely first; none where every consistency check passes."""
         return isolate_faults(self.consistency_checks, self.solution.left_out)
+
+    @property
+    def rests_on(self) -> tuple[str, ...]:
+        """On what position, height and azimuth rest, which no residual shows."""
+        return rests_on(self.telemetry, self.solution.settings)
 
     @property
     def has_attitude(self) -> bool:

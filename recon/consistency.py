@@ -36,7 +36,7 @@ from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.telemetry import Finding
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
 from recon.settings import COMPILED
-from recon.smoother import Smoothed, backward, jacobian
+from recon.smoother import Smoothed, backward, jacobian, two_filter
 from recon.state import KINEMATIC, States, boxminus, unpacked
 
 _MOST_EDITED = 0.05  # share of a source's points
@@ -268,7 +268,7 @@ def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -
     wanted = np.unique(node[rows])
     kept = np.zeros(len(problem.time_s), dtype=bool)
     kept[wanted] = True
-    x, covariance = _smoothed(problem, run, kept, engine)
+    x, covariance = smoothed_covariance(problem, run, kept, engine)
     slots = problem.sources().slot
     out = []
     for row in rows.tolist():
@@ -310,19 +310,28 @@ def _chosen(problem: Problem) -> IntArray:
     return np.asarray(rows, dtype=np.int64)
 
 
-def _smoothed(problem: Problem, run: ForwardPass, kept: BoolArray, engine: str) -> tuple[FloatArray, FloatArray]:
+def smoothed_covariance(
+    problem: Problem, run: ForwardPass, kept: BoolArray, engine: str
+) -> tuple[FloatArray, FloatArray]:
     """Smoothed errors at all nodes (n, N) and their whole covariance at the kept ones (k, N, N)."""
     rows: IntArray = np.full(len(kept), -1, dtype=np.int64)
     rows[kept] = np.arange(int(kept.sum()))
+    filtered = run.filtered._replace(kept=rows)
+    triangles = np.empty((int(kept.sum()), problem.size * (problem.size + 1) // 2))
+    variance = np.empty((len(triangles), problem.size))
+    considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
+    if len(considered):
+        x = run.filtered.x_minus.copy()
+        two_filter(
+            run.steps, filtered, problem.observed, problem.sources().slot, run.innovations, considered, x, triangles,
+            variance,
+        )  # fmt: skip
+        return x, unpacked(triangles)
     phi = run.steps.transition
     # the smoother keeps the covariance of errors that the motion depends on: of all, where all are columns
     wide = np.concatenate([phi, np.zeros((*phi.shape[:2], problem.size - phi.shape[2]))], axis=2)
     x = run.filtered.x_plus.copy()
-    triangles = np.empty((int(kept.sum()), problem.size * (problem.size + 1) // 2))
-    backward(engine)(
-        run.steps._replace(transition=wide), run.filtered._replace(kept=rows), problem.moving, x, triangles,
-        np.empty((len(triangles), problem.size)),
-    )  # fmt: skip
+    backward(engine)(run.steps._replace(transition=wide), filtered, problem.moving, x, triangles, variance)
     return x, unpacked(triangles)
 
 

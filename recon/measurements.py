@@ -7,8 +7,10 @@ tag minus true time), so
 
 with ``w`` the body's rate against the Earth and ``a`` the acceleration. Then, each plus its errors and noise:
 
-* radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95) and residual
-  refraction, ``N cot(E)`` for a ray through the whole atmosphere;
+* radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95), residual
+  refraction, ``N cot(E)`` for a ray through the whole atmosphere, and errors of the site's survey, its own and those
+  common to all sites: with a stated place ``d`` off the true one, ``r = (1 - rho x) (R (p - site) + d)``, where ``rho``
+  is the turn of north, east and down over ``d`` on the Earth;
 * receiver: ``p`` north, east and down of a reference, and its velocity along the same axes;
 * barometer: geodetic height of ``p``;
 * magnetometer: ``S R(m)^T D^T C^T B + b``, S with scales and soft iron, m the mounting rotation, D its nominal axes;
@@ -32,6 +34,7 @@ from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunR
 from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, SLOTS, SUN, VELOCITY
 from recon.state import ErrorModel, right_jacobian
 
+SITES = "sites"  # owner of the errors that are common to all radar sites
 _SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {
     RADAR: ("range", "azimuth", "elevation"),
@@ -43,7 +46,7 @@ COMPONENTS = {
 }
 # time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
-    RADAR: instruments.RADAR.states,
+    RADAR: (*instruments.RADAR.states, *instruments.SITES.states),
     POSITION: instruments.GNSS.states,
     VELOCITY: ("", "", "", instruments.GNSS.states[3]),
     HEIGHT: instruments.BAROMETER.states,
@@ -100,7 +103,9 @@ class Instrument:
     def slots(self, model: ErrorModel) -> IntArray:
         """Which error (`SLOTS`,) of the model stands in each slot; -1 for none."""
         names = SLOT_NAMES[self.kind]
-        found = [model.column(self.owner, name) if name else -1 for name in names]
+        own = len(instruments.RADAR.states)  # of a radar; what follows is common to all sites
+        owners = [self.owner if k < own else SITES for k in range(len(names))]
+        found = [model.column(owner, name) if name else -1 for owner, name in zip(owners, names, strict=True)]
         return np.array([*found, *[-1] * (SLOTS - len(found))], dtype=np.int64)
 
 
@@ -246,7 +251,9 @@ def predict(
 def _radar(
     instrument: Instrument, known: FloatArray, e: FloatArray, point: FloatArray, by_error: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    n, east, d = instrument.dcm @ (point - instrument.site_ecef_m)
+    ned = instrument.dcm @ (point - instrument.site_ecef_m)
+    moved = _site_partials(instrument, ned)
+    n, east, d = ned + moved @ (e[13:16] + e[17:20])
     level = np.hypot(n, east)
     slant = np.hypot(level, d)
     az, el = np.arctan2(east, n), np.arctan2(-d, level)
@@ -266,6 +273,7 @@ def _radar(
     by_error[1, 9], by_error[2, 10] = sec, 1.0
     by_error[2, 11] = known[0] * np.cos(el) / max(np.sin(el), 0.035)
     by_error[0, 12] = slant
+    by_error[1, [16, 20]] = 1.0
     # the errors themselves change with azimuth and elevation
     g = np.eye(3) + np.diag([e[12], 0.0, 0.0])
     g[1, 1] += tan * (np.sin(az) * e[4] - np.cos(az) * e[5])
@@ -274,7 +282,19 @@ def _radar(
     cosecant_square = 1.0 / np.sin(el) ** 2 if np.sin(el) > 0.035 else np.sin(el) / 0.035
     g[2, 2] -= np.sin(el) * e[6] + known[0] * cosecant_square * e[11]
     others = np.delete(np.arange(SLOTS), 3)
-    return np.array([slant, az, el]) + by_error[:, others] @ e[others], g @ partials @ instrument.dcm
+    h = np.array([slant, az, el]) + by_error[:, others] @ e[others]
+    by_error[:, 13:16] = by_error[:, 17:20] = g @ partials @ moved
+    return h, g @ partials @ instrument.dcm
+
+
+def _site_partials(instrument: Instrument, ned: FloatArray) -> FloatArray:
+    """Partials (3, 3) of north, east, down by the stated place's error to the north, to the east and upwards."""
+    per_m = 1.0 / float(np.linalg.norm(instrument.site_ecef_m))
+    tan_lat = -instrument.dcm[2, 2] / max(instrument.dcm[0, 2], 1e-6)
+    turns = per_m * np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, tan_lat]])  # of a metre to the north, to the east
+    moved = np.diag([1.0, 1.0, -1.0])
+    moved[:, :2] -= np.cross(turns, ned).T
+    return moved
 
 
 def _height(

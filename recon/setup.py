@@ -18,7 +18,7 @@ import numpy as np
 from flightmodel import earth, geomagnetism_and_sun, rotations
 from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.gate import spaced
-from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER
+from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesSpec
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import AttitudePrior, Telemetry
 from recon import measurements
@@ -42,6 +42,7 @@ _LEAST_POINTS = 4
 _TRACK_SPAN_S = 2.5
 _FIXED_RAD = 1e-6  # sd of the rotation of ballistic flight, which is held fixed
 _GYRO = slice(18, 27)
+_LEAST_SURVEY_M, _LEAST_NORTH_RAD = 1e-3, 1e-9  # a millimetre, and at 1000 km too
 
 
 @dataclass(frozen=True)
@@ -254,6 +255,7 @@ def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, at
         blocks = imu_blocks(sensors.force.spec, sensors.rate.spec)
     for radar in telemetry.radars.values():
         blocks += instrument_blocks(RADAR_ERRORS, radar.site)
+    blocks += instrument_blocks(SITES, _sites(telemetry))
     for fixes in telemetry.gnss.values():
         blocks += instrument_blocks(GNSS, fixes.spec)
     for heights in telemetry.barometers.values():
@@ -263,6 +265,24 @@ def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, at
     if attitude_sensors and telemetry.sun is not None:
         blocks += sun_blocks(telemetry.sun.spec)
     return ErrorModel(tuple(blocks))
+
+
+def _sites(telemetry: Telemetry) -> SitesSpec:
+    """Errors common to all radar sites: as stated, and so small that nothing moves where others can contradict them.
+
+    What an error that is not stated would do to the answer is its covariance with the answer over its variance.
+    """
+    stated = telemetry.sites
+    if not telemetry.radars:
+        return SitesSpec()
+    if not (telemetry.places or telemetry.gnss or telemetry.barometers):
+        return stated
+    return SitesSpec(
+        stated.name,
+        max(stated.survey_sd_m, _LEAST_SURVEY_M),
+        max(stated.height_datum_sd_m, _LEAST_SURVEY_M),
+        max(stated.north_sd_rad, _LEAST_NORTH_RAD),
+    )
 
 
 def _span(

@@ -435,3 +435,23 @@ def test_video_needs_a_vehicle(folder):
 def test_no_second_in_common_is_refused(folder):
     late = GNSS.replace('"gps.csv"', '"gps.csv"\ntime = { offset_s = 19.0 }')
     folder.refused([late, TRIADS, PRIOR], "no-common-time", "accelerometer", "rates", "receivers", kind=GateError)
+
+
+# the survey that trackers share
+
+
+def test_survey_and_places_are_read_in_si(folder):
+    sites = "[sites]\nsurvey_sd_m = 0.3\nheight_datum_sd_m = 0.5\nnorth_sd_deg = 0.01\n"
+    place = '[[places]]\nname = "pad"\nt_s = 1.5\nlatitude_deg = 33.0\nlongitude_deg = -106.0\nsd_m = 2.0\n'
+    prior = PRIOR + "latitude_deg = 32.9\nlongitude_deg = -106.9\n"
+    telemetry = folder.read(prior, GNSS, BALLISTIC, sites, place)
+    assert (telemetry.sites.survey_sd_m, telemetry.sites.height_datum_sd_m) == (0.3, 0.5)
+    assert telemetry.sites.north_sd_rad == pytest.approx(0.01 * DEG)
+    stated, pad = telemetry.places
+    assert (stated.name, stated.time_s, stated.sd_m) == ("attitude_prior", 0.0, 100.0)
+    assert (pad.name, pad.latitude_rad, pad.sd_m) == ("pad", pytest.approx(33.0 * DEG), 2.0)
+    assert np.isnan([stated.height_m, pad.height_m]).all()
+
+
+def test_no_tracker_is_called_as_all_sites_together(folder):
+    folder.refused([GNSS.replace("gnss.gps", "gnss.sites"), BALLISTIC], "name-twice", "sites")

@@ -31,6 +31,8 @@ TABLES = {
         "sensors.magnetometer": instruments.MagnetometerEntry,
         "sensors.sun": instruments.SunEntry,
         "radars.NAME": instruments.RadarEntry,
+        "sites": instruments.SitesEntry,
+        "places": flightfolder.PlaceEntry,
         "gnss.NAME": instruments.GnssEntry,
         "barometers.NAME": instruments.BarometerEntry,
         "atmosphere": instruments.AtmosphereEntry,
