@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -48,6 +48,7 @@ from flightmodel.instruments import (
     SunEntry,
     TriadEntry,
 )
+from flightmodel.rest import find_rest, readings
 from flightmodel.sensor_tables import (
     read_barometer,
     read_frames,
@@ -67,6 +68,7 @@ from flightmodel.telemetry import (
     Motion,
     RadarRecord,
     Sounding,
+    Start,
     SunRecord,
     Telemetry,
     TriadRecord,
@@ -75,6 +77,7 @@ from flightmodel.telemetry import (
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
 LEAST_SPAN_S = 1.0
+_TAKEN = {SitesSpec.name: "all radar sites together", "rest": "the rest on the pad"}  # names of sources in results
 Record = TypeVar("Record")
 AttitudeSd = Annotated[float, Field(ge=1e-9, le=180.0)]
 
@@ -118,6 +121,23 @@ class AttitudeEntry(Section):
             raise ValueError("write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis")
         if (place[0] is None) != (place[1] is None):
             raise ValueError("latitude_deg and longitude_deg belong together")
+        return self
+
+
+class StartEntry(Section):
+    """What is known of the start; `flightmodel.telemetry.Start`."""
+
+    at_rest: tuple[Time, Time] | None = None
+    sd_mps: Annotated[float, Field(ge=1e-6, le=10.0)] = 0.01
+    azimuth_deg: Angle | None = None
+    azimuth_sd_deg: Annotated[float, Field(ge=1e-3, le=180.0)] = 2.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> StartEntry:
+        if self.at_rest is not None and not self.at_rest[0] < self.at_rest[1]:
+            raise KeyFaults([("at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s")])
+        if self.at_rest is None and self.azimuth_deg is not None:
+            raise KeyFaults([("azimuth_deg", self.azimuth_deg, "counts where at_rest = [from, to] is stated too")])
         return self
 
 
@@ -203,6 +223,7 @@ class FlightFile(Section):
     synthetic: bool = False
     description: str = ""
     attitude_prior: AttitudeEntry | None = None
+    start: StartEntry = StartEntry()
     motion: MotionEntry = MotionEntry()
     sensors: SensorsEntry = SensorsEntry()
     radars: dict[Name, RadarEntry] = {}
@@ -238,11 +259,11 @@ class FlightFile(Section):
             out += self._misfits_of_path()
         if self.frames and self.vehicle is None:
             out.append(Fault('frames: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing"))
-        names = [*self.radars, *self.gnss, *self.barometers, SitesSpec.name]
+        names = [*self.radars, *self.gnss, *self.barometers, *_TAKEN]
         for name in sorted({n for n in names if names.count(n) > 1}):
             words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
-            if name == SitesSpec.name:
-                words = f"the name '{name}' stands for all radar sites together; call the tracker otherwise"
+            if name in _TAKEN:
+                words = f"the name '{name}' stands for {_TAKEN[name]}; call the tracker otherwise"
             out.append(Fault(words, "name-twice"))
         return out
 
@@ -263,10 +284,13 @@ class FlightFile(Section):
                 'needs [sensors.accelerometer] and [sensors.rates]; without them write model = "ballistic" in [motion]'
             )
             out.append(Fault(f'motion.model = "strapdown" {words}', "inertial-missing"))
-        attitude = self.attitude_prior or (self.sensors.magnetometer and self.sensors.sun)
+        attitude = self.attitude_prior or self.start.at_rest or (self.sensors.magnetometer and self.sensors.sun)
+        if self.start.at_rest and (self.motion.model != "strapdown" or len(triads) < 2):
+            words = "start.at_rest: a rest is measured by accelerometer and gyros, which do not carry this flight"
+            out.append(Fault(f"{words}; take [start] out", "rest-without-inertial"))
         if self.motion.model == "strapdown" and not attitude:
             words = "write [attitude_prior] (a quaternion, or azimuth_deg, elevation_deg and roll_deg)"
-            words = f"no initial attitude: {words}, or both [sensors.magnetometer] and [sensors.sun]"
+            words = f"no initial attitude: {words}, [start] at_rest, or both [sensors.magnetometer] and [sensors.sun]"
             out.append(Fault(words, "attitude-missing"))
         return out
 
@@ -387,9 +411,11 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         reconstruction=dict(spec.reconstruction),
         sites=SitesSpec(**SITES.from_file(spec.sites)),
         places=_places(spec),
+        start=_start(spec.start),
     )
     if not found.radars and not found.gnss:
         return telemetry
+    telemetry = replace(telemetry, findings=(*telemetry.findings, *_rest_findings(telemetry)))
     start, stop = telemetry.span_s()
     if stop - start < LEAST_SPAN_S:
         who = "accelerometer, rates and" if telemetry.accelerometer is not None else "the flight's"
@@ -469,6 +495,28 @@ def _attitude_prior(
     azimuth, elevation, roll = np.deg2rad([entry.azimuth_deg, entry.elevation_deg, entry.roll_deg])
     q = q_ecef_body_from_pointing(azimuth, elevation, roll, float(latitude), float(longitude))
     return AttitudePrior(entry.t_s, q, sd)
+
+
+def _start(entry: StartEntry) -> Start:
+    azimuth = None if entry.azimuth_deg is None else float(np.deg2rad(entry.azimuth_deg))
+    return Start(entry.at_rest, entry.sd_mps, azimuth, float(np.deg2rad(entry.azimuth_sd_deg)))
+
+
+def _rest_findings(telemetry: Telemetry) -> list[Finding]:
+    """A rest that the data begin with and flight.toml does not state."""
+    if telemetry.motion.model != "strapdown" or telemetry.start.at_rest is not None:
+        return []
+    if telemetry.accelerometer is None or telemetry.rates is None:
+        return []
+    span = find_rest(telemetry.accelerometer, telemetry.rates)
+    if span is None:
+        return []
+    noise = [readings(record, span).noise_sd for record in (telemetry.accelerometer, telemetry.rates)]
+    words = (
+        f"the vehicle stands still: write [start] at_rest = [{span[0]:.2f}, {span[1]:.2f}], which levels it and frees "
+        f"its velocity of the trackers; noise there: {noise[0]:.2g} m/s2, {np.rad2deg(noise[1]):.2g} deg/s"
+    )
+    return [Finding("start", words, *span, code="rest-found")]
 
 
 def _places(spec: FlightFile) -> tuple[KnownPlace, ...]:

@@ -175,6 +175,26 @@ class AttitudePrior:
 
 
 @dataclass(frozen=True)
+class Start:
+    """What is known of the start: a span at rest on the Earth, and where the launcher points.
+
+    Parameters
+    ----------
+    at_rest : (float, float) or None
+        From and to, s; None where the vehicle already moves.
+    sd_mps : float
+        Velocity that may be left then, of each axis: a rocket that sways in the wind.
+    azimuth_rad, azimuth_sd_rad : float or None, float
+        Of the body's x axis as it leans on its launcher, from true north.
+    """
+
+    at_rest: tuple[float, float] | None = None
+    sd_mps: float = 0.01
+    azimuth_rad: float | None = None
+    azimuth_sd_rad: float = 0.0
+
+
+@dataclass(frozen=True)
 class KnownPlace:
     """Where the vehicle is known to have been by other means than its trackers: a pad, a place of recovery.
 
@@ -302,6 +322,7 @@ class Telemetry:
     reconstruction: dict[str, object] = field(default_factory=dict)  # settings of [reconstruction]
     sites: SitesSpec = field(default_factory=SitesSpec)
     places: tuple[KnownPlace, ...] = ()
+    start: Start = Start()
 
     def span_s(self) -> tuple[float, float]:
         """First and last time that all triads and at least one radar or receiver cover together."""

@@ -35,6 +35,7 @@ import pandas as pd
 from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.telemetry import Finding
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
+from recon.measurements import REST
 from recon.settings import COMPILED
 from recon.smoother import Smoothed, backward, jacobian, two_filter
 from recon.state import KINEMATIC, States, boxminus, unpacked
@@ -105,12 +106,17 @@ def consistency_check(
     )
 
 
-def nis_check(source: str, nis: FloatArray, components: int, confidence: float) -> ConsistencyCheck:
-    """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all."""
+def nis_check(
+    source: str, nis: FloatArray, components: int, confidence: float, allowance: bool = False
+) -> ConsistencyCheck:
+    """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all.
+
+    With an ``allowance`` for noise, not its size, residuals may be as small as they like.
+    """
     from scipy.stats import chi2
 
     n, tail = len(nis), 0.5 * (1.0 - confidence)
-    low, high = (float(chi2.ppf(p, components)) / n for p in (tail, 1.0 - tail))
+    low, high = (float(chi2.ppf(p, components)) / n for p in (0.0 if allowance else tail, 1.0 - tail))
     mean = float(np.mean(nis))
     size, advice = (
         ("smaller", "the assumed noise is too large")
@@ -222,10 +228,11 @@ def source_checks(problem: Problem, innovations: Innovations, confidence: float)
         use = mine & settled & innovations.accepted
         checks = []
         if use.sum() >= 10:
-            checks.append(nis_check(instrument.name, innovations.nis[use], int(measured[use].sum()), confidence))
+            components, still = int(measured[use].sum()), instrument.name == REST
+            checks.append(nis_check(instrument.name, innovations.nis[use], components, confidence, still))
             for i, component in enumerate(instrument.components):
                 rows = use & measured[:, i]
-                if rows.sum() >= 10:
+                if rows.sum() >= 10 and not still:
                     checks.append(whiteness_check(instrument.name, component, normalised[rows, i], confidence))
         checks.append(edit_check(instrument.name, innovations.accepted[mine]))
         out += [replace(v, source=instrument.owner) for v in checks]

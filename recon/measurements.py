@@ -13,6 +13,7 @@ with ``w`` the body's rate against the Earth and ``a`` the acceleration. Then, e
   is the turn of north, east and down over ``d`` on the Earth;
 * receiver: ``p`` north, east and down of a reference, and its velocity along the same axes;
 * barometer: geodetic height of ``p``;
+* at rest (`recon.rest`): zero velocity; of the gyros as of a magnetometer, with the Earth's rate for ``B``;
 * magnetometer: ``S R(m)^T D^T C^T B + b``, S with scales and soft iron, m the mounting rotation, D its nominal axes;
 * Sun head: azimuth and elevation of ``R(m)^T D^T C^T s``.
 
@@ -34,6 +35,7 @@ from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunR
 from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, SLOTS, SUN, VELOCITY
 from recon.state import ErrorModel, right_jacobian
 
+REST = "rest"  # zero velocities on the pad
 SITES = "sites"  # owner of the errors that are common to all radar sites
 _SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {
@@ -76,6 +78,8 @@ class Instrument:
         As in `recon.state.Observed`.
     every_s : float
         Of measurements closer than this some are predicted, not used.
+    labels : tuple of str
+        Names of its components where they are not those of its kind.
     """
 
     name: str
@@ -89,11 +93,12 @@ class Instrument:
     variance: FloatArray
     known: FloatArray
     every_s: float = 0.0
+    labels: tuple[str, ...] = ()
 
     @property
     def components(self) -> tuple[str, ...]:
         """Names of its components."""
-        return COMPONENTS[self.kind]
+        return self.labels or COMPONENTS[self.kind]
 
     @property
     def count(self) -> IntArray:
@@ -109,9 +114,10 @@ class Instrument:
         return np.array([*found, *[-1] * (SLOTS - len(found))], dtype=np.int64)
 
 
-def _instrument(
+def instrument_of(
     name: str, kind: int, owner: str, arm: FloatArray, site: FloatArray, dcm: FloatArray,
     time_s: FloatArray, value: FloatArray, sd: FloatArray, known: FloatArray | None = None, every_s: float = 0.0,
+    labels: tuple[str, ...] = (),
 ) -> Instrument:  # fmt: skip
     """Instrument with NaN readings taken as not measured, rows without any left out."""
     variance = np.where(np.isfinite(value), np.broadcast_to(sd, value.shape) ** 2, np.inf)
@@ -120,7 +126,7 @@ def _instrument(
     value = np.where(np.isfinite(value), value, 0.0)
     return Instrument(
         name, kind, owner, np.asarray(arm, dtype=float), np.asarray(site, dtype=float), np.ascontiguousarray(dcm),
-        time_s[keep], value[keep], variance[keep], known[keep], every_s,
+        time_s[keep], value[keep], variance[keep], known[keep], every_s, labels,
     )  # fmt: skip
 
 
@@ -134,7 +140,7 @@ def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, tra
     known = np.tile([_SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
     place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
-    return _instrument(
+    return instrument_of(
         name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known, record.every_s
     )
 
@@ -153,10 +159,10 @@ def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray)
     speed_sd = np.array([spec.speed_sd_mps, spec.speed_sd_mps, spec.vertical_speed_sd_mps])
     place = (record.position_ecef_m - reference) @ dcm.T
     both = [
-        _instrument(
+        instrument_of(
             name, POSITION, spec.name, arm, reference, dcm, record.time_s, place, place_sd, every_s=record.every_s
         ),
-        _instrument(
+        instrument_of(
             f"{name} velocity", VELOCITY, spec.name, arm, reference, dcm,
             record.time_s, record.velocity_ecef_mps @ dcm.T, speed_sd, every_s=record.every_s,
         ),
@@ -168,7 +174,7 @@ def barometer_instrument(name: str, record: BarometerRecord, accelerometer_m: Fl
     """Height by pressure of the datum's point."""
     first = next(iter(record.height_m[np.isfinite(record.height_m)]), 0.0)
     value = np.column_stack([record.height_m, np.full((len(record.height_m), 2), np.nan)])
-    return _instrument(
+    return instrument_of(
         name, HEIGHT, record.spec.name, -accelerometer_m, np.array([first, 0.0, 0.0]), np.eye(3),
         record.time_s, value, np.full(3, record.spec.sd_m), every_s=record.every_s,
     )  # fmt: skip
@@ -178,7 +184,7 @@ def magnetometer_instrument(name: str, record: TriadRecord, field_ecef_t: FloatA
     """Chosen samples of a magnetometer, with the field (n, 3) at them in Earth-fixed axes."""
     spec = record.spec
     sd = np.full(3, np.hypot(spec.noise_sd, spec.resolution / np.sqrt(12.0)))
-    return _instrument(
+    return instrument_of(
         name, FIELD, spec.name, np.zeros(3), np.zeros(3), spec.dcm_body_sensor,
         record.time_s[rows], record.measured_sensor[rows], sd, field_ecef_t,
     )  # fmt: skip
@@ -194,7 +200,7 @@ def sun_instruments(name: str, record: SunRecord, sun_ecef: FloatArray, rows: In
         value = np.column_stack([angles, np.full(len(rows), np.nan)])
         head = f"{name}{number}"
         out.append(
-            _instrument(head, SUN, head, np.zeros(3), np.zeros(3), dcm, record.time_s[rows], value, sd, sun_ecef)
+            instrument_of(head, SUN, head, np.zeros(3), np.zeros(3), dcm, record.time_s[rows], value, sd, sun_ecef)
         )
     return [i for i in out if len(i.time_s)]
 

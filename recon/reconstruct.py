@@ -46,6 +46,7 @@ from recon import (
     fault_isolation,
     imu_screening,
     propagation,
+    rest,
     setup,
     smoother,
     survey,
@@ -166,17 +167,29 @@ def reconstruct(
     """
     settings = settings or Settings.from_mapping(telemetry.reconstruction)
     report = progress or (lambda _fraction, _what: None)
-    solution = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what))
-    inflated = fault_isolation.inflated_priors(solution.consistency_checks, solution.sensor_errors)
+    at_rest = _checks_at_rest(telemetry, settings)
+    known = Adaptation(inflated_sd=rest.inflated_priors(telemetry, at_rest, INFLATION))
+    solution = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what), known)
+    inflated = known.inflated_sd | fault_isolation.inflated_priors(solution.consistency_checks, solution.sensor_errors)
     inflated |= _inflated_clocks(telemetry, solution)
-    if inflated:
+    if inflated != known.inflated_sd:
         solution = _with_inflated_priors(telemetry, settings, solution, inflated)
     sources = trackers(telemetry, settings)
     if len(sources) > 1 and fault_isolation.any_tracker_fails(solution.consistency_checks, sources):
         solution = _compared_leaving_one_out(telemetry, settings, solution, sources, report)
         solution = _with_shared_errors_tried(telemetry, settings, solution)
     report(1.0, "done")
-    return solution
+    return replace(
+        solution,
+        consistency_checks=(*solution.consistency_checks, *at_rest),
+        findings=(*solution.findings, *rest.noise_findings(telemetry)),
+    )
+
+
+def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[ConsistencyCheck]:
+    """Checks of the inertial sensors on the pad; none without a rest, or a place."""
+    points = setup.track_points(setup.tracking_instruments(telemetry, settings, np.zeros(3)))[1]
+    return rest.rest_checks(telemetry, settings.check_confidence, points[0]) if len(points) else []
 
 
 def _with_inflated_priors(

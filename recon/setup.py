@@ -1,10 +1,10 @@
 """What is the filter given? From telemetry to nodes, instruments, error model, motion and the state at the start.
 
-The attitude at the start comes from its prior through the gyros (or from magnetometer and Sun sensors), position and
-velocity from early track points. Position and velocity get a prior so wide that it carries no information
-(`_DIFFUSE_POSITION_M`, `_DIFFUSE_VELOCITY_MPS`): the fit to the first seconds of tracking only chooses the point about
-which to linearise, so no point counts twice. The attitude's errors are correlated with those of the gyros that
-propagated it. Ballistic flight has no attitude; its rotation is held fixed.
+The attitude at the start comes from its prior through the gyros (or from a rest, or from magnetometer and Sun sensors),
+position and velocity from early track points, or from a rest. Position and velocity get a prior so wide that it carries
+no information (`_DIFFUSE_POSITION_M`, `_DIFFUSE_VELOCITY_MPS`): the fit to the first seconds of tracking only chooses
+the point about which to linearise, so no point counts twice. The attitude's errors are correlated with those of the
+gyros that propagated it. Ballistic flight has no attitude; its rotation is held fixed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,16 @@ from recon._measurement_kernels import HEIGHT, POSITION, RADAR, VELOCITY
 from recon.ekf import FIT_SPAN_S, Problem, nearest_index, observe
 from recon.imu_screening import BridgedSensor
 from recon.measurements import Instrument
-from recon.propagation import SAME_INSTANT_S, ballistic_motion, correct, inertial_motion, propagate, with_disturbances
+from recon.propagation import (
+    SAME_INSTANT_S,
+    Motion,
+    ballistic_motion,
+    correct,
+    inertial_motion,
+    propagate,
+    with_disturbances,
+)
+from recon.rest import levelled_attitude, rest_instruments
 from recon.settings import Settings
 from recon.state import KINEMATIC, ErrorModel, States, ballistic_blocks, imu_blocks, instrument_blocks, sun_blocks
 from recon.vector_attitude import start_attitude_from_vectors
@@ -70,10 +79,12 @@ def build_problem(
     instruments = tracking_instruments(telemetry, settings, arm)
     model = _named_model(telemetry, settings, sensors, instruments)
     used = tuple(_without_rejected(i, rejected) for i in instruments if not _is_excluded(i, settings))
-    start_s, end_s = _span(used, settings, sensors)
+    start_s, end_s = _span(used, settings, sensors, telemetry.start.at_rest)
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
     if sensors is not None and settings.pulse_rate_hz > settings.output_rate_hz:
         output_s = _union([output_s, *_pulse_times(instruments, sensors.force, start_s, end_s, settings.pulse_rate_hz)])
+    if sensors is not None:
+        instruments += rest_instruments(telemetry, start_s, track_points(used)[1][0])
     if settings.attitude_sensors:
         instruments += _attitude_instruments(telemetry, used, start_s, end_s)
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
@@ -87,8 +98,10 @@ def build_problem(
         force, rate = sensors.force, sensors.rate
         clocks = model.column(rate.spec.name, "time bias") >= 0
         motion, node_index = inertial_motion(force, rate, time_s, clocks)
-        prior = _attitude_prior(telemetry, start_s)
+        prior = _attitude_prior(telemetry, start_s, track_points(used)[1][0])
         start, covariance = _start_by_inertial_sensors(used, prior, start_s, force, rate, model)
+        if telemetry.start.at_rest is not None and telemetry.start.at_rest[0] <= start_s < telemetry.start.at_rest[1]:
+            start = _start_at_rest(used, telemetry.start.at_rest, motion, start, time_s, node_index)
     motion = with_disturbances(motion, telemetry.motion)
     from scipy.stats import chi2
 
@@ -173,8 +186,8 @@ def _only_predicted(problem: Problem, settings: Settings, rejected: Mapping[str,
     return out
 
 
-def _attitude_prior(telemetry: Telemetry, start_s: float) -> AttitudePrior:
-    """Attitude as it is stated; where it is not, from magnetometer and Sun sensors about the start.
+def _attitude_prior(telemetry: Telemetry, start_s: float, point_ecef_m: FloatArray) -> AttitudePrior:
+    """Attitude as it is stated; where it is not, from a rest, or magnetometer and Sun sensors about the start.
 
     Raises
     ------
@@ -183,6 +196,8 @@ def _attitude_prior(telemetry: Telemetry, start_s: float) -> AttitudePrior:
     """
     if telemetry.attitude_prior is not None:
         return telemetry.attitude_prior
+    if telemetry.start.at_rest is not None:
+        return levelled_attitude(telemetry, max(start_s, telemetry.start.at_rest[0]), point_ecef_m)
     if telemetry.magnetometer is None or telemetry.sun is None:
         raise GateError(
             [
@@ -286,9 +301,12 @@ def _sites(telemetry: Telemetry) -> SitesSpec:
 
 
 def _span(
-    instruments: tuple[Instrument, ...], settings: Settings, sensors: InertialSensors | None
+    instruments: tuple[Instrument, ...],
+    settings: Settings,
+    sensors: InertialSensors | None,
+    at_rest: tuple[float, float] | None = None,
 ) -> tuple[float, float]:
-    """First and last time that inertial sensors and at least one tracker cover, within the settings' span."""
+    """First and last time that inertial sensors and a tracker, or a rest, cover, within the settings' span."""
     t, _ = track_points(instruments)
     if len(t) == 0:
         raise GateError(
@@ -296,6 +314,8 @@ def _span(
             code="no-track-points",
         )
     start_s, end_s = float(t[0]), float(t[-1])
+    if at_rest is not None:
+        start_s = min(start_s, at_rest[0])
     if sensors is not None:
         start_s = max(start_s, sensors.force.time_s[0], sensors.rate.time_s[0])
         end_s = min(end_s, sensors.force.time_s[-1], sensors.rate.time_s[-1])
@@ -510,6 +530,29 @@ def _start_by_inertial_sensors(
     covariance[6:9, gyro] = cross
     covariance[gyro, 6:9] = cross.T
     return state, covariance
+
+
+def _start_at_rest(
+    instruments: tuple[Instrument, ...],
+    at_rest: tuple[float, float],
+    motion: Motion,
+    start: States,
+    time_s: FloatArray,
+    node_index: IntArray,
+) -> States:
+    """Start without velocity: where tracking has it at rest, or from where it came to the first track point."""
+    t, points = track_points(instruments)
+    still = points[(t >= time_s[0] - SAME_INSTANT_S) & (t <= at_rest[1])]
+    start = replace(start, velocity_ecef_mps=np.zeros(3))
+    if len(still):
+        return replace(start, position_ecef_m=np.median(still, axis=0))
+    first = int(np.searchsorted(t, time_s[0]))
+    node = int(nearest_index(time_s, t[first : first + 1])[0])
+    place = replace(start, position_ecef_m=points[first])
+    for _ in range(2):  # gravity is that of the place
+        reached = propagate(motion, int(node_index[0]), int(node_index[node]), place).state.position_ecef_m
+        place = replace(place, position_ecef_m=place.position_ecef_m + points[first] - reached)
+    return place
 
 
 def _start_ballistic(

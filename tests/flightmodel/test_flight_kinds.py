@@ -455,3 +455,20 @@ def test_survey_and_places_are_read_in_si(folder):
 
 def test_no_tracker_is_called_as_all_sites_together(folder):
     folder.refused([GNSS.replace("gnss.gps", "gnss.sites"), BALLISTIC], "name-twice", "sites")
+
+
+# on the pad
+
+
+def test_a_rest_is_read_and_stands_for_an_attitude(folder):
+    start = "[start]\nat_rest = [1.0, 3.0]\nazimuth_deg = 90.0\n"
+    telemetry = folder.read(GNSS, TRIADS, start)
+    assert telemetry.attitude_prior is None
+    assert telemetry.start.at_rest == (1.0, 3.0)
+    assert (telemetry.start.azimuth_rad, telemetry.start.azimuth_sd_rad) == pytest.approx((90.0 * DEG, 2.0 * DEG))
+
+
+def test_what_is_wrong_with_a_rest(folder):
+    folder.refused([GNSS, BALLISTIC, "[start]\nat_rest = [1.0, 3.0]\n"], "rest-without-inertial", "at_rest")
+    folder.refused([GNSS, TRIADS, PRIOR, "[start]\nat_rest = [3.0, 1.0]\n"], "keys-conflict", "at_rest")
+    folder.refused([GNSS, TRIADS, PRIOR, "[start]\nazimuth_deg = 10.0\n"], "keys-conflict", "at_rest")

@@ -24,6 +24,7 @@ TABLES = {
     "flight": {
         "": flightfolder.FlightFile,
         "attitude_prior": flightfolder.AttitudeEntry,
+        "start": flightfolder.StartEntry,
         "motion": flightfolder.MotionEntry,
         "motion.disturbed": flightfolder.UnmodelledEntry,
         "sensors.accelerometer": instruments.TriadEntry,

@@ -236,6 +236,17 @@ class TestPsas:
         assert np.rad2deg(sd_at(r, 0.0, ATTITUDE)) < 25.0
         assert np.rad2deg(sd_at(r, 20.0, ATTITUDE)) > 20.0
 
+    def test_it_stands_still_on_its_pad(self, fly):
+        """The rest that reading the flight proposes, stated: 1.4 m/s +/- 4 become a centimetre."""
+        loose = fly("psas_l12")
+        still = fly("psas_l12", (r"(?m)^\[attitude_prior\]", "[start]\nat_rest = [-4.53, -1.03]\n\n[attitude_prior]"))
+        assert not red(still)
+        on_pad = still.smoothed.time_s < -1.0
+        speed = np.linalg.norm(still.smoothed.velocity_ecef_mps, axis=1)
+        assert on_pad.sum() > 30
+        assert speed[on_pad].max() < 0.03
+        assert sd_at(still, -2.0, slice(3, 6)) < 0.02 < sd_at(loose, -2.0, slice(3, 6))
+
 
 class TestPiccard:
     pytestmark = needs_data
