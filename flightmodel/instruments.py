@@ -75,6 +75,8 @@ class ErrorRow:
         The scenario's key of a quantisation step, which stands in for noise of 0.
     left_out : bool
         Flight.toml of a synthetic flight does not hold it where it is 0.
+    physical : (float, float) or None
+        Range outside which the error cannot be, SI; None: any size is possible.
     response : tuple of int, callable; or None
         Component of the reading that the simulator adds it to, and what it adds there: of the error (1,), slant range
         m, azimuth and elevation rad (n,).
@@ -91,6 +93,7 @@ class ErrorRow:
     required: bool = False
     step: str = ""
     left_out: bool = False
+    physical: tuple[float, float] | None = None
     response: tuple[int, Response] | None = None
     to_si: float = 1.0
     suffix: str = ""
@@ -327,10 +330,11 @@ class RadarSite:
         time_constant=("wander_time_constant_s", 20.0, "wander_time_constant_s"),
     )  # fmt: skip
     wander_time_constant_s: float = 20.0
-    # part of the air's refraction that is left in the elevations: 1 where nothing is known of a correction
+    # part of the air's refraction that is left in the elevations: 1 where nothing is known of a correction. Air bends
+    # downwards only; N at the surface is at most 450, of which the model's 320 are 1 / 1.4
     refraction_sd: float = error_row(
         "1", 0.0, Annotated[float, Field(ge=0.0, le=10.0)], at=0.0, states=("refraction",),
-        simulated=("refraction_left",), left_out=True,
+        simulated=("refraction_left",), left_out=True, physical=(0.0, 1.4),
     )  # fmt: skip
     # range error over range: velocity of light, oscillator
     range_scale_sd: float = error_row(

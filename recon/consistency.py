@@ -27,12 +27,14 @@ S. McReynolds, "Editing data using sequential smoothing techniques for discrete 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
 from flightmodel.checks import BoolArray, FloatArray, IntArray
+from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import Finding
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
 from recon.measurements import REST
@@ -54,6 +56,8 @@ _BALLISTIC_CHECKS = {
         "is beyond the pre-flight uncertainty: check mass, area and coefficients",
     ),
 }
+_MOST_OUTSIDE = 3.0  # sd beyond a physical range
+_ALIKE = 0.5  # correlation of partials from which a radar hardly separates two errors: a quarter of the variance
 SAME_STRETCH_S = 1.0  # edited measurements closer than this are one stretch
 _MOST_STRETCHES = 12  # of edited measurements that are listed one by one
 GROUPS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9)}
@@ -264,6 +268,54 @@ def data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) 
         errors = [error.removeprefix(f"{name} ") for error in rows["name"]]
         out.append(data_sheet_check(code, label, name, errors, estimate, prior_sd, sd, confidence, *bad))
     return [v for v in out if v is not None]
+
+
+def physical_checks(
+    problem: Problem, innovations: Innovations, table: pd.DataFrame, radars: Iterable[str]
+) -> list[ConsistencyCheck]:
+    """One check for each estimated error of the radars that cannot have every size; a failed one names look-alikes."""
+    out = []
+    rows = table.set_index("name")
+    for number, instrument in enumerate(problem.instruments):
+        if instrument.name not in radars:
+            continue
+        for error in RADAR_ERRORS.rows:
+            name = f"{instrument.owner} {error.states[0]}" if error.states else ""
+            if error.physical is None or name not in rows.index or rows.treated[name] == "considered":
+                continue
+            low, high = error.physical
+            estimate, sd = float(rows.estimate[name]), float(rows.sd[name])
+            outside = max(low - estimate, estimate - high, 0.0) / sd
+            found = f"{name} {estimate:.2g} ± {sd:.2g}"
+            alike = _look_alikes(problem, innovations, number, error.states[0]) if outside > _MOST_OUTSIDE else []
+            advice = (
+                f"its readings look alike with {', '.join(alike)}: state these" if alike else "check its correction"
+            )
+            out.append(
+                consistency_check(
+                    "physical-range", f"physical range {name}", outside, 0.0, _MOST_OUTSIDE,
+                    f"{found} is possible", f"{found} is outside {low:g} to {high:g}",
+                    advice=f"{advice}, or the range's correction took out more than there was",
+                    source=instrument.owner, component=error.states[0],
+                )
+            )  # fmt: skip
+    return out
+
+
+def _look_alikes(problem: Problem, innovations: Innovations, number: int, component: str) -> list[str]:
+    """Errors of the same radar whose partials, less those of its biases, correlate with this one's, most first."""
+    rows = np.flatnonzero((problem.observed.source == number) & innovations.accepted)
+    weight = 1.0 / np.sqrt(problem.observed.variance[rows])  # of components that were not measured zero
+    columns = (innovations.by_error[rows] * weight[:, :, None]).reshape(3 * len(rows), -1)
+    names, biases = RADAR_ERRORS.states, [0, 1, 2]
+    columns = columns - columns[:, biases] @ np.linalg.lstsq(columns[:, biases], columns, rcond=None)[0]
+    mine = columns[:, names.index(component)]
+    alike = {}
+    for k, name in enumerate(names):
+        size = np.linalg.norm(columns[:, k]) * np.linalg.norm(mine)
+        if k not in biases and name != component and "survey" not in name and size > 0.0:
+            alike[name] = abs(float(columns[:, k] @ mine)) / size
+    return sorted((name for name, c in alike.items() if c > _ALIKE), key=lambda name: -alike[name])
 
 
 def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -> pd.DataFrame:

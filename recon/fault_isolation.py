@@ -353,6 +353,7 @@ def isolate_faults(checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut
         out.append(FaultHypothesis(what, "motion"))
     rest = [("attitude", v) for v in failed if v.code.startswith("attitude-")]
     rest += [("air", v) for v in failed if v.code in _AIR_CODES]
+    rest += [("error-model", v) for v in failed if v.code == "physical-range"]
     sentences = {FaultHypothesis(f"{what}: {v.remark}", what, (v.source,)): None for what, v in rest}
     return (*out, *sentences)
 

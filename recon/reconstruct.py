@@ -305,6 +305,7 @@ def reconstruct_once(
     checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
     checks += consistency.filter_against_smoother(problem, run, smoothed, reference)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
+    checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
     checks += survey.place_checks(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
     if sensors is not None and adaptation.lag is None:
         lag = time_bias.lag_between(sensors.force, sensors.rate, reference, problem.time_s)

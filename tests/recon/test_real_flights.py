@@ -168,6 +168,16 @@ class TestBlackBrant:
         """docs/known-limits.md says why."""
         assert red(fly("radar_36353")) <= {"whiteness B elevation"}
 
+    def test_refraction_is_possible_and_without_droop_it_is_not(self, fly):
+        """-0.38 +/- 0.08 of refraction, and no word, was what a pedestal that droops looked like."""
+        checks = {v.code: v for v in fly("radar_36353").consistency_checks}
+        assert checks["physical-range"].passed
+        stiff = fly("radar_36353", (r"(?m)^droop_sd_deg.*\n", ""))
+        check = next(v for v in stiff.consistency_checks if v.code == "physical-range")
+        assert not check.passed
+        assert (check.source, check.component) == ("B", "refraction")
+        assert "droop" in check.remark
+
     def test_points_between_are_foretold(self, fly):
         r = fly("radar_36353")
         coast = r.held_out[r.held_out.time_s.between(150.0, 500.0)]
