@@ -539,11 +539,13 @@ def _first_place(radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]) ->
     for radar in radars.values():
         s = radar.site
         points.append(ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m))
-    if not points:
-        return None
-    whole = points[0][np.isfinite(points[0]).all(axis=1)]
-    latitude, longitude, _ = geodetic_from_ecef(whole[0])
-    return float(latitude), float(longitude)
+    for point in points:
+        whole = point[np.isfinite(point).all(axis=1)]
+        if len(whole):
+            latitude, longitude, _ = geodetic_from_ecef(whole[0])
+            return float(latitude), float(longitude)
+    site = next((radar.site for radar in radars.values()), None)
+    return None if site is None else (site.latitude_rad, site.longitude_rad)  # angles or ranges alone: nearby
 
 
 def _motion(entry: MotionEntry) -> Motion:

@@ -345,6 +345,9 @@ class RadarSite:
     survey_sd_m: float = error_row("m", 0.0, at=0.0, states=("survey north", "survey east"), left_out=True)
     height_sd_m: float = error_row("m", 0.0, at=0.0, states=("survey height",), left_out=True)
     north_sd_rad: float = error_row("rad", 0.0, at=0.0, states=("north",), left_out=True)
+    # Doppler: white noise, and an oscillator's constant offset
+    range_rate_sd_mps: float = error_row("m/s", 0.1, Sd, at=0.1)
+    range_rate_bias_sd_mps: float = error_row("m/s", 0.0, at=0.0, states=("range rate bias",), left_out=True)
     # white noise of one angle, where the two differ; azimuth's normal to the line of sight too
     azimuth_sd_rad: float | None = error_row("rad", None, Sd, at=None)
     elevation_sd_rad: float | None = error_row("rad", None, Sd, at=None)
@@ -599,9 +602,14 @@ class TrackingSource(Source):
     every_s: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
 
 
+TrackerReading = Literal["range", "az", "el", "range_rate"]
+
+
 @with_keys(RADAR.file_keys())
 class RadarEntry(TrackingSource):
-    """A tracking radar and its site (WGS-84)."""
+    """A tracking radar, a telescope, a ranging or Doppler station: what it measures, and its site (WGS-84)."""
+
+    measures: Annotated[tuple[TrackerReading, ...], Field(min_length=1)] = ("range", "az", "el")
 
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     longitude_deg: Annotated[float, Field(ge=-360.0, le=360.0)]

@@ -68,10 +68,21 @@ class SunRecord:
 
 @dataclass(frozen=True)
 class RadarRecord:
-    """Track points of one radar: slant range m, azimuth from true north rad, elevation rad; NaN is missing.
+    """Readings of one radar, telescope or Doppler station; NaN is missing.
 
-    ``point`` is what is tracked: ``"cg"`` (skin track, centroid of the echo near the c.g.) or ``"datum"``. Of points
-    closer than ``every_s`` some are predicted, not used.
+    Parameters
+    ----------
+    site : RadarSite
+    time_s : (n,) float
+    range_az_el : (n, 3) float
+        Slant range m, azimuth from true north and elevation rad; columns that it does not measure are NaN.
+    point : str
+        What is tracked: ``"cg"`` (skin track, centroid of the echo near the c.g.) or ``"datum"``.
+    every_s : float
+        Of points closer than this some are predicted, not used.
+    range_rate_mps : (n,) float or None
+    sd : (n, 4) float or None
+        Noise of each range, azimuth, elevation, range rate; NaN, or None, where the site's holds.
     """
 
     site: RadarSite
@@ -79,6 +90,8 @@ class RadarRecord:
     range_az_el: FloatArray
     point: str = "cg"
     every_s: float = 0.0
+    range_rate_mps: FloatArray | None = None
+    sd: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Check once."""

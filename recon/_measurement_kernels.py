@@ -23,7 +23,7 @@ from flightmodel._kernels import (
 )
 from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into
 
-RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN = range(6)
+RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE = range(7)
 SLOTS = 21
 
 
@@ -303,21 +303,49 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
         predict_radar(site, dcm, known, e, point, h, m, by_error)
         state_rows(m, 3, tau, c, effective, speed, by_state, by_error)
         return
+    if kind == RANGE_RATE:
+        predict_range_rate(arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error)
+        return
     predict_place(kind, site, dcm, e, point, speed, h, m, by_error)
     if kind == VELOCITY:
-        velocity_rows(m, arm, rate, c, acceleration, by_state, by_error)
+        velocity_rows(m, 3, arm, rate, c, acceleration, by_state, by_error)
         return
     state_rows(m, 1 if kind == HEIGHT else 3, tau, c, effective, speed, by_state, by_error)
 
 
 @inlined
-def velocity_rows(m, arm, rate, c, acceleration, by_state, by_error):
-    """Partials of a velocity along axes ``m`` (3, 3): ``m (v + C (w x d) - tau a)``."""
+def predict_range_rate(arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error):
+    """Range rate ``u . v`` along the line of sight ``u`` from a site, plus its bias; partials by state and errors."""
+    slant = 0.0
+    for i in range(3):
+        slant += (point[i] - site[i]) * (point[i] - site[i])
+    slant = math.sqrt(slant)
+    along = np.empty((3, 3))
+    h[0] = 0.0
+    for i in range(3):
+        along[0, i] = (point[i] - site[i]) / slant
+        h[0] += along[0, i] * speed[i]
+    for i in range(3):
+        m[0, i] = (speed[i] - h[0] * along[0, i]) / slant
+    velocity_rows(along, 1, arm, rate, c, acceleration, by_state, by_error)
+    swing = by_state[0].copy()
+    late = by_error[0, 3]
+    state_rows(m, 1, tau, c, effective, speed, by_state, by_error)
+    for j in range(3, 9):
+        by_state[0, j] += swing[j]
+    by_error[0, 3] += late
+    by_error[0, 0] = 1.0
+    h[0] += e[0]
+
+
+@inlined
+def velocity_rows(m, count, arm, rate, c, acceleration, by_state, by_error):
+    """Partials of a velocity along the first axes of ``m`` (3, 3): ``m (v + C (w x d) - tau a)``."""
     turn, lever_velocity, row, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         turn[i] = rate[i] - OMEGA_WGS84 * c[2, i]
     cross_into(turn, arm, lever_velocity)
-    for i in range(3):
+    for i in range(count):
         by_error[i, 3] = -(m[i, 0] * acceleration[0] + m[i, 1] * acceleration[1] + m[i, 2] * acceleration[2])
         for j in range(3):
             by_state[i, 3 + j] = m[i, j]

@@ -36,8 +36,9 @@ import pandas as pd
 from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import Finding
+from recon._measurement_kernels import RADAR
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
-from recon.measurements import REST
+from recon.measurements import REST, SLOT_NAMES
 from recon.settings import COMPILED
 from recon.smoother import Smoothed, backward, jacobian, two_filter
 from recon.state import KINEMATIC, States, boxminus, unpacked
@@ -120,7 +121,8 @@ def nis_check(
     from scipy.stats import chi2
 
     n, tail = len(nis), 0.5 * (1.0 - confidence)
-    low, high = (float(chi2.ppf(p, components)) / n for p in (0.0 if allowance else tail, 1.0 - tail))
+    low, high = (float(chi2.ppf(p, components)) / n for p in (tail, 1.0 - tail))
+    low = 0.0 if allowance else low
     mean = float(np.mean(nis))
     size, advice = (
         ("smaller", "the assumed noise is too large")
@@ -307,7 +309,7 @@ def _look_alikes(problem: Problem, innovations: Innovations, number: int, compon
     rows = np.flatnonzero((problem.observed.source == number) & innovations.accepted)
     weight = 1.0 / np.sqrt(problem.observed.variance[rows])  # of components that were not measured zero
     columns = (innovations.by_error[rows] * weight[:, :, None]).reshape(3 * len(rows), -1)
-    names, biases = RADAR_ERRORS.states, [0, 1, 2]
+    names, biases = SLOT_NAMES[RADAR], [0, 1, 2]
     columns = columns - columns[:, biases] @ np.linalg.lstsq(columns[:, biases], columns, rcond=None)[0]
     mine = columns[:, names.index(component)]
     alike = {}

@@ -11,6 +11,7 @@ with ``w`` the body's rate against the Earth and ``a`` the acceleration. Then, e
   refraction, ``N cot(E)`` for a ray through the whole atmosphere, and errors of the site's survey, its own and those
   common to all sites: with a stated place ``d`` off the true one, ``r = (1 - rho x) (R (p - site) + d)``, where ``rho``
   is the turn of north, east and down over ``d`` on the Earth;
+* Doppler: ``u . dp/dt`` along the line of sight ``u``;
 * receiver: ``p`` north, east and down of a reference, and its velocity along the same axes;
 * barometer: geodetic height of ``p``;
 * at rest (`recon.rest`): zero velocity; of the gyros as of a magnetometer, with the Earth's rate for ``B``;
@@ -32,7 +33,7 @@ import numpy as np
 from flightmodel import earth, instruments, rotations
 from flightmodel.checks import FloatArray, IntArray
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
-from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, SLOTS, SUN, VELOCITY
+from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, RANGE_RATE, SLOTS, SUN, VELOCITY
 from recon.state import ErrorModel, right_jacobian
 
 REST = "rest"  # zero velocities on the pad
@@ -45,10 +46,13 @@ COMPONENTS = {
     HEIGHT: ("height",),
     FIELD: ("field x", "field y", "field z"),
     SUN: ("azimuth", "elevation"),
+    RANGE_RATE: ("range rate",),
 }
+_OWN_RADAR = instruments.RADAR.states[:-1]  # the last is of the range rate, a reading of its own
 # time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
-    RADAR: (*instruments.RADAR.states, *instruments.SITES.states),
+    RADAR: (*_OWN_RADAR, *instruments.SITES.states),
+    RANGE_RATE: (instruments.RADAR.states[-1], "", "", instruments.RADAR.states[3]),
     POSITION: instruments.GNSS.states,
     VELOCITY: ("", "", "", instruments.GNSS.states[3]),
     HEIGHT: instruments.BAROMETER.states,
@@ -108,7 +112,7 @@ class Instrument:
     def slots(self, model: ErrorModel) -> IntArray:
         """Which error (`SLOTS`,) of the model stands in each slot; -1 for none."""
         names = SLOT_NAMES[self.kind]
-        own = len(instruments.RADAR.states)  # of a radar; what follows is common to all sites
+        own = len(_OWN_RADAR)  # of a radar; what follows is common to all sites
         owners = [self.owner if k < own else SITES for k in range(len(names))]
         found = [model.column(owner, name) if name else -1 for owner, name in zip(owners, names, strict=True)]
         return np.array([*found, *[-1] * (SLOTS - len(found))], dtype=np.int64)
@@ -133,7 +137,7 @@ def instrument_of(
 def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, traverse: bool = True) -> Instrument:
     """One radar; a missing component leaves the others."""
     site = record.site
-    sd = np.tile([site.range_sd_m, *site.angles_sd_rad], (len(record.time_s), 1))
+    sd = _noise(record, [site.range_sd_m, *site.angles_sd_rad], slice(0, 3))
     if traverse:
         elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
         sd[:, 1] /= np.maximum(np.cos(elevation), 1e-3)
@@ -143,6 +147,27 @@ def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, tra
     return instrument_of(
         name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known, record.every_s
     )
+
+
+def range_rate_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray) -> Instrument | None:
+    """Range rates of one radar or Doppler station; None where it gives none."""
+    site = record.site
+    if record.range_rate_mps is None:
+        return None
+    value = np.column_stack([record.range_rate_mps, np.full((len(record.time_s), 2), np.nan)])
+    sd = np.tile(_noise(record, [site.range_rate_sd_mps], slice(3, 4)), 3)
+    place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
+    dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
+    return instrument_of(
+        f"{name} range rate", RANGE_RATE, site.name, arm_body_m, place, dcm, record.time_s, value, sd,
+        every_s=record.every_s,
+    )  # fmt: skip
+
+
+def _noise(record: RadarRecord, stated: list[float], columns: slice) -> FloatArray:
+    """Noise (n, k) of each reading: its own where the table states it, else the site's."""
+    sd = np.tile(stated, (len(record.time_s), 1))
+    return sd if record.sd is None else np.where(np.isfinite(record.sd[:, columns]), record.sd[:, columns], sd)
 
 
 def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray) -> list[Instrument]:
@@ -240,6 +265,15 @@ def predict(
         by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(lever_velocity)
         by_error[:, 3] = -instrument.dcm @ at.acceleration_ecef_mps2
         return instrument.dcm @ speed, by_state, by_error
+    if instrument.kind == RANGE_RATE:
+        sight = point - instrument.site_ecef_m
+        u = sight / np.linalg.norm(sight)
+        across = (speed - (u @ speed) * u) / np.linalg.norm(sight)
+        by_state[0, 0:3], by_state[0, 3:6] = across, u - tau * across
+        by_state[0, 6:9] = -u @ c @ rotations.skew(lever_velocity)
+        by_state[0, 6:9] -= across @ c @ rotations.skew(arm - tau * lever_velocity)
+        by_error[0, 0], by_error[0, 3] = 1.0, -across @ speed - u @ at.acceleration_ecef_mps2
+        return np.array([u @ speed + e[0], 0.0, 0.0]), by_state, by_error
     if instrument.kind == RADAR:
         h, m = _radar(instrument, known, e, point, by_error)
     elif instrument.kind == POSITION:
@@ -260,16 +294,8 @@ def _radar(
     ned = instrument.dcm @ (point - instrument.site_ecef_m)
     moved = _site_partials(instrument, ned)
     n, east, d = ned + moved @ (e[13:16] + e[17:20])
-    level = np.hypot(n, east)
-    slant = np.hypot(level, d)
-    az, el = np.arctan2(east, n), np.arctan2(-d, level)
-    partials = np.array(
-        [
-            [n / slant, east / slant, d / slant],
-            [-east / level**2, n / level**2, 0.0],
-            [d * n / (slant**2 * level), d * east / (slant**2 * level), -level / slant**2],
-        ]
-    )
+    slant, az, el = sight(n, east, d)
+    partials = sight_partials(n, east, d)
     sec = 1.0 / max(np.cos(el), 1e-3)
     tan = np.sin(el) * sec
     by_error[:, 0:3] = np.eye(3)
@@ -291,6 +317,25 @@ def _radar(
     h = np.array([slant, az, el]) + by_error[:, others] @ e[others]
     by_error[:, 13:16] = by_error[:, 17:20] = g @ partials @ moved
     return h, g @ partials @ instrument.dcm
+
+
+def sight(n: float, east: float, d: float) -> tuple[float, float, float]:
+    """Range, azimuth, elevation of a point north, east, down of a site."""
+    level = np.hypot(n, east)
+    return float(np.hypot(level, d)), float(np.arctan2(east, n)), float(np.arctan2(-d, level))
+
+
+def sight_partials(n: float, east: float, d: float) -> FloatArray:
+    """Partials (3, 3) of range, azimuth, elevation by north, east, down."""
+    level = np.hypot(n, east)
+    slant = np.hypot(level, d)
+    return np.array(
+        [
+            [n / slant, east / slant, d / slant],
+            [-east / level**2, n / level**2, 0.0],
+            [d * n / (slant**2 * level), d * east / (slant**2 * level), -level / slant**2],
+        ]
+    )
 
 
 def _site_partials(instrument: Instrument, ned: FloatArray) -> FloatArray:

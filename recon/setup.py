@@ -22,7 +22,7 @@ from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesS
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import AttitudePrior, Telemetry
 from recon import measurements
-from recon._measurement_kernels import HEIGHT, POSITION, RADAR, VELOCITY
+from recon._measurement_kernels import HEIGHT, POSITION, RADAR, RANGE_RATE, VELOCITY
 from recon.ekf import FIT_SPAN_S, Problem, nearest_index, observe
 from recon.imu_screening import BridgedSensor
 from recon.measurements import Instrument
@@ -38,9 +38,10 @@ from recon.propagation import (
 from recon.rest import levelled_attitude, rest_instruments
 from recon.settings import Settings
 from recon.state import KINEMATIC, ErrorModel, States, ballistic_blocks, imu_blocks, instrument_blocks, sun_blocks
+from recon.triangulation import triangulated
 from recon.vector_attitude import start_attitude_from_vectors
 
-_TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT)
+_TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT, RANGE_RATE)
 _PULSE_CELL_S, _LEAST_PULSE_MPS2 = 0.5, 5.0
 _ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
 _NO_POINTS: Mapping[str, FloatArray] = MappingProxyType({})
@@ -224,7 +225,9 @@ def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: F
     for name, record in telemetry.radars.items():
         cg = telemetry.vehicle.cg_m if telemetry.vehicle is not None and record.point == "cg" else np.zeros(3)
         arm = np.zeros(3) if ballistic else cg - arm_body_m
-        out.append(measurements.radar_instrument(name, record, arm, traverse))
+        radar = measurements.radar_instrument(name, record, arm, traverse)
+        doppler = measurements.range_rate_instrument(name, record, arm)
+        out += [i for i in (radar, doppler) if i is not None and len(i.time_s)]
     for name, fixes in telemetry.gnss.items():
         antenna = fixes.spec.antenna_from_datum_body_m
         out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m)
@@ -310,7 +313,8 @@ def _span(
     t, _ = track_points(instruments)
     if len(t) == 0:
         raise GateError(
-            "no radar or receiver has a usable point that is not left out; a trajectory needs at least one",
+            "no radar or receiver has a usable point that is not left out, nor do angles and ranges of several sites "
+            "meet in one; a trajectory needs at least one",
             code="no-track-points",
         )
     start_s, end_s = float(t[0]), float(t[-1])
@@ -402,7 +406,10 @@ def _start_attitude(
 
 
 def track_points(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:
-    """Times (k,) and points (k, 3), ECEF m, of every measurement that fixes a position by itself, in order."""
+    """Times (k,) and points (k, 3), ECEF m, of every measurement that fixes a position by itself, in order.
+
+    Where none does, of instants at which angles and ranges of several sites do together (`recon.triangulation`).
+    """
     times, points = [], []
     for i in instruments:
         whole = np.isfinite(i.variance).all(axis=1)
@@ -415,6 +422,8 @@ def track_points(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, Float
         times.append(i.time_s[whole])
         points.append(i.site_ecef_m + ned @ i.dcm)
     t = np.concatenate([np.empty(0), *times])
+    if not len(t):
+        return triangulated(tuple(i for i in instruments if i.kind == RADAR))
     order = np.argsort(t, kind="stable")
     return t[order], np.concatenate([np.empty((0, 3)), *points])[order]
 

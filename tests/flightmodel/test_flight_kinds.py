@@ -472,3 +472,35 @@ def test_what_is_wrong_with_a_rest(folder):
     folder.refused([GNSS, BALLISTIC, "[start]\nat_rest = [1.0, 3.0]\n"], "rest-without-inertial", "at_rest")
     folder.refused([GNSS, TRIADS, PRIOR, "[start]\nat_rest = [3.0, 1.0]\n"], "keys-conflict", "at_rest")
     folder.refused([GNSS, TRIADS, PRIOR, "[start]\nazimuth_deg = 10.0\n"], "keys-conflict", "at_rest")
+
+
+# trackers that measure a part of a position
+
+SITE = 'file = "site.csv"\nlatitude_deg = 32.5\nlongitude_deg = -107.0\nheight_m = 1200.0\n'
+
+
+def test_a_telescope_with_noise_of_its_own_and_a_doppler_station(folder):
+    az, el = 350.0 + T, 40.0 + T
+    folder.table("site.csv", "t_s,az_deg,el_deg,el_sd_deg", T, az, el, np.where(T > 5.0, 0.01, np.nan))
+    folder.table("doppler.csv", "t_s,rr", T, 1000.0 - 10.0 * T)
+    telescope = f'[radars.eye]\n{SITE}measures = ["az", "el"]\n'
+    doppler = f'[radars.ear]\n{SITE}measures = ["range_rate"]\n'.replace("site.csv", "doppler.csv")
+    columns = 'columns = { range_rate = { column = "rr", unit = "kmh" } }\n'
+    radars = folder.read(GNSS, BALLISTIC, telescope, doppler, columns).radars
+    eye, ear = radars["eye"], radars["ear"]
+    assert np.isnan(eye.range_az_el[:, 0]).all()
+    np.testing.assert_allclose(eye.range_az_el[:, 2], el * DEG)
+    assert eye.range_rate_mps is None
+    assert np.isnan(eye.sd[0]).all()
+    assert eye.sd[-1, 2] == pytest.approx(0.01 * DEG)
+    assert np.isnan(ear.range_az_el).all()
+    np.testing.assert_allclose(ear.range_rate_mps, (1000.0 - 10.0 * T) / 3.6)
+
+
+def test_what_is_wrong_with_a_part(folder):
+    folder.table("site.csv", "t_s,az_deg,el_deg,el_sd_deg", T, T, 40.0 + T, 0.0 * T)
+    eye = f"[radars.eye]\n{SITE}"
+    # a column that is not there is refused unless the file says that it is not measured
+    folder.refused([GNSS, BALLISTIC, eye], "table-column-missing", "range_m", kind=GateError)
+    folder.refused([GNSS, BALLISTIC, eye, 'measures = ["az", "el"]\n'], "value-range", "el_sd", kind=GateError)
+    folder.refused([GNSS, BALLISTIC, eye, "measures = []\n"], "key-value", "measures")

@@ -1,5 +1,6 @@
 """Errors that all radar sites share: in the covariance where stated, named where a place or a receiver differs."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -75,6 +76,11 @@ def test_a_common_error_is_named_by_known_places(mini_truth, mini_sense, cause):
     assert ("place", cause) in red
     # a shift no residual shows; two azimuths turned about two sites contradict the ranges a little
     assert cause == "north" or red == {("place", cause)}
+    # the size of what was planted, stated minus true: m, deg
+    size = {"survey north": 1110.0, "survey east": -935.0, "height datum": 30.0, "north": 0.05}[cause]
+    remark = next(v.remark for v in solution.consistency_checks if v.component == cause)
+    found = float(re.search(rf"(?<!survey ){cause} ([-+][\d.e+]+)", remark)[1])
+    assert found == pytest.approx(size, rel=0.25)
     suspects = isolate_faults(solution.consistency_checks, solution.left_out)
     assert [(s.code, s.sources) for s in suspects][:1] == [("sites", ("sites",))]
 
