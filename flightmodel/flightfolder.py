@@ -31,7 +31,7 @@ from flightmodel.config import (
     parse_utc,
     read_toml,
 )
-from flightmodel.earth import ecef_from_radar, geodetic_from_ecef, q_ecef_body_from_pointing
+from flightmodel.earth import OMEGA_RADPS, ecef_from_radar, geodetic_from_ecef, q_ecef_body_from_pointing
 from flightmodel.film import Frames
 from flightmodel.gate import Gate
 from flightmodel.instruments import (
@@ -77,6 +77,7 @@ from flightmodel.telemetry import (
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
 LEAST_SPAN_S = 1.0
+_BIAS_TIMES = 6.0  # no bias of a sound gyro is so large, one in a thousand million
 _TAKEN = {SitesSpec.name: "all radar sites together", "rest": "the rest on the pad"}  # names of sources in results
 Record = TypeVar("Record")
 AttitudeSd = Annotated[float, Field(ge=1e-9, le=180.0)]
@@ -516,7 +517,16 @@ def _rest_findings(telemetry: Telemetry) -> list[Finding]:
         f"the vehicle stands still: write [start] at_rest = [{span[0]:.2f}, {span[1]:.2f}], which levels it and frees "
         f"its velocity of the trackers; noise there: {noise[0]:.2g} m/s2, {np.rad2deg(noise[1]):.2g} deg/s"
     )
-    return [Finding("start", words, *span, code="rest-found")]
+    out = [Finding("start", words, *span, code="rest-found")]
+    rates = telemetry.rates
+    turning = float(np.abs(readings(rates, span).mean).max()) - OMEGA_RADPS  # the Earth's own
+    times = turning / max(rates.spec.bias_sd, 1e-12)
+    if times > _BIAS_TIMES:
+        words = (
+            f"at rest it reads {times:.0f} times bias_sd_degps: no track is followed with such a bias; state it wider"
+        )
+        out.append(Finding(rates.spec.name, words, *span, code="bias-beyond-data-sheet"))
+    return out
 
 
 def _places(spec: FlightFile) -> tuple[KnownPlace, ...]:

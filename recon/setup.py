@@ -317,7 +317,7 @@ def _span(
             "meet in one; a trajectory needs at least one",
             code="no-track-points",
         )
-    start_s, end_s = float(t[0]), float(t[-1])
+    start_s, end_s = float(t[0]), float(t[-1]) + settings.carry_on_s
     if at_rest is not None:
         start_s = min(start_s, at_rest[0])
     if sensors is not None:

@@ -504,3 +504,16 @@ def test_what_is_wrong_with_a_part(folder):
     folder.refused([GNSS, BALLISTIC, eye], "table-column-missing", "range_m", kind=GateError)
     folder.refused([GNSS, BALLISTIC, eye, 'measures = ["az", "el"]\n'], "value-range", "el_sd", kind=GateError)
     folder.refused([GNSS, BALLISTIC, eye, "measures = []\n"], "key-value", "measures")
+
+
+def test_a_rest_with_a_large_bias_is_found(folder):
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 8.0, 0.05)
+    noise = 0.02 * rng.standard_normal((6, len(t)))
+    folder.table("imu.csv", "t_s,fx,fy,fz,wx,wy,wz", t, 9.8 + noise[0], *noise[1:3], 2.0 + noise[3], *noise[4:])
+    fixes = np.full(len(T), 1400.0)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m", T, LAT + 0 * T, LON + 0 * T, fixes)
+    telemetry = folder.read(GNSS, TRIADS, PRIOR)
+    assert "rest-found" in findings(telemetry, "start")
+    assert "bias-beyond-data-sheet" in findings(telemetry, "rates")
+    assert "rest-found" not in findings(folder.read(GNSS, TRIADS, "[start]\nat_rest = [0.5, 6.0]\n"), "start")
