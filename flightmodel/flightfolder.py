@@ -522,9 +522,7 @@ def _rest_findings(telemetry: Telemetry) -> list[Finding]:
     turning = float(np.abs(readings(rates, span).mean).max()) - OMEGA_RADPS  # the Earth's own
     times = turning / max(rates.spec.bias_sd, 1e-12)
     if times > _BIAS_TIMES:
-        words = (
-            f"at rest it reads {times:.0f} times bias_sd_degps: no track is followed with such a bias; state it wider"
-        )
+        words = f"at rest it reads {times:.0f} times bias_sd_degps: no track can be followed; state it wider"
         out.append(Finding(rates.spec.name, words, *span, code="bias-beyond-data-sheet"))
     return out
 

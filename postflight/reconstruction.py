@@ -139,8 +139,13 @@ class Reconstruction(Tabular):
 
     @property
     def rests_on(self) -> tuple[str, ...]:
-        """On what position, height and azimuth rest, which no residual shows."""
-        return rests_on(self.telemetry, self.solution.settings)
+        """On what position, height, azimuth and the level of as-flown density rest, which no residual shows."""
+        lines, vehicle = rests_on(self.telemetry, self.solution.settings), self.telemetry.vehicle
+        if self.as_flown is None or vehicle is None:
+            return lines
+        stated = vehicle.uncertainty
+        ca = 100.0 * stated.ca * np.sqrt(1.0 - stated.ca_shape_part)  # what is one factor at all Mach numbers
+        return (*lines, f"density's level rests on C_A to {ca:.2g} % and mass to {100.0 * stated.mass:.2g} %")
 
     @property
     def has_attitude(self) -> bool:
