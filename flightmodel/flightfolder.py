@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -32,10 +32,11 @@ from flightmodel.config import (
     parse_utc,
     read_toml,
 )
-from flightmodel.earth import ecef_from_radar, geodetic_from_ecef, q_ecef_body_from_pointing
+from flightmodel.earth import OMEGA_RADPS, ecef_from_radar, geodetic_from_ecef, q_ecef_body_from_pointing
 from flightmodel.film import Frames
 from flightmodel.gate import Gate
 from flightmodel.instruments import (
+    SITES,
     AtmosphereEntry,
     BarometerEntry,
     FramesEntry,
@@ -43,9 +44,12 @@ from flightmodel.instruments import (
     MagnetometerEntry,
     RadarEntry,
     RatesEntry,
+    SitesEntry,
+    SitesSpec,
     SunEntry,
     TriadEntry,
 )
+from flightmodel.rest import find_rest, readings
 from flightmodel.sensor_tables import (
     read_barometer,
     read_frames,
@@ -61,9 +65,11 @@ from flightmodel.telemetry import (
     BarometerRecord,
     Finding,
     GnssRecord,
+    KnownPlace,
     Motion,
     RadarRecord,
     Sounding,
+    Start,
     SunRecord,
     Telemetry,
     TriadRecord,
@@ -72,6 +78,8 @@ from flightmodel.telemetry import (
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
 LEAST_SPAN_S = 1.0
+_BIAS_TIMES = 6.0  # no bias of a sound gyro is so large, one in a thousand million
+_TAKEN = {SitesSpec.name: "all radar sites together", "rest": "the rest on the pad"}  # names of sources in results
 Record = TypeVar("Record")
 AttitudeSd = Annotated[float, Field(ge=1e-9, le=180.0)]
 
@@ -90,6 +98,8 @@ class AttitudeEntry(Section):
     roll_deg: Angle | None = None
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
+    # of the place, which is compared with the trackers'; written to 0.001 deg it is within 100 m
+    place_sd_m: Annotated[float, Field(ge=1e-3, le=1e6)] = 100.0
     sd_deg: tuple[AttitudeSd, AttitudeSd, AttitudeSd] = (3.0, 3.0, 3.0)
 
     @field_validator(
@@ -114,6 +124,35 @@ class AttitudeEntry(Section):
         if (place[0] is None) != (place[1] is None):
             raise ValueError("latitude_deg and longitude_deg belong together")
         return self
+
+
+class StartEntry(Section):
+    """What is known of the start; `flightmodel.telemetry.Start`."""
+
+    at_rest: tuple[Time, Time] | None = None
+    sd_mps: Annotated[float, Field(ge=1e-6, le=10.0)] = 0.01
+    azimuth_deg: Angle | None = None
+    azimuth_sd_deg: Annotated[float, Field(ge=1e-3, le=180.0)] = 2.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> StartEntry:
+        if self.at_rest is not None and not self.at_rest[0] < self.at_rest[1]:
+            raise KeyFaults([("at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s")])
+        if self.at_rest is None and self.azimuth_deg is not None:
+            raise KeyFaults([("azimuth_deg", self.azimuth_deg, "counts where at_rest = [from, to] is stated too")])
+        return self
+
+
+class PlaceEntry(Section):
+    """A place that the vehicle is known to have been at; `flightmodel.telemetry.KnownPlace`."""
+
+    name: Name
+    t_s: Time
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    height_m: Annotated[float, Field(ge=-1e3, le=1e5)] | None = None
+    sd_m: Annotated[float, Field(ge=1e-3, le=1e6)] = 5.0
+    height_sd_m: Annotated[float, Field(ge=1e-3, le=1e6)] = 5.0
 
 
 class UnmodelledEntry(Section):
@@ -186,9 +225,12 @@ class FlightFile(Section):
     synthetic: bool = False
     description: str = ""
     attitude_prior: AttitudeEntry | None = None
+    start: StartEntry = StartEntry()
     motion: MotionEntry = MotionEntry()
     sensors: SensorsEntry = SensorsEntry()
     radars: dict[Name, RadarEntry] = {}
+    sites: SitesEntry = SitesEntry()
+    places: list[PlaceEntry] = []
     gnss: dict[Name, GnssEntry] = {}
     barometers: dict[Name, BarometerEntry] = {}
     atmosphere: AtmosphereEntry | None = None
@@ -219,9 +261,11 @@ class FlightFile(Section):
             out += self._misfits_of_path()
         if self.frames and self.vehicle is None:
             out.append(Fault('frames: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing"))
-        names = [*self.radars, *self.gnss, *self.barometers]
+        names = [*self.radars, *self.gnss, *self.barometers, *_TAKEN]
         for name in sorted({n for n in names if names.count(n) > 1}):
             words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
+            if name in _TAKEN:
+                words = f"the name '{name}' stands for {_TAKEN[name]}; call the tracker otherwise"
             out.append(Fault(words, "name-twice"))
         return out
 
@@ -242,10 +286,13 @@ class FlightFile(Section):
                 'needs [sensors.accelerometer] and [sensors.rates]; without them write model = "ballistic" in [motion]'
             )
             out.append(Fault(f'motion.model = "strapdown" {words}', "inertial-missing"))
-        attitude = self.attitude_prior or (self.sensors.magnetometer and self.sensors.sun)
+        attitude = self.attitude_prior or self.start.at_rest or (self.sensors.magnetometer and self.sensors.sun)
+        if self.start.at_rest and (self.motion.model != "strapdown" or len(triads) < 2):
+            words = "start.at_rest: a rest is measured by accelerometer and gyros, which do not carry this flight"
+            out.append(Fault(f"{words}; take [start] out", "rest-without-inertial"))
         if self.motion.model == "strapdown" and not attitude:
             words = "write [attitude_prior] (a quaternion, or azimuth_deg, elevation_deg and roll_deg)"
-            words = f"no initial attitude: {words}, or both [sensors.magnetometer] and [sensors.sun]"
+            words = f"no initial attitude: {words}, [start] at_rest, or both [sensors.magnetometer] and [sensors.sun]"
             out.append(Fault(words, "attitude-missing"))
         return out
 
@@ -364,9 +411,13 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         barometers=found.barometers,
         motion=_motion(spec.motion),
         reconstruction=dict(spec.reconstruction),
+        sites=SitesSpec(**SITES.from_file(spec.sites)),
+        places=_places(spec),
+        start=_start(spec.start),
     )
     if not found.radars and not found.gnss:
         return telemetry
+    telemetry = replace(telemetry, findings=(*telemetry.findings, *_rest_findings(telemetry)))
     start, stop = telemetry.span_s()
     if stop - start < LEAST_SPAN_S:
         who = "accelerometer, rates and" if telemetry.accelerometer is not None else "the flight's"
@@ -448,17 +499,62 @@ def _attitude_prior(
     return AttitudePrior(entry.t_s, q, sd)
 
 
+def _start(entry: StartEntry) -> Start:
+    azimuth = None if entry.azimuth_deg is None else float(np.deg2rad(entry.azimuth_deg))
+    return Start(entry.at_rest, entry.sd_mps, azimuth, float(np.deg2rad(entry.azimuth_sd_deg)))
+
+
+def _rest_findings(telemetry: Telemetry) -> list[Finding]:
+    """A rest that the data begin with and flight.toml does not state."""
+    if telemetry.motion.model != "strapdown" or telemetry.start.at_rest is not None:
+        return []
+    if telemetry.accelerometer is None or telemetry.rates is None:
+        return []
+    span = find_rest(telemetry.accelerometer, telemetry.rates)
+    if span is None:
+        return []
+    noise = [readings(record, span).noise_sd for record in (telemetry.accelerometer, telemetry.rates)]
+    words = (
+        f"the vehicle stands still: write [start] at_rest = [{span[0]:.2f}, {span[1]:.2f}], which levels it and frees "
+        f"its velocity of the trackers; noise there: {noise[0]:.2g} m/s2, {np.rad2deg(noise[1]):.2g} deg/s"
+    )
+    out = [Finding("start", words, *span, code="rest-found")]
+    rates = telemetry.rates
+    turning = float(np.abs(readings(rates, span).mean).max()) - OMEGA_RADPS  # the Earth's own
+    times = turning / max(rates.spec.bias_sd, 1e-12)
+    if times > _BIAS_TIMES:
+        words = f"at rest it reads {times:.0f} times bias_sd_degps: no track can be followed; state it wider"
+        out.append(Finding(rates.spec.name, words, *span, code="bias-beyond-data-sheet"))
+    return out
+
+
+def _places(spec: FlightFile) -> tuple[KnownPlace, ...]:
+    """Places that are known: those of ``[[places]]``, and that of the attitude prior where one is stated."""
+    out = []
+    prior = spec.attitude_prior
+    if prior is not None and prior.latitude_deg is not None and prior.longitude_deg is not None:
+        lat, lon = (float(x) for x in np.deg2rad([prior.latitude_deg, prior.longitude_deg]))
+        out.append(KnownPlace("attitude_prior", prior.t_s, lat, lon, np.nan, prior.place_sd_m, np.inf))
+    for entry in spec.places:
+        lat, lon = (float(x) for x in np.deg2rad([entry.latitude_deg, entry.longitude_deg]))
+        height = np.nan if entry.height_m is None else entry.height_m
+        out.append(KnownPlace(entry.name, entry.t_s, lat, lon, height, entry.sd_m, entry.height_sd_m))
+    return tuple(out)
+
+
 def _first_place(radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]) -> tuple[float, float] | None:
     """Latitude and longitude, rad, of the first receiver's first fix, or of the first radar's first point."""
     points: list[FloatArray] = [r.position_ecef_m for r in gnss.values()]
     for radar in radars.values():
         s = radar.site
         points.append(ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m))
-    if not points:
-        return None
-    whole = points[0][np.isfinite(points[0]).all(axis=1)]
-    latitude, longitude, _ = geodetic_from_ecef(whole[0])
-    return float(latitude), float(longitude)
+    for point in points:
+        whole = point[np.isfinite(point).all(axis=1)]
+        if len(whole):
+            latitude, longitude, _ = geodetic_from_ecef(whole[0])
+            return float(latitude), float(longitude)
+    site = next((radar.site for radar in radars.values()), None)
+    return None if site is None else (site.latitude_rad, site.longitude_rad)  # angles or ranges alone: nearby
 
 
 def _motion(entry: MotionEntry) -> Motion:

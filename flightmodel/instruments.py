@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import BaseModel, Field, create_model, model_validator
 
 from flightmodel.checks import Fault, FloatArray
-from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place
+from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place, Section
 from flightmodel.tables import Declared, Source
 
 Sd = Annotated[float, Field(ge=1e-12, le=1e6)]  # its square is a number that can be divided by
@@ -75,6 +75,8 @@ class ErrorRow:
         The scenario's key of a quantisation step, which stands in for noise of 0.
     left_out : bool
         Flight.toml of a synthetic flight does not hold it where it is 0.
+    physical : (float, float) or None
+        Range outside which the error cannot be, SI; None: any size is possible.
     response : tuple of int, callable; or None
         Component of the reading that the simulator adds it to, and what it adds there: of the error (1,), slant range
         m, azimuth and elevation rad (n,).
@@ -91,6 +93,7 @@ class ErrorRow:
     required: bool = False
     step: str = ""
     left_out: bool = False
+    physical: tuple[float, float] | None = None
     response: tuple[int, Response] | None = None
     to_si: float = 1.0
     suffix: str = ""
@@ -327,16 +330,24 @@ class RadarSite:
         time_constant=("wander_time_constant_s", 20.0, "wander_time_constant_s"),
     )  # fmt: skip
     wander_time_constant_s: float = 20.0
-    # part of the air's refraction that is left in the elevations: 1 where nothing is known of a correction
+    # part of the air's refraction that is left in the elevations: 1 where nothing is known of a correction. Air bends
+    # downwards only; N at the surface is at most 450, of which the model's 320 are 1 / 1.4
     refraction_sd: float = error_row(
         "1", 0.0, Annotated[float, Field(ge=0.0, le=10.0)], at=0.0, states=("refraction",),
-        simulated=("refraction_left",), left_out=True,
+        simulated=("refraction_left",), left_out=True, physical=(0.0, 1.4),
     )  # fmt: skip
     # range error over range: velocity of light, oscillator
     range_scale_sd: float = error_row(
         "1", 0.0, Annotated[float, Field(ge=0.0, le=0.1)], at=0.0, states=("range scale",), simulated=None,
         left_out=True, response=(0, lambda error, slant, _az, _el: error * slant),
     )  # fmt: skip
+    # where the site is and where its azimuths start: stated minus true place, azimuth reading minus azimuth from north
+    survey_sd_m: float = error_row("m", 0.0, at=0.0, states=("survey north", "survey east"), left_out=True)
+    height_sd_m: float = error_row("m", 0.0, at=0.0, states=("survey height",), left_out=True)
+    north_sd_rad: float = error_row("rad", 0.0, at=0.0, states=("north",), left_out=True)
+    # Doppler: white noise, and an oscillator's constant offset
+    range_rate_sd_mps: float = error_row("m/s", 0.1, Sd, at=0.1)
+    range_rate_bias_sd_mps: float = error_row("m/s", 0.0, at=0.0, states=("range rate bias",), left_out=True)
     # white noise of one angle, where the two differ; azimuth's normal to the line of sight too
     azimuth_sd_rad: float | None = error_row("rad", None, Sd, at=None)
     elevation_sd_rad: float | None = error_row("rad", None, Sd, at=None)
@@ -349,6 +360,26 @@ class RadarSite:
             self.angle_sd_rad if azimuth is None else azimuth,
             self.angle_sd_rad if elevation is None else elevation,
         )
+
+
+@dataclass(frozen=True)
+class SitesSpec:
+    """What the survey of all radar sites shares: one network, one datum of heights, one azimuth mark.
+
+    Parameters
+    ----------
+    survey_sd_m : float
+        Stated minus true place, each of north and east.
+    height_datum_sd_m : float
+        Stated minus true height: the geoid's undulation, a height system.
+    north_sd_rad : float
+        Azimuth readings minus azimuths from true north.
+    """
+
+    name: str = "sites"
+    survey_sd_m: float = error_row("m", 0.0, at=0.0, states=("survey north", "survey east"))
+    height_datum_sd_m: float = error_row("m", 0.0, at=0.0, states=("height datum",))
+    north_sd_rad: float = error_row("rad", 0.0, at=0.0, states=("north",))
 
 
 @dataclass(frozen=True)
@@ -447,7 +478,9 @@ class SunHeads:
         return np.array([dcm_body_from_sun_head(float(clock)) for clock in self.clock_lv_rad])
 
 
-RADAR, GNSS, BAROMETER, SUN = (table_of(record) for record in (RadarSite, GnssSpec, BarometerSpec, SunHeads))
+RADAR, SITES, GNSS, BAROMETER, SUN = (
+    table_of(record) for record in (RadarSite, SitesSpec, GnssSpec, BarometerSpec, SunHeads)
+)
 
 
 def dcm_body_from_clocking(x_axis_lv_rad: float, y_axis_lv_rad: float) -> FloatArray:
@@ -569,14 +602,24 @@ class TrackingSource(Source):
     every_s: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
 
 
+TrackerReading = Literal["range", "az", "el", "range_rate"]
+
+
 @with_keys(RADAR.file_keys())
 class RadarEntry(TrackingSource):
-    """A tracking radar and its site (WGS-84)."""
+    """A tracking radar, a telescope, a ranging or Doppler station: what it measures, and its site (WGS-84)."""
+
+    measures: Annotated[tuple[TrackerReading, ...], Field(min_length=1)] = ("range", "az", "el")
 
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     longitude_deg: Annotated[float, Field(ge=-360.0, le=360.0)]
     height_m: Annotated[float, Field(ge=-1e3, le=1e5)]
     tracks: Literal["cg", "datum"] = "cg"
+
+
+@with_keys(SITES.file_keys())
+class SitesEntry(Section):
+    """What the survey of all radar sites shares."""
 
 
 class Heights(TrackingSource):

@@ -61,32 +61,54 @@ ECEF, GEODETIC = ("x", "y", "z"), ("lat", "lon", "alt")
 ECEF_SPEEDS, NED_SPEEDS = ("vx", "vy", "vz"), ("vn", "ve", "vd")
 LEAST_RADIUS_M, LEAST_HEIGHT_M = 6.3e6, -12e3  # below every ocean's floor
 FASTEST_MPS = 2e4
+LEAST_SD = 1e-12  # its square is a number that can be divided by
 LOWEST_BAROMETER_M, HIGHEST_BAROMETER_M = -2000.0, 80e3
 
 
 def read_radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
-    """Read one radar's track; None, with the faults kept, where anything in it is refused."""
+    """Read one tracker's readings; None, with the faults kept, where anything in it is refused."""
     label = f"radars.{name}"
-    table = gate.table(label, source, tables.RADAR)
+    measured = tuple(q for q in tables.TRACKER if q.short in source.measures)
+    noises = tuple(q for q in tables.TRACKER_SD if q.short.removesuffix("_sd") in source.measures)
+    table = gate.table(label, source, measured + noises)
     if table is None or table.time_s is None:
         return None
     before = len(gate.faults)
-    gate.refuse_rows(table, "range", 1.0, np.inf, "no slant range")
-    gate.refuse_rows(table, "el", -0.5 * np.pi, 0.5 * np.pi, "no elevation")
+    limits = {
+        "range": (1.0, np.inf, "no slant range"),
+        "el": (-0.5 * np.pi, 0.5 * np.pi, "no elevation"),
+        "range_rate": (-FASTEST_MPS, FASTEST_MPS, "no speed near the Earth"),
+    }
+    for q in measured:
+        if q.short in limits:
+            gate.refuse_rows(table, q.short, *limits[q.short])
+    there = [q for q in noises if q.short in table.columns]
+    for q in there:
+        gate.refuse_rows(table, q.short, LEAST_SD, np.inf, "no standard deviation")
     if len(gate.faults) > before:
         return None
-    azimuth = np.mod(table.columns["az"], 2.0 * np.pi)
-    values = np.column_stack([table.columns["range"], azimuth, table.columns["el"]])
-    if not np.isfinite(values).all(axis=1).any():
-        gate.refuse(
-            f"{label}: {table.path}: no track point with range, azimuth and elevation; remove the radar", "no-samples"
-        )
+    if "az" in table.columns:
+        table.columns["az"] = np.mod(table.columns["az"], 2.0 * np.pi)
+    values = _columns(table, [q.short for q in tables.RADAR])
+    read = np.column_stack([table.columns[q.short] for q in measured])
+    whole = np.isfinite(read).all(axis=1)
+    if not whole.any():
+        words = " and ".join(q.short for q in measured)
+        gate.refuse(f"{label}: {table.path}: no row with {words}; remove the tracker", "no-samples")
         return None
-    gate.findings.extend(find_faults(name, table.time_s, ("range", "az", "el"), values))
+    gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in measured), read))
     gate.findings.extend(oversampled(name, table.time_s, source.every_s))
     place = np.deg2rad([source.latitude_deg, source.longitude_deg])
     site = RadarSite(name, float(place[0]), float(place[1]), source.height_m, **RADAR.from_file(source))
-    return RadarRecord(site, table.time_s, values, source.tracks, source.every_s)
+    sd = _columns(table, [q.short for q in tables.TRACKER_SD]) if there else None
+    rate = table.columns.get("range_rate")
+    return RadarRecord(site, table.time_s, values, source.tracks, source.every_s, rate, sd)
+
+
+def _columns(table: Table, shorts: list[str]) -> FloatArray:
+    """Columns (n, k) of a table, NaN where it has none."""
+    nothing: FloatArray = np.full(len(table.lines), np.nan)
+    return np.column_stack([table.columns.get(short, nothing) for short in shorts])
 
 
 def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:

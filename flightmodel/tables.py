@@ -111,6 +111,11 @@ ACCELEROMETER = tuple(Quantity(f"a{a}", f"a{a}_suba_mps2", "acceleration") for a
 RATES = tuple(Quantity(a, f"{a}_body_degps", "rate") for a in "pqr")
 MAGNETOMETER = tuple(Quantity(f"b{a}", f"b{a}_magnetometer_ut", "magnetic field") for a in "xyz")
 RADAR = (Quantity("range", "range_m", "length"), Quantity("az", "az_deg", "angle"), Quantity("el", "el_deg", "angle"))
+# what a tracker may measure, and the noise of each reading where it differs from row to row
+TRACKER = (*RADAR, Quantity("range_rate", "range_rate_mps", "speed"))
+TRACKER_SD = tuple(
+    Quantity(f"{q.short}_sd", q.canonical.replace(q.short, f"{q.short}_sd"), q.kind, required=False) for q in TRACKER
+)
 GNSS = (
     Quantity("lat", "lat_deg", "angle", required=False),
     Quantity("lon", "lon_deg", "angle", required=False),

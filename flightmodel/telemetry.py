@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
-from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SunHeads, TriadSpec
+from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SitesSpec, SunHeads, TriadSpec
 from flightmodel.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -68,10 +68,21 @@ class SunRecord:
 
 @dataclass(frozen=True)
 class RadarRecord:
-    """Track points of one radar: slant range m, azimuth from true north rad, elevation rad; NaN is missing.
+    """Readings of one radar, telescope or Doppler station; NaN is missing.
 
-    ``point`` is what is tracked: ``"cg"`` (skin track, centroid of the echo near the c.g.) or ``"datum"``. Of points
-    closer than ``every_s`` some are predicted, not used.
+    Parameters
+    ----------
+    site : RadarSite
+    time_s : (n,) float
+    range_az_el : (n, 3) float
+        Slant range m, azimuth from true north and elevation rad; columns that it does not measure are NaN.
+    point : str
+        What is tracked: ``"cg"`` (skin track, centroid of the echo near the c.g.) or ``"datum"``.
+    every_s : float
+        Of points closer than this some are predicted, not used.
+    range_rate_mps : (n,) float or None
+    sd : (n, 4) float or None
+        Noise of each range, azimuth, elevation, range rate; NaN, or None, where the site's holds.
     """
 
     site: RadarSite
@@ -79,6 +90,8 @@ class RadarRecord:
     range_az_el: FloatArray
     point: str = "cg"
     every_s: float = 0.0
+    range_rate_mps: FloatArray | None = None
+    sd: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Check once."""
@@ -172,6 +185,49 @@ class AttitudePrior:
         """Check once."""
         check_shape("attitude prior", self.q_ecef_body, (4,))
         check_shape("attitude prior's standard deviation", self.sd_rad, (3,))
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is known of the start: a span at rest on the Earth, and where the launcher points.
+
+    Parameters
+    ----------
+    at_rest : (float, float) or None
+        From and to, s; None where the vehicle already moves.
+    sd_mps : float
+        Velocity that may be left then, of each axis: a rocket that sways in the wind.
+    azimuth_rad, azimuth_sd_rad : float or None, float
+        Of the body's x axis as it leans on its launcher, from true north.
+    """
+
+    at_rest: tuple[float, float] | None = None
+    sd_mps: float = 0.01
+    azimuth_rad: float | None = None
+    azimuth_sd_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class KnownPlace:
+    """Where the vehicle is known to have been by other means than its trackers: a pad, a place of recovery.
+
+    Parameters
+    ----------
+    name : str
+    time_s : float
+    latitude_rad, longitude_rad, height_m : float
+        WGS-84; the height is NaN where it is not known.
+    sd_m, height_sd_m : float
+        Of each of north and east, and of the height.
+    """
+
+    name: str
+    time_s: float
+    latitude_rad: float
+    longitude_rad: float
+    height_m: float
+    sd_m: float
+    height_sd_m: float
 
 
 @dataclass(frozen=True)
@@ -277,6 +333,9 @@ class Telemetry:
     barometers: dict[str, BarometerRecord] = field(default_factory=dict)
     motion: Motion = Motion()
     reconstruction: dict[str, object] = field(default_factory=dict)  # settings of [reconstruction]
+    sites: SitesSpec = field(default_factory=SitesSpec)
+    places: tuple[KnownPlace, ...] = ()
+    start: Start = Start()
 
     def span_s(self) -> tuple[float, float]:
         """First and last time that all triads and at least one radar or receiver cover together."""

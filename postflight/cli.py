@@ -377,11 +377,14 @@ def check(folder: Path, as_json: bool) -> None:
 @click.option(
     "--vehicle", metavar="NAME", help="A vehicle that ships, or a .toml file to copy; default: a form to fill in."
 )
-def init(folder: Path, vehicle: str | None) -> None:
+@click.option("--no-vehicle", is_flag=True, help="For the trajectory alone: no vehicle file.")
+def init(folder: Path, vehicle: str | None, no_vehicle: bool) -> None:
     """Write a commented flight.toml and vehicle file into FOLDER; what exists is never overwritten."""
     from postflight.intake import flight_form
 
-    flight_form.init(folder, vehicle)
+    if vehicle is not None and no_vehicle:
+        raise click.UsageError("--vehicle names one; leave out --no-vehicle")
+    flight_form.init(folder, vehicle, no_vehicle)
 
 
 @cli.command("import")

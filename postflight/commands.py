@@ -248,6 +248,8 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         line("[yellow]left out[/]", f"as-flown atmosphere: {reason}", reason.code)
     if flight.attitude is not None and flight.attitude.comparison is not None:
         console.print(escape(flight.attitude.remark))
+    for rests in flight.rests_on:
+        console.print(escape(rests))
     print_checks(flight.consistency_checks)
     for k, suspect in enumerate(flight.suspects):
         line(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)

@@ -37,6 +37,7 @@ from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
 from recon.settings import Settings
+from recon.survey import rests_on
 
 Columns = dict[str, FloatArray]
 # quantity of `airdata.derived`, its column, and the column of its sd
@@ -135,6 +136,16 @@ class Reconstruction(Tabular):
     def suspects(self) -> tuple[Fault, ...]:
         """Fault hypotheses, the most likely first; none where every consistency check passes."""
         return isolate_faults(self.consistency_checks, self.solution.left_out)
+
+    @property
+    def rests_on(self) -> tuple[str, ...]:
+        """On what position, height, azimuth and the level of as-flown density rest, which no residual shows."""
+        lines, vehicle = rests_on(self.telemetry, self.solution.settings), self.telemetry.vehicle
+        if self.as_flown is None or vehicle is None:
+            return lines
+        stated = vehicle.uncertainty
+        ca = 100.0 * stated.ca * np.sqrt(1.0 - stated.ca_shape_part)  # what is one factor at all Mach numbers
+        return (*lines, f"density's level rests on C_A to {ca:.2g} % and mass to {100.0 * stated.mass:.2g} %")
 
     @property
     def has_attitude(self) -> bool:

@@ -297,6 +297,7 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
         "film_clock": None if answers.fused is None else answers.fused.time_bias_summary(),
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),
         "missing": list(flight.missing),
+        "rests_on": list(flight.rests_on),
         "attitude_check": attitude_summary(flight.attitude),
         "verdicts_passed": sum(check.passed for check in checks),
         "suspect": flight.suspects[0] if flight.suspects else None,

@@ -23,8 +23,8 @@ from flightmodel._kernels import (
 )
 from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into
 
-RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN = range(6)
-SLOTS = 13
+RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE = range(7)
+SLOTS = 21
 
 
 @merged
@@ -104,6 +104,20 @@ def state_rows(m, count, tau, c, effective, speed, by_state, by_error):
 
 
 @inlined
+def site_partials(site, dcm_ned_ecef, north, east, down, out):
+    """Partials (3, 3) of a point's north, east, down at a site by how far north, east and up of its place it is stated.
+
+    The antenna is levelled where it stands, so that its axes turn with the place: ``(1 - rho x) (r + d)`` with
+    ``rho = (-d_e, d_n, d_e tan(latitude)) / R``, to first order.
+    """
+    per_m = 1.0 / math.sqrt(site[0] * site[0] + site[1] * site[1] + site[2] * site[2])
+    tan_lat = -dcm_ned_ecef[2, 2] / max(dcm_ned_ecef[0, 2], 1e-6)
+    out[0, 0], out[0, 1], out[0, 2] = 1.0 - down * per_m, tan_lat * east * per_m, 0.0
+    out[1, 0], out[1, 1], out[1, 2] = 0.0, 1.0 - (tan_lat * north + down) * per_m, 0.0
+    out[2, 0], out[2, 1], out[2, 2] = north * per_m, east * per_m, -1.0
+
+
+@inlined
 def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
     """Range, azimuth, elevation and partials (3, 3) by the observed point; ``known[0]`` is the site's refractivity."""
     ned = np.empty(3)
@@ -111,6 +125,11 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
         ned[i] = 0.0
         for j in range(3):
             ned[i] += dcm_ned_ecef[i, j] * (point[j] - site[j])
+    moved = np.empty((3, 3))
+    site_partials(site, dcm_ned_ecef, ned[0], ned[1], ned[2], moved)
+    for i in range(3):
+        for j in range(3):
+            ned[i] += moved[i, j] * (e[13 + j] + e[17 + j])
     north, east, down = ned[0], ned[1], ned[2]
     level2 = north * north + east * east
     horizontal = math.sqrt(level2)
@@ -134,6 +153,7 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
     # refraction of a ray through the whole atmosphere; near the horizon it stays at its value at 2 deg
     by_error[2, 11] = known[0] * cos_el / max(sin_el, 0.035)
     by_error[0, 12] = slant
+    by_error[1, 16], by_error[1, 20] = 1.0, 1.0
     # the errors themselves change with azimuth and elevation: near the horizon that of the refraction by a tenth
     by_tilt = cos_az * e[4] + sin_az * e[5]
     cosecant_square = 1.0 / (sin_el * sin_el) if sin_el > 0.035 else sin_el / 0.035
@@ -143,17 +163,20 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
          sec * sec * (e[8] - by_tilt) + sec * tan * (e[7] + e[9])),
         (0.0, by_tilt, 1.0 - sin_el * e[6] - known[0] * cosecant_square * e[11]),
     )  # fmt: skip
-    for i in range(3):
-        for j in range(3):
-            m[i, j] = 0.0
-            for k in range(3):
-                f = g[i][0] * p[0][k] + g[i][1] * p[1][k] + g[i][2] * p[2][k]
-                m[i, j] += f * dcm_ned_ecef[k, j]
     h[0], h[1], h[2] = slant, math.atan2(east, north), math.atan2(-down, horizontal)
     for i in range(3):
         for j in range(SLOTS):
             if j != 3:
                 h[i] += by_error[i, j] * e[j]
+    for i in range(3):
+        for j in range(3):
+            m[i, j] = 0.0
+            by_error[i, 13 + j] = 0.0
+            for k in range(3):
+                f = g[i][0] * p[0][k] + g[i][1] * p[1][k] + g[i][2] * p[2][k]
+                m[i, j] += f * dcm_ned_ecef[k, j]
+                by_error[i, 13 + j] += f * moved[k, j]
+            by_error[i, 17 + j] = by_error[i, 13 + j]
 
 
 @inlined
@@ -280,21 +303,49 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
         predict_radar(site, dcm, known, e, point, h, m, by_error)
         state_rows(m, 3, tau, c, effective, speed, by_state, by_error)
         return
+    if kind == RANGE_RATE:
+        predict_range_rate(arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error)
+        return
     predict_place(kind, site, dcm, e, point, speed, h, m, by_error)
     if kind == VELOCITY:
-        velocity_rows(m, arm, rate, c, acceleration, by_state, by_error)
+        velocity_rows(m, 3, arm, rate, c, acceleration, by_state, by_error)
         return
     state_rows(m, 1 if kind == HEIGHT else 3, tau, c, effective, speed, by_state, by_error)
 
 
 @inlined
-def velocity_rows(m, arm, rate, c, acceleration, by_state, by_error):
-    """Partials of a velocity along axes ``m`` (3, 3): ``m (v + C (w x d) - tau a)``."""
+def predict_range_rate(arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error):
+    """Range rate ``u . v`` along the line of sight ``u`` from a site, plus its bias; partials by state and errors."""
+    slant = 0.0
+    for i in range(3):
+        slant += (point[i] - site[i]) * (point[i] - site[i])
+    slant = math.sqrt(slant)
+    along = np.empty((3, 3))
+    h[0] = 0.0
+    for i in range(3):
+        along[0, i] = (point[i] - site[i]) / slant
+        h[0] += along[0, i] * speed[i]
+    for i in range(3):
+        m[0, i] = (speed[i] - h[0] * along[0, i]) / slant
+    velocity_rows(along, 1, arm, rate, c, acceleration, by_state, by_error)
+    swing = by_state[0].copy()
+    late = by_error[0, 3]
+    state_rows(m, 1, tau, c, effective, speed, by_state, by_error)
+    for j in range(3, 9):
+        by_state[0, j] += swing[j]
+    by_error[0, 3] += late
+    by_error[0, 0] = 1.0
+    h[0] += e[0]
+
+
+@inlined
+def velocity_rows(m, count, arm, rate, c, acceleration, by_state, by_error):
+    """Partials of a velocity along the first axes of ``m`` (3, 3): ``m (v + C (w x d) - tau a)``."""
     turn, lever_velocity, row, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         turn[i] = rate[i] - OMEGA_WGS84 * c[2, i]
     cross_into(turn, arm, lever_velocity)
-    for i in range(3):
+    for i in range(count):
         by_error[i, 3] = -(m[i, 0] * acceleration[0] + m[i, 1] * acceleration[1] + m[i, 2] * acceleration[2])
         for j in range(3):
             by_state[i, 3 + j] = m[i, j]

@@ -27,16 +27,20 @@ S. McReynolds, "Editing data using sequential smoothing techniques for discrete 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
 from flightmodel.checks import BoolArray, FloatArray, IntArray
+from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import Finding
+from recon._measurement_kernels import RADAR
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
+from recon.measurements import REST, SLOT_NAMES
 from recon.settings import COMPILED
-from recon.smoother import Smoothed, backward, jacobian
+from recon.smoother import Smoothed, backward, jacobian, two_filter
 from recon.state import KINEMATIC, States, boxminus, unpacked
 
 _MOST_EDITED = 0.05  # share of a source's points
@@ -53,6 +57,8 @@ _BALLISTIC_CHECKS = {
         "is beyond the pre-flight uncertainty: check mass, area and coefficients",
     ),
 }
+_MOST_OUTSIDE = 3.0  # sd beyond a physical range
+_ALIKE = 0.5  # correlation of partials from which a radar hardly separates two errors: a quarter of the variance
 SAME_STRETCH_S = 1.0  # edited measurements closer than this are one stretch
 _MOST_STRETCHES = 12  # of edited measurements that are listed one by one
 GROUPS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9)}
@@ -105,12 +111,18 @@ def consistency_check(
     )
 
 
-def nis_check(source: str, nis: FloatArray, components: int, confidence: float) -> ConsistencyCheck:
-    """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all."""
+def nis_check(
+    source: str, nis: FloatArray, components: int, confidence: float, allowance: bool = False
+) -> ConsistencyCheck:
+    """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all.
+
+    With an ``allowance`` for noise, not its size, residuals may be as small as they like.
+    """
     from scipy.stats import chi2
 
     n, tail = len(nis), 0.5 * (1.0 - confidence)
     low, high = (float(chi2.ppf(p, components)) / n for p in (tail, 1.0 - tail))
+    low = 0.0 if allowance else low
     mean = float(np.mean(nis))
     size, advice = (
         ("smaller", "the assumed noise is too large")
@@ -222,10 +234,11 @@ def source_checks(problem: Problem, innovations: Innovations, confidence: float)
         use = mine & settled & innovations.accepted
         checks = []
         if use.sum() >= 10:
-            checks.append(nis_check(instrument.name, innovations.nis[use], int(measured[use].sum()), confidence))
+            components, still = int(measured[use].sum()), instrument.name == REST
+            checks.append(nis_check(instrument.name, innovations.nis[use], components, confidence, still))
             for i, component in enumerate(instrument.components):
                 rows = use & measured[:, i]
-                if rows.sum() >= 10:
+                if rows.sum() >= 10 and not still:
                     checks.append(whiteness_check(instrument.name, component, normalised[rows, i], confidence))
         checks.append(edit_check(instrument.name, innovations.accepted[mine]))
         out += [replace(v, source=instrument.owner) for v in checks]
@@ -259,6 +272,54 @@ def data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) 
     return [v for v in out if v is not None]
 
 
+def physical_checks(
+    problem: Problem, innovations: Innovations, table: pd.DataFrame, radars: Iterable[str]
+) -> list[ConsistencyCheck]:
+    """One check for each estimated error of the radars that cannot have every size; a failed one names look-alikes."""
+    out = []
+    rows = table.set_index("name")
+    for number, instrument in enumerate(problem.instruments):
+        if instrument.name not in radars:
+            continue
+        for error in RADAR_ERRORS.rows:
+            name = f"{instrument.owner} {error.states[0]}" if error.states else ""
+            if error.physical is None or name not in rows.index or rows.treated[name] == "considered":
+                continue
+            low, high = error.physical
+            estimate, sd = float(rows.estimate[name]), float(rows.sd[name])
+            outside = max(low - estimate, estimate - high, 0.0) / sd
+            found = f"{name} {estimate:.2g} ± {sd:.2g}"
+            alike = _look_alikes(problem, innovations, number, error.states[0]) if outside > _MOST_OUTSIDE else []
+            advice = (
+                f"its readings look alike with {', '.join(alike)}: state these" if alike else "check its correction"
+            )
+            out.append(
+                consistency_check(
+                    "physical-range", f"physical range {name}", outside, 0.0, _MOST_OUTSIDE,
+                    f"{found} is possible", f"{found} is outside {low:g} to {high:g}",
+                    advice=f"{advice}, or the range's correction took out more than there was",
+                    source=instrument.owner, component=error.states[0],
+                )
+            )  # fmt: skip
+    return out
+
+
+def _look_alikes(problem: Problem, innovations: Innovations, number: int, component: str) -> list[str]:
+    """Errors of the same radar whose partials, less those of its biases, correlate with this one's, most first."""
+    rows = np.flatnonzero((problem.observed.source == number) & innovations.accepted)
+    weight = 1.0 / np.sqrt(problem.observed.variance[rows])  # of components that were not measured zero
+    columns = (innovations.by_error[rows] * weight[:, :, None]).reshape(3 * len(rows), -1)
+    names, biases = SLOT_NAMES[RADAR], [0, 1, 2]
+    columns = columns - columns[:, biases] @ np.linalg.lstsq(columns[:, biases], columns, rcond=None)[0]
+    mine = columns[:, names.index(component)]
+    alike = {}
+    for k, name in enumerate(names):
+        size = np.linalg.norm(columns[:, k]) * np.linalg.norm(mine)
+        if k not in biases and name != component and "survey" not in name and size > 0.0:
+            alike[name] = abs(float(columns[:, k] @ mine)) / size
+    return sorted((name for name, c in alike.items() if c > _ALIKE), key=lambda name: -alike[name])
+
+
 def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -> pd.DataFrame:
     """One row for each component of the measurements that were not used: `_COLUMNS`, in order of time."""
     rows = _chosen(problem)
@@ -268,7 +329,7 @@ def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -
     wanted = np.unique(node[rows])
     kept = np.zeros(len(problem.time_s), dtype=bool)
     kept[wanted] = True
-    x, covariance = _smoothed(problem, run, kept, engine)
+    x, covariance = smoothed_covariance(problem, run, kept, engine)
     slots = problem.sources().slot
     out = []
     for row in rows.tolist():
@@ -310,19 +371,28 @@ def _chosen(problem: Problem) -> IntArray:
     return np.asarray(rows, dtype=np.int64)
 
 
-def _smoothed(problem: Problem, run: ForwardPass, kept: BoolArray, engine: str) -> tuple[FloatArray, FloatArray]:
+def smoothed_covariance(
+    problem: Problem, run: ForwardPass, kept: BoolArray, engine: str
+) -> tuple[FloatArray, FloatArray]:
     """Smoothed errors at all nodes (n, N) and their whole covariance at the kept ones (k, N, N)."""
     rows: IntArray = np.full(len(kept), -1, dtype=np.int64)
     rows[kept] = np.arange(int(kept.sum()))
+    filtered = run.filtered._replace(kept=rows)
+    triangles = np.empty((int(kept.sum()), problem.size * (problem.size + 1) // 2))
+    variance = np.empty((len(triangles), problem.size))
+    considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
+    if len(considered):
+        x = run.filtered.x_minus.copy()
+        two_filter(
+            run.steps, filtered, problem.observed, problem.sources().slot, run.innovations, considered, x, triangles,
+            variance,
+        )  # fmt: skip
+        return x, unpacked(triangles)
     phi = run.steps.transition
     # the smoother keeps the covariance of errors that the motion depends on: of all, where all are columns
     wide = np.concatenate([phi, np.zeros((*phi.shape[:2], problem.size - phi.shape[2]))], axis=2)
     x = run.filtered.x_plus.copy()
-    triangles = np.empty((int(kept.sum()), problem.size * (problem.size + 1) // 2))
-    backward(engine)(
-        run.steps._replace(transition=wide), run.filtered._replace(kept=rows), problem.moving, x, triangles,
-        np.empty((len(triangles), problem.size)),
-    )  # fmt: skip
+    backward(engine)(run.steps._replace(transition=wide), filtered, problem.moving, x, triangles, variance)
     return x, unpacked(triangles)
 
 

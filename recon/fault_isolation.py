@@ -39,6 +39,7 @@ from flightmodel.trajectory import Trajectory, difference, resample
 from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, edit_check
 from recon.ekf import Problem, nearest_index
 from recon.imu_screening import TransientOffset
+from recon.measurements import SITES
 from recon.state import KINEMATIC
 from recon.time_bias import ClockJump, Lag
 
@@ -46,6 +47,7 @@ _CONFIDENCE = 0.999
 _LEAST_LOST = 0.05  # of its variance that a solution loses by leaving a source out, for the test
 _ABOUT_SOURCES = ("nis", "whiteness", "edited", "data-sheet")  # codes of checks about one tracker or sensor
 _AIR_CODES = ("sounding", "pre-flight-drag", "sounding-density", "sounding-wind", "pre-flight-ca", "force-residuals")
+_SHARED_CODES = ("place", "sites")  # about what all trackers share
 _INERTIAL = ("accelerometer", "rates")
 INFLATION = 3.0  # times the estimate: wide enough not to pull, for the estimate was already pulled
 
@@ -337,7 +339,8 @@ def isolate_faults(checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut
     failed = [v for v in checks if not v.passed]
     inertial = [v for v in failed if v.code == "data-sheet" and v.source in _INERTIAL]
     inertial += [v for v in failed if v.code == "clock-lag"]
-    out: list[FaultHypothesis] = []
+    shared = [v for v in failed if v.code in _SHARED_CODES or (v.code == "data-sheet" and v.source == SITES)]
+    out = [FaultHypothesis(f"radar sites: {v.remark}", "sites", (v.source,)) for v in shared]
     if any(is_about(v, s.source) for v in failed for s in left_out):
         out.append(_tracker_hypothesis(failed, left_out, inertial))
     elif not left_out:
@@ -350,6 +353,7 @@ def isolate_faults(checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut
         out.append(FaultHypothesis(what, "motion"))
     rest = [("attitude", v) for v in failed if v.code.startswith("attitude-")]
     rest += [("air", v) for v in failed if v.code in _AIR_CODES]
+    rest += [("error-model", v) for v in failed if v.code == "physical-range"]
     sentences = {FaultHypothesis(f"{what}: {v.remark}", what, (v.source,)): None for what, v in rest}
     return (*out, *sentences)
 

@@ -7,10 +7,14 @@ tag minus true time), so
 
 with ``w`` the body's rate against the Earth and ``a`` the acceleration. Then, each plus its errors and noise:
 
-* radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95) and residual
-  refraction, ``N cot(E)`` for a ray through the whole atmosphere;
+* radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95), residual
+  refraction, ``N cot(E)`` for a ray through the whole atmosphere, and errors of the site's survey, its own and those
+  common to all sites: with a stated place ``d`` off the true one, ``r = (1 - rho x) (R (p - site) + d)``, where ``rho``
+  is the turn of north, east and down over ``d`` on the Earth;
+* Doppler: ``u . dp/dt`` along the line of sight ``u``;
 * receiver: ``p`` north, east and down of a reference, and its velocity along the same axes;
 * barometer: geodetic height of ``p``;
+* at rest (`recon.rest`): zero velocity; of the gyros as of a magnetometer, with the Earth's rate for ``B``;
 * magnetometer: ``S R(m)^T D^T C^T B + b``, S with scales and soft iron, m the mounting rotation, D its nominal axes;
 * Sun head: azimuth and elevation of ``R(m)^T D^T C^T s``.
 
@@ -29,9 +33,11 @@ import numpy as np
 from flightmodel import earth, instruments, rotations
 from flightmodel.checks import FloatArray, IntArray
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
-from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, SLOTS, SUN, VELOCITY
+from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, RANGE_RATE, SLOTS, SUN, VELOCITY
 from recon.state import ErrorModel, right_jacobian
 
+REST = "rest"  # zero velocities on the pad
+SITES = "sites"  # owner of the errors that are common to all radar sites
 _SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {
     RADAR: ("range", "azimuth", "elevation"),
@@ -40,10 +46,13 @@ COMPONENTS = {
     HEIGHT: ("height",),
     FIELD: ("field x", "field y", "field z"),
     SUN: ("azimuth", "elevation"),
+    RANGE_RATE: ("range rate",),
 }
+_OWN_RADAR = instruments.RADAR.states[:-1]  # the last is of the range rate, a reading of its own
 # time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
-    RADAR: instruments.RADAR.states,
+    RADAR: (*_OWN_RADAR, *instruments.SITES.states),
+    RANGE_RATE: (instruments.RADAR.states[-1], "", "", instruments.RADAR.states[3]),
     POSITION: instruments.GNSS.states,
     VELOCITY: ("", "", "", instruments.GNSS.states[3]),
     HEIGHT: instruments.BAROMETER.states,
@@ -73,6 +82,8 @@ class Instrument:
         As in `recon.state.Observed`.
     every_s : float
         Of measurements closer than this some are predicted, not used.
+    labels : tuple of str
+        Names of its components where they are not those of its kind.
     """
 
     name: str
@@ -86,11 +97,12 @@ class Instrument:
     variance: FloatArray
     known: FloatArray
     every_s: float = 0.0
+    labels: tuple[str, ...] = ()
 
     @property
     def components(self) -> tuple[str, ...]:
         """Names of its components."""
-        return COMPONENTS[self.kind]
+        return self.labels or COMPONENTS[self.kind]
 
     @property
     def count(self) -> IntArray:
@@ -100,13 +112,16 @@ class Instrument:
     def slots(self, model: ErrorModel) -> IntArray:
         """Which error (`SLOTS`,) of the model stands in each slot; -1 for none."""
         names = SLOT_NAMES[self.kind]
-        found = [model.column(self.owner, name) if name else -1 for name in names]
+        own = len(_OWN_RADAR)  # of a radar; what follows is common to all sites
+        owners = [self.owner if k < own else SITES for k in range(len(names))]
+        found = [model.column(owner, name) if name else -1 for owner, name in zip(owners, names, strict=True)]
         return np.array([*found, *[-1] * (SLOTS - len(found))], dtype=np.int64)
 
 
-def _instrument(
+def instrument_of(
     name: str, kind: int, owner: str, arm: FloatArray, site: FloatArray, dcm: FloatArray,
     time_s: FloatArray, value: FloatArray, sd: FloatArray, known: FloatArray | None = None, every_s: float = 0.0,
+    labels: tuple[str, ...] = (),
 ) -> Instrument:  # fmt: skip
     """Instrument with NaN readings taken as not measured, rows without any left out."""
     variance = np.where(np.isfinite(value), np.broadcast_to(sd, value.shape) ** 2, np.inf)
@@ -115,23 +130,44 @@ def _instrument(
     value = np.where(np.isfinite(value), value, 0.0)
     return Instrument(
         name, kind, owner, np.asarray(arm, dtype=float), np.asarray(site, dtype=float), np.ascontiguousarray(dcm),
-        time_s[keep], value[keep], variance[keep], known[keep], every_s,
+        time_s[keep], value[keep], variance[keep], known[keep], every_s, labels,
     )  # fmt: skip
 
 
 def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, traverse: bool = True) -> Instrument:
     """One radar; a missing component leaves the others."""
     site = record.site
-    sd = np.tile([site.range_sd_m, *site.angles_sd_rad], (len(record.time_s), 1))
+    sd = _noise(record, [site.range_sd_m, *site.angles_sd_rad], slice(0, 3))
     if traverse:
         elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
         sd[:, 1] /= np.maximum(np.cos(elevation), 1e-3)
     known = np.tile([_SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
     place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
-    return _instrument(
+    return instrument_of(
         name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known, record.every_s
     )
+
+
+def range_rate_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray) -> Instrument | None:
+    """Range rates of one radar or Doppler station; None where it gives none."""
+    site = record.site
+    if record.range_rate_mps is None:
+        return None
+    value = np.column_stack([record.range_rate_mps, np.full((len(record.time_s), 2), np.nan)])
+    sd = np.tile(_noise(record, [site.range_rate_sd_mps], slice(3, 4)), 3)
+    place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
+    dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
+    return instrument_of(
+        f"{name} range rate", RANGE_RATE, site.name, arm_body_m, place, dcm, record.time_s, value, sd,
+        every_s=record.every_s,
+    )  # fmt: skip
+
+
+def _noise(record: RadarRecord, stated: list[float], columns: slice) -> FloatArray:
+    """Noise (n, k) of each reading: its own where the table states it, else the site's."""
+    sd = np.tile(stated, (len(record.time_s), 1))
+    return sd if record.sd is None else np.where(np.isfinite(record.sd[:, columns]), record.sd[:, columns], sd)
 
 
 def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray) -> list[Instrument]:
@@ -148,10 +184,10 @@ def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray)
     speed_sd = np.array([spec.speed_sd_mps, spec.speed_sd_mps, spec.vertical_speed_sd_mps])
     place = (record.position_ecef_m - reference) @ dcm.T
     both = [
-        _instrument(
+        instrument_of(
             name, POSITION, spec.name, arm, reference, dcm, record.time_s, place, place_sd, every_s=record.every_s
         ),
-        _instrument(
+        instrument_of(
             f"{name} velocity", VELOCITY, spec.name, arm, reference, dcm,
             record.time_s, record.velocity_ecef_mps @ dcm.T, speed_sd, every_s=record.every_s,
         ),
@@ -163,7 +199,7 @@ def barometer_instrument(name: str, record: BarometerRecord, accelerometer_m: Fl
     """Height by pressure of the datum's point."""
     first = next(iter(record.height_m[np.isfinite(record.height_m)]), 0.0)
     value = np.column_stack([record.height_m, np.full((len(record.height_m), 2), np.nan)])
-    return _instrument(
+    return instrument_of(
         name, HEIGHT, record.spec.name, -accelerometer_m, np.array([first, 0.0, 0.0]), np.eye(3),
         record.time_s, value, np.full(3, record.spec.sd_m), every_s=record.every_s,
     )  # fmt: skip
@@ -173,7 +209,7 @@ def magnetometer_instrument(name: str, record: TriadRecord, field_ecef_t: FloatA
     """Chosen samples of a magnetometer, with the field (n, 3) at them in Earth-fixed axes."""
     spec = record.spec
     sd = np.full(3, np.hypot(spec.noise_sd, spec.resolution / np.sqrt(12.0)))
-    return _instrument(
+    return instrument_of(
         name, FIELD, spec.name, np.zeros(3), np.zeros(3), spec.dcm_body_sensor,
         record.time_s[rows], record.measured_sensor[rows], sd, field_ecef_t,
     )  # fmt: skip
@@ -189,7 +225,7 @@ def sun_instruments(name: str, record: SunRecord, sun_ecef: FloatArray, rows: In
         value = np.column_stack([angles, np.full(len(rows), np.nan)])
         head = f"{name}{number}"
         out.append(
-            _instrument(head, SUN, head, np.zeros(3), np.zeros(3), dcm, record.time_s[rows], value, sd, sun_ecef)
+            instrument_of(head, SUN, head, np.zeros(3), np.zeros(3), dcm, record.time_s[rows], value, sd, sun_ecef)
         )
     return [i for i in out if len(i.time_s)]
 
@@ -229,6 +265,15 @@ def predict(
         by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(lever_velocity)
         by_error[:, 3] = -instrument.dcm @ at.acceleration_ecef_mps2
         return instrument.dcm @ speed, by_state, by_error
+    if instrument.kind == RANGE_RATE:
+        sight = point - instrument.site_ecef_m
+        u = sight / np.linalg.norm(sight)
+        across = (speed - (u @ speed) * u) / np.linalg.norm(sight)
+        by_state[0, 0:3], by_state[0, 3:6] = across, u - tau * across
+        by_state[0, 6:9] = -u @ c @ rotations.skew(lever_velocity)
+        by_state[0, 6:9] -= across @ c @ rotations.skew(arm - tau * lever_velocity)
+        by_error[0, 0], by_error[0, 3] = 1.0, -across @ speed - u @ at.acceleration_ecef_mps2
+        return np.array([u @ speed + e[0], 0.0, 0.0]), by_state, by_error
     if instrument.kind == RADAR:
         h, m = _radar(instrument, known, e, point, by_error)
     elif instrument.kind == POSITION:
@@ -246,17 +291,11 @@ def predict(
 def _radar(
     instrument: Instrument, known: FloatArray, e: FloatArray, point: FloatArray, by_error: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    n, east, d = instrument.dcm @ (point - instrument.site_ecef_m)
-    level = np.hypot(n, east)
-    slant = np.hypot(level, d)
-    az, el = np.arctan2(east, n), np.arctan2(-d, level)
-    partials = np.array(
-        [
-            [n / slant, east / slant, d / slant],
-            [-east / level**2, n / level**2, 0.0],
-            [d * n / (slant**2 * level), d * east / (slant**2 * level), -level / slant**2],
-        ]
-    )
+    ned = instrument.dcm @ (point - instrument.site_ecef_m)
+    moved = _site_partials(instrument, ned)
+    n, east, d = ned + moved @ (e[13:16] + e[17:20])
+    slant, az, el = sight(n, east, d)
+    partials = sight_partials(n, east, d)
     sec = 1.0 / max(np.cos(el), 1e-3)
     tan = np.sin(el) * sec
     by_error[:, 0:3] = np.eye(3)
@@ -266,6 +305,7 @@ def _radar(
     by_error[1, 9], by_error[2, 10] = sec, 1.0
     by_error[2, 11] = known[0] * np.cos(el) / max(np.sin(el), 0.035)
     by_error[0, 12] = slant
+    by_error[1, [16, 20]] = 1.0
     # the errors themselves change with azimuth and elevation
     g = np.eye(3) + np.diag([e[12], 0.0, 0.0])
     g[1, 1] += tan * (np.sin(az) * e[4] - np.cos(az) * e[5])
@@ -274,7 +314,38 @@ def _radar(
     cosecant_square = 1.0 / np.sin(el) ** 2 if np.sin(el) > 0.035 else np.sin(el) / 0.035
     g[2, 2] -= np.sin(el) * e[6] + known[0] * cosecant_square * e[11]
     others = np.delete(np.arange(SLOTS), 3)
-    return np.array([slant, az, el]) + by_error[:, others] @ e[others], g @ partials @ instrument.dcm
+    h = np.array([slant, az, el]) + by_error[:, others] @ e[others]
+    by_error[:, 13:16] = by_error[:, 17:20] = g @ partials @ moved
+    return h, g @ partials @ instrument.dcm
+
+
+def sight(n: float, east: float, d: float) -> tuple[float, float, float]:
+    """Range, azimuth, elevation of a point north, east, down of a site."""
+    level = np.hypot(n, east)
+    return float(np.hypot(level, d)), float(np.arctan2(east, n)), float(np.arctan2(-d, level))
+
+
+def sight_partials(n: float, east: float, d: float) -> FloatArray:
+    """Partials (3, 3) of range, azimuth, elevation by north, east, down."""
+    level = np.hypot(n, east)
+    slant = np.hypot(level, d)
+    return np.array(
+        [
+            [n / slant, east / slant, d / slant],
+            [-east / level**2, n / level**2, 0.0],
+            [d * n / (slant**2 * level), d * east / (slant**2 * level), -level / slant**2],
+        ]
+    )
+
+
+def _site_partials(instrument: Instrument, ned: FloatArray) -> FloatArray:
+    """Partials (3, 3) of north, east, down by the stated place's error to the north, to the east and upwards."""
+    per_m = 1.0 / float(np.linalg.norm(instrument.site_ecef_m))
+    tan_lat = -instrument.dcm[2, 2] / max(instrument.dcm[0, 2], 1e-6)
+    turns = per_m * np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, tan_lat]])  # of a metre to the north, to the east
+    moved = np.diag([1.0, 1.0, -1.0])
+    moved[:, :2] -= np.cross(turns, ned).T
+    return moved
 
 
 def _height(

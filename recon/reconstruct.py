@@ -46,8 +46,10 @@ from recon import (
     fault_isolation,
     imu_screening,
     propagation,
+    rest,
     setup,
     smoother,
+    survey,
     time_bias,
 )
 from recon.consistency import ConsistencyCheck, held_out_table
@@ -165,16 +167,29 @@ def reconstruct(
     """
     settings = settings or Settings.from_mapping(telemetry.reconstruction)
     report = progress or (lambda _fraction, _what: None)
-    solution = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what))
-    inflated = fault_isolation.inflated_priors(solution.consistency_checks, solution.sensor_errors)
+    at_rest = _checks_at_rest(telemetry, settings)
+    known = Adaptation(inflated_sd=rest.inflated_priors(telemetry, at_rest, INFLATION))
+    solution = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what), known)
+    inflated = known.inflated_sd | fault_isolation.inflated_priors(solution.consistency_checks, solution.sensor_errors)
     inflated |= _inflated_clocks(telemetry, solution)
-    if inflated:
+    if inflated != known.inflated_sd:
         solution = _with_inflated_priors(telemetry, settings, solution, inflated)
     sources = trackers(telemetry, settings)
     if len(sources) > 1 and fault_isolation.any_tracker_fails(solution.consistency_checks, sources):
         solution = _compared_leaving_one_out(telemetry, settings, solution, sources, report)
+        solution = _with_shared_errors_tried(telemetry, settings, solution)
     report(1.0, "done")
-    return solution
+    return replace(
+        solution,
+        consistency_checks=(*solution.consistency_checks, *at_rest),
+        findings=(*solution.findings, *rest.noise_findings(telemetry)),
+    )
+
+
+def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[ConsistencyCheck]:
+    """Checks of the inertial sensors on the pad; none without a rest, or a place."""
+    points = setup.track_points(setup.tracking_instruments(telemetry, settings, np.zeros(3)))[1]
+    return rest.rest_checks(telemetry, settings.check_confidence, points[0]) if len(points) else []
 
 
 def _with_inflated_priors(
@@ -242,6 +257,23 @@ def _compared_leaving_one_out(
     )
 
 
+def _with_shared_errors_tried(
+    telemetry: Telemetry, settings: Settings, solution: TrajectorySolution
+) -> TrajectorySolution:
+    """Solution with a failed check where an error of all radar sites together would make all data consistent."""
+    names = [name for name in survey.WIDE_SD if name in set(solution.sensor_errors.name)]
+    if not names or not (telemetry.gnss or telemetry.barometers):
+        return solution
+    coarse = replace(settings, output_rate_hz=min(settings.output_rate_hz, _LEAVE_ONE_OUT_RATE_HZ), pulse_rate_hz=0.0)
+    again = reconstruct_once(telemetry, coarse, adaptation=replace(solution.adaptation, inflated_sd=survey.WIDE_SD))
+    consistent = all(v.passed for v in again.consistency_checks if v.source != survey.SITES)
+    found = again.sensor_errors.set_index("name").loc[names, ["estimate", "sd"]].to_numpy(dtype=float)
+    check = survey.shared_error_check(found, names, consistent)
+    if check is None:
+        return solution
+    return replace(solution, consistency_checks=(*solution.consistency_checks, check))
+
+
 def reconstruct_once(
     telemetry: Telemetry,
     settings: Settings,
@@ -273,6 +305,8 @@ def reconstruct_once(
     checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
     checks += consistency.filter_against_smoother(problem, run, smoothed, reference)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
+    checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
+    checks += survey.place_checks(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
     if sensors is not None and adaptation.lag is None:
         lag = time_bias.lag_between(sensors.force, sensors.rate, reference, problem.time_s)
         if lag is not None:

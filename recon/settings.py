@@ -106,6 +106,8 @@ class Settings:
         so that equal spans have equal times.
     start_s, end_s : float or None
         Span; the data's own common span where None.
+    carry_on_s : float
+        How long the trajectory goes on after the last measurement of the trackers, by inertial sensors or ballistic.
     passes : int
         Largest number of forward passes over all data. The first filter runs on thinned data about its own estimate,
         iterated until attitudes converge; each pass over all data is linearised about the smoothed trajectory before
@@ -141,6 +143,7 @@ class Settings:
     pulse_rate_hz: float = _number(0.0, 0.1, 1000.0, also=0.0, meaning="none")
     start_s: float | None = _time()
     end_s: float | None = _time()
+    carry_on_s: float = _number(0.0, 0.0, 1e5)
     passes: int = _integer(3, 0, 10)
     gate_probability: float = _number(0.9999, 0.5, 1.0, below=True)
     check_confidence: float = _number(0.999, 0.5, 1.0, below=True)

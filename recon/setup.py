@@ -1,10 +1,10 @@
 """What is the filter given? From telemetry to nodes, instruments, error model, motion and the state at the start.
 
-The attitude at the start comes from its prior through the gyros (or from magnetometer and Sun sensors), position and
-velocity from early track points. Position and velocity get a prior so wide that it carries no information
-(`_DIFFUSE_POSITION_M`, `_DIFFUSE_VELOCITY_MPS`): the fit to the first seconds of tracking only chooses the point about
-which to linearise, so no point counts twice. The attitude's errors are correlated with those of the gyros that
-propagated it. Ballistic flight has no attitude; its rotation is held fixed.
+The attitude at the start comes from its prior through the gyros (or from a rest, or from magnetometer and Sun sensors),
+position and velocity from early track points, or from a rest. Position and velocity get a prior so wide that it carries
+no information (`_DIFFUSE_POSITION_M`, `_DIFFUSE_VELOCITY_MPS`): the fit to the first seconds of tracking only chooses
+the point about which to linearise, so no point counts twice. The attitude's errors are correlated with those of the
+gyros that propagated it. Ballistic flight has no attitude; its rotation is held fixed.
 """
 
 from __future__ import annotations
@@ -18,20 +18,30 @@ import numpy as np
 from flightmodel import earth, geomagnetism_and_sun, rotations
 from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.gate import spaced
-from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER
+from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesSpec
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import AttitudePrior, Telemetry
 from recon import measurements
-from recon._measurement_kernels import HEIGHT, POSITION, RADAR, VELOCITY
+from recon._measurement_kernels import HEIGHT, POSITION, RADAR, RANGE_RATE, VELOCITY
 from recon.ekf import FIT_SPAN_S, Problem, nearest_index, observe
 from recon.imu_screening import BridgedSensor
 from recon.measurements import Instrument
-from recon.propagation import SAME_INSTANT_S, ballistic_motion, correct, inertial_motion, propagate, with_disturbances
+from recon.propagation import (
+    SAME_INSTANT_S,
+    Motion,
+    ballistic_motion,
+    correct,
+    inertial_motion,
+    propagate,
+    with_disturbances,
+)
+from recon.rest import levelled_attitude, rest_instruments
 from recon.settings import Settings
 from recon.state import KINEMATIC, ErrorModel, States, ballistic_blocks, imu_blocks, instrument_blocks, sun_blocks
+from recon.triangulation import triangulated
 from recon.vector_attitude import start_attitude_from_vectors
 
-_TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT)
+_TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT, RANGE_RATE)
 _PULSE_CELL_S, _LEAST_PULSE_MPS2 = 0.5, 5.0
 _ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
 _NO_POINTS: Mapping[str, FloatArray] = MappingProxyType({})
@@ -42,6 +52,7 @@ _LEAST_POINTS = 4
 _TRACK_SPAN_S = 2.5
 _FIXED_RAD = 1e-6  # sd of the rotation of ballistic flight, which is held fixed
 _GYRO = slice(18, 27)
+_LEAST_SURVEY_M, _LEAST_NORTH_RAD = 1e-3, 1e-9  # a millimetre, and at 1000 km too
 
 
 @dataclass(frozen=True)
@@ -69,10 +80,12 @@ def build_problem(
     instruments = tracking_instruments(telemetry, settings, arm)
     model = _named_model(telemetry, settings, sensors, instruments)
     used = tuple(_without_rejected(i, rejected) for i in instruments if not _is_excluded(i, settings))
-    start_s, end_s = _span(used, settings, sensors)
+    start_s, end_s = _span(used, settings, sensors, telemetry.start.at_rest)
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
     if sensors is not None and settings.pulse_rate_hz > settings.output_rate_hz:
         output_s = _union([output_s, *_pulse_times(instruments, sensors.force, start_s, end_s, settings.pulse_rate_hz)])
+    if sensors is not None:
+        instruments += rest_instruments(telemetry, start_s, track_points(used)[1][0])
     if settings.attitude_sensors:
         instruments += _attitude_instruments(telemetry, used, start_s, end_s)
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
@@ -86,8 +99,10 @@ def build_problem(
         force, rate = sensors.force, sensors.rate
         clocks = model.column(rate.spec.name, "time bias") >= 0
         motion, node_index = inertial_motion(force, rate, time_s, clocks)
-        prior = _attitude_prior(telemetry, start_s)
+        prior = _attitude_prior(telemetry, start_s, track_points(used)[1][0])
         start, covariance = _start_by_inertial_sensors(used, prior, start_s, force, rate, model)
+        if telemetry.start.at_rest is not None and telemetry.start.at_rest[0] <= start_s < telemetry.start.at_rest[1]:
+            start = _start_at_rest(used, telemetry.start.at_rest, motion, start, time_s, node_index)
     motion = with_disturbances(motion, telemetry.motion)
     from scipy.stats import chi2
 
@@ -172,8 +187,8 @@ def _only_predicted(problem: Problem, settings: Settings, rejected: Mapping[str,
     return out
 
 
-def _attitude_prior(telemetry: Telemetry, start_s: float) -> AttitudePrior:
-    """Attitude as it is stated; where it is not, from magnetometer and Sun sensors about the start.
+def _attitude_prior(telemetry: Telemetry, start_s: float, point_ecef_m: FloatArray) -> AttitudePrior:
+    """Attitude as it is stated; where it is not, from a rest, or magnetometer and Sun sensors about the start.
 
     Raises
     ------
@@ -182,6 +197,8 @@ def _attitude_prior(telemetry: Telemetry, start_s: float) -> AttitudePrior:
     """
     if telemetry.attitude_prior is not None:
         return telemetry.attitude_prior
+    if telemetry.start.at_rest is not None:
+        return levelled_attitude(telemetry, max(start_s, telemetry.start.at_rest[0]), point_ecef_m)
     if telemetry.magnetometer is None or telemetry.sun is None:
         raise GateError(
             [
@@ -208,7 +225,9 @@ def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: F
     for name, record in telemetry.radars.items():
         cg = telemetry.vehicle.cg_m if telemetry.vehicle is not None and record.point == "cg" else np.zeros(3)
         arm = np.zeros(3) if ballistic else cg - arm_body_m
-        out.append(measurements.radar_instrument(name, record, arm, traverse))
+        radar = measurements.radar_instrument(name, record, arm, traverse)
+        doppler = measurements.range_rate_instrument(name, record, arm)
+        out += [i for i in (radar, doppler) if i is not None and len(i.time_s)]
     for name, fixes in telemetry.gnss.items():
         antenna = fixes.spec.antenna_from_datum_body_m
         out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m)
@@ -254,6 +273,7 @@ def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, at
         blocks = imu_blocks(sensors.force.spec, sensors.rate.spec)
     for radar in telemetry.radars.values():
         blocks += instrument_blocks(RADAR_ERRORS, radar.site)
+    blocks += instrument_blocks(SITES, _sites(telemetry))
     for fixes in telemetry.gnss.values():
         blocks += instrument_blocks(GNSS, fixes.spec)
     for heights in telemetry.barometers.values():
@@ -265,17 +285,41 @@ def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, at
     return ErrorModel(tuple(blocks))
 
 
+def _sites(telemetry: Telemetry) -> SitesSpec:
+    """Errors common to all radar sites: as stated, and so small that nothing moves where others can contradict them.
+
+    What an error that is not stated would do to the answer is its covariance with the answer over its variance.
+    """
+    stated = telemetry.sites
+    if not telemetry.radars:
+        return SitesSpec()
+    if not (telemetry.places or telemetry.gnss or telemetry.barometers):
+        return stated
+    return SitesSpec(
+        stated.name,
+        max(stated.survey_sd_m, _LEAST_SURVEY_M),
+        max(stated.height_datum_sd_m, _LEAST_SURVEY_M),
+        max(stated.north_sd_rad, _LEAST_NORTH_RAD),
+    )
+
+
 def _span(
-    instruments: tuple[Instrument, ...], settings: Settings, sensors: InertialSensors | None
+    instruments: tuple[Instrument, ...],
+    settings: Settings,
+    sensors: InertialSensors | None,
+    at_rest: tuple[float, float] | None = None,
 ) -> tuple[float, float]:
-    """First and last time that inertial sensors and at least one tracker cover, within the settings' span."""
+    """First and last time that inertial sensors and a tracker, or a rest, cover, within the settings' span."""
     t, _ = track_points(instruments)
     if len(t) == 0:
         raise GateError(
-            "no radar or receiver has a usable point that is not left out; a trajectory needs at least one",
+            "no radar or receiver has a usable point that is not left out, nor do angles and ranges of several sites "
+            "meet in one; a trajectory needs at least one",
             code="no-track-points",
         )
-    start_s, end_s = float(t[0]), float(t[-1])
+    start_s, end_s = float(t[0]), float(t[-1]) + settings.carry_on_s
+    if at_rest is not None:
+        start_s = min(start_s, at_rest[0])
     if sensors is not None:
         start_s = max(start_s, sensors.force.time_s[0], sensors.rate.time_s[0])
         end_s = min(end_s, sensors.force.time_s[-1], sensors.rate.time_s[-1])
@@ -362,7 +406,10 @@ def _start_attitude(
 
 
 def track_points(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:
-    """Times (k,) and points (k, 3), ECEF m, of every measurement that fixes a position by itself, in order."""
+    """Times (k,) and points (k, 3), ECEF m, of every measurement that fixes a position by itself, in order.
+
+    Where none does, of instants at which angles and ranges of several sites do together (`recon.triangulation`).
+    """
     times, points = [], []
     for i in instruments:
         whole = np.isfinite(i.variance).all(axis=1)
@@ -375,6 +422,8 @@ def track_points(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, Float
         times.append(i.time_s[whole])
         points.append(i.site_ecef_m + ned @ i.dcm)
     t = np.concatenate([np.empty(0), *times])
+    if not len(t):
+        return triangulated(tuple(i for i in instruments if i.kind == RADAR))
     order = np.argsort(t, kind="stable")
     return t[order], np.concatenate([np.empty((0, 3)), *points])[order]
 
@@ -490,6 +539,29 @@ def _start_by_inertial_sensors(
     covariance[6:9, gyro] = cross
     covariance[gyro, 6:9] = cross.T
     return state, covariance
+
+
+def _start_at_rest(
+    instruments: tuple[Instrument, ...],
+    at_rest: tuple[float, float],
+    motion: Motion,
+    start: States,
+    time_s: FloatArray,
+    node_index: IntArray,
+) -> States:
+    """Start without velocity: where tracking has it at rest, or from where it came to the first track point."""
+    t, points = track_points(instruments)
+    still = points[(t >= time_s[0] - SAME_INSTANT_S) & (t <= at_rest[1])]
+    start = replace(start, velocity_ecef_mps=np.zeros(3))
+    if len(still):
+        return replace(start, position_ecef_m=np.median(still, axis=0))
+    first = int(np.searchsorted(t, time_s[0]))
+    node = int(nearest_index(time_s, t[first : first + 1])[0])
+    place = replace(start, position_ecef_m=points[first])
+    for _ in range(2):  # gravity is that of the place
+        reached = propagate(motion, int(node_index[0]), int(node_index[node]), place).state.position_ecef_m
+        place = replace(place, position_ecef_m=place.position_ecef_m + points[first] - reached)
+    return place
 
 
 def _start_ballistic(

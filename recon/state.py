@@ -35,6 +35,7 @@ from flightmodel.instruments import (
     GnssSpec,
     InstrumentTable,
     RadarSite,
+    SitesSpec,
     SunHeads,
     TriadSpec,
 )
@@ -42,7 +43,7 @@ from flightmodel.telemetry import Motion as MotionSpec
 
 POSITION, VELOCITY, ROTATION = slice(0, 3), slice(3, 6), slice(6, 9)
 KINEMATIC, INERTIAL = 9, 27
-Spec = TriadSpec | RadarSite | GnssSpec | BarometerSpec | SunHeads
+Spec = TriadSpec | RadarSite | SitesSpec | GnssSpec | BarometerSpec | SunHeads
 AXES = ("x", "y", "z")
 
 

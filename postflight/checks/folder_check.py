@@ -168,7 +168,8 @@ def _facts(found: Sources) -> list[Fact]:
         some = np.isfinite(found.sun.az_el_head_rad).any(axis=(1, 2))
         tables.append(("sun", spec.sensors.sun.file, found.sun.time_s, np.where(some, 0.0, np.nan)[:, None]))
     for name, radar in found.radars.items():
-        tables.append((name, spec.radars[name].file, radar.time_s, radar.range_az_el))
+        measured = radar.range_az_el[:, np.isfinite(radar.range_az_el).any(axis=0)]
+        tables.append((name, spec.radars[name].file, radar.time_s, measured))
     for name, fixes in found.gnss.items():
         tables.append((name, spec.gnss[name].file, fixes.time_s, fixes.position_ecef_m))
     for name, barometer in found.barometers.items():

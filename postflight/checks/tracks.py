@@ -45,8 +45,9 @@ _MOST_HOURS = 24
 
 
 def tracks(found: Sources) -> dict[str, RadarRecord | GnssRecord]:
-    """Return radars and receivers by name."""
-    return {**found.radars, **found.gnss}
+    """Return radars and receivers that fix positions by themselves, by name."""
+    whole = {name: r for name, r in found.radars.items() if np.isfinite(r.range_az_el).all(axis=1).any()}
+    return {**whole, **found.gnss}
 
 
 def position_of(record: RadarRecord | GnssRecord) -> FloatArray:

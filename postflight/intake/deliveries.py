@@ -35,7 +35,10 @@ from flightmodel.aerodynamics import COLUMNS, named_columns
 from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, write_file, writing
 from flightmodel.config import read_toml
+from flightmodel.instruments import TriadSpec
+from flightmodel.rest import find_rest, readings
 from flightmodel.tables import to_si
+from flightmodel.telemetry import TriadRecord
 from flightmodel.vehicle import DATA, vehicle_path
 from postflight.intake.column_recognition import (
     ASKED,
@@ -564,7 +567,43 @@ def _proposals(
     listed = "".join(added)
     added += [_without_list(v, folder) for v in came.videos if v.place.relative_to(folder).as_posix() not in listed]
     start = start_text(taken, tables, unrecognised)
-    return "".join(f"\n{text}" for text in (*added, start) if text), shown
+    rest = "" if "start" in tables else _rest_text(shown)
+    return "".join(f"\n{text}" for text in (*added, start, rest) if text), shown
+
+
+def _rest_text(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> str:
+    """``[start]`` where accelerometer and gyros with known units and seconds begin with a rest; else nothing."""
+    records = {}
+    for table, found, _ in shown:
+        for source in found:
+            record = _triad_of(table, source)
+            if record is not None:
+                records[source.section] = record
+    if not {"sensors.accelerometer", "sensors.rates"} <= set(records):
+        return ""
+    both = records["sensors.accelerometer"], records["sensors.rates"]
+    span = find_rest(*both)
+    if span is None:
+        return ""
+    noise = [readings(record, span).noise_sd for record in both]
+    words = f"noise there, for the data sheets: {noise[0]:.2g} m/s2, {np.rad2deg(noise[1]):.2g} deg/s"
+    return f"[start]  # the data begin with a rest\nat_rest = [{span[0]:.2f}, {span[1]:.2f}]  # s; {words}\n"
+
+
+def _triad_of(table: FreeFormTable, source: SourceProposal) -> TriadRecord | None:
+    """Samples of a proposed triad, SI, its own axes; None where times or units are still open."""
+    time = source.time
+    known = time is not None and time.format == "seconds" and time.unit and not time.offset_asked
+    if not known or len(source.columns) != 3 or not all(m.unit for m in source.columns):
+        return None
+    assert time is not None
+    t = to_si(table.numbers(table.names.index(time.columns[0])), time.unit)
+    samples = np.column_stack([to_si(table.numbers(table.names.index(m.column)), m.unit) for m in source.columns])
+    rows = np.isfinite(t) & np.isfinite(samples).all(axis=1)
+    rows[rows] &= np.diff(np.maximum.accumulate(t[rows]), prepend=-np.inf) > 0.0
+    if rows.sum() < 2:
+        return None
+    return TriadRecord(TriadSpec(source.section, np.zeros(3), np.eye(3), 0.0, 0.0, 0.0, 0.0), t[rows], samples[rows])
 
 
 def _earlier_videos(folder: Path) -> list[Video]:

@@ -301,7 +301,7 @@ def _one_line(text: str) -> str:
 # the command
 
 
-def init(folder: Path, vehicle: str | None) -> None:
+def init(folder: Path, vehicle: str | None, no_vehicle: bool = False) -> None:
     """Write the forms of a new flight folder and print what comes next.
 
     Parameters
@@ -310,13 +310,15 @@ def init(folder: Path, vehicle: str | None) -> None:
         Made where it does not exist.
     vehicle : str or None
         Name of a shipped vehicle, path of a vehicle file (copied with its coefficient table), or None for a form.
+    no_vehicle : bool
+        Whether neither is written: a trajectory needs no vehicle.
 
     Raises
     ------
     ConfigError
         ``file-exists`` where a file would be overwritten, or what `flightmodel.vehicle` refuses.
     """
-    texts, copies = _contents(folder, vehicle)
+    texts, copies = _contents(folder, vehicle, no_vehicle)
     there = [path for path in (*texts, *copies) if path.exists()]
     if there:
         words = "exists already, and nothing is overwritten; name another folder"
@@ -334,11 +336,14 @@ def init(folder: Path, vehicle: str | None) -> None:
     console.print(following, highlight=False)
 
 
-def _contents(folder: Path, vehicle: str | None) -> tuple[dict[Path, str], dict[Path, Path]]:
+def _contents(folder: Path, vehicle: str | None, no_vehicle: bool) -> tuple[dict[Path, str], dict[Path, Path]]:
     """Texts to write and files to copy, by their paths."""
     flight = template("flight")
     texts = {folder / ".schema" / f"{kind}.json": schema_text(kind) for kind in ("flight", "vehicle")}
     copies: dict[Path, Path] = {}
+    if no_vehicle:
+        del texts[folder / ".schema" / "vehicle.json"]
+        return texts | {folder / "flight.toml": flight}, copies
     if vehicle is None:
         named = "vehicle/vehicle.toml"
         texts[folder / named] = template("vehicle")

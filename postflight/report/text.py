@@ -85,6 +85,9 @@ def lead(run: Run) -> list[str]:
     if oscillation:
         out.insert(0, oscillation)
     out.append(f"{s['verdicts_passed']} of {len(run.checks)} consistency checks pass.")
+    rests = s.get("rests_on") or []  # runs of before have none
+    if rests:
+        out.append(f"{rests[0][0].upper()}{'; '.join(rests)[1:]}.")
     changes = run.facts["settings"].get("changes")
     if changes:
         out.insert(0, f"A what-if, not the flight as its folder states it: {'; '.join(changes)}.")

@@ -435,3 +435,85 @@ def test_video_needs_a_vehicle(folder):
 def test_no_second_in_common_is_refused(folder):
     late = GNSS.replace('"gps.csv"', '"gps.csv"\ntime = { offset_s = 19.0 }')
     folder.refused([late, TRIADS, PRIOR], "no-common-time", "accelerometer", "rates", "receivers", kind=GateError)
+
+
+# the survey that trackers share
+
+
+def test_survey_and_places_are_read_in_si(folder):
+    sites = "[sites]\nsurvey_sd_m = 0.3\nheight_datum_sd_m = 0.5\nnorth_sd_deg = 0.01\n"
+    place = '[[places]]\nname = "pad"\nt_s = 1.5\nlatitude_deg = 33.0\nlongitude_deg = -106.0\nsd_m = 2.0\n'
+    prior = PRIOR + "latitude_deg = 32.9\nlongitude_deg = -106.9\n"
+    telemetry = folder.read(prior, GNSS, BALLISTIC, sites, place)
+    assert (telemetry.sites.survey_sd_m, telemetry.sites.height_datum_sd_m) == (0.3, 0.5)
+    assert telemetry.sites.north_sd_rad == pytest.approx(0.01 * DEG)
+    stated, pad = telemetry.places
+    assert (stated.name, stated.time_s, stated.sd_m) == ("attitude_prior", 0.0, 100.0)
+    assert (pad.name, pad.latitude_rad, pad.sd_m) == ("pad", pytest.approx(33.0 * DEG), 2.0)
+    assert np.isnan([stated.height_m, pad.height_m]).all()
+
+
+def test_no_tracker_is_called_as_all_sites_together(folder):
+    folder.refused([GNSS.replace("gnss.gps", "gnss.sites"), BALLISTIC], "name-twice", "sites")
+
+
+# on the pad
+
+
+def test_a_rest_is_read_and_stands_for_an_attitude(folder):
+    start = "[start]\nat_rest = [1.0, 3.0]\nazimuth_deg = 90.0\n"
+    telemetry = folder.read(GNSS, TRIADS, start)
+    assert telemetry.attitude_prior is None
+    assert telemetry.start.at_rest == (1.0, 3.0)
+    assert (telemetry.start.azimuth_rad, telemetry.start.azimuth_sd_rad) == pytest.approx((90.0 * DEG, 2.0 * DEG))
+
+
+def test_what_is_wrong_with_a_rest(folder):
+    folder.refused([GNSS, BALLISTIC, "[start]\nat_rest = [1.0, 3.0]\n"], "rest-without-inertial", "at_rest")
+    folder.refused([GNSS, TRIADS, PRIOR, "[start]\nat_rest = [3.0, 1.0]\n"], "keys-conflict", "at_rest")
+    folder.refused([GNSS, TRIADS, PRIOR, "[start]\nazimuth_deg = 10.0\n"], "keys-conflict", "at_rest")
+
+
+# trackers that measure a part of a position
+
+SITE = 'file = "site.csv"\nlatitude_deg = 32.5\nlongitude_deg = -107.0\nheight_m = 1200.0\n'
+
+
+def test_a_telescope_with_noise_of_its_own_and_a_doppler_station(folder):
+    az, el = 350.0 + T, 40.0 + T
+    folder.table("site.csv", "t_s,az_deg,el_deg,el_sd_deg", T, az, el, np.where(T > 5.0, 0.01, np.nan))
+    folder.table("doppler.csv", "t_s,rr", T, 1000.0 - 10.0 * T)
+    telescope = f'[radars.eye]\n{SITE}measures = ["az", "el"]\n'
+    doppler = f'[radars.ear]\n{SITE}measures = ["range_rate"]\n'.replace("site.csv", "doppler.csv")
+    columns = 'columns = { range_rate = { column = "rr", unit = "kmh" } }\n'
+    radars = folder.read(GNSS, BALLISTIC, telescope, doppler, columns).radars
+    eye, ear = radars["eye"], radars["ear"]
+    assert np.isnan(eye.range_az_el[:, 0]).all()
+    np.testing.assert_allclose(eye.range_az_el[:, 2], el * DEG)
+    assert eye.range_rate_mps is None
+    assert np.isnan(eye.sd[0]).all()
+    assert eye.sd[-1, 2] == pytest.approx(0.01 * DEG)
+    assert np.isnan(ear.range_az_el).all()
+    np.testing.assert_allclose(ear.range_rate_mps, (1000.0 - 10.0 * T) / 3.6)
+
+
+def test_what_is_wrong_with_a_part(folder):
+    folder.table("site.csv", "t_s,az_deg,el_deg,el_sd_deg", T, T, 40.0 + T, 0.0 * T)
+    eye = f"[radars.eye]\n{SITE}"
+    # a column that is not there is refused unless the file says that it is not measured
+    folder.refused([GNSS, BALLISTIC, eye], "table-column-missing", "range_m", kind=GateError)
+    folder.refused([GNSS, BALLISTIC, eye, 'measures = ["az", "el"]\n'], "value-range", "el_sd", kind=GateError)
+    folder.refused([GNSS, BALLISTIC, eye, "measures = []\n"], "key-value", "measures")
+
+
+def test_a_rest_with_a_large_bias_is_found(folder):
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 8.0, 0.05)
+    noise = 0.02 * rng.standard_normal((6, len(t)))
+    folder.table("imu.csv", "t_s,fx,fy,fz,wx,wy,wz", t, 9.8 + noise[0], *noise[1:3], 2.0 + noise[3], *noise[4:])
+    fixes = np.full(len(T), 1400.0)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m", T, LAT + 0 * T, LON + 0 * T, fixes)
+    telemetry = folder.read(GNSS, TRIADS, PRIOR)
+    assert "rest-found" in findings(telemetry, "start")
+    assert "bias-beyond-data-sheet" in findings(telemetry, "rates")
+    assert "rest-found" not in findings(folder.read(GNSS, TRIADS, "[start]\nat_rest = [0.5, 6.0]\n"), "start")

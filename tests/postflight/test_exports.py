@@ -1,6 +1,7 @@
 """`postflight export`: each file opened again by another program's reader, with the numbers of the run."""
 
 import builtins
+import json
 import shutil
 from pathlib import Path
 
@@ -201,3 +202,9 @@ def test_run_folders_stay_as_they_are(folder):
     with pytest.raises(ConfigError) as fault:
         exports.export(folder, "csv", folder / "runs" / "x.csv")
     assert fault.value.codes == ("export-into-run",)
+
+
+def test_summary_says_on_what_the_position_rests(folder):
+    (run,) = (folder / "runs").iterdir()
+    (line,) = json.loads((run / "summary.json").read_text())["rests_on"]
+    assert "receiver" in line

@@ -329,6 +329,22 @@ def test_recorded_flights_are_recognised_as_their_flight_file_has_them(name, fol
                 asked = got.get("columns", {}).get(short, column)
                 assert asked["column"] == column["column"], (key, short)
                 assert asked["unit"] in (column["unit"], "FILL IN"), (key, short)
+    # stands 4.5 s on its pad; the others burn, move or have no inertial unit
+    assert ("start" in found) == (name == "psas_l12")
+
+
+def test_a_rest_is_proposed(folder, tmp_path):
+    rng = np.random.default_rng(3)
+    t = np.arange(-6.0, 5.0, 0.02)
+    fires = t > 0.0
+    x = 9.8 + 0.05 * rng.standard_normal(len(t)) + 60.0 * fires
+    rest = 0.04 * rng.standard_normal((5, len(t))) * (1.0 + 5.0 * fires)
+    header = "t_s,ax_mps2,ay_mps2,az_mps2,gx_degps,gy_degps,gz_degps"
+    np.savetxt(tmp_path / "imu.csv", np.column_stack([t, x, *rest]), delimiter=",", header=header, comments="")
+    run("import", tmp_path / "imu.csv", "--into", folder)
+    start, end = tomllib.loads(text_of(folder))["start"]["at_rest"]
+    assert start == pytest.approx(-6.0, abs=0.01)
+    assert -1.1 < end <= -0.4
 
 
 def test_mangled_tables_are_read_or_refused_never_a_traceback(tmp_path):

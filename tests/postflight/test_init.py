@@ -24,6 +24,7 @@ TABLES = {
     "flight": {
         "": flightfolder.FlightFile,
         "attitude_prior": flightfolder.AttitudeEntry,
+        "start": flightfolder.StartEntry,
         "motion": flightfolder.MotionEntry,
         "motion.disturbed": flightfolder.UnmodelledEntry,
         "sensors.accelerometer": instruments.TriadEntry,
@@ -31,6 +32,8 @@ TABLES = {
         "sensors.magnetometer": instruments.MagnetometerEntry,
         "sensors.sun": instruments.SunEntry,
         "radars.NAME": instruments.RadarEntry,
+        "sites": instruments.SitesEntry,
+        "places": flightfolder.PlaceEntry,
         "gnss.NAME": instruments.GnssEntry,
         "barometers.NAME": instruments.BarometerEntry,
         "atmosphere": instruments.AtmosphereEntry,
@@ -120,6 +123,15 @@ def test_new_folder_says_what_is_still_to_fill_in(tmp_path):
     found = json.loads(run("check", tmp_path / "flight", "--json").stdout)
     assert len(found["fill_in"]) == left
     assert sum("[radars.NAME]" in words for words in found["refused"]) == 1
+
+
+def test_a_folder_for_the_trajectory_alone_has_no_vehicle(tmp_path):
+    made = run("init", tmp_path / "flight", "--no-vehicle")
+    assert made.exit_code == 0, made.output
+    assert not (tmp_path / "flight" / "vehicle").exists()
+    found = json.loads(run("check", tmp_path / "flight", "--json").stdout)
+    assert [w.split("'")[1] for w in found["fill_in"]] == ["name", "t0_utc"]
+    assert run("init", tmp_path / "other", "--no-vehicle", "--vehicle", "irve2_reference").exit_code == 2
 
 
 def test_filled_in_vehicle_form_is_a_vehicle(tmp_path):

@@ -268,7 +268,8 @@ def random_problem(seed, drivers=18, others=6, nodes=14, considered=(), prior=2.
     if drivers == 18:  # a start's attitude errs with the gyros that carried it
         p0[6:9, 18:27] = rng.normal(0.0, 0.02, (3, 9))
         p0[18:27, 6:9] = p0[6:9, 18:27].T
-    by_state, by_error = rng.normal(0.0, 1.0, (count, 3, 9)), rng.normal(0.0, 1.0, (count, 3, SLOTS))
+    by_state, by_error = rng.normal(0.0, 1.0, (count, 3, 9)), np.zeros((count, 3, SLOTS))
+    by_error[:, :, :13] = rng.normal(0.0, 1.0, (count, 3, 13))  # more than the slots that are taken
     offset = rng.normal(0.0, 1.0, (nodes, size))
     return Linear(
         Steps(transition, noise, decay, noise_var), wander, observed, slots, by_state, by_error,

@@ -168,6 +168,16 @@ class TestBlackBrant:
         """docs/known-limits.md says why."""
         assert red(fly("radar_36353")) <= {"whiteness B elevation"}
 
+    def test_refraction_is_possible_and_without_droop_it_is_not(self, fly):
+        """-0.38 +/- 0.08 of refraction, and no word, was what a pedestal that droops looked like."""
+        checks = {v.code: v for v in fly("radar_36353").consistency_checks}
+        assert checks["physical-range"].passed
+        stiff = fly("radar_36353", (r"(?m)^droop_sd_deg.*\n", ""))
+        check = next(v for v in stiff.consistency_checks if v.code == "physical-range")
+        assert not check.passed
+        assert (check.source, check.component) == ("B", "refraction")
+        assert "droop" in check.remark
+
     def test_points_between_are_foretold(self, fly):
         r = fly("radar_36353")
         coast = r.held_out[r.held_out.time_s.between(150.0, 500.0)]
@@ -235,6 +245,17 @@ class TestPsas:
         r = fly("psas_l12")
         assert np.rad2deg(sd_at(r, 0.0, ATTITUDE)) < 25.0
         assert np.rad2deg(sd_at(r, 20.0, ATTITUDE)) > 20.0
+
+    def test_it_stands_still_on_its_pad(self, fly):
+        """The rest that reading the flight proposes, stated: 1.4 m/s +/- 4 become a centimetre."""
+        loose = fly("psas_l12")
+        still = fly("psas_l12", (r"(?m)^\[attitude_prior\]", "[start]\nat_rest = [-4.53, -1.03]\n\n[attitude_prior]"))
+        assert not red(still)
+        on_pad = still.smoothed.time_s < -1.0
+        speed = np.linalg.norm(still.smoothed.velocity_ecef_mps, axis=1)
+        assert on_pad.sum() > 30
+        assert speed[on_pad].max() < 0.03
+        assert sd_at(still, -2.0, slice(3, 6)) < 0.02 < sd_at(loose, -2.0, slice(3, 6))
 
 
 class TestPiccard:

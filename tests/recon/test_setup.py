@@ -10,6 +10,7 @@ from flightmodel import instruments
 from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import GnssRecord, RadarRecord, TriadRecord
+from recon._measurement_kernels import RADAR
 from recon.propagation import inertial_motion
 from recon.reconstruct import bridge_inertial_sensors, reconstruct
 from recon.settings import Settings
@@ -156,13 +157,15 @@ def test_a_source_that_is_left_out_chooses_nothing(mini_sense, mini_truth):
 def test_only_stated_errors_become_states(mini_sense, mini_everything):
     plain, full = build(mini_sense(1)[0]), build(mini_everything(1), attitude_sensors=True)
     assert plain.model.size == 18 + 8
-    assert full.model.size == 18 + 2 + 2 * 13 + 4 + 4 + 12 + 4 * 5
+    # four that all sites share stand by where receiver or barometer can contradict them
+    assert full.model.size == 18 + 2 + 2 * 13 + 4 + 4 + 4 + 12 + 4 * 5
     assert full.model.names[:20] == [*plain.model.names[:18], "accelerometer time bias", "rates time bias"]
     for instrument in full.instruments:
         slots = instrument.slots(full.model)
         used = slots[slots >= 0]
         assert len(set(used)) == len(used) > 0
-        assert all(full.model.names[s].startswith(f"{instrument.owner} ") for s in used)
+        owners = (f"{instrument.owner} ", "sites ") if instrument.kind == RADAR else (f"{instrument.owner} ",)
+        assert all(full.model.names[s].startswith(owners) for s in used)
     everywhere = np.concatenate([i.slots(full.model) for i in full.instruments])
     assert set(everywhere[everywhere >= 0]) == set(range(20, full.model.size))
 
