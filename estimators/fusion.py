@@ -56,7 +56,7 @@ from estimators.evidence import (
 )
 from estimators.loads import FlightLoads
 from flightmodel.checks import DivergenceError, FloatArray
-from flightmodel.deflection import DeflectionHistory, history_from_lateral
+from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory, history_from_lateral
 
 KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its oscillation
 # a priori of the process's size, median and sd of its logarithm: a degree of swing at 2 Hz, between a degree at 0.5 Hz
@@ -73,6 +73,10 @@ _NEAR_S = 0.5  # an answer is given no further from a reading
 _BIAS_STEP_S, _FARTHEST_BIAS_SD = 0.01, 3.0
 MOVES = 1.75  # rms rate of the deflection over its sd; of noise alone it is 1
 _SMOOTH_RATE_HZ = 50.0
+# The vehicle's pitching drives the deflection at up to 0.35 of the joint's frequency (four synthetic flights, stiffness
+# 0.75 to 3 times the reference's), which twice as many readings resolve
+_READINGS_A_SWING = 0.8
+_LOCAL = 5  # readings about one, over which the swing's variance is taken
 Inputs = dict[str, FloatArray]
 Read = Callable[[Inputs, Deflection | None], list[Evidence]]
 
@@ -310,7 +314,7 @@ class FarInputsError(DivergenceError):
         self.input_posterior = input_posterior
 
 
-def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> Fused:
+def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None, near_s: float = _NEAR_S) -> Fused:
     """Fuse the methods' readings; one method alone is smoothed.
 
     Parameters
@@ -322,6 +326,8 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
         Name of the answer.
     at_s : (n,) float, optional
         Times of the answer, s; else those of the method with most samples.
+    near_s : float
+        An answer is given no further from a reading.
 
     Raises
     ------
@@ -365,6 +371,7 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
             input_posterior = InputPosterior(found[size:], covariance[size:, size:], problem.place)
             _check_inputs(new, input_posterior, method)
             times = max(readings, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
+            times = times[_apart_from_readings(times, readings) <= near_s]
             answer = problem.smoothed(input_posterior, method)
             return _posterior(answer, problem, input_posterior, readings, method, times)
         # whole Gauss-Newton steps first, then half steps, which cannot oscillate
@@ -377,10 +384,16 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     )
 
 
-def smoothed(history: DeflectionHistory, rate_hz: float = _SMOOTH_RATE_HZ) -> DeflectionHistory:
+def smoothed(
+    history: DeflectionHistory, rate_hz: float = _SMOOTH_RATE_HZ, swing_hz: float | None = None
+) -> DeflectionHistory:
     """One method's history as a smooth one, every ``1 / rate_hz`` s: the joint as a second-order process.
 
-    Its sd grows between readings and through short holes; further than `_NEAR_S` from a reading it has no answer.
+    Its sd grows between readings and through short holes. It has no answer further from a reading than `_NEAR_S`, or,
+    of sparse readings, than half of what `DeflectionHistory.at` takes for a hole.
+
+    Where readings are too sparse for the motion of a joint that swings at ``swing_hz``, its swing between them is in
+    the sd (`_unresolved_swing_var`).
 
     Raises
     ------
@@ -395,7 +408,31 @@ def smoothed(history: DeflectionHistory, rate_hz: float = _SMOOTH_RATE_HZ) -> De
         )
     first, last = np.ceil(known[0] * rate_hz), np.floor(known[-1] * rate_hz)
     one = evidence_of_history(history)
-    return fuse(lambda _inputs, _about: [one], history.method, np.arange(first, last + 1.0) / rate_hz).history
+    at_s, near_s = np.arange(first, last + 1.0) / rate_hz, 0.5 * HOLE_FACTOR * float(np.median(np.diff(known)))
+    out = fuse(lambda _inputs, _about: [one], history.method, at_s, max(near_s, _NEAR_S)).history
+    if swing_hz is None or float(np.median(np.diff(known))) * swing_hz * _READINGS_A_SWING <= 1.0:
+        return out
+    cov = out.lateral_cov_without_plane + _unresolved_swing_var(history, out, swing_hz)[:, None, None] * np.eye(2)
+    words = f"{out.assumptions}; fewer readings than its swing at {swing_hz:.1f} Hz needs, which is in the sd"
+    return history_from_lateral(out.time_s, out.theta_yz_rad, cov, out.method, words)
+
+
+def _unresolved_swing_var(readings: DeflectionHistory, at: DeflectionHistory, swing_hz: float) -> FloatArray:
+    """Variance ``(n,)`` of a swing between readings that do not follow it, rad^2.
+
+    A swing of variance ``v`` is off by ``2 v (1 - cos)`` of its phase since the nearest reading, up to ``2 v``. Its
+    variance is the readings' own about their local mean; at a multiple of their rate they would not show it, so that it
+    is at least that of a swing of any amplitude up to the level itself, which is a load's put on at once.
+    """
+    seen = np.isfinite(readings.theta_rad)
+    time_s, yz = readings.time_s[seen], readings.theta_yz_rad[seen]
+    off = np.sum((yz - uniform_filter1d(yz, _LOCAL, axis=0, mode="nearest")) ** 2, axis=1)
+    var = uniform_filter1d(off, _LOCAL, mode="nearest") * _LOCAL / (_LOCAL - 1.0)
+    level = uniform_filter1d(np.sum(yz**2, axis=1), _LOCAL, mode="nearest")
+    near = np.abs(at.time_s[:, None] - time_s[None, :]).min(axis=1)
+    share = 1.0 - np.cos(np.minimum(2.0 * np.pi * swing_hz * near, 0.5 * np.pi))
+    # a uniform amplitude's mean square is a third of its largest, a swing's variance half of its amplitude's square
+    return np.asarray(np.interp(at.time_s, time_s, np.maximum(var, level / 6.0)) * share)
 
 
 def _uncorrelated(one: Evidence) -> Evidence:
@@ -507,6 +544,13 @@ def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) 
             )
 
 
+def _apart_from_readings(time_s: FloatArray, readings: list[Evidence]) -> FloatArray:
+    """Distance (n,) of each time from the nearest reading of any method, s."""
+    read = np.sort(np.concatenate([e.time_s for e in readings]))
+    after = np.searchsorted(read, time_s).clip(1, len(read) - 1)
+    return np.asarray(np.minimum(np.abs(read[after] - time_s), np.abs(time_s - read[after - 1])))
+
+
 def _posterior(
     answer: tuple[FloatArray, FloatArray, float],
     problem: NormalEquations,
@@ -518,10 +562,6 @@ def _posterior(
     found, covariance, size_radps2 = answer
     spline = problem.spline
     size = 2 * spline.count
-    read = np.concatenate([e.time_s for e in readings])
-    read.sort()
-    after = np.searchsorted(read, t).clip(1, len(read) - 1)
-    t = t[np.minimum(np.abs(read[after] - t), np.abs(t - read[after - 1])) <= _NEAR_S]
     value = spline.rows(t)
     theta_yz = problem.history(found)(t)
     cov = np.zeros((len(t), 2, 2))

@@ -42,6 +42,8 @@ class Deflections(Tabular):
         Posterior of the deflection and of all inputs, and whether the methods agree.
     smooth_camera : DeflectionHistory or None
         The camera's alone as a second-order process, where it estimated the plane.
+    camera_frames : DataFrame or None
+        What became of every frame: `estimators.camera.FilmFit.frame_table`.
     bet : Reconstruction or None
         What they were made from; None where the camera answered without a trajectory.
     """
@@ -50,6 +52,7 @@ class Deflections(Tabular):
     refused: dict[str, Fault] = field(default_factory=dict)
     fused: FusedAnswer | None = None
     smooth_camera: DeflectionHistory | None = None
+    camera_frames: pd.DataFrame | None = field(default=None, compare=False)
     bet: Reconstruction | None = None
 
     @property
@@ -59,6 +62,12 @@ class Deflections(Tabular):
             reason = self.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))
             raise GateError([reason])
         return self.histories["fused"]
+
+    @property
+    def continuous(self) -> dict[str, DeflectionHistory]:
+        """Each method's answer at any time: of the camera, between whose frames the shell swings, the smooth one."""
+        smooth = {} if self.smooth_camera is None else {"camera": self.smooth_camera}
+        return self.histories | smooth
 
     @property
     def reference_s(self) -> float:
@@ -90,13 +99,14 @@ class Deflections(Tabular):
         rows: list[tuple[object, ...]] = []
         at_s = self.reference_s
         for method, history in self.histories.items():
-            theta, sd = np.rad2deg(history.at(at_s))
-            known = np.isfinite(history.theta_rad)
-            lateral = [np.interp(at_s, history.time_s[known], c[known]) for c in history.theta_yz_rad.T]
+            any_time = self.continuous[method]
+            theta, sd = np.rad2deg(any_time.at(at_s))
+            known = np.isfinite(any_time.theta_rad)
+            lateral = [np.interp(at_s, any_time.time_s[known], c[known]) for c in any_time.theta_yz_rad.T]
             k = int(np.nanargmax(history.theta_rad))
             plane = np.rad2deg(lv_clock(np.array(lateral))) if np.isfinite(theta) else np.nan
             largest = np.rad2deg(history.theta_rad[k]), history.time_s[k]
-            rows.append((method, at_s, theta, sd, plane, *largest, "", *np.rad2deg(quantiles_at(history, at_s))))
+            rows.append((method, at_s, theta, sd, plane, *largest, "", *np.rad2deg(quantiles_at(any_time, at_s))))
         nothing = [np.nan] * len(QUANTILE_COLUMNS)
         rows += [(method, at_s, *[np.nan] * 5, str(reason), *nothing) for method, reason in self.refused.items()]
         names = ("method", "t_s", "theta_deg", "theta_sd_deg", "plane_lv_deg", "largest_deg", "largest_t_s", "reason")
@@ -105,7 +115,7 @@ class Deflections(Tabular):
     def _about(self) -> str:
         shown = [
             f"{method} {np.rad2deg(theta):.2f} +/- {np.rad2deg(sd):.2f} deg"
-            for method, (theta, sd) in ((m, h.at(self.reference_s)) for m, h in self.histories.items())
+            for method, (theta, sd) in ((m, h.at(self.reference_s)) for m, h in self.continuous.items())
         ]
         return f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
 
@@ -194,7 +204,7 @@ def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress:
     report = progress or (lambda _fraction, _what: None)
     flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
     answers = Deflections(bet=bet)
-    fused, plain = None, None
+    fused, plain, frames = None, None, None
     for k, method in enumerate(methods):
         report(k / len(methods), f"deflection from {method}")
         try:
@@ -202,6 +212,7 @@ def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress:
                 film = camera_film(flight, _part(report, k, len(methods)))
                 # the fusion estimates the deflection at the benchmark itself: it takes the plain history
                 plain, history = film.history(), with_benchmark_deflection(film, flight, bet)
+                frames = film.frame_table(history)
             elif bet is None:
                 raise GateError(f"{method}: needs a trajectory", "trajectory-missing")
             elif method == "misalignment":
@@ -225,7 +236,8 @@ def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress:
         else:
             answers.refused[method] = Fault(f"no sample has an answer ({history.assumptions})", "no-answer")
     report(1.0, "estimated")
-    return replace(answers, fused=fused, smooth_camera=_smooth_camera(flight, answers.histories))
+    smooth = _smooth_camera(flight, answers.histories)
+    return replace(answers, fused=fused, smooth_camera=smooth, camera_frames=frames)
 
 
 def _part(report: Progress, number: int, parts: int) -> Progress:
@@ -237,8 +249,9 @@ def _smooth_camera(flight: Flight, histories: dict[str, DeflectionHistory]) -> D
     """The camera's history as a second-order process; None in an assumed plane, or where too few frames answered."""
     if "camera" not in histories or flight.camera_plane_lv_rad is not None:
         return None
+    swing = joint_swing(flight.telemetry.required_vehicle())
     try:
-        return smoothed(histories["camera"])
+        return smoothed(histories["camera"], swing_hz=None if swing is None else swing.frequency_hz)
     except DivergenceError:
         return None
 

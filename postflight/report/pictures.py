@@ -12,8 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
+from scipy.ndimage import maximum_filter1d
 
-from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row
+from estimators.overlay import GREY, YELLOW, Overlay, draw_outline, draw_row, horizon_row
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory, lv_direction
 from flightmodel.film import Image
@@ -21,8 +22,10 @@ from flightmodel.geometry import aft_profile, forward_profile, revolved, rim_cur
 from flightmodel.vehicle import Vehicle
 from postflight.plots.overlay import deflection_at, oriented_camera
 from postflight.report.source import Rows, Run, rounded
+from postflight.run_folder import answer_table
 
 _FRAMES, _WIDTH_PX, _DASH_PX = 12, 480, 12
+_WORST, _LEAST_NEIGHBOURS = 5, 2
 QUALITIES, LARGEST_CHARACTERS = (78, 60, 40, 20), 600_000  # the whole strip stays below, or has the last quality
 
 
@@ -62,6 +65,60 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
         out.append(frame)
         drawn.append(picture)
     return [frame | {"jpeg": text} for frame, text in zip(out, jpegs(drawn), strict=True)]
+
+
+def worst_frames(run: Run) -> list[dict[str, Any]]:
+    """Frames that an analyst looks at first, with the outline of the virtual camera's shell; empty without a film.
+
+    The outline is drawn at a used frame's own answer (yellow), at its neighbours' where it was refused (grey).
+    """
+    table, frames = run.tables.get("camera_frames"), run.telemetry.frames
+    if table is None or frames is None:
+        return []
+    theta, plane = (np.deg2rad(table[name].to_numpy(float)) for name in ("theta_deg", "plane_lv_deg"))
+    history = DeflectionHistory(frames.time_s, theta, plane, None, "camera", "")
+    oriented, _ = oriented_camera(run.telemetry, history)
+    used = np.isfinite(theta)
+    out, drawn = [], []
+    for k in worst_first(table)[:_WORST]:
+        row, image = table.iloc[k], frames.picture(k)
+        if image.size == 0:
+            picture = np.zeros((frames.camera.height_px, frames.camera.width_px, 3), dtype=np.uint8)
+        else:
+            picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
+            yz = [float(np.interp(table["t_s"][k], table["t_s"][used], c[used])) for c in history.theta_yz_rad.T]
+            draw_outline(picture, oriented.view, np.array(yz), YELLOW if used[k] else GREY)
+        drawn.append(picture)
+        numbers = {"t": float(row["t_s"]), "theta": row["theta_deg"], "sd": row["theta_sd_deg"]}
+        out.append(numbers | {name: row[name] for name in ("edge_points", "features", "residual_rms_px")})
+        out[-1] |= {"refused": "" if used[k] else f"{row['reason']} [{row['code']}]"}
+    return [frame | {"jpeg": text} for frame, text in zip(out, jpegs(drawn), strict=True)]
+
+
+def worst_first(table: pd.DataFrame) -> list[int]:
+    """Rows of ``camera_frames.csv``: refused frames, one of each code first, and used ones, the largest first.
+
+    Large is a residual against the film's median one, or a distance from the line between the neighbours, over its sd
+    and the film's median one where that is larger.
+    Of the first five, at least two are used ones where there are as many.
+    """
+    refused = table["flag"] == "refused"
+    again = table[refused].groupby("code").cumcount().sort_values(kind="stable")
+    bad = again.index.tolist()
+    used = table[~refused]
+    size = used["residual_rms_px"] / max(used["residual_rms_px"].median(), 1e-9)
+    if len(used) > _LEAST_NEIGHBOURS:
+        yz = lv_direction(np.deg2rad(used["plane_lv_deg"].to_numpy()))[:, 1:] * used["theta_deg"].to_numpy()[:, None]
+        t = used["t_s"].to_numpy()
+        share = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]
+        off = np.linalg.norm(yz[1:-1] - (1.0 - share) * yz[:-2] - share * yz[2:], axis=1)
+        off = np.concatenate([[0.0], off, [0.0]]) / used["theta_sd_deg"].to_numpy()
+        # the neighbours of a step are off the line as well, by half of it
+        steps = np.where(off >= maximum_filter1d(off, 3), off, 0.0)
+        size = np.maximum(size, steps / max(float(np.median(off)), 1.0))
+    good = size.sort_values(ascending=False, kind="stable").index.tolist()
+    first = min(len(bad), max(_WORST - 2, _WORST - len(good)))
+    return [*bad[:first], *good, *bad[first:]]
 
 
 def _dashed_row(picture: Image, row: int) -> Image:
@@ -163,7 +220,7 @@ def poses(run: Run, rows: Rows) -> dict[str, Any]:
     }
     method = best_method(run)
     if method is not None:
-        table = _thinned(run.tables[f"deflection_{method}"])
+        table = _thinned(run.tables[answer_table(method, run.tables)])
         t = table["t_s"].to_numpy()
         out["deflection"] = {"t": rounded(t, 3), "method": method, "hole": hole_s(t)}
         out["deflection"] |= _lateral(table["theta_deg"], table["plane_lv_deg"])
