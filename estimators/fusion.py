@@ -46,7 +46,6 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 
 from estimators.evidence import (
-    CAMERA_TIME_BIAS,
     LIGHT_TIME_S,
     Deflection,
     Evidence,
@@ -173,6 +172,13 @@ class NormalEquations:
         across = by_input @ inputs.covariance
         covariance = np.block([[own + across @ by_input.T, across], [across.T, inputs.covariance]])
         return np.concatenate([own @ given.right, inputs.mean]), covariance, size_radps2
+
+    def without_inputs(self) -> NormalEquations:
+        """Equations of the deflection alone, the inputs being anything that their priors allow."""
+        gain = cho_solve(cho_factor(self.inputs), self.across.T).T
+        return replace(
+            self, deflection=self.deflection - gain @ self.across.T, right=self.right - gain @ self.right_inputs
+        )
 
     def process_size(self) -> float:
         """Most probable size of the process, rad/s^2, of the deflection's block alone."""
@@ -314,7 +320,14 @@ class FarInputsError(DivergenceError):
         self.input_posterior = input_posterior
 
 
-def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None, near_s: float = _NEAR_S) -> Fused:
+def fuse(
+    read: Read,
+    method: str = "fused",
+    at_s: FloatArray | None = None,
+    near_s: float = _NEAR_S,
+    *,
+    free_process: bool = True,
+) -> Fused:
     """Fuse the methods' readings; one method alone is smoothed.
 
     Parameters
@@ -328,6 +341,9 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None, near
         Times of the answer, s; else those of the method with most samples.
     near_s : float
         An answer is given no further from a reading.
+    free_process : bool
+        False gives the process, of its most probable size, a say in the inputs: those of several films are the films'
+        own errors, and the deflection does not step where one film ends. How far these are off is then not limited.
 
     Raises
     ------
@@ -347,7 +363,7 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None, near
     span = _span(readings)
     alone = [_uncorrelated(moved_evidence(e, inputs)) for e in readings]
     problem = NormalEquations.of(alone, {}, span)
-    found = problem.mean(problem.process_size(), method)
+    found, size_radps2 = problem.mean(problem.process_size(), method), _FREE_RADPS2
     for step in range(MOST_STEPS):
         readings = [e for e in read(inputs, problem.history(found)) if e.method in methods]
         if min(np.isfinite(e.theta_yz_rad).all(axis=1).sum() for e in readings) < LEAST_SAMPLES:
@@ -356,23 +372,25 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None, near
                 code="fusion-not-converged",
             )
         problem, before = NormalEquations.of(readings, inputs, span), found
-        found, covariance = problem.solved(_FREE_RADPS2, method)
+        if not free_process and step < _WHOLE_STEPS:  # then held: its own small changes would go on moving the inputs
+            size_radps2 = problem.without_inputs().process_size()
+        found, covariance = problem.solved(size_radps2, method)
         size = 2 * problem.spline.count
         new = {name: found[size:][place] for name, place in problem.place.items()}
         sd = np.sqrt(np.diag(covariance))
         moved = float((np.abs(found[:size] - before[:size]) / sd[:size]).max())
-        if CAMERA_TIME_BIAS in new:
-            bias = (
-                np.abs(new[CAMERA_TIME_BIAS] - inputs.get(CAMERA_TIME_BIAS, 0.0))
-                / sd[size:][problem.place[CAMERA_TIME_BIAS]]
-            )
+        for name in {e.time_bias for e in readings} & new.keys():
+            bias = np.abs(new[name] - inputs.get(name, 0.0)) / sd[size:][problem.place[name]]
             moved = max(moved, float(bias.max()))
         if moved < SETTLED_SD and step > 0:
             input_posterior = InputPosterior(found[size:], covariance[size:, size:], problem.place)
-            _check_inputs(new, input_posterior, method)
+            if free_process:
+                _check_inputs(new, input_posterior, method)
             times = max(readings, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
             times = times[_apart_from_readings(times, readings) <= near_s]
-            answer = problem.smoothed(input_posterior, method)
+            answer = (found, covariance, size_radps2)
+            if free_process:
+                answer = problem.smoothed(input_posterior, method)
             return _posterior(answer, problem, input_posterior, readings, method, times)
         # whole Gauss-Newton steps first, then half steps, which cannot oscillate
         part = 1.0 if step < _WHOLE_STEPS else 0.5
@@ -410,11 +428,18 @@ def smoothed(
     one = evidence_of_history(history)
     at_s, near_s = np.arange(first, last + 1.0) / rate_hz, 0.5 * HOLE_FACTOR * float(np.median(np.diff(known)))
     out = fuse(lambda _inputs, _about: [one], history.method, at_s, max(near_s, _NEAR_S)).history
-    if swing_hz is None or float(np.median(np.diff(known))) * swing_hz * _READINGS_A_SWING <= 1.0:
-        return out
-    cov = out.lateral_cov_without_plane + _unresolved_swing_var(history, out, swing_hz)[:, None, None] * np.eye(2)
-    words = f"{out.assumptions}; fewer readings than its swing at {swing_hz:.1f} Hz needs, which is in the sd"
-    return history_from_lateral(out.time_s, out.theta_yz_rad, cov, out.method, words)
+    return out if swing_hz is None else with_unresolved_swing(history, out, swing_hz)
+
+
+def with_unresolved_swing(readings: DeflectionHistory, smooth: DeflectionHistory, swing_hz: float) -> DeflectionHistory:
+    """Smooth history of readings with the swing in its sd that they are too sparse to follow; as it is elsewhere."""
+    known = readings.time_s[np.isfinite(readings.theta_rad)]
+    if float(np.median(np.diff(known))) * swing_hz * _READINGS_A_SWING <= 1.0:
+        return smooth
+    var = _unresolved_swing_var(readings, smooth, swing_hz)
+    cov = smooth.lateral_cov_without_plane + var[:, None, None] * np.eye(2)
+    words = f"{smooth.assumptions}; fewer readings than its swing at {swing_hz:.1f} Hz needs, which is in the sd"
+    return history_from_lateral(smooth.time_s, smooth.theta_yz_rad, cov, smooth.method, words)
 
 
 def _unresolved_swing_var(readings: DeflectionHistory, at: DeflectionHistory, swing_hz: float) -> FloatArray:
@@ -480,15 +505,21 @@ def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
     off, own = [e for e in readings if e.time_bias_sd_s > 0.0], [e for e in readings if e.time_bias_sd_s == 0.0]
     if not off or not own:
         return {}
-    one, span = off[0], _span(own)
+    span = _span(own)
     problem = NormalEquations.of([_uncorrelated(e) for e in own], {}, span)
     deflection = problem.history(problem.mean(problem.process_size(), method))
+    starts = {one.time_bias: _lowest_bias_sd(one, deflection, span) for one in off}
+    return {name: np.array([bias_sd]) for name, bias_sd in starts.items() if bias_sd is not None}
+
+
+def _lowest_bias_sd(one: Evidence, deflection: Deflection, span: tuple[float, float]) -> float | None:
+    """Time bias of readings at the lowest sum of squares against a deflection, in its sd; None with too few."""
     reach = _FARTHEST_BIAS_SD * one.time_bias_sd_s
     late_s = np.arange(-np.ceil(reach / _BIAS_STEP_S), np.ceil(reach / _BIAS_STEP_S) + 1.0) * _BIAS_STEP_S
     inside = (one.time_s > span[0] + reach) & (one.time_s < span[1] - reach) & np.isfinite(one.theta_yz_rad[:, 0])
     time_s, read = one.time_s[inside], one.theta_yz_rad[inside]
     if len(time_s) < LEAST_SAMPLES:
-        return {}
+        return None
     window = max(3, round(LIGHT_TIME_S / float(np.median(np.diff(time_s)))))
     square = np.empty(len(late_s))
     for k, late in enumerate(late_s):
@@ -496,7 +527,7 @@ def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
         square[k] = np.sum((off_rad - uniform_filter1d(off_rad, window, axis=0, mode="nearest")) ** 2)
     variance = float(square.min()) / (2.0 * len(time_s)) + LEFT_OUT_RAD**2
     best = int(np.argmin(square / variance + (late_s / one.time_bias_sd_s) ** 2))
-    return {CAMERA_TIME_BIAS: np.array([late_s[best] / one.time_bias_sd_s])}
+    return float(late_s[best] / one.time_bias_sd_s)
 
 
 def loads_reader(

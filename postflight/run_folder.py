@@ -30,7 +30,8 @@ from flightmodel import events
 from flightmodel.checks import FloatArray, GateError, writing
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
-from postflight.deflections import NO_VIDEO, Deflections, quantiles_at
+from postflight.deflections import Deflections, quantiles_at
+from postflight.filming import NO_VIDEO
 from postflight.reconstruction import Reconstruction, bet_table
 
 DIGITS = "%.10g"
@@ -260,8 +261,10 @@ def write_answers(run: RunFolder, answers: Deflections) -> None:
         run.write_csv(f"deflection_{method}.csv", history.to_frame())
     if answers.smooth_camera is not None:
         run.write_csv(f"{_SMOOTH_CAMERA}.csv", answers.smooth_camera.to_frame())
-    if answers.camera_frames is not None:
-        run.write_csv("camera_frames.csv", answers.camera_frames)
+    if answers.camera is not None:
+        run.write_csv("camera_frames.csv", answers.camera.frames)
+        if answers.camera.joined is not None:
+            run.write_csv("cameras.csv", answers.camera.joined.to_frame())
     if answers.fused is not None:
         run.write_csv("fusion_inputs.csv", answers.fused.input_frame())
         run.write_csv("fusion_agreement.csv", answers.fused.agreement_frame())

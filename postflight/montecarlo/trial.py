@@ -82,7 +82,7 @@ def whole_trial(plan: Plan, seed: int, run: int) -> dict[str, float]:
     nominal = plan.scenario.vehicle
     case = dispersed_case(plan.scenario, plan.dispersions, draws(plan.dispersions, seed, run))
     flown = replace(case.vehicle, aero=nominal.aero.scaled(*case.scales))
-    spec = case.scenario.spec.model_copy(update={"video": None})
+    spec = case.scenario.spec.model_copy(update={"video": None, "videos": {}})
     scenario = replace(case.scenario, spec=spec, vehicle=flown)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "flight"

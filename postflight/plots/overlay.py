@@ -22,6 +22,7 @@ from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Image, film_frames
 from flightmodel.telemetry import Telemetry
+from postflight.filming import with_largest
 
 _RESOLVED_RAD = 1e-4  # less than a fit resolves: the benchmark frame where it was taken as undeflected
 _BETWEEN_PX = 12  # of white between two frames side by side
@@ -45,6 +46,7 @@ def oriented_camera(telemetry: Telemetry, history: DeflectionHistory) -> tuple[O
 
 def benchmark_and_largest(telemetry: Telemetry, history: DeflectionHistory) -> tuple[Image, str]:
     """Benchmark frame and frame of the largest deflection side by side (h, w, 3), and the caption."""
+    telemetry, history = with_largest(telemetry, history)
     video = telemetry.frames
     assert video is not None
     oriented, benchmark = oriented_camera(telemetry, history)

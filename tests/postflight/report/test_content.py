@@ -56,9 +56,9 @@ def test_a_plane_between_sparse_answers_errs_as_it_says():
 
 def frames_table(rms: list[float], theta: list[float], refused: dict[int, str]) -> pd.DataFrame:
     n = len(rms)
-    columns = {"t_s": np.arange(n) * 0.5, "edge_points": 300, "features": 100.0, "residual_rms_px": rms,
-               "flag": "used", "code": "", "reason": "", "theta_deg": theta, "theta_sd_deg": 0.1,
-               "plane_lv_deg": 30.0, "plane_sd_deg": 1.0}  # fmt: skip
+    columns = {"camera": "camera5", "t_s": np.arange(n) * 0.5, "edge_points": 300, "features": 100.0,
+               "residual_rms_px": rms, "flag": "used", "code": "", "reason": "", "theta_deg": theta,
+               "theta_sd_deg": 0.1, "plane_lv_deg": 30.0, "plane_sd_deg": 1.0}  # fmt: skip
     table = pd.DataFrame(columns)
     for k, code in refused.items():
         table.loc[k, ["flag", "code", "reason"]] = "refused", code, "words"
