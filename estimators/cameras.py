@@ -11,7 +11,7 @@ the axis (with the plane's normal ``P_c``), and ``e_c`` half a constant bias, wh
 readings' sd does (focal length, joint), half Gauss-Markov with the light. The process has a say in these errors: what a
 switch would show as a step is a difference of two cameras' biases, as far as their sd allow. The benchmark frames'
 deflections share their static part; what is left is the joint's oscillation, common to cameras with the same benchmark
-time.
+time. A benchmark frame that others saw deflected has that much of an a priori sd: they determine it.
 
 Two cameras are tested by the difference of their readings where both look (`estimators.agreement`), and each by how far
 it is off the others where it may be off by any constant, which a switch tests too. Where a test fails, each camera is
@@ -52,6 +52,7 @@ from flightmodel.deflection import DeflectionHistory, history_from_lateral
 # of the variance of the benchmark's deflection: 0.06 deg statically of 0.12 deg in all (`camera_fit.AprioriSd`)
 STATIC_PART = 0.25
 _RATE_HZ = 50.0
+_ABOUT_S = 1.0  # about a benchmark: a switch leaves a frame or two out
 _LEAST_INFORMATION = 0.05  # of a direction of a camera's biases, for it to be tested
 _BENCHMARK, _OFFSET = "benchmark frames' deflection", "offset of one camera"
 _ANY_OFFSET_RAD = float(np.deg2rad(20.0))  # sd of an offset about which nothing is known: larger than any deflection
@@ -235,7 +236,7 @@ def join_cameras(cameras: list[CameraReadings], swing_hz: float | None = None) -
     DivergenceError
         Where there are too few readings, or their time biases do not settle.
     """
-    enough = [one for one in cameras if one.frames >= LEAST_SAMPLES]
+    enough = _with_loaded_benchmarks([one for one in cameras if one.frames >= LEAST_SAMPLES])
     fused, tests = _joined(enough, 1.0)
     left_out, wider, used = None, 1.0, enough
     if not all(test.passed for test in tests):
@@ -258,6 +259,29 @@ def join_cameras(cameras: list[CameraReadings], swing_hz: float | None = None) -
     if swing_hz is not None:
         smooth = with_unresolved_swing(at_frames, smooth, swing_hz)
     return JoinedCameras(at_frames, smooth, tuple(tests), left_out, wider, fused, tuple(enough))
+
+
+def _with_loaded_benchmarks(cameras: list[CameraReadings]) -> list[CameraReadings]:
+    """Cameras whose undetermined benchmark may be deflected by as much as cameras with earlier ones read about then.
+
+    The a priori sd holds before the load; a camera that was switched on later has no such frame. The smallest of
+    several readings counts: one camera that errs must not set the others free.
+    """
+    out = []
+    for one in cameras:
+        at, sizes = one.read.benchmark_s, [np.inf]
+        for other in cameras:
+            time_s = other.read.time_s[_known(other)]
+            if other.read.benchmark_s < at and np.abs(time_s - at).min() < _ABOUT_S:
+                k = int(np.abs(time_s - at).argmin())
+                sizes.append(float(np.linalg.norm(other.read.theta_yz_rad[_known(other)][k])))
+        sd = np.sqrt(0.5 * np.trace(one.benchmark.covariance))
+        if one.benchmark.with_readings is None and sd < min(sizes) < np.inf:
+            start = replace(one.benchmark, covariance=min(sizes) ** 2 * np.eye(2))
+            out.append(replace(one, benchmark=start))
+        else:
+            out.append(one)
+    return out
 
 
 def _known(one: CameraReadings) -> FloatArray:
