@@ -21,6 +21,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,6 +40,9 @@ from flightmodel.deflection import (
 from flightmodel.film import read_image
 from flightmodel.geometry import ShellGeometry
 from flightmodel.vehicle import CameraMount
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _MOST = 0.5  # of the answered frames
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
@@ -132,6 +136,34 @@ class FilmFit:
         if self.plane_lv_rad is not None:
             plane[:] = self.plane_lv_rad
         return DeflectionHistory(self.time_s, theta, plane, covariance, "camera", self._remark(None))
+
+    def frame_table(self, history: DeflectionHistory) -> pd.DataFrame:
+        """What became of every frame; ``history`` is the film's, with its answers.
+
+        Returns
+        -------
+        DataFrame
+            ``t_s, edge_points, features, residual_rms_px, flag`` (``used`` or ``refused``), ``code, reason, theta_deg,
+            theta_sd_deg, plane_lv_deg, plane_sd_deg``; of a refused frame no more than its edge points.
+        """
+        import pandas as pd
+
+        assert history.covariance is not None
+        plane_sd = np.sqrt(history.covariance[:, 1, 1])
+        angles = (history.theta_rad, history.theta_sd_rad, history.plane_lv_rad, plane_sd)
+        used = np.array([not fit.refused for fit in self.fits])
+        columns = {
+            "t_s": self.time_s,
+            "edge_points": [len(fit.horizon.points_px) for fit in self.fits],
+            "features": pd.array([fit.features if not fit.refused else None for fit in self.fits], dtype="Int64"),
+            "residual_rms_px": [fit.residual_rms_px for fit in self.fits],
+            "flag": np.where(used, "used", "refused"),
+            "code": [fit.refused.code if fit.refused else "" for fit in self.fits],
+            "reason": [str(fit.refused) for fit in self.fits],
+        }
+        names = ("theta_deg", "theta_sd_deg", "plane_lv_deg", "plane_sd_deg")
+        given = {name: np.rad2deg(np.where(used, x, np.nan)) for name, x in zip(names, angles, strict=True)}
+        return pd.DataFrame(columns | given)
 
     @property
     def _kind_of_features(self) -> str:

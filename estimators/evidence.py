@@ -101,6 +101,8 @@ class Evidence:
         Half the second derivative of the reading by its most uncertain input, rad; None: negligible.
     time_bias_sd_s : float
         A priori sd of the time bias of ``time_s`` against the gyros' time tags, s; zero: the same clock.
+    time_bias : str
+        Name of that input: films of several cameras have one each.
     """
 
     method: str
@@ -113,6 +115,7 @@ class Evidence:
     averaged_s: float
     half_curvature_rad: FloatArray | None = None
     time_bias_sd_s: float = 0.0
+    time_bias: str = CAMERA_TIME_BIAS
 
     @property
     def mean_yz_rad(self) -> FloatArray:
@@ -357,15 +360,27 @@ def evidence_of_history(history: DeflectionHistory, time_bias_sd_s: float = 0.0,
     cov = history.lateral_cov
     known = np.isfinite(history.theta_rad) & np.isfinite(cov[:, 0, 0])
     time_s, theta_yz, cov = history.time_s[known], history.theta_yz_rad[known], cov[known]
+    return evidence_of_readings(history.method, time_s, theta_yz, cov, time_bias_sd_s, plane_sd_rad)
+
+
+def evidence_of_readings(
+    method: str,
+    time_s: FloatArray,
+    theta_yz: FloatArray,
+    cov: FloatArray,
+    time_bias_sd_s: float = 0.0,
+    plane_sd_rad: float = 0.0,
+) -> Evidence:
+    """Evidence from lateral vectors ``(n, 2)``, rad, and their covariance ``(n, 2, 2)``; as `evidence_of_history`."""
     value, axes = np.linalg.eigh(cov)
     # symmetric square root: smooth in time whatever the order of the eigenvalues
     root = (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
-    inputs = {history.method: _rolled(root, correlation_root(time_s, LIGHT_TIME_S, CONSTANT_PART))}
+    inputs = {method: _rolled(root, correlation_root(time_s, LIGHT_TIME_S, CONSTANT_PART))}
     if plane_sd_rad > 0.0:
         normal = np.stack([-theta_yz[:, 1], theta_yz[:, 0]], axis=-1)
         inputs[CAMERA_PLANE] = plane_sd_rad * normal[:, :, None]
     return Evidence(
-        history.method,
+        method,
         time_s,
         theta_yz,
         np.zeros_like(cov),
@@ -383,16 +398,16 @@ def moved_evidence(one: Evidence, inputs: dict[str, FloatArray], about: Deflecti
     With a time bias ``b`` the reading tagged ``t`` is ``theta(t - b)``: its times are moved, and the rest of the bias
     enters by the rate of the deflection ``about`` (from times to lateral vectors) at those.
     """
-    linear = {name: j for name, j in one.by_input.items() if name != CAMERA_TIME_BIAS}
+    linear = {name: j for name, j in one.by_input.items() if name != one.time_bias}
     change = sum((j @ inputs[name] for name, j in linear.items() if name in inputs), np.zeros(2))
     moved = replace(one, theta_yz_rad=one.theta_yz_rad + change)
     if one.time_bias_sd_s == 0.0:
         return moved
-    time_s = one.time_s - one.time_bias_sd_s * float(inputs.get(CAMERA_TIME_BIAS, np.zeros(1))[0])
+    time_s = one.time_s - one.time_bias_sd_s * float(inputs.get(one.time_bias, np.zeros(1))[0])
     if about is None:
         return replace(moved, time_s=time_s)
     response = one.time_bias_sd_s * about(time_s, 1)[:, :, None]
-    return replace(moved, time_s=time_s, by_input=linear | {CAMERA_TIME_BIAS: response})
+    return replace(moved, time_s=time_s, by_input=linear | {one.time_bias: response})
 
 
 def history_of_evidence(evidence: Evidence, loads: FlightLoads, assumptions: str) -> DeflectionHistory:

@@ -46,7 +46,6 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 
 from estimators.evidence import (
-    CAMERA_TIME_BIAS,
     LIGHT_TIME_S,
     Deflection,
     Evidence,
@@ -56,7 +55,7 @@ from estimators.evidence import (
 )
 from estimators.loads import FlightLoads
 from flightmodel.checks import DivergenceError, FloatArray
-from flightmodel.deflection import DeflectionHistory, history_from_lateral
+from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory, history_from_lateral
 
 KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its oscillation
 # a priori of the process's size, median and sd of its logarithm: a degree of swing at 2 Hz, between a degree at 0.5 Hz
@@ -73,6 +72,10 @@ _NEAR_S = 0.5  # an answer is given no further from a reading
 _BIAS_STEP_S, _FARTHEST_BIAS_SD = 0.01, 3.0
 MOVES = 1.75  # rms rate of the deflection over its sd; of noise alone it is 1
 _SMOOTH_RATE_HZ = 50.0
+# The vehicle's pitching drives the deflection at up to 0.35 of the joint's frequency (four synthetic flights, stiffness
+# 0.75 to 3 times the reference's), which twice as many readings resolve
+_READINGS_A_SWING = 0.8
+_LOCAL = 5  # readings about one, over which the swing's variance is taken
 Inputs = dict[str, FloatArray]
 Read = Callable[[Inputs, Deflection | None], list[Evidence]]
 
@@ -169,6 +172,13 @@ class NormalEquations:
         across = by_input @ inputs.covariance
         covariance = np.block([[own + across @ by_input.T, across], [across.T, inputs.covariance]])
         return np.concatenate([own @ given.right, inputs.mean]), covariance, size_radps2
+
+    def without_inputs(self) -> NormalEquations:
+        """Equations of the deflection alone, the inputs being anything that their priors allow."""
+        gain = cho_solve(cho_factor(self.inputs), self.across.T).T
+        return replace(
+            self, deflection=self.deflection - gain @ self.across.T, right=self.right - gain @ self.right_inputs
+        )
 
     def process_size(self) -> float:
         """Most probable size of the process, rad/s^2, of the deflection's block alone."""
@@ -310,7 +320,14 @@ class FarInputsError(DivergenceError):
         self.input_posterior = input_posterior
 
 
-def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> Fused:
+def fuse(
+    read: Read,
+    method: str = "fused",
+    at_s: FloatArray | None = None,
+    near_s: float = _NEAR_S,
+    *,
+    free_process: bool = True,
+) -> Fused:
     """Fuse the methods' readings; one method alone is smoothed.
 
     Parameters
@@ -322,6 +339,11 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
         Name of the answer.
     at_s : (n,) float, optional
         Times of the answer, s; else those of the method with most samples.
+    near_s : float
+        An answer is given no further from a reading.
+    free_process : bool
+        False gives the process, of its most probable size, a say in the inputs: those of several films are the films'
+        own errors, and the deflection does not step where one film ends. How far these are off is then not limited.
 
     Raises
     ------
@@ -341,7 +363,7 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     span = _span(readings)
     alone = [_uncorrelated(moved_evidence(e, inputs)) for e in readings]
     problem = NormalEquations.of(alone, {}, span)
-    found = problem.mean(problem.process_size(), method)
+    found, size_radps2 = problem.mean(problem.process_size(), method), _FREE_RADPS2
     for step in range(MOST_STEPS):
         readings = [e for e in read(inputs, problem.history(found)) if e.method in methods]
         if min(np.isfinite(e.theta_yz_rad).all(axis=1).sum() for e in readings) < LEAST_SAMPLES:
@@ -350,22 +372,25 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
                 code="fusion-not-converged",
             )
         problem, before = NormalEquations.of(readings, inputs, span), found
-        found, covariance = problem.solved(_FREE_RADPS2, method)
+        if not free_process and step < _WHOLE_STEPS:  # then held: its own small changes would go on moving the inputs
+            size_radps2 = problem.without_inputs().process_size()
+        found, covariance = problem.solved(size_radps2, method)
         size = 2 * problem.spline.count
         new = {name: found[size:][place] for name, place in problem.place.items()}
         sd = np.sqrt(np.diag(covariance))
         moved = float((np.abs(found[:size] - before[:size]) / sd[:size]).max())
-        if CAMERA_TIME_BIAS in new:
-            bias = (
-                np.abs(new[CAMERA_TIME_BIAS] - inputs.get(CAMERA_TIME_BIAS, 0.0))
-                / sd[size:][problem.place[CAMERA_TIME_BIAS]]
-            )
+        for name in {e.time_bias for e in readings} & new.keys():
+            bias = np.abs(new[name] - inputs.get(name, 0.0)) / sd[size:][problem.place[name]]
             moved = max(moved, float(bias.max()))
         if moved < SETTLED_SD and step > 0:
             input_posterior = InputPosterior(found[size:], covariance[size:, size:], problem.place)
-            _check_inputs(new, input_posterior, method)
+            if free_process:
+                _check_inputs(new, input_posterior, method)
             times = max(readings, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
-            answer = problem.smoothed(input_posterior, method)
+            times = times[_apart_from_readings(times, readings) <= near_s]
+            answer = (found, covariance, size_radps2)
+            if free_process:
+                answer = problem.smoothed(input_posterior, method)
             return _posterior(answer, problem, input_posterior, readings, method, times)
         # whole Gauss-Newton steps first, then half steps, which cannot oscillate
         part = 1.0 if step < _WHOLE_STEPS else 0.5
@@ -377,10 +402,16 @@ def fuse(read: Read, method: str = "fused", at_s: FloatArray | None = None) -> F
     )
 
 
-def smoothed(history: DeflectionHistory, rate_hz: float = _SMOOTH_RATE_HZ) -> DeflectionHistory:
+def smoothed(
+    history: DeflectionHistory, rate_hz: float = _SMOOTH_RATE_HZ, swing_hz: float | None = None
+) -> DeflectionHistory:
     """One method's history as a smooth one, every ``1 / rate_hz`` s: the joint as a second-order process.
 
-    Its sd grows between readings and through short holes; further than `_NEAR_S` from a reading it has no answer.
+    Its sd grows between readings and through short holes. It has no answer further from a reading than `_NEAR_S`, or,
+    of sparse readings, than half of what `DeflectionHistory.at` takes for a hole.
+
+    Where readings are too sparse for the motion of a joint that swings at ``swing_hz``, its swing between them is in
+    the sd (`_unresolved_swing_var`).
 
     Raises
     ------
@@ -395,7 +426,38 @@ def smoothed(history: DeflectionHistory, rate_hz: float = _SMOOTH_RATE_HZ) -> De
         )
     first, last = np.ceil(known[0] * rate_hz), np.floor(known[-1] * rate_hz)
     one = evidence_of_history(history)
-    return fuse(lambda _inputs, _about: [one], history.method, np.arange(first, last + 1.0) / rate_hz).history
+    at_s, near_s = np.arange(first, last + 1.0) / rate_hz, 0.5 * HOLE_FACTOR * float(np.median(np.diff(known)))
+    out = fuse(lambda _inputs, _about: [one], history.method, at_s, max(near_s, _NEAR_S)).history
+    return out if swing_hz is None else with_unresolved_swing(history, out, swing_hz)
+
+
+def with_unresolved_swing(readings: DeflectionHistory, smooth: DeflectionHistory, swing_hz: float) -> DeflectionHistory:
+    """Smooth history of readings with the swing in its sd that they are too sparse to follow; as it is elsewhere."""
+    known = readings.time_s[np.isfinite(readings.theta_rad)]
+    if float(np.median(np.diff(known))) * swing_hz * _READINGS_A_SWING <= 1.0:
+        return smooth
+    var = _unresolved_swing_var(readings, smooth, swing_hz)
+    cov = smooth.lateral_cov_without_plane + var[:, None, None] * np.eye(2)
+    words = f"{smooth.assumptions}; fewer readings than its swing at {swing_hz:.1f} Hz needs, which is in the sd"
+    return history_from_lateral(smooth.time_s, smooth.theta_yz_rad, cov, smooth.method, words)
+
+
+def _unresolved_swing_var(readings: DeflectionHistory, at: DeflectionHistory, swing_hz: float) -> FloatArray:
+    """Variance ``(n,)`` of a swing between readings that do not follow it, rad^2.
+
+    A swing of variance ``v`` is off by ``2 v (1 - cos)`` of its phase since the nearest reading, up to ``2 v``. Its
+    variance is the readings' own about their local mean; at a multiple of their rate they would not show it, so that it
+    is at least that of a swing of any amplitude up to the level itself, which is a load's put on at once.
+    """
+    seen = np.isfinite(readings.theta_rad)
+    time_s, yz = readings.time_s[seen], readings.theta_yz_rad[seen]
+    off = np.sum((yz - uniform_filter1d(yz, _LOCAL, axis=0, mode="nearest")) ** 2, axis=1)
+    var = uniform_filter1d(off, _LOCAL, mode="nearest") * _LOCAL / (_LOCAL - 1.0)
+    level = uniform_filter1d(np.sum(yz**2, axis=1), _LOCAL, mode="nearest")
+    near = np.abs(at.time_s[:, None] - time_s[None, :]).min(axis=1)
+    share = 1.0 - np.cos(np.minimum(2.0 * np.pi * swing_hz * near, 0.5 * np.pi))
+    # a uniform amplitude's mean square is a third of its largest, a swing's variance half of its amplitude's square
+    return np.asarray(np.interp(at.time_s, time_s, np.maximum(var, level / 6.0)) * share)
 
 
 def _uncorrelated(one: Evidence) -> Evidence:
@@ -443,15 +505,21 @@ def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
     off, own = [e for e in readings if e.time_bias_sd_s > 0.0], [e for e in readings if e.time_bias_sd_s == 0.0]
     if not off or not own:
         return {}
-    one, span = off[0], _span(own)
+    span = _span(own)
     problem = NormalEquations.of([_uncorrelated(e) for e in own], {}, span)
     deflection = problem.history(problem.mean(problem.process_size(), method))
+    starts = {one.time_bias: _lowest_bias_sd(one, deflection, span) for one in off}
+    return {name: np.array([bias_sd]) for name, bias_sd in starts.items() if bias_sd is not None}
+
+
+def _lowest_bias_sd(one: Evidence, deflection: Deflection, span: tuple[float, float]) -> float | None:
+    """Time bias of readings at the lowest sum of squares against a deflection, in its sd; None with too few."""
     reach = _FARTHEST_BIAS_SD * one.time_bias_sd_s
     late_s = np.arange(-np.ceil(reach / _BIAS_STEP_S), np.ceil(reach / _BIAS_STEP_S) + 1.0) * _BIAS_STEP_S
     inside = (one.time_s > span[0] + reach) & (one.time_s < span[1] - reach) & np.isfinite(one.theta_yz_rad[:, 0])
     time_s, read = one.time_s[inside], one.theta_yz_rad[inside]
     if len(time_s) < LEAST_SAMPLES:
-        return {}
+        return None
     window = max(3, round(LIGHT_TIME_S / float(np.median(np.diff(time_s)))))
     square = np.empty(len(late_s))
     for k, late in enumerate(late_s):
@@ -459,7 +527,7 @@ def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
         square[k] = np.sum((off_rad - uniform_filter1d(off_rad, window, axis=0, mode="nearest")) ** 2)
     variance = float(square.min()) / (2.0 * len(time_s)) + LEFT_OUT_RAD**2
     best = int(np.argmin(square / variance + (late_s / one.time_bias_sd_s) ** 2))
-    return {CAMERA_TIME_BIAS: np.array([late_s[best] / one.time_bias_sd_s])}
+    return float(late_s[best] / one.time_bias_sd_s)
 
 
 def loads_reader(
@@ -507,6 +575,13 @@ def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) 
             )
 
 
+def _apart_from_readings(time_s: FloatArray, readings: list[Evidence]) -> FloatArray:
+    """Distance (n,) of each time from the nearest reading of any method, s."""
+    read = np.sort(np.concatenate([e.time_s for e in readings]))
+    after = np.searchsorted(read, time_s).clip(1, len(read) - 1)
+    return np.asarray(np.minimum(np.abs(read[after] - time_s), np.abs(time_s - read[after - 1])))
+
+
 def _posterior(
     answer: tuple[FloatArray, FloatArray, float],
     problem: NormalEquations,
@@ -518,10 +593,6 @@ def _posterior(
     found, covariance, size_radps2 = answer
     spline = problem.spline
     size = 2 * spline.count
-    read = np.concatenate([e.time_s for e in readings])
-    read.sort()
-    after = np.searchsorted(read, t).clip(1, len(read) - 1)
-    t = t[np.minimum(np.abs(read[after] - t), np.abs(t - read[after - 1])) <= _NEAR_S]
     value = spline.rows(t)
     theta_yz = problem.history(found)(t)
     cov = np.zeros((len(t), 2, 2))

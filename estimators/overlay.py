@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from estimators.virtual_camera import VirtualCamera, deformation_of, render
 from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.deflection import lv_clock
 from flightmodel.geometry import BodyMesh, bend, outboard, vehicle_meshes
 
 Picture = NDArray[np.uint8]
@@ -163,6 +165,17 @@ def horizon_row(view: VirtualCamera, theta_rad: float, plane_lv_rad: float) -> i
     """Smallest row of the virtual camera's shell edge, px."""
     edge = view.edge(deformation_of(theta_rad, plane_lv_rad)).pixels
     return round(float(edge[view.camera.is_inside(edge), 1].min()))
+
+
+def draw_outline(picture: Picture, view: VirtualCamera, theta_yz_rad: FloatArray, colour: tuple[int, int, int]) -> None:
+    """Draw the shell's edge at a lateral deflection (2,), rad, as a line."""
+    size, plane = float(np.hypot(*theta_yz_rad)), float(lv_clock(theta_yz_rad))
+    edge = view.edge(deformation_of(size, plane)).pixels
+    seen = view.camera.is_inside(edge)
+    for a, b in pairwise(range(len(edge))):
+        if seen[a] and seen[b]:
+            first, last = ((round(float(edge[k, 0])), round(float(edge[k, 1]))) for k in (a, b))
+            cv2.line(picture, first, last, colour, 1, cv2.LINE_AA)
 
 
 def draw_row(picture: Picture, row: int, colour: tuple[int, int, int]) -> None:

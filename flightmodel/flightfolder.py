@@ -235,6 +235,7 @@ class FlightFile(Section):
     barometers: dict[Name, BarometerEntry] = {}
     atmosphere: AtmosphereEntry | None = None
     frames: FramesEntry | None = None
+    cameras: dict[Name, FramesEntry] = {}
     events: list[EventEntry] = []
     reconstruction: dict[str, Any] = {}  # checked by `recon.settings.Settings`
 
@@ -245,11 +246,23 @@ class FlightFile(Section):
         return value
 
     @property
+    def films(self) -> dict[str, FramesEntry]:
+        """Every camera's film, by its table: ``frames``, or ``cameras.NAME``."""
+        alone = {} if self.frames is None else {"frames": self.frames}
+        return alone | {f"cameras.{name}": entry for name, entry in self.cameras.items()}
+
+    @property
+    def film_names(self) -> dict[str, str]:
+        """Name of each camera by its table: of one alone its mount's."""
+        alone = {} if self.frames is None else {"frames": self.frames.camera}
+        return alone | {f"cameras.{name}": name for name in self.cameras}
+
+    @property
     def sources(self) -> list[Source]:
         """Every table that is named."""
         onboard = (self.sensors.accelerometer, self.sensors.rates, self.sensors.magnetometer, self.sensors.sun)
-        single = [s for s in (*onboard, self.atmosphere, self.frames) if s is not None]
-        return [*single, *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
+        single = [s for s in (*onboard, self.atmosphere) if s is not None]
+        return [*single, *self.films.values(), *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
     def misfits(self, needs_path: bool = True) -> list[Fault]:
         """Return what does not go together, each with what to write instead.
@@ -257,10 +270,16 @@ class FlightFile(Section):
         Without ``needs_path`` a folder with a film and neither radar nor receiver is whole.
         """
         out: list[Fault] = []
-        if needs_path or self.radars or self.gnss or self.frames is None:
+        if needs_path or self.radars or self.gnss or not self.films:
             out += self._misfits_of_path()
-        if self.frames and self.vehicle is None:
-            out.append(Fault('frames: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing"))
+        if self.films and self.vehicle is None:
+            tables = ", ".join(self.films)
+            out.append(
+                Fault(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
+            )
+        if self.frames is not None and self.cameras:
+            words = "[frames] beside [cameras.NAME]: one camera stands in [frames], several in [cameras.NAME] each"
+            out.append(Fault(words, "frames-twice"))
         names = [*self.radars, *self.gnss, *self.barometers, *_TAKEN]
         for name in sorted({n for n in names if names.count(n) > 1}):
             words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
@@ -318,7 +337,7 @@ class Sources:
     gnss: dict[str, GnssRecord]
     barometers: dict[str, BarometerRecord]
     sounding: Sounding | None
-    frames: Frames | None
+    films: dict[str, Frames]
     attitude_prior: AttitudePrior | None
 
 
@@ -363,9 +382,9 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     barometers = {
         name: read_barometer(gate, name, entry, sounding, measured) for name, entry in spec.barometers.items()
     }
-    frames = read_frames(gate, spec.frames, vehicle) if spec.frames else None
+    films = _films(gate, spec, vehicle)
     prior = _attitude_prior(gate, spec.attitude_prior, radars, gnss) if spec.attitude_prior else None
-    return Sources(gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, frames, prior)
+    return Sources(gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, films, prior)
 
 
 def read_flight(folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True) -> Telemetry:
@@ -401,12 +420,12 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         radars=found.radars,
         sounding=found.sounding,
         attitude_prior=found.attitude_prior,
-        frames=found.frames,
+        films=found.films,
         magnetometer=found.triads.get("magnetometer"),
         sun=found.sun,
         events=tuple((e.name, e.t_s) for e in spec.events),
         findings=tuple(gate.findings),
-        hashes=_hashes(gate, spec, found.vehicle, found.frames),
+        hashes=_hashes(gate, spec, found.vehicle, found.films),
         gnss=found.gnss,
         barometers=found.barometers,
         motion=_motion(spec.motion),
@@ -459,6 +478,15 @@ def _vehicle(gate: Gate, name: str) -> Vehicle | None:
         code = "mesh-apart" if mesh.apart else "mesh-drawn"
         gate.findings.append(Finding(f"mesh of the {body}", words, np.nan, np.nan, code))
     return vehicle
+
+
+def _films(gate: Gate, spec: FlightFile, vehicle: Vehicle | None) -> dict[str, Frames]:
+    """Film of each camera that could be read; one alone goes by its mount's name, several by their tables'."""
+    read = {}
+    for (table, entry), name in zip(spec.films.items(), spec.film_names.values(), strict=True):
+        mount = {} if spec.frames is not None or "camera" in entry.model_fields_set else {"camera": name}
+        read[name] = read_frames(gate, entry.model_copy(update=mount), vehicle, table)
+    return _there(read)
 
 
 def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
@@ -573,19 +601,19 @@ def _motion(entry: MotionEntry) -> Motion:
     )
 
 
-def _hashes(gate: Gate, spec: FlightFile, vehicle: Vehicle | None, frames: Frames | None) -> dict[str, str]:
-    """SHA-256 of every file that the results depend on; all frames' pictures share one."""
+def _hashes(gate: Gate, spec: FlightFile, vehicle: Vehicle | None, films: dict[str, Frames]) -> dict[str, str]:
+    """SHA-256 of every file that the results depend on; all pictures of a film share one."""
     names = {"flight.toml", *(source.file for source in spec.sources)}
-    if frames is not None and frames.edits.rows:
+    if any(film.edits.rows for film in films.values()):
         names.add(EDITS_FILE)
     digests = {name: gate.sha256(gate.folder / name) for name in sorted(names)}
     if vehicle is not None:
         digests[f"vehicle {vehicle.name}"] = hashlib.sha256(vehicle.source.read_bytes()).hexdigest()
         for name in vehicle.files:
             digests[f"vehicle's {name}"] = hashlib.sha256((vehicle.source.parent / name).read_bytes()).hexdigest()
-    if frames is not None:
+    for name, frames in films.items():
         pictures = hashlib.sha256()
         for path in frames.paths:
             pictures.update(path.read_bytes())
-        digests["frames' pictures"] = pictures.hexdigest()
+        digests[f"{name}'s pictures" if spec.cameras else "frames' pictures"] = pictures.hexdigest()
     return digests

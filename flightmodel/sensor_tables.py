@@ -394,21 +394,23 @@ def read_sun(gate: Gate, source: SunEntry) -> SunRecord | None:
     return SunRecord(spec, table.time_s, values.reshape(-1, heads, 2))
 
 
-def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Frames | None:
-    """Read the list of frames and check every picture; None, with the faults kept, where anything is refused."""
-    label = "frames"
+def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None, label: str = "frames") -> Frames | None:
+    """Read the list of frames and check every picture; None, with the faults kept, where anything is refused.
+
+    ``label`` is the table of ``flight.toml`` that states it.
+    """
     if source.columns:
-        gate.refuse_config("frames.columns: the frame list has only t_s and frame", "quantity-unknown")
+        gate.refuse_config(f"{label}.columns: the frame list has only t_s and frame", "quantity-unknown")
     if (source.folder is None) == (source.film is None):
         gate.refuse_config(
-            "frames: one of folder (of images) and film (a .webm, .mp4 or .avi file) is wanted", "frames-source"
+            f"{label}: one of folder (of images) and film (a .webm, .mp4 or .avi file) is wanted", "frames-source"
         )
         return None
     path, images = gate.path(source.file), gate.path(source.film or source.folder or "")
     if vehicle is not None and source.camera not in vehicle.cameras:
         hint = nearest_name(source.camera, list(vehicle.cameras))
         gate.refuse_config(
-            f"frames.camera = '{source.camera}'{hint}: not on vehicle '{vehicle.name}'", "camera-unknown"
+            f"{label}.camera = '{source.camera}'{hint}: not on vehicle '{vehicle.name}'", "camera-unknown"
         )
         return None
     if path is None or images is None or vehicle is None:
@@ -430,9 +432,9 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
         gate.findings.extend(findings)
         time_s = time_s[used]
     if source.film is None:
-        paths, numbers = _image_paths(gate, images, table, used, path, camera), None
+        paths, numbers = _image_paths(gate, images, table, used, path, camera, label), None
     else:
-        paths, numbers = (images,), _film_numbers(gate, images, table, used, path, camera)
+        paths, numbers = (images,), _film_numbers(gate, images, table, used, path, camera, label)
     if time_s is None:
         return None
     if not len(time_s):
@@ -440,14 +442,14 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None) -> Fra
         return None
     if not time_s[0] - 2.0 <= source.benchmark_s <= time_s[-1] + 2.0:
         span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
-        gate.refuse_config(f"frames.benchmark_s = {source.benchmark_s}: frames span {span}", "benchmark-outside-film")
+        gate.refuse_config(f"{label}.benchmark_s = {source.benchmark_s}: frames span {span}", "benchmark-outside-film")
         return None
-    edits = _edits(gate, source.camera, time_s, camera)
+    edits = _edits(gate, label, source.camera, time_s, camera)
     benchmark_s = source.benchmark_s if edits.benchmark_s is None else edits.benchmark_s
     return Frames(camera, source.camera, time_s, paths, benchmark_s, numbers, source.time_bias_sd_s, edits)
 
 
-def _edits(gate: Gate, name: str, time_s: FloatArray, camera: CameraMount) -> CameraEdits:
+def _edits(gate: Gate, label: str, name: str, time_s: FloatArray, camera: CameraMount) -> CameraEdits:
     """What an analyst decided about a camera's film; nothing, with the faults kept, where the table is refused."""
     path = gate.folder / EDITS_FILE
     if not path.exists():
@@ -458,14 +460,12 @@ def _edits(gate: Gate, name: str, time_s: FloatArray, camera: CameraMount) -> Ca
         gate.faults.extend(fault.faults)
         return NO_EDITS
     if edits.rows:
-        gate.findings.append(
-            Finding("frames", f"edits by hand ({EDITS_FILE}): {edits}", np.nan, np.nan, "edited-by-hand")
-        )
+        gate.findings.append(Finding(label, f"edits by hand ({EDITS_FILE}): {edits}", np.nan, np.nan, "edited-by-hand"))
     return edits
 
 
 def _image_paths(
-    gate: Gate, images: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount
+    gate: Gate, images: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount, label: str
 ) -> tuple[Path, ...]:
     """Path of every frame's image; what is wrong with one becomes a fault."""
     names, paths = table["frame"].astype(str).str.strip(), []
@@ -473,7 +473,7 @@ def _image_paths(
         image = images / names.iloc[row]
         wrong = gate.wrong_place(image, names.iloc[row]) or image_fault(image, camera)
         if wrong:
-            where = f"frames: {path}: line {tables.line_of(table, row)}: {image}"
+            where = f"{label}: {path}: line {tables.line_of(table, row)}: {image}"
             gate.refuse(
                 f"{where}: {wrong}; replace the file or remove the line", getattr(wrong, "code", "image-unreadable")
             )
@@ -482,32 +482,32 @@ def _image_paths(
 
 
 def _film_numbers(
-    gate: Gate, film: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount
+    gate: Gate, film: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount, label: str
 ) -> IntArray:
     """Number of every frame in the film; what is wrong becomes a fault."""
     text = table["frame"].astype(str).str.strip()
     whole = text.str.fullmatch(r"\d{1,9}").to_numpy(dtype=bool)
     for row in np.flatnonzero(used & ~whole)[:5].tolist():
-        where = f"frames: {path}: line {tables.line_of(table, row)}: frame '{text.iloc[row]}'"
+        where = f"{label}: {path}: line {tables.line_of(table, row)}: frame '{text.iloc[row]}'"
         gate.refuse(
             f'{where}: with film = "{film.name}" a frame\'s number is wanted, the first being 0', "frame-number"
         )
     numbers = np.array([int(t) for t in text.to_numpy()[used & whole]], dtype=np.int64)
     if len(numbers) and (np.diff(numbers) < 0).any():
         row = int(np.flatnonzero(used & whole)[int(np.argmax(np.diff(numbers) < 0)) + 1])
-        where = f"frames: {path}: line {tables.line_of(table, row)}"
+        where = f"{label}: {path}: line {tables.line_of(table, row)}"
         gate.refuse(f"{where}: frame numbers fall where times rise; sort the list by time", "frame-number")
     wrong = film_fault(film, camera, int(numbers.max(initial=0)))
     if wrong:
-        gate.refuse(f"frames: {film}: {wrong}", getattr(wrong, "code", "film-unreadable"))
+        gate.refuse(f"{label}: {film}: {wrong}", getattr(wrong, "code", "film-unreadable"))
         return numbers
     again = int((np.diff(numbers) == 0).sum())
     if again:
         words = f"{path.name}: {again} of {len(numbers)} lines name the same frame as the line before; check the list"
-        gate.findings.append(Finding("frames", words, np.nan, np.nan, code="frame-repeated"))
+        gate.findings.append(Finding(label, words, np.nan, np.nan, code="frame-repeated"))
     timing = film_timing_fault(film)
     if timing:
-        gate.findings.append(Finding("frames", f"{film.name}: {timing}", np.nan, np.nan, timing.code))
+        gate.findings.append(Finding(label, f"{film.name}: {timing}", np.nan, np.nan, timing.code))
     return numbers
 
 

@@ -323,7 +323,7 @@ class Telemetry:
     radars: dict[str, RadarRecord]
     sounding: Sounding
     attitude_prior: AttitudePrior | None
-    frames: Frames | None = None
+    films: dict[str, Frames] = field(default_factory=dict)  # by camera
     magnetometer: TriadRecord | None = None
     sun: SunRecord | None = None
     events: tuple[tuple[str, float], ...] = ()
@@ -336,6 +336,11 @@ class Telemetry:
     sites: SitesSpec = field(default_factory=SitesSpec)
     places: tuple[KnownPlace, ...] = ()
     start: Start = Start()
+
+    @property
+    def frames(self) -> Frames | None:
+        """Film of the first camera; None without video."""
+        return next(iter(self.films.values()), None)
 
     def span_s(self) -> tuple[float, float]:
         """First and last time that all triads and at least one radar or receiver cover together."""

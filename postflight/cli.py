@@ -285,13 +285,14 @@ def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, join
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
+@click.option("--camera", "name", metavar="NAME", help="Of several cameras; default: the first in flight.toml.")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Of 127.0.0.1; default: any free one.")
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in the browser.")
-def camera(folder: Path, port: int, browser: bool) -> None:
+def camera(folder: Path, name: str | None, port: int, browser: bool) -> None:
     """Work at the film in FOLDER by hand: step through it, try deflections, mask, mark, accept and reject."""
     from postflight.camera_bench import command
 
-    command.open_bench(folder, port, browser)
+    command.open_bench(folder, name, port, browser)
 
 
 @cli.command()

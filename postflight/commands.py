@@ -21,7 +21,8 @@ from estimators.calibration import calibrate_lens, read_corners
 from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
 from postflight import run_folder, warmup
-from postflight.deflections import METHODS, NO_VIDEO, Deflections, camera_sensitivity, estimate
+from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate
+from postflight.filming import NO_VIDEO, by_camera
 from postflight.flight import Flight, read_flight
 from postflight.plots import run_figures
 from postflight.plots.deflection import figure_summary
@@ -355,7 +356,9 @@ def deflection(
                 history = answers.histories["camera"]
                 run_figures.draw_camera(flight, history, out.path / "figures")
                 if film:
-                    write_overlay_film(telemetry, history, out.path / "figures" / "overlay.webm", progress=report)
+                    for name, (seen, own) in by_camera(telemetry, history).items():
+                        file = "overlay.webm" if len(telemetry.films) == 1 else f"overlay_{name}.webm"
+                        write_overlay_film(seen, own, out.path / "figures" / file, progress=report)
     for finding in telemetry.findings:
         line("[yellow]found[/]", str(finding), finding.code)
     if trouble:

@@ -7,22 +7,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from estimators.benchmark import benchmark_deflection
-from estimators.camera import FilmFit, JointSwing, read_film, sensitivity_table
-from estimators.fusion import smoothed
+from estimators.camera import sensitivity_table
 from estimators.misalignment import estimate_misalignment as misalignment_history
 from estimators.trim import estimate_trim as trim_history
-from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress
+from flightmodel.checks import Fault, FloatArray, GateError, Progress
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, lv_clock
 from flightmodel.tabular import Tabular
-from flightmodel.vehicle import Vehicle
+from postflight.filming import CameraAnswer, camera_answer, with_largest
 from postflight.flight import Flight
 from postflight.fusing import FusedAnswer, fuse_flight
 from postflight.reconstruction import Reconstruction
 from recon.consistency import ConsistencyCheck
 
 METHODS = ("camera", "misalignment", "trim", "fused")
-NO_VIDEO = "video-missing"
 NO_COMMON_ANSWER = ("inputs-far-off", "fusion-not-converged", "camera-time-bias", "deflection-undetermined")
 # assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
 PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
@@ -40,8 +37,8 @@ class Deflections(Tabular):
         Why a method gave none.
     fused : FusedAnswer or None
         Posterior of the deflection and of all inputs, and whether the methods agree.
-    smooth_camera : DeflectionHistory or None
-        The camera's alone as a second-order process, where it estimated the plane.
+    camera : CameraAnswer or None
+        What stands behind the camera's, of one camera or several, and its answer at any time.
     bet : Reconstruction or None
         What they were made from; None where the camera answered without a trajectory.
     """
@@ -49,7 +46,7 @@ class Deflections(Tabular):
     histories: dict[str, DeflectionHistory] = field(default_factory=dict)
     refused: dict[str, Fault] = field(default_factory=dict)
     fused: FusedAnswer | None = None
-    smooth_camera: DeflectionHistory | None = None
+    camera: CameraAnswer | None = field(default=None, compare=False)
     bet: Reconstruction | None = None
 
     @property
@@ -61,6 +58,16 @@ class Deflections(Tabular):
         return self.histories["fused"]
 
     @property
+    def continuous(self) -> dict[str, DeflectionHistory]:
+        """Each method's answer at any time: of the camera, between whose frames the shell swings, the smooth one."""
+        return self.histories | ({} if self.smooth_camera is None else {"camera": self.smooth_camera})
+
+    @property
+    def smooth_camera(self) -> DeflectionHistory | None:
+        """The camera's answer at any time; None in an assumed plane, or of too few frames."""
+        return None if self.camera is None or "camera" not in self.histories else self.camera.smooth
+
+    @property
     def reference_s(self) -> float:
         """Time at which methods are compared, s: peak dynamic pressure, else the first history's largest deflection."""
         if self.bet is not None:
@@ -69,14 +76,15 @@ class Deflections(Tabular):
 
     @property
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
-        """Whether the methods agree, and whether they have a common answer; none without a fusion."""
+        """Whether several cameras agree, whether the methods do, and whether they have a common answer."""
+        of_cameras = () if self.camera is None else self.camera.consistency_checks
         if self.fused is not None:
-            return self.fused.consistency_checks
+            return (*of_cameras, *self.fused.consistency_checks)
         reason = self.refused.get("fused")
         if reason is None or reason.code not in NO_COMMON_ANSWER:
-            return ()
+            return of_cameras
         name, words = "deflection methods have a common answer", str(reason)
-        return (ConsistencyCheck("deflection-methods", name, 0.0, 1.0, 1.0, False, words),)
+        return (*of_cameras, ConsistencyCheck("deflection-methods", name, 0.0, 1.0, 1.0, False, words))
 
     def to_frame(self) -> pd.DataFrame:
         """One row a method, at `reference_s`.
@@ -90,13 +98,14 @@ class Deflections(Tabular):
         rows: list[tuple[object, ...]] = []
         at_s = self.reference_s
         for method, history in self.histories.items():
-            theta, sd = np.rad2deg(history.at(at_s))
-            known = np.isfinite(history.theta_rad)
-            lateral = [np.interp(at_s, history.time_s[known], c[known]) for c in history.theta_yz_rad.T]
+            any_time = self.continuous[method]
+            theta, sd = np.rad2deg(any_time.at(at_s))
+            known = np.isfinite(any_time.theta_rad)
+            lateral = [np.interp(at_s, any_time.time_s[known], c[known]) for c in any_time.theta_yz_rad.T]
             k = int(np.nanargmax(history.theta_rad))
             plane = np.rad2deg(lv_clock(np.array(lateral))) if np.isfinite(theta) else np.nan
             largest = np.rad2deg(history.theta_rad[k]), history.time_s[k]
-            rows.append((method, at_s, theta, sd, plane, *largest, "", *np.rad2deg(quantiles_at(history, at_s))))
+            rows.append((method, at_s, theta, sd, plane, *largest, "", *np.rad2deg(quantiles_at(any_time, at_s))))
         nothing = [np.nan] * len(QUANTILE_COLUMNS)
         rows += [(method, at_s, *[np.nan] * 5, str(reason), *nothing) for method, reason in self.refused.items()]
         names = ("method", "t_s", "theta_deg", "theta_sd_deg", "plane_lv_deg", "largest_deg", "largest_t_s", "reason")
@@ -105,7 +114,7 @@ class Deflections(Tabular):
     def _about(self) -> str:
         shown = [
             f"{method} {np.rad2deg(theta):.2f} +/- {np.rad2deg(sd):.2f} deg"
-            for method, (theta, sd) in ((m, h.at(self.reference_s)) for m, h in self.histories.items())
+            for method, (theta, sd) in ((m, h.at(self.reference_s)) for m, h in self.continuous.items())
         ]
         return f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
 
@@ -143,8 +152,8 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
         Where there is no video or it cannot be used.
     """
     if isinstance(flown, Flight):
-        return camera_film(flown, progress).history()
-    return with_benchmark_deflection(camera_film(flown.flight, progress), flown.flight, flown)
+        return camera_answer(flown, None, progress).plain
+    return camera_answer(flown.flight, flown, progress).history
 
 
 def estimate_misalignment(bet: Reconstruction) -> DeflectionHistory:
@@ -194,14 +203,13 @@ def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress:
     report = progress or (lambda _fraction, _what: None)
     flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
     answers = Deflections(bet=bet)
-    fused, plain = None, None
+    fused, filmed = None, None
     for k, method in enumerate(methods):
         report(k / len(methods), f"deflection from {method}")
         try:
             if method == "camera":
-                film = camera_film(flight, _part(report, k, len(methods)))
-                # the fusion estimates the deflection at the benchmark itself: it takes the plain history
-                plain, history = film.history(), with_benchmark_deflection(film, flight, bet)
+                filmed = camera_answer(flight, bet, _part(report, k, len(methods)))
+                history = filmed.history
             elif bet is None:
                 raise GateError(f"{method}: needs a trajectory", "trajectory-missing")
             elif method == "misalignment":
@@ -209,15 +217,17 @@ def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress:
             elif method == "trim":
                 history = estimate_trim(bet)
             else:
-                camera = plain if "camera" in answers.histories else _camera_for_fusion(flight, answers.refused)
-                time_bias_s = 0.0 if flight.telemetry.frames is None else flight.telemetry.frames.time_bias_sd_s
+                # the fusion estimates the deflection at the benchmark itself
+                seen = filmed is not None and "camera" in answers.histories
+                camera = filmed.plain if filmed is not None and seen else _camera_for_fusion(flight, answers.refused)
+                time_bias_s = min((film.time_bias_sd_s for film in flight.telemetry.films.values()), default=0.0)
                 fused = fuse_flight(bet.required_loads(), camera, time_bias_s)
                 history = fused.fused.history
         except GateError as fault:
             answers.refused[method] = Fault(str(fault), fault.codes[0])
             continue
         answered = np.isfinite(history.theta_rad)
-        if method == "camera" and answered.any() and not answered[film.time_s != film.benchmark_s].any():
+        if method == "camera" and filmed is not None and filmed.has_only_benchmarks:
             words = f"no frame but the benchmark frame can be used ({history.assumptions})"
             answers.refused[method] = Fault(words, "camera-no-frame")
         elif answered.any():
@@ -225,7 +235,7 @@ def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress:
         else:
             answers.refused[method] = Fault(f"no sample has an answer ({history.assumptions})", "no-answer")
     report(1.0, "estimated")
-    return replace(answers, fused=fused, smooth_camera=_smooth_camera(flight, answers.histories))
+    return replace(answers, fused=fused, camera=filmed)
 
 
 def _part(report: Progress, number: int, parts: int) -> Progress:
@@ -233,72 +243,14 @@ def _part(report: Progress, number: int, parts: int) -> Progress:
     return lambda fraction, what: report((number + fraction) / parts, what)
 
 
-def _smooth_camera(flight: Flight, histories: dict[str, DeflectionHistory]) -> DeflectionHistory | None:
-    """The camera's history as a second-order process; None in an assumed plane, or where too few frames answered."""
-    if "camera" not in histories or flight.camera_plane_lv_rad is not None:
-        return None
-    try:
-        return smoothed(histories["camera"])
-    except DivergenceError:
-        return None
-
-
 def _camera_for_fusion(flight: Flight, refused: dict[str, Fault]) -> DeflectionHistory | None:
     """Camera's history where the camera itself was not asked for; None without usable video."""
-    if "camera" in refused or flight.telemetry.frames is None:
+    if "camera" in refused or not flight.telemetry.films:
         return None
     try:
         return estimate_camera(flight)
     except GateError:
         return None
-
-
-def camera_film(flight: Flight, progress: Progress | None = None) -> FilmFit:
-    """What the onboard video shows, frame by frame; `GateError` where there is none or it cannot be used."""
-    frames = flight.telemetry.frames
-    if frames is None:
-        raise GateError("the flight has no video", NO_VIDEO)
-    vehicle = flight.telemetry.required_vehicle()
-    return read_film(
-        frames.time_s,
-        frames.pictures(),
-        vehicle.geometry,
-        frames.camera,
-        vehicle.joint.station_m,
-        benchmark_time_s=frames.benchmark_s,
-        plane_lv_rad=flight.camera_plane_lv_rad,
-        benchmark=frames.picture(frames.benchmark),
-        progress=progress,
-        joint_swing=joint_swing(vehicle),
-        edits=frames.edits,
-    )
-
-
-def joint_swing(vehicle: Vehicle) -> JointSwing | None:
-    """How fast the vehicle's joint swings; None without a spring that bends."""
-    critical = vehicle.critical_damping_nmsprad()
-    if not critical > 0.0:
-        return None
-    return JointSwing(vehicle.free_free_frequency_hz(), vehicle.joint.bending_damping_nmsprad / critical)
-
-
-def with_benchmark_deflection(film: FilmFit, flight: Flight, bet: Reconstruction | None) -> DeflectionHistory:
-    """Camera's history with the benchmark frame deflected by the moment in the joint; undeflected without one.
-
-    Why there is none stands in the history's assumptions.
-    """
-    telemetry = flight.telemetry
-    try:
-        if bet is None:
-            telemetry.required_triads()
-            raise GateError("no trajectory was made", "trajectory-missing")
-        time_bias_sd_s = 0.0 if telemetry.frames is None else telemetry.frames.time_bias_sd_s
-        frames = film.relative_to_benchmark(time_bias_sd_s)
-        return film.history(benchmark_deflection(frames, bet.required_loads(), film.oriented.apriori.benchmark_rad))
-    except GateError as fault:
-        plain = film.history()
-        words = f"{plain.assumptions}; the benchmark's deflection is not corrected by the joint's moment ({fault})"
-        return replace(plain, assumptions=words)
 
 
 def camera_sensitivity(flight: Flight, history: DeflectionHistory) -> pd.DataFrame:
@@ -307,7 +259,8 @@ def camera_sensitivity(flight: Flight, history: DeflectionHistory) -> pd.DataFra
     Columns ``joint_station_m, plane_lv_deg, deflection_deg, paper_deg``. It need not equal the paper's column: one
     camera sees the component towards it, and the shell and lens are not IRVE-II's.
     """
-    frames, vehicle = flight.telemetry.frames, flight.telemetry.required_vehicle()
+    telemetry, history = with_largest(flight.telemetry, history)
+    frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
     straight, deflected = (frames.picture(k) for k in (frames.benchmark, int(np.nanargmax(history.theta_rad))))
     stations = np.array([0.0, vehicle.joint.station_m])

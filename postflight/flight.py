@@ -119,7 +119,8 @@ class Flight(Tabular):
         inertial = (("accelerometer", t.accelerometer), ("rates", t.rates), ("magnetometer", t.magnetometer))
         rows += [(name, "inertial" if name != "magnetometer" else "field", r.time_s) for name, r in inertial if r]
         rows += [("sun", "Sun sensors", t.sun.time_s)] if t.sun is not None else []
-        rows += [("frames", "video", t.frames.time_s)] if t.frames is not None else []
+        several = len(t.films) > 1
+        rows += [(name if several else "frames", "video", film.time_s) for name, film in t.films.items()]
         table = []
         for name, kind, time_s in rows:
             span = time_s[-1] - time_s[0]

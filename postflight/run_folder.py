@@ -16,6 +16,7 @@ import os
 import platform
 import shutil
 import tempfile
+from collections.abc import Container
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -29,13 +30,15 @@ from flightmodel import events
 from flightmodel.checks import FloatArray, GateError, writing
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
-from postflight.deflections import NO_VIDEO, Deflections, quantiles_at
+from postflight.deflections import Deflections, quantiles_at
+from postflight.filming import NO_VIDEO
 from postflight.reconstruction import Reconstruction, bet_table
 
 DIGITS = "%.10g"
 _COPY = "copy the flight folder to where you may write"
 PARTIAL = ".partial-"  # before the number of the process that writes it
 _FORMAT = 1
+_SMOOTH_CAMERA = "camera_smooth"
 _COVARIANCE_RATE_HZ = 1.0
 _FRAMES = {
     "eci": "equal to ECEF at time zero (epoch_utc), then fixed in space",
@@ -179,10 +182,11 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
     """Each method's deflection at one time, and reason and code where it has none."""
     out: dict[str, dict[str, Any]] = {}
     for method, history in answers.histories.items():
-        theta, sd = np.rad2deg(history.at(at_s))
+        any_time = answers.continuous[method]
+        theta, sd = np.rad2deg(any_time.at(at_s))
         known = history.time_s[np.isfinite(history.theta_rad)]
         largest = int(np.nanargmax(history.theta_rad))
-        quantiles = np.rad2deg(quantiles_at(history, at_s))
+        quantiles = np.rad2deg(quantiles_at(any_time, at_s))
         out[method] = {
             "deflection_deg": float(theta),
             "sd_deg": float(sd),
@@ -256,10 +260,23 @@ def write_answers(run: RunFolder, answers: Deflections) -> None:
     for method, history in answers.histories.items():
         run.write_csv(f"deflection_{method}.csv", history.to_frame())
     if answers.smooth_camera is not None:
-        run.write_csv("camera_smooth.csv", answers.smooth_camera.to_frame())
+        run.write_csv(f"{_SMOOTH_CAMERA}.csv", answers.smooth_camera.to_frame())
+    if answers.camera is not None:
+        run.write_csv("camera_frames.csv", answers.camera.frames)
+        if answers.camera.joined is not None:
+            run.write_csv("cameras.csv", answers.camera.joined.to_frame())
     if answers.fused is not None:
         run.write_csv("fusion_inputs.csv", answers.fused.input_frame())
         run.write_csv("fusion_agreement.csv", answers.fused.agreement_frame())
+
+
+def answer_table(method: str, present: Container[str]) -> str:
+    """Stem of the table with a method's answer at any time, of those ``present`` in a run folder.
+
+    Of the camera it is the smooth one where there is one; ``deflection_camera.csv`` has its frames.
+    """
+    frames = f"deflection_{method}"
+    return _SMOOTH_CAMERA if method == "camera" and frames in present and _SMOOTH_CAMERA in present else frames
 
 
 def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:

@@ -21,7 +21,7 @@ from flightmodel.deflection import DeflectionHistory
 from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, difference, resample
-from postflight.run_folder import newest_run
+from postflight.run_folder import answer_table, newest_run
 
 # what the demo flight with nominal instrument errors must reach: four of the rms errors at peak pressure over many days
 # (0.14 deg by each method, 0.115 deg fused without video; docs/deflection.md, docs/camera.md)
@@ -84,8 +84,9 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     refused = json.loads((run / "summary.json").read_text())["methods"]
     methods: dict[str, dict[str, Any]] = {}
     failures: list[Fault] = []
+    written = {path.stem for path in run.glob("*.csv")}
     for method in DEFLECTION_LIMIT_DEG:
-        row = _method_row(run / f"deflection_{method}.csv", peak_s, true_deg)
+        row = _method_row(run / f"{answer_table(method, written)}.csv", peak_s, true_deg)
         methods[method] = row
         if row["deflection_deg"] is None and refused.get(method, {}).get("applicable", True):
             reason = refused.get(method, {}).get("reason", "not run")

@@ -478,6 +478,7 @@ def film(
     scene: Scene,
     rng: np.random.Generator,
     imaging: Imaging | None = None,
+    shape_rng: np.random.Generator | None = None,
 ) -> Iterator[Image]:
     """Film a scene.
 
@@ -492,6 +493,8 @@ def film(
     rng : numpy.random.Generator
         Of the camera's build, the shell's shape and the pixel noise.
     imaging : Imaging, optional
+    shape_rng : numpy.random.Generator, optional
+        Of the shell's shape, where several cameras film the same shell.
 
     Yields
     ------
@@ -506,7 +509,7 @@ def film(
     camera = as_built_camera(camera_mount, rng, imaging)
     renderer = ShellRenderer(vehicle_geometry, camera, joint_station_m, imaging.vignetting)
     renderer.stack.painted = imaging.painted
-    built, loaded = _shapes(imaging, rng)
+    built, loaded = _shapes(imaging, shape_rng or rng)
 
     def radiance(k: int, after_s: float) -> Float32:
         theta, plane = float(scene.theta_rad[k]), float(scene.plane_lv_rad[k])
@@ -575,23 +578,42 @@ def record(radiance: Float32, vignetting: Float32, imaging: Imaging, rng: np.ran
 CODECS = {"avi": "MJPG", "webm": "VP90"}
 
 
-def write_video(scenario: Scenario, seed: int, truth: Truth, telemetry: Path, report: Progress) -> None:
-    """Film the flight: images in a folder of the camera's name or one film, and the list of frames with their times."""
-    spec, vehicle = scenario.spec.video, scenario.vehicle
-    assert spec is not None
+def write_videos(scenario: Scenario, seed: int, truth: Truth, telemetry: Path, report: Progress) -> None:
+    """Film the flight with every camera; of several, names go by the tables of the scenario."""
+    spec = scenario.spec
+    if spec.video is not None:
+        _write_video(scenario, spec.video, seed, truth, (telemetry, spec.video.camera, "frames.csv"), report)
+    for k, (name, video) in enumerate(spec.videos.items()):
+        part = lambda f, what, k=k: report((k + f) / len(spec.videos), what)  # noqa: E731
+        shape = child_rng(seed, "shell")
+        _write_video(scenario, video, seed, truth, (telemetry, name, f"frames_{name}.csv"), part, shape)
+
+
+def _write_video(
+    scenario: Scenario,
+    spec: Video,
+    seed: int,
+    truth: Truth,
+    place: tuple[Path, str, str],
+    report: Progress,
+    shape_rng: np.random.Generator | None = None,
+) -> None:
+    """Images in a folder or one film of a name, and the list of frames with their times, below a folder."""
+    vehicle, (telemetry, name, listed) = scenario.vehicle, place
     rng = child_rng(seed, spec.camera)
     at = sensing.sample_times(spec.start_s, min(spec.stop_s, float(truth.time_s[-1])), spec.rate_hz)
     mount, imaging = vehicle.cameras[spec.camera], _imaging_from_quality(spec.imaging)
-    frames = film(vehicle.geometry, mount, vehicle.joint.station_m, scene(truth, at, spec.earth), rng, imaging)
+    seen = scene(truth, at, spec.earth)
+    frames = film(vehicle.geometry, mount, vehicle.joint.station_m, seen, rng, imaging, shape_rng)
     images = _reported(frames, len(at), report)
     if spec.format == "png":
-        names: list[object] = list(_write_images(images, telemetry / spec.camera))
+        names: list[object] = list(_write_images(images, telemetry / name))
     else:
-        _write_film(images, telemetry / f"{spec.camera}.{spec.format}", spec, (mount.width_px, mount.height_px))
+        _write_film(images, telemetry / f"{name}.{spec.format}", spec, (mount.width_px, mount.height_px))
         names = list(range(len(at)))
     late = spec.time_offset_s * float(rng.standard_normal())
     table = pd.DataFrame({"t_s": at + late, "frame": names})
-    table.to_csv(telemetry / "frames.csv", index=False, float_format="%.6f", lineterminator="\n")
+    table.to_csv(telemetry / listed, index=False, float_format="%.6f", lineterminator="\n")
 
 
 def _imaging_from_quality(quality: FilmQuality) -> Imaging:

@@ -31,8 +31,8 @@ from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.events import descent_events, find_peak, first_fall, has_peak, splashdown_index, values_at
 from flightmodel.instruments import ACCELEROMETER, MAGNETOMETER, RADAR, RATES, SUN
 from synthetic_flight import sensing, weather
-from synthetic_flight.film import write_video
-from synthetic_flight.instrument_errors import Magnetometer, SunSensors, stated_errors
+from synthetic_flight.film import write_videos
+from synthetic_flight.instrument_errors import Magnetometer, SunSensors, Video, stated_errors
 from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
@@ -163,8 +163,7 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     _csv(telemetry / "atmosphere.csv", columns, "%.8g")
     q_prior = sensing.sense_attitude(truth, spec.attitude_prior, child_rng(seed, "attitude"))
     _write_truth(scenario, seed, truth, folder / "truth")
-    if spec.video is not None:
-        write_video(scenario, seed, truth, telemetry, report)
+    write_videos(scenario, seed, truth, telemetry, report)
     write_flight_toml(scenario, q_prior, folder)
 
 
@@ -293,20 +292,25 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
         ]
     lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
     if spec.video is not None:
-        lines += [
-            "",
-            "[frames]",
-            'file = "telemetry/frames.csv"',
-            f'folder = "telemetry/{spec.video.camera}"'
-            if spec.video.format == "png"
-            else f'film = "telemetry/{spec.video.camera}.{spec.video.format}"',
-            f'camera = "{spec.video.camera}"',
-            f"benchmark_s = {spec.video.benchmark_s}",
-            *([f"time_bias_sd_s = {spec.video.time_offset_s}"] if 0.0 < spec.video.time_offset_s <= 1.0 else []),
-        ]
+        lines += _video_lines("frames", "frames.csv", spec.video.camera, spec.video)
+    for name, video in spec.videos.items():
+        lines += _video_lines(f"cameras.{name}", f"frames_{name}.csv", name, video)
     if spec.time.inflated_s is not None and spec.time.inflated_s >= spec.time.telemetry_from_s:
         lines += ["", "[[events]]", 'name = "aeroshell inflated"', f"t_s = {spec.time.inflated_s}"]
     return "\n".join(lines) + "\n"
+
+
+def _video_lines(table: str, listed: str, name: str, video: Video) -> list[str]:
+    images = video.format == "png"
+    return [
+        "",
+        f"[{table}]",
+        f'file = "telemetry/{listed}"',
+        f'folder = "telemetry/{name}"' if images else f'film = "telemetry/{name}.{video.format}"',
+        f'camera = "{video.camera}"',
+        f"benchmark_s = {video.benchmark_s}",
+        *([f"time_bias_sd_s = {video.time_offset_s}"] if 0.0 < video.time_offset_s <= 1.0 else []),
+    ]
 
 
 def _magnetometer_lines(spec: Magnetometer | None) -> list[str]:

@@ -122,6 +122,7 @@ class ScenarioFile(Section):
     magnetometer: Magnetometer | None = None
     sun: SunSensors | None = None
     video: Video | None = None
+    videos: dict[Name, Video] = {}
     attitude_prior: Attitude
 
     @field_validator("t0_utc")
@@ -140,6 +141,12 @@ class ScenarioFile(Section):
             raise ValueError("at least one radar is wanted: give a table [radars.<name>]")
         return value
 
+    @property
+    def films(self) -> dict[str, Video]:
+        """Every camera's film, by its table in the scenario: ``video``, or ``videos.NAME``."""
+        alone = {} if self.video is None else {"video": self.video}
+        return alone | {f"videos.{name}": video for name, video in self.videos.items()}
+
     @model_validator(mode="after")
     def _in_time(self) -> ScenarioFile:
         start, stop = self.time.telemetry_from_s, self.time.stop_s
@@ -157,13 +164,14 @@ class ScenarioFile(Section):
             if part is not None:
                 offset = part.offset_s if isinstance(part, Radar) else 0.0
                 faults += _rate_faults(name, part.rate_hz, stop - start - offset)
-        if self.video is not None:
-            times = ("start_s", "stop_s")
-            outside = [(f"video.{k}", getattr(self.video, k)) for k in times]
+        if self.video is not None and self.videos:
+            faults.append(("video", "", "write one camera in [video], several in [videos.NAME]"))
+        for table, video in self.films.items():
+            outside = [(f"{table}.{k}", getattr(video, k)) for k in ("start_s", "stop_s")]
             faults += [(key, value, words) for key, value in outside if not start <= value <= stop]
-            count = (self.video.stop_s - self.video.start_s) * self.video.rate_hz
+            count = (video.stop_s - video.start_s) * video.rate_hz
             if count > MOST_FRAMES:
-                faults.append(("video.rate_hz", self.video.rate_hz, f"{count:.2g} frames, at most {MOST_FRAMES}"))
+                faults.append((f"{table}.rate_hz", video.rate_hz, f"{count:.2g} frames, at most {MOST_FRAMES}"))
         if faults:
             raise KeyFaults(faults)
         return self
@@ -233,8 +241,7 @@ def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Fa
     needed = []
     if spec.magnetometer is not None:
         needed.append(("magnetometer.mount", spec.magnetometer.mount, packages, "sensors"))
-    if spec.video is not None:
-        needed.append(("video.camera", spec.video.camera, cameras, "cameras"))
+    needed += [(f"{table}.camera", video.camera, cameras, "cameras") for table, video in spec.films.items()]
     for key, name, known, table in needed:
         if name not in known:
             hint = f"{nearest_name(name, known)}; known there: {', '.join(known) or 'none'}"

@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from flightmodel.camera_edits import EDITS_FILE
-from flightmodel.checks import GateError
+from flightmodel.checks import ConfigError, GateError, nearest_name
 from postflight.camera_bench.server import HOST, serve
 from postflight.camera_bench.session import Session
 from postflight.commands import compile_kernels
@@ -17,7 +17,7 @@ from postflight.flight import Flight, read_flight
 console = Console(soft_wrap=True, highlight=False)
 
 
-def open_bench(folder: Path, port: int, browser: bool) -> None:
+def open_bench(folder: Path, camera: str | None, port: int, browser: bool) -> None:
     """Serve the bench's page on this machine until interrupted.
 
     Raises
@@ -25,7 +25,7 @@ def open_bench(folder: Path, port: int, browser: bool) -> None:
     GateError
         Where the folder has no video or cannot be read, or the port is taken.
     """
-    session = session_of(read_flight(folder, needs_path=False), folder)
+    session = session_of(read_flight(folder, needs_path=False), folder, camera)
     try:
         server, address = serve(session, port)
     except (OSError, SystemExit):  # the library ends the process itself
@@ -42,10 +42,14 @@ def open_bench(folder: Path, port: int, browser: bool) -> None:
         session.close()
 
 
-def session_of(flight: Flight, folder: Path) -> Session:
-    """Session for a flight's video; `GateError` where it has none."""
-    frames = flight.telemetry.frames
-    if frames is None:
+def session_of(flight: Flight, folder: Path, camera: str | None = None) -> Session:
+    """Session for a camera's film, of several the first without a name; `GateError` where there is none such."""
+    films = flight.telemetry.films
+    if not films:
         raise GateError(f"{folder}: the flight has no video; [frames] in flight.toml names it", code="video-missing")
+    name = next(iter(films)) if camera is None else camera
+    if name not in films:
+        words = f"--camera {name}{nearest_name(name, films)}: the flight has films of {', '.join(films)}"
+        raise ConfigError(words, code="camera-unknown")
     compile_kernels("camera")
-    return Session(folder, frames, flight.telemetry.required_vehicle())
+    return Session(folder, films[name], flight.telemetry.required_vehicle())

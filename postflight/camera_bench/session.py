@@ -17,7 +17,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from estimators.benchmark import orient_camera
 from estimators.camera import JointSwing, judged, polar
 from estimators.camera_fit import FrameFit, OrientedCamera
 from estimators.frame_edits import EditedFrame, edited
@@ -28,7 +27,7 @@ from flightmodel.checks import NO_FAULT, Fault, FloatArray, GateError
 from flightmodel.film import Frames
 from flightmodel.tables import read_table
 from flightmodel.vehicle import Vehicle
-from postflight.deflections import joint_swing
+from postflight.filming import joint_swing, orient_on_film
 
 MOST_EDITS = 20_000
 _CHANGED = "was changed by another program since this page was loaded; load the page anew"
@@ -219,11 +218,8 @@ class Session:
 
     def _oriented(self, frames: Frames) -> _Work:
         """Camera oriented on the benchmark frame with the decisions about it; nothing is fitted yet."""
-        at_s = float(frames.time_s[frames.benchmark])
-        picture = edited(frames.picture(frames.benchmark), frames.edits, at_s)
-        geometry, joint_m = self.vehicle.geometry, self.vehicle.joint.station_m
         try:
-            oriented = orient_camera(picture, geometry, frames.camera, joint_m, pose=frames.edits.pose)
+            oriented = orient_on_film(frames, self.vehicle)
         except GateError as fault:
             return _Work(frames, None, Fault(str(fault), fault.codes[0]), {})
         return _Work(frames, oriented, NO_FAULT, {})

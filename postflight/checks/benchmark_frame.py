@@ -7,14 +7,14 @@ estimated from any other frame.
 from __future__ import annotations
 
 from flightmodel.checks import GateError
+from flightmodel.film import Frames
 from flightmodel.flightfolder import Sources
 from flightmodel.telemetry import Finding
-
-SOURCE = "frames"
+from flightmodel.vehicle import Vehicle
 
 
 def benchmark_frame(found: Sources) -> list[Finding]:
-    """Check that the benchmark frame orients the camera.
+    """Check that every camera's benchmark frame orients it.
 
     Returns
     -------
@@ -22,20 +22,21 @@ def benchmark_frame(found: Sources) -> list[Finding]:
         Why it does not, with the code that a run would refuse the film with; or ``features-not-found`` (or the code of
         the failed orientation) where another way had to be taken than by the features that the vehicle file states.
     """
-    frames, vehicle = found.frames, found.vehicle
-    if frames is None or vehicle is None or not len(frames.time_s):
+    films = {table: found.films[name] for table, name in found.spec.film_names.items() if name in found.films}
+    return [finding for table, frames in films.items() for finding in _tried(table, frames, found.vehicle)]
+
+
+def _tried(source: str, frames: Frames, vehicle: Vehicle | None) -> list[Finding]:
+    if vehicle is None or not len(frames.time_s):
         return []
-    from estimators.benchmark import orient_camera  # which a folder without video needs not wait for
-    from estimators.frame_edits import edited
+    from postflight.filming import orient_on_film  # which a folder without video needs not wait for
 
     at = float(frames.time_s[frames.benchmark])
-    picture = edited(frames.picture(frames.benchmark), frames.edits, at)
-    geometry, joint_m, pose = vehicle.geometry, vehicle.joint.station_m, frames.edits.pose
     try:
-        oriented = orient_camera(picture, geometry, frames.camera, joint_m, pose=pose)
+        oriented = orient_on_film(frames, vehicle)
     except GateError as fault:
-        return [Finding(SOURCE, str(fault), at, at, fault.codes[0])]
+        return [Finding(source, str(fault), at, at, fault.codes[0])]
     if oriented.stated_refused:
         words = f"{oriented.stated_refused}; a run goes by the edge and the shell's texture"
-        return [Finding(SOURCE, words, at, at, oriented.stated_refused.code)]
+        return [Finding(source, words, at, at, oriented.stated_refused.code)]
     return []

@@ -174,8 +174,10 @@ def _facts(found: Sources) -> list[Fact]:
         tables.append((name, spec.gnss[name].file, fixes.time_s, fixes.position_ecef_m))
     for name, barometer in found.barometers.items():
         tables.append((name, spec.barometers[name].file, barometer.time_s, barometer.height_m[:, None]))
-    if found.frames is not None and spec.frames is not None:
-        tables.append(("frames", spec.frames.file, found.frames.time_s, found.frames.time_s[:, None]))
+    for table, name in spec.film_names.items():
+        if name in found.films:
+            time_s = found.films[name].time_s
+            tables.append((table, spec.films[table].file, time_s, time_s[:, None]))
     out = []
     for name, file, t, values in tables:
         rate = float(1.0 / np.median(np.diff(t))) if len(t) > 1 else np.nan

@@ -91,8 +91,7 @@ def _spans(found: Sources) -> dict[str, tuple[float, float]]:
     records: dict[str, Any] = {**found.triads, **found.radars, **found.gnss, **found.barometers}
     if found.sun is not None:
         records["sun"] = found.sun
-    if found.frames is not None:
-        records["frames"] = found.frames
+    records |= {table: found.films[name] for table, name in found.spec.film_names.items() if name in found.films}
     return {name: (float(r.time_s[0]), float(r.time_s[-1])) for name, r in records.items() if len(r.time_s)}
 
 

@@ -82,7 +82,7 @@ def whole_trial(plan: Plan, seed: int, run: int) -> dict[str, float]:
     nominal = plan.scenario.vehicle
     case = dispersed_case(plan.scenario, plan.dispersions, draws(plan.dispersions, seed, run))
     flown = replace(case.vehicle, aero=nominal.aero.scaled(*case.scales))
-    spec = case.scenario.spec.model_copy(update={"video": None})
+    spec = case.scenario.spec.model_copy(update={"video": None, "videos": {}})
     scenario = replace(case.scenario, spec=spec, vehicle=flown)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "flight"
@@ -93,7 +93,7 @@ def whole_trial(plan: Plan, seed: int, run: int) -> dict[str, float]:
     peak_s, _ = find_peak(truth.time_s, truth.dynamic_pressure_pa)
     out = dict.fromkeys(SCALARS, np.nan)
     out["truth_deg"] = float(np.rad2deg(np.interp(peak_s, truth.time_s, truth.deflection.theta_rad)))
-    for method, history in answers.histories.items():
+    for method, history in answers.continuous.items():
         theta, sd = np.rad2deg(history.at(peak_s))
         out |= {f"{method}_deg": float(theta), f"{method}_sd_deg": float(sd)}
         out[f"{method}_error_deg"] = float(theta) - out["truth_deg"]

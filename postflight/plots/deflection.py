@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from estimators.fusion import Fused
 from estimators.southwell import Limbs
 from flightmodel.checks import FloatArray
-from flightmodel.deflection import DeflectionHistory
 from postflight.deflections import Deflections
 from postflight.plots.overlay import benchmark_and_largest
 from postflight.plots.paper_figures import trajectory_angle, window
@@ -50,7 +49,7 @@ def figure_summary(
         picture.set_title(caption, fontsize=8)
         picture.axis("off")
     upper, lower = place.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
-    _methods(upper, answers.histories, truth)
+    _methods(upper, answers, truth)
     upper.axvline(flight.peak_s, color=COLOUR["limit"], lw=0.8, ls=":")
     largest = [np.nanmax(np.rad2deg(h.theta_rad)) for h in answers.histories.values() if np.isfinite(h.theta_rad).any()]
     top_deg = 1.25 * float(max(largest, default=5.0))
@@ -68,11 +67,15 @@ def figure_summary(
     return figure
 
 
-def _methods(
-    ax: Axes, histories: dict[str, DeflectionHistory], truth: tuple[FloatArray, FloatArray] | None = None
-) -> None:
-    """Deflection over time, each method with a band of one standard deviation; truth as (s, deg) where known."""
-    for method, history in histories.items():
+def _methods(ax: Axes, answers: Deflections, truth: tuple[FloatArray, FloatArray] | None = None) -> None:
+    """Deflection over time, each method with a band of one standard deviation; truth as (s, deg) where known.
+
+    Frames are dots; between them the camera's smooth answer is drawn.
+    """
+    if answers.smooth_camera is not None:
+        frames = answers.histories["camera"]
+        ax.plot(frames.time_s, np.rad2deg(frames.theta_rad), ".", color=COLOUR["camera"], ms=3, label="_frames")
+    for method, history in answers.continuous.items():
         theta, sd = np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)
         mark = "" if len(history.time_s) > _MANY_ANSWERS else "."
         style: dict[str, Any] = {"color": COLOUR[method], "ls": STROKE[method], "marker": mark, "ms": 3}

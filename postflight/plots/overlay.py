@@ -15,14 +15,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from estimators.benchmark import orient_camera, with_deflected_benchmark
+from estimators.benchmark import with_deflected_benchmark
 from estimators.camera_fit import OrientedCamera
-from estimators.frame_edits import edited
 from estimators.overlay import GREY, YELLOW, Overlay, draw_row, horizon_row, write_lines
 from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Image, film_frames
 from flightmodel.telemetry import Telemetry
+from postflight.filming import orient_on_film, with_largest
 
 _RESOLVED_RAD = 1e-4  # less than a fit resolves: the benchmark frame where it was taken as undeflected
 _BETWEEN_PX = 12  # of white between two frames side by side
@@ -40,15 +40,13 @@ def oriented_camera(telemetry: Telemetry, history: DeflectionHistory) -> tuple[O
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
     benchmark = frames.benchmark
-    at_s = float(frames.time_s[benchmark])
-    picture = edited(frames.picture(benchmark), frames.edits, at_s)
-    pose, joint_m = frames.edits.pose, vehicle.joint.station_m
-    oriented = orient_camera(picture, vehicle.geometry, frames.camera, joint_m, pose=pose)
-    return with_deflected_benchmark(oriented, *deflection_at(history, at_s)), benchmark
+    deflected = deflection_at(history, float(frames.time_s[benchmark]))
+    return with_deflected_benchmark(orient_on_film(frames, vehicle), *deflected), benchmark
 
 
 def benchmark_and_largest(telemetry: Telemetry, history: DeflectionHistory) -> tuple[Image, str]:
     """Benchmark frame and frame of the largest deflection side by side (h, w, 3), and the caption."""
+    telemetry, history = with_largest(telemetry, history)
     video = telemetry.frames
     assert video is not None
     oriented, benchmark = oriented_camera(telemetry, history)

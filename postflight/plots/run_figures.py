@@ -13,6 +13,7 @@ from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
 from postflight.deflections import Deflections
+from postflight.filming import by_camera
 from postflight.flight import Flight
 from postflight.plots.deflection import figure_correlation, figure_fusion, figure_summary
 from postflight.plots.overlay import deflection_at, oriented_camera, write_overlay
@@ -93,8 +94,16 @@ def draw_sensitivity(flight: Reconstruction, table: pd.DataFrame, folder: Path) 
 
 
 def draw_camera(flight: Flight, history: DeflectionHistory, folder: Path) -> None:
-    """Draw benchmark frame and frame of the largest deflection with the virtual camera over them (Figure 2.3)."""
-    telemetry = flight.telemetry
+    """Draw benchmark frame and frame of the largest deflection with the virtual camera over them (Figure 2.3).
+
+    Of several cameras each has files of its own, with its name.
+    """
+    several = len(flight.telemetry.films) > 1
+    for name, (telemetry, own) in by_camera(flight.telemetry, history).items():
+        _draw_one_camera(telemetry, own, folder, f"_{name}" if several else "")
+
+
+def _draw_one_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, ending: str) -> None:
     frames = telemetry.frames
     assert frames is not None
     oriented, benchmark = oriented_camera(telemetry, history)
@@ -105,5 +114,5 @@ def draw_camera(flight: Flight, history: DeflectionHistory, folder: Path) -> Non
     meshes = telemetry.required_vehicle().meshes
     figure = figure_2_3(oriented, [frames.picture(k) for k in pick], times, theta, plane, meshes)
     stamp(figure, telemetry)
-    save(figure, folder / "figure_2_3.png")
-    write_overlay(oriented, telemetry, largest, theta[1], plane[1], folder / "overlay.png")
+    save(figure, folder / f"figure_2_3{ending}.png")
+    write_overlay(oriented, telemetry, largest, theta[1], plane[1], folder / f"overlay{ending}.png")

@@ -21,6 +21,7 @@ from flightmodel.deflection import HOLE_FACTOR
 from postflight.deflections import METHODS
 from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, residual_unit
 from postflight.report.source import Rows, Run, kept_rows, rounded
+from postflight.run_folder import answer_table
 from postflight.studies.preflight import inside
 
 _TRAJECTORY_ROWS, _RAW_POINTS, _TRACK_POINTS, _RESIDUAL_POINTS = 6000, 8000, 6000, 16000
@@ -150,23 +151,30 @@ def with_holes(time_s: FloatArray, columns: Iterable[FloatArray]) -> tuple[Float
 
 
 def deflection_panel(run: Run) -> Panel | None:
-    """Deflection by every method that answered, each at its own times; None where none did."""
-    lines = []
+    """Deflection by every method that answered, each at its own times; None where none did.
+
+    The camera's line is its smooth answer where there is one, with a dot for each frame.
+    """
+    lines, dots = [], []
     for method in METHODS[::-1]:  # the fusion first and so below the others, which are thinner
-        table = run.tables.get(f"deflection_{method}")
-        if table is None or not len(table):
+        frames, name = run.tables.get(f"deflection_{method}"), answer_table(method, run.tables)
+        if frames is None or not len(frames):
             continue
+        table = run.tables[name]
+        if table is not frames:
+            t, theta = (frames[c].to_numpy(float) for c in ("t_s", "theta_deg"))
+            dots.append(_points("frames", t, theta, COLOUR[method], 4, _RAW_POINTS))
         t, (theta, sd) = with_holes(
             table["t_s"].to_numpy(), [table[c].to_numpy(float) for c in ("theta_deg", "theta_sd_deg")]
         )
         rows = kept_rows([theta], _TRAJECTORY_ROWS // 2)
         one = _line(LABEL[method], theta[rows], sd[rows], COLOUR[method], _DASH[method], 4)
         # frames are few: each is a dot, which also sets the line apart without colours
-        one["dots"] = method == "camera"
+        one["dots"] = method == "camera" and table is frames
         lines.append(one | {"t": rounded(t[rows], 4), "width": 3.4 if method == "fused" else 1.4})
     if not lines:
         return None
-    out = _panel("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, [])
+    out = _panel("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, dots)
     return out | {"ceiling": round(1.3 * max(max(x for x in one["y"] if x is not None) for one in lines), 2)}
 
 

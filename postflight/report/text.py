@@ -20,6 +20,7 @@ from postflight.deflections import METHODS
 from postflight.plots.style import COLOUR, LABEL
 from postflight.report.pictures import best_method, hole_s
 from postflight.report.source import Run
+from postflight.run_folder import answer_table
 from postflight.sensitivity import largest_of_groups
 
 _HOW = {
@@ -99,7 +100,7 @@ def _oscillation(run: Run) -> str:
     best = best_method(run)
     if best is None:
         return ""
-    answer, table = run.summary["methods"][best], run.tables[f"deflection_{best}"]
+    answer, table = run.summary["methods"][best], run.tables[answer_table(best, run.tables)]
     near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < _NEAR_PEAK_S]
     if len(near) < 2 or near.max() - near.min() < _OSCILLATES_SD * answer["sd_deg"]:
         return ""
@@ -153,7 +154,7 @@ def _agreement(run: Run, method: str) -> dict[str, str]:
 
 def plane_at(run: Run, method: str) -> str:
     """Plane of the deflection at peak dynamic pressure, deg LV clocking, with its sd; empty where it is not known."""
-    table, at = run.tables[f"deflection_{method}"], run.summary["peak_dynamic_pressure_s"]
+    table, at = run.tables[answer_table(method, run.tables)], run.summary["peak_dynamic_pressure_s"]
     t = table["t_s"].to_numpy()
     k = int(np.abs(t - at).argmin())
     sd = table["plane_sd_deg"].iloc[k]

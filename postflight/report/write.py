@@ -90,6 +90,7 @@ def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
         licence=read("uPlot.LICENSE"),
         data=Markup(safe_json(data)),
         frames=frames,
+        worst=pictures.worst_frames(run),
         absent=absent,
         drawn=data,
         studies=[path.resolve().name for path in studies],
@@ -100,6 +101,8 @@ def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
 def _texts(run: Run) -> dict[str, Any]:
     """Everything on the page that is text or tables."""
     more = {
+        "cameras": "Cameras: frames, and how far each one's own errors were found",
+        "camera_frames": "Frames of the film",
         "camera_sensitivity": "Deflection by video under assumed joints and planes, beside Table 2.1 of AIAA 2011-2571",
         "fusion_inputs": "Inputs of the methods, estimated with the deflection",
         "fusion_agreement": "Chi-square test of every pair of methods",

@@ -23,7 +23,7 @@ from flightmodel.camera_edits import NO_EDITS
 from flightmodel.checks import NO_FAULT
 from flightmodel.vehicle import read_vehicle
 from postflight.checks.benchmark_frame import benchmark_frame
-from postflight.deflections import joint_swing
+from postflight.filming import joint_swing
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film
 
 FRAMES = Path(__file__).parents[1] / "data" / "other_film"
@@ -167,7 +167,8 @@ def found(picture, features):
         time_s=np.array([421.0]), benchmark=0, picture=lambda _k: picture, camera=MOUNT, edits=NO_EDITS
     )
     vehicle = replace(read_vehicle("irve2_reference"), geometry=shell(features))
-    return SimpleNamespace(frames=frames, vehicle=vehicle)
+    spec = SimpleNamespace(film_names={"frames": "camera5"})
+    return SimpleNamespace(films={"camera5": frames}, vehicle=vehicle, spec=spec)
 
 
 def test_check_tries_the_benchmark_frame():
@@ -177,5 +178,5 @@ def test_check_tries_the_benchmark_frame():
     assert remark.code == "features-not-found"
     (remark,) = benchmark_frame(found(np.zeros((480, 720), dtype=np.uint8), "texture"))
     assert remark.code == "frame-dark"
-    assert benchmark_frame(SimpleNamespace(frames=None, vehicle=None)) == []
+    assert benchmark_frame(SimpleNamespace(films={}, vehicle=None, spec=SimpleNamespace(film_names={}))) == []
     assert len(no_features().points_shell_m) == 0

@@ -16,7 +16,7 @@ from flightmodel.camera_edits import read_edits
 from flightmodel.checks import GateError
 from postflight.camera_bench import server as servers
 from postflight.camera_bench.command import session_of
-from postflight.deflections import camera_film
+from postflight.filming import camera_film
 from postflight.flight import read_flight
 from tests.estimators.test_camera_deflection import film
 
@@ -218,6 +218,12 @@ class TestServer:
         done = command("camera", folder, "--no-browser", "--port", str(urlsplit(served).port))
         assert done.returncode == 3
         assert "port-taken" in done.stderr
+
+    def test_a_camera_that_is_not_there_is_refused_by_name(self, folder, command):
+        done = command("camera", folder, "--no-browser", "--camera", "camra5")
+        assert done.returncode == 2
+        assert "camera-unknown" in done.stderr
+        assert "camera5" in done.stderr
 
     def test_a_flight_without_video_is_refused_by_name(self, folder, command):
         spec = tomllib.loads((folder / "flight.toml").read_text())

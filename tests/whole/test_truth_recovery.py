@@ -178,10 +178,13 @@ def test_deflection_at_peak_is_recovered(scored: dict, method: str) -> None:
     assert row["truth_deg"] > 1.0, "without a deflection nothing is shown"
 
 
+ANSWER_AT_ANY_TIME = {"camera": "camera_smooth.csv"}  # frames are in deflection_camera.csv
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_score_is_what_the_files_say(scored: dict, run_folder: Path, true_deflection, truth, peak_s, method) -> None:
     """Recomputed here from the CSV files; 0.05 deg covers the sample nearest the peak against the peak itself."""
-    table = pd.read_csv(run_folder / f"deflection_{method}.csv")
+    table = pd.read_csv(run_folder / ANSWER_AT_ANY_TIME.get(method, f"deflection_{method}.csv"))
     at_peak = np.interp(scored["peak_dynamic_pressure_s"], table["t_s"], table["theta_deg"])
     assert scored["methods"][method]["deflection_deg"] == pytest.approx(at_peak, abs=1e-6)
     true = np.interp(peak_s, true_deflection["t_s"], true_deflection["theta_deg"])
@@ -200,6 +203,27 @@ def test_deflection_history_follows_the_truth(run_folder: Path, true_deflection,
     assert np.sqrt((error**2).mean()) < 2.6 * RMS_DEG[method]
     assert (np.abs(error) < 4.0 * table["theta_sd_deg"]).all()
     assert MEAN_SQUARE[0] < ((error / table["theta_sd_deg"]) ** 2).mean() < MEAN_SQUARE[1]
+
+
+def test_between_frames_the_camera_is_as_right_as_it_says(run_folder: Path, true_deflection, truth) -> None:
+    """The smooth answer at every time of the pulse, not only at frames."""
+    table = pd.read_csv(run_folder / "camera_smooth.csv")
+    pressure = np.interp(table["t_s"], truth["t_s"], truth["dynamic_pressure_pa"])
+    table = table[pressure > PULSE_FRACTION * truth["dynamic_pressure_pa"].max()]
+    error = table["theta_deg"] - np.interp(table["t_s"], true_deflection["t_s"], true_deflection["theta_deg"])
+    assert MEAN_SQUARE[0] < ((error / table["theta_sd_deg"]) ** 2).mean() < MEAN_SQUARE[1]
+
+
+def test_every_frame_has_a_row(run_folder: Path, flown: Path) -> None:
+    rows, listed = pd.read_csv(run_folder / "camera_frames.csv"), pd.read_csv(flown / "telemetry" / "frames.csv")
+    answers = pd.read_csv(run_folder / "deflection_camera.csv")
+    np.testing.assert_allclose(rows["t_s"], listed["t_s"])
+    used = rows[rows["flag"] == "used"]
+    np.testing.assert_allclose(
+        used[["t_s", "theta_deg", "theta_sd_deg"]], answers[["t_s", "theta_deg", "theta_sd_deg"]]
+    )
+    assert (used["edge_points"] > 100).all()
+    assert used["residual_rms_px"][used["t_s"] != 421.0].between(0.01, 1.0).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -254,7 +278,8 @@ def _change(path: Path, column: str, change) -> None:
 @pytest.mark.parametrize("method", [METHODS[0], *(pytest.param(m, marks=pytest.mark.long) for m in METHODS[1:])])
 def test_score_exits_5_where_a_deflection_is_wrong(command, flown, run_folder, tmp_path, method: str) -> None:
     folder, run = _spoiled(flown, run_folder, tmp_path)
-    _change(run / f"deflection_{method}.csv", "theta_deg", lambda v: v + 8.0 * RMS_DEG[method])
+    wrong = run / ANSWER_AT_ANY_TIME.get(method, f"deflection_{method}.csv")
+    _change(wrong, "theta_deg", lambda v: v + 8.0 * RMS_DEG[method])
     done = command("score", folder, "--json")
     assert done.returncode == 5
     result = json.loads(done.stdout)

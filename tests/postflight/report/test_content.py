@@ -15,6 +15,7 @@ import pytest
 
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_clock
+from postflight.plots.style import COLOUR
 from postflight.report import pictures
 from postflight.report import text as texts
 from postflight.report.panels import with_holes
@@ -51,6 +52,33 @@ def test_a_plane_between_sparse_answers_errs_as_it_says():
     turn = 2.0 * np.pi * at / 1.5
     true = float(np.rad2deg(lv_clock(np.array([3.0 + np.cos(turn), np.sin(turn)]))))
     assert 0.3 * sd < abs(plane - true) < 2.0 * sd
+
+
+def frames_table(rms: list[float], theta: list[float], refused: dict[int, str]) -> pd.DataFrame:
+    n = len(rms)
+    columns = {"camera": "camera5", "t_s": np.arange(n) * 0.5, "edge_points": 300, "features": 100.0,
+               "residual_rms_px": rms, "flag": "used", "code": "", "reason": "", "theta_deg": theta,
+               "theta_sd_deg": 0.1, "plane_lv_deg": 30.0, "plane_sd_deg": 1.0}  # fmt: skip
+    table = pd.DataFrame(columns)
+    for k, code in refused.items():
+        table.loc[k, ["flag", "code", "reason"]] = "refused", code, "words"
+        table.loc[k, ["features", "residual_rms_px", "theta_deg", "theta_sd_deg", "plane_lv_deg"]] = np.nan
+    return table
+
+
+def test_frames_to_look_at_first():
+    """Refused frames with one of each code first; then a large residual, and a step against the neighbours."""
+    rms, theta = [0.2, 0.21, 0.19, 0.2] * 5, [float(x) for x in np.linspace(1.0, 3.0, 20)]
+    rms[12], theta[5] = 0.9, theta[5] + 1.5
+    refused = {2: "frame-dark", 3: "frame-dark", 8: "edge-too-short", 9: "frame-dark"}
+    first = pictures.worst_first(frames_table(rms, theta, refused))
+    assert first[:2] == [2, 8]
+    assert first[2] in (3, 9)
+    assert set(first[3:5]) == {5, 12}
+    assert sorted(first) == list(range(20))
+    assert pictures.worst_first(frames_table(rms, theta, {}))[:2] == [5, 12]
+    every = dict.fromkeys(range(20), "frame-dark")
+    assert sorted(pictures.worst_first(frames_table(rms, theta, every))) == list(range(20))
 
 
 def test_a_what_if_says_what_was_assumed(run):
@@ -311,3 +339,22 @@ def test_noisy_film_does_not_swell_the_report(noise: float, coarse: bool) -> Non
     assert sum(map(len, made)) <= pictures.LARGEST_CHARACTERS
     finest = [pictures.jpeg(pictures.narrowed(picture), pictures.QUALITIES[0]) for picture in film]
     assert (made != finest) == coarse
+
+
+def test_card_panel_and_table_have_one_camera_answer_between_frames(run, text: str) -> None:
+    """At the peak, which lies between frames: the smooth answer with its sd everywhere."""
+    at, card = run.summary["peak_dynamic_pressure_s"], run.summary["methods"]["camera"]
+    assert np.abs(run.tables["deflection_camera"]["t_s"] - at).min() > 0.02
+    (panel,) = [p for p in payload(text)["panels"] if p["id"] == "deflection"]
+    (line,) = [one for one in panel["lines"] if one["colour"] == COLOUR["camera"]]
+    assert np.interp(at, line["t"], line["y"]) == pytest.approx(card["deflection_deg"], abs=2e-3)
+    assert np.interp(at, line["t"], line["sd"]) == pytest.approx(card["sd_deg"], abs=2e-3)
+    frames = [dots for dots in panel["raw"] if dots["label"] == "frames"]
+    assert len(frames[0]["t"]) == len(run.tables["deflection_camera"])
+
+
+def test_worst_frames_are_shown_with_their_numbers(run, text: str) -> None:
+    shown = re.findall(r"<figure><img [^>]*alt=\"Onboard frame at ([0-9.]+) s with the outline", text)
+    assert len(shown) == 5
+    table = run.tables["camera_frames"]
+    assert [float(t) for t in shown] == pytest.approx(table["t_s"].iloc[pictures.worst_first(table)[:5]], abs=0.006)

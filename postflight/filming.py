@@ -1,0 +1,271 @@
+"""The deflection by the onboard cameras: one film by itself, or several joined into one history.
+
+A film that cannot be used does not stop the others: it is named, with its reason, in the answer's assumptions and by a
+consistency check.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from estimators.agreement import CONFIDENCE
+from estimators.benchmark import BenchmarkDeflection, benchmark_deflection, orient_camera
+from estimators.camera import FilmFit, JointSwing, read_film
+from estimators.camera_fit import OrientedCamera
+from estimators.cameras import CameraReadings, JoinedCameras, join_cameras
+from estimators.frame_edits import edited
+from estimators.fusion import smoothed
+from flightmodel.checks import DivergenceError, Fault, GateError, Progress
+from flightmodel.deflection import DeflectionHistory
+from flightmodel.film import Frames
+from flightmodel.telemetry import Telemetry
+from flightmodel.vehicle import Vehicle
+from postflight.flight import Flight
+from postflight.fusing import CAMERA_PLANE_SD_RAD
+from postflight.reconstruction import Reconstruction
+from recon.consistency import ConsistencyCheck
+
+NO_VIDEO = "video-missing"
+_SAME_FRAME_S = 1e-3
+
+
+@dataclass(frozen=True)
+class CameraAnswer:
+    """What the cameras answer.
+
+    Parameters
+    ----------
+    history : DeflectionHistory
+        At the frames, with the benchmark frames' deflection corrected where the moment in the joint determines it.
+    plain : DeflectionHistory
+        The same with the benchmark frames taken as undeflected, for the fusion.
+    smooth : DeflectionHistory or None
+        At any time; None in an assumed plane, or of too few frames.
+    frames : DataFrame
+        What became of every frame: ``camera`` and the columns of `FilmFit.frame_table`.
+    joined : JoinedCameras or None
+        None of one camera alone.
+    refused : dict of Fault
+        Cameras whose film cannot be used, and why.
+    benchmarks_s : tuple of float
+        Times of the benchmark frames.
+    """
+
+    history: DeflectionHistory
+    plain: DeflectionHistory
+    smooth: DeflectionHistory | None
+    frames: pd.DataFrame
+    joined: JoinedCameras | None
+    refused: dict[str, Fault]
+    benchmarks_s: tuple[float, ...]
+
+    @property
+    def has_only_benchmarks(self) -> bool:
+        """Whether no frame but a benchmark frame has an answer."""
+        answered = self.history.time_s[np.isfinite(self.history.theta_rad)]
+        return len(answered) > 0 and bool(np.isin(answered, self.benchmarks_s).all())
+
+    @property
+    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+        """Whether several cameras agree, and whether each has an answer; none of one camera alone."""
+        if self.joined is None:
+            return ()
+        checks = []
+        if self.joined.tests:
+            least = min(test.p_value for test in self.joined.tests)
+            name, low = "cameras agree: least chance of a test", 1.0 - CONFIDENCE
+            one = self.joined
+            checks.append(ConsistencyCheck("cameras", name, least, low, 1.0, one.agree, one.remark, one.suspect))
+        words = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items()) or "every camera has an answer"
+        count = float(len(self.refused))
+        source = ", ".join(self.refused)
+        name = "cameras without an answer"
+        return (*checks, ConsistencyCheck("camera-refused", name, count, 0.0, 0.0, not self.refused, words, source))
+
+
+def camera_film(flight: Flight, frames: Frames | None = None, progress: Progress | None = None) -> FilmFit:
+    """What a film shows, frame by frame, the first camera's without ``frames``; `GateError` where it cannot be used."""
+    frames = flight.telemetry.frames if frames is None else frames
+    if frames is None:
+        raise GateError("the flight has no video", NO_VIDEO)
+    vehicle = flight.telemetry.required_vehicle()
+    return read_film(
+        frames.time_s,
+        frames.pictures(),
+        vehicle.geometry,
+        frames.camera,
+        vehicle.joint.station_m,
+        benchmark_time_s=frames.benchmark_s,
+        plane_lv_rad=flight.camera_plane_lv_rad,
+        benchmark=frames.picture(frames.benchmark),
+        progress=progress,
+        joint_swing=joint_swing(vehicle),
+        edits=frames.edits,
+    )
+
+
+def orient_on_film(frames: Frames, vehicle: Vehicle) -> OrientedCamera:
+    """Camera oriented on the benchmark frame of a film, with what an analyst decided about it.
+
+    Raises
+    ------
+    GateError
+        Where the frame cannot be used.
+    """
+    at_s = float(frames.time_s[frames.benchmark])
+    picture = edited(frames.picture(frames.benchmark), frames.edits, at_s)
+    return orient_camera(picture, vehicle.geometry, frames.camera, vehicle.joint.station_m, pose=frames.edits.pose)
+
+
+def joint_swing(vehicle: Vehicle) -> JointSwing | None:
+    """How fast the vehicle's joint swings; None without a spring that bends."""
+    critical = vehicle.critical_damping_nmsprad()
+    if not critical > 0.0:
+        return None
+    return JointSwing(vehicle.free_free_frequency_hz(), vehicle.joint.bending_damping_nmsprad / critical)
+
+
+def camera_answer(flight: Flight, bet: Reconstruction | None, progress: Progress | None = None) -> CameraAnswer:
+    """Deflection by the flight's cameras.
+
+    Parameters
+    ----------
+    flight : Flight
+    bet : Reconstruction or None
+        Without it the benchmark frames are taken as undeflected.
+    progress : callable, optional
+
+    Raises
+    ------
+    GateError
+        Where there is no video, or none that can be used.
+    """
+    films = flight.telemetry.films
+    if len(films) < 2:
+        film = camera_film(flight, progress=progress)
+        history = _with_benchmark_deflection(film, flight, bet)
+        table = film.frame_table(history)
+        table.insert(0, "camera", next(iter(films)))
+        smooth = _smooth(flight, history)
+        return CameraAnswer(history, film.history(), smooth, table, None, {}, (film.benchmark_s,))
+    if flight.camera_plane_lv_rad is not None:
+        words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
+        raise GateError(words, "plane-assumed")
+    return _of_several(flight, bet, progress)
+
+
+def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress | None) -> CameraAnswer:
+    films, refused = {}, {}
+    for k, (name, frames) in enumerate(flight.telemetry.films.items()):
+        part = None
+        if progress is not None:
+            part = lambda f, what, k=k, name=name: progress(  # noqa: E731
+                (k + f) / len(flight.telemetry.films), f"{name}: {what}"
+            )
+        try:
+            films[name] = camera_film(flight, frames, part)
+        except GateError as fault:
+            refused[name] = Fault(str(fault), fault.codes[0])
+    if not films:
+        raise GateError([Fault(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
+    plain, corrected, tables, remarks = [], [], [], []
+    for name, film in films.items():
+        late_s = flight.telemetry.films[name].time_bias_sd_s
+        read, nothing = film.relative_to_benchmark(late_s), film.oriented.apriori.benchmark_rad**2 * np.eye(2)
+        one = CameraReadings(name, read, BenchmarkDeflection(np.zeros(2), nothing), float(CAMERA_PLANE_SD_RAD))
+        found, why = _benchmark(film, late_s, flight, bet)
+        history = film.history(found)
+        table = film.frame_table(history)
+        table.insert(0, "camera", name)
+        tables.append(table)
+        plain.append(one)
+        corrected.append(one if found is None else replace(one, benchmark=found))
+        remarks.append(f"{name}: {history.assumptions}{why}")
+    swing = joint_swing(flight.telemetry.required_vehicle())
+    hz = None if swing is None else swing.frequency_hz
+    joined = join_cameras(corrected, hz)
+    known = any(one is not two for one, two in zip(corrected, plain, strict=True))
+    at_plain = join_cameras(plain, hz) if known else joined
+    unused = {one.name for one in plain} - {one.name for one in joined.readings}
+    refused |= {name: Fault("too few frames with an answer", "too-few-readings") for name in unused}
+    remarks += [f"{name}: no answer ({reason})" for name, reason in refused.items()]
+    words = "; ".join([joined.at_frames.assumptions, joined.remark, *remarks])
+    history, smooth = (replace(h, assumptions=words) for h in (joined.at_frames, joined.smooth))
+    times = tuple(film.benchmark_s for film in films.values())
+    return CameraAnswer(
+        history, at_plain.at_frames, smooth, pd.concat(tables, ignore_index=True), joined, refused, times
+    )
+
+
+def _benchmark(
+    film: FilmFit, late_s: float, flight: Flight, bet: Reconstruction | None
+) -> tuple[BenchmarkDeflection | None, str]:
+    """Deflection of the benchmark frame by the moment in the joint; None, with the reason, where there is none."""
+    try:
+        if bet is None:
+            flight.telemetry.required_triads()
+            raise GateError("no trajectory was made", "trajectory-missing")
+        frames = film.relative_to_benchmark(late_s)
+        return benchmark_deflection(frames, bet.required_loads(), film.oriented.apriori.benchmark_rad), ""
+    except GateError as fault:
+        return None, f"; the benchmark's deflection is not corrected by the joint's moment ({fault})"
+
+
+def _with_benchmark_deflection(film: FilmFit, flight: Flight, bet: Reconstruction | None) -> DeflectionHistory:
+    """One camera's history with the benchmark frame deflected by the moment in the joint; undeflected without one.
+
+    Why there is none stands in the history's assumptions.
+    """
+    frames = flight.telemetry.frames
+    found, why = _benchmark(film, 0.0 if frames is None else frames.time_bias_sd_s, flight, bet)
+    history = film.history(found)
+    return replace(history, assumptions=history.assumptions + why)
+
+
+def _smooth(flight: Flight, history: DeflectionHistory) -> DeflectionHistory | None:
+    """One camera's history as a second-order process; None in an assumed plane, or where too few frames answered."""
+    if flight.camera_plane_lv_rad is not None:
+        return None
+    swing = joint_swing(flight.telemetry.required_vehicle())
+    try:
+        return smoothed(history, swing_hz=None if swing is None else swing.frequency_hz)
+    except DivergenceError:
+        return None
+
+
+def is_oriented(telemetry: Telemetry, frames: Frames) -> bool:
+    """Whether the benchmark frame orients the camera."""
+    try:
+        orient_on_film(frames, telemetry.required_vehicle())
+    except GateError:
+        return False
+    return True
+
+
+def by_camera(telemetry: Telemetry, history: DeflectionHistory) -> dict[str, tuple[Telemetry, DeflectionHistory]]:
+    """Telemetry with one camera, and the history at its frames (NaN where it has no answer), of each camera with some.
+
+    Of one camera alone, both as they are; of several, those that their benchmark frame orients.
+    """
+    if len(telemetry.films) < 2:
+        return dict.fromkeys(telemetry.films, (telemetry, history))
+    out = {}
+    for name, frames in telemetry.films.items():
+        nearest = np.abs(history.time_s[None, :] - frames.time_s[:, None]).argmin(axis=1)
+        there = np.abs(history.time_s[nearest] - frames.time_s) < _SAME_FRAME_S
+        theta = np.where(there, history.theta_rad[nearest], np.nan)
+        cov = None if history.covariance is None else history.covariance[nearest]
+        own = replace(
+            history, time_s=frames.time_s, theta_rad=theta, plane_lv_rad=history.plane_lv_rad[nearest], covariance=cov
+        )
+        if np.isfinite(theta).any() and is_oriented(telemetry, frames):
+            out[name] = (replace(telemetry, films={name: frames}), own)
+    return out
+
+
+def with_largest(telemetry: Telemetry, history: DeflectionHistory) -> tuple[Telemetry, DeflectionHistory]:
+    """The camera, as in `by_camera`, whose frames show the largest deflection."""
+    return max(by_camera(telemetry, history).values(), key=lambda one: np.nanmax(np.abs(one[1].theta_rad)))
