@@ -8,6 +8,7 @@ import sys
 import time
 import tomllib
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -51,16 +52,22 @@ console_err = Console(stderr=True, soft_wrap=True)
 
 def compile_kernels(*groups: str) -> None:
     """Compile before first use, and say so."""
+    _say_once(warmup.CACHE.remark)
     warmup.prepare(groups, lambda words: console_err.print(escape(words)))
+
+
+@cache
+def _say_once(words: str) -> None:
+    if words:
+        console_err.print(f"[yellow]found[/] {escape(f'{words} [no-cache]')}")
 
 
 def warm_up() -> None:
     """Compile every group of kernels that is missing, and say where they lie."""
+    if warmup.CACHE.remark:
+        raise GateError(warmup.CACHE.remark, "cannot-write")
     compile_kernels(*warmup.GROUPS)
-    if warmup.CACHE is None:
-        words = "no folder to keep compiled kernels in can be written: set XDG_CACHE_HOME or NUMBA_CACHE_DIR"
-        raise GateError(words, "cannot-write")
-    console.print(f"kernels are compiled: {escape(str(warmup.CACHE))}")
+    console.print(f"kernels are compiled: {escape(str(warmup.CACHE.path))}")
 
 
 def scenario_and_folder(arguments: tuple[str, ...]) -> tuple[str, Path]:
