@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from flightmodel.checks import ConfigError, Fault, nearest_name
+from flightmodel.guarded_files import file_bytes
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
 Positive = Annotated[float, Field(gt=0.0)]
@@ -113,24 +114,19 @@ def read_toml(path: Path) -> dict[str, Any]:
     if "\0" in str(path):
         raise ConfigError(f"{str(path)!r}: a path holds no NUL character", code="path-nul")
     try:
-        if path.is_file() and path.stat().st_size > LARGEST_TOML_BYTES:
-            raise ConfigError(
-                f"{path}: more than {LARGEST_TOML_BYTES // 10**6} MB; no configuration is that long",
-                code="file-too-large",
-            )
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
+        return tomllib.loads(file_bytes(path, LARGEST_TOML_BYTES).decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file", code="file-missing") from None
     except RecursionError:
         raise ConfigError(
             f"{path}: not valid TOML: arrays or tables lie too deep in each other", code="toml-syntax"
         ) from None
-    except ConfigError:
-        raise
     except ValueError as fault:  # also integers of thousands of digits
         raise ConfigError(f"{path}: not valid TOML: {fault}", code="toml-syntax") from None
     except OSError as fault:
-        raise ConfigError(f"{path}: cannot be read: {fault.strerror or fault}", code="file-unreadable") from None
+        raise ConfigError(
+            f"{path}: cannot be read: {fault.strerror or fault}", getattr(fault, "code", "file-unreadable")
+        ) from None
 
 
 def parse_section(model: type[SectionT], tables: dict[str, Any], where: str) -> SectionT:

@@ -26,6 +26,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from flightmodel.checks import Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.config import Section, Time
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.guarded_files import UnfitFile, file_bytes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -232,9 +233,12 @@ def read_table(path: Path, label: str) -> pd.DataFrame:
         For a file that is missing, empty, binary, ragged, or names a column twice.
     """
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        content = file_bytes(path)
+        text = "\0" if b"\0" in content else content.decode("utf-8-sig")
     except FileNotFoundError:
         raise GateError(f"{label}: {path}: no such file", code="file-missing") from None
+    except UnfitFile as fault:
+        raise GateError(f"{label}: {path}: {fault.strerror}", fault.code) from None
     except (UnicodeDecodeError, OSError) as fault:
         raise GateError(f"{label}: {path}: not a readable CSV table: {fault}", code="table-unreadable") from None
     if "\0" in text:

@@ -422,7 +422,8 @@ def main() -> None:
         sys.exit(fault.exit_code)
     except OSError as fault:
         where = fault.filename or "reading or writing a file failed"
-        click.echo(f"error: {where}: {fault.strerror or fault}", err=True)
+        code = getattr(fault, "code", "")
+        click.echo(f"error: {where}: {fault.strerror or fault}{f' [{code}]' if code else ''}", err=True)
         sys.exit(3)
     except ValueError as fault:
         sys.exit(refusal(fault))

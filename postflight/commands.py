@@ -130,9 +130,9 @@ def print_events(flown: list[Event]) -> None:
 def run(folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False) -> None:
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers."""
     bet, answers, written = run_flight(folder, methods, wanted, reruns)
-    print_flight(bet, pd.read_csv(written / "events.csv"))
+    print_flight(bet, run_folder.read_csv(written / "events.csv"))
     if reruns:
-        print_sensitivity(pd.read_csv(written / "sensitivity.csv"))
+        print_sensitivity(run_folder.read_csv(written / "sensitivity.csv"))
     if methods:
         print_answers(answers)
     console.print(f"results in {escape(str(written))}, to read in report.html")
@@ -430,7 +430,7 @@ def demo(folder: Path, seed: int) -> None:
     compile_kernels("simulator", "ensembles", *warmup.RECONSTRUCTION, "camera")
     simulate(REFERENCE, folder, seed, force=True)
     bet, answers, written = run_flight(folder, METHODS, Asked())
-    print_flight(bet, pd.read_csv(written / "events.csv"))
+    print_flight(bet, run_folder.read_csv(written / "events.csv"))
     for method, reason in answers.refused.items():
         line("[yellow]no answer[/]", f"from {method}: {reason}", reason.code)
     result = score_run(folder, written)
@@ -447,7 +447,7 @@ def demo(folder: Path, seed: int) -> None:
 def truth_history(folder: Path) -> tuple[FloatArray, FloatArray]:
     """Times and true deflection, deg, of a synthetic flight, for drawing after everything is estimated."""
     try:
-        table = pd.read_csv(folder / "truth" / "deflection.csv")
+        table = run_folder.read_csv(folder / "truth" / "deflection.csv")
     except FileNotFoundError:
         raise GateError(f"{folder}: no truth/deflection.csv", "truth-missing") from None
     return table["t_s"].to_numpy(), table["theta_deg"].to_numpy()

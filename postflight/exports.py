@@ -36,7 +36,8 @@ from rich.console import Console
 
 from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
 from flightmodel.config import parse_utc
-from postflight.run_folder import DIGITS, newest_run
+from flightmodel.guarded_files import file_bytes, open_file
+from postflight.run_folder import DIGITS, newest_run, read_csv
 
 _UNITS = {
     "m": "m", "mps": "m s-1", "mps2": "m s-2", "deg": "degree", "degps": "degree s-1", "pa": "Pa", "kgpm3": "kg m-3",
@@ -114,18 +115,18 @@ def read_source(folder: Path) -> Source:
     """Read the newest run of a flight folder; `GateError` where there is none or its files are incomplete."""
     run = newest_run(folder)
     try:
-        header = json.loads((run / "bet_header.json").read_text())
-        facts = json.loads((run / "run.json").read_text())
-        trajectory = pd.read_csv(run / "bet.csv")
-        events = pd.read_csv(run / "events.csv")
-        with np.load(run / "covariance.npz", allow_pickle=False) as stored:
+        header = json.loads(file_bytes(run / "bet_header.json"))
+        facts = json.loads(file_bytes(run / "run.json"))
+        trajectory = read_csv(run / "bet.csv")
+        events = read_csv(run / "events.csv")
+        with open_file(run / "covariance.npz") as file, np.load(file, allow_pickle=False) as stored:
             times, covariance = stored["t_s"], stored["covariance"]
     except FileNotFoundError as fault:
         words = f"has no {Path(str(fault.filename)).name}: it made no trajectory; `postflight run {folder}` does"
         raise GateError(f"{run}: {words}", "trajectory-missing") from None
     except (ValueError, KeyError, OSError) as fault:
         raise GateError(f"{run}: cannot be read back ({fault}); run it again", "run-incomplete") from None
-    deflections = {p.stem.removeprefix("deflection_"): pd.read_csv(p) for p in sorted(run.glob("deflection_*.csv"))}
+    deflections = {p.stem.removeprefix("deflection_"): read_csv(p) for p in sorted(run.glob("deflection_*.csv"))}
     return Source(
         header["flight"], run.name, parse_utc(header["epoch_utc"]), facts["finished_utc"], bool(header["synthetic"]),
         header, trajectory, events, deflections, times, covariance,

@@ -27,6 +27,7 @@ import pandas as pd
 
 from flightmodel import events
 from flightmodel.checks import FloatArray, GateError, writing
+from flightmodel.guarded_files import open_file
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import NO_VIDEO, Deflections, quantiles_at
@@ -134,6 +135,12 @@ class RunFolder:
         """Write one JSON object; NaN becomes null."""
         text = json.dumps(_no_nan(value), indent=2, allow_nan=False)
         (self.path / name).write_text(text + "\n")
+
+
+def read_csv(path: Path) -> pd.DataFrame:
+    """Read a table of a run back."""
+    with open_file(path) as file:
+        return pd.read_csv(file)
 
 
 def run_hash(inputs_sha256: dict[str, str], settings: dict[str, Any], made_by: str) -> str:

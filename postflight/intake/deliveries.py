@@ -35,6 +35,7 @@ from flightmodel.aerodynamics import COLUMNS, named_columns
 from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, write_file, writing
 from flightmodel.config import read_toml
+from flightmodel.guarded_files import file_bytes
 from flightmodel.tables import to_si
 from flightmodel.vehicle import DATA, vehicle_path
 from postflight.intake.column_recognition import (
@@ -327,7 +328,7 @@ def _without_list(video: Video, folder: Path) -> str:
 def _cameras_of(folder: Path, tables: dict[str, Any]) -> list[str]:
     """Names of the cameras in the vehicle file that flight.toml names; none where it cannot be read yet."""
     try:
-        made = tomllib.loads(vehicle_path(str(tables.get("vehicle", "")), folder).read_text(encoding="utf-8-sig"))
+        made = read_toml(vehicle_path(str(tables.get("vehicle", "")), folder))
         return list(made.get("cameras", {}))
     except (OSError, ValueError):
         return []
@@ -490,10 +491,10 @@ def _beside_pictures(folder: Path, video: Video) -> list[Fault]:
 
 def _bytes_of(file: Path) -> bytes:
     try:
-        return file.read_bytes()
+        return file_bytes(file)
     except OSError as fault:
         words = f"cannot be read: {fault.strerror or fault}"
-        raise GateError(f"{file}: {words}", code="file-unreadable") from None
+        raise GateError(f"{file}: {words}", getattr(fault, "code", "file-unreadable")) from None
 
 
 def _coefficients(came: _Delivery, folder: Path, tables: dict[str, Any]) -> None:
@@ -514,7 +515,7 @@ def _coefficients(came: _Delivery, folder: Path, tables: dict[str, Any]) -> None
         if place in came.files:
             raise ConfigError(f"{place}: two delivered tables of this name; rename one", code="file-exists")
         came.files |= {place: content, place.with_suffix(".toml"): sidecar_text(columns)}
-        text = came.vehicle.get(vehicle) or (vehicle.read_text(encoding="utf-8-sig") if vehicle.is_file() else "")
+        text = came.vehicle.get(vehicle) or (file_bytes(vehicle).decode("utf-8-sig") if vehicle.is_file() else "")
         named = _named_in_form(text, place.name)
         if named is not None:
             came.vehicle[vehicle] = named

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.stats import quantile_test
 
 from flightmodel.checks import FloatArray, GateError, write_file
+from flightmodel.guarded_files import open_file
 from flightmodel.statistics import BAND_COLUMNS, BAND_PERCENTILES, percentile_band
 from postflight.montecarlo.study import CONFIDENCE, Study
 from synthetic_flight.ensemble import Row
@@ -97,7 +98,7 @@ def read_chunk(folder: Path, number: int, runs: list[int] | None = None, histori
     """
     path = chunk_path(folder, number)
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with open_file(path) as file, np.load(file, allow_pickle=False) as data:
             held = data["runs"]
             reasons = tuple(data["reasons"].tobytes().decode().split("\0"))
             past = data["histories"] if histories else np.empty((len(held), 0, 0), dtype=np.float32)

@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from flightmodel.checks import ConfigError, GateError, Progress, write_file
+from flightmodel.guarded_files import file_bytes
 from postflight.montecarlo import trial
 from postflight.montecarlo.bands import (
     Chunk,
@@ -210,7 +211,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
     """Return ``study.json``; `GateError` where the folder holds no study."""
     path = folder / "study.json"
     try:
-        held = json.loads(path.read_text())
+        held = json.loads(file_bytes(path))
         kinds = (("settings", dict), ("flights", int), ("source", str))
         if not all(isinstance(held[key], kind) for key, kind in kinds):
             raise ValueError("not a study")
