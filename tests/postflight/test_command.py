@@ -21,7 +21,6 @@ import pytest
 from flightmodel.checks import writing
 from postflight import commands
 from postflight.deflections import METHODS
-from postflight.run_folder import PARTIAL, remove_abandoned
 from tests.postflight.killing import kill_run, run_again, start_command
 from tests.refusing import printed_codes, refuses
 
@@ -440,19 +439,6 @@ def test_killed_runs_leave_nothing_half_written(two_runs, clean_flight, tmp_path
     assert kill_run(tmp_path / "flight", None, saved) == "while writing"
     assert set(moments) <= {"before anything", "while writing"}
     run_again(tmp_path / "flight", saved)
-
-
-def test_what_a_killed_run_left_is_removed(tmp_path: Path) -> None:
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    left, ours, other = (
-        tmp_path / f"{PARTIAL}{number}-abc" for number in (gone.pid, os.getpid(), "x")
-    )  # fmt: skip
-    for path in (left, ours, other):
-        path.mkdir()
-        (path / "bet.csv").write_text("half")
-    remove_abandoned(tmp_path)
-    assert sorted(tmp_path.iterdir()) == sorted([ours, other])
 
 
 def limited(*arguments: str | Path, largest_bytes: int) -> subprocess.CompletedProcess[str]:
