@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+import unicodedata
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -31,6 +32,16 @@ YEARS = (1940, 2200)
 LARGEST_TOML_BYTES = 10_000_000
 # also the name of a table in TOML, of a file and of a column
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
+
+
+def one_line(value: str) -> str:
+    """Refuse a name that would move a cursor, turn a line round or begin another one where it is shown."""
+    if any(unicodedata.category(sign) in ("Cc", "Cf", "Cs", "Zl", "Zp") for sign in value):
+        raise ValueError("one line without control or bidirectional characters is wanted")
+    return value
+
+
+Label = Annotated[str, AfterValidator(one_line)]  # a name for people, who read it in tables and figures
 FILL_IN_VALUE = "FILL IN"  # where a new file leaves a value to its user
 FILL_IN = "still to fill in"  # and the message for it
 NAME_RULE = "a name has 1 to 64 letters (a to z), digits, _ and -"

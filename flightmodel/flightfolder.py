@@ -23,6 +23,7 @@ from flightmodel.config import (
     Duration,
     Elevation,
     KeyFaults,
+    Label,
     Latitude,
     Longitude,
     Name,
@@ -160,7 +161,7 @@ class MotionEntry(Section):
 class EventEntry(Section):
     """A named event."""
 
-    name: str
+    name: Label
     t_s: Time
 
 
@@ -182,7 +183,7 @@ class SensorsEntry(Section):
 class FlightFile(Section):
     """The whole of ``flight.toml``."""
 
-    name: str
+    name: Label
     t0_utc: str
     vehicle: str | None = None
     synthetic: bool = False

@@ -21,6 +21,7 @@ from flightmodel.config import (
     ErrorAngle,
     Fraction,
     KeyFaults,
+    Label,
     Length,
     Name,
     Place,
@@ -205,7 +206,7 @@ class CameraMount(Section):
 class VehicleFile(Section):
     """The whole of a vehicle file."""
 
-    name: str
+    name: Label
     description: str = ""
     reference: Reference
     joint: CompliantJoint

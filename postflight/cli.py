@@ -14,6 +14,8 @@ from typing import Any, Literal
 
 import click
 
+from postflight.streams import close_streams, open_streams, write_out
+
 # heavy imports stand inside the commands, so that --help answers at once
 FOLDER = click.Path(path_type=Path)
 
@@ -329,9 +331,9 @@ def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path,
     if notebook and bands:
         raise click.UsageError("--bands belongs to the report in HTML; leave out --notebook")
     if notebook:
-        click.echo(f"report in {write_notebook(folder, target=output)}")
+        write_out(f"report in {write_notebook(folder, target=output)}\n")
     else:
-        click.echo(f"report in {write_report(folder, target=output, studies=bands)}")
+        write_out(f"report in {write_report(folder, target=output, studies=bands)}\n")
 
 
 @cli.command()
@@ -383,7 +385,7 @@ def schema(kind: str) -> None:
     """Print the JSON Schema of a flight.toml, vehicle or scenario file, or of a coefficient table's sidecar."""
     from postflight.intake.flight_form import schema_text
 
-    click.echo(schema_text(kind), nl=False)
+    write_out(schema_text(kind))
 
 
 @cli.command()
@@ -406,6 +408,7 @@ def terminate(_number: int, _frame: object) -> None:
 def main() -> None:
     """Run the command; known faults become messages and exit codes, never a traceback."""
     signal.signal(signal.SIGTERM, terminate)
+    open_streams()
     try:
         cli.main(standalone_mode=False)
     except click.exceptions.Exit as stop:
@@ -415,7 +418,7 @@ def main() -> None:
         known = isinstance(fault, click.exceptions.Abort | KeyboardInterrupt)
         if not known and not isinstance(fault.__cause__, KeyboardInterrupt):
             raise
-        click.echo("interrupted; nothing half-written is left", err=True)
+        write_out("interrupted; nothing half-written is left\n", sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
     except click.ClickException as fault:
         fault.show()
@@ -423,10 +426,12 @@ def main() -> None:
     except OSError as fault:
         where = fault.filename or "reading or writing a file failed"
         code = getattr(fault, "code", "")
-        click.echo(f"error: {where}: {fault.strerror or fault}{f' [{code}]' if code else ''}", err=True)
+        write_out(f"error: {where}: {fault.strerror or fault}{f' [{code}]' if code else ''}\n", sys.stderr)
         sys.exit(3)
     except ValueError as fault:
         sys.exit(refusal(fault))
+    finally:
+        close_streams()
 
 
 def refusal(fault: ValueError) -> int:
@@ -436,9 +441,9 @@ def refusal(fault: ValueError) -> int:
     if not isinstance(fault, GateError):
         raise fault
     for line in fault.faults:
-        click.echo(f"error: {line}{f' [{line.code}]' if line.code else ''}", err=True)
+        write_out(f"error: {line}{f' [{line.code}]' if line.code else ''}\n", sys.stderr)
     if len(fault.faults) > 1:
-        click.echo(f"{len(fault.faults)} faults", err=True)
+        write_out(f"{len(fault.faults)} faults\n", sys.stderr)
     return fault.exit_code
 
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -33,6 +32,8 @@ from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
+from postflight.streams import write_out
+from postflight.terminal import terminal
 from recon.consistency import ConsistencyCheck
 from recon.setup import check_sources
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
@@ -46,8 +47,8 @@ SHORT = {
 }  # fmt: skip
 LARGEST_NORMAL = 3.5  # standard deviations that one of some dozens of changes may be off
 REFERENCE = "irve2_reference"
-console = Console(soft_wrap=True)
-console_err = Console(stderr=True, soft_wrap=True)
+console = terminal()
+console_err = terminal(stderr=True)
 
 
 def compile_kernels(*groups: str) -> None:
@@ -390,7 +391,7 @@ def score(folder: Path, as_json: bool) -> None:
     """Score the newest run; exit 5 where recovery fails."""
     result = score_run(folder)
     if as_json:
-        sys.stdout.write(json.dumps(result.as_json()) + "\n")
+        write_out(json.dumps(result.as_json()) + "\n")
     else:
         print_score(result)
     if result.failures:

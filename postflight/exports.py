@@ -32,12 +32,12 @@ from xml.sax.saxutils import escape
 import numpy as np
 import pandas as pd
 from rich import markup
-from rich.console import Console
 
 from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
 from flightmodel.config import parse_utc
 from flightmodel.guarded_files import file_bytes, open_file
 from postflight.run_folder import DIGITS, newest_run, read_csv
+from postflight.terminal import terminal
 
 _UNITS = {
     "m": "m", "mps": "m s-1", "mps2": "m s-2", "deg": "degree", "degps": "degree s-1", "pa": "Pa", "kgpm3": "kg m-3",
@@ -290,15 +290,15 @@ def _kml(source: Source) -> bytes:
     for event in source.events.itertuples(index=False):
         at = ",".join(f"{np.interp(event.t_s, t, c):.9g}" for c in place.T)
         points += (
-            f"<Placemark><name>{escape(_printable(str(event.event)))}</name><TimeStamp><when>{source.utc(event.t_s)}Z"
+            f"<Placemark><name>{_label(str(event.event))}</name><TimeStamp><when>{source.utc(event.t_s)}Z"
             f"</when></TimeStamp><Point><altitudeMode>absolute</altitudeMode><coordinates>{at}</coordinates></Point>"
             "</Placemark>\n"
         )
     text = f"""<?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
 <Document>
-<name>{escape(_printable(source.name))}</name>
-<description>{escape(_printable(description))}</description>
+<name>{_label(source.name)}</name>
+<description>{escape(escape(_printable(description))).replace("$[", "$ [")}</description>
 <Style id="flight"><LineStyle><color>ff0080ff</color><width>2</width></LineStyle></Style>
 <Placemark><name>track</name><styleUrl>#flight</styleUrl><gx:Track><altitudeMode>absolute</altitudeMode>
 {whens}{track}</gx:Track></Placemark>
@@ -311,6 +311,11 @@ def _kml(source: Source) -> bytes:
 </kml>
 """
     return text.encode()
+
+
+def _label(text: str) -> str:
+    """Name of a place: a globe lists it as text, and shows it in a balloon as HTML in which ``$[...]`` is filled in."""
+    return escape(_printable(text).translate({ord("<"): "‹", ord(">"): "›"}).replace("$[", "$ ["))
 
 
 def _oem(source: Source) -> bytes:
@@ -362,7 +367,7 @@ FORMS: dict[str, tuple[Callable[[Source], bytes], str]] = {
     "oem": (_oem, ".oem"),
 }
 EXTRAS = {"pyarrow": "parquet"}  # library, and the extra of the installation that brings it
-console = Console(soft_wrap=True)
+console = terminal()
 
 
 def export(folder: Path, form: str, out: Path | None) -> None:

@@ -14,6 +14,7 @@ import errno
 import hashlib
 import json
 import platform
+import re
 import shutil
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -136,12 +137,26 @@ class RunFolder:
 
     def write_csv(self, name: str, table: pd.DataFrame) -> None:
         """Write a table."""
-        table.to_csv(self.path / name, index=False, float_format=DIGITS, lineterminator="\n")
+        plain_text(table).to_csv(self.path / name, index=False, float_format=DIGITS, lineterminator="\n")
 
     def write_json(self, name: str, value: Any) -> None:
         """Write one JSON object; NaN becomes null."""
         text = json.dumps(_no_nan(value), indent=2, allow_nan=False)
         (self.path / name).write_text(text + "\n")
+
+
+# what a spreadsheet takes for a formula; a name such as -x, of letters and digits, computes nothing
+_FORMULA = re.compile(r"[=@\t\r＝＠]|[+\-＋－].*[^A-Za-z0-9_+-]", re.DOTALL)
+
+
+def plain_text(table: pd.DataFrame) -> pd.DataFrame:
+    """Table in which an apostrophe stands before every text that a spreadsheet would execute."""
+    texts = [name for name in table if not pd.api.types.is_numeric_dtype(table[name])]
+
+    def neutral(cell: Any) -> Any:
+        return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
+
+    return table.assign(**{name: table[name].map(neutral) for name in texts})
 
 
 def read_csv(path: Path) -> pd.DataFrame:

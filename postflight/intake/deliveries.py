@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -54,6 +53,7 @@ from postflight.intake.column_recognition import (
 from postflight.intake.flight_form import placeholders, section_text, start_text, template
 from postflight.intake.freeform_tables import FreeFormTable, read_matlab, read_text_table
 from postflight.intake.headers import fold, parse_column_name
+from postflight.terminal import terminal
 
 _WIND_AXES = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:])
 _DAVEML = (".dml",)
@@ -66,7 +66,7 @@ _BELONG = 0.9  # of a list's names, in the folder that it is of
 _RADIOSONDE = {"alt", "temperature", "pressure", "wind_speed", "wind_from"}
 _ZERO_C_K = 273.15
 _LOWEST_M, _HIGHEST_M = -1000.0, 2e5
-console = Console(soft_wrap=True)
+console = terminal()
 
 
 # coefficients
