@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -410,7 +411,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, terminate)
     open_streams()
     try:
-        cli.main(standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = show_warning
+            cli.main(standalone_mode=False)
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
     except (click.exceptions.Abort, KeyboardInterrupt, RuntimeError) as fault:
@@ -432,6 +435,12 @@ def main() -> None:
         sys.exit(refusal(fault))
     finally:
         close_streams()
+
+
+def show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    """Print a warning as a finding, without the place in the source that `warnings` gives."""
+    code = getattr(category, "code", category.__name__)
+    write_out(f"found {message} [{code}]\n", sys.stderr)
 
 
 def refusal(fault: ValueError) -> int:

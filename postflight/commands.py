@@ -26,13 +26,14 @@ from postflight.flight import Flight, read_flight
 from postflight.plots import run_figures
 from postflight.plots.deflection import figure_summary
 from postflight.plots.overlay import write_overlay_film
-from postflight.plots.style import save
+from postflight.plots.style import draw
 from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import write_out
+from postflight.studies.preflight import rigid_bounds
 from postflight.terminal import terminal
 from recon.consistency import ConsistencyCheck
 from recon.setup import check_sources
@@ -173,12 +174,16 @@ def run_flight(
             if "camera" in answers.histories:
                 out.write_csv("camera_sensitivity.csv", camera_sensitivity(flight, answers.histories["camera"]))
             out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
-            bounds = run_figures.draw_run(bet, answers, out.path / "figures", step(0.7 * share, share))
-            if bounds is not None:
+            bounds, table = None, None
+            if bet.loads is not None:
+                bounds = rigid_bounds(bet, progress=step(0.7 * share, 0.9 * share))
                 out.write_csv("rigid_bounds.csv", bounds.table())
             if reruns:
                 table = sensitivity(bet, step(share, 1.0))
                 out.write_csv("sensitivity.csv", table)
+            # every table is written
+            run_figures.draw_run(bet, answers, out.path / "figures", step(0.9 * share, share), bounds)
+            if table is not None:
                 run_figures.draw_sensitivity(bet, table, out.path / "figures")
             step(1.0, 1.0)(0.0, "writing the report")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
@@ -436,7 +441,7 @@ def demo(folder: Path, seed: int) -> None:
         line("[yellow]no answer[/]", f"from {method}: {reason}", reason.code)
     result = score_run(folder, written)
     picture = folder / "demo.png"
-    save(figure_summary(bet, answers, truth_history(folder)), picture)
+    draw(picture, figure_summary, bet, answers, truth_history(folder))
     print_score(result)
     console.print(f"results, figures and report.html in {escape(str(written))}")
     console.print(f"the answer as a picture, with the truth: {escape(str(picture))}")

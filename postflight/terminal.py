@@ -1,4 +1,4 @@
-"""The console that commands print on."""
+"""On what do commands print? On rich's console, which text from files cannot steer and a lost reader cannot end."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ import pytest
 from flightmodel.checks import writing
 from postflight import commands
 from postflight.deflections import METHODS
+from postflight.plots import run_figures
 from tests.postflight.killing import kill_run, run_again, start_command
 from tests.refusing import printed_codes, refuses
 
@@ -439,6 +440,24 @@ def test_killed_runs_leave_nothing_half_written(two_runs, clean_flight, tmp_path
     assert kill_run(tmp_path / "flight", None, saved) == "while writing"
     assert set(moments) <= {"before anything", "while writing"}
     run_again(tmp_path / "flight", saved)
+
+
+@pytest.mark.filterwarnings("default::RuntimeWarning")
+def test_a_figure_that_fails_costs_itself_alone_and_says_so(flight, command, monkeypatch) -> None:
+    def fails(*_: object) -> None:
+        raise ValueError("two dollars: $x$ \\bad")
+
+    for name in ("figure_residuals", "figure_2_5"):
+        monkeypatch.setattr(run_figures, name, fails)
+    done = command("run", flight.root)
+    (run,) = (flight.root / "runs").iterdir()
+    assert "Traceback" not in done.stderr
+    assert printed_codes(done.stderr) == ["figure-failed"] * 2
+    assert all(name in done.stderr for name in ("residuals.png", "figure_2_5.png"))
+    drawn = {p.name for p in (run / "figures").iterdir()}
+    assert "filter_and_smoother.png" in drawn
+    assert not drawn & {"residuals.png", "figure_2_5.png"}
+    assert {"summary.json", "report.html", "rigid_bounds.csv", "bet.csv"} <= {p.name for p in run.iterdir()}
 
 
 def limited(*arguments: str | Path, largest_bytes: int) -> subprocess.CompletedProcess[str]:
