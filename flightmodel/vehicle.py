@@ -346,6 +346,9 @@ def vehicle_from_toml(path: Path) -> Vehicle:
         words = "leads out of the vehicle file's folder; copy the file there"
         raise ConfigError([f"{path.parent / name}: {words}" for name in out], code="path-outside-folder")
     own = table is not None and (path.parent / table).exists()
+    if own and table is not None and (path.parent / table).with_suffix(".toml").resolve() == path.resolve():
+        words = f"key 'aerodynamics.table' = '{table}': its sidecar would be this vehicle file; rename the table"
+        raise ConfigError(f"{path}: {words}", code="sidecar-is-vehicle")
     aero, table_sd = aerodynamics_from(spec.aerodynamics, shape, (path.parent, DATA / "aerodynamics"))
     lenses = {name: camera.position_m for name, camera in spec.cameras.items()}
     meshes = body_meshes(spec.meshes, path.parent, shell, lenses)

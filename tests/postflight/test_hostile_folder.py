@@ -155,6 +155,17 @@ def test_a_run_folder_with_a_pipe(flight, command, name, verb):
     assert "Traceback" not in done.stderr, done.stderr
 
 
+def test_a_vehicle_file_of_its_table_s_name_is_one_fault(with_vehicle):
+    """The sidecar of vehicle.csv would be vehicle.toml, which is no sidecar in twenty ways."""
+    root = with_vehicle.root
+    (root / "aero.csv").rename(root / "vehicle.csv")
+    text = (root / "vehicle.toml").read_text()
+    (root / "vehicle.toml").write_text(text.replace('"aero.csv"', '"vehicle.csv"'))
+    with refuses("sidecar-is-vehicle", names=["vehicle.csv"], kind=ConfigError) as caught:
+        read_flight(root)
+    assert len(caught.value.faults) == 1
+
+
 def test_what_grows_while_it_is_read_has_an_end(tmp_path):
     """A file of /proc states no size."""
     status = "/proc/self/status"
