@@ -16,6 +16,7 @@ from typing import Any, Literal
 import click
 
 from postflight.streams import close_streams, open_streams, write_out
+from postflight.threads import pin_threads
 
 # heavy imports stand inside the commands, so that --help answers at once
 FOLDER = click.Path(path_type=Path)
@@ -32,7 +33,10 @@ def montecarlo() -> None:
 def workers_and_scheduler(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that say who flies."""
     command = click.option(
-        "--scheduler", metavar="ADDRESS", help="Fly on the Dask cluster of this scheduler, e.g. tcp://host:8786."
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Fly on the cluster of this Dask scheduler: tcp://127.0.0.1:8786, or tls://HOST:8786; without TLS its "
+        "ports are open to everyone on the network.",
     )(command)
     return click.option("--workers", type=click.IntRange(min=1), help="Processes here; every core by default.")(command)
 
@@ -410,6 +414,7 @@ def main() -> None:
     """Run the command; known faults become messages and exit codes, never a traceback."""
     signal.signal(signal.SIGTERM, terminate)
     open_streams()
+    pin_threads()
     try:
         with warnings.catch_warnings():
             warnings.showwarning = show_warning
