@@ -6,3 +6,11 @@ Conventions (CONVENTIONS.md has them all): SI and radians in memory; frames ``ec
 """
 
 from __future__ import annotations
+
+import os
+from pathlib import Path
+
+try:
+    Path.home()
+except RuntimeError:  # no HOME, and a user without a name: libraries fail at import; container engines set this
+    os.environ["HOME"] = "/"

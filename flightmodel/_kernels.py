@@ -10,49 +10,46 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import math
-import os
 from pathlib import Path
 
 import llvmlite.binding
 import numba
 
+from flightmodel.cache_folder import CacheFolder, cache_folder
+
 # Contraction and reordering are allowed; assuming away NaN is not: telemetry marks gaps with it.
 FASTMATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 
-def _point_cache_at_these_sources() -> Path | None:
+def _point_cache_at_these_sources() -> CacheFolder:
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()}".encode())
     for package in ("flightmodel", "recon", "estimators", "synthetic_flight"):
         spec = importlib.util.find_spec(package)
         for folder in (spec.submodule_search_locations or ()) if spec else ():
             for source in sorted(Path(folder).glob("*_kernels.py")):
                 digest.update(source.name.encode() + source.read_bytes())
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    cache = Path(os.environ.get("NUMBA_CACHE_DIR") or base / "postflight") / f"kernels-{digest.hexdigest()[:16]}"
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-    except OSError:  # a read-only home: numba compiles anew, which is slow but right
-        return None
-    numba.config.CACHE_DIR = str(cache)
+    cache = cache_folder(f"kernels-{digest.hexdigest()[:16]}")
+    numba.config.CACHE_DIR = str(cache.path or "")
     return cache
 
 
 CACHE = _point_cache_at_these_sources()
+KEPT = CACHE.path is not None  # without a folder numba must not be asked for a cache: it would refuse to import
 
 
 def kernel(function):
     """Compile with the project's settings: for what is called from Python only."""
-    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)(function)
+    return numba.njit(cache=KEPT, nogil=True, error_model="numpy", fastmath=FASTMATH)(function)
 
 
 def exact_kernel(function):
     """Compile as `kernel` does, but every operation as it is written: for what must round correctly."""
-    return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return numba.njit(cache=KEPT, nogil=True, error_model="numpy")(function)
 
 
 def exact_inlined(function):
     """Compile as `exact_kernel` does, as a part of every kernel that calls it."""
-    return numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function)
+    return numba.njit(cache=KEPT, nogil=True, error_model="numpy", forceinline=True)(function)
 
 
 def inlined(function):
@@ -62,7 +59,7 @@ def inlined(function):
     optimised; which one runs would depend on what was compiled in the process and what came from the cache.
     """
     options = {"nogil": True, "error_model": "numpy", "fastmath": FASTMATH, "forceinline": True}
-    return numba.njit(cache=True, **options)(function)
+    return numba.njit(cache=KEPT, **options)(function)
 
 
 def merged(function):

@@ -43,6 +43,7 @@ from pydantic import Field, model_validator
 
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, TableRangeError
 from flightmodel.config import FileBeside, Fraction, KeyFaults, Length, Place, Section, parse_section, read_toml
+from flightmodel.guarded_files import file_bytes
 from flightmodel.sphere_cone import (
     bridge,
     sphere_cone_closed_form,
@@ -215,11 +216,12 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
         With every fault: missing columns, numbers that are not finite, a grid with holes or uneven angles.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = file_bytes(path, LARGEST_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such aerodynamic table", code="file-missing") from None
     except (OSError, UnicodeDecodeError) as fault:
-        raise GateError(f"{path}: cannot be read as a table: {fault}", code="file-unreadable") from None
+        code = getattr(fault, "code", "file-unreadable")
+        raise GateError(f"{path}: cannot be read as a table: {getattr(fault, 'strerror', fault)}", code) from None
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
     header = [cell.strip() for cell in lines[0][1].split("#")[0].split(",")] if lines else []
     header = [c.lower() if c.lower() in names else c for c in header]
@@ -357,13 +359,10 @@ def read_daveml(path: Path, force_names: tuple[str, str] = ("CA", "CN")) -> Aero
 
 def _parse(path: Path) -> ET.Element:
     try:
-        data = path.read_bytes()
+        data = file_bytes(path, LARGEST_BYTES)
     except OSError as fault:
-        raise GateError(f"{path}: cannot be read: {fault.strerror or fault}", code="file-unreadable") from None
-    if len(data) > LARGEST_BYTES:
-        raise GateError(
-            f"{path}: {len(data)} bytes; DAVE-ML files above {LARGEST_BYTES} are not read", code="file-too-large"
-        )
+        code = getattr(fault, "code", "file-unreadable")
+        raise GateError(f"{path}: cannot be read: {fault.strerror or fault}", code) from None
     scout = expat.ParserCreate()
 
     def refuse(*_: Any) -> None:

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flightmodel.partial_files import abandoned, partial_path
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -100,9 +102,14 @@ def writing(where: Path, remedy: str) -> Iterator[None]:
 
 
 def write_file(path: Path, content: bytes | str) -> None:
-    """Write bytes, or text as UTF-8, whole or not at all: beside its place, then renamed; folders are made."""
+    """Write bytes, or text as UTF-8, whole or not at all: beside its place, then renamed; folders are made.
+
+    Of several processes that write one file at once, the last one's stays.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
+    for left in abandoned(path.parent, path.name):
+        left.unlink(missing_ok=True)
+    partial = partial_path(path)
     try:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
         partial.replace(path)

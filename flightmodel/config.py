@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+import unicodedata
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from flightmodel.checks import ConfigError, Fault, nearest_name
+from flightmodel.guarded_files import file_bytes
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
 Positive = Annotated[float, Field(gt=0.0)]
@@ -30,6 +32,16 @@ YEARS = (1940, 2200)
 LARGEST_TOML_BYTES = 10_000_000
 # also the name of a table in TOML, of a file and of a column
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
+
+
+def one_line(value: str) -> str:
+    """Refuse a name that would move a cursor, turn a line round or begin another one where it is shown."""
+    if any(unicodedata.category(sign) in ("Cc", "Cf", "Cs", "Zl", "Zp") for sign in value):
+        raise ValueError("one line without control or bidirectional characters is wanted")
+    return value
+
+
+Label = Annotated[str, AfterValidator(one_line)]  # a name for people, who read it in tables and figures
 FILL_IN_VALUE = "FILL IN"  # where a new file leaves a value to its user
 FILL_IN = "still to fill in"  # and the message for it
 NAME_RULE = "a name has 1 to 64 letters (a to z), digits, _ and -"
@@ -113,24 +125,19 @@ def read_toml(path: Path) -> dict[str, Any]:
     if "\0" in str(path):
         raise ConfigError(f"{str(path)!r}: a path holds no NUL character", code="path-nul")
     try:
-        if path.is_file() and path.stat().st_size > LARGEST_TOML_BYTES:
-            raise ConfigError(
-                f"{path}: more than {LARGEST_TOML_BYTES // 10**6} MB; no configuration is that long",
-                code="file-too-large",
-            )
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
+        return tomllib.loads(file_bytes(path, LARGEST_TOML_BYTES).decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file", code="file-missing") from None
     except RecursionError:
         raise ConfigError(
             f"{path}: not valid TOML: arrays or tables lie too deep in each other", code="toml-syntax"
         ) from None
-    except ConfigError:
-        raise
     except ValueError as fault:  # also integers of thousands of digits
         raise ConfigError(f"{path}: not valid TOML: {fault}", code="toml-syntax") from None
     except OSError as fault:
-        raise ConfigError(f"{path}: cannot be read: {fault.strerror or fault}", code="file-unreadable") from None
+        raise ConfigError(
+            f"{path}: cannot be read: {fault.strerror or fault}", getattr(fault, "code", "file-unreadable")
+        ) from None
 
 
 def parse_section(model: type[SectionT], tables: dict[str, Any], where: str) -> SectionT:

@@ -9,6 +9,7 @@ refuse by name.
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
 from flightmodel.checks import NO_FAULT, Fault, FloatArray
+from flightmodel.guarded_files import PICTURE_BYTES, unfit
 from flightmodel.vehicle import CameraMount
 
 Image = NDArray[np.uint8]
@@ -155,8 +157,8 @@ def film_timing_fault(path: Path) -> Fault:
 
 def film_fault(path: Path, camera: CameraMount, last_number: int) -> str:
     """Say why a film cannot be used; empty when it can."""
-    if not path.is_file():
-        return Fault("no such file", "file-missing")
+    if fault := unfit(path, sys.maxsize):  # it is decoded frame by frame
+        return fault
     if path.stat().st_size == 0:
         return Fault("is empty", "file-empty")
     with path.open("rb") as file:
@@ -190,8 +192,8 @@ def image_fault(path: Path, camera: CameraMount) -> str:
 
     Its size is read from its head first: an image of another size than the camera's is never unpacked.
     """
-    if not path.is_file():
-        return Fault("no such file", "file-missing")
+    if fault := unfit(path, PICTURE_BYTES):
+        return fault
     wanted = (camera.width_px, camera.height_px)
     try:
         with warnings.catch_warnings():

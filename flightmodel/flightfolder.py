@@ -7,6 +7,7 @@ opened here. The tables themselves: `flightmodel.sensor_tables`.
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from flightmodel.config import (
     Duration,
     Elevation,
     KeyFaults,
+    Label,
     Latitude,
     Longitude,
     Name,
@@ -32,9 +34,11 @@ from flightmodel.config import (
     parse_utc,
     read_toml,
 )
+from flightmodel.csv_reading import file_sha256
 from flightmodel.earth import OMEGA_RADPS, ecef_from_radar, geodetic_from_ecef, q_ecef_body_from_pointing
 from flightmodel.film import Frames
 from flightmodel.gate import Gate
+from flightmodel.guarded_files import open_file
 from flightmodel.instruments import (
     SITES,
     AtmosphereEntry,
@@ -197,7 +201,7 @@ class MotionEntry(Section):
 class EventEntry(Section):
     """A named event."""
 
-    name: str
+    name: Label
     t_s: Time
 
 
@@ -219,7 +223,7 @@ class SensorsEntry(Section):
 class FlightFile(Section):
     """The whole of ``flight.toml``."""
 
-    name: str
+    name: Label
     t0_utc: str
     vehicle: str | None = None
     synthetic: bool = False
@@ -468,7 +472,10 @@ def _there(records: dict[str, Record | None]) -> dict[str, Record]:
 def _vehicle(gate: Gate, name: str) -> Vehicle | None:
     """Read the vehicle that flight.toml names; None, with its faults kept, where it is refused."""
     try:
-        vehicle = vehicle_from_toml(vehicle_path(name, gate.folder))
+        path = vehicle_path(name, gate.folder)
+        if gate.is_truth(path):
+            raise ConfigError(f"{path} lies in truth/, which no estimator may open", code="path-in-truth")
+        vehicle = vehicle_from_toml(path)
     except GateError as fault:
         for each in fault.faults:
             gate.refuse_config(Fault(f"vehicle: {each}", each.code))
@@ -608,12 +615,14 @@ def _hashes(gate: Gate, spec: FlightFile, vehicle: Vehicle | None, films: dict[s
         names.add(EDITS_FILE)
     digests = {name: gate.sha256(gate.folder / name) for name in sorted(names)}
     if vehicle is not None:
-        digests[f"vehicle {vehicle.name}"] = hashlib.sha256(vehicle.source.read_bytes()).hexdigest()
+        digests[f"vehicle {vehicle.name}"] = file_sha256(vehicle.source)
         for name in vehicle.files:
-            digests[f"vehicle's {name}"] = hashlib.sha256((vehicle.source.parent / name).read_bytes()).hexdigest()
+            digests[f"vehicle's {name}"] = file_sha256(vehicle.source.parent / name)
     for name, frames in films.items():
         pictures = hashlib.sha256()
         for path in frames.paths:
-            pictures.update(path.read_bytes())
+            with open_file(path, sys.maxsize) as file:
+                while piece := file.read(1024**2):
+                    pictures.update(piece)
         digests[f"{name}'s pictures" if spec.cameras else "frames' pictures"] = pictures.hexdigest()
     return digests

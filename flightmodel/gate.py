@@ -108,13 +108,21 @@ class Gate:
         """Return why a named file may not be read: outside the folder, or below its truth; empty where it may."""
         if "\0" in named:
             return Fault(f"file {named!r}: a path holds no NUL character", "path-nul")
-        root, target = self.folder.resolve(), path.resolve()
-        if Path(named).is_absolute() or not target.is_relative_to(root):
+        if Path(named).is_absolute() or not path.resolve().is_relative_to(self.folder.resolve()):
             words = f"file '{named}' lies outside the flight folder; copy it inside and name it relative to flight.toml"
             return Fault(words, "path-outside-folder")
-        if target.is_relative_to(root / "truth"):
-            return Fault(f"file '{named}' lies below truth/, which no estimator may open", "path-in-truth")
+        if self.is_truth(path):
+            return Fault(f"file '{named}' lies in truth/, which no estimator may open", "path-in-truth")
         return ""
+
+    def is_truth(self, path: Path) -> bool:
+        """Whether a path leads below ``truth/`` of this flight, or to a file there by another name (a hard link)."""
+        truth = self.folder / "truth"
+        if path.resolve().is_relative_to(truth.resolve()):
+            return True
+        if not path.is_file() or path.stat().st_nlink == 1:
+            return False
+        return any(path.samefile(other) for other in truth.rglob("*") if other.is_file())
 
     def path(self, named: str) -> Path | None:
         """Path of a file or folder that flight.toml names; None, with a fault, where it may not be read."""

@@ -36,6 +36,7 @@ from flightmodel import rotations
 from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError
 from flightmodel.config import FileBeside, KeyFaults, Length, Section, beside
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
+from flightmodel.guarded_files import UnfitFile, file_bytes
 
 if TYPE_CHECKING:
     import trimesh
@@ -415,13 +416,10 @@ def read_mesh(path: Path) -> tuple[FloatArray, Faces]:
     """
     if not path.is_file():
         raise ConfigError(f"{path}: no such mesh; key 'meshes' names it", code="file-missing")
-    size = path.stat().st_size
-    if size > LARGEST_BYTES:
-        raise GateError(
-            f"{path}: {size / 1e6:.0f} MB where {LARGEST_BYTES // 10**6} at most are taken; thin it out",
-            code="file-too-large",
-        )
-    data, kind = path.read_bytes(), path.suffix.lower()[1:]
+    try:
+        data, kind = file_bytes(path, LARGEST_BYTES), path.suffix.lower()[1:]
+    except UnfitFile as unfit:
+        raise GateError(f"{path}: {unfit.strerror}", unfit.code) from None
     fault = {"stl": _fault_of_stl, "obj": _fault_of_obj, "glb": _fault_of_glb}[kind](data) if data else EMPTY
     if fault:
         raise GateError(f"{path}: {fault}", code=getattr(fault, "code", "mesh-unreadable"))

@@ -454,6 +454,10 @@ def _edits(gate: Gate, label: str, name: str, time_s: FloatArray, camera: Camera
     path = gate.folder / EDITS_FILE
     if not path.exists():
         return NO_EDITS
+    wrong = gate.wrong_place(path, EDITS_FILE)
+    if wrong:
+        gate.refuse(wrong, getattr(wrong, "code", ""))
+        return NO_EDITS
     try:
         edits = read_edits(path, name, time_s, (camera.width_px, camera.height_px))
     except GateError as fault:

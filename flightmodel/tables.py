@@ -25,6 +25,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from flightmodel.checks import Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.config import Section, Time
+from flightmodel.guarded_files import UnfitFile, file_bytes
 from flightmodel.units import UNITS, read_unit
 
 if TYPE_CHECKING:
@@ -187,9 +188,12 @@ def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
         For a file that is missing, empty, binary, ragged, or names a column twice.
     """
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        content = file_bytes(path)
+        text = "\0" if b"\0" in content else content.decode("utf-8-sig")
     except FileNotFoundError:
         raise GateError(f"{label}: {path}: no such file", code="file-missing") from None
+    except UnfitFile as fault:
+        raise GateError(f"{label}: {path}: {fault.strerror}", fault.code) from None
     except (UnicodeDecodeError, OSError) as fault:
         raise GateError(f"{label}: {path}: not a readable CSV table: {fault}", code="table-unreadable") from None
     if "\0" in text:
@@ -367,14 +371,12 @@ def unordered_times_s(
     bad = ~np.isfinite(values)
     if bad.any():
         first = int(np.argmax(bad))
-        faults.append(
-            Fault(
-                f"{label}: {path}: line {line_of(frame, first)}: time "
-                f"'{':'.join(frame[column].iloc[first] for column in spec.parts)}' is not in format "
-                f"'{spec.format}' ({int(bad.sum())} in all)",
-                "time-format",
-            )
-        )
+        cell = ":".join(frame[column].iloc[first].strip() for column in spec.parts)
+        where = f"{label}: {path}: line {line_of(frame, first)}: time '{cell}'"
+        if _SECOND_60.search(cell):
+            faults.append(Fault(f"{where} {SECOND_60}", "second-60"))
+        else:
+            faults.append(Fault(f"{where} is not in format '{spec.format}' ({int(bad.sum())} in all)", "time-format"))
         return None
     return values
 
@@ -405,12 +407,18 @@ def _times_of_day(parts: list[FloatArray], t0: datetime) -> FloatArray:
     """Seconds after t0 of hours, minutes and seconds of a day (UTC): of the day on which they lie nearest to t0."""
     hour, minute, second = parts
     with np.errstate(invalid="ignore"):
-        real = (hour >= 0) & (hour < 24) & (minute >= 0) & (minute < 60) & (second >= 0) & (second < 61)
+        real = (hour >= 0) & (hour < 24) & (minute >= 0) & (minute < 60) & (second >= 0) & (second < 60)
     of_day = (t0 - t0.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()
     after = np.where(real, 3600.0 * hour + 60.0 * minute + second - of_day, np.nan)
     return np.round(after - 86400.0 * np.round(after / 86400.0), 7)
 
 
+_SECOND_60 = re.compile(r":0?60(\.\d*)?(Z|[+-]00:?00)?$")
+# UTC days are taken as 86400 s long, so a leap second has no time of its own after t0
+SECOND_60 = (
+    "has second 60: where it is a rounded 59.9996, write second 0 of the next minute; where it is a leap second, give "
+    'the times of every table as seconds after t0 (format = "seconds")'
+)
 _IRIG = re.compile(r"^(\d{1,3}):(\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)$", re.ASCII)
 _COLONS, _POINT, _WIDEST = [3, 6, 9], 12, 22  # where the usual form has them; so many digits are exact in float64
 HALF_YEAR_S = 183 * 86400.0

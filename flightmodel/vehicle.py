@@ -21,6 +21,7 @@ from flightmodel.config import (
     ErrorAngle,
     Fraction,
     KeyFaults,
+    Label,
     Length,
     Name,
     Place,
@@ -30,6 +31,7 @@ from flightmodel.config import (
 )
 from flightmodel.deflection import lv_direction
 from flightmodel.geometry import BodyMesh, MeshFiles, ShellGeometry, body_meshes
+from flightmodel.guarded_files import leads_outside
 from flightmodel.instruments import dcm_body_from_clocking
 from flightmodel.shell_features import read_features
 
@@ -204,7 +206,7 @@ class CameraMount(Section):
 class VehicleFile(Section):
     """The whole of a vehicle file."""
 
-    name: str
+    name: Label
     description: str = ""
     reference: Reference
     joint: CompliantJoint
@@ -337,14 +339,21 @@ def vehicle_from_toml(path: Path) -> Vehicle:
         reference.length_m,
     )
     table = spec.aerodynamics.table
+    listed = [shell.features] if shell.features.lower().endswith(".csv") else []
+    drawn = [mesh.file for mesh in (spec.meshes.aeroshell, spec.meshes.centerbody) if mesh is not None]
+    beside = [*listed, *drawn, *((table, str(Path(table).with_suffix(".toml"))) if table is not None else ())]
+    if out := [name for name in beside if leads_outside(path.parent, name)]:
+        words = "leads out of the vehicle file's folder; copy the file there"
+        raise ConfigError([f"{path.parent / name}: {words}" for name in out], code="path-outside-folder")
     own = table is not None and (path.parent / table).exists()
+    if own and table is not None and (path.parent / table).with_suffix(".toml").resolve() == path.resolve():
+        words = f"key 'aerodynamics.table' = '{table}': its sidecar would be this vehicle file; rename the table"
+        raise ConfigError(f"{path}: {words}", code="sidecar-is-vehicle")
     aero, table_sd = aerodynamics_from(spec.aerodynamics, shape, (path.parent, DATA / "aerodynamics"))
     lenses = {name: camera.position_m for name, camera in spec.cameras.items()}
     meshes = body_meshes(spec.meshes, path.parent, shell, lenses)
-    listed = [shell.features] if shell.features.lower().endswith(".csv") else []
     if listed:
         shell = shell.with_listed(read_features(path.parent / listed[0], shell))
-    drawn = [mesh.file for mesh in (spec.meshes.aeroshell, spec.meshes.centerbody) if mesh is not None]
     # the vehicle file's own word first, then the table's
     stated = {k: v for k, v in table_sd if v is not None and k not in spec.uncertainty.model_fields_set}
     return Vehicle(

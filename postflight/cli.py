@@ -10,12 +10,16 @@ import _thread
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any, Literal
 
 import click
+
+from postflight.streams import close_streams, open_streams, write_out
+from postflight.threads import pin_threads
 
 # heavy imports stand inside the commands, so that --help answers at once
 FOLDER = click.Path(path_type=Path)
@@ -46,7 +50,10 @@ def montecarlo() -> None:
 def workers_and_scheduler(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that say who flies."""
     command = click.option(
-        "--scheduler", metavar="ADDRESS", help="Fly on the Dask cluster of this scheduler, e.g. tcp://host:8786."
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Fly on the cluster of this Dask scheduler: tcp://127.0.0.1:8786, or tls://HOST:8786; without TLS its "
+        "ports are open to everyone on the network.",
     )(command)
     return click.option("--workers", type=click.IntRange(min=1), help="Processes here; every core by default.")(command)
 
@@ -358,9 +365,9 @@ def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path,
     if notebook and bands:
         raise click.UsageError("--bands belongs to the report in HTML; leave out --notebook")
     if notebook:
-        click.echo(f"report in {write_notebook(folder, target=output)}")
+        write_out(f"report in {write_notebook(folder, target=output)}\n")
     else:
-        click.echo(f"report in {write_report(folder, target=output, studies=bands)}")
+        write_out(f"report in {write_report(folder, target=output, studies=bands)}\n")
 
 
 @cli.command()
@@ -415,7 +422,7 @@ def schema(kind: str) -> None:
     """Print the JSON Schema of a flight.toml, vehicle or scenario file, or of a coefficient table's sidecar."""
     from postflight.intake.flight_form import schema_text
 
-    click.echo(schema_text(kind), nl=False)
+    write_out(schema_text(kind))
 
 
 @cli.command()
@@ -455,22 +462,35 @@ def main() -> None:
     signal.signal(signal.SIGTERM, terminate)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the parent has it ignored
         signal.signal(signal.SIGINT, interrupt)
+    open_streams()
+    pin_threads()
     try:
-        cli.main(standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = show_warning
+            cli.main(standalone_mode=False)
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
     except (click.exceptions.Abort, KeyboardInterrupt):
-        click.echo("interrupted; nothing half-written is left", err=True)
+        write_out("interrupted; nothing half-written is left\n", sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
     except click.ClickException as fault:
         fault.show()
         sys.exit(fault.exit_code)
     except OSError as fault:
         where = fault.filename or "reading or writing a file failed"
-        click.echo(f"error: {where}: {fault.strerror or fault}", err=True)
+        code = getattr(fault, "code", "")
+        write_out(f"error: {where}: {fault.strerror or fault}{f' [{code}]' if code else ''}\n", sys.stderr)
         sys.exit(3)
     except ValueError as fault:
         sys.exit(refusal(fault))
+    finally:
+        close_streams()
+
+
+def show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    """Print a warning as a finding, without the place in the source that `warnings` gives."""
+    code = getattr(category, "code", category.__name__)
+    write_out(f"found {message} [{code}]\n", sys.stderr)
 
 
 def refusal(fault: ValueError) -> int:
@@ -480,9 +500,9 @@ def refusal(fault: ValueError) -> int:
     if not isinstance(fault, GateError):
         raise fault
     for line in fault.faults:
-        click.echo(f"error: {line}{f' [{line.code}]' if line.code else ''}", err=True)
+        write_out(f"error: {line}{f' [{line.code}]' if line.code else ''}\n", sys.stderr)
     if len(fault.faults) > 1:
-        click.echo(f"{len(fault.faults)} faults", err=True)
+        write_out(f"{len(fault.faults)} faults\n", sys.stderr)
     return fault.exit_code
 
 

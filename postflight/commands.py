@@ -8,12 +8,12 @@ import sys
 import time
 import tomllib
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -27,12 +27,15 @@ from postflight.flight import Flight, read_flight
 from postflight.plots import run_figures
 from postflight.plots.deflection import figure_summary
 from postflight.plots.overlay import write_overlay_film
-from postflight.plots.style import save
+from postflight.plots.style import draw
 from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
+from postflight.streams import write_out
+from postflight.studies.preflight import rigid_bounds
+from postflight.terminal import terminal
 from recon.consistency import ConsistencyCheck
 from recon.setup import check_sources
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
@@ -46,22 +49,28 @@ SHORT = {
 }  # fmt: skip
 LARGEST_NORMAL = 3.5  # standard deviations that one of some dozens of changes may be off
 REFERENCE = "irve2_reference"
-console = Console(soft_wrap=True)
-console_err = Console(stderr=True, soft_wrap=True)
+console = terminal()
+console_err = terminal(stderr=True)
 
 
 def compile_kernels(*groups: str) -> None:
     """Compile before first use, and say so."""
+    _say_once(warmup.CACHE.remark)
     warmup.prepare(groups, lambda words: console_err.print(escape(words)))
+
+
+@cache
+def _say_once(words: str) -> None:
+    if words:
+        console_err.print(f"[yellow]found[/] {escape(f'{words} [no-cache]')}")
 
 
 def warm_up() -> None:
     """Compile every group of kernels that is missing, and say where they lie."""
+    if warmup.CACHE.remark:
+        raise GateError(warmup.CACHE.remark, "cannot-write")
     compile_kernels(*warmup.GROUPS)
-    if warmup.CACHE is None:
-        words = "no folder to keep compiled kernels in can be written: set XDG_CACHE_HOME or NUMBA_CACHE_DIR"
-        raise GateError(words, "cannot-write")
-    console.print(f"kernels are compiled: {escape(str(warmup.CACHE))}")
+    console.print(f"kernels are compiled: {escape(str(warmup.CACHE.path))}")
 
 
 def scenario_and_folder(arguments: tuple[str, ...]) -> tuple[str, Path]:
@@ -124,9 +133,9 @@ def print_events(flown: list[Event]) -> None:
 def run(folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False) -> None:
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers."""
     bet, answers, written = run_flight(folder, methods, wanted, reruns)
-    print_flight(bet, pd.read_csv(written / "events.csv"))
+    print_flight(bet, run_folder.read_csv(written / "events.csv"))
     if reruns:
-        print_sensitivity(pd.read_csv(written / "sensitivity.csv"))
+        print_sensitivity(run_folder.read_csv(written / "sensitivity.csv"))
     if methods:
         print_answers(answers)
     console.print(f"results in {escape(str(written))}, to read in report.html")
@@ -166,12 +175,16 @@ def run_flight(
             if "camera" in answers.histories:
                 out.write_csv("camera_sensitivity.csv", camera_sensitivity(flight, answers.histories["camera"]))
             out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
-            bounds = run_figures.draw_run(bet, answers, out.path / "figures", step(0.7 * share, share))
-            if bounds is not None:
+            bounds, table = None, None
+            if bet.loads is not None:
+                bounds = rigid_bounds(bet, progress=step(0.7 * share, 0.9 * share))
                 out.write_csv("rigid_bounds.csv", bounds.table())
             if reruns:
                 table = sensitivity(bet, step(share, 1.0))
                 out.write_csv("sensitivity.csv", table)
+            # every table is written
+            run_figures.draw_run(bet, answers, out.path / "figures", step(0.9 * share, share), bounds)
+            if table is not None:
                 run_figures.draw_sensitivity(bet, table, out.path / "figures")
             step(1.0, 1.0)(0.0, "writing the report")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
@@ -388,7 +401,7 @@ def score(folder: Path, as_json: bool) -> None:
     """Score the newest run; exit 5 where recovery fails."""
     result = score_run(folder)
     if as_json:
-        sys.stdout.write(json.dumps(result.as_json()) + "\n")
+        write_out(json.dumps(result.as_json()) + "\n")
     else:
         print_score(result)
     if result.failures:
@@ -428,12 +441,12 @@ def demo(folder: Path, seed: int) -> None:
     compile_kernels("simulator", "ensembles", *warmup.RECONSTRUCTION, "camera")
     simulate(REFERENCE, folder, seed, force=True)
     bet, answers, written = run_flight(folder, METHODS, Asked())
-    print_flight(bet, pd.read_csv(written / "events.csv"))
+    print_flight(bet, run_folder.read_csv(written / "events.csv"))
     for method, reason in answers.refused.items():
         line("[yellow]no answer[/]", f"from {method}: {reason}", reason.code)
     result = score_run(folder, written)
     picture = folder / "demo.png"
-    save(figure_summary(bet, answers, truth_history(folder)), picture)
+    draw(picture, figure_summary, bet, answers, truth_history(folder))
     print_score(result)
     console.print(f"results, figures and report.html in {escape(str(written))}")
     console.print(f"the answer as a picture, with the truth: {escape(str(picture))}")
@@ -445,7 +458,7 @@ def demo(folder: Path, seed: int) -> None:
 def truth_history(folder: Path) -> tuple[FloatArray, FloatArray]:
     """Times and true deflection, deg, of a synthetic flight, for drawing after everything is estimated."""
     try:
-        table = pd.read_csv(folder / "truth" / "deflection.csv")
+        table = run_folder.read_csv(folder / "truth" / "deflection.csv")
     except FileNotFoundError:
         raise GateError(f"{folder}: no truth/deflection.csv", "truth-missing") from None
     return table["t_s"].to_numpy(), table["theta_deg"].to_numpy()

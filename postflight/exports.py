@@ -32,11 +32,12 @@ from xml.sax.saxutils import escape
 import numpy as np
 import pandas as pd
 from rich import markup
-from rich.console import Console
 
 from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
 from flightmodel.config import parse_utc
-from postflight.run_folder import DIGITS, newest_run
+from flightmodel.guarded_files import file_bytes, open_file
+from postflight.run_folder import DIGITS, newest_run, read_csv
+from postflight.terminal import terminal
 
 _UNITS = {
     "m": "m", "mps": "m s-1", "mps2": "m s-2", "deg": "degree", "degps": "degree s-1", "pa": "Pa", "kgpm3": "kg m-3",
@@ -114,18 +115,18 @@ def read_source(folder: Path) -> Source:
     """Read the newest run of a flight folder; `GateError` where there is none or its files are incomplete."""
     run = newest_run(folder)
     try:
-        header = json.loads((run / "bet_header.json").read_text())
-        facts = json.loads((run / "run.json").read_text())
-        trajectory = pd.read_csv(run / "bet.csv")
-        events = pd.read_csv(run / "events.csv")
-        with np.load(run / "covariance.npz", allow_pickle=False) as stored:
+        header = json.loads(file_bytes(run / "bet_header.json"))
+        facts = json.loads(file_bytes(run / "run.json"))
+        trajectory = read_csv(run / "bet.csv")
+        events = read_csv(run / "events.csv")
+        with open_file(run / "covariance.npz") as file, np.load(file, allow_pickle=False) as stored:
             times, covariance = stored["t_s"], stored["covariance"]
     except FileNotFoundError as fault:
         words = f"has no {Path(str(fault.filename)).name}: it made no trajectory; `postflight run {folder}` does"
         raise GateError(f"{run}: {words}", "trajectory-missing") from None
     except (ValueError, KeyError, OSError) as fault:
         raise GateError(f"{run}: cannot be read back ({fault}); run it again", "run-incomplete") from None
-    deflections = {p.stem.removeprefix("deflection_"): pd.read_csv(p) for p in sorted(run.glob("deflection_*.csv"))}
+    deflections = {p.stem.removeprefix("deflection_"): read_csv(p) for p in sorted(run.glob("deflection_*.csv"))}
     return Source(
         header["flight"], run.name, parse_utc(header["epoch_utc"]), facts["finished_utc"], bool(header["synthetic"]),
         header, trajectory, events, deflections, times, covariance,
@@ -289,15 +290,15 @@ def _kml(source: Source) -> bytes:
     for event in source.events.itertuples(index=False):
         at = ",".join(f"{np.interp(event.t_s, t, c):.9g}" for c in place.T)
         points += (
-            f"<Placemark><name>{escape(_printable(str(event.event)))}</name><TimeStamp><when>{source.utc(event.t_s)}Z"
+            f"<Placemark><name>{_label(str(event.event))}</name><TimeStamp><when>{source.utc(event.t_s)}Z"
             f"</when></TimeStamp><Point><altitudeMode>absolute</altitudeMode><coordinates>{at}</coordinates></Point>"
             "</Placemark>\n"
         )
     text = f"""<?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
 <Document>
-<name>{escape(_printable(source.name))}</name>
-<description>{escape(_printable(description))}</description>
+<name>{_label(source.name)}</name>
+<description>{escape(escape(_printable(description))).replace("$[", "$ [")}</description>
 <Style id="flight"><LineStyle><color>ff0080ff</color><width>2</width></LineStyle></Style>
 <Placemark><name>track</name><styleUrl>#flight</styleUrl><gx:Track><altitudeMode>absolute</altitudeMode>
 {whens}{track}</gx:Track></Placemark>
@@ -310,6 +311,11 @@ def _kml(source: Source) -> bytes:
 </kml>
 """
     return text.encode()
+
+
+def _label(text: str) -> str:
+    """Name of a place: a globe lists it as text, and shows it in a balloon as HTML in which ``$[...]`` is filled in."""
+    return escape(_printable(text).translate({ord("<"): "‹", ord(">"): "›"}).replace("$[", "$ ["))
 
 
 def _oem(source: Source) -> bytes:
@@ -361,7 +367,7 @@ FORMS: dict[str, tuple[Callable[[Source], bytes], str]] = {
     "oem": (_oem, ".oem"),
 }
 EXTRAS = {"pyarrow": "parquet"}  # library, and the extra of the installation that brings it
-console = Console(soft_wrap=True)
+console = terminal()
 
 
 def export(folder: Path, form: str, out: Path | None) -> None:

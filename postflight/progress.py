@@ -11,6 +11,7 @@ from rich import progress as bars
 from rich.console import Console
 
 from flightmodel.checks import Progress
+from postflight.terminal import terminal
 
 _EVERY_S = 10.0  # between plain lines; a shorter command prints none
 
@@ -18,7 +19,7 @@ _EVERY_S = 10.0  # between plain lines; a shorter command prints none
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
     """Progress on standard error: a bar with remaining time, or a line every ten seconds where that is no terminal."""
-    screen = Console(stderr=True, soft_wrap=True)
+    screen = terminal(stderr=True)
     if not screen.is_terminal:
         with plain_lines(screen, _EVERY_S) as report:
             yield report

@@ -10,12 +10,12 @@ reconstruction.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
-import os
 import platform
+import re
 import shutil
-import tempfile
 from collections.abc import Container
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -28,6 +28,8 @@ import pandas as pd
 
 from flightmodel import events
 from flightmodel.checks import FloatArray, GateError, writing
+from flightmodel.guarded_files import open_file
+from flightmodel.partial_files import abandoned, partial_path
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import Deflections, quantiles_at
@@ -36,7 +38,7 @@ from postflight.reconstruction import Reconstruction, bet_table
 
 DIGITS = "%.10g"
 _COPY = "copy the flight folder to where you may write"
-PARTIAL = ".partial-"  # before the number of the process that writes it
+_ATTEMPTS = 100  # at the place that equal runs of other processes take in the same second
 _FORMAT = 1
 _SMOOTH_CAMERA = "camera_smooth"
 _COVARIANCE_RATE_HZ = 1.0
@@ -88,9 +90,10 @@ class RunFolder:
         """Make the partial folder beside the final one."""
         with writing(self.parent, _COPY):
             self.parent.mkdir(exist_ok=True)
-            remove_abandoned(self.parent)
-            self.path = Path(tempfile.mkdtemp(prefix=f"{PARTIAL}{os.getpid()}-", dir=self.parent))
-            (self.path / "figures").mkdir()
+            for left in abandoned(self.parent):
+                shutil.rmtree(left, ignore_errors=True)  # refuses what is no folder, or a link to one
+            self.path = partial_path(self.parent / "run")
+            (self.path / "figures").mkdir(parents=True)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, _: object) -> None:
@@ -123,15 +126,21 @@ class RunFolder:
     def _finish(self) -> None:
         now = self.finished or self.write_facts()
         final = self.parent / f"{now.strftime('%Y%m%dT%H%M%SZ')}-{self.hash8}"
-        if final.exists():
-            shutil.rmtree(final)
-        self.path.chmod(0o755)
-        self.path.rename(final)
-        self.path = final
+        for _ in range(_ATTEMPTS):
+            shutil.rmtree(final, ignore_errors=True)
+            try:
+                self.path.rename(final)
+            except OSError as fault:
+                if fault.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                continue
+            self.path = final
+            return
+        raise GateError(f"{final}: other processes write the same run; run it again", "run-contended")
 
     def write_csv(self, name: str, table: pd.DataFrame) -> None:
         """Write a table."""
-        table.to_csv(self.path / name, index=False, float_format=DIGITS, lineterminator="\n")
+        plain_text(table).to_csv(self.path / name, index=False, float_format=DIGITS, lineterminator="\n")
 
     def write_json(self, name: str, value: Any) -> None:
         """Write one JSON object; NaN becomes null."""
@@ -139,24 +148,30 @@ class RunFolder:
         (self.path / name).write_text(text + "\n")
 
 
+# what a spreadsheet takes for a formula; a name such as -x, of letters and digits, computes nothing
+_FORMULA = re.compile(r"[=@\t\r＝＠]|[+\-＋－].*[^A-Za-z0-9_+-]", re.DOTALL)
+
+
+def plain_text(table: pd.DataFrame) -> pd.DataFrame:
+    """Table in which an apostrophe stands before every text that a spreadsheet would execute."""
+    texts = [name for name in table if not pd.api.types.is_numeric_dtype(table[name])]
+
+    def neutral(cell: Any) -> Any:
+        return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
+
+    return table.assign(**{name: table[name].map(neutral) for name in texts})
+
+
+def read_csv(path: Path) -> pd.DataFrame:
+    """Read a table of a run back."""
+    with open_file(path) as file:
+        return pd.read_csv(file)
+
+
 def run_hash(inputs_sha256: dict[str, str], settings: dict[str, Any], made_by: str) -> str:
     """Eight hexadecimal digits of inputs, settings and version, which equal runs share."""
     facts = json.dumps([inputs_sha256, settings, made_by], sort_keys=True)
     return hashlib.sha256(facts.encode()).hexdigest()[:8]
-
-
-def remove_abandoned(parent: Path) -> None:
-    """Remove incomplete folders, named `PARTIAL`, process number, ``-`` and anything, of processes that ended."""
-    for path in parent.iterdir():
-        number, dash, _ = path.name.removeprefix(PARTIAL).partition("-")
-        if not path.name.startswith(PARTIAL) or not dash or not number.isdigit():
-            continue
-        try:
-            os.kill(int(number), 0)
-        except ProcessLookupError:
-            shutil.rmtree(path, ignore_errors=True)  # refuses what is no folder, or a link to one
-        except (PermissionError, OverflowError):
-            continue
 
 
 def _no_nan(value: Any) -> Any:

@@ -19,9 +19,10 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.events import find_peak
+from flightmodel.guarded_files import file_bytes
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, difference, resample
-from postflight.run_folder import answer_table, newest_run
+from postflight.run_folder import answer_table, newest_run, read_csv
 
 # what the demo flight with nominal instrument errors must reach: four of the rms errors at peak pressure over many days
 # (0.14 deg by each method, 0.115 deg fused without video; docs/deflection.md, docs/camera.md)
@@ -81,7 +82,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     deflection = _read(truth_folder / "deflection.csv", ("t_s", "theta_deg"))
     peak_s, _ = find_peak(truth["t_s"].to_numpy(), truth["dynamic_pressure_pa"].to_numpy())
     true_deg = float(np.interp(peak_s, deflection["t_s"], deflection["theta_deg"]))
-    refused = json.loads((run / "summary.json").read_text())["methods"]
+    refused = json.loads(file_bytes(run / "summary.json"))["methods"]
     methods: dict[str, dict[str, Any]] = {}
     failures: list[Fault] = []
     written = {path.stem for path in run.glob("*.csv")}
@@ -106,7 +107,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
 def _read(path: Path, columns: tuple[str, ...]) -> pd.DataFrame:
     """Read a result or truth table; `GateError` where it is no table of numbers with these columns."""
     try:
-        table = pd.read_csv(path)
+        table = read_csv(path)
         return table.astype(dict.fromkeys(columns, float))
     except (OSError, ValueError, KeyError, pd.errors.ParserError, pd.errors.EmptyDataError) as fault:
         raise GateError(

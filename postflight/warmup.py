@@ -136,10 +136,10 @@ RECONSTRUCTION = ("filter", "smoothers")
 
 def _stamp(group: str) -> Path | None:
     """Mark of a compiled group. numba keeps compiled code by the sources' location, and so does the mark."""
-    if CACHE is None:
+    if CACHE.path is None:
         return None
     location = hashlib.sha256(str(Path(earth.__file__).parent).encode()).hexdigest()[:8]
-    return CACHE / f"{group}-{location}.compiled"
+    return CACHE.path / f"{group}-{location}.compiled"
 
 
 def missing(groups: Iterable[str]) -> list[str]:

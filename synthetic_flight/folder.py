@@ -17,7 +17,6 @@ Sutton and Graves, "A general stagnation-point convective-heating equation for a
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +29,7 @@ from flightmodel.checks import FloatArray, GateError, Progress, writing
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.events import descent_events, find_peak, first_fall, has_peak, splashdown_index, values_at
 from flightmodel.instruments import ACCELEROMETER, MAGNETOMETER, RADAR, RATES, SUN
+from flightmodel.partial_files import abandoned, partial_path
 from synthetic_flight import sensing, weather
 from synthetic_flight.film import write_videos
 from synthetic_flight.instrument_errors import Magnetometer, SunSensors, Video, stated_errors
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 TRUTH_RATE_HZ = 50.0
 SHORTEST_TELEMETRY_S = 1.0
+OLD = "old"  # name of a flight that is being replaced
 
 
 def simulate_to_folder(
@@ -73,7 +74,7 @@ def simulate_to_folder(
     report(0.0, "flying")
     truth = fly_scenario(scenario, seed)
     _check_telemetry(scenario, truth)
-    partial = _beside(destination, "partial")
+    partial = partial_path(destination)
     with writing(destination, "choose another folder"):
         destination.parent.mkdir(parents=True, exist_ok=True)
         partial.mkdir(mode=0o755)
@@ -97,16 +98,12 @@ def _check_telemetry(scenario: Scenario, truth: Truth) -> None:
         )
 
 
-def _beside(destination: Path, what: str) -> Path:
-    return destination.with_name(f".{destination.name}-{what}-{os.getpid()}")
-
-
 def _put_in_place(partial: Path, destination: Path) -> None:
     """Rename; what was there before is moved aside first and removed last, so that one of the two always exists."""
     if not destination.exists():
         partial.rename(destination)
         return
-    old = _beside(destination, "old")
+    old = partial_path(destination, OLD)
     destination.rename(old)
     partial.rename(destination)
     shutil.rmtree(old, ignore_errors=True)
@@ -114,16 +111,13 @@ def _put_in_place(partial: Path, destination: Path) -> None:
 
 def _remove_leftovers(destination: Path) -> None:
     """Remove what killed processes left beside the destination; an old flight without a successor is put back."""
-    if not Path("/proc/self").exists():  # whether a process still runs cannot be found out
-        return
-    for left in destination.parent.glob(f".{destination.name}-*-*"):
-        what, _, number = left.name.removeprefix(f".{destination.name}-").partition("-")
-        if what not in ("partial", "old") or not number.isdigit() or Path(f"/proc/{number}").exists():
-            continue
-        if what == "old" and not destination.exists():
-            left.rename(destination)
-        else:
+    for left in abandoned(destination.parent, destination.name, OLD):
+        if destination.exists():
             shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.rename(destination)
+    for left in abandoned(destination.parent, destination.name):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def check_destination(destination: Path, replace: bool) -> None:

@@ -25,6 +25,7 @@ from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import EDITS_FILE, POSE, CameraEdits, Edit, faults_of, read_edits, write_edits
 from flightmodel.checks import NO_FAULT, Fault, FloatArray, GateError
 from flightmodel.film import Frames
+from flightmodel.guarded_files import file_bytes
 from flightmodel.tables import read_table
 from flightmodel.vehicle import Vehicle
 from postflight.filming import joint_swing, orient_on_film
@@ -314,4 +315,4 @@ def _edit_of(row: dict[str, Any], camera: str) -> Edit:
 
 
 def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
+    return hashlib.sha256(file_bytes(path)).hexdigest() if path.exists() else ""

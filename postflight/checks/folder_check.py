@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -33,13 +32,15 @@ from postflight.checks.benchmark_frame import benchmark_frame
 from postflight.checks.track_force import best_comparison, track_force
 from postflight.checks.units_and_axes import TimeBias
 from postflight.intake.flight_form import placeholders
+from postflight.streams import write_out
+from postflight.terminal import terminal
 
 _SHARP_S = 0.5  # a time bias of a larger standard deviation is not reported
 _FITS = 5.0  # reduced chi-square beyond which one lag and one scale do not describe the comparison
 _FORCE_WIDTH_S = 8.0
 WIDE = 160  # of a log file: a table need not be squeezed there
 _LONGEST_NAME = 28  # that leaves room for the rest of a table on 80 columns
-console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else WIDE)
+console = terminal(width=None if sys.stdout.isatty() else WIDE)
 
 
 @dataclass(frozen=True)
@@ -269,7 +270,7 @@ def check(folder: Path, as_json: bool) -> None:
     """Print what a flight folder holds, what is suspicious and what is refused; leave with its exit code."""
     report = check_folder(folder)
     if as_json:
-        sys.stdout.write(json.dumps(report.as_json(), indent=2, allow_nan=False) + "\n")
+        write_out(json.dumps(report.as_json(), indent=2, allow_nan=False) + "\n")
     else:
         print_report(report)
     if report.exit_code:

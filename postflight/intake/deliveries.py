@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -35,6 +34,7 @@ from flightmodel.aerodynamics import COLUMNS, named_columns
 from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, write_file, writing
 from flightmodel.config import read_toml
+from flightmodel.guarded_files import file_bytes
 from flightmodel.instruments import TriadSpec
 from flightmodel.rest import find_rest, readings
 from flightmodel.tables import to_si
@@ -56,6 +56,7 @@ from postflight.intake.column_recognition import (
 from postflight.intake.flight_form import placeholders, section_text, start_text, template
 from postflight.intake.freeform_tables import FreeFormTable, read_matlab, read_text_table
 from postflight.intake.headers import fold, parse_column_name
+from postflight.terminal import terminal
 
 _WIND_AXES = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:])
 _DAVEML = (".dml",)
@@ -68,7 +69,7 @@ _BELONG = 0.9  # of a list's names, in the folder that it is of
 _RADIOSONDE = {"alt", "temperature", "pressure", "wind_speed", "wind_from"}
 _ZERO_C_K = 273.15
 _LOWEST_M, _HIGHEST_M = -1000.0, 2e5
-console = Console(soft_wrap=True)
+console = terminal()
 
 
 # coefficients
@@ -332,7 +333,7 @@ def _without_list(video: Video, folder: Path) -> str:
 def _cameras_of(folder: Path, tables: dict[str, Any]) -> list[str]:
     """Names of the cameras in the vehicle file that flight.toml names; none where it cannot be read yet."""
     try:
-        made = tomllib.loads(vehicle_path(str(tables.get("vehicle", "")), folder).read_text(encoding="utf-8-sig"))
+        made = read_toml(vehicle_path(str(tables.get("vehicle", "")), folder))
         return list(made.get("cameras", {}))
     except (OSError, ValueError):
         return []
@@ -495,10 +496,10 @@ def _beside_pictures(folder: Path, video: Video) -> list[Fault]:
 
 def _bytes_of(file: Path) -> bytes:
     try:
-        return file.read_bytes()
+        return file_bytes(file)
     except OSError as fault:
         words = f"cannot be read: {fault.strerror or fault}"
-        raise GateError(f"{file}: {words}", code="file-unreadable") from None
+        raise GateError(f"{file}: {words}", getattr(fault, "code", "file-unreadable")) from None
 
 
 def _coefficients(came: _Delivery, folder: Path, tables: dict[str, Any]) -> None:
@@ -519,7 +520,7 @@ def _coefficients(came: _Delivery, folder: Path, tables: dict[str, Any]) -> None
         if place in came.files:
             raise ConfigError(f"{place}: two delivered tables of this name; rename one", code="file-exists")
         came.files |= {place: content, place.with_suffix(".toml"): sidecar_text(columns)}
-        text = came.vehicle.get(vehicle) or (vehicle.read_text(encoding="utf-8-sig") if vehicle.is_file() else "")
+        text = came.vehicle.get(vehicle) or (file_bytes(vehicle).decode("utf-8-sig") if vehicle.is_file() else "")
         named = _named_in_form(text, place.name)
         if named is not None:
             came.vehicle[vehicle] = named

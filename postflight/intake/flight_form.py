@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
-from rich.console import Console
 from rich.markup import escape
 
 from flightmodel.aerodynamics import Sidecar
@@ -38,6 +37,7 @@ from postflight.intake.column_recognition import (
     TimeProposal,
     quoted,
 )
+from postflight.terminal import terminal
 
 _EVERY_QUANTITY = (*ACCELEROMETER, *RATES, *MAGNETOMETER, *RADAR, *GNSS, *BAROMETER, *ATMOSPHERE)
 KINDS = ("flight", "vehicle", "scenario", "coefficients")
@@ -45,7 +45,7 @@ _HEADER = re.compile(r"^(?:# )?\[\[?([\w.]+)\]\]?")
 _KEY = re.compile(r"^(?:# )?(\w+) = (.*?)\s+# (.*)$")
 _WIDTH = 62  # of a line's value, before its comment
 _VEHICLE_LINE = '# vehicle = "vehicle/vehicle.toml"    #'
-console = Console(soft_wrap=True)
+console = terminal()
 
 
 # forms and schema

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from flightmodel.checks import ConfigError, FloatArray, GateError
+from flightmodel.guarded_files import UnfitFile, file_bytes, open_file
 from postflight.intake.headers import SEVERAL_MEANINGS, UNIT_SPELLINGS, unit_key
 
-_LARGEST_BYTES = 2 * 1024**3
 _LARGEST = 1e100  # what is beyond is a broken word
 _HEAD_LINES = 80  # names and first rows are within
 _COMMENT = re.compile(r"^\s*(#+|%+|//+|\*+|;|!|\")\s*")
@@ -99,11 +99,11 @@ def read_text_table(path: Path) -> FreeFormTable:
         ``table-binary``, or ``file-missing``.
     """
     try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise GateError(f"{path}: larger than 2 GB; split it", code="table-too-large")
-        raw = path.read_bytes()
+        raw = file_bytes(path)
     except FileNotFoundError:
         raise GateError(f"{path}: no such file", code="file-missing") from None
+    except UnfitFile as fault:
+        raise GateError(f"{path}: {fault.strerror}", fault.code) from None
     text, notes = _decoded(path, raw)
     lines = [line for line in text.splitlines() if line.strip()]
     ruled = _ruled(path, lines)
@@ -266,10 +266,12 @@ def read_matlab(path: Path) -> list[FreeFormTable]:
         ``h5py-missing`` for version 7.3 without h5py.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             head = file.read(128)
     except FileNotFoundError:
         raise GateError(f"{path}: no such file", code="file-missing") from None
+    except UnfitFile as fault:
+        raise GateError(f"{path}: {fault.strerror}", fault.code) from None
     variables, left_out = _version_73(path) if b"MATLAB 7.3" in head or head[:4] == b"\x89HDF" else _version_5(path)
     groups: dict[tuple[str, int], dict[str, FloatArray]] = {}
     for parent, name, values in variables:

@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 from scipy.stats import quantile_test
 
 from flightmodel.checks import FloatArray, GateError, write_file
+from flightmodel.guarded_files import open_file
+from flightmodel.partial_files import abandoned, partial_path
 from flightmodel.statistics import BAND_COLUMNS, BAND_PERCENTILES, percentile_band
 from postflight.montecarlo.study import CONFIDENCE, Study
 from synthetic_flight.ensemble import Row
-
-PARTIAL = ".part"
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def chunk_path(folder: Path, number: int) -> Path:
 def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     """Write a chunk beside its place and rename it."""
     path = chunk_path(folder, number)
-    partial = path.with_name(f".{path.stem}-{os.getpid()}{PARTIAL}")
+    partial = partial_path(path)
     reasons = "\0".join(chunk.reasons).encode()
     try:
         with partial.open("wb") as file:
@@ -97,7 +97,7 @@ def read_chunk(folder: Path, number: int, runs: list[int] | None = None, histori
     """
     path = chunk_path(folder, number)
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with open_file(path) as file, np.load(file, allow_pickle=False) as data:
             held = data["runs"]
             reasons = tuple(data["reasons"].tobytes().decode().split("\0"))
             past = data["histories"] if histories else np.empty((len(held), 0, 0), dtype=np.float32)
@@ -112,15 +112,9 @@ def read_chunk(folder: Path, number: int, runs: list[int] | None = None, histori
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove half-written files of killed processes of this machine."""
-    for path in (folder / "chunks").glob(f".*{PARTIAL}"):
-        number = path.name.removesuffix(PARTIAL).rpartition("-")[2]
-        try:
-            os.kill(int(number), 0)
-        except ProcessLookupError:
-            path.unlink(missing_ok=True)
-        except (PermissionError, ValueError, OverflowError):
-            continue
+    """Remove half-written files of killed processes."""
+    for left in abandoned(folder / "chunks"):
+        left.unlink(missing_ok=True)
 
 
 def percentile_interval(values: FloatArray, percentile: float, confidence: float) -> tuple[float, float]:

@@ -10,13 +10,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.checks import ConfigError, GateError
-from postflight.commands import compile_kernels, console
+from postflight.commands import compile_kernels, console, line
 from postflight.montecarlo import execution
 from postflight.montecarlo.bands import Merged, merge, write_csv, write_merged
 from postflight.montecarlo.execution import Wanted
 from postflight.montecarlo.study import Stop, Study, indices, read_study, sobol_study
 from postflight.plots.studies import figure_bands, figure_sobol
-from postflight.plots.style import save
+from postflight.plots.style import draw
 from postflight.progress import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from synthetic_flight.ensemble import available_cores, check_outputs
@@ -55,6 +55,9 @@ def stop_from(text: str, study: Study) -> Stop:
 def fly(study: Study, folder: Path, wanted: Wanted) -> int:
     """Fly with progress; return how many flights the study has."""
     compile_kernels("simulator", "ensembles", *(RECONSTRUCTION if study.spec.mode == "whole" else ()))
+    if wanted.scheduler is not None and execution.is_open(wanted.scheduler):
+        words = f"--scheduler {wanted.scheduler}: not encrypted, and whoever reaches its port can run code there; use tls://"
+        line("[yellow]found[/]", words, "scheduler-open")
     with progress_bar() as report:
         return execution.run(study, folder, wanted, report)
 
@@ -65,7 +68,7 @@ def finish(study: Study, folder: Path, flights: int) -> Merged:
     write_merged(folder, merged)
     title = f"{flights} dispersed flights: 2.3, 50 and 97.7 % of them"
     if len(merged.bands):
-        save(figure_bands(merged.bands, title, _origin(study)), folder / "bands.png")
+        draw(folder / "bands.png", figure_bands, merged.bands, title, _origin(study))
     _print_merged(merged, folder)
     if merged.summary["failed"] == flights:
         message = f"{folder}: every flight failed; the first: {merged.flights['reason'].iloc[0]}"
@@ -162,7 +165,7 @@ def finish_sobol(study: Study, folder: Path, output: str | None = None) -> None:
     if shown.empty:
         raise GateError(f"{folder}: {output} has no indices", code="sobol-spread")
     title = f"Sobol indices of {shown['output'].iloc[0]}: {design.flights} flights"
-    save(figure_sobol(shown, title, _origin(study)), folder / "sobol.png")
+    draw(folder / "sobol.png", figure_sobol, shown, title, _origin(study))
     printed = Table(title=title)
     for head in ("factor", "first order", "95 %", "total", "95 %"):
         printed.add_column(head, justify="left" if head == "factor" else "right", no_wrap=head == "factor")

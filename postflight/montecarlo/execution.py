@@ -28,10 +28,12 @@ from itertools import islice
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from flightmodel.checks import ConfigError, GateError, Progress, write_file
+from flightmodel.guarded_files import file_bytes
 from postflight.montecarlo import trial
 from postflight.montecarlo.bands import (
     Chunk,
@@ -43,6 +45,7 @@ from postflight.montecarlo.bands import (
     write_chunk,
 )
 from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
+from postflight.threads import VARIABLES, pin_threads
 from synthetic_flight.ensemble import fly_runs
 
 Job = tuple[int, list[int]]
@@ -50,7 +53,6 @@ Done = tuple[int, Chunk]
 AHEAD = 2  # chunks queued a worker: none waits, and results do not pile up
 CONNECT_S = 20
 END_S = 5.0  # to wait for a terminated worker process
-THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def fly_chunk(study: Study, job: Job) -> Done:
@@ -91,8 +93,8 @@ def _begin() -> None:
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Limit linear algebra of processes that start now to one thread: there are as many of them as cores."""
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    before = {name: os.environ.get(name) for name in VARIABLES}
+    pin_threads()
     try:
         yield
     finally:
@@ -133,6 +135,12 @@ def _in_processes(study: Study, jobs: list[Job], workers: int) -> Iterator[Done]
             process.join(END_S)
 
 
+def is_open(address: str) -> bool:
+    """Whether a scheduler's address is neither of this machine alone nor encrypted."""
+    url = urlsplit(address if "://" in address else f"tcp://{address}")
+    return url.scheme not in ("tls", "wss") and url.hostname not in ("localhost", "127.0.0.1", "::1")
+
+
 def _on_dask(study: Study, jobs: list[Job], address: str) -> Iterator[Done]:
     try:
         from distributed import Client, as_completed
@@ -140,7 +148,7 @@ def _on_dask(study: Study, jobs: list[Job], address: str) -> Iterator[Done]:
         raise ConfigError("--scheduler needs Dask: pip install 'postflight[cluster]'", code="package-missing") from None
     try:
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as fault:
+    except (OSError, ValueError, TypeError, TimeoutError) as fault:  # TypeError: tls without certificates
         message = f"--scheduler {address}: no scheduler answers there: {fault}"
         raise ConfigError(message, code="scheduler-unreachable") from None
     with client, client.as_current():
@@ -210,7 +218,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
     """Return ``study.json``; `GateError` where the folder holds no study."""
     path = folder / "study.json"
     try:
-        held = json.loads(path.read_text())
+        held = json.loads(file_bytes(path))
         kinds = (("settings", dict), ("flights", int), ("source", str))
         if not all(isinstance(held[key], kind) for key, kind in kinds):
             raise ValueError("not a study")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, ParamSpec
 
 import numpy as np
 import pandas as pd
@@ -18,7 +20,7 @@ from postflight.flight import Flight
 from postflight.plots.deflection import figure_correlation, figure_fusion, figure_summary
 from postflight.plots.overlay import deflection_at, oriented_camera, write_overlay
 from postflight.plots.paper_figures import figure_1_3, figure_2_3, figure_2_5, figure_2_7, figure_2_9
-from postflight.plots.style import save, stamp
+from postflight.plots.style import draw, stamp
 from postflight.plots.trajectory import (
     figure_air,
     figure_attitude,
@@ -28,47 +30,61 @@ from postflight.plots.trajectory import (
     figure_sensitivity,
 )
 from postflight.reconstruction import Reconstruction
-from postflight.studies.preflight import Bounds, rigid_bounds
+from postflight.studies.preflight import Bounds
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Parameters = ParamSpec("Parameters")
 _PAPER_OFFSETS_M = (0.01, 0.0254)  # of the c.g., beside the vehicle's own, as in the paper's Figure 2.9
 
 
-def draw_run(flight: Reconstruction, answers: Deflections, folder: Path, report: Progress) -> Bounds | None:
-    """Draw everything that the run's answers allow; return the rigid vehicle's bands where it was flown."""
-    bounds = None
+def draw_run(
+    flight: Reconstruction, answers: Deflections, folder: Path, report: Progress, bounds: Bounds | None = None
+) -> None:
+    """Draw everything that the run's answers allow, Figure 1.3 where the rigid vehicle's ``bounds`` are given.
+
+    A figure that fails costs itself alone, with a `postflight.plots.style.FigureWarning`.
+    """
+    report(0.0, "drawing")
+    if bounds is not None:
+        draw(folder / "figure_1_3.png", figure_1_3, flight, bounds)
     if flight.loads is not None:
-        report(0.0, "flying the rigid vehicle")
-        bounds = rigid_bounds(flight, progress=lambda f, what: report(0.6 * f, what))
-        save(figure_1_3(flight, bounds), folder / "figure_1_3.png")
-        save(figure_2_5(flight), folder / "figure_2_5.png")
+        draw(folder / "figure_2_5.png", figure_2_5, flight)
     else:
-        save(figure_flown(flight), folder / "flown.png")
-    report(0.6, "drawing")
+        draw(folder / "flown.png", figure_flown, flight)
     if flight.as_flown is not None:
-        save(figure_air(flight, flight.as_flown), folder / "air.png")
+        draw(folder / "air.png", figure_air, flight, flight.as_flown)
     if flight.attitude is not None and flight.attitude.comparison is not None:
-        save(figure_attitude(flight, flight.attitude), folder / "attitude_check.png")
-    save(figure_filter_and_smoother(flight), folder / "filter_and_smoother.png")
-    save(figure_residuals(flight), folder / "residuals.png")
+        draw(folder / "attitude_check.png", figure_attitude, flight, flight.attitude)
+    draw(folder / "filter_and_smoother.png", figure_filter_and_smoother, flight)
+    draw(folder / "residuals.png", figure_residuals, flight)
     if "misalignment" in answers.histories:
-        save(figure_2_7(flight, answers.histories["misalignment"]), folder / "figure_2_7.png")
+        draw(folder / "figure_2_7.png", figure_2_7, flight, answers.histories["misalignment"])
     if "camera" in answers.histories:
         draw_camera(flight.flight, answers.histories["camera"], folder)
     if answers.fused is not None:
-        answer = answers.fused
+        answer, telemetry = answers.fused, flight.telemetry
         words = f"{answer.agreement.remark}; {answer.limbs_remark}"
-        for name, figure in (
-            ("fusion.png", figure_fusion(answer.fused, answer.limbs, words)),
-            ("told_apart.png", figure_correlation(answer.fused, answer.agreement.singular_values)),
-        ):
-            stamp(figure, flight.telemetry)
-            save(figure, folder / name)
+        draw(folder / "fusion.png", _stamped(figure_fusion, telemetry), answer.fused, answer.limbs, words)
+        told_apart = _stamped(figure_correlation, telemetry)
+        draw(folder / "told_apart.png", told_apart, answer.fused, answer.agreement.singular_values)
     if flight.loads is not None:
         _draw_static_trim(flight.loads, flight.telemetry, folder)
     if answers.histories:
-        save(figure_summary(flight, answers), folder / "summary.png")
+        draw(folder / "summary.png", figure_summary, flight, answers)
     report(1.0, "drawn")
-    return bounds
+
+
+def _stamped(figure: Callable[Parameters, Figure], telemetry: Telemetry) -> Callable[Parameters, Figure]:
+    """Let a figure bear the flight's name in its corner."""
+
+    def with_stamp(*args: Parameters.args, **named: Parameters.kwargs) -> Figure:
+        made = figure(*args, **named)
+        stamp(made, telemetry)
+        return made
+
+    return with_stamp
 
 
 def _draw_static_trim(pulse: FlightLoads, telemetry: Telemetry, folder: Path) -> None:
@@ -82,15 +98,14 @@ def _draw_static_trim(pulse: FlightLoads, telemetry: Telemetry, folder: Path) ->
     own = float(np.linalg.norm(vehicle.cg_m[1:]))
     offsets = sorted({round(own, 5), *_PAPER_OFFSETS_M})
     title = f"Static trim at {pressure:.0f} Pa, Mach {mach:.1f} (AIAA 2011-2571, Figure 2.9)"
-    figure = figure_2_9(static, offsets, vehicle.joint.bending_stiffness_nmprad, title)
-    stamp(figure, telemetry)
-    save(figure, folder / "figure_2_9.png")
+    stiffness = vehicle.joint.bending_stiffness_nmprad
+    draw(folder / "figure_2_9.png", _stamped(figure_2_9, telemetry), static, offsets, stiffness, title)
 
 
 def draw_sensitivity(flight: Reconstruction, table: pd.DataFrame, folder: Path) -> None:
     """Draw the changes in the reruns, where any succeeded."""
     if table["quantity"].notna().any():
-        save(figure_sensitivity(flight, table), folder / "sensitivity.png")
+        draw(folder / "sensitivity.png", figure_sensitivity, flight, table)
 
 
 def draw_camera(flight: Flight, history: DeflectionHistory, folder: Path) -> None:
@@ -112,7 +127,7 @@ def _draw_one_camera(telemetry: Telemetry, history: DeflectionHistory, folder: P
     times = [float(t) for t in frames.time_s[pick]]
     theta, plane = zip(*(deflection_at(history, t) for t in times), strict=True)
     meshes = telemetry.required_vehicle().meshes
-    figure = figure_2_3(oriented, [frames.picture(k) for k in pick], times, theta, plane, meshes)
-    stamp(figure, telemetry)
-    save(figure, folder / f"figure_2_3{ending}.png")
+    pictures = [frames.picture(k) for k in pick]
+    path = folder / f"figure_2_3{ending}.png"
+    draw(path, _stamped(figure_2_3, telemetry), oriented, pictures, times, theta, plane, meshes)
     write_overlay(oriented, telemetry, largest, theta[1], plane[1], folder / f"overlay{ending}.png")

@@ -15,6 +15,7 @@ M. Okabe, K. Ito, *Color Universal Design*, 2008.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from functools import wraps
 from pathlib import Path
@@ -193,3 +194,27 @@ def stamp(figure: Figure, telemetry: Telemetry) -> None:
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG whose bytes depend on the picture alone."""
     figure.savefig(path, dpi=_DPI, metadata={"Software": None})
+
+
+class FigureWarning(RuntimeWarning):
+    """A figure that was not drawn, and why; everything else of the run is as it would be with it."""
+
+    code = "figure-failed"
+
+
+def draw(path: Path, figure: Callable[_P, Figure], *args: _P.args, **named: _P.kwargs) -> None:
+    """Draw and `save` a figure; one that fails costs itself alone, with a `FigureWarning`.
+
+    Raises
+    ------
+    OSError
+        Where the file cannot be written: then nothing else can.
+    """
+    try:
+        save(figure(*args, **named), path)
+    except OSError:
+        raise
+    except Exception as fault:
+        path.unlink(missing_ok=True)
+        words = f"{path.name} was not drawn ({type(fault).__name__}: {fault}); tables and report are whole"
+        warnings.warn(FigureWarning(words), stacklevel=2)

@@ -20,7 +20,7 @@ from postflight.commands import compile_kernels, console, print_checks
 from postflight.deflections import estimate
 from postflight.flight import PULSE_RATE_HZ, Flight
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
-from postflight.plots.style import save
+from postflight.plots.style import draw
 from postflight.progress import progress_bar
 from postflight.reconciliation.credibility import credibility
 from postflight.reconciliation.fit import JointFit, select_laws
@@ -160,16 +160,18 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             out.write_json("reconciliation.json", facts)
             out.write_csv("bands.csv", bands(rigid, flexible))
             out.write_csv("bands_shares.csv", shares)
-            save(bands_picture, out.path / "figures" / "bands.png")
-            if modal is not None:
-                save(figure_modes(modal, telemetry), out.path / "figures" / "modes.png")
             (out.path / "joint.toml").write_text(vehicle_file_lines(fit))
             if posterior is not None:
                 out.write_csv("posterior.csv", quantities(fit.problem.vehicle_parameters, posterior.samples))
                 out.write_csv("posterior_summary.csv", posterior_summary(posterior))
-                save(figure_posterior(posterior, telemetry), out.path / "figures" / "posterior.png")
+            figures = out.path / "figures"  # every table is written
+            draw(figures / "bands.png", bands_picture)
+            if modal is not None:
+                draw(figures / "modes.png", figure_modes, modal, telemetry)
+            if posterior is not None:
+                draw(figures / "posterior.png", figure_posterior, posterior, telemetry)
             fused = answers.histories.get("fused")
-            save(figure_reconciled(fit, telemetry, deflection, fused), out.path / "figures" / "reconciled.png")
+            draw(figures / "reconciled.png", figure_reconciled, fit, telemetry, deflection, fused)
     _print_joint(fit, table, odds)
     print_checks(checks)
     if posterior is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import html
 import json
 import os
+import re
 from pathlib import Path
 
 from postflight.report.source import Run, read_run
@@ -99,10 +100,13 @@ def write_notebook(flight_folder: Path, target: Path | None = None) -> Path:
 
 def _notebook(run: Run, folder: str) -> str:
     """Text of the notebook; ``folder`` is the flight's path from where it lies."""
-    title = html.escape(" ".join(run.telemetry.name.split())).replace("[", "\\[").replace("`", "'")
+    code = {"folder": repr(folder), "run": repr(run.path.name)}
     cells = [
-        ("markdown", f"# {title}\n\nRun `{run.path.name}`. Inputs, results and consistency checks."),
-        ("code", _START.replace("{folder!r}", repr(folder)).replace("{run!r}", repr(run.path.name))),
+        (
+            "markdown",
+            f"# {_text(run.telemetry.name)}\n\nRun {_text(run.path.name)}. Inputs, results, consistency checks.",
+        ),
+        ("code", re.sub(r"\{(folder|run)!r\}", lambda name: code[name[1]], _START)),
         ("markdown", "## Measurements"),
         ("code", _SENSORS),
         ("markdown", "## Best-estimated trajectory, with one standard deviation"),
@@ -123,6 +127,11 @@ def _notebook(run: Run, folder: str) -> str:
         "nbformat_minor": 5,
     }
     return json.dumps(book, indent=1, ensure_ascii=False) + "\n"
+
+
+def _text(words: str) -> str:
+    """Words from a file as a line of Markdown that shows them: nothing in it is markup, HTML or a formula."""
+    return re.sub(r"([\\`*_{}\[\]()#+!|~$-])", r"\\\1", html.escape(" ".join(words.split()), quote=False))
 
 
 def _cell(number: int, kind: str, text: str) -> dict[str, object]:

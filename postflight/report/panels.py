@@ -21,7 +21,7 @@ from flightmodel.deflection import HOLE_FACTOR
 from postflight.deflections import METHODS
 from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, residual_unit
 from postflight.report.source import Rows, Run, kept_rows, rounded
-from postflight.run_folder import answer_table
+from postflight.run_folder import answer_table, read_csv
 from postflight.studies.preflight import inside
 
 _TRAJECTORY_ROWS, _RAW_POINTS, _TRACK_POINTS, _RESIDUAL_POINTS = 6000, 8000, 6000, 16000
@@ -256,7 +256,7 @@ def _read_bands(path: Path) -> pd.DataFrame:
     """Read the bands of a folder, or of a file of its own: label, quantity, time, percentiles and nominal."""
     file = path / _FILE if path.is_dir() else path
     try:
-        table = pd.read_csv(file).rename(columns={"history": "quantity", "joint": "label"})
+        table = read_csv(file).rename(columns={"history": "quantity", "joint": "label"})
         numbers = table[["time_s", _LOW, _MIDDLE, _HIGH]].astype(float)
     except FileNotFoundError:
         where = "`postflight montecarlo run` and `postflight reconcile` write them"

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.flightfolder import read_flight
+from flightmodel.guarded_files import file_bytes
 from flightmodel.telemetry import Telemetry
-from postflight.run_folder import newest_run, run_hash
+from postflight.run_folder import newest_run, read_csv, run_hash
 
 _NEEDED = ("bet", "events", "peaks", "residuals", "verdicts", "findings")
 _CHECKS = ("name", "value", "low", "high", "passed", "remark", "code")
@@ -78,10 +79,10 @@ def read_run(flight_folder: Path, path: Path | None = None, telemetry: Telemetry
     again = f"use `postflight run {flight_folder}` again"
     try:
         summary, facts, header = (
-            json.loads((path / f"{name}.json").read_text()) for name in ("summary", "run", "bet_header")
+            json.loads(file_bytes(path / f"{name}.json")) for name in ("summary", "run", "bet_header")
         )
-        tables = {p.stem: pd.read_csv(p) for p in sorted(path.glob("*.csv"))}
-    except (FileNotFoundError, ValueError) as fault:
+        tables = {p.stem: read_csv(p) for p in sorted(path.glob("*.csv"))}
+    except (OSError, ValueError) as fault:
         raise GateError(f"{path}: not a whole run ({fault}); {again}", "run-incomplete") from None
     missing = [f"{name}.csv" for name in _NEEDED if name not in tables]
     if missing:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,7 @@ from postflight.flight import read_flight
 from postflight.montecarlo.bands import write_csv
 from postflight.montecarlo.study import read_study
 from postflight.plots import studies
-from postflight.plots.style import save
+from postflight.plots.style import draw
 from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies import joints
@@ -27,6 +29,8 @@ from postflight.studies.preflight import Bounds, entry_bounds, inside
 from postflight.warmup import RECONSTRUCTION
 from synthetic_flight.scenarios import read_scenario
 
+Drawing = Callable[[], studies.Figure]
+
 
 def stiffness_and_damping(vehicle: str, folder: Path) -> None:
     """Write and print Table 3.1."""
@@ -34,7 +38,7 @@ def stiffness_and_damping(vehicle: str, folder: Path) -> None:
     table = table_3_1(known)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "table_3_1.csv", table)
-    save(studies.figure_table_3_1(table, f"vehicle: {known.name}"), folder / "table_3_1.png")
+    draw(folder / "table_3_1.png", studies.figure_table_3_1, table, f"vehicle: {known.name}")
     printed = Table(title="Table 3.1 (AIAA 2011-2571)")
     for name in ("study", "Hz", "% of c*", "quantity", "paper", "ours", "vehicle's own"):
         printed.add_column(name, justify="left" if name in ("study", "quantity") else "right")
@@ -54,7 +58,7 @@ def damping(scenario: str, folder: Path, seed: int) -> None:
     title = "Damping of the joint at 2.5 Hz, % of critical (AIAA 2011-2571, Figure 3.1)"
     label = "centerbody total angle of attack (deg)"
     synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
-    picture = studies.figure_joints(study, "alpha_total_deg", label, title, synthetic)
+    picture = partial(studies.figure_joints, study, "alpha_total_deg", label, title, synthetic)
     write_study(study, folder, "damping", {"figure_3_1.png": picture})
 
 
@@ -64,10 +68,9 @@ def stiffness(scenario: str, folder: Path, seed: int) -> None:
     compile_kernels("simulator", "ensembles")
     study = joints.stiffness_study(chosen, seed)
     synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
+    title = "Stiffness of the joint at 0.5 % of critical (AIAA 2011-2571"
     pictures = {
-        name: studies.figure_joints(
-            study, quantity, label, f"Stiffness of the joint at 0.5 % of critical (AIAA 2011-2571, {number})", synthetic
-        )
+        name: partial(studies.figure_joints, study, quantity, label, f"{title}, {number})", synthetic)
         for name, quantity, label, number in (
             ("figure_3_2.png", "alpha_total_deg", "centerbody total angle of attack (deg)", "Figure 3.2"),
             ("figure_3_3.png", "normal_g", "centerbody normal acceleration (g)", "Figure 3.3"),
@@ -76,14 +79,16 @@ def stiffness(scenario: str, folder: Path, seed: int) -> None:
     write_study(study, folder, "stiffness", pictures)
 
 
-def write_study(study: joints.JointStudy, folder: Path, name: str, pictures: dict[str, studies.Figure]) -> None:
+def write_study(
+    study: joints.JointStudy, folder: Path, name: str, pictures: Mapping[str, Callable[[], studies.Figure]]
+) -> None:
     """Write tables and figures of a study of the joint, and print it beside the paper's statements."""
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / f"{name}.csv", study.table)
     write_csv(folder / f"{name}_paper.csv", study.paper)
     write_csv(folder / f"{name}_histories.csv", joints.histories(study))
     for file, figure in pictures.items():
-        save(figure, folder / file)
+        draw(folder / file, figure)
     later = f"{joints.LATER_S[0]:g} to {joints.LATER_S[1]:g} s later"
     table = Table(title=f"Centerbody around peak pressure ({study.peak_s:.1f} s) and {later}")
     for head in ("joint", "alpha deg", "later", "normal g", "peak g", "deflection deg", "tumbled s"):
@@ -113,7 +118,7 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
     write_csv(folder / "preflight.csv", table)
     write_csv(folder / "preflight_bands.csv", bands(rigid, flexible))
     write_csv(folder / "preflight_flight.csv", flown)
-    save(picture, folder / "figure_1_3.png")
+    draw(folder / "figure_1_3.png", picture)
     printed = Table(title=f"The flight against 2.3 to 97.7 % of {flights} entries, over the pulse")
     for head in ("joint", "quantity", "inside", "over the median", "peak / 97.7 %", "diverged"):
         left = head in ("joint", "quantity")
@@ -128,8 +133,8 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
 
 def compared_with_bounds(
     flight: Reconstruction, rigid: Bounds, flexible: Bounds
-) -> tuple[pd.DataFrame, pd.DataFrame, studies.Figure]:
-    """Return `shares`, the flight's own columns ``time_s, alpha_total_deg, normal_g``, and both as a picture."""
+) -> tuple[pd.DataFrame, pd.DataFrame, Drawing]:
+    """Return `shares`, the flight's own columns ``time_s, alpha_total_deg, normal_g``, and what draws both."""
     pulse = flight.required_loads()
     flown = pd.DataFrame(
         {
@@ -146,8 +151,8 @@ def compared_with_bounds(
     tag = "SYNTHETIC flight" if flight.telemetry.synthetic else "flight"
     span = _pulse_span(flight)
     window = span[0] - 10.0, span[1] + 5.0
-    picture = studies.figure_preflight(rigid, flexible, flown, window, remark, f"{flight.telemetry.name}: {tag}")
-    return table, flown, picture
+    title = f"{flight.telemetry.name}: {tag}"
+    return table, flown, partial(studies.figure_preflight, rigid, flexible, flown, window, remark, title)
 
 
 def _pulse_span(flight: Reconstruction) -> tuple[float, float]:

@@ -11,7 +11,7 @@ FLY = """
 import numpy as np
 from flightmodel import _kernels
 from synthetic_flight import _kernels as flight
-print(_kernels.CACHE)
+print(_kernels.CACHE.path)
 print(flight.beyond_freeplay(0.2, 0.1, 0.01, 25.0))
 """
 

@@ -913,6 +913,39 @@ def test_frame_of_the_wrong_size_names_both_sizes(flight) -> None:
     refused(flight, "frame_1.png", "320", "240", "720", "480", codes={"image-size"})
 
 
+@pytest.mark.parametrize(
+    ("form", "t0", "before", "cell"),
+    [
+        ("utc", "2016-12-31T23:59:00Z", "2016-12-31T23:59:{:07.4f}Z", "2016-12-31T23:59:60.2000Z"),
+        ("utc", "2009-08-17T12:52:00Z", "2009-08-17T12:52:{:07.4f}Z", "2009-08-17T12:52:60.000Z"),
+        ("irig_doy", "2009-08-17T12:52:00Z", "229:12:52:{:06.3f}", "229:12:52:60.000"),
+    ],
+)
+def test_second_60_says_what_to_do(flight, form: str, t0: str, before: str, cell: str) -> None:
+    """A leap second, or a clock that rounds 59.9996."""
+    flight.replace("flight.toml", "2009-08-17T12:52:00Z", t0)
+    times = [before.format(at) for at in np.linspace(50.0, 59.9, len(flight.lines("rates.csv")) - 1)]
+    times[-1] = cell
+    remaining = iter(times)
+    flight.map_column("rates.csv", 0, lambda _: next(remaining))
+    flight.declare(f'time = {{ column = "t_s", format = "{form}" }}', 'file = "telemetry/rates.csv"')
+    error = refused(flight, cell, "seconds", codes={"second-60"})
+    assert names_line(str(error), len(times) + 1)
+
+
+def test_second_60_of_a_time_of_day(flight) -> None:
+    """In three columns it was taken for the next minute's second 0, which the next row may have as well."""
+    lines = flight.lines("radar_north.csv")
+    rows = [f"12,{59 + (k >= 20)},{41 + k if k < 20 else k - 20}" for k in range(len(lines) - 1)]
+    rows[19] = "12,59,60"
+    cells = [line.split(",", 1)[1] for line in lines]
+    head = "h,m,s," + cells[0]
+    flight.write_lines("radar_north.csv", [head, *(f"{r},{c}" for r, c in zip(rows, cells[1:], strict=True))])
+    time = 'time = { format = "utc_hms", columns = ["h", "m", "s"] }'
+    flight.declare(time, 'file = "telemetry/radar_north.csv"')
+    assert names_line(str(refused(flight, "12:59:60", codes={"second-60", "time-format"})), 21)
+
+
 def test_frame_listed_without_a_name(flight) -> None:
     flight.cell("frames.csv", 3, 1, "")
     assert names_line(str(refused(flight, "frames.csv", codes={"file-missing"})), 3)

@@ -21,7 +21,7 @@ import pytest
 from flightmodel.checks import writing
 from postflight import cli, commands
 from postflight.deflections import METHODS
-from postflight.run_folder import PARTIAL, remove_abandoned
+from postflight.plots import run_figures
 from tests.postflight.killing import kill_run, run_again, start_command
 from tests.refusing import printed_codes, refuses
 
@@ -472,17 +472,22 @@ def test_killed_runs_leave_nothing_half_written(two_runs, clean_flight, tmp_path
     run_again(tmp_path / "flight", saved)
 
 
-def test_what_a_killed_run_left_is_removed(tmp_path: Path) -> None:
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    left, ours, other = (
-        tmp_path / f"{PARTIAL}{number}-abc" for number in (gone.pid, os.getpid(), "x")
-    )  # fmt: skip
-    for path in (left, ours, other):
-        path.mkdir()
-        (path / "bet.csv").write_text("half")
-    remove_abandoned(tmp_path)
-    assert sorted(tmp_path.iterdir()) == sorted([ours, other])
+@pytest.mark.filterwarnings("default::RuntimeWarning")
+def test_a_figure_that_fails_costs_itself_alone_and_says_so(flight, command, monkeypatch) -> None:
+    def fails(*_: object) -> None:
+        raise ValueError("two dollars: $x$ \\bad")
+
+    for name in ("figure_residuals", "figure_2_5"):
+        monkeypatch.setattr(run_figures, name, fails)
+    done = command("run", flight.root)
+    (run,) = (flight.root / "runs").iterdir()
+    assert "Traceback" not in done.stderr
+    assert printed_codes(done.stderr) == ["figure-failed"] * 2
+    assert all(name in done.stderr for name in ("residuals.png", "figure_2_5.png"))
+    drawn = {p.name for p in (run / "figures").iterdir()}
+    assert "filter_and_smoother.png" in drawn
+    assert not drawn & {"residuals.png", "figure_2_5.png"}
+    assert {"summary.json", "report.html", "rigid_bounds.csv", "bet.csv"} <= {p.name for p in run.iterdir()}
 
 
 def limited(*arguments: str | Path, largest_bytes: int) -> subprocess.CompletedProcess[str]:

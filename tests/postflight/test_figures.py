@@ -139,3 +139,8 @@ def test_every_figure_is_at_the_door(name):
 @pytest.mark.parametrize("colours", [[style.COLOUR[m] for m in style.STROKE], list(style.AXES.values()), style.MANY])
 def test_lines_that_share_axes_differ_in_colour(colours):
     assert len(set(colours)) == len(colours)
+
+
+def test_a_full_disk_is_no_matter_of_one_figure(tmp_path) -> None:
+    with pytest.raises(OSError, match="missing"):
+        style.draw(tmp_path / "missing" / "a.png", matplotlib.figure.Figure)

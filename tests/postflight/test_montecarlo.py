@@ -15,10 +15,10 @@ import pytest
 from scipy.stats import binom
 
 from flightmodel.checks import ConfigError, GateError
+from flightmodel.partial_files import PARTIAL, machine
 from flightmodel.vehicle import DATA
 from postflight.montecarlo import commands, execution, trial
 from postflight.montecarlo.bands import (
-    PARTIAL,
     chunk_path,
     coverage,
     is_narrow,
@@ -36,7 +36,7 @@ from .killing import start_command
 from .short_flights import DISPERSIONS, ENTRY, write_short
 
 FLIGHTS = 24
-PARTIAL_GLOB = f".*{PARTIAL}"
+PARTIAL_GLOB = f".{PARTIAL}-*"
 
 
 def quiet(_fraction, _words):
@@ -186,7 +186,7 @@ def test_damaged_and_abandoned_files_are_flown_again(reference, path, tmp_path):
     chunk_path(folder, 4).unlink()
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    (folder / "chunks" / f".chunk-000001-{ended.pid}{PARTIAL}").write_bytes(b"half")
+    (folder / "chunks" / f".{PARTIAL}-{machine()}-{ended.pid}-00000000-chunk-000001.npz").write_bytes(b"half")
     assert status(folder).chunks == 3
     study = read_study(str(path))
     with refuses("chunk-missing", names=[r"\b3\b.*\b6\b"]):

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from postflight.montecarlo.bands import chunk_from_rows, merge, write_merged
 from postflight.montecarlo.execution import Wanted
 from postflight.montecarlo.study import read_study
 from tests.documents import ROOT
+from tests.refusing import printed_codes
 
 from .short_flights import write_short
 from .test_montecarlo import content, fly, quiet
@@ -141,3 +143,45 @@ def test_the_pages_script_for_a_queue_runs(kind: str, tmp_path: Path) -> None:
     flown = pd.read_csv(tmp_path / "study" / "flights.csv")
     assert len(flown) == 192
     assert flown.reason.isna().all()
+
+
+@pytest.mark.parametrize(
+    ("address", "is_open"),
+    [("tcp://127.0.0.1:8786", False), ("tcp://localhost:8786", False), ("tls://node7:8786", False),
+     ("tcp://[::1]:8786", False), ("tcp://node7:8786", True), ("node7:8786", True), ("tcp://0.0.0.0:8786", True)],
+)  # fmt: skip
+def test_an_open_scheduler_is_known(address, is_open):
+    assert execution.is_open(address) == is_open
+
+
+def test_an_open_scheduler_is_named(path, tmp_path, monkeypatch, command):
+    monkeypatch.setattr(execution, "CONNECT_S", 0.3)
+    for address, codes in (("tcp://0.0.0.0:9", ["scheduler-open"]), ("tcp://127.0.0.1:9", [])):
+        done = command("montecarlo", "run", path, tmp_path / "study", "--flights", "8", "--scheduler", address)
+        assert printed_codes(done.stdout) == codes
+        assert printed_codes(done.stderr) == ["scheduler-unreachable"]
+
+
+@pytest.mark.slow
+def test_a_cluster_with_tls_makes_the_same_bytes(reference, path, tmp_path, monkeypatch):
+    """With certificates from the environment's settings, as the page has it; one without is not let in."""
+    dask = pytest.importorskip("dask")
+    if shutil.which("openssl") is None:
+        pytest.skip("no openssl to make a certificate")
+    own, key = tmp_path / "own.pem", tmp_path / "own.key"
+    make = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=test"]
+    subprocess.run([*make, "-keyout", key, "-out", own], check=True, capture_output=True)
+    where, roles = "distributed.comm.tls", ("scheduler", "worker", "client")
+    tls = {f"{where}.ca-file": str(own), "distributed.comm.require-encryption": True}
+    tls |= {f"{where}.{role}.{part}": str(file) for role in roles for part, file in (("cert", own), ("key", key))}
+    bare = {f"{where}.{part}": None for part in ("ca-file", "client.cert", "client.key")}
+    monkeypatch.setattr(execution, "CONNECT_S", 5)
+    with dask.config.set(tls):
+        options = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "protocol": "tls://"}
+        with distributed.LocalCluster(n_workers=2, security=distributed.Security(), **options) as found:
+            fly(path, tmp_path / "study", flights=FLIGHTS, scheduler=found.scheduler_address)
+            assert found.scheduler_address.startswith("tls://")
+            with dask.config.set(bare), pytest.raises(ConfigError) as refusal:
+                fly(path, tmp_path / "other", flights=8, scheduler=found.scheduler_address)
+    assert refusal.value.codes == ("scheduler-unreachable",)
+    assert content(tmp_path / "study") == reference

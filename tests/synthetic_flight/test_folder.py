@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from flightmodel.checks import GateError
+from flightmodel.partial_files import machine
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 
@@ -28,16 +29,23 @@ def dead_process_number():
 
 
 def test_leftovers_of_dead_processes_are_removed_and_of_living_ones_left(tmp_path, short):
-    dead = dead_process_number()
-    for name in (f".a-partial-{dead}", ".a-partial-1", ".ab-partial-1", ".a-partial-notes"):
+    dead, here, other = dead_process_number(), machine(), "0" * 8
+    left = {f".partial-{here}-{dead}-00000000-a", f".old-{here}-{dead}-00000000-a"}
+    running = {f".partial-{here}-1-00000000-a", f".partial-{other}-{dead}-00000000-a"}
+    kept = running | {f".partial-{here}-{dead}-00000000-ab", ".partial-notes-a"}
+    for name in left | kept:
         (tmp_path / name).mkdir()
-    simulate_to_folder(short, 0, tmp_path / "a")
-    assert {p.name for p in tmp_path.iterdir()} == {"a", ".a-partial-1", ".ab-partial-1", ".a-partial-notes"}
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "flight.toml").touch()
+    (tmp_path / "a" / "truth").mkdir()
+    (tmp_path / "a" / "truth" / "run.json").touch()
+    simulate_to_folder(short, 0, tmp_path / "a", replace=True)
+    assert {p.name for p in tmp_path.iterdir()} == {"a", *kept}
 
 
 def test_an_old_flight_whose_successor_was_never_put_in_place_comes_back(tmp_path, short):
     simulate_to_folder(short, 0, tmp_path / "a")
-    (tmp_path / "a").rename(tmp_path / f".a-old-{dead_process_number()}")
+    (tmp_path / "a").rename(tmp_path / f".old-{machine()}-{dead_process_number()}-00000000-a")
     with pytest.raises(GateError) as refusal:
         simulate_to_folder(short, 1, tmp_path / "a")
     assert refusal.value.codes == ("folder-exists",)

@@ -38,7 +38,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     flight = flight.replace('name = "irve2_reference"', f'name = "{HOSTILE}"', 1)
     (folder / "flight.toml").write_text(flight + f"\n[[events]]\nname = '{HOSTILE_EVENT}'\nt_s = 430.0\n")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_figures, "save", lambda *_: None)  # nobody looks at them here
+        patch.setattr(run_figures, "draw", lambda *_: None)  # nobody looks at them here
         commands.run_flight(folder, METHODS, commands.Asked())
     return folder
 

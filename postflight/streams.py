@@ -1,0 +1,63 @@
+"""How does text from files reach standard output? As text: it moves no cursor, turns no line round, ends no command.
+
+A name in a delivery may hold escape sequences that rewrite what stands above, or bidirectional marks that show a number
+backwards; a reader such as `head` may close its end of the pipe, a log may take ASCII only.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import unicodedata
+from typing import Any, TextIO
+
+_HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidi, zero width), half a character, line ends
+_KEPT = {"\n", "\t"}
+
+
+def visible(text: str) -> str:
+    """Text with ``?`` in place of every character that is not seen but does something."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join("?" if unicodedata.category(c) in _HIDDEN and c not in _KEPT else c for c in text)
+
+
+def write_out(text: str, stream: TextIO | None = None) -> None:
+    """Write text to standard output, or another stream; nowhere if nobody reads."""
+    stream = stream or sys.stdout
+    try:
+        stream.write(visible(text))
+        stream.flush()
+    except BrokenPipeError:
+        into_nothing(stream)
+
+
+def into_nothing(stream: Any) -> None:
+    """Send what a stream still holds, and all that follows, to the null device."""
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, stream.fileno())
+    os.close(nothing)
+
+
+def open_streams() -> None:
+    """Make standard streams such that no character and no closed descriptor can end a command."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:  # closed by the caller: the next file opened would take its number, and be printed into
+            os.open(os.devnull, os.O_RDWR)
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        stream: TextIO | None = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, os.fdopen(number, "w", encoding="utf-8", closefd=False))
+        elif hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def close_streams() -> None:
+    """Write what is still held; a reader that has gone is no fault."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            into_nothing(stream)
