@@ -7,6 +7,7 @@ import re
 import sys
 import time
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -131,25 +132,35 @@ def print_events(flown: list[Event]) -> None:
 
 
 def run(folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False) -> None:
-    """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers."""
-    bet, answers, written = run_flight(folder, methods, wanted, reruns)
-    print_flight(bet, run_folder.read_csv(written / "events.csv"))
+    """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers.
+
+    The answers are printed before figures and report are made.
+    """
+
+    def show_answers(bet: Reconstruction, answers: Deflections, events: pd.DataFrame) -> None:
+        print_flight(bet, events)
+        if methods:
+            print_answers(answers)
+
+    _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers)
     if reruns:
         print_sensitivity(run_folder.read_csv(written / "sensitivity.csv"))
-    if methods:
-        print_answers(answers)
     console.print(f"results in {escape(str(written))}, to read in report.html")
     if any(reason.code != NO_VIDEO for reason in answers.refused.values()):
         sys.exit(EXIT_NO_ANSWER)
 
 
 def run_flight(
-    folder: Path, methods: tuple[str, ...], asked_for: Asked, reruns: bool = False
-) -> tuple[Reconstruction, Deflections, Path]:
-    """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too."""
-    log: list[str] = []
-    with progress_bar() as report:
+    folder: Path, methods: tuple[str, ...], asked_for: Asked, reruns: bool = False,
+    show_answers: Callable[[Reconstruction, Deflections, pd.DataFrame], None] = lambda *_: None,
+) -> tuple[Reconstruction, Deflections, Path]:  # fmt: skip
+    """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too.
 
+    ``show_answers`` is called with trajectory, deflections and events once their tables are written.
+    """
+    log: list[str] = []
+
+    def steps(report: Progress) -> Callable[[float, float], Progress]:
         def step(low: float, high: float) -> Progress:
             def show(fraction: float, what: str) -> None:
                 if not log or log[-1] != what:
@@ -158,40 +169,53 @@ def run_flight(
 
             return show
 
-        share = 0.2 if reruns else 1.0  # of the time, for all but the reruns
-        flight = asked_for.of(read_flight(folder, step(0.0, 0.05 * share)))
+        return step
+
+    with progress_bar() as report:
+        step = steps(report)
+        flight = asked_for.of(read_flight(folder, step(0.0, 0.05)))
         compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *(["camera"] if "camera" in methods else []))
-        bet = reconstruct(flight, None, step(0.05 * share, 0.5 * share))
+        bet = reconstruct(flight, None, step(0.05, 0.7))
         wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
-        answers = estimate(bet, wanted, step(0.5 * share, 0.7 * share))
-        if "camera" in methods and "camera" not in wanted:
-            answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
-        settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
-        if flight.changes:
-            settings["changes"] = list(flight.changes)
-        with run_folder.RunFolder(folder, flight.telemetry, settings) as out:
-            event_rows = run_folder.write_reconstruction(out, bet, answers)
-            run_folder.write_answers(out, answers)
-            if "camera" in answers.histories:
-                out.write_csv("camera_sensitivity.csv", camera_sensitivity(flight, answers.histories["camera"]))
-            out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
-            bounds, table = None, None
-            if bet.loads is not None:
-                bounds = rigid_bounds(bet, progress=step(0.7 * share, 0.9 * share))
-                out.write_csv("rigid_bounds.csv", bounds.table())
-            if reruns:
-                table = sensitivity(bet, step(share, 1.0))
-                out.write_csv("sensitivity.csv", table)
-            # every table is written
-            run_figures.draw_run(bet, answers, out.path / "figures", step(0.9 * share, share), bounds)
-            if table is not None:
-                run_figures.draw_sensitivity(bet, table, out.path / "figures")
-            step(1.0, 1.0)(0.0, "writing the report")
+        answers = estimate(bet, wanted, step(0.7, 1.0))
+    if "camera" in methods and "camera" not in wanted:
+        answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
+    settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
+    if flight.changes:
+        settings["changes"] = list(flight.changes)
+    with run_folder.RunFolder(folder, flight.telemetry, settings) as out:
+        event_rows = run_folder.write_reconstruction(out, bet, answers)
+        run_folder.write_answers(out, answers)
+        out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
+        show_answers(bet, answers, run_folder.read_csv(out.path / "events.csv"))
+        with progress_bar() as report:
+            _write_rest(out, bet, answers, reruns, steps(report))
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
             (out.path / "log.jsonl").write_text(lines)
             out.write_facts()
             write_report(folder, out.path, flight.telemetry)
     return bet, answers, out.path
+
+
+def _write_rest(
+    out: run_folder.RunFolder, bet: Reconstruction, answers: Deflections, reruns: bool,
+    step: Callable[[float, float], Progress],
+) -> None:  # fmt: skip
+    """Write what comes after the answers: further tables, then, every table written, the figures."""
+    share = 0.3 if reruns else 1.0  # of the time, for all but the reruns
+    if "camera" in answers.histories:
+        out.write_csv("camera_sensitivity.csv", camera_sensitivity(bet.flight, answers.histories["camera"]))
+    bounds, table = None, None
+    if bet.loads is not None:
+        bounds = rigid_bounds(bet, progress=step(0.0, 0.4 * share))
+        out.write_csv("rigid_bounds.csv", bounds.table())
+    if reruns:
+        table = sensitivity(bet, step(0.4 * share, 0.7))
+        out.write_csv("sensitivity.csv", table)
+    run_figures.draw_run(bet, answers, out.path / "figures", step(0.7 if reruns else 0.4, 1.0), bounds)
+    if table is not None:
+        run_figures.draw_sensitivity(bet, table, out.path / "figures")
+    step(1.0, 1.0)(0.0, "writing the report")
 
 
 @dataclass(frozen=True)
