@@ -269,6 +269,9 @@ def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: li
 
     text = frame[column].str.strip()
     values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, copy=True)
+    read = np.isfinite(values)
+    # pandas 3.0 and before round the last of seventeen digits
+    values[read] = [float(cell) for cell in text.to_numpy(dtype=object)[read]]
     missing = text.str.lower().isin(["", "nan", "na", "null", "-"]).to_numpy()
     bad = (~np.isfinite(values)) & ~missing
     if bad.any():
