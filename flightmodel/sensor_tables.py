@@ -646,7 +646,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> 
             f"temperatures are up to {size:.0f} % too {side} for the fall of density with height (hydrostatic "
             "balance): check the units of all three"
         )
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="hydrostatic"))
+        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="hydrostatic-balance"))
     density_sd, wind_sd = default_sounding_sd(alt)
     for key, default in (("rho_sd", density_sd), ("wind_sd", wind_sd)):
         if key in c:

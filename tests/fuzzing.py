@@ -415,7 +415,7 @@ def write_flight(root: Path) -> None:
         "barometer": {"t_s": 1e3 * t, "height_m": 60e3 - 300.0 * (t - 420.0) + w[0]},
         "atmosphere": {
             "alt_m": 3000.0 * np.arange(31), "rho_kgpm3": 1.2 * np.exp(-3.0 * np.arange(31) / 7.1),
-            "t_k": 250.0 + 20.0 * np.sin(np.arange(31.0)), "wind_n_mps": w[0], "wind_e_mps": w[1],
+            "t_k": 250.0 + 2.0 * np.sin(np.arange(31.0)), "wind_n_mps": w[0], "wind_e_mps": w[1],
         },
     }  # fmt: skip
     for name, columns in tables.items():

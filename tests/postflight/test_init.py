@@ -63,6 +63,10 @@ EVERY_TABLE = {"time", "columns", "use_s"}  # said once, above the sensors
 CASES = [(kind, table) for kind, tables in TABLES.items() for table in tables]
 
 
+def test_template_speaks_of_several_cameras():
+    assert "[cameras.NAME]" in template("flight")
+
+
 def run(*arguments):
     return CliRunner().invoke(cli, [str(a) for a in arguments])
 
@@ -75,7 +79,8 @@ def test_template_names_every_key_with_its_default(kind, table):
         t.split(".")[len(table.split(".")) if table else 0] for t in TABLES[kind] if t != table and t.startswith(table)
     }
     shared = EVERY_TABLE | {"position_from_datum_body_m", "axes"} if issubclass(model, Source) else set()
-    settings = {"reconstruction"} if not table else set()  # tested below: no model of pydantic
+    # settings are tested below: no model of pydantic; cameras have the keys of [frames]
+    settings = {"reconstruction", "cameras"} if not table else set()
     missing = set(model.model_fields) - set(lines) - below - shared - settings
     assert not missing
     assert set(lines) <= set(model.model_fields)
