@@ -82,10 +82,10 @@ pf.compare(answer, changed)
 # %% [markdown]
 # ## The claim
 #
-# The three agree by their own tests, the fused answer is narrower than those of accelerometers and trim (the camera's may be
-# narrower still: it takes the deflection as proportional to the moment in the joint), and the truth, looked at only now,
-# lies within three standard deviations of every one. Under the wrong assumption the methods disagree, and the offset is
-# among what is suspected.
+# The three agree by their own tests, the fused answer is narrower than those of accelerometers and trim (the camera's
+# may be narrower still: it takes the deflection as proportional to the moment in the joint), and the truth, looked at
+# only now, lies within three standard deviations of every one. Under the wrong assumption the methods disagree, and the
+# offset is among what is suspected.
 
 # %%
 truth = pd.read_csv(folder / "truth" / "deflection.csv")
