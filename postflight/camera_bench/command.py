@@ -33,6 +33,7 @@ def open_bench(folder: Path, camera: str | None, port: int, browser: bool) -> No
         raise GateError(f"--port {port}: {HOST} does not offer it; leave --port out", code="port-taken") from None
     console.print(f"film of {folder} at {address}", markup=False)
     console.print(f"decisions are saved in {folder / EDITS_FILE}; Ctrl-C ends the bench", markup=False)
+    console.file.flush()  # into a pipe, too, before the page is waited for
     if browser:
         webbrowser.open(address)
     try:

@@ -2,6 +2,8 @@
 
 import http.client
 import json
+import signal
+import subprocess
 import threading
 import time
 import tomllib
@@ -19,6 +21,7 @@ from postflight.camera_bench.command import session_of
 from postflight.filming import camera_film
 from postflight.flight import read_flight
 from tests.estimators.test_camera_deflection import film
+from tests.postflight.killing import start_command
 
 TIMES = (421.0, 425.0, 430.0, 435.0)
 THETA, PLANE = (0.0, 1.5, 3.0, 4.2), (0.0, 170.0, 175.0, 180.0)
@@ -250,6 +253,20 @@ def residual(page, fits) -> None:
             return
         page.wait_for_timeout(50)
     raise AssertionError(words)
+
+
+def test_the_command_serves_until_it_is_interrupted(folder):
+    process = start_command("camera", folder, "--no-browser", stdout=subprocess.PIPE, text=True)
+    try:
+        lines = iter(process.stdout.readline, "")
+        address = next(line for line in lines if "http://127.0.0.1:" in line).split()[-1]
+        assert asked(address)[0] == 200
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
 
 
 @pytest.mark.browser

@@ -63,19 +63,34 @@ LONG = {
     "postflight reconcile demo-flight",
     "postflight reconcile demo-flight --freeplay --hardening",
     "postflight reconcile demo-flight --posterior",
-    "dask scheduler --port 8786",
+    "dask scheduler --host 127.0.0.1 --port 8786 --no-dashboard",
     "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False",
-    "dask worker tcp://host:8786 --nworkers 16 --nthreads 1",
-    "postflight montecarlo run irve2_reference study --flights 100000 --scheduler tcp://host:8786",
+    "dask worker tcp://127.0.0.1:8786 --host 127.0.0.1 --no-dashboard --nworkers 16 --nthreads 1",
+    "postflight montecarlo run irve2_reference study --flights 100000 --scheduler tcp://127.0.0.1:8786",
 }
 NOT_RUN = {
     "make demo": "makes an environment from a package registry; `postflight demo` is run",
     "make test": "is this suite",
+    "postflight camera my-flight": "serves until it is interrupted; tests/postflight/test_camera_bench.py",
     "make docs": "makes an environment likewise; tests/test_documentation.py builds the site",
     "python -m pytest tests/synthetic_flight tests/recon --junitxml=proofs.xml": "is a part of this suite",
 }
-# blocks that are no commands, by their first line
-SHOWN = ("Deflection at the true peak of dynamic pressure", "my-flight/")
+_WITH_CERTIFICATES = "needs certificates; tests/postflight/test_montecarlo_cluster.py runs a cluster with some"
+NOT_RUN |= dict.fromkeys(
+    (
+        "export DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION=True",
+        "export DASK_DISTRIBUTED__COMM__TLS__CA_FILE=ca.pem",
+        "dask scheduler --protocol tls --port 8786 --no-dashboard",
+        "dask worker tls://host:8786 --no-dashboard --nworkers 16 --nthreads 1",
+        "postflight montecarlo run irve2_reference study --flights 100000 --scheduler tls://host:8786",
+    ),
+    _WITH_CERTIFICATES,
+)
+# blocks that are no commands, or not those alone, by their first line
+SHOWN = (
+    "Deflection at the true peak of dynamic pressure", "my-flight/",
+    "export DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION",
+)  # fmt: skip
 # what a command leaves, beside its exit code
 WRITES = {
     "postflight demo demo-flight": "demo-flight/demo.png demo-flight/runs/*/report.html",
@@ -248,8 +263,8 @@ def free_port() -> int:
 def test_long_commands_of_a_page_run(page: Path, flown: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     run, port, started = runner(capsys, monkeypatch), str(free_port()), []
     give(tmp_path, flown, flown, ("demo-flight", "my-flight", "examples"))
-    monkeypatch.setitem(SMALLER, "tcp://host:8786", f"tcp://127.0.0.1:{port}")
-    monkeypatch.setitem(SMALLER, "--port 8786", f"--host 127.0.0.1 --port {port} --no-dashboard")
+    monkeypatch.setitem(SMALLER, "tcp://127.0.0.1:8786", f"tcp://127.0.0.1:{port}")
+    monkeypatch.setitem(SMALLER, "--port 8786", f"--port {port}")
     try:
         for line in command_lines(page):
             if not is_long(page, line):
