@@ -56,6 +56,7 @@ from estimators.evidence import (
 from estimators.loads import FlightLoads
 from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory, history_from_lateral
+from flightmodel.trajectory import nearest_index
 
 KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its oscillation
 # a priori of the process's size, median and sd of its logarithm: a degree of swing at 2 Hz, between a degree at 0.5 Hz
@@ -454,7 +455,7 @@ def _unresolved_swing_var(readings: DeflectionHistory, at: DeflectionHistory, sw
     off = np.sum((yz - uniform_filter1d(yz, _LOCAL, axis=0, mode="nearest")) ** 2, axis=1)
     var = uniform_filter1d(off, _LOCAL, mode="nearest") * _LOCAL / (_LOCAL - 1.0)
     level = uniform_filter1d(np.sum(yz**2, axis=1), _LOCAL, mode="nearest")
-    near = np.abs(at.time_s[:, None] - time_s[None, :]).min(axis=1)
+    near = np.abs(at.time_s - time_s[nearest_index(time_s, at.time_s)])
     share = 1.0 - np.cos(np.minimum(2.0 * np.pi * swing_hz * near, 0.5 * np.pi))
     # a uniform amplitude's mean square is a third of its largest, a swing's variance half of its amplitude's square
     return np.asarray(np.interp(at.time_s, time_s, np.maximum(var, level / 6.0)) * share)
@@ -578,8 +579,7 @@ def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) 
 def _apart_from_readings(time_s: FloatArray, readings: list[Evidence]) -> FloatArray:
     """Distance (n,) of each time from the nearest reading of any method, s."""
     read = np.sort(np.concatenate([e.time_s for e in readings]))
-    after = np.searchsorted(read, time_s).clip(1, len(read) - 1)
-    return np.asarray(np.minimum(np.abs(read[after] - time_s), np.abs(time_s - read[after - 1])))
+    return np.abs(time_s - read[nearest_index(read, time_s)])
 
 
 def _posterior(

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flightmodel import earth, rotations
-from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing, check_shape, check_unit_quaternion
+from flightmodel.checks import (
+    FloatArray,
+    GateError,
+    IntArray,
+    check_finite,
+    check_increasing,
+    check_shape,
+    check_unit_quaternion,
+)
 from flightmodel.tabular import Tabular
 
 if TYPE_CHECKING:
@@ -145,6 +153,12 @@ def resample(trajectory: Trajectory, time_s: FloatArray) -> Trajectory:
         interpolate_rows(at, t, trajectory.omega_body_eci_body_radps),
         covariance,
     )
+
+
+def nearest_index(grid: FloatArray, at: FloatArray) -> IntArray:
+    """Index of the value of an increasing grid (n,), n > 1, that is nearest to each of ``at``."""
+    k = np.clip(np.searchsorted(grid, at), 1, len(grid) - 1)
+    return np.asarray(k - (at - grid[k - 1] < grid[k] - at), dtype=np.int64)
 
 
 def interpolate_rows(at: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:

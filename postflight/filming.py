@@ -22,6 +22,7 @@ from flightmodel.checks import DivergenceError, Fault, GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Frames
 from flightmodel.telemetry import Telemetry
+from flightmodel.trajectory import nearest_index
 from flightmodel.vehicle import Vehicle
 from postflight.flight import Flight
 from postflight.fusing import CAMERA_PLANE_SD_RAD
@@ -254,7 +255,7 @@ def by_camera(telemetry: Telemetry, history: DeflectionHistory) -> dict[str, tup
         return dict.fromkeys(telemetry.films, (telemetry, history))
     out = {}
     for name, frames in telemetry.films.items():
-        nearest = np.abs(history.time_s[None, :] - frames.time_s[:, None]).argmin(axis=1)
+        nearest = nearest_index(history.time_s, frames.time_s)
         there = np.abs(history.time_s[nearest] - frames.time_s) < _SAME_FRAME_S
         theta = np.where(there, history.theta_rad[nearest], np.nan)
         cov = None if history.covariance is None else history.covariance[nearest]

@@ -36,6 +36,7 @@ import numpy as np
 
 from flightmodel import rotations
 from flightmodel.checks import BoolArray, FloatArray, IntArray
+from flightmodel.trajectory import nearest_index
 from recon import _filter_kernels, _measurement_kernels
 from recon._measurement_kernels import SLOTS
 from recon.measurements import Instrument, NodeMotion, predict, wrapped
@@ -269,12 +270,6 @@ def observe(time_s: FloatArray, instruments: tuple[Instrument, ...]) -> tuple[Ob
     first = np.searchsorted(nodes, np.arange(len(time_s) + 1)).astype(np.int64)
     usable = np.ones(len(rows), dtype=bool)
     return Observed(first, sources, gathered("value"), gathered("variance"), gathered("known"), usable), rows
-
-
-def nearest_index(grid_s: FloatArray, at_s: FloatArray) -> IntArray:
-    """Index of the grid time nearest to each of ``at_s``."""
-    k = np.clip(np.searchsorted(grid_s, at_s), 1, len(grid_s) - 1)
-    return np.asarray(k - (at_s - grid_s[k - 1] < grid_s[k] - at_s), dtype=np.int64)
 
 
 @dataclass(frozen=True)

@@ -35,9 +35,9 @@ import pandas as pd
 
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.telemetry import Finding
-from flightmodel.trajectory import Trajectory, difference, resample
+from flightmodel.trajectory import Trajectory, difference, nearest_index, resample
 from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, edit_check
-from recon.ekf import Problem, nearest_index
+from recon.ekf import Problem
 from recon.imu_screening import TransientOffset
 from recon.measurements import SITES
 from recon.state import KINEMATIC

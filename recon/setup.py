@@ -21,9 +21,10 @@ from flightmodel.gate import spaced
 from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesSpec
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.telemetry import AttitudePrior, Telemetry
+from flightmodel.trajectory import nearest_index
 from recon import measurements
 from recon._measurement_kernels import HEIGHT, POSITION, RADAR, RANGE_RATE, VELOCITY
-from recon.ekf import FIT_SPAN_S, Problem, nearest_index, observe
+from recon.ekf import FIT_SPAN_S, Problem, observe
 from recon.imu_screening import BridgedSensor
 from recon.measurements import Instrument
 from recon.propagation import (
@@ -41,6 +42,7 @@ from recon.state import KINEMATIC, ErrorModel, States, ballistic_blocks, imu_blo
 from recon.triangulation import triangulated
 from recon.vector_attitude import start_attitude_from_vectors
 
+Track = tuple[FloatArray, FloatArray]  # times (n,) and points (n, 3), ECEF m
 _TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT, RANGE_RATE)
 _PULSE_CELL_S, _LEAST_PULSE_MPS2 = 0.5, 5.0
 _ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
@@ -80,29 +82,32 @@ def build_problem(
     instruments = tracking_instruments(telemetry, settings, arm)
     model = _named_model(telemetry, settings, sensors, instruments)
     used = tuple(_without_rejected(i, rejected) for i in instruments if not _is_excluded(i, settings))
-    start_s, end_s = _span(used, settings, sensors, telemetry.start.at_rest)
+    track = track_points(used)
+    start_s, end_s = _span(track[0], settings, sensors, telemetry.start.at_rest)
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
     if sensors is not None and settings.pulse_rate_hz > settings.output_rate_hz:
         output_s = _union([output_s, *_pulse_times(instruments, sensors.force, start_s, end_s, settings.pulse_rate_hz)])
     if sensors is not None:
-        instruments += rest_instruments(telemetry, start_s, track_points(used)[1][0])
+        instruments += rest_instruments(telemetry, start_s, track[1][0])
     if settings.attitude_sensors:
-        instruments += _attitude_instruments(telemetry, used, start_s, end_s)
+        instruments += _attitude_instruments(telemetry, track, start_s, end_s)
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
     between = np.arange(start_s, end_s, _BALLISTIC_STEP_S) if sensors is None else np.empty(0)
     time_s = _union([output_s, between, *inside])
     observed, row = observe(time_s, instruments)
     if sensors is None:
-        motion, node_index = ballistic_motion(telemetry.motion, telemetry.sounding, _cross_path_direction(used), time_s)
-        start, covariance = _start_ballistic(used, start_s, model)
+        motion, node_index = ballistic_motion(
+            telemetry.motion, telemetry.sounding, _cross_path_direction(track[1]), time_s
+        )
+        start, covariance = _start_ballistic(track, start_s, model)
     else:
         force, rate = sensors.force, sensors.rate
         clocks = model.column(rate.spec.name, "time bias") >= 0
         motion, node_index = inertial_motion(force, rate, time_s, clocks)
-        prior = _attitude_prior(telemetry, start_s, track_points(used)[1][0])
-        start, covariance = _start_by_inertial_sensors(used, prior, start_s, force, rate, model)
+        prior = _attitude_prior(telemetry, start_s, track[1][0])
+        start, covariance = _start_by_inertial_sensors(used, track, prior, start_s, force, rate, model)
         if telemetry.start.at_rest is not None and telemetry.start.at_rest[0] <= start_s < telemetry.start.at_rest[1]:
-            start = _start_at_rest(used, telemetry.start.at_rest, motion, start, time_s, node_index)
+            start = _start_at_rest(track, telemetry.start.at_rest, motion, start, time_s, node_index)
     motion = with_disturbances(motion, telemetry.motion)
     from scipy.stats import chi2
 
@@ -236,11 +241,9 @@ def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: F
     return tuple(out)
 
 
-def _attitude_instruments(
-    telemetry: Telemetry, tracking: tuple[Instrument, ...], start_s: float, end_s: float
-) -> tuple[Instrument, ...]:
+def _attitude_instruments(telemetry: Telemetry, track: Track, start_s: float, end_s: float) -> tuple[Instrument, ...]:
     """Magnetometer and Sun heads as measurements, thinned; positions for the field come from the tracking data."""
-    t, points = track_points(tracking)
+    t, points = track
     out: list[Instrument] = []
     if telemetry.magnetometer is not None:
         record = telemetry.magnetometer
@@ -304,13 +307,12 @@ def _sites(telemetry: Telemetry) -> SitesSpec:
 
 
 def _span(
-    instruments: tuple[Instrument, ...],
+    t: FloatArray,
     settings: Settings,
     sensors: InertialSensors | None,
-    at_rest: tuple[float, float] | None = None,
+    at_rest: tuple[float, float] | None,
 ) -> tuple[float, float]:
-    """First and last time that inertial sensors and a tracker, or a rest, cover, within the settings' span."""
-    t, _ = track_points(instruments)
+    """First and last time that inertial sensors and track points (n,), or a rest, cover, within the settings' span."""
     if len(t) == 0:
         raise GateError(
             "no radar or receiver has a usable point that is not left out, nor do angles and ranges of several sites "
@@ -405,7 +407,7 @@ def _start_attitude(
     return step.state.q_ecef_body, total, cross
 
 
-def track_points(instruments: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:
+def track_points(instruments: tuple[Instrument, ...]) -> Track:
     """Times (k,) and points (k, 3), ECEF m, of every measurement that fixes a position by itself, in order.
 
     Where none does, of instants at which angles and ranges of several sites do together (`recon.triangulation`).
@@ -433,7 +435,7 @@ def _ned_from_radar(range_az_el: FloatArray) -> FloatArray:
     return np.column_stack([slant * np.cos(el) * np.cos(az), slant * np.cos(el) * np.sin(az), -slant * np.sin(el)])
 
 
-def fit_start(instruments: tuple[Instrument, ...], start_s: float) -> tuple[FloatArray, FloatArray]:
+def fit_start(track: Track, start_s: float) -> tuple[FloatArray, FloatArray]:
     """Position and velocity (3,) of the tracked point at the start: a parabola through the seconds about it.
 
     With fewer than `_LEAST_POINTS` in them a line through two is used (a rocket on its pad whose receiver gives no fix
@@ -445,7 +447,7 @@ def fit_start(instruments: tuple[Instrument, ...], start_s: float) -> tuple[Floa
     GateError
         With fewer than three points.
     """
-    t, p = track_points(instruments)
+    t, p = track
     t, p = t[t >= start_s - FIT_SPAN_S] - start_s, p[t >= start_s - FIT_SPAN_S]
     if len(t) < 3:
         what = f"tracking: {len(t)} points after {start_s:.3f} s; at least 3 are needed to start"
@@ -464,12 +466,11 @@ def fit_start(instruments: tuple[Instrument, ...], start_s: float) -> tuple[Floa
     return coefficients[0], coefficients[1]
 
 
-def _cross_path_direction(instruments: tuple[Instrument, ...]) -> FloatArray:
-    """Horizontal direction (3,), ECEF, normal to the path: that in which the tracked positions scatter least.
+def _cross_path_direction(points: FloatArray) -> FloatArray:
+    """Horizontal direction (3,), ECEF, normal to the path: that in which track points (n, 3) scatter least.
 
     Each counts by its direction from the median alone, so that an outlier has no more weight than another.
     """
-    _, points = track_points(instruments)
     middle = np.median(points, axis=0)
     up = middle / np.linalg.norm(middle)
     level = points - middle
@@ -518,6 +519,7 @@ def _covariance(model: ErrorModel) -> FloatArray:
 
 def _start_by_inertial_sensors(
     instruments: tuple[Instrument, ...],
+    track: Track,
     prior: AttitudePrior,
     start_s: float,
     force: BridgedSensor,
@@ -526,7 +528,7 @@ def _start_by_inertial_sensors(
 ) -> tuple[States, FloatArray]:
     """State at the start and its covariance (9 + m, 9 + m)."""
     q, var, cross = _start_attitude(prior, start_s, force, rate, model)
-    position, velocity = fit_start(instruments, start_s)
+    position, velocity = fit_start(track, start_s)
     sample = np.array([[np.interp(start_s, rate.time_s, column) for column in rate.measured_sensor.T]])
     w = correct(sample, np.zeros(9), rate.spec.dcm_body_sensor)[0]
     arm = next(i.arm_body_m for i in instruments if i.kind in (RADAR, POSITION))
@@ -542,7 +544,7 @@ def _start_by_inertial_sensors(
 
 
 def _start_at_rest(
-    instruments: tuple[Instrument, ...],
+    track: Track,
     at_rest: tuple[float, float],
     motion: Motion,
     start: States,
@@ -550,7 +552,7 @@ def _start_at_rest(
     node_index: IntArray,
 ) -> States:
     """Start without velocity: where tracking has it at rest, or from where it came to the first track point."""
-    t, points = track_points(instruments)
+    t, points = track
     still = points[(t >= time_s[0] - SAME_INSTANT_S) & (t <= at_rest[1])]
     start = replace(start, velocity_ecef_mps=np.zeros(3))
     if len(still):
@@ -564,11 +566,9 @@ def _start_at_rest(
     return place
 
 
-def _start_ballistic(
-    instruments: tuple[Instrument, ...], start_s: float, model: ErrorModel
-) -> tuple[States, FloatArray]:
+def _start_ballistic(track: Track, start_s: float, model: ErrorModel) -> tuple[States, FloatArray]:
     """State at the start and its covariance (9 + m, 9 + m), without attitude."""
-    position, velocity = fit_start(instruments, start_s)
+    position, velocity = fit_start(track, start_s)
     covariance = _covariance(model)
     covariance[range(6, 9), range(6, 9)] = _FIXED_RAD**2
     return States(position, velocity, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(model.size)), covariance

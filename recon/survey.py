@@ -25,8 +25,9 @@ import numpy as np
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import KnownPlace, Telemetry
+from flightmodel.trajectory import nearest_index
 from recon.consistency import ConsistencyCheck, consistency_check, smoothed_covariance
-from recon.ekf import ForwardPass, Problem, nearest_index
+from recon.ekf import ForwardPass, Problem
 from recon.measurements import SITES
 from recon.settings import Settings
 from recon.state import KINEMATIC, States

@@ -32,14 +32,14 @@ def test_a_start_is_the_datum_s_where_the_antenna_moves_about_it(monkeypatch):
         return place + t * velocity + rotations.rotate(turned, arm)
 
     seen = antenna(0.0), (antenna(step) - antenna(-step)) / (2.0 * step)
-    monkeypatch.setattr(setup, "fit_start", lambda instruments, start_s: seen)
+    monkeypatch.setattr(setup, "fit_start", lambda track, start_s: seen)
     monkeypatch.setattr(setup, "_start_attitude", lambda *_: (q, np.eye(3), np.zeros((3, 9))))
     rate = SimpleNamespace(
         time_s=np.array([9.0, 11.0]), measured_sensor=np.array([w, w]), spec=SimpleNamespace(dcm_body_sensor=np.eye(3))
     )
     tracker = SimpleNamespace(kind=POSITION, arm_body_m=arm)
     model = SimpleNamespace(size=18, prior_sd=np.ones(18))
-    state, _ = setup._start_by_inertial_sensors((tracker,), None, 10.0, None, rate, model)
+    state, _ = setup._start_by_inertial_sensors((tracker,), None, None, 10.0, None, rate, model)
     np.testing.assert_allclose(state.position_ecef_m, place, rtol=0.0, atol=1e-8)
     # differences of 6e6 m over 2 ms: 1e-6 m/s
     np.testing.assert_allclose(state.velocity_ecef_mps, velocity, rtol=0.0, atol=1e-5)
