@@ -447,6 +447,11 @@ class RelativeDeflections:
     benchmark_s: float
     time_bias_sd_s: float = 0.0
 
+    @property
+    def answered(self) -> BoolArray:
+        """Whether each frame has an answer, (n,)."""
+        return np.asarray(np.isfinite(self.theta_yz_rad).all(axis=1))
+
 
 @dataclass(frozen=True)
 class _Moment:
@@ -507,7 +512,7 @@ def benchmark_deflection(frames: RelativeDeflections, loads: FlightLoads, prior_
             f"{_WORST_TIME_BIAS_S} s",
             code="camera-time-bias",
         )
-    known = np.isfinite(frames.theta_yz_rad).all(axis=1) & _measured(frames.time_s, loads.time_s)
+    known = frames.answered & _measured(frames.time_s, loads.time_s)
     if not _measured(np.array([frames.benchmark_s]), loads.time_s)[0]:
         raise GateError("accelerometer and gyros have no data at the benchmark frame", code="data-gap")
     rows = np.flatnonzero(known)
@@ -577,7 +582,7 @@ def _mixture(
     # shapes of slack and freeplay are assumed: their part here stays in the error bar
     slack_var, freeplay_var = weight @ _SIZES_RAD**2
     stays = float(slack_var + freeplay_var * unsure[-1] ** 2)
-    answered = np.flatnonzero(np.isfinite(frames.theta_yz_rad).all(axis=1))
+    answered = np.flatnonzero(frames.answered)
     together = np.full((len(frames.time_s), 2, 2), np.nan)
     together[answered] = (_camera_covariance(frames, answered, rows) @ gain[:, : 2 * n].T).reshape(-1, 2, 2)
     return BenchmarkDeflection(np.asarray(mean), np.asarray(spread + stays * np.eye(2)), together)

@@ -48,6 +48,7 @@ from estimators.evidence import (
 from estimators.fusion import LEAST_SAMPLES, Fused, Inputs, fuse, with_unresolved_swing
 from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
+from flightmodel.trajectory import nearest_index
 
 # of the variance of the benchmark's deflection: 0.06 deg statically of 0.12 deg in all (`camera_fit.AprioriSd`)
 STATIC_PART = 0.25
@@ -81,7 +82,7 @@ class CameraReadings:
     @property
     def frames(self) -> int:
         """Frames with an answer."""
-        return int(np.isfinite(self.read.theta_yz_rad).all(axis=1).sum())
+        return int(self.read.answered.sum())
 
     def late_against(self, clock: CameraReadings) -> float:
         """A priori sd of the time bias against another camera's, s; zero against its own."""
@@ -149,7 +150,7 @@ class JoinedCameras:
     left_out : str or None
         Camera that contradicts the others, which agree without it.
     wider : float
-        Factor on the cameras' sd where the contradiction cannot be told.
+        Factor on the cameras' sd where who contradicts cannot be determined.
     fused : Fused
     readings : tuple of CameraReadings
         Those that were used or left out.
@@ -189,7 +190,7 @@ class JoinedCameras:
         words = f"{failed}: readings differ beyond the cameras' stated uncertainties"
         if self.left_out is not None:
             return f"{words}; the others agree without {self.left_out}, which is left out"
-        return f"{words}; which one errs cannot be told, the sd of all are {self.wider:.1f} times the stated ones"
+        return f"{words}; which one errs cannot be determined, the sd of all are {self.wider:.1f} times the stated ones"
 
     def to_frame(self) -> pd.DataFrame:
         """One row a camera.
@@ -203,7 +204,7 @@ class JoinedCameras:
         """
         rows = []
         for one in self.readings:
-            known = one.read.time_s[np.isfinite(one.read.theta_yz_rad).all(axis=1)]
+            known = one.read.time_s[one.read.answered]
             bias, late, late_sd = (np.nan, np.nan), 0.0, 0.0
             inputs, own = self.fused.inputs, f"camera {one.name}"
             if own in inputs:
@@ -247,7 +248,7 @@ def join_cameras(cameras: list[CameraReadings], swing_hz: float | None = None) -
             wider = float(np.sqrt(max(test.chi_square / test.degrees for test in tests)))
         fused, _ = _joined(used, wider)
     history = fused.history
-    frames = np.unique(np.concatenate([one.read.time_s[_known(one)] for one in used]))
+    frames = np.unique(np.concatenate([one.read.time_s[one.read.answered] for one in used]))
     at = np.isin(history.time_s, frames)
     words = f"from {len(used)} cameras with systematic errors of their own: {', '.join(one.name for one in used)}"
     at_frames, smooth = (
@@ -271,10 +272,10 @@ def _with_loaded_benchmarks(cameras: list[CameraReadings]) -> list[CameraReading
     for one in cameras:
         at, sizes = one.read.benchmark_s, [np.inf]
         for other in cameras:
-            time_s = other.read.time_s[_known(other)]
+            time_s = other.read.time_s[other.read.answered]
             if other.read.benchmark_s < at and np.abs(time_s - at).min() < _ABOUT_S:
                 k = int(np.abs(time_s - at).argmin())
-                sizes.append(float(np.linalg.norm(other.read.theta_yz_rad[_known(other)][k])))
+                sizes.append(float(np.linalg.norm(other.read.theta_yz_rad[other.read.answered][k])))
         sd = np.sqrt(0.5 * np.trace(one.benchmark.covariance))
         if one.benchmark.with_readings is None and sd < min(sizes) < np.inf:
             start = replace(one.benchmark, covariance=min(sizes) ** 2 * np.eye(2))
@@ -282,10 +283,6 @@ def _with_loaded_benchmarks(cameras: list[CameraReadings]) -> list[CameraReading
         else:
             out.append(one)
     return out
-
-
-def _known(one: CameraReadings) -> FloatArray:
-    return np.asarray(np.isfinite(one.read.theta_yz_rad).all(axis=1))
 
 
 def best_clock(cameras: list[CameraReadings]) -> CameraReadings:
@@ -298,11 +295,11 @@ def _joined(cameras: list[CameraReadings], wider: float) -> tuple[Fused, list[Ca
     if not cameras:
         raise DivergenceError("camera: no camera has enough frames with an answer", code="too-few-readings")
     evidence = [one.evidence(best_clock(cameras), wider) for one in cameras]
-    known = np.concatenate([one.time_s for one in evidence])
+    known = np.sort(np.concatenate([one.time_s for one in evidence]))
     grid = np.arange(np.ceil(known.min() * _RATE_HZ), np.floor(known.max() * _RATE_HZ) + 1.0) / _RATE_HZ
     at_s = np.unique(np.concatenate([known, grid]))
     # a grid time within rounding of a frame's would be a row of its own
-    at_s = at_s[np.isin(at_s, known) | (np.abs(at_s[:, None] - known[None, :]).min(axis=1) > 1e-6)]
+    at_s = at_s[np.isin(at_s, known) | (np.abs(at_s - known[nearest_index(known, at_s)]) > 1e-6)]
     fused = _fitted(evidence, at_s)
     tests = (
         [*_pair_tests(evidence, fused), *_offset_tests(evidence, fused)] if len(cameras) > 1 and wider == 1.0 else []
@@ -361,7 +358,7 @@ def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[CameraTest]:
 
 
 def _left_out(cameras: list[CameraReadings]) -> str | None:
-    """The one camera without which, and without which alone, the others agree; None where that cannot be told."""
+    """The one camera without which, and without which alone, the others agree; None where that cannot be determined."""
     if len(cameras) < 3:
         return None
     sound = []
