@@ -9,7 +9,8 @@ A row is one decision::
 ===========  ==============================================================================================
 benchmark    the frame at ``t_s`` is the benchmark frame, instead of flight.toml's
 reject       the frame at ``t_s`` is not used; ``note`` says why
-accept       the frame at ``t_s`` is used although its neighbours speak against it (codes `ACCEPTABLE`)
+accept       the frame at ``t_s`` is used although its neighbours speak against it: ``jump-too-fast``,
+             ``features-lost``
 mask         a corner ``u_px, v_px`` of the region ``name`` that is not looked at; without ``t_s`` in no frame
 rim          a point of the shell's edge in the frame at ``t_s``; it takes the place of the edge found there
 feature      where the feature ``name`` is in the frame at ``t_s``; it must be marked in the benchmark frame, too
@@ -37,7 +38,6 @@ COLUMNS = ("camera", "t_s", "edit", "name", "u_px", "v_px", "value", "note")
 EDITS = ("benchmark", "reject", "accept", "mask", "rim", "feature", "pose")
 POSE = ("rotation_x_deg", "rotation_y_deg", "rotation_z_deg", "focal_factor")
 """Rotations of the camera about its own axes (x to the right, y down, z along the line of sight), and a factor."""
-ACCEPTABLE = ("jump-too-fast", "features-lost")
 SAME_FRAME_S = 1e-3
 LEAST_CORNERS = 3
 _LABEL = "camera edits"
@@ -59,6 +59,10 @@ class Edit:
     value: float = float("nan")
     note: str = ""
 
+    def is_of(self, t_s: float) -> bool:
+        """Whether it is about the frame at a time; with NaN, whether it is about no frame of its own."""
+        return bool(np.isnan(self.t_s) if np.isnan(t_s) else abs(self.t_s - t_s) <= SAME_FRAME_S)
+
 
 @dataclass(frozen=True)
 class CameraEdits:
@@ -78,9 +82,7 @@ class CameraEdits:
 
     def at(self, kind: str, t_s: float) -> list[Edit]:
         """Edits of one kind of the frame at a time; masks of all frames belong to each."""
-        return [
-            row for row in self.of(kind) if abs(row.t_s - t_s) <= SAME_FRAME_S or (kind == "mask" and np.isnan(row.t_s))
-        ]
+        return [row for row in self.of(kind) if row.is_of(t_s) or (kind == "mask" and np.isnan(row.t_s))]
 
     @property
     def benchmark_s(self) -> float | None:
@@ -97,7 +99,7 @@ class CameraEdits:
 
     def verdict(self, t_s: float) -> Edit | None:
         """Last of "reject" and "accept" for the frame at a time."""
-        found = [row for row in self.rows if row.edit in ("reject", "accept") and abs(row.t_s - t_s) <= SAME_FRAME_S]
+        found = [row for row in self.rows if row.edit in ("reject", "accept") and row.is_of(t_s)]
         return found[-1] if found else None
 
     def masks_px(self, t_s: float) -> list[FloatArray]:
@@ -121,14 +123,14 @@ NO_EDITS = CameraEdits()
 
 
 def read_edits(
-    path: Path, camera: str, time_s: FloatArray | None = None, size_px: tuple[int, int] | None = None
+    path: Path, camera: str | None, time_s: FloatArray | None = None, size_px: tuple[int, int] | None = None
 ) -> CameraEdits:
-    """Read the edits of one camera.
+    """Read the edits of one camera; of all, with None.
 
     Parameters
     ----------
     path : Path
-    camera : str
+    camera : str or None
     time_s : (n,) float, optional
         Of its frames, seconds after t0; without them, and the size, nothing is checked against the film.
     size_px : (2,) int, optional
@@ -151,7 +153,7 @@ def read_edits(
     words = {c: frame[c].str.strip().tolist() for c in ("camera", "edit", "name", "note")}
     rows, lines = [], []
     for k, own in enumerate(words["camera"]):
-        if own == camera:
+        if camera is None or own == camera:
             numbers = (float(u[k]), float(v[k]), float(value[k]))
             rows.append(Edit(own, float(t[k]), words["edit"][k], words["name"][k], *numbers, words["note"][k]))
             lines.append(f"{_LABEL}: {path}: line {tables.line_of(frame, k)}")

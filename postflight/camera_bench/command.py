@@ -5,16 +5,12 @@ from __future__ import annotations
 import webbrowser
 from pathlib import Path
 
-from rich.console import Console
-
 from flightmodel.camera_edits import EDITS_FILE
 from flightmodel.checks import ConfigError, GateError, nearest_name
 from postflight.camera_bench.server import HOST, serve
 from postflight.camera_bench.session import Session
-from postflight.commands import compile_kernels
+from postflight.commands import compile_kernels, console
 from postflight.flight import Flight, read_flight
-
-console = Console(soft_wrap=True, highlight=False)
 
 
 def open_bench(folder: Path, camera: str | None, port: int, browser: bool) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.camera import JointSwing, judged, polar
 from estimators.camera_fit import FrameFit, OrientedCamera
@@ -26,7 +27,6 @@ from flightmodel.camera_edits import EDITS_FILE, POSE, CameraEdits, Edit, faults
 from flightmodel.checks import NO_FAULT, Fault, FloatArray, GateError
 from flightmodel.film import Frames
 from flightmodel.guarded_files import file_bytes
-from flightmodel.tables import read_table
 from flightmodel.vehicle import Vehicle
 from postflight.filming import joint_swing, orient_on_film
 
@@ -62,6 +62,7 @@ class Session:
         self._lock = threading.Lock()
         self._revision = _digest(self.path)
         self._ended = False
+        self._last: tuple[int, NDArray[np.uint8]] | None = None
         self._work = self._oriented(frames)
         self._wake = threading.Event()
         self._fitter = threading.Thread(target=self._fit_all, daemon=True)
@@ -122,12 +123,19 @@ class Session:
 
     def picture(self, index: int) -> bytes:
         """PNG of a frame."""
-        image = self._work.frames.picture(index)
+        image = self._image(index)
         if image.size == 0:
             image = np.zeros((self._work.frames.camera.height_px, self._work.frames.camera.width_px), dtype=np.uint8)
         done, data = cv2.imencode(".png", image)
         assert done
         return data.tobytes()
+
+    def _image(self, index: int) -> NDArray[np.uint8]:
+        """A frame as filmed; the last is kept, since a film is decoded from its start for each."""
+        last = self._last
+        if last is None or last[0] != index:
+            self._last = last = (index, self._work.frames.picture(index))
+        return last[1]
 
     def frame(self, index: int, theta_rad: float | None, plane_rad: float | None, pose: FloatArray | None) -> dict:
         """Outline and points of a frame, at its own answer, or at a deflection or from a pose that is being tried.
@@ -143,7 +151,7 @@ class Session:
         answered = fit is not None and not fit.refused
         own = np.array([*fit.rotation_yz_rad, fit.flattening_rad]) if fit is not None and answered else np.zeros(3)
         tried = own if theta_rad is None or plane_rad is None else deformation_of(theta_rad, plane_rad)
-        picture = edited(work.frames.picture(index), work.frames.edits, float(work.frames.time_s[index]))
+        picture = edited(self._image(index), work.frames.edits, float(work.frames.time_s[index]))
         view = self._nominal(pose) if pose is not None or work.oriented is None else work.oriented.view
         out: dict[str, Any] = {"answer": None if fit is None else _answer_json(fit), "edge": [], "features": []}
         try:
@@ -193,9 +201,7 @@ class Session:
         """Rows of the file that are about other cameras."""
         if not self.path.exists():
             return []
-        cameras = sorted(set(read_table(self.path, "camera edits", 1)["camera"].str.strip()))
-        others = [name for name in cameras if name != self._work.frames.camera_name]
-        return [row for name in others for row in read_edits(self.path, name).rows]
+        return [row for row in read_edits(self.path, None).rows if row.camera != self._work.frames.camera_name]
 
     def _apply(self, edits: CameraEdits) -> None:
         """Take decisions over; the frames that they touch lose their fits, all of them where the camera does."""
@@ -245,12 +251,7 @@ class Session:
 
 def _about(edits: CameraEdits, t_s: float) -> list[Edit]:
     """Decisions that change a fit of the frame at a time; of no frame (NaN): poses and masks of all frames."""
-    return [
-        row
-        for row in edits.rows
-        if row.edit in ("mask", "rim", "feature", "pose")
-        and (np.isnan(row.t_s) if np.isnan(t_s) else abs(row.t_s - t_s) < 1e-3)
-    ]
+    return [row for row in edits.rows if row.edit in ("mask", "rim", "feature", "pose") and row.is_of(t_s)]
 
 
 def _points(
