@@ -29,7 +29,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.special import ndtr, stdtrit
 
 from flightmodel import tables
 from flightmodel.camera import Lens
@@ -185,7 +185,7 @@ def _sd(residual: FloatArray, jacobian: FloatArray, unknowns: int, readings: Seq
     without = np.array([np.linalg.solve(whole - n, -g) for n, g in zip(normal, gradient, strict=True)])
     k = len(normal)
     jackknife = (k - 1) / k * np.sum((without - without.mean(axis=0)) ** 2, axis=0)
-    wider = float(stats.t.ppf(stats.norm.cdf(1.0), k - 1))
+    wider = float(stdtrit(k - 1, ndtr(1.0)))
     return np.asarray(np.sqrt(np.maximum(independent, wider**2 * jackknife)))
 
 

@@ -14,10 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray
-from postflight.checks.units_and_axes import interval_around, trapezoid_integral
+from postflight.checks.units_and_axes import interval_around
 
 _LEAST_SAMPLES = 6  # of a window
 _LEAST_WINDOWS = 8
@@ -170,7 +171,7 @@ def _smoothed(time_s: FloatArray, values: FloatArray, width_s: float) -> tuple[F
     if len(grid) < len(kernel):
         return grid, np.full(len(grid), np.nan)
     # cells of means first: a fast sensor's noise would fold into the grid
-    total = trapezoid_integral(t, v[:, None])[:, 0]
+    total = cumulative_trapezoid(v, t, initial=0.0)
     mean = np.interp(grid + step / 2, t, total) - np.interp(grid - step / 2, t, total)
     width = np.minimum(grid + step / 2, t[-1]) - np.maximum(grid - step / 2, t[0])
     out = np.convolve(mean / width, kernel, mode="same")

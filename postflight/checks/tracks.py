@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from flightmodel import earth, tables
 from flightmodel.checks import BoolArray, FloatArray
@@ -26,7 +27,6 @@ from postflight.checks.units_and_axes import (
     TimeBias,
     interval_around,
     slope_through_mean,
-    trapezoid_integral,
     unit_hint,
     unit_of,
     unit_that_explains,
@@ -203,7 +203,7 @@ def receiver_velocity(found: Sources, name: str, record: GnssRecord) -> list[Fin
         return []
     # displacement over stretches of some seconds: from fix to fix the noise of positions hides it
     step = np.diff(t)
-    way = trapezoid_integral(t, v)
+    way = cumulative_trapezoid(v, t, axis=0, initial=0.0)
     first = np.searchsorted(t, np.arange(t[0], t[-1] - _STRETCH_S, _STRETCH_S))
     last = np.minimum(np.searchsorted(t, t[first] + _STRETCH_S), len(t) - 1)
     gaps = np.concatenate([[0], np.cumsum(step > 5.0 * float(np.median(step)))])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from flightmodel.checks import FloatArray
 from flightmodel.tables import Quantity, Source, place
@@ -105,15 +106,9 @@ def slope_through_mean(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     return slope, float(np.sqrt(residual @ residual / (len(x) - 2) / square))
 
 
-def trapezoid_integral(time_s: FloatArray, values: FloatArray) -> FloatArray:
-    """Return the running integral (n, k) of samples (n, k) by the trapezoid rule, zero at the first."""
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time_s)[:, None]
-    return np.vstack([np.zeros(values.shape[1]), np.cumsum(steps, axis=0)])
-
-
 def window_means(time_s: FloatArray, values: FloatArray, grid_s: FloatArray, low_s: float, high_s: float) -> FloatArray:
     """Return means (m, k) of samples (n, k) over windows from ``grid_s + low_s`` to ``grid_s + high_s``."""
-    total = trapezoid_integral(time_s, values)
+    total = cumulative_trapezoid(values, time_s, axis=0, initial=0.0)
     low, high = (np.column_stack([np.interp(grid_s + side, time_s, c) for c in total.T]) for side in (low_s, high_s))
     return np.asarray((high - low) / (high_s - low_s))
 
