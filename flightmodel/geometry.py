@@ -473,9 +473,9 @@ def _too_many(count: int) -> str:
 
 def _fault_of_stl(data: bytes) -> str:
     """Say why an STL file is not to be decoded; the count in a binary one's head must fit its size."""
-    told = int.from_bytes(data[80:84], "little")
-    if len(data) >= 84 and len(data) == 84 + 50 * told:
-        return _too_many(told) if told else EMPTY
+    stated = int.from_bytes(data[80:84], "little")
+    if len(data) >= 84 and len(data) == 84 + 50 * stated:
+        return _too_many(stated) if stated else EMPTY
     if data.lstrip()[:5].lower() == b"solid" and (b"facet" in data or b"endsolid" in data):
         if b"facet" not in data:
             return EMPTY
@@ -484,7 +484,7 @@ def _fault_of_stl(data: bytes) -> str:
         return _too_many(data.count(b"endfacet"))
     if len(data) < 84:
         return f"is cut off: {len(data)} bytes where the head of a binary STL takes 84"
-    words = f"its head tells of {told} faces, which take {84 + 50 * told} bytes, and it has {len(data)}"
+    words = f"its header states {stated} faces, which take {84 + 50 * stated} bytes, and it has {len(data)}"
     return f"is cut off or no STL: {words}"
 
 
@@ -498,9 +498,9 @@ def _fault_of_glb(data: bytes) -> str:
     """Say why a GLB file is not to be decoded: cut off, referring elsewhere, packed, or larger than it looks."""
     if data[:4] != b"glTF" or len(data) < 20:
         return "is no GLB file, or cut off: it does not begin with glTF and a head of 20 bytes"
-    told, size = (int.from_bytes(data[k : k + 4], "little") for k in (8, 12))
-    if told != len(data):
-        return f"is cut off: {len(data)} bytes where its head tells of {told}"
+    stated, size = (int.from_bytes(data[k : k + 4], "little") for k in (8, 12))
+    if stated != len(data):
+        return f"is cut off: {len(data)} bytes where its header states {stated}"
     try:
         tree = json.loads(data[20 : 20 + size])
         accessors, nodes = tree.get("accessors", []), tree.get("nodes", [])

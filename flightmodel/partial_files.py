@@ -1,8 +1,8 @@
 """What is being written bears a name of its own until it is whole; whose process has ended may be removed.
 
-A name tells who writes: ``.partial-<machine>-<process>-<any>-<name>``. Process numbers mean something in one PID
+A name says who writes: ``.partial-<machine>-<process>-<any>-<name>``. Process numbers mean something in one PID
 namespace of one boot of one machine, which ``<machine>`` identifies; of what another container or host writes, only
-its age tells. It is taken for abandoned where nothing in it changed for `LEFT_ALONE_S`.
+its age decides. It is taken for abandoned where nothing in it changed for `LEFT_ALONE_S`.
 """
 
 from __future__ import annotations

@@ -198,7 +198,7 @@ class Start:
     sd_mps : float
         Velocity that may be left then, of each axis: a rocket that sways in the wind.
     azimuth_rad, azimuth_sd_rad : float or None, float
-        Of the body's x axis as it leans on its launcher, from true north.
+        Of the body's x axis on its launcher, from true north.
     """
 
     at_rest: tuple[float, float] | None = None

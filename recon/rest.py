@@ -1,4 +1,4 @@
-"""What does a vehicle that stands on its pad tell? Velocity, level, heading, and the errors of its inertial sensors.
+"""What is known of a vehicle at rest on its pad? Velocity, level, heading, and the errors of its inertial sensors.
 
 At rest on the Earth the accelerometer's velocity is zero, and accelerometer and gyros measure
 

@@ -161,7 +161,7 @@ def test_doppler_makes_the_velocity_better():
 
 
 def test_noise_of_its_own_for_each_row():
-    """Half of the rows ten times noisier: told so, they are weighed so."""
+    """Half of the rows ten times noisier: with that stated, they are weighted so."""
     t = fly(capsule())[0]
     noisy = np.where(np.arange(len(t)) % 2, 10.0, 1.0)
     telemetry = watch(5, SITES[:2], ("az", "el"), noisy)
