@@ -25,8 +25,9 @@ from tests import fuzzing
 
 # quick kinds have the larger part of the trials
 SHARE = {
-    "tables of a flight": 0.05, "flight.toml": 0.10, "vehicle.toml": 0.28, "coefficients": 0.37, "scenario.toml": 0.12,
+    "tables of a flight": 0.05, "flight.toml": 0.10, "vehicle.toml": 0.20, "coefficients": 0.30, "scenario.toml": 0.12,
     "pictures": 0.035, "film, AVI": 0.015, "film, WebM": 0.015, "corners": 0.015,
+    "camera edits": 0.10, "shell features": 0.05,
 }  # fmt: skip
 
 

@@ -123,7 +123,11 @@ NO_EDITS = CameraEdits()
 
 
 def read_edits(
-    path: Path, camera: str | None, time_s: FloatArray | None = None, size_px: tuple[int, int] | None = None
+    path: Path,
+    camera: str | None,
+    time_s: FloatArray | None = None,
+    size_px: tuple[int, int] | None = None,
+    cameras: Iterable[str] | None = None,
 ) -> CameraEdits:
     """Read the edits of one camera; of all, with None.
 
@@ -135,6 +139,8 @@ def read_edits(
         Of its frames, seconds after t0; without them, and the size, nothing is checked against the film.
     size_px : (2,) int, optional
         Width and height of its pictures.
+    cameras : iterable of str, optional
+        Of the vehicle: a row of another is refused.
 
     Raises
     ------
@@ -151,13 +157,18 @@ def read_edits(
     if faults:
         raise GateError(faults)
     words = {c: frame[c].str.strip().tolist() for c in ("camera", "edit", "name", "note")}
-    rows, lines = [], []
+    rows, lines, found = [], [], []
+    known = None if cameras is None else list(cameras)
     for k, own in enumerate(words["camera"]):
+        where = f"{_LABEL}: {path}: line {tables.line_of(frame, k)}"
+        if known is not None and own not in known:
+            hint = f"{nearest_name(own, known)}; the vehicle has {', '.join(known)}"
+            found.append(Fault(f"{where}: camera '{own}'{hint}", "camera-unknown"))
         if camera is None or own == camera:
             numbers = (float(u[k]), float(v[k]), float(value[k]))
             rows.append(Edit(own, float(t[k]), words["edit"][k], words["name"][k], *numbers, words["note"][k]))
-            lines.append(f"{_LABEL}: {path}: line {tables.line_of(frame, k)}")
-    found = [] if time_s is None or size_px is None else faults_of(rows, time_s, size_px, lines)
+            lines.append(where)
+    found += [] if time_s is None or size_px is None else faults_of(rows, time_s, size_px, lines)
     if found:
         raise GateError(found)
     return CameraEdits(tuple(rows))

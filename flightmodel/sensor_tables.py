@@ -444,12 +444,12 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None, label:
         span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
         gate.refuse_config(f"{label}.benchmark_s = {source.benchmark_s}: frames span {span}", "benchmark-outside-film")
         return None
-    edits = _edits(gate, label, source.camera, time_s, camera)
+    edits = _edits(gate, label, source.camera, time_s, vehicle)
     benchmark_s = source.benchmark_s if edits.benchmark_s is None else edits.benchmark_s
     return Frames(camera, source.camera, time_s, paths, benchmark_s, numbers, source.time_bias_sd_s, edits)
 
 
-def _edits(gate: Gate, label: str, name: str, time_s: FloatArray, camera: CameraMount) -> CameraEdits:
+def _edits(gate: Gate, label: str, name: str, time_s: FloatArray, vehicle: Vehicle) -> CameraEdits:
     """What an analyst decided about a camera's film; nothing, with the faults kept, where the table is refused."""
     path = gate.folder / EDITS_FILE
     if not path.exists():
@@ -459,9 +459,10 @@ def _edits(gate: Gate, label: str, name: str, time_s: FloatArray, camera: Camera
         gate.refuse(wrong, getattr(wrong, "code", ""))
         return NO_EDITS
     try:
-        edits = read_edits(path, name, time_s, (camera.width_px, camera.height_px))
+        camera = vehicle.cameras[name]
+        edits = read_edits(path, name, time_s, (camera.width_px, camera.height_px), vehicle.cameras)
     except GateError as fault:
-        gate.faults.extend(fault.faults)
+        gate.faults.extend(f for f in fault.faults if f not in gate.faults)  # of several cameras each reads the table
         return NO_EDITS
     if edits.rows:
         gate.findings.append(Finding(label, f"edits by hand ({EDITS_FILE}): {edits}", np.nan, np.nan, "edited-by-hand"))

@@ -105,9 +105,9 @@ def _nearest_circle(geometry: ShellGeometry, station: FloatArray, radius: FloatA
     """Place (n, 2), station and radius, from the nearest torus's centre circle, and the distance from it, m."""
     centres = np.column_stack(torus_circles(geometry))
     away = np.column_stack([station, radius])[:, None] - centres
-    nearest = np.argmin(np.linalg.norm(away, axis=2), axis=1)
+    nearest = np.argmin(np.hypot(away[:, :, 0], away[:, :, 1]), axis=1)
     place = away[np.arange(len(away)), nearest]
-    return place, np.asarray(np.linalg.norm(place, axis=1))
+    return place, np.hypot(place[:, 0], place[:, 1])
 
 
 def _at_clocks(station_radius: FloatArray, clock_rad: FloatArray) -> FloatArray:

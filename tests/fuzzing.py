@@ -24,9 +24,12 @@ import pandas as pd
 from estimators.calibration import calibrate_lens, read_corners
 from flightmodel import aerodynamics
 from flightmodel.aerodynamics import read_with_sidecar
+from flightmodel.camera_edits import EDITS_FILE, read_edits
 from flightmodel.checks import Fault, GateError
 from flightmodel.film import Frames
 from flightmodel.flightfolder import read_flight, read_flight_file
+from flightmodel.geometry import FEATURE_KINDS, torus_circles
+from flightmodel.shell_features import read_features
 from flightmodel.vehicle import DATA, vehicle_from_toml
 from synthetic_flight.scenarios import read_scenario
 
@@ -645,6 +648,108 @@ def corners_case(root: Path) -> Case:
     return Case(root, (path,), spoil_table, judge)
 
 
+# ------------------------------------------------------------------------- an analyst's edits of a film, shell features
+
+EDIT_TIMES, EDIT_SIZE = np.array([421.0, 421.04, 421.08, 440.0]), (720, 480)
+EDITS = """\
+camera,t_s,edit,name,u_px,v_px,value,note
+camera5,421.04,benchmark,,,,,the first whole one
+camera5,440,reject,,,,,"glare, worst"
+camera5,421.08,accept,,,,,
+camera5,,mask,sun,1,2,,
+camera5,,mask,sun,100.5,2,,
+camera5,,mask,sun,50,90.25,,
+camera2,430,reject,,,,,of another camera
+camera5,440,rim,,300.25,20.5,,
+camera5,440,feature,dot 3,10,11,,
+camera5,,pose,rotation_x_deg,,,0.25,
+camera5,,pose,focal_factor,,,1.01,
+"""
+FEATURES = """\
+station_m,radius_m,clock_lv_deg,kind,shade,width_m
+"""
+
+
+def _plain_table(data: bytes) -> list[dict[str, str]]:
+    """Rows of a CSV by name, cells stripped; empty lines left out."""
+    lines = [line for line in data.decode("utf-8-sig").splitlines() if line.strip()]
+    header, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines, skipinitialspace=True)]
+    if any(header.count(name) > 1 for name in header if name):
+        raise ValueError("a column stands twice")
+    return [dict(zip(header, row, strict=True)) for row in rows]
+
+
+def _judged_rows(data: bytes, rows: Callable[[list[dict[str, str]]], list[Any]], got: list[Any]) -> str:
+    """Nothing where what was read is what a plain reader makes of the file."""
+    try:
+        wanted = rows(_plain_table(data))
+    except (ValueError, KeyError, UnicodeDecodeError) as fault:
+        return f"accepted, where a plain reader finds {type(fault).__name__}: {fault}"
+    if wanted != got:
+        return f"read {[g for g in got if g not in wanted][:1] or len(got)} where the file says otherwise"
+    return ""
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def edits_case(root: Path) -> Case:
+    """A table of an analyst's edits of one camera's film, with a row of another's."""
+    root.mkdir(parents=True)
+    path = root / EDITS_FILE
+    path.write_text(EDITS)
+
+    def plain(table: list[dict[str, str]]) -> list[Any]:
+        rows = []
+        for row in table:
+            numbers = [_or_none(_number(row[c])) for c in ("t_s", "u_px", "v_px", "value")]
+            words = tuple(row[c] for c in ("camera", "edit", "name", "note"))
+            rows += [(words, numbers)] if row["camera"] == "camera5" else []
+        return rows
+
+    def judge(path: Path, data: bytes) -> str:
+        found = read_edits(path, "camera5", EDIT_TIMES, EDIT_SIZE, ("camera2", "camera5")).rows
+        got = [
+            ((r.camera, r.edit, r.name, r.note), [_or_none(v) for v in (r.t_s, r.u_px, r.v_px, r.value)]) for r in found
+        ]
+        return _judged_rows(data, plain, got)
+
+    return Case(root, (path,), spoil_table, judge)
+
+
+def features_case(root: Path) -> Case:
+    """A list of marks on a shell."""
+    root.mkdir(parents=True)
+    geometry = vehicle_from_toml(DATA / "vehicles/irve2_reference.toml").geometry
+    station, radius = (float(c[-1]) for c in torus_circles(geometry))
+    marks = [
+        f"{station + geometry.torus_minor_radius_m:.4f},{radius:.4f},{clock},{kind},{shade},0.03"
+        for clock, kind, shade in ((0, "dot", "darker"), (72.5, "seam", "paler"), (-144, "hoop", "darker"),
+                                   (216, "dot", "paler"), (288, "dot", "darker"))
+    ]  # fmt: skip
+    path = root / "features.csv"
+    path.write_text(FEATURES + "\n".join(marks) + "\n")
+
+    def plain(table: list[dict[str, str]]) -> list[Any]:
+        rows = []
+        for row in table:
+            place = [_number(row[c]) for c in ("station_m", "radius_m", "clock_lv_deg")]
+            at = np.deg2rad(place[2])
+            x, y, z = -place[0], -place[1] * np.cos(at), place[1] * np.sin(at)
+            point = tuple(np.round([x, y, z], 9).tolist())
+            rows.append((point, FEATURE_KINDS.index(row["kind"]), row["shade"] == "paler", _number(row["width_m"])))
+        return rows
+
+    def judge(path: Path, data: bytes) -> str:
+        f = read_features(path, geometry)
+        points = [tuple((np.round(p, 9) + 0.0).tolist()) for p in f.points_shell_m]
+        got = list(zip(points, f.kind.tolist(), f.is_paler.tolist(), f.width_m.tolist(), strict=True))
+        return _judged_rows(data, plain, got)
+
+    return Case(root, (path,), spoil_table, judge)
+
+
 def cases(root: Path) -> dict[str, Case]:
     """Every case, in folders of its own below ``root``."""
     tables, flight = flight_case(root / "flight")
@@ -659,4 +764,6 @@ def cases(root: Path) -> dict[str, Case]:
         "film, AVI": film_case(root / "avi", "film.avi", "MJPG"),
         "film, WebM": film_case(root / "webm", "film.webm", "VP90"),
         "corners": corners_case(root / "corners"),
+        "camera edits": edits_case(root / "edits"),
+        "shell features": features_case(root / "features"),
     }

@@ -27,8 +27,13 @@ def cases(tmp_path_factory):
     return fuzzing.cases(tmp_path_factory.mktemp("fuzz"))
 
 
-@pytest.mark.parametrize("kind", ["tables of a flight", "flight.toml", "vehicle.toml", "coefficients", "scenario.toml",
-                                  "pictures", "film, AVI", "film, WebM", "corners"])  # fmt: skip
+KINDS = (
+    "tables of a flight", "flight.toml", "vehicle.toml", "coefficients", "scenario.toml", "pictures", "film, AVI",
+    "film, WebM", "corners", "camera edits", "shell features",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_spoilt_input_is_refused_or_read_as_it_is(cases, kind):
     rng = np.random.default_rng([7, len(kind)])
     seen = []

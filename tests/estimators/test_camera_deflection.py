@@ -12,7 +12,7 @@ import pytest
 import flightmodel
 from estimators.benchmark import orient_camera, with_deflected_benchmark
 from estimators.camera import polar, read_film, sensitivity_table
-from estimators.camera_fit import REACH_PX
+from estimators.camera_fit import REACH_PX, _light_columns
 from estimators.edge import HorizonLine, find_horizon
 from estimators.overlay import Overlay
 from estimators.virtual_camera import VirtualCamera
@@ -164,6 +164,17 @@ def test_every_derivative_of_the_edge_equals_differences(view):
         scale = max(np.abs(jacobian[:, column]).max(), 1.0)
         # vertices slide along the edge by up to 0.1 px
         np.testing.assert_allclose(numeric, jacobian[at, column], atol=2e-3 * scale, err_msg=str(column))
+
+
+def test_light_moves_an_edge_by_shift_tilt_and_bow_that_do_not_do_for_each_other(view):
+    """Over the picture's width the three shapes are orthogonal, each one at its right-hand side."""
+    middle, weight = np.polynomial.legendre.leggauss(6)
+    u = 0.5 * view.camera.width_px * (1.0 + np.append(middle, 1.0))
+    at = np.column_stack([u, np.zeros_like(u)])
+    shapes = _light_columns(view, HorizonLine(at, at, np.ones_like(u), np.arange(len(u))))
+    np.testing.assert_allclose(shapes[-1], 1.0)
+    products = np.einsum("n,ni,nj->ij", weight, shapes[:-1], shapes[:-1])
+    np.testing.assert_allclose(products, np.diag(np.diag(products)), atol=1e-12)
 
 
 def test_positive_bending_towards_the_camera_moves_the_edge_up(view):

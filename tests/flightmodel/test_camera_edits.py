@@ -95,3 +95,14 @@ def test_all_faults_come_at_once_and_other_cameras_are_left_alone(tmp_path):
     with pytest.raises(GateError) as refusal:
         read_edits(path, "camera5", TIMES, SIZE)
     assert set(refusal.value.codes) == {"table-column-missing"}
+
+
+def test_an_edit_of_a_camera_that_the_vehicle_lacks_is_refused(tmp_path):
+    """A misspelled camera: its edit is not another camera's to leave alone."""
+    path = write(tmp_path / "e.csv", "camera5,440,reject,,,,,", "camra5,421,reject,,,,,", "camera2,1,reject,,,,,")
+    with pytest.raises(GateError) as refused:
+        read_edits(path, "camera5", TIMES, SIZE, ("camera2", "camera5"))
+    assert refused.value.codes == ("camera-unknown",)
+    assert "line 3" in str(refused.value)
+    assert "camera5" in str(refused.value)
+    assert len(read_edits(path, "camera5", TIMES, SIZE).rows) == 1

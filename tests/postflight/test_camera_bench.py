@@ -131,7 +131,7 @@ class TestSession:
         assert refusal.value.codes == ("edits-changed",)
 
     def test_rows_of_another_camera_stay(self, folder):
-        other = "camera2,99.0000,reject,,,,,glare"
+        other = "camera5_uncalibrated,99.0000,reject,,,,,glare"
         (folder / "camera_edits.csv").write_text(f"camera,t_s,edit,name,u_px,v_px,value,note\n{other}\n")
         session = session_of(read_flight(folder, needs_path=False), folder)
         session.save([edit("accept", t_s=430.0)], session.state()["revision"])
