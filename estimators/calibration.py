@@ -34,6 +34,7 @@ from scipy.special import ndtr, stdtrit
 from flightmodel import tables
 from flightmodel.camera import Lens
 from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
+from flightmodel.statistics import jackknife_variance
 
 COLUMNS = ("image", "X_m", "Y_m", "u_px", "v_px")
 LEAST_PICTURES, _LEAST_CORNERS = 3, 6
@@ -183,10 +184,8 @@ def _sd(residual: FloatArray, jacobian: FloatArray, unknowns: int, readings: Seq
     variance = float(residual @ residual) / max(len(residual) - jacobian.shape[1], 1)
     independent = variance * np.diag(np.linalg.inv(whole))
     without = np.array([np.linalg.solve(whole - n, -g) for n, g in zip(normal, gradient, strict=True)])
-    k = len(normal)
-    jackknife = (k - 1) / k * np.sum((without - without.mean(axis=0)) ** 2, axis=0)
-    wider = float(stdtrit(k - 1, ndtr(1.0)))
-    return np.asarray(np.sqrt(np.maximum(independent, wider**2 * jackknife)))
+    wider = float(stdtrit(len(normal) - 1, ndtr(1.0)))
+    return np.asarray(np.sqrt(np.maximum(independent, wider**2 * jackknife_variance(without))))
 
 
 def _check_condition(jacobian: FloatArray) -> None:

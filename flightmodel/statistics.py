@@ -58,6 +58,15 @@ def _gauss_markov_root(at: FloatArray, length: float) -> FloatArray:
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
+def jackknife_variance(without: FloatArray) -> FloatArray:
+    """Variance ``(...)`` of an estimate by the estimates ``(n, ...)`` without each of ``n`` parts of the data.
+
+    B. Efron, *The Jackknife, the Bootstrap and Other Resampling Plans*, SIAM, 1982.
+    """
+    n = len(without)
+    return np.asarray((n - 1) / n * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
+
+
 def percentile_band(values: FloatArray, axis: int = 0) -> FloatArray:
     """Lower limit, median and upper limit of an ensemble along ``axis``, first in the result (`BAND_PERCENTILES`)."""
     return np.asarray(np.percentile(values, BAND_PERCENTILES, axis=axis))

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError
+from flightmodel.statistics import jackknife_variance
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.forward_model import STIFFNESS_LOG_SD, VehicleParameters
 from postflight.reconstruction import Reconstruction
@@ -102,12 +103,11 @@ def stiffness_from_modes(flight: Reconstruction, about_nmprad: float) -> ModalSt
         raise GateError(message, code="mode-not-detected")
     best = _peak(mean_log_power)
     parts = np.array_split(np.arange(len(t)), BLOCKS)
-    jackknife = np.array([_peak(np.delete(power, part, axis=1).mean(axis=1)) for part in parts])
-    scatter = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((jackknife - jackknife.mean()) ** 2))
+    without = np.array([_peak(np.delete(power, part, axis=1).mean(axis=1)) for part in parts])
     factor = about * float(np.exp(best))
     aerodynamic, joint = _frequencies(_stiffer(nominal, factor), flow)
     _check_spin(flight, joint, t)
-    sd = float(np.hypot(scatter, _vehicle_sd(nominal, factor, flow)))
+    sd = float(np.hypot(np.sqrt(jackknife_variance(without)), _vehicle_sd(nominal, factor, flow)))
     stiffness = nominal.joint.bending_stiffness_nmprad * factor
     order = np.argsort(frequency)
     return ModalStiffness(

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from estimators.calibration import calibrate_lens
+from estimators.calibration import _sd, calibrate_lens
 from flightmodel.checks import GateError
 
 CORNERS = pd.read_csv(Path(__file__).parents[1] / "data/fisheye/corners_even.csv")
@@ -113,6 +113,25 @@ def test_corners_that_err_together_in_each_picture_stay_within_the_sd():
     assert np.min(narrow) > 0.2  # the bends are there
     # twelve lenses of eight correlated parameters, half of which count as independent: chi-square 0.1 % each side
     assert 0.45 < np.mean(np.square(normal)) < 1.9
+
+
+def test_of_corners_that_err_alone_the_sd_is_that_of_the_linear_problem():
+    """Residuals that no picture's own fit would lessen: no jackknife, and the variance has its degrees of freedom."""
+    rng = np.random.default_rng(8)
+    pictures, corners, lens = 4, 12, 3
+    jacobian = np.zeros((pictures * corners, lens + 6 * pictures))
+    residual = rng.standard_normal(pictures * corners)
+    for k in range(pictures):
+        rows, pose = slice(k * corners, (k + 1) * corners), slice(lens + 6 * k, lens + 6 * (k + 1))
+        jacobian[rows, :lens], jacobian[rows, pose] = (
+            rng.standard_normal((corners, lens)),
+            rng.standard_normal((corners, 6)),
+        )
+        own = np.linalg.qr(jacobian[rows][:, [*range(lens), *range(pose.start, pose.stop)]])[0]
+        residual[rows] -= own @ (own.T @ residual[rows])
+    variance = residual @ residual / (pictures * corners - lens - 6 * pictures)
+    wanted = np.sqrt(variance * np.diag(np.linalg.inv(jacobian.T @ jacobian))[:lens])
+    np.testing.assert_allclose(_sd(residual, jacobian, lens, [corners] * pictures), wanted, rtol=1e-9)
 
 
 def test_the_lines_for_a_vehicle_file_are_toml():

@@ -10,7 +10,7 @@ from flightmodel.atmosphere import (
     sounding_correlation_root,
     unresolved_variance,
 )
-from flightmodel.statistics import correlation, correlation_root, percentile_band
+from flightmodel.statistics import correlation, correlation_root, jackknife_variance, percentile_band
 
 
 def test_correlation_is_a_constant_part_and_a_decay():
@@ -54,3 +54,10 @@ def test_bands_hold_two_standard_deviations_of_a_normal_ensemble():
     values = norm.ppf((np.arange(20000) + 0.5) / 20000.0)
     assert percentile_band(values) == pytest.approx([-1.9954, 0.0, 1.9954], abs=2e-3)
     assert percentile_band(np.tile(values, (3, 1)), axis=1).shape == (3, 3)
+
+
+def test_a_mean_s_jackknife_is_its_standard_error():
+    """Of a mean it is exactly the scatter over the root of the count (Efron 1982, chapter 3)."""
+    x = np.random.default_rng(5).standard_normal((9, 2))
+    without = np.array([np.delete(x, k, axis=0).mean(axis=0) for k in range(9)])
+    np.testing.assert_allclose(jackknife_variance(without), x.var(axis=0, ddof=1) / 9.0, rtol=1e-12)
