@@ -198,6 +198,49 @@ class DeflectionHistory(Tabular):
         return float(np.interp(time_s, t, theta)), float(np.hypot(np.interp(time_s, t, sd), missed))
 
 
+_CLEAR_SD = 4.0  # of a cycle: a minimum lies so many sd below its neighbouring maxima
+
+
+def cycle_about(history: DeflectionHistory, at_s: float) -> tuple[float, float] | None:
+    """Times of the minima before and after a time, s: the cycle in which it lies; None where none stands out there.
+
+    A minimum counts where the angle rises to both sides by `_CLEAR_SD` of its sd at ``at_s``.
+    """
+    from scipy.signal import find_peaks
+
+    sd = history.at(at_s)[1]
+    known = np.isfinite(history.theta_rad)
+    if not np.isfinite(sd):
+        return None
+    t, theta = history.time_s[known], history.theta_rad[known]
+    at = t[find_peaks(-theta, prominence=max(_CLEAR_SD * sd, 1e-9))[0]]
+    before, after = at[at <= at_s], at[at > at_s]
+    if not len(before) or not len(after):
+        return None
+    inside = (t >= before[-1]) & (t <= after[0])
+    if np.diff(t[inside]).max() > HOLE_FACTOR * np.median(np.diff(t)):
+        return None
+    return float(before[-1]), float(after[0])
+
+
+def mean_over(history: DeflectionHistory, span_s: tuple[float, float]) -> tuple[float, float]:
+    """Mean of the angle over a span, and an upper bound of its sd, rad; NaN where the history does not cover it.
+
+    The bound is the mean of the standard deviations: that of the mean is no larger, whatever the errors' correlation.
+    """
+    known = np.isfinite(history.theta_rad)
+    t = history.time_s[known]
+    inside = np.array([*span_s, *t[(t > span_s[0]) & (t < span_s[1])]])
+    if len(inside) < 5 or not (t[0] <= span_s[0] and span_s[1] <= t[-1]):
+        return float("nan"), float("nan")
+    at = np.sort(inside)
+    if np.diff(at).max() > HOLE_FACTOR * np.median(np.diff(t)):
+        return float("nan"), float("nan")
+    values = (np.interp(at, t, x[known]) for x in (history.theta_rad, history.theta_sd_rad))
+    mean, sd = (float(np.trapezoid(x, at) / (at[-1] - at[0])) for x in values)
+    return mean, sd
+
+
 @cache
 def standard_normals(dimensions: int) -> FloatArray:
     """Evenly spread draws ``(512, dimensions)`` of independent unit normals, always the same (Sobol)."""

@@ -333,19 +333,25 @@ def print_sensitivity(found: pd.DataFrame) -> None:
 def print_answers(answers: Deflections) -> None:
     """Deflection method by method at peak dynamic pressure; without a trajectory at the largest."""
     at_s = answers.reference_s
-    note = "peak q" if answers.bet is not None else "its largest; no trajectory was made"
-    when = f" at {at_s:.2f} s" if np.isfinite(at_s) else ""
-    table = Table(title=f"Deflection of the aeroshell against the centerbody{when} ({note})")
-    for name in ("method", "deflection deg", "1 sd", "5 to 95 %", "plane LV deg", "largest deg", "at s"):
-        table.add_column(name, justify="left" if name == "method" else "right")
+    cycle = answers.cycle_s
+    parts = [] if cycle is None else [f"mean over the cycle from {cycle[0]:.2f} to {cycle[1]:.2f} s"]
+    parts.append("largest")
+    if np.isfinite(at_s):
+        note = "peak q" if answers.bet is not None else "its largest; no trajectory was made"
+        parts.append(f"at {at_s:.2f} s ({note})")
+    table = Table(title=f"Deflection of the aeroshell against the centerbody, deg: {', '.join(parts)}; plane in deg LV")
+    means = () if cycle is None else ("mean",)
+    for name in ("method", *means, "largest", "at s", f"at {at_s:.1f} s", "5 to 95 %", "LV"):
+        table.add_column(name, justify="left" if name == "method" else "right", no_wrap=name != "5 to 95 %")
     for row in answers.to_frame().itertuples(index=False):
         if not np.isfinite(row.theta_deg):
-            table.add_row(row.method, "no answer", "", "", "", "", "")
+            table.add_row(row.method, *[""] * (len(means) + 2), "no answer")
             continue
-        numbers = (row.theta_deg, row.theta_sd_deg)
-        largest = (f"{row.largest_deg:.2f}", f"{row.largest_t_s:.2f}")
+        shown = [f"{row.mean_deg:.2f}" if np.isfinite(row.mean_deg) else ""] * len(means)
+        here = f"{row.theta_deg:.2f} ± {row.theta_sd_deg:.2f}"
         within = f"{row.theta_p5_deg:.2f} to {row.theta_p95_deg:.2f}"
-        table.add_row(row.method, *(f"{x:.2f}" for x in numbers), within, f"{row.plane_lv_deg:.0f}", *largest)
+        largest = f"{row.largest_deg:.2f}", f"{row.largest_t_s:.2f}"
+        table.add_row(row.method, *shown, *largest, here, within, f"{row.plane_lv_deg:.0f}")
     console.print(table)
     for check in answers.consistency_checks:
         if check.passed:

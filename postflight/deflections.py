@@ -11,7 +11,7 @@ from estimators.camera import sensitivity_table
 from estimators.misalignment import estimate_misalignment as misalignment_history
 from estimators.trim import estimate_trim as trim_history
 from flightmodel.checks import Fault, FloatArray, GateError, Progress
-from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, lv_clock
+from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
 from postflight.filming import CameraAnswer, camera_answer, with_largest
 from postflight.flight import Flight
@@ -75,6 +75,19 @@ class Deflections(Tabular):
         return next((float(h.time_s[np.nanargmax(h.theta_rad)]) for h in self.histories.values()), float("nan"))
 
     @property
+    def best(self) -> str | None:
+        """The fused answer, else the method of the smallest sd at `reference_s`; None where none answers there."""
+        at = {method: history.at(self.reference_s)[1] for method, history in self.continuous.items()}
+        if np.isfinite(at.get("fused", np.nan)):
+            return "fused"
+        return min((m for m, sd in at.items() if np.isfinite(sd)), key=lambda m: at[m], default=None)
+
+    @property
+    def cycle_s(self) -> tuple[float, float] | None:
+        """The best answer's cycle, minimum to minimum, in which `reference_s` lies; None where none is clear."""
+        return None if self.best is None else cycle_about(self.continuous[self.best], self.reference_s)
+
+    @property
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
         """Whether several cameras agree, whether the methods do, and whether they have a common answer."""
         of_cameras = () if self.camera is None else self.camera.consistency_checks
@@ -92,11 +105,11 @@ class Deflections(Tabular):
         Returns
         -------
         DataFrame
-            ``method, t_s, theta_deg, theta_sd_deg, plane_lv_deg, largest_deg, largest_t_s, reason`` and the
-            quantiles of `DeflectionHistory.to_frame`.
+            ``method, t_s, theta_deg, theta_sd_deg, plane_lv_deg, largest_deg, largest_t_s, reason``, the quantiles of
+            `DeflectionHistory.to_frame`, and ``mean_deg, mean_sd_deg`` over the cycle about ``t_s`` (`cycle_s`).
         """
         rows: list[tuple[object, ...]] = []
-        at_s = self.reference_s
+        at_s, cycle = self.reference_s, self.cycle_s
         for method, history in self.histories.items():
             any_time = self.continuous[method]
             theta, sd = np.rad2deg(any_time.at(at_s))
@@ -105,11 +118,14 @@ class Deflections(Tabular):
             k = int(np.nanargmax(history.theta_rad))
             plane = np.rad2deg(lv_clock(np.array(lateral))) if np.isfinite(theta) else np.nan
             largest = np.rad2deg(history.theta_rad[k]), history.time_s[k]
-            rows.append((method, at_s, theta, sd, plane, *largest, "", *np.rad2deg(quantiles_at(any_time, at_s))))
-        nothing = [np.nan] * len(QUANTILE_COLUMNS)
+            mean = np.rad2deg(mean_over(any_time, cycle)) if cycle is not None else (np.nan, np.nan)
+            rows.append(
+                (method, at_s, theta, sd, plane, *largest, "", *np.rad2deg(quantiles_at(any_time, at_s)), *mean)
+            )
+        nothing = [np.nan] * (len(QUANTILE_COLUMNS) + 2)
         rows += [(method, at_s, *[np.nan] * 5, str(reason), *nothing) for method, reason in self.refused.items()]
         names = ("method", "t_s", "theta_deg", "theta_sd_deg", "plane_lv_deg", "largest_deg", "largest_t_s", "reason")
-        return pd.DataFrame(rows, columns=[*names, *QUANTILE_COLUMNS])
+        return pd.DataFrame(rows, columns=[*names, *QUANTILE_COLUMNS, "mean_deg", "mean_sd_deg"])
 
     def _about(self) -> str:
         shown = [

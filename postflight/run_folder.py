@@ -28,6 +28,7 @@ import pandas as pd
 
 from flightmodel import events
 from flightmodel.checks import FloatArray, GateError, writing
+from flightmodel.deflection import mean_over
 from flightmodel.guarded_files import open_file
 from flightmodel.partial_files import abandoned, partial_path
 from flightmodel.telemetry import Finding, Telemetry
@@ -55,6 +56,7 @@ _FRAMES = {
     "wind": "velocity of the air mass, north and east",
     "force": "specific force in body axes; C_A along -x, C_N the size of the normal force, reference area below",
 }
+_DEGREES = {"rad": "deg", "rad/s": "deg/s"}
 _STATISTICS = ("source", "component", "unit", "count", "edited", "mean", "sd", "rms_normalised", "lag1", "nis")
 # peak of the size of which column of bet.csv, and the column of its standard deviation
 _PEAKS = {
@@ -196,6 +198,7 @@ def newest_run(flight_folder: Path) -> Path:
 def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any]]:
     """Each method's deflection at one time, and reason and code where it has none."""
     out: dict[str, dict[str, Any]] = {}
+    cycle = answers.cycle_s
     for method, history in answers.histories.items():
         any_time = answers.continuous[method]
         theta, sd = np.rad2deg(any_time.at(at_s))
@@ -210,6 +213,9 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
             "largest_at_s": float(history.time_s[largest]),
             "assumptions": history.assumptions,
         }
+        if cycle is not None:
+            mean, mean_sd = np.rad2deg(mean_over(any_time, cycle))
+            out[method] |= {"mean_deg": float(mean), "mean_sd_deg": float(mean_sd), "mean_over_s": list(cycle)}
         if not np.isfinite(theta):
             words = f"no data at {at_s:.2f} s; answers span {known[0]:.2f} to {known[-1]:.2f} s"
             out[method] |= {"deflection_deg": None, "sd_deg": None, "reason": words, "code": "no-answer"}
@@ -236,10 +242,10 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflec
     slow = slow_covariance(flight)
     np.savez_compressed(run.path / "covariance.npz", t_s=slow["t_s"], covariance=slow["covariance"])
     run.write_csv("peaks.csv", peak_table(flight, table))
-    run.write_csv("residual_statistics.csv", residual_statistics(flight))
-    run.write_csv("residuals.csv", bet.residuals)
-    if len(bet.held_out):
-        run.write_csv("withheld.csv", bet.held_out)
+    run.write_csv("residual_statistics.csv", in_degrees(residual_statistics(flight), "mean", "sd"))
+    for name, table_of in (("residuals", bet.residuals), ("withheld", bet.held_out)):
+        if name == "residuals" or len(table_of):
+            run.write_csv(f"{name}.csv", in_degrees(_with_units(table_of), "residual", "predicted_sd"))
     of_deflection = () if answers is None else answers.consistency_checks
     checks = pd.DataFrame([vars(v) for v in (*flight.consistency_checks, *of_deflection)])
     run.write_csv("consistency_checks.csv", checks)
@@ -248,7 +254,7 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflec
         "verdicts.csv",
         checks.drop(columns=["code", "source", "component", "symptom"]).rename(columns={"remark": "words"}),
     )
-    run.write_csv("sensor_errors.csv", bet.sensor_errors)
+    run.write_csv("sensor_errors.csv", in_degrees(bet.sensor_errors, "prior_sd", "estimate", "sd"))
     event_rows = event_table(flight, table)
     run.write_csv("events.csv", event_rows)
     if flight.as_flown is not None:
@@ -466,6 +472,31 @@ def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["peak", "column", "t_s", "value", "sd", "inside"])
 
 
+def _unit(source: str, component: str) -> str:
+    """SI unit of a component's residuals."""
+    if "velocity" in f"{source} {component}" or component == "range rate":
+        return "m/s"
+    if component.startswith(("field", "rate ")):
+        return "T" if component.startswith("field") else "rad/s"
+    return "rad" if component in ("azimuth", "elevation") else "m"
+
+
+def _with_units(residuals: pd.DataFrame) -> pd.DataFrame:
+    """Residuals with the unit of each row."""
+    pairs = zip(residuals["source"], residuals["component"], strict=True)
+    return residuals.assign(unit=[_unit(source, component) for source, component in pairs])
+
+
+def in_degrees(table: pd.DataFrame, *columns: str) -> pd.DataFrame:
+    """Table with a column ``unit`` as it is written: rows of angles and their rates in degrees."""
+    turned = table["unit"].isin(list(_DEGREES))
+    out = table.copy()
+    for column in columns:
+        out[column] = np.where(turned, np.rad2deg(table[column].to_numpy(dtype=float)), table[column])
+    out["unit"] = table["unit"].replace(_DEGREES)
+    return out
+
+
 def residual_statistics(flight: Reconstruction) -> pd.DataFrame:
     """Statistics of the residuals of each source and component; edited points are in ``count`` and ``edited`` alone.
 
@@ -478,8 +509,7 @@ def residual_statistics(flight: Reconstruction) -> pd.DataFrame:
     for (source, component), part in flight.solution.residuals.groupby(["source", "component"], sort=False):
         good = part[part["accepted"]]
         r, z = good["residual"].to_numpy(), (good["residual"] / good["predicted_sd"]).to_numpy()
-        unit = "rad" if component in ("azimuth", "elevation") else "m"
-        unit = "m/s" if "velocity" in f"{source} {component}" else unit
+        unit = _unit(source, component)
         values = (np.nan,) * 4
         if len(r) > 2:
             values = (float(r.mean()), float(r.std(ddof=1)), float(np.sqrt((z**2).mean())), _lag1(z))

@@ -10,12 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from estimators.fusion import Fused
-from estimators.southwell import Limbs
+from estimators.southwell import SPAN_S, Limbs
 from flightmodel.checks import FloatArray
 from postflight.deflections import Deflections
 from postflight.plots.overlay import benchmark_and_largest
 from postflight.plots.paper_figures import trajectory_angle, window
-from postflight.plots.style import COLOUR, LABEL, STROKE, TIME, WIDE_BAND, band, in_style, stamp
+from postflight.plots.style import COLOUR, LABEL, STROKE, TIME, WIDE_BAND, band, in_style, legend_above, stamp
 from postflight.reconstruction import Reconstruction
 
 _MANY_ANSWERS = 400  # of a history, above which its single answers are not marked
@@ -54,13 +54,13 @@ def figure_summary(
     largest = [np.nanmax(np.rad2deg(h.theta_rad)) for h in answers.histories.values() if np.isfinite(h.theta_rad).any()]
     top_deg = 1.25 * float(max(largest, default=5.0))
     upper.set(ylabel="deflection of aeroshell\nagainst centerbody (deg)", xlim=window(flight), ylim=(0, top_deg))
-    upper.legend(title="bands: 1 sd; dotted: peak dynamic pressure")
+    legend_above(upper, 5, "bands: 1 sd; dotted: peak dynamic pressure")
     trajectory_angle(lower, flight, "centerbody total angle of attack, 1 sd")
     lower.set(ylabel="angle of attack (deg)", xlabel=TIME, ylim=(0, 16))
-    lower.legend()
+    legend_above(lower, 1)
     pressure = lower.twinx()
     pressure.plot(flight.air.time_s, flight.air.dynamic_pressure_pa, color=COLOUR["prior"], lw=1)
-    pressure.set(ylabel="dynamic pressure (Pa), grey", ylim=(0, None))
+    pressure.set(ylabel="dynamic pressure\n(Pa), grey", ylim=(0, None))
     pressure.grid(visible=False)
     figure.suptitle("Deflection of the aeroshell by each method")
     stamp(figure, flight.telemetry)
@@ -102,7 +102,7 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
         ax.plot(history.time_s, values, color=COLOUR["fused"], label="fused")
         band(ax, history.time_s, values, spread, COLOUR["fused"], label="1 sd")
         ax.set(ylabel=label, xlabel=TIME, ylim=(0.0, top))
-        ax.legend()
+        legend_above(ax, 2)
     if limbs is None:
         line.set_axis_off()
         line.text(0.5, 0.5, "no Southwell line", ha="center", transform=line.transAxes)
@@ -124,7 +124,14 @@ def _southwell(ax: Axes, limbs: Limbs) -> None:
     clear = both.theta_rad > 2.0 * both.theta_sd_rad
     q, theta, sd = both.pressure_pa[clear], both.theta_rad[clear], both.theta_sd_rad[clear]
     error = np.rad2deg(sd) / np.rad2deg(theta) ** 2
-    ax.errorbar(1e3 / q, 1.0 / np.rad2deg(theta), yerr=error, fmt="o", color=COLOUR["measured"])
+    ax.errorbar(
+        1e3 / q,
+        1.0 / np.rad2deg(theta),
+        yerr=error,
+        fmt="o",
+        color=COLOUR["measured"],
+        label=f"means of {SPAN_S:g} s, 1 sd",
+    )
     over = np.linspace(1e3 / both.critical_pressure_pa, 1e3 / q.min() if len(q) else 5.0, 200)[1:]
     for name, limb, colour in (
         ("both", both, COLOUR["measured"]),
@@ -134,9 +141,10 @@ def _southwell(ax: Axes, limbs: Limbs) -> None:
         if limb is not None:
             ax.plot(over, 1.0 / np.rad2deg(limb.deflection(1e3 / over)), color=colour, label=name, lw=1.0)
     low, high = both.critical_interval_pa
-    ax.set(xlabel="1000 / dynamic pressure (1/Pa)", ylabel="1 / deflection (1/deg)", xlim=(0.0, None), ylim=(0.0, None))
-    ax.set_title(f"Southwell: critical pressure {both.critical_pressure_pa:.0f} Pa (90 %: {low:.0f} to {high:.0f})")
-    ax.legend()
+    ax.set(xlabel="1 / dynamic pressure (1/kPa)", ylabel="1 / deflection (1/deg)", xlim=(0.0, None), ylim=(0.0, None))
+    words = f"{both.critical_pressure_pa:.0f} Pa (90 %: {low:.0f} to {high:.0f})"
+    ax.set_title(f"Southwell plot: critical pressure {words}")
+    ax.legend(loc="lower right")
 
 
 @in_style
@@ -164,5 +172,5 @@ def figure_correlation(fused: Fused, singular_values: FloatArray) -> Figure:
     i, j = np.unravel_index(np.argmax(size), size.shape)
     most = f"largest: {fused.names[i]} and {fused.names[j]} ({fused.correlation[i, j]:+.2f})"
     table.set_title(f"correlation given all readings, at {fused.at_s:.1f} s\n{most}")
-    figure.colorbar(image, ax=table, shrink=0.7)
+    figure.colorbar(image, ax=table, shrink=0.7, label="correlation coefficient")
     return figure

@@ -26,7 +26,7 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.geometry import BodyMesh
-from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, stamp
+from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_above, stamp
 from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds, rigid_bounds
 
@@ -74,8 +74,8 @@ def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: in
     lower.plot(pulse.time_s, normal, color=COLOUR["estimate"], lw=1.4, label="measured, at the c.g.")
     upper.set(ylabel="total angle of attack (deg)", ylim=(0, 16), xlim=window(flight))
     lower.set(ylabel="normal acceleration (g)", ylim=(0, None), xlabel=TIME)
-    for ax in (upper, lower):
-        ax.legend()
+    legend_above(upper, 3)
+    legend_above(lower, 4)
     figure.suptitle("Flight against a rigid vehicle (in the manner of AIAA 2011-2571, Figure 1.3)")
     stamp(figure, flight.telemetry)
     return figure
@@ -167,7 +167,7 @@ def _look_up(ax: Axes, time_s: FloatArray, use: BoolArray, angle_rad: FloatArray
 
 def _angles(figure: Figure, ax: Axes, flight: Reconstruction, title: str, number: str) -> Figure:
     ax.set(xlim=window(flight), ylim=(0, _LOOK_UP_END_DEG), ylabel="total angle of attack (deg)", xlabel=TIME)
-    ax.legend()
+    legend_above(ax, 1)
     figure.suptitle(f"{title} (AIAA 2011-2571, Figure {number})")
     stamp(figure, flight.telemetry)
     return figure

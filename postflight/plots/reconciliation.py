@@ -11,7 +11,7 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.telemetry import Telemetry
-from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, ellipses, in_style, limits, stamp
+from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, ellipses, in_style, legend_above, limits, stamp
 from postflight.reconciliation.fit import JointFit
 from postflight.reconciliation.modes import ModalStiffness
 from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities, stiffness_and_offset
@@ -50,7 +50,7 @@ def _pair(ax: Axes, t: FloatArray, measured: FloatArray, flown: FloatArray, labe
     ax.plot(t, measured, color=COLOUR["measured"], label="measured")
     ax.plot(t, flown, color=_FOUND, lw=1.0, ls="--", label="simulated with the estimated joint")
     ax.set_ylabel(label)
-    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
+    legend_above(ax, 2)
 
 
 def _residuals(ax: Axes, t: FloatArray, residual: FloatArray, label: str) -> None:
@@ -71,7 +71,7 @@ def _deflection(ax: Axes, history: DeflectionHistory, fused: DeflectionHistory |
     band(ax, history.time_s, theta, sd, _FOUND, label="1 sd")
     ax.set_ylabel("deflection (deg)")
     ax.set_ylim(bottom=0.0)
-    ax.legend()
+    legend_above(ax, 3)
 
 
 def _ridge(ax: Axes, found: JointFit) -> None:

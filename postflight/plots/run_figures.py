@@ -67,8 +67,8 @@ def draw_run(
         answer, telemetry = answers.fused, flight.telemetry
         words = f"{answer.agreement.remark}; {answer.limbs_remark}"
         draw(folder / "fusion.png", _stamped(figure_fusion, telemetry), answer.fused, answer.limbs, words)
-        told_apart = _stamped(figure_correlation, telemetry)
-        draw(folder / "told_apart.png", told_apart, answer.fused, answer.agreement.singular_values)
+        correlation = _stamped(figure_correlation, telemetry)
+        draw(folder / "correlation.png", correlation, answer.fused, answer.agreement.singular_values)
     if flight.loads is not None:
         _draw_static_trim(flight.loads, flight.telemetry, folder)
     if answers.histories:

@@ -152,6 +152,11 @@ def band(
     ax.fill_between(x, middle - sd, middle + sd, color=colour, alpha=alpha, lw=0, label=label or None)
 
 
+def legend_above(ax: Axes, ncols: int, title: str | None = None) -> None:
+    """Legend between the axes and what is above them, where no data are."""
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=ncols, borderaxespad=0.0, title=title)
+
+
 def percentiles(ax: Axes, time_s: FloatArray, low: FloatArray, middle: FloatArray, high: FloatArray) -> None:
     """Draw the 2.3, 50 and 97.7 percentiles of many flights over time."""
     ax.fill_between(time_s, low, high, color=COLOUR["estimate"], alpha=BAND, lw=0, label="2.3 to 97.7 %")

@@ -11,7 +11,7 @@ from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import difference, resample
 from postflight.attitude import AttitudeCheck
-from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, in_style, limits, residual_unit, stamp
+from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, in_style, legend_above, limits, residual_unit, stamp
 from postflight.reconstruction import Reconstruction
 from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.atmosphere import ReconstructedAir
@@ -113,8 +113,8 @@ def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
             far = min(max(far, 1.1 * float(np.nanpercentile(np.abs(ratio[:, part]), 99.5))), 30.0)
         apart.set_ylim(-far, far)
         apart.set_ylabel(f"difference over\nits sd ({'body' if name == 'attitude' else 'ECEF'})")
-        apart.legend(ncols=3, loc="upper right")
-    grid[0, 0].legend(ncols=2, loc="upper right")
+        legend_above(apart, 3)
+    legend_above(grid[0, 0], 2)
     for ax in grid[-1]:
         ax.set_xlabel(TIME)
     figure.suptitle("Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)")
@@ -141,7 +141,7 @@ def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
         _along_height(ax, height_km, found, (wind[:, k], prior_wind_sd))
         ax.set_xlabel(f"wind velocity, {way} (m/s)")
     axes[0].set(xlabel="density / sounding's density", ylabel="altitude (km)")
-    axes[1].legend(loc="lower left")
+    upper.legend(*axes[1].get_legend_handles_labels(), ncols=3, loc="outside lower left")
     _drag(lower.subplots(), day.drag)
     figure.suptitle("As-flown atmosphere from the deceleration along the reconstructed trajectory")
     stamp(figure, flight.telemetry)
@@ -153,11 +153,11 @@ def _along_height(
 ) -> None:
     """Values and standard deviations (n,), prior and posterior, along altitude."""
     for (middle, sd), colour, edge, alpha, stroke, label in (
-        (prior, COLOUR["prior_band"], COLOUR["prior"], 1.0, ":", "sounding, 1 sd"),
-        (found, COLOUR["estimate"], COLOUR["estimate"], BAND, "-", "reconstructed, 1 sd"),
+        (prior, COLOUR["prior_band"], COLOUR["prior"], 1.0, ":", "sounding"),
+        (found, COLOUR["estimate"], COLOUR["estimate"], BAND, "-", "reconstructed"),
     ):
-        ax.fill_betweenx(height_km, middle - sd, middle + sd, color=colour, alpha=alpha, lw=0, label=label)
-        ax.plot(middle, height_km, color=edge, ls=stroke)
+        ax.fill_betweenx(height_km, middle - sd, middle + sd, color=colour, alpha=alpha, lw=0, label=f"{label}, 1 sd")
+        ax.plot(middle, height_km, color=edge, ls=stroke, label=label)
 
 
 def _drag(ax: Axes, drag: pd.DataFrame) -> None:
@@ -173,7 +173,7 @@ def _drag(ax: Axes, drag: pd.DataFrame) -> None:
     low, high = np.percentile(ratio, [1, 99])
     room = max(1.3 * np.abs(np.array([low, high]) - 1.0).max(), 1.5 * float(np.median(prior_sd)))
     ax.set(xlabel="Mach number", ylabel="drag ratio", ylim=(1.0 - room, 1.0 + room))
-    ax.legend(loc="lower right", ncols=2)
+    legend_above(ax, 2)
 
 
 @in_style

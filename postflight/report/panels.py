@@ -190,6 +190,8 @@ def residual_panels(run: Run) -> list[Panel]:
     out: list[Panel] = []
     for (source, component), rows in pairs:
         scale, unit = residual_unit(component)
+        if "unit" in rows and rows["unit"].iloc[0] == "deg":  # a run of version 0.1 has none, and radians
+            scale *= float(np.deg2rad(1.0))
         r, sd = (scale * rows[c].to_numpy(float) for c in ("residual", "predicted_sd"))
         good = rows["accepted"].to_numpy(bool)
         kept = kept_rows([r, np.where(good, np.nan, r)], _RESIDUAL_POINTS // len(pairs))

@@ -54,6 +54,9 @@ def title(run: Run) -> str:
     if best is not None:
         answer = run.summary["methods"][best]
         by = "" if best == "fused" else f", by {_BY[best]}"
+        if answer.get("mean_deg") is not None:
+            mean = pair(answer["mean_deg"], answer["mean_sd_deg"])
+            return f"Deflection {mean}° on average over a cycle, {answer['largest_deg']:.1f}° at most{by}"
         return f"Deflection {pair(answer['deflection_deg'], answer['sd_deg'])}° at {_peak_name(run)}{by}"
     asked = run.facts["settings"]["methods"]
     end = "no method gave a deflection" if asked else "no deflection was asked for"
@@ -82,9 +85,7 @@ def lead(run: Run) -> list[str]:
         f"{_peak_name(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
         f"({_utc(run, at)} UTC), Mach {there['mach']:.2f}, {there['alt_m'] / 1e3:.1f} km."
     )
-    oscillation = _oscillation(run)
-    if oscillation:
-        out.insert(0, oscillation)
+    out[0:0] = [words for words in (_oscillation(run), _outside_its_inputs(run)) if words]
     out.append(f"{s['verdicts_passed']} of {len(run.checks)} consistency checks pass.")
     rests = s.get("rests_on") or []  # runs of before have none
     if rests:
@@ -101,6 +102,12 @@ def _oscillation(run: Run) -> str:
     if best is None:
         return ""
     answer, table = run.summary["methods"][best], run.tables[answer_table(best, run.tables)]
+    if answer.get("mean_deg") is not None:
+        first, last = answer["mean_over_s"]
+        return (
+            f"{pair(answer['deflection_deg'], answer['sd_deg'])}° at {_peak_name(run)}; the mean is that of the cycle "
+            f"about it, {first:.2f} to {last:.2f} s, the largest at {answer['largest_at_s']:.2f} s."
+        )
     near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < _NEAR_PEAK_S]
     if len(near) < 2 or near.max() - near.min() < _OSCILLATES_SD * answer["sd_deg"]:
         return ""
@@ -108,6 +115,24 @@ def _oscillation(run: Run) -> str:
         f"It oscillates between {near.min():.1f} and {near.max():.1f}° within {_NEAR_PEAK_S:.0f} s of that time; "
         f"largest {answer['largest_deg']:.1f}° at {answer['largest_at_s']:.2f} s."
     )
+
+
+def _outside_its_inputs(run: Run) -> str:
+    """Sentence on a fused angle beyond those of all methods, and why; empty where it lies among them."""
+    answers = {
+        name: m["deflection_deg"] for name, m in run.summary["methods"].items() if m["deflection_deg"] is not None
+    }
+    fused = answers.pop("fused", None)
+    if fused is None or len(answers) < 2 or min(answers.values()) <= fused <= max(answers.values()):
+        return ""
+    side = "above" if fused > max(answers.values()) else "below"
+    words = f"The fused angle is {side} that of every method: it is no mean at one instant, but what explains all "
+    words += "readings of the pulse with the inputs that the methods share"
+    table = run.tables.get("fusion_inputs")
+    if table is None or not len(table):
+        return f"{words}."
+    most = table.loc[table["moved_sd"].abs().idxmax()]
+    return f"{words}, of which {most['input']} moved most, by {most['moved_sd']:+.1f} sd."
 
 
 def cards(run: Run) -> list[dict[str, Any]]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import rice
 
-from flightmodel.deflection import QUANTILE_COLUMNS, QUANTILES, history_from_lateral
+from flightmodel.deflection import QUANTILE_COLUMNS, QUANTILES, cycle_about, history_from_lateral, mean_over
 
 SD = np.deg2rad(0.2)
 
@@ -61,3 +61,32 @@ def test_a_plane_that_is_lost_leaves_the_angle_s_own():
     assert np.isnan(one.lateral_cov[0]).all()
     want = rice.ppf(QUANTILES, np.deg2rad(0.01) / SD, scale=SD)
     np.testing.assert_allclose(one.theta_quantiles_rad[0], want, atol=0.06 * SD)
+
+
+# ------------------------------------------------------------------------------------------------- a cycle and its mean
+
+
+def swinging(amplitude_deg, sd_deg=0.05, keep=slice(None)):
+    t = np.arange(0.0, 16.0, 0.1)
+    theta = np.deg2rad(4.0 + 0.1 * (t - 8.0) + amplitude_deg * np.sin(2.0 * np.pi * t / 1.6))
+    cov = np.tile(np.deg2rad(sd_deg) ** 2 * np.eye(2), (len(t), 1, 1))
+    return history_from_lateral(t[keep], theta[keep, None] * np.array([[0.6, 0.8]]), cov[keep], "fused", "")
+
+
+def test_a_cycle_lies_between_the_minima_about_a_time_and_its_mean_is_what_it_oscillates_about():
+    one = swinging(1.0)
+    first, last = cycle_about(one, 8.3)
+    # minima of 4 + sin: 1.2 s after each multiple of 1.6 s, to a step
+    assert (first, last) == pytest.approx((7.6, 9.2), abs=0.11)
+    mean, sd = np.rad2deg(mean_over(one, (first, last)))
+    assert mean == pytest.approx(4.0 + 0.1 * (0.5 * (first + last) - 8.0), abs=0.05)
+    assert sd == pytest.approx(0.05, rel=1e-6)
+
+
+def test_what_does_not_stand_out_of_its_error_or_is_not_covered_is_no_cycle():
+    assert cycle_about(swinging(0.1), 8.3) is None
+    assert cycle_about(swinging(1.0), 0.3) is None
+    gap = np.r_[0:80, 88:160]
+    assert cycle_about(swinging(1.0, keep=gap), 8.3) is None
+    assert np.isnan(mean_over(swinging(1.0, keep=gap), (7.6, 9.2))).all()
+    assert np.isnan(mean_over(swinging(1.0), (15.0, 17.0))).all()

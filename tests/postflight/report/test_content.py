@@ -145,8 +145,23 @@ def test_page_files_are_in_the_package() -> None:
 
 def test_title_is_the_answer(run, text: str) -> None:
     answer = run.summary["methods"]["fused"]
-    assert f" {answer['deflection_deg']:.1f}\u00a0±\u00a0{answer['sd_deg']:.1f}° " in texts.title(run)
+    assert f" {texts.pair(answer['mean_deg'], answer['mean_sd_deg'])}° " in texts.title(run)
+    assert f" {answer['largest_deg']:.1f}° " in texts.title(run)
     assert f"<h1>{texts.title(run)}</h1>" in text
+    assert texts.lead(run)[0].startswith(f"{texts.pair(answer['deflection_deg'], answer['sd_deg'])}° at ")
+
+
+def test_a_fused_angle_beyond_its_inputs_says_why(run) -> None:
+    methods = {name: dict(answer) for name, answer in run.summary["methods"].items()}
+    for name, angle in (("camera", 3.0), ("misalignment", 3.2), ("trim", 3.4), ("fused", 3.1)):
+        methods[name]["deflection_deg"] = angle
+    among = replace(run, summary=run.summary | {"methods": methods})
+    methods = {name: dict(answer) for name, answer in methods.items()}
+    methods["fused"]["deflection_deg"] = 3.5
+    above = replace(run, summary=run.summary | {"methods": methods})
+    said = [words for words in texts.lead(above) if words not in texts.lead(among)]
+    inputs = run.tables["fusion_inputs"]
+    assert any(inputs["input"][inputs["moved_sd"].abs().idxmax()] in words for words in said)
 
 
 @pytest.mark.parametrize(
