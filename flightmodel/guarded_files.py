@@ -22,6 +22,8 @@ _KINDS = {
     stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket",
 }
+# not handed to child processes, bytes as they are, and no waiting for a pipe; each system has some of them
+_FLAGS = sum({getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NOINHERIT", "O_BINARY", "O_NONBLOCK")})
 
 
 class UnfitFile(OSError):
@@ -41,7 +43,7 @@ def open_file(path: Path, most_bytes: int = TABLE_BYTES) -> BinaryIO:
         For anything else; other OSErrors as `open` has them.
     """
     _check(path, path.stat(), most_bytes)  # before it is opened: to open a device may already do something
-    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | getattr(os, "O_NONBLOCK", 0))
+    handle = os.open(path, os.O_RDONLY | _FLAGS)
     try:
         _check(path, os.fstat(handle), most_bytes)  # what was opened, should it have changed in between
         return os.fdopen(handle, "rb")

@@ -50,6 +50,8 @@ def abandoned(folder: Path, name: str | None = None, kind: str = PARTIAL) -> Ite
 
 
 def _is_running(process: int) -> bool:
+    if os.name == "nt":  # where signal 0 is Ctrl-C: age decides
+        return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:

@@ -112,10 +112,12 @@ def _texts(run: Run) -> dict[str, Any]:
         "peaks": "Peak values",
     }
     checks, again = run.checks, run.tables.get("sensitivity")
+    day = parse_utc(run.telemetry.t0_utc)
     return {
         "title": text.title(run),
         "lead": text.lead(run),
         "cards": text.with_whiskers(text.cards(run)),
+        "clock": text.clock_drawing(run),
         "events": text.events(run),
         "findings": text.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
         "checks": text.table_rows(checks.assign(passed=checks["passed"].map({True: "✓ pass", False: "✕ fail"}))),
@@ -123,7 +125,7 @@ def _texts(run: Run) -> dict[str, Any]:
         "sensitivity": text.sensitivity_rows(again) if again is not None else None,
         "vehicle": [(k, text.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
         "settings": [(k, text.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
-        "date": parse_utc(run.telemetry.t0_utc).strftime("%-d %B %Y"),
+        "date": f"{day.day} {day:%B %Y}",
     }
 
 
