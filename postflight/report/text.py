@@ -87,13 +87,22 @@ def lead(run: Run) -> list[str]:
     )
     out[0:0] = [words for words in (_oscillation(run), _outside_its_inputs(run)) if words]
     out.append(f"{s['verdicts_passed']} of {len(run.checks)} consistency checks pass.")
-    rests = s.get("rests_on") or []  # runs of before have none
+    rests = _rests_on(s.get("rests_on") or [])  # runs of before have none
     if rests:
-        out.append(f"{rests[0][0].upper()}{'; '.join(rests)[1:]}.")
+        out.append(f"{rests[0].upper()}{rests[1:]}.")
     changes = run.facts["settings"].get("changes")
     if changes:
         out.insert(0, f"A what-if, not the flight as its folder states it: {'; '.join(changes)}.")
     return out
+
+
+def _rests_on(lines: list[str]) -> str:
+    """What the answer rests on, in one sentence that says once whose uncertainty is not stated."""
+    unknown = " (uncertainty not stated)"
+    bare = [line.removesuffix(unknown) for line in lines if line.endswith(unknown)]
+    stated = [line for line in lines if not line.endswith(unknown)]
+    last = [f"{'; '.join(bare)} (uncertainties not stated)"] if len(bare) > 1 else [line + unknown for line in bare]
+    return "; ".join([*stated, *last])
 
 
 def _oscillation(run: Run) -> str:
@@ -218,6 +227,20 @@ def with_whiskers(shown: list[dict[str, Any]]) -> list[dict[str, Any]]:
         if fused is not None:
             c["behind"] = [place(fused["quantiles"][k]) for k in (0, -1)]
     return shown
+
+
+def clock_drawing(run: Run) -> dict[str, Any] | None:
+    """Plane of the best answer, deg LV, and its end in a circle of 36 about (0, 0) seen from behind (y to the right).
+
+    Clocking direction ``phi`` is ``(0, -cos phi, sin phi)`` in body axes; None where no plane is known.
+    """
+    best = best_method(run)
+    plane = "" if best is None else plane_at(run, best)
+    if best is None or not plane:
+        return None
+    phi = np.deg2rad(float(plane.split()[0]))
+    end = [round(36.0 * float(x), 1) for x in (-np.cos(phi), np.sin(phi))]
+    return {"plane": plane, "label": LABEL[best], "end": end, "colour": COLOUR[best]}
 
 
 def events(run: Run) -> list[dict[str, Any]]:

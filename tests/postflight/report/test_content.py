@@ -373,3 +373,26 @@ def test_worst_frames_are_shown_with_their_numbers(run, text: str) -> None:
     assert len(shown) == 5
     table = run.tables["camera_frames"]
     assert [float(t) for t in shown] == pytest.approx(table["t_s"].iloc[pictures.worst_first(table)[:5]], abs=0.006)
+
+
+def test_what_is_not_stated_is_said_once() -> None:
+    lines = [
+        "position rests on A (uncertainty not stated)",
+        "height rests on B (uncertainty not stated)",
+        "rho on C to 2 %",
+    ]
+    joined = texts._rests_on(lines)
+    assert joined == "rho on C to 2 %; position rests on A; height rests on B (uncertainties not stated)"
+    assert texts._rests_on(lines[:1]) == lines[0]
+    assert texts._rests_on([]) == ""
+
+
+@pytest.mark.parametrize(
+    ("plane", "end"), [("0 ± 2", [-36.0, 0.0]), ("90 ± 2", [0.0, 36.0]), ("180.0 ± 0.4", [36.0, 0.0])]
+)
+def test_clocking_is_drawn_as_seen_from_behind(run, monkeypatch, plane: str, end: list[float]) -> None:
+    """Body y, at 180 deg, is to the right and body z, at 90 deg, down (SVG's y grows downwards)."""
+    monkeypatch.setattr(texts, "plane_at", lambda *_: plane)
+    assert texts.clock_drawing(run)["end"] == pytest.approx(end, abs=0.05)
+    monkeypatch.setattr(texts, "plane_at", lambda *_: "")
+    assert texts.clock_drawing(run) is None
