@@ -30,9 +30,14 @@ lint: $(VENV)/installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# the documentation as a site that needs no network: site/index.html
-docs: $(VENV)/installed-docs
+# the documentation as a site that needs no network: site/index.html, with a report and the notebooks' output
+docs: $(VENV)/installed-docs build/notebooks/made
 	$(BIN)/python -m mkdocs build --strict
+
+build/notebooks/made: notebooks/*.ipynb | $(VENV)/installed-docs
+	test -d demo-flight || $(BIN)/postflight demo demo-flight
+	$(BIN)/python -m nbconvert --to notebook --execute --output-dir build/notebooks notebooks/*.ipynb
+	touch $@
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

@@ -1,4 +1,4 @@
-"""Makes a site of the pages in ``docs/``: pages from files beside it, the reference, formulas as MathML.
+"""Makes a site of the pages in ``docs/``: files beside it, the reference, notebooks, a report, formulas as MathML.
 
 The pages are written to be read in the repository too, where links lead to files that are no pages of the site: such a
 link becomes its words.
@@ -8,8 +8,10 @@ import html
 import re
 from pathlib import Path
 
+import nbformat
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
+from nbconvert import MarkdownExporter
 
 ROOT = Path(__file__).parents[1]
 BESIDE = {
@@ -31,11 +33,40 @@ def reference():
     return f"# The public interface\n\n```text\n{postflight.__doc__.strip()}\n```\n\n{text}"
 
 
+def notebook(name):
+    """A notebook's page and its pictures: as run by ``make docs``, else as it is stored, without output."""
+    run = ROOT / "build/notebooks" / f"{name}.ipynb"
+    path = run if run.exists() else ROOT / "notebooks" / f"{name}.ipynb"
+    exporter = MarkdownExporter()
+    resources = {"output_files_dir": f"{name}_files"}
+    text, made = exporter.from_notebook_node(nbformat.read(path, as_version=4), resources)
+    if not run.exists():
+        text = f"*Without output; `make docs` runs it.*\n\n{text}"
+    return {f"{name}.md": text, **made["outputs"]}
+
+
+def sample_report():
+    """Page with the demo's report, as any run writes it, and the report itself."""
+    words = "# A sample report\n\nThe report of [the demo](tutorial-demo.md)'s flight, which is synthetic"
+    reports = sorted((ROOT / "demo-flight/runs").glob("2*/report.html"))
+    if not reports:
+        return {"sample-report.md": f"{words}. Not made here: `make docs` makes it.\n"}
+    style = "width: 100%; height: 80vh; border: 1px solid"
+    frame = f'<iframe src="demo-report.html" title="report of the demo" style="{style}"></iframe>'
+    text = f'{words}: <a href="demo-report.html">on a page of its own</a>, or here.\n\n{frame}\n'
+    return {"sample-report.md": text, "demo-report.html": reports[-1].read_bytes()}
+
+
 def on_files(files, config):
-    """Add pages that are made: of files beside ``docs/``, of docstrings, a list of decisions."""
+    """Add pages that are made: of files beside ``docs/``, of docstrings, notebooks, the demo's report, decisions."""
     for page, source in BESIDE.items():
         files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
     files.append(File.generated(config, "reference/postflight.md", content=reference()))
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        for name, content in notebook(path.stem).items():
+            files.append(File.generated(config, f"notebooks/{name}", content=content))
+    for name, content in sample_report().items():
+        files.append(File.generated(config, name, content=content))
     decisions = sorted((ROOT / "docs/decisions").glob("0*.md"))
     listed = "\n".join(f"- [{path.read_text().splitlines()[0].lstrip('# ')}]({path.name})" for path in decisions)
     files.append(File.generated(config, "decisions/index.md", content=f"# Decisions\n\n{listed}\n"))

@@ -1,9 +1,6 @@
 """The pages of scenario, vehicle and flight files name every key that these files may hold, with their defaults."""
 
-import importlib.util
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -156,25 +153,3 @@ def test_commands_on_the_page_are_understood(page: Path, monkeypatch: pytest.Mon
 def test_python_on_the_page_compiles(page: Path):
     for text in blocks(page, "python"):
         compile(text, page.name, "exec")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    any(importlib.util.find_spec(name) is None for name in ("material", "mkdocstrings", "latex2mathml")),
-    reason="the extra 'docs' is not installed",
-)
-def test_site_builds_without_a_warning_and_asks_for_nothing(tmp_path: Path):
-    site = tmp_path / "site"
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(site)],
-        cwd=ROOT, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    pages = {page.relative_to(site).as_posix(): page.read_text() for page in site.rglob("*.html")}
-    for name, text in pages.items():
-        asked = re.findall(r"<(?:script|img|iframe|source)[^>]* src=\"?(?:https?:)?//", text)
-        asked += re.findall(r"<link[^>]* href=\"?(?:https?:)?//[^>]*(?:stylesheet|preconnect|icon)", text)
-        assert not asked, f"{name} loads something from elsewhere"
-        assert not re.search(r'class="arithmatex"', text), f"{name} has a formula that is not drawn"
-    assert "<math" in pages["derivations.html"]
-    assert "estimate_misalignment" in pages["reference/postflight.html"]
