@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -128,15 +128,38 @@ def check_folder(folder: Path) -> Report:
         found = read_sources(folder)
     except GateError as fault:
         _refuse(report, folder, [*fault.faults, *_vehicle_faults(folder)], fault.exit_code)
+        report.findings = _not_used(folder)
         return report
     gate = found.gate
     if gate.config or gate.faults:
         _refuse(report, folder, [*gate.config, *gate.faults], 3 if gate.faults else 2)
     report.facts = _facts(found)
-    report.findings = sorted(gate.findings, key=lambda f: (f.source, np.nan_to_num(f.start_s, nan=-np.inf)))
+    report.findings = _not_used(folder) + sorted(
+        gate.findings, key=lambda f: (f.source, np.nan_to_num(f.start_s, nan=-np.inf))
+    )
     with np.errstate(invalid="ignore"):
         _cross_check(found, report)
     return report
+
+
+def _not_used(folder: Path) -> list[Finding]:
+    """Tables below ``telemetry/`` that flight.toml does not name: delivered, imported perhaps, and read by nobody."""
+    try:
+        named = set(_texts(read_toml(folder / "flight.toml")))
+    except GateError:
+        return []
+    there = sorted(path.relative_to(folder).as_posix() for path in (folder / "telemetry").glob("*.csv"))
+    words = "no table of flight.toml reads it; declare its columns there, or remove it"
+    return [Finding(name, words, np.nan, np.nan, "file-not-used") for name in there if name not in named]
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Every text in the tables of a TOML file."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _texts(inner)
 
 
 def _vehicle_faults(folder: Path) -> list[Fault]:
