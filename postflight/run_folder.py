@@ -368,6 +368,7 @@ def header(flight: Reconstruction) -> dict[str, Any]:
         "vehicle": _vehicle(flight),
         "atmosphere": _atmosphere(flight),
         "sensors": _sensors(flight),
+        "assumed": telemetry.assumed,
         "settings": settings,
         "inputs_sha256": telemetry.hashes,
         "missing": list(flight.missing),

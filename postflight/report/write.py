@@ -18,7 +18,7 @@ from flightmodel.checks import write_file, writing
 from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
 from postflight.plots.style import COLOUR, PAGE
-from postflight.report import pictures, text
+from postflight.report import pictures, stated_errors, text
 from postflight.report.panels import (
     NO_DEFLECTION,
     deflection_panel,
@@ -133,6 +133,8 @@ def _texts(run: Run) -> dict[str, Any]:
         "sensitivity": text.sensitivity_rows(again) if again is not None else None,
         "vehicle": [(k, text.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
         "settings": [(k, text.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
+        "assumed": stated_errors.assumed(run),
+        "measured": stated_errors.measured(run),
         "date": parse_utc(run.telemetry.t0_utc).strftime("%-d %B %Y"),
     }
 
