@@ -59,14 +59,15 @@ def locate(word: str) -> Path:
         ``run-incomplete``, ``run-unknown`` or ``run-missing``.
     """
     path = Path(word)
-    if path.parent.name == "runs" and path.is_dir():
+    is_flight = (path / "flight.toml").is_file() or (path / "runs").is_dir()
+    if path.is_dir() and path.absolute().parent.name == "runs" and not is_flight:
         if not is_complete(path):
             words = "is not complete: `postflight run` or `reconstruct` makes runs to compare"
             raise GateError(f"{path}: {words}", "run-incomplete")
         return path
     if path.is_dir():
         return find_run(path)
-    if path.parent.is_dir() and (path.parent / "flight.toml").is_file():
+    if (path.parent / "flight.toml").is_file() or (path.parent / "runs").is_dir():
         return find_run(path.parent, path.name)
     words = "no run: name a run's folder, a flight's, or FLIGHT/RUN with a run's name, such as my-flight/plain"
     raise GateError(f"{word}: {words}", "run-unknown")

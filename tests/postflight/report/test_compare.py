@@ -180,6 +180,13 @@ def test_every_word_that_means_no_run_is_named(flown, tmp_path, capsys, monkeypa
     assert "did you mean 'dense'?" in done.stderr
 
 
+def test_a_flight_in_a_folder_called_runs_is_a_flight(flown, tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "one").symlink_to(flown, target_is_directory=True)
+    assert compare.locate(str(tmp_path / "runs" / "one")).name == find_run(flown).name
+    assert compare.locate(str(find_run(flown, "plain"))) == find_run(flown, "plain")
+
+
 def test_only_an_earlier_comparison_is_replaced(flown, tmp_path, capsys, monkeypatch):
     run = runner(capsys, monkeypatch)
     words = ("compare", flown / "plain", flown / "dense", "--output")
