@@ -7,6 +7,7 @@ opened here. The tables themselves: `flightmodel.sensor_tables`.
 from __future__ import annotations
 
 import hashlib
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -82,6 +83,7 @@ from flightmodel.telemetry import (
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
 LEAST_SPAN_S = 1.0
+_SD = re.compile(r"(^|_)sd(_|$)")  # in a key: a standard deviation
 _BIAS_TIMES = 6.0  # no bias of a sound gyro is so large, one in a thousand million
 _TAKEN = {SitesSpec.name: "all radar sites together", "rest": "the rest on the pad"}  # names of sources in results
 Record = TypeVar("Record")
@@ -430,6 +432,7 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         events=tuple((e.name, e.t_s) for e in spec.events),
         findings=tuple(gate.findings),
         hashes=_hashes(gate, spec, found.vehicle, found.films),
+        assumed=assumed_errors(spec, found.radars),
         gnss=found.gnss,
         barometers=found.barometers,
         motion=_motion(spec.motion),
@@ -606,6 +609,45 @@ def _motion(entry: MotionEntry) -> Motion:
             UnmodelledSpan(d.from_s, d.to_s, d.sd_mps2, float(np.deg2rad(d.sd_degps))) for d in entry.disturbed
         ),
     )
+
+
+def assumed_errors(spec: FlightFile, radars: dict[str, RadarRecord]) -> dict[str, dict[str, float]]:
+    """Standard deviations that flight.toml does not state and that are taken from the defaults, by table and key.
+
+    Errors whose default is none at all are left out, and those that the table does not measure.
+    """
+    entries: dict[str, Section | None] = {f"gnss.{name}": entry for name, entry in spec.gnss.items()}
+    entries |= {f"barometers.{name}": entry for name, entry in spec.barometers.items()}
+    entries |= {f"sensors.{name}": getattr(spec.sensors, name) for name in type(spec.sensors).model_fields}
+    out = {table: _assumed_of(entry, set()) for table, entry in entries.items() if entry is not None}
+    for name, radar in spec.radars.items():
+        out[f"radars.{name}"] = _assumed_of(radar, _not_measured_or_in_the_table(radar, radars.get(name)))
+    prior = spec.attitude_prior
+    if prior is not None and "sd_deg" not in prior.model_fields_set:
+        out["attitude_prior"] = {"sd_deg": float(prior.sd_deg[0])}
+    return {table: keys for table, keys in out.items() if keys}
+
+
+def _assumed_of(entry: Section, known: set[str]) -> dict[str, float]:
+    stated = known | entry.model_fields_set
+    if isinstance(entry, GnssEntry) and not entry.velocity:
+        stated |= {"speed_sd_mps", "vertical_speed_sd_mps"}
+    defaults = {key: field.default for key, field in type(entry).model_fields.items() if _SD.search(key)}
+    return {key: float(sd) for key, sd in defaults.items() if key not in stated and isinstance(sd, float) and sd > 0.0}
+
+
+def _not_measured_or_in_the_table(radar: RadarEntry, record: RadarRecord | None) -> set[str]:
+    """Keys of readings that a radar does not have, or whose noise is stated apart or in each row."""
+    rows = None if record is None else record.sd
+    range_known, az_known, el_known, rate_known = (rows is not None and np.isfinite(rows[:, k]).all() for k in range(4))
+    measures, apart = set(radar.measures), radar.model_fields_set
+    out = {"range_sd_m", "range_bias_sd_m"} if "range" not in measures else set()
+    out |= {"range_sd_m"} if range_known else set()
+    out |= {"range_rate_sd_mps"} if "range_rate" not in measures or rate_known else set()
+    known = {"az": az_known or "azimuth_sd_deg" in apart, "el": el_known or "elevation_sd_deg" in apart}
+    if all(is_known for angle, is_known in known.items() if angle in measures):
+        out.add("angle_sd_deg")
+    return out | ({"angle_bias_sd_deg"} if not measures & {"az", "el"} else set())
 
 
 def _hashes(gate: Gate, spec: FlightFile, vehicle: Vehicle | None, films: dict[str, Frames]) -> dict[str, str]:

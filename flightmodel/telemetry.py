@@ -336,6 +336,7 @@ class Telemetry:
     sites: SitesSpec = field(default_factory=SitesSpec)
     places: tuple[KnownPlace, ...] = ()
     start: Start = Start()
+    assumed: dict[str, dict[str, float]] = field(default_factory=dict)  # sds that no file states, by table and key
 
     @property
     def frames(self) -> Frames | None:

@@ -199,6 +199,7 @@ class FiniteRange(click.FloatRange):
 
 def what_ifs(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that change a flight's assumptions or the reconstruction's settings."""
+    command = click.option("--name", "run_name", metavar="NAME", help="Of the run, to select it by.")(command)
     command = click.option(
         "--without", multiple=True, metavar="SOURCE", help="Leave this tracker out; repeat for several."
     )(command)
@@ -209,6 +210,14 @@ def what_ifs(command: Callable[..., None]) -> Callable[..., None]:
         metavar="NAME=VALUE",
         help="Change an assumption (c_n=1.1, mass_kg=158, wind=none) or setting (engine=filterpy); repeat for several.",
     )(command)
+
+
+def of_run(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the option that selects a run."""
+    words = (
+        "A run by its name, its eight digits or its folder; 'plain' for the last that is no what-if. Default: the last."
+    )
+    return click.option("--run", "wanted", metavar="RUN", help=words)(command)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -255,12 +264,17 @@ def simulate(arguments: tuple[str, ...], seed: int, force: bool) -> None:
 @click.option("--sensitivity", is_flag=True, help="Also rerun without each source, wind, and with other air and mass.")
 @what_ifs
 def reconstruct(
-    folder: Path, rate: float | None, sensitivity: bool, settings: tuple[str, ...], without: tuple[str, ...]
+    folder: Path,
+    rate: float | None,
+    sensitivity: bool,
+    settings: tuple[str, ...],
+    without: tuple[str, ...],
+    run_name: str | None,
 ) -> None:
     """Reconstruct the best-estimated trajectory of the flight in FOLDER."""
     from postflight import commands
 
-    commands.run(folder, (), commands.asked(settings, without, rate), sensitivity)
+    commands.run(folder, (), commands.asked(settings, without, rate, run_name), sensitivity)
 
 
 @cli.command()
@@ -317,12 +331,14 @@ def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> 
 @click.argument("folder", type=FOLDER)
 @click.option("--rate", type=FiniteRange(1.0, 200.0), help="Output rate, Hz; default: flight.toml's, or 20.")
 @what_ifs
-def run(folder: Path, rate: float | None, settings: tuple[str, ...], without: tuple[str, ...]) -> None:
+def run(
+    folder: Path, rate: float | None, settings: tuple[str, ...], without: tuple[str, ...], run_name: str | None
+) -> None:
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
     from postflight import commands
     from postflight.deflections import METHODS
 
-    commands.run(folder, METHODS, commands.asked(settings, without, rate))
+    commands.run(folder, METHODS, commands.asked(settings, without, rate, run_name))
 
 
 @cli.command()
@@ -340,11 +356,12 @@ def reconcile(folder: Path, hardening: bool, freeplay: bool, posterior: bool) ->
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-def score(folder: Path, as_json: bool) -> None:
-    """Compare the newest run of a synthetic flight with its truth; exit 5 where recovery fails."""
+@of_run
+def score(folder: Path, as_json: bool, wanted: str | None) -> None:
+    """Compare a run of a synthetic flight, the last complete one, with its truth; exit 5 where recovery fails."""
     from postflight import commands
 
-    commands.score(folder, as_json)
+    commands.score(folder, as_json, wanted)
 
 
 @cli.command()
@@ -357,17 +374,33 @@ def score(folder: Path, as_json: bool) -> None:
     type=click.Path(exists=True, path_type=Path),
     help="Folder of a Monte Carlo study or a reconciliation to hold the flight against.",
 )
-def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path, ...]) -> None:
-    """Write the report of the newest run of the flight in FOLDER: one HTML file that needs nothing else."""
+@of_run
+def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path, ...], wanted: str | None) -> None:
+    """Write the report of a run, the last complete one, of the flight in FOLDER: one HTML file, no network needed."""
     from postflight.report.notebook import write_notebook
     from postflight.report.write import write_report
+    from postflight.runs import find_run
 
     if notebook and bands:
         raise click.UsageError("--bands belongs to the report in HTML; leave out --notebook")
+    run = find_run(folder, wanted)
     if notebook:
-        write_out(f"report in {write_notebook(folder, target=output)}\n")
+        write_out(f"report in {write_notebook(folder, output, run)}\n")
     else:
-        write_out(f"report in {write_report(folder, target=output, studies=bands)}\n")
+        write_out(f"report in {write_report(folder, run, target=output, studies=bands)}\n")
+
+
+@cli.command()
+@click.argument("runs", nargs=-1, required=True, metavar="RUN RUN...")
+@click.option("--output", type=FOLDER, help="Folder to write; default: comparisons/RUN-and-RUN in the flight's.")
+def compare(runs: tuple[str, ...], output: Path | None) -> None:
+    """Set runs side by side, the others against the first: deflections, trajectory, checks, over each other on a page.
+
+    RUN is a run's folder, a flight's (its last complete run), or FLIGHT/NAME: my-flight/plain my-flight/more-lift.
+    """
+    from postflight.report import compare
+
+    compare.compare(runs, output)
 
 
 @cli.command()
@@ -409,11 +442,12 @@ def import_tables(files: tuple[Path, ...], folder: Path) -> None:
 @click.argument("folder", type=FOLDER)
 @click.option("--to", "form", required=True, type=NamedChoice(["csv", "parquet", "mat", "nc", "kml", "oem"]))
 @click.option("--out", type=FOLDER, help="File to write; default: exports/RUN.FORMAT in FOLDER.")
-def export(folder: Path, form: str, out: Path | None) -> None:
-    """Write the newest run's trajectory and deflections for another program."""
+@of_run
+def export(folder: Path, form: str, out: Path | None, wanted: str | None) -> None:
+    """Write trajectory and deflections of a run, the last complete one, for another program."""
     from postflight import exports
 
-    exports.export(folder, form, out)
+    exports.export(folder, form, out, wanted)
 
 
 @cli.command()

@@ -32,6 +32,7 @@ from postflight.plots.style import draw
 from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
+from postflight.runs import check_name, find_run
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import write_out
@@ -183,7 +184,7 @@ def run_flight(
     settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
     if flight.changes:
         settings["changes"] = list(flight.changes)
-    with run_folder.RunFolder(folder, flight.telemetry, settings) as out:
+    with run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read) as out:
         event_rows = run_folder.write_reconstruction(out, bet, answers)
         run_folder.write_answers(out, answers)
         out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
@@ -220,11 +221,12 @@ def _write_rest(
 
 @dataclass(frozen=True)
 class Asked:
-    """What a command line asks of a flight: changed assumptions and settings, sources left out, the output rate."""
+    """What a command line asks of a flight: changed assumptions and settings, sources left out, output rate, name."""
 
     changes: dict[str, Any] = field(default_factory=dict)
     without: tuple[str, ...] = ()
     rate_hz: float | None = None
+    name: str = ""
 
     def of(self, flight: Flight) -> Flight:
         """Return the flight as asked for; sources are left out beside those that flight.toml leaves out.
@@ -242,10 +244,17 @@ class Asked:
         return flight
 
 
-def asked(settings: tuple[str, ...], without: tuple[str, ...], rate_hz: float | None) -> Asked:
-    """Read ``--set NAME=VALUE`` (the value as TOML writes it), ``--without`` and ``--rate``; every fault at once."""
+def asked(
+    settings: tuple[str, ...], without: tuple[str, ...], rate_hz: float | None, run_name: str | None = None
+) -> Asked:
+    """Read ``--set NAME=VALUE`` (the value as TOML writes it) and the other options; every fault at once."""
     changes: dict[str, Any] = {}
-    faults = []
+    faults: list[Fault] = []
+    if run_name is not None:
+        try:
+            check_name(run_name)
+        except ConfigError as fault:
+            faults += fault.faults
     for text in settings:
         name, equals, value = (part.strip() for part in text.partition("="))
         if equals and name:
@@ -254,7 +263,7 @@ def asked(settings: tuple[str, ...], without: tuple[str, ...], rate_hz: float | 
             faults.append(Fault(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
     if faults:
         raise ConfigError(faults)
-    return Asked(changes, without, rate_hz)
+    return Asked(changes, without, rate_hz, run_name or "")
 
 
 def _toml_value(text: str) -> Any:
@@ -269,6 +278,8 @@ def _toml_value(text: str) -> Any:
 
 def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
     """Events, verdicts and findings."""
+    if flight.flight.changes:
+        console.print(f"[yellow]what-if[/] {escape('; '.join(flight.flight.changes))}")
     table = Table(title=f"Best-estimated trajectory of {escape(flight.telemetry.name)}")
     for name in ("event", "t s", "altitude km", "Mach", "q Pa", "alpha total deg"):
         table.add_column(name, justify="left" if name == "event" else "right")
@@ -393,7 +404,7 @@ def deflection(
                 raise
             trouble = Fault(str(fault), fault.codes[0])
         answers = estimate(bet or flight, methods, lambda f, what: report(0.6 + 0.3 * f, what))
-        with run_folder.RunFolder(folder, telemetry, settings) as out:
+        with run_folder.RunFolder(folder, telemetry, settings, as_read=flight.as_read) as out:
             run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 history = answers.histories["camera"]
@@ -427,9 +438,9 @@ def calibrate(corners: Path, size: str, lens: Lens) -> None:
     console.print(escape(found.toml()), highlight=False)
 
 
-def score(folder: Path, as_json: bool) -> None:
-    """Score the newest run; exit 5 where recovery fails."""
-    result = score_run(folder)
+def score(folder: Path, as_json: bool, wanted: str | None = None) -> None:
+    """Score a run (`find_run`); exit 5 where recovery fails."""
+    result = score_run(folder, None if wanted is None else find_run(folder, wanted))
     if as_json:
         write_out(json.dumps(result.as_json()) + "\n")
     else:

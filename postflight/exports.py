@@ -1,4 +1,4 @@
-"""How does a run leave for another program? `postflight export`: the newest run as one file in the program's format.
+"""How does a run leave for another program? `postflight export`: a run as one file in the program's format.
 
 =========  ==========================================================================================================
 csv        trajectory with UTC, deflections interpolated to its times
@@ -36,7 +36,8 @@ from rich import markup
 from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
 from flightmodel.config import parse_utc
 from flightmodel.guarded_files import file_bytes, open_file
-from postflight.run_folder import DIGITS, newest_run, read_csv
+from postflight.run_folder import DIGITS, read_csv
+from postflight.runs import find_run
 from postflight.terminal import terminal
 
 _UNITS = {
@@ -108,12 +109,18 @@ class Source:
     def title(self) -> str:
         """What the file is, in a line."""
         kind = "SYNTHETIC flight" if self.synthetic else "flight"
-        return f"Best-estimated trajectory and deflections of the {kind} {self.name}"
+        return f"Best-estimated trajectory and deflections of the {kind} {self.name}{self.what_if}"
+
+    @property
+    def what_if(self) -> str:
+        """Assumptions in which the run differs from its flight folder, to stand behind a title; empty for none."""
+        changes = self.header.get("changes")  # runs of before have none there
+        return f"; what-if: {'; '.join(changes)}" if changes else ""
 
 
-def read_source(folder: Path) -> Source:
-    """Read the newest run of a flight folder; `GateError` where there is none or its files are incomplete."""
-    run = newest_run(folder)
+def read_source(folder: Path, wanted: str | None = None) -> Source:
+    """Read a run (`find_run`); `GateError` where there is none or its files are incomplete."""
+    run = find_run(folder, wanted)
     try:
         header = json.loads(file_bytes(run / "bet_header.json"))
         facts = json.loads(file_bytes(run / "run.json"))
@@ -370,8 +377,8 @@ EXTRAS = {"pyarrow": "parquet"}  # library, and the extra of the installation th
 console = terminal()
 
 
-def export(folder: Path, form: str, out: Path | None) -> None:
-    """Write one file and say where.
+def export(folder: Path, form: str, out: Path | None, run: str | None = None) -> None:
+    """Write one file of a run (`find_run`) and say where.
 
     Raises
     ------
@@ -380,7 +387,7 @@ def export(folder: Path, form: str, out: Path | None) -> None:
     GateError
         Where the flight has no run with a trajectory.
     """
-    source = read_source(folder)
+    source = read_source(folder, run)
     write, suffix = FORMS[form]
     path = out or folder / "exports" / f"{source.run}{suffix}"
     if (folder / "runs").resolve() in path.resolve().parents:
@@ -396,5 +403,6 @@ def export(folder: Path, form: str, out: Path | None) -> None:
     with writing(path, "name another place with --out"):
         write_file(path, content)
     console.print(
-        f"{markup.escape(str(path))} ({len(content) / 1e6:.1f} MB) of run {markup.escape(source.run)}", highlight=False
+        f"{markup.escape(str(path))} ({len(content) / 1e6:.1f} MB) of run {markup.escape(source.run + source.what_if)}",
+        highlight=False,
     )

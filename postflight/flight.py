@@ -6,8 +6,9 @@ computed from that flight rests on it. Nothing here opens ``truth/``; only `post
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pandas as pd
 
 from flightmodel.checks import ConfigError, Fault, GateError, Progress, nearest_name
 from flightmodel.flightfolder import read_flight as read_telemetry
+from flightmodel.guarded_files import file_bytes
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, Sounding, Telemetry
 from flightmodel.vehicle import Vehicle
@@ -41,6 +43,8 @@ class Flight(Tabular):
         Where it was read from.
     changes : tuple of str
         What differs from the folder, one sentence a change (``"c_n = 1.1"``).
+    as_read : mapping of str to bytes
+        flight.toml and the vehicle's files as they were read; a run keeps them.
     """
 
     telemetry: Telemetry
@@ -48,6 +52,7 @@ class Flight(Tabular):
     camera_plane_lv_rad: float | None = None
     folder: Path | None = None
     changes: tuple[str, ...] = ()
+    as_read: Mapping[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Take the settings that the flight's file states where none are given."""
@@ -155,7 +160,23 @@ def read_flight(folder: str | Path, progress: Progress | None = None, needs_path
     report: Callable[[float], None] | None = None
     if progress is not None:
         report = lambda fraction: progress(fraction, "reading telemetry")  # noqa: E731
-    return Flight(read_telemetry(Path(folder), report, needs_path), folder=Path(folder))
+    telemetry = read_telemetry(Path(folder), report, needs_path)
+    return Flight(telemetry, folder=Path(folder), as_read=_as_read(Path(folder), telemetry))
+
+
+def _as_read(folder: Path, telemetry: Telemetry) -> dict[str, bytes]:
+    """Content of flight.toml and the vehicle's files; `GateError` where it is no longer what was read."""
+    places = {"flight.toml": (folder / "flight.toml", "flight.toml")}
+    vehicle = telemetry.vehicle
+    if vehicle is not None:
+        beside = vehicle.source.parent
+        places[f"vehicle/{vehicle.source.name}"] = vehicle.source, f"vehicle {vehicle.name}"
+        places |= {f"vehicle/{name}": (beside / name, f"vehicle's {name}") for name in vehicle.files}
+    out = {place: file_bytes(path) for place, (path, _) in places.items()}
+    for place, (path, digest) in places.items():
+        if hashlib.sha256(out[place]).hexdigest() != telemetry.hashes[digest]:
+            raise GateError(f"{path}: changed while the flight was read; try again", "inputs-changed")
+    return out
 
 
 def calm(sounding: Sounding) -> Sounding:

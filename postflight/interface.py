@@ -13,6 +13,7 @@ from flightmodel.checks import GateError, Progress
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import difference, resample
 from postflight.checks.folder_check import Report, check_folder
+from postflight.comparison import sd_bounds
 from postflight.deflections import Deflections
 from postflight.montecarlo import execution
 from postflight.montecarlo.bands import Merged, merge, write_merged
@@ -144,7 +145,7 @@ class Comparison(Tabular):
     names: tuple[str, str]
 
     def to_frame(self) -> pd.DataFrame:
-        """One row a quantity: ``quantity, unit, first, first_sd, second, second_sd, difference``."""
+        """One row a quantity: ``quantity, unit, first, first_sd, second, second_sd, difference``, bounds of its sd."""
         return self.table
 
     def _about(self) -> str:
@@ -164,7 +165,8 @@ def compare(first: Reconstruction | Deflections, second: Reconstruction | Deflec
     Comparison
         Peak dynamic pressure and its time, Mach number and total angle of attack there, largest differences of the
         trajectories over the pressure pulse, deflection by method, numbers of consistency checks that pass;
-        ``difference`` is second minus first. The two share their data: their sd says nothing of the difference.
+        ``difference`` is second minus first. The two share their data, so that their errors are correlated: the sd of
+        the difference lies between ``difference_sd_low`` and ``difference_sd_high`` for every correlation.
 
     Raises
     ------
@@ -178,6 +180,7 @@ def compare(first: Reconstruction | Deflections, second: Reconstruction | Deflec
     rows.append(("consistency checks passed", "", _passed(bets[0]), np.nan, _passed(bets[1]), np.nan))
     table = pd.DataFrame(rows, columns=["quantity", "unit", "first", "first_sd", "second", "second_sd"])
     table["difference"] = table["second"] - table["first"]
+    table["difference_sd_low"], table["difference_sd_high"] = sd_bounds(table["first_sd"], table["second_sd"])
     a, b = ("; ".join((bet.flight.name, *bet.flight.changes)) for bet in bets)
     return Comparison(table, (a, b))
 

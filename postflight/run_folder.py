@@ -1,7 +1,8 @@
-"""What does a run leave? Tables, headers and summary in ``runs/<utc>-<hash8>/``, complete or not there at all.
+"""What does a run leave? Tables, headers, summary in ``runs/<utc>-<hash8>[-<name>]/``, complete or not there at all.
 
 The hash covers inputs, settings and version, so equal runs carry equal hashes, and the same inputs give the same bytes
-in every file but ``run.json``, which alone holds times and machine.
+in every file but ``run.json``, which alone holds times and machine (and the report that shows the run's name).
+``inputs/`` keeps flight.toml and the vehicle file as they were read.
 
 ``bet_header.json`` states what the numbers of ``bet.csv`` refer to (epoch, frames, vehicle, atmosphere, sensors,
 settings, version); events and peaks are read from that table, residual statistics and covariances from the
@@ -16,18 +17,19 @@ import json
 import platform
 import re
 import shutil
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from flightmodel import events
-from flightmodel.checks import FloatArray, GateError, writing
+from flightmodel.checks import FloatArray, GateError, write_file, writing
 from flightmodel.deflection import mean_over
 from flightmodel.guarded_files import open_file
 from flightmodel.partial_files import abandoned, partial_path
@@ -40,6 +42,8 @@ from postflight.reconstruction import Reconstruction, bet_table
 DIGITS = "%.10g"
 _COPY = "copy the flight folder to where you may write"
 _ATTEMPTS = 100  # at the place that equal runs of other processes take in the same second
+FACTS = "run.json"
+INPUTS = "inputs"  # folder of flight.toml and the vehicle file as they were read
 _FORMAT = 1
 _SMOOTH_CAMERA = "camera_smooth"
 _COVARIANCE_RATE_HZ = 1.0
@@ -80,8 +84,18 @@ _EVENT_COLUMNS = {
 class RunFolder:
     """A run folder under construction: use as a context; it is renamed into place when the block ends well."""
 
-    def __init__(self, flight_folder: Path, telemetry: Telemetry, settings: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        flight_folder: Path,
+        telemetry: Telemetry,
+        settings: dict[str, Any],
+        name: str = "",
+        as_read: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:
+        """Take what identifies the run, the ``name`` it is given, and the files that it keeps as they were read."""
         self.hash8 = run_hash(telemetry.hashes, settings, version("postflight"))
+        self.name = name
+        self.as_read = as_read
         self.finished: datetime | None = None
         self.settings = settings
         self.telemetry = telemetry
@@ -96,6 +110,8 @@ class RunFolder:
                 shutil.rmtree(left, ignore_errors=True)  # refuses what is no folder, or a link to one
             self.path = partial_path(self.parent / "run")
             (self.path / "figures").mkdir(parents=True)
+            for place, content in self.as_read.items():
+                write_file(self.path / INPUTS / place, content)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, _: object) -> None:
@@ -114,6 +130,7 @@ class RunFolder:
         """Write ``run.json`` and return the run's time: at the end, or earlier for what reads it (the report)."""
         now = datetime.now(UTC)
         facts = {
+            **({"name": self.name} if self.name else {}),
             "finished_utc": now.isoformat(timespec="seconds"),
             "version": version("postflight"),
             "python": platform.python_version(),
@@ -121,13 +138,14 @@ class RunFolder:
             "settings": self.settings,
             "inputs_sha256": self.telemetry.hashes,
         }
-        self.write_json("run.json", facts)
+        self.write_json(FACTS, facts)
         self.finished = now
         return now
 
     def _finish(self) -> None:
         now = self.finished or self.write_facts()
-        final = self.parent / f"{now.strftime('%Y%m%dT%H%M%SZ')}-{self.hash8}"
+        label = f"-{self.name}" if self.name else ""
+        final = self.parent / f"{now.strftime('%Y%m%dT%H%M%SZ')}-{self.hash8}{label}"
         for _ in range(_ATTEMPTS):
             shutil.rmtree(final, ignore_errors=True)
             try:
@@ -184,15 +202,6 @@ def _no_nan(value: Any) -> Any:
     if isinstance(value, float):
         return value if np.isfinite(value) else None
     return value
-
-
-def newest_run(flight_folder: Path) -> Path:
-    """Return the newest run that has a summary; `GateError` where there is none."""
-    finished = (flight_folder / "runs").glob("*/summary.json")
-    runs = sorted(path.parent for path in finished if not path.parent.name.startswith("."))
-    if not runs:
-        raise GateError(f"{flight_folder}: no finished run; use `postflight run {flight_folder}` first", "run-missing")
-    return runs[-1]
 
 
 def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any]]:
@@ -325,6 +334,7 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
     return {
         "flight": flight.telemetry.name,
         "synthetic": flight.telemetry.synthetic,
+        "changes": list(flight.flight.changes),
         "peak_dynamic_pressure_pa": float(at_peak["dynamic_pressure_pa"]),
         "peak_dynamic_pressure_s": float(flight.peak_s),
         "alpha_total_wind_deg": alpha[0] if flight.has_attitude else None,
@@ -353,6 +363,7 @@ def header(flight: Reconstruction) -> dict[str, Any]:
         "postflight": version("postflight"),
         "flight": telemetry.name,
         "synthetic": telemetry.synthetic,
+        "changes": list(flight.flight.changes),
         "epoch_utc": telemetry.t0_utc,
         "start_s": bet.provenance["start_s"],
         "end_s": bet.provenance["end_s"],
@@ -363,6 +374,7 @@ def header(flight: Reconstruction) -> dict[str, Any]:
         "vehicle": _vehicle(flight),
         "atmosphere": _atmosphere(flight),
         "sensors": _sensors(flight),
+        "assumed": telemetry.assumed,
         "settings": settings,
         "inputs_sha256": telemetry.hashes,
         "missing": list(flight.missing),

@@ -14,27 +14,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from flightmodel import rotations
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.events import find_peak
 from flightmodel.guarded_files import file_bytes
 from flightmodel.tabular import Tabular
-from flightmodel.trajectory import Trajectory, difference, resample
-from postflight.run_folder import answer_table, newest_run, read_csv
+from flightmodel.trajectory import difference, resample
+from postflight.run_folder import answer_table, read_csv
+from postflight.runs import STATE_COLUMNS, deflection_history, find_run, trajectory_of
 
 # what the demo flight with nominal instrument errors must reach: four of the rms errors at peak pressure over many days
 # (0.14 deg by each method, 0.115 deg fused without video; docs/deflection.md, docs/camera.md)
 DEFLECTION_LIMIT_DEG = {"camera": 0.56, "misalignment": 0.56, "trim": 0.56, "fused": 0.46}
 BET_LIMITS = {"position_rms_m": 30.0, "velocity_rms_mps": 0.5, "alpha_total_rms_deg": 0.5}
-_STATE_COLUMNS = (
-    "t_s",
-    *(f"r{a}_ecef_m" for a in "xyz"),
-    *(f"v{a}_ecef_mps" for a in "xyz"),
-    *(f"q{a}_ecef_body" for a in "wxyz"),
-    *(f"{a}_body_degps" for a in "pqr"),
-)
 PAPER_DEG = {"camera": 4.2, "misalignment": 3.5, "trim": 3.75}
 
 
@@ -77,8 +70,8 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     truth_folder = flight_folder / "truth"
     if not (truth_folder / "truth.csv").is_file():
         raise GateError(f"{flight_folder}: no truth/truth.csv to score against", "truth-missing")
-    run = run or newest_run(flight_folder)
-    truth = _read(truth_folder / "truth.csv", (*_STATE_COLUMNS, "dynamic_pressure_pa", "alpha_body_deg"))
+    run = run or find_run(flight_folder)
+    truth = _read(truth_folder / "truth.csv", (*STATE_COLUMNS, "dynamic_pressure_pa", "alpha_body_deg"))
     deflection = _read(truth_folder / "deflection.csv", ("t_s", "theta_deg"))
     peak_s, _ = find_peak(truth["t_s"].to_numpy(), truth["dynamic_pressure_pa"].to_numpy())
     true_deg = float(np.interp(peak_s, deflection["t_s"], deflection["theta_deg"]))
@@ -95,7 +88,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
         elif row["deflection_deg"] is not None and not abs(row["error_deg"]) <= DEFLECTION_LIMIT_DEG[method]:
             words = f"{method}: error {row['error_deg']:+.2f} deg beyond {DEFLECTION_LIMIT_DEG[method]} deg"
             failures.append(Fault(words, "deflection-error"))
-    bet = _bet_errors(_read(run / "bet.csv", (*_STATE_COLUMNS, "alpha_total_wind_deg")), truth)
+    bet = _bet_errors(_read(run / "bet.csv", (*STATE_COLUMNS, "alpha_total_wind_deg")), truth)
     failures += [
         Fault(f"BET {name}: {bet[name]:.3f} beyond {limit}", "trajectory-error")
         for name, limit in BET_LIMITS.items()
@@ -117,12 +110,7 @@ def _read(path: Path, columns: tuple[str, ...]) -> pd.DataFrame:
 
 def _history(path: Path) -> DeflectionHistory:
     """Read a ``deflection_<method>.csv`` back."""
-    names = ("theta_deg", "plane_lv_deg", "theta_sd_deg")
-    table = _read(path, ("t_s", *names))
-    theta, plane, sd = (np.deg2rad(table[c].to_numpy(dtype=float)) for c in names)
-    cov = np.zeros((len(table), 2, 2))
-    cov[:, 0, 0] = sd**2
-    return DeflectionHistory(table["t_s"].to_numpy(dtype=float), theta, plane, cov, path.stem)
+    return deflection_history(_read(path, ("t_s", "theta_deg", "plane_lv_deg", "theta_sd_deg")), path.stem)
 
 
 def _method_row(path: Path, at_s: float, true_deg: float) -> dict[str, Any]:
@@ -135,28 +123,10 @@ def _method_row(path: Path, at_s: float, true_deg: float) -> dict[str, Any]:
     return row
 
 
-def _trajectory(table: pd.DataFrame, epoch_utc: str = "2000-01-01T00:00:00Z") -> Trajectory:
-    """Trajectory from the columns that ``truth.csv`` and ``bet.csv`` share."""
-
-    def columns(pattern: str, letters: str) -> FloatArray:
-        return table[[pattern.format(a) for a in letters]].to_numpy(dtype=float)
-
-    q = columns("q{}_ecef_body", "wxyz")
-    return Trajectory(
-        epoch_utc,
-        table["t_s"].to_numpy(dtype=float),
-        "datum",
-        columns("r{}_ecef_m", "xyz"),
-        columns("v{}_ecef_mps", "xyz"),
-        rotations.continuous(q / np.linalg.norm(q, axis=1, keepdims=True)),
-        np.deg2rad(columns("{}_body_degps", "pqr")),
-    )
-
-
 def _bet_errors(bet: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:
     """Root-mean-square errors over the pressure pulse."""
     bet = bet[(bet["t_s"] >= truth["t_s"].iloc[0]) & (bet["t_s"] <= truth["t_s"].iloc[-1])]
-    estimate, true = _trajectory(bet), _trajectory(truth)
+    estimate, true = trajectory_of(bet), trajectory_of(truth)
     error = difference(estimate, resample(true, estimate.time_s))
 
     def along(column: str) -> FloatArray:

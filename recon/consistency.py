@@ -112,11 +112,12 @@ def consistency_check(
 
 
 def nis_check(
-    source: str, nis: FloatArray, components: int, confidence: float, allowance: bool = False
+    source: str, nis: FloatArray, components: int, confidence: float, allowance: bool = False, measured: str = ""
 ) -> ConsistencyCheck:
     """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all.
 
-    With an ``allowance`` for noise, not its size, residuals may be as small as they like.
+    With an ``allowance`` for noise, not its size, residuals may be as small as they like; else ``measured`` says what
+    noise they have, for the data sheet.
     """
     from scipy.stats import chi2
 
@@ -125,7 +126,7 @@ def nis_check(
     low = 0.0 if allowance else low
     mean = float(np.mean(nis))
     size, advice = (
-        ("smaller", "the assumed noise is too large")
+        ("smaller", f"the assumed noise is too large{f'; measured: {measured}' if measured else ''}")
         if mean < low
         else ("larger", "noise is larger than assumed or an error is not modelled")
     )
@@ -235,7 +236,8 @@ def source_checks(problem: Problem, innovations: Innovations, confidence: float)
         checks = []
         if use.sum() >= 10:
             components, still = int(measured[use].sum()), instrument.name == REST
-            checks.append(nis_check(instrument.name, innovations.nis[use], components, confidence, still))
+            noise = "" if still else _measured_noise(normalised[use], measured[use], instrument.components)
+            checks.append(nis_check(instrument.name, innovations.nis[use], components, confidence, still, noise))
             for i, component in enumerate(instrument.components):
                 rows = use & measured[:, i]
                 if rows.sum() >= 10 and not still:
@@ -243,6 +245,15 @@ def source_checks(problem: Problem, innovations: Innovations, confidence: float)
         checks.append(edit_check(instrument.name, innovations.accepted[mine]))
         out += [replace(v, source=instrument.owner) for v in checks]
     return out
+
+
+def _measured_noise(normalised: FloatArray, measured: BoolArray, components: tuple[str, ...]) -> str:
+    """Noise of each component as a share of the stated one, in words: rms of normalised innovations (n, c).
+
+    That is exact where noise is most of an innovation, and where the state's uncertainty goes with the noise.
+    """
+    there = [(name, normalised[measured[:, i], i]) for i, name in enumerate(components) if measured[:, i].any()]
+    return ", ".join(f"{name} {np.sqrt(np.mean(z**2)):.2g}" for name, z in there) + " times the stated"
 
 
 def filter_against_smoother(

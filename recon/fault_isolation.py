@@ -131,7 +131,12 @@ class FaultHypothesis(Fault):
 
 def is_about(check: ConsistencyCheck, source: str) -> bool:
     """Whether a check judges this tracker: its residuals, its edits or its a priori errors."""
-    return check.code in _ABOUT_SOURCES and check.source == source
+    return check.code in _ABOUT_SOURCES and check.source == source and not is_generous(check)
+
+
+def is_generous(check: ConsistencyCheck) -> bool:
+    """Whether residuals are smaller than predicted: the stated noise is too large, and no sensor is at fault."""
+    return check.code == "nis" and check.value < check.low
 
 
 def any_tracker_fails(checks: tuple[ConsistencyCheck, ...], sources: tuple[str, ...]) -> bool:
@@ -354,6 +359,7 @@ def isolate_faults(checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut
     rest = [("attitude", v) for v in failed if v.code.startswith("attitude-")]
     rest += [("air", v) for v in failed if v.code in _AIR_CODES]
     rest += [("error-model", v) for v in failed if v.code == "physical-range"]
+    rest += [("stated-noise", v) for v in failed if is_generous(v)]
     sentences = {FaultHypothesis(f"{what}: {v.remark}", what, (v.source,)): None for what, v in rest}
     return (*out, *sentences)
 
@@ -394,6 +400,7 @@ def _tracker_hypothesis(
 def _single_tracker_hypothesis(failed: list[ConsistencyCheck]) -> list[FaultHypothesis]:
     """What can be concluded where no tracker could be left out."""
     about = [v for v in failed if v.code in _ABOUT_SOURCES and not (v.code == "data-sheet" and v.source in _INERTIAL)]
+    about = [v for v in about if not is_generous(v)]
     if not about:
         return []
     what = f"tracker or motion ({_symptoms(about)}): with one tracker alone the two cannot be separated"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from rich.table import Table
 from flightmodel import earth
 from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.config import FILL_IN, read_toml
-from flightmodel.flightfolder import Sources, read_sources
+from flightmodel.flightfolder import Sources, assumed_errors, read_sources
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
@@ -64,6 +64,7 @@ class Report(Tabular):
     findings: list[Finding] = field(default_factory=list)
     cross_checks: list[Finding] = field(default_factory=list)
     time_biases: list[TimeBias] = field(default_factory=list)
+    assumed: dict[str, dict[str, float]] = field(default_factory=dict)
     fill_in: list[str] = field(default_factory=list)
     refused: list[Fault] = field(default_factory=list)
     exit_code: int = 0
@@ -95,6 +96,7 @@ class Report(Tabular):
             "cross_checks": _rows(self.cross_checks),
             "oddities": _rows(self.cross_checks),  # the former name, until the next release
             "clocks": _rows(self.time_biases),
+            "assumed": self.assumed,
             "fill_in": self.fill_in,
             "refused": self.refused,
             "refused_codes": [fault.code for fault in self.refused],
@@ -128,15 +130,39 @@ def check_folder(folder: Path) -> Report:
         found = read_sources(folder)
     except GateError as fault:
         _refuse(report, folder, [*fault.faults, *_vehicle_faults(folder)], fault.exit_code)
+        report.findings = _not_used(folder)
         return report
     gate = found.gate
     if gate.config or gate.faults:
         _refuse(report, folder, [*gate.config, *gate.faults], 3 if gate.faults else 2)
     report.facts = _facts(found)
-    report.findings = sorted(gate.findings, key=lambda f: (f.source, np.nan_to_num(f.start_s, nan=-np.inf)))
+    report.assumed = assumed_errors(found.spec, found.radars)
+    report.findings = _not_used(folder) + sorted(
+        gate.findings, key=lambda f: (f.source, np.nan_to_num(f.start_s, nan=-np.inf))
+    )
     with np.errstate(invalid="ignore"):
         _cross_check(found, report)
     return report
+
+
+def _not_used(folder: Path) -> list[Finding]:
+    """Tables below ``telemetry/`` that flight.toml does not name: delivered, imported perhaps, and read by nobody."""
+    try:
+        named = set(_texts(read_toml(folder / "flight.toml")))
+    except GateError:
+        return []
+    there = sorted(path.relative_to(folder).as_posix() for path in (folder / "telemetry").glob("*.csv"))
+    words = "no table of flight.toml reads it; declare its columns there, or remove it"
+    return [Finding(name, words, np.nan, np.nan, "file-not-used") for name in there if name not in named]
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Every text in the tables of a TOML file."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _texts(inner)
 
 
 def _vehicle_faults(folder: Path) -> list[Fault]:
@@ -296,6 +322,9 @@ def print_report(report: Report) -> None:
         _line("[red]suspicious[/]", str(remark), remark.code)
     for bias in report.time_biases:
         _line("time bias", f"{bias.source}: {bias.late_s:+.3f} +/- {bias.sd_s:.3f} s against {bias.against}")
+    for section, sizes in report.assumed.items():
+        keys = ", ".join(f"{key} = {size:g}" for key, size in sizes.items())
+        _line("[yellow]assumed[/]", f"[{section}] {keys}: not stated in flight.toml", "default-assumed")
     for words in report.fill_in:
         _line("[cyan]to fill in[/]", words, "placeholder")
     for fault in report.refused:

@@ -286,7 +286,7 @@ class Recogniser:
 
         Three-axis sensors first, whose columns come in threes; then radar, receiver, barometer, sounding.
         """
-        if self._is_sounding():
+        if self.is_sounding():
             self.time = None
             found = self._sounding()
         elif self.time is None:
@@ -520,11 +520,26 @@ class Recogniser:
             found |= {q: m for q in tables.ATMOSPHERE if q.short in _AIR_BY_COMPONENTS and (m := self._single(q))}
         return found
 
-    def _is_sounding(self) -> bool:
-        """Whether height, temperature and wind's direction or density are there, and nothing of a tracker."""
+    def is_sounding(self) -> bool:
+        """Whether height, temperature and wind's direction or density are there, and nothing of a tracker.
+
+        A balloon's table has times, latitudes and longitudes too: with pressure, temperature and wind all there it is
+        a sounding and nothing else.
+        """
+        wind = self._certain("wind_from") or all(self._certain(short) for short in _AIR_BY_COMPONENTS)
+        if wind and self._certain("pressure") and self._certain("temperature"):
+            return True
         tracker = all(self.columns_of(s) for s in ("lat", "lon")) or all(self.columns_of(q.short) for q in tables.RADAR)
         air = all(self.columns_of(s) for s in ("alt", "temperature"))
         return air and not tracker and bool(self.columns_of("wind_from") or self.columns_of("rho"))
+
+    def _certain(self, short: str) -> bool:
+        """Whether a column is named for a quantity in a word, or by a letter with a unit of it."""
+        kind = next(q.kind for q in tables.ATMOSPHERE if q.short == short)
+        return any(
+            kind in self.named[k].kinds or (not self.named[k].kinds and max(map(len, self.named[k].tokens)) > 1)
+            for k in self.columns_of(short)
+        )
 
     def _sounding(self) -> list[SourceProposal]:
         """Columns of a table by altitude, as they are; `postflight.intake.deliveries` derives densities before."""

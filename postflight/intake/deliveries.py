@@ -20,6 +20,7 @@ import io
 import json
 import re
 import shutil
+import sys
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -54,21 +55,26 @@ from postflight.intake.column_recognition import (
     find_time,
 )
 from postflight.intake.flight_form import placeholders, section_text, start_text, template
-from postflight.intake.freeform_tables import FreeFormTable, read_matlab, read_text_table
+from postflight.intake.freeform_tables import FreeFormTable
 from postflight.intake.headers import fold, parse_column_name
+from postflight.intake.stored_tables import read_tables
 from postflight.terminal import terminal
 
 _WIND_AXES = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:])
 _DAVEML = (".dml",)
-_MATLAB = (".mat",)
-_TABLES = (".csv", ".tsv", ".dat", ".asc", ".tab", *_MATLAB)  # what is named so and holds no table is refused
+_TABLES = (  # what is named so and holds no table is refused
+    ".csv", ".tsv", ".dat", ".asc", ".tab", ".mat", ".xlsx", ".xlsm", ".xls", ".parquet", ".nc", ".cdf", ".h5", ".hdf5",
+)  # fmt: skip
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _FILMS = (".webm", ".mp4", ".avi")
 _FRAME_TOKENS = {"frame", "frames", "frameno", "picture", "image", "bild"}
 _BELONG = 0.9  # of a list's names, in the folder that it is of
-_RADIOSONDE = {"alt", "temperature", "pressure", "wind_speed", "wind_from"}
+_RADIOSONDE = {"alt", "temperature", "pressure"}
+_BY_DIRECTION, _BY_COMPONENTS = {"wind_speed", "wind_from"}, {"wind_north", "wind_east"}
+_GEOMETRIC = {"gps", "gnss", "geometric", "ell", "ellipsoid", "hae"}  # in the name of a height
 _ZERO_C_K = 273.15
 _LOWEST_M, _HIGHEST_M = -1000.0, 2e5
+EXIT_NOT_ALL_USED = 3
 console = terminal()
 
 
@@ -158,9 +164,13 @@ def radiosonde_table(table: FreeFormTable) -> FreeFormTable | None:
     A table that has densities is none: its columns are declared as they are.
     """
     recogniser = Recogniser(table)
-    found = {q.short: m for q, m in recogniser.air_columns().items()}
-    if "rho" in found or not set(found) >= _RADIOSONDE or any(not m.unit for m in found.values()):
+    if not recogniser.is_sounding():
         return None
+    found = {q.short: m for q, m in recogniser.air_columns().items()}
+    if "rho" in found or _missing_of_a_radiosonde(found):
+        return None
+    height_name = column_names(table)[table.names.index(found["alt"].column)]
+    is_geometric = bool(_GEOMETRIC & set(height_name.tokens))
     c = {short: to_si(table.numbers(table.names.index(m.column)), m.unit) for short, m in found.items()}
     dew = _dew_point(recogniser)
     height, p = c["alt"], c["pressure"]
@@ -170,9 +180,12 @@ def radiosonde_table(table: FreeFormTable) -> FreeFormTable | None:
     up = -np.log(np.where(whole, p, 1.0))
     temperature, filled_t = _between(up, c["temperature"], whole)
     dew_k = _between(up, dew, whole)[0] if dew is not None else np.full(len(p), np.nan)
-    flow = c["wind_speed"][:, None] * np.column_stack([np.cos(c["wind_from"]), np.sin(c["wind_from"])])
+    if set(c) >= _BY_DIRECTION:
+        flow = c["wind_speed"][:, None] * np.column_stack([np.cos(c["wind_from"]), np.sin(c["wind_from"])])
+    else:  # components are of where the air goes
+        flow = -np.column_stack([c["wind_north"], c["wind_east"]])
     (north, filled_wind), (east, _) = (_between(height, component, whole) for component in flow.T)
-    geometric = EARTH_RADIUS_US76_M * height / (EARTH_RADIUS_US76_M - height)
+    geometric = height if is_geometric else EARTH_RADIUS_US76_M * height / (EARTH_RADIUS_US76_M - height)
     from_deg = np.mod(np.rad2deg(np.arctan2(east, north)), 360.0)
     density = _moist_density(p, temperature, dew_k)
     columns = np.column_stack([geometric, density, temperature, p, np.hypot(north, east), from_deg])
@@ -188,11 +201,21 @@ def radiosonde_table(table: FreeFormTable) -> FreeFormTable | None:
         "neighbours",
         f"{len(height) - len(rows)} levels left out: no height or pressure, or beyond the first or last that has both",
         "density by gas law" + (" with the dew point's vapour" if dew is not None else ", as of dry air"),
-        "geopotential heights became geometric ones",
+        f"heights '{height_name.name}' are geometric" if is_geometric else "geopotential heights became geometric ones",
     ]
     names = ["alt_m", "rho_kgpm3", "t_k", "p_pa", "wind_speed_mps", "wind_from_deg"]
     cells = [[f"{v:.8g}" for v in row] for row in columns[rows]]
     return FreeFormTable(table.label, names, [""] * len(names), cells, notes)
+
+
+def _missing_of_a_radiosonde(found: dict[str, ColumnProposal]) -> str:
+    """What of a radiosonde has no column or no known unit, in words; empty where nothing is missing."""
+    known = {short for short, column in found.items() if column.unit}
+    without = [f"the unit of '{column.column}'" for column in found.values() if not column.unit]
+    without += [f"a column of {short}" for short in sorted(_RADIOSONDE - set(found))]
+    if not (known >= _BY_DIRECTION or known >= _BY_COMPONENTS) and not without:
+        without.append("the wind's speed")
+    return " and ".join(without)
 
 
 def _moist_density(pressure_pa: FloatArray, temperature_k: FloatArray, dew_point_k: FloatArray) -> FloatArray:
@@ -402,7 +425,9 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
     ConfigError
         ``flight-file-missing``, or ``file-exists`` where one would be overwritten.
     GateError
-        Every table file in which no table is found, with the codes of `postflight.intake.freeform_tables`.
+        Every table file in which no table is found, with the codes of `postflight.intake.stored_tables`.
+
+    Leaves with `EXIT_NOT_ALL_USED` where something delivered is not used, which is named.
     """
     path = folder / "flight.toml"
     if not path.exists():
@@ -417,7 +442,7 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
     if there:
         words = "exists already, and nothing is overwritten; rename the new one, or remove it there"
         raise ConfigError([f"{p}: {words}" for p in there], code="file-exists")
-    added, shown = _proposals(came, places, folder, tables)
+    added, shown, unused = _proposals(came, places, folder, tables)
     text = path.read_text(encoding="utf-8-sig").rstrip() + "\n" + added
     tomllib.loads(text)  # what is written can be read
     for video in came.videos:
@@ -433,9 +458,11 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
         console.print(f"{escape(str(video.place))}: {what}", highlight=False)
     for words in came.notes:
         console.print(escape(words), highlight=False)
-    for fault in came.skipped:
+    for fault in (*came.skipped, *unused):
         console.print(f"[yellow]left out[/] {escape(f'{fault} [{fault.code}]')}", highlight=False)
     _print_placeholders(folder)
+    if came.skipped or unused:
+        sys.exit(EXIT_NOT_ALL_USED)
 
 
 def _print_placeholders(folder: Path) -> None:
@@ -455,6 +482,7 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
     """Sort and read what was delivered; `GateError` with every table that cannot be read."""
     came = _Delivery()
     faults: list[str] = []
+    lacking: list[str] = []  # libraries that are not installed
     for file in files:
         video = _video_of(file, folder / "telemetry")
         if video is not None:
@@ -470,16 +498,18 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
             came.skipped.append(Fault(words, "nothing-to-import"))
         else:
             try:
-                came.tables += read_matlab(file) if file.suffix.lower() in _MATLAB else [read_text_table(file)]
-            except ConfigError:
-                raise
+                came.tables += read_tables(file)
+            except ConfigError as fault:
+                lacking += fault.faults
             except GateError as fault:
                 if file.suffix.lower() in _TABLES or not file.is_file():
                     faults += fault.faults
                 else:
                     came.skipped += fault.faults
     if faults:
-        raise GateError(faults)
+        raise GateError([*faults, *lacking])
+    if lacking:
+        raise ConfigError(lacking)
     if not (came.tables or came.videos or came.daveml):
         raise GateError(came.skipped, code="nothing-to-import")
     came.tables = [radiosonde_table(table) or table for table in came.tables]
@@ -547,10 +577,10 @@ def _place(folder: Path, table: FreeFormTable) -> Path:
 
 def _proposals(
     came: _Delivery, places: list[Path], folder: Path, tables: dict[str, Any]
-) -> tuple[str, list[tuple[FreeFormTable, list[SourceProposal], list[str]]]]:
-    """Text to add to flight.toml, and what to print."""
+) -> tuple[str, list[tuple[FreeFormTable, list[SourceProposal], list[str]]], list[Fault]]:
+    """Text to add to flight.toml, what to print, and what of the tables is not used, with why."""
     taken = _sections(tables)
-    added, shown, unrecognised = [], [], []
+    added, shown, unrecognised, unused_tables = [], [], [], []
     videos = [*came.videos, *_earlier_videos(folder)]
     cameras = _cameras_of(folder, tables)
     for table, place in zip(came.tables, places, strict=True):
@@ -561,15 +591,30 @@ def _proposals(
         if frames is None and recogniser.may_be_inertial():
             unrecognised.append(table.label)
         shown.append((table, found, unused))
+        file = place.relative_to(folder).as_posix()
+        if not found:
+            unused_tables.append(_not_recognised(table, file))
         for source in found:
-            file = place.relative_to(folder).as_posix()
+            if source.section in taken:
+                words = f"{file}: flight.toml has a [{source.section}] already; this one stands there as a comment"
+                unused_tables.append(Fault(words, "second-of-its-kind"))
             added.append(section_text(source, file, table.notes, source.section in taken))
             taken.add(source.section)
     listed = "".join(added)
     added += [_without_list(v, folder) for v in came.videos if v.place.relative_to(folder).as_posix() not in listed]
     start = start_text(taken, tables, unrecognised)
     rest = "" if "start" in tables else _rest_text(shown)
-    return "".join(f"\n{text}" for text in (*added, start, rest) if text), shown
+    return "".join(f"\n{text}" for text in (*added, start, rest) if text), shown, unused_tables
+
+
+def _not_recognised(table: FreeFormTable, file: str) -> Fault:
+    recogniser = Recogniser(table)
+    if recogniser.is_sounding():
+        without = _missing_of_a_radiosonde({q.short: m for q, m in recogniser.air_columns().items()}) or "three levels"
+        words = f"{file}: a sounding, in which {without} is missing; write it into the names of the columns"
+        return Fault(words, "sounding-incomplete")
+    words = f"{file}: nothing recognised among {', '.join(table.names)}; declare its columns in flight.toml"
+    return Fault(words, "not-recognised")
 
 
 def _rest_text(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> str:
@@ -637,8 +682,5 @@ def _print_proposals(shown: list[tuple[FreeFormTable, list[SourceProposal], list
                 screen.add_row(*map(escape, (m.column, f"{source.section} {m.short}", unit, m.how, m.why)))
         if found:
             console.print(screen)
-        else:
-            words = f"{table.label}: nothing recognised among {', '.join(table.names)}"
-            console.print(f"[yellow]{escape(words)}[/]; its columns can be declared in flight.toml by hand")
         for words in (*table.notes, *([f"not used: {', '.join(unused)}"] if unused and found else [])):
             console.print(f"  {escape(words)}", highlight=False)

@@ -1,10 +1,8 @@
-"""How is a table read that somebody else wrote? Text in any layout, and vectors in MATLAB files.
+"""How is a text table read that somebody else wrote? In any layout.
 
-Text: any delimiter, comments, a preface, a row of units, decimal commas, old encodings, columns between dashed rules.
-The table is where most columns stand: names, then three rows of numbers of the same count. MATLAB: version 5 to 7 by
-scipy, 7.3 (HDF5) by h5py where it is installed; vectors of one length beside each other (at the top, or in one
-structure) are a table, a matrix with as many rows gives a column for each of its own. Only numbers are read, no
-objects.
+Any delimiter, comments, a preface, a row of units, decimal commas, old encodings, columns between dashed rules. The
+table is where most columns stand: names, then three rows of numbers of the same count. Files of programs (spreadsheets,
+MATLAB, NetCDF, Parquet): `postflight.intake.stored_tables`.
 
 Nothing is dropped or changed without a note. What comes out are text cells that `flightmodel.tables.read_table` reads
 once they are written as plain CSV.
@@ -15,16 +13,14 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from flightmodel.checks import ConfigError, FloatArray, GateError
-from flightmodel.guarded_files import UnfitFile, file_bytes, open_file
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.guarded_files import UnfitFile, file_bytes
 from postflight.intake.headers import SEVERAL_MEANINGS, UNIT_SPELLINGS, unit_key
 
 _LARGEST = 1e100  # what is beyond is a broken word
@@ -35,8 +31,7 @@ _COMMA_NUMBER = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
 _CLOCK = re.compile(r"^(\d{1,3}[:/])?\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?$|^\d{4}-\d{2}-\d{2}[T ]")
 _DELIMITERS = ("\t", ";", ",", "|", None)  # None: runs of spaces
 _MISSING = {"", "nan", "na", "n/a", "null", "-", "--", "---", "none"}
-_MOST_NUMBERS = 200_000_000  # of a MATLAB file
-_LEAST_ROWS = 3
+LEAST_ROWS = 3
 
 
 @dataclass
@@ -105,15 +100,37 @@ def read_text_table(path: Path) -> FreeFormTable:
     except UnfitFile as fault:
         raise GateError(f"{path}: {fault.strerror}", fault.code) from None
     text, notes = _decoded(path, raw)
-    lines = [line for line in text.splitlines() if line.strip()]
-    ruled = _ruled(path, lines)
+    table = table_of_lines([line for line in text.splitlines() if line.strip()], path.stem, str(path), notes)
+    plain = not table.notes and all(len(r) == len(table.names) for r in table.rows)
+    return replace(table, raw=raw) if plain else table
+
+
+def table_of_lines(lines: list[str], label: str, where: str, notes: list[str]) -> FreeFormTable:
+    """Find the table in lines of text, none of them empty.
+
+    Parameters
+    ----------
+    lines : list of str
+    label : str
+        Of the table.
+    where : str
+        What a refusal names.
+    notes : list of str
+        What was changed already.
+
+    Raises
+    ------
+    GateError
+        ``table-missing`` where no names above three rows of numbers are found.
+    """
+    ruled = _ruled(label, lines)
     if ruled is not None:
         ruled.notes[:0] = notes
         return ruled
     found = _layout(lines[:_HEAD_LINES])
     if found is None:
         words = "no table found: a line of names, three rows of numbers below it and one delimiter are wanted"
-        raise GateError(f"{path}: {words}", code="table-missing")
+        raise GateError(f"{where}: {words}", code="table-missing")
     delimiter, first, header, unit_row = found
     names = [n.strip() for n in header]
     units = [u.strip() for u in unit_row] if unit_row else [""] * len(names)
@@ -132,11 +149,10 @@ def read_text_table(path: Path) -> FreeFormTable:
         if not name or names.index(name) != k:
             names[k] = f"{name or 'column'}_{k + 1}"
             notes.append(f"column {k + 1} was named '{name}' like another: now '{names[k]}'")
-    plain = not notes and all(len(r) == len(names) for r in rows)
-    return FreeFormTable(path.stem, names, units, rows, notes, raw if plain else None)
+    return FreeFormTable(label, names, units, rows, notes)
 
 
-def _ruled(path: Path, lines: list[str]) -> FreeFormTable | None:
+def _ruled(label: str, lines: list[str]) -> FreeFormTable | None:
     """Read a table of right-aligned columns between dashed rules (as the University of Wyoming lists soundings).
 
     Empty cells are blanks there: a cell ends below the end of its name.
@@ -154,9 +170,9 @@ def _ruled(path: Path, lines: list[str]) -> FreeFormTable | None:
             if not _NUMBER.match(cells[0]):
                 break
             rows.append(cells)
-        if len(rows) >= 3:
+        if len(rows) >= LEAST_ROWS:
             note = f"columns between rules became CSV; {len(lines) - len(rows)} lines of names, units and text left out"
-            return FreeFormTable(path.stem, names, units, rows, [note])
+            return FreeFormTable(label, names, units, rows, [note])
     return None
 
 
@@ -249,117 +265,3 @@ def _are_units(cells: list[str]) -> bool:
 def _decimal_comma(rows: list[list[str]]) -> bool:
     cells = [c for row in rows for c in row]
     return any(_COMMA_NUMBER.match(c) for c in cells) and not any(_NUMBER.match(c) and "." in c for c in cells)
-
-
-# MATLAB
-
-
-def read_matlab(path: Path) -> list[FreeFormTable]:
-    """Read every table of a MATLAB file.
-
-    Raises
-    ------
-    GateError
-        ``table-missing`` where no two columns of numbers have one length, ``matlab-unreadable``,
-        ``table-too-large``, or ``file-missing``.
-    ConfigError
-        ``h5py-missing`` for version 7.3 without h5py.
-    """
-    try:
-        with open_file(path) as file:
-            head = file.read(128)
-    except FileNotFoundError:
-        raise GateError(f"{path}: no such file", code="file-missing") from None
-    except UnfitFile as fault:
-        raise GateError(f"{path}: {fault.strerror}", fault.code) from None
-    variables, left_out = _version_73(path) if b"MATLAB 7.3" in head or head[:4] == b"\x89HDF" else _version_5(path)
-    groups: dict[tuple[str, int], dict[str, FloatArray]] = {}
-    for parent, name, values in variables:
-        rows = max(values.shape)
-        if rows < _LEAST_ROWS or values.ndim != 2:
-            left_out.append(name)
-            continue
-        block = values if values.shape[0] == rows else values.T
-        columns = {name: block[:, 0]} if block.shape[1] == 1 else {f"{name}_{k + 1}": c for k, c in enumerate(block.T)}
-        groups.setdefault((parent, rows), {}).update(columns)
-    tables = []
-    for k, ((parent, _), columns) in enumerate(g for g in groups.items() if len(g[1]) >= 2):
-        label = "_".join(filter(None, [path.stem, parent])) + (f"_{k + 1}" if not parent and k else "")
-        cells = [
-            [repr(float(v)) if np.isfinite(v) else "" for v in row] for row in np.column_stack(list(columns.values()))
-        ]
-        notes = ["MATLAB numbers became CSV"]
-        if left_out:
-            notes.append(f"left out, as no columns of numbers: {', '.join(sorted(left_out)[:8])}")
-        tables.append(FreeFormTable(label, list(columns), [""] * len(columns), cells, notes))
-    if not tables:
-        words = f"no two columns of numbers of one length; left out: {', '.join(left_out) or 'nothing'}"
-        raise GateError(f"{path}: {words}", code="table-missing")
-    return tables
-
-
-def _version_5(path: Path) -> tuple[list[tuple[str, str, FloatArray]], list[str]]:
-    from scipy.io import loadmat, whosmat
-    from scipy.io.matlab import MatReadError
-
-    try:
-        if sum(int(np.prod(shape)) for _, shape, _ in whosmat(path)) > _MOST_NUMBERS:
-            raise GateError(f"{path}: more than {_MOST_NUMBERS} numbers; split it", code="table-too-large")
-        content = loadmat(path, chars_as_strings=True)
-    except (ValueError, TypeError, OSError, MatReadError, NotImplementedError, KeyError) as fault:
-        if isinstance(fault, GateError):
-            raise
-        words = f"not a MATLAB file that can be read ({fault}); save it with -v7, or as CSV"
-        raise GateError(f"{path}: {words}", code="matlab-unreadable") from None
-    found, left_out = [], []
-    for parent, name, value in _walk(content):
-        if _is_numbers(value):
-            found.append((parent, name, np.atleast_2d(np.asarray(value, dtype=float))))
-        else:
-            left_out.append(name)
-    return found, left_out
-
-
-def _walk(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
-    """Variables, and fields of structures of one element."""
-    for name, value in content.items():
-        if name.startswith("__"):
-            continue
-        fields = getattr(getattr(value, "dtype", None), "names", None)
-        if fields and value.size == 1:
-            yield from ((name, part, value[part].flat[0]) for part in fields)
-        else:
-            yield "", name, value
-
-
-def _is_numbers(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 0
-
-
-def _version_73(path: Path) -> tuple[list[tuple[str, str, FloatArray]], list[str]]:
-    try:
-        import h5py
-    except ImportError:
-        words = (
-            "a MATLAB 7.3 file needs h5py: pip install 'postflight[matlab]', or save it in MATLAB with -v7, or as CSV"
-        )
-        raise ConfigError(f"{path}: {words}", code="h5py-missing") from None
-    found: list[tuple[str, str, FloatArray]] = []
-    left_out: list[str] = []
-
-    def visit(name: str, item: Any) -> None:
-        if not isinstance(item, h5py.Dataset) or name.startswith("#"):
-            return
-        parent, _, own = name.rpartition("/")
-        if item.dtype.kind in "fiu" and item.ndim <= 2 and 0 < item.size <= _MOST_NUMBERS:
-            found.append((parent.replace("/", "_"), own, np.atleast_2d(np.asarray(item[()], dtype=float))))
-        else:
-            left_out.append(own)
-
-    try:
-        with h5py.File(path, "r") as file:
-            file.visititems(visit)
-    except OSError as fault:
-        words = f"not a MATLAB file that can be read ({fault})"
-        raise GateError(f"{path}: {words}", code="matlab-unreadable") from None
-    return found, left_out

@@ -28,7 +28,7 @@ _SPELLINGS = {
     "nmi": "nm",
     "km": "kilometer",
     "kft": "kilofeet",
-    "deg": "degrees degree grad degn dege",
+    "deg": "degrees degree grad degn dege degrees_north degrees_east degree_north degree_east",
     "rad": "radians radian",
     "mil": "mils",
     "gon": "gons",
@@ -95,10 +95,10 @@ QUANTITIES = _vocabulary(
         "temperature": "temperature temp temperatur t lufttemperatur",
         "dewpoint": "td dwpt dewpoint taupunkt dew",
         "rho": "rho density dichte dens luftdichte",
-        "wind_speed": "windspeed wspd ff sknt windgeschwindigkeit smps wind",
-        "wind_from": "winddir wdir dd drct windrichtung from wd",
-        "wind_north": "windn v vgrd meridional",
-        "wind_east": "winde u ugrd zonal",
+        "wind_speed": "windspeed wspd ff sknt windgeschwindigkeit smps wind speed spd",
+        "wind_from": "winddir wdir dd drct windrichtung from wd direction dir",
+        "wind_north": "windn v vgrd meridional ncomp",
+        "wind_east": "winde u ugrd zonal ecomp",
         "nsat": "nsat sats satellites satelliten numsv nsats sat",
     }
 )

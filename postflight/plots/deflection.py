@@ -63,7 +63,7 @@ def figure_summary(
     pressure.set(ylabel="dynamic pressure\n(Pa), grey", ylim=(0, None))
     pressure.grid(visible=False)
     figure.suptitle("Deflection of the aeroshell by each method")
-    stamp(figure, flight.telemetry)
+    stamp(figure, flight.telemetry, flight.flight.changes)
     return figure
 
 

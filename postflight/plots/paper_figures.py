@@ -77,7 +77,7 @@ def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: in
     legend_above(upper, 3)
     legend_above(lower, 4)
     figure.suptitle("Flight against a rigid vehicle (in the manner of AIAA 2011-2571, Figure 1.3)")
-    stamp(figure, flight.telemetry)
+    stamp(figure, flight.telemetry, flight.flight.changes)
     return figure
 
 
@@ -169,7 +169,7 @@ def _angles(figure: Figure, ax: Axes, flight: Reconstruction, title: str, number
     ax.set(xlim=window(flight), ylim=(0, _LOOK_UP_END_DEG), ylabel="total angle of attack (deg)", xlabel=TIME)
     legend_above(ax, 1)
     figure.suptitle(f"{title} (AIAA 2011-2571, Figure {number})")
-    stamp(figure, flight.telemetry)
+    stamp(figure, flight.telemetry, flight.flight.changes)
     return figure
 
 

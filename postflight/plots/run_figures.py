@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec
 
@@ -13,7 +14,6 @@ from estimators.loads import FlightLoads
 from estimators.trim import static_trim
 from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
-from flightmodel.telemetry import Telemetry
 from postflight.deflections import Deflections
 from postflight.filming import by_camera
 from postflight.flight import Flight
@@ -64,30 +64,30 @@ def draw_run(
     if "camera" in answers.histories:
         draw_camera(flight.flight, answers.histories["camera"], folder)
     if answers.fused is not None:
-        answer, telemetry = answers.fused, flight.telemetry
+        answer = answers.fused
         words = f"{answer.agreement.remark}; {answer.limbs_remark}"
-        draw(folder / "fusion.png", _stamped(figure_fusion, telemetry), answer.fused, answer.limbs, words)
-        correlation = _stamped(figure_correlation, telemetry)
+        draw(folder / "fusion.png", _stamped(figure_fusion, flight.flight), answer.fused, answer.limbs, words)
+        correlation = _stamped(figure_correlation, flight.flight)
         draw(folder / "correlation.png", correlation, answer.fused, answer.agreement.singular_values)
     if flight.loads is not None:
-        _draw_static_trim(flight.loads, flight.telemetry, folder)
+        _draw_static_trim(flight.loads, flight.flight, folder)
     if answers.histories:
         draw(folder / "summary.png", figure_summary, flight, answers)
     report(1.0, "drawn")
 
 
-def _stamped(figure: Callable[Parameters, Figure], telemetry: Telemetry) -> Callable[Parameters, Figure]:
+def _stamped(figure: Callable[Parameters, Figure], flight: Flight) -> Callable[Parameters, Figure]:
     """Let a figure bear the flight's name in its corner."""
 
     def with_stamp(*args: Parameters.args, **named: Parameters.kwargs) -> Figure:
         made = figure(*args, **named)
-        stamp(made, telemetry)
+        stamp(made, flight.telemetry, flight.changes)
         return made
 
     return with_stamp
 
 
-def _draw_static_trim(pulse: FlightLoads, telemetry: Telemetry, folder: Path) -> None:
+def _draw_static_trim(pulse: FlightLoads, flight: Flight, folder: Path) -> None:
     """Draw Figure 2.9 for the vehicle at the flight's peak of dynamic pressure; none where it has no static trim."""
     vehicle, k = pulse.vehicle, int(np.argmax(pulse.dynamic_pressure_pa))
     mach, pressure = float(pulse.mach[k]), float(pulse.dynamic_pressure_pa[k])
@@ -99,7 +99,7 @@ def _draw_static_trim(pulse: FlightLoads, telemetry: Telemetry, folder: Path) ->
     offsets = sorted({round(own, 5), *_PAPER_OFFSETS_M})
     title = f"Static trim at {pressure:.0f} Pa, Mach {mach:.1f} (AIAA 2011-2571, Figure 2.9)"
     stiffness = vehicle.joint.bending_stiffness_nmprad
-    draw(folder / "figure_2_9.png", _stamped(figure_2_9, telemetry), static, offsets, stiffness, title)
+    draw(folder / "figure_2_9.png", _stamped(figure_2_9, flight), static, offsets, stiffness, title)
 
 
 def draw_sensitivity(flight: Reconstruction, table: pd.DataFrame, folder: Path) -> None:
@@ -115,10 +115,12 @@ def draw_camera(flight: Flight, history: DeflectionHistory, folder: Path) -> Non
     """
     several = len(flight.telemetry.films) > 1
     for name, (telemetry, own) in by_camera(flight.telemetry, history).items():
-        _draw_one_camera(telemetry, own, folder, f"_{name}" if several else "")
+        seen = replace(flight, telemetry=telemetry)
+        _draw_one_camera(seen, own, folder, f"_{name}" if several else "")
 
 
-def _draw_one_camera(telemetry: Telemetry, history: DeflectionHistory, folder: Path, ending: str) -> None:
+def _draw_one_camera(flight: Flight, history: DeflectionHistory, folder: Path, ending: str) -> None:
+    telemetry = flight.telemetry
     frames = telemetry.frames
     assert frames is not None
     oriented, benchmark = oriented_camera(telemetry, history)
@@ -129,5 +131,5 @@ def _draw_one_camera(telemetry: Telemetry, history: DeflectionHistory, folder: P
     meshes = telemetry.required_vehicle().meshes
     pictures = [frames.picture(k) for k in pick]
     path = folder / f"figure_2_3{ending}.png"
-    draw(path, _stamped(figure_2_3, telemetry), oriented, pictures, times, theta, plane, meshes)
+    draw(path, _stamped(figure_2_3, flight), oriented, pictures, times, theta, plane, meshes)
     write_overlay(oriented, telemetry, largest, theta[1], plane[1], folder / f"overlay{ending}.png")

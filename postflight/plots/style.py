@@ -191,9 +191,10 @@ def note(figure: Figure, words: str) -> None:
     figure.supxlabel(words, x=0.995, ha="right", fontsize=_SMALL, color=COLOUR["note"], parse_math=False)
 
 
-def stamp(figure: Figure, telemetry: Telemetry) -> None:
-    """Name the flight in the corner, and whether it is synthetic."""
-    note(figure, f"{telemetry.name}: {'SYNTHETIC flight' if telemetry.synthetic else 'flight'}")
+def stamp(figure: Figure, telemetry: Telemetry, changes: tuple[str, ...] = ()) -> None:
+    """Name the flight in the corner, whether it is synthetic, and what a what-if assumes."""
+    assumed = f"; what-if: {'; '.join(changes)}" if changes else ""
+    note(figure, f"{telemetry.name}: {'SYNTHETIC flight' if telemetry.synthetic else 'flight'}{assumed}")
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -41,7 +41,7 @@ def figure_flown(flight: Reconstruction) -> Figure:
         for f in found:
             ax.axvspan(f.start_s, f.end_s, color=COLOUR["flagged"], alpha=0.3, lw=0)
     figure.suptitle("Reconstructed flight" + ("; shaded: unmodelled acceleration" if found else ""))
-    stamp(figure, flight.telemetry)
+    stamp(figure, flight.telemetry, flight.flight.changes)
     return figure
 
 
@@ -71,7 +71,7 @@ def figure_residuals(flight: Reconstruction) -> Figure:
     figure.suptitle(
         "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside", fontsize=10
     )
-    stamp(figure, flight.telemetry)
+    stamp(figure, flight.telemetry, flight.flight.changes)
     return figure
 
 
@@ -118,7 +118,7 @@ def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
     for ax in grid[-1]:
         ax.set_xlabel(TIME)
     figure.suptitle("Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)")
-    stamp(figure, flight.telemetry)
+    stamp(figure, flight.telemetry, flight.flight.changes)
     return figure
 
 
@@ -144,7 +144,7 @@ def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
     upper.legend(*axes[1].get_legend_handles_labels(), ncols=3, loc="outside lower left")
     _drag(lower.subplots(), day.drag)
     figure.suptitle("As-flown atmosphere from the deceleration along the reconstructed trajectory")
-    stamp(figure, flight.telemetry)
+    stamp(figure, flight.telemetry, flight.flight.changes)
     return figure
 
 
@@ -203,7 +203,7 @@ def figure_attitude(flight: Reconstruction, check: AttitudeCheck) -> Figure:
     axes[-1].set_xlabel(TIME)
     remark = "\n(not independent: the trajectory depends on these sensors too)" if check.dependence else ""
     figure.suptitle("Attitude from magnetometer and Sun sensors alone against the trajectory's" + remark)
-    stamp(figure, flight.telemetry)
+    stamp(figure, flight.telemetry, flight.flight.changes)
     return figure
 
 
@@ -240,5 +240,5 @@ def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
         "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3",
         fontsize=10,
     )
-    stamp(figure, flight.telemetry)
+    stamp(figure, flight.telemetry, flight.flight.changes)
     return figure

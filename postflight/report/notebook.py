@@ -83,15 +83,17 @@ The same from the library, with other settings:
     pf.compare(answers, changed)"""
 
 
-def write_notebook(flight_folder: Path, target: Path | None = None) -> Path:
-    """Write the notebook of the newest run to ``target`` or into the run's folder; return where it lies.
+def write_notebook(flight_folder: Path, target: Path | None = None, path: Path | None = None) -> Path:
+    """Write the notebook of a run (the last complete one, or the one given) to ``target``; return where it lies.
+
+    Without a target it goes into the run's folder.
 
     Raises
     ------
     GateError
         Where the run cannot be read, or the file not be written.
     """
-    run = read_run(flight_folder)
+    run = read_run(flight_folder, path)
     target = run.path / _NAME if target is None else target
     away = os.path.relpath(flight_folder.resolve(), target.parent.resolve())
     write_whole(target, _notebook(run, Path(away).as_posix()))
@@ -104,7 +106,8 @@ def _notebook(run: Run, folder: str) -> str:
     cells = [
         (
             "markdown",
-            f"# {_text(run.telemetry.name)}\n\nRun {_text(run.path.name)}. Inputs, results, consistency checks.",
+            f"# {_text(run.telemetry.name)}\n\nRun {_text(run.path.name)}. Inputs, results, consistency checks."
+            + (f"\n\n**What-if:** {_text('; '.join(run.changes))}" if run.changes else ""),
         ),
         ("code", re.sub(r"\{(folder|run)!r\}", lambda name: code[name[1]], _START)),
         ("markdown", "## Measurements"),

@@ -54,7 +54,7 @@ _WHY_ABSENT = {"alpha": _NO_ATTITUDE, "axial": _NO_ACCELEROMETER, "lateral": _NO
 _FLOOR = {"speed", "mach", "pressure", "alpha", "deflection"}
 
 
-def _line(
+def line_of(
     label: str, values: FloatArray, sd: FloatArray | None, colour: str, dash: list[int], decimals: int
 ) -> dict[str, Any]:
     """One line of a panel with its standard deviation where it is known."""
@@ -62,6 +62,16 @@ def _line(
     if sd is not None and np.isfinite(sd).any():
         out["sd"] = rounded(sd, decimals)
     return out
+
+
+def quantities_drawn() -> list[tuple[str, str, str, float, str, str]]:
+    """Of every quantity with a sd: id, title, unit, scale, its column and the column of its sd."""
+    return [
+        (f"{name}_{k}", f"{title}: {label}" if len(lines) > 1 else title, unit, scale, column, sd_column)
+        for name, title, unit, scale, _, lines in _TRAJECTORY
+        for k, (label, column, sd_column, *_) in enumerate(lines)
+        if sd_column is not None
+    ]
 
 
 def trajectory_rows(run: Run) -> Rows:
@@ -81,15 +91,15 @@ def trajectory_panels(run: Run, rows: Rows) -> tuple[list[Panel], list[tuple[str
         for label, column, sd_column, colour, dash in drawn:
             if bet[column].notna().any():
                 sd = None if sd_column is None else scale * bet[sd_column].to_numpy(float)
-                lines.append(_line(label, scale * bet[column].to_numpy(float), sd, colour, dash, decimals))
+                lines.append(line_of(label, scale * bet[column].to_numpy(float), sd, colour, dash, decimals))
         if lines:
-            panels.append(_panel(name, title, unit, "bet", lines, raw.get(name, [])))
+            panels.append(panel_of(name, title, unit, "bet", lines, raw.get(name, [])))
         else:
             absent.append((name, title, _WHY_ABSENT.get(name, "The run's table holds no value of it.")))
     return panels, absent
 
 
-def _panel(
+def panel_of(
     name: str, title: str, unit: str, time: str | None, lines: list[dict[str, Any]], raw: list[dict[str, Any]]
 ) -> Panel:
     """One panel; lines hold times of their own where ``time`` is None."""
@@ -168,13 +178,13 @@ def deflection_panel(run: Run) -> Panel | None:
             table["t_s"].to_numpy(), [table[c].to_numpy(float) for c in ("theta_deg", "theta_sd_deg")]
         )
         rows = kept_rows([theta], _TRAJECTORY_ROWS // 2)
-        one = _line(LABEL[method], theta[rows], sd[rows], COLOUR[method], _DASH[method], 4)
+        one = line_of(LABEL[method], theta[rows], sd[rows], COLOUR[method], _DASH[method], 4)
         # frames are few: each is a dot, which also sets the line apart without colours
         one["dots"] = method == "camera" and table is frames
         lines.append(one | {"t": rounded(t[rows], 4), "width": 3.4 if method == "fused" else 1.4})
     if not lines:
         return None
-    out = _panel("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, dots)
+    out = panel_of("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, dots)
     return out | {"ceiling": round(1.3 * max(max(x for x in one["y"] if x is not None) for one in lines), 2)}
 
 
@@ -301,9 +311,9 @@ def _band_panels(run: Run, bands: pd.DataFrame, prefix: str) -> list[Panel]:
                 top = max(top, float(np.nanmax(band[_MIDDLE])))
         if lines:
             kept = kept_rows([flown], _TRAJECTORY_ROWS)
-            lines.append(_line("this flight", flown[kept], None, _BLUE, [], 4) | {"t": rounded(t[kept], 3)})
+            lines.append(line_of("this flight", flown[kept], None, _BLUE, [], 4) | {"t": rounded(t[kept], 3)})
             # a rigid vehicle may tumble late, out of what is of interest here
-            one = _panel(f"{prefix}_{quantity}", title, unit, None, lines, [])
+            one = panel_of(f"{prefix}_{quantity}", title, unit, None, lines, [])
             out.append(one | {"ceiling": round(1.5 * top, 2)} | ({"floor": 0} if unit in ("deg", "g") else {}))
     if not out:
         raise GateError(

@@ -5,95 +5,49 @@ Of long series the smallest and the largest value of each of equal runs of rows 
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.flightfolder import read_flight
-from flightmodel.guarded_files import file_bytes
 from flightmodel.telemetry import Telemetry
-from postflight.run_folder import newest_run, read_csv, run_hash
-
-_NEEDED = ("bet", "events", "peaks", "residuals", "verdicts", "findings")
-_CHECKS = ("name", "value", "low", "high", "passed", "remark", "code")
+from postflight.runs import RunTables, find_run, read_tables
 
 
 @dataclass(frozen=True)
-class Run:
-    """A finished run.
+class Run(RunTables):
+    """A complete run with the telemetry that it was made from.
 
     Parameters
     ----------
     telemetry : Telemetry
         As the run read it.
-    path : Path
-        The run's folder.
-    summary, facts, header : dict
-        ``summary.json``, ``run.json``, ``bet_header.json``.
-    tables : dict of DataFrame
-        Every CSV table of the folder by its stem.
     """
 
     telemetry: Telemetry
-    path: Path
-    summary: dict[str, Any]
-    facts: dict[str, Any]
-    header: dict[str, Any]
-    tables: dict[str, pd.DataFrame]
-
-    @property
-    def hash8(self) -> str:
-        """What stands for inputs, settings and version in the folder's name."""
-        return run_hash(self.facts["inputs_sha256"], self.facts["settings"], self.facts["version"])
-
-    @property
-    def checks(self) -> pd.DataFrame:
-        """Consistency checks; of a run of version 0.1 those of ``verdicts.csv``, without codes."""
-        table = self.tables.get("consistency_checks")
-        if table is None:
-            table = self.tables["verdicts"].rename(columns={"words": "remark"})
-        return table[[name for name in _CHECKS if name in table]]
-
-    def peak(self, name: str) -> pd.Series | None:
-        """Row of ``peaks.csv``; None where the flight has none of that name."""
-        rows = self.tables["peaks"][self.tables["peaks"]["peak"] == name]
-        return rows.iloc[0] if len(rows) else None
 
 
 def read_run(flight_folder: Path, path: Path | None = None, telemetry: Telemetry | None = None) -> Run:
-    """Read a run, the newest unless one is named, and its telemetry unless it is at hand.
+    """Read a run, the last complete one unless one is named, and its telemetry unless it is at hand.
 
     Raises
     ------
     GateError
-        Where there is no finished run, a file of it is missing, or the telemetry is not what the run was made from.
+        Where there is no complete run, a file of it is missing, or the telemetry is not what the run was made from.
     """
-    path = newest_run(flight_folder) if path is None else path
-    again = f"use `postflight run {flight_folder}` again"
-    try:
-        summary, facts, header = (
-            json.loads(file_bytes(path / f"{name}.json")) for name in ("summary", "run", "bet_header")
-        )
-        tables = {p.stem: read_csv(p) for p in sorted(path.glob("*.csv"))}
-    except (OSError, ValueError) as fault:
-        raise GateError(f"{path}: not a whole run ({fault}); {again}", "run-incomplete") from None
-    missing = [f"{name}.csv" for name in _NEEDED if name not in tables]
-    if missing:
-        raise GateError(f"{path}: not a whole run, without {', '.join(missing)}; {again}", "run-incomplete")
+    read = read_tables(find_run(flight_folder) if path is None else path)
     telemetry = read_flight(flight_folder) if telemetry is None else telemetry
-    then, now = facts["inputs_sha256"], telemetry.hashes
+    then, now = read.facts["inputs_sha256"], telemetry.hashes
     changed = sorted(name for name in then.keys() | now.keys() if then.get(name) != now.get(name))
     if changed:
-        words = f"{flight_folder}: changed since the run {path.name}: {', '.join(changed)}; {again}"
+        again = f"use `postflight run {flight_folder}` again"
+        words = f"{flight_folder}: changed since the run {read.path.name}: {', '.join(changed)}; {again}"
         raise GateError(words, "inputs-changed")
-    return Run(telemetry, path, summary, facts, header, tables)
+    return Run(**vars(read), telemetry=telemetry)
 
 
 Rows = NDArray[np.int64]

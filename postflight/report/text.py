@@ -90,9 +90,8 @@ def lead(run: Run) -> list[str]:
     rests = _rests_on(s.get("rests_on") or [])  # runs of before have none
     if rests:
         out.append(f"{rests[0].upper()}{rests[1:]}.")
-    changes = run.facts["settings"].get("changes")
-    if changes:
-        out.insert(0, f"A what-if, not the flight as its folder states it: {'; '.join(changes)}.")
+    if run.changes:
+        out.insert(0, f"A what-if, not the flight as its folder states it: {'; '.join(run.changes)}.")
     return out
 
 

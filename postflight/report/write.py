@@ -18,7 +18,7 @@ from flightmodel.checks import write_file, writing
 from flightmodel.config import parse_utc
 from flightmodel.telemetry import Telemetry
 from postflight.plots.style import COLOUR, PAGE
-from postflight.report import pictures, text
+from postflight.report import pictures, stated_errors, text
 from postflight.report.panels import (
     NO_DEFLECTION,
     deflection_panel,
@@ -33,6 +33,7 @@ from postflight.report.source import Run, read_run, rounded
 _NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
 STYLES = ("uPlot.min.css", "page.css")
+PARTS = "parts.html"  # macros that the pages share
 # what a script element must not hold literally: its own end, a comment's start, and line ends of JavaScript alone
 _ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
@@ -67,34 +68,43 @@ def write_whole(target: Path, content: str) -> None:
 
 def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
     """Return the whole page."""
+    frames = pictures.film_strip(run)
+    data, absent = _numbers(run, frames, studies)
+    return rendered(
+        "page.html",
+        data,
+        run=run,
+        frames=frames,
+        worst=pictures.worst_frames(run),
+        absent=absent,
+        studies=[path.resolve().name for path in studies],
+        **_texts(run),
+    )
+
+
+def rendered(template: str, data: dict[str, Any], **texts: Any) -> str:
+    """Return a page with its scripts and styles inside, and a policy that allows these alone; all text is escaped."""
     here = files("postflight.report").joinpath("page")
     read = lambda name: here.joinpath(name).read_text(encoding="utf-8")  # noqa: E731
     script = "\n".join(read(name) for name in SCRIPTS)
     variables = " ".join(f"--{name}: {value};" for name, value in PAGE.items())
     style = "\n".join([f":root {{ {variables} }}", *(read(name) for name in STYLES)])
-    frames = pictures.film_strip(run)
-    data, absent = _numbers(run, frames, studies)
     environment = Environment(
-        loader=DictLoader({"page": read("page.html")}),
+        loader=DictLoader({name: read(name) for name in (template, PARTS)}),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template("page").render(
-        run=run,
+    return environment.get_template(template).render(
         script=Markup(script),
         style=Markup(style),
         script_hash=_content_hash(script),
         style_hash=_content_hash(style),
         licence=read("uPlot.LICENSE"),
         data=Markup(safe_json(data)),
-        frames=frames,
-        worst=pictures.worst_frames(run),
-        absent=absent,
         drawn=data,
-        studies=[path.resolve().name for path in studies],
-        **_texts(run),
+        **texts,
     )
 
 
@@ -125,6 +135,8 @@ def _texts(run: Run) -> dict[str, Any]:
         "sensitivity": text.sensitivity_rows(again) if again is not None else None,
         "vehicle": [(k, text.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
         "settings": [(k, text.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
+        "assumed": stated_errors.assumed(run),
+        "measured": stated_errors.measured(run),
         "date": f"{day.day} {day:%B %Y}",
     }
 
@@ -147,8 +159,8 @@ def _numbers(
         "t0_ms": round(1e3 * parse_utc(run.telemetry.t0_utc).timestamp()),
         "span": span,
         "colours": PAGE | {"residual": COLOUR["estimate"]},
-        "pulse": _pulse_window(bet),
-        "first": span if deflection is None else _pulse_window(bet),
+        "pulse": pulse_window(bet),
+        "first": span if deflection is None else pulse_window(bet),
         "peak": round(float(run.summary["peak_dynamic_pressure_s"]), 3),
         "bet": rounded(bet["t_s"].to_numpy()[rows], 4),
         "rows": [len(rows), len(bet)],
@@ -164,7 +176,7 @@ def _numbers(
     return data, absent
 
 
-def _pulse_window(bet: pd.DataFrame) -> list[float]:
+def pulse_window(bet: pd.DataFrame) -> list[float]:
     """From well before the pressure pulse to well after it, s."""
     t = bet["t_s"].to_numpy()
     inside = t[pressure_pulse(bet["dynamic_pressure_pa"].to_numpy())]

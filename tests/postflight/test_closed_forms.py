@@ -25,7 +25,8 @@ from postflight.montecarlo.study import design_for, indices
 from postflight.reconciliation.modes import FACTORS, _peak, _track_power
 from postflight.reconstruction import _coefficients
 from postflight.report.panels import _FLOWN
-from postflight.score import _STATE_COLUMNS, _bet_errors, _method_row
+from postflight.runs import STATE_COLUMNS
+from postflight.score import _bet_errors, _method_row
 from postflight.studies import preflight
 from recon import atmosphere
 
@@ -325,7 +326,7 @@ def test_errors_of_a_trajectory_over_its_pulse_are_those_that_were_planted():
     # a straight flight off by known vectors, everywhere alike: rms are their lengths; the angle's is its own
     n = 41
     t = np.arange(n) * 0.5
-    truth = pd.DataFrame(0.0, index=range(n), columns=list(_STATE_COLUMNS))
+    truth = pd.DataFrame(0.0, index=range(n), columns=list(STATE_COLUMNS))
     truth["t_s"], truth["qw_ecef_body"] = t, 1.0
     truth["rx_ecef_m"], truth["vx_ecef_mps"] = 6.5e6 + 100.0 * t, 100.0
     truth["dynamic_pressure_pa"] = 1000.0 * np.exp(-(((t - 10.0) / 3.0) ** 2))

@@ -381,7 +381,7 @@ def test_score_with_broken_truth_exits_3_without_traceback(command, flight) -> N
         (flight.root / "truth" / name).write_text("")
     run = flight.root / "runs" / "20260101T000000Z-00000000"
     run.mkdir(parents=True)
-    for name in ("run.json", "summary.json"):
+    for name in ("run.json", "summary.json", "bet_header.json"):
         (run / name).write_text(json.dumps({"methods": {}}))
     (run / "bet.csv").write_text("t_s\n")
     done = command("score", flight.root)

@@ -104,7 +104,8 @@ HOSTILE = "{run!r}\\[x](javascript:1) $\\alpha$ `` <img src=x> *b*"
 
 def book(name, folder, run):
     path = SimpleNamespace(name=run)
-    return notebook._notebook(SimpleNamespace(telemetry=SimpleNamespace(name=name), path=path), folder)
+    flown = SimpleNamespace(telemetry=SimpleNamespace(name=name), path=path, changes=(f"c_n = {name}",))
+    return notebook._notebook(flown, folder)
 
 
 def test_a_notebook_has_a_folder_of_any_name_as_one_string():
