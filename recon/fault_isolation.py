@@ -273,7 +273,7 @@ def edit_checks_with_rejected(
         again[check.name] = check
     known = {v.name for v in checks}  # of a tracker without any accepted point there is none
     made = [replace(again[v.name], source=v.source) if v.name in again else v for v in checks]
-    return (*made, *(replace(v, source=name) for name, v in again.items() if name not in known))
+    return (*made, *(v for name, v in again.items() if name not in known))
 
 
 def rejected_point_findings(rejected: dict[str, FloatArray]) -> list[Finding]:

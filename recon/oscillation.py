@@ -44,7 +44,7 @@ _ROLL_STEP_RAD = np.deg2rad(1.0)
 _MOST_WINDOWS = 24  # those with the largest lateral force: enough, and quick on a long flight
 _LEAST_WINDOWS = 4
 _LEAST_EXPLAINED = 0.95  # share of the lateral force's square, by the best hypothesis
-# unequal moments of inertia, c.g. offsets and the joint turn the relation: 0.37 deg rms, at most 0.6, on 13 sound flights
+# unequal inertia, c.g. offsets and the joint turn the relation: 0.37 deg rms, at most 0.63, on 13 sound flights
 _LEAST_ROLL_RAD = np.deg2rad(2.0)
 _ROLL_SD = 4.0
 _USELESS_ROLL_RAD = np.deg2rad(10.0)  # a sixth of the lateral force is then in the wrong plane
