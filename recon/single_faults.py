@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flightmodel import rotations
+from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Telemetry, TriadRecord
 from recon.ekf import ForwardPass, Problem
@@ -32,7 +32,7 @@ from recon.time_bias import Lag
 
 WIDER = 30.0  # times the stated sd: a misaligned or mistimed sensor is some tens of its data sheet's sd off
 _NOISIER = 10.0
-_G, _DEGREE = 9.80665, np.pi / 180.0
+_G, _DEGREE = earth.STANDARD_GRAVITY_MPS2, np.pi / 180.0
 _UNIT_SLIPS = {"accelerometer": (_G, 1.0 / _G), "rates": (_DEGREE, 1.0 / _DEGREE)}
 _REFRACTION_SD = 1.0  # of the whole correction
 _PRIOR_SD_RAD = np.deg2rad(30.0)  # a linear filter converges from so far; starts a quarter turn apart reach everything
