@@ -206,8 +206,13 @@ def _single_faults(telemetry: Telemetry, settings: Settings, solution: Trajector
     if not candidates:
         prior_sd = dict(zip(solution.sensor_errors.name, solution.sensor_errors.prior_sd, strict=True))
         candidates = single_faults.singles(telemetry, trackers(telemetry, settings), prior_sd)
-    stated, _ = _log_likelihood(Single("", "", (), telemetry), settings, known)
-    found = []
+    try:
+        stated, _ = _log_likelihood(Single("", "", (), telemetry), settings, known)
+    except GateError:
+        return ()
+    found: list[SingleFault] = []
+    if not np.isfinite(stated):
+        return ()
     for one in candidates:
         try:
             likelihood, misfit = _log_likelihood(one, settings, known)

@@ -83,13 +83,18 @@ class SingleFault:
 
 
 def log_likelihood(problem: Problem, run: ForwardPass) -> tuple[float, float]:
-    """Log likelihood of all measurements that the filter was offered, up to a constant, and their mean square."""
+    """Log likelihood of all measurements that the filter was offered, up to a constant, and their mean square.
+
+    Of a filter that diverged it is minus infinity.
+    """
     offered, found = problem.observed.usable, run.innovations
-    count = np.isfinite(problem.observed.variance).sum(axis=1)
-    size = np.minimum(found.nis, problem.gate[count])
-    _, log_det = np.linalg.slogdet(found.covariance)
-    # components that were not measured have unit variance there
-    return float(-0.5 * (size + log_det)[offered].sum()), float(size[offered].sum() / count[offered].sum())
+    count = np.isfinite(problem.observed.variance).sum(axis=1)[offered]
+    nis, covariance = found.nis[offered], found.covariance[offered]
+    if not (np.isfinite(nis).all() and np.isfinite(covariance).all()):
+        return -np.inf, np.inf
+    size = np.minimum(nis, problem.gate[count])
+    _, log_det = np.linalg.slogdet(covariance)  # components that were not measured have unit variance there
+    return float(-0.5 * (size + log_det).sum()), float(size.sum() / count.sum())
 
 
 def with_noise(problem: Problem, noisier: dict[str, float]) -> Problem:
