@@ -102,7 +102,9 @@ class FusedAnswer:
         passed = not self.agreement.hypotheses and self.left_out is None and not self.alternatives
         likeliest = self.agreement.likeliest
         least = min((p.p_value for p in self.agreement.pairs), default=1.0)
-        source = "" if passed else self.left_out or (likeliest[0] if likeliest else "")
+        # a method that is no sensor is wrong by an input of its own
+        blamed = (self.left_out,) if self.left_out == "camera" else (*likeliest, self.left_out or "")
+        source = "" if passed else blamed[0]
         name = "deflection methods agree: least chance of a pair"
         checks = [
             ConsistencyCheck("deflection-methods", name, least, 1.0 - CONFIDENCE, 1.0, passed, self.remark, source)

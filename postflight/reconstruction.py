@@ -135,7 +135,7 @@ class Reconstruction(Tabular):
     @property
     def suspects(self) -> tuple[Fault, ...]:
         """Fault hypotheses, the most likely first; none where every consistency check passes."""
-        return isolate_faults(self.consistency_checks, self.solution.left_out)
+        return isolate_faults(self.consistency_checks, self.solution.left_out, self.solution.single_faults)
 
     @property
     def rests_on(self) -> tuple[str, ...]:
@@ -220,12 +220,21 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     try:
         telemetry.required_vehicle()
         telemetry.required_triads()
+        _check_axes(solution)
         loads = loads_from_solution(telemetry, solution, air)
         profile = profile_from_sounding(telemetry.sounding)
         as_flown = as_flown_atmosphere(telemetry, solution, profile, solution.settings.check_confidence)
     except GateError as fault:
         missing += fault.faults
     return Reconstruction(flight, solution, air, loads, as_flown, tuple(missing))
+
+
+def _check_axes(solution: TrajectorySolution) -> None:
+    """Raise `GateError` where accelerometer and gyros do not have one set of axes: no loads follow from them."""
+    swings = solution.adaptation.oscillation
+    if swings is not None and not swings.one_set_of_axes:
+        (check,) = (v for v in solution.consistency_checks if v.code == "axes")
+        raise GateError(f"{check.name}: {check.remark}", "axes")
 
 
 def air_data(trajectory: Trajectory, flight: Flight) -> AirData:

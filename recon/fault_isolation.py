@@ -40,6 +40,8 @@ from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, ed
 from recon.ekf import Problem
 from recon.imu_screening import TransientOffset
 from recon.measurements import SITES
+from recon.oscillation import Oscillation
+from recon.single_faults import SingleFault, likeliest
 from recon.state import KINEMATIC
 from recon.time_bias import ClockJump, Lag
 
@@ -47,8 +49,10 @@ _CONFIDENCE = 0.999
 _LEAST_LOST = 0.05  # of its variance that a solution loses by leaving a source out, for the test
 _ABOUT_SOURCES = ("nis", "whiteness", "edited", "data-sheet")  # codes of checks about one tracker or sensor
 _AIR_CODES = ("sounding", "pre-flight-drag", "sounding-density", "sounding-wind", "pre-flight-ca", "force-residuals")
+_AIR_SOURCES = {code: "vehicle" if code.startswith("pre-flight") else "atmosphere" for code in _AIR_CODES}
 _SHARED_CODES = ("place", "sites")  # about what all trackers share
 _INERTIAL = ("accelerometer", "rates")
+_ABOUT_BOTH = ("clock-lag", "axes")
 INFLATION = 3.0  # times the estimate: wide enough not to pull, for the estimate was already pulled
 
 
@@ -99,6 +103,8 @@ class Adaptation:
         Of the inertial sensors' clocks; None where that is still to be found.
     lag : Lag or None
         Of the accelerometer's tags behind the gyros', where it is more than their data sheets allow.
+    oscillation : Oscillation or None
+        What the oscillation of the vehicle shows of accelerometer and gyros.
     rejected_points : dict
         By name of a tracker, times (k,) of its points that all the rest of the flight contradicts.
     """
@@ -107,6 +113,7 @@ class Adaptation:
     rejected_offsets: tuple[TransientOffset, ...] | None = None
     jumps: tuple[ClockJump, ...] | None = None
     lag: Lag | None = None
+    oscillation: Oscillation | None = None
     rejected_points: dict[str, FloatArray] = field(default_factory=dict)
 
 
@@ -269,7 +276,9 @@ def edit_checks_with_rejected(
         offered = mine.used.to_numpy() | out
         check = edit_check(name, (mine.accepted.to_numpy() & ~out)[offered])
         again[check.name] = check
-    return tuple(replace(again[v.name], source=v.source) if v.name in again else v for v in checks)
+    known = {v.name for v in checks}  # of a tracker without any accepted point there is none
+    made = [replace(again[v.name], source=v.source) if v.name in again else v for v in checks]
+    return (*made, *(v for name, v in again.items() if name not in known))
 
 
 def rejected_point_findings(rejected: dict[str, FloatArray]) -> list[Finding]:
@@ -339,11 +348,33 @@ def prior_inflation_findings(
 # ---- fault hypotheses
 
 
-def isolate_faults(checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut, ...]) -> tuple[FaultHypothesis, ...]:
+def isolate_faults(
+    checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut, ...], singles: tuple[SingleFault, ...] = ()
+) -> tuple[FaultHypothesis, ...]:
     """Fault hypotheses, the most likely first; none where every check passes."""
     failed = [v for v in checks if not v.passed]
+    if not failed:
+        return ()
+    first = _single_hypothesis(singles)
+    return (*first, *_from_checks(failed, left_out))
+
+
+def _single_hypothesis(singles: tuple[SingleFault, ...]) -> tuple[FaultHypothesis, ...]:
+    """What one fault explains best, with those that are hardly less likely."""
+    if not singles:
+        return ()
+    named = likeliest(singles)
+    words = " or ".join(dict.fromkeys(one.words for one in named))
+    sources = tuple(dict.fromkeys(name for one in named for name in one.sources))
+    rest = singles[len(named) :]
+    odds = f"; odds over {rest[0].words}: 1e{(named[0].gain - rest[0].gain) / np.log(10.0):.0f}" if rest else ""
+    return (FaultHypothesis(f"{words}: this one fault explains the data best{odds}", named[0].code, sources),)
+
+
+def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) -> tuple[FaultHypothesis, ...]:
+    """What the failed checks and the comparison of trackers say."""
     inertial = [v for v in failed if v.code == "data-sheet" and v.source in _INERTIAL]
-    inertial += [v for v in failed if v.code == "clock-lag"]
+    inertial += [v for v in failed if v.code in _ABOUT_BOTH]
     shared = [v for v in failed if v.code in _SHARED_CODES or (v.code == "data-sheet" and v.source == SITES)]
     out = [FaultHypothesis(f"radar sites: {v.remark}", "sites", (v.source,)) for v in shared]
     if any(is_about(v, s.source) for v in failed for s in left_out):
@@ -357,7 +388,7 @@ def isolate_faults(checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut
         what = "motion: filter and smoother differ by more than sensor noise and errors explain"
         out.append(FaultHypothesis(what, "motion"))
     rest = [("attitude", v) for v in failed if v.code.startswith("attitude-")]
-    rest += [("air", v) for v in failed if v.code in _AIR_CODES]
+    rest += [("air", replace(v, source=v.source or _AIR_SOURCES[v.code])) for v in failed if v.code in _AIR_CODES]
     rest += [("error-model", v) for v in failed if v.code == "physical-range"]
     rest += [("stated-noise", v) for v in failed if is_generous(v)]
     sentences = {FaultHypothesis(f"{what}: {v.remark}", what, (v.source,)): None for what, v in rest}
@@ -418,7 +449,7 @@ def _inertial(checks: list[ConsistencyCheck]) -> str:
 
 
 def _inertial_sources(checks: list[ConsistencyCheck]) -> tuple[str, ...]:
-    names = [name for v in checks for name in (_INERTIAL if v.code == "clock-lag" else (v.source,))]
+    names = [name for v in checks for name in ((v.source,) if v.source else _INERTIAL)]
     return tuple(dict.fromkeys(names))
 
 

@@ -37,7 +37,7 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import earth, rotations
-from flightmodel.checks import FloatArray, Progress
+from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows
 from recon import (
@@ -45,9 +45,11 @@ from recon import (
     ekf,
     fault_isolation,
     imu_screening,
+    oscillation,
     propagation,
     rest,
     setup,
+    single_faults,
     smoother,
     survey,
     time_bias,
@@ -67,6 +69,7 @@ from recon.imu_screening import BridgedSensor
 from recon.propagation import correct, correction_partials
 from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem
+from recon.single_faults import Single, SingleFault
 from recon.smoother import Smoothed
 from recon.state import INERTIAL, KINEMATIC, ROTATION, States, unpacked
 
@@ -74,6 +77,7 @@ _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left
 _THINNED_STEP_S = 0.5
 _UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
 _MOST_THINNED_PASSES = 6
+_LINEAR_LAG_S = 0.03  # of an oscillation of a second's period a tenth of a radian
 _FARTHEST_SD = 3.0
 _CONVERGED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of its effect
 _CONVERGED_SD = 0.01  # a pass that changes nothing by more than this part of its sd is the last
@@ -114,6 +118,8 @@ class TrajectorySolution:
         Leave-one-out comparison of the trackers, where a check about one failed.
     adaptation : Adaptation
         What was found in the data, for other reconstructions that are to be compared with this one.
+    single_faults : tuple of SingleFault
+        Single hypotheses that explain what failed, the likeliest first.
     """
 
     smoothed: Trajectory
@@ -133,6 +139,7 @@ class TrajectorySolution:
     provenance: dict[str, object]
     left_out: tuple[LeftOut, ...] = ()
     adaptation: Adaptation = NO_ADAPTATION
+    single_faults: tuple[SingleFault, ...] = ()
 
     @property
     def settings(self) -> Settings:
@@ -170,6 +177,11 @@ def reconstruct(
     at_rest = _checks_at_rest(telemetry, settings)
     known = Adaptation(inflated_sd=rest.inflated_priors(telemetry, at_rest, INFLATION))
     solution = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what), known)
+    faults: tuple[SingleFault, ...] = ()
+    if any(not check.passed for check in solution.consistency_checks):
+        report(0.5, "trying single faults")
+        faults = _single_faults(telemetry, settings, solution)
+        telemetry, solution = _with_corrected_clock(telemetry, settings, solution, faults)
     inflated = known.inflated_sd | fault_isolation.inflated_priors(solution.consistency_checks, solution.sensor_errors)
     inflated |= _inflated_clocks(telemetry, solution)
     if inflated != known.inflated_sd:
@@ -183,7 +195,72 @@ def reconstruct(
         solution,
         consistency_checks=(*solution.consistency_checks, *at_rest),
         findings=(*solution.findings, *rest.noise_findings(telemetry)),
+        single_faults=faults,
     )
+
+
+def _single_faults(telemetry: Telemetry, settings: Settings, solution: TrajectorySolution) -> tuple[SingleFault, ...]:
+    """Single hypotheses, likeliest first: of the two triads alone, where their oscillation contradicts itself."""
+    known, swings = solution.adaptation, solution.adaptation.oscillation
+    candidates = single_faults.corrections(telemetry, swings, known.lag)
+    if not candidates:
+        prior_sd = dict(zip(solution.sensor_errors.name, solution.sensor_errors.prior_sd, strict=True))
+        candidates = single_faults.singles(telemetry, trackers(telemetry, settings), prior_sd)
+    try:
+        stated, _ = _log_likelihood(Single("", "", (), telemetry), settings, known)
+    except GateError:
+        return ()
+    found: list[SingleFault] = []
+    if not np.isfinite(stated):
+        return ()
+    for one in candidates:
+        try:
+            likelihood, misfit = _log_likelihood(one, settings, known)
+        except GateError:
+            continue
+        found.append(SingleFault(one.code, one.words, one.sources, likelihood - stated, misfit))
+    # what the oscillation has shown needs no other proof: the trackers only say which of the two it is
+    shown = known.lag is not None or (bool(found) and found[0].code == "axes")
+    return single_faults.ranked(found, shown)
+
+
+def _log_likelihood(one: Single, settings: Settings, known: Adaptation) -> tuple[float, float]:
+    """Log likelihood of thinned tracking data under a hypothesis, and the innovations' mean square."""
+    coarse = replace(settings, output_rate_hz=min(settings.output_rate_hz, 1.0), pulse_rate_hz=0.0)
+    sensors = bridge_inertial_sensors(one.telemetry, replace(known, rejected_offsets=()))
+    problem = build_problem(one.telemetry, coarse, sensors, known.rejected_points)
+    problem = fault_isolation.with_inflated_priors(problem, one.inflated_sd)
+    thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(_THINNED_STEP_S)
+    reference = None
+    for k in range(_MOST_THINNED_PASSES):
+        run = ekf.forward(thinned, reference, coarse.engine)
+        smoothed = smoother.smooth(thinned, run, False, coarse.engine)
+        moved = np.abs(smoothed.x[:, ROTATION]).max() if k else np.inf
+        reference = _bounded_drivers(thinned, smoothed.states(run.charts))
+        if moved < _CONVERGED_RAD:
+            break
+    return single_faults.log_likelihood(thinned, run)
+
+
+def _with_corrected_clock(
+    telemetry: Telemetry, settings: Settings, first: TrajectorySolution, faults: tuple[SingleFault, ...]
+) -> tuple[Telemetry, TrajectorySolution]:
+    """Telemetry and solution with corrected tags of the likelier triad, where a lag is too long to be linear."""
+    lag, swings = first.adaptation.lag, first.adaptation.oscillation
+    if lag is None or not faults or abs(lag.lag_s) < _LINEAR_LAG_S:
+        return telemetry, first
+    name = faults[0].sources[0]
+    one = next(c for c in single_faults.corrections(telemetry, swings, lag) if c.sources == (name,))
+    # which of the two it is may be open: then both may still be off by all of it
+    sure = len(single_faults.likeliest(faults)) == 1
+    wide_s = INFLATION * (lag.sd_s if sure else abs(lag.lag_s))
+    known = Adaptation(inflated_sd={f"{triad} time bias": wide_s for triad in single_faults.TRIADS})
+    again = reconstruct_once(one.telemetry, settings, adaptation=known)
+    start_s, end_s = again.smoothed.time_s[[0, -1]].tolist()
+    finding = Finding(name, f"{one.words.partition(': ')[2]}: corrected", start_s, end_s, "clock-corrected")
+    failed = tuple(replace(v, source=name if sure else "") for v in first.consistency_checks if v.code == "clock-lag")
+    checks = (*(v for v in again.consistency_checks if v.code != "clock-lag"), *failed)
+    return one.telemetry, replace(again, consistency_checks=checks, findings=(*again.findings, finding))
 
 
 def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[ConsistencyCheck]:
@@ -308,10 +385,8 @@ def reconstruct_once(
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
     checks += survey.place_checks(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
     if sensors is not None and adaptation.lag is None:
-        lag = time_bias.lag_between(sensors.force, sensors.rate, reference, problem.time_s)
-        if lag is not None:
-            checks.append(time_bias.lag_check(lag, sensors.force, sensors.rate, settings.check_confidence))
-            adaptation = replace(adaptation, lag=None if checks[-1].passed else lag)
+        more, adaptation = _oscillation_checks(telemetry, settings, sensors, problem, reference, adaptation)
+        checks += more
     series = _series(problem, sensors, reference, smoothed)
     findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
     if sensors is not None:
@@ -349,6 +424,29 @@ def reconstruct_once(
         },
         adaptation=adaptation,
     )
+
+
+def _oscillation_checks(
+    telemetry: Telemetry,
+    settings: Settings,
+    sensors: InertialSensors,
+    problem: Problem,
+    states: States,
+    known: Adaptation,
+) -> tuple[list[ConsistencyCheck], Adaptation]:
+    """Checks of both triads against each other by the oscillation, and the adaptation with what it shows."""
+    force, rate, checks = sensors.force, sensors.rate, []
+    span = float(problem.time_s[0]), float(problem.time_s[-1])
+    swings = oscillation.oscillation(force, rate, *span, telemetry.vehicle)
+    if swings is not None:
+        checks.append(oscillation.axes_check(swings, force, rate))
+        known = replace(known, oscillation=swings)
+    about_s = 0.0 if swings is None else swings.lag_s
+    lag = time_bias.lag_between(force, rate, states, problem.time_s, about_s=about_s)
+    if lag is not None and (swings is None or swings.kind in (oscillation.DELIVERED, oscillation.LAG)):
+        checks.append(time_bias.lag_check(lag, force, rate, settings.check_confidence))
+        known = replace(known, lag=None if checks[-1].passed else lag)
+    return checks, known
 
 
 def _screened(

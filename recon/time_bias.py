@@ -37,11 +37,11 @@ from recon.imu_screening import BridgedSensor, usual_steps
 from recon.state import KINEMATIC, States
 
 _WINDOW_S, _STEP_S = 4.0, 0.01
-_SMOOTH_S, _SLOWEST_S = 0.04, 0.05  # of the Gaussian filter of both signals; steps of a record too slow to use
+_SMOOTH_S, SLOWEST_S = 0.04, 0.05  # of the Gaussian filter of both signals; steps of a record too slow to use
 _LONGEST_LAG_S, _LAG_STEP_S = 0.08, 0.01
 _LARGEST_SD_S = _LONGEST_LAG_S / 10.0  # else hardly any lag in the range would be significant
 _LEAST_EXPLAINED = 0.95  # share of the lateral force's square
-_CORRELATION_S = 0.7  # of residuals
+CORRELATION_S = 0.7  # of residuals
 _LEAST_WINDOWS = 4
 _ARM_M = 3.0  # of a vehicle of six metres
 _SHORTEST_S = 0.004
@@ -63,24 +63,25 @@ def lag_between(
     time_s: FloatArray,
     start_s: float = -np.inf,
     end_s: float = np.inf,
+    about_s: float = 0.0,
 ) -> Lag | None:
     """Lag of the accelerometer behind the gyros from ``start_s`` to ``end_s``; None where oscillations do not show it.
 
-    ``path`` at ``time_s`` (n,) is where the vehicle flew, roughly.
+    ``path`` at ``time_s`` (n,) is where the vehicle flew, roughly; the lag is searched ``about_s``.
     """
-    start = max(start_s, float(force.time_s[0]), float(rate.time_s[0])) + _LONGEST_LAG_S
-    end = min(end_s, float(force.time_s[-1]), float(rate.time_s[-1])) - _LONGEST_LAG_S
-    if max(np.median(np.diff(t.time_s)) for t in (force, rate)) > _SLOWEST_S or end - start < _WINDOW_S:
+    start = max(start_s, float(force.time_s[0]), float(rate.time_s[0]) + about_s) + _LONGEST_LAG_S
+    end = min(end_s, float(force.time_s[-1]), float(rate.time_s[-1]) + about_s) - _LONGEST_LAG_S
+    if max(np.median(np.diff(t.time_s)) for t in (force, rate)) > SLOWEST_S or end - start < _WINDOW_S:
         return None
     lags_found = []
-    (ft, f), (wt, w) = _smoothed(force), _smoothed(rate)
+    (ft, f), (wt, w) = smoothed_body_axes(force), smoothed_body_axes(rate)
     turning = np.column_stack([w, np.gradient(w, wt, axis=0)])
     speed = np.linalg.norm(path.velocity_ecef_mps, axis=1)
     for begin in np.arange(start, end - _WINDOW_S, _WINDOW_S):
-        if _has_gap(force, begin) or _has_gap(rate, begin):
+        if has_gap(force, begin) or has_gap(rate, begin):
             continue
         at = begin + np.arange(0.0, _WINDOW_S, _STEP_S)
-        lags = np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1e-9, _LAG_STEP_S)
+        lags = about_s + np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1e-9, _LAG_STEP_S)
         shifted = [interpolate_rows(at - lag, wt, turning) for lag in lags]
         damping = _ARM_M / max(float(np.interp(begin + 0.5 * _WINDOW_S, time_s, speed)), 1.0)
         both = (_lag_in_window(interpolate_rows(at, ft, f)[:, i], shifted, lags, i) for i in (1, 2))
@@ -89,7 +90,7 @@ def lag_between(
     return lag if lag is not None and lag.sd_s < _LARGEST_SD_S else None
 
 
-def _smoothed(sensor: BridgedSensor) -> tuple[FloatArray, FloatArray]:
+def smoothed_body_axes(sensor: BridgedSensor) -> tuple[FloatArray, FloatArray]:
     """Even times (n,) and samples (n, 3) in body axes, through a Gaussian of `_SMOOTH_S`."""
     from scipy.ndimage import gaussian_filter1d
 
@@ -99,7 +100,8 @@ def _smoothed(sensor: BridgedSensor) -> tuple[FloatArray, FloatArray]:
     return at, gaussian_filter1d(interpolate_rows(at, sensor.time_s, body), _SMOOTH_S / step, axis=0)
 
 
-def _has_gap(sensor: BridgedSensor, begin: float) -> bool:
+def has_gap(sensor: BridgedSensor, begin: float) -> bool:
+    """Whether a sensor has a gap in, or near, the window from ``begin`` on."""
     a, b = np.searchsorted(sensor.time_s, [begin - _LONGEST_LAG_S, begin + _WINDOW_S + _LONGEST_LAG_S])
     gaps: BoolArray = sensor.in_gap[max(a - 1, 0) : b]
     return bool(gaps.any())
@@ -122,7 +124,7 @@ def _lag_in_window(
     curvature = before - 2.0 * here + after
     lag = lags[k] + 0.5 * _LAG_STEP_S * (before - after) / curvature
     least = max(here - 0.125 * (before - after) ** 2 / curvature, 0.0)
-    return float(lag), float(np.sqrt(least / len(force) * (_CORRELATION_S / _STEP_S) / curvature) * _LAG_STEP_S)
+    return float(lag), float(np.sqrt(least / len(force) * (CORRELATION_S / _STEP_S) / curvature) * _LAG_STEP_S)
 
 
 def _residual_square(y: FloatArray, columns: FloatArray) -> float:

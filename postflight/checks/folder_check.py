@@ -29,8 +29,9 @@ from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.checks import inertial, pressure_and_field, tracks
 from postflight.checks.benchmark_frame import benchmark_frame
+from postflight.checks.oscillation import oscillation_of
 from postflight.checks.track_force import best_comparison, track_force
-from postflight.checks.units_and_axes import TimeBias
+from postflight.checks.units_and_axes import TimeBias, clock_remarks
 from postflight.intake.flight_form import placeholders
 from postflight.streams import write_out
 from postflight.terminal import terminal
@@ -90,12 +91,13 @@ class Report(Tabular):
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON; times that are none become null."""
+        biases = self.time_biases
         return {
             "facts": _rows(self.facts),
             "findings": _rows(self.findings),
             "cross_checks": _rows(self.cross_checks),
             "oddities": _rows(self.cross_checks),  # the former name, until the next release
-            "clocks": _rows(self.time_biases),
+            "clocks": [row | {"worth_a_look": b.is_worth_a_look} for row, b in zip(_rows(biases), biases, strict=True)],
             "assumed": self.assumed,
             "fill_in": self.fill_in,
             "refused": self.refused,
@@ -216,46 +218,54 @@ def _facts(found: Sources) -> list[Fact]:
 def _cross_check(found: Sources, report: Report) -> None:
     """Sensors against each other and against physics."""
     remarks = report.cross_checks
-    remarks += tracks.outside_time(found) + inertial.at_rest(found) + inertial.lever(found)
+    remarks += tracks.outside_time(found) + inertial.at_rest(found) + inertial.lever(found) + inertial.place(found)
     for name, radar in found.radars.items():
         remarks += tracks.free_fall(found, name, radar)
     for name, fixes in found.gnss.items():
         remarks += tracks.receiver_velocity(found, name, fixes)
     suspicious = {f.source for f in remarks}
     trackers = {name: record for name, record in tracks.tracks(found).items() if name not in suspicious}
-    for name, record in trackers.items():
-        _against_accelerometer(found, name, record, report)
     names = list(trackers)
     for k, first in enumerate(names):
         for second in names[k + 1 :]:
             apart, bias = tracks.tracker_pair(found, first, second)
             remarks += apart
             _keep_sharp(report, bias)
+    for name, record in trackers.items():
+        _against_accelerometer(found, name, record, report)
+    swings = oscillation_of(found)
+    remarks += [f for f in swings.remarks if not any(r.code.startswith("accelerometer-") for r in remarks)]
+    _keep_sharp(report, swings.bias)
+    rotation, lag = pressure_and_field.field_rotation(found)
+    if lag is not None:
+        _keep_sharp(report, TimeBias("magnetometer", "rates", *lag))
+    remarks += clock_remarks(report.time_biases, list(found.triads))
+    for record in trackers.values():
+        _axes_and_attitude(found, record, report)
     if trackers:
         _against_place(found, trackers, report)
-    rotation, lag = pressure_and_field.field_rotation(found)
     remarks += rotation
-    if lag is not None:
-        bias = _keep_sharp(report, TimeBias("magnetometer", "rates", *lag))
-        remarks += bias.remarks(*_span(found.triads["magnetometer"].time_s)) if bias else []
     # last: gyros and attitude are only compared where nothing else is suspicious
     remarks += benchmark_frame(found)
 
 
 def _against_accelerometer(found: Sources, name: str, record: RadarRecord | GnssRecord, report: Report) -> None:
-    """Scale, time tags, axes and attitude of the inertial sensors against one track's specific force."""
+    """Scale and time tags of the accelerometer against one track's specific force."""
     sensed, remarks = found.triads.get("accelerometer"), report.cross_checks
     if sensed is None:
         return
-    position = tracks.position_of(record)
-    seen = best_comparison(record.time_s, position, sensed.time_s, sensed.measured_sensor)
+    seen = best_comparison(record.time_s, tracks.position_of(record), sensed.time_s, sensed.measured_sensor)
     if seen is not None and seen.misfit < _FITS:
         if not any(f.source == "accelerometer" for f in remarks):
             remarks += inertial.against_track(found, name, seen)
-        bias = _keep_sharp(report, TimeBias(name, "accelerometer", seen.lag_s, seen.lag_sd_s))
-        remarks += bias.remarks(*_span(record.time_s)) if bias else []
-    force = track_force(record.time_s, position, _FORCE_WIDTH_S)
-    if force is None:
+        _keep_sharp(report, TimeBias(name, "accelerometer", seen.lag_s, seen.lag_sd_s))
+
+
+def _axes_and_attitude(found: Sources, record: RadarRecord | GnssRecord, report: Report) -> None:
+    """Axes and attitude of the inertial sensors against one track's specific force."""
+    remarks = report.cross_checks
+    force = track_force(record.time_s, tracks.position_of(record), _FORCE_WIDTH_S)
+    if force is None or "accelerometer" not in found.triads:
         return
     if not any(f.code == "accelerometer-axes" for f in remarks):
         remarks += inertial.entry_axis(found, force)
@@ -271,10 +281,6 @@ def _keep_sharp(report: Report, bias: TimeBias | None) -> TimeBias | None:
         return None
     report.time_biases.append(bias)
     return bias
-
-
-def _span(time_s: FloatArray) -> tuple[float, float]:
-    return float(time_s[0]), float(time_s[-1])
 
 
 def _against_place(found: Sources, trackers: dict[str, RadarRecord | GnssRecord], report: Report) -> None:
@@ -321,7 +327,8 @@ def print_report(report: Report) -> None:
     for remark in report.cross_checks:
         _line("[red]suspicious[/]", str(remark), remark.code)
     for bias in report.time_biases:
-        _line("time bias", f"{bias.source}: {bias.late_s:+.3f} +/- {bias.sd_s:.3f} s against {bias.against}")
+        mark = "[yellow]worth a look[/] time bias" if bias.is_worth_a_look else "time bias"
+        _line(mark, f"{bias.source}: {bias.late_s:+.3f} +/- {bias.sd_s:.3f} s against {bias.against}")
     for section, sizes in report.assumed.items():
         keys = ", ".join(f"{key} = {size:g}" for key, size in sizes.items())
         _line("[yellow]assumed[/]", f"[{section}] {keys}: not stated in flight.toml", "default-assumed")

@@ -167,6 +167,19 @@ def lever(found: Sources) -> list[Finding]:
     return [Finding("rates", words, float(rates.time_s[0]), float(rates.time_s[-1]), "gyro-unit")]
 
 
+def place(found: Sources) -> list[Finding]:
+    """Check that the accelerometer lies between the nose and the aft end: ``sensor-outside`` or none."""
+    record, vehicle = found.triads.get("accelerometer"), found.vehicle
+    if record is None or vehicle is None:
+        return []
+    x = float(record.spec.position_from_datum_body_m[0])
+    length = vehicle.geometry.centerbody_length_m
+    if -length <= x <= 0.0:
+        return []
+    words = f"lies {x:+.2f} m from the nose, x forward; the vehicle reaches from {-length:.2f} to 0 m: check its sign"
+    return [Finding("accelerometer", words, np.nan, np.nan, "sensor-outside")]
+
+
 def _accelerometer_unit(found: Sources) -> str:
     """Unit in which the accelerometer's columns are read."""
     source = found.spec.sensors.accelerometer

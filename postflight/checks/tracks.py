@@ -248,7 +248,7 @@ def tracker_pair(found: Sources, first: str, second: str) -> tuple[list[Finding]
     Returns
     -------
     findings : list of Finding
-        ``clock-lag``, ``tracker-distance``, or none.
+        ``tracker-distance``, or none.
     bias : TimeBias or None
         Of the second's time tags against the first's, where the distance lies along the motion.
     """
@@ -268,8 +268,8 @@ def tracker_pair(found: Sources, first: str, second: str) -> tuple[list[Finding]
     span = (float(tb[0]), float(tb[-1]))
     lag = _lag_along_motion(ta, pa, tb, other, off, max(9.0 * own**2, (0.1 * distance) ** 2))
     bias = None if lag is None else TimeBias(second, first, lag[0], own / lag[1])
-    if bias is not None and (late := bias.remarks(*span)):
-        return late, bias
+    if bias is not None and bias.is_significant:
+        return [], bias
     if distance > max(_APART_SD * own, _APART_M):
         words = (
             f"{distance / 1000:.3g} km from {first} (median), where their errors are {own:.0f} m: check site, units "

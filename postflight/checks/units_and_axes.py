@@ -8,7 +8,7 @@ cross-check's remark where it exceeds five standard deviations and 0.1 s.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
@@ -23,6 +23,7 @@ Axes = tuple[tuple[int, ...], tuple[int, ...]]
 AS_DECLARED: Axes = ((0, 1, 2), (1, 1, 1))
 _SAME_UNIT = 0.05  # logarithm: a unit explains a ratio within this
 _SIGNIFICANT_SD, _SIGNIFICANT_S = 5.0, 0.1
+_WORTH_A_LOOK_SD = 3.0
 
 
 def unit_of(source: Source, quantity: Quantity) -> str:
@@ -83,16 +84,56 @@ class TimeBias:
     late_s: float
     sd_s: float
 
-    def remarks(self, start_s: float, end_s: float) -> list[Finding]:
-        """Return the cross-check's remark over the span of the comparison; none where the bias is not significant."""
-        if abs(self.late_s) <= max(_SIGNIFICANT_SD * self.sd_s, _SIGNIFICANT_S):
-            return []
-        which = "later" if self.late_s > 0 else "earlier"
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is beyond five standard deviations and 0.1 s."""
+        return abs(self.late_s) > max(_SIGNIFICANT_SD * self.sd_s, _SIGNIFICANT_S)
+
+    @property
+    def is_worth_a_look(self) -> bool:
+        """Whether it is beyond three standard deviations, and not significant."""
+        return abs(self.late_s) > _WORTH_A_LOOK_SD * self.sd_s and not self.is_significant
+
+
+def clock_remarks(biases: list[TimeBias], onboard: Sequence[str]) -> list[Finding]:
+    """Return a remark for each clock that is off, where time biases between pairs are significant.
+
+    A clock that is late by ``x`` is late against each other by ``x``: the clock that explains the biases best (weighted
+    least squares) is named, its part is taken out, and the next one is sought. The sensors ``onboard`` may share one.
+    Of clocks that explain the biases equally well the first in ``biases`` is named.
+    """
+    left, out, named = list(biases), [], set[tuple[str, ...]]()
+    while any(bias.is_significant for bias in left):
+        far = [bias for bias in left if bias.is_significant]
+        names = dict.fromkeys((name,) for bias in far for name in (bias.source, bias.against))
+        clocks = [clock for clock in (*names, tuple(onboard)) if _signs(clock, far).any() and clock not in named]
+        if not clocks:
+            break
+        _, clock, late_s, sd_s = max((_explained(clock, left) for clock in clocks), key=lambda found: found[0])
+        named.add(clock)
+        others = dict.fromkeys(name for b in left for name in (b.source, b.against) if name not in clock)
+        which, name = "later" if late_s > 0 else "earlier", ", ".join(clock)
         words = (
-            f"time tags are {abs(self.late_s):.3f} +/- {self.sd_s:.3f} s {which} than those of {self.against}; "
-            f"if {self.source} is the one in error, add {-self.late_s:.3f} to its time.offset_s"
+            f"time tags are {abs(late_s):.3f} +/- {sd_s:.3f} s {which} than those of {' and '.join(others)}; "
+            f"if {name} is the one in error, add {-late_s:.3f} to its time.offset_s"
         )
-        return [Finding(self.source, words, start_s, end_s, "clock-lag")]
+        out.append(Finding(name, words, np.nan, np.nan, "clock-lag"))
+        signs = _signs(clock, left)
+        left = [replace(b, late_s=b.late_s - late_s * float(sign)) for b, sign in zip(left, signs, strict=True)]
+    return out
+
+
+def _signs(clock: Sequence[str], biases: list[TimeBias]) -> FloatArray:
+    """How much later each pair's first is against its second where this clock is late by one."""
+    return np.array([float(b.source in clock) - float(b.against in clock) for b in biases])
+
+
+def _explained(clock: tuple[str, ...], biases: list[TimeBias]) -> tuple[float, tuple[str, ...], float, float]:
+    """Half the chi-square that one clock explains, the clock, how late it is, s, and the standard deviation."""
+    signs, sd = _signs(clock, biases), np.array([b.sd_s for b in biases])
+    weight = float(np.sum((signs / sd) ** 2))
+    late_s = float(np.sum(signs * np.array([b.late_s for b in biases]) / sd**2)) / weight
+    return 0.5 * late_s**2 * weight, clock, late_s, weight**-0.5
 
 
 def slope_through_mean(x: FloatArray, y: FloatArray) -> tuple[float, float]:

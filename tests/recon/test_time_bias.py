@@ -137,7 +137,7 @@ def test_a_clock_beyond_its_data_sheet_is_estimated_from_the_oscillation(monkeyp
     rates = telemetry.rates
     early = replace(telemetry, rates=replace(rates, time_s=rates.time_s - 0.02))
     lag = time_bias.Lag(0.02, 0.002)
-    monkeypatch.setattr(time_bias, "lag_between", lambda *_: lag)
+    monkeypatch.setattr(time_bias, "lag_between", lambda *_, **__: lag)
     found = reconstruct(early, Settings(output_rate_hz=5.0))
     (check,) = (v for v in found.consistency_checks if v.code == "clock-lag")
     assert not check.passed

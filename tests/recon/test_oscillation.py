@@ -1,0 +1,133 @@
+"""Lag, roll and mirror image of one triad against the other, planted in a vehicle that swings; single faults."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from recon.fault_isolation import isolate_faults
+from recon.imu_screening import bridge
+from recon.oscillation import DELIVERED, LAG, MIRRORED, ROLL, axes_check, oscillation
+from recon.reconstruct import reconstruct
+from recon.settings import Settings
+from recon.single_faults import SingleFault, corrections, likeliest, ranked
+from tests.recon.test_time_bias import swinging
+
+VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
+FAST = Settings(output_rate_hz=5.0)
+
+
+def found(force, rate, vehicle=VEHICLE):
+    return oscillation(bridge(force), bridge(rate, 1), -np.inf, np.inf, vehicle)
+
+
+def turned(record, matrix):
+    return replace(record, measured_sensor=record.measured_sensor @ np.asarray(matrix).T)
+
+
+def about_roll(deg):
+    return Rotation.from_euler("x", deg, degrees=True).as_matrix()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sound_sensors_have_one_clock_and_one_set_of_axes(seed):
+    force, rate = swinging(seed=seed, kicks=1e-3)
+    swings = found(force, rate)
+    assert swings.kind == DELIVERED
+    assert swings.one_set_of_axes
+    assert axes_check(swings, bridge(force), bridge(rate, 1)).passed
+
+
+@pytest.mark.parametrize("late_s", [-1.0, -0.2, 0.06, 0.5])
+def test_lag_of_any_size_is_what_was_planted(late_s):
+    swings = found(*swinging(late_s, kicks=1e-3))
+    assert swings.kind == LAG
+    assert swings.lag_s == pytest.approx(late_s, abs=0.021)
+
+
+@pytest.mark.parametrize("deg", [-60.0, 8.0, 45.0])
+def test_roll_is_what_was_planted_in_either_sensor(deg):
+    force, rate = swinging(kicks=1e-3)
+    for pair in ((turned(force, about_roll(deg)), rate), (force, turned(rate, about_roll(-deg)))):
+        swings = found(*pair)
+        assert swings.kind == ROLL
+        assert np.rad2deg(swings.roll_rad) == pytest.approx(deg, abs=1.0)
+        assert not axes_check(swings, bridge(force), bridge(rate, 1)).passed
+
+
+@pytest.mark.parametrize("slip", [np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, -1.0]), np.eye(3)[[0, 2, 1]]])
+def test_mirror_image_is_undone_by_the_correction_of_either_sensor(mini_sense, slip):
+    telemetry, _ = mini_sense(3)
+    force, rate = swinging(kicks=1e-3)
+    for pair in ((turned(force, slip), rate), (force, turned(rate, slip))):
+        swings = found(*pair)
+        assert swings.kind == MIRRORED
+        assert not swings.one_set_of_axes
+        flight = replace(telemetry, accelerometer=pair[0], rates=pair[1])
+        for one in corrections(flight, swings, None):
+            assert found(one.telemetry.accelerometer, one.telemetry.rates).kind == DELIVERED
+
+
+def test_nothing_is_said_of_a_body_that_is_not_known_or_does_not_swing():
+    force, rate = swinging()
+    assert found(force, rate, None) is None
+    still = 1e-3 * np.random.default_rng(1).standard_normal(rate.measured_sensor.shape)
+    assert found(force, replace(rate, measured_sensor=still)) is None
+
+
+# ---- single faults
+
+
+def test_only_what_explains_the_flight_is_ranked_and_each_source_once():
+    kinds = [("a", 50.0, 1.0), ("a", 60.0, 1.0), ("b", 59.0, 1.1), ("c", 99.0, 3.0), ("d", 2.0, 1.0)]
+    order = ranked([SingleFault("code", name, (name,), gain, misfit) for name, gain, misfit in kinds])
+    assert [(f.sources, f.gain) for f in order] == [(("a",), 60.0), (("b",), 59.0)]
+    assert likeliest(order) == order
+
+
+def wrong_scale(telemetry):
+    record = telemetry.accelerometer
+    return replace(telemetry, accelerometer=replace(record, measured_sensor=1.04 * record.measured_sensor))
+
+
+def wrong_unit(telemetry):
+    record = telemetry.accelerometer
+    return replace(telemetry, accelerometer=replace(record, measured_sensor=record.measured_sensor / 9.80665))
+
+
+def late_radar(telemetry):
+    record = telemetry.radars["west"]
+    return replace(telemetry, radars=telemetry.radars | {"west": replace(record, time_s=record.time_s + 0.02)})
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code", "source"),
+    [
+        (wrong_scale, "scale", "accelerometer"),
+        (wrong_unit, "units-and-signs", "accelerometer"),
+        (late_radar, "time-bias", "west"),
+    ],
+)
+def test_the_source_of_a_single_fault_is_named_first(mini_sense, spoil, code, source):
+    telemetry, _ = mini_sense(46)
+    solution = reconstruct(spoil(telemetry), FAST)
+    first = isolate_faults(solution.consistency_checks, solution.left_out, solution.single_faults)[0]
+    assert first.code == code
+    assert first.sources[0] == source
+
+
+def test_a_tracker_whose_points_are_all_rejected_is_red_and_named(mini_sense):
+    telemetry, _ = mini_sense(46)
+    record = telemetry.radars["west"]
+    late = replace(telemetry, radars=telemetry.radars | {"west": replace(record, time_s=record.time_s + 1.0)})
+    solution = reconstruct(late, FAST)
+    assert [v.passed for v in solution.consistency_checks if (v.code, v.source) == ("edited", "west")] == [False]
+    first = isolate_faults(solution.consistency_checks, solution.left_out, solution.single_faults)[0]
+    assert first.sources == ("west",)
+
+
+def test_a_sound_flight_tries_nothing(mini_sense):
+    telemetry, _ = mini_sense(47)
+    assert reconstruct(telemetry, FAST).single_faults == ()

@@ -1,0 +1,82 @@
+"""The page of wrong inputs: which case is named by what, and how wrong the worst answer is.
+
+``python -m tests.wrong.table FOLDER`` runs every case on the flight in FOLDER, a sound synthetic flight with its truth,
+and prints the page's rows.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from postflight.deflections import METHODS
+from tests.wrong.cases import Case, cases
+from tests.wrong.outcome import Outcome, outcome_of
+from tests.wrong.package import Package, read_package
+
+NAMED, HARMLESS, UNSEEN, REFUSED = "named", "harmless", "not visible", "refused"
+_INPUTS = {  # of the methods' agreement, and whose file states them
+    "aerodynamic coefficients": "vehicle",
+    "initial c.g. offset": "vehicle",
+    "mass properties": "vehicle",
+    "sounded wind": "atmosphere",
+    "sounded density": "atmosphere",
+    "frames": "camera",
+}
+
+
+def first_named(found: Outcome) -> tuple[str, tuple[str, ...]]:
+    """Code and suspects of what is named first; empty where nothing is."""
+    for code, sources in found.named:
+        suspects = tuple(_INPUTS.get(name, name) for source in sources for name in source.split(", ") if name)
+        if suspects:
+            return code, suspects
+    return "", ()
+
+
+def verdict(case: Case, found: Outcome) -> str:
+    """`NAMED` rightly, `REFUSED` by the run, `HARMLESS`, `UNSEEN`, or in words what is wrong."""
+    _, suspects = first_named(found)
+    if set(suspects) & set(case.suspects):
+        return NAMED
+    if any(reason.startswith("run ") for reason in found.refused):
+        return REFUSED
+    if suspects:
+        return f"blames {' or '.join(suspects)}"
+    return UNSEEN if found.is_wrong else HARMLESS
+
+
+def outcomes(package: Package, truth: Path, chosen: list[Case]) -> Iterator[tuple[Case, Outcome]]:
+    """Run cases one after the other."""
+    for case in chosen:
+        wrong = package.copy()
+        if not case.fused:
+            wrong.film = None
+            wrong.spec.pop("frames", None)
+        case.change(wrong)
+        methods = METHODS if case.fused else ("misalignment", "trim")
+        with tempfile.TemporaryDirectory() as folder:
+            yield case, outcome_of(wrong.write(Path(folder) / "flight"), truth, methods)
+
+
+def row(case: Case, found: Outcome) -> str:
+    """One row of the page's table."""
+    code, suspects = first_named(found)
+    by = f"`{code}`: {', '.join(dict.fromkeys(suspects))}" if code else ""
+    worst, size = found.worst
+    error = f"{worst}, {size:.1f}" if found.errors_sd else ""
+    return f"| {case.name} | {by} | {error} | {verdict(case, found)} |"
+
+
+def main(folder: Path) -> None:
+    """Write the rows of every case to standard output."""
+    package = read_package(folder)
+    for case, found in outcomes(package, folder / "truth", cases(package)):
+        sys.stdout.write(row(case, found) + "\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
