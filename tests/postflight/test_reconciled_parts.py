@@ -181,6 +181,18 @@ def test_a_soft_joint_is_estimated_and_a_locked_one_bounded():
     assert row.low == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.parametrize(("of_limit", "bounded"), [(0.88, False), (0.92, True), (0.98, True)])
+def test_a_joint_near_the_frequency_that_windows_resolve_is_bounded(of_limit, bounded):
+    """However small the sd: a faster joint may have been fitted at a false frequency."""
+    nominal = VehicleParameters(VEHICLE).nominal
+    limit = resolved_stiffness_nmprad(nominal) / nominal.joint.bending_stiffness_nmprad
+    found = found_at(float(np.log(limit * of_limit**2)) / STIFFNESS_LOG_SD, (STIFFNESS_LOG_SD / 0.014) ** 2)
+    best = found.problem.vehicle_parameters.vehicle(found.parameters.vehicle).joint.bending_stiffness_nmprad
+    bound = stiffness_bound(found)
+    assert (bound is not None) is bounded
+    assert not bounded or bound <= best
+
+
 def test_the_bound_is_continuous_where_the_tail_is_an_exponential():
     # compliances 9.9 and 10.1 sd below zero by the measurements
     bounds = []

@@ -76,7 +76,7 @@ NOT_RUN = {
     "make demo": "makes an environment from a package registry; `postflight demo` is run",
     "make test": "is this suite",
     "postflight camera my-flight": "serves until it is interrupted; tests/postflight/test_camera_bench.py",
-    "make docs": "makes an environment likewise; tests/test_documentation.py builds the site",
+    "make docs": "makes an environment likewise; tests/postflight/test_site.py builds the site",
     "python -m pytest tests/synthetic_flight tests/recon --junitxml=proofs.xml": "is a part of this suite",
 }
 _WITH_CERTIFICATES = "needs certificates; tests/postflight/test_montecarlo_cluster.py runs a cluster with some"
@@ -93,7 +93,7 @@ NOT_RUN |= dict.fromkeys(
 # blocks that are no commands, or not those alone, by their first line
 SHOWN = (
     "Deflection at the true peak of dynamic pressure", "my-flight/",
-    "export DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION",
+    "export DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION", "docker build",
 )  # fmt: skip
 # what a command leaves, beside its exit code
 WRITES = {
