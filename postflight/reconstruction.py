@@ -233,8 +233,8 @@ def _check_axes(solution: TrajectorySolution) -> None:
     """Raise `GateError` where accelerometer and gyros do not have one set of axes: no loads follow from them."""
     swings = solution.adaptation.oscillation
     if swings is not None and not swings.one_set_of_axes:
-        (check,) = (v for v in solution.consistency_checks if v.code == "axes")
-        raise GateError(f"{check.name}: {check.remark}", "axes")
+        (check,) = (v for v in solution.consistency_checks if v.code == "triads-axes")
+        raise GateError(f"{check.name}: {check.remark}", "triads-axes")
 
 
 def air_data(trajectory: Trajectory, flight: Flight) -> AirData:

@@ -52,7 +52,7 @@ _AIR_CODES = ("sounding", "pre-flight-drag", "sounding-density", "sounding-wind"
 _AIR_SOURCES = {code: "vehicle" if code.startswith("pre-flight") else "atmosphere" for code in _AIR_CODES}
 _SHARED_CODES = ("place", "sites")  # about what all trackers share
 _INERTIAL = ("accelerometer", "rates")
-_ABOUT_BOTH = ("clock-lag", "axes")
+_ABOUT_BOTH = ("clock-lag", "triads-axes")
 INFLATION = 3.0  # times the estimate: wide enough not to pull, for the estimate was already pulled
 
 

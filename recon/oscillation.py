@@ -237,5 +237,13 @@ def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) ->
         advice = "check the mount and the column order of both"
     value = max(found.gain, LOG_LIKELIHOOD_LIMIT + 1.0) if off else 0.0
     return consistency_check(
-        "axes", f"axes of {names}", value, 0.0, LOG_LIKELIHOOD_LIMIT, good, bad, advice=advice, component=found.kind
+        "triads-axes",
+        f"axes of {names}",
+        value,
+        0.0,
+        LOG_LIKELIHOOD_LIMIT,
+        good,
+        bad,
+        advice=advice,
+        component=found.kind,
     )

@@ -220,7 +220,7 @@ def _single_faults(telemetry: Telemetry, settings: Settings, solution: Trajector
             continue
         found.append(SingleFault(one.code, one.words, one.sources, likelihood - stated, misfit))
     # what the oscillation has shown needs no other proof: the trackers only say which of the two it is
-    shown = known.lag is not None or (bool(found) and found[0].code == "axes")
+    shown = known.lag is not None or (bool(found) and found[0].code == "triads-axes")
     return single_faults.ranked(found, shown)
 
 

@@ -123,11 +123,13 @@ def corrections(telemetry: Telemetry, found: Oscillation | None, lag: Lag | None
     turn = Rotation.from_rotvec([found.roll_rad, 0.0, 0.0]).as_matrix()
     if found.kind == ROLL:
         words = [f"{name}: mounting about roll" for name in TRIADS]
-        return _of_either("axes", words, telemetry, _turned(force, turn.T), _turned(rate, turn))
+        return _of_either("triads-axes", words, telemetry, _turned(force, turn.T), _turned(rate, turn))
     words = [f"{name}: order or sign of its axes" for name in TRIADS]
     flip = np.diag([1.0, 1.0, -1.0])
     opposite = np.diag([1.0, -1.0, -1.0])
-    return _of_either("axes", words, telemetry, _turned(force, opposite @ turn @ flip), _turned(rate, turn @ flip))
+    return _of_either(
+        "triads-axes", words, telemetry, _turned(force, opposite @ turn @ flip), _turned(rate, turn @ flip)
+    )
 
 
 def _of_either(

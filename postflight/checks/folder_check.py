@@ -29,7 +29,6 @@ from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.checks import inertial, pressure_and_field, tracks
 from postflight.checks.benchmark_frame import benchmark_frame
-from postflight.checks.oscillation import oscillation_of
 from postflight.checks.track_force import best_comparison, track_force
 from postflight.checks.units_and_axes import TimeBias, clock_remarks
 from postflight.intake.flight_form import placeholders
@@ -233,6 +232,8 @@ def _cross_check(found: Sources, report: Report) -> None:
             _keep_sharp(report, bias)
     for name, record in trackers.items():
         _against_accelerometer(found, name, record, report)
+    from postflight.checks.oscillation import oscillation_of  # with the filter's package, where there are tables
+
     swings = oscillation_of(found)
     remarks += [f for f in swings.remarks if not any(r.code.startswith("accelerometer-") for r in remarks)]
     _keep_sharp(report, swings.bias)
