@@ -206,8 +206,10 @@ def _single_faults(telemetry: Telemetry, settings: Settings, solution: Trajector
     if not candidates:
         prior_sd = dict(zip(solution.sensor_errors.name, solution.sensor_errors.prior_sd, strict=True))
         candidates = single_faults.singles(telemetry, trackers(telemetry, settings), prior_sd)
+    coarse = replace(settings, output_rate_hz=min(settings.output_rate_hz, 1.0), pulse_rate_hz=0.0)
     try:
-        stated, _ = _log_likelihood(Single("", "", (), telemetry), settings, known)
+        as_stated = _coarse_problem(telemetry, coarse, known)
+        stated, _ = _log_likelihood(Single("", "", (), telemetry), as_stated, coarse)
     except GateError:
         return ()
     found: list[SingleFault] = []
@@ -215,7 +217,9 @@ def _single_faults(telemetry: Telemetry, settings: Settings, solution: Trajector
         return ()
     for one in candidates:
         try:
-            likelihood, misfit = _log_likelihood(one, settings, known)
+            # most hypotheses are of the data as delivered, whose screening and integration take the time
+            problem = as_stated if one.telemetry is telemetry else _coarse_problem(one.telemetry, coarse, known)
+            likelihood, misfit = _log_likelihood(one, problem, coarse)
         except GateError:
             continue
         found.append(SingleFault(one.code, one.words, one.sources, likelihood - stated, misfit))
@@ -224,11 +228,13 @@ def _single_faults(telemetry: Telemetry, settings: Settings, solution: Trajector
     return single_faults.ranked(found, shown)
 
 
-def _log_likelihood(one: Single, settings: Settings, known: Adaptation) -> tuple[float, float]:
-    """Log likelihood of thinned tracking data under a hypothesis, and the innovations' mean square."""
-    coarse = replace(settings, output_rate_hz=min(settings.output_rate_hz, 1.0), pulse_rate_hz=0.0)
-    sensors = bridge_inertial_sensors(one.telemetry, replace(known, rejected_offsets=()))
-    problem = build_problem(one.telemetry, coarse, sensors, known.rejected_points)
+def _coarse_problem(telemetry: Telemetry, coarse: Settings, known: Adaptation) -> Problem:
+    sensors = bridge_inertial_sensors(telemetry, replace(known, rejected_offsets=()))
+    return build_problem(telemetry, coarse, sensors, known.rejected_points)
+
+
+def _log_likelihood(one: Single, problem: Problem, coarse: Settings) -> tuple[float, float]:
+    """Log likelihood of thinned tracking data of a problem under a hypothesis, and the innovations' mean square."""
     problem = fault_isolation.with_inflated_priors(problem, one.inflated_sd)
     thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(_THINNED_STEP_S)
     reference = None
