@@ -230,10 +230,9 @@ def mean_over(history: DeflectionHistory, span_s: tuple[float, float]) -> tuple[
     """
     known = np.isfinite(history.theta_rad)
     t = history.time_s[known]
-    inside = np.array([*span_s, *t[(t > span_s[0]) & (t < span_s[1])]])
-    if len(inside) < 5 or not (t[0] <= span_s[0] and span_s[1] <= t[-1]):
+    at = np.array([span_s[0], *t[(t > span_s[0]) & (t < span_s[1])], span_s[1]])
+    if len(at) < 5 or not (t[0] <= span_s[0] and span_s[1] <= t[-1]):
         return float("nan"), float("nan")
-    at = np.sort(inside)
     if np.diff(at).max() > HOLE_FACTOR * np.median(np.diff(t)):
         return float("nan"), float("nan")
     values = (np.interp(at, t, x[known]) for x in (history.theta_rad, history.theta_sd_rad))

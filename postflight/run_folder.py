@@ -38,6 +38,7 @@ from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import Deflections, quantiles_at
 from postflight.filming import NO_VIDEO
 from postflight.reconstruction import Reconstruction, bet_table
+from recon.measurements import component_unit
 
 DIGITS = "%.10g"
 _COPY = "copy the flight folder to where you may write"
@@ -252,9 +253,9 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflec
     np.savez_compressed(run.path / "covariance.npz", t_s=slow["t_s"], covariance=slow["covariance"])
     run.write_csv("peaks.csv", peak_table(flight, table))
     run.write_csv("residual_statistics.csv", in_degrees(residual_statistics(flight), "mean", "sd"))
-    for name, table_of in (("residuals", bet.residuals), ("withheld", bet.held_out)):
-        if name == "residuals" or len(table_of):
-            run.write_csv(f"{name}.csv", in_degrees(_with_units(table_of), "residual", "predicted_sd"))
+    run.write_csv("residuals.csv", _residuals(bet.residuals))
+    if len(bet.held_out):
+        run.write_csv("withheld.csv", _residuals(bet.held_out))
     of_deflection = () if answers is None else answers.consistency_checks
     checks = pd.DataFrame([vars(v) for v in (*flight.consistency_checks, *of_deflection)])
     run.write_csv("consistency_checks.csv", checks)
@@ -484,19 +485,10 @@ def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["peak", "column", "t_s", "value", "sd", "inside"])
 
 
-def _unit(source: str, component: str) -> str:
-    """SI unit of a component's residuals."""
-    if "velocity" in f"{source} {component}" or component == "range rate":
-        return "m/s"
-    if component.startswith(("field", "rate ")):
-        return "T" if component.startswith("field") else "rad/s"
-    return "rad" if component in ("azimuth", "elevation") else "m"
-
-
-def _with_units(residuals: pd.DataFrame) -> pd.DataFrame:
-    """Residuals with the unit of each row."""
-    pairs = zip(residuals["source"], residuals["component"], strict=True)
-    return residuals.assign(unit=[_unit(source, component) for source, component in pairs])
+def _residuals(residuals: pd.DataFrame) -> pd.DataFrame:
+    """Residuals as they are written: each row with its unit, angles in degrees."""
+    with_units = residuals.assign(unit=residuals["component"].map(component_unit))
+    return in_degrees(with_units, "residual", "predicted_sd")
 
 
 def in_degrees(table: pd.DataFrame, *columns: str) -> pd.DataFrame:
@@ -521,7 +513,7 @@ def residual_statistics(flight: Reconstruction) -> pd.DataFrame:
     for (source, component), part in flight.solution.residuals.groupby(["source", "component"], sort=False):
         good = part[part["accepted"]]
         r, z = good["residual"].to_numpy(), (good["residual"] / good["predicted_sd"]).to_numpy()
-        unit = _unit(source, component)
+        unit = component_unit(component)
         values = (np.nan,) * 4
         if len(r) > 2:
             values = (float(r.mean()), float(r.std(ddof=1)), float(np.sqrt((z**2).mean())), _lag1(z))

@@ -41,7 +41,7 @@ from recon.ekf import Problem
 from recon.imu_screening import TransientOffset
 from recon.measurements import SITES
 from recon.oscillation import Oscillation
-from recon.single_faults import SingleFault, likeliest
+from recon.single_faults import TRIADS, SingleFault, likeliest
 from recon.state import KINEMATIC
 from recon.time_bias import ClockJump, Lag
 
@@ -51,7 +51,6 @@ _ABOUT_SOURCES = ("nis", "whiteness", "edited", "data-sheet")  # codes of checks
 _AIR_CODES = ("sounding", "pre-flight-drag", "sounding-density", "sounding-wind", "pre-flight-ca", "force-residuals")
 _AIR_SOURCES = {code: "vehicle" if code.startswith("pre-flight") else "atmosphere" for code in _AIR_CODES}
 _SHARED_CODES = ("place", "sites")  # about what all trackers share
-_INERTIAL = ("accelerometer", "rates")
 _ABOUT_BOTH = ("clock-lag", "triads-axes")
 INFLATION = 3.0  # times the estimate: wide enough not to pull, for the estimate was already pulled
 
@@ -373,7 +372,7 @@ def _single_hypothesis(singles: tuple[SingleFault, ...]) -> tuple[FaultHypothesi
 
 def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) -> tuple[FaultHypothesis, ...]:
     """What the failed checks and the comparison of trackers say."""
-    inertial = [v for v in failed if v.code == "data-sheet" and v.source in _INERTIAL]
+    inertial = [v for v in failed if v.code == "data-sheet" and v.source in TRIADS]
     inertial += [v for v in failed if v.code in _ABOUT_BOTH]
     shared = [v for v in failed if v.code in _SHARED_CODES or (v.code == "data-sheet" and v.source == SITES)]
     out = [FaultHypothesis(f"radar sites: {v.remark}", "sites", (v.source,)) for v in shared]
@@ -430,7 +429,7 @@ def _tracker_hypothesis(
 
 def _single_tracker_hypothesis(failed: list[ConsistencyCheck]) -> list[FaultHypothesis]:
     """What can be concluded where no tracker could be left out."""
-    about = [v for v in failed if v.code in _ABOUT_SOURCES and not (v.code == "data-sheet" and v.source in _INERTIAL)]
+    about = [v for v in failed if v.code in _ABOUT_SOURCES and not (v.code == "data-sheet" and v.source in TRIADS)]
     about = [v for v in about if not is_generous(v)]
     if not about:
         return []
@@ -449,7 +448,7 @@ def _inertial(checks: list[ConsistencyCheck]) -> str:
 
 
 def _inertial_sources(checks: list[ConsistencyCheck]) -> tuple[str, ...]:
-    names = [name for v in checks for name in ((v.source,) if v.source else _INERTIAL)]
+    names = [name for v in checks for name in ((v.source,) if v.source else TRIADS)]
     return tuple(dict.fromkeys(names))
 
 

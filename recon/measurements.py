@@ -61,6 +61,15 @@ SLOT_NAMES: dict[int, tuple[str, ...]] = {
 }
 
 
+def component_unit(component: str) -> str:
+    """SI unit of a component's readings and residuals."""
+    if component.startswith(("field", "rate ")):
+        return "T" if component.startswith("field") else "rad/s"
+    if component.startswith("velocity") or component == "range rate":
+        return "m/s"
+    return "rad" if component in ("azimuth", "elevation") else "m"
+
+
 @dataclass(frozen=True)
 class Instrument:
     """One source of measurements and all that it measured.

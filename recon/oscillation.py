@@ -39,7 +39,7 @@ from recon.time_bias import CORRELATION_S, SLOWEST_S, has_gap, smoothed_body_axe
 ComplexArray = NDArray[np.complex128]
 DELIVERED, LAG, ROLL, MIRRORED = "as delivered", "lag", "roll", "mirrored"
 _WINDOW_S, _STEP_S = 4.0, 0.02
-_LONGEST_LAG_S, _LAG_STEP_S = 1.5, 0.02  # of a clock that was set wrongly; beyond it trackers show it by themselves
+_LONGEST_LAG_S, LAG_STEP_S = 1.5, 0.02  # of a clock that was set wrongly; beyond it trackers show it by themselves
 _ROLL_STEP_RAD = np.deg2rad(1.0)
 _MOST_WINDOWS = 24  # those with the largest lateral force: enough, and quick on a long flight
 _LEAST_WINDOWS = 4
@@ -67,7 +67,7 @@ class Oscillation:
     gain : float
         Its log likelihood over that of the data as delivered.
     lag_s : float
-        How much later the accelerometer's tags are than the gyros', to `_LAG_STEP_S`; zero for other kinds.
+        How much later the accelerometer's tags are than the gyros', to `LAG_STEP_S`; zero for other kinds.
     roll_rad, roll_sd_rad : float
         How far the accelerometer is turned about +x against the gyros; of `MIRRORED` the phase.
     windows : int
@@ -123,8 +123,8 @@ def oscillation(
     if vehicle is None or max(np.median(np.diff(t.time_s)) for t in (force, rate)) > SLOWEST_S:
         return None
     aft = bool(force.spec.position_from_datum_body_m[0] <= vehicle.cg_m[0])
-    steps = round(_LONGEST_LAG_S / _LAG_STEP_S)
-    lags = np.asarray(_LAG_STEP_S * np.arange(-steps, steps + 1), dtype=np.float64)
+    steps = round(_LONGEST_LAG_S / LAG_STEP_S)
+    lags = np.asarray(LAG_STEP_S * np.arange(-steps, steps + 1), dtype=np.float64)
     found = _normal_equations(force, rate, start_s, end_s, lags)
     if found is None:
         return None

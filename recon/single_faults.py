@@ -30,7 +30,7 @@ from recon.ekf import ForwardPass, Problem
 from recon.oscillation import MIRRORED, ROLL, Oscillation
 from recon.time_bias import Lag
 
-WIDER = 30.0  # times the stated sd: a misaligned or mistimed sensor is some tens of its data sheet's sd off
+WIDER = 30.0  # times the stated sd: a misaligned or mistimed sensor is some tens of them off
 _NOISIER = 10.0
 _G, _DEGREE = earth.STANDARD_GRAVITY_MPS2, np.pi / 180.0
 _UNIT_SLIPS = {"accelerometer": (_G, 1.0 / _G), "rates": (_DEGREE, 1.0 / _DEGREE)}

@@ -11,9 +11,7 @@ from flightmodel.flightfolder import Sources
 from flightmodel.telemetry import Finding
 from postflight.checks.units_and_axes import TimeBias
 from recon.imu_screening import bridge
-from recon.oscillation import DELIVERED, LAG, Oscillation, axes_check, oscillation
-
-_LAG_SD_S = 0.01  # half a step of the lags that are tried
+from recon.oscillation import DELIVERED, LAG, LAG_STEP_S, Oscillation, axes_check, oscillation
 
 
 class Swings(NamedTuple):
@@ -36,7 +34,7 @@ def oscillation_of(found: Sources) -> Swings:
     if swings is None:
         return Swings([], None)
     if swings.kind in (DELIVERED, LAG):
-        return Swings([], TimeBias("accelerometer", "rates", swings.lag_s, _LAG_SD_S))
+        return Swings([], TimeBias("accelerometer", "rates", swings.lag_s, LAG_STEP_S / 2.0))
     check = axes_check(swings, *sensors)
     span = float(force.time_s[0]), float(force.time_s[-1])
     return Swings([Finding("accelerometer, rates", check.remark, *span, "triads-axes")], None)

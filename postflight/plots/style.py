@@ -177,13 +177,15 @@ def ellipses(ax: Axes, mean: FloatArray, covariance: FloatArray) -> None:
         ax.plot(*(mean[:, None] + size * circle), color=COLOUR["estimate"], ls=stroke, label=f"{size:g} sd")
 
 
-def residual_unit(component: str) -> tuple[float, str]:
-    """Scale and unit in which a component's residuals are drawn."""
-    if component.startswith("velocity"):
-        return 1.0, "m/s"
-    if component.startswith("field"):
-        return 1e6, "uT"
-    return (1e3, "mrad") if component in ("azimuth", "elevation") else (1.0, "m")
+_DRAWN = {
+    "rad": (1e3, "mrad"), "deg": (1e3 * np.pi / 180.0, "mrad"), "T": (1e6, "uT"),
+    "rad/s": (1e3, "mrad/s"), "deg/s": (1e3 * np.pi / 180.0, "mrad/s"),
+}  # fmt: skip
+
+
+def drawn_unit(unit: str) -> tuple[float, str]:
+    """Scale and unit in which residuals of a unit are drawn."""
+    return _DRAWN.get(unit, (1.0, unit))
 
 
 def note(figure: Figure, words: str) -> None:

@@ -11,10 +11,11 @@ from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import difference, resample
 from postflight.attitude import AttitudeCheck
-from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, in_style, legend_above, limits, residual_unit, stamp
+from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, drawn_unit, in_style, legend_above, limits, stamp
 from postflight.reconstruction import Reconstruction
 from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.atmosphere import ReconstructedAir
+from recon.measurements import component_unit
 
 _LEAST_LOST = 1e-3  # of the filter's variance that the smoother takes away, for a difference to be drawn
 
@@ -53,7 +54,7 @@ def figure_residuals(flight: Reconstruction) -> Figure:
     figure = Figure(figsize=(7.2, 1.5 * len(pairs) + 0.8))
     axes = figure.subplots(len(pairs), 1, sharex=True, squeeze=False)[:, 0]
     for ax, ((source, component), rows) in zip(axes, pairs, strict=True):
-        scale, unit = residual_unit(component)
+        scale, unit = drawn_unit(component_unit(component))
         good = rows["accepted"].to_numpy(dtype=bool)
         t, r = rows["time_s"].to_numpy(), scale * rows["residual"].to_numpy()
         sd = scale * rows["predicted_sd"].to_numpy()

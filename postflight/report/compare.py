@@ -6,7 +6,6 @@ The page is made of the report's own parts (panels, scripts, styles, policy) and
 from __future__ import annotations
 
 import shutil
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from postflight.deflections import METHODS
 from postflight.plots.style import COLOUR, LABEL, MANY, PAGE
 from postflight.report.panels import Panel, line_of, panel_of, quantities_drawn, with_holes
 from postflight.report.source import kept_rows, rounded
-from postflight.report.text import cell
+from postflight.report.text import cell, date
 from postflight.report.write import pulse_window, rendered
 from postflight.run_folder import DIGITS, answer_table, plain_text
 from postflight.runs import RunTables, find_run, is_complete, read_tables
@@ -244,16 +243,12 @@ def page(compared: RunComparison, over_time: pd.DataFrame) -> str:
         title=_title(compared),
         flights=sorted({run.header["flight"] for run in compared.runs}),
         synthetic=any(run.header["synthetic"] for run in compared.runs),
-        date=_date(parse_utc(first.header["epoch_utc"])),
+        date=date(first.header["epoch_utc"]),
         values={"names": _value_names(compared), "rows": value_rows(compared), "more": 0},
         checks=_check_rows(compared),
         inputs=_input_rows(compared),
         correlated=any(relation.kind == CORRELATED for relation in compared.relations),
     )
-
-
-def _date(epoch: datetime) -> str:
-    return f"{epoch.day} {epoch:%B %Y}"
 
 
 def _title(compared: RunComparison) -> str:

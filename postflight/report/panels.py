@@ -19,10 +19,11 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR
 from postflight.deflections import METHODS
-from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, residual_unit
+from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, drawn_unit
 from postflight.report.source import Rows, Run, kept_rows, rounded
 from postflight.run_folder import answer_table, read_csv
 from postflight.studies.preflight import inside
+from recon.measurements import component_unit
 
 _TRAJECTORY_ROWS, _RAW_POINTS, _TRACK_POINTS, _RESIDUAL_POINTS = 6000, 8000, 6000, 16000
 _BLUE, _GREY, _DARK = COLOUR["estimate"], COLOUR["prior"], COLOUR["limit"]
@@ -199,9 +200,8 @@ def residual_panels(run: Run) -> list[Panel]:
     pairs = list(table.assign(together=together).groupby(["source", "component"], sort=False))
     out: list[Panel] = []
     for (source, component), rows in pairs:
-        scale, unit = residual_unit(component)
-        if "unit" in rows and rows["unit"].iloc[0] == "deg":  # a run of version 0.1 has none, and radians
-            scale *= float(np.deg2rad(1.0))
+        # a run of version 0.1 states no units, and wrote SI
+        scale, unit = drawn_unit(str(rows["unit"].iloc[0]) if "unit" in rows else component_unit(component))
         r, sd = (scale * rows[c].to_numpy(float) for c in ("residual", "predicted_sd"))
         good = rows["accepted"].to_numpy(bool)
         kept = kept_rows([r, np.where(good, np.nan, r)], _RESIDUAL_POINTS // len(pairs))

@@ -36,6 +36,12 @@ SHOWN_ROWS = 200
 _NEAR_PEAK_S, _OSCILLATES_SD = 1.0, 4.0  # window about the peak; range in it that one number does not describe
 
 
+def date(utc: str) -> str:
+    """Day of a UTC time as it is read: ``17 August 2009``."""
+    day = parse_utc(utc)
+    return f"{day.day} {day:%B %Y}"
+
+
 def _utc(run: Run, time_s: float) -> str:
     """Clock time of a mission time, ``12:59:20.62``."""
     stamp = parse_utc(run.telemetry.t0_utc) + timedelta(seconds=float(time_s), milliseconds=5)

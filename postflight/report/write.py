@@ -33,7 +33,7 @@ from postflight.report.source import Run, read_run, rounded
 _NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
 STYLES = ("uPlot.min.css", "page.css")
-PARTS = "parts.html"  # macros that the pages share
+SHARED = ("head.html", "parts.html")  # what the pages share: how they begin, and macros
 # what a script element must not hold literally: its own end, a comment's start, and line ends of JavaScript alone
 _ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
@@ -90,7 +90,7 @@ def rendered(template: str, data: dict[str, Any], **texts: Any) -> str:
     variables = " ".join(f"--{name}: {value};" for name, value in PAGE.items())
     style = "\n".join([f":root {{ {variables} }}", *(read(name) for name in STYLES)])
     environment = Environment(
-        loader=DictLoader({name: read(name) for name in (template, PARTS)}),
+        loader=DictLoader({name: read(name) for name in (template, *SHARED)}),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -122,7 +122,6 @@ def _texts(run: Run) -> dict[str, Any]:
         "peaks": "Peak values",
     }
     checks, again = run.checks, run.tables.get("sensitivity")
-    day = parse_utc(run.telemetry.t0_utc)
     return {
         "title": text.title(run),
         "lead": text.lead(run),
@@ -137,7 +136,7 @@ def _texts(run: Run) -> dict[str, Any]:
         "settings": [(k, text.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
         "assumed": stated_errors.assumed(run),
         "measured": stated_errors.measured(run),
-        "date": f"{day.day} {day:%B %Y}",
+        "date": text.date(run.telemetry.t0_utc),
     }
 
 
