@@ -280,7 +280,7 @@ def evidence_of_balance(
     averaged_s : float
         As in `Evidence`.
     with_inputs : bool
-        False leaves the responses to inputs out.
+        False leaves the responses to inputs and the noise out.
     """
     vehicle = loads.vehicle
     known: BoolArray = np.asarray(np.isfinite(swing.theta_yz_rad).all(axis=1))
@@ -311,13 +311,14 @@ def evidence_of_balance(
         moved = [left(replace(loads, **{name: values + step * e})) for e in np.eye(values.shape[1])]
         return np.asarray(-solve @ np.stack([column(m, step) for m in moved], -1))
 
-    by_force, by_turning = history("specific_force_body_mps2", _FORCE_MPS2), np.zeros((len(base), 2, 3))
-    if loads.angular_acceleration_sd_radps2 > 0.0:
-        by_turning = history("angular_acceleration_body_radps2", _TURN_RADPS2)
-    noise = loads.force_noise_sd_mps2**2 * by_force @ by_force.transpose(0, 2, 1)
-    noise += loads.angular_acceleration_sd_radps2**2 * by_turning @ by_turning.transpose(0, 2, 1)
     inputs: dict[str, FloatArray] = {}
+    noise = np.zeros((len(base), 2, 2))
     if with_inputs:
+        by_force = history("specific_force_body_mps2", _FORCE_MPS2)
+        noise += loads.force_noise_sd_mps2**2 * by_force @ by_force.transpose(0, 2, 1)
+        if loads.angular_acceleration_sd_radps2 > 0.0:
+            by_turning = history("angular_acceleration_body_radps2", _TURN_RADPS2)
+            noise += loads.angular_acceleration_sd_radps2**2 * by_turning @ by_turning.transpose(0, 2, 1)
         by_flow = history("flow_yz_rad", _THETA_RAD)
         inputs = {name: by_flow @ part for name, part in flow_inputs(loads).items()}
         own = by_force @ loads.force_root_mps2 + history("rate_body_radps", _RATE_RADPS) @ loads.rate_root_radps

@@ -118,6 +118,18 @@ class Spline:
 
 
 @dataclass(frozen=True)
+class SplineDeflection:
+    """Lateral vectors (n, 2) over time, of a spline's coefficients (count, 2), rad."""
+
+    spline: Spline
+    coefficients: FloatArray
+
+    def __call__(self, time_s: FloatArray, derivative: int = 0) -> FloatArray:
+        """Vectors or their derivatives at times (n,)."""
+        return self.spline.rows(time_s, derivative) @ self.coefficients
+
+
+@dataclass(frozen=True)
 class NormalEquations:
     """Normal equations of the deflection's spline and of the inputs' unit normals, without the process's prior.
 
@@ -216,8 +228,7 @@ class NormalEquations:
 
     def history(self, found: FloatArray) -> Deflection:
         """Lateral vectors (n, 2) of a solution, from times."""
-        coefficients = found[: 2 * self.spline.count].reshape(-1, 2)
-        return lambda time_s, derivative=0: self.spline.rows(time_s, derivative) @ coefficients
+        return SplineDeflection(self.spline, found[: 2 * self.spline.count].reshape(-1, 2))
 
 
 def _undetermined(method: str) -> DivergenceError:

@@ -98,7 +98,7 @@ def misalignment_evidence(loads: FlightLoads, about: Deflection | None = None, w
     about : callable, optional
         Deflection about which the reading is linear; None: the reading itself.
     with_inputs : bool
-        False leaves the responses to inputs out.
+        False leaves the responses to inputs and the noise out.
     """
     swing = _own_swing(loads) if about is None else Swing.of(about, loads.time_s)
     return evidence_of_balance("misalignment", force_residual, loads, swing, _AVERAGED_S, with_inputs)

@@ -162,8 +162,14 @@ def nearest_index(grid: FloatArray, at: FloatArray) -> IntArray:
 
 
 def interpolate_rows(at: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
-    """Linear interpolation of each column of ``values`` (n, m) given at ``t``."""
-    return np.column_stack([np.interp(at, t, column) for column in values.T])
+    """Linear interpolation of each column of ``values`` (n, m) given at ``t``; outside, the first and last row."""
+    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, max(len(t) - 2, 0))
+    after = np.minimum(k + 1, len(t) - 1)
+    inside = np.clip(at, t[0], t[-1]) - t[k]
+    slope = (values[after] - values[k]) / np.where(after > k, t[after] - t[k], 1.0)[:, None]
+    out = np.asarray(slope * inside[:, None] + values[k])
+    out[at >= t[-1]] = values[-1]
+    return out
 
 
 def move_point(trajectory: Trajectory, to: str, to_from_point_body_m: FloatArray) -> Trajectory:

@@ -23,20 +23,17 @@ from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate
+from postflight.drawing import DrawingProcess
 from postflight.filming import NO_VIDEO, by_camera
 from postflight.flight import Flight, read_flight
-from postflight.plots import run_figures
-from postflight.plots.deflection import figure_summary
-from postflight.plots.overlay import write_overlay_film
-from postflight.plots.style import draw
 from postflight.progress import progress_bar
-from postflight.reconstruction import Reconstruction, reconstruct
+from postflight.reconstruction import Reconstruction, bet_table, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
 from postflight.score import PAPER_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import write_out
-from postflight.studies.preflight import rigid_bounds
+from postflight.studies.preflight import Bounds, rigid_bounds
 from postflight.terminal import terminal
 from recon.consistency import ConsistencyCheck
 from recon.setup import check_sources
@@ -135,7 +132,7 @@ def print_events(flown: list[Event]) -> None:
 def run(folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False) -> None:
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers.
 
-    The answers are printed before figures and report are made.
+    The answers are printed before tables, figures and report are written.
     """
 
     def show_answers(bet: Reconstruction, answers: Deflections, events: pd.DataFrame) -> None:
@@ -157,7 +154,8 @@ def run_flight(
 ) -> tuple[Reconstruction, Deflections, Path]:  # fmt: skip
     """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too.
 
-    ``show_answers`` is called with trajectory, deflections and events once their tables are written.
+    ``show_answers`` is called with trajectory, deflections and events before anything is written. Figures are drawn by
+    a second process, made ready meanwhile.
     """
     log: list[str] = []
 
@@ -172,51 +170,61 @@ def run_flight(
 
         return step
 
-    with progress_bar() as report:
-        step = steps(report)
-        flight = asked_for.of(read_flight(folder, step(0.0, 0.05)))
-        compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *(["camera"] if "camera" in methods else []))
-        bet = reconstruct(flight, None, step(0.05, 0.7))
-        wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
-        answers = estimate(bet, wanted, step(0.7, 1.0))
-    if "camera" in methods and "camera" not in wanted:
-        answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
-    settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
-    if flight.changes:
-        settings["changes"] = list(flight.changes)
-    with run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read) as out:
-        event_rows = run_folder.write_reconstruction(out, bet, answers)
-        run_folder.write_answers(out, answers)
-        out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
-        show_answers(bet, answers, run_folder.read_csv(out.path / "events.csv"))
+    with DrawingProcess() as drawing:
         with progress_bar() as report:
-            _write_rest(out, bet, answers, reruns, steps(report))
+            bet, answers = _answered(folder, methods, asked_for, steps(report))
+        flight, table = bet.flight, bet_table(bet)
+        event_rows = run_folder.event_table(bet, table)
+        show_answers(bet, answers, event_rows)
+        settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
+        if flight.changes:
+            settings["changes"] = list(flight.changes)
+        new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
+        with new as out, progress_bar() as report:
+            step = steps(report)
+            run_folder.write_reconstruction(out, bet, answers, table)
+            run_folder.write_answers(out, answers)
+            out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
+            bounds, reran = _write_rest(out, bet, answers, reruns, step)
+            step(0.9, 1.0)(0.0, "drawing, and writing the report")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
             (out.path / "log.jsonl").write_text(lines)
             out.write_facts()
-            write_report(folder, out.path, flight.telemetry)
+            with drawing.at_work(bet, answers, out.path / "figures", bounds, reran):
+                write_report(folder, out.path, flight.telemetry)
     return bet, answers, out.path
+
+
+def _answered(
+    folder: Path, methods: tuple[str, ...], asked_for: Asked, step: Callable[[float, float], Progress]
+) -> tuple[Reconstruction, Deflections]:
+    """Trajectory and deflections; a camera without video is among the methods that were refused."""
+    flight = asked_for.of(read_flight(folder, step(0.0, 0.05)))
+    own = warmup.ESTIMATES if "camera" in methods else warmup.ESTIMATES[:1]
+    compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
+    bet = reconstruct(flight, None, step(0.05, 0.7))
+    wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
+    answers = estimate(bet, wanted, step(0.7, 1.0))
+    if "camera" in methods and "camera" not in wanted:
+        answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
+    return bet, answers
 
 
 def _write_rest(
     out: run_folder.RunFolder, bet: Reconstruction, answers: Deflections, reruns: bool,
     step: Callable[[float, float], Progress],
-) -> None:  # fmt: skip
-    """Write what comes after the answers: further tables, then, every table written, the figures."""
-    share = 0.3 if reruns else 1.0  # of the time, for all but the reruns
+) -> tuple[Bounds | None, pd.DataFrame | None]:  # fmt: skip
+    """Write what comes after the answers; return the rigid vehicle's bounds and the sensitivity, for the figures."""
     if "camera" in answers.histories:
         out.write_csv("camera_sensitivity.csv", camera_sensitivity(bet.flight, answers.histories["camera"]))
     bounds, table = None, None
     if bet.loads is not None:
-        bounds = rigid_bounds(bet, progress=step(0.0, 0.4 * share))
+        bounds = rigid_bounds(bet, progress=step(0.1, 0.2 if reruns else 0.9))
         out.write_csv("rigid_bounds.csv", bounds.table())
     if reruns:
-        table = sensitivity(bet, step(0.4 * share, 0.7))
+        table = sensitivity(bet, step(0.2, 0.9))
         out.write_csv("sensitivity.csv", table)
-    run_figures.draw_run(bet, answers, out.path / "figures", step(0.7 if reruns else 0.4, 1.0), bounds)
-    if table is not None:
-        run_figures.draw_sensitivity(bet, table, out.path / "figures")
-    step(1.0, 1.0)(0.0, "writing the report")
+    return bounds, table
 
 
 @dataclass(frozen=True)
@@ -381,6 +389,9 @@ def deflection(
     folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None, film: bool = False
 ) -> None:
     """Estimate the deflection alone; the camera needs no trajectory, and is corrected where one can be made."""
+    from postflight.plots.overlay import write_overlay_film
+    from postflight.plots.run_figures import draw_camera
+
     assumed = {"camera_plane_lv_deg": plane_deg, "joint_station_m": joint_m}
     flight = read_flight(folder, needs_path=set(methods) != {"camera"})
     flight = flight.with_(**{name: value for name, value in assumed.items() if value is not None})
@@ -408,7 +419,7 @@ def deflection(
             run_folder.write_answers(out, answers)
             if "camera" in answers.histories:
                 history = answers.histories["camera"]
-                run_figures.draw_camera(flight, history, out.path / "figures")
+                draw_camera(flight, history, out.path / "figures")
                 if film:
                     for name, (seen, own) in by_camera(telemetry, history).items():
                         file = "overlay.webm" if len(telemetry.films) == 1 else f"overlay_{name}.webm"
@@ -476,10 +487,13 @@ def print_score(result: Score) -> None:
 
 def demo(folder: Path, seed: int) -> None:
     """Fly, reconstruct, estimate, and only then look at the truth."""
+    from postflight.plots.deflection import figure_summary
+    from postflight.plots.style import draw
+
     check_destination(folder, replace=True)
     begun = time.perf_counter()
     console.print("A synthetic flight of an IRVE-II-class vehicle. The estimators see telemetry/ only.")
-    compile_kernels("simulator", "ensembles", *warmup.RECONSTRUCTION, "camera")
+    compile_kernels("simulator", "ensembles", *warmup.RECONSTRUCTION, *warmup.ESTIMATES)
     simulate(REFERENCE, folder, seed, force=True)
     bet, answers, written = run_flight(folder, METHODS, Asked())
     print_flight(bet, run_folder.read_csv(written / "events.csv"))

@@ -109,6 +109,15 @@ def _tables() -> None:
     kernels.read_rows(data, 0, 4, slots, kernels.EXACT_TENS, *powers, np.empty((1, 1)), spans, 0)
 
 
+def _balance() -> None:
+    from estimators import _balance_kernels as kernels
+
+    vehicle, one, rows = _vehicle_at_rest()[0], np.ones(1), np.zeros((1, 3))
+    common = rows, rows, np.zeros((1, 2)), one, one, vehicle.aero.mach, vehicle.aero.coefficients, np.empty((1, 2))
+    kernels.force_left(np.ones(kernels.COUNT), np.zeros((3, 1, 2)), rows, *common)
+    kernels.moment_left(np.ones(kernels.COUNT), np.zeros((3, 1, 2)), one, *common)
+
+
 def _camera() -> None:
     """Orient a camera on one synthetic frame, and fit it."""
     from estimators.benchmark import orient_camera
@@ -129,9 +138,10 @@ GROUPS: dict[str, Callable[[], None]] = {
     "filter": _filter,
     "smoothers": _smoothers,
     "tables": _tables,
+    "balance": _balance,
     "camera": _camera,
 }
-RECONSTRUCTION = ("filter", "smoothers")
+RECONSTRUCTION, ESTIMATES = ("filter", "smoothers"), ("balance", "camera")
 
 
 def _stamp(group: str) -> Path | None:

@@ -112,8 +112,8 @@ def bridge(record: TriadRecord, sensor: int = 0, rejected: tuple[TransientOffset
     column, density = np.empty((len(grid), 3)), np.empty((len(grid), 3))
     in_gap = np.zeros(len(grid), dtype=bool)
     errors: dict[tuple[float, float], dict[str, float]] = {}
-    masks: list[BoolArray] = list(np.unique(good, axis=1).T)  # axes that miss the same samples are bridged together
-    for mask in masks:
+    masks = {axis.tobytes(): axis for axis in good.T}  # axes that miss the same samples are bridged together
+    for mask in masks.values():
         axes = np.flatnonzero((good == mask[:, None]).all(axis=0))
         column[:, axes], density[:, axes], gaps, sizes_by_span = _bridge_axes(
             spec, t[mask], x[np.ix_(mask, axes)], grid, _Unused(t, excluded[:, axes], stop[:, axes])

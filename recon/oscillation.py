@@ -174,7 +174,7 @@ def _normal_equations(
 ) -> tuple[_Normal, _Normal] | None:
     """Normal equations of the proper relation at all lags and of the mirrored one at none; None without windows."""
     (ft, f), (wt, w) = smoothed_body_axes(force), smoothed_body_axes(rate)
-    turn = np.gradient(w, wt, axis=0)
+    rates = np.column_stack([w, np.gradient(w, wt, axis=0)[:, 1:]])
     start = max(start_s, ft[0], wt[0] + _LONGEST_LAG_S)
     end = min(end_s, ft[-1], wt[-1] - _LONGEST_LAG_S)
     begins = [b for b in np.arange(start, end - _WINDOW_S, _WINDOW_S) if not (has_gap(force, b) or has_gap(rate, b))]
@@ -198,11 +198,11 @@ def _normal_equations(
         row = []
         for lag in (*lags, np.nan):
             at = begins[k] + (u + 0.5) * _WINDOW_S - np.nan_to_num(lag)
-            rates, turns = interpolate_rows(at, wt, w), interpolate_rows(at, wt, turn)
-            lateral, normal = rates[:, 1] + 1j * rates[:, 2], turns[:, 1] + 1j * turns[:, 2]
+            p, q, r, q_dot, r_dot = interpolate_rows(at, wt, rates).T
+            lateral, normal = q + 1j * r, q_dot + 1j * r_dot
             if np.isnan(lag):
                 lateral, normal = lateral.conj(), normal.conj()
-            columns = fast(np.column_stack([1j * normal, u * 1j * normal, rates[:, 0] * lateral]))
+            columns = fast(np.column_stack([1j * normal, u * 1j * normal, p * lateral]))
             gram = (columns.conj().T @ columns).real
             row.append((gram + 1e-12 * np.trace(gram) * np.eye(3), columns.conj().T @ forces[k]))
         rows.append(row)

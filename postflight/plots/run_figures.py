@@ -12,7 +12,7 @@ import pandas as pd
 
 from estimators.loads import FlightLoads
 from estimators.trim import static_trim
-from flightmodel.checks import GateError, Progress
+from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
 from postflight.deflections import Deflections
 from postflight.filming import by_camera
@@ -40,13 +40,17 @@ _PAPER_OFFSETS_M = (0.01, 0.0254)  # of the c.g., beside the vehicle's own, as i
 
 
 def draw_run(
-    flight: Reconstruction, answers: Deflections, folder: Path, report: Progress, bounds: Bounds | None = None
+    flight: Reconstruction,
+    answers: Deflections,
+    folder: Path,
+    bounds: Bounds | None = None,
+    reran: pd.DataFrame | None = None,
 ) -> None:
     """Draw everything that the run's answers allow, Figure 1.3 where the rigid vehicle's ``bounds`` are given.
 
-    A figure that fails costs itself alone, with a `postflight.plots.style.FigureWarning`.
+    ``reran`` is the table of `postflight.sensitivity`. A figure that fails costs itself alone, with a
+    `postflight.plots.style.FigureWarning`.
     """
-    report(0.0, "drawing")
     if bounds is not None:
         draw(folder / "figure_1_3.png", figure_1_3, flight, bounds)
     if flight.loads is not None:
@@ -73,7 +77,8 @@ def draw_run(
         _draw_static_trim(flight.loads, flight.flight, folder)
     if answers.histories:
         draw(folder / "summary.png", figure_summary, flight, answers)
-    report(1.0, "drawn")
+    if reran is not None and reran["quantity"].notna().any():
+        draw(folder / "sensitivity.png", figure_sensitivity, flight, reran)
 
 
 def _stamped(figure: Callable[Parameters, Figure], flight: Flight) -> Callable[Parameters, Figure]:
@@ -100,12 +105,6 @@ def _draw_static_trim(pulse: FlightLoads, flight: Flight, folder: Path) -> None:
     title = f"Static trim at {pressure:.0f} Pa, Mach {mach:.1f} (AIAA 2011-2571, Figure 2.9)"
     stiffness = vehicle.joint.bending_stiffness_nmprad
     draw(folder / "figure_2_9.png", _stamped(figure_2_9, flight), static, offsets, stiffness, title)
-
-
-def draw_sensitivity(flight: Reconstruction, table: pd.DataFrame, folder: Path) -> None:
-    """Draw the changes in the reruns, where any succeeded."""
-    if table["quantity"].notna().any():
-        draw(folder / "sensitivity.png", figure_sensitivity, flight, table)
 
 
 def draw_camera(flight: Flight, history: DeflectionHistory, folder: Path) -> None:

@@ -17,6 +17,7 @@ from estimators.trim import moment_term, solve_trim, trim_evidence, trim_model
 from flightmodel import airdata, earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
 from synthetic_flight.simulate import fly, state_from_ecef
+from tests.oracles.plain_balance import axes, relative_rate
 
 from .conftest import VEHICLE
 
@@ -224,10 +225,10 @@ def test_the_shell_s_rate_is_the_derivative_of_its_axes():
     # of swings that go round: differences of the matrices, whose skew part is the rate
     rng, step = np.random.default_rng(6), 1e-6
     swing = Swing(rng.uniform(-0.5, 0.5, (40, 2)), rng.uniform(-3.0, 3.0, (40, 2)), np.zeros((40, 2)))
-    ahead, behind = (Swing.held(swing.theta_yz_rad + s * swing.rate_yz_radps).axes for s in (step, -step))
-    turning = (ahead - behind) / (2.0 * step) @ swing.axes.transpose(0, 2, 1)
+    ahead, behind = (axes(Swing.held(swing.theta_yz_rad + s * swing.rate_yz_radps)) for s in (step, -step))
+    turning = (ahead - behind) / (2.0 * step) @ axes(swing).transpose(0, 2, 1)
     rate = np.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], axis=-1)
-    np.testing.assert_allclose(swing.relative_rate, rate, atol=1e-8)
+    np.testing.assert_allclose(relative_rate(swing), rate, atol=1e-8)
 
 
 def test_what_is_left_of_the_moments_is_a_shift_of_the_cg():
