@@ -11,7 +11,7 @@ oem        CCSDS Orbit Ephemeris Message 2.0 (KVN): Earth-fixed states, covarian
 
 A file is written whole or not at all, with the same bytes for the same run. Deflections have times of their own; in the
 tables their two components are interpolated separately (a clock angle jumps at 360 deg), and left empty outside and
-in gaps. KML heights are meant above sea level and written above the WGS-84 ellipsoid, which the description says.
+in gaps. KML heights are above mean sea level: EGM96, as the format has it.
 
 References
 ----------
@@ -35,6 +35,7 @@ from rich import markup
 
 from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
 from flightmodel.config import parse_utc
+from flightmodel.geoid import undulation_m
 from flightmodel.guarded_files import file_bytes, open_file
 from postflight.run_folder import DIGITS, read_csv
 from postflight.runs import find_run
@@ -285,11 +286,10 @@ def _kml(source: Source) -> bytes:
     t = table["t_s"].to_numpy()
     keep = np.flatnonzero(np.diff(np.floor((t - t[0]) / _KML_STEP_S + 1e-9), prepend=-1.0) > 0.0)
     keep = np.unique(np.append(keep, len(t) - 1))
-    place = table[["lon_deg", "lat_deg", "alt_m"]].to_numpy()
-    description = (
-        f"{source.title}; {source.header['point']}. Heights are above the WGS-84 ellipsoid, drawn as above sea level: "
-        "up to 107 m apart."
-    )
+    latitude, longitude = np.deg2rad(table[["lat_deg", "lon_deg"]].to_numpy().T)
+    above_sea_m = table["alt_m"].to_numpy() - undulation_m(latitude, longitude)
+    place = np.column_stack([table[["lon_deg", "lat_deg"]].to_numpy(), above_sea_m])
+    description = f"{source.title}; {source.header['point']}. Heights are above mean sea level (EGM96)."
     whens = "".join(f"<when>{source.utc(t[k])}Z</when>\n" for k in keep)
     track = "".join(f"<gx:coord>{' '.join(f'{v:.9g}' for v in place[k])}</gx:coord>\n" for k in keep)
     line = "\n".join(",".join(f"{v:.9g}" for v in place[k]) for k in keep)

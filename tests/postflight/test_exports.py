@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from flightmodel.checks import ConfigError, GateError
+from flightmodel.geoid import undulation_m
 from postflight import exports, run_folder
 from postflight.cli import cli
 from postflight.deflections import Deflections
@@ -130,7 +131,9 @@ def test_kml_by_an_xml_parser(written, folder, run_table):
     assert (np.diff(pd.to_datetime(whens).astype("int64")) > 0).all()
     source = read_source(folder)
     t = (pd.to_datetime(whens, utc=True) - source.epoch).total_seconds()
-    np.testing.assert_allclose(coords[:, 2], np.interp(t, run_table.t_s, run_table.alt_m), atol=0.01)
+    above = np.interp(t, run_table.t_s, run_table.alt_m) - coords[:, 2]  # the ellipsoid
+    np.testing.assert_allclose(above, undulation_m(*np.deg2rad(coords[:, 1::-1].T)), atol=0.01)
+    assert abs(above).min() > 1.0
     np.testing.assert_allclose(coords[:, 0], np.interp(t, run_table.t_s, run_table.lon_deg), atol=1e-7)
     line = root.find(f".//{KML}LineString/{KML}coordinates").text.split()
     assert len(line) == len(coords)
