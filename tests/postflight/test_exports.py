@@ -18,6 +18,7 @@ from postflight.deflections import Deflections
 from postflight.exports import read_source
 from postflight.flight import read_flight
 from postflight.reconstruction import reconstruct
+from tests.refusing import refuses
 
 FLIGHT = Path(__file__).parents[1] / "data" / "real_flights" / "rocketpy_prometheus"
 KML = "{http://www.opengis.net/kml/2.2}"
@@ -168,6 +169,13 @@ def test_oem_by_another_reader(written, run_table):
     wanted = run_table[["rx_ecef_sd_m", "ry_ecef_sd_m", "rz_ecef_sd_m"]].iloc[0]
     np.testing.assert_allclose(sd[:3], wanted, rtol=1e-6)
     assert (np.linalg.eigvalsh(first) > 0.0).all()
+
+
+def test_attitude_that_is_not_known_is_refused(folder):
+    """The recorded rocket has no gyros."""
+    for form in ("aem", "msopck"):
+        with refuses("attitude-missing"):
+            exports.FORMS[form][0](read_source(folder))
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "mat", "nc", "kml", "oem"])
