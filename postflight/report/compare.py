@@ -15,12 +15,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.checks import ConfigError, Fault, GateError, writing
-from flightmodel.config import parse_utc
 from flightmodel.partial_files import abandoned, partial_path
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
-from postflight.plots.style import COLOUR, LABEL, MANY, PAGE
-from postflight.report.compare_other import OTHER_TABLES, compare_with_other, print_other
+from postflight.plots.style import LABEL, MANY
+from postflight.report.compare_other import OTHER_TABLES, charts, compare_with_other, print_other
 from postflight.report.panels import Panel, line_of, panel_of, quantities_drawn, with_holes
 from postflight.report.source import kept_rows, rounded
 from postflight.report.text import cell, date
@@ -238,21 +237,9 @@ def page(compared: RunComparison, over_time: pd.DataFrame) -> str:
     first = compared.runs[0]
     bet = first.tables["bet"]
     spans = [run.tables["bet"]["t_s"] for run in compared.runs]
-    data = {
-        "t0_ms": round(1e3 * parse_utc(first.header["epoch_utc"]).timestamp()),
-        "span": [float(min(t.iloc[0] for t in spans)), float(max(t.iloc[-1] for t in spans))],
-        "colours": PAGE | {"residual": COLOUR["estimate"]},
-        "pulse": pulse_window(bet),
-        "first": pulse_window(bet),
-        "peak": round(first.peak_s, 3),
-        "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in first.tables["events"].itertuples()],
-        "panels": [*_deflection_panels(compared), *_trajectory_panels(compared)],
-        "rigid": [],
-        "studies": _difference_panels(compared, over_time),
-        "residuals": [],
-        "solid": None,
-        "frames": [],
-    }
+    whole = [float(min(t.iloc[0] for t in spans)), float(max(t.iloc[-1] for t in spans))]
+    panels = [*_deflection_panels(compared), *_trajectory_panels(compared)]
+    data = charts(first, whole, pulse_window(bet), panels, _difference_panels(compared, over_time))
     return rendered(
         "compare.html",
         data,

@@ -18,6 +18,7 @@ from postflight.intake.other_trajectory import read_other
 from postflight.plots.style import COLOUR, PAGE
 from postflight.report.panels import Panel, line_of, panel_of
 from postflight.report.source import kept_rows, rounded
+from postflight.report.text import date
 from postflight.report.write import pulse_window, rendered
 from postflight.runs import RunTables, trajectory_of
 from postflight.systematic_differences import SystematicDifferences, systematic_differences
@@ -110,29 +111,42 @@ def _chi_square_cells(found: SystematicDifferences) -> tuple[list[str], list[lis
 
 
 def _page(run: RunTables, found: SystematicDifferences, tables: dict[str, pd.DataFrame]) -> str:
-    t = found.time_s
-    bet = run.tables["bet"]
-    data = {
-        "t0_ms": round(1e3 * parse_utc(run.header["epoch_utc"]).timestamp()),
-        "span": [float(t[0]), float(t[-1])],
-        "colours": PAGE | {"residual": COLOUR["estimate"]},
-        "pulse": pulse_window(bet),
-        "first": [float(t[0]), float(t[-1])],
-        "peak": round(run.peak_s, 3),
-        "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in run.tables["events"].itertuples()],
-        "panels": _panels(found, tables["differences_over_time"]),
-        "rigid": [],
-        "studies": [],
-        "residuals": [],
-        "solid": None,
-        "frames": [],
-    }
+    span = [float(found.time_s[0]), float(found.time_s[-1])]
+    data = charts(run, span, span, _panels(found, tables["differences_over_time"]), [])
     effects, chi_square = (
         {"names": names, "rows": rows, "more": 0} for names, rows in (_effect_cells(found), _chi_square_cells(found))
     )
     return rendered(
-        "compare_other.html", data, run=run, found=found, effects=effects, chi_square=chi_square, title=_title(found)
+        "compare_other.html",
+        data,
+        run=run,
+        found=found,
+        effects=effects,
+        chi_square=chi_square,
+        title=_title(found),
+        date=date(run.header["epoch_utc"]),
     )
+
+
+def charts(
+    run: RunTables, span: list[float], first: list[float], panels: list[Panel], studies: list[Panel]
+) -> dict[str, Any]:
+    """What the page's scripts draw: whole time and the part shown first, events of a run, panels of two sections."""
+    return {
+        "t0_ms": round(1e3 * parse_utc(run.header["epoch_utc"]).timestamp()),
+        "span": span,
+        "colours": PAGE | {"residual": COLOUR["estimate"]},
+        "pulse": pulse_window(run.tables["bet"]),
+        "first": first,
+        "peak": round(run.peak_s, 3),
+        "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in run.tables["events"].itertuples()],
+        "panels": panels,
+        "rigid": [],
+        "studies": studies,
+        "residuals": [],
+        "solid": None,
+        "frames": [],
+    }
 
 
 def _title(found: SystematicDifferences) -> str:
