@@ -26,7 +26,7 @@ An effect is ``beyond`` the covariances where a component exceeds 3.3 (99.9 %) o
 a fault of one of the two. Effects within are there all the same, and faults where the two share data or solution.
 
 Two effects have a known size. Inertial velocity is named where its estimated factor is 1 within 3 sd and 1 %. The datum
-is taken as it is or not at all: whichever needs fewer effects, and a shift that is likelier under both sd.
+is taken as it is or not at all: whichever needs fewer effects, and leaves the likelier shift.
 
 Chi-square per degree of freedom is averaged over epochs; however errors are correlated in time its mean is 1, and above
 its 99.9 % quantile for one epoch the covariances do not explain the difference.
@@ -44,6 +44,7 @@ from functools import cached_property
 
 import numpy as np
 import pandas as pd
+from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from flightmodel import earth, rotations
@@ -261,7 +262,7 @@ def systematic_differences(
     stated = _stated(best.fit, covariance_time_s, covariance, other)
     if np.abs(best.fit.undulation_m).min() > _LEAST_UNDULATION_M:
         by_datum = _Fit(run, other, has_attitude, best.fit.start_s, datum=True).explained()
-        gain = by_datum.odds_over(best) + by_datum.prior_odds(stated) - best.prior_odds(stated)
+        gain = by_datum.odds_over(best) + _shift_odds(by_datum, best, stated)
         best = by_datum if gain > _LEAST_ODDS else best
     return _result(best, stated, other)
 
@@ -495,14 +496,6 @@ class _Explained:
         out[self.used] = np.sqrt((self._gain() ** 2 * self.noise.sd_effective**2).sum(axis=(1, 2)))
         return out
 
-    def prior_odds(self, covariances: tuple[FloatArray, ...]) -> float:
-        """Log odds of the shift's size, normal with what the difference and both covariances allow."""
-        if "shift" not in self.names:
-            return 0.0
-        at = self.fit.slices["shift"]
-        allowed = np.hypot(self.sd(), self.stated_sd(covariances))[at]
-        return -0.5 * float(np.sum((self.x[at] / allowed) ** 2))
-
     def stated_sd(self, covariances: tuple[FloatArray, ...]) -> FloatArray:
         """Sd (count,) where errors with these covariances (n, m, m) each keep their value over the flight."""
         gain, variance = self._gain(), np.zeros(int(self.used.sum()))
@@ -515,6 +508,22 @@ class _Explained:
         out = np.full(self.fit.count, np.nan)
         out[self.used] = np.sqrt(variance)
         return out
+
+
+def _shift_odds(one: _Explained, other: _Explained, covariances: tuple[FloatArray, ...]) -> float:
+    """Log odds of the size of the shift that one set of effects leaves, over that of another; no shift is one of zero.
+
+    What both covariances allow is the largest scale of a shift; two files of one solution differ by far less. So its
+    scale is any from a thousandth of that on, evenly in its logarithm.
+    """
+    having = [found for found in (one, other) if "shift" in found.names]
+    if not having:
+        return 0.0
+    at = one.fit.slices["shift"]
+    sd, allowed = having[0].sd()[at], having[0].stated_sd(covariances)[at]
+    variance = (np.geomspace(1e-3, 1.0, 60)[:, None] * allowed) ** 2 + sd**2
+    logs = [logsumexp(-0.5 * (found.x[at] ** 2 / variance + np.log(variance)).sum(axis=1)) for found in (one, other)]
+    return float(logs[0] - logs[1])
 
 
 # the covariances
