@@ -134,11 +134,12 @@ def _read_oem(path: Path, text: str, epoch: datetime) -> OtherTrajectory:
     rows = []
     for line, cells in message.states:
         try:
-            rows.append([_seconds(cells[0], epoch), *map(float, cells[1:7])])
-        except (ValueError, IndexError):
-            raise _oem_syntax(path, line, "a time and six numbers are wanted") from None
-        if len(rows[-1]) != 7:
+            row = [_seconds(cells[0], epoch), *map(float, cells[1:7])]
+        except ValueError:
+            row = []
+        if len(row) != 7 or not np.isfinite(row).all():
             raise _oem_syntax(path, line, "a time and six numbers are wanted")
+        rows.append(row)
     table = np.array(rows, dtype=float).reshape(-1, 7)
     table = table[np.append(np.diff(table[:, 0]) != 0.0, True)] if len(table) else table  # segments share their ends
     times, covariance, skipped = _oem_covariances(path, message, epoch)
@@ -188,7 +189,7 @@ def _oem_covariances(path: Path, message: _Oem, epoch: datetime) -> tuple[FloatA
         try:
             for k, cells in enumerate(rows):
                 matrix[k, : k + 1] = np.array(cells, dtype=float)
-            if len(rows) != 6:
+            if len(rows) != 6 or not np.isfinite(matrix).all():
                 raise ValueError
             times.append(_seconds(stamp, epoch))
         except ValueError:

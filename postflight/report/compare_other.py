@@ -78,14 +78,14 @@ def print_other(found: SystematicDifferences) -> None:
 def _print_table(title: str, names: list[str], rows: list[list[str]]) -> None:
     table = Table(title=title)
     for k, name in enumerate(names):
-        table.add_column(name, justify="right" if k else "left")
+        table.add_column(name, justify="right" if k else "left", no_wrap=not k)
     for row in rows:
         table.add_row(*map(escape, row))
     console.print(table)
 
 
 def _effect_cells(found: SystematicDifferences) -> tuple[list[str], list[list[str]]]:
-    names = ["effect", "component", "value", "sd by the difference", "sd by the covariances", "unit", "beyond both"]
+    names = ["effect", "component", "value", "sd", "allowed sd", "unit", "beyond"]
     rows = [
         [
             str(r.effect),

@@ -232,6 +232,7 @@ def test_oem_times_by_day_of_year_and_accelerations(tmp_path):
         ("ITRF-97", "EME2000", {"oem-frame"}),
         ("= UTC", "= GPS", {"oem-time-system"}),
         ("6377.0 1.0 2.0 0.1 0.2 0.3", "6377.0 1.0 2.0 0.1 0.2", {"oem-syntax"}),
+        ("6377.0", "nan", {"oem-syntax"}),
         ("12:52:01.5", "12:52:03.5", {"time-order"}),
         ("2009-08-17T12:52:01.500000 6377.0", "", {"oem-syntax"}),
     ],
