@@ -19,8 +19,8 @@ Gauss-Newton on the exact effects, chosen one by one (and dropped again) by a li
 variance of its own residuals, and ``n / g`` independent ones of ``n``, ``g = 1 + 2 sum rho_k`` up to the first
 correlation that is not positive. An effect of p parameters is named where it gains ``ln 1000`` over ``p/2 ln (n/g)``.
 Its sd follows from the same residuals: how well the difference itself shows it. What the two covariances allow is
-another number (``stated_sd``): the sd of the effect where the errors of each trajectory, independent between the two,
-keep their value over the flight, which errors of surveys, biases and clocks do.
+another number (``stated_sd``): the largest sd of the effect that errors with these covariances have, whatever their
+correlation in time, independent between the two: ``sum_k sqrt(G_k P_k G_k')`` with the estimator's rows ``G_k``.
 
 An effect is ``beyond`` the covariances where a component exceeds 3.3 (99.9 %) of the root of both variances: then it is
 a fault of one of the two. Effects within are there all the same, and faults where the two share data or solution.
@@ -262,8 +262,10 @@ def systematic_differences(
     stated = _stated(best.fit, covariance_time_s, covariance, other)
     if np.abs(best.fit.undulation_m).min() > _LEAST_UNDULATION_M:
         by_datum = _Fit(run, other, has_attitude, best.fit.start_s, datum=True).explained()
-        gain = by_datum.odds_over(best) + _shift_odds(by_datum, best, stated)
-        best = by_datum if gain > _LEAST_ODDS else best
+        # the same effects with a shift in the datum's place: what else differs must not speak for the datum
+        without = best.fit.solved(tuple(dict.fromkeys((*by_datum.names, "shift"))))
+        gains = [by_datum.odds_over(rival) + _shift_odds(by_datum, rival, stated) for rival in (best, without)]
+        best = by_datum if min(gains) > _LEAST_ODDS else best
     return _result(best, stated, other)
 
 
@@ -391,17 +393,17 @@ class _Fit:
 
     def explained(self) -> _Explained:
         """The effects that the difference bears, added one by one and dropped where others have made them needless."""
-        current = self._solved(("time-offset",) if self.start_s else (), np.zeros(self.count))
+        current = self.solved(("time-offset",) if self.start_s else ())
         while len(current.names) < len(self.names):
             trials = [
-                self._solved((*current.names, name), current.x) for name in self.names if name not in current.names
+                self.solved((*current.names, name), current.x) for name in self.names if name not in current.names
             ]
             best = max((t for t in trials if self._possible(t)), key=lambda t: t.odds_over(current), default=None)
             if best is None or best.odds_over(current) < _LEAST_ODDS:
                 break
             current = best
             for name in current.names[:-1]:
-                fewer = self._solved(tuple(n for n in current.names if n != name), current.x)
+                fewer = self.solved(tuple(n for n in current.names if n != name), current.x)
                 if self._possible(fewer) and current.odds_over(fewer) < _LEAST_ODDS:
                     current = fewer
         return current
@@ -413,8 +415,9 @@ class _Fit:
         at = self.slices["inertial-velocity"]
         return bool(abs(float(fit.x[at][0]) - 1.0) < 3.0 * float(fit.sd()[at][0]) + 0.01)
 
-    def _solved(self, names: tuple[str, ...], x: FloatArray) -> _Explained:
+    def solved(self, names: tuple[str, ...], x: FloatArray | None = None) -> _Explained:
         """Weighted least squares of some effects, weights by their own residuals; the other effects are none."""
+        x = np.zeros(self.count) if x is None else x
         used = np.zeros(self.count, dtype=bool)
         for name in names:
             used[self.slices[name]] = True
@@ -497,14 +500,11 @@ class _Explained:
         return out
 
     def stated_sd(self, covariances: tuple[FloatArray, ...]) -> FloatArray:
-        """Sd (count,) where errors with these covariances (n, m, m) each keep their value over the flight."""
+        """Largest sd (count,) that errors with these covariances (n, m, m) give, whatever their correlation in time."""
         gain, variance = self._gain(), np.zeros(int(self.used.sum()))
         for covariance in covariances:
-            vectors_of = np.linalg.eigh(covariance)
-            root = vectors_of[1] * np.sqrt(np.maximum(vectors_of[0], 0.0))[:, None, :]
-            root = root @ np.swapaxes(vectors_of[1], 1, 2)  # symmetric, so that neighbours have neighbouring roots
-            together = np.einsum("pni,nij->pj", gain, root)
-            variance += (together**2).sum(axis=1)
+            each = np.einsum("pni,nij,pnj->pn", gain, covariance, gain)
+            variance += np.sqrt(np.maximum(each, 0.0)).sum(axis=1) ** 2
         out = np.full(self.fit.count, np.nan)
         out[self.used] = np.sqrt(variance)
         return out
