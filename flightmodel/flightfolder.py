@@ -385,8 +385,9 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
         )
         gate.findings.append(Finding("motion", words, np.nan, np.nan, code="inertial-unused"))
     measured = spec.atmosphere is not None
+    place = _first_place(radars, gnss)
     barometers = {
-        name: read_barometer(gate, name, entry, sounding, measured) for name, entry in spec.barometers.items()
+        name: read_barometer(gate, name, entry, sounding, measured, place) for name, entry in spec.barometers.items()
     }
     films = _films(gate, spec, vehicle)
     prior = _attitude_prior(gate, spec.attitude_prior, radars, gnss) if spec.attitude_prior else None

@@ -26,6 +26,7 @@ from pydantic import BaseModel, Field, create_model, model_validator
 
 from flightmodel.checks import Fault, FloatArray
 from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place, Section
+from flightmodel.geoid import undulation_m
 from flightmodel.tables import Declared, Source
 
 Sd = Annotated[float, Field(ge=1e-12, le=1e6)]  # its square is a number that can be divided by
@@ -629,22 +630,19 @@ class Heights(TrackingSource):
     geoid_undulation_m: Undulation | None = None
 
     @model_validator(mode="after")
-    def _undulation_known(self) -> Heights:
-        if self.height_is == "msl" and self.geoid_undulation_m is None:
-            words = (
-                "heights above mean sea level need geoid_undulation_m, the height of the geoid above the WGS-84 "
-                "ellipsoid at the place (EGM96 or EGM2008; -107 to 85 m)"
-            )
-            raise KeyFaults([("height_is", self.height_is, words)])
+    def _undulation_meant(self) -> Heights:
         if self.height_is != "msl" and self.geoid_undulation_m is not None:
             words = 'is used only with height_is = "msl"; say that, or remove it'
             raise KeyFaults([("geoid_undulation_m", self.geoid_undulation_m, words)])
         return self
 
-    @property
-    def to_ellipsoid_m(self) -> float:
-        """What is added to a height of the table."""
-        return self.geoid_undulation_m or 0.0
+    def to_ellipsoid_m(self, latitude_rad: FloatArray | float, longitude_rad: FloatArray | float) -> FloatArray:
+        """What is added to heights of the table at places (...,), m: the stated undulation, else EGM96's."""
+        if self.height_is != "msl":
+            return np.zeros(np.shape(latitude_rad))
+        if self.geoid_undulation_m is not None:
+            return np.full(np.shape(latitude_rad), self.geoid_undulation_m)
+        return undulation_m(latitude_rad, longitude_rad)
 
 
 @with_keys(GNSS.file_keys())

@@ -45,6 +45,7 @@ from flightmodel.instruments import (
     FramesEntry,
     GnssEntry,
     GnssSpec,
+    Heights,
     MagnetometerEntry,
     RadarEntry,
     RadarSite,
@@ -184,7 +185,7 @@ def _positions(gate: Gate, table: Table, source: GnssEntry) -> FloatArray | None
         _refuse_fixes(gate, table, radius < LEAST_RADIUS_M, "lies inside the Earth")
         return np.where(np.isfinite(radius)[:, None], position, np.nan)
     if source.height_is is None:
-        words = 'alt is above what? write height_is = "ellipsoid", or height_is = "msl" with geoid_undulation_m'
+        words = 'alt is above what? write height_is = "ellipsoid" or height_is = "msl"'
         gate.refuse_config(f"{table.label}: {words}; the two differ by up to 107 m", "height-datum")
         return None
     gate.refuse_rows(table, "lat", -0.5 * np.pi, 0.5 * np.pi, "no latitude")
@@ -192,8 +193,19 @@ def _positions(gate: Gate, table: Table, source: GnssEntry) -> FloatArray | None
     lat, lon, alt = (table.columns[short] for short in GEODETIC)
     gate.refuse_rows(table, "lon", -2.0 * np.pi, 2.0 * np.pi, "no longitude")
     _refuse_fixes(gate, table, (lat == 0.0) & (lon == 0.0), "is at latitude and longitude 0")
-    position = earth.ecef_from_geodetic(lat, lon, alt + source.to_ellipsoid_m)
+    undulation = source.to_ellipsoid_m(lat, lon)
+    _note_geoid(gate, table.label.rpartition(".")[2], source, undulation)
+    position = earth.ecef_from_geodetic(lat, lon, alt + undulation)
     return np.where(np.isfinite(lat + lon + alt)[:, None], position, np.nan)
+
+
+def _note_geoid(gate: Gate, name: str, source: Heights, undulation_m: FloatArray) -> None:
+    """Name what was added to heights above sea level where flight.toml states no undulation."""
+    if source.height_is == "msl" and source.geoid_undulation_m is None and np.isfinite(undulation_m).any():
+        low, high = np.nanmin(undulation_m), np.nanmax(undulation_m)
+        size = f"{low:.1f} m" if high - low < 0.1 else f"{low:.1f} to {high:.1f} m"
+        words = f"heights above mean sea level became ellipsoidal with EGM96's undulation, {size}"
+        gate.findings.append(Finding(name, words, np.nan, np.nan, code="undulation-by-model"))
 
 
 def _refuse_fixes(gate: Gate, table: Table, bad: BoolArray, words: str) -> None:
@@ -236,18 +248,24 @@ def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: Fl
 
 
 def read_barometer(
-    gate: Gate, name: str, source: BarometerEntry, sounding: Sounding | None, measured_air: bool
+    gate: Gate,
+    name: str,
+    source: BarometerEntry,
+    sounding: Sounding | None,
+    measured_air: bool,
+    place: tuple[float, float] | None,
 ) -> BarometerRecord | None:
     """Read one barometer as heights above the ellipsoid; None, with the faults kept, where it is refused.
 
     Pressures become heights by the flight's air; ``measured_air``: whether that is a sounding, not the standard's.
+    ``place``: latitude and longitude, rad, at which the geoid is taken; None where every tracker was refused.
     """
     label = f"barometers.{name}"
     table = gate.table(label, source, tables.BAROMETER)
     if table is None or table.time_s is None:
         return None
     form = _barometer_form(gate, table, source)
-    if form is None or sounding is None:
+    if form is None or sounding is None or place is None:
         return None
     before = len(gate.faults)
     if form == "pressure":
@@ -270,7 +288,9 @@ def read_barometer(
         gate.findings.append(Finding(name, words, np.nan, np.nan, code="heights-from-pressure"))
     else:
         height = table.columns["height"]
-    height = height + source.to_ellipsoid_m
+    undulation = source.to_ellipsoid_m(*place)
+    _note_geoid(gate, name, source, undulation)
+    height = height + undulation
     if not np.isfinite(height).any():
         gate.refuse(f"{label}: {table.path}: every reading is missing; remove the barometer", "no-samples")
         return None
@@ -294,7 +314,7 @@ def _barometer_form(gate: Gate, table: Table, source: BarometerEntry) -> str | N
             f"{table.label}: {words} in {table.label}.columns, as height or as pressure", "columns-ambiguous"
         )
     if form is not None and source.height_is is None:
-        words = 'say height_is = "ellipsoid", or height_is = "msl" with geoid_undulation_m (pressures too)'
+        words = 'say height_is = "ellipsoid" or height_is = "msl" (pressures too)'
         gate.refuse_config(f"{table.label}: heights above what? {words}", "height-datum")
         return None
     return form

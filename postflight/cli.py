@@ -391,12 +391,14 @@ def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path,
 
 
 @cli.command()
-@click.argument("runs", nargs=-1, required=True, metavar="RUN RUN...")
+@click.argument("runs", nargs=-1, required=True, metavar="RUN RUN|FILE...")
 @click.option("--output", type=FOLDER, help="Folder to write; default: comparisons/RUN-and-RUN in the flight's.")
 def compare(runs: tuple[str, ...], output: Path | None) -> None:
     """Set runs side by side, the others against the first: deflections, trajectory, checks, over each other on a page.
 
     RUN is a run's folder, a flight's (its last complete run), or FLIGHT/NAME: my-flight/plain my-flight/more-lift.
+    A RUN and a file compare it with another team's trajectory (CCSDS OEM, CSV, NetCDF, ...): time offset, shift,
+    rotation, height datum and frame of velocity are looked for.
     """
     from postflight.report import compare
 
@@ -440,7 +442,9 @@ def import_tables(files: tuple[Path, ...], folder: Path) -> None:
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--to", "form", required=True, type=NamedChoice(["csv", "parquet", "mat", "nc", "kml", "oem"]))
+@click.option(
+    "--to", "form", required=True, type=NamedChoice(["csv", "parquet", "mat", "nc", "kml", "oem", "aem", "msopck"])
+)
 @click.option("--out", type=FOLDER, help="File to write; default: exports/RUN.FORMAT in FOLDER.")
 @of_run
 def export(folder: Path, form: str, out: Path | None, wanted: str | None) -> None:

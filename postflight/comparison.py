@@ -278,7 +278,7 @@ def _angle_deg(history: DeflectionHistory, time_s: FloatArray) -> FloatArray:
 def _vectors(a: pd.DataFrame, b: pd.DataFrame) -> dict[str, FloatArray]:
     """Sizes of the differences of position, velocity and attitude; NaN where one has no attitude."""
     has_attitude = all(table["qw_ecef_body"].notna().all() for table in (a, b))
-    paths = [trajectory_of(table if has_attitude else _upright(table)) for table in (a, b)]
+    paths = [trajectory_of(table if has_attitude else upright(table)) for table in (a, b)]
     gap = difference(resample(paths[1], paths[0].time_s), paths[0])
     out = {}
     for name, part, scale in _APART:
@@ -287,7 +287,7 @@ def _vectors(a: pd.DataFrame, b: pd.DataFrame) -> dict[str, FloatArray]:
     return out
 
 
-def _upright(table: pd.DataFrame) -> pd.DataFrame:
+def upright(table: pd.DataFrame) -> pd.DataFrame:
     """Table with a placeholder where the attitude is not known, which positions and velocities do not feel."""
     blank = {f"q{a}_ecef_body": float(a == "w") for a in "wxyz"} | {f"{a}_body_degps": 0.0 for a in "pqr"}
     return table.assign(**blank)

@@ -7,15 +7,21 @@ mat        MATLAB 5: structures ``trajectory``, ``deflection.<method>``, ``covar
 nc         NetCDF classic, CF conventions 1.8: a trajectory, and deflections at their own times
 kml        KML 2.2: the track with its times (gx:Track), the same as a line, events as points
 oem        CCSDS Orbit Ephemeris Message 2.0 (KVN): Earth-fixed states, covariances once a second
+aem        CCSDS Attitude Ephemeris Message 1.0 (KVN): quaternions from the Earth-fixed to the body frame
+msopck     input of NAIF's msopck (attitude and rates for a SPICE C-kernel), and its setup file beside it
 =========  ==========================================================================================================
 
 A file is written whole or not at all, with the same bytes for the same run. Deflections have times of their own; in the
 tables their two components are interpolated separately (a clock angle jumps at 360 deg), and left empty outside and
-in gaps. KML heights are meant above sea level and written above the WGS-84 ellipsoid, which the description says.
+in gaps. KML heights are above mean sea level: EGM96, as the format has it.
 
 References
 ----------
 CCSDS 502.0-B-2, Orbit Data Messages, 2009. WGS-84 (G1150 and later) and ITRF2000 agree to centimetres.
+CCSDS 504.0-B-1, Attitude Data Messages, 2008, annex on conventions: with ATTITUDE_DIR = A2B the matrix of the
+quaternion takes components in A to those in B and its element (1, 2) is ``2 (q1 q2 + q3 qc)``: q is our ``q_A_B``.
+NAIF, MSOPCK User's Guide: a SPICE quaternion is that of the C-matrix, which takes the reference frame's components to
+the instrument's: our ``q_body_ecef``, scalar first.
 """
 
 from __future__ import annotations
@@ -33,8 +39,10 @@ import numpy as np
 import pandas as pd
 from rich import markup
 
+from flightmodel import earth, rotations
 from flightmodel.checks import ConfigError, FloatArray, GateError, write_file, writing
 from flightmodel.config import parse_utc
+from flightmodel.geoid import undulation_m
 from flightmodel.guarded_files import file_bytes, open_file
 from postflight.run_folder import DIGITS, read_csv
 from postflight.runs import find_run
@@ -59,7 +67,8 @@ _COORDINATES = "time lat_deg lon_deg alt_m"
 _GAP_FACTOR = 5.0  # of the usual step of a deflection: a longer one is a gap
 _KML_STEP_S = 0.5  # between points of the track
 _MAT_HEADER = b"MATLAB 5.0 MAT-file, postflight export"  # scipy writes the time of writing there
-_OEM_FRAME = "ITRF2000"
+_CCSDS_FRAME = "ITRF2000"
+_SPICE_FRAME, _SPICE_ID = "ITRF93", -999000  # Earth-fixed; a number that no mission has, to be replaced
 _OEM_STATE = ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m", "vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"]
 
 
@@ -285,11 +294,10 @@ def _kml(source: Source) -> bytes:
     t = table["t_s"].to_numpy()
     keep = np.flatnonzero(np.diff(np.floor((t - t[0]) / _KML_STEP_S + 1e-9), prepend=-1.0) > 0.0)
     keep = np.unique(np.append(keep, len(t) - 1))
-    place = table[["lon_deg", "lat_deg", "alt_m"]].to_numpy()
-    description = (
-        f"{source.title}; {source.header['point']}. Heights are above the WGS-84 ellipsoid, drawn as above sea level: "
-        "up to 107 m apart."
-    )
+    latitude, longitude = np.deg2rad(table[["lat_deg", "lon_deg"]].to_numpy().T)
+    above_sea_m = table["alt_m"].to_numpy() - undulation_m(latitude, longitude)
+    place = np.column_stack([table[["lon_deg", "lat_deg"]].to_numpy(), above_sea_m])
+    description = f"{source.title}; {source.header['point']}. Heights are above mean sea level (EGM96)."
     whens = "".join(f"<when>{source.utc(t[k])}Z</when>\n" for k in keep)
     track = "".join(f"<gx:coord>{' '.join(f'{v:.9g}' for v in place[k])}</gx:coord>\n" for k in keep)
     line = "\n".join(",".join(f"{v:.9g}" for v in place[k]) for k in keep)
@@ -330,19 +338,9 @@ def _oem(source: Source) -> bytes:
     table = source.trajectory
     t = table["t_s"].to_numpy()
     state = table[_OEM_STATE].to_numpy() / 1000.0
-    name = "".join(c if c.isalnum() and c.isascii() else "_" for c in source.name) or "flight"
     lines = [
-        "CCSDS_OEM_VERS = 2.0",
-        "COMMENT " + _printable(source.title, "?", ascii_only=True),
-        f"COMMENT point: {_printable(source.header['point'], '?', ascii_only=True)}",
-        f"CREATION_DATE = {source.finished_utc[:19]}",
-        "ORIGINATOR = POSTFLIGHT",
-        "",
-        "META_START",
-        f"OBJECT_NAME = {name}",
-        f"OBJECT_ID = {source.epoch:%Y}-000A",
-        "CENTER_NAME = EARTH",
-        f"REF_FRAME = {_OEM_FRAME}",
+        *_ccsds_head(source, "OEM", "2.0"),
+        f"REF_FRAME = {_CCSDS_FRAME}",
         "TIME_SYSTEM = UTC",
         f"START_TIME = {source.utc(t[0])}",
         f"STOP_TIME = {source.utc(t[-1])}",
@@ -354,9 +352,98 @@ def _oem(source: Source) -> bytes:
     lines += [f"{source.utc(at)} {' '.join(f'{v:.9f}' for v in row)}" for at, row in zip(t, state, strict=True)]
     lines += ["", "COVARIANCE_START"]
     for at, covariance in zip(source.covariance_time_s, source.covariance[:, :6, :6] / 1e6, strict=True):
-        lines += [f"EPOCH = {source.utc(at)}", f"COV_REF_FRAME = {_OEM_FRAME}"]
+        lines += [f"EPOCH = {source.utc(at)}", f"COV_REF_FRAME = {_CCSDS_FRAME}"]
         lines += [" ".join(f"{v:.9e}" for v in covariance[k, : k + 1]) for k in range(6)]
     return ("\n".join([*lines, "COVARIANCE_STOP"]) + "\n").encode()
+
+
+def _ccsds_head(source: Source, message: str, version: str) -> list[str]:
+    """Header and first metadata of a CCSDS message."""
+    name = "".join(c if c.isalnum() and c.isascii() else "_" for c in source.name) or "flight"
+    return [
+        f"CCSDS_{message}_VERS = {version}",
+        "COMMENT " + _printable(source.title, "?", ascii_only=True),
+        f"COMMENT point: {_printable(source.header['point'], '?', ascii_only=True)}",
+        f"CREATION_DATE = {source.finished_utc[:19]}",
+        "ORIGINATOR = POSTFLIGHT",
+        "",
+        "META_START",
+        f"OBJECT_NAME = {name}",
+        f"OBJECT_ID = {source.epoch:%Y}-000A",
+        "CENTER_NAME = EARTH",
+    ]
+
+
+def _attitude(source: Source) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times (n,), ``q_ecef_body`` (n, 4) and rates of the body relative to the Earth in body axes (n, 3), rad/s."""
+    q = source.trajectory[[f"q{a}_ecef_body" for a in "wxyz"]].to_numpy(dtype=float)
+    known = np.isfinite(q).all(axis=1)
+    if not known.any():
+        words = "no attitude is known, as it has no gyros; --to oem has positions and velocities"
+        raise GateError(f"{source.run}: {words}", "attitude-missing")
+    q = rotations.continuous(q[known] / np.linalg.norm(q[known], axis=1, keepdims=True))
+    rates = np.deg2rad(source.trajectory[[f"{a}_body_degps" for a in "pqr"]].to_numpy(dtype=float)[known])
+    earth_rate = np.broadcast_to(earth.OMEGA_ECEF_RADPS, rates.shape)
+    return source.trajectory["t_s"].to_numpy()[known], q, rates - rotations.rotate(rotations.conjugate(q), earth_rate)
+
+
+def _aem(source: Source) -> bytes:
+    """CCSDS AEM."""
+    t, q, _ = _attitude(source)
+    lines = [
+        *_ccsds_head(source, "AEM", "1.0"),
+        f"REF_FRAME_A = {_CCSDS_FRAME}",
+        "REF_FRAME_B = SC_BODY_1",
+        "ATTITUDE_DIR = A2B",
+        "TIME_SYSTEM = UTC",
+        f"START_TIME = {source.utc(t[0])}",
+        f"STOP_TIME = {source.utc(t[-1])}",
+        "ATTITUDE_TYPE = QUATERNION",
+        "QUATERNION_TYPE = LAST",
+        "INTERPOLATION_METHOD = LINEAR",
+        "INTERPOLATION_DEGREE = 1",
+        "META_STOP",
+        "",
+        "DATA_START",
+    ]
+    lines += _timed_rows(source, t, q[:, [1, 2, 3, 0]])
+    return ("\n".join([*lines, "DATA_STOP"]) + "\n").encode()
+
+
+def _msopck(source: Source) -> bytes:
+    """Input of msopck: UTC, SPICE quaternion, rates in the instrument's frame, rad/s."""
+    t, q, rates = _attitude(source)
+    rows = np.column_stack([rotations.conjugate(q), rates])
+    return ("\n".join(_timed_rows(source, t, rows)) + "\n").encode()
+
+
+def _timed_rows(source: Source, t: FloatArray, rows: FloatArray) -> list[str]:
+    return [f"{source.utc(at)} {' '.join(f'{v:.12f}' for v in row)}" for at, row in zip(t, rows, strict=True)]
+
+
+def _msopck_setup(source: Source, data: Path) -> bytes:
+    """Setup of msopck for the input in a file, as a text kernel; lines are below its 132 characters."""
+    title = _printable(source.title, "?", ascii_only=True)
+    body = data.name
+    longest = float(np.diff(_attitude(source)[0]).max(initial=0.0))
+    keys = {
+        "LSK_FILE_NAME": "'naif0012.tls'",
+        "MAKE_FAKE_SCLK": f"'{data.stem}.tsc'",
+        "CK_TYPE": "3",
+        "INSTRUMENT_ID": str(_SPICE_ID),
+        "REFERENCE_FRAME_NAME": f"'{_SPICE_FRAME}'",
+        "INPUT_TIME_TYPE": "'UTC'",
+        "INPUT_DATA_TYPE": "'SPICE QUATERNIONS'",
+        "ANGULAR_RATE_PRESENT": "'YES'",
+        "ANGULAR_RATE_FRAME": "'INSTRUMENT'",
+        "MAXIMUM_VALID_INTERVAL": f"{max(1.0, 1.01 * longest):.6g}",
+        "CHECK_TIME_ORDER": "'YES'",
+        "PRODUCER_ID": "'POSTFLIGHT'",
+    }
+    lines = ["KPL/IK", "", title[:120], "", f"    msopck {body}.setup {body} {data.stem}.bc"[:130], ""]
+    lines += [f"Replace {_SPICE_ID} by your structure's NAIF id; NAIF supplies the leap seconds (naif0012.tls).", ""]
+    lines += ["\\begindata", "", *(f"   {key} = {value}" for key, value in keys.items()), "", "\\begintext", ""]
+    return "\n".join(lines).encode()
 
 
 def _printable(text: str, instead: str = " ", *, ascii_only: bool = False) -> str:
@@ -372,6 +459,8 @@ FORMS: dict[str, tuple[Callable[[Source], bytes], str]] = {
     "nc": (_netcdf, ".nc"),
     "kml": (_kml, ".kml"),
     "oem": (_oem, ".oem"),
+    "aem": (_aem, ".aem"),
+    "msopck": (_msopck, ".msopck"),
 }
 EXTRAS = {"pyarrow": "parquet"}  # library, and the extra of the installation that brings it
 console = terminal()
@@ -402,6 +491,9 @@ def export(folder: Path, form: str, out: Path | None, run: str | None = None) ->
         raise ConfigError(words, "library-missing") from None
     with writing(path, "name another place with --out"):
         write_file(path, content)
+    if form == "msopck":
+        with writing(path, "name another place with --out"):
+            write_file(path.with_name(f"{path.name}.setup"), _msopck_setup(source, path))
     console.print(
         f"{markup.escape(str(path))} ({len(content) / 1e6:.1f} MB) of run {markup.escape(source.run + source.what_if)}",
         highlight=False,

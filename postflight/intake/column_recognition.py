@@ -488,15 +488,13 @@ class Recogniser:
         candidates = self.columns_of("alt")
         ell = [k for k in candidates if set(self.named[k].tokens) & {"ell", "ellipsoid", "hae", "wgs", "wgs84"}]
         msl = [k for k in candidates if set(self.named[k].tokens) & {"msl", "amsl", "geoid", "nn", "sea"}]
-        if ell:  # asks for no undulation
+        if ell:
             self._set_aside(set(candidates) - {ell[0]})
             return self._single(quantity), [("height_is", '"ellipsoid"', "by the column's name")]
-        where = "m: geoid above the ellipsoid at the place (EGM96), -107 to 85"
-        undulation = ("geoid_undulation_m", FILL_IN_TOML, where)
         if msl:
             self._set_aside(set(candidates) - {msl[0]})
-            return self._single(quantity), [("height_is", '"msl"', "by the column's name"), undulation]
-        return self._single(quantity), [("height_is", FILL_IN_TOML, '"ellipsoid", or "msl" with geoid_undulation_m')]
+            return self._single(quantity), [("height_is", '"msl"', "by the column's name")]
+        return self._single(quantity), [("height_is", FILL_IN_TOML, '"ellipsoid" or "msl"')]
 
     def _set_aside(self, at: set[int]) -> None:
         self.spare |= at & self.free
@@ -510,7 +508,7 @@ class Recogniser:
             found = self._single(height, "alt")
         if found is None:
             return []
-        what = '"ellipsoid", or "msl" with geoid_undulation_m = ... (m, geoid above ellipsoid); pressures too'
+        what = '"ellipsoid" or "msl"; pressures too'
         return [SourceProposal(f"barometers.{self.name}", [found], [("height_is", FILL_IN_TOML, what)])]
 
     def air_columns(self) -> dict[Quantity, ColumnProposal]:

@@ -14,12 +14,12 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-from flightmodel.checks import Fault, GateError, writing
-from flightmodel.config import parse_utc
+from flightmodel.checks import ConfigError, Fault, GateError, writing
 from flightmodel.partial_files import abandoned, partial_path
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
-from postflight.plots.style import COLOUR, LABEL, MANY, PAGE
+from postflight.plots.style import LABEL, MANY
+from postflight.report.compare_other import OTHER_TABLES, charts, compare_with_other, print_other
 from postflight.report.panels import Panel, line_of, panel_of, quantities_drawn, with_holes
 from postflight.report.source import kept_rows, rounded
 from postflight.report.text import cell, date
@@ -30,7 +30,7 @@ from postflight.terminal import terminal
 
 PAGE_NAME = "compare.html"
 TABLES = ("runs", "differences", "differences_over_time", "checks")
-_FILES = {PAGE_NAME, *(f"{name}.csv" for name in TABLES)}
+_FILES = {PAGE_NAME, *(f"{name}.csv" for name in (*TABLES, *OTHER_TABLES))}
 _DASHES: tuple[list[int], ...] = ([], [8, 4], [2, 3], [10, 3, 2, 3], [5, 2], [14, 4])
 _ROWS = 3000  # of a line that are drawn
 # panels of differences: title, unit, column of the table of differences over time
@@ -78,17 +78,22 @@ def compare(words: tuple[str, ...], output: Path | None) -> None:
     Parameters
     ----------
     words : tuple of str
-        Runs as `locate` takes them; the others are compared with the first.
+        Runs as `locate` takes them; the others are compared with the first. Or a run and a file with another source's
+        trajectory (`postflight.intake.other_trajectory`).
     output : Path or None
         Folder to write; default: ``comparisons/<run>-and-<run>`` in the first run's flight folder.
 
     Raises
     ------
     ConfigError
-        Too few, too many or equal runs.
+        Too few, too many or equal runs; ``compare-one-file`` where a file does not stand behind one run.
     GateError
-        Every word that means no run, runs that cannot be read; ``folder-exists`` where the folder holds other things.
+        What a file is refused for; every word that means no run, runs that cannot be read; ``folder-exists`` where the
+        folder holds other things.
     """
+    if any(Path(word).is_file() for word in words):
+        _compare_with_file(words, output)
+        return
     faults: list[Fault] = []
     found = []
     for word in words:
@@ -99,26 +104,37 @@ def compare(words: tuple[str, ...], output: Path | None) -> None:
     if faults:
         raise GateError(faults)
     compared = compare_runs(tuple(read_tables(path) for path in found))
-    folder = output or _default_folder(compared)
-    _write(compared, folder)
+    folder = output or _default_folder(compared.runs, ())
+    over_time = compared.histories()
+    tables = dict(zip(TABLES, (compared.to_frame(), compared.differences(), over_time, compared.checks()), strict=True))
+    _write(folder, compared.runs, tables, page(compared, over_time))
     print_comparison(compared)
     console.print(escape(f"tables and {PAGE_NAME} in {folder}"), highlight=False)
 
 
-def _default_folder(compared: RunComparison) -> Path:
-    called = [run.name or run.path.name.split("-")[1] for run in compared.runs]
-    return compared.runs[0].path.parent.parent / "comparisons" / "-and-".join(called)
+def _compare_with_file(words: tuple[str, ...], output: Path | None) -> None:
+    """Print and write the comparison of a run with another source's file."""
+    if len(words) != 2 or Path(words[0]).is_file():
+        raise ConfigError("compare: a run, then one file with another trajectory, is wanted", "compare-one-file")
+    run, path = read_tables(locate(words[0])), Path(words[1])
+    found, tables, text = compare_with_other(run, path)
+    folder = output or _default_folder((run,), (path.stem,))
+    _write(folder, (run,), tables, text)
+    print_other(found)
+    console.print(escape(f"tables and {PAGE_NAME} in {folder}"), highlight=False)
 
 
-def _write(compared: RunComparison, folder: Path) -> None:
+def _default_folder(runs: tuple[RunTables, ...], others: tuple[str, ...]) -> Path:
+    called = [run.name or run.path.name.split("-")[1] for run in runs]
+    return runs[0].path.parent.parent / "comparisons" / "-and-".join((*called, *others))
+
+
+def _write(folder: Path, runs: tuple[RunTables, ...], tables: dict[str, pd.DataFrame], text: str) -> None:
     """Write everything beside the folder and rename; an earlier comparison there is replaced, nothing else."""
-    over_time = compared.histories()
-    tables = dict(zip(TABLES, (compared.to_frame(), compared.differences(), over_time, compared.checks()), strict=True))
-    text = page(compared, over_time)
     if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= _FILES):
         raise GateError(f"{folder}: exists and is no comparison; name another with --output", "folder-exists")
     place = folder.resolve()
-    if any(run.path.resolve().parent in (place, *place.parents) for run in compared.runs):
+    if any(run.path.resolve().parent in (place, *place.parents) for run in runs):
         raise GateError(f"{folder}: run folders stay as they were written; name another place", "export-into-run")
     with writing(folder, "name another folder with --output"):
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -221,21 +237,9 @@ def page(compared: RunComparison, over_time: pd.DataFrame) -> str:
     first = compared.runs[0]
     bet = first.tables["bet"]
     spans = [run.tables["bet"]["t_s"] for run in compared.runs]
-    data = {
-        "t0_ms": round(1e3 * parse_utc(first.header["epoch_utc"]).timestamp()),
-        "span": [float(min(t.iloc[0] for t in spans)), float(max(t.iloc[-1] for t in spans))],
-        "colours": PAGE | {"residual": COLOUR["estimate"]},
-        "pulse": pulse_window(bet),
-        "first": pulse_window(bet),
-        "peak": round(first.peak_s, 3),
-        "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in first.tables["events"].itertuples()],
-        "panels": [*_deflection_panels(compared), *_trajectory_panels(compared)],
-        "rigid": [],
-        "studies": _difference_panels(compared, over_time),
-        "residuals": [],
-        "solid": None,
-        "frames": [],
-    }
+    whole = [float(min(t.iloc[0] for t in spans)), float(max(t.iloc[-1] for t in spans))]
+    panels = [*_deflection_panels(compared), *_trajectory_panels(compared)]
+    data = charts(first, whole, pulse_window(bet), panels, _difference_panels(compared, over_time))
     return rendered(
         "compare.html",
         data,

@@ -12,6 +12,7 @@ from flightmodel.atmosphere import height_from_pressure, profile_from_sounding, 
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.earth import q_ecef_body_from_pointing
 from flightmodel.flightfolder import read_flight
+from flightmodel.geoid import undulation_m
 from tests.refusing import numbers_in, refuses
 
 DEG = np.pi / 180.0
@@ -101,6 +102,19 @@ def test_height_above_sea_level_gets_the_undulation(folder):
     after = folder.read(above_sea, BALLISTIC).gnss["gps"].position_ecef_m
     up = earth.ned_from_ecef(after - before, before)
     np.testing.assert_allclose(up, np.tile([0.0, 0.0, 24.0], (len(T), 1)), atol=1e-5)
+
+
+def test_where_no_undulation_is_stated_the_model_gives_it(folder):
+    before = folder.read(GNSS, BARO, BALLISTIC)
+    after = folder.read(GNSS.replace("ellipsoid", "msl"), BARO.replace("ellipsoid", "msl"), BALLISTIC)
+    fixes = after.gnss["gps"].position_ecef_m
+    up = earth.ned_from_ecef(fixes - before.gnss["gps"].position_ecef_m, fixes)
+    expected = float(undulation_m(LAT * DEG, LON * DEG))
+    assert abs(expected) > 5.0
+    np.testing.assert_allclose(up, np.tile([0.0, 0.0, -expected], (len(T), 1)), atol=1e-3)
+    raised = after.barometers["baro"].height_m - before.barometers["baro"].height_m
+    np.testing.assert_allclose(raised, expected, atol=1e-3)
+    assert [f.source for f in after.findings if f.code == "undulation-by-model"] == ["gps", "baro"]
 
 
 def test_ecef_columns_are_read_before_geodetic_ones_and_velocities_either_way(folder):
@@ -336,9 +350,6 @@ def test_mounts_that_contradict_or_lack_a_vehicle_are_refused(folder):
 
 def test_heights_above_what_must_be_said(folder):
     folder.refused([GNSS.replace('height_is = "ellipsoid"\n', ""), BALLISTIC], "height-datum", "gnss.gps")
-    folder.refused(
-        [GNSS.replace("ellipsoid", "msl"), BALLISTIC], "keys-conflict", "gnss.gps.height_is", "geoid_undulation_m"
-    )
     folder.refused([GNSS + "geoid_undulation_m = 20.0\n", BALLISTIC], "keys-conflict", "height_is")
     folder.refused([GNSS, BARO.replace('height_is = "ellipsoid"\n', ""), BALLISTIC], "height-datum", "barometers.baro")
     folder.refused([GNSS.replace("ellipsoid", "geoid"), BALLISTIC], "key-value", "gnss.gps.height_is", "'geoid'")

@@ -11,6 +11,7 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.airdata import Inputs, _path_angles, derived, lateral_angles
 from flightmodel.atmosphere import standard_atmosphere, standard_sounding
+from flightmodel.geoid import undulation_m
 from flightmodel.instruments import TriadSpec
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
@@ -19,7 +20,7 @@ from postflight.checks import inertial
 from postflight.checks.pressure_and_field import field_rotation
 from postflight.checks.track_force import _compare, track_force
 from postflight.checks.units_and_axes import slope_through_mean, unit_that_explains
-from postflight.exports import _OEM_STATE, Source, _kml, _oem
+from postflight.exports import _OEM_STATE, Source, _aem, _kml, _msopck, _oem
 from postflight.montecarlo.bands import Chunk, _bands, coverage, is_narrow, percentile_interval, write_chunk
 from postflight.montecarlo.study import design_for, indices
 from postflight.reconciliation.modes import FACTORS, _peak, _track_power
@@ -383,7 +384,64 @@ def test_oem_is_in_kilometres_and_their_squares():
 def test_kml_has_longitude_before_latitude():
     words = _kml(source()).decode()
     lon, lat, alt = (float(x) for x in words.split("<gx:coord>")[1].split("<")[0].split())
-    assert (lon, lat, alt) == (-75.0, 37.0, 9e4)
+    assert (lon, lat) == (-75.0, 37.0)
+    assert alt == pytest.approx(9e4 - float(undulation_m(np.deg2rad(37.0), np.deg2rad(-75.0))), abs=1e-3)
+
+
+def turning():
+    """The source with a body that turns about an axis of its own, at rates against inertial space."""
+    rate = np.array([0.7, -0.4, 0.2])
+    t = np.arange(0.0, 3.0, 0.01)
+    start = rotations.exp(np.array([0.3, -1.1, 0.8]))
+    # of a body at a steady rate in inertial space, seen from the Earth, which is there at time zero
+    q = rotations.multiply(earth.q_ecef_eci(t), rotations.boxplus(start, t[:, None] * rate))
+    table = {"t_s": t} | {f"q{a}_ecef_body": q[:, k] for k, a in enumerate("wxyz")}
+    table |= {f"{a}_body_degps": np.full(len(t), np.rad2deg(rate[k])) for k, a in enumerate("pqr")}
+    return replace(source(), trajectory=pd.DataFrame(table)), t, q
+
+
+def test_aem_is_the_matrix_of_the_standard():
+    """Its element by element form, by which components in A (Earth-fixed) go to B (body); the scalar is last."""
+    flown, t, q = turning()
+    lines = _aem(flown).decode().splitlines()
+    assert {"ATTITUDE_DIR = A2B", "QUATERNION_TYPE = LAST", "REF_FRAME_A = ITRF2000"} <= set(lines)
+    rows = [line.split() for line in lines[lines.index("DATA_START") + 1 : lines.index("DATA_STOP")]]
+    assert len(rows) == len(t)
+    assert rows[50][0] == "2009-08-17T12:50:00.500000"
+    q1, q2, q3, qc = (float(x) for x in rows[50][1:])
+    matrix = np.array(
+        [
+            [q1**2 - q2**2 - q3**2 + qc**2, 2 * (q1 * q2 + q3 * qc), 2 * (q1 * q3 - q2 * qc)],
+            [2 * (q1 * q2 - q3 * qc), -(q1**2) + q2**2 - q3**2 + qc**2, 2 * (q2 * q3 + q1 * qc)],
+            [2 * (q1 * q3 + q2 * qc), 2 * (q2 * q3 - q1 * qc), -(q1**2) - q2**2 + q3**2 + qc**2],
+        ]
+    )
+    nose_ecef = rotations.rotate(q[50], np.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(matrix @ nose_ecef, [1.0, 0.0, 0.0], atol=1e-10)
+
+
+def test_msopck_has_the_c_matrix_and_rates_that_turn_it():
+    """SPICE's matrix of the quaternion takes the Earth's components to the body's; dC/dt = -[w x] C."""
+    flown, t, q = turning()
+    rows = [line.split() for line in _msopck(flown).decode().splitlines()]
+    numbers = np.array([[float(x) for x in row[1:]] for row in rows])
+
+    def c_matrix(row):
+        q0, q1, q2, q3 = row[:4]
+        return np.array(
+            [
+                [1 - 2 * (q2 * q2 + q3 * q3), 2 * (q1 * q2 - q0 * q3), 2 * (q1 * q3 + q0 * q2)],
+                [2 * (q1 * q2 + q0 * q3), 1 - 2 * (q1 * q1 + q3 * q3), 2 * (q2 * q3 - q0 * q1)],
+                [2 * (q1 * q3 - q0 * q2), 2 * (q2 * q3 + q0 * q1), 1 - 2 * (q1 * q1 + q2 * q2)],
+            ]
+        )
+
+    before, now, after = (c_matrix(numbers[k]) for k in (99, 100, 101))
+    np.testing.assert_allclose(now @ rotations.rotate(q[100], np.array([1.0, 0.0, 0.0])), [1.0, 0.0, 0.0], atol=1e-10)
+    turned = (after - before) / (t[101] - t[99])
+    # central differences: w^3 h^2 / 6 = 1e-5; the Earth's rate, which the rates must be rid of, is 7e-5
+    np.testing.assert_allclose(turned, -rotations.skew(numbers[100, 4:]) @ now, atol=1.5e-5)
+    assert not np.allclose(numbers[100, 4:], [0.7, -0.4, 0.2], atol=2e-5)
 
 
 # ------------------------------------------------------------------------------------------------------ intake checks

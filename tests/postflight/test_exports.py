@@ -11,12 +11,14 @@ import pytest
 from click.testing import CliRunner
 
 from flightmodel.checks import ConfigError, GateError
+from flightmodel.geoid import undulation_m
 from postflight import exports, run_folder
 from postflight.cli import cli
 from postflight.deflections import Deflections
 from postflight.exports import read_source
 from postflight.flight import read_flight
 from postflight.reconstruction import reconstruct
+from tests.refusing import refuses
 
 FLIGHT = Path(__file__).parents[1] / "data" / "real_flights" / "rocketpy_prometheus"
 KML = "{http://www.opengis.net/kml/2.2}"
@@ -130,7 +132,9 @@ def test_kml_by_an_xml_parser(written, folder, run_table):
     assert (np.diff(pd.to_datetime(whens).astype("int64")) > 0).all()
     source = read_source(folder)
     t = (pd.to_datetime(whens, utc=True) - source.epoch).total_seconds()
-    np.testing.assert_allclose(coords[:, 2], np.interp(t, run_table.t_s, run_table.alt_m), atol=0.01)
+    above = np.interp(t, run_table.t_s, run_table.alt_m) - coords[:, 2]  # the ellipsoid
+    np.testing.assert_allclose(above, undulation_m(*np.deg2rad(coords[:, 1::-1].T)), atol=0.01)
+    assert abs(above).min() > 1.0
     np.testing.assert_allclose(coords[:, 0], np.interp(t, run_table.t_s, run_table.lon_deg), atol=1e-7)
     line = root.find(f".//{KML}LineString/{KML}coordinates").text.split()
     assert len(line) == len(coords)
@@ -165,6 +169,13 @@ def test_oem_by_another_reader(written, run_table):
     wanted = run_table[["rx_ecef_sd_m", "ry_ecef_sd_m", "rz_ecef_sd_m"]].iloc[0]
     np.testing.assert_allclose(sd[:3], wanted, rtol=1e-6)
     assert (np.linalg.eigvalsh(first) > 0.0).all()
+
+
+def test_attitude_that_is_not_known_is_refused(folder):
+    """The recorded rocket has no gyros."""
+    for form in ("aem", "msopck"):
+        with refuses("attitude-missing"):
+            exports.FORMS[form][0](read_source(folder))
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "mat", "nc", "kml", "oem"])

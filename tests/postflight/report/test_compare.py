@@ -228,7 +228,8 @@ def written(entry, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("page") / "made"
     theirs = entry.tables["deflection_fused"].assign(theta_deg=lambda table: table["theta_deg"] + 0.5)
     facts = entry.facts | {"settings": entry.facts["settings"] | {"changes": [f"c_n = {HOSTILE}"]}, "name": HOSTILE}
-    compare._write(compare_runs((entry, replace(moved(entry, deflection_fused=theirs), facts=facts))), folder)
+    compared = compare_runs((entry, replace(moved(entry, deflection_fused=theirs), facts=facts)))
+    compare._write(folder, compared.runs, {}, compare.page(compared, compared.histories()))
     return folder / PAGE_NAME
 
 

@@ -1,0 +1,604 @@
+"""By what do two trajectories of one flight differ: a clock, a datum, a frame, or by what their covariances allow?
+
+Another source's states are compared with the run at the other's own times; only the run is interpolated. Difference
+is other minus run, position and velocity in north, east, down at the run's place, rotation in body axes. It is
+explained by as few of these effects as its likelihood bears, each one constant of the flight:
+
+====================  =================================================================================================
+time-offset           other(t) = run(t - tau): its tags are late by tau
+shift                 of position, along north, east, down at the middle of the track
+height-datum          its heights are above the geoid and were taken above the ellipsoid: -N (EGM96) upwards
+track-rotation        of positions and velocities about the first common place, about its north, east, down
+inertial-velocity     its velocity is v + W x r, relative to inertial space
+attitude-body         of the body axes (mounting, definition of the axes)
+attitude-earth        of the axes that the attitude refers to (north, heading)
+other-point           another point fixed in the body is followed
+====================  =================================================================================================
+
+Gauss-Newton on the exact effects, chosen one by one (and dropped again) by a likelihood in which each component has the
+variance of its own residuals, and ``n / g`` independent ones of ``n``, ``g = 1 + 2 sum rho_k`` up to the first
+correlation that is not positive. An effect of p parameters is named where it gains ``ln 1000`` over ``p/2 ln (n/g)``.
+Its sd follows from the same residuals: how well the difference itself shows it. What the two covariances allow is
+another number (``stated_sd``): the largest sd of the effect that errors with these covariances have, whatever their
+correlation in time, independent between the two: ``sum_k sqrt(G_k P_k G_k')`` with the estimator's rows ``G_k``.
+
+An effect is ``beyond`` the covariances where a component exceeds 3.3 (99.9 %) of the root of both variances: then it is
+a fault of one of the two. Effects within are there all the same, and faults where the two share data or solution.
+
+Two effects have a known size. Inertial velocity is named where its estimated factor is 1 within 3 sd and 1 %. The datum
+is taken as it is or not at all: whichever needs fewer effects, and leaves the likelier shift.
+
+Chi-square per degree of freedom is averaged over epochs; however errors are correlated in time its mean is 1, and above
+its 99.9 % quantile for one epoch the covariances do not explain the difference.
+
+References
+----------
+Wolff, "Monte Carlo errors with less errors", Comput. Phys. Commun. 156 (2004) 143 (the inefficiency g).
+Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978) 461.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+from scipy.special import logsumexp
+from scipy.stats import chi2
+
+from flightmodel import earth, rotations
+from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.geoid import undulation_m
+from flightmodel.tabular import Tabular
+from flightmodel.trajectory import Trajectory, interpolate_rows, resample
+from postflight.intake.other_trajectory import OtherTrajectory
+
+_MOST_EPOCHS = 800
+_LEAST_EPOCHS = 20
+_LEAST_ODDS = np.log(1000.0)  # for one more effect
+_CONFIDENCE = 0.999
+_STEPS = 4  # of Gauss-Newton: the effects are nearly linear
+_FAR_S, _FAR_STEP_S = 40.0, 0.25  # of time offsets that are looked for: leap seconds, a second's slip
+# resolution of files: below it nothing is claimed (m, m/s, rad)
+_RESOLUTION = np.repeat([1e-3, 1e-3, np.deg2rad(1e-4)], 3)
+_BEYOND_SD = 3.3
+_GEOID_ERROR_M = 1.0  # of EGM96 by the half degree, 1 sd
+_LEAST_UNDULATION_M = 5.0  # where a datum can be told from a shift
+GROUPS = ("position", "velocity", "attitude")
+_UNITS = {"position": "m", "velocity": "m/s", "attitude": "deg"}
+_NED, _BODY = ("north", "east", "down"), ("x", "y", "z")
+# effect: components, unit, scale from SI, step of the numerical derivative, parts of the difference that show it
+_EFFECTS: dict[str, tuple[tuple[str, ...], str, float, float, tuple[str, ...]]] = {
+    "time-offset": (("",), "ms", 1e3, 1e-3, GROUPS),
+    "inertial-velocity": (("",), "of W x r", 1.0, 0.1, ("velocity",)),
+    "shift": (_NED, "m", 1.0, 1.0, ("position",)),
+    "track-rotation": (_NED, "deg", 180.0 / np.pi, 1e-5, ("position", "velocity")),
+    "attitude-body": (_BODY, "deg", 180.0 / np.pi, 1e-5, ("attitude",)),
+    "attitude-earth": (_NED, "deg", 180.0 / np.pi, 1e-5, ("attitude",)),
+    "other-point": (_BODY, "m", 1.0, 0.1, ("position", "velocity")),
+}
+_WORDS = {
+    "time-offset": "its time tags are late by",
+    "height-datum": "its heights are above the geoid and were taken above the ellipsoid, so that they lie higher by",
+    "inertial-velocity": "its velocity is inertial, not relative to the Earth: factor",
+    "shift": "its positions are shifted by",
+    "track-rotation": "its track is turned about the first common place by",
+    "attitude-body": "its body axes are turned by",
+    "attitude-earth": "its attitude is turned in Earth axes by",
+    "other-point": "it follows another point of the body, in body axes at",
+}
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """One systematic difference, other minus run.
+
+    Parameters
+    ----------
+    name : str
+        Key of the module's table.
+    components : tuple of str
+    value, sd, stated_sd : (p,) float
+        In ``unit``; ``stated_sd`` is what both covariances allow, NaN where none is stated.
+    unit : str
+    """
+
+    name: str
+    components: tuple[str, ...]
+    value: FloatArray
+    sd: FloatArray
+    stated_sd: FloatArray
+    unit: str
+
+    @property
+    def words(self) -> str:
+        """What differs and by how much, with the sd that the difference shows and the one that is stated."""
+        parts = [
+            f"{name} {v:.{_digits(s)}f} ± {s:.{_digits(s)}f}".strip()
+            for name, v, s in zip(self.components, self.value, self.sd, strict=True)
+        ]
+        size = f" (together {np.linalg.norm(self.value):.{_digits(self.sd.max())}f})" if len(parts) > 1 else ""
+        return f"{_WORDS[self.name]} {', '.join(parts)} {self.unit}{size}"
+
+    @property
+    def beyond(self) -> bool:
+        """Whether it is larger than both covariances allow."""
+        if self.name in ("height-datum", "inertial-velocity"):
+            return True
+        return bool((np.abs(self.value) > _BEYOND_SD * np.hypot(self.sd, self.stated_sd)).any())
+
+
+@dataclass(frozen=True, repr=False)
+class SystematicDifferences(Tabular):
+    """Another source's trajectory against a run's.
+
+    Parameters
+    ----------
+    label : str
+        The other's name.
+    time_s : (n,) float
+        The other's times, after the run's time zero.
+    given, left : (n, m) float
+        Difference as it is, and less the effects; ``m`` is 3 for each of ``groups``: m, m/s, rad.
+    sd : (n, m) float
+        By both covariances.
+    groups : tuple of str
+    effects : tuple of FoundEffect
+        In the order in which they explain most.
+    chi_square : dict of str to (float, float, float)
+        By group, and ``all``: mean per degree of freedom as given, less the effects, and the limit.
+    both_stated : bool
+        Whether the other states covariances.
+    notes : tuple of str
+    """
+
+    label: str
+    time_s: FloatArray
+    given: FloatArray
+    left: FloatArray
+    sd: FloatArray
+    groups: tuple[str, ...]
+    effects: tuple[FoundEffect, ...]
+    chi_square: dict[str, tuple[float, float, float]]
+    both_stated: bool
+    notes: tuple[str, ...] = field(default=())
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a component of an effect: ``effect, component, value, sd, stated_sd, unit, beyond``."""
+        rows = [
+            (effect.name, *row, effect.unit, effect.beyond)
+            for effect in self.effects
+            for row in zip(effect.components, effect.value, effect.sd, effect.stated_sd, strict=True)
+        ]
+        return pd.DataFrame(rows, columns=["effect", "component", "value", "sd", "stated_sd", "unit", "beyond"])
+
+    def histories(self) -> pd.DataFrame:
+        """Differences over time, as given and ``left``, with their sd; units in the columns' names."""
+        columns = {"t_s": self.time_s}
+        for k, (name, unit, scale) in enumerate(self._columns()):
+            for what, values in (("", self.given), ("_left", self.left), ("_sd", self.sd)):
+                columns[f"{name}{what}_{unit}"] = scale * values[:, k]
+        return pd.DataFrame(columns)
+
+    def _columns(self) -> list[tuple[str, str, float]]:
+        units = {"position": ("m", 1.0), "velocity": ("mps", 1.0), "attitude": ("deg", 180.0 / np.pi)}
+        axes = {"attitude": _BODY}
+        return [(f"{group}_{axis}", *units[group]) for group in self.groups for axis in axes.get(group, _NED)]
+
+    def rms(self, group: str) -> tuple[float, float]:
+        """Root mean square of the difference's size as given and less the effects, in m, m/s, deg."""
+        at = 3 * self.groups.index(group)
+        scale = 180.0 / np.pi if group == "attitude" else 1.0
+        given, left = (
+            scale * float(np.sqrt((d[:, at : at + 3] ** 2).sum(axis=1).mean())) for d in (self.given, self.left)
+        )
+        return given, left
+
+    @cached_property
+    def paragraph(self) -> str:
+        """What was found, in one paragraph."""
+        span = f"{len(self.time_s)} epochs from {self.time_s[0]:.2f} to {self.time_s[-1]:.2f} s"
+        words, found = f"{self.label} against the run, {span}. ", bool(self.effects)
+        for beyond, head in ((True, "Beyond"), (False, "Within")):
+            parts = [effect.words for effect in self.effects if effect.beyond == beyond]
+            words += f"{head} what the covariances allow, {'; '.join(parts)}. " if parts else ""
+        words += "" if found else "No systematic difference is found. "
+        changes = []
+        for group in self.groups:
+            given, left = self.rms(group)
+            change = f"{group} {_short(given)}" + (f" to {_short(left)}" if found else "")
+            changes.append(f"{change} {_UNITS[group]}")
+        words += f"Rms of the difference: {', '.join(changes)}. "
+        given, left, limit = self.chi_square["all"]
+        whose = "both covariances" if self.both_stated else "the run's covariance alone (the other states none)"
+        words += f"Chi-square per degree of freedom with {whose}: {_short(given)}"
+        words += f", {_short(left)} less these. " if found else ". "
+        last = left if found else given
+        if last > limit:
+            words += f"Above {limit:.1f} the covariances do not explain the difference, however correlated in time. "
+        words += "Errors of the two are taken as independent; where they share data less is allowed."
+        return words
+
+    def _about(self) -> str:
+        return f"{self.label}: {', '.join(e.name for e in self.effects) or 'no systematic difference'}"
+
+
+def _digits(sd: float) -> int:
+    return max(0, min(6, 1 - int(np.floor(np.log10(max(float(sd), 1e-6))))))
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def systematic_differences(
+    run: Trajectory, covariance_time_s: FloatArray, covariance: FloatArray, has_attitude: bool, other: OtherTrajectory
+) -> SystematicDifferences:
+    """Find what separates another source's trajectory from the run's.
+
+    Parameters
+    ----------
+    run : Trajectory
+    covariance_time_s : (k,) float
+    covariance : (k, 9, 9) float
+        Of the run, in the coordinates of `flightmodel.trajectory.difference`.
+    has_attitude : bool
+        Whether the run's attitude is known.
+    other : OtherTrajectory
+
+    Raises
+    ------
+    GateError
+        ``no-common-time`` where fewer than 20 of the other's epochs lie in the run.
+    """
+    best: _Explained | None = None
+    starts = [s for s in (0.0, *_far_offset(run, other)) if _covered(run, other.time_s, s).sum() >= _LEAST_EPOCHS]
+    for start_s in starts or [0.0]:
+        explained = _Fit(run, other, has_attitude, start_s).explained()
+        if best is None or explained.score > best.score:
+            best = explained
+    assert best is not None
+    stated = _stated(best.fit, covariance_time_s, covariance, other)
+    if np.abs(best.fit.undulation_m).min() > _LEAST_UNDULATION_M:
+        by_datum = _Fit(run, other, has_attitude, best.fit.start_s, datum=True).explained()
+        # the same effects with a shift in the datum's place: what else differs must not speak for the datum
+        without = best.fit.solved(tuple(dict.fromkeys((*by_datum.names, "shift"))))
+        gains = [by_datum.odds_over(rival) + _shift_odds(by_datum, rival, stated) for rival in (best, without)]
+        best = by_datum if min(gains) > _LEAST_ODDS else best
+    return _result(best, stated, other)
+
+
+def _covered(run: Trajectory, time_s: FloatArray, offset_s: float) -> BoolArray:
+    """Times that the run covers when they are moved by an offset, and by half a second more to both sides."""
+    margin = 0.5
+    return np.asarray(
+        (time_s - offset_s >= run.time_s[0] + margin) & (time_s - offset_s <= run.time_s[-1] - margin), dtype=bool
+    )
+
+
+def _far_offset(run: Trajectory, other: OtherTrajectory) -> list[float]:
+    """Time offset at which the two tracks have one form, where that is far from none and far better."""
+    offsets = np.arange(-_FAR_S, _FAR_S + _FAR_STEP_S, _FAR_STEP_S)
+    scatter = np.full(len(offsets), np.inf)
+    few = np.unique(np.linspace(0, len(other.time_s) - 1, 300).astype(int))
+    t, place = other.time_s[few], other.position_ecef_m[few]
+    for k, offset in enumerate(offsets):
+        use = _covered(run, t, float(offset))
+        if use.sum() >= max(_LEAST_EPOCHS, len(few) // 3):
+            apart = place[use] - interpolate_rows(t[use] - offset, run.time_s, run.position_ecef_m)
+            scatter[k] = float(apart.std(axis=0).max())
+    if not np.isfinite(scatter).any():
+        return []
+    best, none = int(scatter.argmin()), int(np.abs(offsets).argmin())
+    far = abs(offsets[best]) >= 2.0 * _FAR_STEP_S and not scatter[none] < 2.0 * scatter[best]
+    return [float(offsets[best])] if far else []
+
+
+# the model
+
+
+class _Fit:
+    """Difference and effects at the other's epochs."""
+
+    def __init__(
+        self, run: Trajectory, other: OtherTrajectory, has_attitude: bool, start_s: float, datum: bool = False
+    ) -> None:
+        use = np.flatnonzero(_covered(run, other.time_s, start_s))
+        if len(use) < _LEAST_EPOCHS:
+            words = f"{len(use)} of its epochs lie in the run ({_span(run.time_s)}); its own are {_span(other.time_s)}"
+            raise GateError(f"{other.label}: {words}; {_LEAST_EPOCHS} are wanted", "no-common-time")
+        use = use[np.unique(np.linspace(0, len(use) - 1, min(len(use), _MOST_EPOCHS)).astype(int))]
+        self.run, self.other, self.use, self.start_s, self.datum = run, other, use, start_s, datum
+        self.time_s = other.time_s[use]
+        known = {
+            "position": True,
+            "velocity": other.velocity_ecef_mps is not None,
+            "attitude": has_attitude and other.q_ecef_body is not None,
+        }
+        self.groups = tuple(group for group in GROUPS if known[group])
+        self.parts = np.concatenate([np.arange(3) + 3 * GROUPS.index(group) for group in self.groups])
+        self.known: dict[float, Trajectory] = {}
+        whole = self._run_at(start_s)
+        self.latitude, self.longitude, _ = earth.geodetic_from_ecef(whole.position_ecef_m)
+        self.dcm_ned_ecef = earth.dcm_ned_ecef(self.latitude, self.longitude)
+        self.middle = self.dcm_ned_ecef[len(use) // 2]
+        self.undulation_m = undulation_m(self.latitude, self.longitude)
+        first_s = np.clip(other.time_s[0] - start_s, run.time_s[0], None)
+        self.centre_m = resample(run, np.array([first_s])).position_ecef_m[0]
+        latitude, longitude, _ = earth.geodetic_from_ecef(self.centre_m)
+        self.first = earth.dcm_ned_ecef(float(latitude), float(longitude))
+        self.names = tuple(
+            name for name, (*_, shown) in _EFFECTS.items() if self._can_be_seen(name, shown, has_attitude)
+        )
+        self.slices: dict[str, slice] = {}
+        at = 0
+        for name in self.names:
+            self.slices[name] = slice(at, at + len(_EFFECTS[name][0]))
+            at = self.slices[name].stop
+        self.count = at
+
+    def _can_be_seen(self, name: str, shown: tuple[str, ...], has_attitude: bool) -> bool:
+        if name == "other-point" and not has_attitude:
+            return False
+        return bool(set(shown) & set(self.groups))
+
+    def _run_at(self, offset_s: float) -> Trajectory:
+        """The run at the epochs less a time offset; the last few are kept, as derivatives ask for one again."""
+        if offset_s not in self.known:
+            if len(self.known) > 8:
+                self.known.clear()
+            self.known[offset_s] = resample(self.run, self.time_s - offset_s)
+        return self.known[offset_s]
+
+    def difference(self, x: FloatArray) -> FloatArray:
+        """Other minus run with the effects ``x`` (count,) applied, (n, m)."""
+        get = {name: x[at] for name, at in self.slices.items()}
+        none = np.zeros(3)
+        path = self._run_at(self.start_s + float(get["time-offset"][0]))
+        turn = rotations.exp(self.first.T @ get.get("track-rotation", none))
+        place = self.centre_m + rotations.rotate(turn, path.position_ecef_m - self.centre_m)
+        place = place + self.middle.T @ get["shift"]
+        if self.datum:
+            place = place + self.undulation_m[:, None] * self.dcm_ned_ecef[:, 2]
+        velocity = rotations.rotate(turn, path.velocity_ecef_mps)
+        if "inertial-velocity" in get:
+            velocity = velocity + get["inertial-velocity"][0] * np.cross(earth.OMEGA_ECEF_RADPS, path.position_ecef_m)
+        if "other-point" in get:
+            arm = rotations.rotate(path.q_ecef_body, np.broadcast_to(get["other-point"], (len(self.time_s), 3)))
+            rate = rotations.rotate(path.q_ecef_body, path.omega_body_eci_body_radps) - earth.OMEGA_ECEF_RADPS
+            place, velocity = place + arm, velocity + np.cross(rate, arm)
+        out = [np.einsum("nij,nj->ni", self.dcm_ned_ecef, self.other.position_ecef_m[self.use] - place)]
+        if self.other.velocity_ecef_mps is not None:
+            gap = self.other.velocity_ecef_mps[self.use] - velocity
+            out.append(np.einsum("nij,nj->ni", self.dcm_ned_ecef, gap))
+        if "attitude" in self.groups and self.other.q_ecef_body is not None:
+            turned = rotations.multiply(rotations.exp(self.middle.T @ get["attitude-earth"]), path.q_ecef_body)
+            turned = rotations.boxplus(turned, get["attitude-body"])
+            out.append(rotations.boxminus(self.other.q_ecef_body[self.use], turned))
+        return np.hstack(out)
+
+    def jacobian(self, x: FloatArray, names: tuple[str, ...]) -> FloatArray:
+        """Derivative of what some effects predict, (n, m, p), by central differences."""
+        columns = []
+        for name in (name for name in self.names if name in names):
+            at, step = self.slices[name], _EFFECTS[name][3]
+            for k in range(at.start, at.stop):
+                away = np.zeros(self.count)
+                away[k] = step
+                columns.append((self.difference(x - away) - self.difference(x + away)) / (2.0 * step))
+        return np.stack(columns, axis=-1)
+
+    # which effects
+
+    def explained(self) -> _Explained:
+        """The effects that the difference bears, added one by one and dropped where others have made them needless."""
+        current = self.solved(("time-offset",) if self.start_s else ())
+        while len(current.names) < len(self.names):
+            trials = [
+                self.solved((*current.names, name), current.x) for name in self.names if name not in current.names
+            ]
+            best = max((t for t in trials if self._possible(t)), key=lambda t: t.odds_over(current), default=None)
+            if best is None or best.odds_over(current) < _LEAST_ODDS:
+                break
+            current = best
+            for name in current.names[:-1]:
+                fewer = self.solved(tuple(n for n in current.names if n != name), current.x)
+                if self._possible(fewer) and current.odds_over(fewer) < _LEAST_ODDS:
+                    current = fewer
+        return current
+
+    def _possible(self, fit: _Explained) -> bool:
+        """Whether inertial velocity, if it is among the effects, has its size."""
+        if "inertial-velocity" not in fit.names:
+            return True
+        at = self.slices["inertial-velocity"]
+        return bool(abs(float(fit.x[at][0]) - 1.0) < 3.0 * float(fit.sd()[at][0]) + 0.01)
+
+    def solved(self, names: tuple[str, ...], x: FloatArray | None = None) -> _Explained:
+        """Weighted least squares of some effects, weights by their own residuals; the other effects are none."""
+        x = np.zeros(self.count) if x is None else x
+        used = np.zeros(self.count, dtype=bool)
+        for name in names:
+            used[self.slices[name]] = True
+        x = np.where(used, x, 0.0)
+        left = self.difference(x)
+        noise = _Noise.of(left, self.parts)
+        slope = np.empty((*left.shape, 0))
+        for _ in range(_STEPS if names else 0):
+            slope = self.jacobian(x, names) if not slope.size else slope
+            root = 1.0 / noise.sd_effective
+            a = (slope * root[:, None]).reshape(-1, int(used.sum()))
+            change = np.linalg.lstsq(a, (left * root).ravel(), rcond=1e-12)[0]
+            x = x.copy()
+            x[used] += change
+            left = self.difference(x)
+            noise = _Noise.of(left, self.parts)
+        return _Explained(self, names, used, x, left, slope, noise)
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """Residuals (n, m): variance of each component and how many of n are independent."""
+
+    variance: FloatArray
+    inefficiency: FloatArray
+    epochs: int
+
+    @classmethod
+    def of(cls, left: FloatArray, parts: FloatArray) -> _Noise:
+        n = len(left)
+        padded = np.fft.rfft(left, 2 * n, axis=0)
+        lagged = np.fft.irfft(np.abs(padded) ** 2, axis=0)[:n]
+        rho = lagged / np.maximum(lagged[0], 1e-300)
+        first = np.argmax(rho <= 0.0, axis=0)
+        upto = np.where((rho <= 0.0).any(axis=0), first, n)
+        g = np.array([1.0 + 2.0 * rho[1:end, k].sum() for k, end in enumerate(upto)])
+        return cls((left**2).mean(axis=0) + _RESOLUTION[parts] ** 2, np.clip(g, 1.0, n / 2.0), n)
+
+    @property
+    def sd_effective(self) -> FloatArray:
+        """Sd (m,) that makes n correlated residuals weigh as much as their independent ones."""
+        return np.sqrt(self.variance * self.inefficiency)
+
+
+@dataclass(frozen=True)
+class _Explained:
+    """A set of effects, solved."""
+
+    fit: _Fit
+    names: tuple[str, ...]
+    used: BoolArray
+    x: FloatArray
+    left: FloatArray
+    slope: FloatArray
+    noise: _Noise
+
+    @property
+    def score(self) -> float:
+        """Larger is better: how small the residuals of position are."""
+        return -float(np.log(self.noise.variance[:3]).sum())
+
+    def odds_over(self, fewer: _Explained) -> float:
+        """Log odds over another set."""
+        independent = self.noise.epochs / self.noise.inefficiency
+        gain = float((independent * np.log(fewer.noise.variance / self.noise.variance)).sum())
+        more = int(self.used.sum()) - int(fewer.used.sum())
+        return 0.5 * gain - 0.5 * more * float(np.log(max(independent.mean(), 2.0)))
+
+    def _gain(self) -> FloatArray:
+        """Matrix (p, n, m) that takes differences to the effects."""
+        root = 1.0 / self.noise.sd_effective
+        a = (self.slope * root[:, None]).reshape(-1, int(self.used.sum()))
+        inverse = np.linalg.pinv(a, rcond=1e-12)
+        return inverse.reshape(-1, *self.left.shape) * root
+
+    def sd(self) -> FloatArray:
+        """Sd (count,) by the residuals; NaN of effects that are not in the set."""
+        out = np.full(self.fit.count, np.nan)
+        out[self.used] = np.sqrt((self._gain() ** 2 * self.noise.sd_effective**2).sum(axis=(1, 2)))
+        return out
+
+    def stated_sd(self, covariances: tuple[FloatArray, ...]) -> FloatArray:
+        """Largest sd (count,) that errors with these covariances (n, m, m) give, whatever their correlation in time."""
+        gain, variance = self._gain(), np.zeros(int(self.used.sum()))
+        for covariance in covariances:
+            each = np.einsum("pni,nij,pnj->pn", gain, covariance, gain)
+            variance += np.sqrt(np.maximum(each, 0.0)).sum(axis=1) ** 2
+        out = np.full(self.fit.count, np.nan)
+        out[self.used] = np.sqrt(variance)
+        return out
+
+
+def _shift_odds(one: _Explained, other: _Explained, covariances: tuple[FloatArray, ...]) -> float:
+    """Log odds of the size of the shift that one set of effects leaves, over that of another; no shift is one of zero.
+
+    What both covariances allow is the largest scale of a shift; two files of one solution differ by far less. So its
+    scale is any from a thousandth of that on, evenly in its logarithm.
+    """
+    having = [found for found in (one, other) if "shift" in found.names]
+    if not having:
+        return 0.0
+    at = one.fit.slices["shift"]
+    sd, allowed = having[0].sd()[at], having[0].stated_sd(covariances)[at]
+    variance = (np.geomspace(1e-3, 1.0, 60)[:, None] * allowed) ** 2 + sd**2
+    logs = [logsumexp(-0.5 * (found.x[at] ** 2 / variance + np.log(variance)).sum(axis=1)) for found in (one, other)]
+    return float(logs[0] - logs[1])
+
+
+# the covariances
+
+
+def _stated(fit: _Fit, time_s: FloatArray, covariance: FloatArray, other: OtherTrajectory) -> tuple[FloatArray, ...]:
+    """Covariances (n, m, m) at the epochs, in the difference's axes: the run's, and the other's where it states one."""
+    found = [_local(fit, _interpolated(time_s, covariance, fit.time_s))]
+    if len(other.covariance_time_s):
+        theirs = _interpolated(other.covariance_time_s, other.covariance, fit.time_s)
+        whole = np.zeros((len(theirs), 9, 9))
+        size = theirs.shape[1]
+        whole[:, :size, :size] = theirs
+        found.append(_local(fit, whole))
+    return tuple(found)
+
+
+def _interpolated(time_s: FloatArray, covariance: FloatArray, at_s: FloatArray) -> FloatArray:
+    """Covariances at other times, linear between stated ones, kept beyond them."""
+    if len(time_s) == 1:
+        return np.repeat(covariance, len(at_s), axis=0)
+    k = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
+    w = np.clip((at_s - time_s[k]) / (time_s[k + 1] - time_s[k]), 0.0, 1.0)[:, None, None]
+    return np.asarray((1.0 - w) * covariance[k] + w * covariance[k + 1])
+
+
+def _local(fit: _Fit, covariance: FloatArray) -> FloatArray:
+    """Position and velocity turned to north, east, down; the groups that are compared."""
+    turn = np.zeros((len(covariance), 9, 9))
+    turn[:, :3, :3] = turn[:, 3:6, 3:6] = fit.dcm_ned_ecef
+    turn[:, 6:, 6:] = np.eye(3)
+    turned = turn @ np.nan_to_num(covariance) @ np.swapaxes(turn, 1, 2)
+    return turned[:, fit.parts[:, None], fit.parts]
+
+
+def _result(best: _Explained, stated: tuple[FloatArray, ...], other: OtherTrajectory) -> SystematicDifferences:
+    fit = best.fit
+    x = best.x.copy()
+    x[fit.slices["time-offset"]] += fit.start_s
+    sd, allowed = (best.sd(), best.stated_sd(stated)) if best.names else (x, x)
+    effects = []
+    if fit.datum:
+        higher = np.array([-float(fit.undulation_m.mean())])
+        error = np.array([_GEOID_ERROR_M])
+        effects.append(FoundEffect("height-datum", ("",), higher, error, np.full(1, np.nan), "m"))
+    for name in best.names:
+        components, unit, scale, *_ = _EFFECTS[name]
+        at = fit.slices[name]
+        effects.append(FoundEffect(name, components, scale * x[at], scale * sd[at], scale * allowed[at], unit))
+    none = np.zeros(fit.count)
+    none[fit.slices["time-offset"]] = -fit.start_s
+    plain = _Fit(fit.run, other, "attitude" in fit.groups, fit.start_s)
+    given = plain.difference(none if _covered(fit.run, fit.time_s, 0.0).all() else np.zeros(fit.count))
+    total = np.sum(stated, axis=0) + np.diag(_RESOLUTION[fit.parts] ** 2)
+    chi_square = {}
+    for group in ("all", *fit.groups):
+        rows = np.arange(len(fit.parts)) if group == "all" else np.arange(3) + 3 * fit.groups.index(group)
+        inverse = np.linalg.inv(total[:, rows[:, None], rows])
+        both = (given[:, rows], best.left[:, rows])
+        before, after = (float(np.einsum("ni,nij,nj->n", d, inverse, d).mean()) for d in both)
+        degrees = len(rows)
+        chi_square[group] = before / degrees, after / degrees, float(chi2.ppf(_CONFIDENCE, degrees)) / degrees
+    return SystematicDifferences(
+        other.label,
+        fit.time_s,
+        given,
+        best.left,
+        np.sqrt(np.diagonal(total, axis1=1, axis2=2)),
+        fit.groups,
+        tuple(effects),
+        chi_square,
+        len(stated) > 1,
+        other.notes,
+    )
+
+
+def _span(time_s: FloatArray) -> str:
+    return f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
