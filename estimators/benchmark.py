@@ -266,6 +266,12 @@ def _fitted(
             residuals = look.residuals
             if alone:
                 residuals = residuals.some(residuals.index >= len(look.clocks_rad))
+            if not len(residuals.index):
+                raise GateError(
+                    "benchmark frame: neither a point of the edge nor a feature where the camera should see them; "
+                    "choose another benchmark time",
+                    code="edge-points-too-few",
+                )
             offset = residuals.index >= len(look.clocks_rad)
             shape = np.column_stack([residuals.rows[:, FLATTENING], residuals.shape, offset])
             design = np.column_stack([residuals.rows[:, POSED], shape])
