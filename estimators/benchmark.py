@@ -51,7 +51,6 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from estimators.camera_fit import (
     POSED,
-    USUAL_RMS_PX,
     USUAL_SHARE,
     AprioriSd,
     FrameResiduals,
@@ -65,6 +64,7 @@ from estimators.camera_fit import (
 from estimators.edge import NO_FAULT, HorizonLine, ScanLines, fault_of_frame, is_coherent
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.features import Features, ImageFeatures, fit_feature_map, no_features, valleys, visible_features
+from estimators.frame_checks import USUAL_RMS_PX
 from estimators.frame_edits import MARK_SD_PX, EditedFrame, MarkedFeatures, marked_on_shell, unedited
 from estimators.loads import FlightLoads
 from estimators.texture import texture_of

@@ -48,6 +48,7 @@ from estimators.edge import (
     no_horizon,
 )
 from estimators.features import Features, ImageFeatures, fit_feature_map, valleys
+from estimators.frame_checks import USUAL_RMS_PX, Design, fault_of_fit
 from estimators.frame_edits import LEAST_MARKS, EditedFrame, MarkedFeatures, unedited
 from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
@@ -72,13 +73,11 @@ _AGREED_PX, _LEAST_AGREED = 0.5, 0.5  # by chance a sixth of the patches lie wit
 _SOUND_SCORE = 1.5  # the texture agrees with itself
 _EDGE_PASSES = 2
 _CONTRADICTION = 18.4  # chi-square of two components that one sound frame in 10,000 exceeds
-# chi-square of seven of shape and light, and of three rotations, that one sound frame in 10,000 exceeds
-_WORST_SHAPE, _WORST_TURN = 29.9, 21.1
 _LEAST_VAR = float(np.deg2rad(1e-3) ** 2)  # of a difference, far below what any film shows
 _BESIDE = 4  # places of 240 along the edge: a residual of the benchmark frame holds that far for a mark by hand
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
-USUAL_SHARE, USUAL_RMS_PX = 0.75, 1.0  # features shown and rms of a benchmark frame that is not suspicious
+USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
 JOINT = HELD.stop - 1
 POSED = slice(CAMERA.start, JOINT)
 TURN = slice(CAMERA.start, CAMERA.start + 3)
@@ -425,40 +424,12 @@ class OrientedCamera:
         return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
 
     def _check_explained(self, last: _Solution, flattening_rad: float) -> None:
-        """Refuse a frame that no deflection explains, or none without more of shape and light than their a priori sd.
-
-        Or one that a turn of the camera in its mount explains: what the residuals determine of it beside deflection,
-        shape and light, where lobes that are not modelled may look like one of the size of the modelled ovality.
-        """
-        if last.rms_px > USUAL_RMS_PX:
-            raise _NoFitError(
-                f"no deflection explains edge and features: rms {last.rms_px:.1f} px where {USUAL_RMS_PX:.1f} px are "
-                "allowed",
-                "edge-not-shell",
-            )
-        sd = self._shape_prior(2)
-        design = np.concatenate([last.rows[:, DEFLECTION], last.rows[:, [FLATTENING, JOINT]], last.shape], axis=1)
-        weighted = design.T * last.weight
-        formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(2), sd**-2])))
-        shape = np.array([flattening_rad, *(formal @ weighted @ last.residual_px)[3:]]) / sd
-        if shape @ shape > _WORST_SHAPE:
-            raise _NoFitError(
-                f"shape and light would have to be {np.sqrt(shape @ shape / len(shape)):.1f} sd (rms of seven) from "
-                f"the benchmark frame's, where {np.sqrt(_WORST_SHAPE / len(shape)):.1f} are allowed",
-                "edge-not-shell",
-            )
-        turn = last.rows[:, TURN]
-        turned = turn.T * last.weight
-        crossed = turned @ design @ formal
-        covariance = np.linalg.inv(turned @ turn - crossed @ weighted @ turn)
-        estimate = covariance @ (turned - crossed @ weighted) @ last.residual_px
-        known = covariance + self.apriori.ovality_rad**2 * np.eye(3)
-        if estimate @ np.linalg.solve(known, estimate) > _WORST_TURN:
-            raise _NoFitError(
-                f"the camera seems turned by {np.rad2deg(np.linalg.norm(estimate)):.1f} deg in its mount since the "
-                "benchmark frame, or edge and features are not the shell's alone",
-                "camera-turned",
-            )
+        """Refuse a frame that no deflection explains, by `estimators.frame_checks`."""
+        rest = np.concatenate([last.rows[:, [FLATTENING, JOINT]], last.shape], axis=1)
+        design = Design(last.rows[:, DEFLECTION], rest, last.rows[:, TURN], last.residual_px, last.weight)
+        fault = fault_of_fit(design, last.rms_px, flattening_rad, self._shape_prior(2), self.apriori.ovality_rad)
+        if fault:
+            raise _NoFitError(fault)
 
     def points_at(
         self, picture: Image | EditedFrame, own: FloatArray, tried: FloatArray
