@@ -51,7 +51,6 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from estimators.camera_fit import (
     POSED,
-    USUAL_RMS_PX,
     USUAL_SHARE,
     AprioriSd,
     FrameResiduals,
@@ -65,6 +64,7 @@ from estimators.camera_fit import (
 from estimators.edge import NO_FAULT, HorizonLine, ScanLines, fault_of_frame, is_coherent
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.features import Features, ImageFeatures, fit_feature_map, no_features, valleys, visible_features
+from estimators.frame_checks import USUAL_RMS_PX
 from estimators.frame_edits import MARK_SD_PX, EditedFrame, MarkedFeatures, marked_on_shell, unedited
 from estimators.loads import FlightLoads
 from estimators.texture import texture_of
@@ -266,6 +266,12 @@ def _fitted(
             residuals = look.residuals
             if alone:
                 residuals = residuals.some(residuals.index >= len(look.clocks_rad))
+            if not len(residuals.index):
+                raise GateError(
+                    "benchmark frame: neither a point of the edge nor a feature where the camera should see them; "
+                    "choose another benchmark time",
+                    code="edge-points-too-few",
+                )
             offset = residuals.index >= len(look.clocks_rad)
             shape = np.column_stack([residuals.rows[:, FLATTENING], residuals.shape, offset])
             design = np.column_stack([residuals.rows[:, POSED], shape])

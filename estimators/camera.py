@@ -27,6 +27,7 @@ import numpy as np
 
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, orient_camera
 from estimators.camera_fit import AprioriSd, FrameFit, Image, OrientedCamera, refused_fit
+from estimators.edge import no_horizon
 from estimators.frame_edits import edited
 from estimators.texture import TrackedTexture
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
@@ -37,7 +38,7 @@ from flightmodel.deflection import (
     polar_from_lateral,
     rotation_vector_body_shell,
 )
-from flightmodel.film import read_image
+from flightmodel.film import NO_PICTURE, read_image
 from flightmodel.geometry import ShellGeometry
 from flightmodel.vehicle import CameraMount
 
@@ -45,7 +46,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _MOST = 0.5  # of the answered frames
+_NOT_THE_SHELL = ("camera-turned", "edge-not-shell", "features-contradict-edge")
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
+_FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
 _SWAP = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from a rotation about body y and z to the lateral vector
 
 
@@ -275,13 +278,16 @@ def read_film(
     oriented = orient_camera(benchmark_frame, geometry, camera_mount, joint_station_m, apriori, edits.pose)
     axis = None if plane_lv_rad is None else _axis_of(plane_lv_rad)
     fits: list[FrameFit] = []
-    start = np.zeros(2)
+    start, before = np.zeros(2), NO_PICTURE
     for picture in _decoded_ahead(frames):
         if progress is not None and len(fits) % 10 == 0:
             progress(min(len(fits) / len(times), 1.0), f"frame {len(fits) + 1} of {len(times)}")
         t_s = float(times[min(len(fits), len(times) - 1)])
+        if np.array_equal(picture, before) and picture.size:
+            fits.append(refused_fit(no_horizon(_FROZEN), _FROZEN))
+            continue
         fits.append(oriented.fit(edited(picture, edits, t_s), axis, start))
-        start = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad
+        start, before = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad, picture
     if len(fits) != len(times):
         raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
     fits = judged(times, fits, joint_swing, edits)
@@ -304,7 +310,7 @@ def judged(
         else fit
         for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
     ]
-    found = without_lost_features(kept)
+    found = without_doubtful(without_lost_features(kept))
     if joint_swing is not None:
         found = without_jumps(time_s, found, joint_swing)
     accepted = [v is not None and v.edit == "accept" for v in verdicts]
@@ -320,6 +326,22 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
     lost = Fault(words, "features-lost")
     bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
     return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
+
+
+def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:
+    """Refuse answers among frames that contradict the shell: what spoils a film lasts longer than a frame.
+
+    A frame of another scene passes all its tests now and then, and of a camera that moved the edge alone may answer; of
+    the two nearest frames on both sides half or more then fail a test, or their features contradict the edge.
+    """
+    contradicts = np.array([fit.contradicted or getattr(fit.refused, "code", "") in _NOT_THE_SHELL for fit in fits])
+    words = "half or more of the four frames around contradict the shell: an answer here may be chance"
+    out = []
+    for k, fit in enumerate(fits):
+        around = np.delete(contradicts[max(k - 2, 0) : k + 3], min(k, 2))
+        doubtful = len(around) > 0 and not fit.refused and bool(around.mean() >= _MOST)
+        out.append(refused_fit(fit.horizon, Fault(words, "frames-around-refused")) if doubtful else fit)
+    return out
 
 
 @dataclass(frozen=True)

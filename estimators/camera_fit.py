@@ -48,6 +48,7 @@ from estimators.edge import (
     no_horizon,
 )
 from estimators.features import Features, ImageFeatures, fit_feature_map, valleys
+from estimators.frame_checks import USUAL_RMS_PX, Design, fault_of_fit
 from estimators.frame_edits import LEAST_MARKS, EditedFrame, MarkedFeatures, unedited
 from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
@@ -60,7 +61,7 @@ STEPS = 12
 LAST_STEP_RAD = 2e-5
 OUTLIER_PX = 5.0
 REACH_PX = 8  # within which features are looked for around their prediction
-_WORST_RMS_PX, _FEATURES_RMS_PX = 2.5, 1.0
+_WORST_RMS_PX = 2.5  # from where a fit goes on
 LEAST_POINTS, _LEAST_FEATURES = 60, 40
 _FEW_FEATURES = 0.6  # of those found at the benchmark
 _FAR_RAD = np.deg2rad([4.0, 4.0])
@@ -76,9 +77,10 @@ _LEAST_VAR = float(np.deg2rad(1e-3) ** 2)  # of a difference, far below what any
 _BESIDE = 4  # places of 240 along the edge: a residual of the benchmark frame holds that far for a mark by hand
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
-USUAL_SHARE, USUAL_RMS_PX = 0.75, 1.0  # features shown and rms of a benchmark frame that is not suspicious
+USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
 JOINT = HELD.stop - 1
 POSED = slice(CAMERA.start, JOINT)
+TURN = slice(CAMERA.start, CAMERA.start + 3)
 
 
 @dataclass(frozen=True)
@@ -409,10 +411,8 @@ class OrientedCamera:
             last = self._solve(horizon, place, deformation, basis, _WORST_RMS_PX)
             last = self._reconciled(frame, horizon, place, deformation, last)
             contradicted = place is not None and last.edge_count == len(last.rows)
-            if last.edge_count < _least_points(horizon) and last.rms_px > _FEATURES_RMS_PX:
-                raise _NoFitError(
-                    f"no edge near the features, whose rms is {last.rms_px:.1f} px: not the shell's", "edge-not-shell"
-                )
+            if not horizon.is_by_hand:
+                self._check_explained(last, deformation[2])
             if plane_axis is not None:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
                 # the seed paper's way uses the edge alone
@@ -422,6 +422,14 @@ class OrientedCamera:
         except _NoFitError as fault_of_fit:
             return refused_fit(horizon, fault_of_fit.faults[0])
         return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
+
+    def _check_explained(self, last: _Solution, flattening_rad: float) -> None:
+        """Refuse a frame that no deflection explains, by `estimators.frame_checks`."""
+        rest = np.concatenate([last.rows[:, [FLATTENING, JOINT]], last.shape], axis=1)
+        design = Design(last.rows[:, DEFLECTION], rest, last.rows[:, TURN], last.residual_px, last.weight)
+        fault = fault_of_fit(design, last.rms_px, flattening_rad, self._shape_prior(2), self.apriori.ovality_rad)
+        if fault:
+            raise _NoFitError(fault)
 
     def points_at(
         self, picture: Image | EditedFrame, own: FloatArray, tried: FloatArray

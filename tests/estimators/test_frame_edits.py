@@ -124,7 +124,9 @@ def test_frames_are_rejected_and_accepted_by_hand(frames):
     assert "by hand: reject 1" in read(frames, rejected).history().assumptions
     # ten frames that stand still about one that jumps
     times = 430.0 + 0.1 * np.arange(11)
-    pictures = [frames[0]] + [frames[2]] * 10
+    pictures = [frames[0]] + [frames[2].copy() for _ in range(10)]
+    for k, picture in enumerate(pictures[1:]):
+        picture[0, k] += 1  # no frozen picture
     pictures[5] = frames[1]
     swing = JointSwing(0.05, 0.01)
 

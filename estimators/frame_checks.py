@@ -1,0 +1,88 @@
+"""Does a deflection explain what was found in a frame, or would more have to have happened than it allows for?
+
+Tested at the end of a frame's fit are the rms of its residuals, the shape and light that the fit needed against their a
+priori sd, and a turn of the camera in its mount since the benchmark frame. With the design ``D`` of deflection, shape
+and light, weights ``W``, prior ``P``, residuals ``r`` and the derivatives ``T`` by the turn,
+
+    turn = C T' W (r - D x),    x = (D' W D + P)^-1 D' W r,    C^-1 = T' W T - T' W D (D' W D + P)^-1 D' W T
+
+in which lobes of the shell that are not modelled may look like a turn of the size of the modelled ovality.
+
+Assumed: the camera is fixed to the centerbody. Edge points alone hardly tell its turn from a deflection.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.edge import NO_FAULT
+from flightmodel.checks import Fault, FloatArray
+
+USUAL_RMS_PX = 1.0  # of edge and features in a frame that is not suspicious
+# chi-square of seven of shape and light, and of three rotations, that one sound frame in 10,000 exceeds
+_WORST_SHAPE, _WORST_TURN = 29.9, 21.1
+
+
+@dataclass(frozen=True)
+class Design:
+    """Edge points and features of a frame's fit, ``n`` in all.
+
+    Parameters
+    ----------
+    deflection : (n, 2) float
+        Derivatives by the two components, px/rad.
+    shape : (n, 7) float
+        By flattening, joint station, ovality (2) and light (3).
+    turn : (n, 3) float
+        By the scene's rotation in camera axes, px/rad.
+    residual_px, weight : (n,) float
+    """
+
+    deflection: FloatArray
+    shape: FloatArray
+    turn: FloatArray
+    residual_px: FloatArray
+    weight: FloatArray
+
+
+def fault_of_fit(design: Design, rms_px: float, flattening_rad: float, shape_sd: FloatArray, lobes_rad: float) -> Fault:
+    """Why a deflection does not explain a frame, with its code; empty where it does.
+
+    Parameters
+    ----------
+    design : Design
+    rms_px : float
+        Weighted.
+    flattening_rad : float
+        Of the shell, about which the fit ended.
+    shape_sd : (7,) float
+        A priori, of the columns of ``design.shape``.
+    lobes_rad : float
+        A priori sd of shapes that are not modelled.
+    """
+    if rms_px > USUAL_RMS_PX:
+        words = f"rms {rms_px:.1f} px where {USUAL_RMS_PX:.1f} px are allowed"
+        return Fault(f"no deflection explains edge and features: {words}", "edge-not-shell")
+    both = np.concatenate([design.deflection, design.shape], axis=1)
+    weighted, turned = both.T * design.weight, design.turn.T * design.weight
+    formal = np.linalg.inv(weighted @ both + np.diag(np.concatenate([np.zeros(2), shape_sd**-2])))
+    # the flattening's value was carried from step to step, the others are counted from zero in each
+    shape = np.array([flattening_rad, *(formal @ weighted @ design.residual_px)[3:]]) / shape_sd
+    if shape @ shape > _WORST_SHAPE:
+        words = (
+            f"shape and light would have to be {np.sqrt(shape @ shape / len(shape)):.1f} sd (rms of seven) from the "
+            f"benchmark frame's, where {np.sqrt(_WORST_SHAPE / len(shape)):.1f} are allowed"
+        )
+        return Fault(words, "edge-not-shell")
+    crossed = turned @ both @ formal
+    covariance = np.linalg.inv(turned @ design.turn - crossed @ weighted @ design.turn)
+    turn = covariance @ (turned - crossed @ weighted) @ design.residual_px
+    if turn @ np.linalg.solve(covariance + lobes_rad**2 * np.eye(3), turn) > _WORST_TURN:
+        words = (
+            f"the camera seems turned by {np.rad2deg(np.linalg.norm(turn)):.1f} deg in its mount since the benchmark "
+            "frame, or edge and features are not the shell's alone"
+        )
+        return Fault(words, "camera-turned")
+    return NO_FAULT

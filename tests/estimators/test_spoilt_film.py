@@ -1,0 +1,84 @@
+"""Frames that show the shell, but not as the camera saw it: what is refused, by which code."""
+
+import cv2
+import numpy as np
+import pytest
+
+from estimators import benchmark
+from estimators.benchmark import orient_camera
+from estimators.camera import read_film, without_doubtful
+from estimators.camera_fit import AprioriSd, refused_fit
+from estimators.features import valleys
+from estimators.frame_edits import EditedFrame
+from estimators.virtual_camera import VirtualCamera
+from flightmodel.camera import camera_from_mount
+from flightmodel.checks import Fault, GateError
+from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
+from tests.estimators.test_other_film import answers
+
+CONTRADICTS = {"camera-turned", "edge-not-shell", "features-contradict-edge"}
+THETA_DEG, PLANE_DEG = [0.0, 3.0, 3.6], [0.0, 188.0, 160.0]
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return film(5, THETA_DEG, PLANE_DEG)
+
+
+def moved(frame, turn_deg, shift_px):
+    h, w = frame.shape
+    matrix = cv2.getRotationMatrix2D((0.5 * w, 0.5 * h), turn_deg, 1.0)
+    matrix[:, 2] += shift_px
+    return cv2.warpAffine(frame, matrix, (w, h), flags=cv2.INTER_CUBIC)
+
+
+@pytest.mark.parametrize(("turn_deg", "shift_px"), [(2.0, (0.0, 0.0)), (-1.0, (12.0, 4.0))])
+def test_a_camera_that_moved_in_its_mount_is_noticed(frames, turn_deg, shift_px):
+    """What the features determine of a turn beside the deflection; unmoved, the same frame is answered."""
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    assert not oriented.fit(frames[1]).refused
+    spoilt = oriented.fit(moved(frames[1], turn_deg, shift_px))
+    # of one frame alone the whole edge counts where features contradict it; of several none does
+    assert spoilt.contradicted or spoilt.refused.code in CONTRADICTS
+    assert all(fit.refused for fit in without_doubtful([spoilt] * 4))
+
+
+def test_a_frame_that_needs_more_than_a_deflection_is_no_answer(frames):
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    h, w = frames[1].shape
+    v, u = np.mgrid[:h, :w].astype(np.float32)
+    twisted = cv2.remap(frames[1], u, (v + 8.0 * np.sin(u / 40.0)).astype(np.float32), cv2.INTER_LINEAR)
+    assert not oriented.fit(frames[1]).refused
+    assert not oriented.fit(frames[2]).refused
+    assert oriented.fit(twisted).refused.code in CONTRADICTS
+
+
+def test_a_frozen_picture_is_no_frame(frames):
+    pictures = [frames[0], frames[1], frames[1].copy(), frames[2]]
+    read = read_film(np.array([421.0, 430.0, 431.0, 432.0]), pictures, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None)
+    assert [fit.refused.code if fit.refused else "" for fit in read.fits] == ["", "", "frame-frozen", ""]
+    assert "frozen" in read.history().assumptions
+
+
+def test_an_answer_among_frames_that_contradict_the_shell_is_doubted():
+    fits = answers(np.linspace(1.0, 2.0, 10))
+
+    def codes(*refused, code="camera-turned"):
+        spoilt = [refused_fit(f.horizon, Fault("no", code)) if k in refused else f for k, f in enumerate(fits)]
+        return [k for k, f in enumerate(without_doubtful(spoilt))
+                if f.refused and f.refused.code == "frames-around-refused"]  # fmt: skip
+
+    assert codes() == []
+    assert codes(4) == []
+    assert codes(4, 6) == [5]
+    assert codes(7, 8) == [6, 9]
+    assert codes(4, 6, code="frame-dark") == []
+
+
+def test_a_benchmark_without_any_point_is_refused_in_words(frames):
+    nominal = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
+    prior = benchmark._prior_sd(MOUNT.uncertainty, AprioriSd())
+    empty = EditedFrame(np.full_like(frames[0], 90))
+    with pytest.raises(GateError) as refusal:
+        benchmark._fitted(nominal, empty, prior, AprioriSd(), np.zeros(12), (12, 8), valleys)
+    assert refusal.value.codes == ("edge-points-too-few",)
