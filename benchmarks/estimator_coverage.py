@@ -44,7 +44,6 @@ from postflight.fusing import fuse_flight
 from postflight.loads import loads_from_solution
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
-from synthetic_flight.scenarios import ACCELEROMETER_MOUNT
 from tests import wide_flights
 
 KEPT = "/tmp/wide_estimator_coverage"
@@ -125,7 +124,7 @@ def kept_flight(folder, seed):
         truth = {k.removeprefix("true_"): data[k] for k in data.files if k.startswith("true_")}
     one = wide_flights.wide_flight(seed)
     spec, vehicle = one.scenario.spec, one.stated
-    arm = vehicle.cg_m - vehicle.sensors[ACCELEROMETER_MOUNT].position_from_datum_body_m
+    arm = vehicle.cg_m - vehicle.sensors[spec.accelerometer.mount].position_from_datum_body_m
     stated = (vehicle, vehicle.cg_m, spec.accelerometer.time_bias_s, spec.rates.time_bias_s, arm)
     return FlightLoads(**arrays, **dict(zip(STATED, stated, strict=True))), truth
 

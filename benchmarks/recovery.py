@@ -15,7 +15,7 @@ from postflight import run_folder
 from postflight.deflections import METHODS, estimate
 from postflight.flight import read_flight
 from postflight.reconstruction import reconstruct
-from postflight.score import BET_LIMITS, score_run
+from postflight.score import BET_SD, score_run
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 
@@ -40,7 +40,7 @@ def main():
                 run_folder.write_answers(run, answers)
                 run.write_json("summary.json", run_folder.summary(flight, answers))
             score = score_run(folder)
-        bets.append([score.bet[k] for k in BET_LIMITS])
+        bets.append([score.bet[k] for k in BET_SD])
         words = [f"{m} {score.methods[m]['error_deg']:+.2f} (sd {score.methods[m]['sd_deg']:.2f})" for m in methods]
         for m in methods:
             errors[m].append(score.methods[m]["error_deg"])
@@ -48,7 +48,7 @@ def main():
         print(f"seed {seed}: m, m/s, deg {np.round(bets[-1], 2)}; {', '.join(words)}; red verdicts {red}", flush=True)
     print(
         "BET rms errors over the pulse, largest:",
-        dict(zip(BET_LIMITS, np.max(bets, axis=0).round(2).tolist(), strict=True)),
+        dict(zip(BET_SD, np.max(bets, axis=0).round(2).tolist(), strict=True)),
     )
     for method, values in errors.items():
         if values:

@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, GateError, check_finite, check_increasing
+from flightmodel.checks import ConfigError, FloatArray, GateError, check_finite, check_increasing
+from flightmodel.config import parse_utc
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.statistics import correlation, correlation_root
 from flightmodel.telemetry import Sounding
@@ -309,7 +310,39 @@ def nrlmsis_profile(name: str = "nrlmsis_2009_08_17") -> AtmosphereProfile:
     Temperature is the kinetic one; as everywhere here, the speed of sound takes it with sea-level composition.
     """
     z, density, temperature, _ = np.loadtxt(TABLES / f"{name}.csv", delimiter=",", comments="#", skiprows=3).T
+    return _still_profile(z, density, temperature)
+
+
+def _still_profile(z: FloatArray, density: FloatArray, temperature: FloatArray) -> AtmosphereProfile:
     standard, standard_t, _ = us76(z)
     sd = default_sounding_sd(z)
     still = np.zeros((len(z), 3))
     return AtmosphereProfile(z, np.log(density / standard), temperature - standard_t, still, *sd)
+
+
+@cache
+def nrlmsis_of(t0_utc: str, latitude_deg: float, longitude_deg: float, f107: float, ap: float) -> AtmosphereProfile:
+    """NRLMSIS 2.1 of a time and place, 0 to 400 km, without winds, through pymsis.
+
+    Parameters
+    ----------
+    t0_utc : str
+        ISO 8601.
+    f107, ap : float
+        Solar flux (of the day and its mean) and geomagnetic index: nothing is looked up, nothing downloaded.
+
+    Raises
+    ------
+    ConfigError
+        ``nrlmsis-missing`` without the library.
+    """
+    try:
+        import pymsis
+    except ImportError:
+        words = "NRLMSIS needs pymsis: pip install 'postflight[msis]', or choose base = \"us76\""
+        raise ConfigError(words, code="nrlmsis-missing") from None
+    z = np.concatenate([np.arange(0.0, 130e3, 1000.0), np.arange(130e3, 200e3, 2000.0), np.arange(200e3, 4.01e5, 1e4)])
+    time = np.datetime64(parse_utc(t0_utc).replace(tzinfo=None))
+    out = pymsis.calculate(time, longitude_deg, latitude_deg, z / 1000.0, [f107], [f107], [[ap] * 7], version=2.1)
+    out = np.asarray(out, dtype=float).reshape(len(z), 11)
+    return _still_profile(z, out[:, 0], out[:, 10])

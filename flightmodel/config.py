@@ -51,7 +51,7 @@ def beside(value: str) -> str:
     """Refuse a file name that leads out of the folder, so that a copy of the folder is whole."""
     paths = PurePosixPath(value), PureWindowsPath(value)
     if not value or "\0" in value or any(path.anchor or ".." in path.parts for path in paths):
-        raise ValueError("a file beside the vehicle file, or in a folder below it, is wanted; copy it there")
+        raise ValueError("a file beside this one, or in a folder below it, is wanted; copy it there")
     return value
 
 
@@ -196,7 +196,8 @@ def _keys_beside(model: Any, path: list[str]) -> list[str]:
             if (isinstance(model, type) and issubclass(model, BaseModel)) or not inner:
                 break
             model = inner[-1]
-    return list(model.model_fields) if hasattr(model, "model_fields") else []
+    fields = getattr(model, "model_fields", {})
+    return [field.alias or name for name, field in fields.items()]
 
 
 def parse_utc(text: str) -> datetime:

@@ -370,7 +370,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
         gate.progress = _share_of(folder, spec, progress)
     for misfit in spec.misfits(needs_path):
         gate.refuse_config(misfit)
-    vehicle = _vehicle(gate, spec.vehicle) if spec.vehicle is not None else None
+    vehicle = _vehicle(gate, spec.vehicle, spec.events) if spec.vehicle is not None else None
     triads = {
         name: read_triad(gate, name, entry, vehicle, spec.vehicle is not None) for name, entry in spec.sensors.triads
     }
@@ -473,13 +473,13 @@ def _there(records: dict[str, Record | None]) -> dict[str, Record]:
     return {name: record for name, record in records.items() if record is not None}
 
 
-def _vehicle(gate: Gate, name: str) -> Vehicle | None:
+def _vehicle(gate: Gate, name: str, events: list[EventEntry]) -> Vehicle | None:
     """Read the vehicle that flight.toml names; None, with its faults kept, where it is refused."""
     try:
         path = vehicle_path(name, gate.folder)
         if gate.is_truth(path):
             raise ConfigError(f"{path} lies in truth/, which no estimator may open", code="path-in-truth")
-        vehicle = vehicle_from_toml(path)
+        vehicle = vehicle_from_toml(path).with_events((event.name, event.t_s) for event in events)
     except GateError as fault:
         for each in fault.faults:
             gate.refuse_config(Fault(f"vehicle: {each}", each.code))

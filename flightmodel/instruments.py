@@ -41,7 +41,7 @@ AXIS = {
 Size = Annotated[float, Field(ge=0.0, le=1e4)]
 LateClock = Annotated[float, Field(ge=0.0, le=10.0)]
 TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
-SIMULATED = {"m": Size, "s": LateClock, "rad": ErrorAngle, "1": Fraction, "": Size}  # by the unit of the error
+SIMULATED = {"m": Size, "m/s": Size, "s": LateClock, "rad": ErrorAngle, "1": Fraction, "": Size}  # by the unit of the error
 
 Response = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 Model = TypeVar("Model", bound=BaseModel)
@@ -406,16 +406,16 @@ class GnssSpec:
 
     name: str
     antenna_from_datum_body_m: FloatArray
-    horizontal_sd_m: float = error_row("m", 5.0, Sd)
-    vertical_sd_m: float = error_row("m", 10.0, Sd)
-    speed_sd_mps: float = error_row("m/s", 0.5, Sd)
-    vertical_speed_sd_mps: float = error_row("m/s", 1.0, Sd)
+    horizontal_sd_m: float = error_row("m", 5.0, Sd, simulated=("horizontal_sd_m",), required=True)
+    vertical_sd_m: float = error_row("m", 10.0, Sd, simulated=("vertical_sd_m",), required=True)
+    speed_sd_mps: float = error_row("m/s", 0.5, Sd, simulated=("speed_sd_mps",), required=True)
+    vertical_speed_sd_mps: float = error_row("m/s", 1.0, Sd, simulated=("vertical_speed_sd_mps",), required=True)
     wander_sd_m: float = error_row(
-        "m", 3.0, at=0.0, states=("wander north", "wander east", "wander down"),
-        time_constant=("wander_time_constant_s", 100.0, ""),
+        "m", 3.0, at=0.0, states=("wander north", "wander east", "wander down"), simulated=None,
+        time_constant=("wander_time_constant_s", 100.0, "wander_time_constant_s"),
     )  # fmt: skip
     wander_time_constant_s: float = 100.0
-    time_bias_sd_s: float = error_row("s", 0.5, SlowClock, at=0.0, states=("time bias",))
+    time_bias_sd_s: float = error_row("s", 0.5, SlowClock, at=0.0, states=("time bias",), simulated=None)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ launch-vehicle frame). The datum is the nose. *Shell* axes equal body axes when 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,6 +27,7 @@ from flightmodel.config import (
     Name,
     Place,
     Section,
+    Time,
     parse_section,
     read_toml,
 )
@@ -95,6 +97,23 @@ class MassProperties(Section):
     def inertia(self) -> FloatArray:
         """Inertia tensor about the c.g., (3, 3), kg m^2."""
         return np.array(self.inertia_kgm2)
+
+
+class MassStep(Section):
+    """Mass properties from a time of flight, or an event of that name, until the next: of the bodies that it states."""
+
+    from_s: Time | None = None
+    event: Label | None = None
+    aeroshell: MassProperties | None = None
+    centerbody: MassProperties | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> MassStep:
+        if (self.from_s is None) == (self.event is None):
+            raise ValueError("either from_s or event is wanted, and not both")
+        if self.aeroshell is None and self.centerbody is None:
+            raise ValueError("the body that changes is wanted: aeroshell, centerbody or both")
+        return self
 
 
 class CompliantJoint(Section):
@@ -212,6 +231,7 @@ class VehicleFile(Section):
     joint: CompliantJoint
     aeroshell: MassProperties
     centerbody: MassProperties
+    mass: tuple[MassStep, ...] = ()
     uncertainty: Uncertainty = Uncertainty()
     aerodynamics: Aerodynamics
     geometry: ShellGeometry
@@ -252,6 +272,7 @@ class Vehicle:
     source: Path
     files: tuple[str, ...] = ()  # coefficient table, sidecar and meshes beside the vehicle file, relative to it
     meshes: dict[str, BodyMesh] = field(default_factory=dict)  # of the user's own, by body
+    mass_steps: tuple[MassStep, ...] = ()  # later mass properties; `at` has those of a time
 
     @property
     def mass_kg(self) -> float:
@@ -277,6 +298,64 @@ class Vehicle:
     def joint_m(self) -> FloatArray:
         """Joint from the datum, body axes, (3,), m."""
         return np.array([-self.joint.station_m, 0.0, 0.0])
+
+    def with_events(self, events: Iterable[tuple[str, float]]) -> Vehicle:
+        """Return the vehicle with the times (s) of the events that its mass steps name, in order of time.
+
+        Raises
+        ------
+        ConfigError
+            ``event-unknown``: a step names an event that is not among ``events``.
+        """
+        times, faults, steps = dict(events), list[str](), list[MassStep]()
+        for step in self.mass_steps:
+            if step.event is not None and step.event not in times:
+                hint = f"{nearest_name(step.event, list(times))}; known: {', '.join(times) or 'none'}"
+                faults.append(f"{self.source}: key 'mass.event' = '{step.event}': the flight has no such event{hint}")
+            else:
+                at_s = step.from_s if step.event is None else times[step.event]
+                steps.append(step.model_copy(update={"from_s": at_s, "event": None}))
+        if faults:
+            raise ConfigError(faults, code="event-unknown")
+        return replace(self, mass_steps=tuple(sorted(steps, key=lambda step: step.from_s or 0.0)))
+
+    def phases(self, start_s: float, stop_s: float) -> list[tuple[float, float, Vehicle]]:
+        """Spans within ``start_s`` to ``stop_s`` in which mass properties hold, each with its vehicle without steps."""
+        now, out, begins = replace(self, mass_steps=()), list[tuple[float, float, Vehicle]](), start_s
+        for step in self.mass_steps:
+            assert step.from_s is not None, "events have their times (`with_events`)"
+            if step.from_s >= stop_s:
+                break
+            if step.from_s > begins:
+                out.append((begins, step.from_s, now))
+                begins = step.from_s
+            parts = {"aeroshell": step.aeroshell, "centerbody": step.centerbody}
+            now = replace(now, **{name: part for name, part in parts.items() if part is not None})
+        return [*out, (begins, stop_s, now)]
+
+    def at(self, time_s: float) -> Vehicle:
+        """Return the vehicle as it is at a time, s, without mass steps."""
+        return self.phases(time_s, np.inf)[0][2] if self.mass_steps else self
+
+    def mass_at(self, time_s: FloatArray) -> FloatArray:
+        """Total mass (n,), kg, at times (n,), s."""
+        out = np.full(len(time_s), self.mass_kg)
+        for begins, _, vehicle in self.phases(-np.inf, np.inf):
+            out[time_s >= begins] = vehicle.mass_kg
+        return out
+
+    def with_bodies(self, changed: Callable[[str, MassProperties], MassProperties]) -> Vehicle:
+        """Return the vehicle with every body, those of the mass steps too, changed by ``changed(name, body)``."""
+
+        def of(name: str, part: MassProperties | None) -> MassProperties | None:
+            return None if part is None else changed(name, part)
+
+        steps = tuple(
+            step.model_copy(update={name: of(name, getattr(step, name)) for name in ("aeroshell", "centerbody")})
+            for step in self.mass_steps
+        )
+        shell, body = changed("aeroshell", self.aeroshell), changed("centerbody", self.centerbody)
+        return replace(self, aeroshell=shell, centerbody=body, mass_steps=steps)
 
     def transverse_inertia_about_joint(self) -> tuple[float, float]:
         """Aeroshell's and centerbody's mean transverse inertia about the joint, kg m^2 (seed paper eq. [7])."""
@@ -370,4 +449,5 @@ def vehicle_from_toml(path: Path) -> Vehicle:
         source=path,
         files=(*((table, str(Path(table).with_suffix(".toml"))) if own and table is not None else ()), *drawn, *listed),
         meshes=meshes,
+        mass_steps=spec.mass,
     )

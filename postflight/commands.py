@@ -30,7 +30,7 @@ from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, bet_table, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
-from postflight.score import PAPER_DEG, Score, score_run
+from postflight.score import PUBLISHED_DEG, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import write_out
 from postflight.studies.preflight import Bounds, rigid_bounds
@@ -461,23 +461,25 @@ def score(folder: Path, as_json: bool, wanted: str | None = None) -> None:
 
 
 def print_score(result: Score) -> None:
-    """Estimates against the truth, with the paper's own figures beside them."""
+    """Estimates against the truth, with what was published of this vehicle's flight beside them."""
     table = Table(title=f"Deflection at the true peak of dynamic pressure ({result.peak_s:.3f} s), against the truth")
-    for name in ("method", "deflection deg", "1 sd", "truth", "error", "IRVE-II (paper)"):
+    title, published = PUBLISHED_DEG.get(result.vehicle, ("", {}))
+    for name in ("method", "deflection deg", "1 sd", "truth", "error", *([title] if title else [])):
         table.add_column(name, justify="left" if name == "method" else "right")
     for method, row in result.methods.items():
-        paper = f"{PAPER_DEG[method]:g}" if method in PAPER_DEG else ""
+        beside = [f"{published[method]:g}" if method in published else ""] if title else []
         if row["deflection_deg"] is None:
-            table.add_row(method, "no answer", "", f"{row['truth_deg']:.2f}", "", paper)
+            table.add_row(method, "no answer", "", f"{row['truth_deg']:.2f}", "", *beside)
             continue
         numbers = (f"{row[k]:.2f}" for k in ("deflection_deg", "sd_deg", "truth_deg"))
-        table.add_row(method, *numbers, f"{row['error_deg']:+.2f}", paper)
+        table.add_row(method, *numbers, f"{row['error_deg']:+.2f}", *beside)
     console.print(table)
     bet = result.bet
     console.print(
-        f"BET over the pulse ({bet['pulse_start_s']:.1f} to {bet['pulse_end_s']:.1f} s), rms error: "
-        f"position {bet['position_rms_m']:.1f} m, velocity {bet['velocity_rms_mps']:.2f} m/s, "
-        f"total angle of attack {bet['alpha_total_rms_deg']:.2f} deg"
+        f"BET over the pulse ({bet['pulse_start_s']:.1f} to {bet['pulse_end_s']:.1f} s), rms error (1 sd as stated): "
+        f"position {bet['position_rms_m']:.1f} ({bet['position_sd_m']:.1f}) m, "
+        f"velocity {bet['velocity_rms_mps']:.2f} ({bet['velocity_sd_mps']:.2f}) m/s, "
+        f"total angle of attack {bet['alpha_total_rms_deg']:.2f} ({bet['alpha_total_sd_deg']:.2f}) deg"
     )
     for failure in result.failures:
         line("[red]failed[/]", failure, failure.code)

@@ -201,11 +201,7 @@ def with_mass(telemetry: Telemetry, factor: float) -> Telemetry:
     motion = replace(telemetry.motion, drag_area_per_mass_m2pkg=telemetry.motion.drag_area_per_mass_m2pkg / factor)
     vehicle = telemetry.vehicle
     if vehicle is not None:
-        shell, body = (
-            part.model_copy(update={"mass_kg": factor * part.mass_kg})
-            for part in (vehicle.aeroshell, vehicle.centerbody)
-        )
-        vehicle = replace(vehicle, aeroshell=shell, centerbody=body)
+        vehicle = vehicle.with_bodies(lambda _, part: part.model_copy(update={"mass_kg": factor * part.mass_kg}))
     return replace(telemetry, motion=motion, vehicle=vehicle)
 
 
@@ -259,10 +255,13 @@ def _cg_shift(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
     vehicle, shift = _vehicle_of(telemetry, name), np.asarray(value, dtype=float)
     if shift.shape != (3,) or not np.isfinite(shift).all():
         raise GateError(f"assumption {name} = {value!r}: three numbers in body axes, m, are wanted", "what-if-value")
-    body = vehicle.centerbody
-    cg = body.cg_m + vehicle.mass_kg / body.mass_kg * shift
-    body = body.model_copy(update={"cg_from_datum_body_m": tuple(cg.tolist())})
-    return replace(telemetry, vehicle=replace(vehicle, centerbody=body))
+    carried = vehicle.mass_kg / vehicle.centerbody.mass_kg * shift
+
+    def moved(name: str, part: MassProperties) -> MassProperties:
+        cg = part.cg_m + (carried if name == "centerbody" else 0.0)
+        return part.model_copy(update={"cg_from_datum_body_m": tuple(cg.tolist())})
+
+    return replace(telemetry, vehicle=vehicle.with_bodies(moved))
 
 
 def _joint_station(telemetry: Telemetry, name: str, value: Any) -> Telemetry:

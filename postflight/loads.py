@@ -42,7 +42,11 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
     grid = bet.smoothed.time_s
     ticks = grid * bet.output_rate_hz
     inside = windows_are_whole(bet, grid) & (np.abs(ticks - np.round(ticks)) < 1e-5)
-    vehicle, (accelerometer, rates) = telemetry.required_vehicle(), telemetry.required_triads()
+    whole, (accelerometer, rates) = telemetry.required_vehicle(), telemetry.required_triads()
+    # where mass properties change in flight: those at peak pressure, and only while they hold
+    peak_s = float(grid[np.nanargmax(air.dynamic_pressure_pa)])
+    begins, ends, vehicle = next(p for p in whole.phases(-np.inf, np.inf) if p[0] <= peak_s < p[1])
+    inside &= (grid >= begins) & (grid < ends)
     t = grid[inside]
     step = np.median(np.diff(bet.imu_time_s)) if len(bet.imu_time_s) > 1 else 0.0
     h = min(HALF_WINDOW_S, max(_HALF_WINDOW_S, _LEAST_SAMPLES * float(step)))

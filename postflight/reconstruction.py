@@ -359,7 +359,7 @@ def _force(flight: Reconstruction) -> Columns:
         force = at.specific_force_cg_mps2
         found |= _vector("a{}_cg_mps2", "xyz", force) | _vector("a{}_cg_sd_mps2", "xyz", sd)
         q, q_sd = (getattr(flight.air, f"dynamic_pressure{end}_pa")[rows] for end in ("", "_sd"))
-        mass_per_area = vehicle.mass_kg / vehicle.reference.area_m2
+        mass_per_area = vehicle.mass_at(t[rows]) / vehicle.reference.area_m2
         found |= _coefficients(force, cov, q / mass_per_area, np.hypot(q_sd / q, vehicle.uncertainty.mass))
     for name, numbers in found.items():
         out[name][rows] = numbers

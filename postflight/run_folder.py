@@ -396,6 +396,7 @@ def _vehicle(flight: Reconstruction) -> dict[str, Any] | None:
         "mass_kg": vehicle.mass_kg,
         "cg_from_datum_body_m": [float(x) for x in vehicle.cg_m],
         "inertia_about_cg_kgm2": [[float(x) for x in row] for row in vehicle.inertia],
+        **({"mass_steps": [step.model_dump() for step in vehicle.mass_steps]} if vehicle.mass_steps else {}),
         "uncertainty": vehicle.uncertainty.model_dump(),
     }
 

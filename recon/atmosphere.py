@@ -111,11 +111,12 @@ class AirSamples:
 class Drag:
     """Aerodynamic force model: coefficients, reference area over mass, sd of both (fractions), reference length.
 
+    ``area_per_mass_m2pkg`` is one number, or one for each sample (n,) where mass changes in flight.
     ``ca_shape_sd`` is the part of ``ca_sd`` that changes with Mach number.
     """
 
     table: AeroTable
-    area_per_mass_m2pkg: float
+    area_per_mass_m2pkg: FloatArray | float
     ca_sd: float
     cn_sd: float
     length_m: float
@@ -521,15 +522,17 @@ def as_flown_atmosphere(
     """
     vehicle = telemetry.required_vehicle()
     known = vehicle.uncertainty
+    samples = _air_samples(telemetry, bet)
+    changing = bool(vehicle.mass_steps)
     drag = Drag(
         vehicle.aero,
-        vehicle.reference.area_m2 / vehicle.mass_kg,
+        vehicle.reference.area_m2 / (vehicle.mass_at(samples.time_s) if changing else vehicle.mass_kg),
         float(np.hypot(known.ca, known.mass)),
         float(np.hypot(known.cn, known.mass)),
         vehicle.reference.length_m,
         float(np.sqrt(known.ca_shape_part) * known.ca),
     )
-    return reconstruct_air(_air_samples(telemetry, bet), profile, drag, confidence)
+    return reconstruct_air(samples, profile, drag, confidence)
 
 
 def _air_samples(telemetry: Telemetry, bet: TrajectorySolution) -> AirSamples:

@@ -241,7 +241,8 @@ def dispersed_case(scenario: Scenario, dispersions: Dispersions, u: dict[str, fl
     spec = scenario.spec.model_copy(update={"initial": initial})
     flown = replace(scenario, spec=spec, vehicle=dispersed_vehicle(scenario.vehicle, of))
     # one day for all flights is that of u = 0.5, whatever the seed
-    profile = day_of_flight_atmosphere(scenario.spec.atmosphere, rng_from_draw(u.get("atmosphere.day", 0.5)))
+    rng = rng_from_draw(u.get("atmosphere.day", 0.5))
+    profile = day_of_flight_atmosphere(scenario.spec.atmosphere, rng, scenario.mean_air)
     scales = dispersed_scales(of)
     return Case(flown, _dispersed_air(profile, of), scales)
 

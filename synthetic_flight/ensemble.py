@@ -115,6 +115,7 @@ def fly_ensemble(
             f"fly_ensemble: workers, steps and records must be positive; got {workers}, {schedule}",
             code="ensemble-arguments",
         )
+    _check_mass(vehicle)
     check_step(vehicle, schedule.step_s)
     remaining = iter(runs)
     with ThreadPoolExecutor(workers) as pool:
@@ -145,11 +146,27 @@ def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule:
     return [Flown(run, *lane) for run, lane in zip(runs, lanes, strict=False)]
 
 
+def _check_mass(vehicle: Vehicle) -> None:
+    """Refuse a vehicle whose mass properties change in flight: all lanes have one set of them throughout."""
+    if vehicle.mass_steps:
+        raise ConfigError(
+            f"{vehicle.source}: [[mass]]: ensembles fly one set of mass properties; take the steps out, and give "
+            "[aeroshell] and [centerbody] those of the window",
+            code="mass-changes",
+        )
+
+
 def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[Schedule]) -> list[Flown]:
     """Fly at most `LANES` flights through legs that follow each other; the records of the last are kept.
 
     A flight that diverges in an earlier leg has no record.
+
+    Raises
+    ------
+    ConfigError
+        ``mass-changes``: the vehicle's mass properties change in flight.
     """
+    _check_mass(vehicle)
     flown: list[Flown] = []
     for leg in legs:
         if flown:

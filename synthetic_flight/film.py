@@ -47,7 +47,7 @@ Float32 = NDArray[np.float32]
 MARCHING_STEPS = 5
 COARSE, COARSE_STEPS = 4, 50
 STRIP_ROWS = 32
-FARTHEST_M = np.float32(6.0)
+FARTHEST_M, FARTHEST_RADII = 6.0, 4.0  # how far a ray marches: the larger of the two (m, base radii of the shell)
 EARTH_RADIUS_M = 6.371e6
 LIMB_GLOW_RAD = float(np.deg2rad(0.4))
 
@@ -133,7 +133,7 @@ class ShellRenderer:
         depth, shade = np.full((h, w), np.inf, dtype=np.float32), np.zeros((h, w), dtype=np.float32)
         for top in range(0, h, STRIP_ROWS):
             near = start[top : top + STRIP_ROWS].reshape(-1)
-            live = np.flatnonzero((near < FARTHEST_M) & self.is_clear[top : top + STRIP_ROWS].reshape(-1))
+            live = np.flatnonzero((near < self.stack.farthest_m) & self.is_clear[top : top + STRIP_ROWS].reshape(-1))
             if len(live) == 0:
                 continue
             rays = _Rays(_rotated(to_shell, self.rays[:, top : top + STRIP_ROWS].reshape(3, -1)[:, live]), eye)
@@ -257,6 +257,7 @@ class _Stack:
         self.cos, self.sin = np.float32(np.cos(half)), np.float32(np.sin(half))
         self.pitch, self.minor = np.float32(geometry.torus_spacing_m), np.float32(geometry.torus_minor_radius_m)
         self.last = np.float32(geometry.torus_count - 1)
+        self.farthest_m = np.float32(max(FARTHEST_M, FARTHEST_RADII * geometry.base_radius_m))
         self.gore_rad = np.float32(2.0 * np.pi / geometry.gore_count)
         self.warp: Warp | None = None
         self.painted = True
@@ -316,13 +317,13 @@ class _Stack:
         for _ in range(steps):
             gap *= np.float32(stretch)
             t += gap
-            np.minimum(t, FARTHEST_M, out=t)
+            np.minimum(t, self.farthest_m, out=t)
             gap = self.gap(rays, t)
         return t, gap
 
     def closest(self, rays: _Rays, start: Float32) -> tuple[Float32, Float32]:
         """Depth of closest approach to the stack near ``start`` and the signed distance there (parabola steps)."""
-        h, t = np.float32(0.03), np.where(start < FARTHEST_M, start, 1.0).astype(np.float32)
+        h, t = np.float32(0.03), np.where(start < self.farthest_m, start, 1.0).astype(np.float32)
         for _ in range(4):
             before, here, after = self.gap(rays, t - h), self.gap(rays, t), self.gap(rays, t + h)
             curve = np.maximum(before - 2.0 * here + after, 1e-5)

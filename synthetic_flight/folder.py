@@ -24,16 +24,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flightmodel import earth
+from flightmodel import earth, tables
 from flightmodel.checks import FloatArray, GateError, Progress, writing
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.events import descent_events, find_peak, first_fall, has_peak, splashdown_index, values_at
-from flightmodel.instruments import ACCELEROMETER, MAGNETOMETER, RADAR, RATES, SUN
+from flightmodel.instruments import ACCELEROMETER, GNSS, MAGNETOMETER, RADAR, RATES, SUN
 from flightmodel.partial_files import abandoned, partial_path
 from synthetic_flight import sensing, weather
 from synthetic_flight.film import write_videos
 from synthetic_flight.instrument_errors import Magnetometer, SunSensors, Video, stated_errors
-from synthetic_flight.scenarios import ACCELEROMETER_MOUNT, Scenario, child_rng, fly_scenario
+from synthetic_flight.scenarios import Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
 if TYPE_CHECKING:
@@ -142,9 +142,10 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     telemetry = folder / "telemetry"
     telemetry.mkdir()
     report(0.15, "sensing")
-    rng = child_rng(seed, ACCELEROMETER_MOUNT)
-    at, force = sensing.sense_accelerometer(truth, vehicle, ACCELEROMETER_MOUNT, spec.accelerometer, start, rng)
-    _csv(telemetry / "accelerometer.csv", {"t_s": at, **_named("a{}_suba_mps2", "xyz", force)}, "%.6f")
+    mount = spec.accelerometer.mount
+    rng = child_rng(seed, mount)
+    at, force = sensing.sense_accelerometer(truth, vehicle, mount, spec.accelerometer, start, rng)
+    _csv(telemetry / "accelerometer.csv", {"t_s": at, **_named(f"a{{}}_{mount}_mps2", "xyz", force)}, "%.6f")
     at, rate = sensing.sense_rates(truth, spec.rates, start, child_rng(seed, "rates"))
     _csv(telemetry / "rates.csv", {"t_s": at, **_named("{}_body_degps", "pqr", np.rad2deg(rate))}, "%.6f")
     _write_attitude_sensors(scenario, seed, truth, telemetry)
@@ -152,6 +153,10 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
         at, rae = sensing.sense_radar(truth, radar, start, child_rng(seed, name), name)
         columns = {"t_s": at, "range_m": rae[:, 0], "az_deg": np.rad2deg(rae[:, 1]), "el_deg": np.rad2deg(rae[:, 2])}
         _csv(telemetry / f"radar_{name}.csv", columns, "%.6f")
+    for name, receiver in spec.gnss.items():
+        at, fixes = sensing.sense_gnss(truth, receiver, start, child_rng(seed, f"gnss {name}"), name)
+        columns = {"t_s": at, **_named("{}_ecef_m", "xyz", fixes[:, :3]), **_named("v{}_ecef_mps", "xyz", fixes[:, 3:])}
+        _csv(telemetry / f"gnss_{name}.csv", columns, "%.4f")
     z, air, wind = weather.sense_atmosphere(truth.profile, spec.atmosphere, child_rng(seed, "sounding"))
     columns = {"alt_m": z, "rho_kgpm3": air[:, 0], "t_k": air[:, 1], "wind_n_mps": wind[:, 0], "wind_e_mps": wind[:, 1]}
     _csv(telemetry / "atmosphere.csv", columns, "%.8g")
@@ -262,9 +267,10 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
         "",
         "[sensors.accelerometer]",
         'file = "telemetry/accelerometer.csv"',
-        f'mount = "{ACCELEROMETER_MOUNT}"',
+        f'mount = "{acc.mount}"',
         *stated_errors(ACCELEROMETER, acc),
         *stated_errors(ACCELEROMETER, acc, if_there=True),
+        *_accelerometer_columns(acc.mount),
         "",
         "[sensors.rates]",
         'file = "telemetry/rates.csv"',
@@ -284,14 +290,31 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
             *([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []),
             *stated_errors(RADAR, radar, if_there=True),
         ]
+    for name, receiver in spec.gnss.items():
+        lines += [
+            "",
+            f"[gnss.{name}]",
+            f'file = "telemetry/gnss_{name}.csv"',
+            f"antenna_from_datum_body_m = {list(receiver.antenna_from_datum_body_m)}",
+            *stated_errors(GNSS, receiver),
+        ]
     lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
     if spec.video is not None:
         lines += _video_lines("frames", "frames.csv", spec.video.camera, spec.video)
     for name, video in spec.videos.items():
         lines += _video_lines(f"cameras.{name}", f"frames_{name}.csv", name, video)
-    if spec.time.inflated_s is not None and spec.time.inflated_s >= spec.time.telemetry_from_s:
-        lines += ["", "[[events]]", 'name = "aeroshell inflated"', f"t_s = {spec.time.inflated_s}"]
+    for name, at_s in spec.event_times:
+        if at_s >= spec.time.telemetry_from_s or scenario.vehicle.mass_steps:  # which may refer to it
+            lines += ["", "[[events]]", f"name = {_text(name)}", f"t_s = {at_s}"]
     return "\n".join(lines) + "\n"
+
+
+def _accelerometer_columns(mount: str) -> list[str]:
+    """Lines that declare the accelerometer's columns where they do not bear the names that are read without."""
+    names = [(f"a{axis}", f"a{axis}_{mount}_mps2") for axis in "xyz"]
+    if [name for _, name in names] == [quantity.canonical for quantity in tables.ACCELEROMETER]:
+        return []
+    return [f'columns.{short} = {{ column = "{name}", unit = "mps2" }}' for short, name in names]
 
 
 def _video_lines(table: str, listed: str, name: str, video: Video) -> list[str]:

@@ -30,11 +30,13 @@ from flightmodel.config import (
     KeyFaults,
     Latitude,
     Longitude,
+    Name,
+    Place,
     SampleRate,
     Section,
     Time,
 )
-from flightmodel.instruments import ACCELEROMETER, MAGNETOMETER, RADAR, RATES, SUN, InstrumentTable, with_keys
+from flightmodel.instruments import ACCELEROMETER, GNSS, MAGNETOMETER, RADAR, RATES, SUN, InstrumentTable, with_keys
 from flightmodel.refraction import Refractivity
 from flightmodel.trajectory import interpolate_rows
 from synthetic_flight import _kernels
@@ -307,12 +309,14 @@ class Triad(Section):
 
 @with_keys(ACCELEROMETER.scenario_keys())
 class Accelerometer(Triad):
-    """Errors of the accelerometer triad; ``elements_sensor_m`` puts each of the three at its own place in the package.
+    """Errors of the accelerometer triad; ``mount`` names its package of the vehicle file.
 
-    ``range_mps2`` is of each axis of the package (z is aft in Sub-A).
+    ``elements_sensor_m`` puts each of the three at its own place in the package; ``range_mps2`` is of each of its axes
+    (z is aft in Sub-A).
     """
 
     table, full_scale_key = ACCELEROMETER, "range_mps2"
+    mount: Name = "suba"
     range_mps2: Limits | None = None
     elements_sensor_m: tuple[Vector, Vector, Vector] | None = None
 
@@ -411,6 +415,19 @@ class Radar(Section):
     def refraction_left(self) -> float:
         """Size of the part of refraction that the range's correction leaves."""
         return 0.0 if self.refraction is None else abs(self.refraction.residual)
+
+
+@with_keys(GNSS.scenario_keys())
+class Gnss(Section):
+    """A satellite navigation receiver: its antenna and errors, those of `flightmodel.instruments.GnssSpec`.
+
+    Fixes hold position and velocity; intervals without any (blackout) are ``dropouts``.
+    """
+
+    rate_hz: SampleRate
+    offset_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 0.0
+    antenna_from_datum_body_m: tuple[Place, Place, Place] = (0.0, 0.0, 0.0)
+    dropouts: Dropouts | None = None
 
 
 class FilmQuality(Section):

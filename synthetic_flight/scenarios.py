@@ -22,6 +22,7 @@ from flightmodel.config import (
     Duration,
     Elevation,
     KeyFaults,
+    Label,
     Latitude,
     Longitude,
     Name,
@@ -35,6 +36,7 @@ from flightmodel.vehicle import DATA, Vehicle, vehicle_from_toml, vehicle_path
 from synthetic_flight.instrument_errors import (
     Accelerometer,
     Attitude,
+    Gnss,
     Magnetometer,
     Radar,
     Rates,
@@ -44,11 +46,10 @@ from synthetic_flight.instrument_errors import (
     name_key,
 )
 from synthetic_flight.simulate import Truth, fly, state_from_ecef
-from synthetic_flight.weather import DayOfFlightAtmosphere, day_of_flight_atmosphere
+from synthetic_flight.weather import DayOfFlightAtmosphere, MeanAir, day_of_flight_atmosphere, mean_air
 
 Altitude = Annotated[float, Field(ge=0.0, le=1e6)]
 MOST_RECORDS, MOST_STEPS, MOST_SAMPLES, MOST_FRAMES = 5_000_000, 2_000_000_000, 5_000_000, 20_000
-ACCELEROMETER_MOUNT = "suba"
 Faults = list[tuple[str, object, str]]
 
 
@@ -107,6 +108,16 @@ class Initial(Section):
     spin_rpm: Annotated[float, Field(ge=-1000.0, le=1000.0)] = 0.0
 
 
+class EventOfFlight(Section):
+    """A named event, which mass steps of the vehicle may refer to; flight.toml gets it."""
+
+    name: Label
+    t_s: Time
+
+
+INFLATED = "aeroshell inflated"  # event of `TimeSpan.inflated_s`
+
+
 class ScenarioFile(Section):
     """The whole of a scenario file."""
 
@@ -115,10 +126,12 @@ class ScenarioFile(Section):
     vehicle: str
     time: TimeSpan
     initial: Initial
+    events: tuple[EventOfFlight, ...] = ()
     atmosphere: DayOfFlightAtmosphere
     accelerometer: Accelerometer
     rates: Rates
-    radars: dict[Name, Radar]
+    radars: dict[Name, Radar] = {}
+    gnss: dict[Name, Gnss] = {}
     magnetometer: Magnetometer | None = None
     sun: SunSensors | None = None
     video: Video | None = None
@@ -134,12 +147,11 @@ class ScenarioFile(Section):
             raise ValueError("an ISO 8601 time such as 2009-08-17T12:52:00Z is wanted") from None
         return value
 
-    @field_validator("radars")
-    @classmethod
-    def _at_least_one(cls, value: dict[str, Radar]) -> dict[str, Radar]:
-        if not value:
-            raise ValueError("at least one radar is wanted: give a table [radars.<name>]")
-        return value
+    @property
+    def event_times(self) -> list[tuple[str, float]]:
+        """Named events with their times, s, inflation among them."""
+        inflated = [] if self.time.inflated_s is None else [(INFLATED, self.time.inflated_s)]
+        return inflated + [(event.name, event.t_s) for event in self.events]
 
     @property
     def films(self) -> dict[str, Video]:
@@ -151,18 +163,22 @@ class ScenarioFile(Section):
     def _in_time(self) -> ScenarioFile:
         start, stop = self.time.telemetry_from_s, self.time.stop_s
         words, faults = f"a time of the telemetry, {start:g} to {stop:g} s, is wanted", Faults()
+        if not self.radars and not self.gnss:
+            faults.append(("radars", "", "at least one tracker is wanted: a table [radars.NAME] or [gnss.NAME]"))
+        faults += [(f"gnss.{n}", "", "a radar has this name; results go by name") for n in self.gnss if n in self.radars]
         if not start <= self.attitude_prior.t_s <= stop:
             faults.append(("attitude_prior.t_s", self.attitude_prior.t_s, words))
-        instruments: dict[str, Triad | SunSensors | Radar | None] = {
+        instruments: dict[str, Triad | SunSensors | Radar | Gnss | None] = {
             "accelerometer": self.accelerometer,
             "rates": self.rates,
             "magnetometer": self.magnetometer,
             "sun": self.sun,
             **{f"radars.{name}": radar for name, radar in self.radars.items()},
+            **{f"gnss.{name}": receiver for name, receiver in self.gnss.items()},
         }
         for name, part in instruments.items():
             if part is not None:
-                offset = part.offset_s if isinstance(part, Radar) else 0.0
+                offset = part.offset_s if isinstance(part, Radar | Gnss) else 0.0
                 faults += _rate_faults(name, part.rate_hz, stop - start - offset)
         if self.video is not None and self.videos:
             faults.append(("video", "", "write one camera in [video], several in [videos.NAME]"))
@@ -196,6 +212,13 @@ class Scenario:
     vehicle: Vehicle
     source: Path
 
+    @property
+    def mean_air(self) -> MeanAir:
+        """Air of the place and day where the flight starts, before any random structure."""
+        start = self.spec.initial
+        folder, place = self.source.parent, (start.latitude_deg, start.longitude_deg)
+        return mean_air(self.spec.atmosphere, folder, self.spec.t0_utc, *place)
+
 
 def shipped_scenarios() -> list[str]:
     """Names of the scenarios that ship with the toolkit."""
@@ -226,7 +249,7 @@ def read_scenario(name: str) -> Scenario:
     if spec is not None and vehicle is not None:
         faults += _vehicle_faults(spec, vehicle, path)
         if not faults:
-            return Scenario(spec, vehicle, path)
+            return Scenario(spec, vehicle.with_events(spec.event_times), path)
     raise ConfigError(faults)
 
 
@@ -234,11 +257,7 @@ def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Fa
     """Return which sensor packages and cameras the scenario ``path`` needs and the vehicle lacks."""
     packages, cameras = list(vehicle.sensors), list(vehicle.cameras)
     faults = []
-    if ACCELEROMETER_MOUNT not in packages:
-        wanted = f"key 'sensors.{ACCELEROMETER_MOUNT}' is missing: the accelerometer's package"
-        message = f"{vehicle.source}: {wanted}; known there: {', '.join(packages) or 'none'}"
-        faults.append(Fault(message, "mount-unknown"))
-    needed = []
+    needed = [("accelerometer.mount", spec.accelerometer.mount, packages, "sensors")]
     if spec.magnetometer is not None:
         needed.append(("magnetometer.mount", spec.magnetometer.mount, packages, "sensors"))
     needed += [(f"{table}.camera", video.camera, cameras, "cameras") for table, video in spec.films.items()]
@@ -283,15 +302,15 @@ def initial_state(scenario: Scenario) -> FloatArray:
 
 def fly_scenario(scenario: Scenario, seed: int) -> Truth:
     """Fly a scenario with the day-of-flight atmosphere that ``seed`` draws."""
-    time = scenario.spec.time
-    profile = day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere"))
+    spec, time = scenario.spec, scenario.spec.time
+    profile = day_of_flight_atmosphere(spec.atmosphere, child_rng(seed, "atmosphere"), scenario.mean_air)
     return fly(
         scenario.vehicle,
         profile,
         initial_state(scenario),
         time.start_s,
         time.stop_s,
-        scenario.spec.t0_utc,
+        spec.t0_utc,
         time.step_s,
         time.record_s,
         time.inflated_s,

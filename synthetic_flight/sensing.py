@@ -28,7 +28,7 @@ from scipy.interpolate import CubicHermiteSpline
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.geomagnetism_and_sun import is_sun_visible, magnetic_field_ecef_t, sun_direction_ecef
-from flightmodel.instruments import RADAR, SUN, dcm_body_from_sun_head, sun_angles_from_direction
+from flightmodel.instruments import GNSS, RADAR, SUN, dcm_body_from_sun_head, sun_angles_from_direction
 from flightmodel.refraction import refracted
 from flightmodel.trajectory import interpolate_rows
 from flightmodel.vehicle import Vehicle
@@ -36,6 +36,7 @@ from synthetic_flight.instrument_errors import (
     BUTTERWORTH,
     Accelerometer,
     Attitude,
+    Gnss,
     Magnetometer,
     Radar,
     Rates,
@@ -174,6 +175,52 @@ def _head(
         angles = np.round(angles / step) * step
     angles[~lit | (sun[:, 2] < edge)] = np.nan
     return np.asarray(angles)
+
+
+def sense_gnss(
+    truth: Truth, spec: Gnss, start_s: float, rng: np.random.Generator, name: str = "gnss"
+) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) and fixes ``(n, 6)`` of a receiver's antenna: position ECEF m, velocity ECEF m/s.
+
+    Noise and wander are drawn in north, east and down. A positive time bias stamps a fix later than it was measured.
+
+    Raises
+    ------
+    GateError
+        Where fewer than two fixes are left.
+    """
+    at = sample_times(start_s, truth.time_s[-1] - 0.05, spec.rate_hz, spec.offset_s)
+    size = {key: values[0] for key, values in GNSS.from_scenario(spec).items()}
+    late = size["time_bias_sd_s"] * rng.standard_normal()
+    seen_at = np.clip(at - late, truth.time_s[0], truth.time_s[-1])
+    path, arm = truth.trajectory, np.array(spec.antenna_from_datum_body_m)
+    q = path.q_ecef_body
+    # of the body against the Earth
+    turn = path.omega_body_eci_body_radps - rotations.rotate(rotations.conjugate(q), earth.OMEGA_ECEF_RADPS)
+    position = path.position_ecef_m + rotations.rotate(q, np.broadcast_to(arm, path.position_ecef_m.shape))
+    velocity = path.velocity_ecef_mps + rotations.rotate(q, np.cross(turn, arm))
+    place = CubicHermiteSpline(truth.time_s, position, velocity)(seen_at)
+    moving = interpolate_rows(seen_at, truth.time_s, velocity)
+    across, up = size["horizontal_sd_m"], size["vertical_sd_m"]
+    of_place = rng.standard_normal((len(at), 3)) * [across, across, up]
+    across, up = size["speed_sd_mps"], size["vertical_speed_sd_mps"]
+    of_speed = rng.standard_normal((len(at), 3)) * [across, across, up]
+    if size["wander_sd_m"] > 0.0:
+        wandering = child(rng, "wander")
+        of_place += gauss_markov(at, size["wander_sd_m"], size["wander_time_constant_s"], 3, wandering)
+    fixes = np.column_stack(
+        [place + earth.ecef_from_ned(of_place, place), moving + earth.ecef_from_ned(of_speed, place)]
+    )
+    keep = np.ones(len(at), dtype=bool)
+    if spec.dropouts:
+        keep = kept(at, spec.dropouts.errors, child(rng, "dropouts"))
+    if keep.sum() < 2:
+        raise GateError(
+            f"gnss.{name}: {keep.sum()} fixes from {start_s + spec.offset_s:g} s to the flight's end at "
+            f"{truth.time_s[-1]:.2f} s; two are the least: raise rate_hz, or shorten its dropouts",
+            code="track-short",
+        )
+    return at[keep], fixes[keep]
 
 
 LOWEST_RAD = np.deg2rad(0.5)

@@ -10,6 +10,7 @@ every 50 m (`atmosphere_table`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
@@ -103,7 +104,7 @@ class Truth(Tabular):
 
         state, vehicle = self.state_eci, self.vehicle
         velocity_body = rotations.rotate(rotations.conjugate(state[:, 6:10]), state[:, 3:6])
-        force = vehicle.mass_kg * self.specific_force_body(vehicle.cg_m)
+        force = vehicle.mass_at(self.time_s)[:, None] * self.specific_force_body(vehicle.cg_m)
         return pd.DataFrame(
             {
                 "t_s": self.time_s,
@@ -116,11 +117,16 @@ class Truth(Tabular):
                 "theta_deg": np.rad2deg(self.deflection.theta_rad),
                 "plane_lv_deg": np.rad2deg(self.deflection.plane_lv_rad),
                 "twist_deg": np.rad2deg(self.twist_rad),
-                "energy_j": dynamics.energy(state, vehicle),
-                "angular_momentum_nms": np.linalg.norm(dynamics.angular_momentum(state, vehicle), axis=1),
+                "energy_j": self._by_phase(dynamics.energy),
+                "angular_momentum_nms": np.linalg.norm(self._by_phase(dynamics.angular_momentum), axis=1),
                 "sensed_power_w": np.sum(force * velocity_body, axis=1),
             }
         )
+
+    def _by_phase(self, of: Callable[[FloatArray, Vehicle], FloatArray]) -> FloatArray:
+        """Return a function of states and vehicle at every record, with the mass properties of its time."""
+        rows = _phase_rows(self.vehicle, self.time_s)
+        return np.concatenate([of(self.state_eci[part], vehicle) for part, vehicle in rows])
 
     def _about(self) -> str:
         k = int(np.argmax(self.dynamic_pressure_pa))
@@ -133,14 +139,28 @@ class Truth(Tabular):
         Joint force over mass, moved from the body's c.g. by lever-arm terms, plus the difference of gravitation
         between the two points.
         """
-        body = self.vehicle.centerbody
-        arm = position_from_datum_body_m - body.cg_m
-        w, e = self.state_eci[:, 14:17], self.angular_acceleration_body_radps2
-        q = self.state_eci[:, 6:10]
-        at_cg = dynamics.points(self.state_eci, self.vehicle)["body"][0]
-        at_point = at_cg + rotations.rotate(q, np.broadcast_to(arm, at_cg.shape))
-        tide = rotations.rotate(rotations.conjugate(q), earth.gravitation(at_cg) - earth.gravitation(at_point))
-        return self.joint_force_body_n / body.mass_kg + np.cross(e, arm) + np.cross(w, np.cross(w, arm)) + tide
+        parts = []
+        for rows, vehicle in _phase_rows(self.vehicle, self.time_s):
+            body, state = vehicle.centerbody, self.state_eci[rows]
+            arm = position_from_datum_body_m - body.cg_m
+            w, e = state[:, 14:17], self.angular_acceleration_body_radps2[rows]
+            q = state[:, 6:10]
+            at_cg = dynamics.points(state, vehicle)["body"][0]
+            at_point = at_cg + rotations.rotate(q, np.broadcast_to(arm, at_cg.shape))
+            tide = rotations.rotate(rotations.conjugate(q), earth.gravitation(at_cg) - earth.gravitation(at_point))
+            force = self.joint_force_body_n[rows] / body.mass_kg
+            parts.append(force + np.cross(e, arm) + np.cross(w, np.cross(w, arm)) + tide)
+        return np.concatenate(parts)
+
+
+def _phase_rows(vehicle: Vehicle, time_s: FloatArray) -> list[tuple[slice, Vehicle]]:
+    """Records of each span in which mass properties hold; a record at its beginning has the new ones."""
+    phases = vehicle.phases(float(time_s[0]), np.inf)
+    edges = np.searchsorted(time_s, [begins - 1e-9 for begins, _, _ in phases]).tolist()
+    ends = [*edges[1:], len(time_s)]
+    return [
+        (slice(a, b), flown) for a, b, (_, _, flown) in zip(edges, ends, phases, strict=True) if b > a
+    ]
 
 
 def state_from_ecef(
@@ -272,7 +292,8 @@ def fly(
         check_step(vehicle, step_s)
     records = int(np.floor((stop_s - start_s) / record_s + 1e-6)) + 1
     lock = 0 if inflated_s is None else max(0, int(np.ceil((inflated_s - start_s) / record_s - 1e-9)))
-    states, aux = integrate(vehicle, atmosphere_table(profile), state, step_s, per_record, records, lock)
+    time_s = start_s + record_s * np.arange(records, dtype=np.float64)
+    states, aux = _fly_phases(vehicle, atmosphere_table(profile), state, step_s, per_record, time_s, lock)
     diverged = len(states) < records
     at_sea = splashdown_index(aux[:, 0])
     states, aux = states[:at_sea], aux[:at_sea]
@@ -280,11 +301,54 @@ def fly(
         vehicle,
         profile,
         epoch_utc,
-        start_s + record_s * np.arange(len(states), dtype=np.float64),
+        time_s[: len(states)],
         states,
         aux,
         diverged,
     )
+
+
+def _fly_phases(
+    vehicle: Vehicle,
+    atmosphere: FloatArray,
+    state: FloatArray,
+    step_s: float,
+    per_record: int,
+    time_s: FloatArray,
+    lock_records: int,
+) -> tuple[FloatArray, FloatArray]:
+    """States and auxiliaries of a flight through its mass steps, each taken at the next record.
+
+    At a step hardware keeps its place, attitude and motion: what leaves takes its own momentum along, and the composite
+    c.g. moves to where the new masses have it.
+    """
+    rows = _phase_rows(vehicle, time_s)
+    states, auxiliaries, before = [], [], rows[0][1]
+    for part, flown in rows:
+        state = _handed_over(state, before, flown)
+        last = part.stop == len(time_s)
+        # one record more: the state at which the next phase begins
+        count = part.stop - part.start + (not last)
+        lock = max(0, lock_records - part.start)
+        path, aux = integrate(flown, atmosphere, state, step_s, per_record, count, min(lock, count))
+        whole = len(path) == count
+        states.append(path if last or not whole else path[:-1])
+        auxiliaries.append(aux if last or not whole else aux[:-1])
+        if not whole:
+            break
+        state, before = path[-1], flown
+    return np.concatenate(states), np.concatenate(auxiliaries)
+
+
+def _handed_over(state: FloatArray, before: Vehicle, after: Vehicle) -> FloatArray:
+    """State (20,) of the same motion of the hardware with other mass properties."""
+    if after is before:
+        return state
+    (old, old_v), (new, new_v) = (dynamics.offsets(state, vehicle)["joint"] for vehicle in (before, after))
+    moved = state.copy()
+    moved[0:3] += old - new
+    moved[3:6] += old_v - new_v
+    return moved
 
 
 def _truth(
@@ -298,8 +362,10 @@ def _truth(
 ) -> Truth:
     q_b, q_a = states[:, 6:10], states[:, 10:14]
     to_ecef = earth.q_ecef_eci(time_s)
-    cg, cg_v = dynamics.points(states, vehicle)["body"]
-    arm = rotations.rotate(q_b, np.broadcast_to(-vehicle.centerbody.cg_m, cg.shape))
+    parts = [(dynamics.points(states[rows], flown)["body"], flown) for rows, flown in _phase_rows(vehicle, time_s)]
+    cg, cg_v = (np.concatenate([point[k] for point, _ in parts]) for k in (0, 1))
+    arms = [np.broadcast_to(-flown.centerbody.cg_m, point[0].shape) for point, flown in parts]
+    arm = rotations.rotate(q_b, np.concatenate(arms))
     rate = rotations.rotate(q_b, states[:, 14:17])
     r_ecef = rotations.rotate(to_ecef, cg + arm)
     v_ecef = rotations.rotate(to_ecef, cg_v + np.cross(rate, arm)) - np.cross(earth.OMEGA_ECEF_RADPS, r_ecef)

@@ -1,8 +1,10 @@
 """What is the true atmosphere of the day of flight, and what would a sounding of it report?
 
-``rho = rho_base exp(wave + structure)`` with a base of US76, or NRLMSIS of one day, a smooth gravity wave and a
-Gauss-Markov structure of 5 km correlation length; winds are a smooth August profile with a structure of 3 km. Then
-come the disturbances that the scenario names: density pockets, wind shears, turbulence, discrete gusts.
+``rho = rho_base exp(wave + structure)`` with a base of US76, NRLMSIS or a measured sounding, a smooth gravity wave and
+a Gauss-Markov structure of 5 km correlation length; winds are those of the place and month, of the scenario or of the
+sounding, with a structure of 3 km (`MeanAir`). A measured sounding holds its own structure: none is added unless the
+scenario states its size. Then come the disturbances that the scenario names: density pockets, wind shears, turbulence,
+discrete gusts.
 
 Two soundings can be had of it. The simple one errs by a constant part, a gravity wave and small structure of the size
 that the filter assumes. The range's is a balloon below 30 km, a datasonde and an inflatable sphere above, each with its
@@ -17,14 +19,28 @@ MIL-F-8785C, section 3.7 (Dryden spectra, 1-cosine gust).
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from flightmodel.atmosphere import AtmosphereProfile, default_sounding_sd, nrlmsis_profile, standard_atmosphere
-from flightmodel.checks import FloatArray
-from flightmodel.config import Fraction, Section
+from flightmodel.atmosphere import (
+    TABLES,
+    AtmosphereProfile,
+    default_sounding_sd,
+    nrlmsis_of,
+    nrlmsis_profile,
+    profile_from_sounding,
+    standard_atmosphere,
+    us76,
+)
+from flightmodel.checks import ConfigError, FloatArray
+from flightmodel.config import FileBeside, Fraction, KeyFaults, Section, parse_utc
 from synthetic_flight.instrument_errors import gauss_markov
 
 Wind = Annotated[float, Field(ge=-500.0, le=500.0)]
@@ -32,6 +48,7 @@ WindSize = Annotated[float, Field(ge=0.0, le=500.0)]
 # the dynamics' table of the atmosphere has a row every 50 m: a layer must span at least four of them
 Thickness = Annotated[float, Field(ge=200.0, le=110e3)]
 Altitude = Annotated[float, Field(gt=0.0, lt=110e3)]
+WindHeight = Annotated[float, Field(ge=-500.0, le=110e3)]
 STEP_M, TOP_M = 250.0, 130000.0
 POINTS_PER_LENGTH = 10  # knots along a disturbance's thickness
 # gain 1/2 of a Gaussian of standard deviation s at wavelength l: s = l sqrt(ln 2 / 2) / pi
@@ -88,10 +105,18 @@ class RangeSounding(Section):
 
 
 class DayOfFlightAtmosphere(Section):
-    """Departure of the day-of-flight atmosphere from its base, and the size of the sounding's errors."""
+    """Departure of the day-of-flight atmosphere from its base, and the size of the sounding's errors.
 
-    base: Literal["us76", "nrlmsis_2009_08_17"] = "us76"
+    The base is a model (``base``) or a measured sounding (``from``, a table as flight folders have it). ``winds`` are
+    those of the place and month, ``mean_wind`` (altitude m, north and east m/s) instead, or the sounding's.
+    """
+
+    base: Literal["us76", "nrlmsis_2009_08_17", "nrlmsis"] = "us76"
+    from_: FileBeside | None = Field(default=None, alias="from")
+    f107: Annotated[float, Field(ge=50.0, le=500.0)] = 120.0
+    ap: Annotated[float, Field(ge=0.0, le=400.0)] = 9.0
     winds: bool = True
+    mean_wind: Annotated[tuple[tuple[WindHeight, Wind, Wind], ...], Field(min_length=2)] | None = None
     density_sd: Fraction = 0.015
     wind_sd_mps: WindSize = 2.0
     pockets: tuple[Pocket, ...] = ()
@@ -101,8 +126,33 @@ class DayOfFlightAtmosphere(Section):
     sounding_scale: Annotated[float, Field(ge=0.0, le=10.0)] = 1.0
     sounding: RangeSounding | None = None
 
+    @model_validator(mode="after")
+    def _fit_each_other(self) -> DayOfFlightAtmosphere:
+        faults: list[tuple[str, object, str]] = []
+        if self.from_ is not None and "base" in self.model_fields_set:
+            faults.append(("from", self.from_, f"base = '{self.base}' states another air; keep one of the two"))
+        if self.mean_wind is not None and not self.winds:
+            faults.append(("winds", False, "mean_wind states winds; remove one of the two"))
+        if any(b[0] <= a[0] for a, b in pairwise(self.mean_wind or ())):
+            faults.append(("mean_wind", "", "altitudes must increase"))
+        if faults:
+            raise KeyFaults(faults)
+        return self
 
-# altitude km, north and east wind m/s: a smooth mid-latitude August day, assumed
+    @property
+    def structure_sd(self) -> tuple[float, float]:
+        """Size of the random structure: density (fraction), wind m/s. A sounding has none unless one is stated."""
+        measured = self.from_ is not None
+        sizes = (self.density_sd, self.wind_sd_mps)
+        names = ("density_sd", "wind_sd_mps")
+        density, wind = (
+            0.0 if measured and name not in self.model_fields_set else size
+            for name, size in zip(names, sizes, strict=True)
+        )
+        return density, wind
+
+
+# altitude km, north and east wind m/s: a smooth mid-latitude August day, assumed; flown 30 to 45 N in July and August
 _AUGUST_WIND = np.array(
     [
         [0, 2, 1], [5, 3, 8], [11, 4, 16], [18, 1, 0], [25, 0, -10], [35, 2, -18], [45, 3, -28], [55, -4, -38],
@@ -110,6 +160,101 @@ _AUGUST_WIND = np.array(
     ],
     dtype=float,
 )  # fmt: skip
+
+
+_AUGUST_MONTHS, _AUGUST_LATITUDES_DEG = (7, 8), (30.0, 45.0)
+
+
+@dataclass(frozen=True)
+class MeanAir:
+    """Air of the place and the day before any random structure.
+
+    Parameters
+    ----------
+    base : AtmosphereProfile or None
+        Density, temperature and, where measured, winds; None is US76 without winds.
+    wind : (n, 3) float
+        Altitude km, mean north and east wind m/s, added to the base's; linear between the rows.
+    """
+
+    base: AtmosphereProfile | None
+    wind: FloatArray
+
+
+AUGUST = MeanAir(None, _AUGUST_WIND)
+_NO_WIND = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
+
+
+def mean_air(
+    spec: DayOfFlightAtmosphere, folder: Path, t0_utc: str, latitude_deg: float, longitude_deg: float
+) -> MeanAir:
+    """Air that a scenario of a folder, place and time states, or that of its place and month.
+
+    Raises
+    ------
+    ConfigError
+        Where its sounding cannot be read, or NRLMSIS is asked for without the library (``nrlmsis-missing``).
+    """
+    if spec.from_ is not None:
+        base: AtmosphereProfile | None = _measured(folder / spec.from_)
+    elif spec.base == "us76":
+        base = None
+    elif spec.base == "nrlmsis":
+        base = nrlmsis_of(t0_utc, latitude_deg, longitude_deg, spec.f107, spec.ap)
+    else:
+        base = nrlmsis_profile(spec.base)
+    if spec.mean_wind is not None:
+        return MeanAir(base, np.array(spec.mean_wind) / [1000.0, 1.0, 1.0])
+    if not spec.winds or spec.from_ is not None:
+        return MeanAir(base, _NO_WIND)
+    month, low, high = parse_utc(t0_utc).month, *_AUGUST_LATITUDES_DEG
+    if month in _AUGUST_MONTHS and low <= latitude_deg <= high:
+        return MeanAir(base, _AUGUST_WIND)
+    return MeanAir(base, seasonal_wind(month, latitude_deg))
+
+
+@cache
+def _wind_table() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Latitudes (k,) deg, altitudes (n,) km and east wind ``(12, k, n)``, m/s, of ``mean_winds.csv``."""
+    path = TABLES / "mean_winds.csv"
+    head = next(line for line in path.read_text().splitlines() if not line.startswith("#"))
+    altitude_km = np.array([float(name[1:-2]) for name in head.split(",")[2:]])
+    rows = np.loadtxt(path, delimiter=",", comments="#", skiprows=3).reshape(12, -1, 2 + len(altitude_km))
+    return rows[0, :, 1], altitude_km, rows[:, :, 2:]
+
+
+def seasonal_wind(month: int, latitude_deg: float) -> FloatArray:
+    """Zonal-mean wind of a month (1 to 12) and latitude, ``(n, 3)``: altitude km, north (0) and east wind m/s.
+
+    In gradient balance with NRLMSIS 2.1's pressures (``data/atmosphere/mean_winds.py``).
+    """
+    latitudes, altitude_km, wind = _wind_table()
+    east = [np.interp(latitude_deg, latitudes, column) for column in wind[month - 1].T]
+    return np.column_stack([altitude_km, np.zeros(len(altitude_km)), east])
+
+
+def _measured(path: Path) -> AtmosphereProfile:
+    """Read a sounding as a profile, on knots that follow its blending into the standard atmosphere beyond its ends."""
+    from flightmodel.gate import Gate  # these import pandas: longer than a flight takes
+    from flightmodel.instruments import AtmosphereEntry
+    from flightmodel.sensor_tables import read_sounding
+
+    gate = Gate(path.parent, datetime(2000, 1, 1, tzinfo=UTC))  # a sounding has no times
+    sounding = read_sounding(gate, AtmosphereEntry(file=path.name))
+    if sounding is None:
+        raise ConfigError([*gate.config, *gate.faults])
+    profile = profile_from_sounding(sounding)
+    above = np.arange(sounding.altitude_m[-1], TOP_M + 60e3, 1000.0)
+    z = np.union1d(profile.altitude_m, np.union1d(above, np.arange(0.0, sounding.altitude_m[0], STEP_M)))
+    air, (density, temperature, _) = profile.at(z), us76(z)
+    return AtmosphereProfile(
+        z,
+        np.log(air.density_kgpm3 / density),
+        air.temperature_k - temperature,
+        air.wind_ned_mps,
+        air.density_sd,
+        air.wind_sd_mps,
+    )
 
 
 def correlated(altitude_m: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:
@@ -144,24 +289,28 @@ def _smooth_step(altitude_m: FloatArray, centre_m: float, thickness_m: float) ->
     return 0.5 * (1.0 + np.sin(np.pi * x))
 
 
-def day_of_flight_atmosphere(spec: DayOfFlightAtmosphere, rng: np.random.Generator) -> AtmosphereProfile:
+def day_of_flight_atmosphere(
+    spec: DayOfFlightAtmosphere, rng: np.random.Generator, mean: MeanAir = AUGUST
+) -> AtmosphereProfile:
     """Draw the true atmosphere of the flight: structure from 0 to 130 km, its base above.
 
-    Turbulence draws from children of ``rng``, one a band, so it leaves all other draws as they are.
+    ``mean`` is the air without random structure (`mean_air`). Turbulence draws from children of ``rng``, one a band, so
+    it leaves all other draws as they are.
     """
     z = np.arange(0.0, TOP_M + 1.0, STEP_M)
-    smooth = 0.03 * np.sin(2.0 * np.pi * (z / 45000.0 + rng.random())) * (spec.density_sd > 0.0)
-    ratio = smooth + spec.density_sd * correlated(z, 5000.0, rng)
+    density_structure, wind_structure = spec.structure_sd
+    smooth = 0.03 * np.sin(2.0 * np.pi * (z / 45000.0 + rng.random())) * (density_structure > 0.0)
+    ratio = smooth + density_structure * correlated(z, 5000.0, rng)
     wind = np.zeros((len(z), 3))
     if spec.winds:
         for axis in (0, 1):
-            mean = np.interp(z / 1000.0, _AUGUST_WIND[:, 0], _AUGUST_WIND[:, axis + 1])
-            wind[:, axis] = mean + spec.wind_sd_mps * correlated(z, 3000.0, rng)
+            of_place = np.interp(z / 1000.0, mean.wind[:, 0], mean.wind[:, axis + 1])
+            wind[:, axis] = of_place + wind_structure * correlated(z, 3000.0, rng)
         wind *= np.interp(z, [110000.0, 130000.0], [1.0, 0.0])[:, None]
     density_sd, wind_sd = default_sounding_sd(z)
     day = AtmosphereProfile(z, ratio, np.zeros(len(z)), wind, density_sd, wind_sd)
-    if spec.base != "us76":
-        day = _on_base(day, nrlmsis_profile(spec.base))
+    if mean.base is not None:
+        day = _on_base(day, mean.base if spec.winds else replace(mean.base, wind_ned_mps=0.0 * mean.base.wind_ned_mps))
     structures = (*spec.pockets, *spec.shears, *spec.gusts, *spec.discrete_gusts)
     return _with_structures(day, spec, rng) if structures else day
 
@@ -192,7 +341,7 @@ def _on_base(day: AtmosphereProfile, base: AtmosphereProfile) -> AtmosphereProfi
         z,
         under.log_density_ratio + fade * np.interp(z, day.altitude_m, day.log_density_ratio),
         under.temperature_offset_k,
-        np.column_stack([fade * np.interp(z, day.altitude_m, w) for w in day.wind_ned_mps.T]),
+        under.wind_ned_mps + np.column_stack([fade * np.interp(z, day.altitude_m, w) for w in day.wind_ned_mps.T]),
         under.density_sd,
         under.wind_sd_mps,
     )

@@ -23,7 +23,7 @@ KINDS = {
     ),
     "radar": (instruments.RADAR, instruments.RadarEntry, simulated.Radar, RadarSite),
     "sun": (instruments.SUN, instruments.SunEntry, simulated.SunSensors, instruments.SunHeads),
-    "gnss": (instruments.GNSS, instruments.GnssEntry, None, instruments.GnssSpec),
+    "gnss": (instruments.GNSS, instruments.GnssEntry, simulated.Gnss, instruments.GnssSpec),
     "barometer": (instruments.BAROMETER, instruments.BarometerEntry, None, instruments.BarometerSpec),
 }  # fmt: skip
 SITE = {"name": "r", "latitude_rad": 0.6, "longitude_rad": -1.3, "height_m": 12.0}

@@ -203,7 +203,7 @@ def reconcile(
 def problem_of(flight: Reconstruction, measured: Measurements, laws: tuple[str, ...]) -> Problem:
     """Least-squares problem of a flight."""
     air = AtmosphereParameters(flight.telemetry.sounding, float(measured.altitude_m.min()))
-    return Problem(measured, VehicleParameters(flight.telemetry.required_vehicle(), laws), air)
+    return Problem(measured, VehicleParameters(flight.required_loads().vehicle, laws), air)
 
 
 def solve(

@@ -76,7 +76,8 @@ def stiffness_from_modes(flight: Reconstruction, about_nmprad: float) -> ModalSt
     GateError
         Where vehicle or sensors are missing, the pulse is shorter than a few windows, or no mode stands out.
     """
-    pulse, nominal = flight.required_loads(), flight.telemetry.required_vehicle()
+    pulse = flight.required_loads()
+    nominal = pulse.vehicle
     about = about_nmprad / nominal.joint.bending_stiffness_nmprad
     t, log_power = _spectra(flight, pulse.time_s)
     pressure = np.interp(t, pulse.time_s, pulse.dynamic_pressure_pa)

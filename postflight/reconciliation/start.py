@@ -90,7 +90,8 @@ def damping_guess(problem: Problem, x: FloatArray) -> float:
 
 def critical_stiffness(flight: Reconstruction) -> float:
     """Bending stiffness, N m/rad, below which the stated vehicle diverges at the flight's largest load."""
-    pulse, stated = flight.required_loads(), flight.telemetry.required_vehicle()
+    pulse = flight.required_loads()
+    stated = pulse.vehicle
     pressure, mach = pulse.dynamic_pressure_pa[::EVERY_LOAD].tolist(), pulse.mach[::EVERY_LOAD].tolist()
     at = zip(pressure, mach, strict=True)
     return max(critical_stiffness_nmprad(stated, slopes_at(stated, each), load) for load, each in at)
