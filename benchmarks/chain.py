@@ -38,7 +38,9 @@ def best(work):
 def main():
     scenario = read_scenario("irve2_reference")
     vehicle = scenario.vehicle
-    table = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    table = simulate.atmosphere_table(
+        day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere"), scenario.mean_air)
+    )
     state = initial_state(scenario)
     rows = []
     kernel = best(lambda: integrate(vehicle, table, state, 0.002, 2, 110001, 52501))

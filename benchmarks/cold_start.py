@@ -53,7 +53,9 @@ def everything(folder, side_by_side):
     from synthetic_flight.weather import day_of_flight_atmosphere
 
     scenario = read_scenario("irve2_reference")
-    table = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    table = simulate.atmosphere_table(
+        day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere"), scenario.mean_air)
+    )
     start = Start(initial_state(scenario), simulate.parameter_vector(scenario.vehicle), table)
     short = Schedule(step_s=0.005, per_record=1, records=2)
     stages = {

@@ -21,7 +21,7 @@ from synthetic_flight import simulate
 from synthetic_flight.ensemble import LANES, Schedule, Start, available_cores, fly_ensemble
 from synthetic_flight.scenarios import child_rng, read_scenario
 from synthetic_flight.simulate import integrate
-from synthetic_flight.weather import day_of_flight_atmosphere
+from synthetic_flight.weather import AUGUST, day_of_flight_atmosphere
 
 SECONDS, RECORD_HZ = 300.0, 10.0
 RATES_HZ = (200.0, 150.0)
@@ -44,7 +44,7 @@ def dispersed_starts(problem):
         vehicle: Vehicle = replace(
             problem.vehicle, joint=joint.model_copy(update={"bending_stiffness_nmprad": stiffness})
         )
-        table = simulate.atmosphere_table(day_of_flight_atmosphere(spec, child_rng(run, "atmosphere")))
+        table = simulate.atmosphere_table(day_of_flight_atmosphere(spec, child_rng(run, "atmosphere"), AUGUST))
         return Start(problem.inflated, simulate.parameter_vector(vehicle, *factors[1:]), table)
 
     return start_of

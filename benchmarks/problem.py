@@ -29,7 +29,9 @@ def reference_problem() -> Problem:
     """Fly the reference scenario, joint locked until inflation, to where the benchmarks start."""
     scenario = read_scenario("irve2_reference")
     time_s = scenario.spec.time
-    air = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere")))
+    air = simulate.atmosphere_table(
+        day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(0, "atmosphere"), scenario.mean_air)
+    )
     locked = round(time_s.inflated_s - time_s.start_s)
     states, _ = integrate(
         scenario.vehicle, air, initial_state(scenario), 0.004, 250, round(START_S - time_s.start_s) + 1, locked

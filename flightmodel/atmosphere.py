@@ -321,7 +321,7 @@ def _still_profile(z: FloatArray, density: FloatArray, temperature: FloatArray) 
 
 
 @cache
-def nrlmsis_of(t0_utc: str, latitude_deg: float, longitude_deg: float, f107: float, ap: float) -> AtmosphereProfile:
+def nrlmsis_of(t0_utc: str, latitude_rad: float, longitude_rad: float, f107: float, ap: float) -> AtmosphereProfile:
     """NRLMSIS 2.1 of a time and place, 0 to 400 km, without winds, through pymsis.
 
     Parameters
@@ -343,6 +343,7 @@ def nrlmsis_of(t0_utc: str, latitude_deg: float, longitude_deg: float, f107: flo
         raise ConfigError(words, code="nrlmsis-missing") from None
     z = np.concatenate([np.arange(0.0, 130e3, 1000.0), np.arange(130e3, 200e3, 2000.0), np.arange(200e3, 4.01e5, 1e4)])
     time = np.datetime64(parse_utc(t0_utc).replace(tzinfo=None))
-    out = pymsis.calculate(time, longitude_deg, latitude_deg, z / 1000.0, [f107], [f107], [[ap] * 7], version=2.1)
+    east, north = np.rad2deg([longitude_rad, latitude_rad])
+    out = pymsis.calculate(time, east, north, z / 1000.0, [f107], [f107], [[ap] * 7], version=2.1)
     out = np.asarray(out, dtype=float).reshape(len(z), 11)
     return _still_profile(z, out[:, 0], out[:, 10])

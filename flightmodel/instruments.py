@@ -41,7 +41,14 @@ AXIS = {
 Size = Annotated[float, Field(ge=0.0, le=1e4)]
 LateClock = Annotated[float, Field(ge=0.0, le=10.0)]
 TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
-SIMULATED = {"m": Size, "m/s": Size, "s": LateClock, "rad": ErrorAngle, "1": Fraction, "": Size}  # by the unit of the error
+SIMULATED = {
+    "m": Size,
+    "m/s": Size,
+    "s": LateClock,
+    "rad": ErrorAngle,
+    "1": Fraction,
+    "": Size,
+}  # by the unit of the error
 
 Response = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 Model = TypeVar("Model", bound=BaseModel)

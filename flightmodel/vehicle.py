@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from flightmodel.aerodynamics import Aerodynamics, AeroTable, Shape, aerodynamics_from
-from flightmodel.checks import ConfigError, FloatArray, check_positive_definite, nearest_name
+from flightmodel.checks import ConfigError, Fault, FloatArray, check_positive_definite, nearest_name
 from flightmodel.config import (
     Angle,
     ErrorAngle,
@@ -307,16 +307,17 @@ class Vehicle:
         ConfigError
             ``event-unknown``: a step names an event that is not among ``events``.
         """
-        times, faults, steps = dict(events), list[str](), list[MassStep]()
+        times, faults, steps = dict(events), list[Fault](), list[MassStep]()
         for step in self.mass_steps:
             if step.event is not None and step.event not in times:
                 hint = f"{nearest_name(step.event, list(times))}; known: {', '.join(times) or 'none'}"
-                faults.append(f"{self.source}: key 'mass.event' = '{step.event}': the flight has no such event{hint}")
+                words = f"{self.source}: key 'mass.event' = '{step.event}': the flight has no such event{hint}"
+                faults.append(Fault(words, "event-unknown"))
             else:
                 at_s = step.from_s if step.event is None else times[step.event]
                 steps.append(step.model_copy(update={"from_s": at_s, "event": None}))
         if faults:
-            raise ConfigError(faults, code="event-unknown")
+            raise ConfigError(faults)
         return replace(self, mass_steps=tuple(sorted(steps, key=lambda step: step.from_s or 0.0)))
 
     def phases(self, start_s: float, stop_s: float) -> list[tuple[float, float, Vehicle]]:
@@ -329,8 +330,7 @@ class Vehicle:
             if step.from_s > begins:
                 out.append((begins, step.from_s, now))
                 begins = step.from_s
-            parts = {"aeroshell": step.aeroshell, "centerbody": step.centerbody}
-            now = replace(now, **{name: part for name, part in parts.items() if part is not None})
+            now = replace(now, aeroshell=step.aeroshell or now.aeroshell, centerbody=step.centerbody or now.centerbody)
         return [*out, (begins, stop_s, now)]
 
     def at(self, time_s: float) -> Vehicle:

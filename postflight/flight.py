@@ -20,7 +20,7 @@ from flightmodel.flightfolder import read_flight as read_telemetry
 from flightmodel.guarded_files import file_bytes
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, Sounding, Telemetry
-from flightmodel.vehicle import Vehicle
+from flightmodel.vehicle import MassProperties, Vehicle
 from recon.settings import Settings
 
 PULSE_RATE_HZ = 50.0

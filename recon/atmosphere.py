@@ -28,7 +28,7 @@ Laboratory", J. Spacecraft Rockets 51 (2014) 1048 (density and drag are not sepa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -121,6 +121,11 @@ class Drag:
     cn_sd: float
     length_m: float
     ca_shape_sd: float
+
+    def rows(self, keep: BoolArray) -> Drag:
+        """Of chosen samples."""
+        per_mass = self.area_per_mass_m2pkg
+        return replace(self, area_per_mass_m2pkg=per_mass[keep]) if isinstance(per_mass, np.ndarray) else self
 
     @property
     def ca_constant_sd(self) -> float:
@@ -257,7 +262,7 @@ def reconstruct_air(
             f"at least {_LEAST_SAMPLES} are needed to estimate density and winds",
             code="air-not-observable",
         )
-    samples = samples.rows(keep)
+    samples, drag = samples.rows(keep), drag.rows(keep)
     model = _Model(samples, profile, drag)
     drag_ratio = _drag_ratio(model)
     height = _knots(samples.altitude_m, _KNOT_M)

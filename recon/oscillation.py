@@ -18,7 +18,9 @@ Each is a single hypothesis, its likelihood that of all windows with an unknown 
 ``n`` the number of independent samples. ``d`` is positive where the vehicle is statically stable and the accelerometer
 lies aft of the c.g.; elsewhere its sign is open, and a triad turned by half a turn cannot be recognised.
 
-A hypothesis takes over from the data as delivered at a thousand to one.
+A hypothesis takes over from the data as delivered at a thousand to one. On a vehicle that cones, a lag turns the
+lateral components as a roll does (37 rad/s and 1.4 ms: 3 deg): the angle about roll is known no better than what the
+stated time biases of both clocks make of it.
 """
 
 from __future__ import annotations
@@ -95,6 +97,10 @@ class _Normal:
     gram: FloatArray
     moment: ComplexArray
 
+    def at(self, lag: int) -> _Normal:
+        """Return those of one lag alone."""
+        return _Normal(self.square, self.gram[:, [lag]], self.moment[:, [lag]])
+
     def rest(self, phase_rad: FloatArray) -> FloatArray:
         """Share of the square (w, l, p) that is left at phases (p,)."""
         turned = (self.moment[:, :, None] * np.exp(-1j * phase_rad)[:, None]).real
@@ -133,16 +139,18 @@ def oscillation(
     quarter = np.linspace(0.0, 1.5 * np.pi, 4)
     phases = np.linspace(-np.pi, np.pi, round(2.0 * np.pi / _ROLL_STEP_RAD), endpoint=False)
     by_lag = proper.rest(np.zeros(1))[:, :, 0]
-    at_none = _Normal(proper.square, proper.gram[:, [none]], proper.moment[:, [none]])
+    at_none = proper.at(none)
     by_roll, by_mirror = at_none.rest(phases)[:, 0], mirrored.rest(quarter)[:, 0]
     best = np.minimum.reduce([by_lag.min(axis=1), by_roll.min(axis=1), by_mirror.min(axis=1)])
     use = best < 1.0 - _LEAST_EXPLAINED
     if use.sum() < _LEAST_WINDOWS:
         return None
     samples = 2.0 * _WINDOW_S / CORRELATION_S  # of both components
-    lag_log, roll_log, mirror_log = (
-        -0.5 * samples * np.log(np.maximum(rest[use], 1e-9)).sum(axis=0) for rest in (by_lag, by_roll, by_mirror)
-    )
+
+    def log_likelihood(rest: FloatArray) -> FloatArray:
+        return np.asarray(-0.5 * samples * np.log(np.maximum(rest[use], 1e-9)).sum(axis=0))
+
+    lag_log, roll_log, mirror_log = (log_likelihood(rest) for rest in (by_lag, by_roll, by_mirror))
     gains = {
         DELIVERED: 0.0,
         LAG: float(lag_log.max() - lag_log[none]),
@@ -150,6 +158,11 @@ def oscillation(
         MIRRORED: float(mirror_log.max() - lag_log[none]),
     }
     roll, roll_sd = _refined(roll_log, _ROLL_STEP_RAD)
+    either_side = [_refined(log_likelihood(proper.at(none + k).rest(phases)[:, 0]), _ROLL_STEP_RAD)[0] for k in (-1, 1)]
+    # a phase and its opposite leave the same rest: half a turn more or less is none
+    per_lag = np.mod(either_side[1] - either_side[0] + 0.5 * np.pi, np.pi) - 0.5 * np.pi
+    clocks_s = np.hypot(force.spec.time_bias_sd_s, rate.spec.time_bias_sd_s)
+    roll_sd = float(np.hypot(roll_sd, clocks_s * per_lag / (2.0 * _LAG_STEP_S)))
     roll = _with_positive(at_none, use, phases[0] + roll, aft)
     kind = max(gains, key=lambda name: gains[name])
     if gains[kind] < LOG_LIKELIHOOD_LIMIT or (kind == ROLL and abs(roll) < max(_LEAST_ROLL_RAD, _ROLL_SD * roll_sd)):

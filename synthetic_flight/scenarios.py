@@ -165,7 +165,9 @@ class ScenarioFile(Section):
         words, faults = f"a time of the telemetry, {start:g} to {stop:g} s, is wanted", Faults()
         if not self.radars and not self.gnss:
             faults.append(("radars", "", "at least one tracker is wanted: a table [radars.NAME] or [gnss.NAME]"))
-        faults += [(f"gnss.{n}", "", "a radar has this name; results go by name") for n in self.gnss if n in self.radars]
+        faults += [
+            (f"gnss.{n}", "", "a radar has this name; results go by name") for n in self.gnss if n in self.radars
+        ]
         if not start <= self.attitude_prior.t_s <= stop:
             faults.append(("attitude_prior.t_s", self.attitude_prior.t_s, words))
         instruments: dict[str, Triad | SunSensors | Radar | Gnss | None] = {
@@ -215,9 +217,8 @@ class Scenario:
     @property
     def mean_air(self) -> MeanAir:
         """Air of the place and day where the flight starts, before any random structure."""
-        start = self.spec.initial
-        folder, place = self.source.parent, (start.latitude_deg, start.longitude_deg)
-        return mean_air(self.spec.atmosphere, folder, self.spec.t0_utc, *place)
+        north, east = np.deg2rad([self.spec.initial.latitude_deg, self.spec.initial.longitude_deg])
+        return mean_air(self.spec.atmosphere, self.source.parent, self.spec.t0_utc, float(north), float(east))
 
 
 def shipped_scenarios() -> list[str]:

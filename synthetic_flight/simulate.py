@@ -158,9 +158,7 @@ def _phase_rows(vehicle: Vehicle, time_s: FloatArray) -> list[tuple[slice, Vehic
     phases = vehicle.phases(float(time_s[0]), np.inf)
     edges = np.searchsorted(time_s, [begins - 1e-9 for begins, _, _ in phases]).tolist()
     ends = [*edges[1:], len(time_s)]
-    return [
-        (slice(a, b), flown) for a, b, (_, _, flown) in zip(edges, ends, phases, strict=True) if b > a
-    ]
+    return [(slice(a, b), flown) for a, b, (_, _, flown) in zip(edges, ends, phases, strict=True) if b > a]
 
 
 def state_from_ecef(

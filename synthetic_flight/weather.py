@@ -186,7 +186,7 @@ _NO_WIND = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
 
 
 def mean_air(
-    spec: DayOfFlightAtmosphere, folder: Path, t0_utc: str, latitude_deg: float, longitude_deg: float
+    spec: DayOfFlightAtmosphere, folder: Path, t0_utc: str, latitude_rad: float, longitude_rad: float
 ) -> MeanAir:
     """Air that a scenario of a folder, place and time states, or that of its place and month.
 
@@ -200,17 +200,17 @@ def mean_air(
     elif spec.base == "us76":
         base = None
     elif spec.base == "nrlmsis":
-        base = nrlmsis_of(t0_utc, latitude_deg, longitude_deg, spec.f107, spec.ap)
+        base = nrlmsis_of(t0_utc, latitude_rad, longitude_rad, spec.f107, spec.ap)
     else:
         base = nrlmsis_profile(spec.base)
     if spec.mean_wind is not None:
         return MeanAir(base, np.array(spec.mean_wind) / [1000.0, 1.0, 1.0])
     if not spec.winds or spec.from_ is not None:
         return MeanAir(base, _NO_WIND)
-    month, low, high = parse_utc(t0_utc).month, *_AUGUST_LATITUDES_DEG
-    if month in _AUGUST_MONTHS and low <= latitude_deg <= high:
+    month, (low, high) = parse_utc(t0_utc).month, np.deg2rad(_AUGUST_LATITUDES_DEG)
+    if month in _AUGUST_MONTHS and low <= latitude_rad <= high:
         return MeanAir(base, _AUGUST_WIND)
-    return MeanAir(base, seasonal_wind(month, latitude_deg))
+    return MeanAir(base, seasonal_wind(month, latitude_rad))
 
 
 @cache
@@ -223,13 +223,13 @@ def _wind_table() -> tuple[FloatArray, FloatArray, FloatArray]:
     return rows[0, :, 1], altitude_km, rows[:, :, 2:]
 
 
-def seasonal_wind(month: int, latitude_deg: float) -> FloatArray:
+def seasonal_wind(month: int, latitude_rad: float) -> FloatArray:
     """Zonal-mean wind of a month (1 to 12) and latitude, ``(n, 3)``: altitude km, north (0) and east wind m/s.
 
     In gradient balance with NRLMSIS 2.1's pressures (``data/atmosphere/mean_winds.py``).
     """
     latitudes, altitude_km, wind = _wind_table()
-    east = [np.interp(latitude_deg, latitudes, column) for column in wind[month - 1].T]
+    east = [np.interp(np.rad2deg(latitude_rad), latitudes, column) for column in wind[month - 1].T]
     return np.column_stack([altitude_km, np.zeros(len(altitude_km)), east])
 
 
@@ -289,9 +289,7 @@ def _smooth_step(altitude_m: FloatArray, centre_m: float, thickness_m: float) ->
     return 0.5 * (1.0 + np.sin(np.pi * x))
 
 
-def day_of_flight_atmosphere(
-    spec: DayOfFlightAtmosphere, rng: np.random.Generator, mean: MeanAir = AUGUST
-) -> AtmosphereProfile:
+def day_of_flight_atmosphere(spec: DayOfFlightAtmosphere, rng: np.random.Generator, mean: MeanAir) -> AtmosphereProfile:
     """Draw the true atmosphere of the flight: structure from 0 to 130 km, its base above.
 
     ``mean`` is the air without random structure (`mean_air`). Turbulence draws from children of ``rng``, one a band, so

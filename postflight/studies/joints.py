@@ -133,7 +133,8 @@ def _fly(
 ) -> tuple[tuple[JointFlight, ...], float]:
     """Fly a locked joint, then the given ones, through the pulse of the locked flight."""
     time = scenario.spec.time
-    table = simulate.atmosphere_table(day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere")))
+    air = day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(seed, "atmosphere"), scenario.mean_air)
+    table = simulate.atmosphere_table(air)
     state = initial_state(scenario)
     first = max(time.start_s, time.inflated_s or time.start_s)
     peak_s = _pressure_peak(scenario, Start(state, simulate.parameter_vector(scenario.vehicle), table), first)

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import rotations
+from flightmodel.airdata import pressure_pulse
 from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
 from flightmodel.checks import BoolArray, FloatArray, GateError, Progress
 from flightmodel.statistics import percentile_band
@@ -134,7 +135,7 @@ def entry_bounds(
         Where the reconstruction never comes below 100 km, or a draw cannot fly.
     """
     report = progress or (lambda _fraction, _what: None)
-    entry = _Entry(flight, vehicle or flight.telemetry.required_vehicle(), joint)
+    entry = _Entry(flight, vehicle or flight.telemetry.required_vehicle().at(flight.peak_s), joint)
     nominal = entry.fly([entry.start(None)])[0]
     alpha, normal = np.empty((2, flights, entry.records))
     ended = 0
@@ -174,7 +175,9 @@ class _Entry:
         if not len(below):
             raise GateError("pre-flight bounds: the reconstruction never comes below 100 km", code="entry-missing")
         self.start_s = float(air.time_s[below[0]])
-        self.records = round(min(SPAN_S, air.time_s[-1] - self.start_s) / RECORD_S)
+        pulse_end_s = float(air.time_s[np.flatnonzero(pressure_pulse(air.dynamic_pressure_pa))[-1]])
+        span = max(SPAN_S, pulse_end_s - self.start_s)
+        self.records = round(min(span, air.time_s[-1] - self.start_s) / RECORD_S)
         self.vehicle, self.locked = vehicle, joint is None
         self.dispersions = dispersions_of(vehicle.uncertainty, joint)
         self.profile = profile_from_sounding(flight.telemetry.sounding)

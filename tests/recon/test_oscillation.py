@@ -70,6 +70,27 @@ def test_mirror_image_is_undone_by_the_correction_of_either_sensor(mini_sense, s
             assert found(one.telemetry.accelerometer, one.telemetry.rates).kind == DELIVERED
 
 
+def test_a_lag_of_a_coning_vehicle_within_the_stated_clocks_is_no_roll():
+    """At 30 rad/s a lag of 1.5 ms turns what cones by 2.6 deg: red only where the clocks are stated to be better."""
+    force, rate = swinging(kicks=1e-3)
+    w, noise = 30.0, np.random.default_rng(7)
+
+    def coning(t, size):
+        lateral = np.column_stack([np.zeros_like(t), np.cos(w * t), np.sin(w * t)])
+        return size * lateral + 1e-4 * noise.standard_normal((len(t), 3))
+
+    # F = d i W' with d > 0, and i W' of a vector that cones is opposite to it
+    gyros = replace(rate, measured_sensor=coning(rate.time_s, 0.1))
+    accelerometer = replace(force, measured_sensor=coning(force.time_s - 0.0015, -1.5))
+
+    def with_clocks(sd_s):
+        return found(*(replace(r, spec=replace(r.spec, time_bias_sd_s=sd_s)) for r in (accelerometer, gyros)))
+
+    assert abs(np.rad2deg(with_clocks(0.001).roll_rad)) == pytest.approx(np.rad2deg(0.0015 * w), abs=0.3)
+    assert with_clocks(0.001).kind == DELIVERED
+    assert with_clocks(1e-5).kind != DELIVERED
+
+
 def test_nothing_is_said_of_a_body_that_is_not_known_or_does_not_swing():
     force, rate = swinging()
     assert found(force, rate, None) is None

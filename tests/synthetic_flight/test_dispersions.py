@@ -86,7 +86,8 @@ def test_wrong_dispersions_are_refused(tables, codes, name):
 def test_an_undispersed_flight_is_the_simulators_own(short):
     """Legs, longer steps before inflation and outputs against `fly_scenario`, on the same day."""
     truth = fly_scenario(short, 5)
-    table = simulate.atmosphere_table(day_of_flight_atmosphere(short.spec.atmosphere, child_rng(5, "atmosphere")))
+    air = day_of_flight_atmosphere(short.spec.atmosphere, child_rng(5, "atmosphere"), short.mean_air)
+    table = simulate.atmosphere_table(air)
     start = Start(initial_state(short), simulate.parameter_vector(short.vehicle), table)
     plan = legs(short.spec.time, WINDOW, locked=False)
     records = records_of(fly_legs(short.vehicle, [0], [start], plan)[0], short.vehicle, table)

@@ -14,7 +14,7 @@ from synthetic_flight import _kernels, simulate
 from synthetic_flight.ensemble import LANES, Schedule, Start, fly_ensemble
 from synthetic_flight.scenarios import child_rng
 from synthetic_flight.simulate import integrate
-from synthetic_flight.weather import DayOfFlightAtmosphere, day_of_flight_atmosphere
+from synthetic_flight.weather import AUGUST, DayOfFlightAtmosphere, day_of_flight_atmosphere
 
 from .conftest import entry_state
 
@@ -30,7 +30,7 @@ def dispersed(vehicle):
         stiffness = 4335.0 * np.exp(0.2 * rng.standard_normal())
         joint = vehicle.joint.model_copy(update={"bending_stiffness_nmprad": stiffness})
         factors = 1.0 + 0.05 * rng.standard_normal(3)
-        profile = day_of_flight_atmosphere(DayOfFlightAtmosphere(), child_rng(run, "atmosphere"))
+        profile = day_of_flight_atmosphere(DayOfFlightAtmosphere(), child_rng(run, "atmosphere"), AUGUST)
         state = entry_state(vehicle, alpha_deg=3.0 + rng.random(), spin_rpm=10.0 * rng.random())
         state[:3] *= 1.0 - 30e3 / np.linalg.norm(state[:3])
         p = simulate.parameter_vector(replace(vehicle, joint=joint), *factors, cmq_shift=0.1 * rng.standard_normal())

@@ -12,9 +12,9 @@ from estimators.edge import find_horizon
 from estimators.virtual_camera import VirtualCamera
 from flightmodel.camera import camera_from_mount
 from flightmodel.deflection import lv_direction
-from flightmodel.geometry import ShellGeometry, bend, vehicle_meshes
-from flightmodel.vehicle import CameraMount
-from synthetic_flight.film import Imaging, ShellRenderer, as_built_camera, record, render_video
+from flightmodel.geometry import ShellGeometry, bend, torus_circles, vehicle_meshes
+from flightmodel.vehicle import CameraMount, vehicle_from_toml, vehicle_path
+from synthetic_flight.film import Imaging, ShellRenderer, _Rays, _Stack, as_built_camera, record, render_video
 from tests.refusing import refuses
 
 TABLES = tomllib.loads((Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml").read_text())
@@ -163,3 +163,18 @@ def test_film_refuses_lengths_that_differ_and_nan():
         render_video(GEOMETRY, MOUNT, JOINT_M, np.zeros(3), np.zeros(2), light, rng)
     with refuses("not-finite", names=["theta"]):
         render_video(GEOMETRY, MOUNT, JOINT_M, np.full(3, np.nan), np.zeros(3), light, rng)
+
+
+def test_rays_reach_the_far_rim_of_a_shell_of_any_size():
+    """A camera at the rim of a 6 m shell looks at the opposite rim, 6 m away and more."""
+    geometry = vehicle_from_toml(vehicle_path("loftid")).geometry
+    stack = _Stack(geometry)
+    station, radius = torus_circles(geometry)
+    eye = np.array([-station[-1] - 0.5, -radius[-1], 0.0])
+    far = np.array([-station[-1], radius[-1], 0.0]) - eye
+    ray = (far / np.linalg.norm(far)).astype(np.float32)[:, None]
+    depth, gap = stack.march(_Rays(ray, eye), np.full(1, 0.3, dtype=np.float32), 200)
+    assert abs(gap[0]) < 0.01
+    # within two rings of the rim: the ray comes in under a flat angle
+    assert np.linalg.norm(far) - 4.0 * geometry.torus_minor_radius_m < depth[0] < np.linalg.norm(far)
+    assert stack.farthest_m > 2.0 * radius[-1]

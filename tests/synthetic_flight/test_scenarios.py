@@ -107,3 +107,61 @@ def test_a_radar_without_points_is_named_with_what_took_them(tmp_path):
     name = write(tmp_path, {"stop_s = 90.0": "stop_s = 6.0", "range_sd_m": "max_range_m = 10.0\nrange_sd_m"})
     with refuses("track-short", names=[r"radars\.\w+", r"max_range_m = 10\b"]):
         simulate_to_folder(read_scenario(name), 1, tmp_path / "flight")
+
+
+GNSS = """
+[gnss.gps]
+rate_hz = 5.0
+antenna_from_datum_body_m = [-0.9, 0.1, 0.0]
+horizontal_sd_m = 3.0
+vertical_sd_m = 5.0
+speed_sd_mps = 0.1
+vertical_speed_sd_mps = 0.2
+time_bias_s = 0.01
+"""
+
+
+def test_a_package_of_any_name_and_a_receiver_without_a_radar_are_read_back(tmp_path):
+    """What is delivered is what is read: package axes and place, the receiver's antenna and stated errors."""
+    radar = (EXAMPLE / "scenario.toml").read_text()
+    radar = radar[radar.index("[radars.shore]") : radar.index("[attitude_prior]")]
+    scenario = write(
+        tmp_path,
+        {radar: GNSS, "[accelerometer]": '[accelerometer]\nmount = "imu-2"', "stop_s = 90.0": "stop_s = 6.0"},
+        {"[sensors.suba]": "[sensors.imu-2]"},
+    )
+    simulate_to_folder(read_scenario(scenario), 3, tmp_path / "flight")
+    flight = read_flight(tmp_path / "flight")
+    assert not flight.radars
+    mount = flight.vehicle.sensors["imu-2"]
+    assert flight.accelerometer.spec.dcm_body_sensor.tolist() == mount.dcm_body_sensor.tolist()
+    assert flight.accelerometer.spec.position_from_datum_body_m.tolist() == [-0.6, 0.0, 0.0]
+    spec = flight.gnss["gps"].spec
+    assert spec.antenna_from_datum_body_m.tolist() == [-0.9, 0.1, 0.0]
+    assert (spec.horizontal_sd_m, spec.vertical_speed_sd_mps, spec.wander_sd_m, spec.time_bias_sd_s) == (
+        3.0,
+        0.2,
+        0.0,
+        0.01,
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "codes", "names"),
+    [
+        ({"[accelerometer]": '[accelerometer]\nmount = "sub"'}, {"mount-unknown"}, ["accelerometer.mount", "suba"]),
+        ({"[radars.shore]": "[gnss.shore]"}, {"key-unknown", "key-missing"}, ["horizontal_sd_m"]),
+        ({"[attitude_prior]": GNSS.replace("gps", "shore") + "[attitude_prior]"}, {"keys-conflict"}, [r"gnss\.shore"]),
+        ({"[atmosphere]": "[[events]]\nname = 'x'\nt_s = 'y'\n[atmosphere]"}, {"key-value"}, ["events.0.t_s"]),
+    ],
+)
+def test_faults_of_trackers_packages_and_events_are_named(tmp_path, changes, codes, names):
+    with refuses(*codes, names=names, kind=ConfigError):
+        read_scenario(write(tmp_path, changes))
+
+
+def test_a_scenario_needs_some_tracker(tmp_path):
+    radar = (EXAMPLE / "scenario.toml").read_text()
+    radar = radar[radar.index("[radars.shore]") : radar.index("[attitude_prior]")]
+    with refuses("keys-conflict", names=["radars", "gnss"], kind=ConfigError):
+        read_scenario(write(tmp_path, {radar: ""}))

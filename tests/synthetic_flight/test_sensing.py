@@ -8,6 +8,7 @@ from flightmodel.checks import ConfigError, GateError
 from flightmodel.trajectory import move_point
 from synthetic_flight import sensing
 from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.instrument_errors import Dropouts, Gnss
 from synthetic_flight.scenarios import child_rng, fly_scenario, read_scenario
 from synthetic_flight.weather import day_of_flight_atmosphere, sense_atmosphere
 from tests.refusing import refuses
@@ -139,7 +140,8 @@ def test_instruments_do_not_share_noise_and_a_day_is_a_seed(scenario):
     a, b = (child_rng(3, name).standard_normal(4) for name in ("wallops_island", "rates"))
     assert not np.allclose(a, b)
     np.testing.assert_array_equal(a, child_rng(3, "wallops_island").standard_normal(4))
-    one, two = (day_of_flight_atmosphere(scenario.spec.atmosphere, child_rng(s, "atmosphere")) for s in (3, 4))
+    spec, mean = scenario.spec.atmosphere, scenario.mean_air
+    one, two = (day_of_flight_atmosphere(spec, child_rng(s, "atmosphere"), mean) for s in (3, 4))
     assert not np.allclose(one.log_density_ratio, two.log_density_ratio)
 
 
@@ -178,3 +180,53 @@ def test_unknown_scenario_and_faults_of_a_file(tmp_path):
         "key-unknown", "keys-conflict", names=["'spin_rpm'", r"telemetry_from_s\b.*\bstop_s"], kind=ConfigError
     ):
         read_scenario(str(tmp_path / "bad.toml"))
+
+
+# ---- receivers, packages of any name
+
+
+RECEIVER = Gnss(
+    rate_hz=10.0, antenna_from_datum_body_m=(-1.2, 0.3, -0.1), horizontal_sd_m=0.0, vertical_sd_m=0.0, speed_sd_mps=0.0,
+    vertical_speed_sd_mps=0.0,
+)  # fmt: skip
+
+
+def test_an_ideal_receiver_has_its_antennas_place_and_motion(truth):
+    at, fixes = sensing.sense_gnss(truth, RECEIVER, 300.0, np.random.default_rng(0))
+    path = move_point(truth.trajectory, "antenna", np.array(RECEIVER.antenna_from_datum_body_m))
+    rows = np.searchsorted(truth.time_s, at - 1e-9)
+    np.testing.assert_allclose(fixes[:, :3], path.position_ecef_m[rows], atol=1e-4)
+    np.testing.assert_allclose(fixes[:, 3:], path.velocity_ecef_mps[rows], atol=2e-3)
+    # its velocity is the change of its place: 0.1 s steps of the pulse's 80 m/s^2 err by (0.1)^2 / 6 of their change
+    middle = at[1:-1] < 420.0
+    slope = (fixes[2:, :3] - fixes[:-2, :3]) / 0.2
+    np.testing.assert_allclose(slope[middle], fixes[1:-1, 3:][middle], atol=0.02)
+
+
+def test_errors_of_a_receiver_are_as_large_as_stated_and_late_is_positive(truth):
+    stated = {"horizontal_sd_m": 3.0, "vertical_sd_m": 8.0, "speed_sd_mps": 0.2, "vertical_speed_sd_mps": 0.5}
+    _, ideal = sensing.sense_gnss(truth, RECEIVER, 300.0, np.random.default_rng(0))
+    _, noisy = sensing.sense_gnss(truth, RECEIVER.model_copy(update=stated), 300.0, np.random.default_rng(1))
+    ned = [earth.ned_from_ecef((noisy - ideal)[:, part], ideal[:, :3]) for part in (slice(0, 3), slice(3, 6))]
+    # 1500 fixes: 1.8 %, 4 sd
+    for found, sd in zip(np.column_stack(ned).std(axis=0), (3.0, 3.0, 8.0, 0.2, 0.2, 0.5), strict=True):
+        assert found == pytest.approx(sd, rel=0.08)
+    wander = RECEIVER.model_copy(update={"wander_m": 5.0, "wander_time_constant_s": 2.0})
+    slow = sensing.sense_gnss(truth, wander, 300.0, np.random.default_rng(2))[1] - ideal
+    # 75 independent values an axis: 8 % each, three axes
+    assert np.sqrt(np.mean(slow[:, :3] ** 2)) == pytest.approx(5.0, rel=0.2)
+    late = sensing.sense_gnss(truth, RECEIVER.model_copy(update={"time_bias_s": 0.5}), 300.0, np.random.default_rng(3))[
+        1
+    ]
+    behind = np.sum((ideal - late)[:, :3] * ideal[:, 3:], axis=1) / np.sum(ideal[:, 3:] ** 2, axis=1)
+    drawn = 0.5 * np.random.default_rng(3).standard_normal()
+    assert np.median(behind[5:-5]) == pytest.approx(drawn, abs=0.02)
+
+
+def test_blackout_leaves_no_fix_and_all_of_it_is_refused(truth):
+    gone = RECEIVER.model_copy(update={"dropouts": Dropouts(outages_s=((310.0, 330.0),))})
+    at, _ = sensing.sense_gnss(truth, gone, 300.0, np.random.default_rng(0))
+    assert not ((at >= 310.0) & (at < 330.0)).any()
+    with refuses("track-short", names=["gps"]):
+        never = RECEIVER.model_copy(update={"dropouts": Dropouts(outages_s=((0.0, 1e4),))})
+        sensing.sense_gnss(truth, never, 300.0, np.random.default_rng(0), "gps")

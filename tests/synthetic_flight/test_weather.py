@@ -1,5 +1,8 @@
 """The day's air and its sounding: structures where they are asked for, nothing else moved, errors of declared size."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -13,17 +16,23 @@ from synthetic_flight.weather import (
     RangeSounding,
     day_of_flight_atmosphere,
     dryden_transverse,
+    mean_air,
     range_sounding_sd,
+    seasonal_wind,
     sense_atmosphere,
 )
 from tests.refusing import refuses
 
 STILL = {"winds": False, "density_sd": 0.0, "wind_sd_mps": 0.0}
 Z = np.arange(500.0, 129e3, 37.0)
+HERE = Path(__file__).parent
+WALLOPS_IN_AUGUST = ("2009-08-17T12:52:00Z", *np.deg2rad([37.8, -75.5]))
 
 
 def day(seed=3, **keys):
-    return day_of_flight_atmosphere(parse_section(DayOfFlightAtmosphere, keys, "test"), np.random.default_rng(seed))
+    spec = parse_section(DayOfFlightAtmosphere, keys, "test")
+    mean = mean_air(spec, HERE, *WALLOPS_IN_AUGUST)
+    return day_of_flight_atmosphere(spec, np.random.default_rng(seed), mean)
 
 
 def test_every_structure_leaves_the_random_day_as_it_is():
@@ -180,5 +189,112 @@ def test_top_and_faults_of_the_tables():
         day(
             pockets=[{"altitude_m": 45e3, "depht": 0.1, "thickness_m": 100.0}],
             gusts=[{"sd_mps": 1.0, "length_m": 500.0, "from_m": 50e3, "to_m": 50.5e3}],
-            base="nrlmsis",
+            base="nrlmsis_1999",
         )
+
+
+# ---- winds of the place and month, measured soundings, NRLMSIS
+
+
+def test_mean_winds_are_those_of_the_published_climatology():
+    """CIRA-86's jets (Fleming et al. 1990, zonal means), whose own spread between years is 10 m/s and more."""
+    for month, latitude_deg, altitude_km, east_mps in (
+        (1, 35.0, 10.0, 35.0),  # subtropical jet
+        (1, 40.0, 60.0, 50.0),  # winter mesosphere
+        (7, 40.0, 65.0, -60.0),  # summer mesosphere
+        (7, -45.0, 50.0, 85.0),  # southern winter stratopause
+        (1, -40.0, 60.0, -65.0),  # southern summer
+    ):
+        wind = seasonal_wind(month, np.deg2rad(latitude_deg))
+        assert np.interp(altitude_km, wind[:, 0], wind[:, 2]) == pytest.approx(east_mps, abs=20.0)
+
+
+def test_mean_winds_obey_the_thermal_wind_equation():
+    """Other way to them: their growth with height is the model's temperature gradient along latitude."""
+    pymsis = pytest.importorskip("pymsis", reason="pymsis comes with the msis extra")
+    month, lat = 1, 45.0
+    z = 1000.0 * np.arange(30.0, 71.0, 5.0)
+    longitude = np.arange(0.0, 360.0, 15.0)
+
+    def temperature(latitude_deg, height_m):
+        at = np.datetime64(f"2009-{month:02d}-15T12:00")
+        out = pymsis.calculate(at, longitude, latitude_deg, height_m / 1e3, [120.0], [120.0], [[9.0] * 7], version=2.1)
+        return np.asarray(out).reshape(len(longitude), len(height_m), 11)[..., 10].mean(axis=0)
+
+    wind = seasonal_wind(month, np.deg2rad(lat))
+    u = np.interp(z / 1e3, wind[:, 0], wind[:, 2])
+    slope = (temperature(lat + 5.0, z) - temperature(lat - 5.0, z)) / (np.deg2rad(10.0) * (6.371e6 + z))
+    middle = 0.5 * (temperature(lat, z)[1:] + temperature(lat, z)[:-1])
+    f = 2.0 * 7.292e-5 * np.sin(np.deg2rad(lat)) + u * np.tan(np.deg2rad(lat)) / 6.4e6
+    growth = -9.6 * 0.5 * (slope[1:] + slope[:-1]) / middle / (0.5 * (f[1:] + f[:-1])) * np.diff(z)
+    # of 40 m/s in all; the table is rounded to 1 m/s
+    np.testing.assert_allclose(np.cumsum(growth), np.diff(u).cumsum(), atol=6.0)
+
+
+def test_winds_are_those_of_the_place_and_month_unless_stated():
+    spec = parse_section(DayOfFlightAtmosphere, {}, "test")
+    north, south = (mean_air(spec, HERE, "2012-01-20T00:00:00Z", np.deg2rad(x), 0.0).wind for x in (45.0, -45.0))
+    assert np.interp(60.0, north[:, 0], north[:, 2]) > 30.0
+    assert np.interp(60.0, south[:, 0], south[:, 2]) < -30.0
+    stated = {"mean_wind": [[0.0, 1.0, 2.0], [100e3, 1.0, 2.0]], "wind_sd_mps": 0.0}
+    np.testing.assert_allclose(day(**stated).at(np.array([50e3])).wind_ned_mps[0], [1.0, 2.0, 0.0], atol=1e-12)
+    twice = {"mean_wind": [[5.0, 0.0, 0.0], [5.0, 0.0, 0.0]]}
+    for keys in ({**stated, "winds": False}, twice, {"from": "a.csv", "base": "us76"}):
+        with pytest.raises(ConfigError):
+            parse_section(DayOfFlightAtmosphere, keys, "test")
+
+
+def sounding(folder, z, air, columns="alt_m,rho_kgpm3,t_k,wind_n_mps,wind_e_mps"):
+    rows = np.column_stack([z, air.density_kgpm3, air.temperature_k, air.wind_ned_mps[:, :2]])
+    text = "\n".join(",".join(f"{x:.9g}" for x in row) for row in rows)
+    (folder / "sounding.csv").write_text(f"{columns}\n{text}\n")
+
+
+def flown_from(folder, **keys):
+    spec = parse_section(DayOfFlightAtmosphere, {"from": "sounding.csv", **keys}, "test")
+    return day_of_flight_atmosphere(spec, np.random.default_rng(0), mean_air(spec, folder, *WALLOPS_IN_AUGUST))
+
+
+def test_a_measured_sounding_is_flown_as_measured(tmp_path):
+    z = np.arange(0.0, 80001.0, 500.0)
+    air = day(seed=8).at(z)
+    sounding(tmp_path, z, air)
+    flown = flown_from(tmp_path).at(z)
+    np.testing.assert_allclose(flown.density_kgpm3, air.density_kgpm3, rtol=1e-7)
+    np.testing.assert_allclose(flown.temperature_k, air.temperature_k, atol=1e-3)
+    np.testing.assert_allclose(flown.wind_ned_mps, air.wind_ned_mps, atol=1e-4)
+    assert np.abs(flown_from(tmp_path, winds=False).at(z).wind_ned_mps).max() == 0.0
+    # above its top it fades into the standard; structure comes only where its size is stated
+    high = flown_from(tmp_path).at(np.array([140e3]))
+    assert high.density_kgpm3[0] == pytest.approx(us76(140e3)[0], rel=1e-3)
+    rough = np.log(flown_from(tmp_path, density_sd=0.02).at(z).density_kgpm3 / air.density_kgpm3)
+    assert 0.005 < rough.std() < 0.06
+
+
+def test_faults_of_a_sounding_are_named(tmp_path):
+    z = np.arange(0.0, 80001.0, 5000.0)
+    sounding(tmp_path, z, day().at(z), "alt_m,rho_kgpm3,t_k,wind_n_mps,wind_x_mps")
+    with refuses("table-column-missing", names=["wind"], kind=ConfigError):
+        flown_from(tmp_path)
+    (tmp_path / "sounding.csv").unlink()
+    with refuses("file-missing", kind=ConfigError):
+        flown_from(tmp_path)
+
+
+def test_nrlmsis_of_any_day_and_place_is_the_models():
+    pymsis = pytest.importorskip("pymsis", reason="pymsis comes with the msis extra")
+    spec = parse_section(DayOfFlightAtmosphere, {"base": "nrlmsis", "f107": 75.0, "ap": 5.0, **STILL}, "test")
+    at, z = ("2012-07-23T11:01:00Z", *np.deg2rad([-33.0, 151.0])), np.array([30e3, 60e3, 95e3])
+    flown = day_of_flight_atmosphere(spec, np.random.default_rng(0), mean_air(spec, HERE, *at)).at(z)
+    indices = [75.0], [75.0], [[5.0] * 7]
+    model = pymsis.calculate(np.datetime64("2012-07-23T11:01"), 151.0, -33.0, z / 1e3, *indices, version=2.1)
+    model = np.asarray(model).reshape(3, 11)
+    np.testing.assert_allclose(flown.density_kgpm3, model[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(flown.temperature_k, model[:, 10], atol=1e-2)
+
+
+def test_nrlmsis_without_its_library_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymsis", None)
+    spec = parse_section(DayOfFlightAtmosphere, {"base": "nrlmsis"}, "test")
+    with refuses("nrlmsis-missing", names=[r"postflight\[msis\]"], kind=ConfigError):
+        mean_air(spec, HERE, "2001-01-01T00:00:00Z", 0.1, 0.1)

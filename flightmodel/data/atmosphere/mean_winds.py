@@ -1,4 +1,4 @@
-"""Write ``mean_winds.csv``: zonal-mean east wind by month, latitude and altitude, in balance with NRLMSIS 2.1's pressure.
+"""Write ``mean_winds.csv``: zonal-mean east wind by month, latitude and altitude, in balance with NRLMSIS 2.1.
 
 On a surface of constant geopotential the zonal mean of the steady wind is in gradient balance,
 

@@ -1,0 +1,72 @@
+"""Limits of the score: four of the run's own standard deviations, whatever the vehicle and the size of its errors."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from flightmodel import earth
+from postflight.commands import console, print_score
+from postflight.score import score_run
+
+T = np.arange(0.0, 20.0, 0.1)
+
+
+def table(position_m=0.0, velocity_mps=0.0):
+    place = earth.ecef_from_geodetic(0.6, -1.3, 4e4)
+    columns = {"t_s": T}
+    for k, a in enumerate("xyz"):
+        columns |= {f"r{a}_ecef_m": place[k] + position_m + 0.0 * T, f"v{a}_ecef_mps": velocity_mps + 0.0 * T}
+    columns |= {f"q{a}_ecef_body": float(a == "w") + 0.0 * T for a in "wxyz"}
+    return columns | {f"{a}_body_degps": 0.0 * T for a in "pqr"}
+
+
+@pytest.fixture
+def flight(tmp_path):
+    """Write a flight of which nothing is there but what the score reads; errors and sds as asked for."""
+
+    def write(error=0.0, sd=1.0, position_m=0.0, position_sd_m=1.0, vehicle="irve2_reference"):
+        truth, run = tmp_path / "truth", tmp_path / "runs" / "20260101T000000Z-00000000"
+        for folder in (truth, run):
+            folder.mkdir(parents=True, exist_ok=True)
+        pressure = 1e3 * np.exp(-(((T - 10.0) / 4.0) ** 2))
+        true = table() | {"dynamic_pressure_pa": pressure, "alpha_body_deg": 3.0 + 0.0 * T}
+        pd.DataFrame(true).to_csv(truth / "truth.csv", index=False)
+        pd.DataFrame({"t_s": T, "theta_deg": 2.0 + 0.0 * T}).to_csv(truth / "deflection.csv", index=False)
+        stated = {f"r{a}_ecef_sd_m": position_sd_m + 0.0 * T for a in "xyz"}
+        stated |= {f"v{a}_ecef_sd_mps": 0.1 + 0.0 * T for a in "xyz"} | {"alpha_total_wind_sd_deg": 0.1 + 0.0 * T}
+        bet = table(position_m) | {"alpha_total_wind_deg": 3.0 + 0.0 * T} | stated
+        pd.DataFrame(bet).to_csv(run / "bet.csv", index=False)
+        answer = {"t_s": T, "theta_deg": 2.0 + error, "plane_lv_deg": 0.0 * T, "theta_sd_deg": sd + 0.0 * T}
+        pd.DataFrame(answer).to_csv(run / "deflection_trim.csv", index=False)
+        others = dict.fromkeys(("camera", "misalignment", "fused"), {"applicable": False, "reason": "no video"})
+        (run / "summary.json").write_text(json.dumps({"methods": others}))
+        (run / "bet_header.json").write_text(json.dumps({"vehicle": {"name": vehicle}}))
+        (run / "run.json").write_text(json.dumps({"settings": {}}))
+        return score_run(tmp_path, run)
+
+    return write
+
+
+@pytest.mark.parametrize("sd", [0.01, 1.0, 30.0])
+def test_an_error_is_judged_by_its_own_standard_deviation(flight, sd):
+    assert not flight(error=3.9 * sd, sd=sd).failures
+    assert [f.code for f in flight(error=-4.1 * sd, sd=sd).failures] == ["deflection-error"]
+    assert [f.code for f in flight(error=0.0, sd=np.nan).failures] == ["deflection-missing"]
+
+
+@pytest.mark.parametrize("sd", [0.3, 50.0])
+def test_so_is_the_trajectory(flight, sd):
+    """All three components off by as many of their sds."""
+    right, wrong = (flight(position_m=k * sd, position_sd_m=sd) for k in (3.9, 4.1))
+    assert not right.failures
+    assert right.bet["position_sd_m"] == pytest.approx(np.sqrt(3.0) * sd)
+    assert [f.code for f in wrong.failures] == ["trajectory-error"]
+
+
+def test_published_figures_stand_beside_their_own_vehicle_alone(flight):
+    for vehicle, there in (("irve2_reference", True), ("loftid", False)):
+        with console.capture() as shown:
+            print_score(flight(vehicle=vehicle))
+        assert ("paper" in shown.get()) == there
