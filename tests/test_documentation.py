@@ -81,7 +81,8 @@ FLIGHT_SECTIONS = [
 
 def missing_keys(page: str, model: type[BaseModel]) -> list[str]:
     quoted = (DOCS / page).read_text().replace(".", "`").replace("[", "`").replace("]", "`")
-    return [key for key in model.model_fields if f"`{key}`" not in quoted]
+    keys = [field.alias or name for name, field in model.model_fields.items()]
+    return [key for key in keys if f"`{key}`" not in quoted]
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda m: m.__name__)

@@ -40,7 +40,7 @@ def flight(tmp_path):
         pd.DataFrame(bet).to_csv(run / "bet.csv", index=False)
         answer = {"t_s": T, "theta_deg": 2.0 + error, "plane_lv_deg": 0.0 * T, "theta_sd_deg": sd + 0.0 * T}
         pd.DataFrame(answer).to_csv(run / "deflection_trim.csv", index=False)
-        others = dict.fromkeys(("camera", "misalignment", "fused"), {"applicable": False, "reason": "no video"})
+        others = {name: {"applicable": False, "reason": "-"} for name in ("camera", "misalignment", "fused")}
         (run / "summary.json").write_text(json.dumps({"methods": others}))
         (run / "bet_header.json").write_text(json.dumps({"vehicle": {"name": vehicle}}))
         (run / "run.json").write_text(json.dumps({"settings": {}}))
