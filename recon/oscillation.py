@@ -162,7 +162,7 @@ def oscillation(
     # a phase and its opposite leave the same rest: half a turn more or less is none
     per_lag = np.mod(either_side[1] - either_side[0] + 0.5 * np.pi, np.pi) - 0.5 * np.pi
     clocks_s = np.hypot(force.spec.time_bias_sd_s, rate.spec.time_bias_sd_s)
-    roll_sd = float(np.hypot(roll_sd, clocks_s * per_lag / (2.0 * _LAG_STEP_S)))
+    roll_sd = float(np.hypot(roll_sd, clocks_s * per_lag / (2.0 * LAG_STEP_S)))
     roll = _with_positive(at_none, use, phases[0] + roll, aft)
     kind = max(gains, key=lambda name: gains[name])
     if gains[kind] < LOG_LIKELIHOOD_LIMIT or (kind == ROLL and abs(roll) < max(_LEAST_ROLL_RAD, _ROLL_SD * roll_sd)):

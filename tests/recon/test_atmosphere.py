@@ -78,6 +78,18 @@ def test_sounding_without_errors_is_left_as_it_is():
     assert all(v.passed for v in found.consistency_checks)
 
 
+def test_a_mass_that_falls_in_flight_is_no_thin_air():
+    """A third of the mass goes: with the mass of each time the air is the sounding's, with one mass it is not."""
+    samples = descent()
+    felt = pushed(samples, np.zeros((len(samples.time_s), atmosphere._UNKNOWNS)))
+    heavy = np.where(samples.time_s > np.median(samples.time_s), 1.5, 1.0)
+    lighter = replace(felt, specific_force_body_mps2=heavy[:, None] * felt.specific_force_body_mps2)
+    stepped = replace(DRAG, area_per_mass_m2pkg=heavy * DRAG.area_per_mass_m2pkg)
+    ratio = [atmosphere.reconstruct_air(lighter, KNOWN, drag).drag["ratio"].to_numpy() for drag in (stepped, DRAG)]
+    np.testing.assert_allclose(ratio[0], 1.0, atol=0.02)
+    assert np.ptp(ratio[1]) > 0.4
+
+
 @pytest.fixture(scope="module")
 def many():
     """Sixteen days drawn from the prior: normalised errors of density, winds and C_A, and sds over prior."""
