@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _MOST = 0.5  # of the answered frames
+_MOST_AROUND = 2
 _NOT_THE_SHELL = ("camera-turned", "edge-not-shell", "features-contradict-edge")
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
@@ -332,14 +333,14 @@ def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:
     """Refuse answers among frames that contradict the shell: what spoils a film lasts longer than a frame.
 
     A frame of another scene passes all its tests now and then, and of a camera that moved the edge alone may answer; of
-    the two nearest frames on both sides half or more then fail a test, or their features contradict the edge.
+    the two nearest frames on both sides two or more then fail a test, or their features contradict the edge.
     """
     contradicts = np.array([fit.contradicted or getattr(fit.refused, "code", "") in _NOT_THE_SHELL for fit in fits])
-    words = "half or more of the four frames around contradict the shell: an answer here may be chance"
+    words = "two or more of the four frames around contradict the shell: an answer here may be chance"
     out = []
     for k, fit in enumerate(fits):
         around = np.delete(contradicts[max(k - 2, 0) : k + 3], min(k, 2))
-        doubtful = len(around) > 0 and not fit.refused and bool(around.mean() >= _MOST)
+        doubtful = not fit.refused and int(around.sum()) >= _MOST_AROUND
         out.append(refused_fit(fit.horizon, Fault(words, "frames-around-refused")) if doubtful else fit)
     return out
 

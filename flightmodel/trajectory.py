@@ -167,7 +167,7 @@ def interpolate_rows(at: FloatArray, t: FloatArray, values: FloatArray) -> Float
     after = np.minimum(k + 1, len(t) - 1)
     inside = np.clip(at, t[0], t[-1]) - t[k]
     slope = (values[after] - values[k]) / np.where(after > k, t[after] - t[k], 1.0)[:, None]
-    out = np.asarray(slope * inside[:, None] + values[k])
+    out = np.ascontiguousarray(slope * inside[:, None] + values[k])  # kernels are compiled for this layout alone
     out[at >= t[-1]] = values[-1]
     return out
 

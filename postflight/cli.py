@@ -10,6 +10,7 @@ import _thread
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -330,15 +331,21 @@ def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> 
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--rate", type=FiniteRange(1.0, 200.0), help="Output rate, Hz; default: flight.toml's, or 20.")
+@click.option("--timings", is_flag=True, help="Print how long each stage took.")
 @what_ifs
 def run(
-    folder: Path, rate: float | None, settings: tuple[str, ...], without: tuple[str, ...], run_name: str | None
-) -> None:
+    folder: Path, rate: float | None, settings: tuple[str, ...], without: tuple[str, ...], run_name: str | None,
+    timings: bool,
+) -> None:  # fmt: skip
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
+    begun = time.perf_counter()
     from postflight import commands
     from postflight.deflections import METHODS
 
-    commands.run(folder, METHODS, commands.asked(settings, without, rate, run_name))
+    stages = commands.Stages(begun)
+    commands.run(folder, METHODS, commands.asked(settings, without, rate, run_name), stages=stages)
+    if timings:
+        commands.print_stages(stages)
 
 
 @cli.command()

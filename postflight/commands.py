@@ -129,7 +129,33 @@ def print_events(flown: list[Event]) -> None:
     console.print(table)
 
 
-def run(folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False) -> None:
+class Stages:
+    """What a command spent its time on: names and seconds, from when it began."""
+
+    def __init__(self, begun: float | None = None) -> None:
+        """Count from a moment of `time.perf_counter`, or from now; what is past is loading the program."""
+        self._last = time.perf_counter()
+        self.seconds = {"loading the program": 0.0 if begun is None else self._last - begun}
+
+    def end(self, name: str) -> None:
+        """End a stage."""
+        now = time.perf_counter()
+        self.seconds[name], self._last = now - self._last, now
+
+
+def print_stages(stages: Stages) -> None:
+    """Print each stage with its seconds."""
+    table = Table(title="Time by stage")
+    table.add_column("stage")
+    table.add_column("s", justify="right")
+    for name, seconds in (*stages.seconds.items(), ("in all", sum(stages.seconds.values()))):
+        table.add_row(name, f"{seconds:.2f}")
+    console.print(table)
+
+
+def run(
+    folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False, stages: Stages | None = None
+) -> None:
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers.
 
     The answers are printed before tables, figures and report are written.
@@ -140,7 +166,7 @@ def run(folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = Fa
         if methods:
             print_answers(answers)
 
-    _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers)
+    _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers, stages or Stages())
     if reruns:
         print_sensitivity(run_folder.read_csv(written / "sensitivity.csv"))
     console.print(f"results in {escape(str(written))}, to read in report.html")
@@ -151,6 +177,7 @@ def run(folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = Fa
 def run_flight(
     folder: Path, methods: tuple[str, ...], asked_for: Asked, reruns: bool = False,
     show_answers: Callable[[Reconstruction, Deflections, pd.DataFrame], None] = lambda *_: None,
+    stages: Stages | None = None,
 ) -> tuple[Reconstruction, Deflections, Path]:  # fmt: skip
     """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too.
 
@@ -158,6 +185,7 @@ def run_flight(
     a second process, made ready meanwhile.
     """
     log: list[str] = []
+    stages = stages or Stages()
 
     def steps(report: Progress) -> Callable[[float, float], Progress]:
         def step(low: float, high: float) -> Progress:
@@ -172,10 +200,11 @@ def run_flight(
 
     with DrawingProcess() as drawing:
         with progress_bar() as report:
-            bet, answers = _answered(folder, methods, asked_for, steps(report))
+            bet, answers = _answered(folder, methods, asked_for, steps(report), stages)
         flight, table = bet.flight, bet_table(bet)
         event_rows = run_folder.event_table(bet, table)
         show_answers(bet, answers, event_rows)
+        stages.end("printing the answers")
         settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
         if flight.changes:
             settings["changes"] = list(flight.changes)
@@ -185,26 +214,34 @@ def run_flight(
             run_folder.write_reconstruction(out, bet, answers, table)
             run_folder.write_answers(out, answers)
             out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
+            stages.end("tables")
             bounds, reran = _write_rest(out, bet, answers, reruns, step)
+            stages.end("bounds of the rigid vehicle")
             step(0.9, 1.0)(0.0, "drawing, and writing the report")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
             (out.path / "log.jsonl").write_text(lines)
             out.write_facts()
             with drawing.at_work(bet, answers, out.path / "figures", bounds, reran):
                 write_report(folder, out.path, flight.telemetry)
+                stages.end("report")
+            stages.end("figures that were not drawn meanwhile")
     return bet, answers, out.path
 
 
 def _answered(
-    folder: Path, methods: tuple[str, ...], asked_for: Asked, step: Callable[[float, float], Progress]
+    folder: Path, methods: tuple[str, ...], asked_for: Asked, step: Callable[[float, float], Progress], stages: Stages
 ) -> tuple[Reconstruction, Deflections]:
     """Trajectory and deflections; a camera without video is among the methods that were refused."""
     flight = asked_for.of(read_flight(folder, step(0.0, 0.05)))
+    stages.end("reading telemetry")
     own = warmup.ESTIMATES if "camera" in methods else warmup.ESTIMATES[:1]
     compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
+    stages.end("compiling")
     bet = reconstruct(flight, None, step(0.05, 0.7))
+    stages.end("trajectory")
     wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
     answers = estimate(bet, wanted, step(0.7, 1.0))
+    stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
         answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
     return bet, answers

@@ -22,6 +22,7 @@ from postflight.deflections import Deflections
 from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds
 
+Process = multiprocessing.get_context("spawn").Process  # a fork would copy locks that other threads hold
 _Job = tuple[Reconstruction, Deflections, Path, Bounds | None, pd.DataFrame | None]
 _Warnings = list[tuple[type[Warning], str]]
 
@@ -31,9 +32,8 @@ class DrawingProcess:
 
     def __enter__(self) -> DrawingProcess:
         """Start it."""
-        context = multiprocessing.get_context("spawn")  # a fork would copy locks that other threads hold
-        self._here, there = context.Pipe()
-        self._process = context.Process(target=_serve, args=(there,), daemon=True)
+        self._here, there = multiprocessing.Pipe()
+        self._process = Process(target=_serve, args=(there,), daemon=True)
         with contextlib.suppress(OSError):
             self._process.start()
         there.close()
@@ -89,7 +89,7 @@ def _serve(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is for the process that started this one
     import postflight.plots.run_figures  # noqa: F401 - makes ready
 
-    with warnings.catch_warnings(record=True) as given, contextlib.suppress(EOFError):
+    with warnings.catch_warnings(record=True) as given, contextlib.suppress(EOFError, BrokenPipeError):
         warnings.simplefilter("always")
         job: _Job = connection.recv()
         try:

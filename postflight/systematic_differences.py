@@ -115,10 +115,10 @@ class FoundEffect:
     def words(self) -> str:
         """What differs and by how much, with the sd that the difference shows and the one that is stated."""
         parts = [
-            f"{name} {v:.{_digits(s)}f} ± {s:.{_digits(s)}f}".strip()
+            f"{name} {v:.{digits(s)}f} ± {s:.{digits(s)}f}".strip()
             for name, v, s in zip(self.components, self.value, self.sd, strict=True)
         ]
-        size = f" (together {np.linalg.norm(self.value):.{_digits(self.sd.max())}f})" if len(parts) > 1 else ""
+        size = f" (together {np.linalg.norm(self.value):.{digits(self.sd.max())}f})" if len(parts) > 1 else ""
         return f"{_WORDS[self.name]} {', '.join(parts)} {self.unit}{size}"
 
     @property
@@ -224,7 +224,8 @@ class SystematicDifferences(Tabular):
         return f"{self.label}: {', '.join(e.name for e in self.effects) or 'no systematic difference'}"
 
 
-def _digits(sd: float) -> int:
+def digits(sd: float) -> int:
+    """Decimals in which a value with this sd is printed: two digits of the sd."""
     return max(0, min(6, 1 - int(np.floor(np.log10(max(float(sd), 1e-6))))))
 
 

@@ -119,15 +119,18 @@ def _balance() -> None:
 
 
 def _camera() -> None:
-    """Orient a camera on one synthetic frame, and fit it."""
+    """Orient a camera on one synthetic frame, fit it, and lay the virtual camera over it."""
     from estimators.benchmark import orient_camera
+    from estimators.overlay import Overlay
     from synthetic_flight.film import render_video
 
     vehicle, _ = _vehicle_at_rest()
     mount, joint_m = next(iter(vehicle.cameras.values())), vehicle.joint.station_m
     sun = np.array([[0.5, 0.6, 0.6]])
     (frame,) = render_video(vehicle.geometry, mount, joint_m, np.zeros(1), np.zeros(1), sun, np.random.default_rng(0))
-    fit = orient_camera(frame, vehicle.geometry, mount, joint_m).fit(frame)
+    oriented = orient_camera(frame, vehicle.geometry, mount, joint_m)
+    fit = oriented.fit(frame)
+    Overlay(oriented.view).blended(frame, 0.0, 0.0)
     if fit.refused:  # then a part of the kernels was not called
         raise GateError(fit.refused, code="kernels-not-called")
 

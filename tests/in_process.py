@@ -1,4 +1,7 @@
-"""The command's own ``main`` in this process: the same codes and words without two seconds of imports."""
+"""The command's own ``main`` in this process: the same codes and words without two seconds of imports.
+
+Figures are drawn here too, as where their process cannot be started: `tests.postflight.test_drawing` has that process.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,24 @@ from types import SimpleNamespace
 import pytest
 
 
+def draw_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let figures be drawn by this process."""
+    from multiprocessing.context import SpawnProcess
+
+    from postflight import drawing
+
+    class NoProcess(SpawnProcess):
+        def start(self) -> None:
+            raise OSError("not started by tests")
+
+    monkeypatch.setattr(drawing, "Process", NoProcess)
+
+
 def runner(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
     """``run(*arguments, cwd=None)`` gives ``returncode``, ``stdout`` and ``stderr``, as a process would."""
     from postflight.cli import main
+
+    draw_here(monkeypatch)
 
     def run(*arguments: str | Path, cwd: Path | None = None) -> SimpleNamespace:
         monkeypatch.setattr(sys, "argv", ["postflight", *map(str, arguments)])

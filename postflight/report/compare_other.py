@@ -21,7 +21,7 @@ from postflight.report.source import kept_rows, rounded
 from postflight.report.text import date
 from postflight.report.write import pulse_window, rendered
 from postflight.runs import RunTables, trajectory_of
-from postflight.systematic_differences import SystematicDifferences, systematic_differences
+from postflight.systematic_differences import SystematicDifferences, digits, systematic_differences
 from postflight.terminal import terminal
 
 OTHER_TABLES = ("systematic_differences", "chi_square", "differences_over_time")
@@ -90,7 +90,7 @@ def _effect_cells(found: SystematicDifferences) -> tuple[list[str], list[list[st
         [
             str(r.effect),
             str(r.component),
-            f"{r.value:.6g}",
+            f"{r.value:.{digits(r.sd)}f}",
             f"{r.sd:.2g}",
             _number(r.stated_sd),
             str(r.unit),

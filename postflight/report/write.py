@@ -33,7 +33,7 @@ from postflight.report.source import Run, read_run, rounded
 _NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
 STYLES = ("uPlot.min.css", "page.css")
-SHARED = ("head.html", "parts.html")  # what the pages share: how they begin, and macros
+SHARED = ("head.html", "parts.html", "foot.html")  # what the pages share: how they begin and end, and macros
 # what a script element must not hold literally: its own end, a comment's start, and line ends of JavaScript alone
 _ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 

@@ -54,7 +54,10 @@ SWITCHED = [(4.0, 17.0), (17.1, 28.0)]
 AT_ONCE = [(4.0, 28.0), (4.0, 28.0)]
 
 
-@pytest.mark.parametrize("spans_s", [SWITCHED, AT_ONCE, [(4.0, 14.0), (12.0, 20.0), (20.1, 28.0)]])
+@pytest.mark.parametrize(
+    "spans_s",
+    [SWITCHED, AT_ONCE, pytest.param([(4.0, 14.0), (12.0, 20.0), (20.1, 28.0)], marks=pytest.mark.long)],
+)
 def test_one_history_as_right_as_it_says(spans_s):
     z = []
     for seed in range(10):

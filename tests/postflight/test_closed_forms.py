@@ -307,7 +307,10 @@ def test_an_entry_starts_with_its_cg_where_the_datum_s_flight_has_it():
         np.tile(1e-12 * np.eye(9), (n, 1, 1)),
     )  # fmt: skip
     _, _, height = earth.geodetic_from_ecef(r)
-    air = SimpleNamespace(altitude_m=height, flight_path_angle_rad=np.full(n, -1.4), time_s=t)
+    pressure = np.exp(-(((t - 40.0) / 10.0) ** 2))
+    air = SimpleNamespace(
+        altitude_m=height, flight_path_angle_rad=np.full(n, -1.4), time_s=t, dynamic_pressure_pa=pressure
+    )
     telemetry = SimpleNamespace(sounding=standard_sounding(), required_vehicle=lambda: vehicle)
     flight = SimpleNamespace(air=air, telemetry=telemetry, solution=SimpleNamespace(smoothed=path))
     entry = preflight._Entry(flight, vehicle, None)
@@ -337,7 +340,14 @@ def test_errors_of_a_trajectory_over_its_pulse_are_those_that_were_planted():
     bet["rz_ecef_m"] -= 4.0
     bet["vz_ecef_mps"] += 0.2
     bet["alpha_total_wind_deg"] = 5.3
+    sds = {"m": 2.0, "mps": 0.1}
+    for unit, names in (("m", [f"r{a}_ecef" for a in "xyz"]), ("mps", [f"v{a}_ecef" for a in "xyz"])):
+        bet[[f"{name}_sd_{unit}" for name in names]] = sds[unit]
+    bet["alpha_total_wind_sd_deg"] = 0.2
     found = _bet_errors(bet, truth)
+    assert found["position_sd_m"] == pytest.approx(2.0 * 3.0**0.5)
+    assert found["velocity_sd_mps"] == pytest.approx(0.1 * 3.0**0.5)
+    assert found["alpha_total_sd_deg"] == pytest.approx(0.2)
     assert found["position_rms_m"] == pytest.approx(5.0)
     assert found["velocity_rms_mps"] == pytest.approx(0.2)
     assert found["alpha_total_rms_deg"] == pytest.approx(0.3)

@@ -162,7 +162,7 @@ def test_an_open_scheduler_is_named(path, tmp_path, monkeypatch, command):
         assert printed_codes(done.stderr) == ["scheduler-unreachable"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cluster_with_tls_makes_the_same_bytes(reference, path, tmp_path, monkeypatch):
     """With certificates from the environment's settings, as the page has it; one without is not let in."""
     dask = pytest.importorskip("dask")

@@ -143,7 +143,7 @@ def test_shear_that_was_not_sounded_is_named(good: Telemetry, sign: float) -> No
     assert numbers_in(worst)[0] < 40.0
 
 
-@pytest.mark.parametrize("axis", ["y", "z"])
+@pytest.mark.parametrize("axis", ["y", pytest.param("z", marks=pytest.mark.long)])
 def test_accelerometer_mounted_two_degrees_wrong_is_named(good: Telemetry, axis: str) -> None:
     record = good.accelerometer
     c = record.spec.dcm_body_sensor
@@ -152,7 +152,7 @@ def test_accelerometer_mounted_two_degrees_wrong_is_named(good: Telemetry, axis:
     assert found["data-sheet", "accelerometer"].startswith("mount")
 
 
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", [pytest.param(0, marks=pytest.mark.long), 1])
 def test_gyro_scale_wrong_by_three_percent_is_named(good: Telemetry, axis: int) -> None:
     record = good.rates
     scale = np.ones(3)

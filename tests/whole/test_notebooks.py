@@ -34,8 +34,16 @@ def test_essay_ends_in_what_it_proved(script):
         assert "assert " in last
 
 
+# reconciliation and fusion of a whole flight, which other tests of every change do too
+LONG = ("the_joint_that_explains_the_flight", "three_methods_one_answer")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "script",
+    [pytest.param(p, marks=pytest.mark.long) if p.stem in LONG else p for p in NOTEBOOKS],
+    ids=lambda p: p.stem,
+)
 def test_notebook_runs(script, tmp_path, monkeypatch, request):
     import jupytext
     from nbclient import NotebookClient

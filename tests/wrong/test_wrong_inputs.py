@@ -68,7 +68,7 @@ def test_the_page_has_sixty_cases_and_leaves_only_what_all_radars_share_unseen(p
     assert all(SHARED.match(name) for name, stands in verdicts.items() if stands == UNSEEN)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_few_cases_are_named_rightly(flight):
     for case, found in run(flight, FEW):
         assert verdict(case, found) == NAMED, (case.name, found.named)

@@ -15,6 +15,7 @@ from postflight.deflections import METHODS
 from postflight.plots import run_figures
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
+from tests.in_process import draw_here
 from tests.postflight.short_flights import write_pulse
 
 ROOT = Path(__file__).parents[3]
@@ -39,6 +40,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "flight.toml").write_text(flight + f"\n[[events]]\nname = '{HOSTILE_EVENT}'\nt_s = 430.0\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_figures, "draw", lambda *_: None)  # nobody looks at them here
+        draw_here(patch)
         commands.run_flight(folder, METHODS, commands.Asked())
     return folder
 
