@@ -113,7 +113,7 @@ def wait_for_chunks(process, folder, count):
         time.sleep(0.002)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_killed_twice_goes_on_to_the_same_bytes(path, tmp_path):
     """Killed without warning, once alone and once with two processes, whose workers follow their parent."""
     flights, folder = 96, tmp_path / "killed"

@@ -117,7 +117,7 @@ def red(flight: Reconstruction) -> dict[tuple[str, str], str]:
     return {(v.code, v.source): v.component for v in flight.consistency_checks if not v.passed}
 
 
-@pytest.fixture(scope="module", params=[0, 7])
+@pytest.fixture(scope="module", params=[0, pytest.param(7, marks=pytest.mark.long)])
 def good(days, request) -> Telemetry:
     flight, _, wrong = days[request.param]
     return with_coefficients(flight.telemetry, *np.exp(-wrong))

@@ -384,6 +384,7 @@ def _drop_frames(folder: Path) -> None:
     toml.write_text(text[:start] + text[text.index("[", start + 1) :])
 
 
+@pytest.mark.long
 def test_no_answer_where_the_accelerometer_was_silent(command, flown: Path, truth, tmp_path: Path, peak_s) -> None:
     """Seven seconds of missing samples around the peak: no deflection may be named there, the rest stays honest."""
     folder = copy_of(flown, tmp_path / "flight", "runs", "camera5", "frames.csv", "truth")
