@@ -17,7 +17,7 @@ test: lint
 	$(BIN)/postflight warmup
 	$(PYTEST) -m "not long"
 
-# statistics over many flights, beyond what a check of every change can wait for (some twenty minutes)
+# statistics over many flights and second days of whole ones, beyond what a check of every change can wait for
 long: $(VENV)/installed-dev
 	$(PYTEST) -m long
 

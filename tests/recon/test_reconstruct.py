@@ -91,7 +91,7 @@ def test_smoother_is_better_than_the_filter(ensemble, mini_truth):
     assert rms["smoothed"][3] < rms["filtered"][3]  # roll
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("attitude_sensors", "runs"), [(False, 12), pytest.param(True, 6, marks=pytest.mark.long)])
 def test_flights_with_every_error_alive_err_as_they_claim(mini_everything, mini_truth, attitude_sensors, runs):
     """Pedestals, wandering trackers, receiver, barometer, magnetometer and Sun heads, each drawn from its sheet."""

@@ -169,7 +169,7 @@ def test_derivative_at_one_state(generic_vehicle, measured, seed):
     measured("angular acceleration of the shell, relative", np.abs(turn_shell - want[17:20]).max() / scale, 1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_entry_on_mujoco_s_own_ball_joint(generic_vehicle, measured):
     # MuJoCo's spring pulls along the whole rotation vector with one stiffness; ours bends and twists apart. With equal
     # stiffness the two potentials differ by K s^2 t^2 / 12 (s swing, t twist), i.e. by s^2 / 6 of the twisting moment:

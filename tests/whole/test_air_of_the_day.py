@@ -21,7 +21,7 @@ from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 from tests.refusing import numbers_in
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 DAYS = 12
 HEIGHTS_KM = (80, 75, 70, 65, 60, 55, 50, 45, 42, 40, 38, 35, 32, 30, 28)
 CA_SD, CN_SD = 0.03, 0.07

@@ -34,8 +34,8 @@ def test_essay_ends_in_what_it_proved(script):
         assert "assert " in last
 
 
-# reconciliation and fusion of a whole flight, which other tests of every change do too
-LONG = ("the_joint_that_explains_the_flight", "three_methods_one_answer")
+# whole flights, which other tests of every change reconstruct, fuse and reconcile too
+LONG = ("one_flight", "real_rockets", "the_joint_that_explains_the_flight", "three_methods_one_answer")
 
 
 @pytest.mark.slow

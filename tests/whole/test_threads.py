@@ -35,7 +35,7 @@ def test_a_command_has_one_thread_for_linear_algebra():
     assert (done.returncode, done.stdout.strip()) == (0, "1"), done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_runs_with_one_two_and_four_threads_are_the_same_bytes(short, tmp_path):
     written = []
     for threads in (1, 2, 4):

@@ -352,6 +352,7 @@ def without_truth(command, flown: Path, tmp_path_factory: pytest.TempPathFactory
     return newest(folder)
 
 
+@pytest.mark.long
 def test_without_truth_every_result_has_the_same_bytes(run_folder: Path, without_truth: Path) -> None:
     seen, blind = tree(run_folder), tree(without_truth)
     assert sorted(seen) == sorted(blind)
@@ -408,6 +409,7 @@ def test_no_answer_where_the_accelerometer_was_silent(command, flown: Path, trut
     assert ratio.max() < 4.0
 
 
+@pytest.mark.long
 def test_swapped_accelerometer_axes_turn_something_red(command, flown: Path, tmp_path: Path) -> None:
     """Two columns in each other's place, as a wiring list can have it: a verdict and the score go red, or no answer."""
     folder = copy_of(flown, tmp_path / "flight", "runs", "camera5", "frames.csv")
