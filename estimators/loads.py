@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from flightmodel.aerodynamics import AeroTable
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import BoolArray, FloatArray, check_shape
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
@@ -126,9 +125,3 @@ def lateral_and_size(vectors_yz: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unit vectors ``(n, 2)`` (zero for zero) and lengths ``(n,)``."""
     size = np.linalg.norm(vectors_yz, axis=-1)
     return vectors_yz / np.where(size > 0.0, size, 1.0)[..., None], size
-
-
-def flow_coefficients(aero: AeroTable, mach: FloatArray, flow_yz_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vector ``(n, 2)`` of a lateral flow angle ``(n, 2)``, rad, and the coefficients ``(n, 4)`` at its size."""
-    direction, alpha = lateral_and_size(flow_yz_rad)
-    return direction, aero.at(mach, np.minimum(alpha, np.pi))

@@ -45,7 +45,6 @@ from estimators.evidence import (
     moved_vehicle,
 )
 from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, lateral_and_size
-from flightmodel import rotations
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
@@ -140,7 +139,7 @@ def moment_term(model: TrimModel, loads: FlightLoads) -> FloatArray:
     alpha = np.minimum(np.linalg.norm(loads.flow_yz_rad, axis=1), np.pi)
     coefficients = model.aero.at(loads.mach, alpha)
     w, turn = loads.rate_body_radps, loads.angular_acceleration_body_radps2
-    moment = turn @ model.inertia_kgm2.T + rotations.cross(w, w @ model.inertia_kgm2.T)
+    moment = turn @ model.inertia_kgm2.T + np.cross(w, w @ model.inertia_kgm2.T)
     q_area = loads.dynamic_pressure_pa * model.area_m2
     damping = (q_area * model.length_m**2 * coefficients[:, 3] / (2.0 * loads.airspeed_mps))[:, None] * w
     transverse = (moment - damping)[:, 1:]

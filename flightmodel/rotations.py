@@ -104,16 +104,6 @@ def slerp(time_s: FloatArray, q: FloatArray, at_s: FloatArray) -> FloatArray:
     return continuous(boxplus(q[k], fraction[:, None] * boxminus(q[k + 1], q[k])))
 
 
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products ``(..., 3)``, the same numbers as numpy's in a quarter of its time for some hundred vectors."""
-    a, b = np.broadcast_arrays(a, b)
-    out = np.empty(a.shape)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        out[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
-    return out
-
-
 def skew(v: FloatArray) -> FloatArray:
     """Matrices ``(..., 3, 3)`` with ``skew(a) @ b = a x b``."""
     x, y, z = np.moveaxis(np.asarray(v, dtype=float), -1, 0)
@@ -123,19 +113,9 @@ def skew(v: FloatArray) -> FloatArray:
     )
 
 
-def left_jacobian(rotation_rad: FloatArray) -> FloatArray:
-    """Matrices ``(..., 3, 3)`` with ``exp(w + dw) = exp(J dw) exp(w)`` to first order, of rotation vectors (..., 3)."""
-    angle = np.linalg.norm(rotation_rad, axis=-1)[..., None, None]
-    cross = skew(rotation_rad)
-    # (angle - sin angle) / angle^3, by its series where the difference would be rounding
-    small = angle < 1e-2
-    safe = np.where(small, 1.0, angle)
-    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
-    return np.asarray(np.eye(3) + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * cross + third * cross @ cross)
-
-
 def lever_arm_acceleration(
     rate_radps: FloatArray, angular_acceleration_radps2: FloatArray, arm_m: FloatArray
 ) -> FloatArray:
     """Specific force ``(n, 3)`` at the end of an arm less that at its beginning, m/s^2: ``w' x r + w x (w x r)``."""
-    return cross(angular_acceleration_radps2, arm_m) + cross(rate_radps, cross(rate_radps, arm_m))
+    swing = np.cross(rate_radps, np.cross(rate_radps, arm_m))
+    return np.asarray(np.cross(angular_acceleration_radps2, arm_m) + swing)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from estimators.balance import Swing
-from estimators.loads import FlightLoads, flow_coefficients, lateral_and_size
+from estimators.loads import FlightLoads, lateral_and_size
 from flightmodel import rotations
+from flightmodel.aerodynamics import AeroTable
 from flightmodel.airdata import lateral_angles
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import rotation_vector_of_lateral
@@ -14,6 +15,23 @@ from flightmodel.vehicle import Vehicle
 
 _STEP_S = 1e-4
 _X = np.array([1.0, 0.0, 0.0])
+
+
+def left_jacobian(rotation_rad: FloatArray) -> FloatArray:
+    """Matrices ``(..., 3, 3)`` with ``exp(w + dw) = exp(J dw) exp(w)`` to first order, of rotation vectors (..., 3)."""
+    angle = np.linalg.norm(rotation_rad, axis=-1)[..., None, None]
+    cross = rotations.skew(rotation_rad)
+    # (angle - sin angle) / angle^3, by its series where the difference would be rounding
+    small = angle < 1e-2
+    safe = np.where(small, 1.0, angle)
+    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * cross + third * cross @ cross)
+
+
+def flow_coefficients(aero: AeroTable, mach: FloatArray, flow_yz_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vector ``(n, 2)`` of a lateral flow angle ``(n, 2)``, rad, and the coefficients ``(n, 4)`` at its size."""
+    direction, alpha = lateral_and_size(flow_yz_rad)
+    return direction, aero.at(mach, np.minimum(alpha, np.pi))
 
 
 def _around(swing: Swing) -> tuple[Swing, Swing]:
@@ -33,7 +51,7 @@ def axes(swing: Swing) -> FloatArray:
 
 def relative_rate(swing: Swing) -> FloatArray:
     """Rate of the shell against the body, body axes (n, 3): the rotation vector's left Jacobian times its rate."""
-    turning = rotations.left_jacobian(rotation_vector_of_lateral(swing.theta_yz_rad))
+    turning = left_jacobian(rotation_vector_of_lateral(swing.theta_yz_rad))
     return _turned(turning, rotation_vector_of_lateral(swing.rate_yz_radps))
 
 
