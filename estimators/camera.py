@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _MOST = 0.5  # of the answered frames
-_MOST_AROUND = 2
+_DOUBTFUL = 2  # of the four frames around: one alone is a spoilt frame, not a spoilt film
 _NOT_THE_SHELL = ("camera-turned", "edge-not-shell", "features-contradict-edge")
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
@@ -340,7 +340,7 @@ def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:
     out = []
     for k, fit in enumerate(fits):
         around = np.delete(contradicts[max(k - 2, 0) : k + 3], min(k, 2))
-        doubtful = not fit.refused and int(around.sum()) >= _MOST_AROUND
+        doubtful = not fit.refused and int(around.sum()) >= _DOUBTFUL
         out.append(refused_fit(fit.horizon, Fault(words, "frames-around-refused")) if doubtful else fit)
     return out
 

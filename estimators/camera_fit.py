@@ -419,8 +419,8 @@ class OrientedCamera:
                 basis = plane_axis[:, None]
                 deformation[:] = *(basis[:, 0] * (basis[:, 0] @ deformation[:2])), 0.0
                 last = self._solve(horizon, None, deformation, basis, np.inf)
-        except _NoFitError as fault_of_fit:
-            return refused_fit(horizon, fault_of_fit.faults[0])
+        except _NoFitError as refusal:
+            return refused_fit(horizon, refusal.faults[0])
         return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
 
     def _check_explained(self, last: _Solution, flattening_rad: float) -> None:

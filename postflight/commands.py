@@ -27,7 +27,7 @@ from postflight.drawing import DrawingProcess
 from postflight.filming import NO_VIDEO, by_camera
 from postflight.flight import Flight, read_flight
 from postflight.progress import progress_bar
-from postflight.reconstruction import Reconstruction, bet_table, reconstruct
+from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
 from postflight.score import PUBLISHED_DEG, Score, score_run
@@ -166,7 +166,7 @@ def run(
         if methods:
             print_answers(answers)
 
-    _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers, stages or Stages())
+    _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers, stages)
     if reruns:
         print_sensitivity(run_folder.read_csv(written / "sensitivity.csv"))
     console.print(f"results in {escape(str(written))}, to read in report.html")
@@ -198,11 +198,13 @@ def run_flight(
 
         return step
 
+    with progress_bar() as report:
+        flight = asked_for.of(read_flight(folder, steps(report)(0.0, 0.05)))
+    stages.end("reading telemetry")
     with DrawingProcess() as drawing:
         with progress_bar() as report:
-            bet, answers = _answered(folder, methods, asked_for, steps(report), stages)
-        flight, table = bet.flight, bet_table(bet)
-        event_rows = run_folder.event_table(bet, table)
+            bet, answers = _answered(flight, methods, steps(report), stages)
+        event_rows = run_folder.event_table(bet, bet.table)
         show_answers(bet, answers, event_rows)
         stages.end("printing the answers")
         settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
@@ -211,7 +213,7 @@ def run_flight(
         new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
         with new as out, progress_bar() as report:
             step = steps(report)
-            run_folder.write_reconstruction(out, bet, answers, table)
+            run_folder.write_reconstruction(out, bet, answers)
             run_folder.write_answers(out, answers)
             out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
             stages.end("tables")
@@ -229,11 +231,9 @@ def run_flight(
 
 
 def _answered(
-    folder: Path, methods: tuple[str, ...], asked_for: Asked, step: Callable[[float, float], Progress], stages: Stages
+    flight: Flight, methods: tuple[str, ...], step: Callable[[float, float], Progress], stages: Stages
 ) -> tuple[Reconstruction, Deflections]:
     """Trajectory and deflections; a camera without video is among the methods that were refused."""
-    flight = asked_for.of(read_flight(folder, step(0.0, 0.05)))
-    stages.end("reading telemetry")
     own = warmup.ESTIMATES if "camera" in methods else warmup.ESTIMATES[:1]
     compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
     stages.end("compiling")

@@ -349,7 +349,7 @@ def _oem(source: Source) -> bytes:
         "META_STOP",
         "",
     ]
-    lines += [f"{source.utc(at)} {' '.join(f'{v:.9f}' for v in row)}" for at, row in zip(t, state, strict=True)]
+    lines += _timed_rows(source, t, state, 9)
     lines += ["", "COVARIANCE_START"]
     for at, covariance in zip(source.covariance_time_s, source.covariance[:, :6, :6] / 1e6, strict=True):
         lines += [f"EPOCH = {source.utc(at)}", f"COV_REF_FRAME = {_CCSDS_FRAME}"]
@@ -417,8 +417,8 @@ def _msopck(source: Source) -> bytes:
     return ("\n".join(_timed_rows(source, t, rows)) + "\n").encode()
 
 
-def _timed_rows(source: Source, t: FloatArray, rows: FloatArray) -> list[str]:
-    return [f"{source.utc(at)} {' '.join(f'{v:.12f}' for v in row)}" for at, row in zip(t, rows, strict=True)]
+def _timed_rows(source: Source, t: FloatArray, rows: FloatArray, decimals: int = 12) -> list[str]:
+    return [f"{source.utc(at)} {' '.join(f'{v:.{decimals}f}' for v in row)}" for at, row in zip(t, rows, strict=True)]
 
 
 def _msopck_setup(source: Source, data: Path) -> bytes:

@@ -9,6 +9,7 @@ force, of dynamic pressure and of the mass. Columns, units and frames: docs/bet-
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -170,6 +171,11 @@ class Reconstruction(Tabular):
 
     def to_frame(self) -> pd.DataFrame:
         """Trajectory and air data with their standard deviations: the columns of ``bet.csv`` (docs/bet-product.md)."""
+        return self.table.copy()
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """Table of `to_frame`, made once; not to be changed."""
         return bet_table(self)
 
     def _about(self) -> str:

@@ -37,7 +37,7 @@ from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import Deflections, quantiles_at
 from postflight.filming import NO_VIDEO
-from postflight.reconstruction import Reconstruction, bet_table
+from postflight.reconstruction import Reconstruction
 from recon.measurements import component_unit
 
 DIGITS = "%.10g"
@@ -240,16 +240,12 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
     return out
 
 
-def write_reconstruction(
-    run: RunFolder, flight: Reconstruction, answers: Deflections | None = None, table: pd.DataFrame | None = None
-) -> pd.DataFrame:
+def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflections | None = None) -> pd.DataFrame:
     """Write trajectory, covariance, residuals, checks, sensor errors, events, air, findings; return the events.
 
-    The checks of the deflection are among them where its ``answers`` are given; ``table`` is the flight's `bet_table`,
-    where it is at hand.
+    The checks of the deflection are among them where its ``answers`` are given.
     """
-    bet = flight.solution
-    table = bet_table(flight) if table is None else table
+    bet, table = flight.solution, flight.table
     run.write_csv("bet.csv", table)
     run.write_json("bet_header.json", header(flight))
     slow = slow_covariance(flight)

@@ -544,11 +544,8 @@ def _stated(fit: _Fit, time_s: FloatArray, covariance: FloatArray, other: OtherT
 
 def _interpolated(time_s: FloatArray, covariance: FloatArray, at_s: FloatArray) -> FloatArray:
     """Covariances at other times, linear between stated ones, kept beyond them."""
-    if len(time_s) == 1:
-        return np.repeat(covariance, len(at_s), axis=0)
-    k = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
-    w = np.clip((at_s - time_s[k]) / (time_s[k + 1] - time_s[k]), 0.0, 1.0)[:, None, None]
-    return np.asarray((1.0 - w) * covariance[k] + w * covariance[k + 1])
+    rows = interpolate_rows(at_s, time_s, covariance.reshape(len(covariance), -1))
+    return rows.reshape(-1, *covariance.shape[1:])
 
 
 def _local(fit: _Fit, covariance: FloatArray) -> FloatArray:

@@ -142,14 +142,10 @@ class DayOfFlightAtmosphere(Section):
     @property
     def structure_sd(self) -> tuple[float, float]:
         """Size of the random structure: density (fraction), wind m/s. A sounding has none unless one is stated."""
-        measured = self.from_ is not None
-        sizes = (self.density_sd, self.wind_sd_mps)
-        names = ("density_sd", "wind_sd_mps")
-        density, wind = (
-            0.0 if measured and name not in self.model_fields_set else size
-            for name, size in zip(names, sizes, strict=True)
-        )
-        return density, wind
+        if self.from_ is None:
+            return self.density_sd, self.wind_sd_mps
+        stated = self.model_dump(include=self.model_fields_set)
+        return stated.get("density_sd", 0.0), stated.get("wind_sd_mps", 0.0)
 
 
 # altitude km, north and east wind m/s: a smooth mid-latitude August day, assumed; flown 30 to 45 N in July and August

@@ -26,6 +26,7 @@ from postflight.report.text import cell, date
 from postflight.report.write import pulse_window, rendered
 from postflight.run_folder import DIGITS, answer_table, plain_text
 from postflight.runs import RunTables, find_run, is_complete, read_tables
+from postflight.systematic_differences import digits
 from postflight.terminal import terminal
 
 PAGE_NAME = "compare.html"
@@ -206,13 +207,7 @@ def _number(value: float, sd: float) -> str:
         return ""
     if not (np.isfinite(sd) and sd > 0.0):
         return f"{value:.2f}"
-    digits = _digits(sd)
-    return f"{value:.{digits}f} ± {sd:.{digits}f}"
-
-
-def _digits(sd: float) -> int:
-    """Decimals that show two digits of a standard deviation."""
-    return max(0, min(6, 1 - int(np.floor(np.log10(sd)))))
+    return f"{value:.{digits(sd)}f} ± {sd:.{digits(sd)}f}"
 
 
 def _apart(compared: RunComparison, number: int, quantity: Quantity) -> list[str]:
@@ -222,10 +217,10 @@ def _apart(compared: RunComparison, number: int, quantity: Quantity) -> list[str
         return ["", ""]
     if not (np.isfinite(high) and high > 0.0):
         return [f"{change:+.2f}", ""]
-    digits = _digits(high)
+    shown = digits(high)
     return [
-        f"{change:+.{digits}f}",
-        f"{sd:.{digits}f}" if np.isfinite(sd) else f"{low:.{digits}f} to {high:.{digits}f}",
+        f"{change:+.{shown}f}",
+        f"{sd:.{shown}f}" if np.isfinite(sd) else f"{low:.{shown}f} to {high:.{shown}f}",
     ]
 
 

@@ -60,7 +60,7 @@ class Silent:
 
 
 @pytest.fixture
-def told(monkeypatch):
+def answering(monkeypatch):
     def with_answer(says):
         process = drawing.DrawingProcess()
         process._here, process._process = Silent(says), type("Ended", (), {"pid": None})
@@ -69,14 +69,14 @@ def told(monkeypatch):
     return with_answer
 
 
-def test_warnings_of_the_process_are_given_here(told):
+def test_warnings_of_the_process_are_given_here(answering):
     with (
         pytest.warns(RuntimeWarning, match="fusion.png was not drawn"),
-        told([(RuntimeWarning, "fusion.png was not drawn")]).at_work(),
+        answering([(RuntimeWarning, "fusion.png was not drawn")]).at_work(),
     ):
         pass
 
 
-def test_a_file_that_cannot_be_written_is_raised_here(told):
-    with pytest.raises(OSError, match="No space left"), told(OSError(28, "No space left on device")).at_work():
+def test_a_file_that_cannot_be_written_is_raised_here(answering):
+    with pytest.raises(OSError, match="No space left"), answering(OSError(28, "No space left on device")).at_work():
         pass

@@ -23,13 +23,15 @@ from pathlib import Path
 
 import numpy as np
 
+from flightmodel.earth import FLATTENING, OMEGA_RADPS, SEMI_MAJOR_M
+
 F107, AP, YEAR = 120.0, 9.0, 2009
 LATITUDE_DEG = np.arange(-80.0, 81.0, 10.0)
 ALTITUDE_KM = np.arange(0.0, 111.0, 5.0)
 LONGITUDE_DEG = np.arange(0.0, 360.0, 15.0)
 STEP_DEG, BALANCED_DEG = 5.0, 15.0
 BOLTZMANN = 1.380649e-23
-SEMI_MAJOR_M, FLATTENING, OMEGA, M_RATIO = 6378137.0, 1.0 / 298.257223563, 7.292115e-5, 0.00344978650684
+M_RATIO = 0.00344978650684
 GRAVITY_EQUATOR, SOMIGLIANA, ECCENTRICITY2 = 9.7803253359, 0.00193185265241, 0.00669437999014
 
 
@@ -57,14 +59,13 @@ def balanced(month: int, latitude_deg: float) -> np.ndarray:
     z, lat = 1000.0 * ALTITUDE_KM, np.deg2rad(latitude_deg)
     south, north = np.deg2rad([latitude_deg - STEP_DEG, latitude_deg + STEP_DEG])
     (p_south, _), (p_north, _) = (zonal_mean(month, latitude_deg + side * STEP_DEG) for side in (-1.0, 1.0))
-    _, density = zonal_mean(month, latitude_deg)
-    pressure, _ = zonal_mean(month, latitude_deg)
+    pressure, density = zonal_mean(month, latitude_deg)
     radius = SEMI_MAJOR_M + z
     along = radius * (north - south)
     # of the logarithm: over 10 deg of latitude pressure at 80 km changes by a third
     push = pressure / density * np.log(p_north / p_south) / along
     push = push + (geopotential(north, z) - geopotential(south, z)) / along
-    f, curve = 2.0 * OMEGA * np.sin(lat), np.tan(lat) / radius
+    f, curve = 2.0 * OMEGA_RADPS * np.sin(lat), np.tan(lat) / radius
     root = np.sqrt(np.maximum(f * f - 4.0 * curve * push, 0.0))
     return np.asarray(-2.0 * push / (f + np.sign(f) * root))
 
