@@ -52,6 +52,7 @@ from flightmodel.sphere_cone import (
     stagnation_cp,
     wall_speed_ratio,
 )
+from flightmodel.tables import plain_number
 
 MOST_FAULTS = 10
 AXIAL_TOLERANCE = 1e-6
@@ -183,14 +184,6 @@ def _row_faults(row: list[float], names: tuple[str, ...]) -> list[Fault]:
     return faults
 
 
-def _number(text: str) -> float:
-    try:
-        # Python's own float takes 1_0 and digits of any script
-        return float(text) if text.isascii() and "_" not in text else float("nan")
-    except ValueError:
-        return float("nan")
-
-
 def named_columns(wanted: tuple[str, ...], header: list[str]) -> dict[str, str]:
     """Return which column of a header each of the ``wanted`` is, where one alone says it, however it is written."""
     words = {column: re.findall("[a-z]+", column.lower()) for column in header}
@@ -247,7 +240,7 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
                 )
             )
             continue
-        row = [_number(cells[header.index(c)]) for c in names]
+        row = [plain_number(cells[header.index(c)]) for c in names]
         rows.append(row)
         bad = [c for c, value in zip(names, row, strict=True) if not np.isfinite(value)]
         at = f"{path}, line {k}"

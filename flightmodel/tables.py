@@ -287,6 +287,14 @@ def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: li
     return values + 0.0  # no negative zero: whole-number columns know none
 
 
+def plain_number(text: str) -> float:
+    """Return what a cell says; NaN where it is no number in plain digits (``float`` takes 1_0 and any script)."""
+    try:
+        return float(text) if text.isascii() and "_" not in text else float("nan")
+    except ValueError:
+        return float("nan")
+
+
 def place(quantity: Quantity, declared: Declared | None) -> tuple[str, str]:
     """Column and unit in which a table holds a quantity."""
     if declared is not None:

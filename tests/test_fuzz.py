@@ -16,7 +16,7 @@ from flightmodel.config import LARGEST_TOML_BYTES, YEARS, parse_utc, read_toml
 from flightmodel.film import image_fault
 from flightmodel.flightfolder import read_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from tests import fuzzing
+from tests import fuzzing, fuzzing_deliveries
 from tests.refusing import numbers_in, refuses
 
 MUTATIONS = 40  # a count, not a time: the same inputs on every machine
@@ -24,12 +24,14 @@ MUTATIONS = 40  # a count, not a time: the same inputs on every machine
 
 @pytest.fixture(scope="module")
 def cases(tmp_path_factory):
-    return fuzzing.cases(tmp_path_factory.mktemp("fuzz"))
+    root = tmp_path_factory.mktemp("fuzz")
+    return fuzzing.cases(root) | fuzzing_deliveries.cases(root / "deliveries")
 
 
 KINDS = (
     "tables of a flight", "flight.toml", "vehicle.toml", "coefficients", "scenario.toml", "pictures", "film, AVI",
-    "film, WebM", "corners", "camera edits", "shell features",
+    "film, WebM", "corners", "camera edits", "shell features", "stored tables", "spreadsheet", "OEM",
+    "trajectory table",
 )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.guarded_files import UnfitFile, file_bytes
+from flightmodel.tables import plain_number
 from postflight.intake.headers import SEVERAL_MEANINGS, UNIT_SPELLINGS, unit_key
 
 _LARGEST = 1e100  # what is beyond is a broken word
@@ -63,10 +64,7 @@ class FreeFormTable:
         out = np.full(len(self.rows), np.nan)
         for k, row in enumerate(self.rows):
             if column < len(row):
-                try:
-                    out[k] = float(row[column])
-                except ValueError:
-                    continue
+                out[k] = plain_number(row[column])
         return np.where(np.abs(out) < _LARGEST, out, np.nan)
 
     def cells(self, column: int, rows: int | None = None) -> list[str]:

@@ -16,7 +16,7 @@ CCSDS 502.0-B-2, Orbit Data Messages, 2009; 502.0-B-3, 2023.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +34,8 @@ from postflight.intake.stored_tables import read_tables
 
 _OEM = b"CCSDS_OEM_VERS"
 _FIXED_FRAMES = re.compile(r"(ITRF|WGS-?84|ECEF)")  # agree to centimetres
+_LARGEST = 1e100  # what is beyond is a broken word
+_NEAR_M = 6.2e6, 1e9  # from the Earth's centre: no flight is below, none that is compared beyond
 _DAY_OF_YEAR = re.compile(r"(\d{4})-(\d{3})T(.*)")
 _POSITIONS = (tuple(f"r{a}_ecef_m" for a in "xyz"), tuple(f"{a}_ecef_m" for a in "xyz"))
 _GEODETIC = ("lat_deg", "lon_deg", "alt_m")
@@ -92,7 +94,8 @@ def read_other(path: Path, epoch_utc: str) -> OtherTrajectory:
     ------
     GateError
         What `read_tables` refuses; ``oem-syntax``, ``oem-frame``, ``oem-time-system``; ``no-trajectory`` where no table
-        holds times and positions, ``unit-missing`` where a column's unit is not stated, ``time-order``.
+        holds times and positions, ``unit-missing`` where a column's unit is not stated, ``position-range``,
+        ``time-order``.
     """
     try:
         content = file_bytes(path)
@@ -102,10 +105,32 @@ def read_other(path: Path, epoch_utc: str) -> OtherTrajectory:
         found = _read_oem(path, content.decode("utf-8", "replace"), parse_utc(epoch_utc))
     else:
         found = _read_table(path, parse_utc(epoch_utc))
+    found = _near_earth(path, found)
     if len(found.time_s) < LEAST_ROWS or (np.diff(found.time_s) <= 0.0).any():
         words = f"{LEAST_ROWS} states in the order of their times are wanted, each time once"
         raise GateError(f"{path}: {words}", "time-order")
     return found
+
+
+def _near_earth(path: Path, found: OtherTrajectory) -> OtherTrajectory:
+    """Leave out states whose place is none of a flight, and say so."""
+    distance_m = np.linalg.norm(found.position_ecef_m, axis=1)
+    keep = (distance_m > _NEAR_M[0]) & (distance_m < _NEAR_M[1])
+    if keep.all():
+        return found
+    if not keep.any():
+        words = f"positions are {np.median(distance_m):.4g} m from the Earth's centre: of another unit or frame"
+        raise GateError(f"{path}: {words}", "position-range")
+    words = f"{int((~keep).sum())} of {len(keep)} states in the Earth or far from it are left out"
+    velocity, attitude = found.velocity_ecef_mps, found.q_ecef_body
+    return replace(
+        found,
+        time_s=found.time_s[keep],
+        position_ecef_m=found.position_ecef_m[keep],
+        velocity_ecef_mps=None if velocity is None else velocity[keep],
+        q_ecef_body=None if attitude is None else attitude[keep],
+        notes=(*found.notes, words),
+    )
 
 
 # CCSDS OEM
@@ -134,16 +159,19 @@ def _read_oem(path: Path, text: str, epoch: datetime) -> OtherTrajectory:
     rows = []
     for line, cells in message.states:
         try:
-            row = [_seconds(cells[0], epoch), *map(float, cells[1:7])]
+            row = [_seconds(cells[0], epoch), *map(tables.plain_number, cells[1:7])]
         except ValueError:
             row = []
-        if len(row) != 7 or not np.isfinite(row).all():
+        if len(row) != 7 or not (np.abs(row) < _LARGEST).all():
             raise _oem_syntax(path, line, "a time and six numbers are wanted")
         rows.append(row)
     table = np.array(rows, dtype=float).reshape(-1, 7)
-    table = table[np.append(np.diff(table[:, 0]) != 0.0, True)] if len(table) else table  # segments share their ends
+    first = np.append(True, np.diff(table[:, 0]) != 0.0)[: len(table)]  # segments share their ends
     times, covariance, skipped = _oem_covariances(path, message, epoch)
     notes = [f"{skipped} covariances in another frame than the states' are left out"] if skipped else []
+    if not first.all():
+        notes.append(f"{int((~first).sum())} states at the time of the one before are left out")
+        table = table[first]
     return OtherTrajectory(
         path.name, table[:, 0], 1e3 * table[:, 1:4], 1e3 * table[:, 4:7], None, times, covariance, tuple(notes)
     )
@@ -163,6 +191,8 @@ def _oem_lines(path: Path, text: str) -> _Oem:
         key, equals, value = (part.strip() for part in line.partition("="))
         if inside == "META" and equals:
             found.metadata.append((number, key, value))
+        elif inside == "META":
+            raise _oem_syntax(path, number, "within META_START and META_STOP KEY = value is wanted")
         elif inside == "COVARIANCE" and key == "EPOCH":
             found.covariances.append((value, frame, []))
         elif inside == "COVARIANCE" and key == "COV_REF_FRAME":
@@ -188,8 +218,8 @@ def _oem_covariances(path: Path, message: _Oem, epoch: datetime) -> tuple[FloatA
         matrix = np.zeros((6, 6))
         try:
             for k, cells in enumerate(rows):
-                matrix[k, : k + 1] = np.array(cells, dtype=float)
-            if len(rows) != 6 or not np.isfinite(matrix).all():
+                matrix[k, : k + 1] = [tables.plain_number(cell) for cell in cells]
+            if len(rows) != 6 or not (np.abs(matrix) < _LARGEST).all():
                 raise ValueError
             times.append(_seconds(stamp, epoch))
         except ValueError:
@@ -241,7 +271,7 @@ def _columns(table: FreeFormTable, names: tuple[str, ...]) -> FloatArray | None:
 
 def _by_name(path: Path, table: FreeFormTable, epoch: datetime) -> OtherTrajectory | None:
     """What a table with the columns of ``bet.csv`` holds; None for any other."""
-    notes: list[str] = []
+    notes = list(table.notes)
     position = next((p for names in _POSITIONS if (p := _columns(table, names)) is not None), None)
     geodetic = _columns(table, _GEODETIC)
     if position is None and geodetic is not None:
@@ -330,7 +360,7 @@ def _by_vocabulary(path: Path, table: FreeFormTable, epoch: datetime, refused: l
     if unknown:
         refused.append(f"write the unit of {', '.join(unknown)} into its header, as in 'alt (km)'")
         return None
-    notes = [f"read: {', '.join(c.column for c in source.columns)}"]
+    notes = [*table.notes, f"read: {', '.join(c.column for c in source.columns)}"]
     values = {c.short: _in_si(table, c.column, c.unit or _canonical_unit(c.short)) for c in source.columns}
     if all(a in values for a in "xyz"):
         position = np.column_stack([values[a] for a in "xyz"])

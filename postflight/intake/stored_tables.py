@@ -13,12 +13,15 @@ What a file is, its first bytes say. Only numbers, times and texts are read, no 
   channel is a structure of ``data``, ``units`` and perhaps ``time``.
 
 Each library but scipy is optional, and what is missing is named with the extra that brings it. What is left out of a
-file is noted.
+file is noted. A damaged file can keep a compiled library busy without end, deaf to Ctrl-C, or crash it: a process of
+its own reads HDF5, MATLAB and Parquet through first.
 """
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime, time
@@ -41,6 +44,22 @@ _ERRORS = {"#DIV/0!", "#N/A", "#NAME?", "#NULL!", "#NUM!", "#REF!", "#VALUE!"}  
 _UNITS, _NAMES = ("units", "unit"), ("names", "columns", "channels", "labels", "variables")
 _DATA, _TIMES = ("data", "value", "values", "signal"), ("time", "t")
 _SINCE = re.compile(r"^\s*(\w+)\s+since\s+(\S+(?:\s+[\d:.]+)?)(?:\s*(?:Z|UTC|\+?0+(?::0+)?))?\s*$", re.IGNORECASE)
+# seconds that another process may take to read a file through, and bytes for one more: some hundred times what it needs
+_READ_S, _READ_BYTES_PER_S = 20.0, 1e6
+_READ_THROUGH = {
+    "HDF5": f"""
+import h5py, sys
+
+def read(name, item):
+    if isinstance(item, h5py.Dataset) and item.size is not None and item.size <= {_MOST_NUMBERS}:
+        item[()], dict(item.attrs)
+
+with h5py.File(sys.argv[1], "r") as file:
+    file.visititems(read)
+""",
+    "MATLAB": "import scipy.io, sys; scipy.io.loadmat(sys.argv[1], chars_as_strings=True)",
+    "Parquet": "import pyarrow.parquet, sys; pyarrow.parquet.ParquetFile(sys.argv[1]).read()",
+}
 _STEP_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _STEPS = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), "s"),
@@ -121,6 +140,22 @@ def _missing(path: Path, fault: ImportError, code: str) -> ConfigError:
         raise fault
     words = f"needs {name}, which is not installed: pip install 'postflight[{EXTRAS[name]}]', or store it as CSV"
     return ConfigError(f"{path}: {words}", code=code)
+
+
+def _check_readable(path: Path, kind: str) -> None:
+    """Refuse a file that the library of its kind does not come to the end of, or dies of."""
+    limit_s = _READ_S + path.stat().st_size / _READ_BYTES_PER_S
+    command = [sys.executable, "-c", _READ_THROUGH[kind], str(path)]
+    try:
+        status = subprocess.run(command, capture_output=True, timeout=limit_s, check=False).returncode
+        fate = f"dies of it (signal {-status})"
+    except subprocess.TimeoutExpired:
+        status, fate = -1, f"does not come to its end in {limit_s:.0f} s"
+    if status < 0:  # what a library says of a damaged file is its reader's to report
+        words = (
+            f"a damaged file: the library for {kind} {fate}; compare its checksum with the sender's, or have it as CSV"
+        )
+        raise GateError(f"{path}: {words}", code="table-unreadable")
 
 
 def _check_size(path: Path, numbers: int) -> None:
@@ -217,6 +252,7 @@ def _parquet(path: Path) -> list[FreeFormTable]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    _check_readable(path, "Parquet")
     file = pq.ParquetFile(path)
     _check_size(path, file.metadata.num_rows * file.metadata.num_columns)
     columns: list[Column] = []
@@ -258,6 +294,7 @@ def _netcdf_classic(path: Path) -> list[FreeFormTable]:
 def _netcdf_4(path: Path) -> list[FreeFormTable]:
     import h5py
 
+    _check_readable(path, "HDF5")
     found: list[tuple[str, str, str, NDArray[Any], dict[str, Any]]] = []
     left_out = []
 
@@ -417,6 +454,7 @@ def _version_5(path: Path) -> Tree:
     from scipy.io import loadmat, whosmat
 
     _check_size(path, sum(int(np.prod(shape)) for _, shape, _ in whosmat(path)))
+    _check_readable(path, "MATLAB")
     content = loadmat(path, chars_as_strings=True)
     return {name: _plain(value) for name, value in content.items() if not name.startswith("__")}
 
@@ -454,6 +492,7 @@ def _version_73(path: Path) -> Tree:
             return np.atleast_2d(np.asarray(item[()], dtype=float))
         return None
 
+    _check_readable(path, "HDF5")
     with h5py.File(path, "r") as file:
         tree: Tree = plain(file)
         return tree

@@ -19,7 +19,8 @@ from flightmodel.gate import Gate
 from flightmodel.instruments import AtmosphereEntry, RadarEntry
 from flightmodel.sensor_tables import read_radar, read_sounding
 from postflight.cli import cli
-from tests.refusing import printed_codes
+from postflight.intake import stored_tables
+from tests.refusing import printed_codes, refuses
 
 # a range's radar, in feet and mils of an older plotting board, and in SI
 T = np.arange(50) * 0.1
@@ -429,3 +430,13 @@ def test_check_names_a_table_that_no_section_reads(folder, tmp_path):
     lines = [line for line in result.output.splitlines() if "[file-not-used]" in line]
     assert len(lines) == 2
     assert [name in line for name, line in zip(("noon.csv", "odd.csv"), lines, strict=True)] == [True, True]
+
+
+@pytest.mark.parametrize("fate", ["import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "while True: pass"])
+def test_a_file_that_kills_or_holds_its_library_is_refused(tmp_path, monkeypatch, fate):
+    """A damaged MATLAB file crashed the process, a damaged HDF5 file kept it busy without end."""
+    savemat(tmp_path / "track.mat", {"time": T, "range": RANGE_M})
+    monkeypatch.setitem(stored_tables._READ_THROUGH, "MATLAB", fate)
+    monkeypatch.setattr(stored_tables, "_READ_S", 0.5)
+    with refuses("table-unreadable", names=["MATLAB", "checksum"]):
+        stored_tables.read_tables(tmp_path / "track.mat")

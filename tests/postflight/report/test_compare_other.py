@@ -233,6 +233,8 @@ def test_oem_times_by_day_of_year_and_accelerations(tmp_path):
         ("= UTC", "= GPS", {"oem-time-system"}),
         ("6377.0 1.0 2.0 0.1 0.2 0.3", "6377.0 1.0 2.0 0.1 0.2", {"oem-syntax"}),
         ("6377.0", "nan", {"oem-syntax"}),
+        ("6377.0", "63_77", {"oem-syntax"}),
+        ("META_STOP", "", {"oem-syntax"}),
         ("12:52:01.5", "12:52:03.5", {"time-order"}),
         ("2009-08-17T12:52:01.500000 6377.0", "", {"oem-syntax"}),
     ],
@@ -242,6 +244,17 @@ def test_oem_that_cannot_be_compared_is_refused(tmp_path, old, new, codes):
     with pytest.raises(GateError) as fault:
         read_other(tmp_path / "x.oem", "2009-08-17T12:52:00Z")
     assert set(fault.value.codes) == codes
+
+
+def test_positions_in_another_unit_are_refused_and_a_lone_one_is_left_out(tmp_path):
+    (tmp_path / "x.oem").write_text(OEM.replace(".0 1.0 2.0", "000.0 1000.0 2000.0"))
+    with refuses("position-range"):
+        read_other(tmp_path / "x.oem", "2009-08-17T12:52:00Z")
+    one = "2009-08-17T12:52:03.500000 63750.0 1.0 2.0 0.1 0.2 0.3\n"
+    (tmp_path / "x.oem").write_text(OEM + one + one.replace("03.5", "04.5").replace("63750.0", "0.0"))
+    theirs = read_other(tmp_path / "x.oem", "2009-08-17T12:52:00Z")
+    assert len(theirs.time_s) == 4
+    assert len(theirs.notes) == 1
 
 
 def test_a_covariance_in_another_frame_is_left_out_and_said(tmp_path):
