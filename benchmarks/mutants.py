@@ -51,7 +51,7 @@ FIRST = 10  # of the tests that run a line, so many are tried before all others:
 ENDLESS = -1000
 PRELOADED = (
     "numpy", "scipy.interpolate", "scipy.optimize", "scipy.stats", "scipy.signal", "scipy.ndimage", "pandas", "numba",
-    "pydantic", "cv2", "matplotlib.pyplot", "pytest", "hypothesis", "pymap3d", "filterpy.kalman",
+    "pydantic", "cv2", "matplotlib.pyplot", "pytest", "hypothesis", "erfa", "filterpy.kalman",
 )  # fmt: skip
 HOME = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "postflight" / "mutants"
 

@@ -44,7 +44,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from estimators.evidence import (
     ACCELEROMETER,
@@ -217,7 +217,7 @@ def agreement(
         d, cov = _difference(a, b, deflection)
         if len(d):
             square = float(d @ cho_solve(cho_factor(cov), d))
-            pairs.append(Pair((a.method, b.method), square, len(d), float(chi2.sf(square, len(d)))))
+            pairs.append(Pair((a.method, b.method), square, len(d), float(chdtrc(len(d), square))))
     if input_posterior is None or not pairs:
         return Agreement(tuple(pairs), {}, np.empty(0))
     gains = {}

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from estimators.evidence import CONSTANT_PART
 from flightmodel.checks import DivergenceError, FloatArray
@@ -112,7 +112,7 @@ def southwell_limbs(
         middle = np.array([0.8 * float(q.max())])
         change = float(np.log(fall.deflection(middle)[0] / rise.deflection(middle)[0]))
         apart = change / float(np.hypot(_log_sd(rise, middle[0]), _log_sd(fall, middle[0])))
-        limit = norm.ppf(0.5 + 0.5 * CONFIDENCE)
+        limit = ndtri(0.5 + 0.5 * CONFIDENCE)
         found = "hysteresis" if abs(apart) > limit else "no significant hysteresis"
         remarks.insert(0, f"fall over rise {np.exp(change):.2f} at 80 % of peak load ({apart:+.1f} sd): {found}")
     return Limbs(both, rise, fall, apart, "; ".join(remarks))
@@ -178,7 +178,7 @@ def southwell(
             "Southwell plot: the deflection is within its error bars: neither stiffness nor offset observable",
             code="stiffness-not-observable",
         )
-    k = norm.ppf(0.5 + 0.5 * CONFIDENCE)
+    k = ndtri(0.5 + 0.5 * CONFIDENCE)
     crit, offset = top * (1.0 + beyond), float(np.exp(fit.x[1]))
     sd_x = np.sqrt(np.linalg.inv(normal)[0, 0])
     # the logarithm of the margin over the largest load is normal, that of the pressure's scale too

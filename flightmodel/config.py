@@ -50,7 +50,7 @@ NAME_RULE = "a name has 1 to 64 letters (a to z), digits, _ and -"
 def beside(value: str) -> str:
     """Refuse a file name that leads out of the folder, so that a copy of the folder is whole."""
     paths = PurePosixPath(value), PureWindowsPath(value)
-    if not value or "\0" in value or any(path.anchor or ".." in path.parts for path in paths):
+    if not paths[0].name or "\0" in value or any(path.anchor or ".." in path.parts for path in paths):
         raise ValueError("a file beside this one, or in a folder below it, is wanted; copy it there")
     return value
 

@@ -9,15 +9,15 @@ to the right of one who looks along x; of a rocket that stands upright with azim
 
 References
 ----------
-NIMA TR8350.2 (WGS-84), 3rd ed. Conversions: pymap3d.
+NIMA TR8350.2 (WGS-84), 3rd ed. Conversions: ERFA.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import erfa
 import numpy as np
-import pymap3d
 
 from flightmodel import rotations
 from flightmodel.checks import FloatArray
@@ -29,6 +29,7 @@ J2 = 1.082629821313e-3
 OMEGA_RADPS = 7.292115e-5
 OMEGA_ECEF_RADPS = np.array([0.0, 0.0, OMEGA_RADPS])
 STANDARD_GRAVITY_MPS2 = 9.80665
+_WGS84 = 1  # ERFA's number of the ellipsoid
 
 
 class Planet(NamedTuple):
@@ -64,15 +65,17 @@ def gravitation(position_m: FloatArray) -> FloatArray:
 def geodetic_from_ecef(position_ecef_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Geodetic latitude, longitude (rad) and height (m) of ECEF positions ``(..., 3)``."""
     p = np.asarray(position_ecef_m, dtype=float)
-    lat, lon, height = pymap3d.ecef2geodetic(p[..., 0], p[..., 1], p[..., 2], deg=False)
-    return np.asarray(lat), np.asarray(lon), np.asarray(height)
+    with np.errstate(invalid="ignore"):
+        lon, lat, height = erfa.gc2gd(_WGS84, p)
+    known = np.isfinite(height)  # else it is taken for a place on the axis
+    return np.where(known, lat, np.nan), np.where(known, lon, np.nan), np.asarray(height)
 
 
 def ecef_from_geodetic(
     latitude_rad: FloatArray | float, longitude_rad: FloatArray | float, height_m: FloatArray | float
 ) -> FloatArray:
     """ECEF positions ``(..., 3)``, m, of geodetic latitude, longitude and height."""
-    return np.stack(pymap3d.geodetic2ecef(latitude_rad, longitude_rad, height_m, deg=False), axis=-1)
+    return np.asarray(erfa.gd2gc(_WGS84, longitude_rad, latitude_rad, height_m))
 
 
 def dcm_ned_ecef(latitude_rad: FloatArray | float, longitude_rad: FloatArray | float) -> FloatArray:

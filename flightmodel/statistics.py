@@ -15,12 +15,18 @@ A. Gelb (ed.), Applied Optimal Estimation, MIT Press, 1974, section 3.8 (exponen
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from flightmodel.checks import FloatArray
 
 KNOTS_A_LENGTH = 3  # of a Gauss-Markov history, in one correlation length
 BAND_PERCENTILES = (2.3, 50.0, 97.7)
 BAND_COLUMNS = tuple(f"p{p:g}" for p in BAND_PERCENTILES)
+
+
+def chi_square_quantile(probability: float, degrees: float) -> float:
+    """Value below which a chi-square number of ``degrees`` stays; `scipy.stats`, which has it, takes long to load."""
+    return float(2.0 * gammaincinv(0.5 * degrees, probability))
 
 
 def correlation(at: FloatArray, length: float, constant_part: float = 0.0) -> FloatArray:

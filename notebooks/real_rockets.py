@@ -33,10 +33,10 @@ import shutil
 from pathlib import Path
 from tempfile import mkdtemp
 
+import erfa
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-import pymap3d
 
 import postflight as pf
 
@@ -59,7 +59,7 @@ def flight(name, *edits):
 
 
 def height(position):
-    return pymap3d.ecef2geodetic(*position.T)[2]
+    return erfa.gc2gd(1, position)[2]
 
 
 # %% [markdown]

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2
 
 from flightmodel import earth, rotations
 from flightmodel.airdata import euler_321
 from flightmodel.checks import GateError
+from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import interpolate_rows, resample
 from recon.consistency import ConsistencyCheck
@@ -72,7 +72,7 @@ class AttitudeCheck:
         if self.comparison is None or self.history is None:
             return ()
         nees, inside = self.comparison.mean_nees, self.comparison.share_inside
-        high = float(chi2.ppf(self.confidence, 3))
+        high = chi_square_quantile(self.confidence, 3)
         return (
             ConsistencyCheck("attitude-nees", "attitude check size", nees, 0.0, high, nees <= high, self.remark),
             ConsistencyCheck(

@@ -181,8 +181,8 @@ def run_flight(
 ) -> tuple[Reconstruction, Deflections, Path]:  # fmt: skip
     """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too.
 
-    ``show_answers`` is called with trajectory, deflections and events before anything is written. Figures are drawn by
-    a second process, made ready meanwhile.
+    ``show_answers`` is called with trajectory, deflections and events before tables and report are written. Figures are
+    drawn by a second process as soon as their numbers are there.
     """
     log: list[str] = []
     stages = stages or Stages()
@@ -201,49 +201,53 @@ def run_flight(
     with progress_bar() as report:
         flight = asked_for.of(read_flight(folder, steps(report)(0.0, 0.05)))
     stages.end("reading telemetry")
-    with DrawingProcess() as drawing:
+    settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
+    if flight.changes:
+        settings["changes"] = list(flight.changes)
+    new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
+    with new as out, DrawingProcess(out.path / "figures") as drawing:
         with progress_bar() as report:
-            bet, answers = _answered(flight, methods, steps(report), stages)
+            bet, answers = _answered(flight, methods, steps(report), stages, drawing)
         event_rows = run_folder.event_table(bet, bet.table)
         show_answers(bet, answers, event_rows)
         stages.end("printing the answers")
-        settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
-        if flight.changes:
-            settings["changes"] = list(flight.changes)
-        new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
-        with new as out, progress_bar() as report:
+        with progress_bar() as report:
             step = steps(report)
+            bounds, reran = _write_rest(out, bet, answers, reruns, step)
+            drawing.studies(bounds, reran)
+            stages.end("bounds of the rigid vehicle")
             run_folder.write_reconstruction(out, bet, answers)
             run_folder.write_answers(out, answers)
             out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
             stages.end("tables")
-            bounds, reran = _write_rest(out, bet, answers, reruns, step)
-            stages.end("bounds of the rigid vehicle")
             step(0.9, 1.0)(0.0, "drawing, and writing the report")
             lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
             (out.path / "log.jsonl").write_text(lines)
             out.write_facts()
-            with drawing.at_work(bet, answers, out.path / "figures", bounds, reran):
-                write_report(folder, out.path, flight.telemetry)
-                stages.end("report")
+            write_report(folder, out.path, flight.telemetry)
+            stages.end("report")
+            drawing.finish()
             stages.end("figures that were not drawn meanwhile")
     return bet, answers, out.path
 
 
 def _answered(
-    flight: Flight, methods: tuple[str, ...], step: Callable[[float, float], Progress], stages: Stages
-) -> tuple[Reconstruction, Deflections]:
-    """Trajectory and deflections; a camera without video is among the methods that were refused."""
+    flight: Flight, methods: tuple[str, ...], step: Callable[[float, float], Progress], stages: Stages,
+    drawing: DrawingProcess,
+) -> tuple[Reconstruction, Deflections]:  # fmt: skip
+    """Trajectory and deflections, given to be drawn; a camera without video is among the methods that were refused."""
     own = warmup.ESTIMATES if "camera" in methods else warmup.ESTIMATES[:1]
     compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
     stages.end("compiling")
     bet = reconstruct(flight, None, step(0.05, 0.7))
     stages.end("trajectory")
+    drawing.trajectory(bet)
     wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
     answers = estimate(bet, wanted, step(0.7, 1.0))
     stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
         answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
+    drawing.deflections(answers)
     return bet, answers
 
 

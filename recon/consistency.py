@@ -32,9 +32,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from scipy.special import ndtri
 
 from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.instruments import RADAR as RADAR_ERRORS
+from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Finding
 from recon._measurement_kernels import RADAR
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
@@ -119,10 +121,8 @@ def nis_check(
     With an ``allowance`` for noise, not its size, residuals may be as small as they like; else ``measured`` says what
     noise they have, for the data sheet.
     """
-    from scipy.stats import chi2
-
     n, tail = len(nis), 0.5 * (1.0 - confidence)
-    low, high = (float(chi2.ppf(p, components)) / n for p in (tail, 1.0 - tail))
+    low, high = (float(chi_square_quantile(p, components)) / n for p in (tail, 1.0 - tail))
     low = 0.0 if allowance else low
     mean = float(np.mean(nis))
     size, advice = (
@@ -138,12 +138,10 @@ def nis_check(
 
 def whiteness_check(source: str, component: str, normalised: FloatArray, confidence: float) -> ConsistencyCheck:
     """Lag-one autocorrelation of one component's normalised innovations (n,) against its band."""
-    from scipy.stats import norm
-
     n = len(normalised)
     centred = normalised - normalised.mean()
     rho = float(centred[1:] @ centred[:-1] / (centred @ centred))
-    band = float(norm.ppf(0.5 * (1.0 + confidence))) / np.sqrt(n)
+    band = float(ndtri(0.5 * (1.0 + confidence))) / np.sqrt(n)
     return consistency_check(
         "whiteness", f"whiteness {source} {component}", rho, -band, band, "successive residuals are uncorrelated",
         "successive residuals are correlated", advice="an error that lasts several points is not modelled",
@@ -177,8 +175,6 @@ def data_sheet_check(
 
     The remark names the ``components`` entry that moved most: ``bad`` follows its name, ``good`` goes before it.
     """
-    from scipy.stats import norm
-
     observable = sd < MOST_KEPT_SD * prior_sd
     if not observable.any():
         return None
@@ -188,7 +184,7 @@ def data_sheet_check(
     name = f"{source} {worst}".strip()
     symptom, _, advice = bad.partition(": ")
     return consistency_check(
-        code, label, float(shift.max()), 0.0, float(norm.isf(tail)), f"{good} {name}, {shift.max():.1f} sd",
+        code, label, float(shift.max()), 0.0, float(-ndtri(tail)), f"{good} {name}, {shift.max():.1f} sd",
         f"{name} {symptom}", advice=advice, source=source, component=worst,
     )  # fmt: skip
 

@@ -32,8 +32,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
+from scipy.special import ndtri
 
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
+from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, difference, nearest_index, resample
 from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, edit_check
@@ -194,7 +196,6 @@ def _supported(left_out: tuple[LeftOut, ...]) -> list[LeftOut]:
 
 def _compared(smoothed: Trajectory, other: Trajectory) -> tuple[BoolArray, FloatArray, BoolArray]:
     """Times (n,) that both solutions cover, their difference (k, 9) there, and where it is further than allowed."""
-    from scipy.stats import chi2
 
     inside = np.asarray((smoothed.time_s >= other.time_s[0]) & (smoothed.time_s <= other.time_s[-1]))
     there, mine = (resample(path, smoothed.time_s[inside]) for path in (other, smoothed))
@@ -207,7 +208,7 @@ def _compared(smoothed: Trajectory, other: Trajectory) -> tuple[BoolArray, Float
         np.einsum("ni,nij,nj->n", unit, p[:, :3, :3], unit)
         for p in (there.covariance, there.covariance - mine.covariance)
     )
-    limit = float(chi2.ppf(_CONFIDENCE, 3))
+    limit = chi_square_quantile(_CONFIDENCE, 3)
     return inside, error, np.asarray(size**2 > limit * np.maximum(lost, _LEAST_LOST * along))
 
 
@@ -247,13 +248,12 @@ def rejected_points(
     gate : float
         Probability of a single component.
     """
-    from scipy.stats import norm
 
     resolving = [s for s in left_out if s.resolves]
     if len(resolving) != 1 or not resolving[0].inconsistent:
         return {}
     table, source = held_out[resolving[0].source], resolving[0].source
-    table = table.assign(far=table.residual.abs() > norm.ppf(0.5 * (1.0 + gate)) * table.predicted_sd)
+    table = table.assign(far=table.residual.abs() > ndtri(0.5 * (1.0 + gate)) * table.predicted_sd)
     out = {}
     for name, rows in table.groupby("source"):
         if str(name) == source or str(name).startswith(f"{source} "):

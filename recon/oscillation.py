@@ -196,33 +196,39 @@ def _normal_equations(
     u = np.linspace(-0.5, 0.5, round(_WINDOW_S / _STEP_S))
     slow, _ = np.linalg.qr(np.column_stack([np.ones_like(u), u, u**2]))
 
-    def fast(columns: ComplexArray) -> ComplexArray:
-        return columns - slow @ (slow.T @ columns)
-
     forces = []
     for begin in begins:
-        at = begin + (u + 0.5) * _WINDOW_S
-        values = interpolate_rows(at, ft, f)
-        forces.append(fast(values[:, 1] + 1j * values[:, 2]))
+        values = interpolate_rows(begin + (u + 0.5) * _WINDOW_S, ft, f)
+        forces.append(_fast(values[:, 1] + 1j * values[:, 2], slow))
     square = np.array([np.vdot(x, x).real for x in forces])
     strongest = np.sort(np.argsort(-square)[:_MOST_WINDOWS])
-    rows: list[list[tuple[FloatArray, ComplexArray]]] = []
+    proper, mirrored = [], []
     for k in strongest:
-        row = []
-        for lag in (*lags, np.nan):
-            at = begins[k] + (u + 0.5) * _WINDOW_S - np.nan_to_num(lag)
-            p, q, r, q_dot, r_dot = interpolate_rows(at, wt, rates).T
-            lateral, normal = q + 1j * r, q_dot + 1j * r_dot
-            if np.isnan(lag):
-                lateral, normal = lateral.conj(), normal.conj()
-            columns = fast(np.column_stack([1j * normal, u * 1j * normal, p * lateral]))
-            gram = (columns.conj().T @ columns).real
-            row.append((gram + 1e-12 * np.trace(gram) * np.eye(3), columns.conj().T @ forces[k]))
-        rows.append(row)
-    gram = np.array([[g for g, _ in row] for row in rows])
-    moment = np.array([[m for _, m in row] for row in rows])
-    proper = _Normal(square[strongest], gram[:, :-1], moment[:, :-1])
-    return proper, _Normal(square[strongest], gram[:, -1:], moment[:, -1:])
+        at = begins[k] + (u + 0.5) * _WINDOW_S - lags[:, None]
+        p, q, r, q_dot, r_dot = interpolate_rows(at.ravel(), wt, rates).T.reshape(5, *at.shape)
+        lateral, normal, none = q + 1j * r, q_dot + 1j * r_dot, [len(lags) // 2]
+        proper.append(_gram_and_moment(u, p, lateral, normal, slow, forces[k]))
+        mirrored.append(_gram_and_moment(u, p[none], lateral[none].conj(), normal[none].conj(), slow, forces[k]))
+    at_lags, at_none = (
+        _Normal(square[strongest], *(np.array(part) for part in zip(*rows, strict=True))) for rows in (proper, mirrored)
+    )
+    return at_lags, at_none
+
+
+def _fast(columns: ComplexArray, slow: FloatArray) -> ComplexArray:
+    """Columns (..., n, k) less what is a combination of slow ones (n, s)."""
+    return np.asarray(columns - slow @ (slow.T @ columns))
+
+
+def _gram_and_moment(
+    u: FloatArray, p: FloatArray, lateral: ComplexArray, normal: ComplexArray, slow: FloatArray, force: ComplexArray
+) -> tuple[FloatArray, ComplexArray]:
+    """Normal matrix (l, 3, 3) and right-hand side (l, 3) of one window at lags: rates are (l, n), the force (n,)."""
+    columns = _fast(np.stack([1j * normal, u * 1j * normal, p * lateral], axis=-1), slow)
+    adjoint = columns.conj().swapaxes(-1, -2)
+    gram = (adjoint @ columns).real
+    regular = 1e-12 * np.trace(gram, axis1=-2, axis2=-1)[:, None, None] * np.eye(3)
+    return gram + regular, adjoint @ force
 
 
 def _refined(log: FloatArray, step: float) -> tuple[float, float]:

@@ -23,6 +23,7 @@ P. Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation 
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtri
 
 from flightmodel import earth, geomagnetism_and_sun, rotations
 from flightmodel.checks import FloatArray, GateError
@@ -144,12 +145,11 @@ def _heading(
 
 def rest_checks(telemetry: Telemetry, confidence: float, point_ecef_m: FloatArray) -> list[ConsistencyCheck]:
     """Mean specific force against gravity, mean rates against the Earth's, by the data sheets; none without a rest."""
-    from scipy.stats import norm
 
     span = telemetry.start.at_rest
     if span is None or telemetry.accelerometer is None or telemetry.rates is None:
         return []
-    most = float(norm.isf(0.5 * (1.0 - confidence)))
+    most = float(-ndtri(0.5 * (1.0 - confidence)))
     out = []
     gravity = float(np.linalg.norm(gravity_ecef_mps2(point_ecef_m)))
     force, mean = telemetry.accelerometer, readings(telemetry.accelerometer, span)

@@ -20,6 +20,7 @@ from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateEr
 from flightmodel.gate import spaced
 from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesSpec
 from flightmodel.instruments import RADAR as RADAR_ERRORS
+from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import AttitudePrior, Telemetry
 from flightmodel.trajectory import nearest_index
 from recon import measurements
@@ -109,9 +110,8 @@ def build_problem(
         if telemetry.start.at_rest is not None and telemetry.start.at_rest[0] <= start_s < telemetry.start.at_rest[1]:
             start = _start_at_rest(track, telemetry.start.at_rest, motion, start, time_s, node_index)
     motion = with_disturbances(motion, telemetry.motion)
-    from scipy.stats import chi2
 
-    gate = np.array([0.0, *(float(chi2.ppf(settings.gate_probability, k)) for k in (1, 2, 3))])
+    gate = np.array([0.0, *(chi_square_quantile(settings.gate_probability, k) for k in (1, 2, 3))])
     kept: BoolArray = np.zeros(len(time_s), dtype=bool)
     kept[nearest_index(time_s, output_s)] = True
     problem = Problem(time_s, node_index, motion, model, instruments, row, observed, start, covariance, gate, kept)

@@ -24,6 +24,7 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
+from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import KnownPlace, Telemetry
 from flightmodel.trajectory import nearest_index
 from recon.consistency import ConsistencyCheck, consistency_check, smoothed_covariance
@@ -79,7 +80,6 @@ def place_checks(
         A time outside the trajectory is compared with its nearer end, less well by the way flown in between.
     settings : Settings
     """
-    from scipy.stats import chi2
 
     if not places:
         return []
@@ -89,7 +89,7 @@ def place_checks(
     for miss in misses:
         away = float(np.linalg.norm(miss.residual_m))
         symptom = f"the trajectory passes {away:.3g} m from it"
-        most = float(chi2.ppf(settings.check_confidence, len(miss.residual_m)))
+        most = chi_square_quantile(settings.check_confidence, len(miss.residual_m))
         good = f"{symptom}, within the uncertainty of both"
         check = consistency_check(
             "place", f"place {miss.place.name}", miss.chi2, 0.0, most, good, symptom, advice=causes, source=SITES,
@@ -134,7 +134,6 @@ def _misses(
 
 def _causes(misses: list[_Miss], confidence: float) -> tuple[str, str]:
     """What would explain all misses, in words, and the likeliest error; the error is empty where no single one does."""
-    from scipy.stats import chi2
 
     dof = sum(len(miss.residual_m) for miss in misses)
     found: list[tuple[float, str, str]] = []
@@ -149,7 +148,7 @@ def _causes(misses: list[_Miss], confidence: float) -> tuple[str, str]:
             projected += weighted.T @ miss.residual_m
         size = np.linalg.lstsq(information, projected, rcond=None)[0]
         left = sum(miss.chi2 for miss in misses) - float(projected @ size)
-        if left <= float(chi2.ppf(confidence, dof - len(names))):
+        if left <= chi_square_quantile(confidence, dof - len(names)):
             words = " and ".join(_amount(name, float(x)) for name, x in zip(names, size, strict=True))
             found.append((left, words, " and ".join(names)))
     if not found:

@@ -26,6 +26,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.telemetry import Finding, TriadRecord
@@ -148,10 +149,9 @@ def _combined(lags: FloatArray) -> Lag:
 
 def lag_check(lag: Lag, force: BridgedSensor, rate: BridgedSensor, confidence: float) -> ConsistencyCheck:
     """Whether the lag is consistent with the time biases that both data sheets state."""
-    from scipy.stats import norm
 
     allowed = float(np.hypot(force.spec.time_bias_sd_s, rate.spec.time_bias_sd_s))
-    limit = float(norm.ppf(0.5 * (1.0 + confidence)))
+    limit = float(ndtri(0.5 * (1.0 + confidence)))
     names = f"{force.spec.name} and {rate.spec.name}"
     verb = "lag" if lag.lag_s > 0.0 else "lead"
     symptom = f"{force.spec.name} time tags {verb} those of {rate.spec.name} by {1e3 * abs(lag.lag_s):.1f} ± "

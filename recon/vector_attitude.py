@@ -22,9 +22,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
+from scipy.special import ndtri
 
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray
+from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import AttitudePrior, Finding, SunRecord, Telemetry, TriadRecord
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from recon.attitude_smoother import (
@@ -301,12 +303,11 @@ def _history(
 
 def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[ConsistencyCheck]:
     """Of each sensor its residuals, and its constant errors against its data sheet."""
-    from scipy.stats import chi2
 
     out: list[ConsistencyCheck] = []
     tail = 0.5 * (1.0 - confidence)
     for name, (squares, expected) in fit.misfit.items():
-        low, high = chi2.ppf([tail, 1.0 - tail], expected) / expected
+        low, high = (chi_square_quantile(p, expected) / expected for p in (tail, 1.0 - tail))
         out.append(
             consistency_check(
                 "attitude-residuals",
@@ -395,7 +396,6 @@ def compare(history: AttitudeHistory, trajectory: Trajectory, confidence: float 
     GateError
         Where the two share no time.
     """
-    from scipy.stats import chi2
 
     t = history.time_s
     rows = np.flatnonzero((t >= trajectory.time_s[0]) & (t <= trajectory.time_s[-1]))
@@ -412,7 +412,7 @@ def compare(history: AttitudeHistory, trajectory: Trajectory, confidence: float 
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     nees = float(np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[:, :, None])[:, :, 0]).mean())
     inside = float(np.mean(np.abs(off) <= 3.0 * sd))
-    passed = bool(nees <= chi2.ppf(confidence, 3) and inside >= LEAST_INSIDE)
+    passed = bool(nees <= chi_square_quantile(confidence, 3) and inside >= LEAST_INSIDE)
     rms, predicted = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (off, sd))
     spread = float(np.sqrt(np.trace(theirs, axis1=1, axis2=2).mean() / 3.0))
     offsets, allowed = _constant_rotations(history, other, rows, spread)
@@ -454,9 +454,8 @@ def _constant_rotations(
 
 def _inconsistent_sensors(offsets: dict[str, FloatArray], allowed: dict[str, float], confidence: float) -> str:
     """Sensors whose constant rotation relative to the trajectory is larger than its sd allows."""
-    from scipy.stats import norm
 
-    limit = float(norm.isf(0.5 * (1.0 - confidence) / (3 * len(offsets))))
+    limit = float(-ndtri(0.5 * (1.0 - confidence) / (3 * len(offsets))))
     angle = {name: float(np.linalg.norm(offset)) for name, offset in offsets.items()}
     off = [name for name in offsets if np.abs(offsets[name]).max() > limit * allowed[name]]
     listed = ", ".join(f"{name} ({np.rad2deg(angle[name]):.1f} deg)" for name in sorted(off, key=lambda n: -angle[n]))

@@ -35,6 +35,7 @@ from synthetic_flight.scenarios import read_scenario
 
 PLAIN = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 MISSING = ("", "nan", "na", "null", "-")
+HALF_YEAR_S = 182.5 * 86400.0
 T0 = datetime(2009, 8, 17, 12, 52, tzinfo=UTC)
 CELLS = (
     "nan", "NaN", "inf", "-inf", "Infinity", "1e308", "-1e308", "1e309", "1e-320", "-0.0", "0", "-1", "9" * 400,
@@ -255,7 +256,8 @@ def _time(cell: str, kind: str, scale: float) -> float:
     if kind == "irig":
         day, hour, minute, second = cell.strip().split(":")
         start = (datetime(T0.year, 1, 1, tzinfo=UTC) - T0).total_seconds()
-        return start + (int(day) - 1) * 86400.0 + int(hour) * 3600 + int(minute) * 60 + float(second)
+        seconds = start + (int(day) - 1) * 86400.0 + int(hour) * 3600 + int(minute) * 60 + float(second)
+        return seconds if seconds > -HALF_YEAR_S else seconds + 365 * 86400.0  # a flight across the turn of a year
     stamp = pd.Timestamp(cell.strip())
     stamp = stamp.tz_localize("UTC") if stamp.tzinfo is None else stamp
     return (stamp - pd.Timestamp(T0)).total_seconds()

@@ -79,6 +79,15 @@ def test_a_path_with_nul_is_refused(tmp_path):
         read_flight(tmp_path / "f")
 
 
+@pytest.mark.parametrize("name", [".", "./", "", ".."])
+def test_a_table_without_a_name_is_refused(tmp_path, name):
+    fuzzing.vehicle_cases(tmp_path / "v")
+    file = tmp_path / "v/vehicle.toml"
+    file.write_text(file.read_text().replace('table = "aero.csv"', f'table = "{name}"'))
+    with refuses("key-value", names=["aerodynamics"], kind=ConfigError):
+        vehicle_from_toml(file)
+
+
 def test_number_that_overflows_in_si_is_refused_with_its_line(tmp_path):
     fuzzing.write_flight(tmp_path / "f")
     file = tmp_path / "f/telemetry/accelerometer.csv"

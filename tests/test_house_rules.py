@@ -15,7 +15,7 @@ CODE = [p for p in SOURCES if "data" not in p.relative_to(ROOT).parts]
 DOORS = {
     "filterpy": {"recon/ekf.py"},
     "ppigrf": {"flightmodel/geomagnetism_and_sun.py"},
-    "erfa": {"flightmodel/geomagnetism_and_sun.py"},
+    "erfa": {"flightmodel/earth.py", "flightmodel/geomagnetism_and_sun.py"},
     "numba": "_kernels.py",
     "matplotlib": "postflight/plots/",
 }

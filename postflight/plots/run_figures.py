@@ -51,8 +51,13 @@ def draw_run(
     ``reran`` is the table of `postflight.sensitivity`. A figure that fails costs itself alone, with a
     `postflight.plots.style.FigureWarning`.
     """
-    if bounds is not None:
-        draw(folder / "figure_1_3.png", figure_1_3, flight, bounds)
+    draw_trajectory(flight, folder)
+    draw_deflections(flight, folder, answers)
+    draw_studies(flight, folder, bounds, reran)
+
+
+def draw_trajectory(flight: Reconstruction, folder: Path) -> None:
+    """Draw what the trajectory alone shows."""
     if flight.loads is not None:
         draw(folder / "figure_2_5.png", figure_2_5, flight)
     else:
@@ -63,6 +68,12 @@ def draw_run(
         draw(folder / "attitude_check.png", figure_attitude, flight, flight.attitude)
     draw(folder / "filter_and_smoother.png", figure_filter_and_smoother, flight)
     draw(folder / "residuals.png", figure_residuals, flight)
+    if flight.loads is not None:
+        _draw_static_trim(flight.loads, flight.flight, folder)
+
+
+def draw_deflections(flight: Reconstruction, folder: Path, answers: Deflections) -> None:
+    """Draw the answers of the methods, and what the fusion rests on."""
     if "misalignment" in answers.histories:
         draw(folder / "figure_2_7.png", figure_2_7, flight, answers.histories["misalignment"])
     if "camera" in answers.histories:
@@ -73,10 +84,14 @@ def draw_run(
         draw(folder / "fusion.png", _stamped(figure_fusion, flight.flight), answer.fused, answer.limbs, words)
         correlation = _stamped(figure_correlation, flight.flight)
         draw(folder / "correlation.png", correlation, answer.fused, answer.agreement.singular_values)
-    if flight.loads is not None:
-        _draw_static_trim(flight.loads, flight.flight, folder)
     if answers.histories:
         draw(folder / "summary.png", figure_summary, flight, answers)
+
+
+def draw_studies(flight: Reconstruction, folder: Path, bounds: Bounds | None, reran: pd.DataFrame | None) -> None:
+    """Draw the flight among rigid ones (Figure 1.3) and the sensitivity, where they are given."""
+    if bounds is not None:
+        draw(folder / "figure_1_3.png", figure_1_3, flight, bounds)
     if reran is not None and reran["quantity"].notna().any():
         draw(folder / "sensitivity.png", figure_sensitivity, flight, reran)
 

@@ -18,6 +18,7 @@ from flightmodel import earth
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR
+from flightmodel.statistics import chi_square_quantile
 from postflight.deflections import METHODS
 from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, drawn_unit
 from postflight.report.source import Rows, Run, kept_rows, rounded
@@ -191,7 +192,6 @@ def deflection_panel(run: Run) -> Panel | None:
 
 def residual_panels(run: Run) -> list[Panel]:
     """Residuals before each update, with three predicted sd and the gate; one panel a source and component."""
-    from scipy.stats import chi2
 
     table = run.tables["residuals"]
     table = table[table["used"].astype(bool)]
@@ -205,7 +205,7 @@ def residual_panels(run: Run) -> list[Panel]:
         r, sd = (scale * rows[c].to_numpy(float) for c in ("residual", "predicted_sd"))
         good = rows["accepted"].to_numpy(bool)
         kept = kept_rows([r, np.where(good, np.nan, r)], _RESIDUAL_POINTS // len(pairs))
-        gate = float(np.sqrt(chi2.ppf(chance, int(rows["together"].max()))))
+        gate = float(np.sqrt(chi_square_quantile(chance, int(rows["together"].max()))))
         out.append(
             {"id": f"residual_{len(out)}", "title": f"{source}: {component}", "unit": unit, "gate": round(gate, 3),
              "edited": int(np.count_nonzero(~good)), "of": len(rows),

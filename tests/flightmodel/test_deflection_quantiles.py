@@ -2,9 +2,17 @@
 
 import numpy as np
 import pytest
+from scipy.signal import find_peaks
 from scipy.stats import rice
 
-from flightmodel.deflection import QUANTILE_COLUMNS, QUANTILES, cycle_about, history_from_lateral, mean_over
+from flightmodel.deflection import (
+    QUANTILE_COLUMNS,
+    QUANTILES,
+    _clear_minima,
+    cycle_about,
+    history_from_lateral,
+    mean_over,
+)
 
 SD = np.deg2rad(0.2)
 
@@ -19,7 +27,7 @@ def history(size_rad, sd=SD, draws=None):
 def test_of_a_round_gaussian_they_are_those_of_rice(size_deg):
     got = history(np.deg2rad(size_deg)).theta_quantiles_rad[0]
     want = rice.ppf(QUANTILES, np.deg2rad(size_deg) / SD, scale=SD)
-    # 512 even draws know a quantile to a few hundredths of a sd
+    # even draws know a quantile to a few hundredths of a sd
     np.testing.assert_allclose(got, want, atol=0.06 * SD)
 
 
@@ -90,3 +98,11 @@ def test_what_does_not_stand_out_of_its_error_or_is_not_covered_is_no_cycle():
     assert cycle_about(swinging(1.0, keep=gap), 8.3) is None
     assert np.isnan(mean_over(swinging(1.0, keep=gap), (7.6, 9.2))).all()
     assert np.isnan(mean_over(swinging(1.0), (15.0, 17.0))).all()
+
+
+@pytest.mark.parametrize("rise", [0.5, 2.0, 5.0])
+def test_minima_that_stand_out_are_those_of_the_library(rise):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        values = np.cumsum(rng.standard_normal(200)) + rng.standard_normal(200)
+        np.testing.assert_array_equal(_clear_minima(values, rise), find_peaks(-values, prominence=rise)[0])

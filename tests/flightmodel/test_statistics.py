@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from flightmodel.atmosphere import (
     SOUNDING_CONSTANT_PART,
@@ -10,7 +11,19 @@ from flightmodel.atmosphere import (
     sounding_correlation_root,
     unresolved_variance,
 )
-from flightmodel.statistics import correlation, correlation_root, jackknife_variance, percentile_band
+from flightmodel.statistics import (
+    chi_square_quantile,
+    correlation,
+    correlation_root,
+    jackknife_variance,
+    percentile_band,
+)
+
+
+@pytest.mark.parametrize("degrees", [1, 3, 57.5])
+def test_quantiles_of_chi_square_are_those_of_the_library(degrees):
+    for p in (1e-4, 0.3, 0.9999):
+        assert chi_square_quantile(p, degrees) == pytest.approx(chi2.ppf(p, degrees), rel=1e-12)
 
 
 def test_correlation_is_a_constant_part_and_a_decay():

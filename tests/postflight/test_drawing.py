@@ -2,26 +2,42 @@
 
 import os
 import signal
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from postflight import drawing
+from postflight.deflections import Deflections
+
+FOLDER = Path("figures")
 
 
 def draw_here(monkeypatch):
     done = []
-    monkeypatch.setattr(drawing, "_draw", lambda job: done.append(job))
+    monkeypatch.setattr(drawing, "_draw", lambda part, *rest: done.append((part, *rest)))
     return done
+
+
+def all_parts(process):
+    process.trajectory("flight")
+    process.deflections(Deflections(bet="flight"))
+    process.studies(1, 2)
+
+
+def drawn(done):
+    parts = [("trajectory", ()), ("deflections", (Deflections(bet=None),)), ("studies", (1, 2))]
+    return done == [(part, "flight", FOLDER, arguments) for part, arguments in parts]
 
 
 def test_a_killed_process_costs_no_figure(monkeypatch):
     done = draw_here(monkeypatch)
-    with drawing.DrawingProcess() as process:
+    with drawing.DrawingProcess(FOLDER) as process:
         os.kill(process._process.pid, signal.SIGKILL)
         process._process.join()
-        with process.at_work(1, 2):
-            pass
-    assert done == [(1, 2)]
+        all_parts(process)
+        process.finish()
+    assert drawn(done)
 
 
 def test_a_process_that_cannot_start_costs_no_figure(monkeypatch):
@@ -31,52 +47,57 @@ def test_a_process_that_cannot_start_costs_no_figure(monkeypatch):
         raise OSError(11, "Resource temporarily unavailable")
 
     monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", refused)
-    with drawing.DrawingProcess() as process, process.at_work(1, 2):
-        pass
-    assert done == [(1, 2)]
+    with drawing.DrawingProcess(FOLDER) as process:
+        all_parts(process)
+        process.finish()
+    assert drawn(done)
 
 
-def test_a_fault_of_the_block_ends_the_process_before_it_is_raised():
-    with drawing.DrawingProcess() as process:
-        with pytest.raises(RuntimeError, match="own fault"), process.at_work("no job"):
-            raise RuntimeError("own fault")
-        assert not process._process.is_alive()
+def test_leaving_early_ends_the_process_whatever_it_was_given():
+    """Also where it has not begun to read: more than a pipe holds is on its way."""
+    with drawing.DrawingProcess(FOLDER) as process:
+        process.trajectory(bytes(10_000_000))
+        assert process._process.is_alive()
+    assert not process._process.is_alive()
 
 
 class Silent:
     """Stands for the other end: what it says is set beforehand."""
 
-    def __init__(self, says):
-        self.says = says
+    def __init__(self, *says):
+        self.says = list(says)
 
-    def send(self, _job):
+    def send_bytes(self, _job):
         pass
 
     def recv(self):
-        return self.says
-
-    def close(self):
-        pass
+        if not self.says:
+            raise EOFError
+        return self.says.pop(0)
 
 
 @pytest.fixture
-def answering(monkeypatch):
-    def with_answer(says):
-        process = drawing.DrawingProcess()
-        process._here, process._process = Silent(says), type("Ended", (), {"pid": None})
+def answering():
+    def with_answers(*says):
+        process = drawing.DrawingProcess(FOLDER)
+        process._here, process._sender = Silent(*says), ThreadPoolExecutor(1)
+        all_parts(process)
         return process
 
-    return with_answer
+    return with_answers
 
 
 def test_warnings_of_the_process_are_given_here(answering):
-    with (
-        pytest.warns(RuntimeWarning, match="fusion.png was not drawn"),
-        answering([(RuntimeWarning, "fusion.png was not drawn")]).at_work(),
-    ):
-        pass
+    with pytest.warns(RuntimeWarning, match="fusion.png was not drawn"):
+        answering([], [(RuntimeWarning, "fusion.png was not drawn")], []).finish()
 
 
 def test_a_file_that_cannot_be_written_is_raised_here(answering):
-    with pytest.raises(OSError, match="No space left"), answering(OSError(28, "No space left on device")).at_work():
-        pass
+    with pytest.raises(OSError, match="No space left"):
+        answering([], OSError(28, "No space left on device")).finish()
+
+
+def test_what_a_process_that_died_amid_its_work_did_not_draw_is_drawn_here(answering, monkeypatch):
+    done = draw_here(monkeypatch)
+    answering([]).finish()
+    assert [part for part, *_ in done] == ["deflections", "studies"]
