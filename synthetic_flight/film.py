@@ -20,7 +20,10 @@ written as images or as a playable film, with a table of the frames' times.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -38,6 +41,7 @@ from flightmodel.geomagnetism_and_sun import sun_direction_ecef
 from flightmodel.geometry import ShellGeometry, torus_circles
 from flightmodel.vehicle import CameraMount
 from synthetic_flight import sensing
+from synthetic_flight.ensemble import available_cores
 from synthetic_flight.instrument_errors import FilmQuality, Video
 from synthetic_flight.scenarios import Scenario, child_rng
 from synthetic_flight.simulate import Truth
@@ -121,43 +125,51 @@ class ShellRenderer:
         self, theta_rad: float, plane_lv_rad: float, sun_direction_body: FloatArray,
         warp: Warp | None = None, background: Background | None = None,
     ) -> Float32:  # fmt: skip
-        """Scene radiance ``(h, w)`` before errors of lens and sensor; one is full scale."""
-        self.stack.warp = warp
+        """Scene radiance ``(h, w)`` before errors of lens and sensor; one is full scale. Threads may ask at once."""
+        stack = copy(self.stack)
+        stack.warp = warp
         rotation = rotation_vector_body_shell(np.array(theta_rad), np.array(plane_lv_rad))
         dcm_shell_body = rotations.dcm_from_q(rotations.exp(-rotation))
         eye = dcm_shell_body @ (self.camera.position_body_m - self.joint_m) + self.joint_m
         sun = dcm_shell_body @ np.asarray(sun_direction_body, dtype=float)
         to_shell = dcm_shell_body.astype(np.float32)
         h, w = self.sky.shape
-        start = self._near_depth(to_shell, eye)
+        start = self._near_depth(stack, to_shell, eye)
         depth, shade = np.full((h, w), np.inf, dtype=np.float32), np.zeros((h, w), dtype=np.float32)
         for top in range(0, h, STRIP_ROWS):
             near = start[top : top + STRIP_ROWS].reshape(-1)
-            live = np.flatnonzero((near < self.stack.farthest_m) & self.is_clear[top : top + STRIP_ROWS].reshape(-1))
+            live = np.flatnonzero((near < stack.farthest_m) & self.is_clear[top : top + STRIP_ROWS].reshape(-1))
             if len(live) == 0:
                 continue
             rays = _Rays(_rotated(to_shell, self.rays[:, top : top + STRIP_ROWS].reshape(3, -1)[:, live]), eye)
-            t, gap = self.stack.march(rays, near[live], MARCHING_STEPS)
+            t, gap = stack.march(rays, near[live], MARCHING_STEPS)
             slow = np.flatnonzero(gap > 0.002)
-            t[slow], gap[slow] = self.stack.march(rays.some(slow), t[slow], 9 * MARCHING_STEPS, 1.6)
+            t[slow], gap[slow] = stack.march(rays.some(slow), t[slow], 9 * MARCHING_STEPS, 1.6)
             here = live + top * w
             depth.reshape(-1)[here] = np.where(gap < 0.004, t, np.inf)
-            shade.reshape(-1)[here] = self.stack.shade(rays, t, sun)
+            shade.reshape(-1)[here] = stack.shade(rays, t, sun)
         behind = self.sky if background is None else np.maximum(self.sky, self._earth(background))
-        return self._composed(depth, shade, to_shell, eye, np.asarray(sun_direction_body, dtype=float), behind)
+        return self._composed(stack, depth, shade, to_shell, eye, np.asarray(sun_direction_body, dtype=float), behind)
 
-    def _near_depth(self, to_shell: Float32, eye: FloatArray) -> Float32:
+    def _near_depth(self, stack: _Stack, to_shell: Float32, eye: FloatArray) -> Float32:
         """Depth ``(h, w)``, m, a little in front of the shell, from a march of many steps of every fourth ray."""
         coarse = self.rays[:, COARSE // 2 :: COARSE, COARSE // 2 :: COARSE]
         shape = coarse.shape[1:]
         rays = _Rays(_rotated(to_shell, coarse.reshape(3, -1)), eye)
-        t, gap = self.stack.march(rays, np.full(rays.across.shape, 0.05, dtype=np.float32), COARSE_STEPS)
+        t, gap = stack.march(rays, np.full(rays.across.shape, 0.05, dtype=np.float32), COARSE_STEPS)
         near = np.where(gap < 0.004, t, np.float32(np.inf)).reshape(shape)
         near = cv2.erode(near, np.ones((3, 3), np.uint8)) - np.float32(0.005)
         return np.asarray(cv2.resize(near, self.camera.size_px, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
 
     def _composed(
-        self, depth: Float32, shade: Float32, to_shell: Float32, eye: FloatArray, sun_body: FloatArray, behind: Float32
+        self,
+        stack: _Stack,
+        depth: Float32,
+        shade: Float32,
+        to_shell: Float32,
+        eye: FloatArray,
+        sun_body: FloatArray,
+        behind: Float32,
     ) -> Float32:
         """Shell over sky, its edge weighted by coverage, the centerbody over both."""
         hit = np.isfinite(depth).astype(np.uint8)
@@ -167,12 +179,12 @@ class ShellRenderer:
         if len(u):
             rays = _Rays(_rotated(to_shell, self.rays[:, v, u]), eye)
             sun = to_shell.astype(float) @ sun_body
-            t, gap = self.stack.closest(rays, cv2.erode(depth, kernel)[v, u])
+            t, gap = stack.closest(rays, cv2.erode(depth, kernel)[v, u])
             pixel_m = t / np.float32(self.camera.focal_px.mean())
             cover[v, u] = np.clip(0.5 - gap / pixel_m, 0.0, 1.0)
             # at the edge the line of sight grazes the surface: its shade there is that of the whole pixel
             graze = ~hit[v, u].astype(bool)
-            shade[v[graze], u[graze]] = self.stack.shade(rays, t, sun)[graze]
+            shade[v[graze], u[graze]] = stack.shade(rays, t, sun)[graze]
         picture = cover * shade + (1.0 - cover) * behind
         out: Float32 = np.where(self.is_clear, picture, self._centerbody_shade(sun_body))
         return out
@@ -524,18 +536,30 @@ def film(
             earth = Background(scene.nadir_body[k], float(scene.altitude_m[k]))
         return renderer.radiance(theta, plane, scene.sun_body[k], warp, earth)
 
-    def frames() -> Iterator[Image]:
-        for k in range(len(scene.theta_rad)):
-            if imaging.interlace_s:
-                early, late = (radiance(k, side * 0.5 * imaging.interlace_s) for side in (-1.0, 1.0))
-                # each field is open from its start to the other's: it moves while it is exposed
-                picture = 0.75 * early + 0.25 * late
-                picture[1::2] = 0.25 * early[1::2] + 0.75 * late[1::2]
-            else:
-                picture = radiance(k, 0.0)
-            yield record(picture, renderer.vignetting, imaging, rng)
+    def exposed(k: int) -> Float32:
+        if imaging.interlace_s:
+            early, late = (radiance(k, side * 0.5 * imaging.interlace_s) for side in (-1.0, 1.0))
+            # each field is open from its start to the other's: it moves while it is exposed
+            picture = 0.75 * early + 0.25 * late
+            picture[1::2] = 0.25 * early[1::2] + 0.75 * late[1::2]
+            return picture
+        return radiance(k, 0.0)
 
-    return frames()
+    pictures = _ahead(exposed, len(scene.theta_rad))
+    return (record(picture, renderer.vignetting, imaging, rng) for picture in pictures)
+
+
+def _ahead(make: Callable[[int], Float32], count: int) -> Iterator[Float32]:
+    """What is made of 0, 1, ..., in this order, a few ahead in threads: numpy's arithmetic runs beside Python."""
+    threads = available_cores()
+    waiting: deque[Future[Float32]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        for k in range(count):
+            waiting.append(pool.submit(make, k))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def render_video(
