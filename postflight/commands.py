@@ -23,7 +23,6 @@ from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate
-from postflight.drawing import DrawingProcess
 from postflight.filming import NO_VIDEO, by_camera
 from postflight.flight import Flight, read_flight
 from postflight.progress import progress_bar
@@ -31,6 +30,7 @@ from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
 from postflight.score import PUBLISHED_DEG, Score, score_run
+from postflight.second_process import SecondProcess
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import write_out
 from postflight.studies.preflight import Bounds, rigid_bounds
@@ -181,8 +181,8 @@ def run_flight(
 ) -> tuple[Reconstruction, Deflections, Path]:  # fmt: skip
     """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too.
 
-    ``show_answers`` is called with trajectory, deflections and events before tables and report are written. Figures are
-    drawn by a second process as soon as their numbers are there.
+    ``show_answers`` is called with trajectory, deflections and events before tables and report are written. The film is
+    read and figures are drawn by a second process as soon as their numbers are there.
     """
     log: list[str] = []
     stages = stages or Stages()
@@ -205,16 +205,16 @@ def run_flight(
     if flight.changes:
         settings["changes"] = list(flight.changes)
     new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
-    with new as out, DrawingProcess(out.path / "figures") as drawing:
+    with new as out, SecondProcess(out.path / "figures") as second:
         with progress_bar() as report:
-            bet, answers = _answered(flight, methods, steps(report), stages, drawing)
+            bet, answers = _answered(flight, methods, steps(report), stages, second)
         event_rows = run_folder.event_table(bet, bet.table)
         show_answers(bet, answers, event_rows)
         stages.end("printing the answers")
         with progress_bar() as report:
             step = steps(report)
             bounds, reran = _write_rest(out, bet, answers, reruns, step)
-            drawing.studies(bounds, reran)
+            second.draw_studies(bounds, reran)
             stages.end("bounds of the rigid vehicle")
             run_folder.write_reconstruction(out, bet, answers)
             run_folder.write_answers(out, answers)
@@ -226,28 +226,30 @@ def run_flight(
             out.write_facts()
             write_report(folder, out.path, flight.telemetry)
             stages.end("report")
-            drawing.finish()
+            second.finish()
             stages.end("figures that were not drawn meanwhile")
     return bet, answers, out.path
 
 
 def _answered(
     flight: Flight, methods: tuple[str, ...], step: Callable[[float, float], Progress], stages: Stages,
-    drawing: DrawingProcess,
+    second: SecondProcess,
 ) -> tuple[Reconstruction, Deflections]:  # fmt: skip
     """Trajectory and deflections, given to be drawn; a camera without video is among the methods that were refused."""
     own = warmup.ESTIMATES if "camera" in methods else warmup.ESTIMATES[:1]
     compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
     stages.end("compiling")
+    if "camera" in methods and len(flight.telemetry.films) == 1:
+        second.read_film(flight)
     bet = reconstruct(flight, None, step(0.05, 0.7))
     stages.end("trajectory")
-    drawing.trajectory(bet)
+    second.draw_trajectory(bet)
     wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
-    answers = estimate(bet, wanted, step(0.7, 1.0))
+    answers = estimate(bet, wanted, step(0.7, 1.0), second.film)
     stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
         answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
-    drawing.deflections(answers)
+    second.draw_deflections(answers)
     return bet, answers
 
 

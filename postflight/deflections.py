@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
 
-from estimators.camera import sensitivity_table
+from estimators.camera import FilmFit, sensitivity_table
 from estimators.misalignment import estimate_misalignment as misalignment_history
 from estimators.trim import estimate_trim as trim_history
 from flightmodel.checks import Fault, FloatArray, GateError, Progress
@@ -211,10 +212,16 @@ def fuse(bet: Reconstruction, progress: Progress | None = None) -> Deflections:
     return estimate(bet, wanted, progress)
 
 
-def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress: Progress | None = None) -> Deflections:
+def estimate(
+    flown: Flight | Reconstruction,
+    methods: tuple[str, ...],
+    progress: Progress | None = None,
+    film: Callable[[], FilmFit | None] = lambda: None,
+) -> Deflections:
     """Run the methods asked for; one that cannot answer says why, and does not stop the others.
 
-    A `Flight` without a trajectory has an answer of the camera alone.
+    A `Flight` without a trajectory has an answer of the camera alone. What ``film`` returns is taken for what the one
+    camera's film shows; without it the film is read.
     """
     report = progress or (lambda _fraction, _what: None)
     flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
@@ -224,7 +231,7 @@ def estimate(flown: Flight | Reconstruction, methods: tuple[str, ...], progress:
         report(k / len(methods), f"deflection from {method}")
         try:
             if method == "camera":
-                filmed = camera_answer(flight, bet, _part(report, k, len(methods)))
+                filmed = camera_answer(flight, bet, _part(report, k, len(methods)), film())
                 history = filmed.history
             elif bet is None:
                 raise GateError(f"{method}: needs a trajectory", "trajectory-missing")

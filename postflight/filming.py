@@ -129,7 +129,9 @@ def joint_swing(vehicle: Vehicle) -> JointSwing | None:
     return JointSwing(vehicle.free_free_frequency_hz(), vehicle.joint.bending_damping_nmsprad / critical)
 
 
-def camera_answer(flight: Flight, bet: Reconstruction | None, progress: Progress | None = None) -> CameraAnswer:
+def camera_answer(
+    flight: Flight, bet: Reconstruction | None, progress: Progress | None = None, film: FilmFit | None = None
+) -> CameraAnswer:
     """Deflection by the flight's cameras.
 
     Parameters
@@ -138,6 +140,8 @@ def camera_answer(flight: Flight, bet: Reconstruction | None, progress: Progress
     bet : Reconstruction or None
         Without it the benchmark frames are taken as undeflected.
     progress : callable, optional
+    film : FilmFit, optional
+        What the film of the flight's one camera shows, where it is read already.
 
     Raises
     ------
@@ -146,7 +150,7 @@ def camera_answer(flight: Flight, bet: Reconstruction | None, progress: Progress
     """
     films = flight.telemetry.films
     if len(films) < 2:
-        film = camera_film(flight, progress=progress)
+        film = camera_film(flight, progress=progress) if film is None else film
         history = _with_benchmark_deflection(film, flight, bet)
         table = film.frame_table(history)
         table.insert(0, "camera", next(iter(films)))

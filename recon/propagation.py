@@ -271,10 +271,12 @@ def fill_between(motion: Motion, node_index: IntArray, known: IntArray, at_known
     is_known = np.zeros(n, dtype=bool)
     is_known[known] = True
     errors = np.ascontiguousarray(at_known.sensor_errors[np.cumsum(is_known) - 1])
+    split, unused = motion.split(), (np.empty((9, 9 + motion.drivers)), np.empty((9, 9)))
     for k in np.flatnonzero(~is_known):
-        before = States(position[k - 1], velocity[k - 1], q[k - 1], errors[k - 1])
-        state = propagate(motion, node_index[k - 1], node_index[k], before).state
-        position[k], velocity[k], q[k] = state.position_ecef_m, state.velocity_ecef_mps, state.q_ecef_body
+        state = position[k], velocity[k], q[k]
+        for row, before in zip(state, (position[k - 1], velocity[k - 1], q[k - 1]), strict=True):
+            row[:] = before
+        _filter_kernels.propagate_one(*split, node_index[k - 1], node_index[k], errors[k - 1], *state, *unused)
     return States(position, velocity, rotations.continuous(q), errors)
 
 

@@ -83,7 +83,7 @@ def lag_between(
             continue
         at = begin + np.arange(0.0, _WINDOW_S, _STEP_S)
         lags = about_s + np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1e-9, _LAG_STEP_S)
-        shifted = [interpolate_rows(at - lag, wt, turning) for lag in lags]
+        shifted = interpolate_rows((at - lags[:, None]).ravel(), wt, turning).reshape(len(lags), len(at), -1)
         damping = _ARM_M / max(float(np.interp(begin + 0.5 * _WINDOW_S, time_s, speed)), 1.0)
         both = (_lag_in_window(interpolate_rows(at, ft, f)[:, i], shifted, lags, i) for i in (1, 2))
         lags_found += [(*one, damping) for one in both if one is not None]
@@ -108,16 +108,13 @@ def has_gap(sensor: BridgedSensor, begin: float) -> bool:
     return bool(gaps.any())
 
 
-def _lag_in_window(
-    force: FloatArray, shifted: list[FloatArray], lags: FloatArray, axis: int
-) -> tuple[float, float] | None:
-    """Lag and its sd by one axis (1 or 2) of one window, from rates and angular accelerations (n, 6) at each lag."""
+def _lag_in_window(force: FloatArray, shifted: FloatArray, lags: FloatArray, axis: int) -> tuple[float, float] | None:
+    """Lag and its sd by one axis (1 or 2) of one window, from rates and angular accelerations (l, n, 6) at the lags."""
     u = np.linspace(-0.5, 0.5, len(force))
     slow = np.column_stack([np.ones_like(u), u, u**2])
-    rest = np.empty(len(lags))
-    for k, w in enumerate(shifted):
-        normal = w[:, 3 + 3 - axis]
-        rest[k] = _residual_square(force, np.column_stack([slow, normal, normal * u, w[:, 0] * w[:, axis]]))
+    normal = shifted[..., 3 + 3 - axis]
+    moving = np.stack([normal, normal * u, shifted[..., 0] * shifted[..., axis]], axis=-1)
+    rest = _residual_square(force, np.concatenate([np.broadcast_to(slow, moving.shape), moving], axis=-1))
     k = int(np.argmin(rest))
     if not 0 < k < len(lags) - 1 or rest[k] > (1.0 - _LEAST_EXPLAINED) * _residual_square(force, slow):
         return None
@@ -128,11 +125,11 @@ def _lag_in_window(
     return float(lag), float(np.sqrt(least / len(force) * (CORRELATION_S / _STEP_S) / curvature) * _LAG_STEP_S)
 
 
-def _residual_square(y: FloatArray, columns: FloatArray) -> float:
-    """Sum of squares that a least-squares fit leaves."""
+def _residual_square(y: FloatArray, columns: FloatArray) -> FloatArray:
+    """Sums of squares (...) that least-squares fits of columns (..., n, k) to (n,) leave."""
     orthogonal, _ = np.linalg.qr(columns)
-    rest = y - orthogonal @ (orthogonal.T @ y)
-    return float(rest @ rest)
+    rest = y - (orthogonal @ (y @ orthogonal)[..., None])[..., 0]
+    return np.asarray(np.sum(rest * rest, axis=-1))
 
 
 def _combined(lags: FloatArray) -> Lag:

@@ -1,6 +1,7 @@
 """The command's own ``main`` in this process: the same codes and words without two seconds of imports.
 
-Figures are drawn here too, as where their process cannot be started: `tests.postflight.test_drawing` has that process.
+Films are read and figures drawn here too, as where the second process cannot be started:
+`tests.postflight.test_second_process` has that one.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ def draw_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let figures be drawn by this process."""
     from multiprocessing.context import SpawnProcess
 
-    from postflight import drawing
+    from postflight import second_process
 
     class NoProcess(SpawnProcess):
         def start(self) -> None:
             raise OSError("not started by tests")
 
-    monkeypatch.setattr(drawing, "Process", NoProcess)
+    monkeypatch.setattr(second_process, "Process", NoProcess)
 
 
 def runner(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:

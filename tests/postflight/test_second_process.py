@@ -1,4 +1,4 @@
-"""The process that draws a run's figures: its warnings arrive, and where it dies the figures are drawn all the same."""
+"""The process beside a run's own: its warnings arrive, and where it dies its work is done all the same."""
 
 import os
 import signal
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from postflight import drawing
+from postflight import second_process
 from postflight.deflections import Deflections
 
 FOLDER = Path("figures")
@@ -15,14 +15,14 @@ FOLDER = Path("figures")
 
 def draw_here(monkeypatch):
     done = []
-    monkeypatch.setattr(drawing, "_draw", lambda part, *rest: done.append((part, *rest)))
+    monkeypatch.setattr(second_process, "_draw", lambda part, *rest: done.append((part, *rest)))
     return done
 
 
 def all_parts(process):
-    process.trajectory("flight")
-    process.deflections(Deflections(bet="flight"))
-    process.studies(1, 2)
+    process.draw_trajectory("flight")
+    process.draw_deflections(Deflections(bet="flight"))
+    process.draw_studies(1, 2)
 
 
 def drawn(done):
@@ -32,10 +32,12 @@ def drawn(done):
 
 def test_a_killed_process_costs_no_figure(monkeypatch):
     done = draw_here(monkeypatch)
-    with drawing.DrawingProcess(FOLDER) as process:
+    with second_process.SecondProcess(FOLDER) as process:
+        process.read_film("flight")
         os.kill(process._process.pid, signal.SIGKILL)
         process._process.join()
         all_parts(process)
+        assert process.film() is None
         process.finish()
     assert drawn(done)
 
@@ -47,7 +49,7 @@ def test_a_process_that_cannot_start_costs_no_figure(monkeypatch):
         raise OSError(11, "Resource temporarily unavailable")
 
     monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", refused)
-    with drawing.DrawingProcess(FOLDER) as process:
+    with second_process.SecondProcess(FOLDER) as process:
         all_parts(process)
         process.finish()
     assert drawn(done)
@@ -55,8 +57,8 @@ def test_a_process_that_cannot_start_costs_no_figure(monkeypatch):
 
 def test_leaving_early_ends_the_process_whatever_it_was_given():
     """Also where it has not begun to read: more than a pipe holds is on its way."""
-    with drawing.DrawingProcess(FOLDER) as process:
-        process.trajectory(bytes(10_000_000))
+    with second_process.SecondProcess(FOLDER) as process:
+        process.draw_trajectory(bytes(10_000_000))
         assert process._process.is_alive()
     assert not process._process.is_alive()
 
@@ -79,7 +81,7 @@ class Silent:
 @pytest.fixture
 def answering():
     def with_answers(*says):
-        process = drawing.DrawingProcess(FOLDER)
+        process = second_process.SecondProcess(FOLDER)
         process._here, process._sender = Silent(*says), ThreadPoolExecutor(1)
         all_parts(process)
         return process
@@ -101,3 +103,11 @@ def test_what_a_process_that_died_amid_its_work_did_not_draw_is_drawn_here(answe
     done = draw_here(monkeypatch)
     answering([]).finish()
     assert [part for part, *_ in done] == ["deflections", "studies"]
+
+
+def test_the_film_is_what_comes_first(answering):
+    process = answering("what it shows", [], [], [])
+    process._reading = True
+    assert process.film() == "what it shows"
+    assert process.film() is None
+    process.finish()

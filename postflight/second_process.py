@@ -1,0 +1,165 @@
+"""What does a second process do for a run? It reads the film while the first one reconstructs, then draws the figures.
+
+Figures take as much processor time as the trajectory, and nothing waits for them but the end of the command; a film
+takes a quarter of it, and needs no trajectory. The process is started early, so that it has matplotlib loaded when
+there is something to draw, and is given each part of the figures as soon as its numbers are there. It ends with the
+process that started it, however that ends. Where it cannot be started, or is killed, what is missing is done here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import signal
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import pandas as pd
+
+from estimators.camera import FilmFit
+from flightmodel.checks import GateError
+from postflight.deflections import Deflections
+from postflight.filming import camera_film
+from postflight.flight import Flight
+from postflight.reconstruction import Reconstruction
+from postflight.studies.preflight import Bounds
+
+Process = multiprocessing.get_context("spawn").Process  # a fork would copy locks that other threads hold
+_Part = Literal["trajectory", "deflections", "studies"]  # functions draw_... of `postflight.plots.run_figures`
+_Warnings = list[tuple[type[Warning], str]]
+
+
+class SecondProcess:
+    """A process that works beside this one: use as a context, inside that of the folder it draws into.
+
+    Parameters
+    ----------
+    figures : Path
+        Folder of the figures.
+    """
+
+    def __init__(self, figures: Path) -> None:
+        self._figures = figures
+        self._flight: Reconstruction | None = None
+        self._drawing: list[tuple[_Part, tuple[Any, ...]]] = []
+        self._reading = False
+
+    def __enter__(self) -> SecondProcess:
+        """Start it."""
+        self._here, there = multiprocessing.Pipe()
+        self._process = Process(target=_serve, args=(there, self._figures), daemon=True)
+        with contextlib.suppress(OSError):
+            self._process.start()
+        there.close()
+        self._sender = ThreadPoolExecutor(1)  # the other may not be ready to take it
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        """End it, also in the middle of its work."""
+        if self._process.pid is not None:
+            self._process.terminate()
+            self._process.join()
+        self._sender.shutdown(cancel_futures=True)
+        self._here.close()
+
+    def read_film(self, flight: Flight) -> None:
+        """Let it read the film of a flight's one camera (`camera_film`)."""
+        self._reading = True
+        self._send(("film", (flight,)))
+
+    def film(self) -> FilmFit | None:
+        """What the film shows, once it is read; None where that was not asked for or could not be done."""
+        found: FilmFit | None = None
+        if self._reading:
+            self._reading = False
+            with contextlib.suppress(EOFError, OSError):
+                found = self._here.recv()
+        return found
+
+    def draw_trajectory(self, flight: Reconstruction) -> None:
+        """Let it draw the trajectory."""
+        self._flight = flight
+        self._send(("flight", (flight,)))
+        self._draw("trajectory")
+
+    def draw_deflections(self, answers: Deflections) -> None:
+        """Let it draw the answers; after the trajectory."""
+        self._draw("deflections", replace(answers, bet=None))  # which it has
+
+    def draw_studies(self, bounds: Bounds | None, reran: pd.DataFrame | None) -> None:
+        """Let it draw Figure 1.3 and the sensitivity; after the trajectory."""
+        self._draw("studies", bounds, reran)
+
+    def finish(self) -> None:
+        """Wait until everything is drawn; warnings of the other process are given here.
+
+        Raises
+        ------
+        OSError
+            Where it could not write a file.
+        """
+        self.film()
+        for part, arguments in self._drawing:
+            try:
+                found: _Warnings | OSError = self._here.recv()
+            except (EOFError, OSError):
+                _draw(part, self._flight, self._figures, arguments)
+                continue
+            if isinstance(found, OSError):
+                raise found
+            for category, words in found:
+                warnings.warn(category(words), stacklevel=2)
+
+    def _draw(self, part: _Part, *arguments: Any) -> None:
+        self._drawing.append((part, arguments))
+        self._send((part, arguments))
+
+    def _send(self, what: Any) -> None:
+        # where nobody receives, those who wait for an answer find out
+        self._sender.submit(self._here.send_bytes, ForkingPickler.dumps(what))
+
+
+def _draw(part: _Part, flight: Reconstruction | None, figures: Path, arguments: tuple[Any, ...]) -> None:
+    from postflight.plots import run_figures
+
+    getattr(run_figures, f"draw_{part}")(flight, figures, *arguments)
+
+
+def _drawn(part: _Part, flight: Reconstruction | None, figures: Path, arguments: tuple[Any, ...]) -> Any:
+    """Draw, and return the warnings, or why a file could not be written."""
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        try:
+            _draw(part, flight, figures, arguments)
+        except OSError as fault:
+            return fault
+    return [(one.category, str(one.message)) for one in given]
+
+
+def _film(flight: Flight) -> FilmFit | None:
+    """What the film shows; None where it cannot be used, which the first process then finds out and says."""
+    try:
+        return camera_film(flight)
+    except (GateError, OSError):
+        return None
+
+
+def _serve(connection: Connection, figures: Path) -> None:
+    """Be ready, do what is asked in its order, and send back what came of it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is for the process that started this one
+    flight: Reconstruction | None = None
+    with contextlib.suppress(EOFError, BrokenPipeError):
+        while True:
+            if not connection.poll():
+                import postflight.plots.run_figures  # noqa: F401 - makes ready while nothing is asked
+            kind, arguments = connection.recv()
+            if kind == "flight":
+                (flight,) = arguments
+            else:
+                connection.send(_film(*arguments) if kind == "film" else _drawn(kind, flight, figures, arguments))
