@@ -27,6 +27,7 @@ from flightmodel.checks import FloatArray
 from flightmodel.telemetry import Telemetry
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -134,15 +135,15 @@ def _without_tex(figure: Figure) -> None:
     from matplotlib.axis import Axis
     from matplotlib.text import Text
 
-    ticks = {
-        id(text)
-        for axis in figure.findobj(Axis)
-        for tick in (*axis.majorTicks, *axis.minorTicks)
-        for text in (tick.label1, tick.label2)
-    }
-    for text in figure.findobj(Text):
-        if id(text) not in ticks:
-            text.set_parse_math(False)
+    artists: list[Artist] = [figure]
+    while artists:
+        artist = artists.pop()
+        if isinstance(artist, Axis):  # whose children are made by looking at them
+            artists += [artist.label, artist.offsetText]
+            continue
+        if isinstance(artist, Text):
+            artist.set_parse_math(False)
+        artists += artist.get_children()
 
 
 def band(
