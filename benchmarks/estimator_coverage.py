@@ -273,6 +273,7 @@ def report(results):
     print(f"{'':18}  {head}")
     for name in dict.fromkeys(n for r in rows for n in r["rows"]):
         a = np.array([r["rows"][name] for r in rows if name in r["rows"]])
+        a = a[np.isfinite(a[:, 0])]
         z, bent = a[:, 0] / a[:, 1], a[:, 4] > np.deg2rad(1.0)
         rms = np.sqrt(np.mean(a[:, 0] ** 2))
         share = [100.0 * np.mean(np.abs(z) < k) for k in (1, 2)]
@@ -297,6 +298,7 @@ def report_quantiles(rows):
     print(f"share of the truths below the quantiles {stated} %, by the true deflection")
     for name in dict.fromkeys(n for r in rows for n in r["rows"] if n != "angle of attack"):
         a = np.array([r["rows"][name] for r in rows if name in r["rows"]])
+        a = a[np.isfinite(a[:, 0])]
         for low, high in pairwise(BINS_DEG):
             below = a[(np.rad2deg(a[:, 4]) >= low) & (np.rad2deg(a[:, 4]) < high), 6:]
             if len(below):
