@@ -4,7 +4,8 @@ Run: ``python benchmarks/estimator_coverage.py [FLIGHTS [FIRST SEED]] [FOLDER] [
 flights from seed 0). Drawn anew for each seed, as `tests.wide_flights` says: spin, joint, damping, offset, size and
 mass of the vehicle, and what is unknown of it. No video. Some 4 s a flight on each of two cores; what the
 estimators see and the truth are kept in FOLDER, so that the estimators can be scored again without flying. The
-camera's history is drawn, not rendered. ``--planted`` spoils one assumption at a time, with uncertainties as the
+camera's history is drawn, not rendered. Beside errors over their sd the quantiles are scored: the share of truths below
+each, for little, some and much deflection. ``--planted`` spoils one assumption at a time, with uncertainties as the
 reference vehicle's file states them; ``suspects_bound.py`` says how well the same errors could be found at all.
 ``--packages`` scores flights of another simulator: folders with flight.toml and truth/truth.csv.
 """
@@ -17,6 +18,7 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import fields, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +37,7 @@ from flightmodel import rotations
 from flightmodel.airdata import air_data, lateral_angles
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import DivergenceError, GateError
-from flightmodel.deflection import history_from_lateral, polar_from_lateral
+from flightmodel.deflection import QUANTILES, history_from_lateral, polar_from_lateral
 from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
@@ -68,6 +70,7 @@ PLANTED = {  # and the right suspect
     OFFSET: OFFSET,
     CAMERA_MISALIGNED: CAMERA_MISALIGNED,
 }
+BINS_DEG = (0.0, 0.5, 2.0, 90.0)  # of the true deflection: a locked joint's, about 1 deg, more
 TURN_YZ_RAD = np.deg2rad(0.5) * np.array([0.6, 0.8])
 
 
@@ -235,7 +238,7 @@ def safely(out, work):
 
 
 def row_of(history, pulse, truth):
-    """Angle error, its sd, plane error, its sd, true angle, lateral normalised square; rad."""
+    """Angle error, its sd, plane error, its sd, true angle, lateral normalised square; below which quantiles it is."""
     k = int(np.argmin(np.abs(history.time_s - truth["peak"])))
     true = truth["theta_yz"][int(np.argmin(np.abs(pulse.time_s - history.time_s[k])))]
     size, d, cov = float(np.hypot(*true)), history.theta_yz_rad[k] - true, history.lateral_cov[k]
@@ -246,6 +249,7 @@ def row_of(history, pulse, truth):
     square = float(d @ np.linalg.solve(cov, d))
     return (
         history.theta_rad[k] - size, history.theta_sd_rad[k], turn, np.sqrt(history.covariance[k, 1, 1]), size, square,
+        *(size < history.theta_quantiles_rad[k]),
     )  # fmt: skip
 
 
@@ -269,6 +273,7 @@ def report(results):
     print(f"{'':18}  {head}")
     for name in dict.fromkeys(n for r in rows for n in r["rows"]):
         a = np.array([r["rows"][name] for r in rows if name in r["rows"]])
+        a = a[np.isfinite(a[:, 0])]
         z, bent = a[:, 0] / a[:, 1], a[:, 4] > np.deg2rad(1.0)
         rms = np.sqrt(np.mean(a[:, 0] ** 2))
         share = [100.0 * np.mean(np.abs(z) < k) for k in (1, 2)]
@@ -281,9 +286,24 @@ def report(results):
             plane = np.rad2deg(np.sqrt(np.mean(a[bent, 2] ** 2)))
             words += f"{plane:28.1f}{100 * np.mean(np.abs(zp) < 1):8.0f}{100 * np.mean(np.abs(zp) < 2):8.0f}"
         print(words)
+    report_quantiles(rows)
     for video in ("no video", *CAMERA_SD):
         said = [r["seed"] for r in rows if r.get("disagree", {}).get(video)]
         print(f"said to disagree, {video}: {len(said)} of {len(rows)} {said}")
+
+
+def report_quantiles(rows):
+    """Share of the truths below each quantile, by the size of the true deflection."""
+    stated = ", ".join(f"{100.0 * p:.0f}" for p in QUANTILES)
+    print(f"share of the truths below the quantiles {stated} %, by the true deflection")
+    for name in dict.fromkeys(n for r in rows for n in r["rows"] if n != "angle of attack"):
+        a = np.array([r["rows"][name] for r in rows if name in r["rows"]])
+        a = a[np.isfinite(a[:, 0])]
+        for low, high in pairwise(BINS_DEG):
+            below = a[(np.rad2deg(a[:, 4]) >= low) & (np.rad2deg(a[:, 4]) < high), 6:]
+            if len(below):
+                shares = ", ".join(f"{100.0 * x:.0f}" for x in below.mean(axis=0))
+                print(f"{name:18}{low:4.1f} to {high:4.1f} deg, {len(below):3d} flights: {shares} %")
 
 
 def score_packages(folder):
