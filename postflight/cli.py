@@ -352,12 +352,13 @@ def run(
 @click.argument("folder", type=FOLDER)
 @click.option("--hardening", is_flag=True, help="Ask whether the spring hardens (or softens) with the angle.")
 @click.option("--freeplay", is_flag=True, help="Ask whether the joint has freeplay.")
+@click.option("--creep", is_flag=True, help="Ask whether part of the joint's compliance comes late.")
 @click.option("--posterior", is_flag=True, help="Sample the posterior (emcee), evidence by dynesty.")
-def reconcile(folder: Path, hardening: bool, freeplay: bool, posterior: bool) -> None:
+def reconcile(folder: Path, hardening: bool, freeplay: bool, creep: bool, posterior: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
     from postflight.reconciliation import command
 
-    command.run(folder, ("freeplay",) * freeplay + ("hardening",) * hardening, posterior)
+    command.run(folder, ("freeplay",) * freeplay + ("creep",) * creep + ("hardening",) * hardening, posterior)
 
 
 @cli.command()

@@ -36,8 +36,8 @@ STATES, CREEP_STATES, AUX = 20, 2, 18
 
 # parameters of a vehicle: masses of body and shell, 1/m_B, 1/m_A, m_A/m, -m_B/m, 1/m; of the body, then of the shell,
 # inertia, its inverse, and -[p] I^-1 [p] of the arm p from c.g. to joint (6 each: xx xy xz yy yz zz); those arms; nose
-# from the shell's c.g.; the joint's nine numbers; area, length; factors on C_A, C_N, C_m, shift of C_mq; of the creep its
-# compliance (delayed, rad per N m) and 1 / time constant
+# from the shell's c.g.; the joint's nine numbers; area, length; factors on C_A, C_N, C_m, shift of C_mq; the delayed
+# compliance, rad/(N m), and 1 / its time constant
 M_B, M_A, PER_B, PER_A, SHARE_B, SHARE_A, PER_MASS = 0, 1, 2, 3, 4, 5, 6
 I_B, W_B, N_B, I_A, W_A, N_A = 7, 13, 19, 25, 31, 37
 P_B, P_A, NOSE_A, JOINT, REFERENCE, FACTOR, DELAYED = 43, 46, 49, 52, 61, 63, 67
@@ -486,7 +486,7 @@ def _advance(s, w, stage, step):
 
 @inlined
 def _advance_creep(s, w, creep, stage, step):
-    """`_advance` of the creep; of one function for both, with rows as arguments, ensembles would be a quarter slower."""
+    """`_advance` of the creep: with one function for both, rows as arguments, ensembles take a quarter longer."""
     n, ahead, share = len(creep) * w, step * (1.0 if stage == 2 else 0.5), step / (6.0 if stage == 0 else 3.0)
     for k in range(CREEP * w, CREEP * w + n):
         s[k + 3 * n] = (s[k] if stage == 0 else s[k + 3 * n]) + share * s[k + 2 * n]

@@ -35,15 +35,17 @@ from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_c
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.fit import JointFit, LawSelection, part_of
 from postflight.reconciliation.forward_model import (
+    CREEP_TIME_LOG_SD,
     DAMPING_LOG_SD,
     DEFLECTION,
     FREEPLAY_SD_RAD,
     HARDENING_SD,
-    MOTION,
     OFFSET_SD_M,
     STIFFNESS_LOG_SD,
     WINDOWS,
     VehicleParameters,
+    creep_share,
+    creep_time_s,
     resolved_stiffness_nmprad,
 )
 from postflight.reconciliation.gauss_newton import Linearization, NormalEquations, Parameters, descend
@@ -102,6 +104,26 @@ class _LinearQuantity:
         return np.abs(value) if self.is_size else value
 
 
+def _creep_rows(fit: JointFit, reach: float) -> list[tuple[object, ...]]:
+    """Rows of `joint_table`: share of the compliance that comes late and its time constant, factors of either."""
+    names = fit.problem.vehicle_parameters.names
+    if "creep" not in names:
+        return []
+    share_at, time_at = names.index("creep"), names.index("creep time")
+    x, sd = fit.parameters.vehicle, np.sqrt(np.diag(fit.covariance))
+    file = fit.problem.vehicle_parameters.nominal.joint
+    share, share_sd = x[share_at], sd[share_at]
+    ends = [float(creep_share(share + side * reach * share_sd)) for side in (-1.0, 1.0)]
+    found, far = float(creep_share(share)), float(creep_share(share + DIFFERENCE))
+    time_s, log_sd = float(creep_time_s(x[time_at])), CREEP_TIME_LOG_SD * float(sd[time_at])
+    times = [time_s * float(np.exp(side * reach * log_sd)) for side in (-1.0, 1.0)]
+    slope = (far - found) / DIFFERENCE
+    return [
+        ("creep share", "", file.creep_share, found, slope * float(share_sd), *ends, "estimate"),
+        ("creep time", "s", file.creep_time_s, time_s, time_s * log_sd, *times, "estimate"),
+    ]
+
+
 def _linear_quantities(parameters: VehicleParameters) -> list[_LinearQuantity]:
     """Static stability, and the coefficients of the laws that the joint has."""
     known = {
@@ -145,6 +167,7 @@ def joint_table(fit: JointFit) -> pd.DataFrame:
     for linear in _linear_quantities(vehicle_parameters):
         at, sd = float(linear.of(x)), linear.scale * float(np.sqrt(covariance[linear.index, linear.index]))
         rows.append((linear.label, linear.unit, linear.nominal, at, sd, at - reach * sd, at + reach * sd, "estimate"))
+    rows += _creep_rows(fit, reach)
     return pd.DataFrame(rows, columns=["quantity", "unit", "told", "found", "sd", "low", "high", "kind"])
 
 
@@ -218,7 +241,7 @@ def deflection_of(fit: JointFit) -> DeflectionHistory:
     lateral = np.column_stack([rotation[:, 2], -rotation[:, 1]])
     at_start = np.empty((measured.spans, 2, 2))
     for span in range(measured.spans):
-        at = problem.first_motion + MOTION * span + DEFLECTION.start + np.array([2, 1])
+        at = problem.first_motion + problem.motion * span + DEFLECTION.start + np.array([2, 1])
         at_start[span] = fit.covariance[np.ix_(at, at)] * np.array([[1.0, -1.0], [-1.0, 1.0]])
     assumptions = "by the simulator with the reconciled joint, from accelerometers and rates"
     covariance = np.repeat(at_start, WINDOWS, axis=0)
@@ -241,6 +264,8 @@ def vehicle_file_lines(fit: JointFit) -> str:
         lines.append(f"freeplay_deg = {joint.freeplay_deg:.6g}")
     if "hardening" in fit.problem.vehicle_parameters.laws:
         lines.append(f"hardening_nmprad3 = {joint.hardening_nmprad3:.6g}")
+    if "creep" in fit.problem.vehicle_parameters.laws:
+        lines += [f"creep_share = {joint.creep_share:.6g}", f"creep_time_s = {joint.creep_time_s:.6g}"]
     return "\n".join(lines) + "\n"
 
 
@@ -393,6 +418,10 @@ def quantities(vehicle_parameters: VehicleParameters, x: FloatArray) -> pd.DataF
     out = pd.DataFrame([_joint(vehicle_parameters.vehicle(row)) for row in x])
     for linear in _linear_quantities(vehicle_parameters):
         out[linear.column] = linear.of(x)
+    names = vehicle_parameters.names
+    if "creep" in names:
+        out["creep_share"] = creep_share(x[:, names.index("creep")])
+        out["creep_time_s"] = creep_time_s(x[:, names.index("creep time")])
     return out
 
 

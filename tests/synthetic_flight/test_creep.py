@@ -31,7 +31,9 @@ SMALL_RAD = 1e-4  # squares of it are 1e-8
 def test_a_free_joint_moves_as_the_linear_solid(vehicle, measured, share, time_s):
     """``I e'' = -K (e - b) - C e'``, ``tau b' + b = s / (1 - s) (e - b)``: twenty seconds, fifty periods."""
     one = with_joint(vehicle, creep_share=share, creep_time_s=time_s)
-    body = one.centerbody.model_copy(update={"cg_from_datum_body_m": (one.centerbody.cg_from_datum_body_m[0], 0.0, 0.0)})
+    body = one.centerbody.model_copy(
+        update={"cg_from_datum_body_m": (one.centerbody.cg_from_datum_body_m[0], 0.0, 0.0)}
+    )
     one = replace(one, centerbody=body)
     inertia, damping, stiffness = dynamics.joint_modes(one)["bending"]
     ratio = share / (1.0 - share)
