@@ -1,14 +1,14 @@
 """Does it matter that a real shell creeps? Flights whose joint does, through every estimate that is made of a flight.
 
-Run: ``python benchmarks/joint_memory.py [FLIGHTS] [--first SEED] [--joints FIRST:LAST] [--out FILE] [--kept FOLDER]`` (3
-flights of each joint). The joints are standard linear solids: a tenth, three tenths and half of the compliance come late, with 1,
-10 and 60 s; the stiffness against loads that stay is drawn as that of `benchmarks/reconciliation.py`'s joints, so that
-no vehicle diverges. All else is dispersed as there. Printed are, joint by joint, rms errors and the rms of error over
-the stated sd: of misalignment, trim and their fusion at peak pressure (both lateral axes), of the benchmark frame's
-deflection (`estimators.benchmark`, DRAWS films' readings drawn from the true deflection), and of the reconciliation's
-stiffness (against fast motion), damping ratio, offset, stability and deflection at peak pressure, with one
-stiffness and with what the evidence selects; and which of its checks are red. ``--kept FOLDER`` keeps what the
-benchmark frame's deflection is made of, and ``--frames FOLDER`` scores that alone again.
+Run: ``python benchmarks/joint_memory.py [FLIGHTS] [--first SEED] [--joints FIRST:LAST] [--out FILE] [--kept FOLDER]``
+(3 flights of each joint). The joints are standard linear solids: a tenth, three tenths and half of the compliance come
+late, with 1, 10 and 60 s; the stiffness against loads that stay is drawn as that of `benchmarks/reconciliation.py`'s
+joints, so that no vehicle diverges. All else is dispersed as there. Printed are, joint by joint, rms errors and the rms
+of error over the stated sd: of misalignment, trim and their fusion at peak pressure (both lateral axes), of the
+benchmark frame's deflection (`estimators.benchmark`, `DRAWS` films' readings drawn from the true deflection), and of
+the reconciliation's stiffness (against fast motion), damping ratio, offset, stability and deflection at peak pressure,
+with one stiffness and with what the evidence selects; and which of its checks are red. ``--kept FOLDER`` keeps what the
+benchmark frame's deflection is made of, and ``--frames FOLDER`` scores that alone again. About two minutes a flight.
 
 Dry friction is not flown: the simulator's joint has none. The estimators of a flight do not use the joint's law; the
 benchmark frame's deflection does, and is also drawn with play operators (Prandtl) on the flight's own moment, of the
@@ -18,6 +18,7 @@ size of the shell that was loaded on the ground: a third of the compliance, slip
 import json
 import pickle
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -25,15 +26,20 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from benchmarks.reconciliation import TOLD, flown_vehicle, reconstructed
+from benchmarks.reconciliation import TOLD, flown_vehicle
 from estimators.benchmark import RelativeDeflections, benchmark_deflection, joint_moment
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from flightmodel.checks import GateError
+from flightmodel.flightfolder import read_flight
 from flightmodel.statistics import correlation_root
 from postflight.deflections import estimate
+from postflight.flight import Flight
 from postflight.reconciliation.credibility import credibility
 from postflight.reconciliation.fit import select_laws
 from postflight.reconciliation.posterior import deflection_of, joint_table
+from postflight.reconstruction import reconstruct
+from synthetic_flight.folder import simulate_to_folder
+from tests.recon import dispersed
 
 JOINTS = [(0.0, 10.0), *((share, time_s) for share in (0.1, 0.3, 0.5) for time_s in (1.0, 10.0, 60.0))]
 DRAWS, FRAMES, PRIOR_RAD, READ_SD_RAD = 8, 25, np.deg2rad(0.12), np.deg2rad(0.05)
@@ -51,6 +57,20 @@ def creeping(seed, share, time_s):
         "creep_time_s": time_s,
     }
     return replace(vehicle, joint=joint.model_copy(update=changed)), factors
+
+
+def reconstructed(seed, vehicle):
+    """Flight as its analyst has it, who knows the c.g.'s offset as well as the vehicle file says, and the truth."""
+    scenario = replace(dispersed.dispersed_scenario("irve2_reference", seed), vehicle=vehicle)
+    with tempfile.TemporaryDirectory() as temporary:
+        truth = simulate_to_folder(scenario, seed, Path(temporary) / "flight")
+        telemetry = read_flight(Path(temporary) / "flight")
+    rng, stated = np.random.default_rng([seed, 41, 2009]), telemetry.vehicle
+    body = stated.centerbody
+    offset = vehicle.cg_m[1:] + stated.uncertainty.cg_lateral_m * rng.standard_normal(2)
+    lateral = (offset * stated.mass_kg / body.mass_kg).tolist()
+    body = body.model_copy(update={"cg_from_datum_body_m": (body.cg_from_datum_body_m[0], *lateral)})
+    return reconstruct(Flight(replace(telemetry, vehicle=replace(stated, centerbody=body)))), truth
 
 
 def at_times(time_s, at_s, columns):

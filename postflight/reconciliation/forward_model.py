@@ -9,8 +9,9 @@ reconstruction's position and velocity and are flown by the simulator, many at o
 Sought are the joint's parameters (stiffness, damping; freeplay, hardening and creep where asked for), the lateral
 c.g. offset and the static stability. Nuisance parameters are all else that the motion depends on within its a priori
 uncertainty: masses, stations, inertias, other coefficients, the instruments' constant errors, and the atmosphere.
-Parameters of vehicle and instruments count in a priori standard deviations; those of the atmosphere are the logarithm of the density
-ratio and the differences of the winds, m/s, and of the temperature, K, to the sounding, at knots along altitude.
+Parameters of vehicle and instruments count in a priori standard deviations; those of the atmosphere are the logarithm
+of the density ratio and the differences of the winds, m/s, and of the temperature, K, to the sounding, at knots along
+altitude.
 
 The velocity at the starts is a parameter, too, and joined from span to span. What an accelerometer misaligned by 2 mrad
 or a gyro's mounting does to a reconstructed path of 9 g turns with the vehicle, as the c.g.'s offset does: at 50 rpm

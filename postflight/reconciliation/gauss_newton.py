@@ -66,7 +66,7 @@ VEHICLE_STEP, AIR_STEP, WARMTH_STEP_K = 1e-5, np.array([1e-6, 2e-4, 2e-4]), 1e-2
 
 @dataclass(frozen=True)
 class Parameters:
-    """All parameters: vehicle (v,), instruments (20,), air (3, k), temperature (n,), motion at the starts (s, 15 or 17)."""
+    """All parameters: vehicle (v,), instruments (20,), air (3, k), temperature (n,), motion at starts (s, 15 or 17)."""
 
     vehicle: FloatArray
     instruments: FloatArray
@@ -218,8 +218,14 @@ class Problem:
 
     @property
     def log_weight(self) -> float:
-        """Sum of the logarithms of all weights."""
-        return float(np.log(self.weight[self.weight > 0.0]).sum() + np.log(self.join_weight).sum())
+        """Sum of the logarithms of all weights, those that all models of a flight have in their priors left out."""
+        first_creep = -np.log(self.first_creep_sd).sum()
+        return float(np.log(self.weight[self.weight > 0.0]).sum() + np.log(self.join_weight).sum() + first_creep)
+
+    @property
+    def first_creep_sd(self) -> FloatArray:
+        """A priori sd of the creep at the first start, rad, (2,) or none: it is no larger than the deflection."""
+        return self.measured.first_deflection_sd[1 : 1 + self.motion - MOTION]
 
     @property
     def _sd_factors(self) -> FloatArray:
@@ -400,12 +406,7 @@ class Problem:
             (slice(first, first + 3), self.first_precision(slice(6, 9)), u.motion[0, ATTITUDE]),
             (slice(first + 6, first + 12), np.diag(self.measured.first_deflection_sd**-2.0), u.motion[0, 6:12]),
             (slice(first + 12, first + MOTION), self.first_precision(slice(3, 6)), u.motion[0, VELOCITY]),
-            # the first creep is no larger than the deflection
-            (
-                slice(first + MOTION, first + self.motion),
-                np.diag(self.measured.first_deflection_sd[1 : 1 + self.motion - MOTION] ** -2.0),
-                u.motion[0, CREEP],
-            ),
+            (slice(first + MOTION, first + self.motion), np.diag(self.first_creep_sd**-2.0), u.motion[0, CREEP]),
         ]
 
 
