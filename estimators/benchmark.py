@@ -100,7 +100,14 @@ _WORST_TIME_BIAS_S = 0.03  # half a radian of oscillation at 2.5 Hz
 _LEFT_OUT = 0.05  # of the deflection: damping, oscillation that the sensors' windows smooth
 _SLACK_TIME_S = 2.5
 _SLACKS_DEG, _FREEPLAYS_DEG = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64), (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)
-_SIZES_RAD = np.deg2rad(list(product(_SLACKS_DEG, _FREEPLAYS_DEG)))
+_WITH_CREEP_DEG = (0.0, 0.2)  # freeplay beside creep: of sizes that are as good as none, and as any
+# slack, freeplay (rad) and whether there is creep
+_HYPOTHESES = np.array(
+    [
+        *((*np.deg2rad(sizes), 0.0) for sizes in product(_SLACKS_DEG, _FREEPLAYS_DEG)),
+        *((*np.deg2rad(sizes), 1.0) for sizes in product(_SLACKS_DEG, _WITH_CREEP_DEG)),
+    ]
+)
 # time constants that stand for all between them, and the sd of the compliance that comes late with each, over the
 # spring's: shells on the ground had a third to a half of all of it late
 _CREEP_TIMES_S, _CREEP = (1.0, 7.0, 50.0), 0.4
@@ -589,7 +596,7 @@ def _mixture(
 
     for _ in range(_PASSES):
         compliance = posterior(*_USUAL_RAD).compliance
-    found = [posterior(*sizes, creep) for creep in (0.0, _CREEP) for sizes in _SIZES_RAD]
+    found = [posterior(slack, freeplay, _CREEP * creep) for slack, freeplay, creep in _HYPOTHESES]
     evidence = np.array([one.log_evidence for one in found])
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
@@ -598,7 +605,7 @@ def _mixture(
     off = np.array([one.gain @ read for one in found]) - mean
     spread = np.einsum("k,kij->ij", weight, [one.covariance for one in found]) + (weight * off.T) @ off
     # shapes of slack and freeplay are assumed: their part here stays in the error bar
-    slack_var, freeplay_var = weight @ np.tile(_SIZES_RAD**2, (2, 1))
+    slack_var, freeplay_var = weight @ _HYPOTHESES[:, :2] ** 2
     stays = float(slack_var + freeplay_var * unsure[-1] ** 2)
     answered = np.flatnonzero(frames.answered)
     together = np.full((len(frames.time_s), 2, 2), np.nan)

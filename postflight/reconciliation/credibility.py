@@ -94,7 +94,7 @@ def _creep(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
         consistency_check(
             "joint-creep", "reconciliation: creep of the joint", max(worst.sds, 0.0), 0.0, MOST_OFF_SD,
             "deflections follow the moment without creep",
-            f"deflections lag behind the moment: the joint creeps (linear estimate: {words})",
+            f"deflections lag behind the moment, as of a joint that creeps (linear estimate: {words})",
             advice="one stiffness does not describe this joint; fit its law with --creep",
         ),
     )  # fmt: skip

@@ -104,7 +104,7 @@ class _LinearQuantity:
         return np.abs(value) if self.is_size else value
 
 
-def _creep_rows(fit: JointFit, reach: float) -> list[tuple[object, ...]]:
+def _creep_rows(fit: JointFit, reach: float) -> list[tuple[str, str, float, float, float, float, float, str]]:
     """Rows of `joint_table`: share of the compliance that comes late and its time constant, factors of either."""
     names = fit.problem.vehicle_parameters.names
     if "creep" not in names:
