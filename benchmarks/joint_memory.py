@@ -1,6 +1,6 @@
 """Does it matter that a real shell creeps? Flights whose joint does, through every estimate that is made of a flight.
 
-Run: ``python benchmarks/joint_memory.py [FLIGHTS] [--first SEED] [--joints FIRST:LAST] [--out FILE] [--kept FOLDER]``
+Run: ``python benchmarks/joint_memory.py [FLIGHTS] [--first SEED] [--joints FIRST:LAST[:STEP]] [--out FILE] [--kept FOLDER]``
 (3 flights of each joint). The joints are standard linear solids: a tenth, three tenths and half of the compliance come
 late, with 1, 10 and 60 s; the stiffness against loads that stay is drawn as that of `benchmarks/reconciliation.py`'s
 joints, so that no vehicle diverges. All else is dispersed as there. Printed are, joint by joint, rms errors and the rms
@@ -143,8 +143,9 @@ def joint_rows(found, vehicle, factors, flight, truth):
     if "creep share" in table.index:
         share = vehicle.joint.creep_share
         out["creep share"] = [[float(table.found["creep share"] - share), float(table.sd["creep share"])]]
-        off = float(np.log(table.found["creep time"] / vehicle.joint.creep_time_s))
-        out["log creep time"] = [[off, float(table.sd["creep time"] / table.found["creep time"])]]
+        slower = 1.0 / table.found["creep time"]
+        sd = float(slower**2 * table.sd["creep time"])
+        out["creep settling, 1/s"] = [[float(slower - 1.0 / vehicle.joint.creep_time_s), sd]]
     history = deflection_of(found)
     k = int(np.argmin(np.abs(history.time_s - flight.peak_s)))
     true = at_times(truth.time_s, history.time_s[[k]], truth.deflection.theta_yz_rad)[0]
@@ -226,8 +227,7 @@ def main():
         return
     count = int(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[1].isdigit() else 3
     first, out = option("--first", 0), Path(option("--out", "/tmp/joint_memory.jsonl"))
-    chosen = [int(k) for k in option("--joints", f"0:{len(JOINTS)}").split(":")]
-    joints = JOINTS[slice(*chosen)]
+    joints = JOINTS[slice(*(int(k) for k in option("--joints", f"0:{len(JOINTS)}").split(":")))]
     kept = Path(option("--kept", "")) if "--kept" in sys.argv else None
     results = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     done = {(r["seed"], r["share"], r["time_s"]) for r in results}

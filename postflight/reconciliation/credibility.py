@@ -24,7 +24,7 @@ JOINT_WORDS = (
     "that are wrong"
 )
 # their a priori law says next to nothing of them
-OPEN = ("stiffness", "damping", "freeplay", "hardening", "creep", "creep time")
+OPEN = ("stiffness", "damping", "freeplay", "hardening", "creep growth", "creep settling")
 
 
 def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[ConsistencyCheck, ...]:

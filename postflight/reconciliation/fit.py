@@ -36,9 +36,7 @@ import numpy as np
 from flightmodel.checks import FloatArray, Progress
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.forward_model import (
-    CREEP_SD,
-    CREEP_TIME_LOG_SD,
-    CREEP_TIME_S,
+    CREEP_PER_S,
     DEFLECTION,
     FREEPLAY_SD_RAD,
     AtmosphereParameters,
@@ -77,6 +75,7 @@ SHARES = np.geomspace(0.05, 2.0, 7)
 # the standard deviations of the first steps, which the change from the held to the fast stiffness needs
 CREEP_TIMES_S = (2.0, 10.0, 50.0)
 SD_FACTORS_CREEP = (10.0, 3.0)
+USUAL_CREEP = 0.3  # delayed compliance over the spring's, until a fit has found its own
 
 
 @dataclass(frozen=True)
@@ -217,16 +216,18 @@ class CreepScore:
 
 def _creep_score(fit: JointFit, time_s: float) -> CreepScore:
     """Step of the delayed compliance from none, all other parameters following, and its sd."""
-    problem, start = _with_parameters(fit, "creep", [0.0, _creep_time_parameter(time_s)])
-    k = problem.vehicle_parameters.names.index("creep")
+    problem, start = _without_creep_yet(fit, time_s)
+    k = problem.vehicle_parameters.names.index("creep growth")
     normal = NormalEquations(*problem.normal_equations(start, problem.linearize(start)))
     unit = np.eye(len(normal.right))[k]
     step, variance = normal.solve(normal.right)[k], normal.solve(unit)[k]
-    return CreepScore(time_s, CREEP_SD * float(step), CREEP_SD * float(np.sqrt(variance)))
+    return CreepScore(time_s, CREEP_PER_S * time_s * float(step), CREEP_PER_S * time_s * float(np.sqrt(variance)))
 
 
-def _creep_time_parameter(time_s: float) -> float:
-    return float(np.log(time_s / CREEP_TIME_S)) / CREEP_TIME_LOG_SD
+def _without_creep_yet(fit: JointFit, time_s: float) -> tuple[Problem, Parameters]:
+    """Problem with creep of a time constant, and the fit's parameters with none of it."""
+    problem, start = _with_parameters(fit, "creep", [0.0, float(np.arcsinh(1.0 / (CREEP_PER_S * time_s)))])
+    return replace(problem, creep_per_s=USUAL_CREEP / time_s), start
 
 
 def _with_parameters(fit: JointFit, law: str, values: list[float]) -> tuple[Problem, Parameters]:
@@ -244,20 +245,23 @@ def reconcile_with_creep(plain: JointFit, progress: Progress | None = None) -> J
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "reconciling, creep")
     likeliest = max(plain.creep_scores, key=lambda score: abs(score.sds))
-    return _from_fit(plain, "creep", [0.0, _creep_time_parameter(likeliest.time_s)], report)
+    return _from_fit(*_without_creep_yet(plain, likeliest.time_s), report)
 
 
 def _with_hardening(fit: JointFit, report: Progress) -> JointFit:
     """Fit hardening besides the laws that a fit has, from that fit."""
-    return _from_fit(fit, "hardening", [0.0], report)
+    return _from_fit(*_with_parameters(fit, "hardening", [0.0]), report)
 
 
-def _from_fit(fit: JointFit, law: str, values: list[float], report: Progress) -> JointFit:
-    """Fit with one law more, from a fit without it."""
-    problem, start = _with_parameters(fit, law, values)
+def _from_fit(problem: Problem, start: Parameters, report: Progress) -> JointFit:
+    """Fit with one law more, from the parameters of a fit without it."""
     correct = reconnected if "freeplay" in problem.vehicle_parameters.laws else None
     early = [replace(problem, sd_factor=factor) for factor in SD_FACTORS_CREEP]
     first = solve(problem, start, early, part_of(report, 0.2, 0.6), correct, EARLY_TOLERANCE)
+    joint = first.vehicle.joint
+    if "creep" in problem.vehicle_parameters.laws and joint.creep_share > 0.0:
+        per_s = joint.delayed_compliance_radpnm * joint.bending_stiffness_nmprad / joint.creep_time_s
+        first = replace(first, problem=replace(problem, creep_per_s=per_s))
     return _refit_with_turbulence(first, part_of(report, 0.6, 1.0), correct)
 
 

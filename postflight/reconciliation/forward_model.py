@@ -60,12 +60,17 @@ LEAST_INERTIA = 0.01  # of the stated one: a trial step never makes an inertia n
 FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
 # hardening is counted as the share by which the tangent stiffness has grown at this angle; negative: it softens
 HARDENING_AT_RAD = np.deg2rad(4.0)
-# creep by the delayed compliance over that of the spring (a share of a third: one sd) and the logarithm of its time
-# constant: one sd is from 2 to 29 s, two from 0.6 to 108 s
-CREEP_SD, CREEP_TIME_S, CREEP_TIME_LOG_SD = 0.5, 8.0, 1.3
+# creep by how fast it grows, delayed compliance over the spring's and over the time constant, and how fast it settles,
+# 1 / time constant: of creep slower than the flight the growth is measured and the rest is not, so that both follow
+# from the data by nearly straight lines. Both as sinh of the parameter: one sd is 0.06 1/s, four are 1.4 1/s
+CREEP_PER_S, LEAST_SETTLING_PER_S = 0.05, 1.0 / 300.0
 LEAST_CREEP = -0.5  # of the spring's compliance: a trial step never makes a joint that runs away from its load
 JOINT = ("stiffness", "damping", "offset y", "offset z", "static stability")
-LAWS = {"freeplay": ("freeplay",), "hardening": ("hardening",), "creep": ("creep", "creep time")}  # and parameters
+LAWS = {
+    "freeplay": ("freeplay",),
+    "hardening": ("hardening",),
+    "creep": ("creep growth", "creep settling"),
+}  # and parameters
 NUISANCE = (
     "C_A", "C_N", "C_mq", "mass of the shell", "mass of the centerbody", "station of the shell's c.g.",
     "station of the centerbody's c.g.", "shell's c.g. y", "shell's c.g. z", "inertia of the shell",
@@ -127,9 +132,8 @@ class VehicleParameters:
                 changed["freeplay_corner"] = self.corner
         if "hardening" in v:
             changed["hardening_nmprad3"] = stiffness * HARDENING_SD * v["hardening"] / (3.0 * HARDENING_AT_RAD**2)
-        if "creep" in v:
-            changed["creep_share"] = float(creep_share(v["creep"]))
-            changed["creep_time_s"] = float(creep_time_s(v["creep time"]))
+        if "creep growth" in v:
+            changed["creep_share"], changed["creep_time_s"] = creep_law(v["creep growth"], v["creep settling"])
         # the whole vehicle's offset; the centerbody carries it
         lateral = known.cg_lateral_m * np.array([v["shell's c.g. y"], v["shell's c.g. z"]])
         offset = OFFSET_SD_M * np.array([v["offset y"], v["offset z"]]) * nominal.mass_kg - lateral * shell.mass_kg
@@ -154,15 +158,11 @@ class VehicleParameters:
         )  # fmt: skip
 
 
-def creep_share(x: FloatArray | float) -> FloatArray:
-    """Part of the compliance that comes late, of the parameter in a priori standard deviations."""
-    delayed = np.maximum(CREEP_SD * np.asarray(x), LEAST_CREEP)
-    return np.asarray(delayed / (1.0 + delayed))
-
-
-def creep_time_s(x: FloatArray | float) -> FloatArray:
-    """Time constant of the creep, s, of the parameter in a priori standard deviations."""
-    return np.asarray(CREEP_TIME_S * np.exp(CREEP_TIME_LOG_SD * np.asarray(x)))
+def creep_law(growth: float, settling: float) -> tuple[float, float]:
+    """Share of the compliance that comes late, and its time constant, s, of the two parameters."""
+    time_s = float(1.0 / np.hypot(LEAST_SETTLING_PER_S, CREEP_PER_S * np.sinh(settling)))
+    delayed = max(CREEP_PER_S * float(np.sinh(growth)) * time_s, LEAST_CREEP)
+    return delayed / (1.0 + delayed), time_s
 
 
 def _perturbed(

@@ -31,6 +31,7 @@ from postflight.reconciliation.forward_model import (
     CREEP,
     MOTION,
     RATE,
+    SPAN_S,
     STIFFNESS_LOG_SD,
     VELOCITY,
     AtmosphereParameters,
@@ -56,8 +57,8 @@ VACUUM_SD = np.append(
 GUST_KNOT_M = 300.0
 LARGE_ANGLE_RAD = np.deg2rad(5.0)  # angle of attack at which density structure rotates the vehicle
 GUST_RATE, GUST_FORCE_MPS2 = 2.0, 60.0  # of the windows' rates and lateral force, as if white from window to window
-# creep moves by as much of the deflection as a span is of its time constant; without noise it is known as the moment is
-GUST_CREEP, VACUUM_CREEP_SD = 0.02, np.deg2rad(1e-4)
+# what a gust does to the deflection comes late for half a span on average; `Problem.creep_per_s` of it in a second
+GUST_CREEP_S, VACUUM_CREEP_SD = 0.5 * SPAN_S * GUST[7], np.deg2rad(2e-5)
 MOTION_STEP = np.append(np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3)), [1e-3, 1e-3, 1e-3])
 CREEP_STEP = np.deg2rad(2e-5)
 LEAST_COMPLIANCE = 0.5  # of a joint's compliance: a step that lessens it by more is shortened
@@ -138,6 +139,8 @@ class Problem:
         Parameters of the vehicle that no step moves.
     sd_factor : float or (s,) float
         Factor on all standard deviations, or on each span's.
+    creep_per_s : float
+        Delayed compliance over the spring's and over the time constant: how fast creep follows a gust.
     """
 
     measured: Measurements
@@ -145,6 +148,7 @@ class Problem:
     air: AtmosphereParameters
     held: tuple[str, ...] = ()
     sd_factor: float | FloatArray = 1.0
+    creep_per_s: float = 0.0
 
     @property
     def first_instrument(self) -> int:
@@ -208,7 +212,10 @@ class Problem:
         """Inverse standard deviations (s - 1, motion) of ends against starts."""
         factor = np.maximum(self._sd_factors[:-1], self._sd_factors[1:])
         more = self.motion - MOTION
-        gust, vacuum = np.append(GUST, [GUST_CREEP] * more), np.append(VACUUM_SD, [VACUUM_CREEP_SD] * more)
+        gust, vacuum = (
+            np.append(GUST, [GUST_CREEP_S * self.creep_per_s] * more),
+            np.append(VACUUM_SD, [VACUUM_CREEP_SD] * more),
+        )
         return np.asarray(1.0 / (factor[:, None] * np.hypot(gust * self.turbulence_rad[:-1, None], vacuum)))
 
     @property

@@ -35,7 +35,6 @@ from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_c
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.fit import JointFit, LawSelection, part_of
 from postflight.reconciliation.forward_model import (
-    CREEP_TIME_LOG_SD,
     DAMPING_LOG_SD,
     DEFLECTION,
     FREEPLAY_SD_RAD,
@@ -44,8 +43,7 @@ from postflight.reconciliation.forward_model import (
     STIFFNESS_LOG_SD,
     WINDOWS,
     VehicleParameters,
-    creep_share,
-    creep_time_s,
+    creep_law,
     resolved_stiffness_nmprad,
 )
 from postflight.reconciliation.gauss_newton import Linearization, NormalEquations, Parameters, descend
@@ -105,22 +103,28 @@ class _LinearQuantity:
 
 
 def _creep_rows(fit: JointFit, reach: float) -> list[tuple[str, str, float, float, float, float, float, str]]:
-    """Rows of `joint_table`: share of the compliance that comes late and its time constant, factors of either."""
+    """Rows of `joint_table`: share of the compliance that comes late, and its time constant.
+
+    The interval of the time constant is that of its inverse; it has no end where creep may settle later than any time.
+    """
     names = fit.problem.vehicle_parameters.names
-    if "creep" not in names:
+    if "creep growth" not in names:
         return []
-    share_at, time_at = names.index("creep"), names.index("creep time")
-    x, sd = fit.parameters.vehicle, np.sqrt(np.diag(fit.covariance))
+    at = names.index("creep growth")
+    x, covariance = fit.parameters.vehicle[at : at + 2], fit.covariance[at : at + 2, at : at + 2]
+    share, time_s = creep_law(*x.tolist())
+    moved = np.array(
+        [creep_law(*(x + side * DIFFERENCE * unit).tolist()) for unit in np.eye(2) for side in (1.0, -1.0)]
+    )
+    by_share, by_settling = ((c[::2] - c[1::2]) / (2.0 * DIFFERENCE) for c in (moved[:, 0], 1.0 / moved[:, 1]))
+    share_sd, settling_sd = (float(np.sqrt(slope @ covariance @ slope)) for slope in (by_share, by_settling))
+    slowest = 1.0 / time_s - reach * settling_sd
+    times = 1.0 / (1.0 / time_s + reach * settling_sd), 1.0 / slowest if slowest > 0.0 else np.inf
     file = fit.problem.vehicle_parameters.nominal.joint
-    share, share_sd = x[share_at], sd[share_at]
-    ends = [float(creep_share(share + side * reach * share_sd)) for side in (-1.0, 1.0)]
-    found, far = float(creep_share(share)), float(creep_share(share + DIFFERENCE))
-    time_s, log_sd = float(creep_time_s(x[time_at])), CREEP_TIME_LOG_SD * float(sd[time_at])
-    times = [time_s * float(np.exp(side * reach * log_sd)) for side in (-1.0, 1.0)]
-    slope = (far - found) / DIFFERENCE
+    ends = share - reach * share_sd, share + reach * share_sd
     return [
-        ("creep share", "", file.creep_share, found, slope * float(share_sd), *ends, "estimate"),
-        ("creep time", "s", file.creep_time_s, time_s, time_s * log_sd, *times, "estimate"),
+        ("creep share", "", file.creep_share, share, share_sd, *ends, "estimate"),
+        ("creep time", "s", file.creep_time_s, time_s, time_s**2 * settling_sd, *times, "estimate"),
     ]
 
 
@@ -418,10 +422,9 @@ def quantities(vehicle_parameters: VehicleParameters, x: FloatArray) -> pd.DataF
     out = pd.DataFrame([_joint(vehicle_parameters.vehicle(row)) for row in x])
     for linear in _linear_quantities(vehicle_parameters):
         out[linear.column] = linear.of(x)
-    names = vehicle_parameters.names
-    if "creep" in names:
-        out["creep_share"] = creep_share(x[:, names.index("creep")])
-        out["creep_time_s"] = creep_time_s(x[:, names.index("creep time")])
+    if "creep" in vehicle_parameters.laws:
+        at = vehicle_parameters.names.index("creep growth")
+        out["creep_share"], out["creep_time_s"] = np.array([creep_law(*row) for row in x[:, at : at + 2].tolist()]).T
     return out
 
 

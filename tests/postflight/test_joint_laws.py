@@ -12,6 +12,7 @@ from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.reconciliation import posterior
 from postflight.reconciliation.fit import with_freeplay
 from postflight.reconciliation.forward_model import (
+    CREEP_PER_S,
     DEFLECTION,
     FREEPLAY_SD_RAD,
     JOINT,
@@ -86,11 +87,14 @@ def test_quantities_are_the_vehicles():
 
 def test_creep_is_two_parameters_and_two_numbers_of_every_motion():
     parameters = VehicleParameters(NOMINAL, ("creep", "hardening"))
-    assert parameters.names[len(JOINT) : parameters.sought] == ("creep", "creep time", "hardening")
+    assert parameters.names[len(JOINT) : parameters.sought] == ("creep growth", "creep settling", "hardening")
     assert parameters.motion == MOTION + 2
     assert VehicleParameters(NOMINAL).motion == MOTION
     x = np.zeros((2, len(parameters.names)))
-    x[1, len(JOINT) : len(JOINT) + 2] = 2.0 * 0.25 / 0.75, np.log(20.0 / 8.0) / 1.3
+    growth, settling = 0.25 / 0.75 / 20.0, 1.0 / 20.0
+    x[1, len(JOINT) : len(JOINT) + 2] = np.arcsinh(
+        [growth / CREEP_PER_S, np.sqrt(settling**2 - 300.0**-2) / CREEP_PER_S]
+    )
     plain, creeping = (parameters.vehicle(row).joint for row in x)
     assert plain.creep_share == 0.0
     # share s is a delayed compliance of s / (1 - s) of the spring's
@@ -99,7 +103,7 @@ def test_creep_is_two_parameters_and_two_numbers_of_every_motion():
     assert creeping.bending_stiffness_nmprad == plain.bending_stiffness_nmprad
     table = quantities(parameters, x)
     assert table.creep_share.tolist() == [0.0, pytest.approx(0.25)]
-    assert table.creep_time_s.tolist() == [pytest.approx(8.0), pytest.approx(20.0)]
+    assert table.creep_time_s.tolist() == [pytest.approx(300.0), pytest.approx(20.0)]
     # a trial step never makes a joint that runs away from its load
     x[1, len(JOINT)] = -50.0
     assert parameters.vehicle(x[1]).joint.delayed_compliance_radpnm * plain.bending_stiffness_nmprad == pytest.approx(
