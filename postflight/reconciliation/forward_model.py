@@ -64,7 +64,9 @@ HARDENING_AT_RAD = np.deg2rad(4.0)
 # 1 / time constant: of creep slower than the flight the growth is measured and the rest is not, so that both follow
 # from the data by nearly straight lines. Both as sinh of the parameter: one sd is 0.06 1/s, four are 1.4 1/s
 CREEP_PER_S, LEAST_SETTLING_PER_S = 0.05, 1.0 / 300.0
-LEAST_CREEP = -0.5  # of the spring's compliance: a trial step never makes a joint that runs away from its load
+# delayed compliance over the spring's, and rates, that a trial step makes at most: a joint that runs away from its load
+# is none, and a vehicle file has no share above 0.9 and no time constant below 0.1 s
+LEAST_CREEP, MOST_CREEP, MOST_PER_S = -0.5, 9.0, 10.0
 JOINT = ("stiffness", "damping", "offset y", "offset z", "static stability")
 LAWS = {
     "freeplay": ("freeplay",),
@@ -160,8 +162,10 @@ class VehicleParameters:
 
 def creep_law(growth: float, settling: float) -> tuple[float, float]:
     """Share of the compliance that comes late, and its time constant, s, of the two parameters."""
-    time_s = float(1.0 / np.hypot(LEAST_SETTLING_PER_S, CREEP_PER_S * np.sinh(settling)))
-    delayed = max(CREEP_PER_S * float(np.sinh(growth)) * time_s, LEAST_CREEP)
+    most = np.arcsinh(MOST_PER_S / CREEP_PER_S)
+    grows, settles = CREEP_PER_S * np.sinh(np.clip([growth, settling], -most, most))
+    time_s = float(1.0 / np.hypot(LEAST_SETTLING_PER_S, settles))
+    delayed = float(np.clip(grows * time_s, LEAST_CREEP, MOST_CREEP))
     return delayed / (1.0 + delayed), time_s
 
 

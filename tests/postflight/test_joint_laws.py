@@ -104,7 +104,12 @@ def test_creep_is_two_parameters_and_two_numbers_of_every_motion():
     table = quantities(parameters, x)
     assert table.creep_share.tolist() == [0.0, pytest.approx(0.25)]
     assert table.creep_time_s.tolist() == [pytest.approx(300.0), pytest.approx(20.0)]
-    # a trial step never makes a joint that runs away from its load
+    # a trial step never makes a joint that runs away from its load, nor one that no vehicle file can have
+    x[1, len(JOINT) : len(JOINT) + 2] = 900.0, 900.0
+    wild = parameters.vehicle(x[1]).joint
+    assert 0.0 < wild.creep_share <= 0.9
+    assert wild.creep_time_s == pytest.approx(0.1, rel=1e-3)
+    x[1, len(JOINT) + 1] = 0.0
     x[1, len(JOINT)] = -50.0
     assert parameters.vehicle(x[1]).joint.delayed_compliance_radpnm * plain.bending_stiffness_nmprad == pytest.approx(
         -0.5
