@@ -22,13 +22,10 @@ a prior so wide that it carries no information. The film reads the deflection re
     read_i = theta(t_i) - R_i theta(t_b) + camera's error,     theta(t) = kappa (m(t) + A(t) x) + slack(t)
 
 Unknown are kappa, the ``x ~ N(0, 1)`` of the moment (the accelerometer's constant errors, the centerbody's c.g. and
-inertia), creep (part of the compliance comes late: the slow pulse sees more of it than the oscillation, of which the
-benchmark frame holds one moment) and the slack: deflection that does not follow the law, as by freeplay, a spring that
-hardens, friction. Creep adds ``kappa sum g_k lag_k(m)``, moments that lag by time constants from a second to a minute,
-with ``g_k ~ N(0, _CREEP)``; whether there is any, and the slack's size, is estimated too, by the evidence of the
-readings over `_SLACKS_DEG`: slack of a size that the film cannot exclude stays in the error bar. All is Gaussian, and
-the deflection of the benchmark frame, with its prior, is one conditional mean and covariance, a mixture over creep and
-sizes of the slack.
+inertia) and the slack: deflection that does not follow the law, as by freeplay, a spring that hardens, friction. Its
+size is estimated too, by the evidence of the readings over `_SLACKS_DEG`: slack of a size that the film cannot exclude
+stays in the error bar. All is Gaussian, and the deflection of the benchmark frame, with its prior, is one conditional
+mean and covariance, a mixture over sizes of the slack.
 
 The same film gives and receives this deflection, so the two errors are correlated: an error common to all frames looks
 like a deflection of the benchmark, and is removed with it. With ``theta(t_b) = K read``, the error ``e`` of a frame and
@@ -75,7 +72,7 @@ from estimators.virtual_camera import DEFLECTION, FLATTENING, VirtualCamera
 from flightmodel import rotations
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
-from flightmodel.deflection import lagged, lv_clock, rotation_vector_body_shell
+from flightmodel.deflection import lv_clock, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry
 from flightmodel.vehicle import CameraMount, CameraUncertainty
 
@@ -100,17 +97,7 @@ _WORST_TIME_BIAS_S = 0.03  # half a radian of oscillation at 2.5 Hz
 _LEFT_OUT = 0.05  # of the deflection: damping, oscillation that the sensors' windows smooth
 _SLACK_TIME_S = 2.5
 _SLACKS_DEG, _FREEPLAYS_DEG = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64), (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)
-_WITH_CREEP_DEG = (0.0, 0.2)  # freeplay beside creep: of sizes that are as good as none, and as any
-# slack, freeplay (rad) and whether there is creep
-_HYPOTHESES = np.array(
-    [
-        *((*np.deg2rad(sizes), 0.0) for sizes in product(_SLACKS_DEG, _FREEPLAYS_DEG)),
-        *((*np.deg2rad(sizes), 1.0) for sizes in product(_SLACKS_DEG, _WITH_CREEP_DEG)),
-    ]
-)
-# time constants that stand for all between them, and the sd of the compliance that comes late with each, over the
-# spring's: shells on the ground had a third to a half of all of it late
-_CREEP_TIMES_S, _CREEP = (1.0, 7.0, 50.0), 0.4
+_SIZES_RAD = np.deg2rad(list(product(_SLACKS_DEG, _FREEPLAYS_DEG)))
 _USUAL_RAD = np.deg2rad([0.04, 0.1])  # sizes at which the compliance is estimated that scales the law's errors
 _PASSES = 2
 _WIDE = 30.0  # prior sd of the compliance, in the values found
@@ -474,23 +461,17 @@ class RelativeDeflections:
 
 @dataclass(frozen=True)
 class _Moment:
-    """At times (n,): moment as a lateral vector (n, 2), N m, its response to each input (n, 2, k), its noise's sd.
-
-    ``late_nm`` (n, 2, c): the moment lagging by each of `_CREEP_TIMES_S`.
-    """
+    """At times (n,): moment as a lateral vector (n, 2), N m, its response to each input (n, 2, k), its noise's sd."""
 
     value_nm: FloatArray
     by_input_nm: FloatArray
     noise_nm: float
-    late_nm: FloatArray
 
     def at(self, time_s: FloatArray, at_s: FloatArray) -> _Moment:
         """Linear interpolation."""
-        parts = [self.value_nm[:, :, None], self.late_nm, self.by_input_nm]
-        flat = np.concatenate(parts, axis=2).reshape(len(time_s), -1)
+        flat = np.concatenate([self.value_nm[:, :, None], self.by_input_nm], axis=2).reshape(len(time_s), -1)
         here = np.stack([np.interp(at_s, time_s, column) for column in flat.T], axis=-1).reshape(len(at_s), 2, -1)
-        first = 1 + self.late_nm.shape[2]
-        return _Moment(here[:, :, 0], here[:, :, first:], self.noise_nm, here[:, :, 1:first])
+        return _Moment(here[:, :, 0], here[:, :, 1:], self.noise_nm)
 
 
 def joint_moment(loads: FlightLoads) -> _Moment:
@@ -509,9 +490,7 @@ def joint_moment(loads: FlightLoads) -> _Moment:
         abs(arm[0]) * body.mass_kg * loads.force_noise_sd_mps2,
     )
     value = spin - np.cross(arm, body.mass_kg * force)
-    lateral = _lateral(value)
-    late = np.stack([lagged(loads.time_s, lateral, lag_s) for lag_s in _CREEP_TIMES_S], axis=-1)
-    return _Moment(lateral, np.stack([_lateral(part) for part in parts], axis=-1), float(noise), late)
+    return _Moment(_lateral(value), np.stack([_lateral(part) for part in parts], axis=-1), float(noise))
 
 
 def _lateral(moment: FloatArray) -> FloatArray:
@@ -558,7 +537,9 @@ def benchmark_deflection(frames: RelativeDeflections, loads: FlightLoads, prior_
         )
     if frames.time_bias_sd_s > 0.0:
         late = whole.at(loads.time_s, times + frames.time_bias_sd_s).value_nm - moment.value_nm
-        moment = replace(moment, by_input_nm=np.concatenate([moment.by_input_nm, late[:, :, None]], axis=2))
+        moment = _Moment(
+            moment.value_nm, np.concatenate([moment.by_input_nm, late[:, :, None]], axis=2), whole.noise_nm
+        )
     return _mixture(frames, rows, times, moment, prior_sd_rad)
 
 
@@ -589,14 +570,14 @@ def _mixture(
     load = (design @ moment.value_nm.ravel())[: 2 * n]
     compliance = float(load @ read[: 2 * n] / (load @ load))
 
-    def posterior(slack_rad: float, freeplay_rad: float, creep: float = 0.0) -> _Posterior:
+    def posterior(slack_rad: float, freeplay_rad: float) -> _Posterior:
         error = block_diag(camera, (prior_sd_rad**2 + slack_rad**2 + freeplay_rad**2) * np.eye(2))
-        law = _law_covariance(moment, compliance, correlation) + _creep_covariance(moment, compliance, creep)
+        law = _law_covariance(moment, compliance, correlation)
         return _posterior(law + slack_rad**2 * correlation + freeplay_rad**2 * taken_up, design, read, error, moment)
 
     for _ in range(_PASSES):
         compliance = posterior(*_USUAL_RAD).compliance
-    found = [posterior(slack, freeplay, _CREEP * creep) for slack, freeplay, creep in _HYPOTHESES]
+    found = [posterior(*sizes) for sizes in _SIZES_RAD]
     evidence = np.array([one.log_evidence for one in found])
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
@@ -605,7 +586,7 @@ def _mixture(
     off = np.array([one.gain @ read for one in found]) - mean
     spread = np.einsum("k,kij->ij", weight, [one.covariance for one in found]) + (weight * off.T) @ off
     # shapes of slack and freeplay are assumed: their part here stays in the error bar
-    slack_var, freeplay_var = weight @ _HYPOTHESES[:, :2] ** 2
+    slack_var, freeplay_var = weight @ _SIZES_RAD**2
     stays = float(slack_var + freeplay_var * unsure[-1] ** 2)
     answered = np.flatnonzero(frames.answered)
     together = np.full((len(frames.time_s), 2, 2), np.nan)
@@ -632,12 +613,6 @@ def _law_covariance(moment: _Moment, compliance: float, correlation: FloatArray)
     size = _LEFT_OUT * np.repeat(compliance * np.linalg.norm(moment.value_nm, axis=1), 2)
     noise = (compliance * moment.noise_nm) ** 2 * np.eye(len(flat))
     return _WIDE**2 * np.outer(flat, flat) + inputs @ inputs.T + np.outer(size, size) * correlation + noise
-
-
-def _creep_covariance(moment: _Moment, compliance: float, creep: float) -> FloatArray:
-    """Covariance of the deflection that comes late, with a compliance of sd ``creep`` over the spring's a lag."""
-    late = creep * compliance * moment.late_nm.reshape(2 * len(moment.late_nm), -1)
-    return np.asarray(late @ late.T)
 
 
 @dataclass(frozen=True)

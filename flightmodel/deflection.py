@@ -302,18 +302,3 @@ def history_from_lateral(
     """
     theta, plane, cov = polar_from_lateral(theta_yz_rad, covariance_yz)
     return DeflectionHistory(time_s, theta, plane, cov, method, assumptions, draws_yz_rad)
-
-
-def lagged(time_s: FloatArray, load: FloatArray, lag_s: float, first: FloatArray | float = 0.0) -> FloatArray:
-    """``b`` of ``lag b' + b = load``, ``(n, ...)``, from ``first`` on: creep under a load.
-
-    Exact where the load is straight between its times (n,), s.
-    """
-    step = np.diff(time_s).reshape(-1, *[1] * (load.ndim - 1))
-    keep, slope = np.exp(-step / lag_s), np.diff(load, axis=0) / step * lag_s
-    ahead = load[1:] - slope - keep * (load[:-1] - slope)
-    out = np.empty_like(load)
-    out[0] = first
-    for k in range(len(step)):
-        out[k + 1] = keep[k] * out[k] + ahead[k]
-    return out

@@ -33,7 +33,6 @@ import pandas as pd
 from scipy.optimize import least_squares
 
 from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
-from flightmodel.deflection import lagged
 from flightmodel.tables import line_of, numbers, read_table
 from flightmodel.units import read_unit
 
@@ -105,7 +104,8 @@ def read_load_test(
         faults.append(Fault(words, "time-order"))
     if faults:
         raise GateError(faults)
-    assert t is not None and moment is not None
+    assert t is not None
+    assert moment is not None
     angle = np.mean([a for a in angles if a is not None], axis=0)
     known = np.isfinite(moment) & np.isfinite(angle)
     every = -(-int(known.sum()) // MOST_ROWS) or 1
@@ -325,3 +325,18 @@ def _cubic(load: FloatArray, cubic: float) -> FloatArray:
         if np.abs(step).max() < 1e-12 * max(1.0, np.abs(d).max()):
             break
     return d
+
+
+def lagged(time_s: FloatArray, load: FloatArray, lag_s: float, first: FloatArray | float = 0.0) -> FloatArray:
+    """``b`` of ``lag b' + b = load``, ``(n, ...)``, from ``first`` on: creep under a load.
+
+    Exact where the load is straight between its times (n,), s.
+    """
+    step = np.diff(time_s).reshape(-1, *[1] * (load.ndim - 1))
+    keep, slope = np.exp(-step / lag_s), np.diff(load, axis=0) / step * lag_s
+    ahead = load[1:] - slope - keep * (load[:-1] - slope)
+    out = np.empty_like(load)
+    out[0] = first
+    for k in range(len(step)):
+        out[k + 1] = keep[k] * out[k] + ahead[k]
+    return out

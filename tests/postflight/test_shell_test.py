@@ -10,10 +10,9 @@ from click.testing import CliRunner
 
 from flightmodel.checks import GateError
 from flightmodel.config import parse_section, read_toml
-from flightmodel.deflection import lagged
 from flightmodel.vehicle import CompliantJoint, Section
 from postflight.cli import cli
-from postflight.studies.shell_test import LoadTest, fit_laws, predicted, read_load_test
+from postflight.studies.shell_test import LoadTest, fit_laws, lagged, predicted, read_load_test
 
 TIME_S = 0.5 * np.arange(500)
 MOMENT_NM = 800.0 * np.interp(TIME_S, [0.0, 20.0, 140.0, 240.0, 250.0], [0.04, 0.04, 1.0, 0.05, 0.04])
