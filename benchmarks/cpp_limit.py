@@ -60,6 +60,7 @@ class Flights:
         workspace, written = simulate.workspace(self.states, self.parameters), np.zeros(self.lanes, dtype=np.int64)
         _kernels.integrate(
             (0,) * self.lanes,
+            (),
             workspace,
             self.tables,
             earth.WGS84,
@@ -76,7 +77,7 @@ class Flights:
 
     def cpp(self, function, seconds, step):
         """The same from C++."""
-        state, parameters = self.states.T.copy(), self.parameters.T.copy()
+        state, parameters = self.states.T.copy(), self.parameters[:, : _kernels.DELAYED].T.copy()
         arrays = [a.ctypes.data_as(DOUBLES) for a in self.tables]
         air, _, mach, coefficients, _ = (a.shape for a in self.tables)
         tables = Tables(*arrays, air[0], air[1], mach[0], coefficients[1])

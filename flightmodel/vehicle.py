@@ -117,10 +117,16 @@ class MassStep(Section):
 
 
 class CompliantJoint(Section):
-    """Spherical joint on the axis with bending and torsion springs, damping, freeplay and hardening.
+    """Spherical joint on the axis with bending and torsion springs, damping, freeplay, hardening and creep.
 
-    The bending moment is ``K1 d + K3 d^3`` of the bending angle ``d`` beyond the freeplay, the damping moment
-    ``(C1 + C3 theta^2)`` times the relative angular rate.
+    The bending moment is ``F = K1 d + K3 d^3`` of the spring's angle ``d`` beyond the freeplay, the damping moment
+    ``(C1 + C3 theta^2)`` times the relative angular rate. The deflection is the spring's angle and the creep ``b``
+    (standard linear solid, a spring and a Kelvin element in series; docs/derivations.md)::
+
+        creep_time_s b' + b = creep_share / (1 - creep_share) F / K1
+
+    so that ``K1`` holds for fast motion, ``K1 (1 - creep_share)`` for a load that stays, and ``creep_share`` is the
+    part of the compliance that comes late.
     """
 
     station_m: Place
@@ -132,6 +138,26 @@ class CompliantJoint(Section):
     freeplay_corner: Annotated[float, Field(gt=0.0, le=0.5)] = 0.02
     hardening_nmprad3: Stiffness = 0.0
     damping_hardening_nmsprad3: Damping = 0.0
+    creep_share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
+    creep_time_s: Annotated[float, Field(ge=0.1, le=1e4)] = 10.0
+
+    @model_validator(mode="after")
+    def _spring_to_creep(self) -> CompliantJoint:
+        if self.creep_share > 0.0 and self.bending_stiffness_nmprad == 0.0:
+            raise KeyFaults([("creep_share", self.creep_share, "a joint without bending stiffness has none; 0")])
+        return self
+
+    @property
+    def delayed_compliance_radpnm(self) -> float:
+        """Compliance that comes late, rad/(N m)."""
+        if self.creep_share == 0.0:
+            return 0.0
+        return self.creep_share / (1.0 - self.creep_share) / self.bending_stiffness_nmprad
+
+    @property
+    def held_stiffness_nmprad(self) -> float:
+        """Bending stiffness against a load that stays, N m/rad; without creep that against any."""
+        return self.bending_stiffness_nmprad * (1.0 - self.creep_share)
 
 
 class Uncertainty(Section):

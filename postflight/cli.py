@@ -170,6 +170,29 @@ def study_stiffness(folder: Path, scenario: str, seed: int) -> None:
     commands.stiffness(scenario, folder, seed)
 
 
+@study.command(name="shell-test")
+@click.argument("table", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("folder", type=FOLDER, default=Path("study-shell-test"))
+@click.option(
+    "--time", default="t_s", show_default=True, help="Column of time, unit behind the last _ or as NAME:UNIT."
+)
+@click.option("--load", default="moment_nm", show_default=True, help="Column of the load: a moment, or a force.")
+@click.option(
+    "--displacement", "displacements", multiple=True, default=("angle_deg",), show_default=True,
+    help="Column of an angle, or a displacement; of several the mean is taken.",
+)  # fmt: skip
+@click.option(
+    "--arm-m", type=click.FloatRange(min=0.0, min_open=True), help="Arm about the joint of force and displacement."
+)
+def study_shell_test(
+    table: Path, folder: Path, time: str, load: str, displacements: tuple[str, ...], arm_m: float | None
+) -> None:
+    """Which joint has a shell by its load test on the ground (TABLE, a CSV of load and displacement)? Into FOLDER."""
+    from postflight.studies import commands
+
+    commands.shell_test(table, folder, time, load, displacements, arm_m)
+
+
 @study.command(name="preflight")
 @click.argument("flight", type=FOLDER)
 @click.argument("folder", type=FOLDER, default=Path("study-preflight"))
@@ -352,12 +375,13 @@ def run(
 @click.argument("folder", type=FOLDER)
 @click.option("--hardening", is_flag=True, help="Ask whether the spring hardens (or softens) with the angle.")
 @click.option("--freeplay", is_flag=True, help="Ask whether the joint has freeplay.")
+@click.option("--creep", is_flag=True, help="Ask whether part of the joint's compliance comes late.")
 @click.option("--posterior", is_flag=True, help="Sample the posterior (emcee), evidence by dynesty.")
-def reconcile(folder: Path, hardening: bool, freeplay: bool, posterior: bool) -> None:
+def reconcile(folder: Path, hardening: bool, freeplay: bool, creep: bool, posterior: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
     from postflight.reconciliation import command
 
-    command.run(folder, ("freeplay",) * freeplay + ("hardening",) * hardening, posterior)
+    command.run(folder, ("freeplay",) * freeplay + ("creep",) * creep + ("hardening",) * hardening, posterior)
 
 
 @cli.command()

@@ -1,7 +1,9 @@
 """How do two rigid bodies on a compliant joint move? Compiled right-hand side, Runge-Kutta steps and recording.
 
 State (20): position and velocity of the composite c.g. (ECI), quaternions ECI from body and ECI from shell, rates of
-body and shell (own axes). ``m_B a_B = F_B + Fc`` and ``m_A a_A = F_A - Fc`` with one acceleration of the joint's point:
+body and shell (own axes); of a joint that creeps two more, the creep (shell axes y and z). Whether there are any is the
+length of the tuple ``creep``, a constant of the compiler: flights without them run through the same instructions as if
+there were no such law. ``m_B a_B = F_B + Fc`` and ``m_A a_A = F_A - Fc`` with one acceleration of the joint's point:
 the constraint is eliminated, so nothing drifts, and the joint's force ``Fc`` comes from one 3x3 symmetric
 positive-definite solve (constraint force equation of a spherical joint), in shell axes, where the shell's inertia, its
 arm to the joint and the aerodynamic wrench need no rotation. The readable form that tests compare with is
@@ -29,18 +31,19 @@ import math
 from flightmodel import _kernels as la
 from flightmodel._kernels import inlined, kernel
 
-# columns of a record: state, and the auxiliary quantities beside it
-STATES, AUX = 20, 18
+# columns of a record: state, what a joint that creeps adds to it, and the auxiliary quantities beside it
+STATES, CREEP_STATES, AUX = 20, 2, 18
 
 # parameters of a vehicle: masses of body and shell, 1/m_B, 1/m_A, m_A/m, -m_B/m, 1/m; of the body, then of the shell,
 # inertia, its inverse, and -[p] I^-1 [p] of the arm p from c.g. to joint (6 each: xx xy xz yy yz zz); those arms; nose
-# from the shell's c.g.; the joint's nine numbers; area, length; factors on C_A, C_N, C_m, shift of C_mq
+# from the shell's c.g.; the joint's nine numbers; area, length; factors on C_A, C_N, C_m, shift of C_mq; the delayed
+# compliance, rad/(N m), and 1 / its time constant
 M_B, M_A, PER_B, PER_A, SHARE_B, SHARE_A, PER_MASS = 0, 1, 2, 3, 4, 5, 6
 I_B, W_B, N_B, I_A, W_A, N_A = 7, 13, 19, 25, 31, 37
-P_B, P_A, NOSE_A, JOINT, REFERENCE, FACTOR = 43, 46, 49, 52, 61, 63
-PARAMETERS = 67
+P_B, P_A, NOSE_A, JOINT, REFERENCE, FACTOR, DELAYED = 43, 46, 49, 52, 61, 63, 67
+PARAMETERS = 69
 
-# rows: state, trial state of a Runge-Kutta stage, its derivative, the next state
+# rows: state, trial state of a Runge-Kutta stage, its derivative, the next state; in `CREEP` those of the creep
 Y, TRIAL, RATE, NEXT = 0, 20, 40, 60
 # recorded: altitude, density, Mach, dynamic pressure, shell's total angle of attack, deflection; in shell axes force
 # and moment of the joint on the body, and aerodynamic force
@@ -55,7 +58,8 @@ SIN, COS, SIN_LON, COS_LON, SOUND, NORTH, EAST, FREE = 130, 131, 132, 133, 134, 
 # C_A C_N C_m C_mq; flow at the nose, shell axes; its size, its lateral part; Mach bracket of the last look-up
 COEF, FLOW, SPEED, LATERAL, BRACKET = 138, 142, 145, 146, 147
 P = 148
-ROWS = P + PARAMETERS
+CREEP = P + PARAMETERS
+ROWS = CREEP + 4 * CREEP_STATES
 
 
 @inlined
@@ -285,7 +289,7 @@ def _joint(s, lanes):
 
     Bending potential of the angle between the two x axes, torsion potential of the twist that is left after the
     shortest rotation of one x axis onto the other; both moments are exact gradients, so springs conserve energy at any
-    angle. both moments are exact gradients, so springs conserve energy at any angle.
+    angle.
     """
     w = len(lanes)
     for i in range(w):
@@ -305,6 +309,37 @@ def _joint(s, lanes):
         t = -(s[j + 2 * w] * twist + (s[j + 5 * w] - damp) * along) / (1.0 + x)
         s[THETA * w + i] = theta
         _put(s, MOMENT, w, i, t * (1.0 + x) - damp * w0, k * z + t * y - damp * w1, t * z - k * y - damp * w2)
+
+
+@inlined
+def _creep(s, lanes):
+    """Joint's moment with creep in place of that without, and the creep's rate.
+
+    Spring and a Kelvin element in series: of the deflection ``e`` (shell axes y and z of the body's x axis, as long as
+    the angle) the spring feels ``e - b``, and ``b' = (k F - b) / tau`` with the spring's force ``F`` and the delayed
+    compliance ``k``. The potential of ``e - b`` has a slope across the plane of ``e``, too; the moment is its gradient.
+    """
+    w = len(lanes)
+    for i in range(w):
+        x, y, z = s[C_AB * w + i], s[(C_AB + 3) * w + i], s[(C_AB + 6) * w + i]
+        per_sine, theta = 1.0 / (math.sqrt(y * y + z * z) + 1e-300), s[THETA * w + i]
+        u, v = y * per_sine, z * per_sine
+        t = (CREEP + CREEP_STATES) * w + i
+        p, q = theta * u - s[t], theta * v - s[t + w]
+        size = math.sqrt(p * p + q * q)
+        j, k = (P + JOINT) * w + i, (P + DELAYED) * w + i
+        d = beyond_freeplay(theta, s[j + 6 * w], s[j + 7 * w], s[j + 8 * w])
+        without = d * (s[j] + s[j + w] * d * d)
+        d = beyond_freeplay(size, s[j + 6 * w], s[j + 7 * w], s[j + 8 * w])
+        per_size = d * (s[j] + s[j + w] * d * d) / (size + 1e-300)
+        p, q = p * per_size, q * per_size
+        along, across = p * u + q * v - without, (p * v - q * u) * theta * per_sine
+        m = MOMENT * w + i
+        s[m] += across * y * u + across * z * v
+        s[m + w] += along * v - across * x * u
+        s[m + 2 * w] -= along * u + across * x * v
+        r = t + CREEP_STATES * w
+        s[r], s[r + w] = s[k + w] * (s[k] * p - s[t]), s[k + w] * (s[k] * q - s[t + w])
 
 
 @inlined
@@ -391,7 +426,7 @@ def _rigid(s, lanes):
 
 
 @inlined
-def rates(s, lanes, atmosphere, grid, mach_knots, table, free, planet, locked):
+def rates(s, lanes, creep, atmosphere, grid, mach_knots, table, free, planet, locked):
     """Time derivative of the trial state of every lane, and what is recorded."""
     _attitudes(s, lanes)
     _position(s, lanes, planet)
@@ -403,11 +438,13 @@ def rates(s, lanes, atmosphere, grid, mach_knots, table, free, planet, locked):
         _rigid(s, lanes)
     else:
         _joint(s, lanes)
+        if len(creep) > 0:
+            _creep(s, lanes)
         _joined(s, lanes)
 
 
 @inlined
-def _record(s, w, record, limit, out, out_aux, written):
+def _record(s, w, creep, record, limit, out, out_aux, written):
     """Write state and record of every lane that still flies, forces and moments in ECI; true while any flies."""
     flying = False
     for i in range(w):
@@ -416,6 +453,8 @@ def _record(s, w, record, limit, out, out_aux, written):
         written[i] = record + 1
         for k in range(STATES):
             out[i, record, k] = s[(Y + k) * w + i]
+        for k in range(len(creep)):
+            out[i, record, STATES + k] = s[(CREEP + k) * w + i]
         for k in range(6):
             out_aux[i, record, k] = s[(ALTITUDE + k) * w + i]
         r = _nine(s, R_A, w, i)
@@ -446,6 +485,24 @@ def _advance(s, w, stage, step):
 
 
 @inlined
+def _advance_creep(s, w, creep, stage, step):
+    """`_advance` of the creep: with one function for both, rows as arguments, ensembles take a quarter longer."""
+    n, ahead, share = len(creep) * w, step * (1.0 if stage == 2 else 0.5), step / (6.0 if stage == 0 else 3.0)
+    for k in range(CREEP * w, CREEP * w + n):
+        s[k + 3 * n] = (s[k] if stage == 0 else s[k + 3 * n]) + share * s[k + 2 * n]
+        s[k + n] = s[k] + ahead * s[k + 2 * n]
+
+
+@inlined
+def _finish_creep(s, w, creep, step):
+    """`_finish` of the creep."""
+    n = len(creep) * w
+    for k in range(CREEP * w, CREEP * w + n):
+        s[k] = s[k + 3 * n] + step / 6.0 * s[k + 2 * n]
+        s[k + n] = s[k]
+
+
+@inlined
 def _finish(s, w, step):
     """After the last stage: the new state, quaternions of length one, and the trial state equal to it."""
     for k in range(STATES * w):
@@ -461,7 +518,7 @@ def _finish(s, w, step):
 
 
 @kernel
-def integrate(lanes, s, tables, planet, step, per_record, records, lock_records, limit, out, out_aux, written):
+def integrate(lanes, creep, s, tables, planet, step, per_record, records, lock_records, limit, out, out_aux, written):
     """Fly ``records - 1`` intervals of ``per_record`` RK4 steps; joint locked for the first ``lock_records`` intervals.
 
     ``written`` becomes the number of records of every lane, negative where the flight ended because the deflection
@@ -470,18 +527,24 @@ def integrate(lanes, s, tables, planet, step, per_record, records, lock_records,
     w = len(lanes)
     for k in range(STATES * w):
         s[TRIAL * w + k] = s[Y * w + k]
+    for k in range(len(creep) * w):
+        s[(CREEP + CREEP_STATES) * w + k] = s[CREEP * w + k]
     for record in range(records):
         locked = record < lock_records
         for sub in range(per_record):
             for stage in range(4):
-                rates(s, lanes, tables[0], tables[1], tables[2], tables[3], tables[4], planet, locked)
+                rates(s, lanes, creep, tables[0], tables[1], tables[2], tables[3], tables[4], planet, locked)
                 if stage + sub == 0:
-                    flying = _record(s, w, record, limit, out, out_aux, written)
+                    flying = _record(s, w, creep, record, limit, out, out_aux, written)
                     if record == records - 1 or not flying:
                         return
                 if stage < 3:
                     _advance(s, w, stage, step)
+                    if len(creep) > 0:
+                        _advance_creep(s, w, creep, stage, step)
             _finish(s, w, step)
+            if len(creep) > 0:
+                _finish_creep(s, w, creep, step)
 
 
 @kernel

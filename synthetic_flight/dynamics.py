@@ -3,7 +3,8 @@
 State ``(..., 20)`` as in `synthetic_flight._kernels`: position and velocity of the composite c.g. (ECI), quaternions
 ECI from body and ECI from shell, rates of body and shell in their own axes; B is the centerbody (*body*), A the
 aeroshell (*shell*). Energy is ``sum(m v^2 + w I w) / 2 + V(theta) + k_t twist^2 / 2 + gravity``, ``V`` the integral of
-the joint's moment over the deflection ``theta``. The equations of motion are compiled in `synthetic_flight._kernels`.
+the joint's moment over the deflection ``theta``; of a joint that creeps over the deflection less the creep, and the
+creep's own spring. The equations of motion are compiled in `synthetic_flight._kernels`.
 
 Steps: a free joint's modes obey ``I'' s^2 + C s + K = 0``; a fourth-order Runge-Kutta step h multiplies a mode by
 ``R(h s)``, ``R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24``, and must not amplify it. Assumed: springs at their stiffness at
@@ -22,7 +23,7 @@ from flightmodel.vehicle import Vehicle
 
 
 def split(state: FloatArray) -> tuple[FloatArray, ...]:
-    """Position, velocity (ECI), q_eci_body, q_eci_shell, omega_body, omega_shell of states ``(..., 20)``."""
+    """Position, velocity (ECI), q_eci_body, q_eci_shell, omega_body, omega_shell of states ``(..., 20 or 22)``."""
     return (
         state[..., 0:3],
         state[..., 3:6],
@@ -83,10 +84,29 @@ def beyond_freeplay(theta_rad: FloatArray, freeplay_rad: float, corner: float) -
     return np.where(theta_rad <= freeplay_rad - half, 0.0, outside)
 
 
-def _spring_energy(vehicle: Vehicle, q_eci_body: FloatArray, q_eci_shell: FloatArray) -> FloatArray:
+def spring_deflection(state: FloatArray) -> FloatArray:
+    """Deflection that the joint's spring feels, rad ``(..., 2)``: of the body's x axis, shell axes y and z, less creep.
+
+    As long as the angle: coordinates of the body's x axis on the sphere about the shell's.
+    """
+    _, _, q_b, q_a, _, _ = split(state)
+    theta, _ = deflection_angle(q_b, q_a)
+    x_axis = rotations.rotate(
+        rotations.multiply(rotations.conjugate(q_a), q_b),
+        np.broadcast_to(np.array([1.0, 0.0, 0.0]), (*theta.shape, 3)),
+    )
+    lateral = x_axis[..., 1:] * (theta / np.maximum(np.hypot(x_axis[..., 1], x_axis[..., 2]), 1e-300))[..., None]
+    return np.asarray(lateral - state[..., 20:22] if state.shape[-1] > 20 else lateral)
+
+
+def _spring_energy(vehicle: Vehicle, state: FloatArray) -> FloatArray:
     """Energy in the joint's springs, J: the integral of its moment over the angle, freeplay and hardening included."""
     joint = vehicle.joint
-    theta, _ = deflection_angle(q_eci_body, q_eci_shell)
+    theta = (
+        np.linalg.norm(spring_deflection(state), axis=-1)
+        if state.shape[-1] > 20
+        else deflection_angle(state[..., 6:10], state[..., 10:14])[0]
+    )
     node, weight = np.polynomial.legendre.leggauss(64)
     freeplay = np.deg2rad(joint.freeplay_deg)
     # the moment is smooth on each side of the corner: integrate piecewise
@@ -98,14 +118,16 @@ def _spring_energy(vehicle: Vehicle, q_eci_body: FloatArray, q_eci_shell: FloatA
         d = beyond_freeplay(x, freeplay, joint.freeplay_corner)
         moment = joint.bending_stiffness_nmprad * d + joint.hardening_nmprad3 * d**3
         energy = energy + 0.5 * (b - a) * np.sum(weight * moment, axis=-1)
-    return energy + 0.5 * joint.torsion_stiffness_nmprad * twist(q_eci_body, q_eci_shell) ** 2
+    if joint.creep_share > 0.0 and state.shape[-1] > 20:
+        energy = energy + 0.5 * np.sum(state[..., 20:22] ** 2, axis=-1) / joint.delayed_compliance_radpnm
+    return energy + 0.5 * joint.torsion_stiffness_nmprad * twist(state[..., 6:10], state[..., 10:14]) ** 2
 
 
 def internal_energy(state: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Energy of springs and of motion about the composite c.g., J, of states ``(..., 20)``."""
-    _, _, q_b, q_a, w_b, w_a = split(state)
+    *_, w_b, w_a = split(state)
     about = offsets(state, vehicle)
-    total = _spring_energy(vehicle, q_b, q_a)
+    total = _spring_energy(vehicle, state)
     for part, name, w in ((vehicle.centerbody, "body", w_b), (vehicle.aeroshell, "shell", w_a)):
         v = about[name][1]
         total = total + 0.5 * part.mass_kg * np.sum(v * v, axis=-1)
@@ -186,3 +208,11 @@ def check_step(vehicle: Vehicle, step_s: float) -> None:
                 f"{1e3 * longest:.2g} ms is stable (better half of it); shorten time.step_s, or soften the joint",
                 code="step-too-long",
             )
+    # under a deflection that is held the creep settles faster than under a load that is
+    settles_s = vehicle.joint.creep_time_s * (1.0 - vehicle.joint.creep_share)
+    if vehicle.joint.creep_share > 0.0 and step_s > SURELY_STABLE * settles_s:
+        raise ConfigError(
+            f"step of {1e3 * step_s:g} ms is too long for the joint's creep, which settles in {1e3 * settles_s:g} ms: "
+            "shorten time.step_s",
+            code="step-too-long",
+        )

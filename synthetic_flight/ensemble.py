@@ -44,10 +44,10 @@ class Start:
     Parameters
     ----------
     state : (20,) float
-        At the start (`synthetic_flight.simulate.state_from_ecef`).
-    parameters : (67,) float
-        `synthetic_flight.simulate.parameter_vector` of the dispersed vehicle. All flights share one coefficient table;
-        the last four parameters scale C_A, C_N, C_m and shift C_mq.
+        At the start (`synthetic_flight.simulate.state_from_ecef`); (22,) with creep, which is none otherwise.
+    parameters : (69,) float
+        `synthetic_flight.simulate.parameter_vector` of the dispersed vehicle. All flights share one coefficient table,
+        which four of the parameters scale.
     atmosphere : (rows, 6) float
         `synthetic_flight.simulate.atmosphere_table` of the flight's own atmosphere.
     """
@@ -136,7 +136,7 @@ def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule:
     lanes = integrate_lanes(
         vehicle,
         starts[0].atmosphere if shared else np.stack([s.atmosphere for s in padded]),
-        np.stack([s.state for s in padded]),
+        np.stack([simulate.with_creep(s.state, vehicle) for s in padded]),
         np.stack([s.parameters for s in padded]),
         schedule.step_s,
         schedule.per_record,
@@ -170,8 +170,8 @@ def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[
     flown: list[Flown] = []
     for leg in legs:
         if flown:
-            ends = [f.states[-1] if len(f.states) and not f.diverged else np.full(len(s.state), np.nan)
-                    for f, s in zip(flown, starts, strict=True)]  # fmt: skip
+            ends = [f.states[-1] if len(f.states) and not f.diverged else np.full(f.states.shape[1], np.nan)
+                    for f in flown]  # fmt: skip
             starts = [replace(s, state=end) for s, end in zip(starts, ends, strict=True)]
         flown = _fly_block(vehicle, runs, starts, leg)
     return flown

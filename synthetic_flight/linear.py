@@ -9,7 +9,9 @@ positive angles move the aft end to ``+y``. Flow angles are taken at the shell's
                                   + K (theta_B - theta_A) + C (theta_B' - theta_A')
     m_B r_B y'' + I_B theta_B'' = m_B a_x r_B theta_B - K (theta_B - theta_A) - C (theta_B' - theta_A')
 
-with ``a_x = q S C_A / m`` and inertias about the joint. Assumed: both bodies axisymmetric with c.g.s on the axis,
+with ``a_x = q S C_A / m`` and inertias about the joint. Where the joint creeps its spring feels ``theta_B - theta_A -
+b``, and ``tau b' = k K (theta_B - theta_A - b) - b`` with the delayed compliance ``k`` and the time constant ``tau``;
+loads that stay feel the stiffness ``K / (1 + k K)``. Assumed: both bodies axisymmetric with c.g.s on the axis,
 constant density, small angles, springs at their stiffness at rest, no freeplay.
 
 References
@@ -50,6 +52,8 @@ def slopes_at(vehicle: Vehicle, mach: float) -> Slopes:
 def linear_matrix(vehicle: Vehicle, slopes: Slopes, pressure_pa: float, speed_mps: float) -> FloatArray:
     """Matrix (5, 5) of ``x' = A x``, ``x = (y', theta_A, theta_B, theta_A', theta_B')``: m/s, rad, rad/s.
 
+    Of a joint that creeps (6, 6), the creep, rad, last.
+
     Parameters
     ----------
     vehicle : Vehicle
@@ -64,9 +68,12 @@ def linear_matrix(vehicle: Vehicle, slopes: Slopes, pressure_pa: float, speed_mp
     first_a = shell.mass_kg * float(vehicle.joint_m[0] - shell.cg_m[0])
     first_b = body.mass_kg * float(vehicle.joint_m[0] - body.cg_m[0])
     inertia_a, inertia_b = vehicle.transverse_inertia_about_joint()
-    drift, angle_a, angle_b, rate_a, rate_b = np.eye(5)
+    creeps = joint.creep_share > 0.0
+    drift, angle_a, angle_b, rate_a, rate_b, *more = np.eye(6 if creeps else 5)
+    creep = more[0] if creeps else 0.0 * drift
     flow = angle_a + (drift - joint.station_m * rate_a) / speed_mps
-    spring = joint.bending_stiffness_nmprad * (angle_b - angle_a) + joint.bending_damping_nmsprad * (rate_b - rate_a)
+    elastic = joint.bending_stiffness_nmprad * (angle_b - angle_a - creep)
+    spring = elastic + joint.bending_damping_nmsprad * (rate_b - rate_a)
     deceleration = load * slopes.ca / vehicle.mass_kg
     moment = load * (slopes.cm_alpha * length + slopes.cn_alpha * joint.station_m) * flow
     moment = moment + load * length**2 * slopes.cmq / (2.0 * speed_mps) * rate_a
@@ -81,7 +88,8 @@ def linear_matrix(vehicle: Vehicle, slopes: Slopes, pressure_pa: float, speed_mp
         ]
     )
     turning = np.linalg.solve(mass, right)
-    return np.stack([turning[0], rate_a, rate_b, turning[1], turning[2]])
+    settling = [(joint.delayed_compliance_radpnm * elastic - creep) / joint.creep_time_s] * creeps
+    return np.stack([turning[0], rate_a, rate_b, turning[1], turning[2], *settling])
 
 
 @dataclass(frozen=True)
@@ -90,7 +98,7 @@ class Modes:
 
     Parameters
     ----------
-    eigenvalues_radps : (5,) complex
+    eigenvalues_radps : (5,) complex, or (6,) of a joint that creeps
         By falling real part.
     growth_rate_radps : float
         Largest real part, 1/s.
@@ -125,7 +133,10 @@ def _levers(vehicle: Vehicle, slopes: Slopes) -> tuple[float, float]:
 
 
 def critical_stiffness_nmprad(vehicle: Vehicle, slopes: Slopes, pressure_pa: float) -> float:
-    """Bending stiffness, N m/rad, below which the vehicle diverges: ``q S C_A xbar (1 + xbar / L)``."""
+    """Bending stiffness, N m/rad, below which the vehicle diverges: ``q S C_A xbar (1 + xbar / L)``.
+
+    Of a joint that creeps it is that against loads that stay.
+    """
     xbar, margin = _levers(vehicle, slopes)
     return pressure_pa * vehicle.reference.area_m2 * slopes.ca * xbar * (1.0 + xbar / margin)
 
@@ -133,9 +144,9 @@ def critical_stiffness_nmprad(vehicle: Vehicle, slopes: Slopes, pressure_pa: flo
 def static_trim(vehicle: Vehicle, slopes: Slopes, pressure_pa: float, offset_m: float) -> tuple[float, float]:
     """Angle of attack of the shell and deflection, rad, at which a lateral c.g. offset in the centerbody trims.
 
-    ``offset_m`` is that of the vehicle's c.g. Diverges as the stiffness nears the critical one.
+    ``offset_m`` is that of the vehicle's c.g. Diverges as the stiffness nears the critical one; with creep, after it.
     """
     xbar, margin = _levers(vehicle, slopes)
-    softness = critical_stiffness_nmprad(vehicle, slopes, pressure_pa) / vehicle.joint.bending_stiffness_nmprad
+    softness = critical_stiffness_nmprad(vehicle, slopes, pressure_pa) / vehicle.joint.held_stiffness_nmprad
     alpha = slopes.ca * offset_m / (slopes.cn_alpha * margin) / (1.0 - softness)
     return alpha, offset_m / xbar * softness / (1.0 - softness)

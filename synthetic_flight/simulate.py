@@ -4,7 +4,7 @@
 Runge-Kutta with a fixed step; the joint may be locked until the aeroshell is inflated. A flight that tumbles is
 flagged, one whose deflection passes 90 deg ends there; neither is an error.
 
-The kernels take a vehicle as a vector of 67 parameters (`parameter_vector`) and the atmosphere as a table with a row
+The kernels take a vehicle as a vector of 69 parameters (`parameter_vector`) and the atmosphere as a table with a row
 every 50 m (`atmosphere_table`).
 """
 
@@ -27,7 +27,7 @@ from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import _kernels as at
 from synthetic_flight import dynamics
-from synthetic_flight._kernels import AUX, STATES
+from synthetic_flight._kernels import AUX, CREEP_STATES, STATES
 from synthetic_flight.dynamics import check_step
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Truth(Tabular):
     trajectory : Trajectory
         Of the structural datum on the centerbody's axis, body attitude.
     state_eci : (n, 20) float
-        As integrated (`synthetic_flight._kernels`).
+        As integrated (`synthetic_flight._kernels`); (n, 22) where the joint creeps.
     q_body_shell : (n, 4) float
     deflection : DeflectionHistory
         Method ``"truth"``.
@@ -191,12 +191,15 @@ def integrate(
 ) -> tuple[FloatArray, FloatArray]:
     """States ``(n, 20)`` and auxiliaries ``(n, 18)`` of a flight; fewer than ``records`` where the joint diverged.
 
+    A joint that creeps has two states more; it starts without creep where ``state`` is (20,).
+
     Raises
     ------
     ConfigError
         Where the state's shape, the step or a count is impossible.
     """
-    if state.shape != (STATES,) or records < 1 or per_record < 1 or not step_s > 0.0:
+    state = with_creep(state, vehicle)
+    if state.shape not in ((STATES,), (STATES + CREEP_STATES,)) or records < 1 or per_record < 1 or not step_s > 0.0:
         raise ConfigError(
             f"integrate: a state (20,), step_s > 0, per_record and records >= 1 are wanted; got state {state.shape}, "
             f"step_s {step_s:g}, per_record {per_record}, records {records}",
@@ -222,13 +225,15 @@ def integrate_lanes(
 ) -> list[tuple[FloatArray, FloatArray, bool]]:
     """States, auxiliaries and whether the joint diverged of flights side by side.
 
-    ``states`` ``(lanes, 20)``, ``parameters`` ``(lanes, 67)``; ``atmosphere`` is one table, or ``(lanes, rows, 6)``.
+    ``states`` ``(lanes, 20)``, or ``(lanes, 22)`` of joints that creep, ``parameters`` ``(lanes, 69)``; ``atmosphere``
+    is one table, or ``(lanes, rows, 6)``.
     """
-    lanes = len(states)
-    out, aux = np.empty((lanes, records, STATES)), np.empty((lanes, records, AUX))
+    lanes, width = states.shape
+    out, aux = np.empty((lanes, records, width)), np.empty((lanes, records, AUX))
     written = np.zeros(lanes, dtype=np.int64)
     at.integrate(
         (0,) * lanes,
+        (0,) * (width - STATES),
         workspace(states, parameters),
         kernel_tables(vehicle, atmosphere),
         planet,
@@ -415,7 +420,7 @@ def freeplay_corner(freeplay_rad: float, corner: float) -> tuple[float, float, f
 def parameter_vector(
     vehicle: Vehicle, ca: float = 1.0, cn: float = 1.0, cm: float = 1.0, cmq_shift: float = 0.0
 ) -> FloatArray:
-    """Pack a vehicle for the kernels, (67,), with factors on its C_A, C_N and C_m and a shift of its C_mq."""
+    """Pack a vehicle for the kernels, (69,), with factors on its C_A, C_N and C_m and a shift of its C_mq."""
     p = np.zeros(at.PARAMETERS)
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
     upper = np.triu_indices(3)
@@ -444,6 +449,7 @@ def parameter_vector(
     )
     p[at.REFERENCE : at.REFERENCE + 2] = vehicle.reference.area_m2, vehicle.reference.length_m
     p[at.FACTOR : at.FACTOR + 4] = ca, cn, cm, cmq_shift
+    p[at.DELAYED : at.DELAYED + 2] = joint.delayed_compliance_radpnm, 1.0 / joint.creep_time_s
     return p
 
 
@@ -488,11 +494,19 @@ def kernel_tables(vehicle: Vehicle, atmosphere: FloatArray) -> tuple[FloatArray,
 
 
 def workspace(states: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Flat workspace of the kernels of states ``(lanes, 20)`` and parameter vectors ``(lanes, 67)``."""
+    """Flat workspace of the kernels of states ``(lanes, 20 or 22)`` and parameter vectors ``(lanes, 69)``."""
     s = np.zeros((at.ROWS, len(states)))
-    s[at.Y : at.Y + at.STATES] = states.T
-    s[at.P :] = parameters.T
+    s[at.Y : at.Y + STATES] = states[:, :STATES].T
+    s[at.P : at.CREEP] = parameters.T
+    s[at.CREEP : at.CREEP + states.shape[1] - STATES] = states[:, STATES:].T
     return s.ravel()
+
+
+def with_creep(state: FloatArray, vehicle: Vehicle) -> FloatArray:
+    """State (20,), or (22,) without creep yet where the vehicle's joint creeps and the state does not say how far."""
+    if vehicle.joint.creep_share == 0.0 or len(state) != STATES:
+        return state
+    return np.append(state, np.zeros(CREEP_STATES))
 
 
 def _finite_records(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:

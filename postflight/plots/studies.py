@@ -14,6 +14,7 @@ from matplotlib.ticker import ScalarFormatter
 from postflight.plots.style import COLOUR, MANY, STROKES, TIME, in_style, note, percentiles
 from postflight.studies.joints import JointStudy
 from postflight.studies.preflight import Bounds
+from postflight.studies.shell_test import ShellTest
 
 _MOST_BARS = 15
 _HIGHEST = {"alpha_total_deg": 25.0, "normal_g": 2.5}  # shown of a joint study; a tumble goes beyond
@@ -160,4 +161,28 @@ def figure_preflight(
     axes[0, 0].legend()
     figure.suptitle(f"Flight against bounds of its own entry (AIAA 2011-2571, Figure 1.3)\n{words}", fontsize=10)
     note(figure, synthetic)
+    return figure
+
+
+@in_style
+def figure_shell_test(found: ShellTest, title: str) -> Figure:
+    """Load against angle, measured and by the selected law and a straight spring; what each leaves over time."""
+    figure = Figure(figsize=(7.2, 3.4))
+    ax, left = figure.subplots(1, 2)
+    test, selected = found.selected.test, found.selected
+    ax.plot(np.rad2deg(test.angle_rad), test.moment_nm, color=COLOUR["estimate"], label="measured")
+    shown = (("selected", selected, "second"), ("straight", found.fits[0], "limit"))
+    for name, fit, colour in shown if selected is not found.fits[0] else shown[1:]:
+        label = f"{name}: {' and '.join(fit.laws) or 'spring'}, rms {100.0 * fit.rms_share:.1f} %"
+        ax.plot(
+            np.rad2deg(test.angle_rad - fit.residual_rad), test.moment_nm, color=COLOUR[colour], lw=1.0, label=label
+        )
+        left.plot(test.time_s, 100.0 * fit.residual_rad / test.largest_rad, color=COLOUR[colour], lw=1.0)
+    ax.set_xlabel("angle (deg)")
+    ax.set_ylabel("moment in the joint (N m)")
+    ax.legend(fontsize=7)
+    left.axhline(0.0, color=COLOUR["zero"], lw=0.8)
+    left.set_xlabel(TIME)
+    left.set_ylabel("measured less fitted (% of the largest)")
+    figure.suptitle(title, fontsize=10)
     return figure

@@ -50,7 +50,11 @@ from synthetic_flight.dispersions import Factor, JointDispersions
 
 ENTRIES = 300
 STRONG = 3.0  # logarithm of odds of twenty to one
-LAW_NAMES = {"freeplay": "freeplay", "hardening": "a spring whose slope changes with the angle"}
+LAW_NAMES = {
+    "freeplay": "freeplay",
+    "creep": "creep (part of the compliance comes late)",
+    "hardening": "a spring whose slope changes with the angle",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -277,7 +281,8 @@ def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> 
         if law not in odds:
             continue
         side = "for" if odds[law] > 0.0 else "against"
-        evidence = "no clear evidence" if abs(odds[law]) < STRONG else f"strong evidence {side}"
+        open_words = "cannot be told" if law == "creep" else "no clear evidence"
+        evidence = open_words if abs(odds[law]) < STRONG else f"strong evidence {side}"
         console.print(f"{name}: {evidence} (odds e^{odds[law]:+.1f})")
     if odds.get("hardening", 0.0) > STRONG and "hardening" not in fit.problem.vehicle_parameters.laws:
         console.print(

@@ -20,15 +20,16 @@ CONFIDENCE = 0.999  # as the reconstruction's checks
 MOST_OFF_SD = 4.0  # as the camera's time bias
 MOST_MOVED_SD = 4.0  # of some forty parameters of a right fit one is beyond it in two fits of a thousand
 JOINT_WORDS = (
-    "another joint, or freeplay (--freeplay), than was fitted; mass properties or sensors' places that are wrong"
+    "another joint, or freeplay (--freeplay) or creep (--creep), than was fitted; mass properties or sensors' places "
+    "that are wrong"
 )
 # their a priori law says next to nothing of them
-OPEN = ("stiffness", "damping", "freeplay", "hardening")
+OPEN = ("stiffness", "damping", "freeplay", "hardening", "creep growth", "creep settling")
 
 
 def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[ConsistencyCheck, ...]:
     """Checks of residuals, moves, joins and convergence, and against the stiffness by the joint's frequency."""
-    checks = (_residuals(fit), _moves(fit), _spans(fit), _convergence(fit))
+    checks = (_residuals(fit), _moves(fit), _spans(fit), _convergence(fit), *_creep(fit))
     # a loose joint oscillates at the frequency of a softer one
     if modal is None or "freeplay" in fit.problem.vehicle_parameters.laws:
         return checks
@@ -38,8 +39,10 @@ def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[Con
 def _residuals(fit: JointFit) -> ConsistencyCheck:
     """All residuals against chi-square: one each for what was measured, joined and stated, less one a parameter."""
     problem = fit.problem
-    # every parameter but the motion has an a priori residual; the first motion has twelve of its fifteen
-    degrees = int((problem.weight > 0.0).sum()) + fit.residuals.joins.size - MOTION * problem.measured.spans + 12
+    # every parameter but the motion has an a priori residual; of the first motion all but the three rates
+    first = problem.motion - 3
+    degrees = int((problem.weight > 0.0).sum()) + fit.residuals.joins.size - problem.motion * problem.measured.spans
+    degrees += first
     high = float(chi2.ppf(CONFIDENCE, degrees)) / degrees
     return consistency_check(
         "joint-residuals", "reconciliation: residuals", fit.residuals.cost / degrees, 0.0, high,
@@ -76,6 +79,24 @@ def _spans(fit: JointFit) -> ConsistencyCheck:
     return consistency_check(
         "joint-spans", "reconciliation: spans", count, 0.0, 0.0, "all spans match sensors and neighbours", bad,
         advice="the motion between them is not the fitted joint's",
+    )  # fmt: skip
+
+
+def _creep(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
+    """How many sd of creep the fit is short of, where it has none and the joint is resolved."""
+    problem = fit.problem
+    if problem.motion > MOTION or problem.held:
+        return ()
+    worst = max(fit.creep_scores, key=lambda score: score.sds)
+    share = worst.delayed / (1.0 + worst.delayed)
+    words = f"{100.0 * share:.0f} % of the compliance with a time constant of {worst.time_s:g} s"
+    return (
+        consistency_check(
+            "joint-creep", "reconciliation: creep of the joint", max(worst.sds, 0.0), 0.0, MOST_OFF_SD,
+            "deflections follow the moment without creep",
+            f"deflections lag behind the moment, as of a joint that creeps (linear estimate: {words})",
+            advice="one stiffness does not describe this joint; fit its law with --creep",
+        ),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Which joint, c.g. offset and static stability explain the flight, and has the joint freeplay or hardening?
+"""Which joint, c.g. offset and static stability explain the flight, and has the joint freeplay, hardening or creep?
 
 ``max p(parameters | measurements)`` by Gauss-Newton (`gauss_newton`), first with all standard deviations many times
 wider, so that distant starts reach the minimum, at last with the estimated turbulence. The first stiffness is guessed
@@ -16,20 +16,27 @@ settle on a false path, with impacts at the wrong edge of the band. Before each 
 the end of the one before it, and spans that do not match are fitted once more from wide standard deviations, or from
 another freeplay.
 
-Freeplay and hardening are kept where the evidence favours them. Freeplay is compared first, on the loaded part of the
-flight; where it is rejected the joint is fitted to the whole flight again. Hardening is compared next.
+Creep. The fit without it is the start: about it the linear problem says how much creep of each of some time constants
+would lower the cost (`CreepScore`), and the steps begin with the time constant of the largest. The creep at the
+starts of spans is sought as the rest of the motion is, since it remembers more than a span.
+
+Freeplay, creep and hardening are kept where the evidence favours them. Freeplay is compared first, on the loaded part
+of the flight; where it is rejected the joint is fitted to the whole flight again. Creep is compared next, since a
+spring that hardens is a smaller part of what a shell does under load, then hardening.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from flightmodel.checks import FloatArray, Progress
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.forward_model import (
+    CREEP_PER_S,
     DEFLECTION,
     FREEPLAY_SD_RAD,
     AtmosphereParameters,
@@ -64,6 +71,11 @@ STARTS_RAD = np.deg2rad([0.25, 0.5, 0.1])
 MISMATCH_COST, LEAST_GAIN = 150.0, 10.0  # of a span's 60 samples with both its joins; of a new start
 # shares of the turbulence of the sounding's statistics
 SHARES = np.geomspace(0.05, 2.0, 7)
+# of creep: time constants that are tried (a factor of five apart the answers differ by less than a sd), and factors on
+# the standard deviations of the first steps, which the change from the held to the fast stiffness needs
+CREEP_TIMES_S = (2.0, 10.0, 50.0)
+SD_FACTORS_CREEP = (10.0, 3.0)
+USUAL_CREEP = 0.3  # delayed compliance over the spring's, until a fit has found its own
 
 
 @dataclass(frozen=True)
@@ -108,6 +120,11 @@ class JointFit:
         """Vehicle with the fitted joint, offset and coefficients."""
         return self.problem.vehicle_parameters.flown(self.parameters.vehicle)
 
+    @cached_property
+    def creep_scores(self) -> tuple[CreepScore, ...]:
+        """What the linear problem at the solution says of creep with each of `CREEP_TIMES_S`; of a fit without any."""
+        return tuple(_creep_score(self, time_s) for time_s in CREEP_TIMES_S)
+
 
 @dataclass(frozen=True)
 class LawSelection:
@@ -138,12 +155,15 @@ def select_laws(flight: Reconstruction, asked: tuple[str, ...] = (), progress: P
         As `reconcile`.
     """
     report = progress or (lambda _fraction, _what: None)
-    fits, most = 0, 1 + 3 * ("freeplay" in asked) + ("hardening" in asked)
+    fits, most = 0, 1 + 3 * ("freeplay" in asked) + sum(law in asked for law in ("creep", "hardening"))
+
+    def next_part() -> Progress:
+        nonlocal fits
+        fits += 1
+        return part_of(report, (fits - 1) / most, fits / most)
 
     def fitted(laws: tuple[str, ...], loaded: bool) -> JointFit:
-        nonlocal fits
-        part = part_of(report, fits / most, (fits + 1) / most)
-        fits += 1
+        part = next_part()
         if "freeplay" in laws:
             return reconcile_with_freeplay(flight, select_measurements(flight, loaded), laws, part)
         return reconcile(flight, laws, loaded, part)
@@ -155,14 +175,94 @@ def select_laws(flight: Reconstruction, asked: tuple[str, ...] = (), progress: P
         best = loose if loose.log_evidence > tight.log_evidence else None
     kept = best.problem.vehicle_parameters.laws if best else ()
     best = best or fitted((), False)
+    if "creep" in asked:
+        creeping = reconcile_with_creep(best, next_part())
+        compared["creep"] = best, creeping
+        # a joint that recoils from its load is not a law, but something else that is wrong
+        if creeping.log_evidence > best.log_evidence and creeping.vehicle.joint.creep_share > 0.0:
+            best = creeping
     if "hardening" in asked:
-        hard = fitted((*kept, "hardening"), bool(kept))
+        creeps = "creep" in best.problem.vehicle_parameters.laws
+        hard = _with_hardening(best, next_part()) if creeps else fitted((*kept, "hardening"), bool(kept))
         compared["hardening"] = best, hard
         # the vehicle file has no joint that softens: such a fit is reported, not flown
         if hard.log_evidence > best.log_evidence and hard.vehicle.joint.hardening_nmprad3 > 0.0:
             best = hard
     report(1.0, "reconciled")
     return LawSelection(best, compared)
+
+
+@dataclass(frozen=True)
+class CreepScore:
+    """What the linear problem about a fit without creep says of creep with one time constant.
+
+    Parameters
+    ----------
+    time_s : float
+    delayed : float
+        Compliance that would come late over that of the spring, and ``sd``.
+    sd : float
+    """
+
+    time_s: float
+    delayed: float
+    sd: float
+
+    @property
+    def sds(self) -> float:
+        """Delayed compliance in standard deviations: its square is the predicted decrease of the cost."""
+        return self.delayed / self.sd
+
+
+def _creep_score(fit: JointFit, time_s: float) -> CreepScore:
+    """Step of the delayed compliance from none, all other parameters following, and its sd."""
+    problem, start = _without_creep_yet(fit, time_s)
+    k = problem.vehicle_parameters.names.index("creep growth")
+    normal = NormalEquations(*problem.normal_equations(start, problem.linearize(start)))
+    unit = np.eye(len(normal.right))[k]
+    step, variance = normal.solve(normal.right)[k], normal.solve(unit)[k]
+    return CreepScore(time_s, CREEP_PER_S * time_s * float(step), CREEP_PER_S * time_s * float(np.sqrt(variance)))
+
+
+def _without_creep_yet(fit: JointFit, time_s: float) -> tuple[Problem, Parameters]:
+    """Problem with creep of a time constant, and the fit's parameters with none of it."""
+    problem, start = _with_parameters(fit, "creep", [0.0, float(np.arcsinh(1.0 / (CREEP_PER_S * time_s)))])
+    return replace(problem, creep_per_s=USUAL_CREEP / time_s), start
+
+
+def _with_parameters(fit: JointFit, law: str, values: list[float]) -> tuple[Problem, Parameters]:
+    """Problem of a fit with one law more, and the fit's parameters with those of the law; creep nowhere yet."""
+    before = fit.problem.vehicle_parameters
+    problem = replace(fit.problem, vehicle_parameters=replace(before, laws=(*before.laws, law)))
+    motion = np.zeros((len(fit.parameters.motion), problem.motion))
+    motion[:, : fit.problem.motion] = fit.parameters.motion
+    vehicle = np.insert(fit.parameters.vehicle, before.sought, values)
+    return problem, replace(fit.parameters, vehicle=vehicle, motion=motion)
+
+
+def reconcile_with_creep(plain: JointFit, progress: Progress | None = None) -> JointFit:
+    """Fit a joint that creeps, from a fit without creep."""
+    report = progress or (lambda _fraction, _what: None)
+    report(0.0, "reconciling, creep")
+    likeliest = max(plain.creep_scores, key=lambda score: abs(score.sds))
+    return _from_fit(*_without_creep_yet(plain, likeliest.time_s), report)
+
+
+def _with_hardening(fit: JointFit, report: Progress) -> JointFit:
+    """Fit hardening besides the laws that a fit has, from that fit."""
+    return _from_fit(*_with_parameters(fit, "hardening", [0.0]), report)
+
+
+def _from_fit(problem: Problem, start: Parameters, report: Progress) -> JointFit:
+    """Fit with one law more, from the parameters of a fit without it."""
+    correct = reconnected if "freeplay" in problem.vehicle_parameters.laws else None
+    early = [replace(problem, sd_factor=factor) for factor in SD_FACTORS_CREEP]
+    first = solve(problem, start, early, part_of(report, 0.2, 0.6), correct, EARLY_TOLERANCE)
+    joint = first.vehicle.joint
+    if "creep" in problem.vehicle_parameters.laws and joint.creep_share > 0.0:
+        per_s = joint.delayed_compliance_radpnm * joint.bending_stiffness_nmprad / joint.creep_time_s
+        first = replace(first, problem=replace(problem, creep_per_s=per_s))
+    return _refit_with_turbulence(first, part_of(report, 0.6, 1.0), correct)
 
 
 def part_of(report: Progress, first: float, last: float) -> Progress:

@@ -6,11 +6,12 @@ from attitude and atmosphere, and deflections by misalignment and trim are made 
 count them twice. Spans of ten windows, about a period of the joint, start from a motion of their own at the
 reconstruction's position and velocity and are flown by the simulator, many at once.
 
-Sought are the joint's parameters (stiffness, damping, freeplay and hardening where asked for), the lateral c.g. offset
-and the static stability. Nuisance parameters are all else that the motion depends on within its a priori uncertainty:
-masses, stations, inertias, other coefficients, the instruments' constant errors, and the atmosphere. Parameters of
-vehicle and instruments count in a priori standard deviations; those of the atmosphere are the logarithm of the density
-ratio and the differences of the winds, m/s, and of the temperature, K, to the sounding, at knots along altitude.
+Sought are the joint's parameters (stiffness, damping; freeplay, hardening and creep where asked for), the lateral
+c.g. offset and the static stability. Nuisance parameters are all else that the motion depends on within its a priori
+uncertainty: masses, stations, inertias, other coefficients, the instruments' constant errors, and the atmosphere.
+Parameters of vehicle and instruments count in a priori standard deviations; those of the atmosphere are the logarithm
+of the density ratio and the differences of the winds, m/s, and of the temperature, K, to the sounding, at knots along
+altitude.
 
 The velocity at the starts is a parameter, too, and joined from span to span. What an accelerometer misaligned by 2 mrad
 or a gyro's mounting does to a reconstructed path of 9 g turns with the vehicle, as the c.g.'s offset does: at 50 rpm
@@ -45,6 +46,7 @@ from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
 from postflight.reconstruction import Reconstruction
 from recon.atmosphere import cg_accelerations, windows_are_whole
 from synthetic_flight import simulate
+from synthetic_flight._kernels import CREEP_STATES
 from synthetic_flight.dynamics import joint_modes
 from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
 
@@ -58,8 +60,19 @@ LEAST_INERTIA = 0.01  # of the stated one: a trial step never makes an inertia n
 FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
 # hardening is counted as the share by which the tangent stiffness has grown at this angle; negative: it softens
 HARDENING_AT_RAD = np.deg2rad(4.0)
+# creep by how fast it grows, delayed compliance over the spring's and over the time constant, and how fast it settles,
+# 1 / time constant: of creep slower than the flight the growth is measured and the rest is not, so that both follow
+# from the data by nearly straight lines. Both as sinh of the parameter: one sd is 0.06 1/s, four are 1.4 1/s
+CREEP_PER_S, LEAST_SETTLING_PER_S = 0.05, 1.0 / 300.0
+# delayed compliance over the spring's, and rates, that a trial step makes at most: a joint that runs away from its load
+# is none, and a vehicle file has no share above 0.9 and no time constant below 0.1 s
+LEAST_CREEP, MOST_CREEP, MOST_PER_S = -0.5, 9.0, 10.0
 JOINT = ("stiffness", "damping", "offset y", "offset z", "static stability")
-LAWS = ("freeplay", "hardening")
+LAWS = {
+    "freeplay": ("freeplay",),
+    "hardening": ("hardening",),
+    "creep": ("creep growth", "creep settling"),
+}  # and parameters
 NUISANCE = (
     "C_A", "C_N", "C_mq", "mass of the shell", "mass of the centerbody", "station of the shell's c.g.",
     "station of the centerbody's c.g.", "shell's c.g. y", "shell's c.g. z", "inertia of the shell",
@@ -89,12 +102,22 @@ class VehicleParameters:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, the joint's first."""
-        return (*JOINT, *self.laws, *NUISANCE)
+        return (*JOINT, *self._of_laws, *NUISANCE)
 
     @property
     def sought(self) -> int:
         """How many of them are sought; the others are nuisance parameters."""
-        return len(JOINT) + len(self.laws)
+        return len(JOINT) + len(self._of_laws)
+
+    @property
+    def _of_laws(self) -> tuple[str, ...]:
+        return tuple(name for law in self.laws for name in LAWS[law])
+
+    @property
+    def motion(self) -> int:
+        """How many numbers the motion at a span's start has: with creep, that of both lateral axes."""
+        creeps = "creep" in self.laws or self.nominal.joint.creep_share > 0.0
+        return MOTION + (CREEP_STATES if creeps else 0)
 
     def vehicle(self, x: FloatArray) -> Vehicle:
         """Vehicle of parameters (v,), with nominal coefficients (`factors` scales them)."""
@@ -111,6 +134,8 @@ class VehicleParameters:
                 changed["freeplay_corner"] = self.corner
         if "hardening" in v:
             changed["hardening_nmprad3"] = stiffness * HARDENING_SD * v["hardening"] / (3.0 * HARDENING_AT_RAD**2)
+        if "creep growth" in v:
+            changed["creep_share"], changed["creep_time_s"] = creep_law(v["creep growth"], v["creep settling"])
         # the whole vehicle's offset; the centerbody carries it
         lateral = known.cg_lateral_m * np.array([v["shell's c.g. y"], v["shell's c.g. z"]])
         offset = OFFSET_SD_M * np.array([v["offset y"], v["offset z"]]) * nominal.mass_kg - lateral * shell.mass_kg
@@ -133,6 +158,15 @@ class VehicleParameters:
             1.0 + known.ca * v["C_A"], 1.0 + known.cn * v["C_N"], 1.0 + known.cm * v["static stability"],
             known.cmq * v["C_mq"],
         )  # fmt: skip
+
+
+def creep_law(growth: float, settling: float) -> tuple[float, float]:
+    """Share of the compliance that comes late, and its time constant, s, of the two parameters."""
+    most = np.arcsinh(MOST_PER_S / CREEP_PER_S)
+    grows, settles = CREEP_PER_S * np.sinh(np.clip([growth, settling], -most, most))
+    time_s = float(1.0 / np.hypot(LEAST_SETTLING_PER_S, settles))
+    delayed = float(np.clip(grows * time_s, LEAST_CREEP, MOST_CREEP))
+    return delayed / (1.0 + delayed), time_s
 
 
 def _perturbed(
@@ -430,16 +464,17 @@ def _affine(values: FloatArray, responses: FloatArray) -> FloatArray:
 
 
 # of a span's start: rotation from the reconstructed attitude, body's rate, shell's rotation vector from the body (x is
-# its twist), shell's rate relative to the body, shell axes; velocity less the reconstructed one, ECEF
+# its twist), shell's rate relative to the body, shell axes; velocity less the reconstructed one, ECEF; of a joint that
+# creeps its creep as `synthetic_flight._kernels` has it
 MOTION = 15
 ATTITUDE, RATE, DEFLECTION, DEFLECTION_RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-VELOCITY = slice(12, 15)
+VELOCITY, CREEP = slice(12, 15), slice(15, 17)
 Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class TrialVehicle:
-    """A vehicle with its vector for the kernels, `simulate.parameter_vector` (67,)."""
+    """A vehicle with its vector for the kernels, `simulate.parameter_vector` (69,)."""
 
     vehicle: Vehicle
     kernel_vector: FloatArray
@@ -452,7 +487,7 @@ class SpanFlights:
     Parameters
     ----------
     span, vehicle, table : (m,) int
-    motion : (m, 15) float
+    motion : (m, 15 or 17) float
     vehicles : list of TrialVehicle
     tables : list of (rows, 6) float
         Kernel tables of the atmosphere.
@@ -476,7 +511,7 @@ class PredictedSpans:
         Rates, rad/s, and specific force, m/s^2, means over windows, and their rates of change.
     deflection : (m, WINDOWS, 3) float
         Shell's rotation vector from the body at the windows' middles, rad.
-    end : (m, 15) float
+    end : (m, 15 or 17) float
         Motion at the end of the span, in the coordinates of the next one's start.
     """
 
@@ -520,7 +555,7 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
         return Start(starts[k], vehicle.kernel_vector, flights.tables[flights.table[k]])
 
     steps = measured.steps
-    states = np.full((len(starts), steps.records, 20), np.nan)
+    states = np.full((len(starts), steps.records, starts.shape[1]), np.nan)
     aux = np.full((len(starts), steps.records, 18), np.nan)
     schedule = Schedule(steps.step_s, steps.per_record, steps.records)
     for flown in fly_ensemble(integrable(nominal, steps), start_of, range(len(starts)), schedule):
@@ -532,7 +567,10 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
 
 
 def _start_states(measured: Measurements, flights: SpanFlights) -> FloatArray:
-    """States (m, 20) as `synthetic_flight.simulate.state_from_ecef` lays them out, of the deflected vehicle's c.g."""
+    """States (m, 20) as `synthetic_flight.simulate.state_from_ecef` lays them out, of the deflected vehicle's c.g.
+
+    (m, 22) of joints that creep.
+    """
     at, span, motion = measured.start, flights.span, flights.motion
     q = rotations.boxplus(at.q_ecef_body[span], motion[:, ATTITUDE])
     omega, q_body_shell = motion[:, RATE], rotations.exp(motion[:, DEFLECTION])
@@ -550,6 +588,7 @@ def _start_states(measured: Measurements, flights: SpanFlights) -> FloatArray:
             rotations.multiply(q_body, q_body_shell),
             omega,
             shell_rate,
+            motion[:, CREEP],
         ]
     )
 
@@ -586,7 +625,7 @@ def _windows(
 
 
 def _ends(measured: Measurements, flights: SpanFlights, state: FloatArray) -> FloatArray:
-    """Motion (m, 15) in the coordinates of the next span's start."""
+    """Motion (m, 15 or 17) in the coordinates of the next span's start."""
     span, at = flights.span, measured.start
     q_body, q_shell, omega, shell = state[:, 6:10], state[:, 10:14], state[:, 14:17], state[:, 17:20]
     to_ecef = earth.q_ecef_eci(at.time_s[span] + SPAN_S)
@@ -602,5 +641,6 @@ def _ends(measured: Measurements, flights: SpanFlights, state: FloatArray) -> Fl
             rotations.log(q_body_shell),
             shell - rotations.rotate(rotations.conjugate(q_body_shell), omega),
             velocity - at.velocity_ecef_mps[span + 1],
+            state[:, 20:],
         ]
     )

@@ -28,8 +28,10 @@ from scipy.linalg import cho_factor, cho_solve
 from flightmodel.checks import DivergenceError, FloatArray
 from postflight.reconciliation.forward_model import (
     ATTITUDE,
+    CREEP,
     MOTION,
     RATE,
+    SPAN_S,
     STIFFNESS_LOG_SD,
     VELOCITY,
     AtmosphereParameters,
@@ -55,14 +57,17 @@ VACUUM_SD = np.append(
 GUST_KNOT_M = 300.0
 LARGE_ANGLE_RAD = np.deg2rad(5.0)  # angle of attack at which density structure rotates the vehicle
 GUST_RATE, GUST_FORCE_MPS2 = 2.0, 60.0  # of the windows' rates and lateral force, as if white from window to window
+# what a gust does to the deflection comes late for half a span on average; `Problem.creep_per_s` of it in a second
+GUST_CREEP_S, VACUUM_CREEP_SD = 0.5 * SPAN_S * GUST[7], np.deg2rad(2e-5)
 MOTION_STEP = np.append(np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3)), [1e-3, 1e-3, 1e-3])
+CREEP_STEP = np.deg2rad(2e-5)
 LEAST_COMPLIANCE = 0.5  # of a joint's compliance: a step that lessens it by more is shortened
 VEHICLE_STEP, AIR_STEP, WARMTH_STEP_K = 1e-5, np.array([1e-6, 2e-4, 2e-4]), 1e-2
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """All parameters: vehicle (v,), instruments (20,), air (3, k), temperature (n,), motion at each start (s, 15)."""
+    """All parameters: vehicle (v,), instruments (20,), air (3, k), temperature (n,), motion at starts (s, 15 or 17)."""
 
     vehicle: FloatArray
     instruments: FloatArray
@@ -96,7 +101,7 @@ def stiffness_step(step: float) -> float:
 
 @dataclass(frozen=True)
 class Residuals:
-    """In standard deviations: sensors (s, WINDOWS, 6), joins (s - 1, 15); ``cost``: sum of squares with priors."""
+    """In sd: sensors (s, WINDOWS, 6), joins (s - 1, 15 or 17); ``cost``: sum of squares with priors."""
 
     sensors: FloatArray
     joins: FloatArray
@@ -134,6 +139,8 @@ class Problem:
         Parameters of the vehicle that no step moves.
     sd_factor : float or (s,) float
         Factor on all standard deviations, or on each span's.
+    creep_per_s : float
+        Delayed compliance over the spring's and over the time constant: how fast creep follows a gust.
     """
 
     measured: Measurements
@@ -141,6 +148,7 @@ class Problem:
     air: AtmosphereParameters
     held: tuple[str, ...] = ()
     sd_factor: float | FloatArray = 1.0
+    creep_per_s: float = 0.0
 
     @property
     def first_instrument(self) -> int:
@@ -160,7 +168,12 @@ class Problem:
     @property
     def count(self) -> int:
         """Number of parameters."""
-        return self.first_motion + MOTION * self.measured.spans
+        return self.first_motion + self.motion * self.measured.spans
+
+    @property
+    def motion(self) -> int:
+        """Numbers of the motion at a span's start."""
+        return self.vehicle_parameters.motion
 
     @cached_property
     def turbulence_rad(self) -> FloatArray:
@@ -196,14 +209,30 @@ class Problem:
 
     @cached_property
     def join_weight(self) -> FloatArray:
-        """Inverse standard deviations (s - 1, 15) of ends against starts."""
+        """Inverse standard deviations (s - 1, motion) of ends against starts."""
         factor = np.maximum(self._sd_factors[:-1], self._sd_factors[1:])
-        return np.asarray(1.0 / (factor[:, None] * np.hypot(GUST * self.turbulence_rad[:-1, None], VACUUM_SD)))
+        more = self.motion - MOTION
+        gust, vacuum = (
+            np.append(GUST, [GUST_CREEP_S * self.creep_per_s] * more),
+            np.append(VACUUM_SD, [VACUUM_CREEP_SD] * more),
+        )
+        return np.asarray(1.0 / (factor[:, None] * np.hypot(gust * self.turbulence_rad[:-1, None], vacuum)))
+
+    @property
+    def motion_step(self) -> FloatArray:
+        """Steps (motion,) over which derivatives by a span's start are taken."""
+        return np.append(MOTION_STEP, [CREEP_STEP] * (self.motion - MOTION))
 
     @property
     def log_weight(self) -> float:
-        """Sum of the logarithms of all weights."""
-        return float(np.log(self.weight[self.weight > 0.0]).sum() + np.log(self.join_weight).sum())
+        """Sum of the logarithms of all weights, those that all models of a flight have in their priors left out."""
+        first_creep = -np.log(self.first_creep_sd).sum()
+        return float(np.log(self.weight[self.weight > 0.0]).sum() + np.log(self.join_weight).sum() + first_creep)
+
+    @property
+    def first_creep_sd(self) -> FloatArray:
+        """A priori sd of the creep at the first start, rad, (2,) or none: it is no larger than the deflection."""
+        return self.measured.first_deflection_sd[1 : 1 + self.motion - MOTION]
 
     @property
     def _sd_factors(self) -> FloatArray:
@@ -224,7 +253,7 @@ class Problem:
 
     def start(self) -> Parameters:
         """Nominal vehicle, instruments and sounding, motion as reconstructed."""
-        motion = np.zeros((self.measured.spans, MOTION))
+        motion = np.zeros((self.measured.spans, self.motion))
         motion[:, RATE] = self.measured.start.omega_body_eci_body_radps[:-1]
         air = np.zeros((3, len(self.air.knots_m)))
         warmer = np.zeros(len(self.air.temperature_knots_m))
@@ -302,8 +331,8 @@ class Problem:
             sensors.append((both, np.column_stack([response.reshape(len(step), -1).T, errors])))
             if span + 1 < self.measured.spans:
                 ended = (moved.end[part] - base.end[span]) / step[:, None]
-                following = self.first_motion + MOTION * (span + 1) + np.arange(MOTION)
-                response = np.column_stack([-ended.T, np.eye(MOTION)]) * self.join_weight[span][:, None]
+                following = self.first_motion + self.motion * (span + 1) + np.arange(self.motion)
+                response = np.column_stack([-ended.T, np.eye(self.motion)]) * self.join_weight[span][:, None]
                 joins.append((np.concatenate([column, following]), response))
         return Linearization(self.residuals(u, base), sensors, joins, self.count)
 
@@ -340,12 +369,12 @@ class Problem:
         for span in range(self.measured.spans):
             motion = u.motion[span]
             rows += [(span, j, motion, 0) for j in range(v)]
-            rows += [(span, v, motion + d, 0) for d in np.diag(MOTION_STEP)]
+            rows += [(span, v, motion + d, 0) for d in np.diag(self.motion_step)]
             near = self._nearby_air[span]
             rows += [(span, v, motion, 1 + k) for k in near.tolist()]
-            own = self.first_motion + MOTION * span + np.arange(MOTION)
+            own = self.first_motion + self.motion * span + np.arange(self.motion)
             columns.append(np.array([*range(v), *own, *air_columns[near]]))
-            steps.append(np.array([*([VEHICLE_STEP] * v), *MOTION_STEP, *air_steps[near]]))
+            steps.append(np.array([*([VEHICLE_STEP] * v), *self.motion_step, *air_steps[near]]))
         which = np.array([(row[0], row[1], row[3]) for row in rows]).T
         motions = np.array([row[2] for row in rows])
         return SpanFlights(which[0], which[1], motions, which[2], vehicles, tables), columns, steps
@@ -384,6 +413,7 @@ class Problem:
             (slice(first, first + 3), self.first_precision(slice(6, 9)), u.motion[0, ATTITUDE]),
             (slice(first + 6, first + 12), np.diag(self.measured.first_deflection_sd**-2.0), u.motion[0, 6:12]),
             (slice(first + 12, first + MOTION), self.first_precision(slice(3, 6)), u.motion[0, VELOCITY]),
+            (slice(first + MOTION, first + self.motion), np.diag(self.first_creep_sd**-2.0), u.motion[0, CREEP]),
         ]
 
 

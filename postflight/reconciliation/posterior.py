@@ -39,11 +39,11 @@ from postflight.reconciliation.forward_model import (
     DEFLECTION,
     FREEPLAY_SD_RAD,
     HARDENING_SD,
-    MOTION,
     OFFSET_SD_M,
     STIFFNESS_LOG_SD,
     WINDOWS,
     VehicleParameters,
+    creep_law,
     resolved_stiffness_nmprad,
 )
 from postflight.reconciliation.gauss_newton import Linearization, NormalEquations, Parameters, descend
@@ -102,6 +102,32 @@ class _LinearQuantity:
         return np.abs(value) if self.is_size else value
 
 
+def _creep_rows(fit: JointFit, reach: float) -> list[tuple[str, str, float, float, float, float, float, str]]:
+    """Rows of `joint_table`: share of the compliance that comes late, and its time constant.
+
+    The interval of the time constant is that of its inverse; it has no end where creep may settle later than any time.
+    """
+    names = fit.problem.vehicle_parameters.names
+    if "creep growth" not in names:
+        return []
+    at = names.index("creep growth")
+    x, covariance = fit.parameters.vehicle[at : at + 2], fit.covariance[at : at + 2, at : at + 2]
+    share, time_s = creep_law(*x.tolist())
+    moved = np.array(
+        [creep_law(*(x + side * DIFFERENCE * unit).tolist()) for unit in np.eye(2) for side in (1.0, -1.0)]
+    )
+    by_share, by_settling = ((c[::2] - c[1::2]) / (2.0 * DIFFERENCE) for c in (moved[:, 0], 1.0 / moved[:, 1]))
+    share_sd, settling_sd = (float(np.sqrt(slope @ covariance @ slope)) for slope in (by_share, by_settling))
+    slowest = 1.0 / time_s - reach * settling_sd
+    times = 1.0 / (1.0 / time_s + reach * settling_sd), 1.0 / slowest if slowest > 0.0 else np.inf
+    file = fit.problem.vehicle_parameters.nominal.joint
+    ends = share - reach * share_sd, share + reach * share_sd
+    return [
+        ("creep share", "", file.creep_share, share, share_sd, *ends, "estimate"),
+        ("creep time", "s", file.creep_time_s, time_s, time_s**2 * settling_sd, *times, "estimate"),
+    ]
+
+
 def _linear_quantities(parameters: VehicleParameters) -> list[_LinearQuantity]:
     """Static stability, and the coefficients of the laws that the joint has."""
     known = {
@@ -145,6 +171,7 @@ def joint_table(fit: JointFit) -> pd.DataFrame:
     for linear in _linear_quantities(vehicle_parameters):
         at, sd = float(linear.of(x)), linear.scale * float(np.sqrt(covariance[linear.index, linear.index]))
         rows.append((linear.label, linear.unit, linear.nominal, at, sd, at - reach * sd, at + reach * sd, "estimate"))
+    rows += _creep_rows(fit, reach)
     return pd.DataFrame(rows, columns=["quantity", "unit", "told", "found", "sd", "low", "high", "kind"])
 
 
@@ -218,7 +245,7 @@ def deflection_of(fit: JointFit) -> DeflectionHistory:
     lateral = np.column_stack([rotation[:, 2], -rotation[:, 1]])
     at_start = np.empty((measured.spans, 2, 2))
     for span in range(measured.spans):
-        at = problem.first_motion + MOTION * span + DEFLECTION.start + np.array([2, 1])
+        at = problem.first_motion + problem.motion * span + DEFLECTION.start + np.array([2, 1])
         at_start[span] = fit.covariance[np.ix_(at, at)] * np.array([[1.0, -1.0], [-1.0, 1.0]])
     assumptions = "by the simulator with the reconciled joint, from accelerometers and rates"
     covariance = np.repeat(at_start, WINDOWS, axis=0)
@@ -241,6 +268,8 @@ def vehicle_file_lines(fit: JointFit) -> str:
         lines.append(f"freeplay_deg = {joint.freeplay_deg:.6g}")
     if "hardening" in fit.problem.vehicle_parameters.laws:
         lines.append(f"hardening_nmprad3 = {joint.hardening_nmprad3:.6g}")
+    if "creep" in fit.problem.vehicle_parameters.laws:
+        lines += [f"creep_share = {joint.creep_share:.6g}", f"creep_time_s = {joint.creep_time_s:.6g}"]
     return "\n".join(lines) + "\n"
 
 
@@ -393,6 +422,9 @@ def quantities(vehicle_parameters: VehicleParameters, x: FloatArray) -> pd.DataF
     out = pd.DataFrame([_joint(vehicle_parameters.vehicle(row)) for row in x])
     for linear in _linear_quantities(vehicle_parameters):
         out[linear.column] = linear.of(x)
+    if "creep" in vehicle_parameters.laws:
+        at = vehicle_parameters.names.index("creep growth")
+        out["creep_share"], out["creep_time_s"] = np.array([creep_law(*row) for row in x[:, at : at + 2].tolist()]).T
     return out
 
 

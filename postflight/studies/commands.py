@@ -26,6 +26,7 @@ from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies import joints
 from postflight.studies.joints import table_3_1
 from postflight.studies.preflight import Bounds, entry_bounds, inside
+from postflight.studies.shell_test import fit_laws, read_load_test
 from postflight.warmup import RECONSTRUCTION
 from synthetic_flight.scenarios import read_scenario
 
@@ -101,6 +102,30 @@ def write_study(
     for r in study.paper.itertuples():
         mark = "[green]agrees[/]" if r.agrees else "[yellow]differs[/]"
         console.print(f"{mark} {escape(r.claim)}: paper {r.paper}, here {r.ours:.2f} ({escape(r.measured_as)})")
+    console.print(f"results in {escape(str(folder))}")
+
+
+def shell_test(
+    table: Path, folder: Path, time: str, load: str, displacements: tuple[str, ...], arm_m: float | None
+) -> None:
+    """Fit a joint's law to a load test; write its table, the lines of a vehicle file and a figure, and print them."""
+    test = read_load_test(table, time, load, displacements, arm_m)
+    found = fit_laws(test)
+    laws = found.table()
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "shell_test.csv", laws)
+    (folder / "joint.toml").write_text(found.selected.vehicle_file_lines())
+    draw(folder / "shell_test.png", studies.figure_shell_test, found, f"load test {test.name}")
+    printed = Table(title=f"Laws of the joint by the load test {escape(test.name)}")
+    for head in ("law", "rms, % of the largest", "largest", "creep share", "time constant s", ""):
+        printed.add_column(head, justify="left" if head in ("law", "") else "right")
+    for fit, r in zip(found.fits, laws.to_dict(orient="records"), strict=True):
+        creep = [f"{r[name]:.3g} +/- {r[f'{name}_sd']:.1g}" if "creep" in fit.laws else ""
+                 for name in ("creep_share", "creep_time_s")]  # fmt: skip
+        remark = "selected" if r["selected"] else "" if fit.time_is_inside else "time constant not inside the test"
+        printed.add_row(r["law"], f"{r['rms_percent']:.2f}", f"{r['largest_percent']:.1f}", *creep, remark)
+    console.print(printed)
+    console.print(escape(found.selected.vehicle_file_lines()), end="")
     console.print(f"results in {escape(str(folder))}")
 
 

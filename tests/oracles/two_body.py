@@ -18,7 +18,30 @@ from flightmodel import earth, rotations, sphere_cone
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
-from synthetic_flight.dynamics import beyond_freeplay, points, split, twist
+from synthetic_flight.dynamics import beyond_freeplay, points, split, spring_deflection, twist
+
+
+def creeping_moment(vehicle: Vehicle, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Moment of a spring in series with a Kelvin element on the body, ECI (3,), and the creep's rate (2,).
+
+    The moment is the steepest descent of the potential of deflection less creep, by turning the body about each axis.
+    """
+    joint, turn = vehicle.joint, 1e-5
+
+    def potential(angles: FloatArray) -> float:
+        moved = state.copy()
+        moved[6:10] = rotations.multiply(rotations.exp(angles), state[6:10])
+        d = beyond_freeplay(
+            np.linalg.norm(spring_deflection(moved)), np.deg2rad(joint.freeplay_deg), joint.freeplay_corner
+        )
+        return float(0.5 * joint.bending_stiffness_nmprad * d**2 + 0.25 * joint.hardening_nmprad3 * d**4)
+
+    slope = [(potential(turn * axis) - potential(-turn * axis)) / (2.0 * turn) for axis in np.eye(3)]
+    felt = spring_deflection(state)
+    d = beyond_freeplay(np.linalg.norm(felt), np.deg2rad(joint.freeplay_deg), joint.freeplay_corner)
+    force = (joint.bending_stiffness_nmprad * d + joint.hardening_nmprad3 * d**3) * felt / np.linalg.norm(felt)
+    share = joint.creep_share / (1.0 - joint.creep_share)
+    return -np.array(slope), (share * force / joint.bending_stiffness_nmprad - state[20:]) / joint.creep_time_s
 
 
 def joint_moment(vehicle: Vehicle, q_b: FloatArray, q_a: FloatArray, rate_eci: FloatArray) -> FloatArray:

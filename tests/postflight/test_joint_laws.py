@@ -12,8 +12,10 @@ from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.reconciliation import posterior
 from postflight.reconciliation.fit import with_freeplay
 from postflight.reconciliation.forward_model import (
+    CREEP_PER_S,
     DEFLECTION,
     FREEPLAY_SD_RAD,
+    JOINT,
     KNOT_M,
     MOTION,
     UPPER_M,
@@ -81,6 +83,37 @@ def test_quantities_are_the_vehicles():
     joint = parameters.vehicle(x[1]).joint
     steeper = 3.0 * joint.hardening_nmprad3 * np.deg2rad(4.0) ** 2 / joint.bending_stiffness_nmprad
     assert steeper == pytest.approx(0.3)
+
+
+def test_creep_is_two_parameters_and_two_numbers_of_every_motion():
+    parameters = VehicleParameters(NOMINAL, ("creep", "hardening"))
+    assert parameters.names[len(JOINT) : parameters.sought] == ("creep growth", "creep settling", "hardening")
+    assert parameters.motion == MOTION + 2
+    assert VehicleParameters(NOMINAL).motion == MOTION
+    x = np.zeros((2, len(parameters.names)))
+    growth, settling = 0.25 / 0.75 / 20.0, 1.0 / 20.0
+    x[1, len(JOINT) : len(JOINT) + 2] = np.arcsinh(
+        [growth / CREEP_PER_S, np.sqrt(settling**2 - 300.0**-2) / CREEP_PER_S]
+    )
+    plain, creeping = (parameters.vehicle(row).joint for row in x)
+    assert plain.creep_share == 0.0
+    # share s is a delayed compliance of s / (1 - s) of the spring's
+    assert creeping.creep_share == pytest.approx(0.25)
+    assert creeping.creep_time_s == pytest.approx(20.0)
+    assert creeping.bending_stiffness_nmprad == plain.bending_stiffness_nmprad
+    table = quantities(parameters, x)
+    assert table.creep_share.tolist() == [0.0, pytest.approx(0.25)]
+    assert table.creep_time_s.tolist() == [pytest.approx(300.0), pytest.approx(20.0)]
+    # a trial step never makes a joint that runs away from its load, nor one that no vehicle file can have
+    x[1, len(JOINT) : len(JOINT) + 2] = 900.0, 900.0
+    wild = parameters.vehicle(x[1]).joint
+    assert 0.0 < wild.creep_share <= 0.9
+    assert wild.creep_time_s == pytest.approx(0.1, rel=1e-3)
+    x[1, len(JOINT) + 1] = 0.0
+    x[1, len(JOINT)] = -50.0
+    assert parameters.vehicle(x[1]).joint.delayed_compliance_radpnm * plain.bending_stiffness_nmprad == pytest.approx(
+        -0.5
+    )
 
 
 def test_missing_samplers_are_refused(monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.reconciliation.credibility import MOST_MOVED_SD, credibility
-from postflight.reconciliation.fit import JointFit, with_freeplay
+from postflight.reconciliation.fit import CreepScore, JointFit, with_freeplay
 from postflight.reconciliation.forward_model import (
     FAST_JOINT,
     FREEPLAY_SD_RAD,
@@ -207,8 +207,8 @@ def test_the_bound_is_continuous_where_the_tail_is_an_exponential():
     assert bounds[0] > 0.0
 
 
-def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True):
-    """Fit of ten spans: its residuals, and the move of one stated number of the vehicle."""
+def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True, creep=1.0):
+    """Fit of ten spans: its residuals, the move of one stated number of the vehicle, sd of creep that it lacks."""
     parameters = VehicleParameters(VEHICLE)
     values = np.zeros(len(parameters.names))
     values[parameters.names.index("mass of the shell")] = vehicle
@@ -216,10 +216,13 @@ def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True):
     joins[3, 4] = spans
     residuals = SimpleNamespace(sensors=np.ones((10, 10, 6)), joins=joins, cost=cost)
     problem = SimpleNamespace(
-        vehicle_parameters=parameters, measured=SimpleNamespace(spans=10), weight=np.ones((10, 10, 6))
-    )
+        vehicle_parameters=parameters, measured=SimpleNamespace(spans=10), weight=np.ones((10, 10, 6)),
+        motion=parameters.motion, held=(),
+    )  # fmt: skip
     unknown = SimpleNamespace(vehicle=values, instruments=np.zeros(20))
-    return JointFit(problem, unknown, 0.5 * np.eye(len(values) + 20), residuals, 4, converged)
+    found = JointFit(problem, unknown, 0.5 * np.eye(len(values) + 20), residuals, 4, converged)
+    found.__dict__["creep_scores"] = (CreepScore(2.0, -0.3, 0.05), CreepScore(10.0, 0.02 * creep, 0.02))
+    return found
 
 
 @pytest.mark.parametrize(
@@ -229,6 +232,7 @@ def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True):
         ({"vehicle": 1.1 * MOST_MOVED_SD}, "joint-moves"),
         ({"spans": 12.0}, "joint-spans"),
         ({"converged": False}, "joint-converged"),
+        ({"creep": 4.5}, "joint-creep"),
     ],
 )
 def test_a_fit_that_cannot_be_believed_turns_red(wrong, code):

@@ -37,7 +37,7 @@ def windy():
 def kernel_rates(state, vehicle, table, locked=False):
     s = simulate.workspace(state[None], simulate.parameter_vector(vehicle)[None])
     s[at.TRIAL : at.TRIAL + at.STATES] = state
-    _kernels.rates(s, (0,), *simulate.kernel_tables(vehicle, table), earth.WGS84, locked)
+    _kernels.rates(s, (0,), (), *simulate.kernel_tables(vehicle, table), earth.WGS84, locked)
     # as recorded: forces and moments in ECI
     vectors = s[at.FORCE : at.FORCE + 9].reshape(3, 3) @ s[at.R_A : at.R_A + 9].reshape(3, 3).T
     aux = np.concatenate([s[at.ALTITUDE : at.ALTITUDE + 6], vectors.ravel(), s[at.RATE + 14 : at.RATE + 17]])

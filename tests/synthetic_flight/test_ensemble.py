@@ -87,7 +87,9 @@ def test_wrong_schedules_are_refused(vehicle, dispersed):
         assert refusal.value.codes == ("ensemble-arguments",)
 
 
-@pytest.mark.parametrize("name", ["_attitudes", "_position", "_flow", "_loads", "_joint", "_joined", "_rigid"])
+@pytest.mark.parametrize(
+    "name", ["_attitudes", "_position", "_flow", "_loads", "_joint", "_creep", "_joined", "_rigid"]
+)
 def test_vector_loops_are_in_vector_registers(vehicle, name):
     """A branch or an alias that the compiler cannot see through would undo this in silence."""
     lanes, planet = (0,) * LANES, earth.WGS84

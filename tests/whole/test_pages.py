@@ -67,7 +67,7 @@ LONG = {
     "postflight run other-flight",
     "postflight score other-flight --json",
     "postflight reconcile demo-flight",
-    "postflight reconcile demo-flight --freeplay --hardening",
+    "postflight reconcile demo-flight --freeplay --creep --hardening",
     "postflight reconcile demo-flight --posterior",
     "dask scheduler --host 127.0.0.1 --port 8786 --no-dashboard",
     "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False",
@@ -79,6 +79,8 @@ NOT_RUN = {
     "make test": "is this suite",
     "postflight camera my-flight": "serves until it is interrupted; tests/postflight/test_camera_bench.py",
     "make docs": "makes an environment likewise; tests/postflight/test_site.py builds the site",
+    "postflight study shell-test load-test.csv": "wants a test of one's own; tests/postflight/test_shell_test.py",
+    "postflight study shell-test tub.csv --time min:min --load load_kn --displacement left_mm --arm-m 1.4": "likewise",
     "python -m pytest tests/synthetic_flight tests/recon --junitxml=proofs.xml": "is a part of this suite",
 }
 _WITH_CERTIFICATES = "needs certificates; tests/postflight/test_montecarlo_cluster.py runs a cluster with some"

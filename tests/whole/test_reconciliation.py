@@ -18,9 +18,11 @@ from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight.cli import cli
 from postflight.flight import Flight
+from postflight.reconciliation.credibility import credibility
 from postflight.reconciliation.fit import mismatched_spans, reconcile, reconcile_with_freeplay, select_laws
 from postflight.reconciliation.forward_model import (
     ATTITUDE,
+    CREEP,
     DEFLECTION,
     DEFLECTION_RATE,
     RATE,
@@ -44,7 +46,7 @@ SEED = 5
 STIFFER, MORE_DAMPING, OFFSET_M = 1.2, 1.3, (0.0025, -0.0012)
 
 
-FREEPLAY_DEG = 0.1
+FREEPLAY_DEG, CREEP_SHARE, CREEP_S = 0.1, 0.15, 6.0
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +62,14 @@ def loose(tmp_path_factory):
     return reconstruct(Flight(read_flight(folder))), vehicle
 
 
-def fly(tmp_path_factory, freeplay_deg):
+@pytest.fixture(scope="module")
+def creeping(tmp_path_factory):
+    """The same with creep."""
+    folder, truth, vehicle = fly(tmp_path_factory, 0.0, CREEP_SHARE)
+    return reconstruct(Flight(read_flight(folder))), truth, vehicle
+
+
+def fly(tmp_path_factory, freeplay_deg, creep_share=0.0):
     scenario = dispersed.dispersed_scenario("irve2_reference", SEED)
     vehicle = scenario.vehicle
     body, joint = vehicle.centerbody, vehicle.joint
@@ -73,6 +82,8 @@ def fly(tmp_path_factory, freeplay_deg):
                 "bending_stiffness_nmprad": joint.bending_stiffness_nmprad * STIFFER,
                 "bending_damping_nmsprad": joint.bending_damping_nmsprad * MORE_DAMPING,
                 "freeplay_deg": freeplay_deg,
+                "creep_share": creep_share,
+                "creep_time_s": CREEP_S,
             }
         ),
         aero=vehicle.aero.scaled(ca=0.97, cn=1.06, cm=0.93, cmq_shift=0.1),
@@ -228,6 +239,57 @@ def test_freeplay_is_separated_from_a_plain_joint(loose, flown):
     plain = select_laws(reconstruct(Flight(read_flight(flown[0]))), ("freeplay", "hardening"))
     assert plain.log_odds["freeplay"] < 0.0
     assert "freeplay" not in plain.fit.problem.vehicle_parameters.laws
+
+
+def test_spans_of_a_true_flight_with_creep_join(creeping):
+    """And the gradient by its creep is that of the cost."""
+    flight, truth, vehicle = creeping
+    measured = select_measurements(flight)
+    at = [int(np.argmin(np.abs(truth.time_s - t))) for t in measured.start.time_s]
+    path, state = truth.trajectory, truth.state_eci[at]
+    place = replace(
+        measured.start, position_ecef_m=path.position_ecef_m[at], velocity_ecef_mps=path.velocity_ecef_mps[at]
+    )
+    q_body_shell = rotations.multiply(rotations.conjugate(state[:, 6:10]), state[:, 10:14])
+    shell_rate = state[:, 17:20] - rotations.rotate(rotations.conjugate(q_body_shell), state[:, 14:17])
+    rotation = rotations.boxminus(path.q_ecef_body[at], place.q_ecef_body)
+    turning = [rotation, state[:, 14:17], rotations.log(q_body_shell), shell_rate]
+    motion = np.column_stack([*turning, np.zeros((len(at), 3)), state[:, 20:]])
+    spans = np.arange(measured.spans)
+    zero = np.zeros_like(spans)
+    true = TrialVehicle(vehicle, simulate.parameter_vector(vehicle))
+    flights = SpanFlights(spans, zero, motion[:-1], zero, [true], [simulate.atmosphere_table(truth.profile)])
+    predicted = fly_spans(replace(measured, start=place), vehicle, flights)
+    assert np.abs(motion[:, CREEP]).max() > 0.002
+    assert np.abs((predicted.end - motion[1:])[:, CREEP]).max() < np.deg2rad(2e-4)
+    air = AtmosphereParameters(flight.telemetry.sounding, float(measured.altitude_m.min()))
+    problem = Problem(measured, VehicleParameters(flight.telemetry.required_vehicle(), ("creep",)), air)
+    u = near(problem)
+    u.motion[:, CREEP] = 0.01 * np.random.default_rng(4).standard_normal((len(u.motion), 2))
+    _, right = problem.normal_equations(u, problem.linearize(u))
+    for columns, size in (([5, 6], 1e-4), (problem.first_motion + problem.motion * spans + CREEP.start, 1e-7)):
+        step = np.zeros(problem.count)
+        step[columns] = size * np.random.default_rng(5).standard_normal(len(columns))
+        difference = problem.residuals(u.plus(step)).cost - problem.residuals(u.plus(-step)).cost
+        assert right @ step == pytest.approx(-0.25 * difference, rel=2e-3)
+
+
+@pytest.mark.long
+def test_creep_is_found_and_one_stiffness_is_red(creeping, flown):
+    """And a plain flight has none."""
+    flight, _, vehicle = creeping
+    selection = select_laws(flight, ("creep",))
+    assert selection.log_odds["creep"] > 20.0
+    table = joint_table(selection.fit).set_index("quantity")
+    for name, true in (("creep share", CREEP_SHARE), ("creep time", CREEP_S),
+                       ("bending stiffness", vehicle.joint.bending_stiffness_nmprad)):  # fmt: skip
+        assert abs(table.found[name] - true) < 4.0 * table.sd[name], name
+    assert "creep_share = 0.1" in vehicle_file_lines(selection.fit)
+    assert not [each.code for each in credibility(selection.fit) if not each.passed]
+    assert "joint-creep" in [each.code for each in credibility(selection.compared["creep"][0]) if not each.passed]
+    plain = select_laws(reconstruct(Flight(read_flight(flown[0]))), ("creep",))
+    assert plain.log_odds["creep"] < 0.0
+    assert "joint-creep" not in [each.code for each in credibility(plain.fit) if not each.passed]
 
 
 @pytest.mark.long
