@@ -122,7 +122,7 @@ def nis_check(
     noise they have, for the data sheet.
     """
     n, tail = len(nis), 0.5 * (1.0 - confidence)
-    low, high = (float(chi_square_quantile(p, components)) / n for p in (tail, 1.0 - tail))
+    low, high = (chi_square_quantile(p, components) / n for p in (tail, 1.0 - tail))
     low = 0.0 if allowance else low
     mean = float(np.mean(nis))
     size, advice = (
