@@ -171,9 +171,9 @@ def figure_shell_test(found: ShellTest, title: str) -> Figure:
     ax, left = figure.subplots(1, 2)
     test, selected = found.selected.test, found.selected
     ax.plot(np.rad2deg(test.angle_rad), test.moment_nm, color=COLOUR["estimate"], label="measured")
-    shown = (("selected", selected, "second"), ("straight", found.fits[0], "limit"))
+    shown = (("selected", selected, "second"), ("not selected", found.fits[0], "limit"))
     for name, fit, colour in shown if selected is not found.fits[0] else shown[1:]:
-        label = f"{name}: {' and '.join(fit.laws) or 'spring'}, rms {100.0 * fit.rms_share:.1f} %"
+        label = f"{name}: {' and '.join(fit.laws) or 'straight spring'}, rms {100.0 * fit.rms_share:.1f} %"
         ax.plot(
             np.rad2deg(test.angle_rad - fit.residual_rad), test.moment_nm, color=COLOUR[colour], lw=1.0, label=label
         )
@@ -182,7 +182,7 @@ def figure_shell_test(found: ShellTest, title: str) -> Figure:
     ax.set_ylabel("moment in the joint (N m)")
     ax.legend(fontsize=7)
     left.axhline(0.0, color=COLOUR["zero"], lw=0.8)
-    left.set_xlabel(TIME)
+    left.set_xlabel("time (s)")
     left.set_ylabel("measured less fitted (% of the largest)")
     figure.suptitle(title, fontsize=10)
     return figure
