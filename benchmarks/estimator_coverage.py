@@ -37,7 +37,7 @@ from flightmodel import rotations
 from flightmodel.airdata import air_data, lateral_angles
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import DivergenceError, GateError
-from flightmodel.deflection import QUANTILES, history_from_lateral, polar_from_lateral
+from flightmodel.deflection import QUANTILES, history_from_lateral, polar_from_lateral, standard_normals
 from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
@@ -238,7 +238,9 @@ def safely(out, work):
 
 
 def row_of(history, pulse, truth):
-    """Angle error, its sd, plane error, its sd, true angle, lateral normalised square; below which quantiles it is."""
+    """Angle error, its sd, plane error, its sd, true angle, lateral normalised square; the angle's expected square over
+    its variance; below which quantiles the truth is.
+    """
     k = int(np.argmin(np.abs(history.time_s - truth["peak"])))
     true = truth["theta_yz"][int(np.argmin(np.abs(pulse.time_s - history.time_s[k])))]
     size, d, cov = float(np.hypot(*true)), history.theta_yz_rad[k] - true, history.lateral_cov[k]
@@ -249,8 +251,20 @@ def row_of(history, pulse, truth):
     square = float(d @ np.linalg.solve(cov, d))
     return (
         history.theta_rad[k] - size, history.theta_sd_rad[k], turn, np.sqrt(history.covariance[k, 1, 1]), size, square,
-        *(size < history.theta_quantiles_rad[k]),
+        expected_square(true, cov), *(size < history.theta_quantiles_rad[k]),
     )  # fmt: skip
+
+
+def expected_square(true_yz, cov):
+    """Mean square of an angle's error over its variance if readings scatter about the true vector as stated.
+
+    Above one for a vector near zero: its angle cannot err downwards.
+    """
+    if not np.isfinite(cov).all():  # no answer
+        return np.nan
+    drawn = true_yz + standard_normals(2) @ np.linalg.cholesky(cov).T
+    size, _, polar = polar_from_lateral(drawn, np.tile(cov, (len(drawn), 1, 1)))
+    return float(np.mean((size - np.hypot(*true_yz)) ** 2 / polar[:, 0, 0]))
 
 
 def angle_row(pulse, truth):
@@ -262,13 +276,14 @@ def angle_row(pulse, truth):
     turn = plane[0] - np.arctan2(true[1], -true[0])
     turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
     sd = np.sqrt(np.diag(polar[0]))
-    return size[0] - np.hypot(*true), sd[0], turn, sd[1], np.hypot(*true), float(d @ np.linalg.solve(cov, d))
+    square = float(d @ np.linalg.solve(cov, d))
+    return size[0] - np.hypot(*true), sd[0], turn, sd[1], np.hypot(*true), square, expected_square(true, cov)
 
 
 def report(results):
     rows = [r for r in results if not r["words"]]
     print(f"\n{len(results)} flights, {len(results) - len(rows)} of them tumbled and left out; at peak pressure, deg")
-    head = "rms   bias  rms of z, of the vector's  1 sd %  2 sd %  refused  lateral 68, 95 %"
+    head = "rms   bias  rms of z, as stated, of the vector's  1 sd %  2 sd %  refused  lateral 68, 95 %"
     head += "   plane (bent > 1 deg): rms  1 sd %  2 sd %"
     print(f"{'':18}  {head}")
     for name in dict.fromkeys(n for r in rows for n in r["rows"]):
@@ -278,7 +293,8 @@ def report(results):
         rms = np.sqrt(np.mean(a[:, 0] ** 2))
         share = [100.0 * np.mean(np.abs(z) < k) for k in (1, 2)]
         words = f"{name:18}{np.rad2deg(rms):6.3f}{np.rad2deg(a[:, 0].mean()):+7.3f}{np.sqrt(np.mean(z**2)):9.2f}"
-        words += f"{np.sqrt(0.5 * np.mean(a[:, 5])):13.2f}{share[0]:14.0f}{share[1]:8.0f}{len(rows) - len(a):9d}"
+        words += f"{np.sqrt(a[:, 6].mean()):11.2f}{np.sqrt(0.5 * np.mean(a[:, 5])):13.2f}"
+        words += f"{share[0]:14.0f}{share[1]:8.0f}{len(rows) - len(a):9d}"
         inside = [100.0 * np.mean(a[:, 5] < chi2.ppf(p, 2)) for p in (0.6827, 0.9545)]
         words += f"{inside[0]:9.0f}{inside[1]:5.0f}"
         if bent.any():
@@ -300,7 +316,7 @@ def report_quantiles(rows):
         a = np.array([r["rows"][name] for r in rows if name in r["rows"]])
         a = a[np.isfinite(a[:, 0])]
         for low, high in pairwise(BINS_DEG):
-            below = a[(np.rad2deg(a[:, 4]) >= low) & (np.rad2deg(a[:, 4]) < high), 6:]
+            below = a[(np.rad2deg(a[:, 4]) >= low) & (np.rad2deg(a[:, 4]) < high), 7:]
             if len(below):
                 shares = ", ".join(f"{100.0 * x:.0f}" for x in below.mean(axis=0))
                 print(f"{name:18}{low:4.1f} to {high:4.1f} deg, {len(below):3d} flights: {shares} %")
