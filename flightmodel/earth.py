@@ -75,7 +75,8 @@ def ecef_from_geodetic(
     latitude_rad: FloatArray | float, longitude_rad: FloatArray | float, height_m: FloatArray | float
 ) -> FloatArray:
     """ECEF positions ``(..., 3)``, m, of geodetic latitude, longitude and height."""
-    return np.asarray(erfa.gd2gc(_WGS84, longitude_rad, latitude_rad, height_m))
+    with np.errstate(invalid="ignore", over="ignore"):  # no place where a number is missing
+        return np.asarray(erfa.gd2gc(_WGS84, longitude_rad, latitude_rad, height_m))
 
 
 def dcm_ned_ecef(latitude_rad: FloatArray | float, longitude_rad: FloatArray | float) -> FloatArray:
