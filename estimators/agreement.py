@@ -5,9 +5,6 @@ The difference of two methods' readings at one time holds no deflection, only th
     d(t) = read_a - read_b - (B_a - B_b) theta' - (A_a - A_b) theta'' = -(J_a - J_b) x + e,      x ~ N(0, 1)
 
 taken at the sparser one's times and averaged over spans. Its chi-square against that covariance is the test of a pair.
-The deflection that is known follows a fast joint's swing in part, and where a method answers only now and then the rest
-does not average out: by how much ``d`` changes from reading to reading more than inputs and noise make it
-(`_swing_left_var`) is noise, too.
 
 Each input is a fault hypothesis: how much likelier are all readings together if its stated sd is `WIDER` times too
 small (prior inflation)? With mean ``m`` and covariance ``P`` of its unit normals after the fusion, the log of that
@@ -86,9 +83,8 @@ _FAULT_PLANE_RAD = np.deg2rad(25.0)
 # difference of two methods
 SPAN_S = 2.0
 _LEFT_OUT_RAD = np.deg2rad(0.05)  # neglected by the methods' equations, in each mean: up to 0.05 deg at the pulse's end
-_LARGEST_STEP = 1.5  # usual steps: over a reading left out, half a period of a fast joint, is not interpolated
+_LARGEST_STEP = 2.5  # usual steps: over a wider hole readings are not interpolated
 _LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is compared with another
-_CHANCE_SD = 2.0  # of the changes between neighbours: below it they are noise
 # a sounding's errors may hold waves shorter than the fusion's model: 5 of 50 sound flights fail a pair at 1 %
 CONFIDENCE = 0.999
 WIDER = 4.0
@@ -291,35 +287,9 @@ def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> tupl
     responses = [_less(sparse.by_input.get(n), dense.by_input.get(n), both, between) for n in names]
     noise = sparse.independent_cov[both] + between(dense.independent_cov)
     share = means_over_spans(time_s, SPAN_S, from_s=0.0)
-    response = np.concatenate(responses, axis=2)
-    left = _swing_left_var(time_s, d, response, noise, share)
-    noise += left[:, None, None] * np.eye(2)
-    columns = np.tensordot(share, response, axes=1).reshape(2 * len(share), -1)
+    columns = np.tensordot(share, np.concatenate(responses, axis=2), axes=1).reshape(2 * len(share), -1)
     blocks = np.einsum("bn,nij->bij", share**2, noise) + _LEFT_OUT_RAD**2 * np.eye(2)
     return (share @ d).ravel(), columns @ columns.T + block_diag(*blocks)
-
-
-def _swing_left_var(
-    time_s: FloatArray, d: FloatArray, response: FloatArray, noise: FloatArray, share: FloatArray
-) -> FloatArray:
-    """Variance (n,), rad^2, of a swing left in differences ``d`` (n, 2), each component; one for each span.
-
-    By squares of the changes between neighbours (von Neumann), less what ``response`` (n, 2, k) and ``noise`` (n, 2, 2)
-    make them; none where chance makes the rest. A span without neighbours has the largest of all.
-    """
-    if len(time_s) < 2:
-        return np.zeros(len(time_s))
-    step = np.diff(time_s)
-    near = step < _LARGEST_STEP * np.median(step)
-    expected = np.trace(noise[1:] + noise[:-1], axis1=1, axis2=2) + np.sum(np.diff(response, axis=0) ** 2, axis=(1, 2))
-    more = np.sum(np.diff(d, axis=0) ** 2, axis=1) - expected
-    inside = ((share[:, 1:] > 0.0) & (share[:, :-1] > 0.0) & near).astype(float)
-    count = inside.sum(axis=1)
-    # the square of a change of two components has its own mean as sd
-    surplus, chance = inside @ more, np.sqrt(inside @ expected**2)
-    left = np.where(surplus > _CHANCE_SD * chance, surplus, 0.0) / (4.0 * np.maximum(count, 1.0))
-    left = np.where(count > 0.0, left, left.max())
-    return np.asarray(left @ (share > 0.0))
 
 
 def _well_determined(one: Evidence) -> Evidence:

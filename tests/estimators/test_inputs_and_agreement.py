@@ -212,23 +212,6 @@ def test_pairs_that_agree_fail_as_often_as_chance_lets_them(noises):
     assert np.mean(chances < 0.1) < 0.15
 
 
-@pytest.mark.parametrize(("swing_rad", "constant_rad", "fails"), [(0.02, 0.0, False), (0.0, 0.02, True)])
-def test_a_swing_that_nothing_follows_is_no_disagreement(swing_rad, constant_rad, fails):
-    # the second method answers three times in each half second, over which a swing of 5.3 Hz does not average out
-    rng = np.random.default_rng(11)
-    failed = []
-    for _ in range(60):
-        first, _ = pair(rng, (1e-3, 1e-3), shared=False)
-        at = first.time_s[np.arange(len(first.time_s)) % 10 < 3]
-        waves = np.cos(2.0 * np.pi * 5.3 * at[:, None] + rng.uniform(0.0, 2.0 * np.pi, 2))
-        read = swing_rad * waves + constant_rad + 1e-3 * rng.standard_normal(waves.shape)
-        still, cov = np.zeros((len(at), 2, 2)), np.tile(1e-6 * np.eye(2), (len(at), 1, 1))
-        second = Evidence("trim", at, read, still, still, {WIND: still}, cov, 0.05)
-        failed.append(not agreement([first, second]).pairs[0].passed)
-    # of sound pairs one in a thousand, of the others all
-    assert np.mean(failed) == 1.0 if fails else np.mean(failed) < 0.05
-
-
 def test_gain_is_the_likelihood_of_worse_known_inputs():
     # all readings y = J x + e once more by their whole covariance: log N(y; 0, C + (WIDER^2 - 1) J J') - log N(y; 0, C)
     rng = np.random.default_rng(3)
