@@ -88,8 +88,8 @@ def true_parameters(problem, one, truth):
     """Parameters of the flight as it was; the instruments' are the most probable of readings less true motion."""
     measured, air, path = problem.measured, problem.air, truth.trajectory
     sounded = profile_from_sounding(air.sounding)
-    at, told = truth.profile.at(air.knots_m), sounded.at(air.knots_m)
-    difference = [np.log(at.density_kgpm3 / told.density_kgpm3), *(at.wind_ned_mps - told.wind_ned_mps).T[:2]]
+    at, sounding = truth.profile.at(air.knots_m), sounded.at(air.knots_m)
+    difference = [np.log(at.density_kgpm3 / sounding.density_kgpm3), *(at.wind_ned_mps - sounding.wind_ned_mps).T[:2]]
     warm = air.temperature_knots_m
     warmer = truth.profile.at(warm).temperature_k - sounded.at(warm).temperature_k
     rows = np.searchsorted(truth.time_s, measured.start.time_s[:-1] - 1e-6)

@@ -57,8 +57,19 @@ def read(name, item):
 with h5py.File(sys.argv[1], "r") as file:
     file.visititems(read)
 """,
-    "MATLAB": "import scipy.io, sys; scipy.io.loadmat(sys.argv[1], chars_as_strings=True)",
-    "Parquet": "import pyarrow.parquet, sys; pyarrow.parquet.ParquetFile(sys.argv[1]).read()",
+    "MATLAB": f"""
+import math, scipy.io, sys
+
+if sum(math.prod(shape) for _, shape, _ in scipy.io.whosmat(sys.argv[1])) <= {_MOST_NUMBERS}:
+    scipy.io.loadmat(sys.argv[1], chars_as_strings=True)
+""",
+    "Parquet": f"""
+import pyarrow.parquet, sys
+
+file = pyarrow.parquet.ParquetFile(sys.argv[1])
+if file.metadata.num_rows * file.metadata.num_columns <= {_MOST_NUMBERS}:
+    file.read()
+""",
 }
 _STEP_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _STEPS = {
@@ -453,8 +464,8 @@ def _split(name: str, values: NDArray[Any], unit: Any, names: Any, left_out: lis
 def _version_5(path: Path) -> Tree:
     from scipy.io import loadmat, whosmat
 
-    _check_size(path, sum(int(np.prod(shape)) for _, shape, _ in whosmat(path)))
     _check_readable(path, "MATLAB")
+    _check_size(path, sum(int(np.prod(shape)) for _, shape, _ in whosmat(path)))
     content = loadmat(path, chars_as_strings=True)
     return {name: _plain(value) for name, value in content.items() if not name.startswith("__")}
 

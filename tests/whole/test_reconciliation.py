@@ -153,10 +153,8 @@ def test_noise_has_no_information_on_a_scale(problem):
         assert abs(right[k]) < 4.0 * 30.0 * np.sqrt(matrix[k, k])
 
 
-def test_spans_of_the_true_flight_join(problem, flown):
-    """Flown from the true motion with the true vehicle and air every span ends where the next begins."""
-    _, truth, vehicle = flown
-    measured = problem.measured
+def flown_spans(measured, truth, vehicle):
+    """True motion at the starts of spans, with the creep where the joint has it, and the spans flown from there."""
     at = [int(np.argmin(np.abs(truth.time_s - t))) for t in measured.start.time_s]
     path, state = truth.trajectory, truth.state_eci[at]
     place = replace(
@@ -166,12 +164,20 @@ def test_spans_of_the_true_flight_join(problem, flown):
     shell_rate = state[:, 17:20] - rotations.rotate(rotations.conjugate(q_body_shell), state[:, 14:17])
     rotation = rotations.boxminus(path.q_ecef_body[at], place.q_ecef_body)
     turning = [rotation, state[:, 14:17], rotations.log(q_body_shell), shell_rate]
-    motion = np.column_stack([*turning, np.zeros((len(at), 3))])
+    motion = np.column_stack([*turning, np.zeros((len(at), 3)), state[:, 20:]])
     spans = np.arange(measured.spans)
     zero = np.zeros_like(spans)
     true = TrialVehicle(vehicle, simulate.parameter_vector(vehicle))
     flights = SpanFlights(spans, zero, motion[:-1], zero, [true], [simulate.atmosphere_table(truth.profile)])
     predicted = fly_spans(replace(measured, start=place), vehicle, flights)
+    return motion, predicted
+
+
+def test_spans_of_the_true_flight_join(problem, flown):
+    """Flown from the true motion with the true vehicle and air every span ends where the next begins."""
+    _, truth, vehicle = flown
+    measured = problem.measured
+    motion, predicted = flown_spans(measured, truth, vehicle)
     assert np.abs(motion[:, DEFLECTION]).max() > 0.02
     assert np.abs((predicted.end - motion[1:])[:, :12]).max() < np.deg2rad(2e-4)
     assert np.abs(predicted.end[:, VELOCITY]).max() < 1e-4
@@ -245,21 +251,7 @@ def test_spans_of_a_true_flight_with_creep_join(creeping):
     """And the gradient by its creep is that of the cost."""
     flight, truth, vehicle = creeping
     measured = select_measurements(flight)
-    at = [int(np.argmin(np.abs(truth.time_s - t))) for t in measured.start.time_s]
-    path, state = truth.trajectory, truth.state_eci[at]
-    place = replace(
-        measured.start, position_ecef_m=path.position_ecef_m[at], velocity_ecef_mps=path.velocity_ecef_mps[at]
-    )
-    q_body_shell = rotations.multiply(rotations.conjugate(state[:, 6:10]), state[:, 10:14])
-    shell_rate = state[:, 17:20] - rotations.rotate(rotations.conjugate(q_body_shell), state[:, 14:17])
-    rotation = rotations.boxminus(path.q_ecef_body[at], place.q_ecef_body)
-    turning = [rotation, state[:, 14:17], rotations.log(q_body_shell), shell_rate]
-    motion = np.column_stack([*turning, np.zeros((len(at), 3)), state[:, 20:]])
-    spans = np.arange(measured.spans)
-    zero = np.zeros_like(spans)
-    true = TrialVehicle(vehicle, simulate.parameter_vector(vehicle))
-    flights = SpanFlights(spans, zero, motion[:-1], zero, [true], [simulate.atmosphere_table(truth.profile)])
-    predicted = fly_spans(replace(measured, start=place), vehicle, flights)
+    motion, predicted = flown_spans(measured, truth, vehicle)
     assert np.abs(motion[:, CREEP]).max() > 0.002
     assert np.abs((predicted.end - motion[1:])[:, CREEP]).max() < np.deg2rad(2e-4)
     air = AtmosphereParameters(flight.telemetry.sounding, float(measured.altitude_m.min()))
@@ -267,7 +259,10 @@ def test_spans_of_a_true_flight_with_creep_join(creeping):
     u = near(problem)
     u.motion[:, CREEP] = 0.01 * np.random.default_rng(4).standard_normal((len(u.motion), 2))
     _, right = problem.normal_equations(u, problem.linearize(u))
-    for columns, size in (([5, 6], 1e-4), (problem.first_motion + problem.motion * spans + CREEP.start, 1e-7)):
+    for columns, size in (
+        ([5, 6], 1e-4),
+        (problem.first_motion + problem.motion * np.arange(measured.spans) + CREEP.start, 1e-7),
+    ):
         step = np.zeros(problem.count)
         step[columns] = size * np.random.default_rng(5).standard_normal(len(columns))
         difference = problem.residuals(u.plus(step)).cost - problem.residuals(u.plus(-step)).cost
