@@ -24,7 +24,7 @@ from synthetic_flight.simulate import integrate
 from synthetic_flight.weather import AUGUST, day_of_flight_atmosphere
 
 SECONDS, RECORD_HZ = 300.0, 10.0
-RATES_HZ = (200.0, 150.0)
+RATES_HZ = (200.0, 150.0, 60.0)
 FLIGHTS = 4 * LANES  # two blocks a worker
 
 

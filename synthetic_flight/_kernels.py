@@ -9,6 +9,11 @@ positive-definite solve (constraint force equation of a spherical joint), in she
 arm to the joint and the aerodynamic wrench need no rotation. The readable form that tests compare with is
 `tests.oracles.two_body`.
 
+The joint's twist is stiff: tens of hertz, which nobody needs and which alone would bound the step. Where a step is too
+long for it, the twist gets an inertia of its own beside those of the two bodies (`_slow_twist`), just large enough for
+the step. The deflection by loads that change slowly stays exact, and so do momentum and all other motion; free
+vibrations of the twist are slowed.
+
 One flight is a long chain of dependent arithmetic, in which a processor mostly waits. Flights do not depend on each
 other, so they fly in lanes: row ``r`` of the workspace ``s`` holds one quantity of every flight, ``s[r * lanes + i]``,
 and loops over ``i`` become vector instructions. The number of lanes is the length of the tuple ``lanes``, a constant of
@@ -58,7 +63,9 @@ SIN, COS, SIN_LON, COS_LON, SOUND, NORTH, EAST, FREE = 130, 131, 132, 133, 134, 
 # C_A C_N C_m C_mq; flow at the nose, shell axes; its size, its lateral part; Mach bracket of the last look-up
 COEF, FLOW, SPEED, LATERAL, BRACKET = 138, 142, 145, 146, 147
 P = 148
-CREEP = P + PARAMETERS
+# inertia that is added to the joint's twist, kg m^2: `synthetic_flight.dynamics.added_twist_inertia`
+ADDED = P + PARAMETERS
+CREEP = ADDED + 1
 ROWS = CREEP + 4 * CREEP_STATES
 
 
@@ -384,6 +391,62 @@ def _joined(s, lanes):
 
 
 @inlined
+def _slow_twist(s, lanes):
+    """Accelerations, joint's force and moment with the added inertia of the twist, from those without.
+
+    The twist changes at ``p' = w n / (1 + x)``, with ``w`` the body's rate less the shell's, ``x y z`` the body's x
+    axis (shell axes) and ``n = (1 + x, y, z)``; the torsion ``T n / (1 + x)`` does the work ``T p'``. An inertia of the
+    twist alone adds the torsion ``-I p''``; as accelerations are linear in it, one solution for a torsion of one
+    newton metre gives how much.
+    """
+    w = len(lanes)
+    for i in range(w):
+        c = _nine(s, C_AB, w, i)
+        x, y, z = c[0], c[3], c[6]
+        per = 1.0 / (1.0 + x)
+        b0, b1, b2 = _three(s, RATE_B, w, i)
+        a0, a1, a2 = _three(s, TRIAL + 17, w, i)
+        r0, r1, r2 = b0 - a0, b1 - a1, b2 - a2
+        u, v, t = la.times(c, s[(RATE + 14) * w + i], s[(RATE + 15) * w + i], s[(RATE + 16) * w + i])
+        d0, d1, d2 = la.cross(r0, r1, r2, a0, a1, a2)  # of the body's rate, seen from the shell
+        e0, e1, e2 = _three(s, RATE + 17, w, i)
+        u, v, t = u + d0 - e0, v + d1 - e1, t + d2 - e2
+        n0, n1, n2 = la.cross(r0, r1, r2, x, y, z)
+        rate = (r0 * (1.0 + x) + r1 * y + r2 * z) * per
+        turn = (u * (1.0 + x) + v * y + t * z + r0 * n0 + r1 * n1 + r2 * n2 - rate * n0) * per
+        # a torsion of one: of the bodies held apart, then with the force that keeps their joint together
+        m1, m2 = y * per, z * per
+        p0, p1, p2 = _three(s, P + P_B, w, i)
+        q0, q1, q2 = _three(s, P + P_A, w, i)
+        inverse_b, inverse_a = _six(s, P + W_B, w, i), _six(s, P + W_A, w, i)
+        u, v, t = la.back(c, 1.0, m1, m2)
+        b0, b1, b2 = la.symmetric(inverse_b, u, v, t)
+        a0, a1, a2 = la.symmetric(inverse_a, -1.0, -m1, -m2)
+        u, v, t = la.cross(b0, b1, b2, p0, p1, p2)
+        u, v, t = la.times(c, u, v, t)
+        d0, d1, d2 = la.cross(a0, a1, a2, q0, q1, q2)
+        n, m = la.turned(c, _six(s, P + N_B, w, i)), _six(s, P + N_A, w, i)
+        k = s[(P + PER_A) * w + i] + s[(P + PER_B) * w + i]
+        n = (n[0] + m[0] + k, n[1] + m[1], n[2] + m[2], n[3] + m[3] + k, n[4] + m[4], n[5] + m[5] + k)
+        f0, f1, f2 = la.solved(n, d0 - u, d1 - v, d2 - t)
+        u, v, t = la.back(c, f0, f1, f2)
+        u, v, t = la.cross(p0, p1, p2, u, v, t)
+        u, v, t = la.symmetric(inverse_b, u, v, t)
+        b0, b1, b2 = b0 + u, b1 + v, b2 + t
+        u, v, t = la.cross(q0, q1, q2, f0, f1, f2)
+        u, v, t = la.symmetric(inverse_a, u, v, t)
+        a0, a1, a2 = a0 - u, a1 - v, a2 - t
+        u, v, t = la.times(c, b0, b1, b2)
+        added = s[ADDED * w + i]
+        yielding = u - a0 + (v - a1) * m1 + (t - a2) * m2
+        share = -added * turn / (1.0 + added * yielding)
+        for row, e in ((RATE + 14, (b0, b1, b2)), (RATE + 17, (a0, a1, a2)), (FORCE, (f0, f1, f2)),
+                       (MOMENT, (1.0, m1, m2))):  # fmt: skip
+            g0, g1, g2 = _three(s, row, w, i)
+            _put(s, row, w, i, g0 + share * e[0], g1 + share * e[1], g2 + share * e[2])
+
+
+@inlined
 def _rigid(s, lanes):
     """Angular acceleration of one rigid body, and the moment and force that the lock of the joint carries."""
     w = len(lanes)
@@ -426,7 +489,7 @@ def _rigid(s, lanes):
 
 
 @inlined
-def rates(s, lanes, creep, atmosphere, grid, mach_knots, table, free, planet, locked):
+def rates(s, lanes, creep, atmosphere, grid, mach_knots, table, free, planet, locked, slowed):
     """Time derivative of the trial state of every lane, and what is recorded."""
     _attitudes(s, lanes)
     _position(s, lanes, planet)
@@ -441,6 +504,8 @@ def rates(s, lanes, creep, atmosphere, grid, mach_knots, table, free, planet, lo
         if len(creep) > 0:
             _creep(s, lanes)
         _joined(s, lanes)
+        if slowed:
+            _slow_twist(s, lanes)
 
 
 @inlined
@@ -525,6 +590,9 @@ def integrate(lanes, creep, s, tables, planet, step, per_record, records, lock_r
     passed ``limit`` or was not a number any more.
     """
     w = len(lanes)
+    slowed = False  # by one for all lanes: an added inertia of zero changes nothing
+    for i in range(w):
+        slowed = slowed or s[ADDED * w + i] > 0.0
     for k in range(STATES * w):
         s[TRIAL * w + k] = s[Y * w + k]
     for k in range(len(creep) * w):
@@ -533,7 +601,7 @@ def integrate(lanes, creep, s, tables, planet, step, per_record, records, lock_r
         locked = record < lock_records
         for sub in range(per_record):
             for stage in range(4):
-                rates(s, lanes, creep, tables[0], tables[1], tables[2], tables[3], tables[4], planet, locked)
+                rates(s, lanes, creep, tables[0], tables[1], tables[2], tables[3], tables[4], planet, locked, slowed)
                 if stage + sub == 0:
                     flying = _record(s, w, creep, record, limit, out, out_aux, written)
                     if record == records - 1 or not flying:

@@ -122,10 +122,14 @@ class AirDispersions(Section):
 
 
 class Window(Section):
-    """Part of the flight that is recorded, s, and its steps: for peaks, and for histories."""
+    """Part of the flight that is recorded, s, and its steps: for peaks, for histories, and of the integration.
+
+    ``step_s`` is the longest step after inflation; none given, the scenario's own.
+    """
 
     from_s: Time
     to_s: Time
+    step_s: Annotated[float, Field(ge=1e-4, le=0.1)] | None = None
     record_s: Annotated[float, Field(ge=1e-3, le=1.0)] = 0.02
     history_s: Annotated[float, Field(ge=1e-3, le=10.0)] = 0.1
 

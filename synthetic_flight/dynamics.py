@@ -8,7 +8,8 @@ creep's own spring. The equations of motion are compiled in `synthetic_flight._k
 
 Steps: a free joint's modes obey ``I'' s^2 + C s + K = 0``; a fourth-order Runge-Kutta step h multiplies a mode by
 ``R(h s)``, ``R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24``, and must not amplify it. Assumed: springs at their stiffness at
-rest. A joint much stiffer than its flight needs is better locked.
+rest. A joint much stiffer than its flight needs is better locked. The twist never bounds the step: where it would, it
+is given an inertia of its own.
 """
 
 from __future__ import annotations
@@ -179,6 +180,16 @@ def joint_modes(vehicle: Vehicle) -> dict[str, tuple[float, float, float]]:
     }
 
 
+def added_twist_inertia(inertia: FloatArray, damping: FloatArray, stiffness: FloatArray, step_s: float) -> FloatArray:
+    """Least inertia, kg m^2, that brings a twist's roots within 2 / step; zero where they are.
+
+    The roots of ``I s^2 + C s + K`` lie within a circle of radius s where ``I s^2 >= K`` and ``I s^2 - C s + K >= 0``.
+    """
+    circle = SURELY_STABLE / step_s
+    needed = np.maximum(stiffness, damping * circle - stiffness) / circle**2
+    return np.asarray(np.maximum(needed - inertia, 0.0))
+
+
 def largest_step_s(inertia: float, damping: float, stiffness: float) -> float:
     """Longest stable step of one mode, s; infinite without spring and damper."""
     roots = np.roots([inertia, damping, stiffness]).astype(complex)
@@ -195,19 +206,36 @@ def _growth(z: FloatArray) -> FloatArray:
     return 1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))
 
 
+# in a step: fourth-order steps then err by 2e-4 of a joint's frequency and damp it by 2e-4 of the critical damping
+RESOLVED_PHASE_RAD = 0.4
+
+
+def check_resolved(vehicle: Vehicle, step_s: float) -> None:
+    """Refuse a step that blurs the joint's oscillation; `ConfigError` says the longest that does not."""
+    inertia, _, stiffness = joint_modes(vehicle)["bending"]
+    longest = RESOLVED_PHASE_RAD * np.sqrt(inertia / stiffness)
+    if step_s > longest:
+        raise ConfigError(
+            f"step of {1e3 * step_s:.3g} ms is too long for a bending mode of "
+            f"{np.sqrt(stiffness / inertia) / (2.0 * np.pi):.1f} Hz: at most {1e3 * longest:.2g} ms resolves it",
+            code="step-too-coarse",
+        )
+
+
 def check_step(vehicle: Vehicle, step_s: float) -> None:
-    """Refuse a step at which a mode of the joint is unstable; `ConfigError` names the mode and the longest step."""
-    for name, (inertia, damping, stiffness) in joint_modes(vehicle).items():
-        if step_s * float(np.abs(np.roots([inertia, damping, stiffness])).max(initial=0.0)) < SURELY_STABLE:
-            continue
-        longest = largest_step_s(inertia, damping, stiffness)
-        if step_s > longest:
-            frequency = np.sqrt(stiffness / inertia) / (2.0 * np.pi)
-            raise ConfigError(
-                f"step of {1e3 * step_s:g} ms is too long for the joint's {name} mode at {frequency:.1f} Hz: at most "
-                f"{1e3 * longest:.2g} ms is stable (better half of it); shorten time.step_s, or soften the joint",
-                code="step-too-long",
-            )
+    """Refuse a step at which the joint's bending is unstable; `ConfigError` says the longest step.
+
+    A step too long for the twist is not refused: `added_twist_inertia`.
+    """
+    inertia, damping, stiffness = joint_modes(vehicle)["bending"]
+    longest = largest_step_s(inertia, damping, stiffness)
+    if step_s > longest:
+        frequency = np.sqrt(stiffness / inertia) / (2.0 * np.pi)
+        raise ConfigError(
+            f"step of {1e3 * step_s:g} ms is too long for the joint's bending mode at {frequency:.1f} Hz: at most "
+            f"{1e3 * longest:.2g} ms is stable (better a tenth of it); shorten time.step_s, or soften the joint",
+            code="step-too-long",
+        )
     # under a deflection that is held the creep settles faster than under a load that is
     settles_s = vehicle.joint.creep_time_s * (1.0 - vehicle.joint.creep_share)
     if vehicle.joint.creep_share > 0.0 and step_s > SURELY_STABLE * settles_s:

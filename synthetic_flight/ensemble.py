@@ -5,10 +5,11 @@ since compiled code holds no interpreter lock. Flight ``run`` is the same to the
 goes through the same instructions. Memory does not grow with the number of flights.
 
 The joint is locked until the shell is inflated. Until then the vehicle is rigid and outside the atmosphere, and flown
-with longer steps; then with the scenario's own. Only the window is recorded. Of each flight named numbers and histories
-are kept: ``peak_X`` is the largest sample of the quantity X in the window, ``X_at_peak_pressure`` its sample at the
-largest dynamic pressure. Angles are degrees and accelerations g, since these numbers are for files and figures. A joint
-that diverges ends its flight: histories hold their last value from there on, so that bands include that flight.
+with longer steps; then with those of the window, or the scenario's own. Only the window is recorded. Of each flight
+named numbers and histories are kept: ``peak_X`` is the largest sample of the quantity X in the window,
+``X_at_peak_pressure`` its sample at the largest dynamic pressure. Angles are degrees and accelerations g, since these
+numbers are for files and figures. A joint that diverges ends its flight: histories hold their last value from there
+on, so that bands include that flight.
 """
 
 from __future__ import annotations
@@ -321,7 +322,7 @@ def legs(time: TimeSpan, window: Window, locked: bool) -> list[Schedule]:
     ConfigError
         Where the window does not lie between inflation and the scenario's end.
     """
-    begins = time.start_s
+    begins, longest = time.start_s, window.step_s or time.step_s
     inflated = begins if time.inflated_s is None else max(time.inflated_s, begins)
     if not inflated <= window.from_s < window.to_s <= time.stop_s:
         raise ConfigError(
@@ -332,12 +333,12 @@ def legs(time: TimeSpan, window: Window, locked: bool) -> list[Schedule]:
     out = []
     for start, end, step, lock in (
         (begins, inflated, LOCKED_STEP_S, True),
-        (inflated, window.from_s, time.step_s, locked),
+        (inflated, window.from_s, longest, locked),
     ):
         if end > start:
             steps = int(np.ceil((end - start) / step - 1e-9))
             out.append(Schedule((end - start) / steps, steps, 2, 2 if lock else 0))
-    per_record = int(np.ceil(window.record_s / time.step_s - 1e-9))
+    per_record = int(np.ceil(window.record_s / longest - 1e-9))
     step = window.record_s / per_record
     return [*out, Schedule(step, per_record, window.records, window.records if locked else 0)]
 

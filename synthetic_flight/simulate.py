@@ -28,7 +28,7 @@ from flightmodel.vehicle import Vehicle
 from synthetic_flight import _kernels as at
 from synthetic_flight import dynamics
 from synthetic_flight._kernels import AUX, CREEP_STATES, STATES
-from synthetic_flight.dynamics import check_step
+from synthetic_flight.dynamics import added_twist_inertia, check_step
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -234,7 +234,7 @@ def integrate_lanes(
     at.integrate(
         (0,) * lanes,
         (0,) * (width - STATES),
-        workspace(states, parameters),
+        workspace(states, parameters, step_s),
         kernel_tables(vehicle, atmosphere),
         planet,
         step_s,
@@ -493,11 +493,18 @@ def kernel_tables(vehicle: Vehicle, atmosphere: FloatArray) -> tuple[FloatArray,
     return np.ascontiguousarray(air), grid, np.ascontiguousarray(vehicle.aero.mach), coefficients, free
 
 
-def workspace(states: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Flat workspace of the kernels of states ``(lanes, 20 or 22)`` and parameter vectors ``(lanes, 69)``."""
+def workspace(states: FloatArray, parameters: FloatArray, step_s: float = 0.0) -> FloatArray:
+    """Flat workspace of the kernels of states ``(lanes, 20 or 22)`` and parameter vectors ``(lanes, 69)``.
+
+    ``step_s`` is the integration's: the twist of a joint for which it is too long is slowed.
+    """
     s = np.zeros((at.ROWS, len(states)))
     s[at.Y : at.Y + STATES] = states[:, :STATES].T
-    s[at.P : at.CREEP] = parameters.T
+    s[at.P : at.ADDED] = parameters.T
+    if step_s > 0.0:
+        inertia = 1.0 / (1.0 / parameters[:, at.I_A] + 1.0 / parameters[:, at.I_B])
+        stiffness, damping = parameters[:, at.JOINT + 2], parameters[:, at.JOINT + 5]
+        s[at.ADDED] = added_twist_inertia(inertia, damping, stiffness, step_s)
     s[at.CREEP : at.CREEP + states.shape[1] - STATES] = states[:, STATES:].T
     return s.ravel()
 

@@ -33,6 +33,7 @@ from flightmodel.config import Section, parse_section, read_toml
 from flightmodel.vehicle import DATA, Vehicle
 from postflight.montecarlo import trial
 from synthetic_flight.dispersions import SMALLEST, Dispersions, Window, draws
+from synthetic_flight.dynamics import check_resolved
 from synthetic_flight.ensemble import QUANTITIES, SCALARS, Plan, check_outputs, legs
 from synthetic_flight.scenarios import read_scenario
 
@@ -197,6 +198,8 @@ def read_study(name: str) -> Study:
         faults += [Fault(f"{path}: {words}", words.code) for words in trial.impossible_dispersions(spec)]
     try:
         legs(scenario.spec.time, spec.window, spec.joint_is == "locked")
+        if spec.window.step_s is not None and spec.joint_is == "flexible":
+            check_resolved(scenario.vehicle, spec.window.step_s)
     except ConfigError as fault:
         faults += [Fault(f"{path}: {words}", words.code) for words in fault.faults]
     if faults:

@@ -63,7 +63,7 @@ def test_the_kernel_equals_the_readable_form(generic_vehicle, measured):
     s = simulate.workspace(state[None], simulate.parameter_vector(one)[None])
     s[at.TRIAL : at.TRIAL + at.STATES], s[at.CREEP + 2 : at.CREEP + 4] = state[:20], state[20:]
     tables = simulate.kernel_tables(one, simulate.vacuum_table())
-    _kernels.rates(s, (0,), (0, 0), *tables, earth.WGS84, False)
+    _kernels.rates(s, (0,), (0, 0), *tables, earth.WGS84, False, False)
     moment, creep_rate = two_body.creeping_moment(one, state)
     in_eci = s[at.R_A : at.R_A + 9].reshape(3, 3) @ s[at.MOMENT : at.MOMENT + 3]
     # central differences of 1e-5 rad: 1e-10 of cubic terms, 1e-16 / 1e-5 of rounding
