@@ -228,8 +228,8 @@ def check_step(vehicle: Vehicle, step_s: float) -> None:
     A step too long for the twist is not refused: `added_twist_inertia`.
     """
     inertia, damping, stiffness = joint_modes(vehicle)["bending"]
-    longest = largest_step_s(inertia, damping, stiffness)
-    if step_s > longest:
+    fastest = float(np.abs(np.roots([inertia, damping, stiffness])).max(initial=0.0))
+    if step_s * fastest > SURELY_STABLE and step_s > (longest := largest_step_s(inertia, damping, stiffness)):
         frequency = np.sqrt(stiffness / inertia) / (2.0 * np.pi)
         raise ConfigError(
             f"step of {1e3 * step_s:g} ms is too long for the joint's bending mode at {frequency:.1f} Hz: at most "

@@ -51,11 +51,14 @@ class Start:
         which four of the parameters scale.
     atmosphere : (rows, 6) float
         `synthetic_flight.simulate.atmosphere_table` of the flight's own atmosphere.
+    altitude_m : (2,) float, optional
+        Between which altitudes a short flight stays: no other air is looked at then.
     """
 
     state: FloatArray
     parameters: FloatArray
     atmosphere: FloatArray
+    altitude_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -134,17 +137,30 @@ def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule:
     """Fly at most `LANES` flights side by side, in this thread; see `fly_ensemble`."""
     padded = starts + [starts[-1]] * (LANES - len(starts))
     shared = all(s.atmosphere is starts[0].atmosphere for s in starts)
+    rows = _rows_needed(starts)
     lanes = integrate_lanes(
         vehicle,
-        starts[0].atmosphere if shared else np.stack([s.atmosphere for s in padded]),
+        starts[0].atmosphere[rows] if shared else np.stack([s.atmosphere[rows] for s in padded]),
         np.stack([simulate.with_creep(s.state, vehicle) for s in padded]),
         np.stack([s.parameters for s in padded]),
         schedule.step_s,
         schedule.per_record,
         schedule.records,
         schedule.lock_records,
+        air_from_m=ATMOSPHERE_START_M + rows.start * ATMOSPHERE_STEP_M,
     )
     return [Flown(run, *lane) for run, lane in zip(runs, lanes, strict=False)]
+
+
+def _rows_needed(starts: list[Start]) -> slice:
+    """Rows of the tables of air that flights need, two at least: copying all of each takes longer than a flight."""
+    given = [s.altitude_m for s in starts if s.altitude_m is not None]
+    last = len(starts[0].atmosphere)
+    if len(given) < len(starts):
+        return slice(0, last)
+    low, high = ((altitude - ATMOSPHERE_START_M) / ATMOSPHERE_STEP_M for altitude in np.array(given).T)
+    first = int(np.clip(np.floor(low.min()), 0, last - 2))
+    return slice(first, int(np.clip(np.ceil(high.max()) + 1, first + 2, last)))
 
 
 def _check_mass(vehicle: Vehicle) -> None:

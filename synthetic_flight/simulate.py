@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 DEFLECTION_LIMIT_RAD = 0.5 * np.pi
 TUMBLE_RAD = 0.5 * np.pi
 
+ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, ATMOSPHERE_ROWS = -1000.0, 50.0, 8001
+
 
 @dataclass(frozen=True, repr=False)
 class Truth(Tabular):
@@ -222,11 +224,12 @@ def integrate_lanes(
     records: int,
     lock_records: int,
     planet: earth.Planet = earth.WGS84,
+    air_from_m: float = ATMOSPHERE_START_M,
 ) -> list[tuple[FloatArray, FloatArray, bool]]:
     """States, auxiliaries and whether the joint diverged of flights side by side.
 
     ``states`` ``(lanes, 20)``, or ``(lanes, 22)`` of joints that creep, ``parameters`` ``(lanes, 69)``; ``atmosphere``
-    is one table, or ``(lanes, rows, 6)``.
+    is one table, or ``(lanes, rows, 6)``, its first row at ``air_from_m``.
     """
     lanes, width = states.shape
     out, aux = np.empty((lanes, records, width)), np.empty((lanes, records, AUX))
@@ -235,7 +238,7 @@ def integrate_lanes(
         (0,) * lanes,
         (0,) * (width - STATES),
         workspace(states, parameters, step_s),
-        kernel_tables(vehicle, atmosphere),
+        kernel_tables(vehicle, atmosphere, air_from_m),
         planet,
         step_s,
         per_record,
@@ -408,9 +411,6 @@ def _truth(
     )
 
 
-ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, ATMOSPHERE_ROWS = -1000.0, 50.0, 8001
-
-
 def freeplay_corner(freeplay_rad: float, corner: float) -> tuple[float, float, float]:
     """Arguments of `_kernels.beyond_freeplay` after the angle: freeplay, half width of its corner, 1 / (4 half)."""
     half = corner * freeplay_rad
@@ -480,9 +480,11 @@ def vacuum_table() -> FloatArray:
     return np.tile(np.array([0.0, 0.0, 300.0, 0.0, 0.0, 0.0]), (ATMOSPHERE_ROWS, 1))
 
 
-def kernel_tables(vehicle: Vehicle, atmosphere: FloatArray) -> tuple[FloatArray, ...]:
+def kernel_tables(
+    vehicle: Vehicle, atmosphere: FloatArray, air_from_m: float = ATMOSPHERE_START_M
+) -> tuple[FloatArray, ...]:
     """Return the tables of the kernels: atmosphere of every lane, grid, Mach knots, coefficients, free-molecular."""
-    grid = np.array([ATMOSPHERE_START_M, 1.0 / ATMOSPHERE_STEP_M, 1.0 / vehicle.aero.alpha_rad[1]])
+    grid = np.array([air_from_m, 1.0 / ATMOSPHERE_STEP_M, 1.0 / vehicle.aero.alpha_rad[1]])
     coefficients = np.ascontiguousarray(vehicle.aero.coefficients)
     air = atmosphere if atmosphere.ndim == 3 else atmosphere[None]
     free = np.zeros(coefficients.shape[1:])

@@ -47,12 +47,12 @@ from postflight.reconciliation.forward_model import (
 )
 from postflight.reconciliation.gauss_newton import (
     Linearization,
-    NormalEquations,
     Parameters,
     Problem,
     Residuals,
     descend,
 )
+from postflight.reconciliation.normal_equations import NormalEquations
 from postflight.reconciliation.start import resolved, stiffness_guess
 from postflight.reconstruction import Reconstruction
 
@@ -87,8 +87,8 @@ class JointFit:
     problem : Problem
     parameters : Parameters
         The most probable.
-    covariance : (n, n) float
-        Of all parameters, in their order, of the linear problem at the solution.
+    normal : NormalEquations
+        Of the linear problem at the solution.
     residuals : Residuals
     steps : int
     converged : bool
@@ -96,10 +96,15 @@ class JointFit:
 
     problem: Problem
     parameters: Parameters
-    covariance: FloatArray
+    normal: NormalEquations
     residuals: Residuals
     steps: int
     converged: bool
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance (v, v) of the vehicle's parameters, in their order."""
+        return self.normal.covariance_of(np.arange(self.problem.first_instrument))
 
     @property
     def sensor_rms_sd(self) -> float:
@@ -109,11 +114,9 @@ class JointFit:
     @property
     def log_evidence(self) -> float:
         """Logarithm of the evidence by Laplace's method, up to a constant common to all models of a flight."""
-        sd = np.sqrt(np.diag(self.covariance))
-        _, shape = np.linalg.slogdet(self.covariance / np.outer(sd, sd))
         # freeplay has one sign: its prior is folded
         folded = np.log(2.0) if "freeplay" in self.problem.vehicle_parameters.laws else 0.0
-        return float(folded + self.problem.log_weight + 0.5 * shape + np.log(sd).sum() - 0.5 * self.residuals.cost)
+        return float(folded + self.problem.log_weight - 0.5 * self.normal.log_det - 0.5 * self.residuals.cost)
 
     @property
     def vehicle(self) -> Vehicle:
@@ -218,7 +221,7 @@ def _creep_score(fit: JointFit, time_s: float) -> CreepScore:
     """Step of the delayed compliance from none, all other parameters following, and its sd."""
     problem, start = _without_creep_yet(fit, time_s)
     k = problem.vehicle_parameters.names.index("creep growth")
-    normal = NormalEquations(*problem.normal_equations(start, problem.linearize(start)))
+    normal = problem.normal_equations(start, problem.linearize(start))
     unit = np.eye(len(normal.right))[k]
     step, variance = normal.solve(normal.right)[k], normal.solve(unit)[k]
     return CreepScore(time_s, CREEP_PER_S * time_s * float(step), CREEP_PER_S * time_s * float(np.sqrt(variance)))
@@ -340,7 +343,7 @@ def solve(
         cost = step.residuals.cost
         report(number / most, f"reconciling, step {number + 1}")
     report(1.0, "reconciled")
-    return JointFit(problem, step.end, step.normal.covariance, step.residuals, number, converged)
+    return JointFit(problem, step.end, step.normal, step.residuals, number, converged)
 
 
 def _refit_with_turbulence(fit: JointFit, report: Progress, correct: Correction | None = None) -> JointFit:
@@ -385,7 +388,7 @@ def _log_evidence(problem: Problem, other: Problem, u: Parameters, linear: Linea
         [(column, rows * by[:, None]) for (column, rows), by in zip(linear.joins, joins, strict=True)],
         linear.count,
     )
-    normal = NormalEquations(*other.normal_equations(u, weighted))
+    normal = other.normal_equations(u, weighted)
     cost = (residuals.sensors**2).sum() + (residuals.joins**2).sum() + other.prior_cost(u)
     lowest = cost - normal.solve(normal.right) @ normal.right
     return float(other.log_weight - 0.5 * lowest - 0.5 * normal.log_det)

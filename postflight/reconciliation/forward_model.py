@@ -281,18 +281,36 @@ class AtmosphereParameters:
         table[:, 4] += east
         return table
 
+    def moved_table(self, table: FloatArray, kind: int, knot: int, step: float) -> FloatArray:
+        """Kernel table with one difference (log density, north, east wind) moved at one knot; rows about it change."""
+        knots, rows = self.knots_m, self._sounded[1]
+        first = 0 if knot == 0 else int(np.searchsorted(rows, knots[knot - 1])) - 1
+        last = len(rows) if knot == len(knots) - 1 else int(np.searchsorted(rows, knots[knot + 1])) + 1
+        near = slice(max(first, 0), last)
+        unit = np.zeros(len(knots))
+        unit[knot] = step
+        change = np.interp(rows[near], knots, unit)
+        table = table.copy()
+        if kind == 0:
+            table[near, 0] *= np.exp(change)
+            table[near, 1][:-1] += np.diff(change)
+        else:
+            table[near, 2 + kind] += change
+        return table
+
 
 START_ALTITUDE_M = 100e3
 WINDOW_S = 0.04  # passes 98 % of the joint's oscillation at 2.5 Hz; the simulated flight is averaged alike
 WINDOWS = 10  # a span
 SPAN_S = WINDOWS * WINDOW_S
+SPAN_MARGIN_M = 200.0  # of the air about a span, beside what it falls through
 LEAST_SPANS = 20
 LOADED = 0.1  # of the largest dynamic pressure
 # a priori sd of deflection and its rate (about x, y, z) at the first start: at rest above the atmosphere; under load
 REST_SD, LOADED_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0]), np.deg2rad([1e-3, 3.0, 3.0, 0.1, 30.0, 30.0])
 
 
-MOST_PHASE_RAD = 0.8  # of a joint's mode in a step, with an error of a percent a radian; unstable from 2.8
+MOST_PHASE_RAD = 0.8  # of the joint's bending in a step, with an error of a percent a radian; unstable from 2.8
 # damping ratio of a mode that windows do not resolve: its oscillation decays within a few windows, and deflections lag
 # their load by few milliseconds. From so many periods a window (10.7 Hz) it grows, over so many more (to 12.5 Hz)
 UNRESOLVED_RATIO, UNRESOLVED_FROM, UNRESOLVED_BLEND = 0.2, 0.43, 0.07
@@ -326,7 +344,7 @@ class WindowSteps:
         return np.asarray(weights / (3.0 * self.intervals))
 
 
-SLOW_JOINT, FAST_JOINT = WindowSteps(2, 5), WindowSteps(4, 3)
+SLOW_JOINT, FAST_JOINT = WindowSteps(2, 2), WindowSteps(4, 2)
 FAST_HZ = 6.0  # a window's mean of a faster oscillation is off by more than half a percent with two intervals
 
 
@@ -528,17 +546,15 @@ def integrable(vehicle: Vehicle, steps: WindowSteps) -> Vehicle:
     oscillations near the windows' Nyquist frequency (12.5 Hz) or beyond it fit at many false frequencies: there the
     joint is so much damped that it follows its load.
     """
-    joint, changed = vehicle.joint, {}
-    for name, (inertia, _, stiffness) in joint_modes(vehicle).items():
-        most = inertia * (MOST_PHASE_RAD / steps.step_s) ** 2
-        # smooth, so that steps of a fit see where it ends; a tenth of the limit is lowered by 3e-5
-        limited = stiffness / (1.0 + (stiffness / most) ** 4) ** 0.25
-        changed[f"{name}_stiffness_nmprad"] = limited
-        frequency = np.sqrt(limited / inertia) / (2.0 * np.pi)
-        ratio = UNRESOLVED_RATIO * np.clip((frequency * WINDOW_S - UNRESOLVED_FROM) / UNRESOLVED_BLEND, 0.0, 1.0)
-        key = f"{name}_damping_nmsprad"
-        changed[key] = max(getattr(joint, key), float(ratio * 2.0 * np.sqrt(limited * inertia)))
-    return replace(vehicle, joint=joint.model_copy(update=changed))
+    inertia, _, stiffness = joint_modes(vehicle)["bending"]
+    most = inertia * (MOST_PHASE_RAD / steps.step_s) ** 2
+    # smooth, so that steps of a fit see where it ends; a tenth of the limit is lowered by 3e-5
+    limited = stiffness / (1.0 + (stiffness / most) ** 4) ** 0.25
+    frequency = np.sqrt(limited / inertia) / (2.0 * np.pi)
+    ratio = UNRESOLVED_RATIO * np.clip((frequency * WINDOW_S - UNRESOLVED_FROM) / UNRESOLVED_BLEND, 0.0, 1.0)
+    damping = max(vehicle.joint.bending_damping_nmsprad, float(ratio * 2.0 * np.sqrt(limited * inertia)))
+    changed = {"bending_stiffness_nmprad": limited, "bending_damping_nmsprad": damping}
+    return replace(vehicle, joint=vehicle.joint.model_copy(update=changed))
 
 
 def resolved_stiffness_nmprad(vehicle: Vehicle) -> float:
@@ -549,10 +565,14 @@ def resolved_stiffness_nmprad(vehicle: Vehicle) -> float:
 def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) -> PredictedSpans:
     """Fly spans and predict the sensors' windows; ``nominal`` gives the coefficient table."""
     starts = _start_states(measured, flights)
+    # a span that leaves these by a trial vehicle's tumbling meets the air at their ends
+    passed = np.abs(np.gradient(measured.altitude_m)) + SPAN_MARGIN_M
+    lowest, highest = measured.altitude_m - passed, measured.altitude_m + passed
 
     def start_of(k: int) -> Start:
         vehicle = flights.vehicles[flights.vehicle[k]]
-        return Start(starts[k], vehicle.kernel_vector, flights.tables[flights.table[k]])
+        table, span = flights.tables[flights.table[k]], flights.span[k]
+        return Start(starts[k], vehicle.kernel_vector, table, (lowest[span], highest[span]))
 
     steps = measured.steps
     states = np.full((len(starts), steps.records, starts.shape[1]), np.nan)

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from flightmodel.checks import DivergenceError, FloatArray
 from postflight.reconciliation.forward_model import (
@@ -44,6 +43,7 @@ from postflight.reconciliation.forward_model import (
     fly_spans,
     integrable,
 )
+from postflight.reconciliation.normal_equations import ArrowMatrix, NormalEquations
 from synthetic_flight import simulate
 
 INSTRUMENTS = 20
@@ -336,14 +336,14 @@ class Problem:
                 joins.append((np.concatenate([column, following]), response))
         return Linearization(self.residuals(u, base), sensors, joins, self.count)
 
-    def normal_equations(self, u: Parameters, linear: Linearization) -> tuple[FloatArray, FloatArray]:
-        """NormalEquations matrix and right-hand side of a step from ``u``."""
-        matrix = np.zeros((self.count, self.count))
+    def normal_equations(self, u: Parameters, linear: Linearization) -> NormalEquations:
+        """Normal equations of a step from ``u``."""
+        matrix = ArrowMatrix.zeros(self.first_motion, self.motion * self.measured.spans, 2 * self.motion - 1)
         for column, response in (*linear.sensors, *linear.joins):
-            matrix[np.ix_(column, column)] += response.T @ response
+            matrix.add(column, response.T @ response)
         for part, precision, _ in self._priors(u):
-            matrix[part, part] += precision
-        return matrix, self.right_hand_side(u, linear, linear.residuals)
+            matrix.add(np.arange(part.start, part.stop), precision)
+        return NormalEquations(matrix, self.right_hand_side(u, linear, linear.residuals))
 
     def right_hand_side(self, u: Parameters, linear: Linearization, residuals: Residuals) -> FloatArray:
         """Right-hand side of a step from ``u`` with its residuals, by derivatives at ``u`` or nearby."""
@@ -384,9 +384,7 @@ class Problem:
         tables, steps = [self.air.table(u.air, u.warmer_k)], []
         for kind, step in enumerate(AIR_STEP):
             for knot in range(len(self.air.knots_m)):
-                air = u.air.copy()
-                air[kind, knot] += step
-                tables.append(self.air.table(air, u.warmer_k))
+                tables.append(self.air.moved_table(tables[0], kind, knot, step))
                 steps.append(step)
         for unit in np.eye(len(u.warmer_k)):
             tables.append(self.air.table(u.air, u.warmer_k + WARMTH_STEP_K * unit))
@@ -425,49 +423,6 @@ FIRST_DAMPING, MOST_DAMPING, FAIR = 1e-2, 1e3, 0.5
 
 
 @dataclass(frozen=True)
-class NormalEquations:
-    """NormalEquations equations of a step, scaled to a diagonal of one."""
-
-    matrix: FloatArray
-    right: FloatArray
-
-    @cached_property
-    def scale(self) -> FloatArray:
-        """One over the root of the diagonal."""
-        return np.asarray(1.0 / np.sqrt(np.diag(self.matrix)))
-
-    def factor(self, damping: float) -> FloatArray:
-        """Lower Cholesky factor of the scaled matrix with a share of the diagonal added."""
-        scaled = self.matrix * self.scale[:, None] * self.scale
-        scaled[np.diag_indices_from(scaled)] += damping
-        return np.asarray(cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)[0])
-
-    @cached_property
-    def undamped(self) -> FloatArray:
-        """Factor of the matrix as it is."""
-        return self.factor(0.0)
-
-    def solver(self, damping: float) -> Callable[[FloatArray], FloatArray]:
-        """Solver of the equations with a share of the diagonal added."""
-        factor, scale = self.factor(damping) if damping else self.undamped, self.scale
-        return lambda right: np.asarray((cho_solve((factor, True), (right.T * scale).T).T * scale).T)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solution of the equations."""
-        return self.solver(0.0)(right)
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Covariance (n, n) of all parameters."""
-        return self.solve(np.eye(len(self.right)))
-
-    @property
-    def log_det(self) -> float:
-        """Logarithm of the determinant."""
-        return float(2.0 * (np.log(np.diag(self.undamped)).sum() - np.log(self.scale).sum()))
-
-
-@dataclass(frozen=True)
 class Step:
     """End of a step, decrease of the cost that the linear problem predicts, residuals at the end, its equations."""
 
@@ -493,7 +448,7 @@ def step_from(problem: Problem, u: Parameters) -> Step:
             "a stiffer joint in the vehicle file to start from",
             code="joint-diverges",
         )
-    normal = NormalEquations(*problem.normal_equations(u, linear))
+    normal = problem.normal_equations(u, linear)
     predicted_decrease = float(normal.solve(normal.right) @ normal.right)
     best = linear.residuals, u
     for damping in DAMPINGS:

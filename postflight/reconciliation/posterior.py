@@ -46,7 +46,8 @@ from postflight.reconciliation.forward_model import (
     creep_law,
     resolved_stiffness_nmprad,
 )
-from postflight.reconciliation.gauss_newton import Linearization, NormalEquations, Parameters, descend
+from postflight.reconciliation.gauss_newton import Linearization, Parameters, descend
+from postflight.reconciliation.normal_equations import NormalEquations
 
 INTERVAL, BOUND = 0.90, 0.95
 FROM_ZERO_SD = 3.0  # of the compliance: nearer to zero the stiffness has no upper limit
@@ -150,7 +151,7 @@ def joint_table(fit: JointFit) -> pd.DataFrame:
     """
     vehicle_parameters, x = fit.problem.vehicle_parameters, fit.parameters.vehicle
     n = len(x)
-    covariance = fit.covariance[:n, :n]
+    covariance = fit.covariance
     reach = float(norm.ppf(0.5 + 0.5 * INTERVAL))
     nominal, best = vehicle_parameters.vehicle(np.zeros(n)), vehicle_parameters.vehicle(x)
     moved = [[vehicle_parameters.vehicle(x + side * DIFFERENCE * unit) for side in (-1.0, 1.0)] for unit in np.eye(n)]
@@ -206,7 +207,7 @@ def posterior_sd(fit: JointFit) -> tuple[tuple[float, float], float, float]:
     Of a stiffness that is only bounded the sd is that with which the bound holds with 95 %.
     """
     names = fit.problem.vehicle_parameters.names
-    sd = dict(zip(names, np.sqrt(np.diag(fit.covariance)[: len(names)]).tolist(), strict=True))
+    sd = dict(zip(names, np.sqrt(np.diag(fit.covariance)).tolist(), strict=True))
     offset = float(OFFSET_SD_M * np.hypot(sd["offset y"], sd["offset z"]) / np.sqrt(2.0))
     stiffness, bound = STIFFNESS_LOG_SD * sd["stiffness"], stiffness_bound(fit)
     if bound is not None:
@@ -219,7 +220,7 @@ def posterior_sd(fit: JointFit) -> tuple[tuple[float, float], float, float]:
 def correlations(fit: JointFit) -> pd.DataFrame:
     """Correlation of the vehicle's parameters, those sought first."""
     names = fit.problem.vehicle_parameters.names
-    covariance = fit.covariance[: len(names), : len(names)]
+    covariance = fit.covariance
     sd = np.sqrt(np.diag(covariance))
     return pd.DataFrame(covariance / np.outer(sd, sd), columns=list(names)).assign(unknown=list(names))
 
@@ -233,7 +234,7 @@ def stiffness_and_offset(fit: JointFit) -> tuple[FloatArray, FloatArray]:
     slope = np.zeros((2, len(x)))
     slope[0, 0] = STIFFNESS_LOG_SD * vehicle.joint.bending_stiffness_nmprad
     slope[1, 2:4] = 100.0 * OFFSET_SD_M * offset / max(size, 1e-9)
-    covariance = slope @ fit.covariance[: len(x), : len(x)] @ slope.T
+    covariance = slope @ fit.covariance @ slope.T
     return np.array([vehicle.joint.bending_stiffness_nmprad, 100.0 * size]), covariance
 
 
@@ -243,10 +244,10 @@ def deflection_of(fit: JointFit) -> DeflectionHistory:
     rotation = problem.predict(fit.parameters).deflection.reshape(-1, 3)
     # rotation vector y z to lateral vector: the shell's nose moves along its cross product with x
     lateral = np.column_stack([rotation[:, 2], -rotation[:, 1]])
-    at_start = np.empty((measured.spans, 2, 2))
-    for span in range(measured.spans):
-        at = problem.first_motion + problem.motion * span + DEFLECTION.start + np.array([2, 1])
-        at_start[span] = fit.covariance[np.ix_(at, at)] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    span = np.arange(measured.spans)
+    at = problem.first_motion + problem.motion * span[:, None] + DEFLECTION.start + np.array([2, 1])
+    whole = fit.normal.covariance_of(at.ravel()).reshape(measured.spans, 2, measured.spans, 2)
+    at_start = whole[span, :, span] * np.array([[1.0, -1.0], [-1.0, 1.0]])
     assumptions = "by the simulator with the reconciled joint, from accelerometers and rates"
     covariance = np.repeat(at_start, WINDOWS, axis=0)
     return history_from_lateral(measured.time_s.ravel(), lateral, covariance, "reconciled", assumptions)
@@ -335,9 +336,10 @@ class Profile:
         """Derivatives at the best fit, steps (n, p) of all parameters to a candidate, equations of the others."""
         p, problem = self.count, self.fit.problem
         linear = problem.linearize(self.fit.parameters)
-        matrix, right = problem.normal_equations(self.fit.parameters, linear)
-        others = NormalEquations(matrix[p:, p:], right[p:])
-        return linear, np.concatenate([self.root, -others.solve(matrix[p:, :p] @ self.root)]), others
+        whole = problem.normal_equations(self.fit.parameters, linear)
+        others = NormalEquations(whole.matrix.without(p), whole.right[p:])
+        coupling = np.concatenate([whole.matrix.corner[p:, :p], whole.matrix.across[:, :p]])
+        return linear, np.concatenate([self.root, -others.solve(coupling @ self.root)]), others
 
     def one_sided(self, z: FloatArray) -> NDArray[np.bool_]:
         """Mask (n,) of candidates with freeplay of the best fit's sign: those of the other sign are the same again."""
@@ -446,7 +448,7 @@ def linear_quantities(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     at = np.concatenate([x[None], x + DIFFERENCE * np.eye(n), x - DIFFERENCE * np.eye(n)])
     values = quantities(vehicle_parameters, at).to_numpy()
     slope = (values[1 : n + 1] - values[n + 1 :]) / (2.0 * DIFFERENCE)
-    return values[0], slope.T @ posterior.fit.covariance[:n, :n] @ slope
+    return values[0], slope.T @ posterior.fit.covariance @ slope
 
 
 def posterior_summary(posterior: Posterior) -> pd.DataFrame:

@@ -6,6 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from flightmodel.atmosphere import default_sounding_sd, us76
+from flightmodel.telemetry import Sounding
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.reconciliation.credibility import MOST_MOVED_SD, credibility
 from postflight.reconciliation.fit import CreepScore, JointFit, with_freeplay
@@ -16,6 +18,7 @@ from postflight.reconciliation.forward_model import (
     OFFSET_SD_M,
     SLOW_JOINT,
     STIFFNESS_LOG_SD,
+    AtmosphereParameters,
     VehicleParameters,
     integrable,
     resolved_stiffness_nmprad,
@@ -24,17 +27,24 @@ from postflight.reconciliation.forward_model import (
 from postflight.reconciliation.gauss_newton import (
     LEAST_COMPLIANCE,
     Linearization,
-    NormalEquations,
     Parameters,
     Residuals,
     _better,
     stiffness_step,
 )
 from postflight.reconciliation.modes import HOP, PADDED, RATE_HZ, WINDOW, _spectra
+from postflight.reconciliation.normal_equations import ArrowMatrix, NormalEquations
 from postflight.reconciliation.posterior import joint_table, stiffness_bound
 from synthetic_flight.dynamics import beyond_freeplay, joint_modes
 
 VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
+
+
+def full(matrix):
+    """Matrix as one without a band."""
+    out = ArrowMatrix.zeros(len(matrix), 0, 0)
+    out.add(np.arange(len(matrix)), matrix)
+    return out
 
 
 def test_evidence_is_the_integral_of_the_posterior():
@@ -45,7 +55,8 @@ def test_evidence_is_the_integral_of_the_posterior():
     cost = lowest + np.einsum("...i,ij,...j->...", x, np.linalg.inv(covariance), x)
     integral = np.exp(-0.5 * cost).sum() * (grid[1] - grid[0]) ** 2 / (2.0 * np.pi)
     problem = SimpleNamespace(vehicle_parameters=SimpleNamespace(laws=()), log_weight=weights)
-    found = JointFit(problem, None, covariance, SimpleNamespace(cost=lowest), 1, True)
+    normal = NormalEquations(full(np.linalg.inv(covariance)), np.zeros(2))
+    found = JointFit(problem, None, normal, SimpleNamespace(cost=lowest), 1, True)
     assert found.log_evidence == pytest.approx(weights + np.log(integral), rel=1e-6)
 
 
@@ -104,10 +115,45 @@ def test_a_step_whose_look_ahead_tumbles_is_tried_straight():
     u = Parameters(np.zeros(1), np.zeros(1), np.zeros((3, 0)), np.zeros(0), np.zeros((0, MOTION)))
     first = residuals(u)
     linear = Linearization(first, [(np.array([0, 1]), np.array([[0.0, 1.0]]))], [], 2)
-    normal = NormalEquations(np.eye(2), np.array([0.0, 1.0]))
+    normal = NormalEquations(full(np.eye(2)), np.array([0.0, 1.0]))
     found, end = _better(SimpleNamespace(residuals=residuals), u, linear, normal, 0.0, (first, u))
     assert end.instruments[0] == pytest.approx(1.0)
     assert found.cost == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(("shared", "blocks", "size"), [(7, 12, 5), (0, 4, 3), (6, 0, 5), (3, 1, 4)])
+def test_normal_equations_of_an_arrow_are_solved_as_full_ones(shared, blocks, size):
+    rng = np.random.default_rng(5)
+    n = shared + blocks * size
+    response = rng.standard_normal((3 * n, n)) * np.exp(3.0 * rng.standard_normal(n))
+    matrix = response.T @ response
+    block = np.maximum(np.arange(n) - shared, -1) // size
+    apart = np.abs(block[:, None] - block) > 1
+    matrix[apart & (block[:, None] >= 0) & (block >= 0)] = 0.0
+    matrix += np.diag(0.5 * np.abs(matrix).sum(axis=1) * (block >= 0))  # positive definite without what was taken out
+    right = rng.standard_normal(n)
+    arrow = ArrowMatrix.zeros(shared, blocks * size, 2 * size - 1)
+    # all that is shared, then the rest block by block with the next
+    arrow.add(np.arange(shared), matrix[:shared, :shared])
+    left = matrix.copy()
+    left[:shared, :shared] = 0.0
+    for start in range(shared, n, size):
+        columns = np.concatenate([np.arange(shared), np.arange(start, min(start + 2 * size, n))])
+        part = left[np.ix_(columns, columns)]
+        arrow.add(columns, part)
+        left[np.ix_(columns, columns)] = 0.0
+    np.testing.assert_allclose(arrow.dense, matrix, rtol=1e-14)
+    normal = NormalEquations(arrow, right)
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    for damping in (0.0, 0.3):
+        damped = matrix + damping * np.diag(np.diag(matrix))
+        want = np.linalg.solve(damped * scale[:, None] * scale, right * scale) * scale
+        np.testing.assert_allclose(normal.solver(damping)(right) / scale, want / scale, rtol=1e-9, atol=1e-10)
+    some = rng.permutation(n)[:4]
+    want = np.linalg.inv(matrix * scale[:, None] * scale)[np.ix_(some, some)]
+    np.testing.assert_allclose(normal.covariance_of(some) / np.outer(scale[some], scale[some]), want, atol=1e-9)
+    assert normal.log_det == pytest.approx(np.linalg.slogdet(matrix)[1], abs=1e-9)
+    np.testing.assert_allclose(arrow.without(shared // 2).dense, matrix[shared // 2 :, shared // 2 :], rtol=1e-14)
 
 
 def stiff(factor):
@@ -217,10 +263,11 @@ def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True, creep=1.0):
     residuals = SimpleNamespace(sensors=np.ones((10, 10, 6)), joins=joins, cost=cost)
     problem = SimpleNamespace(
         vehicle_parameters=parameters, measured=SimpleNamespace(spans=10), weight=np.ones((10, 10, 6)),
-        motion=parameters.motion, held=(),
+        motion=parameters.motion, held=(), first_instrument=len(values),
     )  # fmt: skip
     unknown = SimpleNamespace(vehicle=values, instruments=np.zeros(20))
-    found = JointFit(problem, unknown, 0.5 * np.eye(len(values) + 20), residuals, 4, converged)
+    normal = NormalEquations(full(2.0 * np.eye(len(values) + 20)), np.zeros(len(values) + 20))
+    found = JointFit(problem, unknown, normal, residuals, 4, converged)
     found.__dict__["creep_scores"] = (CreepScore(2.0, -0.3, 0.05), CreepScore(10.0, 0.02 * creep, 0.02))
     return found
 
@@ -252,3 +299,22 @@ def test_a_joint_that_oscillates_at_another_frequency_turns_red(factor, passed):
     assert check.value == pytest.approx(abs(np.log(factor)) / np.hypot(0.1, 0.02), rel=1e-6)
     assert check.passed is passed
     assert all(each.passed for each in others)
+
+
+def test_a_table_moved_at_a_knot_is_that_of_the_moved_differences():
+    z = np.arange(0.0, 100e3, 500.0)
+    density, temperature, pressure = us76(z)
+    sounding = Sounding(z, density, temperature, pressure, 0.0 * z + 5.0, 0.0 * z, *default_sounding_sd(z))
+    air = AtmosphereParameters(sounding, 30e3)
+    rng = np.random.default_rng(2)
+    knots, warm = len(air.knots_m), rng.standard_normal(len(air.temperature_knots_m))
+    difference = rng.standard_normal((3, knots)) * np.array([[0.02], [5.0], [5.0]])
+    table = air.table(difference, warm)
+    for kind in range(3):
+        for knot in (0, 1, knots // 2, knots - 2, knots - 1):
+            moved = difference.copy()
+            moved[kind, knot] += 0.1
+            np.testing.assert_allclose(
+                air.moved_table(table, kind, knot, 0.1), air.table(moved, warm), rtol=1e-13, atol=1e-12
+            )
+            assert not np.array_equal(air.table(moved, warm), table)

@@ -34,7 +34,7 @@ from postflight.reconciliation.forward_model import (
     fly_spans,
     select_measurements,
 )
-from postflight.reconciliation.gauss_newton import Parameters, Problem
+from postflight.reconciliation.gauss_newton import VACUUM_SD, Parameters, Problem
 from postflight.reconciliation.posterior import joint_table, posterior_summary, sample, vehicle_file_lines
 from postflight.reconstruction import reconstruct
 from synthetic_flight import simulate
@@ -120,7 +120,7 @@ def near(problem: Problem) -> Parameters:
 def test_gradient_is_that_of_the_cost(problem):
     """Of every group of unknowns, along a random direction, against central differences."""
     u = near(problem)
-    _, right = problem.normal_equations(u, problem.linearize(u))
+    right = problem.normal_equations(u, problem.linearize(u)).right
     rng = np.random.default_rng(2)
     first = problem.first_motion
     groups = {
@@ -147,10 +147,10 @@ def test_noise_has_no_information_on_a_scale(problem):
     noisy = replace(problem)
     sd = np.divide(1.0, problem.weight, out=np.zeros_like(problem.weight), where=problem.weight > 0.0)
     noisy.__dict__["data"] = predicted.windows + 30.0 * sd * rng.standard_normal(sd.shape)
-    matrix, right = noisy.normal_equations(u, noisy.linearize(u))
+    normal = noisy.normal_equations(u, noisy.linearize(u))
     for number in (3, 4, 5, 12, 13, 14):  # scale of gyros; errors of the accelerometer that the trajectory left
         k = problem.first_instrument + number
-        assert abs(right[k]) < 4.0 * 30.0 * np.sqrt(matrix[k, k])
+        assert abs(normal.right[k]) < 4.0 * 30.0 * np.sqrt(normal.matrix.diagonal[k])
 
 
 def flown_spans(measured, truth, vehicle):
@@ -179,7 +179,8 @@ def test_spans_of_the_true_flight_join(problem, flown):
     measured = problem.measured
     motion, predicted = flown_spans(measured, truth, vehicle)
     assert np.abs(motion[:, DEFLECTION]).max() > 0.02
-    assert np.abs((predicted.end - motion[1:])[:, :12]).max() < np.deg2rad(2e-4)
+    # steps of 10 ms, of which the twist is slowed: well inside what joins are believed to
+    assert (np.abs((predicted.end - motion[1:])[:, :12]) / VACUUM_SD[:12]).max() < 0.2
     assert np.abs(predicted.end[:, VELOCITY]).max() < 1e-4
 
 
@@ -258,7 +259,7 @@ def test_spans_of_a_true_flight_with_creep_join(creeping):
     problem = Problem(measured, VehicleParameters(flight.telemetry.required_vehicle(), ("creep",)), air)
     u = near(problem)
     u.motion[:, CREEP] = 0.01 * np.random.default_rng(4).standard_normal((len(u.motion), 2))
-    _, right = problem.normal_equations(u, problem.linearize(u))
+    right = problem.normal_equations(u, problem.linearize(u)).right
     for columns, size in (
         ([5, 6], 1e-4),
         (problem.first_motion + problem.motion * np.arange(measured.spans) + CREEP.start, 1e-7),
