@@ -373,6 +373,16 @@ def run(
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
+@click.option("--accept", is_flag=True, help="Write the proposed levels into flight.toml, the old ones beside them.")
+def noise(folder: Path, accept: bool) -> None:
+    """Propose noise levels of trackers, inertial sensors and motion for flight.toml, by the innovations' likelihood."""
+    from postflight import noise
+
+    noise.run(folder, accept)
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER)
 @click.option("--hardening", is_flag=True, help="Ask whether the spring hardens (or softens) with the angle.")
 @click.option("--freeplay", is_flag=True, help="Ask whether the joint has freeplay.")
 @click.option("--creep", is_flag=True, help="Ask whether part of the joint's compliance comes late.")

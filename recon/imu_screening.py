@@ -34,7 +34,7 @@ accepted they still add to the process noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -215,7 +215,7 @@ def _bridge_axes(
     """Samples (n, k) on the grid, densities (n, k) in sensor axes, gaps (n,), and the error of each long bridge."""
     step = np.diff(t)
     usual = usual_steps(step)
-    sample_var = max(spec.noise_sd**2 + spec.resolution**2 / 12.0, 1e-24)
+    sample_var = _sample_var(spec)
     density = sample_var * np.append(usual, usual[-1])[:, None] + _interpolation_density(x, usual)
     wide = np.zeros(len(t), dtype=bool)
     wide[:-1] = step > _GAP * usual
@@ -234,6 +234,20 @@ def _bridge_axes(
         errors[float(t[k]), float(t[k + 1])] = sizes
     held = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
     return column, density[held], wide[held], errors
+
+
+def _sample_var(spec: TriadSpec) -> float:
+    """White variance of a sample, with its quantisation."""
+    return max(spec.noise_sd**2 + spec.resolution**2 / 12.0, 1e-24)
+
+
+def with_noise(sensor: BridgedSensor, noise_sd: float) -> BridgedSensor:
+    """Sensor with the same samples and bridges, of another white noise."""
+    spec = replace(sensor.spec, noise_sd=noise_sd)
+    step = np.diff(sensor.time_s, append=2.0 * sensor.time_s[-1] - sensor.time_s[-2])
+    least = _sample_var(spec) * step
+    density = sensor.density + (least - _sample_var(sensor.spec) * step)[:, None]
+    return replace(sensor, spec=spec, density=np.maximum(density, least[:, None]))
 
 
 def _at_a_stop(x: FloatArray, good: BoolArray) -> IntArray:

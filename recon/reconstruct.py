@@ -371,10 +371,7 @@ def reconstruct_once(
     report = progress or (lambda _fraction, _what: None)
     report(0.0, "bridging gaps")
     sensors = bridge_inertial_sensors(telemetry, adaptation)
-    problem = build_problem(telemetry, settings, sensors, adaptation.rejected_points)
-    problem = fault_isolation.with_inflated_priors(problem, adaptation.inflated_sd)
-    if sensors is not None:
-        problem = time_bias.with_lag(problem, adaptation.lag, sensors.force.spec.name, sensors.rate.spec.name)
+    problem = _adapted_problem(telemetry, settings, sensors, adaptation)
     run, smoothed, reference, passes, spans = _iterate(problem, settings, report)
     screened = _screened(telemetry, problem, run, sensors, adaptation)
     known = adaptation.jumps or (), adaptation.rejected_offsets or ()
@@ -430,6 +427,52 @@ def reconstruct_once(
         },
         adaptation=adaptation,
     )
+
+
+def _adapted_problem(
+    telemetry: Telemetry, settings: Settings, sensors: InertialSensors | None, adaptation: Adaptation
+) -> Problem:
+    problem = build_problem(telemetry, settings, sensors, adaptation.rejected_points)
+    problem = fault_isolation.with_inflated_priors(problem, adaptation.inflated_sd)
+    if sensors is None:
+        return problem
+    return time_bias.with_lag(problem, adaptation.lag, sensors.force.spec.name, sensors.rate.spec.name)
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A flight's reconstructed states at all nodes, about which others of the same data and other noise are linearised.
+
+    Parameters
+    ----------
+    states : States
+    adaptation : Adaptation
+    unmodelled : tuple of UnmodelledAcceleration
+    sensors : InertialSensors or None
+    """
+
+    states: States
+    adaptation: Adaptation
+    unmodelled: tuple[UnmodelledAcceleration, ...]
+    sensors: InertialSensors | None
+
+    def problem_of(self, telemetry: Telemetry, settings: Settings) -> Problem:
+        """Problem of the same flight with other standard deviations; its data are screened as before."""
+        sensors = self.sensors
+        if sensors is not None and telemetry.accelerometer is not None and telemetry.rates is not None:
+            force = imu_screening.with_noise(sensors.force, telemetry.accelerometer.spec.noise_sd)
+            sensors = InertialSensors(force, imu_screening.with_noise(sensors.rate, telemetry.rates.spec.noise_sd))
+        problem = _adapted_problem(telemetry, settings, sensors, self.adaptation)
+        return with_unmodelled(problem, self.unmodelled)
+
+
+def linearised(telemetry: Telemetry, settings: Settings) -> Linearised:
+    """Reconstruct a flight as `reconstruct_once` does, for its states at all nodes."""
+    adaptation = reconstruct_once(telemetry, settings).adaptation
+    sensors = bridge_inertial_sensors(telemetry, adaptation)
+    problem = _adapted_problem(telemetry, settings, sensors, adaptation)
+    _, _, states, _, unmodelled = _iterate(problem, settings, lambda _fraction, _what: None)
+    return Linearised(states, adaptation, unmodelled, sensors)
 
 
 def _oscillation_checks(
