@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flightmodel import earth, rotations
-from flightmodel.atmosphere import GAMMA, R_AIR_JPKGK, AirState, AtmosphereProfile
+from flightmodel.atmosphere import AirState, AtmosphereProfile
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
 from flightmodel.trajectory import Trajectory
@@ -123,6 +123,7 @@ class _Flow:
     density_kgpm3: FloatArray
     point_ecef_mps: dict[str, FloatArray]
     body_mps: dict[str, FloatArray]
+    planet: earth.Planet
 
     @property
     def airspeed_mps(self) -> FloatArray:
@@ -130,7 +131,7 @@ class _Flow:
 
     @property
     def mach(self) -> FloatArray:
-        return self.airspeed_mps / np.sqrt(GAMMA * R_AIR_JPKGK * self.temperature_k)
+        return self.airspeed_mps / np.sqrt(self.planet.gamma * self.planet.gas_jpkgk * self.temperature_k)
 
     @property
     def dynamic_pressure_pa(self) -> FloatArray:
@@ -148,14 +149,14 @@ class _Flow:
 def _flow(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) -> _Flow:
     path = inputs.trajectory
     r, q = path.position_ecef_m, path.q_ecef_body
-    lat, lon, altitude = earth.geodetic_from_ecef(r)
+    lat, lon, altitude = earth.geodetic_from_ecef(r, path.planet)
     air = profile.at(altitude)
     dcm_ned_ecef, dcm_ecef_body = earth.dcm_ned_ecef(lat, lon), rotations.dcm_from_q(q)
-    spin = path.omega_body_eci_body_radps - dcm_ecef_body.transpose(0, 2, 1) @ earth.OMEGA_ECEF_RADPS
+    spin = path.omega_body_eci_body_radps - dcm_ecef_body.transpose(0, 2, 1) @ path.planet.rate_ecef_radps
     ground = path.velocity_ecef_mps + rotations.rotate(q, np.cross(spin, arm_body_m))
     wind_ned = air.wind_ned_mps + np.pad(inputs.wind_mps, ((0, 0), (0, 1)))
     point = {
-        "inertial": ground + np.cross(earth.OMEGA_ECEF_RADPS, r),
+        "inertial": ground + np.cross(path.planet.rate_ecef_radps, r),
         "ground": ground,
         "wind": ground - np.einsum("nji,nj->ni", dcm_ned_ecef, wind_ned),
     }
@@ -169,6 +170,7 @@ def _flow(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) ->
         temperature_k=air.temperature_k + inputs.temperature_k,
         density_kgpm3=air.density_kgpm3 * np.exp(inputs.log_density),
         point_ecef_mps=point,
+        planet=path.planet,
         body_mps={name: np.einsum("nji,nj->ni", dcm_ecef_body, v) for name, v in point.items()},
     )
 
@@ -279,7 +281,7 @@ def derived(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) 
     Speeds, path angles and headings are those of the trajectory's point, against the air those of the other point.
     """
     path, flow = inputs.trajectory, _flow(inputs, profile, arm_body_m)
-    carried = np.cross(earth.OMEGA_ECEF_RADPS, path.position_ecef_m)
+    carried = np.cross(path.planet.rate_ecef_radps, path.position_ecef_m)
     along = {
         "inertial": path.velocity_ecef_mps + carried,
         "ground": path.velocity_ecef_mps,
@@ -294,7 +296,7 @@ def derived(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) 
     out |= dict(zip(("roll", "pitch", "yaw"), euler_321(flow.dcm_ned_ecef @ flow.dcm_ecef_body), strict=True))
     out |= {"alpha": flow.alpha_rad, "beta": flow.beta_rad, "mach": flow.mach}
     out |= {"temperature": flow.temperature_k, "density": flow.density_kgpm3}
-    out["pressure"] = flow.density_kgpm3 * R_AIR_JPKGK * flow.temperature_k
+    out["pressure"] = flow.density_kgpm3 * path.planet.gas_jpkgk * flow.temperature_k
     out["dynamic_pressure"] = flow.dynamic_pressure_pa
     return out
 
@@ -304,8 +306,13 @@ def is_angle(name: str) -> bool:
     return name in ANGLES or name.startswith(("path_", "heading_", "clock_", "alpha_total_"))
 
 
-def temperature_sd(altitude_m: FloatArray) -> FloatArray:
-    """Usual error of datasonde and sphere temperatures, K: 1 at 30 km, 3 at 70 km, 5 from 80 km (1 sd)."""
+def temperature_sd(altitude_m: FloatArray, planet: earth.Planet = earth.WGS84) -> FloatArray:
+    """Usual error of datasonde and sphere temperatures, K: 1 at 30 km, 3 at 70 km, 5 from 80 km (1 sd).
+
+    Of Mars, what season, hour and dust do to the standard's: 15 to 50 km, 25 from 100 km (assumed).
+    """
+    if planet != earth.WGS84:
+        return np.asarray(np.interp(altitude_m, [50e3, 100e3], [15.0, 25.0]))
     return np.asarray(np.interp(altitude_m, [30e3, 70e3, 80e3], [1.0, 3.0, 5.0]))
 
 
@@ -318,7 +325,7 @@ def derived_with_sd(
     value = derived(nothing, profile, arm_body_m)
     air = profile.at(value["altitude"])
     root: FloatArray = np.asarray(np.linalg.cholesky(trajectory.covariance + 1e-18 * np.eye(9)), dtype=np.float64)
-    warm = temperature_sd(value["altitude"])
+    warm = temperature_sd(value["altitude"], trajectory.planet)
 
     def moved(k: int, sign: float) -> dict[str, FloatArray]:
         if k < 9:

@@ -5,9 +5,15 @@ log density and log pressure, and its temperature equations. A modelled profile 
 ratio to the standard, as a sounding is. Speed of sound uses gamma = 1.4 and the sea-level gas
 constant throughout, so above 86 km Mach number is a convention, as in the trajectory codes of the field.
 
+Of Mars the standard is the model of the northern summer after Viking: temperatures to 100 km, and pressure from them by
+hydrostatic equilibrium in the planet's own gravity. Above, its temperature is assumed to rise to 200 K at 150 km, as
+Viking's entries found it to between 120 and 200 km (140 to 220 K), and to stay there.
+
 References
 ----------
 NOAA/NASA/USAF, "U.S. Standard Atmosphere, 1976", NOAA-S/T 76-1562: tables I, VIII and section 1.2.
+A. Seiff, "Post-Viking models for the structure of the summer atmosphere of Mars", Adv. Space Res. 2 (1982) 3.
+A. Seiff, D. Kirk, "Structure of the atmosphere of Mars in summer at mid-latitudes", J. Geophys. Res. 82 (1977) 4364.
 Emmert et al., "NRLMSIS 2.1", J. Geophys. Res. Space Phys. 127, 2022 (the table in ``data/atmosphere``).
 """
 
@@ -23,12 +29,11 @@ import numpy as np
 
 from flightmodel.checks import ConfigError, FloatArray, GateError, check_finite, check_increasing
 from flightmodel.config import parse_utc
-from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.earth import MARS, STANDARD_GRAVITY_MPS2, WGS84, Planet
 from flightmodel.statistics import correlation, correlation_root
 from flightmodel.telemetry import Sounding
 
-GAMMA = 1.4
-R_AIR_JPKGK = 8314.32 / 28.9644
+GAMMA, R_AIR_JPKGK = WGS84.gamma, WGS84.gas_jpkgk
 EARTH_RADIUS_US76_M = 6356766.0
 # geopotential base m, base temperature K, lapse K/m
 _LAYERS = np.array(
@@ -77,7 +82,20 @@ DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0
 SOUNDING_CONSTANT_PART = 0.5
 TABLES = Path(__file__).parent / "data" / "atmosphere"
 TOP_M = 1.0e6
-BOTTOM_M = -5000.0
+BOTTOM_M, BOTTOM_MARS_M = -5000.0, -10000.0  # Hellas lies 8 km below Mars's ellipsoid
+# height km, temperature K; below the first and above the last as there
+_MARS_TEMPERATURE = np.array(
+    [
+        [0, 214.0], [2, 213.8], [4, 213.4], [6, 212.4], [8, 209.2], [10, 205.0], [14, 197.8], [18, 191.4], [22, 185.2],
+        [26, 180.0], [38, 164.8], [42, 160.0], [46, 156.0], [50, 152.2], [54, 148.7], [60, 144.2], [62, 143.0],
+        [68, 140.0], [72, 139.0], [100, 139.0], [150, 200.0],
+    ]
+)  # fmt: skip
+_MARS_PRESSURE_PA = 636.0  # at height 0; over a year and over the planet's weather it swings by 15 %
+# heights m, and sd of the density's natural logarithm there: season, tide and dust about a mean of one season; assumed
+_MARS_DENSITY_SD = np.array([[0.0, 40e3, 80e3, 130e3], [0.12, 0.2, 0.4, 0.7]])
+_MARS_WIND_SD_MPS = 25.0  # of each component; assumed
+_MARS_MEAN_RADIUS_M = 3389.5e3
 
 
 @dataclass(frozen=True)
@@ -115,6 +133,41 @@ def us76(altitude_m: FloatArray | float) -> tuple[FloatArray, FloatArray, FloatA
     pressure = np.where(above, np.exp(_LOG_PRESSURE(high)), p_low)
     density = np.where(above, np.exp(_LOG_DENSITY(high)), p_low / (R_AIR_JPKGK * t_low))
     return density, temperature, pressure
+
+
+def bottom_m(planet: Planet) -> float:
+    """Lowest height of a planet's standard atmosphere, m."""
+    return BOTTOM_M if planet == WGS84 else BOTTOM_MARS_M
+
+
+def standard_air(altitude_m: FloatArray | float, planet: Planet) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Density kg/m^3, temperature K, pressure Pa of a planet's standard atmosphere; `us76` of the Earth."""
+    if planet == WGS84:
+        return us76(altitude_m)
+    z = np.asarray(altitude_m, dtype=float)
+    if not ((z >= BOTTOM_MARS_M) & (z <= TOP_M)).all():
+        raise GateError(
+            f"Mars: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_MARS_M:.0f} to {TOP_M:.0f} m",
+            code="altitude-range",
+        )
+    temperature = np.interp(z, 1000.0 * _MARS_TEMPERATURE[:, 0], _MARS_TEMPERATURE[:, 1])
+    grid, log_pressure = _mars_log_pressure()
+    pressure = np.exp(np.interp(z, grid, log_pressure))
+    return pressure / (planet.gas_jpkgk * temperature), temperature, pressure
+
+
+@cache
+def _mars_log_pressure() -> tuple[FloatArray, FloatArray]:
+    """Heights, m, and log pressure there: ``d ln p / dz = -g / (R T)``, by Simpson's rule over 100 m."""
+    z = np.arange(BOTTOM_MARS_M, TOP_M + 1.0, 100.0)
+
+    def slope(at: FloatArray) -> FloatArray:
+        temperature = np.interp(at, 1000.0 * _MARS_TEMPERATURE[:, 0], _MARS_TEMPERATURE[:, 1])
+        return -MARS.gm_m3ps2 / (_MARS_MEAN_RADIUS_M + at) ** 2 / (MARS.gas_jpkgk * temperature)
+
+    part = 100.0 / 6.0 * (slope(z[:-1]) + 4.0 * slope(z[:-1] + 50.0) + slope(z[1:]))
+    total = np.concatenate([np.zeros(1), np.cumsum(part)])
+    return z, total - np.interp(0.0, z, total) + np.log(_MARS_PRESSURE_PA)
 
 
 def _below_86_km(h: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -207,7 +260,7 @@ def unresolved_variance(spacing_m: FloatArray | float, length_m: float) -> Float
 
 @dataclass(frozen=True)
 class AtmosphereProfile:
-    """Air over altitude: log density relative to US76, temperature, winds, each linear between knots.
+    """Air over altitude: log density relative to the standard (US76), temperature, winds, each linear between knots.
 
     Between the knots the US76 carries the exponential; outside them the ratio to US76 and the winds fade with
     ``fade_m``, and the standard deviations grow to 15 % and 20 m/s.
@@ -220,6 +273,7 @@ class AtmosphereProfile:
     density_sd: FloatArray
     wind_sd_mps: FloatArray
     fade_m: float = 10000.0
+    planet: Planet = WGS84
 
     def __post_init__(self) -> None:
         """Check once."""
@@ -230,9 +284,9 @@ class AtmosphereProfile:
     def at(
         self, altitude_m: FloatArray | float, standard: tuple[FloatArray, FloatArray, FloatArray] | None = None
     ) -> AirState:
-        """Air at geometric altitudes, m; ``standard`` is `us76` there, where it is known already."""
+        """Air at geometric altitudes, m; ``standard`` is `standard_air` there, where it is known already."""
         z = np.asarray(altitude_m, dtype=float)
-        density, temperature, pressure = us76(z) if standard is None else standard
+        density, temperature, pressure = standard_air(z, self.planet) if standard is None else standard
         beyond = np.maximum(z - self.altitude_m[-1], 0.0) + np.maximum(self.altitude_m[0] - z, 0.0)
         fade = np.exp(-beyond / self.fade_m)
 
@@ -246,7 +300,7 @@ class AtmosphereProfile:
             density_kgpm3=density * ratio,
             temperature_k=warmer,
             pressure_pa=pressure * ratio * warmer / temperature,
-            sound_speed_mps=np.sqrt(GAMMA * R_AIR_JPKGK * warmer),
+            sound_speed_mps=np.sqrt(self.planet.gamma * self.planet.gas_jpkgk * warmer),
             wind_ned_mps=wind,
             density_sd=column(self.density_sd) * fade + 0.15 * (1.0 - fade),
             wind_sd_mps=column(self.wind_sd_mps) * fade + 20.0 * (1.0 - fade),
@@ -254,8 +308,8 @@ class AtmosphereProfile:
 
 
 def profile_from_sounding(sounding: Sounding) -> AtmosphereProfile:
-    """Blend the day's sounding into US76."""
-    density, temperature, _ = us76(sounding.altitude_m)
+    """Blend the day's sounding into the planet's standard atmosphere."""
+    density, temperature, _ = standard_air(sounding.altitude_m, sounding.planet)
     return AtmosphereProfile(
         altitude_m=sounding.altitude_m,
         log_density_ratio=np.log(sounding.density_kgpm3 / density),
@@ -265,6 +319,7 @@ def profile_from_sounding(sounding: Sounding) -> AtmosphereProfile:
         ),
         density_sd=sounding.density_sd,
         wind_sd_mps=sounding.wind_sd_mps,
+        planet=sounding.planet,
     )
 
 
@@ -284,12 +339,17 @@ def standard_atmosphere() -> AtmosphereProfile:
     return AtmosphereProfile(z, np.zeros(len(z)), np.zeros(len(z)), np.zeros((len(z), 3)), density_sd, wind_sd)
 
 
-def standard_sounding() -> Sounding:
+def standard_sounding(planet: Planet = WGS84) -> Sounding:
     """US76 without winds in the form of a sounding, 0 to 120 km, for a flight of which no sounding was made.
 
     Density is uncertain by 10 % and each component of the wind by 15 m/s: the day's departure from the standard in
-    middle latitudes and the usual winds of the stratosphere, not an instrument's error.
+    middle latitudes and the usual winds of the stratosphere, not an instrument's error. Of Mars, 0 to 250 km, by what
+    stands beside its temperatures above.
     """
+    if planet != WGS84:
+        z = np.arange(BOTTOM_MARS_M, 250001.0, 1000.0)
+        still, wind_sd = np.zeros(len(z)), np.full(len(z), _MARS_WIND_SD_MPS)
+        return Sounding(z, *standard_air(z, planet), still, still, np.interp(z, *_MARS_DENSITY_SD), wind_sd, planet)
     z = np.arange(0.0, 120001.0, 1000.0)
     density, temperature, pressure = us76(z)
     still = np.zeros(len(z))

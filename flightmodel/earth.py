@@ -1,4 +1,4 @@
-"""Where are things on a rotating WGS-84 Earth, how does it attract them, and which way does a body point there?
+"""Where are things on a rotating planet, how does it attract them, and which way does a body point there?
 
 Gravitation is the gradient of ``U = GM/r (1 - J2 (a/r)^2 (3 sin^2 phi' - 1)/2)`` (phi' geocentric latitude). ECI
 equals ECEF at the epoch (time zero) and is fixed after it.
@@ -7,9 +7,18 @@ An attitude from azimuth, elevation and roll is ``q_ecef_body = q_ecef_ned * q_n
 by azimuth about down, by elevation about the body's y, by roll about its x. At roll 0 the body's y axis is horizontal,
 to the right of one who looks along x; of a rocket that stands upright with azimuth 0 it points east and z points north.
 
+Functions take the planet last, WGS-84 unless another is given; ECEF stands for the axes fixed to it. The axes of
+inertial space at Mars (`planet_from_j2000`) follow from the pole and prime meridian of the IAU.
+
 References
 ----------
 NIMA TR8350.2 (WGS-84), 3rd ed. Conversions: ERFA.
+B. Archinal et al., "Report of the IAU Working Group on Cartographic Coordinates and Rotational Elements: 2009",
+Celest. Mech. Dyn. Astron. 109 (2011) 101: ellipsoid, pole, prime meridian of Mars.
+A. Genova et al., "Seasonal and static gravity field of Mars from MGS, Mars Odyssey and MRO radio science", Icarus 272
+(2016) 228 (GMM-3): GM, and J2 from C20 = -8.750211e-4 (normalised, for 3396.0 km).
+A. Seiff, "Post-Viking models for the structure of the summer atmosphere of Mars", Adv. Space Res. 2 (1982) 3:
+molecular weight 43.49. Ratio of specific heats: carbon dioxide at 220 K, JANAF tables; 1.38 at 140 K.
 """
 
 from __future__ import annotations
@@ -20,7 +29,8 @@ import erfa
 import numpy as np
 
 from flightmodel import rotations
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.config import parse_utc
 
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1.0 / 298.257223563
@@ -29,54 +39,123 @@ J2 = 1.082629821313e-3
 OMEGA_RADPS = 7.292115e-5
 OMEGA_ECEF_RADPS = np.array([0.0, 0.0, OMEGA_RADPS])
 STANDARD_GRAVITY_MPS2 = 9.80665
-_WGS84 = 1  # ERFA's number of the ellipsoid
 
 
 class Planet(NamedTuple):
-    """What pulls and turns below a simulated flight; everything that reads flights assumes `WGS84`."""
+    """What pulls and turns below a flight, and the gas around it; numbers alone, so that kernels take it as it is."""
 
     gm_m3ps2: float
     j2: float
     semi_major_m: float
     flattening: float
     rate_radps: float
+    gamma: float
+    gas_jpkgk: float
+
+    @property
+    def rate_ecef_radps(self) -> FloatArray:
+        """Rate of rotation (3,) in its own axes."""
+        return np.array([0.0, 0.0, self.rate_radps])
 
 
-WGS84 = Planet(GM_M3PS2, J2, SEMI_MAJOR_M, FLATTENING, OMEGA_RADPS)
+WGS84 = Planet(GM_M3PS2, J2, SEMI_MAJOR_M, FLATTENING, OMEGA_RADPS, 1.4, 8314.32 / 28.9644)
+MARS = Planet(
+    gm_m3ps2=4.2828375e13,
+    j2=8.750211e-4 * 5.0**0.5 * (3396.0 / 3396.19) ** 2,  # of the ellipsoid's radius instead of the field's
+    semi_major_m=3396190.0,
+    flattening=(3396.19 - 3376.20) / 3396.19,
+    rate_radps=float(np.deg2rad(350.89198226)) / 86400.0,
+    gamma=1.33,
+    gas_jpkgk=8314.32 / 43.49,
+)
+PLANETS = {"earth": WGS84, "mars": MARS}
 
 
-def potential(position_m: FloatArray) -> FloatArray:
+def name_of(planet: Planet) -> str:
+    """Name of a planet as flight.toml has it."""
+    return next(name for name, known in PLANETS.items() if known == planet)
+
+
+def require_earth(planet_name: str, what: str) -> None:
+    """Raise `GateError` (``planet-unsupported``) where something that assumes the Earth is asked of another planet."""
+    if planet_name != "earth":
+        words = f'{what} assumes the Earth; of a flight with planet = "{planet_name}" take the run\'s own tables'
+        raise GateError(words, "planet-unsupported")
+
+
+def planet_from_j2000(t0_utc: str, time_s: FloatArray | float, planet: Planet) -> FloatArray:
+    """Matrices ``(..., 3, 3)`` from axes of J2000 (ICRF) to those fixed to Mars, ``time_s`` after t0.
+
+    Pole and prime meridian are linear in time (IAU 2009); what newer series add is below 100 m at the surface.
+    """
+    if planet != MARS:
+        raise GateError(
+            'axes = "j2000" is known at Mars alone: the Earth\'s turn needs its orientation parameters; give '
+            'axes = "fixed" or "inertial"',
+            "axes-unknown",
+        )
+    utc = parse_utc(t0_utc)
+    jd = erfa.dtf2d("UTC", utc.year, utc.month, utc.day, utc.hour, utc.minute, utc.second + 1e-6 * utc.microsecond)
+    tt = erfa.taitt(*erfa.utctai(*jd))  # TT stands for TDB: 2 ms
+    days = (tt[0] - 2451545.0) + tt[1] + np.asarray(time_s, dtype=float) / 86400.0
+    century = days / 36525.0
+    right_ascension = np.deg2rad(317.68143 - 0.1061 * century)
+    declination = np.deg2rad(52.88650 - 0.0609 * century)
+    meridian = np.deg2rad(np.mod(176.630 + 350.89198226 * days, 360.0))
+    equator = _turn_x(0.5 * np.pi - declination) @ _turn_z(0.5 * np.pi + right_ascension)
+    return np.asarray(_turn_z(meridian) @ equator)
+
+
+def _turn_z(angle: FloatArray) -> FloatArray:
+    """Matrices (..., 3, 3) to axes turned about z."""
+    c, s, one, no = np.cos(angle), np.sin(angle), np.ones_like(angle), np.zeros_like(angle)
+    return np.stack([np.stack(row, -1) for row in ((c, s, no), (-s, c, no), (no, no, one))], -2)
+
+
+def _turn_x(angle: FloatArray) -> FloatArray:
+    """Matrices (..., 3, 3) to axes turned about x."""
+    c, s, one, no = np.cos(angle), np.sin(angle), np.ones_like(angle), np.zeros_like(angle)
+    return np.stack([np.stack(row, -1) for row in ((one, no, no), (no, c, s), (no, -s, c))], -2)
+
+
+def potential(position_m: FloatArray, planet: Planet = WGS84) -> FloatArray:
     """Gravitational potential with J2 at ECEF (or ECI) positions ``(..., 3)``, m^2/s^2, positive."""
     r = np.linalg.norm(position_m, axis=-1)
     sin2 = (position_m[..., 2] / r) ** 2
-    return GM_M3PS2 / r * (1.0 - J2 * (SEMI_MAJOR_M / r) ** 2 * 0.5 * (3.0 * sin2 - 1.0))
+    reach = planet.semi_major_m / r
+    return planet.gm_m3ps2 / r * (1.0 - planet.j2 * reach**2 * 0.5 * (3.0 * sin2 - 1.0))
 
 
-def gravitation(position_m: FloatArray) -> FloatArray:
+def gravitation(position_m: FloatArray, planet: Planet = WGS84) -> FloatArray:
     """Gravitational acceleration with J2 at positions ``(..., 3)`` in ECEF (or ECI) axes, m/s^2, no rotation term."""
     p = np.asarray(position_m, dtype=float)
     r2 = np.sum(p * p, axis=-1, keepdims=True)
-    k = 1.5 * J2 * SEMI_MAJOR_M**2 / r2
+    k = 1.5 * planet.j2 * planet.semi_major_m**2 / r2
     s = 5.0 * p[..., 2:] ** 2 / r2
     bracket = np.concatenate([1.0 + k * (1.0 - s)] * 2 + [1.0 + k * (3.0 - s)], axis=-1)
-    return -GM_M3PS2 / r2**1.5 * bracket * p
+    return -planet.gm_m3ps2 / r2**1.5 * bracket * p
 
 
-def geodetic_from_ecef(position_ecef_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def geodetic_from_ecef(
+    position_ecef_m: FloatArray, planet: Planet = WGS84
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Geodetic latitude, longitude (rad) and height (m) of ECEF positions ``(..., 3)``."""
     p = np.asarray(position_ecef_m, dtype=float)
     with np.errstate(invalid="ignore"):
-        lon, lat, height = erfa.gc2gd(_WGS84, p)
+        lon, lat, height = erfa.gc2gde(planet.semi_major_m, planet.flattening, p)
     known = np.isfinite(height)  # else it is taken for a place on the axis
     return np.where(known, lat, np.nan), np.where(known, lon, np.nan), np.asarray(height)
 
 
 def ecef_from_geodetic(
-    latitude_rad: FloatArray | float, longitude_rad: FloatArray | float, height_m: FloatArray | float
+    latitude_rad: FloatArray | float,
+    longitude_rad: FloatArray | float,
+    height_m: FloatArray | float,
+    planet: Planet = WGS84,
 ) -> FloatArray:
     """ECEF positions ``(..., 3)``, m, of geodetic latitude, longitude and height."""
     with np.errstate(invalid="ignore", over="ignore"):  # no place where a number is missing
-        return np.asarray(erfa.gd2gc(_WGS84, longitude_rad, latitude_rad, height_m))
+        return np.asarray(erfa.gd2gce(planet.semi_major_m, planet.flattening, longitude_rad, latitude_rad, height_m))
 
 
 def dcm_ned_ecef(latitude_rad: FloatArray | float, longitude_rad: FloatArray | float) -> FloatArray:
@@ -90,30 +169,30 @@ def dcm_ned_ecef(latitude_rad: FloatArray | float, longitude_rad: FloatArray | f
     return np.stack([north, east, down], axis=-2)
 
 
-def ned_from_ecef(vector_ecef: FloatArray, position_ecef_m: FloatArray) -> FloatArray:
+def ned_from_ecef(vector_ecef: FloatArray, position_ecef_m: FloatArray, planet: Planet = WGS84) -> FloatArray:
     """North, east, down components of ECEF vectors ``(..., 3)`` at the given positions."""
-    lat, lon, _ = geodetic_from_ecef(position_ecef_m)
+    lat, lon, _ = geodetic_from_ecef(position_ecef_m, planet)
     return np.einsum("...ij,...j->...i", dcm_ned_ecef(lat, lon), vector_ecef)
 
 
-def ecef_from_ned(vector_ned: FloatArray, position_ecef_m: FloatArray) -> FloatArray:
+def ecef_from_ned(vector_ned: FloatArray, position_ecef_m: FloatArray, planet: Planet = WGS84) -> FloatArray:
     """ECEF components of north, east, down vectors ``(..., 3)`` at the given positions."""
-    lat, lon, _ = geodetic_from_ecef(position_ecef_m)
+    lat, lon, _ = geodetic_from_ecef(position_ecef_m, planet)
     return np.einsum("...ji,...j->...i", dcm_ned_ecef(lat, lon), vector_ned)
 
 
-def q_ecef_eci(time_s: FloatArray | float) -> FloatArray:
+def q_ecef_eci(time_s: FloatArray | float, planet: Planet = WGS84) -> FloatArray:
     """Quaternions ``(..., 4)`` from ECI to ECEF components, ``time_s`` after the epoch."""
-    half = -0.5 * OMEGA_RADPS * np.asarray(time_s, dtype=float)
+    half = -0.5 * planet.rate_radps * np.asarray(time_s, dtype=float)
     zero = np.zeros_like(half)
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
 
 
 def radar_from_ecef(
-    position_ecef_m: FloatArray, latitude_rad: float, longitude_rad: float, height_m: float
+    position_ecef_m: FloatArray, latitude_rad: float, longitude_rad: float, height_m: float, planet: Planet = WGS84
 ) -> FloatArray:
     """Slant range m, azimuth from true north rad in [0, 2 pi), elevation rad, ``(..., 3)``, seen from a site."""
-    site = ecef_from_geodetic(latitude_rad, longitude_rad, height_m)
+    site = ecef_from_geodetic(latitude_rad, longitude_rad, height_m, planet)
     north, east, down = np.moveaxis((position_ecef_m - site) @ dcm_ned_ecef(latitude_rad, longitude_rad).T, -1, 0)
     return np.stack(
         [
@@ -125,11 +204,13 @@ def radar_from_ecef(
     )
 
 
-def ecef_from_radar(range_az_el: FloatArray, latitude_rad: float, longitude_rad: float, height_m: float) -> FloatArray:
+def ecef_from_radar(
+    range_az_el: FloatArray, latitude_rad: float, longitude_rad: float, height_m: float, planet: Planet = WGS84
+) -> FloatArray:
     """ECEF positions ``(..., 3)``, m, from slant range m, azimuth and elevation rad: inverse of `radar_from_ecef`."""
     slant, az, el = np.moveaxis(np.asarray(range_az_el, dtype=float), -1, 0)
     ned = np.stack([slant * np.cos(el) * np.cos(az), slant * np.cos(el) * np.sin(az), -slant * np.sin(el)], axis=-1)
-    site = ecef_from_geodetic(latitude_rad, longitude_rad, height_m)
+    site = ecef_from_geodetic(latitude_rad, longitude_rad, height_m, planet)
     return site + ned @ dcm_ned_ecef(latitude_rad, longitude_rad)
 
 

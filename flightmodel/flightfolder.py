@@ -36,7 +36,15 @@ from flightmodel.config import (
     read_toml,
 )
 from flightmodel.csv_reading import file_sha256
-from flightmodel.earth import OMEGA_RADPS, ecef_from_radar, geodetic_from_ecef, q_ecef_body_from_pointing
+from flightmodel.earth import (
+    PLANETS,
+    WGS84,
+    Planet,
+    ecef_from_radar,
+    geodetic_from_ecef,
+    q_ecef_body_from_pointing,
+)
+from flightmodel.entry_state import DragEntry, StateEntry, read_drag
 from flightmodel.film import Frames
 from flightmodel.gate import Gate
 from flightmodel.guarded_files import open_file
@@ -75,6 +83,8 @@ from flightmodel.telemetry import (
     RadarRecord,
     Sounding,
     Start,
+    StatedDrag,
+    StatePrior,
     SunRecord,
     Telemetry,
     TriadRecord,
@@ -84,6 +94,7 @@ from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
 LEAST_SPAN_S = 1.0
 _SD = re.compile(r"(^|_)sd(_|$)")  # in a key: a standard deviation
+_TRIM_TIME_CONSTANT_S = 100.0  # of a trimmed entry's drag and lift: about its length
 _BIAS_TIMES = 6.0  # no bias of a sound gyro is so large, one in a thousand million
 _TAKEN = {SitesSpec.name: "all radar sites together", "rest": "the rest on the pad"}  # names of sources in results
 Record = TypeVar("Record")
@@ -139,6 +150,7 @@ class StartEntry(Section):
     sd_mps: Annotated[float, Field(ge=1e-6, le=10.0)] = 0.01
     azimuth_deg: Angle | None = None
     azimuth_sd_deg: Annotated[float, Field(ge=1e-3, le=180.0)] = 2.0
+    state: StateEntry | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> StartEntry:
@@ -146,6 +158,8 @@ class StartEntry(Section):
             raise KeyFaults([("at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s")])
         if self.at_rest is None and self.azimuth_deg is not None:
             raise KeyFaults([("azimuth_deg", self.azimuth_deg, "counts where at_rest = [from, to] is stated too")])
+        if self.at_rest is not None and self.state is not None:
+            raise KeyFaults([("state", "...", "a start at rest has its own state; keep at_rest or state")])
         return self
 
 
@@ -186,18 +200,12 @@ class MotionEntry(Section):
     drag_sd: Annotated[float, Field(ge=1e-9, le=20.0)] = 1.0
     drag_time_constant_s: Duration = 10.0
     side_sd: Annotated[float, Field(ge=0.0, le=10.0)] = 0.1
+    side_time_constant_s: Duration = 10.0
+    trim_sd_deg: Annotated[float, Field(gt=0.0, le=20.0)] = 3.0
     acceleration_density: Annotated[float, Field(ge=0.0, le=100.0)] = 0.002
     powered_s: Spans | None = None
     powered_sd_mps2: Annotated[float, Field(ge=1e-9, le=1e4)] = 50.0
     disturbed: list[UnmodelledEntry] = []
-
-    @model_validator(mode="after")
-    def _drag_known(self) -> MotionEntry:
-        if self.model == "ballistic" and self.drag_area_per_mass_m2pkg is None:
-            raise KeyFaults(
-                [("model", self.model, "needs drag_area_per_mass_m2pkg, C_D S / m to a factor of exp(drag_sd)")]
-            )
-        return self
 
 
 class EventEntry(Section):
@@ -227,7 +235,9 @@ class FlightFile(Section):
 
     name: Label
     t0_utc: str
+    planet: Literal["earth", "mars"] = "earth"
     vehicle: str | None = None
+    drag: DragEntry | None = None
     synthetic: bool = False
     description: str = ""
     attitude_prior: AttitudeEntry | None = None
@@ -252,6 +262,17 @@ class FlightFile(Section):
         return value
 
     @property
+    def body(self) -> Planet:
+        """Where the flight was."""
+        return PLANETS[self.planet]
+
+    @property
+    def measures_deceleration(self) -> bool:
+        """Whether the accelerometer measures ballistic flight's deceleration; else gyros go with it, or it is idle."""
+        alone = self.sensors.rates is None or "trim_sd_deg" in self.motion.model_fields_set
+        return self.motion.model == "ballistic" and self.sensors.accelerometer is not None and alone
+
+    @property
     def films(self) -> dict[str, FramesEntry]:
         """Every camera's film, by its table: ``frames``, or ``cameras.NAME``."""
         alone = {} if self.frames is None else {"frames": self.frames}
@@ -267,7 +288,8 @@ class FlightFile(Section):
     def sources(self) -> list[Source]:
         """Every table that is named."""
         onboard = (self.sensors.accelerometer, self.sensors.rates, self.sensors.magnetometer, self.sensors.sun)
-        single = [s for s in (*onboard, self.atmosphere) if s is not None]
+        drag = None if self.drag is None else self.drag.table
+        single = [s for s in (*onboard, self.atmosphere, drag) if s is not None]
         return [*single, *self.films.values(), *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
     def misfits(self, needs_path: bool = True) -> list[Fault]:
@@ -275,7 +297,10 @@ class FlightFile(Section):
 
         Without ``needs_path`` a folder with a film and neither radar nor receiver is whole.
         """
-        out: list[Fault] = []
+        out = self._misfits_of_planet()
+        if self.drag is not None and self.vehicle is not None:
+            words = "[drag] beside vehicle: the vehicle file states C_A, area and mass; take one of the two out"
+            out.append(Fault(words, "drag-twice"))
         if needs_path or self.radars or self.gnss or not self.films:
             out += self._misfits_of_path()
         if self.films and self.vehicle is None:
@@ -294,17 +319,62 @@ class FlightFile(Section):
             out.append(Fault(words, "name-twice"))
         return out
 
+    def _misfits_of_planet(self) -> list[Fault]:
+        """Return what is known of the Earth alone."""
+        out: list[Fault] = []
+        if self.body == WGS84:
+            return out
+        where = f'planet = "{self.planet}"'
+        if self.sensors.magnetometer is not None:
+            out.append(Fault(f"[sensors.magnetometer]: {where} has no field model; take it out", "field-unknown"))
+        if self.sensors.sun is not None:
+            words = "the Sun's direction is known from the Earth alone; take it out and state [attitude_prior]"
+            out.append(Fault(f"[sensors.sun]: {where}: {words}", "sun-unknown"))
+        for table, entries in (("gnss", self.gnss), ("barometers", self.barometers)):
+            for name, entry in entries.items():
+                if entry.height_is == "msl" and entry.geoid_undulation_m is None:
+                    words = 'state geoid_undulation_m, or heights above the ellipsoid (height_is = "ellipsoid")'
+                    out.append(Fault(f"{table}.{name}: {where} has no geoid here; {words}", "geoid-unknown"))
+        if self.start.at_rest is not None:
+            words = "a rest is levelled by the Earth's gravity and turn; state [start.state]"
+            out.append(Fault(f"start.at_rest: {where}: {words}", "rest-unknown"))
+        return out
+
+    def _misfits_of_drag(self) -> list[Fault]:
+        """Return what ballistic flight and an accelerometer without gyros lack."""
+        out = []
+        if self.motion.model == "ballistic" and self.motion.drag_area_per_mass_m2pkg is None and self.drag is None:
+            words = "needs drag_area_per_mass_m2pkg, C_D S / m to a factor of exp(drag_sd), or [drag]"
+            out.append(Fault(f"key 'motion.model' = 'ballistic': {words}", "keys-conflict"))
+        entry = self.sensors.accelerometer
+        if entry is not None and self.measures_deceleration and entry.mount in (None, "body"):
+            axial = entry.dcm_body_sensor[0]
+            unread = [a for a, part in zip(("ax", "ay", "az"), axial, strict=True) if part and a not in entry.measures]
+            if unread:
+                words = (
+                    f"its {unread[0]} lies along body x, where the deceleration is; add it to measures, or state axes"
+                )
+                out.append(Fault(f"sensors.accelerometer: {words}", "axial-missing"))
+        elif entry is not None and len(set(entry.measures)) < 3 and self.motion.model == "strapdown":
+            words = 'measures: three axes carry a state; with fewer write model = "ballistic" in [motion]'
+            out.append(Fault(f"sensors.accelerometer.{words}", "inertial-missing"))
+        return out
+
     def _misfits_of_path(self) -> list[Fault]:
         """Return what keeps a path from being found."""
-        out = []
+        out = self._misfits_of_drag()
         triads = [name for name in ("accelerometer", "rates") if getattr(self.sensors, name) is not None]
-        if not self.radars and not self.gnss:
+        if not self.radars and not self.gnss and self.start.state is None:
             also = "; a barometer alone gives no place" if self.barometers else ""
-            words = f"no [radars.NAME] and no [gnss.NAME]: a trajectory needs at least one of them{also}"
+            words = (
+                f"no [radars.NAME] and no [gnss.NAME]: a trajectory needs at least one of them, or [start.state]{also}"
+            )
             out.append(Fault(words, "tracker-missing"))
-        if len(triads) == 1:
+        if len(triads) == 1 and not self.measures_deceleration:
             other = "rates" if triads == ["accelerometer"] else "accelerometer"
             words = f"[sensors.{triads[0]}] without [sensors.{other}]: only both together carry a state; add the other"
+            if triads == ["accelerometer"]:
+                words += ', or write model = "ballistic" in [motion], where an accelerometer measures the drag'
             out.append(Fault(words, "inertial-missing"))
         if self.motion.model == "strapdown" and not triads:
             words = (
@@ -345,6 +415,8 @@ class Sources:
     sounding: Sounding | None
     films: dict[str, Frames]
     attitude_prior: AttitudePrior | None
+    drag: StatedDrag | None = None
+    state: StatePrior | None = None
 
 
 def read_sources(folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True) -> Sources:
@@ -376,22 +448,27 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     }
     sun = read_sun(gate, spec.sensors.sun) if spec.sensors.sun else None
     radars = _there({name: read_radar(gate, name, entry) for name, entry in spec.radars.items()})
-    gnss = _there({name: read_gnss(gate, name, entry) for name, entry in spec.gnss.items()})
+    gnss = _there({name: read_gnss(gate, name, entry, spec.t0_utc, spec.body) for name, entry in spec.gnss.items()})
     sounding = _sounding(gate, spec)
-    if spec.motion.model == "ballistic" and triads.get("accelerometer") and triads.get("rates"):
+    drag = read_drag(gate, spec.drag) if spec.drag is not None else None
+    state = _state(gate, spec)
+    idle = spec.motion.model == "ballistic" and not spec.measures_deceleration
+    if idle and triads.get("accelerometer") and triads.get("rates"):
         words = (
             'accelerometer and rates are there, but with model = "ballistic" gravitation and drag carry the flight: '
             "they are not used for its path and attitude; take [motion] out unless that is meant"
         )
         gate.findings.append(Finding("motion", words, np.nan, np.nan, code="inertial-unused"))
     measured = spec.atmosphere is not None
-    place = _first_place(radars, gnss)
+    place = _first_place(radars, gnss, spec.body, state)
     barometers = {
         name: read_barometer(gate, name, entry, sounding, measured, place) for name, entry in spec.barometers.items()
     }
     films = _films(gate, spec, vehicle)
-    prior = _attitude_prior(gate, spec.attitude_prior, radars, gnss) if spec.attitude_prior else None
-    return Sources(gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, films, prior)
+    prior = _attitude_prior(gate, spec.attitude_prior, place) if spec.attitude_prior else None
+    return Sources(
+        gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, films, prior, drag, state
+    )
 
 
 def read_flight(folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True) -> Telemetry:
@@ -434,21 +511,24 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         findings=tuple(gate.findings),
         hashes=_hashes(gate, spec, found.vehicle, found.films),
         assumed=assumed_errors(spec, found.radars),
+        drag=found.drag,
+        planet=spec.body,
         gnss=found.gnss,
         barometers=found.barometers,
-        motion=_motion(spec.motion),
+        motion=_motion(spec, found.drag),
         reconstruction=dict(spec.reconstruction),
         sites=SitesSpec(**SITES.from_file(spec.sites)),
         places=_places(spec),
-        start=_start(spec.start),
+        start=replace(_start(spec.start), state=found.state),
     )
-    if not found.radars and not found.gnss:
+    if not found.radars and not found.gnss and found.state is None:
         return telemetry
     telemetry = replace(telemetry, findings=(*telemetry.findings, *_rest_findings(telemetry)))
     start, stop = telemetry.span_s()
     if stop - start < LEAST_SPAN_S:
         who = "accelerometer, rates and" if telemetry.accelerometer is not None else "the flight's"
-        trackers = " and ".join(kind for kind, some in (("radars", found.radars), ("receivers", found.gnss)) if some)
+        kinds = (("radars", found.radars), ("receivers", found.gnss), ("start", found.state))
+        trackers = " and ".join(kind for kind, some in kinds if some)
         raise GateError(
             f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)", code="no-common-time"
         )
@@ -503,7 +583,11 @@ def _films(gate: Gate, spec: FlightFile, vehicle: Vehicle | None) -> dict[str, F
 def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
     """Read the day's air; the standard's, with a finding, where flight.toml names no table."""
     if spec.atmosphere is not None:
-        return read_sounding(gate, spec.atmosphere)
+        return read_sounding(gate, spec.atmosphere, spec.body)
+    if spec.body != WGS84:
+        words = f"no [atmosphere]: the standard atmosphere of {spec.planet.capitalize()} without wind stands for it"
+        gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
+        return standard_sounding(spec.body)
     words = (
         "no [atmosphere]: the US Standard Atmosphere 1976 without wind stands for it, density to 10 %, wind to 15 m/s"
     )
@@ -511,9 +595,7 @@ def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
     return standard_sounding()
 
 
-def _attitude_prior(
-    gate: Gate, entry: AttitudeEntry, radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]
-) -> AttitudePrior | None:
+def _attitude_prior(gate: Gate, entry: AttitudeEntry, place: tuple[float, float] | None) -> AttitudePrior | None:
     """Attitude to start from; None, with a fault kept, where no place is known for it."""
     sd = np.deg2rad(entry.sd_deg)
     if entry.q_ecef_body is not None:
@@ -526,7 +608,6 @@ def _attitude_prior(
     if entry.latitude_deg is not None and entry.longitude_deg is not None:
         latitude, longitude = np.deg2rad([entry.latitude_deg, entry.longitude_deg])
     else:
-        place = _first_place(radars, gnss)
         if place is None:  # its table was refused
             return None
         latitude, longitude = place
@@ -536,6 +617,18 @@ def _attitude_prior(
     azimuth, elevation, roll = np.deg2rad([entry.azimuth_deg, entry.elevation_deg, entry.roll_deg])
     q = q_ecef_body_from_pointing(azimuth, elevation, roll, float(latitude), float(longitude))
     return AttitudePrior(entry.t_s, q, sd)
+
+
+def _state(gate: Gate, spec: FlightFile) -> StatePrior | None:
+    """State that the flight starts from; None, with a fault kept, where its axes are not known."""
+    if spec.start.state is None:
+        return None
+    try:
+        return spec.start.state.prior(spec.t0_utc, spec.body)
+    except GateError as fault:
+        for each in fault.faults:
+            gate.refuse_config(Fault(f"start.state: {each}", each.code))
+        return None
 
 
 def _start(entry: StartEntry) -> Start:
@@ -559,7 +652,7 @@ def _rest_findings(telemetry: Telemetry) -> list[Finding]:
     )
     out = [Finding("start", words, *span, code="rest-found")]
     rates = telemetry.rates
-    turning = float(np.abs(readings(rates, span).mean).max()) - OMEGA_RADPS  # the Earth's own
+    turning = float(np.abs(readings(rates, span).mean).max()) - telemetry.planet.rate_radps
     times = turning / max(rates.spec.bias_sd, 1e-12)
     if times > _BIAS_TIMES:
         words = f"at rest it reads {times:.0f} times bias_sd_degps: no track can be followed; state it wider"
@@ -581,28 +674,44 @@ def _places(spec: FlightFile) -> tuple[KnownPlace, ...]:
     return tuple(out)
 
 
-def _first_place(radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]) -> tuple[float, float] | None:
-    """Latitude and longitude, rad, of the first receiver's first fix, or of the first radar's first point."""
-    points: list[FloatArray] = [r.position_ecef_m for r in gnss.values()]
+def _first_place(
+    radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord], planet: Planet, state: StatePrior | None
+) -> tuple[float, float] | None:
+    """Latitude and longitude, rad, of a stated start, the first receiver's first fix or first radar's first point."""
+    points: list[FloatArray] = [] if state is None else [state.position_ecef_m[None]]
+    points += [r.position_ecef_m for r in gnss.values()]
     for radar in radars.values():
         s = radar.site
-        points.append(ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m))
+        points.append(ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m, planet))
     for point in points:
         whole = point[np.isfinite(point).all(axis=1)]
         if len(whole):
-            latitude, longitude, _ = geodetic_from_ecef(whole[0])
+            latitude, longitude, _ = geodetic_from_ecef(whole[0], planet)
             return float(latitude), float(longitude)
     site = next((radar.site for radar in radars.values()), None)
     return None if site is None else (site.latitude_rad, site.longitude_rad)  # angles or ranges alone: nearby
 
 
-def _motion(entry: MotionEntry) -> Motion:
+def _motion(spec: FlightFile, drag: StatedDrag | None) -> Motion:
+    entry, trim_rad, drag_area = spec.motion, 0.0, spec.motion.drag_area_per_mass_m2pkg
+    # a blunt body's lift over drag is about its angle of attack, and a trimmed one keeps it. No tracker says how high
+    # it is: a drag that came back soon to what is stated would make the density tell
+    known: dict[str, float] = {}
+    if spec.measures_deceleration:
+        trim_rad = float(np.deg2rad(entry.trim_sd_deg))
+        known = {"drag_time_constant_s": _TRIM_TIME_CONSTANT_S, "side_sd": trim_rad}
+    known |= {key: getattr(entry, key) for key in entry.model_fields_set}
+    drag_time = known.get("drag_time_constant_s", entry.drag_time_constant_s)
+    if drag_area is None:
+        drag_area = 0.0 if drag is None else float(drag.area_per_mass_m2pkg(drag.mach[-1:])[0])
     return Motion(
         model=entry.model,
-        drag_area_per_mass_m2pkg=entry.drag_area_per_mass_m2pkg or 0.0,
+        drag_area_per_mass_m2pkg=drag_area,
         drag_sd=entry.drag_sd,
-        drag_time_constant_s=entry.drag_time_constant_s,
-        side_sd=entry.side_sd,
+        drag_time_constant_s=drag_time,
+        side_sd=known.get("side_sd", entry.side_sd),
+        side_time_constant_s=known.get("side_time_constant_s", drag_time),
+        trim_sd_rad=trim_rad,
         acceleration_density=entry.acceleration_density,
         powered_s=entry.powered_s or (),
         powered_sd_mps2=entry.powered_sd_mps2,
@@ -623,6 +732,8 @@ def assumed_errors(spec: FlightFile, radars: dict[str, RadarRecord]) -> dict[str
     out = {table: _assumed_of(entry, set()) for table, entry in entries.items() if entry is not None}
     for name, radar in spec.radars.items():
         out[f"radars.{name}"] = _assumed_of(radar, _not_measured_or_in_the_table(radar, radars.get(name)))
+    if spec.measures_deceleration and "trim_sd_deg" not in spec.motion.model_fields_set:
+        out["motion"] = {"trim_sd_deg": spec.motion.trim_sd_deg}
     prior = spec.attitude_prior
     if prior is not None and "sd_deg" not in prior.model_fields_set:
         out["attitude_prior"] = {"sd_deg": float(prior.sd_deg[0])}

@@ -575,7 +575,9 @@ class Mounted(Source):
 
 @with_keys(ACCELEROMETER.file_keys())
 class TriadEntry(Mounted):
-    """Accelerometer triad: file, mounting, errors from the data sheet (one standard deviation)."""
+    """Accelerometer triad, or single channels of one: file, mounting, data sheet's errors (one standard deviation)."""
+
+    measures: Annotated[tuple[Literal["ax", "ay", "az"], ...], Field(min_length=1, max_length=3)] = ("ax", "ay", "az")
 
 
 @with_keys(RATES.file_keys())
@@ -654,10 +656,14 @@ class Heights(TrackingSource):
 
 @with_keys(GNSS.file_keys())
 class GnssEntry(Heights):
-    """A satellite navigation receiver: its table, antenna, errors, and which fixes are good enough."""
+    """A satellite navigation receiver: its table, antenna, errors, and which fixes are good enough.
+
+    ``axes`` are those of positions x, y, z and of their velocities: planet-fixed ones, these at t0, or J2000 (Mars).
+    """
 
     antenna_from_datum_body_m: tuple[Place, Place, Place] = (0.0, 0.0, 0.0)
     velocity: bool = True
+    axes: Literal["fixed", "inertial", "j2000"] = "fixed"
     min_satellites: Annotated[int, Field(ge=1, le=64)] | None = None
     satellites_column: str = "nsat"
     min_fix_mode: Annotated[int, Field(ge=1, le=9)] | None = None

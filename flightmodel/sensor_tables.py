@@ -22,13 +22,16 @@ from flightmodel import earth, tables
 from flightmodel.atmosphere import (
     EARTH_RADIUS_US76_M,
     R_AIR_JPKGK,
+    bottom_m,
     default_sounding_sd,
     height_from_pressure,
     profile_from_sounding,
+    standard_sounding,
 )
 from flightmodel.camera_edits import EDITS_FILE, NO_EDITS, CameraEdits, read_edits
 from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.entry_state import fixed_axes
 from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault
 from flightmodel.gate import Gate, Table, find_faults, oversampled, rows_to_use
 from flightmodel.instruments import (
@@ -60,7 +63,7 @@ from flightmodel.vehicle import CameraMount, Vehicle
 
 ECEF, GEODETIC = ("x", "y", "z"), ("lat", "lon", "alt")
 ECEF_SPEEDS, NED_SPEEDS = ("vx", "vy", "vz"), ("vn", "ve", "vd")
-LEAST_RADIUS_M, LEAST_HEIGHT_M = 6.3e6, -12e3  # below every ocean's floor
+LEAST_DEPTH_M, LEAST_HEIGHT_M = 78e3, -12e3  # below the equator's radius, and below every ocean's floor
 FASTEST_MPS = 2e4
 LEAST_SD = 1e-12  # its square is a number that can be divided by
 LOWEST_BAROMETER_M, HIGHEST_BAROMETER_M = -2000.0, 80e3
@@ -112,7 +115,9 @@ def _columns(table: Table, shorts: list[str]) -> FloatArray:
     return np.column_stack([table.columns.get(short, nothing) for short in shorts])
 
 
-def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:
+def read_gnss(
+    gate: Gate, name: str, source: GnssEntry, t0_utc: str = "", planet: earth.Planet = earth.WGS84
+) -> GnssRecord | None:
     """Read one receiver's fixes; None, with the faults kept, where anything in them is refused."""
     label = f"gnss.{name}"
     least = {"nsat": source.min_satellites, "fix_mode": source.min_fix_mode}
@@ -125,15 +130,16 @@ def read_gnss(gate: Gate, name: str, source: GnssEntry) -> GnssRecord | None:
     if not good.any():
         return None
     time_s, table = table.time_s[good], table.of_rows(good)
-    position = _positions(gate, table, source)
+    position = _positions(gate, table, source, planet)
     if position is None or len(gate.faults) + len(gate.config) > before:
         return None
     if not np.isfinite(position).all(axis=1).any():
         gate.refuse(f"{label}: {table.path}: no fix with a whole position; remove the receiver", "no-samples")
         return None
-    velocity = _velocities(gate, table, source, position)
+    velocity = _velocities(gate, table, source, position, planet)
     if velocity is None:
         return None
+    position, velocity = fixed_axes(source.axes, t0_utc, time_s, position, velocity, planet)
     gate.findings.extend(find_faults(name, time_s, ("x", "y", "z"), position))
     gate.findings.extend(oversampled(name, time_s, source.every_s))
     spec = GnssSpec(name, np.array(source.antenna_from_datum_body_m), **GNSS.from_file(source))
@@ -159,7 +165,7 @@ def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> B
     return good
 
 
-def _positions(gate: Gate, table: Table, source: GnssEntry) -> FloatArray | None:
+def _positions(gate: Gate, table: Table, source: GnssEntry, planet: earth.Planet) -> FloatArray | None:
     """ECEF positions (n, 3), m, from whichever columns are there; those that flight.toml declares go first."""
     whole = {form: set(form) <= set(table.columns) for form in (ECEF, GEODETIC)}
     stated = [form for form in (ECEF, GEODETIC) if set(form) & set(source.columns)]
@@ -179,10 +185,16 @@ def _positions(gate: Gate, table: Table, source: GnssEntry) -> FloatArray | None
             "table-column-missing",
         )
         return None
+    if source.axes != "fixed" and (form != ECEF or set(NED_SPEEDS) & set(table.columns)):
+        words = (
+            f'axes = "{source.axes}" goes with x, y, z and vx, vy, vz; other columns are of the planet: take axes out'
+        )
+        gate.refuse_config(f"{table.label}: {words}", "axes-conflict")
+        return None
     if form == ECEF:
         position = np.column_stack([table.columns[short] for short in ECEF])
         radius = np.linalg.norm(position, axis=1)
-        _refuse_fixes(gate, table, radius < LEAST_RADIUS_M, "lies inside the Earth")
+        _refuse_fixes(gate, table, radius < planet.semi_major_m - LEAST_DEPTH_M, "lies inside the planet")
         return np.where(np.isfinite(radius)[:, None], position, np.nan)
     if source.height_is is None:
         words = 'alt is above what? write height_is = "ellipsoid" or height_is = "msl"'
@@ -195,7 +207,7 @@ def _positions(gate: Gate, table: Table, source: GnssEntry) -> FloatArray | None
     _refuse_fixes(gate, table, (lat == 0.0) & (lon == 0.0), "is at latitude and longitude 0")
     undulation = source.to_ellipsoid_m(lat, lon)
     _note_geoid(gate, table.label.rpartition(".")[2], source, undulation)
-    position = earth.ecef_from_geodetic(lat, lon, alt + undulation)
+    position = earth.ecef_from_geodetic(lat, lon, alt + undulation, planet)
     return np.where(np.isfinite(lat + lon + alt)[:, None], position, np.nan)
 
 
@@ -215,7 +227,9 @@ def _refuse_fixes(gate: Gate, table: Table, bad: BoolArray, words: str) -> None:
         gate.refuse(f"{table.at(k)}: the fix {words} ({count} in all), {hint}", "fix-impossible")
 
 
-def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: FloatArray) -> FloatArray | None:
+def _velocities(
+    gate: Gate, table: Table, source: GnssEntry, position_ecef_m: FloatArray, planet: earth.Planet
+) -> FloatArray | None:
     """ECEF velocities (n, 3), m/s, NaN where there are none; None, with a fault, where some components lack."""
     nothing: FloatArray = np.full(position_ecef_m.shape, np.nan)
     if not source.velocity:
@@ -241,7 +255,7 @@ def _velocities(gate: Gate, table: Table, source: GnssEntry, position_ecef_m: Fl
     if form == NED_SPEEDS:
         # a velocity without a position has no local axes
         whole &= np.isfinite(position_ecef_m).all(axis=1)
-        nothing[whole] = earth.ecef_from_ned(velocity[whole], position_ecef_m[whole])
+        nothing[whole] = earth.ecef_from_ned(velocity[whole], position_ecef_m[whole], planet)
     else:
         nothing[whole] = velocity[whole]
     return nothing
@@ -340,6 +354,8 @@ def read_triad(
     ``vehicle`` is None where flight.toml states none, and where the stated one is refused.
     """
     quantities = TRIAD_COLUMNS[type(source)]
+    if isinstance(source, TriadEntry):
+        quantities = tuple(q for q in quantities if q.short in source.measures)
     mounting = _mounting(gate, name, source, vehicle, vehicle_stated)
     table = gate.table(f"sensors.{name}", source, quantities)
     if table is None or table.time_s is None:
@@ -351,6 +367,7 @@ def read_triad(
     gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in quantities), values))
     if mounting is None:
         return None
+    values = _columns(table, [q.short for q in TRIAD_COLUMNS[type(source)]])
     if isinstance(source, MagnetometerEntry) and source.reversed:
         values = -values
     stated = TRIADS[type(source)].from_file(source)
@@ -584,26 +601,27 @@ BALLOON_TOP_M = 32e3  # above it the densities' own errors grow
 HYDROSTATIC_TOLERANCE = 0.15  # over a scale height, from two densities with errors of 2 %: 5 sd
 
 
-def read_sounding(gate: Gate, source: AtmosphereEntry) -> Sounding | None:
+def read_sounding(gate: Gate, source: AtmosphereEntry, planet: earth.Planet = earth.WGS84) -> Sounding | None:
     """Read the sounding; None, with the faults kept in the gate, where it cannot be used."""
     table = gate.table(SOURCE, source, tables.ATMOSPHERE, timed=False)
     if table is None:
         return None
     before = len(gate.faults)
-    gate.refuse_rows(table, "alt", -1000.0, 2.0e5, "outside -1 to 200 km")
+    lowest = -1000.0 if planet == earth.WGS84 else bottom_m(planet)
+    gate.refuse_rows(table, "alt", lowest, 2.0e5, f"outside {lowest / 1000:.0f} to 200 km")
     gate.refuse_rows(table, "rho", TINY, 2.0, "no density of the Earth's air")
     gate.refuse_rows(table, "temperature", 80.0, 400.0, "outside 80 to 400 K")
     for short in ("wind_north", "wind_east", "wind_speed"):
         gate.refuse_rows(table, short, -300.0, 300.0, "above 300 m/s")
     gate.refuse_rows(table, "rho_sd", SMALLEST_SD, 10.0, "no standard deviation of a density, as a fraction")
     gate.refuse_rows(table, "wind_sd", SMALLEST_SD, 300.0, "no standard deviation of a wind")
-    winds = _winds(gate, table)
+    winds = _winds(gate, table, planet)
     if winds is None or len(gate.faults) > before:
         return None
-    return _ordered(gate, table, winds)
+    return _ordered(gate, table, winds, planet)
 
 
-def _winds(gate: Gate, table: Table) -> tuple[FloatArray, FloatArray] | None:
+def _winds(gate: Gate, table: Table, planet: earth.Planet) -> tuple[FloatArray, FloatArray] | None:
     """North and east components of where the air goes."""
     c = table.columns
     if {"wind_north", "wind_east"} <= set(c):
@@ -612,6 +630,9 @@ def _winds(gate: Gate, table: Table) -> tuple[FloatArray, FloatArray] | None:
         words = "wind is given by where it comes from: converted to the velocity of the air mass"
         gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="wind-direction-converted"))
         return -c["wind_speed"] * np.cos(c["wind_from"]), -c["wind_speed"] * np.sin(c["wind_from"])
+    if planet != earth.WGS84 and not {"wind_north", "wind_east", "wind_speed", "wind_from"} & set(c):
+        still = np.zeros(len(table.lines))  # no wind is known there but by models
+        return still, still
     needs = "wind_n_mps and wind_e_mps, or wind speed and direction from"
     gate.refuse(f"{SOURCE}: {table.path}: line 1: needs {needs}", "table-column-missing")
     return None
@@ -632,7 +653,7 @@ def hydrostatic_error(altitude_m: FloatArray, pressure_pa: FloatArray, temperatu
     return float(off[np.argmax(np.abs(off))]) if len(off) else 0.0
 
 
-def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> Sounding | None:
+def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], planet: earth.Planet) -> Sounding | None:
     c = table.columns
     whole = np.isfinite(c["alt"] + c["rho"] + c["temperature"] + winds[0] + winds[1])
     if not whole.all():
@@ -651,7 +672,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> 
     if alt[-1] < LOWEST_TOP_M:
         words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, winds fade to zero"
         gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="sounding-short"))
-    pressure = rho * R_AIR_JPKGK * temperature
+    pressure = rho * planet.gas_jpkgk * temperature
     if "pressure" in c:
         off = np.abs(c["pressure"][rows] / pressure - 1.0)
         if np.nanmax(off, initial=0.0) > GAS_LAW_TOLERANCE:
@@ -660,7 +681,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> 
             gate.findings.append(
                 Finding(SOURCE, f"{words}{int(table.lines[k])}; density is used", np.nan, np.nan, code="gas-law")
             )
-    out_of_balance = hydrostatic_error(alt, pressure, temperature)
+    out_of_balance = hydrostatic_error(alt, pressure, temperature) if planet == earth.WGS84 else 0.0
     if abs(out_of_balance) > HYDROSTATIC_TOLERANCE:
         size, side = 100.0 * abs(out_of_balance), "high" if out_of_balance > 0.0 else "low"
         words = (
@@ -669,8 +690,12 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray]) -> 
         )
         gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="hydrostatic-balance"))
     density_sd, wind_sd = default_sounding_sd(alt)
+    if planet != earth.WGS84:
+        standard = standard_sounding(planet)
+        density_sd = np.interp(alt, standard.altitude_m, standard.density_sd)
+        wind_sd = np.full(len(alt), standard.wind_sd_mps[0])
     for key, default in (("rho_sd", density_sd), ("wind_sd", wind_sd)):
         if key in c:
             given = c[key][rows]
             default[np.isfinite(given)] = given[np.isfinite(given)]
-    return Sounding(alt, rho, temperature, pressure, winds[0][rows], winds[1][rows], density_sd, wind_sd)
+    return Sounding(alt, rho, temperature, pressure, winds[0][rows], winds[1][rows], density_sd, wind_sd, planet)

@@ -144,6 +144,8 @@ ATMOSPHERE = (
     Quantity("wind_sd", "wind_sd_mps", "speed", required=False),
 )
 
+AXIAL = (Quantity("mach", "mach", "fraction"), Quantity("c_a", "c_a", "fraction"))  # C_A along Mach number
+
 
 def sun_quantities(heads: int) -> tuple[Quantity, ...]:
     """Columns of a table of Sun sensors with so many heads, counted from 1."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
+from flightmodel.earth import WGS84, Planet
 from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SitesSpec, SunHeads, TriadSpec
 from flightmodel.vehicle import Vehicle
 
@@ -171,6 +172,55 @@ class Sounding:
     wind_east_mps: FloatArray
     density_sd: FloatArray
     wind_sd_mps: FloatArray
+    planet: Planet = WGS84
+
+
+@dataclass(frozen=True)
+class StatePrior:
+    """Position and velocity at one time from another source: what navigation gives at the entry interface.
+
+    Parameters
+    ----------
+    time_s : float
+    position_ecef_m, velocity_ecef_mps : (3,) float
+        Of the tracked point, in axes fixed to the planet, relative to it.
+    covariance : (6, 6) float
+    """
+
+    time_s: float
+    position_ecef_m: FloatArray
+    velocity_ecef_mps: FloatArray
+    covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check once."""
+        check_shape("start's position", self.position_ecef_m, (3,))
+        check_shape("start's velocity", self.velocity_ecef_mps, (3,))
+        check_shape("start's covariance", self.covariance, (6, 6))
+
+
+@dataclass(frozen=True)
+class StatedDrag:
+    """Axial force coefficient and mass properties of a flight without a vehicle file.
+
+    Parameters
+    ----------
+    mach, c_a : (k,) float
+        Linear between, constant outside.
+    area_m2, mass_kg : float
+    sd : float
+        Of ``C_A S / m``, as a fraction: of C_A and mass together.
+    """
+
+    mach: FloatArray
+    c_a: FloatArray
+    area_m2: float
+    mass_kg: float
+    sd: float
+
+    def area_per_mass_m2pkg(self, mach: FloatArray) -> FloatArray:
+        """``C_A S / m`` at Mach numbers (n,)."""
+        return np.interp(mach, self.mach, self.c_a) * self.area_m2 / self.mass_kg
 
 
 @dataclass(frozen=True)
@@ -199,12 +249,15 @@ class Start:
         Velocity that may be left then, of each axis: a rocket that sways in the wind.
     azimuth_rad, azimuth_sd_rad : float or None, float
         Of the body's x axis on its launcher, from true north.
+    state : StatePrior or None
+        Position and velocity that another source gives; then the reconstruction begins there, with or without trackers.
     """
 
     at_rest: tuple[float, float] | None = None
     sd_mps: float = 0.01
     azimuth_rad: float | None = None
     azimuth_sd_rad: float = 0.0
+    state: StatePrior | None = None
 
 
 @dataclass(frozen=True)
@@ -260,8 +313,10 @@ class Motion:
         ``C_D S / m`` before anything is learnt.
     drag_sd, drag_time_constant_s : float
         Standard deviation of its natural logarithm, and how long it stays what it is (Gauss-Markov).
-    side_sd : float
-        Of forces normal to the flow, as a fraction of the drag; they change as the drag does.
+    side_sd, side_time_constant_s : float
+        Of forces normal to the flow, as a fraction of the drag, and how long they stay what they are.
+    trim_sd_rad : float
+        Of the angle between body x and the flow where an accelerometer without gyros measures the deceleration.
     acceleration_density : float
         Root power spectral density, (m/s^2)/sqrt(Hz) per axis, of what ballistic flight leaves out everywhere.
     powered_s : tuple of (float, float)
@@ -277,6 +332,8 @@ class Motion:
     drag_sd: float = 1.0
     drag_time_constant_s: float = 10.0
     side_sd: float = 0.1
+    side_time_constant_s: float = 10.0
+    trim_sd_rad: float = 0.0
     acceleration_density: float = 0.002
     powered_s: tuple[tuple[float, float], ...] = ()
     powered_sd_mps2: float = 50.0
@@ -310,8 +367,8 @@ class Finding:
 class Telemetry:
     """Everything measured on one flight, plus what the analyst states about vehicle, start and motion.
 
-    Accelerometer and rates are there both or neither. At least one radar or receiver is there, but
-    where the film alone is looked at.
+    Rates are not there without an accelerometer; an accelerometer alone measures the deceleration of ballistic flight.
+    At least one radar or receiver is there, but where the film alone is looked at or ``start`` gives a state.
     """
 
     name: str
@@ -337,6 +394,8 @@ class Telemetry:
     places: tuple[KnownPlace, ...] = ()
     start: Start = Start()
     assumed: dict[str, dict[str, float]] = field(default_factory=dict)  # sds that no file states, by table and key
+    drag: StatedDrag | None = None  # without a vehicle file
+    planet: Planet = WGS84
 
     @property
     def frames(self) -> Frames | None:
@@ -347,6 +406,8 @@ class Telemetry:
         """First and last time that all triads and at least one radar or receiver cover together."""
         trackers = [r.time_s for r in self.radars.values()] + [r.time_s for r in self.gnss.values()]
         triads = [t.time_s for t in (self.accelerometer, self.rates) if t is not None]
+        if self.start.state is not None:
+            trackers.append(np.array([self.start.state.time_s, np.inf]))
         start = max([min(t[0] for t in trackers), *(t[0] for t in triads)])
         return float(start), float(min([max(t[-1] for t in trackers), *(t[-1] for t in triads)]))
 

@@ -46,6 +46,7 @@ class Trajectory(Tabular):
         Rate of the body relative to inertial space, body axes.
     covariance : (n, 9, 9) float or None
         Of position ECEF m, velocity ECEF m/s, rotation in body axes rad: the coordinates of `difference`.
+    planet : Planet
     """
 
     epoch_utc: str
@@ -56,6 +57,7 @@ class Trajectory(Tabular):
     q_ecef_body: FloatArray
     omega_body_eci_body_radps: FloatArray
     covariance: FloatArray | None = None
+    planet: earth.Planet = earth.WGS84
 
     def __post_init__(self) -> None:
         """Check shapes, finiteness, time order and unit attitudes once."""
@@ -84,7 +86,7 @@ class Trajectory(Tabular):
         """
         import pandas as pd
 
-        latitude, longitude, altitude = earth.geodetic_from_ecef(self.position_ecef_m)
+        latitude, longitude, altitude = earth.geodetic_from_ecef(self.position_ecef_m, self.planet)
         columns = {"t_s": self.time_s}
         for pattern, letters, values in (
             ("{}_ecef_m", "xyz", self.position_ecef_m),
@@ -152,6 +154,7 @@ def resample(trajectory: Trajectory, time_s: FloatArray) -> Trajectory:
         rotations.slerp(t, trajectory.q_ecef_body, at),
         interpolate_rows(at, t, trajectory.omega_body_eci_body_radps),
         covariance,
+        trajectory.planet,
     )
 
 
@@ -175,7 +178,8 @@ def interpolate_rows(at: FloatArray, t: FloatArray, values: FloatArray) -> Float
 def move_point(trajectory: Trajectory, to: str, to_from_point_body_m: FloatArray) -> Trajectory:
     """Trajectory of another point fixed in the body, ``to_from_point_body_m`` (3,) away; covariance is dropped."""
     arm = rotations.rotate(trajectory.q_ecef_body, np.broadcast_to(to_from_point_body_m, (len(trajectory.time_s), 3)))
-    rate = rotations.rotate(trajectory.q_ecef_body, trajectory.omega_body_eci_body_radps) - earth.OMEGA_ECEF_RADPS
+    rate = rotations.rotate(trajectory.q_ecef_body, trajectory.omega_body_eci_body_radps)
+    rate = rate - trajectory.planet.rate_ecef_radps
     return Trajectory(
         trajectory.epoch_utc,
         trajectory.time_s,
@@ -184,6 +188,7 @@ def move_point(trajectory: Trajectory, to: str, to_from_point_body_m: FloatArray
         trajectory.velocity_ecef_mps + np.cross(rate, arm),
         trajectory.q_ecef_body,
         trajectory.omega_body_eci_body_radps,
+        planet=trajectory.planet,
     )
 
 

@@ -124,7 +124,7 @@ def attitude_table(check: AttitudeCheck, bet: TrajectorySolution) -> pd.DataFram
     rows = np.searchsorted(history.time_s, comparison.time_s)
     path = resample(bet.smoothed, comparison.time_s)
     assert path.covariance is not None
-    latitude, longitude, _ = earth.geodetic_from_ecef(path.position_ecef_m)
+    latitude, longitude, _ = earth.geodetic_from_ecef(path.position_ecef_m, path.planet)
     dcm = earth.dcm_ned_ecef(latitude, longitude) @ rotations.dcm_from_q(history.q_ecef_body[rows])
     columns = {"t_s": comparison.time_s}
     angles = zip(("roll", "pitch", "yaw"), euler_321(dcm), strict=True)

@@ -462,6 +462,7 @@ FORMS: dict[str, tuple[Callable[[Source], bytes], str]] = {
     "aem": (_aem, ".aem"),
     "msopck": (_msopck, ".msopck"),
 }
+_OF_THE_EARTH = ("oem", "aem", "kml", "msopck")  # by their frames
 EXTRAS = {"pyarrow": "parquet"}  # library, and the extra of the installation that brings it
 console = terminal()
 
@@ -478,6 +479,8 @@ def export(folder: Path, form: str, out: Path | None, run: str | None = None) ->
     """
     source = read_source(folder, run)
     write, suffix = FORMS[form]
+    if form in _OF_THE_EARTH:
+        earth.require_earth(source.header.get("planet", "earth"), f"--to {form}")
     path = out or folder / "exports" / f"{source.run}{suffix}"
     if (folder / "runs").resolve() in path.resolve().parents:
         raise ConfigError(f"{path}: run folders stay as they were written; name another place", "export-into-run")

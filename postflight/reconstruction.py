@@ -17,7 +17,7 @@ import pandas as pd
 from estimators.loads import FlightLoads
 from flightmodel import airdata, earth, rotations
 from flightmodel.airdata import AirData, derived_with_sd, is_angle
-from flightmodel.atmosphere import BOTTOM_M, TOP_M, profile_from_sounding
+from flightmodel.atmosphere import TOP_M, bottom_m, profile_from_sounding
 from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress
 from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
@@ -34,6 +34,7 @@ from recon.atmosphere import (
     windows_are_whole,
 )
 from recon.consistency import ConsistencyCheck
+from recon.entry_density import density_by_drag
 from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
@@ -101,6 +102,8 @@ class Reconstruction(Tabular):
         Why there are no loads or no as-flown atmosphere.
     attitude : AttitudeCheck or None
         Comparison with an attitude from magnetometer and Sun sensors alone.
+    density : DataFrame or None
+        Density, dynamic pressure, Mach number by the deceleration with the drag of [drag], `recon.entry_density`.
     """
 
     flight: Flight
@@ -110,6 +113,7 @@ class Reconstruction(Tabular):
     as_flown: ReconstructedAir | None = None
     missing: tuple[Fault, ...] = ()
     attitude: AttitudeCheck | None = None
+    density: pd.DataFrame | None = None
 
     @property
     def telemetry(self) -> Telemetry:
@@ -142,6 +146,9 @@ class Reconstruction(Tabular):
     def rests_on(self) -> tuple[str, ...]:
         """On what position, height, azimuth and the level of as-flown density rest, which no residual shows."""
         lines, vehicle = rests_on(self.telemetry, self.solution.settings), self.telemetry.vehicle
+        if self.density is not None and self.telemetry.drag is not None:
+            drag_percent = 100.0 * self.telemetry.drag.sd
+            return (*lines, f"density's level rests on C_A and mass to {drag_percent:.2g} %")
         if self.as_flown is None or vehicle is None:
             return lines
         stated = vehicle.uncertainty
@@ -232,7 +239,10 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
         as_flown = as_flown_atmosphere(telemetry, solution, profile, solution.settings.check_confidence)
     except GateError as fault:
         missing += fault.faults
-    return Reconstruction(flight, solution, air, loads, as_flown, tuple(missing))
+    density = None
+    if telemetry.drag is not None:
+        density = density_by_drag(telemetry, solution.smoothed, solution.drag)
+    return Reconstruction(flight, solution, air, loads, as_flown, tuple(missing), density=density)
 
 
 def _check_axes(solution: TrajectorySolution) -> None:
@@ -265,8 +275,8 @@ def air_data(trajectory: Trajectory, flight: Flight) -> AirData:
 
 def _check_inside_tables(trajectory: Trajectory) -> None:
     """Raise `DivergenceError` where the reconstruction left the ground or the atmosphere's tables."""
-    _, _, altitude_m = earth.geodetic_from_ecef(trajectory.position_ecef_m)
-    wrong = (altitude_m < BOTTOM_M) | (altitude_m > TOP_M)
+    _, _, altitude_m = earth.geodetic_from_ecef(trajectory.position_ecef_m, trajectory.planet)
+    wrong = (altitude_m < bottom_m(trajectory.planet)) | (altitude_m > TOP_M)
     if wrong.any():
         k = int(np.argmax(wrong))
         raise DivergenceError(
@@ -316,13 +326,13 @@ def _inertial(flight: Reconstruction) -> Columns:
     """Position and velocity in ECI with standard deviations."""
     bet = flight.solution.smoothed
     assert bet.covariance is not None
-    turn = rotations.conjugate(earth.q_ecef_eci(bet.time_s))
+    turn = rotations.conjugate(earth.q_ecef_eci(bet.time_s, bet.planet))
     dcm = rotations.dcm_from_q(turn)
     r = rotations.rotate(turn, bet.position_ecef_m)
-    v = rotations.rotate(turn, bet.velocity_ecef_mps) + np.cross(earth.OMEGA_ECEF_RADPS, r)
+    v = rotations.rotate(turn, bet.velocity_ecef_mps) + np.cross(bet.planet.rate_ecef_radps, r)
     move = np.zeros((len(r), 6, 6))
     move[:, 0:3, 0:3] = move[:, 3:6, 3:6] = dcm
-    move[:, 3:6, 0:3] = rotations.skew(earth.OMEGA_ECEF_RADPS) @ dcm
+    move[:, 3:6, 0:3] = rotations.skew(bet.planet.rate_ecef_radps) @ dcm
     moved = move @ bet.covariance[:, :6, :6] @ move.transpose(0, 2, 1)
     sd = np.sqrt(np.diagonal(moved, axis1=1, axis2=2))
     out = _vector("r{}_eci_m", "xyz", r) | _vector("v{}_eci_mps", "xyz", v)

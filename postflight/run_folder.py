@@ -33,6 +33,7 @@ import pandas as pd
 from flightmodel import events
 from flightmodel.checks import FloatArray, GateError, write_file, writing
 from flightmodel.deflection import mean_over
+from flightmodel.earth import WGS84, name_of
 from flightmodel.guarded_files import open_file
 from flightmodel.partial_files import abandoned, partial_path
 from flightmodel.telemetry import Finding, Telemetry
@@ -288,6 +289,8 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflec
         run.write_csv("air_profile.csv", flight.as_flown.profile)
         run.write_csv("drag_ratio.csv", flight.as_flown.drag)
         run.write_csv("air_parameters.csv", flight.as_flown.parameters)
+    if flight.density is not None:
+        run.write_csv("density_by_drag.csv", flight.density)
     if flight.attitude is not None and flight.attitude.comparison is not None:
         run.write_csv("attitude_check.csv", attitude_table(flight.attitude, bet))
     findings = [vars(f) for f in (*flight.findings, *without_attitude(flight))]
@@ -383,6 +386,7 @@ def header(flight: Reconstruction) -> dict[str, Any]:
         "synthetic": telemetry.synthetic,
         "changes": list(flight.flight.changes),
         "epoch_utc": telemetry.t0_utc,
+        **({} if telemetry.planet == WGS84 else {"planet": name_of(telemetry.planet)}),
         "start_s": bet.provenance["start_s"],
         "end_s": bet.provenance["end_s"],
         "point": "datum (the nose); air data and flow angles at the c.g.",

@@ -267,7 +267,7 @@ def at_times(flight: Reconstruction, at: FloatArray) -> Reconstruction:
 
 def _turn(path: Trajectory) -> FloatArray:
     """Matrices (k, 9, 9) of errors from ECEF to north, east, down; rotations stay about body axes."""
-    latitude, longitude, _ = earth.geodetic_from_ecef(path.position_ecef_m)
+    latitude, longitude, _ = earth.geodetic_from_ecef(path.position_ecef_m, path.planet)
     out = np.tile(np.eye(9), (len(path.time_s), 1, 1))
     out[:, 0:3, 0:3] = out[:, 3:6, 3:6] = earth.dcm_ned_ecef(latitude, longitude)
     return out

@@ -321,13 +321,13 @@ class _Fit:
         self.parts = np.concatenate([np.arange(3) + 3 * GROUPS.index(group) for group in self.groups])
         self.known: dict[float, Trajectory] = {}
         whole = self._run_at(start_s)
-        self.latitude, self.longitude, _ = earth.geodetic_from_ecef(whole.position_ecef_m)
+        self.latitude, self.longitude, _ = earth.geodetic_from_ecef(whole.position_ecef_m, whole.planet)
         self.dcm_ned_ecef = earth.dcm_ned_ecef(self.latitude, self.longitude)
         self.middle = self.dcm_ned_ecef[len(use) // 2]
         self.undulation_m = undulation_m(self.latitude, self.longitude)
         first_s = np.clip(other.time_s[0] - start_s, run.time_s[0], None)
         self.centre_m = resample(run, np.array([first_s])).position_ecef_m[0]
-        latitude, longitude, _ = earth.geodetic_from_ecef(self.centre_m)
+        latitude, longitude, _ = earth.geodetic_from_ecef(self.centre_m, whole.planet)
         self.first = earth.dcm_ned_ecef(float(latitude), float(longitude))
         self.names = tuple(
             name for name, (*_, shown) in _EFFECTS.items() if self._can_be_seen(name, shown, has_attitude)
@@ -364,10 +364,12 @@ class _Fit:
             place = place + self.undulation_m[:, None] * self.dcm_ned_ecef[:, 2]
         velocity = rotations.rotate(turn, path.velocity_ecef_mps)
         if "inertial-velocity" in get:
-            velocity = velocity + get["inertial-velocity"][0] * np.cross(earth.OMEGA_ECEF_RADPS, path.position_ecef_m)
+            velocity = velocity + get["inertial-velocity"][0] * np.cross(
+                path.planet.rate_ecef_radps, path.position_ecef_m
+            )
         if "other-point" in get:
             arm = rotations.rotate(path.q_ecef_body, np.broadcast_to(get["other-point"], (len(self.time_s), 3)))
-            rate = rotations.rotate(path.q_ecef_body, path.omega_body_eci_body_radps) - earth.OMEGA_ECEF_RADPS
+            rate = rotations.rotate(path.q_ecef_body, path.omega_body_eci_body_radps) - path.planet.rate_ecef_radps
             place, velocity = place + arm, velocity + np.cross(rate, arm)
         out = [np.einsum("nij,nj->ni", self.dcm_ned_ecef, self.other.position_ecef_m[self.use] - place)]
         if self.other.velocity_ecef_mps is not None:

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import WGS84, boxplus, geodetic, inlined, kernel, merged
-from recon._measurement_kernels import RADAR, SLOTS, SUN, node_motion, predict
+from flightmodel._kernels import boxplus, constants, geodetic, inlined, kernel, merged
+from recon._measurement_kernels import DECELERATION, RADAR, SLOTS, SUN, node_motion, predict, predict_deceleration
 from recon._propagation_kernels import propagate_ballistic, propagate_strapdown
 
 TWO_PI = 2.0 * math.pi
@@ -39,16 +39,16 @@ def propagate_one(motion, air, first, last, errors, position, velocity, q, phi, 
 
 
 @inlined
-def height_of(p):
+def height_of(p, planet):
     """Geodetic height of a point (3,), m."""
-    _, _, height, _ = geodetic(p[0], p[1], p[2], WGS84)
+    _, _, height, _ = geodetic(p[0], p[1], p[2], constants(planet))
     return height
 
 
 @kernel
-def height(p):
+def height(p, planet=None):
     """`height_of` for callers in Python."""
-    return height_of(p)
+    return height_of(p, planet)
 
 
 @inlined
@@ -285,7 +285,7 @@ def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k
         boxplus(q, x[6], x[7], x[8])
         for j in range(len(errors)):
             errors[j] += x[9 + j]
-    before = height_of(position)
+    before = height_of(position, motion.planet)
     phi = steps.transition[a]
     noise = steps.noise[a]
     level_transition(phi, noise)
@@ -294,7 +294,7 @@ def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k
         propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise)
     else:
         propagate_ballistic(motion, air, first, last, errors, position, velocity, phi, noise)
-    climb = abs(height_of(position) - before)
+    climb = abs(height_of(position, motion.planet) - before)
     dt = motion.time_s[node_index[k]] - motion.time_s[node_index[a]]
     decay = steps.decay[a]
     moving = decay_and_noise(wander, dt, climb, decay, steps.noise_var[a])
@@ -339,8 +339,11 @@ def update_node(motion, air, index, sources, observed, wander, gate, charts, inn
             e[col] = charts.errors[k, slot[col]] if slot[col] >= 0 else 0.0
         predict(
             kind, sources.arm_body_m[source], sources.site_ecef_m[source], sources.dcm[source], observed.known[row], e,
-            position, velocity, c, rate, acceleration, h, by_state, by_error,
+            position, velocity, c, rate, acceleration, h, by_state, by_error, motion.planet,
         )  # fmt: skip
+        if air is not None:  # noqa: SIM102 - alone it prunes the branch before types are found
+            if kind == DECELERATION:
+                predict_deceleration(air, e, position, velocity, acceleration, h, by_state, by_error)
         count = 0
         for i in range(3):
             if math.isinf(observed.variance[row, i]):

@@ -11,19 +11,19 @@ import math
 import numpy as np
 
 from flightmodel._kernels import (
-    OMEGA_WGS84,
-    WGS84,
     boxplus,
+    constants,
     dcm_from_quaternion,
     geodetic,
     gravitation,
     inlined,
     kernel,
     merged,
+    spin_rate,
 )
 from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into
 
-RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE = range(7)
+RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
 SLOTS = 21
 
 
@@ -37,15 +37,15 @@ def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acce
             errors[0], errors[1], errors[2], errors[3], errors[4], errors[5],
         )  # fmt: skip
         for i in range(3):
-            rate[i] = OMEGA_WGS84 * c[2, i]
+            rate[i] = spin_rate(motion.planet) * c[2, i]
             acceleration[i] = a[i]
         return
     force = np.empty(3)
     corrected(motion.force_sensor_mps2[index], errors, 0, motion.dcm_body_force, force)
     corrected(motion.rate_sensor_radps[index], errors, 9, motion.dcm_body_rate, rate)
     x, y, z = position[0], position[1], position[2]
-    gx, gy, gz = gravitation(x, y, z, WGS84)
-    w2, two = OMEGA_WGS84 * OMEGA_WGS84, 2.0 * OMEGA_WGS84
+    gx, gy, gz = gravitation(x, y, z, constants(motion.planet))
+    w2, two = spin_rate(motion.planet) * spin_rate(motion.planet), 2.0 * spin_rate(motion.planet)
     for i in range(3):
         acceleration[i] = c[i, 0] * force[0] + c[i, 1] * force[1] + c[i, 2] * force[2]
     acceleration[0] += gx + w2 * x + two * velocity[1]
@@ -71,14 +71,14 @@ def corrected(measured, errors, offset, dcm_body_sensor, out):
 
 
 @inlined
-def observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective):
+def observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective, planet):
     """Observed point (3,), its velocity (3,), and the lever (3,) of rotation, in place.
 
     ``p = r + C d - tau (v + C (w x d)) + tau^2 a / 2`` with ``w`` against the Earth.
     """
     turn, lever_velocity = np.empty(3), np.empty(3)
     for i in range(3):
-        turn[i] = rate[i] - OMEGA_WGS84 * c[2, i]
+        turn[i] = rate[i] - spin_rate(planet) * c[2, i]
     cross_into(turn, arm, lever_velocity)
     for i in range(3):
         effective[i] = arm[i] - tau * lever_velocity[i]
@@ -180,10 +180,10 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
 
 
 @inlined
-def predict_place(kind, site, dcm_ned_ecef, e, point, speed, h, m, by_error):
+def predict_place(kind, site, dcm_ned_ecef, e, point, speed, h, m, by_error, planet):
     """Position or velocity along a reference's axes, or height; partials by the observed point."""
     if kind == HEIGHT:
-        sin_lat, cos_lat, height, per_p = geodetic(point[0], point[1], point[2], WGS84)
+        sin_lat, cos_lat, height, per_p = geodetic(point[0], point[1], point[2], constants(planet))
         level_part = (1.0 + e[1]) * cos_lat * per_p
         m[0, 0], m[0, 1], m[0, 2] = level_part * point[0], level_part * point[1], (1.0 + e[1]) * sin_lat
         by_error[0, 0], by_error[0, 1], by_error[0, 2] = 1.0, height - site[0], 1.0
@@ -282,7 +282,7 @@ def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
 
 
 @merged
-def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error):
+def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error, planet):
     """Prediction and partials of one measurement, in place."""
     for i in range(3):
         h[i] = 0.0
@@ -298,23 +298,27 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
         return
     point, speed, effective, m = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
     tau = e[3]
-    observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective)
+    observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective, planet)
     if kind == RADAR:
         predict_radar(site, dcm, known, e, point, h, m, by_error)
         state_rows(m, 3, tau, c, effective, speed, by_state, by_error)
         return
     if kind == RANGE_RATE:
-        predict_range_rate(arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error)
+        predict_range_rate(
+            arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error, planet
+        )
         return
-    predict_place(kind, site, dcm, e, point, speed, h, m, by_error)
+    predict_place(kind, site, dcm, e, point, speed, h, m, by_error, planet)
     if kind == VELOCITY:
-        velocity_rows(m, 3, arm, rate, c, acceleration, by_state, by_error)
+        velocity_rows(m, 3, arm, rate, c, acceleration, by_state, by_error, planet)
         return
     state_rows(m, 1 if kind == HEIGHT else 3, tau, c, effective, speed, by_state, by_error)
 
 
 @inlined
-def predict_range_rate(arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error):
+def predict_range_rate(
+    arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error, planet
+):
     """Range rate ``u . v`` along the line of sight ``u`` from a site, plus its bias; partials by state and errors."""
     slant = 0.0
     for i in range(3):
@@ -327,7 +331,7 @@ def predict_range_rate(arm, site, tau, e, rate, c, acceleration, point, speed, e
         h[0] += along[0, i] * speed[i]
     for i in range(3):
         m[0, i] = (speed[i] - h[0] * along[0, i]) / slant
-    velocity_rows(along, 1, arm, rate, c, acceleration, by_state, by_error)
+    velocity_rows(along, 1, arm, rate, c, acceleration, by_state, by_error, planet)
     swing = by_state[0].copy()
     late = by_error[0, 3]
     state_rows(m, 1, tau, c, effective, speed, by_state, by_error)
@@ -339,11 +343,11 @@ def predict_range_rate(arm, site, tau, e, rate, c, acceleration, point, speed, e
 
 
 @inlined
-def velocity_rows(m, count, arm, rate, c, acceleration, by_state, by_error):
+def velocity_rows(m, count, arm, rate, c, acceleration, by_state, by_error, planet):
     """Partials of a velocity along the first axes of ``m`` (3, 3): ``m (v + C (w x d) - tau a)``."""
     turn, lever_velocity, row, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
-        turn[i] = rate[i] - OMEGA_WGS84 * c[2, i]
+        turn[i] = rate[i] - spin_rate(planet) * c[2, i]
     cross_into(turn, arm, lever_velocity)
     for i in range(count):
         by_error[i, 3] = -(m[i, 0] * acceleration[0] + m[i, 1] * acceleration[1] + m[i, 2] * acceleration[2])
@@ -355,12 +359,54 @@ def velocity_rows(m, count, arm, rate, c, acceleration, by_state, by_error):
             by_state[i, 6 + j] = lever[j]
 
 
+@inlined
+def predict_deceleration(air, e, position, velocity, acceleration, h, by_state, by_error):
+    """Deceleration along the flow, ``(1 + scale) a + bias``, of slots 1 and 0; slots 4 to 9 are the air's drivers.
+
+    A late tag, slot 3, reads what was: ``a - tau da/dt`` along the path, the drivers constant.
+    """
+    s, partial = np.empty(12), np.empty(12)
+    for j in range(3):
+        s[j], s[3 + j] = position[j], velocity[j]
+    for j in range(6):
+        s[6 + j] = e[4 + j]
+    drag = ballistic_acceleration(air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])[4]
+    for j in range(12):
+        middle, step = s[j], 1.0 if j < 3 else (0.01 if j < 6 else 1e-4)
+        s[j] = middle + step
+        a = ballistic_acceleration(air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])[4]
+        s[j] = middle - step
+        b = ballistic_acceleration(air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])[4]
+        s[j] = middle
+        partial[j] = (a - b) / (2.0 * step)
+    change = 0.0
+    for j in range(3):
+        change += partial[j] * velocity[j] + partial[3 + j] * acceleration[j]
+    gain = 1.0 + e[1]
+    for i in range(3):
+        h[i] = 0.0
+        for j in range(9):
+            by_state[i, j] = gain * partial[j] if i == 0 and j < 6 else 0.0
+        for j in range(SLOTS):
+            by_error[i, j] = gain * partial[2 + j] if i == 0 and 4 <= j < 10 else 0.0
+    h[0] = gain * (drag - e[3] * change) + e[0]
+    by_error[0, 0], by_error[0, 1], by_error[0, 3] = 1.0, drag, -gain * change
+
+
 @kernel
-def predict_one(kind, arm, site, dcm, known, e, position, velocity, q, rate, acceleration, h, by_state, by_error):
+def deceleration_at(air, e, position, velocity, acceleration, h, by_state, by_error):
+    """`predict_deceleration` for the filterpy engine and for tests."""
+    predict_deceleration(air, e, position, velocity, acceleration, h, by_state, by_error)
+
+
+@kernel
+def predict_one(
+    kind, arm, site, dcm, known, e, position, velocity, q, rate, acceleration, h, by_state, by_error, planet=None
+):
     """`predict` from an attitude quaternion, for the filterpy engine and for tests."""
     c = np.empty((3, 3))
     dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
-    predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error)
+    predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error, planet)
 
 
 @kernel

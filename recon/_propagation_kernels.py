@@ -16,15 +16,15 @@ import math
 import numpy as np
 
 from flightmodel._kernels import (
-    GM_WGS84,
-    OMEGA_WGS84,
-    WGS84,
     boxplus,
+    constants,
     dcm_from_quaternion,
     geodetic,
     gravitation,
     inlined,
+    mass_parameter,
     merged,
+    spin_rate,
 )
 
 # a filter far from its track may ask for a drag that stops the vehicle within a step: such a step is taken in parts.
@@ -129,14 +129,16 @@ def coning_and_sculling(force, d_force, rate, d_rate, dt):
 
 
 @inlined
-def advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, rotated, forced, moved):
+def advance_columns(
+    phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, rotated, forced, moved, planet
+):
     """Carry the columns of ``phi`` (9, 27 or 29) over one step; ``rotated``, ``forced``, ``moved`` (3, ...): scratch.
 
     ``by_clock`` (2, 3) is what force and rate change in a second. Along rows, which lie side by side in memory: the
     compiler puts several columns into one instruction.
     """
     width = phi.shape[1]
-    h, two_omega = 0.5 * dt, 2.0 * OMEGA_WGS84
+    h, two_omega = 0.5 * dt, 2.0 * spin_rate(planet)
     for i in range(3):
         a, b, c = half_turn[0, i], half_turn[1, i], half_turn[2, i]
         for j in range(width):
@@ -220,7 +222,7 @@ def advance_noise(noise, dt, half_turn, dcm_mid, force, force_density, rate_dens
 
 
 @inlined
-def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient):
+def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient, planet):
     """Carry the state over one step in place; leaves mid-step attitude, half turn and gravity gradient behind."""
     one = np.empty(4)
     level(one)
@@ -230,22 +232,22 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     for i in range(4):
         q_mid[i] = q[i]
     boxplus(q_mid, h * rate[0], h * rate[1], h * rate[2])
-    turn_ecef(q_mid, OMEGA_WGS84 * h)
+    turn_ecef(q_mid, spin_rate(planet) * h)
     dcm_from_quaternion(q_mid[0], q_mid[1], q_mid[2], q_mid[3], dcm_mid)
     for i in range(4):
         q[i] = q_mid[i]
     boxplus(q, h * rate[0], h * rate[1], h * rate[2])
-    turn_ecef(q, OMEGA_WGS84 * h)
+    turn_ecef(q, spin_rate(planet) * h)
 
     x = position[0] + h * velocity[0]
     y = position[1] + h * velocity[1]
     z = position[2] + h * velocity[2]
-    gx, gy, gz = gravitation(x, y, z, WGS84)
-    w2 = OMEGA_WGS84 * OMEGA_WGS84
+    gx, gy, gz = gravitation(x, y, z, constants(planet))
+    w2 = spin_rate(planet) * spin_rate(planet)
     ax = dcm_mid[0, 0] * force[0] + dcm_mid[0, 1] * force[1] + dcm_mid[0, 2] * force[2] + gx + w2 * x
     ay = dcm_mid[1, 0] * force[0] + dcm_mid[1, 1] * force[1] + dcm_mid[1, 2] * force[2] + gy + w2 * y
     az = dcm_mid[2, 0] * force[0] + dcm_mid[2, 1] * force[1] + dcm_mid[2, 2] * force[2] + gz
-    two = 2.0 * OMEGA_WGS84
+    two = 2.0 * spin_rate(planet)
     vx = velocity[0] + h * (ax + two * velocity[1])
     vy = velocity[1] + h * (ay - two * velocity[0])
     ax += two * vy
@@ -258,7 +260,7 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     velocity[2] += dt * az
 
     r2 = x * x + y * y + z * z
-    k = GM_WGS84 / (r2 * math.sqrt(r2))
+    k = mass_parameter(planet) / (r2 * math.sqrt(r2))
     point = (x, y, z)
     for i in range(3):
         for j in range(3):
@@ -300,15 +302,18 @@ def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi,
         for i in range(3):
             by_clock[0, i], by_clock[1, i] = force_change[i] / dt, rate_change[i] / dt
         coning_and_sculling(force, force_change, rate, rate_change, dt)
-        advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient)
-        advance_columns(phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, rotated, forced, moved)
+        advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_mid, gradient, motion.planet)
+        advance_columns(
+            phi, dt, half_turn, dcm_mid, force, d_force, d_rate, by_clock, gradient, rotated, forced, moved,
+            motion.planet,
+        )  # fmt: skip
         advance_noise(noise, dt, half_turn, dcm_mid, force, motion.force_density[j], motion.rate_density[j])
 
 
 @inlined
 def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
-    """Acceleration against the rotating Earth, m/s^2, and the rate 1/s at which the air changes the velocity."""
-    sin_lat, cos_lat, height, per_p = geodetic(x, y, z, WGS84)
+    """Acceleration against the rotating planet, m/s^2, rate 1/s at which the air changes the velocity, deceleration."""
+    sin_lat, cos_lat, height, per_p = geodetic(x, y, z, constants(air.planet))
     at = (height - air.from_m) / air.step_m
     row = int(min(max(at, 0.0), len(air.table) - 2.0))
     w = min(max(at - row, 0.0), 1.0)
@@ -332,11 +337,11 @@ def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     n = 1.0 / (math.sqrt(ax * ax + ay * ay + az * az) + 1e-9)
     ax, ay, az = ax * n, ay * n, az * n
     bx, by, bz = m * (uy * az - uz * ay), m * (uz * ax - ux * az), m * (ux * ay - uy * ax)
-    gx, gy, gz = gravitation(x, y, z, WGS84)
-    w2, two = OMEGA_WGS84 * OMEGA_WGS84, 2.0 * OMEGA_WGS84
+    gx, gy, gz = gravitation(x, y, z, constants(air.planet))
+    w2, two = spin_rate(air.planet) * spin_rate(air.planet), 2.0 * spin_rate(air.planet)
     fx = k * (speed * (e1 * ax + e2 * bx) - ux) + gx + w2 * x + two * vy
     fy = k * (speed * (e1 * ay + e2 * by) - uy) + gy + w2 * y - two * vx
-    return fx, fy, k * (speed * (e1 * az + e2 * bz) - uz) + gz, k * math.sqrt(1.0 + e1 * e1 + e2 * e2)
+    return fx, fy, k * (speed * (e1 * az + e2 * bz) - uz) + gz, k * math.sqrt(1.0 + e1 * e1 + e2 * e2), k * speed
 
 
 @inlined
@@ -369,7 +374,7 @@ def ballistic_step(air, dt, point, stage, slope, mid):
         slope[j] = 0.0
     for i in range(4):
         s = stage
-        a0, a1, a2, _ = ballistic_acceleration(
+        a0, a1, a2, _, _ = ballistic_acceleration(
             air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11]
         )
         weight = 1.0 / 6.0 if i == 0 or i == 3 else 1.0 / 3.0

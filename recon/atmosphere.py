@@ -553,10 +553,10 @@ def _air_samples(telemetry: Telemetry, bet: TrajectorySolution) -> AirSamples:
         return np.asarray(values.reshape(len(t), _POINTS, *values.shape[1:]).mean(axis=1))
 
     middle = resample(bet.smoothed, t)
-    lat, lon, altitude = earth.geodetic_from_ecef(middle.position_ecef_m)
+    lat, lon, altitude = earth.geodetic_from_ecef(middle.position_ecef_m, middle.planet)
     dcm_ned_ecef = earth.dcm_ned_ecef(lat, lon)
     dcm = rotations.dcm_from_q(dense.q_ecef_body)
-    spin = dense.omega_body_eci_body_radps - dcm.transpose(0, 2, 1) @ earth.OMEGA_ECEF_RADPS
+    spin = dense.omega_body_eci_body_radps - dcm.transpose(0, 2, 1) @ dense.planet.rate_ecef_radps
     velocity = dense.velocity_ecef_mps + np.einsum("nij,nj->ni", dcm, np.cross(spin, cg))
     return AirSamples(
         t,

@@ -38,7 +38,7 @@ from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Finding
-from recon._measurement_kernels import RADAR
+from recon._measurement_kernels import DECELERATION, RADAR
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
 from recon.measurements import REST, SLOT_NAMES
 from recon.settings import COMPILED
@@ -230,7 +230,8 @@ def source_checks(problem: Problem, innovations: Innovations, confidence: float)
             continue
         use = mine & settled & innovations.accepted
         checks = []
-        if use.sum() >= 10:
+        # the drag follows each reading of a deceleration, so that its innovations test nothing
+        if use.sum() >= 10 and instrument.kind != DECELERATION:
             components, still = int(measured[use].sum()), instrument.name == REST
             noise = "" if still else _measured_noise(normalised[use], measured[use], instrument.components)
             checks.append(nis_check(instrument.name, innovations.nis[use], components, confidence, still, noise))

@@ -36,6 +36,7 @@ import numpy as np
 
 from flightmodel import rotations
 from flightmodel.checks import BoolArray, FloatArray, IntArray
+from flightmodel.earth import WGS84, Planet
 from flightmodel.trajectory import nearest_index
 from recon import _filter_kernels, _measurement_kernels
 from recon._measurement_kernels import SLOTS
@@ -383,7 +384,8 @@ class _FilterpyPass:
         phi = step.transition
         if not self.follow:
             phi[:, ROTATION] = phi[:, ROTATION] @ right_jacobian(ekf.x[ROTATION])
-        climb = abs(height(step.state) - height(estimate))
+        planet = problem.motion.planet
+        climb = abs(height(step.state, planet) - height(estimate, planet))
         decay, noise_var = self._decay(problem.time_s[k] - problem.time_s[j], climb)
         reached = States(*as_charts(step.state)[:3], step.state.sensor_errors * decay)
         self.steps.transition[j], self.steps.noise[j] = phi, step.noise
@@ -415,7 +417,10 @@ class _FilterpyPass:
             *self.problem.motion.split(), self.problem.node_index[k], *as_charts(chart), rate, acceleration
         )
         c = rotations.dcm_from_q(chart.q_ecef_body)
-        return NodeMotion(chart.position_ecef_m, chart.velocity_ecef_mps, c, rate, acceleration)
+        _, air = self.problem.motion.split()
+        return NodeMotion(
+            chart.position_ecef_m, chart.velocity_ecef_mps, c, rate, acceleration, air, self.problem.motion.planet
+        )
 
     def update(self, k: int, row: int) -> None:
         """Use one measurement if it passes the gate."""
@@ -476,6 +481,6 @@ def schmidt_update(
     return np.asarray(gain)
 
 
-def height(state: States) -> float:
+def height(state: States, planet: Planet = WGS84) -> float:
     """Geodetic height of one state, m."""
-    return float(_filter_kernels.height(state.position_ecef_m))
+    return float(_filter_kernels.height(state.position_ecef_m, None if planet == WGS84 else planet))

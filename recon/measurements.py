@@ -14,6 +14,10 @@ with ``w`` the body's rate against the Earth and ``a`` the acceleration. Then, e
 * Doppler: ``u . dp/dt`` along the line of sight ``u``;
 * receiver: ``p`` north, east and down of a reference, and its velocity along the same axes;
 * barometer: geodetic height of ``p``;
+* an accelerometer without gyros, in ballistic flight: the deceleration along the flow, ``(1 + s) a + b`` with
+  ``a = rho |u|^2 B e^d / 2`` of `recon.propagation`. The vehicle is taken to be trimmed with body x along the velocity
+  against the air, so that body x reads ``-a``: off by an angle ``e`` the axial reading differs by about ``e^2``
+  (``C_A = C_D cos e - C_L sin e`` with a lift of ``-e`` of the drag, as a blunt body has), which widens ``s``;
 * at rest (`recon.rest`): zero velocity; of the gyros as of a magnetometer, with the Earth's rate for ``B``;
 * magnetometer: ``S R(m)^T D^T C^T B + b``, S with scales and soft iron, m the mounting rotation, D its nominal axes;
 * Sun head: azimuth and elevation of ``R(m)^T D^T C^T s``.
@@ -32,12 +36,26 @@ import numpy as np
 
 from flightmodel import earth, instruments, rotations
 from flightmodel.checks import FloatArray, IntArray
+from flightmodel.earth import WGS84, Planet
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
-from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, RANGE_RATE, SLOTS, SUN, VELOCITY
-from recon.state import ErrorModel, right_jacobian
+from recon import _measurement_kernels
+from recon._measurement_kernels import (
+    DECELERATION,
+    FIELD,
+    HEIGHT,
+    POSITION,
+    RADAR,
+    RANGE_RATE,
+    SLOTS,
+    SUN,
+    VELOCITY,
+)
+from recon.propagation import Air
+from recon.state import DRIVERS, ErrorModel, right_jacobian
 
 REST = "rest"  # zero velocities on the pad
 SITES = "sites"  # owner of the errors that are common to all radar sites
+DECELERATION_RATE_HZ = 20.0  # of block means: over 50 ms an entry's deceleration is a straight line to 1e-3 m/s^2
 _SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {
     RADAR: ("range", "azimuth", "elevation"),
@@ -47,6 +65,7 @@ COMPONENTS = {
     FIELD: ("field x", "field y", "field z"),
     SUN: ("azimuth", "elevation"),
     RANGE_RATE: ("range rate",),
+    DECELERATION: ("deceleration",),
 }
 _OWN_RADAR = instruments.RADAR.states[:-1]  # the last is of the range rate, a reading of its own
 # time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
@@ -58,7 +77,9 @@ SLOT_NAMES: dict[int, tuple[str, ...]] = {
     HEIGHT: instruments.BAROMETER.states,
     FIELD: instruments.MAGNETOMETER.states,
     SUN: (*instruments.SUN.states[:2], "", "", *instruments.SUN.states[2:]),
+    DECELERATION: ("bias", "scale", "", "time bias", *(name for _, name in DRIVERS)),
 }
+_OWNERS = {DECELERATION: dict(enumerate((owner for owner, _ in DRIVERS), start=4))}  # of slots that are not its own
 
 
 def component_unit(component: str) -> str:
@@ -67,6 +88,8 @@ def component_unit(component: str) -> str:
         return "T" if component.startswith("field") else "rad/s"
     if component.startswith("velocity") or component == "range rate":
         return "m/s"
+    if component == "deceleration":
+        return "m/s2"
     return "rad" if component in ("azimuth", "elevation") else "m"
 
 
@@ -122,7 +145,8 @@ class Instrument:
         """Which error (`SLOTS`,) of the model stands in each slot; -1 for none."""
         names = SLOT_NAMES[self.kind]
         own = len(_OWN_RADAR)  # of a radar; what follows is common to all sites
-        owners = [self.owner if k < own else SITES for k in range(len(names))]
+        shared = _OWNERS.get(self.kind, {})
+        owners = [shared.get(k, self.owner if k < own else SITES) for k in range(len(names))]
         found = [model.column(owner, name) if name else -1 for owner, name in zip(owners, names, strict=True)]
         return np.array([*found, *[-1] * (SLOTS - len(found))], dtype=np.int64)
 
@@ -143,7 +167,9 @@ def instrument_of(
     )  # fmt: skip
 
 
-def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, traverse: bool = True) -> Instrument:
+def radar_instrument(
+    name: str, record: RadarRecord, arm_body_m: FloatArray, traverse: bool = True, planet: Planet = WGS84
+) -> Instrument:
     """One radar; a missing component leaves the others."""
     site = record.site
     sd = _noise(record, [site.range_sd_m, *site.angles_sd_rad], slice(0, 3))
@@ -151,21 +177,23 @@ def radar_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray, tra
         elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
         sd[:, 1] /= np.maximum(np.cos(elevation), 1e-3)
     known = np.tile([_SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
-    place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
+    place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m, planet)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
     return instrument_of(
         name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known, record.every_s
     )
 
 
-def range_rate_instrument(name: str, record: RadarRecord, arm_body_m: FloatArray) -> Instrument | None:
+def range_rate_instrument(
+    name: str, record: RadarRecord, arm_body_m: FloatArray, planet: Planet = WGS84
+) -> Instrument | None:
     """Range rates of one radar or Doppler station; None where it gives none."""
     site = record.site
     if record.range_rate_mps is None:
         return None
     value = np.column_stack([record.range_rate_mps, np.full((len(record.time_s), 2), np.nan)])
     sd = np.tile(_noise(record, [site.range_rate_sd_mps], slice(3, 4)), 3)
-    place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
+    place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m, planet)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
     return instrument_of(
         f"{name} range rate", RANGE_RATE, site.name, arm_body_m, place, dcm, record.time_s, value, sd,
@@ -179,14 +207,16 @@ def _noise(record: RadarRecord, stated: list[float], columns: slice) -> FloatArr
     return sd if record.sd is None else np.where(np.isfinite(record.sd[:, columns]), record.sd[:, columns], sd)
 
 
-def gnss_instruments(name: str, record: GnssRecord, accelerometer_m: FloatArray) -> list[Instrument]:
+def gnss_instruments(
+    name: str, record: GnssRecord, accelerometer_m: FloatArray, planet: Planet = WGS84
+) -> list[Instrument]:
     """Position of one receiver and, where it gives one, velocity; axes are those at its first fix."""
     spec = record.spec
     good = np.isfinite(record.position_ecef_m).all(axis=1)
     if not good.any():
         return []
     reference = record.position_ecef_m[good][0]
-    latitude, longitude, _ = earth.geodetic_from_ecef(reference)
+    latitude, longitude, _ = earth.geodetic_from_ecef(reference, planet)
     dcm = earth.dcm_ned_ecef(float(latitude), float(longitude))
     arm = spec.antenna_from_datum_body_m - accelerometer_m
     place_sd = np.array([spec.horizontal_sd_m, spec.horizontal_sd_m, spec.vertical_sd_m])
@@ -211,6 +241,25 @@ def barometer_instrument(name: str, record: BarometerRecord, accelerometer_m: Fl
     return instrument_of(
         name, HEIGHT, record.spec.name, -accelerometer_m, np.array([first, 0.0, 0.0]), np.eye(3),
         record.time_s, value, np.full(3, record.spec.sd_m), every_s=record.every_s,
+    )  # fmt: skip
+
+
+def deceleration_instrument(record: TriadRecord) -> Instrument:
+    """Deceleration by an accelerometer whose body x axis is taken to lie along the velocity against the air."""
+    spec, axial = record.spec, record.spec.dcm_body_sensor[0]
+    used = np.abs(axial) > 1e-9
+    reading = -record.measured_sensor[:, used] @ axial[used]
+    there = np.isfinite(reading)
+    t, reading = record.time_s[there], reading[there]
+    block = np.floor(t * DECELERATION_RATE_HZ).astype(np.int64)
+    first = np.flatnonzero(np.diff(block, prepend=-(2**62)))
+    count = np.diff(np.append(first, len(t)))
+    mean = np.add.reduceat(reading, first) / count
+    noise = np.hypot(spec.noise_sd, spec.resolution / np.sqrt(12.0)) / np.sqrt(count)
+    value = np.column_stack([mean, np.full((len(mean), 2), np.nan)])
+    return instrument_of(
+        spec.name, DECELERATION, spec.name, np.zeros(3), np.zeros(3), np.eye(3),
+        np.add.reduceat(t, first) / count, value, np.tile(noise[:, None], (1, 3)),
     )  # fmt: skip
 
 
@@ -248,6 +297,8 @@ class NodeMotion:
     dcm_ecef_body: FloatArray
     rate_body_radps: FloatArray
     acceleration_ecef_mps2: FloatArray
+    air: Air | None = None
+    planet: Planet = WGS84
 
 
 def predict(
@@ -258,6 +309,10 @@ def predict(
     ``e`` (`SLOTS`,) are the errors. Twin of `recon._measurement_kernels.predict`.
     """
     by_state, by_error = np.zeros((3, 9)), np.zeros((3, SLOTS))
+    if instrument.kind == DECELERATION:
+        h, motion = np.zeros(3), (at.position_ecef_m, at.velocity_ecef_mps, at.acceleration_ecef_mps2)
+        _measurement_kernels.deceleration_at(at.air, e, *motion, h, by_state, by_error)
+        return h, by_state, by_error
     if instrument.kind in (FIELD, SUN):
         body = at.dcm_ecef_body.T @ known
         model = magnetometer_model if instrument.kind == FIELD else sun_model
@@ -265,7 +320,7 @@ def predict(
         by_state[: len(reading), 6:9] = by_body @ rotations.skew(body)
         return np.append(reading, np.zeros(3 - len(reading))), by_state, by_error
     c, arm, tau = at.dcm_ecef_body, instrument.arm_body_m, e[3]
-    lever_velocity = np.cross(at.rate_body_radps - earth.OMEGA_RADPS * c[2], arm)
+    lever_velocity = np.cross(at.rate_body_radps - at.planet.rate_radps * c[2], arm)
     moving = at.velocity_ecef_mps + c @ lever_velocity
     point = at.position_ecef_m + c @ arm - tau * moving + 0.5 * tau**2 * at.acceleration_ecef_mps2
     speed = moving - tau * at.acceleration_ecef_mps2
@@ -289,7 +344,7 @@ def predict(
         m, by_error[:, 0:3] = instrument.dcm, np.eye(3)
         h = m @ (point - instrument.site_ecef_m) + e[0:3]
     else:
-        h, m = _height(instrument, e, point, by_error)
+        h, m = _height(instrument, e, point, by_error, at.planet)
     by_state[:, 0:3] = m
     by_state[:, 3:6] = -tau * m
     by_state[:, 6:9] = -m @ c @ rotations.skew(arm - tau * lever_velocity)
@@ -358,9 +413,9 @@ def _site_partials(instrument: Instrument, ned: FloatArray) -> FloatArray:
 
 
 def _height(
-    instrument: Instrument, e: FloatArray, point: FloatArray, by_error: FloatArray
+    instrument: Instrument, e: FloatArray, point: FloatArray, by_error: FloatArray, planet: Planet
 ) -> tuple[FloatArray, FloatArray]:
-    latitude, longitude, height = earth.geodetic_from_ecef(point)
+    latitude, longitude, height = earth.geodetic_from_ecef(point, planet)
     m = np.zeros((3, 3))
     m[0] = -(1.0 + e[1]) * earth.dcm_ned_ecef(float(latitude), float(longitude))[2]
     above = float(height) - instrument.site_ecef_m[0]

@@ -52,8 +52,9 @@ from typing import NamedTuple
 import numpy as np
 
 from flightmodel import rotations
-from flightmodel.atmosphere import profile_from_sounding
+from flightmodel.atmosphere import bottom_m, profile_from_sounding
 from flightmodel.checks import FloatArray, IntArray
+from flightmodel.earth import WGS84, Planet
 from flightmodel.telemetry import Motion as MotionSpec
 from flightmodel.telemetry import Sounding
 from flightmodel.trajectory import interpolate_rows
@@ -79,6 +80,7 @@ class Inertial(NamedTuple):
     rate_density: FloatArray
     dcm_body_force: FloatArray
     dcm_body_rate: FloatArray
+    planet: Planet | None
 
 
 class Air(NamedTuple):
@@ -89,6 +91,7 @@ class Air(NamedTuple):
     step_m: float
     drag_m2pkg: float
     across: FloatArray
+    planet: Planet | None
 
 
 class Motion(NamedTuple):
@@ -116,6 +119,7 @@ class Motion(NamedTuple):
         A priori drag area per mass.
     across_ecef : (3,) float
         Normal of the path's plane, for the axes of side forces.
+    planet : Planet
     """
 
     ballistic: bool
@@ -132,15 +136,17 @@ class Motion(NamedTuple):
     air_step_m: float
     drag_m2pkg: float
     across_ecef: FloatArray
+    planet: Planet = WGS84
 
     def split(self) -> tuple[Inertial, Air | None]:
         """Return what kernels take: a None for the air lets them be compiled without ballistic flight."""
+        planet = None if self.planet == WGS84 else self.planet
         air = (
-            Air(self.air, self.air_from_m, self.air_step_m, self.drag_m2pkg, self.across_ecef)
+            Air(self.air, self.air_from_m, self.air_step_m, self.drag_m2pkg, self.across_ecef, planet)
             if self.ballistic
             else None
         )
-        return Inertial(*self[1:8]), air
+        return Inertial(*self[1:8], planet), air
 
     @property
     def drivers(self) -> int:
@@ -192,7 +198,11 @@ def with_exact_integrals(time_s: FloatArray, samples: FloatArray) -> FloatArray:
 
 
 def inertial_motion(
-    force: BridgedSensor, rate: BridgedSensor, node_time_s: FloatArray, clocks: bool = False
+    force: BridgedSensor,
+    rate: BridgedSensor,
+    node_time_s: FloatArray,
+    clocks: bool = False,
+    planet: Planet = WGS84,
 ) -> tuple[Motion, IntArray]:
     """Both sensors from first to last node, on the faster one's times and the nodes', and each node's index."""
     first, last = node_time_s[0], node_time_s[-1]
@@ -209,7 +219,7 @@ def inertial_motion(
         rate.spec.dcm_body_sensor,
         clocks,
     )
-    return motion, np.searchsorted(t, node_time_s).astype(np.int64)
+    return motion._replace(planet=planet), np.searchsorted(t, node_time_s).astype(np.int64)
 
 
 def _with_nodes(between: FloatArray, node_time_s: FloatArray) -> FloatArray:
@@ -282,10 +292,15 @@ def fill_between(motion: Motion, node_index: IntArray, known: IntArray, at_known
 
 def air_table(sounding: Sounding) -> FloatArray:
     """Rows of `Motion.air` on the fixed altitudes above."""
-    altitude = np.arange(AIR_FROM_M, _AIR_TO_M, AIR_STEP_M)
+    altitude = np.arange(air_from_m(sounding.planet), _AIR_TO_M, AIR_STEP_M)
     air = profile_from_sounding(sounding).at(altitude)
     wind = air.wind_ned_mps
     return np.column_stack([np.log(air.density_kgpm3), wind[:, 0], wind[:, 1], air.density_sd, air.wind_sd_mps])
+
+
+def air_from_m(planet: Planet) -> float:
+    """Lowest altitude of `air_table`, m."""
+    return AIR_FROM_M if planet == WGS84 else bottom_m(planet)
 
 
 def ballistic_motion(
@@ -300,8 +315,8 @@ def ballistic_motion(
         density[(t >= start) & (t < end)] += spec.powered_sd_mps2**2 * _POWERED_CORRELATION_S
     still = np.zeros((len(t), 3))
     motion = Motion(
-        True, t, still, still, density, still, np.eye(3), np.eye(3), False, air_table(sounding), AIR_FROM_M,
-        AIR_STEP_M, spec.drag_area_per_mass_m2pkg, across_ecef,
+        True, t, still, still, density, still, np.eye(3), np.eye(3), False, air_table(sounding),
+        air_from_m(sounding.planet), AIR_STEP_M, spec.drag_area_per_mass_m2pkg, across_ecef, sounding.planet,
     )  # fmt: skip
     return motion, np.searchsorted(t, node_time_s).astype(np.int64)
 

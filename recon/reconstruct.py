@@ -36,8 +36,9 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 import pandas as pd
 
-from flightmodel import earth, rotations
+from flightmodel import rotations
 from flightmodel.checks import FloatArray, GateError, Progress
+from flightmodel.earth import WGS84, name_of
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows
 from recon import (
@@ -56,6 +57,7 @@ from recon import (
 )
 from recon.consistency import ConsistencyCheck, held_out_table
 from recon.ekf import Problem
+from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
 from recon.fault_detection import (
     UNMODELLED_CODE,
     UnmodelledAcceleration,
@@ -120,6 +122,8 @@ class TrajectorySolution:
         What was found in the data, for other reconstructions that are to be compared with this one.
     single_faults : tuple of SingleFault
         Single hypotheses that explain what failed, the likeliest first.
+    drag : DragHistory or None
+        What the deceleration says of the air; None without accelerometer and drag.
     """
 
     smoothed: Trajectory
@@ -140,6 +144,7 @@ class TrajectorySolution:
     left_out: tuple[LeftOut, ...] = ()
     adaptation: Adaptation = NO_ADAPTATION
     single_faults: tuple[SingleFault, ...] = ()
+    drag: DragHistory | None = None
 
     @property
     def settings(self) -> Settings:
@@ -395,8 +400,9 @@ def reconstruct_once(
     if sensors is not None:
         findings += time_bias.jump_findings(adaptation.jumps or (), (sensors.force.spec.name, sensors.rate.spec.name))
     report(1.0, "done")
+    path = datum_trajectory(problem, mount, reference, smoothed.triangles)
     return TrajectorySolution(
-        smoothed=datum_trajectory(problem, mount, reference, smoothed.triangles),
+        smoothed=path,
         filtered=datum_trajectory(problem, mount, run.states(), run.filtered.p_plus),
         sensor_errors=table,
         residuals=consistency.residual_table(problem, run.innovations),
@@ -424,8 +430,12 @@ def reconstruct_once(
             "passes": passes,
             "motion": "ballistic" if problem.motion.ballistic else "strapdown",
             "hashes": dict(telemetry.hashes),
+            **_assumptions(telemetry),
         },
         adaptation=adaptation,
+        drag=drag_of_drivers(problem, reference, smoothed.triangles, path)
+        if sensors is None
+        else drag_of_readings(telemetry, path, series[0], series[1], series[3]),
     )
 
 
@@ -473,6 +483,17 @@ def linearised(telemetry: Telemetry, settings: Settings) -> Linearised:
     problem = _adapted_problem(telemetry, settings, sensors, adaptation)
     _, _, states, _, unmodelled = _iterate(problem, settings, lambda _fraction, _what: None)
     return Linearised(states, adaptation, unmodelled, sensors)
+
+
+def _assumptions(telemetry: Telemetry) -> dict[str, object]:
+    """What stands for a sensor that the flight did not have, and the planet where it is not the Earth."""
+    out: dict[str, object] = {} if telemetry.planet == WGS84 else {"planet": name_of(telemetry.planet)}
+    trim_deg = float(np.rad2deg(telemetry.motion.trim_sd_rad))
+    if trim_deg > 0.0:
+        out["attitude"] = (
+            f"assumed: trimmed, body x along the velocity against the air within {trim_deg:.2g} deg (1 sd)"
+        )
+    return out
 
 
 def _oscillation_checks(
@@ -636,14 +657,14 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
     kept = np.flatnonzero(problem.kept)
     covariance = unpacked(triangles, KINEMATIC if mounting.rate is None else INERTIAL)
     states = states[kept]
-    n = len(kept)
+    n, planet = len(kept), problem.motion.planet
     if mounting.rate is None:
         covariance[:, 6:9] = 0.0
         covariance[:, :, 6:9] = 0.0
         covariance[:, range(6, 9), range(6, 9)] = _UNKNOWN_ROTATION_VAR
         return Trajectory(
             mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m, states.velocity_ecef_mps,
-            states.q_ecef_body, np.tile(earth.OMEGA_ECEF_RADPS, (n, 1)), covariance,
+            states.q_ecef_body, np.tile(planet.rate_ecef_radps, (n, 1)), covariance, planet,
         )  # fmt: skip
     motion = problem.motion
     measured = interpolate_rows(problem.time_s[kept], mounting.rate.time_s, mounting.rate.measured_sensor)
@@ -651,7 +672,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
     c = rotations.dcm_from_q(states.q_ecef_body)
     omega = correct(measured, errors, motion.dcm_body_rate)
     r = mounting.arm_body_m
-    lever_velocity = np.cross(omega - earth.OMEGA_RADPS * c[:, 2], r)
+    lever_velocity = np.cross(omega - planet.rate_radps * c[:, 2], r)
 
     move = np.zeros((n, 9, 27))
     move[:, range(9), range(9)] = 1.0
@@ -670,6 +691,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
         states.q_ecef_body,
         omega,
         0.5 * (moved + np.swapaxes(moved, 1, 2)),
+        planet,
     )
 
 

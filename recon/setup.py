@@ -1,5 +1,7 @@
 """What is the filter given? From telemetry to nodes, instruments, error model, motion and the state at the start.
 
+A state that flight.toml gives ([start.state]) is the start, with its covariance, and no tracker is needed. Else:
+
 The attitude at the start comes from its prior through the gyros (or from a rest, or from magnetometer and Sun sensors),
 position and velocity from early track points, or from a rest. Position and velocity get a prior so wide that it carries
 no information (`_DIFFUSE_POSITION_M`, `_DIFFUSE_VELOCITY_MPS`): the fit to the first seconds of tracking only chooses
@@ -15,13 +17,14 @@ from types import MappingProxyType
 
 import numpy as np
 
-from flightmodel import earth, geomagnetism_and_sun, rotations
+from flightmodel import geomagnetism_and_sun, rotations
 from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.earth import Planet
 from flightmodel.gate import spaced
 from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesSpec
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import AttitudePrior, Telemetry
+from flightmodel.telemetry import AttitudePrior, Start, StatePrior, Telemetry
 from flightmodel.trajectory import nearest_index
 from recon import measurements
 from recon._measurement_kernels import HEIGHT, POSITION, RADAR, RANGE_RATE, VELOCITY
@@ -39,7 +42,16 @@ from recon.propagation import (
 )
 from recon.rest import levelled_attitude, rest_instruments
 from recon.settings import Settings
-from recon.state import KINEMATIC, ErrorModel, States, ballistic_blocks, imu_blocks, instrument_blocks, sun_blocks
+from recon.state import (
+    KINEMATIC,
+    ErrorModel,
+    States,
+    ballistic_blocks,
+    deceleration_blocks,
+    imu_blocks,
+    instrument_blocks,
+    sun_blocks,
+)
 from recon.triangulation import triangulated
 from recon.vector_attitude import start_attitude_from_vectors
 
@@ -55,6 +67,7 @@ _LEAST_POINTS = 4
 _TRACK_SPAN_S = 2.5
 _FIXED_RAD = 1e-6  # sd of the rotation of ballistic flight, which is held fixed
 _GYRO = slice(18, 27)
+_START_GAP_S = 0.1  # from a stated state to the sensors' first sample
 _LEAST_SURVEY_M, _LEAST_NORTH_RAD = 1e-3, 1e-9  # a millimetre, and at 1000 km too
 
 
@@ -81,15 +94,17 @@ def build_problem(
     """
     arm = _accelerometer_arm(sensors)
     instruments = tracking_instruments(telemetry, settings, arm)
+    stated = telemetry.start.state
     model = _named_model(telemetry, settings, sensors, instruments)
     used = tuple(_without_rejected(i, rejected) for i in instruments if not _is_excluded(i, settings))
     track = track_points(used)
-    start_s, end_s = _span(track[0], settings, sensors, telemetry.start.at_rest)
+    begin = (track[1][0] if stated is None else stated.position_ecef_m) if stated or len(track[0]) else np.zeros(3)
+    start_s, end_s = _span(track[0], settings, sensors, telemetry.start, used)
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
     if sensors is not None and settings.pulse_rate_hz > settings.output_rate_hz:
         output_s = _union([output_s, *_pulse_times(instruments, sensors.force, start_s, end_s, settings.pulse_rate_hz)])
     if sensors is not None:
-        instruments += rest_instruments(telemetry, start_s, track[1][0])
+        instruments += rest_instruments(telemetry, start_s, begin)
     if settings.attitude_sensors:
         instruments += _attitude_instruments(telemetry, track, start_s, end_s)
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
@@ -97,16 +112,19 @@ def build_problem(
     time_s = _union([output_s, between, *inside])
     observed, row = observe(time_s, instruments)
     if sensors is None:
-        motion, node_index = ballistic_motion(
-            telemetry.motion, telemetry.sounding, _cross_path_direction(track[1]), time_s
-        )
-        start, covariance = _start_ballistic(track, start_s, model)
+        across = _cross_path_direction(track[1]) if stated is None else _normal_of_path(stated)
+        motion, node_index = ballistic_motion(telemetry.motion, telemetry.sounding, across, time_s)
+        start, covariance = _start_ballistic(track, start_s, model, stated)
     else:
         force, rate = sensors.force, sensors.rate
         clocks = model.column(rate.spec.name, "time bias") >= 0
-        motion, node_index = inertial_motion(force, rate, time_s, clocks)
-        prior = _attitude_prior(telemetry, start_s, track[1][0])
-        start, covariance = _start_by_inertial_sensors(used, track, prior, start_s, force, rate, model)
+        motion, node_index = inertial_motion(force, rate, time_s, clocks, telemetry.planet)
+        prior = _attitude_prior(telemetry, start_s, begin)
+        attitude = _start_attitude(prior, start_s, force, rate, model, telemetry.planet)
+        point = _tracked_start(used, track, start_s) if stated is None else _stated_start(stated, arm)
+        start, covariance = _start_by_inertial_sensors(point, attitude, start_s, rate, model, telemetry.planet)
+        if stated is not None:
+            covariance[:6, :6] = stated.covariance
         if telemetry.start.at_rest is not None and telemetry.start.at_rest[0] <= start_s < telemetry.start.at_rest[1]:
             start = _start_at_rest(track, telemetry.start.at_rest, motion, start, time_s, node_index)
     motion = with_disturbances(motion, telemetry.motion)
@@ -223,21 +241,24 @@ def _accelerometer_arm(sensors: InertialSensors | None) -> FloatArray:
 
 
 def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: FloatArray) -> tuple[Instrument, ...]:
-    """Radars, receivers and barometers."""
+    """Radars, receivers and barometers, and an accelerometer that measures ballistic flight's deceleration."""
     traverse = settings.angle_noise == "traverse"
-    ballistic = telemetry.accelerometer is None
+    planet, trim_rad = telemetry.planet, telemetry.motion.trim_sd_rad
+    ballistic = telemetry.accelerometer is None or telemetry.rates is None or trim_rad > 0.0
     out: list[Instrument] = []
     for name, record in telemetry.radars.items():
         cg = telemetry.vehicle.cg_m if telemetry.vehicle is not None and record.point == "cg" else np.zeros(3)
         arm = np.zeros(3) if ballistic else cg - arm_body_m
-        radar = measurements.radar_instrument(name, record, arm, traverse)
-        doppler = measurements.range_rate_instrument(name, record, arm)
+        radar = measurements.radar_instrument(name, record, arm, traverse, planet)
+        doppler = measurements.range_rate_instrument(name, record, arm, planet)
         out += [i for i in (radar, doppler) if i is not None and len(i.time_s)]
     for name, fixes in telemetry.gnss.items():
         antenna = fixes.spec.antenna_from_datum_body_m
-        out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m)
+        out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m, planet)
     for name, heights in telemetry.barometers.items():
         out.append(measurements.barometer_instrument(name, heights, arm_body_m))
+    if telemetry.accelerometer is not None and trim_rad > 0.0:
+        out.append(measurements.deceleration_instrument(telemetry.accelerometer))
     return tuple(out)
 
 
@@ -272,6 +293,8 @@ def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, at
     """All errors that the flight file states, drivers of the motion first."""
     if sensors is None:
         blocks = ballistic_blocks(telemetry.motion)
+        if telemetry.accelerometer is not None and telemetry.motion.trim_sd_rad > 0.0:
+            blocks += deceleration_blocks(telemetry.accelerometer.spec, telemetry.motion.trim_sd_rad)
     else:
         blocks = imu_blocks(sensors.force.spec, sensors.rate.spec)
     for radar in telemetry.radars.values():
@@ -307,19 +330,26 @@ def _sites(telemetry: Telemetry) -> SitesSpec:
 
 
 def _span(
-    t: FloatArray,
-    settings: Settings,
-    sensors: InertialSensors | None,
-    at_rest: tuple[float, float] | None,
+    t: FloatArray, settings: Settings, sensors: InertialSensors | None, start: Start, used: tuple[Instrument, ...]
 ) -> tuple[float, float]:
-    """First and last time that inertial sensors and track points (n,), or a rest, cover, within the settings' span."""
-    if len(t) == 0:
+    """First and last time that inertial sensors and track points (n,), or a rest, cover, within the settings' span.
+
+    With a stated state the span begins at its time, and track points are not needed.
+    """
+    at_rest, stated = start.at_rest, start.state
+    if stated is not None:
+        start_s = stated.time_s
+        ends = [i.time_s[-1] for i in used if len(i.time_s)]
+        end_s = max([start_s, *map(float, ends)]) + settings.carry_on_s if sensors is None else np.inf
+        _check_reach(stated.time_s, settings, sensors)
+    elif len(t) == 0:
         raise GateError(
             "no radar or receiver has a usable point that is not left out, nor do angles and ranges of several sites "
             "meet in one; a trajectory needs at least one",
             code="no-track-points",
         )
-    start_s, end_s = float(t[0]), float(t[-1]) + settings.carry_on_s
+    else:
+        start_s, end_s = float(t[0]), float(t[-1]) + settings.carry_on_s
     if at_rest is not None:
         start_s = min(start_s, at_rest[0])
     if sensors is not None:
@@ -338,6 +368,25 @@ def _span(
     return float(start_s), float(end_s)
 
 
+def _check_reach(state_s: float, settings: Settings, sensors: InertialSensors | None) -> None:
+    """Raise `GateError` where a reconstruction cannot begin at the time of the stated state."""
+    words = ""
+    if settings.start_s is not None and settings.start_s > state_s:
+        words = f"the reconstruction is to begin at {settings.start_s:.3f} s; take start_s out"
+    if sensors is not None:
+        first = max(sensors.force.time_s[0], sensors.rate.time_s[0])
+        if first > state_s + _START_GAP_S:
+            words = f"accelerometer and gyros begin at {first:.3f} s; carry the state there, and its covariance"
+    if words:
+        raise GateError(f"start.state is of {state_s:.3f} s, but {words}", code="start-out-of-reach")
+
+
+def _normal_of_path(state: StatePrior) -> FloatArray:
+    """Horizontal direction (3,), ECEF, normal to the path that a state is on."""
+    normal = np.cross(state.position_ecef_m, state.velocity_ecef_mps)
+    return np.asarray(normal / np.linalg.norm(normal))
+
+
 def _output_times(start_s: float, end_s: float, rate_hz: float) -> FloatArray:
     """Multiples of the output step inside the span, and the start itself."""
     first, last = np.ceil(start_s * rate_hz - 1e-6), np.floor(end_s * rate_hz + 1e-6)
@@ -350,7 +399,7 @@ def _pulse_times(
 ) -> list[FloatArray]:
     """Multiples of the pulse's step where the descent's specific force exceeds half its largest; empty without one."""
     at, points = track_points(instruments)
-    apex_s = float(at[int(np.argmax(np.linalg.norm(points, axis=1)))])
+    apex_s = float(at[int(np.argmax(np.linalg.norm(points, axis=1)))]) if len(at) else start_s
     inside = (force.time_s >= max(start_s, apex_s)) & (force.time_s <= end_s)
     if inside.sum() < 2:
         return []
@@ -377,7 +426,7 @@ def _union(times: list[FloatArray]) -> FloatArray:
 
 
 def _start_attitude(
-    prior: AttitudePrior, start_s: float, force: BridgedSensor, rate: BridgedSensor, model: ErrorModel
+    prior: AttitudePrior, start_s: float, force: BridgedSensor, rate: BridgedSensor, model: ErrorModel, planet: Planet
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Attitude (4,) at the start, its covariance (3, 3) and its covariance with the gyros' errors (3, 9).
 
@@ -396,9 +445,9 @@ def _start_attitude(
             f"{rate.time_s[-1]:.3f} s and cannot carry it to the start at {start_s:.3f} s",
             code="attitude-prior-out-of-reach",
         )
-    motion, ends = inertial_motion(force, rate, np.array([lo, hi]))
+    motion, ends = inertial_motion(force, rate, np.array([lo, hi]), planet=planet)
     first, last = (int(ends[0]), int(ends[1])) if prior.time_s < start_s else (int(ends[1]), int(ends[0]))
-    anywhere = States(np.array([earth.SEMI_MAJOR_M, 0.0, 0.0]), np.zeros(3), q, np.zeros(model.size))
+    anywhere = States(np.array([planet.semi_major_m, 0.0, 0.0]), np.zeros(3), q, np.zeros(model.size))
     step = propagate(motion, first, last, anywhere)
     by_attitude, by_gyro = step.transition[6:9, 6:9], step.transition[6:9, _GYRO]
     gyro_var = np.diag(model.prior_sd[9:18] ** 2)
@@ -517,23 +566,34 @@ def _covariance(model: ErrorModel) -> FloatArray:
     return np.diag(sd**2)
 
 
+def _tracked_start(
+    instruments: tuple[Instrument, ...], track: Track, start_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position and velocity (3,) of the tracked point, and where it is from the accelerometer, body axes."""
+    arm = next(i.arm_body_m for i in instruments if i.kind in (RADAR, POSITION))
+    return (*fit_start(track, start_s), arm)
+
+
+def _stated_start(state: StatePrior, accelerometer_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """As `_tracked_start`, of the datum, from a stated state."""
+    return state.position_ecef_m, state.velocity_ecef_mps, -accelerometer_m
+
+
 def _start_by_inertial_sensors(
-    instruments: tuple[Instrument, ...],
-    track: Track,
-    prior: AttitudePrior,
+    point: tuple[FloatArray, FloatArray, FloatArray],
+    attitude: tuple[FloatArray, FloatArray, FloatArray],
     start_s: float,
-    force: BridgedSensor,
     rate: BridgedSensor,
     model: ErrorModel,
+    planet: Planet,
 ) -> tuple[States, FloatArray]:
     """State at the start and its covariance (9 + m, 9 + m)."""
-    q, var, cross = _start_attitude(prior, start_s, force, rate, model)
-    position, velocity = fit_start(track, start_s)
+    position, velocity, arm = point
+    q, var, cross = attitude
     sample = np.array([[np.interp(start_s, rate.time_s, column) for column in rate.measured_sensor.T]])
     w = correct(sample, np.zeros(9), rate.spec.dcm_body_sensor)[0]
-    arm = next(i.arm_body_m for i in instruments if i.kind in (RADAR, POSITION))
     c = rotations.dcm_from_q(q)
-    lever_velocity = c @ np.cross(w - c.T @ earth.OMEGA_ECEF_RADPS, arm)
+    lever_velocity = c @ np.cross(w - c.T @ planet.rate_ecef_radps, arm)
     state = States(position - c @ arm, velocity - lever_velocity, q, np.zeros(model.size))
     covariance = _covariance(model)
     covariance[6:9, 6:9] = var
@@ -566,9 +626,15 @@ def _start_at_rest(
     return place
 
 
-def _start_ballistic(track: Track, start_s: float, model: ErrorModel) -> tuple[States, FloatArray]:
+def _start_ballistic(
+    track: Track, start_s: float, model: ErrorModel, stated: StatePrior | None
+) -> tuple[States, FloatArray]:
     """State at the start and its covariance (9 + m, 9 + m), without attitude."""
-    position, velocity = fit_start(track, start_s)
     covariance = _covariance(model)
+    if stated is not None:
+        position, velocity = stated.position_ecef_m, stated.velocity_ecef_mps
+        covariance[:6, :6] = stated.covariance
+    else:
+        position, velocity = fit_start(track, start_s)
     covariance[range(6, 9), range(6, 9)] = _FIXED_RAD**2
     return States(position, velocity, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(model.size)), covariance

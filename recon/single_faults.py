@@ -144,8 +144,9 @@ def _of_either(
 
 def _turned(record: TriadRecord, matrix: FloatArray) -> TriadRecord:
     """Record whose readings, in body axes, are multiplied by a matrix."""
-    sensor = record.spec.dcm_body_sensor
-    return replace(record, measured_sensor=record.measured_sensor @ (sensor.T @ matrix @ sensor).T)
+    sensor, measured = record.spec.dcm_body_sensor, record.measured_sensor
+    turned = np.nan_to_num(measured) @ (sensor.T @ matrix @ sensor).T  # a channel that is missing leaves the others
+    return replace(record, measured_sensor=np.where(np.isfinite(measured), turned, np.nan))
 
 
 def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, float]) -> list[Single]:

@@ -43,6 +43,11 @@ from flightmodel.telemetry import Motion as MotionSpec
 
 POSITION, VELOCITY, ROTATION = slice(0, 3), slice(3, 6), slice(6, 9)
 KINEMATIC, INERTIAL = 9, 27
+# of ballistic motion, owner and name
+DRIVERS = (
+    ("vehicle", "drag"), ("vehicle", "side force across"), ("vehicle", "side force within"),
+    ("air", "density"), ("air", "wind north"), ("air", "wind east"),
+)  # fmt: skip
 Spec = TriadSpec | RadarSite | SitesSpec | GnssSpec | BarometerSpec | SunHeads
 AXES = ("x", "y", "z")
 
@@ -258,11 +263,17 @@ def instrument_blocks(table: InstrumentTable, spec: Spec, name: str = "") -> lis
         sd = getattr(spec, row.name)
         tau, walk = getattr(spec, row.time_constant[0]) if row.time_constant[0] else np.inf, 0.0
         if isinstance(spec, TriadSpec) and row.name == "bias_sd":
-            sd = float(np.hypot(sd, spec.bias_wander_sd))
-            walk = 2.0 * spec.bias_wander_sd**2 / spec.bias_time_constant_s
+            sd, walk = _bias(spec)
         if row.states and (sd > 0.0 or row.least is not None):
             blocks.append(Block(name or spec.name, row.states, row.unit, max(sd, row.least or 0.0), tau, np.inf, walk))
     return blocks
+
+
+def _bias(spec: TriadSpec) -> tuple[float, float]:
+    """Sd of a bias with its slowly varying part, and the variance by which it walks in a second."""
+    sd = float(np.hypot(spec.bias_sd, spec.bias_wander_sd))
+    walk = 2.0 * spec.bias_wander_sd**2 / spec.bias_time_constant_s
+    return sd, walk
 
 
 def imu_blocks(force: TriadSpec, rate: TriadSpec) -> list[Block]:
@@ -272,6 +283,16 @@ def imu_blocks(force: TriadSpec, rate: TriadSpec) -> list[Block]:
     if max(force.time_bias_sd_s, rate.time_bias_sd_s) > 0.0:
         blocks += [Block(spec.name, ("time bias",), "s", max(spec.time_bias_sd_s, 1e-9)) for spec in (force, rate)]
     return blocks
+
+
+def deceleration_blocks(spec: TriadSpec, trim_sd_rad: float) -> list[Block]:
+    """Errors of an accelerometer that measures ballistic flight's deceleration alone; the trim's with its scale."""
+    bias, walk = _bias(spec)
+    return [
+        Block(spec.name, ("bias",), "m/s2", max(bias, 1e-9), walk_var_per_s=walk),
+        Block(spec.name, ("scale",), "1", max(float(np.hypot(spec.scale_sd, trim_sd_rad**2)), 1e-9)),
+        Block(spec.name, ("time bias",), "s", max(spec.time_bias_sd_s, 1e-9)),
+    ]
 
 
 def sun_blocks(spec: SunHeads) -> list[Block]:
@@ -285,7 +306,7 @@ def ballistic_blocks(motion: MotionSpec) -> list[Block]:
     tau = motion.drag_time_constant_s
     return [
         Block("vehicle", ("drag",), "1", motion.drag_sd, tau),
-        Block("vehicle", ("side force across", "side force within"), "1", motion.side_sd, tau),
+        Block("vehicle", ("side force across", "side force within"), "1", motion.side_sd, motion.side_time_constant_s),
         Block("air", ("density",), "sd", 1.0, altitude_m=DENSITY_LENGTH_M),
         Block("air", ("wind north", "wind east"), "sd", 1.0, altitude_m=WIND_LENGTH_M),
     ]

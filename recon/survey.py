@@ -107,6 +107,7 @@ def _misses(
     places: tuple[KnownPlace, ...],
     settings: Settings,
 ) -> list[_Miss]:
+    planet = problem.motion.planet
     nodes = nearest_index(problem.time_s, np.array([place.time_s for place in places]))
     kept = np.zeros(len(problem.time_s), dtype=bool)
     kept[nodes] = True
@@ -118,8 +119,8 @@ def _misses(
         state = states[node]
         datum = state.position_ecef_m - rotations.dcm_from_q(state.q_ecef_body) @ arm_body_m
         ned = earth.dcm_ned_ecef(place.latitude_rad, place.longitude_rad)[: 2 if np.isnan(place.height_m) else 3]
-        height = float(earth.geodetic_from_ecef(datum)[2]) if np.isnan(place.height_m) else place.height_m
-        known = earth.ecef_from_geodetic(place.latitude_rad, place.longitude_rad, height)
+        height = float(earth.geodetic_from_ecef(datum, planet)[2]) if np.isnan(place.height_m) else place.height_m
+        known = earth.ecef_from_geodetic(place.latitude_rad, place.longitude_rad, height, planet)
         flown = np.linalg.norm(state.velocity_ecef_mps) * (place.time_s - problem.time_s[node])
         variance = np.array([place.sd_m**2, place.sd_m**2, place.height_sd_m**2])[: len(ned)] + flown**2
         response = {}
@@ -194,6 +195,8 @@ def rests_on(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
     radars = [r.site for name, r in telemetry.radars.items() if name not in settings.without]
     receivers = [name for name in telemetry.gnss if name not in settings.without]
     checked = f"; checked by {', '.join(place.name for place in telemetry.places)}" if telemetry.places else ""
+    if not radars and not receivers and telemetry.start.state is not None:
+        return (f"position, height and azimuth rest on the state at {telemetry.start.state.time_s:g} s{checked}",)
     if not radars:
         return (f"position, height and azimuth rest on the receiver {', '.join(receivers)}{checked}",)
     also = f" and on the receiver {', '.join(receivers)}" if receivers else ""

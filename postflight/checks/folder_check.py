@@ -191,7 +191,8 @@ def _facts(found: Sources) -> list[Fact]:
     spec = found.spec
     tables: list[tuple[str, str, FloatArray, FloatArray]] = []
     for name, triad in found.triads.items():
-        tables.append((name, getattr(spec.sensors, name).file, triad.time_s, triad.measured_sensor))
+        channels = triad.measured_sensor[:, np.isfinite(triad.measured_sensor).any(axis=0)]
+        tables.append((name, getattr(spec.sensors, name).file, triad.time_s, channels))
     if found.sun is not None and spec.sensors.sun is not None:
         some = np.isfinite(found.sun.az_el_head_rad).any(axis=(1, 2))
         tables.append(("sun", spec.sensors.sun.file, found.sun.time_s, np.where(some, 0.0, np.nan)[:, None]))
@@ -255,7 +256,10 @@ def _against_accelerometer(found: Sources, name: str, record: RadarRecord | Gnss
     sensed, remarks = found.triads.get("accelerometer"), report.cross_checks
     if sensed is None:
         return
-    seen = best_comparison(record.time_s, tracks.position_of(record), sensed.time_s, sensed.measured_sensor)
+    planet = found.spec.body
+    seen = best_comparison(
+        record.time_s, tracks.position_of(record, planet), sensed.time_s, sensed.measured_sensor, planet
+    )
     if seen is not None and seen.misfit < _FITS:
         if not any(f.source == "accelerometer" for f in remarks):
             remarks += inertial.against_track(found, name, seen)
@@ -265,7 +269,7 @@ def _against_accelerometer(found: Sources, name: str, record: RadarRecord | Gnss
 def _axes_and_attitude(found: Sources, record: RadarRecord | GnssRecord, report: Report) -> None:
     """Axes and attitude of the inertial sensors against one track's specific force."""
     remarks = report.cross_checks
-    force = track_force(record.time_s, tracks.position_of(record), _FORCE_WIDTH_S)
+    force = track_force(record.time_s, tracks.position_of(record, found.spec.body), _FORCE_WIDTH_S, found.spec.body)
     if force is None or "accelerometer" not in found.triads:
         return
     if not any(f.code == "accelerometer-axes" for f in remarks):
@@ -287,10 +291,10 @@ def _keep_sharp(report: Report, bias: TimeBias | None) -> TimeBias | None:
 def _against_place(found: Sources, trackers: dict[str, RadarRecord | GnssRecord], report: Report) -> None:
     """Barometers and the magnetometer's magnitude against the first track, a receiver's where there is one."""
     record = trackers[next((name for name in trackers if name in found.gnss), next(iter(trackers)))]
-    position = tracks.position_of(record)
+    position = tracks.position_of(record, found.spec.body)
     whole = np.isfinite(position).all(axis=1)
     t, position = record.time_s[whole], position[whole]
-    height = earth.geodetic_from_ecef(position)[2]
+    height = earth.geodetic_from_ecef(position, found.spec.body)[2]
     for name, barometer in found.barometers.items():
         report.cross_checks += pressure_and_field.barometer_unit(found, name, barometer, t, height)
     report.cross_checks += pressure_and_field.field_size(found, t, position)

@@ -271,7 +271,7 @@ def attitude_prior(found: Sources, force: TrackForce) -> list[Finding]:
     first = int(np.searchsorted(grid, force.time_s[clear[0]] - half))
     if not (np.isfinite(w).all() and np.isfinite(a[first:]).all()):
         return []
-    q = _as_stated_and_slipped(prior)
+    q = _as_stated_and_slipped(prior, found.spec.body)
     sums = _carried(q, np.tile(np.eye(3), (len(q), 1, 1)), grid, w, np.nan_to_num(a), force, clear)
     track = force.force_mps2[clear]
     cosine = np.einsum("cki,ki->ck", sums, track) / (np.linalg.norm(sums, axis=2) * np.linalg.norm(track, axis=1))
@@ -290,11 +290,11 @@ def attitude_prior(found: Sources, force: TrackForce) -> list[Finding]:
     return [Finding("attitude_prior", words, prior.time_s, float(force.time_s[clear[-1]]), code)]
 
 
-def _as_stated_and_slipped(prior: AttitudePrior) -> FloatArray:
+def _as_stated_and_slipped(prior: AttitudePrior, planet: earth.Planet) -> FloatArray:
     """Quaternions (1 + slips, 4), body to inertial axes: as stated, and with each slip undone."""
     q = prior.q_ecef_body
     every = [q, *(rotations.conjugate(q) if order is None else q[order] for order in _SLIPS.values())]
-    inertial = rotations.conjugate(earth.q_ecef_eci(prior.time_s))
+    inertial = rotations.conjugate(earth.q_ecef_eci(prior.time_s, planet))
     return np.array([rotations.multiply(inertial, one) for one in every])
 
 

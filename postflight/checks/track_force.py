@@ -54,6 +54,7 @@ class TrackForce:
     acceleration_mps2: FloatArray
     force_mps2: FloatArray
     covariance: FloatArray
+    planet: earth.Planet = earth.WGS84
 
     def size(self) -> tuple[FloatArray, FloatArray]:
         """Return the magnitude (n,) of the force and its standard deviation along its direction, m/s^2."""
@@ -66,7 +67,7 @@ class TrackForce:
     @property
     def relative_velocity_mps(self) -> FloatArray:
         """Velocity (n, 3) relative to the rotating Earth, inertial axes."""
-        return self.velocity_mps - np.cross(earth.OMEGA_ECEF_RADPS, self.position_m)
+        return self.velocity_mps - np.cross(self.planet.rate_ecef_radps, self.position_m)
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,9 @@ class Comparison:
     end_s: float
 
 
-def track_force(time_s: FloatArray, position_ecef_m: FloatArray, width_s: float) -> TrackForce | None:
+def track_force(
+    time_s: FloatArray, position_ecef_m: FloatArray, width_s: float, planet: earth.Planet = earth.WGS84
+) -> TrackForce | None:
     """Fit quadratics to windows of a track.
 
     Parameters
@@ -102,7 +105,7 @@ def track_force(time_s: FloatArray, position_ecef_m: FloatArray, width_s: float)
     t, p = time_s[whole], position_ecef_m[whole]
     if len(t) < _LEAST_SAMPLES:
         return None
-    p = rotations.rotate(rotations.conjugate(earth.q_ecef_eci(t)), p)
+    p = rotations.rotate(rotations.conjugate(earth.q_ecef_eci(t, planet)), p)
     rows = []
     for centre in np.arange(t[0] + width_s / 2, t[-1] - width_s / 2, width_s / _STRIDES):
         low, high = np.searchsorted(t, [centre - width_s / 2, centre + width_s / 2])
@@ -120,12 +123,16 @@ def track_force(time_s: FloatArray, position_ecef_m: FloatArray, width_s: float)
     if len(rows) < _LEAST_WINDOWS:
         return None
     centres, place, velocity, acceleration, covariance = (np.array(part) for part in zip(*rows, strict=True))
-    force = acceleration - earth.gravitation(place)
-    return TrackForce(centres, width_s, place, velocity, acceleration, force, covariance)
+    force = acceleration - earth.gravitation(place, planet)
+    return TrackForce(centres, width_s, place, velocity, acceleration, force, covariance, planet)
 
 
 def best_comparison(
-    time_s: FloatArray, position_ecef_m: FloatArray, sensed_time_s: FloatArray, sensed_mps2: FloatArray
+    time_s: FloatArray,
+    position_ecef_m: FloatArray,
+    sensed_time_s: FloatArray,
+    sensed_mps2: FloatArray,
+    planet: earth.Planet = earth.WGS84,
 ) -> Comparison | None:
     """Compare at several window widths and return the comparison of the smallest lag sd (then scale sd).
 
@@ -145,7 +152,7 @@ def best_comparison(
     """
     found = []
     for width in _WIDTHS_S:
-        force = track_force(time_s, position_ecef_m, width)
+        force = track_force(time_s, position_ecef_m, width, planet)
         one = _compare(force, sensed_time_s, sensed_mps2) if force is not None else None
         if one is not None:
             found.append(one)

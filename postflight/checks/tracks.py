@@ -50,14 +50,14 @@ def tracks(found: Sources) -> dict[str, RadarRecord | GnssRecord]:
     return {**whole, **found.gnss}
 
 
-def position_of(record: RadarRecord | GnssRecord) -> FloatArray:
+def position_of(record: RadarRecord | GnssRecord, planet: earth.Planet = earth.WGS84) -> FloatArray:
     """Return a tracker's positions (n, 3), ECEF m."""
-    return record.position_ecef_m if isinstance(record, GnssRecord) else _position(record, record.range_az_el)
+    return record.position_ecef_m if isinstance(record, GnssRecord) else _position(record, record.range_az_el, planet)
 
 
-def _position(record: RadarRecord, range_az_el: FloatArray) -> FloatArray:
+def _position(record: RadarRecord, range_az_el: FloatArray, planet: earth.Planet) -> FloatArray:
     s = record.site
-    return earth.ecef_from_radar(range_az_el, s.latitude_rad, s.longitude_rad, s.height_m)
+    return earth.ecef_from_radar(range_az_el, s.latitude_rad, s.longitude_rad, s.height_m, planet)
 
 
 # spans of time
@@ -125,7 +125,7 @@ def free_fall(found: Sources, name: str, record: RadarRecord) -> list[Finding]:
     declared = tuple(unit_of(found.spec.radars[name], q) for q in tables.RADAR)
     shares = {}
     for units in _candidates(declared):
-        tried = _reread(record, declared, units)
+        tried = _reread(record, declared, units, found.spec.body)
         if tried is not None:
             shares[units] = _share_that_falls(found, record, tried)
     own, span = shares.pop((*declared, "az el"))
@@ -152,7 +152,9 @@ def _candidates(declared: tuple[str, ...]) -> list[tuple[str, ...]]:
     ]
 
 
-def _reread(record: RadarRecord, declared: tuple[str, ...], units: tuple[str, ...]) -> FloatArray | None:
+def _reread(
+    record: RadarRecord, declared: tuple[str, ...], units: tuple[str, ...], planet: earth.Planet
+) -> FloatArray | None:
     """Positions (n, 3) as other units, or exchanged angles, would have them, ECEF m; None where they cannot be."""
     pairs = [(read_unit(new), read_unit(old)) for new, old in zip(units[:3], declared[:3], strict=True)]
     factor = [new.factor / old.factor for new, old in pairs if new is not None and old is not None]
@@ -162,7 +164,7 @@ def _reread(record: RadarRecord, declared: tuple[str, ...], units: tuple[str, ..
     elevation = values[:, 2][np.isfinite(values[:, 2])]
     if np.abs(elevation).max(initial=0.0) > 0.5 * np.pi or np.abs(values[:, 1]).max(initial=0.0) > 4 * np.pi:
         return None
-    return _position(record, values)
+    return _position(record, values, planet)
 
 
 def _share_that_falls(
@@ -170,7 +172,7 @@ def _share_that_falls(
 ) -> tuple[float | None, tuple[float, float]]:
     """Share of windows (in coast, where an accelerometer shows it) without force, and their span."""
     nothing = (np.nan, np.nan)
-    force = track_force(record.time_s, position_m, _FALL_WIDTH_S)
+    force = track_force(record.time_s, position_m, _FALL_WIDTH_S, found.spec.body)
     if force is None:
         return None, nothing
     use = _sharp(force)
@@ -211,8 +213,8 @@ def receiver_velocity(found: Sources, name: str, record: GnssRecord) -> list[Fin
     first, last = first[whole], last[whole]
     if len(first) < 6:
         return []
-    moved = earth.ned_from_ecef((p[last] - p[first]) / _STRETCH_S, p[first])
-    integrated = earth.ned_from_ecef((way[last] - way[first]) / _STRETCH_S, p[first])
+    moved = earth.ned_from_ecef((p[last] - p[first]) / _STRETCH_S, p[first], found.spec.body)
+    integrated = earth.ned_from_ecef((way[last] - way[first]) / _STRETCH_S, p[first], found.spec.body)
     span = (float(t[0]), float(t[-1]))
     slopes = [slope_through_mean(integrated[:, k], moved[:, k]) for k in range(3)]
     sure = [(k, s) for k, (s, sd) in enumerate(slopes) if sd < 0.1 * abs(s)]
@@ -253,7 +255,8 @@ def tracker_pair(found: Sources, first: str, second: str) -> tuple[list[Finding]
         Of the second's time tags against the first's, where the distance lies along the motion.
     """
     a, b = tracks(found)[first], tracks(found)[second]
-    pa, pb = position_of(a), position_of(b)
+    planet = found.spec.body
+    pa, pb = position_of(a, planet), position_of(b, planet)
     a_whole, b_whole = np.isfinite(pa).all(axis=1), np.isfinite(pb).all(axis=1)
     ta, pa, tb, pb = a.time_s[a_whole], pa[a_whole], b.time_s[b_whole], pb[b_whole]
     inside = (tb > ta[0]) & (tb < ta[-1])
@@ -263,10 +266,10 @@ def tracker_pair(found: Sources, first: str, second: str) -> tuple[list[Finding]
     tb, pb = tb[inside], pb[inside]
     other = np.column_stack([np.interp(tb, ta, c) for c in pa.T])
     off = pb - other
-    own = float(np.median(np.hypot(_sd_m(a, other), _sd_m(b, pb))))
+    own = float(np.median(np.hypot(_sd_m(a, other, planet), _sd_m(b, pb, planet))))
     distance = float(np.median(np.linalg.norm(off, axis=1)))
     span = (float(tb[0]), float(tb[-1]))
-    lag = _lag_along_motion(ta, pa, tb, other, off, max(9.0 * own**2, (0.1 * distance) ** 2))
+    lag = _lag_along_motion(ta, pa, tb, other, off, max(9.0 * own**2, (0.1 * distance) ** 2), planet)
     bias = None if lag is None else TimeBias(second, first, lag[0], own / lag[1])
     if bias is not None and bias.is_significant:
         return [], bias
@@ -280,10 +283,16 @@ def tracker_pair(found: Sources, first: str, second: str) -> tuple[list[Finding]
 
 
 def _lag_along_motion(
-    ta: FloatArray, pa: FloatArray, tb: FloatArray, other: FloatArray, off: FloatArray, most_normal_m2: float
+    ta: FloatArray,
+    pa: FloatArray,
+    tb: FloatArray,
+    other: FloatArray,
+    off: FloatArray,
+    most_normal_m2: float,
+    planet: earth.Planet,
 ) -> tuple[float, float] | None:
     """Lag of the second's tags, s, and the speed, m/s; None where the distance is not along the motion."""
-    force = track_force(ta, pa, 4.0) or track_force(ta, pa, _FALL_WIDTH_S)
+    force = track_force(ta, pa, 4.0, planet) or track_force(ta, pa, _FALL_WIDTH_S, planet)
     if force is None:
         return None
     speed = np.interp(tb, force.time_s, np.linalg.norm(force.relative_velocity_mps, axis=1))
@@ -300,7 +309,7 @@ def _lag_along_motion(
     return float(np.median(d)), float(np.median(speed[fast]))
 
 
-def _sd_m(record: RadarRecord | GnssRecord, position_m: FloatArray) -> FloatArray:
+def _sd_m(record: RadarRecord | GnssRecord, position_m: FloatArray, planet: earth.Planet) -> FloatArray:
     """Standard deviation (n,) of a track's own errors at positions (n, 3), biases with noise, m."""
     if isinstance(record, GnssRecord):
         s = record.spec
@@ -308,7 +317,7 @@ def _sd_m(record: RadarRecord | GnssRecord, position_m: FloatArray) -> FloatArra
             len(position_m), float(np.sqrt(2 * s.horizontal_sd_m**2 + s.vertical_sd_m**2 + s.wander_sd_m**2))
         )
     site = record.site
-    at = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m)
+    at = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m, planet)
     slant = np.linalg.norm(position_m - at, axis=1)
     own = [getattr(site, row.name) for row in RADAR.rows if row.unit == "rad" and row.states]
     angle = np.sqrt(2 * (site.angle_sd_rad**2 + sum(sd**2 for sd in own)))

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.earth import name_of, require_earth
 from flightmodel.flightfolder import read_flight
 from flightmodel.tabular import Tabular
 from postflight import run_folder
@@ -124,6 +125,7 @@ def reconcile(bet: Reconstruction, progress: Progress | None = None) -> Reconcil
     DivergenceError
         Where the vehicle file's joint diverges.
     """
+    require_earth(name_of(bet.telemetry.planet), "the reconciliation's simulator")
     return Reconciliation(bet, fit_joint(bet, progress=progress))
 
 
@@ -135,6 +137,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     with progress_bar() as report:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
+        require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
         compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
         flight = reconstruct(
             Flight(telemetry), Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import parse_utc
+from flightmodel.earth import require_earth
 from flightmodel.guarded_files import open_file
 from postflight.comparison import upright
 from postflight.intake.other_trajectory import read_other
@@ -40,6 +41,7 @@ def compare_with_other(run: RunTables, path: Path) -> tuple[SystematicDifference
     """
     bet = run.tables["bet"]
     epoch = run.header["epoch_utc"]
+    require_earth(run.header.get("planet", "earth"), "a comparison with another source's file")
     has_attitude = bool(bet["qw_ecef_body"].notna().all())
     trajectory = trajectory_of(bet if has_attitude else upright(bet), epoch)
     times, covariance = _covariance(run)

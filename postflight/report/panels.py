@@ -112,12 +112,13 @@ def panel_of(
 def _tracker_heights(run: Run) -> list[dict[str, Any]]:
     """Heights by each tracker's own points, as measured."""
     tracks: list[tuple[str, FloatArray, FloatArray]] = []
+    planet = run.telemetry.planet
     for name, radar in run.telemetry.radars.items():
         s = radar.site
-        places = earth.ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m)
+        places = earth.ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m, planet)
         tracks.append((name, radar.time_s, places))
     tracks += [(name, fixes.time_s, fixes.position_ecef_m) for name, fixes in run.telemetry.gnss.items()]
-    known = [(name, t, earth.geodetic_from_ecef(places)[2]) for name, t, places in tracks]
+    known = [(name, t, earth.geodetic_from_ecef(places, planet)[2]) for name, t, places in tracks]
     known += [(name, b.time_s, b.height_m) for name, b in run.telemetry.barometers.items()]
     return [_points(name, t, h / 1e3, _GREY, 4, _TRACK_POINTS // len(known)) for name, t, h in known]
 

@@ -26,6 +26,7 @@ from tests.refusing import printed_codes
 
 # what a page says that its reader has
 READER_HAS = {
+    "another-planet.md": ("examples",),
     "README.md": ("delivered", "corners.csv", "my-scenario.toml"),
     "check.md": ("my-flight",),
     "exports.md": ("my-flight",),

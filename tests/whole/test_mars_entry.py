@@ -1,0 +1,97 @@
+"""Mars entries of an independent integrator, reconstructed from an entry state and one accelerometer channel."""
+
+import numpy as np
+import pytest
+
+import postflight as pf
+from flightmodel import earth
+from flightmodel.statistics import chi_square_quantile
+from tests.oracles import mars_entry
+
+AT_S = np.array([0.0, 40.0, 60.0, 80.0, 110.0, 160.0])
+
+
+def normalised(seed, folder):
+    """NEES of place and velocity (k,), and errors of density and dynamic pressure over their sd (k - 1,)."""
+    truth = mars_entry.fly(seed)
+    mars_entry.write(truth, folder)
+    bet = pf.reconstruct(pf.read_flight(folder))
+    path, density = bet.trajectory, bet.density
+    rows = np.searchsorted(path.time_s, AT_S)
+    t = path.time_s[rows]
+
+    def on(values):
+        return np.column_stack([np.interp(t, truth.time_s, column) for column in values.T])
+
+    error = np.hstack(
+        [path.position_ecef_m[rows] - on(truth.position_m), path.velocity_ecef_mps[rows] - on(truth.velocity_mps)]
+    )
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(path.covariance[rows][:, :6, :6]), error)
+    found = density.iloc[np.searchsorted(density.time_s, AT_S[1:])]
+    t = found.time_s.to_numpy()
+    rho = np.exp(np.interp(t, truth.time_s, np.log(truth.density_kgpm3)))
+    pressure = 0.5 * rho * np.interp(t, truth.time_s, truth.airspeed_mps) ** 2
+    return (
+        nees,
+        ((found.density_kgpm3 - rho) / found.density_sd_kgpm3).to_numpy(),
+        ((found.dynamic_pressure_pa - pressure) / found.dynamic_pressure_sd_pa).to_numpy(),
+    )
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_stated(tmp_path):
+    """Over 24 flights: the mean NEES of six errors, and the spread of density and dynamic pressure at each time."""
+    flights = 24
+    found = [normalised(seed, tmp_path / f"{seed}") for seed in range(900, 900 + flights)]
+    nees, density, pressure = (np.array(part) for part in zip(*found, strict=True))
+    bound = chi_square_quantile(0.9999, 6 * flights) / flights
+    assert (nees.mean(axis=0) < bound).all(), nees.mean(axis=0)
+    most = np.sqrt(chi_square_quantile(0.9999, flights) / flights)
+    for errors in (density, pressure):
+        spread = np.sqrt(np.mean(errors**2, axis=0))
+        assert (spread < most).all(), spread
+        assert (spread > 0.2).all(), spread  # an sd five times too large helps nobody
+
+
+def test_an_entry_without_tracker_and_gyros_says_what_it_assumes(tmp_path):
+    truth = mars_entry.fly(3)
+    mars_entry.write(truth, tmp_path)
+    flight = pf.read_flight(tmp_path)
+    assert flight.telemetry.planet == earth.MARS
+    bet = pf.reconstruct(flight)
+    assert bet.solution.provenance["planet"] == "mars"
+    assert "trimmed" in bet.solution.provenance["attitude"]
+    assert not bet.has_attitude
+    peak = bet.density.loc[bet.density.dynamic_pressure_pa.idxmax()]
+    k = int(np.argmax(truth.axial_mps2))
+    assert peak.time_s == pytest.approx(truth.time_s[k], abs=1.0)
+    # Mach by Mars's gas: at 230 m/s of sound it is a third more than by the Earth's at 300
+    sound = np.sqrt(1.33 * 8314.32 / 43.49 * 177.0)
+    assert peak.mach == pytest.approx(truth.airspeed_mps[k] / sound, rel=0.06)
+
+
+def test_both_engines_agree(tmp_path):
+    mars_entry.write(mars_entry.fly(4, to_s=80.0), tmp_path)
+    flight = pf.read_flight(tmp_path)
+    paths = [
+        pf.reconstruct(flight.with_(engine=engine, output_rate_hz=2)).trajectory for engine in ("compiled", "filterpy")
+    ]
+    sd = paths[0].sd()[:, :6]
+    np.testing.assert_array_less(np.abs(paths[0].position_ecef_m - paths[1].position_ecef_m), 1e-3 * sd[:, :3])
+
+
+def test_no_function_of_the_earth_is_given_the_earth(tmp_path, monkeypatch):
+    """On Mars no conversion falls back to WGS-84: each refuses it here."""
+    truth = mars_entry.fly(5)
+    mars_entry.write(truth, tmp_path)
+    flight = pf.read_flight(tmp_path)
+    for name in ("geodetic_from_ecef", "gravitation", "q_ecef_eci", "ecef_from_geodetic", "ned_from_ecef"):
+        usual = getattr(earth, name)
+
+        def refusing(*args, _usual=usual, _name=name, **kwargs):
+            planets = [a for a in (*args, *kwargs.values()) if isinstance(a, earth.Planet)]
+            assert planets == [earth.MARS], _name
+            return _usual(*args, **kwargs)
+
+        monkeypatch.setattr(earth, name, refusing)
+    assert len(pf.reconstruct(flight).to_frame())
