@@ -196,6 +196,8 @@ def _places(telemetry: Telemetry, settings: Settings) -> list[_Place]:
             if name not in settings.without:
                 out += _of_record(kind, name, record, table_of(record_type), f"{kind}.{name}", _TRACKERS[kind])
     if telemetry.motion.model == "ballistic":
+        if telemetry.motion.trim_sd_rad > 0.0:  # the drag follows a measured deceleration: its sd is no noise
+            return out
         fields = [f for f in _BALLISTIC if getattr(telemetry.motion, f) > 0.0]
         return out + [_Place("motion", "", f, "motion", f, 1.0) for f in fields]
     for kind, table in (("accelerometer", ACCELEROMETER), ("rates", RATES)):

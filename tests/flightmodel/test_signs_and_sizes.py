@@ -55,7 +55,7 @@ def test_far_above_a_sounding_only_the_standard_is_known():
 def test_a_wind_from_the_west_goes_east():
     columns = {"wind_speed": np.array([10.0, 5.0]), "wind_from": np.deg2rad([270.0, 0.0])}
     gate = SimpleNamespace(findings=[], faults=[])
-    north, east = _winds(gate, SimpleNamespace(columns=columns))
+    north, east = _winds(gate, SimpleNamespace(columns=columns), earth.WGS84)
     np.testing.assert_allclose(north, [0.0, -5.0], atol=1e-12)
     np.testing.assert_allclose(east, [10.0, 0.0], atol=1e-12)
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from flightmodel import rotations
+from flightmodel import earth, rotations
 from flightmodel.instruments import ACCELEROMETER, GnssSpec, TriadSpec
 from flightmodel.telemetry import GnssRecord, TriadRecord
 from flightmodel.trajectory import Trajectory, difference
+from recon._measurement_kernels import RADAR
 from recon.consistency import source_checks
 from recon.fault_isolation import _compared
 from recon.imu_screening import (
@@ -158,7 +159,7 @@ def test_whiteness_is_judged_of_residuals_over_their_own_sd():
     residual, covariance = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
     residual[:, 0], covariance[:, 0, 0] = sd * z, sd**2
     variance = np.tile([1.0, np.inf, np.inf], (n, 1))
-    radar = SimpleNamespace(name="radar", owner="radar", components=("range",))
+    radar = SimpleNamespace(name="radar", owner="radar", components=("range",), kind=RADAR)
     problem = SimpleNamespace(
         time_s=np.arange(n) * 1.0, node=np.arange(n), instruments=[radar],
         observed=SimpleNamespace(variance=variance, source=np.zeros(n, dtype=int), usable=np.ones(n, dtype=bool)),
@@ -232,8 +233,9 @@ def datum_of(state, covariance, noise_sd=0.0):
         spec=SimpleNamespace(noise_sd=noise_sd),
     )  # fmt: skip
     problem = SimpleNamespace(
-        time_s=np.array([0.0, 1.0]), kept=np.array([True, True]), motion=SimpleNamespace(dcm_body_rate=np.eye(3))
-    )
+        time_s=np.array([0.0, 1.0]), kept=np.array([True, True]),
+        motion=SimpleNamespace(dcm_body_rate=np.eye(3), planet=earth.WGS84),
+    )  # fmt: skip
     mounting = Mounting("2009-08-17T12:50:00Z", arm, rate)
     return datum_trajectory(problem, mounting, state, packed(np.tile(covariance, (2, 1, 1)))), arm
 

@@ -9,7 +9,6 @@ from scipy.stats import norm
 
 from flightmodel import earth, rotations
 from recon import atmosphere, fault_detection, setup
-from recon._measurement_kernels import POSITION
 from recon.imu_screening import TransientOffset
 from recon.propagation import correct
 from recon.reconstruct import accelerometer_root, reconstruct
@@ -17,7 +16,7 @@ from recon.settings import Settings
 from recon.state import packed
 
 
-def test_a_start_is_the_datum_s_where_the_antenna_moves_about_it(monkeypatch):
+def test_a_start_is_the_datum_s_where_the_antenna_moves_about_it():
     # a turning body: places of the antenna by its attitude at three instants, and its velocity by their difference
     place, velocity = earth.ecef_from_geodetic(0.6, -1.9, 60e3), np.array([900.0, -2300.0, 400.0])
     arm, w = np.array([1.7, -0.4, 0.6]), np.array([0.7, -1.1, 0.5])
@@ -32,14 +31,13 @@ def test_a_start_is_the_datum_s_where_the_antenna_moves_about_it(monkeypatch):
         return place + t * velocity + rotations.rotate(turned, arm)
 
     seen = antenna(0.0), (antenna(step) - antenna(-step)) / (2.0 * step)
-    monkeypatch.setattr(setup, "fit_start", lambda track, start_s: seen)
-    monkeypatch.setattr(setup, "_start_attitude", lambda *_: (q, np.eye(3), np.zeros((3, 9))))
     rate = SimpleNamespace(
         time_s=np.array([9.0, 11.0]), measured_sensor=np.array([w, w]), spec=SimpleNamespace(dcm_body_sensor=np.eye(3))
     )
-    tracker = SimpleNamespace(kind=POSITION, arm_body_m=arm)
     model = SimpleNamespace(size=18, prior_sd=np.ones(18))
-    state, _ = setup._start_by_inertial_sensors((tracker,), None, None, 10.0, None, rate, model)
+    state, _ = setup._start_by_inertial_sensors(
+        (*seen, arm), (q, np.eye(3), np.zeros((3, 9))), 10.0, rate, model, earth.WGS84
+    )
     np.testing.assert_allclose(state.position_ecef_m, place, rtol=0.0, atol=1e-8)
     # differences of 6e6 m over 2 ms: 1e-6 m/s
     np.testing.assert_allclose(state.velocity_ecef_mps, velocity, rtol=0.0, atol=1e-5)
