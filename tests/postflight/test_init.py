@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 from click.testing import CliRunner
 
-from flightmodel import aerodynamics, flightfolder, geometry, instruments, vehicle
+from flightmodel import aerodynamics, entry_state, flightfolder, geometry, instruments, vehicle
 from flightmodel.tables import Source
 from postflight.cli import cli
 from postflight.flight import PULSE_RATE_HZ
@@ -25,6 +25,8 @@ TABLES = {
         "": flightfolder.FlightFile,
         "attitude_prior": flightfolder.AttitudeEntry,
         "start": flightfolder.StartEntry,
+        "start.state": entry_state.StateEntry,
+        "drag": entry_state.DragEntry,
         "motion": flightfolder.MotionEntry,
         "motion.disturbed": flightfolder.UnmodelledEntry,
         "sensors.accelerometer": instruments.TriadEntry,

@@ -50,7 +50,9 @@ def q_ecef_ned(latitude, longitude):
 
 
 # case 4: round and at rest, with NASA's constant
-ROUND_EARTH = earth.Planet(CONSTANTS["GM_m3ps2"], 0.0, ROUND_EARTH_M, 0.0, 0.0)
+ROUND_EARTH = earth.WGS84._replace(
+    gm_m3ps2=CONSTANTS["GM_m3ps2"], j2=0.0, semi_major_m=ROUND_EARTH_M, flattening=0.0, rate_radps=0.0
+)
 
 
 def fly(case, vehicle, step_s=0.005, planet=earth.WGS84, drag=1.0):
