@@ -213,6 +213,8 @@ def give(folder: Path, flight: Path, scenario: Path, names: tuple[str, ...]) -> 
             shutil.copy(ROOT / "tests" / "data" / "fisheye" / "corners_even.csv", folder / name)
         elif name == "my-scenario.toml":
             shutil.copy(scenario, folder / name)
+        elif name == "examples":  # in which commands write
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("runs"))
         else:
             (folder / name).symlink_to(ROOT / name, target_is_directory=True)
 
