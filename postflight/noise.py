@@ -53,11 +53,7 @@ def run(folder: Path, accept: bool) -> None:
 
 def accepted_values(found: NoiseLevels) -> dict[tuple[str, str], float]:
     """Levels that differ from what is stated, by table and key, to three digits."""
-    return {
-        (level.table, level.key): float(f"{level.proposed:.{DIGITS}g}")
-        for level in found.levels
-        if level.proposed != level.stated
-    }
+    return {(level.table, level.key): float(f"{level.proposed:.{DIGITS}g}") for level in found.levels if level.changed}
 
 
 def toml_lines(values: dict[tuple[str, str], float]) -> str:
@@ -143,7 +139,7 @@ def _print(found: NoiseLevels) -> None:
     for column in ("where", "stated", "proposed", "90 % interval"):
         table.add_column(column, justify="left" if column == "where" else "right")
     for level in found.levels:
-        proposed = f"{level.proposed:.3g}" if level.proposed != level.stated else ""
+        proposed = f"{level.proposed:.3g}" if level.changed else ""
         where = escape(f"[{level.table}] {level.key}")
         table.add_row(where, f"{level.stated:.4g}", proposed, f"{level.low:.2g} to {level.high:.2g}")
     console.print(table)

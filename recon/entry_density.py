@@ -98,7 +98,7 @@ def drag_of_readings(
 
 
 def density_by_drag(telemetry: Telemetry, path: Trajectory, history: DragHistory | None) -> pd.DataFrame:
-    """Density, dynamic pressure and Mach number as flown, a row a time at which the deceleration tells them.
+    """Density, dynamic pressure and Mach number as flown, a row a time at which the deceleration determines them.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How noisy are trackers, inertial sensors and the process model in this flight? The innovations' likelihood tells.
+"""How noisy are trackers, inertial sensors and the process model in this flight? By the likelihood of the innovations.
 
 Data sheets and defaults are right within a factor. The filter's innovations say what the noise of the flight was: with
 levels ``k`` (white noise, slow errors and their time constants, the noise of inertial sensors as process noise, or that
