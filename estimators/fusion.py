@@ -191,7 +191,10 @@ class NormalEquations:
         factor = self._factor(size_radps2, method)
         gain = cho_solve_banded((factor, False), self.across)
         precision = self.inputs - self.across.T @ gain
-        mean = cho_solve(cho_factor(precision), self.right_inputs - gain.T @ self.right)
+        try:
+            mean = cho_solve(cho_factor(precision), self.right_inputs - gain.T @ self.right)
+        except np.linalg.LinAlgError:
+            raise _undetermined(method) from None
         return mean, precision, self.history(cho_solve_banded((factor, False), self.right - self.across @ mean))
 
     def without_inputs(self) -> NormalEquations:

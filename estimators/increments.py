@@ -355,7 +355,8 @@ def _axial_rows(
         rows[:, size + place[name].start : size + place[name].stop] = response[:, 0]
         if name in inputs:
             want += response[:, 0] @ inputs[name]
-    share = means_over_spans(pulse.time_s, _AVERAGED_S, pulse.time_s[0])
-    var = share**2 @ axial.independent_var + share @ axial.density_density / _AVERAGED_S
+    keep = np.isfinite(want)  # of a force that points forward there is no logarithm
+    share = means_over_spans(pulse.time_s[keep], _AVERAGED_S, pulse.time_s[0])
+    var = share**2 @ axial.independent_var[keep] + share @ axial.density_density[keep] / _AVERAGED_S
     whiten = 1.0 / np.sqrt(var)
-    return whiten[:, None] * (share @ rows), whiten * (share @ want)
+    return whiten[:, None] * (share @ rows[keep]), whiten * (share @ want[keep])

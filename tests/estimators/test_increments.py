@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+from estimators import increments
 from estimators.fusion import FREE_RADPS2, NormalEquations, fuse, inverse, loads_reader
 from estimators.increments import COEFFICIENTS, SHAPE_LENGTH, STATED, Processes, estimate_increments
 from flightmodel.atmosphere import standard_atmosphere
@@ -81,9 +82,9 @@ def flown(k=0, size=0.0):
     return flown_with(slope(k, size))
 
 
-def flown_with(increments):
-    """Loads of a vehicle whose table has increments (4, k) at the knots of `PROCESSES`."""
-    vehicle = replace(VEHICLE, aero=PROCESSES.flown(VEHICLE.aero, increments))
+def flown_with(change):
+    """Loads of a vehicle whose table has increments ``change`` (4, k) at the knots of `PROCESSES`."""
+    vehicle = replace(VEHICLE, aero=PROCESSES.flown(VEHICLE.aero, change))
     state = start(12.0, [0.1, -0.15], [0.06, -0.08], np.deg2rad([2.0, -1.5]))
     truth = fly(vehicle, standard_atmosphere(), state, START_S, START_S + 12.0, EPOCH, 0.002, 0.01)
     assert truth.remark == ""
@@ -152,6 +153,18 @@ def test_what_is_stated_to_be_known_stays():
     loads = flown()
     found, _ = found_of(replace(loads, vehicle=replace(VEHICLE, uncertainty=known)))
     assert np.abs(found.mean[COEFFICIENTS.index("C_m")]).max() < 1e-4
+
+
+def test_a_sample_whose_force_points_forward_says_nothing_along_the_axis():
+    pulse = flown()
+    n = len(pulse.time_s)
+    want, response = np.ones(n), np.ones((n, 1, 1))
+    want[100], response[100] = np.nan, np.nan
+    one = increments._AxialReading(np.zeros((n, 2)), {"C_A": response}, want, np.ones(n), np.zeros(n))
+    rows, right = increments._axial_rows(one, one.by_input, {"C_A": slice(0, 1)}, {}, pulse)
+    np.testing.assert_allclose(rows[:, 2], right)  # both over the same sd
+    counts = np.round(right**2).astype(int)  # the sum of so many samples of unit variance
+    assert counts.sum() == n - 1
 
 
 def test_means_over_windows_are_taken_back():
