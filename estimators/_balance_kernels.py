@@ -206,6 +206,19 @@ def force_left(v, swing, force, rate, turning, flow, mach, airspeed, knots, tabl
 
 
 @kernel
+def axial_left(v, swing, force, rate, turning, flow, mach, airspeed, knots, table, out):
+    """Logarithm of the specific force along the shell's axis over C_A, into ``out`` (n, 1); see above."""
+    for i in range(len(out)):
+        state, w = _state(swing, i), _vector(rate[i], 0)
+        turn = _axes(state[0], state[1])
+        f = _specific_force(v, state, _vector(force[i], 0), w, _vector(turning[i], 0))
+        f = la.back(turn, f[0], f[1], f[2])
+        _, _, alpha = _nose_flow(v, state, turn, w, airspeed[i], flow[i, 0], flow[i, 1])
+        ratio = -f[0] / _coefficients(mach[i], alpha, knots, table)[0]
+        out[i, 0] = math.log(ratio) if ratio > 0.0 else math.nan
+
+
+@kernel
 def moment_left(v, swing, pressure, rate, turning, flow, mach, airspeed, knots, table, out):
     """Transverse moment of the air less the motion's over ``q S C_A``, a shift of the c.g., body y, z, m; see above."""
     for i in range(len(out)):

@@ -16,8 +16,8 @@ alone, at its nose, in shell axes::
 
 ``n`` is the unit vector of the nose's lateral velocity in the air and ``w_A`` the shell's own rate. What is left of the
 two balances are the residuals of the estimators: the force's *direction* (`force_residual`; neither mass nor dynamic
-pressure enters but through the motion) and the transverse *moment*, over ``q S C_A``, as a shift of the c.g.
-(`moment_residual`).
+pressure enters but through the motion), its *size* along the shell's axis as a logarithm (`axial_residual`) and the
+transverse *moment*, over ``q S C_A``, as a shift of the c.g. (`moment_residual`).
 
 Assumed: rigid bodies, no twist, no air on the centerbody, no difference of gravitation within the vehicle.
 
@@ -83,6 +83,18 @@ def force_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatA
     force = np.ascontiguousarray(loads.specific_force_body_mps2)
     kernels.force_left(_numbers(vehicle, loads), swing.orders, force, *motion, *_table(vehicle), out)
     return out
+
+
+def axial_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
+    """Logarithm of the force along the shell's axis over the air's ``q S C_A`` (n, 1); NaN where it points forward.
+
+    Parameters as of `force_residual`.
+    """
+    out, motion = np.empty((len(loads.time_s), 1)), _motion(loads)
+    force = np.ascontiguousarray(loads.specific_force_body_mps2)
+    kernels.axial_left(_numbers(vehicle, loads), swing.orders, force, *motion, *_table(vehicle), out)
+    mass_per_force = vehicle.mass_kg / (loads.dynamic_pressure_pa * vehicle.reference.area_m2)
+    return out + np.log(mass_per_force)[:, None]
 
 
 def moment_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:

@@ -291,13 +291,7 @@ def evidence_of_balance(
 
     base = left()
 
-    def column(changed: FloatArray, step: float) -> FloatArray:
-        return (changed - base) / step
-
-    along, none = np.eye(2), np.zeros(2)
-    by_theta = np.stack([column(left(at=swing.moved(_THETA_RAD * e, none, none)), _THETA_RAD) for e in along], -1)
-    by_rate = np.stack([column(left(at=swing.moved(none, _RATE_RADPS * e, none)), _RATE_RADPS) for e in along], -1)
-    by_turn = np.stack([column(left(at=swing.moved(none, none, _TURN_RADPS2 * e)), _TURN_RADPS2) for e in along], -1)
+    by_theta, by_rate, by_turn = swing_responses(lambda at: left(at=at), swing, base)
     solve, good = _inverse(by_theta)
     known = np.asarray(known & good)
     by_rate, by_turn = solve @ by_rate, solve @ by_turn
@@ -305,27 +299,68 @@ def evidence_of_balance(
     read += np.einsum("nij,nj->ni", by_rate, swing.rate_yz_radps)
     read += np.einsum("nij,nj->ni", by_turn, swing.acceleration_yz_radps2)
 
-    def history(name: str, step: float) -> FloatArray:
-        """Response ``(n, 2, 3)`` of the reading to a measured vector."""
-        values = getattr(loads, name)
-        moved = [left(replace(loads, **{name: values + step * e})) for e in np.eye(values.shape[1])]
-        return np.asarray(-solve @ np.stack([column(m, step) for m in moved], -1))
-
     inputs: dict[str, FloatArray] = {}
     noise = np.zeros((len(base), 2, 2))
     if with_inputs:
-        by_force = history("specific_force_body_mps2", _FORCE_MPS2)
-        noise += loads.force_noise_sd_mps2**2 * by_force @ by_force.transpose(0, 2, 1)
-        if loads.angular_acceleration_sd_radps2 > 0.0:
-            by_turning = history("angular_acceleration_body_radps2", _TURN_RADPS2)
-            noise += loads.angular_acceleration_sd_radps2**2 * by_turning @ by_turning.transpose(0, 2, 1)
-        by_flow = history("flow_yz_rad", _THETA_RAD)
-        inputs = {name: by_flow @ part for name, part in flow_inputs(loads).items()}
-        own = by_force @ loads.force_root_mps2 + history("rate_body_radps", _RATE_RADPS) @ loads.rate_root_radps
-        inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + own
-        inputs |= _other_inputs(loads, base, solve, left)
+        inputs, noise = input_responses(left, loads, base, solve)
     read = np.where(known[:, None], read, np.nan)
     return Evidence(method, loads.time_s, read, by_rate, by_turn, inputs, noise, averaged_s)
+
+
+def swing_responses(
+    left: Callable[[Swing], FloatArray], swing: Swing, base: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Derivatives (n, c, 2) of what is left of a balance (n, c) by the deflection, its rate and its acceleration."""
+    none = np.zeros(2)
+
+    def by(step: float, moved: Callable[[FloatArray], Swing]) -> FloatArray:
+        return np.stack([(left(moved(step * e)) - base) / step for e in np.eye(2)], -1)
+
+    return (
+        by(_THETA_RAD, lambda by_so_much: swing.moved(by_so_much, none, none)),
+        by(_RATE_RADPS, lambda by_so_much: swing.moved(none, by_so_much, none)),
+        by(_TURN_RADPS2, lambda by_so_much: swing.moved(none, none, by_so_much)),
+    )
+
+
+def input_responses(
+    left: Callable[..., FloatArray], loads: FlightLoads, base: FloatArray, solve: FloatArray
+) -> tuple[dict[str, FloatArray], FloatArray]:
+    """Responses of readings to every uncertain input, and the covariance of their own noise.
+
+    Parameters
+    ----------
+    left : callable
+        What is left of a balance (n, c), of loads and, as ``of``, of a vehicle.
+    loads : FlightLoads
+    base : (n, c) float
+        What is left of it as things are.
+    solve : (n, c, c) float
+        A reading is ``-solve @ left``.
+
+    Returns
+    -------
+    dict of str to (n, c, k) float
+        Per unit normal of each input that a reading responds to.
+    (n, c, c) float
+    """
+
+    def history(name: str, step: float) -> FloatArray:
+        """Response ``(n, c, 3)`` of the reading to a measured vector."""
+        values = getattr(loads, name)
+        moved = [left(replace(loads, **{name: values + step * e})) for e in np.eye(values.shape[1])]
+        return np.asarray(-solve @ np.stack([(m - base) / step for m in moved], -1))
+
+    by_force = history("specific_force_body_mps2", _FORCE_MPS2)
+    noise = loads.force_noise_sd_mps2**2 * by_force @ by_force.transpose(0, 2, 1)
+    if loads.angular_acceleration_sd_radps2 > 0.0:
+        by_turning = history("angular_acceleration_body_radps2", _TURN_RADPS2)
+        noise += loads.angular_acceleration_sd_radps2**2 * by_turning @ by_turning.transpose(0, 2, 1)
+    by_flow = history("flow_yz_rad", _THETA_RAD)
+    inputs = {name: by_flow @ part for name, part in flow_inputs(loads).items()}
+    own = by_force @ loads.force_root_mps2 + history("rate_body_radps", _RATE_RADPS) @ loads.rate_root_radps
+    inputs[ACCELEROMETER] = inputs[ACCELEROMETER] + own
+    return inputs | _other_inputs(loads, base, solve, left), noise
 
 
 def _other_inputs(

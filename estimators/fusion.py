@@ -18,7 +18,7 @@ with the normal matrix ``N`` and right-hand side ``b`` of the readings and the p
     log p(readings | s) = log det Q(s) / 2 - log det(N + Q(s)) / 2 + b' (N + Q(s))^-1 b / 2 + constant,
 
 times a prior of ``s`` (`SIZE_RADPS2`, `SIZE_LOG_SD`) that says little. The process has no say in the inputs: these are
-found with a free one (`_FREE_RADPS2`), so that only what the methods read counts. A swing is a line in the spectrum;
+found with a free one (`FREE_RADPS2`), so that only what the methods read counts. A swing is a line in the spectrum;
 priced by a white process at every one of some 600 knots it would be cheaper to take as an error of C_N, by up to ten
 of its standard deviations.
 
@@ -33,7 +33,7 @@ information). D. J. C. MacKay, "Bayesian interpolation", Neural Computation 4 (1
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -57,12 +57,13 @@ from estimators.loads import FlightLoads
 from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory, history_from_lateral
 from flightmodel.trajectory import nearest_index
+from flightmodel.vehicle import Vehicle
 
 KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its oscillation
 # a priori of the process's size, median and sd of its logarithm: a degree of swing at 2 Hz, between a degree at 0.5 Hz
 # and ten at 3 Hz
 SIZE_RADPS2, SIZE_LOG_SD = 3.0, 1.5
-_SIZES_RADPS2, _FREE_RADPS2 = (1e-3, 1e3), 1e3  # within which it is looked for; ten degrees of swing at 12 Hz
+_SIZES_RADPS2, FREE_RADPS2 = (1e-3, 1e3), 1e3  # within which it is looked for; ten degrees of swing at 12 Hz
 DEFLECTION_SD_RAD = 1.0  # of the deflection itself: no information
 # neglected by the methods' equations, second order in the angles and gusts shorter than the wind's knots: with true
 # inputs 0.01 to 0.02 deg rms over the pulses of thirty flights, decorrelated within half a second
@@ -148,17 +149,17 @@ class NormalEquations:
     @classmethod
     def of(cls, readings: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> NormalEquations:
         """Equations of the methods' readings at ``inputs``; the spline reaches over ``span_s``."""
-        spline = Spline.over(*span_s)
-        place: dict[str, slice] = {}
-        total = 0
-        for name, response in (item for e in readings for item in e.by_input.items()):
-            if name not in place:
-                place[name] = slice(total, total + response.shape[2])
-                total = place[name].stop
-        size = 2 * spline.count
+        spline, place = Spline.over(*span_s), places(e.by_input for e in readings)
+        return cls.of_rows(spline, place, (whitened(one, spline, place, inputs) for one in readings))
+
+    @classmethod
+    def of_rows(
+        cls, spline: Spline, place: dict[str, slice], parts: Iterable[tuple[FloatArray, FloatArray]]
+    ) -> NormalEquations:
+        """Equations of rows (r, unknowns) of the least-squares problem and their right-hand sides, of unit variance."""
+        size, total = 2 * spline.count, max((p.stop for p in place.values()), default=0)
         normal, right = np.zeros((size + total,) * 2), np.zeros(size + total)
-        for one in readings:
-            rows, want = whitened(one, spline, place, inputs)
+        for rows, want in parts:
             normal += rows.T @ rows
             right += rows.T @ want
         own = normal[size:, size:] + np.eye(total)
@@ -172,9 +173,8 @@ class NormalEquations:
             factor = cho_factor(normal)[0]
         except np.linalg.LinAlgError:
             raise _undetermined(method) from None
-        upper = np.triu(dpotri(factor)[0])
         right = np.concatenate([self.right, self.right_inputs])
-        return cho_solve((factor, False), right), upper + np.triu(upper, 1).T
+        return cho_solve((factor, False), right), _inverse_of_factor(factor)
 
     def smoothed(self, inputs: InputPosterior, method: str) -> tuple[FloatArray, FloatArray, float]:
         """Mean and covariance of all unknowns, of inputs found without the process, and the process's size."""
@@ -185,6 +185,17 @@ class NormalEquations:
         across = by_input @ inputs.covariance
         covariance = np.block([[own + across @ by_input.T, across], [across.T, inputs.covariance]])
         return np.concatenate([own @ given.right, inputs.mean]), covariance, size_radps2
+
+    def of_inputs(self, size_radps2: float, method: str) -> tuple[FloatArray, FloatArray, Deflection]:
+        """Posterior mean and precision of the inputs, the deflection integrated over, and the deflection's mean."""
+        factor = self._factor(size_radps2, method)
+        gain = cho_solve_banded((factor, False), self.across)
+        precision = self.inputs - self.across.T @ gain
+        try:
+            mean = cho_solve(cho_factor(precision), self.right_inputs - gain.T @ self.right)
+        except np.linalg.LinAlgError:
+            raise _undetermined(method) from None
+        return mean, precision, self.history(cho_solve_banded((factor, False), self.right - self.across @ mean))
 
     def without_inputs(self) -> NormalEquations:
         """Equations of the deflection alone, the inputs being anything that their priors allow."""
@@ -231,6 +242,17 @@ class NormalEquations:
         return SplineDeflection(self.spline, found[: 2 * self.spline.count].reshape(-1, 2))
 
 
+def _inverse_of_factor(factor: FloatArray) -> FloatArray:
+    """Inverse of the matrix whose upper Cholesky factor is given."""
+    upper = np.triu(dpotri(factor)[0])
+    return np.asarray(upper + np.triu(upper, 1).T)
+
+
+def inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of a positive definite matrix."""
+    return _inverse_of_factor(cho_factor(matrix)[0])
+
+
 def _undetermined(method: str) -> DivergenceError:
     return DivergenceError(f"{method}: the readings do not determine the deflection", code="deflection-undetermined")
 
@@ -241,6 +263,17 @@ def _upper_band(matrix: FloatArray) -> FloatArray:
     out = np.zeros((width + 1, len(matrix)))
     for k in range(width + 1):
         out[width - k, k:] = np.diagonal(matrix, k)
+    return out
+
+
+def places(of: Iterable[dict[str, FloatArray]]) -> dict[str, slice]:
+    """Place of each input's unit normals among all, of responses (n, c, k) by name."""
+    out: dict[str, slice] = {}
+    total = 0
+    for name, response in (item for by_input in of for item in by_input.items()):
+        if name not in out:
+            out[name] = slice(total, total + response.shape[2])
+            total = out[name].stop
     return out
 
 
@@ -372,10 +405,10 @@ def fuse(
     methods = [e.method for e in readings]
     # first every sample by itself, without shared errors: a deflection to be linear about
     inputs: Inputs = _initial_time_bias(readings, method)
-    span = _span(readings)
+    span = span_of(readings)
     alone = [_uncorrelated(moved_evidence(e, inputs)) for e in readings]
     problem = NormalEquations.of(alone, {}, span)
-    found, size_radps2 = problem.mean(problem.process_size(), method), _FREE_RADPS2
+    found, size_radps2 = problem.mean(problem.process_size(), method), FREE_RADPS2
     for step in range(MOST_STEPS):
         readings = [e for e in read(inputs, problem.history(found)) if e.method in methods]
         if min(np.isfinite(e.theta_yz_rad).all(axis=1).sum() for e in readings) < LEAST_SAMPLES:
@@ -477,7 +510,7 @@ def _uncorrelated(one: Evidence) -> Evidence:
     return replace(one, by_input={}, independent_cov=one.covariance)
 
 
-def _span(readings: list[Evidence]) -> tuple[float, float]:
+def span_of(readings: list[Evidence]) -> tuple[float, float]:
     """First and last time of all readings, whatever their time biases."""
     wide = [_FARTHEST_BIAS_SD * e.time_bias_sd_s for e in readings]
     low = min(e.time_s[0] - w for e, w in zip(readings, wide, strict=True))
@@ -493,7 +526,7 @@ def time_bias_is_observable(read: Read) -> bool:
     off, own = [e for e in readings if e.time_bias_sd_s > 0.0], [e for e in readings if e.time_bias_sd_s == 0.0]
     if not off or not own:
         return False
-    span = _span(own)
+    span = span_of(own)
     # a constant error does not move
     problem = NormalEquations.of([replace(e, by_input={}) for e in own], {}, span)
     try:
@@ -517,7 +550,7 @@ def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
     off, own = [e for e in readings if e.time_bias_sd_s > 0.0], [e for e in readings if e.time_bias_sd_s == 0.0]
     if not off or not own:
         return {}
-    span = _span(own)
+    span = span_of(own)
     problem = NormalEquations.of([_uncorrelated(e) for e in own], {}, span)
     deflection = problem.history(problem.mean(problem.process_size(), method))
     starts = {one.time_bias: _lowest_bias_sd(one, deflection, span) for one in off}
@@ -542,28 +575,39 @@ def _lowest_bias_sd(one: Evidence, deflection: Deflection, span: tuple[float, fl
     return float(late_s[best] / one.time_bias_sd_s)
 
 
-def loads_reader(
-    loads: FlightLoads, methods: dict[str, Method], others: list[Evidence]
-) -> Read:  # fmt: skip
+@dataclass(frozen=True)
+class LoadsReader:
     """Reader for `fuse`: methods that read the flight loads, and others whose readings are given.
 
     Inputs scale the measurements, and would scale their noise too, which no input can have made smaller: they act only
-    on the measurements' part that the spline can follow.
+    on the measurements' part that the spline can follow, ``smooth``.
     """
-    pulse = loads.rows(loads.through_pulse)
-    smooth = _smoothed_loads(pulse)
 
-    def read(inputs: Inputs, about: Deflection | None) -> list[Evidence]:
+    pulse: FlightLoads
+    smooth: FlightLoads
+    methods: dict[str, Method]
+    others: list[Evidence]
+
+    def with_vehicle(self, vehicle: Vehicle) -> LoadsReader:
+        """Return the reader of the same measurements of another vehicle."""
+        return replace(self, pulse=replace(self.pulse, vehicle=vehicle), smooth=replace(self.smooth, vehicle=vehicle))
+
+    def __call__(self, inputs: Inputs, about: Deflection | None) -> list[Evidence]:
+        """Readings, as `fuse` asks for them."""
         if about is None:
-            return [*(method(pulse) for method in methods.values()), *others]
-        moved, out = corrected_loads(smooth, inputs), []
-        for method in methods.values():
+            return [*(method(self.pulse) for method in self.methods.values()), *self.others]
+        moved, out = corrected_loads(self.smooth, inputs), []
+        for method in self.methods.values():
             found = method(moved, about)
-            raw, even = (method(one, about, with_inputs=False).theta_yz_rad for one in (pulse, smooth))
+            raw, even = (method(one, about, with_inputs=False).theta_yz_rad for one in (self.pulse, self.smooth))
             out.append(replace(found, theta_yz_rad=found.theta_yz_rad + raw - even))
-        return [*out, *(moved_evidence(other, inputs, about) for other in others)]
+        return [*out, *(moved_evidence(other, inputs, about) for other in self.others)]
 
-    return read
+
+def loads_reader(loads: FlightLoads, methods: dict[str, Method], others: list[Evidence]) -> LoadsReader:
+    """Reader of the loads through the pressure pulse."""
+    pulse = loads.rows(loads.through_pulse)
+    return LoadsReader(pulse, _smoothed_loads(pulse), methods, others)
 
 
 def _smoothed_loads(loads: FlightLoads) -> FlightLoads:

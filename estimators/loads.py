@@ -55,6 +55,9 @@ class FlightLoads:
         A priori sd of the sensors' time biases, s; zero: none.
     cg_from_sensor_m : (3,) float
         Arm over which the gyros carried the accelerometer's reading to the c.g., body axes.
+    half_window_s : float
+        Force and rate are means over so much to both sides; the angular acceleration is the difference of the rate's
+        means over whole windows before and after.
 
     Raises
     ------
@@ -84,6 +87,7 @@ class FlightLoads:
     accelerometer_time_bias_sd_s: float = 0.0
     gyro_time_bias_sd_s: float = 0.0
     cg_from_sensor_m: FloatArray = field(default_factory=lambda: np.zeros(3))
+    half_window_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Check shapes once."""

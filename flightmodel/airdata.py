@@ -98,12 +98,16 @@ def pressure_pulse(dynamic_pressure_pa: FloatArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What may err: a trajectory's rows, and departures of winds (n, 2), log density (n,), temperature (n,)."""
+    """What may err: a trajectory's rows, and departures of winds (n, 2), log density (n,), temperature (n,).
+
+    ``higher_m`` (n,) is by how much the profile, measured from the path, errs in height with it.
+    """
 
     trajectory: Trajectory
     wind_mps: FloatArray
     log_density: FloatArray
     temperature_k: FloatArray
+    higher_m: FloatArray
 
 
 @dataclass(frozen=True)
@@ -150,7 +154,7 @@ def _flow(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) ->
     path = inputs.trajectory
     r, q = path.position_ecef_m, path.q_ecef_body
     lat, lon, altitude = earth.geodetic_from_ecef(r, path.planet)
-    air = profile.at(altitude)
+    air = profile.at(altitude - inputs.higher_m)
     dcm_ned_ecef, dcm_ecef_body = earth.dcm_ned_ecef(lat, lon), rotations.dcm_from_q(q)
     spin = path.omega_body_eci_body_radps - dcm_ecef_body.transpose(0, 2, 1) @ path.planet.rate_ecef_radps
     ground = path.velocity_ecef_mps + rotations.rotate(q, np.cross(spin, arm_body_m))
@@ -177,7 +181,7 @@ def _flow(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) ->
 
 def _as_stated(trajectory: Trajectory) -> Inputs:
     n = len(trajectory.time_s)
-    return Inputs(trajectory, np.zeros((n, 2)), np.zeros(n), np.zeros(n))
+    return Inputs(trajectory, np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n))
 
 
 def air_data(trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: FloatArray) -> AirData:
@@ -306,16 +310,6 @@ def is_angle(name: str) -> bool:
     return name in ANGLES or name.startswith(("path_", "heading_", "clock_", "alpha_total_"))
 
 
-def temperature_sd(altitude_m: FloatArray, planet: earth.Planet = earth.WGS84) -> FloatArray:
-    """Usual error of datasonde and sphere temperatures, K: 1 at 30 km, 3 at 70 km, 5 from 80 km (1 sd).
-
-    Of Mars, what season, hour and dust do to the standard's: 15 to 50 km, 25 from 100 km (assumed).
-    """
-    if planet != earth.WGS84:
-        return np.asarray(np.interp(altitude_m, [50e3, 100e3], [15.0, 25.0]))
-    return np.asarray(np.interp(altitude_m, [30e3, 70e3, 80e3], [1.0, 3.0, 5.0]))
-
-
 def derived_with_sd(
     trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: FloatArray
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
@@ -325,7 +319,14 @@ def derived_with_sd(
     value = derived(nothing, profile, arm_body_m)
     air = profile.at(value["altitude"])
     root: FloatArray = np.asarray(np.linalg.cholesky(trajectory.covariance + 1e-18 * np.eye(9)), dtype=np.float64)
-    warm = temperature_sd(value["altitude"], trajectory.planet)
+    warm = profile.temperature_sd(value["altitude"])
+
+    def with_path(path: Trajectory) -> FloatArray:
+        if profile.met_m is None:
+            return nothing.higher_m
+        low, high = profile.met_m
+        higher = earth.geodetic_from_ecef(path.position_ecef_m, path.planet)[2] - value["altitude"]
+        return np.where((value["altitude"] >= low) & (value["altitude"] <= high), higher, 0.0)
 
     def moved(k: int, sign: float) -> dict[str, FloatArray]:
         if k < 9:
@@ -336,7 +337,7 @@ def derived_with_sd(
                 velocity_ecef_mps=trajectory.velocity_ecef_mps + step[:, 3:6],
                 q_ecef_body=rotations.boxplus(trajectory.q_ecef_body, step[:, 6:9]),
             )
-            return derived(replace(nothing, trajectory=path), profile, arm_body_m)
+            return derived(replace(nothing, trajectory=path, higher_m=with_path(path)), profile, arm_body_m)
         if k < 11:
             wind = np.zeros((n, 2))
             wind[:, k - 9] = sign * air.wind_sd_mps

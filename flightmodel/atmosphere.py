@@ -243,6 +243,17 @@ def default_sounding_sd(altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]
     return density, np.interp(altitude_m, knots, [2.0, 4.0, 4.0, 8.0, 8.0, 15.0])
 
 
+def temperature_sd(altitude_m: FloatArray, planet: Planet = WGS84) -> FloatArray:
+    """Usual error of datasonde and sphere temperatures, K: 1 at 30 km, 3 at 70 km, 5 from 80 km (1 sd).
+
+    Of Mars, what season, hour and dust do to the standard's: 20 to 50 km, 35 from 80 km (assumed; Pathfinder met 92 K
+    at 80 km, 45 K below it: Schofield et al., Science 278 (1997) 1752).
+    """
+    if planet != WGS84:
+        return np.asarray(np.interp(altitude_m, [50e3, 80e3], [20.0, 35.0]))
+    return np.asarray(np.interp(altitude_m, [30e3, 70e3, 80e3], [1.0, 3.0, 5.0]))
+
+
 def sounding_correlation(altitude_m: FloatArray, length_m: float) -> FloatArray:
     """Correlation ``(n, n)`` of a sounding's error between altitudes (n,); the length is that of density or wind."""
     return correlation(altitude_m, length_m, SOUNDING_CONSTANT_PART)
@@ -274,6 +285,9 @@ class AtmosphereProfile:
     wind_sd_mps: FloatArray
     fade_m: float = 10000.0
     planet: Planet = WGS84
+    temperature_sd_k: FloatArray | None = None  # at the knots; None: the usual one, `temperature_sd`
+    # heights between which a flight's own deceleration measured it: an error of the path's height is the profile's, too
+    met_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Check once."""
@@ -305,6 +319,14 @@ class AtmosphereProfile:
             density_sd=column(self.density_sd) * fade + 0.15 * (1.0 - fade),
             wind_sd_mps=column(self.wind_sd_mps) * fade + 20.0 * (1.0 - fade),
         )
+
+    def temperature_sd(self, altitude_m: FloatArray) -> FloatArray:
+        """Standard deviation of the temperature, K, at geometric altitudes, m; beyond the knots the usual one."""
+        usual = temperature_sd(altitude_m, self.planet)
+        if self.temperature_sd_k is None:
+            return usual
+        inside = (altitude_m >= self.altitude_m[0]) & (altitude_m <= self.altitude_m[-1])
+        return np.where(inside, np.interp(altitude_m, self.altitude_m, self.temperature_sd_k), usual)
 
 
 def profile_from_sounding(sounding: Sounding) -> AtmosphereProfile:

@@ -172,6 +172,8 @@ def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Fault]:
     if item["type"] == "missing":
         return [Fault(f"{where}: key '{key}' is missing", "key-missing")]
     words = item["msg"].removeprefix("Value error, ")
+    if item["type"] == "model_type":
+        words = f"a table is wanted here, with keys among {', '.join(_keys_beside(model, path))}"
     cause = item.get("ctx", {}).get("error")
     if isinstance(cause, KeyFaults):
         return [

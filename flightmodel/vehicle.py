@@ -165,7 +165,7 @@ class Uncertainty(Section):
 
     Mass, c.g. and inertia are each body's own; products of inertia are the centerbody's, of its transverse moment;
     C_mq's is absolute. ``ca_shape_part`` is the part of the variance of C_A that changes with Mach number; the rest is
-    one factor at all of them.
+    one factor at all of them; ``cn_shape_part`` and so on alike.
     """
 
     mass: Fraction = 0.01
@@ -176,8 +176,11 @@ class Uncertainty(Section):
     ca: Fraction = 0.03
     ca_shape_part: Fraction = 0.5
     cn: Fraction = 0.07
+    cn_shape_part: Fraction = 0.5
     cm: Fraction = 0.10
+    cm_shape_part: Fraction = 0.5
     cmq: Annotated[float, Field(ge=0.0, le=10.0)] = 0.15
+    cmq_shape_part: Fraction = 0.5
 
 
 class SensorMount(Section):

@@ -35,7 +35,15 @@ if TYPE_CHECKING:
     from flightmodel.trajectory import Trajectory
     from flightmodel.vehicle import read_vehicle
     from postflight import plots
-    from postflight.deflections import Deflections, estimate_camera, estimate_misalignment, estimate_trim, fuse
+    from postflight.aero_increments import AeroIncrements
+    from postflight.deflections import (
+        Deflections,
+        aero_increments,
+        estimate_camera,
+        estimate_misalignment,
+        estimate_trim,
+        fuse,
+    )
     from postflight.flight import Flight, read_flight
     from postflight.interface import check_flight, compare, monte_carlo, score, simulate, write_report
     from postflight.reconciliation.command import reconcile
@@ -57,6 +65,8 @@ _DOOR = {
     "estimate_misalignment": "postflight.deflections",
     "estimate_trim": "postflight.deflections",
     "fuse": "postflight.deflections",
+    "aero_increments": "postflight.deflections",
+    "AeroIncrements": "postflight.aero_increments",
     "Deflections": "postflight.deflections",
     "DeflectionHistory": "flightmodel.deflection",
     "read_vehicle": "flightmodel.vehicle",
@@ -70,12 +80,14 @@ _DOOR = {
 }
 
 __all__ = [
+    "AeroIncrements",
     "DeflectionHistory",
     "Deflections",
     "Flight",
     "Reconstruction",
     "Settings",
     "Trajectory",
+    "aero_increments",
     "air_data",
     "check_flight",
     "compare",

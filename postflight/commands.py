@@ -22,7 +22,7 @@ from estimators.calibration import calibrate_lens, read_corners
 from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
 from postflight import run_folder, warmup
-from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate
+from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
 from postflight.filming import NO_VIDEO, by_camera
 from postflight.flight import Flight, read_flight
 from postflight.progress import progress_bar
@@ -167,6 +167,7 @@ def run(
             print_answers(answers)
 
     _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers, stages)
+    print_increments(answers)
     if reruns:
         print_sensitivity(run_folder.read_csv(written / "sensitivity.csv"))
     console.print(f"results in {escape(str(written))}, to read in report.html")
@@ -213,8 +214,10 @@ def run_flight(
         stages.end("printing the answers")
         with progress_bar() as report:
             step = steps(report)
+            answers = with_increments(answers)
+            stages.end("aerodynamic increments")
             bounds, reran = _write_rest(out, bet, answers, reruns, step)
-            second.draw_studies(bounds, reran)
+            second.draw_studies(bounds, reran, answers.increments)
             stages.end("bounds of the rigid vehicle")
             run_folder.write_reconstruction(out, bet, answers)
             run_folder.write_answers(out, answers)
@@ -344,7 +347,7 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         line("[yellow]found[/]", "the data end before or begin after the peak of dynamic pressure", "peak-outside-data")
     for finding in (*flight.findings, *run_folder.without_attitude(flight)):
         line("[yellow]found[/]", str(finding), finding.code)
-    for reason in flight.missing:
+    for reason in () if flight.density is not None else flight.missing:  # that is as flown, too
         line("[yellow]left out[/]", f"as-flown atmosphere: {reason}", reason.code)
     if flight.attitude is not None and flight.attitude.comparison is not None:
         console.print(escape(flight.attitude.remark))
@@ -367,6 +370,18 @@ def print_checks(checks: tuple[ConsistencyCheck, ...]) -> None:
 def line(mark: str, words: str, code: str = "") -> None:
     """Print a finding, refusal or failed check with its code in brackets at the end."""
     console.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}")
+
+
+def print_increments(answers: Deflections) -> None:
+    """Aerodynamic increments in one line, and in red those that the preflight table does not allow."""
+    if answers.no_increments is not None:
+        line("[yellow]left out[/]", str(answers.no_increments), answers.no_increments.code)
+    if answers.increments is None:
+        return
+    console.print(f"against the preflight table, {escape(answers.increments.about)}")
+    for check in answers.increments.consistency_checks:
+        if not check.passed:
+            line("[red]check failed[/]", f"{check.name}: {check.remark}", check.code)
 
 
 def print_sensitivity(found: pd.DataFrame) -> None:

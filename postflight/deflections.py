@@ -14,6 +14,7 @@ from estimators.trim import estimate_trim as trim_history
 from flightmodel.checks import Fault, FloatArray, GateError, Progress
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
+from postflight.aero_increments import AeroIncrements, increments_of
 from postflight.filming import CameraAnswer, camera_answer, with_largest
 from postflight.flight import Flight
 from postflight.fusing import FusedAnswer, fuse_flight
@@ -42,6 +43,9 @@ class Deflections(Tabular):
         What stands behind the camera's, of one camera or several, and its answer at any time.
     bet : Reconstruction or None
         What they were made from; None where the camera answered without a trajectory.
+    increments : AeroIncrements or None
+        Of the aerodynamic coefficients, where they were asked for (`with_increments`); ``no_increments`` says why not.
+    no_increments : Fault or None
     """
 
     histories: dict[str, DeflectionHistory] = field(default_factory=dict)
@@ -49,6 +53,8 @@ class Deflections(Tabular):
     fused: FusedAnswer | None = None
     camera: CameraAnswer | None = field(default=None, compare=False)
     bet: Reconstruction | None = None
+    increments: AeroIncrements | None = field(default=None, compare=False)
+    no_increments: Fault | None = None
 
     @property
     def history(self) -> DeflectionHistory:
@@ -90,10 +96,11 @@ class Deflections(Tabular):
 
     @property
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
-        """Whether several cameras agree, whether the methods do, and whether they have a common answer."""
+        """Whether cameras agree, methods do, they have a common answer, and coefficients are as stated."""
         of_cameras = () if self.camera is None else self.camera.consistency_checks
         if self.fused is not None:
-            return (*of_cameras, *self.fused.consistency_checks)
+            of_table = () if self.increments is None else self.increments.consistency_checks
+            return (*of_cameras, *self.fused.consistency_checks, *of_table)
         reason = self.refused.get("fused")
         if reason is None or reason.code not in NO_COMMON_ANSWER:
             return of_cameras
@@ -259,6 +266,40 @@ def estimate(
             answers.refused[method] = Fault(f"no sample has an answer ({history.assumptions})", "no-answer")
     report(1.0, "estimated")
     return replace(answers, fused=fused, camera=filmed)
+
+
+def with_increments(answers: Deflections) -> Deflections:
+    """Answers with the increments of the aerodynamic coefficients, or why there are none.
+
+    Without a fused answer there are none, and nothing is said of them.
+    """
+    if answers.fused is None or answers.bet is None:
+        return answers
+    confidence, name = answers.bet.solution.settings.check_confidence, answers.bet.telemetry.name
+    try:
+        return replace(answers, increments=increments_of(answers.fused, confidence, name))
+    except GateError as fault:
+        return replace(answers, no_increments=Fault(str(fault), fault.codes[0]))
+
+
+def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> AeroIncrements:
+    """Increments of C_A, C_N, C_m and C_mq along Mach number against the vehicle's preflight table.
+
+    Parameters
+    ----------
+    bet : Reconstruction
+    answers : Deflections, optional
+        Of `fuse`; else it is made.
+
+    Raises
+    ------
+    GateError
+        Where there is no fused deflection, or the increments do not settle.
+    """
+    found = fuse(bet) if answers is None else answers
+    if found.fused is None:
+        raise GateError([found.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))])
+    return increments_of(found.fused, bet.solution.settings.check_confidence, bet.telemetry.name)
 
 
 def _part(report: Progress, number: int, parts: int) -> Progress:

@@ -21,7 +21,16 @@ import pandas as pd
 
 from estimators.agreement import CONFIDENCE, HYPOTHESES, Agreement, agreement, fault_hypotheses
 from estimators.evidence import CAMERA_TIME_BIAS, evidence_of_history, moved_evidence
-from estimators.fusion import FarInputsError, Fused, Method, Read, fuse, loads_reader, time_bias_is_observable
+from estimators.fusion import (
+    FarInputsError,
+    Fused,
+    LoadsReader,
+    Method,
+    Read,
+    fuse,
+    loads_reader,
+    time_bias_is_observable,
+)
 from estimators.loads import MIN_AXIAL_MPS2, FlightLoads
 from estimators.misalignment import estimate_misalignment, misalignment_evidence
 from estimators.southwell import Limbs, southwell_limbs
@@ -76,6 +85,8 @@ class FusedAnswer:
         Method that contradicts the others, which agree without it.
     alternatives : tuple of str
         What the answer is a mixture of, in words; empty where the readings agree.
+    reader : LoadsReader or None
+        Of what the loads say, and the camera where it is not left out, whatever was made of their disagreement.
     """
 
     fused: Fused
@@ -85,6 +96,7 @@ class FusedAnswer:
     camera_time_bias: CameraTimeBias | None = None
     left_out: str | None = None
     alternatives: tuple[str, ...] = ()
+    reader: LoadsReader | None = None
 
     @property
     def remark(self) -> str:
@@ -203,6 +215,8 @@ def fuse_flight(
             answer = replace(_without_each(sources, bias_sd_s) or answer, agreement=answer.agreement)
         elif answer.agreement.hypotheses:
             answer = _with_faults_freed(sources, answer, bias_sd_s)
+    seen = tuple(n for n in sources.names if n != "camera" or answer.left_out != "camera")
+    answer = replace(answer, reader=sources.loads_reader(seen, bias_sd_s))
     return answer if answer.camera_time_bias is not None else replace(answer, camera_time_bias=bias)
 
 
@@ -221,10 +235,7 @@ class _Sources:
 
     def reader(self, names: tuple[str, ...], bias_sd_s: float, freed: tuple[str, ...] = ()) -> Read:
         """Reader of some methods; inputs in ``freed`` are as good as unknown."""
-        others = []
-        if "camera" in names and self.camera is not None:
-            others = [evidence_of_history(self.camera, bias_sd_s, CAMERA_PLANE_SD_RAD)]
-        read = loads_reader(self.loads, {n: m for n, m in _METHODS.items() if n in names}, others)
+        read = self.loads_reader(names, bias_sd_s)
 
         def scaled(values: dict[str, FloatArray]) -> dict[str, FloatArray]:
             return {name: _FREED * x if name in freed else x for name, x in values.items()}
@@ -232,6 +243,13 @@ class _Sources:
         return lambda inputs, about: [
             replace(one, by_input=scaled(one.by_input)) for one in read(scaled(inputs), about)
         ]
+
+    def loads_reader(self, names: tuple[str, ...], bias_sd_s: float) -> LoadsReader:
+        """Reader of some methods."""
+        others = []
+        if "camera" in names and self.camera is not None:
+            others = [evidence_of_history(self.camera, bias_sd_s, CAMERA_PLANE_SD_RAD)]
+        return loads_reader(self.loads, {n: m for n, m in _METHODS.items() if n in names}, others)
 
     def answer(self, names: tuple[str, ...], bias_sd_s: float, freed: tuple[str, ...] = ()) -> FusedAnswer:
         """Common posterior of some methods and the test of their agreement; `DivergenceError` without one."""

@@ -77,4 +77,5 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
         accelerometer_time_bias_sd_s=accelerometer.spec.time_bias_sd_s,
         gyro_time_bias_sd_s=rates.spec.time_bias_sd_s,
         cg_from_sensor_m=arm,
+        half_window_s=h,
     )

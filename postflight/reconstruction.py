@@ -17,12 +17,13 @@ import pandas as pd
 from estimators.loads import FlightLoads
 from flightmodel import airdata, earth, rotations
 from flightmodel.airdata import AirData, derived_with_sd, is_angle
-from flightmodel.atmosphere import TOP_M, bottom_m, profile_from_sounding
+from flightmodel.atmosphere import TOP_M, AtmosphereProfile, bottom_m, profile_from_sounding
 from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress
 from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
+from flightmodel.vehicle import Vehicle
 from postflight.attitude import AttitudeCheck, check_attitude
 from postflight.flight import Flight
 from postflight.loads import loads_from_solution
@@ -34,7 +35,7 @@ from recon.atmosphere import (
     windows_are_whole,
 )
 from recon.consistency import ConsistencyCheck
-from recon.entry_density import density_by_drag
+from recon.entry_density import density_by_drag, profile_as_flown
 from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
@@ -93,7 +94,9 @@ class Reconstruction(Tabular):
     solution : TrajectorySolution
         Smoothed and filtered trajectory, sensor errors, residuals, consistency checks.
     air : AirData
-        Along the trajectory, by the sounding.
+        Along the trajectory, by ``profile``.
+    profile : AtmosphereProfile
+        The sounding's; with [drag] the atmosphere as flown, where the deceleration tells it better.
     loads : FlightLoads or None
         Motion and flow at the c.g., for the estimators of the deflection; None where ``missing`` says why.
     as_flown : ReconstructedAir or None
@@ -103,12 +106,13 @@ class Reconstruction(Tabular):
     attitude : AttitudeCheck or None
         Comparison with an attitude from magnetometer and Sun sensors alone.
     density : DataFrame or None
-        Density, dynamic pressure, Mach number by the deceleration with the drag of [drag], `recon.entry_density`.
+        Air by the deceleration with the drag of [drag], `recon.entry_density`.
     """
 
     flight: Flight
     solution: TrajectorySolution
     air: AirData
+    profile: AtmosphereProfile
     loads: FlightLoads | None
     as_flown: ReconstructedAir | None = None
     missing: tuple[Fault, ...] = ()
@@ -168,7 +172,7 @@ class Reconstruction(Tabular):
 
     @property
     def peak_s(self) -> float:
-        """Time of peak dynamic pressure by the BET and the sounding's density, s."""
+        """Time of peak dynamic pressure by the BET and its air's density, s."""
         return find_peak(self.air.time_s, self.air.dynamic_pressure_pa)[0]
 
     @property
@@ -227,7 +231,12 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     """Air data, loads and as-flown atmosphere along a solution; `DivergenceError` where it leaves the air's tables."""
     telemetry = flight.telemetry
     _check_inside_tables(solution.smoothed)
-    air = air_data(solution.smoothed, flight)
+    stated = profile = profile_from_sounding(telemetry.sounding)
+    density = None
+    if telemetry.drag is not None:
+        density = density_by_drag(telemetry, solution.smoothed, solution.drag)
+        profile = profile_as_flown(stated, density)
+    air = airdata.air_data(solution.smoothed, profile, _arm(flight.vehicle))
     loads, as_flown = None, None
     missing: list[Fault] = []
     try:
@@ -235,14 +244,10 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
         telemetry.required_triads()
         _check_axes(solution)
         loads = loads_from_solution(telemetry, solution, air)
-        profile = profile_from_sounding(telemetry.sounding)
-        as_flown = as_flown_atmosphere(telemetry, solution, profile, solution.settings.check_confidence)
+        as_flown = as_flown_atmosphere(telemetry, solution, stated, solution.settings.check_confidence)
     except GateError as fault:
         missing += fault.faults
-    density = None
-    if telemetry.drag is not None:
-        density = density_by_drag(telemetry, solution.smoothed, solution.drag)
-    return Reconstruction(flight, solution, air, loads, as_flown, tuple(missing), density=density)
+    return Reconstruction(flight, solution, air, profile, loads, as_flown, tuple(missing), density=density)
 
 
 def _check_axes(solution: TrajectorySolution) -> None:
@@ -268,9 +273,12 @@ def air_data(trajectory: Trajectory, flight: Flight) -> AirData:
     AirData
         At the trajectory's times, of the vehicle's c.g. (of the followed point without a vehicle).
     """
-    vehicle = flight.vehicle
-    profile = profile_from_sounding(flight.telemetry.sounding)
-    return airdata.air_data(trajectory, profile, np.zeros(3) if vehicle is None else vehicle.cg_m)
+    return airdata.air_data(trajectory, profile_from_sounding(flight.telemetry.sounding), _arm(flight.vehicle))
+
+
+def _arm(vehicle: Vehicle | None) -> FloatArray:
+    """Point that meets the air, from the datum, body axes (3,), m: the c.g., or the datum of no vehicle."""
+    return np.zeros(3) if vehicle is None else vehicle.cg_m
 
 
 def _check_inside_tables(trajectory: Trajectory) -> None:
@@ -341,9 +349,7 @@ def _inertial(flight: Reconstruction) -> Columns:
 
 def _derived(flight: Reconstruction) -> Columns:
     """Air data, flow angles and attitude angles; winds."""
-    vehicle, profile = flight.telemetry.vehicle, profile_from_sounding(flight.telemetry.sounding)
-    arm = np.zeros(3) if vehicle is None else vehicle.cg_m
-    value, sd = derived_with_sd(flight.solution.smoothed, profile, arm)
+    value, sd = derived_with_sd(flight.solution.smoothed, flight.profile, _arm(flight.telemetry.vehicle))
     out: Columns = {}
     for name, (column, sd_column) in _DERIVED.items():
         unknown = not flight.has_attitude and name.startswith(_NEED_ATTITUDE)

@@ -319,6 +319,10 @@ def write_answers(run: RunFolder, answers: Deflections) -> None:
     if answers.fused is not None:
         run.write_csv("fusion_inputs.csv", answers.fused.input_frame())
         run.write_csv("fusion_agreement.csv", answers.fused.agreement_frame())
+    if answers.increments is not None:
+        run.write_csv("aero_increments.csv", answers.increments.to_frame())
+        run.write_csv("aero_increments_correlations.csv", answers.increments.correlations())
+        answers.increments.write_table(run.path)
 
 
 def answer_table(method: str, present: Container[str]) -> str:
@@ -347,6 +351,14 @@ def attitude_summary(check: AttitudeCheck | None) -> dict[str, Any] | None:
     }
 
 
+def increments_summary(answers: Deflections) -> dict[str, Any] | None:
+    """Aerodynamic increments at peak pressure, or reason and code where they were refused; None without a fusion."""
+    if answers.increments is not None:
+        return answers.increments.summary()
+    fault = answers.no_increments
+    return None if fault is None else {"reason": str(fault), "code": fault.code}
+
+
 def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFrame) -> dict[str, Any]:
     """Return the results of a run in short, for ``summary.json``; ``event_rows`` is its `event_table`."""
     at_peak = event_rows.iloc[int((event_rows["t_s"] - flight.peak_s).abs().argmin())]
@@ -365,6 +377,7 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
         "left_out": None if answers.fused is None else answers.fused.left_out,
         "film_clock": None if answers.fused is None else answers.fused.time_bias_summary(),
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),
+        "aero_increments": increments_summary(answers),
         "missing": list(flight.missing),
         "rests_on": list(flight.rests_on),
         "attitude_check": attitude_summary(flight.attitude),

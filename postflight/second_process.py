@@ -24,6 +24,7 @@ import pandas as pd
 
 from estimators.camera import FilmFit
 from flightmodel.checks import GateError
+from postflight.aero_increments import AeroIncrements
 from postflight.deflections import Deflections
 from postflight.filming import camera_film
 from postflight.flight import Flight
@@ -92,9 +93,11 @@ class SecondProcess:
         """Let it draw the answers; after the trajectory."""
         self._draw("deflections", replace(answers, bet=None))  # which it has
 
-    def draw_studies(self, bounds: Bounds | None, reran: pd.DataFrame | None) -> None:
-        """Let it draw Figure 1.3 and the sensitivity; after the trajectory."""
-        self._draw("studies", bounds, reran)
+    def draw_studies(
+        self, bounds: Bounds | None, reran: pd.DataFrame | None, increments: AeroIncrements | None = None
+    ) -> None:
+        """Let it draw Figure 1.3, the sensitivity and the aerodynamic increments; after the trajectory."""
+        self._draw("studies", bounds, reran, increments)
 
     def finish(self) -> None:
         """Wait until everything is drawn; warnings of the other process are given here.

@@ -23,7 +23,6 @@ import pandas as pd
 
 from flightmodel import earth
 from flightmodel.airdata import air_data, pressure_pulse
-from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, interpolate_rows, resample
@@ -259,7 +258,7 @@ def at_times(flight: Reconstruction, at: FloatArray) -> Reconstruction:
         for c in (bet.specific_force_cov, bet.rate_cov)
     )
     arm = np.zeros(3) if telemetry.vehicle is None else telemetry.vehicle.cg_m
-    air = air_data(path, profile_from_sounding(telemetry.sounding), arm)
+    air = air_data(path, flight.profile, arm)
     return replace(
         flight, solution=replace(bet, smoothed=path, specific_force_cov=force, rate_cov=rate), air=air, loads=None
     )

@@ -6,20 +6,36 @@
 smoothed drivers (`recon.propagation`): ``ln(2 a / |u|^2) = ln(B rho0(h)) + d + c0 sd(h)``, with the smoothed covariance
 of place and drivers, so that noise and bias of an accelerometer, trim and wind are all in it. With gyros ``a`` is the
 corrected axial reading, averaged over a window, taken to lie along the flow. C_A and mass are stated; what they may err
-is one factor of the whole profile. Mach number takes the temperature of the flight's atmosphere.
+is one factor of the whole profile.
+
+Pressure is the weight of the air above, and temperature follows from the gas law (Seiff and Kirk 1977)::
+
+    p(h) = p(top) + integral of rho g from h to top,   T = p / (R rho)
+
+from the uppermost row on, whose temperature is the stated atmosphere's; what that errs is gone two scale heights below.
+The factor of C_A and mass is in pressure as in density, and not in temperature. Other errors of density and those of
+the vertical velocity (the layers' thickness) are taken to be of one sign over all heights in the pressure, and
+independent of it in the temperature. Temperature is the mean of that and the stated atmosphere's, by their variances.
+Assumed: level surfaces of pressure along the path.
+
+References
+----------
+A. Seiff, D. B. Kirk, "Structure of the atmosphere of Mars in summer at mid-latitudes", J. Geophys. Res. 82 (1977) 4364.
+J. A. Magalhaes, J. T. Schofield, A. Seiff, "Results of the Mars Pathfinder atmospheric structure investigation",
+J. Geophys. Res. 104 (1999) 8943.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
 from flightmodel import earth
-from flightmodel.airdata import air_data, temperature_sd
-from flightmodel.atmosphere import profile_from_sounding
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.airdata import AirData, air_data
+from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding, standard_air
+from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory
 from recon.ekf import Problem
@@ -27,6 +43,7 @@ from recon.state import KINEMATIC, States, unpacked
 
 LEAST_KNOWN = 0.5  # fractional sd of density, C_A apart, from which a row is given
 _HALF_WINDOW_S = 0.25  # of an axial reading
+_LAYER_M = 250.0  # over which rows are one knot of the atmosphere as flown: a fortieth of Mars's scale height
 
 
 @dataclass(frozen=True)
@@ -87,10 +104,7 @@ def drag_of_readings(
     mean = np.where(last > first, (total[last] - total[first]) / count, np.nan)
     noise = telemetry.accelerometer.spec.noise_sd / np.sqrt(count)
     air = air_data(path, profile_from_sounding(telemetry.sounding), np.zeros(3))
-    speed = air.airspeed_mps
-    assert path.covariance is not None
-    unit = path.velocity_ecef_mps / np.linalg.norm(path.velocity_ecef_mps, axis=1)[:, None]
-    speed_var = np.einsum("ni,nij,nj->n", unit, path.covariance[:, 3:6, 3:6], unit) + air.air.wind_sd_mps**2
+    speed, speed_var = air.airspeed_mps, _speed_var(path, air)
     with np.errstate(invalid="ignore", divide="ignore"):
         log_drag = np.log(2.0 * mean / speed**2)  # none where it pushes, as noise does in thin air
         own = np.sqrt(force_cov[:, 0, 0] + noise**2) / mean
@@ -98,7 +112,7 @@ def drag_of_readings(
 
 
 def density_by_drag(telemetry: Telemetry, path: Trajectory, history: DragHistory | None) -> pd.DataFrame:
-    """Density, dynamic pressure and Mach number as flown, a row a time at which the deceleration determines them.
+    """Density, pressure, temperature, dynamic pressure and Mach number as flown, where the deceleration tells them.
 
     Raises
     ------
@@ -110,38 +124,128 @@ def density_by_drag(telemetry: Telemetry, path: Trajectory, history: DragHistory
         raise GateError("density as flown: state [drag] (c_a, area, mass) or a vehicle in flight.toml", "drag-missing")
     if history is None:
         raise GateError("density as flown: no accelerometer and no ballistic motion", "deceleration-missing")
-    air = air_data(path, profile_from_sounding(telemetry.sounding), np.zeros(3))
-    area = drag.area_per_mass_m2pkg(air.mach)
-    rho, sd = np.exp(history.log_drag) / area, np.hypot(history.sd, drag.sd)
-    pressure = 0.5 * rho * air.airspeed_mps**2
-    covariance = path.covariance
+    profile = profile_from_sounding(telemetry.sounding)
+    air = air_data(path, profile, np.zeros(3))
+    rho = np.exp(history.log_drag) / drag.area_per_mass_m2pkg(air.mach)
+    known = np.isfinite(history.sd) & (history.sd < LEAST_KNOWN) & np.isfinite(rho)
+    rho, own_sd, sd = rho[known], history.sd[known], np.hypot(history.sd, drag.sd)[known]
+    pressure, weight_sd = _weight_of_air(path, air, profile, known, rho, own_sd)
+    # the uppermost row's temperature is the stated one, whose error the weight has too
+    warm_sd = profile.temperature_sd(air.altitude_m[known])
+    temperature, temperature_sd = _mean(
+        pressure / (path.planet.gas_jpkgk * rho), np.hypot(own_sd, weight_sd), air.air.temperature_k[known], warm_sd
+    )
+    speed, covariance = air.airspeed_mps[known], path.covariance
     assert covariance is not None
-    down = earth.dcm_ned_ecef(air.latitude_rad, air.longitude_rad)[:, 2]
-    height_sd = np.sqrt(np.einsum("ni,nij,nj->n", down, covariance[:, :3, :3], down))
-    known = np.isfinite(sd) & (history.sd < LEAST_KNOWN) & np.isfinite(rho)
-    table = pd.DataFrame(
+    down = _down(air)
+    height_sd = np.sqrt(np.einsum("ni,nij,nj->n", down, covariance[:, :3, :3], down))[known]
+    mach = speed / np.sqrt(path.planet.gamma * path.planet.gas_jpkgk * temperature)
+    mach_sd = np.hypot(0.5 * temperature_sd / temperature, np.sqrt(_speed_var(path, air))[known] / speed)
+    ratio, q = rho / air.air.density_kgpm3[known], 0.5 * rho * speed**2
+    return pd.DataFrame(
         {
-            "time_s": path.time_s,
-            "altitude_m": air.altitude_m,
+            "time_s": path.time_s[known],
+            "altitude_m": air.altitude_m[known],
             "altitude_sd_m": height_sd,
             "density_kgpm3": rho,
             "density_sd_kgpm3": rho * sd,
-            "density_ratio": rho / air.air.density_kgpm3,
-            "density_ratio_sd": rho / air.air.density_kgpm3 * sd,
+            "density_ratio": ratio,
+            "density_ratio_sd": ratio * sd,
             "common_factor_sd": np.full(len(rho), drag.sd),
-            "mach": air.mach,
-            "mach_sd": air.mach * _mach_sd(air.air.temperature_k, air.airspeed_mps, path, air.air.wind_sd_mps),
-            "dynamic_pressure_pa": pressure,
-            "dynamic_pressure_sd_pa": pressure * np.hypot(history.pressure_sd, drag.sd),
+            "pressure_pa": pressure,
+            "pressure_sd_pa": pressure * np.hypot(weight_sd, drag.sd),
+            "temperature_k": temperature,
+            "temperature_sd_k": temperature_sd,
+            "mach": mach,
+            "mach_sd": mach * mach_sd,
+            "dynamic_pressure_pa": q,
+            "dynamic_pressure_sd_pa": q * np.hypot(history.pressure_sd[known], drag.sd),
         }
     )
-    return table[known].reset_index(drop=True)
 
 
-def _mach_sd(temperature_k: FloatArray, speed_mps: FloatArray, path: Trajectory, wind_sd: FloatArray) -> FloatArray:
-    """Fractional sd of the Mach number by temperature, velocity and wind."""
+def _weight_of_air(
+    path: Trajectory, air: AirData, profile: AtmosphereProfile, known: BoolArray, rho: FloatArray, own_sd: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pressure, Pa, at the known rows (k,) by the weight of the air above, and its fractional sd without C_A's."""
+    if not len(rho):
+        return rho, rho
+    height, planet = air.altitude_m[known], path.planet
+    time_s, position, down = path.time_s[known], path.position_ecef_m[known], _down(air)[known]
+    spin, covariance = planet.rate_ecef_radps, path.covariance
+    assert covariance is not None
+    gravity = np.linalg.norm(earth.gravitation(position, planet) - np.cross(spin, np.cross(spin, position)), axis=1)
+    sink_sd = np.sqrt(np.einsum("ni,nij,nj->n", down, covariance[known, 3:6, 3:6], down))
+    top = int(np.argmax(height))
+    warm, warm_sd = air.air.temperature_k[known][top], profile.temperature_sd(height[[top]])[0]
+    above = rho[top] * planet.gas_jpkgk * warm
+    # between two rows density is exponential
+    low, high = (rho * gravity)[:-1], (rho * gravity)[1:]
+    step = np.log(high / low)
+    mean = np.where(np.abs(step) > 1e-6, (high - low) / np.where(step == 0.0, 1.0, step), low)
+    thickness = -np.diff(height)
+    wrong_m = 0.5 * (own_sd[:-1] + own_sd[1:]) * np.abs(thickness) + 0.5 * (sink_sd[:-1] + sink_sd[1:]) * np.diff(
+        time_s
+    )
+    weight, wrong = (np.concatenate([[0.0], np.cumsum(mean * metres)]) for metres in (thickness, wrong_m))
+    pressure = above + weight - weight[top]
+    sd = above * np.hypot(own_sd[top], warm_sd / warm) + np.abs(wrong - wrong[top])
+    return pressure, sd / pressure
+
+
+def _mean(
+    flown: FloatArray, flown_part: FloatArray, stated: FloatArray, stated_sd: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean of two temperatures by their variances, and its sd; of the flown one a fractional sd is given."""
+    # of a temperature that is wrong by a factor the sd is that of the stated one's size
+    weight = 1.0 / (1.0 + (flown_part * stated / stated_sd) ** 2)
+    return weight * flown + (1.0 - weight) * stated, np.sqrt(1.0 - weight) * stated_sd
+
+
+def profile_as_flown(stated: AtmosphereProfile, table: pd.DataFrame) -> AtmosphereProfile:
+    """Stated atmosphere with density and temperature as flown where the deceleration knows density better.
+
+    Parameters
+    ----------
+    stated : AtmosphereProfile
+    table : DataFrame
+        Of `density_by_drag`.
+    """
+    part = (table["density_ratio_sd"] / table["density_ratio"]).to_numpy()
+    better = table[part < stated.at(table["altitude_m"].to_numpy()).density_sd]
+    if better.empty:
+        return stated
+    rows = better.groupby(np.floor(better["altitude_m"] / _LAYER_M)).mean()
+    z = rows["altitude_m"].to_numpy()
+    beyond = (stated.altitude_m < z[0] - _LAYER_M) | (stated.altitude_m > z[-1] + _LAYER_M)
+    knots = np.concatenate([z, stated.altitude_m[beyond]])
+    order = np.argsort(knots)
+    density, temperature, _ = standard_air(z, stated.planet)
+
+    def joined(flown: FloatArray, own: FloatArray) -> FloatArray:
+        return np.concatenate([flown, own[beyond]])[order]
+
+    wind = np.column_stack([np.interp(knots[order], stated.altitude_m, w) for w in stated.wind_ned_mps.T])
+    return replace(
+        stated,
+        altitude_m=knots[order],
+        log_density_ratio=joined(np.log(rows["density_kgpm3"].to_numpy() / density), stated.log_density_ratio),
+        temperature_offset_k=joined(rows["temperature_k"].to_numpy() - temperature, stated.temperature_offset_k),
+        wind_ned_mps=wind,
+        density_sd=joined((rows["density_sd_kgpm3"] / rows["density_kgpm3"]).to_numpy(), stated.density_sd),
+        wind_sd_mps=np.interp(knots[order], stated.altitude_m, stated.wind_sd_mps),
+        temperature_sd_k=joined(rows["temperature_sd_k"].to_numpy(), stated.temperature_sd(stated.altitude_m)),
+        met_m=(float(better["altitude_m"].min()), float(better["altitude_m"].max())),
+    )
+
+
+def _down(air: AirData) -> FloatArray:
+    """Direction (n, 3) of the local vertical, ECEF axes."""
+    return np.asarray(earth.dcm_ned_ecef(air.latitude_rad, air.longitude_rad)[:, 2])
+
+
+def _speed_var(path: Trajectory, air: AirData) -> FloatArray:
+    """Variance (n,) of the speed against the air, (m/s)^2."""
     assert path.covariance is not None
     unit = path.velocity_ecef_mps / np.linalg.norm(path.velocity_ecef_mps, axis=1)[:, None]
-    var = np.einsum("ni,nij,nj->n", unit, path.covariance[:, 3:6, 3:6], unit) + wind_sd**2
-    _, _, height = earth.geodetic_from_ecef(path.position_ecef_m, path.planet)
-    return np.asarray(np.hypot(0.5 * temperature_sd(height, path.planet) / temperature_k, np.sqrt(var) / speed_mps))
+    return np.asarray(np.einsum("ni,nij,nj->n", unit, path.covariance[:, 3:6, 3:6], unit) + air.air.wind_sd_mps**2)

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from postflight.plots.aerodynamics import figure_increments
     from postflight.plots.deflection import figure_correlation, figure_fusion, figure_summary
     from postflight.plots.overlay import write_overlay_film
     from postflight.plots.paper_figures import figure_1_3, figure_2_3, figure_2_5, figure_2_7, figure_2_9
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 # imported on first use: matplotlib takes half a second
 _DOOR = {
+    "aerodynamics": ("figure_increments",),
     "paper_figures": ("figure_1_3", "figure_2_3", "figure_2_5", "figure_2_7", "figure_2_9"),
     "deflection": ("figure_correlation", "figure_fusion", "figure_summary"),
     "trajectory": (
@@ -50,9 +52,9 @@ _MODULE = {name: module for module, names in _DOOR.items() for name in names}
 __all__ = [
     "COLOUR", "ZONE", "draw_camera", "draw_run", "figure_1_3", "figure_2_3", "figure_2_5", "figure_2_7", "figure_2_9",
     "figure_air", "figure_attitude", "figure_bands", "figure_correlation", "figure_filter_and_smoother", "figure_flown",
-    "figure_fusion", "figure_joints", "figure_modes", "figure_posterior", "figure_preflight", "figure_reconciled",
-    "figure_residuals", "figure_sensitivity", "figure_sobol", "figure_summary", "figure_table_3_1", "in_style", "save",
-    "stamp", "write_overlay_film",
+    "figure_fusion", "figure_increments", "figure_joints", "figure_modes", "figure_posterior", "figure_preflight",
+    "figure_reconciled", "figure_residuals", "figure_sensitivity", "figure_sobol", "figure_summary", "figure_table_3_1",
+    "in_style", "save", "stamp", "write_overlay_film",
 ]  # fmt: skip
 
 

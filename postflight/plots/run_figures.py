@@ -14,9 +14,11 @@ from estimators.loads import FlightLoads
 from estimators.trim import static_trim
 from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
+from postflight.aero_increments import AeroIncrements
 from postflight.deflections import Deflections
 from postflight.filming import by_camera
 from postflight.flight import Flight
+from postflight.plots.aerodynamics import figure_increments
 from postflight.plots.deflection import figure_correlation, figure_fusion, figure_summary
 from postflight.plots.overlay import deflection_at, oriented_camera, write_overlay
 from postflight.plots.paper_figures import figure_1_3, figure_2_3, figure_2_5, figure_2_7, figure_2_9
@@ -53,7 +55,7 @@ def draw_run(
     """
     draw_trajectory(flight, folder)
     draw_deflections(flight, folder, answers)
-    draw_studies(flight, folder, bounds, reran)
+    draw_studies(flight, folder, bounds, reran, answers.increments)
 
 
 def draw_trajectory(flight: Reconstruction, folder: Path) -> None:
@@ -88,8 +90,16 @@ def draw_deflections(flight: Reconstruction, folder: Path, answers: Deflections)
         draw(folder / "summary.png", figure_summary, flight, answers)
 
 
-def draw_studies(flight: Reconstruction, folder: Path, bounds: Bounds | None, reran: pd.DataFrame | None) -> None:
-    """Draw the flight among rigid ones (Figure 1.3) and the sensitivity, where they are given."""
+def draw_studies(
+    flight: Reconstruction,
+    folder: Path,
+    bounds: Bounds | None,
+    reran: pd.DataFrame | None,
+    increments: AeroIncrements | None = None,
+) -> None:
+    """Draw the flight among rigid ones (Figure 1.3), sensitivity and aerodynamic increments, where they are given."""
+    if increments is not None:
+        draw(folder / "aero_increments.png", _stamped(figure_increments, flight.flight), increments)
     if bounds is not None:
         draw(folder / "figure_1_3.png", figure_1_3, flight, bounds)
     if reran is not None and reran["quantity"].notna().any():

@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel import earth, rotations
-from flightmodel.airdata import temperature_sd
 from flightmodel.atmosphere import (
     DENSITY_LENGTH_M,
     GAMMA,
@@ -35,6 +34,7 @@ from flightmodel.atmosphere import (
     WIND_LENGTH_M,
     profile_from_sounding,
     sounding_correlation,
+    temperature_sd,
     unresolved_variance,
 )
 from flightmodel.checks import FloatArray, GateError

@@ -116,6 +116,7 @@ def _texts(run: Run) -> dict[str, Any]:
         "camera_sensitivity": "Deflection by video under assumed joints and planes, beside Table 2.1 of AIAA 2011-2571",
         "fusion_inputs": "Inputs of the methods, estimated with the deflection",
         "fusion_agreement": "Chi-square test of every pair of methods",
+        "aero_increments": "Coefficients in flight against the preflight table, along Mach number",
         "air_parameters": "Coefficient scales and flexure, estimated with the as-flown atmosphere",
         "residual_statistics": "Residuals by source and component",
         "sensor_errors": "Estimated sensor errors",

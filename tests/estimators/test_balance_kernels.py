@@ -27,7 +27,7 @@ def swing_of(size_rad, count):
 
 
 @pytest.mark.parametrize("size_rad", [0.0, 1e-9, 1e-3, 0.1, 0.5])
-@pytest.mark.parametrize("name", ["force_residual", "moment_residual"])
+@pytest.mark.parametrize("name", ["force_residual", "axial_residual", "moment_residual"])
 def test_kernels_leave_what_the_readable_balances_leave(loads, name, size_rad):
     swing = swing_of(size_rad, len(loads.time_s))
     got, want = (getattr(module, name)(loads.vehicle, swing, loads) for module in (balance, plain_balance))
@@ -35,7 +35,7 @@ def test_kernels_leave_what_the_readable_balances_leave(loads, name, size_rad):
     np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-8)
 
 
-@pytest.mark.parametrize("name", ["force_residual", "moment_residual"])
+@pytest.mark.parametrize("name", ["force_residual", "axial_residual", "moment_residual"])
 @pytest.mark.parametrize("mach", [0.0, 0.3, 3.0, 50.0])
 def test_coefficients_are_held_beyond_the_table_s_mach_numbers(loads, name, mach):
     there = replace(loads, mach=np.full(len(loads.time_s), mach))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from estimators.balance import Swing, force_residual, moment_residual
+from estimators.balance import Swing, axial_residual, force_residual, moment_residual
 from estimators.loads import FlightLoads
 from estimators.misalignment import misalignment_evidence
 from estimators.trim import moment_term, solve_trim, trim_evidence, trim_model
@@ -244,3 +244,17 @@ def test_what_is_left_of_the_moments_is_a_shift_of_the_cg():
         body = vehicle.centerbody.model_copy(update={"cg_from_datum_body_m": tuple(place.tolist())})
         left = moment_residual(replace(vehicle, centerbody=body), held, pulse)
         np.testing.assert_allclose(left, np.tile(1e-3 * np.eye(2)[axis], (len(left), 1)), atol=2e-5)
+
+
+@pytest.mark.parametrize("bent_deg", [0.0, 30.0])
+@pytest.mark.parametrize("rpm", RPM)
+def test_the_force_along_the_shell_s_axis_closes(rpm, bent_deg):
+    bent = np.deg2rad(bent_deg) * np.array([0.8, -0.6])
+    state = start(rpm, [0.1, -0.15], np.array([0.03, -0.04]) - bent, bent)
+    truth = fly(living(-1.0), standard_atmosphere(), state, START_S, START_S + 0.2, EPOCH, 0.002, 0.01, START_S + 9.0)
+    pulse, held = pulse_of_truth(truth), Swing.held(truth.deflection.theta_yz_rad)
+    # the simulator's dynamic pressure is the nose's, and nothing else is left out
+    np.testing.assert_allclose(axial_residual(truth.vehicle, held, pulse), 0.0, atol=1e-6)
+    if bent_deg:
+        straight = axial_residual(truth.vehicle, Swing.held(0.0 * truth.deflection.theta_yz_rad), pulse)
+        assert np.abs(straight).min() > 0.01

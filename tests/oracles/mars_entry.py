@@ -36,6 +36,21 @@ class Entry:
     stated_spherical: np.ndarray
     mass_kg: float = MASS_KG
 
+    @property
+    def pressure_pa(self) -> np.ndarray:
+        """Weight of the air above, (n,); above the first row as high as there."""
+        per_metre = self.density_kgpm3 * GM / np.sum(self.position_m**2, axis=1)
+        fine = np.linspace(self.height_m[-1], self.height_m[0], 20001)
+        down = np.exp(np.interp(fine, self.height_m[::-1], np.log(per_metre)[::-1]))
+        layer = 0.5 * (down[1:] + down[:-1]) * (fine[1] - fine[0])
+        above = down[-1] * 7e3
+        return np.interp(self.height_m, fine, np.concatenate([np.cumsum(layer[::-1])[::-1], [0.0]]) + above)
+
+    @property
+    def temperature_k(self) -> np.ndarray:
+        """By the gas law, (n,)."""
+        return self.pressure_pa / (8314.32 / 43.49 * self.density_kgpm3)
+
 
 STATE = np.array([3522.2e3, 22.6, 338.0, 7264.2, -14.06, 253.1])  # m, deg, deg, m/s, deg, deg: inertial, at entry
 STATE_SD = np.array([1500.0, 0.02, 0.03, 0.7, 0.03, 0.03])

@@ -127,6 +127,18 @@ def force_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatA
     return np.asarray(lateral_angles(-force) - direction * np.arctan2(c[:, 1], c[:, 0])[:, None])
 
 
+def axial_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
+    """Logarithm of the force along the shell's axis over the air's ``q S C_A`` (n, 1).
+
+    Parameters as of `force_residual`.
+    """
+    force = _turned(axes(swing).transpose(0, 2, 1), specific_force(vehicle, swing, loads))
+    _, c = flow_coefficients(vehicle.aero, loads.mach, nose_flow(vehicle, swing, loads))
+    air = loads.dynamic_pressure_pa * vehicle.reference.area_m2 * c[:, 0]
+    with np.errstate(invalid="ignore"):  # of a force that points forward
+        return np.asarray(np.log(-vehicle.mass_kg * force[:, 0] / air)[:, None])
+
+
 def moment_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
     """Transverse moment of the air less the motion's over ``q S C_A``, a shift of the c.g.; body y, z (n, 2), m.
 

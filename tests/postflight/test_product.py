@@ -101,7 +101,8 @@ def test_standard_deviations_are_the_scatter_of_drawn_errors() -> None:
         path(error),
         air.wind_sd_mps[:, None] * rng.standard_normal((n, 2)),
         air.density_sd * rng.standard_normal(n),
-        airdata.temperature_sd(value["altitude"]) * rng.standard_normal(n),
+        profile.temperature_sd(value["altitude"]) * rng.standard_normal(n),
+        np.zeros(n),
     )
     scattered = airdata.derived(drawn, profile, arm)
     for name, numbers in scattered.items():

@@ -22,11 +22,11 @@ def draw_here(monkeypatch):
 def all_parts(process):
     process.draw_trajectory("flight")
     process.draw_deflections(Deflections(bet="flight"))
-    process.draw_studies(1, 2)
+    process.draw_studies(1, 2, 3)
 
 
 def drawn(done):
-    parts = [("trajectory", ()), ("deflections", (Deflections(bet=None),)), ("studies", (1, 2))]
+    parts = [("trajectory", ()), ("deflections", (Deflections(bet=None),)), ("studies", (1, 2, 3))]
     return done == [(part, "flight", FOLDER, arguments) for part, arguments in parts]
 
 

@@ -330,3 +330,17 @@ class TestNavego:
         row = r.sensor_errors.set_index("name").loc["receiver time bias"]
         assert row.estimate == pytest.approx(-2.5e-3, abs=3.5 * row.sd)
         assert row.estimate < -1e-3
+
+
+@needs_data[0]
+@needs_data[1]
+@needs_data[2]
+def test_mars_science_laboratory_by_positions_alone(fly):
+    """The deceleration of the filter's air is that of the positions' own second difference less gravitation."""
+    found = fly("msl_entry")
+    force_mps2, peak_s = 123.5, 80.35  # largest, lift and drag, of the table's own second difference
+    drag = np.exp(found.drag.log_drag) * np.sum(found.smoothed.velocity_ecef_mps**2, axis=1) / 2.0
+    k = int(np.argmax(drag))
+    assert found.smoothed.time_s[k] == pytest.approx(peak_s, abs=0.5)
+    # lift of a quarter of the drag is 3 % of the force
+    assert drag[k] == pytest.approx(force_mps2 / np.hypot(1.0, 0.24), rel=0.01)
