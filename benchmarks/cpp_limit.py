@@ -61,6 +61,7 @@ class Flights:
         _kernels.integrate(
             (0,) * self.lanes,
             (),
+            (),
             workspace,
             self.tables,
             earth.WGS84,

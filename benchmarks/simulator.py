@@ -66,7 +66,7 @@ def dop853(problem, seconds, rtol):
 
     def derivative(_, y):
         s[trial] = y
-        _kernels.rates(s, (0,), (), air, grid, mach, table, free, planet, False, False)
+        _kernels.rates(s, (0,), (), (), air, grid, mach, table, free, planet, False, False)
         return s[rate].copy()
 
     times = np.linspace(0.0, seconds, round(seconds * 10.0) + 1)

@@ -15,10 +15,10 @@ from flightmodel._kernels import inlined, kernel
 STEP_S = 1e-4  # of rates of some rad/s it leaves 1e-8 of truncation and 1e-9 of rounding
 # where in a vehicle's row: joint, shell's c.g. from it, centerbody's c.g., vehicle's c.g., point of the loads (three
 # numbers each), shell's share of the mass, reduced mass, inertias of shell and centerbody (xx xy xz yy yz zz),
-# reference length and area
+# reference length and area, the nine of `flightmodel.vehicle.AeroTerms`
 _JOINT, _ARM, _BODY_CG, _CG, _POINT = 0, 3, 6, 9, 12
-COUNT = 31
-_SHARE, _REDUCED, _SHELL, _BODY, _LENGTH, _AREA = 15, 16, 17, 23, 29, 30
+COUNT = 40
+_SHARE, _REDUCED, _SHELL, _BODY, _LENGTH, _AREA, _TERMS = 15, 16, 17, 23, 29, 30, 31
 
 
 @inlined
@@ -180,6 +180,21 @@ def _coefficients(mach, alpha, knots, table):
 
 
 @inlined
+def _air(v, turn, y, z, c):
+    """C_A, lateral force (y, z) and lateral flow of the moment (y, z), over ``q S``, of the coefficients ``c``.
+
+    ``turn`` has the body's x axis in shell axes as its first row.
+    """
+    by_roll = 1.0
+    if v[_TERMS + 7] != 0.0:
+        by_roll += v[_TERMS + 7] * math.cos(v[_TERMS + 6] * (math.atan2(z, y) - v[_TERMS + 8]))
+    ey, ez = turn[1], turn[2]
+    normal, moment, cn, cm = by_roll * c[1], by_roll * c[2], v[_TERMS + 4], v[_TERMS + 5]
+    axial = c[0] + v[_TERMS + 3] * (ey * ey + ez * ez)
+    return axial, normal * y + cn * ey, normal * z + cn * ez, moment * y + cm * ey, moment * z + cm * ez
+
+
+@inlined
 def _state(swing, i):
     return swing[0, i, 0], swing[0, i, 1], swing[1, i, 0], swing[1, i, 1], swing[2, i, 0], swing[2, i, 1]
 
@@ -197,12 +212,14 @@ def force_left(v, swing, force, rate, turning, flow, mach, airspeed, knots, tabl
         f = _specific_force(v, state, _vector(force[i], 0), w, _vector(turning[i], 0))
         f = la.back(turn, f[0], f[1], f[2])
         y, z, alpha = _nose_flow(v, state, turn, w, airspeed[i], flow[i, 0], flow[i, 1])
-        c = _coefficients(mach[i], alpha, knots, table)
+        axial, ny, nz, _, _ = _air(v, turn, y, z, _coefficients(mach[i], alpha, knots, table))
         lateral = math.hypot(f[1], f[2])
         tilt = math.atan2(lateral, -f[0]) / lateral if lateral > 0.0 else 0.0
-        air = math.atan2(c[1], c[0])
-        out[i, 0] = -tilt * f[1] - y * air
-        out[i, 1] = -tilt * f[2] - z * air
+        # a force that points to where the flow comes from has a negative coefficient
+        size = math.hypot(ny, nz)
+        air = math.atan2(size, axial) / size if size > 0.0 else 0.0
+        out[i, 0] = -tilt * f[1] - ny * air
+        out[i, 1] = -tilt * f[2] - nz * air
 
 
 @kernel
@@ -213,8 +230,8 @@ def axial_left(v, swing, force, rate, turning, flow, mach, airspeed, knots, tabl
         turn = _axes(state[0], state[1])
         f = _specific_force(v, state, _vector(force[i], 0), w, _vector(turning[i], 0))
         f = la.back(turn, f[0], f[1], f[2])
-        _, _, alpha = _nose_flow(v, state, turn, w, airspeed[i], flow[i, 0], flow[i, 1])
-        ratio = -f[0] / _coefficients(mach[i], alpha, knots, table)[0]
+        y, z, alpha = _nose_flow(v, state, turn, w, airspeed[i], flow[i, 0], flow[i, 1])
+        ratio = -f[0] / _air(v, turn, y, z, _coefficients(mach[i], alpha, knots, table))[0]
         out[i, 0] = math.log(ratio) if ratio > 0.0 else math.nan
 
 
@@ -226,12 +243,19 @@ def moment_left(v, swing, pressure, rate, turning, flow, mach, airspeed, knots, 
         turn = _axes(state[0], state[1])
         y, z, alpha = _nose_flow(v, state, turn, w, airspeed[i], flow[i, 0], flow[i, 1])
         c = _coefficients(mach[i], alpha, knots, table)
+        axial, ny, nz, my, mz = _air(v, turn, y, z, c)
         length, p = v[_LENGTH], _relative_rate(state[0], state[1], state[2], state[3])
         own = la.back(turn, w[0] + p[0], w[1] + p[1], w[2] + p[2])
         damping = c[3] * length / (2.0 * airspeed[i])
+        coning = v[_TERMS + 2] * length / (2.0 * airspeed[i]) * math.sin(alpha) ** 2 * (own[1] * y + own[2] * z)
         # (0, y, z) x x_hat = (0, z, -y)
-        about = la.times(turn, 0.0, length * (c[2] * z + damping * own[1]), length * (-c[2] * y + damping * own[2]))
-        force = la.times(turn, -c[0], -c[1] * y, -c[1] * z)
+        about = la.times(
+            turn,
+            0.0,
+            length * (mz + damping * own[1] + coning * y),
+            length * (-my + damping * own[2] + coning * z),
+        )
+        force = la.times(turn, -axial, -ny, -nz)
         nose = la.times(turn, -v[_JOINT], -v[_JOINT + 1], -v[_JOINT + 2])
         cg = _cg(v, state[0], state[1])
         lever = la.cross(
@@ -243,5 +267,5 @@ def moment_left(v, swing, pressure, rate, turning, flow, mach, airspeed, knots, 
         needed = _moment(v, state, w, _vector(turning[i], 0))
         per = 1.0 / (pressure[i] * v[_AREA])
         # a lateral shift d of the c.g. against the axial force has the moment d x x_hat = (0, d_z, -d_y)
-        out[i, 0] = -(about[2] + lever[2] - per * needed[2]) / c[0]
-        out[i, 1] = (about[1] + lever[1] - per * needed[1]) / c[0]
+        out[i, 0] = -(about[2] + lever[2] - per * needed[2]) / axial
+        out[i, 1] = (about[1] + lever[1] - per * needed[1]) / axial

@@ -134,5 +134,6 @@ def _numbers(vehicle: Vehicle, loads: FlightLoads) -> FloatArray:
             shell.inertia[upper],
             body.inertia[upper],
             [vehicle.reference.length_m, vehicle.reference.area_m2],
+            vehicle.aero_terms.numbers,
         ]
     )

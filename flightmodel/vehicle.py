@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from flightmodel.aerodynamics import Aerodynamics, AeroTable, Shape, aerodynamics_from
+from flightmodel.aerodynamics import Aerodynamics, AeroTable, Coefficient, Shape, aerodynamics_from
 from flightmodel.checks import ConfigError, Fault, FloatArray, check_positive_definite, nearest_name
 from flightmodel.config import (
     Angle,
@@ -119,9 +119,9 @@ class MassStep(Section):
 class CompliantJoint(Section):
     """Spherical joint on the axis with bending and torsion springs, damping, freeplay, hardening and creep.
 
-    The bending moment is ``F = K1 d + K3 d^3`` of the spring's angle ``d`` beyond the freeplay, the damping moment
-    ``(C1 + C3 theta^2)`` times the relative angular rate. The deflection is the spring's angle and the creep ``b``
-    (standard linear solid, a spring and a Kelvin element in series; docs/derivations.md)::
+    The bending moment is ``F = K1 d + K2 |d| d + K3 d^3`` of the spring's angle ``d`` beyond the freeplay, the damping
+    moment ``(C1 + C3 theta^2)`` times the relative angular rate. The deflection is the spring's angle and the creep
+    ``b`` (standard linear solid, a spring and a Kelvin element in series; docs/derivations.md)::
 
         creep_time_s b' + b = creep_share / (1 - creep_share) F / K1
 
@@ -136,6 +136,7 @@ class CompliantJoint(Section):
     torsion_damping_nmsprad: Damping = 0.0
     freeplay_deg: ErrorAngle = 0.0
     freeplay_corner: Annotated[float, Field(gt=0.0, le=0.5)] = 0.02
+    quadratic_nmprad2: Annotated[float, Field(ge=-1e15, le=1e15)] = 0.0
     hardening_nmprad3: Stiffness = 0.0
     damping_hardening_nmsprad3: Damping = 0.0
     creep_share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
@@ -145,6 +146,14 @@ class CompliantJoint(Section):
     def _spring_to_creep(self) -> CompliantJoint:
         if self.creep_share > 0.0 and self.bending_stiffness_nmprad == 0.0:
             raise KeyFaults([("creep_share", self.creep_share, "a joint without bending stiffness has none; 0")])
+        return self
+
+    @model_validator(mode="after")
+    def _spring_that_rises(self) -> CompliantJoint:
+        least = -np.sqrt(3.0 * self.bending_stiffness_nmprad * self.hardening_nmprad3)
+        if self.quadratic_nmprad2 < min(least, 0.0):
+            words = f"the moment would fall with the angle; at least -sqrt(3 K1 K3) = {least:.4g} is wanted"
+            raise KeyFaults([("quadratic_nmprad2", self.quadratic_nmprad2, words)])
         return self
 
     @property
@@ -181,6 +190,58 @@ class Uncertainty(Section):
     cm_shape_part: Fraction = 0.5
     cmq: Annotated[float, Field(ge=0.0, le=10.0)] = 0.15
     cmq_shape_part: Fraction = 0.5
+
+
+class AeroTerms(Section):
+    """What a table over Mach number and total angle of attack cannot say of a shell; all zero of a body of revolution.
+
+    In shell axes, with ``n`` the unit vector of the flow's lateral velocity at the nose, ``phi`` its clock angle, ``e``
+    the lateral part of the centerbody's x axis (as long as the sine of the deflection), ``p``, ``w`` the shell's own
+    rates about x and across it, ``k`` and ``g`` order and share of the dependence on roll::
+
+        lateral force  = -q S ((1 + g cos k (phi - phi_0)) C_N n + cn_deflection e)
+        axial force    = -q S (C_A + ca_deflection |e|^2)
+        moment, x      = q S l (cl + clp p l / 2V)
+        moment, across = q S l (((1 + g cos k (phi - phi_0)) C_m n + cm_deflection e) x x_hat
+                                + l / 2V (C_mq w + cnr_less_cmq sin(alpha)^2 (w n) n))
+
+    ``e`` points to where the flow would have to come from for a flow angle of that size: the increments by deflection
+    are those of that much more incidence, of a shell that its load has deformed. ``w n`` is the rate in the plane of
+    the angle of attack, of coning; at no angle a body of revolution damps it as it damps pitching. A side force by the
+    dependence on roll is neglected.
+
+    References
+    ----------
+    M. Tobak, L. B. Schiff, "Generalized formulation of nonlinear pitch-yaw-roll coupling", AIAA J. 13 (1975) 323, 327
+    (coning). C. H. Murphy, "Free flight motion of symmetric missiles", BRL Report 1216 (1963) (roll, asymmetries).
+    """
+
+    cl: Coefficient = 0.0
+    clp: Coefficient = 0.0
+    cnr_less_cmq: Coefficient = 0.0
+    ca_deflection: Coefficient = 0.0
+    cn_deflection: Coefficient = 0.0
+    cm_deflection: Coefficient = 0.0
+    roll_order: Annotated[int, Field(ge=0, le=12)] = 0
+    roll_share: Annotated[float, Field(ge=-0.9, le=0.9)] = 0.0
+    roll_clock_lv_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+
+    @model_validator(mode="after")
+    def _whole(self) -> AeroTerms:
+        if (self.roll_order == 0) != (self.roll_share == 0.0):
+            raise ValueError("roll_order (1 or more) and roll_share are wanted together")
+        return self
+
+    @property
+    def numbers(self) -> FloatArray:
+        """As the kernels have them (9,), the clock in rad from body y towards z."""
+        way = lv_direction(float(np.deg2rad(self.roll_clock_lv_deg)))
+        by_roll = float(self.roll_order), self.roll_share, float(np.arctan2(way[2], way[1]))
+        by_deflection = self.ca_deflection, self.cn_deflection, self.cm_deflection
+        return np.array([self.cl, self.clp, self.cnr_less_cmq, *by_deflection, *by_roll])
+
+
+NO_TERMS = AeroTerms()
 
 
 class SensorMount(Section):
@@ -263,6 +324,7 @@ class VehicleFile(Section):
     mass: tuple[MassStep, ...] = ()
     uncertainty: Uncertainty = Uncertainty()
     aerodynamics: Aerodynamics
+    aerodynamic_terms: AeroTerms = AeroTerms()
     geometry: ShellGeometry
     meshes: MeshFiles = MeshFiles()
     sensors: dict[Name, SensorMount] = {}
@@ -302,6 +364,7 @@ class Vehicle:
     files: tuple[str, ...] = ()  # coefficient table, sidecar and meshes beside the vehicle file, relative to it
     meshes: dict[str, BodyMesh] = field(default_factory=dict)  # of the user's own, by body
     mass_steps: tuple[MassStep, ...] = ()  # later mass properties; `at` has those of a time
+    aero_terms: AeroTerms = NO_TERMS
 
     @property
     def mass_kg(self) -> float:
@@ -479,4 +542,5 @@ def vehicle_from_toml(path: Path) -> Vehicle:
         files=(*((table, str(Path(table).with_suffix(".toml"))) if own and table is not None else ()), *drawn, *listed),
         meshes=meshes,
         mass_steps=spec.mass,
+        aero_terms=spec.aerodynamic_terms,
     )

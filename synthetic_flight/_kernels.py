@@ -42,11 +42,12 @@ STATES, CREEP_STATES, AUX = 20, 2, 18
 # parameters of a vehicle: masses of body and shell, 1/m_B, 1/m_A, m_A/m, -m_B/m, 1/m; of the body, then of the shell,
 # inertia, its inverse, and -[p] I^-1 [p] of the arm p from c.g. to joint (6 each: xx xy xz yy yz zz); those arms; nose
 # from the shell's c.g.; the joint's nine numbers; area, length; factors on C_A, C_N, C_m, shift of C_mq; the delayed
-# compliance, rad/(N m), and 1 / its time constant
+# compliance, rad/(N m), and 1 / its time constant; the joint's quadratic stiffness; the nine of
+# `flightmodel.vehicle.AeroTerms`
 M_B, M_A, PER_B, PER_A, SHARE_B, SHARE_A, PER_MASS = 0, 1, 2, 3, 4, 5, 6
 I_B, W_B, N_B, I_A, W_A, N_A = 7, 13, 19, 25, 31, 37
-P_B, P_A, NOSE_A, JOINT, REFERENCE, FACTOR, DELAYED = 43, 46, 49, 52, 61, 63, 67
-PARAMETERS = 69
+P_B, P_A, NOSE_A, JOINT, REFERENCE, FACTOR, DELAYED, QUADRATIC, TERMS = 43, 46, 49, 52, 61, 63, 67, 69, 70
+PARAMETERS = 79
 
 # rows: state, trial state of a Runge-Kutta stage, its derivative, the next state; in `CREEP` those of the creep
 Y, TRIAL, RATE, NEXT = 0, 20, 40, 60
@@ -259,6 +260,39 @@ def _wrench(s, w, i):
 
 
 @inlined
+def _terms(s, lanes):
+    """Add to force and moment on the shell what `flightmodel.vehicle.AeroTerms` says beyond the table."""
+    w = len(lanes)
+    for i in range(w):
+        _, v, z = _three(s, FLOW, w, i)
+        speed, area, length = s[SPEED * w + i], s[(P + REFERENCE) * w + i], s[(P + REFERENCE + 1) * w + i]
+        lateral = s[LATERAL * w + i] + 1e-12
+        ny, nz = v / lateral, z / lateral
+        t, f, n = (P + TERMS) * w + i, (P + FACTOR) * w + i, COEF * w + i
+        qs = s[PRESSURE * w + i] * area
+        ey, ez = s[(C_AB + 3) * w + i], s[(C_AB + 6) * w + i]
+        by_roll = s[t + 7 * w] * math.cos(s[t + 6 * w] * (la.atan2(z, v) - s[t + 8 * w]))
+        cn, cm = by_roll * s[n + w] * s[f + w], by_roll * s[n + 2 * w] * s[f + 2 * w]
+        fx = -qs * s[t + 3 * w] * (ey * ey + ez * ez)
+        fy, fz = -qs * (cn * ny + s[t + 4 * w] * ey), -qs * (cn * nz + s[t + 4 * w] * ez)
+        my, mz = cm * ny + s[t + 5 * w] * ey, cm * nz + s[t + 5 * w] * ez
+        wa0, wa1, wa2 = _three(s, TRIAL + 17, w, i)
+        per_rate = 0.5 * length / (speed + 1e-12)
+        coning = s[t + 2 * w] * per_rate * (lateral / (speed + 1e-12)) ** 2 * (wa1 * ny + wa2 * nz)
+        x, y, t2 = qs * length * (s[t] + s[t + w] * per_rate * wa0), qs * length * mz, -qs * length * my
+        y, t2 = y + qs * length * coning * ny, t2 + qs * length * coning * nz
+        a0, a1, a2 = _three(s, P + NOSE_A, w, i)
+        c0, c1, c2 = la.cross(a0, a1, a2, fx, fy, fz)
+        m, a = SHELL * w + i, AERO * w + i
+        s[m], s[m + w], s[m + 2 * w] = s[m] + x + c0, s[m + w] + y + c1, s[m + 2 * w] + t2 + c2
+        s[a], s[a + w], s[a + 2 * w] = s[a] + fx, s[a + w] + fy, s[a + 2 * w] + fz
+        per_mass = s[(P + PER_MASS) * w + i]
+        c0, c1, c2 = la.times(_nine(s, R_A, w, i), fx * per_mass, fy * per_mass, fz * per_mass)
+        r = (RATE + 3) * w + i
+        s[r], s[r + w], s[r + 2 * w] = s[r] + c0, s[r + w] + c1, s[r + 2 * w] + c2
+
+
+@inlined
 def _loads(s, lanes, planet):
     """Acceleration of the composite c.g. by gravity and aerodynamics, and the loads on the two bodies."""
     w = len(lanes)
@@ -291,6 +325,13 @@ def beyond_freeplay(theta, freeplay, half, per_four_half):
 
 
 @inlined
+def _spring(s, w, i, d):
+    """Moment of the spring at an angle beyond the freeplay."""
+    j = (P + JOINT) * w + i
+    return d * (s[j] + d * (s[(P + QUADRATIC) * w + i] + s[j + w] * d))
+
+
+@inlined
 def _joint(s, lanes):
     """Moment of the joint on the body, and the deflection.
 
@@ -306,7 +347,7 @@ def _joint(s, lanes):
         theta = la.atan2(sine, x)
         j = (P + JOINT) * w + i
         d = beyond_freeplay(theta, s[j + 6 * w], s[j + 7 * w], s[j + 8 * w])
-        k = d * (s[j] + s[j + w] * d * d) / (sine + 1e-300)
+        k = _spring(s, w, i, d) / (sine + 1e-300)
         twist = 2.0 * la.atan2(s[(TWIST + 1) * w + i], s[TWIST * w + i])
         twist -= 2.0 * math.pi * ((1.0 if twist > math.pi else 0.0) - (1.0 if twist < -math.pi else 0.0))
         b0, b1, b2 = _three(s, RATE_B, w, i)
@@ -336,9 +377,9 @@ def _creep(s, lanes):
         size = math.sqrt(p * p + q * q)
         j, k = (P + JOINT) * w + i, (P + DELAYED) * w + i
         d = beyond_freeplay(theta, s[j + 6 * w], s[j + 7 * w], s[j + 8 * w])
-        without = d * (s[j] + s[j + w] * d * d)
+        without = _spring(s, w, i, d)
         d = beyond_freeplay(size, s[j + 6 * w], s[j + 7 * w], s[j + 8 * w])
-        per_size = d * (s[j] + s[j + w] * d * d) / (size + 1e-300)
+        per_size = _spring(s, w, i, d) / (size + 1e-300)
         p, q = p * per_size, q * per_size
         along, across = p * u + q * v - without, (p * v - q * u) * theta * per_sine
         m = MOMENT * w + i
@@ -489,14 +530,19 @@ def _rigid(s, lanes):
 
 
 @inlined
-def rates(s, lanes, creep, atmosphere, grid, mach_knots, table, free, planet, locked, slowed):
-    """Time derivative of the trial state of every lane, and what is recorded."""
+def rates(s, lanes, creep, terms, atmosphere, grid, mach_knots, table, free, planet, locked, slowed):
+    """Time derivative of the trial state of every lane, and what is recorded.
+
+    Whether ``terms`` is empty is a constant of the compiler, as for ``creep``.
+    """
     _attitudes(s, lanes)
     _position(s, lanes, planet)
     _air(s, lanes, atmosphere, grid)
     _flow(s, lanes)
     _coefficients(s, lanes, grid, mach_knots, table, free)
     _loads(s, lanes, planet)
+    if len(terms) > 0:
+        _terms(s, lanes)
     if locked:
         _rigid(s, lanes)
     else:
@@ -583,7 +629,9 @@ def _finish(s, w, step):
 
 
 @kernel
-def integrate(lanes, creep, s, tables, planet, step, per_record, records, lock_records, limit, out, out_aux, written):
+def integrate(
+    lanes, creep, terms, s, tables, planet, step, per_record, records, lock_records, limit, out, out_aux, written
+):
     """Fly ``records - 1`` intervals of ``per_record`` RK4 steps; joint locked for the first ``lock_records`` intervals.
 
     ``written`` becomes the number of records of every lane, negative where the flight ended because the deflection
@@ -601,7 +649,8 @@ def integrate(lanes, creep, s, tables, planet, step, per_record, records, lock_r
         locked = record < lock_records
         for sub in range(per_record):
             for stage in range(4):
-                rates(s, lanes, creep, tables[0], tables[1], tables[2], tables[3], tables[4], planet, locked, slowed)
+                air, grid, knots, table, free = tables
+                rates(s, lanes, creep, terms, air, grid, knots, table, free, planet, locked, slowed)
                 if stage + sub == 0:
                     flying = _record(s, w, creep, record, limit, out, out_aux, written)
                     if record == records - 1 or not flying:

@@ -108,6 +108,7 @@ class JointDispersions(Section):
     torsion_stiffness: Factor | None = None
     station_m: Shift | None = None
     freeplay_deg: Shift | None = None
+    quadratic_nmprad2: Shift | None = None
     hardening_nmprad3: Shift | None = None
     damping_hardening_nmsprad3: Shift | None = None
 
@@ -273,6 +274,7 @@ def dispersed_vehicle(vehicle: Vehicle, of: Callable[[str], float]) -> Vehicle:
         "bending_damping_nmsprad": joint.bending_damping_nmsprad * (1.0 + of("joint.damping")),
         "torsion_stiffness_nmprad": joint.torsion_stiffness_nmprad * (1.0 + of("joint.torsion_stiffness")),
         "freeplay_deg": joint.freeplay_deg + of("joint.freeplay_deg"),
+        "quadratic_nmprad2": joint.quadratic_nmprad2 + of("joint.quadratic_nmprad2"),
         "hardening_nmprad3": joint.hardening_nmprad3 + of("joint.hardening_nmprad3"),
         "damping_hardening_nmsprad3": joint.damping_hardening_nmsprad3 + of("joint.damping_hardening_nmsprad3"),
     }

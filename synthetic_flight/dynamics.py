@@ -101,7 +101,7 @@ def spring_deflection(state: FloatArray) -> FloatArray:
 
 
 def _spring_energy(vehicle: Vehicle, state: FloatArray) -> FloatArray:
-    """Energy in the joint's springs, J: the integral of its moment over the angle, freeplay and hardening included."""
+    """Energy in the joint's springs, J: the integral of its moment over the angle, freeplay and all orders included."""
     joint = vehicle.joint
     theta = (
         np.linalg.norm(spring_deflection(state), axis=-1)
@@ -117,7 +117,7 @@ def _spring_energy(vehicle: Vehicle, state: FloatArray) -> FloatArray:
         a, b = np.minimum(low, theta), np.minimum(high, theta)
         x = a[..., None] + 0.5 * (b - a)[..., None] * (node + 1.0)
         d = beyond_freeplay(x, freeplay, joint.freeplay_corner)
-        moment = joint.bending_stiffness_nmprad * d + joint.hardening_nmprad3 * d**3
+        moment = joint.bending_stiffness_nmprad * d + joint.quadratic_nmprad2 * d**2 + joint.hardening_nmprad3 * d**3
         energy = energy + 0.5 * (b - a) * np.sum(weight * moment, axis=-1)
     if joint.creep_share > 0.0 and state.shape[-1] > 20:
         energy = energy + 0.5 * np.sum(state[..., 20:22] ** 2, axis=-1) / joint.delayed_compliance_radpnm

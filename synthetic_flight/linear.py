@@ -75,14 +75,17 @@ def linear_matrix(vehicle: Vehicle, slopes: Slopes, pressure_pa: float, speed_mp
     elastic = joint.bending_stiffness_nmprad * (angle_b - angle_a - creep)
     spring = elastic + joint.bending_damping_nmsprad * (rate_b - rate_a)
     deceleration = load * slopes.ca / vehicle.mass_kg
-    moment = load * (slopes.cm_alpha * length + slopes.cn_alpha * joint.station_m) * flow
+    # increments by deflection: as that much more incidence
+    bent, terms = angle_a - angle_b, vehicle.aero_terms
+    normal = slopes.cn_alpha * flow + terms.cn_deflection * bent
+    moment = load * ((slopes.cm_alpha * flow + terms.cm_deflection * bent) * length + normal * joint.station_m)
     moment = moment + load * length**2 * slopes.cmq / (2.0 * speed_mps) * rate_a
     mass = np.array(
         [[vehicle.mass_kg, first_a, first_b], [first_a, inertia_a, 0.0], [first_b, 0.0, inertia_b]],
     )
     right = np.stack(
         [
-            load * (slopes.ca * angle_a - slopes.cn_alpha * flow),
+            load * (slopes.ca * angle_a - normal),
             first_a * deceleration * angle_a + moment + spring,
             first_b * deceleration * angle_b - spring,
         ]
@@ -135,7 +138,7 @@ def _levers(vehicle: Vehicle, slopes: Slopes) -> tuple[float, float]:
 def critical_stiffness_nmprad(vehicle: Vehicle, slopes: Slopes, pressure_pa: float) -> float:
     """Bending stiffness, N m/rad, below which the vehicle diverges: ``q S C_A xbar (1 + xbar / L)``.
 
-    Of a joint that creeps it is that against loads that stay.
+    Of a joint that creeps it is that against loads that stay. Increments of coefficients by deflection are not in it.
     """
     xbar, margin = _levers(vehicle, slopes)
     return pressure_pa * vehicle.reference.area_m2 * slopes.ca * xbar * (1.0 + xbar / margin)

@@ -228,7 +228,7 @@ def integrate_lanes(
 ) -> list[tuple[FloatArray, FloatArray, bool]]:
     """States, auxiliaries and whether the joint diverged of flights side by side.
 
-    ``states`` ``(lanes, 20)``, or ``(lanes, 22)`` of joints that creep, ``parameters`` ``(lanes, 69)``; ``atmosphere``
+    ``states`` ``(lanes, 20)``, or ``(lanes, 22)`` of joints that creep, ``parameters`` ``(lanes, 79)``; ``atmosphere``
     is one table, or ``(lanes, rows, 6)``, its first row at ``air_from_m``.
     """
     lanes, width = states.shape
@@ -237,6 +237,7 @@ def integrate_lanes(
     at.integrate(
         (0,) * lanes,
         (0,) * (width - STATES),
+        (0,) * int(parameters[:, at.TERMS :].any()),
         workspace(states, parameters, step_s),
         kernel_tables(vehicle, atmosphere, air_from_m),
         planet,
@@ -420,7 +421,7 @@ def freeplay_corner(freeplay_rad: float, corner: float) -> tuple[float, float, f
 def parameter_vector(
     vehicle: Vehicle, ca: float = 1.0, cn: float = 1.0, cm: float = 1.0, cmq_shift: float = 0.0
 ) -> FloatArray:
-    """Pack a vehicle for the kernels, (69,), with factors on its C_A, C_N and C_m and a shift of its C_mq."""
+    """Pack a vehicle for the kernels, (79,), with factors on its C_A, C_N and C_m and a shift of its C_mq."""
     p = np.zeros(at.PARAMETERS)
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
     upper = np.triu_indices(3)
@@ -450,6 +451,8 @@ def parameter_vector(
     p[at.REFERENCE : at.REFERENCE + 2] = vehicle.reference.area_m2, vehicle.reference.length_m
     p[at.FACTOR : at.FACTOR + 4] = ca, cn, cm, cmq_shift
     p[at.DELAYED : at.DELAYED + 2] = joint.delayed_compliance_radpnm, 1.0 / joint.creep_time_s
+    p[at.QUADRATIC] = joint.quadratic_nmprad2
+    p[at.TERMS :] = vehicle.aero_terms.numbers
     return p
 
 
@@ -496,7 +499,7 @@ def kernel_tables(
 
 
 def workspace(states: FloatArray, parameters: FloatArray, step_s: float = 0.0) -> FloatArray:
-    """Flat workspace of the kernels of states ``(lanes, 20 or 22)`` and parameter vectors ``(lanes, 69)``.
+    """Flat workspace of the kernels of states ``(lanes, 20 or 22)`` and parameter vectors ``(lanes, 79)``.
 
     ``step_s`` is the integration's: the twist of a joint for which it is too long is slowed.
     """

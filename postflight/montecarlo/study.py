@@ -125,7 +125,7 @@ def _vehicle_facts(vehicle: Vehicle) -> dict[str, Any]:
     table = vehicle.aero.coefficients.tobytes() + vehicle.aero.mach.tobytes() + vehicle.aero.alpha_rad.tobytes()
     if vehicle.aero.free_molecular is not None:
         table += vehicle.aero.free_molecular.tobytes()
-    parts = ("reference", "joint", "aeroshell", "centerbody", "uncertainty", "geometry")
+    parts = ("reference", "joint", "aeroshell", "centerbody", "uncertainty", "geometry", "aero_terms")
     facts = {name: getattr(vehicle, name).model_dump(mode="json") for name in parts}
     return facts | {"coefficients_sha256": hashlib.sha256(table).hexdigest()}
 

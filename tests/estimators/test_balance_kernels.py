@@ -8,6 +8,7 @@ import pytest
 from estimators import balance
 from estimators.balance import Swing
 from flightmodel.atmosphere import standard_atmosphere
+from flightmodel.vehicle import AeroTerms
 from synthetic_flight.simulate import fly
 from tests.oracles import plain_balance
 
@@ -33,6 +34,22 @@ def test_kernels_leave_what_the_readable_balances_leave(loads, name, size_rad):
     got, want = (getattr(module, name)(loads.vehicle, swing, loads) for module in (balance, plain_balance))
     # second differences over (1e-4 s)^2 leave rounding of 1e-8 m/s^2 of their own
     np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-8)
+
+
+TERMS = AeroTerms(
+    cl=0.01, clp=-0.2, cnr_less_cmq=-0.7, ca_deflection=0.9, cn_deflection=0.4, cm_deflection=-0.2, roll_order=3,
+    roll_share=0.15, roll_clock_lv_deg=25.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("size_rad", [0.0, 0.1, 0.5])
+@pytest.mark.parametrize("name", ["force_residual", "axial_residual", "moment_residual"])
+def test_terms_beyond_the_table_are_those_of_the_readable_balances(loads, name, size_rad):
+    swing, vehicle = swing_of(size_rad, len(loads.time_s)), replace(loads.vehicle, aero_terms=TERMS)
+    got, want = (getattr(module, name)(vehicle, swing, loads) for module in (balance, plain_balance))
+    np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-8)
+    if name != "axial_residual" or size_rad > 0.0:  # of these it has the deflection's alone
+        assert np.abs(got - getattr(balance, name)(loads.vehicle, swing, loads)).max() > 1e-4
 
 
 @pytest.mark.parametrize("name", ["force_residual", "axial_residual", "moment_residual"])

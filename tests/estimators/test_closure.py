@@ -16,6 +16,7 @@ from estimators.misalignment import misalignment_evidence
 from estimators.trim import moment_term, solve_trim, trim_evidence, trim_model
 from flightmodel import airdata, earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
+from flightmodel.vehicle import AeroTerms
 from synthetic_flight.simulate import fly, state_from_ecef
 from tests.oracles.plain_balance import axes, relative_rate
 
@@ -112,6 +113,34 @@ def test_balances_of_a_locked_joint_close(rpm, bent_deg, cmq):
         for evidence in (trim_evidence, misalignment_evidence):
             read = evidence(pulse).theta_yz_rad
             np.testing.assert_allclose(np.rad2deg(read - truth.deflection.theta_yz_rad), 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("rpm", RPM)
+def test_balances_close_with_terms_beyond_the_table_and_not_without(rpm):
+    """Coning, roll dependence and increments by deflection, a locked joint bent by 5 deg; one left out leaves 0.05."""
+    bent = np.deg2rad([4.0, -3.0])
+    terms = {
+        "coning": {"cnr_less_cmq": -20.0},
+        "axial": {"ca_deflection": 20.0},
+        "normal": {"cn_deflection": 0.3},
+        "moment": {"cm_deflection": -0.1},
+        "roll": {"roll_order": 2, "roll_share": 0.3, "roll_clock_lv_deg": 20.0},
+    }
+    vehicle = living(-1.0)
+    every = {key: value for one in terms.values() for key, value in one.items()}
+    flown = replace(vehicle, aero_terms=AeroTerms(**every))
+    state = start(rpm, [0.1, -0.15], np.array([0.08, -0.06]) - bent, bent)
+    truth = fly(flown, standard_atmosphere(), state, START_S, START_S + 2.0, EPOCH, 0.002, 0.01, START_S + 9.0)
+    swing = Swing.held(truth.deflection.theta_yz_rad)
+    force, moment = left_deg(truth, swing)
+    np.testing.assert_allclose(force, 0.0, atol=1e-5)
+    # damping takes the c.g.'s airspeed, not the nose's
+    np.testing.assert_allclose(moment, 0.0, atol=1e-3)
+    np.testing.assert_allclose(axial_residual(flown, swing, pulse_of_truth(truth)), 0.0, atol=1e-5)
+    for name, own in terms.items():
+        rest = {key: value for key, value in every.items() if key not in own}
+        other = replace(truth, vehicle=replace(flown, aero_terms=AeroTerms(**rest)))
+        assert max(np.abs(left).max() for left in left_deg(other, swing)) > 0.05, name
 
 
 def test_each_term_of_the_balances_is_alive():

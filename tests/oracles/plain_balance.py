@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from estimators.balance import Swing
@@ -112,6 +114,36 @@ def nose_flow(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
     return lateral_angles(_turned(turn.transpose(0, 2, 1), velocity))
 
 
+@dataclass(frozen=True)
+class Air:
+    """Over ``q S``, shell axes: C_A (n,), lateral force, the moment's lateral flow, flow's direction (n, 3) each."""
+
+    axial: FloatArray
+    lateral: FloatArray
+    tilting: FloatArray
+    side: FloatArray
+    cmq: FloatArray
+    sine: FloatArray
+
+
+def air(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> Air:
+    """Coefficients of the table and `flightmodel.vehicle.AeroTerms`."""
+    flow, terms = nose_flow(vehicle, swing, loads), vehicle.aero_terms
+    direction, c = flow_coefficients(vehicle.aero, loads.mach, flow)
+    side = np.column_stack([np.zeros(len(c)), direction])
+    bent = axes(swing)[:, 0] * [0.0, 1.0, 1.0]
+    clock = np.arctan2(direction[:, 1], direction[:, 0]) - terms.numbers[8]
+    by_roll = (1.0 + terms.roll_share * np.cos(terms.roll_order * clock))[:, None]
+    return Air(
+        c[:, 0] + terms.ca_deflection * np.sum(bent**2, axis=1),
+        by_roll * c[:, 1:2] * side + terms.cn_deflection * bent,
+        by_roll * c[:, 2:3] * side + terms.cm_deflection * bent,
+        side,
+        c[:, 3],
+        np.sin(np.linalg.norm(flow, axis=1)),
+    )
+
+
 def force_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
     """Tilt of the force against the shell less the air's, ``atan(C_N/C_A)`` on the flow's side; shell y, z (n, 2), rad.
 
@@ -123,8 +155,9 @@ def force_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatA
     loads : FlightLoads
     """
     force = _turned(axes(swing).transpose(0, 2, 1), specific_force(vehicle, swing, loads))
-    direction, c = flow_coefficients(vehicle.aero, loads.mach, nose_flow(vehicle, swing, loads))
-    return np.asarray(lateral_angles(-force) - direction * np.arctan2(c[:, 1], c[:, 0])[:, None])
+    of_air = air(vehicle, swing, loads)
+    along = of_air.lateral + of_air.axial[:, None] * _X
+    return np.asarray(lateral_angles(-force) - lateral_angles(along))
 
 
 def axial_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
@@ -133,10 +166,9 @@ def axial_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatA
     Parameters as of `force_residual`.
     """
     force = _turned(axes(swing).transpose(0, 2, 1), specific_force(vehicle, swing, loads))
-    _, c = flow_coefficients(vehicle.aero, loads.mach, nose_flow(vehicle, swing, loads))
-    air = loads.dynamic_pressure_pa * vehicle.reference.area_m2 * c[:, 0]
+    wanted = loads.dynamic_pressure_pa * vehicle.reference.area_m2 * air(vehicle, swing, loads).axial
     with np.errstate(invalid="ignore"):  # of a force that points forward
-        return np.asarray(np.log(-vehicle.mass_kg * force[:, 0] / air)[:, None])
+        return np.asarray(np.log(-vehicle.mass_kg * force[:, 0] / wanted)[:, None])
 
 
 def moment_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
@@ -145,17 +177,18 @@ def moment_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> Float
     Parameters as of `force_residual`.
     """
     turn, length = axes(swing), vehicle.reference.length_m
-    direction, c = flow_coefficients(vehicle.aero, loads.mach, nose_flow(vehicle, swing, loads))
-    side = np.column_stack([np.zeros(len(c)), direction])
+    at = air(vehicle, swing, loads)
     rate = _turned(turn.transpose(0, 2, 1), loads.rate_body_radps + relative_rate(swing)) * [0.0, 1.0, 1.0]
-    force = -(c[:, :1] * _X + c[:, 1:2] * side)
-    damping = c[:, 3:] * length / (2.0 * loads.airspeed_mps[:, None]) * rate
-    about_nose = length * (c[:, 2:3] * np.cross(side, _X) + damping)
+    force = -(at.axial[:, None] * _X + at.lateral)
+    coning = np.sum(rate * at.side, axis=1, keepdims=True) * at.side
+    less = vehicle.aero_terms.cnr_less_cmq * at.sine[:, None] ** 2
+    damping = length / (2.0 * loads.airspeed_mps[:, None]) * (at.cmq[:, None] * rate + less * coning)
+    about_nose = length * (np.cross(at.tilting, _X) + damping)
     force, about_nose = _turned(turn, force), _turned(turn, about_nose)
     nose = vehicle.joint_m - turn @ vehicle.joint_m
     cg = loads.point_from_datum_m + _cg_from_point(vehicle, loads.point_from_datum_m, swing)
     of_air = about_nose + np.cross(nose - cg, force)
     q_area = loads.dynamic_pressure_pa[:, None] * vehicle.reference.area_m2
-    left = (of_air - _moment(vehicle, swing, loads) / q_area) / c[:, :1]
+    left = (of_air - _moment(vehicle, swing, loads) / q_area) / at.axial[:, None]
     # a lateral shift d of the c.g. against the axial force has the moment d x x_hat = (0, d_z, -d_y)
     return np.column_stack([-left[:, 2], left[:, 1]])

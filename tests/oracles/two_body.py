@@ -17,6 +17,7 @@ import numpy as np
 from flightmodel import earth, rotations, sphere_cone
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray
+from flightmodel.deflection import lv_direction
 from flightmodel.vehicle import Vehicle
 from synthetic_flight.dynamics import beyond_freeplay, points, split, spring_deflection, twist
 
@@ -34,14 +35,22 @@ def creeping_moment(vehicle: Vehicle, state: FloatArray) -> tuple[FloatArray, Fl
         d = beyond_freeplay(
             np.linalg.norm(spring_deflection(moved)), np.deg2rad(joint.freeplay_deg), joint.freeplay_corner
         )
-        return float(0.5 * joint.bending_stiffness_nmprad * d**2 + 0.25 * joint.hardening_nmprad3 * d**4)
+        straight, hardening = 0.5 * joint.bending_stiffness_nmprad * d**2, 0.25 * joint.hardening_nmprad3 * d**4
+        return float(straight + joint.quadratic_nmprad2 * d**3 / 3.0 + hardening)
 
     slope = [(potential(turn * axis) - potential(-turn * axis)) / (2.0 * turn) for axis in np.eye(3)]
     felt = spring_deflection(state)
     d = beyond_freeplay(np.linalg.norm(felt), np.deg2rad(joint.freeplay_deg), joint.freeplay_corner)
-    force = (joint.bending_stiffness_nmprad * d + joint.hardening_nmprad3 * d**3) * felt / np.linalg.norm(felt)
+    force = spring_moment(vehicle, d) * felt / np.linalg.norm(felt)
     share = joint.creep_share / (1.0 - joint.creep_share)
     return -np.array(slope), (share * force / joint.bending_stiffness_nmprad - state[20:]) / joint.creep_time_s
+
+
+def spring_moment(vehicle: Vehicle, d: float) -> float:
+    """Moment of the bending spring, N m, at an angle beyond the freeplay, rad."""
+    joint = vehicle.joint
+    straight = joint.bending_stiffness_nmprad * d
+    return float(straight + joint.quadratic_nmprad2 * abs(d) * d + joint.hardening_nmprad3 * d**3)
 
 
 def joint_moment(vehicle: Vehicle, q_b: FloatArray, q_a: FloatArray, rate_eci: FloatArray) -> FloatArray:
@@ -52,7 +61,7 @@ def joint_moment(vehicle: Vehicle, q_b: FloatArray, q_a: FloatArray, rate_eci: F
     sine, cosine = np.linalg.norm(normal), x_b @ x_a
     theta = np.arctan2(sine, cosine)
     d = beyond_freeplay(theta, np.deg2rad(joint.freeplay_deg), joint.freeplay_corner)
-    spring = joint.bending_stiffness_nmprad * d + joint.hardening_nmprad3 * d**3
+    spring = spring_moment(vehicle, d)
     moment = spring * normal / sine if sine > 0 else np.zeros(3)
     middle = x_b + x_a
     moment = moment - joint.torsion_stiffness_nmprad * twist(q_b, q_a) * middle / (1.0 + cosine)
@@ -80,9 +89,19 @@ def aerodynamics(
     ca, cn, cm, cmq = vehicle.aero.at(speed / air.sound_speed_mps, np.arctan2(lateral, flow[0]), thin)
     q_area = 0.5 * air.density_kgpm3 * speed**2 * vehicle.reference.area_m2
     length = vehicle.reference.length_m
-    force = -q_area * (ca * x_hat + cn * n)
-    transverse = np.array([0.0, w_a[1], w_a[2]])
-    moment = q_area * length * (cm * np.cross(n, x_hat) + cmq * length / (2.0 * speed) * transverse)
+    terms = vehicle.aero_terms
+    bent = rotations.rotate(rotations.conjugate(q_a), rotations.rotate(state[6:10], x_hat)) * [0.0, 1.0, 1.0]
+    # clock angles count as those of the launch vehicle's frame do: from the direction at 0 deg to that at 90 deg
+    zero, quarter = lv_direction(0.0), lv_direction(np.pi / 2.0)
+    clock = np.arctan2(n @ quarter, n @ zero) - np.deg2rad(terms.roll_clock_lv_deg)
+    by_roll = 1.0 + terms.roll_share * np.cos(terms.roll_order * clock)
+    force = -q_area * ((ca + terms.ca_deflection * bent @ bent) * x_hat + by_roll * cn * n + terms.cn_deflection * bent)
+    per_rate = length / (2.0 * speed)
+    coning = terms.cnr_less_cmq * (lateral / speed) ** 2 * (w_a @ n) * n
+    damping = per_rate * (cmq * np.array([0.0, w_a[1], w_a[2]]) + coning)
+    roll = (terms.cl + terms.clp * per_rate * w_a[0]) * x_hat
+    tilting = np.cross(by_roll * cm * n + terms.cm_deflection * bent, x_hat)
+    moment = q_area * length * (tilting + damping + roll)
     return rotations.rotate(q_a, force), rotations.rotate(q_a, moment)
 
 

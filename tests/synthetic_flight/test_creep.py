@@ -59,11 +59,12 @@ def test_a_free_joint_moves_as_the_linear_solid(vehicle, measured, share, time_s
 
 def test_the_kernel_equals_the_readable_form(generic_vehicle, measured):
     one = with_joint(undamped(generic_vehicle), creep_share=0.35, creep_time_s=2.0, torsion_stiffness_nmprad=0.0)
+    one = with_joint(one, quadratic_nmprad2=3e4)
     state = np.append(bent_entry_state([0.004, 0.05, -0.06], [0.1, 0.2, 0.3]), [0.03, -0.02])
     s = simulate.workspace(state[None], simulate.parameter_vector(one)[None])
     s[at.TRIAL : at.TRIAL + at.STATES], s[at.CREEP + 2 : at.CREEP + 4] = state[:20], state[20:]
     tables = simulate.kernel_tables(one, simulate.vacuum_table())
-    _kernels.rates(s, (0,), (0, 0), *tables, earth.WGS84, False, False)
+    _kernels.rates(s, (0,), (0, 0), (), *tables, earth.WGS84, False, False)
     moment, creep_rate = two_body.creeping_moment(one, state)
     in_eci = s[at.R_A : at.R_A + 9].reshape(3, 3) @ s[at.MOMENT : at.MOMENT + 3]
     # central differences of 1e-5 rad: 1e-10 of cubic terms, 1e-16 / 1e-5 of rounding

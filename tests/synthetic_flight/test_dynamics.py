@@ -5,12 +5,13 @@ import pytest
 
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile
+from flightmodel.vehicle import AeroTerms
 from synthetic_flight import _kernels, dynamics, simulate
 from synthetic_flight import _kernels as at
 from synthetic_flight.simulate import integrate, state_from_ecef
 from tests.oracles import two_body
 
-from .conftest import entry_state, free_state, undamped
+from .conftest import entry_state, free_state, undamped, with_joint
 
 
 def entry_45_km():
@@ -38,14 +39,17 @@ def kernel_rates(state, vehicle, table, locked=False, added=0.0):
     s = simulate.workspace(state[None], simulate.parameter_vector(vehicle)[None])
     s[at.ADDED] = added
     s[at.TRIAL : at.TRIAL + at.STATES] = state
-    _kernels.rates(s, (0,), (), *simulate.kernel_tables(vehicle, table), earth.WGS84, locked, added > 0.0)
+    terms = (0,) * (vehicle.aero_terms != AeroTerms())
+    _kernels.rates(s, (0,), (), terms, *simulate.kernel_tables(vehicle, table), earth.WGS84, locked, added > 0.0)
     # as recorded: forces and moments in ECI
     vectors = s[at.FORCE : at.FORCE + 9].reshape(3, 3) @ s[at.R_A : at.R_A + 9].reshape(3, 3).T
     aux = np.concatenate([s[at.ALTITUDE : at.ALTITUDE + 6], vectors.ravel(), s[at.RATE + 14 : at.RATE + 17]])
     return s[at.RATE : at.RATE + at.STATES], aux
 
 
-def test_kernel_equals_the_readable_form_with_every_term_alive(generic_vehicle):
+@pytest.mark.parametrize("quadratic_nmprad2", [0.0, 3e4])
+def test_kernel_equals_the_readable_form_with_every_term_alive(generic_vehicle, quadratic_nmprad2):
+    generic_vehicle = with_joint(generic_vehicle, quadratic_nmprad2=quadratic_nmprad2)
     state, profile = entry_45_km(), windy()
     dy, aux = kernel_rates(state, generic_vehicle, simulate.atmosphere_table(profile))
     force, _ = two_body.aerodynamics(state, generic_vehicle, profile)
@@ -125,12 +129,14 @@ def test_joint_point_of_both_bodies_has_one_acceleration(generic_vehicle):
     np.testing.assert_allclose(where["body"][1][-1] - where["body"][1][0], impulse, atol=2e-6)
 
 
-@pytest.mark.parametrize(("freeplay_deg", "tolerance"), [(0.0, 1e-10), (0.4, 1e-9)])
-def test_energy_and_momentum_of_the_free_undamped_system(generic_vehicle, freeplay_deg, tolerance):
+@pytest.mark.parametrize(
+    ("freeplay_deg", "quadratic_nmprad2", "tolerance"), [(0.0, 0.0, 1e-10), (0.0, 3e4, 1e-10), (0.4, 0.0, 1e-9)]
+)
+def test_energy_and_momentum_of_the_free_undamped_system(generic_vehicle, freeplay_deg, quadratic_nmprad2, tolerance):
     # the freeplay's corner is smooth in slope, not in curvature, which costs the fourth-order steps their order there
     # 1e10 m away gravity's gradient is 1e-15 /s^2: motion about the c.g. is free
     vehicle = undamped(generic_vehicle)
-    vehicle = replace(vehicle, joint=vehicle.joint.model_copy(update={"freeplay_deg": freeplay_deg}))
+    vehicle = with_joint(vehicle, freeplay_deg=freeplay_deg, quadratic_nmprad2=quadratic_nmprad2)
     states, aux = integrate(vehicle, simulate.vacuum_table(), free_state(vehicle), 5e-5, 10000, 201)
     energy = dynamics.internal_energy(states, vehicle)
     inside = energy[0]

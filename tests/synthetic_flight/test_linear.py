@@ -5,11 +5,14 @@ two decimals); the nonlinear simulator, differentiated numerically; the closed f
 printed values.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
 from flightmodel import rotations
+from flightmodel.vehicle import AeroTerms
 from synthetic_flight import dynamics
 from synthetic_flight.linear import (
     DIVERGENT,
@@ -104,10 +107,11 @@ def planar_rates(vehicle, x, air, speed_mps=SPEED_MPS):
 
 
 @pytest.mark.parametrize("cmq", [0.2, -0.3])
-@pytest.mark.parametrize("stiffness", [2774.0, 4335.0, 20000.0])
-def test_nonlinear_equations_differentiated(vehicle, measured, stiffness, cmq):
+@pytest.mark.parametrize(("stiffness", "bent"), [(2774.0, 0.0), (4335.0, 0.0), (20000.0, 0.0), (4335.0, 0.5)])
+def test_nonlinear_equations_differentiated(vehicle, measured, stiffness, bent, cmq):
     slopes = r1_slopes(cmq)
     body = r1(vehicle, stiffness, 0.03, linear_table(slopes))
+    body = replace(body, aero_terms=AeroTerms(cn_deflection=bent, cm_deflection=-0.6 * bent))
     air = FrozenAir(2.0 * PRESSURE_PA / SPEED_MPS**2)
     got, scale = np.empty((5, 5)), np.array([0.1, 1e-4, 1e-4, 1e-3, 1e-3])
     for j in range(5):
@@ -116,7 +120,9 @@ def test_nonlinear_equations_differentiated(vehicle, measured, stiffness, cmq):
     want = linear_matrix(body, slopes, PRESSURE_PA, SPEED_MPS)
     # central differences: (1e-4)^2 of cubic terms, 1e-16 / 1e-4 of rounding
     difference = np.abs(got - want) / np.abs(want).max(axis=1, keepdims=True)
-    measured(f"K {stiffness:.0f}, C_mq {cmq:+}: matrix against differences", difference.max(), 1e-6)
+    measured(
+        f"K {stiffness:.0f}, C_mq {cmq:+}, {bent:g} by deflection: matrix against differences", difference.max(), 1e-6
+    )
 
 
 def test_slopes_come_from_the_table(vehicle):
