@@ -55,6 +55,7 @@ TABLES = {
         "aerodynamics": aerodynamics.Aerodynamics,
         "aerodynamics.sphere_cone": aerodynamics.SphereCone,
         "aerodynamics.free_molecular": aerodynamics.FreeMolecular,
+        "aerodynamic_terms": vehicle.AeroTerms,
         "geometry": vehicle.ShellGeometry,
         "meshes": geometry.MeshFiles,
         "meshes.aeroshell": geometry.MeshFile,
