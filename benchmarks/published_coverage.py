@@ -22,7 +22,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.estimator_coverage import columns, report, row_of, safely
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
-from flightmodel.events import find_peak
 from flightmodel.trajectory import difference, resample
 from postflight.flight import read_flight
 from postflight.fusing import fuse_flight
@@ -87,7 +86,7 @@ def density_z(truth, bet, at_s):
 def scored(name, seed):
     """One flight's errors over what is stated; what was red, and why an answer is missing."""
     truth, bet = flown(name, seed)
-    peak = find_peak(truth.time_s, truth.dynamic_pressure_pa)[0]
+    peak = bet.peak_s  # the truth's own may lie beyond the last fix
     out = {"seed": seed, "words": truth.remark, "squares": trajectory_squares(truth, bet, peak), "rows": {}}
     out["density"] = density_z(truth, bet, peak)
     out["red"] = [check.code for check in bet.consistency_checks if not check.passed]

@@ -441,8 +441,8 @@ def _atmosphere(flight: Reconstruction) -> dict[str, Any]:
         "highest_m": float(sounding.altitude_m[-1]),
         "density_sd": [float(np.min(sounding.density_sd)), float(np.max(sounding.density_sd))],
         "wind_sd_mps": [float(np.min(sounding.wind_sd_mps)), float(np.max(sounding.wind_sd_mps))],
-        "columns": "rho, p, t, mach, winds, alpha: with the sounding's air; density_ratio: as-flown density over the "
-        "sounding's",
+        "columns": "rho, p, t, mach, winds, alpha: with the sounding's air (with [drag] as flown, where that is known "
+        "better); density_ratio: as-flown density over the sounding's",
     }
 
 

@@ -40,9 +40,10 @@ _TRAJECTORY: list[tuple[str, str, str, float, int, list[tuple[str, str, str | No
     ("speed", "Speed", "m/s", 1.0, 2, [
         ("airspeed", "airspeed_mps", "airspeed_sd_mps", _BLUE, []),
         ("ground speed", "speed_ground_mps", None, _DARK, [6, 4])]),
-    ("mach", "Mach number", "", 1.0, 4, [("by airspeed and the sounding's temperature", "mach", "mach_sd", _BLUE, [])]),
+    ("mach", "Mach number", "", 1.0, 4,
+     [("by airspeed and the atmosphere's temperature", "mach", "mach_sd", _BLUE, [])]),
     ("pressure", "Dynamic pressure", "Pa", 1.0, 3,
-     [("with the sounding's density", "dynamic_pressure_pa", "dynamic_pressure_sd_pa", _BLUE, [])]),
+     [("with the atmosphere's density", "dynamic_pressure_pa", "dynamic_pressure_sd_pa", _BLUE, [])]),
     ("alpha", "Total angle of attack of the centerbody", "deg", 1.0, 3, [
         ("wind-relative", "alpha_total_wind_deg", "alpha_total_wind_sd_deg", _BLUE, []),
         ("without wind", "alpha_total_ground_deg", None, _DARK, [6, 4])]),
