@@ -57,14 +57,14 @@ def drawn(stated, rng):
 
 
 def flown(name, seed):
-    """Truth of a flight and the analyst's reconstruction."""
+    """Truth of a flight and the analyst's reconstruction; None of a flight that tumbled."""
     scenario = read_scenario(name)
     vehicle = drawn(scenario.vehicle, np.random.default_rng([seed, 22, 2010]))
     spec = scenario.spec.model_copy(update={"video": None})
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "flight"
         truth = simulate_to_folder(replace(scenario, spec=spec, vehicle=vehicle), seed, folder)
-        return truth, reconstruct(read_flight(folder))
+        return truth, None if truth.remark else reconstruct(read_flight(folder))
 
 
 def trajectory_squares(truth, bet, at_s):
@@ -86,6 +86,8 @@ def density_z(truth, bet, at_s):
 def scored(name, seed):
     """One flight's errors over what is stated; what was red, and why an answer is missing."""
     truth, bet = flown(name, seed)
+    if bet is None:
+        return {"seed": seed, "words": truth.remark}
     peak = bet.peak_s  # the truth's own may lie beyond the last fix
     out = {"seed": seed, "words": truth.remark, "squares": trajectory_squares(truth, bet, peak), "rows": {}}
     out["density"] = density_z(truth, bet, peak)
@@ -112,8 +114,13 @@ def main():
         for seed in range(asked.first, asked.first + asked.flights):
             results.append(scored(name, seed))
             one = results[-1]
+            if one["words"]:
+                print(f"{name} {seed}: {one['words']}; left out", flush=True)
+                continue
             words = " ".join(f"{row[0] / row[1]:+.1f}" for row in one["rows"].values())
             print(f"{name} {seed}: z of {', '.join(one['rows'])}: {words}; red {one['red']}", flush=True)
+        report(results)
+        results = [one for one in results if not one["words"]]
         squares, count = np.array([one["squares"] for one in results]), len(results)
         low, high = chi2.ppf([0.025, 0.975], 3 * count) / (3 * count)
         shown = ", ".join(f"{group} {value:.2f}" for group, value in zip(GROUPS, squares.mean(axis=0), strict=True))

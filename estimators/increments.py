@@ -203,24 +203,32 @@ def estimate_increments(reader: LoadsReader, fused: Fused) -> Increments:
     vehicle, mach = reader.pulse.vehicle, reader.pulse.mach
     processes = Processes.over(mach, vehicle.uncertainty)
     deflection, inputs = fused.deflection, _from_factors(processes, fused)
-    roots = processes.roots()
+    roots, before = processes.roots(), np.inf
     for _ in range(_MOST_STEPS):
         increments = np.array([root @ inputs[name] for name, root in zip(COEFFICIENTS, roots, strict=True)])
         flown = replace(vehicle, aero=processes.flown(vehicle.aero, increments))
         normal = _equations(reader.with_vehicle(flown), deflection, inputs, _Slopes(processes, roots, increments))
-        mean, precision, deflection = normal.of_inputs(FREE_RADPS2, "aerodynamic increments")
+        mean, precision, found = normal.of_inputs(FREE_RADPS2, "aerodynamic increments")
         step = mean.copy()
         for name, place in normal.place.items():
             step[place] -= inputs.get(name, 0.0)
         moved = float(np.sqrt(step @ precision @ step))
-        inputs = {name: mean[place] for name, place in normal.place.items()}
         if moved < _SETTLED_SD:
             return Increments(processes, InputPosterior(mean, inverse(precision), normal.place))
+        if moved > 0.5 * before:  # whole steps lead to and fro between two points
+            mean, found = mean - 0.5 * step, _halfway(deflection, found)
+        deflection, before = found, moved
+        inputs = {name: mean[place] for name, place in normal.place.items()}
     raise DivergenceError(
         f"aerodynamic increments: after {_MOST_STEPS} steps they still move by {moved:.2g} sd in all, where "
         f"{_SETTLED_SD:g} are allowed; check the coefficient table and its [uncertainty]",
         code="increments-not-converged",
     )
+
+
+def _halfway(one: Deflection, other: Deflection) -> Deflection:
+    """Mean of two deflections, as a function of times and derivative."""
+    return lambda time_s, derivative=0: 0.5 * (one(time_s, derivative) + other(time_s, derivative))
 
 
 def _instantaneous(reader: LoadsReader) -> LoadsReader:
