@@ -630,7 +630,7 @@ class TrackingSource(Source):
     Errors that last several rows are no white noise: taken for it, a hundred rows of one error count as a hundred.
     """
 
-    every_s: Thinning = ()
+    every_s: Thinning = Field(default=0.0)  # type: ignore[arg-type]  # its plain form, read as any other
 
     @property
     def components(self) -> tuple[str, ...]:

@@ -60,7 +60,7 @@ def _as_spans(value: Any) -> Any:
 Thinning = Annotated[
     tuple[ThinnedSpan, ...],
     BeforeValidator(_as_spans, json_schema_input_type=Spacing | dict[Component, Spacing] | tuple[ThinnedSpan, ...]),
-    Field(max_length=100),
+    Field(max_length=100, validate_default=True),
 ]
 
 

@@ -103,7 +103,8 @@ def watch(t, states, seed, sites=SITES, gap_s=None, receiver=False):
         if site.wander_sd_rad > 0.0:
             noise[:, 1:] += gauss_markov(t[rows], 2, site.wander_sd_rad, site.wander_time_constant_s, rng)
         if site.range_wander_sd_m > 0.0:
-            noise[:, 0] += gauss_markov(t[rows], 1, site.range_wander_sd_m, site.range_wander_time_constant_s, rng)[:, 0]
+            tau_s = site.range_wander_time_constant_s
+            noise[:, 0] += gauss_markov(t[rows], 1, site.range_wander_sd_m, tau_s, rng)[:, 0]
         noise[:, 1] /= np.cos(z[:, 2])
         radars[site.name] = RadarRecord(site, t[rows], z + np.array(sd) * rng.standard_normal(3) + noise)
     gnss = {}

@@ -16,7 +16,7 @@ from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.setup import build_problem, track_points
 
-from .ballistic_flight import SITES, SPEC, fly, watch
+from .ballistic_flight import SITES, fly, watch
 
 SITE = {"file": "r.csv", "latitude_deg": 10.0, "longitude_deg": 20.0, "height_m": 30.0}
 ANGLES = (ThinnedSpan(every_s=1.0, components=("az", "el")),)
@@ -35,7 +35,7 @@ def every(value):
 
 
 def test_every_form_is_read():
-    assert RadarEntry.model_validate(SITE).every_s == ()
+    assert RadarEntry.model_validate(SITE).every_s == (ThinnedSpan(every_s=0.0),)
     assert every(4.0) == (ThinnedSpan(every_s=4.0),)
     assert every({"az": 4.0, "el": 2.0}) == (
         ThinnedSpan(every_s=4.0, components=("az",)),
@@ -70,11 +70,11 @@ def test_all_faults_of_a_table_are_named_at_once():
 def test_what_is_thinned_is_said():
     t = 0.25 * np.arange(40)
     (finding,) = oversampled("r", t, ANGLES, ("range", "az", "el"))
-    assert finding.text == (
+    assert finding.what == (
         "30 (az), 30 (el) of 40 rows lie closer than every_s = 1 s: they are predicted and not used"
     )
     (finding,) = oversampled("r", t, (ThinnedSpan(every_s=1.0),), ("range", "az", "el"))
-    assert finding.text.startswith("30 of 40 rows lie closer than every_s = 1 s")
+    assert finding.what.startswith("30 of 40 rows lie closer than every_s = 1 s")
 
 
 def test_components_thinned_alike_share_rows_and_the_track_stays_whole():
