@@ -16,7 +16,7 @@ from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.setup import build_problem, track_points
 
-from .ballistic_flight import SITES, fly, watch
+from .ballistic_flight import SITES, SPEC, fly, watch
 
 SITE = {"file": "r.csv", "latitude_deg": 10.0, "longitude_deg": 20.0, "height_m": 30.0}
 ANGLES = (ThinnedSpan(every_s=1.0, components=("az", "el")),)
@@ -134,16 +134,7 @@ def test_correlated_errors_of_range_and_angles_are_as_large_as_stated():
         telemetry = watch(t, states, seed, SLOW)
         modelled.append(six(reconstruct(telemetry, Settings(output_rate_hz=2.0)).smoothed, t, states))
         if seed < 3:
-            as_white = {
-                name: replace(
-                    r,
-                    site=replace(
-                        r.site, range_sd_m=np.hypot(2.0, 25.0), range_wander_sd_m=0.0, wander_sd_rad=0.0,
-                        angle_sd_rad=np.hypot(r.site.angle_sd_rad, 3e-4),
-                    ),
-                )
-                for name, r in telemetry.radars.items()
-            }  # fmt: skip
+            as_white = {name: without_wander(r) for name, r in telemetry.radars.items()}
             as_white = reconstruct(replace(telemetry, radars=as_white), Settings(output_rate_hz=2.0))
             white.append(six(as_white.smoothed, t, states))
     low, high = chi2.ppf([5e-5, 1.0 - 5e-5], 6 * runs) / runs
@@ -151,3 +142,37 @@ def test_correlated_errors_of_range_and_angles_are_as_large_as_stated():
     assert (mean > low).all(), mean
     assert (mean < high).all(), mean
     assert np.mean(white) > 2.0 * np.mean(modelled)
+
+
+def test_the_peak_of_a_reentry_is_lost_by_thinning_and_kept_by_states():
+    """Half of the errors 2 s long, rows five times a second: at 4 s the drag's change about its peak is not sampled."""
+    spec = replace(SPEC, drag_area_per_mass_m2pkg=0.008, drag_sd=0.7, drag_time_constant_s=20.0, side_sd=0.01)
+    slow = [replace(s, angle_sd_rad=3e-5, range_wander_sd_m=8.0, wander_sd_rad=1e-4) for s in SLOW]
+    off: dict[str, list[float]] = {"states": [], "thinned": []}
+    for seed in range(300, 306):
+        t, states = fly(seed, 100.0, spec, 125e3, (-800.0, 6500.0, 2200.0))
+        velocity = np.array([s.velocity_ecef_mps for s in states])[::10]
+        telemetry = replace(watch(t, states, seed, slow), motion=spec)
+        four = (ThinnedSpan(every_s=4.0),)
+        thinned = {n: replace(without_wander(r), every_s=four) for n, r in telemetry.radars.items()}
+        for name, each in {"states": telemetry, "thinned": replace(telemetry, radars=thinned)}.items():
+            found = reconstruct(each, Settings(output_rate_hz=2.0)).smoothed
+            on = np.isin(np.round(20.0 * found.time_s), np.round(20.0 * t[::10]))
+            off[name].append(peak(found.time_s[on], found.velocity_ecef_mps[on]) / peak(t[::10], velocity) - 1.0)
+    rms = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in off.items()}
+    assert rms["states"] < 0.04
+    assert rms["thinned"] > 1.5 * rms["states"]
+
+
+def without_wander(record):
+    """The same readings, of which all error is stated as white noise."""
+    s = record.site
+    range_sd, angle_sd = np.hypot(s.range_sd_m, s.range_wander_sd_m), np.hypot(s.angle_sd_rad, s.wander_sd_rad)
+    white = replace(s, range_sd_m=range_sd, angle_sd_rad=angle_sd, range_wander_sd_m=0.0, wander_sd_rad=0.0)
+    return replace(record, site=white)
+
+
+def peak(time_s, velocity_mps):
+    """Largest rate of change of a velocity (n, 3) away from the ends, m/s^2."""
+    size = np.linalg.norm(np.gradient(velocity_mps, time_s, axis=0), axis=1)
+    return size[(time_s > 5.0) & (time_s < 92.0)].max()
