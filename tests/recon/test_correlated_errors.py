@@ -176,3 +176,17 @@ def peak(time_s, velocity_mps):
     """Largest rate of change of a velocity (n, 3) away from the ends, m/s^2."""
     size = np.linalg.norm(np.gradient(velocity_mps, time_s, axis=0), axis=1)
     return size[(time_s > 5.0) & (time_s < 92.0)].max()
+
+
+def test_engines_agree_on_slow_errors_and_rows_apart():
+    t, states = fly(0, end_s=20.0)
+    telemetry = watch(t, states, 0, SLOW)
+    radars = {n: replace(r, every_s=ANGLES) for n, r in telemetry.radars.items()}
+    settings = Settings(output_rate_hz=1.0)
+    one, two = (
+        reconstruct(replace(telemetry, radars=radars), replace(settings, engine=engine)).smoothed
+        for engine in (settings.engine, "filterpy")
+    )
+    sd = one.sd()[:, :3]
+    assert (np.abs(one.position_ecef_m - two.position_ecef_m) < 1e-3 * sd).all()
+    assert np.allclose(two.sd()[:, :3], sd, rtol=1e-4)
