@@ -24,6 +24,7 @@ import numpy as np
 from flightmodel import earth, rotations
 from flightmodel.flightfolder import read_flight
 from flightmodel.geoid import undulation_m
+from flightmodel.thinning import ThinnedSpan
 from postflight.intake.other_trajectory import OtherTrajectory
 from postflight.systematic_differences import systematic_differences
 from recon.reconstruct import reconstruct
@@ -93,7 +94,8 @@ def main():
         truth = fly_scenario(scenario, seed)
         telemetry = telemetry_of(scenario, truth, seed)
         bet = reconstruct(telemetry, settings).smoothed
-        thinned = {name: replace(radar, every_s=2.0) for name, radar in list(telemetry.radars.items())[1:]}
+        others = list(telemetry.radars.items())[1:]
+        thinned = {name: replace(radar, every_s=(ThinnedSpan(every_s=2.0),)) for name, radar in others}
         rng = np.random.default_rng([seed, 4])
         n = len(bet.time_s)
         noisy = replace(

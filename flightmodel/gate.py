@@ -34,6 +34,7 @@ from flightmodel.checks import NO_FAULT, BoolArray, ConfigError, Fault, FloatArr
 from flightmodel.csv_reading import file_sha256, read_numbers
 from flightmodel.tables import Source
 from flightmodel.telemetry import Finding
+from flightmodel.thinning import ThinnedSpan, spaced, spacing_s
 
 # no entry vehicle's instruments read beyond these; a larger number is a wrong unit or a broken word
 SANE_LIMIT = {
@@ -552,22 +553,15 @@ def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArr
     return use, findings
 
 
-def spaced(time_s: FloatArray, every_s: float) -> BoolArray:
-    """Rows (n,) that keep at least ``every_s`` from the one kept before, the first among them; all of them for 0."""
-    if every_s <= 0.0:
-        return np.ones(len(time_s), dtype=bool)
-    keep = np.zeros(len(time_s), dtype=bool)
-    next_s = -np.inf
-    for k, t in enumerate(time_s.tolist()):
-        if t >= next_s - 1e-6:
-            keep[k], next_s = True, t + every_s
-    return keep
-
-
-def oversampled(name: str, time_s: FloatArray, every_s: float) -> list[Finding]:
-    """Say how many of a tracker's rows only check the trajectory."""
-    idle = int((~spaced(time_s, every_s)).sum())
-    if not idle:
+def oversampled(
+    name: str, time_s: FloatArray, thinning: tuple[ThinnedSpan, ...], components: tuple[str, ...]
+) -> list[Finding]:
+    """Say how many of a tracker's rows only check the trajectory, of which components."""
+    idle = {c: int((~spaced(time_s, spacing_s(thinning, time_s, c))).sum()) for c in components}
+    if not any(idle.values()):
         return []
-    words = f"{idle} of {len(time_s)} rows lie closer than every_s = {every_s:g} s: they are predicted and not used"
+    counts = set(idle.values())
+    rows = str(counts.pop()) if len(counts) == 1 else ", ".join(f"{count} ({c})" for c, count in idle.items() if count)
+    spacings = "; ".join(sorted({f"{s.every_s:g} s" for s in thinning if s.every_s > 0.0}))
+    words = f"{rows} of {len(time_s)} rows lie closer than every_s = {spacings}: they are predicted and not used"
     return [Finding(name, words, np.nan, np.nan, code="rows-oversampled")]

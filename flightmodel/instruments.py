@@ -28,6 +28,7 @@ from flightmodel.checks import Fault, FloatArray
 from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place, Section
 from flightmodel.geoid import undulation_m
 from flightmodel.tables import Declared, Source
+from flightmodel.thinning import Thinning
 
 Sd = Annotated[float, Field(ge=1e-12, le=1e6)]  # its square is a number that can be divided by
 SdOrNone = Annotated[float, Field(ge=0.0, le=1e6)]
@@ -356,6 +357,17 @@ class RadarSite:
     # Doppler: white noise, and an oscillator's constant offset
     range_rate_sd_mps: float = error_row("m/s", 0.1, Sd, at=0.1)
     range_rate_bias_sd_mps: float = error_row("m/s", 0.0, at=0.0, states=("range rate bias",), left_out=True)
+    range_rate_wander_sd_mps: float = error_row(
+        "m/s", 0.0, at=0.0, states=("range rate wander",), left_out=True,
+        time_constant=("range_rate_wander_time_constant_s", 5.0, ""),
+    )  # fmt: skip
+    range_rate_wander_time_constant_s: float = 5.0
+    # slow error of the range: its tracking loop, multipath, a beacon's delay with the signal's strength
+    range_wander_sd_m: float = error_row(
+        "m", 0.0, at=0.0, states=("range wander",), simulated=None, left_out=True,
+        time_constant=("range_wander_time_constant_s", 20.0, "range_wander_time_constant_s"),
+    )  # fmt: skip
+    range_wander_time_constant_s: float = 20.0
     # white noise of one angle, where the two differ; azimuth's normal to the line of sight too
     azimuth_sd_rad: float | None = error_row("rad", None, Sd, at=None)
     elevation_sd_rad: float | None = error_row("rad", None, Sd, at=None)
@@ -409,6 +421,9 @@ class GnssSpec:
         orbits, the ionosphere and reflections change in minutes, so that one fix repeats the error of the last.
     time_bias_sd_s : float
         Time tag minus true time, constant over a flight: a receiver's latency, or the second that its clock rounds to.
+    velocity_wander_sd_mps, velocity_wander_time_constant_s : float
+        Slowly varying (Gauss-Markov) part of the velocity's error, of each axis: the receiver's own filter makes
+        neighbouring velocities repeat their errors; 0 for none.
     """
 
     name: str
@@ -423,6 +438,12 @@ class GnssSpec:
     )  # fmt: skip
     wander_time_constant_s: float = 100.0
     time_bias_sd_s: float = error_row("s", 0.5, SlowClock, at=0.0, states=("time bias",), simulated=None)
+    velocity_wander_sd_mps: float = error_row(
+        "m/s", 0.0, at=0.0, states=("velocity wander north", "velocity wander east", "velocity wander down"),
+        simulated=None, left_out=True,
+        time_constant=("velocity_wander_time_constant_s", 5.0, "velocity_wander_time_constant_s"),
+    )  # fmt: skip
+    velocity_wander_time_constant_s: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -604,12 +625,26 @@ class SunEntry(Source):
 
 
 class TrackingSource(Source):
-    """A table of places; of rows closer than ``every_s`` some are predicted and not used (a smoothed, oversampled one).
+    """A table of places; of rows closer than ``every_s`` (`flightmodel.thinning`) some are predicted, not used.
 
     Errors that last several rows are no white noise: taken for it, a hundred rows of one error count as a hundred.
     """
 
-    every_s: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
+    every_s: Thinning = Field(default=0.0)  # type: ignore[arg-type]  # its plain form, read as any other
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """What ``every_s`` may name."""
+        return ("height",)
+
+    @model_validator(mode="after")
+    def _thinned_components_measured(self) -> TrackingSource:
+        named = {c for span in self.every_s for c in span.components}
+        words = f"is not among what is measured here: {', '.join(self.components)}"
+        faults: list[tuple[str, object, str]] = [("every_s", c, words) for c in sorted(named - {*self.components})]
+        if faults:
+            raise KeyFaults(faults)
+        return self
 
 
 TrackerReading = Literal["range", "az", "el", "range_rate"]
@@ -625,6 +660,11 @@ class RadarEntry(TrackingSource):
     longitude_deg: Annotated[float, Field(ge=-360.0, le=360.0)]
     height_m: Annotated[float, Field(ge=-1e3, le=1e5)]
     tracks: Literal["cg", "datum"] = "cg"
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """What ``every_s`` may name."""
+        return self.measures
 
 
 @with_keys(SITES.file_keys())
@@ -668,6 +708,11 @@ class GnssEntry(Heights):
     satellites_column: str = "nsat"
     min_fix_mode: Annotated[int, Field(ge=1, le=9)] | None = None
     fix_mode_column: str = "fix_mode"
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """What ``every_s`` may name."""
+        return ("position", "velocity") if self.velocity else ("position",)
 
     def declared(self, short: str) -> Declared | None:
         """Return the declared column of a quantity; counts are named by keys of their own and have no unit."""

@@ -101,7 +101,7 @@ def read_radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
         gate.refuse(f"{label}: {table.path}: no row with {words}; remove the tracker", "no-samples")
         return None
     gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in measured), read))
-    gate.findings.extend(oversampled(name, table.time_s, source.every_s))
+    gate.findings.extend(oversampled(name, table.time_s, source.every_s, source.components))
     place = np.deg2rad([source.latitude_deg, source.longitude_deg])
     site = RadarSite(name, float(place[0]), float(place[1]), source.height_m, **RADAR.from_file(source))
     sd = _columns(table, [q.short for q in tables.TRACKER_SD]) if there else None
@@ -141,7 +141,7 @@ def read_gnss(
         return None
     position, velocity = fixed_axes(source.axes, t0_utc, time_s, position, velocity, planet)
     gate.findings.extend(find_faults(name, time_s, ("x", "y", "z"), position))
-    gate.findings.extend(oversampled(name, time_s, source.every_s))
+    gate.findings.extend(oversampled(name, time_s, source.every_s, source.components))
     spec = GnssSpec(name, np.array(source.antenna_from_datum_body_m), **GNSS.from_file(source))
     return GnssRecord(spec, time_s, position, velocity, source.every_s)
 
@@ -309,7 +309,7 @@ def read_barometer(
         gate.refuse(f"{label}: {table.path}: every reading is missing; remove the barometer", "no-samples")
         return None
     gate.findings.extend(find_faults(name, table.time_s, (form,), height[:, None]))
-    gate.findings.extend(oversampled(name, table.time_s, source.every_s))
+    gate.findings.extend(oversampled(name, table.time_s, source.every_s, source.components))
     return BarometerRecord(BarometerSpec(name, **BAROMETER.from_file(source)), table.time_s, height, source.every_s)
 
 

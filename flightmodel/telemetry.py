@@ -13,6 +13,7 @@ import numpy as np
 from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
 from flightmodel.earth import WGS84, Planet
 from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SitesSpec, SunHeads, TriadSpec
+from flightmodel.thinning import ThinnedSpan
 from flightmodel.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ class RadarRecord:
         Slant range m, azimuth from true north and elevation rad; columns that it does not measure are NaN.
     point : str
         What is tracked: ``"cg"`` (skin track, centroid of the echo near the c.g.) or ``"datum"``.
-    every_s : float
+    every_s : tuple of ThinnedSpan
         Of points closer than this some are predicted, not used.
     range_rate_mps : (n,) float or None
     sd : (n, 4) float or None
@@ -90,7 +91,7 @@ class RadarRecord:
     time_s: FloatArray
     range_az_el: FloatArray
     point: str = "cg"
-    every_s: float = 0.0
+    every_s: tuple[ThinnedSpan, ...] = ()
     range_rate_mps: FloatArray | None = None
     sd: FloatArray | None = None
 
@@ -113,7 +114,7 @@ class GnssRecord:
         NaN is missing.
     velocity_ecef_mps : (n, 3) float
         Relative to the rotating Earth; NaN where the receiver gives none.
-    every_s : float
+    every_s : tuple of ThinnedSpan
         Of fixes closer than this some are predicted, not used.
     """
 
@@ -121,7 +122,7 @@ class GnssRecord:
     time_s: FloatArray
     position_ecef_m: FloatArray
     velocity_ecef_mps: FloatArray
-    every_s: float = 0.0
+    every_s: tuple[ThinnedSpan, ...] = ()
 
     def __post_init__(self) -> None:
         """Check once."""
@@ -141,14 +142,14 @@ class BarometerRecord:
         Strictly increasing, seconds after t0.
     height_m : (n,) float
         Above the WGS-84 ellipsoid; NaN is missing.
-    every_s : float
+    every_s : tuple of ThinnedSpan
         Of heights closer than this some are predicted, not used.
     """
 
     spec: BarometerSpec
     time_s: FloatArray
     height_m: FloatArray
-    every_s: float = 0.0
+    every_s: tuple[ThinnedSpan, ...] = ()
 
     def __post_init__(self) -> None:
         """Check once."""

@@ -73,6 +73,8 @@ def _tiny_problem() -> Problem:
         np.empty((0, 3)),
         np.empty((0, 3)),
         np.empty((0, 3)),
+        np.empty(0, dtype=np.int64),
+        np.empty(0),
     )
     nodes = np.arange(3)
     observed, row = observe(motion.time_s, (nothing,))

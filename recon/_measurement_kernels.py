@@ -24,7 +24,7 @@ from flightmodel._kernels import (
 from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
-SLOTS = 21
+SLOTS = 22
 
 
 @merged
@@ -154,6 +154,7 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
     by_error[2, 11] = known[0] * cos_el / max(sin_el, 0.035)
     by_error[0, 12] = slant
     by_error[1, 16], by_error[1, 20] = 1.0, 1.0
+    by_error[0, 21] = 1.0
     # the errors themselves change with azimuth and elevation: near the horizon that of the refraction by a tenth
     by_tilt = cos_az * e[4] + sin_az * e[5]
     cosecant_square = 1.0 / (sin_el * sin_el) if sin_el > 0.035 else sin_el / 0.035
@@ -190,8 +191,8 @@ def predict_place(kind, site, dcm_ned_ecef, e, point, speed, h, m, by_error, pla
         h[0] = height + e[0] + (height - site[0]) * e[1] + e[2]
         return
     for i in range(3):
-        h[i] = e[i] if kind == POSITION else 0.0
-        by_error[i, i] = 1.0 if kind == POSITION else 0.0
+        h[i] = e[i]
+        by_error[i, i] = 1.0
         for j in range(3):
             m[i, j] = dcm_ned_ecef[i, j]
             h[i] += m[i, j] * (point[j] - site[j] if kind == POSITION else speed[j])
@@ -338,8 +339,9 @@ def predict_range_rate(
     for j in range(3, 9):
         by_state[0, j] += swing[j]
     by_error[0, 3] += late
-    by_error[0, 0] = 1.0
+    by_error[0, 0], by_error[0, 1] = 1.0, 1.0
     h[0] += e[0]
+    h[0] += e[1]
 
 
 @inlined

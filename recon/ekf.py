@@ -210,6 +210,13 @@ class Problem:
             np.array([i.slots(self.model) for i in self.instruments]),
         )
 
+    @property
+    def group(self) -> IntArray:
+        """Group of components (M,) that each measurement is of."""
+        return np.array(
+            [self.instruments[s].group[r] for s, r in zip(self.observed.source, self.row, strict=True)], dtype=np.int64
+        )
+
     def without(self, unusable: BoolArray) -> Problem:
         """Same problem in which some measurements (M,) are only predicted, never used."""
         return replace(self, observed=self.observed._replace(usable=self.observed.usable & ~unusable))
@@ -217,12 +224,16 @@ class Problem:
     def thinned(self, step_s: float) -> tuple[Problem, IntArray]:
         """Problem with at most one used measurement of an instrument every ``step_s``, and the nodes (k,) it keeps.
 
+        Components with rows of their own count as instruments.
+
         A node of every step stays even where nothing is measured: after a long step a decorrelated error cannot be
         smoothed.
         """
         node, used = self.node, np.flatnonzero(self.observed.usable)
         cell = np.floor(self.time_s[node[used]] / step_s).astype(np.int64)
-        _, first = np.unique(np.column_stack([self.observed.source[used], cell]), axis=0, return_index=True)
+        _, first = np.unique(
+            np.column_stack([self.observed.source[used], self.group[used], cell]), axis=0, return_index=True
+        )
         chosen = np.sort(used[first])
         _, first_of_step = np.unique(np.floor(self.time_s / step_s), return_index=True)
         index = np.unique(np.concatenate([first_of_step, node[chosen]])).astype(np.int64)

@@ -38,6 +38,7 @@ from flightmodel import earth, instruments, rotations
 from flightmodel.checks import FloatArray, IntArray
 from flightmodel.earth import WGS84, Planet
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
+from flightmodel.thinning import spacing_s
 from recon import _measurement_kernels
 from recon._measurement_kernels import (
     DECELERATION,
@@ -67,13 +68,15 @@ COMPONENTS = {
     RANGE_RATE: ("range rate",),
     DECELERATION: ("deceleration",),
 }
-_OWN_RADAR = instruments.RADAR.states[:-1]  # the last is of the range rate, a reading of its own
+_STATES = instruments.RADAR.states
+_RANGE_RATE_AT = _STATES.index("range rate bias")  # a reading of its own, with two errors
+_OWN_RADAR, _DOPPLER, _LAST = _STATES[:_RANGE_RATE_AT], _STATES[_RANGE_RATE_AT:-1], _STATES[-1:]
 # time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
-    RADAR: (*_OWN_RADAR, *instruments.SITES.states),
-    RANGE_RATE: (instruments.RADAR.states[-1], "", "", instruments.RADAR.states[3]),
-    POSITION: instruments.GNSS.states,
-    VELOCITY: ("", "", "", instruments.GNSS.states[3]),
+    RADAR: (*_OWN_RADAR, *instruments.SITES.states, *_LAST),
+    RANGE_RATE: (*_DOPPLER, "", _STATES[3]),
+    POSITION: instruments.GNSS.states[:4],
+    VELOCITY: (*instruments.GNSS.states[4:], instruments.GNSS.states[3]),
     HEIGHT: instruments.BAROMETER.states,
     FIELD: instruments.MAGNETOMETER.states,
     SUN: (*instruments.SUN.states[:2], "", "", *instruments.SUN.states[2:]),
@@ -112,8 +115,10 @@ class Instrument:
     time_s : (k,) float
     value, variance, known : (k, 3) float
         As in `recon.state.Observed`.
-    every_s : float
-        Of measurements closer than this some are predicted, not used.
+    group : (k,) int
+        Components that are thinned alike share rows; others have rows of their own at the same times.
+    spacing_s : (k,) float
+        Of rows of one group closer than this some are predicted, not used.
     labels : tuple of str
         Names of its components where they are not those of its kind.
     """
@@ -128,7 +133,8 @@ class Instrument:
     value: FloatArray
     variance: FloatArray
     known: FloatArray
-    every_s: float = 0.0
+    group: IntArray
+    spacing_s: FloatArray
     labels: tuple[str, ...] = ()
 
     @property
@@ -138,32 +144,52 @@ class Instrument:
 
     @property
     def count(self) -> IntArray:
-        """Components measured at each time, (k,)."""
+        """Components measured in each row, (k,)."""
         return np.isfinite(self.variance).sum(axis=1)
+
+    def joined(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times, values and variances (n, 3) with the components of one instant in one row again."""
+        if not self.group.any():
+            return self.time_s, self.value, self.variance
+        time_s, first, instant = np.unique(self.time_s, return_index=True, return_inverse=True)
+        variance: FloatArray = np.full((len(time_s), 3), np.inf)
+        np.minimum.at(variance, instant, self.variance)
+        return time_s, self.value[first], variance
 
     def slots(self, model: ErrorModel) -> IntArray:
         """Which error (`SLOTS`,) of the model stands in each slot; -1 for none."""
         names = SLOT_NAMES[self.kind]
-        own = len(_OWN_RADAR)  # of a radar; what follows is common to all sites
+        common = range(len(_OWN_RADAR), len(_OWN_RADAR) + len(instruments.SITES.states))  # to all sites
         shared = _OWNERS.get(self.kind, {})
-        owners = [shared.get(k, self.owner if k < own else SITES) for k in range(len(names))]
+        owners = [shared.get(k, SITES if k in common else self.owner) for k in range(len(names))]
         found = [model.column(owner, name) if name else -1 for owner, name in zip(owners, names, strict=True)]
         return np.array([*found, *[-1] * (SLOTS - len(found))], dtype=np.int64)
 
 
 def instrument_of(
     name: str, kind: int, owner: str, arm: FloatArray, site: FloatArray, dcm: FloatArray,
-    time_s: FloatArray, value: FloatArray, sd: FloatArray, known: FloatArray | None = None, every_s: float = 0.0,
-    labels: tuple[str, ...] = (),
+    time_s: FloatArray, value: FloatArray, sd: FloatArray, known: FloatArray | None = None,
+    spacing_s: FloatArray | None = None, labels: tuple[str, ...] = (),
 ) -> Instrument:  # fmt: skip
-    """Instrument with NaN readings taken as not measured, rows without any left out."""
+    """Instrument with NaN readings taken as not measured, rows without any left out.
+
+    Components that are thinned differently, by ``spacing_s`` (k, 1 or 3), become rows of their own, whose variances of
+    the others are infinite.
+    """
     variance = np.where(np.isfinite(value), np.broadcast_to(sd, value.shape) ** 2, np.inf)
-    keep = np.isfinite(variance).any(axis=1)
     known = np.zeros((len(value), 3)) if known is None else known
     value = np.where(np.isfinite(value), value, 0.0)
+    spacing = np.zeros((len(value), 1)) if spacing_s is None else spacing_s
+    alike, member = np.unique(spacing, axis=1, return_inverse=True)
+    row, group = np.divmod(np.arange(len(value) * alike.shape[1]), alike.shape[1])
+    variance = variance[row]
+    if alike.shape[1] > 1:
+        variance[member.ravel() != group[:, None]] = np.inf
+    keep = np.isfinite(variance).any(axis=1)
+    row, group = row[keep], group[keep]
     return Instrument(
         name, kind, owner, np.asarray(arm, dtype=float), np.asarray(site, dtype=float), np.ascontiguousarray(dcm),
-        time_s[keep], value[keep], variance[keep], known[keep], every_s, labels,
+        time_s[row], value[row], variance[keep], known[row], group, alike[row, group], labels,
     )  # fmt: skip
 
 
@@ -180,8 +206,9 @@ def radar_instrument(
     place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m, planet)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
     return instrument_of(
-        name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known, record.every_s
-    )
+        name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known,
+        _spacing(record, "range", "az", "el"),
+    )  # fmt: skip
 
 
 def range_rate_instrument(
@@ -197,8 +224,13 @@ def range_rate_instrument(
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
     return instrument_of(
         f"{name} range rate", RANGE_RATE, site.name, arm_body_m, place, dcm, record.time_s, value, sd,
-        every_s=record.every_s,
+        spacing_s=_spacing(record, "range_rate"),
     )  # fmt: skip
+
+
+def _spacing(record: RadarRecord | GnssRecord | BarometerRecord, *components: str) -> FloatArray:
+    """Least time (k, components) to the row used before."""
+    return np.column_stack([spacing_s(record.every_s, record.time_s, c) for c in components])
 
 
 def _noise(record: RadarRecord, stated: list[float], columns: slice) -> FloatArray:
@@ -224,11 +256,13 @@ def gnss_instruments(
     place = (record.position_ecef_m - reference) @ dcm.T
     both = [
         instrument_of(
-            name, POSITION, spec.name, arm, reference, dcm, record.time_s, place, place_sd, every_s=record.every_s
+            name, POSITION, spec.name, arm, reference, dcm, record.time_s, place, place_sd,
+            spacing_s=_spacing(record, "position"),
         ),
         instrument_of(
             f"{name} velocity", VELOCITY, spec.name, arm, reference, dcm,
-            record.time_s, record.velocity_ecef_mps @ dcm.T, speed_sd, every_s=record.every_s,
+            record.time_s, record.velocity_ecef_mps @ dcm.T, speed_sd,
+            spacing_s=_spacing(record, "velocity"),
         ),
     ]  # fmt: skip
     return [i for i in both if len(i.time_s)]
@@ -240,7 +274,8 @@ def barometer_instrument(name: str, record: BarometerRecord, accelerometer_m: Fl
     value = np.column_stack([record.height_m, np.full((len(record.height_m), 2), np.nan)])
     return instrument_of(
         name, HEIGHT, record.spec.name, -accelerometer_m, np.array([first, 0.0, 0.0]), np.eye(3),
-        record.time_s, value, np.full(3, record.spec.sd_m), every_s=record.every_s,
+        record.time_s, value, np.full(3, record.spec.sd_m),
+        spacing_s=_spacing(record, "height"),
     )  # fmt: skip
 
 
@@ -327,8 +362,9 @@ def predict(
     if instrument.kind == VELOCITY:
         by_state[:, 3:6] = instrument.dcm
         by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(lever_velocity)
+        by_error[:, 0:3] = np.eye(3)
         by_error[:, 3] = -instrument.dcm @ at.acceleration_ecef_mps2
-        return instrument.dcm @ speed, by_state, by_error
+        return instrument.dcm @ speed + e[0:3], by_state, by_error
     if instrument.kind == RANGE_RATE:
         sight = point - instrument.site_ecef_m
         u = sight / np.linalg.norm(sight)
@@ -336,8 +372,8 @@ def predict(
         by_state[0, 0:3], by_state[0, 3:6] = across, u - tau * across
         by_state[0, 6:9] = -u @ c @ rotations.skew(lever_velocity)
         by_state[0, 6:9] -= across @ c @ rotations.skew(arm - tau * lever_velocity)
-        by_error[0, 0], by_error[0, 3] = 1.0, -across @ speed - u @ at.acceleration_ecef_mps2
-        return np.array([u @ speed + e[0], 0.0, 0.0]), by_state, by_error
+        by_error[0, 0:2], by_error[0, 3] = 1.0, -across @ speed - u @ at.acceleration_ecef_mps2
+        return np.array([u @ speed + e[0] + e[1], 0.0, 0.0]), by_state, by_error
     if instrument.kind == RADAR:
         h, m = _radar(instrument, known, e, point, by_error)
     elif instrument.kind == POSITION:
@@ -370,6 +406,7 @@ def _radar(
     by_error[2, 11] = known[0] * np.cos(el) / max(np.sin(el), 0.035)
     by_error[0, 12] = slant
     by_error[1, [16, 20]] = 1.0
+    by_error[0, 21] = 1.0
     # the errors themselves change with azimuth and elevation
     g = np.eye(3) + np.diag([e[12], 0.0, 0.0])
     g[1, 1] += tan * (np.sin(az) * e[4] - np.cos(az) * e[5])

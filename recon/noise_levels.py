@@ -52,9 +52,10 @@ _RELINEARISED = 0.1  # change of a logarithm that moves the trajectory about whi
 # of each kind of record: fields of its noise, which may only scale what is stated, and time constants
 _TRACKERS = {
     "radars": ("range_sd_m", "angle_sd_rad", "azimuth_sd_rad", "elevation_sd_rad", "range_rate_sd_mps",
-               "wander_sd_rad", "wander_time_constant_s"),
+               "wander_sd_rad", "wander_time_constant_s", "range_wander_sd_m", "range_wander_time_constant_s",
+               "range_rate_wander_sd_mps", "range_rate_wander_time_constant_s"),
     "gnss": ("horizontal_sd_m", "vertical_sd_m", "speed_sd_mps", "vertical_speed_sd_mps",
-             "wander_sd_m", "wander_time_constant_s"),
+             "wander_sd_m", "wander_time_constant_s", "velocity_wander_sd_mps", "velocity_wander_time_constant_s"),
     "barometers": ("sd_m", "wander_sd_m", "wander_time_constant_s"),
 }  # fmt: skip
 _TRIADS = ("noise_sd", "bias_wander_sd", "bias_time_constant_s")
@@ -212,12 +213,12 @@ def _of_record(kind: str, name: str, record: Any, table: Any, section: str, fiel
     spec: RadarSite | GnssSpec | BarometerSpec | TriadSpec = record.site if kind == "radars" else record.spec
     keys = {row.name: (row.key, row.to_si) for row in table.rows}
     keys |= {row.time_constant[0]: (row.time_constant[0], 1.0) for row in table.rows if row.time_constant[0]}
-    out, wanders = [], ("wander_sd_rad", "wander_sd_m", "bias_wander_sd")
-    still = all(getattr(spec, wander, 0.0) == 0.0 for wander in wanders)
+    wanders = {row.time_constant[0]: row.name for row in table.rows if row.time_constant[0]}
+    out = []
     for field in fields:
-        value = getattr(spec, field)
-        slow = field.endswith("time_constant_s")
-        if value is None or not 0.0 < value < np.inf or (slow and still) or not _has_reading(kind, record, field):
+        value, size = getattr(spec, field), wanders.get(field, field)
+        still = getattr(spec, size) == 0.0
+        if value is None or not 0.0 < value < np.inf or still or not _has_reading(kind, record, size):
             continue
         out.append(_Place(kind, name, field, section, *keys[field]))
     return out
@@ -225,12 +226,12 @@ def _of_record(kind: str, name: str, record: Any, table: Any, section: str, fiel
 
 def _has_reading(kind: str, record: Any, field: str) -> bool:
     """Whether a record has the readings that a level is about, and no noise of their own row by row."""
-    if kind == "gnss" and "speed" in field:
+    if kind == "gnss" and ("speed" in field or "velocity" in field):
         return bool(np.isfinite(record.velocity_ecef_mps).any())
     if kind != "radars":
         return True
-    column = {"range_sd_m": 0, "azimuth_sd_rad": 1, "elevation_sd_rad": 2, "range_rate_sd_mps": 3}.get(field)
-    if column == 3:
+    column = {"range_sd_m": 0, "azimuth_sd_rad": 1, "elevation_sd_rad": 2, "range_wander_sd_m": 0}.get(field)
+    if field.startswith("range_rate"):
         return record.range_rate_mps is not None
     own = record.sd is not None and column is not None and bool(np.isfinite(record.sd[:, column]).any())
     if field == "angle_sd_rad":

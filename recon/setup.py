@@ -20,11 +20,11 @@ import numpy as np
 from flightmodel import geomagnetism_and_sun, rotations
 from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.earth import Planet
-from flightmodel.gate import spaced
 from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesSpec
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import AttitudePrior, Start, StatePrior, Telemetry
+from flightmodel.thinning import spaced
 from flightmodel.trajectory import nearest_index
 from recon import measurements
 from recon._measurement_kernels import HEIGHT, POSITION, RADAR, RANGE_RATE, VELOCITY
@@ -139,7 +139,9 @@ def build_problem(
 def _without_rejected(instrument: Instrument, rejected: Mapping[str, FloatArray]) -> Instrument:
     """Instrument without its measurements at rejected times."""
     keep = ~_at_any(instrument.time_s, rejected.get(instrument.name))
-    parts = {name: getattr(instrument, name)[keep] for name in ("time_s", "value", "variance", "known")}
+    parts = {
+        name: getattr(instrument, name)[keep] for name in ("time_s", "value", "variance", "known", "group", "spacing_s")
+    }
     return replace(instrument, **parts)
 
 
@@ -201,10 +203,12 @@ def _only_predicted(problem: Problem, settings: Settings, rejected: Mapping[str,
         out[mine] = _is_excluded(i, settings) | _at_any(at[mine], rejected.get(i.name))
         if i.kind not in _TRACKING:
             continue
-        out[mine] |= ~spaced(at[mine], i.every_s)
-        if settings.hold_out_every:
-            left = mine[~out[mine]]
-            out[left[settings.hold_out_every - 1 :: settings.hold_out_every]] = True
+        group = i.group[problem.row[mine]]
+        for alike in (mine[group == g] for g in np.unique(group)):
+            out[alike] |= ~spaced(at[alike], i.spacing_s[problem.row[alike]])
+            if settings.hold_out_every:
+                left = alike[~out[alike]]
+                out[left[settings.hold_out_every - 1 :: settings.hold_out_every]] = True
         for start, end in settings.hold_out_spans_s:
             out[mine] |= (at[mine] >= start) & (at[mine] < end)
     return out
@@ -463,14 +467,15 @@ def track_points(instruments: tuple[Instrument, ...]) -> Track:
     """
     times, points = [], []
     for i in instruments:
-        whole = np.isfinite(i.variance).all(axis=1)
+        time_s, value, variance = i.joined()
+        whole = np.isfinite(variance).all(axis=1)
         if i.kind == RADAR:
-            ned = _ned_from_radar(i.value[whole])
+            ned = _ned_from_radar(value[whole])
         elif i.kind == POSITION:
-            ned = i.value[whole]
+            ned = value[whole]
         else:
             continue
-        times.append(i.time_s[whole])
+        times.append(time_s[whole])
         points.append(i.site_ecef_m + ned @ i.dcm)
     t = np.concatenate([np.empty(0), *times])
     if not len(t):

@@ -208,6 +208,9 @@ def sense_gnss(
     if size["wander_sd_m"] > 0.0:
         wandering = child(rng, "wander")
         of_place += gauss_markov(at, size["wander_sd_m"], size["wander_time_constant_s"], 3, wandering)
+    if size["velocity_wander_sd_mps"] > 0.0:
+        sd, tau_s = size["velocity_wander_sd_mps"], size["velocity_wander_time_constant_s"]
+        of_speed += gauss_markov(at, sd, tau_s, 3, child(rng, "velocity wander"))
     fixes = np.column_stack(
         [place + earth.ecef_from_ned(of_place, place), moving + earth.ecef_from_ned(of_speed, place)]
     )
@@ -374,9 +377,12 @@ def mislevel(azimuth_rad: FloatArray, elevation_rad: FloatArray, tilt_rad: Float
 
 
 def wander(time_s: FloatArray, observed: FloatArray, spec: Radar, rng: np.random.Generator) -> FloatArray:
-    """Slow random error ``(n, 3)`` of both angles, of one size normal to the line of sight."""
+    """Slow random errors ``(n, 3)``: of the range, and of both angles, of one size normal to the line of sight."""
     out = np.zeros_like(observed)
     size = RADAR.from_scenario(spec)
+    (sd,), (tau_s,) = size["range_wander_sd_m"], size["range_wander_time_constant_s"]
+    if sd > 0.0:
+        out[:, 0] = gauss_markov(time_s, sd, tau_s, 1, child(rng, "range wander"))[:, 0]
     (sd,), (tau_s,) = size["wander_sd_rad"], size["wander_time_constant_s"]
     if sd > 0.0:
         out[:, 1:] = gauss_markov(time_s, sd, tau_s, 2, child(rng, "wander"))

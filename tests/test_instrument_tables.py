@@ -46,7 +46,8 @@ def test_every_error_state_of_a_radar_has_its_row_s_size_and_unit():
     blocks = instrument_blocks(instruments.RADAR, RadarSite(**SITE, **SIZES))
     rows = [row for row in instruments.RADAR.rows if row.states]
     assert [(b.components, b.unit, b.prior_sd) for b in blocks] == [(r.states, r.unit, SIZES[r.name]) for r in rows]
-    assert [b.time_constant_s for b in blocks if np.isfinite(b.time_constant_s)] == [20.0]
+    # angles, range rate, range
+    assert [b.time_constant_s for b in blocks if np.isfinite(b.time_constant_s)] == [20.0, 5.0, 20.0]
 
 
 def test_units_of_the_file_become_si():

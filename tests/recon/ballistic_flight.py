@@ -48,6 +48,15 @@ def across_plane(state):
     return across / np.linalg.norm(across)
 
 
+def gauss_markov(t, count, sd, time_constant_s, rng):
+    """Stationary first-order Gauss-Markov sequences (n, count)."""
+    out = sd * rng.standard_normal((len(t), count))
+    for k in range(1, len(t)):
+        keeps = np.exp(-(t[k] - t[k - 1]) / time_constant_s)
+        out[k] = keeps * out[k - 1] + np.sqrt(1.0 - keeps**2) * out[k]
+    return out
+
+
 @cache
 def fly(seed, end_s=80.0, spec=SPEC, height_m=90e3, velocity_ned_mps=(300.0, 900.0, 400.0)):
     """Times and states of one flight drawn from the model: drivers that wander, white acceleration noise."""
@@ -91,6 +100,11 @@ def watch(t, states, seed, sites=SITES, gap_s=None, receiver=False):
         point = position[rows] - late * velocity[rows]
         z = earth.radar_from_ecef(point, site.latitude_rad, site.longitude_rad, site.height_m)
         noise = rng.standard_normal(z.shape) * [site.range_sd_m, site.angle_sd_rad, site.angle_sd_rad]
+        if site.wander_sd_rad > 0.0:
+            noise[:, 1:] += gauss_markov(t[rows], 2, site.wander_sd_rad, site.wander_time_constant_s, rng)
+        if site.range_wander_sd_m > 0.0:
+            tau_s = site.range_wander_time_constant_s
+            noise[:, 0] += gauss_markov(t[rows], 1, site.range_wander_sd_m, tau_s, rng)[:, 0]
         noise[:, 1] /= np.cos(z[:, 2])
         radars[site.name] = RadarRecord(site, t[rows], z + np.array(sd) * rng.standard_normal(3) + noise)
     gnss = {}

@@ -35,6 +35,8 @@ from flightmodel.telemetry import (
 from flightmodel.trajectory import Trajectory
 from synthetic_flight.sensing import mislevel
 
+from .ballistic_flight import gauss_markov
+
 DEG = np.pi / 180.0
 START, END = 100.0, 160.0
 CG = np.array([-0.54, 0.004, -0.0004])
@@ -190,15 +192,8 @@ def pedestal(site, t, z, rng):
     slow = gauss_markov(t, 2, site.wander_sd_rad, site.wander_time_constant_s, rng)
     out[:, 1] += slow[:, 0] / np.cos(el)
     out[:, 2] += slow[:, 1]
-    return out
-
-
-def gauss_markov(t, count, sd, time_constant_s, rng):
-    """Stationary first-order Gauss-Markov sequences (n, count)."""
-    out = sd * rng.standard_normal((len(t), count))
-    for k in range(1, len(t)):
-        keeps = np.exp(-(t[k] - t[k - 1]) / time_constant_s)
-        out[k] = keeps * out[k - 1] + np.sqrt(1.0 - keeps**2) * out[k]
+    if site.range_wander_sd_m > 0.0:
+        out[:, 0] += gauss_markov(t, 1, site.range_wander_sd_m, site.range_wander_time_constant_s, rng)[:, 0]
     return out
 
 
@@ -212,6 +207,8 @@ def measure_gnss(truth, spec, t, rng):
     place = sd * rng.standard_normal((len(t), 3))
     place += gauss_markov(t, 3, spec.wander_sd_m, spec.wander_time_constant_s, rng)
     speed = speed_sd * rng.standard_normal((len(t), 3))
+    if spec.velocity_wander_sd_mps > 0.0:
+        speed += gauss_markov(t, 3, spec.velocity_wander_sd_mps, spec.velocity_wander_time_constant_s, rng)
     return GnssRecord(spec, t, track.position_ecef_m + place @ ned, track.velocity_ecef_mps + speed @ ned)
 
 

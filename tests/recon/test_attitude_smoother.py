@@ -82,7 +82,18 @@ def test_sensors_are_predicted_as_the_filter_predicts_them(observed):
         kind = FIELD if one.is_field else SUN
         nothing = np.zeros(3)
         instrument = Instrument(
-            one.name, kind, one.name, nothing, nothing, one.dcm_body_sensor, nothing, nothing, nothing, nothing
+            one.name,
+            kind,
+            one.name,
+            nothing,
+            nothing,
+            one.dcm_body_sensor,
+            nothing,
+            nothing,
+            nothing,
+            nothing,
+            nothing,
+            nothing,
         )
         for row in range(len(one.knot)):
             turn = rotations.exp(rate[one.knot[row]] * one.lag_s[row])

@@ -56,12 +56,13 @@ ERRORS = {
         5.0,
         2.0,
         -1e-4,
+        -6.0,
     ],
     POSITION: [3.0, -4.0, 5.0, 0.02],
-    VELOCITY: [0.0, 0.0, 0.0, 0.02],
+    VELOCITY: [0.2, -0.3, 0.1, 0.02],
     HEIGHT: [50.0, 0.01, -30.0, 0.05],
     FIELD: [5e-7, -3e-7, 2e-7, 0.01, -0.02, 0.015, 0.02, -0.01, 0.03, 0.01, -0.02, 0.005],
-    RANGE_RATE: [0.3, 0.0, 0.0, 0.02],
+    RANGE_RATE: [0.3, -0.2, 0.0, 0.02],
     SUN: [0.004, -0.003, 0.0, 0.0, 0.01, -0.02, 0.015],
 }
 KNOWN = {
@@ -84,7 +85,7 @@ def instrument(kind, arm=ARM):
     if kind == HEIGHT:
         site = np.array([5e4, 0.0, 0.0])
     nothing = (np.zeros(1), *(np.zeros((1, 3)),) * 3)
-    return Instrument("i", kind, "i", arm, site, dcm, *nothing)
+    return Instrument("i", kind, "i", arm, site, dcm, *nothing, np.zeros(1, dtype=int), np.zeros(1))
 
 
 def padded(values):

@@ -61,7 +61,7 @@ def level_problem(series, noise_var, walk_var, mean, variance):
     sd2 = np.tile([noise_var, np.inf, np.inf], (there.sum(), 1))
     barometer = Instrument(
         "barometer", HEIGHT, "barometer", np.zeros(3), np.zeros(3), np.eye(3), motion.time_s[there], value, sd2,
-        np.zeros_like(value),
+        np.zeros_like(value), np.zeros(len(value), dtype=int), np.zeros(len(value)),
     )  # fmt: skip
     observed, row = observe(motion.time_s, (barometer,))
     start.sensor_errors[BIAS] = mean

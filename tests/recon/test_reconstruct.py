@@ -12,8 +12,7 @@ from flightmodel.trajectory import difference
 from recon.reconstruct import reconstruct
 from recon.settings import ENGINES, Settings
 
-from .ballistic_flight import fly, watch
-from .conftest import gauss_markov
+from .ballistic_flight import fly, gauss_markov, watch
 
 SEEDS = 8
 FAST = Settings(output_rate_hz=5.0)

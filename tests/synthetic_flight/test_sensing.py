@@ -215,6 +215,11 @@ def test_errors_of_a_receiver_are_as_large_as_stated_and_late_is_positive(truth)
     slow = sensing.sense_gnss(truth, wander, 300.0, np.random.default_rng(2))[1] - ideal
     # 75 independent values an axis: 8 % each, three axes
     assert np.sqrt(np.mean(slow[:, :3] ** 2)) == pytest.approx(5.0, rel=0.2)
+    assert np.allclose(slow[:, 3:], 0.0)
+    wander = RECEIVER.model_copy(update={"velocity_wander_mps": 0.5, "velocity_wander_time_constant_s": 2.0})
+    slow = sensing.sense_gnss(truth, wander, 300.0, np.random.default_rng(2))[1] - ideal
+    assert np.allclose(slow[:, :3], 0.0)
+    assert np.sqrt(np.mean(slow[:, 3:] ** 2)) == pytest.approx(0.5, rel=0.2)
     late = sensing.sense_gnss(truth, RECEIVER.model_copy(update={"time_bias_s": 0.5}), 300.0, np.random.default_rng(3))[
         1
     ]

@@ -196,6 +196,15 @@ def test_wander_is_slow_and_across_the_line_of_sight():
     assert not out[:, 0].any()
 
 
+def test_range_wander_is_slow_and_leaves_the_angles():
+    t = 5.0 * np.arange(20000)
+    observed = np.column_stack([np.full(len(t), 1e5), np.zeros(len(t)), np.full(len(t), 1.0)])
+    out = sensing.wander(t, observed, radar(range_wander_m=8.0), np.random.default_rng(2))
+    assert out[:, 0].std() == pytest.approx(8.0, rel=0.06)
+    assert np.corrcoef(out[1:, 0], out[:-1, 0])[0, 1] == pytest.approx(np.exp(-5.0 / 20.0), abs=0.03)
+    assert not out[:, 1:].any()
+
+
 def test_datum_and_cg_are_told_apart(truth):
     """The nose is half a metre ahead: the ranges differ by the lever arm's part along the line of sight."""
     at, cg = sensed(truth)
