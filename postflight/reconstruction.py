@@ -316,6 +316,7 @@ def bet_table(flight: Reconstruction) -> pd.DataFrame:
     columns |= _derived(flight)
     columns |= _force(flight)
     columns |= _density_ratio(flight)
+    columns |= _deceleration(flight)
     if not flight.has_attitude:  # the trajectory's own attitude is a placeholder there
         blank = np.full(len(bet.time_s), np.nan)
         columns |= {name: blank for name in columns if "_body" in name}
@@ -405,6 +406,15 @@ def _coefficients(force: FloatArray, cov: FloatArray, scale_mps2: FloatArray, sc
     }
     weak = axial < LEAST_AXIAL_MPS2
     return {name: np.where(weak, np.nan, numbers) for name, numbers in out.items()}
+
+
+def _deceleration(flight: Reconstruction) -> Columns:
+    """Deceleration along the flow of ballistic flight, by the smoothed drag; no columns of other motion."""
+    drag = flight.solution.drag
+    if flight.has_attitude or drag is None:
+        return {}
+    deceleration = 0.5 * np.exp(drag.log_drag) * flight.air.airspeed_mps**2
+    return {"deceleration_mps2": deceleration, "deceleration_sd_mps2": deceleration * drag.pressure_sd}
 
 
 def _density_ratio(flight: Reconstruction) -> Columns:
