@@ -409,10 +409,10 @@ def _coefficients(force: FloatArray, cov: FloatArray, scale_mps2: FloatArray, sc
 
 
 def _deceleration(flight: Reconstruction) -> Columns:
-    """Deceleration along the flow of ballistic flight, by the smoothed drag; no columns of other motion."""
-    drag = flight.solution.drag
+    """Deceleration along the flow of ballistic flight, by the smoothed drag; empty of other motion."""
+    drag, nothing = flight.solution.drag, np.full(len(flight.air.time_s), np.nan)
     if flight.has_attitude or drag is None:
-        return {}
+        return {"deceleration_mps2": nothing, "deceleration_sd_mps2": nothing}
     deceleration = 0.5 * np.exp(drag.log_drag) * flight.air.airspeed_mps**2
     return {"deceleration_mps2": deceleration, "deceleration_sd_mps2": deceleration * drag.pressure_sd}
 

@@ -506,8 +506,6 @@ def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     pulse, time_s = q >= 0.5 * q.max(), table["t_s"].to_numpy()
     rows = []
     for name, (column, sd_column) in _PEAKS.items():
-        if column not in table:
-            continue
         size = np.abs(table[column].to_numpy(dtype=float))
         use = np.isfinite(size) & (pulse if "pulse" in name else size > -1.0)
         if name in ("Mach number", "airspeed"):
