@@ -107,7 +107,7 @@ class Inputs:
     wind_mps: FloatArray
     log_density: FloatArray
     temperature_k: FloatArray
-    higher_m: FloatArray
+    higher_m: FloatArray | float = 0.0
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def _flow(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) ->
 
 def _as_stated(trajectory: Trajectory) -> Inputs:
     n = len(trajectory.time_s)
-    return Inputs(trajectory, np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n))
+    return Inputs(trajectory, np.zeros((n, 2)), np.zeros(n), np.zeros(n))
 
 
 def air_data(trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: FloatArray) -> AirData:
@@ -321,7 +321,7 @@ def derived_with_sd(
     root: FloatArray = np.asarray(np.linalg.cholesky(trajectory.covariance + 1e-18 * np.eye(9)), dtype=np.float64)
     warm = profile.temperature_sd(value["altitude"])
 
-    def with_path(path: Trajectory) -> FloatArray:
+    def with_path(path: Trajectory) -> FloatArray | float:
         if profile.met_m is None:
             return nothing.higher_m
         low, high = profile.met_m

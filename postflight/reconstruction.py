@@ -164,6 +164,15 @@ class Reconstruction(Tabular):
         """Whether inertial sensors carried the attitude; in ballistic flight it is not known."""
         return self.solution.provenance["motion"] != "ballistic"
 
+    @property
+    def deceleration(self) -> tuple[FloatArray, FloatArray] | None:
+        """Deceleration along the flow of ballistic flight and its sd (n,), m/s^2, by the smoothed drag."""
+        drag = self.solution.drag
+        if self.has_attitude or drag is None:
+            return None
+        value = 0.5 * np.exp(drag.log_drag) * self.air.airspeed_mps**2
+        return value, value * drag.pressure_sd
+
     def required_loads(self) -> FlightLoads:
         """Motion and flow at the c.g.; `GateError` with the reason where there are none."""
         if self.loads is None:
@@ -316,7 +325,6 @@ def bet_table(flight: Reconstruction) -> pd.DataFrame:
     columns |= _derived(flight)
     columns |= _force(flight)
     columns |= _density_ratio(flight)
-    columns |= _deceleration(flight)
     if not flight.has_attitude:  # the trajectory's own attitude is a placeholder there
         blank = np.full(len(bet.time_s), np.nan)
         columns |= {name: blank for name in columns if "_body" in name}
@@ -406,15 +414,6 @@ def _coefficients(force: FloatArray, cov: FloatArray, scale_mps2: FloatArray, sc
     }
     weak = axial < LEAST_AXIAL_MPS2
     return {name: np.where(weak, np.nan, numbers) for name, numbers in out.items()}
-
-
-def _deceleration(flight: Reconstruction) -> Columns:
-    """Deceleration along the flow of ballistic flight, by the smoothed drag; empty of other motion."""
-    drag, nothing = flight.solution.drag, np.full(len(flight.air.time_s), np.nan)
-    if flight.has_attitude or drag is None:
-        return {"deceleration_mps2": nothing, "deceleration_sd_mps2": nothing}
-    deceleration = 0.5 * np.exp(drag.log_drag) * flight.air.airspeed_mps**2
-    return {"deceleration_mps2": deceleration, "deceleration_sd_mps2": deceleration * drag.pressure_sd}
 
 
 def _density_ratio(flight: Reconstruction) -> Columns:

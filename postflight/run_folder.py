@@ -72,7 +72,6 @@ _PEAKS = {
     "Mach number": ("mach", "mach_sd"),
     "airspeed": ("airspeed_mps", "airspeed_sd_mps"),
     "axial deceleration": ("ax_cg_mps2", "ax_cg_sd_mps2"),
-    "deceleration": ("deceleration_mps2", "deceleration_sd_mps2"),  # of ballistic motion alone
     "total angle of attack in the pulse": ("alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
     "altitude": ("alt_m", "alt_sd_m"),
 }
@@ -502,10 +501,14 @@ def _three_sd(column: str) -> str:
 
 def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     """Peak values with times and standard deviations; ``inside`` is false where one lies at an end of the data."""
+    peaks = dict(_PEAKS)
+    if flight.deceleration is not None:
+        peaks |= {"deceleration": ("deceleration_mps2", "deceleration_sd_mps2")}
+        table = table.assign(**dict(zip(peaks["deceleration"], flight.deceleration, strict=True)))
     q = table["dynamic_pressure_pa"].to_numpy()
     pulse, time_s = q >= 0.5 * q.max(), table["t_s"].to_numpy()
     rows = []
-    for name, (column, sd_column) in _PEAKS.items():
+    for name, (column, sd_column) in peaks.items():
         size = np.abs(table[column].to_numpy(dtype=float))
         use = np.isfinite(size) & (pulse if "pulse" in name else size > -1.0)
         if name in ("Mach number", "airspeed"):

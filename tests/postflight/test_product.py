@@ -102,7 +102,6 @@ def test_standard_deviations_are_the_scatter_of_drawn_errors() -> None:
         air.wind_sd_mps[:, None] * rng.standard_normal((n, 2)),
         air.density_sd * rng.standard_normal(n),
         profile.temperature_sd(value["altitude"]) * rng.standard_normal(n),
-        np.zeros(n),
     )
     scattered = airdata.derived(drawn, profile, arm)
     for name, numbers in scattered.items():
