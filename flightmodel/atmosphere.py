@@ -30,7 +30,7 @@ import numpy as np
 from flightmodel.checks import ConfigError, FloatArray, GateError, check_finite, check_increasing
 from flightmodel.config import parse_utc
 from flightmodel.earth import MARS, STANDARD_GRAVITY_MPS2, WGS84, Planet
-from flightmodel.statistics import correlation, correlation_root
+from flightmodel.statistics import KNOTS_A_LENGTH, correlation, correlation_root
 from flightmodel.telemetry import Sounding
 
 GAMMA, R_AIR_JPKGK = WGS84.gamma, WGS84.gas_jpkgk
@@ -259,9 +259,11 @@ def sounding_correlation(altitude_m: FloatArray, length_m: float) -> FloatArray:
     return correlation(altitude_m, length_m, SOUNDING_CONSTANT_PART)
 
 
-def sounding_correlation_root(altitude_m: FloatArray, length_m: float) -> FloatArray:
+def sounding_correlation_root(
+    altitude_m: FloatArray, length_m: float, knots_a_length: int = KNOTS_A_LENGTH
+) -> FloatArray:
     """Root ``(n, k)`` of `sounding_correlation`: a sounding's error, over its sd, per unit normal."""
-    return correlation_root(altitude_m, length_m, SOUNDING_CONSTANT_PART)
+    return correlation_root(altitude_m, length_m, SOUNDING_CONSTANT_PART, knots_a_length)
 
 
 def unresolved_variance(spacing_m: FloatArray | float, length_m: float) -> FloatArray:

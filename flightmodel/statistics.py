@@ -35,24 +35,26 @@ def correlation(at: FloatArray, length: float, constant_part: float = 0.0) -> Fl
     return constant_part + (1.0 - constant_part) * np.exp(-apart / length)
 
 
-def correlation_root(at: FloatArray, length: float, constant_part: float = 0.0) -> FloatArray:
+def correlation_root(
+    at: FloatArray, length: float, constant_part: float = 0.0, knots_a_length: int = KNOTS_A_LENGTH
+) -> FloatArray:
     """Errors ``(n, k)`` of unit variance at places ``(n,)`` per unit normal: ``root @ root.T`` is their correlation.
 
-    The Gauss-Markov part is drawn at knots, a third of ``length`` apart or closer, with straight lines between; ``at``
+    The Gauss-Markov part is drawn at knots, ``knots_a_length`` in ``length``, with straight lines between; ``at``
     may be in any order. A constant part, where there is one, is the first column.
     """
-    root = _gauss_markov_root(at, length)
+    root = _gauss_markov_root(at, length, knots_a_length)
     if constant_part == 0.0:
         return root
     constant = np.full(len(at), np.sqrt(constant_part))
     return np.column_stack([constant, np.sqrt(1.0 - constant_part) * root])
 
 
-def _gauss_markov_root(at: FloatArray, length: float) -> FloatArray:
+def _gauss_markov_root(at: FloatArray, length: float, knots_a_length: int) -> FloatArray:
     if len(at) == 0 or np.ptp(at) == 0.0:
         return np.ones((len(at), 1))
     low, high = float(at.min()), float(at.max())
-    knots = np.linspace(low, high, max(2, int(np.ceil(KNOTS_A_LENGTH * (high - low) / length)) + 1))
+    knots = np.linspace(low, high, max(2, int(np.ceil(knots_a_length * (high - low) / length)) + 1))
     position = np.clip((at - low) / max(knots[1] - knots[0], 1e-12), 0.0, len(knots) - 1.0)
     k = np.minimum(position.astype(int), len(knots) - 2)
     fraction = position - k
