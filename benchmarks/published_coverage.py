@@ -26,11 +26,11 @@ from flightmodel.trajectory import difference, resample
 from postflight.flight import read_flight
 from postflight.fusing import fuse_flight
 from postflight.reconstruction import reconstruct
+from recon.consistency import GROUPS
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 
 NAMES = ("irve3", "loftid", "adept_sr1", "fire2")
-GROUPS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9)}
 
 
 def drawn(stated, rng):
@@ -130,7 +130,6 @@ def main():
         print(
             f"red checks of the trajectory: {dict(Counter(code for one in results for code in one['red'])) or 'none'}"
         )
-        report(results)
 
 
 if __name__ == "__main__":

@@ -145,16 +145,12 @@ def flow_inputs(loads: FlightLoads) -> dict[str, FloatArray]:
     c, s = np.cos(roll), np.sin(roll)
     # body components of vectors that do not roll
     body_from_fixed = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=1)
+    gusts = sounding_correlation_root(loads.altitude_m, WIND_LENGTH_M, _WIND_KNOTS_A_LENGTH)
     return {
         ACCELEROMETER: root,
         ATTITUDE: _rolled(body_from_fixed, trajectory[:, None] * correlation_root(loads.time_s, TRAJECTORY_TIME_S)),
-        WIND: _rolled(body_from_fixed, wind[:, None] * _wind_root(loads.altitude_m)),
+        WIND: _rolled(body_from_fixed, wind[:, None] * gusts),
     }
-
-
-def _wind_root(altitude_m: FloatArray) -> FloatArray:
-    """Sounding's wind error over its sd per unit normal, with its waves down to those that the vehicle follows."""
-    return sounding_correlation_root(altitude_m, WIND_LENGTH_M, _WIND_KNOTS_A_LENGTH)
 
 
 def pressure_input(loads: FlightLoads) -> FloatArray:

@@ -96,7 +96,7 @@ class Reconstruction(Tabular):
     air : AirData
         Along the trajectory, by ``profile``.
     profile : AtmosphereProfile
-        The sounding's; with [drag] the atmosphere as flown, where the deceleration tells it better.
+        The sounding's; with [drag] the atmosphere as flown, where the deceleration determines it better.
     loads : FlightLoads or None
         Motion and flow at the c.g., for the estimators of the deflection; None where ``missing`` says why.
     as_flown : ReconstructedAir or None

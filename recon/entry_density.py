@@ -112,7 +112,7 @@ def drag_of_readings(
 
 
 def density_by_drag(telemetry: Telemetry, path: Trajectory, history: DragHistory | None) -> pd.DataFrame:
-    """Density, pressure, temperature, dynamic pressure and Mach number as flown, where the deceleration tells them.
+    """Density, pressure, temperature, dynamic pressure and Mach number as flown, where the deceleration determines it.
 
     Raises
     ------
