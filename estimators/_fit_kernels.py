@@ -13,7 +13,7 @@ from estimators._sight_kernels import COLUMNS, feet, limb_points, project_points
 from flightmodel._kernels import inlined, kernel
 
 JOINT = COLUMNS - 1
-_SHAPES = 5
+SHAPES = 7  # lobes n = 2 and 3 (4), light (3)
 DONE, TOO_FEW, DIVERGED = 0, 1, 2
 
 
@@ -55,6 +55,13 @@ def _project_edge(deformation, clocks, circle, ring, joint, lens, terms, points,
 
 
 @inlined
+def _lobe_columns(flattening, clock, shape):
+    """Derivatives by a flattening that varies round the shell as the cosine and the sine of two and three clocks."""
+    shape[0], shape[1] = flattening * math.cos(2.0 * clock), flattening * math.sin(2.0 * clock)
+    shape[2], shape[3] = flattening * math.cos(3.0 * clock), flattening * math.sin(3.0 * clock)
+
+
+@inlined
 def _edge_residuals(found, light, edge_offset, pixels, jacobian, kept, count, residual, rows, shape, at):
     """Residuals, derivatives and shape columns of edge points, the benchmark's residuals subtracted."""
     m = len(found)
@@ -63,8 +70,8 @@ def _edge_residuals(found, light, edge_offset, pixels, jacobian, kept, count, re
         residual[i] -= edge_offset[i]
         j = min(int(at[i]), count - 2) if math.isfinite(residual[i]) else 0
         clock = kept[j] + (at[i] - j) * (kept[j + 1] - kept[j])
-        shape[i, 0], shape[i, 1] = rows[i, 2] * math.cos(2.0 * clock), rows[i, 2] * math.sin(2.0 * clock)
-        shape[i, 2], shape[i, 3], shape[i, 4] = light[i, 0], light[i, 1], light[i, 2]
+        _lobe_columns(rows[i, 2], clock, shape[i])
+        shape[i, 4:] = light[i]
 
 
 @inlined
@@ -81,10 +88,17 @@ def _feature_residuals(
             residual[m + i] = np.nan
         for c in range(COLUMNS):
             rows[m + i, c] = ax * jacobian[i, 0, c] + ay * jacobian[i, 1, c]
-        clock = math.atan2(spots[i, 2], -spots[i, 1])
-        shape[m + i, 0] = rows[m + i, 2] * math.cos(2.0 * clock)
-        shape[m + i, 1] = rows[m + i, 2] * math.sin(2.0 * clock)
-        shape[m + i, 2], shape[m + i, 3], shape[m + i, 4] = 0.0, 0.0, 0.0
+        _lobe_columns(rows[m + i, 2], math.atan2(spots[i, 2], -spots[i, 1]), shape[m + i])
+        shape[m + i, 4:] = 0.0
+
+
+@inlined
+def _without_shape(residual, rows, shape, form, left):
+    """Residuals less what joint, lobes and light of the step before explain: they are no scatter."""
+    for i in range(len(residual)):
+        left[i] = residual[i] - rows[i, JOINT] * form[0]
+        for j in range(SHAPES):
+            left[i] -= shape[i, j] * form[1 + j]
 
 
 @inlined
@@ -121,8 +135,8 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
 
 @inlined
 def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, design, normal, right):
-    """Weighted normal equations with priors on all but the deflection; the flattening's mean is zero."""
-    k, n = basis.shape[1], len(design)
+    """Weighted normal equations with priors, means and sd, on all but the deflection."""
+    (mean, sd), k, n = prior, basis.shape[1], len(design)
     normal[:] = 0.0
     right[:] = 0.0
     for i in range(len(residual)):
@@ -130,7 +144,7 @@ def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, d
             for j in range(k):
                 design[j] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
             design[k], design[k + 1] = rows[i, 2], rows[i, JOINT]
-            for j in range(_SHAPES):
+            for j in range(SHAPES):
                 design[k + 2 + j] = shape[i, j]
             for a in range(n):
                 weighted = weight[i] * design[a]
@@ -139,39 +153,42 @@ def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, d
                     normal[a, b] += weighted * design[b]
     for a in range(n):
         if a >= k:
-            normal[a, a] += 1.0 / prior[a - k] ** 2
+            normal[a, a] += 1.0 / sd[a - k] ** 2
+            right[a] += mean[a - k] / sd[a - k] ** 2
         for b in range(a):
             normal[a, b] = normal[b, a]
-    right[k] -= flattening / prior[0] ** 2
+    # the flattening is carried from step to step, the others are counted from zero in each
+    right[k] -= flattening / sd[0] ** 2
 
 
 @kernel
-def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, residual, rows, shape, weight):
+def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, residual, rows, shape, weight, left):
     """Fit a deformation (3,) in place to edge points and features; its state, steps taken.
 
     ``shell``: clocking angles of the edge, circle of the outermost torus, ring about which the shell flattens, joint
     station. ``edge``: points (m, 2), light (m, 3), sd and residual at the benchmark (m,), NaN where it was not
-    found. ``features``: points of the shell (p, 3), directions (p, 2), places, sd, residuals there (p,). ``prior``: sd
-    of flattening, joint, ovality (2), light (3). ``limits``: Huber's, largest residual, last step, steps, fewest edge
-    points.
-    Rows with weight zero were not used; edge points come first.
+    found. ``features``: points of the shell (p, 3), directions (p, 2), places, sd, residuals there (p,). ``prior``:
+    mean and sd of flattening, joint, lobes (4), light (3). ``limits``: Huber's, largest residual, last step, steps,
+    fewest edge points. ``residual``: against the deformed shell without lobes; ``left``: with what the fit makes of
+    them, of joint and light. Rows with weight zero were not used; edge points come first.
     """
     clocks, circle, ring, joint = shell
     found, light, edge_sd, edge_offset = edge
     spots, across, place, feature_sd, feature_offset = features
     m, p, k = len(found), len(spots), basis.shape[1]
-    n = k + 2 + _SHAPES
+    n = k + 2 + SHAPES
     points, pixels = np.empty((len(clocks), 3)), np.empty((len(clocks), 2))
     jacobian = np.empty((len(clocks), 2, COLUMNS))
     spot_pixels, spot_jacobian = np.empty((p, 2)), np.empty((p, 2, COLUMNS))
     kept, at = np.empty(len(clocks)), np.empty(m)
-    rotation, left = np.empty((3, 3)), np.empty((3, 2))
+    rotation, columns = np.empty((3, 3)), np.empty((3, 2))
     scaled = np.empty(max(m, p))
     design, normal, right = np.empty(n), np.empty((n, n)), np.empty(n)
+    form = np.zeros(1 + SHAPES)
     huber, outlier, last_step, steps, fewest = limits
     for taken in range(steps):
-        rotation_of(deformation[0], deformation[1], rotation, left)
-        terms = (rotation, left, joint, deformation[2], ring[0], ring[1])
+        rotation_of(deformation[0], deformation[1], rotation, columns)
+        terms = (rotation, columns, joint, deformation[2], ring[0], ring[1])
         if m > 0:
             count = _project_edge(deformation, clocks, circle, ring, joint, lens, terms, points, pixels, jacobian, kept)
             if count < 2:
@@ -181,7 +198,8 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
             spots, across, place, feature_offset, terms, lens, outlier, m, spot_pixels, spot_jacobian, residual, rows,
             shape,
         )  # fmt: skip
-        edges = huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight)
+        _without_shape(residual, rows, shape, form, left)
+        edges = huber_weights(m, p, edge_sd, feature_sd, huber, left, scaled, weight)
         if edges < fewest:
             return TOO_FEW, edges
         _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, design, normal, right)
@@ -190,6 +208,7 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
             deformation[0] += basis[0, j] * step[j]
             deformation[1] += basis[1, j] * step[j]
         deformation[2] += step[k]
+        form[:] = step[k + 1 :]
         if not deformation[0] ** 2 + deformation[1] ** 2 < 0.25:
             return DIVERGED, taken
         largest = 0.0

@@ -2,7 +2,7 @@
 
 **Orientation** (`orient_camera`). The camera's rotation, focal scale, principal point, k1, k2 and position and the
 shell's radius are fitted to the edge and the features of a frame in which the shell is taken as undeflected, each with
-its a priori sd (``[cameras.*.uncertainty]``), beside the shell's own shape (flattening and ovality as built) and the
+its a priori sd (``[cameras.*.uncertainty]``), beside the shell's own shape (flattening and saddle as built) and the
 light at its edge: Gauss-Newton with Huber's weights, the points found again in every step. For an uncalibrated lens the
 prior is wide, and the frame calibrates it, as the seed paper oriented its camera on the frame at 421 s. First the edge
 alone is fitted, which may be far from the nominal camera's prediction; then features are looked for from farther, then
@@ -53,19 +53,15 @@ from estimators.camera_fit import (
     POSED,
     USUAL_SHARE,
     AprioriSd,
-    FrameResiduals,
     Image,
     OrientedCamera,
-    edge_residuals,
-    feature_residuals,
-    huber_gain,
-    joined,
 )
 from estimators.edge import NO_FAULT, HorizonLine, ScanLines, fault_of_frame, is_coherent
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.features import Features, ImageFeatures, fit_feature_map, no_features, valleys, visible_features
 from estimators.frame_checks import USUAL_RMS_PX
 from estimators.frame_edits import MARK_SD_PX, EditedFrame, MarkedFeatures, marked_on_shell, unedited
+from estimators.frame_residuals import FrameResiduals, edge_residuals, feature_residuals, huber_gain, joined
 from estimators.loads import FlightLoads
 from estimators.texture import texture_of
 from estimators.virtual_camera import DEFLECTION, FLATTENING, VirtualCamera
@@ -88,6 +84,7 @@ _WORST_RMS_PX = 2.5
 _WORST_CORRECTIONS = 31.8  # chi-square of eight corrections that one sound frame in 10,000 exceeds
 _FOCAL, _FOCAL_PIECE = 3, 0.08
 _BUILT_RAD = np.deg2rad(0.3)
+_BUILT = [0, 1, 4, 5, 6]  # saddle and light: three waves beside a lens that is fitted cost more than they explain
 _POSES = POSED.stop - POSED.start
 # deflection
 LEAST_FRAMES, MOST_FRAMES = 12, 150
@@ -273,7 +270,7 @@ def _fitted(
                     code="edge-points-too-few",
                 )
             offset = residuals.index >= len(look.clocks_rad)
-            shape = np.column_stack([residuals.rows[:, FLATTENING], residuals.shape, offset])
+            shape = np.column_stack([residuals.rows[:, FLATTENING], residuals.shape[:, _BUILT], offset])
             design = np.column_stack([residuals.rows[:, POSED], shape])
             gain, formal, rms = huber_gain(residuals, design, np.diag(sd**-2.0), len(look.clocks_rad))
             before = np.concatenate([pose, np.zeros(len(sd) - _POSES)])
@@ -355,7 +352,7 @@ def _pose_of_feature_map(
 
 
 def _prior_sd(camera: CameraUncertainty, apriori: AprioriSd) -> FloatArray:
-    """A priori sd of the pose (12), the shell's flattening and ovality as built (3) and the light (3)."""
+    """A priori sd of the pose (12), the shell's flattening and saddle as built (3) and the light (3)."""
     sd = [
         *[np.deg2rad(camera.pointing_deg)] * 3, camera.focal, *[camera.centre_px] * 2, camera.k1, camera.k2,
         *[camera.position_m] * 3, apriori.rim_radius_m, *[_BUILT_RAD] * 3, *[apriori.edge_px] * 3,
@@ -444,6 +441,9 @@ class RelativeDeflections:
     benchmark_s : float
     time_bias_sd_s : float
         A priori sd of the frames' time bias against the gyros'.
+    by_shape : (n, 2, 5) float or None
+        Part of the readings' error that the shell's shape under load has in common, per unit normal; its square is in
+        ``covariance``.
     """
 
     time_s: FloatArray
@@ -452,6 +452,14 @@ class RelativeDeflections:
     per_benchmark: FloatArray
     benchmark_s: float
     time_bias_sd_s: float = 0.0
+    by_shape: FloatArray | None = None
+
+    @property
+    def own_covariance(self) -> FloatArray:
+        """Covariance (n, 2, 2) without the shape's part."""
+        if self.by_shape is None:
+            return self.covariance
+        return self.covariance - self.by_shape @ self.by_shape.transpose(0, 2, 1)
 
     @property
     def answered(self) -> BoolArray:
@@ -595,14 +603,19 @@ def _mixture(
 
 
 def _camera_covariance(frames: RelativeDeflections, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> FloatArray:
-    """Covariance of readings, (2 n, 2 m): constant bias and Gauss-Markov with the light, as in the fusion."""
-    ends = []
+    """Covariance of readings, (2 n, 2 m): constant bias and Gauss-Markov with the light, as in the fusion, and shape.
+
+    The error by a shape that grows with the load grows with it: it must not pass for the joint's compliance.
+    """
+    ends, own = [], frames.own_covariance
     for k in (rows, columns):
-        value, axes = np.linalg.eigh(frames.covariance[k])
+        value, axes = np.linalg.eigh(own[k])
         ends.append((axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1))
     apart = np.abs(frames.time_s[rows][:, None] - frames.time_s[columns][None, :])
     shared = CONSTANT_PART + (1.0 - CONSTANT_PART) * np.exp(-apart / LIGHT_TIME_S)
     both = np.einsum("iab,ij,jcb->iajc", ends[0], shared, ends[1])
+    if frames.by_shape is not None:
+        both += np.einsum("iak,jck->iajc", frames.by_shape[rows], frames.by_shape[columns])
     return np.asarray(both.reshape(2 * len(rows), 2 * len(columns)))
 
 

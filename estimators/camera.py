@@ -76,6 +76,8 @@ class FilmFit:
         Of the assumed plane.
     by_hand : str
         What an analyst edited.
+    shape_covariance : (5, 5) float or None
+        Of what the film told about the shell's shape under load, where the answers use it (`estimators.shell_shape`).
     """
 
     time_s: FloatArray
@@ -85,6 +87,7 @@ class FilmFit:
     plane_lv_rad: float | None
     plane_sd_rad: float
     by_hand: str = ""
+    shape_covariance: FloatArray | None = None
 
     def relative_to_benchmark(self, time_bias_sd_s: float = 0.0) -> RelativeDeflections:
         """Deflections relative to the benchmark frame's, where the planes were estimated.
@@ -107,7 +110,16 @@ class FilmFit:
             _SWAP @ rest @ _SWAP.T,
             self.benchmark_s,
             time_bias_sd_s,
+            self._shape_root(),
         )
+
+    def _shape_root(self) -> FloatArray | None:
+        """Root (n, 2, 5) of the readings' common error by the shell's shape under load, as lateral vectors."""
+        if self.shape_covariance is None:
+            return None
+        value, axes = np.linalg.eigh(self.shape_covariance)
+        by_shape = np.array([np.full((2, 5), np.nan) if fit.by_shape is None else fit.by_shape for fit in self.fits])
+        return np.asarray(_SWAP @ by_shape @ (axes * np.sqrt(np.maximum(value, 0.0))))
 
     def history(self, benchmark: BenchmarkDeflection | None = None) -> DeflectionHistory:
         """History of the deflection, with the benchmark frame undeflected or with a given deflection there.

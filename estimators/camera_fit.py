@@ -7,19 +7,19 @@ measure motion.
 
 In the other frames, with the plane estimated: Gauss-Newton with Huber's weights on
 
-    r_i = found_i - predicted_i(w, kappa) - r_i(benchmark),   parameters  w (2), kappa, joint, ovality (2), light (3),
+    r_i = found_i - predicted_i(w, kappa) - r_i(benchmark),   parameters  w (2), kappa, joint, lobes (4), light (3),
 
-each but ``w`` with its prior: the shell's flattening and ovality under load, the joint's station, and the shift,
-tilt and bow by which a changing light moves the found edge. With an assumed plane, the seed paper's way, one component
-of ``w`` alone is fitted to the edge alone, and the rest is only in the error bar. The covariance is the formal one,
-scaled by the residuals, plus that of the benchmark's uncertain parameters,
+each but ``w`` with its prior: the shell's flattening and its lobes of two and three waves under load, the joint's
+station, and the shift, tilt and bow by which a changing light moves the found edge. With an assumed plane, the seed
+paper's way, one component of ``w`` alone is fitted to the edge alone, and the rest is only in the error bar. The
+covariance is the formal one, scaled by the residuals, plus that of the benchmark's uncertain parameters,
 
     dw = G [(C_f - C_b) dc + (B_b + (C_f - C_b) S) db],      G = (J' W J + P^-1)^-1 J' W,
 
 with ``c`` the camera, ``b`` the deflection of the benchmark frame, ``S = dc/db``, and ``C``, ``B`` the derivatives in
 the frame ``f`` and in the benchmark ``b``.
 
-Assumed: the shell moves as one body but for flattening and ovality; independent errors of edge points and features
+Assumed: the shell moves as one body but for flattening and lobes; independent errors of edge points and features
 beside the modelled ones.
 
 References
@@ -48,15 +48,19 @@ from estimators.edge import (
     no_horizon,
 )
 from estimators.features import Features, ImageFeatures, fit_feature_map, valleys
-from estimators.frame_checks import USUAL_RMS_PX, Design, fault_of_fit
+from estimators.frame_checks import USUAL_RMS_PX, WORST_SHAPE, Design, fault_of_fit
 from estimators.frame_edits import LEAST_MARKS, EditedFrame, MarkedFeatures, unedited
+from estimators.frame_residuals import (
+    HUBER,
+    FrameResiduals,
+    edge_residuals,
+    light_columns,
+)
 from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
-from flightmodel.deflection import lv_clock
 
 Image = NDArray[np.uint8]
 
-HUBER = 2.5
 STEPS = 12
 LAST_STEP_RAD = 2e-5
 OUTLIER_PX = 5.0
@@ -81,111 +85,10 @@ USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
 JOINT = HELD.stop - 1
 POSED = slice(CAMERA.start, JOINT)
 TURN = slice(CAMERA.start, CAMERA.start + 3)
-
-
-@dataclass(frozen=True)
-class FrameResiduals:
-    """Residuals of the edge points and features found in one frame, ``n`` in all.
-
-    Parameters
-    ----------
-    residual_px : (n,) float
-        Found minus predicted.
-    rows : (n, 16) float
-        Derivatives of the prediction; see `estimators.virtual_camera`.
-    shape : (n, 5) float
-        Derivatives by the two ovalities, px/rad, and by the edge's shift, tilt and bow.
-    sd_px : (n,) float
-    index : (n,) int
-        Place of the edge, or number of places plus row of `ImageFeatures`.
-    """
-
-    residual_px: FloatArray
-    rows: FloatArray
-    shape: FloatArray
-    sd_px: FloatArray
-    index: NDArray[np.intp]
-
-    def some(self, chosen: BoolArray) -> FrameResiduals:
-        """Chosen rows."""
-        return FrameResiduals(
-            self.residual_px[chosen], self.rows[chosen], self.shape[chosen], self.sd_px[chosen], self.index[chosen]
-        )
-
-
-def edge_residuals(view: VirtualCamera, horizon: HorizonLine, deformation: FloatArray) -> FrameResiduals:
-    """Residuals of edge points against the edge predicted for a deformation (3,)."""
-    residual, rows, clocks = view.mismatch(horizon, view.edge(deformation))
-    shape = np.column_stack([*_ovality(rows, clocks), _light_columns(view, horizon)])
-    return FrameResiduals(residual, rows, shape, horizon.sd_px, horizon.line)
-
-
-def _light_columns(view: VirtualCamera, horizon: HorizonLine) -> FloatArray:
-    """Shift, tilt and bow of the found edge, ``(n, 3)``; one at the picture's sides."""
-    width = 0.5 * view.camera.width_px
-    side = (horizon.points_px[:, 0] - width) / width
-    return np.column_stack([np.ones_like(side), side, 1.5 * side**2 - 0.5])
-
-
-def _ovality(rows: FloatArray, clocks_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives by a flattening that varies round the shell as ``cos 2 clock`` and as ``sin 2 clock``."""
-    return rows[:, FLATTENING] * np.cos(2.0 * clocks_rad), rows[:, FLATTENING] * np.sin(2.0 * clocks_rad)
-
-
-def feature_residuals(
-    view: VirtualCamera,
-    features: Features,
-    found: tuple[FloatArray, FloatArray],
-    deformation: FloatArray,
-    first_index: int,
-) -> FrameResiduals:
-    """Residuals of found features against those predicted for a deformation (3,)."""
-    place, sd = found
-    has = np.flatnonzero(np.isfinite(sd))
-    points, across = features.points_shell_m[has], features.across_px[has]
-    sight = view.sight(points, deformation)
-    residual = place[has] - np.einsum("ni,ni->n", sight.pixels, across)
-    rows = np.einsum("ni,nik->nk", across, sight.jacobian)
-    shape = np.column_stack([*_ovality(rows, lv_clock(points[:, 1:])), np.zeros((len(has), 3))])
-    return FrameResiduals(residual, rows, shape, sd[has], first_index + has)
-
-
-def joined(first: FrameResiduals, second: FrameResiduals) -> FrameResiduals:
-    """Rows of both."""
-    parts = zip(*((s.residual_px, s.rows, s.shape, s.sd_px, s.index) for s in (first, second)), strict=True)
-    return FrameResiduals(*(np.concatenate(pair) for pair in parts))
-
-
-def huber_gain(
-    residuals: FrameResiduals,
-    design: FloatArray,
-    information: FloatArray,
-    lines: int,
-    together: FloatArray | float = 1.0,
-) -> tuple[FloatArray, FloatArray, float]:
-    """Weigh one Gauss-Newton step by Huber's rule.
-
-    The sd of edge points and of features are each inflated to the scatter of their residuals, and by the root of the
-    number ``together`` that err alike.
-
-    Returns
-    -------
-    gain : (k, m) float
-        The step is ``gain @ residual``.
-    covariance : (k, k) float
-        Formal, of the parameters with the prior ``information (k, k)``.
-    rms_px : float
-    """
-    residual, scale = residuals.residual_px, residuals.sd_px.copy()
-    is_edge = residuals.index < lines
-    for group in (is_edge, ~is_edge):
-        if group.any():
-            centre = np.median(residual[group])
-            scale[group] *= max(1.4826 * float(np.median(np.abs(residual[group] - centre) / scale[group])), 1.0)
-    weight = 1.0 / scale**2 / np.maximum(1.0, np.abs(residual) / (HUBER * scale)) / together
-    weighted = design.T * weight
-    covariance: FloatArray = np.linalg.inv(weighted @ design + information).astype(float)
-    return covariance @ weighted, covariance, float(np.sqrt(np.average(residual**2, weights=weight)))
+LOBES = slice(2, 6)
+"""Among flattening, joint station, lobes and light."""
+SHAPE = np.array([2, 4, 5, 6, 7])
+"""Flattening and lobes among deflection, flattening, joint station, lobes and light."""
 
 
 @dataclass(frozen=True)
@@ -199,9 +102,11 @@ class AprioriSd:
     benchmark_rad : float
         Deflection of the benchmark frame, each lateral axis. Statically ``(z0/x) u/(1-u)``, 0.06 deg for the reference
         vehicle at 421 s, and the joint's oscillation about it.
-    flattening_rad, ovality_rad : float
-        Flattening (the shell opens like an umbrella) and ovality (a saddle) between benchmark and frame. The local
-        deformation of the seed paper's shell was not measured.
+    flattening_rad, lobes_rad : float
+        Flattening (the shell opens like an umbrella) and lobes of two and three waves, cosine and sine each, between
+        benchmark and frame. The local deformation of the seed paper's shell was not measured.
+    higher_lobes_rad : float
+        Lobes of more waves, which are not modelled.
     edge_px : float
         Shift of the found edge against the true one, different from frame to frame with the light; as much for a
         tilt and for a bow of the edge across the picture (at the picture's sides).
@@ -211,8 +116,31 @@ class AprioriSd:
     joint_station_m: float = 0.05
     benchmark_rad: float = float(np.deg2rad(0.12))
     flattening_rad: float = float(np.deg2rad(0.25))
-    ovality_rad: float = float(np.deg2rad(0.1))
+    lobes_rad: float = float(np.deg2rad(0.2))
+    higher_lobes_rad: float = float(np.deg2rad(0.1))
     edge_px: float = 0.2
+
+
+@dataclass(frozen=True)
+class FrameShape:
+    """Deflection and shape fitted to one frame together, shapes with their a priori sd about zero.
+
+    Parameters
+    ----------
+    found_rad : (7,) float
+        Rotation vector about body y and z, flattening, lobes (cosine and sine of two waves, then of three).
+    formal : (7, 7) float
+        Covariance that the frame's own points leave.
+    by_camera : (7, 12) float
+        Error per unit error of the oriented camera's pose.
+    by_benchmark : (7, 2) float
+        Missing part per unit deflection of the benchmark frame.
+    """
+
+    found_rad: FloatArray
+    formal: FloatArray
+    by_camera: FloatArray
+    by_benchmark: FloatArray
 
 
 @dataclass(frozen=True)
@@ -238,6 +166,10 @@ class FrameFit:
         Why there is no answer, with its code; empty when there is one.
     contradicted : bool
         Whether features were found that contradict a whole edge, which alone gave the answer.
+    shape : FrameShape or None
+        None in an assumed plane.
+    by_shape : (2, 5) float or None
+        Error per unit error of what the film tells about the shell's shape under load, where it was used.
     """
 
     rotation_yz_rad: FloatArray
@@ -250,6 +182,8 @@ class FrameFit:
     horizon: HorizonLine
     refused: Fault = NO_FAULT
     contradicted: bool = False
+    shape: FrameShape | None = None
+    by_shape: FloatArray | None = None
 
 
 _NOTHING = no_horizon(NO_FAULT)
@@ -261,13 +195,15 @@ class _NoFitError(GateError):
 
 @dataclass(frozen=True)
 class _Solution:
-    """Last step of one frame's fit: gain ``(k, m)`` and formal covariance ``(k, k)`` of the deflection.
+    """Last step of one frame's fit: gain ``(k + 9, m)`` and formal covariance of deflection, shape and light.
 
-    ``before``: the benchmark's rows of the points used; ``edge_count`` of them are edge points and come first.
+    ``shape_found`` (9,): flattening, joint station, lobes and light. ``before``: the benchmark's rows of the points
+    used; ``edge_count`` of them are edge points and come first.
     """
 
     gain: FloatArray
     formal: FloatArray
+    shape_found: FloatArray
     rows: FloatArray
     shape: FloatArray
     before: FloatArray
@@ -279,9 +215,13 @@ class _Solution:
 
 @dataclass(frozen=True)
 class _Points:
-    """Edge points, which come first, and features at the end of a fit; ``benchmark_at``: their rows there."""
+    """Edge points, which come first, and features at the end of a fit; ``benchmark_at``: their rows there.
+
+    ``left_px``: residuals less what the shell's lobes, the joint's station and the light explain.
+    """
 
     residual_px: FloatArray
+    left_px: FloatArray
     rows: FloatArray
     shape: FloatArray
     weight: FloatArray
@@ -427,7 +367,8 @@ class OrientedCamera:
         """Refuse a frame that no deflection explains, by `estimators.frame_checks`."""
         rest = np.concatenate([last.rows[:, [FLATTENING, JOINT]], last.shape], axis=1)
         design = Design(last.rows[:, DEFLECTION], rest, last.rows[:, TURN], last.residual_px, last.weight)
-        fault = fault_of_fit(design, last.rms_px, flattening_rad, self._shape_prior(2), self.apriori.ovality_rad)
+        shape_sd = self._shape_prior(2)[1]
+        fault = fault_of_fit(design, last.rms_px, flattening_rad, shape_sd, self.apriori.higher_lobes_rad)
         if fault:
             raise _NoFitError(fault)
 
@@ -491,7 +432,7 @@ class OrientedCamera:
         alone = deformation.copy()
         try:
             near = self._independent_edge(frame, horizon, alone)
-            edge = self._solve(near, None, alone, np.eye(2), np.inf)
+            edge = self._solve(near, None, alone, np.eye(2), np.inf, self._prior_about(both))
         except _NoFitError:
             # steps in the clouds are no edge to contradict anything
             return both
@@ -506,7 +447,7 @@ class OrientedCamera:
                 "features-contradict-edge",
             )
         deformation[:] = alone
-        return edge
+        return self._solve(near, None, deformation, np.eye(2), np.inf)
 
     @property
     def _edge_rms_px(self) -> float:
@@ -517,14 +458,14 @@ class OrientedCamera:
     def _contradiction(self, difference: FloatArray, edge: _Solution, both: _Solution) -> float:
         """Chi-square (2) of the difference of two answers, of which one uses a part of the other's points."""
         posed, missing = (
-            [s.gain @ (s.rows[:, POSED] - s.before[:, POSED]) for s in (edge, both)],
-            [s.gain @ s.before[:, DEFLECTION] for s in (edge, both)],
+            [s.gain[:2] @ (s.rows[:, POSED] - s.before[:, POSED]) for s in (edge, both)],
+            [s.gain[:2] @ s.before[:, DEFLECTION] for s in (edge, both)],
         )
         camera = posed[0] - posed[1]
         rest = (missing[0] - missing[1] + camera @ self.posed_per_deflection) * self.apriori.benchmark_rad
         covariance = camera @ self.posed_covariance @ camera.T + rest @ rest.T
         # of the best answers, the better one's error has no part in the difference
-        value, axes = np.linalg.eigh(edge.formal - both.formal)
+        value, axes = np.linalg.eigh((edge.formal - both.formal)[:2, :2])
         covariance += (axes * np.maximum(value, _LEAST_VAR)) @ axes.T
         return float(difference @ np.linalg.solve(covariance, difference))
 
@@ -604,7 +545,7 @@ class OrientedCamera:
         sharp = found[0], np.where(found[1] < _WORST_TEXTURE_SD_PX, found[1], np.inf)
         if len(_has(sharp)) < _LEAST_FEATURES:
             return None, 0.0
-        residual = self._fit_points(_NOTHING, sharp, deformation.copy(), np.eye(2)).residual_px
+        residual = self._fit_points(_NOTHING, sharp, deformation.copy(), np.eye(2)).left_px
         agreed = float(np.mean(np.abs(residual) < _AGREED_PX))
         if agreed < _LEAST_AGREED:
             return None, agreed
@@ -665,25 +606,37 @@ class OrientedCamera:
 
     @property
     def _shape_sd(self) -> FloatArray:
-        """A priori sd of flattening, joint station, ovality (2) and light (3) of a frame against the benchmark."""
+        """A priori sd of flattening, joint station, lobes (4) and light (3) of a frame against the benchmark."""
         apriori = self.apriori
         light = [np.sqrt(2.0) * apriori.edge_px] * 3
-        return np.array([apriori.flattening_rad, apriori.joint_station_m, *[apriori.ovality_rad] * 2, *light])
+        return np.array([apriori.flattening_rad, apriori.joint_station_m, *[apriori.lobes_rad] * 4, *light])
 
-    def _shape_prior(self, k: int) -> FloatArray:
-        """Prior sd of the shape, which must not absorb what an assumed plane (k = 1) cannot explain."""
-        return self._shape_sd * (1.0 if k == 2 else 1e-3)
+    def _shape_prior(self, k: int) -> tuple[FloatArray, FloatArray]:
+        """Prior mean and sd of the shape, which must not absorb what an assumed plane (k = 1) cannot explain."""
+        return np.zeros(len(self._shape_sd)), self._shape_sd * (1.0 if k == 2 else 1e-3)
+
+    def _prior_about(self, both: _Solution) -> tuple[FloatArray, FloatArray]:
+        """Prior mean and sd of the shape that the edge alone sees: lobes about those of edge and features together.
+
+        Free lobes would let half of an edge agree with features that are a degree off, and so would lobes that no shell
+        has.
+        """
+        mean, sd = self._shape_prior(2)
+        if np.sum((both.shape_found / sd) ** 2) < WORST_SHAPE:
+            mean[LOBES] = both.shape_found[LOBES]
+        sd[LOBES] = self.apriori.higher_lobes_rad
+        return mean, sd
 
     def _fit_points(
         self, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
-        basis: FloatArray,
+        basis: FloatArray, prior: tuple[FloatArray, FloatArray] | None = None,
     ) -> _Points:  # fmt: skip
         """Fit ``deformation`` (3,) in place to the edge and, where given, the found features."""
         view, k, lines = self.view, basis.shape[1], len(self.clocks_rad)
         has = _has(place) if place is not None else np.zeros(0, dtype=np.intp)
         edge_offset, before_sd, edge_at = self._at_benchmark(horizon.line, _BESIDE if horizon.is_by_hand else 0)
         feature_offset, feature_before_sd, feature_at = self._at_benchmark(lines + has)
-        edge = (horizon.points_px, _light_columns(view, horizon), np.hypot(horizon.sd_px, before_sd), edge_offset)
+        edge = (horizon.points_px, light_columns(view, horizon), np.hypot(horizon.sd_px, before_sd), edge_offset)
         spot, sd = (place[0][has], place[1][has]) if place is not None else (np.zeros(0), np.zeros(0))
         painted = self.features
         features = (
@@ -693,14 +646,15 @@ class OrientedCamera:
             np.hypot(sd, feature_before_sd),
             feature_offset,
         )
-        prior = self._shape_prior(k)
+        prior = prior or self._shape_prior(k)
         count = len(edge_offset) + len(has)
-        residual, rows, shape, weight = np.empty(count), np.zeros((count, 16)), np.zeros((count, 5)), np.empty(count)
+        residual, left, weight = np.empty(count), np.empty(count), np.empty(count)
+        rows, shape = np.zeros((count, 16)), np.zeros((count, _fit_kernels.SHAPES))
         least = _least_points(horizon)
         limits = (HUBER, OUTLIER_PX, LAST_STEP_RAD, STEPS, 0 if len(has) >= _LEAST_FEATURES else least)
         state, number = _fit_kernels.fit_frame(
             deformation, np.ascontiguousarray(basis), view.shell_terms, view.camera.lens_terms, edge, features, prior,
-            limits, residual, rows, shape, weight,
+            limits, residual, rows, shape, weight, left,
         )  # fmt: skip
         if state == _fit_kernels.TOO_FEW:
             raise _NoFitError(
@@ -709,30 +663,34 @@ class OrientedCamera:
             )
         if state == _fit_kernels.DIVERGED:
             raise _NoFitError("the fit diverged beyond 28 deg", "fit-diverged")
-        return _Points(residual, rows, shape, weight, np.concatenate([edge_at, feature_at]), len(edge_offset))
+        return _Points(residual, left, rows, shape, weight, np.concatenate([edge_at, feature_at]), len(edge_offset))
 
     def _solve(
         self, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
-        basis: FloatArray, worst_rms_px: float,
+        basis: FloatArray, worst_rms_px: float, prior: tuple[FloatArray, FloatArray] | None = None,
     ) -> _Solution:  # fmt: skip
         """Fit as `_fit_points`, with its covariance; `_NoFitError` where the residuals are too large."""
-        found, k = self._fit_points(horizon, place, deformation, basis), basis.shape[1]
-        prior = self._shape_prior(k)
+        k = basis.shape[1]
+        mean, sd = prior = prior or self._shape_prior(k)
+        found = self._fit_points(horizon, place, deformation, basis, prior)
         residual, rows, shape, weight = found.residual_px, found.rows, found.shape, found.weight
         used = weight > 0.0
         residual, rows, shape, weight = residual[used], rows[used], shape[used], weight[used]
-        rms = float(np.sqrt(np.average(residual**2, weights=weight)))
+        rms = float(np.sqrt(np.average(found.left_px[used] ** 2, weights=weight)))
         if rms > worst_rms_px:
             raise _NoFitError(
                 f"the edge is not the shell's: rms {rms:.1f} px where {worst_rms_px} px are allowed", "edge-not-shell"
             )
         design = np.concatenate([rows[:, DEFLECTION] @ basis, rows[:, [FLATTENING, JOINT]], shape], axis=1)
         weighted = design.T * weight
-        formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(k), prior**-2])))
+        formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(k), sd**-2.0])))
         before = self.benchmark_residuals.rows[found.benchmark_at[used]]
         edge_count = int(used[: found.edge_points].sum())
-        gain = (formal @ weighted)[:k]
-        return _Solution(gain, formal[:k, :k], rows, shape, before, edge_count, rms, residual, weight)
+        # the flattening's value was carried from step to step, the others are counted from zero in each
+        pull = np.concatenate([np.zeros(k), (mean - np.eye(len(sd))[0] * deformation[2]) / sd**2])
+        shape_found = (formal @ (weighted @ residual + pull))[k:]
+        shape_found[0] += deformation[2]
+        return _Solution(formal @ weighted, formal, shape_found, rows, shape, before, edge_count, rms, residual, weight)
 
     def _independent_edge(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> HorizonLine:
         """Edge that owes nothing to the features, ``deformation`` moved near it; `_NoFitError` where there is none.
@@ -754,34 +712,44 @@ class OrientedCamera:
 
     def _edge_step(self, both: _Solution, flattening_rad: float) -> tuple[FloatArray, _Solution]:
         """One step (2,) from an answer of edge and features to that of the edge alone, and its gain and covariance."""
-        edge, prior = slice(0, both.edge_count), self._shape_prior(2)
+        edge, (mean, sd) = slice(0, both.edge_count), self._prior_about(both)
         rows, shape, weight = both.rows[edge], both.shape[edge], both.weight[edge]
         design = np.concatenate([rows[:, DEFLECTION], rows[:, [FLATTENING, JOINT]], shape], axis=1)
         weighted = design.T * weight
-        formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(2), prior**-2])))
+        formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(2), sd**-2.0])))
         right = weighted @ both.residual_px[edge]
-        right[2] -= flattening_rad / prior[0] ** 2
+        right[2:] += (mean - np.eye(len(sd))[0] * flattening_rad) / sd**2
         step = formal @ right
         # features that contradict the edge leave it residuals that are none of its scatter
         left = both.residual_px[edge] - design @ step
         scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
         alone = replace(
-            both, gain=(formal @ weighted)[:2], formal=min(scatter, 1.0) * formal[:2, :2], rows=rows,
-            before=both.before[edge],
+            both, gain=formal @ weighted, formal=min(scatter, 1.0) * formal, rows=rows, before=both.before[edge],
         )  # fmt: skip
         return step[:2], alone
 
     def _answer(self, horizon: HorizonLine, deformation: FloatArray, last: _Solution, basis: FloatArray) -> FrameFit:
-        gain, before, leak = last.gain, last.before, 0.0
-        posed = gain @ (last.rows[:, POSED] - before[:, POSED])
-        missing = gain @ before[:, DEFLECTION] + posed @ self.posed_per_deflection
-        rest = missing * self.apriori.benchmark_rad
-        covariance = last.formal + posed @ self.posed_covariance @ posed.T + rest @ rest.T
-        if basis.shape[1] == 1:
-            shape = gain @ np.concatenate([last.rows[:, [FLATTENING, JOINT]], last.shape], axis=1) * self._shape_sd
-            covariance = covariance + shape @ shape.T
+        k, before = basis.shape[1], last.before
+        by_camera = last.gain @ (last.rows[:, POSED] - before[:, POSED])
+        by_benchmark = last.gain @ before[:, DEFLECTION] + by_camera @ self.posed_per_deflection
+        features, shape, leak = len(last.rows) - last.edge_count, None, 0.0
+        covariance = self.covariance_of(last.formal[:k, :k], by_camera[:k], by_benchmark[:k])
+        if k == 1:
+            rest = np.concatenate([last.rows[:, [FLATTENING, JOINT]], last.shape], axis=1)
+            spread = last.gain[:1] @ rest * self._shape_sd
+            covariance = covariance + spread @ spread.T
             # a plane grows by +90 deg as its axis rotates from (y, z) to (-z, y)
-            leak = float(gain[0] @ last.rows[:, DEFLECTION] @ np.array([-basis[1, 0], basis[0, 0]]))
-        features = len(last.rows) - last.edge_count
-        answer = basis @ (basis.T @ deformation[:2])
-        return FrameFit(answer, covariance, missing, leak, float(deformation[2]), last.rms_px, features, horizon)
+            leak = float(last.gain[0] @ last.rows[:, DEFLECTION] @ np.array([-basis[1, 0], basis[0, 0]]))
+        else:
+            found = np.concatenate([deformation[:2], last.shape_found[SHAPE - 2]])
+            chosen = np.concatenate([[0, 1], SHAPE])
+            shape = FrameShape(found, last.formal[np.ix_(chosen, chosen)], by_camera[chosen], by_benchmark[chosen])
+        answer, flattening = basis @ (basis.T @ deformation[:2]), float(deformation[2])
+        return FrameFit(
+            answer, covariance, by_benchmark[:k], leak, flattening, last.rms_px, features, horizon, shape=shape
+        )
+
+    def covariance_of(self, formal: FloatArray, by_camera: FloatArray, by_benchmark: FloatArray) -> FloatArray:
+        """Covariance of an answer with that of the camera's pose and of the benchmark frame's deflection."""
+        rest = by_benchmark * self.apriori.benchmark_rad
+        return np.asarray(formal + by_camera @ self.posed_covariance @ by_camera.T + rest @ rest.T)

@@ -55,6 +55,7 @@ STATIC_PART = 0.25
 _RATE_HZ = 50.0
 _ABOUT_S = 1.0  # about a benchmark: a switch leaves a frame or two out
 _LEAST_INFORMATION = 0.05  # of a direction of a camera's biases, for it to be tested
+_SHAPE = "shell's shape under load"
 _BENCHMARK, _OFFSET = "benchmark frames' deflection", "offset of one camera"
 _ANY_OFFSET_RAD = float(np.deg2rad(20.0))  # sd of an offset about which nothing is known: larger than any deflection
 
@@ -95,7 +96,7 @@ class CameraReadings:
         """
         apart_s = self.late_against(clock)
         read, start = self.read, self.benchmark
-        back, covariance = read.per_benchmark, read.covariance
+        back, covariance = read.per_benchmark, read.own_covariance
         if start.with_readings is not None:
             crossed = start.with_readings @ back.transpose(0, 2, 1)
             value, axes = np.linalg.eigh(np.nan_to_num(covariance + crossed + crossed.transpose(0, 2, 1)))
@@ -108,6 +109,8 @@ class CameraReadings:
         )
         root = wider * back[known] @ np.linalg.cholesky(start.covariance + 1e-18 * np.eye(2))
         inputs = {f"{CAMERA_PLANE} {self.name}" if n == CAMERA_PLANE else n: j for n, j in one.by_input.items()}
+        if read.by_shape is not None:
+            inputs[_SHAPE] = wider * read.by_shape[known]
         inputs[_BENCHMARK] = np.sqrt(STATIC_PART) * root
         inputs[f"{_BENCHMARK} at {read.benchmark_s:.1f} s"] = np.sqrt(1.0 - STATIC_PART) * root
         return replace(one, by_input=inputs, time_bias=f"{CAMERA_TIME_BIAS} {self.name}")

@@ -1,7 +1,8 @@
 """The deflection by the onboard cameras: one film by itself, or several joined into one history.
 
 A film that cannot be used does not stop the others: it is named, with its reason, in the answer's assumptions and by a
-consistency check.
+consistency check. Where a trajectory gives the dynamic pressure at the frames, the shell's shape under load is estimated
+from all films, and every frame's answer uses it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from estimators.camera_fit import OrientedCamera
 from estimators.cameras import CameraReadings, JoinedCameras, join_cameras
 from estimators.frame_edits import edited
 from estimators.fusion import smoothed
+from estimators.shell_shape import LoadedFilm, ShellShape, shell_shape, with_shape
 from flightmodel.checks import DivergenceError, Fault, GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Frames
@@ -53,6 +55,8 @@ class CameraAnswer:
         Cameras whose film cannot be used, and why.
     benchmarks_s : tuple of float
         Times of the benchmark frames.
+    shape : ShellShape or None
+        How the shell's shape followed the load; None where nothing tells (why stands in the assumptions).
     """
 
     history: DeflectionHistory
@@ -62,6 +66,7 @@ class CameraAnswer:
     joined: JoinedCameras | None
     refused: dict[str, Fault]
     benchmarks_s: tuple[float, ...]
+    shape: ShellShape | None = None
 
     @property
     def has_only_benchmarks(self) -> bool:
@@ -151,11 +156,15 @@ def camera_answer(
     films = flight.telemetry.films
     if len(films) < 2:
         film = camera_film(flight, progress=progress) if film is None else film
+        name = next(iter(films))
+        shaped, shape, why = _with_shell_shape({name: film}, flight, bet)
+        film = shaped[name]
         history = _with_benchmark_deflection(film, flight, bet)
+        history = replace(history, assumptions=f"{history.assumptions}; {why}")
         table = film.frame_table(history)
-        table.insert(0, "camera", next(iter(films)))
+        table.insert(0, "camera", name)
         smooth = _smooth(flight, history)
-        return CameraAnswer(history, film.history(), smooth, table, None, {}, (film.benchmark_s,))
+        return CameraAnswer(history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape)
     if flight.camera_plane_lv_rad is not None:
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
         raise GateError(words, "plane-assumed")
@@ -176,6 +185,7 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
             refused[name] = Fault(str(fault), fault.codes[0])
     if not films:
         raise GateError([Fault(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
+    films, shape, words_of_shape = _with_shell_shape(films, flight, bet)
     plain, corrected, tables, remarks = [], [], [], []
     for name, film in films.items():
         late_s = flight.telemetry.films[name].time_bias_sd_s
@@ -197,12 +207,31 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
     unused = {one.name for one in plain} - {one.name for one in joined.readings}
     refused |= {name: Fault("too few frames with an answer", "too-few-readings") for name in unused}
     remarks += [f"{name}: no answer ({reason})" for name, reason in refused.items()]
-    words = "; ".join([joined.at_frames.assumptions, joined.remark, *remarks])
+    words = "; ".join([joined.at_frames.assumptions, joined.remark, words_of_shape, *remarks])
     history, smooth = (replace(h, assumptions=words) for h in (joined.at_frames, joined.smooth))
-    times = tuple(film.benchmark_s for film in films.values())
-    return CameraAnswer(
-        history, at_plain.at_frames, smooth, pd.concat(tables, ignore_index=True), joined, refused, times
-    )
+    times, frames = tuple(film.benchmark_s for film in films.values()), pd.concat(tables, ignore_index=True)
+    return CameraAnswer(history, at_plain.at_frames, smooth, frames, joined, refused, times, shape)
+
+
+def _with_shell_shape(
+    films: dict[str, FilmFit], flight: Flight, bet: Reconstruction | None
+) -> tuple[dict[str, FilmFit], ShellShape | None, str]:
+    """Films with the shell's shape under load in their answers, that shape, and a remark on it or why there is none."""
+    try:
+        if bet is None:
+            raise GateError("no trajectory was made", "trajectory-missing")
+        if flight.camera_plane_lv_rad is not None:
+            raise GateError("a plane is assumed", "plane-assumed")
+        air = bet.air
+        at = {
+            name: np.interp(film.time_s, air.time_s, air.dynamic_pressure_pa, left=np.nan, right=np.nan)
+            for name, film in films.items()
+        }
+        loaded = {name: LoadedFilm(film, at[name]) for name, film in films.items()}
+        shape = shell_shape(list(loaded.values()))
+    except GateError as fault:
+        return films, None, f"shell's shape: frame by frame, within its a priori sd ({fault})"
+    return {name: with_shape(one, shape) for name, one in loaded.items()}, shape, f"shell's shape: {shape.remark}"
 
 
 def _benchmark(

@@ -314,6 +314,8 @@ def write_answers(run: RunFolder, answers: Deflections) -> None:
         run.write_csv(f"{_SMOOTH_CAMERA}.csv", answers.smooth_camera.to_frame())
     if answers.camera is not None:
         run.write_csv("camera_frames.csv", answers.camera.frames)
+        if answers.camera.shape is not None:
+            run.write_csv("shell_shape.csv", answers.camera.shape.to_frame())
         if answers.camera.joined is not None:
             run.write_csv("cameras.csv", answers.camera.joined.to_frame())
     if answers.fused is not None:

@@ -8,7 +8,7 @@ point from the innermost centre,
     distance = hypot(a - p round(a / p), b) - a_minor,       t <- t + distance,
 
 one expression for the whole stack. A shell that is out of shape is evaluated in the half-plane rotated back about the
-innermost ring by ``flattening + cosine cos 2 clock + sine sin 2 clock + lobes cos 3 clock``. Shading is Lambert's with
+innermost ring by the flattening and lobes of two and of three waves round the shell. Shading is Lambert's with
 one Sun and a weak sky; seams and dots are painted by surface coordinates. Behind the rim is a dark sky, and the Earth
 where the scenario has it. Assumed: no shadows. Then come interlace and motion, vignetting, blur, sensor noise and
 compression.
@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -58,31 +58,29 @@ LIMB_GLOW_RAD = float(np.deg2rad(0.4))
 
 @dataclass(frozen=True)
 class Warp:
-    """Departure of a shell from its nominal shape: half angle, saddle, three lobes, rad.
+    """Departure of a shell from its nominal shape: half angle, lobes of two and of three waves, rad.
 
     Parameters
     ----------
     flattening_rad : float
         All round; positive moves the rim aft.
-    cosine_rad, sine_rad : float
-        Times ``cos 2 clock`` and ``sin 2 clock``.
-    lobes_rad : float
-        Times ``cos 3 clock``: no estimator models it.
+    cosine_2_rad, sine_2_rad, cosine_3_rad, sine_3_rad : float
+        Times cosine and sine of two and of three clocking angles.
     """
 
     flattening_rad: float = 0.0
-    cosine_rad: float = 0.0
-    sine_rad: float = 0.0
-    lobes_rad: float = 0.0
+    cosine_2_rad: float = 0.0
+    sine_2_rad: float = 0.0
+    cosine_3_rad: float = 0.0
+    sine_3_rad: float = 0.0
 
     def plus(self, other: Warp) -> Warp:
         """Return both together."""
-        mine, theirs = ((w.flattening_rad, w.cosine_rad, w.sine_rad, w.lobes_rad) for w in (self, other))
-        return Warp(*(a + b for a, b in zip(mine, theirs, strict=True)))
+        return Warp(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
     def times(self, load: float) -> Warp:
         """Return the warp under a share of the load."""
-        return Warp(load * self.flattening_rad, load * self.cosine_rad, load * self.sine_rad, load * self.lobes_rad)
+        return Warp(*(load * part for part in astuple(self)))
 
 
 @dataclass(frozen=True)
@@ -312,10 +310,12 @@ class _Stack:
         assert self.warp is not None
         per = 1.0 / np.maximum(r * r, np.float32(1e-6))
         # cos and sin of twice the clocking angle, whose cosine is -y / r
-        turn = np.float32(self.warp.flattening_rad) + np.float32(self.warp.cosine_rad) * ((y * y - z * z) * per)
-        turn -= np.float32(2.0 * self.warp.sine_rad) * (y * z * per)
-        cosine = -y * np.sqrt(per)
-        turn += np.float32(self.warp.lobes_rad) * cosine * (4.0 * cosine * cosine - 3.0)
+        turn = np.float32(self.warp.flattening_rad) + np.float32(self.warp.cosine_2_rad) * ((y * y - z * z) * per)
+        turn -= np.float32(2.0 * self.warp.sine_2_rad) * (y * z * per)
+        per = np.sqrt(per)
+        cosine, sine = -y * per, z * per
+        turn += np.float32(self.warp.cosine_3_rad) * cosine * (4.0 * cosine * cosine - 3.0)
+        turn += np.float32(self.warp.sine_3_rad) * sine * (3.0 - 4.0 * sine * sine)
         aft, out = s - self.s0, r - self.r0
         return s - turn * out, r + turn * aft
 
@@ -409,7 +409,9 @@ class Imaging:
     painted : bool
         Whether the shell carries seams and dots that can be seen.
     built_sd_rad, loaded_sd_rad : float
-        Flattening of the shell as built, and under the largest load; saddle and lobes half of that each.
+        Flattening of the shell as built, and under the largest load; each lobe's cosine and sine half of that.
+    loaded : Warp
+        Shape under the largest load, beside the drawn one.
     """
 
     pointing_sd_rad: float = float(np.deg2rad(0.5))
@@ -426,6 +428,7 @@ class Imaging:
     painted: bool = True
     built_sd_rad: float = 0.0
     loaded_sd_rad: float = 0.0
+    loaded: Warp = Warp()
 
 
 @dataclass(frozen=True)
@@ -580,13 +583,16 @@ def render_video(
 
 def _shapes(imaging: Imaging, rng: np.random.Generator) -> tuple[Warp, Warp] | tuple[None, None]:
     """Draw the shell's departure from its shape, as built and under the largest load."""
-    if not imaging.built_sd_rad and not imaging.loaded_sd_rad:
+    if not imaging.built_sd_rad and not imaging.loaded_sd_rad and imaging.loaded == Warp():
         return None, None
-    share = np.array([1.0, 0.5, 0.5, 0.5])
+    share = np.array([1.0, 0.5, 0.5, 0.5, 0.5])
+    # the fifth of each from a stream of its own: the noise of the pictures stays what it was without it
+    fifth = rng.spawn(1)[0]
     built, loaded = (
-        Warp(*(sd * share * rng.standard_normal(4)).tolist()) for sd in (imaging.built_sd_rad, imaging.loaded_sd_rad)
+        Warp(*(sd * share * np.append(rng.standard_normal(4), fifth.standard_normal())).tolist())
+        for sd in (imaging.built_sd_rad, imaging.loaded_sd_rad)
     )
-    return built, loaded
+    return built, loaded.plus(imaging.loaded)
 
 
 def record(radiance: Float32, vignetting: Float32, imaging: Imaging, rng: np.random.Generator) -> Image:
@@ -658,6 +664,7 @@ def _imaging_from_quality(quality: FilmQuality) -> Imaging:
         painted=quality.painted,
         built_sd_rad=float(np.deg2rad(quality.built_deg)),
         loaded_sd_rad=float(np.deg2rad(quality.loaded_deg)),
+        loaded=Warp(*np.deg2rad(quality.loaded_shape_deg).tolist()),
     )
 
 

@@ -430,6 +430,9 @@ class Gnss(Section):
     dropouts: Dropouts | None = None
 
 
+ShapeAngle = Annotated[float, Field(ge=-5.0, le=5.0)]
+
+
 class FilmQuality(Section):
     """How the real camera differs from its drawing, and how it records; see `synthetic_flight.film.Imaging`."""
 
@@ -447,6 +450,7 @@ class FilmQuality(Section):
     painted: bool = True
     built_deg: ErrorAngle = 0.0
     loaded_deg: ErrorAngle = 0.0
+    loaded_shape_deg: tuple[ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Video(Section):

@@ -112,6 +112,7 @@ def _texts(run: Run) -> dict[str, Any]:
     """Everything on the page that is text or tables."""
     more = {
         "cameras": "Cameras: frames, and how far each one's own errors were found",
+        "shell_shape": "Rocking or local deformation: the shell's shape under load, by video",
         "camera_frames": "Frames of the film",
         "camera_sensitivity": "Deflection by video under assumed joints and planes, beside Table 2.1 of AIAA 2011-2571",
         "fusion_inputs": "Inputs of the methods, estimated with the deflection",

@@ -12,8 +12,9 @@ import pytest
 import flightmodel
 from estimators.benchmark import orient_camera, with_deflected_benchmark
 from estimators.camera import polar, read_film, sensitivity_table
-from estimators.camera_fit import REACH_PX, _light_columns
+from estimators.camera_fit import REACH_PX
 from estimators.edge import HorizonLine, find_horizon, steps_near
+from estimators.frame_residuals import light_columns
 from estimators.overlay import Overlay
 from estimators.virtual_camera import VirtualCamera
 from flightmodel.camera import camera_from_mount
@@ -171,7 +172,7 @@ def test_light_moves_an_edge_by_shift_tilt_and_bow_that_do_not_do_for_each_other
     middle, weight = np.polynomial.legendre.leggauss(6)
     u = 0.5 * view.camera.width_px * (1.0 + np.append(middle, 1.0))
     at = np.column_stack([u, np.zeros_like(u)])
-    shapes = _light_columns(view, HorizonLine(at, at, np.ones_like(u), np.arange(len(u))))
+    shapes = light_columns(view, HorizonLine(at, at, np.ones_like(u), np.arange(len(u))))
     np.testing.assert_allclose(shapes[-1], 1.0)
     products = np.einsum("n,ni,nj->ij", weight, shapes[:-1], shapes[:-1])
     np.testing.assert_allclose(products, np.diag(np.diag(products)), atol=1e-12)

@@ -298,16 +298,30 @@ def fit_inputs(view, bending, edge_left=0.0):
 
 def fitted(view, edge, marks, prior, start):
     bending, count = np.array(start, dtype=float), len(edge[0]) + len(marks[0])
-    out = np.empty(count), np.zeros((count, 16)), np.zeros((count, 5)), np.empty(count)
+    out = (
+        np.empty(count),
+        np.zeros((count, 16)),
+        np.zeros((count, _fit_kernels.SHAPES)),
+        np.empty(count),
+        np.empty(count),
+    )
     limits = (1.5, 12.0, 1e-9, 30, 4)
     state, _ = _fit_kernels.fit_frame(
-        bending, np.eye(2), view.shell_terms, view.camera.lens_terms, edge, marks, prior, limits, *out
+        bending,
+        np.eye(2),
+        view.shell_terms,
+        view.camera.lens_terms,
+        edge,
+        marks,
+        (np.zeros_like(prior), prior),
+        limits,
+        *out,
     )
     assert state == _fit_kernels.DONE
     return bending, out
 
 
-PRIOR = np.array([0.004, 0.05, 0.002, 0.002, 0.3, 0.3, 0.3])
+PRIOR = np.array([0.004, 0.05, *[0.002] * 4, 0.3, 0.3, 0.3])
 
 
 def test_exact_points_give_their_deformation_back_whatever_the_benchmark_s_residuals():
@@ -341,7 +355,7 @@ def test_the_fit_is_the_most_probable_one():
         left = np.concatenate(rows) - out[1][:, 15] * shape[0] - out[2] @ shape[1:]
         return np.concatenate([np.sqrt(weight) * left, bending[2:] / PRIOR[0], shape / PRIOR[1:]])
 
-    best = least_squares(residuals, np.concatenate([got, np.zeros(6)]), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    best = least_squares(residuals, np.concatenate([got, np.zeros(8)]), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
     assert abs(best[2] - true[2]) > 1e-5  # the priors pull
     np.testing.assert_allclose(got, best[:3], atol=2e-6)
 

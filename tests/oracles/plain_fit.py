@@ -7,11 +7,8 @@ from estimators.camera_fit import (
     LAST_STEP_RAD,
     OUTLIER_PX,
     STEPS,
-    edge_residuals,
-    feature_residuals,
-    huber_gain,
-    joined,
 )
+from estimators.frame_residuals import edge_residuals, feature_residuals, huber_gain, joined
 from estimators.virtual_camera import DEFLECTION, FLATTENING
 
 
@@ -23,10 +20,11 @@ def plain_fit(oriented, horizon, place, start):
         [
             apriori.flattening_rad,
             apriori.joint_station_m,
-            *[apriori.ovality_rad] * 2,
+            *[apriori.lobes_rad] * 4,
             *[np.sqrt(2.0) * apriori.edge_px] * 3,
         ]
     )
+    form = np.zeros(8)
     for _ in range(STEPS):
         residuals = edge_residuals(oriented.view, horizon, deformation)
         if place is not None:
@@ -39,13 +37,16 @@ def plain_fit(oriented, horizon, place, start):
         sd = np.hypot(residuals.sd_px[both], before.sd_px[at])
         used = (residuals.index[both] < lines) | (np.abs(residual) < OUTLIER_PX)
         rows, shape = residuals.rows[both][used], residuals.shape[both][used]
-        moved = type(residuals)(residual[used], rows, shape, sd[used], residuals.index[both][used])
+        # what joint, lobes and light explain is no scatter
+        left = residual[used] - np.column_stack([rows[:, JOINT], shape]) @ form
+        scattered = type(residuals)(left, rows, shape, sd[used], residuals.index[both][used])
         design = np.column_stack([rows[:, DEFLECTION], rows[:, FLATTENING], rows[:, JOINT], shape])
-        gain, formal, _ = huber_gain(moved, design, np.diag(np.concatenate([np.zeros(2), prior**-2.0])), lines)
+        gain, formal, _ = huber_gain(scattered, design, np.diag(np.concatenate([np.zeros(2), prior**-2.0])), lines)
         pull = np.zeros(len(formal))
         pull[2] = deformation[2] / prior[0] ** 2
-        step = gain @ moved.residual_px - formal @ pull
+        step = gain @ residual[used] - formal @ pull
         deformation += step[:3]
+        form = step[3:]
         if np.abs(step[:3]).max() < LAST_STEP_RAD:
             break
     return deformation

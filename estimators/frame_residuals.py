@@ -1,0 +1,133 @@
+"""How far are the edge points and features found in a frame from where a deformed shell would show them?
+
+Residuals are found minus predicted, with the prediction's derivatives by all that is fitted: the deformation, the
+camera, the shell's lobes and the light at its edge. Lobes are a flattening that varies round the shell: with two waves
+it becomes a saddle, with three it has three lobes.
+
+References
+----------
+P. J. Huber, "Robust Statistics", 1981, chapter 7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.edge import HorizonLine
+from estimators.features import Features
+from estimators.virtual_camera import FLATTENING, VirtualCamera
+from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.deflection import lv_clock
+
+HUBER = 2.5
+WAVES = (2, 3)
+"""Round the shell, of the modelled lobes."""
+
+
+@dataclass(frozen=True)
+class FrameResiduals:
+    """Residuals of the edge points and features found in one frame, ``n`` in all.
+
+    Parameters
+    ----------
+    residual_px : (n,) float
+        Found minus predicted.
+    rows : (n, 16) float
+        Derivatives of the prediction; see `estimators.virtual_camera`.
+    shape : (n, 7) float
+        Derivatives by the lobes, px/rad, and by the edge's shift, tilt and bow.
+    sd_px : (n,) float
+    index : (n,) int
+        Place of the edge, or number of places plus row of `ImageFeatures`.
+    """
+
+    residual_px: FloatArray
+    rows: FloatArray
+    shape: FloatArray
+    sd_px: FloatArray
+    index: NDArray[np.intp]
+
+    def some(self, chosen: BoolArray) -> FrameResiduals:
+        """Chosen rows."""
+        return FrameResiduals(
+            self.residual_px[chosen], self.rows[chosen], self.shape[chosen], self.sd_px[chosen], self.index[chosen]
+        )
+
+
+def edge_residuals(view: VirtualCamera, horizon: HorizonLine, deformation: FloatArray) -> FrameResiduals:
+    """Residuals of edge points against the edge predicted for a deformation (3,)."""
+    residual, rows, clocks = view.mismatch(horizon, view.edge(deformation))
+    shape = np.column_stack([lobe_columns(rows, clocks), light_columns(view, horizon)])
+    return FrameResiduals(residual, rows, shape, horizon.sd_px, horizon.line)
+
+
+def light_columns(view: VirtualCamera, horizon: HorizonLine) -> FloatArray:
+    """Shift, tilt and bow of the found edge, ``(n, 3)``; one at the picture's sides."""
+    width = 0.5 * view.camera.width_px
+    side = (horizon.points_px[:, 0] - width) / width
+    return np.column_stack([np.ones_like(side), side, 1.5 * side**2 - 0.5])
+
+
+def lobe_columns(rows: FloatArray, clocks_rad: FloatArray) -> FloatArray:
+    """Derivatives (n, 4) by a flattening that varies round the shell as cosine and sine of two and of three clocks."""
+    waves = [wave(n * clocks_rad) for n in WAVES for wave in (np.cos, np.sin)]
+    return rows[:, [FLATTENING]] * np.stack(waves, axis=1)
+
+
+def feature_residuals(
+    view: VirtualCamera,
+    features: Features,
+    found: tuple[FloatArray, FloatArray],
+    deformation: FloatArray,
+    first_index: int,
+) -> FrameResiduals:
+    """Residuals of found features against those predicted for a deformation (3,)."""
+    place, sd = found
+    has = np.flatnonzero(np.isfinite(sd))
+    points, across = features.points_shell_m[has], features.across_px[has]
+    sight = view.sight(points, deformation)
+    residual = place[has] - np.einsum("ni,ni->n", sight.pixels, across)
+    rows = np.einsum("ni,nik->nk", across, sight.jacobian)
+    shape = np.column_stack([lobe_columns(rows, lv_clock(points[:, 1:])), np.zeros((len(has), 3))])
+    return FrameResiduals(residual, rows, shape, sd[has], first_index + has)
+
+
+def joined(first: FrameResiduals, second: FrameResiduals) -> FrameResiduals:
+    """Rows of both."""
+    parts = zip(*((s.residual_px, s.rows, s.shape, s.sd_px, s.index) for s in (first, second)), strict=True)
+    return FrameResiduals(*(np.concatenate(pair) for pair in parts))
+
+
+def huber_gain(
+    residuals: FrameResiduals,
+    design: FloatArray,
+    information: FloatArray,
+    lines: int,
+    together: FloatArray | float = 1.0,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Weigh one Gauss-Newton step by Huber's rule.
+
+    The sd of edge points and of features are each inflated to the scatter of their residuals, and by the root of the
+    number ``together`` that err alike.
+
+    Returns
+    -------
+    gain : (k, m) float
+        The step is ``gain @ residual``.
+    covariance : (k, k) float
+        Formal, of the parameters with the prior ``information (k, k)``.
+    rms_px : float
+    """
+    residual, scale = residuals.residual_px, residuals.sd_px.copy()
+    is_edge = residuals.index < lines
+    for group in (is_edge, ~is_edge):
+        if group.any():
+            centre = np.median(residual[group])
+            scale[group] *= max(1.4826 * float(np.median(np.abs(residual[group] - centre) / scale[group])), 1.0)
+    weight = 1.0 / scale**2 / np.maximum(1.0, np.abs(residual) / (HUBER * scale)) / together
+    weighted = design.T * weight
+    covariance: FloatArray = np.linalg.inv(weighted @ design + information).astype(float)
+    return covariance @ weighted, covariance, float(np.sqrt(np.average(residual**2, weights=weight)))

@@ -1,0 +1,318 @@
+"""Did the shell rock as one body, or did it change its shape under load too?
+
+The seed paper read a rocking of its shell and could not say whether a local deformation was among it. A frame's fit
+(`estimators.camera_fit`) finds, beside the deflection ``w``, the shell's flattening and its lobes of two and of three
+waves round the shell, ``s`` (5), each with a wide a priori sd about zero. Half of the shell is in view: one frame tells
+lobes from rocking poorly. A film tells more, as a shape that yields to the load grows with the dynamic pressure ``q``::
+
+    s_i = a l_i + f_i,    l_i = (q_i - q_b) / q_max,    f ~ Gauss-Markov with sd sigma
+
+relative to the benchmark frame ``b``. The amplitudes ``a`` are the shell's, common to all its cameras; the frames' own
+part ``f`` is a shape that does not follow the load. What a frame found is linear in its true shape, in the errors ``c``
+of its camera's pose and in the deflection ``d`` of the benchmark frame,
+
+    found_i = G_i s_i + C_i c + B_i d + e_i,    G_i = 1 - P_i / P_prior,    cov(e_i) = P_i G_i'
+
+with ``P_i`` the formal covariance of the shape; ``e`` is correlated in time as a camera's readings are
+(`LIGHT_TIME_S`). ``w`` is free in every frame: nothing is assumed of the deflection. All is Gaussian, and the evidence
+of the films decides between four hypotheses: rocking alone, with lobes of two waves, of three, of both; the shell may
+flatten in each. Rocking alone has a prior probability of one half, the others share the rest. ``sigma`` has three sizes
+of equal probability.
+
+The amplitudes' posterior, a mixture over the hypotheses, is then the prior of every frame's shape: of the frame's
+covariance ``P`` of ``(w, s)``, prior ``P_prior`` is replaced by ``N(a l_i, sigma^2)``. What is left of the amplitudes'
+error is common to all frames and grows with the load (`FrameFit.by_shape`): a shape that follows the load must not pass
+for compliance of the joint.
+
+Assumed: shapes of more than three waves are in the residuals; the amplitudes' error is independent of the cameras'.
+
+References
+----------
+Seed paper, conclusions of the CAD-based estimate. D. J. C. MacKay, "Bayesian interpolation", Neural Computation 4
+(1992) 415, for the evidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import pandas as pd
+from scipy.linalg import cho_factor, cho_solve, sqrtm
+
+from estimators.camera import FilmFit
+from estimators.camera_fit import AprioriSd, FrameFit, OrientedCamera
+from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
+from flightmodel.checks import FloatArray, GateError
+
+MODES = ("flattening", "two waves, cosine", "two waves, sine", "three waves, cosine", "three waves, sine")
+HYPOTHESES = {
+    "rocking alone": (0,),
+    "lobes of two waves": (0, 1, 2),
+    "lobes of three waves": (0, 3, 4),
+    "lobes of two and of three waves": (0, 1, 2, 3, 4),
+}
+_ALONE = "rocking alone"
+_PRIOR = {name: 0.5 if name == _ALONE else 0.5 / (len(HYPOTHESES) - 1) for name in HYPOTHESES}
+_FRAME_SDS_RAD = np.deg2rad([0.01, 0.03, 0.1])
+CALLED = 0.9  # probability from which an answer is called
+_DETERMINED = 0.5  # of the a priori sd
+LEAST_FRAMES, _MOST_FRAMES = 12, 100
+_LEAST_LOAD = 0.3  # of the film's largest, between frames: less shows no growth
+_JITTER_RAD2 = float(np.deg2rad(1e-4) ** 2)  # where a frame tells nothing of a shape, what it found is exactly zero
+
+
+@dataclass(frozen=True)
+class LoadedFilm:
+    """A film and the dynamic pressure at its frames (n,), Pa."""
+
+    film: FilmFit
+    pressure_pa: FloatArray
+
+    def shares(self, largest_pa: float) -> FloatArray:
+        """Loads ``l`` (n,) relative to the benchmark frame's, over the largest of all films."""
+        at = int(np.argmin(np.abs(self.film.time_s - self.film.benchmark_s)))
+        return np.asarray((self.pressure_pa - self.pressure_pa[at]) / largest_pa)
+
+    @property
+    def rows(self) -> FloatArray:
+        """Frames with an answer whose load is known, `_MOST_FRAMES` at the most."""
+        known = [
+            k for k, fit in enumerate(self.film.fits) if fit.shape is not None and np.isfinite(self.pressure_pa[k])
+        ]
+        return np.array(known[:: max(1, -(-len(known) // _MOST_FRAMES))], dtype=int)
+
+
+@dataclass(frozen=True)
+class ShellShape:
+    """How the shell's shape followed the load.
+
+    Parameters
+    ----------
+    amplitude_rad : (5,) float
+        Of `MODES` at the largest dynamic pressure, over all hypotheses.
+    covariance : (5, 5) float
+    if_any_rad, if_any_sd_rad : (5,) float
+        With lobes of two and of three waves.
+    probability : dict of float
+        Of each of `HYPOTHESES`.
+    frame_sd_rad : float
+        Of a frame's own shape.
+    determined : (5,) bool
+        Whether the films determined an amplitude better than half its a priori sd.
+    largest_pa : float
+        Largest dynamic pressure of the films.
+    """
+
+    amplitude_rad: FloatArray
+    covariance: FloatArray
+    if_any_rad: FloatArray
+    if_any_sd_rad: FloatArray
+    probability: dict[str, float]
+    frame_sd_rad: float
+    determined: tuple[bool, ...]
+    largest_pa: float
+
+    @property
+    def lobes_probability(self) -> float:
+        """Probability that the shell has lobes under load."""
+        return 1.0 - self.probability[_ALONE]
+
+    @property
+    def call(self) -> str:
+        """The likeliest hypothesis where it, or that there are lobes at all, is beyond doubt; else ``undecided``."""
+        if self.lobes_probability <= 1.0 - CALLED:
+            return _ALONE
+        if self.lobes_probability < CALLED:
+            return "undecided"
+        name, probability = max(self.probability.items(), key=lambda item: item[1])
+        return name if probability >= CALLED else "lobes"
+
+    @property
+    def remark(self) -> str:
+        """One sentence."""
+        alone = 100.0 * self.probability[_ALONE]
+        told = [mode for mode, yes in zip(MODES, self.determined, strict=True) if yes]
+        size = np.rad2deg([np.hypot(*self.if_any_rad[k : k + 2]) for k in (1, 3)])
+        words = f"rocking alone has {alone:.1f} %, {self.call}" if self.call != _ALONE else f"{_ALONE} ({alone:.1f} %)"
+        found = f"lobes at the largest load of {size[0]:.2f} deg (two waves) and {size[1]:.2f} deg (three)"
+        return f"{words}; {found} if there are any; the films determined {', '.join(told) or 'no shape'}"
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a mode.
+
+        Returns
+        -------
+        DataFrame
+            ``mode, amplitude_deg, sd_deg`` (over all hypotheses, at the largest dynamic pressure), ``if_any_deg,
+            if_any_sd_deg`` (with all lobes), ``probability`` (that the mode is there), ``determined``.
+        """
+        there = [sum(p for name, p in self.probability.items() if k in HYPOTHESES[name]) for k in range(len(MODES))]
+        degrees = {
+            "amplitude_deg": self.amplitude_rad, "sd_deg": np.sqrt(np.diag(self.covariance)),
+            "if_any_deg": self.if_any_rad, "if_any_sd_deg": self.if_any_sd_rad,
+        }  # fmt: skip
+        columns = {name: np.rad2deg(value) for name, value in degrees.items()}
+        return pd.DataFrame({"mode": MODES, **columns, "probability": there, "determined": self.determined})
+
+
+def shell_shape(films: list[LoadedFilm]) -> ShellShape:
+    """Amplitudes of the shell's shape under load and the odds of the hypotheses.
+
+    Parameters
+    ----------
+    films : list of LoadedFilm
+        Of one shell; the planes estimated.
+
+    Raises
+    ------
+    GateError
+        Where too few frames, or too equal loads, tell nothing.
+    """
+    frames = sum(len(one.rows) for one in films)
+    if frames < LEAST_FRAMES:
+        raise GateError(f"{frames} frames with a load where {LEAST_FRAMES} are needed", code="too-few-frames")
+    largest = max(float(np.nanmax(one.pressure_pa)) for one in films)
+    loads = np.concatenate([one.shares(largest)[one.rows] for one in films])
+    if np.ptp(loads) < _LEAST_LOAD:
+        raise GateError(
+            f"the dynamic pressure of the frames varies by {100.0 * np.ptp(loads):.0f} % of the largest where "
+            f"{100.0 * _LEAST_LOAD:.0f} % are needed",
+            code="loads-alike",
+        )
+    prior = mode_sd_rad(films[0].film.oriented.apriori)
+    found, respond, camera, frame_part = _stacked(films, loads)
+    told = []
+    for size in _FRAME_SDS_RAD:
+        factor = cho_factor(camera + size**2 * frame_part, lower=True)
+        solved = cho_solve(factor, np.column_stack([respond, found]))
+        log = -0.5 * float(found @ solved[:, -1]) - float(np.log(np.diag(factor[0])).sum())
+        told.append((log, respond.T @ solved[:, :-1], respond.T @ solved[:, -1]))
+    answers = [
+        _Amplitudes.given(name, size, prior, *one)
+        for (size, one), name in product(zip(_FRAME_SDS_RAD, told, strict=True), HYPOTHESES)
+    ]
+    return _mixed(answers, prior, largest)
+
+
+def mode_sd_rad(apriori: AprioriSd) -> FloatArray:
+    """A priori sd of `MODES`, (5,)."""
+    return np.array([apriori.flattening_rad, *[apriori.lobes_rad] * 4])
+
+
+def _stacked(films: list[LoadedFilm], loads: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Shapes found (5 n,), response to the amplitudes (5 n, 5), covariance without and of unit own shapes (5 n, 5 n)."""
+    found, through, own, at_s = [], [], [], []
+    for one in films:
+        fits = [one.film.fits[k].shape for k in one.rows]
+        prior = mode_sd_rad(one.film.oriented.apriori) ** -2.0
+        formal = np.array([fit.formal[2:, 2:] for fit in fits])
+        share = np.eye(len(prior)) - formal * prior
+        found.append(np.array([fit.found_rad[2:] for fit in fits]).ravel())
+        through.append(share)
+        noise = share @ formal
+        time_s = one.film.time_s[one.rows]
+        apart = np.abs(time_s[:, None] - time_s[None, :])
+        together = CONSTANT_PART + (1.0 - CONSTANT_PART) * np.exp(-apart / LIGHT_TIME_S)
+        root = np.array([np.real(sqrtm(0.5 * (n + n.T))) for n in noise])
+        errors = _pairs(root, together)
+        camera = np.concatenate([fit.by_camera[2:] for fit in fits])
+        start = np.concatenate([fit.by_benchmark[2:] for fit in fits]) * one.film.oriented.apriori.benchmark_rad
+        own.append(errors + camera @ one.film.oriented.posed_covariance @ camera.T + start @ start.T)
+        at_s.append(time_s)
+    shares, times = np.concatenate(through), np.concatenate(at_s)
+    apart = np.abs(times[:, None] - times[None, :])
+    n = 5 * len(times)
+    respond = (shares * loads[:, None, None]).reshape(n, 5)
+    covariance, first = _JITTER_RAD2 * np.eye(n), 0
+    for block in own:
+        here = slice(first, first + len(block))
+        covariance[here, here] += block
+        first += len(block)
+    return np.concatenate(found), respond, covariance, _pairs(shares, np.exp(-apart / LIGHT_TIME_S))
+
+
+def _pairs(root: FloatArray, together: FloatArray) -> FloatArray:
+    """Covariance (k n, k n) of ``root_i x_i`` (n, k, k) with a correlation of the ``x`` in time (n, n)."""
+    n, k = len(root), root.shape[1]
+    return np.einsum("iab,ij,jcb->iajc", root, together, root).reshape(k * n, k * n)
+
+
+@dataclass(frozen=True)
+class _Amplitudes:
+    """Posterior of the amplitudes under a hypothesis and a size of the frames' own shapes."""
+
+    name: str
+    size_rad: float
+    mean: FloatArray
+    covariance: FloatArray
+    log_evidence: float
+
+    @staticmethod
+    def given(
+        name: str, size_rad: float, prior_sd: FloatArray, log: float, information: FloatArray, right: FloatArray
+    ) -> _Amplitudes:
+        """Of the information (5, 5) and its mean's product (5,) that the films have on all modes."""
+        there = list(HYPOTHESES[name])
+        within = np.linalg.inv(information[np.ix_(there, there)] + np.diag(prior_sd[there] ** -2.0))
+        mean, covariance = np.zeros(len(prior_sd)), np.zeros((len(prior_sd), len(prior_sd)))
+        mean[there] = within @ right[there]
+        covariance[np.ix_(there, there)] = within
+        gained = 0.5 * float(right[there] @ mean[there]) + 0.5 * float(np.linalg.slogdet(within)[1])
+        return _Amplitudes(name, size_rad, mean, covariance, log + gained - float(np.log(prior_sd[there]).sum()))
+
+
+def _mixed(answers: list[_Amplitudes], prior_sd: FloatArray, largest_pa: float) -> ShellShape:
+    """Mean and covariance over hypotheses and sizes."""
+    log = np.array([one.log_evidence + np.log(_PRIOR[one.name]) for one in answers])
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    mean, covariance = _moments(weight, answers)
+    every = np.array([len(HYPOTHESES[one.name]) == len(MODES) for one in answers])
+    with_all = weight * every
+    if_any, if_any_cov = _moments(with_all / max(with_all.sum(), 1e-300), answers)
+    sd = np.sqrt(np.diag(if_any_cov))
+    odds = {
+        name: float(sum(w for w, one in zip(weight, answers, strict=True) if one.name == name)) for name in HYPOTHESES
+    }
+    size = float(np.sqrt(weight @ np.array([one.size_rad for one in answers]) ** 2))
+    determined = tuple(bool(x) for x in sd < _DETERMINED * prior_sd)
+    return ShellShape(mean, covariance, if_any, sd, odds, size, determined, largest_pa)
+
+
+def _moments(weight: FloatArray, answers: list[_Amplitudes]) -> tuple[FloatArray, FloatArray]:
+    means = np.array([one.mean for one in answers])
+    mean = weight @ means
+    off = means - mean
+    covariance = np.einsum("k,kij->ij", weight, [one.covariance for one in answers]) + (weight * off.T) @ off
+    return mean, covariance
+
+
+def with_shape(one: LoadedFilm, shape: ShellShape) -> FilmFit:
+    """Film with the answers of all frames given the shell's shape under their load."""
+    loads = one.shares(shape.largest_pa)
+    fits = tuple(
+        fit if fit.shape is None or not np.isfinite(load) else _given_shape(fit, float(load), shape, one.film.oriented)
+        for fit, load in zip(one.film.fits, loads, strict=True)
+    )
+    return replace(one.film, fits=fits, shape_covariance=shape.covariance)
+
+
+def _given_shape(fit: FrameFit, load: float, shape: ShellShape, oriented: OrientedCamera) -> FrameFit:
+    assert fit.shape is not None
+    own, modes = fit.shape, slice(2, 7)
+    information = np.linalg.inv(own.formal)
+    told = information.copy()
+    told[modes, modes] += np.diag(shape.frame_sd_rad**-2.0 - mode_sd_rad(oriented.apriori) ** -2.0)
+    formal = np.linalg.inv(told)
+    by_amplitude = formal[:, modes] * (load / shape.frame_sd_rad**2)
+    found = formal @ information @ own.found_rad + by_amplitude @ shape.amplitude_rad
+    by_camera, by_benchmark = (formal @ information @ by for by in (own.by_camera, own.by_benchmark))
+    covariance = oriented.covariance_of(formal[:2, :2], by_camera[:2], by_benchmark[:2])
+    by_shape = by_amplitude[:2]
+    covariance = covariance + by_shape @ shape.covariance @ by_shape.T
+    return replace(
+        fit, rotation_yz_rad=found[:2], covariance=covariance, per_benchmark=by_benchmark[:2],
+        flattening_rad=float(found[2]), by_shape=by_shape,
+    )  # fmt: skip
