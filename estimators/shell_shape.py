@@ -19,10 +19,11 @@ of the films decides between four hypotheses: rocking alone, with lobes of two w
 flatten in each. Rocking alone has a prior probability of one half, the others share the rest. ``sigma`` has three sizes
 of equal probability.
 
-The amplitudes' posterior, a mixture over the hypotheses, is then the prior of every frame's shape: of the frame's
-covariance ``P`` of ``(w, s)``, prior ``P_prior`` is replaced by ``N(a l_i, sigma^2)``. What is left of the amplitudes'
-error is common to all frames and grows with the load (`FrameFit.by_shape`): a shape that follows the load must not pass
-for compliance of the joint.
+The amplitudes' posterior, a mixture over the hypotheses, is then the prior of every frame's shape, ``N(a l, sigma^2)``
+in place of the wide one about zero: the frame's answer is moved by the best gain on what it found of the shape beside
+what it should have found, with the errors ``c``, ``d``, ``e`` of both. What is left of the amplitudes' error is common
+to all frames and grows with the load (`FrameFit.by_shape`): a shape that follows the load must not pass for compliance
+of the joint.
 
 Assumed: shapes of more than three waves are in the residuals; the amplitudes' error is independent of the cameras'.
 
@@ -202,13 +203,12 @@ def mode_sd_rad(apriori: AprioriSd) -> FloatArray:
 
 
 def _stacked(films: list[LoadedFilm], loads: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Shapes found (5 n,), response to the amplitudes (5 n, 5), covariance without and of unit own shapes (5 n, 5 n)."""
+    """Shapes found (5 n,), response to amplitudes (5 n, 5), covariance without and of unit own shapes (5 n, 5 n)."""
     found, through, own, at_s = [], [], [], []
     for one in films:
         fits = [one.film.fits[k].shape for k in one.rows]
-        prior = mode_sd_rad(one.film.oriented.apriori) ** -2.0
         formal = np.array([fit.formal[2:, 2:] for fit in fits])
-        share = np.eye(len(prior)) - formal * prior
+        share = _share_told(formal, one.film.oriented.apriori)
         found.append(np.array([fit.found_rad[2:] for fit in fits]).ravel())
         through.append(share)
         noise = share @ formal
@@ -300,19 +300,27 @@ def with_shape(one: LoadedFilm, shape: ShellShape) -> FilmFit:
 
 
 def _given_shape(fit: FrameFit, load: float, shape: ShellShape, oriented: OrientedCamera) -> FrameFit:
+    """Best linear unbiased answer of a frame whose shape is ``N(a l, sigma^2)``."""
     assert fit.shape is not None
-    own, modes = fit.shape, slice(2, 7)
-    information = np.linalg.inv(own.formal)
-    told = information.copy()
-    told[modes, modes] += np.diag(shape.frame_sd_rad**-2.0 - mode_sd_rad(oriented.apriori) ** -2.0)
-    formal = np.linalg.inv(told)
-    by_amplitude = formal[:, modes] * (load / shape.frame_sd_rad**2)
-    found = formal @ information @ own.found_rad + by_amplitude @ shape.amplitude_rad
-    by_camera, by_benchmark = (formal @ information @ by for by in (own.by_camera, own.by_benchmark))
-    covariance = oriented.covariance_of(formal[:2, :2], by_camera[:2], by_benchmark[:2])
-    by_shape = by_amplitude[:2]
-    covariance = covariance + by_shape @ shape.covariance @ by_shape.T
-    return replace(
-        fit, rotation_yz_rad=found[:2], covariance=covariance, per_benchmark=by_benchmark[:2],
-        flattening_rad=float(found[2]), by_shape=by_shape,
-    )  # fmt: skip
+    own, apriori = fit.shape, oriented.apriori
+    mean, spread = load * shape.amplitude_rad, shape.frame_sd_rad**2
+    across = own.formal[:2, 2:] * mode_sd_rad(apriori) ** -2.0
+    share = _share_told(own.formal[2:, 2:], apriori)
+    noise = own.formal - own.formal[:, 2:] * mode_sd_rad(apriori) ** -2.0 @ own.formal[2:]
+    pose, start = own.by_camera @ oriented.posed_covariance, own.by_benchmark * apriori.benchmark_rad**2
+    read = noise + pose @ own.by_camera.T + start @ own.by_benchmark.T
+    crossed = read[:2, 2:] - spread * across @ share.T
+    innovation = read[2:, 2:] + spread * share @ share.T + _JITTER_RAD2 * np.eye(len(mean))
+    gain = crossed @ np.linalg.inv(innovation)
+    by_mean = across + gain @ share
+    answer = own.found_rad[:2] + by_mean @ mean - gain @ own.found_rad[2:]
+    both = np.hstack([np.eye(2), -gain])
+    by_camera, by_benchmark, by_shape = both @ own.by_camera, both @ own.by_benchmark, load * by_mean
+    formal = both @ noise @ both.T + spread * by_mean @ by_mean.T
+    covariance = oriented.covariance_of(formal, by_camera, by_benchmark) + by_shape @ shape.covariance @ by_shape.T
+    return replace(fit, rotation_yz_rad=answer, covariance=covariance, per_benchmark=by_benchmark, by_shape=by_shape)
+
+
+def _share_told(formal: FloatArray, apriori: AprioriSd) -> FloatArray:
+    """``G``: what is found per unit of a true shape, of formal covariances (..., 5, 5)."""
+    return np.eye(formal.shape[-1]) - formal * mode_sd_rad(apriori) ** -2.0

@@ -1,8 +1,8 @@
 """The deflection by the onboard cameras: one film by itself, or several joined into one history.
 
 A film that cannot be used does not stop the others: it is named, with its reason, in the answer's assumptions and by a
-consistency check. Where a trajectory gives the dynamic pressure at the frames, the shell's shape under load is estimated
-from all films, and every frame's answer uses it.
+consistency check. Where a trajectory gives the dynamic pressure at the frames, the shell's shape under load is
+estimated from all films, and every frame's answer uses it.
 """
 
 from __future__ import annotations
