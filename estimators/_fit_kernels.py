@@ -13,7 +13,9 @@ from estimators._sight_kernels import COLUMNS, feet, limb_points, project_points
 from flightmodel._kernels import inlined, kernel
 
 JOINT = COLUMNS - 1
-SHAPES = 7  # lobes n = 2 and 3 (4), light (3)
+LOBES = 12  # cosine and sine of lobes of two to five waves (8) and of rings out of round of two and three (4)
+SHAPES = LOBES + 3  # light
+_RADIUS = COLUMNS - 2
 DONE, TOO_FEW, DIVERGED = 0, 1, 2
 
 
@@ -55,14 +57,22 @@ def _project_edge(deformation, clocks, circle, ring, joint, lens, terms, points,
 
 
 @inlined
-def _lobe_columns(flattening, clock, shape):
-    """Derivatives by a flattening that varies round the shell as the cosine and the sine of two and three clocks."""
-    shape[0], shape[1] = flattening * math.cos(2.0 * clock), flattening * math.sin(2.0 * clock)
-    shape[2], shape[3] = flattening * math.cos(3.0 * clock), flattening * math.sin(3.0 * clock)
+def _lobe_columns(flattening, outwards, clock, shape):
+    """Derivatives by a flattening, and by a growth outwards, that vary round the shell as waves.
+
+    ``flattening``, ``outwards``: derivatives by those that do not vary.
+    """
+    c, s = math.cos(clock), math.sin(clock)
+    cosine, sine = c, s
+    for wave in range(4):
+        cosine, sine = cosine * c - sine * s, sine * c + cosine * s
+        shape[2 * wave], shape[2 * wave + 1] = flattening * cosine, flattening * sine
+        if wave < 2:
+            shape[8 + 2 * wave], shape[9 + 2 * wave] = outwards * cosine, outwards * sine
 
 
 @inlined
-def _edge_residuals(found, light, edge_offset, pixels, jacobian, kept, count, residual, rows, shape, at):
+def _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at):
     """Residuals, derivatives and shape columns of edge points, the benchmark's residuals subtracted."""
     m = len(found)
     feet(found, pixels[:count], jacobian[:count], residual[:m], rows[:m], at)
@@ -70,13 +80,13 @@ def _edge_residuals(found, light, edge_offset, pixels, jacobian, kept, count, re
         residual[i] -= edge_offset[i]
         j = min(int(at[i]), count - 2) if math.isfinite(residual[i]) else 0
         clock = kept[j] + (at[i] - j) * (kept[j + 1] - kept[j])
-        _lobe_columns(rows[i, 2], clock, shape[i])
-        shape[i, 4:] = light[i]
+        _lobe_columns(rows[i, 2], width * rows[i, _RADIUS], clock, shape[i])
+        shape[i, LOBES:] = light[i]
 
 
 @inlined
 def _feature_residuals(
-    spots, across, place, feature_offset, terms, lens, outlier, m, pixels, jacobian, residual, rows, shape
+    spots, across, place, feature_offset, ring, terms, lens, outlier, m, pixels, jacobian, residual, rows, shape
 ):  # fmt: skip
     """As `_edge_residuals` for features, in the rows behind the edge's; those beyond ``outlier`` px become NaN."""
     p = len(spots)
@@ -88,8 +98,11 @@ def _feature_residuals(
             residual[m + i] = np.nan
         for c in range(COLUMNS):
             rows[m + i, c] = ax * jacobian[i, 0, c] + ay * jacobian[i, 1, c]
-        _lobe_columns(rows[m + i, 2], math.atan2(spots[i, 2], -spots[i, 1]), shape[m + i])
-        shape[m + i, 4:] = 0.0
+        radius = math.sqrt(spots[i, 1] ** 2 + spots[i, 2] ** 2)
+        away = math.sqrt((-spots[i, 0] - ring[0]) ** 2 + (radius - ring[1]) ** 2)
+        clock = math.atan2(spots[i, 2], -spots[i, 1])
+        _lobe_columns(rows[m + i, 2], away * rows[m + i, _RADIUS], clock, shape[m + i])
+        shape[m + i, LOBES:] = 0.0
 
 
 @inlined
@@ -168,7 +181,7 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
     ``shell``: clocking angles of the edge, circle of the outermost torus, ring about which the shell flattens, joint
     station. ``edge``: points (m, 2), light (m, 3), sd and residual at the benchmark (m,), NaN where it was not
     found. ``features``: points of the shell (p, 3), directions (p, 2), places, sd, residuals there (p,). ``prior``:
-    mean and sd of flattening, joint, lobes (4), light (3). ``limits``: Huber's, largest residual, last step, steps,
+    mean and sd of flattening, joint, lobes (12), light (3). ``limits``: Huber's, largest residual, last step, steps,
     fewest edge points. ``residual``: against the deformed shell without lobes; ``left``: with what the fit makes of
     them, of joint and light. Rows with weight zero were not used; edge points come first.
     """
@@ -185,6 +198,7 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
     scaled = np.empty(max(m, p))
     design, normal, right = np.empty(n), np.empty((n, n)), np.empty(n)
     form = np.zeros(1 + SHAPES)
+    width = math.sqrt((circle[0] - ring[0]) ** 2 + (circle[1] - ring[1]) ** 2)
     huber, outlier, last_step, steps, fewest = limits
     for taken in range(steps):
         rotation_of(deformation[0], deformation[1], rotation, columns)
@@ -193,9 +207,9 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
             count = _project_edge(deformation, clocks, circle, ring, joint, lens, terms, points, pixels, jacobian, kept)
             if count < 2:
                 return TOO_FEW, taken
-            _edge_residuals(found, light, edge_offset, pixels, jacobian, kept, count, residual, rows, shape, at)
+            _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at)
         _feature_residuals(
-            spots, across, place, feature_offset, terms, lens, outlier, m, spot_pixels, spot_jacobian, residual, rows,
+            spots, across, place, feature_offset, ring, terms, lens, outlier, m, spot_pixels, spot_jacobian, residual, rows,
             shape,
         )  # fmt: skip
         _without_shape(residual, rows, shape, form, left)

@@ -84,7 +84,7 @@ _WORST_RMS_PX = 2.5
 _WORST_CORRECTIONS = 31.8  # chi-square of eight corrections that one sound frame in 10,000 exceeds
 _FOCAL, _FOCAL_PIECE = 3, 0.08
 _BUILT_RAD = np.deg2rad(0.3)
-_BUILT = [0, 1, 4, 5, 6]  # saddle and light: three waves beside a lens that is fitted cost more than they explain
+_BUILT = [0, 1, -3, -2, -1]  # saddle and light: more waves beside a lens that is fitted cost more than they explain
 _POSES = POSED.stop - POSED.start
 # deflection
 LEAST_FRAMES, MOST_FRAMES = 12, 150
@@ -441,7 +441,7 @@ class RelativeDeflections:
     benchmark_s : float
     time_bias_sd_s : float
         A priori sd of the frames' time bias against the gyros'.
-    by_shape : (n, 2, 5) float or None
+    by_shape : (n, 2, 13) float or None
         Part of the readings' error that the shell's shape under load has in common, per unit normal; its square is in
         ``covariance``.
     """

@@ -76,7 +76,7 @@ class FilmFit:
         Of the assumed plane.
     by_hand : str
         What an analyst edited.
-    shape_covariance : (5, 5) float or None
+    shape_covariance : (13, 13) float or None
         Of what the film told about the shell's shape under load, where the answers use it (`estimators.shell_shape`).
     """
 
@@ -114,11 +114,13 @@ class FilmFit:
         )
 
     def _shape_root(self) -> FloatArray | None:
-        """Root (n, 2, 5) of the readings' common error by the shell's shape under load, as lateral vectors."""
+        """Root (n, 2, 13) of the readings' common error by the shell's shape under load, as lateral vectors."""
         if self.shape_covariance is None:
             return None
         value, axes = np.linalg.eigh(self.shape_covariance)
-        by_shape = np.array([np.full((2, 5), np.nan) if fit.by_shape is None else fit.by_shape for fit in self.fits])
+        by_shape = np.array(
+            [np.full((2, len(value)), np.nan) if fit.by_shape is None else fit.by_shape for fit in self.fits]
+        )
         return np.asarray(_SWAP @ by_shape @ (axes * np.sqrt(np.maximum(value, 0.0))))
 
     def history(self, benchmark: BenchmarkDeflection | None = None) -> DeflectionHistory:

@@ -7,9 +7,9 @@ measure motion.
 
 In the other frames, with the plane estimated: Gauss-Newton with Huber's weights on
 
-    r_i = found_i - predicted_i(w, kappa) - r_i(benchmark),   parameters  w (2), kappa, joint, lobes (4), light (3),
+    r_i = found_i - predicted_i(w, kappa) - r_i(benchmark),   parameters  w (2), kappa, joint, lobes (12), light (3),
 
-each but ``w`` with its prior: the shell's flattening and its lobes of two and three waves under load, the joint's
+each but ``w`` with its prior: the shell's flattening and its lobes of two to five waves under load, the joint's
 station, and the shift, tilt and bow by which a changing light moves the found edge. With an assumed plane, the seed
 paper's way, one component of ``w`` alone is fitted to the edge alone, and the rest is only in the error bar. The
 covariance is the formal one, scaled by the residuals, plus that of the benchmark's uncertain parameters,
@@ -85,9 +85,9 @@ USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
 JOINT = HELD.stop - 1
 POSED = slice(CAMERA.start, JOINT)
 TURN = slice(CAMERA.start, CAMERA.start + 3)
-LOBES = slice(2, 6)
+LOBES = slice(2, 2 + _fit_kernels.LOBES)
 """Among flattening, joint station, lobes and light."""
-SHAPE = np.array([2, 4, 5, 6, 7])
+SHAPE = np.array([2, *range(4, 4 + _fit_kernels.LOBES)])
 """Flattening and lobes among deflection, flattening, joint station, lobes and light."""
 
 
@@ -103,8 +103,8 @@ class AprioriSd:
         Deflection of the benchmark frame, each lateral axis. Statically ``(z0/x) u/(1-u)``, 0.06 deg for the reference
         vehicle at 421 s, and the joint's oscillation about it.
     flattening_rad, lobes_rad : float
-        Flattening (the shell opens like an umbrella) and lobes of two and three waves, cosine and sine each, between
-        benchmark and frame. The local deformation of the seed paper's shell was not measured.
+        Flattening (the shell opens like an umbrella) and each lobe's cosine and sine between benchmark and frame, as
+        angles about the innermost ring. The local deformation of the seed paper's shell was not measured.
     higher_lobes_rad : float
         Lobes of more waves, which are not modelled.
     edge_px : float
@@ -127,13 +127,13 @@ class FrameShape:
 
     Parameters
     ----------
-    found_rad : (7,) float
-        Rotation vector about body y and z, flattening, lobes (cosine and sine of two waves, then of three).
-    formal : (7, 7) float
+    found_rad : (15,) float
+        Rotation vector about body y and z, flattening, lobes (`estimators.frame_residuals.lobe_columns`).
+    formal : (15, 15) float
         Covariance that the frame's own points leave.
-    by_camera : (7, 12) float
+    by_camera : (15, 12) float
         Error per unit error of the oriented camera's pose.
-    by_benchmark : (7, 2) float
+    by_benchmark : (15, 2) float
         Missing part per unit deflection of the benchmark frame.
     """
 
@@ -168,7 +168,7 @@ class FrameFit:
         Whether features were found that contradict a whole edge, which alone gave the answer.
     shape : FrameShape or None
         None in an assumed plane.
-    by_shape : (2, 5) float or None
+    by_shape : (2, 13) float or None
         Error per unit error of what the film tells about the shell's shape under load, where it was used.
     """
 
@@ -195,9 +195,9 @@ class _NoFitError(GateError):
 
 @dataclass(frozen=True)
 class _Solution:
-    """Last step of one frame's fit: gain ``(k + 9, m)`` and formal covariance of deflection, shape and light.
+    """Last step of one frame's fit: gain ``(k + 17, m)`` and formal covariance of deflection, shape and light.
 
-    ``shape_found`` (9,): flattening, joint station, lobes and light. ``before``: the benchmark's rows of the points
+    ``shape_found`` (17,): flattening, joint station, lobes and light. ``before``: the benchmark's rows of the points
     used; ``edge_count`` of them are edge points and come first.
     """
 
@@ -606,10 +606,12 @@ class OrientedCamera:
 
     @property
     def _shape_sd(self) -> FloatArray:
-        """A priori sd of flattening, joint station, lobes (4) and light (3) of a frame against the benchmark."""
+        """A priori sd of flattening, joint station, lobes (12) and light (3) of a frame against the benchmark."""
         apriori = self.apriori
         light = [np.sqrt(2.0) * apriori.edge_px] * 3
-        return np.array([apriori.flattening_rad, apriori.joint_station_m, *[apriori.lobes_rad] * 4, *light])
+        return np.array(
+            [apriori.flattening_rad, apriori.joint_station_m, *[apriori.lobes_rad] * _fit_kernels.LOBES, *light]
+        )
 
     def _shape_prior(self, k: int) -> tuple[FloatArray, FloatArray]:
         """Prior mean and sd of the shape, which must not absorb what an assumed plane (k = 1) cannot explain."""

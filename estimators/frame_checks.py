@@ -21,8 +21,8 @@ from estimators.edge import NO_FAULT
 from flightmodel.checks import Fault, FloatArray
 
 USUAL_RMS_PX = 1.0  # of edge and features in a frame that is not suspicious
-# chi-square of nine of shape and light, and of three rotations, that one sound frame in 10,000 exceeds
-WORST_SHAPE, _WORST_TURN = 33.7, 21.1
+# chi-square of seventeen of shape and light, and of three rotations, that one sound frame in 10,000 exceeds
+WORST_SHAPE, _WORST_TURN = 47.6, 21.1
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Design:
     ----------
     deflection : (n, 2) float
         Derivatives by the two components, px/rad.
-    shape : (n, 9) float
-        By flattening, joint station, lobes (4) and light (3).
+    shape : (n, 17) float
+        By flattening, joint station, lobes (12) and light (3).
     turn : (n, 3) float
         By the scene's rotation in camera axes, px/rad.
     residual_px, weight : (n,) float
@@ -57,7 +57,7 @@ def fault_of_fit(design: Design, rms_px: float, flattening_rad: float, shape_sd:
         Weighted.
     flattening_rad : float
         Of the shell, about which the fit ended.
-    shape_sd : (9,) float
+    shape_sd : (17,) float
         A priori, of the columns of ``design.shape``.
     lobes_rad : float
         A priori sd of shapes that are not modelled.
@@ -72,7 +72,7 @@ def fault_of_fit(design: Design, rms_px: float, flattening_rad: float, shape_sd:
     shape = np.array([flattening_rad, *(formal @ weighted @ design.residual_px)[3:]]) / shape_sd
     if shape @ shape > WORST_SHAPE:
         words = (
-            f"shape and light would have to be {np.sqrt(shape @ shape / len(shape)):.1f} sd (rms of nine) from the "
+            f"shape and light would have to be {np.sqrt(shape @ shape / len(shape)):.1f} sd (rms of seventeen) from the "
             f"benchmark frame's, where {np.sqrt(WORST_SHAPE / len(shape)):.1f} are allowed"
         )
         return Fault(words, "edge-not-shell")

@@ -1,8 +1,9 @@
 """How far are the edge points and features found in a frame from where a deformed shell would show them?
 
 Residuals are found minus predicted, with the prediction's derivatives by all that is fitted: the deformation, the
-camera, the shell's lobes and the light at its edge. Lobes are a flattening that varies round the shell: with two waves
-it becomes a saddle, with three it has three lobes.
+camera, the shell's lobes and the light at its edge. Lobes are a flattening that varies round the shell (with two waves it
+becomes a saddle), or a growth outwards that does (with two waves its rings become oval), in proportion to the distance
+from the innermost ring: the unit of both is an angle about that.
 
 References
 ----------
@@ -18,13 +19,13 @@ from numpy.typing import NDArray
 
 from estimators.edge import HorizonLine
 from estimators.features import Features
-from estimators.virtual_camera import FLATTENING, VirtualCamera
+from estimators.virtual_camera import FLATTENING, RADIUS, VirtualCamera
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
 
 HUBER = 2.5
-WAVES = (2, 3)
-"""Round the shell, of the modelled lobes."""
+WAVES, ROUND_WAVES = (2, 3, 4, 5), (2, 3)
+"""Round the shell, of the modelled lobes across it and along its radius."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class FrameResiduals:
         Found minus predicted.
     rows : (n, 16) float
         Derivatives of the prediction; see `estimators.virtual_camera`.
-    shape : (n, 7) float
+    shape : (n, 15) float
         Derivatives by the lobes, px/rad, and by the edge's shift, tilt and bow.
     sd_px : (n,) float
     index : (n,) int
@@ -60,7 +61,9 @@ class FrameResiduals:
 def edge_residuals(view: VirtualCamera, horizon: HorizonLine, deformation: FloatArray) -> FrameResiduals:
     """Residuals of edge points against the edge predicted for a deformation (3,)."""
     residual, rows, clocks = view.mismatch(horizon, view.edge(deformation))
-    shape = np.column_stack([lobe_columns(rows, clocks), light_columns(view, horizon)])
+    shape = np.column_stack(
+        [lobe_columns(rows, np.full(len(rows), view.width_m), clocks), light_columns(view, horizon)]
+    )
     return FrameResiduals(residual, rows, shape, horizon.sd_px, horizon.line)
 
 
@@ -71,10 +74,16 @@ def light_columns(view: VirtualCamera, horizon: HorizonLine) -> FloatArray:
     return np.column_stack([np.ones_like(side), side, 1.5 * side**2 - 0.5])
 
 
-def lobe_columns(rows: FloatArray, clocks_rad: FloatArray) -> FloatArray:
-    """Derivatives (n, 4) by a flattening that varies round the shell as cosine and sine of two and of three clocks."""
-    waves = [wave(n * clocks_rad) for n in WAVES for wave in (np.cos, np.sin)]
-    return rows[:, [FLATTENING]] * np.stack(waves, axis=1)
+def lobe_columns(rows: FloatArray, away_m: FloatArray, clocks_rad: FloatArray) -> FloatArray:
+    """Derivatives (n, 12) by cosine and sine of each wave across the shell, then by those along its radius.
+
+    ``away_m``: distance from the innermost ring.
+    """
+    across, along = (
+        np.stack([wave(n * clocks_rad) for n in waves for wave in (np.cos, np.sin)], axis=1)
+        for waves in (WAVES, ROUND_WAVES)
+    )
+    return np.hstack([rows[:, [FLATTENING]] * across, (away_m * rows[:, RADIUS])[:, None] * along])
 
 
 def feature_residuals(
@@ -91,7 +100,9 @@ def feature_residuals(
     sight = view.sight(points, deformation)
     residual = place[has] - np.einsum("ni,ni->n", sight.pixels, across)
     rows = np.einsum("ni,nik->nk", across, sight.jacobian)
-    shape = np.column_stack([lobe_columns(rows, lv_clock(points[:, 1:])), np.zeros((len(has), 3))])
+    shape = np.column_stack(
+        [lobe_columns(rows, view.from_ring_m(points), lv_clock(points[:, 1:])), np.zeros((len(has), 3))]
+    )
     return FrameResiduals(residual, rows, shape, sd[has], first_index + has)
 
 

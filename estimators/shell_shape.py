@@ -1,9 +1,9 @@
 """Did the shell rock as one body, or did it change its shape under load too?
 
 The seed paper read a rocking of its shell and could not say whether a local deformation was among it. A frame's fit
-(`estimators.camera_fit`) finds, beside the deflection ``w``, the shell's flattening and its lobes of two and of three
-waves round the shell, ``s`` (5), each with a wide a priori sd about zero. Half of the shell is in view: one frame tells
-lobes from rocking poorly. A film tells more, as a shape that yields to the load grows with the dynamic pressure ``q``::
+(`estimators.camera_fit`) finds, beside the deflection ``w``, the shell's flattening and its lobes of two to five waves
+round the shell, ``s`` (13), each with a wide a priori sd about zero. Half of the shell is in view: one frame tells lobes
+from rocking poorly. A film tells more, as a shape that yields to the load grows with the dynamic pressure ``q``::
 
     s_i = a l_i + f_i,    l_i = (q_i - q_b) / q_max,    f ~ Gauss-Markov with sd sigma
 
@@ -15,9 +15,9 @@ of its camera's pose and in the deflection ``d`` of the benchmark frame,
 
 with ``P_i`` the formal covariance of the shape; ``e`` is correlated in time as a camera's readings are
 (`LIGHT_TIME_S`). ``w`` is free in every frame: nothing is assumed of the deflection. All is Gaussian, and the evidence
-of the films decides between four hypotheses: rocking alone, with lobes of two waves, of three, of both; the shell may
-flatten in each. Rocking alone has a prior probability of one half, the others share the rest. ``sigma`` has three sizes
-of equal probability.
+of the films decides between rocking alone and lobes of two waves, of three, of more, and of each combination; the shell
+may flatten in each. Rocking alone has a prior probability of one half, the others share the rest. ``sigma`` has three
+sizes of equal probability.
 
 The amplitudes' posterior, a mixture over the hypotheses, is then the prior of every frame's shape, ``N(a l, sigma^2)``
 in place of the wide one about zero: the frame's answer is moved by the best gain on what it found of the shape beside
@@ -25,7 +25,8 @@ what it should have found, with the errors ``c``, ``d``, ``e`` of both. What is 
 to all frames and grows with the load (`FrameFit.by_shape`): a shape that follows the load must not pass for compliance
 of the joint.
 
-Assumed: shapes of more than three waves are in the residuals; the amplitudes' error is independent of the cameras'.
+Assumed: shapes of more than five waves, and of one torus alone, are in the residuals; the amplitudes' error is
+independent of the cameras'.
 
 References
 ----------
@@ -36,7 +37,7 @@ Seed paper, conclusions of the CAD-based estimate. D. J. C. MacKay, "Bayesian in
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import chain, combinations, product
 
 import numpy as np
 import pandas as pd
@@ -45,17 +46,17 @@ from scipy.linalg import cho_factor, cho_solve, sqrtm
 from estimators.camera import FilmFit
 from estimators.camera_fit import AprioriSd, FrameFit, OrientedCamera
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
-from flightmodel.checks import FloatArray, GateError
+from estimators.frame_residuals import ROUND_WAVES, WAVES
+from flightmodel.checks import BoolArray, FloatArray, GateError
 
-MODES = ("flattening", "two waves, cosine", "two waves, sine", "three waves, cosine", "three waves, sine")
-HYPOTHESES = {
-    "rocking alone": (0,),
-    "lobes of two waves": (0, 1, 2),
-    "lobes of three waves": (0, 3, 4),
-    "lobes of two and of three waves": (0, 1, 2, 3, 4),
-}
-_ALONE = "rocking alone"
-_PRIOR = {name: 0.5 if name == _ALONE else 0.5 / (len(HYPOTHESES) - 1) for name in HYPOTHESES}
+_PARTS = [(w, f"{w} waves across the shell") for w in WAVES] + [(w, f"{w} waves of its radius") for w in ROUND_WAVES]
+MODES = ("flattening", *(f"{what}, {wave}" for _, what in _PARTS for wave in ("cosine", "sine")))
+"""Flattening and lobes, in the order of `estimators.frame_residuals.lobe_columns`."""
+_WAVES_OF_MODE = np.array([0, *(w for w, _ in _PARTS for _ in range(2))])
+LOBES = {"two waves": (2,), "three waves": (3,), "more waves": (4, 5)}
+HYPOTHESES = tuple(chain.from_iterable(combinations(LOBES, k) for k in range(len(LOBES) + 1)))
+"""Lobes that there are; the first: rocking alone."""
+_PRIOR = np.array([0.5, *[0.5 / (len(HYPOTHESES) - 1)] * (len(HYPOTHESES) - 1)])
 _FRAME_SDS_RAD = np.deg2rad([0.01, 0.03, 0.1])
 CALLED = 0.9  # probability from which an answer is called
 _DETERMINED = 0.5  # of the a priori sd
@@ -91,16 +92,16 @@ class ShellShape:
 
     Parameters
     ----------
-    amplitude_rad : (5,) float
-        Of `MODES` at the largest dynamic pressure, over all hypotheses.
-    covariance : (5, 5) float
-    if_any_rad, if_any_sd_rad : (5,) float
-        With lobes of two and of three waves.
-    probability : dict of float
-        Of each of `HYPOTHESES`.
+    amplitude_rad : (13,) float
+        Of `MODES` at the largest dynamic pressure, angles about the innermost ring, over all hypotheses.
+    covariance : (13, 13) float
+    if_any_rad, if_any_sd_rad : (13,) float
+        With all lobes.
+    probability : (8,) float
+        Of `HYPOTHESES`.
     frame_sd_rad : float
         Of a frame's own shape.
-    determined : (5,) bool
+    determined : (13,) bool
         Whether the films determined an amplitude better than half its a priori sd.
     largest_pa : float
         Largest dynamic pressure of the films.
@@ -110,35 +111,45 @@ class ShellShape:
     covariance: FloatArray
     if_any_rad: FloatArray
     if_any_sd_rad: FloatArray
-    probability: dict[str, float]
+    probability: FloatArray
     frame_sd_rad: float
-    determined: tuple[bool, ...]
+    determined: BoolArray
     largest_pa: float
 
     @property
-    def lobes_probability(self) -> float:
-        """Probability that the shell has lobes under load."""
-        return 1.0 - self.probability[_ALONE]
+    def rocking_alone(self) -> float:
+        """Probability that the shell has no lobes under load."""
+        return float(self.probability[0])
+
+    @property
+    def lobes(self) -> dict[str, float]:
+        """Probability of lobes of each number of waves."""
+        return {
+            name: float(sum(p for p, there in zip(self.probability, HYPOTHESES, strict=True) if name in there))
+            for name in LOBES
+        }
 
     @property
     def call(self) -> str:
-        """The likeliest hypothesis where it, or that there are lobes at all, is beyond doubt; else ``undecided``."""
-        if self.lobes_probability <= 1.0 - CALLED:
-            return _ALONE
-        if self.lobes_probability < CALLED:
+        """``rocking alone``, or the lobes, where beyond doubt (`CALLED`); else ``undecided``."""
+        if self.rocking_alone >= CALLED:
+            return "rocking alone"
+        if self.rocking_alone > 1.0 - CALLED:
             return "undecided"
-        name, probability = max(self.probability.items(), key=lambda item: item[1])
-        return name if probability >= CALLED else "lobes"
+        sure = [name for name, probability in self.lobes.items() if probability >= CALLED]
+        return f"lobes of {' and '.join(sure)}" if sure else "lobes"
 
     @property
     def remark(self) -> str:
         """One sentence."""
-        alone = 100.0 * self.probability[_ALONE]
-        told = [mode for mode, yes in zip(MODES, self.determined, strict=True) if yes]
-        size = np.rad2deg([np.hypot(*self.if_any_rad[k : k + 2]) for k in (1, 3)])
-        words = f"rocking alone has {alone:.1f} %, {self.call}" if self.call != _ALONE else f"{_ALONE} ({alone:.1f} %)"
-        found = f"lobes at the largest load of {size[0]:.2f} deg (two waves) and {size[1]:.2f} deg (three)"
-        return f"{words}; {found} if there are any; the films determined {', '.join(told) or 'no shape'}"
+        sizes = []
+        for name, waves in LOBES.items():
+            here = np.isin(_WAVES_OF_MODE, waves)
+            size = np.rad2deg(np.sqrt(np.sum(self.if_any_rad[here] ** 2)))
+            sizes.append(f"{name} {size:.2f} deg ({100.0 * self.lobes[name]:.0f} %)")
+        there = f"{100.0 * self.rocking_alone:.0f} % that the shell rocks without lobes"
+        words = f"{self.call} ({there}); lobes at the largest load, if there are any: {', '.join(sizes)}"
+        return f"{words}; the films determined {int(self.determined.sum())} of {len(MODES)} modes"
 
     def to_frame(self) -> pd.DataFrame:
         """One row a mode.
@@ -146,16 +157,17 @@ class ShellShape:
         Returns
         -------
         DataFrame
-            ``mode, amplitude_deg, sd_deg`` (over all hypotheses, at the largest dynamic pressure), ``if_any_deg,
-            if_any_sd_deg`` (with all lobes), ``probability`` (that the mode is there), ``determined``.
+            ``mode, amplitude_deg, sd_deg`` (over all hypotheses, at the largest dynamic pressure, angles about the
+            innermost ring), ``if_any_deg, if_any_sd_deg`` (with all lobes), ``probability`` (that the mode is there),
+            ``determined``.
         """
-        there = [sum(p for name, p in self.probability.items() if k in HYPOTHESES[name]) for k in range(len(MODES))]
+        found = [1.0, *(p for w in _WAVES_OF_MODE[1:] for name, p in self.lobes.items() if w in LOBES[name])]
         degrees = {
             "amplitude_deg": self.amplitude_rad, "sd_deg": np.sqrt(np.diag(self.covariance)),
             "if_any_deg": self.if_any_rad, "if_any_sd_deg": self.if_any_sd_rad,
         }  # fmt: skip
         columns = {name: np.rad2deg(value) for name, value in degrees.items()}
-        return pd.DataFrame({"mode": MODES, **columns, "probability": there, "determined": self.determined})
+        return pd.DataFrame({"mode": MODES, **columns, "probability": found, "determined": self.determined})
 
 
 def shell_shape(films: list[LoadedFilm]) -> ShellShape:
@@ -191,19 +203,19 @@ def shell_shape(films: list[LoadedFilm]) -> ShellShape:
         log = -0.5 * float(found @ solved[:, -1]) - float(np.log(np.diag(factor[0])).sum())
         told.append((log, respond.T @ solved[:, :-1], respond.T @ solved[:, -1]))
     answers = [
-        _Amplitudes.given(name, size, prior, *one)
-        for (size, one), name in product(zip(_FRAME_SDS_RAD, told, strict=True), HYPOTHESES)
+        _Amplitudes.given(number, size, prior, *one)
+        for (size, one), number in product(zip(_FRAME_SDS_RAD, told, strict=True), range(len(HYPOTHESES)))
     ]
     return _mixed(answers, prior, largest)
 
 
 def mode_sd_rad(apriori: AprioriSd) -> FloatArray:
-    """A priori sd of `MODES`, (5,)."""
-    return np.array([apriori.flattening_rad, *[apriori.lobes_rad] * 4])
+    """A priori sd of `MODES`, (13,)."""
+    return np.array([apriori.flattening_rad, *[apriori.lobes_rad] * (len(MODES) - 1)])
 
 
 def _stacked(films: list[LoadedFilm], loads: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Shapes found (5 n,), response to amplitudes (5 n, 5), covariance without and of unit own shapes (5 n, 5 n)."""
+    """Shapes found (k n,), response to amplitudes (k n, k), covariance without and of unit own shapes (k n, k n)."""
     found, through, own, at_s = [], [], [], []
     for one in films:
         fits = [one.film.fits[k].shape for k in one.rows]
@@ -223,8 +235,8 @@ def _stacked(films: list[LoadedFilm], loads: FloatArray) -> tuple[FloatArray, Fl
         at_s.append(time_s)
     shares, times = np.concatenate(through), np.concatenate(at_s)
     apart = np.abs(times[:, None] - times[None, :])
-    n = 5 * len(times)
-    respond = (shares * loads[:, None, None]).reshape(n, 5)
+    n = len(MODES) * len(times)
+    respond = (shares * loads[:, None, None]).reshape(n, len(MODES))
     covariance, first = _JITTER_RAD2 * np.eye(n), 0
     for block in own:
         here = slice(first, first + len(block))
@@ -243,7 +255,7 @@ def _pairs(root: FloatArray, together: FloatArray) -> FloatArray:
 class _Amplitudes:
     """Posterior of the amplitudes under a hypothesis and a size of the frames' own shapes."""
 
-    name: str
+    number: int
     size_rad: float
     mean: FloatArray
     covariance: FloatArray
@@ -251,34 +263,32 @@ class _Amplitudes:
 
     @staticmethod
     def given(
-        name: str, size_rad: float, prior_sd: FloatArray, log: float, information: FloatArray, right: FloatArray
+        number: int, size_rad: float, prior_sd: FloatArray, log: float, information: FloatArray, right: FloatArray
     ) -> _Amplitudes:
-        """Of the information (5, 5) and its mean's product (5,) that the films have on all modes."""
-        there = list(HYPOTHESES[name])
+        """Of the information (k, k) and its mean's product (k,) that the films have on all modes."""
+        waves = [w for name in HYPOTHESES[number] for w in LOBES[name]]
+        there = np.flatnonzero(np.isin(_WAVES_OF_MODE, [0, *waves]))
         within = np.linalg.inv(information[np.ix_(there, there)] + np.diag(prior_sd[there] ** -2.0))
         mean, covariance = np.zeros(len(prior_sd)), np.zeros((len(prior_sd), len(prior_sd)))
         mean[there] = within @ right[there]
         covariance[np.ix_(there, there)] = within
         gained = 0.5 * float(right[there] @ mean[there]) + 0.5 * float(np.linalg.slogdet(within)[1])
-        return _Amplitudes(name, size_rad, mean, covariance, log + gained - float(np.log(prior_sd[there]).sum()))
+        return _Amplitudes(number, size_rad, mean, covariance, log + gained - float(np.log(prior_sd[there]).sum()))
 
 
 def _mixed(answers: list[_Amplitudes], prior_sd: FloatArray, largest_pa: float) -> ShellShape:
     """Mean and covariance over hypotheses and sizes."""
-    log = np.array([one.log_evidence + np.log(_PRIOR[one.name]) for one in answers])
+    log = np.array([one.log_evidence + np.log(_PRIOR[one.number]) for one in answers])
     weight = np.exp(log - log.max())
     weight /= weight.sum()
     mean, covariance = _moments(weight, answers)
-    every = np.array([len(HYPOTHESES[one.name]) == len(MODES) for one in answers])
-    with_all = weight * every
+    number = np.array([one.number for one in answers])
+    with_all = weight * (number == len(HYPOTHESES) - 1)
     if_any, if_any_cov = _moments(with_all / max(with_all.sum(), 1e-300), answers)
     sd = np.sqrt(np.diag(if_any_cov))
-    odds = {
-        name: float(sum(w for w, one in zip(weight, answers, strict=True) if one.name == name)) for name in HYPOTHESES
-    }
     size = float(np.sqrt(weight @ np.array([one.size_rad for one in answers]) ** 2))
-    determined = tuple(bool(x) for x in sd < _DETERMINED * prior_sd)
-    return ShellShape(mean, covariance, if_any, sd, odds, size, determined, largest_pa)
+    probability = np.bincount(number, weight, len(HYPOTHESES))
+    return ShellShape(mean, covariance, if_any, sd, probability, size, sd < _DETERMINED * prior_sd, largest_pa)
 
 
 def _moments(weight: FloatArray, answers: list[_Amplitudes]) -> tuple[FloatArray, FloatArray]:

@@ -41,7 +41,7 @@ _OUTER_PX, _INNER_PX = 75.0, 45.0
 WIDEST_RAD, _MARGIN_RAD = float(np.deg2rad(5.0)), float(np.deg2rad(0.5))
 _DEEPEST_SPLIT = 20
 
-DEFLECTION, FLATTENING, CAMERA, HELD = slice(0, 2), 2, slice(3, 11), slice(11, 16)
+DEFLECTION, FLATTENING, CAMERA, HELD, RADIUS = slice(0, 2), 2, slice(3, 11), slice(11, 16), 14
 """Columns of a derivative: the shell's rotation vector about body y and z (px/rad) and its flattening (px/rad); the
 scene's rotation in camera axes (3, px/rad), focal scale, principal point (2), k1, k2 (px); camera position in body axes
 (3), shell radius and joint station (px/m)."""
@@ -127,6 +127,18 @@ class VirtualCamera:
         """Station, radius and minor radius of the outermost torus; station and radius of the innermost, m."""
         station, radius = (part.tolist() for part in torus_circles(self.geometry))
         return (station[-1], radius[-1], self.geometry.torus_minor_radius_m), (station[0], radius[0])
+
+    @property
+    def width_m(self) -> float:
+        """Distance of the outermost torus from the innermost, m."""
+        (station, radius, _), ring = self._circles
+        return float(np.hypot(station - ring[0], radius - ring[1]))
+
+    def from_ring_m(self, points_shell_m: FloatArray) -> FloatArray:
+        """Distance (n,) of points of the undeflected shell from the innermost torus's centre line, m."""
+        station, radius = self._circles[1]
+        outwards = np.hypot(*points_shell_m[:, 1:].T) - radius
+        return np.asarray(np.hypot(-points_shell_m[:, 0] - station, outwards))
 
     def _rotation(self, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation matrix (3, 3) of a deformation, and the y and z columns (3, 2) of its left Jacobian."""

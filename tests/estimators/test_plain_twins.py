@@ -321,7 +321,7 @@ def fitted(view, edge, marks, prior, start):
     return bending, out
 
 
-PRIOR = np.array([0.004, 0.05, *[0.002] * 4, 0.3, 0.3, 0.3])
+PRIOR = np.array([0.004, 0.05, *[0.002] * 12, 0.3, 0.3, 0.3])
 
 
 def test_exact_points_give_their_deformation_back_whatever_the_benchmark_s_residuals():
@@ -355,7 +355,7 @@ def test_the_fit_is_the_most_probable_one():
         left = np.concatenate(rows) - out[1][:, 15] * shape[0] - out[2] @ shape[1:]
         return np.concatenate([np.sqrt(weight) * left, bending[2:] / PRIOR[0], shape / PRIOR[1:]])
 
-    best = least_squares(residuals, np.concatenate([got, np.zeros(8)]), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    best = least_squares(residuals, np.concatenate([got, np.zeros(16)]), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
     assert abs(best[2] - true[2]) > 1e-5  # the priors pull
     np.testing.assert_allclose(got, best[:3], atol=2e-6)
 

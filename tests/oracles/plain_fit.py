@@ -20,11 +20,11 @@ def plain_fit(oriented, horizon, place, start):
         [
             apriori.flattening_rad,
             apriori.joint_station_m,
-            *[apriori.lobes_rad] * 4,
+            *[apriori.lobes_rad] * 12,
             *[np.sqrt(2.0) * apriori.edge_px] * 3,
         ]
     )
-    form = np.zeros(8)
+    form = np.zeros(16)
     for _ in range(STEPS):
         residuals = edge_residuals(oriented.view, horizon, deformation)
         if place is not None:
