@@ -2,8 +2,8 @@
 
 The seed paper read a rocking of its shell and could not say whether a local deformation was among it. A frame's fit
 (`estimators.camera_fit`) finds, beside the deflection ``w``, the shell's flattening and its lobes of two to five waves
-round the shell, ``s`` (13), each with a wide a priori sd about zero. Half of the shell is in view: one frame tells lobes
-from rocking poorly. A film tells more, as a shape that yields to the load grows with the dynamic pressure ``q``::
+round the shell, ``s`` (13), each with a wide a priori sd about zero. Half of the shell is in view: one frame tells
+lobes from rocking poorly. A film tells more, as a shape that yields to the load grows with the dynamic pressure ``q``::
 
     s_i = a l_i + f_i,    l_i = (q_i - q_b) / q_max,    f ~ Gauss-Markov with sd sigma
 
@@ -19,11 +19,10 @@ of the films decides between rocking alone and lobes of two waves, of three, of 
 may flatten in each. Rocking alone has a prior probability of one half, the others share the rest. ``sigma`` has three
 sizes of equal probability.
 
-The amplitudes' posterior, a mixture over the hypotheses, is then the prior of every frame's shape, ``N(a l, sigma^2)``
-in place of the wide one about zero: the frame's answer is moved by the best gain on what it found of the shape beside
-what it should have found, with the errors ``c``, ``d``, ``e`` of both. What is left of the amplitudes' error is common
-to all frames and grows with the load (`FrameFit.by_shape`): a shape that follows the load must not pass for compliance
-of the joint.
+The amplitudes' posterior, a mixture over the hypotheses, is then the prior of every frame's shape: in the frame's own
+posterior of ``(w, s)`` the wide prior about zero is replaced by ``N(a l, sigma^2)``. What is left of the amplitudes'
+error is common to all frames and grows with the load (`FrameFit.by_shape`): a shape that follows the load must not pass
+for compliance of the joint.
 
 Assumed: shapes of more than five waves, and of one torus alone, are in the residuals; the amplitudes' error is
 independent of the cameras'.
@@ -310,24 +309,19 @@ def with_shape(one: LoadedFilm, shape: ShellShape) -> FilmFit:
 
 
 def _given_shape(fit: FrameFit, load: float, shape: ShellShape, oriented: OrientedCamera) -> FrameFit:
-    """Best linear unbiased answer of a frame whose shape is ``N(a l, sigma^2)``."""
+    """A frame's answer with ``N(a l, sigma^2)`` in place of its shape's a priori distribution."""
     assert fit.shape is not None
-    own, apriori = fit.shape, oriented.apriori
-    mean, spread = load * shape.amplitude_rad, shape.frame_sd_rad**2
-    across = own.formal[:2, 2:] * mode_sd_rad(apriori) ** -2.0
-    share = _share_told(own.formal[2:, 2:], apriori)
-    noise = own.formal - own.formal[:, 2:] * mode_sd_rad(apriori) ** -2.0 @ own.formal[2:]
-    pose, start = own.by_camera @ oriented.posed_covariance, own.by_benchmark * apriori.benchmark_rad**2
-    read = noise + pose @ own.by_camera.T + start @ own.by_benchmark.T
-    crossed = read[:2, 2:] - spread * across @ share.T
-    innovation = read[2:, 2:] + spread * share @ share.T + _JITTER_RAD2 * np.eye(len(mean))
-    gain = crossed @ np.linalg.inv(innovation)
-    by_mean = across + gain @ share
-    answer = own.found_rad[:2] + by_mean @ mean - gain @ own.found_rad[2:]
-    both = np.hstack([np.eye(2), -gain])
-    by_camera, by_benchmark, by_shape = both @ own.by_camera, both @ own.by_benchmark, load * by_mean
-    formal = both @ noise @ both.T + spread * by_mean @ by_mean.T
-    covariance = oriented.covariance_of(formal, by_camera, by_benchmark) + by_shape @ shape.covariance @ by_shape.T
+    own, modes = fit.shape, slice(2, None)
+    information = np.linalg.inv(own.formal)
+    told = information.copy()
+    told[modes, modes] += np.diag(shape.frame_sd_rad**-2.0 - mode_sd_rad(oriented.apriori) ** -2.0)
+    formal = np.linalg.inv(told)[:2]
+    by_shape = formal[:, modes] * (load / shape.frame_sd_rad**2)
+    again = formal @ information
+    answer = again @ own.found_rad + by_shape @ shape.amplitude_rad
+    by_camera, by_benchmark = again @ own.by_camera, again @ own.by_benchmark
+    covariance = oriented.covariance_of(formal[:, :2], by_camera, by_benchmark)
+    covariance = covariance + by_shape @ shape.covariance @ by_shape.T
     return replace(fit, rotation_yz_rad=answer, covariance=covariance, per_benchmark=by_benchmark, by_shape=by_shape)
 
 
