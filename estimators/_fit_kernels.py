@@ -209,8 +209,8 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
                 return TOO_FEW, taken
             _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at)
         _feature_residuals(
-            spots, across, place, feature_offset, ring, terms, lens, outlier, m, spot_pixels, spot_jacobian, residual, rows,
-            shape,
+            spots, across, place, feature_offset, ring, terms, lens, outlier, m, spot_pixels, spot_jacobian, residual,
+            rows, shape,
         )  # fmt: skip
         _without_shape(residual, rows, shape, form, left)
         edges = huber_weights(m, p, edge_sd, feature_sd, huber, left, scaled, weight)

@@ -357,6 +357,7 @@ class OrientedCamera:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
                 # the seed paper's way uses the edge alone
                 basis = plane_axis[:, None]
+                horizon = frame.near_edge(self.view.lines_at(self.clocks_rad, deformation))
                 deformation[:] = *(basis[:, 0] * (basis[:, 0] @ deformation[:2])), 0.0
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except _NoFitError as refusal:

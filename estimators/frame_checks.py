@@ -72,8 +72,8 @@ def fault_of_fit(design: Design, rms_px: float, flattening_rad: float, shape_sd:
     shape = np.array([flattening_rad, *(formal @ weighted @ design.residual_px)[3:]]) / shape_sd
     if shape @ shape > WORST_SHAPE:
         words = (
-            f"shape and light would have to be {np.sqrt(shape @ shape / len(shape)):.1f} sd (rms of seventeen) from the "
-            f"benchmark frame's, where {np.sqrt(WORST_SHAPE / len(shape)):.1f} are allowed"
+            f"shape and light would have to be {np.sqrt(shape @ shape / len(shape)):.1f} sd (rms of {len(shape)}) from "
+            f"the benchmark frame's, where {np.sqrt(WORST_SHAPE / len(shape)):.1f} are allowed"
         )
         return Fault(words, "edge-not-shell")
     crossed = turned @ both @ formal

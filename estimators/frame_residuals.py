@@ -1,9 +1,9 @@
 """How far are the edge points and features found in a frame from where a deformed shell would show them?
 
 Residuals are found minus predicted, with the prediction's derivatives by all that is fitted: the deformation, the
-camera, the shell's lobes and the light at its edge. Lobes are a flattening that varies round the shell (with two waves it
-becomes a saddle), or a growth outwards that does (with two waves its rings become oval), in proportion to the distance
-from the innermost ring: the unit of both is an angle about that.
+camera, the shell's lobes and the light at its edge. Lobes are a flattening that varies round the shell (with two waves
+it becomes a saddle), or a growth outwards that does (with two waves its rings become oval), in proportion to the
+distance from the innermost ring: the unit of both is an angle about that.
 
 References
 ----------
