@@ -197,15 +197,15 @@ class _NoFitError(GateError):
 class _Solution:
     """Last step of one frame's fit: gain ``(k + 17, m)`` and formal covariance of deflection, shape and light.
 
-    ``shape_found`` (17,): flattening, joint station, lobes and light. ``before``: the benchmark's rows of the points
+    ``columns`` (m, k + 17): derivatives by these. ``shape_found`` (17,): flattening, joint station, lobes and light. ``before``: the benchmark's rows of the points
     used; ``edge_count`` of them are edge points and come first.
     """
 
     gain: FloatArray
     formal: FloatArray
     shape_found: FloatArray
+    columns: FloatArray
     rows: FloatArray
-    shape: FloatArray
     before: FloatArray
     edge_count: int
     rms_px: float
@@ -352,7 +352,7 @@ class OrientedCamera:
             last = self._reconciled(frame, horizon, place, deformation, last)
             contradicted = place is not None and last.edge_count == len(last.rows)
             if not horizon.is_by_hand:
-                self._check_explained(last, deformation[2])
+                self._check_explained(last)
             if plane_axis is not None:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
                 # the seed paper's way uses the edge alone
@@ -364,12 +364,11 @@ class OrientedCamera:
             return refused_fit(horizon, refusal.faults[0])
         return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
 
-    def _check_explained(self, last: _Solution, flattening_rad: float) -> None:
+    def _check_explained(self, last: _Solution) -> None:
         """Refuse a frame that no deflection explains, by `estimators.frame_checks`."""
-        rest = np.concatenate([last.rows[:, [FLATTENING, JOINT]], last.shape], axis=1)
-        design = Design(last.rows[:, DEFLECTION], rest, last.rows[:, TURN], last.residual_px, last.weight)
-        shape_sd = self._shape_prior(2)[1]
-        fault = fault_of_fit(design, last.rms_px, flattening_rad, shape_sd, self.apriori.higher_lobes_rad)
+        design = Design(last.columns, last.gain, last.rows[:, TURN], last.residual_px, last.weight)
+        shape = last.shape_found / self._shape_sd
+        fault = fault_of_fit(design, last.rms_px, shape, self.apriori.higher_lobes_rad)
         if fault:
             raise _NoFitError(fault)
 
@@ -693,7 +692,9 @@ class OrientedCamera:
         pull = np.concatenate([np.zeros(k), (mean - np.eye(len(sd))[0] * deformation[2]) / sd**2])
         shape_found = (formal @ (weighted @ residual + pull))[k:]
         shape_found[0] += deformation[2]
-        return _Solution(formal @ weighted, formal, shape_found, rows, shape, before, edge_count, rms, residual, weight)
+        return _Solution(
+            formal @ weighted, formal, shape_found, design, rows, before, edge_count, rms, residual, weight
+        )
 
     def _independent_edge(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> HorizonLine:
         """Edge that owes nothing to the features, ``deformation`` moved near it; `_NoFitError` where there is none.
@@ -716,8 +717,7 @@ class OrientedCamera:
     def _edge_step(self, both: _Solution, flattening_rad: float) -> tuple[FloatArray, _Solution]:
         """One step (2,) from an answer of edge and features to that of the edge alone, and its gain and covariance."""
         edge, (mean, sd) = slice(0, both.edge_count), self._prior_about(both)
-        rows, shape, weight = both.rows[edge], both.shape[edge], both.weight[edge]
-        design = np.concatenate([rows[:, DEFLECTION], rows[:, [FLATTENING, JOINT]], shape], axis=1)
+        design, weight = both.columns[edge], both.weight[edge]
         weighted = design.T * weight
         formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(2), sd**-2.0])))
         right = weighted @ both.residual_px[edge]
@@ -727,7 +727,8 @@ class OrientedCamera:
         left = both.residual_px[edge] - design @ step
         scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
         alone = replace(
-            both, gain=formal @ weighted, formal=min(scatter, 1.0) * formal, rows=rows, before=both.before[edge],
+            both, gain=formal @ weighted, formal=min(scatter, 1.0) * formal, rows=both.rows[edge],
+            before=both.before[edge],
         )  # fmt: skip
         return step[:2], alone
 
@@ -738,8 +739,7 @@ class OrientedCamera:
         features, shape, leak = len(last.rows) - last.edge_count, None, 0.0
         covariance = self.covariance_of(last.formal[:k, :k], by_camera[:k], by_benchmark[:k])
         if k == 1:
-            rest = np.concatenate([last.rows[:, [FLATTENING, JOINT]], last.shape], axis=1)
-            spread = last.gain[:1] @ rest * self._shape_sd
+            spread = last.gain[:1] @ last.columns[:, 1:] * self._shape_sd
             covariance = covariance + spread @ spread.T
             # a plane grows by +90 deg as its axis rotates from (y, z) to (-z, y)
             leak = float(last.gain[0] @ last.rows[:, DEFLECTION] @ np.array([-basis[1, 0], basis[0, 0]]))

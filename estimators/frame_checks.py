@@ -31,23 +31,23 @@ class Design:
 
     Parameters
     ----------
-    deflection : (n, 2) float
-        Derivatives by the two components, px/rad.
-    shape : (n, 17) float
-        By flattening, joint station, lobes (12) and light (3).
+    columns : (n, 19) float
+        Derivatives by deflection (2), flattening, joint station, lobes (12) and light (3).
+    gain : (19, n) float
+        The fit's, with the priors.
     turn : (n, 3) float
         By the scene's rotation in camera axes, px/rad.
     residual_px, weight : (n,) float
     """
 
-    deflection: FloatArray
-    shape: FloatArray
+    columns: FloatArray
+    gain: FloatArray
     turn: FloatArray
     residual_px: FloatArray
     weight: FloatArray
 
 
-def fault_of_fit(design: Design, rms_px: float, flattening_rad: float, shape_sd: FloatArray, lobes_rad: float) -> Fault:
+def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: float) -> Fault:
     """Why a deflection does not explain a frame, with its code; empty where it does.
 
     Parameters
@@ -55,30 +55,24 @@ def fault_of_fit(design: Design, rms_px: float, flattening_rad: float, shape_sd:
     design : Design
     rms_px : float
         Weighted.
-    flattening_rad : float
-        Of the shell, about which the fit ended.
-    shape_sd : (17,) float
-        A priori, of the columns of ``design.shape``.
+    shape : (17,) float
+        Flattening, joint station, lobes and light that the fit found, over their a priori sd.
     lobes_rad : float
         A priori sd of shapes that are not modelled.
     """
     if rms_px > USUAL_RMS_PX:
         words = f"rms {rms_px:.1f} px where {USUAL_RMS_PX:.1f} px are allowed"
         return Fault(f"no deflection explains edge and features: {words}", "edge-not-shell")
-    both = np.concatenate([design.deflection, design.shape], axis=1)
-    weighted, turned = both.T * design.weight, design.turn.T * design.weight
-    formal = np.linalg.inv(weighted @ both + np.diag(np.concatenate([np.zeros(2), shape_sd**-2])))
-    # the flattening's value was carried from step to step, the others are counted from zero in each
-    shape = np.array([flattening_rad, *(formal @ weighted @ design.residual_px)[3:]]) / shape_sd
     if shape @ shape > WORST_SHAPE:
         words = (
             f"shape and light would have to be {np.sqrt(shape @ shape / len(shape)):.1f} sd (rms of {len(shape)}) from "
             f"the benchmark frame's, where {np.sqrt(WORST_SHAPE / len(shape)):.1f} are allowed"
         )
         return Fault(words, "edge-not-shell")
-    crossed = turned @ both @ formal
-    covariance = np.linalg.inv(turned @ design.turn - crossed @ weighted @ design.turn)
-    turn = covariance @ (turned - crossed @ weighted) @ design.residual_px
+    turned = design.turn.T * design.weight
+    crossed = turned @ design.columns @ design.gain
+    covariance = np.linalg.inv(turned @ design.turn - crossed @ design.turn)
+    turn = covariance @ (turned - crossed) @ design.residual_px
     if turn @ np.linalg.solve(covariance + lobes_rad**2 * np.eye(3), turn) > _WORST_TURN:
         words = (
             f"the camera seems turned by {np.rad2deg(np.linalg.norm(turn)):.1f} deg in its mount since the benchmark "

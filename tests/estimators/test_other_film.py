@@ -72,7 +72,7 @@ def test_where_features_contradict_the_edge_it_counts_if_it_is_whole():
     oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
     answer = oriented.fit(frames[1])
     true = np.array([*answer.rotation_yz_rad, 0.0])
-    for off_deg, contradicts in ((0.0, False), (0.8, True), (3.0, True)):
+    for off_deg, contradicts in ((0.0, False), (1.0, True), (3.0, True)):
         said = true + deformation_of(D(off_deg), D(153.0))
         points = oriented.features.points_shell_m
         where = np.einsum("ni,ni->n", oriented.view.sight(points, said).pixels, oriented.features.across_px)
