@@ -52,6 +52,8 @@ from estimators.frame_checks import USUAL_RMS_PX, WORST_SHAPE, Design, fault_of_
 from estimators.frame_edits import LEAST_MARKS, EditedFrame, MarkedFeatures, unedited
 from estimators.frame_residuals import (
     HUBER,
+    ROUND_WAVES,
+    WAVES,
     FrameResiduals,
     edge_residuals,
     light_columns,
@@ -85,6 +87,7 @@ USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
 JOINT = HELD.stop - 1
 POSED = slice(CAMERA.start, JOINT)
 TURN = slice(CAMERA.start, CAMERA.start + 3)
+_SOFT_WAVES = 3  # a ring's stiffness grows as (n^2 - 1)^2: 9, 64, 225, 576
 LOBES = slice(2, 2 + _fit_kernels.LOBES)
 """Among flattening, joint station, lobes and light."""
 SHAPE = np.array([2, *range(4, 4 + _fit_kernels.LOBES)])
@@ -103,10 +106,11 @@ class AprioriSd:
         Deflection of the benchmark frame, each lateral axis. Statically ``(z0/x) u/(1-u)``, 0.06 deg for the reference
         vehicle at 421 s, and the joint's oscillation about it.
     flattening_rad, lobes_rad : float
-        Flattening (the shell opens like an umbrella) and each lobe's cosine and sine between benchmark and frame, as
-        angles about the innermost ring. The local deformation of the seed paper's shell was not measured.
+        Flattening (the shell opens like an umbrella), and cosine and sine of lobes of two and three waves, between
+        benchmark and frame, as angles about the innermost ring. The local deformation of the seed paper's shell was
+        not measured.
     higher_lobes_rad : float
-        Lobes of more waves, which are not modelled.
+        Lobes of more waves, against which a ring is much stiffer; of more than five they are not modelled.
     edge_px : float
         Shift of the found edge against the true one, different from frame to frame with the light; as much for a
         tilt and for a bow of the edge across the picture (at the picture's sides).
@@ -118,6 +122,13 @@ class AprioriSd:
     flattening_rad: float = float(np.deg2rad(0.25))
     lobes_rad: float = float(np.deg2rad(0.2))
     higher_lobes_rad: float = float(np.deg2rad(0.1))
+
+    @property
+    def lobe_sd_rad(self) -> FloatArray:
+        """Of each modelled lobe (12,), in the order of `estimators.frame_residuals.lobe_columns`."""
+        waves = np.repeat([*WAVES, *ROUND_WAVES], 2)
+        return np.where(waves <= _SOFT_WAVES, self.lobes_rad, self.higher_lobes_rad)
+
     edge_px: float = 0.2
 
 
@@ -197,8 +208,8 @@ class _NoFitError(GateError):
 class _Solution:
     """Last step of one frame's fit: gain ``(k + 17, m)`` and formal covariance of deflection, shape and light.
 
-    ``columns`` (m, k + 17): derivatives by these. ``shape_found`` (17,): flattening, joint station, lobes and light. ``before``: the benchmark's rows of the points
-    used; ``edge_count`` of them are edge points and come first.
+    ``columns`` (m, k + 17): derivatives by these. ``shape_found`` (17,): flattening, joint station, lobes and light.
+    ``before``: the benchmark's rows of the points used; ``edge_count`` of them are edge points and come first.
     """
 
     gain: FloatArray
@@ -609,9 +620,7 @@ class OrientedCamera:
         """A priori sd of flattening, joint station, lobes (12) and light (3) of a frame against the benchmark."""
         apriori = self.apriori
         light = [np.sqrt(2.0) * apriori.edge_px] * 3
-        return np.array(
-            [apriori.flattening_rad, apriori.joint_station_m, *[apriori.lobes_rad] * _fit_kernels.LOBES, *light]
-        )
+        return np.array([apriori.flattening_rad, apriori.joint_station_m, *apriori.lobe_sd_rad, *light])
 
     def _shape_prior(self, k: int) -> tuple[FloatArray, FloatArray]:
         """Prior mean and sd of the shape, which must not absorb what an assumed plane (k = 1) cannot explain."""

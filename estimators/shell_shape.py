@@ -210,7 +210,7 @@ def shell_shape(films: list[LoadedFilm]) -> ShellShape:
 
 def mode_sd_rad(apriori: AprioriSd) -> FloatArray:
     """A priori sd of `MODES`, (13,)."""
-    return np.array([apriori.flattening_rad, *[apriori.lobes_rad] * (len(MODES) - 1)])
+    return np.array([apriori.flattening_rad, *apriori.lobe_sd_rad])
 
 
 def _stacked(films: list[LoadedFilm], loads: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -286,7 +286,7 @@ def _mixed(answers: list[_Amplitudes], prior_sd: FloatArray, largest_pa: float) 
     if_any, if_any_cov = _moments(with_all / max(with_all.sum(), 1e-300), answers)
     sd = np.sqrt(np.diag(if_any_cov))
     size = float(np.sqrt(weight @ np.array([one.size_rad for one in answers]) ** 2))
-    probability = np.bincount(number, weight, len(HYPOTHESES))
+    probability = np.bincount(number, weight, len(HYPOTHESES)).astype(float)
     return ShellShape(mean, covariance, if_any, sd, probability, size, sd < _DETERMINED * prior_sd, largest_pa)
 
 

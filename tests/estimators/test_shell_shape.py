@@ -48,7 +48,7 @@ def drawn(rng, there, formal_deg=0.05):
     told = points.copy()
     told[2:, 2:] += np.diag(prior**-2.0)
     formal = np.linalg.inv(told)
-    by_camera = rng.standard_normal((n, m, 12)) * D(0.03) * np.linspace(0.2, 1.0, n)[:, None, None]
+    by_camera = rng.standard_normal((n, m, 12)) * D(0.01) * np.linspace(0.2, 1.0, n)[:, None, None]
     by_benchmark = np.tile(np.eye(m)[:, :2], (n, 1, 1)) + 0.1 * rng.standard_normal((n, m, 2))
     load = (PRESSURE_PA - PRESSURE_PA[0]) / PRESSURE_PA.max()
     waves = [mode.split()[0] for mode in MODES]
@@ -117,7 +117,7 @@ def test_a_film_that_knows_its_shell_reads_the_deflection_better_and_says_so(man
         errors.append(fit.rotation_yz_rad - true[k, :2])
         before.append(first.rotation_yz_rad - true[k, :2])
         square.append(errors[-1] @ np.linalg.solve(fit.covariance, errors[-1]))
-    assert np.std(errors) < np.std(before)
+    assert np.std(errors) < 0.9 * np.std(before)
     assert abs(np.mean(square) - 2.0) < 3.3 * np.sqrt(4.0 / len(square))
 
 

@@ -20,7 +20,7 @@ def plain_fit(oriented, horizon, place, start):
         [
             apriori.flattening_rad,
             apriori.joint_station_m,
-            *[apriori.lobes_rad] * 12,
+            *apriori.lobe_sd_rad,
             *[np.sqrt(2.0) * apriori.edge_px] * 3,
         ]
     )
