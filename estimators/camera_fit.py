@@ -736,7 +736,7 @@ class OrientedCamera:
         left = both.residual_px[edge] - design @ step
         scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
         alone = replace(
-            both, gain=formal @ weighted, formal=min(scatter, 1.0) * formal, rows=both.rows[edge],
+            both, gain=formal @ weighted, formal=np.asarray(min(scatter, 1.0) * formal), rows=both.rows[edge],
             before=both.before[edge],
         )  # fmt: skip
         return step[:2], alone

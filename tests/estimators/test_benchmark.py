@@ -6,7 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, benchmark_deflection, joint_moment
+from estimators.benchmark import (
+    BenchmarkDeflection,
+    RelativeDeflections,
+    _camera_covariance,
+    benchmark_deflection,
+    joint_moment,
+)
 from estimators.camera import read_film
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from flightmodel.checks import GateError
@@ -181,3 +187,32 @@ def test_an_assumed_plane_has_no_relative_deflections():
     with pytest.raises(GateError) as refusal:
         read.relative_to_benchmark()
     assert refusal.value.codes == ("plane-assumed",)
+
+
+def test_a_shape_that_follows_the_load_does_not_pass_for_compliance():
+    """A reading's error that grows with the pressure, in any direction: stated as common it leaves less of it."""
+    rng, stated, hidden = np.random.default_rng(9), [], []
+    pressure = -np.interp(FRAMES_S, TIME_S, PULSE.specific_force_body_mps2[:, 0])
+    load = (pressure - pressure[0]) / pressure.max()
+    by_shape = D(0.3) * load[:, None, None] * np.eye(2)
+    for _ in range(25):
+        frames, true = drawn(rng)
+        read = frames.theta_yz_rad + by_shape @ rng.standard_normal(2)
+        whole = frames.covariance + by_shape @ by_shape.transpose(0, 2, 1)
+        spoilt = replace(frames, theta_yz_rad=read, covariance=whole)
+        for told, rows in ((replace(spoilt, by_shape=by_shape), stated), (spoilt, hidden)):
+            got = benchmark_deflection(told, PULSE, PRIOR_RAD)
+            rows.append(got.theta_yz_rad - true[0])
+    assert np.mean(np.square(stated)) < np.mean(np.square(hidden))
+
+
+def test_the_shape_s_error_is_common_to_all_frames_and_the_rest_is_the_camera_s_own():
+    frames, _ = drawn(np.random.default_rng(3))
+    by_shape = D(0.1) * np.random.default_rng(4).standard_normal((len(FRAMES_S), 2, 3))
+    square = by_shape @ by_shape.transpose(0, 2, 1)
+    with_shape = replace(frames, by_shape=by_shape, covariance=frames.covariance + square)
+    rows = np.arange(len(FRAMES_S))
+    blocks = _camera_covariance(with_shape, rows, rows).reshape(len(rows), 2, len(rows), 2)
+    alone = _camera_covariance(frames, rows, rows).reshape(len(rows), 2, len(rows), 2)
+    for i, j in ((0, 0), (3, 20), (20, 3)):
+        np.testing.assert_allclose(blocks[i, :, j], alone[i, :, j] + by_shape[i] @ by_shape[j].T, atol=1e-12)
