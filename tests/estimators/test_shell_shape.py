@@ -111,7 +111,6 @@ def test_amplitudes_err_as_they_say(many):
 
 def test_a_film_that_knows_its_shell_reads_the_deflection_better_and_says_so(many):
     errors, before, square = [], [], []
-    still = AprioriSd().benchmark_rad ** 2  # the benchmark's own deflection is in both
     for *_, true, film, better in many:
         k = int(np.argmax(PRESSURE_PA))
         fit, first = better.fits[k], film.film.fits[k]
