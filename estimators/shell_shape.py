@@ -139,6 +139,15 @@ class ShellShape:
         return f"lobes of {' and '.join(sure)}" if sure else "lobes"
 
     @property
+    def verdict(self) -> str:
+        """The call and its probability, for the end of a sentence."""
+        return f"{self.call} ({100.0 * self.rocking_alone:.0f} % that the shell rocks without lobes)"
+
+    def summary(self) -> dict[str, object]:
+        """The call and the probabilities, for ``summary.json``."""
+        return {"call": self.call, "rocking_alone": self.rocking_alone, "lobes": self.lobes}
+
+    @property
     def remark(self) -> str:
         """One sentence."""
         sizes = []
@@ -146,8 +155,7 @@ class ShellShape:
             here = np.isin(_WAVES_OF_MODE, waves)
             size = np.rad2deg(np.sqrt(np.sum(self.if_any_rad[here] ** 2)))
             sizes.append(f"{name} {size:.2f} deg ({100.0 * self.lobes[name]:.0f} %)")
-        there = f"{100.0 * self.rocking_alone:.0f} % that the shell rocks without lobes"
-        words = f"{self.call} ({there}); lobes at the largest load, if there are any: {', '.join(sizes)}"
+        words = f"{self.verdict}; lobes at the largest load, if there are any: {', '.join(sizes)}"
         return f"{words}; the films determined {int(self.determined.sum())} of {len(MODES)} modes"
 
     def to_frame(self) -> pd.DataFrame:

@@ -438,6 +438,8 @@ def print_answers(answers: Deflections) -> None:
     bias = None if answers.fused is None else answers.fused.camera_time_bias
     if bias is not None and bias.applied:
         console.print(escape(bias.remark))
+    if answers.camera is not None and answers.camera.shape is not None:
+        console.print(f"shell's shape under load, by video: {escape(answers.camera.shape.verdict)}")
     for method, row in run_folder.method_summary(answers, at_s).items():
         if "reason" in row:
             line("[yellow]no answer[/]", f"from {method}: {row['reason']}", row["code"])

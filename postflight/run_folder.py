@@ -365,7 +365,7 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
     """Return the results of a run in short, for ``summary.json``; ``event_rows`` is its `event_table`."""
     at_peak = event_rows.iloc[int((event_rows["t_s"] - flight.peak_s).abs().argmin())]
     alpha = [float(at_peak["alpha_total_wind_deg"]), float(at_peak["alpha_total_wind_3sd_deg"]) / 3.0]
-    checks = (*flight.consistency_checks, *answers.consistency_checks)
+    checks, camera = (*flight.consistency_checks, *answers.consistency_checks), answers.camera
     return {
         "flight": flight.telemetry.name,
         "synthetic": flight.telemetry.synthetic,
@@ -378,6 +378,7 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
         "agreement": None if answers.fused is None else answers.fused.remark,
         "left_out": None if answers.fused is None else answers.fused.left_out,
         "film_clock": None if answers.fused is None else answers.fused.time_bias_summary(),
+        "shell_shape": None if camera is None or camera.shape is None else camera.shape.summary(),
         "southwell": None if answers.fused is None else answers.fused.southwell_summary(),
         "aero_increments": increments_summary(answers),
         "missing": list(flight.missing),
