@@ -284,10 +284,9 @@ def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> tupl
         dense_share = means_over_spans(dense.time_s, SPAN_S, from_s=0.0)
     d, by_input, noise = _means(sparse, share, deflection)
     other, other_by_input, other_noise = _means(dense, dense_share, deflection)
-    none = np.zeros((len(d), 2, 1))
-    names = dict.fromkeys([*by_input, *other_by_input])
-    columns = np.concatenate([by_input.get(n, none) - other_by_input.get(n, none) for n in names], axis=2)
-    columns = columns.reshape(2 * len(d), -1)
+    none, names = np.zeros((len(d), 2, 1)), dict.fromkeys([*by_input, *other_by_input])
+    apart = [none, *(by_input.get(n, none) - other_by_input.get(n, none) for n in names)]
+    columns = np.concatenate(apart, axis=2).reshape(2 * len(d), -1)
     cov = columns @ columns.T + block_diag(*(noise + other_noise + _LEFT_OUT_RAD**2 * np.eye(2)))
     tested = np.repeat(np.diag(cov).reshape(-1, 2).sum(axis=1) < _LARGEST_SD_RAD**2, 2)
     return (d - other).ravel()[tested], cov[np.ix_(tested, tested)]
