@@ -48,11 +48,13 @@ from flightmodel import rotations
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, standard_normals
-from flightmodel.statistics import correlation_root
+from flightmodel.statistics import correlation_root, correlation_root_and_rest
 from flightmodel.vehicle import Vehicle
 
 CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0
-LIGHT_TIME_S = 2.5
+# with three knots in this time, frames between two of them could err as a straight line only: the rest of the error
+# looked like the deflection's motion, and without spin like a c.g. station 4 sd off
+LIGHT_TIME_S, _LIGHT_KNOTS_A_TIME = 2.5, 10
 # a vehicle turns into gusts: those that no knot resolves look like a smaller C_m. 300 m are crossed at 1 km/s in half a
 # period of pitching at 1.7 Hz; with 1 km the C_m of a light vehicle at small angles came out 4 sd low
 _WIND_KNOTS_A_LENGTH = 10
@@ -405,7 +407,7 @@ def evidence_of_history(history: DeflectionHistory, time_bias_sd_s: float = 0.0,
 
     A history's covariance does not state how its errors are correlated in time. `CONSTANT_PART` of the variance is
     taken as a constant bias (orientation, benchmark), the rest as Gauss-Markov with the correlation time `LIGHT_TIME_S`
-    (light, which rolls with the vehicle); nothing averages out from frame to frame.
+    (light, which rolls with the vehicle), with straight lines between knots; only what lies off these is a frame's own.
     """
     cov = history.lateral_cov
     known = np.isfinite(history.theta_rad) & np.isfinite(cov[:, 0, 0])
@@ -425,7 +427,8 @@ def evidence_of_readings(
     value, axes = np.linalg.eigh(cov)
     # symmetric square root: smooth in time whatever the order of the eigenvalues
     root = (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
-    inputs = {method: _rolled(root, correlation_root(time_s, LIGHT_TIME_S, CONSTANT_PART))}
+    light, rest = correlation_root_and_rest(time_s, LIGHT_TIME_S, CONSTANT_PART, _LIGHT_KNOTS_A_TIME)
+    inputs = {method: _rolled(root, light)}
     if plane_sd_rad > 0.0:
         normal = np.stack([-theta_yz[:, 1], theta_yz[:, 0]], axis=-1)
         inputs[CAMERA_PLANE] = plane_sd_rad * normal[:, :, None]
@@ -436,7 +439,7 @@ def evidence_of_readings(
         np.zeros_like(cov),
         np.zeros_like(cov),
         inputs,
-        np.zeros_like(cov),
+        rest[:, None, None] * cov,
         averaged_s=float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0,
         time_bias_sd_s=time_bias_sd_s,
     )

@@ -9,6 +9,8 @@ from estimators.agreement import SPAN_S, WIDER, agreement
 from estimators.evidence import (
     ACCELEROMETER,
     CAMERA_TIME_BIAS,
+    CONSTANT_PART,
+    LIGHT_TIME_S,
     PRESSURE,
     WIND,
     Evidence,
@@ -18,13 +20,14 @@ from estimators.evidence import (
     moved_evidence,
     moved_vehicle,
 )
-from estimators.fusion import InputPosterior, fuse
+from estimators.fusion import LEFT_OUT_RAD, LEFT_OUT_TIME_S, InputPosterior, fuse
 from estimators.misalignment import misalignment_evidence
 from estimators.southwell import LEFT_OUT, southwell_limbs
 from estimators.trim import SLOPE_AT_RAD, estimate_trim, static_trim, trim_curvature, trim_evidence
 from flightmodel import rotations
 from flightmodel.airdata import lateral_angles
 from flightmodel.deflection import history_from_lateral
+from flightmodel.statistics import correlation
 from synthetic_flight.linear import Slopes, linear_matrix
 
 from .conftest import VEHICLE, pulse_of
@@ -190,6 +193,22 @@ def test_a_history_s_evidence_has_the_history_s_covariance():
     share = np.trace(covariance, axis1=1, axis2=2) / np.trace(root @ root.T)
     assert share.min() > 0.9
     assert share.max() < 1.1
+
+
+@pytest.mark.parametrize("frames_hz", [1.0, 4.0, 10.0, 30.0])
+def test_a_camera_s_errors_between_knots_are_no_motion(frames_hz):
+    # mean chi-square of errors of the stated covariance by what the fusion takes them to have, beside its own floor.
+    # What lies off straight lines between knots is shared by the frames there; with three knots in the correlation time
+    # and no error off the lines it would be 2, 9, 4 and 2
+    t, sd = np.arange(0.0, 29.3, 1.0 / frames_hz), np.deg2rad(0.4)
+    stated = sd**2 * correlation(t, LIGHT_TIME_S, CONSTANT_PART)
+    far, cov = np.tile([0.2, 0.0], (len(t), 1)), np.tile(sd**2 * np.eye(2), (len(t), 1, 1))
+    one = evidence_of_history(history_from_lateral(t, far, cov, "camera", ""))
+    response = one.by_input["camera"][:, 0]
+    taken = response @ response.T + np.diag(one.independent_cov[:, 0, 0])
+    np.testing.assert_allclose(np.diag(taken), sd**2, rtol=1e-6)
+    floor = LEFT_OUT_RAD**2 * LEFT_OUT_TIME_S / one.averaged_s * np.eye(len(t))
+    assert np.trace(np.linalg.solve(taken + floor, stated + floor)) / len(t) == pytest.approx(1.0, abs=0.1)
 
 
 def test_of_many_swings_that_fit_alike_the_clock_s_own_term_chooses():
