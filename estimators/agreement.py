@@ -89,7 +89,7 @@ SPAN_S = 2.0
 _LEFT_OUT_RAD = np.deg2rad(0.05)  # neglected by the methods' equations, in each mean: up to 0.05 deg at the pulse's end
 _LARGEST_STEP = 2.5  # usual steps: over a wider hole readings are not interpolated
 _LARGEST_SD_RAD = np.deg2rad(1.0)  # of a difference that is tested: beyond it the methods are not linear
-# a sounding's errors may hold waves shorter than the fusion's model: 5 of 50 sound flights fail a pair at 1 %
+# a sounding's errors may hold waves shorter than the fusion's model
 CONFIDENCE = 0.999
 WIDER = 4.0
 _LEAST_INFORMATION = 0.05  # part of a direction's variance that the readings must have taken away
