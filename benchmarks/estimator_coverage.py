@@ -25,7 +25,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import chi2
 
-from flightmodel.statistics import correlation_root
+from flightmodel.statistics import correlation
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from estimators.agreement import CAMERA_MISALIGNED, COEFFICIENTS, HYPOTHESES, MOUNT, OFFSET
@@ -146,16 +146,17 @@ def fly_missing(folder, seeds, workers=2):
 
 
 def camera_history(rng, truth_yz, time_s, sd_rad):
-    """Camera's history drawn from the error that the fusion takes it to have; half of its variance lasts, half forgets.
+    """Camera's history drawn with the error that the fusion states: half of its variance lasts, half forgets.
 
-    Towards the camera's side ``sd_rad``, across twice that. No frames are rendered: what real frames do is measured by
+    The latter is Gauss-Markov from frame to frame, whatever knots the fusion has for it. Towards the camera's side
+    ``sd_rad``, across twice that. No frames are rendered: what real frames do is measured by
     ``benchmarks/recovery.py --video``.
     """
     frames = np.arange(0, len(time_s), 5)
     t, bent = time_s[frames], truth_yz[frames]
     towards = np.array([-np.cos(CAMERA_CLOCK), np.sin(CAMERA_CLOCK)])
     axes = np.stack([towards, [-towards[1], towards[0]]], axis=-1) * [sd_rad, 2.0 * sd_rad]
-    lasting, light = rng.standard_normal(2), correlation_root(t, LIGHT_TIME_S)
+    lasting, light = rng.standard_normal(2), np.linalg.cholesky(correlation(t, LIGHT_TIME_S))
     drawn = np.sqrt(0.5) * (lasting + light @ rng.standard_normal((light.shape[1], 2)))
     cov = np.tile(axes @ axes.T, (len(t), 1, 1))
     return history_from_lateral(t, bent + drawn @ axes.T, cov, "camera", "drawn, not rendered")

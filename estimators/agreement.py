@@ -1,10 +1,15 @@
 """Do the methods agree, and if not, which of their inputs is most likely wrong?
 
-The difference of two methods' readings at one time holds no deflection, only the inputs on which they depend::
+What a method's readings have beyond the fused deflection, less that of another method, holds no deflection, only the
+inputs on which they depend::
 
-    d(t) = read_a - read_b - (B_a - B_b) theta' - (A_a - A_b) theta'' = -(J_a - J_b) x + e,      x ~ N(0, 1)
+    d = mean(off_a) - mean(off_b) = -(mean(J_a) - mean(J_b)) x + e,      off = read - theta - B theta' - A theta''
 
-taken at the sparser one's times and averaged over spans. Its chi-square against that covariance is the test of a pair.
+with ``x ~ N(0, 1)``: means over spans of time, each method's over all of its own samples. Its chi-square against that
+covariance is the test of a pair. The joint swings faster than the deflection's spline can follow (a stiff one at 8 Hz):
+what ``A theta''`` leaves of that in a sample, a degree in the trim late in the pulse, averages out over the samples of
+a span. It does not over a few that are chosen by their sd, which come at one phase of the motion, nor over one method's
+samples at the times of another's, whose rate the swing may be near.
 
 Each input is a fault hypothesis: how much likelier are all readings together if its stated sd is `WIDER` times too
 small (prior inflation)? With mean ``m`` and covariance ``P`` of its unit normals after the fusion, the log of that
@@ -37,7 +42,6 @@ Transactions of the Royal Society A 231 (1933) 289.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -58,7 +62,7 @@ from estimators.evidence import (
     Evidence,
     offset_sd_m,
 )
-from estimators.fusion import InputPosterior, means_over_spans
+from estimators.fusion import InputPosterior, means_over_spans, span_numbers
 from estimators.loads import FlightLoads
 from flightmodel.checks import BoolArray, FloatArray
 
@@ -84,8 +88,8 @@ _FAULT_PLANE_RAD = np.deg2rad(25.0)
 SPAN_S = 2.0
 _LEFT_OUT_RAD = np.deg2rad(0.05)  # neglected by the methods' equations, in each mean: up to 0.05 deg at the pulse's end
 _LARGEST_STEP = 2.5  # usual steps: over a wider hole readings are not interpolated
-_LARGEST_SD_RAD = np.deg2rad(1.0)  # of a reading that is compared with another
-# a sounding's errors may hold waves shorter than the fusion's model: 5 of 50 sound flights fail a pair at 1 %
+_LARGEST_SD_RAD = np.deg2rad(1.0)  # of a difference that is tested: beyond it the methods are not linear
+# a sounding's errors may hold waves shorter than the fusion's model
 CONFIDENCE = 0.999
 WIDER = 4.0
 _LEAST_INFORMATION = 0.05  # part of a direction's variance that the readings must have taken away
@@ -260,42 +264,66 @@ def fault_gain(input_posterior: InputPosterior, columns: FloatArray) -> float:
 
 
 def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> tuple[FloatArray, FloatArray]:
-    """Differences (2 n,) and their covariance: at the sparser one's times, averaged over spans of `SPAN_S`."""
-    a, b = _well_determined(a), _well_determined(b)
+    """Differences (2 n,) of the methods' means over spans of `SPAN_S` in which both answer, and their covariance.
+
+    Without a common deflection the denser one's readings are those at the sparser one's times, the joint at rest.
+    """
+    a, b = (_chosen(one, np.asarray(np.isfinite(one.theta_yz_rad).all(axis=1))) for one in (a, b))
     if len(a.time_s) < 2 or len(b.time_s) < 2:
         return np.empty(0), np.empty((0, 0))
     sparse, dense = sorted((a, b), key=lambda e: -float(np.median(np.diff(e.time_s))))
-    after = np.searchsorted(dense.time_s, sparse.time_s).clip(1, len(dense.time_s) - 1)
-    step = dense.time_s[after] - dense.time_s[after - 1]
-    part = (sparse.time_s - dense.time_s[after - 1]) / step
-    both = (part >= 0.0) & (part <= 1.0) & (step < _LARGEST_STEP * np.median(np.diff(dense.time_s)))
-    time_s, after, part = sparse.time_s[both], after[both], part[both]
-    if not len(time_s):
-        return np.empty(0), np.empty((0, 0))
-
-    def between(values: FloatArray) -> FloatArray:
-        w = part.reshape((-1,) + (1,) * (values.ndim - 1))
-        return np.asarray((1.0 - w) * values[after - 1] + w * values[after])
-
-    d = sparse.theta_yz_rad[both] - between(dense.theta_yz_rad)
+    sparse = _chosen(sparse, _answered(dense, sparse.time_s))
     if deflection is not None:
-        by_rate = sparse.by_rate_s[both] - between(dense.by_rate_s)
-        by_acceleration = sparse.by_acceleration_s2[both] - between(dense.by_acceleration_s2)
-        d -= np.einsum("nij,nj->ni", by_rate, deflection(time_s, 1))
-        d -= np.einsum("nij,nj->ni", by_acceleration, deflection(time_s, 2))
-    names = dict.fromkeys([*sparse.by_input, *dense.by_input])
-    responses = [_less(sparse.by_input.get(n), dense.by_input.get(n), both, between) for n in names]
-    noise = sparse.independent_cov[both] + between(dense.independent_cov)
-    share = means_over_spans(time_s, SPAN_S, from_s=0.0)
-    columns = np.tensordot(share, np.concatenate(responses, axis=2), axes=1).reshape(2 * len(share), -1)
-    blocks = np.einsum("bn,nij->bij", share**2, noise) + _LEFT_OUT_RAD**2 * np.eye(2)
-    return (share @ d).ravel(), columns @ columns.T + block_diag(*blocks)
+        of_sparse, of_dense = (span_numbers(one.time_s, SPAN_S, from_s=0.0) for one in (sparse, dense))
+        sparse, dense = _chosen(sparse, np.isin(of_sparse, of_dense)), _chosen(dense, np.isin(of_dense, of_sparse))
+    if not len(sparse.time_s):
+        return np.empty(0), np.empty((0, 0))
+    share = means_over_spans(sparse.time_s, SPAN_S, from_s=0.0)
+    dense_share = share @ _between(dense.time_s, sparse.time_s)
+    if deflection is not None:
+        dense_share = means_over_spans(dense.time_s, SPAN_S, from_s=0.0)
+    d, by_input, noise = _means(sparse, share, deflection)
+    other, other_by_input, other_noise = _means(dense, dense_share, deflection)
+    none, names = np.zeros((len(d), 2, 1)), dict.fromkeys([*by_input, *other_by_input])
+    apart = [none, *(by_input.get(n, none) - other_by_input.get(n, none) for n in names)]
+    columns = np.concatenate(apart, axis=2).reshape(2 * len(d), -1)
+    cov = columns @ columns.T + block_diag(*(noise + other_noise + _LEFT_OUT_RAD**2 * np.eye(2)))
+    tested = np.repeat(np.diag(cov).reshape(-1, 2).sum(axis=1) < _LARGEST_SD_RAD**2, 2)
+    return (d - other).ravel()[tested], cov[np.ix_(tested, tested)]
 
 
-def _well_determined(one: Evidence) -> Evidence:
-    """Evidence where its sum of errors is below `_LARGEST_SD_RAD`."""
-    keep = np.isfinite(one.theta_yz_rad).all(axis=1)
-    keep &= np.trace(one.covariance, axis1=1, axis2=2) < _LARGEST_SD_RAD**2
+def _means(
+    one: Evidence, share: FloatArray, deflection: Deflection | None
+) -> tuple[FloatArray, dict[str, FloatArray], FloatArray]:
+    """What readings have beyond a deflection and its motion, mean of samples (n, 2), of their responses and noise."""
+    off = one.theta_yz_rad
+    if deflection is not None:
+        off = off - deflection(one.time_s)
+        off -= np.einsum("nij,nj->ni", one.by_rate_s, deflection(one.time_s, 1))
+        off -= np.einsum("nij,nj->ni", one.by_acceleration_s2, deflection(one.time_s, 2))
+    by_input = {name: np.tensordot(share, response, axes=1) for name, response in one.by_input.items()}
+    return share @ off, by_input, np.einsum("bn,nij->bij", share**2, one.independent_cov)
+
+
+def _between(known_s: FloatArray, at_s: FloatArray) -> FloatArray:
+    """Weights (n, k) of values at ``known_s`` (k,) on straight lines between them at times (n,) within."""
+    after = np.searchsorted(known_s, at_s).clip(1, len(known_s) - 1)
+    part, row = (at_s - known_s[after - 1]) / (known_s[after] - known_s[after - 1]), np.arange(len(at_s))
+    out = np.zeros((len(at_s), len(known_s)))
+    out[row, after - 1], out[row, after] = 1.0 - part, part
+    return out
+
+
+def _answered(one: Evidence, time_s: FloatArray) -> BoolArray:
+    """Whether times (n,) lie between readings of a method that are no further apart than `_LARGEST_STEP`."""
+    after = np.searchsorted(one.time_s, time_s).clip(1, len(one.time_s) - 1)
+    step = one.time_s[after] - one.time_s[after - 1]
+    near = step < _LARGEST_STEP * np.median(np.diff(one.time_s))
+    return np.asarray(near & (time_s >= one.time_s[after - 1]) & (time_s <= one.time_s[after]))
+
+
+def _chosen(one: Evidence, keep: BoolArray) -> Evidence:
+    """Evidence of chosen samples (n,)."""
     return replace(
         one,
         time_s=one.time_s[keep],
@@ -306,13 +334,3 @@ def _well_determined(one: Evidence) -> Evidence:
         independent_cov=one.independent_cov[keep],
         half_curvature_rad=None,
     )
-
-
-def _less(
-    sparse: FloatArray | None, dense: FloatArray | None, both: BoolArray, between: Callable[[FloatArray], FloatArray]
-) -> FloatArray:
-    """Response of the difference to an input on which one of the two may not depend."""
-    if sparse is None:
-        assert dense is not None
-        return -between(dense)
-    return sparse[both] if dense is None else sparse[both] - between(dense)

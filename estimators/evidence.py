@@ -15,7 +15,13 @@ worst known coefficient: the curvature shifts the mean of the deflection and wid
 
 The flow's error has three parts: that of the inertial sensors' constant errors (estimated together with the attitude,
 and rolling with the vehicle), the rest of the trajectory's, and the wind's. The last two do not roll with the vehicle:
-they are written in axes that do not roll. The trajectory's is a Gauss-Markov process with the correlation time
+they are written in axes across the flow that do not roll about it. The body rolls about the flow, which meets it at the
+angle ``alpha`` from the side of the unit vector ``e``, at the rate (that of the twist about a fixed direction)
+
+    w . (x + v) / (1 + x . v) = w_x + tan(alpha / 2) e . w_yz,        v = x cos(alpha) + e sin(alpha)
+
+A body that cones by 25 deg goes on by 34 deg about the flow for every turn by its own gyro, and a steady wind looks to
+the latter as one that turns. The trajectory's is a Gauss-Markov process with the correlation time
 `TRAJECTORY_TIME_S`; the wind's is half constant bias, half Gauss-Markov with the correlation length `WIND_LENGTH_M` of
 altitude, as in the reconstruction of the atmosphere; so is the density's in the dynamic pressure, with
 `DENSITY_LENGTH_M`.
@@ -37,16 +43,18 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 from estimators.balance import Swing
-from estimators.loads import FlightLoads
+from estimators.loads import FlightLoads, lateral_and_size
 from flightmodel import rotations
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, standard_normals
-from flightmodel.statistics import correlation_root
+from flightmodel.statistics import correlation_root, correlation_root_and_rest
 from flightmodel.vehicle import Vehicle
 
 CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0
-LIGHT_TIME_S = 2.5
+# with three knots in this time, frames between two of them could err as a straight line only: the rest of the error
+# looked like the deflection's motion, and without spin like a c.g. station 4 sd off
+LIGHT_TIME_S, _LIGHT_KNOTS_A_TIME = 2.5, 10
 # a vehicle turns into gusts: those that no knot resolves look like a smaller C_m. 300 m are crossed at 1 km/s in half a
 # period of pitching at 1.7 Hz; with 1 km the C_m of a light vehicle at small angles came out 4 sd low
 _WIND_KNOTS_A_LENGTH = 10
@@ -62,6 +70,7 @@ _OF_SD = 0.01  # of a vehicle's input
 _LEAST_DETERMINANT = 1e-9  # of a balance's derivative by the deflection: of a force 1, of a moment some 0.1 m^2
 _LEAST_VAR = 1e-16  # rad^2, so that a root exists where nothing errs
 _OSCILLATION_WINDOW_S = 2.0  # about a period of the slow aerodynamic mode, over which the joint's is averaged
+_FROM_BEHIND_RAD = np.deg2rad(170.0)  # where the flow comes from no side that lasts, the roll about it goes to infinity
 _BODIES = ("aeroshell", "centerbody")
 VEHICLE_INPUTS = (
     "C_A",
@@ -191,7 +200,10 @@ def _rolled(body_from_fixed: FloatArray, columns: FloatArray) -> FloatArray:
 
 
 def _roll(loads: FlightLoads) -> FloatArray:
-    rate, step = loads.rate_body_radps[:, 0], np.diff(loads.time_s)
+    """Roll (n,) about the flow since the first sample, rad."""
+    e, alpha = lateral_and_size(loads.flow_yz_rad)
+    w, step = loads.rate_body_radps, np.diff(loads.time_s)
+    rate = w[:, 0] + np.tan(0.5 * np.minimum(alpha, _FROM_BEHIND_RAD)) * np.sum(e * w[:, 1:], axis=1)
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
 
 
@@ -395,7 +407,7 @@ def evidence_of_history(history: DeflectionHistory, time_bias_sd_s: float = 0.0,
 
     A history's covariance does not state how its errors are correlated in time. `CONSTANT_PART` of the variance is
     taken as a constant bias (orientation, benchmark), the rest as Gauss-Markov with the correlation time `LIGHT_TIME_S`
-    (light, which rolls with the vehicle); nothing averages out from frame to frame.
+    (light, which rolls with the vehicle), with straight lines between knots; only what lies off these is a frame's own.
     """
     cov = history.lateral_cov
     known = np.isfinite(history.theta_rad) & np.isfinite(cov[:, 0, 0])
@@ -415,7 +427,8 @@ def evidence_of_readings(
     value, axes = np.linalg.eigh(cov)
     # symmetric square root: smooth in time whatever the order of the eigenvalues
     root = (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
-    inputs = {method: _rolled(root, correlation_root(time_s, LIGHT_TIME_S, CONSTANT_PART))}
+    light, rest = correlation_root_and_rest(time_s, LIGHT_TIME_S, CONSTANT_PART, _LIGHT_KNOTS_A_TIME)
+    inputs = {method: _rolled(root, light)}
     if plane_sd_rad > 0.0:
         normal = np.stack([-theta_yz[:, 1], theta_yz[:, 0]], axis=-1)
         inputs[CAMERA_PLANE] = plane_sd_rad * normal[:, :, None]
@@ -426,7 +439,7 @@ def evidence_of_readings(
         np.zeros_like(cov),
         np.zeros_like(cov),
         inputs,
-        np.zeros_like(cov),
+        rest[:, None, None] * cov,
         averaged_s=float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0,
         time_bias_sd_s=time_bias_sd_s,
     )

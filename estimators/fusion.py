@@ -39,6 +39,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, lstsq
 from scipy.linalg.lapack import dpotri
@@ -306,10 +307,14 @@ def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inp
     return (whiten @ rows).reshape(2 * len(share), -1), (whiten @ (share @ want)[:, :, None]).ravel()
 
 
+def span_numbers(time_s: FloatArray, width_s: float, from_s: float) -> NDArray[np.int64]:
+    """Number of the span in which each time (n,) lies, one of which begins at ``from_s``."""
+    return np.asarray(np.floor((time_s - from_s) / width_s + 1e-6).astype(np.int64))
+
+
 def means_over_spans(time_s: FloatArray, width_s: float, from_s: float) -> FloatArray:
     """Weights (bins, n) of the means over spans of time, one of which begins at ``from_s``; empty ones are left out."""
-    which = np.floor((time_s - from_s) / width_s + 1e-6).astype(int)
-    _, which, count = np.unique(which, return_inverse=True, return_counts=True)
+    _, which, count = np.unique(span_numbers(time_s, width_s, from_s), return_inverse=True, return_counts=True)
     out = np.zeros((len(count), len(time_s)))
     out[which, np.arange(len(time_s))] = 1.0 / count[which]
     return out

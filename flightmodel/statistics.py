@@ -43,11 +43,23 @@ def correlation_root(
     The Gauss-Markov part is drawn at knots, ``knots_a_length`` in ``length``, with straight lines between; ``at``
     may be in any order. A constant part, where there is one, is the first column.
     """
+    root, rest = correlation_root_and_rest(at, length, constant_part, knots_a_length)
+    # straight lines between knots are a little too small
+    light = root if constant_part == 0.0 else root[:, 1:]
+    light *= np.sqrt((1.0 - constant_part) / (1.0 - constant_part - rest))[:, None]
+    return root
+
+
+def correlation_root_and_rest(
+    at: FloatArray, length: float, constant_part: float, knots_a_length: int
+) -> tuple[FloatArray, FloatArray]:
+    """Errors ``(n, k)`` as `correlation_root` has them, and the variance (n,) of what lies off the straight lines."""
     root = _gauss_markov_root(at, length, knots_a_length)
+    rest = (1.0 - constant_part) * np.maximum(1.0 - np.sum(root**2, axis=1), 0.0)
     if constant_part == 0.0:
-        return root
+        return root, rest
     constant = np.full(len(at), np.sqrt(constant_part))
-    return np.column_stack([constant, np.sqrt(1.0 - constant_part) * root])
+    return np.column_stack([constant, np.sqrt(1.0 - constant_part) * root]), rest
 
 
 def _gauss_markov_root(at: FloatArray, length: float, knots_a_length: int) -> FloatArray:
@@ -61,9 +73,7 @@ def _gauss_markov_root(at: FloatArray, length: float, knots_a_length: int) -> Fl
     between = np.zeros((len(at), len(knots)))
     row = np.arange(len(at))
     between[row, k], between[row, k + 1] = 1.0 - fraction, fraction
-    out = between @ np.linalg.cholesky(correlation(knots, length))
-    # straight lines between knots are a little too small
-    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+    return np.asarray(between @ np.linalg.cholesky(correlation(knots, length)))
 
 
 def jackknife_variance(without: FloatArray) -> FloatArray:

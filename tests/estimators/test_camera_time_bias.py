@@ -19,7 +19,7 @@ from estimators.fusion import fuse, smoothed, time_bias_is_observable
 from flightmodel import rotations
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
-from flightmodel.statistics import correlation_root
+from flightmodel.statistics import correlation
 from postflight.fusing import CameraTimeBias, fuse_flight
 
 from .conftest import pulse_of
@@ -41,7 +41,7 @@ def motion(time_s, oscillation=1.0):
 def camera(rng, late_s, rate=2, oscillation=1.0, sd=CAMERA_SD):
     """Camera's history with the errors that the fusion takes it to have, its times late."""
     t = TIME_S[::rate]
-    light = correlation_root(t, LIGHT_TIME_S)
+    light = np.linalg.cholesky(correlation(t, LIGHT_TIME_S))
     drawn = np.sqrt(0.5) * (rng.standard_normal(2) + light @ rng.standard_normal((light.shape[1], 2)))
     cov = np.tile(sd**2 * np.eye(2), (len(t), 1, 1))
     return history_from_lateral(t, motion(t - late_s, oscillation) + sd * drawn, cov, "camera", "")

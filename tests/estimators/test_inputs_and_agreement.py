@@ -9,19 +9,25 @@ from estimators.agreement import SPAN_S, WIDER, agreement
 from estimators.evidence import (
     ACCELEROMETER,
     CAMERA_TIME_BIAS,
+    CONSTANT_PART,
+    LIGHT_TIME_S,
     PRESSURE,
     WIND,
     Evidence,
     corrected_loads,
     evidence_of_history,
+    flow_inputs,
     moved_evidence,
     moved_vehicle,
 )
-from estimators.fusion import InputPosterior, fuse
+from estimators.fusion import LEFT_OUT_RAD, LEFT_OUT_TIME_S, InputPosterior, fuse
 from estimators.misalignment import misalignment_evidence
 from estimators.southwell import LEFT_OUT, southwell_limbs
 from estimators.trim import SLOPE_AT_RAD, estimate_trim, static_trim, trim_curvature, trim_evidence
+from flightmodel import rotations
+from flightmodel.airdata import lateral_angles
 from flightmodel.deflection import history_from_lateral
+from flightmodel.statistics import correlation
 from synthetic_flight.linear import Slopes, linear_matrix
 
 from .conftest import VEHICLE, pulse_of
@@ -83,6 +89,37 @@ def test_under_spin_the_gyros_errors_move_the_trim():
     assert np.rad2deg(np.abs(response).max()) > 0.02
     change = trim_evidence(corrected_loads(pulse, {ACCELEROMETER: x})).theta_yz_rad - base.theta_yz_rad
     np.testing.assert_allclose(change, response @ x, atol=0.03 * np.abs(response @ x).max())
+
+
+def coning(alpha_rad, precession_radps, spin_radps):
+    """Loads of a body whose axis goes round a steady flow, and the matrices (n, 3, 3) that turn body into flow axes."""
+    pulse, _ = pulse_of(np.random.default_rng(12), 600)
+    since = pulse.time_s - pulse.time_s[0]
+    x, z = np.eye(3)[0], np.eye(3)[2]
+    q = rotations.multiply(
+        rotations.exp(precession_radps * since[:, None] * x),
+        rotations.multiply(rotations.exp(alpha_rad * z), rotations.exp(spin_radps * since[:, None] * x)),
+    )
+    dcm = rotations.dcm_from_q(q)
+    rate = spin_radps * x + precession_radps * dcm[:, 0]
+    flow = lateral_angles(1000.0 * dcm[:, 0])
+    return replace(pulse, rate_body_radps=rate, flow_yz_rad=flow, wind_flow_sd_rad=np.full(len(since), 1e-3)), dcm
+
+
+@pytest.mark.parametrize("alpha_deg", [3.0, 25.0, 45.0])
+def test_a_steady_wind_stays_steady_however_the_body_cones(alpha_deg):
+    # a metre a second across 1000 m/s is the two constant columns of the wind and nothing else; the gyro's own roll
+    # would have gone on by 5.9 rad at 25 deg
+    pulse, dcm = coning(np.deg2rad(alpha_deg), 2.1, 1.3)
+    since = pulse.time_s[-1] - pulse.time_s[0]
+    assert 2.1 * since * (1.0 - np.cos(np.deg2rad(25.0))) > 5.0
+    change = lateral_angles(np.einsum("nji,j->ni", dcm, [1000.0, 0.6, -0.8])) - pulse.flow_yz_rad
+    columns = flow_inputs(pulse)[WIND]
+    steady = np.sqrt(2.0) * columns[:, :, [0, columns.shape[2] // 2]]
+    size = np.linalg.lstsq(steady.reshape(-1, 2), change.ravel())[0]
+    assert np.hypot(*size) == pytest.approx(1.0, abs=0.06)  # half of alpha / sin(alpha) - 1 at 45 deg
+    left = change - steady @ size
+    assert np.sqrt(np.mean(left**2)) < (0.003 if alpha_deg < 10.0 else 0.06) * np.sqrt(np.mean(change**2))
 
 
 def test_moved_vehicle_is_moved_as_its_names_say():
@@ -158,6 +195,22 @@ def test_a_history_s_evidence_has_the_history_s_covariance():
     assert share.max() < 1.1
 
 
+@pytest.mark.parametrize("frames_hz", [1.0, 4.0, 10.0, 30.0])
+def test_a_camera_s_errors_between_knots_are_no_motion(frames_hz):
+    # mean chi-square of errors of the stated covariance by what the fusion takes them to have, beside its own floor.
+    # What lies off straight lines between knots is shared by the frames there; with three knots in the correlation time
+    # and no error off the lines it would be 2, 9, 4 and 2
+    t, sd = np.arange(0.0, 29.3, 1.0 / frames_hz), np.deg2rad(0.4)
+    stated = sd**2 * correlation(t, LIGHT_TIME_S, CONSTANT_PART)
+    far, cov = np.tile([0.2, 0.0], (len(t), 1)), np.tile(sd**2 * np.eye(2), (len(t), 1, 1))
+    one = evidence_of_history(history_from_lateral(t, far, cov, "camera", ""))
+    response = one.by_input["camera"][:, 0]
+    taken = response @ response.T + np.diag(one.independent_cov[:, 0, 0])
+    np.testing.assert_allclose(np.diag(taken), sd**2, rtol=1e-6)
+    floor = LEFT_OUT_RAD**2 * LEFT_OUT_TIME_S / one.averaged_s * np.eye(len(t))
+    assert np.trace(np.linalg.solve(taken + floor, stated + floor)) / len(t) == pytest.approx(1.0, abs=0.1)
+
+
 def test_of_many_swings_that_fit_alike_the_clock_s_own_term_chooses():
     # a steady ringing at 2.5 Hz fits an offset of 0.05 s as well as one of 0.45 or -0.35 s; the clock is known to 0.2 s
     t = 430.0 + np.arange(0.0, 8.0, 0.02)
@@ -210,6 +263,38 @@ def test_pairs_that_agree_fail_as_often_as_chance_lets_them(noises):
     chances = np.array([p.p_value for p in found])
     assert 0.35 < np.mean(chances < 0.5) < 0.58
     assert np.mean(chances < 0.1) < 0.15
+
+
+def still(time_s, derivative=0):
+    """Deflection of nothing."""
+    return np.zeros((len(time_s), 2))
+
+
+def resting(name, time_s, theta_yz, coefficient):
+    """Readings of a joint at rest, known to a milliradian and a coefficient."""
+    rest, cov = np.zeros((len(time_s), 2, 2)), np.tile(1e-6 * np.eye(2), (len(time_s), 1, 1))
+    return Evidence(name, time_s, theta_yz, rest, rest, {"C_m": coefficient}, cov, 0.05)
+
+
+@pytest.mark.parametrize(("swing_rad", "constant_rad", "fails"), [(0.02, 0.0, False), (0.0, 0.02, True)])
+def test_a_swing_that_no_spline_follows_is_no_disagreement(swing_rad, constant_rad, fails):
+    # a stiff joint rings at 8.2 Hz, and the trim reads a degree of it; it knows the deflection well only where the
+    # vehicle passes its trim angle, three samples in ten, and a film has four frames a second: neither is compared
+    # at those moments alone
+    rng, t, failed = np.random.default_rng(11), 430.0 + 0.05 * np.arange(240), []
+    for _ in range(60):
+        waves = swing_rad * np.cos(2.0 * np.pi * 8.2 * t[:, None] + rng.uniform(0.0, 2.0 * np.pi, 2))
+        coefficient = 0.05 * np.sin(2.0 * np.pi * t + rng.uniform(0.0, 2.0 * np.pi))[:, None, None] * [[0.8], [-0.6]]
+        noise, none = 1e-3 * rng.standard_normal((3, len(t), 2)), np.zeros((len(t), 2, 1))
+        trim = waves + constant_rad + noise[0] - coefficient[:, :, 0] * rng.standard_normal()
+        readings = [
+            resting("misalignment", t, noise[1], none),
+            resting("trim", t, trim, coefficient),
+            resting("camera", t[::5], noise[2, ::5], none[::5]),
+        ]
+        failed.append([not p.passed for p in agreement(readings, deflection=still).pairs])
+    # misalignment and trim, misalignment and film, trim and film
+    assert (np.abs(np.mean(failed, axis=0) - [fails, False, fails]) < 0.05).all()
 
 
 def test_gain_is_the_likelihood_of_worse_known_inputs():
