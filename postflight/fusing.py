@@ -110,7 +110,10 @@ class FusedAnswer:
 
     @property
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
-        """Whether the methods agree, and whether the camera's time bias is what is stated."""
+        """Whether the methods agree, and whether the camera's time bias is what is stated.
+
+        A time bias that is off comes first: what else the agreement suspects supposes that the frames' times are right.
+        """
         passed = not self.agreement.hypotheses and self.left_out is None and not self.alternatives
         likeliest = self.agreement.likeliest
         least = min((p.p_value for p in self.agreement.pairs), default=1.0)
@@ -125,9 +128,10 @@ class FusedAnswer:
         if bias is not None and not bias.applied:
             size, source = abs(bias.offset_s) / bias.sd_s, "camera" if bias.is_off else ""
             name = "camera time bias over its sd"
-            checks.append(
-                ConsistencyCheck("camera-time-bias", name, size, 0.0, _OFF_SD, not bias.is_off, bias.remark, source)
+            clock = ConsistencyCheck(
+                "camera-time-bias", name, size, 0.0, _OFF_SD, not bias.is_off, bias.remark, source
             )
+            checks.insert(0 if bias.is_off else 1, clock)
         return tuple(checks)
 
     def time_bias_summary(self) -> dict[str, Any] | None:
