@@ -128,9 +128,7 @@ class FusedAnswer:
         if bias is not None and not bias.applied:
             size, source = abs(bias.offset_s) / bias.sd_s, "camera" if bias.is_off else ""
             name = "camera time bias over its sd"
-            clock = ConsistencyCheck(
-                "camera-time-bias", name, size, 0.0, _OFF_SD, not bias.is_off, bias.remark, source
-            )
+            clock = ConsistencyCheck("camera-time-bias", name, size, 0.0, _OFF_SD, not bias.is_off, bias.remark, source)
             checks.insert(0 if bias.is_off else 1, clock)
         return tuple(checks)
 
