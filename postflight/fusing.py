@@ -118,8 +118,8 @@ class FusedAnswer:
         likeliest = self.agreement.likeliest
         least = min((p.p_value for p in self.agreement.pairs), default=1.0)
         # a method that is no sensor is wrong by an input of its own
-        blamed = (self.left_out,) if self.left_out == "camera" else (*likeliest, self.left_out or "")
-        source = "" if passed else blamed[0]
+        blamed = "camera" if self.left_out == "camera" else ", ".join(likeliest) or self.left_out or ""
+        source = "" if passed else blamed
         name = "deflection methods agree: least chance of a pair"
         checks = [
             ConsistencyCheck("deflection-methods", name, least, 1.0 - CONFIDENCE, 1.0, passed, self.remark, source)
