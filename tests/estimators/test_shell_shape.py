@@ -1,5 +1,6 @@
 """Rocking or local deformation: lobes found in films of another renderer, odds and error bars that hold."""
 
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -155,3 +156,19 @@ def test_frames_of_one_load_tell_nothing():
     with pytest.raises(GateError) as refusal:
         shell_shape([LoadedFilm(film.film, np.where(np.arange(len(TIME_S)) < 5, PRESSURE_PA, np.nan))])
     assert refusal.value.codes == ("too-few-frames",)
+
+
+def test_the_film_s_shape_takes_the_place_of_the_frame_s_prior():
+    """As a fit of the frame's points alone, with the film's shape for its prior, would have it."""
+    film, _, _ = drawn(np.random.default_rng(5), ("two waves",))
+    shape = replace(shell_shape([film]), frame_sd_rad=float(D(0.1)))
+    k = int(np.argmax(PRESSURE_PA))
+    own, load = film.film.fits[k].shape, film.shares(shape.largest_pa)[k]
+    points = np.linalg.inv(own.formal)
+    seen = points @ own.found_rad
+    points[2:, 2:] -= np.diag(mode_sd_rad(AprioriSd()) ** -2.0)
+    points[2:, 2:] += np.eye(len(MODES)) / D(0.1) ** 2
+    seen[2:] += load * shape.amplitude_rad / D(0.1) ** 2
+    np.testing.assert_allclose(
+        with_shape(film, shape).fits[k].rotation_yz_rad, np.linalg.solve(points, seen)[:2], rtol=1e-8
+    )
