@@ -18,12 +18,23 @@ other-point           another point fixed in the body is followed
 Gauss-Newton on the exact effects, chosen one by one (and dropped again) by a likelihood in which each component has the
 variance of its own residuals, and ``n / g`` independent ones of ``n``, ``g = 1 + 2 sum rho_k`` up to the first
 correlation that is not positive. An effect of p parameters is named where it gains ``ln 1000`` over ``p/2 ln (n/g)``.
-Its sd follows from the same residuals: how well the difference itself shows it. What the two covariances allow is
-another number (``stated_sd``): the largest sd of the effect that errors with these covariances have, whatever their
-correlation in time, independent between the two: ``sum_k sqrt(G_k P_k G_k')`` with the estimator's rows ``G_k``.
+Its sd follows from the same residuals: how well the difference itself shows it.
 
-An effect is ``beyond`` the covariances where a component exceeds 3.3 (99.9 %) of the root of both variances: then it is
-a fault of one of the two. Effects within are there all the same, and faults where the two share data or solution.
+What the two covariances allow is another number. Errors of covariance ``P_k`` (their sum, independent between the two)
+at epoch k, with whatever correlation in time, are asked for the effects, ``d_k = H_k x``, by least squares with weights
+``w_k`` that sum to one:
+
+    x = M^-1 sum_k w_k H_k' P_k^-1 d_k,   M = sum_k w_k H_k' P_k^-1 H_k,   cov(x) <= M^-1
+
+For ``c'x = sum_k w_k e_k`` with ``w_k e_k`` of sd ``w_k s_k`` has an sd of ``sum w_k s_k`` at most, whose square is at
+most ``sum w_k s_k^2 = c'M^-1 c``; and ``x' M x`` is at most a chi-square with as many degrees of freedom as ``x``, as
+the sum of n whitened errors, each of unit covariance, has no eigenvalue above n. This holds for all weights that do not
+depend on the difference. They are those in which an effect is seen best, the others being unknown too: the D_s-optimal
+design, by multiplication. ``stated_sd`` are the roots of its ``M^-1``, ``stated_size`` is the effect's size in them.
+
+An effect is ``beyond`` the covariances where this size, by ``M^-1`` and the sd of the scatter together, exceeds the root
+of chi-square's 99.9 % quantile (3.3 for one component, 4.0 for three): then it is a fault of one of the two. Effects
+within are there all the same, and faults where the two share data or solution.
 
 Two effects have a known size. Inertial velocity is named where its estimated factor is 1 within 3 sd and 1 %. The datum
 is taken as it is or not at all: whichever needs fewer effects, and leaves the likelier shift.
@@ -35,6 +46,8 @@ References
 ----------
 Wolff, "Monte Carlo errors with less errors", Comput. Phys. Commun. 156 (2004) 143 (the inefficiency g).
 Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978) 461.
+Silvey, Titterington, Torsney, "An algorithm for optimal designs on a finite design space", Commun. Statist. A 7 (1978)
+1379 (the multiplication). Atwood, "Optimal and efficient designs of experiments", Ann. Math. Statist. 40 (1969) 1570.
 """
 
 from __future__ import annotations
@@ -62,7 +75,7 @@ _STEPS = 4  # of Gauss-Newton: the effects are nearly linear
 _FAR_S, _FAR_STEP_S = 40.0, 0.25  # of time offsets that are looked for: leap seconds, a second's slip
 # resolution of files: below it nothing is claimed (m, m/s, rad)
 _RESOLUTION = np.repeat([1e-3, 1e-3, np.deg2rad(1e-4)], 3)
-_BEYOND_SD = 3.3
+_DESIGN_STEPS = 40  # towards the optimal weights; any weights give a bound, these are within percents of the least
 _GEOID_ERROR_M = 1.0  # of EGM96 by the half degree, 1 sd
 _LEAST_UNDULATION_M = 5.0  # where a datum can be told from a shift
 GROUPS = ("position", "velocity", "attitude")
@@ -100,8 +113,10 @@ class FoundEffect:
         Key of the module's table.
     components : tuple of str
     value, sd, stated_sd : (p,) float
-        In ``unit``; ``stated_sd`` is what both covariances allow, NaN where none is stated.
+        In ``unit``; ``stated_sd`` is what both covariances allow, NaN for a datum.
     unit : str
+    stated_size : float
+        Size, over its components, in standard deviations by the covariances and the scatter; infinite for a datum.
     """
 
     name: str
@@ -110,6 +125,7 @@ class FoundEffect:
     sd: FloatArray
     stated_sd: FloatArray
     unit: str
+    stated_size: float = np.inf
 
     @property
     def words(self) -> str:
@@ -118,15 +134,16 @@ class FoundEffect:
             f"{name} {v:.{digits(s)}f} ± {s:.{digits(s)}f}".strip()
             for name, v, s in zip(self.components, self.value, self.sd, strict=True)
         ]
-        size = f" (together {np.linalg.norm(self.value):.{digits(self.sd.max())}f})" if len(parts) > 1 else ""
-        return f"{_WORDS[self.name]} {', '.join(parts)} {self.unit}{size}"
+        size = [f"together {np.linalg.norm(self.value):.{digits(self.sd.max())}f}"] if len(parts) > 1 else []
+        size += [f"{self.stated_size:.1f} sd by the covariances"] if np.isfinite(self.stated_size) else []
+        return f"{_WORDS[self.name]} {', '.join(parts)} {self.unit}" + (f" ({'; '.join(size)})" if size else "")
 
     @property
     def beyond(self) -> bool:
         """Whether it is larger than both covariances allow."""
         if self.name in ("height-datum", "inertial-velocity"):
             return True
-        return bool((np.abs(self.value) > _BEYOND_SD * np.hypot(self.sd, self.stated_sd)).any())
+        return bool(self.stated_size > np.sqrt(chi2.ppf(_CONFIDENCE, len(self.value))))
 
 
 @dataclass(frozen=True, repr=False)
@@ -165,13 +182,13 @@ class SystematicDifferences(Tabular):
     notes: tuple[str, ...] = field(default=())
 
     def to_frame(self) -> pd.DataFrame:
-        """One row a component of an effect: ``effect, component, value, sd, stated_sd, unit, beyond``."""
+        """One row a component of an effect: ``effect, component, value, sd, stated_sd, unit, stated_size, beyond``."""
         rows = [
-            (effect.name, *row, effect.unit, effect.beyond)
+            (effect.name, *row, effect.unit, effect.stated_size, effect.beyond)
             for effect in self.effects
             for row in zip(effect.components, effect.value, effect.sd, effect.stated_sd, strict=True)
         ]
-        return pd.DataFrame(rows, columns=["effect", "component", "value", "sd", "stated_sd", "unit", "beyond"])
+        return pd.DataFrame(rows, columns=["effect", "component", "value", "sd", "stated_sd", "unit", "stated_size", "beyond"])
 
     def histories(self) -> pd.DataFrame:
         """Differences over time, as given and ``left``, with their sd; units in the columns' names."""
@@ -502,16 +519,6 @@ class _Explained:
         out[self.used] = np.sqrt((self._gain() ** 2 * self.noise.sd_effective**2).sum(axis=(1, 2)))
         return out
 
-    def stated_sd(self, covariances: tuple[FloatArray, ...]) -> FloatArray:
-        """Largest sd (count,) that errors with these covariances (n, m, m) give, whatever their correlation in time."""
-        gain, variance = self._gain(), np.zeros(int(self.used.sum()))
-        for covariance in covariances:
-            each = np.einsum("pni,nij,pnj->pn", gain, covariance, gain)
-            variance += np.sqrt(np.maximum(each, 0.0)).sum(axis=1) ** 2
-        out = np.full(self.fit.count, np.nan)
-        out[self.used] = np.sqrt(variance)
-        return out
-
 
 def _shift_odds(one: _Explained, other: _Explained, covariances: tuple[FloatArray, ...]) -> float:
     """Log odds of the size of the shift that one set of effects leaves, over that of another; no shift is one of zero.
@@ -523,7 +530,7 @@ def _shift_odds(one: _Explained, other: _Explained, covariances: tuple[FloatArra
     if not having:
         return 0.0
     at = one.fit.slices["shift"]
-    sd, allowed = having[0].sd()[at], having[0].stated_sd(covariances)[at]
+    sd, allowed = having[0].sd()[at], _Allowed.of(having[0], "shift", covariances).sd
     variance = (np.geomspace(1e-3, 1.0, 60)[:, None] * allowed) ** 2 + sd**2
     logs = [logsumexp(-0.5 * (found.x[at] ** 2 / variance + np.log(variance)).sum(axis=1)) for found in (one, other)]
     return float(logs[0] - logs[1])
@@ -542,6 +549,52 @@ def _stated(fit: _Fit, time_s: FloatArray, covariance: FloatArray, other: OtherT
         whole[:, :size, :size] = theirs
         found.append(_local(fit, whole))
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Allowed:
+    """What errors with the stated covariances can make of one effect: sd (p,), and the effect's size in them."""
+
+    sd: FloatArray
+    size: float
+
+    @classmethod
+    def of(cls, found: _Explained, name: str, covariances: tuple[FloatArray, ...]) -> _Allowed:
+        """By the weights that show this effect best, while the others that were found are unknown."""
+        fit, noise = found.fit, found.noise
+        asked = np.concatenate([np.full(len(_EFFECTS[n][0]), n == name) for n in fit.names if n in found.names])
+        unit = np.sqrt((found.slope**2 / noise.variance[:, None]).mean(axis=(0, 1)))  # brings all columns to one size
+        slope = found.slope / unit
+        rows = np.linalg.solve(np.sum(covariances, axis=0) + np.diag(_RESOLUTION[fit.parts] ** 2), slope)
+        information = np.einsum("nmp,nmq->npq", slope, rows)
+        weight = _best_seen(information, asked)
+        allowed = _pseudo_inverse(np.einsum("n,npq->pq", weight, information))
+        gain = np.einsum("pq,n,nmq->pnm", allowed, weight, rows)
+        x = np.einsum("pnm,nm->p", gain, found.left) + found.x[found.used] * unit
+        scatter = np.einsum("pnm,qnm,m->pq", gain, gain, noise.sd_effective**2)
+        x, both = x[asked], (allowed + scatter)[np.ix_(asked, asked)]
+        size = float(np.sqrt(x @ _pseudo_inverse(both) @ x))
+        return cls(np.sqrt(np.diag(allowed)[asked]) / unit[asked], size)
+
+
+def _best_seen(information: FloatArray, asked: BoolArray) -> FloatArray:
+    """Weights (n,) of epochs near the D_s-optimal design of the parameters asked for; information is (n, p, p)."""
+    weight = np.full(len(information), 1.0 / len(information))
+    others = ~asked
+    for _ in range(_DESIGN_STEPS):
+        whole = np.einsum("n,npq->pq", weight, information)
+        seen = np.einsum("pq,nqp->n", _pseudo_inverse(whole), information)
+        if others.any():
+            rest = np.ix_(others, others)
+            seen = seen - np.einsum("pq,nqp->n", _pseudo_inverse(whole[rest]), information[:, *rest])
+        weight = weight * np.maximum(seen, 0.0)
+        weight = weight / weight.sum()
+    return weight
+
+
+def _pseudo_inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of a symmetric matrix; directions that nothing shows are left out."""
+    return np.asarray(np.linalg.pinv(matrix, rcond=1e-12, hermitian=True))
 
 
 def _interpolated(time_s: FloatArray, covariance: FloatArray, at_s: FloatArray) -> FloatArray:
@@ -563,7 +616,7 @@ def _result(best: _Explained, stated: tuple[FloatArray, ...], other: OtherTrajec
     fit = best.fit
     x = best.x.copy()
     x[fit.slices["time-offset"]] += fit.start_s
-    sd, allowed = (best.sd(), best.stated_sd(stated)) if best.names else (x, x)
+    sd = best.sd() if best.names else x
     effects = []
     if fit.datum:
         higher = np.array([-float(fit.undulation_m.mean())])
@@ -571,8 +624,9 @@ def _result(best: _Explained, stated: tuple[FloatArray, ...], other: OtherTrajec
         effects.append(FoundEffect("height-datum", ("",), higher, error, np.full(1, np.nan), "m"))
     for name in best.names:
         components, unit, scale, *_ = _EFFECTS[name]
-        at = fit.slices[name]
-        effects.append(FoundEffect(name, components, scale * x[at], scale * sd[at], scale * allowed[at], unit))
+        at, allowed = fit.slices[name], _Allowed.of(best, name, stated)
+        values = scale * x[at], scale * sd[at], scale * allowed.sd
+        effects.append(FoundEffect(name, components, *values, unit, allowed.size))
     none = np.zeros(fit.count)
     none[fit.slices["time-offset"]] = -fit.start_s
     plain = _Fit(fit.run, other, "attitude" in fit.groups, fit.start_s)
