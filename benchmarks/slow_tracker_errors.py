@@ -5,10 +5,10 @@ entry, vehicle, start and all errors dispersed, as in `tests.recon.dispersed`:
 
 - ``range-rate``: both radars also give range rates (0.05 m/s white, 0.2 m/s that lasts 5 s), ten a second;
 - ``velocity``: instead of radars a receiver at 10 Hz (0.1 m/s white, 0.3 m/s that lasts 5 s);
-- ``servo HZ``: the radars' angles follow the target as a second-order servo (Butterworth), reading ten a second.
+- ``servo HZ SD_DEG TAU_S``: the radars' angles follow the target as a second-order servo (Butterworth).
 
 Each is reconstructed as stated by the scenario, and with the slow error taken out of the flight file; for a servo, of
-which the file has no word, with a wander of the angles of the size and duration given as SD_DEG TAU_S. Printed: rms of
+which the file has no word, with a wander of the angles of a size and duration given as SD_DEG TAU_S. Printed: rms of
 error over sd by group, over six epochs about the peak; mean NIS of each tracker over its degrees of freedom; red
 checks. About 15 s a flight.
 """

@@ -299,6 +299,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
             f'file = "telemetry/gnss_{name}.csv"',
             f"antenna_from_datum_body_m = {list(receiver.antenna_from_datum_body_m)}",
             *stated_errors(GNSS, receiver),
+            *stated_errors(GNSS, receiver, if_there=True),
         ]
     lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
     if spec.video is not None:
