@@ -355,11 +355,13 @@ class RadarSite:
     height_sd_m: float = error_row("m", 0.0, at=0.0, states=("survey height",), left_out=True)
     north_sd_rad: float = error_row("rad", 0.0, at=0.0, states=("north",), left_out=True)
     # Doppler: white noise, and an oscillator's constant offset
-    range_rate_sd_mps: float = error_row("m/s", 0.1, Sd, at=0.1)
-    range_rate_bias_sd_mps: float = error_row("m/s", 0.0, at=0.0, states=("range rate bias",), left_out=True)
+    range_rate_sd_mps: float = error_row("m/s", 0.1, Sd, at=0.1, simulated=("range_rate_sd_mps",), left_out=True)
+    range_rate_bias_sd_mps: float = error_row(
+        "m/s", 0.0, at=0.0, states=("range rate bias",), simulated=None, left_out=True
+    )
     range_rate_wander_sd_mps: float = error_row(
-        "m/s", 0.0, at=0.0, states=("range rate wander",), left_out=True,
-        time_constant=("range_rate_wander_time_constant_s", 5.0, ""),
+        "m/s", 0.0, at=0.0, states=("range rate wander",), simulated=None, left_out=True,
+        time_constant=("range_rate_wander_time_constant_s", 5.0, "range_rate_wander_time_constant_s"),
     )  # fmt: skip
     range_rate_wander_time_constant_s: float = 5.0
     # slow error of the range: its tracking loop, multipath, a beacon's delay with the signal's strength

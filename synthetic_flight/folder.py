@@ -152,6 +152,7 @@ def _write(scenario: Scenario, seed: int, truth: Truth, folder: Path, report: Pr
     for name, radar in spec.radars.items():
         at, rae = sensing.sense_radar(truth, radar, start, child_rng(seed, name), name)
         columns = {"t_s": at, "range_m": rae[:, 0], "az_deg": np.rad2deg(rae[:, 1]), "el_deg": np.rad2deg(rae[:, 2])}
+        columns |= {"range_rate_mps": rae[:, 3]} if rae.shape[1] > 3 else {}
         _csv(telemetry / f"radar_{name}.csv", columns, "%.6f")
     for name, receiver in spec.gnss.items():
         at, fixes = sensing.sense_gnss(truth, receiver, start, child_rng(seed, f"gnss {name}"), name)
@@ -286,6 +287,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
             f"latitude_deg = {radar.latitude_deg}",
             f"longitude_deg = {radar.longitude_deg}",
             f"height_m = {radar.height_m}",
+            *(['measures = ["range", "az", "el", "range_rate"]'] if radar.range_rate_sd_mps > 0.0 else []),
             *stated_errors(RADAR, radar),
             *([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []),
             *stated_errors(RADAR, radar, if_there=True),
@@ -297,6 +299,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
             f'file = "telemetry/gnss_{name}.csv"',
             f"antenna_from_datum_body_m = {list(receiver.antenna_from_datum_body_m)}",
             *stated_errors(GNSS, receiver),
+            *stated_errors(GNSS, receiver, if_there=True),
         ]
     lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
     if spec.video is not None:

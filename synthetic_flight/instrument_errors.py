@@ -36,7 +36,17 @@ from flightmodel.config import (
     Section,
     Time,
 )
-from flightmodel.instruments import ACCELEROMETER, GNSS, MAGNETOMETER, RADAR, RATES, SUN, InstrumentTable, with_keys
+from flightmodel.instruments import (
+    ACCELEROMETER,
+    GNSS,
+    MAGNETOMETER,
+    RADAR,
+    RATES,
+    SUN,
+    InstrumentTable,
+    Size,
+    with_keys,
+)
 from flightmodel.refraction import Refractivity
 from flightmodel.trajectory import interpolate_rows
 from synthetic_flight import _kernels
@@ -393,7 +403,8 @@ class Radar(Section):
     Sizes of errors are those of `flightmodel.instruments.RadarSite`; ``encoder_once_deg`` and ``encoder_twice_deg`` go
     once and twice a turn of each encoder. ``angle_servo_hz`` is the bandwidth of a tracking servo without velocity lag.
     ``transit_time`` leaves in that an echo shows where the vehicle was when it was hit. Points beyond ``max_range_m``
-    or below ``min_elevation_deg`` (the horizon) are not tracked.
+    or below ``min_elevation_deg`` (the horizon) are not tracked. Range rates are measured where ``range_rate_sd_mps``
+    is above 0.
     """
 
     latitude_deg: Latitude
@@ -405,11 +416,20 @@ class Radar(Section):
     angle_servo_hz: Bandwidth = 0.0
     transit_time: bool = False
     refraction: AirRefraction | None = None
+    range_rate_sd_mps: Size = 0.0
     range_resolution_m: RangeError = 0.0
     angle_resolution_deg: ErrorAngle = 0.0
     max_range_m: Annotated[float, Field(gt=0.0, le=1e9)] | None = None
     min_elevation_deg: Elevation = 0.0
     dropouts: Dropouts | None = None
+
+    @model_validator(mode="after")
+    def _range_rate_measured(self) -> Radar:
+        given = [key for key in ("range_rate_bias_mps", "range_rate_wander_mps") if getattr(self, key, 0.0) > 0.0]
+        if given and self.range_rate_sd_mps == 0.0:
+            words = "of a range rate that is not measured: state its noise, range_rate_sd_mps, too"
+            raise KeyFaults([(key, getattr(self, key), words) for key in given])
+        return self
 
     @property
     def refraction_left(self) -> float:

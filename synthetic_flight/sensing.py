@@ -234,6 +234,8 @@ def sense_radar(
 ) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and slant range m, azimuth, elevation rad ``(n, 3)`` of the vehicle's true c.g. (or its datum).
 
+    A fourth column is the range rate, m/s, where the radar measures one.
+
     Angle noise is that of the beam: normal to the line of sight, so azimuth scatters by ``1 / cos(elevation)`` more. A
     positive time bias stamps a point later than it was measured.
 
@@ -265,6 +267,8 @@ def sense_radar(
         if step > 0.0:
             measured[:, column] = np.round(measured[:, column] / step) * step
     measured[:, 1] = np.mod(measured[:, 1], 2.0 * np.pi)
+    if spec.range_rate_sd_mps > 0.0:
+        measured = np.column_stack([measured, range_rates(truth, spec, at, seen_at, child(rng, "range rate"))])
     keep = np.ones(len(at), dtype=bool)
     if spec.dropouts:
         keep &= kept(at, spec.dropouts.errors, child(rng, "dropouts"))
@@ -307,6 +311,21 @@ def echo(truth: Truth, spec: Radar, time_s: FloatArray) -> FloatArray:
     for _ in range(2):
         now = geometric(np.maximum(time_s - now[:, 0] / speed_of_light, truth.time_s[0]))
     return now
+
+
+def range_rates(
+    truth: Truth, spec: Radar, time_s: FloatArray, seen_at_s: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Doppler (n,): rate of the echo's range m/s when it was seen, with the errors of its own of those tags."""
+    step_s = 1e-3  # a jerk of 1000 m/s3 makes 0.2 mm/s
+    before, after = (np.clip(seen_at_s + s, truth.time_s[0], truth.time_s[-1]) for s in (-step_s, step_s))
+    rate = (echo(truth, spec, after)[:, 0] - echo(truth, spec, before)[:, 0]) / (after - before)
+    size = {key: values[0] for key, values in RADAR.from_scenario(spec).items() if key.startswith("range_rate")}
+    rate += size["range_rate_bias_sd_mps"] * child(rng, "bias").standard_normal()
+    sd, tau_s = size["range_rate_wander_sd_mps"], size["range_rate_wander_time_constant_s"]
+    if sd > 0.0:
+        rate += gauss_markov(time_s, sd, tau_s, 1, child(rng, "wander"))[:, 0]
+    return np.asarray(rate + size["range_rate_sd_mps"] * rng.standard_normal(len(time_s)))
 
 
 def in_air(geometric: FloatArray, spec: Radar) -> FloatArray:

@@ -87,7 +87,7 @@ def _print_table(title: str, names: list[str], rows: list[list[str]]) -> None:
 
 
 def _effect_cells(found: SystematicDifferences) -> tuple[list[str], list[list[str]]]:
-    names = ["effect", "component", "value", "sd", "allowed sd", "unit", "beyond"]
+    names = ["effect", "component", "value", "sd", "allowed sd", "unit", "size in allowed sd", "beyond"]
     rows = [
         [
             str(r.effect),
@@ -96,6 +96,7 @@ def _effect_cells(found: SystematicDifferences) -> tuple[list[str], list[list[st
             f"{r.sd:.2g}",
             _number(r.stated_sd),
             str(r.unit),
+            f"{r.stated_size:.1f}" if np.isfinite(r.stated_size) else "",
             "yes" if r.beyond else "no",
         ]
         for r in found.to_frame().itertuples()

@@ -4,11 +4,15 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from flightmodel.checks import GateError
+from flightmodel.flightfolder import read_flight
+from flightmodel.instruments import GNSS, RADAR
 from flightmodel.partial_files import machine
 from synthetic_flight.folder import simulate_to_folder
+from synthetic_flight.instrument_errors import Gnss
 from synthetic_flight.scenarios import read_scenario
 
 
@@ -73,3 +77,21 @@ def test_a_flight_too_short_for_its_telemetry_says_so(tmp_path, short):
     assert "99.00 s" in str(refusal.value)
     assert "time.telemetry_from_s = 98.5" in str(refusal.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folder_states_every_error_that_its_trackers_were_given(tmp_path, short):
+    """An error that the simulator draws and the folder is silent about makes every error bar too small."""
+    first = short.spec.radars["wallops_island"]
+    radar = first.model_copy(update={key: 0.01 for key in RADAR.scenario_keys() if key != "refraction_left"})
+    receiver = Gnss(rate_hz=5.0, **dict.fromkeys(GNSS.scenario_keys(), 0.01))
+    spec = short.spec.model_copy(update={"radars": {"r": radar}, "gnss": {"g": receiver}})
+    simulate_to_folder(replace(short, spec=spec), 0, tmp_path / "a")
+    telemetry = read_flight(tmp_path / "a")
+    for table, drawn, stated in (
+        (RADAR, radar, telemetry.radars["r"].site),
+        (GNSS, receiver, telemetry.gnss["g"].spec),
+    ):
+        for name, sizes in table.from_scenario(drawn).items():
+            if any(sizes):
+                assert getattr(stated, name) == pytest.approx(np.linalg.norm(sizes), rel=1e-3), name
+    assert telemetry.radars["r"].range_rate_mps is not None

@@ -205,6 +205,38 @@ def test_range_wander_is_slow_and_leaves_the_angles():
     assert not out[:, 1:].any()
 
 
+def test_range_rate_is_the_speed_along_the_line_of_sight(truth):
+    """Of the datum against the turning Earth, late tags read what was; the white noise asked for is 1 um/s."""
+    at, sensed_there = sensed(truth, tracks="datum", range_rate_sd_mps=1e-6)
+    rows = np.searchsorted(truth.time_s, at - 1e-6)
+    site = earth.ecef_from_geodetic(np.deg2rad(37.841), np.deg2rad(-75.485), 12.0)
+    line = truth.trajectory.position_ecef_m[rows] - site
+    along = np.sum(truth.trajectory.velocity_ecef_mps[rows] * line, axis=1) / np.linalg.norm(line, axis=1)
+    np.testing.assert_allclose(sensed_there[:, 3], along, atol=2e-3)
+    assert np.abs(along).max() > 300.0
+    _, without = sensed(truth, tracks="datum")
+    np.testing.assert_array_equal(sensed_there[:, :3], without)
+
+
+def test_range_rate_wanders_about_its_bias(truth):
+    t = 101.0 + np.arange(4000) * 0.012
+    spec = radar(range_rate_sd_mps=1e-6, range_rate_wander_mps=0.2, range_rate_wander_time_constant_s=0.1)
+    clean = radar(range_rate_sd_mps=1e-6)
+    biased = radar(range_rate_sd_mps=1e-6, range_rate_bias_mps=0.3)
+    given = [sensing.range_rates(truth, each, t, t, np.random.default_rng(5)) for each in (spec, biased, clean)]
+    off = [each - given[2] for each in given]
+    # 4000 values correlated over 16: 250 independent ones, 4.5 % of a standard deviation
+    assert off[0].std() == pytest.approx(0.2, rel=0.18)
+    assert np.corrcoef(off[0][1:], off[0][:-1])[0, 1] == pytest.approx(np.exp(-0.12), abs=0.03)
+    assert np.ptp(off[1]) < 1e-5
+    assert 0.01 < abs(off[1].mean()) < 1.2
+
+
+def test_errors_of_a_range_rate_that_is_not_measured_are_refused():
+    with pytest.raises(ValueError, match="range_rate_sd_mps"):
+        radar(range_rate_wander_mps=0.2)
+
+
 def test_datum_and_cg_are_told_apart(truth):
     """The nose is half a metre ahead: the ranges differ by the lever arm's part along the line of sight."""
     at, cg = sensed(truth)

@@ -17,6 +17,7 @@ from flightmodel.checks import GateError
 from flightmodel.geoid import undulation_m
 from flightmodel.trajectory import resample
 from postflight import exports
+from postflight import systematic_differences as differences
 from postflight.intake.other_trajectory import OtherTrajectory, read_other
 from postflight.report.compare import PAGE_NAME
 from postflight.report.compare_other import OTHER_TABLES
@@ -160,6 +161,87 @@ def test_chi_square_is_the_differences_own(run, other):
     np.testing.assert_allclose(result.effects[0].stated_sd, 3.0, rtol=1e-2)  # kept over the flight: no averaging
     assert not result.effects[0].beyond  # 1 m is nothing against 3 m
     assert result.both_stated
+
+
+# ------------------------------------------------------------------------------------- what the covariances allow
+
+SD = np.repeat([7.0, 0.1, np.deg2rad(0.2)], 3)  # of each of two teams, constant over the flight
+SEEN = ("time-offset", "shift", "track-rotation")
+
+
+def two_teams(run, other, errors):
+    """The run as another team has it, both with covariances by `SD`; errors (n, 9) in north, east, down and body."""
+    path, times, _ = run
+    ned = earth.dcm_ned_ecef(*earth.geodetic_from_ecef(other.position_ecef_m)[:2])
+    place, speed = (np.einsum("nji,nj->ni", ned, errors[:, k : k + 3]) for k in (0, 3))
+    covariance = np.diag(SD**2)
+    theirs = replace(
+        other,
+        position_ecef_m=other.position_ecef_m + place,
+        velocity_ecef_mps=other.velocity_ecef_mps + speed,
+        q_ecef_body=rotations.boxplus(other.q_ecef_body, errors[:, 6:]),
+        covariance_time_s=other.time_s[[0, -1]],
+        covariance=np.tile(covariance, (2, 1, 1)),
+    )
+    return (path, times, np.tile(covariance, (len(times), 1, 1))), theirs
+
+
+def slow_errors(other, rng):
+    """Errors of both teams (n, 9), each a wave of 100 s with its sd."""
+    t = other.time_s[:, None] / 100.0
+    a, b = rng.standard_normal((2, 9)) * SD * np.sqrt(2.0)
+    return a * np.cos(2.0 * np.pi * t) + b * np.sin(2.0 * np.pi * t)
+
+
+@pytest.fixture(scope="module")
+def teams(run, other):
+    return two_teams(run, other, slow_errors(other, np.random.default_rng(8)))
+
+
+@pytest.mark.parametrize(
+    ("plant", "name"), [(late, "time-offset"), (turned_track, "track-rotation"), (above_the_geoid, "height-datum")]
+)
+def test_what_two_teams_covariances_do_not_allow_is_named_alone(teams, plant, name):
+    """20 ms at 70 m/s2 are 1.4 m/s, 0.3 deg turn 1 km/s by 5 m/s, of an sd of 0.14 m/s; 40 m are four times 10 m."""
+    mine, theirs = teams
+    result = found(mine, plant(theirs))
+    assert [effect.name for effect in result.effects if effect.beyond] == [name], result.paragraph
+
+
+@pytest.mark.parametrize("plant", [shifted, turned_body, lambda other: other])
+def test_what_is_within_is_not_beyond(teams, plant):
+    """1 m of 10 m, 0.3 deg of 0.28 deg an axis."""
+    mine, theirs = teams
+    result = found(mine, plant(theirs))
+    assert not any(effect.beyond for effect in result.effects), result.paragraph
+
+
+def test_errors_of_any_correlation_in_time_stay_within_what_is_allowed(run, other):
+    """Size squared is a chi-square at most: reached by errors that last the whole flight, not passed by white ones."""
+    few = np.linspace(0, len(other.time_s) - 1, 60).astype(int)
+    thin = replace(
+        other,
+        time_s=other.time_s[few],
+        position_ecef_m=other.position_ecef_m[few],
+        velocity_ecef_mps=other.velocity_ecef_mps[few],
+        q_ecef_body=other.q_ecef_body[few],
+    )
+    mine, theirs = two_teams(run, thin, np.zeros((60, 9)))
+    fit = differences._Fit(mine[0], mine[1:], theirs, True, 0.0)
+    solved, epochs = fit.solved(SEEN), len(fit.time_s)
+    rng = np.random.default_rng(3)
+    draws = 150
+    for correlated, least in ((True, 0.5), (False, 0.0)):
+        squares = {name: np.empty(draws) for name in SEEN}
+        for k in range(draws):
+            u = np.tile(rng.standard_normal(9), (epochs, 1)) if correlated else rng.standard_normal((epochs, 9))
+            drawn = replace(solved, x=np.zeros(fit.count), left=np.einsum("nij,nj->ni", fit.root, u))
+            for name in SEEN:
+                squares[name][k] = differences._Allowed.of(drawn, name).size ** 2
+        for name in SEEN:
+            p = len(differences._EFFECTS[name][0])
+            most = p + 4.0 * np.sqrt(2.0 * p / draws)  # of the mean of chi-squares
+            assert least * p < squares[name].mean() < most, (name, correlated)
 
 
 # ------------------------------------------------------------------------------------------------------------- files
