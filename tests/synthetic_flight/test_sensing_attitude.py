@@ -291,5 +291,6 @@ def test_every_error_of_the_rich_scenario_is_alive(rich):
         # a magnetometer's clock is drawn by none: its field turns as slowly as the vehicle
         known = skipped | ({"time_bias_s"} if section is rich.spec.magnetometer else set())
         for name in type(section).model_fields:
-            if name not in known:
+            # the two pulse radars give no range rate: its errors are tested in test_sensing_radar
+            if name not in known and not name.startswith("range_rate_"):
                 assert getattr(section, name), f"{type(section).__name__}.{name}"
