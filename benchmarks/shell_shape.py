@@ -76,18 +76,18 @@ def filmed(seed: int, pulse: FlightLoads, theta_yz: np.ndarray, options: argpars
 
 def answers(films: list[FilmFit], pulse: FlightLoads) -> np.ndarray:
     """Size of the deflection and its sd (2, n), rad: of one camera, or of all together."""
-    told = []
+    read_by = []
     for one in films:
         read = one.relative_to_benchmark()
         try:
             start = benchmark_deflection(read, pulse, one.oriented.apriori.benchmark_rad)
         except GateError:
             start = BenchmarkDeflection(np.zeros(2), one.oriented.apriori.benchmark_rad**2 * np.eye(2))
-        told.append((one, read, start))
+        read_by.append((read, start))
     if len(films) == 1:
-        history = films[0].history(told[0][2])
+        history = films[0].history(read_by[0][1])
         return np.array([history.theta_rad, history.theta_sd_rad])
-    cameras = [CameraReadings(f"{k}", read, start, PLANE_SD_RAD) for k, (_, read, start) in enumerate(told)]
+    cameras = [CameraReadings(f"{k}", read, start, PLANE_SD_RAD) for k, (read, start) in enumerate(read_by)]
     history = join_cameras(cameras).at_frames
     out = np.full((2, len(FLOWN_S)), np.nan)
     out[:, np.searchsorted(FLOWN_S, history.time_s)] = history.theta_rad, history.theta_sd_rad

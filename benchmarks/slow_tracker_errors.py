@@ -92,8 +92,8 @@ def main():
             folder = Path(temporary) / "flight"
             truth = simulate_to_folder(scenario_of(case, seed, servo_hz), seed, folder)
             telemetry = read_flight(folder)
-        for way, told in ways_of(case, telemetry, wander).items():
-            one, error, nis, reds = scored(told, truth)
+        for way, given in ways_of(case, telemetry, wander).items():
+            one, error, nis, reds = scored(given, truth)
             innovations.setdefault(way, []).append(nis)
             normal.setdefault(way, []).append(one)
             errors.setdefault(way, []).append(error)

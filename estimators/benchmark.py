@@ -48,6 +48,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.special import softmax
 
 from estimators.camera_fit import (
     POSED,
@@ -70,6 +71,7 @@ from flightmodel.camera import camera_from_mount
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.deflection import lv_clock, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry
+from flightmodel.statistics import mixture_moments, paired_covariance, symmetric_root
 from flightmodel.vehicle import CameraMount, CameraUncertainty
 
 # orientation
@@ -587,19 +589,17 @@ def _mixture(
         compliance = posterior(*_USUAL_RAD).compliance
     found = [posterior(*sizes) for sizes in _SIZES_RAD]
     evidence = np.array([one.log_evidence for one in found])
-    weight = np.exp(evidence - evidence.max())
-    weight /= weight.sum()
+    weight = softmax(evidence)
     gain = np.einsum("k,kij->ij", weight, [one.gain for one in found])
-    mean = gain @ read
-    off = np.array([one.gain @ read for one in found]) - mean
-    spread = np.einsum("k,kij->ij", weight, [one.covariance for one in found]) + (weight * off.T) @ off
+    means, covariances = (np.array(x) for x in zip(*((one.gain @ read, one.covariance) for one in found), strict=True))
+    mean, spread = mixture_moments(weight, means, covariances)
     # shapes of slack and freeplay are assumed: their part here stays in the error bar
     slack_var, freeplay_var = weight @ _SIZES_RAD**2
     stays = float(slack_var + freeplay_var * unsure[-1] ** 2)
     answered = np.flatnonzero(frames.answered)
     together = np.full((len(frames.time_s), 2, 2), np.nan)
     together[answered] = (_camera_covariance(frames, answered, rows) @ gain[:, : 2 * n].T).reshape(-1, 2, 2)
-    return BenchmarkDeflection(np.asarray(mean), np.asarray(spread + stays * np.eye(2)), together)
+    return BenchmarkDeflection(mean, spread + stays * np.eye(2), together)
 
 
 def _camera_covariance(frames: RelativeDeflections, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> FloatArray:
@@ -607,16 +607,14 @@ def _camera_covariance(frames: RelativeDeflections, rows: NDArray[np.intp], colu
 
     The error by a shape that grows with the load grows with it: it must not pass for the joint's compliance.
     """
-    ends, own = [], frames.own_covariance
-    for k in (rows, columns):
-        value, axes = np.linalg.eigh(own[k])
-        ends.append((axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1))
+    own = frames.own_covariance
     apart = np.abs(frames.time_s[rows][:, None] - frames.time_s[columns][None, :])
     shared = CONSTANT_PART + (1.0 - CONSTANT_PART) * np.exp(-apart / LIGHT_TIME_S)
-    both = np.einsum("iab,ij,jcb->iajc", ends[0], shared, ends[1])
+    both = paired_covariance(symmetric_root(own[rows]), shared, symmetric_root(own[columns]))
     if frames.by_shape is not None:
-        both += np.einsum("iak,jck->iajc", frames.by_shape[rows], frames.by_shape[columns])
-    return np.asarray(both.reshape(2 * len(rows), 2 * len(columns)))
+        left, right = (frames.by_shape[k].reshape(2 * len(k), -1) for k in (rows, columns))
+        both += left @ right.T
+    return both
 
 
 def _law_covariance(moment: _Moment, compliance: float, correlation: FloatArray) -> FloatArray:

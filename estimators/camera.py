@@ -40,6 +40,7 @@ from flightmodel.deflection import (
 )
 from flightmodel.film import NO_PICTURE, read_image
 from flightmodel.geometry import ShellGeometry
+from flightmodel.statistics import symmetric_root
 from flightmodel.vehicle import CameraMount
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ class FilmFit:
     by_hand : str
         What an analyst edited.
     shape_covariance : (13, 13) float or None
-        Of what the film told about the shell's shape under load, where the answers use it (`estimators.shell_shape`).
+        Of the shell's shape under load as the film determined it, where the answers use it (`estimators.shell_shape`).
     """
 
     time_s: FloatArray
@@ -117,11 +118,9 @@ class FilmFit:
         """Root (n, 2, 13) of the readings' common error by the shell's shape under load, as lateral vectors."""
         if self.shape_covariance is None:
             return None
-        value, axes = np.linalg.eigh(self.shape_covariance)
-        by_shape = np.array(
-            [np.full((2, len(value)), np.nan) if fit.by_shape is None else fit.by_shape for fit in self.fits]
-        )
-        return np.asarray(_SWAP @ by_shape @ (axes * np.sqrt(np.maximum(value, 0.0))))
+        none = np.full((2, len(self.shape_covariance)), np.nan)
+        by_shape = np.array([none if fit.by_shape is None else fit.by_shape for fit in self.fits])
+        return np.asarray(_SWAP @ by_shape @ symmetric_root(self.shape_covariance))
 
     def history(self, benchmark: BenchmarkDeflection | None = None) -> DeflectionHistory:
         """History of the deflection, with the benchmark frame undeflected or with a given deflection there.

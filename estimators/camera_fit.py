@@ -180,7 +180,7 @@ class FrameFit:
     shape : FrameShape or None
         None in an assumed plane.
     by_shape : (2, 13) float or None
-        Error per unit error of what the film tells about the shell's shape under load, where it was used.
+        Error per unit error of the shell's shape under load as the film determined it, where that was used.
     """
 
     rotation_yz_rad: FloatArray

@@ -48,7 +48,7 @@ from flightmodel import rotations
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, standard_normals
-from flightmodel.statistics import correlation_root, correlation_root_and_rest
+from flightmodel.statistics import correlation_root, correlation_root_and_rest, symmetric_root
 from flightmodel.vehicle import Vehicle
 
 CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0
@@ -424,11 +424,8 @@ def evidence_of_readings(
     plane_sd_rad: float = 0.0,
 ) -> Evidence:
     """Evidence from lateral vectors ``(n, 2)``, rad, and their covariance ``(n, 2, 2)``; as `evidence_of_history`."""
-    value, axes = np.linalg.eigh(cov)
-    # symmetric square root: smooth in time whatever the order of the eigenvalues
-    root = (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
     light, rest = correlation_root_and_rest(time_s, LIGHT_TIME_S, CONSTANT_PART, _LIGHT_KNOTS_A_TIME)
-    inputs = {method: _rolled(root, light)}
+    inputs = {method: _rolled(symmetric_root(cov), light)}
     if plane_sd_rad > 0.0:
         normal = np.stack([-theta_yz[:, 1], theta_yz[:, 0]], axis=-1)
         inputs[CAMERA_PLANE] = plane_sd_rad * normal[:, :, None]

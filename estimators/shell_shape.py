@@ -2,8 +2,9 @@
 
 The seed paper read a rocking of its shell and could not say whether a local deformation was among it. A frame's fit
 (`estimators.camera_fit`) finds, beside the deflection ``w``, the shell's flattening and its lobes of two to five waves
-round the shell, ``s`` (13), each with a wide a priori sd about zero. Half of the shell is in view: one frame tells
-lobes from rocking poorly. A film tells more, as a shape that yields to the load grows with the dynamic pressure ``q``::
+round the shell, ``s`` (13), each with a wide a priori sd about zero. Half of the shell is in view: one frame separates
+lobes from rocking poorly. A film does better, as a shape that yields to the load grows with the dynamic pressure
+``q``::
 
     s_i = a l_i + f_i,    l_i = (q_i - q_b) / q_max,    f ~ Gauss-Markov with sd sigma
 
@@ -40,13 +41,15 @@ from itertools import chain, combinations, product
 
 import numpy as np
 import pandas as pd
-from scipy.linalg import cho_factor, cho_solve, sqrtm
+from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.special import softmax
 
 from estimators.camera import FilmFit
 from estimators.camera_fit import AprioriSd, FrameFit, OrientedCamera
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.frame_residuals import ROUND_WAVES, WAVES
 from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.statistics import correlation, mixture_moments, paired_covariance, symmetric_root
 
 _PARTS = [(w, f"{w} waves across the shell") for w in WAVES] + [(w, f"{w} waves of its radius") for w in ROUND_WAVES]
 MODES = ("flattening", *(f"{what}, {wave}" for _, what in _PARTS for wave in ("cosine", "sine")))
@@ -61,7 +64,7 @@ CALLED = 0.9  # probability from which an answer is called
 _DETERMINED = 0.5  # of the a priori sd
 LEAST_FRAMES, _MOST_FRAMES = 12, 100
 _LEAST_LOAD = 0.3  # of the film's largest, between frames: less shows no growth
-_JITTER_RAD2 = float(np.deg2rad(1e-4) ** 2)  # where a frame tells nothing of a shape, what it found is exactly zero
+_JITTER_RAD2 = float(np.deg2rad(1e-4) ** 2)  # where a frame shows nothing of a shape, what it found is exactly zero
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,7 @@ def shell_shape(films: list[LoadedFilm]) -> ShellShape:
     Raises
     ------
     GateError
-        Where too few frames, or too equal loads, tell nothing.
+        Where frames are too few, or their loads too equal.
     """
     frames = sum(len(one.rows) for one in films)
     if frames < LEAST_FRAMES:
@@ -203,15 +206,15 @@ def shell_shape(films: list[LoadedFilm]) -> ShellShape:
         )
     prior = mode_sd_rad(films[0].film.oriented.apriori)
     found, respond, camera, frame_part = _stacked(films, loads)
-    told = []
+    by_size = []
     for size in _FRAME_SDS_RAD:
         factor = cho_factor(camera + size**2 * frame_part, lower=True)
         solved = cho_solve(factor, np.column_stack([respond, found]))
         log = -0.5 * float(found @ solved[:, -1]) - float(np.log(np.diag(factor[0])).sum())
-        told.append((log, respond.T @ solved[:, :-1], respond.T @ solved[:, -1]))
+        by_size.append((log, respond.T @ solved[:, :-1], respond.T @ solved[:, -1]))
     answers = [
         _Amplitudes.given(number, size, prior, *one)
-        for (size, one), number in product(zip(_FRAME_SDS_RAD, told, strict=True), range(len(HYPOTHESES)))
+        for (size, one), number in product(zip(_FRAME_SDS_RAD, by_size, strict=True), range(len(HYPOTHESES)))
     ]
     return _mixed(answers, prior, largest)
 
@@ -227,35 +230,27 @@ def _stacked(films: list[LoadedFilm], loads: FloatArray) -> tuple[FloatArray, Fl
     for one in films:
         fits = [one.film.fits[k].shape for k in one.rows]
         formal = np.array([fit.formal[2:, 2:] for fit in fits])
-        share = _share_told(formal, one.film.oriented.apriori)
+        share = _share_found(formal, one.film.oriented.apriori)
         found.append(np.array([fit.found_rad[2:] for fit in fits]).ravel())
         through.append(share)
         noise = share @ formal
         time_s = one.film.time_s[one.rows]
-        apart = np.abs(time_s[:, None] - time_s[None, :])
-        together = CONSTANT_PART + (1.0 - CONSTANT_PART) * np.exp(-apart / LIGHT_TIME_S)
-        root = np.array([np.real(sqrtm(0.5 * (n + n.T))) for n in noise])
-        errors = _pairs(root, together)
+        root = symmetric_root(0.5 * (noise + noise.transpose(0, 2, 1)))
+        errors = paired_covariance(root, correlation(time_s, LIGHT_TIME_S, CONSTANT_PART), root)
         camera = np.concatenate([fit.by_camera[2:] for fit in fits])
         start = np.concatenate([fit.by_benchmark[2:] for fit in fits]) * one.film.oriented.apriori.benchmark_rad
         own.append(errors + camera @ one.film.oriented.posed_covariance @ camera.T + start @ start.T)
         at_s.append(time_s)
     shares, times = np.concatenate(through), np.concatenate(at_s)
-    apart = np.abs(times[:, None] - times[None, :])
     n = len(MODES) * len(times)
     respond = (shares * loads[:, None, None]).reshape(n, len(MODES))
-    covariance, first = _JITTER_RAD2 * np.eye(n), 0
-    for block in own:
-        here = slice(first, first + len(block))
-        covariance[here, here] += block
-        first += len(block)
-    return np.concatenate(found), respond, covariance, _pairs(shares, np.exp(-apart / LIGHT_TIME_S))
-
-
-def _pairs(root: FloatArray, together: FloatArray) -> FloatArray:
-    """Covariance (k n, k n) of ``root_i x_i`` (n, k, k) with a correlation of the ``x`` in time (n, n)."""
-    n, k = len(root), root.shape[1]
-    return np.einsum("iab,ij,jcb->iajc", root, together, root).reshape(k * n, k * n)
+    covariance = block_diag(*own) + _JITTER_RAD2 * np.eye(n)
+    return (
+        np.concatenate(found),
+        respond,
+        covariance,
+        paired_covariance(shares, correlation(times, LIGHT_TIME_S), shares),
+    )
 
 
 @dataclass(frozen=True)
@@ -286,24 +281,16 @@ class _Amplitudes:
 def _mixed(answers: list[_Amplitudes], prior_sd: FloatArray, largest_pa: float) -> ShellShape:
     """Mean and covariance over hypotheses and sizes."""
     log = np.array([one.log_evidence + np.log(_PRIOR[one.number]) for one in answers])
-    weight = np.exp(log - log.max())
-    weight /= weight.sum()
-    mean, covariance = _moments(weight, answers)
+    weight = softmax(log)
+    means, covariances = (np.array(x) for x in zip(*((one.mean, one.covariance) for one in answers), strict=True))
+    mean, covariance = mixture_moments(weight, means, covariances)
     number = np.array([one.number for one in answers])
     with_all = weight * (number == len(HYPOTHESES) - 1)
-    if_any, if_any_cov = _moments(with_all / max(with_all.sum(), 1e-300), answers)
+    if_any, if_any_cov = mixture_moments(with_all / max(with_all.sum(), 1e-300), means, covariances)
     sd = np.sqrt(np.diag(if_any_cov))
     size = float(np.sqrt(weight @ np.array([one.size_rad for one in answers]) ** 2))
     probability = np.bincount(number, weight, len(HYPOTHESES)).astype(float)
     return ShellShape(mean, covariance, if_any, sd, probability, size, sd < _DETERMINED * prior_sd, largest_pa)
-
-
-def _moments(weight: FloatArray, answers: list[_Amplitudes]) -> tuple[FloatArray, FloatArray]:
-    means = np.array([one.mean for one in answers])
-    mean = weight @ means
-    off = means - mean
-    covariance = np.einsum("k,kij->ij", weight, [one.covariance for one in answers]) + (weight * off.T) @ off
-    return mean, covariance
 
 
 def with_shape(one: LoadedFilm, shape: ShellShape) -> FilmFit:
@@ -321,9 +308,9 @@ def _given_shape(fit: FrameFit, load: float, shape: ShellShape, oriented: Orient
     assert fit.shape is not None
     own, modes = fit.shape, slice(2, None)
     information = np.linalg.inv(own.formal)
-    told = information.copy()
-    told[modes, modes] += np.diag(shape.frame_sd_rad**-2.0 - mode_sd_rad(oriented.apriori) ** -2.0)
-    formal = np.linalg.inv(told)[:2]
+    informed = information.copy()
+    informed[modes, modes] += np.diag(shape.frame_sd_rad**-2.0 - mode_sd_rad(oriented.apriori) ** -2.0)
+    formal = np.linalg.inv(informed)[:2]
     by_shape = formal[:, modes] * (load / shape.frame_sd_rad**2)
     again = formal @ information
     answer = again @ own.found_rad + by_shape @ shape.amplitude_rad
@@ -333,6 +320,6 @@ def _given_shape(fit: FrameFit, load: float, shape: ShellShape, oriented: Orient
     return replace(fit, rotation_yz_rad=answer, covariance=covariance, per_benchmark=by_benchmark, by_shape=by_shape)
 
 
-def _share_told(formal: FloatArray, apriori: AprioriSd) -> FloatArray:
-    """``G``: what is found per unit of a true shape, of formal covariances (..., 5, 5)."""
+def _share_found(formal: FloatArray, apriori: AprioriSd) -> FloatArray:
+    """``G``: what is found per unit of a true shape, of formal covariances (..., 13, 13)."""
     return np.eye(formal.shape[-1]) - formal * mode_sd_rad(apriori) ** -2.0

@@ -35,6 +35,27 @@ def correlation(at: FloatArray, length: float, constant_part: float = 0.0) -> Fl
     return constant_part + (1.0 - constant_part) * np.exp(-apart / length)
 
 
+def symmetric_root(covariance: FloatArray) -> FloatArray:
+    """Symmetric roots of covariances ``(..., k, k)``: smooth in time whatever the order of the eigenvalues."""
+    value, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.sqrt(np.maximum(value, 0.0))[..., None, :]) @ np.swapaxes(axes, -1, -2))
+
+
+def paired_covariance(root: FloatArray, together: FloatArray, other: FloatArray) -> FloatArray:
+    """Covariance ``(n k, m k)`` of ``root_i x_i`` (n, k, k) with ``other_j x_j`` (m, k, k), normals ``x`` of unit size.
+
+    ``together`` (n, m): their correlation, the same for each of the k.
+    """
+    return np.einsum("iab,ij,jcb->iajc", root, together, other).reshape(len(root) * root.shape[1], -1)
+
+
+def mixture_moments(weight: FloatArray, means: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean ``(k,)`` and covariance ``(k, k)`` of a mixture of distributions with these ``(n, k)`` and ``(n, k, k)``."""
+    mean = weight @ means
+    off = means - mean
+    return mean, np.einsum("n,nij->ij", weight, covariances) + (weight * off.T) @ off
+
+
 def correlation_root(
     at: FloatArray, length: float, constant_part: float = 0.0, knots_a_length: int = KNOTS_A_LENGTH
 ) -> FloatArray:

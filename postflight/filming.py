@@ -56,7 +56,7 @@ class CameraAnswer:
     benchmarks_s : tuple of float
         Times of the benchmark frames.
     shape : ShellShape or None
-        How the shell's shape followed the load; None where nothing tells (why stands in the assumptions).
+        How the shell's shape followed the load; None where nothing determines it (why stands in the assumptions).
     """
 
     history: DeflectionHistory
@@ -222,16 +222,18 @@ def _with_shell_shape(
             raise GateError("no trajectory was made", "trajectory-missing")
         if flight.camera_plane_lv_rad is not None:
             raise GateError("a plane is assumed", "plane-assumed")
-        air = bet.air
-        at = {
-            name: np.interp(film.time_s, air.time_s, air.dynamic_pressure_pa, left=np.nan, right=np.nan)
-            for name, film in films.items()
-        }
-        loaded = {name: LoadedFilm(film, at[name]) for name, film in films.items()}
+        loaded = {name: _with_pressure(film, bet) for name, film in films.items()}
         shape = shell_shape(list(loaded.values()))
     except GateError as fault:
         return films, None, f"shell's shape: frame by frame, within its a priori sd ({fault})"
     return {name: with_shape(one, shape) for name, one in loaded.items()}, shape, f"shell's shape: {shape.remark}"
+
+
+def _with_pressure(film: FilmFit, bet: Reconstruction) -> LoadedFilm:
+    """Film and dynamic pressure at its frames, NaN outside the trajectory."""
+    air = bet.air
+    at_pa = np.interp(film.time_s, air.time_s, air.dynamic_pressure_pa, left=np.nan, right=np.nan)
+    return LoadedFilm(film, at_pa)
 
 
 def _benchmark(

@@ -200,8 +200,8 @@ def test_a_shape_that_follows_the_load_does_not_pass_for_compliance():
         read = frames.theta_yz_rad + by_shape @ rng.standard_normal(2)
         whole = frames.covariance + by_shape @ by_shape.transpose(0, 2, 1)
         spoilt = replace(frames, theta_yz_rad=read, covariance=whole)
-        for told, rows in ((replace(spoilt, by_shape=by_shape), stated), (spoilt, hidden)):
-            got = benchmark_deflection(told, PULSE, PRIOR_RAD)
+        for given, rows in ((replace(spoilt, by_shape=by_shape), stated), (spoilt, hidden)):
+            got = benchmark_deflection(given, PULSE, PRIOR_RAD)
             rows.append(got.theta_yz_rad - true[0])
     assert np.mean(np.square(stated)) < np.mean(np.square(hidden))
 

@@ -13,6 +13,7 @@ from estimators.edge import NO_FAULT, no_horizon
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.shell_shape import HYPOTHESES, LOBES, MODES, LoadedFilm, mode_sd_rad, shell_shape, with_shape
 from flightmodel.checks import GateError
+from flightmodel.statistics import correlation
 from synthetic_flight.film import Imaging, Scene, Warp
 from synthetic_flight.film import film as rendered
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, sun
@@ -31,7 +32,7 @@ def test_lobes_of_another_renderer_are_found_and_are_no_rocking(shape_deg):
     fit = read.fits[1]
     own, true = fit.shape, D(np.array([*shape_deg, *np.zeros(8)]))
     covariance = own.formal + own.by_camera @ read.oriented.posed_covariance @ own.by_camera.T
-    # thirteen modes, of which half of the shell tells some only together: chi-square, 0.1 %
+    # thirteen modes, of which half of the shell shows some only together: chi-square, 0.1 %
     off = own.found_rad[2:] - true
     assert off @ np.linalg.solve(covariance[2:, 2:], off) < 34.5
     assert own.found_rad[2:] @ np.linalg.solve(covariance[2:, 2:], own.found_rad[2:]) > 200.0
@@ -41,25 +42,24 @@ def test_lobes_of_another_renderer_are_found_and_are_no_rocking(shape_deg):
 def drawn(rng, there, formal_deg=0.05):
     """A film whose errors are drawn as the model states them, its true deflections and amplitudes.
 
-    A frame's points tell (deflection, shape) with random directions poorly told; a camera of twelve errors.
+    A frame's points determine deflection and shape, random directions of them poorly; a camera has twelve errors.
     """
     n, apriori, m = len(TIME_S), AprioriSd(), len(MODES) + 2
     prior, mixed = mode_sd_rad(apriori), rng.standard_normal((m, m))
     points = np.linalg.inv(mixed @ np.diag(D(formal_deg) ** 2 * np.geomspace(0.1, 300.0, m)) @ mixed.T)
-    told = points.copy()
-    told[2:, 2:] += np.diag(prior**-2.0)
-    formal = np.linalg.inv(told)
+    whole = points.copy()
+    whole[2:, 2:] += np.diag(prior**-2.0)
+    formal = np.linalg.inv(whole)
     by_camera = rng.standard_normal((n, m, 12)) * D(0.01) * np.linspace(0.2, 1.0, n)[:, None, None]
     by_benchmark = np.tile(np.eye(m)[:, :2], (n, 1, 1)) + 0.1 * rng.standard_normal((n, m, 2))
     load = (PRESSURE_PA - PRESSURE_PA[0]) / PRESSURE_PA.max()
     waves = [mode.split()[0] for mode in MODES]
     has = np.isin(waves, ["flattening", *(str(w) for name in there for w in LOBES[name])])
     amplitude = has * prior * rng.standard_normal(len(MODES))
-    apart = np.abs(TIME_S[:, None] - TIME_S)
-    own = np.linalg.cholesky(np.exp(-apart / LIGHT_TIME_S)) @ rng.standard_normal((n, len(MODES))) * D(0.03)
+    own = np.linalg.cholesky(correlation(TIME_S, LIGHT_TIME_S)) @ rng.standard_normal((n, len(MODES))) * D(0.03)
     shape = amplitude * load[:, None] + own
     true = np.column_stack([D(4.0) * rng.standard_normal((n, 2)), shape])
-    together = CONSTANT_PART + (1.0 - CONSTANT_PART) * np.exp(-apart / LIGHT_TIME_S)
+    together = correlation(TIME_S, LIGHT_TIME_S, CONSTANT_PART)
     noise = np.linalg.cholesky(together) @ rng.standard_normal((n, m)) @ np.linalg.cholesky(points).T
     camera, start = rng.standard_normal(12), apriori.benchmark_rad * rng.standard_normal(2)
     # the frame's own estimate, pulled towards a shape of zero
