@@ -45,6 +45,7 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 from scipy.linalg.lapack import dpotri
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
+from scipy.sparse import csr_array
 
 from estimators.evidence import (
     LIGHT_TIME_S,
@@ -108,9 +109,10 @@ class Spline:
         return cls(np.asarray(inner), len(full) - 4, np.asarray(full))
 
     @cached_property
-    def curvature(self) -> FloatArray:
-        """Second derivative (knots, count) of every basis function at the knots."""
-        return self.rows(self.knots_s, 2)
+    def stiffness(self) -> FloatArray:
+        """Matrix (2 count, 2 count) of the sum over the knots of both axes' squared second derivatives."""
+        curvature = self.rows(self.knots_s, 2)
+        return np.kron(curvature.T @ curvature, np.eye(2))
 
     def rows(self, time_s: FloatArray, derivative: int = 0) -> FloatArray:
         """Values (n, count) of every basis function, or of its derivative."""
@@ -168,7 +170,7 @@ class NormalEquations:
 
     def solved(self, size_radps2: float, method: str) -> tuple[FloatArray, FloatArray]:
         """Posterior mean and covariance of all unknowns, the process of a size."""
-        prior = np.kron(self._precision(size_radps2), np.eye(2))
+        prior = self.spline.stiffness / size_radps2**2 + np.eye(len(self.right)) / DEFLECTION_SD_RAD**2
         normal = np.block([[self.deflection + prior, self.across], [self.across.T, self.inputs]])
         try:
             factor = cho_factor(normal)[0]
@@ -213,9 +215,7 @@ class NormalEquations:
             factor = self._factor(size, "")
             prior = 0.5 * ((log_size - np.log(SIZE_RADPS2)) / SIZE_LOG_SD) ** 2
             # a determinant is the square of the product of its Cholesky factor's diagonal, the last row of the band
-            # and the process's is that of one axis, twice
-            free = np.log(cholesky_banded(_upper_band(self._precision(size)))[-1]).sum()
-            volume = np.log(factor[-1]).sum() - 2.0 * free
+            volume = np.log(factor[-1]).sum() - np.log(cholesky_banded(self._prior_band(size))[-1]).sum()
             return float(prior + volume - 0.5 * self.right @ cho_solve_banded((factor, False), self.right))
 
         found = minimize_scalar(surprise, bounds=np.log(_SIZES_RADPS2), method="bounded", options={"xatol": 0.05})
@@ -225,16 +225,23 @@ class NormalEquations:
         """Posterior mean of the deflection's coefficients alone."""
         return np.asarray(cho_solve_banded((self._factor(size_radps2, method), False), self.right))
 
-    def _precision(self, size_radps2: float) -> FloatArray:
-        """Of the process's prior, one axis of the spline (count, count)."""
-        curvature = self.spline.curvature / size_radps2
-        return np.asarray(curvature.T @ curvature + np.eye(self.spline.count) / DEFLECTION_SD_RAD**2)
+    @cached_property
+    def _bands(self) -> tuple[FloatArray, FloatArray]:
+        """Upper bands of the deflection's block and of the spline's stiffness, equally wide."""
+        stiffness = self.spline.stiffness
+        width = max(_width(self.deflection), _width(stiffness))
+        return _upper_band(self.deflection, width), _upper_band(stiffness, width)
+
+    def _prior_band(self, size_radps2: float) -> FloatArray:
+        """Upper band of the process's precision."""
+        out = self._bands[1] / size_radps2**2
+        out[-1] += 1.0 / DEFLECTION_SD_RAD**2
+        return out
 
     def _factor(self, size_radps2: float, method: str) -> FloatArray:
         """Cholesky factor of the deflection's block with the process's prior, an upper band."""
-        prior = np.kron(self._precision(size_radps2), np.eye(2))
         try:
-            return np.asarray(cholesky_banded(_upper_band(self.deflection + prior)))
+            return np.asarray(cholesky_banded(self._bands[0] + self._prior_band(size_radps2)))
         except np.linalg.LinAlgError:
             raise _undetermined(method) from None
 
@@ -258,9 +265,13 @@ def _undetermined(method: str) -> DivergenceError:
     return DivergenceError(f"{method}: the readings do not determine the deflection", code="deflection-undetermined")
 
 
-def _upper_band(matrix: FloatArray) -> FloatArray:
+def _width(matrix: FloatArray) -> int:
+    """Number of diagonals above the main one, up to the last that is not zero."""
+    return int(np.max(np.subtract(*np.nonzero(matrix)), initial=0))
+
+
+def _upper_band(matrix: FloatArray, width: int) -> FloatArray:
     """Symmetric matrix (n, n) as the rows of its upper band, the diagonal last."""
-    width = int(np.max(np.subtract(*np.nonzero(matrix)), initial=0))
     out = np.zeros((width + 1, len(matrix)))
     for k in range(width + 1):
         out[width - k, k:] = np.diagonal(matrix, k)
@@ -300,7 +311,7 @@ def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inp
         if name in inputs:
             want -= response @ inputs[name]
     share = means_over_spans(one.time_s[keep], one.averaged_s, one.time_s[keep][0])
-    rows = (share @ rows.reshape(n, -1)).reshape(len(share), 2, -1)
+    rows = (csr_array(share) @ rows.reshape(n, -1)).reshape(len(share), 2, -1)
     cov = np.einsum("bn,nij->bij", share**2, one.independent_cov[keep])
     cov += LEFT_OUT_RAD**2 * LEFT_OUT_TIME_S / one.averaged_s * np.eye(2)
     whiten = np.linalg.inv(np.linalg.cholesky(cov))

@@ -212,6 +212,7 @@ def run_flight(
         event_rows = run_folder.event_table(bet, bet.table)
         show_answers(bet, answers, event_rows)
         stages.end("printing the answers")
+        second.draw_deflections(answers)
         with progress_bar() as report:
             step = steps(report)
             answers = with_increments(answers)
@@ -252,7 +253,6 @@ def _answered(
     stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
         answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
-    second.draw_deflections(answers)
     return bet, answers
 
 

@@ -21,7 +21,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
@@ -120,7 +119,7 @@ def corrections(telemetry: Telemetry, found: Oscillation | None, lag: Lag | None
     if found is None or found.kind not in (ROLL, MIRRORED):
         return []
     # roll: F = k i e^(i phase) W', mirrored: F = k i e^(i phase) conj(W)', so conj(F) = -k i e^(-i phase) W'
-    turn = Rotation.from_rotvec([found.roll_rad, 0.0, 0.0]).as_matrix()
+    turn = rotations.dcm_from_q(rotations.exp(np.array([found.roll_rad, 0.0, 0.0])))
     if found.kind == ROLL:
         words = [f"{name}: mounting about roll" for name in TRIADS]
         return _of_either("triads-axes", words, telemetry, _turned(force, turn.T), _turned(rate, turn))

@@ -142,11 +142,9 @@ def unpacked(triangles: FloatArray, count: int | None = None) -> FloatArray:
     """Symmetric matrices ``(..., c, c)`` from packed lower triangles; of their first ``count`` rows where given."""
     size = int(np.sqrt(2 * triangles.shape[-1]))
     c = size if count is None else count
-    rows, columns = np.tril_indices(c)
-    out = np.empty((*triangles.shape[:-1], c, c))
-    out[..., rows, columns] = triangles[..., : len(rows)]
-    out[..., columns, rows] = triangles[..., : len(rows)]
-    return out
+    row, column = np.indices((c, c))
+    low, high = np.minimum(row, column), np.maximum(row, column)
+    return np.take(triangles, high * (high + 1) // 2 + low, axis=-1)
 
 
 @dataclass(frozen=True)

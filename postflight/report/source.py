@@ -6,7 +6,6 @@ Of long series the smallest and the largest value of each of equal runs of rows 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -56,12 +55,16 @@ Rows = NDArray[np.int64]
 def extreme_rows(values: FloatArray, buckets: int) -> Rows:
     """Rows of the smallest and the largest value ``(n,)`` in each of equal runs of rows, ascending; NaN is no value."""
     edges = np.linspace(0, len(values), buckets + 1).astype(int)
-    found: list[int] = []
-    for low, high in pairwise(edges.tolist()):
-        part = values[low:high]
-        if np.isfinite(part).any():
-            found += [low + int(np.nanargmin(part)), low + int(np.nanargmax(part))]
-    return np.unique(np.array(found, dtype=np.int64))
+    first, last = edges[:-1][np.diff(edges) > 0], edges[1:][np.diff(edges) > 0] - 1
+    if not len(first):
+        return np.empty(0, dtype=np.int64)
+    # a bucket a row; in the shorter ones the last value stands twice
+    rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
+    part = values[rows]
+    known = np.isfinite(part)
+    lowest, highest = np.where(known, part, np.inf).argmin(axis=1), np.where(known, part, -np.inf).argmax(axis=1)
+    there, every = known.any(axis=1), np.arange(len(first))
+    return np.unique(np.concatenate([rows[every, lowest][there], rows[every, highest][there]]))
 
 
 def kept_rows(columns: list[FloatArray], limit: int) -> Rows:
