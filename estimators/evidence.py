@@ -47,7 +47,13 @@ from estimators.loads import FlightLoads, lateral_and_size
 from flightmodel import rotations
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
 from flightmodel.checks import BoolArray, FloatArray
-from flightmodel.deflection import DeflectionHistory, history_from_lateral, standard_normals
+from flightmodel.deflection import (
+    QUANTILES,
+    DeflectionHistory,
+    history_from_lateral,
+    length_quantiles,
+    standard_normals,
+)
 from flightmodel.statistics import correlation_root, correlation_root_and_rest, symmetric_root
 from flightmodel.vehicle import Vehicle
 
@@ -471,11 +477,11 @@ def history_of_evidence(evidence: Evidence, loads: FlightLoads, assumptions: str
     theta_yz[rows] = evidence.mean_yz_rad
     swinging = _oscillation_var(evidence)[:, None, None] * np.eye(2)
     cov[rows] = evidence.covariance + swinging
-    draws = None
+    quantiles = None
     if evidence.half_curvature_rad is not None:
-        draws = np.full((n, len(standard_normals(3)), 2), np.nan)
-        draws[rows] = _curved_draws(evidence, swinging)
-    return history_from_lateral(loads.time_s, theta_yz, cov, evidence.method, assumptions, draws)
+        quantiles = np.full((n, len(QUANTILES)), np.nan)
+        quantiles[rows] = length_quantiles(_curved_draws(evidence, swinging))
+    return history_from_lateral(loads.time_s, theta_yz, cov, evidence.method, assumptions, quantiles)
 
 
 def _curved_draws(evidence: Evidence, swinging: FloatArray) -> FloatArray:

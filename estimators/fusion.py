@@ -112,7 +112,7 @@ class Spline:
     def stiffness(self) -> FloatArray:
         """Matrix (2 count, 2 count) of the sum over the knots of both axes' squared second derivatives."""
         curvature = self.rows(self.knots_s, 2)
-        return np.kron(curvature.T @ curvature, np.eye(2))
+        return np.asarray(np.kron(curvature.T @ curvature, np.eye(2)), dtype=float)
 
     def rows(self, time_s: FloatArray, derivative: int = 0) -> FloatArray:
         """Values (n, count) of every basis function, or of its derivative."""

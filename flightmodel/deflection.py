@@ -72,8 +72,8 @@ class DeflectionHistory(Tabular):
         ``"camera"``, ``"misalignment"``, ``"trim"``, ``"fused"`` or ``"truth"``.
     assumptions : str
         In words.
-    draws_yz_rad : (n, k, 2) float or None
-        Lateral vectors drawn from a posterior that is not Gaussian; None: the covariance says it all.
+    curved_quantiles_rad : (n, 5) float or None
+        `QUANTILES` of the angle, of a posterior that is not Gaussian; None: the covariance says it all.
     """
 
     time_s: FloatArray
@@ -82,7 +82,7 @@ class DeflectionHistory(Tabular):
     covariance: FloatArray | None
     method: str
     assumptions: str = field(default="")
-    draws_yz_rad: FloatArray | None = field(default=None, compare=False)
+    curved_quantiles_rad: FloatArray | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         """Check shapes and time order once."""
@@ -141,15 +141,15 @@ class DeflectionHistory(Tabular):
 
         The length of a lateral vector is not normal: near zero a sd says too little of it, and it is never negative.
         """
-        if self.draws_yz_rad is not None:
-            return np.asarray(np.quantile(np.linalg.norm(self.draws_yz_rad, axis=2), QUANTILES, axis=1).T)
+        if self.curved_quantiles_rad is not None:
+            return self.curved_quantiles_rad
         out = np.full((len(self.time_s), len(QUANTILES)), np.nan)
         cov = self.lateral_cov_without_plane
         known = np.isfinite(cov[:, 0, 0]) & np.isfinite(self.theta_rad)
         value, axes = np.linalg.eigh(cov[known])
         root = axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]
         drawn = self.theta_yz_rad[known][:, None, :] + standard_normals(2) @ root.transpose(0, 2, 1)
-        out[known] = np.quantile(np.linalg.norm(drawn, axis=2), QUANTILES, axis=1).T
+        out[known] = length_quantiles(drawn)
         return out
 
     @property
@@ -309,17 +309,22 @@ def polar_from_lateral(
     return size, plane, cov
 
 
+def length_quantiles(drawn: FloatArray) -> FloatArray:
+    """`QUANTILES` ``(n, 5)`` of the lengths of vectors ``(n, k, 2)`` drawn from n distributions."""
+    return np.asarray(np.quantile(np.linalg.norm(drawn, axis=2), QUANTILES, axis=1).T)
+
+
 def history_from_lateral(
     time_s: FloatArray,
     theta_yz_rad: FloatArray,
     covariance_yz: FloatArray,
     method: str,
     assumptions: str,
-    draws_yz_rad: FloatArray | None = None,
+    curved_quantiles_rad: FloatArray | None = None,
 ) -> DeflectionHistory:
     """History from lateral deflection vectors ``(n, 2)`` in body y, z and their covariance ``(n, 2, 2)``, rad.
 
     Rows that hold NaN stay NaN.
     """
     theta, plane, cov = polar_from_lateral(theta_yz_rad, covariance_yz)
-    return DeflectionHistory(time_s, theta, plane, cov, method, assumptions, draws_yz_rad)
+    return DeflectionHistory(time_s, theta, plane, cov, method, assumptions, curved_quantiles_rad)

@@ -581,8 +581,8 @@ def _iterate(
     if settings.passes > 0:
         report(0.02, "first passes on thinned data")
         reference, found = _first_reference(problem, settings)
-    most = max(1, settings.passes)
-    for i in range(most):
+    most, i = max(1, settings.passes), 0
+    while True:
         share = 0.85 / most
         report(0.1 + share * i, f"filter, pass {i + 1}")
         run, found = _follow_track(problem, reference, settings, found)
@@ -591,10 +591,11 @@ def _iterate(
         kept = np.flatnonzero(problem.kept)
         moved = np.abs(smoothed.x[kept]) / np.sqrt(np.maximum(smoothed.variance, 1e-300))
         smoothed_states = smoothed.states(run.charts)
-        if moved.max() < _CONVERGED_SD:
-            break
+        i += 1
+        if moved.max() < _CONVERGED_SD or i == most:
+            return run, smoothed, smoothed_states, i, found
         reference = _bounded_drivers(problem, smoothed_states)
-    return run, smoothed, smoothed_states, i + 1, found
+        del run, smoothed  # as large as all else together, and the next pass makes its own
 
 
 def _follow_track(
