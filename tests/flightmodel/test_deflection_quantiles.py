@@ -11,16 +11,18 @@ from flightmodel.deflection import (
     _clear_minima,
     cycle_about,
     history_from_lateral,
+    length_quantiles,
     mean_over,
 )
 
 SD = np.deg2rad(0.2)
 
 
-def history(size_rad, sd=SD, draws=None):
+def history(size_rad, sd=SD, drawn=None):
     yz = np.array([[0.6, 0.8]]) * np.atleast_1d(size_rad)[:, None]
     cov = np.tile(sd**2 * np.eye(2), (len(yz), 1, 1))
-    return history_from_lateral(430.0 + np.arange(len(yz)), yz, cov, "fused", "", draws)
+    quantiles = None if drawn is None else length_quantiles(drawn)
+    return history_from_lateral(430.0 + np.arange(len(yz)), yz, cov, "fused", "", quantiles)
 
 
 @pytest.mark.parametrize("size_deg", [0.0, 0.1, 0.5, 2.0])
@@ -42,7 +44,7 @@ def test_of_an_ellipse_along_the_deflection_they_are_normal():
 def test_draws_of_a_posterior_with_a_tail_are_taken_as_they_are():
     drawn = np.zeros((1, 1000, 2))
     drawn[0, :, 1] = -np.deg2rad(np.linspace(0.0, 10.0, 1000) ** 2)
-    one = history(np.deg2rad(25.0), draws=drawn)
+    one = history(np.deg2rad(25.0), drawn=drawn)
     np.testing.assert_allclose(np.rad2deg(one.theta_quantiles_rad[0]), (10.0 * np.array(QUANTILES)) ** 2, rtol=1e-2)
 
 
