@@ -5,10 +5,10 @@ entry, vehicle, start and all errors dispersed, as in `tests.recon.dispersed`:
 
 - ``range-rate``: both radars also give range rates (0.05 m/s white, 0.2 m/s that lasts 5 s), ten a second;
 - ``velocity``: instead of radars a receiver at 10 Hz (0.1 m/s white, 0.3 m/s that lasts 5 s);
-- ``servo HZ SD_DEG TAU_S``: the radars' angles follow the target as a second-order servo (Butterworth).
+- ``servo HZ LAG_SD``: the radars' angles follow the target as a second-order servo (Butterworth), and its lag is off by
+  a fraction of LAG_SD.
 
-Each is reconstructed as stated by the scenario, and with the slow error taken out of the flight file; for a servo, of
-which the file has no word, with a wander of the angles of a size and duration given as SD_DEG TAU_S. Printed: rms of
+Each is reconstructed as stated by the scenario, and with the slow error taken out of the flight file. Printed: rms of
 error over sd by group, over six epochs about the peak; mean NIS of each tracker over its degrees of freedom; red
 checks. About 15 s a flight.
 """
@@ -37,14 +37,14 @@ RECEIVER = {
 DOPPLER = {"range_rate_sd_mps": 0.05, "range_rate_wander_mps": 0.2, "range_rate_wander_time_constant_s": 5.0}
 
 
-def scenario_of(case, seed, servo_hz):
+def scenario_of(case, seed, servo):
     """The dispersed reference entry with one case's trackers."""
     scenario = dispersed.dispersed_scenario("irve2_reference", seed)
     spec = scenario.spec
     if case == "velocity":
         update = {"radars": {}, "gnss": {"receiver": Gnss(**RECEIVER)}}
     else:
-        terms = {"rate_hz": RATE_HZ} | (DOPPLER if case == "range-rate" else {"angle_servo_hz": servo_hz})
+        terms = {"rate_hz": RATE_HZ} | (DOPPLER if case == "range-rate" else servo)
         update = {"radars": {name: radar.model_copy(update=terms) for name, radar in spec.radars.items()}}
     return replace(scenario, spec=spec.model_copy(update=update))
 
@@ -56,15 +56,13 @@ def restated(telemetry, **sizes):
     return replace(telemetry, radars=radars, gnss=gnss)
 
 
-def ways_of(case, telemetry, wander):
+def ways_of(case, telemetry):
     """Telemetry by how the slow error is stated."""
     if case == "range-rate":
         return {"stated": telemetry, "not stated": restated(telemetry, range_rate_wander_sd_mps=0.0)}
     if case == "velocity":
         return {"stated": telemetry, "not stated": restated(telemetry, velocity_wander_sd_mps=0.0)}
-    sd_deg, tau_s = wander
-    stated = restated(telemetry, wander_sd_rad=np.deg2rad(sd_deg), wander_time_constant_s=tau_s)
-    return {"as wander": stated, "not stated": telemetry}
+    return {"stated": telemetry, "not stated": restated(telemetry, angle_servo_hz=0.0, servo_lag_sd=0.0)}
 
 
 def scored(telemetry, truth):
@@ -82,17 +80,17 @@ def scored(telemetry, truth):
 def main():
     case, *rest = sys.argv[1:]
     numbers = [float(a) for a in rest]
-    servo_hz, wander = 0.0, (0.0, 1.0)
+    servo = {}
     if case == "servo":
-        servo_hz, wander, numbers = numbers[0], tuple(numbers[1:3]), numbers[3:]
+        servo, numbers = {"angle_servo_hz": numbers[0], "servo_lag": numbers[1]}, numbers[2:]
     first, last = map(int, numbers or (0, 12))
     normal, errors, innovations, red = {}, {}, {}, {}
     for seed in range(first, last):
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary) / "flight"
-            truth = simulate_to_folder(scenario_of(case, seed, servo_hz), seed, folder)
+            truth = simulate_to_folder(scenario_of(case, seed, servo), seed, folder)
             telemetry = read_flight(folder)
-        for way, given in ways_of(case, telemetry, wander).items():
+        for way, given in ways_of(case, telemetry).items():
             one, error, nis, reds = scored(given, truth)
             innovations.setdefault(way, []).append(nis)
             normal.setdefault(way, []).append(one)

@@ -22,7 +22,7 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, Field, create_model, model_validator
+from pydantic import AfterValidator, BaseModel, Field, create_model, model_validator
 
 from flightmodel.checks import Fault, FloatArray
 from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place, Section
@@ -30,6 +30,14 @@ from flightmodel.geoid import undulation_m
 from flightmodel.tables import Declared, Source
 from flightmodel.thinning import Thinning
 
+
+def _none_or_some(hertz: float) -> float:
+    if 0.0 < hertz < 1e-3:
+        raise ValueError("0 for none, or at least 0.001 Hz is wanted")
+    return hertz
+
+
+Bandwidth = Annotated[float, Field(ge=0.0, le=1e5), AfterValidator(_none_or_some)]
 Sd = Annotated[float, Field(ge=1e-12, le=1e6)]  # its square is a number that can be divided by
 SdOrNone = Annotated[float, Field(ge=0.0, le=1e6)]
 SlowClock = Annotated[float, Field(ge=0.0, le=60.0)]
@@ -297,6 +305,8 @@ class RadarSite:
         As in the flight file.
     latitude_rad, longitude_rad, height_m : float
         WGS-84.
+    angle_servo_hz : float
+        Bandwidth of the servo with which the antenna follows the target (`recon.tracking_servo`); 0: it does not lag.
 
     All others are standard deviations, one row each.
     """
@@ -370,9 +380,15 @@ class RadarSite:
         time_constant=("range_wander_time_constant_s", 20.0, "range_wander_time_constant_s"),
     )  # fmt: skip
     range_wander_time_constant_s: float = 20.0
+    # of the angles behind an accelerating target: a fraction of the lag that the servo's bandwidth makes
+    servo_lag_sd: float = error_row(
+        "1", 0.0, Annotated[float, Field(ge=0.0, le=10.0)], at=0.0, states=("servo lag",), simulated=None,
+        left_out=True, physical=(-1.0, np.inf),
+    )  # fmt: skip
     # white noise of one angle, where the two differ; azimuth's normal to the line of sight too
     azimuth_sd_rad: float | None = error_row("rad", None, Sd, at=None)
     elevation_sd_rad: float | None = error_row("rad", None, Sd, at=None)
+    angle_servo_hz: float = 0.0
 
     @property
     def angles_sd_rad(self) -> tuple[float, float]:
@@ -662,11 +678,20 @@ class RadarEntry(TrackingSource):
     longitude_deg: Annotated[float, Field(ge=-360.0, le=360.0)]
     height_m: Annotated[float, Field(ge=-1e3, le=1e5)]
     tracks: Literal["cg", "datum"] = "cg"
+    angle_servo_hz: Bandwidth = 0.0
 
     @property
     def components(self) -> tuple[str, ...]:
         """What ``every_s`` may name."""
         return self.measures
+
+    @model_validator(mode="after")
+    def _lag_has_a_servo(self) -> RadarEntry:
+        stated = getattr(self, "servo_lag_sd", 0.0)
+        if stated > 0.0 and self.angle_servo_hz == 0.0:
+            words = "a fraction of the servo's lag: state its bandwidth, angle_servo_hz, too"
+            raise KeyFaults([("servo_lag_sd", stated, words)])
+        return self
 
 
 @with_keys(SITES.file_keys())

@@ -102,7 +102,10 @@ def read_radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
     gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in measured), read))
     gate.findings.extend(oversampled(name, table.time_s, source.every_s, source.components))
     place = np.deg2rad([source.latitude_deg, source.longitude_deg])
-    site = RadarSite(name, float(place[0]), float(place[1]), source.height_m, **RADAR.from_file(source))
+    site = RadarSite(
+        name, float(place[0]), float(place[1]), source.height_m, **RADAR.from_file(source),
+        angle_servo_hz=source.angle_servo_hz,
+    )  # fmt: skip
     sd = _columns(table, [q.short for q in tables.TRACKER_SD]) if there else None
     rate = table.columns.get("range_rate")
     return RadarRecord(site, table.time_s, values, source.tracks, source.every_s, rate, sd)

@@ -24,7 +24,7 @@ from flightmodel._kernels import (
 from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
-SLOTS = 22
+SLOTS = 23
 
 
 @merged
@@ -119,7 +119,10 @@ def site_partials(site, dcm_ned_ecef, north, east, down, out):
 
 @inlined
 def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
-    """Range, azimuth, elevation and partials (3, 3) by the observed point; ``known[0]`` is the site's refractivity."""
+    """Range, azimuth, elevation and partials (3, 3) by the observed point.
+
+    ``known`` (3,) are the site's refractivity and the servo's lag of azimuth and elevation.
+    """
     ned = np.empty(3)
     for i in range(3):
         ned[i] = 0.0
@@ -155,6 +158,7 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
     by_error[0, 12] = slant
     by_error[1, 16], by_error[1, 20] = 1.0, 1.0
     by_error[0, 21] = 1.0
+    by_error[1, 22], by_error[2, 22] = known[1], known[2]
     # the errors themselves change with azimuth and elevation: near the horizon that of the refraction by a tenth
     by_tilt = cos_az * e[4] + sin_az * e[5]
     cosecant_square = 1.0 / (sin_el * sin_el) if sin_el > 0.035 else sin_el / 0.035
@@ -164,7 +168,7 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
          sec * sec * (e[8] - by_tilt) + sec * tan * (e[7] + e[9])),
         (0.0, by_tilt, 1.0 - sin_el * e[6] - known[0] * cosecant_square * e[11]),
     )  # fmt: skip
-    h[0], h[1], h[2] = slant, math.atan2(east, north), math.atan2(-down, horizontal)
+    h[0], h[1], h[2] = slant, math.atan2(east, north) + known[1], math.atan2(-down, horizontal) + known[2]
     for i in range(3):
         for j in range(SLOTS):
             if j != 3:

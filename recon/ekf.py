@@ -68,7 +68,8 @@ class Observed(NamedTuple):
     value, variance : (M, 3) float
         Variance is infinite where a component was not measured.
     known : (M, 3) float
-        Field or direction to the Sun, Earth-fixed axes; of a radar, the refractivity at its site first.
+        Field or direction to the Sun, Earth-fixed axes; of a radar, the refractivity at its site, and the lag of both
+        angles behind the path about which the filter is linearised.
     usable : (M,) bool
         Whether the filter may use it at all.
     """

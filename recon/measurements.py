@@ -7,7 +7,8 @@ tag minus true time), so
 
 with ``w`` the body's rate against the Earth and ``a`` the acceleration. Then, each plus its errors and noise:
 
-* radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95), residual
+* radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95), the lag of its servo
+  (`recon.tracking_servo`, ``1 + e`` times the one of the path about which one is linearised), residual
   refraction, ``N cot(E)`` for a ray through the whole atmosphere, and errors of the site's survey, its own and those
   common to all sites: with a stated place ``d`` off the true one, ``r = (1 - rho x) (R (p - site) + d)``, where ``rho``
   is the turn of north, east and down over ``d`` on the Earth;
@@ -30,7 +31,7 @@ scatter by ``angle_sd`` at any elevation. The numpy form below serves the filter
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -70,7 +71,7 @@ COMPONENTS = {
 }
 _STATES = instruments.RADAR.states
 _RANGE_RATE_AT = _STATES.index("range rate bias")  # a reading of its own, with two errors
-_OWN_RADAR, _DOPPLER, _LAST = _STATES[:_RANGE_RATE_AT], _STATES[_RANGE_RATE_AT:-1], _STATES[-1:]
+_OWN_RADAR, _DOPPLER, _LAST = _STATES[:_RANGE_RATE_AT], _STATES[_RANGE_RATE_AT:-2], _STATES[-2:]
 # time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
     RADAR: (*_OWN_RADAR, *instruments.SITES.states, *_LAST),
@@ -121,6 +122,8 @@ class Instrument:
         Of rows of one group closer than this some are predicted, not used.
     labels : tuple of str
         Names of its components where they are not those of its kind.
+    servo_hz : float
+        Bandwidth of a radar's servo; 0 for none.
     """
 
     name: str
@@ -136,6 +139,7 @@ class Instrument:
     group: IntArray
     spacing_s: FloatArray
     labels: tuple[str, ...] = ()
+    servo_hz: float = 0.0
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -205,10 +209,11 @@ def radar_instrument(
     known = np.tile([_SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
     place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m, planet)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
-    return instrument_of(
+    made = instrument_of(
         name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known,
         _spacing(record, "range", "az", "el"),
     )  # fmt: skip
+    return replace(made, servo_hz=site.angle_servo_hz)
 
 
 def range_rate_instrument(
@@ -407,6 +412,7 @@ def _radar(
     by_error[0, 12] = slant
     by_error[1, [16, 20]] = 1.0
     by_error[0, 21] = 1.0
+    by_error[1:, 22] = known[1:]
     # the errors themselves change with azimuth and elevation
     g = np.eye(3) + np.diag([e[12], 0.0, 0.0])
     g[1, 1] += tan * (np.sin(az) * e[4] - np.cos(az) * e[5])
@@ -415,7 +421,7 @@ def _radar(
     cosecant_square = 1.0 / np.sin(el) ** 2 if np.sin(el) > 0.035 else np.sin(el) / 0.035
     g[2, 2] -= np.sin(el) * e[6] + known[0] * cosecant_square * e[11]
     others = np.delete(np.arange(SLOTS), 3)
-    h = np.array([slant, az, el]) + by_error[:, others] @ e[others]
+    h = np.array([slant, az + known[1], el + known[2]]) + by_error[:, others] @ e[others]
     by_error[:, 13:16] = by_error[:, 17:20] = g @ partials @ moved
     return h, g @ partials @ instrument.dcm
 

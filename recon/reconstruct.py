@@ -74,6 +74,7 @@ from recon.setup import InertialSensors, build_problem
 from recon.single_faults import Single, SingleFault
 from recon.smoother import Smoothed
 from recon.state import INERTIAL, KINEMATIC, ROTATION, States, unpacked
+from recon.tracking_servo import with_servo_lag
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
 _THINNED_STEP_S = 0.5
@@ -244,6 +245,7 @@ def _log_likelihood(one: Single, problem: Problem, coarse: Settings) -> tuple[fl
     thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(_THINNED_STEP_S)
     reference = None
     for k in range(_MOST_THINNED_PASSES):
+        thinned = with_servo_lag(thinned, reference)
         run = ekf.forward(thinned, reference, coarse.engine)
         smoothed = smoother.smooth(thinned, run, False, coarse.engine)
         moved = np.abs(smoothed.x[:, ROTATION]).max() if k else np.inf
@@ -377,7 +379,7 @@ def reconstruct_once(
     report(0.0, "bridging gaps")
     sensors = bridge_inertial_sensors(telemetry, adaptation)
     problem = _adapted_problem(telemetry, settings, sensors, adaptation)
-    run, smoothed, reference, passes, spans = _iterate(problem, settings, report)
+    problem, run, smoothed, reference, passes, spans = _iterate(problem, settings, report)
     screened = _screened(telemetry, problem, run, sensors, adaptation)
     known = adaptation.jumps or (), adaptation.rejected_offsets or ()
     if (screened.jumps, screened.rejected_offsets) != known:
@@ -473,7 +475,7 @@ class Linearised:
             force = imu_screening.with_noise(sensors.force, telemetry.accelerometer.spec.noise_sd)
             sensors = InertialSensors(force, imu_screening.with_noise(sensors.rate, telemetry.rates.spec.noise_sd))
         problem = _adapted_problem(telemetry, settings, sensors, self.adaptation)
-        return with_unmodelled(problem, self.unmodelled)
+        return with_unmodelled(with_servo_lag(problem, self.states), self.unmodelled)
 
 
 def linearised(telemetry: Telemetry, settings: Settings) -> Linearised:
@@ -481,7 +483,7 @@ def linearised(telemetry: Telemetry, settings: Settings) -> Linearised:
     adaptation = reconstruct_once(telemetry, settings).adaptation
     sensors = bridge_inertial_sensors(telemetry, adaptation)
     problem = _adapted_problem(telemetry, settings, sensors, adaptation)
-    _, _, states, _, unmodelled = _iterate(problem, settings, lambda _fraction, _what: None)
+    *_, states, _, unmodelled = _iterate(problem, settings, lambda _fraction, _what: None)
     return Linearised(states, adaptation, unmodelled, sensors)
 
 
@@ -574,8 +576,8 @@ def _series(
 
 def _iterate(
     problem: Problem, settings: Settings, report: Progress
-) -> tuple[ekf.ForwardPass, Smoothed, States, int, tuple[UnmodelledAcceleration, ...]]:
-    """Last forward pass, smoothed errors and states, how often it ran, spans of unmodelled acceleration."""
+) -> tuple[Problem, ekf.ForwardPass, Smoothed, States, int, tuple[UnmodelledAcceleration, ...]]:
+    """Problem with its radars' lag, last forward pass, smoothed errors and states, passes, unmodelled accelerations."""
     reference = None
     found: tuple[UnmodelledAcceleration, ...] = ()
     if settings.passes > 0:
@@ -585,6 +587,7 @@ def _iterate(
     while True:
         share = 0.85 / most
         report(0.1 + share * i, f"filter, pass {i + 1}")
+        problem = with_servo_lag(problem, reference)
         run, found = _follow_track(problem, reference, settings, found)
         report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
         smoothed = smoother.smooth(problem, run, True, settings.engine)
@@ -593,7 +596,7 @@ def _iterate(
         smoothed_states = smoothed.states(run.charts)
         i += 1
         if moved.max() < _CONVERGED_SD or i == most:
-            return run, smoothed, smoothed_states, i, found
+            return problem, run, smoothed, smoothed_states, i, found
         reference = _bounded_drivers(problem, smoothed_states)
         del run, smoothed  # as large as all else together, and the next pass makes its own
 
@@ -630,6 +633,7 @@ def _first_reference(problem: Problem, settings: Settings) -> tuple[States, tupl
     reference = None
     found: tuple[UnmodelledAcceleration, ...] = ()
     for k in range(_MOST_THINNED_PASSES):
+        thinned = with_servo_lag(thinned, reference)
         run, found = _follow_track(thinned, reference, settings, found)
         if k == 0 and problem.motion.ballistic and track_is_lost(thinned, run):
             # after a long gap the filter's prediction is far from the track: linearise about the tracking data

@@ -34,6 +34,7 @@ _NOISIER = 10.0
 _G, _DEGREE = earth.STANDARD_GRAVITY_MPS2, np.pi / 180.0
 _UNIT_SLIPS = {"accelerometer": (_G, 1.0 / _G), "rates": (_DEGREE, 1.0 / _DEGREE)}
 _REFRACTION_SD = 1.0  # of the whole correction
+_SERVO_HZ, _SERVO_LAG_SD = 0.5, 3.0  # the lag goes with 1 / Hz^2: from none to that of a quarter of a hertz within 1 sd
 _PRIOR_SD_RAD = np.deg2rad(30.0)  # a linear filter converges from so far; starts a quarter turn apart reach everything
 _LEAST_GAIN = np.log(100.0)  # over the flight as stated, of which a check has failed already
 _LARGEST_MISFIT = 1.3  # of the mean normalised innovation squared of some hundred points, 4 sd
@@ -176,6 +177,11 @@ def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, f
             name: replace(r, site=replace(r.site, refraction_sd=_REFRACTION_SD)) for name, r in telemetry.radars.items()
         }
         out.append(Single("refraction", "refraction of the radars", tuple(bent), replace(telemetry, radars=bent)))
+        slow = {
+            name: replace(r, site=replace(r.site, angle_servo_hz=_SERVO_HZ, servo_lag_sd=_SERVO_LAG_SD))
+            for name, r in telemetry.radars.items()
+        }
+        out.append(Single("servo-lag", "servo of the radars", tuple(slow), replace(telemetry, radars=slow)))
     return out + _attitudes(telemetry) + _slips(telemetry)
 
 

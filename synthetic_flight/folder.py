@@ -290,6 +290,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
             *(['measures = ["range", "az", "el", "range_rate"]'] if radar.range_rate_sd_mps > 0.0 else []),
             *stated_errors(RADAR, radar),
             *([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []),
+            *([f"angle_servo_hz = {radar.angle_servo_hz}"] if radar.angle_servo_hz > 0.0 else []),
             *stated_errors(RADAR, radar, if_there=True),
         ]
     for name, receiver in spec.gnss.items():

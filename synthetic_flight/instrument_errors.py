@@ -18,7 +18,7 @@ from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from flightmodel import rotations
 from flightmodel.checks import BoolArray, FloatArray
@@ -43,6 +43,7 @@ from flightmodel.instruments import (
     RADAR,
     RATES,
     SUN,
+    Bandwidth,
     InstrumentTable,
     Size,
     with_keys,
@@ -224,14 +225,7 @@ def quantised(values: FloatArray, limit: tuple[float, float, float] | None, reso
     return counts * resolution
 
 
-def _none_or_some(hertz: float) -> float:
-    if 0.0 < hertz < 1e-3:
-        raise ValueError("0 for none, or at least 0.001 Hz is wanted")
-    return hertz
-
-
 RangeError = Annotated[float, Field(ge=0.0, le=1e4)]
-Bandwidth = Annotated[float, Field(ge=0.0, le=1e5), AfterValidator(_none_or_some)]
 Delay = Annotated[float, Field(ge=-10.0, le=10.0)]
 Limit = Annotated[float, Field(gt=0.0, le=1e6)]
 Offset = Annotated[float, Field(ge=-10.0, le=10.0)]

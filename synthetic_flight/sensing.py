@@ -260,7 +260,10 @@ def sense_radar(
     noise_sd = np.array([size["range_sd_m"][0], *[size["angle_sd_rad"][0]] * 2])
     noise = noise_sd * rng.standard_normal(arrived.shape)
     noise[:, 1] /= np.cos(arrived[:, 2])
-    observed = in_air(arrived, spec) + servo_lag(truth, spec, seen_at)
+    # the data sheet's bandwidth is not exactly the servo's
+    off = size["servo_lag_sd"][0]
+    lag = 1.0 + (off * child(rng, "servo lag").standard_normal() if off > 0.0 else 0.0)
+    observed = in_air(arrived, spec) + lag * servo_lag(truth, spec, seen_at)
     measured = observed + pedestal_errors(observed, spec, rng) + wander(at, observed, spec, rng) + bias + noise
     steps = (spec.range_resolution_m, *np.deg2rad([spec.angle_resolution_deg] * 2))
     for column, step in enumerate(steps):
