@@ -65,8 +65,10 @@ def servo_lag(instrument: Instrument, time_s: FloatArray, states: States, at_s: 
     c = rotations.dcm_from_q(states.q_ecef_body)
     point = CubicHermiteSpline(time_s, states.position_ecef_m + c @ instrument.arm_body_m, states.velocity_ecef_mps)
     step_s = float(np.clip(1.0 / (_STEPS_A_PERIOD * instrument.servo_hz), *_STEPS_S))
-    even_s = np.arange(time_s[0], time_s[-1] + step_s, step_s)
-    ned = (point(np.minimum(even_s, time_s[-1])) - instrument.site_ecef_m) @ instrument.dcm.T
+    even_s, step_s = np.linspace(
+        time_s[0], time_s[-1], 1 + int(np.ceil((time_s[-1] - time_s[0]) / step_s)), retstep=True
+    )
+    ned = (point(even_s) - instrument.site_ecef_m) @ instrument.dcm.T
     north, east, down = ned.T
     elevation = np.arctan2(-down, np.hypot(north, east))
     angles = np.column_stack([np.unwrap(np.arctan2(east, north)), elevation])

@@ -57,6 +57,7 @@ ERRORS = {
         2.0,
         -1e-4,
         -6.0,
+        0.4,
     ],
     POSITION: [3.0, -4.0, 5.0, 0.02],
     VELOCITY: [0.2, -0.3, 0.1, 0.02],
@@ -66,7 +67,7 @@ ERRORS = {
     SUN: [0.004, -0.003, 0.0, 0.0, 0.01, -0.02, 0.015],
 }
 KNOWN = {
-    RADAR: [3.2e-4, 0.0, 0.0],
+    RADAR: [3.2e-4, 4e-4, -3e-4],
     FIELD: [1.2e-5, -2.1e-5, 0.7e-5],
     SUN: [0.3, -0.8, np.sqrt(1.0 - 0.09 - 0.64)],
 }
@@ -228,7 +229,7 @@ def test_radar_sees_the_tracked_point_at_the_true_time():
     turn = RATE - c.T @ earth.OMEGA_ECEF_RADPS
     point = position + c @ ARM - 2.5e-3 * (velocity + c @ np.cross(turn, ARM)) + 0.5 * 2.5e-3**2 * ACCELERATION
     z = earth.radar_from_ecef(point, LATITUDE, LONGITUDE, HEIGHT_M)
-    assert np.allclose(wrapped(RADAR, h - z), [4.0, 2e-4, -1e-4], rtol=1e-6)
+    assert np.allclose(wrapped(RADAR, h - z), np.array([4.0, 2e-4, -1e-4]) + [0.0, *KNOWN[RADAR][1:]], rtol=1e-6)
 
 
 def test_a_time_bias_follows_the_flight_to_second_order(mini_truth):
