@@ -425,6 +425,15 @@ class Radar(Section):
             raise KeyFaults([(key, getattr(self, key), words) for key in given])
         return self
 
+    @model_validator(mode="after")
+    def _lag_has_a_servo(self) -> Radar:
+        off = getattr(self, "servo_lag", 0.0)
+        if off > 0.0 and self.angle_servo_hz == 0.0:
+            raise KeyFaults(
+                [("servo_lag", off, "of a servo that is not there: state its bandwidth, angle_servo_hz, too")]
+            )
+        return self
+
     @property
     def refraction_left(self) -> float:
         """Size of the part of refraction that the range's correction leaves."""

@@ -82,7 +82,8 @@ def test_a_flight_too_short_for_its_telemetry_says_so(tmp_path, short):
 def test_the_folder_states_every_error_that_its_trackers_were_given(tmp_path, short):
     """An error that the simulator draws and the folder is silent about makes every error bar too small."""
     first = short.spec.radars["wallops_island"]
-    radar = first.model_copy(update={key: 0.01 for key in RADAR.scenario_keys() if key != "refraction_left"})
+    sizes = {key: 0.01 for key in RADAR.scenario_keys() if key != "refraction_left"}
+    radar = first.model_copy(update=sizes | {"angle_servo_hz": 2.0})
     receiver = Gnss(rate_hz=5.0, **dict.fromkeys(GNSS.scenario_keys(), 0.01))
     spec = short.spec.model_copy(update={"radars": {"r": radar}, "gnss": {"g": receiver}})
     simulate_to_folder(replace(short, spec=spec), 0, tmp_path / "a")
@@ -95,3 +96,4 @@ def test_the_folder_states_every_error_that_its_trackers_were_given(tmp_path, sh
             if any(sizes):
                 assert getattr(stated, name) == pytest.approx(np.linalg.norm(sizes), rel=1e-3), name
     assert telemetry.radars["r"].range_rate_mps is not None
+    assert telemetry.radars["r"].site.angle_servo_hz == 2.0
