@@ -7,6 +7,7 @@ The commands ``postflight montecarlo`` and ``postflight study``: many flights at
 from __future__ import annotations
 
 import _thread
+import os
 import signal
 import sys
 import threading
@@ -516,24 +517,35 @@ cli.add_command(montecarlo)
 cli.add_command(study)
 
 
-_IMPORTING_S = 0.02  # after which an interrupt amid an import is tried again
+_AGAIN_S = 0.02  # after which a signal that came where nothing may be raised is tried again
+_BINDINGS = f"{os.sep}llvmlite{os.sep}binding{os.sep}"
 
 
-def terminate(_number: int, _frame: object) -> None:
+def terminate(number: int, frame: FrameType | None) -> None:
     """Leave as after Ctrl-C, so that what is half-written is removed; exit code as the shell gives it."""
-    sys.exit(EXIT_TERMINATED)
+    if not _postponed(number, frame):
+        sys.exit(EXIT_TERMINATED)
 
 
-def interrupt(_number: int, frame: FrameType | None) -> None:
-    """Stop by `KeyboardInterrupt`, but not amid an import: libraries turn it there into errors of their own."""
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Stop by `KeyboardInterrupt`."""
+    if not _postponed(number, frame):
+        raise KeyboardInterrupt
+
+
+def _postponed(number: int, frame: FrameType | None) -> bool:
+    """Whether a signal is tried again: amid an import or LLVM's bindings nothing may be raised.
+
+    Libraries turn it there into errors of their own; bindings leave objects half made, which fail when they are freed.
+    """
     while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            again = threading.Timer(_IMPORTING_S, _thread.interrupt_main)
+        if frame.f_code.co_filename.startswith("<frozen importlib") or _BINDINGS in frame.f_code.co_filename:
+            again = threading.Timer(_AGAIN_S, _thread.interrupt_main, (number,))
             again.daemon = True
             again.start()
-            return
+            return True
         frame = frame.f_back
-    raise KeyboardInterrupt
+    return False
 
 
 def main() -> None:

@@ -351,18 +351,23 @@ def test_interrupt_before_anything_is_written(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_interrupt_amid_an_import_waits_for_its_end() -> None:
+@pytest.mark.parametrize("amid", ["<frozen importlib._bootstrap>", "/site-packages/llvmlite/binding/ffi.py"])
+@pytest.mark.parametrize(
+    ("sent", "handler", "raised"),
+    [(signal.SIGINT, cli.interrupt, KeyboardInterrupt), (signal.SIGTERM, cli.terminate, SystemExit)],
+)
+def test_signals_amid_an_import_or_bindings_wait_for_its_end(amid, sent, handler, raised) -> None:
     """Compiled libraries turn a KeyboardInterrupt there into an ImportError, or print its traceback themselves."""
-    importing = compile("cli.interrupt(2, sys._getframe())", "<frozen importlib._bootstrap>", "exec")
-    with pytest.raises(KeyboardInterrupt):
-        cli.interrupt(2, sys._getframe())
-    before = signal.signal(signal.SIGINT, cli.interrupt)
+    inside = compile("handler(sent, sys._getframe())", amid, "exec")
+    with pytest.raises(raised):
+        handler(sent, sys._getframe())
+    before = signal.signal(sent, handler)
     try:
-        exec(importing, {"cli": cli, "sys": sys})
-        with pytest.raises(KeyboardInterrupt):
+        exec(inside, {"handler": handler, "sent": sent, "sys": sys})
+        with pytest.raises(raised):
             time.sleep(10.0)
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(sent, before)
 
 
 # ---------------------------------------------------------------------------------------------------------------- score
