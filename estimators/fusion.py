@@ -227,10 +227,13 @@ class NormalEquations:
 
     @cached_property
     def _bands(self) -> tuple[FloatArray, FloatArray]:
-        """Upper bands of the deflection's block and of the spline's stiffness, equally wide."""
+        """Upper bands of the deflection's block and of the spline's stiffness; the first is the wider, if they differ.
+
+        Without the inputs the first is a whole triangle, where the process's determinant need not be one.
+        """
         stiffness = self.spline.stiffness
-        width = max(_width(self.deflection), _width(stiffness))
-        return _upper_band(self.deflection, width), _upper_band(stiffness, width)
+        narrow = _width(stiffness)
+        return _upper_band(self.deflection, max(_width(self.deflection), narrow)), _upper_band(stiffness, narrow)
 
     def _prior_band(self, size_radps2: float) -> FloatArray:
         """Upper band of the process's precision."""
@@ -240,8 +243,10 @@ class NormalEquations:
 
     def _factor(self, size_radps2: float, method: str) -> FloatArray:
         """Cholesky factor of the deflection's block with the process's prior, an upper band."""
+        band, prior = self._bands[0].copy(), self._prior_band(size_radps2)
+        band[-len(prior) :] += prior
         try:
-            return np.asarray(cholesky_banded(self._bands[0] + self._prior_band(size_radps2)))
+            return np.asarray(cholesky_banded(band))
         except np.linalg.LinAlgError:
             raise _undetermined(method) from None
 

@@ -37,6 +37,7 @@ def _none_or_some(hertz: float) -> float:
     return hertz
 
 
+BUTTERWORTH = np.sqrt(0.5)  # damping of second-order filters and servos
 Bandwidth = Annotated[float, Field(ge=0.0, le=1e5), AfterValidator(_none_or_some)]
 Sd = Annotated[float, Field(ge=1e-12, le=1e6)]  # its square is a number that can be divided by
 SdOrNone = Annotated[float, Field(ge=0.0, le=1e6)]
@@ -665,6 +666,13 @@ class TrackingSource(Source):
         return self
 
 
+def check_servo(key: str, stated: float, servo_hz: float) -> None:
+    """Raise `KeyFaults` where a fraction of a servo's lag is stated, of a flight or a scenario, and no bandwidth."""
+    if stated > 0.0 and servo_hz == 0.0:
+        words = "a fraction of the servo's lag: state its bandwidth, angle_servo_hz, too"
+        raise KeyFaults([(key, stated, words)])
+
+
 TrackerReading = Literal["range", "az", "el", "range_rate"]
 
 
@@ -687,10 +695,7 @@ class RadarEntry(TrackingSource):
 
     @model_validator(mode="after")
     def _lag_has_a_servo(self) -> RadarEntry:
-        stated = getattr(self, "servo_lag_sd", 0.0)
-        if stated > 0.0 and self.angle_servo_hz == 0.0:
-            words = "a fraction of the servo's lag: state its bandwidth, angle_servo_hz, too"
-            raise KeyFaults([("servo_lag_sd", stated, words)])
+        check_servo("servo_lag_sd", getattr(self, "servo_lag_sd", 0.0), self.angle_servo_hz)
         return self
 
 

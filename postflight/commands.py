@@ -212,7 +212,7 @@ def run_flight(
         event_rows = run_folder.event_table(bet, bet.table)
         show_answers(bet, answers, event_rows)
         stages.end("printing the answers")
-        second.draw_deflections(answers)
+        second.draw_deflections(answers)  # not sooner: to hand them over takes a moment
         with progress_bar() as report:
             step = steps(report)
             answers = with_increments(answers)
@@ -239,7 +239,7 @@ def _answered(
     flight: Flight, methods: tuple[str, ...], step: Callable[[float, float], Progress], stages: Stages,
     second: SecondProcess,
 ) -> tuple[Reconstruction, Deflections]:  # fmt: skip
-    """Trajectory and deflections, given to be drawn; a camera without video is among the methods that were refused."""
+    """Trajectory, given to be drawn, and deflections; a camera without video is among the methods that were refused."""
     own = warmup.ESTIMATES if "camera" in methods else warmup.ESTIMATES[:1]
     compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
     stages.end("compiling")

@@ -32,6 +32,7 @@ scatter by ``angle_sd`` at any elevation. The numpy form below serves the filter
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -426,10 +427,10 @@ def _radar(
     return h, g @ partials @ instrument.dcm
 
 
-def sight(n: float, east: float, d: float) -> tuple[float, float, float]:
-    """Range, azimuth, elevation of a point north, east, down of a site."""
+def sight(n: Any, east: Any, d: Any) -> tuple[Any, Any, Any]:
+    """Range, azimuth, elevation of a point north, east, down of a site, or of points (k,)."""
     level = np.hypot(n, east)
-    return float(np.hypot(level, d)), float(np.arctan2(east, n)), float(np.arctan2(-d, level))
+    return np.hypot(level, d), np.arctan2(east, n), np.arctan2(-d, level)
 
 
 def sight_partials(n: float, east: float, d: float) -> FloatArray:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -173,16 +174,18 @@ def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, f
             out.append(Single("tracker", f"{name}: site or calibration", (name,), telemetry, rest))
         out.append(Single("tracker", f"{name}: noise", (name,), telemetry, noisier={name: _NOISIER}))
     if telemetry.radars:
-        bent = {
-            name: replace(r, site=replace(r.site, refraction_sd=_REFRACTION_SD)) for name, r in telemetry.radars.items()
-        }
-        out.append(Single("refraction", "refraction of the radars", tuple(bent), replace(telemetry, radars=bent)))
-        slow = {
-            name: replace(r, site=replace(r.site, angle_servo_hz=_SERVO_HZ, servo_lag_sd=_SERVO_LAG_SD))
-            for name, r in telemetry.radars.items()
-        }
-        out.append(Single("servo-lag", "servo of the radars", tuple(slow), replace(telemetry, radars=slow)))
+        names = tuple(telemetry.radars)
+        bent = _with_sites(telemetry, refraction_sd=_REFRACTION_SD)
+        slow = _with_sites(telemetry, angle_servo_hz=_SERVO_HZ, servo_lag_sd=_SERVO_LAG_SD)
+        out.append(Single("refraction", "refraction of the radars", names, bent))
+        out.append(Single("servo-lag", "servo of the radars", names, slow))
     return out + _attitudes(telemetry) + _slips(telemetry)
+
+
+def _with_sites(telemetry: Telemetry, **stated: Any) -> Telemetry:
+    """Telemetry whose radars' sites state something else."""
+    radars = {name: replace(r, site=replace(r.site, **stated)) for name, r in telemetry.radars.items()}
+    return replace(telemetry, radars=radars)
 
 
 def _slips(telemetry: Telemetry) -> list[Single]:

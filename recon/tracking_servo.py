@@ -22,12 +22,12 @@ import numpy as np
 
 from flightmodel import rotations
 from flightmodel.checks import FloatArray
+from flightmodel.instruments import BUTTERWORTH
 from recon._measurement_kernels import RADAR
 from recon.ekf import Problem
-from recon.measurements import Instrument
+from recon.measurements import Instrument, sight
 from recon.state import States
 
-_DAMPING = np.sqrt(0.5)
 # the lag is exact for an angle that runs straight between steps: the path's own steps are a tenth of a second
 _STEPS_A_PERIOD, _STEPS_S = 50, (0.01, 0.1)
 _LEAST_NODES = 4
@@ -69,14 +69,13 @@ def servo_lag(instrument: Instrument, time_s: FloatArray, states: States, at_s: 
         time_s[0], time_s[-1], 1 + int(np.ceil((time_s[-1] - time_s[0]) / step_s)), retstep=True
     )
     ned = (point(even_s) - instrument.site_ecef_m) @ instrument.dcm.T
-    north, east, down = ned.T
-    elevation = np.arctan2(-down, np.hypot(north, east))
-    angles = np.column_stack([np.unwrap(np.arctan2(east, north)), elevation])
+    _, azimuth, elevation = sight(*ned.T)
+    angles = np.column_stack([np.unwrap(azimuth), elevation])
     # a straight line has no lag, and without that of the start there is no transient
     start, rate = angles[0], (angles[1] - angles[0]) / step_s
     bent = angles - start - rate * (even_s - even_s[0])[:, None]
     w = 2.0 * np.pi * instrument.servo_hz
-    behind = ([-1.0, 0.0, 0.0], [1.0, 2.0 * _DAMPING * w, w * w])
+    behind = ([-1.0, 0.0, 0.0], [1.0, 2.0 * BUTTERWORTH * w, w * w])
     top, bottom, _ = signal.cont2discrete(behind, step_s, method="foh")
     lag = signal.lfilter(np.ravel(top), bottom, bent, axis=0)
     return np.column_stack([np.interp(at_s, even_s, column) for column in lag.T])

@@ -38,6 +38,7 @@ from flightmodel.config import (
 )
 from flightmodel.instruments import (
     ACCELEROMETER,
+    BUTTERWORTH,
     GNSS,
     MAGNETOMETER,
     RADAR,
@@ -46,13 +47,13 @@ from flightmodel.instruments import (
     Bandwidth,
     InstrumentTable,
     Size,
+    check_servo,
     with_keys,
 )
 from flightmodel.refraction import Refractivity
 from flightmodel.trajectory import interpolate_rows
 from synthetic_flight import _kernels
 
-BUTTERWORTH = np.sqrt(0.5)
 CHILD = 0  # stands between an instrument's key and its child's: no name holds a NUL
 
 
@@ -427,11 +428,7 @@ class Radar(Section):
 
     @model_validator(mode="after")
     def _lag_has_a_servo(self) -> Radar:
-        off = getattr(self, "servo_lag", 0.0)
-        if off > 0.0 and self.angle_servo_hz == 0.0:
-            raise KeyFaults(
-                [("servo_lag", off, "of a servo that is not there: state its bandwidth, angle_servo_hz, too")]
-            )
+        check_servo("servo_lag", getattr(self, "servo_lag", 0.0), self.angle_servo_hz)
         return self
 
     @property

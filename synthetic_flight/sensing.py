@@ -28,12 +28,18 @@ from scipy.interpolate import CubicHermiteSpline
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.geomagnetism_and_sun import is_sun_visible, magnetic_field_ecef_t, sun_direction_ecef
-from flightmodel.instruments import GNSS, RADAR, SUN, dcm_body_from_sun_head, sun_angles_from_direction
+from flightmodel.instruments import (
+    BUTTERWORTH,
+    GNSS,
+    RADAR,
+    SUN,
+    dcm_body_from_sun_head,
+    sun_angles_from_direction,
+)
 from flightmodel.refraction import refracted
 from flightmodel.trajectory import interpolate_rows
 from flightmodel.vehicle import Vehicle
 from synthetic_flight.instrument_errors import (
-    BUTTERWORTH,
     Accelerometer,
     Attitude,
     Gnss,
@@ -260,9 +266,8 @@ def sense_radar(
     noise_sd = np.array([size["range_sd_m"][0], *[size["angle_sd_rad"][0]] * 2])
     noise = noise_sd * rng.standard_normal(arrived.shape)
     noise[:, 1] /= np.cos(arrived[:, 2])
-    # the data sheet's bandwidth is not exactly the servo's
-    off = size["servo_lag_sd"][0]
-    lag = 1.0 + (off * child(rng, "servo lag").standard_normal() if off > 0.0 else 0.0)
+    # the stated bandwidth is not exactly the servo's
+    lag = 1.0 + drawn(rng, "servo lag", size["servo_lag_sd"][0], 1)
     observed = in_air(arrived, spec) + lag * servo_lag(truth, spec, seen_at)
     measured = observed + pedestal_errors(observed, spec, rng) + wander(at, observed, spec, rng) + bias + noise
     steps = (spec.range_resolution_m, *np.deg2rad([spec.angle_resolution_deg] * 2))
@@ -358,27 +363,28 @@ def servo_lag(truth: Truth, spec: Radar, time_s: FloatArray) -> FloatArray:
     return np.column_stack([np.zeros(len(time_s)), *(np.interp(time_s, t, column) for column in behind.T)])
 
 
+def drawn(rng: np.random.Generator, name: str, size: float, count: int) -> FloatArray:
+    """Constant errors (count,) of one size, from the generator's child of a name."""
+    # np.zeros keeps an absent error from costing a generator
+    return size * child(rng, name).standard_normal(count) if size > 0.0 else np.zeros(count)
+
+
 def pedestal_errors(observed: FloatArray, spec: Radar, rng: np.random.Generator) -> FloatArray:
     """Systematic errors ``(n, 3)`` of range, azimuth and elevation that the pedestal adds to what arrives at it."""
-
-    def drawn(name: str, size: float, count: int) -> FloatArray:
-        # np.zeros keeps an absent error from costing a generator
-        return size * child(rng, name).standard_normal(count) if size > 0.0 else np.zeros(count)
-
     slant, az, el = observed.T
     out = np.zeros_like(observed)
     size = RADAR.from_scenario(spec)
     for row in RADAR.rows:
         if row.response is not None:
             component, response = row.response
-            out[:, component] += response(drawn(row.title, size[row.name][0], 1), slant, az, el)
+            out[:, component] += response(drawn(rng, row.title, size[row.name][0], 1), slant, az, el)
     for turns, (name, wave_rad) in enumerate(zip(("once", "twice"), size["angle_bias_sd_rad"][1:], strict=True), 1):
-        wave = drawn(f"encoder {name}", wave_rad, 4)
+        wave = drawn(rng, f"encoder {name}", wave_rad, 4)
         out[:, 1] += wave[0] * np.sin(turns * az) + wave[1] * np.cos(turns * az)
         out[:, 2] += wave[2] * np.sin(turns * el) + wave[3] * np.cos(turns * el)
     tilt_rad = size["mislevel_sd_rad"][0]
     if tilt_rad > 0.0:
-        out[:, 1:] += mislevel(az, el, drawn("mislevel", tilt_rad, 2))
+        out[:, 1:] += mislevel(az, el, drawn(rng, "mislevel", tilt_rad, 2))
     return out
 
 
