@@ -14,7 +14,8 @@ the smoothed trajectory: with state and error ``x_s`` of covariance ``P_s`` at t
     residual = z - h(x_s),   variance = H P_s H^T + R
 
 and residuals over their standard deviations have a mean square of one. Neighbours share the trajectory's error, so
-that mean is less certain than their number suggests.
+that mean is less certain than their number suggests; the check of measurements held out on purpose counts those beyond
+the gate, of which independence is not asked.
 
 A failed check is a finding about the data or the model, not an error of the program. Each is two-sided at the
 settings' confidence, so that eighteen checks of a consistent flight all pass 98 times in a hundred (at 0.999).
@@ -41,7 +42,7 @@ from flightmodel.telemetry import Finding
 from recon._measurement_kernels import DECELERATION, RADAR
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
 from recon.measurements import REST, SLOT_NAMES
-from recon.settings import COMPILED
+from recon.settings import COMPILED, Settings
 from recon.smoother import Smoothed, backward, jacobian, two_filter
 from recon.state import KINEMATIC, States, boxminus, unpacked
 
@@ -214,6 +215,37 @@ def mcreynolds_checks(
                 component=name,
             )
         )
+    return out
+
+
+def beyond_gate(held_out: pd.DataFrame, gate: float) -> pd.Series[bool]:
+    """Whether a component of a held-out measurement lies beyond the gate, by source and time."""
+    far = held_out.residual.abs() > float(ndtri(0.5 * (1.0 + gate))) * held_out.predicted_sd
+    return far.groupby([held_out.source, held_out.time_s], sort=False).any()
+
+
+def held_out_checks(problem: Problem, held_out: pd.DataFrame, settings: Settings) -> list[ConsistencyCheck]:
+    """Whether measurements that the settings hold out are where the rest of the flight predicts them.
+
+    None of trackers that the settings leave out altogether, nor of rows that a tracker's ``every_s`` leaves out where
+    nothing is held out.
+    """
+    if not (settings.hold_out_every or settings.hold_out_spans_s):
+        return []
+    out = []
+    owners = {instrument.name: instrument.owner for instrument in problem.instruments}
+    for source, far in beyond_gate(held_out, settings.gate_probability).groupby("source", sort=False):
+        owner = owners[str(source)]
+        if owner in settings.without:
+            continue
+        symptom = f"{int(far.sum())} of {len(far)} held-out points farther off than predicted"
+        out.append(
+            consistency_check(
+                "held-out", f"held out {source}", float(far.mean()), 0.0, _MOST_EDITED, symptom, symptom,
+                advice="the stated noise is too small, these points are faulty, or an error is not modelled",
+                source=owner,
+            )
+        )  # fmt: skip
     return out
 
 

@@ -32,13 +32,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
-from scipy.special import ndtri
 
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Finding
 from flightmodel.trajectory import Trajectory, difference, nearest_index, resample
-from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, edit_check
+from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, beyond_gate, edit_check
 from recon.ekf import Problem
 from recon.imu_screening import TransientOffset
 from recon.measurements import SITES
@@ -49,7 +48,7 @@ from recon.time_bias import ClockJump, Lag
 
 _CONFIDENCE = 0.999
 _LEAST_LOST = 0.05  # of its variance that a solution loses by leaving a source out, for the test
-_ABOUT_SOURCES = ("nis", "whiteness", "edited", "data-sheet")  # codes of checks about one tracker or sensor
+_ABOUT_SOURCES = ("nis", "whiteness", "edited", "held-out", "data-sheet")  # codes of checks about one tracker or sensor
 _AIR_CODES = ("sounding", "pre-flight-drag", "sounding-density", "sounding-wind", "pre-flight-ca", "force-residuals")
 _AIR_SOURCES = {code: "vehicle" if code.startswith("pre-flight") else "atmosphere" for code in _AIR_CODES}
 _SHARED_CODES = ("place", "sites")  # about what all trackers share
@@ -253,11 +252,10 @@ def rejected_points(
     if len(resolving) != 1 or not resolving[0].inconsistent:
         return {}
     table, source = held_out[resolving[0].source], resolving[0].source
-    table = table.assign(far=table.residual.abs() > ndtri(0.5 * (1.0 + gate)) * table.predicted_sd)
     out = {}
-    for name, rows in table.groupby("source"):
+    for name, far in beyond_gate(table, gate).groupby("source"):
         if str(name) == source or str(name).startswith(f"{source} "):
-            judged = rows.groupby("time_s").far.any()
+            judged = far.droplevel("source")
             times = np.unique(residuals.time_s[residuals.source == name])
             out[str(name)] = times[judged.to_numpy()[nearest_index(judged.index.to_numpy(), times)]]
     return {name: times for name, times in out.items() if len(times)}

@@ -393,6 +393,8 @@ def reconstruct_once(
     checks += consistency.filter_against_smoother(problem, run, smoothed, reference)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
+    held_out = held_out_table(problem, run, settings.engine)
+    checks += consistency.held_out_checks(problem, held_out, settings)
     checks += survey.place_checks(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
     if sensors is not None and adaptation.lag is None:
         more, adaptation = _oscillation_checks(telemetry, settings, sensors, problem, reference, adaptation)
@@ -408,7 +410,7 @@ def reconstruct_once(
         filtered=datum_trajectory(problem, mount, run.states(), run.filtered.p_plus),
         sensor_errors=table,
         residuals=consistency.residual_table(problem, run.innovations),
-        held_out=held_out_table(problem, run, settings.engine),
+        held_out=held_out,
         consistency_checks=tuple(checks),
         imu_time_s=series[0],
         specific_force_body_mps2=series[1],

@@ -21,6 +21,7 @@ from flightmodel import earth, rotations
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
 from recon.consistency import summary
+from recon.noise_levels import noise_levels
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 
@@ -40,11 +41,11 @@ DISTURBED_UNTOLD = (r"(?m)^\[\[motion\.disturbed\]\]\n(.+\n){3}", "")
 
 @pytest.fixture(scope="module")
 def fly(tmp_path_factory):
-    """``fly(name, *edits, **settings)``: reconstruct a flight, its flight.toml edited; each but once."""
+    """``fly(name, *edits, **settings)``: reconstruct a flight, its flight.toml and noise as asked; each but once."""
     flown = {}
 
-    def one(name, *edits, **settings):
-        key = (name, edits, tuple(sorted(settings.items())))
+    def one(name, *edits, proposed_noise=False, **settings):
+        key = (name, edits, proposed_noise, tuple(sorted(settings.items())))
         if key not in flown:
             folder = tmp_path_factory.mktemp(name)
             tables = FLIGHTS / name if any((FLIGHTS / name).glob("*.csv")) else Path(str(REAL)) / name
@@ -55,7 +56,10 @@ def fly(tmp_path_factory):
                 text, count = re.subn(pattern, new, text)
                 assert count, pattern
             (folder / "flight.toml").write_text(text)
-            flown[key] = reconstruct(read_flight(folder), Settings(**settings))
+            telemetry, chosen = read_flight(folder), Settings(**settings)
+            if proposed_noise:
+                telemetry = noise_levels(telemetry, chosen).telemetry
+            flown[key] = reconstruct(telemetry, chosen)
         return flown[key]
 
     return one
@@ -264,6 +268,18 @@ class TestPiccard:
     def test_receiver_and_sensors_agree(self, fly):
         assert red(fly("euroc21_piccard")) <= {"NIS baro", "filter-smoother position"}
 
+    def test_proposed_noise_foretells_held_out_fixes(self, fly):
+        proposed = fly("euroc21_piccard", proposed_noise=True, hold_out_every=2)
+        ratio = foretold(proposed, "gps")
+        assert all(0.2 < value < 1.6 for value in ratio.values()), ratio
+        assert "held out gps" not in red(proposed)
+
+    def test_a_fix_held_out_while_the_receiver_finds_back_is_found(self, fly):
+        # proposals from the fixes between make the one at 10.24 s 6 sd wrong
+        early = (r"\[11\.0, 68\.0\]", "[9.0, 68.0]")
+        proposed = fly("euroc21_piccard", early, proposed_noise=True, hold_out_every=2)
+        assert "held out gps" in red(proposed)
+
     def test_every_other_fix_is_foretold_by_the_rest(self, fly):
         ratio = foretold(fly("euroc21_piccard", hold_out_every=2), "gps")
         # nine fixes whose errors last: between one and nine independent ones
@@ -274,8 +290,12 @@ class TestPiccard:
         assert h.max() == pytest.approx(6339.0 + 54.0, abs=20.0)
 
     def test_rocket_stands_on_its_pad_before_it_flies(self, fly):
-        t, h = heights(fly("euroc21_piccard"))
-        assert h[0] == pytest.approx(155.0 + 54.0, abs=30.0)
+        # without a rest, the start velocity hangs on an accelerometer that reads 5 % less under thrust
+        flight = fly("euroc21_piccard")
+        t, h = heights(flight)
+        sd_m = 8.0 + sd_at(flight, t[0], slice(0, 3))
+        assert sd_m < 35.0
+        assert h[0] == pytest.approx(155.0 + 54.0, abs=2.0 * sd_m)
         assert (np.diff(t) > 0.0).all()
 
 

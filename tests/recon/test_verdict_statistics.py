@@ -1,9 +1,20 @@
 """Consistency checks fail as often as their confidence states, and their bands are those of the textbook."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import pandas as pd
 import pytest
 
-from recon.consistency import data_sheet_check, edit_check, mcreynolds_checks, nis_check, whiteness_check
+from recon.consistency import (
+    data_sheet_check,
+    edit_check,
+    held_out_checks,
+    mcreynolds_checks,
+    nis_check,
+    whiteness_check,
+)
+from recon.settings import Settings
 
 DRAWS = 4000
 
@@ -93,3 +104,24 @@ def test_more_than_a_twentieth_edited_is_told():
         consistency_check = edit_check("a", accepted)
         assert consistency_check.value == pytest.approx(bad / 100.0)
         assert consistency_check.passed is passes
+
+
+def test_held_out_points_beyond_the_gate_are_told():
+    rng = np.random.default_rng(3)
+    instruments = (SimpleNamespace(name="gps", owner="gps"), SimpleNamespace(name="gps velocity", owner="gps"))
+    problem = SimpleNamespace(instruments=instruments)
+    rows = [
+        (t, name, c, rng.standard_normal(), 1.0) for t in range(40) for name in ("gps", "gps velocity") for c in "ned"
+    ]
+    table = pd.DataFrame(rows, columns=["time_s", "source", "component", "residual", "predicted_sd"])
+    settings = Settings(hold_out_every=2)
+    assert [v.passed for v in held_out_checks(problem, table, settings)] == [True, True]
+    # three points of forty, one component of each: a point is counted once
+    bad = (table.source == "gps velocity") & (table.component == "e") & (table.time_s < 3)
+    table.loc[bad, "residual"] = -6.0
+    good, far = held_out_checks(problem, table, settings)
+    assert good.passed
+    assert not far.passed
+    assert (far.code, far.source, far.value) == ("held-out", "gps", pytest.approx(3 / 40))
+    assert held_out_checks(problem, table, Settings(hold_out_every=2, without=("gps",))) == []
+    assert held_out_checks(problem, table, Settings()) == []
