@@ -510,7 +510,7 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         events=tuple((e.name, e.t_s) for e in spec.events),
         findings=tuple(gate.findings),
         hashes=_hashes(gate, spec, found.vehicle, found.films),
-        assumed=assumed_errors(spec, found.radars),
+        assumed=assumed_errors(spec, found.radars, found.gnss),
         drag=found.drag,
         planet=spec.body,
         gnss=found.gnss,
@@ -721,15 +721,18 @@ def _motion(spec: FlightFile, drag: StatedDrag | None) -> Motion:
     )
 
 
-def assumed_errors(spec: FlightFile, radars: dict[str, RadarRecord]) -> dict[str, dict[str, float]]:
+def assumed_errors(
+    spec: FlightFile, radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]
+) -> dict[str, dict[str, float]]:
     """Standard deviations that flight.toml does not state and that are taken from the defaults, by table and key.
 
     Errors whose default is none at all are left out, and those that the table does not measure.
     """
-    entries: dict[str, Section | None] = {f"gnss.{name}": entry for name, entry in spec.gnss.items()}
-    entries |= {f"barometers.{name}": entry for name, entry in spec.barometers.items()}
+    entries: dict[str, Section | None] = {f"barometers.{name}": entry for name, entry in spec.barometers.items()}
     entries |= {f"sensors.{name}": getattr(spec.sensors, name) for name in type(spec.sensors).model_fields}
     out = {table: _assumed_of(entry, set()) for table, entry in entries.items() if entry is not None}
+    for name, receiver in spec.gnss.items():
+        out[f"gnss.{name}"] = _assumed_of(receiver, _not_in_the_fixes(gnss[name]) if name in gnss else set())
     for name, radar in spec.radars.items():
         out[f"radars.{name}"] = _assumed_of(radar, _not_measured_or_in_the_table(radar, radars.get(name)))
     if spec.measures_deceleration and "trim_sd_deg" not in spec.motion.model_fields_set:
@@ -742,10 +745,21 @@ def assumed_errors(spec: FlightFile, radars: dict[str, RadarRecord]) -> dict[str
 
 def _assumed_of(entry: Section, known: set[str]) -> dict[str, float]:
     stated = known | entry.model_fields_set
-    if isinstance(entry, GnssEntry) and not entry.velocity:
-        stated |= {"speed_sd_mps", "vertical_speed_sd_mps"}
     defaults = {key: field.default for key, field in type(entry).model_fields.items() if _SD.search(key)}
     return {key: float(sd) for key, sd in defaults.items() if key not in stated and isinstance(sd, float) and sd > 0.0}
+
+
+def _not_in_the_fixes(record: GnssRecord) -> set[str]:
+    """Keys of what a receiver does not measure, or whose noise it states in each fix."""
+    out = set()
+    for read, own, keys in (
+        (record.position_ecef_m, 0, ("horizontal_sd_m", "vertical_sd_m", "wander_sd_m")),
+        (record.velocity_ecef_mps, 2, ("speed_sd_mps", "vertical_speed_sd_mps")),
+    ):
+        there = np.isfinite(read).all(axis=1)
+        known = [record.sd is not None and np.isfinite(record.sd[there, own + k]).all() for k in range(2)]
+        out |= {key for key, is_known in zip(keys, (*known, False), strict=False) if is_known or not there.any()}
+    return out
 
 
 def _not_measured_or_in_the_table(radar: RadarEntry, record: RadarRecord | None) -> set[str]:

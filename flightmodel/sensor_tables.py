@@ -124,10 +124,14 @@ def read_gnss(
     label = f"gnss.{name}"
     least = {"nsat": source.min_satellites, "fix_mode": source.min_fix_mode}
     asked = {short: count for short, count in least.items() if count is not None}
-    table = gate.table(label, source, tables.GNSS + tuple(tables.GNSS_COUNTS[short] for short in asked))
+    counts = tuple(tables.GNSS_COUNTS[short] for short in asked)
+    table = gate.table(label, source, tables.GNSS + tables.GNSS_SD + counts)
     if table is None or table.time_s is None:
         return None
     before = len(gate.faults) + len(gate.config)
+    stated = [q for q in tables.GNSS_SD if q.short in table.columns]
+    for q in stated:
+        gate.refuse_rows(table, q.short, LEAST_SD, np.inf, "no standard deviation")
     good = _good_fixes(gate, name, table, asked)
     if not good.any():
         return None
@@ -135,17 +139,20 @@ def read_gnss(
     position = _positions(gate, table, source, planet)
     if position is None or len(gate.faults) + len(gate.config) > before:
         return None
-    if not np.isfinite(position).all(axis=1).any():
-        gate.refuse(f"{label}: {table.path}: no fix with a whole position; remove the receiver", "no-samples")
-        return None
     velocity = _velocities(gate, table, source, position, planet)
     if velocity is None:
         return None
+    alone = not set(ECEF + GEODETIC) & set(table.columns)
+    measured, what = (velocity, "velocity") if alone else (position, "position")
+    if not np.isfinite(measured).all(axis=1).any():
+        gate.refuse(f"{label}: {table.path}: no fix with a whole {what}; remove the receiver", "no-samples")
+        return None
     position, velocity = fixed_axes(source.axes, t0_utc, time_s, position, velocity, planet)
-    gate.findings.extend(find_faults(name, time_s, ("x", "y", "z"), position))
+    gate.findings.extend(find_faults(name, time_s, ECEF_SPEEDS if alone else ECEF, velocity if alone else position))
     gate.findings.extend(oversampled(name, time_s, source.every_s, source.components))
     spec = GnssSpec(name, np.array(source.antenna_from_datum_body_m), **GNSS.from_file(source))
-    return GnssRecord(spec, time_s, position, velocity, source.every_s)
+    sd = _columns(table, [q.short for q in tables.GNSS_SD]) if stated else None
+    return GnssRecord(spec, time_s, position, velocity, source.every_s, sd)
 
 
 def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> BoolArray:
@@ -178,12 +185,15 @@ def _positions(gate: Gate, table: Table, source: GnssEntry, planet: earth.Planet
         )
         return None
     form = stated[0] if stated else ECEF if whole[ECEF] else GEODETIC
+    if set(ECEF_SPEEDS) <= set(table.columns) and not set(ECEF + GEODETIC) & set(table.columns) and source.velocity:
+        return np.full((len(table.lines), 3), np.nan)
     if not whole[form]:
         canonical = {q.short: q.canonical for q in tables.GNSS}
         absent = ", ".join(canonical[short] for short in form if short not in table.columns)
         gate.refuse(
             f"{table.label}: {table.path}: line 1: no column {absent}; a position is lat_deg, lon_deg, alt_m, or "
-            f"x_ecef_m, y_ecef_m, z_ecef_m; other columns are declared in {table.label}.columns",
+            f"x_ecef_m, y_ecef_m, z_ecef_m; without one a velocity is vx_ecef_mps, vy_ecef_mps, vz_ecef_mps; other "
+            f"columns are declared in {table.label}.columns",
             "table-column-missing",
         )
         return None

@@ -125,6 +125,13 @@ GNSS = (
     *(Quantity(f"v{a}", f"v{a}_ecef_mps", "speed", required=False) for a in "xyz"),
     *(Quantity(f"v{a}", f"v{a}_mps", "speed", required=False) for a in "ned"),
 )
+# noise of each fix, where the receiver states it
+GNSS_SD = (
+    Quantity("horizontal_sd", "horizontal_sd_m", "length", required=False),
+    Quantity("vertical_sd", "vertical_sd_m", "length", required=False),
+    Quantity("speed_sd", "speed_sd_mps", "speed", required=False),
+    Quantity("vertical_speed_sd", "vertical_speed_sd_mps", "speed", required=False),
+)
 # counts of a receiver, read where flight.toml asks for a least one
 GNSS_COUNTS = {"nsat": Quantity("nsat", "nsat", "fraction"), "fix_mode": Quantity("fix_mode", "fix_mode", "fraction")}
 BAROMETER = (

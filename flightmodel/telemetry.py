@@ -111,11 +111,14 @@ class GnssRecord:
     time_s : (n,) float
         Strictly increasing, seconds after t0.
     position_ecef_m : (n, 3) float
-        NaN is missing.
+        NaN is missing; of a receiver that gives velocities alone, all are.
     velocity_ecef_mps : (n, 3) float
         Relative to the rotating Earth; NaN where the receiver gives none.
     every_s : tuple of ThinnedSpan
         Of fixes closer than this some are predicted, not used.
+    sd : (n, 4) float, optional
+        White noise of each fix in place of the stated one, NaN where that holds: of each horizontal axis and of height,
+        m; of each horizontal axis of the velocity and of the vertical one, m/s.
     """
 
     spec: GnssSpec
@@ -123,6 +126,7 @@ class GnssRecord:
     position_ecef_m: FloatArray
     velocity_ecef_mps: FloatArray
     every_s: tuple[ThinnedSpan, ...] = ()
+    sd: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Check once."""

@@ -60,6 +60,7 @@ REST = "rest"  # zero velocities on the pad
 SITES = "sites"  # owner of the errors that are common to all radar sites
 DECELERATION_RATE_HZ = 20.0  # of block means: over 50 ms an entry's deceleration is a straight line to 1e-3 m/s^2
 _SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
+_NO_PLACE = np.full(3, np.nan)
 COMPONENTS = {
     RADAR: ("range", "azimuth", "elevation"),
     POSITION: ("north", "east", "down"),
@@ -239,26 +240,33 @@ def _spacing(record: RadarRecord | GnssRecord | BarometerRecord, *components: st
     return np.column_stack([spacing_s(record.every_s, record.time_s, c) for c in components])
 
 
-def _noise(record: RadarRecord, stated: list[float], columns: slice) -> FloatArray:
-    """Noise (n, k) of each reading: its own where the table states it, else the site's."""
+def _noise(record: RadarRecord | GnssRecord, stated: list[float], columns: slice | list[int]) -> FloatArray:
+    """Noise (n, k) of each reading: its own where the table states it, else the instrument's."""
     sd = np.tile(stated, (len(record.time_s), 1))
     return sd if record.sd is None else np.where(np.isfinite(record.sd[:, columns]), record.sd[:, columns], sd)
 
 
 def gnss_instruments(
-    name: str, record: GnssRecord, accelerometer_m: FloatArray, planet: Planet = WGS84
+    name: str,
+    record: GnssRecord,
+    accelerometer_m: FloatArray,
+    planet: Planet = WGS84,
+    near_ecef_m: FloatArray = _NO_PLACE,
 ) -> list[Instrument]:
-    """Position of one receiver and, where it gives one, velocity; axes are those at its first fix."""
+    """Position of one receiver and velocity, those of both that it gives.
+
+    Axes are those at its first fix; of a receiver that gives velocities alone, those at ``near_ecef_m`` (3,).
+    """
     spec = record.spec
     good = np.isfinite(record.position_ecef_m).all(axis=1)
-    if not good.any():
+    reference = record.position_ecef_m[good][0] if good.any() else near_ecef_m
+    if not np.isfinite(reference).all():
         return []
-    reference = record.position_ecef_m[good][0]
     latitude, longitude, _ = earth.geodetic_from_ecef(reference, planet)
     dcm = earth.dcm_ned_ecef(float(latitude), float(longitude))
     arm = spec.antenna_from_datum_body_m - accelerometer_m
-    place_sd = np.array([spec.horizontal_sd_m, spec.horizontal_sd_m, spec.vertical_sd_m])
-    speed_sd = np.array([spec.speed_sd_mps, spec.speed_sd_mps, spec.vertical_speed_sd_mps])
+    place_sd = _noise(record, [spec.horizontal_sd_m, spec.horizontal_sd_m, spec.vertical_sd_m], [0, 0, 1])
+    speed_sd = _noise(record, [spec.speed_sd_mps, spec.speed_sd_mps, spec.vertical_speed_sd_mps], [2, 2, 3])
     place = (record.position_ecef_m - reference) @ dcm.T
     both = [
         instrument_of(

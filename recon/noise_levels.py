@@ -34,6 +34,7 @@ import pandas as pd
 from scipy.optimize import minimize
 from scipy.special import ndtri
 
+from flightmodel import tables
 from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.instruments import ACCELEROMETER, RATES, BarometerSpec, GnssSpec, RadarSite, TriadSpec, table_of
 from flightmodel.telemetry import Telemetry
@@ -58,6 +59,7 @@ _TRACKERS = {
              "wander_sd_m", "wander_time_constant_s", "velocity_wander_sd_mps", "velocity_wander_time_constant_s"),
     "barometers": ("sd_m", "wander_sd_m", "wander_time_constant_s"),
 }  # fmt: skip
+_FIXES = [q.canonical for q in tables.GNSS_SD]  # noise that a receiver may state of each fix
 _TRIADS = ("noise_sd", "bias_wander_sd", "bias_time_constant_s")
 _BALLISTIC = ("drag_sd", "drag_time_constant_s", "side_sd", "acceleration_density")
 
@@ -226,8 +228,11 @@ def _of_record(kind: str, name: str, record: Any, table: Any, section: str, fiel
 
 def _has_reading(kind: str, record: Any, field: str) -> bool:
     """Whether a record has the readings that a level is about, and no noise of their own row by row."""
-    if kind == "gnss" and ("speed" in field or "velocity" in field):
-        return bool(np.isfinite(record.velocity_ecef_mps).any())
+    if kind == "gnss":
+        moving = "speed" in field or "velocity" in field
+        read = record.velocity_ecef_mps if moving else record.position_ecef_m
+        own = record.sd is not None and field in _FIXES and bool(np.isfinite(record.sd[:, _FIXES.index(field)]).any())
+        return not own and bool(np.isfinite(read).any())
     if kind != "radars":
         return True
     column = {"range_sd_m": 0, "azimuth_sd_rad": 1, "elevation_sd_rad": 2, "range_wander_sd_m": 0}.get(field)

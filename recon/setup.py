@@ -256,14 +256,24 @@ def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: F
         radar = measurements.radar_instrument(name, record, arm, traverse, planet)
         doppler = measurements.range_rate_instrument(name, record, arm, planet)
         out += [i for i in (radar, doppler) if i is not None and len(i.time_s)]
+    near = _any_place(telemetry, out)
     for name, fixes in telemetry.gnss.items():
         antenna = fixes.spec.antenna_from_datum_body_m
-        out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m, planet)
+        out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m, planet, near)
     for name, heights in telemetry.barometers.items():
         out.append(measurements.barometer_instrument(name, heights, arm_body_m))
     if telemetry.accelerometer is not None and trim_rad > 0.0:
         out.append(measurements.deceleration_instrument(telemetry.accelerometer))
     return tuple(out)
+
+
+def _any_place(telemetry: Telemetry, radars: list[Instrument]) -> FloatArray:
+    """Place (3,) by the flight's first position, ECEF, m: the local axes of velocities alone; NaN without one."""
+    known = [f.position_ecef_m[np.isfinite(f.position_ecef_m).all(axis=1)] for f in telemetry.gnss.values()]
+    first = next((points[0] for points in (*known, track_points(tuple(radars))[1]) if len(points)), None)
+    if first is None and telemetry.start.state is not None:
+        first = telemetry.start.state.position_ecef_m
+    return np.full(3, np.nan) if first is None else np.asarray(first)
 
 
 def _attitude_instruments(telemetry: Telemetry, track: Track, start_s: float, end_s: float) -> tuple[Instrument, ...]:

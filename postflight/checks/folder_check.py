@@ -137,7 +137,7 @@ def check_folder(folder: Path) -> Report:
     if gate.config or gate.faults:
         _refuse(report, folder, [*gate.config, *gate.faults], 3 if gate.faults else 2)
     report.facts = _facts(found)
-    report.assumed = assumed_errors(found.spec, found.radars)
+    report.assumed = assumed_errors(found.spec, found.radars, found.gnss)
     report.findings = _not_used(folder) + sorted(
         gate.findings, key=lambda f: (f.source, np.nan_to_num(f.start_s, nan=-np.inf))
     )
@@ -200,7 +200,9 @@ def _facts(found: Sources) -> list[Fact]:
         measured = radar.range_az_el[:, np.isfinite(radar.range_az_el).any(axis=0)]
         tables.append((name, spec.radars[name].file, radar.time_s, measured))
     for name, fixes in found.gnss.items():
-        tables.append((name, spec.gnss[name].file, fixes.time_s, fixes.position_ecef_m))
+        positions = np.isfinite(fixes.position_ecef_m).any()
+        measured = fixes.position_ecef_m if positions else fixes.velocity_ecef_mps
+        tables.append((name, spec.gnss[name].file, fixes.time_s, measured))
     for name, barometer in found.barometers.items():
         tables.append((name, spec.barometers[name].file, barometer.time_s, barometer.height_m[:, None]))
     for table, name in spec.film_names.items():

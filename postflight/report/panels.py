@@ -119,7 +119,8 @@ def _tracker_heights(run: Run) -> list[dict[str, Any]]:
         places = earth.ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m, planet)
         tracks.append((name, radar.time_s, places))
     tracks += [(name, fixes.time_s, fixes.position_ecef_m) for name, fixes in run.telemetry.gnss.items()]
-    known = [(name, t, earth.geodetic_from_ecef(places, planet)[2]) for name, t, places in tracks]
+    whole = [(name, t, places) for name, t, places in tracks if np.isfinite(places).all(axis=1).any()]
+    known = [(name, t, earth.geodetic_from_ecef(places, planet)[2]) for name, t, places in whole]
     known += [(name, b.time_s, b.height_m) for name, b in run.telemetry.barometers.items()]
     return [_points(name, t, h / 1e3, _GREY, 4, _TRACK_POINTS // len(known)) for name, t, h in known]
 

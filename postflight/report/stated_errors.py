@@ -49,7 +49,7 @@ def measured(run: Run) -> str:
         ("radars", run.telemetry.radars), ("gnss", run.telemetry.gnss), ("barometers", run.telemetry.barometers)
     ):  # fmt: skip
         for name in records:
-            in_rows = group == "radars" and run.telemetry.radars[name].sd is not None
+            in_rows = getattr(records[name], "sd", None) is not None
             lines = ([] if in_rows else _noise(run, group, name)) + _estimated(run, name)
             out += [f"[{group}.{name}]", *lines, ""] if lines else []
     for name in ("accelerometer", "rates", "magnetometer"):

@@ -138,6 +138,38 @@ def test_ecef_columns_are_read_before_geodetic_ones_and_velocities_either_way(fo
     np.testing.assert_allclose(height, 9999.0, atol=1e-3)
 
 
+def test_a_receiver_of_velocities_alone_is_read(folder):
+    folder.table("doppler.csv", "t_s,vx_ecef_mps,vy_ecef_mps,vz_ecef_mps", T, 3 + 0 * T, T, -T)
+    alone = '[gnss.doppler]\nfile = "doppler.csv"\n'
+    telemetry = folder.read(GNSS, alone, BALLISTIC)
+    record = telemetry.gnss["doppler"]
+    np.testing.assert_allclose(record.velocity_ecef_mps, np.column_stack([3 + 0 * T, T, -T]))
+    assert np.isnan(record.position_ecef_m).all()
+    assert not any("horizontal" in key or "wander" in key for key in telemetry.assumed["gnss.doppler"])
+    assert "speed_sd_mps" in telemetry.assumed["gnss.doppler"]
+    # local axes need a place
+    folder.table("doppler.csv", "t_s,vn_mps,ve_mps,vd_mps", T, T, T, T)
+    folder.refused([GNSS, alone, BALLISTIC], "table-column-missing", "vx_ecef_mps", kind=GateError)
+    folder.table("doppler.csv", "t_s,vx_ecef_mps,vy_ecef_mps,vz_ecef_mps", T, T, T, np.nan * T)
+    folder.refused([GNSS, alone, BALLISTIC], "no-samples", "velocity", kind=GateError)
+
+
+def test_noise_of_its_own_for_each_fix(folder):
+    fix = (T, LAT + 0 * T, LON + 0 * T, 1400 + T)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,hacc,vertical_sd_m", *fix, 2 + T, np.where(T < 2.0, np.nan, 4.0))
+    columns = 'columns = { horizontal_sd = { column = "hacc", unit = "ft" } }\n'
+    telemetry = folder.read(GNSS + columns, BALLISTIC)
+    sd = telemetry.gnss["gps"].sd
+    np.testing.assert_allclose(sd[:, 0], 0.3048 * (2 + T))
+    np.testing.assert_array_equal(np.isnan(sd[:, 1]), T < 2.0)
+    assert np.isnan(sd[:, 2:]).all()
+    # what each fix states is not taken from the defaults; what some do not state is
+    assert "horizontal_sd_m" not in telemetry.assumed["gnss.gps"]
+    assert "vertical_sd_m" in telemetry.assumed["gnss.gps"]
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,horizontal_sd_m", *fix, 0 * T)
+    folder.refused([GNSS, BALLISTIC], "value-range", "horizontal_sd", kind=GateError)
+
+
 def test_weak_fixes_are_left_out_and_counted(folder):
     nsat = np.where(T < 5.0, 5, 9)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,sats", T, LAT + 0 * T, LON + 0 * T, 1400 + T, nsat)

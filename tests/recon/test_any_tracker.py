@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import standard_sounding
-from flightmodel.instruments import RadarSite
-from flightmodel.telemetry import Motion, RadarRecord, Telemetry
+from flightmodel.instruments import GnssSpec, RadarSite
+from flightmodel.telemetry import GnssRecord, Motion, RadarRecord, Telemetry
 from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
 from recon.setup import track_points, tracking_instruments
@@ -173,6 +173,43 @@ def test_noise_of_its_own_for_each_row():
     _, covariance, rows = off(solution)
     ratio = np.sqrt(np.trace(covariance[20, :3, :3]) / np.trace(least[rows][20, :3, :3]))
     assert 1.0 < ratio < 1.6  # half of the rows, and a hundredth of the others: root of two in what noise decides
+
+
+def receiver(seed, speed_sd, noisy=None):
+    """A receiver's velocities alone; ``noisy`` (n,) multiplies the noise and is stated of each fix."""
+    t, path = fly(capsule())
+    spec = GnssSpec("gps", np.zeros(3), 1.0, 1.0, speed_sd, 2.0 * speed_sd, time_bias_sd_s=1e-6)
+    times = np.ones(len(t)) if noisy is None else noisy
+    sd = speed_sd * np.array([1.0, 1.0, 2.0]) * times[:, None]
+    ned = np.random.default_rng([seed, 9]).standard_normal((len(t), 3)) * sd
+    velocity = path[:, 3:] + ned @ earth.dcm_ned_ecef(LAT, LON)
+    nothing = np.full((len(t), 2), np.nan)
+    own = None if noisy is None else np.column_stack([nothing, sd[:, 1:]])
+    return GnssRecord(spec, t, np.full((len(t), 3), np.nan), velocity, sd=own)
+
+
+def test_velocities_alone_help_and_err_as_stated():
+    squares, seeds = 0.0, range(6)
+    for seed in seeds:
+        telemetry = replace(watch(seed, SITES[:2], ("az", "el")), gnss={"gps": receiver(seed, 0.02)})
+        solution = reconstruct_once(telemetry, QUICK)
+        assert all(v.passed for v in solution.consistency_checks if v.code in ("nis", "edited"))
+        error, covariance, rows = off(solution)
+        k = len(rows) // 2
+        squares += error[k] @ np.linalg.solve(covariance[k], error[k])
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * len(seeds))
+    assert low < squares < high
+    plain = off(reconstruct_once(watch(5, SITES[:2], ("az", "el")), QUICK))[1]
+    assert np.trace(covariance[k, 3:, 3:]) < 0.5 * np.trace(plain[k, 3:, 3:])
+
+
+def test_noise_of_its_own_for_each_velocity():
+    noisy = np.where(np.arange(len(fly(capsule())[0])) % 2, 10.0, 1.0)
+    telemetry = watch(5, SITES[:2], ("az", "el"))
+    told = replace(telemetry, gnss={"gps": receiver(5, 0.02, noisy)})
+    assert all(v.passed for v in reconstruct_once(told, QUICK).consistency_checks if v.code in ("nis", "edited"))
+    untold = replace(told, gnss={"gps": replace(told.gnss["gps"], sd=None)})
+    assert {v.source for v in reconstruct_once(untold, QUICK).consistency_checks if not v.passed} == {"gps"}
 
 
 def test_points_are_where_rays_and_ranges_meet():
