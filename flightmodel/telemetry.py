@@ -134,6 +134,11 @@ class GnssRecord:
         check_shape(self.spec.name, self.position_ecef_m, (len(self.time_s), 3))
         check_shape(self.spec.name, self.velocity_ecef_mps, (len(self.time_s), 3))
 
+    @property
+    def has_positions(self) -> bool:
+        """Whether it gives positions, not velocities alone."""
+        return bool(np.isfinite(self.position_ecef_m).all(axis=1).any())
+
 
 @dataclass(frozen=True)
 class BarometerRecord:
@@ -406,6 +411,11 @@ class Telemetry:
     def frames(self) -> Frames | None:
         """Film of the first camera; None without video."""
         return next(iter(self.films.values()), None)
+
+    @property
+    def has_other_positions(self) -> bool:
+        """Whether a receiver's positions or a barometer can contradict what all radar sites share."""
+        return bool(self.barometers) or any(record.has_positions for record in self.gnss.values())
 
     def span_s(self) -> tuple[float, float]:
         """First and last time that all triads and at least one radar or receiver cover together."""

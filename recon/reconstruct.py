@@ -352,7 +352,7 @@ def _with_shared_errors_tried(
 ) -> TrajectorySolution:
     """Solution with a failed check where an error of all radar sites together would make all data consistent."""
     names = [name for name in survey.WIDE_SD if name in set(solution.sensor_errors.name)]
-    if not names or not (telemetry.gnss or telemetry.barometers):
+    if not names or not telemetry.has_other_positions:
         return solution
     coarse = replace(settings, output_rate_hz=min(settings.output_rate_hz, _LEAVE_ONE_OUT_RATE_HZ), pulse_rate_hz=0.0)
     again = reconstruct_once(telemetry, coarse, adaptation=replace(solution.adaptation, inflated_sd=survey.WIDE_SD))

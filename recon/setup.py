@@ -333,7 +333,7 @@ def _sites(telemetry: Telemetry) -> SitesSpec:
     stated = telemetry.sites
     if not telemetry.radars:
         return SitesSpec()
-    if not (telemetry.places or telemetry.gnss or telemetry.barometers):
+    if not (telemetry.places or telemetry.has_other_positions):
         return stated
     return SitesSpec(
         stated.name,

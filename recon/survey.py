@@ -193,7 +193,7 @@ def shared_error_check(table: FloatArray, names: list[str], consistent: bool) ->
 def rests_on(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
     """One line each for position, height and azimuth: on what they rest and to how much, where no residual shows it."""
     radars = [r.site for name, r in telemetry.radars.items() if name not in settings.without]
-    receivers = [name for name in telemetry.gnss if name not in settings.without]
+    receivers = [name for name, r in telemetry.gnss.items() if name not in settings.without and r.has_positions]
     checked = f"; checked by {', '.join(place.name for place in telemetry.places)}" if telemetry.places else ""
     if not radars and not receivers and telemetry.start.state is not None:
         return (f"position, height and azimuth rest on the state at {telemetry.start.state.time_s:g} s{checked}",)

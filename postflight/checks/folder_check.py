@@ -200,8 +200,7 @@ def _facts(found: Sources) -> list[Fact]:
         measured = radar.range_az_el[:, np.isfinite(radar.range_az_el).any(axis=0)]
         tables.append((name, spec.radars[name].file, radar.time_s, measured))
     for name, fixes in found.gnss.items():
-        positions = np.isfinite(fixes.position_ecef_m).any()
-        measured = fixes.position_ecef_m if positions else fixes.velocity_ecef_mps
+        measured = fixes.position_ecef_m if fixes.has_positions else fixes.velocity_ecef_mps
         tables.append((name, spec.gnss[name].file, fixes.time_s, measured))
     for name, barometer in found.barometers.items():
         tables.append((name, spec.barometers[name].file, barometer.time_s, barometer.height_m[:, None]))

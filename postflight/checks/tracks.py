@@ -47,7 +47,7 @@ _MOST_HOURS = 24
 def tracks(found: Sources) -> dict[str, RadarRecord | GnssRecord]:
     """Return radars and receivers that fix positions by themselves, by name."""
     whole = {name: r for name, r in found.radars.items() if np.isfinite(r.range_az_el).all(axis=1).any()}
-    return {**whole, **{name: f for name, f in found.gnss.items() if np.isfinite(f.position_ecef_m).all(axis=1).any()}}
+    return {**whole, **{name: record for name, record in found.gnss.items() if record.has_positions}}
 
 
 def position_of(record: RadarRecord | GnssRecord, planet: earth.Planet = earth.WGS84) -> FloatArray:

@@ -118,9 +118,8 @@ def _tracker_heights(run: Run) -> list[dict[str, Any]]:
         s = radar.site
         places = earth.ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m, planet)
         tracks.append((name, radar.time_s, places))
-    tracks += [(name, fixes.time_s, fixes.position_ecef_m) for name, fixes in run.telemetry.gnss.items()]
-    whole = [(name, t, places) for name, t, places in tracks if np.isfinite(places).all(axis=1).any()]
-    known = [(name, t, earth.geodetic_from_ecef(places, planet)[2]) for name, t, places in whole]
+    tracks += [(name, r.time_s, r.position_ecef_m) for name, r in run.telemetry.gnss.items() if r.has_positions]
+    known = [(name, t, earth.geodetic_from_ecef(places, planet)[2]) for name, t, places in tracks]
     known += [(name, b.time_s, b.height_m) for name, b in run.telemetry.barometers.items()]
     return [_points(name, t, h / 1e3, _GREY, 4, _TRACK_POINTS // len(known)) for name, t, h in known]
 

@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from estimators.agreement import CAMERA_MISALIGNED
 from postflight.deflections import METHODS
 from tests.wrong.cases import Case, cases
 from tests.wrong.outcome import Outcome, outcome_of
@@ -24,13 +25,15 @@ _INPUTS = {  # of the methods' agreement, and whose file states them
     "sounded wind": "atmosphere",
     "sounded density": "atmosphere",
     "frames": "camera",
+    CAMERA_MISALIGNED: "camera",
 }
 
 
 def first_named(found: Outcome) -> tuple[str, tuple[str, ...]]:
     """Code and suspects of what is named first; empty where nothing is."""
     for code, sources in found.named:
-        suspects = tuple(_INPUTS.get(name, name) for source in sources for name in source.split(", ") if name)
+        names = [name for source in sources for name in _INPUTS.get(source, source).split(", ") if name]
+        suspects = tuple(_INPUTS.get(name, name) for name in names)
         if suspects:
             return code, suspects
     return "", ()
