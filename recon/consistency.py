@@ -249,11 +249,17 @@ def held_out_checks(problem: Problem, held_out: pd.DataFrame, settings: Settings
     return out
 
 
+def _settled_from_s(problem: Problem) -> float:
+    """Time from which on points are tested: the start was fitted to those before; of a short span, the later half."""
+    first, last = float(problem.time_s[0]), float(problem.time_s[-1])
+    return first + min(FIT_SPAN_S, 0.5 * (last - first))
+
+
 def source_checks(problem: Problem, innovations: Innovations, confidence: float) -> list[ConsistencyCheck]:
     """NIS, whiteness and edits of each source; one that was excluded by settings has none."""
     out: list[ConsistencyCheck] = []
     time_s = problem.time_s[problem.node]
-    settled = time_s > problem.time_s[0] + FIT_SPAN_S
+    settled = time_s > _settled_from_s(problem)
     measured = np.isfinite(problem.observed.variance)
     normalised = innovations.residual / np.sqrt(np.diagonal(innovations.covariance, axis1=1, axis2=2))
     for number, instrument in enumerate(problem.instruments):
@@ -290,7 +296,7 @@ def filter_against_smoother(
 ) -> list[ConsistencyCheck]:
     """Filter against smoother at the kept nodes after the first seconds."""
     kept = np.flatnonzero(problem.kept)
-    settled = problem.time_s[kept] > problem.time_s[0] + FIT_SPAN_S
+    settled = problem.time_s[kept] > _settled_from_s(problem)
     difference = boxminus(run.states()[kept], reference[kept])[settled, :KINEMATIC]
     p_filter, p_smoother = (unpacked(t[settled], KINEMATIC) for t in (run.filtered.p_plus, smoothed.triangles))
     groups = [name for name in GROUPS if name != "attitude" or not problem.motion.ballistic]

@@ -64,6 +64,7 @@ _BALLISTIC_STEP_S = 0.5  # drivers are constant within a step, and decorrelate i
 _DIFFUSE_POSITION_M = 1000.0
 _DIFFUSE_VELOCITY_MPS = 100.0
 _LEAST_POINTS = 4
+_LEAST_SPAN_S = 2.0  # its later half gives a tracker of ten points a second the ten that residuals are tested with
 _TRACK_SPAN_S = 2.5
 _FIXED_RAD = 1e-6  # sd of the rotation of ballistic flight, which is held fixed
 _GYRO = slice(18, 27)
@@ -373,10 +374,10 @@ def _span(
         start_s = max(start_s, settings.start_s)
     if settings.end_s is not None:
         end_s = min(end_s, settings.end_s)
-    if end_s - start_s < 2.0 * FIT_SPAN_S:
+    if end_s - start_s < _LEAST_SPAN_S:
         raise GateError(
             f"inertial sensors and trackers share only {start_s:.3f} to {end_s:.3f} s; "
-            f"at least {2.0 * FIT_SPAN_S:.0f} s are needed: check time bases and the chosen span",
+            f"at least {_LEAST_SPAN_S:g} s are needed: check time bases and the chosen span",
             code="span-too-short",
         )
     return float(start_s), float(end_s)

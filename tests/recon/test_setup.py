@@ -110,7 +110,7 @@ def test_a_receiver_alone_tracks(mini_everything):
     assert len(build(both).instruments) == 3
 
 
-@pytest.mark.parametrize("span", [{"start_s": 158.0, "end_s": None}, {"end_s": 103.0}, {"start_s": 300.0}])
+@pytest.mark.parametrize("span", [{"start_s": 159.5, "end_s": None}, {"end_s": 100.9}, {"start_s": 300.0}])
 def test_no_common_span_is_refused_in_words(mini_sense, span):
     assert faults(build, mini_sense(1)[0], **span)[0].code == "span-too-short"
 
