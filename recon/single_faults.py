@@ -17,14 +17,14 @@ that are hardly less likely.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
+from flightmodel.instruments import RadarSite
 from flightmodel.telemetry import Telemetry, TriadRecord
 from recon.ekf import ForwardPass, Problem
 from recon.oscillation import MIRRORED, ROLL, Oscillation
@@ -175,17 +175,23 @@ def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, f
         out.append(Single("tracker", f"{name}: noise", (name,), telemetry, noisier={name: _NOISIER}))
     if telemetry.radars:
         names = tuple(telemetry.radars)
-        bent = _with_sites(telemetry, refraction_sd=_REFRACTION_SD)
-        slow = _with_sites(telemetry, angle_servo_hz=_SERVO_HZ, servo_lag_sd=_SERVO_LAG_SD)
+        bent = _with_sites(telemetry, lambda site: replace(site, refraction_sd=_REFRACTION_SD))
+        slow = _with_sites(telemetry, _slower)
         out.append(Single("refraction", "refraction of the radars", names, bent))
         out.append(Single("servo-lag", "servo of the radars", names, slow))
     return out + _attitudes(telemetry) + _slips(telemetry)
 
 
-def _with_sites(telemetry: Telemetry, **stated: Any) -> Telemetry:
+def _with_sites(telemetry: Telemetry, changed: Callable[[RadarSite], RadarSite]) -> Telemetry:
     """Telemetry whose radars' sites state something else."""
-    radars = {name: replace(r, site=replace(r.site, **stated)) for name, r in telemetry.radars.items()}
+    radars = {name: replace(r, site=changed(r.site)) for name, r in telemetry.radars.items()}
     return replace(telemetry, radars=radars)
+
+
+def _slower(site: RadarSite) -> RadarSite:
+    """Site whose servo may lag by as much as that of a slow one, whatever bandwidth is stated."""
+    hz = site.angle_servo_hz or _SERVO_HZ
+    return replace(site, angle_servo_hz=hz, servo_lag_sd=_SERVO_LAG_SD * (hz / _SERVO_HZ) ** 2)
 
 
 def _slips(telemetry: Telemetry) -> list[Single]:

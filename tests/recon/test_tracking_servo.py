@@ -105,8 +105,9 @@ def test_a_bandwidth_that_is_off_is_estimated(mini_truth, mini_sense):
     assert (rows.sd < 0.2).any()
 
 
-def test_nobody_stated_it_and_it_is_named(mini_truth, mini_sense):
-    solution = reconstruct(lagging(mini_sense(4)[0], mini_truth, hz=0.2), QUICK)
+@pytest.mark.parametrize("stated", [{}, {"angle_servo_hz": 2.0}], ids=["not stated", "stated ten times too fast"])
+def test_a_slow_servo_that_is_not_stated_is_named(mini_truth, mini_sense, stated):
+    solution = reconstruct(lagging(mini_sense(4)[0], mini_truth, hz=0.2, **stated), QUICK)
     assert any(not check.passed for check in solution.consistency_checks)
     assert solution.single_faults[0].code == "servo-lag"
 
