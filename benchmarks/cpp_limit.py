@@ -82,7 +82,7 @@ class Flights:
         arrays = [a.ctypes.data_as(DOUBLES) for a in self.tables]
         air, _, mach, coefficients, _ = (a.shape for a in self.tables)
         tables = Tables(*arrays, air[0], air[1], mach[0], coefficients[1])
-        planet = (ctypes.c_double * 5)(*earth.WGS84)
+        planet = (ctypes.c_double * 5)(*earth.WGS84[:5])  # its gas is that of the air table
         function(
             state.ctypes.data_as(DOUBLES),
             parameters.ctypes.data_as(DOUBLES),
