@@ -1,12 +1,13 @@
 """Do the deflection estimates err as they say? Flights far from the reference vehicle, scored at peak pressure.
 
-Run: ``python benchmarks/estimator_coverage.py [FLIGHTS [FIRST SEED]] [FOLDER] [--planted] [--packages FOLDER]`` (100
-flights from seed 0). Drawn anew for each seed, as `tests.wide_flights` says: spin, joint, damping, offset, size and
-mass of the vehicle, and what is unknown of it. No video. Some 4 s a flight on each of two cores; what the
+Run: ``python benchmarks/estimator_coverage.py [FLIGHTS [FIRST SEED]] [FOLDER] [--bent] [--planted] [--packages DIR]``
+(100 flights from seed 0). Drawn anew for each seed, as `tests.wide_flights` says: spin, joint, damping, offset, size
+and mass of the vehicle, and what is unknown of it. No video. Some 4 s a flight on each of two cores; what the
 estimators see and the truth are kept in FOLDER, so that the estimators can be scored again without flying. The
 camera's history is drawn, not rendered. Beside errors over their sd the quantiles are scored: the share of truths below
 each, for little, some and much deflection. ``--planted`` spoils one assumption at a time, with uncertainties as the
 reference vehicle's file states them; ``suspects_bound.py`` says how well the same errors could be found at all.
+``--bent`` flies soft joints and no small offsets: deflections of some degrees, kept in a folder of their own.
 ``--packages`` scores flights of another simulator: folders with flight.toml and truth/truth.csv.
 """
 
@@ -81,9 +82,9 @@ def loads_of(telemetry):
     return loads_from_solution(telemetry, bet, air_data(bet.smoothed, profile, telemetry.vehicle.cg_m))
 
 
-def flown_pulse(seed):
+def flown_pulse(seed, bent=False):
     """One flight: what the estimators see, and the truth at the same times."""
-    one = wide_flights.wide_flight(seed)
+    one = wide_flights.wide_flight(seed, bent=bent)
     with tempfile.TemporaryDirectory() as temporary:
         telemetry, truth = wide_flights.flown(one, Path(temporary) / "flight")
         pulse = loads_of(telemetry)
@@ -97,6 +98,7 @@ def flown_pulse(seed):
         "factors": np.array([one.factors[k] for k in ("ca", "cn", "cm")]),
         "peak": np.array(find_peak(truth.time_s, truth.dynamic_pressure_pa)[0]),
         "locked": np.array(one.locked),
+        "bent": np.array(bent),
         "spin": np.array(one.scenario.spec.initial.spin_rpm),
         "words": np.array(truth.remark),
     }
@@ -111,8 +113,8 @@ def kept_path(folder, seed):
     return Path(folder) / f"flight_{seed:04d}.npz"
 
 
-def fly_and_keep(seed, folder):
-    pulse, truth = flown_pulse(seed)
+def fly_and_keep(seed, folder, bent):
+    pulse, truth = flown_pulse(seed, bent)
     data = {f"pulse_{k}": getattr(pulse, k) for k in ARRAYS} | {f"true_{k}": v for k, v in truth.items()}
     np.savez(kept_path(folder, seed), **data)
     return seed, str(truth["words"])
@@ -125,20 +127,20 @@ def kept_flight(folder, seed):
         for name in ("angular_acceleration_sd_radps2", "force_noise_sd_mps2", "half_window_s"):
             arrays[name] = float(arrays[name])
         truth = {k.removeprefix("true_"): data[k] for k in data.files if k.startswith("true_")}
-    one = wide_flights.wide_flight(seed)
+    one = wide_flights.wide_flight(seed, bent=bool(truth.get("bent", False)))
     spec, vehicle = one.scenario.spec, one.stated
     arm = vehicle.cg_m - vehicle.sensors[spec.accelerometer.mount].position_from_datum_body_m
     stated = (vehicle, vehicle.cg_m, spec.accelerometer.time_bias_s, spec.rates.time_bias_s, arm)
     return FlightLoads(**arrays, **dict(zip(STATED, stated, strict=True))), truth
 
 
-def fly_missing(folder, seeds, workers=2):
+def fly_missing(folder, seeds, workers=2, bent=False):
     """Fly what is not kept yet, and say how far it is."""
     Path(folder).mkdir(parents=True, exist_ok=True)
     missing = [s for s in seeds if not kept_path(folder, s).exists()]
     begun = time.perf_counter()
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
-        jobs = [pool.submit(fly_and_keep, s, folder) for s in missing]
+        jobs = [pool.submit(fly_and_keep, s, folder, bent) for s in missing]
         for k, job in enumerate(as_completed(jobs), 1):
             seed, words = job.result()
             left = (time.perf_counter() - begun) / k * (len(jobs) - k)
@@ -375,7 +377,7 @@ def main():
     if "--packages" in sys.argv:
         return score_packages(sys.argv[sys.argv.index("--packages") + 1])
     seeds, folder = seeds_and_folder()
-    fly_missing(folder, seeds)
+    fly_missing(folder, seeds, bent="--bent" in sys.argv)
     whats = PLANTED if "--planted" in sys.argv else (None,)
     begun = time.perf_counter()
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:

@@ -26,6 +26,7 @@ from synthetic_flight.scenarios import Scenario
 from synthetic_flight.simulate import Truth
 from tests.recon import dispersed
 
+BENT_RAD, BENT_OFFSET_M = tuple(np.deg2rad([3.0, 8.0])), (0.004, 0.008)  # asked for: static, at the largest load
 SPIN_RPM, STIFFNESS_NMPRAD, DAMPING_RATIO = (0.0, 60.0), (1e3, 50e3), (0.002, 0.03)
 OFFSET_M, MASS_KG, LOCKED_HZ = (0.0, 0.008), (60.0, 400.0), 40.0
 LENGTH_SD, PRODUCT = 0.10, 0.002  # of the lengths; of a body's transverse inertia
@@ -59,17 +60,21 @@ class WideFlight:
         return self.factors["ca"] * np.exp(np.interp(mach, SHAPE_MACH, self.ca_shape))
 
 
-def wide_flight(seed: int, ca_shape_part: float = 0.0) -> WideFlight:
-    """Draw one flight; any ``ca_shape_part`` leaves all other draws as they are."""
+def wide_flight(seed: int, ca_shape_part: float = 0.0, bent: bool = False) -> WideFlight:
+    """Draw one flight; any ``ca_shape_part`` leaves all other draws as they are.
+
+    ``bent``: the offset is no small one, and the joint so soft that it gives way by degrees.
+    """
     rng = np.random.default_rng([seed, 18, 2009])
-    stated = _stated(rng)
+    stated = _stated(rng, BENT_OFFSET_M if bent else OFFSET_M)
     stated = replace(stated, uncertainty=stated.uncertainty.model_copy(update={"ca_shape_part": ca_shape_part}))
     flown, factors = _flown(stated, rng, np.sqrt(1.0 - ca_shape_part))
     shape = np.sqrt(ca_shape_part) * stated.uncertainty.ca * _unit_shape(np.random.default_rng([seed, 5, 18, 2009]))
     if ca_shape_part > 0.0:
         flown = replace(flown, aero=_reshaped(flown.aero, shape))
-    locked = seed % 8 == 7
-    flown = replace(flown, joint=_joint(flown, rng, locked))
+    locked = seed % 8 == 7 and not bent
+    asked = np.random.default_rng([seed, 7, 18, 2009]).uniform(*BENT_RAD) if bent else 0.0
+    flown = replace(flown, joint=_joint(flown, rng, locked, asked))
     scenario = dispersed.dispersed_scenario("irve2_reference", seed)
     spin = float(rng.uniform(*SPIN_RPM))
     initial = scenario.spec.initial.model_copy(update={"spin_rpm": spin})
@@ -78,12 +83,12 @@ def wide_flight(seed: int, ca_shape_part: float = 0.0) -> WideFlight:
     return WideFlight(seed, stated, replace(scenario, spec=spec, vehicle=flown), factors, locked, shape)
 
 
-def _stated(rng: np.random.Generator) -> Vehicle:
+def _stated(rng: np.random.Generator, offset_m: tuple[float, float]) -> Vehicle:
     """Reference vehicle of another size and mass, its offset anywhere."""
     nominal = vehicle_from_toml(vehicle_path("irve2_reference"))
     mass = _log_uniform(rng, MASS_KG) / nominal.mass_kg
     length = mass ** (1.0 / 3.0) * np.exp(LENGTH_SD * rng.standard_normal())
-    clock, size = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*OFFSET_M)
+    clock, size = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*offset_m)
     lateral = size * nominal.mass_kg / nominal.centerbody.mass_kg * np.array([-np.cos(clock), np.sin(clock)])
     parts = {}
     for name in ("aeroshell", "centerbody"):
@@ -149,13 +154,17 @@ def _flown(stated: Vehicle, rng: np.random.Generator, constant_ca: float) -> tup
     return replace(stated, aero=aero, **parts), {**factors, "cmq_shift": shift}
 
 
-def _joint(flown: Vehicle, rng: np.random.Generator, locked: bool) -> CompliantJoint:
-    """Joint that holds at the flight's largest load."""
+def _joint(flown: Vehicle, rng: np.random.Generator, locked: bool, bent_rad: float) -> CompliantJoint:
+    """Joint that holds at the flight's largest load, where asked for with so much static deflection under it."""
     nominal = vehicle_from_toml(vehicle_path("irve2_reference"))
     loading = flown.mass_kg / flown.reference.area_m2 * nominal.reference.area_m2 / nominal.mass_kg
-    least = LEAST_MARGIN * static_trim(flown, 3.0, PEAK_PA * loading).critical_stiffness_nmprad
+    trim = static_trim(flown, 3.0, PEAK_PA * loading)
+    least = LEAST_MARGIN * trim.critical_stiffness_nmprad
     stiffness = _log_uniform(rng, (max(least, STIFFNESS_NMPRAD[0]), max(STIFFNESS_NMPRAD[1], 1.5 * least)))
     ratio = _log_uniform(rng, DAMPING_RATIO)
+    if bent_rad:  # deflection = offset / xbar u / (1 - u), u the critical stiffness over the joint's
+        share = float(np.hypot(*flown.cg_m[1:])) / trim.xbar_m
+        stiffness = max(least, trim.critical_stiffness_nmprad * (bent_rad + share) / bent_rad)
     if locked:
         stiffness, ratio = flown.joint.bending_stiffness_nmprad * (LOCKED_HZ / flown.free_free_frequency_hz()) ** 2, 0.1
     size = flown.transverse_inertia_about_joint()[1] / nominal.transverse_inertia_about_joint()[1]
