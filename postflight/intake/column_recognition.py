@@ -418,6 +418,17 @@ class Recogniser:
             return ColumnProposal(quantity.short, name, unit, STATED, "its canonical name", canonical=True)
         return ColumnProposal(quantity.short, name, unit, how, why)
 
+    def _own_noise(self, quantities: tuple[Quantity, ...]) -> list[ColumnProposal]:
+        """Columns with the noise of each row, by their canonical names: what "accuracy" means differs by maker."""
+        found = []
+        for quantity in quantities:
+            k = next((k for k in sorted(self.free) if self.table.names[k] == quantity.canonical), None)
+            if k is not None:
+                self.free.discard(k)
+                unit = next(iter(self.named[k].units(quantity.kind)), "")
+                found.append(self._proposal(quantity, k, unit, STATED, ""))
+        return found
+
     def _radar(self) -> list[SourceProposal]:
         """Slant range, azimuth, elevation."""
         if not all(self.columns_of(q.short) for q in tables.RADAR):
@@ -429,6 +440,7 @@ class Recogniser:
             ("latitude_deg", "deg: the radar's site, WGS-84"), ("longitude_deg", "deg, east positive"),
             ("height_m", "m above the ellipsoid"),
         )]  # fmt: skip
+        found += self._own_noise(tables.TRACKER_SD)
         return [SourceProposal(f"radars.{self.name}", [m for m in found if m], keys)]
 
     def _receiver(self) -> list[SourceProposal]:
@@ -456,6 +468,7 @@ class Recogniser:
                 keys.append(("satellites_column", name, "counted there; min_satellites = 8 leaves poor fixes out"))
         for short in ("lat", "lon", "alt") if ecef else ():  # the same positions once more
             self._set_aside(set(self.columns_of(short)))
+        found += self._own_noise(tables.GNSS_SD)
         return [SourceProposal(f"gnss.{self.name}", found, keys)]
 
     def _vectors(self, kind: str, shorts: tuple[str, ...]) -> list[ColumnProposal]:

@@ -206,6 +206,19 @@ def test_accelerometer_at_rest_tells_its_unit(folder, tmp_path, level, unit):
     assert tomllib.loads(text_of(folder))["sensors"]["accelerometer"]["columns"]["ax"]["unit"] == unit
 
 
+def test_noise_of_each_fix_is_taken_by_its_canonical_name(folder, tmp_path):
+    n = 50
+    table = pd.DataFrame(
+        {"t_s": np.arange(n) + 0.0, "lat_deg": 37.8, "lon_deg": -75.4, "alt_ell_m": 100.0 + np.arange(n)}
+    )
+    table.assign(horizontal_sd_m=np.linspace(2.0, 4.0, n), accuracy=3.0).to_csv(tmp_path / "gps.csv", index=False)
+    result = run("import", tmp_path / "gps.csv", "--into", folder)
+    assert "not used: accuracy" in " ".join(result.output.split())
+    answer(folder)
+    record = read_sources(folder).gnss["gps"]
+    np.testing.assert_allclose(record.sd[:, 0], np.linspace(2.0, 4.0, n))
+
+
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
