@@ -20,8 +20,7 @@ from typing import Any, Literal
 
 import click
 
-from postflight.streams import close_streams, open_streams, write_out
-from postflight.threads import pin_threads
+from postflight.streams import close_streams, open_streams, pin_threads, write_out
 
 # heavy imports stand inside the commands, so that --help answers at once
 FOLDER = click.Path(path_type=Path)
@@ -336,9 +335,9 @@ def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, join
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in the browser.")
 def camera(folder: Path, name: str | None, port: int, browser: bool) -> None:
     """Work at the film in FOLDER by hand: step through it, try deflections, mask, mark, accept and reject."""
-    from postflight.camera_bench import command
+    from postflight.camera_bench import server
 
-    command.open_bench(folder, name, port, browser)
+    server.open_bench(folder, name, port, browser)
 
 
 @cli.command()

@@ -25,7 +25,6 @@ from postflight import run_folder, warmup
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
 from postflight.filming import NO_VIDEO, by_camera
 from postflight.flight import Flight, read_flight
-from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
@@ -34,7 +33,7 @@ from postflight.second_process import SecondProcess
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import write_out
 from postflight.studies.preflight import Bounds, rigid_bounds
-from postflight.terminal import terminal
+from postflight.terminal import progress_bar, terminal
 from recon.consistency import ConsistencyCheck
 from recon.setup import check_sources
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder

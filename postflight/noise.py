@@ -16,8 +16,8 @@ from flightmodel.guarded_files import file_bytes
 from flightmodel.partial_files import partial_path
 from postflight.commands import compile_kernels, console
 from postflight.flight import read_flight
-from postflight.progress import progress_bar
 from postflight.streams import write_out
+from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from recon.noise_levels import NoiseLevels, noise_levels
 

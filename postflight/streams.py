@@ -1,7 +1,8 @@
 """How does text from files reach standard output? As text: it moves no cursor, turns no line round, ends no command.
 
 A name in a delivery may hold escape sequences that rewrite what stands above, or bidirectional marks that show a number
-backwards; a reader such as `head` may close its end of the pipe, a log may take ASCII only.
+backwards; a reader such as `head` may close its end of the pipe, a log may take ASCII only. Beside the streams of a
+command's process stand its threads.
 """
 
 from __future__ import annotations
@@ -61,3 +62,14 @@ def close_streams() -> None:
             stream.flush()
         except BrokenPipeError:
             into_nothing(stream)
+
+
+# threads of linear algebra: sums of several round otherwise than sums of one, and bytes would depend on the cores
+
+# read by the libraries behind numpy and scipy when they are loaded
+THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+
+
+def pin_threads() -> None:
+    """Limit linear algebra of this process and its children to one thread; before numpy is imported."""
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))

@@ -1,13 +1,20 @@
-"""On what do commands print? On rich's console, which text from files cannot steer and a lost reader cannot end."""
+"""On what do commands print, and how far are they? On rich's console, which text from files cannot steer and a lost
+reader cannot end; progress is a bar on a terminal, and a plain line now and then where standard error is none.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
+from rich import progress as bars
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
+from flightmodel.checks import Progress
 from postflight.streams import into_nothing, visible
 
 
@@ -27,3 +34,54 @@ class Terminal(Console):
 def terminal(**options: Any) -> Terminal:
     """Return a console of the project's settings on standard output, or on standard error where asked."""
     return Terminal(soft_wrap=True, **options)
+
+
+# progress of a long command: a bar on a terminal, a plain line now and then where standard error is none
+
+_EVERY_S = 10.0  # between plain lines; a shorter command prints none
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """Progress on standard error: a bar with remaining time, or a line every ten seconds where that is no terminal."""
+    screen = terminal(stderr=True)
+    if not screen.is_terminal:
+        with plain_lines(screen, _EVERY_S) as report:
+            yield report
+        return
+    columns = (
+        bars.TextColumn("{task.description:<34}"),
+        bars.BarColumn(),
+        bars.TimeElapsedColumn(),
+        bars.TimeRemainingColumn(),
+    )
+    with bars.Progress(*columns, console=screen, transient=True) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda fraction, what: bar.update(task, completed=fraction, description=what)
+
+
+@contextmanager
+def plain_lines(screen: Console, every_s: float) -> Iterator[Progress]:
+    """Print elapsed seconds, the part that is done and the present step, every so many seconds.
+
+    A step that takes longer is printed again, so that a log shows that the command is alive.
+    """
+    begun, now, done = time.monotonic(), (0.0, "starting"), threading.Event()
+
+    def report(fraction: float, what: str) -> None:
+        nonlocal now
+        now = (fraction, what)
+
+    def print_lines() -> None:
+        while not done.wait(every_s):
+            fraction, what = now
+            line = f"{time.monotonic() - begun:.0f} s: {100.0 * min(fraction, 1.0):.0f} %, {what}"
+            screen.print(line, highlight=False, markup=False)
+
+    thread = threading.Thread(target=print_lines, daemon=True)
+    thread.start()
+    try:
+        yield report
+    finally:
+        done.set()
+        thread.join()

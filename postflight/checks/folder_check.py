@@ -23,12 +23,12 @@ from rich.table import Table
 from flightmodel import earth
 from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.config import FILL_IN, read_toml
+from flightmodel.film import Frames
 from flightmodel.flightfolder import Sources, assumed_errors, read_sources
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
-from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from postflight.checks import inertial, pressure_and_field, tracks
-from postflight.checks.benchmark_frame import benchmark_frame
 from postflight.checks.track_force import best_comparison, track_force
 from postflight.checks.units_and_axes import TimeBias, clock_remarks
 from postflight.intake.flight_form import placeholders
@@ -234,7 +234,7 @@ def _cross_check(found: Sources, report: Report) -> None:
             _keep_sharp(report, bias)
     for name, record in trackers.items():
         _against_accelerometer(found, name, record, report)
-    from postflight.checks.oscillation import oscillation_of  # with the filter's package, where there are tables
+    from postflight.checks.inertial import oscillation_of  # with the filter's package, where there are tables
 
     swings = oscillation_of(found)
     remarks += [f for f in swings.remarks if not any(r.code.startswith("accelerometer-") for r in remarks)]
@@ -347,3 +347,35 @@ def print_report(report: Report) -> None:
 
 def _line(mark: str, words: str, code: str = "") -> None:
     console.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}", highlight=False)
+
+
+# a camera's benchmark frame, tried as a run would use it: seconds where the lens is not calibrated
+
+
+def benchmark_frame(found: Sources) -> list[Finding]:
+    """Check that every camera's benchmark frame orients it.
+
+    Returns
+    -------
+    list of Finding
+        Why it does not, with the code that a run would refuse the film with; or ``features-not-found`` (or the code of
+        the failed orientation) where another way had to be taken than by the features that the vehicle file states.
+    """
+    films = {table: found.films[name] for table, name in found.spec.film_names.items() if name in found.films}
+    return [finding for table, frames in films.items() for finding in _tried(table, frames, found.vehicle)]
+
+
+def _tried(source: str, frames: Frames, vehicle: Vehicle | None) -> list[Finding]:
+    if vehicle is None or not len(frames.time_s):
+        return []
+    from postflight.filming import orient_on_film  # which a folder without video needs not wait for
+
+    at = float(frames.time_s[frames.benchmark])
+    try:
+        oriented = orient_on_film(frames, vehicle)
+    except GateError as fault:
+        return [Finding(source, str(fault), at, at, fault.codes[0])]
+    if oriented.stated_refused:
+        words = f"{oriented.stated_refused}; a run goes by the edge and the shell's texture"
+        return [Finding(source, words, at, at, oriented.stated_refused.code)]
+    return []

@@ -17,7 +17,7 @@ from postflight.montecarlo.execution import Wanted
 from postflight.montecarlo.study import Stop, Study, indices, read_study, sobol_study
 from postflight.plots.studies import figure_bands, figure_sobol
 from postflight.plots.style import draw
-from postflight.progress import progress_bar
+from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from synthetic_flight.ensemble import available_cores, check_outputs
 

@@ -45,7 +45,7 @@ from postflight.montecarlo.bands import (
     write_chunk,
 )
 from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
-from postflight.threads import VARIABLES, pin_threads
+from postflight.streams import THREAD_VARIABLES, pin_threads
 from synthetic_flight.ensemble import fly_runs
 
 Job = tuple[int, list[int]]
@@ -93,7 +93,7 @@ def _begin() -> None:
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Limit linear algebra of processes that start now to one thread: there are as many of them as cores."""
-    before = {name: os.environ.get(name) for name in VARIABLES}
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     pin_threads()
     try:
         yield

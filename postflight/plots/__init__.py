@@ -9,8 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from postflight.plots.aerodynamics import figure_increments
-    from postflight.plots.deflection import figure_correlation, figure_fusion, figure_summary
+    from postflight.plots.deflection import figure_correlation, figure_fusion, figure_increments, figure_summary
     from postflight.plots.overlay import write_overlay_film
     from postflight.plots.paper_figures import figure_1_3, figure_2_3, figure_2_5, figure_2_7, figure_2_9
     from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
@@ -34,9 +33,8 @@ if TYPE_CHECKING:
 
 # imported on first use: matplotlib takes half a second
 _DOOR = {
-    "aerodynamics": ("figure_increments",),
     "paper_figures": ("figure_1_3", "figure_2_3", "figure_2_5", "figure_2_7", "figure_2_9"),
-    "deflection": ("figure_correlation", "figure_fusion", "figure_summary"),
+    "deflection": ("figure_correlation", "figure_fusion", "figure_increments", "figure_summary"),
     "trajectory": (
         "figure_air", "figure_attitude", "figure_filter_and_smoother", "figure_flown", "figure_residuals",
         "figure_sensitivity",

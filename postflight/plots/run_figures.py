@@ -18,8 +18,7 @@ from postflight.aero_increments import AeroIncrements
 from postflight.deflections import Deflections
 from postflight.filming import by_camera
 from postflight.flight import Flight
-from postflight.plots.aerodynamics import figure_increments
-from postflight.plots.deflection import figure_correlation, figure_fusion, figure_summary
+from postflight.plots.deflection import figure_correlation, figure_fusion, figure_increments, figure_summary
 from postflight.plots.overlay import deflection_at, oriented_camera, write_overlay
 from postflight.plots.paper_figures import figure_1_3, figure_2_3, figure_2_5, figure_2_7, figure_2_9
 from postflight.plots.style import draw, stamp

@@ -22,7 +22,6 @@ from postflight.deflections import estimate
 from postflight.flight import PULSE_RATE_HZ, Flight
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.plots.style import draw
-from postflight.progress import progress_bar
 from postflight.reconciliation.credibility import credibility
 from postflight.reconciliation.fit import JointFit, select_laws
 from postflight.reconciliation.fit import reconcile as fit_joint
@@ -44,6 +43,7 @@ from postflight.reconciliation.posterior import (
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies.commands import bands, compared_with_bounds
 from postflight.studies.preflight import Bounds, entry_bounds, rigid_bounds
+from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from recon.consistency import ConsistencyCheck
 from recon.settings import Settings

@@ -21,12 +21,12 @@ from postflight.montecarlo.bands import write_csv
 from postflight.montecarlo.study import read_study
 from postflight.plots import studies
 from postflight.plots.style import draw
-from postflight.progress import progress_bar
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies import joints
 from postflight.studies.joints import table_3_1
 from postflight.studies.preflight import Bounds, entry_bounds, inside
 from postflight.studies.shell_test import fit_laws, read_load_test
+from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from synthetic_flight.scenarios import read_scenario
 

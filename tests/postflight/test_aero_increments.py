@@ -15,7 +15,7 @@ from flightmodel.vehicle import DATA, vehicle_from_toml
 from postflight.aero_increments import TABLE, increments_of
 from postflight.deflections import Deflections, aero_increments, with_increments
 from postflight.fusing import fuse_flight
-from postflight.plots.aerodynamics import figure_increments
+from postflight.plots.deflection import figure_increments
 from postflight.run_folder import increments_summary
 from tests.estimators.conftest import VEHICLE
 from tests.estimators.test_increments import PROCESSES, SD, flown, flown_with

@@ -17,7 +17,7 @@ import pytest
 from flightmodel.camera_edits import read_edits
 from flightmodel.checks import GateError
 from postflight.camera_bench import server as servers
-from postflight.camera_bench.command import session_of
+from postflight.camera_bench.server import session_of
 from postflight.filming import camera_film
 from postflight.flight import read_flight
 from tests.estimators.test_camera_deflection import film

@@ -4,7 +4,7 @@ import time
 
 from rich.console import Console
 
-from postflight.progress import plain_lines, progress_bar
+from postflight.terminal import plain_lines, progress_bar
 
 
 def test_lines_repeat_a_long_step(capsys):

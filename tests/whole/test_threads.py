@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from postflight.threads import VARIABLES
+from postflight.streams import THREAD_VARIABLES
 from tests.postflight.killing import assert_same, contents
 
 MAIN = """
@@ -25,7 +25,7 @@ cli.main()
 
 
 def environment(threads):
-    return os.environ | dict.fromkeys(VARIABLES, str(threads)) | {"NO_COLOR": "1"}
+    return os.environ | dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"NO_COLOR": "1"}
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted in /proc")
