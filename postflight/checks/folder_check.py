@@ -234,7 +234,7 @@ def _cross_check(found: Sources, report: Report) -> None:
             _keep_sharp(report, bias)
     for name, record in trackers.items():
         _against_accelerometer(found, name, record, report)
-    from postflight.checks.inertial import oscillation_of  # with the filter's package, where there are tables
+    from postflight.checks.oscillation import oscillation_of  # with the filter's package, where there are tables
 
     swings = oscillation_of(found)
     remarks += [f for f in swings.remarks if not any(r.code.startswith("accelerometer-") for r in remarks)]

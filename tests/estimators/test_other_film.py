@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from postflight.checks.benchmark_frame import benchmark_frame
 
 from estimators.benchmark import orient_camera, samples_together
 from estimators.camera import JointSwing, read_film, without_jumps, without_lost_features
@@ -23,6 +22,7 @@ from estimators.virtual_camera import deformation_of
 from flightmodel.camera_edits import NO_EDITS
 from flightmodel.checks import NO_FAULT
 from flightmodel.vehicle import read_vehicle
+from postflight.checks.folder_check import benchmark_frame
 from postflight.filming import joint_swing
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film
 
