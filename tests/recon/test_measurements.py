@@ -385,3 +385,19 @@ def test_noise_of_a_magnetometer_holds_its_resolution():
     record = TriadRecord(spec, np.arange(2.0), np.full((2, 3), 2e-5))
     found = magnetometer_instrument("m", record, np.zeros((2, 3)), np.arange(2))
     assert np.allclose(found.variance, 1e-14 + 3.6e-13 / 12.0)
+
+
+def test_a_receivers_noise_is_each_fixs_own_where_it_is_stated():
+    n = 3
+    spec = GnssSpec("gps", np.zeros(3), 5.0, 10.0, 0.5, 1.0)
+    own = np.array([[2.0, 3.0, 0.2, 0.4], [np.nan] * 4, [2.0, np.nan, np.nan, 0.4]])
+    place = np.tile([7e6, 0.0, 0.0], (n, 1))
+    record = GnssRecord(spec, np.arange(n) + 0.0, place, np.zeros((n, 3)), sd=own)
+    position, velocity = gnss_instruments("gps", record, np.zeros(3))
+    np.testing.assert_allclose(np.sqrt(position.variance), [[2.0, 2.0, 3.0], [5.0, 5.0, 10.0], [2.0, 2.0, 10.0]])
+    np.testing.assert_allclose(np.sqrt(velocity.variance), [[0.2, 0.2, 0.4], [0.5, 0.5, 1.0], [0.5, 0.5, 0.4]])
+    # velocities alone, in the local axes of another place; without one there are none
+    alone = GnssRecord(spec, np.arange(n) + 0.0, np.full((n, 3), np.nan), np.tile([1.0, 0.0, 0.0], (n, 1)))
+    assert gnss_instruments("gps", alone, np.zeros(3)) == []
+    (only,) = gnss_instruments("gps", alone, np.zeros(3), near_ecef_m=place[0])
+    np.testing.assert_allclose(only.value, np.tile([0.0, 0.0, -1.0], (n, 1)), atol=1e-12)
