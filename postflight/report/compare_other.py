@@ -126,7 +126,7 @@ def _page(run: RunTables, found: SystematicDifferences, tables: dict[str, pd.Dat
         found=found,
         effects=effects,
         chi_square=chi_square,
-        title=_title(found),
+        title=title_of(found),
         date=date(run.header["epoch_utc"]),
     )
 
@@ -152,9 +152,14 @@ def charts(
     }
 
 
-def _title(found: SystematicDifferences) -> str:
-    named = [effect.name.replace("-", " ") for effect in found.effects]
-    return f"{found.label}: {', '.join(named) if named else 'no systematic difference'}"
+def title_of(found: SystematicDifferences) -> str:
+    """Heading of the page: what is beyond the covariances, and what is within."""
+    if not found.effects:
+        return f"{found.label}: no systematic difference"
+    beyond = [effect.name.replace("-", " ") for effect in found.effects if effect.beyond]
+    within = [effect.name.replace("-", " ") for effect in found.effects if not effect.beyond]
+    parts = ", ".join(beyond), f"{', '.join(within)} within the covariances" if within else ""
+    return f"{found.label}: {'; '.join(part for part in parts if part)}"
 
 
 def _panels(found: SystematicDifferences, table: pd.DataFrame) -> list[Panel]:

@@ -20,7 +20,7 @@ from postflight import exports
 from postflight import systematic_differences as differences
 from postflight.intake.other_trajectory import OtherTrajectory, read_other
 from postflight.report.compare import PAGE_NAME
-from postflight.report.compare_other import OTHER_TABLES
+from postflight.report.compare_other import OTHER_TABLES, title_of
 from postflight.run_folder import read_csv
 from postflight.runs import find_run, trajectory_of
 from postflight.systematic_differences import systematic_differences
@@ -206,6 +206,9 @@ def test_what_two_teams_covariances_do_not_allow_is_named_alone(teams, plant, na
     mine, theirs = teams
     result = found(mine, plant(theirs))
     assert [effect.name for effect in result.effects if effect.beyond] == [name], result.paragraph
+    heading = title_of(result)
+    assert heading.startswith(f"{result.label}: {name.replace('-', ' ')}")
+    assert ("; " in heading) == (len(result.effects) > 1)
 
 
 @pytest.mark.parametrize("plant", [shifted, turned_body, lambda other: other])
@@ -214,6 +217,7 @@ def test_what_is_within_is_not_beyond(teams, plant):
     mine, theirs = teams
     result = found(mine, plant(theirs))
     assert not any(effect.beyond for effect in result.effects), result.paragraph
+    assert title_of(result).endswith(" within the covariances" if result.effects else "no systematic difference")
 
 
 def test_errors_of_any_correlation_in_time_stay_within_what_is_allowed(run, other):
