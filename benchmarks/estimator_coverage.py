@@ -370,7 +370,8 @@ def seeds_and_folder():
     """Return seeds, from a count and the first one, and the folder of kept flights, as the command line has them."""
     numbers = [int(a) for a in sys.argv[1:] if a.isdigit()]
     count, first = numbers + [100, 0][len(numbers) :]
-    return range(first, first + count), next((a for a in sys.argv[1:] if not a.isdigit() and a[0] != "-"), KEPT)
+    kept = f"{KEPT}_bent" if "--bent" in sys.argv else KEPT
+    return range(first, first + count), next((a for a in sys.argv[1:] if not a.isdigit() and a[0] != "-"), kept)
 
 
 def main():

@@ -72,7 +72,7 @@ from flightmodel.sensor_tables import (
     read_sun,
     read_triad,
 )
-from flightmodel.tables import Source, Spans
+from flightmodel.tables import GNSS_SD, Source, Spans
 from flightmodel.telemetry import (
     AttitudePrior,
     BarometerRecord,
@@ -751,15 +751,13 @@ def _assumed_of(entry: Section, known: set[str]) -> dict[str, float]:
 
 def _not_in_the_fixes(record: GnssRecord) -> set[str]:
     """Keys of what a receiver does not measure, or whose noise it states in each fix."""
+    noises = [q.canonical for q in GNSS_SD]
     out = set()
-    for read, own, keys in (
-        (record.position_ecef_m, 0, ("horizontal_sd_m", "vertical_sd_m", "wander_sd_m")),
-        (record.velocity_ecef_mps, 2, ("speed_sd_mps", "vertical_speed_sd_mps")),
-    ):
-        there = np.isfinite(read).all(axis=1)
-        known = [record.sd is not None and np.isfinite(record.sd[there, own + k]).all() for k in range(2)]
-        out |= {key for key, is_known in zip(keys, (*known, False), strict=False) if is_known or not there.any()}
-    return out
+    for read, keys in ((record.position_ecef_m, noises[:2]), (record.velocity_ecef_mps, noises[2:])):
+        own = np.full((len(read), 4), np.nan) if record.sd is None else record.sd
+        own = own[np.isfinite(read).all(axis=1)]
+        out |= {key for key in keys if np.isfinite(own[:, noises.index(key)]).all()}
+    return out if record.has_positions else out | {"wander_sd_m"}
 
 
 def _not_measured_or_in_the_table(radar: RadarEntry, record: RadarRecord | None) -> set[str]:

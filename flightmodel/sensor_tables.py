@@ -142,13 +142,13 @@ def read_gnss(
     velocity = _velocities(gate, table, source, position, planet)
     if velocity is None:
         return None
-    alone = not set(ECEF + GEODETIC) & set(table.columns)
-    measured, what = (velocity, "velocity") if alone else (position, "position")
+    alone = _has_no_position(table)
+    measured, names, what = (velocity, ECEF_SPEEDS, "velocity") if alone else (position, ECEF, "position")
     if not np.isfinite(measured).all(axis=1).any():
         gate.refuse(f"{label}: {table.path}: no fix with a whole {what}; remove the receiver", "no-samples")
         return None
     position, velocity = fixed_axes(source.axes, t0_utc, time_s, position, velocity, planet)
-    gate.findings.extend(find_faults(name, time_s, ECEF_SPEEDS if alone else ECEF, velocity if alone else position))
+    gate.findings.extend(find_faults(name, time_s, names, velocity if alone else position))
     gate.findings.extend(oversampled(name, time_s, source.every_s, source.components))
     spec = GnssSpec(name, np.array(source.antenna_from_datum_body_m), **GNSS.from_file(source))
     sd = _columns(table, [q.short for q in tables.GNSS_SD]) if stated else None
@@ -185,7 +185,8 @@ def _positions(gate: Gate, table: Table, source: GnssEntry, planet: earth.Planet
         )
         return None
     form = stated[0] if stated else ECEF if whole[ECEF] else GEODETIC
-    if set(ECEF_SPEEDS) <= set(table.columns) and not set(ECEF + GEODETIC) & set(table.columns) and source.velocity:
+    moves = source.velocity and set(ECEF_SPEEDS) <= set(table.columns)
+    if _has_no_position(table) and moves and source.axes == "fixed":  # others turn with the planet at a place
         return np.full((len(table.lines), 3), np.nan)
     if not whole[form]:
         canonical = {q.short: q.canonical for q in tables.GNSS}
@@ -221,6 +222,10 @@ def _positions(gate: Gate, table: Table, source: GnssEntry, planet: earth.Planet
     _note_geoid(gate, table.label.rpartition(".")[2], source, undulation)
     position = earth.ecef_from_geodetic(lat, lon, alt + undulation, planet)
     return np.where(np.isfinite(lat + lon + alt)[:, None], position, np.nan)
+
+
+def _has_no_position(table: Table) -> bool:
+    return not set(ECEF + GEODETIC) & set(table.columns)
 
 
 def _note_geoid(gate: Gate, name: str, source: Heights, undulation_m: FloatArray) -> None:

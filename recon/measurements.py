@@ -60,7 +60,6 @@ REST = "rest"  # zero velocities on the pad
 SITES = "sites"  # owner of the errors that are common to all radar sites
 DECELERATION_RATE_HZ = 20.0  # of block means: over 50 ms an entry's deceleration is a straight line to 1e-3 m/s^2
 _SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
-_NO_PLACE = np.full(3, np.nan)
 COMPONENTS = {
     RADAR: ("range", "azimuth", "elevation"),
     POSITION: ("north", "east", "down"),
@@ -251,16 +250,17 @@ def gnss_instruments(
     record: GnssRecord,
     accelerometer_m: FloatArray,
     planet: Planet = WGS84,
-    near_ecef_m: FloatArray = _NO_PLACE,
+    near_ecef_m: FloatArray | None = None,
 ) -> list[Instrument]:
     """Position of one receiver and velocity, those of both that it gives.
 
-    Axes are those at its first fix; of a receiver that gives velocities alone, those at ``near_ecef_m`` (3,).
+    Axes are those at its first fix; of a receiver that gives velocities alone, those at ``near_ecef_m`` (3,), without
+    which it is of no use.
     """
     spec = record.spec
     good = np.isfinite(record.position_ecef_m).all(axis=1)
     reference = record.position_ecef_m[good][0] if good.any() else near_ecef_m
-    if not np.isfinite(reference).all():
+    if reference is None:
         return []
     latitude, longitude, _ = earth.geodetic_from_ecef(reference, planet)
     dcm = earth.dcm_ned_ecef(float(latitude), float(longitude))

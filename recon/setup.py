@@ -257,8 +257,9 @@ def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: F
         radar = measurements.radar_instrument(name, record, arm, traverse, planet)
         doppler = measurements.range_rate_instrument(name, record, arm, planet)
         out += [i for i in (radar, doppler) if i is not None and len(i.time_s)]
-    near = _any_place(telemetry, out)
+    radars = tuple(out)
     for name, fixes in telemetry.gnss.items():
+        near = None if fixes.has_positions else _any_place(telemetry, radars)
         antenna = fixes.spec.antenna_from_datum_body_m
         out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m, planet, near)
     for name, heights in telemetry.barometers.items():
@@ -268,13 +269,14 @@ def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: F
     return tuple(out)
 
 
-def _any_place(telemetry: Telemetry, radars: list[Instrument]) -> FloatArray:
-    """Place (3,) by the flight's first position, ECEF, m: the local axes of velocities alone; NaN without one."""
-    known = [f.position_ecef_m[np.isfinite(f.position_ecef_m).all(axis=1)] for f in telemetry.gnss.values()]
-    first = next((points[0] for points in (*known, track_points(tuple(radars))[1]) if len(points)), None)
-    if first is None and telemetry.start.state is not None:
-        first = telemetry.start.state.position_ecef_m
-    return np.full(3, np.nan) if first is None else np.asarray(first)
+def _any_place(telemetry: Telemetry, radars: tuple[Instrument, ...]) -> FloatArray | None:
+    """Place (3,) by the flight's first position, ECEF, m: the local axes of velocities alone."""
+    tracks = [record.position_ecef_m for record in telemetry.gnss.values()]
+    for points in (*tracks, track_points(radars)[1]):
+        whole = points[np.isfinite(points).all(axis=1)]
+        if len(whole):
+            return np.asarray(whole[0])
+    return None if telemetry.start.state is None else telemetry.start.state.position_ecef_m
 
 
 def _attitude_instruments(telemetry: Telemetry, track: Track, start_s: float, end_s: float) -> tuple[Instrument, ...]:

@@ -147,7 +147,9 @@ def test_a_receiver_of_velocities_alone_is_read(folder):
     assert np.isnan(record.position_ecef_m).all()
     assert not any("horizontal" in key or "wander" in key for key in telemetry.assumed["gnss.doppler"])
     assert "speed_sd_mps" in telemetry.assumed["gnss.doppler"]
-    # local axes need a place
+    # local and inertial axes need a place
+    inertial = alone + 'axes = "inertial"\n'
+    folder.refused([GNSS, inertial, BALLISTIC], "table-column-missing", "x_ecef_m", kind=GateError)
     folder.table("doppler.csv", "t_s,vn_mps,ve_mps,vd_mps", T, T, T, T)
     folder.refused([GNSS, alone, BALLISTIC], "table-column-missing", "vx_ecef_mps", kind=GateError)
     folder.table("doppler.csv", "t_s,vx_ecef_mps,vy_ecef_mps,vz_ecef_mps", T, T, T, np.nan * T)

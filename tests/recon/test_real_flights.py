@@ -274,7 +274,7 @@ class TestPiccard:
         assert all(0.2 < value < 1.6 for value in ratio.values()), ratio
         assert "held out gps" not in red(proposed)
 
-    def test_a_fix_held_out_while_the_receiver_finds_back_is_found(self, fly):
+    def test_a_bad_fix_that_is_held_out_turns_the_check_red(self, fly):
         # proposals from the fixes between make the one at 10.24 s 6 sd wrong
         early = (r"\[11\.0, 68\.0\]", "[9.0, 68.0]")
         proposed = fly("euroc21_piccard", early, proposed_noise=True, hold_out_every=2)

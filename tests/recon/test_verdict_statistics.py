@@ -106,7 +106,7 @@ def test_more_than_a_twentieth_edited_is_told():
         assert consistency_check.passed is passes
 
 
-def test_held_out_points_beyond_the_gate_are_told():
+def test_held_out_points_beyond_the_gate_turn_the_check_red():
     rng = np.random.default_rng(3)
     instruments = (SimpleNamespace(name="gps", owner="gps"), SimpleNamespace(name="gps velocity", owner="gps"))
     problem = SimpleNamespace(instruments=instruments)
