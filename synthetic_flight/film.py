@@ -235,9 +235,14 @@ def warp_terms(warp: Warp | None) -> tuple[float, ...]:
     return (*astuple(warp or Warp()), float(warp is not None))
 
 
+def _unit(vector: FloatArray) -> FloatArray:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
 def _sky(rays: FloatArray, camera: Camera) -> Float32:
     """Radiance of the sky: almost black, brighter towards the shell's rim by light scattered in the lens."""
-    upward = -rays @ camera.dcm_cam_body[1]
+    outboard, ahead = np.array([0.0, *camera.position_body_m[1:]]), camera.dcm_cam_body[2]
+    upward = rays @ _unit(outboard - (outboard @ ahead) * ahead)
     return np.asarray(0.035 + 0.035 * np.exp(-3.0 * np.clip(upward, 0.0, 1.0)), dtype=np.float32)
 
 
