@@ -186,3 +186,42 @@ def test_the_way_to_the_stack_meets_nothing_before_it(generic_vehicle):
         free = np.min(gap[1:] / (_film_kernels.SUN_DIAMETER * ways[1:]))
         assert seen == pytest.approx(np.clip(free, 0.0, 1.0), abs=0.05)
     assert 0.2 < np.mean(share > 0.5) < 0.8
+
+
+def test_the_film_s_shadows_are_those_of_a_sampled_ray(generic_vehicle):
+    """Every pixel's ray towards the Sun, sampled each millimetre, against the centerbody and the tori."""
+    geometry, light = generic_vehicle.geometry, np.array([-0.5, -0.77, -0.35])
+    light /= np.linalg.norm(light)
+    eye, away = np.array([-1.4, 0.174, 0.089]), np.array([0.0, 0.89, 0.455])
+    nose, radius, length = np.array([-0.1, 0.03, 0.0]), geometry.centerbody_radius_m, 1.2
+    across = np.cross(away, [1.0, 0.0, 0.0])
+    grid = [
+        [0.6, 0.0, 0.0] + up * away + side * across for up in (0.5, 0.8, 1.1) for side in np.linspace(-0.9, 0.9, 12)
+    ]
+    rays = np.array(grid).reshape(3, 12, 3)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    body, shell, warp = (
+        (nose, np.array([-1.0, 0.0, 0.0]), radius, length),
+        film.shell_terms(geometry),
+        film.warp_terms(None),
+    )
+    everywhere = np.ones((3, 12), dtype=bool)
+    lit, dark, depth = np.empty((3, 3, 12))
+    for shadows, shade in ((False, lit), (True, dark)):
+        _film_kernels.cast(rays, everywhere, np.eye(3), eye, light, shell, warp, body, False, shadows, depth, shade)
+    unlit = np.empty((3, 12))
+    _film_kernels.cast(rays, everywhere, np.eye(3), eye, 0.0 * light, shell, warp, body, False, False, depth, unlit)
+    stack, seen = plain_film.Stack(geometry), []
+    for i, j in zip(*np.nonzero((lit - unlit > 0.05) & np.isfinite(depth)), strict=True):
+        at = eye + depth[i, j] * rays[i, j] + np.arange(0.01, 3.0, 0.001)[:, None] * light
+        gap = stack.gap(plain_film.Rays(at.T.astype(np.float32), np.zeros(3)), np.float32(1.0))
+        off = np.hypot(*(at - nose)[:, 1:].T) - radius
+        inside = (off < 0.0) & (at[:, 0] < nose[0]) & (at[:, 0] > nose[0] - length)
+        near = abs(np.min(off[(at[:, 0] < nose[0]) & (at[:, 0] > nose[0] - length)], initial=1.0))
+        end = np.min(np.abs(at[off < 0.0, 0] - (nose[0] - length)), initial=1.0)
+        if near > 0.02 and end > 0.02 and abs(np.min(gap[30:])) > 0.02:  # no half shadow
+            seen.append((bool(inside.any()), bool((gap < 0.0).any()), (dark - unlit)[i, j] / (lit - unlit)[i, j]))
+    by_body, by_shell, share = np.array(seen).T
+    np.testing.assert_allclose(share, np.where(by_body + by_shell > 0.0, 0.0, 1.0), atol=1e-6)
+    assert by_body.sum() >= 2
+    assert (share > 0.5).sum() > 5
