@@ -47,6 +47,7 @@ from postflight.reconciliation.normal_equations import ArrowMatrix, NormalEquati
 from synthetic_flight import simulate
 
 INSTRUMENTS = 20
+BORDERS = 3  # of the normal equations: of the sounding's errors that are constant in density, north and east wind
 # process noise of the joins per rad of flow angle that turbulence between knots GUST_KNOT_M apart makes, at the largest
 # dynamic pressure: rotation rad, rate rad/s, deflection rad, its rate rad/s, velocity m/s (of a span's lateral force);
 # and the noise that is left in vacuum
@@ -338,12 +339,45 @@ class Problem:
 
     def normal_equations(self, u: Parameters, linear: Linearization) -> NormalEquations:
         """Normal equations of a step from ``u``."""
-        matrix = ArrowMatrix.zeros(self.first_motion, self.motion * self.measured.spans, 2 * self.motion - 1)
+        place, shared, reach = self._arranged
+        knots, first_air = len(self.air.knots_m), self.first_instrument + INSTRUMENTS
+        matrix = ArrowMatrix.zeros(shared, len(place) + BORDERS - shared, reach)
         for column, response in (*linear.sensors, *linear.joins):
-            matrix.add(column, response.T @ response)
+            matrix.add(place[column], response.T @ response)
         for part, precision, _ in self._priors(u):
-            matrix.add(np.arange(part.start, part.stop), precision)
-        return NormalEquations(matrix, self.right_hand_side(u, linear, linear.residuals))
+            if not first_air <= part.start < self.first_temperature:
+                matrix.add(place[part], precision)
+        for kind, (diagonal, beside, constant) in enumerate(self.air.inverse_covariance):
+            at, border = place[first_air + kind * knots :][:knots], shared - BORDERS + kind
+            matrix.add_pairs(at, at, diagonal)
+            matrix.add_pairs(at[:-1], at[1:], beside)
+            matrix.across[at - shared, border] = constant
+            matrix.corner[border, border] = 1.0
+        return NormalEquations(matrix, self.right_hand_side(u, linear, linear.residuals), place)
+
+    @cached_property
+    def _arranged(self) -> tuple[Index, int, int]:
+        """Rows (count,) of the parameters in the matrix, how many are shared, and how far from the diagonal it reaches.
+
+        First vehicle, instruments, temperature, and a border for each kind of air; then span by span the air that it is
+        the first to pass, and its motion. Air that no span passes is placed with the nearest span.
+        """
+        measured, free = self.measured, self.first_instrument + INSTRUMENTS
+        warm, spans = self.first_motion - self.first_temperature, np.arange(self.measured.spans)
+        passed = np.abs(measured.altitude_m[:, None] - self.air.knots_m).argmin(axis=0)
+        for span in spans[::-1]:
+            passed[self._passed_knots[span]] = span
+        by_span = np.concatenate([np.tile(passed, 3), np.repeat(spans, self.motion)])
+        order = np.argsort(by_span, kind="stable")
+        local = np.empty_like(order)
+        local[order] = np.arange(len(order))
+        shared, air = free + warm + BORDERS, 3 * len(self.air.knots_m)
+        place = np.concatenate([np.arange(free), shared + local[:air], free + np.arange(warm), shared + local[air:]])
+        reach = int(np.abs(np.diff(local[:air].reshape(3, -1), axis=1)).max())
+        for span, near in enumerate(self._nearby_air):
+            motions = local[air + self.motion * span :][: 2 * self.motion]  # its own and the next one's
+            reach = max(reach, int(np.ptp(np.concatenate([local[near[near < air]], motions]))))
+        return place, shared, reach
 
     def right_hand_side(self, u: Parameters, linear: Linearization, residuals: Residuals) -> FloatArray:
         """Right-hand side of a step from ``u`` with its residuals, by derivatives at ``u`` or nearby."""
@@ -392,10 +426,14 @@ class Problem:
         return tables, self.first_instrument + INSTRUMENTS + np.arange(len(steps)), np.array(steps)
 
     @cached_property
+    def _passed_knots(self) -> list[Index]:
+        return self._passed(self.air.knots_m)
+
+    @cached_property
     def _nearby_air(self) -> list[Index]:
         """Parameters of the air, counted from its first, that each span feels."""
         knots = len(self.air.knots_m)
-        by_span = zip(self._passed(self.air.knots_m), self._passed(self.air.temperature_knots_m), strict=True)
+        by_span = zip(self._passed_knots, self._passed(self.air.temperature_knots_m), strict=True)
         return [np.concatenate([near, knots + near, 2 * knots + near, 3 * knots + warm]) for near, warm in by_span]
 
     def _priors(self, u: Parameters) -> list[tuple[slice, FloatArray, FloatArray]]:

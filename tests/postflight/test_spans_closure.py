@@ -151,6 +151,22 @@ def test_a_late_clock_shows_what_was_earlier():
         assert left < 0.08 * np.abs(own - want).max()
 
 
+def test_the_normal_equations_are_those_of_all_residuals():
+    one, u = problem(), true_unknowns()
+    linear = one.linearize(u)
+    normal = one.normal_equations(u, linear)
+    want = np.zeros((one.count, one.count))
+    for column, response in (*linear.sensors, *linear.joins):
+        want[np.ix_(column, column)] += response.T @ response
+    for part, precision, _ in one._priors(u):
+        want[part, part] += precision
+    size = np.sqrt(np.diag(want))
+    np.testing.assert_allclose(normal.dense / np.outer(size, size), want / np.outer(size, size), atol=1e-12)
+    sought, (coupling, others) = 5, normal.without(5)
+    np.testing.assert_allclose(coupling / size[5:, None], want[sought:, :sought] / size[5:, None], atol=1e-9)
+    assert others.log_det == pytest.approx(np.linalg.slogdet(want[sought:, sought:])[1], abs=1e-6)
+
+
 def test_the_cost_falls_along_the_right_hand_side():
     # half the gradient of the sum of squares, by differences of the cost itself, at a candidate off the prior's middle
     one, rng = problem(), np.random.default_rng(3)
