@@ -361,15 +361,16 @@ class Problem:
         """Rows (count,) of the parameters in the matrix, how many are shared, and how far from the diagonal it reaches.
 
         First vehicle, instruments, temperature, and a border for each kind of air; then span by span the air that it is
-        the first to pass, and its motion. Air that no span passes is placed with the nearest span.
+        the first to pass, from above, and its motion. Air that no span passes comes before all spans, or after.
         """
         measured, free = self.measured, self.first_instrument + INSTRUMENTS
         warm, spans = self.first_motion - self.first_temperature, np.arange(self.measured.spans)
-        passed = np.abs(measured.altitude_m[:, None] - self.air.knots_m).argmin(axis=0)
+        passed = np.where(self.air.knots_m < measured.altitude_m.min(), len(spans), 0)
         for span in spans[::-1]:
             passed[self._passed_knots[span]] = span
         by_span = np.concatenate([np.tile(passed, 3), np.repeat(spans, self.motion)])
-        order = np.argsort(by_span, kind="stable")
+        deeper = np.concatenate([np.tile(-self.air.knots_m, 3), np.full(self.motion * len(spans), np.inf)])
+        order = np.lexsort((deeper, by_span))
         local = np.empty_like(order)
         local[order] = np.arange(len(order))
         shared, air = free + warm + BORDERS, 3 * len(self.air.knots_m)
@@ -399,28 +400,35 @@ class Problem:
         vehicles = [self.trial_vehicle(u.vehicle + VEHICLE_STEP * unit) for unit in np.eye(v)]
         vehicles.append(self.trial_vehicle(u.vehicle))
         air = self.air.table(u.air, u.warmer_k)
-        moved, air_steps = self._moved_air(air)
+        felt = np.unique(np.concatenate(self._nearby_air))
+        moved, air_steps = self._moved_air(air, felt)
         first_air, own = v + INSTRUMENTS, self.first_motion + np.arange(m)
         columns, steps, motions = [], [], []
         numbers: list[Index] = []
         for span, near in enumerate(self._nearby_air):
             count = v + m + len(near)
             columns.append(np.concatenate([np.arange(v), own + m * span, first_air + near]))
-            steps.append(np.concatenate([np.full(v, VEHICLE_STEP), self.motion_step, air_steps[near]]))
+            at = np.searchsorted(felt, near)
+            steps.append(np.concatenate([np.full(v, VEHICLE_STEP), self.motion_step, air_steps[at]]))
             motions.append(np.tile(u.motion[span], (count, 1)))
             motions[-1][v : v + m] += np.diag(self.motion_step)
-            table = np.concatenate([np.zeros(v + m, dtype=np.int64), 1 + near])
+            table = np.concatenate([np.zeros(v + m, dtype=np.int64), 1 + at])
             numbers.append(np.stack([np.full(count, span), np.minimum(np.arange(count), v), table]))
         spans, which, table = np.concatenate(numbers, axis=1)
         return SpanFlights(spans, which, np.concatenate(motions), table, vehicles, air, moved), columns, steps
 
-    def _moved_air(self, air: FloatArray) -> tuple[list[MovedRows], FloatArray]:
-        """What changes in a kernel table of the air where each knot moves; steps of the knots."""
-        knots, warm = len(self.air.knots_m), len(self.air.temperature_knots_m)
-        by_kind = enumerate(AIR_STEP.tolist())
-        moved = [self.air.moved_rows(air, kind, knot, step) for kind, step in by_kind for knot in range(knots)]
-        moved += [self.air.warmed_rows(air, knot, WARMTH_STEP_K) for knot in range(warm)]
-        return moved, np.append(np.repeat(AIR_STEP, knots), np.full(warm, WARMTH_STEP_K))
+    def _moved_air(self, air: FloatArray, which: Index) -> tuple[list[MovedRows], FloatArray]:
+        """What changes in a kernel table where parameters of the air (k,) move, counted from its first; their steps."""
+        knots = len(self.air.knots_m)
+        kinds = np.minimum(which // knots, len(AIR_STEP))
+        steps = np.append(AIR_STEP, WARMTH_STEP_K)[kinds]
+        moved = [
+            self.air.moved_rows(air, kind, knot, step)
+            if kind < len(AIR_STEP)
+            else self.air.warmed_rows(air, knot, step)
+            for kind, knot, step in zip(kinds.tolist(), (which - knots * kinds).tolist(), steps.tolist(), strict=True)
+        ]
+        return moved, steps
 
     @cached_property
     def _passed_knots(self) -> list[Index]:
