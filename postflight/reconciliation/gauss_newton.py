@@ -24,7 +24,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flightmodel.checks import DivergenceError, FloatArray
+from flightmodel.checks import BoolArray, DivergenceError, FloatArray
 from postflight.reconciliation.forward_model import (
     ATTITUDE,
     CREEP,
@@ -315,15 +315,18 @@ class Problem:
         """Sum of squares of the a priori residuals."""
         return sum(float(value @ precision @ value) for _, precision, value in self._priors(u))
 
-    def linearize(self, u: Parameters) -> Linearization:
-        """Residuals and their derivatives at ``u``, by forward differences of flown spans."""
-        flights, columns, steps = self._perturbed(u)
+    def linearize(self, u: Parameters, wanted: BoolArray | None = None) -> Linearization:
+        """Residuals and their derivatives at ``u``, by forward differences of flown spans.
+
+        With a mask ``wanted`` (count,) by those parameters alone, and by the instruments'.
+        """
+        flights, columns, steps = self._perturbed(u, np.ones(self.count, dtype=bool) if wanted is None else wanted)
         moved, base = fly_spans(self.measured, self.vehicle_parameters.nominal, flights), self.predict(u)
         rows = self.instrument_response(base)
         at, sensors, joins = 0, [], []
         for span, (column, step) in enumerate(zip(columns, steps, strict=True)):
             part = slice(at, at := at + len(column))
-            step[self.held_columns] = np.inf  # no step moves what is held
+            step[np.isin(column, self.held_columns)] = np.inf  # no step moves what is held
             change = self.sensed_change(
                 u, moved.windows[part] - base.windows[span], moved.slope[part] - base.slope[span]
             )
@@ -394,8 +397,8 @@ class Problem:
         """Columns of the parameters that are held."""
         return [self.vehicle_parameters.names.index(name) for name in self.held]
 
-    def _perturbed(self, u: Parameters) -> tuple[SpanFlights, list[Index], list[FloatArray]]:
-        """Spans with one parameter moved, which parameter (columns) and by how much, span by span."""
+    def _perturbed(self, u: Parameters, wanted: BoolArray) -> tuple[SpanFlights, list[Index], list[FloatArray]]:
+        """Spans with one of the parameters ``wanted`` moved, which (columns) and by how much, span by span."""
         v, m = self.first_instrument, self.motion
         vehicles = [self.trial_vehicle(u.vehicle + VEHICLE_STEP * unit) for unit in np.eye(v)]
         vehicles.append(self.trial_vehicle(u.vehicle))
@@ -407,13 +410,18 @@ class Problem:
         numbers: list[Index] = []
         for span, near in enumerate(self._nearby_air):
             count = v + m + len(near)
-            columns.append(np.concatenate([np.arange(v), own + m * span, first_air + near]))
+            column = np.concatenate([np.arange(v), own + m * span, first_air + near])
             at = np.searchsorted(felt, near)
-            steps.append(np.concatenate([np.full(v, VEHICLE_STEP), self.motion_step, air_steps[at]]))
-            motions.append(np.tile(u.motion[span], (count, 1)))
-            motions[-1][v : v + m] += np.diag(self.motion_step)
+            step = np.concatenate([np.full(v, VEHICLE_STEP), self.motion_step, air_steps[at]])
+            motion = np.tile(u.motion[span], (count, 1))
+            motion[v : v + m] += np.diag(self.motion_step)
             table = np.concatenate([np.zeros(v + m, dtype=np.int64), 1 + at])
-            numbers.append(np.stack([np.full(count, span), np.minimum(np.arange(count), v), table]))
+            number = np.stack([np.full(count, span), np.minimum(np.arange(count), v), table])
+            kept = wanted[column]
+            columns.append(column[kept])
+            steps.append(step[kept])
+            motions.append(motion[kept])
+            numbers.append(number[:, kept])
         spans, which, table = np.concatenate(numbers, axis=1)
         return SpanFlights(spans, which, np.concatenate(motions), table, vehicles, air, moved), columns, steps
 
