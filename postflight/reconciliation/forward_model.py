@@ -35,6 +35,7 @@ from flightmodel.atmosphere import (
     WIND_LENGTH_M,
     profile_from_sounding,
     sounding_correlation,
+    sounding_correlation_inverse,
     temperature_sd,
     unresolved_variance,
 )
@@ -241,14 +242,23 @@ class AtmosphereParameters:
         return np.asarray(np.interp(altitude_m, self.knots_m, apart))
 
     @cached_property
-    def precision(self) -> FloatArray:
-        """Inverse covariance (3, k, k) of the sounding: half constant bias, half Gauss-Markov along altitude."""
+    def inverse_covariance(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
+        """Of each kind the inverse covariance of the sounding: diagonal (k,), beside it (k - 1,), ``u`` (k,).
+
+        Half of the variance is a constant bias, which makes ``-u u^T``, half Gauss-Markov along altitude.
+        """
         at = profile_from_sounding(self.sounding).at(self.knots_m)
         out = []
         for sd, length in ((at.density_sd, DENSITY_LENGTH_M), *[(at.wind_sd_mps, WIND_LENGTH_M)] * 2):
-            correlation = sounding_correlation(self.knots_m, length)
-            out.append(np.linalg.inv(sd[:, None] * correlation * sd))
-        return np.array(out)
+            diagonal, beside, u = sounding_correlation_inverse(self.knots_m, length)
+            out.append((diagonal / sd**2, beside / (sd[:-1] * sd[1:]), u / sd))
+        return tuple(out)
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """The same as full matrices (3, k, k)."""
+        parts = self.inverse_covariance
+        return np.array([np.diag(d) + np.diag(e, 1) + np.diag(e, -1) - np.outer(u, u) for d, e, u in parts])
 
     def unresolved_structure(self, altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (n,) of log density and of wind, m/s, of the structure between the knots."""

@@ -24,6 +24,7 @@ from flightmodel.checks import NO_FAULT
 from flightmodel.vehicle import read_vehicle
 from postflight.checks.folder_check import benchmark_frame
 from postflight.filming import joint_swing
+from synthetic_flight.film import Imaging
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film
 
 FRAMES = Path(__file__).parents[1] / "data" / "other_film"
@@ -68,7 +69,7 @@ def test_the_edge_alone_answers_where_it_is_whole_and_is_refused_where_clouds_li
 
 
 def test_where_features_contradict_the_edge_it_counts_if_it_is_whole():
-    frames = film(5, [0.0, 3.0], [0.0, 188.0])
+    frames = film(5, [0.0, 3.0], [0.0, 188.0], Imaging(shadows=False))  # with the whole edge in the light
     oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
     answer = oriented.fit(frames[1])
     true = np.array([*answer.rotation_yz_rad, 0.0])
