@@ -20,6 +20,7 @@ or a gyro's mounting does to a reconstructed path of 9 g turns with the vehicle,
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -47,8 +48,8 @@ from postflight.reconstruction import Reconstruction
 from recon.atmosphere import cg_accelerations, windows_are_whole
 from synthetic_flight import simulate
 from synthetic_flight._kernels import CREEP_STATES
-from synthetic_flight.dynamics import joint_modes
-from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
+from synthetic_flight.dynamics import check_step, joint_modes
+from synthetic_flight.ensemble import LANES, available_cores, check_mass
 
 # at 1200 m/s a tenth of a second: knots resolve gusts at the joint's 2 to 4 Hz; coarser in thin air
 KNOT_M, UPPER_KNOT_M = 125.0, 250.0
@@ -267,6 +268,10 @@ class AtmosphereParameters:
         passed = rows <= TOP_M  # of a table a knot, each copied for every flight, three quarters lie above
         return table[passed], rows[passed]
 
+    @cached_property
+    def _sounded_temperature(self) -> FloatArray:
+        return np.asarray(self._sounded[0][:, 2] ** 2 / (GAMMA * R_AIR_JPKGK))
+
     def table(self, difference: FloatArray, warmer_k: FloatArray) -> FloatArray:
         """Kernel table (rows, 6) of the atmosphere, of differences (3, k) and (n,)."""
         table, rows = self._sounded
@@ -274,29 +279,48 @@ class AtmosphereParameters:
         ratio, north, east = (np.interp(rows, self.knots_m, part) for part in difference)
         table[:, 0] *= np.exp(ratio)
         table[:-1, 1] += np.diff(ratio)
-        temperature = table[:, 2] ** 2 / (GAMMA * R_AIR_JPKGK)
         # the root of the ratio of temperatures, which no trial step makes negative
-        table[:, 2] *= np.exp(0.5 * np.interp(rows, self.temperature_knots_m, warmer_k) / temperature)
+        warmer = np.interp(rows, self.temperature_knots_m, warmer_k)
+        table[:, 2] *= np.exp(0.5 * warmer / self._sounded_temperature)
         table[:, 3] += north
         table[:, 4] += east
         return table
 
-    def moved_table(self, table: FloatArray, kind: int, knot: int, step: float) -> FloatArray:
-        """Kernel table with one difference (log density, north, east wind) moved at one knot; rows about it change."""
-        knots, rows = self.knots_m, self._sounded[1]
-        first = 0 if knot == 0 else int(np.searchsorted(rows, knots[knot - 1])) - 1
-        last = len(rows) if knot == len(knots) - 1 else int(np.searchsorted(rows, knots[knot + 1])) + 1
-        near = slice(max(first, 0), last)
-        unit = np.zeros(len(knots))
-        unit[knot] = step
-        change = np.interp(rows[near], knots, unit)
-        table = table.copy()
+    def moved_rows(self, table: FloatArray, kind: int, knot: int, step: float) -> MovedRows:
+        """Rows of a kernel table that change where one difference (log density, north, east wind) moves at one knot."""
+        near, change = self._change(self.knots_m, knot, step)
+        rows = table[near].copy()
         if kind == 0:
-            table[near, 0] *= np.exp(change)
-            table[near, 1][:-1] += np.diff(change)
+            rows[:, 0] *= np.exp(change)
+            rows[:-1, 1] += np.diff(change)
         else:
-            table[near, 2 + kind] += change
-        return table
+            rows[:, 2 + kind] += change
+        return MovedRows(near.start, rows)
+
+    def warmed_rows(self, table: FloatArray, knot: int, step_k: float) -> MovedRows:
+        """Rows of a kernel table that change where the temperature moves at one of its knots."""
+        near, warmer = self._change(self.temperature_knots_m, knot, step_k)
+        rows = table[near].copy()
+        rows[:, 2] *= np.exp(0.5 * warmer / self._sounded_temperature[near])
+        return MovedRows(near.start, rows)
+
+    def _change(self, knots_m: FloatArray, knot: int, step: float) -> tuple[slice, FloatArray]:
+        """Rows about a knot, to the knots beside it or the table's end, and what a step at the knot adds there."""
+        rows = self._sounded[1]
+        first = 0 if knot == 0 else int(np.searchsorted(rows, knots_m[knot - 1])) - 1
+        last = len(rows) if knot == len(knots_m) - 1 else int(np.searchsorted(rows, knots_m[knot + 1])) + 1
+        near = slice(max(first, 0), last)
+        unit = np.zeros(len(knots_m))
+        unit[knot] = step
+        return near, np.interp(rows[near], knots_m, unit)
+
+
+@dataclass(frozen=True)
+class MovedRows:
+    """What one kernel table of the air has instead of another's: ``rows`` (n, 6) from row ``first`` on."""
+
+    first: int
+    rows: FloatArray
 
 
 START_ALTITUDE_M = 100e3
@@ -505,10 +529,12 @@ class SpanFlights:
     Parameters
     ----------
     span, vehicle, table : (m,) int
+        Table 0 is ``air``, table k has the rows of ``moved[k - 1]``.
     motion : (m, 15 or 17) float
     vehicles : list of TrialVehicle
-    tables : list of (rows, 6) float
-        Kernel tables of the atmosphere.
+    air : (rows, 6) float
+        Kernel table of the atmosphere.
+    moved : list of MovedRows
     """
 
     span: Index
@@ -516,7 +542,22 @@ class SpanFlights:
     motion: FloatArray
     table: Index
     vehicles: list[TrialVehicle]
-    tables: list[FloatArray]
+    air: FloatArray
+    moved: list[MovedRows] = field(default_factory=list)
+
+    def air_of(self, flights: Index, rows: slice) -> FloatArray:
+        """Rows of the tables of some flights (k,): (k, n, 6), or (n, 6) where all have table 0."""
+        whole, tables = self.air[rows], self.table[flights].tolist()
+        if not any(tables):
+            return whole
+        out = np.repeat(whole[None], len(tables), axis=0)
+        for lane, k in zip(out, tables, strict=True):
+            if k:
+                moved = self.moved[k - 1]
+                first, last = max(moved.first, rows.start), min(moved.first + len(moved.rows), rows.stop)
+                if last > first:
+                    lane[first - rows.start : last - rows.start] = moved.rows[first - moved.first : last - moved.first]
+        return out
 
 
 @dataclass(frozen=True)
@@ -564,26 +605,58 @@ def resolved_stiffness_nmprad(vehicle: Vehicle) -> float:
 
 def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) -> PredictedSpans:
     """Fly spans and predict the sensors' windows; ``nominal`` gives the coefficient table."""
-    starts = _start_states(measured, flights)
-    # a span that leaves these by a trial vehicle's tumbling meets the air at their ends
-    passed = np.abs(np.gradient(measured.altitude_m)) + SPAN_MARGIN_M
-    lowest, highest = measured.altitude_m - passed, measured.altitude_m + passed
-
-    def start_of(k: int) -> Start:
-        vehicle = flights.vehicles[flights.vehicle[k]]
-        table, span = flights.tables[flights.table[k]], flights.span[k]
-        return Start(starts[k], vehicle.kernel_vector, table, (lowest[span], highest[span]))
-
     steps = measured.steps
-    states = np.full((len(starts), steps.records, starts.shape[1]), np.nan)
-    aux = np.full((len(starts), steps.records, 18), np.nan)
-    schedule = Schedule(steps.step_s, steps.per_record, steps.records)
-    for flown in fly_ensemble(integrable(nominal, steps), start_of, range(len(starts)), schedule):
-        states[flown.run, : len(flown.states)], aux[flown.run, : len(flown.aux)] = flown.states, flown.aux
+    states, aux = _flown(measured, integrable(nominal, steps), flights)
     windows, slope = _windows(measured, flights, states, aux)
     middle = states[:, steps.intervals // 2 :: steps.intervals]
     deflection = rotations.log(rotations.multiply(rotations.conjugate(middle[..., 6:10]), middle[..., 10:14]))
     return PredictedSpans(windows, slope, deflection, _ends(measured, flights, states[:, -1]))
+
+
+def _flown(measured: Measurements, vehicle: Vehicle, flights: SpanFlights) -> tuple[FloatArray, FloatArray]:
+    """States (m, records, 20 or 22) and auxiliaries (m, records, 18), sixteen flights side by side; else NaN."""
+    check_mass(vehicle)
+    starts, steps, first, last = _start_states(measured, flights), measured.steps, *_rows_passed(measured, flights)
+    check_step(vehicle, steps.step_s)
+    parameters = np.array([each.kernel_vector for each in flights.vehicles])
+    shape = (len(starts), steps.records)
+    states, aux = np.full((*shape, starts.shape[1]), np.nan), np.full((*shape, simulate.AUX), np.nan)
+
+    def fly(begin: int) -> None:
+        block = slice(begin, min(begin + LANES, len(starts)))
+        which = np.minimum(np.arange(begin, begin + LANES), len(starts) - 1)
+        rows = slice(int(first[block].min()), int(last[block].max()))
+        whole = block.stop - begin == LANES
+        out, more = (states[block], aux[block]) if whole else (a[which] for a in (states, aux))
+        simulate.integrate_into(
+            out, more, vehicle, flights.air_of(which, rows), starts[which], parameters[flights.vehicle[which]],
+            steps.step_s, steps.per_record,
+            air_from_m=simulate.ATMOSPHERE_START_M + rows.start * simulate.ATMOSPHERE_STEP_M,
+        )  # fmt: skip
+        if not whole:
+            states[block], aux[block] = out[: block.stop - begin], more[: block.stop - begin]
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        list(pool.map(fly, range(0, len(starts), LANES)))
+    lost = ~np.isfinite(states).all(axis=2)
+    if lost.any():
+        lost = np.logical_or.accumulate(lost, axis=1)
+        states[lost], aux[lost] = np.nan, np.nan
+    return states, aux
+
+
+def _rows_passed(measured: Measurements, flights: SpanFlights) -> tuple[Index, Index]:
+    """First row (m,) of the tables of air that each flight needs, and the first (m,) that it does not, two at least.
+
+    A span that leaves them by a trial vehicle's tumbling meets the air at their ends.
+    """
+    passed = np.abs(np.gradient(measured.altitude_m)) + SPAN_MARGIN_M
+    ends = np.stack([measured.altitude_m - passed, measured.altitude_m + passed])
+    low, high = (ends - simulate.ATMOSPHERE_START_M) / simulate.ATMOSPHERE_STEP_M
+    count = len(flights.air)
+    first = np.clip(np.floor(low).astype(np.int64), 0, count - 2)
+    last = np.clip(np.ceil(high).astype(np.int64) + 1, first + 2, count)
+    return first[flights.span], last[flights.span]
 
 
 def _start_states(measured: Measurements, flights: SpanFlights) -> FloatArray:

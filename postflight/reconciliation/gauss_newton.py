@@ -36,6 +36,7 @@ from postflight.reconciliation.forward_model import (
     AtmosphereParameters,
     Index,
     Measurements,
+    MovedRows,
     PredictedSpans,
     SpanFlights,
     TrialVehicle,
@@ -269,7 +270,7 @@ class Problem:
         spans = np.arange(self.measured.spans)
         zero = np.zeros_like(spans)
         table = self.air.table(u.air, u.warmer_k)
-        flights = SpanFlights(spans, zero, u.motion, zero, [self.trial_vehicle(u.vehicle)], [table])
+        flights = SpanFlights(spans, zero, u.motion, zero, [self.trial_vehicle(u.vehicle)], table)
         return fly_spans(self.measured, self.vehicle_parameters.nominal, flights)
 
     def instrument_response(self, predicted: PredictedSpans) -> FloatArray:
@@ -360,36 +361,32 @@ class Problem:
 
     def _perturbed(self, u: Parameters) -> tuple[SpanFlights, list[Index], list[FloatArray]]:
         """Spans with one parameter moved, which parameter (columns) and by how much, span by span."""
-        v = self.first_instrument
+        v, m = self.first_instrument, self.motion
         vehicles = [self.trial_vehicle(u.vehicle + VEHICLE_STEP * unit) for unit in np.eye(v)]
         vehicles.append(self.trial_vehicle(u.vehicle))
-        tables, air_columns, air_steps = self._perturbed_tables(u)
-        rows: list[tuple[int, int, FloatArray, int]] = []
-        columns, steps = [], []
-        for span in range(self.measured.spans):
-            motion = u.motion[span]
-            rows += [(span, j, motion, 0) for j in range(v)]
-            rows += [(span, v, motion + d, 0) for d in np.diag(self.motion_step)]
-            near = self._nearby_air[span]
-            rows += [(span, v, motion, 1 + k) for k in near.tolist()]
-            own = self.first_motion + self.motion * span + np.arange(self.motion)
-            columns.append(np.array([*range(v), *own, *air_columns[near]]))
-            steps.append(np.array([*([VEHICLE_STEP] * v), *self.motion_step, *air_steps[near]]))
-        which = np.array([(row[0], row[1], row[3]) for row in rows]).T
-        motions = np.array([row[2] for row in rows])
-        return SpanFlights(which[0], which[1], motions, which[2], vehicles, tables), columns, steps
+        air = self.air.table(u.air, u.warmer_k)
+        moved, air_steps = self._moved_air(air)
+        first_air, own = v + INSTRUMENTS, self.first_motion + np.arange(m)
+        columns, steps, motions = [], [], []
+        numbers: list[Index] = []
+        for span, near in enumerate(self._nearby_air):
+            count = v + m + len(near)
+            columns.append(np.concatenate([np.arange(v), own + m * span, first_air + near]))
+            steps.append(np.concatenate([np.full(v, VEHICLE_STEP), self.motion_step, air_steps[near]]))
+            motions.append(np.tile(u.motion[span], (count, 1)))
+            motions[-1][v : v + m] += np.diag(self.motion_step)
+            table = np.concatenate([np.zeros(v + m, dtype=np.int64), 1 + near])
+            numbers.append(np.stack([np.full(count, span), np.minimum(np.arange(count), v), table]))
+        spans, which, table = np.concatenate(numbers, axis=1)
+        return SpanFlights(spans, which, np.concatenate(motions), table, vehicles, air, moved), columns, steps
 
-    def _perturbed_tables(self, u: Parameters) -> tuple[list[FloatArray], Index, FloatArray]:
-        """Kernel tables of the air as it is and with each knot moved; columns and steps of the latter."""
-        tables, steps = [self.air.table(u.air, u.warmer_k)], []
-        for kind, step in enumerate(AIR_STEP):
-            for knot in range(len(self.air.knots_m)):
-                tables.append(self.air.moved_table(tables[0], kind, knot, step))
-                steps.append(step)
-        for unit in np.eye(len(u.warmer_k)):
-            tables.append(self.air.table(u.air, u.warmer_k + WARMTH_STEP_K * unit))
-            steps.append(WARMTH_STEP_K)
-        return tables, self.first_instrument + INSTRUMENTS + np.arange(len(steps)), np.array(steps)
+    def _moved_air(self, air: FloatArray) -> tuple[list[MovedRows], FloatArray]:
+        """What changes in a kernel table of the air where each knot moves; steps of the knots."""
+        knots, warm = len(self.air.knots_m), len(self.air.temperature_knots_m)
+        by_kind = enumerate(AIR_STEP.tolist())
+        moved = [self.air.moved_rows(air, kind, knot, step) for kind, step in by_kind for knot in range(knots)]
+        moved += [self.air.warmed_rows(air, knot, WARMTH_STEP_K) for knot in range(warm)]
+        return moved, np.append(np.repeat(AIR_STEP, knots), np.full(warm, WARMTH_STEP_K))
 
     @cached_property
     def _nearby_air(self) -> list[Index]:

@@ -19,6 +19,7 @@ from postflight.reconciliation.forward_model import (
     SLOW_JOINT,
     STIFFNESS_LOG_SD,
     AtmosphereParameters,
+    SpanFlights,
     VehicleParameters,
     integrable,
     resolved_stiffness_nmprad,
@@ -314,7 +315,24 @@ def test_a_table_moved_at_a_knot_is_that_of_the_moved_differences():
         for knot in (0, 1, knots // 2, knots - 2, knots - 1):
             moved = difference.copy()
             moved[kind, knot] += 0.1
-            np.testing.assert_allclose(
-                air.moved_table(table, kind, knot, 0.1), air.table(moved, warm), rtol=1e-13, atol=1e-12
-            )
+            rows = air.moved_rows(table, kind, knot, 0.1)
+            np.testing.assert_allclose(with_rows(table, rows), air.table(moved, warm), rtol=1e-13, atol=1e-12)
             assert not np.array_equal(air.table(moved, warm), table)
+    for knot in (0, 1, len(warm) // 2, len(warm) - 1):
+        moved = warm.copy()
+        moved[knot] += 0.1
+        rows = air.warmed_rows(table, knot, 0.1)
+        np.testing.assert_allclose(with_rows(table, rows), air.table(difference, moved), rtol=1e-13, atol=1e-12)
+        assert not np.array_equal(air.table(difference, moved), table)
+
+
+def with_rows(table, moved):
+    """Return table 1 of flights that differ in some rows of the air, by way of a part of it."""
+    none, one = np.zeros(2, dtype=np.int64), np.array([0, 1])
+    flights = SpanFlights(none, none, np.zeros((2, 15)), one, [], table, [moved])
+    first = flights.air_of(none, slice(0, len(table)))
+    np.testing.assert_array_equal(first, table)
+    middle = moved.first + len(moved.rows) // 2
+    parts = [flights.air_of(one, slice(0, middle)), flights.air_of(one, slice(middle, len(table)))]
+    np.testing.assert_array_equal(np.concatenate([part[0] for part in parts]), table)
+    return np.concatenate([part[1] for part in parts])

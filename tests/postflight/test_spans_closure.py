@@ -111,7 +111,7 @@ def test_spans_start_with_the_datum_where_it_was_reconstructed():
     one, u = problem(), true_unknowns()
     spans = np.arange(SPANS)
     zero = np.zeros_like(spans)
-    flights = SpanFlights(spans, zero, u.motion, zero, [one.trial_vehicle(u.vehicle)], [])
+    flights = SpanFlights(spans, zero, u.motion, zero, [one.trial_vehicle(u.vehicle)], np.zeros((0, 6)))
     state = _start_states(one.measured, flights)
     place, velocity = dynamics.points(state, VEHICLE)["body"]
     back = rotations.rotate(state[:, 6:10], np.tile(-VEHICLE.centerbody.cg_m, (SPANS, 1)))
