@@ -5,7 +5,7 @@ Run: ``python benchmarks/growth.py study [FLIGHTS ...]``, ``merge [FLIGHTS ...]`
 
 ``study``: short dispersed flights on the Dask workers of this machine, of which one is killed after a third of them;
 its files against those of plain processes, byte by byte. ``merge``: the tables of invented flights, none flown.
-``imu``: `postflight reconstruct` of a coast of up to an hour with inertial data at 1 kHz, cut to each length.
+``imu``: reading and reconstruction of a coast of up to an hour with inertial data at 1 kHz, cut to each length.
 ``film``: `postflight deflection --method camera` of FLIGHT (a folder of `postflight simulate`), every frame of whose
 film is shown so many times in a row. Of each size: seconds by the clock and of the processor, peak memory, and the
 cost of a unit over that at the smallest size.
@@ -160,9 +160,10 @@ def study(sizes, workers, compared):
                 line = [sys.executable, __file__, "fly", path, root / "plain" / "study", flights, workers, "none"]
                 plain = spent(list(map(str, line)), stdout=subprocess.DEVNULL)
                 same = digest(root / "plain" / "study") == digest(root / "dask" / "study")
+                words = "the same bytes" if same else "DIFFERENT"
                 print(
                     f"  in {workers} processes: {plain[0]:.0f} s by the clock, {plain[1]:.0f} s of the processor, "
-                    f"{1e3 * plain[1] / flights:.2f} ms a flight; files are {'the same bytes' if same else 'DIFFERENT'}",
+                    f"{1e3 * plain[1] / flights:.2f} ms a flight; files are {words}",
                     flush=True,
                 )
                 if not same:
@@ -205,11 +206,20 @@ def merging(sizes):
         print_growth("flights", sizes[: len(rows)], rows)
 
 
-# up at 7 km/s from 110 km, seen by both radars all the time; down after an hour and more
+# a low orbit, followed by a receiver
 COAST = {
-    "start_s": 90.0, "inflated_s": 100.0, "telemetry_from_s": 100.0, "t_s": 100.0, "speed_mps": 7000.0,
-    "flight_path_deg": 88.0, "nose_elevation_deg": -88.0,
+    "start_s": 90.0, "inflated_s": 100.0, "telemetry_from_s": 100.0, "t_s": 100.0, "altitude_m": 350e3,
+    "speed_mps": 7400.0, "flight_path_deg": 0.0,
 }  # fmt: skip
+RECEIVER = """
+[gnss.gps]
+rate_hz = 1.0
+horizontal_sd_m = 5.0
+vertical_sd_m = 8.0
+speed_sd_mps = 0.1
+vertical_speed_sd_mps = 0.2
+
+"""
 
 
 def imu(sizes, rate_hz):
@@ -219,7 +229,7 @@ def imu(sizes, rate_hz):
     with tempfile.TemporaryDirectory() as temporary:
         root = Path(temporary)
         text = (DATA / "scenarios" / "irve2_reference.toml").read_text()
-        text = re.sub(r"(?ms)^\[video\].*?(?=^\[)", "", text)
+        text = re.sub(r"(?ms)^\[(video|radars\.\w+)\].*?(?=^\[)", "", text) + RECEIVER
         for key, value in (COAST | {"stop_s": COAST["start_s"] + 10.0 + max(sizes)}).items():
             text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text, count=1)
         (root / "coast.toml").write_text(re.sub(r"(?m)^rate_hz = 250\.0", f"rate_hz = {rate_hz}", text))
@@ -232,10 +242,19 @@ def imu(sizes, rate_hz):
             shutil.copytree(whole, cut)
             for table in (cut / "telemetry").glob("*.csv"):
                 shorten(table, COAST["telemetry_from_s"] + seconds)
-            line = [sys.executable, "-m", "postflight", "reconstruct", cut]
-            rows.append(spent(line, stdout=subprocess.DEVNULL))
+            rows.append(spent([sys.executable, __file__, "reconstruct-one", str(cut)]))
             shutil.rmtree(cut)
             print_growth("seconds", sizes[: len(rows)], rows)
+
+
+def reconstruct_one(folder):
+    """In its own process: read a flight and find its trajectory once, whatever a check says; name those that fail."""
+    from flightmodel.flightfolder import read_flight
+    from recon.reconstruct import reconstruct_once
+    from recon.settings import Settings
+
+    solution = reconstruct_once(read_flight(Path(folder)), Settings())
+    print(len(solution.imu_time_s), *(check.code for check in solution.consistency_checks if not check.passed))
 
 
 def shorten(table, last_s):
@@ -286,7 +305,7 @@ def main():
     one = kinds.add_parser("film")
     one.add_argument("flight", type=Path)
     one.add_argument("sizes", type=int, nargs="*", default=[1250, 2500, 5000, 10_000], metavar="FRAMES")
-    for name in ("fly", "merge-one"):
+    for name in ("fly", "merge-one", "reconstruct-one"):
         kinds.add_parser(name, help=argparse.SUPPRESS).add_argument("words", nargs="*")
     chosen = parser.parse_args()
     if chosen.kind == "fly":
@@ -294,6 +313,8 @@ def main():
         fly_study(path, folder, int(flights), int(workers), None if scheduler == "none" else scheduler)
     elif chosen.kind == "merge-one":
         merge_invented(chosen.words[0], chosen.words[1], int(chosen.words[2]))
+    elif chosen.kind == "reconstruct-one":
+        reconstruct_one(chosen.words[0])
     elif chosen.kind == "study":
         study(chosen.sizes, chosen.workers, not chosen.alone)
     elif chosen.kind == "merge":
