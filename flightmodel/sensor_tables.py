@@ -23,6 +23,7 @@ from flightmodel.atmosphere import (
     R_AIR_JPKGK,
     bottom_m,
     default_sounding_sd,
+    gas_constant,
     height_from_pressure,
     profile_from_sounding,
     standard_sounding,
@@ -692,7 +693,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
     if alt[-1] < LOWEST_TOP_M:
         words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, winds fade to zero"
         gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="sounding-short"))
-    pressure = rho * planet.gas_jpkgk * temperature
+    pressure = rho * gas_constant(alt, planet) * temperature
     if "pressure" in c:
         off = np.abs(c["pressure"][rows] / pressure - 1.0)
         if np.nanmax(off, initial=0.0) > GAS_LAW_TOLERANCE:

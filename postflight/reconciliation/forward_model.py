@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import (
     DENSITY_LENGTH_M,
-    GAMMA,
-    R_AIR_JPKGK,
     WIND_LENGTH_M,
     profile_from_sounding,
     sounding_correlation,
@@ -261,20 +259,20 @@ class AtmosphereParameters:
         return bridge(at.density_sd, DENSITY_LENGTH_M), bridge(at.wind_sd_mps, WIND_LENGTH_M)
 
     @cached_property
-    def _sounded(self) -> tuple[FloatArray, FloatArray]:
-        table = simulate.atmosphere_table(profile_from_sounding(self.sounding))
+    def _sounded(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        profile = profile_from_sounding(self.sounding)
+        table = simulate.atmosphere_table(profile)
         rows = simulate.ATMOSPHERE_START_M + simulate.ATMOSPHERE_STEP_M * np.arange(len(table), dtype=np.float64)
         passed = rows <= TOP_M  # of a table a knot, each copied for every flight, three quarters lie above
-        return table[passed], rows[passed]
+        return table[passed], rows[passed], profile.at(rows[passed]).temperature_k
 
     def table(self, difference: FloatArray, warmer_k: FloatArray) -> FloatArray:
         """Kernel table (rows, 6) of the atmosphere, of differences (3, k) and (n,)."""
-        table, rows = self._sounded
+        table, rows, temperature = self._sounded
         table = table.copy()
         ratio, north, east = (np.interp(rows, self.knots_m, part) for part in difference)
         table[:, 0] *= np.exp(ratio)
         table[:-1, 1] += np.diff(ratio)
-        temperature = table[:, 2] ** 2 / (GAMMA * R_AIR_JPKGK)
         # the root of the ratio of temperatures, which no trial step makes negative
         table[:, 2] *= np.exp(0.5 * np.interp(rows, self.temperature_knots_m, warmer_k) / temperature)
         table[:, 3] += north
