@@ -129,6 +129,14 @@ class AirState:
     wind_sd_mps: FloatArray
 
 
+def _in_range(name: str, altitude_m: FloatArray | float, lowest_m: float) -> FloatArray:
+    z = np.asarray(altitude_m, dtype=float)
+    if not ((z >= lowest_m) & (z <= TOP_M)).all():
+        words = f"altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {lowest_m:.0f} to {TOP_M:.0f} m"
+        raise GateError(f"{name}: {words}", code="altitude-range")
+    return z
+
+
 def us76(altitude_m: FloatArray | float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Density kg/m^3, temperature K, pressure Pa at geometric altitudes from -5 to 1000 km.
 
@@ -137,12 +145,7 @@ def us76(altitude_m: FloatArray | float) -> tuple[FloatArray, FloatArray, FloatA
     GateError
         Outside that range.
     """
-    z = np.asarray(altitude_m, dtype=float)
-    if not ((z >= BOTTOM_M) & (z <= TOP_M)).all():
-        raise GateError(
-            f"US76: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_M:.0f} to {TOP_M:.0f} m",
-            code="altitude-range",
-        )
+    z = _in_range("US76", altitude_m, BOTTOM_M)
     low = np.minimum(z, 86000.0)
     t_low, p_low = _below_86_km(EARTH_RADIUS_US76_M * low / (EARTH_RADIUS_US76_M + low))
     high = np.maximum(z, 86000.0)
@@ -162,13 +165,8 @@ def standard_air(altitude_m: FloatArray | float, planet: Planet) -> tuple[FloatA
     """Density kg/m^3, temperature K, pressure Pa of a planet's standard atmosphere; `us76` of the Earth."""
     if planet == WGS84:
         return us76(altitude_m)
-    z = np.asarray(altitude_m, dtype=float)
-    if not ((z >= BOTTOM_MARS_M) & (z <= TOP_M)).all():
-        raise GateError(
-            f"Mars: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_MARS_M:.0f} to {TOP_M:.0f} m",
-            code="altitude-range",
-        )
-    temperature = np.interp(z, 1000.0 * _MARS_TEMPERATURE[:, 0], _MARS_TEMPERATURE[:, 1])
+    z = _in_range("Mars", altitude_m, BOTTOM_MARS_M)
+    temperature = _mars_temperature(z)
     grid, log_pressure = _mars_log_pressure()
     pressure = np.exp(np.interp(z, grid, log_pressure))
     return pressure / (planet.gas_jpkgk * temperature), temperature, pressure
@@ -205,14 +203,17 @@ def sound_speed(altitude_m: FloatArray | float, temperature_k: FloatArray, plane
     return np.asarray(np.sqrt(gamma * gas_constant(altitude_m, planet) * temperature_k))
 
 
+def _mars_temperature(z: FloatArray) -> FloatArray:
+    return np.interp(z, 1000.0 * _MARS_TEMPERATURE[:, 0], _MARS_TEMPERATURE[:, 1])
+
+
 @cache
 def _mars_log_pressure() -> tuple[FloatArray, FloatArray]:
     """Heights, m, and log pressure there: ``d ln p / dz = -g / (R T)``, by Simpson's rule over 100 m."""
     z = np.arange(BOTTOM_MARS_M, TOP_M + 1.0, 100.0)
 
     def slope(at: FloatArray) -> FloatArray:
-        temperature = np.interp(at, 1000.0 * _MARS_TEMPERATURE[:, 0], _MARS_TEMPERATURE[:, 1])
-        return -MARS.gm_m3ps2 / (_MARS_MEAN_RADIUS_M + at) ** 2 / (MARS.gas_jpkgk * temperature)
+        return -MARS.gm_m3ps2 / (_MARS_MEAN_RADIUS_M + at) ** 2 / (MARS.gas_jpkgk * _mars_temperature(at))
 
     part = 100.0 / 6.0 * (slope(z[:-1]) + 4.0 * slope(z[:-1] + 50.0) + slope(z[1:]))
     total = np.concatenate([np.zeros(1), np.cumsum(part)])
@@ -281,12 +282,14 @@ _LOG_DENSITY = _spline(1)
 _LOG_PRESSURE = _spline(2)
 
 
-def default_sounding_sd(altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+def default_sounding_sd(altitude_m: FloatArray, planet: Planet = WGS84) -> tuple[FloatArray, FloatArray]:
     """Usual error of rocketsonde and balloon profiles: density (fraction) and wind per component (m/s), 1 sd.
 
     2, 3, 5, 10 % and 2, 4, 8, 15 m/s below 35, 60, 80 km and above (assumed sizes, after the accuracy of falling
-    spheres and datasondes), joined linearly over 5 km.
+    spheres and datasondes), joined linearly over 5 km. Of Mars what stands beside its temperatures above.
     """
+    if planet != WGS84:
+        return np.interp(altitude_m, *_MARS_DENSITY_SD), np.full(np.shape(altitude_m), _MARS_WIND_SD_MPS)
     knots = [32500.0, 37500.0, 57500.0, 62500.0, 77500.0, 82500.0]
     density = np.interp(altitude_m, knots, [0.02, 0.03, 0.03, 0.05, 0.05, 0.10])
     return density, np.interp(altitude_m, knots, [2.0, 4.0, 4.0, 8.0, 8.0, 15.0])
@@ -421,12 +424,12 @@ def standard_sounding(planet: Planet = WGS84) -> Sounding:
     """
     if planet != WGS84:
         z = np.arange(BOTTOM_MARS_M, 250001.0, 1000.0)
-        still, wind_sd = np.zeros(len(z)), np.full(len(z), _MARS_WIND_SD_MPS)
-        return Sounding(z, *standard_air(z, planet), still, still, np.interp(z, *_MARS_DENSITY_SD), wind_sd, planet)
-    z = np.arange(0.0, 120001.0, 1000.0)
-    density, temperature, pressure = us76(z)
+        sd = default_sounding_sd(z, planet)
+    else:
+        z = np.arange(0.0, 120001.0, 1000.0)
+        sd = np.full(len(z), 0.10), np.full(len(z), 15.0)
     still = np.zeros(len(z))
-    return Sounding(z, density, temperature, pressure, still, still, np.full(len(z), 0.10), np.full(len(z), 15.0))
+    return Sounding(z, *standard_air(z, planet), still, still, *sd, planet)
 
 
 @cache

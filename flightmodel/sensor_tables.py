@@ -26,7 +26,6 @@ from flightmodel.atmosphere import (
     gas_constant,
     height_from_pressure,
     profile_from_sounding,
-    standard_sounding,
 )
 from flightmodel.camera_edits import EDITS_FILE, NO_EDITS, CameraEdits, read_edits
 from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
@@ -710,11 +709,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
             "balance): check the units of all three"
         )
         gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="hydrostatic-balance"))
-    density_sd, wind_sd = default_sounding_sd(alt)
-    if planet != earth.WGS84:
-        standard = standard_sounding(planet)
-        density_sd = np.interp(alt, standard.altitude_m, standard.density_sd)
-        wind_sd = np.full(len(alt), standard.wind_sd_mps[0])
+    density_sd, wind_sd = default_sounding_sd(alt, planet)
     for key, default in (("rho_sd", density_sd), ("wind_sd", wind_sd)):
         if key in c:
             given = c[key][rows]
