@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flightmodel import earth, rotations
-from flightmodel.atmosphere import AirState, AtmosphereProfile
+from flightmodel.atmosphere import AirState, AtmosphereProfile, gas_constant, sound_speed
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
 from flightmodel.trajectory import Trajectory
@@ -135,7 +135,7 @@ class _Flow:
 
     @property
     def mach(self) -> FloatArray:
-        return self.airspeed_mps / np.sqrt(self.planet.gamma * self.planet.gas_jpkgk * self.temperature_k)
+        return self.airspeed_mps / sound_speed(self.altitude_m, self.temperature_k, self.planet)
 
     @property
     def dynamic_pressure_pa(self) -> FloatArray:
@@ -300,7 +300,7 @@ def derived(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) 
     out |= dict(zip(("roll", "pitch", "yaw"), euler_321(flow.dcm_ned_ecef @ flow.dcm_ecef_body), strict=True))
     out |= {"alpha": flow.alpha_rad, "beta": flow.beta_rad, "mach": flow.mach}
     out |= {"temperature": flow.temperature_k, "density": flow.density_kgpm3}
-    out["pressure"] = flow.density_kgpm3 * path.planet.gas_jpkgk * flow.temperature_k
+    out["pressure"] = flow.density_kgpm3 * gas_constant(flow.altitude_m, path.planet) * flow.temperature_k
     out["dynamic_pressure"] = flow.dynamic_pressure_pa
     return out
 

@@ -2,16 +2,22 @@
 
 To 86 km the standard's exact equations; above, its printed tables to 1000 km, interpolated by cubic splines of
 log density and log pressure, and its temperature equations. A modelled profile of the day (NRLMSIS) is held as its
-ratio to the standard, as a sounding is. Speed of sound uses gamma = 1.4 and the sea-level gas
-constant throughout, so above 86 km Mach number is a convention, as in the trajectory codes of the field.
+ratio to the standard, as a sounding is. Above 86 km the gas is the standard's own, of any density and temperature:
+its gas constant is ``p / (rho T)`` of the printed tables, and gamma follows from the share of free atoms, each of which
+lacks a molecule's two rotations. Speed of sound is the equilibrium one of the air ahead of the vehicle; what the shock
+makes of the gas is in the vehicle's coefficients, not in Mach number or dynamic pressure.
 
 Of Mars the standard is the model of the northern summer after Viking: temperatures to 100 km, and pressure from them by
 hydrostatic equilibrium in the planet's own gravity. Above, its temperature is assumed to rise to 200 K at 150 km, as
-Viking's entries found it to between 120 and 200 km (140 to 220 K), and to stay there.
+Viking's entries found it to between 120 and 200 km (140 to 220 K), and to stay there. Its gas is mixed everywhere;
+gamma follows the temperature by the vibrations of carbon dioxide, harmonic oscillators in equilibrium.
 
 References
 ----------
 NOAA/NASA/USAF, "U.S. Standard Atmosphere, 1976", NOAA-S/T 76-1562: tables I, VIII and section 1.2.
+T. Owen et al., "The composition of the atmosphere at the surface of Mars", J. Geophys. Res. 82 (1977) 4635: mole
+fractions, with which Seiff's molecular weight agrees.
+T. Shimanouchi, "Tables of molecular vibrational frequencies", NSRDS-NBS 39 (1972): carbon dioxide's.
 A. Seiff, "Post-Viking models for the structure of the summer atmosphere of Mars", Adv. Space Res. 2 (1982) 3.
 A. Seiff, D. Kirk, "Structure of the atmosphere of Mars in summer at mid-latitudes", J. Geophys. Res. 82 (1977) 4364.
 Emmert et al., "NRLMSIS 2.1", J. Geophys. Res. Space Phys. 127, 2022 (the table in ``data/atmosphere``).
@@ -33,7 +39,7 @@ from flightmodel.earth import MARS, STANDARD_GRAVITY_MPS2, WGS84, Planet
 from flightmodel.statistics import KNOTS_A_LENGTH, correlation, correlation_inverse, correlation_root
 from flightmodel.telemetry import Sounding
 
-GAMMA, R_AIR_JPKGK = WGS84.gamma, WGS84.gas_jpkgk
+R_AIR_JPKGK = WGS84.gas_jpkgk
 EARTH_RADIUS_US76_M = 6356766.0
 # geopotential base m, base temperature K, lapse K/m
 _LAYERS = np.array(
@@ -76,6 +82,15 @@ _UPPER = np.array(
         [1000, 3.561e-15, 7.5138e-9],
     ]
 )
+# geometric height km, mole fraction of O, Ar, He and H together, of the number densities as printed; at 86 km none: the
+# 1.4 below leaves argon's 1 % out
+_ATOMS = np.array(
+    [
+        [86, 0.0], [90, 0.01268], [95, 0.02380], [100, 0.04416], [110, 0.11233], [115, 0.15105], [120, 0.18436],
+        [130, 0.24161], [140, 0.29428], [150, 0.34460], [200, 0.56603], [300, 0.84655], [400, 0.95460], [500, 0.98796],
+        [600, 0.99732],
+    ]
+)  # fmt: skip
 # a sounding's errors: correlation lengths of density and wind, and the part of the variance that is one constant over
 # all altitudes (calibration, drag coefficient of the sphere); assumed, after falling spheres and datasondes
 DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0
@@ -96,6 +111,9 @@ _MARS_PRESSURE_PA = 636.0  # at height 0; over a year and over the planet's weat
 _MARS_DENSITY_SD = np.array([[0.0, 40e3, 80e3, 130e3], [0.12, 0.2, 0.4, 0.7]])
 _MARS_WIND_SD_MPS = 25.0  # of each component; assumed
 _MARS_MEAN_RADIUS_M = 3389.5e3
+# mole fractions of carbon dioxide, of N2, O2 and CO, and of argon
+_MARS_TRIATOMIC, _MARS_DIATOMIC, _MARS_ATOMIC = np.array([0.9532, 0.0270 + 0.0013 + 0.0007, 0.016]) / 0.9982
+_CO2_VIBRATIONS_K = 1.438777 * np.array([667.0, 667.0, 1333.0, 2349.0])  # of their wave numbers, 1/cm
 
 
 @dataclass(frozen=True)
@@ -111,6 +129,14 @@ class AirState:
     wind_sd_mps: FloatArray
 
 
+def _in_range(name: str, altitude_m: FloatArray | float, lowest_m: float) -> FloatArray:
+    z = np.asarray(altitude_m, dtype=float)
+    if not ((z >= lowest_m) & (z <= TOP_M)).all():
+        words = f"altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {lowest_m:.0f} to {TOP_M:.0f} m"
+        raise GateError(f"{name}: {words}", code="altitude-range")
+    return z
+
+
 def us76(altitude_m: FloatArray | float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Density kg/m^3, temperature K, pressure Pa at geometric altitudes from -5 to 1000 km.
 
@@ -119,12 +145,7 @@ def us76(altitude_m: FloatArray | float) -> tuple[FloatArray, FloatArray, FloatA
     GateError
         Outside that range.
     """
-    z = np.asarray(altitude_m, dtype=float)
-    if not ((z >= BOTTOM_M) & (z <= TOP_M)).all():
-        raise GateError(
-            f"US76: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_M:.0f} to {TOP_M:.0f} m",
-            code="altitude-range",
-        )
+    z = _in_range("US76", altitude_m, BOTTOM_M)
     low = np.minimum(z, 86000.0)
     t_low, p_low = _below_86_km(EARTH_RADIUS_US76_M * low / (EARTH_RADIUS_US76_M + low))
     high = np.maximum(z, 86000.0)
@@ -144,16 +165,46 @@ def standard_air(altitude_m: FloatArray | float, planet: Planet) -> tuple[FloatA
     """Density kg/m^3, temperature K, pressure Pa of a planet's standard atmosphere; `us76` of the Earth."""
     if planet == WGS84:
         return us76(altitude_m)
-    z = np.asarray(altitude_m, dtype=float)
-    if not ((z >= BOTTOM_MARS_M) & (z <= TOP_M)).all():
-        raise GateError(
-            f"Mars: altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {BOTTOM_MARS_M:.0f} to {TOP_M:.0f} m",
-            code="altitude-range",
-        )
-    temperature = np.interp(z, 1000.0 * _MARS_TEMPERATURE[:, 0], _MARS_TEMPERATURE[:, 1])
+    z = _in_range("Mars", altitude_m, BOTTOM_MARS_M)
+    temperature = _mars_temperature(z)
     grid, log_pressure = _mars_log_pressure()
     pressure = np.exp(np.interp(z, grid, log_pressure))
     return pressure / (planet.gas_jpkgk * temperature), temperature, pressure
+
+
+def gas_constant(altitude_m: FloatArray | float, planet: Planet = WGS84) -> FloatArray:
+    """Gas constant, J/(kg K), ``(...)`` at geometric altitudes, m: mixed air's up to 86 km, the standard's above."""
+    z = np.asarray(altitude_m, dtype=float)
+    if planet != WGS84:
+        return np.full(z.shape, planet.gas_jpkgk)
+    high = np.clip(z, 86000.0, TOP_M)
+    unmixed = np.exp(_LOG_PRESSURE(high) - _LOG_DENSITY(high)) / _temperature_above_86_km(high)
+    return np.where(z > 86000.0, unmixed, R_AIR_JPKGK)
+
+
+def heat_ratio(altitude_m: FloatArray | float, temperature_k: FloatArray | float, planet: Planet = WGS84) -> FloatArray:
+    """Ratio of specific heats ``(...)`` at geometric altitudes, m, and temperatures, K.
+
+    Of the Earth 1.4 up to 86 km and by the share of atoms above, whatever the temperature (nitrogen's and oxygen's
+    vibrations change it by 1 % at 600 K); of Mars that of Viking's mixture at the temperature.
+    """
+    if planet != WGS84:
+        x = _CO2_VIBRATIONS_K / np.asarray(temperature_k, dtype=float)[..., None]
+        vibrating = np.sum((0.5 * x / np.sinh(0.5 * x)) ** 2, axis=-1)
+        own = _MARS_TRIATOMIC * (2.5 + vibrating) + 2.5 * _MARS_DIATOMIC + 1.5 * _MARS_ATOMIC
+        return np.asarray(1.0 + 1.0 / own)
+    atoms = np.interp(altitude_m, 1000.0 * _ATOMS[:, 0], _ATOMS[:, 1])
+    return np.asarray(1.0 + 1.0 / (2.5 - atoms))
+
+
+def sound_speed(altitude_m: FloatArray | float, temperature_k: FloatArray, planet: Planet = WGS84) -> FloatArray:
+    """Speed of sound, m/s, ``(...)`` at geometric altitudes, m, and temperatures, K."""
+    gamma = heat_ratio(altitude_m, temperature_k, planet)
+    return np.asarray(np.sqrt(gamma * gas_constant(altitude_m, planet) * temperature_k))
+
+
+def _mars_temperature(z: FloatArray) -> FloatArray:
+    return np.interp(z, 1000.0 * _MARS_TEMPERATURE[:, 0], _MARS_TEMPERATURE[:, 1])
 
 
 @cache
@@ -162,8 +213,7 @@ def _mars_log_pressure() -> tuple[FloatArray, FloatArray]:
     z = np.arange(BOTTOM_MARS_M, TOP_M + 1.0, 100.0)
 
     def slope(at: FloatArray) -> FloatArray:
-        temperature = np.interp(at, 1000.0 * _MARS_TEMPERATURE[:, 0], _MARS_TEMPERATURE[:, 1])
-        return -MARS.gm_m3ps2 / (_MARS_MEAN_RADIUS_M + at) ** 2 / (MARS.gas_jpkgk * temperature)
+        return -MARS.gm_m3ps2 / (_MARS_MEAN_RADIUS_M + at) ** 2 / (MARS.gas_jpkgk * _mars_temperature(at))
 
     part = 100.0 / 6.0 * (slope(z[:-1]) + 4.0 * slope(z[:-1] + 50.0) + slope(z[1:]))
     total = np.concatenate([np.zeros(1), np.cumsum(part)])
@@ -232,12 +282,14 @@ _LOG_DENSITY = _spline(1)
 _LOG_PRESSURE = _spline(2)
 
 
-def default_sounding_sd(altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+def default_sounding_sd(altitude_m: FloatArray, planet: Planet = WGS84) -> tuple[FloatArray, FloatArray]:
     """Usual error of rocketsonde and balloon profiles: density (fraction) and wind per component (m/s), 1 sd.
 
     2, 3, 5, 10 % and 2, 4, 8, 15 m/s below 35, 60, 80 km and above (assumed sizes, after the accuracy of falling
-    spheres and datasondes), joined linearly over 5 km.
+    spheres and datasondes), joined linearly over 5 km. Of Mars what stands beside its temperatures above.
     """
+    if planet != WGS84:
+        return np.interp(altitude_m, *_MARS_DENSITY_SD), np.full(np.shape(altitude_m), _MARS_WIND_SD_MPS)
     knots = [32500.0, 37500.0, 57500.0, 62500.0, 77500.0, 82500.0]
     density = np.interp(altitude_m, knots, [0.02, 0.03, 0.03, 0.05, 0.05, 0.10])
     return density, np.interp(altitude_m, knots, [2.0, 4.0, 4.0, 8.0, 8.0, 15.0])
@@ -321,7 +373,7 @@ class AtmosphereProfile:
             density_kgpm3=density * ratio,
             temperature_k=warmer,
             pressure_pa=pressure * ratio * warmer / temperature,
-            sound_speed_mps=np.sqrt(self.planet.gamma * self.planet.gas_jpkgk * warmer),
+            sound_speed_mps=sound_speed(z, warmer, self.planet),
             wind_ned_mps=wind,
             density_sd=column(self.density_sd) * fade + 0.15 * (1.0 - fade),
             wind_sd_mps=column(self.wind_sd_mps) * fade + 20.0 * (1.0 - fade),
@@ -377,12 +429,12 @@ def standard_sounding(planet: Planet = WGS84) -> Sounding:
     """
     if planet != WGS84:
         z = np.arange(BOTTOM_MARS_M, 250001.0, 1000.0)
-        still, wind_sd = np.zeros(len(z)), np.full(len(z), _MARS_WIND_SD_MPS)
-        return Sounding(z, *standard_air(z, planet), still, still, np.interp(z, *_MARS_DENSITY_SD), wind_sd, planet)
-    z = np.arange(0.0, 120001.0, 1000.0)
-    density, temperature, pressure = us76(z)
+        sd = default_sounding_sd(z, planet)
+    else:
+        z = np.arange(0.0, 120001.0, 1000.0)
+        sd = np.full(len(z), 0.10), np.full(len(z), 15.0)
     still = np.zeros(len(z))
-    return Sounding(z, density, temperature, pressure, still, still, np.full(len(z), 0.10), np.full(len(z), 15.0))
+    return Sounding(z, *standard_air(z, planet), still, still, *sd, planet)
 
 
 @cache
@@ -396,7 +448,7 @@ def nrlmsis_profile(name: str = "nrlmsis_2009_08_17") -> AtmosphereProfile:
 
     Notes
     -----
-    Temperature is the kinetic one; as everywhere here, the speed of sound takes it with sea-level composition.
+    Temperature is the kinetic one; the gas is US76's, as everywhere here.
     """
     z, density, temperature, _ = np.loadtxt(TABLES / f"{name}.csv", delimiter=",", comments="#", skiprows=3).T
     return _still_profile(z, density, temperature)

@@ -18,7 +18,7 @@ Celest. Mech. Dyn. Astron. 109 (2011) 101: ellipsoid, pole, prime meridian of Ma
 A. Genova et al., "Seasonal and static gravity field of Mars from MGS, Mars Odyssey and MRO radio science", Icarus 272
 (2016) 228 (GMM-3): GM, and J2 from C20 = -8.750211e-4 (normalised, for 3396.0 km).
 A. Seiff, "Post-Viking models for the structure of the summer atmosphere of Mars", Adv. Space Res. 2 (1982) 3:
-molecular weight 43.49. Ratio of specific heats: carbon dioxide at 220 K, JANAF tables; 1.38 at 140 K.
+molecular weight 43.49.
 """
 
 from __future__ import annotations
@@ -49,8 +49,7 @@ class Planet(NamedTuple):
     semi_major_m: float
     flattening: float
     rate_radps: float
-    gamma: float
-    gas_jpkgk: float
+    gas_jpkgk: float  # of its mixed gas, J/(kg K)
 
     @property
     def rate_ecef_radps(self) -> FloatArray:
@@ -58,14 +57,13 @@ class Planet(NamedTuple):
         return np.array([0.0, 0.0, self.rate_radps])
 
 
-WGS84 = Planet(GM_M3PS2, J2, SEMI_MAJOR_M, FLATTENING, OMEGA_RADPS, 1.4, 8314.32 / 28.9644)
+WGS84 = Planet(GM_M3PS2, J2, SEMI_MAJOR_M, FLATTENING, OMEGA_RADPS, 8314.32 / 28.9644)
 MARS = Planet(
     gm_m3ps2=4.2828375e13,
     j2=8.750211e-4 * 5.0**0.5 * (3396.0 / 3396.19) ** 2,  # of the ellipsoid's radius instead of the field's
     semi_major_m=3396190.0,
     flattening=(3396.19 - 3376.20) / 3396.19,
     rate_radps=float(np.deg2rad(350.89198226)) / 86400.0,
-    gamma=1.33,
     gas_jpkgk=8314.32 / 43.49,
 )
 PLANETS = {"earth": WGS84, "mars": MARS}

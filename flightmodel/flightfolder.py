@@ -680,9 +680,7 @@ def _first_place(
     """Latitude and longitude, rad, of a stated start, the first receiver's first fix or first radar's first point."""
     points: list[FloatArray] = [] if state is None else [state.position_ecef_m[None]]
     points += [r.position_ecef_m for r in gnss.values()]
-    for radar in radars.values():
-        s = radar.site
-        points.append(ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m, planet))
+    points += [ecef_from_radar(r.range_az_el, *r.site.geodetic, planet) for r in radars.values()]
     for point in points:
         whole = point[np.isfinite(point).all(axis=1)]
         if len(whole):

@@ -392,6 +392,11 @@ class RadarSite:
     angle_servo_hz: float = 0.0
 
     @property
+    def geodetic(self) -> tuple[float, float, float]:
+        """Latitude and longitude, rad, and height, m."""
+        return self.latitude_rad, self.longitude_rad, self.height_m
+
+    @property
     def angles_sd_rad(self) -> tuple[float, float]:
         """White noise normal to the line of sight, in azimuth's direction and in elevation's."""
         azimuth, elevation = self.azimuth_sd_rad, self.elevation_sd_rad

@@ -23,9 +23,9 @@ from flightmodel.atmosphere import (
     R_AIR_JPKGK,
     bottom_m,
     default_sounding_sd,
+    gas_constant,
     height_from_pressure,
     profile_from_sounding,
-    standard_sounding,
 )
 from flightmodel.camera_edits import EDITS_FILE, NO_EDITS, CameraEdits, read_edits
 from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
@@ -692,7 +692,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
     if alt[-1] < LOWEST_TOP_M:
         words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, winds fade to zero"
         gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="sounding-short"))
-    pressure = rho * planet.gas_jpkgk * temperature
+    pressure = rho * gas_constant(alt, planet) * temperature
     if "pressure" in c:
         off = np.abs(c["pressure"][rows] / pressure - 1.0)
         if np.nanmax(off, initial=0.0) > GAS_LAW_TOLERANCE:
@@ -709,11 +709,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
             "balance): check the units of all three"
         )
         gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="hydrostatic-balance"))
-    density_sd, wind_sd = default_sounding_sd(alt)
-    if planet != earth.WGS84:
-        standard = standard_sounding(planet)
-        density_sd = np.interp(alt, standard.altitude_m, standard.density_sd)
-        wind_sd = np.full(len(alt), standard.wind_sd_mps[0])
+    density_sd, wind_sd = default_sounding_sd(alt, planet)
     for key, default in (("rho_sd", density_sd), ("wind_sd", wind_sd)):
         if key in c:
             given = c[key][rows]

@@ -134,14 +134,20 @@ R_AIR_JPKGK = 8314.32 / 28.9644
 KN_CONTINUUM, KN_FREE = 1e-3, 10.0
 
 
-def mean_free_path(density_kgpm3: FloatArray | float) -> FloatArray:
-    """Mean free path, m, of sea-level air molecules as hard spheres: ``m / (sqrt(2) pi d^2 rho)`` (US76 eq. [44])."""
-    return MOLECULE_KG / (np.sqrt(2.0) * np.pi * COLLISION_DIAMETER_M**2 * np.asarray(density_kgpm3, dtype=float))
+def mean_free_path(density_kgpm3: FloatArray | float, gas_jpkgk: FloatArray | float = R_AIR_JPKGK) -> FloatArray:
+    """Mean free path, m, of hard spheres: ``m / (sqrt(2) pi d^2 rho)`` (US76 eq. [44]).
+
+    The gas constant says how heavy a molecule is on the average; its diameter is air's in every gas.
+    """
+    section = np.sqrt(2.0) * np.pi * COLLISION_DIAMETER_M**2 * np.asarray(density_kgpm3, dtype=float)
+    return MOLECULE_KG * (R_AIR_JPKGK / gas_jpkgk) / section
 
 
-def knudsen(density_kgpm3: FloatArray | float, length_m: float) -> FloatArray:
-    """Knudsen number ``(...)`` of densities, kg/m^3, against the reference length, m."""
-    return mean_free_path(density_kgpm3) / length_m
+def knudsen(
+    density_kgpm3: FloatArray | float, length_m: float, gas_jpkgk: FloatArray | float = R_AIR_JPKGK
+) -> FloatArray:
+    """Knudsen number ``(...)`` of densities, kg/m^3, and gas constants against the reference length, m."""
+    return mean_free_path(density_kgpm3, gas_jpkgk) / length_m
 
 
 def bridge(knudsen_number: FloatArray | float) -> FloatArray:

@@ -20,6 +20,7 @@ import numpy as np
 from flightmodel import earth
 from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray, GateError
+from flightmodel.telemetry import Telemetry
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from recon import ekf, propagation, smoother
 from recon.ekf import Problem, observe
@@ -54,12 +55,13 @@ def _ensembles() -> None:
     list(fly_ensemble(vehicle, lambda _run: start, [0], Schedule(0.001, 1, 2)))
 
 
-def _tiny_problem() -> Problem:
+def _tiny_problem(ballistic: bool = False, planet: earth.Planet = earth.WGS84) -> Problem:
     """Three nodes without a measurement: enough to compile the filter."""
     motion = strapdown_motion(
         np.array([0.0, 0.01, 0.02]), np.zeros((3, 3)), np.zeros((3, 3)), np.ones((3, 3)), np.ones((3, 3)),
         np.eye(3), np.eye(3),
     )  # fmt: skip
+    motion = motion._replace(ballistic=ballistic, planet=planet)
     model = ErrorModel((Block("all", tuple("abcdefghijklmnopqr"), "1", 1.0),))
     start = States(earth.ecef_from_geodetic(0.6, -1.3, 5e4), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(18))
     nothing = Instrument(
@@ -99,6 +101,13 @@ def _smoothers() -> None:
     states = States(*(np.array([part] * 3) for part in ekf.as_charts(problem.start)))
     smoother.smooth(problem, ekf.ForwardPass(states, steps, run, innovations))
     propagation.fill_between(problem.motion, problem.node_index, problem.node_index[:1], states[:1])
+    propagation.propagate(problem.motion, 0, 1, problem.start)
+
+
+def _other_motion(ballistic: bool, planet: earth.Planet) -> None:
+    """Filter and propagation of a motion or planet whose kernels are others than a strapdown flight's at the Earth."""
+    problem = _tiny_problem(ballistic, planet)
+    ekf.forward(problem)
     propagation.propagate(problem.motion, 0, 1, problem.start)
 
 
@@ -146,8 +155,19 @@ GROUPS: dict[str, Callable[[], None]] = {
     "tables": _tables,
     "balance": _balance,
     "camera": _camera,
+    "ballistic": lambda: _other_motion(True, earth.WGS84),
+    "mars": lambda: _other_motion(False, earth.MARS),
+    "ballistic at mars": lambda: _other_motion(True, earth.MARS),
 }
 RECONSTRUCTION, ESTIMATES = ("filter", "smoothers"), ("balance", "camera")
+
+
+def reconstruction_of(telemetry: Telemetry) -> tuple[str, ...]:
+    """Groups that the reconstruction of a flight takes."""
+    ballistic = telemetry.accelerometer is None or telemetry.rates is None or telemetry.motion.model == "ballistic"
+    at = "" if telemetry.planet == earth.WGS84 else earth.name_of(telemetry.planet)
+    other = " at ".join(part for part in ("ballistic" * ballistic, at) if part)
+    return (*RECONSTRUCTION, other) if other else RECONSTRUCTION
 
 
 def _stamp(group: str) -> Path | None:

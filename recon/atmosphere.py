@@ -40,6 +40,7 @@ from flightmodel.atmosphere import (
     DENSITY_LENGTH_M,
     WIND_LENGTH_M,
     AtmosphereProfile,
+    gas_constant,
     sounding_correlation,
     unresolved_variance,
 )
@@ -178,7 +179,8 @@ class _Model:
     def __init__(self, samples: AirSamples, profile: AtmosphereProfile, drag: Drag) -> None:
         self.samples, self.drag = samples, drag
         self.air = profile.at(samples.altitude_m)
-        self.knudsen = knudsen(self.air.density_kgpm3, drag.length_m)
+        gas = gas_constant(samples.altitude_m, profile.planet)
+        self.knudsen = knudsen(self.air.density_kgpm3, drag.length_m, gas)
         still = np.zeros((len(samples.time_s), _UNKNOWNS))
         self.largest_pa = float(self.forces(still, 1.0)[1].max())
 

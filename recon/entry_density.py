@@ -34,7 +34,7 @@ import pandas as pd
 
 from flightmodel import earth
 from flightmodel.airdata import AirData, air_data
-from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding, standard_air
+from flightmodel.atmosphere import AtmosphereProfile, gas_constant, profile_from_sounding, sound_speed, standard_air
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory
@@ -68,12 +68,11 @@ class DragHistory:
 def drag_of_drivers(problem: Problem, states: States, triangles: FloatArray, path: Trajectory) -> DragHistory:
     """Drag of ballistic flight at the kept nodes, from states at all nodes and packed covariances at the kept ones."""
     motion, at = problem.motion, states[np.flatnonzero(problem.kept)]
-    _, _, height = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)
+    latitude, longitude, height = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)
     row = (height - motion.air_from_m) / motion.air_step_m
     grid = np.arange(len(motion.air))
     log_density, wind_north, wind_east, density_sd, wind_sd = (np.interp(row, grid, c) for c in motion.air.T)
     steeper = np.interp(row + 0.5, grid, motion.air[:, 0]) - np.interp(row - 0.5, grid, motion.air[:, 0])
-    latitude, longitude, _ = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)
     ned = earth.dcm_ned_ecef(latitude, longitude)
     drivers = at.sensor_errors[:, :6]
     covariance = unpacked(triangles, KINEMATIC + 6)
@@ -131,21 +130,22 @@ def density_by_drag(telemetry: Telemetry, path: Trajectory, history: DragHistory
     rho, own_sd, sd = rho[known], history.sd[known], np.hypot(history.sd, drag.sd)[known]
     pressure, weight_sd = _weight_of_air(path, air, profile, known, rho, own_sd)
     # the uppermost row's temperature is the stated one, whose error the weight has too
-    warm_sd = profile.temperature_sd(air.altitude_m[known])
+    height, gas = air.altitude_m[known], gas_constant(air.altitude_m[known], path.planet)
+    warm_sd = profile.temperature_sd(height)
     temperature, temperature_sd = _mean(
-        pressure / (path.planet.gas_jpkgk * rho), np.hypot(own_sd, weight_sd), air.air.temperature_k[known], warm_sd
+        pressure / (gas * rho), np.hypot(own_sd, weight_sd), air.air.temperature_k[known], warm_sd
     )
     speed, covariance = air.airspeed_mps[known], path.covariance
     assert covariance is not None
     down = _down(air)
     height_sd = np.sqrt(np.einsum("ni,nij,nj->n", down, covariance[:, :3, :3], down))[known]
-    mach = speed / np.sqrt(path.planet.gamma * path.planet.gas_jpkgk * temperature)
+    mach = speed / sound_speed(height, temperature, path.planet)
     mach_sd = np.hypot(0.5 * temperature_sd / temperature, np.sqrt(_speed_var(path, air))[known] / speed)
     ratio, q = rho / air.air.density_kgpm3[known], 0.5 * rho * speed**2
     return pd.DataFrame(
         {
             "time_s": path.time_s[known],
-            "altitude_m": air.altitude_m[known],
+            "altitude_m": height,
             "altitude_sd_m": height_sd,
             "density_kgpm3": rho,
             "density_sd_kgpm3": rho * sd,
@@ -178,7 +178,7 @@ def _weight_of_air(
     sink_sd = np.sqrt(np.einsum("ni,nij,nj->n", down, covariance[known, 3:6, 3:6], down))
     top = int(np.argmax(height))
     warm, warm_sd = air.air.temperature_k[known][top], profile.temperature_sd(height[[top]])[0]
-    above = rho[top] * planet.gas_jpkgk * warm
+    above = rho[top] * gas_constant(height[top], planet) * warm
     # between two rows density is exponential
     low, high = (rho * gravity)[:-1], (rho * gravity)[1:]
     step = np.log(high / low)

@@ -208,7 +208,7 @@ def radar_instrument(
         elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
         sd[:, 1] /= np.maximum(np.cos(elevation), 1e-3)
     known = np.tile([_SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
-    place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m, planet)
+    place = earth.ecef_from_geodetic(*site.geodetic, planet)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
     made = instrument_of(
         name, RADAR, site.name, arm_body_m, place, dcm, record.time_s, record.range_az_el, sd, known,
@@ -226,7 +226,7 @@ def range_rate_instrument(
         return None
     value = np.column_stack([record.range_rate_mps, np.full((len(record.time_s), 2), np.nan)])
     sd = np.tile(_noise(record, [site.range_rate_sd_mps], slice(3, 4)), 3)
-    place = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m, planet)
+    place = earth.ecef_from_geodetic(*site.geodetic, planet)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
     return instrument_of(
         f"{name} range rate", RANGE_RATE, site.name, arm_body_m, place, dcm, record.time_s, value, sd,

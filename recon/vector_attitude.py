@@ -191,10 +191,8 @@ def _place(
 def track(telemetry: Telemetry) -> tuple[FloatArray, FloatArray]:
     """Times (k,) and positions (k, 3), ECEF m: medians over `_TRACK_BLOCK_S` of all radar points and receiver fixes."""
     times = [r.time_s for r in telemetry.radars.values()] + [r.time_s for r in telemetry.gnss.values()]
-    points = [
-        earth.ecef_from_radar(r.range_az_el, r.site.latitude_rad, r.site.longitude_rad, r.site.height_m)
-        for r in telemetry.radars.values()
-    ] + [r.position_ecef_m for r in telemetry.gnss.values()]
+    points = [earth.ecef_from_radar(r.range_az_el, *r.site.geodetic) for r in telemetry.radars.values()]
+    points += [r.position_ecef_m for r in telemetry.gnss.values()]
     t, p = np.concatenate(times), np.concatenate(points)
     whole = np.isfinite(p).all(axis=1)
     if not whole.any():

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel import airdata, earth, rotations, sphere_cone
-from flightmodel.atmosphere import AtmosphereProfile, us76
+from flightmodel.atmosphere import AtmosphereProfile, gas_constant, us76
 from flightmodel.checks import ConfigError, FloatArray, check_finite
 from flightmodel.deflection import DeflectionHistory, lv_clock
 from flightmodel.events import splashdown_index
@@ -511,6 +511,11 @@ def vacuum_table() -> FloatArray:
     return np.tile(np.array([0.0, 0.0, 300.0, 0.0, 0.0, 0.0]), (ATMOSPHERE_ROWS, 1))
 
 
+@cache
+def _gas_constants(air_from_m: float, rows: int) -> FloatArray:
+    return gas_constant(air_from_m + ATMOSPHERE_STEP_M * np.arange(rows, dtype=np.float64))
+
+
 def kernel_tables(
     vehicle: Vehicle, atmosphere: FloatArray, air_from_m: float = ATMOSPHERE_START_M
 ) -> tuple[FloatArray, ...]:
@@ -522,7 +527,8 @@ def kernel_tables(
     if vehicle.aero.free_molecular is not None:
         free, air = np.ascontiguousarray(vehicle.aero.free_molecular), air.copy()
         with np.errstate(divide="ignore"):  # no air: infinite mean free path
-            air[..., 5] = sphere_cone.bridge(sphere_cone.knudsen(air[..., 0], vehicle.reference.length_m))
+            gas = _gas_constants(air_from_m, air.shape[1])
+            air[..., 5] = sphere_cone.bridge(sphere_cone.knudsen(air[..., 0], vehicle.reference.length_m, gas))
     return np.ascontiguousarray(air), grid, np.ascontiguousarray(vehicle.aero.mach), coefficients, free
 
 

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from flightmodel.atmosphere import (
     TABLES,
@@ -125,6 +125,16 @@ class DayOfFlightAtmosphere(Section):
     discrete_gusts: tuple[DiscreteGust, ...] = ()
     sounding_scale: Annotated[float, Field(ge=0.0, le=10.0)] = 1.0
     sounding: RangeSounding | None = None
+
+    @field_validator("winds", mode="before")
+    @classmethod
+    def _no_wind_model(cls, value: object) -> object:
+        if isinstance(value, str) and value.lower().startswith("hwm"):
+            raise ValueError(
+                "the Horizontal Wind Model has no library that installs without a Fortran compiler; write its winds as "
+                "mean_wind = [[altitude_m, north_mps, east_mps], ...]"
+            )
+        return value
 
     @model_validator(mode="after")
     def _fit_each_other(self) -> DayOfFlightAtmosphere:

@@ -52,12 +52,9 @@ def tracks(found: Sources) -> dict[str, RadarRecord | GnssRecord]:
 
 def position_of(record: RadarRecord | GnssRecord, planet: earth.Planet = earth.WGS84) -> FloatArray:
     """Return a tracker's positions (n, 3), ECEF m."""
-    return record.position_ecef_m if isinstance(record, GnssRecord) else _position(record, record.range_az_el, planet)
-
-
-def _position(record: RadarRecord, range_az_el: FloatArray, planet: earth.Planet) -> FloatArray:
-    s = record.site
-    return earth.ecef_from_radar(range_az_el, s.latitude_rad, s.longitude_rad, s.height_m, planet)
+    if isinstance(record, GnssRecord):
+        return record.position_ecef_m
+    return earth.ecef_from_radar(record.range_az_el, *record.site.geodetic, planet)
 
 
 # spans of time
@@ -164,7 +161,7 @@ def _reread(
     elevation = values[:, 2][np.isfinite(values[:, 2])]
     if np.abs(elevation).max(initial=0.0) > 0.5 * np.pi or np.abs(values[:, 1]).max(initial=0.0) > 4 * np.pi:
         return None
-    return _position(record, values, planet)
+    return earth.ecef_from_radar(values, *record.site.geodetic, planet)
 
 
 def _share_that_falls(
@@ -317,7 +314,7 @@ def _sd_m(record: RadarRecord | GnssRecord, position_m: FloatArray, planet: eart
             len(position_m), float(np.sqrt(2 * s.horizontal_sd_m**2 + s.vertical_sd_m**2 + s.wander_sd_m**2))
         )
     site = record.site
-    at = earth.ecef_from_geodetic(site.latitude_rad, site.longitude_rad, site.height_m, planet)
+    at = earth.ecef_from_geodetic(*site.geodetic, planet)
     slant = np.linalg.norm(position_m - at, axis=1)
     own = [getattr(site, row.name) for row in RADAR.rows if row.unit == "rad" and row.states]
     angle = np.sqrt(2 * (site.angle_sd_rad**2 + sum(sd**2 for sd in own)))

@@ -30,8 +30,6 @@ from numpy.typing import NDArray
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import (
     DENSITY_LENGTH_M,
-    GAMMA,
-    R_AIR_JPKGK,
     WIND_LENGTH_M,
     profile_from_sounding,
     sounding_correlation,
@@ -272,11 +270,12 @@ class AtmosphereParameters:
         return bridge(at.density_sd, DENSITY_LENGTH_M), bridge(at.wind_sd_mps, WIND_LENGTH_M)
 
     @cached_property
-    def _sounded(self) -> tuple[FloatArray, FloatArray]:
-        table = simulate.atmosphere_table(profile_from_sounding(self.sounding))
+    def _sounded(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        profile = profile_from_sounding(self.sounding)
+        table = simulate.atmosphere_table(profile)
         rows = simulate.ATMOSPHERE_START_M + simulate.ATMOSPHERE_STEP_M * np.arange(len(table), dtype=np.float64)
         passed = rows <= TOP_M  # of a table a knot, each copied for every flight, three quarters lie above
-        return table[passed], rows[passed]
+        return table[passed], rows[passed], profile.at(rows[passed]).temperature_k
 
     @cached_property
     def _sounded_temperature(self) -> FloatArray:
@@ -284,7 +283,7 @@ class AtmosphereParameters:
 
     def table(self, difference: FloatArray, warmer_k: FloatArray) -> FloatArray:
         """Kernel table (rows, 6) of the atmosphere, of differences (3, k) and (n,)."""
-        table, rows = self._sounded
+        table, rows, temperature = self._sounded
         table = table.copy()
         ratio, north, east = (np.interp(rows, self.knots_m, part) for part in difference)
         table[:, 0] *= np.exp(ratio)

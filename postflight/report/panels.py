@@ -112,12 +112,11 @@ def panel_of(
 
 def _tracker_heights(run: Run) -> list[dict[str, Any]]:
     """Heights by each tracker's own points, as measured."""
-    tracks: list[tuple[str, FloatArray, FloatArray]] = []
     planet = run.telemetry.planet
-    for name, radar in run.telemetry.radars.items():
-        s = radar.site
-        places = earth.ecef_from_radar(radar.range_az_el, s.latitude_rad, s.longitude_rad, s.height_m, planet)
-        tracks.append((name, radar.time_s, places))
+    tracks = [
+        (name, r.time_s, earth.ecef_from_radar(r.range_az_el, *r.site.geodetic, planet))
+        for name, r in run.telemetry.radars.items()
+    ]
     tracks += [(name, r.time_s, r.position_ecef_m) for name, r in run.telemetry.gnss.items() if r.has_positions]
     known = [(name, t, earth.geodetic_from_ecef(places, planet)[2]) for name, t, places in tracks]
     known += [(name, b.time_s, b.height_m) for name, b in run.telemetry.barometers.items()]

@@ -7,9 +7,13 @@ from scipy.interpolate import CubicSpline
 
 from flightmodel import atmosphere
 from flightmodel.atmosphere import (
+    R_AIR_JPKGK,
     AtmosphereProfile,
     default_sounding_sd,
+    gas_constant,
+    heat_ratio,
     profile_from_sounding,
+    sound_speed,
     standard_atmosphere,
     us76,
 )
@@ -44,6 +48,32 @@ def test_density_and_pressure_above_86_km_equal_the_number_densities():
     # four printed digits; at 300 km the printed helium disagrees in the third digit
     np.testing.assert_allclose(density, number @ molar, rtol=1.5e-3)
     np.testing.assert_allclose(pressure, number.sum(axis=1) * 1.380622e-23 * temperature, rtol=1.6e-3)
+
+
+def test_speed_of_sound_above_86_km_is_that_of_the_printed_mixture():
+    """Diatomic molecules with 5 and atoms with 3 degrees of freedom, as numbers of table VIII has them."""
+    table = pd.read_csv(DATA / "us76_table8_number_density.csv").fillna(0.0)
+    table = table[table["z_m"] > 86000]
+    number, z = table.iloc[:, 1:].to_numpy(), table["z_m"].to_numpy(dtype=float)
+    total, temperature = number.sum(axis=1), us76(z)[1]
+    molar = number @ np.array([28.0134, 15.9994, 31.9988, 39.948, 4.0026, 1.00797]) / total
+    heat = number @ np.array([2.5, 1.5, 2.5, 1.5, 1.5, 1.5]) / total
+    expected = np.sqrt((1.0 + 1.0 / heat) * 8314.32 / molar * temperature)
+    np.testing.assert_allclose(sound_speed(z, temperature), expected, rtol=1e-3)  # four printed digits
+    thermosphere = z > 115e3
+    assert (expected / np.sqrt(1.4 * 287.053 * temperature) > 1.05)[thermosphere].all()  # the term is there
+
+
+def test_gas_is_mixed_air_to_86_km_and_changes_without_a_step():
+    z = np.array([-5e3, 0.0, 50e3, 86e3])
+    assert (gas_constant(z) == R_AIR_JPKGK).all()
+    assert (heat_ratio(z, np.full(4, 250.0)) == 1.4).all()
+    np.testing.assert_allclose(gas_constant(86001.0), R_AIR_JPKGK, rtol=6e-4)  # kinetic temperature from here on
+    z = np.arange(86010.0, 1e6, 100.0)
+    density, temperature, pressure = us76(z)
+    np.testing.assert_allclose(density * gas_constant(z) * temperature, pressure, rtol=1e-12)
+    speed = sound_speed(z, temperature)
+    assert (np.abs(np.diff(np.log(speed))) < 4e-3).all()
 
 
 def test_upper_temperature_as_printed():

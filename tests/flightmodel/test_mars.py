@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flightmodel import earth
-from flightmodel.atmosphere import standard_air, standard_sounding
+from flightmodel.atmosphere import heat_ratio, standard_air, standard_sounding
 from flightmodel.checks import GateError
 from flightmodel.config import parse_section
 from flightmodel.earth import MARS
@@ -44,6 +44,17 @@ def test_the_standard_air_is_vikings():
     assert abs(np.log(pressure[0] / 730.0)) < 2.0 * sd
     assert 4.5 < np.log10(pressure[1] / pressure[2]) < 5.5
     np.testing.assert_allclose(pressure, density * MARS.gas_jpkgk * temperature)
+
+
+def test_speed_of_sound_follows_the_heat_capacity_of_carbon_dioxide():
+    """JANAF tables (Chase 1998), molar heat capacity of CO2 at 100, 200, 298.15, 400 K, J/(mol K); its mixture with
+    N2 (7 R / 2) and argon (5 R / 2) as Viking's landers found it.
+    """
+    temperature = np.array([100.0, 200.0, 298.15, 400.0])
+    capacity = 0.9549 * np.array([29.208, 32.359, 37.129, 41.325]) / 8.31446 + 0.0291 * 3.5 + 0.0160 * 2.5
+    gamma = heat_ratio(np.zeros(4), temperature, MARS)
+    np.testing.assert_allclose(gamma, capacity / (capacity - 1.0), rtol=5e-4)
+    assert np.ptp(gamma) > 0.1
 
 
 def test_air_is_in_hydrostatic_balance():

@@ -51,6 +51,13 @@ class Entry:
         """By the gas law, (n,)."""
         return self.pressure_pa / (8314.32 / 43.49 * self.density_kgpm3)
 
+    @property
+    def sound_speed_mps(self) -> np.ndarray:
+        """By JANAF's heat capacity of CO2, J/(mol K) at 100 to 400 K, in which 4.5 % are rigid diatomic molecules."""
+        printed = np.polyfit([1.0, 2.0, 2.9815, 4.0], [29.208, 32.359, 37.129, 41.325], 3)
+        capacity = 0.955 * np.polyval(printed, self.temperature_k / 100.0) + 0.045 * 29.1
+        return np.sqrt(capacity / (capacity - 8.3145) * 8314.32 / 43.49 * self.temperature_k)
+
 
 STATE = np.array([3522.2e3, 22.6, 338.0, 7264.2, -14.06, 253.1])  # m, deg, deg, m/s, deg, deg: inertial, at entry
 STATE_SD = np.array([1500.0, 0.02, 0.03, 0.7, 0.03, 0.03])

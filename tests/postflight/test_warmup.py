@@ -3,9 +3,14 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from flightmodel.earth import WGS84
+from postflight import warmup
+from postflight.flight import read_flight
 from tests.refusing import printed_codes
 
 COUNT = """
@@ -33,8 +38,10 @@ scenario = read_scenario("irve2_reference")
 scenario = replace(scenario, spec=scenario.spec.model_copy(update={"video": None}))
 simulate_to_folder(scenario, 0, Path(sys.argv[1]))
 reconstruct(read_flight(Path(sys.argv[1])))
+reconstruct(read_flight(Path(sys.argv[2])))
 print(compiled)
 """
+MARS = Path(__file__).parents[2] / "examples" / "mars_entry"
 
 
 @pytest.mark.slow
@@ -44,8 +51,17 @@ def test_after_warmup_a_flight_and_its_reconstruction_compile_nothing(tmp_path):
     assert first.returncode == 0, first.stderr
     again = subprocess.run(run, capture_output=True, text=True)
     assert not again.stderr
-    flown = subprocess.run([sys.executable, "-c", COUNT, str(tmp_path / "flight")], capture_output=True, text=True)
+    count = [sys.executable, "-c", COUNT, str(tmp_path / "flight"), str(MARS)]
+    flown = subprocess.run(count, capture_output=True, text=True)
     assert flown.stdout.strip() == "[]", flown.stderr
+
+
+def test_a_flight_names_the_kernels_of_its_motion_and_planet():
+    telemetry = read_flight(MARS).telemetry
+    assert warmup.reconstruction_of(telemetry) == (*warmup.RECONSTRUCTION, "ballistic at mars")
+    assert warmup.reconstruction_of(replace(telemetry, planet=WGS84))[-1] == "ballistic"
+    for groups in (warmup.reconstruction_of(telemetry), warmup.reconstruction_of(replace(telemetry, planet=WGS84))):
+        assert set(groups) <= set(warmup.GROUPS)
 
 
 def test_what_is_missing_is_compiled_once_and_reported(tmp_path):

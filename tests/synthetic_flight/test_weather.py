@@ -293,6 +293,11 @@ def test_nrlmsis_of_any_day_and_place_is_the_models():
     np.testing.assert_allclose(flown.temperature_k, model[:, 10], atol=1e-2)
 
 
+def test_winds_of_hwm_are_refused_with_the_way_to_state_them():
+    with refuses("key-value", names=["hwm14", "mean_wind"], kind=ConfigError):
+        parse_section(DayOfFlightAtmosphere, {"winds": "hwm14"}, "test")
+
+
 def test_nrlmsis_without_its_library_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymsis", None)
     spec = parse_section(DayOfFlightAtmosphere, {"base": "nrlmsis"}, "test")
