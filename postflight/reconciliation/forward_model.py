@@ -277,10 +277,6 @@ class AtmosphereParameters:
         passed = rows <= TOP_M  # of a table a knot, each copied for every flight, three quarters lie above
         return table[passed], rows[passed], profile.at(rows[passed]).temperature_k
 
-    @cached_property
-    def _sounded_temperature(self) -> FloatArray:
-        return np.asarray(self._sounded[0][:, 2] ** 2 / (GAMMA * R_AIR_JPKGK))
-
     def table(self, difference: FloatArray, warmer_k: FloatArray) -> FloatArray:
         """Kernel table (rows, 6) of the atmosphere, of differences (3, k) and (n,)."""
         table, rows, temperature = self._sounded
@@ -290,7 +286,7 @@ class AtmosphereParameters:
         table[:-1, 1] += np.diff(ratio)
         # the root of the ratio of temperatures, which no trial step makes negative
         warmer = np.interp(rows, self.temperature_knots_m, warmer_k)
-        table[:, 2] *= np.exp(0.5 * warmer / self._sounded_temperature)
+        table[:, 2] *= np.exp(0.5 * warmer / temperature)
         table[:, 3] += north
         table[:, 4] += east
         return table
