@@ -68,12 +68,11 @@ class DragHistory:
 def drag_of_drivers(problem: Problem, states: States, triangles: FloatArray, path: Trajectory) -> DragHistory:
     """Drag of ballistic flight at the kept nodes, from states at all nodes and packed covariances at the kept ones."""
     motion, at = problem.motion, states[np.flatnonzero(problem.kept)]
-    _, _, height = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)
+    latitude, longitude, height = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)
     row = (height - motion.air_from_m) / motion.air_step_m
     grid = np.arange(len(motion.air))
     log_density, wind_north, wind_east, density_sd, wind_sd = (np.interp(row, grid, c) for c in motion.air.T)
     steeper = np.interp(row + 0.5, grid, motion.air[:, 0]) - np.interp(row - 0.5, grid, motion.air[:, 0])
-    latitude, longitude, _ = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)
     ned = earth.dcm_ned_ecef(latitude, longitude)
     drivers = at.sensor_errors[:, :6]
     covariance = unpacked(triangles, KINEMATIC + 6)
