@@ -100,20 +100,8 @@ def planet_from_j2000(t0_utc: str, time_s: FloatArray | float, planet: Planet) -
     right_ascension = np.deg2rad(317.68143 - 0.1061 * century)
     declination = np.deg2rad(52.88650 - 0.0609 * century)
     meridian = np.deg2rad(np.mod(176.630 + 350.89198226 * days, 360.0))
-    equator = _turn_x(0.5 * np.pi - declination) @ _turn_z(0.5 * np.pi + right_ascension)
-    return np.asarray(_turn_z(meridian) @ equator)
-
-
-def _turn_z(angle: FloatArray) -> FloatArray:
-    """Matrices (..., 3, 3) to axes turned about z."""
-    c, s, one, no = np.cos(angle), np.sin(angle), np.ones_like(angle), np.zeros_like(angle)
-    return np.stack([np.stack(row, -1) for row in ((c, s, no), (-s, c, no), (no, no, one))], -2)
-
-
-def _turn_x(angle: FloatArray) -> FloatArray:
-    """Matrices (..., 3, 3) to axes turned about x."""
-    c, s, one, no = np.cos(angle), np.sin(angle), np.ones_like(angle), np.zeros_like(angle)
-    return np.stack([np.stack(row, -1) for row in ((one, no, no), (no, c, s), (no, -s, c))], -2)
+    node = erfa.rz(0.5 * np.pi + right_ascension, np.eye(3))
+    return np.asarray(erfa.rz(meridian, erfa.rx(0.5 * np.pi - declination, node)))
 
 
 def potential(position_m: FloatArray, planet: Planet = WGS84) -> FloatArray:
