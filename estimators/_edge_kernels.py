@@ -37,6 +37,36 @@ def grey_histogram(image, rows, columns, count):
 
 
 @kernel
+def row_differences(image, tall, wide, step, one, two):
+    """Mean square difference of rows next to each other, and of every other row, in blocks of ``tall`` x ``wide`` px.
+
+    Of every ``step``-th column.
+    """
+    for i in range(one.shape[0]):
+        for j in range(one.shape[1]):
+            near, far = 0.0, 0.0
+            for row in range(i * tall, (i + 1) * tall):
+                for column in range(j * wide, (j + 1) * wide, step):
+                    a, b = float(image[row, column]), float(image[row + 1, column])
+                    c = float(image[row + 2, column])
+                    near += (a - b) * (a - b)
+                    far += (a - c) * (a - c)
+            count = tall * ((wide + step - 1) // step)
+            one[i, j], two[i, j] = near / count, far / count
+
+
+@kernel
+def row_steps(image, step, most, out):
+    """Mean difference (h - 1,) of every row from the next, of every ``step``-th column, at most ``most`` a pixel."""
+    for i in range(len(out)):
+        total, count = 0.0, 0
+        for j in range(0, image.shape[1], step):
+            total += min(abs(float(image[i + 1, j]) - float(image[i, j])), most)
+            count += 1
+        out[i] = total / count
+
+
+@kernel
 def sample_lines(image, origin, inward, first, step, corner, size, grey, inside):
     """Grey levels ``(n, m)`` along lines, of a piece of the picture whose upper left pixel is ``corner``."""
     n, m = grey.shape

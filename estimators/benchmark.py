@@ -57,7 +57,7 @@ from estimators.camera_fit import (
     Image,
     OrientedCamera,
 )
-from estimators.edge import NO_FAULT, HorizonLine, ScanLines, fault_of_frame, is_coherent
+from estimators.edge import NO_FAULT, HorizonLine, ScanLines, breaks_across, fault_of_frame, is_coherent
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.features import Features, ImageFeatures, fit_feature_map, no_features, valleys, visible_features
 from estimators.frame_checks import USUAL_RMS_PX
@@ -85,6 +85,12 @@ _SETTLED_SD = 1e-2
 _WORST_RMS_PX = 2.5
 _WORST_CORRECTIONS = 31.8  # chi-square of eight corrections that one sound frame in 10,000 exceeds
 _FOCAL, _FOCAL_PIECE = 3, 0.08
+_NOT_SQUARE = "pixels-not-square"
+_CENTRE = [4, 5]  # among the pose
+_SQUARE_SD = 0.002  # of stretch and shear: what lens coefficients that are not fitted look like, half a pixel at 250
+_WORST_SQUARE = (
+    9.2  # chi-square of two; the allowance included, 34 sound benchmark frames reach 0.2 with features, 8 without
+)
 _BUILT_RAD = np.deg2rad(0.3)
 _BUILT = [0, 1, -3, -2, -1]  # saddle and light: more waves beside a lens that is fitted cost more than they explain
 _POSES = POSED.stop - POSED.start
@@ -179,6 +185,8 @@ def _by_stated_features(
     try:
         oriented = _oriented(nominal, benchmark, prior, apriori, visible_features)
     except GateError as fault:
+        if _NOT_SQUARE in fault.codes:
+            raise
         return None, Fault(f"the stated features do not orient the camera ({fault})", fault.codes[0])
     if oriented.support > LEAST_FEATURES_SHARE and oriented.residual_rms_px < USUAL_RMS_PX:
         return oriented, NO_FAULT
@@ -306,13 +314,42 @@ def _fitted(
             "shell's; choose another benchmark time, or check the mount, the lens and [cameras.NAME.uncertainty]",
             code="camera-far-from-prior",
         )
+    _check_square(look, features, residuals, design, sd)
     # the error of where a feature was painted is in every frame alike: other frames weigh by its measurement alone
     look = _look(_posed(nominal, pose), features, benchmark, reaches_px[-1], 0.0)
     per_deflection = gain[:_POSES] @ residuals.rows[:, DEFLECTION]
     return OrientedCamera(
         look.view, look.clocks_rad, look.lines, features, apriori, look.horizon, look.residuals, pose[:8],
         formal[:_POSES, :_POSES], per_deflection, rms, support=_share_found(look, features),
+        breaks=breaks_across(benchmark.image),
     )  # fmt: skip
+
+
+def _check_square(
+    look: _Look, features: Features, residuals: FrameResiduals, design: FloatArray, sd: FloatArray
+) -> None:  # fmt: skip
+    """Refuse a picture whose pixels are not square, or whose rows are not at right angles to its columns.
+
+    No mount and no lens explains that. Relative stretch and shear are fitted beside all else at the solution.
+    """
+    lines = len(look.clocks_rad)
+    spots = np.full((lines + len(features.points_shell_m), 2), np.nan)
+    spots[look.horizon.line] = look.horizon.points_px
+    spots[lines:] = look.view.sight(features.points_shell_m, np.zeros(3)).pixels
+    u, v = (spots[residuals.index] - look.view.camera.centre_px).T
+    by_u, by_v = residuals.rows[:, POSED][:, _CENTRE].T
+    columns = 0.5 * np.column_stack([u * by_u - v * by_v, v * by_u + u * by_v])
+    information = np.diag(np.concatenate([sd**-2.0, [0.0, 0.0]]))
+    gain, covariance, _ = huber_gain(residuals, np.column_stack([design, columns]), information, lines)
+    found = (gain @ residuals.residual_px)[-2:]
+    allowed = covariance[-2:, -2:] + _SQUARE_SD**2 * np.eye(2)
+    if found @ np.linalg.solve(allowed, found) > _WORST_SQUARE:
+        raise GateError(
+            f"benchmark frame: its pixels seem stretched by {100.0 * found[0]:.1f} % and sheared by "
+            f"{100.0 * found[1]:.1f} %, or the shell or the lens is not the vehicle file's: state the picture's true "
+            "size and focal_px of both axes",
+            code=_NOT_SQUARE,
+        )
 
 
 def _share_found(look: _Look, features: Features) -> float:

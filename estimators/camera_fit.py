@@ -43,6 +43,7 @@ from estimators.edge import (
     NO_FAULT,
     HorizonLine,
     ScanLines,
+    breaks_across,
     fault_of_frame,
     is_coherent,
     no_horizon,
@@ -80,6 +81,7 @@ _SOUND_SCORE = 1.5  # the texture agrees with itself
 _EDGE_PASSES = 2
 _CONTRADICTION = 18.4  # chi-square of two components that one sound frame in 10,000 exceeds
 _LEAST_VAR = float(np.deg2rad(1e-3) ** 2)  # of a difference, far below what any film shows
+_SAME_BREAK_PX = 2
 _BESIDE = 4  # places of 240 along the edge: a residual of the benchmark frame holds that far for a mark by hand
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
@@ -301,6 +303,8 @@ class OrientedCamera:
     support : float
         Share of what the orientation looked for on the shell, features or the valleys between tori, that the benchmark
         frame shows.
+    breaks : (m,) int
+        Rows after which the benchmark frame breaks across its width.
     """
 
     view: VirtualCamera
@@ -316,6 +320,7 @@ class OrientedCamera:
     residual_rms_px: float
     stated_refused: Fault = NO_FAULT
     support: float = 1.0
+    breaks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
 
     @cached_property
     def _benchmark_edge(self) -> BoolArray:
@@ -345,7 +350,7 @@ class OrientedCamera:
             Where to start, e.g. the answer of the frame before.
         """
         frame = unedited(picture)
-        fault = fault_of_frame(frame.image, self.view.camera.size_px)
+        fault = fault_of_frame(frame.image, self.view.camera.size_px) or self._fault_of_breaks(frame.image)
         if fault:
             return refused_fit(no_horizon(fault), fault)
         deformation, basis, horizon = np.zeros(3), np.eye(2), _NOTHING
@@ -374,6 +379,14 @@ class OrientedCamera:
         except _NoFitError as refusal:
             return refused_fit(horizon, refusal.faults[0])
         return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
+
+    def _fault_of_breaks(self, image: Image) -> Fault:
+        """Whether the picture breaks across its width where the benchmark frame, which may have a border, does not."""
+        for row in breaks_across(image):
+            if not np.any(np.abs(self.breaks - row) <= _SAME_BREAK_PX):
+                words = f"breaks across its width after row {row}, as the benchmark frame does not: rolled, or torn"
+                return Fault(words, "frame-broken")
+        return NO_FAULT
 
     def _check_explained(self, last: _Solution) -> None:
         """Refuse a frame that no deflection explains, by `estimators.frame_checks`."""

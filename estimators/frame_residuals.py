@@ -68,9 +68,13 @@ def edge_residuals(view: VirtualCamera, horizon: HorizonLine, deformation: Float
 
 
 def light_columns(view: VirtualCamera, horizon: HorizonLine) -> FloatArray:
-    """Shift, tilt and bow of the found edge, ``(n, 3)``; one at the picture's sides."""
-    width = 0.5 * view.camera.width_px
-    side = (horizon.points_px[:, 0] - width) / width
+    """Shift, tilt and bow of the found edge, ``(n, 3)``; one at the picture's sides, as the shell stands in it."""
+    half = 0.5 * np.array(view.camera.size_px)
+    y, z = view.camera.position_body_m[1:]
+    # towards growing clocking angles
+    along = view.camera.dcm_cam_body[:2, 1:] @ np.array([z, -y])
+    along /= np.hypot(*along)
+    side = (horizon.points_px - half) @ along / (np.abs(along) @ half)
     return np.column_stack([np.ones_like(side), side, 1.5 * side**2 - 0.5])
 
 

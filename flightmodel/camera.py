@@ -221,12 +221,15 @@ def camera_from_mount(mount: CameraMount) -> Camera:
     stands upright like a view to a horizon: **up is outboard and aft**, so the sky is above the shell's rim, the aft
     face of the shell below it and the centerbody at the lower border. Looking forward so, **left is increasing
     clocking angle**, and a rim that moves aft, towards the camera, moves up in the picture (towards smaller rows).
+    ``roll_deg`` turns the camera about its axis, clockwise as it looks: at 180 deg it is mounted upside down.
     """
     lean = np.deg2rad(mount.axis_from_forward_deg)
     outboard = lv_direction(np.deg2rad(mount.clock_lv_deg))
     forward = np.array([1.0, 0.0, 0.0])
     z_cam = np.cos(lean) * forward + np.sin(lean) * outboard
-    y_cam = np.sin(lean) * forward - np.cos(lean) * outboard
+    down = np.sin(lean) * forward - np.cos(lean) * outboard
+    roll, right = np.deg2rad(mount.roll_deg), np.cross(down, z_cam)
+    y_cam = np.cos(roll) * down - np.sin(roll) * right
     return Camera(
         width_px=mount.width_px,
         height_px=mount.height_px,

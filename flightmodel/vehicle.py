@@ -288,6 +288,7 @@ class CameraMount(Section):
     station_m: Place
     radius_m: Metres
     axis_from_forward_deg: Angle
+    roll_deg: Angle = 0.0
     width_px: Annotated[int, Field(ge=16, le=8192)]
     height_px: Annotated[int, Field(ge=16, le=8192)]
     focal_px: tuple[Focal, Focal]

@@ -10,8 +10,12 @@ point from the innermost centre,
 one expression for the whole stack. A shell that is out of shape is evaluated in the half-plane rotated back about the
 innermost ring by the flattening and lobes of two and of three waves round the shell. Shading is Lambert's with
 one Sun and a weak sky; seams and dots are painted by surface coordinates. Behind the rim is a dark sky, and the Earth
-where the scenario has it. Assumed: no shadows. Then come interlace and motion, vignetting, blur, sensor noise and
-compression.
+where the scenario has it. The centerbody and the tori cast shadows, hard but for the Sun's disc: a ray towards the Sun
+that passes a body at a distance ``c`` after a way ``k`` leaves ``1/2 + c / (0.0093 k)`` of the disc free, one that
+passes a torus ``c / (0.0093 k)``. What lies in shadow has the sky's light alone. The rows of a rolling shutter are
+exposed one after the other. Then come interlace and motion, vignetting, blur, sensor noise and compression.
+
+Assumed: one Sun, no light from the Earth or from one torus on another, no glare (the lens looks away from the Sun).
 
 Lens and pointing as built are drawn once a flight (`as_built_camera`), and so is the shell's departure from its shape,
 as built and under load: an estimator starts from the nominal mount and the nominal shell. The film of a flight is
@@ -23,7 +27,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from copy import copy
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -40,7 +43,7 @@ from flightmodel.film import film_frames
 from flightmodel.geomagnetism_and_sun import sun_direction_ecef
 from flightmodel.geometry import ShellGeometry, torus_circles
 from flightmodel.vehicle import CameraMount
-from synthetic_flight import sensing
+from synthetic_flight import _film_kernels, sensing
 from synthetic_flight.ensemble import available_cores
 from synthetic_flight.instrument_errors import FilmQuality, Video
 from synthetic_flight.scenarios import Scenario, child_rng
@@ -48,9 +51,6 @@ from synthetic_flight.simulate import Truth
 
 Float32 = NDArray[np.float32]
 
-MARCHING_STEPS = 5
-COARSE, COARSE_STEPS = 4, 50
-STRIP_ROWS = 32
 FARTHEST_M, FARTHEST_RADII = 6.0, 4.0  # how far a ray marches: the larger of the two (m, base radii of the shell)
 EARTH_RADIUS_M = 6.371e6
 LIMB_GLOW_RAD = float(np.deg2rad(0.4))
@@ -99,21 +99,36 @@ class Background:
 
 
 class ShellRenderer:
-    """Ray caster for one camera and one shell; holds what does not change from frame to frame."""
+    """Ray caster for one camera and one shell; holds what does not change from frame to frame.
+
+    Parameters
+    ----------
+    geometry : ShellGeometry
+    camera : Camera
+    joint_station_m : float
+        Joint aft of the nose, m.
+    vignetting : float
+        Share of light that is lost at right angles to the lens's axis.
+    painted, shadows : bool
+        Whether the shell carries seams and dots, and whether bodies cast shadows.
+    """
 
     def __init__(
-        self, geometry: ShellGeometry, camera: Camera, joint_station_m: float, vignetting: float = 0.38
-    ) -> None:
+        self, geometry: ShellGeometry, camera: Camera, joint_station_m: float, vignetting: float = 0.38,
+        painted: bool = True, shadows: bool = True,
+    ) -> None:  # fmt: skip
         self.geometry, self.camera = geometry, camera
         self.joint_m = np.array([-joint_station_m, 0.0, 0.0])
-        self.stack = _Stack(geometry)
+        self.painted, self.shadows = painted, shadows
+        self.shell = shell_terms(geometry)
         w, h = camera.size_px
         u, v = np.meshgrid(np.arange(w, dtype=float), np.arange(h, dtype=float))
         rays = camera.rays_body(np.column_stack([u.ravel(), v.ravel()]))
         in_field = np.isfinite(rays[:, 0])
         rays[~in_field] = -camera.dcm_cam_body[1]
-        self.rays = np.ascontiguousarray(rays.T.reshape(3, h, w), dtype=np.float32)
-        cosine = np.tensordot(camera.dcm_cam_body[2].astype(np.float32), self.rays, axes=1)
+        self.rays = rays.reshape(h, w, 3)
+        self.rays32 = self.rays.astype(np.float32)
+        cosine = self.rays @ camera.dcm_cam_body[2]
         self.vignetting = np.where(in_field.reshape(h, w), 1.0 - vignetting * (1.0 - cosine), 0.0).astype(np.float32)
         self.sky = _sky(self.rays, camera)
         self.body_depth_m, self.body_normal = self._centerbody()
@@ -124,74 +139,43 @@ class ShellRenderer:
         warp: Warp | None = None, background: Background | None = None,
     ) -> Float32:  # fmt: skip
         """Scene radiance ``(h, w)`` before errors of lens and sensor; one is full scale. Threads may ask at once."""
-        stack = copy(self.stack)
-        stack.warp = warp
-        rotation = rotation_vector_body_shell(np.array(theta_rad), np.array(plane_lv_rad))
-        dcm_shell_body = rotations.dcm_from_q(rotations.exp(-rotation))
-        eye = dcm_shell_body @ (self.camera.position_body_m - self.joint_m) + self.joint_m
-        sun = dcm_shell_body @ np.asarray(sun_direction_body, dtype=float)
-        to_shell = dcm_shell_body.astype(np.float32)
-        h, w = self.sky.shape
-        start = self._near_depth(stack, to_shell, eye)
-        depth, shade = np.full((h, w), np.inf, dtype=np.float32), np.zeros((h, w), dtype=np.float32)
-        for top in range(0, h, STRIP_ROWS):
-            near = start[top : top + STRIP_ROWS].reshape(-1)
-            live = np.flatnonzero((near < stack.farthest_m) & self.is_clear[top : top + STRIP_ROWS].reshape(-1))
-            if len(live) == 0:
-                continue
-            rays = _Rays(_rotated(to_shell, self.rays[:, top : top + STRIP_ROWS].reshape(3, -1)[:, live]), eye)
-            t, gap = stack.march(rays, near[live], MARCHING_STEPS)
-            slow = np.flatnonzero(gap > 0.002)
-            t[slow], gap[slow] = stack.march(rays.some(slow), t[slow], 9 * MARCHING_STEPS, 1.6)
-            here = live + top * w
-            depth.reshape(-1)[here] = np.where(gap < 0.004, t, np.inf)
-            shade.reshape(-1)[here] = stack.shade(rays, t, sun)
+        cover, shade, body = self.seen(theta_rad, plane_lv_rad, sun_direction_body, warp)
         behind = self.sky if background is None else np.maximum(self.sky, self._earth(background))
-        return self._composed(stack, depth, shade, to_shell, eye, np.asarray(sun_direction_body, dtype=float), behind)
+        return np.asarray(np.where(self.is_clear, cover * shade + (1.0 - cover) * behind, body), dtype=np.float32)
 
-    def _near_depth(self, stack: _Stack, to_shell: Float32, eye: FloatArray) -> Float32:
-        """Depth ``(h, w)``, m, a little in front of the shell, from a march of many steps of every fourth ray."""
-        coarse = self.rays[:, COARSE // 2 :: COARSE, COARSE // 2 :: COARSE]
-        shape = coarse.shape[1:]
-        rays = _Rays(_rotated(to_shell, coarse.reshape(3, -1)), eye)
-        t, gap = stack.march(rays, np.full(rays.across.shape, 0.05, dtype=np.float32), COARSE_STEPS)
-        near = np.where(gap < 0.004, t, np.float32(np.inf)).reshape(shape)
-        near = cv2.erode(near, np.ones((3, 3), np.uint8)) - np.float32(0.005)
-        return np.asarray(cv2.resize(near, self.camera.size_px, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
+    def seen(
+        self, theta_rad: float, plane_lv_rad: float, sun_direction_body: FloatArray, warp: Warp | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Share of each pixel that the shell covers, radiance of the shell and of the centerbody, ``(h, w)`` each."""
+        rotation = rotation_vector_body_shell(np.array(theta_rad), np.array(plane_lv_rad))
+        turn = rotations.dcm_from_q(rotations.exp(-rotation))
+        sun_body, geometry = np.asarray(sun_direction_body, dtype=float), self.geometry
+        eye = turn @ (self.camera.position_body_m - self.joint_m) + self.joint_m
+        nose, aft = self.joint_m - turn @ self.joint_m, -turn[:, 0]
+        body = (nose, np.ascontiguousarray(aft), geometry.centerbody_radius_m, geometry.centerbody_length_m)
+        in_shell = (turn, eye, turn @ sun_body, self.shell, warp_terms(warp), body)
+        depth, shade = np.empty(self.sky.shape), np.empty(self.sky.shape)
+        _film_kernels.cast(self.rays, self.is_clear, *in_shell, self.painted, self.shadows, depth, shade)
+        return self._cover(in_shell, depth, shade), shade, self._centerbody_shade(sun_body, in_shell)
 
-    def _composed(
-        self,
-        stack: _Stack,
-        depth: Float32,
-        shade: Float32,
-        to_shell: Float32,
-        eye: FloatArray,
-        sun_body: FloatArray,
-        behind: Float32,
-    ) -> Float32:
-        """Shell over sky, its edge weighted by coverage, the centerbody over both."""
+    def _cover(self, in_shell: _InShell, depth: FloatArray, shade: FloatArray) -> FloatArray:
+        """Share (h, w) of each pixel that the shell covers; ``shade`` is completed where a pixel's middle misses it."""
         hit = np.isfinite(depth).astype(np.uint8)
         kernel = np.ones((7, 7), np.uint8)
         v, u = np.nonzero((cv2.dilate(hit, kernel) != cv2.erode(hit, kernel)) & self.is_clear)
-        cover = hit.astype(np.float32)
-        if len(u):
-            rays = _Rays(_rotated(to_shell, self.rays[:, v, u]), eye)
-            sun = to_shell.astype(float) @ sun_body
-            t, gap = stack.closest(rays, cv2.erode(depth, kernel)[v, u])
-            pixel_m = t / np.float32(self.camera.focal_px.mean())
-            cover[v, u] = np.clip(0.5 - gap / pixel_m, 0.0, 1.0)
-            # at the edge the line of sight grazes the surface: its shade there is that of the whole pixel
-            graze = ~hit[v, u].astype(bool)
-            shade[v[graze], u[graze]] = stack.shade(rays, t, sun)[graze]
-        picture = cover * shade + (1.0 - cover) * behind
-        out: Float32 = np.where(self.is_clear, picture, self._centerbody_shade(sun_body))
-        return out
+        cover = hit.astype(float)
+        gap, at, there = np.empty(len(u)), np.empty(len(u)), np.empty(len(u))
+        near = cv2.erode(depth, kernel)[v, u]
+        _film_kernels.cast_edge(self.rays[v, u], near, *in_shell, self.painted, self.shadows, gap, at, there)
+        cover[v, u] = np.clip(0.5 - gap / (at / self.camera.focal_px.mean()), 0.0, 1.0)
+        # at the edge the line of sight grazes the surface: its shade there is that of the whole pixel
+        graze = ~hit[v, u].astype(bool)
+        shade[v[graze], u[graze]] = there[graze]
+        return cover
 
     def _earth(self, background: Background) -> Float32:
         """Radiance ``(h, w)`` of the Earth: sea, clouds in bands, haze and a limb that glows above the horizon."""
-        nx, ny, nz = np.asarray(background.nadir_body, dtype=np.float32)
-        dx, dy, dz = self.rays
-        down = nx * dx + ny * dy + nz * dz
+        down = self.rays32 @ background.nadir_body.astype(np.float32)
         dip = np.arccos(EARTH_RADIUS_M / (EARTH_RADIUS_M + background.altitude_m))
         above = np.arccos(np.clip(down, -1.0, 1.0)) - np.float32(0.5 * np.pi - dip)
         # where the ray leaves the vehicle sideways, in units of altitude: the clouds' map
@@ -199,16 +183,16 @@ class ShellRenderer:
         east /= np.linalg.norm(east)
         north = np.cross(background.nadir_body, east)
         reach = 1.0 / np.maximum(down, 0.05)
-        e, n = (reach * np.tensordot(axis.astype(np.float32), self.rays, axes=1) for axis in (east, north))
+        e, n = (reach * (self.rays32 @ axis.astype(np.float32)) for axis in (east, north))
         clouds = np.sin(3.1 * e + 1.3 * np.sin(2.3 * n)) * np.sin(2.7 * n - 0.9 * np.sin(1.9 * e))
         ground = 0.16 + 0.20 * np.clip(clouds, 0.0, 1.0) + 0.10 * np.exp(np.minimum(above, 0.0) / np.float32(0.08))
         limb = 0.30 * np.exp(-np.maximum(above, 0.0) / np.float32(LIMB_GLOW_RAD))
         out: Float32 = np.where(above < 0.0, ground, limb).astype(np.float32)
         return out
 
-    def _centerbody(self) -> tuple[Float32, Float32]:
-        """Depth, m (infinite where not seen), and radial normal (y, z) of the cylinder along each pixel's ray."""
-        dx, dy, dz = self.rays
+    def _centerbody(self) -> tuple[FloatArray, FloatArray]:
+        """Depth, m (infinite where not seen), and radial normal (h, w, 2) of the cylinder along each pixel's ray."""
+        dx, dy, dz = np.moveaxis(self.rays, -1, 0)
         x, y, z = self.camera.position_body_m
         # the lens sits on the skin: keep it a millimetre outside
         radius = min(self.geometry.centerbody_radius_m, float(np.hypot(y, z)) - 1e-3)
@@ -218,162 +202,48 @@ class ShellRenderer:
         station = -(x + depth * dx)
         on = (square > 0) & (half_b < 0) & (station > 0.0) & (station < self.geometry.centerbody_length_m)
         reach = np.where(on, depth, 0.0)
-        normal = np.stack([y + reach * dy, z + reach * dz]) / radius
-        return np.where(on, depth, np.inf).astype(np.float32), normal.astype(np.float32)
+        return np.where(on, depth, np.inf), np.stack([y + reach * dy, z + reach * dz], axis=-1) / radius
 
-    def _centerbody_shade(self, sun_body: FloatArray) -> Float32:
-        lit = np.float32(sun_body[1]) * self.body_normal[0] + np.float32(sun_body[2]) * self.body_normal[1]
-        shade: Float32 = (0.10 + 0.35 * np.maximum(lit, 0.0)).astype(np.float32)
-        return shade
+    def _centerbody_shade(self, sun_body: FloatArray, in_shell: _InShell) -> FloatArray:
+        """Radiance (h, w) of the centerbody, lit where the tori do not shade it."""
+        lit = np.maximum(self.body_normal @ sun_body[1:], 0.0)
+        at = self.shadows & (lit > 0.0) & ~self.is_clear
+        turn, eye, sun, shell, warp, _ = in_shell
+        points = eye + self.body_depth_m[at][:, None] * self.rays[at] @ turn.T
+        share = np.empty(len(points))
+        _film_kernels.sunlit(points, sun, shell, warp, share)
+        lit[at] *= share
+        return np.asarray(0.10 + 0.35 * lit)
 
 
-def _rotated(dcm: Float32, vectors: Float32) -> Float32:
-    """Rotate vectors ``(3, n)`` without BLAS, whose idle threads would wait on the other core."""
-    x, y, z = vectors
-    return np.stack([row[0] * x + row[1] * y + row[2] * z for row in dcm])
+_InShell = tuple[FloatArray, FloatArray, FloatArray, tuple[float, ...], tuple[float, ...], tuple[object, ...]]
+"""Shell against body, eye, Sun, shell, warp and centerbody in shell axes, as `synthetic_flight._film_kernels` wants."""
 
 
-def _sky(rays: Float32, camera: Camera) -> Float32:
+def shell_terms(geometry: ShellGeometry) -> tuple[float, ...]:
+    """The stack of tori as the kernels take it."""
+    station, radius = torus_circles(geometry)
+    half = np.deg2rad(geometry.half_angle_deg)
+    farthest_m = max(FARTHEST_M, FARTHEST_RADII * geometry.base_radius_m)
+    cone = (station[0], radius[0], np.cos(half), np.sin(half))
+    tori = (geometry.torus_spacing_m, geometry.torus_minor_radius_m, geometry.torus_count - 1)
+    return tuple(float(term) for term in (*cone, *tori, farthest_m, 2.0 * np.pi / geometry.gore_count))
+
+
+def warp_terms(warp: Warp | None) -> tuple[float, ...]:
+    """A departure from the nominal shape as the kernels take it."""
+    return (*astuple(warp or Warp()), float(warp is not None))
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _sky(rays: FloatArray, camera: Camera) -> Float32:
     """Radiance of the sky: almost black, brighter towards the shell's rim by light scattered in the lens."""
-    upward = -np.tensordot(camera.dcm_cam_body[1], rays, axes=1)
-    sky: Float32 = (0.035 + 0.035 * np.exp(-3.0 * np.clip(upward, 0.0, 1.0))).astype(np.float32)
-    return sky
-
-
-class _Rays:
-    """Rays from one eye point in shell axes, with the products that `_Stack.gap` needs at every depth."""
-
-    def __init__(self, direction: Float32, eye_shell_m: FloatArray) -> None:
-        self.direction = direction
-        self.eye = [np.float32(e) for e in eye_shell_m]
-        (_, ey, ez), (dx, dy, dz) = self.eye, direction
-        self.minus_dx = -dx
-        self.across = dy * dy + dz * dz
-        self.twice_half_b = 2.0 * (ey * dy + ez * dz)
-        self.c = ey * ey + ez * ez
-
-    def some(self, index: NDArray[np.intp]) -> _Rays:
-        """Return a subset of the rays."""
-        return _Rays(self.direction[:, index], np.array(self.eye))
-
-
-class _Stack:
-    """The tori as one distance function in the half-plane of station and radius, float32."""
-
-    def __init__(self, geometry: ShellGeometry) -> None:
-        station, radius = torus_circles(geometry)
-        half = np.deg2rad(geometry.half_angle_deg)
-        self.s0, self.r0 = np.float32(station[0]), np.float32(radius[0])
-        self.cos, self.sin = np.float32(np.cos(half)), np.float32(np.sin(half))
-        self.pitch, self.minor = np.float32(geometry.torus_spacing_m), np.float32(geometry.torus_minor_radius_m)
-        self.last = np.float32(geometry.torus_count - 1)
-        self.farthest_m = np.float32(max(FARTHEST_M, FARTHEST_RADII * geometry.base_radius_m))
-        self.gore_rad = np.float32(2.0 * np.pi / geometry.gore_count)
-        self.warp: Warp | None = None
-        self.painted = True
-
-    def gap(self, rays: _Rays, t: Float32) -> Float32:
-        """Distance, m, from the nearest torus of points at depth ``t`` along rays; negative inside."""
-        r = rays.across * t
-        r += rays.twice_half_b
-        r *= t
-        r += rays.c
-        np.sqrt(np.maximum(r, 0.0, out=r), out=r)
-        # a and b: along the generator and aft of it, from the innermost centre
-        s = rays.minus_dx * t
-        if self.warp is not None:
-            y, z = rays.eye[1] + t * rays.direction[1], rays.eye[2] + t * rays.direction[2]
-            s, r = self._on_nominal_shape(y, z, s - rays.eye[0], r)
-            s += rays.eye[0]
-        a = self.cos * s
-        s *= self.sin
-        s += (-rays.eye[0] - self.s0) * self.sin + self.r0 * self.cos
-        a += (-rays.eye[0] - self.s0) * self.cos - self.r0 * self.sin
-        a += self.sin * r
-        r *= self.cos
-        s -= r
-        i = a * (1.0 / self.pitch)
-        np.rint(i, out=i)
-        np.minimum(i, self.last, out=i)
-        np.maximum(i, 0.0, out=i)
-        i *= self.pitch
-        a -= i
-        a *= a
-        s *= s
-        a += s
-        np.sqrt(a, out=a)
-        a -= self.minor
-        return a
-
-    def _on_nominal_shape(self, y: Float32, z: Float32, s: Float32, r: Float32) -> tuple[Float32, Float32]:
-        """Station and radius, on the nominal shell, of points of the shell that is out of shape."""
-        assert self.warp is not None
-        per = 1.0 / np.maximum(r * r, np.float32(1e-6))
-        # cos and sin of twice the clocking angle, whose cosine is -y / r
-        turn = np.float32(self.warp.flattening_rad) + np.float32(self.warp.cosine_2_rad) * ((y * y - z * z) * per)
-        turn -= np.float32(2.0 * self.warp.sine_2_rad) * (y * z * per)
-        per = np.sqrt(per)
-        cosine, sine = -y * per, z * per
-        turn += np.float32(self.warp.cosine_3_rad) * cosine * (4.0 * cosine * cosine - 3.0)
-        turn += np.float32(self.warp.sine_3_rad) * sine * (3.0 - 4.0 * sine * sine)
-        aft, out = s - self.s0, r - self.r0
-        return s - turn * out, r + turn * aft
-
-    def march(self, rays: _Rays, start: Float32, steps: int, stretch: float = 1.0) -> tuple[Float32, Float32]:
-        """Depth along rays from ``start (n,)`` and the distance left there, m, ``(n,)`` each.
-
-        Near the surface steps may be stretched by a factor below 2: the distance is signed, and an overshoot returns.
-        """
-        t = start.copy()
-        gap = self.gap(rays, t)
-        for _ in range(steps):
-            gap *= np.float32(stretch)
-            t += gap
-            np.minimum(t, self.farthest_m, out=t)
-            gap = self.gap(rays, t)
-        return t, gap
-
-    def closest(self, rays: _Rays, start: Float32) -> tuple[Float32, Float32]:
-        """Depth of closest approach to the stack near ``start`` and the signed distance there (parabola steps)."""
-        h, t = np.float32(0.03), np.where(start < self.farthest_m, start, 1.0).astype(np.float32)
-        for _ in range(4):
-            before, here, after = self.gap(rays, t - h), self.gap(rays, t), self.gap(rays, t + h)
-            curve = np.maximum(before - 2.0 * here + after, 1e-5)
-            t += np.clip(0.5 * h * (before - after) / curve, -0.1, 0.1)
-        return t, self.gap(rays, t)
-
-    def shade(self, rays: _Rays, t: Float32, sun_shell: FloatArray) -> Float32:
-        """Radiance ``(n,)`` of surface points at depth ``t``, the Sun's direction in shell axes."""
-        ex, ey, ez = rays.eye
-        dx, dy, dz = rays.direction
-        sx, sy, sz = (np.float32(e) for e in sun_shell)
-        x, y, z = ex + t * dx, ey + t * dy, ez + t * dz
-        r = np.sqrt(y * y + z * z)
-        s, rho = (-x, r) if self.warp is None else self._on_nominal_shape(y, z, -x, r)
-        a = (s - self.s0) * self.cos + (rho - self.r0) * self.sin
-        b = (s - self.s0) * self.sin - (rho - self.r0) * self.cos
-        a -= self.pitch * np.clip(np.rint(a / self.pitch), 0.0, self.last)
-        # outward normal in the half-plane, then in space
-        n_s = (a * self.cos + b * self.sin) / self.minor
-        n_r = (a * self.sin - b * self.cos) / self.minor
-        lit = np.maximum(n_r * (y * sy + z * sz) / r - n_s * sx, 0.0)
-        crest = np.asarray(np.clip(b / self.minor, 0.0, 1.0), dtype=np.float32)
-        value = (0.10 + 0.10 * crest + 0.62 * lit) * (0.55 + 0.45 * np.sqrt(crest))
-        if self.painted:
-            value *= self._paint(y, z, r, a, crest)
-        return np.asarray(value, dtype=np.float32)
-
-    def _paint(self, y: Float32, z: Float32, r: Float32, a: Float32, crest: Float32) -> Float32:
-        """Return the albedo: seams of 12 mm, dots of 22 mm at mid-gore crests, gores of slightly unlike cloth."""
-        clock = cv2.phase(-y.reshape(1, -1), z.reshape(1, -1)).ravel()
-        gore = clock / self.gore_rad
-        off_seam = np.abs(gore - np.rint(gore)) * self.gore_rad * r
-        off_dot = np.abs(gore - np.floor(gore) - 0.5) * self.gore_rad * r
-        seam = 1.0 - 0.55 * np.clip(1.5 - off_seam / 0.006, 0.0, 1.0)
-        dot = 1.0 - 0.7 * np.clip(3.0 - np.hypot(off_dot, a) / 0.0055, 0.0, 1.0) * (crest > 0.5)
-        cloth = 1.0 + 0.05 * np.sin(2.4 * np.floor(gore))
-        albedo: Float32 = (seam * dot * cloth).astype(np.float32)
-        return albedo
+    outboard, ahead = np.array([0.0, *camera.position_body_m[1:]]), camera.dcm_cam_body[2]
+    upward = rays @ _unit(outboard - (outboard @ ahead) * ahead)
+    return np.asarray(0.035 + 0.035 * np.exp(-3.0 * np.clip(upward, 0.0, 1.0)), dtype=np.float32)
 
 
 Image = NDArray[np.uint8]
@@ -404,10 +274,15 @@ class Imaging:
     interlace_s : float
         Time from the first field to the second, rows taken in turns; each is open for as long. Zero: the whole frame
         at once.
+    readout_s : float
+        Time from the exposure of the first row to that of the last, of a rolling shutter; the frame's time is that of
+        the middle row.
     quality : int
         Of JPEG compression, 1 to 100; zero: none.
     painted : bool
         Whether the shell carries seams and dots that can be seen.
+    shadows : bool
+        Whether the centerbody and the tori cast shadows.
     built_sd_rad, loaded_sd_rad : float
         Flattening of the shell as built, and under the largest load; each lobe's cosine and sine half of that.
     loaded : Warp
@@ -424,8 +299,10 @@ class Imaging:
     blur_px: float = 0.8
     vignetting: float = 0.38
     interlace_s: float = 0.0
+    readout_s: float = 0.0
     quality: int = 0
     painted: bool = True
+    shadows: bool = True
     built_sd_rad: float = 0.0
     loaded_sd_rad: float = 0.0
     loaded: Warp = Warp()
@@ -523,8 +400,9 @@ def film(
     """
     imaging = imaging or Imaging()
     camera = as_built_camera(camera_mount, rng, imaging)
-    renderer = ShellRenderer(vehicle_geometry, camera, joint_station_m, imaging.vignetting)
-    renderer.stack.painted = imaging.painted
+    renderer = ShellRenderer(
+        vehicle_geometry, camera, joint_station_m, imaging.vignetting, imaging.painted, imaging.shadows
+    )
     built, loaded = _shapes(imaging, shape_rng or rng)
 
     def radiance(k: int, after_s: float) -> Float32:
@@ -546,7 +424,20 @@ def film(
             picture = 0.75 * early + 0.25 * late
             picture[1::2] = 0.25 * early[1::2] + 0.75 * late[1::2]
             return picture
+        if imaging.readout_s and scene.deflection_rate_yz_radps is not None:
+            return rolled(k, float(np.linalg.norm(scene.deflection_rate_yz_radps[k])))
         return radiance(k, 0.0)
+
+    def rolled(k: int, rate_radps: float) -> Float32:
+        # between moments less than half a pixel apart, a blend of two pictures is the picture between them
+        apart = 2.0 * rate_radps * imaging.readout_s * float(camera.focal_px.max())
+        moments = np.linspace(-0.5, 0.5, 2 + int(apart)) * imaging.readout_s
+        row_s = (np.arange(0.5, camera.height_px) / camera.height_px - 0.5) * imaging.readout_s
+        picture = np.zeros((camera.height_px, camera.width_px), dtype=np.float32)
+        for moment in moments:
+            share = np.maximum(1.0 - np.abs(row_s - moment) / (moments[1] - moments[0]), 0.0)
+            picture += share[:, None].astype(np.float32) * radiance(k, float(moment))
+        return picture
 
     pictures = _ahead(exposed, len(scene.theta_rad))
     return (record(picture, renderer.vignetting, imaging, rng) for picture in pictures)
@@ -660,8 +551,10 @@ def _imaging_from_quality(quality: FilmQuality) -> Imaging:
         blur_px=quality.blur_px,
         vignetting=quality.vignetting,
         interlace_s=quality.interlace_s,
+        readout_s=quality.readout_s,
         quality=quality.quality,
         painted=quality.painted,
+        shadows=quality.shadows,
         built_sd_rad=float(np.deg2rad(quality.built_deg)),
         loaded_sd_rad=float(np.deg2rad(quality.loaded_deg)),
         loaded=Warp(*np.deg2rad(quality.loaded_shape_deg).tolist()),

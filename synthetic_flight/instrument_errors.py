@@ -466,11 +466,19 @@ class FilmQuality(Section):
     blur_px: Annotated[float, Field(gt=0.0, le=100.0)] = 0.8
     vignetting: Fraction = 0.38
     interlace_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    readout_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     quality: Annotated[int, Field(ge=0, le=100)] = 0
     painted: bool = True
+    shadows: bool = True
     built_deg: ErrorAngle = 0.0
     loaded_deg: ErrorAngle = 0.0
     loaded_shape_deg: tuple[ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _one_shutter(self) -> FilmQuality:
+        if self.interlace_s and self.readout_s:
+            raise KeyFaults([("readout_s", self.readout_s, "either fields (interlace_s) or rows in turn")])
+        return self
 
 
 class Video(Section):

@@ -40,10 +40,12 @@ def sun(clock_deg, from_aft_deg=61.0):
     return -np.cos(a) * np.array([1.0, 0.0, 0.0]) + np.sin(a) * lv_direction(D(clock_deg))
 
 
-def film(seed, theta_deg, plane_deg):
+def film(seed, theta_deg, plane_deg, imaging=None):
     rng = np.random.default_rng(seed)
     light = np.stack([sun(rng.uniform(0, 360), rng.uniform(50, 70)) for _ in theta_deg])
-    return list(render_video(GEOMETRY, MOUNT, JOINT_M, D(np.array(theta_deg)), D(np.array(plane_deg)), light, rng))
+    return list(
+        render_video(GEOMETRY, MOUNT, JOINT_M, D(np.array(theta_deg)), D(np.array(plane_deg)), light, rng, imaging)
+    )
 
 
 @pytest.fixture(scope="module")

@@ -15,16 +15,19 @@ import pytest
 from estimators.benchmark import orient_camera, samples_together
 from estimators.camera import JointSwing, read_film, without_jumps, without_lost_features
 from estimators.camera_fit import FrameFit, _NoFitError
-from estimators.edge import is_coherent, no_horizon, steps_near
+from estimators.edge import fault_of_frame, is_coherent, no_horizon, steps_near
 from estimators.features import no_features
 from estimators.frame_edits import EditedFrame
 from estimators.virtual_camera import deformation_of
+from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import NO_EDITS
 from flightmodel.checks import NO_FAULT
 from flightmodel.vehicle import read_vehicle
 from postflight.checks.folder_check import benchmark_frame
 from postflight.filming import joint_swing
-from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film
+from synthetic_flight.film import Imaging, ShellRenderer, record, render_video
+from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film, sun
+from tests.refusing import refuses
 
 FRAMES = Path(__file__).parents[1] / "data" / "other_film"
 TRUTH = pd.read_csv(FRAMES / "truth.csv")
@@ -68,7 +71,7 @@ def test_the_edge_alone_answers_where_it_is_whole_and_is_refused_where_clouds_li
 
 
 def test_where_features_contradict_the_edge_it_counts_if_it_is_whole():
-    frames = film(5, [0.0, 3.0], [0.0, 188.0])
+    frames = film(5, [0.0, 3.0], [0.0, 188.0], Imaging(shadows=False))  # with the whole edge in the light
     oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
     answer = oriented.fit(frames[1])
     true = np.array([*answer.rotation_yz_rad, 0.0])
@@ -180,3 +183,55 @@ def test_check_tries_the_benchmark_frame():
     assert remark.code == "frame-dark"
     assert benchmark_frame(SimpleNamespace(films={}, vehicle=None, spec=SimpleNamespace(film_names={}))) == []
     assert len(no_features().points_shell_m) == 0
+
+
+@pytest.mark.parametrize("roll_deg", [180.0, 90.0, -37.0])
+def test_a_camera_mounted_upside_down_or_on_its_side_reads_the_same(roll_deg):
+    turned = {"roll_deg": roll_deg}
+    if roll_deg == 90.0:
+        turned |= {"width_px": 480, "height_px": 720, "centre_px": (241.0, 361.0)}
+    mount = MOUNT.model_copy(update=turned)
+    theta, plane = D(np.array([0.0, 4.0, 3.0])), D(np.array([0.0, 190.0, 170.0]))
+    light = np.stack([sun(clock, 60.0) for clock in (330.0, 300.0, 20.0)])
+    frames = list(render_video(GEOMETRY, mount, JOINT_M, theta, plane, light, np.random.default_rng(2)))
+    read = read_film(np.array([421.0, 440.0, 441.0]), frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None).history()
+    # the benchmark frame is truly undeflected: the pictures alone err by hundredths
+    np.testing.assert_allclose(read.theta_rad[1:], theta[1:], atol=D(0.08))
+    np.testing.assert_allclose(read.plane_lv_rad[1:], plane[1:], atol=D(1.5))
+
+
+def test_rows_of_two_moments_are_refused_and_fields_of_a_moment_are_not():
+    renderer = ShellRenderer(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
+    early, later, late = (
+        record(
+            renderer.radiance(D(theta), D(188.0), sun(330.0)), renderer.vignetting, Imaging(), np.random.default_rng(k)
+        )
+        for k, theta in enumerate((3.0, 3.05, 4.0))
+    )
+    for other, code in ((late, "frame-fields-differ"), (later, "")):
+        woven = early.copy()
+        woven[1::2] = other[1::2]
+        assert getattr(fault_of_frame(woven, (720, 480)), "code", "") == code
+
+
+def test_a_picture_that_rolled_is_refused_and_a_border_is_not():
+    frames = film(6, [0.0, 3.0], [0.0, 188.0])
+    rolled = np.roll(frames[1], 90, axis=0)
+    assert orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M).fit(rolled).refused.code == "frame-broken"
+    bordered = [frame.copy() for frame in frames]
+    for frame in bordered:
+        frame[:12] = 90
+    oriented = orient_camera(bordered[0], GEOMETRY, MOUNT, JOINT_M)
+    assert oriented.breaks.tolist() == [11]
+    assert not oriented.fit(bordered[1]).refused
+    # the border of another frame, of another size
+    assert oriented.fit(np.vstack([np.full((40, 720), 90, np.uint8), frames[1][40:]])).refused.code == "frame-broken"
+
+
+def test_a_picture_with_oblong_pixels_is_refused():
+    frame = film(7, [0.0], [0.0])[0]
+    orient_camera(frame, GEOMETRY, MOUNT, JOINT_M)
+    middle, stretch = np.array([360.0, 240.0]), np.diag([1.012, 0.988])
+    oblong = cv2.warpAffine(frame, np.column_stack([stretch, middle - stretch @ middle]), (720, 480))
+    with refuses("pixels-not-square"):
+        orient_camera(oblong, GEOMETRY, MOUNT, JOINT_M)

@@ -161,3 +161,12 @@ def test_the_picture_shows_no_more_than_its_half_angle(mount, focal, ends_in_pic
         assert camera.picture_half_angle_rad == camera.half_field_rad
     else:
         assert camera.picture_half_angle_rad < min(camera.half_field_rad, np.nanmax(angle) + np.deg2rad(2.0))
+
+
+def test_a_camera_rolled_clockwise_sees_the_sky_to_its_left(mount):
+    upright, rolled, over = (camera_from_mount(mount.model_copy(update={"roll_deg": r})) for r in (0.0, 90.0, 180.0))
+    points = upright.position_body_m + 2.0 * upright.dcm_cam_body[2] + 0.1 * lv_direction(D(mount.clock_lv_deg))
+    (up,), (left,), (down,) = (c.project(points[None]) - c.centre_px for c in (upright, rolled, over))
+    assert up[1] < -5.0
+    np.testing.assert_allclose(left, [up[1], -up[0]], atol=1e-9)
+    np.testing.assert_allclose(down, -up, atol=1e-9)

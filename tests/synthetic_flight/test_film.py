@@ -14,7 +14,18 @@ from flightmodel.camera import camera_from_mount
 from flightmodel.deflection import lv_direction
 from flightmodel.geometry import ShellGeometry, bend, torus_circles, vehicle_meshes
 from flightmodel.vehicle import CameraMount, vehicle_from_toml, vehicle_path
-from synthetic_flight.film import Imaging, ShellRenderer, _Rays, _Stack, as_built_camera, record, render_video
+from synthetic_flight import _film_kernels
+from synthetic_flight.film import (
+    Imaging,
+    Scene,
+    ShellRenderer,
+    as_built_camera,
+    film,
+    record,
+    render_video,
+    shell_terms,
+    warp_terms,
+)
 from tests.refusing import refuses
 
 TABLES = tomllib.loads((Path(flightmodel.__file__).parent / "data/vehicles/irve2_reference.toml").read_text())
@@ -36,6 +47,12 @@ def off_camera():
     return camera, ShellRenderer(GEOMETRY, camera, JOINT_M)
 
 
+def unshaded(renderer, theta_rad, plane_rad):
+    """The shell in one grey before the sky and the centerbody."""
+    cover, _, body = renderer.seen(theta_rad, plane_rad, np.zeros(3))
+    return np.where(renderer.is_clear, 0.7 * cover + (1.0 - cover) * renderer.sky, body).astype(np.float32)
+
+
 @pytest.mark.parametrize(
     ("theta_deg", "plane_deg", "sun_deg"),
     [(0.0, 153.0, 330.0), (4.5, 153.0, 200.0), (4.5, 199.0, 40.0), (-3.0, 120.0, 100.0)],
@@ -55,10 +72,9 @@ def test_ray_cast_edge_equals_the_projected_limb(off_camera, theta_deg, plane_de
     assert np.nanstd(residual) < 0.25
 
 
-def test_without_shading_the_two_edges_agree_to_hundredths_of_a_pixel(off_camera, monkeypatch):
+def test_without_shading_the_two_edges_agree_to_hundredths_of_a_pixel(off_camera):
     camera, renderer = off_camera
-    monkeypatch.setattr(renderer.stack, "shade", lambda rays, t, sun_shell: np.full_like(t, 0.7))
-    frame = record(renderer.radiance(D(3.7), D(191.0), sun(0.0)), np.ones_like(renderer.vignetting),
+    frame = record(unshaded(renderer, D(3.7), D(191.0)), np.ones_like(renderer.vignetting),
                    Imaging(noise_sd=0.0), np.random.default_rng(0))  # fmt: skip
     view = VirtualCamera(GEOMETRY, camera, JOINT_M)
     residual, _, _ = view.mismatch(
@@ -70,12 +86,11 @@ def test_without_shading_the_two_edges_agree_to_hundredths_of_a_pixel(off_camera
 
 
 @pytest.mark.parametrize(("theta_deg", "plane_deg"), [(0.0, 153.0), (4.5, 191.0)])
-def test_the_film_shows_the_trimesh_vehicle(off_camera, monkeypatch, theta_deg, plane_deg):
+def test_the_film_shows_the_trimesh_vehicle(off_camera, theta_deg, plane_deg):
     """Rays through the same real lens into the tori's and the centerbody's triangles hit where the film has them."""
     pytest.importorskip("embreex", reason="trimesh casts rays too slowly without embreex")
     camera, renderer = off_camera
-    monkeypatch.setattr(renderer.stack, "shade", lambda rays, t, sun_shell: np.full_like(t, 0.7))
-    shell_in_film = renderer.radiance(D(theta_deg), D(plane_deg), np.zeros(3)) > 0.4
+    shell_in_film = unshaded(renderer, D(theta_deg), D(plane_deg)) > 0.4
     meshes = vehicle_meshes(GEOMETRY, clock_sections=400, torus_sections=128)
     tori = [mesh for name, mesh in meshes.items() if name.startswith("torus")]
     for mesh in tori:
@@ -168,13 +183,82 @@ def test_film_refuses_lengths_that_differ_and_nan():
 def test_rays_reach_the_far_rim_of_a_shell_of_any_size():
     """A camera at the rim of a 6 m shell looks at the opposite rim, 6 m away and more."""
     geometry = vehicle_from_toml(vehicle_path("loftid")).geometry
-    stack = _Stack(geometry)
     station, radius = torus_circles(geometry)
     eye = np.array([-station[-1] - 0.5, -radius[-1], 0.0])
     far = np.array([-station[-1], radius[-1], 0.0]) - eye
-    ray = (far / np.linalg.norm(far)).astype(np.float32)[:, None]
-    depth, gap = stack.march(_Rays(ray, eye), np.full(1, 0.3, dtype=np.float32), 200)
-    assert abs(gap[0]) < 0.01
+    depth, shade = np.empty((2, 1, 1))
+    body = (np.zeros(3), np.array([-1.0, 0.0, 0.0]), 0.2, 1.5)
+    ray, everywhere = (far / np.linalg.norm(far))[None, None], np.ones((1, 1), dtype=bool)
+    _film_kernels.cast(ray, everywhere, np.eye(3), eye, np.zeros(3),
+                       shell_terms(geometry), warp_terms(None), body, False, False, depth, shade)  # fmt: skip
     # within two rings of the rim: the ray comes in under a flat angle
-    assert np.linalg.norm(far) - 4.0 * geometry.torus_minor_radius_m < depth[0] < np.linalg.norm(far)
-    assert stack.farthest_m > 2.0 * radius[-1]
+    assert np.linalg.norm(far) - 4.0 * geometry.torus_minor_radius_m < depth[0, 0] < np.linalg.norm(far)
+
+
+def triangles(theta_rad, plane_rad):
+    """The deflected shell and the centerbody as meshes, whose rays share no code with the film's."""
+    meshes = vehicle_meshes(GEOMETRY, clock_sections=400, torus_sections=128)
+    tori = [mesh for name, mesh in meshes.items() if name.startswith("torus")]
+    for mesh in tori:
+        mesh.vertices = bend(np.asarray(mesh.vertices), theta_rad, plane_rad, JOINT_M)
+    return trimesh.util.concatenate(tori), meshes["centerbody"]
+
+
+@pytest.mark.parametrize(("sun_deg", "from_aft_deg"), [(330.0, 61.0), (60.0, 70.0), (200.0, 60.0)])
+def test_shadows_fall_where_triangles_stand_before_the_sun(off_camera, sun_deg, from_aft_deg):
+    pytest.importorskip("embreex", reason="trimesh casts rays too slowly without embreex")
+    camera, _ = off_camera
+    theta, plane, light = D(4.5), D(191.0), sun(sun_deg, from_aft_deg)
+    lit, dark = (
+        ShellRenderer(GEOMETRY, camera, JOINT_M, painted=False, shadows=s).seen(theta, plane, light)[1]
+        for s in (False, True)
+    )
+    shell, body = triangles(theta, plane)
+    v, u = (x.ravel() for x in np.mgrid[0:480:7, 0:720:7])
+    rays = camera.rays_body(np.column_stack([u, v]).astype(float))
+    seen = np.isfinite(rays[:, 0]) & (lit[v, u] > 0.0)
+    v, u, rays = v[seen], u[seen], rays[seen]
+    points, ray, triangle = shell.ray.intersects_location(
+        np.tile(camera.position_body_m, (len(rays), 1)), rays, multiple_hits=False
+    )
+    normal = shell.face_normals[triangle]
+    # well turned to the Sun: elsewhere light and shadow hardly differ
+    steep = normal @ light > 0.15
+    at = points[steep] + 3e-3 * normal[steep]
+    towards = np.tile(light, (len(at), 1))
+    shaded = shell.ray.intersects_any(at, towards) | body.ray.intersects_any(at, towards)
+    where = v[ray[steep]], u[ray[steep]]
+    film = dark[where] < 0.999 * lit[where]
+    assert np.mean(film == shaded) > 0.97  # half shadow, and triangles of a few mm, at their borders
+    assert 0.1 < shaded.mean() < 0.9
+
+
+def test_the_centerbody_lies_in_the_shadow_of_the_shell(off_camera):
+    camera, _ = off_camera
+    forward = np.array([0.8, *(-0.6 * lv_direction(D(153.0 + 180.0))[1:])])
+    open_sky, shaded = (
+        ShellRenderer(GEOMETRY, camera, JOINT_M, shadows=s).radiance(0.0, 0.0, forward) for s in (False, True)
+    )
+    body = ~ShellRenderer(GEOMETRY, camera, JOINT_M).is_clear
+    assert open_sky[body].max() > 0.2
+    assert np.mean(shaded[body] > 0.11) < 1e-3  # the centerbody is drawn before the shell, also where it is inside it
+
+
+def test_a_rolling_shutter_shows_each_row_at_its_own_time():
+    """Rows of a film of a moving shell are those of films of the shell at rest where it is when they are exposed."""
+    quiet = {"pointing_sd_rad": 0.0, "focal_sd": 0.0, "centre_sd_px": 0.0, "k1_sd": 0.0, "position_sd_m": 0.0,
+             "noise_sd": 0.0}  # fmt: skip
+    theta, plane, light, rate = np.array([D(3.0)]), np.array([D(153.0)]), sun(330.0)[None], D(60.0)
+    lateral = rate * np.array([[-np.cos(plane[0]), np.sin(plane[0])]])
+    moving = Scene(theta, plane, light, deflection_rate_yz_radps=lateral)
+    rolled = next(film(GEOMETRY, MOUNT, JOINT_M, moving, np.random.default_rng(0), Imaging(readout_s=0.02, **quiet)))
+    for row in (100, 240, 330):
+        there = theta + rate * 0.02 * ((row + 0.5) / 480 - 0.5)
+        still = next(
+            film(GEOMETRY, MOUNT, JOINT_M, Scene(there, plane, light), np.random.default_rng(0), Imaging(**quiet))
+        )
+        away = next(film(GEOMETRY, MOUNT, JOINT_M, Scene(theta + D(0.6), plane, light), np.random.default_rng(0),
+                         Imaging(**quiet)))  # fmt: skip
+        off, other = (np.abs(rolled[row].astype(float) - picture[row]).mean() for picture in (still, away))
+        assert off < 0.5
+        assert other > 3.0 * off

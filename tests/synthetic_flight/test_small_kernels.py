@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from synthetic_flight import _kernels, dynamics, simulate
+from synthetic_flight import _film_kernels, _kernels, dynamics, film, simulate
 from synthetic_flight.simulate import integrate
-from tests.oracles import two_body
+from tests.oracles import plain_film, two_body
 
 from .test_dynamics import entry_45_km, kernel_rates, windy
 
@@ -137,3 +137,91 @@ def test_a_locked_joint_carries_the_difference_of_gravity(generic_vehicle):
     want = body.mass_kg * (got[3:6] + np.cross(turn, about["body"][0])) - loads.force_body_n
     assert 1e-6 < np.linalg.norm(want) < 1e-2
     np.testing.assert_allclose(aux[6:9], want, atol=2e-9)
+
+
+@pytest.mark.parametrize("bent", [None, film.Warp(0.01, -0.006, 0.004, 0.005, -0.003)])
+def test_the_film_s_rays_meet_what_plain_ones_do(generic_vehicle, bent):
+    geometry = generic_vehicle.geometry
+    eye, light = np.array([-1.4, 0.17, 0.09]), np.array([-0.5, -0.81, 0.3])
+    rng = np.random.default_rng(4)
+    rays = np.array([0.5, 0.8, 0.4]) + 0.3 * rng.standard_normal((8, 5, 3))
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    shell, warp = film.shell_terms(geometry), film.warp_terms(bent)
+    body = (np.zeros(3), np.array([-1.0, 0.0, 0.0]), 0.19, 1.5)
+    depth, shade = np.empty((2, 8, 5))
+    everywhere = np.ones((8, 5), dtype=bool)
+    _film_kernels.cast(rays, everywhere, np.eye(3), eye, light, shell, warp, body, True, False, depth, shade)
+    stack = plain_film.Stack(geometry)
+    stack.warp = bent
+    plain = plain_film.Rays(rays.reshape(-1, 3).T.astype(np.float32), eye)
+    t, gap = stack.march(plain, np.full(40, 0.05, dtype=np.float32), 400)
+    met = (np.abs(gap) < 1e-3).reshape(8, 5)
+    assert 10 < met.sum() < 40
+    np.testing.assert_array_equal(np.isfinite(depth), met)
+    np.testing.assert_allclose(depth[met], t.reshape(8, 5)[met], atol=2e-3)
+    np.testing.assert_allclose(shade[met], stack.shade(plain, t, light).reshape(8, 5)[met], atol=0.01)
+    near, closest, there = np.empty((3, 40))
+    _film_kernels.cast_edge(rays.reshape(-1, 3), t.astype(float), np.eye(3), eye, light, shell, warp, body, True, False,
+                            near, closest, there)  # fmt: skip
+    want, far = stack.closest(plain, t)
+    np.testing.assert_allclose(near, far, atol=1e-4)
+    np.testing.assert_allclose(closest, want, atol=2e-3)
+
+
+def test_the_way_to_the_stack_meets_nothing_before_it(generic_vehicle):
+    """Between a point aft of the stack and where its shadow ray goes on, no torus is near: sampled densely."""
+    geometry = generic_vehicle.geometry
+    rng = np.random.default_rng(5)
+    stack, share = plain_film.Stack(geometry), np.empty(30)
+    light = np.array([-0.25, -0.9, 0.27])
+    light /= np.linalg.norm(light)
+    r, clock, out = rng.uniform(0.4, 1.3, 30), rng.uniform(0.0, 2.0 * np.pi, 30), rng.uniform(0.12, 0.3, 30)
+    station = stack.s0 + ((r - stack.r0) * stack.cos + out) / stack.sin
+    points = np.column_stack([-station, -r * np.cos(clock), r * np.sin(clock)])
+    _film_kernels.sunlit(points, light, film.shell_terms(geometry), film.warp_terms(None), share)
+    ways = np.linspace(0.0, 4.0, 4001)
+    for point, seen in zip(points, share, strict=True):
+        along = (point + ways[:, None] * light).T
+        gap = stack.gap(plain_film.Rays(along.astype(np.float32), np.zeros(3)), np.float32(1.0))
+        free = np.min(gap[1:] / (_film_kernels.SUN_DIAMETER * ways[1:]))
+        assert seen == pytest.approx(np.clip(free, 0.0, 1.0), abs=0.05)
+    assert 0.2 < np.mean(share > 0.5) < 0.8
+
+
+def test_the_film_s_shadows_are_those_of_a_sampled_ray(generic_vehicle):
+    """Every pixel's ray towards the Sun, sampled each millimetre, against the centerbody and the tori."""
+    geometry, light = generic_vehicle.geometry, np.array([-0.5, -0.77, -0.35])
+    light /= np.linalg.norm(light)
+    eye, away = np.array([-1.4, 0.174, 0.089]), np.array([0.0, 0.89, 0.455])
+    nose, radius, length = np.array([-0.1, 0.03, 0.0]), geometry.centerbody_radius_m, 1.2
+    across = np.cross(away, [1.0, 0.0, 0.0])
+    grid = [
+        [0.6, 0.0, 0.0] + up * away + side * across for up in (0.5, 0.8, 1.1) for side in np.linspace(-0.9, 0.9, 12)
+    ]
+    rays = np.array(grid).reshape(3, 12, 3)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    body, shell, warp = (
+        (nose, np.array([-1.0, 0.0, 0.0]), radius, length),
+        film.shell_terms(geometry),
+        film.warp_terms(None),
+    )
+    everywhere = np.ones((3, 12), dtype=bool)
+    lit, dark, depth = np.empty((3, 3, 12))
+    for shadows, shade in ((False, lit), (True, dark)):
+        _film_kernels.cast(rays, everywhere, np.eye(3), eye, light, shell, warp, body, False, shadows, depth, shade)
+    unlit = np.empty((3, 12))
+    _film_kernels.cast(rays, everywhere, np.eye(3), eye, 0.0 * light, shell, warp, body, False, False, depth, unlit)
+    stack, seen = plain_film.Stack(geometry), []
+    for i, j in zip(*np.nonzero((lit - unlit > 0.05) & np.isfinite(depth)), strict=True):
+        at = eye + depth[i, j] * rays[i, j] + np.arange(0.01, 3.0, 0.001)[:, None] * light
+        gap = stack.gap(plain_film.Rays(at.T.astype(np.float32), np.zeros(3)), np.float32(1.0))
+        off = np.hypot(*(at - nose)[:, 1:].T) - radius
+        inside = (off < 0.0) & (at[:, 0] < nose[0]) & (at[:, 0] > nose[0] - length)
+        near = abs(np.min(off[(at[:, 0] < nose[0]) & (at[:, 0] > nose[0] - length)], initial=1.0))
+        end = np.min(np.abs(at[off < 0.0, 0] - (nose[0] - length)), initial=1.0)
+        if near > 0.02 and end > 0.02 and abs(np.min(gap[30:])) > 0.02:  # no half shadow
+            seen.append((bool(inside.any()), bool((gap < 0.0).any()), (dark - unlit)[i, j] / (lit - unlit)[i, j]))
+    by_body, by_shell, share = np.array(seen).T
+    np.testing.assert_allclose(share, np.where(by_body + by_shell > 0.0, 0.0, 1.0), atol=1e-6)
+    assert by_body.sum() >= 2
+    assert (share > 0.5).sum() > 5

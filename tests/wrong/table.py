@@ -1,11 +1,12 @@
-"""The page of wrong inputs: which case is named by what, and how wrong the worst answer is.
+"""The table of wrong inputs (docs/wrong_inputs.csv): which case is named by what, and how wrong the worst answer is.
 
 ``python -m tests.wrong.table FOLDER`` runs every case on the flight in FOLDER, a sound synthetic flight with its truth,
-and prints the page's rows.
+and prints the table's rows.
 """
 
 from __future__ import annotations
 
+import csv
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -64,20 +65,21 @@ def outcomes(package: Package, truth: Path, chosen: list[Case]) -> Iterator[tupl
             yield case, outcome_of(wrong.write(Path(folder) / "flight"), truth, methods)
 
 
-def row(case: Case, found: Outcome) -> str:
-    """One row of the page's table."""
+def row(case: Case, found: Outcome) -> tuple[str, ...]:
+    """One row of the table."""
     code, suspects = first_named(found)
-    by = f"`{code}`: {', '.join(dict.fromkeys(suspects))}" if code else ""
-    worst, size = found.worst
-    error = f"{worst}, {size:.1f}" if found.errors_sd else ""
-    return f"| {case.name} | {by} | {error} | {verdict(case, found)} |"
+    worst, size = found.worst if found.errors_sd else ("", None)
+    error = "" if size is None else f"{size:.1f}"
+    return case.name, code, " ".join(dict.fromkeys(suspects)), worst, error, verdict(case, found)
 
 
 def main(folder: Path) -> None:
     """Write the rows of every case to standard output."""
     package = read_package(folder)
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(("case", "code", "suspects", "worst_answer", "error_sd", "verdict"))
     for case, found in outcomes(package, folder / "truth", cases(package)):
-        sys.stdout.write(row(case, found) + "\n")
+        writer.writerow(row(case, found))
         sys.stdout.flush()
 
 
