@@ -16,10 +16,15 @@ import numpy as np
 from flightmodel.checks import FloatArray
 
 
+def _components(values: FloatArray) -> list[FloatArray]:
+    values = np.asarray(values, dtype=float)
+    return [values[..., k] for k in range(values.shape[-1])]
+
+
 def multiply(p: FloatArray, q: FloatArray) -> FloatArray:
     """Hamilton product of ``(..., 4)`` quaternions."""
-    pw, px, py, pz = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
-    qw, qx, qy, qz = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    pw, px, py, pz = _components(p)
+    qw, qx, qy, qz = _components(q)
     w = pw * qw - px * qx - py * qy - pz * qz
     out = np.empty((*w.shape, 4))
     out[..., 0] = w
@@ -63,7 +68,7 @@ def boxminus(q_to_from: FloatArray, reference_to_from: FloatArray) -> FloatArray
 
 def dcm_from_q(q: FloatArray) -> FloatArray:
     """Direction cosine matrices ``(..., 3, 3)``."""
-    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    w, x, y, z = _components(q)
     out = np.empty((*w.shape, 3, 3))
     out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
@@ -103,7 +108,7 @@ def slerp(time_s: FloatArray, q: FloatArray, at_s: FloatArray) -> FloatArray:
 
 def skew(v: FloatArray) -> FloatArray:
     """Matrices ``(..., 3, 3)`` with ``skew(a) @ b = a x b``."""
-    x, y, z = np.moveaxis(np.asarray(v, dtype=float), -1, 0)
+    x, y, z = _components(v)
     out = np.zeros((*x.shape, 3, 3))
     out[..., 0, 1], out[..., 0, 2] = -z, y
     out[..., 1, 0], out[..., 1, 2] = z, -x

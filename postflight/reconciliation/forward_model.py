@@ -35,6 +35,7 @@ from flightmodel.atmosphere import (
     WIND_LENGTH_M,
     profile_from_sounding,
     sounding_correlation,
+    sounding_correlation_inverse,
     temperature_sd,
     unresolved_variance,
 )
@@ -241,14 +242,23 @@ class AtmosphereParameters:
         return np.asarray(np.interp(altitude_m, self.knots_m, apart))
 
     @cached_property
-    def precision(self) -> FloatArray:
-        """Inverse covariance (3, k, k) of the sounding: half constant bias, half Gauss-Markov along altitude."""
+    def inverse_covariance(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
+        """Of each kind the inverse covariance of the sounding: diagonal (k,), beside it (k - 1,), ``u`` (k,).
+
+        Half of the variance is a constant bias, which makes ``-u u^T``, half Gauss-Markov along altitude.
+        """
         at = profile_from_sounding(self.sounding).at(self.knots_m)
         out = []
         for sd, length in ((at.density_sd, DENSITY_LENGTH_M), *[(at.wind_sd_mps, WIND_LENGTH_M)] * 2):
-            correlation = sounding_correlation(self.knots_m, length)
-            out.append(np.linalg.inv(sd[:, None] * correlation * sd))
-        return np.array(out)
+            diagonal, beside, u = sounding_correlation_inverse(self.knots_m, length)
+            out.append((diagonal / sd**2, beside / (sd[:-1] * sd[1:]), u / sd))
+        return tuple(out)
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """The same as full matrices (3, k, k)."""
+        parts = self.inverse_covariance
+        return np.array([np.diag(d) + np.diag(e, 1) + np.diag(e, -1) - np.outer(u, u) for d, e, u in parts])
 
     def unresolved_structure(self, altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (n,) of log density and of wind, m/s, of the structure between the knots."""
@@ -288,31 +298,38 @@ class AtmosphereParameters:
 
     def moved_rows(self, table: FloatArray, kind: int, knot: int, step: float) -> MovedRows:
         """Rows of a kernel table that change where one difference (log density, north, east wind) moves at one knot."""
-        near, change = self._change(self.knots_m, knot, step)
-        rows = table[near].copy()
+        near, hat = self._hats[knot]
+        rows, change = table[near].copy(), step * hat
         if kind == 0:
             rows[:, 0] *= np.exp(change)
-            rows[:-1, 1] += np.diff(change)
+            rows[:-1, 1] += change[1:] - change[:-1]
         else:
             rows[:, 2 + kind] += change
         return MovedRows(near.start, rows)
 
     def warmed_rows(self, table: FloatArray, knot: int, step_k: float) -> MovedRows:
         """Rows of a kernel table that change where the temperature moves at one of its knots."""
-        near, warmer = self._change(self.temperature_knots_m, knot, step_k)
+        near, hat = self._temperature_hats[knot]
         rows = table[near].copy()
-        rows[:, 2] *= np.exp(0.5 * warmer / self._sounded_temperature[near])
+        rows[:, 2] *= np.exp(0.5 * step_k * hat / self._sounded_temperature[near])
         return MovedRows(near.start, rows)
 
-    def _change(self, knots_m: FloatArray, knot: int, step: float) -> tuple[slice, FloatArray]:
-        """Rows about a knot, to the knots beside it or the table's end, and what a step at the knot adds there."""
-        rows = self._sounded[1]
-        first = 0 if knot == 0 else int(np.searchsorted(rows, knots_m[knot - 1])) - 1
-        last = len(rows) if knot == len(knots_m) - 1 else int(np.searchsorted(rows, knots_m[knot + 1])) + 1
-        near = slice(max(first, 0), last)
-        unit = np.zeros(len(knots_m))
-        unit[knot] = step
-        return near, np.interp(rows[near], knots_m, unit)
+    @cached_property
+    def _hats(self) -> list[tuple[slice, FloatArray]]:
+        return hats(self._sounded[1], self.knots_m)
+
+    @cached_property
+    def _temperature_hats(self) -> list[tuple[slice, FloatArray]]:
+        return hats(self._sounded[1], self.temperature_knots_m)
+
+
+def hats(rows_m: FloatArray, knots_m: FloatArray) -> list[tuple[slice, FloatArray]]:
+    """Of each knot the rows about it, to the knots beside it or the table's end, and what one at the knot is there."""
+    low = np.maximum(np.searchsorted(rows_m, knots_m[:-1]) - 1, 0).tolist()
+    high = (np.searchsorted(rows_m, knots_m[1:]) + 1).tolist()
+    near = [slice(*ends) for ends in zip([0, *low], [*high, len(rows_m)], strict=True)]
+    units = np.eye(len(knots_m))
+    return [(part, np.interp(rows_m[part], knots_m, unit)) for part, unit in zip(near, units, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -636,8 +653,15 @@ def _flown(measured: Measurements, vehicle: Vehicle, flights: SpanFlights) -> tu
         if not whole:
             states[block], aux[block] = out[: block.stop - begin], more[: block.stop - begin]
 
+    def fly_blocks(begins: Index) -> None:
+        for begin in begins.tolist():
+            fly(begin)
+
     with ThreadPoolExecutor(available_cores()) as pool:
-        list(pool.map(fly, range(0, len(starts), LANES)))
+        blocks = range(0, len(starts), LANES)
+        # a few tasks each: handing over a block takes as long as flying it
+        parts = np.array_split(blocks, min(len(blocks), 4 * available_cores()))
+        list(pool.map(fly_blocks, parts))
     lost = ~np.isfinite(states).all(axis=2)
     if lost.any():
         lost = np.logical_or.accumulate(lost, axis=1)

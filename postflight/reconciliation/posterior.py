@@ -337,8 +337,7 @@ class Profile:
         p, problem = self.count, self.fit.problem
         linear = problem.linearize(self.fit.parameters)
         whole = problem.normal_equations(self.fit.parameters, linear)
-        others = NormalEquations(whole.matrix.without(p), whole.right[p:])
-        coupling = np.concatenate([whole.matrix.corner[p:, :p], whole.matrix.across[:, :p]])
+        coupling, others = whole.without(p)
         return linear, np.concatenate([self.root, -others.solve(coupling @ self.root)]), others
 
     def one_sided(self, z: FloatArray) -> NDArray[np.bool_]:
