@@ -232,7 +232,7 @@ def _slabs(
     names, points, count = shape
     width = BAND_BYTES // (4 * names * count)
     if width >= points:
-        yield slice(0, points), _turned(folder, wanted, 0)
+        yield slice(0, points), _turned(folder, wanted, 0, (names, points))
         return
     width = max(1, width)
     at_once = max(1, BAND_BYTES // (4 * names * points * max(len(runs) for runs in wanted)))
@@ -241,8 +241,8 @@ def _slabs(
         with path.open("w+b") as file:
             before = 0
             for first in range(0, len(wanted), at_once):
-                block = _turned(folder, wanted[first : first + at_once], first)
-                for row, values in enumerate(block.reshape(names * points, -1)):
+                block = _turned(folder, wanted[first : first + at_once], first, (names, points))
+                for row, values in enumerate(values for history in block for values in history):
                     file.seek(4 * (row * count + before))
                     file.write(values.tobytes())
                 before += block.shape[2]
@@ -257,16 +257,18 @@ def _slabs(
         path.unlink(missing_ok=True)
 
 
-def _turned(folder: Path, wanted: Sequence[Sequence[int]], first: int) -> NDArray[np.float32]:
+def _turned(folder: Path, wanted: Sequence[Sequence[int]], first: int, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Histories ``(names, times, flights)`` of the flights that flew in some chunks, ``first`` and those after it."""
-    parts = []
+    out, count = np.empty((*shape, sum(map(len, wanted))), dtype=np.float32), 0
     for number, runs in enumerate(wanted, first):
         chunk = read_chunk(folder, number, runs)
         if chunk is None:
             message = f"{folder}: chunk {number} was damaged while it was read; run again"
             raise GateError(message, code="chunk-damaged")
-        parts.append(np.moveaxis(chunk.histories[chunk.flown], 0, -1))
-    return np.concatenate(parts, axis=-1)
+        kept = chunk.histories[chunk.flown]
+        out[:, :, count : count + len(kept)] = np.moveaxis(kept, 0, -1)
+        count += len(kept)
+    return out[:, :, :count]
 
 
 def coverage(table: pd.DataFrame) -> dict[str, dict[str, float]]:
