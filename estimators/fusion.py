@@ -638,8 +638,8 @@ def _smoothed_loads(loads: FlightLoads) -> FlightLoads:
     names = ("specific_force_body_mps2", "rate_body_radps", "angular_acceleration_body_radps2")
     as_read = np.hstack([getattr(loads, name) for name in names])
     smooth = value @ lstsq(value, as_read, lapack_driver="gelsy")[0]
-    parts = map(np.ascontiguousarray, np.hsplit(smooth, len(names)))
-    return replace(loads, **dict(zip(names, parts, strict=True)))
+    moved = {name: np.ascontiguousarray(smooth[:, 3 * k : 3 * k + 3]) for k, name in enumerate(names)}
+    return replace(loads, **moved)
 
 
 def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) -> None:
