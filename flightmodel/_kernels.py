@@ -80,6 +80,7 @@ J2_WGS84 = 1.082629821313e-3
 OMEGA_WGS84 = 7.292115e-5
 # gravitational parameter, J2, semi-major axis, flattening, rate: as `flightmodel.earth.Planet` begins
 WGS84 = (GM_WGS84, J2_WGS84, A_WGS84, F_WGS84, OMEGA_WGS84)
+GM, RATE = 0, 4  # their places
 
 
 def constants(planet):
@@ -91,33 +92,10 @@ def constants(planet):
     return WGS84 if planet is None else planet
 
 
-def spin_rate(planet):
-    """Rate of rotation, rad/s, as `constants`."""
-    return OMEGA_WGS84 if planet is None else planet[4]
-
-
-def mass_parameter(planet):
-    """Gravitational parameter, m^3/s^2, as `constants`."""
-    return GM_WGS84 if planet is None else planet[0]
-
-
-def _is_earth(planet):
-    return isinstance(planet, numba.types.NoneType | numba.types.Omitted)
-
-
 @overload(constants, inline="always")
 def _constants(planet):
-    return (lambda planet: WGS84) if _is_earth(planet) else (lambda planet: planet)  # noqa: ARG005
-
-
-@overload(spin_rate, inline="always")
-def _spin_rate(planet):
-    return (lambda planet: OMEGA_WGS84) if _is_earth(planet) else (lambda planet: planet[4])  # noqa: ARG005
-
-
-@overload(mass_parameter, inline="always")
-def _mass_parameter(planet):
-    return (lambda planet: GM_WGS84) if _is_earth(planet) else (lambda planet: planet[0])  # noqa: ARG005
+    earth = isinstance(planet, numba.types.NoneType | numba.types.Omitted)
+    return (lambda planet: WGS84) if earth else (lambda planet: planet)  # noqa: ARG005
 
 
 @inlined

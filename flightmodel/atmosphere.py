@@ -41,6 +41,7 @@ from flightmodel.telemetry import Sounding
 
 R_AIR_JPKGK = WGS84.gas_jpkgk
 EARTH_RADIUS_US76_M = 6356766.0
+_AIR_MOLECULE_KG = 28.9644e-3 / 6.022169e23
 # geopotential base m, base temperature K, lapse K/m
 _LAYERS = np.array(
     [
@@ -205,6 +206,17 @@ def sound_speed(altitude_m: FloatArray | float, temperature_k: FloatArray, plane
 
 def _mars_temperature(z: FloatArray) -> FloatArray:
     return np.interp(z, 1000.0 * _MARS_TEMPERATURE[:, 0], _MARS_TEMPERATURE[:, 1])
+
+
+def mean_free_path(
+    density_kgpm3: FloatArray | float, gas_jpkgk: FloatArray | float = R_AIR_JPKGK, planet: Planet = WGS84
+) -> FloatArray:
+    """Mean free path, m, ``(...)`` of hard spheres, ``m / (sqrt(2) pi d^2 rho)`` (US76 eq. [44]).
+
+    The gas constant ``(...)``, J/(kg K), says how heavy a molecule is on the average.
+    """
+    section = np.sqrt(2.0) * np.pi * planet.molecule_m**2 * np.asarray(density_kgpm3, dtype=float)
+    return np.asarray(_AIR_MOLECULE_KG * (R_AIR_JPKGK / gas_jpkgk) / section)
 
 
 @cache

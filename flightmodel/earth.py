@@ -18,7 +18,9 @@ Celest. Mech. Dyn. Astron. 109 (2011) 101: ellipsoid, pole, prime meridian of Ma
 A. Genova et al., "Seasonal and static gravity field of Mars from MGS, Mars Odyssey and MRO radio science", Icarus 272
 (2016) 228 (GMM-3): GM, and J2 from C20 = -8.750211e-4 (normalised, for 3396.0 km).
 A. Seiff, "Post-Viking models for the structure of the summer atmosphere of Mars", Adv. Space Res. 2 (1982) 3:
-molecular weight 43.49.
+molecular weight 43.49. Diameters of molecules: U.S. Standard Atmosphere 1976, section 1.2.12; of Mars, hard spheres by
+Chapman and Enskog that are as viscous as carbon dioxide at 273 K (13.7e-6 Pa s, Fenghour et al., J. Phys. Chem. Ref.
+Data 27 (1998) 31).
 """
 
 from __future__ import annotations
@@ -50,6 +52,7 @@ class Planet(NamedTuple):
     flattening: float
     rate_radps: float
     gas_jpkgk: float  # of its mixed gas, J/(kg K)
+    molecule_m: float  # diameter of a molecule as a hard sphere
 
     @property
     def rate_ecef_radps(self) -> FloatArray:
@@ -57,7 +60,7 @@ class Planet(NamedTuple):
         return np.array([0.0, 0.0, self.rate_radps])
 
 
-WGS84 = Planet(GM_M3PS2, J2, SEMI_MAJOR_M, FLATTENING, OMEGA_RADPS, 8314.32 / 28.9644)
+WGS84 = Planet(GM_M3PS2, J2, SEMI_MAJOR_M, FLATTENING, OMEGA_RADPS, 8314.32 / 28.9644, 3.65e-10)
 MARS = Planet(
     gm_m3ps2=4.2828375e13,
     j2=8.750211e-4 * 5.0**0.5 * (3396.0 / 3396.19) ** 2,  # of the ellipsoid's radius instead of the field's
@@ -65,6 +68,7 @@ MARS = Planet(
     flattening=(3396.19 - 3376.20) / 3396.19,
     rate_radps=float(np.deg2rad(350.89198226)) / 86400.0,
     gas_jpkgk=8314.32 / 43.49,
+    molecule_m=4.66e-10,
 )
 PLANETS = {"earth": WGS84, "mars": MARS}
 
@@ -100,20 +104,8 @@ def planet_from_j2000(t0_utc: str, time_s: FloatArray | float, planet: Planet) -
     right_ascension = np.deg2rad(317.68143 - 0.1061 * century)
     declination = np.deg2rad(52.88650 - 0.0609 * century)
     meridian = np.deg2rad(np.mod(176.630 + 350.89198226 * days, 360.0))
-    equator = _turn_x(0.5 * np.pi - declination) @ _turn_z(0.5 * np.pi + right_ascension)
-    return np.asarray(_turn_z(meridian) @ equator)
-
-
-def _turn_z(angle: FloatArray) -> FloatArray:
-    """Matrices (..., 3, 3) to axes turned about z."""
-    c, s, one, no = np.cos(angle), np.sin(angle), np.ones_like(angle), np.zeros_like(angle)
-    return np.stack([np.stack(row, -1) for row in ((c, s, no), (-s, c, no), (no, no, one))], -2)
-
-
-def _turn_x(angle: FloatArray) -> FloatArray:
-    """Matrices (..., 3, 3) to axes turned about x."""
-    c, s, one, no = np.cos(angle), np.sin(angle), np.ones_like(angle), np.zeros_like(angle)
-    return np.stack([np.stack(row, -1) for row in ((one, no, no), (no, c, s), (no, -s, c))], -2)
+    node = erfa.rz(0.5 * np.pi + right_ascension, np.eye(3))
+    return np.asarray(erfa.rz(meridian, erfa.rx(0.5 * np.pi - declination, node)))
 
 
 def potential(position_m: FloatArray, planet: Planet = WGS84) -> FloatArray:

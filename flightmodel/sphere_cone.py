@@ -23,7 +23,6 @@ References
 ----------
 Bird, "Molecular Gas Dynamics and the Direct Simulation of Gas Flows", 1994, sections 4.2 and 7.4 (sphere, plate).
 Wilmoth, Mitcheltree, Moss, "Low-density aerodynamics of the Stardust sample return capsule", AIAA 97-2510 (bridge).
-US Standard Atmosphere 1976, section 1.2.12 (mean free path, collision diameter 3.65e-10 m).
 """
 
 from __future__ import annotations
@@ -128,26 +127,8 @@ def sphere_cone_quadrature(
     return float(ca), float(cn), float(cm)
 
 
-COLLISION_DIAMETER_M = 3.65e-10
-MOLECULE_KG = 28.9644e-3 / 6.022169e23
 R_AIR_JPKGK = 8314.32 / 28.9644
 KN_CONTINUUM, KN_FREE = 1e-3, 10.0
-
-
-def mean_free_path(density_kgpm3: FloatArray | float, gas_jpkgk: FloatArray | float = R_AIR_JPKGK) -> FloatArray:
-    """Mean free path, m, of hard spheres: ``m / (sqrt(2) pi d^2 rho)`` (US76 eq. [44]).
-
-    The gas constant says how heavy a molecule is on the average; its diameter is air's in every gas.
-    """
-    section = np.sqrt(2.0) * np.pi * COLLISION_DIAMETER_M**2 * np.asarray(density_kgpm3, dtype=float)
-    return MOLECULE_KG * (R_AIR_JPKGK / gas_jpkgk) / section
-
-
-def knudsen(
-    density_kgpm3: FloatArray | float, length_m: float, gas_jpkgk: FloatArray | float = R_AIR_JPKGK
-) -> FloatArray:
-    """Knudsen number ``(...)`` of densities, kg/m^3, and gas constants against the reference length, m."""
-    return mean_free_path(density_kgpm3, gas_jpkgk) / length_m
 
 
 def bridge(knudsen_number: FloatArray | float) -> FloatArray:

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from flightmodel._kernels import (
+    RATE,
     boxplus,
     constants,
     dcm_from_quaternion,
@@ -19,7 +20,6 @@ from flightmodel._kernels import (
     inlined,
     kernel,
     merged,
-    spin_rate,
 )
 from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into
 
@@ -37,7 +37,7 @@ def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acce
             errors[0], errors[1], errors[2], errors[3], errors[4], errors[5],
         )  # fmt: skip
         for i in range(3):
-            rate[i] = spin_rate(motion.planet) * c[2, i]
+            rate[i] = constants(motion.planet)[RATE] * c[2, i]
             acceleration[i] = a[i]
         return
     force = np.empty(3)
@@ -45,7 +45,7 @@ def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acce
     corrected(motion.rate_sensor_radps[index], errors, 9, motion.dcm_body_rate, rate)
     x, y, z = position[0], position[1], position[2]
     gx, gy, gz = gravitation(x, y, z, constants(motion.planet))
-    w2, two = spin_rate(motion.planet) * spin_rate(motion.planet), 2.0 * spin_rate(motion.planet)
+    w2, two = constants(motion.planet)[RATE] * constants(motion.planet)[RATE], 2.0 * constants(motion.planet)[RATE]
     for i in range(3):
         acceleration[i] = c[i, 0] * force[0] + c[i, 1] * force[1] + c[i, 2] * force[2]
     acceleration[0] += gx + w2 * x + two * velocity[1]
@@ -78,7 +78,7 @@ def observed_point(arm, tau, position, velocity, c, rate, acceleration, point, s
     """
     turn, lever_velocity = np.empty(3), np.empty(3)
     for i in range(3):
-        turn[i] = rate[i] - spin_rate(planet) * c[2, i]
+        turn[i] = rate[i] - constants(planet)[RATE] * c[2, i]
     cross_into(turn, arm, lever_velocity)
     for i in range(3):
         effective[i] = arm[i] - tau * lever_velocity[i]
@@ -353,7 +353,7 @@ def velocity_rows(m, count, arm, rate, c, acceleration, by_state, by_error, plan
     """Partials of a velocity along the first axes of ``m`` (3, 3): ``m (v + C (w x d) - tau a)``."""
     turn, lever_velocity, row, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
-        turn[i] = rate[i] - spin_rate(planet) * c[2, i]
+        turn[i] = rate[i] - constants(planet)[RATE] * c[2, i]
     cross_into(turn, arm, lever_velocity)
     for i in range(count):
         by_error[i, 3] = -(m[i, 0] * acceleration[0] + m[i, 1] * acceleration[1] + m[i, 2] * acceleration[2])

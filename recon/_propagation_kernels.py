@@ -16,15 +16,15 @@ import math
 import numpy as np
 
 from flightmodel._kernels import (
+    GM,
+    RATE,
     boxplus,
     constants,
     dcm_from_quaternion,
     geodetic,
     gravitation,
     inlined,
-    mass_parameter,
     merged,
-    spin_rate,
 )
 
 # a filter far from its track may ask for a drag that stops the vehicle within a step: such a step is taken in parts.
@@ -138,7 +138,7 @@ def advance_columns(
     compiler puts several columns into one instruction.
     """
     width = phi.shape[1]
-    h, two_omega = 0.5 * dt, 2.0 * spin_rate(planet)
+    h, two_omega = 0.5 * dt, 2.0 * constants(planet)[RATE]
     for i in range(3):
         a, b, c = half_turn[0, i], half_turn[1, i], half_turn[2, i]
         for j in range(width):
@@ -232,22 +232,22 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     for i in range(4):
         q_mid[i] = q[i]
     boxplus(q_mid, h * rate[0], h * rate[1], h * rate[2])
-    turn_ecef(q_mid, spin_rate(planet) * h)
+    turn_ecef(q_mid, constants(planet)[RATE] * h)
     dcm_from_quaternion(q_mid[0], q_mid[1], q_mid[2], q_mid[3], dcm_mid)
     for i in range(4):
         q[i] = q_mid[i]
     boxplus(q, h * rate[0], h * rate[1], h * rate[2])
-    turn_ecef(q, spin_rate(planet) * h)
+    turn_ecef(q, constants(planet)[RATE] * h)
 
     x = position[0] + h * velocity[0]
     y = position[1] + h * velocity[1]
     z = position[2] + h * velocity[2]
     gx, gy, gz = gravitation(x, y, z, constants(planet))
-    w2 = spin_rate(planet) * spin_rate(planet)
+    w2 = constants(planet)[RATE] * constants(planet)[RATE]
     ax = dcm_mid[0, 0] * force[0] + dcm_mid[0, 1] * force[1] + dcm_mid[0, 2] * force[2] + gx + w2 * x
     ay = dcm_mid[1, 0] * force[0] + dcm_mid[1, 1] * force[1] + dcm_mid[1, 2] * force[2] + gy + w2 * y
     az = dcm_mid[2, 0] * force[0] + dcm_mid[2, 1] * force[1] + dcm_mid[2, 2] * force[2] + gz
-    two = 2.0 * spin_rate(planet)
+    two = 2.0 * constants(planet)[RATE]
     vx = velocity[0] + h * (ax + two * velocity[1])
     vy = velocity[1] + h * (ay - two * velocity[0])
     ax += two * vy
@@ -260,7 +260,7 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     velocity[2] += dt * az
 
     r2 = x * x + y * y + z * z
-    k = mass_parameter(planet) / (r2 * math.sqrt(r2))
+    k = constants(planet)[GM] / (r2 * math.sqrt(r2))
     point = (x, y, z)
     for i in range(3):
         for j in range(3):
@@ -338,7 +338,7 @@ def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     ax, ay, az = ax * n, ay * n, az * n
     bx, by, bz = m * (uy * az - uz * ay), m * (uz * ax - ux * az), m * (ux * ay - uy * ax)
     gx, gy, gz = gravitation(x, y, z, constants(air.planet))
-    w2, two = spin_rate(air.planet) * spin_rate(air.planet), 2.0 * spin_rate(air.planet)
+    w2, two = constants(air.planet)[RATE] * constants(air.planet)[RATE], 2.0 * constants(air.planet)[RATE]
     fx = k * (speed * (e1 * ax + e2 * bx) - ux) + gx + w2 * x + two * vy
     fy = k * (speed * (e1 * ay + e2 * by) - uy) + gy + w2 * y - two * vx
     return fx, fy, k * (speed * (e1 * az + e2 * bz) - uz) + gz, k * math.sqrt(1.0 + e1 * e1 + e2 * e2), k * speed

@@ -41,11 +41,11 @@ from flightmodel.atmosphere import (
     WIND_LENGTH_M,
     AtmosphereProfile,
     gas_constant,
+    mean_free_path,
     sounding_correlation,
     unresolved_variance,
 )
 from flightmodel.checks import BoolArray, FloatArray, GateError
-from flightmodel.sphere_cone import knudsen
 from flightmodel.statistics import correlation
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
@@ -180,7 +180,7 @@ class _Model:
         self.samples, self.drag = samples, drag
         self.air = profile.at(samples.altitude_m)
         gas = gas_constant(samples.altitude_m, profile.planet)
-        self.knudsen = knudsen(self.air.density_kgpm3, drag.length_m, gas)
+        self.knudsen = mean_free_path(self.air.density_kgpm3, gas, profile.planet) / drag.length_m
         still = np.zeros((len(samples.time_s), _UNKNOWNS))
         self.largest_pa = float(self.forces(still, 1.0)[1].max())
 

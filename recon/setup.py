@@ -122,7 +122,10 @@ def build_problem(
         motion, node_index = inertial_motion(force, rate, time_s, clocks, telemetry.planet)
         prior = _attitude_prior(telemetry, start_s, begin)
         attitude = _start_attitude(prior, start_s, force, rate, model, telemetry.planet)
-        point = _tracked_start(used, track, start_s) if stated is None else _stated_start(stated, arm)
+        if stated is None:
+            point = (*fit_start(track, start_s), next(i.arm_body_m for i in used if i.kind in (RADAR, POSITION)))
+        else:
+            point = stated.position_ecef_m, stated.velocity_ecef_mps, -arm
         start, covariance = _start_by_inertial_sensors(point, attitude, start_s, rate, model, telemetry.planet)
         if stated is not None:
             covariance[:6, :6] = stated.covariance
@@ -582,19 +585,6 @@ def _covariance(model: ErrorModel) -> FloatArray:
         [np.full(3, _DIFFUSE_POSITION_M), np.full(3, _DIFFUSE_VELOCITY_MPS), np.zeros(3), model.prior_sd]
     )
     return np.diag(sd**2)
-
-
-def _tracked_start(
-    instruments: tuple[Instrument, ...], track: Track, start_s: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position and velocity (3,) of the tracked point, and where it is from the accelerometer, body axes."""
-    arm = next(i.arm_body_m for i in instruments if i.kind in (RADAR, POSITION))
-    return (*fit_start(track, start_s), arm)
-
-
-def _stated_start(state: StatePrior, accelerometer_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """As `_tracked_start`, of the datum, from a stated state."""
-    return state.position_ecef_m, state.velocity_ecef_mps, -accelerometer_m
 
 
 def _start_by_inertial_sensors(

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel import airdata, earth, rotations, sphere_cone
-from flightmodel.atmosphere import AtmosphereProfile, gas_constant, us76
+from flightmodel.atmosphere import AtmosphereProfile, gas_constant, mean_free_path, us76
 from flightmodel.checks import ConfigError, FloatArray, check_finite
 from flightmodel.deflection import DeflectionHistory, lv_clock
 from flightmodel.events import splashdown_index
@@ -528,7 +528,7 @@ def kernel_tables(
         free, air = np.ascontiguousarray(vehicle.aero.free_molecular), air.copy()
         with np.errstate(divide="ignore"):  # no air: infinite mean free path
             gas = _gas_constants(air_from_m, air.shape[1])
-            air[..., 5] = sphere_cone.bridge(sphere_cone.knudsen(air[..., 0], vehicle.reference.length_m, gas))
+            air[..., 5] = sphere_cone.bridge(mean_free_path(air[..., 0], gas) / vehicle.reference.length_m)
     return np.ascontiguousarray(air), grid, np.ascontiguousarray(vehicle.aero.mach), coefficients, free
 
 

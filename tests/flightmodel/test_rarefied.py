@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from flightmodel.aerodynamics import Aerodynamics, FreeMolecular, Shape, SphereCone, aerodynamics_from
-from flightmodel.atmosphere import gas_constant, us76
-from flightmodel.sphere_cone import bridge, knudsen, mean_free_path, sphere_cone_free_molecular, wall_speed_ratio
+from flightmodel.atmosphere import gas_constant, mean_free_path, us76
+from flightmodel.earth import MARS
+from flightmodel.sphere_cone import bridge, sphere_cone_free_molecular, wall_speed_ratio
 
 ALPHA = np.deg2rad(np.array([0.0, 4.0, 17.0, 45.0, 70.0]))
 
@@ -13,9 +14,17 @@ ALPHA = np.deg2rad(np.array([0.0, 4.0, 17.0, 45.0, 70.0]))
 def test_mean_free_path_as_the_standard_prints_it():
     # US76 table: 6.6328e-8 m at sea level, 1.4223e-1 m at 100 km (where its mean molar mass is 28.40, not 28.96)
     assert mean_free_path(us76(0.0)[0]) == pytest.approx(6.6328e-8, rel=2e-4)
-    gas = gas_constant(100e3)
-    assert mean_free_path(us76(100e3)[0], gas) == pytest.approx(1.4223e-1, rel=1e-3)
-    assert knudsen(us76(100e3)[0], 3.0, gas) == pytest.approx(1.4223e-1 / 3.0, rel=1e-3)
+    assert mean_free_path(us76(100e3)[0], gas_constant(100e3)) == pytest.approx(1.4223e-1, rel=1e-3)
+    number = 4.669e12 + 9.584e13 + 1.252e11 + 4.868e12 + 8.96e10  # table VIII at 400 km: N2, O, O2, He, H
+    expected = 1.0 / (np.sqrt(2.0) * np.pi * 3.65e-10**2 * number)
+    assert mean_free_path(us76(400e3)[0], gas_constant(400e3)) == pytest.approx(expected, rel=1e-3)
+
+
+def test_mean_free_path_on_mars_is_that_of_a_gas_as_viscous():
+    """Hard spheres by Chapman and Enskog: path = 16 / 5 viscosity / (density sqrt(2 pi R T)), first approximation."""
+    gas, temperature, viscosity = MARS.gas_jpkgk, 273.15, 13.7e-6
+    expected = 3.2 * viscosity / 1.016 / (1e-4 * np.sqrt(2.0 * np.pi * gas * temperature))
+    assert mean_free_path(1e-4, gas, MARS) == pytest.approx(expected, rel=0.01)
 
 
 def test_bridge_is_the_published_sine_square():
@@ -86,10 +95,8 @@ def test_table_passes_from_continuum_to_free_molecules():
     twice = table.scaled(ca=2.0)
     np.testing.assert_allclose(twice.at(5.0, alpha, 20.0)[:, 0], 2.0 * free[:, 0])
     # drag rises with altitude alone: at 85 km by 3 %, above 110 km by more than a third
-    ca = [
-        table.at(5.0, 0.0, knudsen(us76(z)[0], 3.0, gas_constant(z)))[0] / plain[0, 0]
-        for z in (70e3, 85e3, 95e3, 110e3)
-    ]
+    thin = [mean_free_path(us76(z)[0], gas_constant(z)) / 3.0 for z in (70e3, 85e3, 95e3, 110e3)]
+    ca = [table.at(5.0, 0.0, kn)[0] / plain[0, 0] for kn in thin]
     assert ca[0] < 1.001
     assert ca[1] < 1.04
     assert ca[3] > 1.33

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flightmodel import earth, rotations, sphere_cone
-from flightmodel.atmosphere import AtmosphereProfile, gas_constant
+from flightmodel import earth, rotations
+from flightmodel.atmosphere import AtmosphereProfile, gas_constant, mean_free_path
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import lv_direction
 from flightmodel.vehicle import Vehicle
@@ -85,7 +85,7 @@ def aerodynamics(
     speed, lateral = float(np.linalg.norm(flow)), float(np.hypot(flow[1], flow[2]))
     n = np.array([0.0, flow[1], flow[2]]) / lateral if lateral > 0 else np.zeros(3)
     x_hat = np.array([1.0, 0.0, 0.0])
-    thin = sphere_cone.knudsen(air.density_kgpm3, vehicle.reference.length_m, gas_constant(height))
+    thin = mean_free_path(air.density_kgpm3, gas_constant(height)) / vehicle.reference.length_m
     ca, cn, cm, cmq = vehicle.aero.at(speed / air.sound_speed_mps, np.arctan2(lateral, flow[0]), thin)
     q_area = 0.5 * air.density_kgpm3 * speed**2 * vehicle.reference.area_m2
     length = vehicle.reference.length_m
