@@ -635,9 +635,10 @@ def _smoothed_loads(loads: FlightLoads) -> FlightLoads:
     """Loads with force, rate and angular acceleration smoothed to a spline with knots `KNOT_S` apart."""
     t = loads.time_s
     value = Spline.over(float(t[0]), float(t[-1])).rows(t)
-    names = ("specific_force_body_mps2", "rate_body_radps", "angular_acceleration_body_radps2")
-    moved = {name: value @ lstsq(value, getattr(loads, name), lapack_driver="gelsy")[0] for name in names}
-    return replace(loads, **moved)
+    as_read = [loads.specific_force_body_mps2, loads.rate_body_radps, loads.angular_acceleration_body_radps2]
+    smooth = value @ lstsq(value, np.hstack(as_read), lapack_driver="gelsy")[0]
+    force, rate, turn = map(np.ascontiguousarray, np.hsplit(smooth, 3))
+    return replace(loads, specific_force_body_mps2=force, rate_body_radps=rate, angular_acceleration_body_radps2=turn)
 
 
 def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) -> None:
