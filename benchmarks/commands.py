@@ -1,12 +1,12 @@
 """How long does one wait for a command? Whole processes, in this checkout and in another, in turn.
 
 Run: ``python benchmarks/commands.py FLIGHT [OTHER_CHECKOUT] [ROUNDS]`` on a flight folder of `postflight simulate`. Of
-each command the least wall time and processor time over the rounds, of `run` also when its answer stands on the
-terminal; with another checkout (its kernels compiled, the same interpreter) the ratios. A quiet machine is wanted.
+each command the least wall time, processor time and memory (of its largest process) over the rounds, of `run` also the
+time when its answer stands on the terminal; with another checkout (its kernels compiled, the same interpreter) the
+ratios. A quiet machine is wanted.
 """
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -16,7 +16,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parents[1]
 ANSWER = "Deflection of the aeroshell"
-COMMANDS = ("run", "reconstruct", "report", "simulate")
+COMMANDS = ("run", "reconstruct", "report", "simulate", "reconcile")
 
 
 def arguments(command, flight, scratch):
@@ -27,9 +27,9 @@ def arguments(command, flight, scratch):
 
 
 def timed(checkout, command, flight, scratch):
-    """Seconds to the answer (of `run`), in all, and of processor time."""
+    """Seconds to the answer (of `run`), in all, and of processor time; most memory of a process, MiB."""
     environment = dict(os.environ, PYTHONPATH=str(checkout), PYTHONUNBUFFERED="1")
-    before, begun, answered = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter(), float("nan")
+    begun, answered = time.perf_counter(), float("nan")
     words = [sys.executable, "-m", "postflight", *arguments(command, flight, scratch)]
     with subprocess.Popen(
         words, env=environment, cwd=checkout, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
@@ -37,10 +37,12 @@ def timed(checkout, command, flight, scratch):
         for line in run.stdout:
             if command == "run" and ANSWER in line.decode():
                 answered = time.perf_counter() - begun
-    whole, after = time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
+        _, status, used = os.wait4(run.pid, 0)  # with the second process of the command
+        run.returncode = os.waitstatus_to_exitcode(status)
+    whole = time.perf_counter() - begun
     if run.returncode:
         raise SystemExit(f"{' '.join(words)}: exit code {run.returncode}")
-    return answered, whole, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return answered, whole, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0
 
 
 def main():
@@ -54,9 +56,9 @@ def main():
         for k, _ in enumerate(checkouts):  # each with runs of its own
             flights.append(scratch / f"flight-{k}")
             shutil.copytree(flight, flights[-1], ignore=shutil.ignore_patterns("runs"))
-        print(f"{'':14s}{'answer s':>10s}{'whole s':>10s}{'CPU s':>10s}")
+        print(f"{'':14s}{'answer s':>10s}{'whole s':>10s}{'CPU s':>10s}{'MiB':>10s}")
         for command in COMMANDS:
-            least = [(float("inf"),) * 3 for _ in checkouts]
+            least = [(float("inf"),) * 4 for _ in checkouts]
             for _ in range(rounds):
                 for k, checkout in enumerate(checkouts):
                     found = timed(checkout, command, flights[k], scratch)

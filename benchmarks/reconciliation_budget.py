@@ -131,7 +131,7 @@ def parts_of(problem, u):
     By the linear problem at the truth ``u``.
     """
     linear = problem.linearize(u)
-    matrix = problem.normal_equations(u, linear).matrix.dense
+    matrix = problem.normal_equations(u, linear).dense
     whole = np.linalg.inv(matrix)
     sought = whole[: len(QUANTITIES)]
     residuals = linear.residuals

@@ -1,6 +1,6 @@
 """Errors of the virtual camera on another renderer's films, over the pressure pulse, and whether its sd cover them.
 
-    python benchmarks/video_footage.py FLIGHT FILM [FILM ...] [--features drawn|none]
+    python benchmarks/video_footage.py FLIGHT FILM [FILM ...] [--features drawn|texture|none]
 
 FLIGHT: a synthetic flight of the reference vehicle (`postflight simulate irve2_reference`), whose motion was filmed.
 FILM: a folder with ``film.avi`` or ``film.mp4``, ``frames.csv`` (t_s, frame) and ``truth.csv`` (t_s, theta_deg,
@@ -75,7 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("flight", type=Path)
     parser.add_argument("films", type=Path, nargs="+")
-    parser.add_argument("--features", choices=["drawn", "none"], default="none")
+    parser.add_argument("--features", choices=["drawn", "texture", "none"], default="texture")
     chosen = parser.parse_args()
     for with_telemetry in (False, True):
         kept, kind = [], "with inertial sensors" if with_telemetry else "film alone"

@@ -636,8 +636,10 @@ def _smoothed_loads(loads: FlightLoads) -> FlightLoads:
     t = loads.time_s
     value = Spline.over(float(t[0]), float(t[-1])).rows(t)
     names = ("specific_force_body_mps2", "rate_body_radps", "angular_acceleration_body_radps2")
-    moved = {name: value @ lstsq(value, getattr(loads, name), lapack_driver="gelsy")[0] for name in names}
-    return replace(loads, **moved)
+    as_read = np.hstack([getattr(loads, name) for name in names])
+    smooth = value @ lstsq(value, as_read, lapack_driver="gelsy")[0]
+    parts = map(np.ascontiguousarray, np.hsplit(smooth, len(names)))
+    return replace(loads, **dict(zip(names, parts, strict=True)))
 
 
 def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) -> None:

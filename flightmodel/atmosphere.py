@@ -36,7 +36,7 @@ import numpy as np
 from flightmodel.checks import ConfigError, FloatArray, GateError, check_finite, check_increasing
 from flightmodel.config import parse_utc
 from flightmodel.earth import MARS, STANDARD_GRAVITY_MPS2, WGS84, Planet
-from flightmodel.statistics import KNOTS_A_LENGTH, correlation, correlation_root
+from flightmodel.statistics import KNOTS_A_LENGTH, correlation, correlation_inverse, correlation_root
 from flightmodel.telemetry import Sounding
 
 R_AIR_JPKGK = WGS84.gas_jpkgk
@@ -321,6 +321,11 @@ def temperature_sd(altitude_m: FloatArray, planet: Planet = WGS84) -> FloatArray
 def sounding_correlation(altitude_m: FloatArray, length_m: float) -> FloatArray:
     """Correlation ``(n, n)`` of a sounding's error between altitudes (n,); the length is that of density or wind."""
     return correlation(altitude_m, length_m, SOUNDING_CONSTANT_PART)
+
+
+def sounding_correlation_inverse(altitude_m: FloatArray, length_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Inverse of `sounding_correlation` at rising altitudes (n,), as `statistics.correlation_inverse` has it."""
+    return correlation_inverse(altitude_m, length_m, SOUNDING_CONSTANT_PART)
 
 
 def sounding_correlation_root(

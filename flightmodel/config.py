@@ -6,6 +6,7 @@ import tomllib
 import unicodedata
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -83,7 +84,7 @@ class Section(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_coercion(cls, value: Any, info: ValidationInfo) -> Any:
-        wanted = set(_leaf_types(cls.model_fields[str(info.field_name)].annotation))
+        wanted = _wanted_types(cls, str(info.field_name))
         for leaf in _leaves(value):
             if isinstance(leaf, str) and leaf.startswith(FILL_IN_VALUE):
                 raise ValueError(FILL_IN)
@@ -94,6 +95,11 @@ class Section(BaseModel):
             if isinstance(leaf, (int, float)) and wanted == {bool} and not isinstance(leaf, bool):
                 raise ValueError("true or false is wanted")
         return value
+
+
+@cache  # a study checks the same few fields a hundred thousand times
+def _wanted_types(model: type[BaseModel], field: str) -> frozenset[type]:
+    return frozenset(_leaf_types(model.model_fields[field].annotation))
 
 
 def _leaf_types(annotation: Any) -> Iterator[type]:

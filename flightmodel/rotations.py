@@ -16,19 +16,22 @@ import numpy as np
 from flightmodel.checks import FloatArray
 
 
+def _components(values: FloatArray) -> list[FloatArray]:
+    values = np.asarray(values, dtype=float)
+    return [values[..., k] for k in range(values.shape[-1])]
+
+
 def multiply(p: FloatArray, q: FloatArray) -> FloatArray:
     """Hamilton product of ``(..., 4)`` quaternions."""
-    pw, px, py, pz = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
-    qw, qx, qy, qz = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
-    return np.stack(
-        [
-            pw * qw - px * qx - py * qy - pz * qz,
-            pw * qx + px * qw + py * qz - pz * qy,
-            pw * qy - px * qz + py * qw + pz * qx,
-            pw * qz + px * qy - py * qx + pz * qw,
-        ],
-        axis=-1,
-    )
+    pw, px, py, pz = _components(p)
+    qw, qx, qy, qz = _components(q)
+    w = pw * qw - px * qx - py * qy - pz * qz
+    out = np.empty((*w.shape, 4))
+    out[..., 0] = w
+    out[..., 1] = pw * qx + px * qw + py * qz - pz * qy
+    out[..., 2] = pw * qy - px * qz + py * qw + pz * qx
+    out[..., 3] = pw * qz + px * qy - py * qx + pz * qw
+    return out
 
 
 def conjugate(q: FloatArray) -> FloatArray:
@@ -65,13 +68,12 @@ def boxminus(q_to_from: FloatArray, reference_to_from: FloatArray) -> FloatArray
 
 def dcm_from_q(q: FloatArray) -> FloatArray:
     """Direction cosine matrices ``(..., 3, 3)``."""
-    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
-    rows = [
-        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-        np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-        np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
-    ]
-    return np.stack(rows, axis=-2)
+    w, x, y, z = _components(q)
+    out = np.empty((*w.shape, 3, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return out
 
 
 def q_from_dcm(dcm: FloatArray) -> FloatArray:
@@ -106,11 +108,12 @@ def slerp(time_s: FloatArray, q: FloatArray, at_s: FloatArray) -> FloatArray:
 
 def skew(v: FloatArray) -> FloatArray:
     """Matrices ``(..., 3, 3)`` with ``skew(a) @ b = a x b``."""
-    x, y, z = np.moveaxis(np.asarray(v, dtype=float), -1, 0)
-    o = np.zeros_like(x)
-    return np.stack(
-        [np.stack([o, -z, y], axis=-1), np.stack([z, o, -x], axis=-1), np.stack([-y, x, o], axis=-1)], axis=-2
-    )
+    x, y, z = _components(v)
+    out = np.zeros((*x.shape, 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -z, y
+    out[..., 1, 0], out[..., 1, 2] = z, -x
+    out[..., 2, 0], out[..., 2, 1] = -y, x
+    return out
 
 
 def lever_arm_acceleration(

@@ -35,6 +35,40 @@ def correlation(at: FloatArray, length: float, constant_part: float = 0.0) -> Fl
     return constant_part + (1.0 - constant_part) * np.exp(-apart / length)
 
 
+def correlation_inverse(
+    at: FloatArray, length: float, constant_part: float = 0.0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Inverse of `correlation` at rising places ``(n,)``, as ``tridiagonal - u u^T``.
+
+    Parameters
+    ----------
+    at : (n,) float
+    length : float
+        In the unit of ``at``.
+    constant_part : float
+
+    Returns
+    -------
+    tuple
+        Diagonal ``(n,)``, what lies beside it ``(n - 1,)``, and ``u (n,)``.
+
+    Notes
+    -----
+    A Gauss-Markov error depends on its neighbours alone: with ``c = exp(-apart / length)`` its inverse correlation has
+    ``-c / (1 - c^2)`` beside the diagonal. The constant part adds an outer product (Sherman-Morrison).
+    """
+    keep = np.exp(-np.diff(at) / length)
+    fresh = (1.0 - constant_part) * (1.0 - keep**2)
+    diagonal = np.full(len(at), 1.0 / (1.0 - constant_part))
+    diagonal[1:] += keep**2 / fresh
+    diagonal[:-1] += keep**2 / fresh
+    beside = -keep / fresh
+    row_sums = diagonal.copy()
+    row_sums[1:] += beside
+    row_sums[:-1] += beside
+    return diagonal, beside, row_sums * np.sqrt(constant_part / (1.0 + constant_part * row_sums.sum()))
+
+
 def symmetric_root(covariance: FloatArray) -> FloatArray:
     """Symmetric roots of covariances ``(..., k, k)``: smooth in time whatever the order of the eigenvalues."""
     value, axes = np.linalg.eigh(covariance)

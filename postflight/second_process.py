@@ -1,4 +1,6 @@
-"""What does a second process do for a run? It reads the film while the first one reconstructs, then draws the figures.
+"""What does a second process do for a command? It reads the film while the first reconstructs, then draws the figures.
+
+Of a reconciliation it does what does not need the fit.
 
 Figures take as much processor time as the trajectory, and nothing waits for them but the end of the command; a film
 takes a quarter of it, and needs no trajectory. The process is started early, so that it has matplotlib loaded when
@@ -12,6 +14,7 @@ import contextlib
 import multiprocessing
 import signal
 import warnings
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -41,12 +44,13 @@ class SecondProcess:
 
     Parameters
     ----------
-    figures : Path
-        Folder of the figures.
+    figures : Path, optional
+        Folder of the figures, where some are to be drawn.
     """
 
-    def __init__(self, figures: Path) -> None:
-        self._figures = figures
+    def __init__(self, figures: Path | None = None) -> None:
+        self._figures = figures or Path()
+        self._asked: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         self._flight: Reconstruction | None = None
         self._drawing: list[tuple[_Part, tuple[Any, ...]]] = []
         self._reading = False
@@ -83,6 +87,22 @@ class SecondProcess:
                 found = self._here.recv()
         return found
 
+    def ask(self, work: Callable[..., Any], *arguments: Any) -> None:
+        """Let it call a function, which is found by its module and name."""
+        self._asked.append((work, arguments))
+        self._send(("work", (work, arguments)))
+
+    def answer(self) -> Any:
+        """What the earliest function that was asked for returns; called here where the other process failed."""
+        work, arguments = self._asked.pop(0)
+        found: tuple[Any, _Warnings] | None = None
+        with contextlib.suppress(EOFError, OSError):
+            found = self._here.recv()
+        if found is None:  # an error, too, is raised here
+            return work(*arguments)
+        _warn(found[1])
+        return found[0]
+
     def draw_trajectory(self, flight: Reconstruction) -> None:
         """Let it draw the trajectory."""
         self._flight = flight
@@ -116,8 +136,7 @@ class SecondProcess:
                 continue
             if isinstance(found, OSError):
                 raise found
-            for category, words in found:
-                warnings.warn(category(words), stacklevel=2)
+            _warn(found)
 
     def _draw(self, part: _Part, *arguments: Any) -> None:
         self._drawing.append((part, arguments))
@@ -126,6 +145,11 @@ class SecondProcess:
     def _send(self, what: Any) -> None:
         # where nobody receives, those who wait for an answer find out
         self._sender.submit(self._here.send_bytes, ForkingPickler.dumps(what))
+
+
+def _warn(given: _Warnings) -> None:
+    for category, words in given:
+        warnings.warn(category(words), stacklevel=3)
 
 
 def _draw(part: _Part, flight: Reconstruction | None, figures: Path, arguments: tuple[Any, ...]) -> None:
@@ -143,6 +167,17 @@ def _drawn(part: _Part, flight: Reconstruction | None, figures: Path, arguments:
         except OSError as fault:
             return fault
     return [(one.category, str(one.message)) for one in given]
+
+
+def _answered(work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, _Warnings] | None:
+    """What a function returns, and the warnings; None where it raises an error."""
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        try:
+            found = work(*arguments)
+        except Exception:  # the first process calls it again, and has the error
+            return None
+    return found, [(one.category, str(one.message)) for one in given]
 
 
 def _film(flight: Flight) -> FilmFit | None:
@@ -164,5 +199,7 @@ def _serve(connection: Connection, figures: Path) -> None:
             kind, arguments = connection.recv()
             if kind == "flight":
                 (flight,) = arguments
+            elif kind == "work":
+                connection.send(_answered(*arguments))
             else:
                 connection.send(_film(*arguments) if kind == "film" else _drawn(kind, flight, figures, arguments))

@@ -399,6 +399,10 @@ def reconstruct_once(
     if sensors is not None and adaptation.lag is None:
         more, adaptation = _oscillation_checks(telemetry, settings, sensors, problem, reference, adaptation)
         checks += more
+    filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
+    residuals = consistency.residual_table(problem, run.innovations)
+    edits = consistency.edit_findings(problem, run.innovations.accepted)
+    del run  # as large as all that follows together
     series = _series(problem, sensors, reference, smoothed)
     findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
     if sensors is not None:
@@ -407,9 +411,9 @@ def reconstruct_once(
     path = datum_trajectory(problem, mount, reference, smoothed.triangles)
     return TrajectorySolution(
         smoothed=path,
-        filtered=datum_trajectory(problem, mount, run.states(), run.filtered.p_plus),
+        filtered=filtered,
         sensor_errors=table,
-        residuals=consistency.residual_table(problem, run.innovations),
+        residuals=residuals,
         held_out=held_out,
         consistency_checks=tuple(checks),
         imu_time_s=series[0],
@@ -422,7 +426,7 @@ def reconstruct_once(
         findings=(
             *findings,
             *(span.finding() for span in spans),
-            *consistency.edit_findings(problem, run.innovations.accepted),
+            *edits,
         ),
         provenance={
             "flight": telemetry.name,

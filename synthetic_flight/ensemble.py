@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -51,14 +51,11 @@ class Start:
         which four of the parameters scale.
     atmosphere : (rows, 6) float
         `synthetic_flight.simulate.atmosphere_table` of the flight's own atmosphere.
-    altitude_m : (2,) float, optional
-        Between which altitudes a short flight stays: no other air is looked at then.
     """
 
     state: FloatArray
     parameters: FloatArray
     atmosphere: FloatArray
-    altitude_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -119,7 +116,7 @@ def fly_ensemble(
             f"fly_ensemble: workers, steps and records must be positive; got {workers}, {schedule}",
             code="ensemble-arguments",
         )
-    _check_mass(vehicle)
+    check_mass(vehicle)
     check_step(vehicle, schedule.step_s)
     remaining = iter(runs)
     with ThreadPoolExecutor(workers) as pool:
@@ -137,33 +134,20 @@ def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule:
     """Fly at most `LANES` flights side by side, in this thread; see `fly_ensemble`."""
     padded = starts + [starts[-1]] * (LANES - len(starts))
     shared = all(s.atmosphere is starts[0].atmosphere for s in starts)
-    rows = _rows_needed(starts)
     lanes = integrate_lanes(
         vehicle,
-        starts[0].atmosphere[rows] if shared else np.stack([s.atmosphere[rows] for s in padded]),
+        starts[0].atmosphere if shared else np.stack([s.atmosphere for s in padded]),
         np.stack([simulate.with_creep(s.state, vehicle) for s in padded]),
         np.stack([s.parameters for s in padded]),
         schedule.step_s,
         schedule.per_record,
         schedule.records,
         schedule.lock_records,
-        air_from_m=ATMOSPHERE_START_M + rows.start * ATMOSPHERE_STEP_M,
     )
     return [Flown(run, *lane) for run, lane in zip(runs, lanes, strict=False)]
 
 
-def _rows_needed(starts: list[Start]) -> slice:
-    """Rows of the tables of air that flights need, two at least: copying all of each takes longer than a flight."""
-    given = [s.altitude_m for s in starts if s.altitude_m is not None]
-    last = len(starts[0].atmosphere)
-    if len(given) < len(starts):
-        return slice(0, last)
-    low, high = ((altitude - ATMOSPHERE_START_M) / ATMOSPHERE_STEP_M for altitude in np.array(given).T)
-    first = int(np.clip(np.floor(low.min()), 0, last - 2))
-    return slice(first, int(np.clip(np.ceil(high.max()) + 1, first + 2, last)))
-
-
-def _check_mass(vehicle: Vehicle) -> None:
+def check_mass(vehicle: Vehicle) -> None:
     """Refuse a vehicle whose mass properties change in flight: all lanes have one set of them throughout."""
     if vehicle.mass_steps:
         raise ConfigError(
@@ -183,7 +167,7 @@ def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[
     ConfigError
         ``mass-changes``: the vehicle's mass properties change in flight.
     """
-    _check_mass(vehicle)
+    check_mass(vehicle)
     flown: list[Flown] = []
     for leg in legs:
         if flown:
@@ -367,7 +351,7 @@ def start_of(case: Case, step_s: float, locked: bool) -> Start:
     return Start(initial_state(case.scenario), parameters, simulate.atmosphere_table(case.profile))
 
 
-def fly_runs(plan: Plan, runs: list[int], draws_of: Callable[[int], dict[str, float]]) -> list[Row]:
+def fly_runs(plan: Plan, runs: Sequence[int], draws_of: Callable[[int], dict[str, float]]) -> list[Row]:
     """Fly runs and keep what the plan asks for, in their order.
 
     Parameters

@@ -42,11 +42,12 @@ class Slopes:
     cmq: float = 0.0
 
 
-def slopes_at(vehicle: Vehicle, mach: float) -> Slopes:
-    """Slopes of a vehicle's coefficient table at zero angle of attack, between its first two angles."""
+def slopes_at(vehicle: Vehicle, mach: FloatArray) -> list[Slopes]:
+    """Slopes at Mach numbers ``(n,)`` of a vehicle's coefficient table at angle zero, between its first two angles."""
     step = float(vehicle.aero.alpha_rad[1])
     zero, first = vehicle.aero.at(mach, 0.0), vehicle.aero.at(mach, step)
-    return Slopes(float(zero[0]), float(first[1] / step), float(first[2] / step), float(zero[3]))
+    columns = np.column_stack([zero[:, 0], first[:, 1] / step, first[:, 2] / step, zero[:, 3]])
+    return [Slopes(*row) for row in columns.tolist()]
 
 
 def linear_matrix(vehicle: Vehicle, slopes: Slopes, pressure_pa: float, speed_mps: float) -> FloatArray:

@@ -16,6 +16,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flightmodel import airdata, earth, rotations, sphere_cone
 from flightmodel.atmosphere import AtmosphereProfile, gas_constant, mean_free_path, us76
@@ -233,6 +234,34 @@ def integrate_lanes(
     """
     lanes, width = states.shape
     out, aux = np.empty((lanes, records, width)), np.empty((lanes, records, AUX))
+    written = integrate_into(
+        out, aux, vehicle, atmosphere, states, parameters, step_s, per_record, lock_records, planet, air_from_m
+    )
+    counts = np.abs(written)
+    return [(*_finite_records(out[k, :n], aux[k, :n]), bool(written[k] < 0)) for k, n in enumerate(counts.tolist())]
+
+
+def integrate_into(
+    out: FloatArray,
+    aux: FloatArray,
+    vehicle: Vehicle,
+    atmosphere: FloatArray,
+    states: FloatArray,
+    parameters: FloatArray,
+    step_s: float,
+    per_record: int,
+    lock_records: int = 0,
+    planet: earth.Planet = earth.WGS84,
+    air_from_m: float = ATMOSPHERE_START_M,
+) -> NDArray[np.int64]:
+    """`integrate_lanes` into ``out`` (lanes, records, 20 or 22) and ``aux`` (lanes, records, 18).
+
+    Returns
+    -------
+    (lanes,) int
+        Records that are written, negative where the joint diverged; what follows them is left as it was.
+    """
+    lanes, records, width = out.shape
     written = np.zeros(lanes, dtype=np.int64)
     at.integrate(
         (0,) * lanes,
@@ -250,8 +279,7 @@ def integrate_lanes(
         aux,
         written,
     )
-    counts = np.abs(written)
-    return [(*_finite_records(out[k, :n], aux[k, :n]), bool(written[k] < 0)) for k, n in enumerate(counts.tolist())]
+    return written
 
 
 def fly(
@@ -432,10 +460,10 @@ def parameter_vector(
         (at.I_A, at.W_A, at.N_A, at.P_A, shell),
     ):
         arm = vehicle.joint_m - part.cg_m
-        inverse = np.linalg.inv(part.inertia)
+        lever, inverse = rotations.skew(arm), np.linalg.inv(part.inertia)
         p[inertia_at : inertia_at + 6] = part.inertia[upper]
         p[inverse_at : inverse_at + 6] = inverse[upper]
-        p[mobility_at : mobility_at + 6] = (-rotations.skew(arm) @ inverse @ rotations.skew(arm))[upper]
+        p[mobility_at : mobility_at + 6] = (-lever @ inverse @ lever)[upper]
         p[arm_at : arm_at + 3] = arm
     p[at.NOSE_A : at.NOSE_A + 3] = -shell.cg_m
     freeplay = np.deg2rad(joint.freeplay_deg)

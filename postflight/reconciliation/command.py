@@ -41,6 +41,7 @@ from postflight.reconciliation.posterior import (
     vehicle_file_lines,
 )
 from postflight.reconstruction import Reconstruction, reconstruct
+from postflight.second_process import SecondProcess
 from postflight.studies.commands import bands, compared_with_bounds
 from postflight.studies.preflight import Bounds, entry_bounds, rigid_bounds
 from postflight.terminal import progress_bar
@@ -134,7 +135,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     settings = {"reconcile": True, "laws": list(laws), "posterior": sampled, "output_rate_hz": 20.0}
     if sampled:
         require_samplers()
-    with progress_bar() as report:
+    with progress_bar() as report, SecondProcess() as second:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
         require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
@@ -142,17 +143,17 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         flight = reconstruct(
             Flight(telemetry), Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
         )
-        answers = estimate(flight, ("fused",), lambda f, what: report(0.2 + 0.1 * f, what))
-        fitting = 0.3 if sampled else 0.6
-        selection = select_laws(flight, laws, lambda f, what: report(0.3 + fitting * f, what))
+        second.ask(_without_fit, flight)
+        fitting = 0.4 if sampled else 0.7
+        selection = select_laws(flight, laws, lambda f, what: report(0.2 + fitting * f, what))
         fit, odds = selection.fit, selection.log_odds
         posterior = None
         if sampled:
             posterior, nested = sample_selection(selection, lambda f, what: report(0.6 + 0.3 * f, what))
             odds |= nested
         modal, no_modes = _modes(flight, fit)
-        rigid = rigid_bounds(flight, ENTRIES, progress=lambda f, what: report(0.9 + 0.05 * f, what))
-        flexible = reconciled_bounds(fit, flight, lambda f, what: report(0.95 + 0.05 * f, what))
+        flexible = reconciled_bounds(fit, flight, lambda f, what: report(0.9 + 0.1 * f, what))
+        fused, rigid = second.answer()
         shares, _, bands_picture = compared_with_bounds(flight, rigid, flexible)
         with run_folder.RunFolder(folder, telemetry, settings) as out:
             table = joint_table(fit)
@@ -177,7 +178,6 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
                 draw(figures / "modes.png", figure_modes, modal, telemetry)
             if posterior is not None:
                 draw(figures / "posterior.png", figure_posterior, posterior, telemetry)
-            fused = answers.histories.get("fused")
             draw(figures / "reconciled.png", figure_reconciled, fit, telemetry, deflection, fused)
     _print_joint(fit, table, odds)
     print_checks(checks)
@@ -193,6 +193,11 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     )
     console.print(f"the flight lies inside the bands of {ENTRIES} entries, of the pulse: {inside}")
     console.print(f"results in {escape(str(out.path))}")
+
+
+def _without_fit(flight: Reconstruction) -> tuple[DeflectionHistory | None, Bounds]:
+    """Fused deflection, and bands of entries with the joint locked."""
+    return estimate(flight, ("fused",)).histories.get("fused"), rigid_bounds(flight, ENTRIES)
 
 
 def _modal(flight: Reconstruction, fit: JointFit) -> ModalStiffness:

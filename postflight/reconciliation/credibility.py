@@ -8,8 +8,8 @@ of the reconstruction are (`recon.consistency`).
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
+from flightmodel.statistics import chi_square_quantile
 from postflight.reconciliation.fit import JointFit, mismatched_spans
 from postflight.reconciliation.forward_model import MOTION
 from postflight.reconciliation.modes import ModalStiffness
@@ -43,7 +43,7 @@ def _residuals(fit: JointFit) -> ConsistencyCheck:
     first = problem.motion - 3
     degrees = int((problem.weight > 0.0).sum()) + fit.residuals.joins.size - problem.motion * problem.measured.spans
     degrees += first
-    high = float(chi2.ppf(CONFIDENCE, degrees)) / degrees
+    high = chi_square_quantile(CONFIDENCE, degrees) / degrees
     return consistency_check(
         "joint-residuals", "reconciliation: residuals", fit.residuals.cost / degrees, 0.0, high,
         "residuals no larger than predicted", "residuals are larger than predicted", advice=JOINT_WORDS,

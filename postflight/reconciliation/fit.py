@@ -46,6 +46,7 @@ from postflight.reconciliation.forward_model import (
     select_measurements,
 )
 from postflight.reconciliation.gauss_newton import (
+    INSTRUMENTS,
     Linearization,
     Parameters,
     Problem,
@@ -126,7 +127,8 @@ class JointFit:
     @cached_property
     def creep_scores(self) -> tuple[CreepScore, ...]:
         """What the linear problem at the solution says of creep with each of `CREEP_TIMES_S`; of a fit without any."""
-        return tuple(_creep_score(self, time_s) for time_s in CREEP_TIMES_S)
+        plain = self.problem.linearize(self.parameters)
+        return tuple(_creep_score(self, plain, time_s) for time_s in CREEP_TIMES_S)
 
 
 @dataclass(frozen=True)
@@ -217,14 +219,39 @@ class CreepScore:
         return self.delayed / self.sd
 
 
-def _creep_score(fit: JointFit, time_s: float) -> CreepScore:
+def _creep_score(fit: JointFit, plain: Linearization, time_s: float) -> CreepScore:
     """Step of the delayed compliance from none, all other parameters following, and its sd."""
     problem, start = _without_creep_yet(fit, time_s)
     k = problem.vehicle_parameters.names.index("creep growth")
-    normal = problem.normal_equations(start, problem.linearize(start))
+    normal = problem.normal_equations(start, _linearized_with_creep(fit.problem, plain, problem, start))
     unit = np.eye(len(normal.right))[k]
     step, variance = normal.solve(normal.right)[k], normal.solve(unit)[k]
     return CreepScore(time_s, CREEP_PER_S * time_s * float(step), CREEP_PER_S * time_s * float(np.sqrt(variance)))
+
+
+def _linearized_with_creep(plain: Problem, known: Linearization, problem: Problem, start: Parameters) -> Linearization:
+    """Linearize a problem with creep where there is none yet: only what creep adds is flown, all else is known.
+
+    Without creep no other parameter moves it, so that the joins' last rows are of creep alone.
+    """
+    sought, more = plain.vehicle_parameters.sought, problem.first_instrument - plain.first_instrument
+    column = np.arange(plain.first_motion)
+    column[sought:] += more
+    motion = problem.first_motion + problem.motion * np.arange(plain.measured.spans)[:, None] + np.arange(plain.motion)
+    column = np.concatenate([column, motion.ravel()])
+    wanted = np.ones(problem.count, dtype=bool)
+    wanted[column] = False
+    added = problem.linearize(start, wanted)
+    sensors, joins = [], []
+    for (old, response), (new, by_creep) in zip(known.sensors, added.sensors, strict=True):
+        own = len(new) - INSTRUMENTS  # which both have
+        sensors.append((np.concatenate([new[:own], column[old]]), np.column_stack([by_creep[:, :own], response])))
+    for (old, response), (new, by_creep) in zip(known.joins, added.joins, strict=True):
+        own = len(old) - plain.motion  # without the next start's, which both have
+        still = np.zeros((problem.motion - plain.motion, own))
+        both = np.column_stack([by_creep, np.concatenate([response[:, :own], still])])
+        joins.append((np.concatenate([new, column[old[:own]]]), both))
+    return Linearization(added.residuals, sensors, joins, problem.count)
 
 
 def _without_creep_yet(fit: JointFit, time_s: float) -> tuple[Problem, Parameters]:

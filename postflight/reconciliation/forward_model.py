@@ -20,6 +20,7 @@ or a gyro's mounting does to a reconstructed path of 9 g turns with the vehicle,
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -32,6 +33,7 @@ from flightmodel.atmosphere import (
     WIND_LENGTH_M,
     profile_from_sounding,
     sounding_correlation,
+    sounding_correlation_inverse,
     temperature_sd,
     unresolved_variance,
 )
@@ -45,8 +47,8 @@ from postflight.reconstruction import Reconstruction
 from recon.atmosphere import cg_accelerations, windows_are_whole
 from synthetic_flight import simulate
 from synthetic_flight._kernels import CREEP_STATES
-from synthetic_flight.dynamics import joint_modes
-from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
+from synthetic_flight.dynamics import check_step, joint_modes
+from synthetic_flight.ensemble import LANES, available_cores, check_mass
 
 # at 1200 m/s a tenth of a second: knots resolve gusts at the joint's 2 to 4 Hz; coarser in thin air
 KNOT_M, UPPER_KNOT_M = 125.0, 250.0
@@ -238,14 +240,23 @@ class AtmosphereParameters:
         return np.asarray(np.interp(altitude_m, self.knots_m, apart))
 
     @cached_property
-    def precision(self) -> FloatArray:
-        """Inverse covariance (3, k, k) of the sounding: half constant bias, half Gauss-Markov along altitude."""
+    def inverse_covariance(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
+        """Of each kind the inverse covariance of the sounding: diagonal (k,), beside it (k - 1,), ``u`` (k,).
+
+        Half of the variance is a constant bias, which makes ``-u u^T``, half Gauss-Markov along altitude.
+        """
         at = profile_from_sounding(self.sounding).at(self.knots_m)
         out = []
         for sd, length in ((at.density_sd, DENSITY_LENGTH_M), *[(at.wind_sd_mps, WIND_LENGTH_M)] * 2):
-            correlation = sounding_correlation(self.knots_m, length)
-            out.append(np.linalg.inv(sd[:, None] * correlation * sd))
-        return np.array(out)
+            diagonal, beside, u = sounding_correlation_inverse(self.knots_m, length)
+            out.append((diagonal / sd**2, beside / (sd[:-1] * sd[1:]), u / sd))
+        return tuple(out)
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """The same as full matrices (3, k, k)."""
+        parts = self.inverse_covariance
+        return np.array([np.diag(d) + np.diag(e, 1) + np.diag(e, -1) - np.outer(u, u) for d, e, u in parts])
 
     def unresolved_structure(self, altitude_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (n,) of log density and of wind, m/s, of the structure between the knots."""
@@ -274,27 +285,54 @@ class AtmosphereParameters:
         table[:, 0] *= np.exp(ratio)
         table[:-1, 1] += np.diff(ratio)
         # the root of the ratio of temperatures, which no trial step makes negative
-        table[:, 2] *= np.exp(0.5 * np.interp(rows, self.temperature_knots_m, warmer_k) / temperature)
+        warmer = np.interp(rows, self.temperature_knots_m, warmer_k)
+        table[:, 2] *= np.exp(0.5 * warmer / temperature)
         table[:, 3] += north
         table[:, 4] += east
         return table
 
-    def moved_table(self, table: FloatArray, kind: int, knot: int, step: float) -> FloatArray:
-        """Kernel table with one difference (log density, north, east wind) moved at one knot; rows about it change."""
-        knots, rows = self.knots_m, self._sounded[1]
-        first = 0 if knot == 0 else int(np.searchsorted(rows, knots[knot - 1])) - 1
-        last = len(rows) if knot == len(knots) - 1 else int(np.searchsorted(rows, knots[knot + 1])) + 1
-        near = slice(max(first, 0), last)
-        unit = np.zeros(len(knots))
-        unit[knot] = step
-        change = np.interp(rows[near], knots, unit)
-        table = table.copy()
+    def moved_rows(self, table: FloatArray, kind: int, knot: int, step: float) -> MovedRows:
+        """Rows of a kernel table that change where one difference (log density, north, east wind) moves at one knot."""
+        near, hat = self._hats[knot]
+        rows, change = table[near].copy(), step * hat
         if kind == 0:
-            table[near, 0] *= np.exp(change)
-            table[near, 1][:-1] += np.diff(change)
+            rows[:, 0] *= np.exp(change)
+            rows[:-1, 1] += change[1:] - change[:-1]
         else:
-            table[near, 2 + kind] += change
-        return table
+            rows[:, 2 + kind] += change
+        return MovedRows(near.start, rows)
+
+    def warmed_rows(self, table: FloatArray, knot: int, step_k: float) -> MovedRows:
+        """Rows of a kernel table that change where the temperature moves at one of its knots."""
+        near, hat = self._temperature_hats[knot]
+        rows = table[near].copy()
+        rows[:, 2] *= np.exp(0.5 * step_k * hat / self._sounded_temperature[near])
+        return MovedRows(near.start, rows)
+
+    @cached_property
+    def _hats(self) -> list[tuple[slice, FloatArray]]:
+        return hats(self._sounded[1], self.knots_m)
+
+    @cached_property
+    def _temperature_hats(self) -> list[tuple[slice, FloatArray]]:
+        return hats(self._sounded[1], self.temperature_knots_m)
+
+
+def hats(rows_m: FloatArray, knots_m: FloatArray) -> list[tuple[slice, FloatArray]]:
+    """Of each knot the rows about it, to the knots beside it or the table's end, and what one at the knot is there."""
+    low = np.maximum(np.searchsorted(rows_m, knots_m[:-1]) - 1, 0).tolist()
+    high = (np.searchsorted(rows_m, knots_m[1:]) + 1).tolist()
+    near = [slice(*ends) for ends in zip([0, *low], [*high, len(rows_m)], strict=True)]
+    units = np.eye(len(knots_m))
+    return [(part, np.interp(rows_m[part], knots_m, unit)) for part, unit in zip(near, units, strict=True)]
+
+
+@dataclass(frozen=True)
+class MovedRows:
+    """What one kernel table of the air has instead of another's: ``rows`` (n, 6) from row ``first`` on."""
+
+    first: int
+    rows: FloatArray
 
 
 START_ALTITUDE_M = 100e3
@@ -503,10 +541,12 @@ class SpanFlights:
     Parameters
     ----------
     span, vehicle, table : (m,) int
+        Table 0 is ``air``, table k has the rows of ``moved[k - 1]``.
     motion : (m, 15 or 17) float
     vehicles : list of TrialVehicle
-    tables : list of (rows, 6) float
-        Kernel tables of the atmosphere.
+    air : (rows, 6) float
+        Kernel table of the atmosphere.
+    moved : list of MovedRows
     """
 
     span: Index
@@ -514,7 +554,22 @@ class SpanFlights:
     motion: FloatArray
     table: Index
     vehicles: list[TrialVehicle]
-    tables: list[FloatArray]
+    air: FloatArray
+    moved: list[MovedRows] = field(default_factory=list)
+
+    def air_of(self, flights: Index, rows: slice) -> FloatArray:
+        """Rows of the tables of some flights (k,): (k, n, 6), or (n, 6) where all have table 0."""
+        whole, tables = self.air[rows], self.table[flights].tolist()
+        if not any(tables):
+            return whole
+        out = np.repeat(whole[None], len(tables), axis=0)
+        for lane, k in zip(out, tables, strict=True):
+            if k:
+                moved = self.moved[k - 1]
+                first, last = max(moved.first, rows.start), min(moved.first + len(moved.rows), rows.stop)
+                if last > first:
+                    lane[first - rows.start : last - rows.start] = moved.rows[first - moved.first : last - moved.first]
+        return out
 
 
 @dataclass(frozen=True)
@@ -562,26 +617,65 @@ def resolved_stiffness_nmprad(vehicle: Vehicle) -> float:
 
 def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) -> PredictedSpans:
     """Fly spans and predict the sensors' windows; ``nominal`` gives the coefficient table."""
-    starts = _start_states(measured, flights)
-    # a span that leaves these by a trial vehicle's tumbling meets the air at their ends
-    passed = np.abs(np.gradient(measured.altitude_m)) + SPAN_MARGIN_M
-    lowest, highest = measured.altitude_m - passed, measured.altitude_m + passed
-
-    def start_of(k: int) -> Start:
-        vehicle = flights.vehicles[flights.vehicle[k]]
-        table, span = flights.tables[flights.table[k]], flights.span[k]
-        return Start(starts[k], vehicle.kernel_vector, table, (lowest[span], highest[span]))
-
     steps = measured.steps
-    states = np.full((len(starts), steps.records, starts.shape[1]), np.nan)
-    aux = np.full((len(starts), steps.records, 18), np.nan)
-    schedule = Schedule(steps.step_s, steps.per_record, steps.records)
-    for flown in fly_ensemble(integrable(nominal, steps), start_of, range(len(starts)), schedule):
-        states[flown.run, : len(flown.states)], aux[flown.run, : len(flown.aux)] = flown.states, flown.aux
+    states, aux = _flown(measured, integrable(nominal, steps), flights)
     windows, slope = _windows(measured, flights, states, aux)
     middle = states[:, steps.intervals // 2 :: steps.intervals]
     deflection = rotations.log(rotations.multiply(rotations.conjugate(middle[..., 6:10]), middle[..., 10:14]))
     return PredictedSpans(windows, slope, deflection, _ends(measured, flights, states[:, -1]))
+
+
+def _flown(measured: Measurements, vehicle: Vehicle, flights: SpanFlights) -> tuple[FloatArray, FloatArray]:
+    """States (m, records, 20 or 22) and auxiliaries (m, records, 18), sixteen flights side by side; else NaN."""
+    check_mass(vehicle)
+    starts, steps, first, last = _start_states(measured, flights), measured.steps, *_rows_passed(measured, flights)
+    check_step(vehicle, steps.step_s)
+    parameters = np.array([each.kernel_vector for each in flights.vehicles])
+    shape = (len(starts), steps.records)
+    states, aux = np.full((*shape, starts.shape[1]), np.nan), np.full((*shape, simulate.AUX), np.nan)
+
+    def fly(begin: int) -> None:
+        block = slice(begin, min(begin + LANES, len(starts)))
+        which = np.minimum(np.arange(begin, begin + LANES), len(starts) - 1)
+        rows = slice(int(first[block].min()), int(last[block].max()))
+        whole = block.stop - begin == LANES
+        out, more = (states[block], aux[block]) if whole else (a[which] for a in (states, aux))
+        simulate.integrate_into(
+            out, more, vehicle, flights.air_of(which, rows), starts[which], parameters[flights.vehicle[which]],
+            steps.step_s, steps.per_record,
+            air_from_m=simulate.ATMOSPHERE_START_M + rows.start * simulate.ATMOSPHERE_STEP_M,
+        )  # fmt: skip
+        if not whole:
+            states[block], aux[block] = out[: block.stop - begin], more[: block.stop - begin]
+
+    def fly_blocks(begins: Index) -> None:
+        for begin in begins.tolist():
+            fly(begin)
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        blocks = range(0, len(starts), LANES)
+        # a few tasks each: handing over a block takes as long as flying it
+        parts = np.array_split(blocks, min(len(blocks), 4 * available_cores()))
+        list(pool.map(fly_blocks, parts))
+    lost = ~np.isfinite(states).all(axis=2)
+    if lost.any():
+        lost = np.logical_or.accumulate(lost, axis=1)
+        states[lost], aux[lost] = np.nan, np.nan
+    return states, aux
+
+
+def _rows_passed(measured: Measurements, flights: SpanFlights) -> tuple[Index, Index]:
+    """First row (m,) of the tables of air that each flight needs, and the first (m,) that it does not, two at least.
+
+    A span that leaves them by a trial vehicle's tumbling meets the air at their ends.
+    """
+    passed = np.abs(np.gradient(measured.altitude_m)) + SPAN_MARGIN_M
+    ends = np.stack([measured.altitude_m - passed, measured.altitude_m + passed])
+    low, high = (ends - simulate.ATMOSPHERE_START_M) / simulate.ATMOSPHERE_STEP_M
+    count = len(flights.air)
+    first = np.clip(np.floor(low).astype(np.int64), 0, count - 2)
+    last = np.clip(np.ceil(high).astype(np.int64) + 1, first + 2, count)
+    return first[flights.span], last[flights.span]
 
 
 def _start_states(measured: Measurements, flights: SpanFlights) -> FloatArray:

@@ -24,7 +24,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flightmodel.checks import DivergenceError, FloatArray
+from flightmodel.checks import BoolArray, DivergenceError, FloatArray
 from postflight.reconciliation.forward_model import (
     ATTITUDE,
     CREEP,
@@ -36,6 +36,7 @@ from postflight.reconciliation.forward_model import (
     AtmosphereParameters,
     Index,
     Measurements,
+    MovedRows,
     PredictedSpans,
     SpanFlights,
     TrialVehicle,
@@ -47,6 +48,7 @@ from postflight.reconciliation.normal_equations import ArrowMatrix, NormalEquati
 from synthetic_flight import simulate
 
 INSTRUMENTS = 20
+BORDERS = 3  # of the normal equations: of the sounding's errors that are constant in density, north and east wind
 # process noise of the joins per rad of flow angle that turbulence between knots GUST_KNOT_M apart makes, at the largest
 # dynamic pressure: rotation rad, rate rad/s, deflection rad, its rate rad/s, velocity m/s (of a span's lateral force);
 # and the noise that is left in vacuum
@@ -269,7 +271,7 @@ class Problem:
         spans = np.arange(self.measured.spans)
         zero = np.zeros_like(spans)
         table = self.air.table(u.air, u.warmer_k)
-        flights = SpanFlights(spans, zero, u.motion, zero, [self.trial_vehicle(u.vehicle)], [table])
+        flights = SpanFlights(spans, zero, u.motion, zero, [self.trial_vehicle(u.vehicle)], table)
         return fly_spans(self.measured, self.vehicle_parameters.nominal, flights)
 
     def instrument_response(self, predicted: PredictedSpans) -> FloatArray:
@@ -313,15 +315,18 @@ class Problem:
         """Sum of squares of the a priori residuals."""
         return sum(float(value @ precision @ value) for _, precision, value in self._priors(u))
 
-    def linearize(self, u: Parameters) -> Linearization:
-        """Residuals and their derivatives at ``u``, by forward differences of flown spans."""
-        flights, columns, steps = self._perturbed(u)
+    def linearize(self, u: Parameters, wanted: BoolArray | None = None) -> Linearization:
+        """Residuals and their derivatives at ``u``, by forward differences of flown spans.
+
+        With a mask ``wanted`` (count,) by those parameters alone, and by the instruments'.
+        """
+        flights, columns, steps = self._perturbed(u, np.ones(self.count, dtype=bool) if wanted is None else wanted)
         moved, base = fly_spans(self.measured, self.vehicle_parameters.nominal, flights), self.predict(u)
         rows = self.instrument_response(base)
         at, sensors, joins = 0, [], []
         for span, (column, step) in enumerate(zip(columns, steps, strict=True)):
             part = slice(at, at := at + len(column))
-            step[self.held_columns] = np.inf  # no step moves what is held
+            step[np.isin(column, self.held_columns)] = np.inf  # no step moves what is held
             change = self.sensed_change(
                 u, moved.windows[part] - base.windows[span], moved.slope[part] - base.slope[span]
             )
@@ -338,12 +343,46 @@ class Problem:
 
     def normal_equations(self, u: Parameters, linear: Linearization) -> NormalEquations:
         """Normal equations of a step from ``u``."""
-        matrix = ArrowMatrix.zeros(self.first_motion, self.motion * self.measured.spans, 2 * self.motion - 1)
+        place, shared, reach = self._arranged
+        knots, first_air = len(self.air.knots_m), self.first_instrument + INSTRUMENTS
+        matrix = ArrowMatrix.zeros(shared, len(place) + BORDERS - shared, reach)
         for column, response in (*linear.sensors, *linear.joins):
-            matrix.add(column, response.T @ response)
+            matrix.add(place[column], response.T @ response)
         for part, precision, _ in self._priors(u):
-            matrix.add(np.arange(part.start, part.stop), precision)
-        return NormalEquations(matrix, self.right_hand_side(u, linear, linear.residuals))
+            if not first_air <= part.start < self.first_temperature:
+                matrix.add(place[part], precision)
+        for kind, (diagonal, beside, constant) in enumerate(self.air.inverse_covariance):
+            at, border = place[first_air + kind * knots :][:knots], shared - BORDERS + kind
+            matrix.add_pairs(at, at, diagonal)
+            matrix.add_pairs(at[:-1], at[1:], beside)
+            matrix.across[at - shared, border] = constant
+            matrix.corner[border, border] = 1.0
+        return NormalEquations(matrix, self.right_hand_side(u, linear, linear.residuals), place)
+
+    @cached_property
+    def _arranged(self) -> tuple[Index, int, int]:
+        """Rows (count,) of the parameters in the matrix, how many are shared, and how far from the diagonal it reaches.
+
+        First vehicle, instruments, temperature, and a border for each kind of air; then span by span the air that it is
+        the first to pass, from above, and its motion. Air that no span passes comes before all spans, or after.
+        """
+        measured, free = self.measured, self.first_instrument + INSTRUMENTS
+        warm, spans = self.first_motion - self.first_temperature, np.arange(self.measured.spans)
+        passed = np.where(self.air.knots_m < measured.altitude_m.min(), len(spans), 0)
+        for span in spans[::-1]:
+            passed[self._passed_knots[span]] = span
+        by_span = np.concatenate([np.tile(passed, 3), np.repeat(spans, self.motion)])
+        deeper = np.concatenate([np.tile(-self.air.knots_m, 3), np.full(self.motion * len(spans), np.inf)])
+        order = np.lexsort((deeper, by_span))
+        local = np.empty_like(order)
+        local[order] = np.arange(len(order))
+        shared, air = free + warm + BORDERS, 3 * len(self.air.knots_m)
+        place = np.concatenate([np.arange(free), shared + local[:air], free + np.arange(warm), shared + local[air:]])
+        reach = int(np.abs(np.diff(local[:air].reshape(3, -1), axis=1)).max())
+        for span, near in enumerate(self._nearby_air):
+            motions = local[air + self.motion * span :][: 2 * self.motion]  # its own and the next one's
+            reach = max(reach, int(np.ptp(np.concatenate([local[near[near < air]], motions]))))
+        return place, shared, reach
 
     def right_hand_side(self, u: Parameters, linear: Linearization, residuals: Residuals) -> FloatArray:
         """Right-hand side of a step from ``u`` with its residuals, by derivatives at ``u`` or nearby."""
@@ -358,44 +397,56 @@ class Problem:
         """Columns of the parameters that are held."""
         return [self.vehicle_parameters.names.index(name) for name in self.held]
 
-    def _perturbed(self, u: Parameters) -> tuple[SpanFlights, list[Index], list[FloatArray]]:
-        """Spans with one parameter moved, which parameter (columns) and by how much, span by span."""
-        v = self.first_instrument
+    def _perturbed(self, u: Parameters, wanted: BoolArray) -> tuple[SpanFlights, list[Index], list[FloatArray]]:
+        """Spans with one of the parameters ``wanted`` moved, which (columns) and by how much, span by span."""
+        v, m = self.first_instrument, self.motion
         vehicles = [self.trial_vehicle(u.vehicle + VEHICLE_STEP * unit) for unit in np.eye(v)]
         vehicles.append(self.trial_vehicle(u.vehicle))
-        tables, air_columns, air_steps = self._perturbed_tables(u)
-        rows: list[tuple[int, int, FloatArray, int]] = []
-        columns, steps = [], []
-        for span in range(self.measured.spans):
-            motion = u.motion[span]
-            rows += [(span, j, motion, 0) for j in range(v)]
-            rows += [(span, v, motion + d, 0) for d in np.diag(self.motion_step)]
-            near = self._nearby_air[span]
-            rows += [(span, v, motion, 1 + k) for k in near.tolist()]
-            own = self.first_motion + self.motion * span + np.arange(self.motion)
-            columns.append(np.array([*range(v), *own, *air_columns[near]]))
-            steps.append(np.array([*([VEHICLE_STEP] * v), *self.motion_step, *air_steps[near]]))
-        which = np.array([(row[0], row[1], row[3]) for row in rows]).T
-        motions = np.array([row[2] for row in rows])
-        return SpanFlights(which[0], which[1], motions, which[2], vehicles, tables), columns, steps
+        air = self.air.table(u.air, u.warmer_k)
+        felt = np.unique(np.concatenate(self._nearby_air))
+        moved, air_steps = self._moved_air(air, felt)
+        first_air, own = v + INSTRUMENTS, self.first_motion + np.arange(m)
+        columns, steps, motions = [], [], []
+        numbers: list[Index] = []
+        for span, near in enumerate(self._nearby_air):
+            count = v + m + len(near)
+            column = np.concatenate([np.arange(v), own + m * span, first_air + near])
+            at = np.searchsorted(felt, near)
+            step = np.concatenate([np.full(v, VEHICLE_STEP), self.motion_step, air_steps[at]])
+            motion = np.tile(u.motion[span], (count, 1))
+            motion[v : v + m] += np.diag(self.motion_step)
+            table = np.concatenate([np.zeros(v + m, dtype=np.int64), 1 + at])
+            number = np.stack([np.full(count, span), np.minimum(np.arange(count), v), table])
+            kept = wanted[column]
+            columns.append(column[kept])
+            steps.append(step[kept])
+            motions.append(motion[kept])
+            numbers.append(number[:, kept])
+        spans, which, table = np.concatenate(numbers, axis=1)
+        return SpanFlights(spans, which, np.concatenate(motions), table, vehicles, air, moved), columns, steps
 
-    def _perturbed_tables(self, u: Parameters) -> tuple[list[FloatArray], Index, FloatArray]:
-        """Kernel tables of the air as it is and with each knot moved; columns and steps of the latter."""
-        tables, steps = [self.air.table(u.air, u.warmer_k)], []
-        for kind, step in enumerate(AIR_STEP):
-            for knot in range(len(self.air.knots_m)):
-                tables.append(self.air.moved_table(tables[0], kind, knot, step))
-                steps.append(step)
-        for unit in np.eye(len(u.warmer_k)):
-            tables.append(self.air.table(u.air, u.warmer_k + WARMTH_STEP_K * unit))
-            steps.append(WARMTH_STEP_K)
-        return tables, self.first_instrument + INSTRUMENTS + np.arange(len(steps)), np.array(steps)
+    def _moved_air(self, air: FloatArray, which: Index) -> tuple[list[MovedRows], FloatArray]:
+        """What changes in a kernel table where parameters of the air (k,) move, counted from its first; their steps."""
+        knots = len(self.air.knots_m)
+        kinds = np.minimum(which // knots, len(AIR_STEP))
+        steps = np.append(AIR_STEP, WARMTH_STEP_K)[kinds]
+        moved = [
+            self.air.moved_rows(air, kind, knot, step)
+            if kind < len(AIR_STEP)
+            else self.air.warmed_rows(air, knot, step)
+            for kind, knot, step in zip(kinds.tolist(), (which - knots * kinds).tolist(), steps.tolist(), strict=True)
+        ]
+        return moved, steps
+
+    @cached_property
+    def _passed_knots(self) -> list[Index]:
+        return self._passed(self.air.knots_m)
 
     @cached_property
     def _nearby_air(self) -> list[Index]:
         """Parameters of the air, counted from its first, that each span feels."""
         knots = len(self.air.knots_m)
-        by_span = zip(self._passed(self.air.knots_m), self._passed(self.air.temperature_knots_m), strict=True)
+        by_span = zip(self._passed_knots, self._passed(self.air.temperature_knots_m), strict=True)
         return [np.concatenate([near, knots + near, 2 * knots + near, 3 * knots + warm]) for near, warm in by_span]
 
     def _priors(self, u: Parameters) -> list[tuple[slice, FloatArray, FloatArray]]:

@@ -173,10 +173,10 @@ def _at_stiffness(nominal: Vehicle, factor: float) -> FloatArray:
 def _frequencies(vehicle: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Frequencies of the aerodynamic and the joint's mode, Hz, each (n,); NaN where one does not oscillate."""
     out = np.full((2, len(flow[0])), np.nan)
-    for k, (pressure, mach, speed) in enumerate(zip(*flow, strict=True)):
-        found = modes(
-            linear_matrix(vehicle, slopes_at(vehicle, float(mach)), float(pressure), float(speed))
-        ).frequencies_hz
+    pressure, mach, speed = flow
+    at = zip(slopes_at(vehicle, mach), pressure.tolist(), speed.tolist(), strict=True)
+    for k, (slopes, load, fast) in enumerate(at):
+        found = modes(linear_matrix(vehicle, slopes, load, fast)).frequencies_hz
         out[1, k] = found[-1] if len(found) else np.nan
         out[0, k] = found[-2] if len(found) > 1 else np.nan
     return out[0], out[1]

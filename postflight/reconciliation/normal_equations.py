@@ -1,9 +1,13 @@
 """How is a step of a fit of many spans solved, and what is its covariance?
 
-The parameters of vehicle, instruments and air are shared by all spans; the motion at a span's start has elements in
-common with theirs and with the next span's alone. So the matrix of the normal equations is an arrow: a band, with full
-rows and columns beside it. Its Cholesky factorisation with the band first fills in nothing: 140 motions cost as much as
-one full matrix of the shared parameters.
+The parameters of vehicle and instruments are shared by all spans; the motion at a span's start and the air that the
+span falls through have elements in common with theirs and with those of the next spans alone. So the matrix of the
+normal equations is an arrow: a band, with full rows and columns beside it. Its Cholesky factorisation with the band
+first fills in nothing.
+
+An error of the sounding that is the same at all altitudes would couple all air with all air, as the product ``-u u^T``
+in the inverse covariance. It is a border, a row and column beside the parameters' own: the equations of ``A - u u^T``
+are those of ``[[A, u], [u^T, 1]]`` with zero on the border's right, and both determinants are equal.
 
 References
 ----------
@@ -14,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, cholesky_banded
@@ -28,7 +32,7 @@ from postflight.reconciliation.forward_model import Index
 class ArrowMatrix:
     """Symmetric matrix that is a band but for its first rows and columns: ``[[corner, across^T], [across, band]]``.
 
-    A motion at a span's start has elements in common with the next span's alone, and with what all spans share.
+    What belongs to a span has elements in common with that of the next spans alone, and with what all spans share.
 
     Parameters
     ----------
@@ -49,13 +53,19 @@ class ArrowMatrix:
 
     def add(self, columns: Index, part: FloatArray) -> None:
         """Add a full symmetric part (k, k) at columns (k,), each at most once."""
-        shared = len(self.corner)
-        first, rest = np.flatnonzero(columns < shared), np.flatnonzero(columns >= shared)
-        at, along = columns[first], columns[rest] - shared
-        self.corner[np.ix_(at, at)] += part[np.ix_(first, first)]
-        self.across[np.ix_(along, at)] += part[np.ix_(rest, first)]
-        row, column = np.nonzero(along[:, None] >= along)
-        self.band[along[row] - along[column], along[column]] += part[rest[row], rest[column]]
+        order = np.argsort(columns)
+        columns, part = columns[order], part[np.ix_(order, order)]
+        shared, k = len(self.corner), int(np.searchsorted(columns, len(self.corner)))
+        at, along = columns[:k], columns[k:] - shared
+        self.corner[np.ix_(at, at)] += part[:k, :k]
+        self.across[np.ix_(along, at)] += part[k:, :k]
+        row, column = _lower(len(along))
+        self.band[along[row] - along[column], along[column]] += part[k:, k:][row, column]
+
+    def add_pairs(self, row: Index, column: Index, values: FloatArray) -> None:
+        """Add elements (k,) of the band and what they mirror, each pair of a row and a column (k,) at most once."""
+        first, second = np.minimum(row, column), np.maximum(row, column)
+        self.band[second - first, first - len(self.corner)] += values
 
     @property
     def diagonal(self) -> FloatArray:
@@ -73,15 +83,19 @@ class ArrowMatrix:
             out[at + k, at] = out[at, at + k] = values[: n - k]
         return out
 
-    def scaled(self, by: FloatArray, more: float) -> ArrowMatrix:
-        """Rows and columns times ``by`` (shared + n,), with ``more`` added to the diagonal then."""
+    def columns(self, at: Index) -> FloatArray:
+        """Columns (shared + n, k) of what is shared, by their numbers (k,)."""
+        return np.concatenate([self.corner[:, at], self.across[:, at]])
+
+    def scaled(self, by: FloatArray, more: FloatArray) -> ArrowMatrix:
+        """Rows and columns times ``by`` (shared + n,), with ``more`` (shared + n,) added to the diagonal then."""
         shared, n = len(self.corner), len(self.across)
         first, rest = by[:shared], by[shared:]
         band = self.band * rest
         for k in range(len(band)):
             band[k, : n - k] *= rest[k:]
-        band[0] += more
-        corner = self.corner * first[:, None] * first + more * np.eye(shared)
+        band[0] += more[shared:]
+        corner = self.corner * first[:, None] * first + np.diag(more[:shared])
         return ArrowMatrix(corner, self.across * rest[:, None] * first, band)
 
     def without(self, p: int) -> ArrowMatrix:
@@ -125,28 +139,62 @@ def _band_solved(band: FloatArray, right: FloatArray, transposed: bool) -> Float
     return np.asarray(dtbtrs(band, right, uplo="L", trans="T" if transposed else "N")[0]).reshape(right.shape)
 
 
+@cache
+def _lower(size: int) -> tuple[Index, Index]:
+    """Rows and columns of a lower triangle."""
+    return np.tril_indices(size)
+
+
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of a step, matrix (n, n) and right-hand side (n,); solved with a diagonal of one."""
+    """Normal equations of a step, solved with a diagonal of one.
+
+    Parameters
+    ----------
+    matrix : ArrowMatrix
+        Of ``m >= n`` rows: those of no parameter are borders, of which each has one on the diagonal.
+    right : (n,) float
+        Right-hand side, in the order of the parameters.
+    place : (n,) int
+        The parameters' rows.
+    """
 
     matrix: ArrowMatrix
     right: FloatArray
+    place: Index
+
+    @cached_property
+    def _borders(self) -> Index:
+        return np.setdiff1d(np.arange(len(self.matrix.diagonal)), self.place)
 
     @cached_property
     def scale(self) -> FloatArray:
-        """One over the root of the diagonal."""
-        return np.asarray(1.0 / np.sqrt(self.matrix.diagonal))
+        """One over the root of the diagonal (m,); of borders one."""
+        diagonal = self.matrix.diagonal - (self.matrix.columns(self._borders) ** 2).sum(axis=1)
+        diagonal[self._borders] = 1.0
+        return np.asarray(1.0 / np.sqrt(diagonal))
 
     @cached_property
     def undamped(self) -> ArrowFactor:
         """Factor of the scaled matrix as it is."""
-        return self.matrix.scaled(self.scale, 0.0).factor()
+        return self._factor(0.0)
+
+    def _factor(self, damping: float) -> ArrowFactor:
+        more = np.zeros(len(self.scale))
+        more[self.place] = damping
+        return self.matrix.scaled(self.scale, more).factor()
 
     def solver(self, damping: float) -> Callable[[FloatArray], FloatArray]:
         """Solver of the equations with a share of the diagonal added."""
-        scale = self.scale
-        factor = self.matrix.scaled(scale, damping).factor() if damping else self.undamped
-        return lambda right: np.asarray((factor.solve((right.T * scale).T).T * scale).T)
+        factor = self._factor(damping) if damping else self.undamped
+        scale = self.scale[self.place]
+
+        def solve(right: FloatArray) -> FloatArray:
+            whole = np.zeros((len(self.scale), *right.shape[1:]))
+            whole[self.place] = (right.T * scale).T
+            return np.asarray((factor.solve(whole)[self.place].T * scale).T)
+
+        return solve
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solution of the equations."""
@@ -157,6 +205,20 @@ class NormalEquations:
         units = np.zeros((len(self.right), len(columns)))
         units[columns, np.arange(len(columns))] = 1.0
         return self.solve(units)[columns]
+
+    def without(self, p: int) -> tuple[FloatArray, NormalEquations]:
+        """Columns (n - p, p) by which the first p parameters, all shared, act on the others, and the others' equations.
+
+        The first p rows are theirs.
+        """
+        others = NormalEquations(self.matrix.without(p), self.right[p:], self.place[p:] - p)
+        return self.matrix.columns(np.arange(p))[self.place[p:]], others
+
+    @property
+    def dense(self) -> FloatArray:
+        """Matrix (n, n) in the order of the parameters."""
+        whole, borders = self.matrix.dense, self.matrix.columns(self._borders)[self.place]
+        return np.asarray(whole[np.ix_(self.place, self.place)] - borders @ borders.T)
 
     @property
     def log_det(self) -> float:

@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from flightmodel.checks import ConfigError, FloatArray, Progress
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_clock
@@ -152,7 +152,7 @@ def joint_table(fit: JointFit) -> pd.DataFrame:
     vehicle_parameters, x = fit.problem.vehicle_parameters, fit.parameters.vehicle
     n = len(x)
     covariance = fit.covariance
-    reach = float(norm.ppf(0.5 + 0.5 * INTERVAL))
+    reach = float(ndtri(0.5 + 0.5 * INTERVAL))
     nominal, best = vehicle_parameters.vehicle(np.zeros(n)), vehicle_parameters.vehicle(x)
     moved = [[vehicle_parameters.vehicle(x + side * DIFFERENCE * unit) for side in (-1.0, 1.0)] for unit in np.eye(n)]
     bound = stiffness_bound(fit)
@@ -191,7 +191,7 @@ def stiffness_bound(fit: JointFit) -> float | None:
     compliance, sd = 1.0 - STIFFNESS_LOG_SD * x / precision, STIFFNESS_LOG_SD / np.sqrt(precision)
     below = -compliance / sd
     if below < FAR_SD:
-        largest = compliance + sd * float(norm.isf((1.0 - BOUND) * norm.sf(below)))
+        largest = compliance + sd * float(-ndtri((1.0 - BOUND) * ndtr(-below)))
     else:  # what is left of a normal law so far out falls as an exponential
         largest = -sd * float(np.log(1.0 - BOUND)) / below
     best = fit.problem.vehicle_parameters.vehicle(fit.parameters.vehicle)
@@ -212,7 +212,7 @@ def posterior_sd(fit: JointFit) -> tuple[tuple[float, float], float, float]:
     stiffness, bound = STIFFNESS_LOG_SD * sd["stiffness"], stiffness_bound(fit)
     if bound is not None:
         best = fit.problem.vehicle_parameters.vehicle(fit.parameters.vehicle).joint.bending_stiffness_nmprad
-        stiffness = min(stiffness, float(np.log(max(best / bound, 1.0)) / norm.ppf(BOUND)))
+        stiffness = min(stiffness, float(np.log(max(best / bound, 1.0)) / ndtri(BOUND)))
     joint = stiffness, DAMPING_LOG_SD * sd["damping"]
     return joint, offset, fit.problem.vehicle_parameters.nominal.uncertainty.cm * sd["static stability"]
 
@@ -337,8 +337,7 @@ class Profile:
         p, problem = self.count, self.fit.problem
         linear = problem.linearize(self.fit.parameters)
         whole = problem.normal_equations(self.fit.parameters, linear)
-        others = NormalEquations(whole.matrix.without(p), whole.right[p:])
-        coupling = np.concatenate([whole.matrix.corner[p:, :p], whole.matrix.across[:, :p]])
+        coupling, others = whole.without(p)
         return linear, np.concatenate([self.root, -others.solve(coupling @ self.root)]), others
 
     def one_sided(self, z: FloatArray) -> NDArray[np.bool_]:

@@ -47,11 +47,10 @@ def stiffness_guess(flight: Reconstruction, problem: Problem) -> tuple[Problem, 
     measured = loaded_part(problem.measured)
     air = AtmosphereParameters(flight.telemetry.sounding, float(measured.altitude_m.min()))
     part = replace(problem, measured=measured, air=air, sd_factor=SD_FACTOR)
-    lowest, best = np.inf, None
+    lowest, best, critical = np.inf, None, critical_stiffness(flight)
     for factor in CANDIDATES:
         vehicle = start.vehicle.copy()
-        stiffness = factor * critical_stiffness(flight)
-        vehicle[0] = np.log(stiffness / nominal.joint.bending_stiffness_nmprad) / STIFFNESS_LOG_SD
+        vehicle[0] = np.log(factor * critical / nominal.joint.bending_stiffness_nmprad) / STIFFNESS_LOG_SD
         vehicle[1] = damping_guess(problem, vehicle)
         try:
             *_, end = descend([resolved(part, vehicle)] * STEPS, replace(part.start(), vehicle=vehicle))
@@ -92,9 +91,9 @@ def critical_stiffness(flight: Reconstruction) -> float:
     """Bending stiffness, N m/rad, below which the stated vehicle diverges at the flight's largest load."""
     pulse = flight.required_loads()
     stated = pulse.vehicle
-    pressure, mach = pulse.dynamic_pressure_pa[::EVERY_LOAD].tolist(), pulse.mach[::EVERY_LOAD].tolist()
-    at = zip(pressure, mach, strict=True)
-    return max(critical_stiffness_nmprad(stated, slopes_at(stated, each), load) for load, each in at)
+    loads = pulse.dynamic_pressure_pa[::EVERY_LOAD].tolist()
+    at = zip(loads, slopes_at(stated, pulse.mach[::EVERY_LOAD]), strict=True)
+    return max(critical_stiffness_nmprad(stated, slopes, load) for load, slopes in at)
 
 
 def loaded_part(measured: Measurements) -> Measurements:

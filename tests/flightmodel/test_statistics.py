@@ -14,6 +14,7 @@ from flightmodel.atmosphere import (
 from flightmodel.statistics import (
     chi_square_quantile,
     correlation,
+    correlation_inverse,
     correlation_root,
     jackknife_variance,
     percentile_band,
@@ -32,6 +33,14 @@ def test_correlation_is_a_constant_part_and_a_decay():
     assert np.allclose(np.diag(rho), 1.0)
     assert rho[0, 2] == pytest.approx(0.3 + 0.7 * np.exp(-2.0))
     assert (np.linalg.eigvalsh(rho) > 0.0).all()
+
+
+def test_the_inverse_is_tridiagonal_less_an_outer_product():
+    at = np.array([0.0, 0.4, 1.0, 1.1, 4.0])
+    for part in (0.0, 0.3):
+        diagonal, beside, u = correlation_inverse(at, 2.0, part)
+        inverse = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1) - np.outer(u, u)
+        np.testing.assert_allclose(inverse @ correlation(at, 2.0, part), np.eye(5), atol=1e-12)
 
 
 def test_root_squares_to_the_correlation_at_its_knots():

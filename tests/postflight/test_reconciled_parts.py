@@ -19,6 +19,7 @@ from postflight.reconciliation.forward_model import (
     SLOW_JOINT,
     STIFFNESS_LOG_SD,
     AtmosphereParameters,
+    SpanFlights,
     VehicleParameters,
     integrable,
     resolved_stiffness_nmprad,
@@ -55,7 +56,7 @@ def test_evidence_is_the_integral_of_the_posterior():
     cost = lowest + np.einsum("...i,ij,...j->...", x, np.linalg.inv(covariance), x)
     integral = np.exp(-0.5 * cost).sum() * (grid[1] - grid[0]) ** 2 / (2.0 * np.pi)
     problem = SimpleNamespace(vehicle_parameters=SimpleNamespace(laws=()), log_weight=weights)
-    normal = NormalEquations(full(np.linalg.inv(covariance)), np.zeros(2))
+    normal = NormalEquations(full(np.linalg.inv(covariance)), np.zeros(2), np.arange(2))
     found = JointFit(problem, None, normal, SimpleNamespace(cost=lowest), 1, True)
     assert found.log_evidence == pytest.approx(weights + np.log(integral), rel=1e-6)
 
@@ -115,7 +116,7 @@ def test_a_step_whose_look_ahead_tumbles_is_tried_straight():
     u = Parameters(np.zeros(1), np.zeros(1), np.zeros((3, 0)), np.zeros(0), np.zeros((0, MOTION)))
     first = residuals(u)
     linear = Linearization(first, [(np.array([0, 1]), np.array([[0.0, 1.0]]))], [], 2)
-    normal = NormalEquations(full(np.eye(2)), np.array([0.0, 1.0]))
+    normal = NormalEquations(full(np.eye(2)), np.array([0.0, 1.0]), np.arange(2))
     found, end = _better(SimpleNamespace(residuals=residuals), u, linear, normal, 0.0, (first, u))
     assert end.instruments[0] == pytest.approx(1.0)
     assert found.cost == pytest.approx(0.0, abs=1e-12)
@@ -143,7 +144,7 @@ def test_normal_equations_of_an_arrow_are_solved_as_full_ones(shared, blocks, si
         arrow.add(columns, part)
         left[np.ix_(columns, columns)] = 0.0
     np.testing.assert_allclose(arrow.dense, matrix, rtol=1e-14)
-    normal = NormalEquations(arrow, right)
+    normal = NormalEquations(arrow, right, np.arange(n))
     scale = 1.0 / np.sqrt(np.diag(matrix))
     for damping in (0.0, 0.3):
         damped = matrix + damping * np.diag(np.diag(matrix))
@@ -154,6 +155,27 @@ def test_normal_equations_of_an_arrow_are_solved_as_full_ones(shared, blocks, si
     np.testing.assert_allclose(normal.covariance_of(some) / np.outer(scale[some], scale[some]), want, atol=1e-9)
     assert normal.log_det == pytest.approx(np.linalg.slogdet(matrix)[1], abs=1e-9)
     np.testing.assert_allclose(arrow.without(shared // 2).dense, matrix[shared // 2 :, shared // 2 :], rtol=1e-14)
+
+
+def test_a_border_takes_an_outer_product_from_the_matrix():
+    rng = np.random.default_rng(6)
+    shared, n = 3, 12
+    response, u = rng.standard_normal((40, n)), 0.5 * rng.standard_normal((n, 2))
+    want = response.T @ response + 2.0 * np.eye(n) - u @ u.T
+    place, borders = rng.permutation(np.r_[0:2, 4 : n + 2]), np.array([2, 3])
+    arrow = ArrowMatrix.zeros(shared + 1, n + 2 - shared - 1, n)
+    arrow.add(place, response.T @ response + 2.0 * np.eye(n))
+    bordered = np.zeros((n + 2, 2))
+    bordered[place] = u
+    bordered[borders] = np.eye(2)
+    arrow.corner[:, borders], arrow.across[:, borders] = bordered[:4], bordered[4:]
+    arrow.corner[borders] = arrow.corner[:, borders].T
+    normal, right = NormalEquations(arrow, rng.standard_normal(n), place), rng.standard_normal((n, 3))
+    np.testing.assert_allclose(normal.dense, want, rtol=1e-12, atol=1e-12)
+    for damping in (0.0, 0.3):
+        damped = want + damping * np.diag(np.diag(want))
+        np.testing.assert_allclose(normal.solver(damping)(right), np.linalg.solve(damped, right), rtol=1e-9, atol=1e-12)
+    assert normal.log_det == pytest.approx(np.linalg.slogdet(want)[1], abs=1e-9)
 
 
 def stiff(factor):
@@ -266,7 +288,8 @@ def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True, creep=1.0):
         motion=parameters.motion, held=(), first_instrument=len(values),
     )  # fmt: skip
     unknown = SimpleNamespace(vehicle=values, instruments=np.zeros(20))
-    normal = NormalEquations(full(2.0 * np.eye(len(values) + 20)), np.zeros(len(values) + 20))
+    n = len(values) + 20
+    normal = NormalEquations(full(2.0 * np.eye(n)), np.zeros(n), np.arange(n))
     found = JointFit(problem, unknown, normal, residuals, 4, converged)
     found.__dict__["creep_scores"] = (CreepScore(2.0, -0.3, 0.05), CreepScore(10.0, 0.02 * creep, 0.02))
     return found
@@ -314,7 +337,24 @@ def test_a_table_moved_at_a_knot_is_that_of_the_moved_differences():
         for knot in (0, 1, knots // 2, knots - 2, knots - 1):
             moved = difference.copy()
             moved[kind, knot] += 0.1
-            np.testing.assert_allclose(
-                air.moved_table(table, kind, knot, 0.1), air.table(moved, warm), rtol=1e-13, atol=1e-12
-            )
+            rows = air.moved_rows(table, kind, knot, 0.1)
+            np.testing.assert_allclose(with_rows(table, rows), air.table(moved, warm), rtol=1e-13, atol=1e-12)
             assert not np.array_equal(air.table(moved, warm), table)
+    for knot in (0, 1, len(warm) // 2, len(warm) - 1):
+        moved = warm.copy()
+        moved[knot] += 0.1
+        rows = air.warmed_rows(table, knot, 0.1)
+        np.testing.assert_allclose(with_rows(table, rows), air.table(difference, moved), rtol=1e-13, atol=1e-12)
+        assert not np.array_equal(air.table(difference, moved), table)
+
+
+def with_rows(table, moved):
+    """Return table 1 of flights that differ in some rows of the air, by way of a part of it."""
+    none, one = np.zeros(2, dtype=np.int64), np.array([0, 1])
+    flights = SpanFlights(none, none, np.zeros((2, 15)), one, [], table, [moved])
+    first = flights.air_of(none, slice(0, len(table)))
+    np.testing.assert_array_equal(first, table)
+    middle = moved.first + len(moved.rows) // 2
+    parts = [flights.air_of(one, slice(0, middle)), flights.air_of(one, slice(middle, len(table)))]
+    np.testing.assert_array_equal(np.concatenate([part[0] for part in parts]), table)
+    return np.concatenate([part[1] for part in parts])

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -61,6 +62,33 @@ def test_leaving_early_ends_the_process_whatever_it_was_given():
         process.draw_trajectory(bytes(10_000_000))
         assert process._process.is_alive()
     assert not process._process.is_alive()
+
+
+def halved(number):
+    if number < 0:
+        raise ValueError("a negative number")
+    if number > 100:
+        warnings.warn("a large number", RuntimeWarning, stacklevel=2)
+    return 0.5 * number, os.getpid()
+
+
+def test_what_is_asked_for_is_done_in_the_other_process_and_its_warnings_and_errors_are_given_here():
+    with second_process.SecondProcess() as process:
+        for number in (3.0, 200.0, -1.0):
+            process.ask(halved, number)
+        assert process.answer() == (1.5, process._process.pid)
+        with pytest.warns(RuntimeWarning, match="a large number"):
+            assert process.answer() == (100.0, process._process.pid)
+        with pytest.raises(ValueError, match="a negative number"):
+            process.answer()
+
+
+def test_what_a_killed_process_was_asked_for_is_done_here():
+    with second_process.SecondProcess() as process:
+        os.kill(process._process.pid, signal.SIGKILL)
+        process._process.join()
+        process.ask(halved, 3.0)
+        assert process.answer() == (1.5, os.getpid())
 
 
 class Silent:

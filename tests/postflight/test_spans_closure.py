@@ -9,6 +9,7 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import profile_from_sounding, standard_sounding
 from flightmodel.trajectory import resample
+from postflight.reconciliation.fit import _linearized_with_creep
 from postflight.reconciliation.forward_model import (
     DAMPING_LOG_SD,
     HARDENING_AT_RAD,
@@ -111,7 +112,7 @@ def test_spans_start_with_the_datum_where_it_was_reconstructed():
     one, u = problem(), true_unknowns()
     spans = np.arange(SPANS)
     zero = np.zeros_like(spans)
-    flights = SpanFlights(spans, zero, u.motion, zero, [one.trial_vehicle(u.vehicle)], [])
+    flights = SpanFlights(spans, zero, u.motion, zero, [one.trial_vehicle(u.vehicle)], np.zeros((0, 6)))
     state = _start_states(one.measured, flights)
     place, velocity = dynamics.points(state, VEHICLE)["body"]
     back = rotations.rotate(state[:, 6:10], np.tile(-VEHICLE.centerbody.cg_m, (SPANS, 1)))
@@ -149,6 +150,22 @@ def test_a_late_clock_shows_what_was_earlier():
     ):
         left = np.abs(shown[1:-1][..., part] - want).max()
         assert left < 0.08 * np.abs(own - want).max()
+
+
+def test_the_normal_equations_are_those_of_all_residuals():
+    one, u = problem(), true_unknowns()
+    linear = one.linearize(u)
+    normal = one.normal_equations(u, linear)
+    want = np.zeros((one.count, one.count))
+    for column, response in (*linear.sensors, *linear.joins):
+        want[np.ix_(column, column)] += response.T @ response
+    for part, precision, _ in one._priors(u):
+        want[part, part] += precision
+    size = np.sqrt(np.diag(want))
+    np.testing.assert_allclose(normal.dense / np.outer(size, size), want / np.outer(size, size), atol=1e-12)
+    sought, (coupling, others) = 5, normal.without(5)
+    np.testing.assert_allclose(coupling / size[5:, None], want[sought:, :sought] / size[5:, None], atol=1e-9)
+    assert others.log_det == pytest.approx(np.linalg.slogdet(want[sought:, sought:])[1], abs=1e-6)
 
 
 def test_the_cost_falls_along_the_right_hand_side():
@@ -247,3 +264,20 @@ def test_the_sounding_s_errors_are_half_constant():
         np.testing.assert_allclose(np.diag(correlation), 1.0, rtol=1e-6)
         far = air.knots_m[-1] - air.knots_m[0]
         assert correlation[0, -1] == pytest.approx(0.5 + 0.5 * np.exp(-far / length), rel=1e-6)
+
+
+def test_creep_is_linearized_by_what_it_adds():
+    """The same equations as with all of its spans flown, to what forward differences leave."""
+    plain, u = problem(), true_unknowns()
+    creeping = replace(plain, vehicle_parameters=VehicleParameters(VEHICLE, ("creep",)), creep_per_s=0.1)
+    vehicle = np.insert(u.vehicle, plain.vehicle_parameters.sought, [0.0, 1.0])
+    start = replace(u, vehicle=vehicle, motion=np.pad(u.motion, ((0, 0), (0, creeping.motion - plain.motion))))
+    found = _linearized_with_creep(plain, plain.linearize(u), creeping, start)
+    want = creeping.linearize(start)
+    np.testing.assert_array_equal(found.residuals.joins, want.residuals.joins)
+    dense = [creeping.normal_equations(start, each).dense for each in (found, want)]
+    size = np.sqrt(np.diag(dense[1]))
+    off = (dense[0] - dense[1]) / np.outer(size, size)
+    np.testing.assert_allclose(off, 0.0, atol=1e-4)
+    growth = creeping.vehicle_parameters.names.index("creep growth")
+    assert dense[1][growth, growth] > 1.1  # more than the prior's: creep acts

@@ -126,7 +126,7 @@ def test_nonlinear_equations_differentiated(vehicle, measured, stiffness, bent, 
 
 
 def test_slopes_come_from_the_table(vehicle):
-    slopes = slopes_at(vehicle, 3.2)
+    (slopes,) = slopes_at(vehicle, np.array([3.2]))
     c = vehicle.aero.at(3.2, vehicle.aero.alpha_rad[1])
     assert slopes.ca == pytest.approx(vehicle.aero.at(3.2, 0.0)[0])
     assert slopes.cn_alpha * vehicle.aero.alpha_rad[1] == pytest.approx(c[1])

@@ -168,7 +168,7 @@ def flown_spans(measured, truth, vehicle):
     spans = np.arange(measured.spans)
     zero = np.zeros_like(spans)
     true = TrialVehicle(vehicle, simulate.parameter_vector(vehicle))
-    flights = SpanFlights(spans, zero, motion[:-1], zero, [true], [simulate.atmosphere_table(truth.profile)])
+    flights = SpanFlights(spans, zero, motion[:-1], zero, [true], simulate.atmosphere_table(truth.profile))
     predicted = fly_spans(replace(measured, start=place), vehicle, flights)
     return motion, predicted
 
