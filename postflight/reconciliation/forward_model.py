@@ -306,7 +306,7 @@ class AtmosphereParameters:
         """Rows of a kernel table that change where the temperature moves at one of its knots."""
         near, hat = self._temperature_hats[knot]
         rows = table[near].copy()
-        rows[:, 2] *= np.exp(0.5 * step_k * hat / self._sounded_temperature[near])
+        rows[:, 2] *= np.exp(0.5 * step_k * hat / self._sounded[2][near])
         return MovedRows(near.start, rows)
 
     @cached_property
