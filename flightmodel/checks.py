@@ -101,8 +101,10 @@ def writing(where: Path, remedy: str) -> Iterator[None]:
         raise GateError(f"{where}: {words}", code="disk-full" if full else "cannot-write") from None
 
 
-def write_file(path: Path, content: bytes | str) -> None:
+def write_file(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
     """Write bytes, or text as UTF-8, whole or not at all: beside its place, then renamed; folders are made.
+
+    What is too large to be made at once is written by a function, to the path that it is called with.
 
     Of several processes that write one file at once, the last one's stays.
     """
@@ -111,7 +113,10 @@ def write_file(path: Path, content: bytes | str) -> None:
         left.unlink(missing_ok=True)
     partial = partial_path(path)
     try:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        if callable(content):
+            content(partial)
+        else:
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

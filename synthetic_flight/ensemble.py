@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -351,7 +351,7 @@ def start_of(case: Case, step_s: float, locked: bool) -> Start:
     return Start(initial_state(case.scenario), parameters, simulate.atmosphere_table(case.profile))
 
 
-def fly_runs(plan: Plan, runs: list[int], draws_of: Callable[[int], dict[str, float]]) -> list[Row]:
+def fly_runs(plan: Plan, runs: Sequence[int], draws_of: Callable[[int], dict[str, float]]) -> list[Row]:
     """Fly runs and keep what the plan asks for, in their order.
 
     Parameters

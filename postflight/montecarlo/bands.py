@@ -10,7 +10,7 @@ stop rule that is evaluated after every chunk tends to stop when the interval ha
 little below the nominal one (docs/monte-carlo.md has the measured figure).
 
 Bands of histories are exact percentiles over all flights, for as many times at once as fit into `BAND_BYTES`, whatever
-the number of flights. Flights that failed are in the table of flights and nowhere else.
+the number of flights; every chunk is read once. Flights that failed are in the table of flights and nowhere else.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,7 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
         partial.unlink(missing_ok=True)
 
 
-def read_chunk(folder: Path, number: int, runs: list[int] | None = None, histories: bool = True) -> Chunk | None:
+def read_chunk(folder: Path, number: int, runs: Sequence[int] | None = None, histories: bool = True) -> Chunk | None:
     """Read a chunk; None where it is missing, damaged, or holds other runs than ``runs``.
 
     Without ``histories`` that array is empty and its bytes are not read.
@@ -106,7 +107,7 @@ def read_chunk(folder: Path, number: int, runs: list[int] | None = None, histori
         return None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
-    if len(reasons) != len(held) or (runs is not None and held.tolist() != runs):
+    if len(reasons) != len(held) or (runs is not None and held.tolist() != list(runs)):
         return None
     return chunk
 
@@ -141,7 +142,7 @@ def is_narrow(values: FloatArray, percentile: float, confidence: float, width: f
     return bool(high - low <= width)
 
 
-BAND_BYTES = 256 * 1024**2
+BAND_BYTES = 64 * 1024**2
 DIGITS = "%.10g"
 
 
@@ -202,7 +203,7 @@ def _percentiles(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["output", "flights", "percentile", "value", "low_95", "high_95"])
 
 
-def _bands(study: Study, folder: Path, wanted: list[list[int]], flown: FloatArray) -> pd.DataFrame:
+def _bands(study: Study, folder: Path, wanted: Sequence[Sequence[int]], flown: NDArray[np.bool_]) -> pd.DataFrame:
     """Percentiles of every history at every time; as many times at once as fit into memory."""
     time_s, names = study.plan.window.history_time_s(), study.plan.histories
     count, points = int(flown.sum()), len(time_s)
@@ -210,19 +211,7 @@ def _bands(study: Study, folder: Path, wanted: list[list[int]], flown: FloatArra
     if not names or not count:
         return pd.DataFrame(columns=columns)
     out = np.empty((len(names), points, len(BAND_PERCENTILES)))
-    width = max(1, BAND_BYTES // (4 * count * len(names)))
-    for first in range(0, points, width):
-        part = slice(first, min(first + width, points))
-        slab = np.empty((len(names), part.stop - part.start, count), dtype=np.float32)
-        row = 0
-        for number, runs in enumerate(wanted):
-            chunk = read_chunk(folder, number, runs)
-            if chunk is None:
-                message = f"{folder}: chunk {number} was damaged while it was read; run again"
-                raise GateError(message, code="chunk-damaged")
-            kept = chunk.histories[chunk.flown][:, :, part]
-            slab[:, :, row : row + len(kept)] = np.moveaxis(kept, 0, -1)
-            row += len(kept)
+    for part, slab in _slabs(folder, wanted, (len(names), points, count)):
         for k in range(len(names)):  # one at a time: sorting takes a copy
             out[k, part] = percentile_band(slab[k], axis=-1).T
     table = pd.DataFrame(out.reshape(-1, len(BAND_PERCENTILES)), columns=columns[3:])
@@ -230,6 +219,56 @@ def _bands(study: Study, folder: Path, wanted: list[list[int]], flown: FloatArra
     table.insert(1, "time_s", np.tile(np.round(time_s, 9), len(names)))
     table.insert(2, "flights", count)
     return table
+
+
+def _slabs(
+    folder: Path, wanted: Sequence[Sequence[int]], shape: tuple[int, int, int]
+) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """Histories of all flights that flew, ``(names, times, flights)``, some times after the others.
+
+    Chunks hold flight by flight what is wanted time by time. Where not all fits into memory the histories are turned
+    round on disk, in a file as large as the chunks, so that every chunk is read once, however many there are.
+    """
+    names, points, count = shape
+    width = BAND_BYTES // (4 * names * count)
+    if width >= points:
+        yield slice(0, points), _turned(folder, wanted, 0, (names, points))
+        return
+    width = max(1, width)
+    at_once = max(1, BAND_BYTES // (4 * names * points * max(len(runs) for runs in wanted)))
+    path = partial_path(folder / "histories")
+    try:
+        with path.open("w+b") as file:
+            before = 0
+            for first in range(0, len(wanted), at_once):
+                block = _turned(folder, wanted[first : first + at_once], first, (names, points))
+                for row, values in enumerate(values for history in block for values in history):
+                    file.seek(4 * (row * count + before))
+                    file.write(values.tobytes())
+                before += block.shape[2]
+            for at in range(0, points, width):
+                part = slice(at, min(at + width, points))
+                slab = np.empty((names, part.stop - at, count), dtype=np.float32)
+                for k in range(names):
+                    file.seek(4 * (k * points + at) * count)
+                    slab[k] = np.fromfile(file, np.float32, slab[k].size).reshape(slab[k].shape)
+                yield part, slab
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _turned(folder: Path, wanted: Sequence[Sequence[int]], first: int, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Histories ``(names, times, flights)`` of the flights that flew in some chunks, ``first`` and those after it."""
+    out, count = np.empty((*shape, sum(map(len, wanted))), dtype=np.float32), 0
+    for number, runs in enumerate(wanted, first):
+        chunk = read_chunk(folder, number, runs)
+        if chunk is None:
+            message = f"{folder}: chunk {number} was damaged while it was read; run again"
+            raise GateError(message, code="chunk-damaged")
+        kept = chunk.histories[chunk.flown]
+        out[:, :, count : count + len(kept)] = np.moveaxis(kept, 0, -1)
+        count += len(kept)
+    return out[:, :, :count]
 
 
 def coverage(table: pd.DataFrame) -> dict[str, dict[str, float]]:
@@ -267,4 +306,4 @@ def write_merged(folder: Path, merged: Merged) -> None:
 
 def write_csv(path: Path, table: pd.DataFrame) -> None:
     """Write a table beside its place and rename it."""
-    write_file(path, table.to_csv(index=False, float_format=DIGITS, lineterminator="\n"))
+    write_file(path, lambda partial: table.to_csv(partial, index=False, float_format=DIGITS, lineterminator="\n"))

@@ -17,7 +17,7 @@ import os
 import signal
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -48,7 +48,7 @@ from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
 from postflight.streams import THREAD_VARIABLES, pin_threads
 from synthetic_flight.ensemble import fly_runs
 
-Job = tuple[int, list[int]]
+Job = tuple[int, Sequence[int]]
 Done = tuple[int, Chunk]
 AHEAD = 2  # chunks queued a worker: none waits, and results do not pile up
 CONNECT_S = 20
@@ -296,7 +296,8 @@ def run(study: Study, folder: Path, wanted: Wanted, report: Progress) -> int:
     begin(study, folder, flights)
     total = study.chunks(flights)
     enough = _Enough(study, wanted.stop, flights)
-    jobs, there = [], 0
+    jobs: list[Job] = []
+    there = 0
     for number in range(total):
         runs = study.runs_of(number, flights)
         chunk = read_chunk(folder, number, runs, histories=False)
@@ -342,7 +343,7 @@ def status(folder: Path) -> Status:
     failed: Counter[str] = Counter()
     total = -(-wanted // size)
     for number in range(total):
-        runs = list(range(number * size, min((number + 1) * size, wanted)))
+        runs = range(number * size, min((number + 1) * size, wanted))
         chunk = read_chunk(folder, number, runs, histories=False)
         if chunk is not None:
             count, flights = count + 1, flights + len(runs)
@@ -358,7 +359,8 @@ def retry_failed(study: Study, folder: Path, wanted: Wanted, report: Progress) -
     drawn outside what can fly fails again.
     """
     begin(study, folder, wanted.flights)
-    jobs, before = [], {}
+    jobs: list[Job] = []
+    before = {}
     for number in range(study.chunks(wanted.flights)):
         chunk = read_chunk(folder, number, study.runs_of(number, wanted.flights))
         if chunk is not None and not chunk.flown.all():

@@ -102,10 +102,10 @@ class Study:
             return self.design.draws_of(run)
         return draws(self.plan.dispersions, self.spec.seed, run)
 
-    def runs_of(self, chunk: int, flights: int) -> list[int]:
+    def runs_of(self, chunk: int, flights: int) -> range:
         """Run numbers of one chunk of a study of so many flights."""
         first = chunk * self.spec.chunk
-        return list(range(first, min(first + self.spec.chunk, flights)))
+        return range(first, min(first + self.spec.chunk, flights))
 
     def chunks(self, flights: int) -> int:
         """Return how many chunks so many flights are."""

@@ -10,7 +10,7 @@ film takes minutes a flight.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def impossible_dispersions(dispersions: Dispersions) -> list[Fault]:
     return [Fault(words, "whole-mode-dispersion") for words in found]
 
 
-def run_trials(trial: Callable[[int], Mapping[str, float]], plan: Plan, runs: list[int]) -> list[Row]:
+def run_trials(trial: Callable[[int], Mapping[str, float]], plan: Plan, runs: Sequence[int]) -> list[Row]:
     """Run trials, one after another; one that raises is a row with its reason.
 
     Parameters
