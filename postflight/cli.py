@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import click
 
-from postflight.streams import close_streams, open_streams, pin_threads, return_large_arrays, write_out
+from postflight.streams import close_streams, open_streams, pin_threads, write_out
 
 # heavy imports stand inside the commands, so that --help answers at once
 FOLDER = click.Path(path_type=Path)
@@ -554,7 +554,6 @@ def main() -> None:
         signal.signal(signal.SIGINT, interrupt)
     open_streams()
     pin_threads()
-    return_large_arrays()
     try:
         with warnings.catch_warnings():
             warnings.showwarning = show_warning

@@ -31,7 +31,7 @@ from postflight.runs import check_name, find_run
 from postflight.score import PUBLISHED_DEG, Score, score_run
 from postflight.second_process import SecondProcess
 from postflight.sensitivity import largest_of_groups, sensitivity
-from postflight.streams import write_out
+from postflight.streams import return_large_arrays, write_out
 from postflight.studies.preflight import Bounds, rigid_bounds
 from postflight.terminal import progress_bar, terminal
 from recon.consistency import ConsistencyCheck
@@ -204,6 +204,7 @@ def run_flight(
     settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
     if flight.changes:
         settings["changes"] = list(flight.changes)
+    return_large_arrays()  # a reconciliation's, made anew at every step, would cost more time than they are worth
     new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
     with new as out, SecondProcess(out.path / "figures") as second:
         with progress_bar() as report:
