@@ -401,3 +401,17 @@ def test_a_receivers_noise_is_each_fixs_own_where_it_is_stated():
     assert gnss_instruments("gps", alone, np.zeros(3)) == []
     (only,) = gnss_instruments("gps", alone, np.zeros(3), near_ecef_m=place[0])
     np.testing.assert_allclose(only.value, np.tile([0.0, 0.0, -1.0], (n, 1)), atol=1e-12)
+
+
+def test_noise_of_a_distant_fix_lies_north_east_and_down_of_it():
+    """Over 13 deg of latitude the first fix's north takes in 5 % of the variance that is down here."""
+    latitude = np.deg2rad([38.0, 25.0, 25.0])
+    place = earth.ecef_from_geodetic(latitude, np.full(3, -2.5), np.zeros(3))
+    place[2] = np.nan  # a velocity alone
+    spec = GnssSpec("gps", np.zeros(3), 3.0, 5.0, speed_sd_mps=0.1, vertical_speed_sd_mps=0.2)
+    instruments = gnss_instruments("gps", GnssRecord(spec, np.arange(3.0), place, np.ones((3, 3))), np.zeros(3))
+    c, s = np.cos(np.deg2rad(13.0)) ** 2, np.sin(np.deg2rad(13.0)) ** 2
+    for one, across, down in zip(instruments, (3.0, 0.1), (5.0, 0.2), strict=True):
+        far = [c * across**2 + s * down**2, across**2, s * across**2 + c * down**2]
+        expected = np.array([[across**2, across**2, down**2], far, far])[: len(one.time_s)]
+        np.testing.assert_allclose(one.variance, expected, rtol=1e-9)
