@@ -71,8 +71,8 @@ def light_columns(view: VirtualCamera, horizon: HorizonLine) -> FloatArray:
     """Shift, tilt and bow of the found edge, ``(n, 3)``; one at the picture's sides, as the shell stands in it."""
     half = 0.5 * np.array(view.camera.size_px)
     y, z = view.camera.position_body_m[1:]
-    # towards growing clocking angles
-    along = view.camera.dcm_cam_body[:2, 1:] @ np.array([z, -y])
+    # towards smaller clocking angles, to the right of an upright picture
+    along = view.camera.dcm_cam_body[:2, 1:] @ np.array([-z, y])
     along /= np.hypot(*along)
     side = (horizon.points_px - half) @ along / (np.abs(along) @ half)
     return np.column_stack([np.ones_like(side), side, 1.5 * side**2 - 0.5])

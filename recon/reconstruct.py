@@ -423,11 +423,7 @@ def reconstruct_once(
         rate_cov=series[4],
         accelerometer_root=series[5],
         triad_root=series[6],
-        findings=(
-            *findings,
-            *(span.finding() for span in spans),
-            *edits,
-        ),
+        findings=(*findings, *(span.finding() for span in spans), *edits),
         provenance={
             "flight": telemetry.name,
             "settings": asdict(settings),

@@ -248,8 +248,9 @@ def test_the_air_s_table_holds_the_difference_at_and_between_its_rows():
     want = np.interp(rows, air.knots_m, difference[0])
     np.testing.assert_allclose(np.log(moved[:, 0] / plain[:, 0])[inside], want[inside], atol=1e-12)
     np.testing.assert_allclose((moved[:, 3] - plain[:, 3])[inside], 7.0)
-    # 0.01 K warmer: the speed of sound, sqrt(1.4 * 287.053 T)
-    np.testing.assert_allclose((moved[:, 2] ** 2 - plain[:, 2] ** 2) / (1.4 * 287.053), 0.01, rtol=1e-4)
+    # 0.01 K warmer: the speed of sound, sqrt(1.4 * 287.053 T) where the gas is the ground's
+    low = rows < 86e3
+    np.testing.assert_allclose((moved[low, 2] ** 2 - plain[low, 2] ** 2) / (1.4 * 287.053), 0.01, rtol=1e-4)
     # each row's change up to the next is the next one's density
     np.testing.assert_allclose(np.diff(np.log(moved[:, 0])), moved[:-1, 1], atol=1e-12)
 
