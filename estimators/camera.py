@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
 _MOST = 0.5  # of the answered frames
 _DOUBTFUL = 2  # of the four frames around: one alone is a spoilt frame, not a spoilt film
+_OF_PICTURE = ("frame-dark", "frame-saturated", "frame-size", "frame-undecodable", "frame-not-grey", "frame-frozen")
 _NOT_THE_SHELL = ("camera-turned", "edge-not-shell", "features-contradict-edge")
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
@@ -324,7 +325,7 @@ def judged(
         else fit
         for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
     ]
-    found = without_doubtful(without_lost_features(kept))
+    found = without_remnants(without_doubtful(without_lost_features(kept)))
     if joint_swing is not None:
         found = without_jumps(time_s, found, joint_swing)
     accepted = [v is not None and v.edit == "accept" for v in verdicts]
@@ -340,6 +341,16 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
     lost = Fault(words, "features-lost")
     bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
     return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
+
+
+def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
+    """Refuse what is left of a film of which most frames that show anything show no shell: those may fit by chance."""
+    shown = [fit for fit in fits if getattr(fit.refused, "code", "") not in _OF_PICTURE]
+    refused = float(np.mean([bool(fit.refused) for fit in shown] or [False]))
+    if len(shown) < _LEVEL_FRAMES or refused <= _MOST:
+        return fits
+    words = f"{100.0 * refused:.0f} % of the film's frames show no shell that can be read: an answer here may be chance"
+    return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mostly-refused")) for fit in fits]
 
 
 def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:

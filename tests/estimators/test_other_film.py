@@ -13,15 +13,15 @@ import pandas as pd
 import pytest
 
 from estimators.benchmark import orient_camera, samples_together
-from estimators.camera import JointSwing, read_film, without_jumps, without_lost_features
-from estimators.camera_fit import FrameFit, _NoFitError
+from estimators.camera import JointSwing, read_film, without_jumps, without_lost_features, without_remnants
+from estimators.camera_fit import FrameFit, _NoFitError, refused_fit
 from estimators.edge import fault_of_frame, is_coherent, no_horizon, steps_near
 from estimators.features import no_features
 from estimators.frame_edits import EditedFrame
 from estimators.virtual_camera import deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import NO_EDITS
-from flightmodel.checks import NO_FAULT
+from flightmodel.checks import NO_FAULT, Fault
 from flightmodel.vehicle import read_vehicle
 from postflight.checks.folder_check import benchmark_frame
 from postflight.filming import joint_swing
@@ -235,3 +235,16 @@ def test_a_picture_with_oblong_pixels_is_refused():
     oblong = cv2.warpAffine(frame, np.column_stack([stretch, middle - stretch @ middle]), (720, 480))
     with refuses("pixels-not-square"):
         orient_camera(oblong, GEOMETRY, MOUNT, JOINT_M)
+
+
+@pytest.mark.parametrize(("code", "refused", "left"), [
+    ("edge-too-short", 11, 0), ("edge-too-short", 10, 10), ("frame-dark", 15, 5),
+])  # fmt: skip
+def test_a_film_of_which_most_frames_show_no_shell_has_no_answer(code, refused, left):
+    fits = answers(np.full(20, 2.0))
+    for k in range(refused):
+        fits[k] = refused_fit(no_horizon(NO_FAULT), Fault("no shell", code))
+    found = without_remnants(fits)
+    assert sum(not fit.refused for fit in found) == left
+    if not left:
+        assert found[-1].refused.code == "film-mostly-refused"
