@@ -152,24 +152,22 @@ def _albedo(y, z, r, a, crest, shell):
 
 
 @inlined
-def _lit(eye, d, t, sun, shell, warp):
-    """Cosine of the Sun's angle from the normal where a ray meets the skin, zero at the least; a place off the skin."""
-    x, y, z = eye[0] + t * d[0], eye[1] + t * d[1], eye[2] + t * d[2]
-    a, b, r = _half_plane(x, y, z, shell, warp)
-    # outward normal in the half-plane, then in space
+def _normal(y, z, a, b, r, shell):
+    """Outward normal of the skin at a point with its place in the half-plane."""
     n_s = (a * shell[2] + b * shell[3]) / shell[5]
     n_r = (a * shell[3] - b * shell[2]) / shell[5]
-    ny, nz = n_r * y / r, n_r * z / r
-    lit = max(ny * sun[1] + nz * sun[2] - n_s * sun[0], 0.0)
-    return lit, x - OFF_SKIN_M * n_s, y + OFF_SKIN_M * ny, z + OFF_SKIN_M * nz
+    return -n_s, n_r * y / r, n_r * z / r
 
 
 @inlined
 def _free(eye, d, t, sun, shell, warp, body):
     """Share of the Sun's disc that is seen from where a ray meets the skin."""
-    lit, x, y, z = _lit(eye, d, t, sun, shell, warp)
-    if lit <= 0.0:
+    x, y, z = eye[0] + t * d[0], eye[1] + t * d[1], eye[2] + t * d[2]
+    a, b, r = _half_plane(x, y, z, shell, warp)
+    nx, ny, nz = _normal(y, z, a, b, r, shell)
+    if nx * sun[0] + ny * sun[1] + nz * sun[2] <= 0.0:
         return 0.0
+    x, y, z = x + OFF_SKIN_M * nx, y + OFF_SKIN_M * ny, z + OFF_SKIN_M * nz
     free = _beside_body(x, y, z, sun, body)
     return free * _beside_shell(x, y, z, sun, shell, warp) if free > 0.0 else 0.0
 
@@ -180,7 +178,8 @@ def _shade(eye, d, t, free, sun, shell, warp, painted):
     y, z = eye[1] + t * d[1], eye[2] + t * d[2]
     a, b, r = _half_plane(eye[0] + t * d[0], y, z, shell, warp)
     crest = min(max(b / shell[5], 0.0), 1.0)
-    lit = free * _lit(eye, d, t, sun, shell, warp)[0] if free > 0.0 else 0.0
+    nx, ny, nz = _normal(y, z, a, b, r, shell)
+    lit = free * max(nx * sun[0] + ny * sun[1] + nz * sun[2], 0.0)
     value = (0.10 + 0.10 * crest + 0.62 * lit) * (0.55 + 0.45 * math.sqrt(crest))
     return value * _albedo(y, z, r, a, crest, shell) if painted else value
 

@@ -32,7 +32,7 @@ from synthetic_flight import dynamics, simulate
 from synthetic_flight.dispersions import Case, Dispersions, Window, dispersed_case
 from synthetic_flight.dynamics import check_step
 from synthetic_flight.scenarios import Scenario, TimeSpan, initial_state
-from synthetic_flight.simulate import ATMOSPHERE_ROWS, ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, integrate_lanes
+from synthetic_flight.simulate import integrate_lanes
 
 # two to four vectors of a register each; more lanes outgrow the first-level cache
 LANES = 16
@@ -178,7 +178,7 @@ def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[
     return flown
 
 
-_TABLE_M = ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS)
+_TABLE_M = simulate.air_altitudes_m()
 
 
 @dataclass(frozen=True)

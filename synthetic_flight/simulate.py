@@ -484,13 +484,14 @@ def parameter_vector(
     return p
 
 
-def _altitudes() -> FloatArray:
-    return ATMOSPHERE_START_M + ATMOSPHERE_STEP_M * np.arange(ATMOSPHERE_ROWS, dtype=np.float64)
+def air_altitudes_m(rows: int = ATMOSPHERE_ROWS, from_m: float = ATMOSPHERE_START_M) -> FloatArray:
+    """Altitudes (rows,) of a kernel table of air."""
+    return from_m + ATMOSPHERE_STEP_M * np.arange(rows, dtype=np.float64)
 
 
 @cache
 def _standard() -> tuple[FloatArray, FloatArray, FloatArray]:
-    return us76(_altitudes())
+    return us76(air_altitudes_m())
 
 
 def atmosphere_table(profile: AtmosphereProfile) -> FloatArray:
@@ -499,7 +500,7 @@ def atmosphere_table(profile: AtmosphereProfile) -> FloatArray:
     Density, the change of its logarithm up to the next row, speed of sound, north and east wind, and room for the
     fraction of free-molecular flow, which depends on the vehicle (`kernel_tables`).
     """
-    z = _altitudes()
+    z = air_altitudes_m()
     air = profile.at(z, _standard())
     change = np.diff(np.log(air.density_kgpm3), append=np.log(air.density_kgpm3[-1]))
     columns = [air.density_kgpm3, change, air.sound_speed_mps, air.wind_ned_mps[:, :2], np.zeros(len(z))]
@@ -513,7 +514,7 @@ def vacuum_table() -> FloatArray:
 
 @cache
 def _gas_constants(air_from_m: float, rows: int) -> FloatArray:
-    return gas_constant(air_from_m + ATMOSPHERE_STEP_M * np.arange(rows, dtype=np.float64))
+    return gas_constant(air_altitudes_m(rows, air_from_m))
 
 
 def kernel_tables(

@@ -273,7 +273,7 @@ class AtmosphereParameters:
     def _sounded(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         profile = profile_from_sounding(self.sounding)
         table = simulate.atmosphere_table(profile)
-        rows = simulate.ATMOSPHERE_START_M + simulate.ATMOSPHERE_STEP_M * np.arange(len(table), dtype=np.float64)
+        rows = simulate.air_altitudes_m(len(table))
         passed = rows <= TOP_M  # of a table a knot, each copied for every flight, three quarters lie above
         return table[passed], rows[passed], profile.at(rows[passed]).temperature_k
 
