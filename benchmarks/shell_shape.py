@@ -106,7 +106,7 @@ def one_flight(seed: int, options: argparse.Namespace) -> tuple[ShellShape, int,
         size = np.linalg.norm(true, axis=1)
         inside = films[0].pressure_pa > PULSE_SHARE * films[0].pressure_pa.max()
         rows = []
-        for some in ([one.film for one in films], [with_shape(one, shape) for one in films]):
+        for some in ([one.film for one in films], with_shape(films, shape)):
             theta, sd = answers(some, pulse)
             rows.append(np.rad2deg(np.array([theta - size, sd])[:, inside]))
     except GateError as fault:

@@ -480,7 +480,7 @@ class RelativeDeflections:
     benchmark_s : float
     time_bias_sd_s : float
         A priori sd of the frames' time bias against the gyros'.
-    by_shape : (n, 2, 13) float or None
+    by_shape : (n, 2, 13 (1 + c)) float or None
         Part of the readings' error that the shell's shape under load has in common, per unit normal; its square is in
         ``covariance``.
     """

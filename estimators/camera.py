@@ -78,7 +78,7 @@ class FilmFit:
         Of the assumed plane.
     by_hand : str
         What an analyst edited.
-    shape_covariance : (13, 13) float or None
+    shape_covariance : (13 (1 + c), 13 (1 + c)) float or None
         Of the shell's shape under load as the film determined it, where the answers use it (`estimators.shell_shape`).
     """
 
@@ -116,7 +116,7 @@ class FilmFit:
         )
 
     def _shape_root(self) -> FloatArray | None:
-        """Root (n, 2, 13) of the readings' common error by the shell's shape under load, as lateral vectors."""
+        """Root (n, 2, 13 (1 + c)) of the readings' common error by the shell's shape under load, as lateral vectors."""
         if self.shape_covariance is None:
             return None
         none = np.full((2, len(self.shape_covariance)), np.nan)

@@ -6,24 +6,31 @@ round the shell, ``s`` (13), each with a wide a priori sd about zero. Half of th
 lobes from rocking poorly. A film does better, as a shape that yields to the load grows with the dynamic pressure
 ``q``::
 
-    s_i = a l_i + f_i,    l_i = (q_i - q_b) / q_max,    f ~ Gauss-Markov with sd sigma
+    s_i = a l_i + f_i - f_b,    l_i = (q_i - q_b) / q_max,    f ~ Gauss-Markov with sd sigma
 
-relative to the benchmark frame ``b``. The amplitudes ``a`` are the shell's, common to all its cameras; the frames' own
-part ``f`` is a shape that does not follow the load. What a frame found is linear in its true shape, in the errors ``c``
-of its camera's pose and in the deflection ``d`` of the benchmark frame,
+relative to the benchmark frame ``b``. The amplitudes ``a`` are the shell's, common to all its cameras. The part ``f``
+is a shape that does not follow the load, and what the light on the shell makes look like one; each camera has its own.
+That of the benchmark frame stands in all frames of its film, unloaded ones as well: as a constant beside the growth it
+is estimated with the amplitudes. What a frame found is linear in its true shape, in the errors ``c`` of its camera's
+pose and in the deflection ``d`` of the benchmark frame,
 
     found_i = G_i s_i + C_i c + B_i d + e_i,    G_i = 1 - P_i / P_prior,    cov(e_i) = P_i G_i'
 
-with ``P_i`` the formal covariance of the shape; ``e`` is correlated in time as a camera's readings are
-(`LIGHT_TIME_S`). ``w`` is free in every frame: nothing is assumed of the deflection. All is Gaussian, and the evidence
-of the films decides between rocking alone and lobes of two waves, of three, of more, and of each combination; the shell
-may flatten in each. Rocking alone has a prior probability of one half, the others share the rest. ``sigma`` has three
-sizes of equal probability.
+with ``P_i`` the formal covariance of the shape, which takes the errors of points as independent: those of neighbours
+are alike, so ``e`` is ``kappa`` times as large. It is correlated in time as a camera's readings are (`LIGHT_TIME_S`).
+``w`` is free in every frame: nothing is assumed of the deflection. All is Gaussian, and the evidence of the films
+decides between rocking alone and lobes of two waves, of three, of more, and of each combination; the shell may flatten
+in each. Rocking alone has a prior probability of one half, the others share the rest. ``sigma`` and ``kappa`` have a
+few sizes of equal probability.
 
-The amplitudes' posterior, a mixture over the hypotheses, is then the prior of every frame's shape: in the frame's own
-posterior of ``(w, s)`` the wide prior about zero is replaced by ``N(a l, sigma^2)``. What is left of the amplitudes'
-error is common to all frames and grows with the load (`FrameFit.by_shape`): a shape that follows the load must not pass
-for compliance of the joint.
+The posterior of amplitudes and ``f_b``, a mixture over the hypotheses, is then the prior of every frame's shape: in the
+frame's own posterior of ``(w, s)`` the wide prior about zero is replaced by the normal of ``s_i`` given ``a`` and
+``f_b``, with ``r`` the correlation of ``f`` between frame and benchmark,
+
+    N(a l_i - (1 - r) f_b, sigma^2 (1 - r^2)).
+
+What is left of the error of ``a`` and ``f_b`` is common to all frames (`FrameFit.by_shape`): a shape that follows the
+load must not pass for compliance of the joint.
 
 Assumed: shapes of more than five waves, and of one torus alone, are in the residuals; the amplitudes' error is
 independent of the cameras'.
@@ -41,7 +48,7 @@ from itertools import chain, combinations, product
 
 import numpy as np
 import pandas as pd
-from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve
 from scipy.special import softmax
 
 from estimators.camera import FilmFit
@@ -59,11 +66,14 @@ LOBES = {"two waves": (2,), "three waves": (3,), "more waves": (4, 5)}
 HYPOTHESES = tuple(chain.from_iterable(combinations(LOBES, k) for k in range(len(LOBES) + 1)))
 """Lobes that there are; the first: rocking alone."""
 _PRIOR = np.array([0.5, *[0.5 / (len(HYPOTHESES) - 1)] * (len(HYPOTHESES) - 1)])
-_FRAME_SDS_RAD = np.deg2rad([0.01, 0.03, 0.1])
+_FRAME_SDS_RAD = np.deg2rad([0.003, 0.01, 0.03, 0.1])
+_POINTS_SCALES = (1.0, 1.7, 3.0, 5.0)  # of points' errors over the formal ones: up to 25 neighbours of 240 err alike
+_SIZES = tuple(product(_POINTS_SCALES, _FRAME_SDS_RAD))
 CALLED = 0.9  # probability from which an answer is called
 _DETERMINED = 0.5  # of the a priori sd
-LEAST_FRAMES, _MOST_FRAMES = 12, 100
+LEAST_FRAMES, _MOST_FRAMES = 12, 60  # more frames of a film lie closer than their errors change
 _LEAST_LOAD = 0.3  # of the film's largest, between frames: less shows no growth
+_LEAST_OWN = 1e-4  # of the variance of a frame's own part: next to the benchmark frame none of it is its own
 _JITTER_RAD2 = float(np.deg2rad(1e-4) ** 2)  # where a frame shows nothing of a shape, what it found is exactly zero
 
 
@@ -73,6 +83,11 @@ class LoadedFilm:
 
     film: FilmFit
     pressure_pa: FloatArray
+
+    @property
+    def with_benchmark(self) -> FloatArray:
+        """Correlation (n,) of a frame's own part with the benchmark frame's."""
+        return np.asarray(np.exp(-np.abs(self.film.time_s - self.film.benchmark_s) / LIGHT_TIME_S))
 
     def shares(self, largest_pa: float) -> FloatArray:
         """Loads ``l`` (n,) relative to the benchmark frame's, over the largest of all films."""
@@ -94,29 +109,43 @@ class ShellShape:
 
     Parameters
     ----------
-    amplitude_rad : (13,) float
-        Of `MODES` at the largest dynamic pressure, angles about the innermost ring, over all hypotheses.
-    covariance : (13, 13) float
+    found_rad : (13 (1 + c),) float
+        Amplitudes of `MODES` at the largest dynamic pressure, angles about the innermost ring, then minus the benchmark
+        frame's own shape of each of the ``c`` films, over all hypotheses.
+    found_covariance : (13 (1 + c), 13 (1 + c)) float
     if_any_rad, if_any_sd_rad : (13,) float
         With all lobes.
     probability : (8,) float
         Of `HYPOTHESES`.
     frame_sd_rad : float
         Of a frame's own shape.
+    points_scale : float
+        Errors of a frame's points over their formal ones.
     determined : (13,) bool
         Whether the films determined an amplitude better than half its a priori sd.
     largest_pa : float
         Largest dynamic pressure of the films.
     """
 
-    amplitude_rad: FloatArray
-    covariance: FloatArray
+    found_rad: FloatArray
+    found_covariance: FloatArray
     if_any_rad: FloatArray
     if_any_sd_rad: FloatArray
     probability: FloatArray
     frame_sd_rad: float
+    points_scale: float
     determined: BoolArray
     largest_pa: float
+
+    @property
+    def amplitude_rad(self) -> FloatArray:
+        """Amplitudes (13,)."""
+        return self.found_rad[: len(MODES)]
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the amplitudes (13, 13)."""
+        return self.found_covariance[: len(MODES), : len(MODES)]
 
     @property
     def rocking_alone(self) -> float:
@@ -205,17 +234,13 @@ def shell_shape(films: list[LoadedFilm]) -> ShellShape:
             code="loads-alike",
         )
     prior = mode_sd_rad(films[0].film.oriented.apriori)
-    found, respond, camera, frame_part = _stacked(films, loads)
-    by_size = []
-    for size in _FRAME_SDS_RAD:
-        factor = cho_factor(camera + size**2 * frame_part, lower=True)
-        solved = cho_solve(factor, np.column_stack([respond, found]))
-        log = -0.5 * float(found @ solved[:, -1]) - float(np.log(np.diag(factor[0])).sum())
-        by_size.append((log, respond.T @ solved[:, :-1], respond.T @ solved[:, -1]))
-    answers = [
-        _Amplitudes.given(number, size, prior, *one)
-        for (size, one), number in product(zip(_FRAME_SDS_RAD, by_size, strict=True), range(len(HYPOTHESES)))
-    ]
+    stacked = {number: _Stacked.of(one, largest) for number, one in enumerate(films) if len(one.rows)}
+    answers = []
+    for scale, size in _SIZES:
+        prior_sd = np.append(prior, np.full(len(films) * len(MODES), size))
+        log, information, right = _information(stacked, len(prior_sd), scale, size)
+        for number in range(len(HYPOTHESES)):
+            answers.append(_Amplitudes.given(number, (scale, size), prior_sd, log, information, right))
     return _mixed(answers, prior, largest)
 
 
@@ -224,58 +249,83 @@ def mode_sd_rad(apriori: AprioriSd) -> FloatArray:
     return np.array([apriori.flattening_rad, *apriori.lobe_sd_rad])
 
 
-def _stacked(films: list[LoadedFilm], loads: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Shapes found (k n,), response to amplitudes (k n, k), covariance without and of unit own shapes (k n, k n)."""
-    found, through, own, at_s = [], [], [], []
-    for one in films:
-        fits = [one.film.fits[k].shape for k in one.rows]
+@dataclass(frozen=True)
+class _Stacked:
+    """What a film found of the shape (13 n,), its responses (13 n, 13), and covariances (13 n, 13 n) of its parts."""
+
+    found: FloatArray
+    to_load: FloatArray
+    to_benchmark: FloatArray
+    points: FloatArray
+    camera: FloatArray
+    own: FloatArray
+
+    @staticmethod
+    def of(one: LoadedFilm, largest_pa: float) -> _Stacked:
+        """``points``: of the formal size; ``own``: of unit own shapes given the benchmark frame's."""
+        rows, oriented = one.rows, one.film.oriented
+        fits = [one.film.fits[k].shape for k in rows]
         formal = np.array([fit.formal[2:, 2:] for fit in fits])
-        share = _share_found(formal, one.film.oriented.apriori)
-        found.append(np.array([fit.found_rad[2:] for fit in fits]).ravel())
-        through.append(share)
-        noise = share @ formal
-        time_s = one.film.time_s[one.rows]
+        share = _share_found(formal, oriented.apriori)
+        noise, time_s, alike = share @ formal, one.film.time_s[rows], one.with_benchmark[rows]
         root = symmetric_root(0.5 * (noise + noise.transpose(0, 2, 1)))
-        errors = paired_covariance(root, correlation(time_s, LIGHT_TIME_S, CONSTANT_PART), root)
         camera = np.concatenate([fit.by_camera[2:] for fit in fits])
-        start = np.concatenate([fit.by_benchmark[2:] for fit in fits]) * one.film.oriented.apriori.benchmark_rad
-        own.append(errors + camera @ one.film.oriented.posed_covariance @ camera.T + start @ start.T)
-        at_s.append(time_s)
-    shares, times = np.concatenate(through), np.concatenate(at_s)
-    n = len(MODES) * len(times)
-    respond = (shares * loads[:, None, None]).reshape(n, len(MODES))
-    covariance = block_diag(*own) + _JITTER_RAD2 * np.eye(n)
-    return (
-        np.concatenate(found),
-        respond,
-        covariance,
-        paired_covariance(shares, correlation(times, LIGHT_TIME_S), shares),
-    )
+        start = np.concatenate([fit.by_benchmark[2:] for fit in fits]) * oriented.apriori.benchmark_rad
+        return _Stacked(
+            np.array([fit.found_rad[2:] for fit in fits]).ravel(),
+            (share * one.shares(largest_pa)[rows, None, None]).reshape(-1, len(MODES)),
+            (share * (1.0 - alike)[:, None, None]).reshape(-1, len(MODES)),
+            paired_covariance(root, correlation(time_s, LIGHT_TIME_S, CONSTANT_PART), root),
+            camera @ oriented.posed_covariance @ camera.T + start @ start.T,
+            paired_covariance(share, correlation(time_s, LIGHT_TIME_S) - np.outer(alike, alike), share),
+        )
+
+
+def _information(
+    films: dict[int, _Stacked], k: int, scale: float, size_rad: float
+) -> tuple[float, FloatArray, FloatArray]:
+    """Logarithm of the evidence without amplitudes, and the information (k, k) on them and the benchmarks' shapes.
+
+    ``films``: by their number, those with an answer.
+    """
+    m, log, information, right = len(MODES), 0.0, np.zeros((k, k)), np.zeros(k)
+    for number, one in films.items():
+        covariance = scale**2 * one.points + one.camera + size_rad**2 * one.own
+        covariance[np.diag_indices_from(covariance)] += _JITTER_RAD2
+        factor = cho_factor(covariance, lower=True, overwrite_a=True)
+        respond = np.hstack([one.to_load, one.to_benchmark])
+        solved = cho_solve(factor, np.column_stack([respond, one.found]))
+        at = np.r_[0:m, m * (1 + number) : m * (2 + number)]
+        information[np.ix_(at, at)] += respond.T @ solved[:, :-1]
+        right[at] += respond.T @ solved[:, -1]
+        log += -0.5 * float(one.found @ solved[:, -1]) - float(np.log(np.diag(factor[0])).sum())
+    return log, information, right
 
 
 @dataclass(frozen=True)
 class _Amplitudes:
-    """Posterior of the amplitudes under a hypothesis and a size of the frames' own shapes."""
+    """Posterior of amplitudes and benchmarks' shapes under a hypothesis and a size of the frames' own shapes."""
 
     number: int
-    size_rad: float
+    sizes: tuple[float, float]
     mean: FloatArray
     covariance: FloatArray
     log_evidence: float
 
     @staticmethod
     def given(
-        number: int, size_rad: float, prior_sd: FloatArray, log: float, information: FloatArray, right: FloatArray
-    ) -> _Amplitudes:
+        number: int, sizes: tuple[float, float], prior_sd: FloatArray, log: float, information: FloatArray,
+        right: FloatArray,
+    ) -> _Amplitudes:  # fmt: skip
         """Of the information (k, k) and its mean's product (k,) that the films have on all modes."""
         waves = [w for name in HYPOTHESES[number] for w in LOBES[name]]
-        there = np.flatnonzero(np.isin(_WAVES_OF_MODE, [0, *waves]))
+        there = np.flatnonzero(np.append(np.isin(_WAVES_OF_MODE, [0, *waves]), np.ones(len(prior_sd) - len(MODES))))
         within = np.linalg.inv(information[np.ix_(there, there)] + np.diag(prior_sd[there] ** -2.0))
         mean, covariance = np.zeros(len(prior_sd)), np.zeros((len(prior_sd), len(prior_sd)))
         mean[there] = within @ right[there]
         covariance[np.ix_(there, there)] = within
         gained = 0.5 * float(right[there] @ mean[there]) + 0.5 * float(np.linalg.slogdet(within)[1])
-        return _Amplitudes(number, size_rad, mean, covariance, log + gained - float(np.log(prior_sd[there]).sum()))
+        return _Amplitudes(number, sizes, mean, covariance, log + gained - float(np.log(prior_sd[there]).sum()))
 
 
 def _mixed(answers: list[_Amplitudes], prior_sd: FloatArray, largest_pa: float) -> ShellShape:
@@ -287,36 +337,51 @@ def _mixed(answers: list[_Amplitudes], prior_sd: FloatArray, largest_pa: float) 
     number = np.array([one.number for one in answers])
     with_all = weight * (number == len(HYPOTHESES) - 1)
     if_any, if_any_cov = mixture_moments(with_all / max(with_all.sum(), 1e-300), means, covariances)
-    sd = np.sqrt(np.diag(if_any_cov))
-    size = float(np.sqrt(weight @ np.array([one.size_rad for one in answers]) ** 2))
+    if_any, sd = if_any[: len(MODES)], np.sqrt(np.diag(if_any_cov))[: len(MODES)]
+    scale, size = np.sqrt(weight @ np.array([one.sizes for one in answers]) ** 2)
     probability = np.bincount(number, weight, len(HYPOTHESES)).astype(float)
-    return ShellShape(mean, covariance, if_any, sd, probability, size, sd < _DETERMINED * prior_sd, largest_pa)
-
-
-def with_shape(one: LoadedFilm, shape: ShellShape) -> FilmFit:
-    """Film with the answers of all frames given the shell's shape under their load."""
-    loads = one.shares(shape.largest_pa)
-    fits = tuple(
-        fit if fit.shape is None or not np.isfinite(load) else _given_shape(fit, float(load), shape, one.film.oriented)
-        for fit, load in zip(one.film.fits, loads, strict=True)
+    return ShellShape(
+        mean, covariance, if_any, sd, probability, float(size), float(scale), sd < _DETERMINED * prior_sd, largest_pa
     )
-    return replace(one.film, fits=fits, shape_covariance=shape.covariance)
 
 
-def _given_shape(fit: FrameFit, load: float, shape: ShellShape, oriented: OrientedCamera) -> FrameFit:
-    """A frame's answer with ``N(a l, sigma^2)`` in place of its shape's a priori distribution."""
+def with_shape(films: list[LoadedFilm], shape: ShellShape) -> list[FilmFit]:
+    """Films with the answers of all frames given the shell's shape under their load, in the order of `shell_shape`."""
+    return [_with_shape(one, number, shape) for number, one in enumerate(films)]
+
+
+def _with_shape(one: LoadedFilm, number: int, shape: ShellShape) -> FilmFit:
+    # of amplitudes and benchmarks' own shapes: what each frame shows of them
+    parts = np.zeros((len(one.film.fits), len(shape.found_rad) // len(MODES)))
+    parts[:, 0], parts[:, 1 + number] = one.shares(shape.largest_pa), 1.0 - one.with_benchmark
+    own = shape.frame_sd_rad**2 * np.maximum(1.0 - one.with_benchmark**2, _LEAST_OWN)
+    fits = tuple(
+        fit
+        if fit.shape is None or not np.isfinite(part[0])
+        else _given_shape(fit, part, float(var), shape, one.film.oriented)
+        for fit, part, var in zip(one.film.fits, parts, own, strict=True)
+    )
+    return replace(one.film, fits=fits, shape_covariance=shape.found_covariance)
+
+
+def _given_shape(
+    fit: FrameFit, parts: FloatArray, own_var: float, shape: ShellShape, oriented: OrientedCamera
+) -> FrameFit:
+    """A frame's answer with its shape's distribution given the film's in place of the a priori one."""
     assert fit.shape is not None
     own, modes = fit.shape, slice(2, None)
     information = np.linalg.inv(own.formal)
     informed = information.copy()
-    informed[modes, modes] += np.diag(shape.frame_sd_rad**-2.0 - mode_sd_rad(oriented.apriori) ** -2.0)
+    informed[modes, modes] -= np.diag(mode_sd_rad(oriented.apriori) ** -2.0)
+    informed /= shape.points_scale**2
+    informed[modes, modes] += np.eye(len(MODES)) / own_var
     formal = np.linalg.inv(informed)[:2]
-    by_shape = formal[:, modes] * (load / shape.frame_sd_rad**2)
-    again = formal @ information
-    answer = again @ own.found_rad + by_shape @ shape.amplitude_rad
+    by_shape: FloatArray = np.kron(parts, formal[:, modes] / own_var).astype(float)
+    again = formal @ information / shape.points_scale**2
+    answer = again @ own.found_rad + by_shape @ shape.found_rad
     by_camera, by_benchmark = again @ own.by_camera, again @ own.by_benchmark
     covariance = oriented.covariance_of(formal[:, :2], by_camera, by_benchmark)
-    covariance = covariance + by_shape @ shape.covariance @ by_shape.T
+    covariance = covariance + by_shape @ shape.found_covariance @ by_shape.T
     return replace(fit, rotation_yz_rad=answer, covariance=covariance, per_benchmark=by_benchmark, by_shape=by_shape)
 
 

@@ -226,7 +226,8 @@ def _with_shell_shape(
         shape = shell_shape(list(loaded.values()))
     except GateError as fault:
         return films, None, f"shell's shape: frame by frame, within its a priori sd ({fault})"
-    return {name: with_shape(one, shape) for name, one in loaded.items()}, shape, f"shell's shape: {shape.remark}"
+    shaped = dict(zip(loaded, with_shape(list(loaded.values()), shape), strict=True))
+    return shaped, shape, f"shell's shape: {shape.remark}"
 
 
 def _with_pressure(film: FilmFit, bet: Reconstruction) -> LoadedFilm:

@@ -19,6 +19,8 @@ from synthetic_flight.film import film as rendered
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, sun
 
 TIME_S = np.arange(421.0, 446.0, 1.0)
+# of a frame's own shape and of its points' errors over what they say: as probable as each other
+OWN_DEG, POINTS_SCALES = (0.003, 0.01, 0.03, 0.1), (1.0, 1.7, 3.0, 5.0)
 PRESSURE_PA = 1200.0 * np.exp(-(((TIME_S - 438.0) / 7.0) ** 2))
 
 
@@ -39,10 +41,11 @@ def test_lobes_of_another_renderer_are_found_and_are_no_rocking(shape_deg):
     assert abs(read.history().theta_rad[1] - theta[1]) < D(0.06)
 
 
-def drawn(rng, there, formal_deg=0.05):
+def drawn(rng, there, formal_deg=0.02):
     """A film whose errors are drawn as the model states them, its true deflections and amplitudes.
 
-    A frame's points determine deflection and shape, random directions of them poorly; a camera has twelve errors.
+    A frame's points determine deflection and shape, random directions of them poorly, and err by more than they say; a
+    camera has twelve errors. What is no growth stands in the benchmark frame too.
     """
     n, apriori, m = len(TIME_S), AprioriSd(), len(MODES) + 2
     prior, mixed = mode_sd_rad(apriori), rng.standard_normal((m, m))
@@ -56,11 +59,12 @@ def drawn(rng, there, formal_deg=0.05):
     waves = [mode.split()[0] for mode in MODES]
     has = np.isin(waves, ["flattening", *(str(w) for name in there for w in LOBES[name])])
     amplitude = has * prior * rng.standard_normal(len(MODES))
-    own = np.linalg.cholesky(correlation(TIME_S, LIGHT_TIME_S)) @ rng.standard_normal((n, len(MODES))) * D(0.03)
-    shape = amplitude * load[:, None] + own
+    size, scale = D(rng.choice(OWN_DEG)), rng.choice(POINTS_SCALES)
+    own = np.linalg.cholesky(correlation(TIME_S, LIGHT_TIME_S)) @ rng.standard_normal((n, len(MODES))) * size
+    shape = amplitude * load[:, None] + own - own[0]
     true = np.column_stack([D(4.0) * rng.standard_normal((n, 2)), shape])
     together = correlation(TIME_S, LIGHT_TIME_S, CONSTANT_PART)
-    noise = np.linalg.cholesky(together) @ rng.standard_normal((n, m)) @ np.linalg.cholesky(points).T
+    noise = scale * np.linalg.cholesky(together) @ rng.standard_normal((n, m)) @ np.linalg.cholesky(points).T
     camera, start = rng.standard_normal(12), apriori.benchmark_rad * rng.standard_normal(2)
     # the frame's own estimate, pulled towards a shape of zero
     found = np.einsum("ij,nj->ni", formal, true @ points + noise) + by_camera @ camera + by_benchmark @ start
@@ -85,7 +89,7 @@ def many():
         there = HYPOTHESES[rng.choice(8, p=[0.5, *[0.5 / 7.0] * 7])]
         film, true, amplitude = drawn(rng, there)
         shape = shell_shape([film])
-        rows.append((there, shape, amplitude, true, film, with_shape(film, shape)))
+        rows.append((there, shape, amplitude, true, film, with_shape([film], shape)[0]))
     return rows
 
 
@@ -160,15 +164,32 @@ def test_frames_of_one_load_tell_nothing():
 
 def test_the_film_s_shape_takes_the_place_of_the_frame_s_prior():
     """As a fit of the frame's points alone, with the film's shape for its prior, would have it."""
-    film, _, _ = drawn(np.random.default_rng(5), ("two waves",))
-    shape = replace(shell_shape([film]), frame_sd_rad=float(D(0.1)))
-    k = int(np.argmax(PRESSURE_PA))
-    own, load = film.film.fits[k].shape, film.shares(shape.largest_pa)[k]
-    points = np.linalg.inv(own.formal)
-    seen = points @ own.found_rad
-    points[2:, 2:] -= np.diag(mode_sd_rad(AprioriSd()) ** -2.0)
-    points[2:, 2:] += np.eye(len(MODES)) / D(0.1) ** 2
-    seen[2:] += load * shape.amplitude_rad / D(0.1) ** 2
-    np.testing.assert_allclose(
-        with_shape(film, shape).fits[k].rotation_yz_rad, np.linalg.solve(points, seen)[:2], rtol=1e-8
-    )
+    rng = np.random.default_rng(5)
+    films = [drawn(rng, ("two waves",))[0] for _ in range(2)]
+    shape = replace(shell_shape(films), frame_sd_rad=float(D(0.1)), points_scale=2.0)
+    k, m = int(np.argmax(PRESSURE_PA)), len(MODES)
+    for number, film in enumerate(films):
+        own, load = film.film.fits[k].shape, film.shares(shape.largest_pa)[k]
+        alike = np.exp(-(TIME_S[k] - TIME_S[0]) / LIGHT_TIME_S)
+        points = np.linalg.inv(own.formal)
+        seen = points @ own.found_rad / 4.0
+        points[2:, 2:] -= np.diag(mode_sd_rad(AprioriSd()) ** -2.0)
+        points /= 4.0
+        # a sum of two: (1 - r) of the benchmark frame's, and what is independent of it
+        var = D(0.1) ** 2 * (1.0 - alike**2)
+        points[2:, 2:] += np.eye(m) / var
+        benchmark = shape.found_rad[m * (1 + number) : m * (2 + number)]
+        seen[2:] += (load * shape.amplitude_rad + (1.0 - alike) * benchmark) / var
+        np.testing.assert_allclose(
+            with_shape(films, shape)[number].fits[k].rotation_yz_rad, np.linalg.solve(points, seen)[:2], rtol=1e-8
+        )
+
+
+def test_a_film_without_answers_leaves_the_others_theirs():
+    rng = np.random.default_rng(6)
+    film, dark = (drawn(rng, ())[0] for _ in range(2))
+    refused = tuple(replace(fit, shape=None) for fit in dark.film.fits)
+    none = LoadedFilm(replace(dark.film, fits=refused), PRESSURE_PA)
+    both, alone = shell_shape([film, none]), shell_shape([film])
+    np.testing.assert_allclose(both.amplitude_rad, alone.amplitude_rad, rtol=1e-6, atol=1e-12)
+    assert with_shape([film, none], both)[1].fits == refused
