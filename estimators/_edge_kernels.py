@@ -167,8 +167,11 @@ def first_rises(grey, inside, level, first, noise, common, limits, step, places,
 
 
 @kernel
-def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
-    """Place of the step, up or down, on short lines across an expected edge; see `estimators.edge`."""
+def steps_near(grey, inside, noise, contrast, places, bases, place, along, left, good):
+    """Place of the step, up or down, on short lines across an expected edge; see `estimators.edge`.
+
+    ``along``: its sd per unit sd of independent samples; ``left`` (n, m): grey levels less step and ramp.
+    """
     n, m = grey.shape
     level_of = 6
     few, value, explained = np.empty(level_of), np.empty(m), np.empty(len(places))
@@ -206,9 +209,14 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, sd, good):
         height = abs(behind / max(count, 1))
         residual_rms = math.sqrt(max(total - explained[best], 0.0) / m)
         if height > contrast and residual_rms < 2.0 * noise + 0.15 * height:
+            step_share, ramp_share = 0.0, 0.0
+            for k in range(m):
+                step_share += value[k] * bases[best, 0, k]
+                ramp_share += value[k] * bases[best, 1, k]
             place[i] = places[best] + (places[1] - places[0]) * shift
-            # as for a crossing found by itself: 2.4 noises over the slope of a blurred step
-            sd[i] = 7.6 * noise / height
+            along[i] = (places[1] - places[0]) * math.sqrt(2.0 / curve)
+            for k in range(m):
+                left[i, k] = value[k] - step_share * bases[best, 0, k] - ramp_share * bases[best, 1, k]
             good[i] = True
 
 

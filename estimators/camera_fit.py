@@ -69,6 +69,7 @@ LAST_STEP_RAD = 2e-5
 OUTLIER_PX = 5.0
 REACH_PX = 8  # within which features are looked for around their prediction
 _WORST_RMS_PX = 2.5  # from where a fit goes on
+_OFF_PLANE_PX = 0.5  # left on the edge by a deflection off an assumed plane, and by shapes, of a few tenths of a degree
 LEAST_POINTS, _LEAST_FEATURES = 60, 40
 _FEW_FEATURES = 0.6  # of those found at the benchmark
 _FAR_RAD = np.deg2rad([4.0, 4.0])
@@ -80,7 +81,7 @@ _AGREED_PX, _LEAST_AGREED = 0.5, 0.5  # by chance a sixth of the patches lie wit
 _SOUND_SCORE = 1.5  # the texture agrees with itself
 _EDGE_PASSES = 2
 _CONTRADICTION = 18.4  # chi-square of two components that one sound frame in 10,000 exceeds
-_LEAST_VAR = float(np.deg2rad(1e-3) ** 2)  # of a difference, far below what any film shows
+_LEAST_VAR = float(np.deg2rad(0.02) ** 2)  # of a difference: shapes that are not modelled, and points that err alike
 _SAME_BREAK_PX = 2
 _BESIDE = 4  # places of 240 along the edge: a residual of the benchmark frame holds that far for a mark by hand
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
@@ -181,7 +182,7 @@ class FrameFit:
         Whether features were found that contradict a whole edge, which alone gave the answer.
     shape : FrameShape or None
         None in an assumed plane.
-    by_shape : (2, 13) float or None
+    by_shape : (2, 13 (1 + c)) float or None
         Error per unit error of the shell's shape under load as the film determined it, where that was used.
     """
 
@@ -374,6 +375,8 @@ class OrientedCamera:
                 # the seed paper's way uses the edge alone
                 basis = plane_axis[:, None]
                 horizon = frame.near_edge(self.view.lines_at(self.clocks_rad, deformation))
+                # what the plane does not explain is more than any point's own error: all count alike
+                horizon = replace(horizon, sd_px=np.hypot(horizon.sd_px, _OFF_PLANE_PX))
                 deformation[:] = *(basis[:, 0] * (basis[:, 0] @ deformation[:2])), 0.0
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except _NoFitError as refusal:

@@ -15,11 +15,16 @@ def grey(image, u, v):
 
 
 def best_place(profile, places, bases):
-    """Place of the shape that explains most of a profile (m,), by a parabola over the three about it."""
+    """Place of the shape that explains most of a profile (m,), by a parabola over the three about it.
+
+    Its curvature per px^2, and what the shape leaves of the profile.
+    """
     explained = np.sum((bases @ profile) ** 2, axis=1)
     k = int(np.clip(np.argmax(explained), 1, len(places) - 2))
     low, mid, high = explained[k - 1 : k + 2]
-    return places[k] + (places[1] - places[0]) * 0.5 * (high - low) / (2.0 * mid - low - high)
+    step, curve = places[1] - places[0], 2.0 * mid - low - high
+    left = profile - bases[k].T @ (bases[k] @ profile)
+    return places[k] + step * 0.5 * (high - low) / curve, curve / step**2, left
 
 
 def dip_centre(image, origin, across, reach, half_width):
