@@ -374,9 +374,9 @@ class OrientedCamera:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
                 # the seed paper's way uses the edge alone
                 basis = plane_axis[:, None]
-                horizon = frame.near_edge(self.view.lines_at(self.clocks_rad, deformation))
+                horizon = self.coherent_edge(frame, deformation)
                 # what the plane does not explain is more than any point's own error: all count alike
-                horizon = replace(horizon, sd_px=np.hypot(horizon.sd_px, _OFF_PLANE_PX))
+                horizon = replace(horizon, sd_px=np.full_like(horizon.sd_px, _OFF_PLANE_PX))
                 deformation[:] = *(basis[:, 0] * (basis[:, 0] @ deformation[:2])), 0.0
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except _NoFitError as refusal:

@@ -66,16 +66,16 @@ history
 # %% [markdown]
 # ## In an assumed plane
 #
-# The paper had to assume the plane. With the plane held 60 deg off the estimated one the same frames give another
+# The paper had to assume the plane. With the plane held 90 deg off the estimated one the same frames give another
 # angle: the plane is part of the answer.
 
 # %%
 largest = int(np.nanargmax(history.theta_rad))
-off_deg = float(np.rad2deg(history.plane_lv_rad[largest]) + 60.0)
+off_deg = float(np.rad2deg(history.plane_lv_rad[largest]) + 90.0)
 assumed = pf.estimate_camera(flight.with_(camera_plane_lv_deg=off_deg))
 sd_deg = np.rad2deg(history.theta_sd_rad[largest])
 print(f"estimated: {np.rad2deg(history.theta_rad[largest]):.2f} +/- {sd_deg:.2f} deg; plane "
-      f"60 deg off: {np.rad2deg(assumed.theta_rad[largest]):.2f} deg")  # fmt: skip
+      f"90 deg off: {np.rad2deg(assumed.theta_rad[largest]):.2f} deg")  # fmt: skip
 
 # %% [markdown]
 # ## Only now, the truth
