@@ -84,10 +84,15 @@ def main() -> None:
             if isinstance(frames, str):
                 print(f"{film.name}, {kind}: refused: {frames}")
                 continue
-            kept.append(errors(frames, film))
             refused = frames.code[frames.flag != "used"].value_counts().to_dict()
-            report(f"{film.name}, {kind}, refused {refused}", kept[-1])
-        report(f"all, {kind}", np.concatenate(kept))
+            answered = errors(frames, film)
+            if not len(answered):
+                print(f"{film.name}, {kind}: no frame of the pulse answered, refused {refused}")
+                continue
+            kept.append(answered)
+            report(f"{film.name}, {kind}, refused {refused}", answered)
+        if kept:
+            report(f"all, {kind}", np.concatenate(kept))
 
 
 if __name__ == "__main__":

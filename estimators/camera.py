@@ -305,17 +305,19 @@ def read_film(
         start, before = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad, picture
     if len(fits) != len(times):
         raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
-    fits = judged(times, fits, joint_swing, edits)
+    fits = judged(times, fits, joint_swing, edits, nearest if isinstance(oriented.features, TrackedTexture) else None)
     remark = f"by hand: {edits}" if edits.rows else ""
     return FilmFit(times, tuple(fits), oriented, float(times[nearest]), plane_lv_rad, plane_sd_rad, remark)
 
 
 def judged(
-    time_s: FloatArray, fits: list[FrameFit], joint_swing: JointSwing | None, edits: CameraEdits
-) -> list[FrameFit]:
+    time_s: FloatArray, fits: list[FrameFit], joint_swing: JointSwing | None, edits: CameraEdits,
+    textured: int | None,
+) -> list[FrameFit]:  # fmt: skip
     """Fits of all frames of a film with those refused that the others or the analyst speak against.
 
-    An analyst's acceptance outweighs what the other frames say, never that a frame has no fit.
+    An analyst's acceptance outweighs what the other frames say, never that a frame has no fit. ``textured``: the
+    benchmark frame's number, where its texture is the features.
     """
     verdicts = [edits.verdict(float(t)) for t in time_s]
     rejected = [v is not None and v.edit == "reject" for v in verdicts]
@@ -325,7 +327,8 @@ def judged(
         else fit
         for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
     ]
-    found = without_remnants(without_doubtful(without_lost_features(kept)))
+    found = without_lost_features(kept) if textured is None else without_stray_texture(kept, textured)
+    found = without_remnants(without_doubtful(found))
     if joint_swing is not None:
         found = without_jumps(time_s, found, joint_swing)
     accepted = [v is not None and v.edit == "accept" for v in verdicts]
@@ -341,6 +344,20 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
     lost = Fault(words, "features-lost")
     bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
     return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
+
+
+def without_stray_texture(fits: list[FrameFit], benchmark: int) -> list[FrameFit]:
+    """Refuse what disagrees with most frames on whether the benchmark frame's texture is the shell's.
+
+    Light and shade on plain cloth agree now and then, and move as the Sun does; the edge alone counts then.
+    """
+    with_texture = [fit.features > 0 for k, fit in enumerate(fits) if not fit.refused and k != benchmark]
+    if np.mean(with_texture or [True]) >= _MOST:
+        return without_lost_features(fits)
+    words = "texture agrees where in most frames none does: it may be light and shade, which move as the Sun does"
+    stray = [not fit.refused and fit.features > 0 and k != benchmark for k, fit in enumerate(fits)]
+    fault = Fault(words, "texture-strays")
+    return [refused_fit(fit.horizon, fault) if out else fit for fit, out in zip(fits, stray, strict=True)]
 
 
 def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:

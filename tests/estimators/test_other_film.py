@@ -13,7 +13,14 @@ import pandas as pd
 import pytest
 
 from estimators.benchmark import orient_camera, samples_together
-from estimators.camera import JointSwing, read_film, without_jumps, without_lost_features, without_remnants
+from estimators.camera import (
+    JointSwing,
+    read_film,
+    without_jumps,
+    without_lost_features,
+    without_remnants,
+    without_stray_texture,
+)
 from estimators.camera_fit import FrameFit, _NoFitError, refused_fit
 from estimators.edge import fault_of_frame, is_coherent, no_horizon, steps_near
 from estimators.features import no_features
@@ -114,6 +121,17 @@ def test_a_frame_that_lost_the_features_of_the_others_is_refused():
     ] == [2]
     bare = [replace(fit, features=0) for fit in fits]
     assert not any(fit.refused for fit in without_lost_features(bare))
+
+
+def test_texture_that_agrees_in_few_frames_is_taken_for_light_and_shade():
+    fits = answers([0.0, 1.0, 2.0, 3.0, 2.5])
+    few = [replace(fit, features=fit.features if k in (0, 3) else 0) for k, fit in enumerate(fits)]
+    codes = [getattr(fit.refused, "code", "") for fit in without_stray_texture(few, benchmark=0)]
+    assert codes == ["", "", "", "texture-strays", ""]
+    # where most frames show it, those without are the odd ones
+    most = [replace(fit, features=0) if k == 2 else fit for k, fit in enumerate(fits)]
+    codes = [getattr(fit.refused, "code", "") for fit in without_stray_texture(most, benchmark=0)]
+    assert codes == ["", "", "features-lost", "", ""]
 
 
 def test_a_jump_that_no_swing_makes_is_refused_and_a_swing_is_not():
