@@ -185,7 +185,7 @@ class FilmFit:
 
     @property
     def _kind_of_features(self) -> str:
-        if isinstance(self.oriented.features, TrackedTexture):
+        if has_texture(self.oriented):
             return "the shell's texture"
         own = self.oriented.view.geometry.listed_features is not None
         return "the vehicle file's features" if own else "seams and dots"
@@ -305,19 +305,25 @@ def read_film(
         start, before = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad, picture
     if len(fits) != len(times):
         raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
-    fits = judged(times, fits, joint_swing, edits, nearest if isinstance(oriented.features, TrackedTexture) else None)
+    benchmark_s = float(times[nearest])
+    fits = judged(times, fits, joint_swing, edits, benchmark_s if has_texture(oriented) else None)
     remark = f"by hand: {edits}" if edits.rows else ""
-    return FilmFit(times, tuple(fits), oriented, float(times[nearest]), plane_lv_rad, plane_sd_rad, remark)
+    return FilmFit(times, tuple(fits), oriented, benchmark_s, plane_lv_rad, plane_sd_rad, remark)
+
+
+def has_texture(oriented: OrientedCamera) -> bool:
+    """Whether the features are the benchmark frame's texture."""
+    return isinstance(oriented.features, TrackedTexture)
 
 
 def judged(
     time_s: FloatArray, fits: list[FrameFit], joint_swing: JointSwing | None, edits: CameraEdits,
-    textured: int | None,
+    textured_s: float | None,
 ) -> list[FrameFit]:  # fmt: skip
     """Fits of all frames of a film with those refused that the others or the analyst speak against.
 
-    An analyst's acceptance outweighs what the other frames say, never that a frame has no fit. ``textured``: the
-    benchmark frame's number, where its texture is the features.
+    An analyst's acceptance outweighs what the other frames say, never that a frame has no fit. ``textured_s``: the
+    benchmark frame's time, where its texture is the features.
     """
     verdicts = [edits.verdict(float(t)) for t in time_s]
     rejected = [v is not None and v.edit == "reject" for v in verdicts]
@@ -327,7 +333,7 @@ def judged(
         else fit
         for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
     ]
-    found = without_lost_features(kept) if textured is None else without_stray_texture(kept, textured)
+    found = without_lost_features(kept) if textured_s is None else without_stray_texture(time_s, kept, textured_s)
     found = without_remnants(without_doubtful(found))
     if joint_swing is not None:
         found = without_jumps(time_s, found, joint_swing)
@@ -346,18 +352,18 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
     return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
 
 
-def without_stray_texture(fits: list[FrameFit], benchmark: int) -> list[FrameFit]:
+def without_stray_texture(time_s: FloatArray, fits: list[FrameFit], benchmark_s: float) -> list[FrameFit]:
     """Refuse what disagrees with most frames on whether the benchmark frame's texture is the shell's.
 
     Light and shade on plain cloth agree now and then, and move as the Sun does; the edge alone counts then.
     """
-    with_texture = [fit.features > 0 for k, fit in enumerate(fits) if not fit.refused and k != benchmark]
-    if np.mean(with_texture or [True]) >= _MOST:
+    answered = np.array([not fit.refused for fit in fits]) & (time_s != benchmark_s)
+    with_texture = np.array([fit.features > 0 for fit in fits]) & answered
+    if not answered.any() or with_texture.sum() >= _MOST * answered.sum():
         return without_lost_features(fits)
     words = "texture agrees where in most frames none does: it may be light and shade, which move as the Sun does"
-    stray = [not fit.refused and fit.features > 0 and k != benchmark for k, fit in enumerate(fits)]
     fault = Fault(words, "texture-strays")
-    return [refused_fit(fit.horizon, fault) if out else fit for fit, out in zip(fits, stray, strict=True)]
+    return [refused_fit(fit.horizon, fault) if out else fit for fit, out in zip(fits, with_texture, strict=True)]
 
 
 def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:

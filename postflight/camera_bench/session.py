@@ -18,10 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.camera import JointSwing, judged, polar
+from estimators.camera import JointSwing, has_texture, judged, polar
 from estimators.camera_fit import FrameFit, OrientedCamera
 from estimators.frame_edits import EditedFrame, edited
-from estimators.texture import TrackedTexture
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import EDITS_FILE, POSE, CameraEdits, Edit, faults_of, read_edits, write_edits
@@ -109,10 +108,10 @@ class Session:
     def _answers(self, work: _Work) -> list[dict[str, Any] | None]:
         """Answer of each frame as a run would give it from the fits so far; None where it is not fitted yet."""
         done = sorted(work.fits)
-        textured = work.oriented is not None and isinstance(work.oriented.features, TrackedTexture)
+        textured = work.oriented is not None and has_texture(work.oriented)
         fits = judged(
             work.frames.time_s[done], [work.fits[k] for k in done], self._swing if len(done) > 1 else None,
-            work.frames.edits, int(np.searchsorted(done, work.frames.benchmark)) if textured else None,
+            work.frames.edits, float(work.frames.time_s[work.frames.benchmark]) if textured else None,
         )  # fmt: skip
         out: list[dict[str, Any] | None] = [None] * len(work.frames.time_s)
         for k, fit in zip(done, fits, strict=True):
