@@ -92,8 +92,8 @@ def figure_2_3(
 ) -> Figure:
     """Frames side by side, the virtual camera over the right part of each (Figure 2.3).
 
-    The dashed yellow line is the smallest row of the virtual camera's edge, the solid one that of the edge found in
-    the frame; where they coincide the hypothesised deflection fits.
+    The dashed yellow line is the smallest row of the virtual camera's edge, the solid one that of the edge found near
+    it in the frame (beyond may be the Earth's limb); where they coincide the hypothesised deflection fits.
 
     Parameters
     ----------
@@ -105,8 +105,9 @@ def figure_2_3(
     meshes : mapping, optional
         A user's own, by body; see `estimators.overlay.Overlay`.
     """
-    from estimators.edge import find_horizon
-    from estimators.overlay import Overlay, horizon_row
+    from estimators.frame_edits import unedited
+    from estimators.overlay import Overlay
+    from estimators.virtual_camera import deformation_of
 
     figure = Figure(figsize=(6.0 * len(frames), 4.4))
     axes = np.atleast_1d(figure.subplots(1, len(frames)))
@@ -114,9 +115,11 @@ def figure_2_3(
     for k, ax in enumerate(axes):
         theta, plane = float(theta_rad[k]), float(plane_lv_rad[k])
         ax.imshow(overlay.blended(np.asarray(frames[k]), theta, plane), interpolation="nearest")
-        ax.axhline(horizon_row(view, theta, plane), color=COLOUR["edge"], ls="--", lw=1.0)
-        found = find_horizon(np.asarray(frames[k]), oriented.lines, view.camera.size_px)
-        if found.is_usable:
+        hypothesis = deformation_of(theta, plane)
+        lines = view.lines_at(oriented.clocks_rad, hypothesis)
+        ax.axhline(lines.origin_px[:, 1].min(), color=COLOUR["edge"], ls="--", lw=1.0)
+        found = oriented.coherent_edge(unedited(np.asarray(frames[k])), hypothesis)
+        if np.isfinite(found.lowest_row_px):
             ax.axhline(found.lowest_row_px, color=COLOUR["edge"], lw=1.4)
         answer = f"{np.rad2deg(theta):.1f} deg in plane {np.rad2deg(plane):.0f} deg LV" if theta else "taken as zero"
         ax.set_title(f"({chr(97 + k)}) {times_s[k]:.2f} s: deflection {answer}")
