@@ -59,8 +59,9 @@ from estimators.frame_residuals import (
     edge_residuals,
     light_columns,
 )
-from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, VirtualCamera
+from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, RADIUS, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
+from flightmodel.deflection import lv_clock
 
 Image = NDArray[np.uint8]
 
@@ -119,6 +120,9 @@ class AprioriSd:
     edge_px : float
         Shift of the found edge against the true one, different from frame to frame with the light; as much for a
         tilt and for a bow of the edge across the picture (at the picture's sides).
+    features_px : float
+        Shift along the shell's meridians that the features found in a frame have in common with the light, which slopes
+        across every torus: the same all round the shell, and cosine and sine of a wave.
     """
 
     rim_radius_m: float = 0.01
@@ -135,6 +139,7 @@ class AprioriSd:
         return np.where(waves <= _SOFT_WAVES, self.lobes_rad, self.higher_lobes_rad)
 
     edge_px: float = 0.2
+    features_px: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -151,12 +156,15 @@ class FrameShape:
         Error per unit error of the oriented camera's pose.
     by_benchmark : (15, 2) float
         Missing part per unit deflection of the benchmark frame.
+    by_light : (15, 3) float
+        Error per sd of a shift of the features with the light.
     """
 
     found_rad: FloatArray
     formal: FloatArray
     by_camera: FloatArray
     by_benchmark: FloatArray
+    by_light: FloatArray
 
 
 @dataclass(frozen=True)
@@ -215,6 +223,7 @@ class _Solution:
 
     ``columns`` (m, k + 17): derivatives by these. ``shape_found`` (17,): flattening, joint station, lobes and light.
     ``before``: the benchmark's rows of the points used; ``edge_count`` of them are edge points and come first.
+    ``light`` (m, 3): how far features shift per sd with the light.
     """
 
     gain: FloatArray
@@ -227,6 +236,7 @@ class _Solution:
     rms_px: float
     residual_px: FloatArray
     weight: FloatArray
+    light: FloatArray
 
 
 @dataclass(frozen=True)
@@ -581,7 +591,8 @@ class OrientedCamera:
         scale = 1.4826 * float(np.nanmedian(np.abs(residual)))
         kept = np.full_like(sharp[1], np.inf)
         rows = _has(sharp)[np.abs(residual) < max(3.0 * scale, 0.3)]
-        kept[rows] = TOGETHER * sharp[1][rows]
+        inflated = max(1.4826 * float(np.nanmedian(np.abs(residual) / sharp[1][_has(sharp)])), 1.0)
+        kept[rows] = TOGETHER * inflated * sharp[1][rows]
         return (sharp[0], kept), agreed
 
     def _approach(
@@ -719,9 +730,25 @@ class OrientedCamera:
         pull = np.concatenate([np.zeros(k), (mean - np.eye(len(sd))[0] * deformation[2]) / sd**2])
         shape_found = (formal @ (weighted @ residual + pull))[k:]
         shape_found[0] += deformation[2]
+        light = self._light_on_features(np.zeros(0, dtype=np.intp) if place is None else _has(place), found.edge_points)
         return _Solution(
-            formal @ weighted, formal, shape_found, design, rows, before, edge_count, rms, residual, weight
+            formal @ weighted, formal, shape_found, design, rows, before, edge_count, rms, residual, weight, light[used]
         )
+
+    def _light_on_features(self, rows: NDArray[np.intp], edge_points: int) -> FloatArray:
+        """Shift (n, 3) of edge points (none here) and features against the benchmark frame's, per sd."""
+        shift = np.sqrt(2.0) * self.apriori.features_px * self._along_meridian[rows]
+        return np.concatenate([np.zeros((edge_points, 3)), shift])
+
+    @cached_property
+    def _along_meridian(self) -> FloatArray:
+        """What a shift of features away from the axis, px, does to each row (n, 3): the same all round, or as waves."""
+        points, across = self.features.points_shell_m, self.features.across_px
+        outwards = self.view.sight(points, np.zeros(3)).jacobian[:, :, RADIUS]
+        along = np.einsum("ni,ni->n", across, outwards) / np.linalg.norm(outwards, axis=1)
+        clock = lv_clock(points[:, 1:])
+        waves = np.column_stack([np.ones_like(clock), np.cos(clock), np.sin(clock)])
+        return np.asarray((self.features.alike * np.nan_to_num(along))[:, None] * waves)
 
     def _independent_edge(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> HorizonLine:
         """Edge that owes nothing to the features, ``deformation`` moved near it; `_NoFitError` where there is none.
@@ -755,7 +782,7 @@ class OrientedCamera:
         scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
         alone = replace(
             both, gain=formal @ weighted, formal=np.asarray(min(scatter, 1.0) * formal), rows=both.rows[edge],
-            before=both.before[edge],
+            before=both.before[edge], light=both.light[edge],
         )  # fmt: skip
         return step[:2], alone
 
@@ -764,7 +791,9 @@ class OrientedCamera:
         by_camera = last.gain @ (last.rows[:, POSED] - before[:, POSED])
         by_benchmark = last.gain @ before[:, DEFLECTION] + by_camera @ self.posed_per_deflection
         features, shape, leak = len(last.rows) - last.edge_count, None, 0.0
+        by_light = last.gain @ last.light
         covariance = self.covariance_of(last.formal[:k, :k], by_camera[:k], by_benchmark[:k])
+        covariance = covariance + by_light[:k] @ by_light[:k].T
         if k == 1:
             spread = last.gain[:1] @ last.columns[:, 1:] * self._shape_sd
             covariance = covariance + spread @ spread.T
@@ -773,7 +802,8 @@ class OrientedCamera:
         else:
             found = np.concatenate([deformation[:2], last.shape_found[SHAPE - 2]])
             chosen = np.concatenate([[0, 1], SHAPE])
-            shape = FrameShape(found, last.formal[np.ix_(chosen, chosen)], by_camera[chosen], by_benchmark[chosen])
+            parts = (part[chosen] for part in (by_camera, by_benchmark, by_light))
+            shape = FrameShape(found, last.formal[np.ix_(chosen, chosen)], *parts)
         answer, flattening = basis @ (basis.T @ deformation[:2]), float(deformation[2])
         return FrameFit(
             answer, covariance, by_benchmark[:k], leak, flattening, last.rms_px, features, horizon, shape=shape

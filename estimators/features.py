@@ -87,6 +87,11 @@ class Features(Protocol):
         """Unit vectors (n, 2) in the picture."""
         ...
 
+    @property
+    def alike(self) -> FloatArray:
+        """How far the light shifts each row (n,) together with its neighbours, over a mark's shift."""
+        ...
+
     def find(
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
     ) -> tuple[FloatArray, FloatArray]:
@@ -125,6 +130,11 @@ class ImageFeatures:
     signs: FloatArray
     placed_m: float = 0.003
     offset_px: float = 0.0
+
+    @property
+    def alike(self) -> FloatArray:
+        """See `Features`."""
+        return np.ones(len(self.across_px))
 
     def find(
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int

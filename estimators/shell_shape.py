@@ -16,12 +16,13 @@ pose and in the deflection ``d`` of the benchmark frame,
 
     found_i = G_i s_i + C_i c + B_i d + e_i,    G_i = 1 - P_i / P_prior,    cov(e_i) = P_i G_i'
 
-with ``P_i`` the formal covariance of the shape, which takes the errors of points as independent: those of neighbours
-are alike, so ``e`` is ``kappa`` times as large. It is correlated in time as a camera's readings are (`LIGHT_TIME_S`).
+with ``P_i`` the formal covariance of the shape, which takes the errors of points as independent. They are ``kappa``
+times as large, as neighbours err alike, and new in every frame; to these come errors ``lambda`` times as large again
+that change with the light (`LIGHT_TIME_S`) or not at all.
 ``w`` is free in every frame: nothing is assumed of the deflection. All is Gaussian, and the evidence of the films
 decides between rocking alone and lobes of two waves, of three, of more, and of each combination; the shell may flatten
-in each. Rocking alone has a prior probability of one half, the others share the rest. ``sigma`` and ``kappa`` have a
-few sizes of equal probability.
+in each. Rocking alone has a prior probability of one half, the others share the rest. ``sigma``, ``kappa`` and
+``lambda`` have a few sizes of equal probability.
 
 The posterior of amplitudes and ``f_b``, a mixture over the hypotheses, is then the prior of every frame's shape: in the
 frame's own posterior of ``(w, s)`` the wide prior about zero is replaced by the normal of ``s_i`` given ``a`` and
@@ -48,7 +49,7 @@ from itertools import chain, combinations, product
 
 import numpy as np
 import pandas as pd
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import softmax
 
 from estimators.camera import FilmFit
@@ -67,8 +68,9 @@ HYPOTHESES = tuple(chain.from_iterable(combinations(LOBES, k) for k in range(len
 """Lobes that there are; the first: rocking alone."""
 _PRIOR = np.array([0.5, *[0.5 / (len(HYPOTHESES) - 1)] * (len(HYPOTHESES) - 1)])
 _FRAME_SDS_RAD = np.deg2rad([0.003, 0.01, 0.03, 0.1])
-_POINTS_SCALES = (1.0, 1.7, 3.0, 5.0)  # of points' errors over the formal ones: up to 25 neighbours of 240 err alike
-_SIZES = tuple(product(_POINTS_SCALES, _FRAME_SDS_RAD))
+# over the formal errors, which take points as independent: those new in every frame, and those that last beside them
+_NEW, _LASTING = (1.0, 1.5, 2.2, 3.3), (0.2, 0.7, 2.0)
+_SIZES = tuple((new, lasting * new, size) for new, lasting, size in product(_NEW, _LASTING, _FRAME_SDS_RAD))
 CALLED = 0.9  # probability from which an answer is called
 _DETERMINED = 0.5  # of the a priori sd
 LEAST_FRAMES, _MOST_FRAMES = 12, 60  # more frames of a film lie closer than their errors change
@@ -120,7 +122,7 @@ class ShellShape:
     frame_sd_rad : float
         Of a frame's own shape.
     points_scale : float
-        Errors of a frame's points over their formal ones.
+        Errors of a frame's points, of both parts, over their formal ones.
     determined : (13,) bool
         Whether the films determined an amplitude better than half its a priori sd.
     largest_pa : float
@@ -236,11 +238,11 @@ def shell_shape(films: list[LoadedFilm]) -> ShellShape:
     prior = mode_sd_rad(films[0].film.oriented.apriori)
     stacked = {number: _Stacked.of(one, largest) for number, one in enumerate(films) if len(one.rows)}
     answers = []
-    for scale, size in _SIZES:
-        prior_sd = np.append(prior, np.full(len(films) * len(MODES), size))
-        log, information, right = _information(stacked, len(prior_sd), scale, size)
+    for sizes in _SIZES:
+        prior_sd = np.append(prior, np.full(len(films) * len(MODES), sizes[-1]))
+        log, information, right = _information(stacked, len(prior_sd), sizes)
         for number in range(len(HYPOTHESES)):
-            answers.append(_Amplitudes.given(number, (scale, size), prior_sd, log, information, right))
+            answers.append(_Amplitudes.given(number, sizes, prior_sd, log, information, right))
     return _mixed(answers, prior, largest)
 
 
@@ -256,13 +258,14 @@ class _Stacked:
     found: FloatArray
     to_load: FloatArray
     to_benchmark: FloatArray
-    points: FloatArray
+    new: FloatArray
+    lasting: FloatArray
     camera: FloatArray
     own: FloatArray
 
     @staticmethod
     def of(one: LoadedFilm, largest_pa: float) -> _Stacked:
-        """``points``: of the formal size; ``own``: of unit own shapes given the benchmark frame's."""
+        """``new``, ``lasting``: of the formal size; ``own``: of unit own shapes given the benchmark frame's."""
         rows, oriented = one.rows, one.film.oriented
         fits = [one.film.fits[k].shape for k in rows]
         formal = np.array([fit.formal[2:, 2:] for fit in fits])
@@ -271,26 +274,29 @@ class _Stacked:
         root = symmetric_root(0.5 * (noise + noise.transpose(0, 2, 1)))
         camera = np.concatenate([fit.by_camera[2:] for fit in fits])
         start = np.concatenate([fit.by_benchmark[2:] for fit in fits]) * oriented.apriori.benchmark_rad
+        light, together = np.array([fit.by_light[2:] for fit in fits]), correlation(time_s, LIGHT_TIME_S, CONSTANT_PART)
         return _Stacked(
             np.array([fit.found_rad[2:] for fit in fits]).ravel(),
             (share * one.shares(largest_pa)[rows, None, None]).reshape(-1, len(MODES)),
             (share * (1.0 - alike)[:, None, None]).reshape(-1, len(MODES)),
-            paired_covariance(root, correlation(time_s, LIGHT_TIME_S, CONSTANT_PART), root),
-            camera @ oriented.posed_covariance @ camera.T + start @ start.T,
+            block_diag(*noise),
+            paired_covariance(root, together, root),
+            camera @ oriented.posed_covariance @ camera.T + start @ start.T + paired_covariance(light, together, light),
             paired_covariance(share, correlation(time_s, LIGHT_TIME_S) - np.outer(alike, alike), share),
         )
 
 
 def _information(
-    films: dict[int, _Stacked], k: int, scale: float, size_rad: float
+    films: dict[int, _Stacked], k: int, sizes: tuple[float, float, float]
 ) -> tuple[float, FloatArray, FloatArray]:
     """Logarithm of the evidence without amplitudes, and the information (k, k) on them and the benchmarks' shapes.
 
     ``films``: by their number, those with an answer.
     """
     m, log, information, right = len(MODES), 0.0, np.zeros((k, k)), np.zeros(k)
+    new, lasting, own = sizes
     for number, one in films.items():
-        covariance = scale**2 * one.points + one.camera + size_rad**2 * one.own
+        covariance = new**2 * one.new + lasting**2 * one.lasting + one.camera + own**2 * one.own
         covariance[np.diag_indices_from(covariance)] += _JITTER_RAD2
         factor = cho_factor(covariance, lower=True, overwrite_a=True)
         respond = np.hstack([one.to_load, one.to_benchmark])
@@ -307,14 +313,14 @@ class _Amplitudes:
     """Posterior of amplitudes and benchmarks' shapes under a hypothesis and a size of the frames' own shapes."""
 
     number: int
-    sizes: tuple[float, float]
+    sizes: tuple[float, float, float]
     mean: FloatArray
     covariance: FloatArray
     log_evidence: float
 
     @staticmethod
     def given(
-        number: int, sizes: tuple[float, float], prior_sd: FloatArray, log: float, information: FloatArray,
+        number: int, sizes: tuple[float, float, float], prior_sd: FloatArray, log: float, information: FloatArray,
         right: FloatArray,
     ) -> _Amplitudes:  # fmt: skip
         """Of the information (k, k) and its mean's product (k,) that the films have on all modes."""
@@ -338,11 +344,10 @@ def _mixed(answers: list[_Amplitudes], prior_sd: FloatArray, largest_pa: float) 
     with_all = weight * (number == len(HYPOTHESES) - 1)
     if_any, if_any_cov = mixture_moments(with_all / max(with_all.sum(), 1e-300), means, covariances)
     if_any, sd = if_any[: len(MODES)], np.sqrt(np.diag(if_any_cov))[: len(MODES)]
-    scale, size = np.sqrt(weight @ np.array([one.sizes for one in answers]) ** 2)
+    new, lasting, size = np.sqrt(weight @ np.array([one.sizes for one in answers]) ** 2).tolist()
+    scale, determined = float(np.hypot(new, lasting)), sd < _DETERMINED * prior_sd
     probability = np.bincount(number, weight, len(HYPOTHESES)).astype(float)
-    return ShellShape(
-        mean, covariance, if_any, sd, probability, float(size), float(scale), sd < _DETERMINED * prior_sd, largest_pa
-    )
+    return ShellShape(mean, covariance, if_any, sd, probability, size, scale, determined, largest_pa)
 
 
 def with_shape(films: list[LoadedFilm], shape: ShellShape) -> list[FilmFit]:
@@ -379,8 +384,8 @@ def _given_shape(
     by_shape: FloatArray = np.kron(parts, formal[:, modes] / own_var).astype(float)
     again = formal @ information / shape.points_scale**2
     answer = again @ own.found_rad + by_shape @ shape.found_rad
-    by_camera, by_benchmark = again @ own.by_camera, again @ own.by_benchmark
-    covariance = oriented.covariance_of(formal[:, :2], by_camera, by_benchmark)
+    by_camera, by_benchmark, by_light = again @ own.by_camera, again @ own.by_benchmark, again @ own.by_light
+    covariance = oriented.covariance_of(formal[:, :2], by_camera, by_benchmark) + by_light @ by_light.T
     covariance = covariance + by_shape @ shape.found_covariance @ by_shape.T
     return replace(fit, rotation_yz_rad=answer, covariance=covariance, per_benchmark=by_benchmark, by_shape=by_shape)
 

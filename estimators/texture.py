@@ -29,7 +29,7 @@ estimation", 1996.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -53,6 +53,7 @@ _BAND = 0.275  # of white noise that passes the band: root of (1/a^2 + 1/b^2 - 4
 _LEAST_FACING = 0.3
 _INDEPENDENT_PX = 4.0 * np.pi * _FINE_PX**2  # area over which the band-pass correlates noise
 _SD_FLOOR_PX = 0.05
+_LINE = 3.0  # so much less sharp along a line than across it, a patch is found where it is looked for, or by its shades
 _TRACE_STEPS, _TRACED_M = 80, 5e-4
 _BORDER_PX = 12
 
@@ -117,6 +118,8 @@ class TrackedTexture:
         Of mean zero and norm one.
     to_tangents : (n, 2, 2) float
         From an offset in the benchmark's picture to metres along the tangents.
+    is_line : (n,) bool
+        Patches that show a line and little else.
     """
 
     points_shell_m: FloatArray
@@ -124,6 +127,12 @@ class TrackedTexture:
     tangents_shell: FloatArray = field(repr=False)
     templates: FloatArray = field(repr=False)
     to_tangents: FloatArray = field(repr=False)
+    is_line: BoolArray = field(repr=False)
+
+    @property
+    def alike(self) -> FloatArray:
+        """See `Features`: a line says less of its place than a corner does."""
+        return np.repeat(np.where(self.is_line, _LINE, 0.5), 2)
 
     def find(
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
@@ -138,6 +147,7 @@ class TrackedTexture:
         limits = (reach_px, _LEAST_CORRELATION, samples)
         across = self.across_px.reshape(-1, 2, 2)
         _texture_kernels.find_patches(band_passed(image), self.templates, middle, affine, across, limits, place, sd)
+        sd[sd[:, 1] > _LINE * sd[:, 0], 1] = np.inf
         return place.ravel(), np.hypot(sd.ravel(), _SD_FLOOR_PX)
 
     def _predicted(self, view: VirtualCamera, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -174,14 +184,16 @@ def texture_of(view: VirtualCamera, benchmark: Image) -> TrackedTexture:
     tangents = np.stack([round_shell, np.cross(normals, round_shell)], axis=1)
     around = np.arange(-HALF_PX, HALF_PX + 1)
     templates = picture[pixels[:, 1, None, None] + around[:, None], pixels[:, 0, None, None] + around]
-    across = np.array([_sharp_directions(t) for t in templates]).reshape(-1, 2)
+    directions = [_sharp_directions(t) for t in templates]
+    across = np.array([axes for axes, _ in directions]).reshape(-1, 2)
+    is_line = np.array([ratio > _LINE for _, ratio in directions], dtype=np.bool_)
     templates = templates - templates.mean(axis=(1, 2), keepdims=True)
     templates = (templates / np.linalg.norm(templates, axis=(1, 2), keepdims=True)).astype(np.float64)
     points = np.repeat(points, 2, axis=0)
     unit = np.tile(np.eye(2), (n, 1, 1))
-    texture = TrackedTexture(points, across, tangents, templates, unit)
+    texture = TrackedTexture(points, across, tangents, templates, unit, is_line)
     _, per_m = texture._predicted(view, np.zeros(3))
-    return TrackedTexture(points, across, tangents, templates, np.asarray(np.linalg.inv(per_m), dtype=float))
+    return replace(texture, to_tangents=np.asarray(np.linalg.inv(per_m), dtype=float))
 
 
 def _on_one_torus(view: VirtualCamera, shape: tuple[int, ...]) -> BoolArray:
@@ -226,8 +238,9 @@ def noise_of(image: Image) -> float:
     return 1.4826 * float(np.median(np.abs(second))) / 6.0
 
 
-def _sharp_directions(template: Picture) -> FloatArray:
-    """Unit vectors (2, 2) of a patch's structure tensor, the sharper first."""
+def _sharp_directions(template: Picture) -> tuple[FloatArray, float]:
+    """Unit vectors (2, 2) of a patch's structure tensor, the sharper first, and how many times sharper that is."""
     gv, gu = np.gradient(template.astype(float))
     tensor = np.array([[np.sum(gu * gu), np.sum(gu * gv)], [np.sum(gu * gv), np.sum(gv * gv)]])
-    return np.asarray(np.linalg.eigh(tensor)[1].T[::-1])
+    value, axes = np.linalg.eigh(tensor)
+    return np.asarray(axes.T[::-1]), float(np.sqrt(value[1] / max(value[0], 1e-9 * value[1])))

@@ -61,8 +61,8 @@ def test_another_paint_is_read_by_its_texture_whatever_the_vehicle_file_states(l
     assert "the shell's texture" in history.assumptions
     assert read.fits[1].features > 60
     error = history.theta_rad[1] - D(rows.theta_deg.iloc[1])
-    # the benchmark frame's own 0.12 deg among it
-    assert history.theta_sd_rad[1] < D(0.2)
+    # the benchmark frame's own 0.12 deg among it, and the light on the features
+    assert history.theta_sd_rad[1] < D(0.25)
     assert abs(error) < 2.0 * history.theta_sd_rad[1]
 
 

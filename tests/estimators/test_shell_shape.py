@@ -19,8 +19,8 @@ from synthetic_flight.film import film as rendered
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, sun
 
 TIME_S = np.arange(421.0, 446.0, 1.0)
-# of a frame's own shape and of its points' errors over what they say: as probable as each other
-OWN_DEG, POINTS_SCALES = (0.003, 0.01, 0.03, 0.1), (1.0, 1.7, 3.0, 5.0)
+# of a frame's own shape, of its points' new errors over what they say, of lasting ones over these: as probable each
+OWN_DEG, NEW, LASTING = (0.003, 0.01, 0.03, 0.1), (1.0, 1.5, 2.2, 3.3), (0.2, 0.7, 2.0)
 PRESSURE_PA = 1200.0 * np.exp(-(((TIME_S - 438.0) / 7.0) ** 2))
 
 
@@ -59,12 +59,12 @@ def drawn(rng, there, formal_deg=0.02):
     waves = [mode.split()[0] for mode in MODES]
     has = np.isin(waves, ["flattening", *(str(w) for name in there for w in LOBES[name])])
     amplitude = has * prior * rng.standard_normal(len(MODES))
-    size, scale = D(rng.choice(OWN_DEG)), rng.choice(POINTS_SCALES)
+    size, new, lasting = D(rng.choice(OWN_DEG)), rng.choice(NEW), rng.choice(LASTING)
     own = np.linalg.cholesky(correlation(TIME_S, LIGHT_TIME_S)) @ rng.standard_normal((n, len(MODES))) * size
     shape = amplitude * load[:, None] + own - own[0]
     true = np.column_stack([D(4.0) * rng.standard_normal((n, 2)), shape])
-    together = correlation(TIME_S, LIGHT_TIME_S, CONSTANT_PART)
-    noise = scale * np.linalg.cholesky(together) @ rng.standard_normal((n, m)) @ np.linalg.cholesky(points).T
+    together = np.eye(n) + lasting**2 * correlation(TIME_S, LIGHT_TIME_S, CONSTANT_PART)
+    noise = new * np.linalg.cholesky(together) @ rng.standard_normal((n, m)) @ np.linalg.cholesky(points).T
     camera, start = rng.standard_normal(12), apriori.benchmark_rad * rng.standard_normal(2)
     # the frame's own estimate, pulled towards a shape of zero
     found = np.einsum("ij,nj->ni", formal, true @ points + noise) + by_camera @ camera + by_benchmark @ start
@@ -73,7 +73,7 @@ def drawn(rng, there, formal_deg=0.02):
     fits = tuple(
         FrameFit(
             found[k, :2], formal[:2, :2], by_benchmark[k, :2], 0.0, 0.0, 0.3, 100, no_horizon(NO_FAULT),
-            shape=FrameShape(found[k], formal, by_camera[k], by_benchmark[k]),
+            shape=FrameShape(found[k], formal, by_camera[k], by_benchmark[k], np.zeros((m, 3))),
         )
         for k in range(n)
     )  # fmt: skip
