@@ -48,7 +48,7 @@ from estimators.edge import (
     is_coherent,
     no_horizon,
 )
-from estimators.features import Features, ImageFeatures, fit_feature_map, valleys
+from estimators.features import Features, ImageFeatures, fit_feature_map, light_shift, valleys
 from estimators.frame_checks import USUAL_RMS_PX, WORST_SHAPE, Design, fault_of_fit
 from estimators.frame_edits import LEAST_MARKS, EditedFrame, MarkedFeatures, unedited
 from estimators.frame_residuals import (
@@ -56,12 +56,12 @@ from estimators.frame_residuals import (
     ROUND_WAVES,
     WAVES,
     FrameResiduals,
+    FrameShape,
     edge_residuals,
     light_columns,
 )
-from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, RADIUS, VirtualCamera
+from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
-from flightmodel.deflection import lv_clock
 
 Image = NDArray[np.uint8]
 
@@ -140,31 +140,6 @@ class AprioriSd:
 
     edge_px: float = 0.2
     features_px: float = 0.1
-
-
-@dataclass(frozen=True)
-class FrameShape:
-    """Deflection and shape fitted to one frame together, shapes with their a priori sd about zero.
-
-    Parameters
-    ----------
-    found_rad : (15,) float
-        Rotation vector about body y and z, flattening, lobes (`estimators.frame_residuals.lobe_columns`).
-    formal : (15, 15) float
-        Covariance that the frame's own points leave.
-    by_camera : (15, 12) float
-        Error per unit error of the oriented camera's pose.
-    by_benchmark : (15, 2) float
-        Missing part per unit deflection of the benchmark frame.
-    by_light : (15, 3) float
-        Error per sd of a shift of the features with the light.
-    """
-
-    found_rad: FloatArray
-    formal: FloatArray
-    by_camera: FloatArray
-    by_benchmark: FloatArray
-    by_light: FloatArray
 
 
 @dataclass(frozen=True)
@@ -730,25 +705,20 @@ class OrientedCamera:
         pull = np.concatenate([np.zeros(k), (mean - np.eye(len(sd))[0] * deformation[2]) / sd**2])
         shape_found = (formal @ (weighted @ residual + pull))[k:]
         shape_found[0] += deformation[2]
-        light = self._light_on_features(np.zeros(0, dtype=np.intp) if place is None else _has(place), found.edge_points)
+        light = self._light_on_features(place, found.edge_points)
         return _Solution(
             formal @ weighted, formal, shape_found, design, rows, before, edge_count, rms, residual, weight, light[used]
         )
 
-    def _light_on_features(self, rows: NDArray[np.intp], edge_points: int) -> FloatArray:
+    def _light_on_features(self, place: tuple[FloatArray, FloatArray] | None, edge_points: int) -> FloatArray:
         """Shift (n, 3) of edge points (none here) and features against the benchmark frame's, per sd."""
-        shift = np.sqrt(2.0) * self.apriori.features_px * self._along_meridian[rows]
+        rows = slice(0) if place is None else _has(place)
+        shift = np.sqrt(2.0) * self.apriori.features_px * self._light_shift[rows]
         return np.concatenate([np.zeros((edge_points, 3)), shift])
 
     @cached_property
-    def _along_meridian(self) -> FloatArray:
-        """What a shift of features away from the axis, px, does to each row (n, 3): the same all round, or as waves."""
-        points, across = self.features.points_shell_m, self.features.across_px
-        outwards = self.view.sight(points, np.zeros(3)).jacobian[:, :, RADIUS]
-        along = np.einsum("ni,ni->n", across, outwards) / np.linalg.norm(outwards, axis=1)
-        clock = lv_clock(points[:, 1:])
-        waves = np.column_stack([np.ones_like(clock), np.cos(clock), np.sin(clock)])
-        return np.asarray((self.features.alike * np.nan_to_num(along))[:, None] * waves)
+    def _light_shift(self) -> FloatArray:
+        return light_shift(self.view, self.features)
 
     def _independent_edge(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> HorizonLine:
         """Edge that owes nothing to the features, ``deformation`` moved near it; `_NoFitError` where there is none.

@@ -33,8 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators import _edge_kernels
-from estimators.virtual_camera import Sight, VirtualCamera
+from estimators.virtual_camera import RADIUS, Sight, VirtualCamera
 from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.deflection import lv_clock
 from flightmodel.geometry import (
     FEATURE_KINDS,
     ListedFeatures,
@@ -205,6 +206,19 @@ def _drawn(view: VirtualCamera) -> ImageFeatures:
     size_m = np.where(is_dot, _HALF_DOT_M, _HALF_SEAM_M)
     half_width = np.ceil(focal * size_m / np.concatenate([r[2] for r in rows]) + 2.0).astype(np.int64)
     return ImageFeatures(points, across, half_width, is_dot, np.ones(len(points)))
+
+
+def light_shift(view: VirtualCamera, features: Features) -> FloatArray:
+    """What the light's shift of features away from the shell's axis, px, does to each row (n, 3).
+
+    It is the same all round the shell, or cosine and sine of one wave.
+    """
+    points = features.points_shell_m
+    outwards = view.sight(points, np.zeros(3)).jacobian[:, :, RADIUS]
+    along = np.einsum("ni,ni->n", features.across_px, outwards) / np.linalg.norm(outwards, axis=1)
+    clock = lv_clock(points[:, 1:])
+    waves = np.column_stack([np.ones_like(clock), np.cos(clock), np.sin(clock)])
+    return np.asarray((features.alike * np.nan_to_num(along))[:, None] * waves)
 
 
 def no_features() -> ImageFeatures:

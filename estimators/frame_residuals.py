@@ -58,6 +58,31 @@ class FrameResiduals:
         )
 
 
+@dataclass(frozen=True)
+class FrameShape:
+    """Deflection and shape fitted to one frame together, shapes with their a priori sd about zero.
+
+    Parameters
+    ----------
+    found_rad : (15,) float
+        Rotation vector about body y and z, flattening, lobes (`lobe_columns`).
+    formal : (15, 15) float
+        Covariance that the frame's own points leave.
+    by_camera : (15, 12) float
+        Error per unit error of the oriented camera's pose.
+    by_benchmark : (15, 2) float
+        Missing part per unit deflection of the benchmark frame.
+    by_light : (15, 3) float
+        Error per sd of a shift of the features with the light.
+    """
+
+    found_rad: FloatArray
+    formal: FloatArray
+    by_camera: FloatArray
+    by_benchmark: FloatArray
+    by_light: FloatArray
+
+
 def edge_residuals(view: VirtualCamera, horizon: HorizonLine, deformation: FloatArray) -> FrameResiduals:
     """Residuals of edge points against the edge predicted for a deformation (3,)."""
     residual, rows, clocks = view.mismatch(horizon, view.edge(deformation))

@@ -76,6 +76,7 @@ _DETERMINED = 0.5  # of the a priori sd
 LEAST_FRAMES, _MOST_FRAMES = 12, 60  # more frames of a film lie closer than their errors change
 _LEAST_LOAD = 0.3  # of the film's largest, between frames: less shows no growth
 _LEAST_OWN = 1e-4  # of the variance of a frame's own part: next to the benchmark frame none of it is its own
+_UNSEEN = 1e-10  # of the largest information: a shape that the points do not show
 _JITTER_RAD2 = float(np.deg2rad(1e-4) ** 2)  # where a frame shows nothing of a shape, what it found is exactly zero
 
 
@@ -375,17 +376,21 @@ def _given_shape(
     """A frame's answer with its shape's distribution given the film's in place of the a priori one."""
     assert fit.shape is not None
     own, modes = fit.shape, slice(2, None)
-    information = np.linalg.inv(own.formal)
-    informed = information.copy()
-    informed[modes, modes] -= np.diag(mode_sd_rad(oriented.apriori) ** -2.0)
-    informed /= shape.points_scale**2
+    information = np.linalg.inv(own.formal) / shape.points_scale**2
+    points = information.copy()
+    points[modes, modes] -= np.diag(mode_sd_rad(oriented.apriori) ** -2.0) / shape.points_scale**2
+    # the light that shifts all features is no error of single points: it is eliminated
+    light = information @ own.by_light
+    back = np.linalg.pinv(points, rcond=_UNSEEN, hermitian=True) @ light
+    out = np.eye(len(points)) - light @ np.linalg.solve(np.eye(light.shape[1]) + light.T @ back, back.T)
+    informed = out @ points
     informed[modes, modes] += np.eye(len(MODES)) / own_var
-    formal = np.linalg.inv(informed)[:2]
+    formal = np.linalg.inv(0.5 * (informed + informed.T))[:2]
     by_shape: FloatArray = np.kron(parts, formal[:, modes] / own_var).astype(float)
-    again = formal @ information / shape.points_scale**2
+    again = formal @ out @ information
     answer = again @ own.found_rad + by_shape @ shape.found_rad
-    by_camera, by_benchmark, by_light = again @ own.by_camera, again @ own.by_benchmark, again @ own.by_light
-    covariance = oriented.covariance_of(formal[:, :2], by_camera, by_benchmark) + by_light @ by_light.T
+    by_camera, by_benchmark = again @ own.by_camera, again @ own.by_benchmark
+    covariance = oriented.covariance_of(formal[:, :2], by_camera, by_benchmark)
     covariance = covariance + by_shape @ shape.found_covariance @ by_shape.T
     return replace(fit, rotation_yz_rad=answer, covariance=covariance, per_benchmark=by_benchmark, by_shape=by_shape)
 
