@@ -385,7 +385,7 @@ def _given_shape(
     out = np.eye(len(points)) - light @ np.linalg.solve(np.eye(light.shape[1]) + light.T @ back, back.T)
     informed = out @ points
     informed[modes, modes] += np.eye(len(MODES)) / own_var
-    formal = np.linalg.inv(0.5 * (informed + informed.T))[:2]
+    formal: FloatArray = np.linalg.inv(0.5 * (informed + informed.T))[:2].astype(float)
     by_shape: FloatArray = np.kron(parts, formal[:, modes] / own_var).astype(float)
     again = formal @ out @ information
     answer = again @ own.found_rad + by_shape @ shape.found_rad
