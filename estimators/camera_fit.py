@@ -149,7 +149,7 @@ class FrameFit:
     Parameters
     ----------
     rotation_yz_rad : (2,) float
-        Rotation vector of the shell against the body about body y and z, rad; NaN when refused.
+        Rotation vector about body y and z, rad; NaN when refused.
     covariance : (k, k) float
         Of the fitted parameters: ``rotation_yz_rad`` (k = 2), or the angle in the assumed plane (k = 1), rad^2.
     per_benchmark : (k, 2) float
@@ -162,9 +162,9 @@ class FrameFit:
         Rows of features used.
     horizon : HorizonLine
     refused : Fault
-        Why there is no answer, with its code; empty when there is one.
+        Why there is no answer; empty when there is one.
     contradicted : bool
-        Whether features were found that contradict a whole edge, which alone gave the answer.
+        Whether a whole edge alone gave the answer, against the features.
     shape : FrameShape or None
         None in an assumed plane.
     by_shape : (2, 13 (1 + c)) float or None
@@ -356,7 +356,7 @@ class OrientedCamera:
             last = self._reconciled(frame, horizon, place, deformation, last)
             contradicted = place is not None and last.edge_count == len(last.rows)
             if not horizon.is_by_hand:
-                self._check_explained(last)
+                last = self._explained(place, deformation, last)
             if plane_axis is not None:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
                 # the seed paper's way uses the edge alone
@@ -377,6 +377,21 @@ class OrientedCamera:
                 words = f"breaks across its width after row {row}, as the benchmark frame does not: rolled, or torn"
                 return Fault(words, "frame-broken")
         return NO_FAULT
+
+    def _explained(
+        self, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray, both: _Solution
+    ) -> _Solution:
+        """Edge and features, or most features alone if clouds along the edge pass for a shape; else `_NoFitError`."""
+        try:
+            self._check_explained(both)
+            return both
+        except _NoFitError as fault:
+            most = max(USUAL_SHARE * int((~self._benchmark_edge).sum()), _LEAST_FEATURES)
+            if fault.codes != ("edge-not-shell",) or place is None or not len(_has(place)) > most:
+                raise
+        alone = self._solve(_NOTHING, place, deformation, np.eye(2), USUAL_RMS_PX)
+        self._check_explained(alone)
+        return alone
 
     def _check_explained(self, last: _Solution) -> None:
         """Refuse a frame that no deflection explains, by `estimators.frame_checks`."""
