@@ -79,6 +79,7 @@ _SMOOTH_RATE_HZ = 50.0
 # The vehicle's pitching drives the deflection at up to 0.35 of the joint's frequency (four synthetic flights, stiffness
 # 0.75 to 3 times the reference's), which twice as many readings resolve
 _READINGS_A_SWING = 0.8
+_HOLE = 1.5  # of the readings' usual spacing: one is missing
 _LOCAL = 5  # readings about one, over which the swing's variance is taken
 Inputs = dict[str, FloatArray]
 Read = Callable[[Inputs, Deflection | None], list[Evidence]]
@@ -500,11 +501,15 @@ def smoothed(
 def with_unresolved_swing(readings: DeflectionHistory, smooth: DeflectionHistory, swing_hz: float) -> DeflectionHistory:
     """Smooth history of readings with the swing in its sd that they are too sparse to follow; as it is elsewhere."""
     known = readings.time_s[np.isfinite(readings.theta_rad)]
-    if float(np.median(np.diff(known))) * swing_hz * _READINGS_A_SWING <= 1.0:
+    after = np.searchsorted(known, smooth.time_s).clip(1, len(known) - 1)
+    sparse = (known[after] - known[after - 1]) * swing_hz * _READINGS_A_SWING > 1.0
+    if not sparse.any():
         return smooth
-    var = _unresolved_swing_var(readings, smooth, swing_hz)
+    var = np.where(sparse, _unresolved_swing_var(readings, smooth, swing_hz), 0.0)
     cov = smooth.lateral_cov_without_plane + var[:, None, None] * np.eye(2)
-    words = f"{smooth.assumptions}; fewer readings than its swing at {swing_hz:.1f} Hz needs, which is in the sd"
+    words = (
+        f"{smooth.assumptions}; where readings are sparser than its swing at {swing_hz:.1f} Hz needs, that is in the sd"
+    )
     return history_from_lateral(smooth.time_s, smooth.theta_yz_rad, cov, smooth.method, words)
 
 
@@ -520,6 +525,11 @@ def _unresolved_swing_var(readings: DeflectionHistory, at: DeflectionHistory, sw
     off = np.sum((yz - uniform_filter1d(yz, _LOCAL, axis=0, mode="nearest")) ** 2, axis=1)
     var = uniform_filter1d(off, _LOCAL, mode="nearest") * _LOCAL / (_LOCAL - 1.0)
     level = uniform_filter1d(np.sum(yz**2, axis=1), _LOCAL, mode="nearest")
+    # in a hole it may be that of the readings around, whose local mean follows the swing
+    hole = np.diff(time_s, append=time_s[-1])
+    for k in np.flatnonzero(hole > _HOLE * np.median(np.diff(time_s))):
+        around = (time_s > time_s[k] - hole[k]) & (time_s < time_s[k + 1] + hole[k])
+        var[k : k + 2] = np.maximum(var[k : k + 2], yz[around].var(axis=0, ddof=1).sum())
     near = np.abs(at.time_s - time_s[nearest_index(time_s, at.time_s)])
     share = 1.0 - np.cos(np.minimum(2.0 * np.pi * swing_hz * near, 0.5 * np.pi))
     # a uniform amplitude's mean square is a third of its largest, a swing's variance half of its amplitude's square

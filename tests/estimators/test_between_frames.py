@@ -18,16 +18,18 @@ def motion(t):
     return (level + swing)[:, None] * np.stack([np.cos(clock), np.sin(clock)], axis=-1)
 
 
-def z_between(rate_hz, swing_hz):
-    """Errors over their sd at all times of the pulse, and the sd, rad, over eight films."""
+def z_between(rate_hz, swing_hz, refused_s=(0.0, 0.0)):
+    """Errors over their sd over the pulse, or among the frames refused, and the sd, rad, of eight films."""
     z, sd = [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
         t = np.arange(0.0, 28.0, 1.0 / rate_hz) + rng.uniform(0.0, 1.0)
+        t = t[(t < refused_s[0]) | (t > refused_s[1])]
         read = motion(t) + SD_RAD * rng.standard_normal((len(t), 2))
         film = history_from_lateral(t, read, np.tile(SD_RAD**2 * np.eye(2), (len(t), 1, 1)), "camera", "")
         got = smoothed(film, swing_hz=swing_hz)
-        inside = (got.time_s > 6.0) & (got.time_s < 22.0)
+        low, high = refused_s if refused_s[1] else (6.0, 22.0)
+        inside = (got.time_s > low) & (got.time_s < high)
         error = got.theta_rad - np.linalg.norm(motion(got.time_s), axis=1)
         z.append((error / got.theta_sd_rad)[inside])
         sd.append(got.theta_sd_rad[inside])
@@ -38,6 +40,13 @@ def z_between(rate_hz, swing_hz):
 def test_the_sd_holds_at_any_rate_of_frames(rate_hz):
     """1 Hz frames see the pitching at 1 Hz in one phase alone, and yet it is in the sd."""
     z, _ = z_between(rate_hz, JOINT_HZ)
+    assert np.sqrt(np.mean(z**2)) < 1.3
+    assert np.mean(np.abs(z) > 3.0) < 0.015
+
+
+def test_the_sd_holds_among_frames_refused_in_a_row():
+    """A second is a whole swing: frames around it say nothing of that one. A row of frames is one draw of its phase."""
+    z = np.concatenate([z_between(4.0, JOINT_HZ, (first, first + 1.0))[0] for first in np.arange(8.0, 20.0, 1.3)])
     assert np.sqrt(np.mean(z**2)) < 1.3
     assert np.mean(np.abs(z) > 3.0) < 0.015
 
