@@ -122,7 +122,8 @@ class AprioriSd:
         tilt and for a bow of the edge across the picture (at the picture's sides).
     features_px : float
         Shift along the shell's meridians that the features found in a frame have in common with the light, which slopes
-        across every torus: the same all round the shell, and cosine and sine of a wave.
+        across every torus: the same all round the shell, and cosine and sine of a wave. Its size is found on films of
+        another renderer (benchmarks/README.md).
     """
 
     rim_radius_m: float = 0.01
@@ -132,14 +133,14 @@ class AprioriSd:
     lobes_rad: float = float(np.deg2rad(0.2))
     higher_lobes_rad: float = float(np.deg2rad(0.1))
 
+    edge_px: float = 0.2
+    features_px: float = 0.1
+
     @property
     def lobe_sd_rad(self) -> FloatArray:
         """Of each modelled lobe (12,), in the order of `estimators.frame_residuals.lobe_columns`."""
         waves = np.repeat([*WAVES, *ROUND_WAVES], 2)
         return np.where(waves <= _SOFT_WAVES, self.lobes_rad, self.higher_lobes_rad)
-
-    edge_px: float = 0.2
-    features_px: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,7 @@ class _Solution:
 
     ``columns`` (m, k + 17): derivatives by these. ``shape_found`` (17,): flattening, joint station, lobes and light.
     ``before``: the benchmark's rows of the points used; ``edge_count`` of them are edge points and come first.
-    ``light`` (m, 3): how far features shift per sd with the light.
+    ``feature_rows``: of the features behind them.
     """
 
     gain: FloatArray
@@ -211,7 +212,7 @@ class _Solution:
     rms_px: float
     residual_px: FloatArray
     weight: FloatArray
-    light: FloatArray
+    feature_rows: NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -572,16 +573,17 @@ class OrientedCamera:
     ) -> tuple[tuple[FloatArray, FloatArray] | None, float]:
         """Places of the texture that agree on one deformation, None where too few do; the share that does."""
         sharp = found[0], np.where(found[1] < _WORST_TEXTURE_SD_PX, found[1], np.inf)
-        if len(_has(sharp)) < _LEAST_FEATURES:
+        has = _has(sharp)
+        if len(has) < _LEAST_FEATURES:
             return None, 0.0
-        residual = self._fit_points(_NOTHING, sharp, deformation.copy(), np.eye(2)).left_px
-        agreed = float(np.mean(np.abs(residual) < _AGREED_PX))
+        off = np.abs(self._fit_points(_NOTHING, sharp, deformation.copy(), np.eye(2)).left_px)
+        agreed = float(np.mean(off < _AGREED_PX))
         if agreed < _LEAST_AGREED:
             return None, agreed
-        scale = 1.4826 * float(np.nanmedian(np.abs(residual)))
+        scale = 1.4826 * float(np.nanmedian(off))
+        inflated = max(1.4826 * float(np.nanmedian(off / sharp[1][has])), 1.0)
+        rows = has[off < max(3.0 * scale, 0.3)]
         kept = np.full_like(sharp[1], np.inf)
-        rows = _has(sharp)[np.abs(residual) < max(3.0 * scale, 0.3)]
-        inflated = max(1.4826 * float(np.nanmedian(np.abs(residual) / sharp[1][_has(sharp)])), 1.0)
         kept[rows] = TOGETHER * inflated * sharp[1][rows]
         return (sharp[0], kept), agreed
 
@@ -720,16 +722,10 @@ class OrientedCamera:
         pull = np.concatenate([np.zeros(k), (mean - np.eye(len(sd))[0] * deformation[2]) / sd**2])
         shape_found = (formal @ (weighted @ residual + pull))[k:]
         shape_found[0] += deformation[2]
-        light = self._light_on_features(place, found.edge_points)
+        features = np.zeros(0, dtype=np.intp) if place is None else _has(place)[used[found.edge_points :]]
         return _Solution(
-            formal @ weighted, formal, shape_found, design, rows, before, edge_count, rms, residual, weight, light[used]
+            formal @ weighted, formal, shape_found, design, rows, before, edge_count, rms, residual, weight, features
         )
-
-    def _light_on_features(self, place: tuple[FloatArray, FloatArray] | None, edge_points: int) -> FloatArray:
-        """Shift (n, 3) of edge points (none here) and features against the benchmark frame's, per sd."""
-        rows = slice(0) if place is None else _has(place)
-        shift = np.sqrt(2.0) * self.apriori.features_px * self._light_shift[rows]
-        return np.concatenate([np.zeros((edge_points, 3)), shift])
 
     @cached_property
     def _light_shift(self) -> FloatArray:
@@ -767,7 +763,7 @@ class OrientedCamera:
         scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
         alone = replace(
             both, gain=formal @ weighted, formal=np.asarray(min(scatter, 1.0) * formal), rows=both.rows[edge],
-            before=both.before[edge], light=both.light[edge],
+            before=both.before[edge], feature_rows=both.feature_rows[:0],
         )  # fmt: skip
         return step[:2], alone
 
@@ -775,8 +771,9 @@ class OrientedCamera:
         k, before = basis.shape[1], last.before
         by_camera = last.gain @ (last.rows[:, POSED] - before[:, POSED])
         by_benchmark = last.gain @ before[:, DEFLECTION] + by_camera @ self.posed_per_deflection
-        features, shape, leak = len(last.rows) - last.edge_count, None, 0.0
-        by_light = last.gain @ last.light
+        features, shape, leak = len(last.feature_rows), None, 0.0
+        light = np.sqrt(2.0) * self.apriori.features_px * self._light_shift[last.feature_rows]  # of two frames
+        by_light = last.gain[:, last.edge_count :] @ light
         covariance = self.covariance_of(last.formal[:k, :k], by_camera[:k], by_benchmark[:k])
         covariance = covariance + by_light[:k] @ by_light[:k].T
         if k == 1:

@@ -249,11 +249,11 @@ def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
     lines : ScanLines
         With origins where the edge is expected; their lengths are not used.
     """
-    near = ScanLines(lines.origin_px, lines.inward_px, _NEAR_PX, _NEAR_PX, lines.index)
-    grey, inside = _sampled(image, near, len(NEAR_ALONG))
-    n = len(near.origin_px)
+    n = len(lines.origin_px)
     if not n:
         return no_horizon(NO_FAULT)
+    near = ScanLines(lines.origin_px, lines.inward_px, _NEAR_PX, _NEAR_PX, lines.index)
+    grey, inside = _sampled(image, near, len(NEAR_ALONG))
     # the noise, from samples so far apart that smoothing did not correlate them
     noise = max(float(np.median(np.abs(grey[:, 6] - grey[:, 0]))) / (0.6745 * np.sqrt(2.0)), 0.3)
     place, along, left, good = np.zeros(n), np.zeros(n), np.zeros_like(grey), np.zeros(n, dtype=np.bool_)

@@ -54,6 +54,8 @@ _LEAST_FACING = 0.3
 _INDEPENDENT_PX = 4.0 * np.pi * _FINE_PX**2  # area over which the band-pass correlates noise
 _SD_FLOOR_PX = 0.05
 _LINE = 3.0  # so much less sharp along a line than across it, a patch is found where it is looked for, or by its shades
+# of a mark's shift with the light, as found on another renderer's films: shades look like a line, hardly like a corner
+_ALIKE_OF_LINE, _ALIKE_OF_CORNER = 3.0, 0.5
 _TRACE_STEPS, _TRACED_M = 80, 5e-4
 _BORDER_PX = 12
 
@@ -132,7 +134,7 @@ class TrackedTexture:
     @property
     def alike(self) -> FloatArray:
         """See `Features`: a line says less of its place than a corner does."""
-        return np.repeat(np.where(self.is_line, _LINE, 0.5), 2)
+        return np.repeat(np.where(self.is_line, _ALIKE_OF_LINE, _ALIKE_OF_CORNER), 2)
 
     def find(
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int

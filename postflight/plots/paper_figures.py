@@ -119,9 +119,9 @@ def figure_2_3(
         lines = view.lines_at(oriented.clocks_rad, hypothesis)
         if len(lines.origin_px):  # else the edge is out of the picture
             ax.axhline(lines.origin_px[:, 1].min(), color=COLOUR["edge"], ls="--", lw=1.0)
-            found = oriented.coherent_edge(unedited(np.asarray(frames[k])), hypothesis)
-            if np.isfinite(found.lowest_row_px):
-                ax.axhline(found.lowest_row_px, color=COLOUR["edge"], lw=1.4)
+        found = oriented.coherent_edge(unedited(np.asarray(frames[k])), hypothesis)
+        if np.isfinite(found.lowest_row_px):
+            ax.axhline(found.lowest_row_px, color=COLOUR["edge"], lw=1.4)
         answer = f"{np.rad2deg(theta):.1f} deg in plane {np.rad2deg(plane):.0f} deg LV" if theta else "taken as zero"
         ax.set_title(f"({chr(97 + k)}) {times_s[k]:.2f} s: deflection {answer}")
         ax.set_axis_off()

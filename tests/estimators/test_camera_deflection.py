@@ -318,6 +318,13 @@ def test_a_wrong_lens_is_refused():
     assert refusal.value.codes == ("camera-far-from-prior",)
 
 
+def test_where_no_line_lies_in_the_picture_no_edge_is_found():
+    frame = film(4, [0.0], [0.0])[0]
+    oriented = orient_camera(frame, GEOMETRY, MOUNT, JOINT_M)
+    lines = oriented.view.lines_at(np.zeros(0), np.zeros(3))
+    assert len(steps_near(frame, lines).points_px) == 0
+
+
 def test_gates_name_what_is_wrong():
     frames = film(4, [0.0], [0.0])
     ahead = MOUNT.model_copy(update={"axis_from_forward_deg": 178.0})

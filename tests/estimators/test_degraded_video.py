@@ -122,6 +122,7 @@ def test_half_the_rim_out_of_view_widens_the_bar():
     films = [read_film(TIMES, f, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None) for f in (frames, half)]
     cut = films[1].history()
     # the benchmark's deflection and the light on the features, most of the bar, are the same in both
+    of_pictures = [read.relative_to_benchmark().covariance for read in films]
     of_points = [[fit.shape.formal[:2, :2] for fit in read.fits] for read in films]
     used = [np.median([len(fit.horizon.points_px) / len(read.oriented.lines.origin_px) for fit in read.fits])
             for read in films]  # fmt: skip
@@ -129,6 +130,7 @@ def test_half_the_rim_out_of_view_widens_the_bar():
     assert used[1] < 0.60
     for k in (1, 2):
         assert np.linalg.det(of_points[1][k]) > 2.0 * np.linalg.det(of_points[0][k])
+        assert np.linalg.det(of_pictures[1][k]) > np.linalg.det(of_pictures[0][k])
         assert normal_error(cut, k, theta, plane)[1] < 13.8
 
 
