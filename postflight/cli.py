@@ -539,12 +539,20 @@ def _postponed(number: int, frame: FrameType | None) -> bool:
     """
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib") or _BINDINGS in frame.f_code.co_filename:
-            again = threading.Timer(_AGAIN_S, _thread.interrupt_main, (number,))
+            again = threading.Timer(_AGAIN_S, _send_again, (number,))
             again.daemon = True
             again.start()
             return True
         frame = frame.f_back
     return False
+
+
+def _send_again(number: int) -> None:
+    """Send a signal to the main thread, so that what it waits for is cut short; Windows lets the wait end first."""
+    if sys.platform == "win32":
+        _thread.interrupt_main(number)
+    else:
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
 
 
 def main() -> None:
