@@ -30,11 +30,11 @@ from estimators.benchmark import orient_camera
 from estimators.camera import read_film
 from estimators.camera_fit import REACH_PX
 from estimators.edge import find_horizon
-from estimators.virtual_camera import render
 from flightmodel import rotations
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.film import film_frames
 from flightmodel.geometry import torus_limb
+from flightmodel.rendering import render
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
 
 SOURCE = Path(__file__).parent / "plain_cpp" / "raster.cpp"

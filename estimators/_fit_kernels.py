@@ -20,8 +20,8 @@ DONE, TOO_FEW, DIVERGED = 0, 1, 2
 
 
 @inlined
-def _project_edge(deformation, clocks, circle, ring, joint, lens, terms, points, pixels, jacobian, kept):
-    """Project the limb of the deformed shell's outermost torus; the number of its points in the lens's field.
+def _project_edge(deformation, clocks, circles, ring, joint, lens, terms, points, pixels, jacobian, kept):
+    """Project the limb of the deformed shell; the number of its points in the lens's field.
 
     They are moved to the front of ``pixels`` and ``jacobian``, their clocking angles into ``kept``.
     """
@@ -32,9 +32,7 @@ def _project_edge(deformation, clocks, circle, ring, joint, lens, terms, points,
     for m in range(3):
         eye[m] = rotation[0, m] * dx + rotation[1, m] * dy + rotation[2, m] * dz
     eye[0] -= joint
-    station, radius, minor = circle
-    flattened = (station + flat * (radius - ring[1]), radius - flat * (station - ring[0]), minor)
-    if not limb_points(flattened, eye, clocks, points):
+    if not limb_points(circles, ring, flat, eye, clocks, points):
         return 0
     per = 1.0 / (1.0 + flat * flat)
     for i in range(len(points)):
@@ -178,14 +176,15 @@ def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, d
 def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, residual, rows, shape, weight, left):
     """Fit a deformation (3,) in place to edge points and features; its state, steps taken.
 
-    ``shell``: clocking angles of the edge, circle of the outermost torus, ring about which the shell flattens, joint
-    station. ``edge``: points (m, 2), light (m, 3), sd and residual at the benchmark (m,), NaN where it was not
-    found. ``features``: points of the shell (p, 3), directions (p, 2), places, sd, residuals there (p,). ``prior``:
-    mean and sd of flattening, joint, lobes (12), light (3). ``limits``: Huber's, largest residual, last step, steps,
-    fewest edge points. ``residual``: against the deformed shell without lobes; ``left``: with what the fit makes of
-    them, of joint and light. Rows with weight zero were not used; edge points come first.
+    ``shell``: clocking angles of the edge, circles whose limb it is (`flightmodel.geometry.edge_circles`), ring about
+    which the shell flattens, distance of the outermost torus from it, joint station. ``edge``: points (m, 2), light
+    (m, 3), sd and residual at the benchmark (m,), NaN where it was not found. ``features``: points of the shell (p, 3),
+    directions (p, 2), places, sd, residuals there (p,). ``prior``: mean and sd of flattening, joint, lobes (12), light
+    (3). ``limits``: Huber's, largest residual, last step, steps, fewest edge points. ``residual``: against the deformed
+    shell without lobes; ``left``: with what the fit makes of them, of joint and light. Rows with weight zero were not
+    used; edge points come first.
     """
-    clocks, circle, ring, joint = shell
+    clocks, circles, ring, width, joint = shell
     found, light, edge_sd, edge_offset = edge
     spots, across, place, feature_sd, feature_offset = features
     m, p, k = len(found), len(spots), basis.shape[1]
@@ -198,13 +197,14 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
     scaled = np.empty(max(m, p))
     design, normal, right = np.empty(n), np.empty((n, n)), np.empty(n)
     form = np.zeros(1 + SHAPES)
-    width = math.sqrt((circle[0] - ring[0]) ** 2 + (circle[1] - ring[1]) ** 2)
     huber, outlier, last_step, steps, fewest = limits
     for taken in range(steps):
         rotation_of(deformation[0], deformation[1], rotation, columns)
         terms = (rotation, columns, joint, deformation[2], ring[0], ring[1])
         if m > 0:
-            count = _project_edge(deformation, clocks, circle, ring, joint, lens, terms, points, pixels, jacobian, kept)
+            count = _project_edge(
+                deformation, clocks, circles, ring, joint, lens, terms, points, pixels, jacobian, kept
+            )
             if count < 2:
                 return TOO_FEW, taken
             _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at)

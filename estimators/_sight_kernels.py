@@ -128,13 +128,14 @@ def project_points(points, terms, lens, pixels, jacobian):
 
 
 @inlined
-def limb_points(circle, eye, clocks, points):
-    """Outboard edge ``(n, 3)`` of a torus (station, radius, minor radius) seen from ``eye``; False inside the torus.
+def limb_points(circles, ring, flat, eye, clocks, points):
+    """Outboard edge ``(n, 3)`` seen from ``eye`` of circles (n, 3), station, radius, minor radius; False inside one.
 
-    See `flightmodel.geometry.torus_limb`.
+    They are flattened by ``flat`` about the ring before. See `flightmodel.geometry.torus_limb`.
     """
-    station, radius, minor = circle
     for i in range(len(clocks)):
+        station = circles[i, 0] + flat * (circles[i, 1] - ring[1])
+        radius, minor = circles[i, 1] - flat * (circles[i, 0] - ring[0]), circles[i, 2]
         oy, oz = -math.cos(clocks[i]), math.sin(clocks[i])
         a = radius - (oy * eye[1] + oz * eye[2])
         b = station + eye[0]
@@ -224,9 +225,9 @@ def project_shell(points, terms, lens, pixels, jacobian):
 
 
 @kernel
-def limb(circle, eye, clocks, points):
+def limb(circles, ring, flat, eye, clocks, points):
     """`limb_points` for callers in Python."""
-    return limb_points(circle, eye, clocks, points)
+    return limb_points(circles, ring, flat, eye, clocks, points)
 
 
 @kernel

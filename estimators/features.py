@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators import _edge_kernels
-from estimators.virtual_camera import RADIUS, Sight, VirtualCamera
+from estimators.virtual_camera import RADIUS, Sight, VirtualCamera, meets_centerbody
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
 from flightmodel.geometry import (
@@ -47,6 +47,7 @@ from flightmodel.geometry import (
     torus_circles,
     torus_limb,
 )
+from flightmodel.rendering import Rendered
 
 Image = NDArray[np.uint8]
 Pixels = Callable[[FloatArray], FloatArray]
@@ -68,6 +69,8 @@ _NOISE_GREY = 2.5
 _VALLEY_STEP_PX, _HALF_VALLEY_PX = 10.0, 5
 _VALLEY_PLACED_M, _VALLEY_OFFSET_PX = 0.03, 3.0  # a tenth of a torus by the light; neighbours err together
 _GRAZING_M = 1e-6
+_BENDS = float(np.cos(np.deg2rad(50.0)))  # within two pixels; the skin of a torus bends by a tenth of that
+_ON_MESH_M = 0.05  # along the sight: two hundredths off the surface, seen at 25 deg
 _ALONG_M = 0.002
 _WIDEST_HALF_PX = 5  # a feature and cloth on both sides fit in the window of the nearest search
 
@@ -233,6 +236,8 @@ def valleys(view: VirtualCamera) -> ImageFeatures:
     One lies behind the limb of each inner torus, whose points are given; directions are outboard. How far behind the
     limb its middle lies, and how dark it is, is the light's doing.
     """
+    if view.undeflected is not None:
+        return _valley_features(*_limbs_within(view, view.undeflected))
     points, across = [], []
     for torus in range(view.geometry.torus_count - 1):
         limb = torus_limb(view.geometry, view.camera.position_body_m, view.clocks_rad, torus)
@@ -245,12 +250,43 @@ def valleys(view: VirtualCamera) -> ImageFeatures:
         # clocking angles grow to the left, so outboard lies to the right along a limb
         across.append(np.column_stack([-along[chosen, 1], along[chosen, 0]]))
     normal = np.concatenate([np.zeros((0, 2)), *across])
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    n = len(normal)
+    return _valley_features(
+        np.concatenate([np.zeros((0, 3)), *points]),
+        normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12),
+    )
+
+
+def _valley_features(points: FloatArray, across: FloatArray) -> ImageFeatures:
+    n = len(points)
     return ImageFeatures(
-        np.concatenate([np.zeros((0, 3)), *points]), normal, np.full(n, _HALF_VALLEY_PX), np.zeros(n, dtype=np.bool_),
-        np.ones(n), _VALLEY_PLACED_M, _VALLEY_OFFSET_PX,
+        points, across, np.full(n, _HALF_VALLEY_PX), np.zeros(n, dtype=np.bool_), np.ones(n), _VALLEY_PLACED_M,
+        _VALLEY_OFFSET_PX,
     )  # fmt: skip
+
+
+def _limbs_within(view: VirtualCamera, rendered: Rendered) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 3) of a mesh beyond which its surface bends away or hides some of itself; outboard in the picture."""
+    camera, mesh = view.camera, view.geometry.mesh
+    assert mesh is not None
+    v, u = np.nonzero(rendered.is_hit)
+    at = np.column_stack([u, v])
+    rays = camera.rays_body(at.astype(float))
+    points = camera.position_body_m + rendered.depth_m[v, u, None] * rays
+    outboard = view.sight(points, np.zeros(3)).jacobian[:, :, RADIUS]
+    outboard /= np.maximum(np.linalg.norm(outboard, axis=1, keepdims=True), 1e-12)
+    inside = camera.is_inside(at.astype(float), _BORDER_PX) & ~meets_centerbody(view, rays)
+    beyond = np.rint(at[inside] + 2.0 * outboard[inside]).astype(np.int64)
+    face, next_face = rendered.face[v[inside], u[inside]], rendered.face[beyond[:, 1], beyond[:, 0]]
+    # towards the camera, however they are wound
+    normal, next_normal = (
+        n * np.sign(np.einsum("ni,ni->n", n, -rays[inside]))[:, None] for n in map(mesh.normals_of, (face, next_face))
+    )
+    bends = np.einsum("ni,ni->n", normal, next_normal) < _BENDS
+    rows = np.flatnonzero(inside)[(next_face >= 0) & bends]
+    # one to a square
+    cell = (v[rows] // _VALLEY_STEP_PX) * len(rendered.face[0]) + u[rows] // _VALLEY_STEP_PX
+    rows = rows[np.unique(cell, return_index=True)[1]]
+    return points[rows], outboard[rows]
 
 
 def _away(view: VirtualCamera, points: FloatArray) -> FloatArray:
@@ -288,8 +324,18 @@ def _in_view(view: VirtualCamera, points: FloatArray, normals: FloatArray) -> Bo
 
 
 def _unhidden(view: VirtualCamera, points: FloatArray, wanted: BoolArray) -> BoolArray:
-    """Whether no torus and no part of the centerbody hides wanted points ``(n, 3)`` of the undeflected shell."""
+    """Whether no torus and no part of the centerbody hides wanted points ``(n, 3)`` of the undeflected shell.
+
+    Of a mesh: whether they lie where it is seen, neither behind its surface nor off it.
+    """
     eye = view.camera.position_body_m
+    if view.undeflected is not None:
+        rays = points - eye
+        away = np.linalg.norm(rays, axis=1)
+        at = np.rint(np.nan_to_num(view.sight(points, np.zeros(3)).pixels, nan=-1.0)).astype(np.int64)
+        u, v = np.clip(at, 0, np.array(view.camera.size_px) - 1).T
+        on = np.abs(view.undeflected.depth_m[v, u] - away) < _ON_MESH_M
+        return np.asarray(wanted & on & ~meets_centerbody(view, rays / away[:, None]))
     visible = wanted.copy()
     share = np.linspace(0.04, 0.97, 80)[:, None, None]
     way = points[visible] + share * (eye - points[visible])

@@ -5,7 +5,7 @@ faces the camera, ``grey = 60 + 150 |n . v|``, with the mesh's lines on it; wher
 drawn. A user's own meshes of either body take the place of the parametric ones. Yellow is the smallest row of the
 virtual edge, the seed paper's horizon line.
 
-Assumed: as in `estimators.virtual_camera`; a mesh is drawn only, the fit is of the parametric shell.
+Assumed: as in `estimators.virtual_camera`; a mesh of the centerbody is drawn only.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.virtual_camera import VirtualCamera, deformation_of, render
+from estimators.virtual_camera import VirtualCamera, deformation_of, meets_centerbody
 from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
 from flightmodel.geometry import BodyMesh, bend, outboard, vehicle_meshes
+from flightmodel.rendering import render
 
 Picture = NDArray[np.uint8]
 
@@ -148,17 +149,10 @@ def _drawing(mesh: BodyMesh, colour: FloatArray = _COLOUR) -> _Drawing:
 
 
 def centerbody_pixels(view: VirtualCamera) -> BoolArray:
-    """Pixels ``(h, w)`` whose rays meet the centerbody, a cylinder on whose skin the camera sits."""
-    camera = view.camera
-    v, u = np.indices((camera.height_px, camera.width_px), dtype=float)
-    rays = np.nan_to_num(camera.rays_body(np.column_stack([u.ravel(), v.ravel()])))
-    x, y, z = camera.position_body_m
-    lateral, inward = np.maximum(rays[:, 1] ** 2 + rays[:, 2] ** 2, 1e-12), -(y * rays[:, 1] + z * rays[:, 2])
-    excess = y**2 + z**2 - min(view.geometry.centerbody_radius_m, float(np.hypot(y, z)) - 1e-3) ** 2
-    square = inward**2 - lateral * excess
-    station = -x - rays[:, 0] * (inward - np.sqrt(np.maximum(square, 0.0))) / lateral
-    met = (square > 0.0) & (inward > 0.0) & (station > 0.0) & (station < view.geometry.centerbody_length_m)
-    return np.asarray(met.reshape(v.shape))
+    """Pixels ``(h, w)`` whose rays meet the centerbody."""
+    v, u = np.indices((view.camera.height_px, view.camera.width_px), dtype=float)
+    rays = np.nan_to_num(view.camera.rays_body(np.column_stack([u.ravel(), v.ravel()])))
+    return meets_centerbody(view, rays).reshape(v.shape)
 
 
 def horizon_row(view: VirtualCamera, theta_rad: float, plane_lv_rad: float) -> int:

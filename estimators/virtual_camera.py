@@ -1,7 +1,8 @@
 """What would the camera see if the shell were deflected by this much?
 
-The shell's edge against the sky is the outermost torus's limb, a closed-form curve of the deformed geometry; it is
-projected, never rendered, and so are the features painted on the shell. A point ``P`` of the shell appears at
+The shell's edge against the sky is the limb of the outermost torus, or of the user's mesh, a closed-form curve of the
+deformed geometry; it is projected, never rendered, and so are the features painted on the shell. A point ``P`` of the
+shell appears at
 
     px = project(c; J + R(w) (P + kappa f(P) - J)),     w = theta x_hat x d(plane)
 
@@ -9,10 +10,7 @@ with the joint ``J``, the camera ``c``, and a flattening ``kappa``: the cone ope
 torus, ``f`` being the motion per radian. Sliding along the surface moves a limb point along the edge only, so the
 edge's motion normal to itself is that of the material point: derivatives are exact without differentiating the limb.
 
-`render` fills triangles through the lens with a depth buffer, for overlays, masks and checks; a fit projects the edge
-instead, which costs hundreds of times less. A straight edge in space is straight in the picture only over a small
-triangle, so larger ones are split until they span less than `WIDEST_RAD` as seen from the camera; that also follows
-those that reach beyond the lens's field or behind the camera.
+Pictures of triangles (`flightmodel.rendering`) cost hundreds of times more: they serve overlays, masks and checks.
 
 Assumed: a rigid shell but for the flattening, tori of circular section; the lens of `flightmodel.camera`.
 
@@ -27,19 +25,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from estimators import _raster_kernels, _sight_kernels
+from estimators import _sight_kernels
 from estimators.edge import HorizonLine, ScanLines
 from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.deflection import rotation_vector_body_shell
-from flightmodel.geometry import ShellGeometry, torus_circles
+from flightmodel.geometry import ShellGeometry, edge_circles, torus_circles
+from flightmodel.rendering import Rendered, render
 
 _EDGE_POINTS = 201
 _OUTER_PX, _INNER_PX = 75.0, 45.0
-WIDEST_RAD, _MARGIN_RAD = float(np.deg2rad(5.0)), float(np.deg2rad(0.5))
-_DEEPEST_SPLIT = 20
 
 DEFLECTION, FLATTENING, CAMERA, HELD, RADIUS = slice(0, 2), 2, slice(3, 11), slice(11, 16), 14
 """Columns of a derivative: the shell's rotation vector about body y and z (px/rad) and its flattening (px/rad); the
@@ -118,27 +114,38 @@ class VirtualCamera:
         return min(self.geometry.centerbody_radius_m, float(np.hypot(*self.camera.position_body_m[1:])) - 1e-3)
 
     @property
-    def shell_terms(self) -> tuple[FloatArray, tuple[float, float, float], tuple[float, float], float]:
+    def shell_terms(self) -> tuple[FloatArray, FloatArray, tuple[float, float], float, float]:
         """The shell in the compiled fit: see `estimators._fit_kernels.fit_frame`."""
-        return self.clocks_rad, *self._circles, self.joint_station_m
+        return self.clocks_rad, self._circles, self._ring, self.width_m, self.joint_station_m
 
     @cached_property
-    def _circles(self) -> tuple[tuple[float, float, float], tuple[float, float]]:
-        """Station, radius and minor radius of the outermost torus; station and radius of the innermost, m."""
-        station, radius = (part.tolist() for part in torus_circles(self.geometry))
-        return (station[-1], radius[-1], self.geometry.torus_minor_radius_m), (station[0], radius[0])
+    def _circles(self) -> FloatArray:
+        """Station, radius and minor radius, m, whose limb is the edge at each clocking angle (n, 3)."""
+        return edge_circles(self.geometry, self.camera.position_body_m, self.clocks_rad)
 
-    @property
+    @cached_property
+    def _ring(self) -> tuple[float, float]:
+        """Station and radius of the innermost torus, m, about which the shell flattens."""
+        station, radius = torus_circles(self.geometry)
+        return float(station[0]), float(radius[0])
+
+    @cached_property
     def width_m(self) -> float:
         """Distance of the outermost torus from the innermost, m."""
-        (station, radius, _), ring = self._circles
-        return float(np.hypot(station - ring[0], radius - ring[1]))
+        station, radius = torus_circles(self.geometry)
+        return float(np.hypot(station[-1] - station[0], radius[-1] - radius[0]))
 
     def from_ring_m(self, points_shell_m: FloatArray) -> FloatArray:
         """Distance (n,) of points of the undeflected shell from the innermost torus's centre line, m."""
-        station, radius = self._circles[1]
+        station, radius = self._ring
         outwards = np.hypot(*points_shell_m[:, 1:].T) - radius
         return np.asarray(np.hypot(-points_shell_m[:, 0] - station, outwards))
+
+    @cached_property
+    def undeflected(self) -> Rendered | None:
+        """The user's mesh of the aeroshell, undeflected and without centerbody; None where there is none."""
+        mesh = self.geometry.mesh
+        return None if mesh is None else render(self.camera, mesh.vertices_m, mesh.faces)
 
     def _rotation(self, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation matrix (3, 3) of a deformation, and the y and z columns (3, 2) of its left Jacobian."""
@@ -152,8 +159,7 @@ class VirtualCamera:
         ``deformation`` (3,) is the shell's rotation vector against the body about body y and z and its flattening, rad.
         """
         rotation, left = self._rotation(deformation)
-        _, ring = self._circles
-        terms = (rotation, left, self.joint_station_m, float(deformation[2]), *ring)
+        terms = (rotation, left, self.joint_station_m, float(deformation[2]), *self._ring)
         pixels, jacobian = np.empty((len(points_shell_m), 2)), np.empty((len(points_shell_m), 2, 16))
         _sight_kernels.project_shell(
             np.ascontiguousarray(points_shell_m), terms, self.camera.lens_terms, pixels, jacobian
@@ -170,11 +176,8 @@ class VirtualCamera:
         """
         rotation, _ = self._rotation(deformation)
         eye = rotation.T @ (self.camera.position_body_m - self.joint_m) + self.joint_m
-        (station, radius, minor), ring = self._circles
-        points = np.empty((len(self.clocks_rad), 3))
-        flat = float(deformation[2])
-        circle = (station + flat * (radius - ring[1]), radius - flat * (station - ring[0]), minor)
-        if not _sight_kernels.limb(circle, eye, self.clocks_rad, points):
+        points, flat = np.empty((len(self.clocks_rad), 3)), float(deformation[2])
+        if not _sight_kernels.limb(self._circles, self._ring, flat, eye, self.clocks_rad, points):
             raise GateError(
                 f"the camera at {np.round(eye, 3).tolist()} m lies inside the outermost torus",
                 code="camera-inside-shell",
@@ -197,7 +200,7 @@ class VirtualCamera:
 
     def _unflattened(self, points: FloatArray, flattening: float) -> FloatArray:
         """Points ``(n, 3)`` of the shell before it flattened."""
-        _, (station, radius) = self._circles
+        station, radius = self._ring
         r = np.hypot(points[:, 1], points[:, 2])
         aft, outwards = -points[:, 0] - station, r - radius
         per = 1.0 / (1.0 + flattening**2)
@@ -254,53 +257,17 @@ class VirtualCamera:
         return residual, rows, np.interp(at, np.arange(len(edge.clocks_rad)), edge.clocks_rad)
 
 
+def meets_centerbody(view: VirtualCamera, rays_body: FloatArray) -> BoolArray:
+    """Whether rays ``(n, 3)`` from the lens meet the centerbody, a cylinder on whose skin the camera sits."""
+    x, y, z = view.camera.position_body_m
+    lateral = np.maximum(rays_body[:, 1] ** 2 + rays_body[:, 2] ** 2, 1e-12)
+    inward = -(y * rays_body[:, 1] + z * rays_body[:, 2])
+    square = inward**2 - lateral * (y**2 + z**2 - view.skin_m**2)
+    station = -x - rays_body[:, 0] * (inward - np.sqrt(np.maximum(square, 0.0))) / lateral
+    return np.asarray((square > 0.0) & (inward > 0.0) & (station > 0.0) & (station < view.geometry.centerbody_length_m))
+
+
 def deformation_of(theta_rad: float, plane_lv_rad: float) -> FloatArray:
     """Deformation (3,) of `VirtualCamera.sight` for a deflection's angle and plane, without flattening."""
     out: FloatArray = rotation_vector_body_shell(np.array(theta_rad), np.array(plane_lv_rad))
     return np.array([out[1], out[2], 0.0])
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """A picture of distances.
-
-    Parameters
-    ----------
-    depth_m : (h, w) float
-        Distance from the camera along each pixel's ray; infinite where nothing is met.
-    face : (h, w) int
-        Index of the face seen; -1 where there is none.
-    """
-
-    depth_m: FloatArray
-    face: NDArray[np.int64]
-
-    @property
-    def is_hit(self) -> BoolArray:
-        """Mask ``(h, w)`` of pixels that show the scene."""
-        return np.asarray(self.face >= 0)
-
-
-def render(camera: Camera, vertices_body_m: FloatArray, faces: NDArray[np.int64]) -> Rendered:
-    """Render triangles.
-
-    Parameters
-    ----------
-    camera : Camera
-    vertices_body_m : (n, 3) float
-        From the datum, body axes.
-    faces : (m, 3) int
-        Indices of vertices.
-
-    Returns
-    -------
-    Rendered
-        ``face`` counts the given faces, whatever was split.
-    """
-    shape = (camera.height_px, camera.width_px)
-    depth, nearest = np.full(shape, np.inf), np.full(shape, -1, dtype=np.int64)
-    _raster_kernels.raster(
-        np.ascontiguousarray(vertices_body_m, dtype=float), np.ascontiguousarray(faces, dtype=np.int64),
-        camera.lens_terms, camera.picture_half_angle_rad + _MARGIN_RAD, WIDEST_RAD, _DEEPEST_SPLIT, depth, nearest,
-    )  # fmt: skip
-    return Rendered(depth, nearest)

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
-from estimators._sight_kernels import FISHEYE
 from flightmodel._kernels import inlined, kernel
+from flightmodel.camera import LENSES
 
+FISHEYE = LENSES.index("fisheye")
 _WIDE_PX = 8
 _BORDER_COS = math.cos(math.radians(0.5))
 
@@ -84,7 +85,7 @@ def fill(ax, ay, bx, by, cx, cy, da, db, dc, face, depth, nearest):
 def raster(vertices, faces, lens, sight, widest, deepest, depth, nearest):
     """Write into ``depth (h, w)`` and ``nearest (h, w)`` the distance and index of the closest face at pixel centres.
 
-    ``vertices (n, 3)`` in body axes; ``lens`` as in `estimators._sight_kernels.project_shell`. A face that spans more
+    ``vertices (n, 3)`` in body axes; ``lens``: `flightmodel.camera.Camera.lens_terms`. A face that spans more
     than ``widest`` is halved across its widest side, again and again, ``deepest`` times at the most; what lies farther
     than ``sight`` from the optical axis is not in the picture.
     """

@@ -565,9 +565,11 @@ def _vehicle(gate: Gate, name: str, events: list[EventEntry]) -> Vehicle | None:
             gate.refuse_config(Fault(f"vehicle: {each}", each.code))
         return None
     for body, mesh in vehicle.meshes.items():
-        words = f"{mesh.words}; it is drawn, while the camera's fit is of [geometry]"
-        code = "mesh-apart" if mesh.apart else "mesh-drawn"
-        gate.findings.append(Finding(f"mesh of the {body}", words, np.nan, np.nan, code))
+        use, code = "the camera's fit is of its edge and surface", "mesh-fitted"
+        if body == "centerbody":
+            use, code = "it is drawn, while the camera's view is bounded by [geometry]", "mesh-drawn"
+        code = "mesh-apart" if mesh.apart else code
+        gate.findings.append(Finding(f"mesh of the {body}", f"{mesh.words}; {use}", np.nan, np.nan, code))
     return vehicle
 
 

@@ -10,9 +10,9 @@ with minor radius ``a`` and spacing ``p``. Body axes: datum at the nose, x forwa
 body axes at zero deflection; `bend` carries shell points to the body. Assumed: the skin follows the tori, the shell
 deflects at the joint alone, gore seams are meridians of the aft side evenly clocked from 0 deg LV.
 
-Meshes (STL, OBJ, GLB) replace the look of aeroshell and centerbody; the stack of tori stays what the camera's fit
-projects. So that both are one vehicle, the mesh must have its size, and a shell's rim must be the circle that
-``[geometry]`` has. A point ``p`` of the file lies in body axes at
+Meshes (STL, OBJ, GLB) take the place of aeroshell and centerbody: their look, and of the aeroshell the edge and surface
+that the camera sees (`edge_circles`). So that mesh and ``[geometry]`` are one vehicle, the mesh must have its size, and
+a shell's rim must be near the circle that ``[geometry]`` has. A point ``p`` of the file lies in body axes at
 
     unit_m R (p - nose),     rows of R: forward, -zero_clock, forward x -zero_clock.
 
@@ -25,6 +25,7 @@ from __future__ import annotations
 import io
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -37,6 +38,7 @@ from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateEr
 from flightmodel.config import FileBeside, KeyFaults, Length, Section, beside
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 from flightmodel.guarded_files import UnfitFile, file_bytes
+from flightmodel.mesh_sections import section_supports, touching_circles
 
 if TYPE_CHECKING:
     import trimesh
@@ -91,6 +93,7 @@ class ShellGeometry(Section):
     centerbody_length_m: Length
     features: Annotated[str, AfterValidator(_known_features)] = "texture"
     _listed: ListedFeatures | None = PrivateAttr(default=None)
+    _mesh: BodyMesh | None = PrivateAttr(default=None)
 
     @property
     def listed_features(self) -> ListedFeatures | None:
@@ -101,6 +104,17 @@ class ShellGeometry(Section):
         """Return this shell with the list that ``features`` names."""
         shell = self.model_copy()
         shell._listed = listed
+        return shell
+
+    @property
+    def mesh(self) -> BodyMesh | None:
+        """The user's mesh of the aeroshell, whose edge and surface the camera then sees; None where there is none."""
+        return self._mesh
+
+    def with_mesh(self, mesh: BodyMesh) -> ShellGeometry:
+        """Return this shell as a mesh has it."""
+        shell = self.model_copy()
+        shell._mesh = mesh
         return shell
 
     @model_validator(mode="after")
@@ -246,6 +260,33 @@ def torus_limb(
     return points
 
 
+def edge_circles(geometry: ShellGeometry, eye_shell_m: FloatArray, clock_lv_rad: FloatArray) -> FloatArray:
+    """Circles in the half-planes at clocking angles ``(n,)`` whose limb is the shell's edge as seen from about a point.
+
+    Returns
+    -------
+    (n, 3) float
+        Station, radius, minor radius, m: of the outermost torus, or what stands for the mesh there.
+
+    Raises
+    ------
+    GateError
+        When no line of sight from ``eye_shell_m`` (3,), aft of the shell, touches the mesh.
+    """
+    if geometry.mesh is None:
+        station, radius = torus_circles(geometry)
+        return np.tile([station[-1], radius[-1], geometry.torus_minor_radius_m], (len(clock_lv_rad), 1))
+    around, supports = geometry.mesh.supports
+    at = np.mod(clock_lv_rad, 2.0 * np.pi)
+    near = np.stack([np.interp(at, around, column, period=2.0 * np.pi) for column in supports.T], axis=1)
+    across = lv_direction(clock_lv_rad) @ eye_shell_m
+    circles = touching_circles(near, np.column_stack([np.full(len(at), -eye_shell_m[0]), across]))
+    if not np.isfinite(circles).all():
+        where = np.round(eye_shell_m, 3).tolist()
+        raise GateError(f"the mesh of the aeroshell has no edge as seen from {where} m", code="mesh-no-edge")
+    return circles
+
+
 def bend(points_shell_m: FloatArray, theta_rad: float, plane_lv_rad: float, joint_station_m: float) -> FloatArray:
     """Points ``(..., 3)`` of the shell, m, in body axes once the joint is bent by ``theta`` in the plane.
 
@@ -298,6 +339,7 @@ UNITS_M = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0
 WRONG_UNIT, SUGGESTED = 1.6, 1.1  # units lie a factor of 2.5 apart; one that makes the size right to a tenth is named
 SAME_RIM, SAME_END = 0.1, 0.25  # of the rim's radius, of the centerbody's length
 NO_CIRCLE = 0.05  # of the rim's radius
+_SECTIONS = 720  # half a degree apart: scallops of forty gores have nine degrees
 NEAR_M = 0.001  # a lens sits on the very skin: from so far outboard of it a mesh is looked at
 TO_CLOSE = "close it in the program that made it (export as a solid; mend holes and coinciding vertices)"
 
@@ -350,7 +392,7 @@ class BodyMesh:
     words : str
         What it is, and how its rim agrees with ``[geometry]``.
     apart : bool
-        Whether the rim is where ``[geometry]`` has none, so that the mesh will not lie over the filmed shell.
+        Whether the rim is where ``[geometry]`` has none: one of the two is not the vehicle's.
     rim : Rim or None
         An aeroshell's largest circle.
     """
@@ -360,6 +402,20 @@ class BodyMesh:
     words: str
     apart: bool = False
     rim: Rim | None = None
+
+    @cached_property
+    def supports(self) -> tuple[FloatArray, FloatArray]:
+        """Clocking angles (k,), and the support of the mesh's section at each (`flightmodel.mesh_sections`)."""
+        around = np.linspace(0.0, 2.0 * np.pi, _SECTIONS, endpoint=False)
+        supports = section_supports(self.vertices_m, self.faces, around)
+        cut = np.isfinite(supports[:, 0])
+        return around[cut], supports[cut]
+
+    def normals_of(self, faces: Faces) -> FloatArray:
+        """Unit normals ``(n, 3)`` of faces, whichever way they are wound."""
+        a, b, c = (self.vertices_m[self.faces[faces, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300))
 
 
 def body_meshes(
@@ -572,7 +628,7 @@ def _laid(body: str, spec: MeshFile, vertices: FloatArray, faces: Faces, geometr
         allowed = f"{SAME_RIM * rim_m:.3f} m of difference is allowed"
         raise ConfigError(f"{key}': {named}{words}; {allowed}; {turn_it}, or correct [geometry]", code="mesh-pose")
     apart = abs(rim.station_m - rim_station_m) > SAME_RIM * rim_m
-    words += ", so it will not lie over the filmed shell" if apart else ""
+    words += ", so one of the two is not the vehicle's: check forward and nose" if apart else ""
     return BodyMesh(placed, faces, f"{head}; {words}", apart, rim)
 
 

@@ -10,7 +10,7 @@ CSV beside the vehicle file, a row a point on the shell::
 it; ``hoop``, a point of a line round the shell. ``shade``: ``darker`` or ``paler`` than the cloth beside it.
 ``width_m`` is the spot's diameter or the line's width.
 
-Assumed: the undeflected shell, station aft of the nose; a point lies on the aft side of a torus.
+Assumed: the undeflected shell, station aft of the nose; a point lies on the aft side of a torus, or of the mesh.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.geometry import FEATURE_KINDS, ListedFeatures, ShellGeometry, revolved, torus_circles
+from flightmodel.mesh_sections import nearest_on_sections
 from flightmodel.tables import line_of, numbers, read_table
 
 if TYPE_CHECKING:
@@ -60,15 +61,12 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
     kind = _words(frame, "kind", FEATURE_KINDS, path, faults)
     shade = _words(frame, "shade", SHADES, path, faults)
     if not faults:
-        from_circle, away = _nearest_circle(geometry, station, radius)
+        off_m, normal = _off_surface(geometry, station, radius, np.deg2rad(clock))
+        surface = "a torus's surface" if geometry.mesh is None else "the mesh of the aeroshell"
         checks = (
             (np.isfinite(clock) & (np.abs(clock) <= 360.0), "clock_lv_deg", "an angle within 360 deg is wanted"),
             ((width > 0.0) & (width <= _WIDEST_M), "width_m", f"0 to {_WIDEST_M} m is wanted"),
-            (
-                np.abs(away - geometry.torus_minor_radius_m) <= _OFF_SURFACE_M,
-                "radius_m",
-                f"within {_OFF_SURFACE_M} m of a torus's surface is wanted",
-            ),
+            (off_m <= _OFF_SURFACE_M, "radius_m", f"within {_OFF_SURFACE_M} m of {surface} is wanted"),
         )
         for good, column, wanted in checks:
             if not good.all():
@@ -81,9 +79,7 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
     if faults:
         raise GateError(faults)
     at = np.deg2rad(clock)
-    points, normals = (
-        _at_clocks(place, at) for place in (np.column_stack([station, radius]), from_circle / away[:, None])
-    )
+    points, normals = (_at_clocks(place, at) for place in (np.column_stack([station, radius]), normal))
     return ListedFeatures(points, normals, kind, width, shade == 1)
 
 
@@ -101,13 +97,18 @@ def _words(
     return cells.map({word: k for k, word in enumerate(known)}).to_numpy(dtype=np.int64)
 
 
-def _nearest_circle(geometry: ShellGeometry, station: FloatArray, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Place (n, 2), station and radius, from the nearest torus's centre circle, and the distance from it, m."""
-    centres = np.column_stack(torus_circles(geometry))
-    away = np.column_stack([station, radius])[:, None] - centres
+def _off_surface(
+    geometry: ShellGeometry, station: FloatArray, radius: FloatArray, clock_rad: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """How far places lie off the shell's surface (n,), m, and its normals there (n, 2), station and radius."""
+    place = np.column_stack([station, radius])
+    if geometry.mesh is not None:
+        return nearest_on_sections(geometry.mesh.vertices_m, geometry.mesh.faces, place, clock_rad)
+    away = place[:, None] - np.column_stack(torus_circles(geometry))
     nearest = np.argmin(np.hypot(away[:, :, 0], away[:, :, 1]), axis=1)
-    place = away[np.arange(len(away)), nearest]
-    return place, np.hypot(place[:, 0], place[:, 1])
+    away = away[np.arange(len(away)), nearest]
+    distance = np.hypot(away[:, 0], away[:, 1])
+    return np.abs(distance - geometry.torus_minor_radius_m), away / distance[:, None]
 
 
 def _at_clocks(station_radius: FloatArray, clock_rad: FloatArray) -> FloatArray:

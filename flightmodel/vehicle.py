@@ -524,6 +524,8 @@ def vehicle_from_toml(path: Path) -> Vehicle:
     aero, table_sd = aerodynamics_from(spec.aerodynamics, shape, (path.parent, DATA / "aerodynamics"))
     lenses = {name: camera.position_m for name, camera in spec.cameras.items()}
     meshes = body_meshes(spec.meshes, path.parent, shell, lenses)
+    if "aeroshell" in meshes:
+        shell = shell.with_mesh(meshes["aeroshell"])
     if listed:
         shell = shell.with_listed(read_features(path.parent / listed[0], shell))
     # the vehicle file's own word first, then the table's

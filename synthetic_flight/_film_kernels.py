@@ -253,6 +253,21 @@ def cast_edge(rays, near, turn, eye, sun, shell, warp, body, painted, shadows, g
 
 
 @kernel
+def shade_mesh(points, normals, sun, shell, body, painted, shadows, shade):
+    """Radiance (n,) at points (n, 3) of a mesh, on the unbent shell; the centerbody alone shades it."""
+    for i in range(len(points)):
+        x, y, z = points[i]
+        nx, ny, nz = normals[i]
+        a, b, r = _half_plane(x, y, z, shell, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        lit = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 0.0)
+        if shadows and lit > 0.0:
+            lit *= _beside_body(x + OFF_SKIN_M * nx, y + OFF_SKIN_M * ny, z + OFF_SKIN_M * nz, sun, body)
+        crest = min(max(b / shell[5], 0.0), 1.0)
+        value = 0.15 + 0.62 * lit
+        shade[i] = value * _albedo(y, z, r, a, crest, shell) if painted else value
+
+
+@kernel
 def sunlit(points, sun, shell, warp, share):
     """Share (n,) of the Sun's disc that the tori leave free at points (n, 3) off them."""
     for i in range(len(points)):

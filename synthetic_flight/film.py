@@ -15,7 +15,11 @@ that passes a body at a distance ``c`` after a way ``k`` leaves ``1/2 + c / (0.0
 passes a torus ``c / (0.0093 k)``. What lies in shadow has the sky's light alone. The rows of a rolling shutter are
 exposed one after the other. Then come interlace and motion, vignetting, blur, sensor noise and compression.
 
-Assumed: one Sun, no light from the Earth or from one torus on another, no glare (the lens looks away from the Sun).
+A user's mesh of the shell is filled through the same lens at three by three samples a pixel (`flightmodel.rendering`);
+seams and dots are painted on it where the tori would have them.
+
+Assumed: one Sun, no light from the Earth or from one torus on another, no glare (the lens looks away from the Sun); a
+mesh casts no shadow.
 
 Lens and pointing as built are drawn once a flight (`as_built_camera`), and so is the shell's departure from its shape,
 as built and under load: an estimator starts from the nominal mount and the nominal shell. The film of a flight is
@@ -28,6 +32,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -38,10 +43,11 @@ from numpy.typing import NDArray
 from flightmodel import earth, rotations
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.checks import FloatArray, GateError, Progress, check_finite, check_shape
-from flightmodel.deflection import rotation_vector_body_shell
+from flightmodel.deflection import lv_clock, rotation_vector_body_shell
 from flightmodel.film import film_frames
 from flightmodel.geomagnetism_and_sun import sun_direction_ecef
-from flightmodel.geometry import ShellGeometry, torus_circles
+from flightmodel.geometry import BodyMesh, ShellGeometry, torus_circles
+from flightmodel.rendering import render
 from flightmodel.vehicle import CameraMount
 from synthetic_flight import _film_kernels, sensing
 from synthetic_flight.ensemble import available_cores
@@ -51,6 +57,7 @@ from synthetic_flight.simulate import Truth
 
 Float32 = NDArray[np.float32]
 
+_SAMPLES = 3  # of a mesh, along each side of a pixel
 FARTHEST_M, FARTHEST_RADII = 6.0, 4.0  # how far a ray marches: the larger of the two (m, base radii of the shell)
 EARTH_RADIUS_M = 6.371e6
 LIMB_GLOW_RAD = float(np.deg2rad(0.4))
@@ -143,6 +150,35 @@ class ShellRenderer:
         behind = self.sky if background is None else np.maximum(self.sky, self._earth(background))
         return np.asarray(np.where(self.is_clear, cover * shade + (1.0 - cover) * behind, body), dtype=np.float32)
 
+    @cached_property
+    def _fine(self) -> tuple[Camera, Float32]:
+        """The camera with samples for pixels, and their rays (h, w, 3)."""
+        camera, n = self.camera, _SAMPLES
+        fine = replace(
+            camera, width_px=n * camera.width_px, height_px=n * camera.height_px, focal_px=n * camera.focal_px,
+            centre_px=n * camera.centre_px + 0.5 * (n - 1),
+        )  # fmt: skip
+        v, u = np.indices((fine.height_px, fine.width_px), dtype=float)
+        rays = fine.rays_body(np.column_stack([u.ravel(), v.ravel()])).astype(np.float32)
+        return fine, rays.reshape(*u.shape, 3)
+
+    def _seen_mesh(self, mesh: BodyMesh, in_shell: _InShell, warp: Warp | None) -> tuple[FloatArray, FloatArray]:
+        """Share (h, w) of each pixel that a mesh of the shell covers, and its radiance, sampled finer than pixels."""
+        turn, eye, sun, shell, _, body = in_shell
+        (h, w), n, (fine, fine_rays) = self.sky.shape, _SAMPLES, self._fine
+        vertices = warped(mesh.vertices_m, warp, self.geometry)
+        picture = render(fine, (vertices - self.joint_m) @ turn + self.joint_m, mesh.faces)
+        v, u = np.nonzero(picture.is_hit)
+        rays = fine_rays[v, u] @ turn.T
+        normal = replace(mesh, vertices_m=vertices).normals_of(np.arange(len(mesh.faces)))[picture.face[v, u]]
+        normal *= np.where(np.einsum("ni,ni->n", normal, rays) > 0.0, -1.0, 1.0)[:, None]
+        points, shade = eye + picture.depth_m[v, u, None] * rays, np.empty(len(u))
+        _film_kernels.shade_mesh(points, normal, sun, shell, body, self.painted, self.shadows, shade)
+        at = (v // n) * w + u // n
+        count = np.bincount(at, minlength=h * w)
+        total = np.bincount(at, shade, minlength=h * w)
+        return (count / n**2).reshape(h, w), (total / np.maximum(count, 1)).reshape(h, w)
+
     def seen(
         self, theta_rad: float, plane_lv_rad: float, sun_direction_body: FloatArray, warp: Warp | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -154,6 +190,8 @@ class ShellRenderer:
         nose, aft = self.joint_m - turn @ self.joint_m, -turn[:, 0]
         body = (nose, np.ascontiguousarray(aft), geometry.centerbody_radius_m, geometry.centerbody_length_m)
         in_shell = (turn, eye, turn @ sun_body, self.shell, warp_terms(warp), body)
+        if geometry.mesh is not None:
+            return *self._seen_mesh(geometry.mesh, in_shell, warp), self._centerbody_shade(sun_body, in_shell)
         depth, shade = np.empty(self.sky.shape), np.empty(self.sky.shape)
         _film_kernels.cast(self.rays, self.is_clear, *in_shell, self.painted, self.shadows, depth, shade)
         return self._cover(in_shell, depth, shade), shade, self._centerbody_shade(sun_body, in_shell)
@@ -233,6 +271,25 @@ def shell_terms(geometry: ShellGeometry) -> tuple[float, ...]:
 def warp_terms(warp: Warp | None) -> tuple[float, ...]:
     """A departure from the nominal shape as the kernels take it."""
     return (*astuple(warp or Warp()), float(warp is not None))
+
+
+def warped(points_shell_m: FloatArray, warp: Warp | None, geometry: ShellGeometry) -> FloatArray:
+    """Points ``(n, 3)`` of the shell out of shape: turned about the innermost ring in their half-planes."""
+    if warp is None:
+        return points_shell_m
+    station, radius = (float(c[0]) for c in torus_circles(geometry))
+    r = np.maximum(np.hypot(*points_shell_m[:, 1:].T), 1e-3)
+    clock = lv_clock(points_shell_m[:, 1:])
+    turn = warp.flattening_rad + sum(
+        part * wave(k * clock)
+        for k, parts in ((2, (warp.cosine_2_rad, warp.sine_2_rad)), (3, (warp.cosine_3_rad, warp.sine_3_rad)))
+        for part, wave in zip(parts, (np.cos, np.sin), strict=True)
+    )
+    aft, out = -points_shell_m[:, 0] - station, r - radius
+    # the inverse of the casting's turn, which is to first order
+    aft, out = (aft + turn * out) / (1.0 + turn**2), (out - turn * aft) / (1.0 + turn**2)
+    scale = (radius + out) / r
+    return np.column_stack([-(station + aft), scale * points_shell_m[:, 1], scale * points_shell_m[:, 2]])
 
 
 def _unit(vector: FloatArray) -> FloatArray:

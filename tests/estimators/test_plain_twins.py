@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from estimators import _edge_kernels, _fit_kernels, _raster_kernels, _sight_kernels, _texture_kernels
+from estimators import _edge_kernels, _fit_kernels, _sight_kernels, _texture_kernels
 from estimators.edge import (
     EDGE_BASES,
     EDGE_HALF,
@@ -20,6 +20,7 @@ from estimators.edge import (
     steps_near,
 )
 from estimators.virtual_camera import VirtualCamera
+from flightmodel import _raster_kernels
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.deflection import lv_direction
 from tests.oracles import plain_horizon, plain_sight
@@ -93,12 +94,15 @@ def test_projection_and_all_its_derivatives_are_those_of_the_plain_one(lens):
 
 
 def test_edge_of_a_torus_is_where_sight_touches_it():
-    circle = (0.62, 1.3, 0.12)
-    eye = np.array([-1.4, 0.25, -0.1])
+    circles = np.array([[0.62, 1.3, 0.12], [0.60, 1.35, 0.10], [0.66, 1.28, 0.0]])
+    eye, ring, flat = np.array([-1.4, 0.25, -0.1]), (0.25, 0.3), 0.03
     clocks = np.deg2rad([10.0, 95.0, 250.0])
     points = np.empty((3, 3))
-    assert _sight_kernels.limb(circle, eye, clocks, points)
-    np.testing.assert_allclose(points, plain_sight.limb(circle, eye, clocks), atol=1e-6)
+    assert _sight_kernels.limb(circles, ring, flat, eye, clocks, points)
+    aft, out = circles[:, 0] - ring[0], circles[:, 1] - ring[1]
+    opened = np.column_stack([circles[:, 0] + flat * out, circles[:, 1] - flat * aft, circles[:, 2]])
+    one_by_one = [plain_sight.limb(circle, eye, clocks[k : k + 1])[0] for k, circle in enumerate(opened)]
+    np.testing.assert_allclose(points, one_by_one, atol=1e-6)
 
 
 def test_distance_from_an_edge_has_a_side_and_a_foot():

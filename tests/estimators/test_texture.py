@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from estimators.texture import surface_seen, texture_of
-from estimators.virtual_camera import VirtualCamera, deformation_of, render
+from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.geometry import vehicle_meshes
+from flightmodel.rendering import render
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D
 
 VIEW = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from estimators.virtual_camera import render
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.geometry import bend, vehicle_meshes
+from flightmodel.rendering import render
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D
 
 LENSES = {

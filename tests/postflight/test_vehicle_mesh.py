@@ -27,7 +27,7 @@ def test_a_mesh_goes_with_its_vehicle_and_is_checked_before_a_run(command, tmp_p
     assert done.returncode == 0, done.stderr
     found = json.loads(command("check", flight, "--json").stdout)
     assert found["exit_code"] == 0
-    assert [f["code"] for f in found["findings"] if "aeroshell" in f["source"]] == ["mesh-drawn"]
+    assert [f["code"] for f in found["findings"] if "aeroshell" in f["source"]] == ["mesh-fitted"]
     copy = flight / "vehicle" / "shell.stl"
     assert copy.read_bytes() == (tmp_path / "shell.stl").read_bytes()
     holed = trimesh.Trimesh(mesh.vertices, mesh.faces[1:], process=False)
