@@ -50,6 +50,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import chdtrc
 
+from estimators.deflection_spline import InputPosterior
 from estimators.evidence import (
     ACCELEROMETER,
     ATTITUDE,
@@ -62,7 +63,7 @@ from estimators.evidence import (
     Evidence,
     offset_sd_m,
 )
-from estimators.fusion import InputPosterior, means_over_spans, span_numbers
+from estimators.fusion import means_over_spans, span_numbers
 from estimators.loads import FlightLoads
 from flightmodel.checks import BoolArray, FloatArray
 

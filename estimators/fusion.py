@@ -35,18 +35,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, lstsq
-from scipy.linalg.lapack import dpotri
 from scipy.ndimage import uniform_filter1d
-from scipy.optimize import minimize_scalar
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, eye_array, kron
 
+from estimators.deflection_spline import (
+    FREE_RADPS2,
+    InputPosterior,
+    Inputs,
+    NormalEquations,
+    Rows,
+    Solution,
+    Spline,
+    block_diagonal,
+)
 from estimators.evidence import (
     LIGHT_TIME_S,
     Deflection,
@@ -61,12 +66,6 @@ from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory, history_from_
 from flightmodel.trajectory import nearest_index
 from flightmodel.vehicle import Vehicle
 
-KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its oscillation
-# a priori of the process's size, median and sd of its logarithm: a degree of swing at 2 Hz, between a degree at 0.5 Hz
-# and ten at 3 Hz
-SIZE_RADPS2, SIZE_LOG_SD = 3.0, 1.5
-_SIZES_RADPS2, FREE_RADPS2 = (1e-3, 1e3), 1e3  # within which it is looked for; ten degrees of swing at 12 Hz
-DEFLECTION_SD_RAD = 1.0  # of the deflection itself: no information
 # neglected by the methods' equations, second order in the angles and gusts shorter than the wind's knots: with true
 # inputs 0.01 to 0.02 deg rms over the pulses of thirty flights, decorrelated within half a second
 LEFT_OUT_RAD, LEFT_OUT_TIME_S = np.deg2rad(0.02), 0.4
@@ -81,207 +80,7 @@ _SMOOTH_RATE_HZ = 50.0
 _READINGS_A_SWING = 0.8
 _HOLE = 1.5  # of the readings' usual spacing: one is missing
 _LOCAL = 5  # readings about one, over which the swing's variance is taken
-Inputs = dict[str, FloatArray]
 Read = Callable[[Inputs, Deflection | None], list[Evidence]]
-
-
-@dataclass(frozen=True)
-class InputPosterior:
-    """Posterior of all inputs: ``mean`` (k,) and ``covariance`` (k, k) of their unit normals, ``place`` of each."""
-
-    mean: FloatArray
-    covariance: FloatArray
-    place: dict[str, slice]
-
-
-@dataclass(frozen=True)
-class Spline:
-    """Cubic B-spline with even knots."""
-
-    knots_s: FloatArray
-    count: int
-    _full: FloatArray
-
-    @classmethod
-    def over(cls, low: float, high: float) -> Spline:
-        """Spline whose knots reach from ``low`` to ``high``, s."""
-        inner = low + KNOT_S * np.arange(int(np.ceil((high - low) / KNOT_S)) + 1)
-        full = np.concatenate([inner[0] - KNOT_S * np.arange(3, 0, -1), inner, inner[-1] + KNOT_S * np.arange(1, 4)])
-        return cls(np.asarray(inner), len(full) - 4, np.asarray(full))
-
-    @cached_property
-    def stiffness(self) -> FloatArray:
-        """Matrix (2 count, 2 count) of the sum over the knots of both axes' squared second derivatives."""
-        curvature = self.rows(self.knots_s, 2)
-        return np.asarray(np.kron(curvature.T @ curvature, np.eye(2)), dtype=float)
-
-    def rows(self, time_s: FloatArray, derivative: int = 0) -> FloatArray:
-        """Values (n, count) of every basis function, or of its derivative."""
-        basis = BSpline(self._full, np.eye(self.count), 3)
-        at = np.clip(time_s, self.knots_s[0], self.knots_s[-1])
-        return np.asarray(basis(at, nu=derivative))
-
-
-@dataclass(frozen=True)
-class SplineDeflection:
-    """Lateral vectors (n, 2) over time, of a spline's coefficients (count, 2), rad."""
-
-    spline: Spline
-    coefficients: FloatArray
-
-    def __call__(self, time_s: FloatArray, derivative: int = 0) -> FloatArray:
-        """Vectors or their derivatives at times (n,)."""
-        return self.spline.rows(time_s, derivative) @ self.coefficients
-
-
-@dataclass(frozen=True)
-class NormalEquations:
-    """Normal equations of the deflection's spline and of the inputs' unit normals, without the process's prior.
-
-    Blocks: ``deflection`` (2 m, 2 m) of the spline's coefficients, y and z of each knot side by side, so that it is a
-    band; ``across`` (2 m, k); ``inputs`` (k, k), at ``place``. Right-hand sides (2 m,) and (k,).
-    """
-
-    spline: Spline
-    place: dict[str, slice]
-    deflection: FloatArray
-    across: FloatArray
-    inputs: FloatArray
-    right: FloatArray
-    right_inputs: FloatArray
-
-    @classmethod
-    def of(cls, readings: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> NormalEquations:
-        """Equations of the methods' readings at ``inputs``; the spline reaches over ``span_s``."""
-        spline, place = Spline.over(*span_s), places(e.by_input for e in readings)
-        return cls.of_rows(spline, place, (whitened(one, spline, place, inputs) for one in readings))
-
-    @classmethod
-    def of_rows(
-        cls, spline: Spline, place: dict[str, slice], parts: Iterable[tuple[FloatArray, FloatArray]]
-    ) -> NormalEquations:
-        """Equations of rows (r, unknowns) of the least-squares problem and their right-hand sides, of unit variance."""
-        size, total = 2 * spline.count, max((p.stop for p in place.values()), default=0)
-        normal, right = np.zeros((size + total,) * 2), np.zeros(size + total)
-        for rows, want in parts:
-            normal += rows.T @ rows
-            right += rows.T @ want
-        own = normal[size:, size:] + np.eye(total)
-        return cls(spline, place, normal[:size, :size], normal[:size, size:], own, right[:size], right[size:])
-
-    def solved(self, size_radps2: float, method: str) -> tuple[FloatArray, FloatArray]:
-        """Posterior mean and covariance of all unknowns, the process of a size."""
-        prior = self.spline.stiffness / size_radps2**2 + np.eye(len(self.right)) / DEFLECTION_SD_RAD**2
-        normal = np.block([[self.deflection + prior, self.across], [self.across.T, self.inputs]])
-        try:
-            factor = cho_factor(normal)[0]
-        except np.linalg.LinAlgError:
-            raise _undetermined(method) from None
-        right = np.concatenate([self.right, self.right_inputs])
-        return cho_solve((factor, False), right), _inverse_of_factor(factor)
-
-    def smoothed(self, inputs: InputPosterior, method: str) -> tuple[FloatArray, FloatArray, float]:
-        """Mean and covariance of all unknowns, of inputs found without the process, and the process's size."""
-        given = replace(self, right=self.right - self.across @ inputs.mean)
-        size_radps2 = given.process_size()
-        own = cho_solve_banded((self._factor(size_radps2, method), False), np.eye(len(self.right)))
-        by_input = -own @ self.across
-        across = by_input @ inputs.covariance
-        covariance = np.block([[own + across @ by_input.T, across], [across.T, inputs.covariance]])
-        return np.concatenate([own @ given.right, inputs.mean]), covariance, size_radps2
-
-    def of_inputs(self, size_radps2: float, method: str) -> tuple[FloatArray, FloatArray, Deflection]:
-        """Posterior mean and precision of the inputs, the deflection integrated over, and the deflection's mean."""
-        factor = self._factor(size_radps2, method)
-        gain = cho_solve_banded((factor, False), self.across)
-        precision = self.inputs - self.across.T @ gain
-        try:
-            mean = cho_solve(cho_factor(precision), self.right_inputs - gain.T @ self.right)
-        except np.linalg.LinAlgError:
-            raise _undetermined(method) from None
-        return mean, precision, self.history(cho_solve_banded((factor, False), self.right - self.across @ mean))
-
-    def without_inputs(self) -> NormalEquations:
-        """Equations of the deflection alone, the inputs being anything that their priors allow."""
-        gain = cho_solve(cho_factor(self.inputs), self.across.T).T
-        return replace(
-            self, deflection=self.deflection - gain @ self.across.T, right=self.right - gain @ self.right_inputs
-        )
-
-    def process_size(self) -> float:
-        """Most probable size of the process, rad/s^2, of the deflection's block alone."""
-
-        def surprise(log_size: float) -> float:
-            size = float(np.exp(log_size))
-            factor = self._factor(size, "")
-            prior = 0.5 * ((log_size - np.log(SIZE_RADPS2)) / SIZE_LOG_SD) ** 2
-            # a determinant is the square of the product of its Cholesky factor's diagonal, the last row of the band
-            volume = np.log(factor[-1]).sum() - np.log(cholesky_banded(self._prior_band(size))[-1]).sum()
-            return float(prior + volume - 0.5 * self.right @ cho_solve_banded((factor, False), self.right))
-
-        found = minimize_scalar(surprise, bounds=np.log(_SIZES_RADPS2), method="bounded", options={"xatol": 0.05})
-        return float(np.exp(found.x))
-
-    def mean(self, size_radps2: float, method: str) -> FloatArray:
-        """Posterior mean of the deflection's coefficients alone."""
-        return np.asarray(cho_solve_banded((self._factor(size_radps2, method), False), self.right))
-
-    @cached_property
-    def _bands(self) -> tuple[FloatArray, FloatArray]:
-        """Upper bands of the deflection's block and of the spline's stiffness; the first is the wider, if they differ.
-
-        Without the inputs the first is a whole triangle, where the process's determinant need not be one.
-        """
-        stiffness = self.spline.stiffness
-        narrow = _width(stiffness)
-        return _upper_band(self.deflection, max(_width(self.deflection), narrow)), _upper_band(stiffness, narrow)
-
-    def _prior_band(self, size_radps2: float) -> FloatArray:
-        """Upper band of the process's precision."""
-        out = self._bands[1] / size_radps2**2
-        out[-1] += 1.0 / DEFLECTION_SD_RAD**2
-        return out
-
-    def _factor(self, size_radps2: float, method: str) -> FloatArray:
-        """Cholesky factor of the deflection's block with the process's prior, an upper band."""
-        band, prior = self._bands[0].copy(), self._prior_band(size_radps2)
-        band[-len(prior) :] += prior
-        try:
-            return np.asarray(cholesky_banded(band))
-        except np.linalg.LinAlgError:
-            raise _undetermined(method) from None
-
-    def history(self, found: FloatArray) -> Deflection:
-        """Lateral vectors (n, 2) of a solution, from times."""
-        return SplineDeflection(self.spline, found[: 2 * self.spline.count].reshape(-1, 2))
-
-
-def _inverse_of_factor(factor: FloatArray) -> FloatArray:
-    """Inverse of the matrix whose upper Cholesky factor is given."""
-    upper = np.triu(dpotri(factor)[0])
-    return np.asarray(upper + np.triu(upper, 1).T)
-
-
-def inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a positive definite matrix."""
-    return _inverse_of_factor(cho_factor(matrix)[0])
-
-
-def _undetermined(method: str) -> DivergenceError:
-    return DivergenceError(f"{method}: the readings do not determine the deflection", code="deflection-undetermined")
-
-
-def _width(matrix: FloatArray) -> int:
-    """Number of diagonals above the main one, up to the last that is not zero."""
-    return int(np.max(np.subtract(*np.nonzero(matrix)), initial=0))
-
-
-def _upper_band(matrix: FloatArray, width: int) -> FloatArray:
-    """Symmetric matrix (n, n) as the rows of its upper band, the diagonal last."""
-    out = np.zeros((width + 1, len(matrix)))
-    for k in range(width + 1):
-        out[width - k, k:] = np.diagonal(matrix, k)
-    return out
 
 
 def places(of: Iterable[dict[str, FloatArray]]) -> dict[str, slice]:
@@ -295,33 +94,33 @@ def places(of: Iterable[dict[str, FloatArray]]) -> dict[str, slice]:
     return out
 
 
-def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inputs) -> tuple[FloatArray, FloatArray]:
-    """Rows ``(2 n, unknowns)`` of the least-squares problem and their right-hand side, errors of unit variance.
+def equations_of(readings: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> NormalEquations:
+    """Equations of the methods' readings at ``inputs``; the spline reaches over ``span_s``."""
+    spline, place = Spline.over(*span_s), places(e.by_input for e in readings)
+    return NormalEquations.of_rows(spline, place, (whitened(one, spline, place, inputs) for one in readings))
 
-    Unknowns are in the order of `NormalEquations`.
-    """
+
+def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inputs) -> Rows:
+    """Rows of the least-squares problem of a method's readings, two of each."""
     keep = np.isfinite(one.theta_yz_rad).all(axis=1)
-    n, m = int(keep.sum()), spline.count
-    value, first, second = (spline.rows(one.time_s[keep], order) for order in range(3))
-    by_rate, by_acceleration = one.by_rate_s[keep], one.by_acceleration_s2[keep]
-    rows = np.zeros((n, 2, 2 * m + max((p.stop for p in place.values()), default=0)))
-    for axis in range(2):
-        for other in range(2):
-            moving = by_rate[:, axis, other, None] * first + by_acceleration[:, axis, other, None] * second
-            rows[:, axis, other : 2 * m : 2] = moving
-        rows[:, axis, axis : 2 * m : 2] += value
+    n, by_lateral = int(keep.sum()), np.broadcast_to(np.eye(2), one.by_rate_s[keep].shape)
+    by_deflection = spline.responses(one.time_s[keep], (by_lateral, one.by_rate_s[keep], one.by_acceleration_s2[keep]))
+    by_input = np.zeros((n, 2, max((p.stop for p in place.values()), default=0)))
     want = one.theta_yz_rad[keep].copy()
     for name, every in one.by_input.items():
         response = every[keep]
-        rows[:, :, 2 * m + place[name].start : 2 * m + place[name].stop] = -response
+        by_input[:, :, place[name]] = -response
         if name in inputs:
             want -= response @ inputs[name]
-    share = means_over_spans(one.time_s[keep], one.averaged_s, one.time_s[keep][0])
-    rows = (csr_array(share) @ rows.reshape(n, -1)).reshape(len(share), 2, -1)
-    cov = np.einsum("bn,nij->bij", share**2, one.independent_cov[keep])
+    share = shares_of_spans(one.time_s[keep], one.averaged_s, one.time_s[keep][0])
+    cov = (share.power(2) @ one.independent_cov[keep].reshape(n, 4)).reshape(-1, 2, 2)
     cov += LEFT_OUT_RAD**2 * LEFT_OUT_TIME_S / one.averaged_s * np.eye(2)
-    whiten = np.linalg.inv(np.linalg.cholesky(cov))
-    return (whiten @ rows).reshape(2 * len(share), -1), (whiten @ (share @ want)[:, :, None]).ravel()
+    whiten = block_diagonal(np.linalg.inv(np.linalg.cholesky(cov)))
+    return Rows(
+        whiten @ (csr_array(kron(share, eye_array(2))) @ by_deflection),
+        whiten @ (share @ by_input.reshape(n, -1)).reshape(whiten.shape[0], -1),
+        whiten @ (share @ want).ravel(),
+    )
 
 
 def span_numbers(time_s: FloatArray, width_s: float, from_s: float) -> NDArray[np.int64]:
@@ -329,12 +128,16 @@ def span_numbers(time_s: FloatArray, width_s: float, from_s: float) -> NDArray[n
     return np.asarray(np.floor((time_s - from_s) / width_s + 1e-6).astype(np.int64))
 
 
-def means_over_spans(time_s: FloatArray, width_s: float, from_s: float) -> FloatArray:
+def shares_of_spans(time_s: FloatArray, width_s: float, from_s: float) -> csr_array:
     """Weights (bins, n) of the means over spans of time, one of which begins at ``from_s``; empty ones are left out."""
     _, which, count = np.unique(span_numbers(time_s, width_s, from_s), return_inverse=True, return_counts=True)
-    out = np.zeros((len(count), len(time_s)))
-    out[which, np.arange(len(time_s))] = 1.0 / count[which]
-    return out
+    place = (which, np.arange(len(time_s)))
+    return csr_array((1.0 / count[which], place), (len(count), len(time_s)))
+
+
+def means_over_spans(time_s: FloatArray, width_s: float, from_s: float) -> FloatArray:
+    """Weights of `shares_of_spans` as a full matrix (bins, n)."""
+    return np.asarray(shares_of_spans(time_s, width_s, from_s).toarray())
 
 
 class Method(Protocol):
@@ -429,38 +232,40 @@ def fuse(
     inputs: Inputs = _initial_time_bias(readings, method)
     span = span_of(readings)
     alone = [_uncorrelated(moved_evidence(e, inputs)) for e in readings]
-    problem = NormalEquations.of(alone, {}, span)
+    problem = equations_of(alone, {}, span)
     found, size_radps2 = problem.mean(problem.process_size(), method), FREE_RADPS2
+    about = problem.history(found)
     for step in range(MOST_STEPS):
-        readings = [e for e in read(inputs, problem.history(found)) if e.method in methods]
+        readings = [e for e in read(inputs, about) if e.method in methods]
         if min(np.isfinite(e.theta_yz_rad).all(axis=1).sum() for e in readings) < LEAST_SAMPLES:
             raise DivergenceError(
                 f"{method}: the steps lead to deflections at which no method has an answer; see each method's own",
                 code="fusion-not-converged",
             )
-        problem, before = NormalEquations.of(readings, inputs, span), found
+        problem, before = equations_of(readings, inputs, span), found
         if not free_process and step < _WHOLE_STEPS:  # then held: its own small changes would go on moving the inputs
             size_radps2 = problem.without_inputs().process_size()
-        found, covariance = problem.solved(size_radps2, method)
-        size = 2 * problem.spline.count
+        answer = problem.solved(size_radps2, method)
+        found, sd, size = answer.mean, answer.sd, 2 * problem.spline.count
         new = {name: found[size:][place] for name, place in problem.place.items()}
-        sd = np.sqrt(np.diag(covariance))
         moved = float((np.abs(found[:size] - before[:size]) / sd[:size]).max())
         for name in {e.time_bias for e in readings} & new.keys():
             bias = np.abs(new[name] - inputs.get(name, 0.0)) / sd[size:][problem.place[name]]
             moved = max(moved, float(bias.max()))
+        input_posterior = InputPosterior(found[size:], answer.inputs, problem.place)
         if moved < SETTLED_SD and step > 0:
-            input_posterior = InputPosterior(found[size:], covariance[size:, size:], problem.place)
             if free_process:
                 _check_inputs(new, input_posterior, method)
             times = max(readings, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
             times = times[_apart_from_readings(times, readings) <= near_s]
-            answer = (found, covariance, size_radps2)
             if free_process:
-                answer = problem.smoothed(input_posterior, method)
-            return _posterior(answer, problem, input_posterior, readings, method, times)
-        # whole Gauss-Newton steps first, then half steps, which cannot oscillate
-        part = 1.0 if step < _WHOLE_STEPS else 0.5
+                answer, size_radps2 = problem.smoothed(input_posterior, method)
+            return _posterior(answer, size_radps2, problem, input_posterior, readings, method, times)
+        # whole Gauss-Newton steps first, then half steps, which cannot oscillate, about the smooth deflection: at the
+        # ends of a long pulse the free one is off by ten degrees, where the methods are not linear, anew at each step
+        part, about = 1.0 if step < _WHOLE_STEPS else 0.5, problem.history(found)
+        if free_process and step >= _WHOLE_STEPS:
+            about = problem.history(problem.smoothed(input_posterior, method)[0].mean)
         inputs = {name: part * x + (1.0 - part) * inputs.get(name, 0.0 * x) for name, x in new.items()}
     raise DivergenceError(
         f"{method}: the deflection did not converge: after {MOST_STEPS} steps it still moves by {moved:.2g} sd, where "
@@ -559,16 +364,16 @@ def time_bias_is_observable(read: Read) -> bool:
         return False
     span = span_of(own)
     # a constant error does not move
-    problem = NormalEquations.of([replace(e, by_input={}) for e in own], {}, span)
+    problem = equations_of([replace(e, by_input={}) for e in own], {}, span)
     try:
-        found, covariance = problem.solved(problem.process_size(), "camera time bias")
+        answer = problem.solved(problem.process_size(), "camera time bias")
     except DivergenceError:
         return False
     time_s = np.concatenate([e.time_s for e in off])
     rows = problem.spline.rows(time_s[(time_s > span[0]) & (time_s < span[1])], 1)
     axes = slice(0, None, 2), slice(1, None, 2)
-    square = sum(float(np.sum((rows @ found[axis]) ** 2)) for axis in axes)
-    variance = sum(float(np.sum((rows @ covariance[axis, axis]) * rows)) for axis in axes)
+    square = sum(float(np.sum((rows @ answer.mean[axis]) ** 2)) for axis in axes)
+    variance = sum(float((rows @ answer.own[axis, axis]).multiply(rows).sum()) for axis in axes)
     return square > MOVES**2 * variance
 
 
@@ -582,7 +387,7 @@ def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
     if not off or not own:
         return {}
     span = span_of(own)
-    problem = NormalEquations.of([_uncorrelated(e) for e in own], {}, span)
+    problem = equations_of([_uncorrelated(e) for e in own], {}, span)
     deflection = problem.history(problem.mean(problem.process_size(), method))
     starts = {one.time_bias: _lowest_bias_sd(one, deflection, span) for one in off}
     return {name: np.array([bias_sd]) for name, bias_sd in starts.items() if bias_sd is not None}
@@ -644,9 +449,8 @@ def loads_reader(loads: FlightLoads, methods: dict[str, Method], others: list[Ev
 def _smoothed_loads(loads: FlightLoads) -> FlightLoads:
     """Loads with force, rate and angular acceleration smoothed to a spline with knots `KNOT_S` apart."""
     t = loads.time_s
-    value = Spline.over(float(t[0]), float(t[-1])).rows(t)
     as_read = [loads.specific_force_body_mps2, loads.rate_body_radps, loads.angular_acceleration_body_radps2]
-    smooth = value @ lstsq(value, np.hstack(as_read), lapack_driver="gelsy")[0]
+    smooth = Spline.over(float(t[0]), float(t[-1])).smooth(t, np.hstack(as_read))
     force, rate, turn = map(np.ascontiguousarray, np.hsplit(smooth, 3))
     return replace(loads, specific_force_body_mps2=force, rate_body_radps=rate, angular_acceleration_body_radps2=turn)
 
@@ -670,30 +474,26 @@ def _apart_from_readings(time_s: FloatArray, readings: list[Evidence]) -> FloatA
 
 
 def _posterior(
-    answer: tuple[FloatArray, FloatArray, float],
+    answer: Solution,
+    size_radps2: float,
     problem: NormalEquations,
     input_posterior: InputPosterior,
     readings: list[Evidence],
     method: str,
     t: FloatArray,
 ) -> Fused:
-    found, covariance, size_radps2 = answer
-    spline = problem.spline
+    spline, found = problem.spline, answer.mean
     size = 2 * spline.count
     value = spline.rows(t)
-    theta_yz = problem.history(found)(t)
-    cov = np.zeros((len(t), 2, 2))
-    for i in range(2):
-        for j in range(2):
-            cov[:, i, j] = np.sum((value @ covariance[i:size:2, j:size:2]) * value, axis=1)
+    theta_yz, cov = problem.history(found)(t), answer.lateral_cov(value)
     remark = f"from {', '.join(e.method for e in readings)} with their shared errors; joint as a second-order process"
     history = history_from_lateral(t, theta_yz, cov, method, remark)
     best = int(np.argmin(np.trace(cov, axis1=1, axis2=2)))
     pick = np.zeros((2 + len(problem.place), len(found)))
-    pick[0, 0:size:2], pick[1, 1:size:2] = value[best], value[best]
+    pick[0, 0:size:2] = pick[1, 1:size:2] = value[[best]].toarray()[0]
     for k, place in enumerate(problem.place.values()):
         pick[2 + k, size + place.start] = 1.0
-    joint = pick @ covariance @ pick.T
+    joint = answer.covariance_of(pick)
     sd = np.sqrt(np.diag(joint))
     names = ("deflection y", "deflection z", *problem.place)
     correlation = joint / np.outer(sd, sd)

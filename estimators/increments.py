@@ -38,23 +38,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.sparse import csr_array, diags_array
 
 from estimators.balance import Swing, axial_residual
+from estimators.deflection_spline import FREE_RADPS2, InputPosterior, Inputs, NormalEquations, Rows, Spline, inverse
 from estimators.evidence import Deflection, Evidence, corrected_loads, input_responses, swing_responses
-from estimators.fusion import (
-    FREE_RADPS2,
-    Fused,
-    InputPosterior,
-    Inputs,
-    LoadsReader,
-    NormalEquations,
-    Spline,
-    inverse,
-    means_over_spans,
-    places,
-    span_of,
-    whitened,
-)
+from estimators.fusion import Fused, LoadsReader, places, shares_of_spans, span_of, whitened
 from estimators.loads import FlightLoads
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.atmosphere import DENSITY_LENGTH_M, unresolved_variance
@@ -312,7 +301,7 @@ class _AxialReading:
 
     Parameters
     ----------
-    by_deflection : (n, 2 m) float
+    by_deflection : (n, 2 m) float, sparse
         Per coefficient of the deflection's spline.
     by_input : dict of str to (n, 1, k) float
     want : (n,) float
@@ -321,7 +310,7 @@ class _AxialReading:
         Variance of a sample's own error; power density, s, of what the knots of the density's error leave out.
     """
 
-    by_deflection: FloatArray
+    by_deflection: csr_array
     by_input: Inputs
     want: FloatArray
     independent_var: FloatArray
@@ -339,32 +328,29 @@ def _axial_reading(reader: LoadsReader, about: Deflection, others: Inputs, splin
 
     by_input, noise = input_responses(left, at, base, -np.ones((len(base), 1, 1)))
     raw, even = (axial_residual(pulse.vehicle, swing, one) for one in (pulse, reader.smooth))
-    rows, want = np.zeros((len(base), 2 * spline.count)), -(base + raw - even)[:, 0]
-    for order, response in enumerate(swing_responses(lambda moved: left(moved=moved), swing, base)):
-        basis = spline.rows(pulse.time_s, order)
-        for axis in range(2):
-            rows[:, axis::2] += response[:, 0, axis, None] * basis
-            want += response[:, 0, axis] * swing.orders[order, :, axis]
+    by_order = list(swing_responses(lambda moved: left(moved=moved), swing, base))
+    want = -(base + raw - even)[:, 0]
+    for response, order in zip(by_order, swing.orders, strict=True):
+        want += np.sum(response[:, 0] * order, axis=1)
     spacing_m = DENSITY_LENGTH_M / KNOTS_A_LENGTH
     part = pulse.dynamic_pressure_sd_pa / pulse.dynamic_pressure_pa
     crossing_s = spacing_m / np.maximum(np.abs(np.gradient(pulse.altitude_m, pulse.time_s)), _LEAST_FALL_MPS)
     left_out = part**2 * unresolved_variance(spacing_m, DENSITY_LENGTH_M) * crossing_s
-    return _AxialReading(rows, by_input, want, noise[:, 0, 0], left_out)
+    by_deflection = spline.responses(pulse.time_s, by_order)
+    return _AxialReading(by_deflection, by_input, want, noise[:, 0, 0], left_out)
 
 
 def _axial_rows(
     axial: _AxialReading, by_input: Inputs, place: dict[str, slice], inputs: Inputs, pulse: FlightLoads
-) -> tuple[FloatArray, FloatArray]:
-    """Rows of the least-squares problem and their right-hand side, errors of unit variance, as `whitened`."""
-    size, want = axial.by_deflection.shape[1], axial.want.copy()
-    rows = np.zeros((len(want), size + max(p.stop for p in place.values())))
-    rows[:, :size] = axial.by_deflection
+) -> Rows:
+    """Rows of the least-squares problem, as `whitened`."""
+    want, rows = axial.want.copy(), np.zeros((len(axial.want), max(p.stop for p in place.values())))
     for name, response in by_input.items():
-        rows[:, size + place[name].start : size + place[name].stop] = response[:, 0]
+        rows[:, place[name]] = response[:, 0]
         if name in inputs:
             want += response[:, 0] @ inputs[name]
     keep = np.isfinite(want)  # of a force that points forward there is no logarithm
-    share = means_over_spans(pulse.time_s[keep], _AVERAGED_S, pulse.time_s[0])
-    var = share**2 @ axial.independent_var[keep] + share @ axial.density_density[keep] / _AVERAGED_S
-    whiten = 1.0 / np.sqrt(var)
-    return whiten[:, None] * (share @ rows[keep]), whiten * (share @ want[keep])
+    share = shares_of_spans(pulse.time_s[keep], _AVERAGED_S, pulse.time_s[0])
+    var = share.power(2) @ axial.independent_var[keep] + share @ axial.density_density[keep] / _AVERAGED_S
+    averaged = diags_array(1.0 / np.sqrt(var)) @ share
+    return Rows(averaged @ axial.by_deflection[np.flatnonzero(keep)], averaged @ rows[keep], averaged @ want[keep])

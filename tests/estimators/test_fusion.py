@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 from estimators import fusion
 from estimators.agreement import COEFFICIENTS, FAULT_MOUNT_RAD, MOUNT, OFFSET, agreement, fault_gain, fault_hypotheses
+from estimators.deflection_spline import SIZE_LOG_SD, SIZE_RADPS2, InputPosterior, Spline
 from estimators.evidence import (
     ACCELEROMETER,
     ACCELEROMETER_TIME_BIAS,
@@ -21,7 +22,7 @@ from estimators.evidence import (
     moved_vehicle,
     offset_sd_m,
 )
-from estimators.fusion import FarInputsError, InputPosterior, fuse, loads_reader
+from estimators.fusion import FarInputsError, fuse, loads_reader
 from estimators.misalignment import misalignment_evidence
 from estimators.trim import trim_evidence
 from flightmodel.checks import DivergenceError
@@ -59,16 +60,21 @@ def linear_reader(readings):
     return lambda inputs, _about: [moved_evidence(e, inputs) for e in readings]
 
 
+def whole(rows):
+    """Rows of the least-squares problem as one full matrix, and their right-hand side."""
+    return np.hstack([rows.by_deflection.toarray(), rows.by_input]), rows.want
+
+
 def test_posterior_is_that_of_the_joint_gaussian():
     """The same problem by the covariance form: condition prior on readings, no normal equations."""
     rng = np.random.default_rng(0)
     readings = [linear_evidence(rng, "a", ("p", "q")), linear_evidence(rng, "b", ("q", "r"))]
     readings = [replace(e, theta_yz_rad=motion() + 1e-3 * rng.normal(size=(N, 2))) for e in readings]
     got = fuse(linear_reader(readings))
-    spline = fusion.Spline.over(TIME_S[0], TIME_S[-1])
-    curvature = spline.rows(spline.knots_s, 2)
+    spline = Spline.over(TIME_S[0], TIME_S[-1])
+    curvature = spline.rows(spline.knots_s, 2).toarray()
     place = {"p": slice(0, 1), "q": slice(1, 2), "r": slice(2, 3)}
-    rows, want = zip(*(fusion.whitened(e, spline, place, {}) for e in readings), strict=True)
+    rows, want = zip(*(whole(fusion.whitened(e, spline, place, {})) for e in readings), strict=True)
     rows, want = np.concatenate(rows), np.concatenate(want)
     size = 2 * spline.count
 
@@ -88,7 +94,7 @@ def test_posterior_is_that_of_the_joint_gaussian():
     # the deflection, given these, with the process of the flight's own size; their covariance comes on top
     x, x_cov = mean[size:], after[size:, size:]
     given, own = posterior(got.process_size_radps2, np.zeros((3, 3)), x)
-    value = spline.rows(got.history.time_s)
+    value = spline.rows(got.history.time_s).toarray()
     lateral = np.stack([value @ given[axis:size:2] for axis in (0, 1)], axis=-1)
     np.testing.assert_allclose(got.history.theta_yz_rad, lateral, atol=1e-7)
     steps = [(posterior(got.process_size_radps2, np.zeros((3, 3)), x + e)[0] - given)[0:size:2] for e in np.eye(3)]
@@ -102,14 +108,14 @@ def test_the_size_of_the_process_is_the_most_probable_one():
     """The evidence by the readings' whole covariance, for a few sizes: no normal equations, no band."""
     rng = np.random.default_rng(21)
     one = replace(linear_evidence(rng, "a", ()), theta_yz_rad=motion() + 1e-3 * rng.normal(size=(N, 2)))
-    spline = fusion.Spline.over(TIME_S[0], TIME_S[-1])
-    curvature = spline.rows(spline.knots_s, 2)
-    rows, want = fusion.whitened(one, spline, {}, {})
+    spline = Spline.over(TIME_S[0], TIME_S[-1])
+    curvature = spline.rows(spline.knots_s, 2).toarray()
+    rows, want = whole(fusion.whitened(one, spline, {}, {}))
 
     def surprise(size):
         prior = np.kron(np.linalg.inv((curvature.T @ curvature) / size**2 + np.eye(spline.count)), np.eye(2))
         cov = rows @ prior @ rows.T + np.eye(len(want))
-        a_priori = 0.5 * (np.log(size / fusion.SIZE_RADPS2) / fusion.SIZE_LOG_SD) ** 2
+        a_priori = 0.5 * (np.log(size / SIZE_RADPS2) / SIZE_LOG_SD) ** 2
         return a_priori + 0.5 * want @ np.linalg.solve(cov, want) + 0.5 * np.linalg.slogdet(cov)[1]
 
     found = fuse(linear_reader([one])).process_size_radps2
@@ -164,6 +170,24 @@ def test_ideal_data_give_the_deflection_back():
     inner = (got.history.time_s > TIME_S[8]) & (got.history.time_s < TIME_S[-9])
     np.testing.assert_allclose(got.history.theta_yz_rad[inner], truth[at][inner], atol=np.deg2rad(0.1))
     assert agreement(loads_reader(loads, METHODS, [])({}, got.deflection)).hypotheses == ()
+
+
+def test_noise_at_the_ends_does_not_keep_it_from_settling():
+    """A method is not linear in the twenty degrees that the free process makes of noise there."""
+    rng = np.random.default_rng(22)
+    at_end = np.minimum(np.arange(N), N - 1 - np.arange(N)) < 6
+    sd = np.where(at_end, 0.3, 1e-3)
+    seen = motion() + sd[:, None] * rng.normal(size=(N, 2))
+    cov = sd[:, None, None] ** 2 * np.eye(2)
+
+    def read(_inputs, about):
+        curved = 0.0 if about is None else 0.5 * np.tanh((about(TIME_S) / 0.25) ** 5)
+        return [Evidence("a", TIME_S, seen - curved, STILL, STILL, {}, cov, 0.1)]
+
+    got = fuse(read)
+    inner = np.abs(got.history.time_s - 434.0) < 3.0
+    at = np.searchsorted(TIME_S, got.history.time_s[inner])
+    np.testing.assert_allclose(got.history.theta_yz_rad[inner], motion()[at], atol=2e-3)
 
 
 def test_a_camera_off_by_a_sd_is_found_out():

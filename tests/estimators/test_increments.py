@@ -6,15 +6,18 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from scipy.sparse import csr_array
 
 from estimators import increments
-from estimators.fusion import FREE_RADPS2, NormalEquations, fuse, inverse, loads_reader
+from estimators.deflection_spline import DEFLECTION_SD_RAD, FREE_RADPS2, inverse
+from estimators.fusion import equations_of, fuse, loads_reader
 from estimators.increments import COEFFICIENTS, SHAPE_LENGTH, STATED, Processes, estimate_increments
 from flightmodel.atmosphere import standard_atmosphere
 from synthetic_flight.simulate import fly
 
 from .conftest import VEHICLE
 from .test_closure import EPOCH, START_S, pulse_of_truth, start
+from .test_deflection_spline import unbanded
 from .test_fusion import METHODS, TIME_S, N, linear_evidence, motion
 
 MACH = np.linspace(1.5, 3.4, 40)
@@ -64,13 +67,23 @@ def test_the_flown_table_has_the_increments_at_all_angles():
 def test_inputs_with_the_deflection_integrated_over_are_those_of_the_whole_problem():
     rng = np.random.default_rng(5)
     one = replace(linear_evidence(rng, "a", ("p", "q")), theta_yz_rad=motion() + 1e-3 * rng.normal(size=(N, 2)))
-    normal = NormalEquations.of([one], {}, (TIME_S[0], TIME_S[-1]))
+    normal = equations_of([one], {}, (TIME_S[0], TIME_S[-1]))
     size = 2 * normal.spline.count
-    mean, covariance = normal.solved(FREE_RADPS2, "whole")
+    matrix = np.block([[unbanded(normal.deflection), normal.across], [normal.across.T, normal.inputs]])
+    stiffness = normal.spline.stiffness.toarray()
+    matrix[:size, :size] += stiffness / FREE_RADPS2**2 + np.eye(size) / DEFLECTION_SD_RAD**2
+    covariance = np.linalg.inv(matrix)
+    mean = covariance @ np.concatenate([normal.right, normal.right_inputs])
     own, precision, deflection = normal.of_inputs(FREE_RADPS2, "inputs")
-    np.testing.assert_allclose(own, mean[size:], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(inverse(precision), covariance[size:, size:], rtol=1e-6)
-    np.testing.assert_allclose(deflection(TIME_S), normal.history(mean)(TIME_S), atol=1e-9)
+    np.testing.assert_allclose(own, mean[size:], rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(inverse(precision), covariance[size:, size:], rtol=1e-5)
+    np.testing.assert_allclose(deflection(TIME_S), normal.history(mean)(TIME_S), atol=1e-7)
+    found = normal.solved(FREE_RADPS2, "whole")
+    np.testing.assert_allclose(found.sd, np.sqrt(np.diag(covariance)), rtol=1e-5)
+    value = normal.spline.rows(TIME_S[::7]).toarray()
+    lateral = value @ covariance[:size:2, 1:size:2] @ value.T
+    got = found.lateral_cov(normal.spline.rows(TIME_S[::7]))
+    np.testing.assert_allclose(got[:, 0, 1], np.diag(lateral), rtol=1e-4, atol=1e-14)
 
 
 @cache
@@ -160,10 +173,10 @@ def test_a_sample_whose_force_points_forward_says_nothing_along_the_axis():
     n = len(pulse.time_s)
     want, response = np.ones(n), np.ones((n, 1, 1))
     want[100], response[100] = np.nan, np.nan
-    one = increments._AxialReading(np.zeros((n, 2)), {"C_A": response}, want, np.ones(n), np.zeros(n))
-    rows, right = increments._axial_rows(one, one.by_input, {"C_A": slice(0, 1)}, {}, pulse)
-    np.testing.assert_allclose(rows[:, 2], right)  # both over the same sd
-    counts = np.round(right**2).astype(int)  # the sum of so many samples of unit variance
+    one = increments._AxialReading(csr_array((n, 2)), {"C_A": response}, want, np.ones(n), np.zeros(n))
+    rows = increments._axial_rows(one, one.by_input, {"C_A": slice(0, 1)}, {}, pulse)
+    np.testing.assert_allclose(rows.by_input[:, 0], rows.want)  # both over the same sd
+    counts = np.round(rows.want**2).astype(int)  # the sum of so many samples of unit variance
     assert counts.sum() == n - 1
 
 

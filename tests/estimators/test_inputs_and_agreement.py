@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.agreement import SPAN_S, WIDER, agreement
+from estimators.deflection_spline import InputPosterior
 from estimators.evidence import (
     ACCELEROMETER,
     CAMERA_TIME_BIAS,
@@ -20,7 +21,7 @@ from estimators.evidence import (
     moved_evidence,
     moved_vehicle,
 )
-from estimators.fusion import LEFT_OUT_RAD, LEFT_OUT_TIME_S, InputPosterior, fuse
+from estimators.fusion import LEFT_OUT_RAD, LEFT_OUT_TIME_S, fuse
 from estimators.misalignment import misalignment_evidence
 from estimators.southwell import LEFT_OUT, southwell_limbs
 from estimators.trim import SLOPE_AT_RAD, estimate_trim, static_trim, trim_curvature, trim_evidence
