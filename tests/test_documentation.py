@@ -1,14 +1,16 @@
-"""The pages of scenario, vehicle and flight files name every key that these files may hold, with their defaults."""
+"""Pages name every key of scenarios, sidecars, dispersions; forms the others (tests/postflight/test_init.py)."""
 
+import ast
+import importlib.util
 import re
-import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import click
 import pytest
 from pydantic import BaseModel
 
-from flightmodel import aerodynamics, flightfolder, geometry, instruments, tables, vehicle
+from flightmodel import aerodynamics, tables
 from postflight.cli import cli
 from postflight.montecarlo import study
 from synthetic_flight import dispersions, ensemble, instrument_errors, scenarios, weather
@@ -35,20 +37,7 @@ MODELS = [
     weather.Turbulence,
     weather.DiscreteGust,
     weather.RangeSounding,
-    vehicle.Reference,
-    vehicle.CompliantJoint,
-    vehicle.MassProperties,
-    geometry.ShellGeometry,
-    vehicle.Uncertainty,
-    vehicle.SensorMount,
-    vehicle.CameraMount,
-    geometry.MeshFiles,
-    geometry.MeshFile,
-    aerodynamics.Aerodynamics,
-    aerodynamics.SphereCone,
-    aerodynamics.FreeMolecular,
     aerodynamics.Sidecar,
-    aerodynamics.TableUncertainty,
 ]
 
 
@@ -63,19 +52,6 @@ DISPERSION_SECTIONS = [
     dispersions.AeroDispersions,
     dispersions.JointDispersions,
     dispersions.AirDispersions,
-]
-
-
-FLIGHT_SECTIONS = [
-    flightfolder.FlightFile,
-    flightfolder.AttitudeEntry,
-    flightfolder.MotionEntry,
-    instruments.Mounted,
-    instruments.MagnetometerEntry,
-    instruments.GnssEntry,
-    instruments.BarometerEntry,
-    tables.TimeEntry,
-    tables.Source,
 ]
 
 
@@ -111,31 +87,10 @@ def test_shipped_dispersions_are_read(name: str):
     assert len(study.read_study(name).spec.factors()) > 20
 
 
-@pytest.mark.parametrize("model", FLIGHT_SECTIONS, ids=lambda m: m.__name__)
-def test_every_key_of_flight_toml_is_on_its_page(model: type[BaseModel]):
+@pytest.mark.parametrize("model", [tables.TimeEntry, tables.Source], ids=lambda m: m.__name__)
+def test_keys_of_every_table_are_on_the_page(model: type[BaseModel]):
     page = (DOCS / "flight-folder.md").read_text()
     assert not [key for key in model.model_fields if not re.search(rf"\b{key}\b", page)]
-
-
-@pytest.mark.parametrize(
-    ("table", "model", "examples"),
-    [
-        (
-            "gnss",
-            instruments.GnssEntry,
-            {"file", "height_is", "geoid_undulation_m", "min_satellites", "min_fix_mode"},
-        ),
-        ("barometers", instruments.BarometerEntry, {"file", "height_is", "geoid_undulation_m", "use_s"}),
-        ("motion", flightfolder.MotionEntry, {"model", "drag_area_per_mass_m2pkg", "powered_s"}),
-    ],
-)
-def test_values_on_the_page_are_the_defaults(table: str, model: type[BaseModel], examples: set[str]):
-    blocks = re.findall(r"```toml\n(.*?)```", (DOCS / "flight-folder.md").read_text(), re.DOTALL)
-    block = next(b for b in blocks if b.startswith(f"[{table}"))
-    written = tomllib.loads(block)[table]
-    section = model.model_validate(written if table == "motion" else next(iter(written.values())))
-    for key in section.model_fields_set - examples:
-        assert getattr(section, key) == model.model_fields[key].default, key
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
@@ -154,3 +109,28 @@ def test_commands_on_the_page_are_understood(page: Path, monkeypatch: pytest.Mon
 def test_python_on_the_page_compiles(page: Path):
     for text in blocks(page, "python"):
         compile(text, page.name, "exec")
+
+
+def message_codes() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("message_codes", DOCS / "message_codes.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_page_of_codes_has_every_code_that_a_call_states():
+    listed = message_codes().message_codes()
+    stated = set()
+    for path in (path for package in message_codes().PACKAGES for path in (ROOT / package).rglob("*.py")):
+        words = [word for node in ast.walk(ast.parse(path.read_text())) for word in getattr(node, "keywords", [])]
+        stated |= {w.value.value for w in words if w.arg == "code" and isinstance(w.value, ast.Constant)}
+    assert len(stated) > 150
+    assert not stated - set(listed)
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [("epoch-range", "lies outside IGRF-14"), ("toml-syntax", "not valid TOML"), ("rest-found", "at_rest")],
+)
+def test_page_of_codes_says_what_the_message_says(code: str, words: str):
+    assert words in message_codes().message_codes()[code]
