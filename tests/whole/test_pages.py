@@ -30,7 +30,6 @@ READER_HAS = {
     "README.md": ("delivered", "corners.csv", "my-scenario.toml"),
     "check.md": ("my-flight",),
     "exports.md": ("my-flight",),
-    "aero-increments.md": ("demo-flight",),
     "how-to.md": ("demo-flight", "examples", "tests"),
     "monte-carlo.md": (),
     "own-data.md": ("delivered",),
