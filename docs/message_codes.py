@@ -18,6 +18,9 @@ CALLS = {
     **dict.fromkeys(("Fault", "refuse", "refuse_config", "_NoFitError", "__init__"), (1, 0)),
     "Finding": (4, 1),
     "FaultHypothesis": (1, 0),
+    "line": (2, 1),
+    "Single": (0, 1),
+    "_of_either": (0, 1),
     "consistency_check": (0, 6),
     "ConsistencyCheck": (0, 6),
 }
@@ -94,7 +97,8 @@ def message_codes() -> dict[str, str]:
         for call, known in calls(ast.parse(path.read_text(encoding="utf-8"))):
             name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
             at_code, at_words = CALLS.get(name, (-1, -1))
-            given = dict(enumerate(call.args)) | {word.arg: word.value for word in call.keywords}
+            spread = [arg for arg in call.args for arg in [arg] * (1 + isinstance(arg, ast.Starred))]  # of two: a span
+            given = dict(enumerate(spread)) | {word.arg: word.value for word in call.keywords}
             code, words = given.get("code", given.get(at_code)), given.get(at_words, given.get("words"))
             if name not in CALLS or code is None or words is None:
                 continue

@@ -4,6 +4,7 @@ The pages in ``docs/`` are written to be read in the repository too, where links
 site: such a link becomes its words. Forms of files are pages as they are; message codes are read from the source.
 """
 
+import csv
 import html
 import re
 from pathlib import Path
@@ -24,7 +25,9 @@ FORMS = {
     "flight-keys.md": ("flight.toml", "postflight/intake/templates/flight.toml"),
     "vehicle-keys.md": ("a vehicle file", "postflight/intake/templates/vehicle.toml"),
 }
+CASES = "docs/wrong_inputs.csv"
 MADE = {source: page for page, source in BESIDE.items()} | {source: page for page, (_, source) in FORMS.items()}
+MADE |= {CASES: "wrong-input-cases.md", "docs/message_codes.py": "message-codes.md"}
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 
 
@@ -63,6 +66,12 @@ def sample_report():
     return {"sample-report.md": text, "demo-report.html": reports[-1].read_bytes()}
 
 
+def table(path):
+    """A CSV file as a table."""
+    head, *rows = csv.reader(path.read_text(encoding="utf-8").splitlines())
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
 def on_files(files, config):
     """Add pages that are made: of files beside ``docs/``, forms, codes, docstrings, notebooks, a report, decisions."""
     for page, source in BESIDE.items():
@@ -71,6 +80,7 @@ def on_files(files, config):
         content = f"# Every key of {what}\n\n```toml\n{(ROOT / source).read_text(encoding='utf-8')}```\n"
         files.append(File.generated(config, page, content=content))
     files.append(File.generated(config, "message-codes.md", content=message_codes.page()))
+    files.append(File.generated(config, MADE[CASES], content=f"# Cases of wrong inputs\n\n{table(ROOT / CASES)}\n"))
     files.append(File.generated(config, "reference/postflight.md", content=reference()))
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         for name, content in notebook(path.stem).items():
