@@ -1,13 +1,15 @@
 """Makes a site of the pages in ``docs/``: files beside it, the reference, notebooks, a report, formulas as MathML.
 
-The pages are written to be read in the repository too, where links lead to files that are no pages of the site: such a
-link becomes its words.
+The pages in ``docs/`` are written to be read in the repository too, where links lead to files that are no pages of the
+site: such a link becomes its words. Forms of files are pages as they are; message codes are read from the source.
 """
 
+import csv
 import html
 import re
 from pathlib import Path
 
+import message_codes  # beside this file
 import nbformat
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
@@ -19,6 +21,13 @@ BESIDE = {
     "benchmarks.md": "benchmarks/README.md",
     "changes.md": "CHANGELOG.md",
 }
+FORMS = {
+    "flight-keys.md": ("flight.toml", "postflight/intake/templates/flight.toml"),
+    "vehicle-keys.md": ("a vehicle file", "postflight/intake/templates/vehicle.toml"),
+}
+CASES = "docs/wrong_inputs.csv"
+MADE = {source: page for page, source in BESIDE.items()} | {source: page for page, (_, source) in FORMS.items()}
+MADE |= {CASES: "wrong-input-cases.md", "docs/message_codes.py": "message-codes.md"}
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 
 
@@ -57,10 +66,21 @@ def sample_report():
     return {"sample-report.md": text, "demo-report.html": reports[-1].read_bytes()}
 
 
+def table(path):
+    """A CSV file as a table."""
+    head, *rows = csv.reader(path.read_text(encoding="utf-8").splitlines())
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
 def on_files(files, config):
-    """Add pages that are made: of files beside ``docs/``, of docstrings, notebooks, the demo's report, decisions."""
+    """Add pages that are made: of files beside ``docs/``, forms, codes, docstrings, notebooks, a report, decisions."""
     for page, source in BESIDE.items():
         files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+    for page, (what, source) in FORMS.items():
+        content = f"# Every key of {what}\n\n```toml\n{(ROOT / source).read_text(encoding='utf-8')}```\n"
+        files.append(File.generated(config, page, content=content))
+    files.append(File.generated(config, "message-codes.md", content=message_codes.page()))
+    files.append(File.generated(config, MADE[CASES], content=f"# Cases of wrong inputs\n\n{table(ROOT / CASES)}\n"))
     files.append(File.generated(config, "reference/postflight.md", content=reference()))
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         for name, content in notebook(path.stem).items():
@@ -83,7 +103,7 @@ def on_page_markdown(markdown, page, config, files):
             return match[0]
         path, _, anchor = target.partition("#")
         there = (ROOT / home / path).resolve().relative_to(ROOT).as_posix()
-        made = {source: name for name, source in BESIDE.items()}.get(there, there.removeprefix("docs/"))
+        made = MADE.get(there, there.removeprefix("docs/"))
         if files.get_file_from_path(made) is None:
             return words
         up = "../" * page.file.src_uri.count("/")

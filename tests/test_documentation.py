@@ -1,15 +1,18 @@
-"""The pages of scenario, vehicle and flight files name every key that these files may hold, with their defaults."""
+"""Pages name every key of scenarios, sidecars, dispersions; forms the others (tests/postflight/test_init.py)."""
 
+import ast
+import importlib.util
 import re
-import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import click
 import pytest
 from pydantic import BaseModel
 
-from flightmodel import aerodynamics, flightfolder, geometry, instruments, tables, vehicle
+from flightmodel import aerodynamics, tables
 from postflight.cli import cli
+from postflight.intake.flight_form import template_keys
 from postflight.montecarlo import study
 from synthetic_flight import dispersions, ensemble, instrument_errors, scenarios, weather
 from tests.documents import PAGES, ROOT, blocks, commands
@@ -35,20 +38,7 @@ MODELS = [
     weather.Turbulence,
     weather.DiscreteGust,
     weather.RangeSounding,
-    vehicle.Reference,
-    vehicle.CompliantJoint,
-    vehicle.MassProperties,
-    geometry.ShellGeometry,
-    vehicle.Uncertainty,
-    vehicle.SensorMount,
-    vehicle.CameraMount,
-    geometry.MeshFiles,
-    geometry.MeshFile,
-    aerodynamics.Aerodynamics,
-    aerodynamics.SphereCone,
-    aerodynamics.FreeMolecular,
     aerodynamics.Sidecar,
-    aerodynamics.TableUncertainty,
 ]
 
 
@@ -66,19 +56,6 @@ DISPERSION_SECTIONS = [
 ]
 
 
-FLIGHT_SECTIONS = [
-    flightfolder.FlightFile,
-    flightfolder.AttitudeEntry,
-    flightfolder.MotionEntry,
-    instruments.Mounted,
-    instruments.MagnetometerEntry,
-    instruments.GnssEntry,
-    instruments.BarometerEntry,
-    tables.TimeEntry,
-    tables.Source,
-]
-
-
 def missing_keys(page: str, model: type[BaseModel]) -> list[str]:
     quoted = (DOCS / page).read_text().replace(".", "`").replace("[", "`").replace("]", "`")
     keys = [field.alias or name for name, field in model.model_fields.items()]
@@ -91,8 +68,16 @@ def test_every_key_is_on_the_page(model: type[BaseModel]):
 
 
 @pytest.mark.parametrize("model", INSTRUMENTS, ids=lambda m: m.__name__)
-def test_every_key_of_an_instrument_is_on_its_page(model: type[BaseModel]):
-    assert not missing_keys("instruments.md", model)
+def test_every_key_of_an_instrument_is_on_its_page_or_the_flight_form_s(model: type[BaseModel]):
+    page = {key.replace("_U", f"_{unit}") for unit in ("mps2", "degps", "ut") for key in named_keys("instruments.md")}
+    flight = {key for _, key, _, _ in template_keys("flight")}
+    flight |= {key.replace("_sd", "") for key in flight}
+    keys = {field.alias or name for name, field in model.model_fields.items()}
+    assert not keys - page - flight
+
+
+def named_keys(page: str) -> set[str]:
+    return set(re.findall(r"\b\w+\b", (DOCS / page).read_text()))
 
 
 @pytest.mark.parametrize("model", DISPERSION_SECTIONS, ids=lambda m: m.__name__)
@@ -111,31 +96,10 @@ def test_shipped_dispersions_are_read(name: str):
     assert len(study.read_study(name).spec.factors()) > 20
 
 
-@pytest.mark.parametrize("model", FLIGHT_SECTIONS, ids=lambda m: m.__name__)
-def test_every_key_of_flight_toml_is_on_its_page(model: type[BaseModel]):
+@pytest.mark.parametrize("model", [tables.TimeEntry, tables.Source], ids=lambda m: m.__name__)
+def test_keys_of_every_table_are_on_the_page(model: type[BaseModel]):
     page = (DOCS / "flight-folder.md").read_text()
     assert not [key for key in model.model_fields if not re.search(rf"\b{key}\b", page)]
-
-
-@pytest.mark.parametrize(
-    ("table", "model", "examples"),
-    [
-        (
-            "gnss",
-            instruments.GnssEntry,
-            {"file", "height_is", "geoid_undulation_m", "min_satellites", "min_fix_mode"},
-        ),
-        ("barometers", instruments.BarometerEntry, {"file", "height_is", "geoid_undulation_m", "use_s"}),
-        ("motion", flightfolder.MotionEntry, {"model", "drag_area_per_mass_m2pkg", "powered_s"}),
-    ],
-)
-def test_values_on_the_page_are_the_defaults(table: str, model: type[BaseModel], examples: set[str]):
-    blocks = re.findall(r"```toml\n(.*?)```", (DOCS / "flight-folder.md").read_text(), re.DOTALL)
-    block = next(b for b in blocks if b.startswith(f"[{table}"))
-    written = tomllib.loads(block)[table]
-    section = model.model_validate(written if table == "motion" else next(iter(written.values())))
-    for key in section.model_fields_set - examples:
-        assert getattr(section, key) == model.model_fields[key].default, key
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
@@ -154,3 +118,28 @@ def test_commands_on_the_page_are_understood(page: Path, monkeypatch: pytest.Mon
 def test_python_on_the_page_compiles(page: Path):
     for text in blocks(page, "python"):
         compile(text, page.name, "exec")
+
+
+def message_codes() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("message_codes", DOCS / "message_codes.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_page_of_codes_has_every_code_that_a_call_states():
+    listed = message_codes().message_codes()
+    stated = set()
+    for path in (path for package in message_codes().PACKAGES for path in (ROOT / package).rglob("*.py")):
+        words = [word for node in ast.walk(ast.parse(path.read_text())) for word in getattr(node, "keywords", [])]
+        stated |= {w.value.value for w in words if w.arg == "code" and isinstance(w.value, ast.Constant)}
+    assert len(stated) > 150
+    assert not stated - set(listed)
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [("epoch-range", "lies outside IGRF-14"), ("toml-syntax", "not valid TOML"), ("rest-found", "at_rest")],
+)
+def test_page_of_codes_says_what_the_message_says(code: str, words: str):
+    assert words in message_codes().message_codes()[code]

@@ -104,11 +104,10 @@ QUEUES = {"PBS": ("qsub", "qdel", "17.queue"), "SLURM": ("sbatch", "scancel", "S
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", QUEUES)
-def test_the_pages_script_for_a_queue_runs(kind: str, tmp_path: Path) -> None:
-    """The script of docs/monte-carlo.md with fewer workers and flights, under a queue's own commands."""
+def test_the_example_for_a_queue_runs(kind: str, tmp_path: Path) -> None:
+    """examples/montecarlo_pbs.py with fewer workers and flights, under a queue's own commands."""
     pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is not installed: postflight[cluster]")
-    page = (ROOT / "docs" / "monte-carlo.md").read_text()
-    script = re.search(r"```python\n(# montecarlo_pbs\.py.*?)```", page, re.DOTALL)[1]
+    script = (ROOT / "examples" / "montecarlo_pbs.py").read_text()
     if kind == "SLURM":
         slurm = re.search(r"# Slurm: (SLURMCluster\(.*\))\n", script)[1]
         script = re.sub(r"PBSCluster\(.*?\n    \)\n", f"{slurm}\n", script, flags=re.DOTALL)

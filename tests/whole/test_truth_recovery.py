@@ -3,7 +3,7 @@
 Deflections must lie within four of their own standard deviations (exceeded once in 16 000 draws) and within four of
 the rms errors that many days with these instruments showed: at peak pressure the largest errors of 21 days were 0.27
 deg (misalignment) and 0.31 deg (trim), 2.2 of an rms of 0.14 as the largest of 21 draws is; rms of a hundred films
-0.14 deg, of a hundred fused flights 0.08 deg (README.md, docs/camera.md, docs/deflection.md). Over a history, whose
+0.14 deg, of a hundred fused flights 0.08 deg (README.md, benchmarks/README.md). Over a history, whose
 errors are correlated, the rms of one flight stays below 2.6 of these (1 in 100), and the mean square of error / sd
 has the 99.9 % band of a chi-square with three degrees of freedom: constant errors, the wind's and the attitude's.
 Bounds on the trajectory's errors are four sd of a single draw.
