@@ -56,10 +56,8 @@ def meridian_sections(
     once = np.mod(clocks_rad, 2.0 * np.pi)[order]
     turns = np.concatenate([once - 2.0 * np.pi, once, once + 2.0 * np.pi])
     # a corner may lie in a half-plane: which side that is, is decided once for all faces that share it, below
-    low, high = (
-        np.searchsorted(turns, around.min(axis=1) - _BESIDE),
-        np.searchsorted(turns, around.max(axis=1) + _BESIDE),
-    )
+    low = np.searchsorted(turns, around.min(axis=1) - _BESIDE)
+    high = np.searchsorted(turns, around.max(axis=1) + _BESIDE)
     count = high - low
     face = np.repeat(np.arange(len(faces)), count)
     turn = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count)
@@ -145,8 +143,5 @@ def touching_circles(supports_m: FloatArray, eyes_m: FloatArray) -> FloatArray:
     for k in np.flatnonzero(past.any(axis=1)):
         near = np.abs(v - touched[k]) <= _ABOUT
         design = np.column_stack([np.sin(v[near]), np.cos(v[near]), np.ones(near.sum())])
-        found = np.linalg.lstsq(design, supports_m[k, near], rcond=None)[0]
-        if found[2] < 0.0:  # a sharp rim
-            found = np.append(np.linalg.lstsq(design[:, :2], supports_m[k, near], rcond=None)[0], 0.0)
-        out[k] = found
+        out[k] = np.linalg.lstsq(design, supports_m[k, near], rcond=None)[0]
     return out

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from estimators.benchmark import orient_camera
+from estimators.features import visible_features
 from estimators.texture import surface_seen
 from estimators.virtual_camera import VirtualCamera
 from flightmodel.camera import camera_from_mount
-from flightmodel.geometry import bend
+from flightmodel.geometry import FEATURE_KINDS, ListedFeatures, bend
 from flightmodel.rendering import render
 from synthetic_flight.film import ShellRenderer, Warp, render_video
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, sun
@@ -50,6 +51,18 @@ def test_pixels_look_at_the_mesh_s_faces():
     np.testing.assert_allclose(back, pixels[on], atol=1e-6)
     towards = view.camera.position_body_m - seen.points_shell_m[on]
     assert (np.einsum("ni,ni->n", towards, seen.normals[on]) > 0.0).all()
+
+
+def test_a_listed_feature_behind_the_mesh_is_not_looked_for():
+    view = VirtualCamera(ODD, camera_from_mount(MOUNT), JOINT_M)
+    seen = surface_seen(view, np.array([[360.0, 150.0], [250.0, 300.0]]))
+    away = seen.points_shell_m - view.camera.position_body_m
+    points = np.concatenate([seen.points_shell_m, seen.points_shell_m + 0.15 * away])
+    kind = np.full(4, FEATURE_KINDS.index("dot"))
+    listed = ListedFeatures(points, np.tile(seen.normals, (2, 1)), kind, np.full(4, 0.02), np.zeros(4, dtype=bool))
+    shell = ODD.with_listed(listed)
+    found = visible_features(replace(view, geometry=shell)).points_shell_m
+    np.testing.assert_allclose(found, np.tile(points[:2], (2, 1)))
 
 
 def test_the_film_of_a_mesh_of_the_tori_is_that_of_the_tori():
