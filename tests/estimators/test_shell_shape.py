@@ -127,6 +127,23 @@ def test_a_film_that_knows_its_shell_reads_the_deflection_better_and_says_so(man
     assert abs(np.mean(square) - 2.0) < 3.3 * np.sqrt(4.0 / len(square))
 
 
+def test_a_camera_whose_error_grows_with_the_load_tells_less_of_the_shape():
+    film, *_ = drawn(np.random.default_rng(31), (next(iter(LOBES)),))
+    load = (PRESSURE_PA - PRESSURE_PA[0]) / PRESSURE_PA.max()
+    alike = np.zeros((len(MODES) + 2, 12))
+    alike[2:] = np.eye(len(MODES))[:, :12] * D(0.2)
+    fits = tuple(
+        replace(fit, shape=replace(fit.shape, by_camera=share * alike))
+        for fit, share in zip(film.film.fits, load, strict=True)
+    )
+    of_pose = []
+    for sd in (0.01, 1.0):
+        oriented = SimpleNamespace(apriori=AprioriSd(), posed_covariance=sd**2 * np.eye(12))
+        shape = shell_shape([replace(film, film=replace(film.film, fits=fits, oriented=oriented))])
+        of_pose.append(np.sqrt(np.diag(shape.covariance)))
+    assert (of_pose[1][:12] > 1.5 * of_pose[0][:12]).any()
+
+
 def test_two_cameras_tell_more_than_one():
     rng = np.random.default_rng(2)
     one, _, _ = drawn(rng, ())
