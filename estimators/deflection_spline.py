@@ -31,7 +31,9 @@ KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot foll
 # a priori of the process's size, median and sd of its logarithm: a degree of swing at 2 Hz, between a degree at 0.5 Hz
 # and ten at 3 Hz
 SIZE_RADPS2, SIZE_LOG_SD = 3.0, 1.5
-_SIZES_RADPS2, FREE_RADPS2 = (1e-3, 1e3), 1e3  # within which it is looked for; ten degrees of swing at 12 Hz
+# within which it is looked for: a tenth of a degree of swing at 1.2 Hz, which a joint in the air keeps, while the
+# allowance for neglected terms, no noise, may hide it from the evidence; ten degrees at 12 Hz
+_SIZES_RADPS2, FREE_RADPS2 = (0.1, 1e3), 1e3
 DEFLECTION_SD_RAD = 1.0  # of the deflection itself: no information
 _WITHOUT_SAMPLES = 1e-12  # weight of a coefficient that no sample reaches, of one that they reach
 Inputs = dict[str, FloatArray]
