@@ -13,8 +13,9 @@ import math
 import numpy as np
 
 from flightmodel._kernels import inlined, kernel
+from flightmodel.camera import LENSES
 
-FISHEYE, PINHOLE = 0, 1
+FISHEYE = LENSES.index("fisheye")
 COLUMNS = 16
 _SPARSE = 10
 

@@ -47,7 +47,7 @@ from flightmodel.geometry import (
     torus_circles,
     torus_limb,
 )
-from flightmodel.rendering import Rendered
+from flightmodel.rendering import Rendered, against, face_normals
 
 Image = NDArray[np.uint8]
 Pixels = Callable[[FloatArray], FloatArray]
@@ -279,7 +279,7 @@ def _limbs_within(view: VirtualCamera, rendered: Rendered) -> tuple[FloatArray, 
     face, next_face = rendered.face[v[inside], u[inside]], rendered.face[beyond[:, 1], beyond[:, 0]]
     # towards the camera, however they are wound
     normal, next_normal = (
-        n * np.sign(np.einsum("ni,ni->n", n, -rays[inside]))[:, None] for n in map(mesh.normals_of, (face, next_face))
+        against(face_normals(mesh.vertices_m, mesh.faces[k]), rays[inside]) for k in (face, next_face)
     )
     bends = np.einsum("ni,ni->n", normal, next_normal) < _BENDS
     rows = np.flatnonzero(inside)[(next_face >= 0) & bends]

@@ -23,7 +23,7 @@ from flightmodel.camera import Camera
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
 from flightmodel.geometry import BodyMesh, bend, outboard, vehicle_meshes
-from flightmodel.rendering import render
+from flightmodel.rendering import face_normals, render
 
 Picture = NDArray[np.uint8]
 
@@ -47,11 +47,9 @@ class _Drawing:
     def rendered(self, camera: Camera, vertices_m: FloatArray) -> tuple[FloatArray, Picture]:
         """Depth ``(h, w)``, m, and picture ``(h, w, 3)``, RGB, with the vertices where they are now, body axes."""
         view = render(camera, vertices_m, self.faces)
-        corners = vertices_m[self.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        away = corners.mean(axis=1) - camera.position_body_m
-        length = np.linalg.norm(normal, axis=1) * np.linalg.norm(away, axis=1)
-        facing = np.abs(np.einsum("ni,ni->n", normal, away)) / np.maximum(length, 1e-12)
+        away = vertices_m[self.faces].mean(axis=1) - camera.position_body_m
+        along = np.abs(np.einsum("ni,ni->n", face_normals(vertices_m, self.faces), away))
+        facing = along / np.maximum(np.linalg.norm(away, axis=1), 1e-12)
         tone = ((60.0 + 150.0 * facing)[:, None] * self.colour).astype(np.uint8)
         picture = np.zeros((*view.face.shape, 3), dtype=np.uint8)
         picture[view.is_hit] = tone[view.face[view.is_hit]]

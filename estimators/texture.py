@@ -39,7 +39,7 @@ from estimators import _texture_kernels
 from estimators.virtual_camera import VirtualCamera, meets_centerbody
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.geometry import circumferential, torus_circles
-from flightmodel.rendering import Rendered
+from flightmodel.rendering import Rendered, against, face_normals
 
 Image = NDArray[np.uint8]
 Picture = NDArray[np.float32]
@@ -111,8 +111,7 @@ def _mesh_seen(view: VirtualCamera, rendered: Rendered, pixels: FloatArray) -> S
     rays = np.nan_to_num(camera.rays_body(pixels))
     u, v = np.rint(np.clip(pixels, 0, np.array(camera.size_px) - 1)).astype(np.int64).T
     face = rendered.face[v, u]
-    normal = mesh.normals_of(face)
-    normal = np.where((np.einsum("ni,ni->n", normal, rays) > 0.0)[:, None], -normal, normal)
+    normal = against(face_normals(mesh.vertices_m, mesh.faces[face]), rays)
     corner = mesh.vertices_m[mesh.faces[face, 0]] - camera.position_body_m
     with np.errstate(divide="ignore", invalid="ignore"):
         along = np.einsum("ni,ni->n", normal, corner) / np.einsum("ni,ni->n", normal, rays)

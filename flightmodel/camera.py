@@ -213,6 +213,13 @@ class Camera:
         turn = rotations.dcm_from_q(rotations.exp(np.asarray(rotation_cam_rad, dtype=float)))
         return replace(self, dcm_cam_body=turn @ self.dcm_cam_body, focal_px=self.focal_px * focal_scale)
 
+    def sampled(self, samples: int) -> Camera:
+        """Return this camera with so many samples along each side of a pixel, those of one pixel about its middle."""
+        return replace(
+            self, width_px=samples * self.width_px, height_px=samples * self.height_px,
+            focal_px=samples * self.focal_px, centre_px=samples * self.centre_px + 0.5 * (samples - 1),
+        )  # fmt: skip
+
 
 def camera_from_mount(mount: CameraMount) -> Camera:
     """Build the nominal camera of a mount.

@@ -411,12 +411,6 @@ class BodyMesh:
         cut = np.isfinite(supports[:, 0])
         return around[cut], supports[cut]
 
-    def normals_of(self, faces: Faces) -> FloatArray:
-        """Unit normals ``(n, 3)`` of faces, whichever way they are wound."""
-        a, b, c = (self.vertices_m[self.faces[faces, k]] for k in range(3))
-        normal = np.cross(b - a, c - a)
-        return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300))
-
 
 def body_meshes(
     spec: MeshFiles, folder: Path, geometry: ShellGeometry, lenses_m: dict[str, FloatArray]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel.checks import BoolArray, FloatArray
-from flightmodel.deflection import lv_clock
+from flightmodel.deflection import lv_clock, lv_direction
 
 SUPPORT_ANGLES: FloatArray = np.deg2rad(np.arange(-15.0, 166.0, 3.0))
 """From outboard to aft, beyond both."""
@@ -52,8 +52,9 @@ def meridian_sections(
     faces = faces[(radius[faces] > _ON_AXIS * radius.max()).all(axis=1)]
     first = clock[faces[:, :1]]
     around = first + np.mod(clock[faces] - first + np.pi, 2.0 * np.pi) - np.pi
-    order = np.argsort(np.mod(clocks_rad, 2.0 * np.pi))
-    once = np.mod(clocks_rad, 2.0 * np.pi)[order]
+    wrapped = np.mod(clocks_rad, 2.0 * np.pi)
+    order = np.argsort(wrapped)
+    once = wrapped[order]
     turns = np.concatenate([once - 2.0 * np.pi, once, once + 2.0 * np.pi])
     # a corner may lie in a half-plane: which side that is, is decided once for all faces that share it, below
     low = np.searchsorted(turns, around.min(axis=1) - _BESIDE)
@@ -64,9 +65,8 @@ def meridian_sections(
     plane = order[turn % max(len(once), 1)]
     corners = vertices_m[faces[face]]
     at = clocks_rad[plane]
-    outboard, along = (np.column_stack([-np.cos(at + quarter), np.sin(at + quarter)]) for quarter in (0.0, 0.5 * np.pi))
-    off = np.einsum("qci,qi->qc", corners[:, :, 1:], along)
-    place = np.stack([-corners[:, :, 0], np.einsum("qci,qi->qc", corners[:, :, 1:], outboard)], axis=-1)
+    off = np.einsum("qci,qi->qc", corners, lv_direction(at + 0.5 * np.pi))
+    place = np.stack([-corners[:, :, 0], np.einsum("qci,qi->qc", corners, lv_direction(at))], axis=-1)
     ends, good = _cut(off, place)
     plane, ends = plane[good], ends[good]
     by_plane = np.argsort(plane, kind="stable")
@@ -138,10 +138,10 @@ def touching_circles(supports_m: FloatArray, eyes_m: FloatArray) -> FloatArray:
     over = supports_m - eyes_m[:, 1:] * np.cos(v) - eyes_m[:, :1] * np.sin(v)
     # from outboard, where the section lies beyond the eye, to the first angle where it does not
     past = (over[:, 1:] <= 0.0) & (over[:, :-1] > 0.0)
-    touched = v[np.argmax(past, axis=1)]
+    touched = np.where(past.any(axis=1), np.argmax(past, axis=1), -1)
     out = np.full((len(supports_m), 3), np.nan)
-    for k in np.flatnonzero(past.any(axis=1)):
-        near = np.abs(v - touched[k]) <= _ABOUT
+    for angle in np.unique(touched[touched >= 0]):
+        near, here = np.abs(v - v[angle]) <= _ABOUT, touched == angle
         design = np.column_stack([np.sin(v[near]), np.cos(v[near]), np.ones(near.sum())])
-        out[k] = np.linalg.lstsq(design, supports_m[k, near], rcond=None)[0]
+        out[here] = np.linalg.lstsq(design, supports_m[here][:, near].T, rcond=None)[0].T
     return out

@@ -43,6 +43,18 @@ class Rendered:
         return np.asarray(self.face >= 0)
 
 
+def face_normals(vertices_m: FloatArray, faces: NDArray[np.int64]) -> FloatArray:
+    """Unit normals ``(m, 3)`` of faces, as they are wound."""
+    a, b, c = (vertices_m[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300))
+
+
+def against(normals: FloatArray, rays: FloatArray) -> FloatArray:
+    """Normals ``(n, 3)`` turned to where rays ``(n, 3)`` come from."""
+    return np.asarray(normals * np.where(np.einsum("ni,ni->n", normals, rays) > 0.0, -1.0, 1.0)[:, None])
+
+
 def render(camera: Camera, vertices_body_m: FloatArray, faces: NDArray[np.int64]) -> Rendered:
     """Render triangles.
 

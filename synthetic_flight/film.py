@@ -19,7 +19,7 @@ A user's mesh of the shell is filled through the same lens at three by three sam
 seams and dots are painted on it where the tori would have them.
 
 Assumed: one Sun, no light from the Earth or from one torus on another, no glare (the lens looks away from the Sun); a
-mesh casts no shadow.
+mesh casts no shadow on itself, and on the centerbody that of the tori.
 
 Lens and pointing as built are drawn once a flight (`as_built_camera`), and so is the shell's departure from its shape,
 as built and under load: an estimator starts from the nominal mount and the nominal shell. The film of a flight is
@@ -47,7 +47,7 @@ from flightmodel.deflection import lv_clock, rotation_vector_body_shell
 from flightmodel.film import film_frames
 from flightmodel.geomagnetism_and_sun import sun_direction_ecef
 from flightmodel.geometry import BodyMesh, ShellGeometry, torus_circles
-from flightmodel.rendering import render
+from flightmodel.rendering import against, face_normals, render
 from flightmodel.vehicle import CameraMount
 from synthetic_flight import _film_kernels, sensing
 from synthetic_flight.ensemble import available_cores
@@ -153,11 +153,7 @@ class ShellRenderer:
     @cached_property
     def _fine(self) -> tuple[Camera, Float32]:
         """The camera with samples for pixels, and their rays (h, w, 3)."""
-        camera, n = self.camera, _SAMPLES
-        fine = replace(
-            camera, width_px=n * camera.width_px, height_px=n * camera.height_px, focal_px=n * camera.focal_px,
-            centre_px=n * camera.centre_px + 0.5 * (n - 1),
-        )  # fmt: skip
+        fine = self.camera.sampled(_SAMPLES)
         v, u = np.indices((fine.height_px, fine.width_px), dtype=float)
         rays = fine.rays_body(np.column_stack([u.ravel(), v.ravel()])).astype(np.float32)
         return fine, rays.reshape(*u.shape, 3)
@@ -170,8 +166,7 @@ class ShellRenderer:
         picture = render(fine, (vertices - self.joint_m) @ turn + self.joint_m, mesh.faces)
         v, u = np.nonzero(picture.is_hit)
         rays = fine_rays[v, u] @ turn.T
-        normal = replace(mesh, vertices_m=vertices).normals_of(np.arange(len(mesh.faces)))[picture.face[v, u]]
-        normal *= np.where(np.einsum("ni,ni->n", normal, rays) > 0.0, -1.0, 1.0)[:, None]
+        normal = against(face_normals(vertices, mesh.faces)[picture.face[v, u]], rays)
         points, shade = eye + picture.depth_m[v, u, None] * rays, np.empty(len(u))
         _film_kernels.shade_mesh(points, normal, sun, shell, body, self.painted, self.shadows, shade)
         at = (v // n) * w + u // n

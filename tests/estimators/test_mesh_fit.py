@@ -22,9 +22,8 @@ ODD = GEOMETRY.with_mesh(body_of(odd(shell_mesh(GEOMETRY, 240))))
 
 @pytest.mark.parametrize(("theta_deg", "plane_deg"), [(0.0, 0.0), (5.0, 200.0)])
 def test_the_edge_is_the_border_of_the_mesh_s_picture(theta_deg, plane_deg):
-    camera, n = camera_from_mount(MOUNT), 4
-    fine = replace(camera, width_px=n * camera.width_px, height_px=n * camera.height_px, focal_px=n * camera.focal_px,
-                   centre_px=n * camera.centre_px + 0.5 * (n - 1))  # fmt: skip
+    n = 4
+    fine = camera_from_mount(MOUNT).sampled(n)
     deflected = bend(ODD.mesh.vertices_m, D(theta_deg), D(plane_deg), JOINT_M)
     hit = render(fine, deflected, ODD.mesh.faces).is_hit
     edge = VirtualCamera(ODD, fine, JOINT_M).edge_of(D(theta_deg), D(plane_deg))

@@ -9,6 +9,7 @@ import pytest
 from tests.documents import PAGES, ROOT, blocks
 
 PYTHON = [(page, code) for page in PAGES for code in blocks(page, "python")]
+PYTHON += [(path, path.read_text()) for path in [ROOT / "examples" / "montecarlo_pbs.py"]]
 
 
 @pytest.mark.slow
@@ -20,4 +21,4 @@ def test_python_examples_run(short: Path, tmp_path: Path) -> None:
     code = "\n".join(f"print({page.name!r}); exec({text!r}, {{}})" for page, text in PYTHON)
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert len(PYTHON) >= 4
+    assert len(PYTHON) >= 5
