@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +34,14 @@ def laid_out(flight: Path, film: Path, folder: Path, features: str, with_telemet
     video = next(path for path in sorted(film.glob("film.*")) if path.suffix in (".avi", ".mp4"))
     for source in (video, film / "frames.csv"):
         shutil.copy(source, folder / "telemetry" / source.name)
-    vehicle = vehicle_path("irve2_reference").read_text()
-    (folder / "vehicle.toml").write_text(vehicle.replace('features = "drawn"', f'features = "{features}"'))
-    text = (flight / "flight.toml").read_text().replace('vehicle = "irve2_reference"', 'vehicle = "vehicle.toml"')
+    text = (flight / "flight.toml").read_text()
+    stated = tomllib.loads(text)["vehicle"]
+    source = flight / stated if (flight / stated).exists() else vehicle_path(stated)
+    if source.parent != vehicle_path("irve2_reference").parent:
+        shutil.copytree(source.parent, folder, dirs_exist_ok=True)
+    vehicle = source.read_text().replace('features = "drawn"', f'features = "{features}"')
+    (folder / "vehicle.toml").write_text(vehicle)
+    text = text.replace(f'vehicle = "{stated}"', 'vehicle = "vehicle.toml"')
     text = text.replace('folder = "telemetry/camera5"', f'film = "telemetry/{video.name}"')
     if not with_telemetry:
         head, film_table = text[: text.index("\n[")], text[text.index("[frames]") :]

@@ -49,7 +49,10 @@ if TYPE_CHECKING:
 _MOST = 0.5  # of the answered frames
 _DOUBTFUL = 2  # of the four frames around: one alone is a spoilt frame, not a spoilt film
 _OF_PICTURE = ("frame-dark", "frame-saturated", "frame-size", "frame-undecodable", "frame-not-grey", "frame-frozen")
-_NOT_THE_SHELL = ("camera-turned", "edge-not-shell", "features-contradict-edge")
+_NOT_THE_SHELL = ("camera-turned", "picture-warped", "edge-not-shell", "features-contradict-edge")
+# share of the benchmark frame's patches: of plain cloth 0.2 agree in the best frame of seven films, of paint 0.3 to 0.5
+# (over so many frames that they are not the benchmark's neighbours alone)
+_PAINTED, _LEAST_PAINTED = 0.25, 3
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
 _SWAP = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from a rotation about body y and z to the lateral vector
@@ -344,9 +347,12 @@ def judged(
 def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
     """Refuse frames answered by the edge alone in a film of which most frames show features that agree with it."""
     with_features = [fit.features > 0 for fit in fits if not fit.refused]
-    if np.mean(with_features or [False]) < _MOST:
-        return fits
-    words = "no feature agrees where most frames show some that do: whether the edge is the shell's is not known"
+    return fits if np.mean(with_features or [False]) < _MOST else _without_bare(fits)
+
+
+def _without_bare(fits: list[FrameFit]) -> list[FrameFit]:
+    """Refuse frames answered by the edge alone, where it does not contradict features that were found."""
+    words = "no feature agrees where other frames show some that do: whether the edge is the shell's is not known"
     lost = Fault(words, "features-lost")
     bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
     return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
@@ -355,12 +361,16 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
 def without_stray_texture(time_s: FloatArray, fits: list[FrameFit], benchmark_s: float) -> list[FrameFit]:
     """Refuse what disagrees with most frames on whether the benchmark frame's texture is the shell's.
 
-    Light and shade on plain cloth agree now and then, and move as the Sun does; the edge alone counts then.
+    Light and shade on plain cloth agree now and then, and move as the Sun does; the edge alone counts then. Where more
+    agrees than ever does of light and shade, the texture is the shell's, and frames without show something else.
     """
     answered = np.array([not fit.refused for fit in fits]) & (time_s != benchmark_s)
-    with_texture = np.array([fit.features > 0 for fit in fits]) & answered
+    agreed = np.array([fit.features for fit in fits])
+    with_texture = (agreed > 0) & answered
     if not answered.any() or with_texture.sum() >= _MOST * answered.sum():
         return without_lost_features(fits)
+    if with_texture.sum() >= _LEAST_PAINTED and np.mean(agreed[with_texture]) > _PAINTED * agreed.max():
+        return _without_bare(fits)
     words = "texture agrees where in most frames none does: it may be light and shade, which move as the Sun does"
     fault = Fault(words, "texture-strays")
     return [refused_fit(fit.horizon, fault) if out else fit for fit, out in zip(fits, with_texture, strict=True)]

@@ -92,7 +92,7 @@ _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
 USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
 JOINT = HELD.stop - 1
 POSED = slice(CAMERA.start, JOINT)
-TURN = slice(CAMERA.start, CAMERA.start + 3)
+TURN, CENTRE = slice(CAMERA.start, CAMERA.start + 4), slice(CAMERA.start + 4, CAMERA.start + 6)
 _SOFT_WAVES = 3  # a ring's stiffness grows as (n^2 - 1)^2: 9, 64, 225, 576
 LOBES = slice(2, 2 + _fit_kernels.LOBES)
 """Among flattening, joint station, lobes and light."""
@@ -396,7 +396,10 @@ class OrientedCamera:
 
     def _check_explained(self, last: _Solution) -> None:
         """Refuse a frame that no deflection explains, by `estimators.frame_checks`."""
-        design = Design(last.columns, last.gain, last.rows[:, TURN], last.residual_px, last.weight)
+        rows, focal = last.rows, float(self.view.camera.focal_px[0])
+        design = Design(
+            last.columns, last.gain, rows[:, TURN], rows[:, CENTRE], focal, last.residual_px, last.weight
+        )  # fmt: skip
         shape = last.shape_found / self._shape_sd
         fault = fault_of_fit(design, last.rms_px, shape, self.apriori.higher_lobes_rad)
         if fault:

@@ -1,14 +1,16 @@
 """Does a deflection explain what was found in a frame, or would more have to have happened than it allows for?
 
 Tested at the end of a frame's fit are the rms of its residuals, the shape and light that the fit needed against their a
-priori sd, and a turn of the camera in its mount since the benchmark frame. With the design ``D`` of deflection, shape
-and light, weights ``W``, prior ``P``, residuals ``r`` and the derivatives ``T`` by the turn,
+priori sd, and two ways in which the picture may have moved since the benchmark frame: a turn of the camera in its mount
+with another focal length, and a warp, as by a drop on the lens or by rows that slip. With the design ``D`` of
+deflection, shape and light, weights ``W``, prior ``P``, residuals ``r`` and the derivatives ``T`` by a motion ``m``,
 
-    turn = C T' W (r - D x),    x = (D' W D + P)^-1 D' W r,    C^-1 = T' W T - T' W D (D' W D + P)^-1 D' W T
+    m = C T' W (r - D x),    x = (D' W D + P)^-1 D' W r,    C^-1 = T' W T - T' W D (D' W D + P)^-1 D' W T
 
-in which lobes of more waves than the modelled ones may look like a turn of their size.
+in which lobes of more waves than the modelled ones may look like a motion of their size. The warp is each of ``1, u, v,
+u^2, u v, v^2`` along both axes of the picture.
 
-Assumed: the camera is fixed to the centerbody. Edge points alone hardly tell its turn from a deflection.
+Assumed: the camera is fixed to the centerbody, its lens too. Edge points alone hardly tell its turn from a deflection.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ from estimators.edge import NO_FAULT
 from flightmodel.checks import Fault, FloatArray
 
 USUAL_RMS_PX = 1.0  # of edge and features in a frame that is not suspicious
-# chi-square of seventeen of shape and light, and of three rotations, that one sound frame in 10,000 exceeds
-WORST_SHAPE, _WORST_TURN = 47.6, 21.1
+# chi-square that one sound frame in 10,000 exceeds: of seventeen of shape and light, of three rotations and a focal
+# length, of twelve terms of a warp
+WORST_SHAPE, _WORST_TURN, _WORST_WARP = 47.6, 23.5, 39.1
 
 
 @dataclass(frozen=True)
@@ -35,16 +38,41 @@ class Design:
         Derivatives by deflection (2), flattening, joint station, lobes (12) and light (3).
     gain : (19, n) float
         The fit's, with the priors.
-    turn : (n, 3) float
-        By the scene's rotation in camera axes, px/rad.
+    turn : (n, 4) float
+        By the scene's rotation in camera axes, rad, and the focal scale, px.
+    across : (n, 2) float
+        Unit vectors along which points are measured, px.
+    focal_px : float
     residual_px, weight : (n,) float
     """
 
     columns: FloatArray
     gain: FloatArray
     turn: FloatArray
+    across: FloatArray
+    focal_px: float
     residual_px: FloatArray
     weight: FloatArray
+
+    @property
+    def warp(self) -> FloatArray:
+        """Derivatives (n, 12) by a warp of the picture, its coordinates over the focal length, px."""
+        # roll about the line of sight moves a point p by its normal, the focal scale by p itself
+        along, roll, (a, b) = self.turn[:, 3], self.turn[:, 2], self.across.T
+        u, v = (along * a + roll * b) / self.focal_px, (along * b - roll * a) / self.focal_px
+        terms = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
+        return np.concatenate([terms * a[:, None], terms * b[:, None]], axis=1)
+
+    def motion(self, by: FloatArray, allowed: float) -> tuple[FloatArray, float]:
+        """Motion (m,) that explains the residuals best, with derivatives (n, m), and its chi-square.
+
+        ``allowed``: sd that unmodelled lobes lend to each of its terms.
+        """
+        turned = by.T * self.weight
+        crossed = turned @ self.columns @ self.gain
+        covariance = np.linalg.pinv(turned @ by - crossed @ by, hermitian=True)
+        motion = covariance @ (turned - crossed) @ self.residual_px
+        return motion, float(motion @ np.linalg.solve(covariance + allowed**2 * np.eye(len(motion)), motion))
 
 
 def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: float) -> Fault:
@@ -69,14 +97,18 @@ def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: fl
             f"the benchmark frame's, where {np.sqrt(WORST_SHAPE / len(shape)):.1f} are allowed"
         )
         return Fault(words, "edge-not-shell")
-    turned = design.turn.T * design.weight
-    crossed = turned @ design.columns @ design.gain
-    covariance = np.linalg.inv(turned @ design.turn - crossed @ design.turn)
-    turn = covariance @ (turned - crossed) @ design.residual_px
-    if turn @ np.linalg.solve(covariance + lobes_rad**2 * np.eye(3), turn) > _WORST_TURN:
+    turn, square = design.motion(design.turn, lobes_rad)
+    if square > _WORST_TURN:
         words = (
-            f"the camera seems turned by {np.rad2deg(np.linalg.norm(turn)):.1f} deg in its mount since the benchmark "
-            "frame, or edge and features are not the shell's alone"
+            f"the camera seems turned by {np.rad2deg(np.linalg.norm(turn[:3])):.1f} deg in its mount and zoomed by "
+            f"{100.0 * turn[3]:.1f} % since the benchmark frame, or edge and features are not the shell's alone"
         )
         return Fault(words, "camera-turned")
+    warp, square = design.motion(design.warp, lobes_rad * design.focal_px)
+    if square > _WORST_WARP:
+        words = (
+            f"the picture seems warped by up to {np.abs(design.warp @ warp).max():.0f} px since the benchmark frame: a "
+            "drop on the lens, rows that slip, or edge and features are not the shell's alone"
+        )
+        return Fault(words, "picture-warped")
     return NO_FAULT

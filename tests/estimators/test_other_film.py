@@ -137,6 +137,17 @@ def test_texture_that_agrees_in_few_frames_is_taken_for_light_and_shade():
     assert codes == ["", "", "features-lost", "", ""]
 
 
+def test_texture_that_agrees_as_light_and_shade_never_does_outweighs_frames_without():
+    fits = answers(np.linspace(0.0, 3.0, 9))
+    some = [replace(fit, features=(100, 40, 20, 30)[k] if k < 4 else 0) for k, fit in enumerate(fits)]
+    codes = [getattr(fit.refused, "code", "") for fit in without_stray_texture(np.arange(9.0), some, 0.0)]
+    assert codes == [""] * 4 + ["features-lost"] * 5
+    # as much of light and shade at the most: those are the odd ones
+    few = [replace(fit, features=(100, 15, 10, 20)[k] if k < 4 else 0) for k, fit in enumerate(fits)]
+    codes = [getattr(fit.refused, "code", "") for fit in without_stray_texture(np.arange(9.0), few, 0.0)]
+    assert codes == ["", *["texture-strays"] * 3, *[""] * 5]
+
+
 def test_a_jump_that_no_swing_makes_is_refused_and_a_swing_is_not():
     swing = JointSwing(2.5, 0.02)
     t = np.arange(30) / 30.0

@@ -1,5 +1,7 @@
 """Frames that show the shell, but not as the camera saw it: what is refused, by which code."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,16 +9,17 @@ import pytest
 from estimators import benchmark
 from estimators.benchmark import orient_camera
 from estimators.camera import read_film, without_doubtful
-from estimators.camera_fit import AprioriSd, refused_fit
-from estimators.features import valleys
+from estimators.camera_fit import TURN, AprioriSd, refused_fit
+from estimators.features import valleys, visible_features
+from estimators.frame_checks import Design, fault_of_fit
 from estimators.frame_edits import EditedFrame
-from estimators.virtual_camera import VirtualCamera
+from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import Fault, GateError
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
 from tests.estimators.test_other_film import answers
 
-CONTRADICTS = {"camera-turned", "edge-not-shell", "features-contradict-edge"}
+CONTRADICTS = {"camera-turned", "picture-warped", "edge-not-shell", "features-contradict-edge"}
 THETA_DEG, PLANE_DEG = [0.0, 3.0, 3.6], [0.0, 188.0, 160.0]
 
 
@@ -51,6 +54,59 @@ def test_a_frame_that_needs_more_than_a_deflection_is_no_answer(frames):
     assert not oriented.fit(frames[1]).refused
     assert not oriented.fit(frames[2]).refused
     assert oriented.fit(twisted).refused.code in CONTRADICTS
+
+
+@pytest.mark.parametrize("zoom", [1.03, 1.08])
+def test_a_lens_that_zoomed_is_noticed(frames, zoom):
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    h, w = frames[1].shape
+    matrix = cv2.getRotationMatrix2D((0.5 * w, 0.5 * h), 0.0, zoom)
+    fit = oriented.fit(cv2.warpAffine(frames[1], matrix, (w, h), flags=cv2.INTER_CUBIC))
+    assert fit.refused.code in CONTRADICTS
+
+
+def sound_design(theta_deg):
+    """Derivatives of features on a shell of which the deflection alone is fitted, and where they are."""
+    view = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
+    features = visible_features(view)
+    sight = view.sight(features.points_shell_m, deformation_of(np.deg2rad(theta_deg), np.deg2rad(188.0)))
+    seen = view.camera.is_inside(sight.pixels)
+    across, pixels = features.across_px[seen], sight.pixels[seen]
+    rows = np.einsum("ni,nij->nj", across, sight.jacobian[seen])
+    rng = np.random.default_rng(4)
+    columns, weight = rows[:, :2], np.full(len(rows), 25.0)
+    gain = np.linalg.solve((columns.T * weight) @ columns, columns.T * weight)
+    residual = 0.2 * rng.standard_normal(len(rows))
+    design = Design(columns, gain, rows[:, TURN], across, float(view.camera.focal_px[0]), residual, weight)
+    return design, (pixels - view.camera.centre_px) / view.camera.focal_px
+
+
+def test_a_warp_moves_points_by_where_they_are():
+    design, places = sound_design(3.0)
+    u, v = places.T
+    a, b = design.across.T
+    expected = np.column_stack([x * c for c in (a, b) for x in (np.ones_like(u), u, v, u * u, u * v, v * v)])
+    np.testing.assert_allclose(design.warp, expected, atol=1e-9)
+
+
+def test_what_a_turn_a_zoom_or_a_warp_explains_is_no_deflection():
+    design, _ = sound_design(3.0)
+    lobes, shape = np.deg2rad(0.1), np.zeros(17)
+
+    def code(moved_px):
+        fault = fault_of_fit(replace(design, residual_px=design.residual_px + moved_px), 0.5, shape, lobes)
+        return getattr(fault, "code", "")
+
+    assert not fault_of_fit(design, 0.5, shape, lobes)
+    assert code(design.turn @ np.deg2rad([0.0, 0.0, 2.0, 0.0])) == "camera-turned"
+    assert code(design.turn @ [0.0, 0.0, 0.0, 0.05]) == "camera-turned"
+    # what lobes that are not modelled may look like
+    assert code(design.turn @ np.deg2rad([0.0, 0.0, 0.1, 0.0])) == ""
+    bent = design.warp[:, 4] - design.warp[:, 9]
+    explained = np.column_stack([design.columns, design.turn])
+    bent -= explained @ np.linalg.lstsq(explained, bent)[0]
+    assert code(20.0 * bent) == "picture-warped"
+    assert code(0.5 * bent) == ""
 
 
 def test_a_frozen_picture_is_no_frame(frames):
