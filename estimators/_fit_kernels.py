@@ -1,4 +1,4 @@
-"""Compiled Gauss-Newton fit of one frame; the model is in `estimators.camera_fit`.
+"""Compiled Gauss-Newton fit of one frame; the model is in `estimators.frame_solution`.
 
 Readable twin: ``tests/oracles/plain_fit.py``.
 """

@@ -50,19 +50,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import softmax
 
-from estimators.camera_fit import (
-    POSED,
-    USUAL_SHARE,
-    AprioriSd,
-    Image,
-    OrientedCamera,
-)
+from estimators.camera_fit import USUAL_SHARE, Image, OrientedCamera
 from estimators.edge import NO_FAULT, HorizonLine, ScanLines, breaks_across, fault_of_frame, is_coherent
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.features import Features, ImageFeatures, fit_feature_map, no_features, valleys, visible_features
 from estimators.frame_checks import USUAL_RMS_PX
 from estimators.frame_edits import MARK_SD_PX, EditedFrame, MarkedFeatures, marked_on_shell, unedited
 from estimators.frame_residuals import FrameResiduals, edge_residuals, feature_residuals, huber_gain, joined
+from estimators.frame_solution import POSED, AprioriSd
 from estimators.loads import FlightLoads
 from estimators.texture import texture_of
 from estimators.virtual_camera import DEFLECTION, FLATTENING, VirtualCamera

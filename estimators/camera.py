@@ -8,7 +8,7 @@ plane along the camera's line of sight).
 With an assumed plane that is off by ``d`` the answer is ``theta (cos d + s sin d)``, ``s`` the answer to a unit
 deflection normal to the plane; its mean square error ``theta^2 (s^2 sd^2 + 3 (1/2 + s^2)^2 sd^4)`` is in the variance.
 
-Assumed: as in `estimators.camera_fit`.
+Assumed: as in `estimators.frame_solution`.
 
 References
 ----------
@@ -26,12 +26,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, orient_camera
-from estimators.camera_fit import AprioriSd, FrameFit, Image, OrientedCamera, refused_fit
+from estimators.camera_fit import Image, OrientedCamera
 from estimators.edge import no_horizon
 from estimators.frame_edits import edited
+from estimators.frame_solution import AprioriSd, FrameFit, refused_fit
 from estimators.texture import TrackedTexture
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
-from flightmodel.checks import Fault, FloatArray, GateError, Progress, check_finite, check_increasing
+from flightmodel.checks import BoolArray, Fault, FloatArray, GateError, Progress, check_finite, check_increasing
 from flightmodel.deflection import (
     DeflectionHistory,
     history_from_lateral,
@@ -79,8 +80,8 @@ class FilmFit:
         Assumed plane; None: estimated in every frame.
     plane_sd_rad : float
         Of the assumed plane.
-    by_hand : str
-        What an analyst edited.
+    edited : str
+        What an analyst edited, and what was left out of every picture.
     shape_covariance : (13 (1 + c), 13 (1 + c)) float or None
         Of the shell's shape under load as the film determined it, where the answers use it (`estimators.shell_shape`).
     """
@@ -91,7 +92,7 @@ class FilmFit:
     benchmark_s: float
     plane_lv_rad: float | None
     plane_sd_rad: float
-    by_hand: str = ""
+    edited: str = ""
     shape_covariance: FloatArray | None = None
 
     def relative_to_benchmark(self, time_bias_sd_s: float = 0.0) -> RelativeDeflections:
@@ -213,8 +214,8 @@ class FilmFit:
             + (f" and {features:.0f} rows of {self._kind_of_features}" if features >= 1.0 else "; no feature could be "
                "used, which leaves flattening and ovality of the shell in the error bar"),
         ]  # fmt: skip
-        if self.by_hand:
-            remarks.append(self.by_hand)
+        if self.edited:
+            remarks.append(self.edited)
         if oriented.stated_refused:
             remarks.append(f"{oriented.stated_refused}: they are not used")
         refused: dict[str, list[float]] = {}
@@ -249,6 +250,7 @@ def read_film(
     progress: Progress | None = None,
     joint_swing: JointSwing | None = None,
     edits: CameraEdits = NO_EDITS,
+    fixed: BoolArray | None = None,
 ) -> FilmFit:
     """Orient the camera on the benchmark frame, and fit the deflection in every frame.
 
@@ -277,6 +279,8 @@ def read_film(
         How fast the joint swings; frames that jump faster are refused. Without it none is.
     edits : CameraEdits, optional
         What an analyst decided by eye.
+    fixed : (h, w) bool, optional
+        What is the same in every picture, and is not looked at.
 
     Raises
     ------
@@ -292,7 +296,7 @@ def read_film(
         if len(frames) != len(times):
             raise GateError(f"{len(times)} frame times for {len(frames)} frames", code="frame-count")
         benchmark = _read_frame(frames[nearest])
-    benchmark_frame = edited(benchmark, edits, float(times[nearest]))
+    benchmark_frame = edited(benchmark, edits, float(times[nearest]), fixed)
     oriented = orient_camera(benchmark_frame, geometry, camera_mount, joint_station_m, apriori, edits.pose)
     axis = None if plane_lv_rad is None else _axis_of(plane_lv_rad)
     fits: list[FrameFit] = []
@@ -304,14 +308,16 @@ def read_film(
         if np.array_equal(picture, before) and picture.size:
             fits.append(refused_fit(no_horizon(_FROZEN), _FROZEN))
             continue
-        fits.append(oriented.fit(edited(picture, edits, t_s), axis, start))
+        fits.append(oriented.fit(edited(picture, edits, t_s, fixed), axis, start))
         start, before = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad, picture
     if len(fits) != len(times):
         raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
     benchmark_s = float(times[nearest])
     fits = judged(times, fits, joint_swing, edits, benchmark_s if has_texture(oriented) else None)
-    remark = f"by hand: {edits}" if edits.rows else ""
-    return FilmFit(times, tuple(fits), oriented, benchmark_s, plane_lv_rad, plane_sd_rad, remark)
+    remarks = [f"by hand: {edits}"] if edits.rows else []
+    if fixed is not None:
+        remarks.append(f"text burnt into the film: {100.0 * fixed.mean():.0f} % of the picture left out")
+    return FilmFit(times, tuple(fits), oriented, benchmark_s, plane_lv_rad, plane_sd_rad, "; ".join(remarks))
 
 
 def has_texture(oriented: OrientedCamera) -> bool:

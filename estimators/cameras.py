@@ -50,7 +50,7 @@ from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
 from flightmodel.trajectory import nearest_index
 
-# of the variance of the benchmark's deflection: 0.06 deg statically of 0.12 deg in all (`camera_fit.AprioriSd`)
+# of the variance of the benchmark's deflection: 0.06 deg statically of 0.12 deg in all (`frame_solution.AprioriSd`)
 STATIC_PART = 0.25
 _RATE_HZ = 50.0
 _ABOUT_S = 1.0  # about a benchmark: a switch leaves a frame or two out

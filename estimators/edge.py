@@ -14,7 +14,7 @@ Where the edge is expected within a few pixels (`steps_near`), what lies behind 
 The standard deviation then follows from the curvature of the sum of squares over the places, and from what step and
 ramp leave unexplained on neighbouring lines beyond the noise: a small step before clouds, or before a shade on the
 shell, has a large one. The blur (lens and smoothing together) is assumed; a wrong one by a tenth still moves the edge
-by about 0.1 px, for `estimators.camera_fit.AprioriSd` to allow for.
+by about 0.1 px, for `estimators.frame_solution.AprioriSd` to allow for.
 
 Assumed of the search from far: the sky is darker than the shell's rim; the Sun is out of view. A frame in which this
 does not hold is refused, with the reason.

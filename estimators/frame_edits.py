@@ -3,7 +3,7 @@
 `EditedFrame` is a picture with the decisions about it (`flightmodel.camera_edits`); the fit looks for edge and features
 through it alone:
 
-- inside a mask nothing is found;
+- inside a mask, and where text is burnt into the film (`flightmodel.burnt_in`), nothing is found;
 - points of the edge marked by hand take the place of the edge found in that frame;
 - features marked by hand in the benchmark frame become points of the shell where their rays meet it
   (`marked_on_shell`), and where they are marked in another frame count two rows each, along the picture's rows and
@@ -147,16 +147,17 @@ class EditedFrame:
         return np.asarray(~inside | ~self.hidden[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)])
 
 
-def edited(image: Image, edits: CameraEdits, t_s: float) -> EditedFrame:
-    """Picture of the frame at a time with the decisions about it."""
+def edited(image: Image, edits: CameraEdits, t_s: float, fixed: BoolArray | None = None) -> EditedFrame:
+    """Picture of the frame at a time with the decisions about it, and what is fixed in every picture (h, w) hidden."""
     rim = np.array([(row.u_px, row.v_px) for row in edits.at("rim", t_s)]).reshape(-1, 2)
-    return EditedFrame(image, _hidden(image, edits.masks_px(t_s)), rim, edits.features_px(t_s))
+    return EditedFrame(image, _hidden(image, edits.masks_px(t_s), fixed), rim, edits.features_px(t_s))
 
 
-def _hidden(image: Image, masks_px: list[FloatArray]) -> BoolArray | None:
-    if not masks_px or image.ndim != 2:
+def _hidden(image: Image, masks_px: list[FloatArray], fixed: BoolArray | None) -> BoolArray | None:
+    has_fixed = fixed is not None and fixed.shape == image.shape
+    if not (masks_px or has_fixed) or image.ndim != 2:
         return None
-    hidden = np.zeros(image.shape, dtype=np.uint8)
+    hidden = fixed.astype(np.uint8) if fixed is not None and has_fixed else np.zeros(image.shape, dtype=np.uint8)
     for corners in masks_px:
         cv2.fillPoly(hidden, [np.rint(corners).astype(np.int32)], (1,))
     return np.asarray(hidden, dtype=np.bool_)

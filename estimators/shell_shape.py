@@ -1,10 +1,10 @@
 """Did the shell rock as one body, or did it change its shape under load too?
 
 The seed paper read a rocking of its shell and could not say whether a local deformation was among it. A frame's fit
-(`estimators.camera_fit`) finds, beside the deflection ``w``, the shell's flattening and its lobes of two to five waves
-round the shell, ``s`` (13), each with a wide a priori sd about zero. Half of the shell is in view: one frame separates
-lobes from rocking poorly. A film does better, as a shape that yields to the load grows with the dynamic pressure
-``q``::
+(`estimators.frame_solution`) finds, beside the deflection ``w``, the shell's flattening and its lobes of two to five
+waves round the shell, ``s`` (13), each with a wide a priori sd about zero. Half of the shell is in view: one frame
+separates lobes from rocking poorly. A film does better, as a shape that yields to the load grows with the dynamic
+pressure ``q``::
 
     s_i = a l_i + f_i - f_b,    l_i = (q_i - q_b) / q_max,    f ~ Gauss-Markov with sd sigma
 
@@ -53,9 +53,10 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import softmax
 
 from estimators.camera import FilmFit
-from estimators.camera_fit import AprioriSd, FrameFit, OrientedCamera
+from estimators.camera_fit import OrientedCamera
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.frame_residuals import ROUND_WAVES, WAVES
+from estimators.frame_solution import AprioriSd, FrameFit
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.statistics import correlation, mixture_moments, paired_covariance, symmetric_root
 

@@ -13,6 +13,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -20,8 +21,9 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+from flightmodel.burnt_in import burnt_in
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
-from flightmodel.checks import NO_FAULT, Fault, FloatArray
+from flightmodel.checks import NO_FAULT, BoolArray, Fault, FloatArray
 from flightmodel.guarded_files import PICTURE_BYTES, unfit
 from flightmodel.vehicle import CameraMount
 
@@ -33,6 +35,7 @@ PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 WEBM_START = b"\x1aE\xdf\xa3"
 PICTURE_KINDS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 UNKNOWN_FILM = "cannot be opened as a film (known are .webm, .mp4 and .avi)"
+_SPREAD = 9  # frames over a film
 NO_PICTURE: Image = np.zeros((0, 0), dtype=np.uint8)
 
 
@@ -84,6 +87,23 @@ class Frames:
                 yield read_image(self.paths[k])
             return
         yield from film_frames(self.paths[0], [int(self.numbers[k]) for k in wanted])
+
+    @cached_property
+    def burnt_in(self) -> BoolArray | None:
+        """Where the picture (h, w) is the same in every frame, as a time code is; None: nowhere."""
+        chosen = np.unique(np.linspace(0, len(self.time_s) - 1, _SPREAD).round().astype(int))
+        if self.numbers is None:
+            return burnt_in([read_image(self.paths[k]) for k in chosen])
+        film, pictures = cv2.VideoCapture(str(self.paths[0])), []
+        try:
+            for number in self.numbers[chosen]:
+                # where a film seeks to a frame beside, that one does as well
+                film.set(cv2.CAP_PROP_POS_FRAMES, float(number))
+                good, picture = film.read()
+                pictures.append(_grey(picture) if good else NO_PICTURE)
+        finally:
+            film.release()
+        return burnt_in(pictures)
 
 
 def read_image(path: Path) -> Image:

@@ -110,6 +110,7 @@ def camera_film(flight: Flight, frames: Frames | None = None, progress: Progress
         progress=progress,
         joint_swing=joint_swing(vehicle),
         edits=frames.edits,
+        fixed=frames.burnt_in,
     )
 
 
@@ -122,7 +123,7 @@ def orient_on_film(frames: Frames, vehicle: Vehicle) -> OrientedCamera:
         Where the frame cannot be used.
     """
     at_s = float(frames.time_s[frames.benchmark])
-    picture = edited(frames.picture(frames.benchmark), frames.edits, at_s)
+    picture = edited(frames.picture(frames.benchmark), frames.edits, at_s, frames.burnt_in)
     return orient_camera(picture, vehicle.geometry, frames.camera, vehicle.joint.station_m, pose=frames.edits.pose)
 
 

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.camera import JointSwing, has_texture, judged, polar
-from estimators.camera_fit import FrameFit, OrientedCamera
+from estimators.camera_fit import OrientedCamera
 from estimators.frame_edits import EditedFrame, edited
+from estimators.frame_solution import FrameFit
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import EDITS_FILE, POSE, CameraEdits, Edit, faults_of, read_edits, write_edits
@@ -152,7 +153,7 @@ class Session:
         answered = fit is not None and not fit.refused
         own = np.array([*fit.rotation_yz_rad, fit.flattening_rad]) if fit is not None and answered else np.zeros(3)
         tried = own if theta_rad is None or plane_rad is None else deformation_of(theta_rad, plane_rad)
-        picture = edited(self._image(index), work.frames.edits, float(work.frames.time_s[index]))
+        picture = edited(self._image(index), work.frames.edits, float(work.frames.time_s[index]), work.frames.burnt_in)
         view = self._nominal(pose) if pose is not None or work.oriented is None else work.oriented.view
         out: dict[str, Any] = {"answer": None if fit is None else _answer_json(fit), "edge": [], "features": []}
         try:
@@ -244,7 +245,7 @@ class Session:
                         break
                     before = work.fits.get(k - 1)
                     start = np.zeros(2) if before is None or before.refused else before.rotation_yz_rad
-                    picture = edited(image, work.frames.edits, float(work.frames.time_s[k]))
+                    picture = edited(image, work.frames.edits, float(work.frames.time_s[k]), work.frames.burnt_in)
                     work.fits[k] = work.oriented.fit(picture, None, start)
             if self._work is work:
                 self._wake.wait()

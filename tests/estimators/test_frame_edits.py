@@ -6,8 +6,8 @@ import pytest
 
 from estimators.benchmark import orient_camera
 from estimators.camera import JointSwing, read_film
-from estimators.camera_fit import AprioriSd
 from estimators.frame_edits import MARK_SD_PX, EditedFrame, edited
+from estimators.frame_solution import AprioriSd
 from estimators.texture import surface_seen
 from estimators.virtual_camera import deformation_of
 from flightmodel.camera_edits import CameraEdits, Edit

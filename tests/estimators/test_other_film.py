@@ -21,11 +21,12 @@ from estimators.camera import (
     without_remnants,
     without_stray_texture,
 )
-from estimators.camera_fit import FrameFit, _NoFitError, refused_fit
 from estimators.edge import fault_of_frame, is_coherent, no_horizon, steps_near
 from estimators.features import no_features
 from estimators.frame_edits import EditedFrame
+from estimators.frame_solution import FrameFit, NoFitError, refused_fit
 from estimators.virtual_camera import deformation_of
+from flightmodel.burnt_in import burnt_in
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import NO_EDITS
 from flightmodel.checks import NO_FAULT, Fault
@@ -66,6 +67,28 @@ def test_another_paint_is_read_by_its_texture_whatever_the_vehicle_file_states(l
     assert abs(error) < 2.0 * history.theta_sd_rad[1]
 
 
+def test_a_burnt_in_time_code_is_no_texture_of_the_shell():
+    frames, rows = footage("clean")
+    text = [
+        cv2.putText(frame.copy(), f"229:12:59:{k:02d}", (180, 260), cv2.FONT_HERSHEY_SIMPLEX, 2.0, 255, 4)
+        for k, frame in enumerate([*frames, *footage("flown")[0], *(cv2.flip(frame, 1) for frame in frames)])
+    ]
+    fixed = burnt_in(text)
+    both = [
+        read_film(rows.t_s.to_numpy(), film, shell("texture"), MOUNT, JOINT_M, plane_lv_rad=None, fixed=hidden)
+        for film, hidden in ((frames, None), (text[:2], fixed))
+    ]
+    clean, spoilt = (read.history() for read in both)
+    assert abs(spoilt.theta_rad[1] - clean.theta_rad[1]) < 0.5 * clean.theta_sd_rad[1]
+    assert "text burnt into the film" in spoilt.assumptions
+    assert "text burnt into the film" not in clean.assumptions
+    # no texture is taken from what is hidden
+    hidden_px = both[1].oriented.view.sight(both[1].oriented.features.points_shell_m, np.zeros(3)).pixels
+    used = both[1].oriented.benchmark_residuals.index - len(both[1].oriented.clocks_rad)
+    u, v = np.rint(hidden_px[used[used >= 0]]).astype(int).T
+    assert not fixed[v, u].any()
+
+
 def test_the_edge_alone_answers_where_it_is_whole_and_is_refused_where_clouds_lie_behind_it():
     frames, rows = footage("clean")
     read = read_film(rows.t_s.to_numpy(), frames, shell("none"), MOUNT, JOINT_M, plane_lv_rad=None)
@@ -98,7 +121,7 @@ def test_where_features_contradict_the_edge_it_counts_if_it_is_whole():
     short = steps_near(half, oriented.view.lines_at(oriented.clocks_rad, true))
     moved = said.copy()
     both = oriented._solve(short, place, moved, np.eye(2), 9.0)
-    with pytest.raises(_NoFitError) as refusal:
+    with pytest.raises(NoFitError) as refusal:
         oriented._reconciled(EditedFrame(half), short, place, moved, both)
     assert refusal.value.codes == ("features-contradict-edge",)
 

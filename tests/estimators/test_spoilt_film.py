@@ -9,10 +9,10 @@ import pytest
 from estimators import benchmark
 from estimators.benchmark import orient_camera
 from estimators.camera import read_film, without_doubtful
-from estimators.camera_fit import TURN, AprioriSd, refused_fit
 from estimators.features import valleys, visible_features
 from estimators.frame_checks import Design, fault_of_fit
 from estimators.frame_edits import EditedFrame
+from estimators.frame_solution import TURN, AprioriSd, refused_fit
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import Fault, GateError

@@ -2,13 +2,8 @@
 
 import numpy as np
 
-from estimators.camera_fit import (
-    JOINT,
-    LAST_STEP_RAD,
-    OUTLIER_PX,
-    STEPS,
-)
 from estimators.frame_residuals import edge_residuals, feature_residuals, huber_gain, joined
+from estimators.frame_solution import JOINT, LAST_STEP_RAD, OUTLIER_PX, STEPS
 from estimators.virtual_camera import DEFLECTION, FLATTENING
 
 
