@@ -69,6 +69,7 @@ _SOUND_SCORE = 1.5  # the texture agrees with itself
 _EDGE_PASSES = 2
 _CONTRADICTION = 18.4  # chi-square of two components that one sound frame in 10,000 exceeds
 _SAME_BREAK_PX = 2
+_HIDDEN_BREAK = 0.3  # of a row: what is left of it is no break across most of the width
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
 USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
@@ -114,7 +115,7 @@ class OrientedCamera(FrameModel):
             Where to start, e.g. the answer of the frame before.
         """
         frame = unedited(picture)
-        fault = fault_of_frame(frame.image, self.view.camera.size_px) or self._fault_of_breaks(frame.image)
+        fault = fault_of_frame(frame.image, self.view.camera.size_px) or self._fault_of_breaks(frame)
         if fault:
             return refused_fit(no_horizon(fault), fault)
         deformation, basis, horizon = np.zeros(3), np.eye(2), _NOTHING
@@ -146,10 +147,14 @@ class OrientedCamera(FrameModel):
             return refused_fit(horizon, refusal.faults[0])
         return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
 
-    def _fault_of_breaks(self, image: Image) -> Fault:
-        """Whether the picture breaks across its width where the benchmark frame, which may have a border, does not."""
-        for row in breaks_across(image):
-            if not np.any(np.abs(self.breaks - row) <= _SAME_BREAK_PX):
+    def _fault_of_breaks(self, frame: EditedFrame) -> Fault:
+        """Whether the picture breaks across its width where the benchmark frame, which may have a border, does not.
+
+        What is hidden, as a line of text, may be as wide.
+        """
+        for row in breaks_across(frame.image):
+            hidden = 0.0 if frame.hidden is None else float(frame.hidden[row : row + 2].mean())
+            if hidden < _HIDDEN_BREAK and not np.any(np.abs(self.breaks - row) <= _SAME_BREAK_PX):
                 words = f"breaks across its width after row {row}, as the benchmark frame does not: rolled, or torn"
                 return Fault(words, "frame-broken")
         return NO_FAULT

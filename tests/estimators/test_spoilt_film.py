@@ -65,6 +65,16 @@ def test_a_lens_that_zoomed_is_noticed(frames, zoom):
     assert fit.refused.code in CONTRADICTS
 
 
+def test_a_bar_of_text_across_the_picture_is_no_break_where_it_is_hidden(frames):
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    bar = np.zeros(frames[1].shape, dtype=bool)
+    bar[300:340, 30:700] = True
+    pictured = np.where(bar, 0, frames[1]).astype(np.uint8)
+    assert oriented.fit(pictured).refused.code == "frame-broken"
+    hidden, clear = oriented.fit(EditedFrame(pictured, bar)), oriented.fit(frames[1])
+    np.testing.assert_allclose(hidden.rotation_yz_rad, clear.rotation_yz_rad, atol=np.deg2rad(0.1))
+
+
 def sound_design(theta_deg):
     """Derivatives of features on a shell of which the deflection alone is fitted, and where they are."""
     view = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
