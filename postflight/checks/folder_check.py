@@ -359,7 +359,8 @@ def benchmark_frame(found: Sources) -> list[Finding]:
     -------
     list of Finding
         Why it does not, with the code that a run would refuse the film with; or ``features-not-found`` (or the code of
-        the failed orientation) where another way had to be taken than by the features that the vehicle file states.
+        the failed orientation) where another way had to be taken than by the features that the vehicle file states; and
+        ``text-burnt-in`` where text in the film is left out.
     """
     films = {table: found.films[name] for table, name in found.spec.film_names.items() if name in found.films}
     return [finding for table, frames in films.items() for finding in _tried(table, frames, found.vehicle)]
@@ -370,12 +371,15 @@ def _tried(source: str, frames: Frames, vehicle: Vehicle | None) -> list[Finding
         return []
     from postflight.filming import orient_on_film  # which a folder without video needs not wait for
 
-    at = float(frames.time_s[frames.benchmark])
+    at, found = float(frames.time_s[frames.benchmark]), []
+    if frames.burnt_in is not None:
+        words = f"text is burnt into the film: {100.0 * frames.burnt_in.mean():.0f} % of the picture are left out"
+        found.append(Finding(source, words, float(frames.time_s[0]), float(frames.time_s[-1]), "text-burnt-in"))
     try:
         oriented = orient_on_film(frames, vehicle)
     except GateError as fault:
-        return [Finding(source, str(fault), at, at, fault.codes[0])]
+        return [*found, Finding(source, str(fault), at, at, fault.codes[0])]
     if oriented.stated_refused:
         words = f"{oriented.stated_refused}; a run goes by the edge and the shell's texture"
-        return [Finding(source, words, at, at, oriented.stated_refused.code)]
-    return []
+        found.append(Finding(source, words, at, at, oriented.stated_refused.code))
+    return found

@@ -220,9 +220,14 @@ def test_neighbours_that_err_together_are_counted():
     assert samples_together(walk) == pytest.approx(9.0, rel=0.35)
 
 
-def found(picture, features):
+def found(picture, features, burnt_in=None):
     frames = SimpleNamespace(
-        time_s=np.array([421.0]), benchmark=0, picture=lambda _k: picture, camera=MOUNT, edits=NO_EDITS
+        time_s=np.array([421.0]),
+        benchmark=0,
+        picture=lambda _k: picture,
+        camera=MOUNT,
+        edits=NO_EDITS,
+        burnt_in=burnt_in,
     )
     vehicle = replace(read_vehicle("irve2_reference"), geometry=shell(features))
     spec = SimpleNamespace(film_names={"frames": "camera5"})
@@ -236,6 +241,10 @@ def test_check_tries_the_benchmark_frame():
     assert remark.code == "features-not-found"
     (remark,) = benchmark_frame(found(np.zeros((480, 720), dtype=np.uint8), "texture"))
     assert remark.code == "frame-dark"
+    text = np.zeros(picture.shape, dtype=bool)
+    text[20:60, 40:400] = True
+    (remark,) = benchmark_frame(found(picture, "texture", text))
+    assert remark.code == "text-burnt-in"
     assert benchmark_frame(SimpleNamespace(films={}, vehicle=None, spec=SimpleNamespace(film_names={}))) == []
     assert len(no_features().points_shell_m) == 0
 
