@@ -250,6 +250,7 @@ def _cross_check(found: Sources, report: Report) -> None:
     remarks += rotation
     # last: gyros and attitude are only compared where nothing else is suspicious
     remarks += benchmark_frame(found)
+    report.findings += text_in_films(found)
 
 
 def _against_accelerometer(found: Sources, name: str, record: RadarRecord | GnssRecord, report: Report) -> None:
@@ -359,8 +360,7 @@ def benchmark_frame(found: Sources) -> list[Finding]:
     -------
     list of Finding
         Why it does not, with the code that a run would refuse the film with; or ``features-not-found`` (or the code of
-        the failed orientation) where another way had to be taken than by the features that the vehicle file states; and
-        ``text-burnt-in`` where text in the film is left out.
+        the failed orientation) where another way had to be taken than by the features that the vehicle file states.
     """
     films = {table: found.films[name] for table, name in found.spec.film_names.items() if name in found.films}
     return [finding for table, frames in films.items() for finding in _tried(table, frames, found.vehicle)]
@@ -371,15 +371,23 @@ def _tried(source: str, frames: Frames, vehicle: Vehicle | None) -> list[Finding
         return []
     from postflight.filming import orient_on_film  # which a folder without video needs not wait for
 
-    at, found = float(frames.time_s[frames.benchmark]), []
-    if frames.burnt_in is not None:
-        words = f"text is burnt into the film: {100.0 * frames.burnt_in.mean():.0f} % of the picture are left out"
-        found.append(Finding(source, words, float(frames.time_s[0]), float(frames.time_s[-1]), "text-burnt-in"))
+    at = float(frames.time_s[frames.benchmark])
     try:
         oriented = orient_on_film(frames, vehicle)
     except GateError as fault:
-        return [*found, Finding(source, str(fault), at, at, fault.codes[0])]
+        return [Finding(source, str(fault), at, at, fault.codes[0])]
     if oriented.stated_refused:
         words = f"{oriented.stated_refused}; a run goes by the edge and the shell's texture"
-        found.append(Finding(source, words, at, at, oriented.stated_refused.code))
-    return found
+        return [Finding(source, words, at, at, oriented.stated_refused.code)]
+    return []
+
+
+def text_in_films(found: Sources) -> list[Finding]:
+    """Find text burnt into films, which is left out of what the camera reads."""
+    out = []
+    for name, frames in found.films.items():
+        hidden = frames.burnt_in
+        if hidden is not None:
+            words = f"text is burnt into the film: {100.0 * np.mean(hidden):.0f} % of the picture is left out"
+            out.append(Finding(name, words, float(frames.time_s[0]), float(frames.time_s[-1]), code="text-burnt-in"))
+    return out

@@ -31,7 +31,7 @@ from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import NO_EDITS
 from flightmodel.checks import NO_FAULT, Fault
 from flightmodel.vehicle import read_vehicle
-from postflight.checks.folder_check import benchmark_frame
+from postflight.checks.folder_check import benchmark_frame, text_in_films
 from postflight.filming import joint_swing
 from synthetic_flight.film import Imaging, ShellRenderer, record, render_video
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film, sun
@@ -243,7 +243,8 @@ def test_check_tries_the_benchmark_frame():
     assert remark.code == "frame-dark"
     text = np.zeros(picture.shape, dtype=bool)
     text[20:60, 40:400] = True
-    (remark,) = benchmark_frame(found(picture, "texture", text))
+    assert text_in_films(found(picture, "texture")) == []
+    (remark,) = text_in_films(found(picture, "texture", text))
     assert remark.code == "text-burnt-in"
     assert benchmark_frame(SimpleNamespace(films={}, vehicle=None, spec=SimpleNamespace(film_names={}))) == []
     assert len(no_features().points_shell_m) == 0
