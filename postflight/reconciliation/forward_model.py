@@ -43,6 +43,7 @@ from flightmodel.rotations import skew
 from flightmodel.telemetry import Sounding
 from flightmodel.trajectory import Trajectory, resample
 from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
+from postflight.reconciliation import _span_kernels
 from postflight.reconstruction import Reconstruction
 from recon.atmosphere import cg_accelerations, windows_are_whole
 from synthetic_flight import simulate
@@ -580,16 +581,26 @@ class PredictedSpans:
     ----------
     windows, slope : (m, WINDOWS, 6) float
         Rates, rad/s, and specific force, m/s^2, means over windows, and their rates of change.
-    deflection : (m, WINDOWS, 3) float
-        Shell's rotation vector from the body at the windows' middles, rad.
+    attitudes : (m, WINDOWS, 8) float
+        Quaternions of body and shell at the windows' middles, from ECI.
     end : (m, 15 or 17) float
         Motion at the end of the span, in the coordinates of the next one's start.
     """
 
     windows: FloatArray
     slope: FloatArray
-    deflection: FloatArray
+    attitudes: FloatArray
     end: FloatArray
+
+    @property
+    def deflection(self) -> FloatArray:
+        """Shell's rotation vector (m, WINDOWS, 3) from the body at the windows' middles, rad."""
+        body, shell = self.attitudes[..., :4], self.attitudes[..., 4:]
+        return rotations.log(rotations.multiply(rotations.conjugate(body), shell))
+
+    def part(self, rows: slice) -> PredictedSpans:
+        """Return some of the spans."""
+        return PredictedSpans(self.windows[rows], self.slope[rows], self.attitudes[rows], self.end[rows])
 
 
 def integrable(vehicle: Vehicle, steps: WindowSteps) -> Vehicle:
@@ -620,9 +631,8 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
     steps = measured.steps
     states, aux = _flown(measured, integrable(nominal, steps), flights)
     windows, slope = _windows(measured, flights, states, aux)
-    middle = states[:, steps.intervals // 2 :: steps.intervals]
-    deflection = rotations.log(rotations.multiply(rotations.conjugate(middle[..., 6:10]), middle[..., 10:14]))
-    return PredictedSpans(windows, slope, deflection, _ends(measured, flights, states[:, -1]))
+    middle = states[:, steps.intervals // 2 :: steps.intervals, 6:14]
+    return PredictedSpans(windows, slope, middle, _ends(measured, flights, states[:, -1]))
 
 
 def _flown(measured: Measurements, vehicle: Vehicle, flights: SpanFlights) -> tuple[FloatArray, FloatArray]:
@@ -723,17 +733,11 @@ def _windows(
     measured: Measurements, flights: SpanFlights, states: FloatArray, aux: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     bodies = [c.vehicle.centerbody for c in flights.vehicles]
-    arm = np.array([measured.accelerometer_m - body.cg_m for body in bodies])[flights.vehicle][:, None]
-    mass = np.array([body.mass_kg for body in bodies])[flights.vehicle][:, None, None]
-    omega, turn = states[..., 14:17], aux[..., 15:18]
-    force = rotations.rotate(rotations.conjugate(states[..., 6:10]), aux[..., 6:9]) / mass
-    force = force + np.cross(turn, arm) + np.cross(omega, np.cross(omega, arm))
-    records = np.concatenate([omega, force], axis=2)
-    steps = measured.steps
-    windows = np.arange(WINDOWS)[:, None] * steps.intervals + np.arange(steps.intervals + 1)
-    parts = records[:, windows]
-    slope = (parts[:, :, -1] - parts[:, :, 0]) / WINDOW_S
-    return np.einsum("k,mwkj->mwj", steps.simpson, parts), slope
+    arms, masses = np.array([measured.accelerometer_m - b.cg_m for b in bodies]), np.array([b.mass_kg for b in bodies])
+    windows, slope = np.empty((2, len(states), WINDOWS, 6))
+    simpson = measured.steps.simpson
+    _span_kernels.sense(states, aux, flights.vehicle, arms, masses, simpson, WINDOW_S, windows, slope)
+    return windows, slope
 
 
 def _ends(measured: Measurements, flights: SpanFlights, state: FloatArray) -> FloatArray:
