@@ -204,7 +204,9 @@ def sound_speed(altitude_m: FloatArray | float, temperature_k: FloatArray, plane
     return np.asarray(np.sqrt(_sound_square_per_k(altitude_m, temperature_k, planet) * temperature_k))
 
 
-def _sound_square_per_k(altitude_m: FloatArray | float, temperature_k: FloatArray | float, planet: Planet) -> FloatArray:
+def _sound_square_per_k(
+    altitude_m: FloatArray | float, temperature_k: FloatArray | float, planet: Planet
+) -> FloatArray:
     return np.asarray(heat_ratio(altitude_m, temperature_k, planet) * gas_constant(altitude_m, planet))
 
 
@@ -403,7 +405,9 @@ class AtmosphereProfile:
             temperature_k=warmer,
             pressure_pa=pressure * ratio * warmer / temperature,
             sound_speed_mps=(
-                sound_speed(z, warmer, self.planet) if standard is None else np.sqrt(standard.sound_square_per_k * warmer)
+                sound_speed(z, warmer, self.planet)
+                if standard is None
+                else np.sqrt(standard.sound_square_per_k * warmer)
             ),
             wind_ned_mps=wind,
             density_sd=column(self.density_sd) * fade + 0.15 * (1.0 - fade),

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
@@ -207,7 +207,7 @@ class Camera:
         out: FloatArray = cam / np.linalg.norm(cam, axis=1, keepdims=True) @ self.dcm_cam_body
         return out
 
-    def turned(self, rotation_cam_rad: FloatArray, focal_scale: float = 1.0, **other: FloatArray) -> Camera:
+    def turned(self, rotation_cam_rad: FloatArray, focal_scale: float = 1.0, **other: Any) -> Camera:
         """Return this camera with the scene turned by a small rotation vector in camera axes and a scaled focal length.
 
         ``v_cam_new = exp(rotation) v_cam``: a positive rotation about camera y (down) moves the scene to the right.

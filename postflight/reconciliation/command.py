@@ -39,8 +39,8 @@ from postflight.reconciliation.posterior import (
     stiffness_bound,
     vehicle_file_lines,
 )
-from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.reconciliation.without_fit import ENTRIES, without_fit
+from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.second_process import SecondProcess
 from postflight.studies.commands import bands, compared_with_bounds
 from postflight.studies.preflight import Bounds, entry_bounds, rigid_bounds

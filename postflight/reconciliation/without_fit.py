@@ -1,4 +1,4 @@
-"""What of a reconciliation does not need the fit? The second process does it, and loads nothing for it but this module."""
+"""What of a reconciliation does not need the fit? The second process does it, and loads nothing else for it."""
 
 from __future__ import annotations
 
