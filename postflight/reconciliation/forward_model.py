@@ -41,7 +41,7 @@ from flightmodel.checks import FloatArray, GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.rotations import skew
 from flightmodel.telemetry import Sounding
-from flightmodel.trajectory import Trajectory, resample
+from flightmodel.trajectory import Trajectory, nearest_index, resample
 from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
 from postflight.reconciliation import _span_kernels
 from postflight.reconstruction import Reconstruction
@@ -478,7 +478,7 @@ def select_measurements(flight: Reconstruction, loaded: bool = False) -> Measure
             code="data-gap",
         )
     means = cg_accelerations(bet, t, np.zeros(3), 0.5 * WINDOW_S)
-    near = np.abs(bet.smoothed.time_s[:, None] - t).argmin(axis=0)
+    near = nearest_index(bet.smoothed.time_s, t)
     shape = (spans, WINDOWS)
 
     def windows(values: FloatArray) -> FloatArray:
