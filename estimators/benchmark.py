@@ -399,13 +399,14 @@ def _posed(nominal: VirtualCamera, pose: FloatArray) -> VirtualCamera:
     camera = nominal.camera
     lens = camera.distortion.copy()
     lens[:2] += pose[6:8]
-    moved = replace(
-        camera,
+    moved = camera.turned(
+        pose[:3],
+        1.0 + pose[3],
         centre_px=camera.centre_px + pose[4:6],
         distortion=lens,
         position_body_m=camera.position_body_m + pose[8:11],
     )
-    return replace(nominal, camera=moved.turned(pose[:3], 1.0 + pose[3]))
+    return replace(nominal, camera=moved)
 
 
 def _look(

@@ -495,11 +495,13 @@ def _curved_draws(evidence: Evidence, swinging: FloatArray) -> FloatArray:
         if name != "C_m":
             others = others + response @ response.transpose(0, 2, 1)
     known: BoolArray = np.asarray(np.isfinite(evidence.theta_yz_rad).all(axis=1))
-    out = np.full((len(known), len(normals), 2), np.nan)
     root = np.linalg.cholesky(others[known] + _LEAST_VAR * np.eye(2))
     x = normals[None, :, 2:]
-    out[known] = evidence.theta_yz_rad[known, None] + normals[:, :2] @ root.transpose(0, 2, 1)
-    out[known] += by_moment[known, None] * x + evidence.half_curvature_rad[known, None] * x**2
+    drawn = normals[:, :2] @ root.transpose(0, 2, 1)
+    drawn += evidence.theta_yz_rad[known, None]
+    drawn += by_moment[known, None] * x + evidence.half_curvature_rad[known, None] * x**2
+    out = np.full((len(known), *drawn.shape[1:]), np.nan)
+    out[known] = drawn
     return out
 
 

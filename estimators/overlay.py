@@ -31,6 +31,7 @@ YELLOW, GREY, _BLACK, _WHITE = (255, 230, 0), (170, 170, 170), (0, 0, 0), (255, 
 _COLOUR, _BODY_COLOUR = np.array([0.45, 0.75, 1.0]), np.array([0.95, 0.85, 0.65])
 _LINE_SHARE = 90.0
 _SHARE = 0.65
+_ROWS = 32  # of a picture, looked along at a time
 _TORUS_SECTIONS = 20
 _SMOOTH_RAD = float(np.deg2rad(15.0))  # faces of a user's mesh that meet at less are one piece
 
@@ -149,8 +150,11 @@ def _drawing(mesh: BodyMesh, colour: FloatArray = _COLOUR) -> _Drawing:
 def centerbody_pixels(view: VirtualCamera) -> BoolArray:
     """Pixels ``(h, w)`` whose rays meet the centerbody."""
     v, u = np.indices((view.camera.height_px, view.camera.width_px), dtype=float)
-    rays = np.nan_to_num(view.camera.rays_body(np.column_stack([u.ravel(), v.ravel()])))
-    return meets_centerbody(view, rays).reshape(v.shape)
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    # some rows at a time: the inverse of the lens takes ten arrays as large as its pixels
+    parts = np.array_split(pixels, max(1, view.camera.height_px // _ROWS))
+    met = [meets_centerbody(view, np.nan_to_num(view.camera.rays_body(part))) for part in parts]
+    return np.concatenate(met).reshape(v.shape)
 
 
 def horizon_row(view: VirtualCamera, theta_rad: float, plane_lv_rad: float) -> int:

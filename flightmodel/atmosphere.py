@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -200,8 +201,28 @@ def heat_ratio(altitude_m: FloatArray | float, temperature_k: FloatArray | float
 
 def sound_speed(altitude_m: FloatArray | float, temperature_k: FloatArray, planet: Planet = WGS84) -> FloatArray:
     """Speed of sound, m/s, ``(...)`` at geometric altitudes, m, and temperatures, K."""
-    gamma = heat_ratio(altitude_m, temperature_k, planet)
-    return np.asarray(np.sqrt(gamma * gas_constant(altitude_m, planet) * temperature_k))
+    return np.asarray(np.sqrt(_sound_square_per_k(altitude_m, temperature_k, planet) * temperature_k))
+
+
+def _sound_square_per_k(
+    altitude_m: FloatArray | float, temperature_k: FloatArray | float, planet: Planet
+) -> FloatArray:
+    return np.asarray(heat_ratio(altitude_m, temperature_k, planet) * gas_constant(altitude_m, planet))
+
+
+class StandardAir(NamedTuple):
+    """What is known at altitudes where air is looked up again and again: `us76`, and the sound's speed^2 per kelvin."""
+
+    density_kgpm3: FloatArray
+    temperature_k: FloatArray
+    pressure_pa: FloatArray
+    sound_square_per_k: FloatArray
+
+
+def earths_standard_air(altitude_m: FloatArray) -> StandardAir:
+    """Return what `AtmosphereProfile.at` needs of the Earth's standard atmosphere at altitudes (n,), m."""
+    density, temperature, pressure = us76(altitude_m)
+    return StandardAir(density, temperature, pressure, _sound_square_per_k(altitude_m, temperature, WGS84))
 
 
 def _mars_temperature(z: FloatArray) -> FloatArray:
@@ -366,12 +387,10 @@ class AtmosphereProfile:
         check_finite("atmosphere wind", self.wind_ned_mps)
         check_finite("atmosphere density", self.log_density_ratio)
 
-    def at(
-        self, altitude_m: FloatArray | float, standard: tuple[FloatArray, FloatArray, FloatArray] | None = None
-    ) -> AirState:
-        """Air at geometric altitudes, m; ``standard`` is `standard_air` there, where it is known already."""
+    def at(self, altitude_m: FloatArray | float, standard: StandardAir | None = None) -> AirState:
+        """Air at geometric altitudes, m; ``standard`` is `earths_standard_air` there, where it is known already."""
         z = np.asarray(altitude_m, dtype=float)
-        density, temperature, pressure = standard_air(z, self.planet) if standard is None else standard
+        density, temperature, pressure = standard_air(z, self.planet) if standard is None else standard[:3]
         beyond = np.maximum(z - self.altitude_m[-1], 0.0) + np.maximum(self.altitude_m[0] - z, 0.0)
         fade = np.exp(-beyond / self.fade_m)
 
@@ -385,7 +404,11 @@ class AtmosphereProfile:
             density_kgpm3=density * ratio,
             temperature_k=warmer,
             pressure_pa=pressure * ratio * warmer / temperature,
-            sound_speed_mps=sound_speed(z, warmer, self.planet),
+            sound_speed_mps=(
+                sound_speed(z, warmer, self.planet)
+                if standard is None
+                else np.sqrt(standard.sound_square_per_k * warmer)
+            ),
             wind_ned_mps=wind,
             density_sd=column(self.density_sd) * fade + 0.15 * (1.0 - fade),
             wind_sd_mps=column(self.wind_sd_mps) * fade + 20.0 * (1.0 - fade),

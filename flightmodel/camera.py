@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
@@ -42,6 +42,8 @@ LENSES: tuple[Lens, ...] = ("fisheye", "pinhole")
 
 WIDEST_HALF_ANGLE_RAD = float(np.deg2rad(89.0))
 """OpenCV projects through X/Z, so a point must lie in front of the camera."""
+_ANGLES_RAD = np.linspace(0.0, WIDEST_HALF_ANGLE_RAD, 2000)
+_SKEWNESS = 1e-9 + 1e-5 * np.eye(3)  # of a rotation matrix times its transpose, at most
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class Camera:
             check_finite(f"camera.{name}", value)
             object.__setattr__(self, name, value)
         dcm = self.dcm_cam_body
-        if not np.allclose(dcm @ dcm.T, np.eye(3), atol=1e-9) or np.linalg.det(dcm) < 0.0:
+        if (np.abs(dcm @ dcm.T - np.eye(3)) > _SKEWNESS).any() or np.linalg.det(dcm) < 0.0:
             raise GateError("camera.dcm_cam_body: not a rotation matrix", code="camera-rotation")
         object.__setattr__(self, "half_field_rad", one_to_one_half_angle_rad(self.distortion, self.lens))
 
@@ -205,13 +207,14 @@ class Camera:
         out: FloatArray = cam / np.linalg.norm(cam, axis=1, keepdims=True) @ self.dcm_cam_body
         return out
 
-    def turned(self, rotation_cam_rad: FloatArray, focal_scale: float = 1.0) -> Camera:
+    def turned(self, rotation_cam_rad: FloatArray, focal_scale: float = 1.0, **other: Any) -> Camera:
         """Return this camera with the scene turned by a small rotation vector in camera axes and a scaled focal length.
 
         ``v_cam_new = exp(rotation) v_cam``: a positive rotation about camera y (down) moves the scene to the right.
+        Other fields are replaced by those that are given.
         """
         turn = rotations.dcm_from_q(rotations.exp(np.asarray(rotation_cam_rad, dtype=float)))
-        return replace(self, dcm_cam_body=turn @ self.dcm_cam_body, focal_px=self.focal_px * focal_scale)
+        return replace(self, dcm_cam_body=turn @ self.dcm_cam_body, focal_px=self.focal_px * focal_scale, **other)
 
     def sampled(self, samples: int) -> Camera:
         """Return this camera with so many samples along each side of a pixel, those of one pixel about its middle."""
@@ -266,7 +269,7 @@ def _lens_slope(angle_rad: FloatArray | float, distortion: FloatArray) -> FloatA
 
 def one_to_one_half_angle_rad(distortion: FloatArray, lens: Lens = "fisheye") -> float:
     """Largest angle from the optical axis up to which the lens spreads what it sees, at most 89 deg, rad."""
-    angle = np.linspace(0.0, WIDEST_HALF_ANGLE_RAD, 2000)
+    angle = _ANGLES_RAD
     if lens == "fisheye":
         slope = _lens_slope(angle, distortion)
     else:

@@ -49,7 +49,7 @@ class SecondProcess:
     """
 
     def __init__(self, figures: Path | None = None) -> None:
-        self._figures = figures or Path()
+        self._figures, self._draws = figures or Path(), figures is not None
         self._asked: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         self._flight: Reconstruction | None = None
         self._drawing: list[tuple[_Part, tuple[Any, ...]]] = []
@@ -58,7 +58,7 @@ class SecondProcess:
     def __enter__(self) -> SecondProcess:
         """Start it."""
         self._here, there = multiprocessing.Pipe()
-        self._process = Process(target=_serve, args=(there, self._figures), daemon=True)
+        self._process = Process(target=_serve, args=(there, self._figures, self._draws), daemon=True)
         with contextlib.suppress(OSError):
             self._process.start()
         there.close()
@@ -188,13 +188,13 @@ def _film(flight: Flight) -> FilmFit | None:
         return None
 
 
-def _serve(connection: Connection, figures: Path) -> None:
+def _serve(connection: Connection, figures: Path, draws: bool) -> None:
     """Be ready, do what is asked in its order, and send back what came of it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is for the process that started this one
     flight: Reconstruction | None = None
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
-            if not connection.poll():
+            if draws and not connection.poll():
                 import postflight.plots.run_figures  # noqa: F401 - makes ready while nothing is asked
             kind, arguments = connection.recv()
             if kind == "flight":

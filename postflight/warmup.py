@@ -130,6 +130,17 @@ def _balance() -> None:
     kernels.moment_left(np.ones(kernels.COUNT), np.zeros((3, 1, 2)), one, *common)
 
 
+def _spans() -> None:
+    from postflight.reconciliation import _span_kernels as kernels
+
+    records, number, three = np.zeros((1, 3, 22)), np.zeros(1, dtype=np.int64), np.zeros((1, 3))
+    windows, slope = np.empty((2, 1, 1, 6))
+    aux, simpson = np.zeros((1, 3, 18)), np.ones(3)
+    kernels.sense(records, aux, number, three, np.ones(1), simpson, 1.0, windows, slope)
+    one = np.zeros((1, 1))
+    kernels.add_part(one, one, one, number, one)
+
+
 def _camera() -> None:
     """Orient a camera on one synthetic frame, fit it, and lay the virtual camera over it."""
     from estimators.benchmark import orient_camera
@@ -154,6 +165,7 @@ GROUPS: dict[str, Callable[[], None]] = {
     "smoothers": _smoothers,
     "tables": _tables,
     "balance": _balance,
+    "spans": _spans,
     "camera": _camera,
     "ballistic": lambda: _other_motion(True, earth.WGS84),
     "mars": lambda: _other_motion(False, earth.MARS),

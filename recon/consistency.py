@@ -298,7 +298,8 @@ def filter_against_smoother(
     kept = np.flatnonzero(problem.kept)
     settled = problem.time_s[kept] > _settled_from_s(problem)
     difference = boxminus(run.states()[kept], reference[kept])[settled, :KINEMATIC]
-    p_filter, p_smoother = (unpacked(t[settled], KINEMATIC) for t in (run.filtered.p_plus, smoothed.triangles))
+    first = KINEMATIC * (KINEMATIC + 1) // 2
+    p_filter, p_smoother = (unpacked(t[settled, :first]) for t in (run.filtered.p_plus, smoothed.triangles))
     groups = [name for name in GROUPS if name != "attitude" or not problem.motion.ballistic]
     return mcreynolds_checks(difference, p_filter, p_smoother, groups)
 

@@ -84,6 +84,7 @@ _LINEAR_LAG_S = 0.03  # of an oscillation of a second's period a tenth of a radi
 _FARTHEST_SD = 3.0
 _CONVERGED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of its effect
 _CONVERGED_SD = 0.01  # a pass that changes nothing by more than this part of its sd is the last
+_BLOCK = 1 << 16  # samples that are corrected at a time
 
 
 @dataclass(frozen=True)
@@ -396,13 +397,15 @@ def reconstruct_once(
     held_out = held_out_table(problem, run, settings.engine)
     checks += consistency.held_out_checks(problem, held_out, settings)
     checks += survey.place_checks(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
+    residuals = consistency.residual_table(problem, run.innovations)
+    edits = consistency.edit_findings(problem, run.innovations.accepted)
+    states, covariance = run.states(), run.filtered.p_plus
+    del run  # as large as all that follows together
     if sensors is not None and adaptation.lag is None:
         more, adaptation = _oscillation_checks(telemetry, settings, sensors, problem, reference, adaptation)
         checks += more
-    filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
-    residuals = consistency.residual_table(problem, run.innovations)
-    edits = consistency.edit_findings(problem, run.innovations.accepted)
-    del run  # as large as all that follows together
+    filtered = datum_trajectory(problem, mount, states, covariance)
+    del states, covariance
     series = _series(problem, sensors, reference, smoothed)
     findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
     if sensors is not None:
@@ -713,11 +716,15 @@ def corrected_series(
     k = np.clip(np.searchsorted(rate.time_s, t, side="right") - 1, 0, len(rate.time_s) - 1)
     in_rate_gap = rate.in_gap[k] & (t - rate.time_s[k] > 1e-6)
     keep = ~bridged & ~in_rate_gap & (t >= problem.time_s[0]) & (t <= problem.time_s[-1])
-    t = t[keep]
-    errors = interpolate_rows(t, problem.time_s, states.sensor_errors[:, :18])
-    specific_force = correct(force.measured_sensor[keep], errors[:, 0:9], problem.motion.dcm_body_force)
-    measured_rate = interpolate_rows(t, rate.time_s, rate.measured_sensor)
-    return t, specific_force, correct(measured_rate, errors[:, 9:18], problem.motion.dcm_body_rate)
+    t, measured_force = t[keep], force.measured_sensor[keep]
+    specific_force, rates = np.empty((2, len(t), 3))
+    for first in range(0, len(t), _BLOCK):  # eighteen errors a sample are six times the samples
+        part = slice(first, first + _BLOCK)
+        errors = interpolate_rows(t[part], problem.time_s, states.sensor_errors[:, :18])
+        specific_force[part] = correct(measured_force[part], errors[:, 0:9], problem.motion.dcm_body_force)
+        measured_rate = interpolate_rows(t[part], rate.time_s, rate.measured_sensor)
+        rates[part] = correct(measured_rate, errors[:, 9:18], problem.motion.dcm_body_rate)
+    return t, specific_force, rates
 
 
 def _force_partials(problem: Problem, states: States) -> FloatArray:

@@ -181,6 +181,21 @@ def fly_legs(vehicle: Vehicle, runs: list[int], starts: list[Start], legs: list[
 _TABLE_M = simulate.air_altitudes_m()
 
 
+def _turned(dcm: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Vectors (n, 3) by matrices (n, 3, 3)."""
+    return np.einsum("nij,nj->ni", dcm, vectors)
+
+
+def _turned_back(dcm: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Vectors (n, 3) by the transposes of matrices (n, 3, 3)."""
+    return np.einsum("nji,nj->ni", dcm, vectors)
+
+
+def _crossed(vectors: FloatArray, by: FloatArray) -> FloatArray:
+    """Cross products of vectors (n, 3) and one vector (3,)."""
+    return vectors @ rotations.skew(by)
+
+
 @dataclass(frozen=True)
 class Records:
     """One flight: ``states`` (n, 20), ``aux`` (n, 18), its vehicle and its atmosphere table (rows, 6)."""
@@ -199,24 +214,32 @@ class Records:
         """
         body = self.vehicle.centerbody
         arm, rate, turn = self.vehicle.cg_m - body.cg_m, self.states[:, 14:17], self.aux[:, 15:18]
-        force = rotations.rotate(rotations.conjugate(self.states[:, 6:10]), self.aux[:, 6:9])
-        return force / body.mass_kg + np.cross(turn, arm) + np.cross(rate, np.cross(rate, arm))
+        force = _turned_back(self._eci_from_body, self.aux[:, 6:9])
+        swing = rate * (rate @ arm)[:, None] - np.einsum("ni,ni->n", rate, rate)[:, None] * arm  # rate x (rate x arm)
+        return force / body.mass_kg + _crossed(turn, arm) + swing
+
+    @cached_property
+    def _eci_from_body(self) -> FloatArray:
+        return rotations.dcm_from_q(self.states[:, 6:10])
 
     @cached_property
     def velocity_air_body_mps(self) -> FloatArray:
         """Velocity of that point relative to the air, ``(n, 3)``, body axes."""
-        q, rate = self.states[:, 6:10], self.states[:, 14:17]
-        position, velocity = dynamics.points(self.states, self.vehicle)["body"]
-        arm = self.vehicle.cg_m - self.vehicle.centerbody.cg_m
-        at = position + rotations.rotate(q, np.broadcast_to(arm, position.shape))
-        velocity = velocity + rotations.rotate(q, np.cross(rate, arm)) - np.cross(earth.OMEGA_ECEF_RADPS, at)
+        position, velocity, _, _, rate, shell_rate = dynamics.split(self.states)
+        vehicle, to_eci, shell_to_eci = self.vehicle, self._eci_from_body, rotations.dcm_from_q(self.states[:, 10:14])
+        # the point lies where the vehicle's c.g. would if the shell, too, had the body's attitude
+        shell = vehicle.aeroshell
+        arm = (shell.mass_kg / vehicle.mass_kg) * (shell.cg_m - vehicle.joint_m)
+        at = position + to_eci @ arm - shell_to_eci @ arm
+        velocity = velocity + _turned(to_eci, _crossed(rate, arm)) - _turned(shell_to_eci, _crossed(shell_rate, arm))
+        velocity += _crossed(at, earth.OMEGA_ECEF_RADPS)
         # ECI differs from ECEF by a rotation about the Earth's axis: north and east at this longitude of ECI are right
         latitude, longitude, _ = earth.geodetic_from_ecef(at)
         wind = np.zeros_like(velocity)
         for axis in (0, 1):
             wind[:, axis] = np.interp(self.aux[:, 0], _TABLE_M, self.atmosphere[:, 3 + axis])
         wind_eci = np.einsum("nji,nj->ni", earth.dcm_ned_ecef(latitude, longitude), wind)
-        return rotations.rotate(rotations.conjugate(q), velocity - wind_eci)
+        return _turned_back(to_eci, velocity - wind_eci)
 
     @cached_property
     def alpha_total_deg(self) -> FloatArray:

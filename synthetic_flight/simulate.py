@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel import airdata, earth, rotations, sphere_cone
-from flightmodel.atmosphere import AtmosphereProfile, gas_constant, mean_free_path, us76
+from flightmodel.atmosphere import AtmosphereProfile, StandardAir, earths_standard_air, gas_constant, mean_free_path
 from flightmodel.checks import ConfigError, FloatArray, check_finite
 from flightmodel.deflection import DeflectionHistory, lv_clock
 from flightmodel.events import splashdown_index
@@ -490,8 +490,8 @@ def air_altitudes_m(rows: int = ATMOSPHERE_ROWS, from_m: float = ATMOSPHERE_STAR
 
 
 @cache
-def _standard() -> tuple[FloatArray, FloatArray, FloatArray]:
-    return us76(air_altitudes_m())
+def _standard() -> StandardAir:
+    return earths_standard_air(air_altitudes_m())
 
 
 def atmosphere_table(profile: AtmosphereProfile) -> FloatArray:

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import quantile_test
 
 from flightmodel.checks import FloatArray, GateError, write_file
 from flightmodel.guarded_files import open_file
@@ -132,6 +131,8 @@ def percentile_interval(values: FloatArray, percentile: float, confidence: float
     """
     if not len(values):
         return np.nan, np.nan
+    from scipy.stats import quantile_test  # half a second to import
+
     found = quantile_test(values, q=np.inf, p=percentile / 100.0).confidence_interval(confidence)
     return float(found.low), float(found.high)
 

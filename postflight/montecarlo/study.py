@@ -26,7 +26,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pandas as pd
 from pydantic import Field
-from scipy.stats import bootstrap
 
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
 from flightmodel.config import Section, parse_section, read_toml
@@ -315,6 +314,8 @@ def indices(design: Design, values: FloatArray, seed: int = 0) -> tuple[pd.DataF
             f"{np.ptp(kept) if kept.size else 0.0:g}; more flights, or an output that varies, are wanted",
             code="sobol-spread",
         )
+
+    from scipy.stats import bootstrap  # half a second to import
 
     found = bootstrap(
         (np.arange(kept.shape[1]),), lambda rows: _estimate(kept[:, rows]), vectorized=False,

@@ -18,7 +18,6 @@ from flightmodel.flightfolder import read_flight
 from flightmodel.tabular import Tabular
 from postflight import run_folder
 from postflight.commands import compile_kernels, console, print_checks
-from postflight.deflections import estimate
 from postflight.flight import PULSE_RATE_HZ, Flight
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.plots.style import draw
@@ -40,6 +39,7 @@ from postflight.reconciliation.posterior import (
     stiffness_bound,
     vehicle_file_lines,
 )
+from postflight.reconciliation.without_fit import ENTRIES, without_fit
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.second_process import SecondProcess
 from postflight.studies.commands import bands, compared_with_bounds
@@ -50,7 +50,6 @@ from recon.consistency import ConsistencyCheck
 from recon.settings import Settings
 from synthetic_flight.dispersions import Factor, JointDispersions
 
-ENTRIES = 300
 STRONG = 3.0  # logarithm of odds of twenty to one
 LAW_NAMES = {
     "freeplay": "freeplay",
@@ -139,11 +138,11 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
         require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
-        compile_kernels(*RECONSTRUCTION, "simulator", "ensembles")
+        compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "spans")
         flight = reconstruct(
             Flight(telemetry), Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
         )
-        second.ask(_without_fit, flight)
+        second.ask(without_fit, flight)
         fitting = 0.4 if sampled else 0.7
         selection = select_laws(flight, laws, lambda f, what: report(0.2 + fitting * f, what))
         fit, odds = selection.fit, selection.log_odds
@@ -193,11 +192,6 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     )
     console.print(f"the flight lies inside the bands of {ENTRIES} entries, of the pulse: {inside}")
     console.print(f"results in {escape(str(out.path))}")
-
-
-def _without_fit(flight: Reconstruction) -> tuple[DeflectionHistory | None, Bounds]:
-    """Fused deflection, and bands of entries with the joint locked."""
-    return estimate(flight, ("fused",)).histories.get("fused"), rigid_bounds(flight, ENTRIES)
 
 
 def _modal(flight: Reconstruction, fit: JointFit) -> ModalStiffness:

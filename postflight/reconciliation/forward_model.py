@@ -41,8 +41,9 @@ from flightmodel.checks import FloatArray, GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.rotations import skew
 from flightmodel.telemetry import Sounding
-from flightmodel.trajectory import Trajectory, resample
+from flightmodel.trajectory import Trajectory, nearest_index, resample
 from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
+from postflight.reconciliation import _span_kernels
 from postflight.reconstruction import Reconstruction
 from recon.atmosphere import cg_accelerations, windows_are_whole
 from synthetic_flight import simulate
@@ -477,7 +478,7 @@ def select_measurements(flight: Reconstruction, loaded: bool = False) -> Measure
             code="data-gap",
         )
     means = cg_accelerations(bet, t, np.zeros(3), 0.5 * WINDOW_S)
-    near = np.abs(bet.smoothed.time_s[:, None] - t).argmin(axis=0)
+    near = nearest_index(bet.smoothed.time_s, t)
     shape = (spans, WINDOWS)
 
     def windows(values: FloatArray) -> FloatArray:
@@ -580,16 +581,26 @@ class PredictedSpans:
     ----------
     windows, slope : (m, WINDOWS, 6) float
         Rates, rad/s, and specific force, m/s^2, means over windows, and their rates of change.
-    deflection : (m, WINDOWS, 3) float
-        Shell's rotation vector from the body at the windows' middles, rad.
+    attitudes : (m, WINDOWS, 8) float
+        Quaternions of body and shell at the windows' middles, from ECI.
     end : (m, 15 or 17) float
         Motion at the end of the span, in the coordinates of the next one's start.
     """
 
     windows: FloatArray
     slope: FloatArray
-    deflection: FloatArray
+    attitudes: FloatArray
     end: FloatArray
+
+    @property
+    def deflection(self) -> FloatArray:
+        """Shell's rotation vector (m, WINDOWS, 3) from the body at the windows' middles, rad."""
+        body, shell = self.attitudes[..., :4], self.attitudes[..., 4:]
+        return rotations.log(rotations.multiply(rotations.conjugate(body), shell))
+
+    def part(self, rows: slice) -> PredictedSpans:
+        """Return some of the spans."""
+        return PredictedSpans(self.windows[rows], self.slope[rows], self.attitudes[rows], self.end[rows])
 
 
 def integrable(vehicle: Vehicle, steps: WindowSteps) -> Vehicle:
@@ -616,37 +627,38 @@ def resolved_stiffness_nmprad(vehicle: Vehicle) -> float:
 
 
 def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) -> PredictedSpans:
-    """Fly spans and predict the sensors' windows; ``nominal`` gives the coefficient table."""
-    steps = measured.steps
-    states, aux = _flown(measured, integrable(nominal, steps), flights)
-    windows, slope = _windows(measured, flights, states, aux)
-    middle = states[:, steps.intervals // 2 :: steps.intervals]
-    deflection = rotations.log(rotations.multiply(rotations.conjugate(middle[..., 6:10]), middle[..., 10:14]))
-    return PredictedSpans(windows, slope, deflection, _ends(measured, flights, states[:, -1]))
+    """Fly spans and predict the sensors' windows; ``nominal`` gives the coefficient table.
 
-
-def _flown(measured: Measurements, vehicle: Vehicle, flights: SpanFlights) -> tuple[FloatArray, FloatArray]:
-    """States (m, records, 20 or 22) and auxiliaries (m, records, 18), sixteen flights side by side; else NaN."""
+    Sixteen fly side by side, and of their records only what is predicted is kept: all records of a linearisation are
+    hundreds of megabytes.
+    """
+    steps, vehicle = measured.steps, integrable(nominal, measured.steps)
     check_mass(vehicle)
-    starts, steps, first, last = _start_states(measured, flights), measured.steps, *_rows_passed(measured, flights)
     check_step(vehicle, steps.step_s)
+    starts, first, last = _start_states(measured, flights), *_rows_passed(measured, flights)
     parameters = np.array([each.kernel_vector for each in flights.vehicles])
-    shape = (len(starts), steps.records)
-    states, aux = np.full((*shape, starts.shape[1]), np.nan), np.full((*shape, simulate.AUX), np.nan)
+    bodies = [each.vehicle.centerbody for each in flights.vehicles]
+    arms, masses = np.array([measured.accelerometer_m - b.cg_m for b in bodies]), np.array([b.mass_kg for b in bodies])
+    windows, slope = np.empty((2, len(starts), WINDOWS, 6))
+    attitudes, ends = np.empty((len(starts), WINDOWS, 8)), np.empty_like(starts)
 
     def fly(begin: int) -> None:
         block = slice(begin, min(begin + LANES, len(starts)))
         which = np.minimum(np.arange(begin, begin + LANES), len(starts) - 1)
         rows = slice(int(first[block].min()), int(last[block].max()))
-        whole = block.stop - begin == LANES
-        out, more = (states[block], aux[block]) if whole else (a[which] for a in (states, aux))
+        states, aux = (np.full((LANES, steps.records, n), np.nan) for n in (starts.shape[1], simulate.AUX))
         simulate.integrate_into(
-            out, more, vehicle, flights.air_of(which, rows), starts[which], parameters[flights.vehicle[which]],
+            states, aux, vehicle, flights.air_of(which, rows), starts[which], parameters[flights.vehicle[which]],
             steps.step_s, steps.per_record,
             air_from_m=simulate.ATMOSPHERE_START_M + rows.start * simulate.ATMOSPHERE_STEP_M,
         )  # fmt: skip
-        if not whole:
-            states[block], aux[block] = out[: block.stop - begin], more[: block.stop - begin]
+        states, aux = _until_lost(states[: block.stop - begin], aux[: block.stop - begin])
+        numbers = flights.vehicle[block]
+        _span_kernels.sense(
+            states, aux, numbers, arms, masses, steps.simpson, WINDOW_S, windows[block], slope[block]
+        )  # fmt: skip
+        attitudes[block] = states[:, steps.intervals // 2 :: steps.intervals, 6:14]
+        ends[block] = states[:, -1]
 
     def fly_blocks(begins: Index) -> None:
         for begin in begins.tolist():
@@ -657,6 +669,11 @@ def _flown(measured: Measurements, vehicle: Vehicle, flights: SpanFlights) -> tu
         # a few tasks each: handing over a block takes as long as flying it
         parts = np.array_split(blocks, min(len(blocks), 4 * available_cores()))
         list(pool.map(fly_blocks, parts))
+    return PredictedSpans(windows, slope, attitudes, _ends(measured, flights, ends))
+
+
+def _until_lost(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """States and auxiliaries of some flights, NaN from the first record on that is not finite."""
     lost = ~np.isfinite(states).all(axis=2)
     if lost.any():
         lost = np.logical_or.accumulate(lost, axis=1)
@@ -717,23 +734,6 @@ def _cg_from_datum(
     place = cg + share * (rotations.rotate(q_body_shell, arm) - arm)
     drift = rotations.rotate(q_body_shell, np.cross(shell_rate, arm)) - np.cross(omega, arm)
     return place, np.cross(omega, cg) + share * drift
-
-
-def _windows(
-    measured: Measurements, flights: SpanFlights, states: FloatArray, aux: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    bodies = [c.vehicle.centerbody for c in flights.vehicles]
-    arm = np.array([measured.accelerometer_m - body.cg_m for body in bodies])[flights.vehicle][:, None]
-    mass = np.array([body.mass_kg for body in bodies])[flights.vehicle][:, None, None]
-    omega, turn = states[..., 14:17], aux[..., 15:18]
-    force = rotations.rotate(rotations.conjugate(states[..., 6:10]), aux[..., 6:9]) / mass
-    force = force + np.cross(turn, arm) + np.cross(omega, np.cross(omega, arm))
-    records = np.concatenate([omega, force], axis=2)
-    steps = measured.steps
-    windows = np.arange(WINDOWS)[:, None] * steps.intervals + np.arange(steps.intervals + 1)
-    parts = records[:, windows]
-    slope = (parts[:, :, -1] - parts[:, :, 0]) / WINDOW_S
-    return np.einsum("k,mwkj->mwj", steps.simpson, parts), slope
 
 
 def _ends(measured: Measurements, flights: SpanFlights, state: FloatArray) -> FloatArray:

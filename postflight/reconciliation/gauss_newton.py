@@ -18,7 +18,7 @@ minimization", 2012 (geodesic acceleration).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -268,11 +268,19 @@ class Problem:
 
     def predict(self, u: Parameters) -> PredictedSpans:
         """Fly every span once; windows without the instruments' errors."""
-        spans = np.arange(self.measured.spans)
-        zero = np.zeros_like(spans)
-        table = self.air.table(u.air, u.warmer_k)
-        flights = SpanFlights(spans, zero, u.motion, zero, [self.trial_vehicle(u.vehicle)], table)
-        return fly_spans(self.measured, self.vehicle_parameters.nominal, flights)
+        return self._predictions([u])[0]
+
+    def _predictions(self, trials: Sequence[Parameters]) -> list[PredictedSpans]:
+        """`predict` of several parameters, side by side."""
+        spans = self.measured.spans
+        number = np.repeat(np.arange(len(trials)), spans)
+        air, *others = [self.air.table(u.air, u.warmer_k) for u in trials]
+        flights = SpanFlights(
+            np.tile(np.arange(spans), len(trials)), number, np.concatenate([u.motion for u in trials]), number,
+            [self.trial_vehicle(u.vehicle) for u in trials], air, [MovedRows(0, table) for table in others],
+        )  # fmt: skip
+        flown = fly_spans(self.measured, self.vehicle_parameters.nominal, flights)
+        return [flown.part(slice(k * spans, (k + 1) * spans)) for k in range(len(trials))]
 
     def instrument_response(self, predicted: PredictedSpans) -> FloatArray:
         """Response of the windows to the instruments' parameters, (s, WINDOWS, 6, 20).
@@ -310,6 +318,10 @@ class Problem:
         with np.errstate(over="ignore", invalid="ignore"):  # a trial vehicle that tumbles
             total = float((sensors**2).sum() + (joins**2).sum()) + self.prior_cost(u)
         return Residuals(sensors, joins, total if np.isfinite(total) else np.inf)
+
+    def residuals_of(self, trials: Sequence[Parameters]) -> list[Residuals]:
+        """`residuals` of several parameters."""
+        return [self.residuals(*each) for each in zip(trials, self._predictions(trials), strict=True)]
 
     def prior_cost(self, u: Parameters) -> float:
         """Sum of squares of the a priori residuals."""
@@ -524,7 +536,7 @@ def _better(
     """Return the lowest of the best so far and of fractions of one step with its curvature."""
     solved = normal.solver(damping)
     step = solved(normal.right)
-    ahead, behind = (problem.residuals(u.plus(side * LOOK_AHEAD * step)) for side in (1.0, -1.0))
+    ahead, behind = problem.residuals_of([u.plus(side * LOOK_AHEAD * step) for side in (1.0, -1.0)])
     bend = linear.transpose_times(
         (ahead.sensors - 2.0 * linear.residuals.sensors + behind.sensors) / LOOK_AHEAD**2,
         (ahead.joins - 2.0 * linear.residuals.joins + behind.joins) / LOOK_AHEAD**2,
@@ -534,7 +546,8 @@ def _better(
         # a curved path, whose straight part alone may go too far
         curvature = solved(bend)
         paths = [part * step + 0.5 * part**2 * curvature for part in STEP_FRACTIONS]
-    return min([best, *((problem.residuals(end), end) for end in map(u.plus, paths))], key=lambda pair: pair[0].cost)
+    ends = [u.plus(path) for path in paths]
+    return min([best, *zip(problem.residuals_of(ends), ends, strict=True)], key=lambda pair: pair[0].cost)
 
 
 def descend(

@@ -18,13 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 
 from flightmodel.checks import FloatArray
+from postflight.reconciliation import _span_kernels
 from postflight.reconciliation.forward_model import Index
 
 
@@ -53,14 +54,7 @@ class ArrowMatrix:
 
     def add(self, columns: Index, part: FloatArray) -> None:
         """Add a full symmetric part (k, k) at columns (k,), each at most once."""
-        order = np.argsort(columns)
-        columns, part = columns[order], part[np.ix_(order, order)]
-        shared, k = len(self.corner), int(np.searchsorted(columns, len(self.corner)))
-        at, along = columns[:k], columns[k:] - shared
-        self.corner[np.ix_(at, at)] += part[:k, :k]
-        self.across[np.ix_(along, at)] += part[k:, :k]
-        row, column = _lower(len(along))
-        self.band[along[row] - along[column], along[column]] += part[k:, k:][row, column]
+        _span_kernels.add_part(self.corner, self.across, self.band, columns, part)
 
     def add_pairs(self, row: Index, column: Index, values: FloatArray) -> None:
         """Add elements (k,) of the band and what they mirror, each pair of a row and a column (k,) at most once."""
@@ -137,12 +131,6 @@ def _band_solved(band: FloatArray, right: FloatArray, transposed: bool) -> Float
     if not right.size:
         return np.zeros(right.shape)
     return np.asarray(dtbtrs(band, right, uplo="L", trans="T" if transposed else "N")[0]).reshape(right.shape)
-
-
-@cache
-def _lower(size: int) -> tuple[Index, Index]:
-    """Rows and columns of a lower triangle."""
-    return np.tril_indices(size)
 
 
 @dataclass(frozen=True)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,13 @@ from flightmodel.atmosphere import (
     R_AIR_JPKGK,
     AtmosphereProfile,
     default_sounding_sd,
+    earths_standard_air,
     gas_constant,
     heat_ratio,
     profile_from_sounding,
     sound_speed,
     standard_atmosphere,
+    standard_sounding,
     us76,
 )
 from flightmodel.checks import GateError
@@ -147,3 +150,12 @@ def test_the_spline_of_the_upper_tables_is_the_library_s(column, own):
     # the given slope at the bottom is that of the equations below
     below = np.log(np.array(us76(np.array([85990.0, 86000.0]))[0 if column == 1 else 2]))
     assert slope == pytest.approx(np.diff(below)[0] / 10.0, rel=1e-6)
+
+
+def test_air_looked_up_again_is_the_same_to_the_last_bit():
+    z = np.linspace(-500.0, 390e3, 500)
+    profile = profile_from_sounding(standard_sounding())
+    warmer = replace(profile, temperature_offset_k=profile.temperature_offset_k + 7.0)
+    plain, known = warmer.at(z), warmer.at(z, earths_standard_air(z))
+    for name, values in vars(plain).items():
+        np.testing.assert_array_equal(getattr(known, name), values, err_msg=name)

@@ -117,7 +117,8 @@ def test_a_step_whose_look_ahead_tumbles_is_tried_straight():
     first = residuals(u)
     linear = Linearization(first, [(np.array([0, 1]), np.array([[0.0, 1.0]]))], [], 2)
     normal = NormalEquations(full(np.eye(2)), np.array([0.0, 1.0]), np.arange(2))
-    found, end = _better(SimpleNamespace(residuals=residuals), u, linear, normal, 0.0, (first, u))
+    problem = SimpleNamespace(residuals_of=lambda trials: [residuals(u) for u in trials])
+    found, end = _better(problem, u, linear, normal, 0.0, (first, u))
     assert end.instruments[0] == pytest.approx(1.0)
     assert found.cost == pytest.approx(0.0, abs=1e-12)
 

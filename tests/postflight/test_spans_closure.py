@@ -107,6 +107,18 @@ def test_spans_flown_from_the_truth_read_and_end_as_the_truth():
     np.testing.assert_allclose(read.end[:-1, VELOCITY], 0.0, atol=5e-4)
 
 
+def test_trials_flown_side_by_side_leave_what_each_leaves_alone():
+    one, u = problem(), true_unknowns()
+    rng = np.random.default_rng(2)
+    trials = [u, *(u.plus(0.05 * rng.standard_normal(one.count)) for _ in range(2))]
+    together = one.residuals_of(trials)
+    for trial, found in zip(trials, together, strict=True):
+        alone = one.residuals(trial)
+        np.testing.assert_allclose(found.sensors, alone.sensors, rtol=0.0, atol=1e-9 * np.abs(alone.sensors).max())
+        np.testing.assert_allclose(found.joins, alone.joins, rtol=0.0, atol=1e-9 * np.abs(alone.joins).max())
+    assert together[1].cost > 2.0 * together[0].cost
+
+
 def test_spans_start_with_the_datum_where_it_was_reconstructed():
     # the composite c.g. of a bent vehicle is put so that the body's datum has the reconstruction's place and velocity
     one, u = problem(), true_unknowns()

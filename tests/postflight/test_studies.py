@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from flightmodel import rotations
+from flightmodel import earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.checks import ConfigError
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
@@ -13,7 +13,7 @@ from postflight.montecarlo.study import read_study
 from postflight.reconstruction import reconstruct
 from postflight.studies import commands, joints
 from postflight.studies.preflight import dispersions_of, entry_bounds, inside, rigid_bounds
-from synthetic_flight import simulate
+from synthetic_flight import dynamics, simulate
 from synthetic_flight.dispersions import Window
 from synthetic_flight.ensemble import Records, Start, fly_legs, legs
 from synthetic_flight.folder import simulate_to_folder
@@ -151,3 +151,22 @@ def test_a_locked_joint_carries_the_force_of_the_rigid_body():
 def test_an_unknown_vehicle_is_refused(tmp_path):
     with refuses("vehicle-unknown", names=["'irve'"], kind=ConfigError):
         commands.stiffness_and_damping("irve", tmp_path)
+
+
+def test_velocity_of_the_undeflected_c_g_through_the_air_by_the_bodies_own_points():
+    """From the centerbody's c.g. as `dynamics.points` has it, moved along the body: with a swinging joint and winds."""
+    scenario, window = read_scenario(VEHICLE), Window(from_s=430.0, to_s=432.0)
+    vehicle, table = scenario.vehicle, simulate.atmosphere_table(standard_atmosphere())
+    table[:, 3:5] = 12.0, -7.0
+    start = Start(initial_state(scenario), simulate.parameter_vector(vehicle), table)
+    (flown,) = fly_legs(vehicle, [0], [start], legs(scenario.spec.time, window, locked=False))
+    q, rate = flown.states[:, 6:10], flown.states[:, 14:17]
+    position, velocity = dynamics.points(flown.states, vehicle)["body"]
+    arm = np.broadcast_to(vehicle.cg_m - vehicle.centerbody.cg_m, position.shape)
+    at, moving = position + rotations.rotate(q, arm), velocity + rotations.rotate(q, np.cross(rate, arm))
+    latitude, longitude, _ = earth.geodetic_from_ecef(at)
+    wind = np.einsum("nji,j->ni", earth.dcm_ned_ecef(latitude, longitude), np.array([12.0, -7.0, 0.0]))
+    want = rotations.rotate(rotations.conjugate(q), moving - np.cross(earth.OMEGA_ECEF_RADPS, at) - wind)
+    found = Records(flown.states, flown.aux, vehicle, table).velocity_air_body_mps
+    np.testing.assert_allclose(found, want, rtol=0.0, atol=1e-8)
+    assert np.ptp(flown.aux[:, 5]) > np.deg2rad(0.1)

@@ -10,6 +10,7 @@ from flightmodel import earth, rotations
 from flightmodel.instruments import ACCELEROMETER, GnssSpec, TriadSpec
 from flightmodel.telemetry import GnssRecord, TriadRecord
 from flightmodel.trajectory import Trajectory, difference
+from recon import reconstruct
 from recon._measurement_kernels import RADAR
 from recon.consistency import source_checks
 from recon.fault_isolation import _compared
@@ -24,7 +25,7 @@ from recon.imu_screening import (
 )
 from recon.measurements import gnss_instruments, magnetometer_instrument
 from recon.propagation import strapdown_motion, with_disturbances, with_exact_integrals
-from recon.reconstruct import Mounting, datum_trajectory
+from recon.reconstruct import Mounting, corrected_series, datum_trajectory
 from recon.setup import fit_start
 from recon.state import States, boxplus, instrument_blocks, packed
 from recon.vector_attitude import _inconsistent_sensors, compare
@@ -280,3 +281,20 @@ def test_two_attitudes_differ_as_both_may_err():
     # 600 draws of three know the mean to 3 %
     assert found.mean_nees == pytest.approx(3.0, abs=0.4)
     assert found.share_inside == pytest.approx(0.9973, abs=0.005)
+
+
+def test_readings_corrected_in_blocks_are_those_corrected_at_once(monkeypatch):
+    rng, t = np.random.default_rng(4), np.arange(0.0, 1.0, 0.01)
+    force, rate = (
+        SimpleNamespace(time_s=t + late, in_gap=np.zeros(len(t), dtype=bool), measured_sensor=rng.normal(size=(100, 3)))
+        for late in (0.0, 0.002)
+    )
+    turn = rotations.dcm_from_q(rotations.exp(np.array([0.1, -0.2, 0.3])))
+    problem = SimpleNamespace(
+        time_s=np.linspace(0.0, 1.0, 6), motion=SimpleNamespace(dcm_body_force=turn, dcm_body_rate=turn.T)
+    )
+    states = SimpleNamespace(sensor_errors=0.01 * rng.normal(size=(6, 20)))
+    at_once = corrected_series(problem, force, rate, states)
+    monkeypatch.setattr(reconstruct, "_BLOCK", 7)
+    for whole, parts in zip(at_once, corrected_series(problem, force, rate, states), strict=True):
+        np.testing.assert_array_equal(parts, whole)
