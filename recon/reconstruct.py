@@ -390,7 +390,7 @@ def reconstruct_once(
     mount = _mounting(telemetry, sensors)
     table = sensor_error_table(problem, reference, smoothed)
     checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
-    checks += consistency.filter_against_smoother(problem, run, smoothed, reference)
+    checks += consistency.filter_against_smoother(problem, run, smoothed, reference, settings.check_confidence)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
     held_out = held_out_table(problem, run, settings.engine)
