@@ -195,7 +195,7 @@ def data_sheet_check(
 def mcreynolds_checks(
     difference: FloatArray, p_filter: FloatArray, p_smoother: FloatArray, groups: list[str], confidence: float
 ) -> list[ConsistencyCheck]:
-    """Share of filter-minus-smoother differences ``(n, 9)`` that are as small as their own covariance says, by group."""
+    """Share of filter-minus-smoother differences ``(n, 9)`` as small as their covariance says, by group."""
     most_sd = -float(ndtri(0.5 * (1.0 - _LEAST_INSIDE) * (1.0 - confidence)))
     var = np.diagonal(p_filter - p_smoother, axis1=1, axis2=2)
     alive = var > 1e-9 * np.diagonal(p_filter, axis1=1, axis2=2)  # at the end both are one

@@ -511,7 +511,8 @@ def _oscillation_checks(
     """Checks of both triads against each other by the oscillation, and the adaptation with what it shows."""
     force, rate, checks = sensors.force, sensors.rate, []
     span = float(problem.time_s[0]), float(problem.time_s[-1])
-    swings = oscillation.oscillation(force, rate, *span, telemetry.vehicle)
+    speed = problem.time_s, np.linalg.norm(states.velocity_ecef_mps, axis=-1)
+    swings = oscillation.oscillation(force, rate, *span, telemetry.vehicle, speed)
     if swings is not None:
         checks.append(oscillation.axes_check(swings, force, rate))
         known = replace(known, oscillation=swings)
