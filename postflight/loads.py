@@ -51,8 +51,8 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
     inside &= (grid >= begins) & (grid < ends)
     t = grid[inside]
     step = np.median(np.diff(bet.imu_time_s)) if len(bet.imu_time_s) > 1 else 0.0
-    fastest_radps = _fastest_radps(vehicle, bet, air)
-    wanted = _HALF_WINDOW_S if fastest_radps <= 0.0 else min(_HALF_WINDOW_S, _MOST_TURN_RAD / fastest_radps)
+    turning_radps = fastest_radps(vehicle, bet, air)
+    wanted = _HALF_WINDOW_S if turning_radps <= 0.0 else min(_HALF_WINDOW_S, _MOST_TURN_RAD / turning_radps)
     h = min(HALF_WINDOW_S, max(wanted, _LEAST_SAMPLES * float(step)))
     arm = vehicle.cg_m - accelerometer.spec.position_from_datum_body_m
     at = cg_accelerations(bet, t, arm, h)
@@ -85,7 +85,7 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
     )
 
 
-def _fastest_radps(vehicle: Vehicle, bet: TrajectorySolution, air: AirData) -> float:
+def fastest_radps(vehicle: Vehicle, bet: TrajectorySolution, air: AirData) -> float:
     """Rate, rad/s, at which the transverse rates turn in body axes: rigid pitching at peak pressure, and spin there."""
     peak = int(np.nanargmax(air.dynamic_pressure_pa))
     _, normal, moment, _ = vehicle.aero.at(air.mach[peak], SLOPE_AT_RAD) / SLOPE_AT_RAD

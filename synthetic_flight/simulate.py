@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 DEFLECTION_LIMIT_RAD = 0.5 * np.pi
 TUMBLE_RAD = 0.5 * np.pi
+AIR_PA = 1.0  # of dynamic pressure, from which on a vehicle tumbles in the air
 
 ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, ATMOSPHERE_ROWS = -1000.0, 50.0, 8001
 
@@ -409,7 +410,7 @@ def _truth(
     theta, nose = dynamics.deflection_angle(q_b, q_a)
     to_body = rotations.conjugate(q_b)
     air = airdata.air_data(trajectory, profile, vehicle.cg_m)
-    tumbling = (aux[:, 4] > TUMBLE_RAD) & (aux[:, 3] > 1.0)
+    tumbling = (aux[:, 4] > TUMBLE_RAD) & (aux[:, 3] > AIR_PA)
     tumbled_s = float(time_s[np.argmax(tumbling)]) if tumbling.any() else None
     diverged_s = float(time_s[-1]) if diverged else None
     remarks = []

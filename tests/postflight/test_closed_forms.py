@@ -625,7 +625,7 @@ def test_windows_of_a_vehicle_that_pitches_fast_are_short_enough():
     frequency = modes(linear_matrix(vehicle, slopes, pressure_pa, 7000.0)).frequencies_hz[0]
     air = SimpleNamespace(time_s=np.zeros(1), mach=np.array([mach]), dynamic_pressure_pa=np.array([pressure_pa]))
     bet = SimpleNamespace(imu_time_s=np.zeros(1), rate_body_radps=np.array([[spin, 0.0, 0.0]]))
-    fastest = loads._fastest_radps(vehicle, bet, air)
+    fastest = loads.fastest_radps(vehicle, bet, air)
     assert fastest == pytest.approx(2.0 * np.pi * frequency + spin, rel=0.02)
     # of an acceleration that turns at that rate no more is left out than at 2.5 Hz by the usual window
     t = np.arange(0.0, 2.0, 1e-4)
