@@ -450,7 +450,7 @@ def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
     row, component = np.nonzero(np.isfinite(problem.observed.variance))
     source = problem.observed.source[row]
     names = np.array([i.name for i in problem.instruments], dtype=object)
-    components = np.array([(*i.components, "", "")[:3] for i in problem.instruments], dtype=object)
+    components = np.array([(*i.components, "", "")[:3] for i in problem.instruments], dtype=object).reshape(-1, 3)
     return pd.DataFrame(
         {
             "time_s": problem.time_s[problem.node[row]],
