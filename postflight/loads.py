@@ -92,5 +92,5 @@ def fastest_radps(vehicle: Vehicle, bet: TrajectorySolution, air: AirData) -> fl
     restoring_m = -(moment * vehicle.reference.length_m - normal * vehicle.cg_m[0])
     inertia = 0.5 * (vehicle.inertia[1, 1] + vehicle.inertia[2, 2])
     square = air.dynamic_pressure_pa[peak] * vehicle.reference.area_m2 * restoring_m / inertia
-    spin = np.interp(air.time_s[peak], bet.imu_time_s, bet.rate_body_radps[:, 0])
+    spin = np.interp(bet.smoothed.time_s[peak], bet.imu_time_s, bet.rate_body_radps[:, 0])
     return float(np.sqrt(max(square, 0.0)) + abs(spin))
