@@ -180,6 +180,12 @@ class DeflectionHistory(Tabular):
         cov[lost] = self.theta_sd_rad[lost, None, None] ** 2 * np.eye(2)
         return cov
 
+    def largest(self, within_s: tuple[float, float] = (-np.inf, np.inf)) -> int:
+        """Number of the largest answer within a span of time; of all where there is none in it."""
+        inside = (self.time_s >= within_s[0]) & (self.time_s <= within_s[1]) & np.isfinite(self.theta_rad)
+        size = np.where(inside, self.theta_rad, np.nan) if inside.any() else self.theta_rad
+        return int(np.nanargmax(size))
+
     def at(self, time_s: float) -> tuple[float, float]:
         """Angle and its sd, rad, at one time by linear interpolation between answers; NaN outside them and in holes.
 

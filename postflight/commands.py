@@ -412,7 +412,7 @@ def print_answers(answers: Deflections) -> None:
     at_s = answers.reference_s
     cycle = answers.cycle_s
     parts = [] if cycle is None else [f"mean over the cycle from {cycle[0]:.2f} to {cycle[1]:.2f} s"]
-    parts.append("largest")
+    parts.append("largest of the pulse" if answers.bet is not None else "largest")
     if np.isfinite(at_s):
         note = "peak q" if answers.bet is not None else "its largest; no trajectory was made"
         parts.append(f"at {at_s:.2f} s ({note})")

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
+from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import ConfigError, FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory
 from flightmodel.tabular import Tabular
@@ -219,13 +220,15 @@ def _values(run: RunTables, at_s: float) -> dict[str, tuple[float, float]]:
     for _, _, column, sd_column in TRAJECTORY:
         known = inside and bet[column].notna().any()
         out[column] = _near(bet, column, sd_column, at_s) if known else nothing
+    loaded = bet["t_s"][pressure_pulse(np.nan_to_num(bet["dynamic_pressure_pa"].to_numpy(dtype=float)))]
     for method in METHODS:
         history = run.history(method)
         if history is None:
             continue
         theta, sd = np.rad2deg(history.at(at_s))
         out[f"deflection_{method}_deg"] = float(theta), float(sd)
-        out[f"largest_{method}_deg"] = float(np.rad2deg(np.nanmax(history.theta_rad))), np.nan
+        largest = history.largest((loaded.iloc[0], loaded.iloc[-1]))
+        out[f"largest_{method}_deg"] = float(np.rad2deg(history.theta_rad[largest])), np.nan
     return out
 
 

@@ -82,6 +82,14 @@ class Deflections(Tabular):
         return next((float(h.time_s[np.nanargmax(h.theta_rad)]) for h in self.histories.values()), float("nan"))
 
     @property
+    def pulse_s(self) -> tuple[float, float]:
+        """Begin and end of the pressure pulse, in which the largest deflection is looked for; all without a trajectory.
+
+        Where there is hardly a load the largest answer is that of the largest noise.
+        """
+        return (-np.inf, np.inf) if self.bet is None else self.bet.pulse_s
+
+    @property
     def best(self) -> str | None:
         """The fused answer, else the method of the smallest sd at `reference_s`; None where none answers there."""
         at = {method: history.at(self.reference_s)[1] for method, history in self.continuous.items()}
@@ -113,8 +121,9 @@ class Deflections(Tabular):
         Returns
         -------
         DataFrame
-            ``method, t_s, theta_deg, theta_sd_deg, plane_lv_deg, largest_deg, largest_t_s, reason``, the quantiles of
-            `DeflectionHistory.to_frame`, and ``mean_deg, mean_sd_deg`` over the cycle about ``t_s`` (`cycle_s`).
+            ``method, t_s, theta_deg, theta_sd_deg, plane_lv_deg, largest_deg, largest_t_s, reason`` (the largest of the
+            pressure pulse), the quantiles of `DeflectionHistory.to_frame`, and ``mean_deg, mean_sd_deg`` over the cycle
+            about ``t_s`` (`cycle_s`).
         """
         rows: list[tuple[object, ...]] = []
         at_s, cycle = self.reference_s, self.cycle_s
@@ -123,7 +132,7 @@ class Deflections(Tabular):
             theta, sd = np.rad2deg(any_time.at(at_s))
             known = np.isfinite(any_time.theta_rad)
             lateral = [np.interp(at_s, any_time.time_s[known], c[known]) for c in any_time.theta_yz_rad.T]
-            k = int(np.nanargmax(history.theta_rad))
+            k = history.largest(self.pulse_s)
             plane = np.rad2deg(lv_clock(np.array(lateral))) if np.isfinite(theta) else np.nan
             largest = np.rad2deg(history.theta_rad[k]), history.time_s[k]
             mean = np.rad2deg(mean_over(any_time, cycle)) if cycle is not None else (np.nan, np.nan)

@@ -12,15 +12,17 @@ from __future__ import annotations
 import numpy as np
 
 from estimators.loads import FlightLoads
+from estimators.trim import SLOPE_AT_RAD
 from flightmodel import rotations
 from flightmodel.airdata import AirData, angle_partials, lateral_angles
 from flightmodel.telemetry import Telemetry
+from flightmodel.vehicle import Vehicle
 from recon.atmosphere import HALF_WINDOW_S, cg_accelerations, windows_are_whole
 from recon.reconstruct import TrajectorySolution
 
-# of the angular acceleration this half window leaves out 0.5 % at 1 Hz and 3 % at 2.5 Hz; at least some samples must
-# lie in it
-_HALF_WINDOW_S, _LEAST_SAMPLES = 0.02, 2.5
+# of the angular acceleration this half window leaves out 0.5 % at 1 Hz and 3 % at 2.5 Hz; so does a shorter one of a
+# vehicle that pitches and spins faster. At least some samples must lie in it
+_HALF_WINDOW_S, _MOST_TURN_RAD, _LEAST_SAMPLES = 0.02, 0.31, 2.5
 
 
 def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirData) -> FlightLoads:
@@ -49,7 +51,9 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
     inside &= (grid >= begins) & (grid < ends)
     t = grid[inside]
     step = np.median(np.diff(bet.imu_time_s)) if len(bet.imu_time_s) > 1 else 0.0
-    h = min(HALF_WINDOW_S, max(_HALF_WINDOW_S, _LEAST_SAMPLES * float(step)))
+    turning_radps = fastest_radps(vehicle, bet, air)
+    wanted = _HALF_WINDOW_S if turning_radps <= 0.0 else min(_HALF_WINDOW_S, _MOST_TURN_RAD / turning_radps)
+    h = min(HALF_WINDOW_S, max(wanted, _LEAST_SAMPLES * float(step)))
     arm = vehicle.cg_m - accelerometer.spec.position_from_datum_body_m
     at = cg_accelerations(bet, t, arm, h)
     velocity = air.velocity_air_body_mps[inside]
@@ -79,3 +83,14 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
         cg_from_sensor_m=arm,
         half_window_s=h,
     )
+
+
+def fastest_radps(vehicle: Vehicle, bet: TrajectorySolution, air: AirData) -> float:
+    """Rate, rad/s, at which the transverse rates turn in body axes: rigid pitching at peak pressure, and spin there."""
+    peak = int(np.nanargmax(air.dynamic_pressure_pa))
+    _, normal, moment, _ = vehicle.aero.at(air.mach[peak], SLOPE_AT_RAD) / SLOPE_AT_RAD
+    restoring_m = -(moment * vehicle.reference.length_m - normal * vehicle.cg_m[0])
+    inertia = 0.5 * (vehicle.inertia[1, 1] + vehicle.inertia[2, 2])
+    square = air.dynamic_pressure_pa[peak] * vehicle.reference.area_m2 * restoring_m / inertia
+    spin = np.interp(bet.smoothed.time_s[peak], bet.imu_time_s, bet.rate_body_radps[:, 0])
+    return float(np.sqrt(max(square, 0.0)) + abs(spin))

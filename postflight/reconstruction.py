@@ -185,6 +185,12 @@ class Reconstruction(Tabular):
         return find_peak(self.air.time_s, self.air.dynamic_pressure_pa)[0]
 
     @property
+    def pulse_s(self) -> tuple[float, float]:
+        """Begin and end of the pressure pulse, s."""
+        inside = self.air.time_s[airdata.pressure_pulse(np.nan_to_num(self.air.dynamic_pressure_pa))]
+        return float(inside[0]), float(inside[-1])
+
+    @property
     def peak_is_inside(self) -> bool:
         """Whether the largest dynamic pressure is a peak, not the first or last second of the data."""
         return self.air.time_s[0] + 1.0 < self.peak_s < self.air.time_s[-1] - 1.0

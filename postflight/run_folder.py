@@ -232,7 +232,7 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
         any_time = answers.continuous[method]
         theta, sd = np.rad2deg(any_time.at(at_s))
         known = history.time_s[np.isfinite(history.theta_rad)]
-        largest = int(np.nanargmax(history.theta_rad))
+        largest = history.largest(answers.pulse_s)
         quantiles = np.rad2deg(quantiles_at(any_time, at_s))
         out[method] = {
             "deflection_deg": float(theta),

@@ -29,7 +29,10 @@ SLOTS = 23
 
 @merged
 def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acceleration):
-    """Attitude matrix, inertial rate in body axes and acceleration against the Earth at a grid point, in place."""
+    """Attitude matrix, inertial rate in body axes and acceleration against the Earth at a grid point, in place.
+
+    ``rate`` (6,) is the rate and its rate of change: an antenna beside the accelerometer moves by both.
+    """
     dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
     if air is not None:
         a = ballistic_acceleration(
@@ -37,12 +40,12 @@ def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acce
             errors[0], errors[1], errors[2], errors[3], errors[4], errors[5],
         )  # fmt: skip
         for i in range(3):
-            rate[i] = constants(motion.planet)[RATE] * c[2, i]
+            rate[i], rate[3 + i] = constants(motion.planet)[RATE] * c[2, i], 0.0
             acceleration[i] = a[i]
         return
     force = np.empty(3)
     corrected(motion.force_sensor_mps2[index], errors, 0, motion.dcm_body_force, force)
-    corrected(motion.rate_sensor_radps[index], errors, 9, motion.dcm_body_rate, rate)
+    node_rate(motion, index, errors, rate)
     x, y, z = position[0], position[1], position[2]
     gx, gy, gz = gravitation(x, y, z, constants(motion.planet))
     w2, two = constants(motion.planet)[RATE] * constants(motion.planet)[RATE], 2.0 * constants(motion.planet)[RATE]
@@ -51,6 +54,32 @@ def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acce
     acceleration[0] += gx + w2 * x + two * velocity[1]
     acceleration[1] += gy + w2 * y - two * velocity[0]
     acceleration[2] += gz
+
+
+@inlined
+def node_rate(motion, index, errors, rate):
+    """Inertial rate at a grid point and its rate of change in body axes into ``rate`` (6,).
+
+    The gyros' clock and what `with_exact_integrals` took from the sample (at even steps) are made good.
+    """
+    w, t = motion.rate_sensor_radps, motion.time_s
+    before, after = max(index - 1, 0), min(index + 1, len(t) - 1)
+    late = errors[19] if motion.clocks else 0.0
+    first, second = t[index] - t[before], t[after] - t[index]
+    even = before < index < after and abs(second - first) < 0.05 * second
+    sample, change, turn = np.empty(3), np.empty(3), np.empty(3)
+    for j in range(3):
+        slope = (w[after, j] - w[before, j]) / (first + second)
+        sample[j] = w[index, j] + late * slope
+        if even:
+            sample[j] += (w[after, j] - 2.0 * w[index, j] + w[before, j]) / 12.0
+        change[j] = slope + errors[9 + j]  # of which `corrected` takes the bias
+    corrected(sample, errors, 9, motion.dcm_body_rate, turn)
+    for j in range(3):
+        rate[j] = turn[j]
+    corrected(change, errors, 9, motion.dcm_body_rate, turn)
+    for j in range(3):
+        rate[3 + j] = turn[j]
 
 
 @inlined
@@ -71,21 +100,29 @@ def corrected(measured, errors, offset, dcm_body_sensor, out):
 
 
 @inlined
-def observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective, planet):
-    """Observed point (3,), its velocity (3,), and the lever (3,) of rotation, in place.
+def observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective, sweep, pulled, planet):
+    """Observed point (3,), its velocity, levers of rotation of both, and the point's acceleration (3,), in place.
 
-    ``p = r + C d - tau (v + C (w x d)) + tau^2 a / 2`` with ``w`` against the Earth.
+    ``p = r + C d - tau (v + C (w x d)) + tau^2 a_p / 2``, ``a_p = a + C (w' x d + w x (w x d))`` with ``w`` against the
+    Earth.
     """
-    turn, lever_velocity = np.empty(3), np.empty(3)
+    turn, change, lever_velocity = np.empty(3), np.empty(3), np.empty(3)
+    swing, inward = np.empty(3), np.empty(3)
     for i in range(3):
-        turn[i] = rate[i] - constants(planet)[RATE] * c[2, i]
+        turn[i], change[i] = rate[i] - constants(planet)[RATE] * c[2, i], rate[3 + i]
     cross_into(turn, arm, lever_velocity)
+    cross_into(change, arm, swing)
+    cross_into(turn, lever_velocity, inward)
     for i in range(3):
-        effective[i] = arm[i] - tau * lever_velocity[i]
+        swing[i] += inward[i]
+        effective[i] = arm[i] - tau * (lever_velocity[i] - 0.5 * tau * swing[i])
+        sweep[i] = lever_velocity[i] - tau * swing[i]
+    for i in range(3):
         moving = velocity[i] + c[i, 0] * lever_velocity[0] + c[i, 1] * lever_velocity[1] + c[i, 2] * lever_velocity[2]
+        pulled[i] = acceleration[i] + c[i, 0] * swing[0] + c[i, 1] * swing[1] + c[i, 2] * swing[2]
         point[i] = position[i] + c[i, 0] * arm[0] + c[i, 1] * arm[1] + c[i, 2] * arm[2]
-        point[i] += tau * (0.5 * tau * acceleration[i] - moving)
-        speed[i] = moving - tau * acceleration[i]
+        point[i] += tau * (0.5 * tau * pulled[i] - moving)
+        speed[i] = moving - tau * pulled[i]
 
 
 @inlined
@@ -302,28 +339,24 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
         predict_sun(dcm, known, e, c, h, by_state, by_error)
         return
     point, speed, effective, m = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
-    tau = e[3]
-    observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective, planet)
+    tau, sweep, pulled = e[3], np.empty(3), np.empty(3)
+    observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective, sweep, pulled, planet)
     if kind == RADAR:
         predict_radar(site, dcm, known, e, point, h, m, by_error)
         state_rows(m, 3, tau, c, effective, speed, by_state, by_error)
         return
     if kind == RANGE_RATE:
-        predict_range_rate(
-            arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error, planet
-        )
+        predict_range_rate(site, tau, e, c, sweep, pulled, point, speed, effective, h, m, by_state, by_error)
         return
     predict_place(kind, site, dcm, e, point, speed, h, m, by_error, planet)
     if kind == VELOCITY:
-        velocity_rows(m, 3, arm, rate, c, acceleration, by_state, by_error, planet)
+        velocity_rows(m, 3, c, sweep, pulled, by_state, by_error)
         return
     state_rows(m, 1 if kind == HEIGHT else 3, tau, c, effective, speed, by_state, by_error)
 
 
 @inlined
-def predict_range_rate(
-    arm, site, tau, e, rate, c, acceleration, point, speed, effective, h, m, by_state, by_error, planet
-):
+def predict_range_rate(site, tau, e, c, sweep, pulled, point, speed, effective, h, m, by_state, by_error):
     """Range rate ``u . v`` along the line of sight ``u`` from a site, plus its bias; partials by state and errors."""
     slant = 0.0
     for i in range(3):
@@ -336,7 +369,7 @@ def predict_range_rate(
         h[0] += along[0, i] * speed[i]
     for i in range(3):
         m[0, i] = (speed[i] - h[0] * along[0, i]) / slant
-    velocity_rows(along, 1, arm, rate, c, acceleration, by_state, by_error, planet)
+    velocity_rows(along, 1, c, sweep, pulled, by_state, by_error)
     swing = by_state[0].copy()
     late = by_error[0, 3]
     state_rows(m, 1, tau, c, effective, speed, by_state, by_error)
@@ -349,18 +382,15 @@ def predict_range_rate(
 
 
 @inlined
-def velocity_rows(m, count, arm, rate, c, acceleration, by_state, by_error, planet):
-    """Partials of a velocity along the first axes of ``m`` (3, 3): ``m (v + C (w x d) - tau a)``."""
-    turn, lever_velocity, row, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for i in range(3):
-        turn[i] = rate[i] - constants(planet)[RATE] * c[2, i]
-    cross_into(turn, arm, lever_velocity)
+def velocity_rows(m, count, c, sweep, pulled, by_state, by_error):
+    """Partials of a velocity along the first axes of ``m`` (3, 3): ``m (v + C (w x d) - tau a_p)``."""
+    row, lever = np.empty(3), np.empty(3)
     for i in range(count):
-        by_error[i, 3] = -(m[i, 0] * acceleration[0] + m[i, 1] * acceleration[1] + m[i, 2] * acceleration[2])
+        by_error[i, 3] = -(m[i, 0] * pulled[0] + m[i, 1] * pulled[1] + m[i, 2] * pulled[2])
         for j in range(3):
             by_state[i, 3 + j] = m[i, j]
             row[j] = m[i, 0] * c[0, j] + m[i, 1] * c[1, j] + m[i, 2] * c[2, j]
-        cross_into(lever_velocity, row, lever)
+        cross_into(sweep, row, lever)
         for j in range(3):
             by_state[i, 6 + j] = lever[j]
 

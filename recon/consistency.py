@@ -3,8 +3,10 @@
 Innovations of a filter whose model matches the data are white with the predicted covariance, so the sum of normalised
 innovations squared (NIS) is chi-square with as many degrees of freedom as components were measured, and the lag-one
 autocorrelation of a component is normal with sd ``1 / sqrt(N)``. Filter minus smoother has covariance ``P_filter -
-P_smoother`` (McReynolds); differences are correlated in time, so one that is beyond three sd by chance may stay there
-for long: a tenth of them may. Points of the first seconds are left out: the start was fitted to them. The normalised
+P_smoother`` (McReynolds); differences are correlated in time, so one that is large by chance may stay so for long (an
+attitude prior 3.2 sd off is so until the first force). A tenth of them may be beyond ``z`` sd. However they are
+correlated, more are by chance at most ten times as often as a single one is (Markov's inequality), which sets ``z``:
+3.9 at a confidence of 0.999. Points of the first seconds are left out: the start was fitted to them. The normalised
 shift of a sensor error from its a priori value, ``estimate / sqrt(prior_sd^2 - sd^2)``, is standard normal where the
 data sheet is right; radars can absorb a wrong mounting so well that only this shows it.
 
@@ -191,12 +193,13 @@ def data_sheet_check(
 
 
 def mcreynolds_checks(
-    difference: FloatArray, p_filter: FloatArray, p_smoother: FloatArray, groups: list[str]
+    difference: FloatArray, p_filter: FloatArray, p_smoother: FloatArray, groups: list[str], confidence: float
 ) -> list[ConsistencyCheck]:
-    """Share of filter-minus-smoother differences ``(n, 9)`` within three sd of their own covariance, by group."""
+    """Share of filter-minus-smoother differences ``(n, 9)`` as small as their covariance says, by group."""
+    most_sd = -float(ndtri(0.5 * (1.0 - _LEAST_INSIDE) * (1.0 - confidence)))
     var = np.diagonal(p_filter - p_smoother, axis1=1, axis2=2)
     alive = var > 1e-9 * np.diagonal(p_filter, axis1=1, axis2=2)  # at the end both are one
-    inside = np.abs(difference) <= 3.0 * np.sqrt(np.where(alive, var, 0.0))
+    inside = np.abs(difference) <= most_sd * np.sqrt(np.where(alive, var, 0.0))
     out = []
     for name in groups:
         part = GROUPS[name]
@@ -292,7 +295,7 @@ def _measured_noise(normalised: FloatArray, measured: BoolArray, components: tup
 
 
 def filter_against_smoother(
-    problem: Problem, run: ForwardPass, smoothed: Smoothed, reference: States
+    problem: Problem, run: ForwardPass, smoothed: Smoothed, reference: States, confidence: float
 ) -> list[ConsistencyCheck]:
     """Filter against smoother at the kept nodes after the first seconds."""
     kept = np.flatnonzero(problem.kept)
@@ -301,7 +304,7 @@ def filter_against_smoother(
     first = KINEMATIC * (KINEMATIC + 1) // 2
     p_filter, p_smoother = (unpacked(t[settled, :first]) for t in (run.filtered.p_plus, smoothed.triangles))
     groups = [name for name in GROUPS if name != "attitude" or not problem.motion.ballistic]
-    return mcreynolds_checks(difference, p_filter, p_smoother, groups)
+    return mcreynolds_checks(difference, p_filter, p_smoother, groups, confidence)
 
 
 def data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) -> list[ConsistencyCheck]:
@@ -448,7 +451,7 @@ def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
     row, component = np.nonzero(np.isfinite(problem.observed.variance))
     source = problem.observed.source[row]
     names = np.array([i.name for i in problem.instruments], dtype=object)
-    components = np.array([(*i.components, "", "")[:3] for i in problem.instruments], dtype=object)
+    components = np.array([(*i.components, "", "")[:3] for i in problem.instruments], dtype=object).reshape(-1, 3)
     return pd.DataFrame(
         {
             "time_s": problem.time_s[problem.node[row]],

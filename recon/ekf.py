@@ -203,12 +203,12 @@ class Problem:
 
     def sources(self) -> Sources:
         """Instruments as arrays."""
-        return Sources(
+        return Sources(  # shaped where there is no instrument, too
             np.array([i.kind for i in self.instruments], dtype=np.int64),
-            np.array([i.arm_body_m for i in self.instruments]),
-            np.array([i.site_ecef_m for i in self.instruments]),
-            np.array([i.dcm for i in self.instruments]),
-            np.array([i.slots(self.model) for i in self.instruments]),
+            np.array([i.arm_body_m for i in self.instruments]).reshape(-1, 3),
+            np.array([i.site_ecef_m for i in self.instruments]).reshape(-1, 3),
+            np.array([i.dcm for i in self.instruments]).reshape(-1, 3, 3),
+            np.array([i.slots(self.model) for i in self.instruments], dtype=np.int64).reshape(-1, SLOTS),
         )
 
     @property
@@ -262,7 +262,8 @@ class Problem:
 
 def observe(time_s: FloatArray, instruments: tuple[Instrument, ...]) -> tuple[Observed, IntArray]:
     """All measurements of instruments that lie on nodes (within `SAME_INSTANT_S`), by node, and their rows (M,)."""
-    source, row, node = [], [], []
+    none = np.empty(0, dtype=np.int64)  # an entry state and inertial sensors need no tracker
+    source, row, node = [none], [none], [none]
     for number, instrument in enumerate(instruments):
         nearest = nearest_index(time_s, instrument.time_s)
         on = np.flatnonzero(np.abs(time_s[nearest] - instrument.time_s) <= SAME_INSTANT_S)
@@ -424,7 +425,7 @@ class _FilterpyPass:
     def node_motion(self, k: int) -> NodeMotion:
         """Motion of a node, as measurements are predicted from it."""
         chart = self.chart(k)
-        rate, acceleration = np.empty(3), np.empty(3)
+        rate, acceleration = np.empty(6), np.empty(3)
         _measurement_kernels.motion_at(
             *self.problem.motion.split(), self.problem.node_index[k], *as_charts(chart), rate, acceleration
         )

@@ -3,9 +3,10 @@
 A tracked point at ``d`` from the accelerometer in body axes, tagged ``t``, was observed at ``t - tau`` (``tau``: time
 tag minus true time), so
 
-    p = r + C d - tau (v + C (w x d)) + tau^2 a / 2
+    p = r + C d - tau (v + C (w x d)) + tau^2 a_p / 2,      a_p = a + C (w' x d + w x (w x d))
 
-with ``w`` the body's rate against the Earth and ``a`` the acceleration. Then, each plus its errors and noise:
+with ``w`` the body's rate against the Earth at the tag, by the gyros' own clock, and ``a`` the acceleration of the
+accelerometer. Then, each plus its errors and noise:
 
 * radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95), the lag of its servo
   (`recon.tracking_servo`, ``1 + e`` times the one of the path about which one is linearised), residual
@@ -351,7 +352,7 @@ def sun_instruments(name: str, record: SunRecord, sun_ecef: FloatArray, rows: In
 
 @dataclass(frozen=True)
 class NodeMotion:
-    """Attitude matrix, inertial rate in body axes and acceleration against the Earth at one node."""
+    """Attitude matrix, inertial rate and its rate of change (6,) in body axes and acceleration against the Earth."""
 
     position_ecef_m: FloatArray
     velocity_ecef_mps: FloatArray
@@ -381,24 +382,28 @@ def predict(
         by_state[: len(reading), 6:9] = by_body @ rotations.skew(body)
         return np.append(reading, np.zeros(3 - len(reading))), by_state, by_error
     c, arm, tau = at.dcm_ecef_body, instrument.arm_body_m, e[3]
-    lever_velocity = np.cross(at.rate_body_radps - at.planet.rate_radps * c[2], arm)
+    turning, change = np.split(at.rate_body_radps, 2)
+    turning = turning - at.planet.rate_radps * c[2]
+    lever_velocity = np.cross(turning, arm)
     moving = at.velocity_ecef_mps + c @ lever_velocity
-    point = at.position_ecef_m + c @ arm - tau * moving + 0.5 * tau**2 * at.acceleration_ecef_mps2
-    speed = moving - tau * at.acceleration_ecef_mps2
+    swing = np.cross(change, arm) + np.cross(turning, lever_velocity)
+    pulled = at.acceleration_ecef_mps2 + c @ swing
+    point = at.position_ecef_m + c @ arm - tau * moving + 0.5 * tau**2 * pulled
+    speed = moving - tau * pulled
     if instrument.kind == VELOCITY:
         by_state[:, 3:6] = instrument.dcm
-        by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(lever_velocity)
+        by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(lever_velocity - tau * swing)
         by_error[:, 0:3] = np.eye(3)
-        by_error[:, 3] = -instrument.dcm @ at.acceleration_ecef_mps2
+        by_error[:, 3] = -instrument.dcm @ pulled
         return instrument.dcm @ speed + e[0:3], by_state, by_error
     if instrument.kind == RANGE_RATE:
         sight = point - instrument.site_ecef_m
         u = sight / np.linalg.norm(sight)
         across = (speed - (u @ speed) * u) / np.linalg.norm(sight)
         by_state[0, 0:3], by_state[0, 3:6] = across, u - tau * across
-        by_state[0, 6:9] = -u @ c @ rotations.skew(lever_velocity)
-        by_state[0, 6:9] -= across @ c @ rotations.skew(arm - tau * lever_velocity)
-        by_error[0, 0:2], by_error[0, 3] = 1.0, -across @ speed - u @ at.acceleration_ecef_mps2
+        by_state[0, 6:9] = -u @ c @ rotations.skew(lever_velocity - tau * swing)
+        by_state[0, 6:9] -= across @ c @ rotations.skew(arm - tau * (lever_velocity - 0.5 * tau * swing))
+        by_error[0, 0:2], by_error[0, 3] = 1.0, -across @ speed - u @ pulled
         return np.array([u @ speed + e[0] + e[1], 0.0, 0.0]), by_state, by_error
     if instrument.kind == RADAR:
         h, m = _radar(instrument, known, e, point, by_error)
@@ -409,7 +414,7 @@ def predict(
         h, m = _height(instrument, e, point, by_error, at.planet)
     by_state[:, 0:3] = m
     by_state[:, 3:6] = -tau * m
-    by_state[:, 6:9] = -m @ c @ rotations.skew(arm - tau * lever_velocity)
+    by_state[:, 6:9] = -m @ c @ rotations.skew(arm - tau * (lever_velocity - 0.5 * tau * swing))
     by_error[:, 3] = -m @ speed
     return h, by_state, by_error
 

@@ -4,10 +4,16 @@ The flow's force on an oscillating vehicle and its moment act at the same instan
 lateral components as complex numbers, ``F = f_y + i f_z`` and ``W = w_y + i w_z``, a vehicle of equal moments of
 inertia about y and z has
 
-    F(t) = a + b u + c u^2 + (d + e u) i W'(t) + g w_x W(t),        d, e, g real, ``u`` from -1/2 to 1/2,
+    F(t) = a + b u + c u^2 + (d + e u) i (W'(t) + k W(t)) + g w_x W(t),        d, e, g real, ``u`` from -1/2 to 1/2,
 
 in windows of `_WINDOW_S`: slow loads, the force of a moment that changes slowly with pressure, the lever arm of the
-accelerometer, and the coupling with roll. A fault of one of the two sensors changes the relation in a way of its own:
+accelerometer, and the coupling with roll. Pitch damping is part of the moment and not of the force,
+
+    k = -q S l^2 C_mq / (2 V I) = -m |a_x| l^2 C_mq / (2 V C_A I),
+
+by the axial force and the trajectory's speed, with the C_mq that explains the readings best, given its stated sd. Of a
+vehicle that cones at ``w`` it turns the relation by ``k / w``: 3 deg in the slow descent of a large shell. A fault of
+one of the two sensors changes the relation in a way of its own:
 
 * a **lag** of the accelerometer's tags: ``W(t - lag)``;
 * a triad turned about **roll**: a common phase of ``d``, ``e`` and ``g``;
@@ -49,6 +55,11 @@ _LEAST_EXPLAINED = 0.95  # share of the lateral force's square, by the best hypo
 # unequal inertia, c.g. offsets and the joint turn the relation: 0.37 deg rms, at most 0.63, on 13 sound flights
 _LEAST_ROLL_RAD = np.deg2rad(2.0)
 _ROLL_SD = 4.0
+# speed of sound in thin air, 270 to 340: C_A and C_mq change slowly with Mach number; slower is no flight
+_SOUND_MPS, _DESCENT_MPS, _SLOWEST_MPS = 300.0, 100.0, 1.0
+# C_mq less the stated one, in its sd, among which it is looked for; dense where an unknown speed may make it small
+_DAMPING_SD = np.array([0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0])
+_DAMPING_SD = np.concatenate([-_DAMPING_SD[:0:-1], _DAMPING_SD])
 _USELESS_ROLL_RAD = np.deg2rad(10.0)  # a sixth of the lateral force is then in the wrong plane
 _SLIPS = (  # phase of the conjugate, in quarter turns, and what each sensor's slip would be
     "the sign of a lateral axis of one of them (r, or the accelerometer's body z)",
@@ -91,7 +102,10 @@ class Oscillation:
 
 @dataclass(frozen=True)
 class _Normal:
-    """Normal equations of w windows at l lags: square of the force (w,), ``Re C^H C`` (w, l, 3, 3), ``C^H F``."""
+    """Normal equations of w windows at l lags: square of the force (w,), ``Re C^H C`` (w, l, 5, 5), ``C^H F``.
+
+    Columns: ``i (W' + k W)``, the same times ``u``, ``i W`` by the sd of ``k``, the same times ``u``, ``w_x W``.
+    """
 
     square: FloatArray
     gram: FloatArray
@@ -101,20 +115,35 @@ class _Normal:
         """Return those of one lag alone."""
         return _Normal(self.square, self.gram[:, [lag]], self.moment[:, [lag]])
 
+    def damped(self, by_sd: float) -> _Normal:
+        """Return those of the three columns with ``k`` moved by so many of its sd."""
+        pick = np.array([[1.0, 0.0, by_sd, 0.0, 0.0], [0.0, 1.0, 0.0, by_sd, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0]])
+        return _Normal(self.square, pick @ self.gram @ pick.T, self.moment @ pick.T)
+
     def rest(self, phase_rad: FloatArray) -> FloatArray:
-        """Share of the square (w, l, p) that is left at phases (p,)."""
+        """Share of the square (w, l, p) that is left at phases (p,), of three columns."""
         turned = (self.moment[:, :, None] * np.exp(-1j * phase_rad)[:, None]).real
         solved = np.linalg.solve(self.gram[:, :, None], turned[..., None])[..., 0]
         return np.asarray(1.0 - np.einsum("wlpi,wlpi->wlp", turned, solved) / self.square[:, None, None])
 
+    def rests(self, phase_rad: FloatArray) -> FloatArray:
+        """Shares (s, w, l, p) that are left with each damping of `_DAMPING_SD` at phases (p,)."""
+        return np.stack([self.damped(by_sd).rest(phase_rad) for by_sd in _DAMPING_SD.tolist()])
+
     def first(self, lag: int, phase_rad: float) -> FloatArray:
-        """Coefficient ``d`` (w,) at one lag and phase."""
-        turned = (self.moment[:, lag] * np.exp(-1j * phase_rad)).real
-        return np.asarray(np.linalg.solve(self.gram[:, lag], turned[..., None])[:, 0, 0])
+        """Coefficient ``d`` (w,) at one lag and phase, damping as stated."""
+        stated = self.damped(0.0)
+        turned = (stated.moment[:, lag] * np.exp(-1j * phase_rad)).real
+        return np.asarray(np.linalg.solve(stated.gram[:, lag], turned[..., None])[:, 0, 0])
 
 
 def oscillation(
-    force: BridgedSensor, rate: BridgedSensor, start_s: float, end_s: float, vehicle: Vehicle | None
+    force: BridgedSensor,
+    rate: BridgedSensor,
+    start_s: float,
+    end_s: float,
+    vehicle: Vehicle | None,
+    speed: tuple[FloatArray, FloatArray] | None = None,
 ) -> Oscillation | None:
     """Likeliest relation of both sensors between two times; None where no oscillation shows it.
 
@@ -125,32 +154,36 @@ def oscillation(
     vehicle : Vehicle or None
         Without one nothing is known of how the body moves in the flow (a car is pushed aside by its wheels), and
         nothing is said.
+    speed : ((n,) float, (n,) float), optional
+        Times, s, and speed, m/s. Without it damping is whatever explains the readings best.
     """
     if vehicle is None or max(np.median(np.diff(t.time_s)) for t in (force, rate)) > SLOWEST_S:
         return None
     aft = bool(force.spec.position_from_datum_body_m[0] <= vehicle.cg_m[0])
     steps = round(_LONGEST_LAG_S / LAG_STEP_S)
     lags = np.asarray(LAG_STEP_S * np.arange(-steps, steps + 1), dtype=np.float64)
-    found = _normal_equations(force, rate, start_s, end_s, lags)
+    found = _normal_equations(force, rate, start_s, end_s, lags, _damping_by_force(vehicle, speed))
     if found is None:
         return None
     proper, mirrored = found
     none = len(lags) // 2
     quarter = np.linspace(0.0, 1.5 * np.pi, 4)
     phases = np.linspace(-np.pi, np.pi, round(2.0 * np.pi / _ROLL_STEP_RAD), endpoint=False)
-    by_lag = proper.rest(np.zeros(1))[:, :, 0]
+    by_lag = proper.rests(np.zeros(1))[..., 0]
     at_none = proper.at(none)
-    by_roll, by_mirror = at_none.rest(phases)[:, 0], mirrored.rest(quarter)[:, 0]
-    best = np.minimum.reduce([by_lag.min(axis=1), by_roll.min(axis=1), by_mirror.min(axis=1)])
+    by_roll, by_mirror = at_none.rests(phases)[:, :, 0], mirrored.rests(quarter)[:, :, 0]
+    best = np.minimum.reduce([rest.min(axis=(0, 2)) for rest in (by_lag, by_roll, by_mirror)])
     use = best < 1.0 - _LEAST_EXPLAINED
     if use.sum() < _LEAST_WINDOWS:
         return None
     samples = 2.0 * _WINDOW_S / CORRELATION_S  # of both components
 
-    def log_likelihood(rest: FloatArray) -> FloatArray:
-        return np.asarray(-0.5 * samples * np.log(np.maximum(rest[use], 1e-9)).sum(axis=0))
+    def log_likelihood(rests: FloatArray) -> FloatArray:
+        """Of the likeliest damping, its prior included."""
+        fits = -0.5 * samples * np.log(np.maximum(rests[:, use], 1e-9)).sum(axis=1)
+        return np.asarray((fits - 0.5 * _DAMPING_SD[:, None] ** 2).max(axis=0))
 
-    lag_log, roll_log, mirror_log = (log_likelihood(rest) for rest in (by_lag, by_roll, by_mirror))
+    lag_log, roll_log, mirror_log = (log_likelihood(rests) for rests in (by_lag, by_roll, by_mirror))
     gains = {
         DELIVERED: 0.0,
         LAG: float(lag_log.max() - lag_log[none]),
@@ -158,7 +191,8 @@ def oscillation(
         MIRRORED: float(mirror_log.max() - lag_log[none]),
     }
     roll, roll_sd = _refined(roll_log, _ROLL_STEP_RAD)
-    either_side = [_refined(log_likelihood(proper.at(none + k).rest(phases)[:, 0]), _ROLL_STEP_RAD)[0] for k in (-1, 1)]
+    beside = (log_likelihood(proper.at(none + k).rests(phases)[:, :, 0]) for k in (-1, 1))
+    either_side = [_refined(log, _ROLL_STEP_RAD)[0] for log in beside]
     # a phase and its opposite leave the same rest: half a turn more or less is none
     per_lag = np.mod(either_side[1] - either_side[0] + 0.5 * np.pi, np.pi) - 0.5 * np.pi
     clocks_s = np.hypot(force.spec.time_bias_sd_s, rate.spec.time_bias_sd_s)
@@ -182,12 +216,34 @@ def _with_positive(normal: _Normal, use: BoolArray, phase_rad: float, aft: bool)
     return float(np.angle(-np.exp(1j * phase))) if wrong else phase
 
 
+def _damping_by_force(vehicle: Vehicle, speed: tuple[FloatArray, FloatArray] | None) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) and ``k / |a_x|`` of the module's equation and its sd (n, 2), s/m.
+
+    Without a speed that of a slow descent, where damping is largest, and anything between it and none.
+    """
+    time_s, speed_mps = (np.zeros(1), np.full(1, _DESCENT_MPS)) if speed is None else speed
+    speed_mps = np.maximum(speed_mps, _SLOWEST_MPS)
+    ca, _, _, cmq = vehicle.aero.at(speed_mps / _SOUND_MPS, 0.0).T
+    inertia = 0.5 * (vehicle.inertia[1, 1] + vehicle.inertia[2, 2])
+    per_cmq = vehicle.mass_kg * vehicle.reference.length_m**2 / (2.0 * speed_mps * ca * inertia)
+    sd = np.full(len(cmq), vehicle.uncertainty.cmq)
+    stated = (-cmq, sd) if speed is not None else (0.0 * cmq, np.hypot(cmq, sd))
+    return time_s, per_cmq[:, None] * np.column_stack(stated)
+
+
 def _normal_equations(
-    force: BridgedSensor, rate: BridgedSensor, start_s: float, end_s: float, lags: FloatArray
+    force: BridgedSensor,
+    rate: BridgedSensor,
+    start_s: float,
+    end_s: float,
+    lags: FloatArray,
+    damping_by_force: tuple[FloatArray, FloatArray],
 ) -> tuple[_Normal, _Normal] | None:
     """Normal equations of the proper relation at all lags and of the mirrored one at none; None without windows."""
     (ft, f), (wt, w) = smoothed_body_axes(force), smoothed_body_axes(rate)
-    rates = np.column_stack([w, np.gradient(w, wt, axis=0)[:, 1:]])
+    deceleration = np.maximum(-np.interp(wt, ft, f[:, 0]), 0.0)
+    damping = deceleration[:, None] * interpolate_rows(wt, *damping_by_force)
+    rates = np.column_stack([w, np.gradient(w, wt, axis=0)[:, 1:] + damping[:, :1] * w[:, 1:], damping[:, 1]])
     start = max(start_s, ft[0], wt[0] + _LONGEST_LAG_S)
     end = min(end_s, ft[-1], wt[-1] - _LONGEST_LAG_S)
     begins = [b for b in np.arange(start, end - _WINDOW_S, _WINDOW_S) if not (has_gap(force, b) or has_gap(rate, b))]
@@ -205,10 +261,12 @@ def _normal_equations(
     proper, mirrored = [], []
     for k in strongest:
         at = begins[k] + (u + 0.5) * _WINDOW_S - lags[:, None]
-        p, q, r, q_dot, r_dot = interpolate_rows(at.ravel(), wt, rates).T.reshape(5, *at.shape)
-        lateral, normal, none = q + 1j * r, q_dot + 1j * r_dot, [len(lags) // 2]
-        proper.append(_gram_and_moment(u, p, lateral, normal, slow, forces[k]))
-        mirrored.append(_gram_and_moment(u, p[none], lateral[none].conj(), normal[none].conj(), slow, forces[k]))
+        p, q, r, q_turn, r_turn, damped = interpolate_rows(at.ravel(), wt, rates).T.reshape(6, *at.shape)
+        lateral, normal, none = q + 1j * r, q_turn + 1j * r_turn, [len(lags) // 2]
+        columns = p * lateral, normal, damped * lateral
+        proper.append(_gram_and_moment(u, *columns, slow, forces[k]))
+        mirror = (p[none] * lateral[none].conj(), normal[none].conj(), damped[none] * lateral[none].conj())
+        mirrored.append(_gram_and_moment(u, *mirror, slow, forces[k]))
     at_lags, at_none = (
         _Normal(square[strongest], *(np.array(part) for part in zip(*rows, strict=True))) for rows in (proper, mirrored)
     )
@@ -221,13 +279,14 @@ def _fast(columns: ComplexArray, slow: FloatArray) -> ComplexArray:
 
 
 def _gram_and_moment(
-    u: FloatArray, p: FloatArray, lateral: ComplexArray, normal: ComplexArray, slow: FloatArray, force: ComplexArray
+    u: FloatArray, roll: ComplexArray, normal: ComplexArray, damped: ComplexArray, slow: FloatArray, force: ComplexArray
 ) -> tuple[FloatArray, ComplexArray]:
-    """Normal matrix (l, 3, 3) and right-hand side (l, 3) of one window at lags: rates are (l, n), the force (n,)."""
-    columns = _fast(np.stack([1j * normal, u * 1j * normal, p * lateral], axis=-1), slow)
+    """Normal matrix (l, 5, 5) and right-hand side (l, 5) of one window at lags: columns are (l, n), the force (n,)."""
+    turning = [1j * normal, u * 1j * normal, 1j * damped, u * 1j * damped, roll]
+    columns = _fast(np.stack(turning, axis=-1), slow)
     adjoint = columns.conj().swapaxes(-1, -2)
     gram = (adjoint @ columns).real
-    regular = 1e-12 * np.trace(gram, axis1=-2, axis2=-1)[:, None, None] * np.eye(3)
+    regular = 1e-12 * np.trace(gram, axis1=-2, axis2=-1)[:, None, None] * np.eye(5)
     return gram + regular, adjoint @ force
 
 

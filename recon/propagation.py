@@ -80,6 +80,7 @@ class Inertial(NamedTuple):
     rate_density: FloatArray
     dcm_body_force: FloatArray
     dcm_body_rate: FloatArray
+    clocks: bool
     planet: Planet | None
 
 
@@ -146,7 +147,7 @@ class Motion(NamedTuple):
             if self.ballistic
             else None
         )
-        return Inertial(*self[1:8], planet), air
+        return Inertial(*self[1:8], self.clocks, planet), air
 
     @property
     def drivers(self) -> int:

@@ -391,7 +391,7 @@ def reconstruct_once(
     mount = _mounting(telemetry, sensors)
     table = sensor_error_table(problem, reference, smoothed)
     checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
-    checks += consistency.filter_against_smoother(problem, run, smoothed, reference)
+    checks += consistency.filter_against_smoother(problem, run, smoothed, reference, settings.check_confidence)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
     held_out = held_out_table(problem, run, settings.engine)
@@ -514,7 +514,8 @@ def _oscillation_checks(
     """Checks of both triads against each other by the oscillation, and the adaptation with what it shows."""
     force, rate, checks = sensors.force, sensors.rate, []
     span = float(problem.time_s[0]), float(problem.time_s[-1])
-    swings = oscillation.oscillation(force, rate, *span, telemetry.vehicle)
+    speed = problem.time_s, np.linalg.norm(states.velocity_ecef_mps, axis=-1)
+    swings = oscillation.oscillation(force, rate, *span, telemetry.vehicle, speed)
     if swings is not None:
         checks.append(oscillation.axes_check(swings, force, rate))
         known = replace(known, oscillation=swings)

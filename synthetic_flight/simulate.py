@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 DEFLECTION_LIMIT_RAD = 0.5 * np.pi
 TUMBLE_RAD = 0.5 * np.pi
+MOST_TURN_RAD = 1.0  # in a step; fourth-order steps are unstable from 2.8 on
+AIR_PA = 1.0  # of dynamic pressure, from which on a vehicle tumbles in the air
 
 ATMOSPHERE_START_M, ATMOSPHERE_STEP_M, ATMOSPHERE_ROWS = -1000.0, 50.0, 8001
 
@@ -63,7 +65,7 @@ class Truth(Tabular):
     tumbled_s : float or None
         When the shell's total angle of attack first passed 90 deg with dynamic pressure above 1 Pa.
     diverged_s : float or None
-        When the deflection passed 90 deg; the flight ends there.
+        When the deflection passed 90 deg, or the vehicle turned by a radian a step; the flight ends there.
     remark : str
         What happened out of the ordinary.
     """
@@ -329,7 +331,12 @@ def fly(
     lock = 0 if inflated_s is None else max(0, int(np.ceil((inflated_s - start_s) / record_s - 1e-9)))
     time_s = start_s + record_s * np.arange(records, dtype=np.float64)
     states, aux = _fly_phases(vehicle, atmosphere_table(profile), state, step_s, per_record, time_s, lock)
-    diverged = len(states) < records
+    ended = "deflection beyond 90 deg" if len(states) < records else ""
+    # what tumbles with a C_mq above zero turns ever faster, until steps can no longer follow it
+    fast = ~(step_s * np.linalg.norm(states[:, 14:17], axis=1) < MOST_TURN_RAD)
+    if fast.any():
+        count = max(1, int(np.argmax(fast)))
+        states, aux, ended = states[:count], aux[:count], "more than a radian a step"
     at_sea = splashdown_index(aux[:, 0])
     states, aux = states[:at_sea], aux[:at_sea]
     return _truth(
@@ -339,7 +346,7 @@ def fly(
         time_s[: len(states)],
         states,
         aux,
-        diverged,
+        ended,
     )
 
 
@@ -393,7 +400,7 @@ def _truth(
     time_s: FloatArray,
     states: FloatArray,
     aux: FloatArray,
-    diverged: bool,
+    ended: str,
 ) -> Truth:
     q_b, q_a = states[:, 6:10], states[:, 10:14]
     to_ecef = earth.q_ecef_eci(time_s)
@@ -409,14 +416,14 @@ def _truth(
     theta, nose = dynamics.deflection_angle(q_b, q_a)
     to_body = rotations.conjugate(q_b)
     air = airdata.air_data(trajectory, profile, vehicle.cg_m)
-    tumbling = (aux[:, 4] > TUMBLE_RAD) & (aux[:, 3] > 1.0)
+    tumbling = (aux[:, 4] > TUMBLE_RAD) & (aux[:, 3] > AIR_PA)
     tumbled_s = float(time_s[np.argmax(tumbling)]) if tumbling.any() else None
-    diverged_s = float(time_s[-1]) if diverged else None
+    diverged_s = float(time_s[-1]) if ended else None
     remarks = []
     if tumbled_s is not None:
         remarks.append(f"tumbled at {tumbled_s:.2f} s")
     if diverged_s is not None:
-        remarks.append(f"deflection beyond 90 deg at {diverged_s:.2f} s; the flight ends there")
+        remarks.append(f"{ended} at {diverged_s:.2f} s; the flight ends there")
     return Truth(
         trajectory=trajectory,
         state_eci=states,

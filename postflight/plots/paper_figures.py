@@ -30,6 +30,7 @@ from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_ab
 from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds, rigid_bounds
 
+_STIFF_SHOWN = 20.0  # a joint so many times as stiff as wanted is shown; a locked one lies beyond the axis
 _LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
 
 
@@ -170,7 +171,12 @@ def _look_up(ax: Axes, time_s: FloatArray, use: BoolArray, angle_rad: FloatArray
 
 
 def _angles(figure: Figure, ax: Axes, flight: Reconstruction, title: str, number: str) -> Figure:
-    ax.set(xlim=window(flight), ylim=(0, _LOOK_UP_END_DEG), ylabel="total angle of attack (deg)", xlabel=TIME)
+    ax.set(xlim=window(flight), ylabel="total angle of attack (deg)", xlabel=TIME)
+    first, last = window(flight)
+    lines = [np.asarray(line.get_xydata(), dtype=np.float64) for line in ax.lines]
+    shown = [xy[(xy[:, 0] >= first) & (xy[:, 0] <= last), 1] for xy in lines]
+    most = max((float(np.nanmax(y)) for y in shown if np.isfinite(y).any()), default=_LOOK_UP_END_DEG)
+    ax.set_ylim(0.0, min(1.15 * most, _LOOK_UP_END_DEG))
     legend_above(ax, 1)
     figure.suptitle(f"{title} (AIAA 2011-2571, Figure {number})")
     stamp(figure, flight.telemetry, flight.flight.changes)
@@ -182,18 +188,17 @@ def figure_2_9(static: StaticTrim, offsets_m: Sequence[float], joint_nmprad: flo
     """Trim angle over joint stiffness for several c.g. offsets, with the divergence limit (Figure 2.9)."""
     figure = Figure(figsize=(7.2, 4.2))
     ax = figure.subplots()
-    stiffness = np.geomspace(2e3, 1e5, 600)
+    marks = (static.critical_stiffness_nmprad, joint_nmprad, static.stiffness_for_growth(0.25))
+    ends = 0.5 * min(marks), 2.0 * max(marks[2], min(joint_nmprad, _STIFF_SHOWN * marks[2]))
+    stiffness = np.geomspace(*ends, 600)
     for offset, colour in zip(offsets_m, MANY[1:], strict=False):
         angle = np.rad2deg(static.trim_angle(stiffness, offset))
         ax.semilogx(stiffness, angle, color=colour, label=f"{100 * offset:.2f} cm")
-    for at, stroke, label in (
-        (static.critical_stiffness_nmprad, "--", "divergence"),
-        (joint_nmprad, "-", "the vehicle's joint"),
-        (static.stiffness_for_growth(0.25), ":", "25 % growth"),
-    ):
+    labels = ("divergence", "the vehicle's joint", "25 % growth")
+    for at, stroke, label in zip(marks, ("--", "-", ":"), labels, strict=True):
         ax.axvline(at, color=COLOUR["limit"], ls=stroke, lw=1.0, label=label)
     ax.set(xlabel="joint stiffness (N m/rad)", ylabel="trim angle of attack of the aeroshell (deg)")
-    ax.set(xlim=(2e3, 1e5), ylim=(0.0, 20.0))
-    ax.legend(title="initial c.g. offset", loc="upper right")
+    ax.set(xlim=ends, ylim=(0.0, 20.0))
+    ax.legend(title="initial c.g. offset", loc="upper right", frameon=True, framealpha=0.9)
     figure.suptitle(title)
     return figure

@@ -22,7 +22,7 @@ from postflight.flight import PULSE_RATE_HZ, Flight
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.plots.style import draw
 from postflight.reconciliation.credibility import credibility
-from postflight.reconciliation.fit import JointFit, select_laws
+from postflight.reconciliation.fit import JointFit, require_damping, select_laws
 from postflight.reconciliation.fit import reconcile as fit_joint
 from postflight.reconciliation.forward_model import SLOW_JOINT, integrable
 from postflight.reconciliation.modes import ModalStiffness, stiffness_from_modes
@@ -138,6 +138,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
         require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
+        require_damping(telemetry.required_vehicle())
         compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "spans")
         flight = reconstruct(
             Flight(telemetry), Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)

@@ -33,7 +33,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, Progress
+from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.forward_model import (
     CREEP_PER_S,
@@ -330,8 +330,20 @@ def reconcile(
     return _refit_with_turbulence(first, part_of(report, 0.6, 1.0))
 
 
+def require_damping(vehicle: Vehicle) -> None:
+    """Refuse a vehicle whose file states no damping of the joint, on which a factor is sought; `GateError`."""
+    if not vehicle.joint.bending_damping_nmsprad > 0.0:
+        raise GateError(
+            f"reconciliation: the joint of vehicle '{vehicle.name}' has no damping, and a factor on it is sought: "
+            "state joint.bending_damping_nmsprad, of which critical is "
+            f"{vehicle.critical_damping_nmsprad():.3g}; a rigid vehicle has no joint to reconcile",
+            code="joint-undamped",
+        )
+
+
 def problem_of(flight: Reconstruction, measured: Measurements, laws: tuple[str, ...]) -> Problem:
     """Least-squares problem of a flight."""
+    require_damping(flight.telemetry.required_vehicle())
     air = AtmosphereParameters(flight.telemetry.sounding, float(measured.altitude_m.min()))
     return Problem(measured, VehicleParameters(flight.required_loads().vehicle, laws), air)
 

@@ -25,6 +25,7 @@ from flightmodel.checks import BoolArray, FloatArray, GateError, Progress
 from flightmodel.statistics import percentile_band
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Uncertainty, Vehicle
+from postflight.loads import fastest_radps
 from postflight.reconstruction import Reconstruction
 from synthetic_flight import simulate
 from synthetic_flight.dispersions import (
@@ -47,15 +48,17 @@ from synthetic_flight.weather import correlated
 
 START_ALTITUDE_M = 100e3
 RECORD_S, SPAN_S = 0.05, 70.0
-# the rigid vehicle's fastest motion is its pitch at 1 Hz: phase errors of 1e-6 by three fourth-order steps a record
-RIGID_STEP_S, FLEXIBLE_STEP_S = RECORD_S / 3.0, 0.005
+# steps of a slow vehicle; of a faster one so many that it turns by `STEP_RAD` in each: fourth-order steps then err by
+# 1e-6 rad
+RIGID_STEP_S, FLEXIBLE_STEP_S, STEP_RAD = RECORD_S / 3.0, 0.005, 0.15
 
 
 @dataclass(frozen=True)
 class Bounds:
     """Percentile bands ``(3, n)`` of dispersed entries, and the nominal history ``(n,)``.
 
-    ``ended`` of ``flights`` ended early, their deflection beyond 90 deg; they hold their last value from there on.
+    ``ended`` of ``flights`` ended early, their deflection or angle of attack beyond 90 deg: a vehicle that tumbles with
+    a C_mq above zero would turn ever faster. They hold their last value from there on.
     """
 
     time_s: FloatArray
@@ -183,8 +186,10 @@ class _Entry:
         self.dispersions = dispersions_of(vehicle.uncertainty, joint)
         self.profile = profile_from_sounding(flight.telemetry.sounding)
         self.at_start = resample(flight.solution.smoothed, np.array([self.start_s]))
-        step = RIGID_STEP_S if self.locked else FLEXIBLE_STEP_S
-        self.schedule = Schedule(step, round(RECORD_S / step), self.records, self.records if self.locked else 0)
+        turning_radps = fastest_radps(vehicle, flight.solution, air)
+        steps = round(RECORD_S / (RIGID_STEP_S if self.locked else FLEXIBLE_STEP_S))
+        steps = max(steps, int(np.ceil(RECORD_S * turning_radps / STEP_RAD)))
+        self.schedule = Schedule(RECORD_S / steps, steps, self.records, self.records if self.locked else 0)
 
     def start(self, run: tuple[int, int] | None) -> tuple[Start, Vehicle]:
         """Start and vehicle of one run, given as seed and number; None is the nominal one."""
@@ -207,7 +212,7 @@ class _Entry:
         return Start(state, parameters, simulate.atmosphere_table(profile)), vehicle
 
     def fly(self, starts: list[tuple[Start, Vehicle]]) -> list[tuple[FloatArray, FloatArray, bool]]:
-        """Centerbody's total angle of attack, deg, normal acceleration, g, and whether the joint diverged."""
+        """Centerbody's total angle of attack, deg, normal acceleration, g, and whether the flight ended early."""
         flown = fly_legs(self.vehicle, list(range(len(starts))), [s for s, _ in starts], [self.schedule])
         return [self._kept(f, start, vehicle) for f, (start, vehicle) in zip(flown, starts, strict=True)]
 
@@ -216,8 +221,10 @@ class _Entry:
             message = "pre-flight bounds: a flight has no record; the reconstruction's state at 100 km cannot be flown"
             raise GateError(message, code="no-record")
         records = Records(flown.states, flown.aux, vehicle, start.atmosphere)
-        rows = np.minimum(np.arange(self.records), len(flown.aux) - 1)
-        return records.alpha_total_deg[rows], records.normal_g[rows], flown.diverged
+        tumbling = (records.alpha_total_deg > np.rad2deg(simulate.TUMBLE_RAD)) & (flown.aux[:, 3] > simulate.AIR_PA)
+        last = int(np.argmax(tumbling)) if tumbling.any() else len(flown.aux) - 1
+        rows = np.minimum(np.arange(self.records), last)
+        return records.alpha_total_deg[rows], records.normal_g[rows], flown.diverged or bool(tumbling.any())
 
 
 def _dispersed_atmosphere(profile: AtmosphereProfile, rng: np.random.Generator) -> AtmosphereProfile:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 GM, J2, RADIUS_M, SPIN_RADPS = 4.282837e13, 1.9566e-3, 3396.19e3, 7.0882e-5
 POLAR_M = 3376.20e3
@@ -187,3 +189,62 @@ def write(entry: Entry, folder) -> None:
     (folder / "flight.toml").write_text(FLIGHT.format(STATE, STATE_SD))
     rows = np.column_stack([entry.time_s, entry.measured_mps2])
     np.savetxt(folder / "accelerometer.csv", rows, fmt="%.6f", delimiter=",", header="t_s,ax_mps2", comments="")
+
+
+INERTIAL = """
+[attitude_prior]
+t_s = 0.0
+q_ecef_body = [{0}]
+sd_deg = 0.2
+
+[motion]
+model = "strapdown"
+
+[sensors.accelerometer]
+file = "accelerometer.csv"
+axes = ["+x", "+y", "+z"]
+columns.ax = {{ column = "x", unit = "mps2" }}
+columns.ay = {{ column = "y", unit = "mps2" }}
+columns.az = {{ column = "z", unit = "mps2" }}
+noise_sd_mps2 = 0.02
+bias_sd_mps2 = 0.02
+scale_sd = 0.001
+position_from_datum_body_m = [0.0, 0.0, 0.0]
+
+[sensors.rates]
+file = "rates.csv"
+axes = ["+x", "+y", "+z"]
+columns.p = {{ column = "x", unit = "radps" }}
+columns.q = {{ column = "y", unit = "radps" }}
+columns.r = {{ column = "z", unit = "radps" }}
+noise_sd_degps = 0.02
+bias_sd_degps = 0.01
+scale_sd = 0.001
+"""
+
+
+def write_inertial(entry: Entry, folder, seed: int) -> None:
+    """Flight folder of an entry with three accelerometers and gyros, body x along the velocity; no tracker."""
+    rng, spin = np.random.default_rng([seed, 3]), np.array([0.0, 0.0, SPIN_RADPS])
+    t, r, v = entry.time_s, entry.position_m, entry.velocity_mps
+    along = v / np.linalg.norm(v, axis=1)[:, None]
+    side = np.cross(along, r)
+    side = side / np.linalg.norm(side, axis=1)[:, None]
+    body = np.stack([along, side, np.cross(along, side)], axis=2)
+    size = np.linalg.norm(r, axis=1)[:, None]
+    z2, k = 5.0 * (r[:, 2:] / size) ** 2, 1.5 * J2 * (RADIUS_M / size) ** 2
+    gravity = -GM / size**3 * r * np.hstack([1.0 + k * (1.0 - z2), 1.0 + k * (1.0 - z2), 1.0 + k * (3.0 - z2)])
+    sensed = CubicSpline(t, v)(t, 1) - gravity + 2.0 * np.cross(spin, v) + np.cross(spin, np.cross(spin, r))
+    change = CubicSpline(t, body.reshape(-1, 9))(t, 1).reshape(-1, 3, 3)
+    skew = np.einsum("nji,njk->nik", body, change)
+    turning = np.column_stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]]) + np.einsum("nji,j->ni", body, spin)
+    folder.mkdir(parents=True, exist_ok=True)
+    readings = {"accelerometer": np.einsum("nji,nj->ni", body, sensed), "rates": turning}
+    for name, noise, bias in (("accelerometer", 0.02, 0.02), ("rates", np.deg2rad(0.02), np.deg2rad(0.01))):
+        off = bias * rng.standard_normal(3) + noise * rng.standard_normal((len(t), 3))
+        rows = np.column_stack([t, readings[name] * (1.0 + 0.001 * rng.standard_normal(3)) + off])
+        np.savetxt(folder / f"{name}.csv", rows, fmt="%.10f", delimiter=",", header="t_s,x,y,z", comments="")
+    known = Rotation.from_matrix(body[0]) * Rotation.from_rotvec(np.deg2rad(0.2) * rng.standard_normal(3))
+    q = ", ".join(f"{x:.12f}" for x in known.as_quat()[[3, 0, 1, 2]])
+    head = FLIGHT.format(STATE, STATE_SD).partition("[motion]")[0]
+    (folder / "flight.toml").write_text(head + INERTIAL.format(q))

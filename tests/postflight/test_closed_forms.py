@@ -30,6 +30,7 @@ from postflight.runs import STATE_COLUMNS
 from postflight.score import _bet_errors, _method_row
 from postflight.studies import preflight
 from recon import atmosphere
+from synthetic_flight.linear import linear_matrix, modes, slopes_at
 
 G0 = 9.80665
 
@@ -309,10 +310,12 @@ def test_an_entry_starts_with_its_cg_where_the_datum_s_flight_has_it():
     _, _, height = earth.geodetic_from_ecef(r)
     pressure = np.exp(-(((t - 40.0) / 10.0) ** 2))
     air = SimpleNamespace(
-        altitude_m=height, flight_path_angle_rad=np.full(n, -1.4), time_s=t, dynamic_pressure_pa=pressure
-    )
+        altitude_m=height, flight_path_angle_rad=np.full(n, -1.4), time_s=t, dynamic_pressure_pa=pressure,
+        mach=np.full(n, 5.0),
+    )  # fmt: skip
     telemetry = SimpleNamespace(sounding=standard_sounding(), required_vehicle=lambda: vehicle)
-    flight = SimpleNamespace(air=air, telemetry=telemetry, solution=SimpleNamespace(smoothed=path))
+    solution = SimpleNamespace(smoothed=path, imu_time_s=t, rate_body_radps=np.zeros((n, 3)))
+    flight = SimpleNamespace(air=air, telemetry=telemetry, solution=solution)
     entry = preflight._Entry(flight, vehicle, None)
     start, _ = entry.start(None)
     k = int(np.searchsorted(t, entry.start_s))
@@ -615,3 +618,22 @@ def test_a_failed_flight_is_in_no_band(tmp_path):
     np.testing.assert_allclose(bands["p50"], 25.0 + time_s)
     np.testing.assert_allclose(bands["p2.3"], 10.0 + 0.069 * 10.0 + time_s, rtol=1e-6)
     np.testing.assert_allclose(bands["p97.7"], 50.0 - 0.069 * 20.0 + time_s, rtol=1e-6)
+
+
+def test_windows_of_a_vehicle_that_pitches_fast_are_short_enough():
+    """FIRE II at peak pressure: pitching by the linear model and 171 rpm turn its rates in body axes at 8.8 Hz."""
+    vehicle, pressure_pa, mach, spin = vehicle_from_toml(vehicle_path("fire2")), 118_500.0, 25.0, 17.9
+    slopes = slopes_at(vehicle, np.array([mach]))[0]
+    frequency = modes(linear_matrix(vehicle, slopes, pressure_pa, 7000.0)).frequencies_hz[0]
+    air = SimpleNamespace(mach=np.array([mach]), dynamic_pressure_pa=np.array([pressure_pa]))
+    at = SimpleNamespace(time_s=np.zeros(1))
+    bet = SimpleNamespace(smoothed=at, imu_time_s=at.time_s, rate_body_radps=np.array([[spin, 0.0, 0.0]]))
+    fastest = loads.fastest_radps(vehicle, bet, air)
+    assert fastest == pytest.approx(2.0 * np.pi * frequency + spin, rel=0.02)
+    # of an acceleration that turns at that rate no more is left out than at 2.5 Hz by the usual window
+    t = np.arange(0.0, 2.0, 1e-4)
+    turning = np.column_stack([0.0 * t, np.cos(fastest * t), np.sin(fastest * t)])
+    seen = SimpleNamespace(imu_time_s=t, specific_force_body_mps2=0.0 * turning, rate_body_radps=turning)
+    h = loads._MOST_TURN_RAD / fastest
+    got = atmosphere.cg_accelerations(seen, np.array([1.0]), np.zeros(3), h).angular_acceleration_radps2[0]
+    assert np.linalg.norm(got) / fastest == pytest.approx(0.968, abs=0.003)

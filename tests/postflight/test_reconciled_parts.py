@@ -10,7 +10,7 @@ from flightmodel.atmosphere import default_sounding_sd, us76
 from flightmodel.telemetry import Sounding
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.reconciliation.credibility import MOST_MOVED_SD, credibility
-from postflight.reconciliation.fit import CreepScore, JointFit, with_freeplay
+from postflight.reconciliation.fit import CreepScore, JointFit, require_damping, with_freeplay
 from postflight.reconciliation.forward_model import (
     FAST_JOINT,
     FREEPLAY_SD_RAD,
@@ -37,6 +37,7 @@ from postflight.reconciliation.modes import HOP, PADDED, RATE_HZ, WINDOW, _spect
 from postflight.reconciliation.normal_equations import ArrowMatrix, NormalEquations
 from postflight.reconciliation.posterior import joint_table, stiffness_bound
 from synthetic_flight.dynamics import beyond_freeplay, joint_modes
+from tests.refusing import refuses
 
 VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
 
@@ -359,3 +360,11 @@ def with_rows(table, moved):
     parts = [flights.air_of(one, slice(0, middle)), flights.air_of(one, slice(middle, len(table)))]
     np.testing.assert_array_equal(np.concatenate([part[0] for part in parts]), table)
     return np.concatenate([part[1] for part in parts])
+
+
+def test_a_joint_without_damping_is_refused_and_told_what_to_state():
+    """A factor on nothing stays nothing: it would be sought without end."""
+    vehicle = vehicle_from_toml(vehicle_path("fire2"))
+    with refuses("joint-undamped", names=["bending_damping_nmsprad", "fire2"]):
+        require_damping(vehicle)
+    require_damping(vehicle_from_toml(vehicle_path("irve3")))

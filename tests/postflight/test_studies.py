@@ -1,5 +1,7 @@
 """The paper's studies: Table 3.1 digit for digit, what the paper says of its figures, and bounds around a flight."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -123,6 +125,19 @@ def test_bounds_are_the_same_flights_whatever_their_number(flight):
     low, high = many.alpha_total_deg[[0, 2]]
     assert inside(many.time_s, many.alpha_total_deg[1], many.time_s, low, high).all()
     assert not inside(many.time_s, high + 1.0, many.time_s, low, high).any()
+
+
+@pytest.mark.slow
+def test_flights_that_tumble_end_there(flight):
+    """With C_mq above zero they would turn ever faster: 1e93 g in the bands of a vehicle whose C_mq may be so."""
+    _, reconstructed = flight
+    vehicle = reconstructed.telemetry.required_vehicle()
+    undamped = replace(vehicle, aero=vehicle.aero.scaled(cmq_shift=3.0))
+    bounds = entry_bounds(reconstructed, None, flights=8, vehicle=undamped)
+    assert bounds.ended == 8
+    assert bounds.normal_g.max() < 20.0
+    # no record turns by more than half a turn beyond the edge
+    assert 90.0 < bounds.alpha_total_deg[2].max() <= 180.0
 
 
 def test_bounds_disperse_what_the_vehicle_file_states():

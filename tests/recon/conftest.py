@@ -33,6 +33,7 @@ from flightmodel.telemetry import (
     TriadRecord,
 )
 from flightmodel.trajectory import Trajectory
+from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from synthetic_flight.sensing import mislevel
 
 from .ballistic_flight import gauss_markov
@@ -42,6 +43,9 @@ START, END = 100.0, 160.0
 CG = np.array([-0.54, 0.004, -0.0004])
 IMU = np.array([-0.95, 0.04, -0.03])
 SPIN = 36.0 * DEG
+REFERENCE = vehicle_from_toml(vehicle_path("irve2_reference"))
+# what pitch damping depends on
+PITCHING = {name: getattr(REFERENCE, name) for name in ("mass_kg", "inertia", "reference", "aero", "uncertainty")}
 CLOCK_SD_S = 1e-3  # of both triads' clocks where these err
 ACCELEROMETER = TriadSpec(
     "accelerometer", IMU, dcm_body_from_clocking(135 * DEG, 225 * DEG), 0.04, 0.05, 0.003, 0.15 * DEG, 0.01
@@ -286,7 +290,7 @@ def sense(
         "mini",
         EPOCH,
         True,
-        SimpleNamespace(cg_m=CG),
+        SimpleNamespace(cg_m=CG, **PITCHING),
         TriadRecord(replace(ACCELEROMETER, time_bias_sd_s=clock_sd_s), t, force),
         TriadRecord(replace(RATES, time_bias_sd_s=clock_sd_s), t_rate, rate),
         radars,

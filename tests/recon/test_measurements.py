@@ -28,7 +28,7 @@ from synthetic_flight.instrument_errors import Radar, child
 
 LATITUDE, LONGITUDE, HEIGHT_M = -0.58, 0.31, 40.0
 ARM = np.array([0.41, -0.36, 0.73])
-RATE = np.array([0.63, -0.2, 0.31])
+RATE = np.array([0.63, -0.2, 0.31, 2.0, -1.4, 0.7])  # and its rate of change
 ACCELERATION = np.array([-40.0, 25.0, -12.0])
 KINDS = {"radar": RADAR, "position": POSITION, "velocity": VELOCITY, "height": HEIGHT, "field": FIELD, "sun": SUN}
 KINDS |= {"range rate": RANGE_RATE}
@@ -226,8 +226,9 @@ def test_radar_sees_the_tracked_point_at_the_true_time():
     e = padded([4.0, 2e-4, -1e-4, 2.5e-3])
     h, _, _ = compiled(instrument(RADAR), e, position, velocity, q)
     c = rotations.dcm_from_q(q)
-    turn = RATE - c.T @ earth.OMEGA_ECEF_RADPS
-    point = position + c @ ARM - 2.5e-3 * (velocity + c @ np.cross(turn, ARM)) + 0.5 * 2.5e-3**2 * ACCELERATION
+    turn = RATE[:3] - c.T @ earth.OMEGA_ECEF_RADPS
+    pulled = ACCELERATION + c @ (np.cross(RATE[3:], ARM) + np.cross(turn, np.cross(turn, ARM)))
+    point = position + c @ ARM - 2.5e-3 * (velocity + c @ np.cross(turn, ARM)) + 0.5 * 2.5e-3**2 * pulled
     z = earth.radar_from_ecef(point, LATITUDE, LONGITUDE, HEIGHT_M)
     assert np.allclose(wrapped(RADAR, h - z), [4.0, 2e-4 + KNOWN[RADAR][1], -1e-4 + KNOWN[RADAR][2]], rtol=1e-6)
 
@@ -245,7 +246,7 @@ def test_a_time_bias_follows_the_flight_to_second_order(mini_truth):
         e = padded([0.0, 0.0, 0.0, tau])
         reading, _, _ = compiled(
             receiver, e, truth.position_ecef_m[0], truth.velocity_ecef_mps[0], truth.q_ecef_body[0],
-            truth.omega_body_eci_body_radps[0], acceleration,
+            np.append(truth.omega_body_eci_body_radps[0], np.zeros(3)), acceleration,
         )  # fmt: skip
         seen = mini_truth.trajectory(np.array([t - tau]), arm).position_ecef_m[0]
         left.append(np.linalg.norm(reading - receiver.dcm @ (seen - receiver.site_ecef_m)))
@@ -258,7 +259,7 @@ def test_receiver_and_height_equal_geometry():
     position, velocity, q = place()
     c = rotations.dcm_from_q(q)
     point = position + c @ ARM
-    swing = c @ np.cross(RATE - c.T @ earth.OMEGA_ECEF_RADPS, ARM)
+    swing = c @ np.cross(RATE[:3] - c.T @ earth.OMEGA_ECEF_RADPS, ARM)
     ned = earth.dcm_ned_ecef(LATITUDE, LONGITUDE)
     site = earth.ecef_from_geodetic(LATITUDE, LONGITUDE, HEIGHT_M)
     h, _, _ = compiled(instrument(POSITION), padded([3.0, -4.0, 5.0]), position, velocity, q)

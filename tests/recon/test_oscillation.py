@@ -19,8 +19,12 @@ VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
 FAST = Settings(output_rate_hz=5.0)
 
 
-def found(force, rate, vehicle=VEHICLE):
-    return oscillation(bridge(force), bridge(rate, 1), -np.inf, np.inf, vehicle)
+FAST_MPS = 2000.0
+
+
+def found(force, rate, vehicle=VEHICLE, speed_mps=FAST_MPS):
+    speed = None if speed_mps is None else (force.time_s[[0, -1]], np.full(2, speed_mps))
+    return oscillation(bridge(force), bridge(rate, 1), -np.inf, np.inf, vehicle, speed)
 
 
 def turned(record, matrix):
@@ -90,6 +94,36 @@ def test_a_lag_of_a_coning_vehicle_within_the_stated_clocks_is_no_roll():
     assert abs(np.rad2deg(with_clocks(0.001).roll_rad)) == pytest.approx(np.rad2deg(0.0015 * w), abs=0.5)
     assert with_clocks(0.001).kind == DELIVERED
     assert with_clocks(1e-5).kind != DELIVERED
+
+
+@pytest.mark.parametrize("planted_deg", [0.0, 8.0])
+def test_pitch_damping_of_a_coning_vehicle_is_no_roll(planted_deg):
+    """A slow descent turns the relation by k / w, with C_mq 1.5 sd off; a turned package still shows."""
+    force, rate = swinging(kicks=1e-3)
+    t, speed_mps, axial_mps2 = force.time_s, 60.0, 5.0
+    ca, _, _, cmq = VEHICLE.aero.at(speed_mps / 300.0, 0.0)
+    vehicle = replace(VEHICLE, aero=VEHICLE.aero.scaled(cmq_shift=-0.3 - cmq))
+    inertia = 0.5 * (vehicle.inertia[1, 1] + vehicle.inertia[2, 2])
+    per_cmq = vehicle.mass_kg * axial_mps2 * vehicle.reference.length_m**2 / (2.0 * speed_mps * ca * inertia)
+    k = per_cmq * (0.3 + 1.5 * vehicle.uncertainty.cmq)
+    turning = 3.0 * t + 2.0 * np.sin(0.2 * t)
+    w = 0.3 * np.exp(1j * turning) + 0.08 * np.exp(-0.9j * turning)
+    pushed = 4.0j * (np.gradient(w, t) + k * w) * np.exp(1j * np.deg2rad(planted_deg))
+    noise = np.random.default_rng(3)
+
+    def body(along, lateral, sd):
+        return np.column_stack([along + 0.0 * t, lateral.real, lateral.imag]) + sd * noise.standard_normal((len(t), 3))
+
+    gyros = replace(rate, measured_sensor=body(0.3, w, 1e-3))
+    accelerometer = replace(force, measured_sensor=body(-axial_mps2, pushed, 0.02))
+    assert 2.5 < np.rad2deg(k / 3.0) < 12.0
+    for known_mps in (speed_mps, None):
+        swings = found(accelerometer, gyros, vehicle, known_mps)
+        assert swings.kind == (ROLL if planted_deg else DELIVERED)
+        assert np.rad2deg(swings.roll_rad) == pytest.approx(planted_deg, abs=0.5)
+    # of a vehicle that hardly damps it would be a turned package
+    fast = found(accelerometer, gyros, vehicle, FAST_MPS)
+    assert abs(np.rad2deg(fast.roll_rad) - planted_deg) > 2.0
 
 
 def test_nothing_is_said_of_a_body_that_is_not_known_or_does_not_swing():

@@ -84,18 +84,33 @@ def test_stated_errors_as_large_as_stated_fail_as_often_as_stated():
 
 
 def test_filter_and_smoother_differ_by_the_difference_of_their_covariances():
-    # three sd of P_filter - P_smoother: of normal differences 0.27 % lie beyond
+    # with a confidence of 0.973 three sd of P_filter - P_smoother: of normal differences 0.27 % lie beyond
     rng = np.random.default_rng(9)
-    n = 3000
+    n, confidence = 3000, 1.0 - 10.0 * 0.0026998
     smoother = np.tile(np.diag(np.full(9, 4.0)), (n, 1, 1))
     filtered = smoother + np.tile(np.diag(np.full(9, 9.0)), (n, 1, 1))
     draws = 3.0 * rng.standard_normal((n, 9))
-    for consistency_check in mcreynolds_checks(draws, filtered, smoother, ["position", "velocity", "attitude"]):
+    for consistency_check in mcreynolds_checks(
+        draws, filtered, smoother, ["position", "velocity", "attitude"], confidence
+    ):
         assert consistency_check.value == pytest.approx(0.9973, abs=0.0025)
     # a tenth may stay beyond, no more
     for share, passes in ((0.08, True), (0.12, False)):
         one = np.where(np.arange(n)[:, None] < share * n, 9.1, 8.9) * np.ones(9)
-        assert {v.passed for v in mcreynolds_checks(one, filtered, smoother, ["velocity"])} == {passes}
+        assert {v.passed for v in mcreynolds_checks(one, filtered, smoother, ["velocity"], confidence)} == {passes}
+
+
+def test_differences_that_never_change_are_red_no_more_often_than_stated():
+    """All of a flight's differences may be one draw, as of a prior of the attitude to the first force."""
+    rng, n, smoother = np.random.default_rng(10), 20, np.tile(np.eye(9), (20, 1, 1))
+    for confidence in (0.9, 0.99):
+        red = [
+            not mcreynolds_checks(
+                np.tile(rng.standard_normal(9), (n, 1)), 2.0 * smoother, smoother, ["attitude"], confidence
+            )[0].passed
+            for _ in range(3000)
+        ]
+        assert 0.1 < np.mean(red) / (1.0 - confidence) < 1.0
 
 
 def test_more_than_a_twentieth_edited_is_told():

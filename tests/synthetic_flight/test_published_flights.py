@@ -81,6 +81,17 @@ def test_fire_2_follows_nasas_trajectory(flown):
         assert truth.altitude_m[k] == pytest.approx(altitude_m, abs=30.0)
 
 
+def test_a_vehicle_that_tumbles_ever_faster_ends_where_steps_no_longer_follow():
+    """With C_mq above zero: what the integration made of it was refused as an altitude of 1e19 km."""
+    scenario = read_scenario("adept_sr1")
+    vehicle = replace(scenario.vehicle, aero=scenario.vehicle.aero.scaled(cmq_shift=1.5))
+    truth = fly_scenario(replace(scenario, vehicle=vehicle), 0)
+    assert truth.tumbled_s < truth.diverged_s < 345.0
+    assert "tumbled" in truth.remark
+    assert "a radian a step" in truth.remark
+    assert np.isfinite(truth.state_eci).all()
+
+
 def test_loftid_s_damping_leaves_few_days_that_would_have_tumbled():
     """The flight did not: of what its file allows, C_mq above the linear bound at the end is a tail (not a quarter)."""
     vehicle = read_scenario("loftid").vehicle

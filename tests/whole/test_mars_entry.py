@@ -102,6 +102,25 @@ def test_an_entry_without_tracker_and_gyros_says_what_it_assumes(tmp_path):
     assert peak.mach == pytest.approx(truth.airspeed_mps[k] / truth.sound_speed_mps[k], rel=0.06)
 
 
+def test_inertial_sensors_alone_carry_the_entry_state(tmp_path):
+    """Accelerometers and gyros, a state and an attitude at entry, no tracker: it ended in a traceback."""
+    squares = []
+    for seed in (60, 61, 62):
+        truth = mars_entry.fly(seed, rate_hz=64.0, to_s=120.0)
+        mars_entry.write_inertial(truth, tmp_path / f"{seed}", seed)
+        path = pf.reconstruct(pf.read_flight(tmp_path / f"{seed}")).trajectory
+        rows = np.searchsorted(path.time_s, [30.0, 75.0, 115.0])
+        true = np.hstack([truth.position_m, truth.velocity_mps])
+        true = np.column_stack([np.interp(path.time_s[rows], truth.time_s, column) for column in true.T])
+        error = np.hstack([path.position_ecef_m[rows], path.velocity_ecef_mps[rows]]) - true
+        cov = path.covariance[rows][:, :6, :6]
+        squares.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error))
+    low, high = (chi_square_quantile(p, 6 * 3) / 3 for p in (1e-4, 1.0 - 1e-4))
+    mean = np.mean(squares, axis=0)
+    assert (mean > low).all(), mean
+    assert (mean < high).all(), mean
+
+
 def test_both_engines_agree(tmp_path):
     mars_entry.write(mars_entry.fly(4, to_s=80.0), tmp_path)
     flight = pf.read_flight(tmp_path)
