@@ -93,7 +93,11 @@ class Frames:
         """Where the picture (h, w) is the same in every frame, as a time code is; None: nowhere."""
         chosen = np.unique(np.linspace(0, len(self.time_s) - 1, _SPREAD).round().astype(int))
         if self.numbers is None:
-            return burnt_in([read_image(self.paths[k]) for k in chosen])
+            # a folder is checked before all of it was found fit
+            fit = [self.paths[k] for k in chosen if not image_fault(self.paths[k], self.camera)]
+            return burnt_in([read_image(path) for path in fit])
+        if film_fault(self.paths[0], self.camera, int(self.numbers[-1])):
+            return None
         film, pictures = cv2.VideoCapture(str(self.paths[0])), []
         try:
             for number in self.numbers[chosen]:

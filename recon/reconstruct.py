@@ -397,15 +397,13 @@ def reconstruct_once(
     held_out = held_out_table(problem, run, settings.engine)
     checks += consistency.held_out_checks(problem, held_out, settings)
     checks += survey.place_checks(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
+    filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
     residuals = consistency.residual_table(problem, run.innovations)
     edits = consistency.edit_findings(problem, run.innovations.accepted)
-    states, covariance = run.states(), run.filtered.p_plus
     del run  # as large as all that follows together
     if sensors is not None and adaptation.lag is None:
         more, adaptation = _oscillation_checks(telemetry, settings, sensors, problem, reference, adaptation)
         checks += more
-    filtered = datum_trajectory(problem, mount, states, covariance)
-    del states, covariance
     series = _series(problem, sensors, reference, smoothed)
     findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
     if sensors is not None:

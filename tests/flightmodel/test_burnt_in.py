@@ -1,5 +1,8 @@
 """Text burnt into a film is found, whatever lies behind it; paint, shade and a film at rest are not taken for it."""
 
+import os
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -65,7 +68,15 @@ def test_frames_of_a_folder_and_of_a_film_show_the_same_text(tmp_path):
         cv2.imwrite(str(tmp_path / f"{k:02d}.png"), picture)
         film.write(picture)
     film.release()
-    time_s = np.arange(30.0)
-    of_folder = Frames(None, "c", time_s, tuple(sorted(tmp_path.glob("*.png"))), 0.0)
-    of_film = Frames(None, "c", time_s, (tmp_path / "film.avi",), 0.0, np.arange(30))
+    time_s, camera = np.arange(30.0), SimpleNamespace(width_px=WIDTH, height_px=HEIGHT)
+    of_folder = Frames(camera, "c", time_s, tuple(sorted(tmp_path.glob("*.png"))), 0.0)
+    of_film = Frames(camera, "c", time_s, (tmp_path / "film.avi",), 0.0, np.arange(30))
     assert np.mean(of_folder.burnt_in & of_film.burnt_in) > 0.9 * np.mean(of_folder.burnt_in | of_film.burnt_in)
+    # what is no picture is not waited for
+    (tmp_path / "00.png").unlink()
+    os.mkfifo(tmp_path / "00.png")
+    (tmp_path / "29.png").write_bytes(b"nothing")
+    again = Frames(camera, "c", time_s, tuple(sorted(tmp_path.glob("*.png"))), 0.0).burnt_in
+    assert np.mean(again & of_folder.burnt_in) > 0.9 * np.mean(again | of_folder.burnt_in)
+    (tmp_path / "film.avi").write_bytes(b"nothing")
+    assert Frames(camera, "c", time_s, (tmp_path / "film.avi",), 0.0, np.arange(30)).burnt_in is None
