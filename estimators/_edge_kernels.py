@@ -268,3 +268,39 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
             squares = reach_in * (reach_in + 1.0) * (2.0 * reach_in + 1.0) / 3.0
             sd[i] = noise / (left + slope * deepest) * math.sqrt(squares / 3.0) / total
         offset[i] = centre
+
+
+@kernel
+def share_of_second_edge(steps, by_turn, limits):
+    """Largest share of points (n,) with a step where a turn would put them, and the turn's size, rad.
+
+    ``steps`` (n, k): where on the line across each point, which lies in the middle, a step is found; within a pixel
+    counts. ``limits``: nearest and farthest that a turn puts a point, px; samples' spacing, px; least points that it
+    puts between. Turns are tried a pixel apart for the point that moves most.
+    """
+    nearest, farthest, spacing, least = limits
+    n, middle, beside = len(by_turn), steps.shape[1] // 2, round(1.0 / spacing)
+    most = 0.0
+    for i in range(n):
+        most = max(most, math.hypot(by_turn[i, 0], by_turn[i, 1]))
+    best, size = 0.0, 0.0
+    if n < least or most == 0.0:
+        return best, size
+    spread = np.zeros(steps.shape, dtype=np.bool_)
+    for i in range(n):
+        for j in range(steps.shape[1]):
+            if steps[i, j]:
+                spread[i, max(j - beside, 0) : j + beside + 1] = True
+    reach = int(farthest)
+    for a in range(-reach, reach + 1):
+        for b in range(-reach, reach + 1):
+            y, z = a / most, b / most
+            moved, found = 0, 0
+            for i in range(n):
+                off = by_turn[i, 0] * y + by_turn[i, 1] * z
+                if nearest <= abs(off) <= farthest:
+                    moved += 1
+                    found += spread[i, middle + round(off / spacing)]
+            if moved >= least and found > best * moved:
+                best, size = found / moved, math.hypot(y, z)
+    return best, size

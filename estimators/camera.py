@@ -50,10 +50,13 @@ if TYPE_CHECKING:
 _MOST = 0.5  # of the answered frames
 _DOUBTFUL = 2  # of the four frames around: one alone is a spoilt frame, not a spoilt film
 _OF_PICTURE = ("frame-dark", "frame-saturated", "frame-size", "frame-undecodable", "frame-not-grey", "frame-frozen")
-_NOT_THE_SHELL = ("camera-turned", "picture-warped", "edge-not-shell", "features-contradict-edge")
+_NOT_THE_SHELL = (
+    "camera-turned", "picture-warped", "picture-doubled", "edge-not-shell", "features-contradict-edge",
+)  # fmt: skip
 # share of the benchmark frame's patches: of plain cloth 0.2 agree in the best frame of seven films, of paint 0.3 to 0.5
 # (over so many frames that they are not the benchmark's neighbours alone)
 _PAINTED, _LEAST_PAINTED = 0.25, 3
+_LEAST_MIXED, _MIXED = 2, 0.05  # frames with two edges, of which 670 sound ones show none; and of all
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
 _SWAP = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from a rotation about body y and z to the lateral vector
@@ -343,7 +346,7 @@ def judged(
         for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
     ]
     found = without_lost_features(kept) if textured_s is None else without_stray_texture(time_s, kept, textured_s)
-    found = without_remnants(without_doubtful(found))
+    found = without_remnants(without_doubtful(without_mixed(found)))
     if joint_swing is not None:
         found = without_jumps(time_s, found, joint_swing)
     accepted = [v is not None and v.edit == "accept" for v in verdicts]
@@ -390,6 +393,18 @@ def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
         return fits
     words = f"{100.0 * refused:.0f} % of the film's frames show no shell that can be read: an answer here may be chance"
     return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mostly-refused")) for fit in fits]
+
+
+def without_mixed(fits: list[FrameFit]) -> list[FrameFit]:
+    """Refuse a film of which some frames show the edge twice: its others mix pictures too, with edges closer together.
+
+    A converter of frame rates does that to a whole film.
+    """
+    doubled = sum(getattr(fit.refused, "code", "") == "picture-doubled" for fit in fits)
+    if doubled < max(_LEAST_MIXED, _MIXED * len(fits)):
+        return fits
+    words = f"{doubled} frames of the film show the edge twice: it mixes pictures, and an edge here may lie between two"
+    return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mixed")) for fit in fits]
 
 
 def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:

@@ -4,7 +4,7 @@ Where the shell is may be known from the frame before; else it is sought: where 
 is from far, where the map of features or of the valleys between tori fits (behind the rim may be the Earth, whose limb
 is an edge too). Edge and features near there are fitted (`estimators.frame_solution`), each also by itself: where they
 contradict each other a whole edge counts, and a frame whose edge is not whole is refused. So is a frame that a
-deflection does not explain (`estimators.frame_checks`).
+deflection does not explain (`estimators.frame_checks`), or that shows the edge twice (`estimators.second_edge`).
 
 Assumed: as in `estimators.frame_solution`.
 
@@ -49,6 +49,8 @@ from estimators.frame_solution import (
     least_points,
     refused_fit,
 )
+from estimators.second_edge import fault_of_second_edge
+from estimators.virtual_camera import DEFLECTION, RADIUS
 from flightmodel.checks import Fault, FloatArray
 
 Image = NDArray[np.uint8]
@@ -133,6 +135,7 @@ class OrientedCamera(FrameModel):
             last = self._reconciled(frame, horizon, place, deformation, last)
             contradicted = place is not None and last.edge_count == len(last.rows)
             if not horizon.is_by_hand:
+                self.check_single(frame, horizon, deformation)
                 last = self._explained(place, deformation, last)
             if plane_axis is not None:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
@@ -182,6 +185,14 @@ class OrientedCamera(FrameModel):
         )  # fmt: skip
         shape = last.shape_found / self._shape_sd
         fault = fault_of_fit(design, last.rms_px, shape, self.apriori.higher_lobes_rad)
+        if fault:
+            raise NoFitError(fault)
+
+    def check_single(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> None:
+        """Refuse a frame that shows the edge twice, by `estimators.second_edge`."""
+        rows = edge_residuals(self.view, horizon, deformation).rows
+        seen = np.asarray(np.isfinite(rows).all(axis=1))
+        fault = fault_of_second_edge(frame.image, horizon.some(seen), rows[seen, DEFLECTION], rows[seen, RADIUS])
         if fault:
             raise NoFitError(fault)
 

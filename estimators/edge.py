@@ -226,7 +226,7 @@ def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> Ho
 def _lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Place along each line, px inwards from its origin, its sd without floor, whether there is one."""
     n = len(lines.origin_px)
-    grey, inside = _sampled(image, lines, round((lines.outer_px + lines.inner_px) / STEP_PX))
+    grey, inside = sampled(image, lines, round((lines.outer_px + lines.inner_px) / STEP_PX))
     level, scatter, first = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
     span = int(6.0 / STEP_PX)
     _edge_kernels.sky_levels(grey, inside, span, level, scatter, first)
@@ -253,7 +253,7 @@ def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
     if not n:
         return no_horizon(NO_FAULT)
     near = ScanLines(lines.origin_px, lines.inward_px, _NEAR_PX, _NEAR_PX, lines.index)
-    grey, inside = _sampled(image, near, len(NEAR_ALONG))
+    grey, inside = sampled(image, near, len(NEAR_ALONG))
     # the noise, from samples so far apart that smoothing did not correlate them
     noise = max(float(np.median(np.abs(grey[:, 6] - grey[:, 0]))) / (0.6745 * np.sqrt(2.0)), 0.3)
     place, along, left, good = np.zeros(n), np.zeros(n), np.zeros_like(grey), np.zeros(n, dtype=np.bool_)
@@ -301,7 +301,7 @@ def is_coherent(line: NDArray[np.intp], residual_px: FloatArray) -> BoolArray:
     return np.asarray(alike.sum(axis=1) > _NEIGHBOURS)
 
 
-def _sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
+def sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
     """Smoothed grey levels ``(n, count)`` along lines, and whether they lie in the picture."""
     h, w = image.shape
     ends = np.concatenate([lines.origin_px - lines.outer_px * lines.inward_px,

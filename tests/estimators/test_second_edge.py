@@ -1,0 +1,131 @@
+"""Two pictures mixed into one: seen by a second edge that is the first one turned, and by nothing else."""
+
+import cv2
+import numpy as np
+import pytest
+
+from estimators import _edge_kernels
+from estimators.benchmark import orient_camera
+from estimators.camera import read_film, without_mixed
+from estimators.edge import no_horizon
+from estimators.frame_residuals import edge_residuals
+from estimators.frame_solution import refused_fit
+from estimators.second_edge import fault_of_second_edge
+from estimators.virtual_camera import DEFLECTION, RADIUS
+from flightmodel.checks import Fault
+from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
+from tests.estimators.test_other_film import answers
+from tests.estimators.test_spoilt_film import CONTRADICTS
+
+LIMITS = (2.0, 24.0, 0.5, 40)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return film(5, [0.0, 1.0, 3.6, 3.0, 2.0, 1.5], [0.0, 188.0, 160.0, 170.0, 200.0, 150.0])
+
+
+@pytest.fixture(scope="module")
+def oriented(frames):
+    return orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+
+
+def mixed(one, other, share):
+    return np.asarray(cv2.addWeighted(one, 1.0 - share, other, share, 0.0), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
+def test_two_pictures_in_one_are_no_frame(frames, oriented, share):
+    fit = oriented.fit(mixed(frames[1], frames[2], share))
+    assert fit.refused.code in CONTRADICTS | {"picture-doubled"}
+
+
+def test_a_mixed_picture_of_plain_cloth_is_no_frame():
+    """Of the edge alone, which takes one of the two; earlier in the film, where the shell stood otherwise."""
+    plain = GEOMETRY.model_copy(update={"features": "none"})
+    frames = film(6, [0.0, 1.0, 3.6], [0.0, 188.0, 160.0])
+    oriented = orient_camera(frames[0], plain, MOUNT, JOINT_M)
+    assert [oriented.fit(mixed(frames[1], frames[2], s)).refused.code for s in (0.3, 0.7)] == ["picture-doubled"] * 2
+    assert not oriented.fit(frames[1]).refused
+    assert not oriented.fit(frames[2]).refused
+
+
+def test_one_picture_has_one_edge(frames, oriented):
+    """Its own noise doubled too: a frame mixed with itself, and with one a tenth of a pixel beside it."""
+    for k in range(1, 6):
+        assert not oriented.fit(frames[k]).refused
+    beside = cv2.warpAffine(frames[1], np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.0]]), frames[1].shape[::-1])
+    assert not oriented.fit(mixed(frames[1], beside, 0.5)).refused
+
+
+def test_a_line_as_far_from_the_edge_everywhere_is_none(frames, oriented):
+    """A seam of the outer torus, a reflection along it: brighter from 9 px inside the edge on."""
+    fit = oriented.fit(frames[1])
+    deformation = np.array([*fit.rotation_yz_rad, 0.0])
+    rows = edge_residuals(oriented.view, fit.horizon, deformation).rows
+    by_turn, by_radius = rows[:, DEFLECTION], rows[:, RADIUS]
+    inside = np.zeros(frames[1].shape, dtype=np.uint8)
+    cv2.fillPoly(inside, [np.rint(fit.horizon.points_px + 9.0 * fit.horizon.inward_px).astype(np.int32)], 1)
+    lit = np.minimum(frames[1].astype(float) * (1.0 + 0.4 * inside), 255.0).astype(np.uint8)
+    assert not fault_of_second_edge(lit, fit.horizon, by_turn, by_radius)
+    # turned instead, it is one
+    offset = by_turn @ np.deg2rad([1.2, -0.9])
+    turned = fit.horizon.points_px + offset[:, None] * fit.horizon.inward_px
+    inside[:] = 0
+    cv2.fillPoly(inside, [np.rint(turned).astype(np.int32)], 1)
+    lit = np.minimum(frames[1].astype(float) * (1.0 + 0.4 * inside) + 25.0 * inside, 255.0).astype(np.uint8)
+    assert fault_of_second_edge(lit, fit.horizon, by_turn, by_radius)
+
+
+def plain_share(steps, by_turn, limits):
+    """The kernel's definition, turn by turn."""
+    nearest, farthest, spacing, least = limits
+    size = np.hypot(*by_turn.T).max()
+    middle = steps.shape[1] // 2
+    best = (0.0, 0.0)
+    for a in range(-int(farthest), int(farthest) + 1):
+        for b in range(-int(farthest), int(farthest) + 1):
+            off = by_turn @ [a / size, b / size]
+            moved = (np.abs(off) >= nearest) & (np.abs(off) <= farthest)
+            if moved.sum() < least:
+                continue
+            at = middle + np.round(off[moved] / spacing).astype(int)
+            beside = np.arange(-2, 3)
+            seen = [row[np.clip(k + beside, 0, len(row) - 1)].any() for row, k in zip(steps[moved], at, strict=True)]
+            if np.mean(seen) > best[0]:
+                best = (float(np.mean(seen)), float(np.hypot(a, b) / size))
+    return best
+
+
+def test_the_share_is_that_of_the_turn_that_most_points_agree_with():
+    rng = np.random.default_rng(7)
+    clock = np.linspace(0.3, 2.9, 60)
+    by_turn = 320.0 * np.column_stack([np.cos(clock), 0.8 * np.sin(clock)])
+    steps = rng.random((60, 101)) < 0.02
+    true = np.array([6.0, -8.0]) / np.hypot(*by_turn.T).max()
+    rows = np.flatnonzero(rng.random(60) < 0.8)
+    steps[rows, 50 + np.round(by_turn[rows] @ true / 0.5).astype(int)] = True
+    share, turn_rad = _edge_kernels.share_of_second_edge(steps, by_turn, LIMITS)
+    expected = plain_share(steps, by_turn, LIMITS)
+    assert (share, turn_rad) == pytest.approx(expected, abs=1e-12)
+    assert share > 0.75
+    assert turn_rad == pytest.approx(np.hypot(*true), rel=0.15)
+    # too few points that a turn moves
+    assert _edge_kernels.share_of_second_edge(steps[:30], by_turn[:30], LIMITS) == (0.0, 0.0)
+
+
+def test_a_film_of_mixed_pictures_is_no_film(frames):
+    times = np.array([421.0, 430.0, 431.0, 432.0, 433.0])
+    pictures = [frames[0], mixed(frames[1], frames[2], 0.4), mixed(frames[5], frames[3], 0.4), frames[4], frames[3]]
+    read = read_film(times, pictures, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None)
+    codes = [fit.refused.code if fit.refused else "" for fit in read.fits]
+    assert codes.count("picture-doubled") == 2
+    assert set(codes) == {"picture-doubled", "film-mixed"}
+
+
+def test_one_doubled_frame_of_a_long_film_is_its_own_fault():
+    fits = answers(np.linspace(1.0, 2.0, 60))
+    doubled = refused_fit(no_horizon(Fault("no", "picture-doubled")), Fault("no", "picture-doubled"))
+    assert sum(bool(f.refused) for f in without_mixed([doubled, *fits])) == 1
+    assert sum(bool(f.refused) for f in without_mixed([doubled] * 2 + fits)) == 2
+    assert all(f.refused for f in without_mixed([doubled] * 4 + fits))
