@@ -257,6 +257,23 @@ def centres(images, noise, sign=1.0):
     return np.array(out).T
 
 
+def test_the_share_is_that_of_the_turn_that_most_points_agree_with():
+    rng, limits = np.random.default_rng(7), (2.0, 12.0, 0.5, 20)
+    clock = np.linspace(0.3, 2.9, 40)
+    by_turn = 320.0 * np.column_stack([np.cos(clock), 0.8 * np.sin(clock)])
+    steps = rng.random((40, 53)) < 0.02
+    true = np.array([5.0, -8.0]) / np.hypot(*by_turn.T).max()
+    rows = np.flatnonzero(rng.random(40) < 0.8)
+    steps[rows, 26 + np.round(by_turn[rows] @ true / 0.5).astype(int)] = True
+    share, turn_rad = _edge_kernels.share_of_second_edge(steps, by_turn, limits)
+    expected = plain_horizon.share_of_second_edge(steps, by_turn, limits)
+    assert (share, turn_rad) == pytest.approx(expected, abs=1e-12)
+    assert share > 0.75
+    assert turn_rad == pytest.approx(np.hypot(*true), rel=0.15)
+    # too few points that a turn moves
+    assert _edge_kernels.share_of_second_edge(steps[:15], by_turn[:15], limits) == (0.0, 0.0)
+
+
 def patch_of(rng):
     """A picture of smooth noise, and the template about its middle."""
     grey = cv2.GaussianBlur(rng.standard_normal((60, 64)), (0, 0), 2.0)

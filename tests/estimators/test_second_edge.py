@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from estimators import _edge_kernels
 from estimators.benchmark import orient_camera
 from estimators.camera import read_film, without_mixed
 from estimators.edge import no_horizon
@@ -16,8 +15,6 @@ from flightmodel.checks import Fault
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
 from tests.estimators.test_other_film import answers
 from tests.estimators.test_spoilt_film import CONTRADICTS
-
-LIMITS = (2.0, 24.0, 0.5, 40)
 
 
 @pytest.fixture(scope="module")
@@ -75,43 +72,6 @@ def test_a_line_as_far_from_the_edge_everywhere_is_none(frames, oriented):
     cv2.fillPoly(inside, [np.rint(turned).astype(np.int32)], 1)
     lit = np.minimum(frames[1].astype(float) * (1.0 + 0.4 * inside) + 25.0 * inside, 255.0).astype(np.uint8)
     assert fault_of_second_edge(lit, fit.horizon, by_turn, by_radius)
-
-
-def plain_share(steps, by_turn, limits):
-    """The kernel's definition, turn by turn."""
-    nearest, farthest, spacing, least = limits
-    size = np.hypot(*by_turn.T).max()
-    middle = steps.shape[1] // 2
-    best = (0.0, 0.0)
-    for a in range(-int(farthest), int(farthest) + 1):
-        for b in range(-int(farthest), int(farthest) + 1):
-            off = by_turn @ [a / size, b / size]
-            moved = (np.abs(off) >= nearest) & (np.abs(off) <= farthest)
-            if moved.sum() < least:
-                continue
-            at = middle + np.round(off[moved] / spacing).astype(int)
-            beside = np.arange(-2, 3)
-            seen = [row[np.clip(k + beside, 0, len(row) - 1)].any() for row, k in zip(steps[moved], at, strict=True)]
-            if np.mean(seen) > best[0]:
-                best = (float(np.mean(seen)), float(np.hypot(a, b) / size))
-    return best
-
-
-def test_the_share_is_that_of_the_turn_that_most_points_agree_with():
-    rng = np.random.default_rng(7)
-    clock = np.linspace(0.3, 2.9, 60)
-    by_turn = 320.0 * np.column_stack([np.cos(clock), 0.8 * np.sin(clock)])
-    steps = rng.random((60, 101)) < 0.02
-    true = np.array([6.0, -8.0]) / np.hypot(*by_turn.T).max()
-    rows = np.flatnonzero(rng.random(60) < 0.8)
-    steps[rows, 50 + np.round(by_turn[rows] @ true / 0.5).astype(int)] = True
-    share, turn_rad = _edge_kernels.share_of_second_edge(steps, by_turn, LIMITS)
-    expected = plain_share(steps, by_turn, LIMITS)
-    assert (share, turn_rad) == pytest.approx(expected, abs=1e-12)
-    assert share > 0.75
-    assert turn_rad == pytest.approx(np.hypot(*true), rel=0.15)
-    # too few points that a turn moves
-    assert _edge_kernels.share_of_second_edge(steps[:30], by_turn[:30], LIMITS) == (0.0, 0.0)
 
 
 def test_a_film_of_mixed_pictures_is_no_film(frames):
