@@ -325,7 +325,7 @@ def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k
 def update_node(motion, air, index, sources, observed, wander, gate, charts, innovations, x, p, k):
     """Use the measurements of node ``k`` that pass the gate."""
     size = len(x)
-    c, rate, acceleration = np.empty((3, 3)), np.empty(6), np.empty(3)
+    c, rate, acceleration = np.empty((3, 3)), np.empty((12, 3)), np.empty(3)
     h, e, y = np.empty(3), np.empty(SLOTS), np.empty(3)
     used, s, factor = np.empty(3, dtype=np.int64), np.empty((3, 3)), np.empty((3, 3))
     w = np.empty((3, size))

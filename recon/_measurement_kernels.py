@@ -21,7 +21,7 @@ from flightmodel._kernels import (
     kernel,
     merged,
 )
-from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into
+from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into, mount_matrices
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
 SLOTS = 23
@@ -31,16 +31,20 @@ SLOTS = 23
 def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acceleration):
     """Attitude matrix, inertial rate in body axes and acceleration against the Earth at a grid point, in place.
 
-    ``rate`` (6,) is the rate and its rate of change: an antenna beside the accelerometer moves by both.
+    ``rate`` (12, 3), all in body axes, are the rate, its rate of change and the specific force, by which an antenna
+    beside the accelerometer moves, and the rate's partials by the gyros' nine errors.
     """
     dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
     if air is not None:
+        for j in range(1, 12):
+            for i in range(3):
+                rate[j, i] = 0.0
         a = ballistic_acceleration(
             air, position[0], position[1], position[2], velocity[0], velocity[1], velocity[2],
             errors[0], errors[1], errors[2], errors[3], errors[4], errors[5],
         )  # fmt: skip
         for i in range(3):
-            rate[i], rate[3 + i] = constants(motion.planet)[RATE] * c[2, i], 0.0
+            rate[0, i] = constants(motion.planet)[RATE] * c[2, i]
             acceleration[i] = a[i]
         return
     force = np.empty(3)
@@ -50,6 +54,7 @@ def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acce
     gx, gy, gz = gravitation(x, y, z, constants(motion.planet))
     w2, two = constants(motion.planet)[RATE] * constants(motion.planet)[RATE], 2.0 * constants(motion.planet)[RATE]
     for i in range(3):
+        rate[2, i] = force[i]
         acceleration[i] = c[i, 0] * force[0] + c[i, 1] * force[1] + c[i, 2] * force[2]
     acceleration[0] += gx + w2 * x + two * velocity[1]
     acceleration[1] += gy + w2 * y - two * velocity[0]
@@ -58,7 +63,7 @@ def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acce
 
 @inlined
 def node_rate(motion, index, errors, rate):
-    """Inertial rate at a grid point and its rate of change in body axes into ``rate`` (6,).
+    """Inertial rate at a grid point, its rate of change and its partials in body axes into ``rate`` (12, 3).
 
     The gyros' clock and what `with_exact_integrals` took from the sample (at even steps) are made good.
     """
@@ -75,11 +80,20 @@ def node_rate(motion, index, errors, rate):
             sample[j] += (w[after, j] - 2.0 * w[index, j] + w[before, j]) / 12.0
         change[j] = slope + errors[9 + j]  # of which `corrected` takes the bias
     corrected(sample, errors, 9, motion.dcm_body_rate, turn)
+    body_actual, body_mount, column = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    mount_matrices(motion.dcm_body_rate, errors[15:18], body_actual, body_mount)
     for j in range(3):
-        rate[j] = turn[j]
+        rate[0, j] = turn[j]
+        gain = 1.0 / (1.0 + errors[12 + j])
+        actual = (sample[j] - errors[9 + j]) * gain
+        cross_into(body_mount[:, j], turn, column)  # -[w x] of a column
+        for i in range(3):
+            rate[3 + j, i] = -gain * body_actual[i, j]
+            rate[6 + j, i] = actual * rate[3 + j, i]
+            rate[9 + j, i] = column[i]
     corrected(change, errors, 9, motion.dcm_body_rate, turn)
     for j in range(3):
-        rate[3 + j] = turn[j]
+        rate[1, j] = turn[j]
 
 
 @inlined
@@ -101,15 +115,15 @@ def corrected(measured, errors, offset, dcm_body_sensor, out):
 
 @inlined
 def observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective, sweep, pulled, planet):
-    """Observed point (3,), its velocity, levers of rotation of both, and the point's acceleration (3,), in place.
+    """Observed point (3,), its velocity, levers of rotation of both, and the point's acceleration (3,) then, in place.
 
-    ``p = r + C d - tau (v + C (w x d)) + tau^2 a_p / 2``, ``a_p = a + C (w' x d + w x (w x d))`` with ``w`` against the
-    Earth.
+    ``p = r + C d - tau (v + C (w x d)) + tau^2 a_p / 2 - tau^3 j / 6``, ``a_p = a + C s``, ``s = w' x d + w x (w x d)``
+    with ``w`` against the Earth; ``j = C (w x (f + s))`` of a force that turns with the body.
     """
     turn, change, lever_velocity = np.empty(3), np.empty(3), np.empty(3)
-    swing, inward = np.empty(3), np.empty(3)
+    swing, inward, pull, jerk = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
-        turn[i], change[i] = rate[i] - constants(planet)[RATE] * c[2, i], rate[3 + i]
+        turn[i], change[i] = rate[0, i] - constants(planet)[RATE] * c[2, i], rate[1, i]
     cross_into(turn, arm, lever_velocity)
     cross_into(change, arm, swing)
     cross_into(turn, lever_velocity, inward)
@@ -117,12 +131,18 @@ def observed_point(arm, tau, position, velocity, c, rate, acceleration, point, s
         swing[i] += inward[i]
         effective[i] = arm[i] - tau * (lever_velocity[i] - 0.5 * tau * swing[i])
         sweep[i] = lever_velocity[i] - tau * swing[i]
+        pull[i] = rate[2, i] + swing[i]
+    cross_into(turn, pull, jerk)
     for i in range(3):
         moving = velocity[i] + c[i, 0] * lever_velocity[0] + c[i, 1] * lever_velocity[1] + c[i, 2] * lever_velocity[2]
         pulled[i] = acceleration[i] + c[i, 0] * swing[0] + c[i, 1] * swing[1] + c[i, 2] * swing[2]
+        late = tau * (c[i, 0] * jerk[0] + c[i, 1] * jerk[1] + c[i, 2] * jerk[2])
         point[i] = position[i] + c[i, 0] * arm[0] + c[i, 1] * arm[1] + c[i, 2] * arm[2]
-        point[i] += tau * (0.5 * tau * pulled[i] - moving)
-        speed[i] = moving - tau * pulled[i]
+        point[i] += tau * (0.5 * tau * (pulled[i] - late / 3.0) - moving)
+        sweep[i] += 0.5 * tau * tau * jerk[i]
+        effective[i] -= tau * tau * tau / 6.0 * jerk[i]
+        speed[i] = moving - tau * (pulled[i] - 0.5 * late)
+        pulled[i] -= late
 
 
 @inlined
@@ -347,10 +367,12 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
         return
     if kind == RANGE_RATE:
         predict_range_rate(site, tau, e, c, sweep, pulled, point, speed, effective, h, m, by_state, by_error)
+        gyro_rows(by_state[:, 3:6], 1, arm, c, rate, by_error)
         return
     predict_place(kind, site, dcm, e, point, speed, h, m, by_error, planet)
     if kind == VELOCITY:
         velocity_rows(m, 3, c, sweep, pulled, by_state, by_error)
+        gyro_rows(m, 3, arm, c, rate, by_error)
         return
     state_rows(m, 1 if kind == HEIGHT else 3, tau, c, effective, speed, by_state, by_error)
 
@@ -393,6 +415,21 @@ def velocity_rows(m, count, c, sweep, pulled, by_state, by_error):
         cross_into(sweep, row, lever)
         for j in range(3):
             by_state[i, 6 + j] = lever[j]
+
+
+@inlined
+def gyro_rows(m, count, arm, c, rate, by_error):
+    """Partials of a velocity along the first axes of ``m`` (3, 3) by the gyros' errors, slots 4 to 12.
+
+    ``m C (dw x d)``. Left out, of what a late tag adds to it: a twentieth at 37 rad/s and a millisecond.
+    """
+    row, lever = np.empty(3), np.empty(3)
+    for i in range(count):
+        for j in range(3):
+            row[j] = m[i, 0] * c[0, j] + m[i, 1] * c[1, j] + m[i, 2] * c[2, j]
+        cross_into(arm, row, lever)  # row . (dw x d) = dw . (d x row)
+        for j in range(9):
+            by_error[i, 4 + j] = rate[3 + j, 0] * lever[0] + rate[3 + j, 1] * lever[1] + rate[3 + j, 2] * lever[2]
 
 
 @inlined

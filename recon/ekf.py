@@ -425,7 +425,7 @@ class _FilterpyPass:
     def node_motion(self, k: int) -> NodeMotion:
         """Motion of a node, as measurements are predicted from it."""
         chart = self.chart(k)
-        rate, acceleration = np.empty(6), np.empty(3)
+        rate, acceleration = np.empty((12, 3)), np.empty(3)
         _measurement_kernels.motion_at(
             *self.problem.motion.split(), self.problem.node_index[k], *as_charts(chart), rate, acceleration
         )

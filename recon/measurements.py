@@ -3,10 +3,11 @@
 A tracked point at ``d`` from the accelerometer in body axes, tagged ``t``, was observed at ``t - tau`` (``tau``: time
 tag minus true time), so
 
-    p = r + C d - tau (v + C (w x d)) + tau^2 a_p / 2,      a_p = a + C (w' x d + w x (w x d))
+    p = r + C d - tau (v + C (w x d)) + tau^2 a_p / 2 - tau^3 j / 6,     a_p = a + C s,   j = C (w x (f + s))
 
-with ``w`` the body's rate against the Earth at the tag, by the gyros' own clock, and ``a`` the acceleration of the
-accelerometer. Then, each plus its errors and noise:
+with ``w`` the body's rate against the Earth at the tag, by the gyros' own clock, ``a`` and ``f`` the acceleration of
+the accelerometer and its specific force, and ``s = w' x d + w x (w x d)``; of ``j`` what turns with a fast vehicle.
+Errors of the gyros move ``dp/dt`` by ``C (dw x d)``. Then, each plus its errors and noise:
 
 * radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95), the lag of its servo
   (`recon.tracking_servo`, ``1 + e`` times the one of the path about which one is linearised), residual
@@ -74,18 +75,21 @@ COMPONENTS = {
 _STATES = instruments.RADAR.states
 _RANGE_RATE_AT = _STATES.index("range rate bias")  # a reading of its own, with two errors
 _OWN_RADAR, _DOPPLER, _LAST = _STATES[:_RANGE_RATE_AT], _STATES[_RANGE_RATE_AT:-2], _STATES[-2:]
+# errors that the velocity of a point beside the accelerometer depends on
+_GYROS = instruments.RATES.states[:9]
 # time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
     RADAR: (*_OWN_RADAR, *instruments.SITES.states, *_LAST),
-    RANGE_RATE: (*_DOPPLER, "", _STATES[3]),
+    RANGE_RATE: (*_DOPPLER, "", _STATES[3], *_GYROS),
     POSITION: instruments.GNSS.states[:4],
-    VELOCITY: (*instruments.GNSS.states[4:], instruments.GNSS.states[3]),
+    VELOCITY: (*instruments.GNSS.states[4:], instruments.GNSS.states[3], *_GYROS),
     HEIGHT: instruments.BAROMETER.states,
     FIELD: instruments.MAGNETOMETER.states,
     SUN: (*instruments.SUN.states[:2], "", "", *instruments.SUN.states[2:]),
     DECELERATION: ("bias", "scale", "", "time bias", *(name for _, name in DRIVERS)),
 }
 _OWNERS = {DECELERATION: dict(enumerate((owner for owner, _ in DRIVERS), start=4))}  # of slots that are not its own
+_OWNERS |= dict.fromkeys((VELOCITY, RANGE_RATE), dict.fromkeys(range(4, 13), "rates"))
 
 
 def component_unit(component: str) -> str:
@@ -352,12 +356,16 @@ def sun_instruments(name: str, record: SunRecord, sun_ecef: FloatArray, rows: In
 
 @dataclass(frozen=True)
 class NodeMotion:
-    """Attitude matrix, inertial rate and its rate of change (6,) in body axes and acceleration against the Earth."""
+    """Attitude matrix, turning in body axes and acceleration against the Earth.
+
+    Turning (12, 3) are the inertial rate, its rate of change, the specific force, and the rate's partials by the gyros'
+    nine errors.
+    """
 
     position_ecef_m: FloatArray
     velocity_ecef_mps: FloatArray
     dcm_ecef_body: FloatArray
-    rate_body_radps: FloatArray
+    turning_body: FloatArray
     acceleration_ecef_mps2: FloatArray
     air: Air | None = None
     planet: Planet = WGS84
@@ -382,28 +390,33 @@ def predict(
         by_state[: len(reading), 6:9] = by_body @ rotations.skew(body)
         return np.append(reading, np.zeros(3 - len(reading))), by_state, by_error
     c, arm, tau = at.dcm_ecef_body, instrument.arm_body_m, e[3]
-    turning, change = np.split(at.rate_body_radps, 2)
+    turning, change, force = at.turning_body[:3]
     turning = turning - at.planet.rate_radps * c[2]
     lever_velocity = np.cross(turning, arm)
     moving = at.velocity_ecef_mps + c @ lever_velocity
     swing = np.cross(change, arm) + np.cross(turning, lever_velocity)
     pulled = at.acceleration_ecef_mps2 + c @ swing
-    point = at.position_ecef_m + c @ arm - tau * moving + 0.5 * tau**2 * pulled
-    speed = moving - tau * pulled
+    jerk = np.cross(turning, force + swing)
+    point = at.position_ecef_m + c @ arm - tau * moving + 0.5 * tau**2 * pulled - tau**3 / 6.0 * c @ jerk
+    speed, pulled = moving - tau * pulled + 0.5 * tau**2 * c @ jerk, pulled - tau * c @ jerk
+    effective = arm - tau * (lever_velocity - 0.5 * tau * swing) - tau**3 / 6.0 * jerk
+    sweep = lever_velocity - tau * swing + 0.5 * tau**2 * jerk
+    by_gyros = -c @ rotations.skew(arm) @ at.turning_body[3:].T
     if instrument.kind == VELOCITY:
         by_state[:, 3:6] = instrument.dcm
-        by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(lever_velocity - tau * swing)
+        by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(sweep)
         by_error[:, 0:3] = np.eye(3)
-        by_error[:, 3] = -instrument.dcm @ pulled
+        by_error[:, 3], by_error[:, 4:13] = -instrument.dcm @ pulled, instrument.dcm @ by_gyros
         return instrument.dcm @ speed + e[0:3], by_state, by_error
     if instrument.kind == RANGE_RATE:
         sight = point - instrument.site_ecef_m
         u = sight / np.linalg.norm(sight)
         across = (speed - (u @ speed) * u) / np.linalg.norm(sight)
         by_state[0, 0:3], by_state[0, 3:6] = across, u - tau * across
-        by_state[0, 6:9] = -u @ c @ rotations.skew(lever_velocity - tau * swing)
-        by_state[0, 6:9] -= across @ c @ rotations.skew(arm - tau * (lever_velocity - 0.5 * tau * swing))
+        by_state[0, 6:9] = -u @ c @ rotations.skew(sweep)
+        by_state[0, 6:9] -= across @ c @ rotations.skew(effective)
         by_error[0, 0:2], by_error[0, 3] = 1.0, -across @ speed - u @ pulled
+        by_error[0, 4:13] = by_state[0, 3:6] @ by_gyros
         return np.array([u @ speed + e[0] + e[1], 0.0, 0.0]), by_state, by_error
     if instrument.kind == RADAR:
         h, m = _radar(instrument, known, e, point, by_error)
@@ -414,7 +427,7 @@ def predict(
         h, m = _height(instrument, e, point, by_error, at.planet)
     by_state[:, 0:3] = m
     by_state[:, 3:6] = -tau * m
-    by_state[:, 6:9] = -m @ c @ rotations.skew(arm - tau * (lever_velocity - 0.5 * tau * swing))
+    by_state[:, 6:9] = -m @ c @ rotations.skew(effective)
     by_error[:, 3] = -m @ speed
     return h, by_state, by_error
 

@@ -46,8 +46,8 @@ from recon import (
     ekf,
     fault_isolation,
     imu_screening,
+    linearisation,
     oscillation,
-    propagation,
     rest,
     setup,
     single_faults,
@@ -61,28 +61,23 @@ from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
 from recon.fault_detection import (
     UNMODELLED_CODE,
     UnmodelledAcceleration,
-    track_is_lost,
     unsupported_offsets,
-    with_one_more,
     with_unmodelled,
 )
 from recon.fault_isolation import INFLATION, NO_ADAPTATION, Adaptation, LeftOut
 from recon.imu_screening import BridgedSensor
+from recon.linearisation import SpinPhase
 from recon.propagation import correct, correction_partials
 from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem
 from recon.single_faults import Single, SingleFault
 from recon.smoother import Smoothed
-from recon.state import INERTIAL, KINEMATIC, ROTATION, States, unpacked
+from recon.state import INERTIAL, KINEMATIC, States, unpacked
 from recon.tracking_servo import with_servo_lag
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
-_THINNED_STEP_S = 0.5
 _UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
-_MOST_THINNED_PASSES = 6
 _LINEAR_LAG_S = 0.03  # of an oscillation of a second's period a tenth of a radian
-_FARTHEST_SD = 3.0
-_CONVERGED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of its effect
 _CONVERGED_SD = 0.01  # a pass that changes nothing by more than this part of its sd is the last
 _BLOCK = 1 << 16  # samples that are corrected at a time
 
@@ -243,16 +238,8 @@ def _coarse_problem(telemetry: Telemetry, coarse: Settings, known: Adaptation) -
 def _log_likelihood(one: Single, problem: Problem, coarse: Settings) -> tuple[float, float]:
     """Log likelihood of thinned tracking data of a problem under a hypothesis, and the innovations' mean square."""
     problem = fault_isolation.with_inflated_priors(problem, one.inflated_sd)
-    thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(_THINNED_STEP_S)
-    reference = None
-    for k in range(_MOST_THINNED_PASSES):
-        thinned = with_servo_lag(thinned, reference)
-        run = ekf.forward(thinned, reference, coarse.engine)
-        smoothed = smoother.smooth(thinned, run, False, coarse.engine)
-        moved = np.abs(smoothed.x[:, ROTATION]).max() if k else np.inf
-        reference = _bounded_drivers(thinned, smoothed.states(run.charts))
-        if moved < _CONVERGED_RAD:
-            break
+    thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(linearisation.THINNED_STEP_S)
+    thinned, run, _ = linearisation.converged(thinned, coarse.engine)
     return single_faults.log_likelihood(thinned, run)
 
 
@@ -380,7 +367,7 @@ def reconstruct_once(
     report(0.0, "bridging gaps")
     sensors = bridge_inertial_sensors(telemetry, adaptation)
     problem = _adapted_problem(telemetry, settings, sensors, adaptation)
-    problem, run, smoothed, reference, passes, spans = _iterate(problem, settings, report)
+    problem, run, smoothed, reference, passes, spans, phase = _iterate(problem, settings, report)
     screened = _screened(telemetry, problem, run, sensors, adaptation)
     known = adaptation.jumps or (), adaptation.rejected_offsets or ()
     if (screened.jumps, screened.rejected_offsets) != known:
@@ -393,6 +380,7 @@ def reconstruct_once(
     checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
     checks += consistency.filter_against_smoother(problem, run, smoothed, reference, settings.check_confidence)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
+    checks += [] if phase is None else [phase.check()]
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
     held_out = held_out_table(problem, run, settings.engine)
     checks += consistency.held_out_checks(problem, held_out, settings)
@@ -486,7 +474,7 @@ def linearised(telemetry: Telemetry, settings: Settings) -> Linearised:
     adaptation = reconstruct_once(telemetry, settings).adaptation
     sensors = bridge_inertial_sensors(telemetry, adaptation)
     problem = _adapted_problem(telemetry, settings, sensors, adaptation)
-    *_, states, _, unmodelled = _iterate(problem, settings, lambda _fraction, _what: None)
+    *_, states, _, unmodelled, _ = _iterate(problem, settings, lambda _fraction, _what: None)
     return Linearised(states, adaptation, unmodelled, sensors)
 
 
@@ -580,19 +568,22 @@ def _series(
 
 def _iterate(
     problem: Problem, settings: Settings, report: Progress
-) -> tuple[Problem, ekf.ForwardPass, Smoothed, States, int, tuple[UnmodelledAcceleration, ...]]:
-    """Problem with its radars' lag, last forward pass, smoothed errors and states, passes, unmodelled accelerations."""
-    reference = None
+) -> tuple[Problem, ekf.ForwardPass, Smoothed, States, int, tuple[UnmodelledAcceleration, ...], SpinPhase | None]:
+    """Problem with its radars' lag, last forward pass, smoothed errors and states, passes, unmodelled accelerations.
+
+    Last, what the phase of a fast spin was chosen from.
+    """
+    reference, phase = None, None
     found: tuple[UnmodelledAcceleration, ...] = ()
     if settings.passes > 0:
         report(0.02, "first passes on thinned data")
-        reference, found = _first_reference(problem, settings)
+        reference, found, phase = linearisation.first_reference(problem, settings)
     most, i = max(1, settings.passes), 0
     while True:
         share = 0.85 / most
         report(0.1 + share * i, f"filter, pass {i + 1}")
         problem = with_servo_lag(problem, reference)
-        run, found = _follow_track(problem, reference, settings, found)
+        run, found = linearisation.follow_track(problem, reference, settings, found)
         report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
         smoothed = smoother.smooth(problem, run, True, settings.engine)
         kept = np.flatnonzero(problem.kept)
@@ -600,56 +591,9 @@ def _iterate(
         smoothed_states = smoothed.states(run.charts)
         i += 1
         if moved.max() < _CONVERGED_SD or i == most:
-            return problem, run, smoothed, smoothed_states, i, found
-        reference = _bounded_drivers(problem, smoothed_states)
+            return problem, run, smoothed, smoothed_states, i, found, phase
+        reference = linearisation.bounded_drivers(problem, smoothed_states)
         del run, smoothed  # as large as all else together, and the next pass makes its own
-
-
-def _follow_track(
-    problem: Problem, reference: States | None, settings: Settings, found: tuple[UnmodelledAcceleration, ...]
-) -> tuple[ekf.ForwardPass, tuple[UnmodelledAcceleration, ...]]:
-    """Forward pass with as many spans of unmodelled acceleration as it takes to follow the track, and these."""
-    while True:
-        run = ekf.forward(with_unmodelled(problem, found), reference, settings.engine)
-        more = with_one_more(found, problem, run)
-        if more is None:
-            return run, found
-        found = more
-
-
-def _bounded_drivers(problem: Problem, states: States) -> States:
-    """States to linearise about: drivers of ballistic flight no farther than `_FARTHEST_SD` from their a priori values.
-
-    Drag enters as its logarithm. Linearised in thin air at high speed, a parachute needs a thousandfold drag, and about
-    that the next pass would be stiff and far from the truth; any point serves that later passes bring nearer.
-    """
-    if not problem.motion.ballistic:
-        return states
-    errors, count = states.sensor_errors.copy(), problem.motion.drivers
-    limit = _FARTHEST_SD * problem.model.prior_sd[:count]
-    errors[:, :count] = np.clip(errors[:, :count], -limit, limit)
-    return replace(states, sensor_errors=errors)
-
-
-def _first_reference(problem: Problem, settings: Settings) -> tuple[States, tuple[UnmodelledAcceleration, ...]]:
-    """Smoothed states at all nodes from a point of each source every `_THINNED_STEP_S`, to convergence."""
-    thinned, kept = problem.thinned(_THINNED_STEP_S)
-    reference = None
-    found: tuple[UnmodelledAcceleration, ...] = ()
-    for k in range(_MOST_THINNED_PASSES):
-        thinned = with_servo_lag(thinned, reference)
-        run, found = _follow_track(thinned, reference, settings, found)
-        if k == 0 and problem.motion.ballistic and track_is_lost(thinned, run):
-            # after a long gap the filter's prediction is far from the track: linearise about the tracking data
-            reference = setup.track_fit_states(problem.instruments, thinned.time_s, problem.model.size)
-            run, found = _follow_track(thinned, reference, settings, ())
-        smoothed = smoother.smooth(thinned, run, False, settings.engine)
-        moved = np.abs(smoothed.x[:, ROTATION]).max() if reference is not None else np.inf
-        reference = _bounded_drivers(problem, smoothed.states(run.charts))
-        if moved < _CONVERGED_RAD:
-            break
-    assert reference is not None
-    return propagation.fill_between(problem.motion, problem.node_index, kept, reference), found
 
 
 @dataclass(frozen=True)

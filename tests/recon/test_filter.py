@@ -166,7 +166,7 @@ def textbook_measurement(problem, reference, row, slots):
     """Prediction, partials by all errors, noise and used components of one measurement, from the numpy twins."""
     k, source = problem.node[row], problem.observed.source[row]
     at, slot = reference[int(k)], slots[source]
-    rate, acceleration = np.empty(6), np.empty(3)
+    rate, acceleration = np.empty((12, 3)), np.empty(3)
     _measurement_kernels.motion_at(
         *problem.motion.split(), problem.node_index[k], *ekf.as_charts(at), rate, acceleration
     )  # fmt: skip

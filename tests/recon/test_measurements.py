@@ -21,6 +21,7 @@ from recon.measurements import (
     radar_instrument,
     wrapped,
 )
+from recon.propagation import strapdown_motion
 from recon.settings import Settings
 from recon.setup import tracking_instruments
 from synthetic_flight import sensing
@@ -28,7 +29,10 @@ from synthetic_flight.instrument_errors import Radar, child
 
 LATITUDE, LONGITUDE, HEIGHT_M = -0.58, 0.31, 40.0
 ARM = np.array([0.41, -0.36, 0.73])
-RATE = np.array([0.63, -0.2, 0.31, 2.0, -1.4, 0.7])  # and its rate of change
+# its rate of change, the specific force, and partials by the gyros' errors
+RATE = np.vstack(
+    [[0.63, -0.2, 0.31], [2.0, -1.4, 0.7], [-35.0, 4.0, 9.0], np.random.default_rng(8).normal(size=(9, 3))]
+)
 ACCELERATION = np.array([-40.0, 25.0, -12.0])
 KINDS = {"radar": RADAR, "position": POSITION, "velocity": VELOCITY, "height": HEIGHT, "field": FIELD, "sun": SUN}
 KINDS |= {"range rate": RANGE_RATE}
@@ -144,7 +148,11 @@ def by_differences(source, e, at):
         ]
         by_state[:, j] = wrapped(source.kind, ends[0] - ends[1]) / (2.0 * step)
     for j, name in enumerate(SLOT_NAMES[source.kind]):
+        if j >= 4 and source.kind in (VELOCITY, RANGE_RATE):
+            break  # the gyros' errors, by which the motion at a node differs
         step = 1e-4 * max(abs(e[j]), 1e-9 if source.kind == FIELD and j < 3 else 1e-3)
+        if j == 3 or (source.kind == RADAR and 13 <= j < 20):
+            step = max(step, 1e-5 if j == 3 else 1e-2)  # of a range of 300 km less leaves six digits
         d = np.zeros(SLOTS)
         d[j] = step
         ends = [compiled(source, e + s * d, position, velocity, q)[0] for s in (1.0, -1.0)]
@@ -157,6 +165,8 @@ def test_partials_are_derivatives_with_every_term_alive(kind):
     source, e = instrument(kind), padded(ERRORS[kind])
     _, by_state, by_error = compiled(source, e, *place())
     state, error = by_differences(source, e, place())
+    gyros = slice(4, 13 if kind in (VELOCITY, RANGE_RATE) else 4)
+    by_error[:, gyros] = 0.0
     for group in (slice(0, 3), slice(3, 6), slice(6, 9)):
         size = np.abs(state[:, group]).max(axis=1, keepdims=True)
         # differences of 10 m, 10 m/s, 1 mrad: third order and rounding below 1e-5. Left out on purpose: the Earth's
@@ -166,6 +176,7 @@ def test_partials_are_derivatives_with_every_term_alive(kind):
     size = np.abs(error).max(axis=0)
     assert (np.abs(by_error - error).max(axis=0) <= 5e-6 * size).all()
     named = np.array([bool(n) for n in SLOT_NAMES[kind]])
+    named[gyros] = False
     assert (size[: len(named)][named] > 0.0).all(), "a slot that does nothing"
     assert not by_error[:, len(named) :].any()
     reads = {FIELD: [False, False, True], SUN: [False, False, True], VELOCITY: [False, True, True]}
@@ -226,8 +237,8 @@ def test_radar_sees_the_tracked_point_at_the_true_time():
     e = padded([4.0, 2e-4, -1e-4, 2.5e-3])
     h, _, _ = compiled(instrument(RADAR), e, position, velocity, q)
     c = rotations.dcm_from_q(q)
-    turn = RATE[:3] - c.T @ earth.OMEGA_ECEF_RADPS
-    pulled = ACCELERATION + c @ (np.cross(RATE[3:], ARM) + np.cross(turn, np.cross(turn, ARM)))
+    turn = RATE[0] - c.T @ earth.OMEGA_ECEF_RADPS
+    pulled = ACCELERATION + c @ (np.cross(RATE[1], ARM) + np.cross(turn, np.cross(turn, ARM)))
     point = position + c @ ARM - 2.5e-3 * (velocity + c @ np.cross(turn, ARM)) + 0.5 * 2.5e-3**2 * pulled
     z = earth.radar_from_ecef(point, LATITUDE, LONGITUDE, HEIGHT_M)
     assert np.allclose(wrapped(RADAR, h - z), [4.0, 2e-4 + KNOWN[RADAR][1], -1e-4 + KNOWN[RADAR][2]], rtol=1e-6)
@@ -246,7 +257,7 @@ def test_a_time_bias_follows_the_flight_to_second_order(mini_truth):
         e = padded([0.0, 0.0, 0.0, tau])
         reading, _, _ = compiled(
             receiver, e, truth.position_ecef_m[0], truth.velocity_ecef_mps[0], truth.q_ecef_body[0],
-            np.append(truth.omega_body_eci_body_radps[0], np.zeros(3)), acceleration,
+            np.vstack([truth.omega_body_eci_body_radps[:1], np.zeros((11, 3))]), acceleration,
         )  # fmt: skip
         seen = mini_truth.trajectory(np.array([t - tau]), arm).position_ecef_m[0]
         left.append(np.linalg.norm(reading - receiver.dcm @ (seen - receiver.site_ecef_m)))
@@ -255,11 +266,55 @@ def test_a_time_bias_follows_the_flight_to_second_order(mini_truth):
     assert np.allclose(np.diff(np.log2(left)), 3.0, atol=0.3)
 
 
+@pytest.mark.parametrize("kind", [VELOCITY, RANGE_RATE])
+def test_gyros_errors_move_an_antenna_beside_the_accelerometer(kind):
+    """Partials by bias, scale and mount of the gyros, through the motion at a node and against its differences."""
+    rng, source, at = np.random.default_rng(11), instrument(kind), place()
+    mounts = [rotations.dcm_from_q(rotations.exp(rng.normal(0.0, 1.0, 3))) for _ in range(2)]
+    force, rate, one = rng.normal(0.0, 20.0, (2, 3)), rng.normal(0.0, 9.0, (2, 3)), np.ones((2, 3))
+    inertial, _ = strapdown_motion(np.array([0.0, 0.01]), force, rate, one, one, *mounts).split()
+
+    def seen(errors):
+        turning, acceleration = np.empty((12, 3)), np.empty(3)
+        _measurement_kernels.motion_at(inertial, None, 1, *at, errors, turning, acceleration)
+        return compiled(source, np.zeros(SLOTS), *at, turning, acceleration)
+
+    errors = rng.normal(0.0, 0.01, 18)
+    by_gyros = seen(errors)[2][:, 4:13]
+    for j in range(9):
+        step = 1e-5 * np.eye(18)[9 + j]
+        want = (seen(errors + step)[0] - seen(errors - step)[0]) / 2e-5
+        # a mount's partial is its matrix to first order in the mount
+        assert np.abs(by_gyros[:, j] - want).max() < (2e-4 if j >= 6 else 1e-7) * np.abs(by_gyros).max(), j
+    assert (np.abs(by_gyros).max(axis=0) > 0.1).all()
+
+
+def test_a_late_velocity_of_a_fast_spinner_is_that_of_its_circle():
+    """An antenna on a circle about the spin axis, as the accelerometer is: its velocity at the tag's true time."""
+    w, tau, arm = np.array([37.7, 0.0, 0.0]), 2e-3, np.array([0.0, 0.2, -0.1])
+    position, velocity, q = place()
+    c = rotations.dcm_from_q(q)
+    own = np.array([0.0, 0.05, 0.03])  # accelerometer from the spin axis
+    turning = np.zeros((12, 3))
+    turning[0], turning[2] = w + c.T @ earth.OMEGA_ECEF_RADPS, np.cross(w, np.cross(w, own))
+    e = padded([0.0, 0.0, 0.0, tau])
+    moving = velocity + c @ np.cross(w, own)
+    found = compiled(instrument(VELOCITY, arm), e, position, moving, q, turning, c @ turning[2])
+    earlier = rotations.dcm_from_q(rotations.boxplus(q, -tau * w))
+    ned = earth.dcm_ned_ecef(LATITUDE, LONGITUDE)
+    want = ned @ (velocity + earlier @ np.cross(w, own + arm))
+    radius, turned = np.linalg.norm((own + arm)[1:]), 37.7 * tau
+    assert np.linalg.norm(found[0] - want) < 37.7 * radius * turned**3 / 5.0
+    assert 37.7 * radius * turned**2 / 2.0 > 0.02  # what the second order is, m/s
+    partial = -ned @ earlier @ np.cross(w, np.cross(w, own + arm))
+    np.testing.assert_allclose(found[2][:, 3], partial, atol=37.7**2 * radius * turned**2)
+
+
 def test_receiver_and_height_equal_geometry():
     position, velocity, q = place()
     c = rotations.dcm_from_q(q)
     point = position + c @ ARM
-    swing = c @ np.cross(RATE[:3] - c.T @ earth.OMEGA_ECEF_RADPS, ARM)
+    swing = c @ np.cross(RATE[0] - c.T @ earth.OMEGA_ECEF_RADPS, ARM)
     ned = earth.dcm_ned_ecef(LATITUDE, LONGITUDE)
     site = earth.ecef_from_geodetic(LATITUDE, LONGITUDE, HEIGHT_M)
     h, _, _ = compiled(instrument(POSITION), padded([3.0, -4.0, 5.0]), position, velocity, q)

@@ -10,7 +10,7 @@ from flightmodel import instruments
 from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import GnssRecord, RadarRecord, TriadRecord
-from recon._measurement_kernels import RADAR
+from recon._measurement_kernels import RADAR, RANGE_RATE, VELOCITY
 from recon.propagation import inertial_motion
 from recon.reconstruct import bridge_inertial_sensors, reconstruct
 from recon.settings import Settings
@@ -164,10 +164,12 @@ def test_only_stated_errors_become_states(mini_sense, mini_everything):
         slots = instrument.slots(full.model)
         used = slots[slots >= 0]
         assert len(set(used)) == len(used) > 0
-        owners = (f"{instrument.owner} ", "sites ") if instrument.kind == RADAR else (f"{instrument.owner} ",)
+        # a radar has what all sites share, a velocity of a point beside the accelerometer the gyros' errors
+        shared = {RADAR: ("sites ",), VELOCITY: ("rates ",), RANGE_RATE: ("rates ",)}.get(instrument.kind, ())
+        owners = (f"{instrument.owner} ", *shared)
         assert all(full.model.names[s].startswith(owners) for s in used)
     everywhere = np.concatenate([i.slots(full.model) for i in full.instruments])
-    assert set(everywhere[everywhere >= 0]) == set(range(20, full.model.size))
+    assert set(everywhere[everywhere >= 0]) == {*range(9, 18), *range(20, full.model.size)}
 
 
 def test_considering_takes_components_groups_and_whole_kinds(mini_everything):
