@@ -107,7 +107,7 @@ def compiled(source, e, position, velocity, q, rate=RATE, acceleration=ACCELERAT
     h, by_state, by_error = np.empty(3), np.empty((3, 9)), np.empty((3, SLOTS))
     _measurement_kernels.predict_one(
         source.kind, source.arm_body_m, source.site_ecef_m, source.dcm, known(source.kind), e, position, velocity, q,
-        rate, acceleration, h, by_state, by_error,
+        rate, acceleration, h, by_state, by_error, earth.WGS84,
     )  # fmt: skip
     return h, by_state, by_error
 
