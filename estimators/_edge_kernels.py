@@ -79,17 +79,31 @@ def sample_lines(image, origin, inward, first, step, corner, size, grey, inside)
 
 
 @inlined
-def _median(values, count):
-    """Median of the first values, which are sorted in place (insertion: they are few)."""
-    for i in range(1, count):
-        key = values[i]
-        j = i - 1
-        while j >= 0 and values[j] > key:
-            values[j + 1] = values[j]
-            j -= 1
-        values[j + 1] = key
+def median(values, count):
+    """Median of the first values, whose order changes (selection by C. A. R. Hoare)."""
     half = count // 2
-    return values[half] if count % 2 else 0.5 * (values[half - 1] + values[half])
+    low, high = 0, count - 1
+    while low < high:
+        pivot, i, j = values[half], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < half:
+            low = i
+        if half < i:
+            high = j
+    if count % 2:
+        return values[half]
+    below = values[0]
+    for i in range(1, half):
+        below = max(below, values[i])
+    return 0.5 * (below + values[half])
 
 
 @kernel
@@ -105,7 +119,7 @@ def sky_levels(grey, inside, span, level, scatter, first):
         for j in range(span):
             few[j] = grey[i, min(first[i] + j, m - 1)]
         scatter[i] = abs(few[span // 2] - few[0])
-        level[i] = _median(few, span)
+        level[i] = median(few, span)
 
 
 @kernel
@@ -139,7 +153,7 @@ def first_rises(grey, inside, level, first, noise, common, limits, step, places,
             count = int(3.5 / step) - int(2.0 / step)
             for j in range(count):
                 few[j] = grey[i, min(inner + int(2.0 / step) + j, m - 1)]
-            shell = _median(few, count)
+            shell = median(few, count)
             half = 0.5 * (level[i] + shell)
             crossing = -1
             for k in range(max(rise - int(3.0 / step), 0), min(rise + int(5.0 / step), m)):
@@ -184,7 +198,7 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, along, left,
             continue
         for k in range(level_of):
             few[k] = grey[i, k]
-        level = _median(few, level_of)
+        level = median(few, level_of)
         total = 0.0
         for k in range(m):
             value[k] = grey[i, k] - level

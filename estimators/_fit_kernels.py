@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from estimators._edge_kernels import median
 from estimators._sight_kernels import COLUMNS, feet, limb_points, project_points, rotation_of
 from flightmodel._kernels import inlined, kernel
 
@@ -47,8 +48,10 @@ def _project_edge(deformation, clocks, circles, ring, joint, lens, terms, points
     for i in range(len(points)):
         if math.isfinite(pixels[i, 0]):
             if count < i:
-                pixels[count] = pixels[i]
-                jacobian[count] = jacobian[i]
+                for c in range(2):
+                    pixels[count, c] = pixels[i, c]
+                    for j in range(COLUMNS):
+                        jacobian[count, c, j] = jacobian[i, c, j]
             kept[count] = clocks[i]
             count += 1
     return count
@@ -79,7 +82,8 @@ def _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, co
         j = min(int(at[i]), count - 2) if math.isfinite(residual[i]) else 0
         clock = kept[j] + (at[i] - j) * (kept[j + 1] - kept[j])
         _lobe_columns(rows[i, 2], width * rows[i, _RADIUS], clock, shape[i])
-        shape[i, LOBES:] = light[i]
+        for c in range(3):
+            shape[i, LOBES + c] = light[i, c]
 
 
 @inlined
@@ -100,7 +104,8 @@ def _feature_residuals(
         away = math.sqrt((-spots[i, 0] - ring[0]) ** 2 + (radius - ring[1]) ** 2)
         clock = math.atan2(spots[i, 2], -spots[i, 1])
         _lobe_columns(rows[m + i, 2], away * rows[m + i, _RADIUS], clock, shape[m + i])
-        shape[m + i, LOBES:] = 0.0
+        for c in range(3):
+            shape[m + i, LOBES + c] = 0.0
 
 
 @inlined
@@ -129,13 +134,13 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
             edges = used
         inflate = 1.0
         if used > 0:
-            centre = np.median(scaled[:used])
+            centre = median(scaled, used)
             used = 0
             for i in range(size):
                 if math.isfinite(residual[start + i]):
                     scaled[used] = abs(residual[start + i] - centre) / sd[i]
                     used += 1
-            inflate = max(1.4826 * np.median(scaled[:used]), 1.0)
+            inflate = max(1.4826 * median(scaled, used), 1.0)
         for i in range(size):
             weight[start + i] = 0.0
             if math.isfinite(residual[start + i]):
@@ -148,8 +153,10 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
 def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, design, normal, right):
     """Weighted normal equations with priors, means and sd, on all but the deflection."""
     (mean, sd), k, n = prior, basis.shape[1], len(design)
-    normal[:] = 0.0
-    right[:] = 0.0
+    for a in range(n):
+        right[a] = 0.0
+        for b in range(n):
+            normal[a, b] = 0.0
     for i in range(len(residual)):
         if weight[i] > 0.0:
             for j in range(k):
@@ -170,6 +177,29 @@ def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, d
             normal[a, b] = normal[b, a]
     # the flattening is carried from step to step, the others are counted from zero in each
     right[k] -= flattening / sd[0] ** 2
+
+
+@inlined
+def solve_by_cholesky(matrix, right):
+    """Solve ``A x = b`` in place of ``b``; of the positive definite ``A`` the lower half becomes its factor.
+
+    Written out: of LAPACK's call the compiler makes more than of this, and so few unknowns wait longer for it.
+    """
+    n = len(right)
+    for i in range(n):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for c in range(j):
+                value -= matrix[i, c] * matrix[j, c]
+            matrix[i, j] = math.sqrt(value) if i == j else value / matrix[j, j]
+        for c in range(i):
+            right[i] -= matrix[i, c] * right[c]
+        right[i] /= matrix[i, i]
+    for r in range(n):
+        i = n - 1 - r
+        for c in range(i + 1, n):
+            right[i] -= matrix[c, i] * right[c]
+        right[i] /= matrix[i, i]
 
 
 @kernel
@@ -217,12 +247,14 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
         if edges < fewest:
             return TOO_FEW, edges
         _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, design, normal, right)
-        step = np.linalg.solve(normal, right)
+        solve_by_cholesky(normal, right)
+        step = right
         for j in range(k):
             deformation[0] += basis[0, j] * step[j]
             deformation[1] += basis[1, j] * step[j]
         deformation[2] += step[k]
-        form[:] = step[k + 1 :]
+        for j in range(1 + SHAPES):
+            form[j] = step[k + 1 + j]
         if not deformation[0] ** 2 + deformation[1] ** 2 < 0.25:
             return DIVERGED, taken
         largest = 0.0

@@ -94,7 +94,8 @@ def project_points(points, terms, lens, pixels, jacobian):
         z = axes[2, 0] * dx + axes[2, 1] * dy + axes[2, 2] * dz
         if math.atan2(math.sqrt(x * x + y * y), z) >= half_field:
             pixels[i, 0] = pixels[i, 1] = np.nan
-            jacobian[i] = 0.0
+            for c in range(COLUMNS):
+                jacobian[i, 0, c] = jacobian[i, 1, c] = 0.0
             continue
         if model == FISHEYE:
             u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = _fisheye_sight(x, y, z, k)

@@ -59,8 +59,8 @@ def find_patches(picture, templates, middle, affine, across, limits, place, sd):
     wide = 2 * reach + 1
     score = np.empty((wide, wide))
     for k in range(len(templates)):
-        place[k] = 0.0
-        sd[k] = np.inf
+        place[k, 0] = place[k, 1] = 0.0
+        sd[k, 0] = sd[k, 1] = np.inf
         if not correlations(picture, templates[k], middle[k], affine[k], reach, score):
             continue
         best = int(np.argmax(score))

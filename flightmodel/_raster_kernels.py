@@ -125,7 +125,9 @@ def raster(vertices, faces, lens, sight, widest, deepest, depth, nearest):
         top = 1
         while top > 0:
             top -= 1
-            t[:], here = stack[top], level[top]
+            here = level[top]
+            for m in range(3):
+                t[m, 0], t[m, 1], t[m, 2] = stack[top, m, 0], stack[top, m, 1], stack[top, m, 2]
             # direction of the middle, and how far the corners lie from it: nothing of it may be in the field
             mx, my, mz = t[0, 0] + t[1, 0] + t[2, 0], t[0, 1] + t[1, 1] + t[2, 1], t[0, 2] + t[1, 2] + t[2, 2]
             mid = math.sqrt(mx * mx + my * my + mz * mz) + 1e-300

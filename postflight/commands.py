@@ -241,7 +241,7 @@ def _answered(
 ) -> tuple[Reconstruction, Deflections]:  # fmt: skip
     """Trajectory, given to be drawn, and deflections; a camera without video is among the methods that were refused."""
     own = warmup.ESTIMATES if "camera" in methods else warmup.ESTIMATES[:1]
-    compile_kernels(*warmup.reconstruction_of(flight.telemetry), "simulator", "ensembles", *own)
+    compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
     stages.end("compiling")
     if "camera" in methods and len(flight.telemetry.films) == 1:
         second.read_film(flight)
@@ -462,7 +462,7 @@ def deflection(
     alone = set(methods) == {"camera"}
     makes_bet = not alone or (plane_deg is None and telemetry.can_tell_moment)
     if makes_bet:
-        compile_kernels(*warmup.reconstruction_of(telemetry))
+        compile_kernels(*warmup.RECONSTRUCTION)
     if "camera" in methods:
         compile_kernels("camera")
     with progress_bar() as report:

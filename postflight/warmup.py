@@ -4,12 +4,14 @@ Kernels are compiled for the very processor they run on and kept in a cache whos
 (`flightmodel._kernels`). Without this a first command would compile them one after another, in silence. Each group
 calls its kernels once on a tiny problem; a file in the cache marks it as compiled.
 
-Run as ``python -m postflight.warmup GROUP`` it compiles one group in its own process.
+Run as ``python -m postflight.warmup GROUP ...`` it compiles these groups in its own process.
 """
 
 from __future__ import annotations
 
+import gc
 import hashlib
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -20,7 +22,6 @@ import numpy as np
 from flightmodel import earth
 from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.telemetry import Telemetry
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from recon import ekf, propagation, smoother
 from recon.ekf import Problem, observe
@@ -55,13 +56,12 @@ def _ensembles() -> None:
     list(fly_ensemble(vehicle, lambda _run: start, [0], Schedule(0.001, 1, 2)))
 
 
-def _tiny_problem(ballistic: bool = False, planet: earth.Planet = earth.WGS84) -> Problem:
+def _tiny_problem() -> Problem:
     """Three nodes without a measurement: enough to compile the filter."""
     motion = strapdown_motion(
         np.array([0.0, 0.01, 0.02]), np.zeros((3, 3)), np.zeros((3, 3)), np.ones((3, 3)), np.ones((3, 3)),
         np.eye(3), np.eye(3),
     )  # fmt: skip
-    motion = motion._replace(ballistic=ballistic, planet=planet)
     model = ErrorModel((Block("all", tuple("abcdefghijklmnopqr"), "1", 1.0),))
     start = States(earth.ecef_from_geodetic(0.6, -1.3, 5e4), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(18))
     nothing = Instrument(
@@ -101,13 +101,6 @@ def _smoothers() -> None:
     states = States(*(np.array([part] * 3) for part in ekf.as_charts(problem.start)))
     smoother.smooth(problem, ekf.ForwardPass(states, steps, run, innovations))
     propagation.fill_between(problem.motion, problem.node_index, problem.node_index[:1], states[:1])
-    propagation.propagate(problem.motion, 0, 1, problem.start)
-
-
-def _other_motion(ballistic: bool, planet: earth.Planet) -> None:
-    """Filter and propagation of a motion or planet whose kernels are others than a strapdown flight's at the Earth."""
-    problem = _tiny_problem(ballistic, planet)
-    ekf.forward(problem)
     propagation.propagate(problem.motion, 0, 1, problem.start)
 
 
@@ -158,28 +151,18 @@ def _camera() -> None:
         raise GateError(fit.refused, code="kernels-not-called")
 
 
+# the longest to compile first: they are dealt out to processes in this order
 GROUPS: dict[str, Callable[[], None]] = {
+    "filter": _filter,
+    "camera": _camera,
+    "smoothers": _smoothers,
     "simulator": _simulator,
     "ensembles": _ensembles,
-    "filter": _filter,
-    "smoothers": _smoothers,
-    "tables": _tables,
     "balance": _balance,
+    "tables": _tables,
     "spans": _spans,
-    "camera": _camera,
-    "ballistic": lambda: _other_motion(True, earth.WGS84),
-    "mars": lambda: _other_motion(False, earth.MARS),
-    "ballistic at mars": lambda: _other_motion(True, earth.MARS),
 }
 RECONSTRUCTION, ESTIMATES = ("filter", "smoothers"), ("balance", "camera")
-
-
-def reconstruction_of(telemetry: Telemetry) -> tuple[str, ...]:
-    """Groups that the reconstruction of a flight takes."""
-    ballistic = telemetry.accelerometer is None or telemetry.rates is None or telemetry.motion.model == "ballistic"
-    at = "" if telemetry.planet == earth.WGS84 else earth.name_of(telemetry.planet)
-    other = " at ".join(part for part in ("ballistic" * ballistic, at) if part)
-    return (*RECONSTRUCTION, other) if other else RECONSTRUCTION
 
 
 def _stamp(group: str) -> Path | None:
@@ -197,7 +180,7 @@ def missing(groups: Iterable[str]) -> list[str]:
 
 
 def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
-    """Compile what is missing, every group in a process of its own.
+    """Compile what is missing, in as many processes as there are processors: each begins with a second of imports.
 
     Parameters
     ----------
@@ -211,24 +194,48 @@ def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
         return
     report(f"compiling kernels for this machine, once (up to a minute): {', '.join(wanted)}")
     quiet, command = subprocess.DEVNULL, [sys.executable, "-m", "postflight.warmup"]
-    running = {
-        group: subprocess.Popen([*command, group], stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True)
-        for group in wanted
-    }
+    shares = _shares(sorted(wanted, key=[*GROUPS, *wanted].index), len(os.sched_getaffinity(0)))
+    running = [
+        subprocess.Popen([*command, *share], stdin=quiet, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for share in shares
+    ]
     try:
-        for group, process in running.items():
-            why = process.communicate()[1]
-            if process.returncode:
-                reason = why.strip().splitlines()[-1] if why.strip() else f"exit code {process.returncode}"
+        for share, process in zip(shares, running, strict=True):
+            failed, why = process.communicate()
+            reasons = dict(line.split("\t", 1) for line in failed.splitlines())
+            if process.returncode:  # ended before its time
+                last = why.strip().splitlines()[-1] if why.strip() else f"exit code {process.returncode}"
+                reasons = dict.fromkeys(missing(share), last) | reasons
+            for group, reason in reasons.items():
                 report(f"kernels of {group} were not compiled beforehand, but will be at their first use: {reason}")
     except BaseException:
-        for process in running.values():
+        for process in running:
             process.terminate()
         raise
 
 
+def _shares(groups: list[str], processes: int) -> list[list[str]]:
+    """Deal groups, the longest first, back and forth."""
+    turns = [groups[k : k + processes] for k in range(0, len(groups), processes)]
+    return [
+        [turn[k] for turn in (t if i % 2 == 0 else t[::-1] for i, t in enumerate(turns)) if k < len(turn)]
+        for k in range(min(processes, len(groups)))
+    ]
+
+
+def _compile(groups: Iterable[str]) -> None:
+    """Compile groups in this process; those that fail are written with the reason."""
+    gc.set_threshold(200_000, 20, 50)  # a compiler makes many objects and hardly any circle: a fifth of the time
+    for group in groups:
+        try:
+            GROUPS[group]()
+        except Exception as fault:
+            sys.stdout.write(f"{group}\t{type(fault).__name__}: {fault}".splitlines()[0] + "\n")
+            continue
+        stamp = _stamp(group)
+        if stamp is not None:
+            stamp.touch()
+
+
 if __name__ == "__main__":
-    GROUPS[sys.argv[1]]()
-    stamp = _stamp(sys.argv[1])
-    if stamp is not None:
-        stamp.touch()
+    _compile(sys.argv[1:])

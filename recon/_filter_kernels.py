@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import boxplus, constants, geodetic, inlined, kernel, merged
+from flightmodel._kernels import boxplus, geodetic, inlined, kernel, merged
 from recon._measurement_kernels import DECELERATION, RADAR, SLOTS, SUN, node_motion, predict, predict_deceleration
 from recon._propagation_kernels import propagate_ballistic, propagate_strapdown
 
@@ -29,24 +29,24 @@ def level_transition(phi, noise):
 
 
 @kernel
-def propagate_one(motion, air, first, last, errors, position, velocity, q, phi, noise):
+def propagate_one(motion, first, last, errors, position, velocity, q, phi, noise):
     """Carry a state in place between grid points with its transition ``phi`` (9, D) and ``noise`` (9, 9)."""
     level_transition(phi, noise)
-    if air is None:
-        propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise)
+    if motion.ballistic:
+        propagate_ballistic(motion, first, last, errors, position, velocity, phi, noise)
     else:
-        propagate_ballistic(motion, air, first, last, errors, position, velocity, phi, noise)
+        propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise)
 
 
 @inlined
 def height_of(p, planet):
     """Geodetic height of a point (3,), m."""
-    _, _, height, _ = geodetic(p[0], p[1], p[2], constants(planet))
+    _, _, height, _ = geodetic(p[0], p[1], p[2], planet)
     return height
 
 
 @kernel
-def height(p, planet=None):
+def height(p, planet):
     """`height_of` for callers in Python."""
     return height_of(p, planet)
 
@@ -236,7 +236,7 @@ def gain_and_update(x, p, w, y, factor, count, used, considered, wander_sd, gain
 
 
 @kernel
-def forward(motion, air, node_index, sources, observed, wander, gate, follow, start, steps, charts, run, innovations):
+def forward(motion, node_index, sources, observed, wander, gate, follow, start, steps, charts, run, innovations):
     """Run the filter through all nodes, in place.
 
     ``charts`` hold the start in row 0, or with ``follow`` a reference in all rows; ``start`` (N,) is the start's error
@@ -247,7 +247,7 @@ def forward(motion, air, node_index, sources, observed, wander, gate, follow, st
     rows = np.empty((9, size))
     for k in range(n):
         if k > 0:
-            moving = advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k)
+            moving = advance(motion, node_index, wander, follow, steps, charts, x, x_next, k)
             predict_covariance(
                 p, steps.transition[k - 1], steps.noise[k - 1], steps.decay[k - 1], steps.noise_var[k - 1], moving, rows
             )
@@ -255,7 +255,7 @@ def forward(motion, air, node_index, sources, observed, wander, gate, follow, st
         for j in range(size):
             run.x_minus[k, j] = x[j]
         if observed.first[k + 1] > observed.first[k]:
-            update_node(motion, air, node_index[k], sources, observed, wander, gate, charts, innovations, x, p, k)
+            update_node(motion, node_index[k], sources, observed, wander, gate, charts, innovations, x, p, k)
         for j in range(size):
             run.x_plus[k, j] = x[j]
         if run.kept[k] >= 0:
@@ -273,7 +273,7 @@ def store_triangle(p, size, out):
 
 
 @merged
-def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k):
+def advance(motion, node_index, wander, follow, steps, charts, x, x_next, k):
     """Carry chart and error from node ``k - 1`` to ``k``; about its own estimate, or along the reference."""
     a = k - 1
     position, velocity, q = charts.position[a].copy(), charts.velocity[a].copy(), charts.q[a].copy()
@@ -290,10 +290,10 @@ def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k
     noise = steps.noise[a]
     level_transition(phi, noise)
     first, last = node_index[a], node_index[k]
-    if air is None:
-        propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise)
+    if motion.ballistic:
+        propagate_ballistic(motion, first, last, errors, position, velocity, phi, noise)
     else:
-        propagate_ballistic(motion, air, first, last, errors, position, velocity, phi, noise)
+        propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise)
     climb = abs(height_of(position, motion.planet) - before)
     dt = motion.time_s[node_index[k]] - motion.time_s[node_index[a]]
     decay = steps.decay[a]
@@ -322,7 +322,7 @@ def advance(motion, air, node_index, wander, follow, steps, charts, x, x_next, k
 
 
 @merged
-def update_node(motion, air, index, sources, observed, wander, gate, charts, innovations, x, p, k):
+def update_node(motion, index, sources, observed, wander, gate, charts, innovations, x, p, k):
     """Use the measurements of node ``k`` that pass the gate."""
     size = len(x)
     c, rate, acceleration = np.empty((3, 3)), np.empty((12, 3)), np.empty(3)
@@ -330,7 +330,7 @@ def update_node(motion, air, index, sources, observed, wander, gate, charts, inn
     used, s, factor = np.empty(3, dtype=np.int64), np.empty((3, 3)), np.empty((3, 3))
     w = np.empty((3, size))
     position, velocity = charts.position[k], charts.velocity[k]
-    node_motion(motion, air, index, position, velocity, charts.q[k], charts.errors[k], c, rate, acceleration)
+    node_motion(motion, index, position, velocity, charts.q[k], charts.errors[k], c, rate, acceleration)
     for row in range(observed.first[k], observed.first[k + 1]):
         source = observed.source[row]
         slot, kind = sources.slot[source], sources.kind[source]
@@ -341,9 +341,8 @@ def update_node(motion, air, index, sources, observed, wander, gate, charts, inn
             kind, sources.arm_body_m[source], sources.site_ecef_m[source], sources.dcm[source], observed.known[row], e,
             position, velocity, c, rate, acceleration, h, by_state, by_error, motion.planet,
         )  # fmt: skip
-        if air is not None:  # noqa: SIM102 - alone it prunes the branch before types are found
-            if kind == DECELERATION:
-                predict_deceleration(air, e, position, velocity, acceleration, h, by_state, by_error)
+        if kind == DECELERATION:
+            predict_deceleration(motion, e, position, velocity, acceleration, h, by_state, by_error)
         count = 0
         for i in range(3):
             if math.isinf(observed.variance[row, i]):

@@ -10,17 +10,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import (
-    RATE,
-    boxplus,
-    constants,
-    dcm_from_quaternion,
-    geodetic,
-    gravitation,
-    inlined,
-    kernel,
-    merged,
-)
+from flightmodel._kernels import RATE, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined, kernel, merged
 from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into, mount_matrices
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
@@ -28,31 +18,31 @@ SLOTS = 23
 
 
 @merged
-def node_motion(motion, air, index, position, velocity, q, errors, c, rate, acceleration):
+def node_motion(motion, index, position, velocity, q, errors, c, rate, acceleration):
     """Attitude matrix, inertial rate in body axes and acceleration against the Earth at a grid point, in place.
 
     ``rate`` (12, 3), all in body axes, are the rate, its rate of change and the specific force, by which an antenna
     beside the accelerometer moves, and the rate's partials by the gyros' nine errors.
     """
     dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
-    if air is not None:
+    if motion.ballistic:
         for j in range(1, 12):
             for i in range(3):
                 rate[j, i] = 0.0
         a = ballistic_acceleration(
-            air, position[0], position[1], position[2], velocity[0], velocity[1], velocity[2],
+            motion, position[0], position[1], position[2], velocity[0], velocity[1], velocity[2],
             errors[0], errors[1], errors[2], errors[3], errors[4], errors[5],
         )  # fmt: skip
         for i in range(3):
-            rate[0, i] = constants(motion.planet)[RATE] * c[2, i]
+            rate[0, i] = motion.planet[RATE] * c[2, i]
             acceleration[i] = a[i]
         return
     force = np.empty(3)
     corrected(motion.force_sensor_mps2[index], errors, 0, motion.dcm_body_force, force)
     node_rate(motion, index, errors, rate)
     x, y, z = position[0], position[1], position[2]
-    gx, gy, gz = gravitation(x, y, z, constants(motion.planet))
-    w2, two = constants(motion.planet)[RATE] * constants(motion.planet)[RATE], 2.0 * constants(motion.planet)[RATE]
+    gx, gy, gz = gravitation(x, y, z, motion.planet)
+    w2, two = motion.planet[RATE] * motion.planet[RATE], 2.0 * motion.planet[RATE]
     for i in range(3):
         rate[2, i] = force[i]
         acceleration[i] = c[i, 0] * force[0] + c[i, 1] * force[1] + c[i, 2] * force[2]
@@ -123,7 +113,7 @@ def observed_point(arm, tau, position, velocity, c, rate, acceleration, point, s
     turn, change, lever_velocity = np.empty(3), np.empty(3), np.empty(3)
     swing, inward, pull, jerk = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
-        turn[i], change[i] = rate[0, i] - constants(planet)[RATE] * c[2, i], rate[1, i]
+        turn[i], change[i] = rate[0, i] - planet[RATE] * c[2, i], rate[1, i]
     cross_into(turn, arm, lever_velocity)
     cross_into(change, arm, swing)
     cross_into(turn, lever_velocity, inward)
@@ -245,7 +235,7 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
 def predict_place(kind, site, dcm_ned_ecef, e, point, speed, h, m, by_error, planet):
     """Position or velocity along a reference's axes, or height; partials by the observed point."""
     if kind == HEIGHT:
-        sin_lat, cos_lat, height, per_p = geodetic(point[0], point[1], point[2], constants(planet))
+        sin_lat, cos_lat, height, per_p = geodetic(point[0], point[1], point[2], planet)
         level_part = (1.0 + e[1]) * cos_lat * per_p
         m[0, 0], m[0, 1], m[0, 2] = level_part * point[0], level_part * point[1], (1.0 + e[1]) * sin_lat
         by_error[0, 0], by_error[0, 1], by_error[0, 2] = 1.0, height - site[0], 1.0
@@ -433,7 +423,7 @@ def gyro_rows(m, count, arm, c, rate, by_error):
 
 
 @inlined
-def predict_deceleration(air, e, position, velocity, acceleration, h, by_state, by_error):
+def predict_deceleration(motion, e, position, velocity, acceleration, h, by_state, by_error):
     """Deceleration along the flow, ``(1 + scale) a + bias``, of slots 1 and 0; slots 4 to 9 are the air's drivers.
 
     A late tag, slot 3, reads what was: ``a - tau da/dt`` along the path, the drivers constant.
@@ -443,15 +433,17 @@ def predict_deceleration(air, e, position, velocity, acceleration, h, by_state, 
         s[j], s[3 + j] = position[j], velocity[j]
     for j in range(6):
         s[6 + j] = e[4 + j]
-    drag = ballistic_acceleration(air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])[4]
-    for j in range(12):
+    drag = 0.0
+    for k in range(25):  # in one loop: what is written once is compiled once
+        j = k // 2 if k < 24 else 0
         middle, step = s[j], 1.0 if j < 3 else (0.01 if j < 6 else 1e-4)
-        s[j] = middle + step
-        a = ballistic_acceleration(air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])[4]
-        s[j] = middle - step
-        b = ballistic_acceleration(air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])[4]
+        s[j] = middle + (0.0 if k == 24 else (step if k % 2 == 0 else -step))
+        drag = ballistic_acceleration(motion, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])[
+            4
+        ]
         s[j] = middle
-        partial[j] = (a - b) / (2.0 * step)
+        if k < 24:
+            partial[j] = drag if k % 2 == 0 else (partial[j] - drag) / (2.0 * step)
     change = 0.0
     for j in range(3):
         change += partial[j] * velocity[j] + partial[3 + j] * acceleration[j]
@@ -467,14 +459,14 @@ def predict_deceleration(air, e, position, velocity, acceleration, h, by_state, 
 
 
 @kernel
-def deceleration_at(air, e, position, velocity, acceleration, h, by_state, by_error):
+def deceleration_at(motion, e, position, velocity, acceleration, h, by_state, by_error):
     """`predict_deceleration` for the filterpy engine and for tests."""
-    predict_deceleration(air, e, position, velocity, acceleration, h, by_state, by_error)
+    predict_deceleration(motion, e, position, velocity, acceleration, h, by_state, by_error)
 
 
 @kernel
 def predict_one(
-    kind, arm, site, dcm, known, e, position, velocity, q, rate, acceleration, h, by_state, by_error, planet=None
+    kind, arm, site, dcm, known, e, position, velocity, q, rate, acceleration, h, by_state, by_error, planet
 ):
     """`predict` from an attitude quaternion, for the filterpy engine and for tests."""
     c = np.empty((3, 3))
@@ -483,6 +475,6 @@ def predict_one(
 
 
 @kernel
-def motion_at(motion, air, index, position, velocity, q, errors, rate, acceleration):
+def motion_at(motion, index, position, velocity, q, errors, rate, acceleration):
     """`node_motion` without the attitude matrix, for the filterpy engine and for tests."""
-    node_motion(motion, air, index, position, velocity, q, errors, np.empty((3, 3)), rate, acceleration)
+    node_motion(motion, index, position, velocity, q, errors, np.empty((3, 3)), rate, acceleration)

@@ -15,17 +15,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import (
-    GM,
-    RATE,
-    boxplus,
-    constants,
-    dcm_from_quaternion,
-    geodetic,
-    gravitation,
-    inlined,
-    merged,
-)
+from flightmodel._kernels import GM, RATE, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined, merged
 
 # a filter far from its track may ask for a drag that stops the vehicle within a step: such a step is taken in parts.
 # Drag falls with the speed it takes, so their number grows as the logarithm of the drag
@@ -138,7 +128,7 @@ def advance_columns(
     compiler puts several columns into one instruction.
     """
     width = phi.shape[1]
-    h, two_omega = 0.5 * dt, 2.0 * constants(planet)[RATE]
+    h, two_omega = 0.5 * dt, 2.0 * planet[RATE]
     for i in range(3):
         a, b, c = half_turn[0, i], half_turn[1, i], half_turn[2, i]
         for j in range(width):
@@ -232,22 +222,22 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     for i in range(4):
         q_mid[i] = q[i]
     boxplus(q_mid, h * rate[0], h * rate[1], h * rate[2])
-    turn_ecef(q_mid, constants(planet)[RATE] * h)
+    turn_ecef(q_mid, planet[RATE] * h)
     dcm_from_quaternion(q_mid[0], q_mid[1], q_mid[2], q_mid[3], dcm_mid)
     for i in range(4):
         q[i] = q_mid[i]
     boxplus(q, h * rate[0], h * rate[1], h * rate[2])
-    turn_ecef(q, constants(planet)[RATE] * h)
+    turn_ecef(q, planet[RATE] * h)
 
     x = position[0] + h * velocity[0]
     y = position[1] + h * velocity[1]
     z = position[2] + h * velocity[2]
-    gx, gy, gz = gravitation(x, y, z, constants(planet))
-    w2 = constants(planet)[RATE] * constants(planet)[RATE]
+    gx, gy, gz = gravitation(x, y, z, planet)
+    w2 = planet[RATE] * planet[RATE]
     ax = dcm_mid[0, 0] * force[0] + dcm_mid[0, 1] * force[1] + dcm_mid[0, 2] * force[2] + gx + w2 * x
     ay = dcm_mid[1, 0] * force[0] + dcm_mid[1, 1] * force[1] + dcm_mid[1, 2] * force[2] + gy + w2 * y
     az = dcm_mid[2, 0] * force[0] + dcm_mid[2, 1] * force[1] + dcm_mid[2, 2] * force[2] + gz
-    two = 2.0 * constants(planet)[RATE]
+    two = 2.0 * planet[RATE]
     vx = velocity[0] + h * (ax + two * velocity[1])
     vy = velocity[1] + h * (ay - two * velocity[0])
     ax += two * vy
@@ -260,7 +250,7 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     velocity[2] += dt * az
 
     r2 = x * x + y * y + z * z
-    k = constants(planet)[GM] / (r2 * math.sqrt(r2))
+    k = planet[GM] / (r2 * math.sqrt(r2))
     point = (x, y, z)
     for i in range(3):
         for j in range(3):
@@ -311,13 +301,13 @@ def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi,
 
 
 @inlined
-def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
+def ballistic_acceleration(motion, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     """Acceleration against the rotating planet, m/s^2, rate 1/s at which the air changes the velocity, deceleration."""
-    sin_lat, cos_lat, height, per_p = geodetic(x, y, z, constants(air.planet))
-    at = (height - air.from_m) / air.step_m
-    row = int(min(max(at, 0.0), len(air.table) - 2.0))
+    sin_lat, cos_lat, height, per_p = geodetic(x, y, z, motion.planet)
+    at = (height - motion.air_from_m) / motion.air_step_m
+    row = int(min(max(at, 0.0), len(motion.air) - 2.0))
     w = min(max(at - row, 0.0), 1.0)
-    low, high = air.table[row], air.table[row + 1]
+    low, high = motion.air[row], motion.air[row + 1]
     density = math.exp(low[0] + w * (high[0] - low[0]) + e3 * (low[3] + w * (high[3] - low[3])))
     wind_sd = low[4] + w * (high[4] - low[4])
     north = low[1] + w * (high[1] - low[1]) + e4 * wind_sd
@@ -328,42 +318,40 @@ def ballistic_acceleration(air, x, y, z, vx, vy, vz, e0, e1, e2, e3, e4, e5):
     uz = vz - cos_lat * north
     speed = math.sqrt(ux * ux + uy * uy + uz * uz) + 1e-9
     # a filter far from its track may ask for any drag; e^8 is a parachute on a needle
-    k = 0.5 * density * air.drag_m2pkg * math.exp(min(max(e0, -8.0), 8.0)) * speed
+    k = 0.5 * density * motion.drag_m2pkg * math.exp(min(max(e0, -8.0), 8.0)) * speed
     # normal to the flow: normal to the path's plane, and in it
     m = 1.0 / speed
-    px, py, pz = air.across[0], air.across[1], air.across[2]
+    px, py, pz = motion.across_ecef[0], motion.across_ecef[1], motion.across_ecef[2]
     along = m * m * (px * ux + py * uy + pz * uz)
     ax, ay, az = px - along * ux, py - along * uy, pz - along * uz
     n = 1.0 / (math.sqrt(ax * ax + ay * ay + az * az) + 1e-9)
     ax, ay, az = ax * n, ay * n, az * n
     bx, by, bz = m * (uy * az - uz * ay), m * (uz * ax - ux * az), m * (ux * ay - uy * ax)
-    gx, gy, gz = gravitation(x, y, z, constants(air.planet))
-    w2, two = constants(air.planet)[RATE] * constants(air.planet)[RATE], 2.0 * constants(air.planet)[RATE]
+    gx, gy, gz = gravitation(x, y, z, motion.planet)
+    w2, two = motion.planet[RATE] * motion.planet[RATE], 2.0 * motion.planet[RATE]
     fx = k * (speed * (e1 * ax + e2 * bx) - ux) + gx + w2 * x + two * vy
     fy = k * (speed * (e1 * ay + e2 * by) - uy) + gy + w2 * y - two * vx
     return fx, fy, k * (speed * (e1 * az + e2 * bz) - uz) + gz, k * math.sqrt(1.0 + e1 * e1 + e2 * e2), k * speed
 
 
 @inlined
-def ballistic_partials(air, point, partials):
+def ballistic_partials(motion, point, partials):
     """Partials (3, 12) of the acceleration by position, velocity and drivers ``point`` (12,), central differences."""
     p = np.empty(12)
     for j in range(12):
         p[j] = point[j]
-    for j in range(12):
+    for k in range(24):  # both sides in one loop: what is written once is compiled once
+        j = k // 2
         h = 1.0 if j < 3 else (0.01 if j < 6 else 1e-4)
-        p[j] = point[j] + h
-        a = ballistic_acceleration(air, p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
-        p[j] = point[j] - h
-        b = ballistic_acceleration(air, p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
+        p[j] = point[j] + h if k % 2 == 0 else point[j] - h
+        a = ballistic_acceleration(motion, p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
         p[j] = point[j]
-        partials[0, j] = (a[0] - b[0]) / (2.0 * h)
-        partials[1, j] = (a[1] - b[1]) / (2.0 * h)
-        partials[2, j] = (a[2] - b[2]) / (2.0 * h)
+        for i in range(3):
+            partials[i, j] = a[i] if k % 2 == 0 else (partials[i, j] - a[i]) / (2.0 * h)
 
 
 @inlined
-def ballistic_step(air, dt, point, stage, slope, mid):
+def ballistic_step(motion, dt, point, stage, slope, mid):
     """Carry position and velocity ``point[:6]`` over a step by Runge and Kutta's fourth-order rule.
 
     ``mid`` (12,) is the point half way; ``stage`` (12,) and ``slope`` (6,) are scratch.
@@ -375,7 +363,7 @@ def ballistic_step(air, dt, point, stage, slope, mid):
     for i in range(4):
         s = stage
         a0, a1, a2, _, _ = ballistic_acceleration(
-            air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11]
+            motion, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11]
         )
         weight = 1.0 / 6.0 if i == 0 or i == 3 else 1.0 / 3.0
         ahead = dt if i == 2 else 0.5 * dt
@@ -414,11 +402,11 @@ def ballistic_transition(partials, dt, full):
 
 
 @inlined
-def followed(air, point, rest):
+def followed(motion, point, rest):
     """Part of a step ``rest`` in which the air changes the velocity by no more than `MOST_CHANGE`."""
     s = point
     a = ballistic_acceleration(
-        air, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11]
+        motion, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11]
     )  # fmt: skip
     change = a[3] * abs(rest)
     return rest if change <= MOST_CHANGE else rest * MOST_CHANGE / change
@@ -455,7 +443,7 @@ def accumulate(full, density, dt, phi, noise, old):
 
 
 @inlined
-def propagate_ballistic(motion, air, first, last, errors, position, velocity, phi, noise):
+def propagate_ballistic(motion, first, last, errors, position, velocity, phi, noise):
     """Carry a state in place between grid points, with ``phi`` (9, 15) and ``noise`` (9, 9) from identity and zero."""
     point, stage, slope, mid = np.empty(12), np.empty(12), np.empty(6), np.empty(12)
     partials, full, old = np.empty((3, 12)), np.empty((6, 12)), np.empty((6, 15))
@@ -469,10 +457,10 @@ def propagate_ballistic(motion, air, first, last, errors, position, velocity, ph
         rest, parts = motion.time_s[k + step] - motion.time_s[k], 0
         while rest != 0.0 and parts < MOST_PARTS:
             parts += 1
-            dt = followed(air, point, rest) if parts < MOST_PARTS else rest
+            dt = followed(motion, point, rest) if parts < MOST_PARTS else rest
             rest -= dt
-            ballistic_step(air, dt, point, stage, slope, mid)
-            ballistic_partials(air, mid, partials)
+            ballistic_step(motion, dt, point, stage, slope, mid)
+            ballistic_partials(motion, mid, partials)
             ballistic_transition(partials, dt, full)
             accumulate(full, density, dt, phi, noise, old)
     for j in range(3):

@@ -315,7 +315,7 @@ def forward(problem: Problem, reference: States | None = None, engine: str = COM
     run.p_last[:] = problem.start_covariance
     if engine == COMPILED:
         _filter_kernels.forward(
-            *problem.motion.split(), problem.node_index, problem.sources(), problem.observed, problem.model.wander,
+            problem.motion, problem.node_index, problem.sources(), problem.observed, problem.model.wander,
             problem.gate, reference is not None, start, steps, charts, run, innovations,
         )  # fmt: skip
     else:
@@ -427,13 +427,11 @@ class _FilterpyPass:
         chart = self.chart(k)
         rate, acceleration = np.empty((12, 3)), np.empty(3)
         _measurement_kernels.motion_at(
-            *self.problem.motion.split(), self.problem.node_index[k], *as_charts(chart), rate, acceleration
+            self.problem.motion, self.problem.node_index[k], *as_charts(chart), rate, acceleration
         )
         c = rotations.dcm_from_q(chart.q_ecef_body)
-        _, air = self.problem.motion.split()
-        return NodeMotion(
-            chart.position_ecef_m, chart.velocity_ecef_mps, c, rate, acceleration, air, self.problem.motion.planet
-        )
+        place = chart.position_ecef_m, chart.velocity_ecef_mps
+        return NodeMotion(*place, c, rate, acceleration, self.problem.motion)
 
     def update(self, k: int, row: int) -> None:
         """Use one measurement if it passes the gate."""
@@ -496,4 +494,4 @@ def schmidt_update(
 
 def height(state: States, planet: Planet = WGS84) -> float:
     """Geodetic height of one state, m."""
-    return float(_filter_kernels.height(state.position_ecef_m, None if planet == WGS84 else planet))
+    return float(_filter_kernels.height(state.position_ecef_m, planet))

@@ -55,7 +55,7 @@ from recon._measurement_kernels import (
     SUN,
     VELOCITY,
 )
-from recon.propagation import Air
+from recon.propagation import Motion
 from recon.state import DRIVERS, ErrorModel, right_jacobian
 
 REST = "rest"  # zero velocities on the pad
@@ -367,8 +367,12 @@ class NodeMotion:
     dcm_ecef_body: FloatArray
     turning_body: FloatArray
     acceleration_ecef_mps2: FloatArray
-    air: Air | None = None
-    planet: Planet = WGS84
+    motion: Motion | None = None  # of which a deceleration takes the air
+
+    @property
+    def planet(self) -> Planet:
+        """Planet below; the Earth where no motion is stated."""
+        return WGS84 if self.motion is None else self.motion.planet
 
 
 def predict(
@@ -381,7 +385,7 @@ def predict(
     by_state, by_error = np.zeros((3, 9)), np.zeros((3, SLOTS))
     if instrument.kind == DECELERATION:
         h, motion = np.zeros(3), (at.position_ecef_m, at.velocity_ecef_mps, at.acceleration_ecef_mps2)
-        _measurement_kernels.deceleration_at(at.air, e, *motion, h, by_state, by_error)
+        _measurement_kernels.deceleration_at(at.motion, e, *motion, h, by_state, by_error)
         return h, by_state, by_error
     if instrument.kind in (FIELD, SUN):
         body = at.dcm_ecef_body.T @ known

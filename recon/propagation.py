@@ -70,33 +70,8 @@ _POWERED_CORRELATION_S = 1.0  # a thrust that may be anything keeps its value fo
 _STATED_CORRELATION_S = 1.0  # correlation time of a stated disturbance
 
 
-class Inertial(NamedTuple):
-    """Inertial part of a `Motion`, for kernels."""
-
-    time_s: FloatArray
-    force_sensor_mps2: FloatArray
-    rate_sensor_radps: FloatArray
-    force_density: FloatArray
-    rate_density: FloatArray
-    dcm_body_force: FloatArray
-    dcm_body_rate: FloatArray
-    clocks: bool
-    planet: Planet | None
-
-
-class Air(NamedTuple):
-    """Ballistic part of a `Motion`, for kernels."""
-
-    table: FloatArray
-    from_m: float
-    step_m: float
-    drag_m2pkg: float
-    across: FloatArray
-    planet: Planet | None
-
-
 class Motion(NamedTuple):
-    """Time grid that contains every node, and what acts on it.
+    """Time grid that contains every node, and what acts on it: as kernels take it, whatever carries the state.
 
     Parameters
     ----------
@@ -138,16 +113,6 @@ class Motion(NamedTuple):
     drag_m2pkg: float
     across_ecef: FloatArray
     planet: Planet = WGS84
-
-    def split(self) -> tuple[Inertial, Air | None]:
-        """Return what kernels take: a None for the air lets them be compiled without ballistic flight."""
-        planet = None if self.planet == WGS84 else self.planet
-        air = (
-            Air(self.air, self.air_from_m, self.air_step_m, self.drag_m2pkg, self.across_ecef, planet)
-            if self.ballistic
-            else None
-        )
-        return Inertial(*self[1:8], self.clocks, planet), air
 
     @property
     def drivers(self) -> int:
@@ -269,7 +234,7 @@ def propagate(motion: Motion, first: int, last: int, start: States) -> Step:
     position, velocity, q = start.position_ecef_m.copy(), start.velocity_ecef_mps.copy(), start.q_ecef_body.copy()
     phi, noise = np.empty((9, 9 + motion.drivers)), np.empty((9, 9))
     errors = np.ascontiguousarray(start.sensor_errors)
-    _filter_kernels.propagate_one(*motion.split(), first, last, errors, position, velocity, q, phi, noise)
+    _filter_kernels.propagate_one(motion, first, last, errors, position, velocity, q, phi, noise)
     return Step(States(position, velocity, q, start.sensor_errors), phi, noise)
 
 
@@ -282,12 +247,12 @@ def fill_between(motion: Motion, node_index: IntArray, known: IntArray, at_known
     is_known = np.zeros(n, dtype=bool)
     is_known[known] = True
     errors = np.ascontiguousarray(at_known.sensor_errors[np.cumsum(is_known) - 1])
-    split, unused = motion.split(), (np.empty((9, 9 + motion.drivers)), np.empty((9, 9)))
+    unused = np.empty((9, 9 + motion.drivers)), np.empty((9, 9))
     for k in np.flatnonzero(~is_known):
         state = position[k], velocity[k], q[k]
         for row, before in zip(state, (position[k - 1], velocity[k - 1], q[k - 1]), strict=True):
             row[:] = before
-        _filter_kernels.propagate_one(*split, node_index[k - 1], node_index[k], errors[k - 1], *state, *unused)
+        _filter_kernels.propagate_one(motion, node_index[k - 1], node_index[k], errors[k - 1], *state, *unused)
     return States(position, velocity, rotations.continuous(q), errors)
 
 

@@ -3,14 +3,10 @@
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from flightmodel.earth import WGS84
-from postflight import warmup
-from postflight.flight import read_flight
 from tests.refusing import printed_codes
 
 COUNT = """
@@ -54,14 +50,6 @@ def test_after_warmup_a_flight_and_its_reconstruction_compile_nothing(tmp_path):
     count = [sys.executable, "-c", COUNT, str(tmp_path / "flight"), str(MARS)]
     flown = subprocess.run(count, capture_output=True, text=True)
     assert flown.stdout.strip() == "[]", flown.stderr
-
-
-def test_a_flight_names_the_kernels_of_its_motion_and_planet():
-    telemetry = read_flight(MARS).telemetry
-    assert warmup.reconstruction_of(telemetry) == (*warmup.RECONSTRUCTION, "ballistic at mars")
-    assert warmup.reconstruction_of(replace(telemetry, planet=WGS84))[-1] == "ballistic"
-    for groups in (warmup.reconstruction_of(telemetry), warmup.reconstruction_of(replace(telemetry, planet=WGS84))):
-        assert set(groups) <= set(warmup.GROUPS)
 
 
 def test_what_is_missing_is_compiled_once_and_reported(tmp_path):

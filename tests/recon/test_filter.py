@@ -168,7 +168,7 @@ def textbook_measurement(problem, reference, row, slots):
     at, slot = reference[int(k)], slots[source]
     rate, acceleration = np.empty((12, 3)), np.empty(3)
     _measurement_kernels.motion_at(
-        *problem.motion.split(), problem.node_index[k], *ekf.as_charts(at), rate, acceleration
+        problem.motion, problem.node_index[k], *ekf.as_charts(at), rate, acceleration
     )  # fmt: skip
     e = np.where(slot >= 0, at.sensor_errors[slot], 0.0)
     c = rotations.dcm_from_q(at.q_ecef_body)

@@ -111,7 +111,7 @@ def compiled(source, e, position, velocity, q, rate=RATE, acceleration=ACCELERAT
     h, by_state, by_error = np.empty(3), np.empty((3, 9)), np.empty((3, SLOTS))
     _measurement_kernels.predict_one(
         source.kind, source.arm_body_m, source.site_ecef_m, source.dcm, known(source.kind), e, position, velocity, q,
-        rate, acceleration, h, by_state, by_error,
+        rate, acceleration, h, by_state, by_error, earth.WGS84,
     )  # fmt: skip
     return h, by_state, by_error
 
@@ -272,11 +272,11 @@ def test_gyros_errors_move_an_antenna_beside_the_accelerometer(kind):
     rng, source, at = np.random.default_rng(11), instrument(kind), place()
     mounts = [rotations.dcm_from_q(rotations.exp(rng.normal(0.0, 1.0, 3))) for _ in range(2)]
     force, rate, one = rng.normal(0.0, 20.0, (2, 3)), rng.normal(0.0, 9.0, (2, 3)), np.ones((2, 3))
-    inertial, _ = strapdown_motion(np.array([0.0, 0.01]), force, rate, one, one, *mounts).split()
+    motion = strapdown_motion(np.array([0.0, 0.01]), force, rate, one, one, *mounts)
 
     def seen(errors):
         turning, acceleration = np.empty((12, 3)), np.empty(3)
-        _measurement_kernels.motion_at(inertial, None, 1, *at, errors, turning, acceleration)
+        _measurement_kernels.motion_at(motion, 1, *at, errors, turning, acceleration)
         return compiled(source, np.zeros(SLOTS), *at, turning, acceleration)
 
     errors = rng.normal(0.0, 0.01, 18)

@@ -107,8 +107,7 @@ def test_motion_at_a_node_is_newton_s_on_a_turning_earth():
     position, velocity = earth.ecef_from_geodetic(-0.6, 1.2, 9e4), np.array([1500.0, -900.0, 700.0])
     q, errors = rotations.exp(rng.normal(0, 1, 3)), rng.normal(0, 0.02, 18)
     seen_rate, acceleration = np.empty((12, 3)), np.empty(3)
-    inertial, air = motion.split()
-    _measurement_kernels.motion_at(inertial, air, 1, position, velocity, q, errors, seen_rate, acceleration)
+    _measurement_kernels.motion_at(motion, 1, position, velocity, q, errors, seen_rate, acceleration)
     f, w = (correct(s[1], e, m) for s, e, m in zip((force, rate), (errors[:9], errors[9:]), mounts, strict=True))
     spin = earth.OMEGA_ECEF_RADPS
     want = rotations.rotate(q, f) + earth.gravitation(position)
@@ -136,7 +135,7 @@ def test_the_rate_at_a_node_is_the_curve_s_by_the_gyros_own_clock():
     motion = strapdown_motion(t, 0.0 * one, with_exact_integrals(t, tagged), one, one, level, level, True)
     seen, acceleration = np.empty((12, 3)), np.empty(3)
     place = earth.ecef_from_geodetic(-0.6, 1.2, 9e4), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
-    _measurement_kernels.motion_at(motion.split()[0], None, 4, *place, errors, seen, acceleration)
+    _measurement_kernels.motion_at(motion, 4, *place, errors, seen, acceleration)
     np.testing.assert_allclose(seen[0], curve(t[[4]])[0], atol=0.015)  # a tag's second order
     # as read it is 0.6 rad/s off
     assert np.linalg.norm(tagged[4] - errors[9:12] - curve(t[[4]])[0]) > 0.5
