@@ -7,6 +7,8 @@ of another file, so a stale cache must not be reachable.
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
 import importlib.util
 import math
@@ -14,6 +16,7 @@ from pathlib import Path
 
 import llvmlite.binding
 import numba
+from numba.core.caching import FunctionCache
 from numba.core.registry import CPUDispatcher
 
 from flightmodel.cache_folder import CacheFolder, cache_folder
@@ -38,14 +41,38 @@ CACHE = _point_cache_at_these_sources()
 KEPT = CACHE.path is not None  # without a folder numba must not be asked for a cache: it would refuse to import
 
 
+class SharedCache(FunctionCache):
+    """A kernel's cache, to which one process at a time saves.
+
+    Of numba's own, two processes that save at once may take one file for two signatures, and a later one would run
+    what was compiled for the other.
+    """
+
+    def save_overload(self, signature, compiled):
+        """Save under a lock; without one where the file system has none."""
+        with contextlib.ExitStack() as held:
+            with contextlib.suppress(OSError):
+                lock = held.enter_context((CACHE.path / "saving").open("w"))
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            super().save_overload(signature, compiled)
+
+
+def _kept(function, **options):
+    """Compile for calls from Python, and keep what was compiled."""
+    dispatcher = numba.njit(cache=KEPT, **options)(function)
+    if KEPT and isinstance(dispatcher, CPUDispatcher):  # else numba is switched off
+        dispatcher._cache = SharedCache(dispatcher.py_func)
+    return dispatcher
+
+
 def kernel(function):
     """Compile with the project's settings: for what is called from Python only."""
-    return numba.njit(cache=KEPT, nogil=True, error_model="numpy", fastmath=FASTMATH)(function)
+    return _kept(function, nogil=True, error_model="numpy", fastmath=FASTMATH)
 
 
 def exact_kernel(function):
     """Compile as `kernel` does, but every operation as it is written: for what must round correctly."""
-    return numba.njit(cache=KEPT, nogil=True, error_model="numpy")(function)
+    return _kept(function, nogil=True, error_model="numpy")
 
 
 class Part(CPUDispatcher):
@@ -58,7 +85,7 @@ class Part(CPUDispatcher):
     def __call__(self, *arguments):
         if not hasattr(self, "alone"):
             options = {name: value for name, value in self.targetoptions.items() if name not in _INSIDE}
-            self.alone = numba.jit(cache=KEPT, **options)(self.py_func)
+            self.alone = _kept(self.py_func, **options)
         return self.alone(*arguments)
 
 

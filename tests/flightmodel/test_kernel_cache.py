@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -42,3 +43,52 @@ def test_an_edit_of_any_kernel_file_leaves_the_old_cache_behind(tmp_path):
     layout = tree / "flightmodel" / "_csv_kernels.py"
     layout.write_text(layout.read_text() + "\n# moved\n")
     assert run(tree, cache)[0] not in (before, after)
+
+
+SIGNATURES = """
+import sys, time
+from numba import types
+from flightmodel import _kernels
+sys.path.insert(0, str(_kernels.CACHE.path))
+path = _kernels.CACHE.path / "shared.py"
+path.write_text("def add(x, y):\\n    return x + y\\n") if not path.exists() else None
+import shared
+add = _kernels.kernel(shared.add)
+numbers = (types.int8, types.int16, types.int32, types.int64, types.float32, types.float64)
+pairs = [(x, y) for x in numbers for y in numbers]
+"""
+COMPILE = (
+    SIGNATURES
+    + """
+first = int(sys.argv[1])
+while time.time() < float(sys.argv[2]):
+    pass
+for k in range(len(pairs)):
+    add.compile(pairs[(k * (2 * first + 1) + 9 * first) % len(pairs)])
+"""
+)
+READ = (
+    SIGNATURES
+    + """
+for pair in pairs:
+    add.compile(pair)
+    assert add.stats.cache_hits[pair] == 1, pair
+assert [s for s in add.signatures] == pairs
+"""
+)
+
+
+def test_processes_that_save_at_once_keep_every_signature_s_own(tmp_path):
+    """What is loaded for a signature was compiled for it, and none is lost."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def started(code, *arguments):
+        return subprocess.Popen([sys.executable, "-c", code, *arguments], env=environment, stderr=subprocess.PIPE)
+
+    subprocess.run([sys.executable, "-c", SIGNATURES], env=environment, check=True)
+    at_once = str(time.time() + 4.0)
+    several = [started(COMPILE, str(k), at_once) for k in (0, 2, 3)]
+    for one in several:
+        assert one.wait() == 0, one.stderr.read().decode()
+    reader = started(READ)
+    assert reader.wait() == 0, reader.stderr.read().decode()
