@@ -80,6 +80,7 @@ _UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
 _LINEAR_LAG_S = 0.03  # of an oscillation of a second's period a tenth of a radian
 _CONVERGED_SD = 0.01  # a pass that changes nothing by more than this part of its sd is the last
 _BLOCK = 1 << 16  # samples that are corrected at a time
+_NODES = 512  # whose covariances are unpacked at a time
 
 
 @dataclass(frozen=True)
@@ -608,10 +609,10 @@ class Mounting:
 def datum_trajectory(problem: Problem, mounting: Mounting, states: States, triangles: FloatArray) -> Trajectory:
     """Trajectory of the datum at the kept nodes from states at all nodes and packed covariances at the kept ones."""
     kept = np.flatnonzero(problem.kept)
-    covariance = unpacked(triangles, KINEMATIC if mounting.rate is None else INERTIAL)
     states = states[kept]
     n, planet = len(kept), problem.motion.planet
     if mounting.rate is None:
+        covariance = unpacked(triangles, KINEMATIC)
         covariance[:, 6:9] = 0.0
         covariance[:, :, 6:9] = 0.0
         covariance[:, range(6, 9), range(6, 9)] = _UNKNOWN_ROTATION_VAR
@@ -627,25 +628,23 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
     r = mounting.arm_body_m
     lever_velocity = np.cross(omega - planet.rate_radps * c[:, 2], r)
 
-    move = np.zeros((n, 9, 27))
-    move[:, range(9), range(9)] = 1.0
-    lever = c @ rotations.skew(r)
-    move[:, 0:3, 6:9] = lever
-    move[:, 3:6, 6:9] = c @ rotations.skew(lever_velocity)
-    move[:, 3:6, 18:27] = lever @ correction_partials(measured, errors, motion.dcm_body_rate)
-    moved = move @ covariance @ np.swapaxes(move, 1, 2)
-    moved[:, 3:6, 3:6] += mounting.rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
+    covariance = np.empty((n, 9, 9))
+    for first in range(0, n, _NODES):  # unpacked, the nodes' covariances are the largest of all arrays
+        k = slice(first, first + _NODES)
+        lever = c[k] @ rotations.skew(r)
+        move = np.zeros((len(lever), 9, 27))
+        move[:, range(9), range(9)] = 1.0
+        move[:, 0:3, 6:9] = lever
+        move[:, 3:6, 6:9] = c[k] @ rotations.skew(lever_velocity[k])
+        move[:, 3:6, 18:27] = lever @ correction_partials(measured[k], errors[k], motion.dcm_body_rate)
+        moved = move @ unpacked(triangles[k], INERTIAL) @ np.swapaxes(move, 1, 2)
+        moved[:, 3:6, 3:6] += mounting.rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
+        covariance[k] = 0.5 * (moved + np.swapaxes(moved, 1, 2))
     return Trajectory(
-        mounting.epoch_utc,
-        problem.time_s[kept],
-        "datum",
-        states.position_ecef_m - c @ r,
-        states.velocity_ecef_mps - np.einsum("nij,nj->ni", c, lever_velocity),
-        states.q_ecef_body,
-        omega,
-        0.5 * (moved + np.swapaxes(moved, 1, 2)),
+        mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m - c @ r,
+        states.velocity_ecef_mps - np.einsum("nij,nj->ni", c, lever_velocity), states.q_ecef_body, omega, covariance,
         planet,
-    )
+    )  # fmt: skip
 
 
 def corrected_series(
