@@ -84,7 +84,7 @@ class Part(CPUDispatcher):
 
     def __call__(self, *arguments):
         if not hasattr(self, "alone"):
-            options = {name: value for name, value in self.targetoptions.items() if name not in _INSIDE}
+            options = {name: value for name, value in self.targetoptions.items() if name not in {*_INSIDE, "nopython"}}
             self.alone = _kept(self.py_func, **options)
         return self.alone(*arguments)
 

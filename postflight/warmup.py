@@ -192,7 +192,7 @@ def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
     wanted = missing(groups)
     if not wanted:
         return
-    report(f"compiling kernels for this machine, once (up to a minute): {', '.join(wanted)}")
+    report(f"compiling kernels for this machine, once (half a minute to two minutes): {', '.join(wanted)}")
     quiet, command = subprocess.DEVNULL, [sys.executable, "-m", "postflight.warmup"]
     shares = _shares(sorted(wanted, key=[*GROUPS, *wanted].index), len(os.sched_getaffinity(0)))
     running = [
