@@ -11,7 +11,7 @@ import numpy as np
 
 from estimators._edge_kernels import median
 from estimators._sight_kernels import COLUMNS, feet, limb_points, project_points, rotation_of
-from flightmodel._kernels import inlined, kernel
+from flightmodel._kernels import inlined, kernel, small_cholesky, small_solve
 
 JOINT = COLUMNS - 1
 LOBES = 12  # cosine and sine of lobes of two to five waves (8) and of rings out of round of two and three (4)
@@ -179,29 +179,6 @@ def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, d
     right[k] -= flattening / sd[0] ** 2
 
 
-@inlined
-def solve_by_cholesky(matrix, right):
-    """Solve ``A x = b`` in place of ``b``; of the positive definite ``A`` the lower half becomes its factor.
-
-    Written out: of LAPACK's call the compiler makes more than of this, and so few unknowns wait longer for it.
-    """
-    n = len(right)
-    for i in range(n):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for c in range(j):
-                value -= matrix[i, c] * matrix[j, c]
-            matrix[i, j] = math.sqrt(value) if i == j else value / matrix[j, j]
-        for c in range(i):
-            right[i] -= matrix[i, c] * right[c]
-        right[i] /= matrix[i, i]
-    for r in range(n):
-        i = n - 1 - r
-        for c in range(i + 1, n):
-            right[i] -= matrix[c, i] * right[c]
-        right[i] /= matrix[i, i]
-
-
 @kernel
 def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, residual, rows, shape, weight, left):
     """Fit a deformation (3,) in place to edge points and features; its state, steps taken.
@@ -247,7 +224,8 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
         if edges < fewest:
             return TOO_FEW, edges
         _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, design, normal, right)
-        solve_by_cholesky(normal, right)
+        small_cholesky(normal, len(right), normal)
+        small_solve(normal, len(right), right)
         step = right
         for j in range(k):
             deformation[0] += basis[0, j] * step[j]

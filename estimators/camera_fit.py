@@ -135,7 +135,7 @@ class OrientedCamera(FrameModel):
             last = self._reconciled(frame, horizon, place, deformation, last)
             contradicted = place is not None and last.edge_count == len(last.rows)
             if not horizon.is_by_hand:
-                self.check_single(frame, horizon, deformation)
+                self._check_single(frame, horizon, deformation)
                 last = self._explained(place, deformation, last)
             if plane_axis is not None:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
@@ -188,7 +188,7 @@ class OrientedCamera(FrameModel):
         if fault:
             raise NoFitError(fault)
 
-    def check_single(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> None:
+    def _check_single(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> None:
         """Refuse a frame that shows the edge twice, by `estimators.second_edge`."""
         rows = edge_residuals(self.view, horizon, deformation).rows
         seen = np.asarray(np.isfinite(rows).all(axis=1))

@@ -4,7 +4,7 @@ A second edge is the first one turned: it lies ``J m`` px from it, ``J`` the der
 deflection. Along a line across every edge point, steps of the edge's sign are sought; of all turns ``m`` the one is
 taken for which most points have a step there. The limb of the Earth, torus and shadow are steps too, but follow no
 turned edge far: in 435 sound frames of 28 films, with and without the Earth, 0.4 of the points agree at the most. A
-ring painted or sewn round the shell does; it is told by the points that agree with another radius.
+ring painted or sewn round the shell does; it is known by the points that agree with another radius.
 
 Assumed: the two are apart by more than an edge's blur, and the weaker one stands out of the scatter. Of frames mixed
 from two at random that were more than 4 sd wrong, half are noticed.

@@ -272,3 +272,31 @@ def boxplus(q, d0, d1, d2):
     q3 = w * ez + x * ey - y * ex + z * c
     n = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     q[0], q[1], q[2], q[3] = q0 * n, q1 * n, q2 * n, q3 * n
+
+
+@inlined
+def small_cholesky(s, count, factor):
+    """Lower factor of the leading ``count`` rows of ``s``, of a few unknowns; it may take the place of ``s``.
+
+    Written out: of LAPACK's call the compiler makes more than of this, and so few unknowns wait longer for it.
+    """
+    for i in range(count):
+        for j in range(i + 1):
+            value = s[i, j]
+            for col in range(j):
+                value -= factor[i, col] * factor[j, col]
+            factor[i, j] = math.sqrt(value) if i == j else value / factor[j, j]
+
+
+@inlined
+def small_solve(factor, count, y):
+    """Solve ``L L^T out = y`` in place of the leading ``count`` of ``y``."""
+    for i in range(count):
+        for col in range(i):
+            y[i] -= factor[i, col] * y[col]
+        y[i] /= factor[i, i]
+    for r in range(count):
+        i = count - 1 - r
+        for col in range(i + 1, count):
+            y[i] -= factor[col, i] * y[col]
+        y[i] /= factor[i, i]

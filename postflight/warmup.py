@@ -216,11 +216,11 @@ def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
 
 def _shares(groups: list[str], processes: int) -> list[list[str]]:
     """Deal groups, the longest first, back and forth."""
-    turns = [groups[k : k + processes] for k in range(0, len(groups), processes)]
-    return [
-        [turn[k] for turn in (t if i % 2 == 0 else t[::-1] for i, t in enumerate(turns)) if k < len(turn)]
-        for k in range(min(processes, len(groups)))
-    ]
+    shares: list[list[str]] = [[] for _ in range(min(processes, len(groups)))]
+    for k, group in enumerate(groups):
+        turn, place = divmod(k, len(shares))
+        shares[place if turn % 2 == 0 else -1 - place].append(group)
+    return shares
 
 
 def _compile(groups: Iterable[str]) -> None:

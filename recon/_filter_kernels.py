@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import boxplus, geodetic, inlined, kernel, merged
+from flightmodel._kernels import boxplus, geodetic, inlined, kernel, merged, small_cholesky, small_solve
 from recon._measurement_kernels import DECELERATION, RADAR, SLOTS, SUN, node_motion, predict, predict_deceleration
 from recon._propagation_kernels import propagate_ballistic, propagate_strapdown
 
@@ -137,31 +137,6 @@ def rotation_between(q, reference, out):
     s = math.sqrt(x * x + y * y + z * z)
     k = 2.0 * math.atan2(s, w) / s if s > 1e-12 else 2.0
     out[0], out[1], out[2] = k * x, k * y, k * z
-
-
-@inlined
-def small_cholesky(s, count, factor):
-    """Lower factor of the leading ``count`` rows of ``s`` (3, 3)."""
-    for i in range(count):
-        for j in range(i + 1):
-            value = s[i, j]
-            for col in range(j):
-                value -= factor[i, col] * factor[j, col]
-            factor[i, j] = math.sqrt(value) if i == j else value / factor[j, j]
-
-
-@inlined
-def small_solve(factor, count, y):
-    """Solve ``L L^T out = y`` in place for ``y`` (3,)."""
-    for i in range(count):
-        for col in range(i):
-            y[i] -= factor[i, col] * y[col]
-        y[i] /= factor[i, i]
-    for r in range(count):
-        i = count - 1 - r
-        for col in range(i + 1, count):
-            y[i] -= factor[col, i] * y[col]
-        y[i] /= factor[i, i]
 
 
 @merged

@@ -438,9 +438,8 @@ def predict_deceleration(motion, e, position, velocity, acceleration, h, by_stat
         j = k // 2 if k < 24 else 0
         middle, step = s[j], 1.0 if j < 3 else (0.01 if j < 6 else 1e-4)
         s[j] = middle + (0.0 if k == 24 else (step if k % 2 == 0 else -step))
-        drag = ballistic_acceleration(motion, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])[
-            4
-        ]
+        a = ballistic_acceleration(motion, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])
+        drag = a[4]
         s[j] = middle
         if k < 24:
             partial[j] = drag if k % 2 == 0 else (partial[j] - drag) / (2.0 * step)
