@@ -437,10 +437,13 @@ class Telemetry:
         return self.vehicle
 
     @property
-    def can_tell_moment(self) -> bool:
-        """Whether there are a vehicle, inertial sensors, which measure the moment in the joint, and a path for them."""
-        triads = self.accelerometer is not None and self.rates is not None
-        return self.vehicle is not None and triads and bool(self.radars or self.gnss)
+    def can_tell_load(self) -> bool:
+        """Whether a path and what moves along it give the load at the frames of a film.
+
+        By inertial sensors the moment in the joint, else the dynamic pressure alone.
+        """
+        moves = self.motion.model == "ballistic" or (self.accelerometer is not None and self.rates is not None)
+        return self.vehicle is not None and moves and bool(self.radars or self.gnss)
 
     def required_triads(self) -> tuple[TriadRecord, TriadRecord]:
         """Return accelerometer and rates, or raise `GateError` where flight.toml names none."""

@@ -460,7 +460,7 @@ def deflection(
         methods = tuple(m for m in METHODS if m != "camera" or telemetry.frames is not None)
     settings = {"methods": list(methods), "plane_deg": plane_deg, "joint_m": joint_m}
     alone = set(methods) == {"camera"}
-    makes_bet = not alone or (plane_deg is None and telemetry.can_tell_moment)
+    makes_bet = not alone or (plane_deg is None and telemetry.can_tell_load)
     if makes_bet:
         compile_kernels(*warmup.RECONSTRUCTION)
     if "camera" in methods:

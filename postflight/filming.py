@@ -7,19 +7,20 @@ estimated from all films, and every frame's answer uses it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
 
 from estimators.agreement import CONFIDENCE
-from estimators.benchmark import BenchmarkDeflection, benchmark_deflection, orient_camera
+from estimators.benchmark import BenchmarkDeflection, benchmark_deflection, joint_moment, orient_camera
 from estimators.camera import FilmFit, JointSwing, read_film
 from estimators.camera_fit import OrientedCamera
 from estimators.cameras import CameraReadings, JoinedCameras, join_cameras
 from estimators.frame_edits import edited
 from estimators.fusion import smoothed
 from estimators.shell_shape import LoadedFilm, ShellShape, shell_shape, with_shape
+from estimators.unloaded_frames import Rest, rest_of
 from flightmodel.checks import DivergenceError, Fault, GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Frames
@@ -57,6 +58,8 @@ class CameraAnswer:
         Times of the benchmark frames.
     shape : ShellShape or None
         How the shell's shape followed the load; None where nothing determines it (why stands in the assumptions).
+    rests : dict of Rest
+        Of each camera whose film can tell: whether its benchmark frame is one at rest.
     """
 
     history: DeflectionHistory
@@ -67,6 +70,7 @@ class CameraAnswer:
     refused: dict[str, Fault]
     benchmarks_s: tuple[float, ...]
     shape: ShellShape | None = None
+    rests: dict[str, Rest] = field(default_factory=dict)
 
     @property
     def has_only_benchmarks(self) -> bool:
@@ -76,10 +80,16 @@ class CameraAnswer:
 
     @property
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
-        """Whether several cameras agree, and whether each has an answer; none of one camera alone."""
+        """Whether each camera's shell rests without load; of several, whether they agree and each has an answer."""
+        checks = [
+            ConsistencyCheck(
+                "camera-rest", f"{name}: deflection without load over its sd", rest.over_sd, 0.0, rest.limit,
+                rest.passed, f"{name}: {rest.remark}", name,
+            )
+            for name, rest in self.rests.items()
+        ]  # fmt: skip
         if self.joined is None:
-            return ()
-        checks = []
+            return tuple(checks)
         if self.joined.tests:
             least = min(test.p_value for test in self.joined.tests)
             name, low = "cameras agree: least chance of a test", 1.0 - CONFIDENCE
@@ -160,12 +170,15 @@ def camera_answer(
         name = next(iter(films))
         shaped, shape, why = _with_shell_shape({name: film}, flight, bet)
         film = shaped[name]
-        history = _with_benchmark_deflection(film, flight, bet)
-        history = replace(history, assumptions=f"{history.assumptions}; {why}")
+        found, uncorrected = _benchmark(film, flight.telemetry.films[name].time_bias_sd_s, flight, bet)
+        history = film.history(found)
+        rest = _rest(film, history, bet, found is not None)
+        history = replace(history, assumptions=f"{history.assumptions}{uncorrected}; {why}")
         table = film.frame_table(history)
         table.insert(0, "camera", name)
         smooth = _smooth(flight, history)
-        return CameraAnswer(history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape)
+        rests = {} if rest is None else {name: rest}
+        return CameraAnswer(history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape, rests)
     if flight.camera_plane_lv_rad is not None:
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
         raise GateError(words, "plane-assumed")
@@ -188,12 +201,15 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
         raise GateError([Fault(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
     films, shape, words_of_shape = _with_shell_shape(films, flight, bet)
     plain, corrected, tables, remarks = [], [], [], []
+    rests: dict[str, Rest] = {}
     for name, film in films.items():
         late_s = flight.telemetry.films[name].time_bias_sd_s
         read, nothing = film.relative_to_benchmark(late_s), film.oriented.apriori.benchmark_rad**2 * np.eye(2)
         one = CameraReadings(name, read, BenchmarkDeflection(np.zeros(2), nothing), float(CAMERA_PLANE_SD_RAD))
         found, why = _benchmark(film, late_s, flight, bet)
         history = film.history(found)
+        rest = _rest(film, history, bet, found is not None)
+        rests |= {} if rest is None else {name: rest}
         table = film.frame_table(history)
         table.insert(0, "camera", name)
         tables.append(table)
@@ -211,7 +227,7 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
     words = "; ".join([joined.at_frames.assumptions, joined.remark, words_of_shape, *remarks])
     history, smooth = (replace(h, assumptions=words) for h in (joined.at_frames, joined.smooth))
     times, frames = tuple(film.benchmark_s for film in films.values()), pd.concat(tables, ignore_index=True)
-    return CameraAnswer(history, at_plain.at_frames, smooth, frames, joined, refused, times, shape)
+    return CameraAnswer(history, at_plain.at_frames, smooth, frames, joined, refused, times, shape, rests)
 
 
 def _with_shell_shape(
@@ -252,15 +268,16 @@ def _benchmark(
         return None, f"; the benchmark's deflection is not corrected by the joint's moment ({fault})"
 
 
-def _with_benchmark_deflection(film: FilmFit, flight: Flight, bet: Reconstruction | None) -> DeflectionHistory:
-    """One camera's history with the benchmark frame deflected by the moment in the joint; undeflected without one.
-
-    Why there is none stands in the history's assumptions.
-    """
-    frames = flight.telemetry.frames
-    found, why = _benchmark(film, 0.0 if frames is None else frames.time_bias_sd_s, flight, bet)
-    history = film.history(found)
-    return replace(history, assumptions=history.assumptions + why)
+def _rest(film: FilmFit, history: DeflectionHistory, bet: Reconstruction | None, corrected: bool) -> Rest | None:
+    """Whether the shell rests in frames without load, by the moment in the joint or else the dynamic pressure."""
+    if bet is None:
+        return None
+    if bet.loads is None:
+        time_s, load = bet.air.time_s, bet.air.dynamic_pressure_pa
+    else:
+        time_s, load = bet.loads.time_s, np.linalg.norm(joint_moment(bet.loads).value_nm, axis=1)
+    at_frames = np.interp(history.time_s, time_s, load, left=np.nan, right=np.nan)
+    return rest_of(history, at_frames, film.benchmark_s, film.oriented.apriori.benchmark_rad, corrected)
 
 
 def _smooth(flight: Flight, history: DeflectionHistory) -> DeflectionHistory | None:

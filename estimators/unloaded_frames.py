@@ -1,0 +1,133 @@
+"""Do frames with little load show the shell at rest, as the benchmark frame is taken to?
+
+A benchmark frame under load, or a camera that has moved in its mount since, shows in frames with little load as a
+deflection that no load explains. Of the frames whose load ``l_k`` is at most a tenth of the film's largest, those
+before it and those after it apart, the readings ``r_k`` and their covariances ``S_k`` give
+
+    m = sum w_k r_k,    C = sum w_k V_k + p^2 I,    V_k = S_k + (2 u l_k)^2 I,    w_k ~ 1 / trace V_k
+
+where ``u = max |r| / max |l - l_benchmark|`` is deflection per load, and ``m' C^-1 m`` is a chi-square of two. A film
+without such frames can only be asked what its benchmark's own load amounts to, ``u l_benchmark``, against the sd ``p``
+with which it is taken as undeflected.
+
+Assumed: deflection follows the load, within a factor of two (dynamic pressure stands for the moment in the joint where
+no inertial sensors measured it, whatever the angle of attack was); a joint without load rests within ``p`` of where it
+rested in the benchmark frame (friction); the frames' errors are in common: the mean's sd is that of one frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from estimators.agreement import CONFIDENCE
+from flightmodel.checks import FloatArray
+from flightmodel.deflection import DeflectionHistory
+
+_LITTLE = 0.1  # of the largest load: the frames' own deflection is then small beside what is looked for
+_LOAD_FACTOR = 2.0  # of what the load explains: the angle of attack off the peak may be twice that at it
+_WORST_BY_LOAD = 2.0  # sd of the benchmark's prior, beyond which the readings' error bars do not hold
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What the film says of its benchmark frame's rest.
+
+    Parameters
+    ----------
+    theta_rad : float
+        Mean deflection of the frames with little load, of those before and those after the largest load the worse; or
+        without them that of the benchmark frame by its load.
+    over_sd : float
+        The same over its sd.
+    limit : float
+        Largest ``over_sd`` that passes.
+    frames : int
+        Frames with little load; 0: none.
+    span_s : tuple of float
+        First and last of them, or the benchmark frame's time twice.
+    """
+
+    theta_rad: float
+    over_sd: float
+    limit: float
+    frames: int
+    span_s: tuple[float, float]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the benchmark frame can be one at rest."""
+        return self.over_sd <= self.limit
+
+    @property
+    def remark(self) -> str:
+        """What was found, and where it fails what to do."""
+        size = np.rad2deg(self.theta_rad)
+        if not self.frames:
+            found = f"the benchmark frame's load deflects the shell by about {size:.2f} deg, and no frame has less"
+            return found if self.passed else f"{found}: state another benchmark_s, of a frame with little load"
+        first, last = self.span_s
+        found = f"{self.frames} frames with little load ({first:.2f} to {last:.2f} s) show {size:.2f} deg on average"
+        if self.passed:
+            return found
+        advice = "the benchmark frame is under load (state benchmark_s of one of these), or the camera moved"
+        return f"{found}, {self.over_sd:.1f} sd from rest: {advice} in its mount"
+
+
+def rest_of(
+    history: DeflectionHistory, load: FloatArray, benchmark_s: float, prior_sd_rad: float, corrected: bool
+) -> Rest | None:
+    """Whether frames with little load show the shell at rest.
+
+    Parameters
+    ----------
+    history : DeflectionHistory
+        Of one camera at its frames, NaN where a frame has no answer.
+    load : (n,) float
+        Moment in the joint or dynamic pressure at the frames, not negative; NaN where it is not known.
+    benchmark_s : float
+    prior_sd_rad : float
+        Sd, an axis, with which a joint without load is taken as undeflected.
+    corrected : bool
+        Whether the benchmark's own deflection is in the history: its load then says nothing against it.
+
+    Returns
+    -------
+    Rest or None
+        None where neither frames nor load can tell.
+    """
+    at = int(np.argmin(np.abs(history.time_s - benchmark_s)))
+    other = np.abs(history.time_s - history.time_s[at]) > 0.0
+    theta, covariance = history.theta_yz_rad, history.lateral_cov_without_plane
+    known = other & np.isfinite(load) & np.isfinite(theta).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    if not known.any() or not np.isfinite(load[at]):
+        return None
+    per_load = np.linalg.norm(theta[known], axis=1).max() / np.abs(load[known] - load[at]).max()
+    largest = max(load[known].max(), load[at])
+    little = known & (load <= _LITTLE * largest)
+    if little.any():
+        loaded = np.where(known | ~other, load, -np.inf)
+        before = history.time_s < history.time_s[int(np.argmax(loaded))]
+        groups = [rows for side in (before, ~before) if len(rows := np.flatnonzero(little & side))]
+        limit = float(np.sqrt(chi2.ppf(1.0 - (1.0 - CONFIDENCE) / len(groups), 2)))
+        found = []
+        for rows in groups:
+            by_load = _LOAD_FACTOR * per_load * load[rows]
+            mean, spread = _mean(theta[rows], covariance[rows] + by_load[:, None, None] ** 2 * np.eye(2))
+            over_sd = float(np.sqrt(mean @ np.linalg.solve(spread + prior_sd_rad**2 * np.eye(2), mean)))
+            first, last = (float(history.time_s[rows[k]]) for k in (0, -1))
+            found.append(Rest(float(np.linalg.norm(mean)), over_sd, limit, len(rows), (first, last)))
+        return max(found, key=lambda one: one.over_sd)
+    if corrected:
+        return None
+    by_load = float(per_load * load[at])
+    return Rest(by_load, by_load / prior_sd_rad, _WORST_BY_LOAD, 0, (benchmark_s, benchmark_s))
+
+
+def _mean(readings: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weighted mean of readings (k, 2) whose errors are in common, and its covariance."""
+    weight = 1.0 / np.trace(covariance, axis1=1, axis2=2)
+    weight /= weight.sum()
+    return weight @ readings, np.tensordot(weight, covariance, axes=1)

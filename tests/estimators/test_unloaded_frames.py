@@ -1,0 +1,85 @@
+"""Frames with little load tell a benchmark frame at rest from one under load, and from a camera that moved since."""
+
+import numpy as np
+import pytest
+
+from estimators.unloaded_frames import rest_of
+from flightmodel.deflection import history_from_lateral
+
+D = np.deg2rad
+PRIOR_RAD, READING_RAD = D(0.12), D(0.08)
+TIME_S = np.arange(420.0, 460.0, 1.0)
+LOAD = 1200.0 * np.exp(-(((TIME_S - 440.0) / 6.0) ** 2))  # dynamic pressure, Pa
+SWING = 1.0 + 0.4 * np.sin(2.0 * TIME_S)  # of the angle of attack: deflection does not follow the load alone
+DEFLECTION = (D(4.0) * LOAD / LOAD.max() * SWING)[:, None] * np.array([0.6, -0.8])
+
+
+ALL = np.arange(len(TIME_S))
+
+
+def read(deflection=DEFLECTION, at=0, offset=(0.0, 0.0), load=LOAD, corrected=False, rows=ALL):
+    """What the frames ``rows`` of a film show whose benchmark is frame ``at``, with readings off by ``offset`` rad."""
+    seen = (deflection - deflection[at] + np.asarray(offset))[rows]
+    covariance = np.tile((READING_RAD**2 + PRIOR_RAD**2) * np.eye(2), (len(rows), 1, 1))
+    history = history_from_lateral(TIME_S[rows], seen, covariance, "camera", "")
+    return rest_of(history, load[rows], float(TIME_S[at]), PRIOR_RAD, corrected)
+
+
+def test_a_benchmark_at_rest_passes():
+    found = read()
+    assert found.passed
+    assert found.frames == 10
+    assert found.over_sd < 0.5
+
+
+def test_a_benchmark_under_load_is_told():
+    """At 434 s, 1.5 deg of it; at the peak, 4 deg."""
+    for at, least in ((14, D(1.0)), (20, D(2.5))):
+        found = read(at=at)
+        assert not found.passed
+        assert found.frames >= 10
+        assert least < found.theta_rad < D(6.0)
+        assert "benchmark_s" in found.remark
+
+
+def test_a_camera_that_moves_later_is_told_where_the_load_has_gone():
+    moved = DEFLECTION + np.where(TIME_S > 436.0, D(1.2), 0.0)[:, None] * np.array([0.0, 1.0])
+    found = read(moved)
+    assert not found.passed
+    assert found.span_s[0] > 440.0
+    assert "moved" in found.remark
+
+
+def test_false_alarms_are_no_more_than_stated():
+    """A thousand films with errors in common as stated, and a joint that does not rest where it did."""
+    rng = np.random.default_rng(20)
+    size = np.sqrt(READING_RAD**2 + 2.0 * PRIOR_RAD**2)
+    over = np.array([read(offset=size * rng.standard_normal(2)).over_sd for _ in range(1000)])
+    assert (over > 3.72).sum() <= 4  # 0.001 of each; more than 4 of 1000 has a chance of 0.004
+    # the load's part is what the sd has too much
+    assert 0.6 < np.sqrt(np.mean(over**2) / 2.0) < 1.05
+
+
+def test_the_load_is_allowed_for():
+    """Deflection by the little load itself, twice the usual for its size, is no fault of the benchmark."""
+    heavy = DEFLECTION * np.where(LOAD / LOAD.max() < 0.1, 2.0, 1.0)[:, None]
+    assert read(heavy).passed
+
+
+def test_without_frames_of_little_load_the_benchmark_s_own_load_counts():
+    pulse = np.flatnonzero(LOAD / LOAD.max() > 0.2)
+    follows = (D(4.0) * LOAD / LOAD.max())[:, None] * np.array([0.6, -0.8])
+    found = read(follows, at=pulse[0], rows=pulse)
+    assert found.frames == 0
+    assert not found.passed
+    assert found.theta_rad == pytest.approx(np.linalg.norm(follows[pulse[0]]), rel=1e-9)
+    assert read(follows, at=pulse[0], rows=pulse, corrected=True) is None
+    soft = read(0.1 * follows, at=pulse[0], rows=pulse)
+    assert soft.passed
+    assert soft.over_sd == pytest.approx(0.1 * found.over_sd, rel=1e-9)
+
+
+def test_nothing_tells_without_a_load_at_the_frames():
+    assert read(load=np.full_like(LOAD, np.nan)) is None
+    only = np.where(np.arange(len(LOAD)) == 20, np.nan, LOAD)
+    assert read(at=20, load=only) is None
