@@ -477,6 +477,7 @@ def deflection(
         answers = estimate(bet or flight, methods, lambda f, what: report(0.6 + 0.3 * f, what))
         with run_folder.RunFolder(folder, telemetry, settings, as_read=flight.as_read) as out:
             run_folder.write_answers(out, answers)
+            run_folder.write_checks(out, answers.consistency_checks)
             if "camera" in answers.histories:
                 history = answers.histories["camera"]
                 draw_camera(flight, history, out.path / "figures")

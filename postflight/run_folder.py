@@ -19,8 +19,8 @@ import json
 import platform
 import re
 import shutil
-from collections.abc import Container, Mapping
-from dataclasses import asdict
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -41,6 +41,7 @@ from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import Deflections, quantiles_at
 from postflight.filming import NO_VIDEO
 from postflight.reconstruction import Reconstruction
+from recon.consistency import ConsistencyCheck
 from recon.measurements import component_unit
 
 DIGITS = "%.10g"
@@ -275,8 +276,7 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflec
     if len(bet.held_out):
         run.write_csv("withheld.csv", _residuals(bet.held_out))
     of_deflection = () if answers is None else answers.consistency_checks
-    checks = pd.DataFrame([vars(v) for v in (*flight.consistency_checks, *of_deflection)])
-    run.write_csv("consistency_checks.csv", checks)
+    checks = write_checks(run, (*flight.consistency_checks, *of_deflection))
     # the table's name and columns of version 0.1, for scripts that read it; to go with version 0.3
     run.write_csv(
         "verdicts.csv",
@@ -304,6 +304,13 @@ def without_attitude(flight: Reconstruction) -> tuple[Finding, ...]:
         return ()
     words = "no inertial sensors carried the attitude: attitude, rates and flow angles are empty in bet.csv"
     return (Finding("attitude", words, np.nan, np.nan, "attitude-missing"),)
+
+
+def write_checks(run: RunFolder, checks: Iterable[ConsistencyCheck]) -> pd.DataFrame:
+    """Write ``consistency_checks.csv``, and return it."""
+    table = pd.DataFrame([vars(v) for v in checks], columns=[f.name for f in fields(ConsistencyCheck)])
+    run.write_csv("consistency_checks.csv", table)
+    return table
 
 
 def write_answers(run: RunFolder, answers: Deflections) -> None:
