@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # two processes; threads of linear algebra in each would only get in each other's way
-PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadscope -q
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -q
 
 # each command reads byte code then, also where Python is told to write none: a third of a second
 COMPILED := $(BIN)/python -m compileall -q flightmodel recon estimators synthetic_flight postflight
