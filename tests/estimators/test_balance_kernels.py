@@ -36,6 +36,15 @@ def test_kernels_leave_what_the_readable_balances_leave(loads, name, size_rad):
     np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-8)
 
 
+@pytest.mark.parametrize("name", ["force_residual", "axial_residual", "moment_residual"])
+def test_a_fast_shell_at_small_angles_too(loads, name):
+    """Where the rate's terms in the angle come from series."""
+    slow = swing_of(1.0, len(loads.time_s))
+    swing = Swing(0.003 * slow.theta_yz_rad, slow.rate_yz_radps, slow.acceleration_yz_radps2)
+    got, want = (getattr(module, name)(loads.vehicle, swing, loads) for module in (balance, plain_balance))
+    np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-7)  # rounding of larger rates
+
+
 TERMS = AeroTerms(
     cl=0.01, clp=-0.2, cnr_less_cmq=-0.7, ca_deflection=0.9, cn_deflection=0.4, cm_deflection=-0.2, roll_order=3,
     roll_share=0.15, roll_clock_lv_deg=25.0,
