@@ -35,7 +35,7 @@ from recon.atmosphere import (
     windows_are_whole,
 )
 from recon.consistency import ConsistencyCheck
-from recon.entry_density import density_by_drag, profile_as_flown
+from recon.entry_density import density_by_drag, density_check, profile_as_flown
 from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
@@ -107,6 +107,8 @@ class Reconstruction(Tabular):
         Comparison with an attitude from magnetometer and Sun sensors alone.
     density : DataFrame or None
         Air by the deceleration with the drag of [drag], `recon.entry_density`.
+    density_check : ConsistencyCheck or None
+        Of that density against the stated atmosphere's.
     """
 
     flight: Flight
@@ -118,6 +120,7 @@ class Reconstruction(Tabular):
     missing: tuple[Fault, ...] = ()
     attitude: AttitudeCheck | None = None
     density: pd.DataFrame | None = None
+    density_check: ConsistencyCheck | None = None
 
     @property
     def telemetry(self) -> Telemetry:
@@ -133,7 +136,8 @@ class Reconstruction(Tabular):
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
         """Checks of the trajectory, then of its attitude, then of the atmosphere."""
         attitude, air = (part.consistency_checks if part is not None else () for part in (self.attitude, self.as_flown))
-        return self.solution.consistency_checks + attitude + air
+        by_drag = () if self.density_check is None else (self.density_check,)
+        return self.solution.consistency_checks + attitude + air + by_drag
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -247,9 +251,10 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     telemetry = flight.telemetry
     _check_inside_tables(solution.smoothed)
     stated = profile = profile_from_sounding(telemetry.sounding)
-    density = None
+    density = check = None
     if telemetry.drag is not None:
         density = density_by_drag(telemetry, solution.smoothed, solution.drag)
+        check = density_check(density, stated, solution.settings.check_confidence)
         profile = profile_as_flown(stated, density)
     air = airdata.air_data(solution.smoothed, profile, _arm(flight.vehicle))
     loads, as_flown = None, None
@@ -262,7 +267,9 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
         as_flown = as_flown_atmosphere(telemetry, solution, stated, solution.settings.check_confidence)
     except GateError as fault:
         missing += fault.faults
-    return Reconstruction(flight, solution, air, profile, loads, as_flown, tuple(missing), density=density)
+    return Reconstruction(
+        flight, solution, air, profile, loads, as_flown, tuple(missing), density=density, density_check=check
+    )
 
 
 def _check_axes(solution: TrajectorySolution) -> None:
@@ -304,7 +311,8 @@ def _check_inside_tables(trajectory: Trajectory) -> None:
         k = int(np.argmax(wrong))
         raise DivergenceError(
             f"reconstruction: diverged: at {trajectory.time_s[k]:.1f} s the altitude is {altitude_m[k] / 1000:.1f} km. "
-            "Check the accelerometer's and gyros' units, signs and mounting, and the attitude prior",
+            "Check planet, [start.state] and its time, the accelerometer's and gyros' units, signs and mounting, and "
+            "the attitude prior",
             "trajectory-diverged",
         )
 

@@ -31,18 +31,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from scipy.special import ndtri
 
 from flightmodel import earth
 from flightmodel.airdata import AirData, air_data
-from flightmodel.atmosphere import AtmosphereProfile, gas_constant, profile_from_sounding, sound_speed, standard_air
+from flightmodel.atmosphere import (
+    DENSITY_LENGTH_M,
+    AtmosphereProfile,
+    gas_constant,
+    profile_from_sounding,
+    sound_speed,
+    standard_air,
+)
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory
+from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import Problem
 from recon.state import KINEMATIC, States, unpacked
 
 LEAST_KNOWN = 0.5  # fractional sd of density, C_A apart, from which a row is given
 _HALF_WINDOW_S = 0.25  # of an axial reading
+_INDEPENDENT_M = 2.0 * DENSITY_LENGTH_M  # thickness of layers in which the stated density errs each by itself
 _LAYER_M = 250.0  # over which rows are one knot of the atmosphere as flown: a fortieth of Mars's scale height
 
 
@@ -200,6 +210,49 @@ def _mean(
     # of a temperature that is wrong by a factor the sd is that of the stated one's size
     weight = 1.0 / (1.0 + (flown_part * stated / stated_sd) ** 2)
     return weight * flown + (1.0 - weight) * stated, np.sqrt(1.0 - weight) * stated_sd
+
+
+def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:
+    """Check the density by the drag against the stated atmosphere, by the error of both and of the height.
+
+    With neither tracker nor gyros this alone shows a radius for a diameter or a height that is 20 km off.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Of `density_by_drag`.
+    stated : AtmosphereProfile
+    confidence : float
+        Two-sided, of the check.
+
+    Returns
+    -------
+    ConsistencyCheck or None
+        None of an empty table.
+    """
+    if table.empty:
+        return None
+    height = table["altitude_m"].to_numpy()
+    knots = stated.altitude_m
+    per_m = np.gradient(np.log(stated.at(knots).density_kgpm3), knots)
+    parts = (
+        table["density_ratio_sd"] / table["density_ratio"],
+        stated.at(height).density_sd,
+        table["altitude_sd_m"] * np.interp(height, knots, per_m),
+    )
+    rows = pd.DataFrame({"log_ratio": np.log(table["density_ratio"]), "sd": np.sqrt(sum(part**2 for part in parts))})
+    layers = rows.groupby(np.floor(height / _INDEPENDENT_M)).mean()
+    shift = (layers["log_ratio"] / layers["sd"]).to_numpy()
+    worst = int(np.argmax(np.abs(shift)))
+    below = _INDEPENDENT_M * layers.index[worst]
+    name = f"density at {below / 1e3:.0f} to {(below + _INDEPENDENT_M) / 1e3:.0f} km"
+    found = f"{name} is {np.exp(layers['log_ratio'].iloc[worst]):.2g} times the stated atmosphere's"
+    return consistency_check(
+        "sounding-density", "sounding density", float(np.abs(shift[worst])), 0.0,
+        float(-ndtri(0.5 * (1.0 - confidence) / len(layers))), f"{found}, within what both may err", found,
+        advice="the air differed, or mass, area or C_A of [drag], height or speed of the stated state, or the "
+        "accelerometer's unit is wrong", component=name,
+    )  # fmt: skip
 
 
 def profile_as_flown(stated: AtmosphereProfile, table: pd.DataFrame) -> AtmosphereProfile:

@@ -30,6 +30,7 @@ import numpy as np
 
 from flightmodel.checks import FloatArray
 from recon import ekf, propagation, setup, single_faults, smoother
+from recon._measurement_kernels import DECELERATION
 from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import Problem
 from recon.fault_detection import UnmodelledAcceleration, track_is_lost, with_one_more, with_unmodelled
@@ -96,6 +97,16 @@ def follow_track(
         if more is None:
             return run, found
         found = more
+
+
+def needs_no_reference(problem: Problem) -> bool:
+    """Whether the filter's own estimate is what to linearise about, once: where a deceleration is measured.
+
+    The filter is then on the drag throughout. About a smoothed path the drag is an exponential of errors a hundred
+    times the process noise: half a scale height up with as much more drag is to first order the same flight, to second
+    order another by 1 m/s^2 in 100, and passes swing along that line instead of converging.
+    """
+    return any(instrument.kind == DECELERATION for instrument in problem.instruments)
 
 
 def bounded_drivers(problem: Problem, states: States) -> States:

@@ -12,7 +12,8 @@ flight without inertial sensors is propagated by gravity and drag in the soundin
 What the data contradict is found on the way and the flight reconstructed again: jumps of the inertial clocks, transient
 offsets of readings, a priori uncertainties that are too small, trackers that contradict the rest
 (`recon.fault_detection`, `recon.fault_isolation`). First passes use thinned data about the filter's own estimate, later
-ones all data about the smoothed trajectory (Gauss-Newton).
+ones all data about the smoothed trajectory (Gauss-Newton); of ballistic flight with a measured deceleration one pass
+about the filter's own estimate is all (`recon.linearisation`).
 
 The answer is of the datum, and of the accelerometer's samples. From the accelerometer (at ``r`` from the datum, body
 axes) to the datum:
@@ -576,10 +577,11 @@ def _iterate(
     """
     reference, phase = None, None
     found: tuple[UnmodelledAcceleration, ...] = ()
-    if settings.passes > 0:
+    passes = 0 if linearisation.needs_no_reference(problem) else settings.passes
+    if passes > 0:
         report(0.02, "first passes on thinned data")
         reference, found, phase = linearisation.first_reference(problem, settings)
-    most, i = max(1, settings.passes), 0
+    most, i = max(1, passes), 0
     while True:
         share = 0.85 / most
         report(0.1 + share * i, f"filter, pass {i + 1}")

@@ -112,7 +112,8 @@ class Settings:
         Largest number of forward passes over all data. The first filter runs on thinned data about its own estimate,
         iterated until attitudes converge; each pass over all data is linearised about the smoothed trajectory before
         it, and another follows only where one moved the result by more than a hundredth of its standard deviation.
-        With 0, a single extended Kalman filter over all data about its own estimate.
+        With 0, a single extended Kalman filter over all data about its own estimate; so is a ballistic flight with a
+        measured deceleration filtered, whatever is set (`recon.linearisation.needs_no_reference`).
     gate_probability : float
         A measurement is edited where its normalised innovation squared is beyond this chi-square quantile.
     check_confidence : float

@@ -67,10 +67,10 @@ C_A, C_A_SD, MASS_SD = 1.70, 0.02, 0.001
 NOISE_MPS2, BIAS_MPS2, SCALE, TRIM_DEG = 0.02, 0.03, 0.002, 2.0
 
 
-def fly(seed: int, rate_hz: float = 16.0, to_s: float = 170.0) -> Entry:
-    """Fly a dispersed entry and measure it."""
+def fly(seed: int, rate_hz: float = 16.0, to_s: float = 170.0, state: np.ndarray = STATE) -> Entry:
+    """Fly an entry dispersed about a stated state and measure it."""
     rng = np.random.default_rng(seed)
-    true_state = STATE + STATE_SD * rng.standard_normal(6)
+    true_state = state + STATE_SD * rng.standard_normal(6)
     c_a = C_A * (1.0 + C_A_SD * rng.standard_normal())
     mass = MASS_KG * (1.0 + MASS_SD * rng.standard_normal())
     shift, waves = 0.15 * rng.standard_normal(), rng.standard_normal((2, 3))
@@ -136,7 +136,7 @@ def fly(seed: int, rate_hz: float = 16.0, to_s: float = 170.0) -> Entry:
     moving = np.einsum("nij,nj->ni", turn, v) - np.cross([0.0, 0.0, SPIN_RADPS], fixed)
     return Entry(
         t, fixed, moving, np.array([p[1] for p in parts]), np.array([p[0] for p in parts]),
-        np.linalg.norm(moving, axis=1), axial, c_a, measured, STATE, mass,
+        np.linalg.norm(moving, axis=1), axial, c_a, measured, state, mass,
     )  # fmt: skip
 
 
@@ -186,7 +186,7 @@ time_bias_sd_s = 0.0
 def write(entry: Entry, folder) -> None:
     """Flight folder of an entry with one accelerometer channel."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "flight.toml").write_text(FLIGHT.format(STATE, STATE_SD))
+    (folder / "flight.toml").write_text(FLIGHT.format(entry.stated_spherical, STATE_SD))
     rows = np.column_stack([entry.time_s, entry.measured_mps2])
     np.savetxt(folder / "accelerometer.csv", rows, fmt="%.6f", delimiter=",", header="t_s,ax_mps2", comments="")
 
@@ -246,5 +246,5 @@ def write_inertial(entry: Entry, folder, seed: int) -> None:
         np.savetxt(folder / f"{name}.csv", rows, fmt="%.10f", delimiter=",", header="t_s,x,y,z", comments="")
     known = Rotation.from_matrix(body[0]) * Rotation.from_rotvec(np.deg2rad(0.2) * rng.standard_normal(3))
     q = ", ".join(f"{x:.12f}" for x in known.as_quat()[[3, 0, 1, 2]])
-    head = FLIGHT.format(STATE, STATE_SD).partition("[motion]")[0]
+    head = FLIGHT.format(entry.stated_spherical, STATE_SD).partition("[motion]")[0]
     (folder / "flight.toml").write_text(head + INERTIAL.format(q))

@@ -121,6 +121,44 @@ def test_inertial_sensors_alone_carry_the_entry_state(tmp_path):
     assert (mean < high).all(), mean
 
 
+def test_a_slow_shallow_entry_errs_as_stated_and_all_is_green(tmp_path):
+    """Passes about the smoothed path swung along drag against height: half had a red check, errors were 1.3 sd."""
+    state = mars_entry.STATE.copy()
+    state[3:5] = 5600.0, -12.0
+    flights, nees = 6, []
+    for seed in range(950, 950 + flights):
+        truth = mars_entry.fly(seed, to_s=150.0, state=state)
+        mars_entry.write(truth, tmp_path / f"{seed}")
+        bet = pf.reconstruct(pf.read_flight(tmp_path / f"{seed}"))
+        assert not [check.name for check in bet.consistency_checks if not check.passed], seed
+        path = bet.trajectory
+        rows = np.searchsorted(path.time_s, [0.0, 60.0, 85.0, 110.0, 120.0, 145.0])
+        true = np.hstack([truth.position_m, truth.velocity_mps])
+        true = np.column_stack([np.interp(path.time_s[rows], truth.time_s, column) for column in true.T])
+        error = np.hstack([path.position_ecef_m[rows], path.velocity_ecef_mps[rows]]) - true
+        nees.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(path.covariance[rows][:, :6, :6]), error))
+    assert (np.mean(nees, axis=0) < chi_square_quantile(0.99, 6 * flights) / flights).all(), np.mean(nees, axis=0)
+
+
+def test_a_density_that_the_atmosphere_does_not_allow_is_red(tmp_path):
+    """Nothing else shows a radius stated for the diameter, or a height 20 km off: every check was green."""
+    truth = mars_entry.fly(901)
+    mars_entry.write(truth, tmp_path)
+    sound = (tmp_path / "flight.toml").read_text()
+
+    def check():
+        bet = pf.reconstruct(pf.read_flight(tmp_path))
+        (found,) = (one for one in bet.consistency_checks if one.code == "sounding-density")
+        assert (found.passed, bool(bet.suspects)) in ((True, False), (False, True))
+        return found
+
+    assert check().passed
+    for old, new in (("diameter_m = 2.65", "diameter_m = 1.325"), ("radius_m = 3522200.0", "radius_m = 3542200.0")):
+        assert sound.count(old) == 1
+        (tmp_path / "flight.toml").write_text(sound.replace(old, new))
+        assert not check().passed, new
+
+
 def test_both_engines_agree(tmp_path):
     mars_entry.write(mars_entry.fly(4, to_s=80.0), tmp_path)
     flight = pf.read_flight(tmp_path)
