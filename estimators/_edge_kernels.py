@@ -285,19 +285,50 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
 
 
 @kernel
+def rises_over_pixel(grey, near, rise, first):
+    """Rises (n, m - 2) over two samples along lines (n, m), and the steepest (n,) within ``near`` of their middles.
+
+    All of a line are positive in the steepest one's direction.
+    """
+    n, m = rise.shape
+    middle = m // 2
+    for i in range(n):
+        first[i] = 0.0
+        for j in range(m):
+            rise[i, j] = grey[i, j + 2] - grey[i, j]
+            if abs(j - middle) <= near and abs(rise[i, j]) > abs(first[i]):
+                first[i] = rise[i, j]
+        if first[i] < 0.0:
+            first[i] = -first[i]
+            for j in range(m):
+                rise[i, j] = -rise[i, j]
+
+
+@kernel
+def tops(rise, least, steps):
+    """Mark the samples (n, m) of lines that rise more than ``least`` (n,) there, and no less than beside them."""
+    n, m = rise.shape
+    for i in range(n):
+        steps[i, 0], steps[i, m - 1] = False, False
+        for j in range(1, m - 1):
+            value = rise[i, j]
+            steps[i, j] = value > least[i] and value >= rise[i, j - 1] and value >= rise[i, j + 1]
+
+
+@kernel
 def share_of_second_edge(steps, by_turn, limits):
-    """Largest share of points (n,) with a step where a turn would put them, and the turn's size, rad.
+    """Largest share of points (n,) with a step where a turn would put them, and the turn's size, rad; or ``low`` and 0.
 
     ``steps`` (n, k): where on the line across each point, which lies in the middle, a step is found; within a pixel
     counts. ``limits``: nearest and farthest that a turn puts a point, px; samples' spacing, px; least points that it
-    puts between. Turns are tried a pixel apart for the point that moves most.
+    puts between; share ``low`` that asks for more. Turns are tried a pixel apart for the point that moves most.
     """
-    nearest, farthest, spacing, least = limits
+    nearest, farthest, spacing, least, low = limits
     n, middle, beside = len(by_turn), steps.shape[1] // 2, round(1.0 / spacing)
     most = 0.0
     for i in range(n):
         most = max(most, math.hypot(by_turn[i, 0], by_turn[i, 1]))
-    best, size = 0.0, 0.0
+    best, size = low, 0.0
     if n < least or most == 0.0:
         return best, size
     spread = np.zeros(steps.shape, dtype=np.bool_)
@@ -311,6 +342,8 @@ def share_of_second_edge(steps, by_turn, limits):
             y, z = a / most, b / most
             moved, found = 0, 0
             for i in range(n):
+                if i % 16 == 0 and found + n - i <= best * (moved + n - i):
+                    break  # were all the others to agree, it would not be the largest
                 off = by_turn[i, 0] * y + by_turn[i, 1] * z
                 if nearest <= abs(off) <= farthest:
                     moved += 1

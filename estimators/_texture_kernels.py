@@ -34,16 +34,22 @@ def correlations(picture, template, middle, affine, reach, score):
             a, b = u - x, v - y
             upper = (1.0 - a) * picture[y, x] + a * picture[y, x + 1]
             window[i, j] = (1.0 - b) * upper + b * ((1.0 - a) * picture[y + 1, x] + a * picture[y + 1, x + 1])
-    count = size * size
-    for p in range(2 * reach + 1):
-        for q in range(2 * reach + 1):
+    # sums over the patch: along rows, then of rows
+    steps, count = 2 * reach + 1, size * size
+    along = np.zeros((wide, steps, 2))
+    for i in range(wide):
+        for q in range(steps):
+            for j in range(size):
+                along[i, q, 0] += window[i, q + j]
+                along[i, q, 1] += window[i, q + j] * window[i, q + j]
+    for p in range(steps):
+        for q in range(steps):
             total, square, product = 0.0, 0.0, 0.0
             for i in range(size):
+                total += along[p + i, q, 0]
+                square += along[p + i, q, 1]
                 for j in range(size):
-                    value = window[p + i, q + j]
-                    total += value
-                    square += value * value
-                    product += value * template[i, j]
+                    product += window[p + i, q + j] * template[i, j]
             spread = square - total * total / count
             score[p, q] = product / math.sqrt(spread) if spread > 1e-9 else 0.0
     return True

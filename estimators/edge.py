@@ -255,7 +255,7 @@ def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
     near = ScanLines(lines.origin_px, lines.inward_px, _NEAR_PX, _NEAR_PX, lines.index)
     grey, inside = sampled(image, near, len(NEAR_ALONG))
     # the noise, from samples so far apart that smoothing did not correlate them
-    noise = max(float(np.median(np.abs(grey[:, 6] - grey[:, 0]))) / (0.6745 * np.sqrt(2.0)), 0.3)
+    noise = max(middle_of(np.abs(grey[:, 6] - grey[:, 0])) / (0.6745 * np.sqrt(2.0)), 0.3)
     place, along, left, good = np.zeros(n), np.zeros(n), np.zeros_like(grey), np.zeros(n, dtype=np.bool_)
     _edge_kernels.steps_near(
         grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, along, left, good
@@ -299,6 +299,14 @@ def is_coherent(line: NDArray[np.intp], residual_px: FloatArray) -> BoolArray:
         alike = np.abs(beside - residual_px[:, None]) < _COHERENT_PX
     # half of those there may be, and the point itself
     return np.asarray(alike.sum(axis=1) > _NEIGHBOURS)
+
+
+def middle_of(values: FloatArray) -> float:
+    """Median of numbers without NaN, in an eighth of the time of numpy's, which places three of them."""
+    flat = values.ravel()
+    half = len(flat) // 2
+    sorted_in = np.partition(flat, half)
+    return float(sorted_in[half] if len(flat) % 2 else 0.5 * (sorted_in[:half].max() + sorted_in[half]))
 
 
 def sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:

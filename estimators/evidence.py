@@ -50,6 +50,7 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import (
     QUANTILES,
     DeflectionHistory,
+    drawn_together,
     history_from_lateral,
     length_quantiles,
     standard_normals,
@@ -480,12 +481,12 @@ def history_of_evidence(evidence: Evidence, loads: FlightLoads, assumptions: str
     quantiles = None
     if evidence.half_curvature_rad is not None:
         quantiles = np.full((n, len(QUANTILES)), np.nan)
-        quantiles[rows] = length_quantiles(_curved_draws(evidence, swinging))
+        quantiles[rows] = _curved_quantiles(evidence, swinging)
     return history_from_lateral(loads.time_s, theta_yz, cov, evidence.method, assumptions, quantiles)
 
 
-def _curved_draws(evidence: Evidence, swinging: FloatArray) -> FloatArray:
-    """Deflections ``(n, k, 2)`` drawn with the reading's curvature by its most uncertain input, C_m."""
+def _curved_quantiles(evidence: Evidence, swinging: FloatArray) -> FloatArray:
+    """`length_quantiles` ``(n, 5)`` of deflections curved by the most uncertain input, C_m."""
     assert evidence.half_curvature_rad is not None
     # without samples, or of a C_m that is known, there is no response
     by_moment = evidence.by_input.get("C_m", np.zeros((len(evidence.time_s), 2, 1)))[:, :, 0]
@@ -494,14 +495,15 @@ def _curved_draws(evidence: Evidence, swinging: FloatArray) -> FloatArray:
     for name, response in evidence.by_input.items():
         if name != "C_m":
             others = others + response @ response.transpose(0, 2, 1)
-    known: BoolArray = np.asarray(np.isfinite(evidence.theta_yz_rad).all(axis=1))
-    root = np.linalg.cholesky(others[known] + _LEAST_VAR * np.eye(2))
+    known = np.flatnonzero(np.isfinite(evidence.theta_yz_rad).all(axis=1))
     x = normals[None, :, 2:]
-    drawn = normals[:, :2] @ root.transpose(0, 2, 1)
-    drawn += evidence.theta_yz_rad[known, None]
-    drawn += by_moment[known, None] * x + evidence.half_curvature_rad[known, None] * x**2
-    out = np.full((len(known), *drawn.shape[1:]), np.nan)
-    out[known] = drawn
+    out = np.full((len(others), len(QUANTILES)), np.nan)
+    for k in drawn_together(known):
+        root = np.linalg.cholesky(others[k] + _LEAST_VAR * np.eye(2))
+        drawn = normals[:, :2] @ root.transpose(0, 2, 1)
+        drawn += evidence.theta_yz_rad[k, None]
+        drawn += by_moment[k, None] * x + evidence.half_curvature_rad[k, None] * x**2
+        out[k] = length_quantiles(drawn)
     return out
 
 

@@ -275,7 +275,7 @@ class FrameModel:
         there = np.abs(before.index[at] - index) <= beside
         return np.where(there, before.residual_px[at], np.nan), before.sd_px[at], at
 
-    @property
+    @cached_property
     def _shape_sd(self) -> FloatArray:
         """A priori sd of flattening, joint station, lobes (12) and light (3) of a frame against the benchmark."""
         apriori = self.apriori

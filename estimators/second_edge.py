@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimators import _edge_kernels
-from estimators.edge import NO_FAULT, STEP_PX, HorizonLine, Image, ScanLines, sampled
+from estimators.edge import NO_FAULT, STEP_PX, HorizonLine, Image, ScanLines, middle_of, sampled
 from flightmodel.checks import Fault, FloatArray
 
 _NEAREST_PX, _FARTHEST_PX = 2.0, 24.0  # nearer is one edge, blurred; farther inside is the next torus
@@ -44,22 +44,19 @@ def fault_of_second_edge(image: Image, horizon: HorizonLine, by_turn: FloatArray
     reach = _FARTHEST_PX + 1.0
     lines = ScanLines(horizon.points_px, horizon.inward_px, reach, reach, horizon.line)
     grey, inside = sampled(image, lines, round(2.0 * reach / STEP_PX) + 1)
-    # over a pixel
-    rise = grey[:, 2:] - grey[:, :-2]
-    middle = rise.shape[1] // 2
-    near = rise[:, middle - 2 : middle + 3]
-    first = np.take_along_axis(near, np.abs(near).argmax(axis=1)[:, None], axis=1)
-    rise = rise * np.sign(first)
-    least = np.maximum(_LEAST_STEP * np.abs(first), _OF_SCATTER * 1.4826 * float(np.median(np.abs(rise))))
-    steps = np.zeros(rise.shape, dtype=np.bool_)
-    steps[:, 1:-1] = (rise[:, 1:-1] >= rise[:, :-2]) & (rise[:, 1:-1] >= rise[:, 2:]) & (rise > least)[:, 1:-1]
-    whole = (np.abs(first) > 2.0 * least)[:, 0] & inside.all(axis=1)
+    rise, first = np.empty((len(grey), grey.shape[1] - 2)), np.empty(len(grey))
+    _edge_kernels.rises_over_pixel(grey, round(1.0 / STEP_PX), rise, first)
+    least = np.maximum(_LEAST_STEP * first, _OF_SCATTER * 1.4826 * middle_of(np.abs(rise)))
+    steps = np.empty(rise.shape, dtype=np.bool_)
+    _edge_kernels.tops(rise, least, steps)
+    whole = (first > 2.0 * least) & inside.all(axis=1)
     limits = (_NEAREST_PX, _FARTHEST_PX, STEP_PX, max(_LEAST_POINTS, round(_LEAST_PART * len(whole))))
-    share, turn_rad = _edge_kernels.share_of_second_edge(steps[whole], by_turn[whole], limits)
-    if share < _DOUBLED:
+    steps, by_turn = steps[whole], by_turn[whole]
+    share, turn_rad = _edge_kernels.share_of_second_edge(steps, by_turn, (*limits, _DOUBLED))
+    if share <= _DOUBLED:
         return NO_FAULT
-    widened = np.column_stack([by_radius, np.zeros_like(by_radius)])[whole]
-    if share < _edge_kernels.share_of_second_edge(steps[whole], widened, limits)[0] + _BEYOND_RING:
+    widened, ring = np.column_stack([by_radius, np.zeros_like(by_radius)])[whole], share - _BEYOND_RING
+    if _edge_kernels.share_of_second_edge(steps, widened, (*limits, ring))[0] > ring:
         return NO_FAULT
     words = (
         f"the edge is seen twice: {100.0 * share:.0f} % of its points have a second step where a turn by "

@@ -19,6 +19,7 @@ import numba
 from numba.core.caching import FunctionCache
 from numba.core.registry import CPUDispatcher
 
+from flightmodel._compiler_kernels import PartCompiler
 from flightmodel.cache_folder import CacheFolder, cache_folder
 
 # Contraction and reordering are allowed; assuming away NaN is not: telemetry marks gaps with it.
@@ -78,8 +79,7 @@ def exact_kernel(function):
 class Part(CPUDispatcher):
     """A function that is compiled into the kernels that call it, without an entry of its own.
 
-    Entries from Python and C take a quarter of the time that compiling takes. Called from Python, as tests do, it
-    becomes a kernel.
+    Called from Python, as tests do, it becomes a kernel.
     """
 
     def __call__(self, *arguments):
@@ -88,12 +88,16 @@ class Part(CPUDispatcher):
             self.alone = _kept(self.py_func, **options)
         return self.alone(*arguments)
 
+    def get_call_template(self, args, kws):
+        """Compile for a number once, and not again for every constant that it is called with."""
+        return super().get_call_template([numba.types.unliteral(kind) for kind in args], kws)
+
 
 _INSIDE = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True}
 
 
 def _part(function, **options):
-    part = numba.njit(nogil=True, error_model="numpy", **options, **_INSIDE)(function)
+    part = numba.njit(nogil=True, error_model="numpy", pipeline_class=PartCompiler, **options, **_INSIDE)(function)
     if isinstance(part, CPUDispatcher):  # else numba is switched off
         part.__class__ = Part
     return part
@@ -111,16 +115,6 @@ def inlined(function):
     optimised; which one runs would depend on what was compiled in the process and what came from the cache.
     """
     return _part(function, fastmath=FASTMATH)
-
-
-def merged(function):
-    """Make a large part of one or two kernels, copied into them before compilation.
-
-    As `inlined` it would be optimised by itself and again in every caller of its caller, which for the filter takes a
-    third of the time that compiling takes.
-    """
-    options = {"nogil": True, "error_model": "numpy", "fastmath": FASTMATH, "inline": "always"}
-    return numba.njit(**options)(function)
 
 
 GM, RATE = 0, 4  # their places in a `flightmodel.earth.Planet`

@@ -12,6 +12,7 @@ vector of the shell against the body is ``theta * x_hat x d``; that of the body 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Literal
@@ -145,11 +146,11 @@ class DeflectionHistory(Tabular):
             return self.curved_quantiles_rad
         out = np.full((len(self.time_s), len(QUANTILES)), np.nan)
         cov = self.lateral_cov_without_plane
-        known = np.isfinite(cov[:, 0, 0]) & np.isfinite(self.theta_rad)
-        value, axes = np.linalg.eigh(cov[known])
-        root = axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]
-        drawn = self.theta_yz_rad[known][:, None, :] + standard_normals(2) @ root.transpose(0, 2, 1)
-        out[known] = length_quantiles(drawn)
+        known = np.flatnonzero(np.isfinite(cov[:, 0, 0]) & np.isfinite(self.theta_rad))
+        for k in drawn_together(known):
+            value, axes = np.linalg.eigh(cov[k])
+            root = axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]
+            out[k] = length_quantiles(self.theta_yz_rad[k, None] + standard_normals(2) @ root.transpose(0, 2, 1))
         return out
 
     @property
@@ -256,7 +257,7 @@ def mean_over(history: DeflectionHistory, span_s: tuple[float, float]) -> tuple[
     return mean, sd
 
 
-_DRAWS = 768
+_DRAWS, _ROWS = 768, 256
 
 
 @cache
@@ -313,6 +314,12 @@ def polar_from_lateral(
     cov[..., 1, 0] *= shrink
     cov[..., 1, 1] *= shrink**2
     return size, plane, cov
+
+
+def drawn_together(rows: IntArray) -> Iterator[IntArray]:
+    """Some rows (k,) after the other, as many as draws are held of at once: of all they are a run's largest arrays."""
+    for first in range(0, len(rows), _ROWS):
+        yield rows[first : first + _ROWS]
 
 
 def length_quantiles(drawn: FloatArray) -> FloatArray:

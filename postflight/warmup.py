@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel import earth
+from flightmodel._compiler_kernels import remember_operators
 from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
@@ -192,11 +193,14 @@ def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
     wanted = missing(groups)
     if not wanted:
         return
-    report(f"compiling kernels for this machine, once (half a minute to two minutes): {', '.join(wanted)}")
+    report(f"compiling kernels for this machine, once (a quarter of a minute to one minute): {', '.join(wanted)}")
     quiet, command = subprocess.DEVNULL, [sys.executable, "-m", "postflight.warmup"]
+    plain = {**os.environ, "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}  # numba colours thousands that it drops
     shares = _shares(sorted(wanted, key=[*GROUPS, *wanted].index), len(os.sched_getaffinity(0)))
     running = [
-        subprocess.Popen([*command, *share], stdin=quiet, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [*command, *share], env=plain, stdin=quiet, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         for share in shares
     ]
     try:
@@ -225,6 +229,7 @@ def _shares(groups: list[str], processes: int) -> list[list[str]]:
 
 def _compile(groups: Iterable[str]) -> None:
     """Compile groups in this process; those that fail are written with the reason."""
+    remember_operators()
     gc.set_threshold(200_000, 20, 50)  # a compiler makes many objects and hardly any circle: a fifth of the time
     for group in groups:
         try:

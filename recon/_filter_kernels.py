@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import boxplus, geodetic, inlined, kernel, merged, small_cholesky, small_solve
+from flightmodel._kernels import boxplus, geodetic, inlined, kernel, small_cholesky, small_solve
 from recon._measurement_kernels import DECELERATION, RADAR, SLOTS, SUN, node_motion, predict, predict_deceleration
 from recon._propagation_kernels import propagate_ballistic, propagate_strapdown
 
@@ -67,7 +67,7 @@ def decay_and_noise(wander, dt, climb, decay, noise_var):
     return moving
 
 
-@merged
+@inlined
 def predict_covariance(p, phi, noise, decay, noise_var, moving, rows):
     """``P = F P F^T + Q`` in place; ``rows`` (9, N) is scratch."""
     size, dense = p.shape[0], phi.shape[1]
@@ -139,7 +139,7 @@ def rotation_between(q, reference, out):
     out[0], out[1], out[2] = k * x, k * y, k * z
 
 
-@merged
+@inlined
 def cross_covariance(p, by_state, by_error, slot, count, rows, used, w):
     """``w`` (3, N) = H P and ``H P H^T`` of the used components in the leading rows of the returned scratch."""
     size = p.shape[0]
@@ -175,7 +175,7 @@ def times(by_state, by_error, slot, x):
     return value
 
 
-@merged
+@inlined
 def gain_and_update(x, p, w, y, factor, count, used, considered, wander_sd, gain):
     """Schmidt's update in place: ``K = P H^T S^-1``, no gain for considered errors, whose own covariance stays."""
     size = len(x)
@@ -247,7 +247,7 @@ def store_triangle(p, size, out):
             at += 1
 
 
-@merged
+@inlined
 def advance(motion, node_index, wander, follow, steps, charts, x, x_next, k):
     """Carry chart and error from node ``k - 1`` to ``k``; about its own estimate, or along the reference."""
     a = k - 1
@@ -296,7 +296,7 @@ def advance(motion, node_index, wander, follow, steps, charts, x, x_next, k):
     return moving
 
 
-@merged
+@inlined
 def update_node(motion, index, sources, observed, wander, gate, charts, innovations, x, p, k):
     """Use the measurements of node ``k`` that pass the gate."""
     size = len(x)

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import inlined, kernel, merged
+from flightmodel._kernels import inlined, kernel
 from recon._measurement_kernels import SLOTS
 
 
@@ -156,7 +156,7 @@ def adjoint_step(phi, decay, mean, information, old, product, wanted):
                     information[i, j] += g * product[col, j]
 
 
-@merged
+@inlined
 def adjoint_update(
     by_state, by_error, slot, gain, covariance, residual, variance, mean, information, wanted, rest, out
 ):

@@ -10,14 +10,14 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import RATE, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined, kernel, merged
+from flightmodel._kernels import RATE, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined, kernel
 from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into, mount_matrices
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
 SLOTS = 23
 
 
-@merged
+@inlined
 def node_motion(motion, index, position, velocity, q, errors, c, rate, acceleration):
     """Attitude matrix, inertial rate in body axes and acceleration against the Earth at a grid point, in place.
 
@@ -333,7 +333,7 @@ def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
             by_error[i, 4 + j] = lever[j]
 
 
-@merged
+@inlined
 def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error, planet):
     """Prediction and partials of one measurement, in place."""
     for i in range(3):

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import GM, RATE, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined, merged
+from flightmodel._kernels import GM, RATE, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined
 
 # a filter far from its track may ask for a drag that stops the vehicle within a step: such a step is taken in parts.
 # Drag falls with the speed it takes, so their number grows as the logarithm of the drag
@@ -260,7 +260,7 @@ def advance_state(position, velocity, q, q_mid, dt, force, rate, half_turn, dcm_
     gradient[1, 1] += w2
 
 
-@merged
+@inlined
 def propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise):
     """Carry a state in place from grid point ``first`` to ``last`` (either direction) with ``phi`` and ``noise``.
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import inlined, kernel, merged
+from flightmodel._kernels import inlined, kernel
 
 LEAST_PIVOT = 1e-14  # of a correlation matrix; below it a direction is known exactly
 
@@ -97,7 +97,7 @@ def invert_kinematic(phi, square, inverse):
                     inverse[i, col] -= f * inverse[j, col]
 
 
-@merged
+@inlined
 def backward_gain(phi, noise, decay, noise_var, moving, still, p, columns, scale, square, inverse, gain, added):
     """Gain rows (d, N) and added covariance (d, d) of one step; ``p`` (N, N) is the prior of the later node."""
     size, d, dense = p.shape[0], len(moving), phi.shape[1]

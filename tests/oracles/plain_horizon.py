@@ -48,10 +48,10 @@ def dip_centre(image, origin, across, reach, half_width):
 
 def share_of_second_edge(steps, by_turn, limits):
     """The kernel's definition, turn by turn."""
-    nearest, farthest, spacing, least = limits
+    nearest, farthest, spacing, least, low = limits
     size = np.hypot(*by_turn.T).max()
     middle = steps.shape[1] // 2
-    best = (0.0, 0.0)
+    best = (low, 0.0)
     for a in range(-int(farthest), int(farthest) + 1):
         for b in range(-int(farthest), int(farthest) + 1):
             off = by_turn @ [a / size, b / size]
