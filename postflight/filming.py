@@ -84,7 +84,7 @@ class CameraAnswer:
         checks = [
             ConsistencyCheck(
                 "camera-rest", f"{name}: deflection without load over its sd", rest.over_sd, 0.0, rest.limit,
-                rest.passed, f"{name}: {rest.remark}", name,
+                rest.passed, f"{name}: {rest.remark}", "camera" if self.joined is None else name,
             )
             for name, rest in self.rests.items()
         ]  # fmt: skip
