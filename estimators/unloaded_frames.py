@@ -99,10 +99,10 @@ def rest_of(
         None where neither frames nor load can tell.
     """
     at = int(np.argmin(np.abs(history.time_s - benchmark_s)))
-    other = np.abs(history.time_s - history.time_s[at]) > 0.0
+    other = np.arange(len(load)) != at
     theta, covariance = history.theta_yz_rad, history.lateral_cov_without_plane
     known = other & np.isfinite(load) & np.isfinite(theta).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    if not known.any() or not np.isfinite(load[at]):
+    if not np.any(load[known] != load[at]) or not np.isfinite(load[at]):
         return None
     per_load = np.linalg.norm(theta[known], axis=1).max() / np.abs(load[known] - load[at]).max()
     largest = max(load[known].max(), load[at])

@@ -172,12 +172,11 @@ def camera_answer(
         film = shaped[name]
         found, uncorrected = _benchmark(film, flight.telemetry.films[name].time_bias_sd_s, flight, bet)
         history = film.history(found)
-        rest = _rest(film, history, bet, found is not None)
+        rests = _rests(name, film, history, bet, found is not None)
         history = replace(history, assumptions=f"{history.assumptions}{uncorrected}; {why}")
         table = film.frame_table(history)
         table.insert(0, "camera", name)
         smooth = _smooth(flight, history)
-        rests = {} if rest is None else {name: rest}
         return CameraAnswer(history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape, rests)
     if flight.camera_plane_lv_rad is not None:
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
@@ -208,8 +207,7 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
         one = CameraReadings(name, read, BenchmarkDeflection(np.zeros(2), nothing), float(CAMERA_PLANE_SD_RAD))
         found, why = _benchmark(film, late_s, flight, bet)
         history = film.history(found)
-        rest = _rest(film, history, bet, found is not None)
-        rests |= {} if rest is None else {name: rest}
+        rests |= _rests(name, film, history, bet, found is not None)
         table = film.frame_table(history)
         table.insert(0, "camera", name)
         tables.append(table)
@@ -268,16 +266,22 @@ def _benchmark(
         return None, f"; the benchmark's deflection is not corrected by the joint's moment ({fault})"
 
 
-def _rest(film: FilmFit, history: DeflectionHistory, bet: Reconstruction | None, corrected: bool) -> Rest | None:
-    """Whether the shell rests in frames without load, by the moment in the joint or else the dynamic pressure."""
+def _rests(
+    name: str, film: FilmFit, history: DeflectionHistory, bet: Reconstruction | None, corrected: bool
+) -> dict[str, Rest]:
+    """Whether a camera's shell rests in frames without load, by name; nothing where no load or no frame can say.
+
+    The load is the moment in the joint, or without inertial sensors the dynamic pressure.
+    """
     if bet is None:
-        return None
+        return {}
     if bet.loads is None:
-        time_s, load = bet.air.time_s, bet.air.dynamic_pressure_pa
+        load = _with_pressure(film, bet).pressure_pa
     else:
-        time_s, load = bet.loads.time_s, np.linalg.norm(joint_moment(bet.loads).value_nm, axis=1)
-    at_frames = np.interp(history.time_s, time_s, load, left=np.nan, right=np.nan)
-    return rest_of(history, at_frames, film.benchmark_s, film.oriented.apriori.benchmark_rad, corrected)
+        moment_nm = np.linalg.norm(joint_moment(bet.loads).value_nm, axis=1)
+        load = np.interp(film.time_s, bet.loads.time_s, moment_nm, left=np.nan, right=np.nan)
+    rest = rest_of(history, load, film.benchmark_s, film.oriented.apriori.benchmark_rad, corrected)
+    return {} if rest is None else {name: rest}
 
 
 def _smooth(flight: Flight, history: DeflectionHistory) -> DeflectionHistory | None:

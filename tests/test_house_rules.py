@@ -3,6 +3,7 @@
 import ast
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -163,3 +164,11 @@ def test_what_users_read_goes_through_the_front_door(path):
         for module in imports(ast.parse(code)):
             if module.split(".")[0] in PACKAGES:
                 assert module == "postflight", f"{module} is internal: import postflight alone"
+
+
+def test_every_planted_error_has_its_place():
+    """An entry whose source was rewritten would end the whole list before it runs."""
+    listed = subprocess.run(
+        [sys.executable, ROOT / "benchmarks" / "mutants.py", "--list"], capture_output=True, text=True, check=False
+    )
+    assert listed.returncode == 0, listed.stderr

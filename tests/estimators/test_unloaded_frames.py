@@ -32,7 +32,7 @@ def test_a_benchmark_at_rest_passes():
     assert found.over_sd < 0.5
 
 
-def test_a_benchmark_under_load_is_told():
+def test_a_benchmark_under_load_is_noticed():
     """At 434 s, 1.5 deg of it; at the peak, 4 deg."""
     for at, least in ((14, D(1.0)), (20, D(2.5))):
         found = read(at=at)
@@ -42,7 +42,7 @@ def test_a_benchmark_under_load_is_told():
         assert "benchmark_s" in found.remark
 
 
-def test_a_camera_that_moves_later_is_told_where_the_load_has_gone():
+def test_a_camera_that_moves_later_is_noticed_where_the_load_has_gone():
     moved = DEFLECTION + np.where(TIME_S > 436.0, D(1.2), 0.0)[:, None] * np.array([0.0, 1.0])
     found = read(moved)
     assert not found.passed
@@ -83,3 +83,4 @@ def test_nothing_tells_without_a_load_at_the_frames():
     assert read(load=np.full_like(LOAD, np.nan)) is None
     only = np.where(np.arange(len(LOAD)) == 20, np.nan, LOAD)
     assert read(at=20, load=only) is None
+    assert read(load=np.zeros_like(LOAD)) is None

@@ -288,7 +288,7 @@ def test_score_exits_5_where_a_deflection_is_wrong(command, flown, run_folder, t
     assert abs(result["methods"][method]["error_deg"]) > 4.0 * sd
 
 
-def test_a_benchmark_frame_under_load_is_told_by_the_camera_alone(command, flown, tmp_path) -> None:
+def test_a_benchmark_frame_under_load_is_noticed_by_the_camera_alone(command, flown, tmp_path) -> None:
     """Without sensors too, where no other method contradicts: frames with less load show a deflection."""
     folder = copy_of(flown, tmp_path / "flight", "runs", "truth")
     toml = folder / "flight.toml"
