@@ -43,7 +43,7 @@ from pydantic import Field, model_validator
 
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, TableRangeError
 from flightmodel.config import FileBeside, Fraction, KeyFaults, Length, Place, Section, parse_section, read_toml
-from flightmodel.guarded_files import file_bytes
+from flightmodel.files import file_bytes
 from flightmodel.sphere_cone import (
     bridge,
     sphere_cone_closed_form,

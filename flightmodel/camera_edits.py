@@ -31,7 +31,8 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel import tables
-from flightmodel.checks import Fault, FloatArray, GateError, nearest_name, write_file
+from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
+from flightmodel.files import write_file
 
 EDITS_FILE = "camera_edits.csv"
 COLUMNS = ("camera", "t_s", "edit", "name", "u_px", "v_px", "value", "note")

@@ -6,15 +6,10 @@ Public entry points check once and then trust; compiled kernels check nothing.
 from __future__ import annotations
 
 import difflib
-import errno
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-
-from flightmodel.partial_files import abandoned, partial_path
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -81,45 +76,6 @@ class TableRangeError(GateError):
 
 class DivergenceError(GateError):
     """The simulated vehicle tumbled or its joint diverged where the caller needs a bounded flight."""
-
-
-NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-
-
-@contextmanager
-def writing(where: Path, remedy: str) -> Iterator[None]:
-    """Turn what a disk refuses inside the block into a `GateError` that names the place and a way out."""
-    try:
-        yield
-    except OSError as fault:
-        full = fault.errno in NO_ROOM
-        named = str(where if fault.filename is None else fault.filename)
-        if not full and not named.startswith(str(where)) and not str(where).startswith(named):
-            raise  # a file elsewhere, named by the fault itself
-        remedy = "make room, or write to another disk" if full else remedy
-        words = f"cannot be written: {fault.strerror or fault}; nothing half-written is left; {remedy}"
-        raise GateError(f"{where}: {words}", code="disk-full" if full else "cannot-write") from None
-
-
-def write_file(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
-    """Write bytes, or text as UTF-8, whole or not at all: beside its place, then renamed; folders are made.
-
-    What is too large to be made at once is written by a function, to the path that it is called with.
-
-    Of several processes that write one file at once, the last one's stays.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    for left in abandoned(path.parent, path.name):
-        left.unlink(missing_ok=True)
-    partial = partial_path(path)
-    try:
-        if callable(content):
-            content(partial)
-        else:
-            partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from flightmodel.checks import ConfigError, Fault, nearest_name
-from flightmodel.guarded_files import file_bytes
+from flightmodel.files import file_bytes
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
 Positive = Annotated[float, Field(gt=0.0)]

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from flightmodel.burnt_in import burnt_in
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
 from flightmodel.checks import NO_FAULT, BoolArray, Fault, FloatArray
-from flightmodel.guarded_files import PICTURE_BYTES, unfit
+from flightmodel.files import PICTURE_BYTES, unfit
 from flightmodel.vehicle import CameraMount
 
 Image = NDArray[np.uint8]

@@ -45,9 +45,9 @@ from flightmodel.earth import (
     q_ecef_body_from_pointing,
 )
 from flightmodel.entry_state import DragEntry, StateEntry, read_drag
+from flightmodel.files import open_file
 from flightmodel.film import Frames
 from flightmodel.gate import Gate
-from flightmodel.guarded_files import open_file
 from flightmodel.instruments import (
     SITES,
     AtmosphereEntry,

@@ -37,7 +37,7 @@ from flightmodel import rotations
 from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError
 from flightmodel.config import FileBeside, KeyFaults, Length, Section, beside
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
-from flightmodel.guarded_files import UnfitFile, file_bytes
+from flightmodel.files import UnfitFile, file_bytes
 from flightmodel.mesh_sections import section_supports, touching_circles
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from flightmodel.checks import Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.config import Section, Time
-from flightmodel.guarded_files import UnfitFile, file_bytes
+from flightmodel.files import UnfitFile, file_bytes
 from flightmodel.units import UNITS, read_unit
 
 if TYPE_CHECKING:

@@ -32,8 +32,8 @@ from flightmodel.config import (
     read_toml,
 )
 from flightmodel.deflection import lv_direction
+from flightmodel.files import leads_outside
 from flightmodel.geometry import BodyMesh, MeshFiles, ShellGeometry, body_meshes
-from flightmodel.guarded_files import leads_outside
 from flightmodel.instruments import dcm_body_from_clocking
 from flightmodel.shell_features import read_features
 

@@ -22,7 +22,8 @@ from estimators.fusion import Fused
 from estimators.increments import COEFFICIENTS, STATED, Increments, estimate_increments
 from estimators.loads import FlightLoads
 from flightmodel.aerodynamics import COLUMNS, AeroTable
-from flightmodel.checks import FloatArray, GateError, write_file
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.files import write_file
 from flightmodel.tabular import Tabular
 from postflight.fusing import FusedAnswer
 from recon.consistency import MOST_KEPT_SD, ConsistencyCheck, data_sheet_check

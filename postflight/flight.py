@@ -16,8 +16,8 @@ import numpy as np
 import pandas as pd
 
 from flightmodel.checks import ConfigError, Fault, GateError, Progress, nearest_name
+from flightmodel.files import file_bytes
 from flightmodel.flightfolder import read_flight as read_telemetry
-from flightmodel.guarded_files import file_bytes
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, Sounding, Telemetry
 from flightmodel.vehicle import MassProperties, Vehicle

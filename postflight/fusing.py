@@ -58,9 +58,9 @@ class CameraTimeBias:
     @property
     def remark(self) -> str:
         """One sentence."""
-        way = "late" if self.offset_s > 0.0 else "early"
         used = "corrected in the fusion" if self.applied else "not applied: time_bias_sd_s in [frames] is 0"
-        return f"camera time bias {self.offset_s:+.3f} s (1 sd {self.sd_s:.3f} s): frames are tagged {way}; {used}"
+        bias_s = round(self.offset_s, 3) + 0.0  # no minus before a zero
+        return f"camera time bias {bias_s:+.3f} s, late positive (1 sd {self.sd_s:.3f} s), {used}"
 
     @property
     def is_off(self) -> bool:

@@ -12,8 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.checks import ConfigError
-from flightmodel.guarded_files import file_bytes
-from flightmodel.partial_files import partial_path
+from flightmodel.files import file_bytes, partial_path
 from postflight.commands import compile_kernels, console
 from postflight.flight import read_flight
 from postflight.streams import write_out

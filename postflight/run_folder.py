@@ -31,11 +31,10 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import events
-from flightmodel.checks import FloatArray, GateError, write_file, writing
+from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import mean_over
 from flightmodel.earth import WGS84, name_of
-from flightmodel.guarded_files import open_file
-from flightmodel.partial_files import abandoned, partial_path
+from flightmodel.files import abandoned, open_file, partial_path, write_file, writing
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import Deflections, quantiles_at

@@ -18,7 +18,7 @@ import pandas as pd
 from flightmodel import rotations
 from flightmodel.checks import ConfigError, FloatArray, GateError, nearest_name
 from flightmodel.deflection import DeflectionHistory
-from flightmodel.guarded_files import file_bytes
+from flightmodel.files import file_bytes
 from flightmodel.trajectory import Trajectory
 from postflight.run_folder import FACTS, answer_table, read_csv, run_hash
 

@@ -20,7 +20,7 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.events import find_peak
-from flightmodel.guarded_files import file_bytes
+from flightmodel.files import file_bytes
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import difference, resample
 from postflight.run_folder import answer_table, read_csv

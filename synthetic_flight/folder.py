@@ -25,11 +25,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flightmodel import earth, tables
-from flightmodel.checks import FloatArray, GateError, Progress, writing
+from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.events import descent_events, find_peak, first_fall, has_peak, splashdown_index, values_at
+from flightmodel.files import abandoned, partial_path, writing
 from flightmodel.instruments import ACCELEROMETER, GNSS, MAGNETOMETER, RADAR, RATES, SUN
-from flightmodel.partial_files import abandoned, partial_path
 from synthetic_flight import sensing, weather
 from synthetic_flight.film import write_videos
 from synthetic_flight.instrument_errors import Magnetometer, SunSensors, Video, stated_errors

@@ -26,8 +26,8 @@ from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import EDITS_FILE, POSE, CameraEdits, Edit, faults_of, read_edits, write_edits
 from flightmodel.checks import NO_FAULT, Fault, FloatArray, GateError
+from flightmodel.files import file_bytes
 from flightmodel.film import Frames
-from flightmodel.guarded_files import file_bytes
 from flightmodel.vehicle import Vehicle
 from postflight.filming import joint_swing, orient_on_film
 

@@ -33,9 +33,9 @@ from rich.table import Table
 
 from flightmodel.aerodynamics import COLUMNS, named_columns
 from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, write_file, writing
+from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
 from flightmodel.config import read_toml
-from flightmodel.guarded_files import file_bytes
+from flightmodel.files import file_bytes, write_file, writing
 from flightmodel.instruments import TriadSpec
 from flightmodel.rest import find_rest, readings
 from flightmodel.tables import to_si

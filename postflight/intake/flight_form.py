@@ -22,8 +22,9 @@ from pydantic import BaseModel
 from rich.markup import escape
 
 from flightmodel.aerodynamics import Sidecar
-from flightmodel.checks import ConfigError, write_file
+from flightmodel.checks import ConfigError
 from flightmodel.config import FILL_IN, FILL_IN_VALUE, read_toml
+from flightmodel.files import write_file
 from flightmodel.flightfolder import FlightFile
 from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES
 from flightmodel.units import UNITS

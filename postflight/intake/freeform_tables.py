@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.guarded_files import UnfitFile, file_bytes
+from flightmodel.files import UnfitFile, file_bytes
 from flightmodel.tables import plain_number
 from postflight.intake.headers import SEVERAL_MEANINGS, UNIT_SPELLINGS, unit_key
 

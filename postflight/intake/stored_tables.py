@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel.checks import ConfigError, FloatArray, GateError
-from flightmodel.guarded_files import TABLE_BYTES, UnfitFile, open_file
+from flightmodel.files import TABLE_BYTES, UnfitFile, open_file
 from postflight.intake.freeform_tables import LEAST_ROWS, FreeFormTable, read_text_table, table_of_lines
 
 _MOST_NUMBERS = 200_000_000  # of a file

@@ -27,9 +27,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from flightmodel.checks import FloatArray, GateError, write_file
-from flightmodel.guarded_files import open_file
-from flightmodel.partial_files import abandoned, partial_path
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.files import abandoned, open_file, partial_path, write_file
 from flightmodel.statistics import BAND_COLUMNS, BAND_PERCENTILES, percentile_band
 from postflight.montecarlo.study import CONFIDENCE, Study
 from synthetic_flight.ensemble import Row

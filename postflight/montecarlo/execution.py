@@ -32,8 +32,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from flightmodel.checks import ConfigError, GateError, Progress, write_file
-from flightmodel.guarded_files import file_bytes
+from flightmodel.checks import ConfigError, GateError, Progress
+from flightmodel.files import file_bytes, write_file
 from postflight.montecarlo import trial
 from postflight.montecarlo.bands import (
     Chunk,

@@ -14,8 +14,8 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-from flightmodel.checks import ConfigError, Fault, GateError, writing
-from flightmodel.partial_files import abandoned, partial_path
+from flightmodel.checks import ConfigError, Fault, GateError
+from flightmodel.files import abandoned, partial_path, writing
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
 from postflight.plots.style import LABEL, MANY

@@ -13,7 +13,7 @@ from rich.table import Table
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import parse_utc
 from flightmodel.earth import require_earth
-from flightmodel.guarded_files import open_file
+from flightmodel.files import open_file
 from postflight.comparison import upright
 from postflight.intake.other_trajectory import read_other
 from postflight.plots.style import COLOUR, PAGE

@@ -14,8 +14,8 @@ from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import write_file, writing
 from flightmodel.config import parse_utc
+from flightmodel.files import write_file, writing
 from flightmodel.telemetry import Telemetry
 from postflight.plots.style import COLOUR, PAGE
 from postflight.report import pictures, stated_errors, text

@@ -18,7 +18,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from flightmodel.checks import writing
+from flightmodel.files import writing
 from postflight import cli, commands
 from postflight.deflections import METHODS
 from postflight.plots import run_figures

@@ -12,8 +12,8 @@ import pytest
 
 from flightmodel.checks import ConfigError
 from flightmodel.config import LARGEST_TOML_BYTES, read_toml
+from flightmodel.files import UnfitFile, file_bytes, leads_outside, open_file
 from flightmodel.flightfolder import read_flight
-from flightmodel.guarded_files import UnfitFile, file_bytes, leads_outside, open_file
 from flightmodel.vehicle import DATA
 from tests.refusing import printed_codes, refuses
 

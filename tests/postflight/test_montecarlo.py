@@ -15,7 +15,7 @@ import pytest
 from scipy.stats import binom
 
 from flightmodel.checks import ConfigError, GateError
-from flightmodel.partial_files import PARTIAL, machine
+from flightmodel.files import PARTIAL, machine
 from flightmodel.vehicle import DATA
 from postflight.montecarlo import commands, execution, trial
 from postflight.montecarlo.bands import (

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flightmodel.checks import GateError
+from flightmodel.files import machine
 from flightmodel.flightfolder import read_flight
 from flightmodel.instruments import GNSS, RADAR
-from flightmodel.partial_files import machine
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.instrument_errors import Gnss
 from synthetic_flight.scenarios import read_scenario

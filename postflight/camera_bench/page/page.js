@@ -93,7 +93,7 @@ function draw() {
     (at === state.benchmark ? ", benchmark frame" : "");
   const rows = answer && !answer.refused ? [
     ["angle", `${answer.theta_deg.toFixed(2)} ± ${answer.theta_sd_deg.toFixed(2)} deg (1 sd)`],
-    ["plane", `${answer.plane_lv_deg.toFixed(1)} ± ${Math.min(answer.plane_sd_deg, 180).toFixed(1)} deg LV`],
+    ["plane", answer.plane_sd_deg > 60 ? "undetermined at so small an angle" : `${answer.plane_lv_deg.toFixed(1)} ± ${answer.plane_sd_deg.toFixed(1)} deg LV`],
     ["residual", `${answer.rms_px.toFixed(2)} px rms`], ["edge points", answer.edge_points], ["rows of features", answer.features],
   ] : [];
   $("answer").replaceChildren(...rows.flatMap(([name, value]) => {

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from flightmodel.partial_files import LEFT_ALONE_S, abandoned, machine, partial_path
+from flightmodel.files import LEFT_ALONE_S, abandoned, machine, partial_path
 
 DEAD = 2**22  # above the largest number that Linux gives a process
 WAIT_S = 60.0
@@ -27,7 +27,7 @@ with RunFolder(Path(sys.argv[1]), SimpleNamespace(hashes={"who": sys.argv[2]}), 
 WRITE = """
 import sys
 from pathlib import Path
-from flightmodel.checks import write_file
+from flightmodel.files import write_file
 
 for _ in range(400):
     write_file(Path(sys.argv[1]), sys.argv[2] * 3000)
