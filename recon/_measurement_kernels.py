@@ -265,33 +265,47 @@ def mount_row(row, value, e, offset, out):
 
 
 @inlined
-def predict_field(dcm_body_sensor, known, e, c, h, by_state, by_error):
-    """Field in a magnetometer's axes: ``S (R(mount)^T D^T C^T B) + bias``, S with scales and soft iron."""
-    q, turn, mount, actual, lever = np.empty(4), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+def in_mounted_axes(dcm_body_sensor, known, e, offset, c, mount, body, actual):
+    """A known ECEF direction in body axes and in those of a sensor whose mount errs by ``e[offset:]``."""
+    q, turn = np.empty(4), np.empty((3, 3))
     level(q)
-    boxplus(q, e[6], e[7], e[8])
+    boxplus(q, e[offset], e[offset + 1], e[offset + 2])
     dcm_from_quaternion(q[0], q[1], q[2], q[3], turn)
     matmul_into(dcm_body_sensor, turn, mount)
-    body = np.empty(3)
     for i in range(3):
         body[i] = c[0, i] * known[0] + c[1, i] * known[1] + c[2, i] * known[2]
     for i in range(3):
         actual[i] = mount[0, i] * body[0] + mount[1, i] * body[1] + mount[2, i] * body[2]
+
+
+@inlined
+def partials_by_rotations(by_axes, i, mount, body, actual, e, offset, by_state, by_error):
+    """Partials of component ``i`` by attitude and by mount, of those by the direction in the sensor's axes, (3,).
+
+    A body rotated by d measures ``b + b x d``, a mount rotated by m about sensor axes likewise.
+    """
+    row, lever = np.empty(3), np.empty(3)
+    for j in range(3):
+        row[j] = by_axes[0] * mount[j, 0] + by_axes[1] * mount[j, 1] + by_axes[2] * mount[j, 2]
+    cross_into(row, body, lever)
+    for j in range(3):
+        by_state[i, 6 + j] = lever[j]
+    row[0], row[1], row[2] = by_axes
+    mount_row(row, actual, e, offset, lever)
+    for j in range(3):
+        by_error[i, offset + j] = lever[j]
+
+
+@inlined
+def predict_field(dcm_body_sensor, known, e, c, h, by_state, by_error):
+    """Field in a magnetometer's axes: ``S (R(mount)^T D^T C^T B) + bias``, S with scales and soft iron."""
+    mount, body, actual = np.empty((3, 3)), np.empty(3), np.empty(3)
+    in_mounted_axes(dcm_body_sensor, known, e, 6, c, mount, body, actual)
     iron = ((1.0 + e[3], e[9], e[10]), (e[9], 1.0 + e[4], e[11]), (e[10], e[11], 1.0 + e[5]))
-    row = np.empty(3)
     for i in range(3):
         h[i] = e[i] + iron[i][0] * actual[0] + iron[i][1] * actual[1] + iron[i][2] * actual[2]
         by_error[i, i], by_error[i, 3 + i] = 1.0, actual[i]
-        # a body rotated by d measures b + b x d, a mount rotated by m about sensor axes likewise
-        for j in range(3):
-            row[j] = iron[i][0] * mount[j, 0] + iron[i][1] * mount[j, 1] + iron[i][2] * mount[j, 2]
-        cross_into(row, body, lever)
-        for j in range(3):
-            by_state[i, 6 + j] = lever[j]
-        row[0], row[1], row[2] = iron[i][0], iron[i][1], iron[i][2]
-        mount_row(row, actual, e, 6, lever)
-        for j in range(3):
-            by_error[i, 6 + j] = lever[j]
+        partials_by_rotations(iron[i], i, mount, body, actual, e, 6, by_state, by_error)
     by_error[0, 9], by_error[1, 9] = actual[1], actual[0]
     by_error[0, 10], by_error[2, 10] = actual[2], actual[0]
     by_error[1, 11], by_error[2, 11] = actual[2], actual[1]
@@ -300,16 +314,8 @@ def predict_field(dcm_body_sensor, known, e, c, h, by_state, by_error):
 @inlined
 def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
     """Azimuth and elevation of the Sun in a head's axes; errors: biases normal to the line of sight, mount."""
-    q, turn, mount, s, lever = np.empty(4), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
-    level(q)
-    boxplus(q, e[4], e[5], e[6])
-    dcm_from_quaternion(q[0], q[1], q[2], q[3], turn)
-    matmul_into(dcm_body_head, turn, mount)
-    body, row = np.empty(3), np.empty(3)
-    for i in range(3):
-        body[i] = c[0, i] * known[0] + c[1, i] * known[1] + c[2, i] * known[2]
-    for i in range(3):
-        s[i] = mount[0, i] * body[0] + mount[1, i] * body[1] + mount[2, i] * body[2]
+    mount, body, s = np.empty((3, 3)), np.empty(3), np.empty(3)
+    in_mounted_axes(dcm_body_head, known, e, 4, c, mount, body, s)
     normal2 = s[1] * s[1] + s[2] * s[2] + 1e-30
     normal = math.sqrt(normal2)
     whole2 = normal2 + s[0] * s[0]
@@ -322,15 +328,7 @@ def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
     h[1] = math.atan2(s[0], normal) + e[1]
     by_error[0, 0], by_error[1, 1] = 1.0 / normal, 1.0
     for i in range(2):
-        for j in range(3):
-            row[j] = p[i][0] * mount[j, 0] + p[i][1] * mount[j, 1] + p[i][2] * mount[j, 2]
-        cross_into(row, body, lever)
-        for j in range(3):
-            by_state[i, 6 + j] = lever[j]
-        row[0], row[1], row[2] = p[i][0], p[i][1], p[i][2]
-        mount_row(row, s, e, 4, lever)
-        for j in range(3):
-            by_error[i, 4 + j] = lever[j]
+        partials_by_rotations(p[i], i, mount, body, s, e, 4, by_state, by_error)
 
 
 @inlined
