@@ -468,15 +468,15 @@ def moved_evidence(one: Evidence, inputs: dict[str, FloatArray], about: Deflecti
 
 
 def history_of_evidence(evidence: Evidence, loads: FlightLoads, assumptions: str) -> DeflectionHistory:
-    """History of a method by itself, sample by sample: NaN where it has no answer.
+    """History of a method by itself, sample by sample: NaN where it has no answer, or none with an uncertainty.
 
     The terms of the joint's oscillation are bounded by the rms of the readings' own derivatives over
-    `_OSCILLATION_WINDOW_S`.
+    `_OSCILLATION_WINDOW_S`; a reading without neighbours has no derivatives.
     """
     rows, n = np.searchsorted(loads.time_s, evidence.time_s), len(loads.time_s)
     theta_yz, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
-    theta_yz[rows] = evidence.mean_yz_rad
     swinging = _oscillation_var(evidence)[:, None, None] * np.eye(2)
+    theta_yz[rows] = np.where(np.isfinite(swinging[:, :1, 0]), evidence.mean_yz_rad, np.nan)
     cov[rows] = evidence.covariance + swinging
     quantiles = None
     if evidence.half_curvature_rad is not None:
@@ -495,7 +495,7 @@ def _curved_quantiles(evidence: Evidence, swinging: FloatArray) -> FloatArray:
     for name, response in evidence.by_input.items():
         if name != "C_m":
             others = others + response @ response.transpose(0, 2, 1)
-    known = np.flatnonzero(np.isfinite(evidence.theta_yz_rad).all(axis=1))
+    known = np.flatnonzero(np.isfinite(evidence.theta_yz_rad).all(axis=1) & np.isfinite(swinging[:, 0, 0]))
     x = normals[None, :, 2:]
     out = np.full((len(others), len(QUANTILES)), np.nan)
     for k in drawn_together(known):
@@ -516,7 +516,11 @@ def _oscillation_var(evidence: Evidence) -> FloatArray:
     window = max(1, round(_OSCILLATION_WINDOW_S / float(np.median(np.diff(t)))))
     total = np.zeros(len(t))
     for derivative, response in ((rate, evidence.by_rate_s), (second, evidence.by_acceleration_s2)):
-        mean_square = uniform_filter1d(np.sum(derivative**2, axis=1), window, mode="nearest")
+        square = np.sum(derivative**2, axis=1)
+        known = np.isfinite(square)
+        share = uniform_filter1d(known.astype(float), window, mode="nearest")
+        sums = uniform_filter1d(np.where(known, square, 0.0), window, mode="nearest")
+        mean_square = np.divide(sums, share, out=np.full(len(t), np.nan), where=share > 0.5 / window)
         total += 0.5 * mean_square * np.mean(np.sum(response**2, axis=2), axis=1)
     return total
 
