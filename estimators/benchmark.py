@@ -144,7 +144,7 @@ def orient_camera(
     """
     apriori = apriori or AprioriSd()
     frame = unedited(benchmark)
-    fault = fault_of_frame(frame.image, (camera_mount.width_px, camera_mount.height_px))
+    fault = fault_of_frame(frame.image, camera_mount.size_px)
     if fault:
         raise GateError(f"benchmark frame: {fault}; choose another benchmark time", fault.code)
     camera = camera_from_mount(camera_mount)

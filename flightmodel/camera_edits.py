@@ -25,7 +25,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +113,16 @@ class CameraEdits:
     def features_px(self, t_s: float) -> dict[str, FloatArray]:
         """Where features are in the frame at a time, by name, (2,)."""
         return {row.name: np.array([row.u_px, row.v_px]) for row in self.at("feature", t_s)}
+
+    def resized(self, from_px: tuple[int, int], to_px: tuple[int, int]) -> CameraEdits:
+        """The same edits, of pictures (width, height) of another size."""
+        across, down = (new / old for new, old in zip(to_px, from_px, strict=True))
+        return CameraEdits(
+            tuple(
+                replace(row, u_px=across * (row.u_px + 0.5) - 0.5, v_px=down * (row.v_px + 0.5) - 0.5)
+                for row in self.rows
+            )
+        )
 
     def __str__(self) -> str:
         """Numbers of edits by kind, for provenance."""

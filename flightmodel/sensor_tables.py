@@ -31,7 +31,7 @@ from flightmodel.camera_edits import EDITS_FILE, NO_EDITS, CameraEdits, read_edi
 from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.entry_state import fixed_axes
-from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault
+from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault, working_camera
 from flightmodel.gate import Gate, Table, find_faults, oversampled, rows_to_use
 from flightmodel.instruments import (
     ACCELEROMETER,
@@ -500,7 +500,19 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None, label:
         return None
     edits = _edits(gate, label, source.camera, time_s, vehicle)
     benchmark_s = source.benchmark_s if edits.benchmark_s is None else edits.benchmark_s
-    return Frames(camera, source.camera, time_s, paths, benchmark_s, numbers, source.time_bias_sd_s, edits)
+    frames = Frames(camera, source.camera, time_s, paths, benchmark_s, numbers, source.time_bias_sd_s, edits)
+    return _reduced(gate, label, frames)
+
+
+def _reduced(gate: Gate, label: str, frames: Frames) -> Frames:
+    """Frames with their pictures read smaller, and a finding, where the camera is finer than is needed."""
+    filed_px, camera = frames.camera.size_px, working_camera(frames.camera)
+    if camera.size_px == filed_px:
+        return frames
+    words = f"pictures of {filed_px[0]} x {filed_px[1]} pixels, read at {camera.width_px} x {camera.height_px}"
+    gate.findings.append(Finding(label, words, np.nan, np.nan, "pictures-reduced"))
+    edits = frames.edits.resized(filed_px, camera.size_px)
+    return replace(frames, camera=camera, edits=edits, filed_px=filed_px)
 
 
 def _edits(gate: Gate, label: str, name: str, time_s: FloatArray, vehicle: Vehicle) -> CameraEdits:
@@ -514,7 +526,7 @@ def _edits(gate: Gate, label: str, name: str, time_s: FloatArray, vehicle: Vehic
         return NO_EDITS
     try:
         camera = vehicle.cameras[name]
-        edits = read_edits(path, name, time_s, (camera.width_px, camera.height_px), vehicle.cameras)
+        edits = read_edits(path, name, time_s, camera.size_px, vehicle.cameras)
     except GateError as fault:
         gate.faults.extend(f for f in fault.faults if f not in gate.faults)  # of several cameras each reads the table
         return NO_EDITS
@@ -530,7 +542,7 @@ def _image_paths(
     names, paths = table["frame"].astype(str).str.strip(), []
     for row in np.flatnonzero(used).tolist():
         image = images / names.iloc[row]
-        wrong = gate.wrong_place(image, names.iloc[row]) or image_fault(image, camera)
+        wrong = gate.wrong_place(image, names.iloc[row]) or image_fault(image, camera.size_px)
         if wrong:
             where = f"{label}: {path}: line {tables.line_of(table, row)}: {image}"
             gate.refuse(
@@ -556,7 +568,7 @@ def _film_numbers(
         row = int(np.flatnonzero(used & whole)[int(np.argmax(np.diff(numbers) < 0)) + 1])
         where = f"{label}: {path}: line {tables.line_of(table, row)}"
         gate.refuse(f"{where}: frame numbers fall where times rise; sort the list by time", "frame-number")
-    wrong = film_fault(film, camera, int(numbers.max(initial=0)))
+    wrong = film_fault(film, camera.size_px, int(numbers.max(initial=0)))
     if wrong:
         gate.refuse(f"{label}: {film}: {wrong}", getattr(wrong, "code", "film-unreadable"))
         return numbers

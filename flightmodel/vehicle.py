@@ -303,6 +303,25 @@ class CameraMount(Section):
         radial = lv_direction(float(np.deg2rad(self.clock_lv_deg)))
         return np.asarray(self.radius_m * radial - np.array([self.station_m, 0.0, 0.0]))
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of its pictures."""
+        return self.width_px, self.height_px
+
+    def resized(self, size_px: tuple[int, int]) -> CameraMount:
+        """The same camera with pictures of another size, whose middle and border are where they were."""
+        along = [new / old for new, old in zip(size_px, self.size_px, strict=True)]
+        known = self.uncertainty.model_copy(update={"centre_px": self.uncertainty.centre_px * max(along)})
+        return self.model_copy(
+            update={
+                "width_px": size_px[0],
+                "height_px": size_px[1],
+                "focal_px": tuple(k * f for k, f in zip(along, self.focal_px, strict=True)),
+                "centre_px": tuple(k * (c + 0.5) - 0.5 for k, c in zip(along, self.centre_px, strict=True)),
+                "uncertainty": known,
+            }
+        )
+
     @model_validator(mode="after")
     def _all_coefficients(self) -> CameraMount:
         count, lens = len(self.distortion), self.lens

@@ -583,7 +583,7 @@ def _write_video(
     if spec.format == "png":
         names: list[object] = list(_write_images(images, telemetry / name))
     else:
-        _write_film(images, telemetry / f"{name}.{spec.format}", spec, (mount.width_px, mount.height_px))
+        _write_film(images, telemetry / f"{name}.{spec.format}", spec, mount.size_px)
         names = list(range(len(at)))
     late = spec.time_offset_s * float(rng.standard_normal())
     table = pd.DataFrame({"t_s": at + late, "frame": names})

@@ -185,7 +185,7 @@ def test_picture_that_would_fill_the_memory_is_refused_by_its_head(tmp_path, mon
     path.write_bytes(data[: len(data) - tail])
     monkeypatch.setattr(cv2, "imread", lambda *_: pytest.fail("unpacked"))
     camera = next(iter(vehicle_from_toml(vehicle_path("irve2_reference")).cameras.values()))
-    assert image_fault(path, camera).code == "image-size"
+    assert image_fault(path, camera.size_px).code == "image-size"
 
 
 @pytest.mark.parametrize(

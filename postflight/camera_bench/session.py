@@ -88,7 +88,7 @@ class Session:
         frames, oriented = work.frames, work.oriented
         return {
             "camera": frames.camera_name,
-            "size_px": [frames.camera.width_px, frames.camera.height_px],
+            "size_px": list(frames.camera.size_px),
             "time_s": frames.time_s.tolist(),
             "benchmark": frames.benchmark,
             "file": self.path.name,
@@ -187,16 +187,17 @@ class Session:
         if len(rows) > MOST_EDITS:
             raise GateError(f"{len(rows)} edits; at most {MOST_EDITS}", code="edit-too-long")
         wanted = [_edit_of(row, frames.camera_name) for row in rows]
-        size = frames.camera.width_px, frames.camera.height_px
-        faults = faults_of(wanted, frames.time_s, size)
+        faults = faults_of(wanted, frames.time_s, frames.camera.size_px)
         if faults:
             raise GateError(faults)
         with self._lock:
             if revision != self._revision or _digest(self.path) != self._revision:
                 raise GateError(f"{self.path.name} {_CHANGED}", code="edits-changed")
-            write_edits(self.path, [*self._of_other_cameras(), *wanted])
+            edits = CameraEdits(tuple(wanted))
+            filed = edits if frames.filed_px is None else edits.resized(frames.camera.size_px, frames.filed_px)
+            write_edits(self.path, [*self._of_other_cameras(), *filed.rows])
             self._revision = _digest(self.path)
-            self._apply(CameraEdits(tuple(wanted)))
+            self._apply(edits)
         return self.state()
 
     def _of_other_cameras(self) -> list[Edit]:

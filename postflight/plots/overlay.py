@@ -96,7 +96,7 @@ def write_overlay_film(telemetry: Telemetry, history: DeflectionHistory, path: P
     before = horizon_row(oriented.view, *deflection_at(history, float(frames.time_s[benchmark])))
     partial = path.with_suffix(".part.webm")
     rate = 1.0 / float(np.median(np.diff(frames.time_s))) if len(frames.time_s) > 1 else 1.0
-    size = (frames.camera.width_px, frames.camera.height_px)
+    size = frames.camera.size_px
     with _without_standard_error():  # OpenCV warns there that it takes another tag for VP9, which is no fault
         writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"VP90"), round(rate, 3), size)
     if not writer.isOpened():

@@ -68,7 +68,7 @@ def test_frames_of_a_folder_and_of_a_film_show_the_same_text(tmp_path):
         cv2.imwrite(str(tmp_path / f"{k:02d}.png"), picture)
         film.write(picture)
     film.release()
-    time_s, camera = np.arange(30.0), SimpleNamespace(width_px=WIDTH, height_px=HEIGHT)
+    time_s, camera = np.arange(30.0), SimpleNamespace(size_px=(WIDTH, HEIGHT))
     of_folder = Frames(camera, "c", time_s, tuple(sorted(tmp_path.glob("*.png"))), 0.0)
     of_film = Frames(camera, "c", time_s, (tmp_path / "film.avi",), 0.0, np.arange(30))
     assert np.mean(of_folder.burnt_in & of_film.burnt_in) > 0.9 * np.mean(of_folder.burnt_in | of_film.burnt_in)

@@ -16,6 +16,7 @@ import pytest
 
 from flightmodel.camera_edits import read_edits
 from flightmodel.checks import GateError
+from flightmodel.vehicle import vehicle_path
 from postflight.camera_bench import server as servers
 from postflight.camera_bench.server import session_of
 from postflight.filming import camera_film
@@ -61,6 +62,23 @@ def session(folder: Path):
     opened = session_of(read_flight(folder, needs_path=False), folder)
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def finer(folder: Path, pictures) -> Path:
+    """The same film by a camera of twice as many pixels a radian."""
+    for t, picture in zip(TIMES, pictures, strict=True):
+        cv2.imwrite(str(folder / "film" / f"{t:.0f}.png"), cv2.resize(picture, (1440, 960)))
+    vehicle = vehicle_path("irve2_reference").read_text()
+    start = vehicle.index("[cameras.camera5]")
+    lens = (("720", "1440"), ("480", "960"), ("[310.0, 310.0]", "[620.0, 620.0]"), ("[361.3, 238.2]", "[723.1, 476.9]"))
+    camera = vehicle[start:]
+    for plain, fine in lens:
+        assert camera.count(f"= {plain}") == 1
+        camera = camera.replace(f"= {plain}", f"= {fine}")
+    (folder / "vehicle.toml").write_text(vehicle[:start] + camera)
+    (folder / "flight.toml").write_text(FLIGHT_TOML.replace('"irve2_reference"', '"vehicle.toml"'))
+    return folder
 
 
 def settled(session):
@@ -147,6 +165,33 @@ class TestSession:
         assert len(shown["outline"]) > 50
         assert len(shown["edge"]) > 50
         session.close()
+
+    def test_pictures_of_a_finer_camera_are_read_smaller(self, finer):
+        telemetry = read_flight(finer, needs_path=False).telemetry
+        frames = telemetry.frames
+        assert [f.code for f in telemetry.findings if f.source == "frames"] == ["pictures-reduced"]
+        assert frames.picture(1).shape == (480, 720)
+        # the reference camera, to rounding: a pixel's middle is at half of the new pixel beside it
+        np.testing.assert_allclose(frames.camera.focal_px, (310.0, 310.0))
+        np.testing.assert_allclose(frames.camera.centre_px, (361.3, 238.2))
+        # the centre's a priori sd is half as many pixels, as large an angle
+        assert frames.camera.uncertainty.centre_px == 0.5 * telemetry.vehicle.cameras["camera5"].uncertainty.centre_px
+        session = session_of(read_flight(finer, needs_path=False), finer)
+        found = [answer["theta_deg"] for answer in settled(session)["answers"]]
+        session.close()
+        np.testing.assert_allclose(found[1:], THETA[1:], atol=0.4)
+
+    def test_decisions_about_a_finer_camera_are_filed_in_its_own_pixels(self, finer):
+        # the corner of a picture stays its corner, whatever the size of a pixel
+        corner = -0.5
+        session = session_of(read_flight(finer, needs_path=False), finer)
+        mask = [edit("mask", name="a", u_px=u, v_px=v) for u, v in ((corner, corner), (99.5, corner), (99.5, 49.5))]
+        session.save(mask, session.state()["revision"])
+        session.close()
+        filed = read_edits(finer / "camera_edits.csv", "camera5").masks_px(430.0)[0]
+        np.testing.assert_allclose(filed, [(corner, corner), (199.5, corner), (199.5, 99.5)])
+        again = read_flight(finer, needs_path=False).telemetry.frames.edits.masks_px(430.0)[0]
+        np.testing.assert_allclose(again, [(corner, corner), (99.5, corner), (99.5, 49.5)])
 
     def test_a_tried_deflection_shows_its_residual(self, session):
         settled(session)
