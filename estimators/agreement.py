@@ -84,7 +84,7 @@ HYPOTHESES = {
 _FAULT_COEFFICIENT = 0.15  # of C_m and C_N, each by itself
 FAULT_MOUNT_RAD = np.deg2rad(0.5)  # normal to the long axis; about it the drag hardly changes direction
 _FAULT_OFFSET_M = 0.005  # of the centerbody's c.g.
-_FAULT_PLANE_RAD = np.deg2rad(25.0)
+_FAULT_PLANE_RAD = np.deg2rad(25.0)  # as uncertain as the plane that the paper assumes
 # difference of two methods
 SPAN_S = 2.0
 _LEFT_OUT_RAD = np.deg2rad(0.05)  # neglected by the methods' equations, in each mean: up to 0.05 deg at the pulse's end

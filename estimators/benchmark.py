@@ -72,34 +72,35 @@ from flightmodel.vehicle import CameraMount, CameraUncertainty
 # orientation
 _STEPS = 10
 LEAST_FEATURES_SHARE = 0.5  # of stated features, to be found in the benchmark frame
-TEXTURE_SD_PX = 0.05
+TEXTURE_SD_PX = 0.05  # of a patch in the frame that it is taken from: its noise
 _LEAST_EDGE = 30  # coherent points beside the valleys: an eighth of the edge in view
-_WILD, _WILD_PX = 3.0, (1.0, 2.5)
+_WILD, _WILD_PX = 3.0, (1.0, 2.5)  # times the scatter, at least a pixel and at most `_WORST_RMS_PX`
 _REACHES_PX = (0, 12, 8)  # within which features are looked for in turn; 0: the edge alone
-_SETTLED_SD = 1e-2
-_WORST_RMS_PX = 2.5
+_SETTLED_SD = 1e-2  # of a correction's a priori sd
+_WORST_RMS_PX = 2.5  # several times an edge's own scatter: what stays beyond it is another shell's edge
 _WORST_CORRECTIONS = 31.8  # chi-square of eight corrections that one sound frame in 10,000 exceeds
-_FOCAL, _FOCAL_PIECE = 3, 0.08
+_FOCAL, _FOCAL_PIECE = 3, 0.08  # relative sd within which one search looks; a wider a priori sd is searched in pieces
 _NOT_SQUARE = "pixels-not-square"
 _CENTRE = [4, 5]  # among the pose
 _SQUARE_SD = 0.002  # of stretch and shear: what lens coefficients that are not fitted look like, half a pixel at 250
 _WORST_SQUARE = (
     9.2  # chi-square of two; the allowance included, 34 sound benchmark frames reach 0.2 with features, 8 without
 )
+# of a shell as built, whose waves are not in the drawing: 8 mm at a radius of 1.5 m; assumed
 _BUILT_RAD = np.deg2rad(0.3)
 _BUILT = [0, 1, -3, -2, -1]  # saddle and light: more waves beside a lens that is fitted cost more than they explain
 _POSES = POSED.stop - POSED.start
 # deflection
 LEAST_FRAMES, MOST_FRAMES = 12, 150
-_LONGEST_HOLE_S = 0.11
+_LONGEST_HOLE_S = 0.11  # a quarter of a period at 2.3 Hz, over which the joint's moment is interpolated
 LOADED = 3.0  # largest moment over the benchmark's
 _WORST_TIME_BIAS_S = 0.03  # half a radian of oscillation at 2.5 Hz
 _LEFT_OUT = 0.05  # of the deflection: damping, oscillation that the sensors' windows smooth
-_SLACK_TIME_S = 2.5
+_SLACK_TIME_S = 2.5  # assumed: friction and freeplay follow the load, which changes in seconds
 _SLACKS_DEG, _FREEPLAYS_DEG = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64), (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)
 _SIZES_RAD = np.deg2rad(list(product(_SLACKS_DEG, _FREEPLAYS_DEG)))
 _USUAL_RAD = np.deg2rad([0.04, 0.1])  # sizes at which the compliance is estimated that scales the law's errors
-_PASSES = 2
+_PASSES = 2  # the second with the errors of the law that the first one's compliance scales
 _WIDE = 30.0  # prior sd of the compliance, in the values found
 
 

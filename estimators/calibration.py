@@ -37,10 +37,10 @@ from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
 from flightmodel.statistics import jackknife_variance
 
 COLUMNS = ("image", "X_m", "Y_m", "u_px", "v_px")
-LEAST_PICTURES, _LEAST_CORNERS = 3, 6
-_LARGEST_BOARD_M = 100.0
+LEAST_PICTURES, _LEAST_CORNERS = 3, 6  # fewer do not determine focal length and centre, or a board's pose
+_LARGEST_BOARD_M = 100.0  # beyond it the unit is wrong
 _LARGEST_CONDITION = 1e8  # of the fit, its unknowns scaled alike
-_STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 300, 1e-10)
+_STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 300, 1e-10)  # to rounding
 
 
 @dataclass(frozen=True)

@@ -59,18 +59,18 @@ REACH_PX = 8  # within which features are looked for around their prediction
 _WORST_RMS_PX = 2.5  # from where a fit goes on
 _OFF_PLANE_PX = 0.5  # left on the edge by a deflection off an assumed plane, and by shapes, of a few tenths of a degree
 _FEW_FEATURES = 0.6  # of those found at the benchmark
-_FAR_RAD = np.deg2rad([4.0, 4.0])
+_FAR_RAD = np.deg2rad([4.0, 4.0])  # about the last answer, which is at most a swing away: IRVE-II's whole deflection
 # texture
 TEXTURE_REACH_PX = 3  # the edge alone predicts to a pixel
-_WORST_TEXTURE_SD_PX = 0.5
+_WORST_TEXTURE_SD_PX = 0.5  # as wide as what agrees: a less sharp patch cannot say whether it does
 TOGETHER = 3.0  # root of the number of patches that err together: they overlap, and their neighbours see the same light
 # by chance a sixth of the patches lie within half a pixel of six; of light and shade on plain cloth, which seem to move
 # as the Sun does, 0.55 do (median, 0.66 at the most), of eight paints 0.79 (median, 0.6 at the least)
 _AGREED_PX, _LEAST_AGREED = 0.5, 0.6
 _SOUND_SCORE = 1.5  # the texture agrees with itself
-_EDGE_PASSES = 2
+_EDGE_PASSES = 2  # the first may have found points of another edge
 _CONTRADICTION = 18.4  # chi-square of two components that one sound frame in 10,000 exceeds
-_SAME_BREAK_PX = 2
+_SAME_BREAK_PX = 2  # a border's row, compressed otherwise in each frame
 _HIDDEN_BREAK = 0.3  # of a row: what is left of it is no break across most of the width
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features

@@ -35,14 +35,14 @@ from flightmodel.checks import BoolArray, Fault, FloatArray
 Image = NDArray[np.uint8]
 NO_FAULT = Fault("")
 
-STEP_PX = 0.5
-_SMOOTHING_PX = 0.8
-WHOLE_BLUR_PX = 1.27
-EDGE_HALF = 7
-_NEAR_PX = 8.0
-_LEAST_CONTRAST = 8.0
-_LEAST_SHARE = 0.4
-_SD_FLOOR_PX = 0.05
+STEP_PX = 0.5  # two samples a pixel: the smoothing below passes nothing shorter
+_SMOOTHING_PX = 0.8  # white noise falls to a third, an edge is not blurred beyond what its lens does
+WHOLE_BLUR_PX = 1.27  # sd of the step that is fitted: of the smoothing, and 1 px of lens and pixel
+EDGE_HALF = 7  # samples on either side of a fitted step: 2.8 of its sd
+_NEAR_PX = 8.0  # sky and shell on either side, for the step's levels; as far as a prediction may be off
+_LEAST_CONTRAST = 8.0  # grey levels: three times the noise of a film
+_LEAST_SHARE = 0.4  # assumed, of the lines: this edge only starts a fit, which tests it
+_SD_FLOOR_PX = 0.05  # assumed: cloth and lens are modelled no better
 # samples that err together: of noise, by the smoothing; of a sky and a shell that are no step and ramp, found in 14,000
 # points of scenes with and without the Earth behind the rim, the same within a quarter for errors of 0.06 to 1.5 px
 _NOISE_TOGETHER = 2.0 * float(np.sqrt(np.pi)) * _SMOOTHING_PX / STEP_PX

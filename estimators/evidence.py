@@ -58,7 +58,7 @@ from flightmodel.deflection import (
 from flightmodel.statistics import correlation_root, correlation_root_and_rest, symmetric_root
 from flightmodel.vehicle import Vehicle
 
-CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0
+CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0  # assumed: half of the variance lasts, half decorrelates, as the air's
 # with three knots in this time, frames between two of them could err as a straight line only: the rest of the error
 # looked like the deflection's motion, and without spin like a c.g. station 4 sd off
 LIGHT_TIME_S, _LIGHT_KNOTS_A_TIME = 2.5, 10

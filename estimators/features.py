@@ -53,11 +53,11 @@ Image = NDArray[np.uint8]
 Pixels = Callable[[FloatArray], FloatArray]
 """From parameters ``(k,)`` to the features' pixels ``(n, 2)``, NaN outside the lens's field."""
 
-_LEAST_FACING = 0.3
-_HALF_SEAM_M, _HALF_DOT_M = 0.006, 0.011
-_SEAM_STEP_PX = 10.0
-_SD_FLOOR_PX = 0.05
-_BORDER_PX = 12.0
+_LEAST_FACING = 0.3  # cosine: seen flatter a feature has less than a third of its width
+_HALF_SEAM_M, _HALF_DOT_M = 0.006, 0.011  # as `flightmodel.geometry` draws them; a list states its own
+_SEAM_STEP_PX = 10.0  # between points of a seam, so that their windows do not overlap
+_SD_FLOOR_PX = 0.05  # as of the edge
+_BORDER_PX = 12.0  # of the picture: the window of a search lies inside
 # the search of the feature map
 _HAT_PX = 17
 _BLURS_PX = (9.0, 9.0, 6.0, 4.0, 3.0, 2.0, 2.0)
@@ -68,10 +68,10 @@ _LEAST_RISE, _OTHERS = 3.0, 60
 _NOISE_GREY = 2.5
 _VALLEY_STEP_PX, _HALF_VALLEY_PX = 10.0, 5
 _VALLEY_PLACED_M, _VALLEY_OFFSET_PX = 0.03, 3.0  # a tenth of a torus by the light; neighbours err together
-_GRAZING_M = 1e-6
+_GRAZING_M = 1e-6  # rounding of a point on the very surface
 _BENDS = float(np.cos(np.deg2rad(50.0)))  # within two pixels; the skin of a torus bends by a tenth of that
 _ON_MESH_M = 0.05  # along the sight: two hundredths off the surface, seen at 25 deg
-_ALONG_M = 0.002
+_ALONG_M = 0.002  # a step along a line, for its direction: a pixel or less
 _WIDEST_HALF_PX = 5  # a feature and cloth on both sides fit in the window of the nearest search
 
 

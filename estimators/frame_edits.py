@@ -30,7 +30,7 @@ from flightmodel.checks import BoolArray, FloatArray, GateError
 
 Image = NDArray[np.uint8]
 
-MARK_SD_PX = 1.0
+MARK_SD_PX = 1.0  # of a click on an enlarged picture, assumed; the scatter of the marks corrects it
 LEAST_MARKS = 5  # deflection (2), flattening and light leave less than that undetermined
 
 

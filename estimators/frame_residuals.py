@@ -23,7 +23,7 @@ from estimators.virtual_camera import FLATTENING, RADIUS, VirtualCamera
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
 
-HUBER = 2.5
+HUBER = 2.5  # of the scatter: 1 % of normal residuals are beyond it
 WAVES, ROUND_WAVES = (2, 3, 4, 5), (2, 3)
 """Round the shell, of the modelled lobes across it and along its radius."""
 

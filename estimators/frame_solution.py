@@ -45,10 +45,10 @@ from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals
 from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 
-STEPS = 12
-LAST_STEP_RAD = 2e-5
-OUTLIER_PX = 5.0
-LEAST_POINTS, LEAST_FEATURES = 60, 40
+STEPS = 12  # a bound, for Gauss-Newton from a few pixels away
+LAST_STEP_RAD = 2e-5  # 0.001 deg, far below any frame's sd
+OUTLIER_PX = 5.0  # a point this far off lies on another edge or feature
+LEAST_POINTS, LEAST_FEATURES = 60, 40  # a quarter of the lines; a seventh of the reference shell's rows in view
 _LEAST_VAR = float(np.deg2rad(0.02) ** 2)  # of a difference: shapes that are not modelled, and points that err alike
 BESIDE = 4  # places of 240 along the edge: a residual of the benchmark frame holds that far for a mark by hand
 JOINT = HELD.stop - 1

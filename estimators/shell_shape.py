@@ -68,7 +68,7 @@ LOBES = {"two waves": (2,), "three waves": (3,), "more waves": (4, 5)}
 HYPOTHESES = tuple(chain.from_iterable(combinations(LOBES, k) for k in range(len(LOBES) + 1)))
 """Lobes that there are; the first: rocking alone."""
 _PRIOR = np.array([0.5, *[0.5 / (len(HYPOTHESES) - 1)] * (len(HYPOTHESES) - 1)])
-_FRAME_SDS_RAD = np.deg2rad([0.003, 0.01, 0.03, 0.1])
+_FRAME_SDS_RAD = np.deg2rad([0.003, 0.01, 0.03, 0.1])  # of lobes that come and go, from none to a tenth of a degree
 # over the formal errors, which take points as independent: those new in every frame, and those that last beside them
 _NEW, _LASTING = (1.0, 1.5, 2.2, 3.3), (0.2, 0.7, 2.0)
 _SIZES = tuple((new, lasting * new, size) for new, lasting, size in product(_NEW, _LASTING, _FRAME_SDS_RAD))

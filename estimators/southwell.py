@@ -34,9 +34,9 @@ from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory
 
 SPAN_S = 1.6  # a period of the slow aerodynamic mode
-LEAST_SPANS = 4
+LEAST_SPANS = 4  # two on either side of the peak, for a line each
 _MOST_LOG_SD = 3.0  # of offset or margin: a factor of twenty
-CONFIDENCE = 0.90
+CONFIDENCE = 0.90  # of the interval, as of the reconciliation's
 LEFT_OUT = 0.10  # sd of means against the static line, of the deflection at peak; elsewhere as the period, 1/sqrt(q)
 _MOST_LOADS = 50.0  # the stiffness of a joint this many times stiffer than its load is not observable
 

@@ -48,16 +48,16 @@ HALF_PX = 7  # of a patch: at most a third of a torus as a camera on the centerb
 _FINE_PX, _COARSE_PX = 0.8, 2.0  # of the band-pass: the lens's blur, and less than the patch
 _CELL_PX = 12  # one patch at the most in a square of this size, so that they spread over the shell
 _STEP_M = 0.002  # along the touching plane, for the affine map
-_LEAST_CORRELATION = 0.8
-_QUIET, _ABOVE_NOISE, _LEAST_GREY = 0.1, 3.0, 0.3
+_LEAST_CORRELATION = 0.8  # assumed; whether patches agree is tested afterwards
+_QUIET, _ABOVE_NOISE, _LEAST_GREY = 0.1, 3.0, 0.3  # quantile of plain cloth; a mark over its noise; rounding
 _BAND = 0.275  # of white noise that passes the band: root of (1/a^2 + 1/b^2 - 4/(a^2 + b^2)) / 4 pi of both blurs
-_LEAST_FACING = 0.3
+_LEAST_FACING = 0.3  # as of features
 _INDEPENDENT_PX = 4.0 * np.pi * _FINE_PX**2  # area over which the band-pass correlates noise
-_SD_FLOOR_PX = 0.05
+_SD_FLOOR_PX = 0.05  # as of the edge
 _LINE = 3.0  # so much less sharp along a line than across it, a patch is found where it is looked for, or by its shades
 # of a mark's shift with the light, as found on another renderer's films: shades look like a line, hardly like a corner
 _ALIKE_OF_LINE, _ALIKE_OF_CORNER = 3.0, 0.5
-_TRACE_STEPS, _TRACED_M = 80, 5e-4
+_TRACE_STEPS, _TRACED_M = 80, 5e-4  # of a ray to the surface: a sixth of a pixel at 310 px a radian and 1 m
 # of a mesh: a slope of 70 deg changes the distance over eight pixels by 7 % at 310 px; normals of a patch on one torus
 # differ by less than one
 _STEP_IN_DEPTH, _VALLEY = 0.1, 1.0

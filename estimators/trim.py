@@ -51,7 +51,7 @@ from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.vehicle import Vehicle
 
-LIMIT_RAD = np.deg2rad(30.0)
+LIMIT_RAD = np.deg2rad(30.0)  # far beyond the trim of an entry that keeps its heat shield forward
 # near 2.3 Hz the shell's inertia balances the aerodynamic stiffness: no information on the deflection
 _AVERAGED_S = 1.0
 _ITERATIONS, _STEP_RAD = 5, 1e-4

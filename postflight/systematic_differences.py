@@ -68,10 +68,10 @@ from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from postflight.intake.other_trajectory import OtherTrajectory
 
-_MOST_EPOCHS = 800
-_LEAST_EPOCHS = 20
+_MOST_EPOCHS = 800  # the effects are smooth; their covariance is a matrix of nine times as many rows
+_LEAST_EPOCHS = 20  # fewer decide nothing among so many effects
 _LEAST_ODDS = np.log(1000.0)  # for one more effect
-_CONFIDENCE = 0.999
+_CONFIDENCE = 0.999  # one false alarm in a thousand comparisons
 _STEPS = 5  # of Gauss-Newton: the effects are nearly linear
 _FAR_S, _FAR_STEP_S = 40.0, 0.25  # of time offsets that are looked for: leap seconds, a second's slip
 _MARGIN_S = 2.0 * _FAR_STEP_S  # about each of them

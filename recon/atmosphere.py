@@ -53,9 +53,10 @@ from flightmodel.vehicle import Vehicle
 from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
 from recon.reconstruct import TrajectorySolution
 
+# a third of the winds' correlation length, a quarter of the trajectory's time
 _KNOT_M, _KNOT_S, _TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
 LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration does not depend on the air measurably
-_LEAST_SAMPLES = 20
+_LEAST_SAMPLES = 20  # windows: fewer say little of a profile
 # of the deceleration, axial and lateral: model error of coefficients and of an oscillating joint
 _AXIAL_PART, _LATERAL_PART, _MODEL_FLOOR_MPS2 = 0.01, 0.02, 0.03
 _FLEXURE_SD = (1.0, 0.3, *[float(np.deg2rad(3.0))] * 4)  # gain, growth, offsets
@@ -67,13 +68,13 @@ _BAD_AIR = "is beyond the sounding's uncertainty: the air differed from the soun
 _BAD_DRAG = "is beyond the pre-flight uncertainty: check mass, area and coefficients"
 _LARGEST_RMS = 2.0
 _LEAST_STIFFNESS = 0.1  # share of the joint's stiffness that aerodynamic load leaves
-_CONVERGED_SD, _MOST_STEPS = 1e-2, 20
+_CONVERGED_SD, _MOST_STEPS = 1e-2, 20  # far below any error; a bound
 # half the window over which sensors are averaged: well below the joint's period, well above the sampling interval
 HALF_WINDOW_S = 0.05
 _WINDOW_S = 0.4  # over which the joint's oscillation is averaged
 _EDGE_S = 0.05  # half the windows over which rates are averaged at both ends
 _POINTS = 9  # at which a window's attitude is interpolated
-_LARGEST_GAP_S = 0.1
+_LARGEST_GAP_S = 0.1  # beside a longer one a window's mean is not of its middle
 
 
 @dataclass(frozen=True)

@@ -60,16 +60,16 @@ _FIELD_SLOTS, _SUN_SLOTS = np.arange(12), np.array([0, 1, 4, 5, 6])  # of `recon
 _FIELD_ERROR, _DRIFT = 12, 15  # where these stand among the magnetometer's terms
 _EARTHLIGHT, _AGE = slice(5, 7), 7  # and among a head's
 _LEAST = 1e-9  # stands for a prior of zero: a fraction, rad or s; and a ten-thousandth of it for tesla
-_DRIFT_SPACING_S = 60.0
+_DRIFT_SPACING_S = 60.0  # of knots of a magnetometer's drift: temperature changes in minutes
 _BLOCK, _BAND = 6, 12
 _ROTATION, _RATE = slice(0, 3), slice(3, 6)
-_STRETCH_S = 5.0
+_STRETCH_S = 5.0  # over which the motion is taken as equally rough: a few periods of coning or pitching
 _LEAST_DENSITY, _FIRST_DENSITY, _MOST_DENSITY = 2e-4, 0.05, 20.0  # rad/s^2 per root hertz; the least is 0.011 deg
 _RATE_PRIOR_SD = 10.0  # rad/s: no information, but a knot without neighbours stays solvable
-_MOST_DENSITY_STEPS, _MOST_STEPS = 12, 30
-_DENSITY_CONVERGED_RAD, _CONVERGED_RAD = 5e-4, 1e-6
-_SMALL_RAD = 1e-5
-_EDIT_SD, _MOST_EDITED = 5.0, 0.05
+_MOST_DENSITY_STEPS, _MOST_STEPS = 12, 30  # bounds
+_DENSITY_CONVERGED_RAD, _CONVERGED_RAD = 5e-4, 1e-6  # 0.03 deg; rounding
+_SMALL_RAD = 1e-5  # of a numerical derivative: its square is rounding
+_EDIT_SD, _MOST_EDITED = 5.0, 0.05  # of white noise one in two million; more are no outliers
 
 
 @dataclass(frozen=True)

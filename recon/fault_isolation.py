@@ -46,7 +46,7 @@ from recon.single_faults import TRIADS, SingleFault, likeliest
 from recon.state import KINEMATIC
 from recon.time_bias import ClockJump, Lag
 
-_CONFIDENCE = 0.999
+_CONFIDENCE = 0.999  # of each test: of some twenty a flight, one false alarm in fifty flights
 _LEAST_LOST = 0.05  # of its variance that a solution loses by leaving a source out, for the test
 _ABOUT_SOURCES = ("nis", "whiteness", "edited", "held-out", "data-sheet")  # codes of checks about one tracker or sensor
 _AIR_CODES = ("sounding", "pre-flight-drag", "sounding-density", "sounding-wind", "pre-flight-ca", "force-residuals")

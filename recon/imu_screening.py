@@ -45,11 +45,11 @@ from flightmodel.gate import runs
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import Finding, TriadRecord
 
-_SLOPE_SPAN_S = 0.06
+_SLOPE_SPAN_S = 0.06  # over which a signal beside a gap is straight: a seventh of a period at 2.5 Hz
 _NEARBY_STEPS = 31  # of which the median is the usual step
 _SLOWER = 1.5  # than the record's own usual step
 _GAP, _LONG_GAP = 1.5, 4.5  # usual steps: a straight line serves up to the second, as good as the signal is smooth
-_LEAST_SAMPLES = 10
+_LEAST_SAMPLES = 10  # of a stretch between gaps: shorter ones carry no trajectory
 _AXES = "xyz"
 
 
@@ -355,9 +355,9 @@ _REACH = 6  # samples of the parabola on either side
 _NEARBY, _BESIDE = 201, 41  # jumps whose median size is the usual one: about a jump, and on either side of it
 _LEAST_JUMP_SD = 7.0  # a record of a million samples of white noise holds none
 _CANCEL_SD = 4.0  # of the sum of jumps that cancel
-_LONGEST_S = 10.0
+_LONGEST_S = 10.0  # of a transient offset: a longer one is a bias that the filter estimates
 _UNEVEN = 0.25  # of the usual step: by no more do the steps about a jump differ
-_LEAST_REPEATED = 10
+_LEAST_REPEATED = 10  # samples equal to earlier ones in a row, where chance alone would ask for fewer
 _HASH = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)  # odd, of mixed bits
 _SEED = 10  # samples in a row by which a block is found
 
@@ -479,7 +479,7 @@ def _lag_to_the_same(measured: FloatArray) -> IntArray:
 
 # ---- frozen data
 
-_LEAST_FROZEN_SAMPLES = 5
+_LEAST_FROZEN_SAMPLES = 5  # fewer equal readings are rounding
 _NEIGHBOURS, _LEAST_NEIGHBOURS = 200, 20  # readings on either side that show how often values repeat
 _CHANCE = 1e-6  # of one such run in a whole record
 _CHANCE_AT_STOP = 1e-3  # of one among the runs at a column's largest or smallest value, which a stop explains

@@ -38,9 +38,9 @@ from recon.settings import Settings
 from recon.state import KINEMATIC, ROTATION, States, boxplus, unpacked
 from recon.tracking_servo import with_servo_lag
 
-THINNED_STEP_S = 0.5
-_MOST_THINNED_PASSES = 6
-_FARTHEST_SD = 3.0
+THINNED_STEP_S = 0.5  # one only linearises about that path
+_MOST_THINNED_PASSES = 6  # a bound: the passes with all points go on from there
+_FARTHEST_SD = 3.0  # where a pass overshoots, the next one corrects it from within the prior
 _CONVERGED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of its effect
 _FOLLOWED_RAD = 0.5  # sd of a phase whose 3 sd are a quarter of a turn, beyond which lateral force corrects it wrongly
 _GYROS = slice(KINEMATIC + 9, KINEMATIC + 18)  # their errors

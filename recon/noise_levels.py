@@ -48,7 +48,7 @@ _LEAST_CHANGE = 0.1  # of a logarithm, that is worth proposing
 _LEAST_GAIN = np.log(20.0)  # of the likelihood, below which nothing is proposed: levels accepted before stay
 _DIFFERENCE = 0.02  # of a logarithm: its effect on log L is far above the rounding of thousands of terms
 _ENOUGH = 0.02  # log likelihood that a further step would gain
-_MOST_STEPS, _MOST_ROUNDS = 15, 3
+_MOST_STEPS, _MOST_ROUNDS = 15, 3  # bounds
 _RELINEARISED = 0.1  # change of a logarithm that moves the trajectory about which passes are linearised
 # of each kind of record: fields of its noise, which may only scale what is stated, and time constants
 _TRACKERS = {

@@ -46,11 +46,11 @@ from recon.time_bias import CORRELATION_S, SLOWEST_S, has_gap, smoothed_body_axe
 
 ComplexArray = NDArray[np.complex128]
 DELIVERED, LAG, ROLL, MIRRORED = "as delivered", "lag", "roll", "mirrored"
-_WINDOW_S, _STEP_S = 4.0, 0.02
+_WINDOW_S, _STEP_S = 4.0, 0.02  # some periods of the oscillation; a twentieth of one at 2.5 Hz
 _LONGEST_LAG_S, LAG_STEP_S = 1.5, 0.02  # of a clock that was set wrongly; beyond it trackers show it by themselves
-_ROLL_STEP_RAD = np.deg2rad(1.0)
+_ROLL_STEP_RAD = np.deg2rad(1.0)  # of the search, half of what is called a roll
 _MOST_WINDOWS = 24  # those with the largest lateral force: enough, and quick on a long flight
-_LEAST_WINDOWS = 4
+_LEAST_WINDOWS = 4  # so that their scatter says how well the roll is known
 _LEAST_EXPLAINED = 0.95  # share of the lateral force's square, by the best hypothesis
 # unequal inertia, c.g. offsets and the joint turn the relation: 0.37 deg rms, at most 0.63, on 13 sound flights
 _LEAST_ROLL_RAD = np.deg2rad(2.0)

@@ -57,15 +57,16 @@ from recon.vector_attitude import start_attitude_from_vectors
 
 Track = tuple[FloatArray, FloatArray]  # times (n,) and points (n, 3), ECEF m
 _TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT, RANGE_RATE)
+# of means in which the pulse is found; half a g, below which nothing deflects
 _PULSE_CELL_S, _LEAST_PULSE_MPS2 = 0.5, 5.0
 _ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
 _NO_POINTS: Mapping[str, FloatArray] = MappingProxyType({})
 _BALLISTIC_STEP_S = 0.5  # drivers are constant within a step, and decorrelate in seconds and kilometres
-_DIFFUSE_POSITION_M = 1000.0
-_DIFFUSE_VELOCITY_MPS = 100.0
-_LEAST_POINTS = 4
+_DIFFUSE_POSITION_M = 1000.0  # no information beside one point of any tracker
+_DIFFUSE_VELOCITY_MPS = 100.0  # the same, beside the line that is fitted
+_LEAST_POINTS = 4  # of a parabola, with one over
 _LEAST_SPAN_S = 2.0  # its later half gives a tracker of ten points a second the ten that residuals are tested with
-_TRACK_SPAN_S = 2.5
+_TRACK_SPAN_S = 2.5  # a parabola at 10 m/s2 with a jerk of 3 m/s3 is off by 8 m: enough to linearise about
 _FIXED_RAD = 1e-6  # sd of the rotation of ballistic flight, which is held fixed
 _GYRO = slice(18, 27)
 _START_GAP_S = 0.1  # from a stated state to the sensors' first sample

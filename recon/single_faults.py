@@ -31,7 +31,7 @@ from recon.oscillation import MIRRORED, ROLL, Oscillation
 from recon.time_bias import Lag
 
 WIDER = 30.0  # times the stated sd: a misaligned or mistimed sensor is some tens of them off
-_NOISIER = 10.0
+_NOISIER = 10.0  # times the stated noise: of a sensor of another grade, or a loose connector
 _G, _DEGREE = earth.STANDARD_GRAVITY_MPS2, np.pi / 180.0
 _UNIT_SLIPS = {"accelerometer": (_G, 1.0 / _G), "rates": (_DEGREE, 1.0 / _DEGREE)}
 _REFRACTION_SD = 1.0  # of the whole correction

@@ -37,15 +37,15 @@ from recon.fault_detection import LOG_LIKELIHOOD_LIMIT, offset_scores
 from recon.imu_screening import BridgedSensor, usual_steps
 from recon.state import KINEMATIC, States
 
-_WINDOW_S, _STEP_S = 4.0, 0.01
+_WINDOW_S, _STEP_S = 4.0, 0.01  # some periods of the oscillation; a fortieth of one at 2.5 Hz
 _SMOOTH_S, SLOWEST_S = 0.04, 0.05  # of the Gaussian filter of both signals; steps of a record too slow to use
-_LONGEST_LAG_S, _LAG_STEP_S = 0.08, 0.01
+_LONGEST_LAG_S, _LAG_STEP_S = 0.08, 0.01  # a fifth of a period at 2.5 Hz: a longer one is found by `recon.oscillation`
 _LARGEST_SD_S = _LONGEST_LAG_S / 10.0  # else hardly any lag in the range would be significant
 _LEAST_EXPLAINED = 0.95  # share of the lateral force's square
 CORRELATION_S = 0.7  # of residuals
-_LEAST_WINDOWS = 4
+_LEAST_WINDOWS = 4  # so that their scatter says how well the lag is known
 _ARM_M = 3.0  # of a vehicle of six metres
-_SHORTEST_S = 0.004
+_SHORTEST_S = 0.004  # that a step is longer than usual: below it the lag cannot be measured
 _LEAST_EXCESS = 0.5  # of a usual step that a step is longer
 _MOST_GAPS = 8  # that are tested, the longest
 

@@ -19,9 +19,9 @@ from flightmodel.checks import FloatArray
 from recon._measurement_kernels import RADAR
 from recon.measurements import Instrument, sight, sight_partials, wrapped
 
-_CELL_S = 0.5
+_CELL_S = 0.5  # one point in each: a start needs no more
 _BRIDGED_S = 3.0  # over which a parabola's chord is off by some tens of metres at 10 m/s2: enough to linearise about
-_ITERATIONS = 50
+_ITERATIONS = 50  # a bound, for Gauss-Newton from far
 _WORST_SD_M = 5e3  # of a point: beyond it the filter would linearise far from the path
 
 

@@ -47,8 +47,8 @@ from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_ch
 
 _QUARTER_RAD = 0.5 * np.pi
 _BLIND_RAD = 0.3  # a single attitude with an angle as uncertain as this starts nothing
-_TRACK_BLOCK_S = 1.0
-LEAST_INSIDE = 0.90
+_TRACK_BLOCK_S = 1.0  # a block a second carries what a velocity's direction says of the attitude
+LEAST_INSIDE = 0.90  # of 95 % regions, less what blocks that are not independent scatter
 _MISFIT_ALLOWANCE = 0.15  # motion is no white noise, and blocks are not quite independent
 _TABLE = ("name", "unit", "prior_sd", "estimate", "sd")
 

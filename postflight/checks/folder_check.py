@@ -37,7 +37,7 @@ from postflight.terminal import terminal
 
 _SHARP_S = 0.5  # a time bias of a larger standard deviation is not reported
 _FITS = 5.0  # reduced chi-square beyond which one lag and one scale do not describe the comparison
-_FORCE_WIDTH_S = 8.0
+_FORCE_WIDTH_S = 8.0  # the second derivative of a radar track of 5 m at 10 Hz is then good to 0.25 m/s2
 WIDE = 160  # of a log file: a table need not be squeezed there
 _LONGEST_NAME = 28  # that leaves room for the rest of a table on 80 columns
 console = terminal(width=None if sys.stdout.isatty() else WIDE)

@@ -37,23 +37,23 @@ from postflight.checks.units_and_axes import (
     window_means,
 )
 
-_REST_S = 2.0
+_REST_S = 2.0  # at the record's ends, before release or after landing
 _REST_SPREAD = 0.02  # of the reading's magnitude: at rest it is steadier
-_REST_RATE_RADPS = 0.02
+_REST_RATE_RADPS = 0.02  # 1 deg/s: more than a gyro's bias, less than any flight
 _FAR = 1.2  # a factor that no accelerometer's scale error makes
 _SURE = 6.0  # standard deviations
 _LEAST_DRAG = 0.5  # share of the force along -x of the body on an entry: 60 deg of total angle of attack
-_STRONG_MPS2 = 5.0
+_STRONG_MPS2 = 5.0  # half a g of drag, whose direction is the flow's
 _Rows = NDArray[np.intp]
 _Reading = tuple[float, Axes]
-_CELL_S = 0.05
-_GAP_S = 0.5
+_CELL_S = 0.05  # over which rates up to 1 rev/s turn by 18 deg, integrated by their mean
+_GAP_S = 0.5  # beyond it an integrated attitude is lost
 _SPAN_S = 60.0  # in which a gyro's bias of 0.2 deg/s adds 12 deg
 _CLEAR = 12.0  # standard deviations of a window's force, so that its direction is known to 5 deg
-_LEAST_WINDOWS = 6
-_WRONG_RAD = np.deg2rad(30.0)
-_RATES_RIGHT_RAD, _ATTITUDE_RIGHT_RAD = np.deg2rad(12.0), np.deg2rad(15.0)
-_ATTITUDE_SD = 4.0
+_LEAST_WINDOWS = 6  # so that one strange direction decides nothing
+_WRONG_RAD = np.deg2rad(30.0)  # more than the angle of attack may turn the force from the flow
+_RATES_RIGHT_RAD, _ATTITUDE_RIGHT_RAD = np.deg2rad(12.0), np.deg2rad(15.0)  # of a gyro's bias; half of wrong
+_ATTITUDE_SD = 4.0  # of the stated attitude carried by the gyros
 _FARTHEST_S = 600.0  # that gyros are trusted to carry an attitude
 _DEGREE = np.pi / 180.0
 # slips in writing a quaternion: hint and code, and the order that undoes it (None: the conjugate)

@@ -33,8 +33,8 @@ from postflight.checks.units_and_axes import (
 _DECADE = 5.0  # iron and calibration change a field's magnitude by less
 _CELL_RAD = 0.3  # rotation within a cell: as long as the field's direction allows, against the readings' noise
 _EXPLAINED = 0.6  # of the rotation's square; noise and iron that is not fixed are the rest
-_MOST_SAMPLES = 4000
-_LARGEST_LAG_S, _COARSE_S = 0.5, 0.025
+_MOST_SAMPLES = 4000  # enough for two numbers, and quick on a long flight
+_LARGEST_LAG_S, _COARSE_S = 0.5, 0.025  # of a clock set to half a second; a sixteenth of a turn at 2.5 Hz
 
 
 def barometer_unit(

@@ -21,14 +21,14 @@ from flightmodel.checks import BoolArray, FloatArray
 from postflight.checks.units_and_axes import interval_around
 
 _LEAST_SAMPLES = 6  # of a window
-_LEAST_WINDOWS = 8
+_LEAST_WINDOWS = 8  # for a scale and a lag, with their scatter
 _STRIDES = 2  # windows overlap by half
 _SIGNAL = 4.0  # magnitudes below so many standard deviations are mostly noise
-_LARGEST_LAG_S = 5.0
-_LAG_STEPS = 401
+_LARGEST_LAG_S = 5.0  # of a clock set by hand; hours and leap seconds are looked for elsewhere
+_LAG_STEPS = 401  # 25 ms, between which a parabola finds the least
 _LEAST_MISFIT = 0.25  # a window's scatter holds what a quadratic leaves out, and is too large by as much
 _OVERLAP = np.sqrt(1.5)  # neighbouring windows share half of their samples
-_WIDTHS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
+_WIDTHS_S = (1.0, 2.0, 4.0, 8.0, 16.0)  # of windows, from a precise receiver's to a coarse radar's
 
 
 @dataclass(frozen=True)

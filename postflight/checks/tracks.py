@@ -32,16 +32,17 @@ from postflight.checks.units_and_axes import (
     unit_that_explains,
 )
 
+# long, as free fall changes slowly: the acceleration of a radar of 5 m is good to 0.05 m/s2
 _FALL_WIDTH_S = 16.0
-_STILL_MPS2 = 0.3
+_STILL_MPS2 = 0.3  # of a vehicle that coasts: bias of a coarse accelerometer
 _SHARP_MPS2 = 1.0  # windows with a larger sd of acceleration decide on no unit
 _FREE = 5.0  # standard deviations that a free fall may be off
-_DENIED, _BORNE_OUT = 0.1, 0.8
-_APART_SD, _APART_M = 20.0, 1000.0
-_STRETCH_S = 10.0
+_DENIED, _BORNE_OUT = 0.1, 0.8  # shares of windows in free fall: a wrong unit has hardly any, the right one nearly all
+_APART_SD, _APART_M = 20.0, 1000.0  # no survey or bias is so far off: another place, or another flight
+_STRETCH_S = 10.0  # over which a velocity's frame moves a position by more than a receiver's noise
 _LEAST_SPEED_MPS = 50.0  # below it a time bias hardly moves a track
 _CARRIED_S = 0.1  # the gyros' samples reach this far beyond their ends
-_MOST_HOURS = 24
+_MOST_HOURS = 24  # of local time taken for UTC
 
 
 def tracks(found: Sources) -> dict[str, RadarRecord | GnssRecord]:

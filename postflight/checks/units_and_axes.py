@@ -22,8 +22,8 @@ from flightmodel.units import UNITS, read_unit
 Axes = tuple[tuple[int, ...], tuple[int, ...]]
 AS_DECLARED: Axes = ((0, 1, 2), (1, 1, 1))
 _SAME_UNIT = 0.05  # logarithm: a unit explains a ratio within this
-_SIGNIFICANT_SD, _SIGNIFICANT_S = 5.0, 0.1
-_WORTH_A_LOOK_SD = 3.0
+_SIGNIFICANT_SD, _SIGNIFICANT_S = 5.0, 0.1  # beyond both: a tenth of a second, which the filter's own time bias takes
+_WORTH_A_LOOK_SD = 3.0  # a remark, not a warning: one in 370 by chance
 
 
 def unit_of(source: Source, quantity: Quantity) -> str:

@@ -24,14 +24,14 @@ from postflight.reconciliation.forward_model import STIFFNESS_LOG_SD, VehiclePar
 from postflight.reconstruction import Reconstruction
 from synthetic_flight.linear import linear_matrix, modes, slopes_at
 
-RATE_HZ = 50.0
-WINDOW, HOP, PADDED = 256, 32, 2048
-LEAST_PRESSURE_PA = 20.0
+RATE_HZ = 50.0  # ten samples a period of the joint at 5 Hz
+WINDOW, HOP, PADDED = 256, 32, 2048  # 5 s resolve 0.2 Hz; a hop of 0.6 s follows the pressure; padded to 0.02 Hz
+LEAST_PRESSURE_PA = 20.0  # below it hardly anything drives the joint
 # of the stiffness to look about: farther off the vehicle's oscillation in the flow passes for a softer joint's
 FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 141))
 MOST_SPIN = 0.1  # of the joint's frequency: the mode is off by the square of it, a percent
 EDGE = 5  # of `FACTORS` at either end: a largest mean there belongs to a line outside
-BLOCKS = 6
+BLOCKS = 6  # whose scatter gives the sd
 DIFFERENCE = 0.05  # of a standard deviation
 # mean logarithm of power over noise along the best track: noise alone -0.2 +/- 0.17, the best of all its tracks 0.2
 LEAST_LOG_POWER = 0.65
