@@ -74,6 +74,8 @@ _SAME_BREAK_PX = 2  # a border's row, compressed otherwise in each frame
 _HIDDEN_BREAK = 0.3  # of a row: what is left of it is no break across most of the width
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
+# of the benchmark frame's edge or features, for an answer by both: of 2900 sound answers in spoilt films one shows less
+_LITTLE_SEEN = 0.4
 USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
 
 _NOTHING = no_horizon(NO_FAULT)
@@ -248,6 +250,14 @@ class OrientedCamera(FrameModel):
             )
         if place is None:
             return both
+        features = (len(both.rows) - both.edge_count) / max(int((~self._benchmark_edge).sum()), 1)
+        edge = self._edge_share(len(horizon.points_px))
+        if max(edge, features) < _LITTLE_SEEN and not horizon.is_by_hand:
+            raise NoFitError(
+                f"{100.0 * edge:.0f} % of the benchmark frame's edge and {100.0 * features:.0f} % of its features "
+                f"are seen where {100.0 * _LITTLE_SEEN:.0f} % of one are needed",
+                "shell-little-seen",
+            )
         # to first order, which takes a tenth of a fit's time, then in full where that is not clear
         if both.edge_count >= least_points(horizon):
             step, alone_near = self._edge_step(both, deformation[2])

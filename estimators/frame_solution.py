@@ -260,8 +260,9 @@ class FrameModel:
         return np.asarray(self.benchmark_residuals.index < len(self.clocks_rad))
 
     def _edge_share(self, points: int) -> float:
-        """So many edge points over those of the benchmark frame."""
-        return points / max(int(self._benchmark_edge.sum()), 1)
+        """So many edge points over those of the benchmark frame; none where that shows no edge."""
+        there = int(self._benchmark_edge.sum())
+        return points / there if there else 0.0
 
     def _at_benchmark(
         self, index: NDArray[np.intp], beside: int = 0

@@ -302,6 +302,24 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
     assert oriented.fit(low, None).refused
 
 
+@pytest.mark.parametrize(("seen_px", "from_left"), [(200, True), (250, True), (200, False)])
+def test_a_frame_that_shows_too_little_of_edge_and_features_is_refused(seen_px, from_left):
+    # of a picture of 720 pixels, the rest covered: all that is seen agrees with one deflection, and may by chance
+    frames = film(4, [0.0, 3.0], [0.0, 175.0])
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    column = np.arange(720)
+    seen = column < seen_px if from_left else column >= 720 - seen_px
+    assert oriented.fit(np.where(seen, frames[1], 0).astype(np.uint8)).refused.code == "shell-little-seen"
+    assert not oriented.fit(frames[1]).refused
+
+
+def test_without_an_edge_in_the_benchmark_frame_no_edge_is_a_share_of_it(monkeypatch):
+    oriented = orient_camera(film(4, [0.0], [0.0])[0], GEOMETRY, MOUNT, JOINT_M)
+    assert oriented._edge_share(120) == pytest.approx(0.5, abs=0.05)
+    monkeypatch.setitem(oriented.__dict__, "_benchmark_edge", np.zeros(3, dtype=bool))
+    assert oriented._edge_share(120) == 0.0
+
+
 def test_a_wrong_lens_is_refused():
     """An edge is found, but the benchmark frame is not explained, or by a camera far off."""
     frames = film(5, [0.0], [0.0])
