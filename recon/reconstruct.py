@@ -21,8 +21,8 @@ axes) to the datum:
     p = p_imu - C r,   v = v_imu - C (w x r),   w = gyro rate - C^T W
 
 and the errors move with them: ``dp = dp_imu + C [r x] d``, ``dv = dv_imu + C [(w x r) x] d + C [r x] dw`` with
-rotation error ``d`` and rate error ``dw`` from the gyros' estimated errors and white noise. In ballistic flight the
-tracked point is the datum and the attitude unknown, with the covariance of an unknown attitude.
+rotation error ``d`` and rate error ``dw`` from the gyros' estimated errors, their clock's too, and white noise. In
+ballistic flight the tracked point is the datum and the attitude unknown, with the covariance of an unknown attitude.
 
 References
 ----------
@@ -73,7 +73,7 @@ from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem
 from recon.single_faults import Single, SingleFault
 from recon.smoother import Smoothed
-from recon.state import INERTIAL, KINEMATIC, States, unpacked
+from recon.state import KINEMATIC, States, unpacked
 from recon.tracking_servo import with_servo_lag
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
@@ -623,8 +623,13 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
             states.q_ecef_body, np.tile(planet.rate_ecef_radps, (n, 1)), covariance, planet,
         )  # fmt: skip
     motion = problem.motion
-    measured = interpolate_rows(problem.time_s[kept], mounting.rate.time_s, mounting.rate.measured_sensor)
-    errors = states.sensor_errors[:, 9:18]
+    rate, errors = mounting.rate, states.sensor_errors[:, 9:18]
+    tagged = problem.time_s[kept] + (states.sensor_errors[:, 19] if motion.clocks else 0.0)
+    step = float(np.median(np.diff(rate.time_s)))
+    before, measured, after = (
+        interpolate_rows(at, rate.time_s, rate.measured_sensor) for at in (tagged - step, tagged, tagged + step)
+    )
+    slope = (after - before) / (2.0 * step)
     c = rotations.dcm_from_q(states.q_ecef_body)
     omega = correct(measured, errors, motion.dcm_body_rate)
     r = mounting.arm_body_m
@@ -634,13 +639,16 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
     for first in range(0, n, _NODES):  # unpacked, the nodes' covariances are the largest of all arrays
         k = slice(first, first + _NODES)
         lever = c[k] @ rotations.skew(r)
-        move = np.zeros((len(lever), 9, 27))
+        by_gyros = lever @ correction_partials(measured[k], errors[k], motion.dcm_body_rate)
+        move = np.zeros((len(lever), 9, KINEMATIC + motion.drivers))
         move[:, range(9), range(9)] = 1.0
         move[:, 0:3, 6:9] = lever
         move[:, 3:6, 6:9] = c[k] @ rotations.skew(lever_velocity[k])
-        move[:, 3:6, 18:27] = lever @ correction_partials(measured[k], errors[k], motion.dcm_body_rate)
-        moved = move @ unpacked(triangles[k], INERTIAL) @ np.swapaxes(move, 1, 2)
-        moved[:, 3:6, 3:6] += mounting.rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
+        move[:, 3:6, 18:27] = by_gyros
+        if motion.clocks:  # a late tag reads too little of what grows, as a bias would
+            move[:, 3:6, 28] = -np.einsum("nij,nj->ni", by_gyros[:, :, 0:3], slope[k])
+        moved = move @ unpacked(triangles[k], move.shape[2]) @ np.swapaxes(move, 1, 2)
+        moved[:, 3:6, 3:6] += rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
         covariance[k] = 0.5 * (moved + np.swapaxes(moved, 1, 2))
     return Trajectory(
         mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m - c @ r,

@@ -42,7 +42,7 @@ from flightmodel.instruments import (
 from flightmodel.telemetry import Motion as MotionSpec
 
 POSITION, VELOCITY, ROTATION = slice(0, 3), slice(3, 6), slice(6, 9)
-KINEMATIC, INERTIAL = 9, 27
+KINEMATIC = 9
 # of ballistic motion, owner and name
 DRIVERS = (
     ("vehicle", "drag"), ("vehicle", "side force across"), ("vehicle", "side force within"),

@@ -228,37 +228,38 @@ def test_a_solution_is_apart_beyond_what_leaving_a_source_out_costs():
 
 
 def datum_of(state, covariance, noise_sd=0.0):
-    arm = np.array([-1.2, 0.3, 0.2])
+    arm, t = np.array([-1.2, 0.3, 0.2]), np.arange(-2.0, 5.0)
     rate = SimpleNamespace(
-        time_s=np.array([0.0, 1.0]), measured_sensor=np.tile([0.6, -0.3, 0.4], (2, 1)),
+        time_s=t, measured_sensor=np.array([0.6, -0.3, 0.4]) + t[:, None] * np.array([0.7, 2.0, -1.5]),
         spec=SimpleNamespace(noise_sd=noise_sd),
     )  # fmt: skip
     problem = SimpleNamespace(
         time_s=np.array([0.0, 1.0]), kept=np.array([True, True]),
-        motion=SimpleNamespace(dcm_body_rate=np.eye(3), planet=earth.WGS84),
+        motion=SimpleNamespace(dcm_body_rate=np.eye(3), planet=earth.WGS84, clocks=True, drivers=20),
     )  # fmt: skip
     mounting = Mounting("2009-08-17T12:50:00Z", arm, rate)
     return datum_trajectory(problem, mounting, state, packed(np.tile(covariance, (2, 1, 1)))), arm
 
 
 def test_the_datum_errs_as_the_moved_state_does():
-    # one direction of all 27 errors: the covariance is the square of what the datum moves by
+    # one direction of all 29 errors: the covariance is the square of what the datum moves by
     rng = np.random.default_rng(2)
     state = States(
         np.tile([6.4e6, 1e5, 2e5], (2, 1)), np.tile([1e3, -2e3, 3e2], (2, 1)),
-        np.tile(rotations.exp(np.array([0.4, -0.2, 0.9])), (2, 1)), np.zeros((2, 18)),
+        np.tile(rotations.exp(np.array([0.4, -0.2, 0.9])), (2, 1)), np.zeros((2, 20)),
     )  # fmt: skip
     e = rng.normal(size=27) * np.repeat([1e-3, 1e-4, 1e-3, 1e-2, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4], 3)
-    made, arm = datum_of(state, np.outer(e, e) + 1e-24 * np.eye(27))
-    up, down = (datum_of(boxplus(state, np.tile(s * e, (2, 1))), np.eye(27))[0] for s in (1.0, -1.0))
+    e = np.append(e, [1e-3, 1e-3])  # clocks; that of the gyros moves the datum by 2 mm/s, twenty times the rest
+    made, arm = datum_of(state, np.outer(e, e) + 1e-24 * np.eye(29))
+    up, down = (datum_of(boxplus(state, np.tile(s * e, (2, 1))), np.eye(29))[0] for s in (1.0, -1.0))
     moved = 0.5 * difference(up, down)[0]
     size = np.abs(moved)
     for rows in (slice(0, 3), slice(3, 6), slice(6, 9)):
         got = made.covariance[0][rows, rows]
         np.testing.assert_allclose(got, np.outer(moved[rows], moved[rows]), atol=0.02 * size[rows].max() ** 2)
     # a sample's own noise of the rate moves the datum by its lever
-    quiet, _ = datum_of(state, 1e-24 * np.eye(27))
-    noisy, _ = datum_of(state, 1e-24 * np.eye(27), 0.02)
+    quiet, _ = datum_of(state, 1e-24 * np.eye(29))
+    noisy, _ = datum_of(state, 1e-24 * np.eye(29), 0.02)
     added = np.trace(noisy.covariance[0][3:6, 3:6] - quiet.covariance[0][3:6, 3:6])
     assert added == pytest.approx(2.0 * 0.02**2 * (arm @ arm), rel=1e-6)
 
