@@ -56,6 +56,7 @@ from recon import (
     survey,
     time_bias,
 )
+from recon._measurement_kernels import DECELERATION
 from recon.consistency import ConsistencyCheck, held_out_table
 from recon.ekf import Problem
 from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
@@ -618,6 +619,8 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
         covariance[:, 6:9] = 0.0
         covariance[:, :, 6:9] = 0.0
         covariance[:, range(6, 9), range(6, 9)] = _UNKNOWN_ROTATION_VAR
+        if any(i.kind == DECELERATION for i in problem.instruments):
+            covariance[:, 3:6, 3:6] += turned_velocity_cov(states.velocity_ecef_mps, covariance[:, 3:6, 3:6])
         return Trajectory(
             mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m, states.velocity_ecef_mps,
             states.q_ecef_body, np.tile(planet.rate_ecef_radps, (n, 1)), covariance, planet,
@@ -655,6 +658,22 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
         states.velocity_ecef_mps - np.einsum("nij,nj->ni", c, lever_velocity), states.q_ecef_body, omega, covariance,
         planet,
     )  # fmt: skip
+
+
+def turned_velocity_cov(velocity_mps: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Second-order part (n, 3, 3) of the covariance of velocities whose size a deceleration gives, not their direction.
+
+    Turned by an unknown lift, a velocity ``V`` that errs by ``c`` across has ``|c|^2 / (2 V)`` less along, of normal
+    ``c`` with covariance ``A`` a mean square of ``(tr(A)^2 + 2 tr(A^2)) / (4 V^2)``; ``V^2`` is that of both parts.
+    """
+    square = np.sum(velocity_mps**2, axis=1)
+    along = velocity_mps / np.sqrt(square)[:, None]
+    outer = along[:, :, None] * along[:, None, :]
+    across = np.eye(3) - outer
+    left = across @ covariance @ across
+    trace = np.trace(left, axis1=1, axis2=2)
+    mean = (trace**2 + 2.0 * np.sum(left**2, axis=(1, 2))) / (4.0 * (square + trace))
+    return np.asarray(mean[:, None, None] * outer)
 
 
 def corrected_series(

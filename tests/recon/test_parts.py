@@ -25,7 +25,7 @@ from recon.imu_screening import (
 )
 from recon.measurements import gnss_instruments, magnetometer_instrument
 from recon.propagation import strapdown_motion, with_disturbances, with_exact_integrals
-from recon.reconstruct import Mounting, corrected_series, datum_trajectory
+from recon.reconstruct import Mounting, corrected_series, datum_trajectory, turned_velocity_cov
 from recon.setup import fit_start
 from recon.state import States, boxplus, instrument_blocks, packed
 from recon.vector_attitude import _inconsistent_sensors, compare
@@ -262,6 +262,24 @@ def test_the_datum_errs_as_the_moved_state_does():
     noisy, _ = datum_of(state, 1e-24 * np.eye(29), 0.02)
     added = np.trace(noisy.covariance[0][3:6, 3:6] - quiet.covariance[0][3:6, 3:6])
     assert added == pytest.approx(2.0 * 0.02**2 * (arm @ arm), rel=1e-6)
+
+
+def test_a_velocity_turned_by_an_unknown_lift_is_shorter_along_its_estimate():
+    # drawn across by as much as is stated and turned, not stretched: the mean square of what is missing along
+    rng, speed = np.random.default_rng(3), 2000.0
+    root = np.array([[40.0, 0.0], [25.0, 90.0]])
+    c = rng.normal(size=(200000, 2)) @ root.T
+    missing = speed - np.sqrt(speed**2 - np.sum(c**2, axis=1))
+    turn = rotations.dcm_from_q(rotations.exp(np.array([0.3, -0.9, 0.4])))
+    velocity, cov = turn @ [speed, 0.0, 0.0], np.zeros((3, 3))
+    cov[1:, 1:] = root @ root.T
+    got = turned_velocity_cov(velocity[None], (turn @ cov @ turn.T)[None])[0]
+    along = turn.T @ got @ turn
+    assert along[0, 0] == pytest.approx(np.mean(missing**2), rel=0.03)
+    np.testing.assert_allclose(along - np.diag([along[0, 0], 0.0, 0.0]), 0.0, atol=1e-9)
+    # one hardly known at all errs along as it does across
+    lost = turned_velocity_cov(np.array([[1e-3, 0.0, 0.0]]), 100.0 * np.eye(3)[None])[0]
+    assert lost[0, 0] == pytest.approx(100.0 * (4.0 + 4.0) / (4.0 * 2.0), rel=1e-6)
 
 
 def test_two_attitudes_differ_as_both_may_err():
