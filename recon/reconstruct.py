@@ -391,6 +391,7 @@ def reconstruct_once(
     filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
     residuals = consistency.residual_table(problem, run.innovations)
     edits = consistency.edit_findings(problem, run.innovations.accepted)
+    about = run.charts
     del run  # as large as all that follows together
     if sensors is not None and adaptation.lag is None:
         more, adaptation = _oscillation_checks(telemetry, settings, sensors, problem, reference, adaptation)
@@ -429,7 +430,7 @@ def reconstruct_once(
             **_assumptions(telemetry),
         },
         adaptation=adaptation,
-        drag=drag_of_drivers(problem, reference, smoothed.triangles, path)
+        drag=drag_of_drivers(problem, reference, smoothed.triangles, path, about)
         if sensors is None
         else drag_of_readings(telemetry, path, series[0], series[1], series[3]),
     )

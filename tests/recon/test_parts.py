@@ -13,6 +13,7 @@ from flightmodel.trajectory import Trajectory, difference
 from recon import reconstruct
 from recon._measurement_kernels import RADAR
 from recon.consistency import source_checks
+from recon.entry_density import _spread
 from recon.fault_isolation import _compared
 from recon.imu_screening import (
     _bridges,
@@ -262,6 +263,16 @@ def test_the_datum_errs_as_the_moved_state_does():
     noisy, _ = datum_of(state, 1e-24 * np.eye(29), 0.02)
     added = np.trace(noisy.covariance[0][3:6, 3:6] - quiet.covariance[0][3:6, 3:6])
     assert added == pytest.approx(2.0 * 0.02**2 * (arm @ arm), rel=1e-6)
+
+
+def test_what_a_straight_line_leaves_of_an_exponential_spreads_over_the_density_s_length():
+    # linearised a logarithm of 0.8 too low, 1.8 was taken for exp(0.8): 19 % of the density found
+    height = np.array([130e3, 125e3, 120e3, 120e3])
+    error = np.array([np.exp(0.8) - 1.8, 0.0, 0.0, 0.0]) / np.exp(0.8)
+    np.testing.assert_allclose(_spread(error, height), error[0] * np.exp([0.0, -1.0, -2.0, -2.0]), rtol=1e-12)
+    np.testing.assert_allclose(
+        _spread(error[::-1], height[::-1]), error[0] * np.exp([-2.0, -2.0, -1.0, 0.0]), rtol=1e-12
+    )
 
 
 def test_a_velocity_turned_by_an_unknown_lift_is_shorter_along_its_estimate():
