@@ -124,7 +124,7 @@ def kept_flight(folder, seed):
     """Return `FlightLoads` and truth of a flight that was kept."""
     with np.load(kept_path(folder, seed)) as data:
         arrays = {k: data[f"pulse_{k}"] for k in ARRAYS}
-        for name in ("angular_acceleration_sd_radps2", "force_noise_sd_mps2", "half_window_s"):
+        for name in ("angular_acceleration_sd_radps2", "force_noise_sd_mps2", "half_window_s", "swing_radps"):
             arrays[name] = float(arrays[name])
         truth = {k.removeprefix("true_"): data[k] for k in data.files if k.startswith("true_")}
     one = wide_flights.wide_flight(seed, bent=bool(truth.get("bent", False)))

@@ -1,6 +1,6 @@
 """How are the deflection's spline and the inputs found together? Normal equations that stay a band.
 
-The deflection's lateral vector is a cubic spline with knots `KNOT_S` apart, of which four basis functions differ from
+The deflection's lateral vector is a cubic spline with even knots, of which four basis functions differ from
 zero at a time: rows of the least-squares problem are sparse in its coefficients, and their normal matrix ``N`` is a
 band, whatever the length of the flight. Only the inputs' unit normals ``x`` are dense. With ``C`` the block across and
 ``Q`` the process's precision, the inputs' precision and mean are those of the Schur complement
@@ -27,7 +27,8 @@ from scipy.sparse import coo_array, csr_array, dia_array, eye_array, kron
 from estimators.evidence import Deflection
 from flightmodel.checks import DivergenceError, FloatArray
 
-KNOT_S = 0.1  # a quarter of the joint's period: knots at half of it cannot follow its oscillation
+# longest spacing of knots: a quarter of a joint's period of 0.4 s; knots at half of a period cannot follow it
+KNOT_S = 0.1
 # a priori of the process's size, median and sd of its logarithm: a degree of swing at 2 Hz, between a degree at 0.5 Hz
 # and ten at 3 Hz
 SIZE_RADPS2, SIZE_LOG_SD = 3.0, 1.5
@@ -50,16 +51,17 @@ class InputPosterior:
 
 @dataclass(frozen=True)
 class Spline:
-    """Cubic B-spline of ``count`` coefficients with even knots."""
+    """Cubic B-spline of ``count`` coefficients with knots ``step_s`` apart."""
 
     knots_s: FloatArray
     count: int
+    step_s: float
 
     @classmethod
-    def over(cls, low: float, high: float) -> Spline:
+    def over(cls, low: float, high: float, step_s: float = KNOT_S) -> Spline:
         """Spline whose knots reach from ``low`` to ``high``, s."""
-        knots = low + KNOT_S * np.arange(max(int(np.ceil((high - low) / KNOT_S)), 1) + 1)
-        return cls(np.asarray(knots), len(knots) + 2)
+        knots = low + step_s * np.arange(max(int(np.ceil((high - low) / step_s)), 1) + 1)
+        return cls(np.asarray(knots), len(knots) + 2, step_s)
 
     @cached_property
     def stiffness(self) -> csr_array:
@@ -69,7 +71,7 @@ class Spline:
 
     def at(self, time_s: FloatArray, derivative: int = 0) -> tuple[NDArray[np.int64], FloatArray]:
         """Numbers (n, 4) and values of the basis functions that differ from zero at times (n,), or of derivatives."""
-        at = (np.clip(time_s, self.knots_s[0], self.knots_s[-1]) - self.knots_s[0]) / KNOT_S
+        at = (np.clip(time_s, self.knots_s[0], self.knots_s[-1]) - self.knots_s[0]) / self.step_s
         first = np.asarray(np.minimum(at.astype(np.int64), len(self.knots_s) - 2))
         u = at - first
         if derivative == 0:
@@ -80,7 +82,7 @@ class Spline:
             value = [-3.0 * rest**2, (9.0 * u - 12.0) * u, (12.0 - 9.0 * rest) * rest, 3.0 * u**2]
         else:
             value = [6.0 * (1.0 - u), 18.0 * u - 12.0, 6.0 - 18.0 * u, 6.0 * u]
-        return first[:, None] + np.arange(4), np.column_stack(value) / (6.0 * KNOT_S**derivative)
+        return first[:, None] + np.arange(4), np.column_stack(value) / (6.0 * self.step_s**derivative)
 
     def rows(self, time_s: FloatArray, derivative: int = 0) -> csr_array:
         """Values (n, count) of every basis function, or of its first or second derivative."""

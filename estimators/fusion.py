@@ -44,6 +44,7 @@ from scipy.sparse import csr_array, eye_array, kron
 
 from estimators.deflection_spline import (
     FREE_RADPS2,
+    KNOT_S,
     InputPosterior,
     Inputs,
     NormalEquations,
@@ -94,9 +95,11 @@ def places(of: Iterable[dict[str, FloatArray]]) -> dict[str, slice]:
     return out
 
 
-def equations_of(readings: list[Evidence], inputs: Inputs, span_s: tuple[float, float]) -> NormalEquations:
+def equations_of(
+    readings: list[Evidence], inputs: Inputs, span_s: tuple[float, float], knot_s: float = KNOT_S
+) -> NormalEquations:
     """Equations of the methods' readings at ``inputs``; the spline reaches over ``span_s``."""
-    spline, place = Spline.over(*span_s), places(e.by_input for e in readings)
+    spline, place = Spline.over(*span_s, knot_s), places(e.by_input for e in readings)
     return NormalEquations.of_rows(spline, place, (whitened(one, spline, place, inputs) for one in readings))
 
 
@@ -197,6 +200,7 @@ def fuse(
     near_s: float = _NEAR_S,
     *,
     free_process: bool = True,
+    knot_s: float = KNOT_S,
 ) -> Fused:
     """Fuse the methods' readings; one method alone is smoothed.
 
@@ -214,6 +218,8 @@ def fuse(
     free_process : bool
         False gives the process, of its most probable size, a say in the inputs: those of several films are the films'
         own errors, and the deflection does not step where one film ends. How far these are off is then not limited.
+    knot_s : float
+        Spacing of the spline's knots.
 
     Raises
     ------
@@ -229,10 +235,10 @@ def fuse(
         )
     methods = [e.method for e in readings]
     # first every sample by itself, without shared errors: a deflection to be linear about
-    inputs: Inputs = _initial_time_bias(readings, method)
+    inputs: Inputs = _initial_time_bias(readings, method, knot_s)
     span = span_of(readings)
     alone = [_uncorrelated(moved_evidence(e, inputs)) for e in readings]
-    problem = equations_of(alone, {}, span)
+    problem = equations_of(alone, {}, span, knot_s)
     found, size_radps2 = problem.mean(problem.process_size(), method), FREE_RADPS2
     about = problem.history(found)
     for step in range(MOST_STEPS):
@@ -242,7 +248,7 @@ def fuse(
                 f"{method}: the steps lead to deflections at which no method has an answer; see each method's own",
                 code="fusion-not-converged",
             )
-        problem, before = equations_of(readings, inputs, span), found
+        problem, before = equations_of(readings, inputs, span, knot_s), found
         if not free_process and step < _WHOLE_STEPS:  # then held: its own small changes would go on moving the inputs
             size_radps2 = problem.without_inputs().process_size()
         answer = problem.solved(size_radps2, method)
@@ -353,7 +359,7 @@ def span_of(readings: list[Evidence]) -> tuple[float, float]:
     return float(low), float(max(e.time_s[-1] + w for e, w in zip(readings, wide, strict=True)))
 
 
-def time_bias_is_observable(read: Read) -> bool:
+def time_bias_is_observable(read: Read, knot_s: float = KNOT_S) -> bool:
     """Whether the deflection by the methods with the gyros' time tags moves enough for a time bias to be observed.
 
     A constant deflection fits any time bias, and the rate of mere noise would fit a wrong one with a small sd.
@@ -364,7 +370,7 @@ def time_bias_is_observable(read: Read) -> bool:
         return False
     span = span_of(own)
     # a constant error does not move
-    problem = equations_of([replace(e, by_input={}) for e in own], {}, span)
+    problem = equations_of([replace(e, by_input={}) for e in own], {}, span, knot_s)
     try:
         answer = problem.solved(problem.process_size(), "camera time bias")
     except DivergenceError:
@@ -377,7 +383,7 @@ def time_bias_is_observable(read: Read) -> bool:
     return square > MOVES**2 * variance
 
 
-def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
+def _initial_time_bias(readings: list[Evidence], method: str, knot_s: float) -> Inputs:
     """Time bias to start from, in its standard deviations; none where all methods share the gyros' time tags.
 
     The joint oscillates several times within the bias's a priori sd: the sum of squares has a minimum at every period,
@@ -387,7 +393,7 @@ def _initial_time_bias(readings: list[Evidence], method: str) -> Inputs:
     if not off or not own:
         return {}
     span = span_of(own)
-    problem = equations_of([_uncorrelated(e) for e in own], {}, span)
+    problem = equations_of([_uncorrelated(e) for e in own], {}, span, knot_s)
     deflection = problem.history(problem.mean(problem.process_size(), method))
     starts = {one.time_bias: _lowest_bias_sd(one, deflection, span) for one in off}
     return {name: np.array([bias_sd]) for name, bias_sd in starts.items() if bias_sd is not None}
@@ -440,6 +446,11 @@ class LoadsReader:
         return [*out, *(moved_evidence(other, inputs, about) for other in self.others)]
 
 
+def knots_of(loads: FlightLoads) -> float:
+    """Spacing, s, of knots that follow the vehicle's swing: a quarter of its period, `KNOT_S` at most."""
+    return min(KNOT_S, loads.quarter_swing_s)
+
+
 def loads_reader(loads: FlightLoads, methods: dict[str, Method], others: list[Evidence]) -> LoadsReader:
     """Reader of the loads through the pressure pulse."""
     pulse = loads.rows(loads.through_pulse)
@@ -447,10 +458,10 @@ def loads_reader(loads: FlightLoads, methods: dict[str, Method], others: list[Ev
 
 
 def _smoothed_loads(loads: FlightLoads) -> FlightLoads:
-    """Loads with force, rate and angular acceleration smoothed to a spline with knots `KNOT_S` apart."""
+    """Loads with force, rate and angular acceleration smoothed to a spline with the deflection's knots."""
     t = loads.time_s
     as_read = [loads.specific_force_body_mps2, loads.rate_body_radps, loads.angular_acceleration_body_radps2]
-    smooth = Spline.over(float(t[0]), float(t[-1])).smooth(t, np.hstack(as_read))
+    smooth = Spline.over(float(t[0]), float(t[-1]), knots_of(loads)).smooth(t, np.hstack(as_read))
     force, rate, turn = map(np.ascontiguousarray, np.hsplit(smooth, 3))
     return replace(loads, specific_force_body_mps2=force, rate_body_radps=rate, angular_acceleration_body_radps2=turn)
 

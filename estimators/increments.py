@@ -43,7 +43,7 @@ from scipy.sparse import csr_array, diags_array
 from estimators.balance import Swing, axial_residual
 from estimators.deflection_spline import FREE_RADPS2, InputPosterior, Inputs, NormalEquations, Rows, Spline, inverse
 from estimators.evidence import Deflection, Evidence, corrected_loads, input_responses, swing_responses
-from estimators.fusion import Fused, LoadsReader, places, shares_of_spans, span_of, whitened
+from estimators.fusion import Fused, LoadsReader, knots_of, places, shares_of_spans, span_of, whitened
 from estimators.loads import FlightLoads
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.atmosphere import DENSITY_LENGTH_M, unresolved_variance
@@ -285,7 +285,7 @@ def _equations(reader: LoadsReader, about: Deflection, inputs: Inputs, slopes: _
         mach = np.exp(np.interp(one.time_s, pulse.time_s, np.log(pulse.mach)))
         by_input = slopes.along(one.by_input, mach)
         readings.append(replace(one, by_input=by_input, averaged_s=min(one.averaged_s, _AVERAGED_S)))
-    spline = Spline.over(*span_of(readings))
+    spline = Spline.over(*span_of(readings), knots_of(pulse))
     axial = _axial_reading(reader, about, others, spline)
     by_input = slopes.along(axial.by_input, pulse.mach)
     # a coefficient that nothing depends on, as one that is stated to be known, has its place too

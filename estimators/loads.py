@@ -58,6 +58,8 @@ class FlightLoads:
     half_window_s : float
         Force and rate are means over so much to both sides; the angular acceleration is the difference of the rate's
         means over whole windows before and after.
+    swing_radps : float
+        Fastest that lateral vectors swing in body axes: rigid pitching and spin; 0: as slow as may be.
 
     Raises
     ------
@@ -88,6 +90,7 @@ class FlightLoads:
     gyro_time_bias_sd_s: float = 0.0
     cg_from_sensor_m: FloatArray = field(default_factory=lambda: np.zeros(3))
     half_window_s: float = 0.0
+    swing_radps: float = 0.0
 
     def __post_init__(self) -> None:
         """Check shapes once."""
@@ -114,6 +117,13 @@ class FlightLoads:
     def informative(self) -> BoolArray:
         """Mask ``(n,)`` of samples where the deceleration is large enough."""
         return -self.specific_force_body_mps2[:, 0] >= MIN_AXIAL_MPS2
+
+    @property
+    def quarter_swing_s(self) -> float:
+        """A quarter of the fastest swing's period, at least the samples' spacing, s; infinite where it is not given."""
+        if self.swing_radps == 0.0 or len(self.time_s) < 2:
+            return np.inf
+        return max(0.5 * np.pi / self.swing_radps, float(np.median(np.diff(self.time_s))))
 
     @property
     def through_pulse(self) -> BoolArray:

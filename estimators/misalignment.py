@@ -27,7 +27,7 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 
-_AVERAGED_S = 0.1  # short against the period of the joint, 0.4 s
+_AVERAGED_S = 0.1  # at most: a quarter of a joint's period of 0.4 s
 # each step contracts by d atan(C_N/C_A)/d alpha, at most 0.15: twelve leave 1e-10
 _ITERATIONS = 12
 _ASSUMPTIONS = (
@@ -101,7 +101,8 @@ def misalignment_evidence(loads: FlightLoads, about: Deflection | None = None, w
         False leaves the responses to inputs and the noise out.
     """
     swing = _own_swing(loads) if about is None else Swing.of(about, loads.time_s)
-    return evidence_of_balance("misalignment", force_residual, loads, swing, _AVERAGED_S, with_inputs)
+    averaged_s = min(_AVERAGED_S, loads.quarter_swing_s)
+    return evidence_of_balance("misalignment", force_residual, loads, swing, averaged_s, with_inputs)
 
 
 def estimate_misalignment(loads: FlightLoads) -> DeflectionHistory:

@@ -28,6 +28,7 @@ from estimators.fusion import (
     Method,
     Read,
     fuse,
+    knots_of,
     loads_reader,
     time_bias_is_observable,
 )
@@ -202,7 +203,7 @@ def fuse_flight(
         )
 
     sources = _Sources(loads, camera)
-    observable = camera is not None and time_bias_is_observable(sources.reader(sources.names, _WIDE_BIAS_SD_S))
+    observable = camera is not None and sources.shows_time_bias()
     bias_sd_s = camera_time_bias_sd_s if observable else 0.0
     bias = _tested_time_bias(sources) if observable and bias_sd_s == 0.0 else None
     try:
@@ -253,10 +254,14 @@ class _Sources:
             others = [evidence_of_history(self.camera, bias_sd_s, CAMERA_PLANE_SD_RAD)]
         return loads_reader(self.loads, {n: m for n, m in _METHODS.items() if n in names}, others)
 
+    def shows_time_bias(self) -> bool:
+        """Whether the deflection moves enough for the camera's time bias to be observed."""
+        return time_bias_is_observable(self.reader(self.names, _WIDE_BIAS_SD_S), knots_of(self.loads))
+
     def answer(self, names: tuple[str, ...], bias_sd_s: float, freed: tuple[str, ...] = ()) -> FusedAnswer:
         """Common posterior of some methods and the test of their agreement; `DivergenceError` without one."""
         read = self.reader(names, bias_sd_s, freed)
-        fused = fuse(read)
+        fused = fuse(read, knot_s=knots_of(self.loads))
         # at the stated inputs, but with the readings' slopes at the posterior's: far inputs are curved
         inputs = {name: mean for name, (mean, _) in fused.inputs.items()}
         back = {name: -mean for name, mean in inputs.items()}
@@ -374,7 +379,8 @@ def _limbs(fused: Fused, loads: FlightLoads) -> tuple[Limbs | None, str]:
 def _tested_time_bias(sources: _Sources) -> CameraTimeBias | None:
     """Estimate of a camera time bias stated as zero; None where there is no common answer with it free."""
     try:
-        return _time_bias(fuse(sources.reader(sources.names, _WIDE_BIAS_SD_S)), _WIDE_BIAS_SD_S, False)
+        read = sources.reader(sources.names, _WIDE_BIAS_SD_S)
+        return _time_bias(fuse(read, knot_s=knots_of(sources.loads)), _WIDE_BIAS_SD_S, False)
     except DivergenceError:
         return None
 

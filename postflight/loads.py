@@ -82,6 +82,7 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
         gyro_time_bias_sd_s=rates.spec.time_bias_sd_s,
         cg_from_sensor_m=arm,
         half_window_s=h,
+        swing_radps=turning_radps,
     )
 
 

@@ -407,9 +407,10 @@ def velocity_rows(m, count, c, sweep, pulled, by_state, by_error):
 
 @inlined
 def gyro_rows(m, count, arm, c, rate, by_error):
-    """Partials of a velocity along the first axes of ``m`` (3, 3) by the gyros' errors, slots 4 to 12.
+    """Partials of a velocity along the first axes of ``m`` (3, 3) by the gyros' errors, slots 4 to 13.
 
-    ``m C (dw x d)``. Left out, of what a late tag adds to it: a twentieth at 37 rad/s and a millisecond.
+    ``m C (dw x d)``; of a late clock ``dw = w'``: without it the filter would find by how much all clocks are late
+    alike, which nothing shows. Left out, of what a late tag adds: a twentieth at 37 rad/s and a millisecond.
     """
     row, lever = np.empty(3), np.empty(3)
     for i in range(count):
@@ -418,6 +419,7 @@ def gyro_rows(m, count, arm, c, rate, by_error):
         cross_into(arm, row, lever)  # row . (dw x d) = dw . (d x row)
         for j in range(9):
             by_error[i, 4 + j] = rate[3 + j, 0] * lever[0] + rate[3 + j, 1] * lever[1] + rate[3 + j, 2] * lever[2]
+        by_error[i, 13] = rate[1, 0] * lever[0] + rate[1, 1] * lever[1] + rate[1, 2] * lever[2]
 
 
 @inlined

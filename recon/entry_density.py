@@ -48,9 +48,12 @@ from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory
 from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import Problem
+from recon.propagation import Motion
 from recon.state import KINEMATIC, States, unpacked
 
 LEAST_KNOWN = 0.5  # fractional sd of density, C_A apart, from which a row is given
+# and of the deceleration, an exponential of what is estimated: the second order, half its square, is then a tenth of it
+_LEAST_FELT = 0.2
 _HALF_WINDOW_S = 0.25  # of an axial reading
 _INDEPENDENT_M = 2.0 * DENSITY_LENGTH_M  # thickness of layers in which the stated density errs each by itself
 _LAYER_M = 250.0  # over which rows are one knot of the atmosphere as flown: a fortieth of Mars's scale height
@@ -75,13 +78,19 @@ class DragHistory:
     pressure_sd: FloatArray
 
 
-def drag_of_drivers(problem: Problem, states: States, triangles: FloatArray, path: Trajectory) -> DragHistory:
-    """Drag of ballistic flight at the kept nodes, from states at all nodes and packed covariances at the kept ones."""
-    motion, at = problem.motion, states[np.flatnonzero(problem.kept)]
+def drag_of_drivers(
+    problem: Problem, states: States, triangles: FloatArray, path: Trajectory, about: States
+) -> DragHistory:
+    """Drag of ballistic flight at the kept nodes, from states at all nodes and packed covariances at the kept ones.
+
+    ``about`` are the states at all nodes about which readings were linearised. The drag is an exponential: where the
+    smoother moved its logarithm by ``m`` it took ``1 + m`` for ``exp(m)``, and what that errs is in the sd.
+    """
+    motion, kept = problem.motion, np.flatnonzero(problem.kept)
+    at = states[kept]
     latitude, longitude, height = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)
-    row = (height - motion.air_from_m) / motion.air_step_m
-    grid = np.arange(len(motion.air))
-    log_density, wind_north, wind_east, density_sd, wind_sd = (np.interp(row, grid, c) for c in motion.air.T)
+    row, grid = (height - motion.air_from_m) / motion.air_step_m, np.arange(len(motion.air))
+    _, wind_north, wind_east, density_sd, wind_sd = (np.interp(row, grid, c) for c in motion.air.T)
     steeper = np.interp(row + 0.5, grid, motion.air[:, 0]) - np.interp(row - 0.5, grid, motion.air[:, 0])
     ned = earth.dcm_ned_ecef(latitude, longitude)
     drivers = at.sensor_errors[:, :6]
@@ -95,9 +104,29 @@ def drag_of_drivers(problem: Problem, states: States, triangles: FloatArray, pat
     to_force = by.copy()
     to_force[:, 3:6] = 2.0 * along
     to_force[:, KINEMATIC + 4 :] = -2.0 * wind_sd[:, None] * np.einsum("nij,nj->ni", ned[:, :2], along)
-    log_drag = np.log(motion.drag_m2pkg) + log_density + drivers[:, 0] + drivers[:, 3] * density_sd
-    sd, force_sd = (np.sqrt(np.einsum("ni,nij,nj->n", j, covariance, j)) for j in (by, to_force))
+    log_drag = _log_drag(motion, at)
+    moved = log_drag - _log_drag(motion, about[kept])
+    left_out = _spread(np.abs(1.0 - (1.0 + moved) * np.exp(-moved)), height)
+    sd, force_sd = (np.hypot(np.sqrt(np.einsum("ni,nij,nj->n", j, covariance, j)), left_out) for j in (by, to_force))
     return DragHistory(log_drag, sd, force_sd)
+
+
+def _log_drag(motion: Motion, at: States) -> FloatArray:
+    """Logarithm (n,) of the drag over the velocity's square."""
+    row = (earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)[2] - motion.air_from_m) / motion.air_step_m
+    log_density, density_sd = (np.interp(row, np.arange(len(motion.air)), motion.air[:, c]) for c in (0, 3))
+    drivers = at.sensor_errors
+    return np.asarray(np.log(motion.drag_m2pkg) + log_density + drivers[:, 0] + drivers[:, 3] * density_sd)
+
+
+def _spread(error: FloatArray, height_m: FloatArray) -> FloatArray:
+    """Errors (n,) with those of their neighbours, which share the density's process, as it decorrelates with height."""
+    out, stays = error.copy(), np.exp(-np.abs(np.diff(height_m)) / DENSITY_LENGTH_M)
+    for k in range(1, len(out)):
+        out[k] = max(out[k], stays[k - 1] * out[k - 1])
+    for k in range(len(out) - 2, -1, -1):
+        out[k] = max(out[k], stays[k] * out[k + 1])
+    return out
 
 
 def drag_of_readings(
@@ -136,7 +165,7 @@ def density_by_drag(telemetry: Telemetry, path: Trajectory, history: DragHistory
     profile = profile_from_sounding(telemetry.sounding)
     air = air_data(path, profile, np.zeros(3))
     rho = np.exp(history.log_drag) / drag.area_per_mass_m2pkg(air.mach)
-    known = np.isfinite(history.sd) & (history.sd < LEAST_KNOWN) & np.isfinite(rho)
+    known = (history.sd < LEAST_KNOWN) & (history.pressure_sd < _LEAST_FELT) & np.isfinite(rho)
     rho, own_sd, sd = rho[known], history.sd[known], np.hypot(history.sd, drag.sd)[known]
     pressure, weight_sd = _weight_of_air(path, air, profile, known, rho, own_sd)
     # the uppermost row's temperature is the stated one, whose error the weight has too

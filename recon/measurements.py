@@ -7,7 +7,8 @@ tag minus true time), so
 
 with ``w`` the body's rate against the Earth at the tag, by the gyros' own clock, ``a`` and ``f`` the acceleration of
 the accelerometer and its specific force, and ``s = w' x d + w x (w x d)``; of ``j`` what turns with a fast vehicle.
-Errors of the gyros move ``dp/dt`` by ``C (dw x d)``. Then, each plus its errors and noise:
+Errors of the gyros move ``dp/dt`` by ``C (dw x d)``, a clock late by ``e`` by ``dw = e w'``. Then, each plus its errors
+and noise:
 
 * radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95), the lag of its servo
   (`recon.tracking_servo`, ``1 + e`` times the one of the path about which one is linearised), residual
@@ -76,7 +77,7 @@ _STATES = instruments.RADAR.states
 _RANGE_RATE_AT = _STATES.index("range rate bias")  # a reading of its own, with two errors
 _OWN_RADAR, _DOPPLER, _LAST = _STATES[:_RANGE_RATE_AT], _STATES[_RANGE_RATE_AT:-2], _STATES[-2:]
 # errors that the velocity of a point beside the accelerometer depends on
-_GYROS = instruments.RATES.states[:9]
+_GYROS = (*instruments.RATES.states[:9], "time bias")
 # time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
     RADAR: (*_OWN_RADAR, *instruments.SITES.states, *_LAST),
@@ -89,7 +90,7 @@ SLOT_NAMES: dict[int, tuple[str, ...]] = {
     DECELERATION: ("bias", "scale", "", "time bias", *(name for _, name in DRIVERS)),
 }
 _OWNERS = {DECELERATION: dict(enumerate((owner for owner, _ in DRIVERS), start=4))}  # of slots that are not its own
-_OWNERS |= dict.fromkeys((VELOCITY, RANGE_RATE), dict.fromkeys(range(4, 13), "rates"))
+_OWNERS |= dict.fromkeys((VELOCITY, RANGE_RATE), dict.fromkeys(range(4, 14), "rates"))
 
 
 def component_unit(component: str) -> str:
@@ -358,8 +359,8 @@ def sun_instruments(name: str, record: SunRecord, sun_ecef: FloatArray, rows: In
 class NodeMotion:
     """Attitude matrix, turning in body axes and acceleration against the Earth.
 
-    Turning (12, 3) are the inertial rate, its rate of change, the specific force, and the rate's partials by the gyros'
-    nine errors.
+    Turning (12, 3) are the inertial rate, its rate of change (the partial by the gyros' clock as well), the specific
+    force, and the rate's partials by the gyros' nine other errors.
     """
 
     position_ecef_m: FloatArray
@@ -405,12 +406,12 @@ def predict(
     speed, pulled = moving - tau * pulled + 0.5 * tau**2 * c @ jerk, pulled - tau * c @ jerk
     effective = arm - tau * (lever_velocity - 0.5 * tau * swing) - tau**3 / 6.0 * jerk
     sweep = lever_velocity - tau * swing + 0.5 * tau**2 * jerk
-    by_gyros = -c @ rotations.skew(arm) @ at.turning_body[3:].T
+    by_gyros = -c @ rotations.skew(arm) @ at.turning_body[[*range(3, 12), 1]].T
     if instrument.kind == VELOCITY:
         by_state[:, 3:6] = instrument.dcm
         by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(sweep)
         by_error[:, 0:3] = np.eye(3)
-        by_error[:, 3], by_error[:, 4:13] = -instrument.dcm @ pulled, instrument.dcm @ by_gyros
+        by_error[:, 3], by_error[:, 4:14] = -instrument.dcm @ pulled, instrument.dcm @ by_gyros
         return instrument.dcm @ speed + e[0:3], by_state, by_error
     if instrument.kind == RANGE_RATE:
         sight = point - instrument.site_ecef_m
@@ -420,7 +421,7 @@ def predict(
         by_state[0, 6:9] = -u @ c @ rotations.skew(sweep)
         by_state[0, 6:9] -= across @ c @ rotations.skew(effective)
         by_error[0, 0:2], by_error[0, 3] = 1.0, -across @ speed - u @ pulled
-        by_error[0, 4:13] = by_state[0, 3:6] @ by_gyros
+        by_error[0, 4:14] = by_state[0, 3:6] @ by_gyros
         return np.array([u @ speed + e[0] + e[1], 0.0, 0.0]), by_state, by_error
     if instrument.kind == RADAR:
         h, m = _radar(instrument, known, e, point, by_error)

@@ -21,8 +21,8 @@ axes) to the datum:
     p = p_imu - C r,   v = v_imu - C (w x r),   w = gyro rate - C^T W
 
 and the errors move with them: ``dp = dp_imu + C [r x] d``, ``dv = dv_imu + C [(w x r) x] d + C [r x] dw`` with
-rotation error ``d`` and rate error ``dw`` from the gyros' estimated errors and white noise. In ballistic flight the
-tracked point is the datum and the attitude unknown, with the covariance of an unknown attitude.
+rotation error ``d`` and rate error ``dw`` from the gyros' estimated errors, their clock's too, and white noise. In
+ballistic flight the tracked point is the datum and the attitude unknown, with the covariance of an unknown attitude.
 
 References
 ----------
@@ -56,6 +56,7 @@ from recon import (
     survey,
     time_bias,
 )
+from recon._measurement_kernels import DECELERATION
 from recon.consistency import ConsistencyCheck, held_out_table
 from recon.ekf import Problem
 from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
@@ -73,7 +74,7 @@ from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem
 from recon.single_faults import Single, SingleFault
 from recon.smoother import Smoothed
-from recon.state import INERTIAL, KINEMATIC, States, unpacked
+from recon.state import KINEMATIC, States, unpacked
 from recon.tracking_servo import with_servo_lag
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
@@ -390,6 +391,7 @@ def reconstruct_once(
     filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
     residuals = consistency.residual_table(problem, run.innovations)
     edits = consistency.edit_findings(problem, run.innovations.accepted)
+    about = run.charts
     del run  # as large as all that follows together
     if sensors is not None and adaptation.lag is None:
         more, adaptation = _oscillation_checks(telemetry, settings, sensors, problem, reference, adaptation)
@@ -428,7 +430,7 @@ def reconstruct_once(
             **_assumptions(telemetry),
         },
         adaptation=adaptation,
-        drag=drag_of_drivers(problem, reference, smoothed.triangles, path)
+        drag=drag_of_drivers(problem, reference, smoothed.triangles, path, about)
         if sensors is None
         else drag_of_readings(telemetry, path, series[0], series[1], series[3]),
     )
@@ -618,13 +620,20 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
         covariance[:, 6:9] = 0.0
         covariance[:, :, 6:9] = 0.0
         covariance[:, range(6, 9), range(6, 9)] = _UNKNOWN_ROTATION_VAR
+        if any(i.kind == DECELERATION for i in problem.instruments):
+            covariance[:, 3:6, 3:6] += turned_velocity_cov(states.velocity_ecef_mps, covariance[:, 3:6, 3:6])
         return Trajectory(
             mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m, states.velocity_ecef_mps,
             states.q_ecef_body, np.tile(planet.rate_ecef_radps, (n, 1)), covariance, planet,
         )  # fmt: skip
     motion = problem.motion
-    measured = interpolate_rows(problem.time_s[kept], mounting.rate.time_s, mounting.rate.measured_sensor)
-    errors = states.sensor_errors[:, 9:18]
+    rate, errors = mounting.rate, states.sensor_errors[:, 9:18]
+    tagged = problem.time_s[kept] + (states.sensor_errors[:, 19] if motion.clocks else 0.0)
+    step = float(np.median(np.diff(rate.time_s)))
+    before, measured, after = (
+        interpolate_rows(at, rate.time_s, rate.measured_sensor) for at in (tagged - step, tagged, tagged + step)
+    )
+    slope = (after - before) / (2.0 * step)
     c = rotations.dcm_from_q(states.q_ecef_body)
     omega = correct(measured, errors, motion.dcm_body_rate)
     r = mounting.arm_body_m
@@ -634,19 +643,38 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
     for first in range(0, n, _NODES):  # unpacked, the nodes' covariances are the largest of all arrays
         k = slice(first, first + _NODES)
         lever = c[k] @ rotations.skew(r)
-        move = np.zeros((len(lever), 9, 27))
+        by_gyros = lever @ correction_partials(measured[k], errors[k], motion.dcm_body_rate)
+        move = np.zeros((len(lever), 9, KINEMATIC + motion.drivers))
         move[:, range(9), range(9)] = 1.0
         move[:, 0:3, 6:9] = lever
         move[:, 3:6, 6:9] = c[k] @ rotations.skew(lever_velocity[k])
-        move[:, 3:6, 18:27] = lever @ correction_partials(measured[k], errors[k], motion.dcm_body_rate)
-        moved = move @ unpacked(triangles[k], INERTIAL) @ np.swapaxes(move, 1, 2)
-        moved[:, 3:6, 3:6] += mounting.rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
+        move[:, 3:6, 18:27] = by_gyros
+        if motion.clocks:  # a late tag reads too little of what grows, as a bias would
+            move[:, 3:6, 28] = -np.einsum("nij,nj->ni", by_gyros[:, :, 0:3], slope[k])
+        moved = move @ unpacked(triangles[k], move.shape[2]) @ np.swapaxes(move, 1, 2)
+        moved[:, 3:6, 3:6] += rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
         covariance[k] = 0.5 * (moved + np.swapaxes(moved, 1, 2))
     return Trajectory(
         mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m - c @ r,
         states.velocity_ecef_mps - np.einsum("nij,nj->ni", c, lever_velocity), states.q_ecef_body, omega, covariance,
         planet,
     )  # fmt: skip
+
+
+def turned_velocity_cov(velocity_mps: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Second-order part (n, 3, 3) of the covariance of velocities whose size a deceleration gives, not their direction.
+
+    Turned by an unknown lift, a velocity ``V`` that errs by ``c`` across has ``|c|^2 / (2 V)`` less along, of normal
+    ``c`` with covariance ``A`` a mean square of ``(tr(A)^2 + 2 tr(A^2)) / (4 V^2)``; ``V^2`` is that of both parts.
+    """
+    square = np.sum(velocity_mps**2, axis=1)
+    along = velocity_mps / np.sqrt(square)[:, None]
+    outer = along[:, :, None] * along[:, None, :]
+    across = np.eye(3) - outer
+    left = across @ covariance @ across
+    trace = np.trace(left, axis1=1, axis2=2)
+    mean = (trace**2 + 2.0 * np.sum(left**2, axis=(1, 2))) / (4.0 * (square + trace))
+    return np.asarray(mean[:, None, None] * outer)
 
 
 def corrected_series(

@@ -315,7 +315,8 @@ def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, at
     if sensors is None:
         blocks = ballistic_blocks(telemetry.motion)
         if telemetry.accelerometer is not None and telemetry.motion.trim_sd_rad > 0.0:
-            blocks += deceleration_blocks(telemetry.accelerometer.spec, telemetry.motion.trim_sd_rad)
+            tracked = bool(telemetry.radars or telemetry.gnss or telemetry.barometers)
+            blocks += deceleration_blocks(telemetry.accelerometer.spec, telemetry.motion.trim_sd_rad, tracked)
     else:
         blocks = imu_blocks(sensors.force.spec, sensors.rate.spec)
     for radar in telemetry.radars.values():

@@ -42,7 +42,7 @@ from flightmodel.instruments import (
 from flightmodel.telemetry import Motion as MotionSpec
 
 POSITION, VELOCITY, ROTATION = slice(0, 3), slice(3, 6), slice(6, 9)
-KINEMATIC, INERTIAL = 9, 27
+KINEMATIC = 9
 # of ballistic motion, owner and name
 DRIVERS = (
     ("vehicle", "drag"), ("vehicle", "side force across"), ("vehicle", "side force within"),
@@ -283,11 +283,14 @@ def imu_blocks(force: TriadSpec, rate: TriadSpec) -> list[Block]:
     return blocks
 
 
-def deceleration_blocks(spec: TriadSpec, trim_sd_rad: float) -> list[Block]:
-    """Errors of an accelerometer that measures ballistic flight's deceleration alone; the trim's with its scale."""
+def deceleration_blocks(spec: TriadSpec, trim_sd_rad: float, tracked: bool) -> list[Block]:
+    """Errors of an accelerometer that measures ballistic flight's deceleration alone; the trim's with its scale.
+
+    Without a tracker the bias is considered: to first order thin air three times as dense as expected is a bias.
+    """
     bias, walk = _bias(spec)
     return [
-        Block(spec.name, ("bias",), "m/s2", max(bias, 1e-9), walk_var_per_s=walk),
+        Block(spec.name, ("bias",), "m/s2", max(bias, 1e-9), walk_var_per_s=walk, considered=not tracked),
         Block(spec.name, ("scale",), "1", max(float(np.hypot(spec.scale_sd, trim_sd_rad**2)), 1e-9)),
         Block(spec.name, ("time bias",), "s", max(spec.time_bias_sd_s, 1e-9)),
     ]

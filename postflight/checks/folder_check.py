@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -218,7 +218,9 @@ def _facts(found: Sources) -> list[Fact]:
 
 def _cross_check(found: Sources, report: Report) -> None:
     """Sensors against each other and against physics."""
-    remarks = report.cross_checks
+    # an entry's one channel has neither a size nor axes to compare
+    whole = {name: t for name, t in found.triads.items() if np.isfinite(t.measured_sensor).any(axis=0).all()}
+    found, remarks = replace(found, triads=whole), report.cross_checks
     remarks += tracks.outside_time(found) + inertial.at_rest(found) + inertial.lever(found) + inertial.place(found)
     for name, radar in found.radars.items():
         remarks += tracks.free_fall(found, name, radar)

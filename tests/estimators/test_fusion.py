@@ -22,7 +22,7 @@ from estimators.evidence import (
     moved_vehicle,
     offset_sd_m,
 )
-from estimators.fusion import FarInputsError, fuse, loads_reader
+from estimators.fusion import FarInputsError, fuse, knots_of, loads_reader
 from estimators.misalignment import misalignment_evidence
 from estimators.trim import trim_evidence
 from flightmodel.checks import DivergenceError
@@ -124,6 +124,31 @@ def test_the_size_of_the_process_is_the_most_probable_one():
     # a joint that hardly moves: a tenth of a degree of swing at 1.2 Hz stays possible
     still = replace(one, theta_yz_rad=1e-3 * rng.normal(size=(N, 2)))
     assert fuse(linear_reader([still])).process_size_radps2 == pytest.approx(0.1, rel=0.1)
+
+
+def test_knots_follow_the_swing_of_a_small_vehicle():
+    """A metre across, it swings at 4.7 Hz in body axes: between knots of 0.1 s that was 3 sd of error, all green."""
+    rng, hz, sd = np.random.default_rng(5), 4.7, 1e-3
+    turn = 2.0 * np.pi * hz * (TIME_S - 430.0)
+    swing = np.deg2rad(0.35) * np.column_stack([np.cos(turn), np.sin(turn)])
+    cov = np.tile(sd**2 * np.eye(2), (N, 1, 1))
+    read = motion() + swing + sd * rng.normal(size=(N, 2))
+    loads = pulse_of(rng, N, motion())[0]
+    loads = replace(loads, swing_radps=2.0 * np.pi * hz)
+    one = Evidence("a", TIME_S, read, STILL, STILL, {}, cov, loads.quarter_swing_s)
+    inside = slice(8, -8)
+
+    def off_sd(knot_s):
+        found = fuse(linear_reader([one]), knot_s=knot_s).history
+        off = (found.theta_yz_rad - motion() - swing)[inside]
+        return np.sqrt(np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.lateral_cov[inside]), off)) / 2.0)
+
+    assert knots_of(loads) == pytest.approx(0.25 / hz)
+    assert off_sd(knots_of(loads)) < 1.25
+    assert off_sd(0.1) > 2.5
+    # readings resolve no more than their spacing, and a slow vehicle's knots are as they were
+    assert knots_of(replace(loads, swing_radps=100.0)) == pytest.approx(np.median(np.diff(loads.time_s)))
+    assert knots_of(replace(loads, swing_radps=5.0)) == knots_of(replace(loads, swing_radps=0.0)) == 0.1
 
 
 def test_linear_readings_err_as_the_posterior_says(monkeypatch):

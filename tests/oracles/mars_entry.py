@@ -67,8 +67,8 @@ C_A, C_A_SD, MASS_SD = 1.70, 0.02, 0.001
 NOISE_MPS2, BIAS_MPS2, SCALE, TRIM_DEG = 0.02, 0.03, 0.002, 2.0
 
 
-def fly(seed: int, rate_hz: float = 16.0, to_s: float = 170.0, state: np.ndarray = STATE) -> Entry:
-    """Fly an entry dispersed about a stated state and measure it."""
+def fly(seed: int, rate_hz: float = 16.0, to_s: float = 170.0, state: np.ndarray = STATE, lift: float = 0.0) -> Entry:
+    """Fly an entry dispersed about a stated state and measure it; ``lift`` is a part of the drag, in any direction."""
     rng = np.random.default_rng(seed)
     true_state = state + STATE_SD * rng.standard_normal(6)
     c_a = C_A * (1.0 + C_A_SD * rng.standard_normal())
@@ -106,7 +106,7 @@ def fly(seed: int, rate_hz: float = 16.0, to_s: float = 170.0, state: np.ndarray
         axis = np.cos(trim) * along + np.sin(trim) * across
         normal = -np.sin(trim) * along + np.cos(trim) * across
         axial = pressure * c_a
-        return -axial * axis - 0.2 * axial * trim * normal, axial
+        return -axial * axis - 0.2 * axial * trim * normal + axial * lift * across, axial
 
     def slope(t, y):
         r, v = y[:3], y[3:]

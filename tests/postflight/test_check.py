@@ -15,6 +15,7 @@ from rich.console import Console
 from postflight.checks import folder_check
 from postflight.checks.folder_check import Fact, Report, check_folder
 from postflight.cli import cli
+from tests.oracles import mars_entry
 from tests.refusing import numbers_in
 
 ROOT = Path(__file__).parents[2]
@@ -88,6 +89,30 @@ def test_recorded_flights_as_described_have_no_remark(name, tmp_path):
 
 
 # planted faults of units
+
+
+def test_one_channel_beside_a_tracker_is_checked(tmp_path):
+    """Mars telemetry of other column names, with the navigation's states: it ended in a traceback."""
+    entry = mars_entry.fly(910, to_s=120.0)
+    mars_entry.write(entry, tmp_path)
+    rows = np.column_stack([entry.time_s, entry.position_m / 1e3])[::16]
+    np.savetxt(tmp_path / "nav.csv", rows, fmt="%.6f", delimiter=",", header="ET,X_KM,Y_KM,Z_KM", comments="")
+    columns = "".join(f'columns.{c} = {{ column = "{c.upper()}_KM", unit = "km" }}\n' for c in "xyz")
+    more = f"""
+[gnss.nav]
+file = "nav.csv"
+time = {{ column = "ET", format = "seconds" }}
+{columns}horizontal_sd_m = 10.0
+vertical_sd_m = 10.0
+wander_sd_m = 0.0
+time_bias_sd_s = 0.0
+"""
+    with (tmp_path / "flight.toml").open("a") as file:
+        file.write(more)
+    report = check_folder(tmp_path)
+    assert report.exit_code == 0
+    assert not report.cross_checks
+    assert [fact.source for fact in report.facts] == ["accelerometer", "nav"]
 
 
 def test_accelerometer_in_g_read_as_metres(folder):

@@ -165,7 +165,7 @@ def test_partials_are_derivatives_with_every_term_alive(kind):
     source, e = instrument(kind), padded(ERRORS[kind])
     _, by_state, by_error = compiled(source, e, *place())
     state, error = by_differences(source, e, place())
-    gyros = slice(4, 13 if kind in (VELOCITY, RANGE_RATE) else 4)
+    gyros = slice(4, 14 if kind in (VELOCITY, RANGE_RATE) else 4)
     by_error[:, gyros] = 0.0
     for group in (slice(0, 3), slice(3, 6), slice(6, 9)):
         size = np.abs(state[:, group]).max(axis=1, keepdims=True)
@@ -268,25 +268,38 @@ def test_a_time_bias_follows_the_flight_to_second_order(mini_truth):
 
 @pytest.mark.parametrize("kind", [VELOCITY, RANGE_RATE])
 def test_gyros_errors_move_an_antenna_beside_the_accelerometer(kind):
-    """Partials by bias, scale and mount of the gyros, through the motion at a node and against its differences."""
+    """Partials by bias, scale, mount and clock of the gyros, through the motion at a node and against differences."""
     rng, source, at = np.random.default_rng(11), instrument(kind), place()
     mounts = [rotations.dcm_from_q(rotations.exp(rng.normal(0.0, 1.0, 3))) for _ in range(2)]
     force, rate, one = rng.normal(0.0, 20.0, (2, 3)), rng.normal(0.0, 9.0, (2, 3)), np.ones((2, 3))
-    motion = strapdown_motion(np.array([0.0, 0.01]), force, rate, one, one, *mounts)
+    motion = strapdown_motion(np.array([0.0, 0.01]), force, rate, one, one, *mounts, clocks=True)
 
     def seen(errors):
         turning, acceleration = np.empty((12, 3)), np.empty(3)
         _measurement_kernels.motion_at(motion, 1, *at, errors, turning, acceleration)
         return compiled(source, np.zeros(SLOTS), *at, turning, acceleration)
 
-    errors = rng.normal(0.0, 0.01, 18)
-    by_gyros = seen(errors)[2][:, 4:13]
-    for j in range(9):
-        step = 1e-5 * np.eye(18)[9 + j]
+    errors = np.append(rng.normal(0.0, 0.01, 18), [0.0, 1e-3])
+    by_gyros = seen(errors)[2][:, 4:14]
+    for j, slot in enumerate([*range(9, 18), 19]):
+        step = 1e-5 * np.eye(20)[slot]
         want = (seen(errors + step)[0] - seen(errors - step)[0]) / 2e-5
         # a mount's partial is its matrix to first order in the mount
-        assert np.abs(by_gyros[:, j] - want).max() < (2e-4 if j >= 6 else 1e-7) * np.abs(by_gyros).max(), j
+        assert np.abs(by_gyros[:, j] - want).max() < (2e-4 if 6 <= j < 9 else 1e-7) * np.abs(by_gyros).max(), j
     assert (np.abs(by_gyros).max(axis=0) > 0.1).all()
+
+
+@pytest.mark.parametrize("kind", [POSITION, VELOCITY, RANGE_RATE])
+def test_no_tracker_sees_all_clocks_late_alike(kind):
+    """The vehicle further on its way by what every tag is late reads the same: else a filter finds the time of day."""
+    source, (position, velocity, q) = instrument(kind), place()
+    c = rotations.dcm_from_q(q)
+    _, by_state, by_error = compiled(source, np.zeros(SLOTS), position, velocity, q)
+    ahead = np.concatenate([velocity, ACCELERATION, RATE[0] - c.T @ earth.OMEGA_ECEF_RADPS])
+    clocks = by_error[:, 3] + (by_error[:, 13] if kind != POSITION else 0.0)
+    np.testing.assert_allclose(by_state @ ahead, -clocks, atol=1e-9 * np.abs(by_state @ ahead).max() + 3e-4 * 0.3)
+    if kind != POSITION:
+        assert np.abs(by_error[:, 13]).max() > 0.5  # m/s a second
 
 
 def test_a_late_velocity_of_a_fast_spinner_is_that_of_its_circle():

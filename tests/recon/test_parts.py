@@ -13,6 +13,7 @@ from flightmodel.trajectory import Trajectory, difference
 from recon import reconstruct
 from recon._measurement_kernels import RADAR
 from recon.consistency import source_checks
+from recon.entry_density import _spread
 from recon.fault_isolation import _compared
 from recon.imu_screening import (
     _bridges,
@@ -25,7 +26,7 @@ from recon.imu_screening import (
 )
 from recon.measurements import gnss_instruments, magnetometer_instrument
 from recon.propagation import strapdown_motion, with_disturbances, with_exact_integrals
-from recon.reconstruct import Mounting, corrected_series, datum_trajectory
+from recon.reconstruct import Mounting, corrected_series, datum_trajectory, turned_velocity_cov
 from recon.setup import fit_start
 from recon.state import States, boxplus, instrument_blocks, packed
 from recon.vector_attitude import _inconsistent_sensors, compare
@@ -228,39 +229,68 @@ def test_a_solution_is_apart_beyond_what_leaving_a_source_out_costs():
 
 
 def datum_of(state, covariance, noise_sd=0.0):
-    arm = np.array([-1.2, 0.3, 0.2])
+    arm, t = np.array([-1.2, 0.3, 0.2]), np.arange(-2.0, 5.0)
     rate = SimpleNamespace(
-        time_s=np.array([0.0, 1.0]), measured_sensor=np.tile([0.6, -0.3, 0.4], (2, 1)),
+        time_s=t, measured_sensor=np.array([0.6, -0.3, 0.4]) + t[:, None] * np.array([0.7, 2.0, -1.5]),
         spec=SimpleNamespace(noise_sd=noise_sd),
     )  # fmt: skip
     problem = SimpleNamespace(
         time_s=np.array([0.0, 1.0]), kept=np.array([True, True]),
-        motion=SimpleNamespace(dcm_body_rate=np.eye(3), planet=earth.WGS84),
+        motion=SimpleNamespace(dcm_body_rate=np.eye(3), planet=earth.WGS84, clocks=True, drivers=20),
     )  # fmt: skip
     mounting = Mounting("2009-08-17T12:50:00Z", arm, rate)
     return datum_trajectory(problem, mounting, state, packed(np.tile(covariance, (2, 1, 1)))), arm
 
 
 def test_the_datum_errs_as_the_moved_state_does():
-    # one direction of all 27 errors: the covariance is the square of what the datum moves by
+    # one direction of all 29 errors: the covariance is the square of what the datum moves by
     rng = np.random.default_rng(2)
     state = States(
         np.tile([6.4e6, 1e5, 2e5], (2, 1)), np.tile([1e3, -2e3, 3e2], (2, 1)),
-        np.tile(rotations.exp(np.array([0.4, -0.2, 0.9])), (2, 1)), np.zeros((2, 18)),
+        np.tile(rotations.exp(np.array([0.4, -0.2, 0.9])), (2, 1)), np.zeros((2, 20)),
     )  # fmt: skip
     e = rng.normal(size=27) * np.repeat([1e-3, 1e-4, 1e-3, 1e-2, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4], 3)
-    made, arm = datum_of(state, np.outer(e, e) + 1e-24 * np.eye(27))
-    up, down = (datum_of(boxplus(state, np.tile(s * e, (2, 1))), np.eye(27))[0] for s in (1.0, -1.0))
+    e = np.append(e, [1e-3, 1e-3])  # clocks; that of the gyros moves the datum by 2 mm/s, twenty times the rest
+    made, arm = datum_of(state, np.outer(e, e) + 1e-24 * np.eye(29))
+    up, down = (datum_of(boxplus(state, np.tile(s * e, (2, 1))), np.eye(29))[0] for s in (1.0, -1.0))
     moved = 0.5 * difference(up, down)[0]
     size = np.abs(moved)
     for rows in (slice(0, 3), slice(3, 6), slice(6, 9)):
         got = made.covariance[0][rows, rows]
         np.testing.assert_allclose(got, np.outer(moved[rows], moved[rows]), atol=0.02 * size[rows].max() ** 2)
     # a sample's own noise of the rate moves the datum by its lever
-    quiet, _ = datum_of(state, 1e-24 * np.eye(27))
-    noisy, _ = datum_of(state, 1e-24 * np.eye(27), 0.02)
+    quiet, _ = datum_of(state, 1e-24 * np.eye(29))
+    noisy, _ = datum_of(state, 1e-24 * np.eye(29), 0.02)
     added = np.trace(noisy.covariance[0][3:6, 3:6] - quiet.covariance[0][3:6, 3:6])
     assert added == pytest.approx(2.0 * 0.02**2 * (arm @ arm), rel=1e-6)
+
+
+def test_what_a_straight_line_leaves_of_an_exponential_spreads_over_the_density_s_length():
+    # linearised a logarithm of 0.8 too low, 1.8 was taken for exp(0.8): 19 % of the density found
+    height = np.array([130e3, 125e3, 120e3, 120e3])
+    error = np.array([np.exp(0.8) - 1.8, 0.0, 0.0, 0.0]) / np.exp(0.8)
+    np.testing.assert_allclose(_spread(error, height), error[0] * np.exp([0.0, -1.0, -2.0, -2.0]), rtol=1e-12)
+    np.testing.assert_allclose(
+        _spread(error[::-1], height[::-1]), error[0] * np.exp([-2.0, -2.0, -1.0, 0.0]), rtol=1e-12
+    )
+
+
+def test_a_velocity_turned_by_an_unknown_lift_is_shorter_along_its_estimate():
+    # drawn across by as much as is stated and turned, not stretched: the mean square of what is missing along
+    rng, speed = np.random.default_rng(3), 2000.0
+    root = np.array([[40.0, 0.0], [25.0, 90.0]])
+    c = rng.normal(size=(200000, 2)) @ root.T
+    missing = speed - np.sqrt(speed**2 - np.sum(c**2, axis=1))
+    turn = rotations.dcm_from_q(rotations.exp(np.array([0.3, -0.9, 0.4])))
+    velocity, cov = turn @ [speed, 0.0, 0.0], np.zeros((3, 3))
+    cov[1:, 1:] = root @ root.T
+    got = turned_velocity_cov(velocity[None], (turn @ cov @ turn.T)[None])[0]
+    along = turn.T @ got @ turn
+    assert along[0, 0] == pytest.approx(np.mean(missing**2), rel=0.03)
+    np.testing.assert_allclose(along - np.diag([along[0, 0], 0.0, 0.0]), 0.0, atol=1e-9)
+    # one hardly known at all errs along as it does across
+    lost = turned_velocity_cov(np.array([[1e-3, 0.0, 0.0]]), 100.0 * np.eye(3)[None])[0]
+    assert lost[0, 0] == pytest.approx(100.0 * (4.0 + 4.0) / (4.0 * 2.0), rel=1e-6)
 
 
 def test_two_attitudes_differ_as_both_may_err():

@@ -140,6 +140,55 @@ def test_a_slow_shallow_entry_errs_as_stated_and_all_is_green(tmp_path):
     assert (np.mean(nees, axis=0) < chi_square_quantile(0.99, 6 * flights) / flights).all(), np.mean(nees, axis=0)
 
 
+def test_the_uppermost_density_of_a_fine_accelerometer_errs_as_stated(tmp_path):
+    """Air three times the standard's was taken for a bias, and rows of 50 % were given: up to 14 sd, all green."""
+    off, tops = [], []
+    for seed in range(980, 986):
+        truth = mars_entry.fly(seed, to_s=60.0)
+        folder = tmp_path / f"{seed}"
+        mars_entry.write(truth, folder)
+        rng = np.random.default_rng(seed)
+        bias, noise = 3e-4, 5e-4
+        read = -truth.axial_mps2 + bias * rng.standard_normal() + noise * rng.standard_normal(len(truth.time_s))
+        rows = np.column_stack([truth.time_s, read])
+        np.savetxt(folder / "accelerometer.csv", rows, fmt="%.7f", delimiter=",", header="t_s,ax_mps2", comments="")
+        text = (folder / "flight.toml").read_text()
+        text = text.replace("noise_sd_mps2 = 0.02", f"noise_sd_mps2 = {noise}")
+        (folder / "flight.toml").write_text(text.replace("bias_sd_mps2 = 0.03", f"bias_sd_mps2 = {bias}"))
+        found = pf.reconstruct(pf.read_flight(folder)).density
+        true = np.exp(np.interp(found.time_s, truth.time_s, np.log(truth.density_kgpm3)))
+        part = ((found.density_kgpm3 - true) / found.density_sd_kgpm3).to_numpy()
+        upper = (found.altitude_m > found.altitude_m.iloc[0] - 20e3).to_numpy()
+        off.append(np.abs(part[upper]).max())
+        tops.append(found.altitude_m.iloc[0])
+    assert max(off) < 4.0, off
+    assert min(tops) > 95e3, tops  # 10 mm/s^2 is felt at 110 km
+
+
+def test_a_lift_that_turns_the_path_is_in_the_velocity_s_sd(tmp_path):
+    """Its direction open by a tenth of a radian and more, the velocity along it erred by 2 to 4 sd, all green."""
+    flights, nees, along = 6, [], []
+    for seed in range(970, 970 + flights):
+        truth = mars_entry.fly(seed, to_s=120.0, lift=0.24)
+        folder = tmp_path / f"{seed}"
+        mars_entry.write(truth, folder)
+        text = (folder / "flight.toml").read_text()
+        (folder / "flight.toml").write_text(text.replace("trim_sd_deg = 2.0", "trim_sd_deg = 2.0\nside_sd = 0.24"))
+        path = pf.reconstruct(pf.read_flight(folder)).trajectory
+        rows = np.searchsorted(path.time_s, [70.0, 80.0, 95.0, 115.0])
+        t = path.time_s[rows]
+        error = path.velocity_ecef_mps[rows] - np.column_stack(
+            [np.interp(t, truth.time_s, c) for c in truth.velocity_mps.T]
+        )
+        cov = path.covariance[rows][:, 3:6, 3:6]
+        nees.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error))
+        unit = path.velocity_ecef_mps[rows] / np.linalg.norm(path.velocity_ecef_mps[rows], axis=1)[:, None]
+        along.append(np.einsum("ni,ni->n", unit, error) / np.sqrt(np.einsum("ni,nij,nj->n", unit, cov, unit)))
+    assert (np.mean(nees, axis=0) < chi_square_quantile(0.99, 3 * flights) / flights).all(), nees
+    rms = np.sqrt(np.mean(np.square(along), axis=0))
+    assert ((rms > 0.2) & (rms < 1.6)).all(), rms
+
+
 def test_a_density_that_the_atmosphere_does_not_allow_is_red(tmp_path):
     """Nothing else shows a radius stated for the diameter, or a height 20 km off: every check was green."""
     truth = mars_entry.fly(901)
