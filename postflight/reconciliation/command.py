@@ -142,7 +142,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
         require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
         require_damping(telemetry.required_vehicle())
-        compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "spans")
+        compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "creep", "spans")
         flight = reconstruct(
             Flight(telemetry), Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
         )
