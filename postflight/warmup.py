@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel import earth
-from flightmodel._compiler_kernels import remember_operators
+from flightmodel._compiler_kernels import list_variables_by_type, remember_operators
 from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
@@ -242,6 +242,7 @@ def _shares(groups: list[str], processes: int) -> list[list[str]]:
 def _compile(groups: Iterable[str]) -> None:
     """Compile groups in this process; those that fail are written with the reason."""
     remember_operators()
+    list_variables_by_type()
     gc.set_threshold(200_000, 20, 50)  # a compiler makes many objects and hardly any circle: a fifth of the time
     for group in groups:
         try:
