@@ -1,8 +1,9 @@
 """Speed of the virtual camera as ratios in one run: a frame's fit, 500 frames from a film, a rendered picture.
 
-    python benchmarks/virtual_camera.py
+    python benchmarks/virtual_camera.py [FLIGHT]
 
-Peers: scipy's least squares over OpenCV's fisheye projection, given the edge points and marks that ours must find
+On FLIGHT (a folder of `postflight simulate`) also the answer of two cameras, which show the same film, against that of
+one. Peers: scipy's least squares over OpenCV's fisheye projection, given the edge points and marks that ours must find
 first, with five unknowns (ours has nine); the same rasteriser in plain C++ (needs g++); trimesh with embreex (one ray a
 pixel), and open3d where it is installed. Jobs take turns; times are minima, of the wall and of the processor with all
 threads.
@@ -17,6 +18,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -35,6 +37,8 @@ from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.film import film_frames
 from flightmodel.geometry import torus_limb
 from flightmodel.rendering import render
+from postflight.filming import camera_answer
+from postflight.flight import Flight, read_flight
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
 
 SOURCE = Path(__file__).parent / "plain_cpp" / "raster.cpp"
@@ -125,6 +129,19 @@ def time_a_film() -> None:
         )
 
 
+def time_two_cameras(folder: Path) -> None:
+    """The history of a folder's one film, and of two cameras that show it."""
+    flight = read_flight(folder)
+    ((name, frames),) = flight.telemetry.films.items()
+
+    def answer(*names: str) -> object:
+        films = {name: replace(frames) for name in names}  # anew, as what a film remembers of its pictures takes time
+        return camera_answer(Flight(replace(flight.telemetry, films=films)), None)
+
+    jobs = {"one camera": lambda: answer(name), "two cameras": lambda: answer(name, "second")}
+    told(rounds(jobs, 5), "one camera")
+
+
 def fine_torus(across: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of a torus around the camera's view, ``2 * 160 * across`` triangles or so."""
     shell = trimesh.creation.torus(1.1, 0.6, major_sections=160, minor_sections=across)
@@ -187,6 +204,8 @@ def main() -> None:
     told(rounds(fit_jobs(), ROUNDS), "ours, edge and marks searched for")
     print("a film")
     time_a_film()
+    for folder in sys.argv[1:]:
+        time_two_cameras(Path(folder))
     mount = MOUNT.model_copy(update={"width_px": 640, "height_px": 480, "centre_px": (320.0, 240.0)})
     camera = camera_from_mount(mount)
     for across in (63, 313):

@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import kernel
+from flightmodel._kernels import inlined, kernel
 
 
-@kernel
+@inlined
 def correlations(picture, template, middle, affine, reach, score):
     """Correlation (2 reach + 1, 2 reach + 1), rows by v, of a template shifted in its own picture; False outside.
 

@@ -20,11 +20,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from estimators.agreement import CONFIDENCE
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.statistics import chi_square_quantile
 
 _LITTLE = 0.1  # of the largest load: the frames' own deflection is then small beside what is looked for
 _LOAD_FACTOR = 2.0  # of what the load explains: the angle of attack off the peak may be twice that at it
@@ -111,7 +111,7 @@ def rest_of(
         loaded = np.where(known | ~other, load, -np.inf)
         before = history.time_s < history.time_s[int(np.argmax(loaded))]
         groups = [rows for side in (before, ~before) if len(rows := np.flatnonzero(little & side))]
-        limit = float(np.sqrt(chi2.ppf(1.0 - (1.0 - CONFIDENCE) / len(groups), 2)))
+        limit = float(np.sqrt(chi_square_quantile(1.0 - (1.0 - CONFIDENCE) / len(groups), 2)))
         found = []
         for rows in groups:
             by_load = _LOAD_FACTOR * per_load * load[rows]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import operator
 
 from numba import _dynfunc, types
+from numba.core import ir
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.compiler_machinery import AnalysisPass, register_pass
@@ -85,3 +86,35 @@ def _plain(key, args):
     if key in PLACES:
         return isinstance(args[0], types.Array)
     return all(isinstance(a, types.Number | types.Boolean) for a in args)
+
+
+# what numba asks, in this order, of everything that an instruction holds
+KINDS = (ir.Var, ir.Inst, (list, tuple), dict)
+
+
+def list_variables_by_type():
+    """Let this process ask once of a type, and not of each of a million objects, whether it holds variables.
+
+    numba lists an instruction's variables after every change of a function: an eighth of the time that compiling takes.
+    """
+    known = {}
+
+    def add(value, found):
+        kind = known.get(type(value), -1)
+        if kind == -1:
+            kind = next((k for k, one in enumerate(KINDS) if isinstance(value, one)), None)
+            known[type(value)] = kind
+        if kind == 0:
+            found.append(value)
+        elif kind == 1:
+            found += value.list_vars()
+        elif kind is not None:
+            for each in value.values() if kind == 3 else value:
+                add(each, found)
+
+    def _rec_list_vars(_self, value):
+        found = []
+        add(value, found)
+        return found
+
+    ir.Inst._rec_list_vars = _rec_list_vars

@@ -51,7 +51,7 @@ def upper_product(a, b):
     return a1 * b1 + (middle >> half) + (a0 * b1 + (middle & _LOW) >> half)
 
 
-@exact_kernel
+@exact_inlined
 def rounded(w, q, high, low):
     """The float64 nearest to ``w * 10**q``, ties to even; NaN below the normal numbers, infinity above all."""
     if w == np.uint64(0) or q < LOWEST_POWER:
@@ -81,7 +81,7 @@ def rounded(w, q, high, low):
     return math.ldexp(float((bits + (bits & _ONE)) >> _ONE), exponent - 52)
 
 
-@exact_kernel
+@exact_inlined
 def after_missing(data, k):
     """First byte after ``nan``, ``na``, ``null`` (in any case) or ``-``, which mean a missing value; else ``k``."""
     if data[k] == _MINUS:
@@ -102,7 +102,7 @@ def after_text(data, k):
     return k
 
 
-@exact_kernel
+@exact_inlined
 def exponent(data, k):
     """Power of ten after an ``e``, and the first byte after it; ``k`` for none."""
     at = k + 1 if data[k] == _MINUS or data[k] == _PLUS else k
@@ -113,7 +113,7 @@ def exponent(data, k):
     return -power if data[k] == _MINUS else power, k if at == begin else at
 
 
-@exact_kernel
+@exact_inlined
 def leading_zeros(data, k):
     """How many zeros stand before the digits that count, of a number from byte ``k`` on."""
     zeros = 0

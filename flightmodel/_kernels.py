@@ -43,19 +43,39 @@ KEPT = CACHE.path is not None  # without a folder numba must not be asked for a 
 
 
 class SharedCache(FunctionCache):
-    """A kernel's cache, to which one process at a time saves.
+    """A kernel's cache, to which one process at a time saves, and machine code alone.
 
     Of numba's own, two processes that save at once may take one file for two signatures, and a later one would run
-    what was compiled for the other.
+    what was compiled for the other. It also keeps the code that was made into a machine's, for callers, which a kernel
+    has none of: to read it took each process 80 ms and 14 MB.
     """
 
     def save_overload(self, signature, compiled):
         """Save under a lock; without one where the file system has none."""
+        library = compiled.library
+        whole = library._get_module_for_linking()
         with contextlib.ExitStack() as held:
             with contextlib.suppress(OSError):
                 lock = held.enter_context((CACHE.path / "saving").open("w"))
                 fcntl.flock(lock, fcntl.LOCK_EX)
-            super().save_overload(signature, compiled)
+            library._shared_module = _names_of(whole)
+            try:
+                super().save_overload(signature, compiled)
+            finally:
+                library._shared_module = whole
+
+    def load_overload(self, signature, context):
+        """Load; a caller that would be compiled with it is refused by numba then, as there is nothing to copy."""
+        compiled = super().load_overload(signature, context)
+        if compiled is not None:
+            compiled.library._shared_module = None
+        return compiled
+
+
+def _names_of(module):
+    """Functions of a module by their names alone, which numba wants to know of what it loads."""
+    names = [function.name for function in module.functions if not function.is_declaration]
+    return llvmlite.binding.parse_assembly("\n".join(f'define void @"{name}"() {{ ret void }}' for name in names))
 
 
 def _kept(function, **options):

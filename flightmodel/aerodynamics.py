@@ -72,6 +72,7 @@ SPELLINGS = {
 SAID_BESIDE = {"deg", "total", "t", "nose", "nase", "cg", "ref", "mrc", "mrp", "body", "wind", "number", "no"}
 # above the cone's half-angle part of it lies in shadow; no entry vehicle of the class flies there, so look-ups stop
 INVERSE_LIMIT_RAD = np.deg2rad(60.0)
+_ROWS = 512  # that are looked up inversely at a time
 
 
 @dataclass(frozen=True)
@@ -136,8 +137,10 @@ class AeroTable:
         """Total angle of attack, rad, whose C_N/C_A is ``ratio`` (seed paper eq. [3]); NaN outside 0 to 60 deg."""
         mach, ratio = np.broadcast_arrays(np.asarray(mach, dtype=float), np.asarray(ratio, dtype=float))
         knots = self.alpha_rad[self.alpha_rad <= INVERSE_LIMIT_RAD + 1e-9]
-        table = self.ratio(mach.ravel()[:, None], knots[None, :])
-        flat = ratio.ravel()
+        flat, table = ratio.ravel(), np.empty((ratio.size, len(knots)))
+        for first in range(0, len(table), _ROWS):  # each point has dozens of knots
+            part = slice(first, first + _ROWS)
+            table[part] = self.ratio(mach.ravel()[part, None], knots[None, :])
         k = np.clip(np.sum(table <= flat[:, None], axis=1) - 1, 0, len(knots) - 2)
         row = np.arange(len(flat))
         fraction = (flat - table[row, k]) / (table[row, k + 1] - table[row, k])

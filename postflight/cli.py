@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import click
 
-from postflight.streams import close_streams, open_streams, pin_threads, write_out
+from postflight.streams import close_streams, leave_arrow_out, open_streams, pin_threads, write_out
 
 # heavy imports stand inside the commands, so that --help answers at once; they make hundred thousands of objects, in
 # which five hundred searches for garbage find none: an eighth of the time of loading, here and in the second process
@@ -264,6 +264,7 @@ def demo(folder: Path, seed: int) -> None:
 
     Writes a flight folder (default ./demo-flight, replaced when it is one already) with results and figures.
     """
+    leave_arrow_out()
     from postflight import commands
 
     commands.demo(folder, seed)
@@ -299,6 +300,7 @@ def reconstruct(
     run_name: str | None,
 ) -> None:
     """Reconstruct the best-estimated trajectory of the flight in FOLDER."""
+    leave_arrow_out()
     from postflight import commands
 
     commands.run(folder, (), commands.asked(settings, without, rate, run_name), sensitivity)
@@ -326,6 +328,7 @@ def reconstruct(
 @click.option("--film", is_flag=True, help="Also write the film with the virtual camera over it (VP9 WebM).")
 def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None, film: bool) -> None:
     """Estimate how far the aeroshell deflected in the flight in FOLDER."""
+    leave_arrow_out()
     from postflight import commands
 
     commands.deflection(folder, methods, plane, joint, film)
@@ -365,6 +368,7 @@ def run(
 ) -> None:  # fmt: skip
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
     begun = time.perf_counter()
+    leave_arrow_out()
     from postflight import commands
     from postflight.deflections import METHODS
 
@@ -392,6 +396,7 @@ def noise(folder: Path, accept: bool) -> None:
 @click.option("--posterior", is_flag=True, help="Sample the posterior (emcee), evidence by dynesty.")
 def reconcile(folder: Path, hardening: bool, freeplay: bool, creep: bool, posterior: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
+    leave_arrow_out()
     from postflight.reconciliation import command
 
     command.run(folder, ("freeplay",) * freeplay + ("creep",) * creep + ("hardening",) * hardening, posterior)

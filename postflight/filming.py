@@ -7,6 +7,7 @@ estimated from all films, and every frame's answer uses it.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -185,17 +186,19 @@ def camera_answer(
 
 
 def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress | None) -> CameraAnswer:
-    films, refused = {}, {}
-    for k, (name, frames) in enumerate(flight.telemetry.films.items()):
-        part = None
-        if progress is not None:
-            part = lambda f, what, k=k, name=name: progress(  # noqa: E731
-                (k + f) / len(flight.telemetry.films), f"{name}: {what}"
-            )
+    names = list(flight.telemetry.films)
+
+    def film_or_fault(name: str) -> FilmFit | Fault:
+        shown = progress if name == names[0] else None  # the others are read meanwhile
         try:
-            films[name] = camera_film(flight, frames, part)
+            return camera_film(flight, flight.telemetry.films[name], shown)
         except GateError as fault:
-            refused[name] = Fault(str(fault), fault.codes[0])
+            return Fault(str(fault), fault.codes[0])
+
+    with ThreadPoolExecutor(len(names)) as pool:
+        of_each = dict(zip(names, pool.map(film_or_fault, names), strict=True))
+    films = {name: film for name, film in of_each.items() if isinstance(film, FilmFit)}
+    refused = {name: fault for name, fault in of_each.items() if isinstance(fault, Fault)}
     if not films:
         raise GateError([Fault(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
     films, shape, words_of_shape = _with_shell_shape(films, flight, bet)

@@ -49,6 +49,7 @@ _ATTEMPTS = 100  # at the place that equal runs of other processes take in the s
 FACTS = "run.json"
 INPUTS = "inputs"  # folder of flight.toml and the vehicle file as they were read
 _FORMAT = 1
+_ROWS = 500  # of a table, made text at a time
 _SMOOTH_CAMERA = "camera_smooth"
 _COVARIANCE_RATE_HZ = 1.0
 _FRAMES = {
@@ -167,11 +168,13 @@ class RunFolder:
 
     def write_csv(self, name: str, table: pd.DataFrame) -> None:
         """Write a table."""
-        columns = dict(plain_text(table).items())
+        written = plain_text(table)
         with (self.path / name).open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(zip(*map(_cells, columns.values()), strict=True))
+            writer.writerow(written)
+            for first in range(0, len(written), _ROWS):  # as text a trajectory would be 40 MB
+                columns = (column for _, column in written[first : first + _ROWS].items())
+                writer.writerows(zip(*map(_cells, columns), strict=True))
 
     def write_json(self, name: str, value: Any) -> None:
         """Write one JSON object; NaN becomes null."""

@@ -21,18 +21,19 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import pandas as pd
+from postflight.streams import leave_arrow_out, return_large_arrays
 
-from estimators.camera import FilmFit
-from flightmodel.checks import GateError
-from postflight.aero_increments import AeroIncrements
-from postflight.deflections import Deflections
-from postflight.filming import camera_film
-from postflight.flight import Flight
-from postflight.reconstruction import Reconstruction
-from postflight.studies.preflight import Bounds
+if TYPE_CHECKING:  # the process decides first how pandas is loaded
+    import pandas as pd
+
+    from estimators.camera import FilmFit
+    from postflight.aero_increments import AeroIncrements
+    from postflight.deflections import Deflections
+    from postflight.flight import Flight
+    from postflight.reconstruction import Reconstruction
+    from postflight.studies.preflight import Bounds
 
 Process = multiprocessing.get_context("spawn").Process  # a fork would copy locks that other threads hold
 _Part = Literal["trajectory", "deflections", "studies"]  # functions draw_... of `postflight.plots.run_figures`
@@ -182,6 +183,9 @@ def _answered(work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any
 
 def _film(flight: Flight) -> FilmFit | None:
     """What the film shows; None where it cannot be used, which the first process then finds out and says."""
+    from flightmodel.checks import GateError
+    from postflight.filming import camera_film
+
     try:
         return camera_film(flight)
     except (GateError, OSError):
@@ -191,6 +195,9 @@ def _film(flight: Flight) -> FilmFit | None:
 def _serve(connection: Connection, figures: Path, draws: bool) -> None:
     """Be ready, do what is asked in its order, and send back what came of it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is for the process that started this one
+    leave_arrow_out()
+    if draws:  # of a reconciliation's arrays `return_large_arrays` is no use
+        return_large_arrays()
     flight: Reconstruction | None = None
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:

@@ -2,7 +2,7 @@
 
 A name in a delivery may hold escape sequences that rewrite what stands above, or bidirectional marks that show a number
 backwards; a reader such as `head` may close its end of the pipe, a log may take ASCII only. Beside the streams of a
-command's process stand its threads.
+command's process stand its threads and its memory.
 """
 
 from __future__ import annotations
@@ -73,12 +73,22 @@ THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"
 
 
 def pin_threads() -> None:
-    """Limit linear algebra of this process and its children to one thread; before numpy is imported.
-
-    Arrow, with which pandas keeps text, takes the C library's memory: its own allocator keeps 16 MB of a run.
-    """
+    """Limit linear algebra of this process and its children to one thread; before numpy is imported."""
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+
+
+def leave_arrow_out() -> None:
+    """Load pandas as it is where Arrow is not installed; not where either is loaded already.
+
+    pandas only keeps text with it, of which a run has little, and it takes 35 MB of each process.
+    """
+    if "pandas" not in sys.modules and "pyarrow" not in sys.modules:
+        absent: dict[str, Any] = {"pyarrow": None}  # what `import` takes as not installed
+        sys.modules.update(absent)
+        try:
+            import pandas  # noqa: F401
+        finally:
+            del sys.modules["pyarrow"]
 
 
 def return_large_arrays() -> None:

@@ -59,11 +59,11 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 from scipy.special import logsumexp
-from scipy.stats import chi2
 
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.geoid import undulation_m
+from flightmodel.statistics import chi_square_quantile
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from postflight.intake.other_trajectory import OtherTrajectory
@@ -640,7 +640,7 @@ def _size_of_last(found: _Explained) -> float:
 
 def _most_size(count: int) -> float:
     """Size of an effect with so many components that one flight in 1000 exceeds."""
-    return float(np.sqrt(chi2.ppf(_CONFIDENCE, count)))
+    return float(np.sqrt(chi_square_quantile(_CONFIDENCE, count)))
 
 
 def _best_seen(information: FloatArray, asked: BoolArray) -> FloatArray:
@@ -702,7 +702,7 @@ def _result(best: _Explained) -> SystematicDifferences:
         both = (given[:, rows], best.left[:, rows])
         before, after = (float(np.einsum("ni,nij,nj->n", d, inverse, d).mean()) for d in both)
         degrees = len(rows)
-        chi_square[group] = before / degrees, after / degrees, float(chi2.ppf(_CONFIDENCE, degrees)) / degrees
+        chi_square[group] = before / degrees, after / degrees, chi_square_quantile(_CONFIDENCE, degrees) / degrees
     return SystematicDifferences(
         other.label,
         fit.time_s,

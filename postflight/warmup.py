@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel import earth
-from flightmodel._compiler_kernels import remember_operators
+from flightmodel._compiler_kernels import list_variables_by_type, remember_operators
 from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
@@ -48,13 +48,24 @@ def _simulator() -> None:
     gauss_markov(np.zeros(1), np.zeros((2, 1)), np.zeros((2, 1)))
 
 
-def _ensembles() -> None:
+def _fly_ensemble(creep: int) -> None:
     from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
     from synthetic_flight.simulate import parameter_vector, vacuum_table
 
     vehicle, state = _vehicle_at_rest()
-    start = Start(state, parameter_vector(vehicle), vacuum_table())
+    start = Start(np.append(state, np.zeros(creep)), parameter_vector(vehicle), vacuum_table())
     list(fly_ensemble(vehicle, lambda _run: start, [0], Schedule(0.001, 1, 2)))
+
+
+def _ensembles() -> None:
+    _fly_ensemble(0)
+
+
+def _creep() -> None:
+    """Of what a joint that creeps adds a reconciliation asks in every flight."""
+    from synthetic_flight._kernels import CREEP_STATES
+
+    _fly_ensemble(CREEP_STATES)
 
 
 def _tiny_problem() -> Problem:
@@ -159,6 +170,7 @@ GROUPS: dict[str, Callable[[], None]] = {
     "smoothers": _smoothers,
     "simulator": _simulator,
     "ensembles": _ensembles,
+    "creep": _creep,
     "balance": _balance,
     "tables": _tables,
     "spans": _spans,
@@ -230,6 +242,7 @@ def _shares(groups: list[str], processes: int) -> list[list[str]]:
 def _compile(groups: Iterable[str]) -> None:
     """Compile groups in this process; those that fail are written with the reason."""
     remember_operators()
+    list_variables_by_type()
     gc.set_threshold(200_000, 20, 50)  # a compiler makes many objects and hardly any circle: a fifth of the time
     for group in groups:
         try:

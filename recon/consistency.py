@@ -197,8 +197,9 @@ def mcreynolds_checks(
 ) -> list[ConsistencyCheck]:
     """Share of filter-minus-smoother differences ``(n, 9)`` as small as their covariance says, by group."""
     most_sd = -float(ndtri(0.5 * (1.0 - _LEAST_INSIDE) * (1.0 - confidence)))
-    var = np.diagonal(p_filter - p_smoother, axis1=1, axis2=2)
-    alive = var > 1e-9 * np.diagonal(p_filter, axis1=1, axis2=2)  # at the end both are one
+    of_filter, of_smoother = (np.diagonal(p, axis1=1, axis2=2) for p in (p_filter, p_smoother))
+    var = of_filter - of_smoother
+    alive = var > 1e-9 * of_filter  # at the end both are one
     inside = np.abs(difference) <= most_sd * np.sqrt(np.where(alive, var, 0.0))
     out = []
     for name in groups:

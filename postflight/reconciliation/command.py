@@ -16,6 +16,7 @@ from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import name_of, require_earth
 from flightmodel.flightfolder import read_flight
 from flightmodel.tabular import Tabular
+from flightmodel.vehicle import Vehicle
 from postflight import run_folder
 from postflight.commands import compile_kernels, console, print_checks
 from postflight.flight import PULSE_RATE_HZ, Flight
@@ -90,7 +91,9 @@ class Reconciliation(Tabular):
         """Bands of dispersed entries with the joint locked, and with the fitted joint."""
         report = progress or (lambda _fraction, _what: None)
         rigid = rigid_bounds(self.bet, flights, progress=lambda f, what: report(0.3 * f, what))
-        return rigid, reconciled_bounds(self.fit, self.bet, lambda f, what: report(0.3 + 0.7 * f, what))
+        laws, vehicle = dispersed(self.fit)
+        flexible = lambda f, what: report(0.3 + 0.7 * f, what)  # noqa: E731
+        return rigid, entry_bounds(self.bet, laws, ENTRIES, progress=flexible, vehicle=vehicle)
 
     def shares_inside(self, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
         """Share of the pressure pulse inside each band: ``joint, quantity, share_inside, ...``."""
@@ -139,7 +142,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
         require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
         require_damping(telemetry.required_vehicle())
-        compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "spans")
+        compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "creep", "spans")
         flight = reconstruct(
             Flight(telemetry), Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
         )
@@ -151,10 +154,11 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         if sampled:
             posterior, nested = sample_selection(selection, lambda f, what: report(0.6 + 0.3 * f, what))
             odds |= nested
+        report(0.9, "flying entries with the fitted joint")
+        laws_flown, vehicle = dispersed(fit)
+        second.ask(entry_bounds, flight, laws_flown, ENTRIES, 0, None, vehicle)
         modal, no_modes = _modes(flight, fit)
-        flexible = reconciled_bounds(fit, flight, lambda f, what: report(0.9 + 0.1 * f, what))
         fused, rigid = second.answer()
-        shares, _, bands_picture = compared_with_bounds(flight, rigid, flexible)
         with run_folder.RunFolder(folder, telemetry, settings) as out:
             table = joint_table(fit)
             out.write_csv("joint.csv", table)
@@ -166,19 +170,21 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             facts = _summary(fit, table, odds, checks)
             facts |= _modal_summary(modal, no_modes) | _posterior_summary(posterior)
             out.write_json("reconciliation.json", facts)
-            out.write_csv("bands.csv", bands(rigid, flexible))
-            out.write_csv("bands_shares.csv", shares)
             (out.path / "joint.toml").write_text(vehicle_file_lines(fit))
             if posterior is not None:
                 out.write_csv("posterior.csv", quantities(fit.problem.vehicle_parameters, posterior.samples))
                 out.write_csv("posterior_summary.csv", posterior_summary(posterior))
-            figures = out.path / "figures"  # every table is written
-            draw(figures / "bands.png", bands_picture)
+            figures = out.path / "figures"
             if modal is not None:
                 draw(figures / "modes.png", figure_modes, modal, telemetry)
             if posterior is not None:
                 draw(figures / "posterior.png", figure_posterior, posterior, telemetry)
             draw(figures / "reconciled.png", figure_reconciled, fit, telemetry, deflection, fused)
+            flexible = second.answer()
+            shares, _, bands_picture = compared_with_bounds(flight, rigid, flexible)
+            out.write_csv("bands.csv", bands(rigid, flexible))
+            out.write_csv("bands_shares.csv", shares)
+            draw(figures / "bands.png", bands_picture)
     _print_joint(fit, table, odds)
     print_checks(checks)
     if posterior is not None:
@@ -240,14 +246,14 @@ def _print_posterior(posterior: Posterior) -> None:
     console.print(printed)
 
 
-def reconciled_bounds(fit: JointFit, flight: Reconstruction, report: Progress) -> Bounds:
-    """Bands of entries with the fitted joint, offset and stability, dispersed by their standard deviations."""
+def dispersed(fit: JointFit) -> tuple[JointDispersions, Vehicle]:
+    """How the fitted joint is dispersed, and the vehicle with it, offset and stability known to their sd."""
     joint, offset, stability = posterior_sd(fit)
     # a joint that is only known to be stiff is flown no stiffer than the simulator's steps can follow
     vehicle = fit.vehicle if stiffness_bound(fit) is None else integrable(fit.vehicle, SLOW_JOINT)
     known = vehicle.uncertainty.model_copy(update={"cg_lateral_m": offset, "cm": stability})
     laws = JointDispersions(stiffness=Factor(lognormal=joint[0]), damping=Factor(lognormal=joint[1]))
-    return entry_bounds(flight, laws, ENTRIES, progress=report, vehicle=replace(vehicle, uncertainty=known))
+    return laws, replace(vehicle, uncertainty=known)
 
 
 def _summary(

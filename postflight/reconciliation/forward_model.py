@@ -653,7 +653,7 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
             air_from_m=simulate.ATMOSPHERE_START_M + rows.start * simulate.ATMOSPHERE_STEP_M,
         )  # fmt: skip
         states, aux = _until_lost(states[: block.stop - begin], aux[: block.stop - begin])
-        numbers = flights.vehicle[block]
+        numbers = np.ascontiguousarray(flights.vehicle[block])  # or the kernel would be compiled for both
         _span_kernels.sense(
             states, aux, numbers, arms, masses, steps.simpson, WINDOW_S, windows[block], slope[block]
         )  # fmt: skip

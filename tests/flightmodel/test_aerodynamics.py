@@ -86,6 +86,8 @@ def test_inverse_look_up(table):
     # the look-up is linear in the ratio between knots 1 deg apart, the ratio itself is not: (1 deg)^2/8 of curvature
     np.testing.assert_allclose(table.alpha_from_ratio(mach, table.ratio(mach, alpha)), alpha, atol=5e-5)
     assert np.isnan(table.alpha_from_ratio(np.array([3.0, 3.0]), np.array([-0.1, 3.0]))).all()
+    many = np.tile(alpha, 300)
+    np.testing.assert_allclose(table.alpha_from_ratio(4.4, table.ratio(4.4, many)), many, atol=5e-5)
 
 
 def test_outside_the_table_is_refused(table):

@@ -6,6 +6,8 @@ import os
 import numba
 import numpy as np
 import pytest
+from numba.core import compiler as numba_compiler
+from numba.core import ir
 from numba.core.types.functions import BaseFunction
 
 from flightmodel import _compiler_kernels as compiler
@@ -65,3 +67,16 @@ def test_operators_are_looked_up_once_and_mean_the_same(monkeypatch):
     assert looked_up.count(operator.getitem) < before
     assert once == every_time == pytest.approx(written_out(arrays[2], 6), rel=1e-14)
     np.testing.assert_array_equal(arrays[0], arrays[1])
+
+
+def test_variables_are_listed_as_numba_lists_them(monkeypatch):
+    function = numba_compiler.run_frontend(written_out)
+    statements = [statement for block in function.blocks.values() for statement in block.body]
+    before = [statement.list_vars() for statement in statements]
+    nested = {"a": [before[0], ("text", None, {"b": before[-1]})], "c": 1}
+    listed = statements[0]._rec_list_vars(nested)
+    monkeypatch.setattr(ir.Inst, "_rec_list_vars", ir.Inst._rec_list_vars)  # put back afterwards
+    compiler.list_variables_by_type()
+    assert [statement.list_vars() for statement in statements] == before
+    assert statements[0]._rec_list_vars(nested) == listed == before[0] + before[-1]
+    assert sum(map(len, before)) > 20

@@ -1,5 +1,6 @@
 """A stale kernel cannot run: numba does not see an edit of a callee in another file, so the cache folder must."""
 
+import ast
 import os
 import shutil
 import subprocess
@@ -92,3 +93,45 @@ def test_processes_that_save_at_once_keep_every_signature_s_own(tmp_path):
         assert one.wait() == 0, one.stderr.read().decode()
     reader = started(READ)
     assert reader.wait() == 0, reader.stderr.read().decode()
+
+
+REFUSED = (
+    SIGNATURES
+    + """
+import numba
+add.compile((types.float64, types.float64))
+assert add.stats.cache_hits, "compiled anew"
+assert add(1.0, 2.0) == 3.0
+
+@numba.njit
+def twice(x):
+    return add(x, x)
+
+try:
+    twice(1.0)
+except RuntimeError as fault:
+    print(fault)
+"""
+)
+
+
+def test_what_is_loaded_is_machine_code_alone_and_no_caller_takes_it_for_more(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
+    compile_one = SIGNATURES + "add.compile((types.float64, types.float64))"
+    subprocess.run([sys.executable, "-c", compile_one], env=environment, check=True)
+    done = subprocess.run([sys.executable, "-c", REFUSED], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "unfit for linking" in done.stdout
+
+
+def test_no_kernel_calls_another():
+    """What is called by kernels is a part: of a kernel that comes from the cache there is nothing to copy."""
+    decorated, called = {}, set()
+    for source in sorted(ROOT.glob("*/**/_*kernels.py")):
+        for node in ast.parse(source.read_text()).body:
+            if isinstance(node, ast.FunctionDef) and node.decorator_list:
+                decorated[node.name] = ast.unparse(node.decorator_list[0])
+                calls = (each.func for each in ast.walk(node) if isinstance(each, ast.Call))
+                called |= {ast.unparse(function).rsplit(".")[-1] for function in calls}
+    assert {"kernel", "exact_kernel", "inlined"} <= set(decorated.values())
+    assert not [name for name in called if decorated.get(name) in ("kernel", "exact_kernel")]

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -81,6 +82,20 @@ def test_what_is_asked_for_is_done_in_the_other_process_and_its_warnings_and_err
             assert process.answer() == (100.0, process._process.pid)
         with pytest.raises(ValueError, match="a negative number"):
             process.answer()
+
+
+def arrow():
+    import pandas as pd
+
+    before = "pyarrow" in sys.modules, pd.Series(["a", None]).isna().tolist()
+    pytest.importorskip("pyarrow")
+    return before
+
+
+def test_pandas_is_loaded_without_arrow_which_stays_at_hand():
+    with second_process.SecondProcess() as process:
+        process.ask(arrow)
+        assert process.answer() == (False, [False, True])
 
 
 def test_what_a_killed_process_was_asked_for_is_done_here():

@@ -138,6 +138,16 @@ def test_a_formula_in_a_table_is_text(cell, tmp_path):
     assert back["t_s"].tolist() == [-1.5, 2.0]
 
 
+def test_a_long_table_is_written_as_pandas_writes_it(tmp_path):
+    count = 1203
+    flags = [None if k % 7 == 0 else f"flag {k}" for k in range(count)]
+    values = np.where(np.arange(count) % 5, np.linspace(-1e9, 1e-9, count), np.nan)
+    table = pd.DataFrame({"t_s": values, "count": np.arange(count), "used": np.arange(count) % 2 == 0, "flag": flags})
+    for name, part in {"long.csv": table, "none.csv": table[:0]}.items():
+        run_folder.RunFolder.write_csv(SimpleNamespace(path=tmp_path), name, part)
+        assert (tmp_path / name).read_text() == part.to_csv(index=False, float_format="%.10g", lineterminator="\n")
+
+
 def test_sources_keep_their_names():
     table = pd.DataFrame({"source": ["-x", "_a", "a-b", "+", ""], "value": [-1.0, np.nan, 2.0, 3.0, 4.0]})
     pd.testing.assert_frame_equal(run_folder.plain_text(table), table)
