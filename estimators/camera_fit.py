@@ -250,11 +250,11 @@ class OrientedCamera(FrameModel):
             )
         if place is None:
             return both
-        features = (len(both.rows) - both.edge_count) / max(int((~self._benchmark_edge).sum()), 1)
-        edge_share = self._edge_share(len(horizon.points_px))
-        if max(edge_share, features) < _LITTLE_SEEN and not horizon.is_by_hand:
+        of_features = (len(both.rows) - both.edge_count) / max(int((~self._benchmark_edge).sum()), 1)
+        of_edge = self._edge_share(len(horizon.points_px))
+        if max(of_edge, of_features) < _LITTLE_SEEN and not horizon.is_by_hand:
             raise NoFitError(
-                f"{100.0 * edge_share:.0f} % of the benchmark frame's edge and {100.0 * features:.0f} % of its features "
+                f"{100.0 * of_edge:.0f} % of the benchmark frame's edge and {100.0 * of_features:.0f} % of its features "
                 f"are seen where {100.0 * _LITTLE_SEEN:.0f} % of one are needed",
                 "shell-little-seen",
             )
