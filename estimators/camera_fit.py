@@ -254,8 +254,8 @@ class OrientedCamera(FrameModel):
         of_edge = self._edge_share(len(horizon.points_px))
         if max(of_edge, of_features) < _LITTLE_SEEN and not horizon.is_by_hand:
             raise NoFitError(
-                f"{100.0 * of_edge:.0f} % of the benchmark frame's edge and {100.0 * of_features:.0f} % of its features "
-                f"are seen where {100.0 * _LITTLE_SEEN:.0f} % of one are needed",
+                f"{100.0 * of_edge:.0f} % of the benchmark frame's edge and {100.0 * of_features:.0f} % of its "
+                f"features are seen where {100.0 * _LITTLE_SEEN:.0f} % of one are needed",
                 "shell-little-seen",
             )
         # to first order, which takes a tenth of a fit's time, then in full where that is not clear
