@@ -137,6 +137,8 @@ class OrientedCamera(FrameModel):
             last = self._reconciled(frame, horizon, place, deformation, last)
             contradicted = place is not None and last.edge_count == len(last.rows)
             if not horizon.is_by_hand:
+                if place is not None and not contradicted:
+                    self._check_seen(horizon, last)
                 self._check_single(frame, horizon, deformation)
                 last = self._explained(place, deformation, last)
             if plane_axis is not None:
@@ -189,6 +191,17 @@ class OrientedCamera(FrameModel):
         fault = fault_of_fit(design, last.rms_px, shape, self.apriori.higher_lobes_rad)
         if fault:
             raise NoFitError(fault)
+
+    def _check_seen(self, horizon: HorizonLine, last: Solution) -> None:
+        """Refuse a frame of which little is seen: what there is may agree by chance."""
+        of_features = (len(last.rows) - last.edge_count) / max(int((~self._benchmark_edge).sum()), 1)
+        of_edge = self._edge_share(len(horizon.points_px))
+        if max(of_edge, of_features) < _LITTLE_SEEN:
+            raise NoFitError(
+                f"{100.0 * of_edge:.0f} % of the benchmark frame's edge and {100.0 * of_features:.0f} % of its "
+                f"features are seen where {100.0 * _LITTLE_SEEN:.0f} % of one are needed",
+                "shell-little-seen",
+            )
 
     def _check_single(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> None:
         """Refuse a frame that shows the edge twice, by `estimators.second_edge`."""
@@ -250,14 +263,6 @@ class OrientedCamera(FrameModel):
             )
         if place is None:
             return both
-        of_features = (len(both.rows) - both.edge_count) / max(int((~self._benchmark_edge).sum()), 1)
-        of_edge = self._edge_share(len(horizon.points_px))
-        if max(of_edge, of_features) < _LITTLE_SEEN and not horizon.is_by_hand:
-            raise NoFitError(
-                f"{100.0 * of_edge:.0f} % of the benchmark frame's edge and {100.0 * of_features:.0f} % of its "
-                f"features are seen where {100.0 * _LITTLE_SEEN:.0f} % of one are needed",
-                "shell-little-seen",
-            )
         # to first order, which takes a tenth of a fit's time, then in full where that is not clear
         if both.edge_count >= least_points(horizon):
             step, alone_near = self._edge_step(both, deformation[2])
