@@ -56,7 +56,7 @@ def rounds(jobs: dict[str, Callable[[], object]], repeats: int) -> dict[str, tup
     return {name: (1e3 * min(w for w, _ in t), 1e3 * min(c for _, c in t)) for name, t in times.items()}
 
 
-def told(measured: dict[str, tuple[float, float]], ours: str) -> None:
+def print_ratios(measured: dict[str, tuple[float, float]], ours: str) -> None:
     """Print times, and how many times ours they are."""
     for name, (wall, worked) in measured.items():
         ratios = f"{wall / measured[ours][0]:6.2f} {worked / measured[ours][1]:6.2f}"
@@ -123,7 +123,7 @@ def time_a_film() -> None:
         def estimate():
             read_film(times, pictures(), GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None, benchmark=frames[0]).history()
 
-        told(
+        print_ratios(
             rounds({f"{FRAMES} frames": estimate, "of it decoding": lambda: deque(pictures(), 0)}, 3),
             f"{FRAMES} frames",
         )
@@ -139,7 +139,7 @@ def time_two_cameras(folder: Path) -> None:
         return camera_answer(Flight(replace(flight.telemetry, films=films)), None)
 
     jobs = {"one camera": lambda: answer(name), "two cameras": lambda: answer(name, "second")}
-    told(rounds(jobs, 5), "one camera")
+    print_ratios(rounds(jobs, 5), "one camera")
 
 
 def fine_torus(across: int) -> tuple[np.ndarray, np.ndarray]:
@@ -201,7 +201,7 @@ def main() -> None:
     """Measure and print."""
     cv2.setNumThreads(1)
     print("fit of a frame")
-    told(rounds(fit_jobs(), ROUNDS), "ours, edge and marks searched for")
+    print_ratios(rounds(fit_jobs(), ROUNDS), "ours, edge and marks searched for")
     print("a film")
     time_a_film()
     for folder in sys.argv[1:]:
@@ -217,7 +217,7 @@ def main() -> None:
             print(f"{len(faces)} triangles, fisheye of 640 x 480, {100 * picture.is_hit.mean():.0f} % covered; "
                   f"C++ sees the same face in {100 * same:.2f} % of the pixels")  # fmt: skip
             jobs = {"ours": lambda v=vertices, f=faces: render(camera, v, f), "plain C++": theirs}
-            told(rounds(jobs | ray_casters(camera, vertices, faces), ROUNDS), "ours")
+            print_ratios(rounds(jobs | ray_casters(camera, vertices, faces), ROUNDS), "ours")
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ _SAME_BREAK_PX = 2  # a border's row, compressed otherwise in each frame
 _HIDDEN_BREAK = 0.3  # of a row: what is left of it is no break across most of the width
 _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
-# of the benchmark frame's edge or features, for an answer by both: of 2900 sound answers in spoilt films one shows less
+# of the benchmark frame's edge or features, for an answer by both: of 3573 sound answers in spoilt films one shows less
 _LITTLE_SEEN = 0.4
 USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
 

@@ -1,5 +1,6 @@
 """The process beside a run's own: its warnings arrive, and where it dies its work is done all the same."""
 
+import importlib
 import os
 import signal
 import sys
@@ -88,11 +89,12 @@ def arrow():
     import pandas as pd
 
     before = "pyarrow" in sys.modules, pd.Series(["a", None]).isna().tolist()
-    pytest.importorskip("pyarrow")
+    importlib.import_module("pyarrow")
     return before
 
 
 def test_pandas_is_loaded_without_arrow_which_stays_at_hand():
+    pytest.importorskip("pyarrow", reason="pyarrow comes with the parquet extra")
     with second_process.SecondProcess() as process:
         process.ask(arrow)
         assert process.answer() == (False, [False, True])

@@ -17,7 +17,7 @@ from tests.oracles import two_body
 from .conftest import bent_entry_state, with_joint
 from .plain_loads import Aerodynamics, JointLaw, SmoothAir, gravitation
 
-mujoco = pytest.importorskip("mujoco")
+mujoco = pytest.importorskip("mujoco", reason="mujoco comes with the dev extra")
 AIR = SmoothAir()
 
 
